@@ -1,0 +1,31 @@
+# Two commands do everything: `make demo` and `make test`. Both first make a virtual environment.
+
+PYTHON ?= python3
+BIN := .venv/bin
+DEMO := demo
+
+.PHONY: demo test check clean
+
+demo: .venv/installed
+	@rm -rf $(DEMO)
+	@echo "Simulating the life of a Y stage whose preload wears and whose mount loosens ..."
+	@$(BIN)/python -m models simulate lms-y --life both --logs 40 --seconds 20 --seed 1 --out $(DEMO)/logs
+	@echo "Analysing its logs ..."
+	@$(BIN)/lmshealth run $(DEMO)/logs --stage lms-y --out $(DEMO)/result
+
+test: .venv/installed check
+	$(BIN)/pytest -n 2
+
+check: .venv/installed
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+
+# The stamp is newer than what it was made from, or the installation is done again.
+.venv/installed: pyproject.toml
+	$(PYTHON) -m venv .venv
+	$(BIN)/pip install --quiet --editable ".[dev]"
+	@touch $@
+
+clean:
+	rm -rf .venv $(DEMO) build *.egg-info .pytest_cache .mypy_cache .ruff_cache

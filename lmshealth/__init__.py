@@ -1,0 +1,36 @@
+"""Health of linear-motor stages from the logs they already write.
+
+Guide preload, mount stiffness and remaining life, with every uncertainty carried from the raw
+samples to the date. Inside the package all quantities are in SI units.
+"""
+
+from importlib.metadata import version
+
+from lmshealth.errors import LmshealthError
+from lmshealth.history import Reading, build_history
+from lmshealth.inference import infer
+from lmshealth.modal import identify
+from lmshealth.pipeline import Settings, assess, run
+from lmshealth.prognosis import prognose
+from lmshealth.readers import read_log
+from lmshealth.stage import load_stage
+from lmshealth.summary import judge
+from lmshealth.tracking import track
+
+__version__ = version("lmshealth")
+
+__all__ = [
+    "LmshealthError",
+    "Reading",
+    "Settings",
+    "assess",
+    "build_history",
+    "identify",
+    "infer",
+    "judge",
+    "load_stage",
+    "prognose",
+    "read_log",
+    "run",
+    "track",
+]

@@ -1,0 +1,67 @@
+"""Errors of lmshealth: each says what was got, what is needed and what to do next."""
+
+from __future__ import annotations
+
+
+class LmshealthError(Exception):
+    """Base of every error that lmshealth raises on purpose."""
+
+
+class BadLog(LmshealthError):
+    """A log that cannot be used.
+
+    Parameters
+    ----------
+    log : str
+        The file, as the user knows it.
+    reason : str
+        Short kind of the trouble, the ``reason`` column of ``refused.csv``.
+    detail : str
+        What was found, what is needed, and the next step.
+    """
+
+    def __init__(self, log: str, reason: str, detail: str) -> None:
+        super().__init__(f"{log}: {reason}: {detail}")
+        self.log = log
+        self.reason = reason
+        self.detail = detail
+
+    def __reduce__(self) -> tuple[type[BadLog], tuple[str, str, str]]:
+        """Survive the way back from a worker process (arguments differ from the message)."""
+        return type(self), (self.log, self.reason, self.detail)
+
+
+class BadStage(LmshealthError):
+    """A stage description or modal map that cannot be used."""
+
+
+class OutsideMap(LmshealthError):
+    """Health parameters outside the grid of the modal map; maps are never extrapolated."""
+
+
+class BadTable(LmshealthError):
+    """A table (manifest, column map, modal estimates) that does not keep its contract."""
+
+
+class NotEnoughData(LmshealthError):
+    """Fewer usable logs or modes than the question needs."""
+
+
+class NotConverged(LmshealthError):
+    """A sampler that did not reach its convergence target.
+
+    Parameters
+    ----------
+    message : str
+        What was reached, what was needed.
+    chains : ndarray
+        The draws so far, shape ``(n_ensembles, n_steps, n_walkers, n_parameters)``.
+    """
+
+    def __init__(self, message: str, chains: object) -> None:
+        super().__init__(message)
+        self.chains = chains
+
+
+class NothingUsable(LmshealthError):
+    """Every log of a batch was refused."""

@@ -1,0 +1,211 @@
+"""Laws by which a health parameter degrades with travel.
+
+A law is a small object: its free parameters with their priors, the health it predicts, the
+travel at which it crosses a limit, and sampling coordinates in which the posterior of a partly
+worn machine is close to a Gaussian. Travel is in m from the baseline; health is a fraction of
+its baseline value.
+"""
+
+from __future__ import annotations
+
+from typing import ClassVar, Protocol
+
+import msgspec
+import numpy as np
+from scipy.special import expit
+
+from lmshealth.priors import Prior, Uniform
+from lmshealth.results import FloatArray
+
+_KM = 1000.0
+
+
+class Law(Protocol):
+    """What prognosis needs of a degradation law; ``y`` are sampling coordinates."""
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the natural parameters; their number is the number of coordinates."""
+
+    def natural(self, y: FloatArray, now: float) -> FloatArray:
+        """Turn coordinates, shape ``(n, k)``, into natural parameters (lengths in m)."""
+
+    def log_prior(self, y: FloatArray, now: float) -> FloatArray:
+        """Log prior density in the coordinates, with the Jacobian, shape ``(n,)``."""
+
+    def draw(self, rng: np.random.Generator, n: int, now: float) -> FloatArray:
+        """Draw coordinates from the prior, shape ``(n, k)``."""
+
+    def health(self, theta: FloatArray, travel: FloatArray) -> FloatArray:
+        """Health at each travel, shape ``(n, n_travel)``."""
+
+    def passage(self, theta: FloatArray, limit: float) -> FloatArray:
+        """Travel in m at which health falls to the limit, inf if never, shape ``(n,)``."""
+
+
+def _draw(prior: Prior, rng: np.random.Generator, n: int) -> FloatArray:
+    return np.asarray(prior.quantile(rng.uniform(1e-9, 1 - 1e-9, n)))
+
+
+class HertzWear(msgspec.Struct, frozen=True, tag="hertz-wear", tag_field="kind"):
+    """Preload lost by wear of the rolling contacts: P(s) = (1 - (s / s_w)^n)^1.5.
+
+    The elastic approach shrinks with travel as (s / s_w)^n, and the contact force goes with its
+    power 3/2 (Hertz). Nothing is left at s_w.
+    """
+
+    life_km: Prior
+    exponent: Uniform = Uniform(0.7, 1.6)
+    outer: ClassVar[float] = 1.5
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the natural parameters."""
+        return "life_m", "exponent"
+
+    def natural(self, y: FloatArray, now: float) -> FloatArray:
+        """From y1 = n ln(now / s_w), y2 = logit of n in its range."""
+        n = self.exponent.low + (self.exponent.high - self.exponent.low) * expit(y[:, 1])
+        # A far-off walker may ask for a life beyond the range of floats; its prior is 0 anyway.
+        return np.column_stack([now * np.exp(np.clip(-y[:, 0] / n, -300, 300)), n])
+
+    def log_prior(self, y: FloatArray, now: float) -> FloatArray:
+        """Log prior density with |d(s_w, n)/d(y1, y2)| = (s_w / n) (dn/dy2)."""
+        life, n = self.natural(y, now).T
+        slope = np.log(expit(y[:, 1])) + np.log(expit(-y[:, 1]))
+        return np.asarray(self.life_km.log_density(life / _KM) + np.log(life / n) + slope)
+
+    def draw(self, rng: np.random.Generator, n: int, now: float) -> FloatArray:
+        """Draw coordinates from the prior."""
+        life = _KM * _draw(self.life_km, rng, n)
+        share = rng.uniform(1e-6, 1 - 1e-6, n)
+        exponent = self.exponent.low + (self.exponent.high - self.exponent.low) * share
+        return np.column_stack([exponent * np.log(now / life), np.log(share / (1 - share))])
+
+    def health(self, theta: FloatArray, travel: FloatArray) -> FloatArray:
+        """Preload as a fraction of its baseline; 0 past the end of the law."""
+        life, n = theta[:, :1], theta[:, 1:]
+        left = 1 - (np.maximum(travel, 0) / life) ** n
+        return np.asarray(np.maximum(left, 0) ** self.outer)
+
+    def passage(self, theta: FloatArray, limit: float) -> FloatArray:
+        """Travel at the limit, in closed form."""
+        if limit >= 1:
+            return np.zeros(theta.shape[0])
+        loss = 1 - limit ** (1 / self.outer)
+        return np.asarray(theta[:, 0] * loss ** (1 / theta[:, 1]))
+
+
+class Loosening(msgspec.Struct, frozen=True, tag="loosening", tag_field="kind"):
+    """Joint that settles towards a floor: k(s) = k_f + (1 - k_f) exp(-s / s_m)."""
+
+    life_km: Prior
+    floor: Prior
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the natural parameters."""
+        return "floor", "life_m"
+
+    def natural(self, y: FloatArray, now: float) -> FloatArray:
+        """From y1 = ln[(1 - k_f)(1 - exp(-now / s_m))], the loss so far, and y2 = ln s_m."""
+        life = np.exp(np.clip(y[:, 1], -300, 300))
+        floor = 1 - np.exp(np.minimum(y[:, 0] - np.log(-np.expm1(-now / life)), 300))
+        return np.column_stack([floor, life])
+
+    def log_prior(self, y: FloatArray, now: float) -> FloatArray:
+        """Log prior density with |d(k_f, s_m)/d(y1, y2)| = (1 - k_f) s_m."""
+        floor, life = self.natural(y, now).T
+        inside = (floor >= 0) & (floor < 1)
+        rest = np.where(inside, 1 - floor, 1.0)
+        value = self.floor.log_density(floor) + self.life_km.log_density(life / _KM)
+        return np.where(inside, value + np.log(rest * life), -np.inf)
+
+    def draw(self, rng: np.random.Generator, n: int, now: float) -> FloatArray:
+        """Draw coordinates from the prior."""
+        life = _KM * _draw(self.life_km, rng, n)
+        floor = np.clip(_draw(self.floor, rng, n), 1e-6, 1 - 1e-6)
+        return np.column_stack([np.log((1 - floor) * -np.expm1(-now / life)), np.log(life)])
+
+    def health(self, theta: FloatArray, travel: FloatArray) -> FloatArray:
+        """Stiffness as a fraction of its baseline."""
+        floor, life = theta[:, :1], theta[:, 1:]
+        return np.asarray(floor + (1 - floor) * np.exp(-np.maximum(travel, 0) / life))
+
+    def passage(self, theta: FloatArray, limit: float) -> FloatArray:
+        """Travel at the limit, in closed form; inf where the floor lies above it."""
+        floor, life = theta.T
+        reached = floor < limit
+        ratio = (1 - floor) / np.where(reached, limit - floor, 1.0)
+        return np.where(reached, life * np.log(np.maximum(ratio, 1.0)), np.inf)
+
+
+class Power(HertzWear, frozen=True, tag="power", tag_field="kind"):
+    """Loss as a power of travel: h(s) = 1 - (s / s_p)^n, for parameters without a physics."""
+
+    outer: ClassVar[float] = 1.0
+
+
+class Linear(msgspec.Struct, frozen=True, tag="linear", tag_field="kind"):
+    """Loss in proportion to travel: h(s) = 1 - r s. A rate below 0 is a gain."""
+
+    rate_per_km: Prior
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the natural parameters."""
+        return ("rate_per_m",)
+
+    def natural(self, y: FloatArray, now: float) -> FloatArray:
+        """From y1 = r now, the loss so far."""
+        return y / now
+
+    def log_prior(self, y: FloatArray, now: float) -> FloatArray:
+        """Log prior density; the Jacobian is constant."""
+        return self.rate_per_km.log_density(y[:, 0] / now * _KM)
+
+    def draw(self, rng: np.random.Generator, n: int, now: float) -> FloatArray:
+        """Draw coordinates from the prior."""
+        return (_draw(self.rate_per_km, rng, n) / _KM * now)[:, None]
+
+    def health(self, theta: FloatArray, travel: FloatArray) -> FloatArray:
+        """Health, never below 0."""
+        return np.asarray(np.maximum(1 - theta * travel, 0))
+
+    def passage(self, theta: FloatArray, limit: float) -> FloatArray:
+        """Travel at the limit; inf where nothing is lost."""
+        rate = theta[:, 0]
+        losing = rate > 0
+        return np.where(losing, max(1 - limit, 0.0) / np.where(losing, rate, 1.0), np.inf)
+
+
+class Unchanging(msgspec.Struct, frozen=True, tag="none", tag_field="kind"):
+    """No degradation: h(s) = 1."""
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """No free parameter."""
+        return ()
+
+    def natural(self, y: FloatArray, now: float) -> FloatArray:
+        """Return the empty coordinates."""
+        return y
+
+    def log_prior(self, y: FloatArray, now: float) -> FloatArray:
+        """Return zeros."""
+        return np.zeros(y.shape[0])
+
+    def draw(self, rng: np.random.Generator, n: int, now: float) -> FloatArray:
+        """Draw nothing."""
+        return np.empty((n, 0))
+
+    def health(self, theta: FloatArray, travel: FloatArray) -> FloatArray:
+        """Return ones."""
+        return np.ones((theta.shape[0], travel.size))
+
+    def passage(self, theta: FloatArray, limit: float) -> FloatArray:
+        """Never."""
+        return np.full(theta.shape[0], np.inf)
+
+
+AnyLaw = HertzWear | Loosening | Power | Linear | Unchanging

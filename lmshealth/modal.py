@@ -1,0 +1,285 @@
+"""Identification of modes: the Whittle likelihood fitted cluster by cluster, channel by channel.
+
+A mode's estimate comes from the one channel that shows it most clearly: channels of one log
+share the excitation, so that their errors are not independent and may not be averaged as if.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from lmshealth.bandfit import BAND, BandFit, View, fit_band
+from lmshealth.errors import BadLog
+from lmshealth.peaks import find_peaks
+from lmshealth.results import Channel, Line, Log, Modes, Refusal
+from lmshealth.spectra import find_segments, periodogram
+from lmshealth.stage import Stage
+from lmshealth.starts import Target, coarsen, locate
+
+# Modes whose bands touch are fitted together, but never more than this many.
+_MOST_TOGETHER = 4
+# Shortest useful segment: half-power bandwidth times duration.
+_LEAST_RESOLUTION = 2.0
+_MAINS = (50.0, 60.0)
+_MOST_HARMONICS = 10
+_TOP = 0.45  # of the sample rate: anti-alias filters reach below Nyquist
+
+
+def identify(
+    log: Log,
+    stage: Stage | None = None,
+    *,
+    channels: Sequence[str] | None = None,
+    band: tuple[float, float] | None = None,
+) -> Modes:
+    """Identify the modes of a log with their covariance.
+
+    Parameters
+    ----------
+    log : Log
+        Displacement (following error) and acceleration channels are used.
+    stage : Stage, optional
+        Says which modes to look for; without it resonances are searched for in the band.
+    channels : sequence of str, optional
+        Use only these channels.
+    band : (float, float), optional
+        Use only modes between these frequencies in Hz. Without a stage the default reaches from
+        twenty periods per record to 0.45 of the sample rate.
+
+    Returns
+    -------
+    Modes
+        With the modes that were looked for and refused, and why.
+
+    Raises
+    ------
+    BadLog
+        If no channel is left, or the record is too short or too slow for the modes.
+    """
+    used = _choose_channels(log, channels)
+    if stage is not None:
+        targets = _stage_targets(stage, band)
+        views = _transform(log, used, targets)
+    else:
+        views = _transform(log, used, ())
+        targets = _search(log, views, band)
+    fits: list[BandFit] = []
+    refused: list[Refusal] = []
+    for cluster in _clusters(targets):
+        found, missing = _identify_cluster(log, views, cluster, known=stage is not None)
+        fits += found
+        refused += missing
+    modes = _collect(fits, _name_lines(log, stage, fits), (*log.refused, *refused))
+    return modes if stage is not None else _renumber(modes)
+
+
+def _choose_channels(log: Log, names: Sequence[str] | None) -> tuple[Channel, ...]:
+    usable = tuple(c for c in log.channels if c.kind in ("displacement", "acceleration"))
+    if names is not None:
+        unknown = set(names) - {channel.name for channel in usable}
+        if unknown:
+            raise BadLog(
+                log.name,
+                "channel",
+                f"no usable channel {sorted(unknown)}; there are "
+                f"{[channel.name for channel in usable]}",
+            )
+        usable = tuple(channel for channel in usable if channel.name in names)
+    if not usable:
+        raise BadLog(log.name, "no-signal", "no delta_e or acc channel is left to analyse")
+    return usable
+
+
+def _stage_targets(stage: Stage, band: tuple[float, float] | None) -> tuple[Target, ...]:
+    low, high = band or (0.0, np.inf)
+    return tuple(
+        Target(mode.name, mode.frequency_hz, mode.damping_ratio, mode.search)
+        for mode in sorted(stage.modes, key=lambda mode: mode.frequency_hz)
+        if low <= mode.frequency_hz <= high
+    )
+
+
+def _transform(
+    log: Log, channels: tuple[Channel, ...], targets: tuple[Target, ...]
+) -> tuple[View, ...]:
+    top = max((target.band(BAND)[1] for target in targets), default=0.0)
+    if top > log.sample_rate / 2:
+        raise BadLog(
+            log.name,
+            "sample-rate",
+            f"{log.sample_rate:g} Hz cannot show modes up to {top:.0f} Hz; "
+            f"needed is at least {2 * top:.0f} Hz",
+        )
+    narrowest = min((2 * t.damping_ratio * t.frequency for t in targets), default=np.inf)
+    needed = _LEAST_RESOLUTION / narrowest
+    segments = find_segments(log, needed)
+    if not segments:
+        longest = max((b - a for a, b in log.pieces), default=0) / log.sample_rate
+        raise BadLog(
+            log.name,
+            "too-short",
+            f"no stretch of constant velocity without gaps lasts {needed:.3g} s, which the "
+            f"narrowest mode needs; the longest piece without gaps has {longest:.3g} s",
+        )
+    return tuple(
+        View(
+            channel.name,
+            "delta_e" if channel.kind == "displacement" else "acc",
+            tuple(periodogram(channel, segment, log.sample_rate) for segment in segments),
+        )
+        for channel in channels
+    )
+
+
+def _search(
+    log: Log, views: tuple[View, ...], band: tuple[float, float] | None
+) -> tuple[Target, ...]:
+    longest = max(s.duration for view in views for s in view.spectra)
+    low, high = band or (20 / longest, _TOP * log.sample_rate)
+    low, high = max(low, 2 / longest), min(high, _TOP * log.sample_rate)
+    held = max(0.0, (high - low) * longest)
+    if held < 50:
+        raise BadLog(
+            log.name,
+            "too-short",
+            f"{longest:.3g} s at {log.sample_rate:g} Hz hold {held:.0f} Fourier frequencies from "
+            f"{low:.4g} to {high:.4g} Hz; needed are at least 50",
+        )
+    return find_peaks(tuple(view.spectra for view in views), low, high)
+
+
+def _clusters(targets: tuple[Target, ...]) -> list[tuple[Target, ...]]:
+    """Group targets whose fitting bands overlap."""
+    groups: list[list[Target]] = []
+    for target in targets:
+        close = bool(groups) and target.band(BAND)[0] < groups[-1][-1].band(BAND)[1]
+        if close and len(groups[-1]) < _MOST_TOGETHER:
+            groups[-1].append(target)
+        else:
+            groups.append([target])
+    return [tuple(group) for group in groups]
+
+
+def _identify_cluster(
+    log: Log, views: tuple[View, ...], cluster: tuple[Target, ...], *, known: bool
+) -> tuple[list[BandFit], list[Refusal]]:
+    """Fit a cluster in every channel and keep each mode from the channel that knows it best."""
+    reach = [target.search if known else 0.0 for target in cluster]
+    low = min(t.band(BAND)[0] * (1 - r) for t, r in zip(cluster, reach, strict=True))
+    high = max(t.band(BAND)[1] * (1 + r) for t, r in zip(cluster, reach, strict=True))
+    width = 0.5 * min(t.damping_ratio * t.frequency for t in cluster)
+    high = min(high, 0.49 * log.sample_rate)
+    coarse = tuple(coarsen(view.spectra, low, high, width) for view in views)
+    placed = cluster
+    if known:
+        found = locate(coarse, cluster).tolist()
+        placed = tuple(replace(t, frequency=f) for t, f in zip(cluster, found, strict=True))
+    fits: list[BandFit] = []
+    reasons: dict[str, tuple[str, str]] = {}
+    for view, binned in zip(views, coarse, strict=True):
+        fit, missing = fit_band(view, binned, placed)
+        # The most telling reason is that of the first channel that got as far as a fit.
+        for name, why in missing.items():
+            if name not in reasons or reasons[name][0] == "not-excited":
+                reasons[name] = why
+        if fit is not None:
+            fits.append(fit)
+    best = _best_channels(fits, [target.name for target in cluster])
+    seen = {target.name for fit in best for target in fit.targets}
+    refused = [
+        Refusal(log=log.name, mode=name, reason=reason, detail=detail)
+        for name, (reason, detail) in reasons.items()
+        if name not in seen
+    ]
+    return best, refused
+
+
+def _best_channels(fits: list[BandFit], names: list[str]) -> list[BandFit]:
+    """Keep each mode in one fit only: accelerometers before Δe, then the clearest channel."""
+    choice: dict[str, int] = {}
+    for name in names:
+        ranked = [
+            (fit.view.source != "acc", -float(fit.clarity[i]), k)
+            for k, fit in enumerate(fits)
+            for i, target in enumerate(fit.targets)
+            if target.name == name
+        ]
+        if ranked:
+            choice[name] = min(ranked)[2]
+    return [
+        fit.only(chosen)
+        for k, fit in enumerate(fits)
+        if (chosen := [n for n in names if choice.get(n) == k])
+    ]
+
+
+def _name_lines(log: Log, stage: Stage | None, fits: list[BandFit]) -> tuple[Line, ...]:
+    """Tell what each line is: an order of the velocity, mains, or unknown."""
+    orders = () if stage is None else stage.description.order
+    bases = [(mains, "mains") for mains in _MAINS] + [
+        (abs(segment.velocity) / (order.wavelength_mm * 1e-3), order.name)
+        for order in orders
+        for segment in find_segments(log, 0.0)
+    ]
+    lines = set()
+    for fit in fits:
+        resolution = 1.5 / max(s.duration for s in fit.view.spectra)
+        for frequency, amplitude in fit.lines.tolist():
+            kind = "unknown"
+            for base, name in bases:
+                if _is_harmonic(frequency, base, resolution):
+                    kind = name
+            lines.add(Line(frequency, amplitude, "m/s²", kind, fit.view.channel))
+    return tuple(sorted(lines, key=lambda line: (line.frequency, line.channel)))
+
+
+def _is_harmonic(frequency: float, base: float, resolution: float) -> bool:
+    # High harmonics of a slow order lie so close together that any line would be one.
+    if not base > 0 or not 1 <= (n := round(frequency / base)) <= _MOST_HARMONICS:
+        return False
+    return abs(frequency - n * base) < resolution
+
+
+def _collect(fits: list[BandFit], lines: tuple[Line, ...], refused: tuple[Refusal, ...]) -> Modes:
+    sizes = [len(fit.targets) for fit in fits]
+    n = sum(sizes)
+    cov = np.zeros((2 * n, 2 * n))
+    estimate = np.zeros(2 * n)
+    at = 0
+    for fit, size in zip(fits, sizes, strict=True):
+        index = np.concatenate([np.arange(at, at + size), np.arange(n + at, n + at + size)])
+        cov[np.ix_(index, index)] = fit.cov
+        estimate[index] = fit.estimate
+        at += size
+    order = np.argsort(estimate[:n], kind="stable")
+    both = np.concatenate([order, order + n])
+    names = [target.name for fit in fits for target in fit.targets]
+    views = [fit.view for fit in fits for _ in fit.targets]
+    snr = np.concatenate([fit.snr for fit in fits]) if fits else np.empty(0)
+    return Modes(
+        names=tuple(names[i] for i in order),
+        sources=tuple(views[i].source for i in order),
+        channels=tuple(views[i].channel for i in order),
+        ln_frequency=estimate[order],
+        ln_damping=estimate[n + order],
+        cov=cov[np.ix_(both, both)],
+        snr=snr[order],
+        lines=lines,
+        refused=refused,
+    )
+
+
+def _renumber(modes: Modes) -> Modes:
+    """Name found modes in ascending order; candidates that were refused leave no gap.
+
+    A peak that turned out to be no mode was our own idea, not the user's question: it is not
+    worth a refusal.
+    """
+    return replace(
+        modes,
+        names=tuple(f"mode_{number}" for number in range(1, len(modes.names) + 1)),
+        refused=tuple(refusal for refusal in modes.refused if not refusal.mode),
+    )

@@ -1,0 +1,365 @@
+"""The main job: a folder of logs to tables and a report."""
+
+from __future__ import annotations
+
+import hashlib
+import multiprocessing
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Executor, ProcessPoolExecutor, as_completed
+from contextlib import contextmanager
+from dataclasses import dataclass
+from datetime import date
+from importlib.metadata import version
+from pathlib import Path
+
+from lmshealth.errors import BadLog, LmshealthError, NothingUsable
+from lmshealth.history import Reading, build_history, in_order
+from lmshealth.inference import epochs_to_infer, infer
+from lmshealth.maintenance import Action, after_last_reset, read_maintenance
+from lmshealth.modal import identify
+from lmshealth.prognosis import prognose
+from lmshealth.readers import content_digest, find_logs, read_log, read_manifest, require_identity
+from lmshealth.report import write_report
+from lmshealth.results import Health, History, Prognosis, Refusal, Track
+from lmshealth.stage import Stage
+from lmshealth.store import Store, result_key
+from lmshealth.summary import Assessment, judge, service_date
+from lmshealth.tables import all_tables
+from lmshealth.tracking import track
+
+Progress = Callable[[str, int, int], None]
+"""Called with what is being done, how much is done, and how much there is."""
+
+Outcome = Reading | tuple[Refusal, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Settings:
+    """How a run is carried out.
+
+    Attributes
+    ----------
+    store : str or None
+        SQLAlchemy URL; None for a SQLite file beside the output.
+    workers : int
+        Processes; results do not depend on it.
+    epochs : int
+        Health is inferred at no more than this many epochs per stage.
+    seed : int
+        Of all randomness.
+    """
+
+    store: str | None = None
+    workers: int = 1
+    epochs: int = 40
+    seed: int = 0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RunResult:
+    """What a run did.
+
+    Attributes
+    ----------
+    index : Path
+        The front page of the report.
+    pages : tuple of Path
+        The page of each stage, in the order of `assessments`.
+    assessments : tuple of Assessment
+        One per stage.
+    n_logs, n_refused, n_remembered : int
+        Logs found, refused as a whole, and taken from the store.
+    """
+
+    index: Path
+    pages: tuple[Path, ...]
+    assessments: tuple[Assessment, ...]
+    n_logs: int
+    n_refused: int
+    n_remembered: int
+
+
+@dataclass(frozen=True, slots=True)
+class _Task:
+    path: Path
+    name: str
+    overrides: dict[str, str]
+    digest: str
+    key: str
+
+
+def run(
+    folder: Path,
+    stages: Sequence[Stage],
+    out: Path,
+    settings: Settings = Settings(),
+    progress: Progress = lambda what, done, total: None,
+) -> RunResult:
+    """Analyse a folder of logs and write tables and report.
+
+    Parameters
+    ----------
+    folder : Path
+        Read recursively; ``manifest.csv`` and ``maintenance.csv`` are understood.
+    stages : sequence of Stage
+        Each log goes to the first description that takes it.
+    out : Path
+        Folder of the output, made if needed.
+    settings : Settings
+        How to do it.
+    progress : callable
+        Told what is going on.
+
+    Raises
+    ------
+    NothingUsable
+        If there is no log, or every log was refused; ``refused.csv`` is written all the same.
+    """
+    out.mkdir(parents=True, exist_ok=True)
+    archive = find_logs(folder)
+    # Output inside the folder of logs is no log.
+    inside = out.resolve()
+    found = [path for path in archive.logs if inside not in path.resolve().parents]
+    store = Store(settings.store or f"sqlite:///{(out / 'lmshealth.sqlite').as_posix()}")
+    try:
+        with _workers(settings.workers) as pool:
+            tasks, refused = _tasks(folder, found, stages, progress)
+            refused = [*archive.refused, *refused]
+            outcomes, n_remembered = _identify_all(tasks, stages, store, pool, progress)
+            readings = in_order([o for o in outcomes if isinstance(o, Reading)])
+            lost = [r for o in outcomes if not isinstance(o, Reading) for r in o]
+            actions = read_maintenance(folder)
+            assessments = _assess_all(readings, stages, actions, settings, pool, progress)
+    finally:
+        store.close()
+    whole = [*refused, *lost]
+    partial = [r for reading in readings for r in reading.modes.refused]
+    order = [r for a in assessments for r in a.refused if r.reason == "odometer-backwards"]
+    tables = all_tables(readings, assessments, [*whole, *partial, *order])
+    for name, table in tables.items():
+        _write_table(out / f"{name}.csv", table.to_csv(index=False))
+    n_logs = len(found) + len(archive.refused)
+    n_refused = len({refusal.log for refusal in whole})
+    if not readings:
+        raise NothingUsable(
+            f"{folder}: no usable log: {n_logs} found, {n_refused} refused; "
+            f"{out / 'refused.csv'} says why"
+        )
+    pages = write_report(out, assessments, whole, service=_service_dates(assessments))
+    return RunResult(
+        index=out / "index.html",
+        pages=tuple(page for page in pages if page.name != "index.html"),
+        assessments=assessments,
+        n_logs=n_logs,
+        n_refused=n_refused,
+        n_remembered=n_remembered,
+    )
+
+
+def _write_table(path: Path, text: str) -> None:
+    """Replace a file in one step, so that an interrupted run leaves no half table."""
+    part = path.with_suffix(".part")
+    part.write_text(text, encoding="utf-8")
+    part.replace(path)
+
+
+def _service_dates(assessments: Sequence[Assessment]) -> dict[str, date | None]:
+    return {
+        a.judgement.stage: service_date(a.prognosis, a.stage.description.decision.max_risk)
+        for a in assessments
+        if a.prognosis is not None
+    }
+
+
+@contextmanager
+def _workers(n: int) -> Iterator[Executor | None]:
+    if n <= 1:
+        yield None
+        return
+    # Spawned, not forked: a fork would share locks of threads that do not come along.
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(n, mp_context=context) as pool:
+        try:
+            yield pool
+        except BaseException:
+            pool.shutdown(wait=False, cancel_futures=True)
+            raise
+
+
+def _tasks(
+    folder: Path, found: Sequence[Path], stages: Sequence[Stage], progress: Progress
+) -> tuple[list[_Task], list[Refusal]]:
+    """Name every log by its content; the same content twice is one log."""
+    manifest = read_manifest(folder)
+    tasks: list[_Task] = []
+    refused: list[Refusal] = list(manifest.refused)
+    seen: dict[str, str] = {}
+    circumstances = [version("lmshealth"), *(stage.digest for stage in stages)]
+    for k, path in enumerate(found):
+        progress("reading", k, len(found))
+        name = path.relative_to(folder).as_posix()
+        try:
+            digest = content_digest(path)
+        except BadLog as error:
+            refused.append(Refusal(name, error.reason, error.detail))
+            continue
+        if digest in seen:
+            detail = f"same content as {seen[digest]}, which is analysed"
+            refused.append(Refusal(name, "duplicate", detail))
+            continue
+        seen[digest] = name
+        overrides = manifest.overrides(path)
+        key = result_key(digest, *circumstances, repr(sorted(overrides.items())))
+        tasks.append(_Task(path, name, overrides, digest, key))
+    progress("reading", len(found), len(found))
+    return tasks, refused
+
+
+def _identify_all(
+    tasks: Sequence[_Task],
+    stages: Sequence[Stage],
+    store: Store,
+    pool: Executor | None,
+    progress: Progress,
+) -> tuple[list[Outcome], int]:
+    """Identify all logs that the store does not know; results in the order of the tasks."""
+    outcomes: dict[str, Outcome] = {}
+    for task in tasks:
+        known = store.get(task.key, task.name)
+        if known is not None:
+            outcomes[task.key] = known
+    n_remembered = len(outcomes)
+    progress("identifying", n_remembered, len(tasks))
+    open_tasks = [task for task in tasks if task.key not in outcomes]
+    for task, outcome in _carry_out(open_tasks, tuple(stages), pool):
+        store.put(task.key, task.name, outcome)
+        outcomes[task.key] = outcome
+        progress("identifying", len(outcomes), len(tasks))
+    return [outcomes[task.key] for task in tasks], n_remembered
+
+
+def _carry_out(
+    tasks: Sequence[_Task], stages: tuple[Stage, ...], pool: Executor | None
+) -> Iterator[tuple[_Task, Outcome]]:
+    if pool is None:
+        for task in tasks:
+            yield task, identify_log(task, stages)
+        return
+    futures = {pool.submit(identify_log, task, stages): task for task in tasks}
+    for future in as_completed(futures):
+        yield futures[future], future.result()
+
+
+def identify_log(task: _Task, stages: tuple[Stage, ...]) -> Outcome:
+    """Read and identify one log; what goes wrong with it is its refusal, never an exception."""
+    try:
+        log = read_log(task.path, overrides=task.overrides, name=task.name)
+        require_identity(log)
+        stage = next((stage for stage in stages if stage.takes(log.metadata)), None)
+        if stage is None:
+            raise BadLog(
+                task.name,
+                "no-stage",
+                f"stage {log.metadata.stage!r} matches none of the descriptions "
+                f"{[s.description.match.stage for s in stages]}; give its description by --stage",
+            )
+        return Reading(task.name, log.digest, log.metadata, identify(log, stage))
+    except BadLog as error:
+        return (Refusal(task.name, error.reason, error.detail),)
+
+
+def _assess_all(
+    readings: Sequence[Reading],
+    stages: Sequence[Stage],
+    actions: Sequence[Action],
+    settings: Settings,
+    pool: Executor | None,
+    progress: Progress,
+) -> tuple[Assessment, ...]:
+    machines: dict[str, list[Reading]] = {}
+    for reading in readings:
+        machines.setdefault(str(reading.metadata.stage), []).append(reading)
+    assessments = []
+    for k, (name, own) in enumerate(sorted(machines.items())):
+        progress("assessing", k, len(machines))
+        stage = next(stage for stage in stages if stage.takes(own[0].metadata))
+        relevant = [action for action in actions if action.stage == name]
+        assessments.append(assess(own, stage, relevant, settings, pool))
+    progress("assessing", len(machines), len(machines))
+    return tuple(assessments)
+
+
+def assess(
+    readings: Sequence[Reading],
+    stage: Stage,
+    actions: Sequence[Action] = (),
+    settings: Settings = Settings(),
+    pool: Executor | None = None,
+) -> Assessment:
+    """Take the readings of one machine through tracking, health, prognosis and verdict.
+
+    Parameters
+    ----------
+    readings : sequence of Reading
+        Logs of one machine, at least one.
+    stage : Stage
+        Its description.
+    actions : sequence of Action
+        Its maintenance.
+    settings : Settings
+        Number of epochs and seed.
+    pool : Executor, optional
+        Epochs are spread over it.
+
+    Returns
+    -------
+    Assessment
+        What the data do not carry is None, with the reason among the notes.
+    """
+    used, notes = after_last_reset(readings, actions)
+    history, refused = build_history(used, stage)
+    partial = [refusal for reading in used for refusal in reading.modes.refused]
+    own = int(hashlib.sha256(f"{history.stage}\n{stage.digest}".encode()).hexdigest()[:12], 16)
+    seed = (settings.seed, own)
+    followed, health, prognosis = _results(history, stage, settings.epochs, seed, pool, notes)
+    ordered = in_order(used)
+    return Assessment(
+        stage=stage,
+        history=history,
+        digests=tuple(reading.digest for reading in ordered),
+        track=followed,
+        health=health,
+        prognosis=prognosis,
+        judgement=judge(stage, history, health),
+        refused=tuple([*partial, *refused]),
+        notes=tuple(notes),
+        seed=settings.seed,
+    )
+
+
+def _results(
+    history: History,
+    stage: Stage,
+    most_epochs: int,
+    seed: tuple[int, int],
+    pool: Executor | None,
+    notes: list[str],
+) -> tuple[Track | None, Health | None, Prognosis | None]:
+    """Go as far as the data carry; what stops it becomes a note."""
+    followed: Track | None = None
+    health: Health | None = None
+    try:
+        followed = track(history, stage)
+        if not stage.parameters:
+            return followed, None, None
+        # The life needs the longest of all: it is begun before the epochs and fetched after them.
+        has_limit = any(parameter.limit for parameter in stage.parameters)
+        life = pool.submit(prognose, history, stage, seed) if pool and has_limit else None
+        epochs = epochs_to_infer(followed, stage, most_epochs)
+        health = infer(followed, stage, seed, epochs=epochs, mapper=pool.map if pool else map)
+        if not has_limit:
+            return followed, health, None
+        return followed, health, life.result() if life else prognose(history, stage, seed)
+    except LmshealthError as error:
+        notes.append(str(error))
+        return followed, health, None

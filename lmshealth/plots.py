@@ -1,0 +1,449 @@
+"""Pictures of results: every function takes the matplotlib Axes to draw on, then results.
+
+They return the Axes. Names of modes and parameters are those of the results; travel is shown in
+km, health in % of baseline. Colours come from the palette of Okabe and Ito, and nothing is told
+by colour alone. `svg` turns one of them into an inline picture.
+"""
+
+from __future__ import annotations
+
+import re
+import warnings
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from lmshealth.results import FloatArray, Health, History, Prognosis, Track
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+INK, MUTED, GRID, PAPER = "#1f2933", "#5f6b7a", "#d9dee5", "#fefefe"
+BLUE, RED, GREEN = "#0072b2", "#c44e00", "#007a5a"
+_NAMED = dict(
+    zip(
+        (INK, MUTED, GRID, PAPER, BLUE, RED, GREEN),
+        ("ink", "muted", "line", "card", "blue", "red", "green"),
+        strict=True,
+    )
+)
+_STYLE: dict[str, Any] = {
+    "font.family": "DejaVu Sans",  # comes with matplotlib: the same outlines everywhere
+    "font.size": 9,
+    "text.usetex": False,
+    "axes.edgecolor": MUTED,
+    "axes.facecolor": "none",
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "axes.spines.right": False,
+    "axes.spines.top": False,
+    "grid.color": GRID,
+    "grid.linewidth": 0.6,
+    "hatch.linewidth": 0.6,
+    "legend.fontsize": 8,
+    "legend.frameon": False,
+    "svg.fonttype": "path",
+    **dict.fromkeys(("xtick.color", "ytick.color"), MUTED),
+    **dict.fromkeys(("axes.labelcolor", "legend.labelcolor", "text.color"), INK),
+    **dict.fromkeys(("xtick.labelcolor", "ytick.labelcolor"), INK),
+}
+_KM = 1000.0
+_LEVELS = np.array([0.05, 0.25, 0.5, 0.75, 0.95])
+_GRID_POINTS = 72
+TOLD = 0.5  # share of the variance that must come from the data before a value is shown
+
+
+def svg(
+    draw: Callable[[Axes], object], *, salt: str, size: tuple[float, float] = (4.8, 2.8)
+) -> str:
+    """Draw one picture as an SVG element for the inside of a page.
+
+    The same input gives the same bytes. Colours follow the style sheet of the page (``--ink``,
+    ``--blue``, ...) where it has one; prolog, comments and metadata are left out, and screen
+    readers skip the picture, because the page carries its text.
+
+    Parameters
+    ----------
+    draw : callable
+        Takes the Axes and draws on it.
+    salt : str
+        Prefix of all identifiers, of letters, digits and dashes; one for each picture of a page.
+    size : (float, float)
+        Width and height in inches.
+    """
+    import io
+
+    import matplotlib
+    from matplotlib.figure import Figure
+
+    target = io.StringIO()
+    nothing = dict.fromkeys(("Date", "Creator", "Format", "Type"))
+    style: Any = _STYLE | {"svg.hashsalt": salt}
+    with matplotlib.rc_context(style), warnings.catch_warnings():
+        # A name in a script the font lacks is drawn as boxes; the page itself spells it out.
+        warnings.filterwarnings("ignore", message="Glyph .* missing")
+        figure = Figure(figsize=size, layout="constrained", facecolor="none")
+        draw(figure.add_subplot())
+        figure.savefig(target, format="svg", metadata=nothing)
+    text = target.getvalue()
+    text = re.sub(r"(?s)<!--.*?-->|<metadata>.*?</metadata>", "", text[text.index("<svg") :])
+    # Glyphs and groups carry the same identifiers in every file: give each picture its own.
+    text = re.sub(r'(\sid="|href="#|url\(#)', rf"\g<1>{salt}-", text)
+    for colour, name in _NAMED.items():
+        text = text.replace(colour, f"var(--{name}, {colour})")
+    # Two decimals of a point are finer than any screen or printer.
+    text = re.sub(r'\sd="[^"]*"', lambda d: re.sub(r"(\.\d\d)\d+", r"\1", d[0]), text)
+    text = re.sub(r"\n\s*", "\n", text).strip()
+    return text.replace("<svg ", '<svg aria-hidden="true" focusable="false" ', 1)
+
+
+def plot_frequencies(ax: Axes, history: History, track: Track | None, mode: str) -> Axes:
+    """Plot the natural frequency of a mode against the odometer.
+
+    Each log's estimate with ± 2 standard deviations as it was measured; the filtered line with
+    its 95 % band has the covariates at their reference. Without a track of this mode the line
+    is left out.
+    """
+    column = history.modes.index(mode)
+    _logs(ax, history, column, history.ln_frequency[:, column], 1.0)
+    if track is not None and mode in track.modes:
+        k = track.modes.index(mode)
+        level = track.ln_frequency[:, k]
+        _filtered(ax, track.travel, level, track.ln_frequency_std[:, k], 1.0)
+        base = np.exp(level - track.drift[:, k])
+        if np.isfinite(base).any():
+            value = float(base[np.isfinite(base)][-1])
+            ax.axhline(value, color=GREEN, lw=1.1, ls=(0, (5, 3)), label="baseline")
+    # A healthy mode must not look like a drama: at least 1 % of the frequency is shown.
+    low, high = ax.get_ylim()
+    middle = (low + high) / 2
+    if high - low < 0.01 * middle:
+        ax.set_ylim(0.995 * middle, 1.005 * middle)
+    ax.set_ylabel("natural frequency in Hz")
+    return _odometer(ax)
+
+
+def plot_damping(ax: Axes, history: History, track: Track | None, mode: str) -> Axes:
+    """Plot the damping ratio of a mode against the odometer, as `plot_frequencies` does."""
+    column = history.modes.index(mode)
+    level = history.ln_damping[:, column]
+    top = _logs(ax, history, len(history.modes) + column, level, 100.0)
+    if track is not None and mode in track.modes:
+        k = track.modes.index(mode)
+        _filtered(ax, track.travel, track.ln_damping[:, k], track.ln_damping_std[:, k], 100.0)
+    # A log that hardly saw the mode has bars without end; they may leave the picture.
+    if top > 0:
+        ax.set_ylim(0, 1.08 * min(top, 300 * float(np.exp(np.nanmax(level)))))
+    ax.set_ylabel("damping ratio in %")
+    return _odometer(ax)
+
+
+def plot_posterior(ax: Axes, health: Health, parameters: tuple[str, ...]) -> Axes:
+    """Plot the joint posterior of the last epoch.
+
+    Two parameters give the highest-density regions that hold 50 and 90 % of the draws, the
+    baseline, the medians and the marginal 90 % intervals (bars along the axes); one parameter
+    gives its density.
+
+    Raises
+    ------
+    ValueError
+        If the number of parameters is neither one nor two.
+    """
+    if len(parameters) not in (1, 2):
+        raise ValueError(
+            f"a posterior of {len(parameters)} parameters cannot be drawn, only 1 or 2"
+        )
+    columns = [health.parameters.index(name) for name in parameters]
+    draws = 100 * health.samples[-1][:, columns]
+    draws = draws[np.isfinite(draws).all(axis=1)]
+    if len(columns) == 1:
+        _density(ax, draws[:, 0])
+    else:
+        _regions(ax, draws)
+        ax.set_ylabel(f"{_spell(parameters[1])} in % of baseline")
+    ax.set_xlabel(f"{_spell(parameters[0])} in % of baseline")
+    return _legend(ax)
+
+
+def plot_health(ax: Axes, health: Health, parameter: str, limit: float | None) -> Axes:
+    """Plot median, 50 and 90 % bands of a health parameter against the odometer.
+
+    The limit is a fraction of baseline.
+    """
+    column = health.parameters.index(parameter)
+    bands = 100 * health.quantile(_LEVELS)[:, :, column]
+    told = _tells(health, parameter)
+    name = "each epoch by itself" if told else "mostly assumption, not measured"
+    _bands(ax, health.travel / _KM, bands, name, told=told)
+    failed = ~health.converged
+    if failed.any():
+        where = health.travel[failed] / _KM
+        ax.plot(where, bands[2, failed], "x", color=RED, ms=6, label="sampler not converged")
+    _levels(ax, limit)
+    _room(ax, bands, limit)
+    ax.set_ylabel("% of baseline")
+    return _odometer(ax)
+
+
+def plot_life(
+    ax: Axes, prognosis: Prognosis, parameter: str, *, health: Health | None = None
+) -> Axes:
+    """Plot the degradation law of a parameter through now and into the future.
+
+    With `health`, its epochs stand beside the law, as 90 % intervals that know nothing of it,
+    unless they are mostly assumption. The bar on the limit holds 90 % of the moments at which it
+    is reached.
+    """
+    column = prognosis.parameters.index(parameter)
+    limit = float(prognosis.limits[column])
+    now, travel = prognosis.travel / _KM, prognosis.curve_travel / _KM
+    bands = 100 * prognosis.curve_quantiles[:, :, column]
+    _bands(ax, travel, bands, "law", told=True)
+    top = 108.0
+    if health is not None and _tells(health, parameter):
+        top = max(top, 1.04 * _epochs(ax, health, parameter))
+    _levels(ax, limit)
+    ax.axvline(now, color=INK, lw=1.2, ls=":", label="now")
+    end = now + prognosis.horizon / _KM
+    low, middle, high = _quantiles(prognosis.remaining[:, column], (0.05, 0.5, 0.95)) / _KM
+    if np.isfinite(low) and low < prognosis.horizon / _KM:
+        _passage(ax, now + np.array([low, middle, high]), 100 * limit)
+    right = min(end, now + max(1.3 * high, 0.25 * now)) if np.isfinite(high) else end
+    shown = right >= 0.55 * end
+    if shown:
+        right = end
+        ax.axvline(end, color=MUTED, lw=1.2, ls="-.", label="horizon")
+    left = min(float(travel.min()), now)
+    if health is not None:
+        left = min(left, float(health.travel.min()) / _KM)
+    ax.set_xlim(left - 0.01 * (right - left), right + 0.02 * (right - left))
+    ax.set_ylim(0, max(top, 1.04 * float(np.max(bands[4][travel <= right], initial=0.0))))
+    ax.set_ylabel("% of baseline")
+    _odometer(ax)
+    if not shown:
+        ax.set_xlabel(f"odometer in km (horizon at {end:.0f} km, not shown)")
+    return ax
+
+
+def plot_survival(ax: Axes, prognosis: Prognosis, *, max_risk: float | None = None) -> Axes:
+    """Plot the probability of not having reached a limit against the travel ahead."""
+    horizon = prognosis.horizon / _KM
+    last = _quantiles(prognosis.remaining[:, -1], (0.99,))[0] / _KM
+    end = min(horizon, max(1.2 * last, horizon / 50)) if np.isfinite(last) else horizon
+    ahead = np.linspace(0, end, 400)
+    ordered = np.sort(prognosis.remaining / _KM, axis=0)
+    dashes = ["--", "-.", ":", (0, (7, 2, 1, 2, 1, 2))]
+    several = len(prognosis.parameters) > 2
+    for k, name in enumerate(prognosis.parameters):
+        past = np.searchsorted(ordered[:, k], ahead, side="right") / ordered.shape[0]
+        if name == "any":
+            label = "no limit reached" if several else f"{_spell(prognosis.parameters[0])} limit"
+            ax.plot(ahead, 100 * (1 - past), color=BLUE, lw=2.2, label=label)
+        elif several:
+            line = dashes[k % len(dashes)]
+            ax.plot(ahead, 100 * (1 - past), color=MUTED, lw=1.2, ls=line, label=_spell(name))
+    if max_risk is not None:
+        accepted = f"accepted risk {100 * max_risk:.3g} %"
+        ax.axhline(100 * (1 - max_risk), color=RED, lw=1.2, ls=(0, (5, 2)), label=accepted)
+    ax.set_xlim(0, end)
+    ax.set_ylim(0, 103)
+    ax.set_xlabel("travel from now in km" + (" (ends at the horizon)" if end == horizon else ""))
+    ax.set_ylabel("probability in %")
+    return _legend(ax)
+
+
+def plot_nis(ax: Axes, track: Track) -> Axes:
+    """Plot the normalised innovation squared of each epoch and its 95 % chi-square band."""
+    seen = (track.nis_dof > 0) & np.isfinite(track.nis)
+    x, nis = track.travel[seen] / _KM, track.nis[seen]
+    low, high = chi_square_band(track.nis_dof[seen])
+    ax.fill_between(x, low, high, step="mid", color=BLUE, alpha=0.18, lw=0, label="95 % band")
+    inside = (nis >= low) & (nis <= high)
+    ax.plot(x[inside], nis[inside], "o", color=BLUE, ms=4, label="inside")
+    if not inside.all():
+        ax.plot(x[~inside], nis[~inside], "D", color=RED, ms=5, label="outside")
+    if nis.size and nis.max() > 4 * high.max():
+        ax.set_yscale("log")
+        ax.set_ylabel("NIS (log scale)")
+    else:
+        ax.set_ylim(bottom=0)
+        ax.set_ylabel("NIS")
+    return _odometer(ax)
+
+
+def chi_square_band(dof: FloatArray) -> FloatArray:
+    """Bounds that hold a chi-square variable with 95 %, shape ``(2, ...)``."""
+    from scipy.special import gammaincinv
+
+    return np.stack([2 * gammaincinv(dof / 2, level) for level in (0.025, 0.975)])
+
+
+def _logs(ax: Axes, history: History, row: int, level: FloatArray, unit: float) -> float:
+    """Draw logarithmic estimates with ± 2 standard deviations; return the top of the bars."""
+    std = np.sqrt(history.cov[:, row, row])
+    seen = np.isfinite(level) & np.isfinite(std)
+    bounds = unit * np.exp(level[seen] + np.array([-2, 0, 2])[:, None] * std[seen])
+    _bars(ax, history.travel[seen], bounds, "each log, ±2σ", 3)
+    return float(np.max(bounds[2], initial=0.0))
+
+
+def _bars(ax: Axes, travel: FloatArray, bounds: FloatArray, label: str, size: float) -> None:
+    """Draw points with bars from low, middle and high values, shape ``(3, n)``."""
+    style: Any = {"fmt": "o", "color": MUTED, "elinewidth": 0.7, "alpha": 0.85}
+    ax.errorbar(travel / _KM, bounds[1], np.diff(bounds, axis=0), ms=size, label=label, **style)
+
+
+def _filtered(
+    ax: Axes, travel: FloatArray, level: FloatArray, std: FloatArray, unit: float
+) -> None:
+    """Draw the filtered line with its 95 % band, above the logs."""
+    x, reach = travel / _KM, 1.96 * std
+    low, high = unit * np.exp(level - reach), unit * np.exp(level + reach)
+    ax.fill_between(x, low, high, color=BLUE, alpha=0.25, lw=0, zorder=3)
+    marker = "o" if travel.size < 3 else ""
+    name = "filtered, 95 % band"
+    ax.plot(x, unit * np.exp(level), color=BLUE, lw=1.8, marker=marker, zorder=4, label=name)
+
+
+def _bands(ax: Axes, x: FloatArray, bands: FloatArray, name: str, *, told: bool) -> None:
+    """Draw median, 50 and 90 % bands; hatched and grey where the data do not tell."""
+    colour = BLUE if told else MUTED
+    for low, alpha, label in ((0, 0.18, "90 %"), (1, 0.32, "50 %")):
+        shown = label if told else None
+        ax.fill_between(x, bands[low], bands[4 - low], fc=colour, alpha=alpha, lw=0, label=shown)
+    if not told:
+        ax.fill_between(x, bands[0], bands[4], fc="none", ec=colour, hatch="///", lw=0)
+    line = "-" if told else (0, (1, 2))
+    marker = "o" if x.size < 3 else ""
+    ax.plot(x, bands[2], color=colour, lw=1.8, ls=line, marker=marker, ms=4, label=name)
+
+
+def _levels(ax: Axes, limit: float | None) -> None:
+    """Draw baseline and limit."""
+    ax.axhline(100, color=GREEN, lw=1.1, ls=(0, (5, 3)), label="baseline")
+    if limit is not None:
+        name = f"limit {100 * limit:.3g} %"
+        ax.axhline(100 * limit, color=RED, lw=1.6, ls=(0, (8, 2)), label=name)
+
+
+def _room(ax: Axes, bands: FloatArray, limit: float | None) -> None:
+    """Show bands, baseline and limit, but not all of a band without end."""
+    values = [100.0, float(np.nanmin(bands[0])), float(np.nanmax(bands[4]))]
+    if limit is not None:
+        values.append(100 * limit)
+    low, high = min(values), min(max(values), 250.0)
+    ax.set_ylim(max(low - 0.06 * (high - low), 0.0), high + 0.06 * (high - low))
+
+
+def _tells(health: Health, parameter: str) -> bool:
+    """Tell whether the last epoch knows a parameter from the data."""
+    if parameter not in health.parameters:
+        return False
+    return bool(health.informed[-1, health.parameters.index(parameter)] >= TOLD)
+
+
+def _epochs(ax: Axes, health: Health, parameter: str) -> float:
+    """Draw epochs that know nothing of the law; return the top of their bars."""
+    bounds = 100 * health.quantile(_LEVELS[::2])[:, :, health.parameters.index(parameter)]
+    # Twenty bars are enough to judge by; the last epoch is always among them.
+    some = np.arange(bounds.shape[1])[:: -max(1, bounds.shape[1] // 20)]
+    _bars(ax, health.travel[some], bounds[:, some], "epochs, 90 %", 2.5)
+    return min(float(bounds[2].max()), 160.0)
+
+
+def _passage(ax: Axes, where: FloatArray, level: float) -> None:
+    """Mark where the limit is reached: 5 to 95 % as a bar on the limit, the median as a point."""
+    finite = where[np.isfinite(where)]
+    right = where[2] if np.isfinite(where[2]) else 1e9  # runs out of the picture
+    ax.plot([finite[0], right], [level, level], color=RED, lw=5, alpha=0.55, solid_capstyle="butt")
+    if np.isfinite(where[1]):
+        ax.plot(where[1], level, "D", color=RED, mec=PAPER, ms=6, zorder=5, label="limit reached")
+
+
+def _regions(ax: Axes, draws: FloatArray) -> None:
+    """Draw highest-density regions of two columns, smoothed along their principal axes."""
+    from scipy.ndimage import gaussian_filter, map_coordinates
+
+    mean, cov = draws.mean(axis=0), np.cov(draws.T)
+    root = np.linalg.cholesky(cov + 1e-12 * np.trace(cov) * np.eye(2))
+    white = np.linalg.solve(root, (draws - mean).T).T
+    reach = 1.15 * np.abs(white).max()
+    edges = np.linspace(-reach, reach, _GRID_POINTS + 1)
+    density = np.histogram2d(white[:, 0], white[:, 1], bins=(edges, edges))[0]
+    width = 1.2 * draws.shape[0] ** (-1 / 6) / (edges[1] - edges[0])
+    density = gaussian_filter(density, width)
+    at = ((white + reach) / (edges[1] - edges[0]) - 0.5).T
+    level90, level50 = np.quantile(map_coordinates(density, at, order=1), [0.1, 0.5])
+    centre = (edges[:-1] + edges[1:]) / 2
+    grid = np.stack(np.meshgrid(centre, centre, indexing="ij"), axis=-1) @ root.T + mean
+    x, y = grid[..., 0], grid[..., 1]
+    if level90 < level50 < density.max():
+        steps = [level90, level50, density.max()]
+        ax.contourf(x, y, density, steps[:1] + steps[2:], colors=[BLUE], alpha=0.2)
+        ax.contourf(x, y, density, steps[1:], colors=[BLUE], alpha=0.35)
+        ax.contour(x, y, density, steps[:2], colors=[BLUE], linewidths=1.2, linestyles=["--", "-"])
+    ax.fill([], [], color=BLUE, alpha=0.55, label="50 %")
+    ax.fill([], [], color=BLUE, alpha=0.2, label="90 %")
+    middle = np.median(draws, axis=0)
+    ax.plot(*middle, "o", color=INK, ms=5, label="median")
+    ax.plot(100, 100, "*", color=GREEN, mec=PAPER, mew=0.5, ms=12, label="baseline", zorder=5)
+    low, high = np.quantile(draws, [0.05, 0.95], axis=0)
+    span = np.quantile(draws, [0.002, 0.998], axis=0)
+    first, last = np.minimum(span[0], 100.0), np.maximum(span[1], 100.0)
+    first, last = first - 0.16 * (last - first), last + 0.06 * (last - first)
+    ax.set_xlim(first[0], last[0])
+    ax.set_ylim(first[1], last[1])
+    across, up = ax.get_xaxis_transform(), ax.get_yaxis_transform()
+    ax.plot([low[0], high[0]], [0.05] * 2, "|-", color=INK, lw=1.4, ms=8, transform=across)
+    name = "single 90 %"
+    ax.plot([0.04] * 2, [low[1], high[1]], "_-", color=INK, lw=1.4, ms=8, transform=up, label=name)
+
+
+def _density(ax: Axes, draws: FloatArray) -> None:
+    """Draw the density of one column with its 50 and 90 % intervals."""
+    from scipy.ndimage import gaussian_filter1d
+
+    margin = 0.1 * float(np.ptp(draws)) + 1e-9
+    counts, edges = np.histogram(draws, 280, (draws.min() - margin, draws.max() + margin))
+    step = edges[1] - edges[0]
+    width = max(1.06 * draws.std() * draws.size**-0.2 / step, 1.0)
+    density = gaussian_filter1d(counts / (draws.size * step), width, mode="constant")
+    x = (edges[:-1] + edges[1:]) / 2
+    q = np.quantile(draws, _LEVELS)
+    for low, high, alpha, name in ((q[0], q[4], 0.2, "90 %"), (q[1], q[3], 0.4, "50 %")):
+        part = (x >= low) & (x <= high)
+        ax.fill_between(x[part], density[part], color=BLUE, alpha=alpha, lw=0, label=name)
+    ax.plot(x, density, color=BLUE, lw=1.6)
+    ax.axvline(float(q[2]), color=INK, lw=1.4, label="median")
+    ax.axvline(100, color=GREEN, lw=1.3, ls=(0, (5, 3)), label="baseline")
+    ax.set_ylim(0, 1.06 * density.max())
+    ax.set_ylabel("probability density per %")
+
+
+def _quantiles(values: FloatArray, levels: tuple[float, ...]) -> FloatArray:
+    """Quantiles of draws that may be infinite: always one of the draws."""
+    return np.asarray(np.quantile(values, levels, method="inverted_cdf"))
+
+
+def _odometer(ax: Axes) -> Axes:
+    ax.set_xlabel("odometer in km")
+    return _legend(ax)
+
+
+def _legend(ax: Axes) -> Axes:
+    """Put the legend above the picture, where it covers nothing."""
+    handles, labels = ax.get_legend_handles_labels()
+    lengths = np.array([len(label) for label in labels])
+    columns = max(min(4, len(labels)), 1)
+    while columns > 1 and sum(p.max() + 6 for p in np.array_split(lengths, columns)) > 72:
+        columns -= 1
+    place: Any = {"loc": "lower left", "bbox_to_anchor": (0, 1), "borderaxespad": 0.2}
+    ax.legend(handles, labels, ncols=columns, columnspacing=1.2, handlelength=1.8, **place)
+    return ax
+
+
+def _spell(name: str) -> str:
+    """Spell a name for people; a dollar sign would open a formula."""
+    return name.replace("_", " ").replace("$", r"\$")

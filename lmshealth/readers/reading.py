@@ -1,0 +1,115 @@
+"""Reading one log, whatever its format: the only place where a file becomes a `Log`."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import stat
+from collections.abc import Mapping
+from pathlib import Path
+
+from lmshealth.errors import BadLog
+from lmshealth.readers.columns import ColumnMap
+from lmshealth.readers.contract import to_log
+from lmshealth.readers.formats import load
+from lmshealth.readers.trouble import Unusable
+from lmshealth.results import Log
+
+
+def shown(path: str | Path) -> str:
+    """Write a path so that it can be printed and stored, whatever bytes its name has."""
+    return os.fsencode(path).decode("utf-8", "replace")
+
+
+def read_log(
+    path: str | Path,
+    *,
+    columns: ColumnMap | None = None,
+    overrides: Mapping[str, str] | None = None,
+    name: str | None = None,
+) -> Log:
+    """Read a log.
+
+    Parameters
+    ----------
+    path : str or Path
+        The file; its suffix names the format and its content must agree.
+    columns : ColumnMap, optional
+        How an export is read; by default the columns are those of the log contract.
+    overrides : mapping of str to str, optional
+        Metadata that override what the file and the column map say, as a manifest gives them.
+    name : str, optional
+        The log as the user knows it; by default the path.
+
+    Returns
+    -------
+    Log
+        In SI units, with the channels that were refused.
+
+    Raises
+    ------
+    BadLog
+        Whatever is wrong with the file; see `lmshealth.readers` for the reasons.
+    """
+    file = Path(path)
+    label = shown(path) if name is None else name
+    try:
+        digest = _digest(file)
+        used = ColumnMap() if columns is None else columns
+        return to_log(load(file, used), used, overrides or {}, name=label, digest=digest)
+    except Unusable as error:
+        raise BadLog(label, error.reason, error.detail) from error
+
+
+def content_digest(path: str | Path) -> str:
+    """Hash a file's content with SHA-256, block by block.
+
+    Raises
+    ------
+    BadLog
+        With reason ``missing-file`` when there is nothing that can be read.
+    """
+    try:
+        return _digest(Path(path))
+    except Unusable as error:
+        raise BadLog(shown(path), error.reason, error.detail) from error
+
+
+def require_identity(log: Log) -> None:
+    """Insist on the metadata that following a stage over its life needs.
+
+    Raises
+    ------
+    BadLog
+        With reason ``metadata``, naming the missing keys.
+    """
+    known = {
+        "stage": log.metadata.stage,
+        "recorded_at": log.metadata.recorded_at,
+        "travel_km": log.metadata.travel,
+    }
+    if absent := [key for key, value in known.items() if value is None]:
+        raise BadLog(
+            log.name,
+            "metadata",
+            f"{', '.join(absent)} not given; needed in the file's metadata or in manifest.csv",
+        )
+
+
+def _digest(file: Path) -> str:
+    """Hash a regular file block by block.
+
+    Raises
+    ------
+    Unusable
+        With reason ``missing-file`` when there is nothing that can be read.
+    """
+    try:
+        # A named pipe would be waited for until somebody writes to it.
+        if not stat.S_ISREG(file.stat().st_mode):
+            raise Unusable("missing-file", "is no regular file")
+        with file.open("rb") as stream:
+            return hashlib.file_digest(stream, "sha256").hexdigest()
+    except (OSError, ValueError) as error:
+        why = getattr(error, "strerror", None) or str(error)
+        raise Unusable("missing-file", f"cannot be opened: {why}") from error

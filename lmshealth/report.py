@@ -1,0 +1,449 @@
+"""Pages for people who decide: one self-contained HTML file per stage, and an index of the fleet.
+
+This module prepares numbers, names and pictures; words and markup are in ``templates/``.
+"""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from datetime import date, datetime
+from functools import partial
+from importlib import metadata
+from itertools import combinations
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lmshealth import plots
+from lmshealth.results import Effect, FloatArray, Health, History, Prognosis, Refusal, Track
+from lmshealth.stage import ParameterSpec
+from lmshealth.summary import Assessment
+
+_KM = 1000.0
+_GAP = "\u202f"  # narrow space that does not break: between a number and its unit
+_LEVELS = np.array([0.05, 0.5, 0.95])
+_UNITS = {"c": "°C", "kg": "kg", "mm": "mm"}
+_FLEET_TOP = 1.5  # length of all gauges of the index, as a fraction of baseline
+
+
+@dataclass(frozen=True, slots=True)
+class Gauge:
+    """A health parameter now, as text; ``places`` are % of the gauge's length."""
+
+    name: str
+    told: bool
+    converged: bool
+    share: str
+    value: str
+    interval: str
+    below: str
+    limit: str
+    unit: str
+    places: dict[str, float]
+
+
+@dataclass(frozen=True, slots=True)
+class Service:
+    """What to do: kind is ``now``, ``by`` a date, ``later`` than the horizon, or ``unknown``."""
+
+    kind: str
+    by: date | None
+    risk: str
+    planned: date | None
+    planned_risk: str
+
+
+@dataclass(frozen=True, slots=True)
+class Life:
+    """Remaining life of one limit, as text: 5, 50, 95 %; ``now`` is health by the law."""
+
+    name: str
+    limit: str
+    km: tuple[str, ...]
+    days: tuple[str, ...]
+    past: str
+    beyond: str
+    now: str
+
+
+@dataclass(frozen=True, slots=True)
+class Fit:
+    """A chi-square beside its 95 % band: ``side`` is ``inside``, ``above`` or ``below`` it."""
+
+    value: float
+    dof: float
+    low: float
+    high: float
+    side: str
+
+
+def write_report(
+    folder: Path,
+    assessments: Sequence[Assessment],
+    refused: Sequence[Refusal],
+    *,
+    service: Mapping[str, date | None],
+    generated: datetime | None = None,
+) -> list[Path]:
+    """Write one page per stage, and ``index.html``.
+
+    The same input gives the same bytes, in any order of the assessments.
+
+    Parameters
+    ----------
+    folder : Path
+        Where to write; made if it is not there.
+    assessments : sequence of Assessment
+        One per stage.
+    refused : sequence of Refusal
+        Logs that belong to no stage.
+    service : mapping of str to date or None
+        Last day before the accepted risk is exceeded, by identity of the stage; None, or
+        absent, where there is no such day.
+    generated : datetime or None
+        Moment to print on the pages; nothing is printed for None.
+
+    Returns
+    -------
+    list of Path
+        The pages of the stages, worst first, then the index.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    ranked = sorted(assessments, key=_urgency)
+    names = _file_names(ranked)
+    pages = _environment()
+    common = {"generated": generated, "version": metadata.version("lmshealth")}
+    rows = []
+    for assessment, name in zip(ranked, names, strict=True):
+        by = service.get(assessment.judgement.stage)
+        row = _summary(assessment, by, None) | common
+        text = pages.get_template("stage.html.j2").render(row | _evidence(assessment))
+        (folder / name).write_text(text, encoding="utf-8", newline="\n")
+        rows.append(_summary(assessment, by, _FLEET_TOP) | {"file": name})
+    parameters = list(dict.fromkeys(gauge.name for row in rows for gauge in row["gauges"]))
+    tones = Counter(row["tone"] for row in rows)
+    context = {"rows": rows, "parameters": parameters, "tones": tones, "refused": refused}
+    text = pages.get_template("index.html.j2").render(context | common)
+    (folder / "index.html").write_text(text, encoding="utf-8", newline="\n")
+    return [folder / name for name in (*names, "index.html")]
+
+
+def _environment() -> Any:
+    """Set up the templates: everything is escaped, and a misspelt name is an error."""
+    import jinja2
+
+    pages = jinja2.Environment(
+        loader=jinja2.PackageLoader("lmshealth", "templates"),
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    pages.filters |= {"spell": _spell, "moment": _moment, "km": _km}
+    return pages
+
+
+def _file_names(assessments: Sequence[Assessment]) -> list[str]:
+    """Name the pages after their stages: safe on every file system, never twice the same."""
+    taken = {"index"}
+    names = {}
+    # In the order of identity, so that a page keeps its name when risks change places.
+    for k in sorted(range(len(assessments)), key=lambda k: assessments[k].judgement.stage):
+        stem = re.sub(r"[^\w.-]+", "-", assessments[k].judgement.stage).strip("-._")[:60] or "stage"
+        name, count = stem, 1
+        while name.casefold() in taken:
+            count += 1
+            name = f"{stem}-{count}"
+        taken.add(name.casefold())
+        names[k] = f"{name}.html"
+    return [names[k] for k in range(len(assessments))]
+
+
+def _urgency(assessment: Assessment) -> tuple[int, float, float, str]:
+    """Sort by risk: days until the accepted risk is used up; unknown before safe."""
+    identity, prognosis = assessment.judgement.stage, assessment.prognosis
+    verdict = assessment.judgement.verdict
+    if verdict == "not-enough-data":
+        return 1, 0.0, 0.0, identity
+    if prognosis is None:
+        return (1 if verdict == "healthy" else 0), 0.0, 0.0, identity
+    risk = assessment.stage.description.decision.max_risk
+    days = float(np.quantile(_days(prognosis)[:, -1], risk, method="inverted_cdf"))
+    group = 2 if verdict == "healthy" and np.isinf(days) else 0
+    return group, days, float(prognosis.beyond_horizon()[-1]), identity
+
+
+def _summary(assessment: Assessment, by: date | None, top: float | None) -> dict[str, Any]:
+    """Collect what both the first screen of a page and a row of the index say."""
+    judgement, prognosis = assessment.judgement, assessment.prognosis
+    specs = assessment.stage.parameters
+    words = {"preload": ("preload",), "mount": ("mount",), "both": ("preload", "mount")}
+    lost = [_spell(s.name) for s in specs if s.word in words.get(judgement.verdict, ())]
+    lives = [] if prognosis is None else [_life(prognosis, k) for k in range(len(prognosis.limits))]
+    return {
+        "assessment": assessment,
+        "identity": judgement.stage,
+        "lost": " and ".join(lost) or judgement.verdict,
+        "tone": {"healthy": "good", "not-enough-data": "open"}.get(judgement.verdict, "bad"),
+        "probability": _percent(judgement.probability) if judgement.probability >= 0 else "",
+        "gauges": list(_gauges(assessment, top)),
+        "lives": lives,
+        "service": _service(assessment, by),
+    }
+
+
+def _evidence(assessment: Assessment) -> dict[str, Any]:
+    """Collect what the rest of a stage's page shows."""
+    track, prognosis, history = assessment.track, assessment.prognosis, assessment.history
+    health = _health(assessment)
+    drift = np.zeros(1) if track is None else np.abs(track.drift[-1])
+    return {
+        "health": health,
+        "modes": [] if track is None else list(_mode_rows(track)),
+        "seen": _seen(history),
+        "pairs": [] if health is None else _pairs(health),
+        "picture": _pictures(assessment),
+        "surprise": None if track is None else _surprise(track),
+        "noise_scale": None if track is None else float(track.noise_scale[-1]),
+        "largest_drift": float(np.nanmax(drift, initial=0.0)),
+        "law": prognosis and _fit(prognosis.chi_square, prognosis.degrees_of_freedom),
+        "effects": [] if track is None else [_effect_row(effect) for effect in track.effects],
+        "reasons": Counter(item.reason for item in assessment.refused).most_common(),
+        "hashes": list(zip(history.logs, assessment.digests, strict=False)),
+    }
+
+
+def _gauges(assessment: Assessment, top: float | None) -> Iterator[Gauge]:
+    health = _health(assessment)
+    if health is None:
+        return
+    if top is None:  # one length for all gauges of a page, so that bars can be compared
+        highest = health.quantile(0.95)[-1].max()
+        top = float(np.clip(np.ceil(10 * highest + 0.5) / 10, 1.2, 2.0))
+    for k, name in enumerate(health.parameters):
+        spec = next((spec for spec in assessment.stage.parameters if spec.name == name), None)
+        yield _gauge(spec, health, k, top)
+
+
+def _gauge(spec: ParameterSpec | None, health: Health, column: int, top: float) -> Gauge:
+    low, middle, high = health.quantile(_LEVELS)[:, -1, column]
+    limit = _limit(spec)
+    places = {"low": low, "median": middle, "high": high, "baseline": 1.0, "limit": limit or 0.0}
+    below = "" if limit is None else _percent(np.mean(health.samples[-1, :, column] < limit))
+    return Gauge(
+        name=_spell(health.parameters[column]),
+        told=bool(health.informed[-1, column] >= plots.TOLD),
+        converged=bool(health.converged[-1]),
+        share=_percent(float(health.informed[-1, column])),
+        value=f"{100 * middle:.0f}{_GAP}%",
+        interval=f"{100 * low:.0f} to {100 * high:.0f}{_GAP}%",
+        below=below,
+        limit="" if limit is None else f"{100 * limit:.3g}{_GAP}%",
+        unit=f"{spec.baseline:g}{_GAP}{spec.unit}" if spec and spec.unit else "",
+        places={key: round(100 * min(float(v) / top, 1.0), 2) for key, v in places.items()},
+    )
+
+
+def _service(assessment: Assessment, by: date | None) -> Service:
+    """Say until when the accepted risk holds; never a date that the data do not carry."""
+    prognosis, decision = assessment.prognosis, assessment.stage.description.decision
+    planned, planned_risk, kind = None, "", "unknown"
+    if prognosis is not None:
+        today = prognosis.recorded_at.date()
+        passed = prognosis.already_past()[-1] > decision.max_risk
+        if passed or (by is not None and by <= today):
+            kind = "now"
+        elif by is not None:
+            kind = "by"
+        elif prognosis.beyond_horizon()[-1] >= 1 - decision.max_risk:
+            kind = "later"
+        planned = decision.next_service
+        if planned is not None:
+            ahead = (planned - today).days
+            planned_risk = _percent(float(np.mean(_days(prognosis)[:, -1] <= ahead)))
+    return Service(kind, by, f"{100 * decision.max_risk:.3g}{_GAP}%", planned, planned_risk)
+
+
+def _life(prognosis: Prognosis, column: int) -> Life:
+    name, limit = prognosis.parameters[column], float(prognosis.limits[column])
+    travel = prognosis.remaining[:, column]
+    km = _quantiles(np.where(travel > prognosis.horizon, np.inf, travel))
+    days = _quantiles(_days(prognosis)[:, column])
+    low, middle, high = _quantiles(
+        100 * prognosis.health[:, min(column, prognosis.health.shape[1] - 1)]
+    )
+    return Life(
+        name="any limit" if name == "any" else _spell(name),
+        limit="" if np.isnan(limit) else f"{100 * limit:.3g}{_GAP}%",
+        km=tuple(_left(v, f"beyond {_km(prognosis.horizon)}", _km(v)) for v in km),
+        days=tuple(_left(v, "beyond", _day_count(v)) for v in days),
+        past=_percent(float(prognosis.already_past()[column])),
+        beyond=_percent(float(prognosis.beyond_horizon()[column])),
+        now="" if name == "any" else f"{middle:.0f}{_GAP}% ({low:.0f} to {high:.0f}{_GAP}%)",
+    )
+
+
+def _pictures(assessment: Assessment) -> dict[tuple[str, str], str]:
+    """Draw every picture of a page, by kind and by what it shows."""
+    history, track, prognosis = assessment.history, assessment.track, assessment.prognosis
+    health, risk = _health(assessment), assessment.stage.description.decision.max_risk
+    draw: dict[tuple[str, str], Any] = {}
+    pair = {"frequency": plots.plot_frequencies, "damping": plots.plot_damping}
+    for mode in _seen(history):
+        for kind, plot in pair.items():
+            draw[kind, mode] = partial(plot, history=history, track=track, mode=mode)
+    if health is not None:
+        for names, key, _ in _pairs(health):
+            draw["posterior", key] = partial(plots.plot_posterior, health=health, parameters=names)
+        limits = {spec.name: _limit(spec) for spec in assessment.stage.parameters}
+        for name in health.parameters:
+            draw["health", _spell(name)] = partial(
+                plots.plot_health, health=health, parameter=name, limit=limits.get(name)
+            )
+    if prognosis is not None:
+        for name in prognosis.parameters[:-1]:
+            draw["life", _spell(name)] = partial(
+                plots.plot_life, prognosis=prognosis, parameter=name, health=health
+            )
+        draw["survival", "any"] = partial(plots.plot_survival, prognosis=prognosis, max_risk=risk)
+    if track is not None and _surprise(track) is not None:
+        draw["nis", "all"] = partial(plots.plot_nis, track=track)
+    return {key: _inline(one, f"p{k}") for k, (key, one) in enumerate(draw.items())}
+
+
+def _inline(draw: Any, salt: str) -> str:
+    # The HTML parser knows these namespaces; without them the page names no address at all.
+    return re.sub(r'\sxmlns(:xlink)?="[^"]*"', "", plots.svg(draw, salt=salt))
+
+
+def _pairs(health: Health) -> list[tuple[tuple[str, ...], str, float]]:
+    """Parameters to draw against each other, their title, and the correlation of the draws."""
+    names = health.parameters
+    if len(names) == 1:
+        return [(names, _spell(names[0]), 0.0)]
+    rho = np.corrcoef(np.log(health.samples[-1]).T)
+    return [
+        ((names[i], names[j]), f"{_spell(names[i])} against {_spell(names[j])}", float(rho[i, j]))
+        for i, j in combinations(range(len(names)), 2)
+    ]
+
+
+def _mode_rows(track: Track) -> Iterator[tuple[str, ...]]:
+    """Name, baseline, present value, change and damping of each mode."""
+    for k, mode in enumerate(track.modes):
+        level, drift = track.ln_frequency[-1, k], track.drift[-1, k]
+        drift_std = np.sqrt(track.drift_cov[-1, k, k])
+        std = np.exp(level) * track.ln_frequency_std[-1, k]
+        zeta = 100 * np.exp(track.ln_damping[-1, k])
+        if np.isfinite([level, drift]).all():
+            yield (
+                _spell(mode),
+                f"{np.exp(level - drift):.2f}{_GAP}Hz",
+                f"{np.exp(level):.2f} ± {std:.2f}{_GAP}Hz",
+                f"{_signed(100 * drift, 2)} ± {100 * drift_std:.2f}{_GAP}%",
+                f"{zeta:.2f} ± {zeta * track.ln_damping_std[-1, k]:.2f}{_GAP}%",
+            )
+
+
+def _surprise(track: Track) -> tuple[int, int, Fit] | None:
+    """Count epochs inside the band of their NIS, all epochs, and judge their sum."""
+    seen = (track.nis_dof > 0) & np.isfinite(track.nis)
+    nis, dof = track.nis[seen], track.nis_dof[seen]
+    low, high = plots.chi_square_band(dof)
+    total = _fit(float(nis.sum()), float(dof.sum()))
+    inside = int(np.sum((nis >= low) & (nis <= high)))
+    return None if total is None else (inside, nis.size, total)
+
+
+def _fit(value: float, dof: float) -> Fit | None:
+    if dof <= 0:
+        return None
+    low, high = plots.chi_square_band(np.array(dof, dtype=float)).tolist()
+    side = "above" if value > high else "below" if value < low else "inside"
+    return Fit(value, dof, low, high, side)
+
+
+def _effect_row(effect: Effect) -> tuple[str, str, str, bool]:
+    """Mode, covariate, coefficient in ‰ per unit, and whether it differs from zero."""
+    name, _, unit = effect.covariate.rpartition("_")
+    if effect.covariate.startswith("bias:"):
+        name, per = f"offset of {effect.covariate[5:]}", ""
+    elif name and unit in _UNITS:
+        per = f" per {_UNITS[unit]}"
+    else:
+        name, per = effect.covariate, " per unit"
+    value = f"{_signed(1e3 * effect.coefficient, 3)} ± {1e3 * effect.std:.3f}{_GAP}‰{per}"
+    return _spell(effect.mode), _spell(name), value, abs(effect.coefficient) > 2 * effect.std
+
+
+def _seen(history: History) -> list[str]:
+    """Modes that at least one log gave."""
+    found = np.isfinite(history.ln_frequency)
+    return [mode for k, mode in enumerate(history.modes) if found[:, k].any()]
+
+
+def _health(assessment: Assessment) -> Health | None:
+    health = assessment.health
+    return health if health is not None and health.recorded_at and health.parameters else None
+
+
+def _limit(spec: ParameterSpec | None) -> float | None:
+    """Limit as a fraction of the baseline."""
+    return None if spec is None or spec.limit is None else spec.limit.below / spec.baseline
+
+
+def _days(prognosis: Prognosis) -> FloatArray:
+    """Draws of the remaining days, infinite past the horizon."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        days = prognosis.remaining / prognosis.usage[:, None]
+    return np.where(prognosis.remaining > prognosis.horizon, np.inf, days)
+
+
+def _spell(name: str) -> str:
+    return name.replace("_", " ")
+
+
+def _moment(when: datetime) -> str:
+    return when.strftime("%Y-%m-%d %H:%M %Z").strip()
+
+
+def _percent(probability: float | np.floating[Any]) -> str:
+    """Probability as text; draws cannot prove 0 or 1."""
+    if probability < 0.01:
+        return f"below 1{_GAP}%"
+    if probability > 0.99:
+        return f"above 99{_GAP}%"
+    return f"{100 * probability:.0f}{_GAP}%"
+
+
+def _signed(value: float, digits: int) -> str:
+    return f"{value:+.{digits}f}".replace("-", "−")
+
+
+def _number(value: float) -> str:
+    """Three significant digits, thousands apart."""
+    rounded = float(f"{value:.3g}")
+    digits = 0 if not abs(rounded) < 10 or rounded.is_integer() else 1
+    return f"{rounded:,.{digits}f}".replace(",", _GAP).replace("-", "−")
+
+
+def _km(metres: float) -> str:
+    return f"{_number(metres / _KM)}{_GAP}km"
+
+
+def _day_count(days: float) -> str:
+    years = f" ({days / 365.25:.1f} years)" if days >= 1000 else ""
+    return f"{_number(days)}{_GAP}days{years}"
+
+
+def _quantiles(values: FloatArray) -> list[float]:
+    """5, 50 and 95 % of draws that may be infinite: always one of the draws."""
+    return [float(q) for q in np.quantile(values, _LEVELS, method="inverted_cdf")]
+
+
+def _left(value: float, beyond: str, text: str) -> str:
+    return "already passed" if value <= 0 else beyond if np.isinf(value) else text

@@ -1,0 +1,527 @@
+"""The nouns of lmshealth: frozen results that floors hand upwards.
+
+Arrays are read-only, time (or log) axis first, mode axis last, NaN where a value is missing.
+SI units throughout: s, m, m/s, Hz, m/s²; temperatures are in °C because only their differences
+are used.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, fields
+from datetime import datetime
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
+ChannelKind = Literal["displacement", "acceleration", "current"]
+
+
+def _freeze(result: Any) -> None:
+    """Make every array field of a frozen dataclass read-only."""
+    for item in fields(result):
+        value = getattr(result, item.name)
+        if isinstance(value, np.ndarray):
+            value.setflags(write=False)
+
+
+def _expect(name: str, array: np.ndarray[Any, Any], shape: tuple[int, ...]) -> None:
+    if array.shape != shape:
+        raise ValueError(f"{name} has shape {array.shape}, needed {shape}")
+
+
+@dataclass(frozen=True, slots=True)
+class Refusal:
+    """Something that was not analysed, and why: one row of ``refused.csv``."""
+
+    log: str
+    reason: str
+    detail: str
+    channel: str = ""
+    mode: str = ""
+    source: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Metadata:
+    """What is known about a log beside its samples.
+
+    Attributes
+    ----------
+    stage : str or None
+        Identity of the physical machine.
+    recorded_at : datetime or None
+        Moment of the recording, with time zone.
+    travel : float or None
+        Odometer in m.
+    covariates : dict of str to float
+        Numbers that move frequencies without wear, keyed by their column name
+        (``temperature_c``, ``payload_kg``, ``position_mm``).
+    servo_id : str or None
+        Tuning of the control loop.
+    baseline : bool or None
+        Whether the manifest declares this log part of the baseline.
+    description : str or None
+        Stage description the manifest names for this log.
+    """
+
+    stage: str | None = None
+    recorded_at: datetime | None = None
+    travel: float | None = None
+    covariates: dict[str, float] = field(default_factory=dict)
+    servo_id: str | None = None
+    baseline: bool | None = None
+    description: str | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Channel:
+    """One signal of a log.
+
+    Attributes
+    ----------
+    name : str
+        Column name without its unit (``delta_e``, ``acc_feed``, ``current``).
+    kind : str
+        Physical quantity: ``displacement`` (m), ``acceleration`` (m/s²) or ``current`` (A).
+    values : ndarray
+        Samples in SI units, shape ``(n_samples,)``; NaN where a sample is missing.
+    """
+
+    name: str
+    kind: ChannelKind
+    values: FloatArray
+
+    def __post_init__(self) -> None:
+        _expect("values", self.values, (self.values.size,))
+        _freeze(self)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Log:
+    """One recording of one stage, in SI units.
+
+    Attributes
+    ----------
+    name : str
+        Path as the user knows it.
+    digest : str
+        SHA-256 of the file's content.
+    metadata : Metadata
+        What is known beside the samples.
+    sample_rate : float
+        In Hz.
+    channels : tuple of Channel
+        Usable signals, all of the same length.
+    reference_velocity : ndarray or None
+        Set point in m/s, shape ``(n_samples,)``.
+    pieces : tuple of (int, int)
+        Half-open sample ranges without gaps; one range covering everything when nothing is missing.
+    refused : tuple of Refusal
+        Channels that were refused at the door.
+    """
+
+    name: str
+    digest: str
+    metadata: Metadata
+    sample_rate: float
+    channels: tuple[Channel, ...]
+    reference_velocity: FloatArray | None
+    pieces: tuple[tuple[int, int], ...]
+    refused: tuple[Refusal, ...]
+
+    def __post_init__(self) -> None:
+        if self.sample_rate <= 0 or not np.isfinite(self.sample_rate):
+            raise ValueError(f"sample_rate is {self.sample_rate}, needed a positive number")
+        sizes = {channel.values.size for channel in self.channels}
+        if len(sizes) > 1:
+            raise ValueError(f"channels have lengths {sorted(sizes)}, needed one length")
+        _freeze(self)
+
+
+@dataclass(frozen=True, slots=True)
+class Line:
+    """A narrow spectral line that is no mode.
+
+    Attributes
+    ----------
+    frequency : float
+        In Hz.
+    amplitude : float
+        Of the sine, in the channel's unit.
+    unit : str
+        SI unit of the amplitude.
+    kind : str
+        What it was recognised as: a name of the stage's orders, ``mains`` or ``unknown``.
+    channel : str
+        The channel it was seen in.
+    """
+
+    frequency: float
+    amplitude: float
+    unit: str
+    kind: str
+    channel: str
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Modes:
+    """Modal estimates of one log with their joint covariance.
+
+    Attributes
+    ----------
+    names : tuple of str
+        Mode names, unique per source.
+    sources : tuple of str
+        ``acc``, ``delta_e``, ``frf`` or ``joint`` per mode.
+    channels : tuple of str
+        The channel each estimate comes from.
+    ln_frequency : ndarray
+        Natural logarithm of the natural frequency in Hz, shape ``(n_modes,)``.
+    ln_damping : ndarray
+        Natural logarithm of the damping ratio, shape ``(n_modes,)``.
+    cov : ndarray
+        Covariance of ``[ln_frequency, ln_damping]``, shape ``(2 n_modes, 2 n_modes)``.
+    snr : ndarray
+        Modal signal-to-noise ratio S / (4 ζ² S_e), shape ``(n_modes,)``.
+    lines : tuple of Line
+        Spectral lines that were kept out of the likelihood.
+    refused : tuple of Refusal
+        Modes that were looked for and not found, with the reason.
+    """
+
+    names: tuple[str, ...]
+    sources: tuple[str, ...]
+    channels: tuple[str, ...]
+    ln_frequency: FloatArray
+    ln_damping: FloatArray
+    cov: FloatArray
+    snr: FloatArray
+    lines: tuple[Line, ...]
+    refused: tuple[Refusal, ...]
+
+    def __post_init__(self) -> None:
+        n = len(self.names)
+        if len(set(zip(self.names, self.sources, strict=True))) != n:
+            raise ValueError(f"mode names are not unique per source: {self.names}")
+        for name in ("ln_frequency", "ln_damping", "snr"):
+            _expect(name, getattr(self, name), (n,))
+        _expect("cov", self.cov, (2 * n, 2 * n))
+        _freeze(self)
+
+    @property
+    def frequency(self) -> FloatArray:
+        """Natural frequency in Hz, shape ``(n_modes,)``."""
+        return np.exp(self.ln_frequency)
+
+    @property
+    def frequency_std(self) -> FloatArray:
+        """Standard deviation of the natural frequency in Hz, shape ``(n_modes,)``."""
+        n = len(self.names)
+        return self.frequency * np.sqrt(np.diag(self.cov)[:n])
+
+    @property
+    def damping_ratio(self) -> FloatArray:
+        """Damping ratio, shape ``(n_modes,)``."""
+        return np.exp(self.ln_damping)
+
+    @property
+    def damping_ratio_std(self) -> FloatArray:
+        """Standard deviation of the damping ratio, shape ``(n_modes,)``."""
+        n = len(self.names)
+        return self.damping_ratio * np.sqrt(np.diag(self.cov)[n:])
+
+    @property
+    def correlation(self) -> FloatArray:
+        """Correlation between frequency and damping ratio of each mode, shape ``(n_modes,)``."""
+        n = len(self.names)
+        std = np.sqrt(np.diag(self.cov))
+        index = np.arange(n)
+        return np.asarray(self.cov[index, index + n] / (std[:n] * std[n:]))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class History:
+    """All modal estimates of one stage, in the order of recording.
+
+    Attributes
+    ----------
+    stage : str
+        Identity of the machine.
+    logs : tuple of str
+        Log names.
+    recorded_at : tuple of datetime
+        Ascending.
+    travel : ndarray
+        Odometer in m, shape ``(n_logs,)``.
+    covariates : dict of str to ndarray
+        Column name to values, each of shape ``(n_logs,)``, NaN where unknown.
+    modes : tuple of str
+        Mode names.
+    ln_frequency, ln_damping : ndarray
+        Shape ``(n_logs, n_modes)``, NaN where the mode was not found.
+    cov : ndarray
+        Covariance of ``[ln_frequency, ln_damping]`` per log, shape
+        ``(n_logs, 2 n_modes, 2 n_modes)``, NaN in rows and columns of missing modes.
+    baseline : int
+        Index of the log at which health is one by definition.
+    """
+
+    stage: str
+    logs: tuple[str, ...]
+    recorded_at: tuple[datetime, ...]
+    travel: FloatArray
+    covariates: dict[str, FloatArray]
+    modes: tuple[str, ...]
+    ln_frequency: FloatArray
+    ln_damping: FloatArray
+    cov: FloatArray
+    baseline: int
+
+    def __post_init__(self) -> None:
+        n, m = len(self.logs), len(self.modes)
+        _expect("travel", self.travel, (n,))
+        _expect("ln_frequency", self.ln_frequency, (n, m))
+        _expect("ln_damping", self.ln_damping, (n, m))
+        _expect("cov", self.cov, (n, 2 * m, 2 * m))
+        if not 0 <= self.baseline < max(n, 1):
+            raise ValueError(f"baseline is log {self.baseline} of {n}")
+        _freeze(self)
+
+    def clock(self) -> FloatArray:
+        """Odometer since the baseline log in m, shape ``(n_logs,)``; never negative after it."""
+        return np.asarray(self.travel - self.travel[self.baseline])
+
+
+@dataclass(frozen=True, slots=True)
+class Effect:
+    """What a covariate does to a mode: one row of ``effects.csv``."""
+
+    mode: str
+    covariate: str
+    coefficient: float
+    std: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Track:
+    """Modes followed over a machine's life by a Kalman filter.
+
+    Attributes
+    ----------
+    stage : str
+        Identity of the machine.
+    logs : tuple of str
+        Names of the logs, one epoch each.
+    recorded_at : tuple of datetime
+        Ascending.
+    travel : ndarray
+        Odometer in m, shape ``(n_epochs,)``.
+    modes : tuple of str
+        Mode names.
+    ln_frequency, ln_frequency_std, ln_damping, ln_damping_std : ndarray
+        Filtered (no future data), covariates at their reference, shape ``(n_epochs, n_modes)``.
+    drift : ndarray
+        ln frequency minus its baseline value, shape ``(n_epochs, n_modes)``.
+    drift_cov : ndarray
+        Covariance of the drifts of one epoch, shape ``(n_epochs, n_modes, n_modes)``.
+    effects : tuple of Effect
+        Coefficients of the covariates after the last epoch.
+    nis : ndarray
+        Normalised innovation squared, shape ``(n_epochs,)``.
+    nis_dof : ndarray
+        Its degrees of freedom, shape ``(n_epochs,)``.
+    noise_scale : ndarray
+        Factor on the reported standard deviations that the innovations ask for,
+        shape ``(n_epochs,)``; 1 when they are consistent.
+    """
+
+    stage: str
+    logs: tuple[str, ...]
+    recorded_at: tuple[datetime, ...]
+    travel: FloatArray
+    modes: tuple[str, ...]
+    ln_frequency: FloatArray
+    ln_frequency_std: FloatArray
+    ln_damping: FloatArray
+    ln_damping_std: FloatArray
+    drift: FloatArray
+    drift_cov: FloatArray
+    effects: tuple[Effect, ...]
+    nis: FloatArray
+    nis_dof: FloatArray
+    noise_scale: FloatArray
+
+    def __post_init__(self) -> None:
+        n, m = len(self.logs), len(self.modes)
+        for name in ("ln_frequency", "ln_frequency_std", "ln_damping", "ln_damping_std", "drift"):
+            _expect(name, getattr(self, name), (n, m))
+        _expect("drift_cov", self.drift_cov, (n, m, m))
+        for name in ("travel", "nis", "nis_dof", "noise_scale"):
+            _expect(name, getattr(self, name), (n,))
+        _freeze(self)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Health:
+    """Posterior of the health parameters per epoch, as fractions of their baseline value.
+
+    Attributes
+    ----------
+    stage : str
+        Identity of the machine.
+    recorded_at : tuple of datetime
+        Epochs that were inferred, ascending.
+    travel : ndarray
+        Odometer in m, shape ``(n_epochs,)``.
+    parameters : tuple of str
+        Parameter names.
+    samples : ndarray
+        Posterior draws, shape ``(n_epochs, n_draws, n_parameters)``.
+    ess : ndarray
+        Bulk effective sample size over all ensembles, shape ``(n_epochs, n_parameters)``.
+    r_hat : ndarray
+        Rank-normalised split R-hat over independent ensembles, shape ``(n_epochs, n_parameters)``.
+    converged : ndarray of bool
+        Shape ``(n_epochs,)``.
+    informed : ndarray
+        One minus the ratio of posterior to prior variance of the logarithm, floored at 0:
+        how much the data, and not the prior, say; shape ``(n_epochs, n_parameters)``.
+    prior_width : ndarray
+        Width of the prior's 90 % interval, shape ``(n_parameters,)``.
+    """
+
+    stage: str
+    recorded_at: tuple[datetime, ...]
+    travel: FloatArray
+    parameters: tuple[str, ...]
+    samples: FloatArray
+    ess: FloatArray
+    r_hat: FloatArray
+    converged: BoolArray
+    informed: FloatArray
+    prior_width: FloatArray
+
+    def __post_init__(self) -> None:
+        n, p = len(self.recorded_at), len(self.parameters)
+        _expect("samples", self.samples, (n, self.samples.shape[1], p))
+        for name in ("ess", "r_hat", "informed"):
+            _expect(name, getattr(self, name), (n, p))
+        _expect("prior_width", self.prior_width, (p,))
+        _expect("travel", self.travel, (n,))
+        _expect("converged", self.converged, (n,))
+        _freeze(self)
+
+    def quantile(self, level: float | FloatArray) -> FloatArray:
+        """Quantiles of every parameter at every epoch, shape ``(..., n_epochs, n_parameters)``."""
+        return np.asarray(np.quantile(self.samples, level, axis=1))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Prognosis:
+    """Remaining useful life with everything that is not known about it.
+
+    Attributes
+    ----------
+    stage : str
+        Identity of the machine.
+    recorded_at : datetime
+        The moment the prognosis is made at: the last log.
+    travel : float
+        Odometer at that moment, in m.
+    parameters : tuple of str
+        Names of the health parameters with a limit, then ``any`` (the first limit reached).
+    limits : ndarray
+        Limit of each parameter, NaN for ``any``, shape ``(n_parameters + 1,)``.
+    remaining : ndarray
+        Draws of the remaining travel in m, negative when the limit is already passed and infinite
+        when it is never reached, shape ``(n_draws, n_parameters + 1)``.
+    usage : ndarray
+        Draws of the travel per day in m, shape ``(n_draws,)``.
+    horizon : float
+        Travel in m past which nothing is claimed.
+    health : ndarray
+        Draws of the parameters with a limit now according to their laws,
+        shape ``(n_draws, n_parameters)``.
+    curve_travel : ndarray
+        Odometer grid in m of the life curves, shape ``(n_grid,)``.
+    curve_quantiles : ndarray
+        5, 25, 50, 75, 95 % quantiles of the same on that grid,
+        shape ``(5, n_grid, n_parameters)``.
+    chi_square : float
+        Of the residuals at the posterior mean.
+    degrees_of_freedom : int
+        Data minus law parameters.
+    walk : float
+        Standard deviation over the history of the random walk of ln frequency that the data ask
+        for beside the laws, averaged over its evidence.
+    noise_scale : float
+        Factor on the reported standard deviations that the data ask for, averaged likewise.
+    ess, r_hat : float
+        Worst over the law parameters.
+    """
+
+    stage: str
+    recorded_at: datetime
+    travel: float
+    parameters: tuple[str, ...]
+    limits: FloatArray
+    remaining: FloatArray
+    usage: FloatArray
+    horizon: float
+    health: FloatArray
+    curve_travel: FloatArray
+    curve_quantiles: FloatArray
+    chi_square: float
+    degrees_of_freedom: int
+    walk: float
+    noise_scale: float
+    ess: float
+    r_hat: float
+
+    def __post_init__(self) -> None:
+        n = len(self.parameters)
+        _expect("limits", self.limits, (n,))
+        _expect("remaining", self.remaining, (self.remaining.shape[0], n))
+        _expect("usage", self.usage, (self.remaining.shape[0],))
+        _expect("health", self.health, (self.health.shape[0], n - 1))
+        _expect("curve_quantiles", self.curve_quantiles, (5, self.curve_travel.size, n - 1))
+        _freeze(self)
+
+    def beyond_horizon(self) -> FloatArray:
+        """Probability that each limit stays unreached to the horizon, ``(n_parameters + 1,)``."""
+        return np.asarray(np.mean(self.remaining > self.horizon, axis=0))
+
+    def already_past(self) -> FloatArray:
+        """Probability that each limit has been passed already, shape ``(n_parameters + 1,)``."""
+        return np.asarray(np.mean(self.remaining <= 0, axis=0))
+
+
+Verdict = Literal["healthy", "preload", "mount", "both", "step", "not-enough-data"]
+
+
+@dataclass(frozen=True, slots=True)
+class Judgement:
+    """What is said about a stage in one word, with its probability.
+
+    Attributes
+    ----------
+    stage : str
+        Identity of the machine.
+    recorded_at : datetime
+        The last log.
+    verdict : str
+        One of the words of ``verdict.csv``.
+    probability : float
+        Posterior probability of that word; NaN for ``not-enough-data``.
+    why : str
+        One sentence for the reader of the report.
+    """
+
+    stage: str
+    recorded_at: datetime
+    verdict: Verdict
+    probability: float
+    why: str

@@ -1,0 +1,174 @@
+"""What is said about a stage: the verdict, and everything the report tells, in one noun."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from datetime import date, timedelta
+
+import numpy as np
+
+from lmshealth.results import (
+    BoolArray,
+    Health,
+    History,
+    Judgement,
+    Prognosis,
+    Refusal,
+    Track,
+    Verdict,
+)
+from lmshealth.stage import ParameterSpec, Stage
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Assessment:
+    """All results of one stage, as far as the data carried them.
+
+    Attributes
+    ----------
+    stage : Stage
+        The description the logs were read with.
+    history : History
+        Modal estimates of all logs.
+    digests : tuple of str
+        SHA-256 of each log of the history.
+    track : Track or None
+        None when no log gave a tracked mode.
+    health : Health or None
+        None when there is no health parameter, or too few logs.
+    prognosis : Prognosis or None
+        None when there is no health, or no limit.
+    judgement : Judgement
+        The verdict.
+    refused : tuple of Refusal
+        Everything of this stage that was not analysed.
+    notes : tuple of str
+        What the reader must know beside the numbers, one sentence each.
+    seed : int
+        Of all random streams.
+    """
+
+    stage: Stage
+    history: History
+    digests: tuple[str, ...]
+    track: Track | None
+    health: Health | None
+    prognosis: Prognosis | None
+    judgement: Judgement
+    refused: tuple[Refusal, ...]
+    notes: tuple[str, ...]
+    seed: int
+
+
+# A parameter counts as degraded once this share of what it may lose is gone.
+DEGRADED_SHARE = 0.25
+_LOSS_WITHOUT_LIMIT = 0.4
+# Below this share of the variance explained by data, a parameter is not told by these logs.
+INFORMED = 0.5
+
+
+def degraded_below(parameter: ParameterSpec) -> float:
+    """Value of a parameter below which it counts as degraded."""
+    limit = (
+        parameter.limit.below
+        if parameter.limit
+        else (parameter.baseline * (1 - _LOSS_WITHOUT_LIMIT))
+    )
+    return parameter.baseline - DEGRADED_SHARE * (parameter.baseline - limit)
+
+
+def judge(stage: Stage, history: History, health: Health | None) -> Judgement:
+    """Say in one word what the last epoch shows, with its posterior probability.
+
+    Parameters
+    ----------
+    stage : Stage
+        Says what counts as degraded and which word tells it.
+    history : History
+        All logs.
+    health : Health or None
+        Posterior of the parameters; None when they could not be inferred.
+
+    Returns
+    -------
+    Judgement
+        ``not-enough-data`` when there are fewer logs than make a baseline, when the sampler did
+        not converge, or when the data say nothing about any parameter.
+    """
+    needed = stage.description.baseline.logs
+    reason = ""
+    if len(history.logs) < needed:
+        reason = f"{len(history.logs)} usable logs, a baseline needs {needed}."
+    elif health is None:
+        reason = "The logs do not carry the health parameters."
+    elif not health.converged[-1]:
+        reason = "The sampler did not converge, so nothing is claimed."
+    elif (health.informed[-1] < INFORMED).all():
+        reason = "These logs move the prior of no parameter: the stage looks the same either way."
+    if reason or health is None:
+        return Judgement(
+            history.stage, history.recorded_at[-1], "not-enough-data", float("nan"), reason
+        )
+    return _judge_posterior(stage, history, health)
+
+
+def _judge_posterior(stage: Stage, history: History, health: Health) -> Judgement:
+    told = [j for j in range(len(stage.parameters)) if health.informed[-1, j] >= INFORMED]
+    lost: dict[str, BoolArray] = {
+        word: np.zeros(health.samples.shape[1], dtype=bool) for word in ("preload", "mount")
+    }
+    for j in told:
+        parameter = stage.parameters[j]
+        lost[parameter.word] |= health.samples[-1, :, j] < degraded_below(parameter)
+    preload, mount = lost["preload"], lost["mount"]
+    probabilities: dict[Verdict, float] = {
+        "healthy": float(np.mean(~preload & ~mount)),
+        "preload": float(np.mean(preload & ~mount)),
+        "mount": float(np.mean(mount & ~preload)),
+        "both": float(np.mean(preload & mount)),
+    }
+    verdict = max(probabilities, key=lambda word: probabilities[word])
+    return Judgement(
+        stage=history.stage,
+        recorded_at=history.recorded_at[-1],
+        verdict=verdict,
+        probability=probabilities[verdict],
+        why=_why(stage, health, told),
+    )
+
+
+def _why(stage: Stage, health: Health, told: list[int]) -> str:
+    low, middle, high = health.quantile(np.array([0.05, 0.5, 0.95]))[:, -1]
+    sentences = []
+    for j, parameter in enumerate(stage.parameters):
+        name = parameter.name.replace("_", " ").capitalize()
+        if j not in told:
+            sentences.append(f"{name}: these logs do not tell.")
+        elif parameter.unit:
+            sentences.append(
+                f"{name} is {middle[j]:.4g} {parameter.unit} (90 %: {low[j]:.4g} to {high[j]:.4g})."
+            )
+        else:
+            low_j, middle_j, high_j = (100 * q[j] / parameter.baseline for q in (low, middle, high))
+            sentences.append(
+                f"{name} is at {middle_j:.0f} % of its commissioning value "
+                f"(90 %: {low_j:.0f} to {high_j:.0f} %)."
+            )
+    return " ".join(sentences)
+
+
+def service_date(prognosis: Prognosis, max_risk: float) -> date | None:
+    """Find the last day on which the risk of having passed any limit is at most ``max_risk``.
+
+    Returns
+    -------
+    date or None
+        None when that day lies past the horizon: no service is asked for. A limit that is passed
+        already with more than that risk gives the day of the last log.
+    """
+    remaining = float(np.quantile(prognosis.remaining[:, -1], max_risk, method="lower"))
+    if remaining > prognosis.horizon:
+        return None
+    days = prognosis.remaining[:, -1] / prognosis.usage
+    wait = max(float(np.quantile(days, max_risk, method="lower")), 0.0)
+    return (prognosis.recorded_at + timedelta(days=wait)).date()

@@ -1,0 +1,263 @@
+"""Results as tables with the columns of the public contract: units stand in the names again."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from datetime import datetime
+from itertools import combinations
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from lmshealth.history import Reading
+from lmshealth.results import FloatArray, Metadata, Modes, Prognosis, Refusal
+from lmshealth.summary import Assessment, service_date
+
+_KM = 1000.0
+_RUL_LEVELS = (0.05, 0.10, 0.25, 0.50, 0.75, 0.90, 0.95)
+
+COLUMNS = {
+    "modes": "log stage recorded_at travel_km temperature_c mode source channel frequency_hz "
+    "frequency_std_hz damping_ratio damping_ratio_std correlation_f_zeta snr",
+    "modes_cov": "log source_a mode_a source_b mode_b cov_ln_f",
+    "track": "stage recorded_at travel_km mode frequency_hz frequency_std_hz damping_ratio "
+    "damping_ratio_std drift drift_std nis nis_dof noise_scale",
+    "track_cov": "stage recorded_at mode_a mode_b cov_drift",
+    "effects": "stage mode covariate coefficient std",
+    "events": "stage recorded_at travel_km kind mode source size std evidence",
+    "health": "stage recorded_at travel_km parameter median q05 q25 q75 q95 ess r_hat converged "
+    "informed",
+    "prognosis": "stage parameter limit "
+    + " ".join(
+        f"rul_{unit}_q{100 * level:02.0f}"
+        for unit in ("km", "hours", "days")
+        for level in _RUL_LEVELS
+    )
+    + " censored_from probability_beyond_horizon probability_already_past service_by",
+    "verdict": "stage recorded_at verdict probability",
+    "refused": "log channel mode source reason detail",
+}
+
+Row = dict[str, Any]
+
+
+def modes_rows(log: str, metadata: Metadata, modes: Modes) -> list[Row]:
+    """List the estimates of one log, one row per mode."""
+    return [
+        {
+            "log": log,
+            "stage": metadata.stage,
+            "recorded_at": _moment(metadata.recorded_at),
+            "travel_km": None if metadata.travel is None else metadata.travel / _KM,
+            "temperature_c": metadata.covariates.get("temperature_c"),
+            "mode": modes.names[i],
+            "source": modes.sources[i],
+            "channel": modes.channels[i],
+            "frequency_hz": float(modes.frequency[i]),
+            "frequency_std_hz": float(modes.frequency_std[i]),
+            "damping_ratio": float(modes.damping_ratio[i]),
+            "damping_ratio_std": float(modes.damping_ratio_std[i]),
+            "correlation_f_zeta": float(modes.correlation[i]),
+            "snr": float(modes.snr[i]),
+        }
+        for i in range(len(modes.names))
+    ]
+
+
+def lines_rows(modes: Modes) -> list[Row]:
+    """List the spectral lines that were kept out, one row each."""
+    return [
+        {
+            "frequency_hz": line.frequency,
+            "amplitude": line.amplitude,
+            "unit": line.unit,
+            "kind": line.kind,
+            "channel": line.channel,
+        }
+        for line in modes.lines
+    ]
+
+
+def refused_rows(refused: Iterable[Refusal]) -> list[Row]:
+    """List what was not analysed, one row each."""
+    return [
+        {name: getattr(refusal, name) for name in COLUMNS["refused"].split()} for refusal in refused
+    ]
+
+
+def frame(name: str, rows: Sequence[Row]) -> pd.DataFrame:
+    """Make one of the tables of the contract, with its columns even when it is empty."""
+    return pd.DataFrame(list(rows), columns=COLUMNS[name].split())
+
+
+def all_tables(
+    readings: Sequence[Reading], assessments: Sequence[Assessment], refused: Sequence[Refusal]
+) -> dict[str, pd.DataFrame]:
+    """Make all tables of a run, keyed by file name without ending."""
+    rows: dict[str, list[Row]] = {name: [] for name in COLUMNS}
+    for reading in readings:
+        rows["modes"] += modes_rows(reading.log, reading.metadata, reading.modes)
+        rows["modes_cov"] += _modes_cov_rows(reading)
+    for assessment in assessments:
+        rows["track"] += _track_rows(assessment)
+        rows["track_cov"] += _track_cov_rows(assessment)
+        rows["effects"] += _effects_rows(assessment)
+        rows["health"] += _health_rows(assessment)
+        rows["prognosis"] += _prognosis_rows(assessment)
+        rows["verdict"].append(
+            {
+                "stage": assessment.judgement.stage,
+                "recorded_at": _moment(assessment.judgement.recorded_at),
+                "verdict": assessment.judgement.verdict,
+                "probability": assessment.judgement.probability,
+            }
+        )
+    rows["refused"] = refused_rows(refused)
+    return {name: frame(name, content) for name, content in rows.items()}
+
+
+def _moment(moment: datetime | None) -> str | None:
+    return None if moment is None else moment.isoformat()
+
+
+def _modes_cov_rows(reading: Reading) -> list[Row]:
+    modes = reading.modes
+    return [
+        {
+            "log": reading.log,
+            "source_a": modes.sources[a],
+            "mode_a": modes.names[a],
+            "source_b": modes.sources[b],
+            "mode_b": modes.names[b],
+            "cov_ln_f": float(modes.cov[a, b]),
+        }
+        for a, b in combinations(range(len(modes.names)), 2)
+        if modes.cov[a, b] != 0
+    ]
+
+
+def _track_rows(assessment: Assessment) -> list[Row]:
+    track = assessment.track
+    if track is None:
+        return []
+    drift_std = np.sqrt(np.einsum("kii->ki", track.drift_cov))
+    frequency, damping = np.exp(track.ln_frequency), np.exp(track.ln_damping)
+    return [
+        {
+            "stage": track.stage,
+            "recorded_at": _moment(track.recorded_at[k]),
+            "travel_km": track.travel[k] / _KM,
+            "mode": mode,
+            "frequency_hz": frequency[k, i],
+            "frequency_std_hz": frequency[k, i] * track.ln_frequency_std[k, i],
+            "damping_ratio": damping[k, i],
+            "damping_ratio_std": damping[k, i] * track.ln_damping_std[k, i],
+            "drift": track.drift[k, i],
+            "drift_std": drift_std[k, i],
+            "nis": track.nis[k],
+            "nis_dof": track.nis_dof[k],
+            "noise_scale": track.noise_scale[k],
+        }
+        for k in range(len(track.logs))
+        for i, mode in enumerate(track.modes)
+    ]
+
+
+def _track_cov_rows(assessment: Assessment) -> list[Row]:
+    track = assessment.track
+    if track is None:
+        return []
+    return [
+        {
+            "stage": track.stage,
+            "recorded_at": _moment(track.recorded_at[k]),
+            "mode_a": track.modes[a],
+            "mode_b": track.modes[b],
+            "cov_drift": track.drift_cov[k, a, b],
+        }
+        for k in range(len(track.logs))
+        for a, b in combinations(range(len(track.modes)), 2)
+    ]
+
+
+def _effects_rows(assessment: Assessment) -> list[Row]:
+    track = assessment.track
+    if track is None:
+        return []
+    return [
+        {
+            "stage": track.stage,
+            "mode": effect.mode,
+            "covariate": effect.covariate,
+            "coefficient": effect.coefficient,
+            "std": effect.std,
+        }
+        for effect in track.effects
+    ]
+
+
+def _health_rows(assessment: Assessment) -> list[Row]:
+    health = assessment.health
+    if health is None:
+        return []
+    q05, q25, median, q75, q95 = health.quantile(np.array([0.05, 0.25, 0.5, 0.75, 0.95]))
+    return [
+        {
+            "stage": health.stage,
+            "recorded_at": _moment(health.recorded_at[k]),
+            "travel_km": health.travel[k] / _KM,
+            "parameter": name,
+            "median": median[k, j],
+            "q05": q05[k, j],
+            "q25": q25[k, j],
+            "q75": q75[k, j],
+            "q95": q95[k, j],
+            "ess": health.ess[k, j],
+            "r_hat": health.r_hat[k, j],
+            "converged": bool(health.converged[k]),
+            "informed": health.informed[k, j],
+        }
+        for k in range(len(health.recorded_at))
+        for j, name in enumerate(health.parameters)
+    ]
+
+
+def _prognosis_rows(assessment: Assessment) -> list[Row]:
+    prognosis = assessment.prognosis
+    if prognosis is None:
+        return []
+    beyond, past = prognosis.beyond_horizon(), prognosis.already_past()
+    service_by = service_date(prognosis, assessment.stage.description.decision.max_risk)
+    rows = []
+    for j, name in enumerate(prognosis.parameters):
+        rows.append(
+            {
+                "stage": prognosis.stage,
+                "parameter": name,
+                "limit": prognosis.limits[j],
+                **_rul(prognosis, prognosis.remaining[:, j]),
+                "probability_beyond_horizon": beyond[j],
+                "probability_already_past": past[j],
+                "service_by": service_by if name == "any" else None,
+            }
+        )
+    return rows
+
+
+def _rul(prognosis: Prognosis, remaining: FloatArray) -> Row:
+    """Quantiles of the remaining life; past the horizon they are empty, not numbers."""
+    left = np.maximum(remaining, 0)
+    days = left / prognosis.usage
+    row: Row = {}
+    censored = [
+        level
+        for level in _RUL_LEVELS
+        if np.quantile(left, level, method="lower") > prognosis.horizon
+    ]
+    for unit, values in (("km", left / _KM), ("hours", days * 24), ("days", days)):
+        for level in _RUL_LEVELS:
+            quantile = None if level in censored else np.quantile(values, level, method="lower")
+            row[f"rul_{unit}_q{100 * level:02.0f}"] = quantile
+    row["censored_from"] = censored[0] if censored else None
+    return row

@@ -1,0 +1,72 @@
+"""Named errors of the simulated stages: each says what was got and what is needed."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+
+class ModelError(Exception):
+    """Base of every error that the package raises on purpose."""
+
+
+class _Unknown(ModelError):
+    """A name that is in no registry; carries the name and the known ones."""
+
+    noun = "name"
+
+    def __init__(self, got: str, known: Iterable[str]) -> None:
+        self.got = got
+        self.known = tuple(known)
+        super().__init__(f"unknown {self.noun} {got!r}; known: {', '.join(self.known)}")
+
+
+class UnknownLife(_Unknown):
+    """A life that is not in the registry of lives."""
+
+    noun = "life"
+
+
+class UnknownStage(_Unknown):
+    """A stage that is neither lms-x nor lms-y."""
+
+    noun = "stage"
+
+
+class UnknownFormat(_Unknown):
+    """A file format in which no log can be written."""
+
+    noun = "format"
+
+
+class BadParameter(ModelError):
+    """A number outside the range in which the model means anything."""
+
+    def __init__(self, name: str, got: object, needed: str) -> None:
+        self.name = name
+        self.got = got
+        super().__init__(f"{name} is {got}; needed: {needed}")
+
+
+class UnstableLoop(ModelError):
+    """The position loop around this structure has poles in the right half plane."""
+
+    def __init__(self, stage: str, growth_per_s: float, frequency_hz: float) -> None:
+        self.stage = stage
+        self.growth_per_s = growth_per_s
+        self.frequency_hz = frequency_hz
+        super().__init__(
+            f"{stage}: the closed loop is unstable: a pole at {frequency_hz:.2f} Hz grows by "
+            f"{growth_per_s:.3g} 1/s; needed: all poles decay (lower the loop gain or keep "
+            "preload, mount stiffness and temperature nearer to their commissioning values)"
+        )
+
+
+class AmbiguousModes(ModelError):
+    """Mode identities could not be followed from the nominal condition."""
+
+    def __init__(self, where: str, similarity: float) -> None:
+        self.similarity = similarity
+        super().__init__(
+            f"mode identities are lost at {where}: best modal assurance {similarity:.2f}; "
+            "needed: at least 0.50 between neighbouring conditions"
+        )

@@ -1,0 +1,296 @@
+"""The stage inside its position loop: state space, closed-loop modes, participation."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import linear_sum_assignment
+
+from models.errors import AmbiguousModes, UnstableLoop
+from models.servo import TUNINGS, Tuning, servo_matrices
+from models.stages import (
+    HOUSING,
+    NOMINAL,
+    PLATFORM,
+    Condition,
+    Point,
+    Stage,
+    build_structure,
+    corners,
+)
+from models.structure import Structure, displacement_rows, named_modes, rigid_translation
+
+Array = NDArray[np.float64]
+ComplexArray = NDArray[np.complex128]
+
+OUTPUTS = ("delta_e", "current", "acc_feed", "acc_pitch")
+SENSORS = ("delta_e", "acc_feed", "acc_pitch")
+INPUTS = (
+    *(f"block{i}_{axis}" for i in range(1, 5) for axis in "xyz"),
+    "ground_x",
+    "ground_y",
+    "ground_z",
+    "motor_force",
+    "encoder_error",
+)
+GUIDE_MODES = ("roll", "pitch", "yaw")
+
+# Continuation: largest step in the logarithm of a parameter, and the modal assurance below which
+# a step is halved, and below which the identity counts as lost.
+_LARGEST_STEP = 0.3
+_TRUSTED_ASSURANCE = 0.9
+_LOST_ASSURANCE = 0.5
+_HALVINGS = 8
+
+
+@dataclass(frozen=True, slots=True)
+class LinearSystem:
+    """ẋ = a x + b u, y = c x + d u, with inputs `INPUTS` and outputs `OUTPUTS` (SI)."""
+
+    a: Array
+    b: Array
+    c: Array
+    d: Array
+
+
+@dataclass(frozen=True, slots=True)
+class Mode:
+    """A closed-loop mode.
+
+    Parameters
+    ----------
+    name, direction
+        Unique name and main direction of motion.
+    frequency_hz
+        Natural frequency |λ| / 2π.
+    damping_ratio
+        −Re λ / |λ|.
+    eigenvalue
+        λ, rad/s.
+    shape
+        (dof,) complex displacement of the bodies.
+    """
+
+    name: str
+    direction: str
+    frequency_hz: float
+    damping_ratio: float
+    eigenvalue: complex
+    shape: ComplexArray
+
+
+def sensor_rows(stage: Stage, structure: Structure) -> dict[str, Array]:
+    """Return for each sensor the (dof,) row that reads the displacement it sees, m."""
+    bodies = structure.bodies
+
+    def moved(body: int, point: Point) -> Array:
+        return displacement_rows(bodies, body, point.value)
+
+    encoder = moved(PLATFORM, stage.encoder_point) - moved(HOUSING, stage.encoder_point)
+    return {
+        "delta_e": encoder[0],
+        "acc_feed": moved(PLATFORM, stage.acc_feed_point)[0],
+        "acc_pitch": moved(PLATFORM, stage.acc_pitch_point)[2],
+    }
+
+
+def _force_columns(stage: Stage, structure: Structure) -> tuple[Array, Array]:
+    """Return generalised forces (dof, 12) per unit block force and (dof,) per unit motor force."""
+    bodies = structure.bodies
+
+    def between(point: tuple[float, float, float]) -> Array:
+        return displacement_rows(bodies, PLATFORM, point) - displacement_rows(
+            bodies, HOUSING, point
+        )
+
+    blocks = np.vstack([between(p) for p in corners(stage.block_half_spacing)]).T
+    return blocks, between(stage.motor_point.value)[0]
+
+
+def closed_loop(
+    stage: Stage, condition: Condition = NOMINAL, *, tuning: Tuning | None = None
+) -> LinearSystem:
+    """Close the position loop around the flexible structure.
+
+    States are displacements relative to the ground, velocities, and the servo's; a steady
+    reference velocity drops out.
+
+    Raises
+    ------
+    UnstableLoop
+        If a pole of the loop does not decay.
+    """
+    tuning = TUNINGS[stage.name] if tuning is None else tuning
+    structure = build_structure(stage, condition)
+    servo = servo_matrices(tuning)
+    n, m = structure.size, servo.b.size
+    sensors = sensor_rows(stage, structure)
+    blocks, motor = _force_columns(stage, structure)
+    solve = np.linalg.solve(
+        structure.mass,
+        np.column_stack([-structure.stiffness, -structure.damping, blocks, motor]),
+    )
+    push = solve[:, -1]
+    encoder = sensors["delta_e"]
+    translation = rigid_translation(structure)
+
+    a = np.zeros((2 * n + m, 2 * n + m))
+    a[:n, n : 2 * n] = np.eye(n)
+    a[n : 2 * n, : 2 * n] = solve[:, : 2 * n]
+    a[n : 2 * n, 2 * n :] = tuning.force_constant * np.outer(push, servo.c)
+    # Negative feedback: the error drives the current that pushes against it.
+    a[2 * n :, :n] = -np.outer(servo.b, encoder)
+    a[2 * n :, 2 * n :] = servo.a
+    b = np.zeros((2 * n + m, len(INPUTS)))
+    b[n : 2 * n, :12] = solve[:, 2 * n : 2 * n + 12]
+    b[n : 2 * n, 12:15] = -translation
+    b[n : 2 * n, 15] = push
+    b[2 * n :, 16] = -servo.b
+
+    c = np.zeros((len(OUTPUTS), 2 * n + m))
+    d = np.zeros((len(OUTPUTS), len(INPUTS)))
+    c[0, :n] = encoder
+    d[0, 16] = 1.0
+    c[1, 2 * n :] = servo.c
+    for row, name in ((2, "acc_feed"), (3, "acc_pitch")):
+        c[row] = sensors[name] @ a[n : 2 * n]
+        d[row] = sensors[name] @ b[n : 2 * n]
+        # Back from the ground's frame to absolute acceleration.
+        d[row, 12:15] += sensors[name] @ translation
+    _refuse_unstable(stage.name, np.linalg.eigvals(a).astype(complex))
+    return LinearSystem(a, b, c, d)
+
+
+def _refuse_unstable(stage: str, poles: ComplexArray) -> None:
+    """Raise if a pole does not decay."""
+    worst = poles[np.argmax(poles.real)]
+    if worst.real >= 0:
+        raise UnstableLoop(stage, float(worst.real), float(abs(worst) / (2 * np.pi)))
+
+
+def _oscillations(stage: Stage, condition: Condition) -> tuple[ComplexArray, ComplexArray]:
+    """Return eigenvalues (pair,) with positive frequency and displacement shapes (dof, pair)."""
+    system = closed_loop(stage, condition)
+    values, vectors = np.linalg.eig(system.a)
+    keep = values.imag > 1e-6 * np.abs(values)
+    size = build_structure(stage, condition).size
+    order = np.argsort(np.abs(values[keep]))
+    return values[keep][order], vectors[:size, keep][:, order]
+
+
+def assurance(mass: Array, first: ComplexArray, second: ComplexArray) -> Array:
+    """Return the mass-weighted modal assurance (i, j) of shapes (dof, i) and (dof, j)."""
+    cross = np.abs(first.conj().T @ mass @ second) ** 2
+    norm = [np.einsum("di,de,ei->i", s.conj(), mass, s).real for s in (first, second)]
+    return np.asarray(cross / np.outer(*norm))
+
+
+def _match(
+    mass: Array, known: tuple[ComplexArray, ComplexArray], found: tuple[ComplexArray, ComplexArray]
+) -> tuple[NDArray[np.intp], Array]:
+    """Assign each known (eigenvalues, shapes) to one of the found; return indices, assurance."""
+    similar = assurance(mass, known[1], found[1])
+    apart = np.log(np.abs(found[0])[None, :] / np.abs(known[0])[:, None])
+    # Shapes of the same kind (platform and housing in pitch) differ little: frequency decides.
+    rows, columns = linear_sum_assignment(-similar + np.minimum((apart / 0.3) ** 2, 4.0))
+    return columns, similar[rows, columns]
+
+
+@lru_cache(maxsize=16)
+def _nominal(stage: Stage) -> tuple[tuple[str, ...], ComplexArray, ComplexArray]:
+    """Return names, eigenvalues and shapes of the closed-loop modes when commissioned."""
+    structure = build_structure(stage)
+    named = named_modes(structure)
+    values, shapes = _oscillations(stage, NOMINAL)
+    known = (named.omega.astype(complex), named.shapes.astype(complex))
+    columns, similar = _match(structure.mass, known, (values, shapes))
+    if similar.min() < _LOST_ASSURANCE:
+        lost = named.names[int(np.argmin(similar))]
+        raise AmbiguousModes(f"{stage.name}, nominal condition, {lost}", float(similar.min()))
+    return named.names, values[columns], shapes[:, columns]
+
+
+def _between(first: Condition, second: Condition, part: float) -> Condition:
+    """Return the condition a part of the way along a straight line in the logarithms."""
+    return Condition(
+        first.guide_preload ** (1 - part) * second.guide_preload**part,
+        first.mount_stiffness ** (1 - part) * second.mount_stiffness**part,
+        first.temperature_c * (1 - part) + second.temperature_c * part,
+    )
+
+
+def _distance(stage: Stage, condition: Condition) -> float:
+    """Return how far a condition is from the nominal, in the logarithm of stiffness."""
+    warmer = condition.temperature_c - NOMINAL.temperature_c
+    return max(
+        abs(math.log(condition.guide_preload)) * stage.preload_exponent.value,
+        abs(math.log(condition.mount_stiffness)),
+        abs(warmer) * stage.temperature_softening.value,
+    )
+
+
+def closed_loop_modes(stage: Stage, condition: Condition = NOMINAL) -> list[Mode]:
+    """Return the named closed-loop modes, ascending in frequency.
+
+    Identities are followed from the nominal condition in steps small enough for each shape to
+    stay alike, so that a mode keeps its name where frequencies cross.
+
+    Raises
+    ------
+    AmbiguousModes
+        If a shape changes too much even over the smallest step.
+    UnstableLoop
+        If the loop is unstable on the way.
+    """
+    names, values, shapes = _nominal(stage)
+    mass = build_structure(stage).mass
+    done = 0.0
+    step = 1.0 / max(1, math.ceil(_distance(stage, condition) / _LARGEST_STEP))
+    smallest = step / 2**_HALVINGS
+    while done < 1.0:
+        target = condition if done + step >= 1.0 else _between(NOMINAL, condition, done + step)
+        found = _oscillations(stage, target)
+        columns, similar = _match(mass, (values, shapes), found)
+        if similar.min() < _TRUSTED_ASSURANCE and step > smallest:
+            step /= 2
+            continue
+        if similar.min() < _LOST_ASSURANCE:
+            raise AmbiguousModes(f"{stage.name}, {target}", float(similar.min()))
+        values, shapes = found[0][columns], found[1][:, columns]
+        done += step
+    modes = [_mode(n, v, shapes[:, i]) for i, (n, v) in enumerate(zip(names, values, strict=True))]
+    return sorted(modes, key=lambda mode: mode.frequency_hz)
+
+
+def _mode(name: str, value: complex, shape: ComplexArray) -> Mode:
+    """Make a mode of its eigenvalue and shape."""
+    return Mode(
+        name=name,
+        direction=name.rsplit("_", maxsplit=1)[-1],
+        frequency_hz=float(abs(value) / (2 * np.pi)),
+        damping_ratio=float(-value.real / abs(value)),
+        eigenvalue=complex(value),
+        shape=shape,
+    )
+
+
+def participation(stage: Stage, mode: Mode) -> dict[str, float]:
+    """Return how much each sensor moves in a mode, as a part of the mode's largest motion.
+
+    The displacement amplitude that the sensor reads, divided by the largest displacement along
+    one axis of any of the three bodies at the four blocks and at the platform's centre of gravity.
+    Δe reads a difference of two bodies and may exceed 1.
+    """
+    structure = build_structure(stage)
+    bodies = structure.bodies
+    places = [*corners(stage.block_half_spacing), bodies[PLATFORM].centre]
+    rows = np.vstack([displacement_rows(bodies, i, p) for i in range(3) for p in places])
+    largest = float(np.abs(rows @ mode.shape).max())
+    return {
+        name: float(abs(row @ mode.shape)) / largest
+        for name, row in sensor_rows(stage, structure).items()
+    }

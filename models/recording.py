@@ -1,0 +1,218 @@
+"""Simulated logs: 20 kHz recordings of a constant-velocity move."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from models.disturbance import ACCELEROMETER_DENSITY, MAINS, noise_levels, order_inputs
+from models.errors import BadParameter
+from models.modal import diagonalise, frequency_response, sampled_spectrum, simulate
+from models.plant import (
+    GUIDE_MODES,
+    OUTPUTS,
+    SENSORS,
+    closed_loop,
+    closed_loop_modes,
+    sensor_rows,
+)
+from models.stages import NOMINAL, Condition, Stage, build_structure
+
+Array = NDArray[np.float64]
+
+SAMPLE_RATE_HZ = 20000.0
+DEFAULT_VELOCITY = 0.010
+# Room to accelerate and stop at both ends of the travel.
+_USABLE_TRAVEL = 0.95
+_SLOWEST = 0.5e-3
+_LINE_BLOCK = 1 << 15
+COLUMNS = (
+    "delta_e_um",
+    "current_a",
+    "acc_feed_m_s2",
+    "acc_pitch_m_s2",
+    "reference_position_mm",
+    "reference_velocity_mm_s",
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Recording:
+    """Columns as they are stored (float32, names carry the unit) and the file's metadata."""
+
+    columns: Mapping[str, NDArray[np.float32]]
+    metadata: Mapping[str, Any]
+
+    def described(self, **metadata: Any) -> Recording:
+        """Return the recording with more metadata."""
+        return Recording(self.columns, {**metadata, **self.metadata})
+
+
+def move_velocity(stage: Stage, seconds: float, wanted: float = DEFAULT_VELOCITY) -> float:
+    """Return the wanted velocity (m/s), or the highest that the travel allows for so long.
+
+    Raises
+    ------
+    BadParameter
+        If the move would have to be slower than 0.5 mm/s, or lasts no time.
+    """
+    if not seconds > 0:
+        raise BadParameter("seconds", seconds, "a positive duration")
+    if not wanted >= _SLOWEST:
+        raise BadParameter("velocity", f"{wanted} m/s", f"at least {_SLOWEST} m/s")
+    usable = _USABLE_TRAVEL * stage.travel.value
+    velocity = min(wanted, usable / seconds)
+    if velocity < _SLOWEST:
+        raise BadParameter(
+            "seconds", seconds, f"at most {usable / _SLOWEST:.0f} s: travel {usable} m"
+        )
+    return velocity
+
+
+def _add_lines(
+    outputs: Array, stage: Stage, condition: Condition, velocity: float, rng: np.random.Generator
+) -> None:
+    """Add velocity orders (through the closed loop) and mains to outputs (output, time)."""
+    frequency, amplitudes = order_inputs(stage, velocity, rng)
+    # The drive's anti-alias filter removes what is above half the sample rate.
+    amplitudes[frequency >= SAMPLE_RATE_HZ / 2] = 0.0
+    response = frequency_response(diagonalise(closed_loop(stage, condition)), frequency)
+    mains = np.zeros((len(OUTPUTS), len(MAINS)), dtype=complex)
+    for i, line in enumerate(MAINS):
+        turned = np.exp(2j * np.pi * rng.random())
+        mains[OUTPUTS.index(line.output), i] = line.amplitude * turned
+    gain = np.hstack([np.einsum("foi,fi->of", response, amplitudes), mains])
+    hertz = np.concatenate([frequency, [line.frequency_hz for line in MAINS]])
+    turn = 2j * np.pi * hertz / SAMPLE_RATE_HZ
+    # One block of all sinusoids, turned on from block to block: no transcendental per sample.
+    block = min(outputs.shape[1], _LINE_BLOCK)
+    waves = np.exp(turn[:, None] * np.arange(block))
+    waves_stacked = np.vstack([waves.real, waves.imag])
+    for start in range(0, outputs.shape[1], block):
+        turned_gain = gain * np.exp(turn * start)
+        size = min(block, outputs.shape[1] - start)
+        read = np.hstack([turned_gain.real, -turned_gain.imag])
+        outputs[:, start : start + size] += read @ waves_stacked[:, :size]
+
+
+def simulate_signals(
+    stage: Stage,
+    condition: Condition,
+    *,
+    seconds: float,
+    velocity: float,
+    rng: np.random.Generator,
+) -> Array:
+    """Return Δe (m), current (A) and two accelerations (m/s²) as sensed, (output, time)."""
+    samples = round(seconds * SAMPLE_RATE_HZ)
+    std, corner = noise_levels(velocity, SAMPLE_RATE_HZ)
+    diagonal = diagonalise(closed_loop(stage, condition), corner)
+    outputs = simulate(diagonal, std, samples, sample_rate_hz=SAMPLE_RATE_HZ, rng=rng)
+    _add_lines(outputs, stage, condition, velocity, rng)
+    noise = ACCELEROMETER_DENSITY * np.sqrt(SAMPLE_RATE_HZ / 2)
+    for name in ("acc_feed", "acc_pitch"):
+        outputs[OUTPUTS.index(name)] += noise * rng.standard_normal(samples)
+    count = stage.encoder_count.value
+    outputs[0] = count * np.round(outputs[0] / count)
+    return outputs
+
+
+def record(
+    stage: Stage,
+    condition: Condition = NOMINAL,
+    *,
+    seconds: float,
+    velocity: float = DEFAULT_VELOCITY,
+    rng: np.random.Generator,
+) -> Recording:
+    """Record a move at constant velocity through the middle of the travel.
+
+    Parameters
+    ----------
+    seconds
+        Duration, s.
+    velocity
+        Wanted velocity, m/s; lowered where the travel is too short for the duration.
+    """
+    velocity = move_velocity(stage, seconds, velocity)
+    signals = simulate_signals(stage, condition, seconds=seconds, velocity=velocity, rng=rng)
+    samples = signals.shape[1]
+    time = (np.arange(samples) - (samples - 1) / 2) / SAMPLE_RATE_HZ
+    columns = (
+        signals[0] * 1e6,
+        signals[1],
+        signals[2],
+        signals[3],
+        velocity * time * 1e3,
+        np.full(samples, velocity * 1e3),
+    )
+    metadata = {
+        "sample_rate_hz": SAMPLE_RATE_HZ,
+        "temperature_c": round(condition.temperature_c, 2),
+        "payload_kg": stage.payload.value,
+        "position_mm": 0.0,
+    }
+    stored = {n: v.astype(np.float32) for n, v in zip(COLUMNS, columns, strict=True)}
+    return Recording(stored, metadata)
+
+
+def spectrum(
+    stage: Stage,
+    frequency_hz: Array,
+    condition: Condition = NOMINAL,
+    *,
+    velocity: float = DEFAULT_VELOCITY,
+) -> Array:
+    """Return one-sided densities (frequency, output) of the sensed signals between the lines."""
+    std, corner = noise_levels(velocity, SAMPLE_RATE_HZ)
+    diagonal = diagonalise(closed_loop(stage, condition), corner)
+    density = sampled_spectrum(diagonal, std, SAMPLE_RATE_HZ, frequency_hz)
+    return density + _sensor_floor(stage)
+
+
+def _sensor_floor(stage: Stage) -> Array:
+    """Return the density (output,) of quantisation and accelerometer noise."""
+    floor = np.zeros(len(OUTPUTS))
+    floor[0] = stage.encoder_count.value**2 / 12 * 2 / SAMPLE_RATE_HZ
+    floor[2:] = ACCELEROMETER_DENSITY**2
+    return floor
+
+
+def signal_to_noise(
+    stage: Stage, condition: Condition = NOMINAL, *, velocity: float = DEFAULT_VELOCITY
+) -> dict[str, dict[str, float]]:
+    """Return the modal signal-to-noise ratio S / (4 ζ² S_e) per guide mode and signal.
+
+    The mode's part of the response at its natural frequency over everything else there, except
+    the other guide modes, which a joint fit takes out.
+    """
+    std, corner = noise_levels(velocity, SAMPLE_RATE_HZ)
+    diagonal = diagonalise(closed_loop(stage, condition), corner)
+    structure = build_structure(stage, condition)
+    rows = np.vstack(list(sensor_rows(stage, structure).values()))
+    seen = rows @ diagonal.states[: structure.size]
+    outputs = [OUTPUTS.index(name) for name in SENSORS]
+    modes = [m for m in closed_loop_modes(stage, condition) if m.name in GUIDE_MODES]
+    ratios: dict[str, dict[str, float]] = {}
+    for mode in modes:
+        s = 2j * np.pi * mode.frequency_hz
+        # A mode's part of an acceleration is s² times its part of the displacement; the partial
+        # fractions of the acceleration itself do not vanish far below the mode.
+        twice = np.array([1.0, s**2, s**2])[:, None]
+        parts = {}
+        for other in modes:
+            pair = np.abs(np.abs(diagonal.poles) - abs(other.eigenvalue)) < 1e-9 * abs(s)
+            parts[other.name] = twice * (
+                (seen[:, pair] / (s - diagonal.poles[pair])) @ diagonal.b[pair]
+            )
+        total = frequency_response(diagonal, np.array([mode.frequency_hz]))[0, outputs]
+        rest = total - sum(parts.values())
+        power = [np.abs(part) ** 2 @ std**2 for part in (parts[mode.name], rest)]
+        floor = _sensor_floor(stage)[outputs] * SAMPLE_RATE_HZ / 2
+        ratio = power[0] / (power[1] + floor)
+        ratios[mode.name] = dict(zip(SENSORS, map(float, ratio), strict=True))
+    return ratios

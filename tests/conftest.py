@@ -1,0 +1,45 @@
+"""What tests share: things a machine may lack, and paths."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+
+
+def _missing(name: str) -> str | None:
+    """Say why something a test needs is not there; None when it is."""
+    if name == "chromium":
+        return None if shutil.which("chromium") else "chromium is not installed (Debian: chromium)"
+    if name == "data":
+        folder = os.environ.get("LMSHEALTH_DATA", "")
+        if not folder:
+            return "LMSHEALTH_DATA is not set: it names the folder of real measurements"
+        return None if Path(folder).is_dir() else f"LMSHEALTH_DATA={folder} is no folder"
+    raise ValueError(f"unknown need {name!r}")
+
+
+@pytest.fixture(scope="session")
+def needs() -> Callable[[str], None]:
+    """Skip a test for want of something, or fail it where LMSHEALTH_REQUIRE names that thing."""
+
+    def check(name: str) -> None:
+        reason = _missing(name)
+        if reason is None:
+            return
+        if name in os.environ.get("LMSHEALTH_REQUIRE", "").replace(",", " ").split():
+            pytest.fail(f"required: {reason}")
+        pytest.skip(reason)
+
+    return check
+
+
+@pytest.fixture(scope="session")
+def root() -> Path:
+    """Folder of the project."""
+    return ROOT

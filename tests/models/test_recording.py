@@ -1,0 +1,104 @@
+"""Tests of simulated logs."""
+
+import time
+
+import numpy as np
+import pytest
+from scipy.signal import periodogram
+
+from models.errors import BadParameter
+from models.plant import OUTPUTS
+from models.recording import (
+    COLUMNS,
+    SAMPLE_RATE_HZ,
+    move_velocity,
+    record,
+    signal_to_noise,
+    spectrum,
+)
+from models.stages import NOMINAL, STAGES
+
+
+@pytest.fixture(scope="module")
+def log_y():
+    """Return 20 s of stage Y."""
+    return record(STAGES["lms-y"], seconds=20.0, rng=np.random.default_rng(3))
+
+
+def test_columns_are_complete_and_single_precision(log_y):
+    """All contract columns are there, as float32 of one length."""
+    assert tuple(log_y.columns) == COLUMNS
+    assert {v.dtype for v in log_y.columns.values()} == {np.dtype("float32")}
+    assert {v.size for v in log_y.columns.values()} == {400000}
+
+
+def test_following_error_is_counted(log_y):
+    """Δe holds whole encoder counts of 4.8828125 nm."""
+    counts = log_y.columns["delta_e_um"].astype(float) / 4.8828125e-3
+    np.testing.assert_array_equal(counts, np.round(counts))
+
+
+def test_signals_have_the_size_of_the_paper(log_y):
+    """Δe scatters by about a micrometre, accelerations by 0.01 to 0.1 m/s²."""
+    std = {name: float(values.std()) for name, values in log_y.columns.items()}
+    assert 0.3 < std["delta_e_um"] < 3.0
+    assert 0.005 < std["acc_feed_m_s2"] < 0.1
+    assert 0.005 < std["acc_pitch_m_s2"] < 0.1
+
+
+def test_set_point_moves_at_its_velocity(log_y):
+    """The reference position is the integral of the reference velocity."""
+    position = log_y.columns["reference_position_mm"].astype(float)
+    assert (position[-1] - position[0]) / (399999 / SAMPLE_RATE_HZ) == pytest.approx(10.0)
+    assert np.all(log_y.columns["reference_velocity_mm_s"] == 10.0)
+
+
+@pytest.mark.parametrize("signal", ["delta_e", "acc_feed", "acc_pitch"])
+def test_spectrum_of_the_record_is_the_analytic_one(log_y, signal):
+    """Between 110 and 148 Hz periodograms average to the state space's spectral density."""
+    index = OUTPUTS.index(signal)
+    unit = 1e-6 if signal == "delta_e" else 1.0
+    values = log_y.columns[COLUMNS[index]].astype(float) * unit
+    hertz, density = periodogram(values, SAMPLE_RATE_HZ, window="hann")
+    band = (hertz > 110) & (hertz < 148)
+    ratio = density[band] / spectrum(STAGES["lms-y"], hertz[band])[:, index]
+    assert ratio.mean() == pytest.approx(1.0, abs=4.5 * np.sqrt(1.94 / ratio.size))
+
+
+def test_same_seed_same_log_other_seed_other_log():
+    """A record is a function of its seed."""
+    first, again, other = (
+        record(STAGES["lms-x"], seconds=1.0, rng=np.random.default_rng(seed)) for seed in (1, 1, 2)
+    )
+    for name in COLUMNS:
+        np.testing.assert_array_equal(first.columns[name], again.columns[name])
+    assert np.any(first.columns["acc_feed_m_s2"] != other.columns["acc_feed_m_s2"])
+
+
+def test_sensors_see_the_modes():
+    """Modal SNR of roll and pitch in acc_pitch, of pitch and yaw in acc_feed, reaches 30."""
+    for name, stage in STAGES.items():
+        ratio = signal_to_noise(stage, NOMINAL)
+        assert min(ratio["roll"]["acc_pitch"], ratio["pitch"]["acc_pitch"]) > 30, name
+        assert min(ratio["pitch"]["acc_feed"], ratio["yaw"]["acc_feed"]) > 30, name
+
+
+def test_simulation_is_faster_than_real_time():
+    """Twenty seconds of signal cost far less than real time."""
+    start = time.perf_counter()
+    record(STAGES["lms-y"], seconds=20.0, rng=np.random.default_rng(0))
+    assert time.perf_counter() - start < 4.0
+
+
+def test_long_log_moves_slower():
+    """A log longer than the travel allows lowers the velocity."""
+    stage = STAGES["lms-x"]
+    assert move_velocity(stage, 20.0) == 0.010
+    assert move_velocity(stage, 60.0) == pytest.approx(0.285 / 60)
+
+
+@pytest.mark.parametrize("seconds", [0.0, -1.0, 1000.0])
+def test_impossible_duration_is_refused(seconds):
+    """No time and a crawl both raise."""
+    with pytest.raises(BadParameter, match="seconds"):
+        move_velocity(STAGES["lms-x"], seconds)

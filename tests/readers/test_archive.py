@@ -1,0 +1,110 @@
+"""Folders of logs and their manifests."""
+
+import os
+
+import pytest
+
+from lmshealth.errors import BadLog, BadTable
+from lmshealth.readers import find_logs, read_log, read_manifest
+
+HEADER = "file,stage,travel_km,baseline\n"
+
+
+def test_find_logs(tmp_path):
+    """Logs are found by suffix, sorted; tables beside them and hidden files are none."""
+    (tmp_path / "sub").mkdir()
+    (tmp_path / ".git").mkdir()
+    names = ["b.csv", "a.H5", "sub/c.csv.gz", "sub/manifest.csv", "maintenance.csv", "truth.csv"]
+    for name in [*names, "notes.txt", ".git/d.csv", "._b.csv"]:
+        (tmp_path / name).write_bytes(b"")
+    found = find_logs(tmp_path)
+    logs, refused = found
+    assert (logs, refused) == (found.logs, found.refused)
+    assert [str(p.relative_to(tmp_path)) for p in found.logs] == ["a.H5", "b.csv", "sub/c.csv.gz"]
+    assert found.refused == ()
+
+
+def test_links(tmp_path):
+    """Links out of the folder, dangling links and pipes are refused; links inside are followed."""
+    outside, root = tmp_path / "outside", tmp_path / "root"
+    outside.mkdir()
+    root.mkdir()
+    (outside / "x.csv").write_bytes(b"")
+    (root / "real.csv").write_bytes(b"")
+    (root / "a.csv").symlink_to(outside / "x.csv")
+    (root / "b.csv").symlink_to(root / "real.csv")
+    (root / "c.csv").symlink_to(root / "gone.csv")
+    (root / "d").symlink_to(outside)
+    (root / "loop").symlink_to(root)
+    os.mkfifo(root / "e.csv")
+    found = find_logs(root)
+    assert [p.name for p in found.logs] == ["b.csv", "real.csv"]
+    refused = {r.log: r.reason for r in found.refused}
+    assert refused == {
+        "a.csv": "escapes",
+        "d": "escapes",
+        "c.csv": "missing-file",
+        "e.csv": "missing-file",
+    }
+
+
+def test_manifest_overrides(make, tmp_path):
+    """A row overrides what the file says; a manifest nearer to the log has the last word."""
+    (tmp_path / "sub").mkdir()
+    path = make("sub/log.csv")
+    (tmp_path / "manifest.csv").write_text(HEADER + "sub/log.csv,up,1,true\n")
+    (tmp_path / "sub/manifest.csv").write_text("file, stage,remark\nlog.csv, near,x\n")
+    manifest = read_manifest(tmp_path)
+    log = read_log(path, overrides=manifest.overrides(path))
+    assert (log.metadata.stage, log.metadata.travel, log.metadata.baseline) == ("near", 1e3, True)
+    assert manifest.refused == () and manifest.overrides(tmp_path / "other.csv") == {}
+
+
+def test_no_manifest(tmp_path):
+    """A folder may have no manifest."""
+    assert read_manifest(tmp_path).rows == {}
+
+
+def test_bad_value_refuses_one_log(make, tmp_path):
+    """A bad cell refuses its log and no other."""
+    path = make("log.csv")
+    (tmp_path / "manifest.csv").write_text(HEADER + "log.csv,A,many,\n")
+    with pytest.raises(BadLog, match="travel_km is 'many'"):
+        read_log(path, overrides=read_manifest(tmp_path).overrides(path))
+
+
+def test_rows_without_log(tmp_path):
+    """Rows that leave the folder or name nothing are refused, the others count."""
+    (tmp_path / "in").mkdir()
+    (tmp_path / "x.csv").write_bytes(b"")
+    (tmp_path / "in/manifest.csv").write_text(
+        HEADER + "../x.csv,A,1,\n/etc/passwd,A,1,\nno.csv,A,,\n"
+    )
+    refused = read_manifest(tmp_path / "in").refused
+    assert [r.reason for r in refused] == ["escapes", "escapes", "missing-file"]
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        b"",
+        b"stage\nA\n",
+        b"file,file\na,b\n",
+        b"file,stage\na.csv,A,B\n",
+        b"file\na.csv\n./a.csv\n",
+        b"file,stage\n,A\n",
+        b"file\n\xff\n",
+    ],
+)
+def test_bad_manifests(tmp_path, text):
+    """A manifest that cannot be understood is an error that names it."""
+    (tmp_path / "manifest.csv").write_bytes(text)
+    with pytest.raises(BadTable, match="manifest"):
+        read_manifest(tmp_path)
+
+
+def test_no_folder(tmp_path):
+    """What is no folder is an error."""
+    for verb in (find_logs, read_manifest):
+        with pytest.raises(BadTable, match="no folder"):
+            verb(tmp_path / "absent")

@@ -1,0 +1,406 @@
+"""Pages: what they say about healthy, worn, unknown and hostile stages, and what they never do."""
+
+from __future__ import annotations
+
+import re
+import shutil
+from collections.abc import Callable
+from dataclasses import replace
+from datetime import UTC, date, datetime
+from html.parser import HTMLParser
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from lmshealth import plots
+from lmshealth.report import write_report
+from lmshealth.results import Judgement, Refusal
+from lmshealth.stage import Stage, load_stage
+from lmshealth.summary import Assessment
+from tests.test_plots import (
+    FREQUENCY,
+    MODES,
+    PARAMETERS,
+    SENSITIVITY,
+    life,
+    make_health,
+    make_history,
+    make_prognosis,
+    make_track,
+)
+
+Maker = Callable[..., Assessment]
+DECISION = "[decision]\nmax_risk = 0.05\nnext_service = 2027-03-01\n"
+
+
+def write_stage(folder: Path, limited: bool = True, parameters: int = 2) -> Stage:
+    """Write a small description with its map, and load it."""
+    names, levels = PARAMETERS[:parameters], np.geomspace(0.3, 1.6, 9)
+    grid = np.stack(np.meshgrid(*[levels] * parameters), -1).reshape(-1, parameters)
+    rows = [",".join([*names, "mode", "frequency_hz"])]
+    for point in grid:
+        for mode, base, slope in zip(MODES, FREQUENCY, SENSITIVITY[:, :parameters], strict=True):
+            values = [*point, mode, base * np.exp(slope @ np.log(point))]
+            rows.append(",".join(str(value) for value in values))
+    (folder / "map.csv").write_text("\n".join(rows))
+    text = 'name = "lms-y"\nsource = "small stage of the tests"\n'
+    for mode, frequency in zip(MODES, FREQUENCY, strict=True):
+        text += f'[[mode]]\nname = "{mode}"\nfrequency_hz = {frequency}\ndamping_ratio = 0.015\n'
+    for name, limit in zip(names, (0.6, 0.7), strict=False):
+        text += f'[[parameter]]\nname = "{name}"\n'
+        text += 'prior = { kind = "lognormal", median = 1.0, sigma = 0.3 }\n'
+        text += f"limit = {{ below = {limit} }}\n" if limited else ""
+    text += f'[map]\nfile = "map.csv"\n{DECISION if limited else ""}'
+    path = folder / "stage.toml"
+    path.write_text(text)
+    return load_stage(str(path))
+
+
+@pytest.fixture
+def make(tmp_path: Path) -> Maker:
+    """Return a maker of assessments: worn unless told otherwise."""
+    stage = write_stage(tmp_path)
+
+    def assess(identity: str = "M7-Y", wear_km: float = 8000, floor: float = 0.68) -> Assessment:
+        travel, truth = life(wear_km, floor)
+        history = make_history(identity, travel, truth)
+        healthy = wear_km > 20000
+        return Assessment(
+            stage=stage,
+            history=history,
+            digests=tuple(f"{k:064x}" for k in range(len(history.logs))),
+            track=make_track(history, truth),
+            health=make_health(history, truth),
+            prognosis=make_prognosis(history, wear_km, floor),
+            judgement=Judgement(
+                stage=identity,
+                recorded_at=history.recorded_at[-1],
+                verdict="healthy" if healthy else "both",
+                probability=0.97 if healthy else 0.93,
+                why="No parameter has left its baseline by more than the logs can tell."
+                if healthy
+                else "Roll, pitch and yaw have fallen by 7, 7 and 4 % since the baseline; the "
+                "map explains this by less guide preload and a looser mount together.",
+            ),
+            refused=(
+                Refusal(
+                    "logs/0007.csv",
+                    "not excited",
+                    "modal SNR 1.3 where 3 is needed",
+                    channel="acc_feed",
+                    mode="roll",
+                    source="acc",
+                ),
+                Refusal("logs/x.csv", "gap", "31 % of the samples are missing, 5 % are allowed"),
+            ),
+            notes=("The temperature of 3 logs is missing; their estimates are less certain.",),
+            seed=0,
+        )
+
+    return assess
+
+
+@pytest.fixture
+def blank(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Leave pictures out where a test reads words only."""
+    monkeypatch.setattr(plots, "svg", lambda draw, *, salt: f'<svg id="{salt}"></svg>')
+
+
+def nothing(assessment: Assessment) -> Assessment:
+    """Return the same stage before its logs carry anything."""
+    judgement = replace(
+        assessment.judgement,
+        verdict="not-enough-data",
+        probability=float("nan"),
+        why="2 logs so far; a baseline needs 5.",
+    )
+    history = assessment.history
+    unseen = replace(history, ln_frequency=np.full_like(history.ln_frequency, np.nan))
+    return replace(
+        assessment, history=unseen, track=None, health=None, prognosis=None, judgement=judgement
+    )
+
+
+def blind(assessment: Assessment) -> Assessment:
+    """Return the same stage with a mount that the logs do not tell, as in LMS-X."""
+    truth = life(8000, 0.68)[1]
+    return replace(assessment, health=make_health(assessment.history, truth, (0.95, 0.08)))
+
+
+class Page(HTMLParser):
+    """What a browser would be asked to load, and the order of headings."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__()
+        self.loads: list[str] = []
+        self.headings: list[int] = []
+        self.ids: list[str] = []
+        self.tags: list[str] = []
+        self.text = ""
+        self.source = path.read_text(encoding="utf-8")
+        self.feed(self.source)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        """Note tags, identifiers and addresses."""
+        self.tags.append(tag)
+        self.text += " " if tag in ("p", "td", "th") else ""
+        if re.fullmatch("h[1-6]", tag):
+            self.headings.append(int(tag[1]))
+        for name, value in attrs:
+            if name == "id":
+                self.ids.append(value or "")
+            if name in ("src", "href", "xlink:href", "action", "data", "srcset"):
+                self.loads.append(value or "")
+
+    def handle_data(self, data: str) -> None:
+        """Collect what is read, outside of style sheets."""
+        if self.tags and self.tags[-1] != "style":
+            self.text += data
+
+
+def one(folder: Path, assessment: Assessment, by: date | None = None) -> Page:
+    """Write the page of one stage and read it."""
+    service = {assessment.judgement.stage: by}
+    return Page(write_report(folder / "out", [assessment], (), service=service)[0])
+
+
+def words(page: Page) -> str:
+    """Return the text of a page with all spaces alike."""
+    return re.sub(r"\s+", " ", page.text)
+
+
+@pytest.mark.usefixtures("blank")
+def test_worn_stage_says_it_first(make: Maker, tmp_path: Path) -> None:
+    """Verdict, probability, reason, date and remaining life stand on the first screen."""
+    text = words(one(tmp_path, make(), date(2026, 11, 3)))
+    first = text[: text.index("Frequencies and damping")]
+    for part in ("Loss of guide preload and mount stiffness", "93 % probability", "Roll, pitch"):
+        assert part in first
+    assert "By 2026-11-03" in first and "accepted risk of 5 %" in first
+    assert re.search(r"Median [\d ]+ km [\d ]+ days", first)
+    assert "service planned for 2027-03-01" in first
+    assert first.index("Loss of") < first.index("Health now") < first.index("Remaining life")
+
+
+@pytest.mark.usefixtures("blank")
+def test_numbers_are_those_of_the_results(make: Maker, tmp_path: Path) -> None:
+    """Median and interval of a gauge, and the quantiles of the life, are those of the draws."""
+    assessment = make()
+    assert assessment.health is not None and assessment.prognosis is not None
+    text = words(one(tmp_path, assessment))
+    low, middle, high = 100 * assessment.health.quantile(np.array([0.05, 0.5, 0.95]))[:, -1, 0]
+    assert f"{middle:.0f} % of baseline, 90 % interval {low:.0f} to {high:.0f} %" in text
+    km = np.median(assessment.prognosis.remaining[:, -1]) / 1000
+    shown = float(re.search(r"Median ([\d ]+) km", text)[1].replace(" ", ""))  # type: ignore[index]
+    assert shown == pytest.approx(km, rel=0.01)
+
+
+@pytest.mark.usefixtures("blank")
+def test_parameter_that_is_not_told_shows_no_number(make: Maker, tmp_path: Path) -> None:
+    """A parameter the logs do not tell says so, in the gauge, the table and the index."""
+    page = one(tmp_path, blind(make()))
+    text = words(page)
+    gauge = text[text.index("Mount stiffness") : text.index("Service")]
+    assert "These logs do not tell" in gauge and "of baseline" not in gauge
+    assert "Rests partly on assumption" in text
+    assert 'class="bar untold"' in page.source
+    assert "not told" in words(Page(tmp_path / "out" / "index.html"))
+
+
+@pytest.mark.usefixtures("blank")
+def test_nothing_known_is_said_in_words(make: Maker, tmp_path: Path) -> None:
+    """A page without track, health and prognosis says why for each."""
+    text = words(one(tmp_path, nothing(make())))
+    assert "Not enough data for a verdict" in text
+    assert "No log gave a tracked mode" in text
+    assert "do not carry a statement about health" in text
+    assert "no remaining life without a statement about health" in text
+    assert "nan" not in text.lower().replace("provenance", "")
+    untracked = replace(make(), track=None)
+    assert "could not be followed as a track" in words(one(tmp_path, untracked))
+
+
+def test_no_log_at_all(make: Maker, tmp_path: Path) -> None:
+    """A history without logs is a page, not a failure."""
+    bare = nothing(make())
+    history = bare.history
+    empty = replace(
+        history,
+        logs=(),
+        recorded_at=(),
+        travel=history.travel[:0],
+        covariates={},
+        ln_frequency=history.ln_frequency[:0],
+        ln_damping=history.ln_damping[:0],
+        cov=history.cov[:0],
+    )
+    text = words(one(tmp_path, replace(bare, history=empty, digests=())))
+    assert "0 logs used" in text
+    assert "No log gave a tracked mode" in text
+
+
+@pytest.mark.usefixtures("blank")
+def test_healthy_stage_without_visible_end(make: Maker, tmp_path: Path) -> None:
+    """A life beyond the horizon is censored: no date, no number."""
+    assessment = make(wear_km=400000, floor=0.98)
+    assert assessment.prognosis is not None
+    endless = np.where(assessment.prognosis.remaining > 2e7, np.inf, 3e7)
+    assessment = replace(assessment, prognosis=replace(assessment.prognosis, remaining=endless))
+    text = words(one(tmp_path, assessment))
+    assert "No service needed yet" in text
+    assert "No end of life visible within 20 000 km" in text
+    assert "beyond 20 000 km" in text
+
+
+@pytest.mark.usefixtures("blank")
+def test_limit_already_passed_means_now(make: Maker, tmp_path: Path) -> None:
+    """Where the accepted risk is used up already, the service is due now."""
+    assessment = make()
+    assert assessment.prognosis is not None
+    late = replace(assessment.prognosis, remaining=assessment.prognosis.remaining - 2e6)
+    text = words(one(tmp_path, replace(assessment, prognosis=late)))
+    assert "Service Now" in text and "already passed" in text
+
+
+def test_one_parameter_without_limit(make: Maker, tmp_path: Path) -> None:
+    """A stage with one parameter and no limit has a density, and says why it has no life."""
+    (tmp_path / "one").mkdir()
+    stage = write_stage(tmp_path / "one", limited=False, parameters=1)
+    assessment = make()
+    health = assessment.health
+    assert health is not None
+    single = replace(
+        health,
+        parameters=health.parameters[:1],
+        samples=health.samples[..., :1],
+        ess=health.ess[:, :1],
+        r_hat=health.r_hat[:, :1],
+        informed=health.informed[:, :1],
+        prior_width=health.prior_width[:1],
+    )
+    text = words(one(tmp_path, replace(assessment, stage=stage, health=single, prognosis=None)))
+    assert "sets no limit" in text
+    assert "The last epoch: guide preload" in text
+
+
+@pytest.mark.usefixtures("blank")
+def test_law_that_does_not_fit_is_told(make: Maker, tmp_path: Path) -> None:
+    """A bad fit, a wide walk and a sampler without convergence are said in words."""
+    assessment = make()
+    assert assessment.prognosis is not None and assessment.health is not None
+    bad = replace(assessment.prognosis, chi_square=400.0, walk=0.04)
+    failed = replace(assessment.health, converged=~assessment.health.converged)
+    text = words(one(tmp_path, replace(assessment, prognosis=bad, health=failed)))
+    assert "The laws do not fit the logs" in text
+    assert "random walk of 4.00 %" in text
+    assert "The sampler did not converge" in text
+
+
+@pytest.mark.usefixtures("blank")
+def test_names_are_escaped(make: Maker, tmp_path: Path) -> None:
+    """Markup in names and reasons stays text, and names no file outside the folder."""
+    evil = "../<script>alert(1)</script>"
+    assessment = make(evil)
+    refusal = Refusal(log=evil, reason=f'"{evil}', detail="'><img src=x onerror=alert(1)>")
+    assessment = replace(assessment, refused=(refusal,), notes=(evil,))
+    paths = write_report(tmp_path / "out", [assessment], [refusal], service={})
+    assert {path.parent for path in paths} == {tmp_path / "out"}
+    for path in paths:
+        page = Page(path)
+        assert "script" not in page.tags and "img" not in page.tags
+        assert evil in page.text
+
+
+@pytest.mark.usefixtures("blank")
+def test_files_never_collide(make: Maker, tmp_path: Path) -> None:
+    """Identities that differ only in case or signs get pages of their own; none is the index."""
+    base = nothing(make())
+    names = ["A 1", "A/1", "a-1", "index", "..", "Führung"]
+    stages = [replace(base, judgement=replace(base.judgement, stage=name)) for name in names]
+    paths = write_report(tmp_path / "out", stages, (), service={})
+    assert len({path.name.casefold() for path in paths}) == len(names) + 1
+    assert {"Führung.html", "index-2.html", "stage.html"} <= {path.name for path in paths}
+    again = write_report(tmp_path / "again", stages[::-1], (), service={})
+    assert [path.name for path in again] == [path.name for path in paths]
+
+
+def test_same_input_same_bytes(make: Maker, tmp_path: Path) -> None:
+    """Pages repeat to the byte in any order of the stages, and tell a time only if given."""
+    stages = [make(), nothing(make("M8-Y"))]
+    first = write_report(tmp_path / "a", stages, (), service={})
+    second = write_report(tmp_path / "b", stages[::-1], (), service={})
+    assert [p.name for p in first] == [p.name for p in second]
+    assert [p.read_bytes() for p in first] == [p.read_bytes() for p in second]
+    when = datetime(2027, 1, 2, 3, 4, tzinfo=UTC)
+    index = write_report(tmp_path / "c", stages[1:], (), service={}, generated=when)[-1]
+    assert "written 2027-01-02 03:04 UTC" in index.read_text(encoding="utf-8")
+
+
+@pytest.mark.usefixtures("blank")
+def test_index_is_sorted_by_risk(make: Maker, tmp_path: Path) -> None:
+    """The worst stage comes first, an unknown one before the healthy one."""
+    safe = make("safe", wear_km=400000, floor=0.98)
+    assert safe.prognosis is not None
+    safe = replace(safe, prognosis=replace(safe.prognosis, remaining=np.full((4000, 3), np.inf)))
+    stages = [safe, nothing(make("unknown")), make("worn")]
+    refused = [Refusal("stray.csv", "no stage", "no description takes stage 'Q'")]
+    paths = write_report(tmp_path / "out", stages, refused, service={"worn": date(2026, 11, 3)})
+    assert [path.stem for path in paths] == ["worn", "unknown", "safe", "index"]
+    text = words(Page(paths[-1]))
+    assert text.index("worn") < text.index("unknown") < text.index("safe") < text.index("stray.csv")
+    assert "By 2026-11-03" in text
+
+
+def test_empty_fleet(tmp_path: Path) -> None:
+    """No stage at all still gives an index that says so."""
+    paths = write_report(tmp_path / "out", [], (), service={})
+    assert [path.name for path in paths] == ["index.html"]
+    assert "No log belongs to a stage" in Page(paths[0]).text
+
+
+def test_page_stands_alone_and_is_well_formed(make: Maker, tmp_path: Path) -> None:
+    """Nothing is loaded from outside, identifiers are unique, headings descend by one."""
+    for path in write_report(tmp_path / "out", [make()], (), service={}):
+        page = Page(path)
+        assert "http:" not in page.source and "https:" not in page.source
+        allowed = ("#", "data:", "index.html", "M7-Y.html")
+        assert all(address.startswith(allowed) for address in page.loads), page.loads
+        assert len(page.ids) == len(set(page.ids))
+        assert {a[1:] for a in page.loads if a.startswith("#")} <= set(page.ids)
+        assert page.headings[0] == 1 and page.headings.count(1) == 1
+        assert all(b <= a + 1 for a, b in pairwise(page.headings))
+        assert '<html lang="en">' in page.source and "Content-Security-Policy" in page.source
+        assert all("scope=" in tag for tag in re.findall("<th[ >][^>]*", page.source))
+
+
+def test_browser_opens_it_offline(
+    make: Maker, tmp_path: Path, needs: Callable[[str], None]
+) -> None:
+    """A browser without network opens both pages in both schemes: no error, no other request."""
+    needs("chromium")
+    playwright = pytest.importorskip("playwright.sync_api")
+    paths = write_report(tmp_path / "out", [blind(make())], (), service={})
+    with playwright.sync_playwright() as driver:
+        browser = driver.chromium.launch(
+            executable_path=shutil.which("chromium"), args=["--no-sandbox", "--disable-gpu"]
+        )
+        for path in paths:
+            for scheme, width in (("light", 1280), ("dark", 390)):
+                context = browser.new_context(
+                    offline=True, color_scheme=scheme, viewport={"width": width, "height": 800}
+                )
+                page = context.new_page()
+                messages: list[str] = []
+                requests: list[str] = []
+                page.on("console", lambda message, seen=messages: seen.append(message.text))
+                page.on("pageerror", lambda error, seen=messages: seen.append(str(error)))
+                page.on("request", lambda request, seen=requests: seen.append(request.url))
+                page.goto(path.as_uri())
+                assert messages == []
+                outside = [url for url in requests if not url.startswith("data:")]
+                assert outside == [path.as_uri()]
+                assert page.evaluate("document.documentElement.scrollWidth") <= width
+                context.close()
+        browser.close()
