@@ -8,8 +8,8 @@ import numpy as np
 
 from lmshealth.results import BoolArray, FloatArray
 from lmshealth.spectra import Spectrum
-from lmshealth.starts import Coarse, Target, incoherent_fit
-from lmshealth.whittle import Block, Likelihood, make_block
+from lmshealth.starts import Coarse, Target
+from lmshealth.whittle import WEAK, Block, Likelihood, make_block
 
 # The band of a fit reaches this many damping ratios from its modes: beyond, a resonance adds
 # little, and the noise need not be as simple as the model says.
@@ -77,6 +77,16 @@ class BandFit:
     clarity: FloatArray
     lines: FloatArray
 
+    def settled(self) -> tuple[Target, ...]:
+        """Its modes as another channel may take them for granted."""
+        m = len(self.targets)
+        std = np.sqrt(np.diag(self.cov)).tolist()
+        f, zeta = np.exp(self.estimate[:m]).tolist(), np.exp(self.estimate[m:]).tolist()
+        return tuple(
+            replace(t, frequency=f[i], damping_ratio=zeta[i], settled=(std[i], std[m + i]))
+            for i, t in enumerate(self.targets)
+        )
+
     def only(self, names: list[str]) -> BandFit:
         """Keep only the named modes; the others stay marginalised in the covariance."""
         m = len(self.targets)
@@ -109,7 +119,7 @@ def fit_band(
     view : View
         The channel.
     coarse : Coarse
-        Its binned spectrum around the cluster.
+        Its binned spectrum around the cluster, with its neighbours.
     targets : tuple of Target
         The modes, placed where they are expected in this log.
 
@@ -167,29 +177,26 @@ def _screen(
             tuple(replace(t, damping_ratio=t.damping_ratio * c) for t in targets)
             for c in (0.5, 1, 2)
         ),
-        key=lambda ts: incoherent_fit(coarse, *_arrays(ts))[1],
+        key=coarse.misfit,
     )
     kept = scaled
     gains: dict[str, float] = {}
     while kept:
-        full = incoherent_fit(coarse, *_arrays(kept))[1]
-        losses = [
-            incoherent_fit(coarse, *_arrays(kept[:i] + kept[i + 1 :]))[1] - full
-            for i in range(len(kept))
-        ]
+        full = coarse.misfit(kept)
+        losses = [coarse.misfit(kept[:i] + kept[i + 1 :]) - full for i in range(len(kept))]
         gains |= {t.name: loss for t, loss in zip(kept, losses, strict=True)}
-        worst = int(np.argmin(losses))
-        if losses[worst] >= _ABSENT:
+        open_losses = [np.inf if t.settled else x for t, x in zip(kept, losses, strict=True)]
+        worst = int(np.argmin(open_losses))
+        if open_losses[worst] >= _ABSENT:
             break
         kept = kept[:worst] + kept[worst + 1 :]
     return kept, gains
 
 
-def _arrays(targets: tuple[Target, ...]) -> tuple[FloatArray, FloatArray]:
-    return (
-        np.array([t.frequency for t in targets]),
-        np.array([t.damping_ratio for t in targets]),
-    )
+def _damped(target: Target, factor: float) -> Target:
+    if target.settled is not None:
+        return target
+    return replace(target, damping_ratio=target.damping_ratio * factor)
 
 
 def _cut(spectra: tuple[Spectrum, ...], targets: tuple[Target, ...]) -> tuple[Spectrum, ...]:
@@ -210,7 +217,9 @@ def _fit_and_prune(
     n_ordinates = sum(block.periodogram.size for block in blocks)
     solution = _solve(coarse, blocks, seen)
     while seen:
-        doubtful = [i for i, t in enumerate(seen) if gains[t.name] < _BEYOND_DOUBT]
+        doubtful = [
+            i for i, t in enumerate(seen) if gains[t.name] < _BEYOND_DOUBT and t.settled is None
+        ]
         evidence: dict[int, tuple[float, _Solution | None]] = {}
         for i in doubtful:
             rest = seen[:i] + seen[i + 1 :]
@@ -230,12 +239,13 @@ def _fit_and_prune(
 
 def _solve(coarse: Coarse, blocks: tuple[Block, ...], targets: tuple[Target, ...]) -> _Solution:
     """Find the posterior mode for a set of modes by a trust-region Newton method."""
-    f, zeta = _arrays(targets)
-    strength, _ = incoherent_fit(coarse, f, zeta)
+    f = np.array([target.frequency for target in targets])
+    zeta = np.array([target.damping_ratio for target in targets])
+    strength, noise = coarse.strengths(targets)
     m = len(targets)
     # A strength of zero would leave the mode without a gradient.
-    floor = 1e-3 * coarse.level.min() * zeta**2
-    noise = max(strength[-1], 1e-2 * coarse.level.min())
+    floor = 0.01 * coarse.level.min() * 4 * zeta**2
+    noise = max(noise, 1e-2 * coarse.level.min())
     start = np.concatenate(
         [np.log(f), np.log(zeta), np.ones(m), np.zeros(max(m - 1, 0)), [np.log(noise), 0.0]]
     )
@@ -244,7 +254,8 @@ def _solve(coarse: Coarse, blocks: tuple[Block, ...], targets: tuple[Target, ...
     likelihood = Likelihood(
         blocks=blocks,
         start=start,
-        scale=np.sqrt(np.maximum(strength[:-1], floor)),
+        belief=np.array([t.settled or WEAK for t in targets]).reshape(m, 2).T.ravel(),
+        scale=np.sqrt(np.maximum(strength, floor)),
         centre=float(np.sqrt(low * high)),
         spread=float(np.log(high / low) / 2),
     )
@@ -328,6 +339,8 @@ def _keep_credible(
     duration = max(s.duration for s in fit.view.spectra)
     keep = []
     for i, target in enumerate(fit.targets):
+        if target.settled is not None:
+            continue
         off = abs(np.log(f[i] / target.frequency))
         low, high = (target.damping_ratio * c for c in (1 / _DAMPING_SPAN, _DAMPING_SPAN))
         if 2 * zeta[i] * f[i] * duration < 1:

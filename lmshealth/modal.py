@@ -17,7 +17,7 @@ from lmshealth.peaks import find_peaks
 from lmshealth.results import Channel, Line, Log, Modes, Refusal
 from lmshealth.spectra import find_segments, periodogram
 from lmshealth.stage import Stage
-from lmshealth.starts import Target, coarsen, locate
+from lmshealth.starts import Coarse, Target, coarsen, locate
 
 # Modes whose bands touch are fitted together, but never more than this many.
 _MOST_TOGETHER = 4
@@ -69,7 +69,7 @@ def identify(
     fits: list[BandFit] = []
     refused: list[Refusal] = []
     for cluster in _clusters(targets):
-        found, missing = _identify_cluster(log, views, cluster, known=stage is not None)
+        found, missing = _identify_cluster(log, views, cluster, targets, known=stage is not None)
         fits += found
         refused += missing
     modes = _collect(fits, _name_lines(log, stage, fits), (*log.refused, *refused))
@@ -164,7 +164,12 @@ def _clusters(targets: tuple[Target, ...]) -> list[tuple[Target, ...]]:
 
 
 def _identify_cluster(
-    log: Log, views: tuple[View, ...], cluster: tuple[Target, ...], *, known: bool
+    log: Log,
+    views: tuple[View, ...],
+    cluster: tuple[Target, ...],
+    targets: tuple[Target, ...],
+    *,
+    known: bool,
 ) -> tuple[list[BandFit], list[Refusal]]:
     """Fit a cluster in every channel and keep each mode from the channel that knows it best."""
     reach = [target.search if known else 0.0 for target in cluster]
@@ -172,11 +177,13 @@ def _identify_cluster(
     high = max(t.band(BAND)[1] * (1 + r) for t, r in zip(cluster, reach, strict=True))
     width = 0.5 * min(t.damping_ratio * t.frequency for t in cluster)
     high = min(high, 0.49 * log.sample_rate)
-    coarse = tuple(coarsen(view.spectra, low, high, width) for view in views)
+    beside = tuple(t for t in targets if t not in cluster and low / 1.3 < t.frequency < 1.3 * high)
+    coarse = tuple(
+        replace(coarsen(view.spectra, low, high, width), neighbours=beside) for view in views
+    )
     placed = cluster
     if known:
-        found = locate(coarse, cluster).tolist()
-        placed = tuple(replace(t, frequency=f) for t, f in zip(cluster, found, strict=True))
+        placed, coarse = locate(coarse, cluster)
     fits: list[BandFit] = []
     reasons: dict[str, tuple[str, str]] = {}
     for view, binned in zip(views, coarse, strict=True):
@@ -188,6 +195,7 @@ def _identify_cluster(
         if fit is not None:
             fits.append(fit)
     best = _best_channels(fits, [target.name for target in cluster])
+    best = [_in_company(fit, best, views, coarse) for fit in best]
     seen = {target.name for fit in best for target in fit.targets}
     refused = [
         Refusal(log=log.name, mode=name, reason=reason, detail=detail)
@@ -195,6 +203,28 @@ def _identify_cluster(
         if name not in seen
     ]
     return best, refused
+
+
+def _in_company(
+    fit: BandFit, best: list[BandFit], views: tuple[View, ...], coarse: tuple[Coarse, ...]
+) -> BandFit:
+    """Fit a channel again together with the modes that only other channels show.
+
+    A mode too weak to be seen here still interferes with the ones that are, and would bias them;
+    where and how damped it is, the other channels know.
+    """
+    own = fit.settled()
+    others = [t for other in best if other is not fit for t in other.settled()]
+    if not others:
+        return fit
+    free = tuple(replace(target, settled=None) for target in own)
+    company = tuple(sorted((*free, *others), key=lambda target: target.frequency))
+    binned = next(c for v, c in zip(views, coarse, strict=True) if v is fit.view)
+    again, _ = fit_band(fit.view, binned, company)
+    names = [target.name for target in own]
+    if again is None or not set(names) <= {target.name for target in again.targets}:
+        return fit
+    return again.only(names)
 
 
 def _best_channels(fits: list[BandFit], names: list[str]) -> list[BandFit]:

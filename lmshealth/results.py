@@ -332,7 +332,8 @@ class Track:
     nis : ndarray
         Normalised innovation squared, shape ``(n_epochs,)``.
     nis_dof : ndarray
-        Its degrees of freedom, shape ``(n_epochs,)``.
+        Its degrees of freedom, shape ``(n_epochs,)``; the first estimate of a mode has none,
+        because the filter starts from it.
     noise_scale : ndarray
         Factor on the reported standard deviations that the innovations ask for,
         shape ``(n_epochs,)``; 1 when they are consistent.

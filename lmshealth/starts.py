@@ -7,16 +7,18 @@ once by an incoherent sum of resonances on a coarsely binned spectrum.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.optimize import nnls
 
 from lmshealth.results import FloatArray
 from lmshealth.spectra import Spectrum
 
 _COMMON_STEPS = 41
 _OWN_STEPS = 15
+# Multiplicative updates, and their exponent over the one that is proved to be monotone.
+_UPDATES = 25
+_STRIDE = 1.8
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,12 +35,16 @@ class Target:
         Start value.
     search : float
         Half width of the search, as a fraction of the frequency.
+    settled : (float, float) or None
+        Standard deviations of ln f and ln ζ where another channel has told them already: the
+        mode then takes part in the fit whether this channel shows it or not.
     """
 
     name: str
     frequency: float
     damping_ratio: float
     search: float
+    settled: tuple[float, float] | None = None
 
     def band(self, widths: float) -> tuple[float, float]:
         """Frequencies within so many damping ratios of the target."""
@@ -54,11 +60,31 @@ class Coarse:
     ----------
     frequency, level, count : ndarray
         Mean frequency in Hz, density from the median, and number of ordinates, ``(n_bins,)``.
+    neighbours : tuple of Target
+        Modes beside the band whose flanks reach into it.
     """
 
     frequency: FloatArray
     level: FloatArray
     count: FloatArray
+    neighbours: tuple[Target, ...] = ()
+
+    def misfit(self, targets: tuple[Target, ...]) -> float:
+        """Whittle misfit of these targets, the neighbours and a white noise."""
+        return float(self._fit(targets)[1])
+
+    def strengths(self, targets: tuple[Target, ...]) -> tuple[FloatArray, float]:
+        """Modal PSD of each target, shape ``(n_targets,)``, and the noise PSD."""
+        strength = self._fit(targets)[0]
+        return strength[: len(targets)], float(strength[-1])
+
+    def _fit(self, targets: tuple[Target, ...]) -> tuple[FloatArray, FloatArray]:
+        everything = (*targets, *self.neighbours)
+        return incoherent_fit(
+            self,
+            np.array([target.frequency for target in everything]),
+            np.array([target.damping_ratio for target in everything]),
+        )
 
 
 def coarsen(spectra: tuple[Spectrum, ...], low: float, high: float, width: float) -> Coarse:
@@ -86,75 +112,95 @@ def coarsen(spectra: tuple[Spectrum, ...], low: float, high: float, width: float
     )
 
 
-def resonances(frequency: FloatArray, f: FloatArray, zeta: FloatArray) -> FloatArray:
-    """Acceleration resonances 1 / ((1 - β²)² + (2ζβ)²), shape ``(n_frequency, n_modes)``."""
-    beta = f / frequency[:, None]
-    return np.asarray(1 / ((1 - beta**2) ** 2 + (2 * zeta * beta) ** 2))
+def incoherent_fit(
+    coarse: Coarse, f: FloatArray, zeta: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Fit strengths of resonances and a white noise to a binned spectrum, for many candidates.
 
-
-def incoherent_fit(coarse: Coarse, f: FloatArray, zeta: FloatArray) -> tuple[FloatArray, float]:
-    """Fit strengths of resonances and a white noise to a binned spectrum.
+    The strengths maximise the Whittle likelihood by multiplicative updates, which keep them
+    positive; least squares would be ruled by the bins that happen to be low.
 
     Parameters
     ----------
     coarse : Coarse
         Binned spectrum.
     f, zeta : ndarray
-        Natural frequencies in Hz and damping ratios, shape ``(n_modes,)``.
+        Natural frequencies in Hz and damping ratios, shape ``(..., n_modes)``.
 
     Returns
     -------
     strength : ndarray
-        Modal PSD of each mode, then the noise PSD, shape ``(n_modes + 1,)``.
-    misfit : float
-        Whittle misfit of the binned spectrum.
+        Modal PSD of each mode, then the noise PSD, shape ``(..., n_modes + 1)``.
+    misfit : ndarray
+        Whittle misfit of the binned spectrum, shape ``(...)``.
+
+    References
+    ----------
+    Fevotte2009
     """
-    design = np.column_stack([resonances(coarse.frequency, f, zeta), np.ones(coarse.level.size)])
-    # Columns differ by orders of magnitude; NNLS stops on absolute tolerances.
-    unit = design.max(axis=0)
-    model = coarse.level
-    strength = np.zeros(unit.size)
-    for _ in range(2):
-        weight = np.sqrt(coarse.count) / model
-        strength = nnls(design / unit * weight[:, None], coarse.level * weight)[0]
-        model = np.maximum(design / unit @ strength, 1e-3 * coarse.level)
-    misfit = float(np.sum(coarse.count * (np.log(model) + coarse.level / model)))
-    return strength / unit, misfit
+    beta = f[..., None, :] / coarse.frequency[:, None]
+    shapes = 1 / ((1 - beta**2) ** 2 + (2 * zeta[..., None, :] * beta) ** 2)
+    design = np.concatenate([shapes, np.ones((*shapes.shape[:-1], 1))], axis=-1)
+    unit = design.mean(axis=-2)
+    design = design / unit[..., None, :]
+    # Every part starts with an equal share of the mean level.
+    weight = np.full(unit.shape, float(np.average(coarse.level, weights=coarse.count)))
+    weight /= weight.shape[-1]
+    turned = np.swapaxes(design, -1, -2)
+    for _ in range(_UPDATES):
+        model = (design @ weight[..., None])[..., 0]
+        pull = turned @ (coarse.count * coarse.level / model**2)[..., None]
+        push = turned @ (coarse.count / model)[..., None]
+        weight = weight * np.sqrt(pull / push)[..., 0] ** _STRIDE
+    model = (design @ weight[..., None])[..., 0]
+    misfit = np.sum(coarse.count * (np.log(model) + coarse.level / model), axis=-1)
+    return weight / unit, np.asarray(misfit)
 
 
-def locate(coarse: tuple[Coarse, ...], targets: tuple[Target, ...]) -> FloatArray:
+def locate(
+    coarse: tuple[Coarse, ...], targets: tuple[Target, ...]
+) -> tuple[tuple[Target, ...], tuple[Coarse, ...]]:
     """Find where the targets stand, by all channels together.
 
     Parameters
     ----------
     coarse : tuple of Coarse
-        Binned spectrum of each channel.
+        Binned spectrum of each channel; all have the same neighbours.
     targets : tuple of Target
         A cluster of modes.
 
     Returns
     -------
-    ndarray
-        Frequencies in Hz, shape ``(n_modes,)``.
+    targets : tuple of Target
+        Placed where they stand.
+    coarse : tuple of Coarse
+        With the neighbours placed by the common shift.
     """
-    nominal = np.array([target.frequency for target in targets])
-    zeta = np.array([target.damping_ratio for target in targets])
-    search = np.array([target.search for target in targets])
+    own = len(targets)
+    everything = (*targets, *coarse[0].neighbours)
+    nominal = np.array([target.frequency for target in everything])
+    zeta = np.array([target.damping_ratio for target in everything])
+    search = np.array([target.search for target in everything])
 
-    def cost(shift: FloatArray) -> float:
+    def best(shifts: FloatArray) -> FloatArray:
         # Shifts are a priori half the search together and a sixth of it apart.
-        common = shift.mean()
-        prior = 0.5 * (common / (search.mean() / 2)) ** 2
-        prior += 0.5 * float(np.sum(((shift - common) / (search / 6)) ** 2))
-        f = nominal * np.exp(shift)
-        return float(prior) + sum(incoherent_fit(channel, f, zeta)[1] for channel in coarse)
+        common = shifts[:, :own].mean(axis=1, keepdims=True)
+        cost = 0.5 * (common[:, 0] / (search.mean() / 2)) ** 2
+        cost += 0.5 * np.sum(((shifts - common) / (search / 6)) ** 2, axis=1)
+        f = nominal * np.exp(shifts)
+        for channel in coarse:
+            cost += incoherent_fit(channel, f, np.broadcast_to(zeta, f.shape))[1]
+        return np.asarray(shifts[int(np.argmin(cost))])
 
-    grid = np.linspace(-1, 1, _COMMON_STEPS)
     reach = float(np.log1p(search.min()))
-    shift = min((np.full(nominal.size, reach * g) for g in grid), key=cost)
-    own = np.linspace(-1, 1, _OWN_STEPS)
+    shift = best(np.linspace(-reach, reach, _COMMON_STEPS)[:, None] * np.ones(nominal.size))
     for width in (3.0, 1.0):
-        for i in range(nominal.size):
-            moved = [shift + width * zeta[i] * g * np.eye(nominal.size)[i] for g in own]
-            shift = min([m for m in moved if abs(m[i]) <= np.log1p(search[i])] or [shift], key=cost)
-    return np.asarray(nominal * np.exp(shift))
+        for i in range(own):
+            moved = np.tile(shift, (_OWN_STEPS, 1))
+            moved[:, i] += width * zeta[i] * np.linspace(-1, 1, _OWN_STEPS)
+            shift = best(moved[np.abs(moved[:, i]) <= np.log1p(search[i])])
+    placed = tuple(
+        replace(target, frequency=float(f))
+        for target, f in zip(everything, nominal * np.exp(shift), strict=True)
+    )
+    return placed[:own], tuple(replace(channel, neighbours=placed[own:]) for channel in coarse)

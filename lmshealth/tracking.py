@@ -246,11 +246,16 @@ def _average(problem: _Problem, settings: list[_Setting], runs: list[_Run]) -> T
         drift_cov=drift_cov,
         effects=_effects(problem, mean[-1], std[-1]),
         nis=np.einsum("gk,gk->k", before, [run.nis for run in runs]),
-        nis_dof=np.isfinite(np.hstack([history.ln_frequency, history.ln_damping])).sum(
-            axis=1, dtype=float
-        ),
+        nis_dof=_predicted(history),
         noise_scale=scales @ weight,
     )
+
+
+def _predicted(history: History) -> FloatArray:
+    """Count the measurements of each log that could surprise: the first of a mode cannot."""
+    there = np.isfinite(np.hstack([history.ln_frequency, history.ln_damping]))
+    again = there & (np.cumsum(there, axis=0) > 1)
+    return np.asarray(again.sum(axis=1, dtype=float))
 
 
 def _effects(problem: _Problem, mean: FloatArray, std: FloatArray) -> tuple[Effect, ...]:

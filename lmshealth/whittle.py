@@ -31,9 +31,8 @@ _SAMPLES_PER_BANDWIDTH = 12
 _MARGIN_BINS = 20
 
 # Standard deviations of the weak normal priors about the start, which only keep directions
-# that the data do not see from running away.
-_PRIOR_LN_F = 0.2
-_PRIOR_LN_ZETA = 2.0
+# that the data do not see from running away: of ln f and ln ζ, amplitudes, e_0 and e_1.
+WEAK = (0.2, 2.0)
 _PRIOR_AMPLITUDE = 30.0
 _PRIOR_NOISE = (5.0, 2.0)
 
@@ -82,14 +81,16 @@ def make_block(spectrum: Spectrum, keep: np.ndarray, bandwidth: float) -> Block:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Likelihood:
-    """Negative log posterior of a band of one channel with weak priors about a start.
+    """Negative log posterior of a band of one channel with priors about a start.
 
     Attributes
     ----------
     blocks : tuple of Block
         One per segment.
     start : ndarray
-        Start value and centre of the weak priors, shape ``(n_unknowns,)``.
+        Start value and centre of the priors, shape ``(n_unknowns,)``.
+    belief : ndarray
+        Standard deviations of the priors of ln f and of ln ζ, shape ``(2 n_modes,)``.
     scale : ndarray
         Unit of the amplitudes of each mode, shape ``(n_modes,)``.
     centre : float
@@ -100,6 +101,7 @@ class Likelihood:
 
     blocks: tuple[Block, ...]
     start: FloatArray
+    belief: FloatArray
     scale: FloatArray
     centre: float
     spread: float
@@ -115,8 +117,7 @@ class Likelihood:
         m = self.n_modes
         return np.concatenate(
             [
-                np.full(m, _PRIOR_LN_F),
-                np.full(m, _PRIOR_LN_ZETA),
+                self.belief,
                 np.full(max(2 * m - 1, 0), _PRIOR_AMPLITUDE),
                 _PRIOR_NOISE,
             ]

@@ -1,0 +1,53 @@
+"""How a study keeps what it found: numbers with seed, versions, machine and run time."""
+
+from __future__ import annotations
+
+import json
+import platform
+import time
+from collections.abc import Mapping
+from datetime import UTC, datetime
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+from scipy.stats import beta
+
+_PACKAGES = ("lmshealth", "numpy", "scipy", "emcee", "filterpy")
+
+
+class Stopwatch:
+    """Measures wall and processor time since it was made."""
+
+    def __init__(self) -> None:
+        self._wall, self._cpu = time.perf_counter(), time.process_time()
+
+    def read(self) -> dict[str, float]:
+        """Return seconds of wall time and of this process's processor time."""
+        return {
+            "wall_s": round(time.perf_counter() - self._wall, 1),
+            "cpu_s": round(time.process_time() - self._cpu, 1),
+        }
+
+
+def keep(path: Path, question: str, answer: Mapping[str, Any], watch: Stopwatch) -> None:
+    """Write the result of a study as JSON."""
+    content = {
+        "question": question,
+        **answer,
+        "recorded": {
+            "date": datetime.now(UTC).date().isoformat(),
+            "python": platform.python_version(),
+            **{name: version(name) for name in _PACKAGES},
+            **watch.read(),
+        },
+    }
+    path.write_text(json.dumps(content, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+
+
+def clopper_pearson(hits: int, trials: int, level: float = 0.95) -> tuple[float, float]:
+    """Exact interval of a proportion."""
+    tail = (1 - level) / 2
+    low = float(beta.ppf(tail, hits, trials - hits + 1)) if hits else 0.0
+    high = float(beta.ppf(1 - tail, hits + 1, trials - hits)) if hits < trials else 1.0
+    return low, high

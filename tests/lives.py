@@ -1,0 +1,284 @@
+"""Small lives for tests: a stage whose modal map is known in closed form, and histories on it.
+
+Ln frequency is linear in ln parameter with one bend, so that a Chebyshev surrogate of degree two
+is exact and a test can compare with the formula itself.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from datetime import UTC, datetime, timedelta
+from itertools import product
+from pathlib import Path
+
+import numpy as np
+
+from lmshealth.history import Reading
+from lmshealth.results import FloatArray, Health, History, Metadata, Modes, Prognosis, Track
+from lmshealth.stage import Stage, load_stage
+
+MODES = ("roll", "pitch", "yaw")
+FREQUENCY = np.array([126.4, 136.6, 155.0])
+DAMPING = np.array([0.018, 0.015, 0.017])
+BEND = 0.01
+START = datetime(2026, 3, 1, 6, 0, tzinfo=UTC)
+# What ln parameter does to ln frequency of each mode; nothing sees "foot".
+SENSITIVITY = {
+    "guide_preload": np.array([0.08, 0.11, 0.10]),
+    "mount_stiffness": np.array([0.27, 0.18, 0.05]),
+    "foot": np.zeros(3),
+}
+AXES = {
+    "guide_preload": np.geomspace(0.2, 1.5, 7),
+    "mount_stiffness": np.geomspace(0.25, 1.6, 7),
+    "foot": np.geomspace(0.4, 2.5, 4),
+}
+PRELOAD = """
+name = "guide_preload"
+prior = { kind = "lognormal", median = 1.0, sigma = 0.3 }
+limit = { below = 0.6 }
+law = { kind = "hertz-wear", life_km = { kind = "lognormal", median = 8000, sigma = 1.0 } }
+"""
+MOUNT = """
+name = "mount_stiffness"
+prior = { kind = "lognormal", median = 1.0, sigma = 0.3 }
+limit = { below = 0.7 }
+
+[parameter.law]
+kind = "loosening"
+life_km = { kind = "lognormal", median = 4000, sigma = 1.0 }
+floor = { kind = "uniform", low = 0.3, high = 1.0 }
+"""
+FADING = """
+name = "guide_preload"
+prior = { kind = "lognormal", median = 1.0, sigma = 0.3 }
+limit = { below = 0.6 }
+law = { kind = "linear", rate_per_km = { kind = "normal", mean = 0.0, std = 2e-4 } }
+"""
+FOOT = """
+name = "foot"
+prior = { kind = "lognormal", median = 1.0, sigma = 0.2 }
+"""
+TEMPERATURE = """
+[[covariate]]
+name = "temperature_c"
+reference = 21.0
+prior_std = 0.001
+"""
+
+
+def true_drift(names: Sequence[str], x: FloatArray) -> FloatArray:
+    """Drift of all modes at ln parameters ``(..., n_parameters)``, by the formula of the map."""
+    slopes = np.array([SENSITIVITY[name] for name in names])
+    return x @ slopes + BEND * x[..., :1] ** 2
+
+
+def stage_text(
+    parameters: Sequence[str] = (PRELOAD, MOUNT),
+    *,
+    n_modes: int = 2,
+    model_std: float = 0.05,
+    tail: str = TEMPERATURE,
+) -> str:
+    """Write a stage description."""
+    parts = ['name = "small"']
+    for name, f, zeta in zip(MODES[:n_modes], FREQUENCY, DAMPING, strict=False):
+        parts.append(f'[[mode]]\nname = "{name}"\nfrequency_hz = {f}\ndamping_ratio = {zeta}')
+    parts += [f"[[parameter]]{parameter}" for parameter in parameters]
+    if parameters:
+        parts.append(f'[map]\nfile = "map.csv"\nmodel_std = {model_std}')
+    return "\n".join([*parts, tail])
+
+
+def map_rows(names: Sequence[str], n_modes: int = 2) -> list[str]:
+    """Write the lines of a modal map, header first."""
+    rows = [",".join([*names, "mode", "frequency_hz"])]
+    for values in product(*(AXES[name] for name in names)):
+        f = FREQUENCY * np.exp(true_drift(names, np.log(np.array(values))))
+        for mode, value in zip(MODES[:n_modes], f, strict=False):
+            rows.append(",".join([*(f"{v:.17g}" for v in values), mode, f"{value:.17g}"]))
+    return rows
+
+
+def make_stage(
+    folder: Path,
+    parameters: Sequence[str] = (PRELOAD, MOUNT),
+    *,
+    n_modes: int = 2,
+    model_std: float = 0.05,
+    tail: str = TEMPERATURE,
+) -> Stage:
+    """Write a stage with its map into a folder and load it."""
+    text = stage_text(parameters, n_modes=n_modes, model_std=model_std, tail=tail)
+    names = [re.findall(r'name = "(\w+)"', parameter)[0] for parameter in parameters]
+    folder.mkdir(parents=True, exist_ok=True)
+    if parameters:
+        (folder / "map.csv").write_text("\n".join(map_rows(names, n_modes)) + "\n")
+    path = folder / "small.toml"
+    path.write_text(text)
+    return load_stage(str(path))
+
+
+def make_history(
+    ln_frequency: FloatArray,
+    *,
+    travel: FloatArray | None = None,
+    cov: FloatArray | None = None,
+    std: float = 1e-3,
+    ln_damping: FloatArray | None = None,
+    temperature: FloatArray | None = None,
+    baseline: int = 0,
+) -> History:
+    """Make a history of the first modes; where ln frequency is NaN, all of the mode is missing."""
+    n, m = ln_frequency.shape
+    travel = np.linspace(2.0e5, 2.2e6, n) if travel is None else travel
+    if cov is None:
+        cov = np.tile(np.diag(np.r_[np.full(m, std**2), np.full(m, 0.05**2)]), (n, 1, 1))
+    cov = np.array(cov)
+    if ln_damping is None:
+        ln_damping = np.tile(np.log(DAMPING[:m]), (n, 1))
+    missing = np.isnan(ln_frequency)
+    ln_damping = np.where(missing, np.nan, ln_damping)
+    gone = np.hstack([missing, missing])
+    cov[gone[:, :, None] | gone[:, None, :]] = np.nan
+    return History(
+        stage="AX-1",
+        logs=tuple(f"{k:03d}.csv" for k in range(n)),
+        recorded_at=tuple(START + timedelta(days=7 * k) for k in range(n)),
+        travel=np.array(travel, dtype=float),
+        covariates={} if temperature is None else {"temperature_c": np.array(temperature)},
+        modes=MODES[:m],
+        ln_frequency=np.array(ln_frequency),
+        ln_damping=ln_damping,
+        cov=cov,
+        baseline=baseline,
+    )
+
+
+def rough_history(rng: np.random.Generator, *, baseline: int = 0, n: int = 10) -> History:
+    """Make a history of two modes with everything that can be awkward.
+
+    Irregular odometer that stands still once, covariances across modes and between frequency and
+    damping, a mode missing here and there, one log without any mode, one without temperature.
+    """
+    m = 2
+    travel = np.cumsum(np.r_[3e5, rng.uniform(1e4, 4e5, n - 1)])
+    travel[6] = travel[5]
+    temperature = 21 + 5 * rng.standard_normal(n)
+    root = rng.standard_normal((n, 2 * m, 2 * m)) * np.r_[2e-3, 1e-3, 0.05, 0.08][:, None]
+    cov = root @ np.swapaxes(root, 1, 2) + np.diag([1e-6, 1e-6, 1e-3, 1e-3])
+    level = np.log(FREQUENCY[:m]) - 0.02 * (travel - travel[0])[:, None] / np.ptp(travel)
+    ln_f = level - 4e-4 * (temperature[:, None] - 21) + 2e-3 * rng.standard_normal((n, m))
+    ln_z = np.log(DAMPING[:m]) + 0.08 * rng.standard_normal((n, m))
+    ln_f[2, 0] = ln_f[7, 1] = np.nan
+    ln_f[4] = np.nan
+    temperature[3] = np.nan
+    return make_history(
+        ln_f, travel=travel, cov=cov, ln_damping=ln_z, temperature=temperature, baseline=baseline
+    )
+
+
+def make_track(drift: FloatArray, cov: FloatArray) -> Track:
+    """Make a track of given drifts ``(n, m)`` with covariances ``(n, m, m)``."""
+    n, m = drift.shape
+    std = np.sqrt(np.einsum("kii->ki", cov))
+    return Track(
+        stage="AX-1",
+        logs=tuple(f"{k:03d}.csv" for k in range(n)),
+        recorded_at=tuple(START + timedelta(days=7 * k) for k in range(n)),
+        travel=np.linspace(0.0, 1e6, n),
+        modes=MODES[:m],
+        ln_frequency=np.log(FREQUENCY[:m]) + drift,
+        ln_frequency_std=std,
+        ln_damping=np.tile(np.log(DAMPING[:m]), (n, 1)),
+        ln_damping_std=np.full((n, m), 0.05),
+        drift=np.array(drift),
+        drift_cov=np.array(cov),
+        effects=(),
+        nis=np.full(n, 2.0 * m),
+        nis_dof=np.full(n, 2.0 * m),
+        noise_scale=np.ones(n),
+    )
+
+
+def make_health(
+    samples: FloatArray,
+    *,
+    parameters: Sequence[str] = ("guide_preload", "mount_stiffness"),
+    converged: bool = True,
+    informed: Sequence[float] = (0.9, 0.9),
+) -> Health:
+    """Make the health of one epoch from draws, shape ``(n_draws, n_parameters)``."""
+    p = len(parameters)
+    return Health(
+        stage="AX-1",
+        recorded_at=(START,),
+        travel=np.array([1e6]),
+        parameters=tuple(parameters),
+        samples=np.array(samples)[None],
+        ess=np.full((1, p), 1000.0),
+        r_hat=np.full((1, p), 1.001),
+        converged=np.array([converged]),
+        informed=np.array([informed], dtype=float),
+        prior_width=np.ones(p),
+    )
+
+
+def make_prognosis(remaining: FloatArray, usage: FloatArray, *, horizon: float = 1e7) -> Prognosis:
+    """Make a prognosis of one limit from draws of the remaining travel in m."""
+    return Prognosis(
+        stage="AX-1",
+        recorded_at=START,
+        travel=1e6,
+        parameters=("guide_preload", "any"),
+        limits=np.array([0.6, np.nan]),
+        remaining=np.column_stack([remaining, remaining]),
+        usage=np.array(usage),
+        horizon=horizon,
+        health=np.full((remaining.size, 1), 0.8),
+        curve_travel=np.linspace(0, 1e6, 3),
+        curve_quantiles=np.full((5, 3, 1), 0.8),
+        chi_square=10.0,
+        degrees_of_freedom=10,
+        walk=1e-3,
+        noise_scale=1.0,
+        ess=1000.0,
+        r_hat=1.001,
+    )
+
+
+def make_reading(
+    log: str,
+    day: float,
+    travel: float,
+    modes: dict[str, float],
+    *,
+    baseline: bool | None = None,
+    covariates: dict[str, float] | None = None,
+) -> Reading:
+    """Make the reading of one log from ln frequencies by mode name."""
+    m = len(modes)
+    root = np.arange(1.0, 4 * m * m + 1).reshape(2 * m, 2 * m) * 1e-4
+    return Reading(
+        log=log,
+        digest=f"digest of {log}",
+        metadata=Metadata(
+            stage="AX-1",
+            recorded_at=START + timedelta(days=day),
+            travel=travel,
+            covariates=covariates or {},
+            baseline=baseline,
+        ),
+        modes=Modes(
+            names=tuple(modes),
+            sources=("acc",) * m,
+            channels=("acc_feed",) * m,
+            ln_frequency=np.array(list(modes.values()), dtype=float),
+            ln_damping=np.log(0.01) + 0.1 * np.arange(m),
+            cov=root @ root.T + 1e-8 * np.eye(2 * m),
+            snr=np.full(m, 200.0),
+            lines=(),
+            refused=(),
+        ),
+    )

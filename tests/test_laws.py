@@ -1,0 +1,147 @@
+"""Degradation laws: coordinates, Jacobians, priors and first passages."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from scipy.optimize import brentq
+
+from lmshealth.laws import AnyLaw, HertzWear, Linear, Loosening, Power, Unchanging
+from lmshealth.priors import Lognormal, Normal, Uniform
+
+NOW = 1.7e6
+WEAR = HertzWear(Lognormal(8000, 1.0), Uniform(0.7, 1.6))
+LOOSE = Loosening(Lognormal(4000, 1.0), Uniform(0.3, 1.0))
+POWER = Power(Normal(6000, 2500), Uniform(0.5, 2.0))
+LINEAR = Linear(Normal(0.0, 2e-4))
+LAWS = [WEAR, LOOSE, POWER, LINEAR]
+NAMES = ["hertz-wear", "loosening", "power", "linear"]
+
+
+def natural_log_prior(law: AnyLaw, theta: np.ndarray) -> float:
+    """Log prior of natural parameters, lengths in m, written out law by law."""
+    if isinstance(law, HertzWear):  # power is one of them
+        value = law.life_km.log_density(theta[:1] / 1000) + law.exponent.log_density(theta[1:])
+    elif isinstance(law, Loosening):
+        value = law.floor.log_density(theta[:1]) + law.life_km.log_density(theta[1:] / 1000)
+    else:
+        value = law.rate_per_km.log_density(theta[:1] * 1000)
+    return float(value[0])
+
+
+def numerical_log_jacobian(law: AnyLaw, y: np.ndarray) -> float:
+    """Log |det dθ/dy| by central differences."""
+    columns = []
+    for j in range(y.size):
+        shift = np.zeros_like(y)
+        shift[j] = 1e-5
+        up, down = law.natural((y + shift)[None], NOW)[0], law.natural((y - shift)[None], NOW)[0]
+        columns.append((up - down) / 2e-5)
+    return float(np.linalg.slogdet(np.column_stack(columns))[1])
+
+
+@pytest.mark.parametrize("law", LAWS, ids=NAMES)
+def test_prior_in_coordinates_is_the_natural_one_times_the_jacobian(law: AnyLaw) -> None:
+    """Log prior in coordinates minus natural log prior minus log Jacobian is one constant."""
+    y = law.draw(np.random.default_rng(1), 40, NOW)
+    y = y[np.isfinite(y).all(axis=1)]
+    found = law.log_prior(y, NOW)
+    known = [
+        natural_log_prior(law, theta) + numerical_log_jacobian(law, point)
+        for theta, point in zip(law.natural(y, NOW), y, strict=True)
+    ]
+    np.testing.assert_allclose(np.diff(found - known), 0, atol=2e-5)
+
+
+@pytest.mark.parametrize("law", LAWS, ids=NAMES)
+def test_draws_follow_the_prior(law: AnyLaw) -> None:
+    """Draws, turned to natural parameters, have the quantiles of the stated priors."""
+    y = law.draw(np.random.default_rng(2), 20_000, NOW)
+    theta = law.natural(y[np.isfinite(y).all(axis=1)], NOW)
+    prior, column, unit = {
+        "hertz-wear": (getattr(law, "life_km", None), 0, 1e-3),
+        "power": (None, 0, 1e-3),
+        "loosening": (getattr(law, "life_km", None), 1, 1e-3),
+        "linear": (getattr(law, "rate_per_km", None), 0, 1e3),
+    }[NAMES[LAWS.index(law)]]
+    if prior is not None:
+        for level in (0.1, 0.5, 0.9):
+            share = np.mean(theta[:, column] * unit < prior.quantile(level))
+            assert abs(share - level) < 5 * np.sqrt(level * (1 - level) / 20_000)
+
+
+@pytest.mark.parametrize("law", [*LAWS, Unchanging()], ids=[*NAMES, "none"])
+def test_draws_are_finite_whatever_the_prior(law: AnyLaw) -> None:
+    """A prior that reaches below 0 is cut there: a sampler cannot start from NaN."""
+    y = law.draw(np.random.default_rng(3), 2000, NOW)
+    assert y.shape == (2000, len(law.names))
+    assert np.isfinite(y).all()
+    assert np.isfinite(law.log_prior(y, NOW)).all()
+
+
+@pytest.mark.parametrize("law", LAWS, ids=NAMES)
+def test_closed_form_passage_is_the_root_of_health(law: AnyLaw) -> None:
+    """Where a limit is reached, root finding on health gives the same travel."""
+    theta = law.natural(np.atleast_2d(law.draw(np.random.default_rng(4), 60, NOW)), NOW)
+    theta = theta[np.isfinite(theta).all(axis=1)]
+    for limit in (0.35, 0.6, 0.95):
+        passage = law.passage(theta, limit)
+        assert passage.shape == (theta.shape[0],)
+        for row, travel in zip(theta[:, None], passage, strict=True):
+
+            def off(s: float, row: np.ndarray = row, limit: float = limit) -> float:
+                return float(law.health(row, np.array([s]))[0, 0] - limit)
+
+            if np.isfinite(travel):
+                root = brentq(off, 0.0, 4 * travel, xtol=1e-9 * travel, rtol=1e-13)
+                assert travel == pytest.approx(root, rel=1e-8)
+            else:
+                assert off(1e13) > -1e-12
+
+
+def test_health_starts_at_one_and_stays_above_zero() -> None:
+    """Every law is whole at the baseline and never negative."""
+    travel = np.array([0.0, 1e5, 1e7, 1e12])
+    for law in LAWS:
+        y = law.draw(np.random.default_rng(5), 50, NOW)
+        health = law.health(law.natural(y[np.isfinite(y).all(axis=1)], NOW), travel)
+        np.testing.assert_allclose(health[:, 0], 1.0, atol=1e-14)
+        assert (health >= 0).all()
+
+
+def test_wear_is_hertz_and_power_is_not() -> None:
+    """Wear has the outer exponent 3/2 of a Hertz contact, a power law has 1."""
+    theta, travel = np.array([[4e6, 1.2]]), np.array([1e6])
+    loss = (1e6 / 4e6) ** 1.2
+    np.testing.assert_allclose(WEAR.health(theta, travel), [[(1 - loss) ** 1.5]])
+    np.testing.assert_allclose(POWER.health(theta, travel), [[1 - loss]])
+
+
+def test_a_limit_that_is_never_reached_is_infinite() -> None:
+    """Floors above the limit, gains and unchanging parameters never fail."""
+    assert np.isinf(LOOSE.passage(np.array([[0.8, 1e6]]), 0.7)).all()
+    assert np.isinf(LINEAR.passage(np.array([[-1e-9], [0.0]]), 0.7)).all()
+    assert np.isinf(Unchanging().passage(np.empty((3, 0)), 0.7)).all()
+    assert (Unchanging().health(np.empty((3, 0)), np.zeros(4)) == 1).all()
+
+
+def test_lower_limits_are_reached_later() -> None:
+    """First passage grows as the limit falls."""
+    for law in LAWS:
+        theta = law.natural(law.draw(np.random.default_rng(6), 50, NOW), NOW)
+        passages = [law.passage(theta, limit) for limit in (0.99, 0.8, 0.5, 0.31)]
+        for early, late in pairwise(passages):
+            keep = np.isfinite(early)
+            assert (early[keep] <= late[keep]).all()
+
+
+@pytest.mark.parametrize("y", [[-400.0, 0.0], [400.0, 0.0], [0.0, 50.0], [1e3, -1e3]])
+@pytest.mark.parametrize("law", [WEAR, LOOSE], ids=["hertz-wear", "loosening"])
+def test_far_off_walkers_raise_no_warning(law: AnyLaw, y: list[float]) -> None:
+    """Coordinates far outside the posterior give a number or minus infinity, never an error."""
+    point = np.array([y])
+    assert not np.isposinf(law.log_prior(point, NOW)).any()
+    health = law.health(law.natural(point, NOW), np.array([0.0, NOW]))
+    assert health.shape == (1, 2)

@@ -1,0 +1,74 @@
+"""Peaks: resonances stand out at their own width; noise and lines do not."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from lmshealth.peaks import find_peaks
+from lmshealth.spectra import Segment, Spectrum, periodogram
+from lmshealth.starts import Target
+from tests.signals import Mode, accelerations, make_log, sine, white
+
+RATE = 1000.0
+
+
+def transform(values: np.ndarray) -> tuple[Spectrum, ...]:
+    """Transform a channel."""
+    (channel,) = make_log({"acc_a": values}, RATE).channels
+    return (periodogram(channel, Segment(0, values.size, float("nan")), RATE),)
+
+
+def near(targets: tuple[Target, ...], frequency: float, share: float = 0.02) -> bool:
+    """Tell whether a target is within a share of a frequency."""
+    return any(abs(target.frequency / frequency - 1) < share for target in targets)
+
+
+@pytest.mark.parametrize("damping", [0.004, 0.01, 0.03])
+def test_a_resonance_is_found_with_a_damping_of_the_right_order(damping: float) -> None:
+    """The frequency is within 2 damping ratios, the damping within a factor of 4."""
+    values = accelerations(np.random.default_rng(1), [Mode(120.0, damping)], 60_000, RATE, 0.1)
+    targets = find_peaks((transform(values[0]),), 40.0, 300.0)
+    best = min(targets, key=lambda target: abs(target.frequency - 120.0))
+    assert abs(best.frequency / 120.0 - 1) < 2 * damping
+    assert 0.25 < best.damping_ratio / damping < 4
+
+
+def test_modes_of_all_channels_are_listed_once_in_ascending_order() -> None:
+    """Two modes, each in its own channel and one in both, make two candidates."""
+    modes = [Mode(90.0, 0.01, 1.0, (1.0, 1.0)), Mode(160.0, 0.01, 1.0, (0.0, 1.0))]
+    values = accelerations(np.random.default_rng(2), modes, 60_000, RATE, 0.05)
+    targets = find_peaks(tuple(transform(row) for row in values), 40.0, 300.0)
+    assert near(targets, 90.0)
+    assert near(targets, 160.0)
+    frequencies = [target.frequency for target in targets]
+    assert frequencies == sorted(frequencies)
+    assert [target.name for target in targets] == [f"mode_{k + 1}" for k in range(len(targets))]
+    assert sum(abs(f / 90 - 1) < 0.02 for f in frequencies) == 1
+
+
+def test_white_noise_has_hardly_any_peaks() -> None:
+    """Twenty records of noise give at most one candidate together."""
+    rng = np.random.default_rng(3)
+    found = [find_peaks((transform(white(rng, 1.0, 20_000, RATE)),), 20, 450) for _ in range(20)]
+    assert sum(len(targets) for targets in found) <= 1
+
+
+def test_a_line_is_no_peak() -> None:
+    """A line ten thousand times above the noise poses as no resonance."""
+    values = white(np.random.default_rng(4), 1.0, 60_000, RATE) + sine(60_000, RATE, 50.0, 20.0)
+    assert not near(find_peaks((transform(values),), 20.0, 300.0), 50.0)
+
+
+def test_peaks_do_not_depend_on_the_unit() -> None:
+    """Signals in another unit have the same candidates."""
+    values = accelerations(np.random.default_rng(5), [Mode(120.0, 0.01)], 30_000, RATE, 0.1)[0]
+    one, other = (find_peaks((transform(v),), 40.0, 300.0) for v in (values, 1e-7 * values))
+    assert [t.name for t in one] == [t.name for t in other]
+    np.testing.assert_allclose([t.frequency for t in one], [t.frequency for t in other])
+
+
+def test_only_the_band_is_searched() -> None:
+    """A resonance outside the band is no candidate."""
+    values = accelerations(np.random.default_rng(6), [Mode(120.0, 0.01)], 60_000, RATE, 0.1)
+    assert not near(find_peaks((transform(values[0]),), 150.0, 300.0), 120.0)

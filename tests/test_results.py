@@ -1,0 +1,116 @@
+"""Results: frozen, checked at birth, and honest about their derived numbers."""
+
+from __future__ import annotations
+
+import pickle
+from dataclasses import FrozenInstanceError, replace
+from datetime import UTC, datetime
+
+import numpy as np
+import pytest
+
+from lmshealth.errors import BadLog
+from lmshealth.results import Channel, History, Log, Metadata, Modes
+from tests.signals import make_log
+
+
+def two_modes() -> Modes:
+    """Give two modes with a full covariance."""
+    rng = np.random.default_rng(1)
+    root = rng.normal(0, 0.01, (4, 4))
+    return Modes(
+        names=("roll", "pitch"),
+        sources=("acc", "acc"),
+        channels=("acc_0", "acc_0"),
+        ln_frequency=np.log([120.0, 135.0]),
+        ln_damping=np.log([0.02, 0.03]),
+        cov=root @ root.T,
+        snr=np.array([100.0, 50.0]),
+        lines=(),
+        refused=(),
+    )
+
+
+def history(**changes: object) -> History:
+    """Give a history of three logs of one mode."""
+    parts: dict[str, object] = {
+        "stage": "test-A",
+        "logs": ("a", "b", "c"),
+        "recorded_at": tuple(datetime(2026, 1, day, tzinfo=UTC) for day in (1, 2, 3)),
+        "travel": np.array([1000.0, 3000.0, 4000.0]),
+        "covariates": {},
+        "modes": ("roll",),
+        "ln_frequency": np.full((3, 1), np.log(100.0)),
+        "ln_damping": np.full((3, 1), np.log(0.02)),
+        "cov": np.tile(1e-6 * np.eye(2), (3, 1, 1)),
+        "baseline": 1,
+    }
+    return History(**(parts | changes))  # type: ignore[arg-type]
+
+
+def test_results_cannot_be_changed() -> None:
+    """Neither a field nor an element of an array of a result can be set."""
+    modes = two_modes()
+    with pytest.raises(FrozenInstanceError):
+        modes.names = ()  # type: ignore[misc]
+    for array in (modes.ln_frequency, modes.cov, history().travel):
+        with pytest.raises(ValueError, match="read-only"):
+            array.flat[0] = 0.0
+
+
+def test_modes_standard_deviations_are_first_order_of_the_logarithms() -> None:
+    """The std of f and ζ is the value times the std of its logarithm; the correlation is kept."""
+    modes = two_modes()
+    std = np.sqrt(np.diag(modes.cov))
+    np.testing.assert_allclose(modes.frequency, [120.0, 135.0])
+    np.testing.assert_allclose(modes.frequency_std, [120.0, 135.0] * std[:2])
+    np.testing.assert_allclose(modes.damping_ratio_std, [0.02, 0.03] * std[2:])
+    expected = [modes.cov[0, 2] / std[0] / std[2], modes.cov[1, 3] / std[1] / std[3]]
+    np.testing.assert_allclose(modes.correlation, expected)
+
+
+def test_modes_refuse_wrong_shapes_and_a_name_twice_in_one_source() -> None:
+    """A covariance of another size and a doubled name are refused; another source is another."""
+    modes = two_modes()
+    with pytest.raises(ValueError, match=r"cov has shape \(2, 2\), needed \(4, 4\)"):
+        replace(modes, cov=np.eye(2))
+    with pytest.raises(ValueError, match="not unique"):
+        replace(modes, names=("roll", "roll"))
+    assert replace(modes, names=("roll", "roll"), sources=("acc", "delta_e")).names[1] == "roll"
+
+
+def test_log_refuses_a_bad_sample_rate_and_channels_of_different_length() -> None:
+    """What would make every later number wrong is refused at birth."""
+    for rate in (0.0, -1.0, float("nan"), float("inf")):
+        with pytest.raises(ValueError, match="sample_rate"):
+            make_log({"acc_a": np.zeros(8)}, rate)
+    with pytest.raises(ValueError, match=r"lengths \[8, 9\]"):
+        make_log({"acc_a": np.zeros(8), "acc_b": np.zeros(9)}, 100.0, pieces=((0, 8),))
+    with pytest.raises(ValueError, match="shape"):
+        Channel("acc_a", "acceleration", np.zeros((2, 3)))
+    assert isinstance(make_log({"acc_a": np.zeros(8)}, 100.0), Log)
+
+
+def test_history_clock_starts_at_the_baseline() -> None:
+    """The clock is the odometer since the baseline log, negative before it."""
+    np.testing.assert_array_equal(history().clock(), [-2000.0, 0.0, 1000.0])
+
+
+def test_history_refuses_a_baseline_that_is_not_there_and_wrong_shapes() -> None:
+    """A baseline outside the logs and estimates of another shape are refused."""
+    with pytest.raises(ValueError, match="baseline is log 3 of 3"):
+        history(baseline=3)
+    with pytest.raises(ValueError, match="ln_damping"):
+        history(ln_damping=np.zeros((3, 2)))
+
+
+def test_metadata_of_two_logs_do_not_share_their_covariates() -> None:
+    """The default dictionary belongs to one log only."""
+    assert Metadata().covariates is not Metadata().covariates
+
+
+def test_bad_log_survives_the_way_back_from_a_worker() -> None:
+    """Pickled and unpickled, the error still carries log, reason and detail."""
+    error = pickle.loads(pickle.dumps(BadLog("a.h5", "corrupt", "cut off")))
+    assert (error.log, error.reason, error.detail) == ("a.h5", "corrupt", "cut off")
+    assert str(error) == "a.h5: corrupt: cut off"
