@@ -26,6 +26,7 @@ _WORST_STD_LN_F = 0.03
 _WORST_STD_LN_ZETA = 0.7
 # A damping off its start by more than this factor belongs to something else.
 _DAMPING_SPAN = 6.0
+_HEAVY = 0.1  # and above this, a hump that nobody expected is no mode
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -126,7 +127,7 @@ def fit_band(
     Returns
     -------
     fit : BandFit or None
-        None when the channel sees none of them.
+        None when the channel sees none of them; without modes where it sees lines only.
     missing : dict
         Reason and detail of each mode that is not in the fit, by name.
     """
@@ -157,7 +158,7 @@ def fit_band(
         return None, missing
     clarity = np.array([gains[target.name] for target in seen])
     fit = replace(fit, clarity=clarity, lines=_lines(spectra, masks))
-    return _keep_credible(fit, missing)
+    return _keep_credible(fit, missing), missing
 
 
 def _absent(view: View, target: Target, gain: float) -> tuple[str, str]:
@@ -173,10 +174,7 @@ def _screen(
 ) -> tuple[tuple[Target, ...], dict[str, float]]:
     """Drop modes without which the binned spectrum is described as well; refine start dampings."""
     scaled = min(
-        (
-            tuple(replace(t, damping_ratio=t.damping_ratio * c) for t in targets)
-            for c in (0.5, 1, 2)
-        ),
+        (tuple(_damped(target, c) for target in targets) for c in (0.5, 1.0, 2.0)),
         key=coarse.misfit,
     )
     kept = scaled
@@ -317,55 +315,60 @@ def _conclude(
 
 
 def _lines(spectra: tuple[Spectrum, ...], masks: list[BoolArray]) -> FloatArray:
-    """Frequency and amplitude of masked peaks of the longest segment; A = sqrt(2 I / T)."""
+    """Frequency and amplitude of what was masked in the longest segment, shape ``(n, 2)``."""
     longest = int(np.argmax([s.duration for s in spectra]))
     spectrum, mask = spectra[longest], masks[longest]
     edges = np.flatnonzero(np.diff(np.concatenate([[0], (~mask).astype(int), [0]])))
-    rows = []
-    for a, b in zip(edges[::2], edges[1::2], strict=True):
-        k = a + int(np.argmax(spectrum.periodogram[a:b]))
-        amplitude = np.sqrt(2 * spectrum.periodogram[k] / spectrum.duration)
-        rows.append((spectrum.frequency[k], amplitude))
+    rows = [spectrum.sine(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True)]
     return np.array(rows).reshape(-1, 2)
 
 
-def _keep_credible(
-    fit: BandFit, missing: dict[str, tuple[str, str]]
-) -> tuple[BandFit | None, dict[str, tuple[str, str]]]:
-    """Refuse modes whose estimate cannot be what it claims to be."""
+def _keep_credible(fit: BandFit, missing: dict[str, tuple[str, str]]) -> BandFit:
+    """Refuse modes whose estimate cannot be what it claims to be; what is a line becomes one."""
     m = len(fit.targets)
-    f, zeta = np.exp(fit.estimate[:m]), np.exp(fit.estimate[m:])
-    std = np.sqrt(np.diag(fit.cov))
-    duration = max(s.duration for s in fit.view.spectra)
-    keep = []
+    f = np.exp(fit.estimate[:m])
+    spectrum = max(fit.view.spectra, key=lambda s: s.duration)
+    keep, lines = [], [fit.lines]
     for i, target in enumerate(fit.targets):
         if target.settled is not None:
             continue
-        off = abs(np.log(f[i] / target.frequency))
-        low, high = (target.damping_ratio * c for c in (1 / _DAMPING_SPAN, _DAMPING_SPAN))
-        if 2 * zeta[i] * f[i] * duration < 1:
-            why = (
-                "line-not-mode",
-                f"{f[i]:.5g} Hz in {fit.view.channel} is narrower "
-                f"({2 * zeta[i] * f[i]:.2g} Hz) than a record of {duration:.3g} s resolves",
-            )
-        elif off > np.log1p(target.search) or not low < zeta[i] < high:
-            why = (
-                "outside-search",
-                f"the fit in {fit.view.channel} went to {f[i]:.5g} Hz, damping {zeta[i]:.2g}; "
-                f"sought within {100 * target.search:.0f} % of {target.frequency:.5g} Hz, "
-                f"damping from {low:.2g} to {high:.2g}",
-            )
-        elif std[i] > _WORST_STD_LN_F or std[m + i] > _WORST_STD_LN_ZETA:
-            why = (
-                "too-uncertain",
-                f"{f[i]:.5g} Hz in {fit.view.channel} is known to {100 * std[i]:.2g} % only, "
-                f"its damping to {100 * std[m + i]:.0f} %; record longer or excite more",
-            )
-        else:
-            keep.append(i)
+        why = _incredible(fit, i, spectrum.duration)
+        if why is None:
+            keep.append(target.name)
             continue
         missing[target.name] = why
-    if not keep:
-        return None, missing
-    return fit.only([fit.targets[i].name for i in keep]), missing
+        if why[0] == "line-not-mode":
+            k = int(np.searchsorted(spectrum.frequency, f[i]))
+            row = spectrum.sine(max(0, k - _LINE_BINS), k + _LINE_BINS + 1)
+            lines.append(np.array([row]))
+    return replace(fit.only(keep), lines=np.concatenate(lines))
+
+
+def _incredible(fit: BandFit, i: int, duration: float) -> tuple[str, str] | None:
+    """Say why a mode's estimate is not believed; None when it is."""
+    m = len(fit.targets)
+    target, channel = fit.targets[i], fit.view.channel
+    f, zeta = float(np.exp(fit.estimate[i])), float(np.exp(fit.estimate[m + i]))
+    std_f, std_zeta = np.sqrt(np.diag(fit.cov))[[i, m + i]].tolist()
+    low = target.damping_ratio / _DAMPING_SPAN
+    high = min(target.damping_ratio * _DAMPING_SPAN, max(_HEAVY, 2 * target.damping_ratio))
+    if 2 * zeta * f * duration < 1:
+        return (
+            "line-not-mode",
+            f"{f:.5g} Hz in {channel} is narrower ({2 * zeta * f:.2g} Hz) than a record of "
+            f"{duration:.3g} s resolves",
+        )
+    if abs(np.log(f / target.frequency)) > np.log1p(target.search) or not low < zeta < high:
+        return (
+            "outside-search",
+            f"the fit in {channel} went to {f:.5g} Hz, damping {zeta:.2g}; sought within "
+            f"{100 * target.search:.0f} % of {target.frequency:.5g} Hz, damping from {low:.2g} "
+            f"to {high:.2g}",
+        )
+    if std_f > _WORST_STD_LN_F or std_zeta > _WORST_STD_LN_ZETA:
+        return (
+            "too-uncertain",
+            f"{f:.5g} Hz in {channel} is known to {100 * std_f:.2g} % only, its damping to "
+            f"{100 * std_zeta:.0f} %; record longer or excite more",
+        )
+    return None

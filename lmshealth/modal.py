@@ -7,13 +7,14 @@ share the excitation, so that their errors are not independent and may not be av
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from lmshealth.bandfit import BAND, BandFit, View, fit_band
 from lmshealth.errors import BadLog
-from lmshealth.peaks import find_peaks
+from lmshealth.lines import name_lines
+from lmshealth.peaks import find_lines, find_peaks
 from lmshealth.results import Channel, Line, Log, Modes, Refusal
 from lmshealth.spectra import find_segments, periodogram
 from lmshealth.stage import Stage
@@ -23,8 +24,6 @@ from lmshealth.starts import Coarse, Target, coarsen, locate
 _MOST_TOGETHER = 4
 # Shortest useful segment: half-power bandwidth times duration.
 _LEAST_RESOLUTION = 2.0
-_MAINS = (50.0, 60.0)
-_MOST_HARMONICS = 10
 _TOP = 0.45  # of the sample rate: anti-alias filters reach below Nyquist
 
 
@@ -60,20 +59,25 @@ def identify(
         If no channel is left, or the record is too short or too slow for the modes.
     """
     used = _choose_channels(log, channels)
+    seen: list[tuple[str, float, float]] = []
     if stage is not None:
         targets = _stage_targets(stage, band)
         views = _transform(log, used, targets)
     else:
         views = _transform(log, used, ())
-        targets = _search(log, views, band)
-    fits: list[BandFit] = []
+        targets, seen = _search(log, views, band)
+    best: list[BandFit] = []
     refused: list[Refusal] = []
     for cluster in _clusters(targets):
-        found, missing = _identify_cluster(log, views, cluster, targets, known=stage is not None)
-        fits += found
-        refused += missing
-    modes = _collect(fits, _name_lines(log, stage, fits), (*log.refused, *refused))
-    return modes if stage is not None else _renumber(modes)
+        found = _fit_cluster(log, views, cluster, targets, known=stage is not None)
+        seen += [(fit.view.channel, *line) for fit in found.fits for line in fit.lines.tolist()]
+        best += found.best
+        refused += found.refused
+    resolution = 1.5 / max(s.duration for view in views for s in view.spectra)
+    lines = name_lines(seen, log, stage, resolution)
+    if stage is not None:
+        return _collect(best, lines, (*log.refused, *refused))
+    return _renumber(_collect(_distinct(best), lines, log.refused))
 
 
 def _choose_channels(log: Log, names: Sequence[str] | None) -> tuple[Channel, ...]:
@@ -136,7 +140,8 @@ def _transform(
 
 def _search(
     log: Log, views: tuple[View, ...], band: tuple[float, float] | None
-) -> tuple[Target, ...]:
+) -> tuple[tuple[Target, ...], list[tuple[str, float, float]]]:
+    """Find candidate modes, and lines that tower over them, in the band."""
     longest = max(s.duration for view in views for s in view.spectra)
     low, high = band or (20 / longest, _TOP * log.sample_rate)
     low, high = max(low, 2 / longest), min(high, _TOP * log.sample_rate)
@@ -148,7 +153,12 @@ def _search(
             f"{longest:.3g} s at {log.sample_rate:g} Hz hold {held:.0f} Fourier frequencies from "
             f"{low:.4g} to {high:.4g} Hz; needed are at least 50",
         )
-    return find_peaks(tuple(view.spectra for view in views), low, high)
+    lines = [
+        (view.channel, *line)
+        for view in views
+        for line in find_lines(max(view.spectra, key=lambda s: s.duration), low, high).tolist()
+    ]
+    return find_peaks(tuple(view.spectra for view in views), low, high), lines
 
 
 def _clusters(targets: tuple[Target, ...]) -> list[tuple[Target, ...]]:
@@ -163,14 +173,21 @@ def _clusters(targets: tuple[Target, ...]) -> list[tuple[Target, ...]]:
     return [tuple(group) for group in groups]
 
 
-def _identify_cluster(
+@dataclass(frozen=True, slots=True, eq=False)
+class _ClusterResult:
+    fits: list[BandFit]  # of every channel
+    best: list[BandFit]  # each mode once
+    refused: list[Refusal]
+
+
+def _fit_cluster(
     log: Log,
     views: tuple[View, ...],
     cluster: tuple[Target, ...],
     targets: tuple[Target, ...],
     *,
     known: bool,
-) -> tuple[list[BandFit], list[Refusal]]:
+) -> _ClusterResult:
     """Fit a cluster in every channel and keep each mode from the channel that knows it best."""
     reach = [target.search if known else 0.0 for target in cluster]
     low = min(t.band(BAND)[0] * (1 - r) for t, r in zip(cluster, reach, strict=True))
@@ -202,7 +219,7 @@ def _identify_cluster(
         for name, (reason, detail) in reasons.items()
         if name not in seen
     ]
-    return best, refused
+    return _ClusterResult(fits, best, refused)
 
 
 def _in_company(
@@ -246,31 +263,21 @@ def _best_channels(fits: list[BandFit], names: list[str]) -> list[BandFit]:
     ]
 
 
-def _name_lines(log: Log, stage: Stage | None, fits: list[BandFit]) -> tuple[Line, ...]:
-    """Tell what each line is: an order of the velocity, mains, or unknown."""
-    orders = () if stage is None else stage.description.order
-    bases = [(mains, "mains") for mains in _MAINS] + [
-        (abs(segment.velocity) / (order.wavelength_mm * 1e-3), order.name)
-        for order in orders
-        for segment in find_segments(log, 0.0)
+def _distinct(fits: list[BandFit]) -> list[BandFit]:
+    """Drop a found mode that another channel has found more clearly at the same place."""
+    rows = [
+        (float(fit.clarity[i]), float(fit.estimate[i]), float(np.exp(fit.estimate[m + i])), name)
+        for fit in fits
+        for m in [len(fit.targets)]
+        for i, name in enumerate(target.name for target in fit.targets)
     ]
-    lines = set()
-    for fit in fits:
-        resolution = 1.5 / max(s.duration for s in fit.view.spectra)
-        for frequency, amplitude in fit.lines.tolist():
-            kind = "unknown"
-            for base, name in bases:
-                if _is_harmonic(frequency, base, resolution):
-                    kind = name
-            lines.add(Line(frequency, amplitude, "m/s²", kind, fit.view.channel))
-    return tuple(sorted(lines, key=lambda line: (line.frequency, line.channel)))
-
-
-def _is_harmonic(frequency: float, base: float, resolution: float) -> bool:
-    # High harmonics of a slow order lie so close together that any line would be one.
-    if not base > 0 or not 1 <= (n := round(frequency / base)) <= _MOST_HARMONICS:
-        return False
-    return abs(frequency - n * base) < resolution
+    kept: list[tuple[float, float, float, str]] = []
+    for row in sorted(rows, reverse=True):
+        # Within half a half-power bandwidth of each other no two modes can be told apart.
+        if all(abs(row[1] - other[1]) > 0.5 * (row[2] + other[2]) for other in kept):
+            kept.append(row)
+    names = {row[3] for row in kept}
+    return [fit.only([t.name for t in fit.targets if t.name in names]) for fit in fits]
 
 
 def _collect(fits: list[BandFit], lines: tuple[Line, ...], refused: tuple[Refusal, ...]) -> Modes:
@@ -303,13 +310,9 @@ def _collect(fits: list[BandFit], lines: tuple[Line, ...], refused: tuple[Refusa
 
 
 def _renumber(modes: Modes) -> Modes:
-    """Name found modes in ascending order; candidates that were refused leave no gap.
+    """Name found modes in ascending order.
 
-    A peak that turned out to be no mode was our own idea, not the user's question: it is not
-    worth a refusal.
+    Candidates that turned out to be no modes leave no gap and no refusal: they were our own idea,
+    not the user's question.
     """
-    return replace(
-        modes,
-        names=tuple(f"mode_{number}" for number in range(1, len(modes.names) + 1)),
-        refused=tuple(refusal for refusal in modes.refused if not refusal.mode),
-    )
+    return replace(modes, names=tuple(f"mode_{n}" for n in range(1, len(modes.names) + 1)))

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
-from lmshealth.results import FloatArray
+from lmshealth.results import BoolArray, FloatArray
 from lmshealth.spectra import Spectrum
 from lmshealth.starts import Target
 
 # Half widths of the sought peaks, as fractions of the frequency: about 1.5 damping ratios.
-_SCALES = (0.003, 0.006, 0.012, 0.024, 0.048)
+_SCALES = (0.001, 0.002, 0.004, 0.008, 0.016, 0.032, 0.064)
 _THRESHOLD = 6.0
-_LEAST_ORDINATES = 6
+_LEAST_ORDINATES = 4
+_TOWERING = 60.0
+_BESIDE = (3, 4, 5, 6, 7, 8)
 
 
 def find_peaks(
@@ -20,8 +24,9 @@ def find_peaks(
     """List candidate modes of all channels in a band, ascending in frequency.
 
     At every frequency and scale the mean of the ordinates within the scale is compared with the
-    means beside it on the left and on the right; a resonance stands out against both. Candidates
-    are only starts: the identification accepts or refuses them.
+    means beside it on the left and on the right; a resonance stands out against both. It does so
+    at its own scale and, by its skirts, at wider ones: the narrowest scale at which it is beyond
+    doubt counts. Candidates are only starts: the identification accepts or refuses them.
 
     Parameters
     ----------
@@ -32,12 +37,12 @@ def find_peaks(
     """
     found: list[tuple[float, float, float]] = []
     for spectra in channels:
-        longest = max(spectra, key=lambda spectrum: spectrum.duration)
+        longest = _without_lines(max(spectra, key=lambda spectrum: spectrum.duration))
         for scale in _SCALES:
             found += _stand_out(longest, low, high, scale)
     chosen: list[tuple[float, float, float]] = []
-    for score, frequency, scale in sorted(found, reverse=True):
-        # The same resonance answers at neighbouring scales and channels; the clearest one counts.
+    for score, frequency, scale in sorted(found, key=lambda c: (c[2], -c[0])):
+        # The same resonance answers at other scales and in other channels.
         if all(abs(frequency - f) > max(scale, s) * f for _, f, s in chosen):
             chosen.append((score, frequency, scale))
     return tuple(
@@ -63,9 +68,7 @@ def _stand_out(
     centre = centre[2 * scale * centre >= _LEAST_ORDINATES * step]
     if centre.size < 3:
         return []
-    # Clip what no exponential variable reaches, so that a line does not pose as a resonance.
-    smooth = _running_median(spectrum.periodogram)
-    total = np.concatenate([[0.0], np.cumsum(np.minimum(spectrum.periodogram, 12 * smooth))])
+    total = np.concatenate([[0.0], np.cumsum(spectrum.periodogram)])
 
     def mean(a: FloatArray, b: FloatArray) -> tuple[FloatArray, FloatArray]:
         first = np.searchsorted(spectrum.frequency, a)
@@ -86,10 +89,43 @@ def _stand_out(
     return [(float(contrast[i]), float(centre[i]), scale) for i in index]
 
 
-def _running_median(values: FloatArray, half: int = 10) -> FloatArray:
-    """Median of blocks of ordinates, repeated to full length: a robust local level."""
-    size = 2 * half + 1
-    n_blocks = max(1, values.size // size)
-    blocks = np.array_split(values, n_blocks)
-    level = [max(float(np.median(block)), 1e-300) for block in blocks]
-    return np.repeat(level, [block.size for block in blocks])
+def find_lines(spectrum: Spectrum, low: float, high: float) -> FloatArray:
+    """List lines that tower over their surroundings.
+
+    Parameters
+    ----------
+    spectrum : Spectrum
+        One segment of a channel.
+    low, high : float
+        Band in Hz.
+
+    Returns
+    -------
+    ndarray
+        Frequency in Hz and amplitude in m/s² of each, shape ``(n_lines, 2)``.
+    """
+    mask, _ = _towering(spectrum)
+    inside = (spectrum.frequency >= low) & (spectrum.frequency <= high)
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], (mask & inside).astype(int), [0]])))
+    rows = [spectrum.sine(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True)]
+    return np.array(rows).reshape(-1, 2)
+
+
+def _towering(spectrum: Spectrum) -> tuple[BoolArray, FloatArray]:
+    """Ordinates that tower over those three to eight beside them, and the median of these.
+
+    A resonance is several ordinates wide and its own neighbours are high; a sine has none.
+    """
+    widest = _BESIDE[-1]
+    padded = np.pad(spectrum.periodogram, widest, mode="reflect")
+    n = spectrum.periodogram.size
+    beside = [padded[widest + k : widest + k + n] for b in _BESIDE for k in (-b, b)]
+    level = np.median(beside, axis=0)
+    towering = spectrum.periodogram > _TOWERING * level
+    # The foot of a line that falls between two ordinates is two more wide.
+    return np.convolve(towering, np.ones(5), mode="same") > 0, np.asarray(level)
+
+
+def _without_lines(spectrum: Spectrum) -> Spectrum:
+    mask, level = _towering(spectrum)
+    return replace(spectrum, periodogram=np.where(mask, level, spectrum.periodogram))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import multiprocessing
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Executor, ProcessPoolExecutor, as_completed
+from concurrent.futures import BrokenExecutor, Executor, ProcessPoolExecutor, as_completed
 from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import date
@@ -122,17 +122,16 @@ def run(
     found = [path for path in archive.logs if inside not in path.resolve().parents]
     store = Store(settings.store or f"sqlite:///{(out / 'lmshealth.sqlite').as_posix()}")
     try:
+        actions = read_maintenance(folder)
+        tasks, refused = _tasks(folder, found, stages, progress)
+        outcomes, n_remembered = _identify_all(tasks, stages, store, settings.workers, progress)
+        readings = in_order([o for o in outcomes if isinstance(o, Reading)])
         with _workers(settings.workers) as pool:
-            tasks, refused = _tasks(folder, found, stages, progress)
-            refused = [*archive.refused, *refused]
-            outcomes, n_remembered = _identify_all(tasks, stages, store, pool, progress)
-            readings = in_order([o for o in outcomes if isinstance(o, Reading)])
-            lost = [r for o in outcomes if not isinstance(o, Reading) for r in o]
-            actions = read_maintenance(folder)
             assessments = _assess_all(readings, stages, actions, settings, pool, progress)
     finally:
         store.close()
-    whole = [*refused, *lost]
+    lost = [r for outcome in outcomes if not isinstance(outcome, Reading) for r in outcome]
+    whole = [*archive.refused, *refused, *lost]
     partial = [r for reading in readings for r in reading.modes.refused]
     order = [r for a in assessments for r in a.refused if r.reason == "odometer-backwards"]
     tables = all_tables(readings, assessments, [*whole, *partial, *order])
@@ -219,7 +218,7 @@ def _identify_all(
     tasks: Sequence[_Task],
     stages: Sequence[Stage],
     store: Store,
-    pool: Executor | None,
+    workers: int,
     progress: Progress,
 ) -> tuple[list[Outcome], int]:
     """Identify all logs that the store does not know; results in the order of the tasks."""
@@ -231,7 +230,7 @@ def _identify_all(
     n_remembered = len(outcomes)
     progress("identifying", n_remembered, len(tasks))
     open_tasks = [task for task in tasks if task.key not in outcomes]
-    for task, outcome in _carry_out(open_tasks, tuple(stages), pool):
+    for task, outcome in _carry_out(open_tasks, tuple(stages), workers):
         store.put(task.key, task.name, outcome)
         outcomes[task.key] = outcome
         progress("identifying", len(outcomes), len(tasks))
@@ -239,15 +238,46 @@ def _identify_all(
 
 
 def _carry_out(
-    tasks: Sequence[_Task], stages: tuple[Stage, ...], pool: Executor | None
+    tasks: Sequence[_Task], stages: tuple[Stage, ...], workers: int
 ) -> Iterator[tuple[_Task, Outcome]]:
-    if pool is None:
+    """Identify logs in the order in which they are done.
+
+    A library that a damaged file crashes takes its process along. The logs that were under way
+    are then done again, each in a process of its own, so that only the one is lost.
+    """
+    if workers <= 1 or len(tasks) <= 1:
         for task in tasks:
             yield task, identify_log(task, stages)
         return
-    futures = {pool.submit(identify_log, task, stages): task for task in tasks}
-    for future in as_completed(futures):
-        yield futures[future], future.result()
+    left = list(tasks)
+    while left:
+        done: set[str] = set()
+        try:
+            with _workers(workers) as pool:
+                assert pool is not None  # more than one worker
+                futures = {pool.submit(identify_log, task, stages): task for task in left}
+                for future in as_completed(futures):
+                    outcome = future.result()
+                    done.add(futures[future].key)
+                    yield futures[future], outcome
+            return
+        except BrokenExecutor:
+            left = [task for task in left if task.key not in done]
+            # Tasks are begun in order: the one that did it is among the first.
+            suspects, left = left[: 2 * workers + 1], left[2 * workers + 1 :]
+            for task in suspects:
+                yield task, _alone(task, stages)
+
+
+def _alone(task: _Task, stages: tuple[Stage, ...]) -> Outcome:
+    """Identify one log in a process of its own, and survive that process."""
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(1, mp_context=context) as pool:
+        try:
+            return pool.submit(identify_log, task, stages).result()
+        except BrokenExecutor:
+            detail = "reading it ended the process that read it: the file is damaged, or too large"
+            return (Refusal(task.name, "corrupt", detail),)
 
 
 def identify_log(task: _Task, stages: tuple[Stage, ...]) -> Outcome:

@@ -64,6 +64,12 @@ class Spectrum:
         cut = slice(int(first), int(last))
         return Spectrum(self.frequency[cut], self.periodogram[cut], self.duration, self.velocity)
 
+    def sine(self, first: int, last: int) -> tuple[float, float]:
+        """Frequency in Hz and amplitude of a sine within some ordinates: Σ I = A² T / 2."""
+        ordinates = self.periodogram[first:last]
+        amplitude = np.sqrt(2 * ordinates.sum() / self.duration)
+        return float(self.frequency[first + int(np.argmax(ordinates))]), float(amplitude)
+
 
 def find_segments(log: Log, shortest: float) -> tuple[Segment, ...]:
     """Cut a log into stretches without gaps and at constant set velocity.

@@ -177,8 +177,8 @@ MACHINE = "test-A"
 _RATE, _SECONDS = 500.0, 20.0
 
 
-def write_archive_stage(folder: Path) -> Path:
-    """Write the description of the archive's machine and its map; give the path."""
+def write_archive_stage(folder: Path, *, health: bool = True) -> Path:
+    """Write the description of the archive's machine, with its map or only its modes."""
     folder.mkdir(parents=True, exist_ok=True)
     lines = ["guide_preload,mode,frequency_hz"]
     for preload in np.geomspace(0.2, 2.0, 12).tolist():
@@ -189,11 +189,16 @@ def write_archive_stage(folder: Path) -> Path:
     for name, frequency, damping, _ in ARCHIVE_MODES:
         text += ["[[mode]]", f'name = "{name}"', f"frequency_hz = {frequency}"]
         text += [f"damping_ratio = {damping}"]
+    path = folder / "small.toml"
+    if not health:
+        path.write_text("\n".join(text) + "\n")
+        return path
     text += ["[[parameter]]", 'name = "guide_preload"', "limit = { below = 0.6 }"]
     text += ['prior = { kind = "lognormal", median = 1.0, sigma = 0.3 }']
-    text += ['law = { kind = "linear", rate_per_km = { kind = "uniform", low = -5e-4, high = 2e-3 } }']
+    text += [
+        'law = { kind = "linear", rate_per_km = { kind = "uniform", low = -5e-4, high = 2e-3 } }'
+    ]
     text += ["[map]", 'file = "small.map.csv"', "[decision]", "max_risk = 0.05"]
-    path = folder / "small.toml"
     path.write_text("\n".join(text) + "\n")
     return path
 

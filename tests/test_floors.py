@@ -13,6 +13,7 @@ FLOORS = [
     {"readers", "spectra", "priors", "modalmap"},
     {"laws", "whittle", "starts"},
     {"stage", "peaks", "bandfit"},
+    {"lines"},
     {"modal", "history", "sampling"},
     {"tracking", "maintenance"},
     {"inference"},

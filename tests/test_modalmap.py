@@ -62,8 +62,7 @@ def test_the_order_of_rows_and_columns_does_not_matter(tmp_path: Path, small: Mo
 
 
 def test_leave_out_error_tells_a_map_that_is_not_smooth(tmp_path: Path) -> None:
-    """A kink of 1 % between grid points shows in the error of the mode that has it, not the other.
-    """
+    """A kink of 1 % between grid points shows in the error of the mode that has it, not the other."""
     head, *rows = map_rows(NAMES)
     kinked = []
     for row in rows:

@@ -226,8 +226,7 @@ def test_short_records_average_to_the_expected_periodogram() -> None:
     mode, noise, n, n_records = Mode(100.0, 0.01), 0.5, 4000, 400
     rng = np.random.default_rng(8)
     spectra = [
-        whole(accelerations(rng, [mode], n, RATE, noise)[0]).band(90, 110)
-        for _ in range(n_records)
+        whole(accelerations(rng, [mode], n, RATE, noise)[0]).band(90, 110) for _ in range(n_records)
     ]
     mean = np.mean([spectrum.periodogram for spectrum in spectra], axis=0)
     frequency, duration = spectra[0].frequency, spectra[0].duration

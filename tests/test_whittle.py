@@ -70,7 +70,9 @@ def test_derivatives_are_those_of_the_value(m: int, duration: float) -> None:
     gradient, hessian = target.derivatives(p)
     step = 1e-5 * np.eye(p.size)
     by_value = [(target.value(p + h) - target.value(p - h)) / 2e-5 for h in step]
-    by_gradient = [(target.derivatives(p + h)[0] - target.derivatives(p - h)[0]) / 2e-5 for h in step]
+    by_gradient = [
+        (target.derivatives(p + h)[0] - target.derivatives(p - h)[0]) / 2e-5 for h in step
+    ]
     np.testing.assert_allclose(gradient, by_value, atol=2e-6 * np.abs(gradient).max())
     size = np.sqrt(np.outer(np.diag(hessian), np.diag(hessian)).clip(1.0))
     np.testing.assert_allclose(hessian / size, np.array(by_gradient) / size, atol=1e-6)

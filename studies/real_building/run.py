@@ -30,7 +30,6 @@ import h5py
 import numpy as np
 import pandas as pd
 
-sys.path.insert(0, str(Path(__file__).parents[2]))
 from studies.real_building.make_map import PUBLISHED
 from studies.record import Stopwatch, clopper_pearson, keep
 

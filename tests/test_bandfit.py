@@ -1,0 +1,137 @@
+"""A cluster in one channel: which modes it shows, which it does not, and the lines it hides."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+
+from lmshealth.bandfit import BandFit, View, fit_band
+from lmshealth.spectra import Segment, periodogram
+from lmshealth.starts import Coarse, Target, coarsen
+from tests.signals import Mode, accelerations, make_log, sine, white
+
+RATE = 1000.0
+ROLL, PITCH = Target("roll", 105.0, 0.015, 0.15), Target("pitch", 125.0, 0.02, 0.15)
+
+
+def view_of(values: np.ndarray) -> tuple[View, Coarse]:
+    """Transform a channel, and bin it around the modes of these tests."""
+    (channel,) = make_log({"acc_a": values}, RATE).channels
+    spectra = (periodogram(channel, Segment(0, values.size, float("nan")), RATE),)
+    return View("acc_a", "acc", spectra), coarsen(spectra, 75.0, 165.0, 0.8)
+
+
+def fit(
+    values: np.ndarray, targets: Sequence[Target]
+) -> tuple[BandFit | None, dict[str, tuple[str, str]]]:
+    """Fit targets to the samples of a channel."""
+    view, coarse = view_of(values)
+    return fit_band(view, coarse, tuple(targets))
+
+
+def both(seed: int = 1, n: int = 60_000) -> np.ndarray:
+    """Give a channel that shows both modes."""
+    modes = [Mode(105.0, 0.015), Mode(125.0, 0.02)]
+    return accelerations(np.random.default_rng(seed), modes, n, RATE, 0.5)[0]
+
+
+def test_both_modes_are_fitted_with_their_truth_inside_four_sigma() -> None:
+    """Frequency and damping of both are within 4 standard deviations of the truth."""
+    found, missing = fit(both(), [ROLL, PITCH])
+    assert found is not None
+    assert missing == {}
+    truth = np.log([105.0, 125.0, 0.015, 0.02])
+    off = (found.estimate - truth) / np.sqrt(np.diag(found.cov))
+    assert np.abs(off).max() < 4
+    assert np.sqrt(np.diag(found.cov))[:2].max() < 2e-3
+
+
+def test_snr_is_the_modal_signal_to_noise_ratio() -> None:
+    """S / (4 ζ² S_e) is found within 40 % where the noise shows between the modes."""
+    modes = [Mode(105.0, 0.015), Mode(125.0, 0.02)]
+    found, _ = fit(
+        accelerations(np.random.default_rng(6), modes, 60_000, RATE, 20.0)[0], [ROLL, PITCH]
+    )
+    assert found is not None
+    np.testing.assert_allclose(found.snr, [mode.snr(20.0) for mode in modes], rtol=0.4)
+
+
+def test_a_mode_that_is_not_there_is_refused_and_the_other_kept() -> None:
+    """Without excitation of pitch the fit holds roll alone, and the reason names both facts."""
+    values = accelerations(np.random.default_rng(2), [Mode(105.0, 0.015)], 60_000, RATE, 0.5)[0]
+    found, missing = fit(values, [ROLL, PITCH])
+    assert found is not None
+    assert [target.name for target in found.targets] == ["roll"]
+    reason, detail = missing["pitch"]
+    assert reason == "not-excited"
+    assert "acc_a" in detail
+    assert "125 Hz" in detail
+
+
+def test_noise_alone_has_no_fit() -> None:
+    """White noise shows none of the modes, and says so for each."""
+    found, missing = fit(white(np.random.default_rng(3), 1.0, 60_000, RATE), [ROLL, PITCH])
+    assert found is None
+    assert {name: reason for name, (reason, _) in missing.items()} == {
+        "roll": "not-excited",
+        "pitch": "not-excited",
+    }
+
+
+def test_a_line_is_kept_out_and_listed_with_its_amplitude() -> None:
+    """A line on the flank of a mode is masked; its amplitude is read within 10 %."""
+    values = both() + sine(60_000, RATE, 110.0, 30.0)
+    found, _ = fit(values, [ROLL, PITCH])
+    clean, _ = fit(both(), [ROLL, PITCH])
+    assert found is not None
+    assert clean is not None
+    assert clean.lines.shape == (0, 2)
+    ((frequency, amplitude),) = found.lines
+    assert frequency == pytest.approx(110.0, abs=0.02)
+    assert amplitude == pytest.approx(30.0, rel=0.1)
+    off = (found.estimate - clean.estimate) / np.sqrt(np.diag(clean.cov))
+    assert np.abs(off).max() < 1
+
+
+def test_a_mode_far_from_where_it_is_sought_is_not_taken() -> None:
+    """A resonance 19 % above a search of ±5 % is not reported under the sought name."""
+    target = Target("roll", 105.0, 0.015, 0.05)
+    values = accelerations(np.random.default_rng(4), [Mode(125.0, 0.02)], 60_000, RATE, 0.5)[0]
+    found, missing = fit(values, [target])
+    assert found is None
+    assert set(missing) == {"roll"}
+
+
+def test_too_few_ordinates_are_named_with_their_number() -> None:
+    """A quarter of a second is too short even for a mode beyond doubt; its frequencies count."""
+    (_, coarse), (view, _) = view_of(both()), view_of(both(n=250))
+    found, missing = fit_band(view, coarse, (ROLL,))
+    assert found is None
+    reason, detail = missing["roll"]
+    assert reason == "too-short"
+    assert "needed 16" in detail
+
+
+def test_keeping_some_modes_marginalises_the_others() -> None:
+    """The covariance of what is kept is the block of the whole; the names follow."""
+    found, _ = fit(both(), [ROLL, PITCH])
+    assert found is not None
+    kept = found.only(["pitch"])
+    assert [target.name for target in kept.targets] == ["pitch"]
+    np.testing.assert_array_equal(kept.estimate, found.estimate[[1, 3]])
+    np.testing.assert_array_equal(kept.cov, found.cov[np.ix_([1, 3], [1, 3])])
+    np.testing.assert_array_equal(kept.snr, found.snr[[1]])
+
+
+def test_the_clearer_channel_has_the_higher_clarity() -> None:
+    """The log likelihood a mode gains is larger where its noise is lower."""
+    modes = [Mode(105.0, 0.015)]
+    clear, blurred = (
+        fit(accelerations(np.random.default_rng(5), modes, 60_000, RATE, noise)[0], [ROLL])[0]
+        for noise in (0.1, 10.0)
+    )
+    assert clear is not None
+    assert blurred is not None
+    assert clear.clarity[0] > blurred.clarity[0] > 0

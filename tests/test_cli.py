@@ -1,0 +1,307 @@
+"""The command line: exit statuses, one line of error, and the three formats of the contract."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner, Result
+
+from lmshealth.cli import main
+from lmshealth.tables import COLUMNS
+from tests.signals import Mode, accelerations, write_archive, write_archive_stage, write_log
+
+MODE_KEYS = set(COLUMNS["modes"].split())
+
+
+def call(*arguments: object) -> Result:
+    """Run the command line in this process."""
+    return CliRunner().invoke(main, [str(argument) for argument in arguments])
+
+
+def strict(text: str) -> dict[str, list[dict[str, object]]]:
+    """Parse JSON and refuse NaN and infinity, which JSON does not have."""
+
+    def refuse(name: str) -> None:
+        raise ValueError(f"{name} is no JSON")
+
+    content = json.loads(text, parse_constant=refuse)
+    assert isinstance(content, dict)
+    return content
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Make two good logs, a broken one, one without metadata, and a description of modes."""
+    root = tmp_path_factory.mktemp("cli")
+    write_archive(root / "good", 2)
+    write_archive_stage(root / "stage", health=False)
+    (root / "bad").mkdir()
+    (root / "bad" / "broken.h5").write_bytes(b"nothing")
+    values = "\n".join(f"{v!r}" for v in _noise())
+    (root / "bare.csv").write_text("# sample_rate_hz: 500\nacc_x_m_s2\n" + values + "\n")
+    return root
+
+
+def _noise() -> list[float]:
+    """Give 16 s of one mode at 62 Hz."""
+    rng = np.random.default_rng(5)
+    return [float(v) for v in accelerations(rng, [Mode(62.0, 0.02)], 8000, 500.0, 0.5)[0]]
+
+
+@pytest.fixture
+def stage(folder: Path) -> Path:
+    """Give the path of the description."""
+    return folder / "stage" / "small.toml"
+
+
+# Help and usage
+
+
+def test_every_command_has_help_with_an_example() -> None:
+    """``--help`` of each command shows how it is called."""
+    assert set(main.commands) >= {"run", "modes"}
+    for name in main.commands:
+        result = call(name, "--help")
+        assert result.exit_code == 0
+        assert "Example" in result.stdout
+        assert f"lmshealth {name} " in result.stdout
+
+
+def test_the_exit_statuses_are_told() -> None:
+    """The help of the program names its exit statuses; -h is help too."""
+    result = call("-h")
+    assert result.exit_code == 0
+    assert "Exit status" in result.stdout
+
+
+def test_the_version_is_told() -> None:
+    """``--version`` prints the version of the package."""
+    from lmshealth import __version__
+
+    assert __version__ in call("--version").stdout
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ("run",),
+        ("run", "."),
+        ("run", ".", "--stage", "lms-y"),
+        ("run", "no-such-folder", "--stage", "lms-y", "--out", "out"),
+        ("run", ".", "--stage", "lms-y", "--out", "out", "--workers", "0"),
+        ("run", ".", "--stage", "lms-y", "--out", "out", "--epochs", "none"),
+        ("modes",),
+        ("modes", "log.h5", "--format", "yaml"),
+        ("modes", "log.h5", "--band", "200", "80"),
+        ("modes", "log.h5", "--band", "-5", "80"),
+        ("modes", "log.h5", "--nonsense"),
+        ("nonsense",),
+    ],
+)
+def test_wrong_usage_is_status_2(arguments: tuple[str, ...]) -> None:
+    """What is wrongly asked is said on standard error with status 2."""
+    result = call(*arguments)
+    assert result.exit_code == 2
+    assert "Error" in result.stderr
+    assert result.stdout == ""
+
+
+# modes
+
+
+def test_modes_as_json_have_the_keys_of_the_contract(folder: Path, stage: Path) -> None:
+    """Modes, lines and refused are lists of objects with at least the contract's keys."""
+    log = folder / "good" / "log-00.h5"
+    result = call("modes", log, "--stage", stage, "--format", "json")
+    assert result.exit_code == 0
+    content = strict(result.stdout)
+    assert set(content) == {"modes", "lines", "refused"}
+    assert [mode["mode"] for mode in content["modes"]] == ["roll", "pitch"]
+    assert all(set(mode) >= MODE_KEYS for mode in content["modes"])
+    assert content["modes"][0]["frequency_hz"] == pytest.approx(62.0, rel=0.01)
+
+
+def test_modes_of_a_bare_log_have_nulls_and_need_no_metadata(folder: Path) -> None:
+    """A log of samples and a rate alone is analysed; what it does not say is null."""
+    result = call("modes", folder / "bare.csv", "--band", 30, 200, "--format", "json")
+    assert result.exit_code == 0
+    (mode,) = strict(result.stdout)["modes"]
+    assert mode["mode"] == "mode_1"
+    assert mode["stage"] is None
+    assert mode["travel_km"] is None
+    assert mode["frequency_hz"] == pytest.approx(62.0, rel=0.02)
+
+
+def test_modes_as_csv_have_the_columns_of_the_contract(folder: Path, stage: Path) -> None:
+    """One header and one row per mode and log, parsed by any reader."""
+    logs = sorted((folder / "good").glob("*.h5"))
+    result = call("modes", *logs, "--stage", stage, "--format", "csv")
+    rows = list(csv.DictReader(io.StringIO(result.stdout)))
+    assert result.exit_code == 0
+    assert set(rows[0]) >= MODE_KEYS
+    assert [(Path(row["log"]).name, row["mode"]) for row in rows] == [
+        (name, mode) for name in ("log-00.h5", "log-01.h5") for mode in ("roll", "pitch")
+    ]
+
+
+def test_modes_as_a_table_name_frequency_and_damping(folder: Path, stage: Path) -> None:
+    """People get a table; it is the default."""
+    result = call("modes", folder / "good" / "log-00.h5", "--stage", stage)
+    assert result.exit_code == 0
+    assert "roll" in result.stdout
+    assert "±" in result.stdout
+
+
+def test_a_refused_mode_alone_is_still_status_0(folder: Path, stage: Path) -> None:
+    """A mode that this log does not show is listed with its reason, and nothing failed."""
+    result = call("modes", folder / "bare.csv", "--stage", stage, "--format", "json")
+    content = strict(result.stdout)
+    assert result.exit_code == 0
+    assert [mode["mode"] for mode in content["modes"]] == ["roll"]
+    (refused,) = content["refused"]
+    assert refused["mode"] == "pitch"
+    assert {"log", "channel", "mode", "reason"} <= set(refused)
+
+
+def test_some_bad_logs_are_status_3_and_all_bad_are_1(folder: Path, stage: Path) -> None:
+    """One line on standard error per bad log; standard output stays what the format says."""
+    good, bad = folder / "good" / "log-00.h5", folder / "bad" / "broken.h5"
+    some = call("modes", good, bad, "--stage", stage, "--format", "json")
+    assert some.exit_code == 3
+    assert len(strict(some.stdout)["modes"]) == 2
+    assert len(some.stderr.splitlines()) == 1
+    assert "broken.h5" in some.stderr
+    none = call("modes", bad, folder / "no-such.h5", "--stage", stage, "--format", "json")
+    assert none.exit_code == 1
+    assert {row["log"] for row in strict(none.stdout)["refused"]} == {
+        str(bad),
+        str(folder / "no-such.h5"),
+    }
+
+
+def test_chosen_channels_and_column_maps_reach_the_analysis(folder: Path, tmp_path: Path) -> None:
+    """A foreign export is read through its map; an unknown channel is a bad log, not a crash."""
+    text = (folder / "bare.csv").read_text().replace("acc_x_m_s2", "CH1")
+    (tmp_path / "export.csv").write_text(text)
+    (tmp_path / "map.toml").write_text('[columns]\nacc_pitch_m_s2 = "CH1"\n')
+    arguments = ("--columns", tmp_path / "map.toml", "--band", 30, 200, "--format", "json")
+    result = call("modes", tmp_path / "export.csv", *arguments)
+    assert result.exit_code == 0
+    assert strict(result.stdout)["modes"][0]["channel"] == "acc_pitch"
+    unknown = call("modes", tmp_path / "export.csv", *arguments, "--channels", "acc_yaw")
+    assert unknown.exit_code == 1
+    assert "acc_pitch" in unknown.stderr
+
+
+def test_the_program_runs_as_a_process(folder: Path, stage: Path) -> None:
+    """From a shell: JSON on standard output, nothing on standard error, status 0."""
+    start = [sys.executable, "-c", "from lmshealth.cli import main; main()"]
+    log = folder / "good" / "log-00.h5"
+    done = subprocess.run(
+        [*start, "modes", str(log), "--stage", str(stage), "--format", "json"],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert (done.returncode, done.stderr) == (0, "")
+    assert len(strict(done.stdout)["modes"]) == 2
+
+
+# run
+
+
+def run(logs: Path, stage: Path | str, out: Path) -> Result:
+    """Run the main job with one worker."""
+    return call("run", logs, "--stage", stage, "--out", out, "--workers", 1)
+
+
+def test_a_clean_run_is_status_0_and_says_where_its_report_is(
+    folder: Path, stage: Path, tmp_path: Path
+) -> None:
+    """The count of logs, a line per stage and the front page; no bar where no terminal is."""
+    result = run(folder / "good", stage, tmp_path / "out")
+    assert result.exit_code == 0
+    assert "2 of 2 logs analysed" in result.stdout
+    assert "test-A: not-enough-data" in result.stdout
+    assert str(tmp_path / "out" / "index.html") in result.stdout
+    assert result.stderr == ""
+    again = run(folder / "good", stage, tmp_path / "out")
+    assert "2 of them known from before" in again.stdout
+
+
+def test_a_run_with_a_bad_log_is_status_3(folder: Path, stage: Path, tmp_path: Path) -> None:
+    """Others are analysed, and refused.csv has the reason."""
+    logs = write_archive(tmp_path / "logs", 1)
+    (logs / "broken.h5").write_bytes(b"nothing")
+    result = run(logs, stage, tmp_path / "out")
+    assert result.exit_code == 3
+    assert "1 of 2 logs analysed" in result.stdout
+    (row,) = csv.DictReader((tmp_path / "out" / "refused.csv").read_text().splitlines())
+    assert row["log"] == "broken.h5"
+
+
+def test_a_run_of_bad_logs_only_is_status_1_with_one_line(
+    folder: Path, stage: Path, tmp_path: Path
+) -> None:
+    """One line on standard error; refused.csv is written all the same."""
+    result = run(folder / "bad", stage, tmp_path / "out")
+    assert result.exit_code == 1
+    assert result.stdout == ""
+    assert len(result.stderr.splitlines()) == 1
+    assert result.stderr.startswith("lmshealth: ")
+    assert "broken.h5" in (tmp_path / "out" / "refused.csv").read_text()
+
+
+def test_a_log_that_no_description_takes_is_refused(stage: Path, tmp_path: Path) -> None:
+    """A machine without a description is ``no-stage``, and says which there are."""
+    logs = tmp_path / "logs"
+    write_log(logs / "foreign.h5", 1.0, 1, stage="other-Z")
+    assert run(logs, stage, tmp_path / "out").exit_code == 1
+    (row,) = csv.DictReader((tmp_path / "out" / "refused.csv").read_text().splitlines())
+    assert row["reason"] == "no-stage"
+    assert "*-A" in row["detail"]
+
+
+@pytest.mark.parametrize("reference", ["lms-q", "nowhere/stage.toml"])
+def test_an_unknown_stage_is_status_1_with_one_line(
+    folder: Path, tmp_path: Path, reference: str
+) -> None:
+    """The line names the description that is not there."""
+    for arguments in (
+        ("run", folder / "good", "--stage", reference, "--out", tmp_path / "out"),
+        ("modes", folder / "good" / "log-00.h5", "--stage", reference),
+    ):
+        result = call(*arguments)
+        assert result.exit_code == 1
+        assert reference in result.stderr
+        assert len(result.stderr.splitlines()) == 1
+
+
+def test_a_store_that_cannot_be_opened_is_status_1(
+    folder: Path, stage: Path, tmp_path: Path
+) -> None:
+    """One line names the store without its password."""
+    result = call(
+        "run", folder / "good", "--stage", stage, "--out", tmp_path / "out",
+        "--workers", 1, "--store", "nosuch://me:hunter2@host/db",
+    )  # fmt: skip
+    assert result.exit_code == 1
+    assert "hunter2" not in result.stderr
+    assert len(result.stderr.splitlines()) == 1
+
+
+def test_a_bad_description_is_status_1_with_one_line(folder: Path, tmp_path: Path) -> None:
+    """A typing slip in a description is named."""
+    bad = tmp_path / "bad.toml"
+    bad.write_text('name = "x"\n[[mode]]\nname = "roll"\nfrequenzy_hz = 3\ndamping_ratio = 0.1\n')
+    result = call("modes", folder / "good" / "log-00.h5", "--stage", bad)
+    assert result.exit_code == 1
+    assert "frequenzy_hz" in result.stderr
+    assert len(result.stderr.splitlines()) == 1

@@ -1,0 +1,300 @@
+"""Health of one epoch against grid integration, and what the data do not tell."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from lmshealth import inference
+from lmshealth.errors import BadStage, NotConverged, NotEnoughData
+from lmshealth.inference import EpochPosterior, draw_prior, epochs_to_infer, infer, one_at_a_time
+from lmshealth.results import FloatArray, Health, Track
+from lmshealth.sampling import Sample
+from lmshealth.stage import Stage
+from lmshealth.tracking import track
+from tests.lives import (
+    AXES,
+    FOOT,
+    FREQUENCY,
+    PRELOAD,
+    make_history,
+    make_stage,
+    make_track,
+    rough_history,
+    true_drift,
+)
+from tests.oracles import epoch_log_posterior
+
+NAMES = ("guide_preload", "mount_stiffness")
+TRUTH = np.log([0.75, 0.85])
+COV = np.array([[1e-6, 4e-7], [4e-7, 2e-6]])
+
+
+@pytest.fixture(scope="module")
+def stage(tmp_path_factory: pytest.TempPathFactory) -> Stage:
+    """Preload and mount seen by two modes."""
+    return make_stage(tmp_path_factory.mktemp("stage"))
+
+
+def epochs(drifts: list[FloatArray], cov: FloatArray = COV) -> Track:
+    """Track of a baseline and the given drifts."""
+    m = cov.shape[0]
+    drift = np.vstack([np.zeros(m), *drifts])
+    return make_track(drift, np.stack([np.zeros((m, m)), *[cov] * len(drifts)]))
+
+
+@pytest.fixture(scope="module")
+def worn() -> Track:
+    """Baseline, then two epochs: half of the loss, and all of it."""
+    return epochs([true_drift(NAMES, share * TRUTH)[:2] for share in (0.5, 1.0)])
+
+
+@pytest.fixture(scope="module")
+def health(stage: Stage, worn: Track) -> Health:
+    """Posterior of both epochs."""
+    return infer(worn, stage, 5)
+
+
+def book(x: FloatArray, stage_std: float = 0.05, drift: FloatArray | None = None) -> float:
+    """Log posterior at one point by the formula behind the map."""
+    alone = np.array([true_drift(NAMES, np.where(np.arange(2) == j, x, 0.0)) for j in range(2)])
+    return epoch_log_posterior(
+        x,
+        true_drift(NAMES, TRUTH)[:2] if drift is None else drift,
+        COV,
+        predicted=true_drift(NAMES, x)[:2],
+        alone=alone[:, :2],
+        model_std=stage_std,
+        medians=(1.0, 1.0),
+        sigmas=(0.3, 0.3),
+    )
+
+
+def inside(n: int, seed: int = 1) -> FloatArray:
+    """Draw ln parameters all over the map."""
+    low, high = (np.log([AXES[name][k] for name in NAMES]) for k in (0, -1))
+    return np.random.default_rng(seed).uniform(low, high, (n, 2))
+
+
+@pytest.mark.parametrize("model_std", [0.0, 0.05, 0.2])
+def test_log_posterior_is_the_textbook_one(tmp_path: Path, model_std: float) -> None:
+    """Many points in one call equal one point at a time by the formula, map error included."""
+    stage = make_stage(tmp_path, model_std=model_std)
+    posterior = EpochPosterior(stage, ("roll", "pitch"), true_drift(NAMES, TRUTH)[:2], COV)
+    x = inside(60)
+    found = posterior.log_probability(x)
+    known = np.array([book(point, model_std) for point in x])
+    np.testing.assert_allclose(found - found[0], known - known[0], rtol=1e-9, atol=1e-7)
+
+
+def test_posterior_quantiles_are_those_of_a_grid(stage: Stage, health: Health) -> None:
+    """Quantiles of the draws have the right probability on a 2-D grid, within Monte-Carlo error."""
+    x = np.log(health.samples[-1])
+    centre, width = x.mean(axis=0), 6 * x.std(axis=0)
+    axes = [np.linspace(c - w, c + w, 81) for c, w in zip(centre, width, strict=True)]
+    grid = np.stack(np.meshgrid(*axes, indexing="ij"), -1)
+    value = np.array([book(point) for point in grid.reshape(-1, 2)]).reshape(81, 81)
+    density = np.exp(value - value.max())
+    for j in range(2):
+        marginal = density.sum(axis=1 - j)
+        cdf = np.cumsum(marginal) - 0.5 * marginal
+        for level in (0.05, 0.25, 0.5, 0.75, 0.95):
+            share = np.interp(np.quantile(x[:, j], level), axes[j], cdf / marginal.sum())
+            n = min(health.ess[-1, j], x.shape[0])
+            assert abs(share - level) < 5 * np.sqrt(level * (1 - level) / n) + 1e-3
+
+
+def test_health_is_sharp_where_modes_tell_it(health: Health) -> None:
+    """The truth lies inside, both epochs converge, and the data and not the prior speak."""
+    low, high = health.quantile(np.array([0.005, 0.995]))
+    assert ((low[-1] < np.exp(TRUTH)) & (np.exp(TRUTH) < high[-1])).all()
+    assert health.converged.all()
+    assert (health.informed > 0.9).all()
+    assert (health.samples[0].mean(axis=0) > health.samples[1].mean(axis=0)).all()
+
+
+def test_map_error_widens_the_posterior(tmp_path: Path, worn: Track, health: Health) -> None:
+    """A map that is believed less gives wider health, in proportion to the drift."""
+    doubtful = infer(worn, make_stage(tmp_path, model_std=0.2), 5, epochs=[2])
+    ratio = doubtful.samples[0].std(axis=0) / health.samples[1].std(axis=0)
+    assert (ratio > 2).all()
+
+
+@pytest.fixture
+def quick(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Put draws of the seed alone in the place of the sampler, to see which seeds it is given."""
+
+    def fake(_: object, __: object, seed: np.random.SeedSequence) -> Sample:
+        draws = 0.1 * np.random.default_rng(seed).standard_normal((500, 2))
+        return Sample(draws=draws, ess=np.full(2, 500.0), r_hat=np.ones(2))
+
+    monkeypatch.setattr(inference, "sample", fake)
+
+
+@pytest.mark.usefixtures("quick")
+def test_an_epoch_has_its_own_stream(stage: Stage, worn: Track) -> None:
+    """An epoch inferred alone gives the very draws it gives among others; another seed does not."""
+    both, alone = infer(worn, stage, 5), infer(worn, stage, 5, epochs=[2])
+    other = infer(worn, stage, 6, epochs=[2])
+    np.testing.assert_array_equal(alone.samples[0], both.samples[1])
+    assert not np.array_equal(other.samples, alone.samples)
+
+
+@pytest.mark.usefixtures("quick")
+def test_two_epochs_do_not_share_draws(stage: Stage) -> None:
+    """Two epochs with the same drift get different draws: their chains are independent."""
+    same = true_drift(NAMES, TRUTH)[:2]
+    found = infer(epochs([same, same]), stage, 5)
+    assert not np.array_equal(found.samples[0], found.samples[1])
+
+
+@pytest.mark.usefixtures("quick")
+def test_any_mapper_gives_the_same(stage: Stage, worn: Track) -> None:
+    """The mapper decides where epochs are computed, not what comes out, and keeps their order."""
+
+    def backwards(function, *columns):
+        tasks = list(zip(*columns, strict=True))
+        return [function(*task) for task in reversed(tasks)][::-1]
+
+    found, plain = infer(worn, stage, 5, mapper=backwards), infer(worn, stage, 5)
+    np.testing.assert_array_equal(found.samples, plain.samples)
+    assert found.recorded_at == plain.recorded_at == worn.recorded_at[1:]
+
+
+def test_a_parameter_no_mode_sees_keeps_its_prior(tmp_path: Path) -> None:
+    """Without sensitivity a parameter is uninformed and its posterior is its prior."""
+    stage = make_stage(tmp_path, (PRELOAD, FOOT))
+    drift = true_drift(("guide_preload", "foot"), np.log([0.7, 1.0]))[:2]
+    found = infer(epochs([drift]), stage, 9)
+    assert found.informed[0, 0] > 0.9
+    assert found.informed[0, 1] < 0.15
+    prior = stats.norm(0, 0.2)
+    x = np.log(found.samples[0, :, 1])
+    for level in (0.05, 0.5, 0.95):
+        error = 5 * np.sqrt(level * (1 - level) / min(found.ess[0, 1], x.size))
+        assert abs(prior.cdf(np.quantile(x, level)) - level) < error
+
+
+def test_one_mode_cannot_tell_two_parameters(stage: Stage) -> None:
+    """With one mode the posterior is a ridge: the product is sharp, the two are strongly tied."""
+    drift = true_drift(NAMES, TRUTH)[:1]
+    found = infer(epochs([drift], COV[:1, :1]), stage, 10)
+    x = np.log(found.samples[0])
+    assert found.converged.all()
+    assert np.corrcoef(x.T)[0, 1] < -0.8
+    assert (found.informed[0] < 0.95).all()
+
+
+def test_draws_never_leave_the_map(stage: Stage) -> None:
+    """Drifts beyond what the map holds push draws to its edge, not over it."""
+    x = np.log([AXES["guide_preload"][0], 1.0])
+    found = infer(epochs([true_drift(NAMES, x)[:2] - 0.004]), stage, 11)
+    for j, name in enumerate(NAMES):
+        assert found.samples[..., j].min() >= AXES[name][0] * (1 - 1e-12)
+        assert found.samples[..., j].max() <= AXES[name][-1] * (1 + 1e-12)
+
+
+def test_outside_the_map_is_impossible_and_raises_nothing(stage: Stage) -> None:
+    """Points outside have log probability minus infinity beside finite ones inside."""
+    posterior = EpochPosterior(stage, ("roll", "pitch"), true_drift(NAMES, TRUTH)[:2], COV)
+    x = np.array([[0.0, 0.0], [-9.0, 0.0], [0.0, 9.0], [-0.1, -0.1]])
+    found = posterior.log_probability(x)
+    assert np.isfinite(found).tolist() == [True, False, False, True]
+    assert np.isneginf(found[1:3]).all()
+    assert np.isneginf(posterior.log_probability(x[1:3])).all()
+
+
+def test_the_prior_is_cut_at_the_map(stage: Stage) -> None:
+    """Prior draws are lognormal between the edges of the grid, each parameter by itself."""
+    x = draw_prior(stage, np.random.default_rng(12), 20_000)
+    assert x.shape == (20_000, 2)
+    for j, name in enumerate(NAMES):
+        low, high = np.log(AXES[name][[0, -1]])
+        cut = stats.truncnorm(low / 0.3, high / 0.3, scale=0.3)
+        assert stats.kstest(x[:, j], cut.cdf).pvalue > 1e-4
+    assert stats.kstest(x[:, 0], stats.norm(0, 0.25).cdf).pvalue < 1e-4  # negative control
+
+
+def test_a_prior_far_from_the_map_is_refused(tmp_path: Path) -> None:
+    """A prior with nothing inside the map is an error of the description."""
+    far = PRELOAD.replace("median = 1.0", "median = 1000.0").replace("sigma = 0.3", "sigma = 0.01")
+    stage = make_stage(tmp_path, (far,))
+    with pytest.raises(BadStage, match="almost nothing inside"):
+        draw_prior(stage, np.random.default_rng(1), 100)
+
+
+def test_one_at_a_time_moves_one_parameter(stage: Stage) -> None:
+    """The stack is the points, then each parameter alone with the other at baseline."""
+    x = np.array([[-0.1, -0.2], [-0.3, -0.4]])
+    known = [[-0.1, -0.2], [-0.3, -0.4], [-0.1, 0], [-0.3, 0], [0, -0.2], [0, -0.4]]
+    np.testing.assert_array_equal(one_at_a_time(stage, x), known)
+
+
+def test_epochs_are_spread_and_end_with_the_last(stage: Stage) -> None:
+    """At most so many epochs, in order, the last among them, and never the baseline."""
+    drift = np.zeros((50, 2))
+    cov = np.tile(COV, (50, 1, 1))
+    drift[:3], cov[:3] = np.nan, np.nan
+    cov[3] = 0.0
+    found = epochs_to_infer(make_track(drift, cov), stage, 7)
+    assert len(found) == 7
+    assert list(found) == sorted(set(found))
+    assert found[0] == 4
+    assert found[-1] == 49
+    assert epochs_to_infer(make_track(drift, cov), stage, 100) == tuple(range(4, 50))
+    assert epochs_to_infer(make_track(drift, cov), stage, 1)[-1] == 49
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_baseline_of_a_real_track_is_no_epoch(stage: Stage, seed: int) -> None:
+    """Epochs of a track come after its baseline, whatever the covariances of its logs."""
+    followed = track(rough_history(np.random.default_rng(seed), baseline=2), stage)
+    assert min(epochs_to_infer(followed, stage, 100)) == 3
+
+
+def test_logs_on_the_spot_of_the_baseline_are_no_epochs(stage: Stage) -> None:
+    """An epoch at the odometer of the baseline cannot have drifted and is not inferred."""
+    ln_f = np.log(FREQUENCY[:2]) + 1e-3 * np.random.default_rng(2).standard_normal((8, 2))
+    cov = np.zeros((8, 4, 4))
+    cov[:] = np.diag([1e-6, 1e-6, 1e-3, 1e-3])
+    cov[:, 0, 1] = cov[:, 1, 0] = 6e-7
+    travel = np.r_[0.0, 0.0, 0.0, np.linspace(1e5, 1e6, 5)]
+    followed = track(make_history(ln_f, travel=travel, cov=cov), stage)
+    assert epochs_to_infer(followed, stage, 100) == (3, 4, 5, 6, 7)
+
+
+def test_a_sampler_that_fails_is_told_epoch_by_epoch(
+    stage: Stage, worn: Track, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A refusal of the sampler keeps its chains but claims no convergence and no sample size."""
+
+    def fail(*_: object) -> None:
+        raise NotConverged("stuck", np.full((4, 50, 16, 2), -0.1))
+
+    monkeypatch.setattr(inference, "sample", fail)
+    found = infer(worn, stage, 1)
+    assert not found.converged.any()
+    assert np.isnan(found.ess).all()
+    np.testing.assert_allclose(found.samples, np.exp(-0.1))
+
+
+def test_without_parameters_there_is_nothing_to_infer(tmp_path: Path, worn: Track) -> None:
+    """A description without parameters is refused."""
+    with pytest.raises(BadStage, match=r"no \[\[parameter\]\]"):
+        infer(worn, make_stage(tmp_path, ()), 1)
+
+
+def test_a_track_without_modes_of_the_map_is_refused(stage: Stage) -> None:
+    """The modes that would be needed are named."""
+    strange = make_track(np.zeros((3, 0)), np.zeros((3, 0, 0)))
+    with pytest.raises(NotEnoughData, match="roll.*pitch"):
+        infer(strange, stage, 1)
+
+
+def test_a_track_of_the_baseline_alone_is_refused(stage: Stage) -> None:
+    """Nothing after the baseline is not enough."""
+    with pytest.raises(NotEnoughData, match="no epoch after the baseline"):
+        infer(epochs([]), stage, 1)

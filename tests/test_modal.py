@@ -1,0 +1,396 @@
+"""Identification: truth within its own uncertainty, refusals that say why, and invariances."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from lmshealth.errors import BadLog
+from lmshealth.modal import identify
+from lmshealth.readers import load_columns, read_log
+from lmshealth.results import Log, Modes
+from tests.signals import (
+    Mode,
+    acceleration_log,
+    accelerations,
+    deviations,
+    displacements,
+    make_log,
+    make_stage,
+    sine,
+    white,
+)
+
+RATE = 1000.0
+LMS_Y = (("roll", 126.4, 0.0176), ("pitch", 136.6, 0.0151), ("yaw", 155.0, 0.0176))
+ROLL = (("roll", 105.0, 0.015),)
+
+
+def rng(seed: int = 1) -> np.random.Generator:
+    """Give a generator."""
+    return np.random.default_rng(seed)
+
+
+def one_mode_log(seconds: float = 60.0, seed: int = 1, noise: float = 0.5) -> Log:
+    """Make a log that shows one mode."""
+    return acceleration_log(rng(seed), [Mode(105.0, 0.015)], seconds, RATE, noise)
+
+
+def why(modes: Modes, name: str) -> str:
+    """Give the reason for which a mode was refused."""
+    (reason,) = {refusal.reason for refusal in modes.refused if refusal.mode == name}
+    return reason
+
+
+# Known truth
+
+
+def test_one_mode_is_found_within_its_uncertainty() -> None:
+    """Over 12 records f and ζ are within 4σ, and their mean square deviation is about one."""
+    stage = make_stage(ROLL)
+    off = np.array(
+        [
+            deviations(identify(one_mode_log(seed=seed), stage), "roll", 105.0, 0.015)
+            for seed in range(12)
+        ]
+    )
+    assert np.abs(off).max() < 4
+    # 24 squares of about unit variance: 0.35 to 2.1 holds all but a thousandth.
+    assert 0.35 < np.mean(off**2) < 2.1
+    # Negative control: standard deviations three times too small would not do.
+    assert np.mean((3 * off) ** 2) > 2.1
+
+
+def test_two_modes_three_bandwidths_apart_keep_their_truth() -> None:
+    """Two modes 3 half-power bandwidths apart are each within 4σ in f and ζ."""
+    first, gap = 120.0, 3 * 2 * 0.018 * 120.0
+    modes = [Mode(first, 0.018), Mode(first + gap, 0.018, 2.0)]
+    stage = make_stage([("roll", first, 0.018), ("pitch", first + gap, 0.018)])
+    for seed in range(4):
+        found = identify(acceleration_log(rng(seed), modes, 60, RATE, 0.5), stage)
+        assert found.names == ("roll", "pitch")
+        assert np.abs(deviations(found, "roll", first, 0.018)).max() < 4
+        assert np.abs(deviations(found, "pitch", first + gap, 0.018)).max() < 4
+
+
+def test_two_modes_of_a_common_force_keep_their_truth() -> None:
+    """Driven by the same force, modes interfere; f and ζ are within 4σ all the same."""
+    modes = [Mode(120.0, 0.018), Mode(133.0, 0.018)]
+    n = 60_000
+    size = 4 * n
+    frequency = np.arange(1, size // 2) * RATE / size
+    force = rng(3).standard_normal((2, frequency.size)) * np.sqrt(RATE * size / 4)
+    spectrum = np.zeros(size // 2 + 1, dtype=complex)
+    total = modes[0].response(frequency) - 0.7 * modes[1].response(frequency)
+    spectrum[1:-1] = total * (force[0] + 1j * force[1])
+    values = np.fft.irfft(spectrum, size)[:n] + white(rng(4), 0.2, n, RATE)
+    found = identify(
+        make_log({"acc_a": values}, RATE),
+        make_stage([("roll", 120.0, 0.018), ("pitch", 133.0, 0.018)]),
+    )
+    assert np.abs(deviations(found, "roll", 120.0, 0.018)).max() < 4
+    assert np.abs(deviations(found, "pitch", 133.0, 0.018)).max() < 4
+
+
+def lms_y_modes(shift: float = 1.0) -> list[Mode]:
+    """Give three modes as the Y stage has them, in three channels of different shape."""
+    shapes = ((1.0, 0.2, 0.5), (0.3, 1.0, 0.4), (0.1, 0.3, 1.0))
+    return [
+        Mode(f * shift, zeta, 1.0, shape) for (_, f, zeta), shape in zip(LMS_Y, shapes, strict=True)
+    ]
+
+
+def test_three_modes_of_a_stage_are_told_apart() -> None:
+    """Roll, pitch and yaw are each within 4σ of their truth, and their order is by frequency."""
+    found = identify(acceleration_log(rng(5), lms_y_modes(), 60, RATE, 0.5), make_stage(LMS_Y))
+    assert found.names == ("roll", "pitch", "yaw")
+    for name, f, zeta in LMS_Y:
+        assert np.abs(deviations(found, name, f, zeta)).max() < 4
+    assert np.linalg.eigvalsh(found.cov).min() > 0
+
+
+@pytest.mark.parametrize("shift", [126.4 / 136.6, 136.6 / 126.4])
+def test_worn_modes_keep_their_identity(shift: float) -> None:
+    """Pitch standing where roll was new is still pitch, and the reverse."""
+    log = acceleration_log(rng(6), lms_y_modes(shift), 60, RATE, 0.5)
+    found = identify(log, make_stage(LMS_Y))
+    assert found.names == ("roll", "pitch", "yaw")
+    for name, f, zeta in LMS_Y:
+        assert np.abs(deviations(found, name, f * shift, zeta)).max() < 4
+
+
+def test_following_error_shows_a_mode_as_an_accelerometer_does() -> None:
+    """From Δe alone, with its floor of white displacement noise, f and ζ are within 4σ."""
+    quiet = 1.0 / (2 * np.pi * 105.0) ** 4
+    values = displacements(rng(7), [Mode(105.0, 0.015)], 60_000, RATE, quiet)
+    log = make_log({"delta_e": values[0]}, RATE)
+    found = identify(log, make_stage(ROLL))
+    assert found.sources == ("delta_e",)
+    assert found.channels == ("delta_e",)
+    assert np.abs(deviations(found, "roll", 105.0, 0.015)).max() < 4
+
+
+def test_accelerometers_come_before_the_following_error() -> None:
+    """Where both show a mode, it is reported once, from the accelerometer."""
+    modes = [Mode(105.0, 0.015)]
+    signals = {
+        "delta_e": displacements(rng(8), modes, 60_000, RATE, 1e-13)[0],
+        "acc_a": accelerations(rng(9), modes, 60_000, RATE, 0.5)[0],
+    }
+    found = identify(make_log(signals, RATE), make_stage(ROLL))
+    assert (found.names, found.sources) == (("roll",), ("acc",))
+
+
+def test_the_floor_of_the_following_error_is_its_noise_also_in_short_moves() -> None:
+    """At 20 kHz and moves of 0.67 s Δe has the SNR of its own noise, within a factor of 3.
+
+    White noise of an encoder, as acceleration, rises with the fourth power of frequency; it must
+    not leak from the far end of the spectrum into the band of the modes.
+    """
+    rate, n = 20_000.0, 13_400
+    level = 1 / (2 * np.pi * 130.0) ** 4
+    mode = Mode(130.0, 0.02)
+    generator = rng(10)
+    moves = [displacements(generator, [mode], n, rate, level)[0] for _ in range(12)]
+    pieces = [(k * n, (k + 1) * n) for k in range(12)]
+    log = make_log({"delta_e": np.concatenate(moves)}, rate, pieces=pieces)
+    found = identify(log, make_stage([("roll", 130.0, 0.02)]))
+    assert found.names == ("roll",)
+    assert found.snr[0] > mode.snr(1.0) / 3
+
+
+def short_moves(seed: int, n_moves: int = 7, seconds: float = 3.0) -> Log:
+    """Make a log of separate short moves of one mode."""
+    generator, n = rng(seed), round(seconds * RATE)
+    parts = [
+        accelerations(generator, [Mode(105.0, 0.015)], n, RATE, 0.5)[0] for _ in range(n_moves)
+    ]
+    pieces = [(k * n, (k + 1) * n) for k in range(n_moves)]
+    return make_log({"acc_a": np.concatenate(parts)}, RATE, pieces=pieces)
+
+
+def test_short_moves_do_not_bias_the_damping() -> None:
+    """Over 40 logs of 7 moves of 3 s the mean ln ζ is the truth within 4 standard errors."""
+    stage = make_stage(ROLL)
+    off, std = [], []
+    for seed in range(40):
+        found = identify(short_moves(seed), stage)
+        off.append(found.ln_damping[0] - np.log(0.015))
+        std.append(np.sqrt(found.cov[1, 1]))
+    error = np.mean(std) / np.sqrt(len(off))
+    # ln ζ itself is skewed: its mean lies below its mode by up to half its variance.
+    assert abs(np.mean(off)) < 4 * error + np.mean(std) ** 2 / 2
+    # Negative control: the 9 % by which a plain likelihood is off would be seen.
+    assert 4 * error + np.mean(std) ** 2 / 2 < 0.16
+
+
+def test_a_channel_that_does_not_see_a_mode_does_no_harm() -> None:
+    """Of three channels two see nothing of roll; it comes from the third, with its truth."""
+    modes = [Mode(105.0, 0.015, 1.0, (0.0, 1.0, 0.0))]
+    found = identify(acceleration_log(rng(11), modes, 60, RATE, 0.5), make_stage(ROLL))
+    assert found.channels == ("acc_1",)
+    assert np.abs(deviations(found, "roll", 105.0, 0.015)).max() < 4
+
+
+# Refusals
+
+
+def test_white_noise_has_no_mode() -> None:
+    """Of six records of noise none gives a mode, with a description or without."""
+    stage = make_stage(LMS_Y)
+    for seed in range(6):
+        log = make_log({"acc_a": white(rng(seed), 1.0, 20_000, RATE)}, RATE)
+        found = identify(log, stage)
+        assert found.names == ()
+        assert found.cov.shape == (0, 0)
+        assert {why(found, name) for name, *_ in LMS_Y} == {"not-excited"}
+        assert identify(log, band=(20.0, 400.0)).names == ()
+
+
+def test_mains_are_a_line_and_no_mode() -> None:
+    """A sine of 50 Hz in noise is no mode at 50 Hz, sought or not."""
+    values = white(rng(12), 1.0, 60_000, RATE) + sine(60_000, RATE, 50.0, 3.0)
+    log = make_log({"acc_a": values}, RATE)
+    assert identify(log, make_stage([("hum", 50.5, 0.015)])).names == ()
+    assert identify(log, band=(20.0, 400.0)).names == ()
+
+
+def test_mains_inside_the_band_of_a_mode_are_named() -> None:
+    """A 50 Hz line on the flank of a mode is listed as mains, in the channel it was seen in."""
+    values = accelerations(rng(13), [Mode(52.0, 0.02)], 60_000, RATE, 0.5)[0]
+    log = make_log({"acc_a": values + sine(60_000, RATE, 50.0, 20.0)}, RATE)
+    found = identify(log, make_stage([("roll", 52.0, 0.02)]))
+    assert np.abs(deviations(found, "roll", 52.0, 0.02)).max() < 4
+    (line,) = found.lines
+    assert (line.kind, line.channel, line.unit) == ("mains", "acc_a", "m/s²")
+    assert line.frequency == pytest.approx(50.0, abs=0.02)
+    assert line.amplitude == pytest.approx(20.0, rel=0.1)
+
+
+@pytest.mark.parametrize("line", [104.0, 104.908, 105.0, 106.2])
+def test_a_line_crossing_a_mode_moves_it_less_than_its_uncertainty(line: float) -> None:
+    """A line 100 times above the peak moves f by less than 1σ and ζ by less than 2σ."""
+    stage, log = make_stage(ROLL), one_mode_log(seed=14)
+    clean = identify(log, stage)
+    values = log.channels[0].values + sine(60_000, RATE, line, 60.0)
+    dirty = identify(make_log({"acc_0": values}, RATE), stage)
+    std = np.sqrt(np.diag(clean.cov))
+    assert abs(dirty.ln_frequency[0] - clean.ln_frequency[0]) < std[0]
+    assert abs(dirty.ln_damping[0] - clean.ln_damping[0]) < 2 * std[1]
+    assert [round(found.frequency, 1) for found in dirty.lines] == [pytest.approx(line, abs=0.06)]
+
+
+def test_an_order_of_the_velocity_is_named() -> None:
+    """A line at velocity over wavelength carries the name of the order."""
+    velocity = 0.4  # ball pass of 4 mm: 100 Hz
+    values = accelerations(rng(15), [Mode(105.0, 0.015)], 60_000, RATE, 0.5)[0]
+    log = make_log(
+        {"acc_a": values + sine(60_000, RATE, 100.0, 30.0)},
+        RATE,
+        velocity=np.full(60_000, velocity),
+    )
+    found = identify(log, make_stage(ROLL, order_mm=4.0))
+    assert [line.kind for line in found.lines] == ["ball pass"]
+
+
+def test_a_record_too_short_names_the_seconds_needed() -> None:
+    """The error says how many seconds the narrowest mode needs, and how many there are."""
+    with pytest.raises(BadLog, match=r"0\.635 s.*0\.3 s") as caught:
+        identify(one_mode_log(0.3), make_stage(ROLL))
+    assert caught.value.reason == "too-short"
+    with pytest.raises(BadLog, match="needed are at least 50") as caught:
+        identify(one_mode_log(0.3), band=(100.0, 110.0))
+    assert caught.value.reason == "too-short"
+
+
+def test_a_sample_rate_too_low_names_the_one_needed() -> None:
+    """A mode above half the sample rate is no question for this log."""
+    with pytest.raises(BadLog, match=r"needed is at least 1\d{3} Hz") as caught:
+        identify(one_mode_log(), make_stage([("roll", 490.0, 0.03)]))
+    assert caught.value.reason == "sample-rate"
+
+
+def test_unknown_channels_are_named_with_those_there_are() -> None:
+    """A channel that is not there is an error that lists what is."""
+    with pytest.raises(BadLog, match=r"acc_9.*acc_0") as caught:
+        identify(one_mode_log(), make_stage(ROLL), channels=["acc_9"])
+    assert caught.value.reason == "channel"
+
+
+def test_chosen_channels_are_the_only_ones_used() -> None:
+    """With channels given, no estimate comes from another."""
+    modes = [Mode(105.0, 0.015, 1.0, (1.0, 0.5))]
+    log = acceleration_log(rng(16), modes, 60, RATE, 0.5)
+    assert identify(log, make_stage(ROLL)).channels == ("acc_0",)
+    assert identify(log, make_stage(ROLL), channels=["acc_1"]).channels == ("acc_1",)
+
+
+def test_refused_channels_of_the_log_are_passed_on() -> None:
+    """What the door refused is in the modes' refusals too."""
+    from lmshealth.results import Refusal
+
+    refusal = Refusal("synthetic.h5", "flat", "all samples are 0", channel="acc_dead")
+    log = replace(one_mode_log(), refused=(refusal,))
+    assert refusal in identify(log, make_stage(ROLL)).refused
+
+
+# Without a description
+
+
+def test_modes_are_found_in_a_band_and_named_in_order() -> None:
+    """Three modes are found without a description, numbered upwards, within 4σ of the truth."""
+    modes = [Mode(60.0, 0.01), Mode(120.0, 0.02), Mode(210.0, 0.008)]
+    found = identify(acceleration_log(rng(17), modes, 60, RATE, 0.2), band=(30.0, 400.0))
+    assert found.names == ("mode_1", "mode_2", "mode_3")
+    for name, mode in zip(found.names, modes, strict=True):
+        assert np.abs(deviations(found, name, mode.frequency, mode.damping)).max() < 4
+
+
+def test_a_very_light_damping_is_found_without_a_description() -> None:
+    """A resonance of ζ = 0.2 % that towers over the noise in 60 s is not overlooked."""
+    log = acceleration_log(rng(18), [Mode(120.0, 0.002)], 60, RATE, 1.0)
+    found = identify(log, band=(40.0, 300.0))
+    assert found.names == ("mode_1",)
+    assert np.abs(deviations(found, "mode_1", 120.0, 0.002)).max() < 4
+
+
+def test_modes_outside_the_band_are_left_alone() -> None:
+    """Only modes of the band are looked for, with a description and without."""
+    log = acceleration_log(rng(19), lms_y_modes(), 60, RATE, 0.5)
+    assert identify(log, make_stage(LMS_Y), band=(130.0, 140.0)).names == ("pitch",)
+    found = identify(log, band=(145.0, 165.0))
+    assert all(145 < f < 165 for f in found.frequency)
+
+
+# Invariances
+
+
+def test_the_order_of_channels_does_not_matter() -> None:
+    """Permuted channels give the same modes to the last bit."""
+    log = acceleration_log(rng(20), lms_y_modes(), 20, RATE, 0.5)
+    turned = replace(log, channels=log.channels[::-1])
+    for stage in (make_stage(LMS_Y), None):
+        one, other = (identify(item, stage, band=(90.0, 200.0)) for item in (log, turned))
+        assert one.names == other.names
+        assert one.channels == other.channels
+        np.testing.assert_array_equal(one.ln_frequency, other.ln_frequency)
+        np.testing.assert_array_equal(one.cov, other.cov)
+
+
+@pytest.mark.parametrize("factor", [1e-6, 1e4])
+def test_the_unit_of_the_signal_does_not_matter(factor: float) -> None:
+    """Scaled signals give the same f, ζ and SNR, and covariances within 10⁻³."""
+    log = acceleration_log(rng(21), lms_y_modes(), 20, RATE, 0.5)
+    signals = {channel.name: factor * channel.values for channel in log.channels}
+    one, other = (identify(item, make_stage(LMS_Y)) for item in (log, make_log(signals, RATE)))
+    assert one.names == other.names
+    np.testing.assert_allclose(one.ln_frequency, other.ln_frequency, rtol=0, atol=1e-7)
+    np.testing.assert_allclose(one.ln_damping, other.ln_damping, rtol=0, atol=1e-5)
+    np.testing.assert_allclose(np.diag(one.cov), np.diag(other.cov), rtol=1e-3)
+    np.testing.assert_allclose(one.snr, other.snr, rtol=1e-3)
+
+
+def test_longer_records_are_surer() -> None:
+    """Four times the record halves the standard deviations, within a third."""
+    stage = make_stage(ROLL)
+    short, long = (identify(one_mode_log(seconds, 22), stage) for seconds in (40.0, 160.0))
+    ratio = np.sqrt(np.diag(short.cov) / np.diag(long.cov))
+    np.testing.assert_allclose(ratio, 2.0, rtol=0.33)
+
+
+# Real measurements
+
+
+def test_a_building_in_the_wind_shows_its_three_modes(needs: Callable[[str], None]) -> None:
+    """Without a description the first half hour gives the three published frequencies."""
+    needs("data")
+    path = Path(os.environ["LMSHEALTH_DATA"]) / "palisaden_building" / "Palisaden_dataset.npy"
+    data = np.load(path, mmap_mode="r")[:180_000].astype(float)
+    log = make_log({f"acc_{k}": data[:, k] for k in range(data.shape[1])}, 100.0)
+    found = identify(log, band=(1.2, 3.5))
+    assert len(found.names) == 3
+    np.testing.assert_allclose(found.frequency, [1.88, 2.42, 2.69], rtol=5e-3)
+    assert ((found.damping_ratio > 0.008) & (found.damping_ratio < 0.025)).all()
+
+
+def test_a_model_frame_shows_its_first_mode(needs: Callable[[str], None], tmp_path: Path) -> None:
+    """An export of another program, read through a column map, shows 3.6 to 3.8 Hz or nothing."""
+    needs("data")
+    folder = Path(os.environ["LMSHEALTH_DATA"]) / "shake_3storey" / "open"
+    (tmp_path / "map.toml").write_text(
+        'sample_rate_hz = 120\n[columns]\nacc_x_m_s2 = "Acc_X"\nacc_y_m_s2 = "Acc_Y"\n'
+        "[csv]\nskip_rows = 7\n"
+    )
+    log = read_log(
+        folder / "Flexible_BonusEvent_1st.csv", columns=load_columns(tmp_path / "map.toml")
+    )
+    found = identify(log, make_stage([("first", 3.7, 0.03)], search=0.1))
+    for name, frequency in zip(found.names, found.frequency, strict=True):
+        assert name == "first"
+        assert frequency == pytest.approx(3.69, abs=0.21)
+    assert found.names or why(found, "first")

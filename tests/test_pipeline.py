@@ -1,0 +1,231 @@
+"""The main job: everything is written, nothing is done twice, and nothing but the logs matters."""
+
+from __future__ import annotations
+
+import csv
+import shutil
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+from lmshealth.errors import NothingUsable
+from lmshealth.inference import infer
+from lmshealth.pipeline import RunResult, Settings, run
+from lmshealth.stage import Stage, load_stage
+from lmshealth.tables import COLUMNS
+from tests.signals import write_archive, write_archive_stage, write_log
+
+N_LOGS = 6
+
+
+def rows(path: Path) -> list[dict[str, str]]:
+    """Read a table."""
+    with path.open(encoding="utf-8", newline="") as stream:
+        return list(csv.DictReader(stream))
+
+
+def tables(out: Path) -> dict[str, bytes]:
+    """Read all tables of an output folder as bytes."""
+    return {path.name: path.read_bytes() for path in sorted(out.glob("*.csv"))}
+
+
+@dataclass(frozen=True)
+class Done:
+    """A full run over an archive with three bad logs, what it wrote, and where."""
+
+    logs: Path
+    out: Path
+    stage: Stage
+    result: RunResult
+    written: dict[str, bytes]
+
+
+@pytest.fixture(scope="module")
+def done(tmp_path_factory: pytest.TempPathFactory) -> Done:
+    """Run the main job once on good logs, a copy, a broken file and a foreign machine."""
+    folder = tmp_path_factory.mktemp("archive")
+    stage = load_stage(str(write_archive_stage(folder / "stage")))
+    logs = write_archive(folder / "logs", N_LOGS)
+    (logs / "later").mkdir()
+    shutil.copy(logs / "log-00.h5", logs / "later" / "copy.h5")
+    (logs / "broken.h5").write_bytes(b"no signal at all" * 100)
+    write_log(logs / "foreign.h5", 1.0, 99, stage="other-Z")
+    out = folder / "out"
+    result = run(logs, [stage], out, Settings(epochs=2))
+    return Done(logs, out, stage, result, tables(out))
+
+
+@pytest.fixture
+def modes_only(tmp_path: Path) -> Stage:
+    """Load a description without health parameters: quick to run."""
+    return load_stage(str(write_archive_stage(tmp_path / "stage", health=False)))
+
+
+def test_all_tables_and_pages_are_written(done: Done) -> None:
+    """Every table of the contract, the index and a page per stage are there, no half files."""
+    assert set(done.written) == {f"{name}.csv" for name in COLUMNS}
+    assert done.result.index == done.out / "index.html"
+    assert done.result.index.is_file()
+    assert [page.name for page in done.result.pages] == ["test-A.html"]
+    assert all(page.is_file() for page in done.result.pages)
+    assert not list(done.out.glob("*.part"))
+
+
+def test_the_truth_is_found_in_the_tables(done: Done) -> None:
+    """Health at the last epoch is 0.90 within its 5 to 95 % interval widened by its own width."""
+    last = rows(done.out / "health.csv")[-1]
+    low, high = float(last["q05"]), float(last["q95"])
+    assert low - (high - low) < 0.90 < high + (high - low)
+    assert high - low < 0.05
+    assert last["converged"] == "True"
+    assert {row["mode"] for row in rows(done.out / "modes.csv")} == {"roll", "pitch"}
+
+
+def test_every_bad_log_is_listed_with_its_reason(done: Done) -> None:
+    """The copy, the broken file and the foreign machine are refused by name; the rest is used."""
+    refused = {row["log"]: row for row in rows(done.out / "refused.csv")}
+    assert refused["later/copy.h5"]["reason"] == "duplicate"
+    assert "log-00.h5" in refused["later/copy.h5"]["detail"]
+    assert refused["broken.h5"]["reason"] in ("corrupt", "format")
+    assert refused["foreign.h5"]["reason"] == "no-stage"
+    assert "other-Z" in refused["foreign.h5"]["detail"]
+    assert all(row["detail"] for row in refused.values())
+    assert (done.result.n_logs, done.result.n_refused) == (N_LOGS + 3, 3)
+    assert len({row["log"] for row in rows(done.out / "modes.csv")}) == N_LOGS
+
+
+def test_a_second_run_takes_all_from_the_store_and_the_truth_does_not_matter(done: Done) -> None:
+    """With truth.csv deleted a second run remembers every log and writes the same bytes."""
+    (done.logs / "truth.csv").unlink()
+    again = run(done.logs, [done.stage], done.out, Settings(epochs=2))
+    # The broken file is told by its content and tried no more than once.
+    assert again.n_remembered == N_LOGS + 2
+    assert tables(done.out) == done.written
+
+
+def test_results_do_not_depend_on_the_number_of_workers(done: Done, tmp_path: Path) -> None:
+    """Two processes with a fresh store write the same bytes as one."""
+    run(done.logs, [done.stage], tmp_path / "out", Settings(workers=2, epochs=2))
+    assert tables(tmp_path / "out") == done.written
+
+
+def test_another_seed_gives_other_draws(done: Done) -> None:
+    """Negative control for the comparisons of bytes: a new seed changes the draws of health."""
+    (assessment,) = done.result.assessments
+    assert assessment.track is not None
+    one, other = (infer(assessment.track, done.stage, seed, epochs=(5,)) for seed in (1, 2))
+    assert one.samples.tobytes() != other.samples.tobytes()
+
+
+def test_output_inside_the_folder_of_logs_is_no_log(tmp_path: Path, modes_only: Stage) -> None:
+    """Tables and store inside the archive are not read back by the next run."""
+    logs = write_archive(tmp_path / "logs", 2)
+    first = run(logs, [modes_only], logs / "result")
+    again = run(logs, [modes_only], logs / "result")
+    assert (first.n_logs, again.n_logs, again.n_refused) == (2, 2, 0)
+    assert again.n_remembered == 2
+
+
+def test_a_changed_description_is_done_again(tmp_path: Path, modes_only: Stage) -> None:
+    """Results of another description are stale: nothing is remembered."""
+    logs = write_archive(tmp_path / "logs", 2)
+    run(logs, [modes_only], tmp_path / "out")
+    path = tmp_path / "stage" / "small.toml"
+    path.write_text(path.read_text() + "# a remark\n")
+    again = run(logs, [load_stage(str(path))], tmp_path / "out")
+    assert again.n_remembered == 0
+
+
+def test_a_renamed_log_is_remembered(tmp_path: Path, modes_only: Stage) -> None:
+    """A log is known by its content; the tables carry its new name."""
+    logs = write_archive(tmp_path / "logs", 2)
+    run(logs, [modes_only], tmp_path / "out")
+    (logs / "log-01.h5").rename(logs / "zero.h5")
+    again = run(logs, [modes_only], tmp_path / "out")
+    assert again.n_remembered == 2
+    assert {row["log"] for row in rows(tmp_path / "out" / "modes.csv")} == {"log-00.h5", "zero.h5"}
+
+
+def test_a_manifest_overrides_and_is_part_of_the_key(tmp_path: Path, modes_only: Stage) -> None:
+    """A new odometer in the manifest is used, not the remembered one; its log is done again."""
+    logs = write_archive(tmp_path / "logs", 2)
+    run(logs, [modes_only], tmp_path / "out")
+    (logs / "manifest.csv").write_text("file,travel_km\nlog-01.h5,777\n")
+    again = run(logs, [modes_only], tmp_path / "out")
+    assert again.n_remembered == 1
+    assert {row["travel_km"] for row in rows(tmp_path / "out" / "modes.csv")} == {"0.0", "777.0"}
+
+
+def test_each_log_goes_to_the_first_description_that_takes_it(tmp_path: Path) -> None:
+    """Two machines with two descriptions get one page each."""
+    logs = write_archive(tmp_path / "logs", 2)
+    write_log(logs / "b.h5", 1.0, 7, stage="test-B")
+    one = write_archive_stage(tmp_path / "one", health=False)
+    two = write_archive_stage(tmp_path / "two", health=False)
+    two.write_text(two.read_text().replace("*-A", "*-B"))
+    result = run(logs, [load_stage(str(one)), load_stage(str(two))], tmp_path / "out")
+    assert [page.name for page in result.pages] == ["test-A.html", "test-B.html"]
+    assert {a.judgement.verdict for a in result.assessments} == {"not-enough-data"}
+
+
+def test_an_archive_of_bad_logs_only_is_an_error_with_its_reasons_written(
+    tmp_path: Path, modes_only: Stage
+) -> None:
+    """When every log is refused the job fails, says how many, and refused.csv says why."""
+    logs = tmp_path / "logs"
+    logs.mkdir()
+    (logs / "broken.h5").write_bytes(b"nothing")
+    (logs / "empty.csv").write_bytes(b"")
+    with pytest.raises(NothingUsable, match="2 found, 2 refused"):
+        run(logs, [modes_only], tmp_path / "out")
+    refused = {row["log"]: row["reason"] for row in rows(tmp_path / "out" / "refused.csv")}
+    assert set(refused) == {"broken.h5", "empty.csv"}
+    assert refused["empty.csv"] == "empty"
+
+
+def test_an_empty_folder_is_an_error(tmp_path: Path, modes_only: Stage) -> None:
+    """No log at all is said."""
+    (tmp_path / "logs").mkdir()
+    with pytest.raises(NothingUsable, match="0 found"):
+        run(tmp_path / "logs", [modes_only], tmp_path / "out")
+
+
+def test_progress_is_told_to_its_end(tmp_path: Path, modes_only: Stage) -> None:
+    """The callback hears of reading, identifying and assessing, each up to its total."""
+    heard: dict[str, tuple[int, int]] = {}
+
+    def hear(what: str, finished: int, total: int) -> None:
+        assert 0 <= finished <= total
+        heard[what] = (finished, total)
+
+    run(write_archive(tmp_path / "logs", 2), [modes_only], tmp_path / "out", progress=hear)
+    assert heard == {"reading": (2, 2), "identifying": (2, 2), "assessing": (1, 1)}
+
+
+def test_an_interrupted_run_loses_nothing_that_was_done(tmp_path: Path, modes_only: Stage) -> None:
+    """Stopped after two logs, the next run remembers two and the tables are as ever."""
+    logs = write_archive(tmp_path / "logs", 4)
+
+    def stop(what: str, finished: int, total: int) -> None:
+        if what == "identifying" and finished == 2:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        run(logs, [modes_only], tmp_path / "out", progress=stop)
+    again = run(logs, [modes_only], tmp_path / "out")
+    run(logs, [modes_only], tmp_path / "other")
+    assert again.n_remembered == 2
+    assert tables(tmp_path / "out") == tables(tmp_path / "other")
+
+
+def test_assess_without_parameters_tracks_and_claims_nothing(
+    tmp_path: Path, modes_only: Stage
+) -> None:
+    """A description of modes alone gives a track, no health, and no verdict."""
+    result = run(write_archive(tmp_path / "logs", 3), [modes_only], tmp_path / "out")
+    (assessment,) = result.assessments
+    assert assessment.track is not None
+    assert assessment.health is None
+    assert assessment.prognosis is None
+    assert assessment.judgement.verdict == "not-enough-data"

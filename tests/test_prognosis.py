@@ -1,0 +1,223 @@
+"""Remaining life: censoring, usage, determinism, and a grid as oracle."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from datetime import timedelta
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from lmshealth import life
+from lmshealth.errors import BadStage, NotEnoughData
+from lmshealth.life import LifeLikelihood
+from lmshealth.prognosis import _usage, prognose
+from lmshealth.results import History, Prognosis
+from lmshealth.stage import Stage
+from tests.lives import (
+    FADING,
+    FOOT,
+    FREQUENCY,
+    MOUNT,
+    START,
+    TEMPERATURE,
+    make_history,
+    make_stage,
+    true_drift,
+)
+
+KNOWN_USAGE = "[usage]\nkm_per_day = 20\nhorizon_km = 5000\n"
+LIMITED_FOOT = FOOT + "limit = { below = 0.8 }\n"
+
+
+@pytest.fixture(scope="module", autouse=True)
+def small_grid() -> Iterator[None]:
+    """Average over two walks and one noise scale: every check here holds for any grid."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(life, "_WALKS", (1e-5, 1.5e-3))
+        patch.setattr(life, "_NOISE_SCALES", (1.0,))
+        patch.setattr(life, "_NOISE_SCALE_PRIOR", (1.0,))
+        yield
+
+
+def fading_life(rate_per_km: float, n: int = 8, *, baseline: int = 0, seed: int = 1) -> History:
+    """Make the life of a preload that fades in proportion to travel, 100 km to 1,500 km."""
+    travel = np.linspace(1e5, 1.5e6, n)
+    left = 1 - rate_per_km / 1000 * np.maximum(travel - travel[baseline], 0)
+    drift = true_drift(("guide_preload",), np.log(left)[:, None])[:, :2]
+    noise = 1e-3 * np.random.default_rng(seed).standard_normal((n, 2))
+    return make_history(np.log(FREQUENCY[:2]) + drift + noise, travel=travel, baseline=baseline)
+
+
+@pytest.fixture(scope="module")
+def stage(small_grid: None, tmp_path_factory: pytest.TempPathFactory) -> Stage:
+    """A fading preload with limit 0.6 and an unchanging foot with limit 0.8; 20 km a day."""
+    folder = tmp_path_factory.mktemp("stage")
+    return make_stage(folder, (FADING, LIMITED_FOOT), tail=TEMPERATURE + KNOWN_USAGE)
+
+
+@pytest.fixture(scope="module")
+def fading(stage: Stage) -> Prognosis:
+    """Preload at about 0.79 after 1,400 km: some 1,300 km left."""
+    return prognose(fading_life(1.5e-4), stage, 3)
+
+
+def test_ten_thousand_draws_and_the_first_limit(fading: Prognosis) -> None:
+    """10,000 draws of each limit; "any" is the smaller of them, draw by draw."""
+    assert fading.parameters == ("guide_preload", "foot", "any")
+    assert fading.remaining.shape == (10_000, 3)
+    np.testing.assert_array_equal(fading.remaining[:, 2], fading.remaining[:, :2].min(axis=1))
+    np.testing.assert_array_equal(fading.limits, [0.6, 0.8, np.nan])
+
+
+def test_remaining_life_is_that_of_a_grid(stage: Stage, fading: Prognosis) -> None:
+    """Quantiles of the remaining travel have the right probability on a 1-D grid."""
+    likelihood = LifeLikelihood(fading_life(1.5e-4), stage)
+    y = np.linspace(-0.3, 0.6, 4001)[:, None]
+    value = likelihood.log_probability(y)
+    density = np.exp(value - value.max())
+    cdf = (np.cumsum(density) - 0.5 * density) / density.sum()
+    for level in (0.05, 0.25, 0.5, 0.75, 0.95):
+        left = np.quantile(fading.remaining[:, 0], level)
+        rate = 0.4 / (left + 1.4e6)  # what is lost per metre if the limit comes after that
+        share = 1 - np.interp(rate * 1.4e6, y[:, 0], cdf)
+        assert abs(share - level) < 5 * np.sqrt(level * (1 - level) / fading.ess) + 0.02
+
+
+def test_the_truth_is_where_it_should_be(fading: Prognosis) -> None:
+    """Truth of health and remaining life lie within the central 99 % of this life's draws."""
+    left = 0.4 / 1.5e-7 - 1.4e6
+    low, high = np.quantile(fading.remaining[:, 0], [0.005, 0.995])
+    assert low < left < high
+    low, high = np.quantile(fading.health[:, 0], [0.005, 0.995])
+    assert low < 0.79 < high
+
+
+def test_limits_never_reached_stay_infinite(fading: Prognosis) -> None:
+    """An unchanging parameter never fails: infinite in every draw, and past every horizon."""
+    assert np.isinf(fading.remaining[:, 1]).all()
+    assert fading.beyond_horizon()[1] == 1
+    assert fading.already_past()[1] == 0
+    assert (fading.health[:, 1] == 1).all()
+
+
+def test_a_machine_that_does_not_wear_keeps_its_censored_draws(stage: Stage) -> None:
+    """With rates around 0 about half of the draws gain, and are kept as infinite."""
+    found = prognose(fading_life(0.0), stage, 4)
+    infinite = np.isinf(found.remaining[:, 0])
+    assert 0.02 < infinite.mean() < 0.98
+    assert found.beyond_horizon()[0] >= infinite.mean()
+    assert found.remaining.shape == (10_000, 3)
+    assert np.isfinite(found.curve_quantiles).all()
+
+
+def test_a_limit_that_is_past_has_negative_life(stage: Stage) -> None:
+    """Preload at 0.5, limit 0.6: past with certainty, by the travel since."""
+    found = prognose(fading_life(0.5 / 1400), stage, 5)
+    assert found.already_past()[0] > 0.99
+    assert np.median(found.remaining[:, 0]) == pytest.approx(1.12e6 - 1.4e6, abs=8e4)
+
+
+def test_the_same_seed_gives_the_same_prognosis(stage: Stage, fading: Prognosis) -> None:
+    """Two prognoses with one seed agree to the bit, with another seed they do not."""
+    again = prognose(fading_life(1.5e-4), stage, 3)
+    other = prognose(fading_life(1.5e-4), stage, 8)
+    np.testing.assert_array_equal(again.remaining, fading.remaining)
+    np.testing.assert_array_equal(again.curve_quantiles, fading.curve_quantiles)
+    assert not np.array_equal(other.remaining, fading.remaining)
+
+
+def test_curves_start_whole_and_fall(fading: Prognosis) -> None:
+    """Quantile curves start at the baseline with 1, are ordered, and their median falls."""
+    assert fading.curve_travel[0] == 1e5
+    np.testing.assert_allclose(fading.curve_quantiles[:, 0], 1.0)
+    assert (np.diff(fading.curve_quantiles, axis=0) >= -1e-12).all()
+    assert (np.diff(fading.curve_quantiles[2, :, 0]) <= 0).all()
+    assert fading.curve_travel[-1] > 1.5e6
+    assert fading.curve_travel[-1] <= 1.5e6 + fading.horizon
+
+
+def test_draws_now_and_left_tell_one_story(fading: Prognosis) -> None:
+    """Draw by draw, health now and remaining travel come from the same life."""
+    rate = (1 - fading.health[:, 0]) / 1.4e6
+    losing = rate > 0
+    left = 0.4 / rate[losing] - 1.4e6
+    np.testing.assert_allclose(fading.remaining[losing, 0], left, rtol=1e-9, atol=1e-3)
+
+
+def test_the_travel_counts_from_the_baseline(stage: Stage) -> None:
+    """With a later baseline the clock starts there: 1,000 km worn of the 2,667 km to the limit."""
+    found = prognose(fading_life(1.5e-4, 15, baseline=4), stage, 6)
+    since = 1.5e6 - np.linspace(1e5, 1.5e6, 15)[4]
+    low, high = np.quantile(found.remaining[:, 0], [0.005, 0.995])
+    assert low < 0.4 / 1.5e-7 - since < high
+    assert found.curve_travel[0] == pytest.approx(1.5e6 - since)
+
+
+def test_usage_that_is_stated_is_taken(fading: Prognosis) -> None:
+    """Stated kilometres per day come out as metres per day without spread."""
+    assert (fading.usage == 20_000).all()
+    assert fading.horizon == 5e6
+
+
+@pytest.fixture(scope="module")
+def unstated(tmp_path_factory: pytest.TempPathFactory) -> Stage:
+    """A stage whose usage has to be read from the odometer."""
+    return make_stage(tmp_path_factory.mktemp("unstated"), (FADING,))
+
+
+def test_usage_is_learned_from_the_odometer(unstated: Stage) -> None:
+    """Usage is total travel per total time, with the relative error of a ratio estimate."""
+    rng = np.random.default_rng(7)
+    steps = 1.4e5 * rng.lognormal(0, 0.5, 40)
+    history = make_history(
+        np.tile(np.log(FREQUENCY[:2]), (41, 1)), travel=np.r_[0, np.cumsum(steps)]
+    )
+    usage = _usage(history, unstated, np.random.default_rng(8))
+    rate = steps.sum() / (40 * 7)
+    relative = np.std(steps, ddof=1) / np.sqrt(40) / steps.mean()
+    assert np.median(usage) == pytest.approx(rate, rel=5 * relative / 80)
+    assert np.std(np.log(usage)) == pytest.approx(relative, rel=0.05)
+
+
+def test_an_odometer_that_tells_no_usage_is_refused(unstated: Stage) -> None:
+    """Logs of one moment cannot tell the usage; the error says what to state."""
+    history = fading_life(1e-4)
+    once = replace(history, recorded_at=(START,) * 8)
+    with pytest.raises(NotEnoughData, match=r"state \[usage\] km_per_day"):
+        _usage(once, unstated, np.random.default_rng(9))
+    twice = replace(history, recorded_at=(START,) * 4 + (START + timedelta(days=9),) * 4)
+    with pytest.raises(NotEnoughData, match="km_per_day"):
+        _usage(twice, unstated, np.random.default_rng(9))
+
+
+def test_without_a_limit_there_is_no_end(tmp_path: Path) -> None:
+    """No limit, no prognosis."""
+    stage = make_stage(tmp_path, (FADING.replace("limit = { below = 0.6 }", ""),))
+    with pytest.raises(BadStage, match=r"no \[\[parameter\]\] has a limit"):
+        prognose(fading_life(1e-4), stage, 1)
+
+
+def test_a_stage_without_any_law_never_fails(tmp_path: Path) -> None:
+    """Where nothing may change the prognosis is infinite, without sampling."""
+    stage = make_stage(tmp_path, (LIMITED_FOOT,), tail=KNOWN_USAGE)
+    found = prognose(fading_life(0.0), stage, 1)
+    assert np.isinf(found.remaining).all()
+    assert found.degrees_of_freedom == 16
+    assert np.isfinite(found.curve_quantiles).all()
+
+
+def test_a_floor_above_the_limit_never_fails_and_one_below_does(tmp_path: Path) -> None:
+    """Draws of a mount whose floor lies above the limit are infinite, the others finite."""
+    stage = make_stage(tmp_path, (MOUNT,), tail=KNOWN_USAGE)
+    travel = np.linspace(0, 2e6, 8)
+    x = np.log(0.7 + 0.3 * np.exp(-travel / 1e6))[:, None]
+    noise = 2e-3 * np.random.default_rng(3).standard_normal((8, 2))
+    ln_f = np.log(FREQUENCY[:2]) + true_drift(("mount_stiffness",), x)[:, :2] + noise
+    found = prognose(make_history(ln_f, std=2e-3, travel=travel), stage, 2)
+    infinite = np.isinf(found.remaining[:, 0])
+    assert 0.05 < infinite.mean() < 0.95
+    assert np.isfinite(found.remaining[~infinite]).all()
+    assert found.health.shape == (10_000, 1)

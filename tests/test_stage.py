@@ -1,0 +1,178 @@
+"""Stage descriptions: schema errors name their key, maps are checked, logs find their stage."""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from lmshealth.errors import BadStage
+from lmshealth.laws import Unchanging
+from lmshealth.results import Metadata
+from lmshealth.stage import Stage, load_stage, shipped
+from tests.lives import FADING, FOOT, MOUNT, PRELOAD, make_stage, map_rows, stage_text, true_drift
+
+
+@pytest.fixture
+def stage(tmp_path: Path) -> Stage:
+    """Preload and mount, two modes."""
+    return make_stage(tmp_path)
+
+
+def load(folder: Path, text: str) -> Stage:
+    """Write a description beside a full map and load it."""
+    (folder / "map.csv").write_text("\n".join(map_rows(("guide_preload", "mount_stiffness"))))
+    path = folder / "odd.toml"
+    path.write_text(text)
+    return load_stage(str(path))
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "needle"),
+    [
+        ("damping_ratio = 0.018", "damping_ratio = 1.8", r"\$\.mode\[0\]\.damping_ratio"),
+        ("damping_ratio = 0.015", "damping = 0.015", r"\$\.mode\[1\]"),
+        ("sigma = 0.3", 'sigma = "wide"', r"\$\.parameter\[.*\]\.prior\.sigma"),
+        ('kind = "hertz-wear"', 'kind = "rust"', r"\$\.parameter\[.*\]\.law"),
+        ("below = 0.6", "below = -1", r"\$\.parameter\[.*\]\.limit\.below"),
+        ("model_std = 0.05", "model_std = 1.5", r"\$\.map\.model_std"),
+        ("prior_std = 0.001", "prior_std = 0", r"\$\.covariate\[0\]\.prior_std"),
+        ("reference = 21.0", "referense = 21.0", r"referense.*\$\.covariate\[0\]|reference"),
+        ('name = "small"', 'nam = "small"', "nam"),
+        ("median = 1.0, sigma = 0.3", "median = -1.0, sigma = 0.3", "median and sigma above 0"),
+        ('name = "pitch"', 'name = "roll"', r"\[\[mode\]\] names must be unique.*roll"),
+        ('name = "mount_stiffness"', 'name = "guide_preload"', r"\[\[parameter\]\].*unique"),
+        ('[map]\nfile = "map.csv"\nmodel_std = 0.05', "", r"\[\[parameter\]\] needs a \[map\]"),
+        ('file = "map.csv"', 'file = "gone.csv"', r"gone\.csv"),
+        ("below = 0.7", "below = 1.2", "mount_stiffness: limit 1.2 must lie below"),
+        ('name = "mount_stiffness"', 'name = "mount"', r"map\.csv: no column \['mount'\]"),
+    ],
+)
+def test_a_description_that_breaks_the_schema_is_refused(
+    tmp_path: Path, old: str, new: str, needle: str
+) -> None:
+    """Each slip is refused with the path of its key, or the part and the name."""
+    text = stage_text()
+    assert old in text
+    with pytest.raises(BadStage, match=needle):
+        load(tmp_path, text.replace(old, new))
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "slip"),
+    [
+        ("sigma = 0.3 }", "sigma = 0.3, medain = 2.0 }", "medain"),
+        ('{ kind = "hertz-wear",', '{ kind = "hertz-wear", exponnt = 1.2,', "exponnt"),
+    ],
+    ids=["prior", "law"],
+)
+def test_unknown_keys_of_priors_and_laws_are_refused(
+    tmp_path: Path, old: str, new: str, slip: str
+) -> None:
+    """A typing slip inside a prior or a law is seen, as everywhere in a description."""
+    text = stage_text()
+    assert old in text
+    with pytest.raises(BadStage, match=slip):
+        load(tmp_path, text.replace(old, new))
+
+
+def test_covariate_names_are_unique(tmp_path: Path) -> None:
+    """Two covariates of one name are refused with the name."""
+    tail = '[[covariate]]\nname = "temperature_c"\nreference = 21.0\nprior_std = 0.001\n' * 2
+    with pytest.raises(BadStage, match=r"\[\[covariate\]\] names must be unique.*temperature_c"):
+        make_stage(tmp_path, tail=tail)
+
+
+def test_a_baseline_outside_the_map_is_refused(tmp_path: Path) -> None:
+    """The state at baseline has to be on the map."""
+    with pytest.raises(BadStage, match="baseline of the parameters lies outside"):
+        make_stage(tmp_path, (PRELOAD + "\n", MOUNT.replace("limit =", "baseline = 9.0\nlimit =")))
+
+
+def test_a_map_without_any_tracked_mode_is_refused(tmp_path: Path) -> None:
+    """A map whose modes are none of the description's says nothing, and both lists are told."""
+    text = stage_text().replace('name = "roll"', 'name = "bounce"').replace('"pitch"', '"sway"')
+    with pytest.raises(BadStage, match="none of them is a tracked.*bounce"):
+        load(tmp_path, text)
+
+
+def test_a_file_that_is_not_there_and_a_name_nobody_knows(tmp_path: Path) -> None:
+    """A missing path is named; an unknown name is told which ones there are."""
+    with pytest.raises(BadStage, match=r"gone\.toml"):
+        load_stage(str(tmp_path / "gone.toml"))
+    with pytest.raises(BadStage, match="lms-x, lms-y"):
+        load_stage("lms-z")
+
+
+def test_a_file_that_is_no_toml_is_refused(tmp_path: Path) -> None:
+    """Broken syntax names the file."""
+    with pytest.raises(BadStage, match=r"odd\.toml"):
+        load(tmp_path, "name = [")
+
+
+def test_drift_is_zero_at_baseline_and_follows_the_map(stage: Stage) -> None:
+    """Predicted drifts are those of the formula behind the map, for the modes asked for."""
+    x = np.log([[1.0, 1.0], [0.7, 0.8], [0.4, 1.2]])
+    known = true_drift(("guide_preload", "mount_stiffness"), x)
+    np.testing.assert_allclose(stage.drift(x, ("pitch", "roll")), known[:, [1, 0]], atol=1e-12)
+    assert (stage.drift(x[:1], ("roll",)) == 0).all()
+
+
+def test_a_stage_without_parameters_needs_no_map(tmp_path: Path) -> None:
+    """Modes can be tracked without health; asking for health then is refused."""
+    stage = make_stage(tmp_path, ())
+    assert stage.modal_map is None
+    assert stage.informative == ()
+    with pytest.raises(BadStage, match=r"no \[map\]"):
+        stage.drift(np.zeros((1, 1)), ("roll",))
+
+
+def test_modes_that_are_not_tracked_do_not_inform(tmp_path: Path) -> None:
+    """Health is read from tracked modes that the map knows."""
+    text = stage_text(n_modes=3).replace(
+        "damping_ratio = 0.015", "damping_ratio = 0.015\ntracked = false"
+    )
+    assert load(tmp_path, text).informative == ("roll",)
+
+
+def test_the_digest_covers_description_and_map(tmp_path: Path, stage: Stage) -> None:
+    """A change of the description or of the map alone changes the digest."""
+    same = make_stage(tmp_path / "same")
+    other = make_stage(tmp_path / "other", model_std=0.04)
+    rows = map_rows(("guide_preload", "mount_stiffness"))
+    (tmp_path / "same" / "map.csv").write_text("\n".join([rows[0], *rows[:0:-1]]) + "\n")
+    moved = load_stage(str(tmp_path / "same" / "small.toml"))
+    assert stage.digest == same.digest
+    assert len({stage.digest, other.digest, moved.digest}) == 3
+
+
+def test_logs_find_their_description(tmp_path: Path) -> None:
+    """A description named in the manifest decides; without one the pattern of the stage does."""
+    stage = make_stage(tmp_path, (FADING,), tail='[match]\nstage = "*-X"')
+    moment = datetime(2026, 1, 1, tzinfo=UTC)
+    assert stage.takes(Metadata(stage="AX-X", recorded_at=moment))
+    assert not stage.takes(Metadata(stage="AX-Y"))
+    assert not stage.takes(Metadata())
+    assert stage.takes(Metadata(stage="AX-Y", description="small"))
+    assert stage.takes(Metadata(stage="AX-Y", description="small.toml"))
+    assert not stage.takes(Metadata(stage="AX-X", description="large"))
+
+
+def test_a_parameter_is_told_by_preload_or_mount(tmp_path: Path) -> None:
+    """The word of a verdict comes from the name unless it is stated; no law means unchanging."""
+    words = FOOT + 'verdict = "preload"\n'
+    stage = make_stage(tmp_path, (PRELOAD, MOUNT, words))
+    assert [p.word for p in stage.parameters] == ["preload", "mount", "preload"]
+    assert isinstance(stage.parameters[2].law, Unchanging)
+
+
+@pytest.mark.parametrize("name", ["lms-x", "lms-y"])
+def test_shipped_stages_load(name: str) -> None:
+    """Shipped descriptions load, with three modes that inform two limited parameters."""
+    stage = load_stage(name)
+    assert name in shipped()
+    assert len(stage.informative) == 3
+    assert [p.name for p in stage.parameters] == ["guide_preload", "mount_stiffness"]
+    assert all(p.limit for p in stage.parameters)

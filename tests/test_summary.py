@@ -1,0 +1,146 @@
+"""Verdicts in one word, and the day of the next service."""
+
+from __future__ import annotations
+
+import re
+from datetime import timedelta
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from lmshealth.results import FloatArray, History
+from lmshealth.stage import Stage
+from lmshealth.summary import degraded_below, judge, service_date
+from tests.lives import (
+    FOOT,
+    FREQUENCY,
+    MOUNT,
+    PRELOAD,
+    START,
+    make_health,
+    make_history,
+    make_prognosis,
+    make_stage,
+)
+
+
+@pytest.fixture(scope="module")
+def stage(tmp_path_factory: pytest.TempPathFactory) -> Stage:
+    """Preload with limit 0.6 and mount with limit 0.7."""
+    return make_stage(tmp_path_factory.mktemp("stage"))
+
+
+def logs(n: int) -> History:
+    """Make a history of so many logs."""
+    return make_history(np.tile(np.log(FREQUENCY[:2]), (n, 1)))
+
+
+def around(preload: float, mount: float, n: int = 1000) -> FloatArray:
+    """Draw health closely around two values."""
+    return np.random.default_rng(1).normal([preload, mount], 0.005, (n, 2))
+
+
+def test_degraded_is_a_quarter_of_what_may_be_lost(stage: Stage, tmp_path: Path) -> None:
+    """Without a limit a loss of 40 % stands for one."""
+    assert [degraded_below(p) for p in stage.parameters] == pytest.approx([0.9, 0.925])
+    foot = make_stage(tmp_path, (PRELOAD, MOUNT, FOOT)).parameters[2]
+    assert degraded_below(foot) == pytest.approx(0.9)
+
+
+@pytest.mark.parametrize(
+    ("preload", "mount", "word"),
+    [
+        (0.99, 1.0, "healthy"),
+        (0.8, 0.99, "preload"),
+        (0.98, 0.8, "mount"),
+        (0.7, 0.75, "both"),
+    ],
+)
+def test_the_word_is_what_the_draws_say(
+    stage: Stage, preload: float, mount: float, word: str
+) -> None:
+    """Clear cases get their word with probability near 1, and numbers in the sentence."""
+    found = judge(stage, logs(8), make_health(around(preload, mount)))
+    assert found.verdict == word
+    assert found.probability > 0.99
+    assert f"Guide preload is at {100 * preload:.0f} %" in found.why
+    assert found.recorded_at == logs(8).recorded_at[-1]
+
+
+def test_the_probability_is_the_share_of_the_draws(stage: Stage) -> None:
+    """Six draws in ten with worn preload: the word is preload, its probability 0.6."""
+    samples = np.ones((10, 2))
+    samples[:6, 0] = 0.8
+    found = judge(stage, logs(8), make_health(samples))
+    assert (found.verdict, found.probability) == ("preload", pytest.approx(0.6))
+
+
+def test_a_parameter_the_logs_do_not_tell_is_left_out(stage: Stage) -> None:
+    """An uninformed mount cannot be blamed, however low its draws lie, and the sentence says so."""
+    found = judge(stage, logs(8), make_health(around(0.99, 0.5), informed=(0.9, 0.1)))
+    assert found.verdict == "healthy"
+    assert "Mount stiffness: these logs do not tell." in found.why
+
+
+@pytest.mark.parametrize(
+    ("n_logs", "options", "needle"),
+    [
+        (3, {}, "3 usable logs, a baseline needs 5"),
+        (8, {"converged": False}, "did not converge"),
+        (8, {"informed": (0.2, 0.4)}, "move the prior of no parameter"),
+    ],
+)
+def test_too_little_data_gets_no_word(
+    stage: Stage, n_logs: int, options: dict, needle: str
+) -> None:
+    """Few logs, no convergence or no information: not-enough-data, without a probability."""
+    found = judge(stage, logs(n_logs), make_health(around(0.5, 0.5), **options))
+    assert found.verdict == "not-enough-data"
+    assert np.isnan(found.probability)
+    assert needle in found.why
+
+
+def test_without_health_there_is_no_word(stage: Stage) -> None:
+    """Logs that do not carry the parameters are told as such."""
+    found = judge(stage, logs(8), None)
+    assert found.verdict == "not-enough-data"
+    assert "do not carry" in found.why
+
+
+def test_a_parameter_with_a_unit_is_told_in_it(tmp_path: Path) -> None:
+    """A parameter of its own unit is told in that unit, not in percent."""
+    stage = make_stage(tmp_path, (PRELOAD.replace("limit", 'unit = "kN"\nlimit'), MOUNT))
+    found = judge(stage, logs(8), make_health(around(0.8, 0.99)))
+    assert re.search(r"Guide preload is 0\.(79|80)\d* kN \(90 %: 0\.79", found.why)
+
+
+def test_the_service_day_is_the_last_with_the_risk_allowed() -> None:
+    """With one draw in ten failing per day, a risk of 0.3 lasts to the day of the third."""
+    remaining = np.arange(1, 11) * 1e4
+    prognosis = make_prognosis(remaining, np.full(10, 1e4))
+    for risk, days in ((0.05, 1), (0.35, 4), (0.95, 9)):
+        day = service_date(prognosis, risk)
+        assert day == (START + timedelta(days=days)).date()
+        wait = (day - START.date()).days
+        assert np.mean(remaining / 1e4 < wait) <= risk
+
+
+def test_a_limit_that_is_passed_asks_for_service_today() -> None:
+    """More risk than allowed already: the day of the last log, not one before it."""
+    prognosis = make_prognosis(np.full(100, -5e5), np.full(100, 1e4))
+    assert service_date(prognosis, 0.05) == START.date()
+
+
+def test_no_service_is_asked_for_past_the_horizon() -> None:
+    """A quantile past the horizon, or never, is no date."""
+    assert service_date(make_prognosis(np.full(100, 2e7), np.full(100, 1e4)), 0.05) is None
+    assert service_date(make_prognosis(np.full(100, np.inf), np.full(100, 1e4)), 0.05) is None
+    few = np.r_[np.full(4, 1e5), np.full(96, np.inf)]
+    assert service_date(make_prognosis(few, np.full(100, 1e4)), 0.05) is None
+
+
+def test_an_idle_machine_needs_no_service_within_any_calendar() -> None:
+    """A day past the last one of the calendar is no date, and no error."""
+    prognosis = make_prognosis(np.full(100, 9e6), np.full(100, 1.0))
+    assert service_date(prognosis, 0.05) is None

@@ -1,0 +1,247 @@
+"""Tables: the columns of the contract, units at the door, and honest gaps."""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from lmshealth.history import Reading
+from lmshealth.results import (
+    Effect,
+    Health,
+    History,
+    Judgement,
+    Line,
+    Metadata,
+    Modes,
+    Prognosis,
+    Refusal,
+    Track,
+)
+from lmshealth.stage import Stage, load_stage
+from lmshealth.summary import Assessment
+from lmshealth.tables import COLUMNS, all_tables, frame, lines_rows, modes_rows
+from tests.signals import write_archive_stage
+
+WHEN = datetime(2026, 3, 1, 8, tzinfo=UTC)
+LEVELS = ("q05", "q10", "q25", "q50", "q75", "q90", "q95")
+
+
+def two_modes(coupled: float = 2e-7) -> Modes:
+    """Give two modes whose ln frequencies have a covariance."""
+    cov = np.diag([1e-6, 4e-6, 1e-2, 1e-2])
+    cov[0, 1] = cov[1, 0] = coupled
+    return Modes(
+        names=("roll", "pitch"),
+        sources=("acc", "acc"),
+        channels=("acc_x", "acc_y"),
+        ln_frequency=np.log([62.0, 105.0]),
+        ln_damping=np.log([0.02, 0.03]),
+        cov=cov,
+        snr=np.array([100.0, 50.0]),
+        lines=(Line(50.0, 0.1, "m/s²", "mains", "acc_x"),),
+        refused=(),
+    )
+
+
+def prognosis(remaining: np.ndarray, usage: float = 10_000.0) -> Prognosis:
+    """Give a prognosis of one parameter with these draws of remaining travel in m."""
+    n = remaining.size
+    return Prognosis(
+        stage="test-A",
+        recorded_at=WHEN,
+        travel=5e5,
+        parameters=("guide_preload", "any"),
+        limits=np.array([0.6, np.nan]),
+        remaining=np.column_stack([remaining, remaining]),
+        usage=np.full(n, usage),
+        horizon=2e7,
+        health=np.full((n, 1), 0.9),
+        curve_travel=np.array([0.0, 1.0]),
+        curve_quantiles=np.ones((5, 2, 1)),
+        chi_square=1.0,
+        degrees_of_freedom=1,
+        walk=0.0,
+        noise_scale=1.0,
+        ess=1000.0,
+        r_hat=1.0,
+    )
+
+
+def assessment(stage: Stage, foretold: Prognosis | None) -> Assessment:
+    """Give an assessment of two logs."""
+    two = (WHEN, WHEN.replace(month=4))
+    travel = np.array([1e5, 5e5])
+    shape = np.full((2, 2), 0.01)
+    drift_cov = np.tile(np.array([[1e-6, 5e-7], [5e-7, 4e-6]]), (2, 1, 1))
+    history = History(
+        "test-A", ("a.h5", "b.h5"), two, travel, {}, ("roll", "pitch"), np.log(100 * shape),
+        np.log(shape), np.tile(np.eye(4), (2, 1, 1)), 0,
+    )  # fmt: skip
+    track = Track(
+        "test-A", ("a.h5", "b.h5"), two, travel, ("roll", "pitch"), np.log(6200 * shape),
+        0.1 * shape, np.log(2 * shape), shape, -shape, drift_cov,
+        (Effect("roll", "temperature_c", -1e-4, 2e-5),), np.ones(2), np.full(2, 4.0), np.ones(2),
+    )  # fmt: skip
+    draws = np.random.default_rng(1).normal(0.9, 0.01, (2, 500, 1))
+    health = Health(
+        "test-A", two, travel, ("guide_preload",), draws, np.full((2, 1), 400.0),
+        np.full((2, 1), 1.001), np.array([True, False]), np.full((2, 1), 0.9), np.array([1.0]),
+    )  # fmt: skip
+    verdict = Judgement("test-A", two[-1], "healthy", 0.8, "")
+    return Assessment(stage, history, ("d", "e"), track, health, foretold, verdict, (), (), 0)
+
+
+@pytest.fixture(scope="module")
+def stage(tmp_path_factory: pytest.TempPathFactory) -> Stage:
+    """Load the small stage of the tests."""
+    return load_stage(str(write_archive_stage(tmp_path_factory.mktemp("stage"))))
+
+
+def tables(stage: Stage, remaining: np.ndarray) -> dict[str, pd.DataFrame]:
+    """Make the tables of one assessment with these draws of remaining travel."""
+    return all_tables([], [assessment(stage, prognosis(remaining))], [])
+
+
+def test_empty_tables_have_their_columns() -> None:
+    """Nothing at all still makes every table with its header."""
+    made = all_tables([], [], [])
+    assert set(made) == set(COLUMNS)
+    for name, table in made.items():
+        assert table.empty
+        assert list(table.columns) == COLUMNS[name].split()
+        assert table.to_csv(index=False) == ",".join(COLUMNS[name].split()) + "\n"
+
+
+def test_modes_leave_with_units_in_their_names() -> None:
+    """Hz, km and °C stand in the table; the std of f is f times the std of ln f."""
+    metadata = Metadata("test-A", WHEN, 123_400.0, {"temperature_c": 21.5})
+    table = frame("modes", modes_rows("a.h5", metadata, two_modes()))
+    row = table.iloc[0]
+    assert (row["mode"], row["source"], row["channel"]) == ("roll", "acc", "acc_x")
+    assert row["recorded_at"] == "2026-03-01T08:00:00+00:00"
+    assert row["travel_km"] == pytest.approx(123.4)
+    assert row["temperature_c"] == 21.5
+    assert row["frequency_std_hz"] == pytest.approx(62.0e-3)
+    assert row["damping_ratio_std"] == pytest.approx(0.02 * 0.1)
+
+
+def test_unknown_metadata_are_empty_cells() -> None:
+    """A log that says nothing about itself leaves empty cells, never a text like nan."""
+    text = frame("modes", modes_rows("a.h5", Metadata(), two_modes())).to_csv(index=False)
+    assert text.splitlines()[1].startswith("a.h5,,,,,roll,acc,")
+    assert "nan" not in text.lower()
+
+
+def test_lines_have_the_keys_of_the_contract() -> None:
+    """A line is told by frequency, amplitude with unit, kind and channel."""
+    (row,) = lines_rows(two_modes())
+    assert row == {
+        "frequency_hz": 50.0,
+        "amplitude": 0.1,
+        "unit": "m/s²",
+        "kind": "mains",
+        "channel": "acc_x",
+    }
+
+
+def test_covariances_between_modes_are_listed_once_and_zeros_left_out() -> None:
+    """A cross term of ln f is one row; modes of separate fits have none."""
+    readings = [Reading("a.h5", "d", Metadata(), two_modes())]
+    table = all_tables(readings, [], [])["modes_cov"]
+    (row,) = table.to_dict("records")
+    assert (row["log"], row["mode_a"], row["mode_b"]) == ("a.h5", "roll", "pitch")
+    assert row["cov_ln_f"] == 2e-7
+    apart = [Reading("a.h5", "d", Metadata(), two_modes(0.0))]
+    assert all_tables(apart, [], [])["modes_cov"].empty
+
+
+def test_track_and_its_covariance_agree(stage: Stage) -> None:
+    """Standard deviations are roots of the diagonal, cross terms one row per pair and epoch."""
+    made = tables(stage, np.full(100, 1e6))
+    track, cov = made["track"], made["track_cov"]
+    assert len(track) == 4
+    assert len(cov) == 2
+    np.testing.assert_allclose(track["drift_std"], [1e-3, 2e-3] * 2)
+    np.testing.assert_allclose(track["frequency_hz"], 62.0)
+    np.testing.assert_allclose(track["frequency_std_hz"], 62.0e-3)
+    np.testing.assert_allclose(track["damping_ratio_std"], 0.02 * 0.01)
+    np.testing.assert_allclose(cov["cov_drift"], 5e-7)
+    assert made["effects"].to_dict("records")[0]["covariate"] == "temperature_c"
+
+
+def test_health_quantiles_are_ordered_and_told_with_their_convergence(stage: Stage) -> None:
+    """Every row has q05 ≤ q25 ≤ median ≤ q75 ≤ q95, and says whether it converged."""
+    health = tables(stage, np.full(100, 1e6))["health"]
+    values = health[["q05", "q25", "median", "q75", "q95"]].to_numpy()
+    assert (np.diff(values, axis=1) > 0).all()
+    assert health["converged"].tolist() == [True, False]
+
+
+def test_remaining_life_is_told_in_three_units(stage: Stage) -> None:
+    """Kilometres over kilometres per day are days, and 24 hours are a day."""
+    remaining = np.linspace(1e5, 1e6, 1001)
+    row = tables(stage, remaining)["prognosis"].iloc[0]
+    assert row["rul_km_q50"] == pytest.approx(550.0)
+    assert row["rul_days_q50"] == pytest.approx(55.0)
+    assert row["rul_hours_q50"] == pytest.approx(55.0 * 24)
+    assert pd.isna(row["censored_from"])
+    km = [row[f"rul_km_{level}"] for level in LEVELS]
+    assert km == sorted(km)
+
+
+def test_quantiles_past_the_horizon_are_empty(stage: Stage) -> None:
+    """With 60 % of the draws past the horizon q50 and above are empty, and the level is told."""
+    remaining = np.concatenate(
+        [np.linspace(1e5, 1e6, 400), np.full(300, 3e7), np.full(300, np.inf)]
+    )
+    row = tables(stage, remaining)["prognosis"].iloc[0]
+    assert row["censored_from"] == 0.5
+    assert row["probability_beyond_horizon"] == pytest.approx(0.6)
+    for unit in ("km", "hours", "days"):
+        assert [bool(pd.isna(row[f"rul_{unit}_{level}"])) for level in LEVELS] == 3 * [
+            False
+        ] + 4 * [True]
+    text = tables(stage, remaining)["prognosis"].to_csv(index=False)
+    assert "inf" not in text
+    assert "nan" not in text
+
+
+def test_a_life_wholly_past_the_horizon_has_no_quantile_and_no_service(stage: Stage) -> None:
+    """All quantiles are empty, censored from the first level; nobody is sent."""
+    row = tables(stage, np.full(100, np.inf))["prognosis"].iloc[1]
+    assert row["parameter"] == "any"
+    assert row["censored_from"] == 0.05
+    assert all(pd.isna(row[f"rul_km_{level}"]) for level in LEVELS)
+    assert pd.isna(row["service_by"])
+
+
+def test_a_limit_already_passed_has_no_life_left(stage: Stage) -> None:
+    """Remaining life is never negative, and the probability of having passed is told."""
+    made = tables(stage, np.full(100, -5e5))["prognosis"]
+    assert (made["rul_km_q05"] == 0).all()
+    assert (made["probability_already_past"] == 1).all()
+    assert made["service_by"].iloc[1] == WHEN.date()
+
+
+def test_refusals_are_rows() -> None:
+    """Log, channel, mode, source, reason and detail are told as they are."""
+    refusal = Refusal("a.h5", "flat", 'all "0", really', channel="acc_x")
+    table = all_tables([], [], [refusal])["refused"]
+    assert table.iloc[0].tolist() == ["a.h5", "acc_x", "", "", "flat", 'all "0", really']
+
+
+def test_the_columns_are_those_of_the_contract() -> None:
+    """Every column of the public contract is in its table."""
+    wanted = {
+        "modes": "log stage recorded_at travel_km temperature_c mode source frequency_hz "
+        "frequency_std_hz damping_ratio damping_ratio_std correlation_f_zeta snr",
+        "events": "stage recorded_at travel_km kind mode source size std evidence",
+        "verdict": "stage recorded_at verdict probability",
+        "refused": "log channel mode source reason detail",
+    }
+    for name, columns in wanted.items():
+        assert set(columns.split()) <= set(COLUMNS[name].split())
