@@ -55,7 +55,8 @@ class NotConverged(LmshealthError):
     message : str
         What was reached, what was needed.
     chains : ndarray
-        The draws so far, shape ``(n_ensembles, n_steps, n_walkers, n_parameters)``.
+        The draws so far, shape ``(n_ensembles, n_steps, n_walkers, n_parameters)``; where no
+        start was found, the points that were tried, ``(n_points, n_parameters)``.
     """
 
     def __init__(self, message: str, chains: object) -> None:

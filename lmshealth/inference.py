@@ -30,7 +30,8 @@ def epochs_to_infer(track: Track, stage: Stage, most: int) -> tuple[int, ...]:
     usable = np.flatnonzero(np.all(np.isfinite(variance) & (variance > 0), axis=1))
     if usable.size <= most:
         return tuple(usable.tolist())
-    spaced = np.unique(np.linspace(0, usable.size - 1, most).round().astype(int))
+    # Counted from the last, which a single epoch must be.
+    spaced = np.unique(np.linspace(usable.size - 1, 0, most).round().astype(int))
     return tuple(usable[spaced].tolist())
 
 

@@ -12,7 +12,7 @@ from typing import ClassVar, Protocol
 
 import msgspec
 import numpy as np
-from scipy.special import expit
+from scipy.special import expit, log_expit
 
 from lmshealth.priors import Prior, Uniform
 from lmshealth.results import FloatArray
@@ -47,7 +47,17 @@ def _draw(prior: Prior, rng: np.random.Generator, n: int) -> FloatArray:
     return np.asarray(prior.quantile(rng.uniform(1e-9, 1 - 1e-9, n)))
 
 
-class HertzWear(msgspec.Struct, frozen=True, tag="hertz-wear", tag_field="kind"):
+def _draw_length(prior: Prior, rng: np.random.Generator, n: int) -> FloatArray:
+    """Draw lengths in m from a prior in km; a prior that reaches below 0 is cut there."""
+    km = _draw(prior, rng, n)
+    while (negative := km <= 0).any():
+        km[negative] = _draw(prior, rng, int(negative.sum()))
+    return _KM * km
+
+
+class HertzWear(
+    msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="hertz-wear", tag_field="kind"
+):
     """Preload lost by wear of the rolling contacts: P(s) = (1 - (s / s_w)^n)^1.5.
 
     The elastic approach shrinks with travel as (s / s_w)^n, and the contact force goes with its
@@ -72,12 +82,12 @@ class HertzWear(msgspec.Struct, frozen=True, tag="hertz-wear", tag_field="kind")
     def log_prior(self, y: FloatArray, now: float) -> FloatArray:
         """Log prior density with |d(s_w, n)/d(y1, y2)| = (s_w / n) (dn/dy2)."""
         life, n = self.natural(y, now).T
-        slope = np.log(expit(y[:, 1])) + np.log(expit(-y[:, 1]))
+        slope = log_expit(y[:, 1]) + log_expit(-y[:, 1])
         return np.asarray(self.life_km.log_density(life / _KM) + np.log(life / n) + slope)
 
     def draw(self, rng: np.random.Generator, n: int, now: float) -> FloatArray:
         """Draw coordinates from the prior."""
-        life = _KM * _draw(self.life_km, rng, n)
+        life = _draw_length(self.life_km, rng, n)
         share = rng.uniform(1e-6, 1 - 1e-6, n)
         exponent = self.exponent.low + (self.exponent.high - self.exponent.low) * share
         return np.column_stack([exponent * np.log(now / life), np.log(share / (1 - share))])
@@ -96,7 +106,9 @@ class HertzWear(msgspec.Struct, frozen=True, tag="hertz-wear", tag_field="kind")
         return np.asarray(theta[:, 0] * loss ** (1 / theta[:, 1]))
 
 
-class Loosening(msgspec.Struct, frozen=True, tag="loosening", tag_field="kind"):
+class Loosening(
+    msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="loosening", tag_field="kind"
+):
     """Joint that settles towards a floor: k(s) = k_f + (1 - k_f) exp(-s / s_m)."""
 
     life_km: Prior
@@ -123,7 +135,7 @@ class Loosening(msgspec.Struct, frozen=True, tag="loosening", tag_field="kind"):
 
     def draw(self, rng: np.random.Generator, n: int, now: float) -> FloatArray:
         """Draw coordinates from the prior."""
-        life = _KM * _draw(self.life_km, rng, n)
+        life = _draw_length(self.life_km, rng, n)
         floor = np.clip(_draw(self.floor, rng, n), 1e-6, 1 - 1e-6)
         return np.column_stack([np.log((1 - floor) * -np.expm1(-now / life)), np.log(life)])
 
@@ -140,13 +152,15 @@ class Loosening(msgspec.Struct, frozen=True, tag="loosening", tag_field="kind"):
         return np.where(reached, life * np.log(np.maximum(ratio, 1.0)), np.inf)
 
 
-class Power(HertzWear, frozen=True, tag="power", tag_field="kind"):
+class Power(HertzWear, frozen=True, forbid_unknown_fields=True, tag="power", tag_field="kind"):
     """Loss as a power of travel: h(s) = 1 - (s / s_p)^n, for parameters without a physics."""
 
     outer: ClassVar[float] = 1.0
 
 
-class Linear(msgspec.Struct, frozen=True, tag="linear", tag_field="kind"):
+class Linear(
+    msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="linear", tag_field="kind"
+):
     """Loss in proportion to travel: h(s) = 1 - r s. A rate below 0 is a gain."""
 
     rate_per_km: Prior
@@ -179,7 +193,9 @@ class Linear(msgspec.Struct, frozen=True, tag="linear", tag_field="kind"):
         return np.where(losing, max(1 - limit, 0.0) / np.where(losing, rate, 1.0), np.inf)
 
 
-class Unchanging(msgspec.Struct, frozen=True, tag="none", tag_field="kind"):
+class Unchanging(
+    msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="none", tag_field="kind"
+):
     """No degradation: h(s) = 1."""
 
     @property

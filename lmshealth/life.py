@@ -65,7 +65,12 @@ class LifeLikelihood:
 
     def __init__(self, history: History, stage: Stage) -> None:
         self.stage = stage
-        self.modes = tuple(name for name in stage.informative if name in history.modes)
+        seen = np.any(np.isfinite(history.ln_frequency[history.baseline :]), axis=0).tolist()
+        self.modes = tuple(
+            name
+            for name in stage.informative
+            if name in history.modes and seen[history.modes.index(name)]
+        )
         columns = [history.modes.index(name) for name in self.modes]
         ln_f = history.ln_frequency[history.baseline :, columns]
         self.clock = history.clock()[history.baseline :]

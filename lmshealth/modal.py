@@ -62,9 +62,9 @@ def identify(
     seen: list[tuple[str, float, float]] = []
     if stage is not None:
         targets = _stage_targets(stage, band)
-        views = _transform(log, used, targets)
+        views = _transform(log, used, targets, band)
     else:
-        views = _transform(log, used, ())
+        views = _transform(log, used, (), band)
         targets, seen = _search(log, views, band)
     best: list[BandFit] = []
     refused: list[Refusal] = []
@@ -107,8 +107,12 @@ def _stage_targets(stage: Stage, band: tuple[float, float] | None) -> tuple[Targ
 
 
 def _transform(
-    log: Log, channels: tuple[Channel, ...], targets: tuple[Target, ...]
+    log: Log,
+    channels: tuple[Channel, ...],
+    targets: tuple[Target, ...],
+    band: tuple[float, float] | None,
 ) -> tuple[View, ...]:
+    """Transform every channel, up to the top of what is looked for."""
     top = max((target.band(BAND)[1] for target in targets), default=0.0)
     if top > log.sample_rate / 2:
         raise BadLog(
@@ -128,11 +132,13 @@ def _transform(
             f"no stretch of constant velocity without gaps lasts {needed:.3g} s, which the "
             f"narrowest mode needs; the longest piece without gaps has {longest:.3g} s",
         )
+    widest = max((target.search for target in targets), default=0.0)
+    reach = (1 + widest) * top if targets else (band or (0.0, np.inf))[1]
     return tuple(
         View(
             channel.name,
             "delta_e" if channel.kind == "displacement" else "acc",
-            tuple(periodogram(channel, segment, log.sample_rate) for segment in segments),
+            tuple(periodogram(channel, segment, log.sample_rate, reach) for segment in segments),
         )
         for channel in channels
     )

@@ -127,7 +127,10 @@ def read_map(path: str, parameters: tuple[str, ...]) -> ModalMap:
             f"{path}: columns {sorted(extra)} are no parameter of the stage description; "
             "describe them as [[parameter]] or make the map without them"
         )
-    numbers = table[[*parameters, "frequency_hz"]].to_numpy(dtype=float)
+    try:
+        numbers = table[[*parameters, "frequency_hz"]].to_numpy(dtype=float)
+    except ValueError as error:
+        raise BadStage(f"{path}: a cell holds no number: {error}") from error
     if not (np.isfinite(numbers) & (numbers > 0)).all():
         raise BadStage(f"{path}: parameters and frequencies must be positive numbers")
     return _fit(path, table, parameters)

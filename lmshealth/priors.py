@@ -9,7 +9,9 @@ from scipy.special import ndtri
 from lmshealth.results import FloatArray
 
 
-class Lognormal(msgspec.Struct, frozen=True, tag="lognormal", tag_field="kind"):
+class Lognormal(
+    msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="lognormal", tag_field="kind"
+):
     """Lognormal distribution by its median and the standard deviation of the logarithm."""
 
     median: float
@@ -31,7 +33,9 @@ class Lognormal(msgspec.Struct, frozen=True, tag="lognormal", tag_field="kind"):
         return self.median * np.exp(self.sigma * ndtri(level))
 
 
-class Normal(msgspec.Struct, frozen=True, tag="normal", tag_field="kind"):
+class Normal(
+    msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="normal", tag_field="kind"
+):
     """Normal distribution."""
 
     mean: float
@@ -50,7 +54,9 @@ class Normal(msgspec.Struct, frozen=True, tag="normal", tag_field="kind"):
         return self.mean + self.std * ndtri(level)
 
 
-class Uniform(msgspec.Struct, frozen=True, tag="uniform", tag_field="kind"):
+class Uniform(
+    msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="uniform", tag_field="kind"
+):
     """Uniform distribution between low and high."""
 
     low: float

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import fft
@@ -11,6 +11,8 @@ from lmshealth.results import Channel, FloatArray, Log
 
 # Setpoint changes below this share of its largest value count as constant velocity.
 _VELOCITY_TOLERANCE = 1e-3
+# The second difference of a displacement reaches over this part of the shortest period.
+_LAG_PERIODS = 8.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,11 +115,15 @@ def _constant_velocity(velocity: FloatArray, offset: int) -> list[Segment]:
     ]
 
 
-def periodogram(channel: Channel, segment: Segment, sample_rate: float) -> Spectrum:
+def periodogram(
+    channel: Channel, segment: Segment, sample_rate: float, top: float = np.inf
+) -> Spectrum:
     """Compute the one-sided periodogram of a channel as acceleration.
 
     A displacement is differenced twice before the transform rather than multiplied by ω² after
-    it: differencing first keeps its large slow part from leaking into the band of the modes.
+    it: differencing first keeps its large slow part from leaking into the band of the modes. The
+    difference reaches over as many samples as the top of the band allows, because between
+    neighbouring samples it would raise the fast noise so far that this leaks instead.
 
     Parameters
     ----------
@@ -127,15 +133,21 @@ def periodogram(channel: Channel, segment: Segment, sample_rate: float) -> Spect
         Which samples.
     sample_rate : float
         In Hz.
+    top : float
+        Highest frequency of interest in Hz; of a displacement nothing is given far above it.
+        By default all are, at the price of that leakage.
 
     Returns
     -------
     Spectrum
-        From the first Fourier frequency up to just below Nyquist.
+        From the first Fourier frequency up to just below Nyquist, for a displacement up to
+        four times ``top`` if that is lower.
     """
     x = channel.values[segment.start : segment.stop]
+    lag = 0
     if channel.kind == "displacement":
-        x = np.diff(x, 2) * sample_rate**2
+        lag = max(1, int(sample_rate / (_LAG_PERIODS * top)))
+        x = (x[2 * lag :] - 2 * x[lag:-lag] + x[: -2 * lag]) * sample_rate**2
     n = x.size
     ramp = np.arange(n) - (n - 1) / 2
     x = x - x.mean() - ramp * (ramp @ x / (ramp @ ramp))
@@ -144,11 +156,14 @@ def periodogram(channel: Channel, segment: Segment, sample_rate: float) -> Spect
     frequency: FloatArray = np.arange(1, last + 1, dtype=np.float64) * (sample_rate / n)
     squared = transform.real**2 + transform.imag**2
     power = 2 / (n * sample_rate) * squared
-    if channel.kind == "displacement":
-        # The second difference has gain (2 fs sin(ω/2fs))², the second derivative ω².
-        half = np.pi * frequency / sample_rate
-        power *= (half / np.sin(half)) ** 4
-    return Spectrum(frequency, power, n / sample_rate, segment.velocity)
+    spectrum = Spectrum(frequency, power, n / sample_rate, segment.velocity)
+    if lag == 0:
+        return spectrum
+    # The difference over L samples has gain (2 fs sin(ωL/2fs))², the second derivative ω²; the
+    # former vanishes at fs/L, eight times the top.
+    half = np.pi * frequency / sample_rate
+    gain = np.abs(np.sin(lag * half)).clip(1e-6)
+    return replace(spectrum, periodogram=power * (half / gain) ** 4).band(0.0, 4 * top)
 
 
 def periodogram_kernel(frequency: FloatArray, duration: float, fine: FloatArray) -> FloatArray:

@@ -299,11 +299,7 @@ def _check_map(path: Path, description: Description, modal_map: ModalMap) -> Non
             f"[[mode]] ({[mode.name for mode in description.mode]})"
         )
     for parameter in description.parameter:
-        if (
-            parameter.unit == ""
-            and parameter.limit is not None
-            and (parameter.limit.below >= parameter.baseline)
-        ):
+        if parameter.limit is not None and parameter.limit.below >= parameter.baseline:
             raise BadStage(
                 f"{path}: {parameter.name}: limit {parameter.limit.below} must lie below the "
                 f"baseline {parameter.baseline}"

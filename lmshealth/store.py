@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from datetime import datetime
@@ -66,8 +67,11 @@ class Store:
             self._shown = make_url(url).render_as_string(hide_password=True)
             self._engine = create_engine(url)
             _Base.metadata.create_all(self._engine)
-        except (ArgumentError, SQLAlchemyError, ImportError) as error:
-            raise StoreError(f"cannot open the store {url.split('@')[-1]}: {error}") from error
+        except (ArgumentError, SQLAlchemyError, ImportError, ValueError) as error:
+            # The URL may hold a password, before the host or among its options.
+            shown = re.sub(r"//[^/]*@", "//", url).split("?")[0]
+            detail = str(error).replace(url, shown)
+            raise StoreError(f"cannot open the store {shown}: {detail}") from error
 
     def close(self) -> None:
         """Let go of all connections."""

@@ -171,4 +171,7 @@ def service_date(prognosis: Prognosis, max_risk: float) -> date | None:
         return None
     days = prognosis.remaining[:, -1] / prognosis.usage
     wait = max(float(np.quantile(days, max_risk, method="lower")), 0.0)
-    return (prognosis.recorded_at + timedelta(days=wait)).date()
+    try:
+        return (prognosis.recorded_at + timedelta(days=wait)).date()
+    except OverflowError:  # past the calendar: the machine hardly moves
+        return None

@@ -92,7 +92,7 @@ def track(history: History, stage: Stage | None = None) -> Track:
 
 
 def _covariates(history: History, stage: Stage | None) -> tuple[Covariate, ...]:
-    """Covariates that vary in this history; one that never moves cannot be told from the level."""
+    """Covariates that are asked for and known in at least one log."""
     if stage is not None:
         wanted = stage.description.covariate
     else:
@@ -230,6 +230,9 @@ def _average(problem: _Problem, settings: list[_Setting], runs: list[_Run]) -> T
     drift_cov = np.einsum("mi,kij,nj->kmn", contrast, cov, contrast)
     early = np.arange(len(history.logs)) < history.baseline
     drift[early], drift_cov[early] = np.nan, np.nan
+    # At the baseline ℓ and ℓ₀ are the same; rounding must not make an epoch of it.
+    still = (problem.clock == 0) & ~early
+    drift[still], drift_cov[still] = 0.0, 0.0
     std = np.sqrt(np.einsum("kii->ki", cov))
     scales = np.array([setting.noise_scale for setting in settings])
     return Track(

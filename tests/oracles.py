@@ -236,16 +236,16 @@ def life_log_likelihood(
         for scale, prior in zip(scales, scale_prior, strict=True):
             cov = np.zeros((r.size, r.size))
             for a, (k, i) in enumerate(where):
-                for c, (l, j) in enumerate(where):
-                    if k == l:
+                for c, (o, j) in enumerate(where):
+                    if k == o:
                         cov[a, c] += scale**2 * history.cov[first + k][i, j]
-                    if k == l and i == j and unknown[k]:
+                    if k == o and i == j and unknown[k]:
                         cov[a, c] += (b_std * spread) ** 2
                     if i == j:
-                        cov[a, c] += intercept_std**2 + b_std**2 * offset[k] * offset[l]
-                        cov[a, c] += walk**2 * min(clock[k], clock[l]) / clock.max()
+                        cov[a, c] += intercept_std**2 + b_std**2 * offset[k] * offset[o]
+                        cov[a, c] += walk**2 * min(clock[k], clock[o]) / clock.max()
                         for own in alone:
-                            cov[a, c] += model_std**2 * own[k, i] * own[l, i]
+                            cov[a, c] += model_std**2 * own[k, i] * own[o, i]
             logs.append(np.log(prior) + stats.multivariate_normal.logpdf(r, cov=cov))
     return float(np.logaddexp.reduce(logs))
 

@@ -22,7 +22,8 @@ FLOORS = [
     {"summary", "plots"},
     {"store", "tables", "report"},
     {"pipeline"},
-    {"cli", "__main__"},
+    {"cli"},
+    {"__main__"},
 ]
 MODEL_FLOORS = [
     {"errors"},

@@ -235,7 +235,7 @@ def test_limited_parameters_keep_their_position(tmp_path: Path) -> None:
 def test_a_life_too_short_is_refused(
     stage: Stage, ln_f: FloatArray, travel: FloatArray | None
 ) -> None:
-    """Fewer than three logs with modes, or no travel, are no life; the error says what is needed."""
+    """Fewer than three logs with modes, or no travel, are no life; the error says so."""
     with pytest.raises(NotEnoughData, match="at least 3 logs and some travel"):
         LifeLikelihood(make_history(ln_f, travel=travel), stage)
 

@@ -15,7 +15,7 @@ HEAD = "stage,recorded_at,action\n"
 
 
 def logs(n: int = 4) -> list:
-    """Readings one day apart from the start."""
+    """Make readings one day apart from the start."""
     return [make_reading(str(k), k, 1e5 * k, {"roll": 4.8}) for k in range(n)]
 
 

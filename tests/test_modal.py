@@ -147,7 +147,7 @@ def test_accelerometers_come_before_the_following_error() -> None:
 
 
 def test_the_floor_of_the_following_error_is_its_noise_also_in_short_moves() -> None:
-    """At 20 kHz and moves of 0.67 s Δe has the SNR of its own noise, within a factor of 3.
+    """At 20 kHz and moves of 0.67 s Δe has the SNR of its own noise, not of what leaks into it.
 
     White noise of an encoder, as acceleration, rises with the fourth power of frequency; it must
     not leak from the far end of the spectrum into the band of the modes.
@@ -155,13 +155,17 @@ def test_the_floor_of_the_following_error_is_its_noise_also_in_short_moves() -> 
     rate, n = 20_000.0, 13_400
     level = 1 / (2 * np.pi * 130.0) ** 4
     mode = Mode(130.0, 0.02)
-    generator = rng(10)
-    moves = [displacements(generator, [mode], n, rate, level)[0] for _ in range(12)]
-    pieces = [(k * n, (k + 1) * n) for k in range(12)]
-    log = make_log({"delta_e": np.concatenate(moves)}, rate, pieces=pieces)
-    found = identify(log, make_stage([("roll", 130.0, 0.02)]))
-    assert found.names == ("roll",)
-    assert found.snr[0] > mode.snr(1.0) / 3
+    snr = []
+    for seed in range(4):
+        generator = rng(seed)
+        moves = [displacements(generator, [mode], n, rate, level)[0] for _ in range(12)]
+        pieces = [(k * n, (k + 1) * n) for k in range(12)]
+        log = make_log({"delta_e": np.concatenate(moves)}, rate, pieces=pieces)
+        found = identify(log, make_stage([("roll", 130.0, 0.02)]))
+        assert found.names == ("roll",)
+        snr.append(found.snr[0])
+    # Under the skirts of the resonance one log tells the noise to a factor of three only.
+    assert mode.snr(1.0) / 3 < np.median(snr) < mode.snr(1.0) * 3
 
 
 def short_moves(seed: int, n_moves: int = 7, seconds: float = 3.0) -> Log:
@@ -379,7 +383,7 @@ def test_a_building_in_the_wind_shows_its_three_modes(needs: Callable[[str], Non
 
 
 def test_a_model_frame_shows_its_first_mode(needs: Callable[[str], None], tmp_path: Path) -> None:
-    """An export of another program, read through a column map, shows 3.6 to 3.8 Hz or nothing."""
+    """An export of another program, read through a column map, shows 3.69 Hz within 0.15 Hz."""
     needs("data")
     folder = Path(os.environ["LMSHEALTH_DATA"]) / "shake_3storey" / "open"
     (tmp_path / "map.toml").write_text(
@@ -390,7 +394,5 @@ def test_a_model_frame_shows_its_first_mode(needs: Callable[[str], None], tmp_pa
         folder / "Flexible_BonusEvent_1st.csv", columns=load_columns(tmp_path / "map.toml")
     )
     found = identify(log, make_stage([("first", 3.7, 0.03)], search=0.1))
-    for name, frequency in zip(found.names, found.frequency, strict=True):
-        assert name == "first"
-        assert frequency == pytest.approx(3.69, abs=0.21)
-    assert found.names or why(found, "first")
+    assert found.names == ("first",)
+    assert found.frequency[0] == pytest.approx(3.69, abs=0.15)

@@ -62,7 +62,7 @@ def test_the_order_of_rows_and_columns_does_not_matter(tmp_path: Path, small: Mo
 
 
 def test_leave_out_error_tells_a_map_that_is_not_smooth(tmp_path: Path) -> None:
-    """A kink of 1 % between grid points shows in the error of the mode that has it, not the other."""
+    """A kink of 1 % between grid points shows in the error of the mode that has it alone."""
     head, *rows = map_rows(NAMES)
     kinked = []
     for row in rows:
@@ -111,7 +111,7 @@ def test_a_map_is_never_extrapolated(small: ModalMap) -> None:
     x = points(small, 5)
     x[3, 1] = small.high[1] + 1e-3
     assert small.inside(x).tolist() == [True, True, True, False, True]
-    with pytest.raises(OutsideMap, match="mount_stiffness.*make a wider map"):
+    with pytest.raises(OutsideMap, match=r"mount_stiffness.*make a wider map"):
         small.ln_frequency(x)
 
 

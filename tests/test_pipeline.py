@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from lmshealth.errors import NothingUsable
-from lmshealth.inference import infer
+from lmshealth.inference import epochs_to_infer, infer
 from lmshealth.pipeline import RunResult, Settings, run
 from lmshealth.stage import Stage, load_stage
 from lmshealth.tables import COLUMNS
@@ -80,6 +80,14 @@ def test_the_truth_is_found_in_the_tables(done: Done) -> None:
     assert high - low < 0.05
     assert last["converged"] == "True"
     assert {row["mode"] for row in rows(done.out / "modes.csv")} == {"roll", "pitch"}
+
+
+def test_the_only_epoch_asked_for_is_the_last(done: Done) -> None:
+    """However few epochs are inferred, the last one, which the verdict is about, is among them."""
+    (assessment,) = done.result.assessments
+    assert assessment.track is not None
+    for most in (1, 2, 3):
+        assert epochs_to_infer(assessment.track, done.stage, most)[-1] == N_LOGS - 1
 
 
 def test_every_bad_log_is_listed_with_its_reason(done: Done) -> None:

@@ -94,7 +94,7 @@ def test_a_baseline_outside_the_map_is_refused(tmp_path: Path) -> None:
 def test_a_map_without_any_tracked_mode_is_refused(tmp_path: Path) -> None:
     """A map whose modes are none of the description's says nothing, and both lists are told."""
     text = stage_text().replace('name = "roll"', 'name = "bounce"').replace('"pitch"', '"sway"')
-    with pytest.raises(BadStage, match="none of them is a tracked.*bounce"):
+    with pytest.raises(BadStage, match=r"none of them is a tracked.*bounce"):
         load(tmp_path, text)
 
 

@@ -39,6 +39,7 @@ def likelihood(
     return Likelihood(
         blocks=tuple(blocks),
         start=start,
+        belief=np.repeat([0.2, 2.0], m),
         scale=np.sqrt([mode.psd * (1 + off) for mode in modes]),
         centre=float(np.sqrt(BAND[0] * BAND[1])),
         spread=float(np.log(BAND[1] / BAND[0]) / 2),
@@ -188,6 +189,19 @@ def test_without_the_kernel_a_short_record_reads_too_much_damping() -> None:
     plain = Block(spectrum.frequency, smeared, None)
     target = likelihood(MODES[:1], [plain] * 8)
     assert np.exp(target.minimise(target.start)[1]) > 1.05 * 0.015
+
+
+def test_a_belief_pulls_as_a_normal_prior() -> None:
+    """The value is the misfit of the data plus half the squared distance in beliefs."""
+    weak = likelihood(MODES[:1], noisy_blocks(MODES[:1], 20.0))
+    sure = replace(weak, belief=np.array([1e-4, 1e-3]))
+    p = weak.start.copy()
+    p[:2] += 3e-4, 2e-3
+    assert sure.value(p) - sure.data_value(p) == pytest.approx((3**2 + 2**2) / 2, rel=1e-6)
+    assert weak.data_value(p) == sure.data_value(p)
+    start = sure.start.copy()
+    found = sure.minimise(start)
+    assert np.abs(found[:2] - start[:2]).max() < 1e-3
 
 
 def test_nonsense_is_infinitely_unlikely_not_an_error() -> None:

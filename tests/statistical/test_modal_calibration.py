@@ -90,5 +90,5 @@ def _short_moves(rng: np.random.Generator) -> Log:
 
 
 def test_intervals_from_short_moves_cover_as_stated(rng: np.random.Generator) -> None:
-    """95 % intervals of 400 logs of short moves cover f and ζ within the Monte-Carlo error."""
-    _judge(_deviations(_short_moves(rng) for _ in range(400)))
+    """95 % intervals of 300 logs of short moves cover f and ζ within the Monte-Carlo error."""
+    _judge(_deviations(_short_moves(rng) for _ in range(300)))

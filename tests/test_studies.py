@@ -1,0 +1,38 @@
+"""The quick form of every study runs and finds what the study claims."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+
+def run_study(root: Path, name: str) -> str:
+    """Run the quick form of a study from the project's folder."""
+    command = [sys.executable, "-W", "error", "-m", f"studies.{name}.run", "--quick"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=root)
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout
+
+
+def test_real_building(root: Path, needs: Callable[[str], None]) -> None:
+    """Half an hour of a real building gives the published modes and a healthy verdict."""
+    needs("data")
+    answer = json.loads(run_study(root, "real_building"))
+    assert all(answer["passed"].values())
+    assert all(mode["n_windows"] == answer["n_windows"] for mode in answer["modes"].values())
+
+
+def test_demo_life(root: Path) -> None:
+    """A short degrading life is recognised, and its truth lies where the posterior does."""
+    life = json.loads(run_study(root, "demo_life").splitlines()[0])
+    assert life["verdict"] == "both"
+    for name in ("guide_preload", "mount_stiffness"):
+        row = life[name]
+        # Twice the 90 % interval: a miss is a fault and not one life in ten.
+        reach = row["q95"] - row["q05"]
+        assert abs(row["truth"] - row["median"]) < reach
+        # Much narrower than the prior, whose 90 % interval is 1.0 wide, and no point.
+        assert 0.01 < reach < 0.3
