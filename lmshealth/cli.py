@@ -21,7 +21,8 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table
 
 from lmshealth.errors import BadLog, LmshealthError
-from lmshealth.results import Metadata, Modes, Refusal
+from lmshealth.logs import Metadata, Refusal
+from lmshealth.results import Modes
 
 if TYPE_CHECKING:
     from lmshealth.pipeline import RunResult

@@ -7,8 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from lmshealth.arrays import FloatArray
 from lmshealth.errors import NotEnoughData
-from lmshealth.results import FloatArray, History, Metadata, Modes, Refusal
+from lmshealth.logs import Metadata, Refusal
+from lmshealth.results import History, Modes
 from lmshealth.stage import Stage
 
 

@@ -14,8 +14,9 @@ from datetime import datetime
 
 import numpy as np
 
+from lmshealth.arrays import FloatArray
 from lmshealth.errors import BadStage, NotConverged, NotEnoughData
-from lmshealth.results import FloatArray, Health, Track
+from lmshealth.results import Health, Track
 from lmshealth.sampling import sample, stream
 from lmshealth.stage import Stage
 

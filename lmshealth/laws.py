@@ -14,8 +14,8 @@ import msgspec
 import numpy as np
 from scipy.special import expit, log_expit
 
+from lmshealth.arrays import FloatArray
 from lmshealth.priors import Prior, Uniform
-from lmshealth.results import FloatArray
 
 _KM = 1000.0
 

@@ -23,9 +23,10 @@ import numpy as np
 from scipy.linalg import solve_triangular
 from scipy.special import logsumexp, softmax
 
+from lmshealth.arrays import FloatArray
 from lmshealth.errors import NotEnoughData
 from lmshealth.inference import one_at_a_time
-from lmshealth.results import FloatArray, History
+from lmshealth.results import History
 from lmshealth.stage import ParameterSpec, Stage
 
 _INTERCEPT_STD = 0.1

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-from lmshealth.results import Line, Log
+from lmshealth.logs import Log
+from lmshealth.results import Line
 from lmshealth.spectra import find_segments
 from lmshealth.stage import Stage
 

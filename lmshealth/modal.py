@@ -14,8 +14,9 @@ import numpy as np
 from lmshealth.bandfit import BAND, BandFit, View, fit_band
 from lmshealth.errors import BadLog
 from lmshealth.lines import name_lines
+from lmshealth.logs import Channel, Log, Refusal
 from lmshealth.peaks import find_lines, find_peaks
-from lmshealth.results import Channel, Line, Log, Modes, Refusal
+from lmshealth.results import Line, Modes
 from lmshealth.spectra import find_segments, periodogram
 from lmshealth.stage import Stage
 from lmshealth.starts import Coarse, Target, coarsen, locate

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 import pandas as pd
 
+from lmshealth.arrays import BoolArray, FloatArray
 from lmshealth.errors import BadStage, OutsideMap
-from lmshealth.results import BoolArray, FloatArray
 
 _MAX_DEGREE = 14
 _NEGLIGIBLE = 1e-6  # error of ln frequency that no measurement comes near

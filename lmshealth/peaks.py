@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from lmshealth.results import BoolArray, FloatArray
+from lmshealth.arrays import BoolArray, FloatArray
 from lmshealth.spectra import Spectrum
 from lmshealth.starts import Target
 

@@ -15,12 +15,13 @@ from pathlib import Path
 from lmshealth.errors import BadLog, LmshealthError, NothingUsable
 from lmshealth.history import Reading, build_history, in_order
 from lmshealth.inference import epochs_to_infer, infer
+from lmshealth.logs import Refusal
 from lmshealth.maintenance import Action, after_last_reset, read_maintenance
 from lmshealth.modal import identify
 from lmshealth.prognosis import prognose
 from lmshealth.readers import content_digest, find_logs, read_log, read_manifest, require_identity
 from lmshealth.report import write_report
-from lmshealth.results import Health, History, Prognosis, Refusal, Track
+from lmshealth.results import Health, History, Prognosis, Track
 from lmshealth.stage import Stage
 from lmshealth.store import Store, result_key
 from lmshealth.summary import Assessment, judge, service_date

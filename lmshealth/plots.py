@@ -14,7 +14,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from lmshealth.results import FloatArray, Health, History, Prognosis, Track
+from lmshealth.arrays import FloatArray
+from lmshealth.results import Health, History, Prognosis, Track
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -6,7 +6,7 @@ import msgspec
 import numpy as np
 from scipy.special import ndtri
 
-from lmshealth.results import FloatArray
+from lmshealth.arrays import FloatArray
 
 
 class Lognormal(

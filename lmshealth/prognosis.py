@@ -6,9 +6,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from lmshealth.arrays import FloatArray
 from lmshealth.errors import BadStage, NotEnoughData
 from lmshealth.life import LifeLikelihood, limited
-from lmshealth.results import FloatArray, History, Prognosis
+from lmshealth.results import History, Prognosis
 from lmshealth.sampling import find_start, sample, stream
 from lmshealth.stage import Stage
 

@@ -19,7 +19,9 @@ from typing import Any
 import numpy as np
 
 from lmshealth import plots
-from lmshealth.results import Effect, FloatArray, Health, History, Prognosis, Refusal, Track
+from lmshealth.arrays import FloatArray
+from lmshealth.logs import Refusal
+from lmshealth.results import Effect, Health, History, Prognosis, Track
 from lmshealth.stage import ParameterSpec
 from lmshealth.summary import Assessment
 

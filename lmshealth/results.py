@@ -1,4 +1,4 @@
-"""The nouns of lmshealth: frozen results that floors hand upwards.
+"""What comes out: frozen results that floors hand upwards.
 
 Arrays are read-only, time (or log) axis first, mode axis last, NaN where a value is missing.
 SI units throughout: s, m, m/s, Hz, m/s²; temperatures are in °C because only their differences
@@ -7,138 +7,14 @@ are used.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass
 from datetime import datetime
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
-ChannelKind = Literal["displacement", "acceleration", "current"]
-
-
-def _freeze(result: Any) -> None:
-    """Make every array field of a frozen dataclass read-only."""
-    for item in fields(result):
-        value = getattr(result, item.name)
-        if isinstance(value, np.ndarray):
-            value.setflags(write=False)
-
-
-def _expect(name: str, array: np.ndarray[Any, Any], shape: tuple[int, ...]) -> None:
-    if array.shape != shape:
-        raise ValueError(f"{name} has shape {array.shape}, needed {shape}")
-
-
-@dataclass(frozen=True, slots=True)
-class Refusal:
-    """Something that was not analysed, and why: one row of ``refused.csv``."""
-
-    log: str
-    reason: str
-    detail: str
-    channel: str = ""
-    mode: str = ""
-    source: str = ""
-
-
-@dataclass(frozen=True, slots=True)
-class Metadata:
-    """What is known about a log beside its samples.
-
-    Attributes
-    ----------
-    stage : str or None
-        Identity of the physical machine.
-    recorded_at : datetime or None
-        Moment of the recording, with time zone.
-    travel : float or None
-        Odometer in m.
-    covariates : dict of str to float
-        Numbers that move frequencies without wear, keyed by their column name
-        (``temperature_c``, ``payload_kg``, ``position_mm``).
-    servo_id : str or None
-        Tuning of the control loop.
-    baseline : bool or None
-        Whether the manifest declares this log part of the baseline.
-    description : str or None
-        Stage description the manifest names for this log.
-    """
-
-    stage: str | None = None
-    recorded_at: datetime | None = None
-    travel: float | None = None
-    covariates: dict[str, float] = field(default_factory=dict)
-    servo_id: str | None = None
-    baseline: bool | None = None
-    description: str | None = None
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Channel:
-    """One signal of a log.
-
-    Attributes
-    ----------
-    name : str
-        Column name without its unit (``delta_e``, ``acc_feed``, ``current``).
-    kind : str
-        Physical quantity: ``displacement`` (m), ``acceleration`` (m/s²) or ``current`` (A).
-    values : ndarray
-        Samples in SI units, shape ``(n_samples,)``; NaN where a sample is missing.
-    """
-
-    name: str
-    kind: ChannelKind
-    values: FloatArray
-
-    def __post_init__(self) -> None:
-        _expect("values", self.values, (self.values.size,))
-        _freeze(self)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Log:
-    """One recording of one stage, in SI units.
-
-    Attributes
-    ----------
-    name : str
-        Path as the user knows it.
-    digest : str
-        SHA-256 of the file's content.
-    metadata : Metadata
-        What is known beside the samples.
-    sample_rate : float
-        In Hz.
-    channels : tuple of Channel
-        Usable signals, all of the same length.
-    reference_velocity : ndarray or None
-        Set point in m/s, shape ``(n_samples,)``.
-    pieces : tuple of (int, int)
-        Half-open sample ranges without gaps; one range covering everything when nothing is missing.
-    refused : tuple of Refusal
-        Channels that were refused at the door.
-    """
-
-    name: str
-    digest: str
-    metadata: Metadata
-    sample_rate: float
-    channels: tuple[Channel, ...]
-    reference_velocity: FloatArray | None
-    pieces: tuple[tuple[int, int], ...]
-    refused: tuple[Refusal, ...]
-
-    def __post_init__(self) -> None:
-        if self.sample_rate <= 0 or not np.isfinite(self.sample_rate):
-            raise ValueError(f"sample_rate is {self.sample_rate}, needed a positive number")
-        sizes = {channel.values.size for channel in self.channels}
-        if len(sizes) > 1:
-            raise ValueError(f"channels have lengths {sorted(sizes)}, needed one length")
-        _freeze(self)
+from lmshealth.arrays import BoolArray, FloatArray, expect_shape, freeze
+from lmshealth.logs import Refusal
 
 
 @dataclass(frozen=True, slots=True)
@@ -207,9 +83,9 @@ class Modes:
         if len(set(zip(self.names, self.sources, strict=True))) != n:
             raise ValueError(f"mode names are not unique per source: {self.names}")
         for name in ("ln_frequency", "ln_damping", "snr"):
-            _expect(name, getattr(self, name), (n,))
-        _expect("cov", self.cov, (2 * n, 2 * n))
-        _freeze(self)
+            expect_shape(name, getattr(self, name), (n,))
+        expect_shape("cov", self.cov, (2 * n, 2 * n))
+        freeze(self)
 
     @property
     def frequency(self) -> FloatArray:
@@ -282,13 +158,13 @@ class History:
 
     def __post_init__(self) -> None:
         n, m = len(self.logs), len(self.modes)
-        _expect("travel", self.travel, (n,))
-        _expect("ln_frequency", self.ln_frequency, (n, m))
-        _expect("ln_damping", self.ln_damping, (n, m))
-        _expect("cov", self.cov, (n, 2 * m, 2 * m))
+        expect_shape("travel", self.travel, (n,))
+        expect_shape("ln_frequency", self.ln_frequency, (n, m))
+        expect_shape("ln_damping", self.ln_damping, (n, m))
+        expect_shape("cov", self.cov, (n, 2 * m, 2 * m))
         if not 0 <= self.baseline < max(n, 1):
             raise ValueError(f"baseline is log {self.baseline} of {n}")
-        _freeze(self)
+        freeze(self)
 
     def clock(self) -> FloatArray:
         """Odometer since the baseline log in m, shape ``(n_logs,)``; never negative after it."""
@@ -358,11 +234,11 @@ class Track:
     def __post_init__(self) -> None:
         n, m = len(self.logs), len(self.modes)
         for name in ("ln_frequency", "ln_frequency_std", "ln_damping", "ln_damping_std", "drift"):
-            _expect(name, getattr(self, name), (n, m))
-        _expect("drift_cov", self.drift_cov, (n, m, m))
+            expect_shape(name, getattr(self, name), (n, m))
+        expect_shape("drift_cov", self.drift_cov, (n, m, m))
         for name in ("travel", "nis", "nis_dof", "noise_scale"):
-            _expect(name, getattr(self, name), (n,))
-        _freeze(self)
+            expect_shape(name, getattr(self, name), (n,))
+        freeze(self)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -407,13 +283,13 @@ class Health:
 
     def __post_init__(self) -> None:
         n, p = len(self.recorded_at), len(self.parameters)
-        _expect("samples", self.samples, (n, self.samples.shape[1], p))
+        expect_shape("samples", self.samples, (n, self.samples.shape[1], p))
         for name in ("ess", "r_hat", "informed"):
-            _expect(name, getattr(self, name), (n, p))
-        _expect("prior_width", self.prior_width, (p,))
-        _expect("travel", self.travel, (n,))
-        _expect("converged", self.converged, (n,))
-        _freeze(self)
+            expect_shape(name, getattr(self, name), (n, p))
+        expect_shape("prior_width", self.prior_width, (p,))
+        expect_shape("travel", self.travel, (n,))
+        expect_shape("converged", self.converged, (n,))
+        freeze(self)
 
     def quantile(self, level: float | FloatArray) -> FloatArray:
         """Quantiles of every parameter at every epoch, shape ``(..., n_epochs, n_parameters)``."""
@@ -484,12 +360,12 @@ class Prognosis:
 
     def __post_init__(self) -> None:
         n = len(self.parameters)
-        _expect("limits", self.limits, (n,))
-        _expect("remaining", self.remaining, (self.remaining.shape[0], n))
-        _expect("usage", self.usage, (self.remaining.shape[0],))
-        _expect("health", self.health, (self.health.shape[0], n - 1))
-        _expect("curve_quantiles", self.curve_quantiles, (5, self.curve_travel.size, n - 1))
-        _freeze(self)
+        expect_shape("limits", self.limits, (n,))
+        expect_shape("remaining", self.remaining, (self.remaining.shape[0], n))
+        expect_shape("usage", self.usage, (self.remaining.shape[0],))
+        expect_shape("health", self.health, (self.health.shape[0], n - 1))
+        expect_shape("curve_quantiles", self.curve_quantiles, (5, self.curve_travel.size, n - 1))
+        freeze(self)
 
     def beyond_horizon(self) -> FloatArray:
         """Probability that each limit stays unreached to the horizon, ``(n_parameters + 1,)``."""

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.random import MT19937, RandomState
 
+from lmshealth.arrays import FloatArray
 from lmshealth.errors import NotConverged
-from lmshealth.results import FloatArray
 
 if TYPE_CHECKING:
     import emcee

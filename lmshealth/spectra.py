@@ -7,7 +7,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy import fft
 
-from lmshealth.results import Channel, FloatArray, Log
+from lmshealth.arrays import FloatArray
+from lmshealth.logs import Channel, Log
 
 # Setpoint changes below this share of its largest value count as constant velocity.
 _VELOCITY_TOLERANCE = 1e-3

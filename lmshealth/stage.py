@@ -18,11 +18,12 @@ import msgspec
 import numpy as np
 from msgspec import Meta, Struct
 
+from lmshealth.arrays import FloatArray
 from lmshealth.errors import BadStage
 from lmshealth.laws import AnyLaw, Unchanging
+from lmshealth.logs import Metadata
 from lmshealth.modalmap import ModalMap, read_map
 from lmshealth.priors import Prior
-from lmshealth.results import FloatArray, Metadata
 
 Positive = Annotated[float, Meta(gt=0)]
 Share = Annotated[float, Meta(gt=0, lt=1)]

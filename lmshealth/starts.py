@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from lmshealth.results import FloatArray
+from lmshealth.arrays import FloatArray
 from lmshealth.spectra import Spectrum
 
 _COMMON_STEPS = 41

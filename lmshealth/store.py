@@ -22,7 +22,8 @@ from sqlalchemy.orm import DeclarativeBase, Mapped, Session, mapped_column
 
 from lmshealth.errors import LmshealthError
 from lmshealth.history import Reading
-from lmshealth.results import Line, Metadata, Modes, Refusal
+from lmshealth.logs import Metadata, Refusal
+from lmshealth.results import Line, Modes
 
 SCHEMA = 1
 

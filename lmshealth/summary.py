@@ -7,16 +7,9 @@ from datetime import date, timedelta
 
 import numpy as np
 
-from lmshealth.results import (
-    BoolArray,
-    Health,
-    History,
-    Judgement,
-    Prognosis,
-    Refusal,
-    Track,
-    Verdict,
-)
+from lmshealth.arrays import BoolArray
+from lmshealth.logs import Refusal
+from lmshealth.results import Health, History, Judgement, Prognosis, Track, Verdict
 from lmshealth.stage import ParameterSpec, Stage
 
 

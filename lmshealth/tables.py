@@ -10,8 +10,10 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from lmshealth.arrays import FloatArray
 from lmshealth.history import Reading
-from lmshealth.results import FloatArray, Metadata, Modes, Prognosis, Refusal
+from lmshealth.logs import Metadata, Refusal
+from lmshealth.results import Modes, Prognosis
 from lmshealth.summary import Assessment, service_date
 
 _KM = 1000.0

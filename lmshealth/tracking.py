@@ -20,8 +20,9 @@ import numpy as np
 from filterpy.kalman import KalmanFilter
 from scipy.special import softmax
 
+from lmshealth.arrays import FloatArray
 from lmshealth.errors import NotEnoughData
-from lmshealth.results import Effect, FloatArray, History, Track
+from lmshealth.results import Effect, History, Track
 from lmshealth.stage import Covariate, Stage
 
 _LEVEL, _RATE, _DAMPING, _BASE = range(4)

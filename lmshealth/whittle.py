@@ -19,7 +19,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import minimize
 
-from lmshealth.results import FloatArray
+from lmshealth.arrays import FloatArray
 from lmshealth.spectra import Spectrum, periodogram_kernel
 
 # Below this many half-power bandwidths times duration the expected periodogram replaces the

@@ -14,8 +14,10 @@ from pathlib import Path
 
 import numpy as np
 
+from lmshealth.arrays import FloatArray
 from lmshealth.history import Reading
-from lmshealth.results import FloatArray, Health, History, Metadata, Modes, Prognosis, Track
+from lmshealth.logs import Metadata
+from lmshealth.results import Health, History, Modes, Prognosis, Track
 from lmshealth.stage import Stage, load_stage
 
 MODES = ("roll", "pitch", "yaw")

@@ -8,7 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import stats
 
-from lmshealth.results import FloatArray, History
+from lmshealth.arrays import FloatArray
+from lmshealth.results import History
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,8 @@ from pathlib import Path
 import h5py
 import numpy as np
 
-from lmshealth.results import Channel, Log, Metadata, Modes
+from lmshealth.logs import Channel, Log, Metadata
+from lmshealth.results import Modes
 from lmshealth.spectra import Spectrum
 from lmshealth.stage import Description, ModeSpec, Order, Stage
 

@@ -9,6 +9,8 @@ import pytest
 
 FLOORS = [
     {"errors"},
+    {"arrays"},
+    {"logs"},
     {"results"},
     {"readers", "spectra", "priors", "modalmap"},
     {"laws", "whittle", "starts"},

@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 
 from lmshealth import life
+from lmshealth.arrays import FloatArray
 from lmshealth.errors import NotEnoughData
 from lmshealth.life import LifeLikelihood, limited
-from lmshealth.results import FloatArray, History
+from lmshealth.results import History
 from lmshealth.stage import Stage
 from tests.lives import (
     FADING,

@@ -11,9 +11,10 @@ import numpy as np
 import pytest
 
 from lmshealth.errors import BadLog
+from lmshealth.logs import Log
 from lmshealth.modal import identify
 from lmshealth.readers import load_columns, read_log
-from lmshealth.results import Log, Modes
+from lmshealth.results import Modes
 from tests.signals import (
     Mode,
     acceleration_log,
@@ -296,7 +297,7 @@ def test_chosen_channels_are_the_only_ones_used() -> None:
 
 def test_refused_channels_of_the_log_are_passed_on() -> None:
     """What the door refused is in the modes' refusals too."""
-    from lmshealth.results import Refusal
+    from lmshealth.logs import Refusal
 
     refusal = Refusal("synthetic.h5", "flat", "all samples are 0", channel="acc_dead")
     log = replace(one_mode_log(), refused=(refusal,))

@@ -15,9 +15,10 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from lmshealth import plots
+from lmshealth.arrays import FloatArray
 from lmshealth.laws import HertzWear, Law, Loosening
 from lmshealth.priors import Lognormal, Normal
-from lmshealth.results import Effect, FloatArray, Health, History, Prognosis, Track
+from lmshealth.results import Effect, Health, History, Prognosis, Track
 
 MODES = ("roll", "pitch", "yaw")
 PARAMETERS = ("guide_preload", "mount_stiffness")

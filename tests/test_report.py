@@ -15,8 +15,9 @@ import numpy as np
 import pytest
 
 from lmshealth import plots
+from lmshealth.logs import Refusal
 from lmshealth.report import write_report
-from lmshealth.results import Judgement, Refusal
+from lmshealth.results import Judgement
 from lmshealth.stage import Stage, load_stage
 from lmshealth.summary import Assessment
 from tests.test_plots import (

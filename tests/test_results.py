@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from lmshealth.errors import BadLog
-from lmshealth.results import Channel, History, Log, Metadata, Modes
+from lmshealth.logs import Channel, Log, Metadata
+from lmshealth.results import History, Modes
 from tests.signals import make_log
 
 

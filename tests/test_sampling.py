@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from lmshealth import sampling
+from lmshealth.arrays import FloatArray
 from lmshealth.errors import NotConverged
-from lmshealth.results import FloatArray
 from lmshealth.sampling import Sample, find_start, sample, stream
 
 MEAN = np.array([0.3, -1.2])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from lmshealth.results import Channel
+from lmshealth.logs import Channel
 from lmshealth.spectra import (
     Segment,
     Spectrum,

@@ -10,7 +10,7 @@ import pytest
 
 from lmshealth.errors import BadStage
 from lmshealth.laws import Unchanging
-from lmshealth.results import Metadata
+from lmshealth.logs import Metadata
 from lmshealth.stage import Stage, load_stage, shipped
 from tests.lives import FADING, FOOT, MOUNT, PRELOAD, make_stage, map_rows, stage_text, true_drift
 

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from lmshealth.history import Reading
-from lmshealth.results import Line, Metadata, Modes, Refusal
+from lmshealth.logs import Metadata, Refusal
+from lmshealth.results import Line, Modes
 from lmshealth.store import Store, StoreError, result_key
 
 

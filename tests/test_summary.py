@@ -9,7 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lmshealth.results import FloatArray, History
+from lmshealth.arrays import FloatArray
+from lmshealth.results import History
 from lmshealth.stage import Stage
 from lmshealth.summary import degraded_below, judge, service_date
 from tests.lives import (

@@ -9,18 +9,8 @@ import pandas as pd
 import pytest
 
 from lmshealth.history import Reading
-from lmshealth.results import (
-    Effect,
-    Health,
-    History,
-    Judgement,
-    Line,
-    Metadata,
-    Modes,
-    Prognosis,
-    Refusal,
-    Track,
-)
+from lmshealth.logs import Metadata, Refusal
+from lmshealth.results import Effect, Health, History, Judgement, Line, Modes, Prognosis, Track
 from lmshealth.stage import Stage, load_stage
 from lmshealth.summary import Assessment
 from lmshealth.tables import COLUMNS, all_tables, frame, lines_rows, modes_rows

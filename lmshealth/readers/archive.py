@@ -11,11 +11,11 @@ from pathlib import Path
 from typing import NamedTuple
 
 from lmshealth.errors import BadTable
+from lmshealth.logs import Refusal
 from lmshealth.readers.formats import format_of
 from lmshealth.readers.metadata import KEYS
 from lmshealth.readers.reading import shown
 from lmshealth.readers.trouble import listed
-from lmshealth.results import Refusal
 
 MANIFEST = "manifest.csv"
 NOT_LOGS = frozenset({MANIFEST, "maintenance.csv", "truth.csv"})

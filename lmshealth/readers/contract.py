@@ -8,6 +8,8 @@ from typing import cast
 
 import numpy as np
 
+from lmshealth.arrays import BoolArray, FloatArray
+from lmshealth.logs import Channel, ChannelKind, Log, Refusal
 from lmshealth.readers.columns import ColumnMap
 from lmshealth.readers.metadata import parse_metadata
 from lmshealth.readers.quality import check_signal, missing_samples
@@ -15,7 +17,6 @@ from lmshealth.readers.raw import Raw
 from lmshealth.readers.timeaxis import TimeAxis, pieces, time_axis
 from lmshealth.readers.trouble import Unusable, listed
 from lmshealth.readers.units import Role, Signal
-from lmshealth.results import BoolArray, Channel, ChannelKind, FloatArray, Log, Refusal
 
 _NEEDED = "needed delta_e_um or acc_<name>_m_s2 (or another unit of the contract)"
 _MEASURED: tuple[Role, ...] = ("displacement", "acceleration", "current")

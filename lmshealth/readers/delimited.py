@@ -10,10 +10,10 @@ from pathlib import Path
 
 import numpy as np
 
+from lmshealth.arrays import FloatArray
 from lmshealth.readers.columns import ColumnMap, CsvLayout
 from lmshealth.readers.raw import Format, Raw, check_size, not_numeric, wanted
 from lmshealth.readers.trouble import Unusable, listed
-from lmshealth.results import FloatArray
 
 _GZIP_MAGIC = b"\x1f\x8b"
 _BLOCK = 1 << 20

@@ -11,11 +11,11 @@ from typing import Any
 
 import numpy as np
 
+from lmshealth.arrays import FloatArray
 from lmshealth.readers.columns import ColumnMap
 from lmshealth.readers.metadata import KEYS
 from lmshealth.readers.raw import Format, Raw, check_size, not_numeric, wanted
 from lmshealth.readers.trouble import Unusable
-from lmshealth.results import FloatArray
 
 _MAGIC = b"\x89HDF\r\n\x1a\n"
 

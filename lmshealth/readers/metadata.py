@@ -6,8 +6,8 @@ import math
 from collections.abc import Mapping
 from datetime import UTC, datetime
 
+from lmshealth.logs import Metadata
 from lmshealth.readers.trouble import Unusable
-from lmshealth.results import Metadata
 
 COVARIATES = ("temperature_c", "payload_kg", "position_mm")
 KEYS = (

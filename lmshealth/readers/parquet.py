@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
+from lmshealth.arrays import FloatArray
 from lmshealth.readers.columns import ColumnMap
 from lmshealth.readers.raw import Format, Raw, check_size, not_numeric, wanted
 from lmshealth.readers.trouble import Unusable, listed
-from lmshealth.results import FloatArray
 
 _MAGIC = b"PAR1"
 # Written by the libraries about themselves, nothing the user said about the log.

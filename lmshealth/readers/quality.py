@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from lmshealth.arrays import BoolArray, FloatArray
 from lmshealth.readers.timeaxis import too_many
 from lmshealth.readers.trouble import Unusable
-from lmshealth.results import BoolArray, FloatArray
 
 LARGEST_MISSING = 0.10
 # No acceleration, position or current reaches this in SI units; its square is still a number.

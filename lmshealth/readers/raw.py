@@ -6,9 +6,9 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
+from lmshealth.arrays import FloatArray
 from lmshealth.readers.columns import ColumnMap
 from lmshealth.readers.trouble import Unusable
-from lmshealth.results import FloatArray
 
 # More than an hour of six channels at 20 kHz, in the 8 bytes a sample takes once it is read.
 LARGEST = 4 << 30

@@ -9,11 +9,11 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from lmshealth.errors import BadLog
+from lmshealth.logs import Log
 from lmshealth.readers.columns import ColumnMap
 from lmshealth.readers.contract import to_log
 from lmshealth.readers.formats import load
 from lmshealth.readers.trouble import Unusable
-from lmshealth.results import Log
 
 
 def shown(path: str | Path) -> str:

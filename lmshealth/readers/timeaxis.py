@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from lmshealth.arrays import BoolArray, FloatArray
 from lmshealth.readers.trouble import Unusable
-from lmshealth.results import BoolArray, FloatArray
 
 IntArray = NDArray[np.int64]
 

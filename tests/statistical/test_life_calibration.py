@@ -11,9 +11,10 @@ from pathlib import Path
 import numpy as np
 
 from lmshealth import life
+from lmshealth.arrays import FloatArray
 from lmshealth.inference import EpochPosterior, draw_prior
 from lmshealth.life import LifeLikelihood
-from lmshealth.results import FloatArray, History
+from lmshealth.results import History
 from lmshealth.stage import Stage
 from tests.lives import (
     AXES,

@@ -14,8 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.stats import beta
 
+from lmshealth.logs import Log
 from lmshealth.modal import identify
-from lmshealth.results import Log
 from tests.signals import (
     Mode,
     acceleration_log,

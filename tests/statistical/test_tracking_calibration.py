@@ -14,7 +14,8 @@ import pytest
 from scipy import stats
 
 from lmshealth import tracking
-from lmshealth.results import FloatArray, History
+from lmshealth.arrays import FloatArray
+from lmshealth.results import History
 from lmshealth.stage import Stage
 from lmshealth.tracking import track
 from tests.lives import DAMPING, FREQUENCY, make_history, make_stage

@@ -1,0 +1,32 @@
+"""Types of arrays, and how frozen results keep theirs."""
+
+from __future__ import annotations
+
+from dataclasses import fields
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
+
+
+def freeze(result: Any) -> None:
+    """Make every array field of a frozen dataclass read-only."""
+    for item in fields(result):
+        value = getattr(result, item.name)
+        if isinstance(value, np.ndarray):
+            value.setflags(write=False)
+
+
+def expect_shape(name: str, array: np.ndarray[Any, Any], shape: tuple[int, ...]) -> None:
+    """Insist on the shape of a field.
+
+    Raises
+    ------
+    ValueError
+        Naming the field, its shape and the one needed.
+    """
+    if array.shape != shape:
+        raise ValueError(f"{name} has shape {array.shape}, needed {shape}")
