@@ -8,7 +8,6 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import BrokenExecutor, Executor, ProcessPoolExecutor, as_completed
 from contextlib import contextmanager
 from dataclasses import dataclass
-from datetime import date
 from importlib.metadata import version
 from pathlib import Path
 
@@ -24,7 +23,7 @@ from lmshealth.report import write_report
 from lmshealth.results import Health, History, Prognosis, Track
 from lmshealth.stage import Stage
 from lmshealth.store import Store, result_key
-from lmshealth.summary import Assessment, judge, service_date
+from lmshealth.summary import Assessment, judge
 from lmshealth.tables import all_tables
 from lmshealth.tracking import track
 
@@ -145,7 +144,7 @@ def run(
             f"{folder}: no usable log: {n_logs} found, {n_refused} refused; "
             f"{out / 'refused.csv'} says why"
         )
-    pages = write_report(out, assessments, whole, service=_service_dates(assessments))
+    pages = write_report(out, assessments, whole)
     return RunResult(
         index=out / "index.html",
         pages=tuple(page for page in pages if page.name != "index.html"),
@@ -161,14 +160,6 @@ def _write_table(path: Path, text: str) -> None:
     part = path.with_suffix(".part")
     part.write_text(text, encoding="utf-8")
     part.replace(path)
-
-
-def _service_dates(assessments: Sequence[Assessment]) -> dict[str, date | None]:
-    return {
-        a.judgement.stage: service_date(a.prognosis, a.stage.description.decision.max_risk)
-        for a in assessments
-        if a.prognosis is not None
-    }
 
 
 @contextmanager

@@ -52,7 +52,6 @@ _STYLE: dict[str, Any] = {
 _KM = 1000.0
 _LEVELS = np.array([0.05, 0.25, 0.5, 0.75, 0.95])
 _GRID_POINTS = 72
-TOLD = 0.5  # share of the variance that must come from the data before a value is shown
 
 
 def svg(
@@ -342,7 +341,7 @@ def _tells(health: Health, parameter: str) -> bool:
     """Tell whether the last epoch knows a parameter from the data."""
     if parameter not in health.parameters:
         return False
-    return bool(health.informed[-1, health.parameters.index(parameter)] >= TOLD)
+    return bool(health.told()[health.parameters.index(parameter)])
 
 
 def _epochs(ax: Axes, health: Health, parameter: str) -> float:

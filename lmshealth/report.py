@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from datetime import date, datetime
 from functools import partial
@@ -88,7 +88,6 @@ def write_report(
     assessments: Sequence[Assessment],
     refused: Sequence[Refusal],
     *,
-    service: Mapping[str, date | None],
     generated: datetime | None = None,
 ) -> list[Path]:
     """Write one page per stage, and ``index.html``.
@@ -103,9 +102,6 @@ def write_report(
         One per stage.
     refused : sequence of Refusal
         Logs that belong to no stage.
-    service : mapping of str to date or None
-        Last day before the accepted risk is exceeded, by identity of the stage; None, or
-        absent, where there is no such day.
     generated : datetime or None
         Moment to print on the pages; nothing is printed for None.
 
@@ -121,7 +117,7 @@ def write_report(
     common = {"generated": generated, "version": metadata.version("lmshealth")}
     rows = []
     for assessment, name in zip(ranked, names, strict=True):
-        by = service.get(assessment.judgement.stage)
+        by = assessment.service_by()
         row = _summary(assessment, by, None) | common
         text = pages.get_template("stage.html.j2").render(row | _evidence(assessment))
         (folder / name).write_text(text, encoding="utf-8", newline="\n")
@@ -238,7 +234,7 @@ def _gauge(spec: ParameterSpec | None, health: Health, column: int, top: float) 
     below = "" if limit is None else _percent(np.mean(health.samples[-1, :, column] < limit))
     return Gauge(
         name=_spell(health.parameters[column]),
-        told=bool(health.informed[-1, column] >= plots.TOLD),
+        told=bool(health.told()[column]),
         converged=bool(health.converged[-1]),
         share=_percent(float(health.informed[-1, column])),
         value=f"{100 * middle:.0f}{_GAP}%",

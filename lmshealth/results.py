@@ -16,6 +16,9 @@ import numpy as np
 from lmshealth.arrays import BoolArray, FloatArray, expect_shape, freeze
 from lmshealth.logs import Refusal
 
+# Share of the prior variance that data must have removed before a value is shown.
+_INFORMED = 0.5
+
 
 @dataclass(frozen=True, slots=True)
 class Line:
@@ -290,6 +293,10 @@ class Health:
         expect_shape("travel", self.travel, (n,))
         expect_shape("converged", self.converged, (n,))
         freeze(self)
+
+    def told(self) -> BoolArray:
+        """Tell which parameters the last epoch's data tell, not the prior, ``(n_parameters,)``."""
+        return np.asarray(self.informed[-1] >= _INFORMED)
 
     def quantile(self, level: float | FloatArray) -> FloatArray:
         """Quantiles of every parameter at every epoch, shape ``(..., n_epochs, n_parameters)``."""

@@ -52,12 +52,16 @@ class Assessment:
     notes: tuple[str, ...]
     seed: int
 
+    def service_by(self) -> date | None:
+        """Last day on which the risk accepted by the description is kept; None without one."""
+        if self.prognosis is None:
+            return None
+        return service_date(self.prognosis, self.stage.description.decision.max_risk)
+
 
 # A parameter counts as degraded once this share of what it may lose is gone.
 DEGRADED_SHARE = 0.25
 _LOSS_WITHOUT_LIMIT = 0.4
-# Below this share of the variance explained by data, a parameter is not told by these logs.
-INFORMED = 0.5
 
 
 def degraded_below(parameter: ParameterSpec) -> float:
@@ -96,7 +100,7 @@ def judge(stage: Stage, history: History, health: Health | None) -> Judgement:
         reason = "The logs do not carry the health parameters."
     elif not health.converged[-1]:
         reason = "The sampler did not converge, so nothing is claimed."
-    elif (health.informed[-1] < INFORMED).all():
+    elif not health.told().any():
         reason = "These logs move the prior of no parameter: the stage looks the same either way."
     if reason or health is None:
         return Judgement(
@@ -106,7 +110,7 @@ def judge(stage: Stage, history: History, health: Health | None) -> Judgement:
 
 
 def _judge_posterior(stage: Stage, history: History, health: Health) -> Judgement:
-    told = [j for j in range(len(stage.parameters)) if health.informed[-1, j] >= INFORMED]
+    told = np.flatnonzero(health.told()).tolist()
     lost: dict[str, BoolArray] = {
         word: np.zeros(health.samples.shape[1], dtype=bool) for word in ("preload", "mount")
     }

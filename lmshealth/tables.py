@@ -14,7 +14,7 @@ from lmshealth.arrays import FloatArray
 from lmshealth.history import Reading
 from lmshealth.logs import Metadata, Refusal
 from lmshealth.results import Modes, Prognosis
-from lmshealth.summary import Assessment, service_date
+from lmshealth.summary import Assessment
 
 _KM = 1000.0
 _RUL_LEVELS = (0.05, 0.10, 0.25, 0.50, 0.75, 0.90, 0.95)
@@ -230,7 +230,6 @@ def _prognosis_rows(assessment: Assessment) -> list[Row]:
     if prognosis is None:
         return []
     beyond, past = prognosis.beyond_horizon(), prognosis.already_past()
-    service_by = service_date(prognosis, assessment.stage.description.decision.max_risk)
     rows = []
     for j, name in enumerate(prognosis.parameters):
         rows.append(
@@ -241,7 +240,7 @@ def _prognosis_rows(assessment: Assessment) -> list[Row]:
                 **_rul(prognosis, prognosis.remaining[:, j]),
                 "probability_beyond_horizon": beyond[j],
                 "probability_already_past": past[j],
-                "service_by": service_by if name == "any" else None,
+                "service_by": assessment.service_by() if name == "any" else None,
             }
         )
     return rows

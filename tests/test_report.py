@@ -6,7 +6,7 @@ import re
 import shutil
 from collections.abc import Callable
 from dataclasses import replace
-from datetime import UTC, date, datetime
+from datetime import UTC, datetime
 from html.parser import HTMLParser
 from itertools import pairwise
 from pathlib import Path
@@ -161,10 +161,9 @@ class Page(HTMLParser):
             self.text += data
 
 
-def one(folder: Path, assessment: Assessment, by: date | None = None) -> Page:
+def one(folder: Path, assessment: Assessment) -> Page:
     """Write the page of one stage and read it."""
-    service = {assessment.judgement.stage: by}
-    return Page(write_report(folder / "out", [assessment], (), service=service)[0])
+    return Page(write_report(folder / "out", [assessment], ())[0])
 
 
 def words(page: Page) -> str:
@@ -175,11 +174,14 @@ def words(page: Page) -> str:
 @pytest.mark.usefixtures("blank")
 def test_worn_stage_says_it_first(make: Maker, tmp_path: Path) -> None:
     """Verdict, probability, reason, date and remaining life stand on the first screen."""
-    text = words(one(tmp_path, make(), date(2026, 11, 3)))
+    assessment = make()
+    by = assessment.service_by()
+    assert by is not None
+    text = words(one(tmp_path, assessment))
     first = text[: text.index("Frequencies and damping")]
     for part in ("Loss of guide preload and mount stiffness", "93 % probability", "Roll, pitch"):
         assert part in first
-    assert "By 2026-11-03" in first and "accepted risk of 5 %" in first
+    assert f"By {by.isoformat()}" in first and "accepted risk of 5 %" in first
     assert re.search(r"Median [\d ]+ km [\d ]+ days", first)
     assert "service planned for 2027-03-01" in first
     assert first.index("Loss of") < first.index("Health now") < first.index("Remaining life")
@@ -306,7 +308,7 @@ def test_names_are_escaped(make: Maker, tmp_path: Path) -> None:
     assessment = make(evil)
     refusal = Refusal(log=evil, reason=f'"{evil}', detail="'><img src=x onerror=alert(1)>")
     assessment = replace(assessment, refused=(refusal,), notes=(evil,))
-    paths = write_report(tmp_path / "out", [assessment], [refusal], service={})
+    paths = write_report(tmp_path / "out", [assessment], [refusal])
     assert {path.parent for path in paths} == {tmp_path / "out"}
     for path in paths:
         page = Page(path)
@@ -320,22 +322,22 @@ def test_files_never_collide(make: Maker, tmp_path: Path) -> None:
     base = nothing(make())
     names = ["A 1", "A/1", "a-1", "index", "..", "Führung"]
     stages = [replace(base, judgement=replace(base.judgement, stage=name)) for name in names]
-    paths = write_report(tmp_path / "out", stages, (), service={})
+    paths = write_report(tmp_path / "out", stages, ())
     assert len({path.name.casefold() for path in paths}) == len(names) + 1
     assert {"Führung.html", "index-2.html", "stage.html"} <= {path.name for path in paths}
-    again = write_report(tmp_path / "again", stages[::-1], (), service={})
+    again = write_report(tmp_path / "again", stages[::-1], ())
     assert [path.name for path in again] == [path.name for path in paths]
 
 
 def test_same_input_same_bytes(make: Maker, tmp_path: Path) -> None:
     """Pages repeat to the byte in any order of the stages, and tell a time only if given."""
     stages = [make(), nothing(make("M8-Y"))]
-    first = write_report(tmp_path / "a", stages, (), service={})
-    second = write_report(tmp_path / "b", stages[::-1], (), service={})
+    first = write_report(tmp_path / "a", stages, ())
+    second = write_report(tmp_path / "b", stages[::-1], ())
     assert [p.name for p in first] == [p.name for p in second]
     assert [p.read_bytes() for p in first] == [p.read_bytes() for p in second]
     when = datetime(2027, 1, 2, 3, 4, tzinfo=UTC)
-    index = write_report(tmp_path / "c", stages[1:], (), service={}, generated=when)[-1]
+    index = write_report(tmp_path / "c", stages[1:], (), generated=when)[-1]
     assert "written 2027-01-02 03:04 UTC" in index.read_text(encoding="utf-8")
 
 
@@ -345,25 +347,26 @@ def test_index_is_sorted_by_risk(make: Maker, tmp_path: Path) -> None:
     safe = make("safe", wear_km=400000, floor=0.98)
     assert safe.prognosis is not None
     safe = replace(safe, prognosis=replace(safe.prognosis, remaining=np.full((4000, 3), np.inf)))
-    stages = [safe, nothing(make("unknown")), make("worn")]
+    worn = make("worn")
+    stages = [safe, nothing(make("unknown")), worn]
     refused = [Refusal("stray.csv", "no stage", "no description takes stage 'Q'")]
-    paths = write_report(tmp_path / "out", stages, refused, service={"worn": date(2026, 11, 3)})
+    paths = write_report(tmp_path / "out", stages, refused)
     assert [path.stem for path in paths] == ["worn", "unknown", "safe", "index"]
     text = words(Page(paths[-1]))
     assert text.index("worn") < text.index("unknown") < text.index("safe") < text.index("stray.csv")
-    assert "By 2026-11-03" in text
+    assert f"By {worn.service_by()}" in text
 
 
 def test_empty_fleet(tmp_path: Path) -> None:
     """No stage at all still gives an index that says so."""
-    paths = write_report(tmp_path / "out", [], (), service={})
+    paths = write_report(tmp_path / "out", [], ())
     assert [path.name for path in paths] == ["index.html"]
     assert "No log belongs to a stage" in Page(paths[0]).text
 
 
 def test_page_stands_alone_and_is_well_formed(make: Maker, tmp_path: Path) -> None:
     """Nothing is loaded from outside, identifiers are unique, headings descend by one."""
-    for path in write_report(tmp_path / "out", [make()], (), service={}):
+    for path in write_report(tmp_path / "out", [make()], ()):
         page = Page(path)
         assert "http:" not in page.source and "https:" not in page.source
         allowed = ("#", "data:", "index.html", "M7-Y.html")
@@ -382,7 +385,7 @@ def test_browser_opens_it_offline(
     """A browser without network opens both pages in both schemes: no error, no other request."""
     needs("chromium")
     playwright = pytest.importorskip("playwright.sync_api")
-    paths = write_report(tmp_path / "out", [blind(make())], (), service={})
+    paths = write_report(tmp_path / "out", [blind(make())], ())
     with playwright.sync_playwright() as driver:
         browser = driver.chromium.launch(
             executable_path=shutil.which("chromium"), args=["--no-sandbox", "--disable-gpu"]
