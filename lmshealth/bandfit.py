@@ -68,6 +68,9 @@ class BandFit:
         those that happen to show a low damping. Shape ``(n_modes,)``.
     lines : ndarray
         Frequency in Hz and amplitude in m/s² of the lines kept out, shape ``(n_lines, 2)``.
+    residual : Spectrum
+        Periodogram of the longest segment over what the fit expects: exponential about one
+        where the fit is right, and one where a line was masked.
     """
 
     view: View
@@ -77,6 +80,7 @@ class BandFit:
     snr: FloatArray
     clarity: FloatArray
     lines: FloatArray
+    residual: Spectrum
 
     def settled(self) -> tuple[Target, ...]:
         """Its modes as another channel may take them for granted."""
@@ -157,7 +161,8 @@ def fit_band(
     if fit is None:
         return None, missing
     clarity = np.array([gains[target.name] for target in seen])
-    fit = replace(fit, clarity=clarity, lines=_lines(spectra, masks))
+    residual = _residual(spectra, masks, solution)
+    fit = replace(fit, clarity=clarity, lines=_lines(spectra, masks), residual=residual)
     return _keep_credible(fit, missing), missing
 
 
@@ -311,7 +316,18 @@ def _conclude(
         snr=strength / (4 * zeta**2 * noise),
         clarity=np.full(m, np.nan),
         lines=np.empty((0, 2)),
+        residual=view.spectra[0],
     )
+
+
+def _residual(
+    spectra: tuple[Spectrum, ...], masks: list[BoolArray], solution: _Solution
+) -> Spectrum:
+    longest = int(np.argmax([s.duration for s in spectra]))
+    ratio = np.ones(spectra[longest].frequency.size)
+    expected = solution.likelihood.expected(solution.p)[longest]
+    ratio[masks[longest]] = spectra[longest].periodogram[masks[longest]] / expected
+    return replace(spectra[longest], periodogram=ratio)
 
 
 def _lines(spectra: tuple[Spectrum, ...], masks: list[BoolArray]) -> FloatArray:
@@ -358,11 +374,12 @@ def _incredible(fit: BandFit, i: int, duration: float) -> tuple[str, str] | None
             f"{f:.5g} Hz in {channel} is narrower ({2 * zeta * f:.2g} Hz) than a record of "
             f"{duration:.3g} s resolves",
         )
-    if abs(np.log(f / target.frequency)) > np.log1p(target.search) or not low < zeta < high:
+    sought = target.nominal or target.frequency
+    if abs(np.log(f / sought)) > np.log1p(target.search) or not low < zeta < high:
         return (
             "outside-search",
             f"the fit in {channel} went to {f:.5g} Hz, damping {zeta:.2g}; sought within "
-            f"{100 * target.search:.0f} % of {target.frequency:.5g} Hz, damping from {low:.2g} "
+            f"{100 * target.search:.0f} % of {sought:.5g} Hz, damping from {low:.2g} "
             f"to {high:.2g}",
         )
     if std_f > _WORST_STD_LN_F or std_zeta > _WORST_STD_LN_ZETA:

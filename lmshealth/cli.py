@@ -41,9 +41,12 @@ class _Group(click.Group):
         except LmshealthError as error:
             click.echo(f"lmshealth: {error}", err=True)
             ctx.exit(_FAILED)
+        except OSError as error:
+            click.echo(f"lmshealth: {error.filename or 'output'}: {error.strerror}", err=True)
+            ctx.exit(_FAILED)
         except KeyboardInterrupt:
             click.echo("lmshealth: interrupted; run again to go on", err=True)
-            ctx.exit(130)
+            ctx.exit(_FAILED)
 
 
 @click.group(cls=_Group, context_settings={"help_option_names": ["-h", "--help"]})

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from bisect import bisect_right
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -12,6 +13,10 @@ from lmshealth.errors import NotEnoughData
 from lmshealth.logs import Metadata, Refusal
 from lmshealth.results import History, Modes
 from lmshealth.stage import Stage
+
+# Between two logs ln f moves by temperature and wear, but not by more than this.
+_JUMP = 0.02
+_JUMP_SIGMAS = 6.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -57,7 +62,8 @@ def build_history(readings: Sequence[Reading], stage: Stage) -> tuple[History, l
         In the order of recording. Its baseline is the first log that the manifest declares one,
         else the first log.
     refused : list of Refusal
-        Odometers that ran backwards; their logs stay in the history, the clock stands still.
+        Logs whose odometer contradicts the others, which are left out, and jumps of a frequency
+        that no second log confirms, which are missing.
 
     Raises
     ------
@@ -66,34 +72,104 @@ def build_history(readings: Sequence[Reading], stage: Stage) -> tuple[History, l
     """
     if not readings:
         raise NotEnoughData(f"{stage.name}: no usable log")
-    ordered = in_order(readings)
-    travel = np.array([reading.metadata.travel for reading in ordered], dtype=float)
-    highest = np.maximum.accumulate(travel)
-    refused = [
-        Refusal(
-            log=reading.log,
-            reason="odometer-backwards",
-            detail=f"travel_km is {own / 1000:g} after {so_far / 1000:g} before; "
-            "the log is used at the higher one",
-        )
-        for reading, own, so_far in zip(ordered, travel, highest, strict=True)
-        if own < so_far
-    ]
+    ordered, refused = _without_contradictions(in_order(readings))
     tracked = [mode.name for mode in stage.modes if mode.tracked]
     found = {name for reading in ordered for name in reading.modes.names}
     modes = tuple(name for name in tracked if name in found)
+    estimates = _estimates(ordered, modes)
+    refused += _refuse_unconfirmed(ordered, modes, estimates)
     declared = [k for k, reading in enumerate(ordered) if reading.metadata.baseline]
     history = History(
         stage=str(ordered[0].metadata.stage),
         logs=tuple(reading.log for reading in ordered),
         recorded_at=tuple(r.metadata.recorded_at for r in ordered if r.metadata.recorded_at),
-        travel=highest,
+        travel=np.array([reading.metadata.travel for reading in ordered], dtype=float),
         covariates=_covariates(ordered),
         modes=modes,
-        **_estimates(ordered, modes),
+        **estimates,
         baseline=declared[0] if declared else 0,
     )
     return history, refused
+
+
+def _without_contradictions(
+    ordered: tuple[Reading, ...],
+) -> tuple[tuple[Reading, ...], list[Refusal]]:
+    """Keep the longest run of logs whose odometer never runs backwards.
+
+    One mistyped odometer contradicts all logs after or before it; it is the odd one out that goes.
+    """
+    travel = [float(reading.metadata.travel or 0.0) for reading in ordered]
+    # Longest non-decreasing subsequence: the lowest end of a run of each length, and its log.
+    ends: list[float] = []
+    logs: list[int] = []
+    before = [-1] * len(travel)
+    for k, own in enumerate(travel):
+        place = bisect_right(ends, own)
+        before[k] = logs[place - 1] if place else -1
+        ends[place : place + 1], logs[place : place + 1] = [own], [k]
+    kept: set[int] = set()
+    at = logs[-1] if logs else -1
+    while at >= 0:
+        kept.add(at)
+        at = before[at]
+    refused = [
+        Refusal(
+            log=reading.log,
+            reason="odometer",
+            detail=f"travel_km {travel[k] / 1000:g} contradicts the logs recorded before or after "
+            "it: an odometer never runs backwards; correct it in manifest.csv",
+        )
+        for k, reading in enumerate(ordered)
+        if k not in kept
+    ]
+    return tuple(ordered[k] for k in sorted(kept)), refused
+
+
+def _refuse_unconfirmed(
+    ordered: Sequence[Reading], modes: tuple[str, ...], estimates: dict[str, FloatArray]
+) -> list[Refusal]:
+    """Take out jumps of a frequency that no second log confirms.
+
+    A peak under a wrong name looks like a sudden loss. A real one is there in the next log too, so
+    that a jump costs one log and no more. Only earlier logs are looked at.
+    """
+    ln_f, m = estimates["ln_frequency"], len(modes)
+    variance = np.einsum("kii->ki", estimates["cov"])[:, :m]
+    refused = []
+    for i, mode in enumerate(modes):
+        accepted: list[int] = []
+        doubted: int | None = None
+        for k in np.flatnonzero(np.isfinite(ln_f[:, i])).tolist():
+            recent = accepted[-3:]
+            near = not recent or _agree(ln_f[k, i], variance[k, i], ln_f[recent, i])
+            confirmed = doubted is not None and _agree(
+                ln_f[k, i], variance[k, i] + variance[doubted, i], ln_f[[doubted], i]
+            )
+            if near or confirmed:
+                # A confirmed jump begins a new level: the logs before it are no measure any more.
+                accepted = [*(accepted if near else []), k]
+                doubted = None
+                continue
+            doubted = k
+            expected = float(np.exp(ln_f[recent[-1], i]))
+            detail = (
+                f"{np.exp(ln_f[k, i]):.5g} Hz after {expected:.5g} Hz: a jump that the log before "
+                "does not show; it is believed once the next log confirms it"
+            )
+            refused.append(Refusal(log=ordered[k].log, mode=mode, reason="jump", detail=detail))
+    for refusal in refused:
+        k = next(k for k, reading in enumerate(ordered) if reading.log == refusal.log)
+        i = modes.index(refusal.mode)
+        ln_f[k, i] = estimates["ln_damping"][k, i] = np.nan
+        for row in (i, m + i):
+            estimates["cov"][k, row], estimates["cov"][k, :, row] = np.nan, np.nan
+    return refused
+
+
+def _agree(value: float, variance: float, others: FloatArray) -> bool:
+    reach = max(_JUMP_SIGMAS * float(np.sqrt(variance)), _JUMP)
+    return bool(np.min(np.abs(value - others)) <= reach)
 
 
 def _covariates(ordered: Sequence[Reading]) -> dict[str, FloatArray]:

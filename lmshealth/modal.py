@@ -8,21 +8,27 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import combinations
 
 import numpy as np
+from scipy.special import softmax
 
 from lmshealth.bandfit import BAND, BandFit, View, fit_band
-from lmshealth.errors import BadLog
+from lmshealth.errors import BadLog, BadStage
 from lmshealth.lines import name_lines
 from lmshealth.logs import Channel, Log, Refusal
-from lmshealth.peaks import find_lines, find_peaks
+from lmshealth.peaks import find_excess, find_lines, find_peaks
 from lmshealth.results import Line, Modes
 from lmshealth.spectra import find_segments, periodogram
 from lmshealth.stage import Stage
-from lmshealth.starts import Coarse, Target, coarsen, locate
+from lmshealth.starts import Coarse, Target, coarsen, locate, shift_cost
 
 # Modes whose bands touch are fitted together, but never more than this many.
 _MOST_TOGETHER = 4
+# Probability from which on a found mode is given its name.
+_CLEAR_NAME = 0.8
+# Without a description, so many times what a fit leaves over is searched for further modes.
+_MOST_ROUNDS = 3
 # Shortest useful segment: half-power bandwidth times duration.
 _LEAST_RESOLUTION = 2.0
 _TOP = 0.45  # of the sample rate: anti-alias filters reach below Nyquist
@@ -71,6 +77,12 @@ def identify(
     refused: list[Refusal] = []
     for cluster in _clusters(targets):
         found = _fit_cluster(log, views, cluster, targets, known=stage is not None)
+        for _ in range(_MOST_ROUNDS if stage is None else 0):
+            more = _unexplained(found.fits, cluster)
+            if len(more) == len(cluster):
+                break
+            cluster = more
+            found = _fit_cluster(log, views, cluster, targets, known=False)
         seen += [(fit.view.channel, *line) for fit in found.fits for line in fit.lines.tolist()]
         best += found.best
         refused += found.refused
@@ -100,11 +112,14 @@ def _choose_channels(log: Log, names: Sequence[str] | None) -> tuple[Channel, ..
 
 def _stage_targets(stage: Stage, band: tuple[float, float] | None) -> tuple[Target, ...]:
     low, high = band or (0.0, np.inf)
-    return tuple(
+    targets = tuple(
         Target(mode.name, mode.frequency_hz, mode.damping_ratio, mode.search)
         for mode in sorted(stage.modes, key=lambda mode: mode.frequency_hz)
         if low <= mode.frequency_hz <= high
     )
+    if not targets:
+        raise BadStage(f"{stage.name}: no [[mode]] lies between {low:g} and {high:g} Hz")
+    return targets
 
 
 def _transform(
@@ -220,6 +235,9 @@ def _fit_cluster(
             fits.append(fit)
     best = _best_channels(fits, [target.name for target in cluster])
     best = [_in_company(fit, best, views, coarse) for fit in best]
+    if known:
+        best, unclear = _named(best, cluster)
+        reasons |= unclear
     seen = {target.name for fit in best for target in fit.targets}
     refused = [
         Refusal(log=log.name, mode=name, reason=reason, detail=detail)
@@ -227,6 +245,54 @@ def _fit_cluster(
         if name not in seen
     ]
     return _ClusterResult(fits, best, refused)
+
+
+def _named(
+    best: list[BandFit], cluster: tuple[Target, ...]
+) -> tuple[list[BandFit], dict[str, tuple[str, str]]]:
+    """Give the modes that were found the names that their frequencies speak for.
+
+    Where fewer were found than sought, one may stand where another began. Every assignment that
+    keeps the order is weighed by the prior of shifts; a mode whose name is not clear is refused.
+    """
+    found = sorted(
+        (float(fit.estimate[i]), target.name)
+        for fit in best
+        for i, target in enumerate(fit.targets)
+    )
+    if not found or len(found) == len(cluster):
+        return best, {}
+    ln_f = np.array([f for f, _ in found])
+    choices = list(combinations(cluster, len(found)))
+    search = np.array([[target.search for target in choice] for choice in choices])
+    home = np.log([[target.frequency for target in choice] for choice in choices])
+    shifts = ln_f - home
+    cost = np.array(
+        [shift_cost(s[None], w, len(found))[0] for s, w in zip(shifts, search, strict=True)]
+    )
+    cost[(np.abs(shifts) > np.log1p(search)).any(axis=1)] = np.inf
+    if not np.isfinite(cost).any():
+        return best, {}
+    weight = softmax(-cost)
+    names: dict[str, str] = {}
+    unclear: dict[str, tuple[str, str]] = {}
+    for i, (f, name) in enumerate(found):
+        chance: dict[str, float] = {}
+        for choice, w in zip(choices, weight.tolist(), strict=True):
+            chance[choice[i].name] = chance.get(choice[i].name, 0.0) + w
+        likely = max(chance, key=lambda n: chance[n])
+        if chance[likely] >= _CLEAR_NAME:
+            names[name] = likely
+            continue
+        told = ", ".join(f"{n} {100 * p:.0f} %" for n, p in chance.items() if p > 0.01)
+        detail = f"the resonance at {np.exp(f):.5g} Hz may be {told}; its neighbours were not found"
+        unclear |= {n: ("ambiguous", detail) for n in chance if chance[n] > 0.01}
+    kept = [fit.only([t.name for t in fit.targets if t.name in names]) for fit in best]
+    renamed = [
+        replace(fit, targets=tuple(replace(t, name=names[t.name]) for t in fit.targets))
+        for fit in kept
+    ]
+    return renamed, {n: why for n, why in unclear.items() if n not in names.values()}
 
 
 def _in_company(
@@ -268,6 +334,19 @@ def _best_channels(fits: list[BandFit], names: list[str]) -> list[BandFit]:
         for k, fit in enumerate(fits)
         if (chosen := [n for n in names if choice.get(n) == k])
     ]
+
+
+def _unexplained(fits: list[BandFit], cluster: tuple[Target, ...]) -> tuple[Target, ...]:
+    """Add to a cluster what stands out of what its fits leave over."""
+    more = list(cluster)
+    for fit in fits:
+        candidate = find_excess(fit.residual)
+        if candidate is None or len(more) > _MOST_TOGETHER:
+            continue
+        near = (abs(candidate.frequency / t.frequency - 1) < t.damping_ratio for t in more)
+        if not any(near):
+            more.append(replace(candidate, name=f"{more[0].name}_and_{len(more)}"))
+    return tuple(sorted(more, key=lambda target: target.frequency))
 
 
 def _distinct(fits: list[BandFit]) -> list[BandFit]:

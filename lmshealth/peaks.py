@@ -14,6 +14,8 @@ from lmshealth.starts import Target
 _SCALES = (0.001, 0.002, 0.004, 0.008, 0.016, 0.032, 0.064)
 _THRESHOLD = 6.0
 _LEAST_ORDINATES = 4
+# Standard deviations by which a residual must be above one.
+_EXCESS = 5.0
 _TOWERING = 60.0
 _BESIDE = (3, 4, 5, 6, 7, 8)
 
@@ -87,6 +89,35 @@ def _stand_out(
     best = (contrast[1:-1] >= contrast[:-2]) & (contrast[1:-1] > contrast[2:])
     index = 1 + np.flatnonzero(best & (contrast[1:-1] > _THRESHOLD))
     return [(float(contrast[i]), float(centre[i]), scale) for i in index]
+
+
+def find_excess(residual: Spectrum) -> Target | None:
+    """Find what a fit leaves over: the place and scale where its residual is most above one.
+
+    Parameters
+    ----------
+    residual : Spectrum
+        Periodogram over its expectation, exponential about one where the fit is right.
+
+    Returns
+    -------
+    Target or None
+        None where nothing stands out.
+    """
+    total = np.concatenate([[0.0], np.cumsum(residual.periodogram - 1.0)])
+    best = (_EXCESS, 0.0, 0.0)
+    for scale in _SCALES:
+        first = np.searchsorted(residual.frequency, residual.frequency * (1 - scale))
+        last = np.searchsorted(residual.frequency, residual.frequency * (1 + scale))
+        n = last - first
+        # A window cut by the edge of the band is judged by what is left of it.
+        score = np.where(n >= _LEAST_ORDINATES, (total[last] - total[first]) / np.sqrt(n), 0.0)
+        k = int(np.argmax(score))
+        best = max(best, (float(score[k]), float(residual.frequency[k]), scale))
+    _, frequency, scale = best
+    if scale == 0.0:
+        return None
+    return Target("excess", frequency, scale / 1.5, min(max(3 * scale, 0.02), 0.15))
 
 
 def find_lines(spectrum: Spectrum, low: float, high: float) -> FloatArray:

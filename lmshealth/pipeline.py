@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import hashlib
+import logging
 import multiprocessing
+import signal
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import BrokenExecutor, Executor, ProcessPoolExecutor, as_completed
 from contextlib import contextmanager
@@ -22,13 +24,15 @@ from lmshealth.readers import content_digest, find_logs, read_log, read_manifest
 from lmshealth.report import write_report
 from lmshealth.results import Health, History, Prognosis, Track
 from lmshealth.stage import Stage
-from lmshealth.store import Store, result_key
+from lmshealth.store import Store, beside, result_key
 from lmshealth.summary import Assessment, judge
 from lmshealth.tables import all_tables
 from lmshealth.tracking import track
 
 Progress = Callable[[str, int, int], None]
 """Called with what is being done, how much is done, and how much there is."""
+
+_logger = logging.getLogger(__name__)
 
 Outcome = Reading | tuple[Refusal, ...]
 
@@ -68,7 +72,7 @@ class RunResult:
     assessments : tuple of Assessment
         One per stage.
     n_logs, n_refused, n_remembered : int
-        Logs found, refused as a whole, and taken from the store.
+        Different logs found, refused as a whole, and taken from the store.
     """
 
     index: Path
@@ -120,7 +124,7 @@ def run(
     # Output inside the folder of logs is no log.
     inside = out.resolve()
     found = [path for path in archive.logs if inside not in path.resolve().parents]
-    store = Store(settings.store or f"sqlite:///{(out / 'lmshealth.sqlite').as_posix()}")
+    store = Store(settings.store or beside(out))
     try:
         actions = read_maintenance(folder)
         tasks, refused = _tasks(folder, found, stages, progress)
@@ -133,12 +137,18 @@ def run(
     lost = [r for outcome in outcomes if not isinstance(outcome, Reading) for r in outcome]
     whole = [*archive.refused, *refused, *lost]
     partial = [r for reading in readings for r in reading.modes.refused]
-    order = [r for a in assessments for r in a.refused if r.reason == "odometer-backwards"]
-    tables = all_tables(readings, assessments, [*whole, *partial, *order])
+    later = [r for a in assessments for r in a.refused if r.reason in ("odometer", "jump")]
+    whole += [refusal for refusal in later if refusal.reason == "odometer"]
+    partial += [refusal for refusal in later if refusal.reason == "jump"]
+    tables = all_tables(readings, assessments, [*whole, *partial])
     for name, table in tables.items():
         _write_table(out / f"{name}.csv", table.to_csv(index=False))
     n_logs = len(found) + len(archive.refused)
-    n_refused = len({refusal.log for refusal in whole})
+    # A row of a manifest that names no log is listed, but no log is lost by it; nor by a copy.
+    names = {path.relative_to(folder).as_posix() for path in found}
+    names |= {refusal.log for refusal in archive.refused}
+    n_refused = len({r.log for r in whole if r.log in names and r.reason != "duplicate"})
+    n_copies = len({r.log for r in whole if r.reason == "duplicate"})
     if not readings:
         raise NothingUsable(
             f"{folder}: no usable log: {n_logs} found, {n_refused} refused; "
@@ -149,7 +159,7 @@ def run(
         index=out / "index.html",
         pages=tuple(page for page in pages if page.name != "index.html"),
         assessments=assessments,
-        n_logs=n_logs,
+        n_logs=n_logs - n_copies,
         n_refused=n_refused,
         n_remembered=n_remembered,
     )
@@ -169,12 +179,17 @@ def _workers(n: int) -> Iterator[Executor | None]:
         return
     # Spawned, not forked: a fork would share locks of threads that do not come along.
     context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(n, mp_context=context) as pool:
+    with ProcessPoolExecutor(n, mp_context=context, initializer=_leave_interrupts) as pool:
         try:
             yield pool
         except BaseException:
             pool.shutdown(wait=False, cancel_futures=True)
             raise
+
+
+def _leave_interrupts() -> None:
+    """Let Ctrl-C be the parent's alone: workers would each print where they stood."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
 def _tasks(
@@ -288,6 +303,10 @@ def identify_log(task: _Task, stages: tuple[Stage, ...]) -> Outcome:
         return Reading(task.name, log.digest, log.metadata, identify(log, stage))
     except BadLog as error:
         return (Refusal(task.name, error.reason, error.detail),)
+    except Exception as error:  # one log must not end the batch, whatever our mistake
+        _logger.exception("%s", task.name)
+        detail = f"{type(error).__name__}: {error}; please report this with the log"
+        return (Refusal(task.name, "internal", detail),)
 
 
 def _assess_all(
@@ -344,11 +363,11 @@ def assess(
     own = int(hashlib.sha256(f"{history.stage}\n{stage.digest}".encode()).hexdigest()[:12], 16)
     seed = (settings.seed, own)
     followed, health, prognosis = _results(history, stage, settings.epochs, seed, pool, notes)
-    ordered = in_order(used)
+    digests = {reading.log: reading.digest for reading in used}
     return Assessment(
         stage=stage,
         history=history,
-        digests=tuple(reading.digest for reading in ordered),
+        digests=tuple(digests[log] for log in history.logs),
         track=followed,
         health=health,
         prognosis=prognosis,

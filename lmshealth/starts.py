@@ -38,6 +38,8 @@ class Target:
     settled : (float, float) or None
         Standard deviations of ln f and ln ζ where another channel has told them already: the
         mode then takes part in the fit whether this channel shows it or not.
+    nominal : float or None
+        Where it was sought before it was placed, in Hz.
     """
 
     name: str
@@ -45,6 +47,7 @@ class Target:
     damping_ratio: float
     search: float
     settled: tuple[float, float] | None = None
+    nominal: float | None = None
 
     def band(self, widths: float) -> tuple[float, float]:
         """Frequencies within so many damping ratios of the target."""
@@ -157,6 +160,28 @@ def incoherent_fit(
     return weight / unit, np.asarray(misfit)
 
 
+def shift_cost(shifts: FloatArray, search: FloatArray, own: int) -> FloatArray:
+    """Negative log prior of shifts: half the search together, a sixth of it apart.
+
+    Parameters
+    ----------
+    shifts : ndarray
+        Of ln frequency, shape ``(n_candidates, n_modes)``.
+    search : ndarray
+        Half widths of the searches, shape ``(n_modes,)``.
+    own : int
+        The common shift is the mean of this many first ones.
+
+    Returns
+    -------
+    ndarray
+        Shape ``(n_candidates,)``.
+    """
+    common = shifts[:, :own].mean(axis=1, keepdims=True)
+    cost = 0.5 * (common[:, 0] / (search.mean() / 2)) ** 2
+    return np.asarray(cost + 0.5 * np.sum(((shifts - common) / (search / 6)) ** 2, axis=1))
+
+
 def locate(
     coarse: tuple[Coarse, ...], targets: tuple[Target, ...]
 ) -> tuple[tuple[Target, ...], tuple[Coarse, ...]]:
@@ -183,10 +208,7 @@ def locate(
     search = np.array([target.search for target in everything])
 
     def best(shifts: FloatArray) -> FloatArray:
-        # Shifts are a priori half the search together and a sixth of it apart.
-        common = shifts[:, :own].mean(axis=1, keepdims=True)
-        cost = 0.5 * (common[:, 0] / (search.mean() / 2)) ** 2
-        cost += 0.5 * np.sum(((shifts - common) / (search / 6)) ** 2, axis=1)
+        cost = shift_cost(shifts, search, own)
         f = nominal * np.exp(shifts)
         for channel in coarse:
             cost += incoherent_fit(channel, f, np.broadcast_to(zeta, f.shape))[1]
@@ -200,7 +222,7 @@ def locate(
             moved[:, i] += width * zeta[i] * np.linspace(-1, 1, _OWN_STEPS)
             shift = best(moved[np.abs(moved[:, i]) <= np.log1p(search[i])])
     placed = tuple(
-        replace(target, frequency=float(f))
+        replace(target, frequency=float(f), nominal=target.frequency)
         for target, f in zip(everything, nominal * np.exp(shift), strict=True)
     )
     return placed[:own], tuple(replace(channel, neighbours=placed[own:]) for channel in coarse)

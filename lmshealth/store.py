@@ -12,11 +12,12 @@ import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from datetime import datetime
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from sqlalchemy import String, Text, create_engine, select
-from sqlalchemy.engine import make_url
+from sqlalchemy.engine import URL, make_url
 from sqlalchemy.exc import ArgumentError, SQLAlchemyError
 from sqlalchemy.orm import DeclarativeBase, Mapped, Session, mapped_column
 
@@ -44,6 +45,11 @@ class _Identified(_Base):
     outcome: Mapped[str] = mapped_column(Text)
 
 
+def beside(folder: Path) -> URL:
+    """URL of the default store: a SQLite file in the folder of the output, whatever its name."""
+    return URL.create("sqlite", database=str(folder / "lmshealth.sqlite"))
+
+
 def result_key(digest: str, *circumstances: str) -> str:
     """Name a result by the content of its log and everything else it depends on."""
     return hashlib.sha256("\n".join([digest, *circumstances]).encode()).hexdigest()
@@ -54,7 +60,7 @@ class Store:
 
     Parameters
     ----------
-    url : str
+    url : str or URL
         Such as ``sqlite:///results.sqlite``.
 
     Raises
@@ -63,15 +69,15 @@ class Store:
         If it cannot be opened.
     """
 
-    def __init__(self, url: str) -> None:
+    def __init__(self, url: str | URL) -> None:
         try:
             self._shown = make_url(url).render_as_string(hide_password=True)
             self._engine = create_engine(url)
             _Base.metadata.create_all(self._engine)
         except (ArgumentError, SQLAlchemyError, ImportError, ValueError) as error:
             # The URL may hold a password, before the host or among its options.
-            shown = re.sub(r"//[^/]*@", "//", url).split("?")[0]
-            detail = str(error).replace(url, shown)
+            shown = re.sub(r"//[^/]*@", "//", str(url)).split("?")[0]
+            detail = str(error).replace(str(url), shown)
             raise StoreError(f"cannot open the store {shown}: {detail}") from error
 
     def close(self) -> None:

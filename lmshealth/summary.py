@@ -148,7 +148,7 @@ def _why(stage: Stage, health: Health, told: list[int]) -> str:
         else:
             low_j, middle_j, high_j = (100 * q[j] / parameter.baseline for q in (low, middle, high))
             sentences.append(
-                f"{name} is at {middle_j:.0f} % of its commissioning value "
+                f"{name} is at {middle_j:.0f} % of its baseline value "
                 f"(90 %: {low_j:.0f} to {high_j:.0f} %)."
             )
     return " ".join(sentences)

@@ -22,8 +22,8 @@ def stage(tmp_path: Path) -> Stage:
 def test_readings_are_sorted_by_moment_then_name(stage: Stage) -> None:
     """The order given does not matter; equal moments are told apart by name."""
     late = make_reading("a", 5, 3e5, {"roll": 4.8})
-    early = make_reading("z", 1, 1e5, {"roll": 4.9})
-    twin = make_reading("b", 1, 1e5, {"roll": 4.9})
+    early = make_reading("z", 1, 1e5, {"roll": 4.81})
+    twin = make_reading("b", 1, 1e5, {"roll": 4.81})
     assert [r.log for r in in_order([late, early, twin])] == ["b", "z", "a"]
     history, refused = build_history([late, early, twin], stage)
     assert history.logs == ("b", "z", "a")
@@ -35,11 +35,11 @@ def test_modes_are_lined_up_with_their_covariances(stage: Stage) -> None:
     """Whatever the order within a log, each mode has its column, rows and cross terms."""
     readings = [
         make_reading("0", 0, 0.0, {"pitch": 4.9, "roll": 4.8}),
-        make_reading("1", 1, 1e5, {"roll": 4.7}),
+        make_reading("1", 1, 1e5, {"roll": 4.79}),
     ]
     history, _ = build_history(readings, stage)
     assert history.modes == ("roll", "pitch")
-    np.testing.assert_array_equal(history.ln_frequency, [[4.8, 4.9], [4.7, np.nan]])
+    np.testing.assert_array_equal(history.ln_frequency, [[4.8, 4.9], [4.79, np.nan]])
     own = readings[0].modes.cov
     order = [1, 0, 3, 2]  # roll before pitch, for frequency and for damping
     np.testing.assert_array_equal(history.cov[0], own[np.ix_(order, order)])
@@ -60,14 +60,52 @@ def test_modes_that_are_not_tracked_or_never_found_are_left_out(stage: Stage) ->
     assert np.isnan(history.ln_frequency[1]).all()
 
 
-def test_an_odometer_that_runs_backwards_stands_still(stage: Stage) -> None:
-    """The log stays at the highest reading so far, and a refusal names it with both numbers."""
-    travels = [1e5, 3e5, 2e5, 4e5]
-    readings = [make_reading(str(k), k, s, {"roll": 4.8}) for k, s in enumerate(travels)]
+def test_one_mistyped_odometer_does_not_rewrite_the_life(stage: Stage) -> None:
+    """The log that contradicts most others goes, whether its odometer is too high or too low."""
+    for wrong, at in ((1.8e7, 1), (1e3, 4)):
+        travels = [1e5, 2e5, 3e5, 4e5, 5e5, 6e5]
+        travels[at] = wrong
+        readings = [make_reading(str(k), k, s, {"roll": 4.8}) for k, s in enumerate(travels)]
+        history, refused = build_history(readings, stage)
+        np.testing.assert_array_equal(history.travel, np.delete(travels, at))
+        assert history.logs == tuple(str(k) for k in range(6) if k != at)
+        assert [(r.log, r.reason) for r in refused] == [(str(at), "odometer")]
+        assert f"{wrong / 1000:g}" in refused[0].detail
+
+
+def jumping(values: list[float], stage: Stage) -> tuple[list[bool], list[str]]:
+    """Tell which logs kept their roll of these ln frequencies, and which were refused."""
+    readings = [
+        make_reading(str(k), k, 1e5 * k, {"roll": value, "pitch": 4.9})
+        for k, value in enumerate(values)
+    ]
     history, refused = build_history(readings, stage)
-    np.testing.assert_array_equal(history.travel, [1e5, 3e5, 3e5, 4e5])
-    assert [(r.log, r.reason) for r in refused] == [("2", "odometer-backwards")]
-    assert "200 after 300" in refused[0].detail
+    assert all(r.reason == "jump" and r.mode == "roll" for r in refused)
+    roll, pitch = history.modes.index("roll"), history.modes.index("pitch")
+    assert np.isfinite(history.ln_frequency[:, pitch]).all()
+    kept = np.isfinite(history.ln_frequency[:, roll])
+    np.testing.assert_array_equal(np.isfinite(history.cov[:, roll, roll]), kept)
+    return kept.tolist(), [r.log for r in refused]
+
+
+def test_a_jump_in_one_log_only_is_not_believed(stage: Stage) -> None:
+    """A frequency that is off in one log, also in the last, is refused and named."""
+    kept, refused = jumping([4.84, 4.84, 4.92, 4.84, 4.839, 4.70], stage)
+    assert kept == [True, True, False, True, True, False]
+    assert refused == ["2", "5"]
+
+
+def test_a_jump_that_the_next_log_confirms_is_a_step(stage: Stage) -> None:
+    """A loosened bolt costs one log; the logs after it are all believed."""
+    kept, refused = jumping([4.84, 4.84, 4.79, 4.79, 4.789, 4.79], stage)
+    assert kept == [True, True, False, True, True, True]
+    assert refused == ["2"]
+
+
+def test_drift_within_reach_is_no_jump(stage: Stage) -> None:
+    """Two per cent a log, as temperature and fast wear may bring, is believed."""
+    kept, refused = jumping([4.84 - 0.015 * k for k in range(6)], stage)
+    assert all(kept) and not refused
 
 
 def test_the_first_declared_baseline_counts(stage: Stage) -> None:

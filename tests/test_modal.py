@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lmshealth.errors import BadLog
+from lmshealth.errors import BadLog, BadStage
 from lmshealth.logs import Log
 from lmshealth.modal import identify
 from lmshealth.readers import load_columns, read_log
@@ -397,3 +397,46 @@ def test_a_model_frame_shows_its_first_mode(needs: Callable[[str], None], tmp_pa
     found = identify(log, make_stage([("first", 3.7, 0.03)], search=0.1))
     assert found.names == ("first",)
     assert found.frequency[0] == pytest.approx(3.69, abs=0.15)
+
+
+@pytest.mark.parametrize("lonely", ["roll", "pitch"])
+def test_a_lonely_resonance_is_not_named_by_guessing(lonely: str) -> None:
+    """Where one of three close modes is excited, its name is not clear: refused, not guessed."""
+    nominal = {"roll": 126.4, "pitch": 136.6, "yaw": 155.0}
+    stage = make_stage([(name, f, 0.017) for name, f in nominal.items()])
+    for seed in range(6):
+        mode = Mode(nominal[lonely], 0.017)
+        signal = accelerations(rng(seed), [mode], round(20 * RATE), RATE, 0.01)[0]
+        found = identify(make_log({"acc_a": signal}, RATE), stage)
+        assert found.names == ()
+        assert {r.mode for r in found.refused} == set(nominal)
+        assert "ambiguous" in {r.reason for r in found.refused}
+
+
+def test_two_of_three_modes_keep_their_names() -> None:
+    """The distance between two resonances tells which of three they are."""
+    nominal = {"roll": 126.4, "pitch": 136.6, "yaw": 155.0}
+    stage = make_stage([(name, f, 0.017) for name, f in nominal.items()])
+    for seed in range(4):
+        modes = [Mode(nominal[name], 0.017) for name in ("roll", "yaw")]
+        signal = accelerations(rng(seed), modes, round(20 * RATE), RATE, 0.01)[0]
+        found = identify(make_log({"acc_a": signal}, RATE), stage)
+        assert found.names == ("roll", "yaw")
+
+
+def test_close_modes_are_found_without_a_description() -> None:
+    """A mode on the skirt of a stronger one stands out of what the first fit leaves over."""
+    modes = [Mode(126.4, 0.017, 0.6), Mode(136.6, 0.015, 1.0)]
+    for seed in range(4):
+        signal = accelerations(rng(seed), modes, round(20 * RATE), RATE, 0.01)[0]
+        found = identify(make_log({"acc_a": signal}, RATE), band=(80.0, 200.0))
+        assert len(found.names) == 2
+        score = (found.frequency - [126.4, 136.6]) / found.frequency_std
+        assert (np.abs(score) < 4).all()
+
+
+def test_a_band_without_modes_of_the_description_is_an_error() -> None:
+    """Nothing to look for is said, not shown as an empty table."""
+    log = make_log({"acc_a": rng(0).standard_normal(20_000)}, RATE)
+    with pytest.raises(BadStage, match="300"):
+        identify(log, make_stage(ROLL), band=(300.0, 400.0))

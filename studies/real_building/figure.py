@@ -11,8 +11,6 @@ from matplotlib.figure import Figure
 
 HERE = Path(__file__).parent
 DATA, FULL, PUBLISHED = "#56606b", "#0072b2", "#d55e00"
-# Independent estimates of the damping ratio that the modes' description rests on.
-PUBLISHED_DAMPING = {"first": 0.0156, "second": 0.0142, "third": 0.0153}
 
 
 def main() -> None:
@@ -34,7 +32,7 @@ def main() -> None:
             ax.errorbar(minutes, value, error, fmt="o", ms=3.5, lw=1, color=DATA,
                         label="5-minute log, ±2σ")  # fmt: skip
             ax.axhline(unit * mode[f"full_{key}"], color=FULL, label="full record")
-            published = mode["published_hz"] if row == 0 else PUBLISHED_DAMPING[name] * unit
+            published = mode["published_hz"] if row == 0 else unit * mode["published_damping_ratio"]
             ax.axhline(published, color=PUBLISHED, ls="--", label="published")
             ax.grid(alpha=0.25)
             if row == 0:

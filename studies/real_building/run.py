@@ -30,7 +30,7 @@ import h5py
 import numpy as np
 import pandas as pd
 
-from studies.real_building.make_map import PUBLISHED
+from studies.real_building.make_map import PUBLISHED, PUBLISHED_DAMPING
 from studies.record import Stopwatch, clopper_pearson, keep
 
 HERE = Path(__file__).parent
@@ -104,9 +104,11 @@ def evaluate(out: Path, full: dict[str, dict[str, Any]], n_samples: int) -> dict
     verdict = pd.read_csv(out / "verdict.csv").iloc[0]
     n_windows = n_samples // int(WINDOW_S * SAMPLE_RATE)
     per_mode = {
-        name: compare(modes[modes["mode"] == name], full[name], f) for name, f in PUBLISHED.items()
+        name: compare(name, modes[modes["mode"] == name], full[name], f)
+        for name, f in PUBLISHED.items()
     }
     return {
+        "seed": 0,
         "n_windows": n_windows,
         "modes": per_mode,
         "stiffness": {key: float(health[key]) for key in ("q05", "median", "q95")},
@@ -133,10 +135,13 @@ def evaluate(out: Path, full: dict[str, dict[str, Any]], n_samples: int) -> dict
     }  # fmt: skip
 
 
-def compare(windows: pd.DataFrame, full: dict[str, Any], published: float) -> dict[str, Any]:
+def compare(
+    name: str, windows: pd.DataFrame, full: dict[str, Any], published: float
+) -> dict[str, Any]:
     """Compare one mode's windows with the full record."""
     found = {
         "published_hz": published,
+        "published_damping_ratio": PUBLISHED_DAMPING[name],
         "full_frequency_hz": full["frequency_hz"],
         "full_damping_ratio": full["damping_ratio"],
         "n_windows": len(windows),
