@@ -14,8 +14,10 @@ from lmshealth.starts import Target
 _SCALES = (0.001, 0.002, 0.004, 0.008, 0.016, 0.032, 0.064)
 _THRESHOLD = 6.0
 _LEAST_ORDINATES = 4
-# Standard deviations by which a residual must be above one.
+# Standard deviations by which a residual must be above one; of fewer ordinates the mean is so
+# skewed that noise reaches it.
 _EXCESS = 5.0
+_LEAST_OF_EXCESS = 16
 _TOWERING = 60.0
 _BESIDE = (3, 4, 5, 6, 7, 8)
 
@@ -111,7 +113,7 @@ def find_excess(residual: Spectrum) -> Target | None:
         last = np.searchsorted(residual.frequency, residual.frequency * (1 + scale))
         n = last - first
         # A window cut by the edge of the band is judged by what is left of it.
-        score = np.where(n >= _LEAST_ORDINATES, (total[last] - total[first]) / np.sqrt(n), 0.0)
+        score = np.where(n >= _LEAST_OF_EXCESS, (total[last] - total[first]) / np.sqrt(n), 0.0)
         k = int(np.argmax(score))
         best = max(best, (float(score[k]), float(residual.frequency[k]), scale))
     _, frequency, scale = best

@@ -424,17 +424,6 @@ def test_two_of_three_modes_keep_their_names() -> None:
         assert found.names == ("roll", "yaw")
 
 
-def test_close_modes_are_found_without_a_description() -> None:
-    """A mode on the skirt of a stronger one stands out of what the first fit leaves over."""
-    modes = [Mode(126.4, 0.017, 0.6), Mode(136.6, 0.015, 1.0)]
-    for seed in range(4):
-        signal = accelerations(rng(seed), modes, round(20 * RATE), RATE, 0.01)[0]
-        found = identify(make_log({"acc_a": signal}, RATE), band=(80.0, 200.0))
-        assert len(found.names) == 2
-        score = (found.frequency - [126.4, 136.6]) / found.frequency_std
-        assert (np.abs(score) < 4).all()
-
-
 def test_a_band_without_modes_of_the_description_is_an_error() -> None:
     """Nothing to look for is said, not shown as an empty table."""
     log = make_log({"acc_a": rng(0).standard_normal(20_000)}, RATE)

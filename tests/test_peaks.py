@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from lmshealth.peaks import find_peaks
+from lmshealth.peaks import find_excess, find_peaks
 from lmshealth.spectra import Segment, Spectrum, periodogram
 from lmshealth.starts import Target
 from tests.signals import Mode, accelerations, make_log, sine, white
@@ -72,3 +72,15 @@ def test_only_the_band_is_searched() -> None:
     """A resonance outside the band is no candidate."""
     values = accelerations(np.random.default_rng(6), [Mode(120.0, 0.01)], 60_000, RATE, 0.1)
     assert not near(find_peaks((transform(values[0]),), 150.0, 300.0), 120.0)
+
+
+def test_what_a_fit_leaves_over_is_found_and_noise_is_not() -> None:
+    """A hump on an exponential residual is a candidate where it stands; pure noise is none."""
+    frequency = np.arange(2000, 3500) / 20.0
+    hump = 1 + 3 / (1 + ((frequency - 126.4) / 2.0) ** 2)
+    for seed in range(10):
+        noise = np.random.default_rng(seed).exponential(size=frequency.size)
+        assert find_excess(Spectrum(frequency, noise, 20.0, 0.0)) is None
+        found = find_excess(Spectrum(frequency, noise * hump, 20.0, 0.0))
+        assert found is not None
+        assert abs(found.frequency - 126.4) < 2.0
