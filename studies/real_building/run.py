@@ -45,6 +45,8 @@ def main() -> None:
     parser.add_argument("--quick", action="store_true")
     quick = parser.parse_args().quick
     watch = Stopwatch()
+    if "LMSHEALTH_DATA" not in os.environ:
+        raise SystemExit("LMSHEALTH_DATA is not set: it names the folder of real measurements")
     data = Path(os.environ["LMSHEALTH_DATA"]) / "palisaden_building" / "Palisaden_dataset.npy"
     record = np.load(data, allow_pickle=False)
     if quick:
