@@ -136,7 +136,8 @@ def _refuse_unconfirmed(
     """
     ln_f, m = estimates["ln_frequency"], len(modes)
     variance = np.einsum("kii->ki", estimates["cov"])[:, :m]
-    refused = []
+    refused: list[Refusal] = []
+    places: list[tuple[int, int]] = []
     for i, mode in enumerate(modes):
         accepted: list[int] = []
         doubted: int | None = None
@@ -158,9 +159,9 @@ def _refuse_unconfirmed(
                 "does not show; it is believed once the next log confirms it"
             )
             refused.append(Refusal(log=ordered[k].log, mode=mode, reason="jump", detail=detail))
-    for refusal in refused:
-        k = next(k for k, reading in enumerate(ordered) if reading.log == refusal.log)
-        i = modes.index(refusal.mode)
+            places.append((k, i))
+    # Only now, because a doubted value is what the next log is compared with.
+    for k, i in places:
         ln_f[k, i] = estimates["ln_damping"][k, i] = np.nan
         for row in (i, m + i):
             estimates["cov"][k, row], estimates["cov"][k, :, row] = np.nan, np.nan

@@ -135,11 +135,10 @@ def run(
     finally:
         store.close()
     lost = [r for outcome in outcomes if not isinstance(outcome, Reading) for r in outcome]
-    whole = [*archive.refused, *refused, *lost]
-    partial = [r for reading in readings for r in reading.modes.refused]
-    later = [r for a in assessments for r in a.refused if r.reason in ("odometer", "jump")]
-    whole += [refusal for refusal in later if refusal.reason == "odometer"]
-    partial += [refusal for refusal in later if refusal.reason == "jump"]
+    contradicted = [r for a in assessments for r in a.refused if r.reason == "odometer"]
+    jumps = [r for a in assessments for r in a.refused if r.reason == "jump"]
+    whole = [*archive.refused, *refused, *lost, *contradicted]
+    partial = [*(r for reading in readings for r in reading.modes.refused), *jumps]
     tables = all_tables(readings, assessments, [*whole, *partial])
     for name, table in tables.items():
         _write_table(out / f"{name}.csv", table.to_csv(index=False))
