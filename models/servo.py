@@ -89,10 +89,21 @@ TUNINGS = {
 
 @dataclass(frozen=True, slots=True)
 class ServoMatrices:
-    """State space from position error (m) to motor current (A): a (n, n), b (n,), c (n,)."""
+    """State space from position error (m) and feedforward (A) to motor current (A).
+
+    Parameters
+    ----------
+    a : (n, n)
+    b : (n,)
+        From the position error.
+    feedforward : (n,)
+        From a command current added in front of the current loop.
+    c : (n,)
+    """
 
     a: Array
     b: Array
+    feedforward: Array
     c: Array
 
 
@@ -143,41 +154,11 @@ def current_loop(tuning: Tuning) -> Any:
 
 @lru_cache(maxsize=32)
 def servo_matrices(tuning: Tuning) -> ServoMatrices:
-    """Return controller and current loop in series as plain arrays."""
+    """Return controller and current loop in series, a feedforward between, as plain arrays."""
     import control
 
-    system = control.series(controller(tuning), current_loop(tuning))
-    return ServoMatrices(np.asarray(system.A), np.asarray(system.B)[:, 0], np.asarray(system.C)[0])
-
-
-def rigid_open_loop(tuning: Tuning, mass: float) -> Any:
-    """Return the open loop around a rigid platform of the given mass (kg)."""
-    import control
-
-    body = control.ss(
-        [[0.0, 1.0], [0.0, 0.0]], [[0.0], [tuning.force_constant / mass]], [[1.0, 0.0]], [[0.0]]
-    )
-    return control.series(controller(tuning), current_loop(tuning), body)
-
-
-def loop_margins(tuning: Tuning, mass: float) -> dict[str, float]:
-    """Return crossover (Hz), phase margin (°) and gain margin (dB) of the rigid loop.
-
-    The loops are conditionally stable: the gain margin is that of the first phase crossover
-    above the gain crossover.
-    """
-    import control
-
-    loop = rigid_open_loop(tuning, mass)
-    # The polynomials inside overflow at frequencies that do not matter here.
-    with np.errstate(all="ignore"):
-        gains, phases, _, at_phase, at_gain, _ = control.stability_margins(loop, returnall=True)
-    first = int(np.argmin(np.abs(phases)))
-    crossover = float(at_gain[first])
-    above = np.asarray(at_phase) > crossover
-    gain = float(np.asarray(gains)[above][np.argmin(np.asarray(at_phase)[above])])
-    return {
-        "crossover_hz": crossover / (2 * np.pi),
-        "phase_margin_deg": float(phases[first]),
-        "gain_margin_db": float(20 * np.log10(gain)),
-    }
+    summed = control.ss([], [], [], [[1.0, 1.0]])
+    command = control.append(controller(tuning), control.ss([], [], [], [[1.0]]))
+    system = control.series(command, summed, current_loop(tuning))
+    b = np.asarray(system.B)
+    return ServoMatrices(np.asarray(system.A), b[:, 0], b[:, 1], np.asarray(system.C)[0])
