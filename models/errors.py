@@ -32,6 +32,24 @@ class UnknownStage(_Unknown):
     noun = "stage"
 
 
+class UnknownReading(_Unknown):
+    """A reading of the equations other than printed, corrected or derived."""
+
+    noun = "reading"
+
+
+class UnknownServo(_Unknown):
+    """A servo_id for which no tuning of the loop is known."""
+
+    noun = "servo_id"
+
+
+class UnknownFault(_Unknown):
+    """A fault of a recording that is not in the registry of faults."""
+
+    noun = "fault"
+
+
 class UnknownFormat(_Unknown):
     """A file format in which no log can be written."""
 
@@ -57,7 +75,7 @@ class UnstableLoop(ModelError):
         super().__init__(
             f"{stage}: the closed loop is unstable: a pole at {frequency_hz:.2f} Hz grows by "
             f"{growth_per_s:.3g} 1/s; needed: all poles decay (lower the loop gain or keep "
-            "preload, mount stiffness and temperature nearer to their commissioning values)"
+            "stiffness, damping and payload nearer to their commissioning values)"
         )
 
 

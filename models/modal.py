@@ -111,10 +111,16 @@ def state_covariance(diagonal: Diagonal, std: Array, sample_rate_hz: float) -> A
     return np.asarray((diagonal.states @ modal @ diagonal.states.conj().T).real)
 
 
-def _stationary_state(
+def stationary_state(
     diagonal: Diagonal, std: Array, sample_rate_hz: float, rng: np.random.Generator
 ) -> ComplexArray:
-    """Draw modal states (n,) from the stationary distribution."""
+    """Draw modal states (n,) from the stationary distribution.
+
+    Parameters
+    ----------
+    std : (input,)
+        Standard deviation of each input's white sequence.
+    """
     covariance = state_covariance(diagonal, std, sample_rate_hz)
     # Displacements and currents differ by 1e6: scale before the factorisation.
     scale = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
@@ -183,7 +189,7 @@ def simulate(
 
     The first state is drawn from the stationary distribution: no samples are thrown away.
     """
-    state = _stationary_state(diagonal, std, sample_rate_hz, rng)
+    state = stationary_state(diagonal, std, sample_rate_hz, rng)
     outputs = np.empty((diagonal.c.shape[0], samples))
     for start in range(0, samples, _CHUNK):
         size = min(_CHUNK, samples - start)

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
@@ -11,7 +12,7 @@ from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
 from models.errors import AmbiguousModes, UnstableLoop
-from models.servo import TUNINGS, Tuning, servo_matrices
+from models.servo import Tuning, servo_matrices
 from models.stages import (
     HOUSING,
     NOMINAL,
@@ -21,6 +22,7 @@ from models.stages import (
     Stage,
     build_structure,
     corners,
+    tuning_named,
 )
 from models.structure import Structure, displacement_rows, named_modes, rigid_translation
 
@@ -29,7 +31,7 @@ ComplexArray = NDArray[np.complex128]
 
 OUTPUTS = ("delta_e", "current", "acc_feed", "acc_pitch")
 SENSORS = ("delta_e", "acc_feed", "acc_pitch")
-INPUTS = (
+NOISE_INPUTS = (
     *(f"block{i}_{axis}" for i in range(1, 5) for axis in "xyz"),
     "ground_x",
     "ground_y",
@@ -37,6 +39,9 @@ INPUTS = (
     "motor_force",
     "encoder_error",
 )
+# What the motion controller knows beforehand.
+COMMAND_INPUTS = ("reference_acceleration", "feedforward_current")
+INPUTS = (*NOISE_INPUTS, *COMMAND_INPUTS)
 GUIDE_MODES = ("roll", "pitch", "yaw")
 
 # Continuation: largest step in the logarithm of a parameter, and the modal assurance below which
@@ -55,6 +60,11 @@ class LinearSystem:
     b: Array
     c: Array
     d: Array
+
+    def driven_by(self, inputs: Sequence[str]) -> LinearSystem:
+        """Return the system with some of its inputs only, in the given order."""
+        chosen = [INPUTS.index(name) for name in inputs]
+        return LinearSystem(self.a, self.b[:, chosen], self.c, self.d[:, chosen])
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,15 +126,16 @@ def closed_loop(
 ) -> LinearSystem:
     """Close the position loop around the flexible structure.
 
-    States are displacements relative to the ground, velocities, and the servo's; a steady
-    reference velocity drops out.
+    States are displacements, velocities and the servo's.  The platform's displacement counts from
+    its reference, the others' from the ground: of the reference only the acceleration then acts,
+    as an inertial force on the platform.
 
     Raises
     ------
     UnstableLoop
         If a pole of the loop does not decay.
     """
-    tuning = TUNINGS[stage.name] if tuning is None else tuning
+    tuning = tuning_named(stage.name, condition.servo_id) if tuning is None else tuning
     structure = build_structure(stage, condition)
     servo = servo_matrices(tuning)
     n, m = structure.size, servo.b.size
@@ -150,6 +161,10 @@ def closed_loop(
     b[n : 2 * n, 12:15] = -translation
     b[n : 2 * n, 15] = push
     b[2 * n :, 16] = -servo.b
+    carried = rigid_translation(structure)[:, 0].copy()
+    carried[: 6 * PLATFORM] = 0.0
+    b[n : 2 * n, 17] = -carried
+    b[2 * n :, 18] = servo.feedforward
 
     c = np.zeros((len(OUTPUTS), 2 * n + m))
     d = np.zeros((len(OUTPUTS), len(INPUTS)))
@@ -161,6 +176,7 @@ def closed_loop(
         d[row] = sensors[name] @ b[n : 2 * n]
         # Back from the ground's frame to absolute acceleration.
         d[row, 12:15] += sensors[name] @ translation
+        d[row, 17] += sensors[name] @ carried
     _refuse_unstable(stage.name, np.linalg.eigvals(a).astype(complex))
     return LinearSystem(a, b, c, d)
 
@@ -200,36 +216,47 @@ def _match(
     return columns, similar[rows, columns]
 
 
-@lru_cache(maxsize=16)
-def _nominal(stage: Stage) -> tuple[tuple[str, ...], ComplexArray, ComplexArray]:
-    """Return names, eigenvalues and shapes of the closed-loop modes when commissioned."""
+@lru_cache(maxsize=32)
+def _nominal(stage: Stage, servo_id: str) -> tuple[tuple[str, ...], ComplexArray, ComplexArray]:
+    """Return names, eigenvalues and shapes of the closed-loop modes of the new stage.
+
+    A tuning has no way along which it could be followed: names come from the structure without
+    its servo, whatever the tuning.
+    """
     structure = build_structure(stage)
     named = named_modes(structure)
-    values, shapes = _oscillations(stage, NOMINAL)
+    values, shapes = _oscillations(stage, Condition(servo_id=servo_id))
     known = (named.omega.astype(complex), named.shapes.astype(complex))
     columns, similar = _match(structure.mass, known, (values, shapes))
     if similar.min() < _LOST_ASSURANCE:
         lost = named.names[int(np.argmin(similar))]
-        raise AmbiguousModes(f"{stage.name}, nominal condition, {lost}", float(similar.min()))
+        where = f"{stage.name}, nominal condition, servo {servo_id}, {lost}"
+        raise AmbiguousModes(where, float(similar.min()))
     return named.names, values[columns], shapes[:, columns]
 
 
-def _between(first: Condition, second: Condition, part: float) -> Condition:
-    """Return the condition a part of the way along a straight line in the logarithms."""
-    return Condition(
-        first.guide_preload ** (1 - part) * second.guide_preload**part,
-        first.mount_stiffness ** (1 - part) * second.mount_stiffness**part,
-        first.temperature_c * (1 - part) + second.temperature_c * part,
+def _on_the_way(condition: Condition, part: float) -> Condition:
+    """Return the condition a part of the way from the nominal: stiffness and loss in logarithms."""
+    return replace(
+        condition,
+        guide_preload=condition.guide_preload**part,
+        mount_stiffness=condition.mount_stiffness**part,
+        temperature_c=NOMINAL.temperature_c * (1 - part) + condition.temperature_c * part,
+        added_payload=condition.added_payload * part,
+        guide_damping=condition.guide_damping**part,
     )
 
 
 def _distance(stage: Stage, condition: Condition) -> float:
-    """Return how far a condition is from the nominal, in the logarithm of stiffness."""
+    """Return how far a condition is from the nominal, in the logarithm of stiffness or mass."""
     warmer = condition.temperature_c - NOMINAL.temperature_c
+    moving = build_structure(stage, condition).bodies[PLATFORM].mass
     return max(
         abs(math.log(condition.guide_preload)) * stage.preload_exponent.value,
         abs(math.log(condition.mount_stiffness)),
         abs(warmer) * stage.temperature_softening.value,
+        abs(math.log(moving / stage.moving_mass.value)),
+        abs(math.log(condition.guide_damping)),
     )
 
 
@@ -246,13 +273,13 @@ def closed_loop_modes(stage: Stage, condition: Condition = NOMINAL) -> list[Mode
     UnstableLoop
         If the loop is unstable on the way.
     """
-    names, values, shapes = _nominal(stage)
+    names, values, shapes = _nominal(stage, condition.servo_id)
     mass = build_structure(stage).mass
     done = 0.0
     step = 1.0 / max(1, math.ceil(_distance(stage, condition) / _LARGEST_STEP))
     smallest = step / 2**_HALVINGS
     while done < 1.0:
-        target = condition if done + step >= 1.0 else _between(NOMINAL, condition, done + step)
+        target = condition if done + step >= 1.0 else _on_the_way(condition, done + step)
         found = _oscillations(stage, target)
         columns, similar = _match(mass, (values, shapes), found)
         if similar.min() < _TRUSTED_ASSURANCE and step > smallest:

@@ -9,20 +9,29 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from models.disturbance import ACCELEROMETER_DENSITY, MAINS, noise_levels, order_inputs
+from models.disturbance import (
+    ACCELEROMETER_DENSITY,
+    drawn_orders,
+    mains,
+    noise_corners,
+    noise_levels,
+)
 from models.errors import BadParameter
-from models.modal import diagonalise, frequency_response, sampled_spectrum, simulate
+from models.modal import Diagonal, diagonalise, frequency_response, sampled_spectrum, simulate
 from models.plant import (
     GUIDE_MODES,
+    NOISE_INPUTS,
     OUTPUTS,
     SENSORS,
     closed_loop,
     closed_loop_modes,
     sensor_rows,
 )
+from models.servo import TUNINGS
 from models.stages import NOMINAL, Condition, Stage, build_structure
 
 Array = NDArray[np.float64]
+ComplexArray = NDArray[np.complex128]
 
 SAMPLE_RATE_HZ = 20000.0
 DEFAULT_VELOCITY = 0.010
@@ -42,9 +51,9 @@ COLUMNS = (
 
 @dataclass(frozen=True, slots=True)
 class Recording:
-    """Columns as they are stored (float32, names carry the unit) and the file's metadata."""
+    """Columns as they are stored (names carry the unit) and the file's metadata."""
 
-    columns: Mapping[str, NDArray[np.float32]]
+    columns: Mapping[str, NDArray[np.floating]]
     metadata: Mapping[str, Any]
 
     def described(self, **metadata: Any) -> Recording:
@@ -73,21 +82,38 @@ def move_velocity(stage: Stage, seconds: float, wanted: float = DEFAULT_VELOCITY
     return velocity
 
 
-def _add_lines(
-    outputs: Array, stage: Stage, condition: Condition, velocity: float, rng: np.random.Generator
-) -> None:
-    """Add velocity orders (through the closed loop) and mains to outputs (output, time)."""
-    frequency, amplitudes = order_inputs(stage, velocity, rng)
-    # The drive's anti-alias filter removes what is above half the sample rate.
-    amplitudes[frequency >= SAMPLE_RATE_HZ / 2] = 0.0
+def shaken(stage: Stage, condition: Condition) -> Diagonal:
+    """Return the closed loop behind the low passes that shape its noise."""
+    system = closed_loop(stage, condition).driven_by(NOISE_INPUTS)
+    return diagonalise(system, noise_corners(stage))
+
+
+def _order_gains(
+    stage: Stage, condition: Condition, velocity: float, rng: np.random.Generator
+) -> tuple[Array, ComplexArray]:
+    """Return frequencies (line,) and complex outputs (output, line) of the velocity orders."""
+    cycles, inputs, amplitudes = drawn_orders(stage, rng)
+    frequency = cycles * abs(velocity)
     response = frequency_response(diagonalise(closed_loop(stage, condition)), frequency)
-    mains = np.zeros((len(OUTPUTS), len(MAINS)), dtype=complex)
-    for i, line in enumerate(MAINS):
+    gain = response[np.arange(frequency.size), :, inputs].T * amplitudes
+    # The drive's anti-alias filter removes what is above half the sample rate.
+    gain[:, frequency >= SAMPLE_RATE_HZ / 2] = 0.0
+    return frequency, gain
+
+
+def _mains_gains(stage: Stage, rng: np.random.Generator) -> tuple[Array, ComplexArray]:
+    """Return frequencies (line,) and complex outputs (output, line) of the mains."""
+    lines = mains(stage)
+    gain = np.zeros((len(OUTPUTS), len(lines)), dtype=complex)
+    for i, line in enumerate(lines):
         turned = np.exp(2j * np.pi * rng.random())
-        mains[OUTPUTS.index(line.output), i] = line.amplitude * turned
-    gain = np.hstack([np.einsum("foi,fi->of", response, amplitudes), mains])
-    hertz = np.concatenate([frequency, [line.frequency_hz for line in MAINS]])
-    turn = 2j * np.pi * hertz / SAMPLE_RATE_HZ
+        gain[OUTPUTS.index(line.output), i] = line.amplitude * turned
+    return np.array([line.frequency_hz for line in lines]), gain
+
+
+def _add_lines(outputs: Array, frequency_hz: Array, gain: ComplexArray) -> None:
+    """Add sinusoids of complex amplitudes (output, line) to outputs (output, time)."""
+    turn = 2j * np.pi * frequency_hz / SAMPLE_RATE_HZ
     # One block of all sinusoids, turned on from block to block: no transcendental per sample.
     block = min(outputs.shape[1], _LINE_BLOCK)
     waves = np.exp(turn[:, None] * np.arange(block))
@@ -97,6 +123,23 @@ def _add_lines(
         size = min(block, outputs.shape[1] - start)
         read = np.hstack([turned_gain.real, -turned_gain.imag])
         outputs[:, start : start + size] += read @ waves_stacked[:, :size]
+
+
+def sense(outputs: Array, stage: Stage, rng: np.random.Generator) -> None:
+    """Make of what happens (output, time) what the sensors write, in place.
+
+    Mains and noise are added to the accelerations, which end at the sensors' range; Δe is
+    rounded to encoder counts.
+    """
+    _add_lines(outputs, *_mains_gains(stage, rng))
+    noise = ACCELEROMETER_DENSITY * np.sqrt(SAMPLE_RATE_HZ / 2)
+    reach = stage.acc_range.value
+    for name in ("acc_feed", "acc_pitch"):
+        sensed = outputs[OUTPUTS.index(name)]
+        sensed += noise * rng.standard_normal(sensed.size)
+        np.clip(sensed, -reach, reach, out=sensed)
+    count = stage.encoder_count.value
+    outputs[0] = count * np.round(outputs[0] / count)
 
 
 def simulate_signals(
@@ -109,15 +152,13 @@ def simulate_signals(
 ) -> Array:
     """Return Δe (m), current (A) and two accelerations (m/s²) as sensed, (output, time)."""
     samples = round(seconds * SAMPLE_RATE_HZ)
-    std, corner = noise_levels(velocity, SAMPLE_RATE_HZ)
-    diagonal = diagonalise(closed_loop(stage, condition), corner)
+    std = noise_levels(stage, np.asarray(velocity), SAMPLE_RATE_HZ)
+    diagonal = shaken(stage, condition)
     outputs = simulate(diagonal, std, samples, sample_rate_hz=SAMPLE_RATE_HZ, rng=rng)
-    _add_lines(outputs, stage, condition, velocity, rng)
-    noise = ACCELEROMETER_DENSITY * np.sqrt(SAMPLE_RATE_HZ / 2)
-    for name in ("acc_feed", "acc_pitch"):
-        outputs[OUTPUTS.index(name)] += noise * rng.standard_normal(samples)
-    count = stage.encoder_count.value
-    outputs[0] = count * np.round(outputs[0] / count)
+    _add_lines(outputs, *_order_gains(stage, condition, velocity, rng))
+    # The ball guide's constant friction costs current; its slow integrator has long met it.
+    outputs[OUTPUTS.index("current")] += stage.friction.value / TUNINGS[stage.name].force_constant
+    sense(outputs, stage, rng)
     return outputs
 
 
@@ -142,18 +183,18 @@ def record(
     signals = simulate_signals(stage, condition, seconds=seconds, velocity=velocity, rng=rng)
     samples = signals.shape[1]
     time = (np.arange(samples) - (samples - 1) / 2) / SAMPLE_RATE_HZ
-    columns = (
-        signals[0] * 1e6,
-        signals[1],
-        signals[2],
-        signals[3],
-        velocity * time * 1e3,
-        np.full(samples, velocity * 1e3),
-    )
+    return to_recording(stage, condition, signals, velocity * time, np.full(samples, velocity))
+
+
+def to_recording(
+    stage: Stage, condition: Condition, signals: Array, position: Array, velocity: Array
+) -> Recording:
+    """Put sensed signals (output, time) and the reference (m, m/s) into the log's columns."""
+    columns = (signals[0] * 1e6, *signals[1:], position * 1e3, velocity * 1e3)
     metadata = {
         "sample_rate_hz": SAMPLE_RATE_HZ,
         "temperature_c": round(condition.temperature_c, 2),
-        "payload_kg": stage.payload.value,
+        "payload_kg": stage.payload.value + condition.added_payload,
         "position_mm": 0.0,
     }
     stored = {n: v.astype(np.float32) for n, v in zip(COLUMNS, columns, strict=True)}
@@ -168,8 +209,8 @@ def spectrum(
     velocity: float = DEFAULT_VELOCITY,
 ) -> Array:
     """Return one-sided densities (frequency, output) of the sensed signals between the lines."""
-    std, corner = noise_levels(velocity, SAMPLE_RATE_HZ)
-    diagonal = diagonalise(closed_loop(stage, condition), corner)
+    std = noise_levels(stage, np.asarray(velocity), SAMPLE_RATE_HZ)
+    diagonal = shaken(stage, condition)
     density = sampled_spectrum(diagonal, std, SAMPLE_RATE_HZ, frequency_hz)
     return density + _sensor_floor(stage)
 
@@ -190,8 +231,8 @@ def signal_to_noise(
     The mode's part of the response at its natural frequency over everything else there, except
     the other guide modes, which a joint fit takes out.
     """
-    std, corner = noise_levels(velocity, SAMPLE_RATE_HZ)
-    diagonal = diagonalise(closed_loop(stage, condition), corner)
+    std = noise_levels(stage, np.asarray(velocity), SAMPLE_RATE_HZ)
+    diagonal = shaken(stage, condition)
     structure = build_structure(stage, condition)
     rows = np.vstack(list(sensor_rows(stage, structure).values()))
     seen = rows @ diagonal.states[: structure.size]

@@ -29,13 +29,13 @@ FLOORS = [
 ]
 MODEL_FLOORS = [
     {"errors"},
-    {"structure", "servo"},
+    {"structure", "servo", "profile"},
     {"stages"},
-    {"plant"},
-    {"calibration", "mapping", "modal", "disturbance"},
+    {"plant", "equations"},
+    {"calibration", "mapping", "modal", "disturbance", "margins"},
     {"recording"},
-    {"formats", "degradation"},
-    {"lives"},
+    {"formats", "degradation", "sweep", "strokes", "faults"},
+    {"lives", "velocities"},
     {"__main__"},
 ]
 

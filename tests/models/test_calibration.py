@@ -9,14 +9,22 @@ from models.stages import STAGES
 
 
 def test_tables_are_met():
-    """Roll and pitch are within 0.1 Hz of Table 5, all other targets within 3 %."""
+    """Roll and pitch are within 0.1 Hz, the rest of Table 5 within 3 %, of Table 2 within 4 %."""
     misfits = dict(zip(TARGETS, target_misfits(dict(STAGES)), strict=True))
     for target, misfit in misfits.items():
         off = abs(np.expm1(misfit))
         if target.mode in ("roll", "pitch"):
             assert off * target.frequency_hz < 0.1, target
         else:
-            assert off < 0.03, target
+            assert off < (0.04 if target.source == "Table 2" else 0.03), target
+
+
+def test_free_numbers_stay_within_two_widths_of_their_priors():
+    """The tables are met with reasonable bodies and joints."""
+    for free in FREE:
+        for name in free.stages:
+            value = getattr(STAGES[name], free.field).value
+            assert abs(np.log(value / free.median)) < 2 * free.width, free
 
 
 def test_calibration_gives_the_stored_numbers():

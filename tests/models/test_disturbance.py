@@ -3,23 +3,71 @@
 import numpy as np
 import pytest
 
-from models.disturbance import noise_levels, order_inputs
-from models.plant import INPUTS
+from models.disturbance import (
+    FRICTION,
+    ROUGHNESS,
+    drawn_orders,
+    mains,
+    noise_corners,
+    noise_levels,
+    orders,
+)
+from models.plant import INPUTS, NOISE_INPUTS
 from models.stages import STAGES
+
+STAGE = STAGES["lms-y"]
 
 
 def test_noise_grows_with_velocity():
-    """Friction grows with the root of velocity, the ground does not care."""
-    slow, _ = noise_levels(0.010, 20000.0)
-    fast, _ = noise_levels(0.040, 20000.0)
-    ratio = dict(zip(INPUTS, fast / slow, strict=True))
-    assert ratio["block1_x"] == pytest.approx(2.0)
-    assert ratio["block4_z"] == pytest.approx(4**0.75)
+    """Friction and roughness follow their powers of velocity, the ground does not care."""
+    slow, fast = (noise_levels(STAGE, np.array(v), 20000.0) for v in (0.010, 0.040))
+    ratio = dict(zip(NOISE_INPUTS, fast / slow, strict=True))
+    assert ratio["block1_x"] == pytest.approx(4 ** FRICTION["lms-y"].power)
+    assert ratio["block4_z"] == pytest.approx(4**ROUGHNESS.power)
     assert ratio["ground_z"] == pytest.approx(1.0)
+
+
+def test_noise_follows_a_changing_velocity_sample_by_sample():
+    """Levels over time are the levels at each velocity, the same in both directions."""
+    velocity = np.array([0.0, 0.010, -0.010, 0.4])
+    over_time = noise_levels(STAGE, velocity, 20000.0)
+    for i, value in enumerate(velocity):
+        np.testing.assert_allclose(over_time[:, i], noise_levels(STAGE, value, 20000.0))
+
+
+def test_standstill_leaves_ground_and_electronics():
+    """Nothing that rolls or rubs is heard at standstill."""
+    level = dict(zip(NOISE_INPUTS, noise_levels(STAGE, np.array(0.0), 20000.0), strict=True))
+    silent = {name for name, value in level.items() if value == 0}
+    assert silent == {name for name in NOISE_INPUTS if name.startswith("block")}
+
+
+def test_a_density_becomes_the_standard_deviation_of_white_samples():
+    """White samples at rate fs with one-sided density d have variance d² fs / 2."""
+    level = dict(zip(NOISE_INPUTS, noise_levels(STAGE, np.array(0.010), 20000.0), strict=True))
+    assert level["block1_z"] ** 2 == pytest.approx(ROUGHNESS.density**2 * 10000.0)
+    assert noise_corners(STAGE).shape == (len(NOISE_INPUTS),)
 
 
 def test_orders_stand_at_velocity_over_wavelength():
     """At 10 mm/s the balls pass at 2.5 Hz and the encoder period at 500 Hz."""
-    frequency, amplitudes = order_inputs(STAGES["lms-y"], 0.010, np.random.default_rng(0))
-    assert {2.5, 500.0} <= set(np.round(frequency, 9))
-    assert amplitudes.shape == (frequency.size, len(INPUTS))
+    cycles, inputs, amplitudes = drawn_orders(STAGE, np.random.default_rng(0))
+    assert {2.5, 500.0} <= set(np.round(cycles * 0.010, 9))
+    assert cycles.shape == inputs.shape == amplitudes.shape
+    assert {INPUTS[i] for i in inputs} == {n for order in orders(STAGE) for n in order.inputs}
+
+
+def test_every_block_hears_the_balls_at_its_own_phase():
+    """Four blocks have four phases and one amplitude."""
+    cycles, inputs, amplitudes = drawn_orders(STAGE, np.random.default_rng(0))
+    at_blocks = np.array([INPUTS[i].startswith("block") for i in inputs])
+    ball = amplitudes[np.isclose(cycles, 250.0) & at_blocks]
+    assert np.unique(np.round(np.angle(ball), 6)).size == 4
+    np.testing.assert_allclose(np.abs(ball), np.abs(ball[0]))
+
+
+def test_mains_lines_are_multiples_of_fifty_hertz():
+    """Every line belongs to the mains and to an accelerometer."""
+    for stage in STAGES.values():
+        assert all(line.frequency_hz % 50 == 0 for line in mains(stage))
+        assert {line.output for line in mains(stage)} == {"acc_feed", "acc_pitch"}

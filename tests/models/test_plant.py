@@ -15,9 +15,17 @@ from models.plant import (
     participation,
     sensor_rows,
 )
-from models.servo import TUNINGS, servo_matrices
-from models.stages import HOUSING, PLATFORM, STAGES, Condition, build_structure
-from models.structure import displacement_rows
+from models.servo import TUNINGS, controller, current_loop, servo_matrices
+from models.stages import (
+    HOUSING,
+    PLATFORM,
+    STAGES,
+    Condition,
+    Number,
+    build_structure,
+    tuning_named,
+)
+from models.structure import displacement_rows, named_modes
 
 BOTH = sorted(STAGES)
 
@@ -75,13 +83,13 @@ def test_temperature_lowers_guide_modes():
 
 
 def test_guide_modes_are_lightly_damped():
-    """Guide modes of Y have 1.5 to 2 % damping, granite modes of both 3 to 7 %."""
+    """Guide modes of Y have 1.4 to 2 % damping, granite modes of both 4 to 10 %."""
     for name in BOTH:
         for mode in closed_loop_modes(STAGES[name]):
             if mode.name.startswith("granite"):
-                assert 0.03 < mode.damping_ratio < 0.07
+                assert 0.04 < mode.damping_ratio < 0.10
             elif mode.name in ("roll", "pitch", "yaw") and name == "lms-y":
-                assert 0.015 <= mode.damping_ratio < 0.02
+                assert 0.014 <= mode.damping_ratio < 0.02
 
 
 def test_identities_survive_a_crossing():
@@ -123,3 +131,89 @@ def test_unstable_loop_is_refused():
     with pytest.raises(UnstableLoop, match="lms-x") as caught:
         closed_loop(STAGES["lms-x"], tuning=tuning)
     assert caught.value.growth_per_s > 0
+
+
+# Standard deviation of the drift of pitch (ln f) that a tracker reaches over 40 logs of 20 s.
+TRACKER_STD = {"lms-x": 1.1e-3, "lms-y": 1.5e-3}
+SERVO_IDS = ("commissioning", "retuned")
+
+
+@pytest.mark.parametrize("name", BOTH)
+def test_retuning_moves_pitch_more_than_a_tracker_wanders(name):
+    """Retuning moves closed-loop pitch by three of its sigmas at least, roll by a tenth at most."""
+    old, new = (frequencies(STAGES[name], 1.0, 1.0, 21.0, 0.0, 1.0, servo) for servo in SERVO_IDS)
+    assert abs(np.log(new["pitch"] / old["pitch"])) > 3 * TRACKER_STD[name]
+    assert abs(np.log(new["roll"] / old["roll"])) < 0.1 * TRACKER_STD[name]
+
+
+@pytest.mark.parametrize("name", BOTH)
+@pytest.mark.parametrize("rigid", [True, False])
+def test_retuned_loop_keeps_its_margins(name, rigid):
+    """Every crossover keeps 6 dB and 30 degrees, around a rigid platform and the flexible one."""
+    stage, tuning = STAGES[name], tuning_named(name, "retuned")
+    hertz = np.geomspace(0.05, 8000.0, 8001)
+    s = 2j * np.pi * hertz
+    gain = controller(tuning)(s, squeeze=True) * current_loop(tuning)(s, squeeze=True)
+    if rigid:
+        plant = 1 / (stage.moving_mass.value * s**2)
+    else:
+        structure = build_structure(stage)
+        point, encoder = stage.motor_point.value, sensor_rows(stage, structure)["delta_e"]
+        push, held = (displacement_rows(structure.bodies, b, point)[0] for b in (PLATFORM, HOUSING))
+        dynamic = (
+            structure.mass * s[:, None, None] ** 2
+            + structure.damping * s[:, None, None]
+            + structure.stiffness
+        )
+        forces = np.broadcast_to((push - held)[:, None], (s.size, structure.size, 1))
+        plant = np.linalg.solve(dynamic, forces)[..., 0] @ encoder
+    loop = tuning.force_constant * gain * plant
+    crossed = np.flatnonzero(np.diff(np.abs(loop) > 1))
+    assert crossed.size >= 1
+    assert np.abs(np.degrees(np.angle(-loop[crossed]))).min() >= 30.0
+    real = np.flatnonzero(np.diff(loop.imag > 0) & (loop.real[:-1] < 0))
+    assert real.size >= 2
+    assert np.abs(20 * np.log10(np.abs(loop[real]))).min() >= 6.0
+
+
+@pytest.mark.parametrize("name", BOTH)
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"servo_id": "retuned"},
+        {"added_payload": 3.0},
+        {"added_payload": -2.0},
+        {"guide_damping": 1.5},
+        {"guide_preload": 0.5, "mount_stiffness": 0.8, "servo_id": "retuned"},
+    ],
+)
+def test_names_agree_with_the_structure_of_the_condition(name, change):
+    """Names followed from the nominal are those that the energies of the damaged structure give."""
+    stage, condition = STAGES[name], Condition(**change)
+    named = named_modes(build_structure(stage, condition))
+    undamped = dict(zip(named.names, named.omega / (2 * np.pi), strict=True))
+    for mode in closed_loop_modes(stage, condition):
+        assert abs(np.log(mode.frequency_hz / undamped[mode.name])) < 0.03
+
+
+def test_payload_lowers_every_mode_of_the_platform():
+    """Three kilograms more lower roll, pitch and yaw of both stages by 1 to 10 %."""
+    for name in BOTH:
+        bare, loaded = (frequencies(STAGES[name], 1.0, 1.0, 21.0, kg) for kg in (0.0, 3.0))
+        for mode in ("roll", "pitch", "yaw"):
+            assert 0.01 < np.log(bare[mode] / loaded[mode]) < 0.10
+
+
+@pytest.mark.parametrize(
+    ("name", "field", "factor"),
+    [("lms-x", "block_stiffness", 1e-3), ("lms-y", "mount_stiffness", 1e-5)],
+)
+def test_stiffness_that_the_loop_cannot_hold_is_refused(name, field, factor):
+    """Guide or mount so soft that the loop grows are named unstable, with the pole."""
+    soft = Number(factor * getattr(STAGES[name], field).value, "N/m", "our choice")
+    stage = replace(STAGES[name], **{field: soft})
+    with pytest.raises(UnstableLoop, match=f"{name}.*unstable") as caught:
+        closed_loop(stage)
+    assert caught.value.growth_per_s > 0
+    with pytest.raises(UnstableLoop):
+        closed_loop_modes(stage)

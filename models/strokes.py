@@ -1,0 +1,125 @@
+"""Recordings of strokes with their transients: acceleration, braking, dwell, there and back.
+
+Table 3 of the paper jumps by six to nine between 20 and 100 mm/s, where no law of friction does:
+its records are taken as windows of one fixed length about the middle of a full stroke.  A slow
+stroke fills the window with constant velocity; a fast one fits into it with its transients.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from models.disturbance import drawn_orders, noise_levels
+from models.errors import BadParameter
+from models.modal import diagonalise, propagate, stationary_state
+from models.plant import INPUTS, closed_loop
+from models.profile import Profile
+from models.recording import SAMPLE_RATE_HZ, Recording, sense, shaken, to_recording
+from models.servo import TUNINGS
+from models.stages import NOMINAL, Condition, Stage
+
+Array = NDArray[np.float64]
+
+# The paper's set velocities, m/s.
+VELOCITIES = (0.001, 0.005, 0.010, 0.020, 0.100, 0.200, 0.400)
+# All but the room that braking needs, of the 300 mm of travel.
+STROKE = 0.280
+WINDOW_S = 4.0
+# Friction turns round within this velocity, m/s (our choice).
+_TURNING = 5e-4
+_CHUNK = 1 << 15
+
+
+def full_stroke(stage: Stage, velocity: float) -> Profile:
+    """Return one full stroke at a set velocity (m/s)."""
+    return Profile(velocity, min(STROKE, 0.95 * stage.travel.value))
+
+
+def commands(stage: Stage, reference: Array) -> Array:
+    """Return what the move itself puts into the stage's inputs, (input, time).
+
+    The reference's acceleration, the controller's feedforward of mass and friction, and the
+    friction itself.  The feedforward leads by part of the current loop's lag.
+
+    Parameters
+    ----------
+    reference : (4, time)
+        Position, velocity, acceleration, jerk, SI.
+    """
+    _, velocity, acceleration, jerk = reference
+    led = acceleration + stage.feedforward_lead.value * jerk
+    friction = stage.friction.value * np.tanh(velocity / _TURNING)
+    wanted = stage.moving_mass.value * led + stage.friction_compensation.value * friction
+    inputs = np.zeros((len(INPUTS), velocity.size))
+    blocks = [i for i, n in enumerate(INPUTS) if n.startswith("block") and n.endswith("x")]
+    inputs[blocks] = -friction / len(blocks)
+    inputs[INPUTS.index("reference_acceleration")] = acceleration
+    inputs[INPUTS.index("feedforward_current")] = wanted / TUNINGS[stage.name].force_constant
+    return inputs
+
+
+def _add_orders(inputs: Array, stage: Stage, reference: Array, rng: np.random.Generator) -> None:
+    """Add the kinematic orders, which follow the position, to inputs (input, time)."""
+    position, velocity = reference[:2]
+    moving = np.tanh(np.abs(velocity) / _TURNING)
+    for cycles, index, amplitude in zip(*drawn_orders(stage, rng), strict=True):
+        # The drive's anti-alias filter removes what is above half the sample rate.
+        heard = moving * (cycles * np.abs(velocity) < SAMPLE_RATE_HZ / 2)
+        inputs[index] += heard * (amplitude * np.exp(2j * np.pi * cycles * position)).real
+
+
+def _noise_outputs(
+    stage: Stage, condition: Condition, velocity: Array, rng: np.random.Generator
+) -> Array:
+    """Return the outputs (output, time) of noise that grows and falls with the velocity."""
+    diagonal = shaken(stage, condition)
+    state = stationary_state(
+        diagonal, noise_levels(stage, velocity[0], SAMPLE_RATE_HZ), SAMPLE_RATE_HZ, rng
+    )
+    outputs = np.empty((diagonal.c.shape[0], velocity.size))
+    for start in range(0, velocity.size, _CHUNK):
+        part = slice(start, start + _CHUNK)
+        level = noise_levels(stage, velocity[part], SAMPLE_RATE_HZ)
+        white = rng.standard_normal(level.shape) * level
+        outputs[:, part], state = propagate(diagonal, state, white, SAMPLE_RATE_HZ)
+    return outputs
+
+
+def record_strokes(
+    stage: Stage,
+    condition: Condition = NOMINAL,
+    *,
+    profile: Profile,
+    seconds: float = WINDOW_S,
+    rng: np.random.Generator,
+) -> Recording:
+    """Record a window about the middle of a move.
+
+    Parameters
+    ----------
+    profile
+        Its last dwell does not count when the middle is found.
+    seconds
+        Length of the window, s; what is longer than the move shows standstill at both ends.
+
+    Raises
+    ------
+    BadParameter
+        If the window holds no sample, or the profile leaves the travel.
+    """
+    if not round(seconds * SAMPLE_RATE_HZ) > 0:
+        raise BadParameter("seconds", seconds, "at least one sample")
+    if profile.stroke > stage.travel.value:
+        raise BadParameter("stroke", f"{profile.stroke} m", f"at most {stage.travel.value} m")
+    time = np.arange(round(seconds * SAMPLE_RATE_HZ)) / SAMPLE_RATE_HZ
+    reference = profile.sampled(time + (profile.seconds - profile.dwell - seconds) / 2)
+    inputs = commands(stage, reference)
+    direct = diagonalise(closed_loop(stage, condition))
+    # What was commanded long enough has settled before the window opens.
+    settled = -(direct.b @ inputs[:, 0]) / direct.poles
+    _add_orders(inputs, stage, reference, rng)
+    outputs, _ = propagate(direct, settled, inputs, SAMPLE_RATE_HZ)
+    outputs += _noise_outputs(stage, condition, reference[1], rng)
+    sense(outputs, stage, rng)
+    return to_recording(stage, condition, outputs, reference[0], reference[1])

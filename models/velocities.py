@@ -1,0 +1,87 @@
+"""The paper's experiment: one log per set velocity from 1 to 400 mm/s."""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+from models.formats import file_suffix, write_log
+from models.profile import Profile
+from models.stages import NOMINAL, Condition, Stage
+from models.strokes import VELOCITIES, WINDOW_S, full_stroke, record_strokes
+
+_START = datetime(2026, 3, 2, 8, 0, tzinfo=UTC)
+_EVERY = timedelta(minutes=2)
+
+
+@dataclass(frozen=True, slots=True)
+class Experiment:
+    """What to drive: stage, condition, strokes of each move, seconds of each window, seed."""
+
+    stage: Stage
+    condition: Condition = NOMINAL
+    strokes: int = 1
+    seconds: float = WINDOW_S
+    seed: int = 0
+
+    @property
+    def identity(self) -> str:
+        """Identity of the machine that the seed makes."""
+        return f"LMS-{self.seed}-{self.stage.identity_suffix}"
+
+    def move(self, velocity: float) -> Profile:
+        """Return the move at a set velocity (m/s)."""
+        return replace(full_stroke(self.stage, velocity), strokes=self.strokes)
+
+    def rng(self, velocity: float) -> np.random.Generator:
+        """Return the generator of one move: independent of which others are driven."""
+        words = [self.seed, zlib.crc32(f"{self.stage.name}/velocities".encode())]
+        return np.random.default_rng(np.random.SeedSequence([*words, round(velocity * 1e6)]))
+
+
+def drive_velocities(
+    experiment: Experiment,
+    folder: Path,
+    file_format: str,
+    *,
+    velocities: tuple[float, ...] = VELOCITIES,
+    progress: Callable[[int], None] | None = None,
+) -> None:
+    """Write one log per velocity (m/s) and the manifest of all.
+
+    Parameters
+    ----------
+    progress
+        Called with 1 after each log.
+    """
+    suffix = file_suffix(file_format)
+    moves = [experiment.move(velocity) for velocity in velocities]
+    folder.mkdir(parents=True, exist_ok=True)
+    rows, travel_km = [], 0.0
+    for i, move in enumerate(moves):
+        recording = record_strokes(
+            experiment.stage,
+            experiment.condition,
+            profile=move,
+            seconds=experiment.seconds,
+            rng=experiment.rng(move.velocity),
+        )
+        travel_km += move.strokes * move.stroke * 1e-3
+        row = {
+            "stage": experiment.identity,
+            "recorded_at": (_START + i * _EVERY).isoformat(),
+            "travel_km": round(travel_km, 6),
+            "velocity_mm_s": round(move.velocity * 1e3, 6),
+        }
+        name = f"velocity-{row['velocity_mm_s']:08.3f}{suffix}"
+        write_log(recording.described(**row), folder / name, file_format)
+        rows.append({"file": name, **row, "temperature_c": experiment.condition.temperature_c})
+        if progress is not None:
+            progress(1)
+    pd.DataFrame(rows).to_csv(folder / "manifest.csv", index=False)
