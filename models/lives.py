@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import zlib
 from collections.abc import Callable, Iterator
@@ -15,12 +16,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from models.degradation import (
-    GUIDE_PRELOAD_LIMIT,
-    MOUNT_STIFFNESS_LIMIT,
-    Life,
-    life_named,
-)
+from models.degradation import Life, life_named
 from models.errors import BadParameter
 from models.formats import file_suffix, write_log
 from models.plant import GUIDE_MODES, closed_loop_modes
@@ -30,13 +26,20 @@ from models.stages import Condition, Stage, stage_named
 _START = datetime(2026, 3, 2, 8, 0, tzinfo=UTC)
 _KM_PER_DAY = 12.0
 _NOW_KM = (1400.0, 2000.0)
+# A life that is followed to its failure goes on for this part of it.
+_PAST_FAILURE = 0.15
+UNTIL = ("now", "failure")
 _MAINTENANCE = ["stage", "recorded_at", "travel_km", "action"]
 _THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
 
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """What to simulate: stage and life by name, count of logs, seconds of each, seed."""
+    """What to simulate: stage and life by name, count of logs, seconds of each, seed.
+
+    ``until`` says where the last log stands: ``now``, at an odometer that does not depend on the
+    life, or past its ``failure``.
+    """
 
     stage: str
     life: str
@@ -44,6 +47,7 @@ class Plan:
     seconds: float
     seed: int
     file_format: str = "hdf5"
+    until: str = "now"
 
     def __post_init__(self) -> None:
         """Refuse impossible plans before any file is written."""
@@ -52,8 +56,11 @@ class Plan:
         if self.seed < 0:
             raise BadParameter("seed", self.seed, "0 or more")
         move_velocity(stage_named(self.stage), self.seconds)
-        self.draw_life()
         file_suffix(self.file_format)
+        if self.until not in UNTIL:
+            raise BadParameter("until", self.until, " or ".join(UNTIL))
+        if self.draw_life().failure_km() is None and self.until == "failure":
+            raise BadParameter("until", self.until, f"now, as {self.life} crosses no limit")
 
     def rng(self, step: str, log: int = 0) -> np.random.Generator:
         """Return the generator of one step of one log: independent of all others."""
@@ -63,6 +70,13 @@ class Plan:
     def draw_life(self) -> Life:
         """Return the life with the laws of this seed."""
         return life_named(self.life, self.rng("laws"))
+
+    def end_km(self, now_km: float) -> float:
+        """Return the odometer (km) of the last log, given that of the present."""
+        failure = self.draw_life().failure_km()
+        if self.until == "now" or failure is None:
+            return now_km
+        return failure * (1.0 + _PAST_FAILURE)
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,16 +94,16 @@ class Visit:
 def schedule(plan: Plan) -> list[Visit]:
     """Return the logs of a life, oldest first.
 
-    The odometer of the last log does not depend on the life: how far a stage has run says
-    nothing about its damage.
+    Until now, the odometer of the last log does not depend on the life: how far a stage has run
+    says nothing about its damage.
     """
     rng = plan.rng("schedule")
-    now_km = float(rng.uniform(*_NOW_KM))
+    end_km = plan.end_km(float(rng.uniform(*_NOW_KM)))
     share = (np.arange(plan.logs) + 0.3 * rng.uniform(-1, 1, plan.logs)) / max(plan.logs - 1, 1)
-    travel = now_km * np.clip(share, 0.0, 1.0)
-    travel[0] = now_km * 0.001
+    travel = end_km * np.clip(share, 0.0, 1.0)
+    travel[0] = end_km * 0.001
     if plan.logs > 1:
-        travel[-1] = now_km
+        travel[-1] = end_km
     # Daily use varies; a long gap averages it out.
     gaps = np.diff(travel, prepend=0.0) / _KM_PER_DAY
     days = np.cumsum(gaps * np.exp(0.1 * rng.standard_normal(plan.logs)))
@@ -103,7 +117,7 @@ def schedule(plan: Plan) -> list[Visit]:
         moment = (_START + timedelta(days=float(moments[i]))).replace(microsecond=0)
         km = round(float(travel[i]), 3)
         temperature = round(life.climate.at(moment, plan.rng("temperature", i)), 2)
-        condition = Condition(life.preload.at(km), life.mount.at(km), temperature)
+        condition = life.condition(km, temperature)
         visits.append(Visit(i, f"log-{i + 1:04d}{suffix}", identity, moment, km, condition))
     return visits
 
@@ -118,24 +132,34 @@ def _simulate_log(plan: Plan, visit: Visit, folder: Path) -> dict[str, object]:
         stage=visit.identity,
         recorded_at=visit.recorded_at.isoformat(),
         travel_km=visit.travel_km,
-        servo_id="commissioning",
+        servo_id=visit.condition.servo_id,
     )
     write_log(recording, folder / visit.file, plan.file_format)
     return truth_row(stage, visit)
 
 
+def payload_kg(stage: Stage, condition: Condition) -> float:
+    """Return what the platform carries, kg, to the gram."""
+    return round(stage.payload.value + condition.added_payload, 3)
+
+
 def truth_row(stage: Stage, visit: Visit) -> dict[str, object]:
-    """Return what was really so at a log: parameters, closed-loop frequencies and damping."""
+    """Return what was really so at a log: its condition and every closed-loop mode."""
+    condition = visit.condition
     row: dict[str, object] = {
         "file": visit.file,
         "recorded_at": visit.recorded_at.isoformat(),
         "travel_km": visit.travel_km,
-        "temperature_c": visit.condition.temperature_c,
-        "guide_preload": visit.condition.guide_preload,
-        "mount_stiffness": visit.condition.mount_stiffness,
+        "temperature_c": condition.temperature_c,
+        "guide_preload": condition.guide_preload,
+        "mount_stiffness": condition.mount_stiffness,
+        "payload_kg": payload_kg(stage, condition),
+        "servo_id": condition.servo_id,
+        "guide_damping_factor": condition.guide_damping,
     }
-    modes = {mode.name: mode for mode in closed_loop_modes(stage, visit.condition)}
-    for name in GUIDE_MODES:
+    modes = {mode.name: mode for mode in closed_loop_modes(stage, condition)}
+    # One order in all rows and files: by frequency it would change where modes cross.
+    for name in (*GUIDE_MODES, *sorted(modes.keys() - set(GUIDE_MODES))):
         row[f"{name}_hz"] = modes[name].frequency_hz
         row[f"{name}_damping"] = modes[name].damping_ratio
     return row
@@ -194,14 +218,29 @@ def simulate_life(
             progress(1)
     life = plan.draw_life()
     truth = pd.DataFrame(rows)
-    truth["guide_preload_limit_km"] = life.preload.reaches_km(GUIDE_PRELOAD_LIMIT)
-    truth["mount_stiffness_limit_km"] = life.mount.reaches_km(MOUNT_STIFFNESS_LIMIT)
+    for name, limit_km in life.limits_km().items():
+        truth[f"{name}_limit_km"] = limit_km
+    truth["failure_km"] = life.failure_km()
     truth.to_csv(folder / "truth.csv", index=False)
-    _manifest(visits).to_csv(folder / "manifest.csv", index=False)
-    pd.DataFrame(columns=_MAINTENANCE).to_csv(folder / "maintenance.csv", index=False)
+    _manifest(stage_named(plan.stage), visits).to_csv(folder / "manifest.csv", index=False)
+    _maintenance(life, visits).to_csv(folder / "maintenance.csv", index=False)
 
 
-def _manifest(visits: list[Visit]) -> pd.DataFrame:
+def _maintenance(life: Life, visits: list[Visit]) -> pd.DataFrame:
+    """Return what was done up to the last log, each at the moment that its odometer was reached."""
+    travel = [visit.travel_km for visit in visits]
+    moments = [visit.recorded_at.timestamp() for visit in visits]
+    rows = []
+    for work in life.work:
+        if work.travel_km <= travel[-1]:
+            # Whole seconds, rounded up: never before a log that did not see it.
+            moment = math.ceil(float(np.interp(work.travel_km, travel, moments)))
+            when = datetime.fromtimestamp(moment, UTC).isoformat()
+            rows.append((visits[0].identity, when, work.travel_km, work.action))
+    return pd.DataFrame(rows, columns=_MAINTENANCE)
+
+
+def _manifest(stage: Stage, visits: list[Visit]) -> pd.DataFrame:
     """Return the manifest: what is known of each log without opening it."""
     return pd.DataFrame(
         [
@@ -211,7 +250,8 @@ def _manifest(visits: list[Visit]) -> pd.DataFrame:
                 "recorded_at": visit.recorded_at.isoformat(),
                 "travel_km": visit.travel_km,
                 "temperature_c": visit.condition.temperature_c,
-                "servo_id": "commissioning",
+                "payload_kg": payload_kg(stage, visit.condition),
+                "servo_id": visit.condition.servo_id,
             }
             for visit in visits
         ]

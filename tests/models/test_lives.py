@@ -27,6 +27,15 @@ KEYS = {
 }
 
 
+def assert_modes(row, stage, condition):
+    """Assert that a row of the truth has every closed-loop mode of a condition, and no other."""
+    modes = {m.name: m for m in closed_loop_modes(stage, condition)}
+    assert {key[:-3] for key in row if key.endswith("_hz")} == set(modes)
+    for name, mode in modes.items():
+        assert row[f"{name}_hz"] == pytest.approx(mode.frequency_hz, rel=1e-9)
+        assert row[f"{name}_damping"] == pytest.approx(mode.damping_ratio, rel=1e-7)
+
+
 @pytest.fixture(scope="module")
 def life(tmp_path_factory):
     """Return the folder of a life of three short HDF5 logs."""
@@ -54,15 +63,14 @@ def test_truth_is_what_the_plant_says(life):
     truth = pd.read_csv(life / "truth.csv")
     for row in truth.to_dict("records"):
         condition = Condition(row["guide_preload"], row["mount_stiffness"], row["temperature_c"])
-        modes = {m.name: m for m in closed_loop_modes(STAGES["lms-y"], condition)}
-        for name in ("roll", "pitch", "yaw"):
-            assert row[f"{name}_hz"] == pytest.approx(modes[name].frequency_hz, rel=1e-9)
-            assert row[f"{name}_damping"] == pytest.approx(modes[name].damping_ratio, rel=1e-7)
+        assert_modes(row, STAGES["lms-y"], condition)
 
 
 def test_limits_in_truth(life):
-    """Both limits of a life with both causes are finite and the same in every row."""
+    """Both limits of a life with both causes are finite, the first of them is its failure."""
     truth = pd.read_csv(life / "truth.csv")
+    limits = truth[["guide_preload_limit_km", "mount_stiffness_limit_km"]]
+    assert (truth["failure_km"] == limits.min(axis=1)).all()
     for column in ("guide_preload_limit_km", "mount_stiffness_limit_km"):
         assert truth[column].nunique() == 1
         assert truth[column].iloc[0] > 100
@@ -141,9 +149,87 @@ def test_healthy_life_stays_new():
         (BadParameter, ("lms-y", "both", 0, 1.0, 0)),
         (BadParameter, ("lms-y", "both", 1, -1.0, 0)),
         (BadParameter, ("lms-y", "both", 1, 1.0, -1)),
+        (BadParameter, ("lms-y", "both", 1, 1.0, 0, "csv", "tomorrow")),
+        (BadParameter, ("lms-y", "servo-retuning", 1, 1.0, 0, "csv", "failure")),
     ],
 )
 def test_impossible_plan_is_refused(error, arguments):
     """A plan that cannot be simulated raises before a file is written."""
     with pytest.raises(error):
         Plan(*arguments)
+
+
+STEPS = {"regreasing": "regrease", "servo-retuning": "servo"}
+
+
+@pytest.mark.parametrize("name", sorted(LIVES))
+def test_every_life_is_written_with_its_truth(tmp_path, name):
+    """Truth is the modes of its condition; logs, manifest and maintenance say the same of it."""
+    simulate_life(Plan("lms-y", name, 3, 2.0, 6), tmp_path)
+    truth = pd.read_csv(tmp_path / "truth.csv")
+    manifest = pd.read_csv(tmp_path / "manifest.csv")
+    stage = STAGES["lms-y"]
+    for row in truth.to_dict("records"):
+        condition = Condition(
+            guide_preload=row["guide_preload"],
+            mount_stiffness=row["mount_stiffness"],
+            temperature_c=row["temperature_c"],
+            added_payload=row["payload_kg"] - stage.payload.value,
+            guide_damping=row["guide_damping_factor"],
+            servo_id=row["servo_id"],
+        )
+        assert_modes(row, stage, condition)
+        with h5py.File(tmp_path / row["file"]) as file:
+            for key in ("payload_kg", "servo_id", "temperature_c", "travel_km", "recorded_at"):
+                assert file.attrs[key] == row[key]
+    shared = [c for c in manifest.columns if c in truth.columns]
+    assert {"file", "payload_kg", "servo_id"} <= set(shared)
+    pd.testing.assert_frame_equal(manifest[shared], truth[shared])
+    damaged = name in ("preload-wear", "mount-loosening", "both", "crash", "sudden-loosening")
+    assert truth["failure_km"].notna().all() == damaged
+    assert truth["failure_km"].isna().all() != damaged
+    check_maintenance(pd.read_csv(tmp_path / "maintenance.csv"), truth, name)
+
+
+def check_maintenance(work, truth, name):
+    """Assert that maintenance has the life's one action, between the logs that it parts."""
+    assert list(work["action"]) == ([STEPS[name]] if name in STEPS else [])
+    for row in work.to_dict("records"):
+        earlier = truth["travel_km"] < row["travel_km"]
+        assert 0 < earlier.sum() < len(truth)
+        assert truth["recorded_at"][earlier].max() < row["recorded_at"]
+        assert truth["recorded_at"][~earlier].min() >= row["recorded_at"]
+        if name == "servo-retuning":
+            assert set(truth["servo_id"][earlier]) == {"commissioning"}
+            assert set(truth["servo_id"][~earlier]) == {"retuned"}
+
+
+def test_conditions_reach_the_workers(tmp_path):
+    """The tuning is the same whether a log is made here or in another process."""
+    plan = Plan("lms-x", "servo-retuning", 3, 0.5, 2)
+    folders = [tmp_path / str(workers) for workers in (1, 2)]
+    for workers, folder in zip((1, 2), folders, strict=True):
+        simulate_life(plan, folder, workers=workers)
+    for path in folders[0].iterdir():
+        assert path.read_bytes() == (folders[1] / path.name).read_bytes()
+
+
+@pytest.mark.parametrize("name", ["preload-wear", "mount-loosening", "both", "crash"])
+def test_a_life_followed_to_its_failure_passes_it(name):
+    """The laws are those of the life until now; the last logs are past the first limit crossed."""
+    now, whole = (Plan("lms-y", name, 40, 1.0, 8, until=until) for until in ("now", "failure"))
+    assert whole.draw_life() == now.draw_life()
+    failure = whole.draw_life().failure_km()
+    passed = [
+        v.condition.guide_preload <= 0.6 or v.condition.mount_stiffness <= 0.7
+        for v in schedule(whole)
+    ]
+    assert passed == [v.travel_km >= failure for v in schedule(whole)]
+    assert passed[-1] and not passed[0]
+    assert schedule(now)[-1].travel_km <= 2000
+
+
+def test_work_still_to_come_is_not_in_maintenance(tmp_path):
+    """A life of one log has not been retuned yet."""
+    simulate_life(Plan("lms-y", "servo-retuning", 1, 0.2, 0), tmp_path)
+    assert (tmp_path / "maintenance.csv").read_text() == "stage,recorded_at,travel_km,action\n"
