@@ -147,6 +147,7 @@ def fit_band(
         n = sum(int(mask.sum()) for mask in masks)
         detail = f"{n} Fourier frequencies in the band, needed {10 + 6 * len(seen)}: record longer"
         return None, missing | {t.name: ("too-short", detail) for t in seen}
+    _mask_towers(spectra, masks, coarse)
     width = min(2 * t.frequency * t.damping_ratio for t in seen)
     rounds = 0
     while True:
@@ -264,6 +265,20 @@ def _solve(coarse: Coarse, blocks: tuple[Block, ...], targets: tuple[Target, ...
     )
     p = likelihood.minimise(start)
     return _Solution(likelihood, p, likelihood.data_value(p))
+
+
+def _mask_towers(spectra: tuple[Spectrum, ...], masks: list[BoolArray], coarse: Coarse) -> None:
+    """Mask lines that tower over the medians around them, before a mode can settle on one.
+
+    A mode that takes a strong line for its resonance leaves its own to its neighbour, which then
+    bears the wrong name. Twice the threshold leaves room for what the bins do not resolve.
+    """
+    threshold = 2 * np.log(sum(int(mask.sum()) for mask in masks) / _LINE_FALSE_ALARM)
+    for spectrum, mask in zip(spectra, masks, strict=True):
+        level = np.interp(spectrum.frequency, coarse.frequency, coarse.level)
+        towers = np.flatnonzero(spectrum.periodogram > threshold * level)
+        for k in towers.tolist():
+            mask[max(0, k - _LINE_BINS) : k + _LINE_BINS + 1] = False
 
 
 def _mask_lines(spectra: tuple[Spectrum, ...], masks: list[BoolArray], solution: _Solution) -> bool:

@@ -5,29 +5,40 @@ from __future__ import annotations
 import json
 import os
 import sys
+import zlib
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import click
+import numpy as np
 from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 
+from models.degradation import LIVES
 from models.errors import ModelError
-from models.formats import WRITERS
-from models.lives import Plan, simulate_life
+from models.faults import FAULTS
+from models.formats import WRITERS, write_log
+from models.lives import UNTIL, Plan, simulate_life
 from models.mapping import modal_map
+from models.margins import GAIN_MARGIN_DB, PHASE_MARGIN_DEG, TABLE_1, cases, margin_record
 from models.plant import SENSORS, closed_loop_modes, participation
 from models.stages import NOMINAL, Condition, stage_named
+from models.strokes import VELOCITIES, WINDOW_S
+from models.sweep import Sweep, record_sweep
+from models.velocities import Experiment, drive_velocities
 
 _TABLE_WIDTH = 100
 _EXAMPLES = {
     "modes": "python -m models modes lms-y --preload 0.8 --format json",
     "map": "python -m models map lms-y --out lms-y.map.csv",
+    "margins": "python -m models margins lms-x --format json",
     "simulate": (
         "python -m models simulate lms-y --life both --logs 60 --seconds 20 --seed 1 --out life"
     ),
+    "velocities": "python -m models velocities lms-y --out velocities",
+    "sweep": "python -m models sweep lms-y --amplitude 0.1 --seconds 20 --out sweep.h5",
 }
 
 
@@ -94,6 +105,79 @@ def modes(stage: str, preload: float, mount: float, temperature: float, file_for
     Console(width=max(console.width, _TABLE_WIDTH)).print(table)
 
 
+def _loop_table(loops: list[dict[str, Any]]) -> Table:
+    """Return one row per loop: stability, peak sensitivity, verdict."""
+    table = Table("reading", "structure", "equations", "growth 1/s", "peak |S|", "at Hz", "verdict")
+    for loop in loops:
+        table.add_row(
+            *(loop[name] for name in ("reading", "structure", "equations")),
+            f"{loop['growth_per_s']:.2f}",
+            f"{loop['peak_sensitivity']:.3f}",
+            f"{loop['peak_sensitivity_hz']:.4g}",
+            loop["verdict"],
+        )
+    return table
+
+
+def _crossover_table(loops: list[dict[str, Any]]) -> Table:
+    """Return one row per crossover of each loop; a star marks the smallest margin of its kind."""
+    judged = {None: "", True: "enough", False: "too small"}
+    table = Table("loop", "crossover", "Hz", "margin", "near mode", "judged")
+    for loop in loops:
+        name = f"{loop['reading']}, {loop['structure']}, {loop['equations']}"
+        for row in loop["crossovers"]:
+            phase, gain = row["phase_margin_deg"], row["gain_margin_db"]
+            table.add_row(
+                name,
+                row["crossover"].replace(" crossover", ""),
+                f"{row['frequency_hz']:.4g}",
+                f"{gain:.1f} dB" if phase is None else f"{phase:.1f}°",
+                row["near"] or "",
+                judged[row["enough"]] + " *" * row["decides"],
+            )
+            name = ""
+        table.add_section()
+    return table
+
+
+@cli.command(epilog=_epilog("margins"))
+@click.argument("stage")
+@click.option("--preload", default=1.0, show_default=True, help="Guide preload, 1 as new.")
+@click.option("--mount", default=1.0, show_default=True, help="Mount stiffness, 1 as new.")
+@click.option(
+    "--format",
+    "file_format",
+    type=click.Choice(["table", "json"]),
+    default="table",
+    show_default=True,
+)
+def margins(stage: str, preload: float, mount: float, file_format: str) -> None:
+    """Print the margins of the position loop of STAGE, as printed, corrected and derived.
+
+    Rigid as in equations (6)-(11), and with the flexible structure inside. Needed are 6 dB and
+    30°. A gain margin is the change of the gain that reaches -1: at an upper phase crossover a
+    rise, at a lower one a fall. Margins of an unstable loop, or of one without roll-off, are not
+    judged.
+    """
+    loops = [margin_record(case) for case in cases(stage, Condition(preload, mount))]
+    names = ("bandwidth_hz", "gain_margin_db", "phase_margin_deg")
+    table_1 = dict(zip(names, TABLE_1[stage], strict=True))
+    if file_format == "json":
+        needed = {"gain_margin_db": GAIN_MARGIN_DB, "phase_margin_deg": PHASE_MARGIN_DEG}
+        report = {"stage": stage, "needed": needed, "table_1": table_1, "loops": loops}
+        click.echo(json.dumps(report, indent=2))
+        return
+    console = Console()
+    wide = Console(width=max(console.width, _TABLE_WIDTH))
+    wide.print(_loop_table(loops))
+    wide.print(_crossover_table(loops))
+    click.echo("* the smallest of its kind in this loop: it decides.")
+    click.echo(
+        "Table 1 of the paper, measured: bandwidth {bandwidth_hz} Hz, gain margin "
+        "{gain_margin_db} dB, phase margin {phase_margin_deg}°.".format(**table_1)
+    )
+
+
 @cli.command("map", epilog=_epilog("map"))
 @click.argument("stage")
 @click.option("--out", type=click.Path(dir_okay=False, path_type=Path), required=True)
@@ -104,10 +188,24 @@ def map_command(stage: str, out: Path) -> None:
 
 @cli.command(epilog=_epilog("simulate"))
 @click.argument("stage")
-@click.option("--life", required=True, help="Name of the life, for example both.")
+@click.option("--life", required=True, help=f"Name of the life: {', '.join(LIVES)}.")
 @click.option("--logs", type=int, required=True, help="Count of logs.")
 @click.option("--seconds", type=float, default=20.0, show_default=True, help="Length of each.")
 @click.option("--seed", type=int, default=0, show_default=True)
+@click.option(
+    "--until",
+    type=click.Choice(UNTIL),
+    default="now",
+    show_default=True,
+    help="Where the last log stands: at 1,400 to 2,000 km, or past the first limit crossed.",
+)
+@click.option(
+    "--fault",
+    "faults",
+    type=click.Choice(list(FAULTS)),
+    multiple=True,
+    help="Fault of the recording in a tenth of the logs; repeat it for several.",
+)
 @click.option("--out", type=click.Path(file_okay=False, path_type=Path), required=True)
 @click.option(
     "--format",
@@ -125,14 +223,100 @@ def simulate(
     logs: int,
     seconds: float,
     seed: int,
+    until: str,
+    faults: tuple[str, ...],
     out: Path,
     file_format: str,
     workers: int | None,
 ) -> None:
-    """Write a life of STAGE: logs, manifest.csv, maintenance.csv and truth.csv."""
-    plan = Plan(stage, life, logs, seconds, seed, file_format)
+    """Write a life of STAGE: logs, manifest.csv, maintenance.csv and truth.csv.
+
+    truth.csv has the true condition and every mode's closed-loop frequency and damping at each
+    log, and the odometers at which the limits are crossed, whether or not the logs go that far.
+    The seed alone draws the laws: with --until failure the same life is seen to its end.
+    """
+    plan = Plan(stage, life, logs, seconds, seed, file_format, until, faults)
     count = min(2, os.cpu_count() or 1) if workers is None else workers
     _with_progress(logs, lambda advance: simulate_life(plan, out, workers=count, progress=advance))
+
+
+@cli.command(epilog=_epilog("sweep"))
+@click.argument("stage")
+@click.option("--low", default=20.0, show_default=True, help="Lowest frequency, Hz.")
+@click.option("--high", default=1000.0, show_default=True, help="Highest frequency, Hz.")
+@click.option("--amplitude", default=0.1, show_default=True, help="Amplitude of the current, A.")
+@click.option("--period", default=5.0, show_default=True, help="Duration of one sweep, s.")
+@click.option("--law", type=click.Choice(["log", "linear"]), default="log", show_default=True)
+@click.option("--seconds", default=20.0, show_default=True, help="Length of the log.")
+@click.option("--velocity", default=10.0, show_default=True, help="Velocity of the move, mm/s.")
+@click.option("--preload", default=1.0, show_default=True, help="Guide preload, 1 as new.")
+@click.option("--mount", default=1.0, show_default=True, help="Mount stiffness, 1 as new.")
+@click.option("--seed", type=click.IntRange(0), default=0, show_default=True)
+@click.option("--out", type=click.Path(dir_okay=False, path_type=Path), required=True)
+@click.option(
+    "--format", "file_format", type=click.Choice(list(WRITERS)), default="hdf5", show_default=True
+)
+def sweep(stage: str, out: Path, file_format: str, **options: Any) -> None:
+    """Write an FRF log of STAGE: the motor current holds a sine that sweeps while it moves.
+
+    The sine alone is the column current_excitation_a, with the servo's current it is current_a.
+    A response to the first has the poles of the closed loop, as `modes` prints them; one to the
+    second has those of the structure without it. Every period is a whole sweep; from the
+    difference between periods the noise is known.
+    """
+    wave = Sweep(*(options[name] for name in ("low", "high", "amplitude", "period", "law")))
+    machine = stage_named(stage)
+    words = [options["seed"], zlib.crc32(f"{stage}/sweep".encode())]
+    recording = record_sweep(
+        machine,
+        wave,
+        Condition(options["preload"], options["mount"]),
+        seconds=options["seconds"],
+        velocity=options["velocity"] * 1e-3,
+        rng=np.random.default_rng(np.random.SeedSequence(words)),
+    )
+    identity = f"LMS-{options['seed']}-{machine.identity_suffix}"
+    write_log(recording.described(stage=identity), out, file_format)
+
+
+@cli.command(epilog=_epilog("velocities"))
+@click.argument("stage")
+@click.option(
+    "--velocity",
+    "velocities",
+    type=float,
+    multiple=True,
+    default=[1e3 * v for v in VELOCITIES],
+    show_default=True,
+    help="Set velocity, mm/s; repeat it for several.",
+)
+@click.option("--strokes", default=1, show_default=True, help="Strokes of each move.")
+@click.option("--seconds", default=WINDOW_S, show_default=True, help="Length of each log.")
+@click.option("--preload", default=1.0, show_default=True, help="Guide preload, 1 as new.")
+@click.option("--mount", default=1.0, show_default=True, help="Mount stiffness, 1 as new.")
+@click.option("--seed", type=click.IntRange(0), default=0, show_default=True)
+@click.option("--out", type=click.Path(file_okay=False, path_type=Path), required=True)
+@click.option(
+    "--format", "file_format", type=click.Choice(list(WRITERS)), default="hdf5", show_default=True
+)
+def velocities(
+    stage: str, velocities: tuple[float, ...], out: Path, file_format: str, **options: Any
+) -> None:
+    """Write one log of STAGE per set velocity: full strokes with acceleration and braking.
+
+    Each log is a window about the middle of the move: a slow stroke fills it with constant
+    velocity, a fast one fits into it with its transients.
+    """
+    condition = Condition(options["preload"], options["mount"])
+    sizes = (options["strokes"], options["seconds"], options["seed"])
+    experiment = Experiment(stage_named(stage), condition, *sizes)
+    wanted = tuple(1e-3 * value for value in velocities)
+    _with_progress(
+        len(wanted),
+        lambda advance: drive_velocities(
+            experiment, out, file_format, velocities=wanted, progress=advance
+        ),
+    )
 
 
 def _with_progress(total: int, work: Callable[[Callable[[int], None]], None]) -> None:

@@ -18,6 +18,7 @@ import pandas as pd
 
 from models.degradation import Life, life_named
 from models.errors import BadParameter
+from models.faults import fault_named
 from models.formats import file_suffix, write_log
 from models.plant import GUIDE_MODES, closed_loop_modes
 from models.recording import move_velocity, record
@@ -38,7 +39,8 @@ class Plan:
     """What to simulate: stage and life by name, count of logs, seconds of each, seed.
 
     ``until`` says where the last log stands: ``now``, at an odometer that does not depend on the
-    life, or past its ``failure``.
+    life, or past its ``failure``.  ``faults`` are faults of the recording, by name: each strikes
+    a tenth of the logs, at least one.
     """
 
     stage: str
@@ -48,6 +50,7 @@ class Plan:
     seed: int
     file_format: str = "hdf5"
     until: str = "now"
+    faults: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         """Refuse impossible plans before any file is written."""
@@ -57,6 +60,8 @@ class Plan:
             raise BadParameter("seed", self.seed, "0 or more")
         move_velocity(stage_named(self.stage), self.seconds)
         file_suffix(self.file_format)
+        for name in self.faults:
+            fault_named(name)
         if self.until not in UNTIL:
             raise BadParameter("until", self.until, " or ".join(UNTIL))
         if self.draw_life().failure_km() is None and self.until == "failure":
@@ -70,6 +75,15 @@ class Plan:
     def draw_life(self) -> Life:
         """Return the life with the laws of this seed."""
         return life_named(self.life, self.rng("laws"))
+
+    def faults_of(self, log: int) -> list[str]:
+        """Return the faults that strike a log (its index)."""
+        share = max(1, round(0.1 * self.logs))
+        return [
+            name
+            for name in self.faults
+            if log in self.rng(f"faults/{name}").choice(self.logs, share, replace=False)
+        ]
 
     def end_km(self, now_km: float) -> float:
         """Return the odometer (km) of the last log, given that of the present."""
@@ -128,6 +142,9 @@ def _simulate_log(plan: Plan, visit: Visit, folder: Path) -> dict[str, object]:
     recording = record(
         stage, visit.condition, seconds=plan.seconds, rng=plan.rng("signals", visit.index)
     )
+    struck = plan.faults_of(visit.index)
+    for name in struck:
+        recording = fault_named(name)(recording, plan.rng(f"fault/{name}", visit.index))
     recording = recording.described(
         stage=visit.identity,
         recorded_at=visit.recorded_at.isoformat(),
@@ -135,7 +152,7 @@ def _simulate_log(plan: Plan, visit: Visit, folder: Path) -> dict[str, object]:
         servo_id=visit.condition.servo_id,
     )
     write_log(recording, folder / visit.file, plan.file_format)
-    return truth_row(stage, visit)
+    return {**truth_row(stage, visit), "faults": " ".join(struck)}
 
 
 def payload_kg(stage: Stage, condition: Condition) -> float:

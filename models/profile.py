@@ -14,9 +14,10 @@ from models.errors import BadParameter
 
 Array = NDArray[np.float64]
 
-# The paper: constant acceleration of 5000 mm/s²; "limited jerk" without a number (our choice).
+# The paper: constant acceleration of 5000 mm/s² and constant jerk without a number; this one (our
+# choice) lets a move to 100 mm/s just reach that acceleration.
 ACCELERATION = 5.0
-JERK = 500.0
+JERK = 250.0
 
 
 @dataclass(frozen=True, slots=True)

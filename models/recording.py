@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from models.disturbance import (
-    ACCELEROMETER_DENSITY,
+    ACCELEROMETER,
     drawn_orders,
     mains,
     noise_corners,
@@ -125,14 +125,19 @@ def _add_lines(outputs: Array, frequency_hz: Array, gain: ComplexArray) -> None:
         outputs[:, start : start + size] += read @ waves_stacked[:, :size]
 
 
-def sense(outputs: Array, stage: Stage, rng: np.random.Generator) -> None:
+def sense(outputs: Array, stage: Stage, velocity: Array, rng: np.random.Generator) -> None:
     """Make of what happens (output, time) what the sensors write, in place.
 
     Mains and noise are added to the accelerations, which end at the sensors' range; Δe is
     rounded to encoder counts.
+
+    Parameters
+    ----------
+    velocity : () or (time,)
+        m/s.
     """
     _add_lines(outputs, *_mains_gains(stage, rng))
-    noise = ACCELEROMETER_DENSITY * np.sqrt(SAMPLE_RATE_HZ / 2)
+    noise = ACCELEROMETER.at(velocity) * np.sqrt(SAMPLE_RATE_HZ / 2)
     reach = stage.acc_range.value
     for name in ("acc_feed", "acc_pitch"):
         sensed = outputs[OUTPUTS.index(name)]
@@ -158,7 +163,7 @@ def simulate_signals(
     _add_lines(outputs, *_order_gains(stage, condition, velocity, rng))
     # The ball guide's constant friction costs current; its slow integrator has long met it.
     outputs[OUTPUTS.index("current")] += stage.friction.value / TUNINGS[stage.name].force_constant
-    sense(outputs, stage, rng)
+    sense(outputs, stage, np.asarray(velocity), rng)
     return outputs
 
 
@@ -194,7 +199,7 @@ def to_recording(
     metadata = {
         "sample_rate_hz": SAMPLE_RATE_HZ,
         "temperature_c": round(condition.temperature_c, 2),
-        "payload_kg": stage.payload.value + condition.added_payload,
+        "payload_kg": round(stage.payload.value + condition.added_payload, 3),
         "position_mm": 0.0,
     }
     stored = {n: v.astype(np.float32) for n, v in zip(COLUMNS, columns, strict=True)}
@@ -212,14 +217,14 @@ def spectrum(
     std = noise_levels(stage, np.asarray(velocity), SAMPLE_RATE_HZ)
     diagonal = shaken(stage, condition)
     density = sampled_spectrum(diagonal, std, SAMPLE_RATE_HZ, frequency_hz)
-    return density + _sensor_floor(stage)
+    return density + _sensor_floor(stage, velocity)
 
 
-def _sensor_floor(stage: Stage) -> Array:
+def _sensor_floor(stage: Stage, velocity: float) -> Array:
     """Return the density (output,) of quantisation and accelerometer noise."""
     floor = np.zeros(len(OUTPUTS))
     floor[0] = stage.encoder_count.value**2 / 12 * 2 / SAMPLE_RATE_HZ
-    floor[2:] = ACCELEROMETER_DENSITY**2
+    floor[2:] = ACCELEROMETER.at(np.asarray(velocity)) ** 2
     return floor
 
 
@@ -253,7 +258,7 @@ def signal_to_noise(
         total = frequency_response(diagonal, np.array([mode.frequency_hz]))[0, outputs]
         rest = total - sum(parts.values())
         power = [np.abs(part) ** 2 @ std**2 for part in (parts[mode.name], rest)]
-        floor = _sensor_floor(stage)[outputs] * SAMPLE_RATE_HZ / 2
+        floor = _sensor_floor(stage, velocity)[outputs] * SAMPLE_RATE_HZ / 2
         ratio = power[0] / (power[1] + floor)
         ratios[mode.name] = dict(zip(SENSORS, map(float, ratio), strict=True))
     return ratios

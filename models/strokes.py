@@ -121,5 +121,5 @@ def record_strokes(
     _add_orders(inputs, stage, reference, rng)
     outputs, _ = propagate(direct, settled, inputs, SAMPLE_RATE_HZ)
     outputs += _noise_outputs(stage, condition, reference[1], rng)
-    sense(outputs, stage, rng)
+    sense(outputs, stage, reference[1], rng)
     return to_recording(stage, condition, outputs, reference[0], reference[1])

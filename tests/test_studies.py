@@ -36,3 +36,11 @@ def test_demo_life(root: Path) -> None:
         assert abs(row["truth"] - row["median"]) < reach
         # Much narrower than the prior, whose 90 % interval is 1.0 wide, and no point.
         assert 0.01 < reach < 0.3
+
+
+def test_three_methods(root: Path) -> None:
+    """FRF, following error and accelerometers agree on guide modes, and controls do not."""
+    answer = json.loads(run_study(root, "three_methods"))
+    assert all(answer["passed"].values())
+    pitch = answer["stages"]["lms-y"]["modes"]["pitch"]
+    assert pitch["seen_by"] == ["frf", "delta_e", "accelerometers"]

@@ -73,3 +73,13 @@ def test_errors_are_one_line_and_status_1():
 def test_wrong_usage_is_status_2():
     """A missing option is wrong usage."""
     assert run("simulate", "lms-y").returncode == 2
+
+
+def test_until_failure_needs_a_life_that_fails(tmp_path):
+    """Following a healthy life to its failure is refused in one line before anything is made."""
+    out = tmp_path / "life"
+    arguments = ["simulate", "lms-y", "--life", "healthy", "--logs", "2", "--until", "failure"]
+    done = run(*arguments, "--out", str(out))
+    assert done.returncode == 1
+    assert done.stderr == "error: until is failure; needed: now, as healthy crosses no limit\n"
+    assert not out.exists()

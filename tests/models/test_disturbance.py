@@ -23,8 +23,17 @@ def test_noise_grows_with_velocity():
     slow, fast = (noise_levels(STAGE, np.array(v), 20000.0) for v in (0.010, 0.040))
     ratio = dict(zip(NOISE_INPUTS, fast / slow, strict=True))
     assert ratio["block1_x"] == pytest.approx(4 ** FRICTION["lms-y"].power)
-    assert ratio["block4_z"] == pytest.approx(4**ROUGHNESS.power)
+    grown = ROUGHNESS.at(np.array(0.040)) / ROUGHNESS.at(np.array(0.010))
+    assert ratio["block4_z"] == pytest.approx(grown)
     assert ratio["ground_z"] == pytest.approx(1.0)
+
+
+def test_slow_and_fast_parts_take_over_from_each_other():
+    """At 1 mm/s the slow power of velocity rules, at 400 mm/s the fast one."""
+    slow, slower = (ROUGHNESS.at(np.array(v)) for v in (0.001, 0.0005))
+    fast, faster = (ROUGHNESS.at(np.array(v)) for v in (0.4, 0.8))
+    assert slow / slower == pytest.approx(2**ROUGHNESS.power, rel=0.01)
+    assert faster / fast == pytest.approx(2**ROUGHNESS.fast_power, rel=0.01)
 
 
 def test_noise_follows_a_changing_velocity_sample_by_sample():
@@ -45,7 +54,8 @@ def test_standstill_leaves_ground_and_electronics():
 def test_a_density_becomes_the_standard_deviation_of_white_samples():
     """White samples at rate fs with one-sided density d have variance d² fs / 2."""
     level = dict(zip(NOISE_INPUTS, noise_levels(STAGE, np.array(0.010), 20000.0), strict=True))
-    assert level["block1_z"] ** 2 == pytest.approx(ROUGHNESS.density**2 * 10000.0)
+    density = ROUGHNESS.at(np.array(0.010))
+    assert level["block1_z"] ** 2 == pytest.approx(density**2 * 10000.0)
     assert noise_corners(STAGE).shape == (len(NOISE_INPUTS),)
 
 

@@ -1,6 +1,7 @@
 """Tests of simulated lives and their files."""
 
 import itertools
+from dataclasses import replace
 
 import h5py
 import numpy as np
@@ -9,7 +10,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from models.degradation import LIVES
-from models.errors import BadParameter, UnknownFormat, UnknownLife
+from models.errors import BadParameter, UnknownFault, UnknownFormat, UnknownLife
 from models.lives import Plan, schedule, simulate_life
 from models.plant import closed_loop_modes
 from models.recording import COLUMNS
@@ -233,3 +234,27 @@ def test_work_still_to_come_is_not_in_maintenance(tmp_path):
     """A life of one log has not been retuned yet."""
     simulate_life(Plan("lms-y", "servo-retuning", 1, 0.2, 0), tmp_path)
     assert (tmp_path / "maintenance.csv").read_text() == "stage,recorded_at,travel_km,action\n"
+
+
+def test_faults_strike_a_tenth_of_the_logs_and_stand_in_the_truth(tmp_path):
+    """Struck logs differ from their clean twins, the others do not, and the truth says which."""
+    clean = Plan("lms-y", "healthy", 12, 0.5, 3)
+    faulty = replace(clean, faults=("dead-channel", "mains-hum"))
+    simulate_life(clean, tmp_path / "clean")
+    simulate_life(faulty, tmp_path / "faulty")
+    truth = pd.read_csv(tmp_path / "faulty" / "truth.csv", keep_default_na=False)
+    assert sum("dead-channel" in names for names in truth["faults"]) == 1
+    assert sum("mains-hum" in names for names in truth["faults"]) == 1
+    for row in truth.itertuples():
+        with (
+            h5py.File(tmp_path / "clean" / row.file) as first,
+            h5py.File(tmp_path / "faulty" / row.file) as second,
+        ):
+            same = np.array_equal(first["acc_pitch_m_s2"], second["acc_pitch_m_s2"])
+        assert same == (row.faults == "")
+
+
+def test_unknown_fault_is_refused_before_any_file():
+    """A fault that does not exist lists those that do."""
+    with pytest.raises(UnknownFault, match="mains-hum"):
+        Plan("lms-y", "healthy", 2, 1.0, 0, faults=("gremlins",))

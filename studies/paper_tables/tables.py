@@ -1,0 +1,296 @@
+"""The paper's tables on the simulated stages: cells of simulated beside printed, row by row."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+from scipy.signal import find_peaks
+
+from models.equations import controller
+from models.margins import cases, margin_record
+from models.plant import closed_loop_modes
+from models.recording import Recording, record
+from models.stages import STAGES
+from models.strokes import VELOCITIES, full_stroke, record_strokes
+from models.sweep import Sweep, record_sweep
+
+Array = NDArray[np.float64]
+
+PRINTED = Path(__file__).parent / "printed"
+FILES = {"x": "lms-x", "y": "lms-y"}
+COUNT, FLOOR_UM = 100, 0.030
+# A resonance stands out of the smoothed response by this much.
+PROMINENCE_DB = 0.5
+# Rows of Tables 6 and 7 that belong to a mode of three rigid bodies.
+MODE_ROWS = {
+    "x": {10: "granite_feed", 50: "granite_pitch", 100: "roll", 150: "yaw", 250: "pitch"},
+    "y": {
+        10: "granite_feed",
+        40: "granite_vertical",
+        50: "granite_pitch",
+        130: "roll",
+        140: "pitch",
+        160: "yaw",
+        380: "vertical",
+    },
+}
+# Section 4 of the paper, from its Figure 18.
+PRINTED_GROWING = {
+    "x": [10, 50, 150],
+    "y": [10, 90, 110, 120, 140, 150, 160, 260, 290, 310, 380, 390],
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """A row of a table: printed and simulated cells (NaN = none), scatter over seeds."""
+
+    table: str
+    name: str
+    printed: tuple[float, ...]
+    simulated: tuple[float, ...]
+    scatter: tuple[float, ...] = ()
+    mode: str | None = None
+
+
+def printed(number: int) -> pd.DataFrame:
+    """Return a table as the paper prints it."""
+    return pd.read_csv(PRINTED / f"table{number}.csv")
+
+
+def amplitude_spectrum(values: Array) -> Array:
+    """Return amplitudes of the FFT's harmonics, the mean left out."""
+    return np.abs(np.fft.rfft(values - values.mean())) * 2 / values.size
+
+
+def error_reading(recording: Recording) -> dict[str, float]:
+    """Read Δe as the paper: statistics, 100 strongest harmonics, those above 30 nm (µm, Hz)."""
+    error = recording.columns["delta_e_um"].astype(float)
+    magnitude = amplitude_spectrum(error)
+    hertz = np.fft.rfftfreq(error.size, 1 / recording.metadata["sample_rate_hz"])
+    strongest = np.argsort(magnitude)[-COUNT:]
+    above = strongest[magnitude[strongest] > FLOOR_UM]
+    return {
+        "min_um": float(error.min()),
+        "max_um": float(error.max()),
+        "std_um": float(error.std()),
+        "mean_um": float(error.mean()),
+        "bandwidth_hz": float(np.ptp(hertz[strongest])),
+        "bandwidth_above_30nm_hz": float(np.ptp(hertz[above])) if above.size else 0.0,
+        "max_magnitude_um": float(magnitude.max()),
+    }
+
+
+def acceleration_reading(recording: Recording, bands: Iterable[Array]) -> list[float]:
+    """Return the largest harmonic (mm/s²) of either accelerometer within each row's bands (Hz).
+
+    The paper does not say which of its two directions a magnitude belongs to.
+    """
+    names = ("acc_feed_m_s2", "acc_pitch_m_s2")
+    magnitude = np.max(
+        [1e3 * amplitude_spectrum(recording.columns[name].astype(float)) for name in names], axis=0
+    )
+    rate = recording.metadata["sample_rate_hz"]
+    hertz = np.fft.rfftfreq(recording.columns[names[0]].size, 1 / rate)
+    return [
+        float(
+            magnitude[np.any([(low < hertz) & (hertz < high) for low, high in row], axis=0)].max()
+        )
+        for row in bands
+    ]
+
+
+def bands_of(axis: str) -> list[Array]:
+    """Return the bands (band, 2) in Hz in which each row of Table 6 or 7 is read.
+
+    A row without a mode: ±5 Hz about its number.  A row with a mode: ±4 Hz about the simulated
+    mode, and, where the number is a multiple of 50 Hz, the mains line that stands in it.
+    """
+    modes = {m.name: m.frequency_hz for m in closed_loop_modes(STAGES[FILES[axis]])}
+    bands = []
+    for hertz in printed(6 if axis == "x" else 7)["frequency_hz"]:
+        if hertz not in MODE_ROWS[axis]:
+            bands.append([(hertz - 5.0, hertz + 5.0)])
+            continue
+        at = modes[MODE_ROWS[axis][hertz]]
+        mains = [(hertz - 0.5, hertz + 0.5)] if hertz % 50 == 0 else []
+        bands.append([(at - 4.0, at + 4.0), *mains])
+    return [np.array(row) for row in bands]
+
+
+def moves(axis: str, seed: int, *, transients: bool) -> list[Recording]:
+    """Return the record of every velocity; without transients only its constant part, 4 s."""
+    stage = STAGES[FILES[axis]]
+    records = []
+    for velocity in VELOCITIES:
+        rng = np.random.default_rng([seed, round(velocity * 1e6)])
+        move = full_stroke(stage, velocity)
+        if transients:
+            records.append(record_strokes(stage, profile=move, rng=rng))
+        else:
+            seconds = min(4.0, move.constant_s)
+            records.append(record(stage, seconds=seconds, velocity=velocity, rng=rng))
+    return records
+
+
+def velocity_rows(axis: str, seeds: int, *, transients: bool = True) -> list[Row]:
+    """Return the rows of Tables 3, 4 and 6 or 7 of one configuration."""
+    bands = bands_of(axis)
+    errors, accelerations = [], []
+    for seed in range(seeds):
+        records = moves(axis, seed, transients=transients)
+        errors.append([list(error_reading(record).values()) for record in records])
+        accelerations.append([acceleration_reading(record, bands) for record in records])
+    keys = list(error_reading(records[0]))
+    table = {**printed(3).to_dict("list"), **printed(4).to_dict("list")}
+    rows = [
+        _row("Table 3" if i < 4 else "Table 4", f"{axis} {key}", table[f"{axis}_{key}"],
+             np.array(errors)[:, :, i])
+        for i, key in enumerate(keys)
+    ]  # fmt: skip
+    number = 6 if axis == "x" else 7
+    for i, line in printed(number).iterrows():
+        hertz = int(line["frequency_hz"])
+        cells = list(line.iloc[2:])
+        rows.append(
+            _row(f"Table {number}", f"{axis} {hertz} Hz", cells, np.array(accelerations)[:, :, i],
+                 MODE_ROWS[axis].get(hertz))
+        )  # fmt: skip
+    return rows
+
+
+def _row(table: str, name: str, cells: list[float], found: Array, mode: str | None = None) -> Row:
+    """Make a row of the mean over seeds (seed, velocity) and its scatter."""
+    spread = found.std(axis=0, ddof=1) if len(found) > 1 else np.full(found.shape[1], np.nan)
+    return Row(
+        table,
+        name,
+        tuple(float(c) for c in cells),
+        tuple(found.mean(axis=0).tolist()),
+        tuple(spread.tolist()),
+        mode,
+    )
+
+
+def loop_rows() -> list[Row]:
+    """Return Table 1: margins with the flexible modes inside, filters from equations 8 and 9."""
+    table = printed(1).set_index("parameter")
+    found: dict[str, list[float]] = {name: [] for name in table.index}
+    for name in STAGES:
+        loops = [margin_record(case) for case in cases(name)]
+        loop = next(
+            row for row in loops if (row["reading"], row["structure"]) == ("corrected", "flexible")
+        )
+        gain = next(c for c in loop["crossovers"] if c["phase_margin_deg"] is not None)
+        upper = [c for c in loop["crossovers"] if c["crossover"].startswith("upper")]
+        found["bandwidth_hz"].append(gain["frequency_hz"])
+        found["phase_margin_deg"].append(gain["phase_margin_deg"])
+        found["gain_margin_db"].append(min(c["gain_margin_db"] for c in upper))
+        for key, value in _controller_numbers(name).items():
+            found[key].append(value)
+    return [
+        Row("Table 1", key, tuple(map(float, table.loc[key])), tuple(values))
+        for key, values in found.items()
+    ]
+
+
+def _controller_numbers(stage: str) -> dict[str, float]:
+    """Return Table 1's settings as the roots of the corrected equations (8) and (9) tell them.
+
+    The velocity loop's P stands in the equations only as a product with a scale: the ratio I/P is
+    what they tell, and P is taken from the table.
+    """
+    law = controller(stage, "corrected")
+    zeros, poles = np.asarray(law.zeros()), np.asarray(law.poles())
+    real = np.sort(np.abs(zeros[np.abs(zeros.imag) < 1e-3 * np.abs(zeros)].real))
+    hertz = np.abs(zeros[zeros.imag > 1]) / (2 * np.pi)
+    filters = np.abs(poles[poles.imag > 1]) / (2 * np.pi)
+    # What has no zero beside it is the low pass.
+    alone = [f for f in filters if np.min(np.abs(np.log(hertz / f))) > 0.01]
+    column = stage[-1]
+    gain = float(printed(1).set_index("parameter").loc["velocity_loop_p", column])
+    notch = hertz[np.argmin(np.abs(hertz - {"x": 280.0, "y": 165.0}[column]))]
+    return {
+        "lpf_cutoff_hz": float(alone[0]),
+        "notch_frequency_hz": float(notch),
+        "position_loop_p": float(real[1]),
+        "velocity_loop_p": gain,
+        "velocity_loop_i": float(real[0]) * gain,
+    }
+
+
+def _feed_response(axis: str, sweep: Sweep, logs: int) -> tuple[Array, Array]:
+    """Return frequencies (Hz) and |acceleration of Δe over motor current| of averaged sweeps."""
+    stage = STAGES[FILES[axis]]
+    total = np.zeros((2, sweep.samples // 2 + 1), dtype=complex)
+    for seed in range(logs):
+        rng = np.random.default_rng(seed)
+        log = record_sweep(stage, sweep, seconds=2 * sweep.period, velocity=0.020, rng=rng)
+        for i, name in enumerate(("delta_e_um", "current_a")):
+            # Whole periods of the sweep: every harmonic of the period is one bin.
+            blocks = log.columns[name].astype(float).reshape(2, -1)
+            total[i] += np.fft.rfft(blocks, axis=1).sum(axis=0)
+    hertz = np.fft.rfftfreq(sweep.samples, 1 / log.metadata["sample_rate_hz"])
+    inside = (hertz > sweep.low_hz) & (hertz < sweep.high_hz)
+    return hertz[inside], np.abs(total[0] / total[1])[inside] * hertz[inside] ** 2
+
+
+def feed_resonances(axis: str, logs: int = 4) -> Array:
+    """Return resonances (Hz) along the feed: peaks of acceleration over current while moving.
+
+    Two sweeps: what moves the stage enough at 900 Hz would turn it back at 10 Hz.
+    """
+    sweeps = (Sweep(8.0, 60.0, 0.2, 5.0), Sweep(50.0, 1200.0, 1.0, 5.0))
+    parts = [_feed_response(axis, sweep, logs) for sweep in sweeps]
+    low = parts[0][0] < 55
+    hertz = np.concatenate([parts[0][0][low], parts[1][0][parts[1][0] >= 55]])
+    level = np.concatenate([parts[0][1][low], parts[1][1][parts[1][0] >= 55]])
+    # Even in the logarithm of frequency and smoothed over half a mode's width of damping 1.5 %.
+    grid = np.geomspace(hertz[0], hertz[-1], 4000)
+    kernel = np.hanning(17) / np.hanning(17).sum()
+    smooth = np.convolve(20 * np.log10(np.interp(grid, hertz, level)), kernel, mode="same")
+    inner = slice(20, -20)
+    peaks, _ = find_peaks(smooth[inner], prominence=PROMINENCE_DB)
+    return np.asarray(grid[inner][peaks])
+
+
+def resonance_rows() -> list[Row]:
+    """Return Table 2: each printed resonance beside a simulated one within 10 %.
+
+    A resonance that the simulated sweep shows comes first; else a mode of the structure that has
+    the frequency and hardly moves along the feed, then with its name.
+    """
+    table = printed(2)
+    rows = []
+    for axis, name in FILES.items():
+        peaks = feed_resonances(axis)
+        modes = {m.name: m.frequency_hz for m in closed_loop_modes(STAGES[name])}
+        for hertz in table[f"{axis}_hz"].dropna():
+            seen = min(peaks, key=lambda peak: abs(np.log(peak / hertz)))
+            mode = min(modes, key=lambda m: abs(np.log(modes[m] / hertz)))
+            label, value, owner = f"{axis} {hertz:g} Hz", np.nan, None
+            if abs(np.log(seen / hertz)) < np.log(1.1):
+                value = float(seen)
+            elif abs(np.log(modes[mode] / hertz)) < np.log(1.1):
+                value, owner = modes[mode], mode
+            rows.append(Row("Table 2", label, (float(hertz),), (value,), mode=owner))
+    return rows
+
+
+def modal_rows() -> list[Row]:
+    """Return Table 5; labels 1 and 3 are swapped between X and Y, so modes go by frequency."""
+    table = printed(5)
+    order = ("granite_feed", "granite_yaw", "granite_vertical", "roll", "pitch")
+    rows = []
+    for axis, name in FILES.items():
+        modes = {m.name: m.frequency_hz for m in closed_loop_modes(STAGES[name])}
+        for line, mode in zip(table.itertuples(), order, strict=True):
+            value = float(getattr(line, f"{axis}_hz"))
+            label = f"{axis} {getattr(line, f'{axis}_direction')}"
+            rows.append(Row("Table 5", label, (value,), (modes[mode],), mode=mode))
+    return rows
