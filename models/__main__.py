@@ -12,6 +12,7 @@ from typing import Any
 
 import click
 import numpy as np
+from rich import box
 from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
@@ -23,7 +24,9 @@ from models.formats import WRITERS, write_log
 from models.lives import UNTIL, Plan, simulate_life
 from models.mapping import modal_map
 from models.margins import GAIN_MARGIN_DB, PHASE_MARGIN_DEG, TABLE_1, cases, margin_record
-from models.plant import SENSORS, closed_loop_modes, participation
+from models.plant import SENSORS, closed_loop_modes
+from models.recording import signal_to_noise
+from models.shapes import body_motions, participation, strain_energy
 from models.stages import NOMINAL, Condition, stage_named
 from models.strokes import VELOCITIES, WINDOW_S
 from models.sweep import Sweep, record_sweep
@@ -55,13 +58,17 @@ def cli() -> None:
 def _mode_records(stage_name: str, condition: Condition) -> list[dict[str, Any]]:
     """Return the modal table of a stage as JSON-ready records."""
     stage = stage_named(stage_name)
+    ratios = signal_to_noise(stage, condition)
     return [
         {
             "mode": mode.name,
             "frequency_hz": mode.frequency_hz,
             "damping_ratio": mode.damping_ratio,
             "direction": mode.direction,
-            "participation": participation(stage, mode),
+            "participation": participation(stage, mode, condition),
+            "strain_energy": strain_energy(stage, mode, condition),
+            "snr": ratios.get(mode.name),
+            "shape": body_motions(stage, mode, condition),
         }
         for mode in closed_loop_modes(stage, condition)
     ]
@@ -84,21 +91,24 @@ def _mode_records(stage_name: str, condition: Condition) -> list[dict[str, Any]]
 def modes(stage: str, preload: float, mount: float, temperature: float, file_format: str) -> None:
     """Print the closed-loop modes of STAGE (lms-x or lms-y).
 
-    Participation is the displacement that a signal reads in the mode, as a part of the
-    platform's largest.
+    Participation is the displacement that a signal reads in the mode, as a part of the mode's
+    largest; then the share of the strain energy in the isolators, the mount and the guide. JSON
+    has that of every joint, the motion of every body and, for roll, pitch and yaw, the modal
+    signal-to-noise ratio at 10 mm/s.
     """
     records = _mode_records(stage, Condition(preload, mount, temperature))
     if file_format == "json":
         click.echo(json.dumps({"modes": records}, indent=2))
         return
-    table = Table("mode", "frequency Hz", "damping %", "direction", *SENSORS)
+    joints = ("isolator", "mount", "guide")
+    table = Table("mode", "Hz", "ζ %", *SENSORS, *joints, box=box.SIMPLE_HEAD)
     for record in records:
         table.add_row(
             record["mode"],
             f"{record['frequency_hz']:.2f}",
             f"{100 * record['damping_ratio']:.2f}",
-            record["direction"],
             *(f"{record['participation'][name]:.4f}" for name in SENSORS),
+            *(f"{100 * sum(record['strain_energy'][name]):.1f} %" for name in joints),
         )
     console = Console()
     # Cut-off names are useless in a file or a pipe.

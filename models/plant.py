@@ -303,21 +303,3 @@ def _mode(name: str, value: complex, shape: ComplexArray) -> Mode:
         eigenvalue=complex(value),
         shape=shape,
     )
-
-
-def participation(stage: Stage, mode: Mode) -> dict[str, float]:
-    """Return how much each sensor moves in a mode, as a part of the mode's largest motion.
-
-    The displacement amplitude that the sensor reads, divided by the largest displacement along
-    one axis of any of the three bodies at the four blocks and at the platform's centre of gravity.
-    Δe reads a difference of two bodies and may exceed 1.
-    """
-    structure = build_structure(stage)
-    bodies = structure.bodies
-    places = [*corners(stage.block_half_spacing), bodies[PLATFORM].centre]
-    rows = np.vstack([displacement_rows(bodies, i, p) for i in range(3) for p in places])
-    largest = float(np.abs(rows @ mode.shape).max())
-    return {
-        name: float(abs(row @ mode.shape)) / largest
-        for name, row in sensor_rows(stage, structure).items()
-    }

@@ -27,8 +27,7 @@ from models.plant import (
     closed_loop_modes,
     sensor_rows,
 )
-from models.servo import TUNINGS
-from models.stages import NOMINAL, Condition, Stage, build_structure
+from models.stages import NOMINAL, Condition, Stage, build_structure, tuning_named
 
 Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
@@ -162,7 +161,8 @@ def simulate_signals(
     outputs = simulate(diagonal, std, samples, sample_rate_hz=SAMPLE_RATE_HZ, rng=rng)
     _add_lines(outputs, *_order_gains(stage, condition, velocity, rng))
     # The ball guide's constant friction costs current; its slow integrator has long met it.
-    outputs[OUTPUTS.index("current")] += stage.friction.value / TUNINGS[stage.name].force_constant
+    constant = tuning_named(stage.name, condition.servo_id).force_constant
+    outputs[OUTPUTS.index("current")] += stage.friction.value / constant
     sense(outputs, stage, np.asarray(velocity), rng)
     return outputs
 

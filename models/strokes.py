@@ -16,8 +16,7 @@ from models.modal import diagonalise, propagate, stationary_state
 from models.plant import INPUTS, closed_loop
 from models.profile import Profile
 from models.recording import SAMPLE_RATE_HZ, Recording, sense, shaken, to_recording
-from models.servo import TUNINGS
-from models.stages import NOMINAL, Condition, Stage
+from models.stages import NOMINAL, Condition, Stage, tuning_named
 
 Array = NDArray[np.float64]
 
@@ -36,7 +35,7 @@ def full_stroke(stage: Stage, velocity: float) -> Profile:
     return Profile(velocity, min(STROKE, 0.95 * stage.travel.value))
 
 
-def commands(stage: Stage, reference: Array) -> Array:
+def commands(stage: Stage, condition: Condition, reference: Array) -> Array:
     """Return what the move itself puts into the stage's inputs, (input, time).
 
     The reference's acceleration, the controller's feedforward of mass and friction, and the
@@ -55,7 +54,8 @@ def commands(stage: Stage, reference: Array) -> Array:
     blocks = [i for i, n in enumerate(INPUTS) if n.startswith("block") and n.endswith("x")]
     inputs[blocks] = -friction / len(blocks)
     inputs[INPUTS.index("reference_acceleration")] = acceleration
-    inputs[INPUTS.index("feedforward_current")] = wanted / TUNINGS[stage.name].force_constant
+    constant = tuning_named(stage.name, condition.servo_id).force_constant
+    inputs[INPUTS.index("feedforward_current")] = wanted / constant
     return inputs
 
 
@@ -114,7 +114,7 @@ def record_strokes(
         raise BadParameter("stroke", f"{profile.stroke} m", f"at most {stage.travel.value} m")
     time = np.arange(round(seconds * SAMPLE_RATE_HZ)) / SAMPLE_RATE_HZ
     reference = profile.sampled(time + (profile.seconds - profile.dwell - seconds) / 2)
-    inputs = commands(stage, reference)
+    inputs = commands(stage, condition, reference)
     direct = diagonalise(closed_loop(stage, condition))
     # What was commanded long enough has settled before the window opens.
     settled = -(direct.b @ inputs[:, 0]) / direct.poles

@@ -26,8 +26,7 @@ from models.plant import (
     closed_loop_modes,
 )
 from models.recording import DEFAULT_VELOCITY, SAMPLE_RATE_HZ, Recording, record
-from models.servo import TUNINGS
-from models.stages import NOMINAL, Condition, Number, Stage, build_structure
+from models.stages import NOMINAL, Condition, Number, Stage, build_structure, tuning_named
 
 Array = NDArray[np.float64]
 
@@ -97,7 +96,8 @@ class Sweep:
 def _from_current(stage: Stage, condition: Condition) -> Diagonal:
     """Return the closed loop with a current beside the servo's (A) as its only input."""
     diagonal = diagonalise(closed_loop(stage, condition))
-    force, index = TUNINGS[stage.name].force_constant, INPUTS.index("motor_force")
+    force = tuning_named(stage.name, condition.servo_id).force_constant
+    index = INPUTS.index("motor_force")
     b, d = force * diagonal.b[:, [index]], force * diagonal.d[:, [index]]
     # The column of the log holds the whole current of the motor.
     d[OUTPUTS.index("current")] = 1.0

@@ -32,7 +32,7 @@ MODEL_FLOORS = [
     {"structure", "servo", "profile"},
     {"stages"},
     {"plant", "equations"},
-    {"calibration", "mapping", "modal", "disturbance", "margins"},
+    {"calibration", "mapping", "modal", "disturbance", "margins", "shapes"},
     {"recording"},
     {"formats", "degradation", "sweep", "strokes", "faults"},
     {"lives", "velocities"},

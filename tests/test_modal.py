@@ -250,6 +250,19 @@ def test_a_line_crossing_a_mode_moves_it_less_than_its_uncertainty(line: float) 
     assert [round(found.frequency, 1) for found in dirty.lines] == [pytest.approx(line, abs=0.06)]
 
 
+@pytest.mark.parametrize("seed", range(8))
+def test_a_strong_line_takes_no_name_from_a_mode(seed: int) -> None:
+    """Mains at 150 Hz, beside yaw, leave roll, pitch and yaw of 20 s their names and places."""
+    log = acceleration_log(rng(100 + seed), lms_y_modes(), 20, RATE, 0.5)
+    mains = sine(20_000, RATE, 150.0, 60.0)
+    dirty = make_log({c.name: c.values + mains for c in log.channels}, RATE)
+    found = identify(dirty, make_stage(LMS_Y))
+    assert found.names == ("roll", "pitch", "yaw")
+    for name, f, zeta in LMS_Y:
+        assert np.abs(deviations(found, name, f, zeta)).max() < 4.5
+    assert {line.kind for line in found.lines} == {"mains"}
+
+
 def test_an_order_of_the_velocity_is_named() -> None:
     """A line at velocity over wavelength carries the name of the order."""
     velocity = 0.4  # ball pass of 4 mm: 100 Hz

@@ -30,7 +30,12 @@ def test_modes_as_json():
         "damping_ratio",
         "direction",
         "participation",
+        "strain_energy",
+        "snr",
+        "shape",
     }
+    assert modes["granite_feed"]["snr"] is None
+    assert modes["roll"]["snr"]["acc_pitch"] > 30
     assert set(modes["roll"]["participation"]) == {"delta_e", "acc_feed", "acc_pitch"}
 
 

@@ -8,7 +8,7 @@ from models.modal import diagonalise, frequency_response
 from models.plant import INPUTS, OUTPUTS, closed_loop
 from models.profile import Profile
 from models.recording import COLUMNS, record
-from models.stages import STAGES
+from models.stages import NOMINAL, STAGES
 from models.strokes import VELOCITIES, commands, full_stroke, record_strokes
 
 STAGE = STAGES["lms-y"]
@@ -89,7 +89,7 @@ def test_feedforward_takes_most_of_the_acceleration_off_the_loop():
 
 def test_commands_rest_before_the_move():
     """A standing reference commands nothing."""
-    assert not commands(STAGE, np.zeros((4, 10))).any()
+    assert not commands(STAGE, NOMINAL, np.zeros((4, 10))).any()
 
 
 def test_error_grows_from_slow_to_fast_and_x_follows_better():
