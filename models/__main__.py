@@ -6,7 +6,7 @@ import json
 import os
 import sys
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -50,6 +50,27 @@ def _epilog(command: str) -> str:
     return f"Example: {_EXAMPLES[command]}"
 
 
+def _condition_options(command: Callable[..., None]) -> Callable[..., None]:
+    """Give a command the two health parameters as options."""
+    preload = click.option(
+        "--preload", default=1.0, show_default=True, help="Guide preload, 1 as new."
+    )
+    mount = click.option(
+        "--mount", default=1.0, show_default=True, help="Mount stiffness, 1 as new."
+    )
+    return preload(mount(command))
+
+
+def _format_option(formats: Sequence[str], default: str) -> Callable[..., Callable[..., None]]:
+    """Return the option that chooses a format."""
+    kinds = click.Choice(list(formats))
+    return click.option("--format", "file_format", type=kinds, default=default, show_default=True)
+
+
+_shown_as = _format_option(("table", "json"), "table")
+_written_as = _format_option(tuple(WRITERS), "hdf5")
+
+
 @click.group()
 def cli() -> None:
     """Simulate the linear-motor stages LMS-X and LMS-Y: modes, modal maps, lives of logs."""
@@ -76,18 +97,11 @@ def _mode_records(stage_name: str, condition: Condition) -> list[dict[str, Any]]
 
 @cli.command(epilog=_epilog("modes"))
 @click.argument("stage")
-@click.option("--preload", default=1.0, show_default=True, help="Guide preload, 1 as new.")
-@click.option("--mount", default=1.0, show_default=True, help="Mount stiffness, 1 as new.")
+@_condition_options
 @click.option(
     "--temperature", default=NOMINAL.temperature_c, show_default=True, help="Temperature, °C."
 )
-@click.option(
-    "--format",
-    "file_format",
-    type=click.Choice(["table", "json"]),
-    default="table",
-    show_default=True,
-)
+@_shown_as
 def modes(stage: str, preload: float, mount: float, temperature: float, file_format: str) -> None:
     """Print the closed-loop modes of STAGE (lms-x or lms-y).
 
@@ -152,15 +166,8 @@ def _crossover_table(loops: list[dict[str, Any]]) -> Table:
 
 @cli.command(epilog=_epilog("margins"))
 @click.argument("stage")
-@click.option("--preload", default=1.0, show_default=True, help="Guide preload, 1 as new.")
-@click.option("--mount", default=1.0, show_default=True, help="Mount stiffness, 1 as new.")
-@click.option(
-    "--format",
-    "file_format",
-    type=click.Choice(["table", "json"]),
-    default="table",
-    show_default=True,
-)
+@_condition_options
+@_shown_as
 def margins(stage: str, preload: float, mount: float, file_format: str) -> None:
     """Print the margins of the position loop of STAGE, as printed, corrected and derived.
 
@@ -217,13 +224,7 @@ def map_command(stage: str, out: Path) -> None:
     help="Fault of the recording in a tenth of the logs; repeat it for several.",
 )
 @click.option("--out", type=click.Path(file_okay=False, path_type=Path), required=True)
-@click.option(
-    "--format",
-    "file_format",
-    type=click.Choice(list(WRITERS)),
-    default="hdf5",
-    show_default=True,
-)
+@_written_as
 @click.option(
     "--workers", type=int, default=None, help="Processes; without it 2 where there are 2 cores."
 )
@@ -259,13 +260,10 @@ def simulate(
 @click.option("--law", type=click.Choice(["log", "linear"]), default="log", show_default=True)
 @click.option("--seconds", default=20.0, show_default=True, help="Length of the log.")
 @click.option("--velocity", default=10.0, show_default=True, help="Velocity of the move, mm/s.")
-@click.option("--preload", default=1.0, show_default=True, help="Guide preload, 1 as new.")
-@click.option("--mount", default=1.0, show_default=True, help="Mount stiffness, 1 as new.")
+@_condition_options
 @click.option("--seed", type=click.IntRange(0), default=0, show_default=True)
 @click.option("--out", type=click.Path(dir_okay=False, path_type=Path), required=True)
-@click.option(
-    "--format", "file_format", type=click.Choice(list(WRITERS)), default="hdf5", show_default=True
-)
+@_written_as
 def sweep(stage: str, out: Path, file_format: str, **options: Any) -> None:
     """Write an FRF log of STAGE: the motor current holds a sine that sweeps while it moves.
 
@@ -301,14 +299,12 @@ def sweep(stage: str, out: Path, file_format: str, **options: Any) -> None:
     help="Set velocity, mm/s; repeat it for several.",
 )
 @click.option("--strokes", default=1, show_default=True, help="Strokes of each move.")
+@click.option("--dwell", default=0.5, show_default=True, help="Standstill after a stroke, s.")
 @click.option("--seconds", default=WINDOW_S, show_default=True, help="Length of each log.")
-@click.option("--preload", default=1.0, show_default=True, help="Guide preload, 1 as new.")
-@click.option("--mount", default=1.0, show_default=True, help="Mount stiffness, 1 as new.")
+@_condition_options
 @click.option("--seed", type=click.IntRange(0), default=0, show_default=True)
 @click.option("--out", type=click.Path(file_okay=False, path_type=Path), required=True)
-@click.option(
-    "--format", "file_format", type=click.Choice(list(WRITERS)), default="hdf5", show_default=True
-)
+@_written_as
 def velocities(
     stage: str, velocities: tuple[float, ...], out: Path, file_format: str, **options: Any
 ) -> None:
@@ -318,7 +314,7 @@ def velocities(
     velocity, a fast one fits into it with its transients.
     """
     condition = Condition(options["preload"], options["mount"])
-    sizes = (options["strokes"], options["seconds"], options["seed"])
+    sizes = (options[name] for name in ("strokes", "dwell", "seconds", "seed"))
     experiment = Experiment(stage_named(stage), condition, *sizes)
     wanted = tuple(1e-3 * value for value in velocities)
     _with_progress(

@@ -22,11 +22,12 @@ _EVERY = timedelta(minutes=2)
 
 @dataclass(frozen=True, slots=True)
 class Experiment:
-    """What to drive: stage, condition, strokes of each move, seconds of each window, seed."""
+    """What to drive: stage, condition, strokes of each move, dwell and window in s, seed."""
 
     stage: Stage
     condition: Condition = NOMINAL
     strokes: int = 1
+    dwell: float = 0.5
     seconds: float = WINDOW_S
     seed: int = 0
 
@@ -37,7 +38,7 @@ class Experiment:
 
     def move(self, velocity: float) -> Profile:
         """Return the move at a set velocity (m/s)."""
-        return replace(full_stroke(self.stage, velocity), strokes=self.strokes)
+        return replace(full_stroke(self.stage, velocity), strokes=self.strokes, dwell=self.dwell)
 
     def rng(self, velocity: float) -> np.random.Generator:
         """Return the generator of one move: independent of which others are driven."""

@@ -44,3 +44,31 @@ def test_three_methods(root: Path) -> None:
     assert all(answer["passed"].values())
     pitch = answer["stages"]["lms-y"]["modes"]["pitch"]
     assert pitch["seen_by"] == ["frf", "delta_e", "accelerometers"]
+
+
+def test_paper_tables(root: Path) -> None:
+    """Two seeds give most of the paper's tables, and constant velocity alone does not."""
+    answer = json.loads(run_study(root, "paper_tables"))
+
+    def hits(summary: str, key: str) -> tuple[int, int]:
+        found, count = answer[summary][key].split(" of ")
+        return int(found), int(count)
+
+    for key, least in (
+        ("table_3_std_within_1.5", 0.9),
+        ("table_4_max_magnitude_within_1.5", 0.6),
+        ("table_6_7_mode_rows_within_3", 0.7),
+    ):
+        found, count = hits("summary", key)
+        assert found >= least * count, key
+        assert hits("control_constant_velocity_only", key)[0] < found
+    assert answer["summary"]["std_of_x_below_y"] == "7 of 7"
+
+
+def test_simulation_cost(root: Path) -> None:
+    """A minute of simulated log stays within its memory and costs less than stepping it."""
+    answer = json.loads(run_study(root, "simulation_cost"))
+    (row,) = answer["stages"].values()
+    assert answer["passed"]["memory"]
+    assert row["peer_over_ours"] > 1.5
+    assert row["record_30s_cpu_s"] < 0.8 * row["record_60s_cpu_s"]
