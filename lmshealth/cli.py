@@ -8,26 +8,31 @@ import os
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
-import json
-import sys
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-from rich.table import Table
 
+from lmshealth import terminal
 from lmshealth.errors import BadLog, LmshealthError
-from lmshealth.logs import Metadata, Refusal
-from lmshealth.results import Modes
+from lmshealth.logs import Log, Refusal
+from lmshealth.magnitudes import (
+    GRID_BAND,
+    Magnitude,
+    choose_bands,
+    find_growth,
+    read_magnitudes,
+)
+from lmshealth.parts import PARTS
+from lmshealth.results import Line, Modes
 
 if TYPE_CHECKING:
     from lmshealth.pipeline import RunResult
     from lmshealth.readers import ColumnMap
     from lmshealth.stage import Stage
+
+Result = TypeVar("Result")
 
 _DONE, _FAILED, _SOME_REFUSED = 0, 1, 3
 
@@ -49,18 +54,24 @@ class _Group(click.Group):
             ctx.exit(_FAILED)
 
 
-@click.group(cls=_Group, context_settings={"help_option_names": ["-h", "--help"]})
+def _examples(*lines: str) -> str:
+    """Write examples that stand unwrapped at the end of a command's help."""
+    # click leaves a paragraph alone that begins with a backspace.
+    return "\n".join(["\b", "Examples:", *(f"    lmshealth {line}" for line in lines)])
+
+
+@click.group(
+    cls=_Group,
+    context_settings={"help_option_names": ["-h", "--help"]},
+    epilog="Exit status: 0 done, 1 failed (one line on standard error says why), 2 wrong usage, "
+    "3 done but some logs were refused.",
+)
 @click.version_option(package_name="lmshealth")
 def main() -> None:
-    r"""Tell how much guide preload and mount stiffness a linear-motor stage has left.
-
-    \b
-    Exit status: 0 done, 1 failed (one line on standard error says why),
-    2 wrong usage, 3 done but some logs were refused.
-    """
+    """Tell how much guide preload and mount stiffness a linear-motor stage has left."""
 
 
-@main.command()
+@main.command(epilog=_examples("run logs/ --stage lms-y --out result/"))
 @click.argument("logs", type=click.Path(exists=True, file_okay=False, path_type=Path))
 @click.option(
     "--stage",
@@ -89,12 +100,7 @@ def main() -> None:
 def run(
     ctx: click.Context, /, logs: Path, stages: tuple[str, ...], out: Path, **options: Any
 ) -> None:
-    r"""Analyse a folder of logs: tables, verdict and report. Run again to go on.
-
-    \b
-    Example:
-        lmshealth run logs/ --stage lms-y --out result/
-    """
+    """Analyse a folder of logs: tables, verdict and report. Run again to go on."""
     from lmshealth.pipeline import Settings
     from lmshealth.pipeline import run as run_pipeline
     from lmshealth.stage import load_stage
@@ -106,51 +112,233 @@ def run(
         seed=options["seed"],
     )
     loaded = [load_stage(reference) for reference in stages]
-    with _progress() as progress:
+    with terminal.progress_bars() as progress:
         result = run_pipeline(logs, loaded, out, settings, progress)
     _tell(result)
     ctx.exit(_SOME_REFUSED if result.n_refused else _DONE)
 
 
-@main.command()
-@click.argument("logs", nargs=-1, required=True, type=click.Path(path_type=Path))
-@click.option("--stage", help="Stage description: a .toml file or a shipped name.")
-@click.option("--columns", type=click.Path(path_type=Path), help="Column map of the export.")
-@click.option("--channels", help="Use only these channels, separated by commas.")
-@click.option("--band", nargs=2, type=float, metavar="LOW HIGH", help="Use only this band, in Hz.")
-@click.option(
+_LOGS = click.argument("logs", nargs=-1, required=True, type=click.Path(path_type=Path))
+_STAGE = click.option("--stage", help="Stage description: a .toml file or a shipped name.")
+_COLUMNS = click.option(
+    "--columns", type=click.Path(path_type=Path), help="Column map of the export."
+)
+_FORMAT = click.option(
     "--format",
     "style",
     type=click.Choice(["table", "csv", "json"]),
     default="table",
     show_default=True,
 )
+_PART = click.option(
+    "--part",
+    type=click.Choice(PARTS),
+    default="record",
+    show_default=True,
+    help="Read all of the log, or what its set point says is this.",
+)
+
+
+@main.command(
+    epilog=_examples(
+        "modes log.h5 --stage lms-y",
+        "modes export.csv --columns map.toml --band 80 200 --format json",
+    )
+)
+@_LOGS
+@_STAGE
+@_COLUMNS
+@click.option("--channels", help="Use only these channels, separated by commas.")
+@click.option("--band", nargs=2, type=float, metavar="LOW HIGH", help="Use only this band, in Hz.")
+@_FORMAT
 @click.pass_context
 def modes(ctx: click.Context, /, logs: tuple[Path, ...], style: str, **options: Any) -> None:
-    r"""Identify the modes of single logs: frequency and damping with their uncertainty.
+    """Identify the modes of single logs: frequency and damping with their uncertainty."""
+    from lmshealth.modal import identify
+    from lmshealth.tables import frame, lines_rows, modes_rows, refused_rows
 
-    \b
-    Examples:
-        lmshealth modes log.h5 --stage lms-y
-        lmshealth modes export.csv --columns map.toml --band 80 200 --format json
-    """
-    from lmshealth.readers import load_columns
-    from lmshealth.stage import load_stage
-
-    stage = load_stage(options["stage"]) if options["stage"] else None
-    columns = load_columns(options["columns"]) if options["columns"] else None
+    stage, columns = _loaded(options["stage"], options["columns"])
     band = _checked_band(options["band"])
     channels = (
         [name.strip() for name in options["channels"].split(",")] if (options["channels"]) else None
     )
-    found: list[tuple[str, Metadata, Modes]] = []
+    found, lost = _each(
+        logs,
+        columns,
+        lambda log: (
+            log.name,
+            log.metadata,
+            identify(log, stage, channels=channels, band=band),
+        ),
+    )
+    rows = [row for log, metadata, own in found for row in modes_rows(log, metadata, own)]
+    refused = refused_rows([*lost, *(refusal for _, _, own in found for refusal in own.refused)])
+    if style == "csv":
+        click.echo(frame("modes", rows).to_csv(index=False), nl=False)
+    elif style == "json":
+        lines = [{"log": log, **row} for log, _, own in found for row in lines_rows(own.lines)]
+        terminal.print_json({"modes": rows, "lines": lines, "refused": refused})
+    else:
+        terminal.print_modes(rows, refused)
+    _exit(ctx, found, lost)
+
+
+@main.command(
+    epilog=_examples(
+        "error velocities/*.h5",
+        "error log.h5 --count 20 --floor-nm 50 --part settling --format json",
+    )
+)
+@_LOGS
+@click.option(
+    "--count",
+    type=click.IntRange(1),
+    default=100,
+    show_default=True,
+    help="Keep so many of the strongest harmonics.",
+)
+@click.option(
+    "--floor-nm",
+    type=click.FloatRange(0),
+    default=30.0,
+    show_default=True,
+    help="Then count those above this amplitude.",
+)
+@_PART
+@_COLUMNS
+@_FORMAT
+@click.pass_context
+def error(ctx: click.Context, /, logs: tuple[Path, ...], style: str, **options: Any) -> None:
+    """Read the following error: statistics, strongest harmonics, bandwidth, maximum magnitude.
+
+    Statistics are those of all samples, harmonics those of the longest stretch without gaps; json
+    lists each of them. Their cosines, added up, rebuild the following error.
+    """
+    from lmshealth.following import read_error
+    from lmshealth.tables import error_row, frame, harmonics_rows, refused_rows
+
+    _, columns = _loaded(None, options["columns"])
+    count, floor = options["count"], 1e-9 * options["floor_nm"]
+    found, lost = _each(
+        logs,
+        columns,
+        lambda log: (
+            log.name,
+            log.refused,
+            read_error(log, count=count, floor=floor, part=options["part"]),
+        ),
+    )
+    rows = [error_row(log, item) for log, _, own in found for item in own]
+    refused = refused_rows([*lost, *(refusal for _, its, _ in found for refusal in its)])
+    if style == "csv":
+        click.echo(frame("error", rows).to_csv(index=False), nl=False)
+    elif style == "json":
+        kept = [row for log, _, own in found for item in own for row in harmonics_rows(log, item)]
+        terminal.print_json({"error": rows, "harmonics": kept, "refused": refused})
+    else:
+        terminal.print_error(rows, refused)
+    _exit(ctx, found, lost)
+
+
+@main.command(
+    epilog=_examples(
+        "spectrum velocities/*.h5 --stage lms-y",
+        "spectrum velocities/*.h5 --band 10 400 --format csv",
+    )
+)
+@_LOGS
+@_STAGE
+@click.option(
+    "--band",
+    nargs=2,
+    type=float,
+    metavar="LOW HIGH",
+    help="Only modes, grid and lines of this band, in Hz; default 10 to 400 without a stage.",
+)
+@_PART
+@_COLUMNS
+@_FORMAT
+@click.pass_context
+def spectrum(ctx: click.Context, /, logs: tuple[Path, ...], style: str, **options: Any) -> None:
+    """Read the accelerometers: magnitude per modal frequency and velocity, and which grow.
+
+    With a stage its modes are read, and RMS in its health band and watched bands; without one a
+    grid of every 10 Hz. A magnitude is the amplitude of the strongest harmonic of a band. Lines
+    are found by a test that shows one where there is none in 1 % of channels.
+    """
+    from lmshealth.tables import frame, growth_rows, lines_rows, magnitudes_rows, refused_rows
+
+    stage, columns = _loaded(options["stage"], options["columns"])
+    band = _checked_band(options["band"])
+    found, lost = _each(logs, columns, lambda log: _survey(log, stage, band, options["part"]))
+    magnitudes = [item for _, own, _, _ in found for item in own]
+    growth = find_growth(magnitudes)
+    known = [(log, line) for log, _, seen, _ in found for line in seen]
+    rows = magnitudes_rows(magnitudes, growth, known)
+    lines = [{"log": log, **row} for log, _, seen, _ in found for row in lines_rows(seen)]
+    refused = refused_rows([*lost, *(refusal for *_, its in found for refusal in its)])
+    if style == "csv":
+        click.echo(frame("magnitudes", rows).to_csv(index=False), nl=False)
+    elif style == "json":
+        content = {"magnitudes": rows, "growth": growth_rows(growth), "lines": lines}
+        terminal.print_json({**content, "refused": refused})
+    else:
+        terminal.print_magnitudes(rows, lines, refused)
+    _exit(ctx, found, lost)
+
+
+_Survey = tuple[str, tuple[Magnitude, ...], tuple[Line, ...], tuple[Refusal, ...]]
+
+
+def _survey(log: Log, stage: Stage | None, band: tuple[float, float] | None, part: Any) -> _Survey:
+    """Read the accelerometers of a log: its name, magnitudes, lines and refusals."""
+    from lmshealth.lines import survey_lines
+    from lmshealth.modal import identify
+
+    accelerometers = [c for c in log.channels if c.kind == "acceleration"]
+    found: Modes | None = None
+    if stage is not None and accelerometers:
+        try:
+            found = identify(log, stage, channels=[c.name for c in accelerometers])
+        except BadLog:
+            found = None  # its modes are read where the description has them
+    bands = choose_bands(stage, found, band)
+    magnitudes = read_magnitudes(log, bands, part=part)
+    widest = band or (
+        min([GRID_BAND[0], *(b.low for b in bands)]),
+        max([GRID_BAND[1], *(b.high for b in bands)]),
+    )
+    lines = survey_lines(log, accelerometers, stage, widest)
+    return log.name, magnitudes, lines, log.refused
+
+
+def _loaded(stage: str | None, columns: Path | None) -> tuple[Stage | None, ColumnMap | None]:
+    from lmshealth.readers import load_columns
+    from lmshealth.stage import load_stage
+
+    return (
+        load_stage(stage) if stage else None,
+        load_columns(columns) if columns else None,
+    )
+
+
+def _each(
+    logs: Iterable[Path], columns: ColumnMap | None, look: Callable[[Log], Result]
+) -> tuple[list[Result], list[Refusal]]:
+    """Look at one log after the other; one that cannot be used is told and left out."""
+    from lmshealth.readers import read_log
+
+    found: list[Result] = []
     lost: list[Refusal] = []
     for path in logs:
         try:
-            found.append(_identify(path, stage, columns, channels, band))
-        except BadLog as error:
-            lost.append(Refusal(error.log, error.reason, error.detail))
-    _show_modes(found, lost, style)
+            found.append(look(read_log(path, columns=columns)))
+        except BadLog as why:
+            lost.append(Refusal(why.log, why.reason, why.detail))
+    return found, lost
+
+
+def _exit(ctx: click.Context, found: Sequence[object], lost: Sequence[Refusal]) -> None:
     for refusal in lost:
         click.echo(f"lmshealth: {refusal.log}: {refusal.reason}: {refusal.detail}", err=True)
     ctx.exit(_DONE if not lost else _SOME_REFUSED if found else _FAILED)
@@ -162,91 +350,6 @@ def _checked_band(band: tuple[float, float] | None) -> tuple[float, float] | Non
             f"needs 0 <= LOW < HIGH, got {band[0]:g} {band[1]:g}", param_hint="--band"
         )
     return band or None
-
-
-def _identify(
-    path: Path,
-    stage: Stage | None,
-    columns: ColumnMap | None,
-    channels: Sequence[str] | None,
-    band: tuple[float, float] | None,
-) -> tuple[str, Metadata, Modes]:
-    from lmshealth.modal import identify
-    from lmshealth.readers import read_log
-
-    log = read_log(path, columns=columns)
-    return log.name, log.metadata, identify(log, stage, channels=channels, band=band)
-
-
-def _show_modes(found: list[tuple[str, Metadata, Modes]], lost: list[Refusal], style: str) -> None:
-    from lmshealth.tables import frame, lines_rows, modes_rows, refused_rows
-
-    rows = [row for log, metadata, own in found for row in modes_rows(log, metadata, own)]
-    refused = refused_rows([*lost, *(refusal for _, _, own in found for refusal in own.refused)])
-    if style == "csv":
-        click.echo(frame("modes", rows).to_csv(index=False), nl=False)
-    elif style == "json":
-        lines = [{"log": log, **row} for log, _, own in found for row in lines_rows(own)]
-        content = {"modes": rows, "lines": lines, "refused": refused}
-        click.echo(json.dumps(_without_nan(content), indent=1, allow_nan=False))
-    else:
-        _print_tables(rows, refused)
-
-
-def _without_nan(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {key: _without_nan(item) for key, item in value.items()}
-    if isinstance(value, list):
-        return [_without_nan(item) for item in value]
-    return None if isinstance(value, float) and value != value else value
-
-
-def _print_tables(rows: list[dict[str, Any]], refused: list[dict[str, Any]]) -> None:
-    console = Console()
-    table = Table(title="Modes (± one standard deviation)" if rows else "No modes found")
-    for name in ("log", "mode", "channel", "frequency Hz", "damping %", "SNR"):
-        table.add_column(name, justify="left" if name in ("log", "mode", "channel") else "right")
-    for row in rows:
-        table.add_row(
-            row["log"],
-            row["mode"],
-            row["channel"],
-            f"{row['frequency_hz']:.4g} ± {row['frequency_std_hz']:.2g}"
-            if row["frequency_std_hz"] >= 1
-            else f"{row['frequency_hz']:.3f} ± {row['frequency_std_hz']:.3f}",
-            f"{100 * row['damping_ratio']:.2f} ± {100 * row['damping_ratio_std']:.2f}",
-            f"{row['snr']:.3g}",
-        )
-    console.print(table)
-    if refused:
-        table = Table(title="Refused")
-        for name in ("log", "channel", "mode", "reason", "detail"):
-            table.add_column(name, overflow="fold")
-        for row in refused:
-            table.add_row(*(row[name] for name in ("log", "channel", "mode", "reason", "detail")))
-        console.print(table)
-
-
-@contextmanager
-def _progress() -> Iterator[Any]:
-    """Show bars on a terminal's standard error, and nothing anywhere else."""
-    console = Console(stderr=True)
-    with Progress(
-        TextColumn("{task.description:<12}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeRemainingColumn(),
-        console=console,
-        disable=not sys.stderr.isatty(),
-    ) as bars:
-        known: dict[str, Any] = {}
-
-        def tell(what: str, done: int, total: int) -> None:
-            if what not in known:
-                known[what] = bars.add_task(what, total=total)
-            bars.update(known[what], completed=done, total=total)
-
-        yield tell
 
 
 def _tell(result: RunResult) -> None:

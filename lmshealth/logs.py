@@ -46,6 +46,8 @@ class Metadata:
         Whether the manifest declares this log part of the baseline.
     description : str or None
         Stage description the manifest names for this log.
+    velocity : float or None
+        Set velocity in m/s, for logs without a set point.
     """
 
     stage: str | None = None
@@ -55,6 +57,7 @@ class Metadata:
     servo_id: str | None = None
     baseline: bool | None = None
     description: str | None = None
+    velocity: float | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)

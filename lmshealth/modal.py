@@ -15,9 +15,9 @@ from scipy.special import softmax
 
 from lmshealth.bandfit import BAND, BandFit, View, fit_band
 from lmshealth.errors import BadLog, BadStage
-from lmshealth.lines import name_lines
+from lmshealth.lines import find_lines, name_lines
 from lmshealth.logs import Channel, Log, Refusal
-from lmshealth.peaks import find_excess, find_lines, find_peaks
+from lmshealth.peaks import find_excess, find_peaks
 from lmshealth.results import Line, Modes
 from lmshealth.spectra import find_segments, periodogram
 from lmshealth.stage import Stage
@@ -72,7 +72,7 @@ def identify(
         views = _transform(log, used, targets, band)
     else:
         views = _transform(log, used, (), band)
-        targets, seen = _search(log, views, band)
+        targets, seen = _search(log, used, views, band)
     best: list[BandFit] = []
     refused: list[Refusal] = []
     for cluster in _clusters(targets):
@@ -161,9 +161,12 @@ def _transform(
 
 
 def _search(
-    log: Log, views: tuple[View, ...], band: tuple[float, float] | None
+    log: Log,
+    channels: tuple[Channel, ...],
+    views: tuple[View, ...],
+    band: tuple[float, float] | None,
 ) -> tuple[tuple[Target, ...], list[tuple[str, float, float]]]:
-    """Find candidate modes, and lines that tower over them, in the band."""
+    """Find candidate modes, and lines in the longest segment, in the band."""
     longest = max(s.duration for view in views for s in view.spectra)
     low, high = band or (20 / longest, _TOP * log.sample_rate)
     low, high = max(low, 2 / longest), min(high, _TOP * log.sample_rate)
@@ -175,10 +178,11 @@ def _search(
             f"{longest:.3g} s at {log.sample_rate:g} Hz hold {held:.0f} Fourier frequencies from "
             f"{low:.4g} to {high:.4g} Hz; needed are at least 50",
         )
+    segment = max(find_segments(log, 0.0), key=lambda s: s.stop - s.start)
     lines = [
-        (view.channel, *line)
-        for view in views
-        for line in find_lines(max(view.spectra, key=lambda s: s.duration), low, high).tolist()
+        (channel.name, *line)
+        for channel in channels
+        for line in find_lines(channel, segment, log.sample_rate, (low, high)).tolist()
     ]
     return find_peaks(tuple(view.spectra for view in views), low, high), lines
 

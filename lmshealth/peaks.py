@@ -122,28 +122,6 @@ def find_excess(residual: Spectrum) -> Target | None:
     return Target("excess", frequency, scale / 1.5, min(max(3 * scale, 0.02), 0.15))
 
 
-def find_lines(spectrum: Spectrum, low: float, high: float) -> FloatArray:
-    """List lines that tower over their surroundings.
-
-    Parameters
-    ----------
-    spectrum : Spectrum
-        One segment of a channel.
-    low, high : float
-        Band in Hz.
-
-    Returns
-    -------
-    ndarray
-        Frequency in Hz and amplitude in m/s² of each, shape ``(n_lines, 2)``.
-    """
-    mask, _ = _towering(spectrum)
-    inside = (spectrum.frequency >= low) & (spectrum.frequency <= high)
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], (mask & inside).astype(int), [0]])))
-    rows = [spectrum.sine(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True)]
-    return np.array(rows).reshape(-1, 2)
-
-
 def _towering(spectrum: Spectrum) -> tuple[BoolArray, FloatArray]:
     """Ordinates that tower over those three to eight beside them, and the median of these.
 

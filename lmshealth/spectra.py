@@ -1,8 +1,10 @@
-"""From samples to FFT ordinates: segments, periodograms, their expectation, and lines."""
+"""From samples to FFT ordinates: segments, periodograms and their expectation."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import Literal
 
 import numpy as np
 from scipy import fft
@@ -14,23 +16,31 @@ from lmshealth.logs import Channel, Log
 _VELOCITY_TOLERANCE = 1e-3
 # The second difference of a displacement reaches over this part of the shortest period.
 _LAG_PERIODS = 8.0
+# So long after a move, in s, the stage settles: some periods of the slowest modes and of the loop.
+_SETTLING = 0.5
+
+Kind = Literal["whole", "ramp", "constant", "settling", "idle"]
 
 
 @dataclass(frozen=True, slots=True)
 class Segment:
-    """A stretch of a log without gaps and at one set velocity.
+    """A stretch of a log without gaps.
 
     Attributes
     ----------
     start, stop : int
         Half-open range of samples.
     velocity : float
-        Set velocity in m/s; NaN where the log has no set point.
+        Mean set velocity in m/s; NaN where the log has no set point.
+    kind : str
+        ``constant`` velocity, ``ramp`` between two velocities, ``settling`` within half a second
+        after a move, ``idle`` at rest otherwise; ``whole`` where the log has no set point.
     """
 
     start: int
     stop: int
     velocity: float
+    kind: Kind = "whole"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -67,6 +77,11 @@ class Spectrum:
         cut = slice(int(first), int(last))
         return Spectrum(self.frequency[cut], self.periodogram[cut], self.duration, self.velocity)
 
+    def density(self, low: float, high: float) -> tuple[float, int]:
+        """Mean ordinate from low to high Hz and its degrees of freedom, two per ordinate."""
+        cut = self.band(low, high).periodogram
+        return float(cut.mean()) if cut.size else float("nan"), 2 * cut.size
+
     def sine(self, first: int, last: int) -> tuple[float, float]:
         """Frequency in Hz and amplitude of a sine within some ordinates: Σ I = A² T / 2."""
         ordinates = self.periodogram[first:last]
@@ -74,13 +89,38 @@ class Spectrum:
         return float(self.frequency[first + int(np.argmax(ordinates))]), float(amplitude)
 
 
-def find_segments(log: Log, shortest: float) -> tuple[Segment, ...]:
-    """Cut a log into stretches without gaps and at constant set velocity.
+def find_phases(log: Log) -> tuple[Segment, ...]:
+    """Cut a log where it has gaps and where its set point changes what it does.
 
     Parameters
     ----------
     log : Log
         Without a set point each gap-free piece is one segment.
+
+    Returns
+    -------
+    tuple of Segment
+        In order of time; together they are all of the log but its gaps.
+    """
+    velocity = log.reference_velocity
+    if velocity is None:
+        return tuple(Segment(start, stop, float("nan")) for start, stop in log.pieces)
+    scale = max((float(np.abs(velocity[a:b]).max()) for a, b in log.pieces), default=0.0)
+    settling = round(_SETTLING * log.sample_rate)
+    found: list[Segment] = []
+    for start, stop in log.pieces:
+        found += _phases(velocity[start:stop], start, scale, settling)
+    return tuple(found)
+
+
+def find_segments(log: Log, shortest: float) -> tuple[Segment, ...]:
+    """Cut a log into stretches without gaps in which it is stationary.
+
+    Parameters
+    ----------
+    log : Log
+        Without a set point each gap-free piece is one segment, and so it is of a log that never
+        moves (ambient vibration); else the stretches of constant velocity are.
     shortest : float
         Segments below this many seconds are left out.
 
@@ -89,30 +129,34 @@ def find_segments(log: Log, shortest: float) -> tuple[Segment, ...]:
     tuple of Segment
         In order of time; empty if nothing is long enough.
     """
-    found = []
-    for start, stop in log.pieces:
-        if log.reference_velocity is None:
-            found.append(Segment(start, stop, float("nan")))
-        else:
-            found += _constant_velocity(log.reference_velocity[start:stop], start)
+    phases = find_phases(log)
+    rests = all(phase.kind == "idle" for phase in phases)
     n_least = max(8, round(shortest * log.sample_rate))
-    return tuple(segment for segment in found if segment.stop - segment.start >= n_least)
+    return tuple(
+        phase
+        for phase in phases
+        if (rests or phase.kind in ("constant", "whole")) and phase.stop - phase.start >= n_least
+    )
 
 
-def _constant_velocity(velocity: FloatArray, offset: int) -> list[Segment]:
-    scale = float(np.max(np.abs(velocity), initial=0.0))
-    # A record at rest throughout (ambient vibration) is one segment of velocity zero.
-    moving = np.abs(velocity) > _VELOCITY_TOLERANCE * scale if scale > 0 else velocity == velocity
+def _phases(velocity: FloatArray, offset: int, scale: float, settling: int) -> list[Segment]:
+    """Cut a gap-free piece by its set velocity; ``settling`` in samples."""
+    moving = np.abs(velocity) > _VELOCITY_TOLERANCE * scale
     # Steps are taken over 1 ms or so of samples: one sample of a slow ramp looks constant.
     lag = max(1, min(20, velocity.size // 4))
     change = np.abs(velocity[lag:] - velocity[:-lag]) > _VELOCITY_TOLERANCE * max(scale, 1e-12)
     steady = moving.copy()
     for shift in (0, lag):
         steady[shift : shift + change.size] &= ~change
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], steady.astype(int), [0]])))
+    # Samples since the last one that moved; a piece that begins at rest is taken to be idle.
+    index = np.arange(velocity.size)
+    last = np.maximum.accumulate(np.where(moving, index, -settling - 1))
+    kinds: tuple[Kind, ...] = ("ramp", "constant", "settling", "idle")
+    code = np.where(moving, steady, np.where(index - last <= settling, 2, 3))
+    cuts = [0, *(np.flatnonzero(np.diff(code)) + 1).tolist(), velocity.size]
     return [
-        Segment(offset + a, offset + b, float(np.mean(velocity[a:b])))
-        for a, b in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True)
+        Segment(offset + a, offset + b, float(np.mean(velocity[a:b])), kinds[int(code[a])])
+        for a, b in pairwise(cuts)
     ]
 
 
@@ -120,6 +164,10 @@ def periodogram(
     channel: Channel, segment: Segment, sample_rate: float, top: float = np.inf
 ) -> Spectrum:
     """Compute the one-sided periodogram of a channel as acceleration.
+
+    Mean and straight trend are taken out first, so that they do not leak into the band. With them
+    goes the share 3/(πk)² of white noise, and up to 6/(πk)² of the amplitude of a sine, at the
+    k-th ordinate: below 10⁻⁶ from the 780th on.
 
     A displacement is differenced twice before the transform rather than multiplied by ω² after
     it: differencing first keeps its large slow part from leaking into the band of the modes. The
@@ -144,11 +192,7 @@ def periodogram(
         From the first Fourier frequency up to just below Nyquist, for a displacement up to
         four times ``top`` if that is lower.
     """
-    x = channel.values[segment.start : segment.stop]
-    lag = 0
-    if channel.kind == "displacement":
-        lag = max(1, int(sample_rate / (_LAG_PERIODS * top)))
-        x = (x[2 * lag :] - 2 * x[lag:-lag] + x[: -2 * lag]) * sample_rate**2
+    x, lag = as_acceleration(channel, segment, sample_rate, top)
     n = x.size
     ramp = np.arange(n) - (n - 1) / 2
     x = x - x.mean() - ramp * (ramp @ x / (ramp @ ramp))
@@ -160,11 +204,37 @@ def periodogram(
     spectrum = Spectrum(frequency, power, n / sample_rate, segment.velocity)
     if lag == 0:
         return spectrum
-    # The difference over L samples has gain (2 fs sin(ωL/2fs))², the second derivative ω²; the
-    # former vanishes at fs/L, eight times the top.
+    power = power * lag_gain(frequency, lag, sample_rate) ** 2
+    return replace(spectrum, periodogram=power).band(0.0, 4 * top)
+
+
+def as_acceleration(
+    channel: Channel, segment: Segment, sample_rate: float, top: float
+) -> tuple[FloatArray, int]:
+    """Cut out a segment; of a displacement take the second difference.
+
+    Returns
+    -------
+    values : ndarray
+        In m/s² but for `lag_gain`, shape ``(n,)``.
+    lag : int
+        Samples that the difference reaches over; 0 for an acceleration.
+    """
+    x = channel.values[segment.start : segment.stop]
+    if channel.kind != "displacement":
+        return x, 0
+    lag = max(1, int(sample_rate / (_LAG_PERIODS * top)))
+    return (x[2 * lag :] - 2 * x[lag:-lag] + x[: -2 * lag]) * sample_rate**2, lag
+
+
+def lag_gain(frequency: FloatArray, lag: int, sample_rate: float) -> FloatArray:
+    """Amplitude of the second derivative over that of the second difference over L samples.
+
+    The latter has gain (2 fs sin(ωL/2fs))², the former ω²; the difference vanishes at fs/L, eight
+    times the top of its band.
+    """
     half = np.pi * frequency / sample_rate
-    gain = np.abs(np.sin(lag * half)).clip(1e-6)
-    return replace(spectrum, periodogram=power * (half / gain) ** 4).band(0.0, 4 * top)
+    return np.asarray((half / np.abs(np.sin(lag * half)).clip(1e-6)) ** 2)
 
 
 def periodogram_kernel(frequency: FloatArray, duration: float, fine: FloatArray) -> FloatArray:

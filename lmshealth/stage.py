@@ -29,6 +29,11 @@ Positive = Annotated[float, Meta(gt=0)]
 Share = Annotated[float, Meta(gt=0, lt=1)]
 
 
+def _check_band(key: str, low: float, high: float) -> None:
+    if not low < high:
+        raise ValueError(f"{key} reaches from {low:g} to {high:g} Hz: needed low < high")
+
+
 class _Part(Struct, frozen=True, forbid_unknown_fields=True):
     """Part of a stage description: unknown keys are errors, so that typing slips are seen."""
 
@@ -56,6 +61,9 @@ class Watch(_Part, frozen=True):
 
     low_hz: Positive
     high_hz: Positive
+
+    def __post_init__(self) -> None:
+        _check_band("[[watch]]", self.low_hz, self.high_hz)
 
 
 class Limit(_Part, frozen=True):
@@ -142,6 +150,7 @@ class Description(_Part, frozen=True):
     mode: tuple[ModeSpec, ...]
     source: str = ""
     match: Match = Match()
+    health_band_hz: tuple[Positive, Positive] | None = None
     watch: tuple[Watch, ...] = ()
     parameter: tuple[ParameterSpec, ...] = ()
     map: MapSpec | None = None
@@ -153,6 +162,8 @@ class Description(_Part, frozen=True):
     usage: Usage = Usage()
 
     def __post_init__(self) -> None:
+        if self.health_band_hz is not None:
+            _check_band("health_band_hz", *self.health_band_hz)
         for kind in ("mode", "parameter", "covariate"):
             names = [part.name for part in getattr(self, kind)]
             twice = {name for name in names if names.count(name) > 1}

@@ -14,7 +14,9 @@ import pytest
 from click.testing import CliRunner, Result
 
 from lmshealth.cli import main
-from lmshealth.tables import COLUMNS
+from lmshealth.tables import COLUMNS, LOOKS
+from models.stages import STAGES
+from models.velocities import Experiment, drive_velocities
 from tests.signals import Mode, accelerations, write_archive, write_archive_stage, write_log
 
 MODE_KEYS = set(COLUMNS["modes"].split())
@@ -66,12 +68,13 @@ def stage(folder: Path) -> Path:
 
 def test_every_command_has_help_with_an_example() -> None:
     """``--help`` of each command shows how it is called."""
-    assert set(main.commands) >= {"run", "modes"}
+    assert set(main.commands) >= {"run", "modes", "error", "spectrum"}
     for name in main.commands:
         result = call(name, "--help")
         assert result.exit_code == 0
         assert "Example" in result.stdout
-        assert f"lmshealth {name} " in result.stdout
+        # One line per example, as it is typed.
+        assert f"\n      lmshealth {name} " in result.stdout
 
 
 def test_the_exit_statuses_are_told() -> None:
@@ -102,6 +105,12 @@ def test_the_version_is_told() -> None:
         ("modes", "log.h5", "--band", "200", "80"),
         ("modes", "log.h5", "--band", "-5", "80"),
         ("modes", "log.h5", "--nonsense"),
+        ("error",),
+        ("error", "log.h5", "--count", "0"),
+        ("error", "log.h5", "--floor-nm", "-1"),
+        ("error", "log.h5", "--part", "ramp"),
+        ("spectrum",),
+        ("spectrum", "log.h5", "--band", "200", "80"),
         ("nonsense",),
     ],
 )
@@ -212,6 +221,108 @@ def test_the_program_runs_as_a_process(folder: Path, stage: Path) -> None:
     )
     assert (done.returncode, done.stderr) == (0, "")
     assert len(strict(done.stdout)["modes"]) == 2
+
+
+# error and spectrum
+
+
+@pytest.fixture(scope="module")
+def strokes(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    """Drive the simulated Y at four velocities, 4 s each with acceleration and braking."""
+    folder = tmp_path_factory.mktemp("strokes")
+    drive_velocities(
+        Experiment(STAGES["lms-y"]), folder, "hdf5", velocities=(0.005, 0.02, 0.1, 0.4)
+    )
+    return sorted(folder.glob("*.h5"))
+
+
+def test_error_as_json_lists_every_harmonic(strokes: list[Path]) -> None:
+    """Rows have the columns of the table; the harmonics' cosines rebuild what they claim."""
+    result = call("error", *strokes, "--count", 20, "--format", "json")
+    assert (result.exit_code, result.stderr) == (0, "")
+    content = strict(result.stdout)
+    assert set(content) == {"error", "harmonics", "refused"}
+    assert [row["velocity_mm_s"] for row in content["error"]] == pytest.approx([5, 20, 100, 400])
+    for row in content["error"]:
+        assert set(row) == set(LOOKS["error"].split())
+        own = [h for h in content["harmonics"] if h["log"] == row["log"]]
+        assert len(own) == 20
+        assert own[0]["amplitude_um"] == row["max_magnitude_um"]
+        power = sum(h["amplitude_um"] ** 2 / 2 for h in own)  # type: ignore[operator]
+        assert power / row["std_um"] ** 2 == pytest.approx(row["share_explained"], rel=1e-6)  # type: ignore[operator]
+
+
+def test_error_as_csv_and_table(strokes: list[Path]) -> None:
+    """One row per log; a floor above everything leaves cells empty, the table a dash."""
+    arguments = ("error", *strokes, "--floor-nm", 1e6)
+    rows = list(csv.DictReader(io.StringIO(call(*arguments, "--format", "csv").stdout)))
+    assert len(rows) == 4
+    assert {row["bandwidth_above_floor_hz"] for row in rows} == {""}
+    shown = call(*arguments).stdout
+    assert "velocity-0400.000.h5" in shown
+    assert "–" in shown
+
+
+def test_error_of_a_part_and_its_refusals(strokes: list[Path], folder: Path) -> None:
+    """A stroke settles; a log without Δe, or that never settles, is refused: status 3, then 1."""
+    result = call("error", strokes[-1], folder / "bare.csv", "--part", "settling")
+    assert result.exit_code == 3
+    assert "no-delta-e" in result.stderr
+    result = call("error", strokes[0], "--part", "settling")
+    assert result.exit_code == 1
+    assert "no-such-part" in result.stderr
+    assert len(result.stderr.splitlines()) == 1
+
+
+def test_spectrum_as_json_says_what_grows(strokes: list[Path]) -> None:
+    """Pitch grows with velocity and is read by both accelerometers; 50 Hz is mains."""
+    result = call("spectrum", *strokes, "--stage", "lms-y", "--format", "json")
+    assert (result.exit_code, result.stderr) == (0, "")
+    content = strict(result.stdout)
+    assert set(content) == {"magnitudes", "growth", "lines", "refused"}
+    assert all(set(row) == set(LOOKS["magnitudes"].split()) for row in content["magnitudes"])
+    assert len(content["magnitudes"]) == 4 * 2 * 7  # logs, accelerometers, bands
+    pitch = [row for row in content["growth"] if row["band"] == "pitch"]
+    assert [row["grows"] for row in pitch] == [True, True]
+    assert {line["kind"] for line in content["lines"]} >= {"mains"}
+    mains = [line["frequency_hz"] for line in content["lines"] if line["kind"] == "mains"]
+    assert min(mains) == pytest.approx(50.0, abs=0.05)  # type: ignore[type-var]
+
+
+def test_spectrum_without_a_stage_reads_the_papers_grid(strokes: list[Path]) -> None:
+    """Every 10 Hz of the band, as CSV and as a table."""
+    arguments = ("spectrum", *strokes, "--band", 100, 140)
+    rows = list(csv.DictReader(io.StringIO(call(*arguments, "--format", "csv").stdout)))
+    assert [row["band"] for row in rows[:5]] == [f"{f} Hz" for f in range(100, 141, 10)]
+    assert len(rows) == 4 * 2 * 5
+    assert "grows" in call(*arguments).stdout
+
+
+def test_one_velocity_has_no_slope_and_that_is_no_failure(strokes: list[Path]) -> None:
+    """A single log is read; what grows cannot be told: null, and a dash in the table."""
+    content = strict(call("spectrum", strokes[0], "--format", "json").stdout)
+    assert {row["slope"] for row in content["growth"]} == {None}
+    assert {row["grows"] for row in content["growth"]} == {None}
+    result = call("spectrum", strokes[0])
+    assert result.exit_code == 0
+    assert "–" in result.stdout
+
+
+def test_spectrum_refuses_what_it_cannot_read(folder: Path, tmp_path: Path) -> None:
+    """No accelerometer and a record too short are named; all refused is status 1."""
+    (tmp_path / "slow.csv").write_text("# sample_rate_hz: 500\ndelta_e_um\n1\n2\n3\n1\n2\n")
+    (tmp_path / "short.csv").write_text(
+        "# sample_rate_hz: 500\nacc_x_m_s2\n" + "".join(f"{v}\n" for v in _noise()[:100])
+    )
+    result = call("spectrum", tmp_path / "slow.csv", tmp_path / "short.csv", "--band", 10, 200)
+    assert result.exit_code == 1
+    assert "no-accelerometer" in result.stderr
+    assert "too-short" in result.stderr
+    assert len(result.stderr.splitlines()) == 2
+    assert (
+        call("spectrum", folder / "bare.csv", tmp_path / "short.csv", "--band", 10, 200).exit_code
+        == 3
+    )
 
 
 # run

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 
@@ -9,6 +11,7 @@ from lmshealth.logs import Channel
 from lmshealth.spectra import (
     Segment,
     Spectrum,
+    find_phases,
     find_segments,
     periodogram,
     periodogram_kernel,
@@ -75,6 +78,41 @@ def test_frequencies_end_below_nyquist() -> None:
         spectrum = whole(np.random.default_rng(0).normal(size=n))
         assert spectrum.frequency[0] == pytest.approx(RATE / n)
         assert RATE / 2 - RATE / n <= spectrum.frequency[-1] < RATE / 2
+
+
+@pytest.mark.parametrize("kind", ["acceleration", "displacement"])
+@pytest.mark.parametrize("phase", [0.0, 0.9, np.pi / 2])
+def test_a_sine_reads_its_amplitude_to_a_millionth(kind: str, phase: float) -> None:
+    """From the 780th ordinate on the trend takes less than 1e-6 away, whatever the phase."""
+    n, k = 16_000, 800
+    lost = 2 if kind == "displacement" else 0
+    frequency = k * RATE / n
+    spectrum = whole(sine(n + lost, RATE, frequency, 0.02, phase), kind)
+    at = int(np.argmax(spectrum.periodogram))
+    amplitude = np.sqrt(2 * spectrum.periodogram[at] / spectrum.duration)
+    factor = (2 * np.pi * frequency) ** 2 if lost else 1.0
+    assert amplitude == pytest.approx(0.02 * factor, rel=1e-6)
+
+
+def test_what_the_trend_takes_from_the_lowest_ordinates_is_as_stated() -> None:
+    """White noise loses the share 3/(πk)² at the k-th ordinate: the projection says so exactly."""
+    n, ks = 4000, np.array([1, 2, 10, 100, 800])
+    t = np.arange(n)
+    ramp = t - (n - 1) / 2
+    part = np.abs(np.exp(-2j * np.pi * np.outer(ks, t) / n) @ ramp) ** 2 / (ramp @ ramp) / n
+    np.testing.assert_allclose(part, 3 / (np.pi * ks) ** 2, rtol=0.2)
+    assert part[-1] < 1e-6
+
+
+def test_the_mean_ordinate_of_a_band_has_two_degrees_of_freedom_each() -> None:
+    """The density of a band scatters over seeds as χ² of its degrees of freedom says."""
+    rng = np.random.default_rng(12)
+    readings = [whole(white(rng, 2.0, 2000, RATE)).density(100.0, 150.0) for _ in range(500)]
+    level = np.array([level for level, _ in readings])
+    (dof,) = {dof for _, dof in readings}
+    assert dof == 100
+    assert abs(level.mean() / 2 - 1) < 4.5 * np.sqrt(2 / dof / 500)
+    assert abs(level.var() / (2**2 * 2 / dof) - 1) < 4.5 * np.sqrt(2.5 / 500)
 
 
 def test_a_displacement_sine_reads_its_acceleration() -> None:
@@ -152,6 +190,38 @@ def test_moves_are_cut_to_their_constant_velocity() -> None:
         assert (stop - start) - (segment.stop - segment.start) <= 42
 
 
+def test_phases_are_all_of_a_move_and_named() -> None:
+    """Rest, ramp, constant velocity and settling follow each other without a hole."""
+    velocity, _ = moves()
+    log = make_log({"acc_a": np.zeros(velocity.size)}, 20_000.0, velocity=velocity)
+    phases = find_phases(log)
+    assert phases[0].start == 0
+    assert phases[-1].stop == velocity.size
+    assert all(a.stop == b.start for a, b in pairwise(phases))
+    long = [p.kind for p in phases if p.stop - p.start > 20]
+    move = ["ramp", "constant", "ramp", "settling"]
+    assert long == ["idle", *move, *move]
+
+
+def test_rest_becomes_idle_half_a_second_after_a_move() -> None:
+    """Settling ends after half a second, wherever the rest ends."""
+    velocity = np.concatenate([np.full(2000, 0.1), np.zeros(3000)])
+    phases = find_phases(make_log({"acc_a": np.zeros(5000)}, RATE, velocity=velocity))
+    settling, idle = phases[-2:]
+    assert (settling.kind, idle.kind) == ("settling", "idle")
+    assert settling.stop - settling.start == pytest.approx(0.5 * RATE, abs=1)
+    assert idle.stop == 5000
+
+
+def test_rest_beside_moves_is_not_stationary() -> None:
+    """In a log that moves, a gap-free piece at rest is no segment; moves there are."""
+    velocity = np.concatenate([np.full(2000, 0.1), np.zeros(2000)])
+    log = make_log(
+        {"acc_a": np.zeros(4000)}, RATE, velocity=velocity, pieces=((0, 1900), (2100, 4000))
+    )
+    assert [s.kind for s in find_segments(log, 0.1)] == ["constant"]
+
+
 def test_short_segments_are_left_out() -> None:
     """A stretch below the shortest useful one is no segment."""
     velocity, _ = moves()
@@ -184,7 +254,7 @@ def test_a_gap_inside_a_move_is_not_bridged() -> None:
 def test_a_record_at_rest_throughout_is_one_segment() -> None:
     """Ambient vibration with the axis standing still is analysed, at velocity zero."""
     log = make_log({"acc_a": np.zeros(4000)}, RATE, velocity=np.zeros(4000))
-    assert find_segments(log, 0.1) == (Segment(0, 4000, 0.0),)
+    assert find_segments(log, 0.1) == (Segment(0, 4000, 0.0, "idle"),)
 
 
 def test_a_continuously_accelerating_sweep_has_no_segment() -> None:

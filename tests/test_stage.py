@@ -176,3 +176,27 @@ def test_shipped_stages_load(name: str) -> None:
     assert len(stage.informative) == 3
     assert [p.name for p in stage.parameters] == ["guide_preload", "mount_stiffness"]
     assert all(p.limit for p in stage.parameters)
+
+
+@pytest.mark.parametrize(("name", "band"), [("lms-x", (10, 150)), ("lms-y", (10, 390))])
+def test_shipped_stages_have_the_papers_health_band(name: str, band: tuple[float, float]) -> None:
+    """The health band comes from the description."""
+    assert load_stage(name).description.health_band_hz == band
+
+
+@pytest.mark.parametrize(
+    ("line", "key"),
+    [
+        ("health_band_hz = [150, 10]", "health_band_hz"),
+        ("health_band_hz = [10]", "health_band_hz"),
+        ("[[watch]]\nlow_hz = 20\nhigh_hz = 20", "watch"),
+    ],
+)
+def test_a_band_that_is_none_is_named(tmp_path: Path, line: str, key: str) -> None:
+    """Bands whose ends are swapped or missing are errors at the door."""
+    path = tmp_path / "bad.toml"
+    path.write_text(
+        f'name = "bad"\n{line}\n[[mode]]\nname = "roll"\nfrequency_hz = 5\ndamping_ratio = 0.1\n'
+    )
+    with pytest.raises(BadStage, match=key):
+        load_stage(str(path))

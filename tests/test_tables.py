@@ -128,7 +128,7 @@ def test_unknown_metadata_are_empty_cells() -> None:
 
 def test_lines_have_the_keys_of_the_contract() -> None:
     """A line is told by frequency, amplitude with unit, kind and channel."""
-    (row,) = lines_rows(two_modes())
+    (row,) = lines_rows(two_modes().lines)
     assert row == {
         "frequency_hz": 50.0,
         "amplitude": 0.1,

@@ -16,10 +16,11 @@
 ``no-signal``       no usable channel of Δe or acceleration is left
 =================== ==============================================================================
 
-``Log.refused`` lists channels that were left out (``flat``, ``clipped``, ``missing-samples``) and
-stretches that were (``gaps``: the channel itself is used, around them).
+``Log.refused`` lists channels that were left out (``flat``, ``clipped``, ``missing-samples``, and
+``time`` for a sample rate of its own) and stretches that were (``gaps``: the channel itself is
+used, around them).
 
-pandas, h5py and pyarrow are imported when the first file needs them.
+pandas, scipy, h5py, pyarrow, npTDMS and pyuff are imported when the first file needs them.
 """
 
 from lmshealth.readers.archive import Found, Manifest, find_logs, read_manifest

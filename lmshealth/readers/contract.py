@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import cast
 
 import numpy as np
@@ -65,7 +65,7 @@ def to_log(
     series = _series(raw, columns)
     time = _first(series, "time")
     axis = time_axis(None if time is None else time.values, rate)
-    refused: list[Refusal] = []
+    refused = [replace(refusal, log=name) for refusal in raw.refused]
     if axis.note:
         refused.append(Refusal(name, "gaps", axis.note, channel="time_s"))
     channels, missing = _usable_channels(series, name, refused)
@@ -97,7 +97,8 @@ def _said(overrides: Mapping[str, str]) -> dict[str, str]:
 def _series(raw: Raw, columns: ColumnMap) -> list[_Series]:
     """Name the columns, convert them to SI and compare their lengths."""
     there = f"there: {listed(raw.present)}"
-    if absent := sorted(set(columns.columns.values()) - set(raw.columns)):
+    left_out = {refusal.channel for refusal in raw.refused}
+    if absent := sorted(set(columns.columns.values()) - set(raw.columns) - left_out):
         raise Unusable("columns", f"the column map needs {listed(absent)}; {there}")
     series = []
     for source, values in raw.columns.items():

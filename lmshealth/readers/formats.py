@@ -7,12 +7,15 @@ from pathlib import Path
 from lmshealth.readers.columns import ColumnMap
 from lmshealth.readers.delimited import CSV, CSV_GZ
 from lmshealth.readers.hdf5 import HDF5
+from lmshealth.readers.mat import MAT
 from lmshealth.readers.parquet import PARQUET
 from lmshealth.readers.raw import Format, Raw
+from lmshealth.readers.tdms import TDMS
 from lmshealth.readers.trouble import Unusable, listed
+from lmshealth.readers.uff import UFF
 
 # Binary formats first: text is what is left when no signature is found.
-FORMATS: tuple[Format, ...] = (HDF5, PARQUET, CSV_GZ, CSV)
+FORMATS: tuple[Format, ...] = (HDF5, PARQUET, TDMS, MAT, CSV_GZ, UFF, CSV)
 SUFFIXES: tuple[str, ...] = tuple(sorted(s for form in FORMATS for s in form.suffixes))
 
 _HEAD = 4096

@@ -19,11 +19,13 @@ KEYS = (
     "servo_id",
     "baseline",
     "description",
+    "velocity_mm_s",
 )
 
 _BOOLEANS = {"true": True, "1": True, "false": False, "0": False}
 _LONGEST_NAME = 200
 _METRES_PER_KM = 1e3
+_METRES_PER_MM = 1e-3
 
 
 def parse_metadata(text: Mapping[str, str]) -> tuple[Metadata, float | None]:
@@ -55,6 +57,7 @@ def parse_metadata(text: Mapping[str, str]) -> tuple[Metadata, float | None]:
         servo_id=_name(given, "servo_id"),
         baseline=_boolean(given),
         description=_name(given, "description"),
+        velocity=_velocity(given),
     )
     return metadata, _sample_rate(given)
 
@@ -103,6 +106,12 @@ def _travel(given: Mapping[str, str]) -> float | None:
     if not 0 <= travel < math.inf:
         raise _bad(given, "travel_km", "an odometer of 0 or more")
     return travel
+
+
+def _velocity(given: Mapping[str, str]) -> float | None:
+    if "velocity_mm_s" not in given:
+        return None
+    return _number(given, "velocity_mm_s") * _METRES_PER_MM
 
 
 def _sample_rate(given: Mapping[str, str]) -> float | None:

@@ -9,7 +9,7 @@ import numpy as np
 
 from lmshealth.arrays import FloatArray
 from lmshealth.readers.columns import ColumnMap
-from lmshealth.readers.raw import Format, Raw, check_size, not_numeric, wanted
+from lmshealth.readers.raw import Format, Raw, check_size, missing_library, not_numeric, wanted
 from lmshealth.readers.trouble import Unusable, listed
 
 _MAGIC = b"PAR1"
@@ -21,9 +21,7 @@ def _load(path: Path, columns: ColumnMap) -> Raw:
     try:
         import pyarrow.parquet as pq
     except ImportError as error:
-        raise Unusable(
-            "format", "reading Parquet needs pyarrow: pip install 'lmshealth[formats]'"
-        ) from error
+        raise missing_library("Parquet", "pyarrow") from error
     # Without pre_buffer the columns are streamed; with it the whole file is held twice.
     with pq.ParquetFile(path, pre_buffer=False, page_checksum_verification=True) as file:
         schema = file.schema_arrow

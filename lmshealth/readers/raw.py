@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from lmshealth.arrays import FloatArray
+from lmshealth.logs import Refusal
 from lmshealth.readers.columns import ColumnMap
 from lmshealth.readers.trouble import Unusable
 
@@ -29,11 +30,14 @@ class Raw:
         As the file has it.
     present : tuple of str
         All column names of the file, for messages.
+    refused : tuple of Refusal
+        Channels that are wanted and cannot go with the others; their log is not named yet.
     """
 
     columns: dict[str, FloatArray]
     metadata: dict[str, str]
     present: tuple[str, ...]
+    refused: tuple[Refusal, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,6 +86,11 @@ def check_size(decoded: int, stored: int) -> None:
 def wanted(names: Iterable[str], columns: ColumnMap) -> list[str]:
     """Choose the columns of a file that the contract or the column map ask for."""
     return [name for name in names if columns.target(name) is not None]
+
+
+def missing_library(form: str, library: str) -> Unusable:
+    """Say that the library which reads a format is not installed."""
+    return Unusable("format", f"reading {form} needs {library}: pip install 'lmshealth[formats]'")
 
 
 def not_numeric(column: str, found: str) -> Unusable:

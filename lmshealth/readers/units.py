@@ -31,8 +31,11 @@ _UNITS: dict[str, tuple[str, float]] = {
 # `_m_s2` must be tried before `_s`, or an acceleration would be read as a time.
 _LONGEST_FIRST = sorted(_UNITS, key=len, reverse=True)
 
-_SPELLINGS = str.maketrans({"/": "_", "^": None, "µ": "u", "μ": "u", "²": "2", " ": None})
-_ALIASES = {"A": "a", "mA": "ma"}
+# "Â" is left of a superscript or a micro sign that some exporter encoded twice.
+_SPELLINGS = str.maketrans(
+    {"/": "_", "^": None, "*": None, "µ": "u", "μ": "u", "²": "2", " ": None, "Â": None}
+)
+_ALIASES = {"A": "a", "mA": "ma", "gn": "g", "m_s_s": "m_s2", "m_sec2": "m_s2"}
 
 _DIMENSIONS: dict[Role, str] = {
     "displacement": "length",
@@ -88,6 +91,12 @@ def unit_key(text: str) -> str | None:
     word = text.strip().translate(_SPELLINGS)
     word = _ALIASES.get(word, word)
     return word if word in _UNITS else None
+
+
+def acceleration_unit(text: str) -> str | None:
+    """Find the contract's word for a unit of acceleration; None for any other unit."""
+    word = unit_key(text)
+    return word if word is not None and _UNITS[word][0] == "acceleration" else None
 
 
 def parse_column(column: str, unit: str | float | None = None) -> Signal:

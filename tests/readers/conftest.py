@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gzip
+import warnings
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
@@ -11,6 +12,9 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+import pyuff
+import scipy.io
+from nptdms import ChannelObject, RootObject, TdmsWriter
 
 META = {
     "stage": "demo-Y",
@@ -43,12 +47,48 @@ def write(path: Path, columns: Mapping[str, np.ndarray], meta: Mapping[str, str]
     elif path.suffix == ".parquet":
         table = pa.table(dict(columns)).replace_schema_metadata(dict(meta) | {"pandas": "{}"})
         pq.write_table(table, path)
+    elif path.suffix == ".tdms":
+        channels = [ChannelObject("log", name, values) for name, values in columns.items()]
+        with TdmsWriter(str(path)) as writer:
+            writer.write_segment([RootObject(dict(meta)), *channels])
+    elif path.suffix == ".mat":
+        scipy.io.savemat(path, {**columns, **meta}, do_compression=True)
     else:
         lines = [f"# {key}: {value}" for key, value in meta.items()] + [",".join(columns)]
         rows = zip(*columns.values(), strict=True)
         lines += [",".join(repr(float(value)) for value in row) for row in rows]
         data = ("\n".join(lines) + "\n").encode()
         path.write_bytes(gzip.compress(data, 1) if path.suffix == ".gz" else data)
+    return path
+
+
+def write_uff(path: Path, records: Mapping[str, np.ndarray], **entries: object) -> Path:
+    """Write time records of acceleration in g at 2 kHz; entries replace those of the header."""
+    path.unlink(missing_ok=True)
+    file = pyuff.UFF(str(path))
+    for name, values in records.items():
+        header = {
+            "binary": 0,
+            "id1": name,
+            "func_type": 1,
+            "rsp_node": 1,
+            "rsp_dir": 1,
+            "ref_node": 0,
+            "ref_dir": 0,
+            "abscissa_spacing": 1,
+            "abscissa_min": 0.0,
+            "abscissa_inc": 5e-4,
+            "abscissa_spec_data_type": 17,
+            "abscissa_axis_units_lab": "s",
+            "ordinate_spec_data_type": 12,
+            "ordinate_axis_units_lab": "g",
+            "orddenom_spec_data_type": 0,
+        }
+        data = {"data": values, "x": np.arange(values.size) / 2000}
+        content = pyuff.prepare_58(**{**header, **data, **entries})
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", ResourceWarning)  # pyuff leaves the file open
+            file.write_sets([content], mode="add")
     return path
 
 

@@ -64,3 +64,18 @@ def test_empty_cells_are_missing():
     """An empty cell is a missing sample, not an error."""
     raw = parse("delta_e_um,b\n1,2\n,4\nnan,4\n")
     assert str(raw.columns["delta_e_um"].tolist()) == "[1.0, nan, nan]"
+
+
+def test_blanks_around_numbers():
+    """Blanks change nothing: rows that the quick way cannot read are read the careful way."""
+    raw = parse("delta_e_um, b, c\n 1 , 2,  \n 3 ,\t4, 5\n")
+    assert raw.columns["delta_e_um"].tolist() == [1.0, 3.0]
+    both = ColumnMap(columns={"delta_e_um": "delta_e_um", "acc_c_g": "c"})
+    raw = parse_text(b"delta_e_um, c\n1,\n2, 5\n", both)
+    assert str(raw.columns["c"].tolist()) == "[nan, 5.0]"
+
+
+def test_text_beside_numbers():
+    """A column that nobody wants may change from numbers to text."""
+    rows = "".join(f"{k},{k if k < 200_000 else 'late'}\n" for k in range(200_100))
+    assert parse("delta_e_um,note\n" + rows).columns["delta_e_um"][-1] == 200_099.0

@@ -15,7 +15,7 @@ from lmshealth import readers
 from lmshealth.errors import BadLog
 from lmshealth.readers import content_digest, read_log, require_identity
 
-ALL = ["log.csv", "log.csv.gz", "log.parquet", "log.h5", "log.hdf5"]
+ALL = ["log.csv", "log.csv.gz", "log.parquet", "log.h5", "log.hdf5", "log.tdms", "log.mat"]
 
 
 def refused(path, reason, *words, **options):
@@ -77,6 +77,10 @@ def test_truncated(make, file, share):
         ("log.h5", "x.csv", "HDF5"),
         ("log.csv", "x.parquet", "CSV"),
         ("log.csv.gz", "x.csv", "gzip"),
+        ("log.tdms", "x.mat", "TDMS"),
+        ("log.mat", "x.tdms", "MAT"),
+        ("log.csv", "x.uff", "CSV"),
+        ("log.mat", "x.csv", "MAT"),
     ],
 )
 def test_wrong_extension(make, content, name, found):
@@ -227,13 +231,14 @@ def test_overrides(make):
 
 
 def test_import_is_light():
-    """Importing the readers brings neither pandas nor pyarrow nor h5py."""
+    """Importing the readers brings none of the libraries that read the formats."""
     folder = str(Path(readers.__file__).parents[1])
     # A bare stand-in for the package, whose own imports are not what is asked about here.
     code = (
         "import sys, types; package = types.ModuleType('lmshealth'); "
         f"package.__path__ = [{folder!r}]; sys.modules['lmshealth'] = package; "
         "import lmshealth.readers; "
-        "sys.exit(any(m in sys.modules for m in ('pandas', 'pyarrow', 'h5py', 'scipy')))"
+        "late = ('pandas', 'pyarrow', 'h5py', 'scipy', 'nptdms', 'pyuff'); "
+        "sys.exit(any(m in sys.modules for m in late))"
     )
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

@@ -1,0 +1,165 @@
+"""The following error as the paper reads it: statistics, strongest harmonics, bandwidth."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from lmshealth.arrays import FloatArray, freeze
+from lmshealth.errors import BadLog
+from lmshealth.harmonics import Harmonics, decompose
+from lmshealth.logs import Channel, Log
+from lmshealth.parts import Part, select_segments, set_velocity
+
+COUNT = 100
+# Six counts of the paper's encoder, in m.
+FLOOR = 30e-9
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FollowingError:
+    """Reading of one following-error channel of a log.
+
+    Attributes
+    ----------
+    channel : str
+        Its name.
+    velocity : float
+        Set velocity in m/s; NaN where unknown or where the log has several.
+    duration : float
+        Seconds that the statistics are taken from.
+    lowest, highest, std, mean : float
+        Of all samples, in m.
+    harmonics : Harmonics
+        Of the longest stretch without gaps.
+    kept : ndarray
+        Indices of the strongest harmonics, strongest first, shape ``(n_kept,)``.
+    floor : float
+        Harmonics up to this amplitude in m are left out of what counts as above it.
+    """
+
+    channel: str
+    velocity: float
+    duration: float
+    lowest: float
+    highest: float
+    std: float
+    mean: float
+    harmonics: Harmonics
+    kept: np.ndarray[tuple[int], np.dtype[np.intp]]
+    floor: float
+
+    def __post_init__(self) -> None:
+        freeze(self)
+
+    @property
+    def above(self) -> np.ndarray[tuple[int], np.dtype[np.intp]]:
+        """Indices of the kept harmonics above the floor, strongest first."""
+        return self.kept[self.harmonics.amplitude[self.kept] > self.floor]
+
+    @property
+    def max_magnitude(self) -> float:
+        """Amplitude of the strongest harmonic in m."""
+        return float(self.harmonics.amplitude[self.kept[0]])
+
+    @property
+    def band(self) -> tuple[float, float]:
+        """Lowest and highest frequency of the kept harmonics in Hz."""
+        return self._span(self.kept)
+
+    @property
+    def band_above(self) -> tuple[float, float]:
+        """The same of those above the floor; NaN where there are none."""
+        return self._span(self.above)
+
+    @property
+    def share_explained(self) -> float:
+        """Share of the variance of the transformed stretch that the kept harmonics rebuild."""
+        return self._share(self.kept)
+
+    @property
+    def share_explained_above(self) -> float:
+        """The same of those above the floor."""
+        return self._share(self.above)
+
+    def rebuilt(self) -> FloatArray:
+        """Rebuild Δe in m from the kept harmonics above the floor, shape ``(n_samples,)``."""
+        return self.harmonics.rebuild(self.above)
+
+    def _span(self, index: np.ndarray[tuple[int], np.dtype[np.intp]]) -> tuple[float, float]:
+        if index.size == 0:
+            return float("nan"), float("nan")
+        frequency = self.harmonics.frequency[index]
+        return float(frequency.min()), float(frequency.max())
+
+    def _share(self, index: np.ndarray[tuple[int], np.dtype[np.intp]]) -> float:
+        power = self.harmonics.power
+        return float(power[index].sum() / power.sum())
+
+
+def read_error(
+    log: Log, *, count: int = COUNT, floor: float = FLOOR, part: Part = "record"
+) -> tuple[FollowingError, ...]:
+    """Read the following error of a log.
+
+    Parameters
+    ----------
+    log : Log
+        With at least one displacement channel.
+    count : int
+        How many of the strongest harmonics are kept.
+    floor : float
+        In m.
+    part : str
+        Which stretches of the log; see `select_segments`.
+
+    Returns
+    -------
+    tuple of FollowingError
+        One per displacement channel.
+
+    Raises
+    ------
+    BadLog
+        With reason ``no-delta-e`` without such a channel, ``too-short`` where the longest stretch
+        has fewer harmonics than are to be kept, or as `select_segments` does.
+
+    References
+    ----------
+    Piscalov2021
+    """
+    channels = [channel for channel in log.channels if channel.kind == "displacement"]
+    if not channels:
+        there = ", ".join(channel.name for channel in log.channels)
+        raise BadLog(
+            log.name, "no-delta-e", f"no usable delta_e channel; there: {there}; needed delta_e_um"
+        )
+    segments = select_segments(log, part)
+    longest = max(segments, key=lambda segment: segment.stop - segment.start)
+    n, needed = longest.stop - longest.start, 2 * count + 1
+    if n < needed:
+        raise BadLog(
+            log.name,
+            "too-short",
+            f"the longest stretch has {n / log.sample_rate:.3g} s; {count} harmonics need "
+            f"{needed / log.sample_rate:.3g} s: record longer or lower --count",
+        )
+
+    def read(channel: Channel) -> FollowingError:
+        samples = np.concatenate([channel.values[s.start : s.stop] for s in segments])
+        harmonics = decompose(channel.values[longest.start : longest.stop], log.sample_rate)
+        return FollowingError(
+            channel=channel.name,
+            velocity=set_velocity(log),
+            duration=samples.size / log.sample_rate,
+            lowest=float(samples.min()),
+            highest=float(samples.max()),
+            std=float(samples.std()),
+            mean=float(samples.mean()),
+            harmonics=harmonics,
+            kept=harmonics.strongest(count),
+            floor=floor,
+        )
+
+    return tuple(read(channel) for channel in channels)

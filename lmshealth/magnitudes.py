@@ -1,0 +1,330 @@
+"""Accelerations as the paper reads them: magnitudes of frequencies over velocity, which grow."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from scipy.special import stdtr
+
+from lmshealth.errors import BadLog
+from lmshealth.harmonics import Harmonics, decompose
+from lmshealth.logs import Channel, Log
+from lmshealth.parts import Part, select_segments, set_velocity
+from lmshealth.results import Modes
+from lmshealth.stage import Stage
+
+# Without a description: the rows of the paper's Tables 6 and 7.
+GRID = 10.0
+GRID_BAND = (10.0, 400.0)
+# A row of a mode reaches this many damping ratios to either side.
+_WIDTHS = 2.5
+# One-sided probability below which a slope counts: of twenty bands that do not depend on velocity
+# one will be said to grow.
+SIGNIFICANCE = 0.05
+_LEAST_ORDINATES = 3
+
+BandKind = Literal["mode", "grid", "health", "watch"]
+
+
+@dataclass(frozen=True, slots=True)
+class Band:
+    """A band of frequencies that is read as one number.
+
+    Attributes
+    ----------
+    name : str
+        Of the mode, or the band in words; the same in all logs.
+    kind : str
+        ``mode``, ``grid`` (no description), ``health`` or ``watch``.
+    low, high : float
+        In Hz.
+    placed_by : str
+        Of a mode: ``identified`` where this log shows it, else ``stage``.
+    """
+
+    name: str
+    kind: BandKind
+    low: float
+    high: float
+    placed_by: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Magnitude:
+    """What one accelerometer of one log reads in a band.
+
+    Attributes
+    ----------
+    log, stage : str
+        Name of the log and identity of the machine, empty where unknown.
+    velocity : float
+        Set velocity in m/s, NaN where unknown.
+    channel : str
+        The accelerometer.
+    band : Band
+        Where.
+    magnitude, frequency : float
+        Amplitude in m/s² and frequency in Hz of the strongest harmonic of the longest stretch.
+    resolution : float
+        Distance of its harmonics in Hz.
+    rms : float
+        In m/s², all stretches together.
+    dof : int
+        Degrees of freedom of the mean square: two per harmonic.
+    """
+
+    log: str
+    stage: str
+    velocity: float
+    channel: str
+    band: Band
+    magnitude: float
+    frequency: float
+    resolution: float
+    rms: float
+    dof: int
+
+    @property
+    def level(self) -> float:
+        """What is compared between velocities, in m/s²: magnitude, of wide bands the RMS."""
+        return self.rms if self.band.kind in ("health", "watch") else self.magnitude
+
+
+@dataclass(frozen=True, slots=True)
+class Growth:
+    """How a level depends on velocity: ln level = constant + slope · ln velocity.
+
+    Attributes
+    ----------
+    stage, channel, band : str
+        Machine, accelerometer and name of the band.
+    n_logs, n_velocities : int
+        Points of the straight line, and different velocities among them.
+    slope, slope_std : float
+        Least squares, with the standard deviation that the scatter about the line tells; NaN where
+        fewer than two velocities, or three logs, leave it open.
+    p_value : float
+        Probability of such a slope or a larger one where there is none (Student's t).
+    """
+
+    stage: str
+    channel: str
+    band: str
+    n_logs: int
+    n_velocities: int
+    slope: float
+    slope_std: float
+    p_value: float
+
+    @property
+    def grows(self) -> bool | None:
+        """Whether the slope is positive beyond chance; None where that cannot be told."""
+        return None if np.isnan(self.p_value) else self.p_value < SIGNIFICANCE
+
+
+def choose_bands(
+    stage: Stage | None, modes: Modes | None, span: tuple[float, float] | None
+) -> tuple[Band, ...]:
+    """Choose what is read: modes and bands of the description, or the paper's grid without one.
+
+    Parameters
+    ----------
+    stage : Stage or None
+        Its modes, health band and watched bands.
+    modes : Modes or None
+        Where this log shows the modes; others are read where the description has them.
+    span : (float, float) or None
+        Only modes or grid frequencies between these, in Hz.
+
+    Returns
+    -------
+    tuple of Band
+        Modes or grid ascending in frequency, then health band, then watched bands.
+    """
+    if stage is None:
+        low, high = span or GRID_BAND
+        grid = GRID * np.arange(np.ceil(low / GRID), np.floor(high / GRID) + 1)
+        return tuple(
+            Band(f"{f:g} Hz", "grid", f - GRID / 2, f + GRID / 2) for f in grid.tolist() if f > 0
+        )
+    bands = _mode_bands(stage, modes, span)
+    description = stage.description
+    if description.health_band_hz is not None:
+        low, high = description.health_band_hz
+        bands.append(Band(f"{low:g}-{high:g} Hz", "health", low, high))
+    for watch in description.watch:
+        name = f"{watch.low_hz:g}-{watch.high_hz:g} Hz"
+        bands.append(Band(name, "watch", watch.low_hz, watch.high_hz))
+    return tuple(bands)
+
+
+def _mode_bands(stage: Stage, modes: Modes | None, span: tuple[float, float] | None) -> list[Band]:
+    """Bands about the modes; where two touch, they part in the middle."""
+    found = {} if modes is None else dict(zip(modes.names, modes.frequency.tolist(), strict=True))
+    low, high = span or (0.0, np.inf)
+    places = sorted(
+        (found.get(mode.name, mode.frequency_hz), mode.damping_ratio, mode.name)
+        for mode in stage.modes
+        if low <= mode.frequency_hz <= high
+    )
+    bands = []
+    for i, (f, damping, name) in enumerate(places):
+        below = f * (1 - _WIDTHS * damping)
+        above = f * (1 + _WIDTHS * damping)
+        if i > 0:
+            below = max(below, (places[i - 1][0] + f) / 2)
+        if i + 1 < len(places):
+            above = min(above, (places[i + 1][0] + f) / 2)
+        bands.append(Band(name, "mode", below, above, "identified" if name in found else "stage"))
+    return bands
+
+
+def read_magnitudes(
+    log: Log, bands: Iterable[Band], *, part: Part = "record"
+) -> tuple[Magnitude, ...]:
+    """Read every accelerometer of a log in every band.
+
+    Parameters
+    ----------
+    log : Log
+        With at least one acceleration channel.
+    bands : iterable of Band
+        Those that reach beyond half the sample rate are passed over.
+    part : str
+        Which stretches of the log; see `select_segments`.
+
+    Returns
+    -------
+    tuple of Magnitude
+        Channel by channel.
+
+    Raises
+    ------
+    BadLog
+        With reason ``no-accelerometer`` without such a channel, ``sample-rate`` where no band is
+        below half of it, ``too-short`` where a band holds fewer than three harmonics, or as
+        `select_segments` does.
+
+    References
+    ----------
+    Piscalov2021
+    """
+    channels = [channel for channel in log.channels if channel.kind == "acceleration"]
+    if not channels:
+        there = ", ".join(channel.name for channel in log.channels)
+        raise BadLog(
+            log.name,
+            "no-accelerometer",
+            f"no usable acc channel; there: {there}; needed acc_<name>_m_s2",
+        )
+    segments = select_segments(log, part)
+    stretches = [(s.start, s.stop) for s in segments]
+    usable = _usable(log, bands, max(b - a for a, b in stretches))
+    velocity = set_velocity(log)
+    magnitudes = []
+    for channel in channels:
+        parts = _decomposed(channel, log.sample_rate, stretches)
+        for band in usable:
+            magnitude, frequency, rms, dof = _read(parts, band)
+            magnitudes.append(
+                Magnitude(
+                    log=log.name,
+                    stage=log.metadata.stage or "",
+                    velocity=velocity,
+                    channel=channel.name,
+                    band=band,
+                    magnitude=magnitude,
+                    frequency=frequency,
+                    resolution=1 / parts[0].duration,
+                    rms=rms,
+                    dof=dof,
+                )
+            )
+    return tuple(magnitudes)
+
+
+def _usable(log: Log, bands: Iterable[Band], longest: int) -> list[Band]:
+    asked = tuple(bands)
+    usable = [band for band in asked if band.high < log.sample_rate / 2]
+    if not usable:
+        lowest = min((band.high for band in asked), default=np.nan)
+        raise BadLog(
+            log.name,
+            "sample-rate",
+            f"{log.sample_rate:g} Hz shows none of the bands asked for; needed is more than "
+            f"{2 * lowest:.4g} Hz",
+        )
+    narrowest = min(band.high - band.low for band in usable)
+    needed, seconds = _LEAST_ORDINATES / narrowest, longest / log.sample_rate
+    if seconds < needed:
+        raise BadLog(
+            log.name,
+            "too-short",
+            f"the longest stretch has {seconds:.3g} s; a band of {narrowest:.3g} Hz needs "
+            f"{needed:.3g} s",
+        )
+    return usable
+
+
+def _decomposed(
+    channel: Channel, sample_rate: float, stretches: list[tuple[int, int]]
+) -> list[Harmonics]:
+    """Harmonics of each stretch, the longest first."""
+    ordered = sorted(stretches, key=lambda stretch: stretch[0] - stretch[1])
+    return [decompose(channel.values[a:b], sample_rate) for a, b in ordered if b - a > 1]
+
+
+def _read(parts: list[Harmonics], band: Band) -> tuple[float, float, float, int]:
+    """Magnitude, its frequency, RMS and degrees of freedom of a band."""
+    inside = parts[0].between(band.low, band.high)
+    amplitude = parts[0].amplitude[inside]
+    at = int(np.argmax(amplitude))
+    total, seconds, dof = 0.0, 0.0, 0
+    for harmonics in parts:
+        own = harmonics.between(band.low, band.high)
+        # A stretch too short for the band says nothing about it.
+        if own.stop - own.start >= _LEAST_ORDINATES - 1:
+            total += harmonics.duration * float(harmonics.power[own].sum())
+            seconds += harmonics.duration
+            dof += 2 * (own.stop - own.start)
+    return (
+        float(amplitude[at]),
+        float(parts[0].frequency[inside][at]),
+        float(np.sqrt(total / seconds)),
+        dof,
+    )
+
+
+def find_growth(magnitudes: Iterable[Magnitude]) -> tuple[Growth, ...]:
+    """Fit the growth of every machine, accelerometer and band over the logs of known velocity.
+
+    Returns
+    -------
+    tuple of Growth
+        In the order in which they are first met.
+    """
+    groups: dict[tuple[str, str, str], list[tuple[float, float]]] = {}
+    for m in magnitudes:
+        points = groups.setdefault((m.stage, m.channel, m.band.name), [])
+        if m.velocity > 0 and m.level > 0:
+            points.append((float(np.log(m.velocity)), float(np.log(m.level))))
+    return tuple(_growth(*key, points) for key, points in groups.items())
+
+
+def _growth(stage: str, channel: str, band: str, points: list[tuple[float, float]]) -> Growth:
+    x, y = np.array(points).reshape(-1, 2).T
+    # Set velocities measured to a percent are the same.
+    n_velocities = np.unique(np.round(x / 0.02)).size
+    slope = std = p_value = float("nan")
+    if n_velocities > 1:
+        off = x - x.mean()
+        slope = float(off @ y / (off @ off))
+        dof = x.size - 2
+        if dof > 0:
+            rest = y - y.mean() - slope * off
+            std = float(np.sqrt(rest @ rest / dof / (off @ off)))
+            p_value = float(stdtr(dof, -slope / std)) if std > 0 else float(slope <= 0)
+    return Growth(stage, channel, band, x.size, n_velocities, slope, std, p_value)

@@ -1,0 +1,233 @@
+"""What a terminal shows: tables for people, JSON for programs, bars while they wait."""
+
+from __future__ import annotations
+
+import json
+import math
+import sys
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import click
+from rich import box
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.table import Table
+
+from lmshealth.tables import Row
+
+# More velocities than these do not fit beside each other.
+_MOST_VELOCITIES = 7
+
+
+def print_json(content: dict[str, list[Row]]) -> None:
+    """Print JSON with null where a number is missing."""
+    click.echo(json.dumps(_without_nan(content), indent=1, allow_nan=False))
+
+
+def _without_nan(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _without_nan(item) for key, item in value.items()}
+    if isinstance(value, list):
+        return [_without_nan(item) for item in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def print_modes(rows: Sequence[Row], refused: Sequence[Row]) -> None:
+    """Print modes with their uncertainty."""
+    cells = [
+        (
+            row["log"],
+            row["mode"],
+            row["channel"],
+            f"{row['frequency_hz']:.4g} ± {row['frequency_std_hz']:.2g}"
+            if row["frequency_std_hz"] >= 1
+            else f"{row['frequency_hz']:.3f} ± {row['frequency_std_hz']:.3f}",
+            f"{100 * row['damping_ratio']:.2f} ± {100 * row['damping_ratio_std']:.2f}",
+            f"{row['snr']:.3g}",
+        )
+        for row in rows
+    ]
+    title = "Modes (± one standard deviation)" if rows else "No modes found"
+    _print(title, ("log", "mode", "channel"), ("frequency Hz", "damping %", "SNR"), cells)
+    _print_refused(refused)
+
+
+def print_error(rows: Sequence[Row], refused: Sequence[Row]) -> None:
+    """Print the following error: its statistics, then what its harmonics say."""
+    if not rows:
+        _print_refused(refused)
+        return
+    several = len({row["channel"] for row in rows}) > 1
+    texts = ("log", "channel") if several else ("log",)
+    first = [
+        (
+            *_labels(row, several),
+            *(_number(row[key]) for key in ("velocity_mm_s", "duration_s")),
+            *(_number(row[key]) for key in ("min_um", "max_um", "std_um", "mean_um")),
+        )
+        for row in rows
+    ]
+    _print("Following error (µm)", texts, ("mm/s", "s", "min", "max", "std", "mean"), first)
+    second = [
+        (
+            *_labels(row, several),
+            *(_number(row[key]) for key in ("max_magnitude_um", "strongest_hz", "bandwidth_hz")),
+            _percent(row["share_explained"]),
+            str(row["n_above_floor"]),
+            _number(row["bandwidth_above_floor_hz"]),
+            _percent(row["share_explained_above_floor"]),
+        )
+        for row in rows
+    ]
+    count, floor = max(row["n_harmonics"] for row in rows), rows[0]["floor_nm"]
+    title = f"Strongest harmonics: {count}, and those of them above {floor:g} nm"
+    heads = ("max µm", "at Hz", "wide Hz", "share", "above", "wide Hz", "share")
+    _print(title, texts, heads, second)
+    click.echo("wide: highest minus lowest frequency; share: of the variance that they rebuild.")
+    _print_refused(refused)
+
+
+def print_magnitudes(rows: Sequence[Row], lines: Sequence[Row], refused: Sequence[Row]) -> None:
+    """Print magnitudes over velocity, one table per machine and accelerometer, then lines."""
+    for stage, channel in dict.fromkeys((row["stage"], row["channel"]) for row in rows):
+        own = [row for row in rows if (row["stage"], row["channel"]) == (stage, channel)]
+        _print_channel(f"{stage or 'unknown machine'}, {channel}", own)
+    if rows:
+        click.echo(
+            "grows: slope of ln level over ln velocity ± its standard deviation;\n"
+            "* positive beyond chance (one-sided, 5 % per row);\n"
+            "– fewer than two velocities or three logs: no slope;\n"
+            "~ the strongest harmonic is a line, no mode. RMS: of a band, in Hz."
+        )
+    if lines:
+        _print_lines(lines)
+    _print_refused(refused)
+
+
+def _print_lines(lines: Sequence[Row]) -> None:
+    """Print each line once for all logs."""
+    groups: dict[tuple[str, str, float], list[Row]] = {}
+    for row in lines:
+        groups.setdefault((row["channel"], row["kind"], round(row["frequency_hz"])), []).append(row)
+    cells = [
+        (
+            channel,
+            kind,
+            f"{rows[0]['frequency_hz']:.2f}",
+            _number(1e3 * max(row["amplitude"] for row in rows)),
+            str(len({row["log"] for row in rows})),
+        )
+        for (channel, kind, _), rows in sorted(groups.items())
+    ]
+    _print("Lines", ("channel", "kind"), ("Hz", "largest mm/s²", "in logs"), cells)
+
+
+def _print_channel(title: str, rows: Sequence[Row]) -> None:
+    """Print a table of bands by velocities: magnitudes, of wide bands RMS."""
+    cells: dict[str, dict[float, list[float]]] = {}
+    lines: set[tuple[str, float]] = set()
+    for row in rows:
+        key = "rms_mm_s2" if row["kind"] in ("health", "watch") else "magnitude_mm_s2"
+        speed = row["velocity_mm_s"]
+        speed = -1.0 if math.isnan(speed) else float(f"{speed:.2g}")
+        cells.setdefault(row["band"], {}).setdefault(speed, []).append(row[key])
+        if row["line"] and key == "magnitude_mm_s2":
+            lines.add((row["band"], speed))
+    speeds = sorted({speed for own in cells.values() for speed in own})
+    left_out = len(speeds) - _MOST_VELOCITIES
+    if left_out > 0:
+        step = (len(speeds) - 1) / (_MOST_VELOCITIES - 1)
+        speeds = [speeds[round(k * step)] for k in range(_MOST_VELOCITIES)]
+        title += f" ({left_out} more velocities in csv and json)"
+    kinds = {row["band"]: row for row in rows}
+    table = [
+        (
+            _band_name(kinds[band]),
+            *(_mean(own.get(v, [])) + ("~" if (band, v) in lines else " ") for v in speeds),
+            _slope(kinds[band]),
+        )
+        for band, own in cells.items()
+    ]
+    heads = tuple("?" if speed < 0 else f"{speed:g}" for speed in speeds)
+    _print(f"{title}: mm/s² at velocities in mm/s", ("band",), (*heads, "grows"), table)
+
+
+def _band_name(row: Row) -> str:
+    kind = row["kind"]
+    if kind == "mode":
+        return f"{row['band']} {(row['low_hz'] + row['high_hz']) / 2:.0f} Hz"
+    if kind == "grid":
+        return str(row["band"])
+    return f"RMS {row['low_hz']:g}-{row['high_hz']:g}"
+
+
+def _slope(row: Row) -> str:
+    if row["grows"] is None:
+        return "–"
+    return f"{row['slope']:.2f}±{row['slope_std']:.2f}{'*' if row['grows'] else ' '}"
+
+
+def _mean(values: Sequence[float]) -> str:
+    return _number(sum(values) / len(values)) if values else ""
+
+
+def _labels(row: Row, several: bool) -> tuple[str, ...]:
+    name = Path(row["log"]).name
+    return (name, row["channel"]) if several else (name,)
+
+
+def _number(value: float) -> str:
+    """Write three significant digits without an exponent where that is short."""
+    if math.isnan(value):
+        return "–"
+    if 100 <= abs(value) < 1e5:
+        return f"{value:.0f}"
+    return f"{value:.3g}" if abs(value) >= 0.1 else f"{value:.2g}"
+
+
+def _percent(share: float) -> str:
+    return f"{100 * share:.1f} %"
+
+
+def _print_refused(rows: Sequence[Row]) -> None:
+    names = ("log", "channel", "mode", "reason", "detail")
+    if rows:
+        _print("Refused", names, (), [tuple(row[name] for name in names) for row in rows])
+
+
+def _print(
+    title: str, texts: Sequence[str], numbers: Sequence[str], cells: Sequence[Sequence[str]]
+) -> None:
+    table = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False)
+    for name in texts:
+        table.add_column(name, overflow="fold")
+    for name in numbers:
+        table.add_column(name, justify="right", no_wrap=True)
+    for row in cells:
+        table.add_row(*row)
+    click.echo(title)
+    Console().print(table)
+
+
+@contextmanager
+def progress_bars() -> Iterator[Any]:
+    """Show bars on a terminal's standard error, and nothing anywhere else."""
+    with Progress(
+        TextColumn("{task.description:<12}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeRemainingColumn(),
+        console=Console(stderr=True),
+        disable=not sys.stderr.isatty(),
+    ) as bars:
+        known: dict[str, Any] = {}
+
+        def tell(what: str, done: int, total: int) -> None:
+            if what not in known:
+                known[what] = bars.add_task(what, total=total)
+            bars.update(known[what], completed=done, total=total)
+
+        yield tell

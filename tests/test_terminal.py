@@ -1,0 +1,118 @@
+"""Terminal: numbers as people read them, tables that fit, JSON without NaN."""
+
+from __future__ import annotations
+
+import json
+import math
+
+import pytest
+
+from lmshealth.terminal import print_error, print_json, print_magnitudes, print_modes, progress_bars
+
+NAN = float("nan")
+
+
+def magnitude(band: str, velocity: float, **other: object) -> dict[str, object]:
+    """Make a row of a magnitude."""
+    row: dict[str, object] = {
+        "log": f"far/away/velocity-{velocity:08.3f}.h5", "stage": "A-Y", "velocity_mm_s": velocity,
+        "channel": "acc_feed", "band": band, "kind": "grid", "low_hz": 95.0, "high_hz": 105.0,
+        "magnitude_mm_s2": 12.345, "line": None, "rms_mm_s2": 777.0, "slope": 0.5,
+        "slope_std": 0.1, "grows": True,
+    }  # fmt: skip
+    return row | other
+
+
+def refused() -> dict[str, object]:
+    """Make a row of a refusal."""
+    return {"log": "b.h5", "channel": "", "mode": "", "reason": "corrupt", "detail": "no bytes"}
+
+
+def test_json_has_null_for_what_is_no_number(capsys: pytest.CaptureFixture[str]) -> None:
+    """NaN and infinity at any depth become null."""
+    print_json({"rows": [{"a": NAN, "b": [math.inf, 1.0], "c": "x"}]})
+    assert json.loads(capsys.readouterr().out) == {
+        "rows": [{"a": None, "b": [None, 1.0], "c": "x"}]
+    }
+
+
+def test_magnitudes_fit_eighty_columns(capsys: pytest.CaptureFixture[str]) -> None:
+    """Seven velocities of three digits stand beside each other, one row per band, unbroken."""
+    speeds = (1.0, 5.0, 10.0, 20.0, 100.0, 200.0, 400.0)
+    rows = [magnitude(f"{f} Hz", v, magnitude_mm_s2=0.012345) for f in (100, 110) for v in speeds]
+    rows += [magnitude("10-390 Hz", v, kind="health", low_hz=10, high_hz=390) for v in speeds]
+    print_magnitudes(rows, [], [])
+    out = capsys.readouterr().out
+    assert max(len(line) for line in out.splitlines()) <= 80
+    (line,) = [line for line in out.splitlines() if "100 Hz" in line]
+    assert line.count("0.012") == 7
+    assert "0.50±0.10*" in line
+    (line,) = [line for line in out.splitlines() if "RMS 10-390" in line]
+    assert line.count("777") == 7
+
+
+def test_more_velocities_than_fit_are_said_to_be_left_out(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """Of twelve velocities seven are shown, the slowest and the fastest among them."""
+    print_magnitudes([magnitude("100 Hz", float(v)) for v in range(1, 13)], [], [])
+    out = capsys.readouterr().out
+    assert "5 more velocities in csv and json" in out
+    head = next(line for line in out.splitlines() if "band" in line).split()
+    assert (head[1], head[-2]) == ("1", "12")
+
+
+def test_what_cannot_be_told_is_a_dash_and_lines_are_marked(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """Unknown velocity is a question mark, no slope a dash, a line a tilde, listed once."""
+    rows = [magnitude("50 Hz", NAN, line="mains", slope=NAN, slope_std=NAN, grows=None)]
+    line = {"log": "a.h5", "channel": "acc_feed", "kind": "mains", "frequency_hz": 50.01,
+            "amplitude": 0.016, "unit": "m/s²"}  # fmt: skip
+    print_magnitudes(rows, [line, line | {"log": "b.h5", "frequency_hz": 49.99}], [refused()])
+    out = capsys.readouterr().out
+    assert "12.3~" in out
+    assert " ? " in out
+    (row,) = [text for text in out.splitlines() if "mains" in text]
+    assert row.split() == ["acc_feed", "mains", "50.01", "16", "2"]
+    assert "no bytes" in out
+
+
+def test_an_error_without_harmonics_above_the_floor_shows_a_dash(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """Missing bandwidth is a dash; two channels are told apart; the table fits 80 columns."""
+    row = {
+        "log": "velocity-0001.000.h5", "channel": "delta_e", "velocity_mm_s": 1.0,
+        "duration_s": 4.0, "min_um": -12345.6, "max_um": 0.5, "std_um": 0.04, "mean_um": 0.0,
+        "max_magnitude_um": 0.01, "strongest_hz": 12.5, "bandwidth_hz": 1000.0,
+        "share_explained": 0.5, "n_above_floor": 0, "bandwidth_above_floor_hz": NAN,
+        "share_explained_above_floor": 0.0, "n_harmonics": 100, "floor_nm": 30.0,
+    }  # fmt: skip
+    print_error([row], [])
+    out = capsys.readouterr().out
+    assert "–" in out
+    assert "-12346" in out
+    assert max(len(line) for line in out.splitlines()) <= 80
+    print_error([row, row | {"channel": "delta_e_2"}], [refused()])
+    out = capsys.readouterr().out
+    assert "delta_e_2" in out
+    assert "corrupt" in out
+
+
+def test_refusals_alone_are_shown(capsys: pytest.CaptureFixture[str]) -> None:
+    """Where nothing was read there is no empty table, but why."""
+    for show in (print_error, print_modes):
+        show([], [refused()])
+        assert "no bytes" in capsys.readouterr().out
+    print_magnitudes([], [], [refused()])
+    assert "no bytes" in capsys.readouterr().out
+
+
+def test_there_is_no_bar_where_there_is_no_terminal(capsys: pytest.CaptureFixture[str]) -> None:
+    """Progress is told without a trace in a pipe."""
+    with progress_bars() as tell:
+        tell("logs", 1, 2)
+        tell("logs", 2, 2)
+    captured = capsys.readouterr()
+    assert captured.err == captured.out == ""
