@@ -19,6 +19,7 @@ from models.recording import SAMPLE_RATE_HZ, Recording, sample_count, sense, sha
 from models.stages import NOMINAL, Condition, Stage, tuning_named
 
 Array = NDArray[np.float64]
+Orders = tuple[Array, NDArray[np.intp], NDArray[np.complex128]]
 
 # The paper's set velocities, m/s.
 VELOCITIES = (0.001, 0.005, 0.010, 0.020, 0.100, 0.200, 0.400)
@@ -63,11 +64,11 @@ def commands(stage: Stage, condition: Condition, reference: Array) -> Array:
     return inputs
 
 
-def _add_orders(inputs: Array, stage: Stage, reference: Array, rng: np.random.Generator) -> None:
+def _add_orders(inputs: Array, drawn: Orders, reference: Array) -> None:
     """Add the kinematic orders, which follow the position, to inputs (input, time)."""
     position, velocity = reference[:2]
     moving = np.tanh(np.abs(velocity) / _TURNING)
-    for cycles, index, amplitude in zip(*drawn_orders(stage, rng), strict=True):
+    for cycles, index, amplitude in zip(*drawn, strict=True):
         # The drive's anti-alias filter removes what is above half the sample rate.
         heard = moving * (cycles * np.abs(velocity) < SAMPLE_RATE_HZ / 2)
         inputs[index] += heard * (amplitude * np.exp(2j * np.pi * cycles * position)).real
@@ -117,12 +118,16 @@ def commanded(
     lead = round(_lead_in_s(profile, float(time[0])) * SAMPLE_RATE_HZ)
     early = time[0] - np.arange(lead, 0, -1) / SAMPLE_RATE_HZ
     reference = profile.sampled(np.concatenate([early, time]))
-    inputs = commands(stage, condition, reference)
     direct = diagonalise(closed_loop(stage, condition))
     # What is commanded at the first sample has been commanded for long.
-    settled = -(direct.b @ inputs[:, 0]) / direct.poles
-    _add_orders(inputs, stage, reference, rng)
-    outputs, _ = propagate(direct, settled, inputs, SAMPLE_RATE_HZ)
+    state = -(direct.b @ commands(stage, condition, reference[:, :1])[:, 0]) / direct.poles
+    drawn = drawn_orders(stage, rng)
+    outputs = np.empty((direct.c.shape[0], reference.shape[1]))
+    for start in range(0, reference.shape[1], _CHUNK):
+        part = slice(start, start + _CHUNK)
+        inputs = commands(stage, condition, reference[:, part])
+        _add_orders(inputs, drawn, reference[:, part])
+        outputs[:, part], state = propagate(direct, state, inputs, SAMPLE_RATE_HZ)
     return outputs[:, lead:], reference[:, lead:]
 
 
