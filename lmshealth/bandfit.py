@@ -271,14 +271,23 @@ def _mask_towers(spectra: tuple[Spectrum, ...], masks: list[BoolArray], coarse: 
     """Mask lines that tower over the medians around them, before a mode can settle on one.
 
     A mode that takes a strong line for its resonance leaves its own to its neighbour, which then
-    bears the wrong name. Twice the threshold leaves room for what the bins do not resolve.
+    bears the wrong name. Twice the threshold leaves room for what the bins do not resolve. A lone
+    mode whose damping is below about 1/15 of its nominal one stands as narrow as a line, and may
+    lose its own peak.
     """
-    threshold = 2 * np.log(sum(int(mask.sum()) for mask in masks) / _LINE_FALSE_ALARM)
-    for spectrum, mask in zip(spectra, masks, strict=True):
+    n_ordinates = sum(int(mask.sum()) for mask in masks)
+    threshold = 2 * np.log(n_ordinates / _LINE_FALSE_ALARM)
+    kept = [mask.copy() for mask in masks]
+    for spectrum, keep in zip(spectra, kept, strict=True):
         level = np.interp(spectrum.frequency, coarse.frequency, coarse.level)
         towers = np.flatnonzero(spectrum.periodogram > threshold * level)
         for k in towers.tolist():
-            mask[max(0, k - _LINE_BINS) : k + _LINE_BINS + 1] = False
+            keep[max(0, k - _LINE_BINS) : k + _LINE_BINS + 1] = False
+    # Towers everywhere are no lines, as in `_mask_lines`.
+    if sum(int(keep.sum()) for keep in kept) < n_ordinates // 2:
+        return
+    for mask, keep in zip(masks, kept, strict=True):
+        mask &= keep
 
 
 def _mask_lines(spectra: tuple[Spectrum, ...], masks: list[BoolArray], solution: _Solution) -> bool:

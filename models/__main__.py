@@ -20,7 +20,7 @@ from rich.table import Table
 from models.degradation import LIVES
 from models.errors import ModelError
 from models.faults import FAULTS
-from models.formats import WRITERS, write_log
+from models.formats import WRITERS, format_of, write_log
 from models.lives import UNTIL, Plan, simulate_life
 from models.mapping import modal_map
 from models.margins import GAIN_MARGIN_DB, PHASE_MARGIN_DEG, TABLE_1, cases, margin_record
@@ -61,7 +61,9 @@ def _condition_options(command: Callable[..., None]) -> Callable[..., None]:
     return preload(mount(command))
 
 
-def _format_option(formats: Sequence[str], default: str) -> Callable[..., Callable[..., None]]:
+def _format_option(
+    formats: Sequence[str], default: str | None
+) -> Callable[..., Callable[..., None]]:
     """Return the option that chooses a format."""
     kinds = click.Choice(list(formats))
     return click.option("--format", "file_format", type=kinds, default=default, show_default=True)
@@ -259,19 +261,25 @@ def simulate(
 @click.option("--period", default=5.0, show_default=True, help="Duration of one sweep, s.")
 @click.option("--law", type=click.Choice(["log", "linear"]), default="log", show_default=True)
 @click.option("--seconds", default=20.0, show_default=True, help="Length of the log.")
-@click.option("--velocity", default=10.0, show_default=True, help="Velocity of the move, mm/s.")
+@click.option(
+    "--velocity",
+    default=10.0,
+    show_default=True,
+    help="Velocity of the move, mm/s; lowered to what the travel allows for so long.",
+)
 @_condition_options
 @click.option("--seed", type=click.IntRange(0), default=0, show_default=True)
 @click.option("--out", type=click.Path(dir_okay=False, path_type=Path), required=True)
-@_written_as
-def sweep(stage: str, out: Path, file_format: str, **options: Any) -> None:
+@_format_option(tuple(WRITERS), None)
+def sweep(stage: str, out: Path, file_format: str | None, **options: Any) -> None:
     """Write an FRF log of STAGE: the motor current holds a sine that sweeps while it moves.
 
     The sine alone is the column current_excitation_a, with the servo's current it is current_a.
     A response to the first has the poles of the closed loop, as `modes` prints them; one to the
     second has those of the structure without it. Every period is a whole sweep; from the
-    difference between periods the noise is known.
+    difference between periods the noise is known. The suffix of --out says the format.
     """
+    chosen = format_of(out, file_format)
     wave = Sweep(*(options[name] for name in ("low", "high", "amplitude", "period", "law")))
     machine = stage_named(stage)
     words = [options["seed"], zlib.crc32(f"{stage}/sweep".encode())]
@@ -284,7 +292,7 @@ def sweep(stage: str, out: Path, file_format: str, **options: Any) -> None:
         rng=np.random.default_rng(np.random.SeedSequence(words)),
     )
     identity = f"LMS-{options['seed']}-{machine.identity_suffix}"
-    write_log(recording.described(stage=identity), out, file_format)
+    write_log(recording.described(stage=identity), out, chosen)
 
 
 @cli.command(epilog=_epilog("velocities"))

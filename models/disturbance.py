@@ -78,7 +78,7 @@ FRICTION = {
 }
 # Force across the feed, lateral and vertical, one sequence per block and direction: from 1 to
 # 20 mm/s Table 7 hardly grows, from there to 400 mm/s a hundredfold.
-ROUGHNESS = Noise(0.0033, power=0.4, corner_hz=200.0, fast_density=0.0012, fast_power=1.5)
+ROUGHNESS = Noise(0.0022, power=0.4, corner_hz=200.0, fast_density=0.0012, fast_power=1.5)
 GROUND_FLAT = Noise(density=4.0e-5, power=0.0, corner_hz=80.0)
 GROUND_UPRIGHT = Noise(density=1.0e-3, power=0.0, corner_hz=15.0)
 # The motor and the encoder themselves add next to nothing between their orders.

@@ -65,6 +65,19 @@ class BadParameter(ModelError):
         super().__init__(f"{name} is {got}; needed: {needed}")
 
 
+class OccupiedFolder(ModelError):
+    """A folder that holds logs which a run would leave beside its own."""
+
+    def __init__(self, folder: str, log: str, count: int) -> None:
+        self.folder = folder
+        self.log = log
+        self.count = count
+        super().__init__(
+            f"{folder} holds {log}: logs that this run would not write again ({count}) would stay; "
+            "needed: another folder (or remove them)"
+        )
+
+
 class UnstableLoop(ModelError):
     """The position loop around this structure has poles in the right half plane."""
 

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 
 import h5py
 import numpy as np
 import pandas as pd
 
-from models.errors import ModelError, UnknownFormat
+from models.errors import BadParameter, ModelError, OccupiedFolder, UnknownFormat
 from models.recording import Recording
 
 _CHUNK = 1 << 16
@@ -79,6 +79,44 @@ def file_suffix(file_format: str) -> str:
     if file_format not in WRITERS:
         raise UnknownFormat(file_format, WRITERS)
     return WRITERS[file_format][0]
+
+
+def format_of(path: Path, wanted: str | None = None) -> str:
+    """Return the format that a file's suffix says.
+
+    Parameters
+    ----------
+    wanted
+        Format that the suffix must not contradict.
+
+    Raises
+    ------
+    BadParameter
+        If no log has such a suffix, or the wanted format has another.
+    UnknownFormat
+        If no writer is registered under the wanted name.
+    """
+    known = {file_suffix(name): name for name in WRITERS if wanted in (None, name)}
+    if wanted is not None and not known:
+        raise UnknownFormat(wanted, WRITERS)
+    if path.suffix not in known:
+        chosen = "" if wanted is None else f", the suffix of {wanted}"
+        raise BadParameter("out", path.name, f"a name ending in {' or '.join(known)}{chosen}")
+    return known[path.suffix]
+
+
+def refuse_other_logs(folder: Path, names: Iterable[str]) -> None:
+    """Refuse a folder in which simulated logs of other names would stay beside a new manifest.
+
+    Raises
+    ------
+    OccupiedFolder
+        If there is one that is not among the names.
+    """
+    others = {p.name for kind in ("log", "velocity") for p in folder.glob(f"{kind}-*.*")}
+    others -= set(names)
+    if others:
+        raise OccupiedFolder(str(folder), min(others), len(others))
 
 
 def write_log(recording: Recording, path: Path, file_format: str) -> None:

@@ -19,7 +19,7 @@ import pandas as pd
 from models.degradation import Life, life_named
 from models.errors import BadParameter
 from models.faults import fault_named
-from models.formats import file_suffix, write_log
+from models.formats import file_suffix, refuse_other_logs, write_log
 from models.plant import GUIDE_MODES, closed_loop_modes
 from models.recording import move_velocity, record
 from models.stages import Condition, Stage, stage_named
@@ -66,6 +66,9 @@ class Plan:
             raise BadParameter("until", self.until, " or ".join(UNTIL))
         if self.draw_life().failure_km() is None and self.until == "failure":
             raise BadParameter("until", self.until, f"now, as {self.life} crosses no limit")
+        # The first log stands at the beginning.
+        if self.until == "failure" and self.logs < 2:
+            raise BadParameter("logs", self.logs, "at least 2 for a life until its failure")
 
     def rng(self, step: str, log: int = 0) -> np.random.Generator:
         """Return the generator of one step of one log: independent of all others."""
@@ -223,11 +226,17 @@ def simulate_life(
         Processes; the files do not depend on it.
     progress
         Called with 1 after each log.
+
+    Raises
+    ------
+    OccupiedFolder
+        If the folder holds logs that would not be overwritten.
     """
     if workers < 1:
         raise BadParameter("workers", workers, "at least 1")
-    folder.mkdir(parents=True, exist_ok=True)
     visits = schedule(plan)
+    refuse_other_logs(folder, [visit.file for visit in visits])
+    folder.mkdir(parents=True, exist_ok=True)
     rows = []
     for row in _rows(plan, visits, folder, workers):
         rows.append(row)

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from scipy.optimize import brentq, minimize_scalar
 
 from models.equations import CONTROLLER, OPEN_LOOP, PLANT, READINGS, Ratio, factors, ratio
-from models.plant import INPUTS, OUTPUTS, closed_loop
+from models.plant import sensor_rows, structure_state
 from models.servo import controller, current_loop
 from models.stages import NOMINAL, Condition, build_structure, stage_named, tuning_named
 from models.structure import named_modes
@@ -156,29 +156,18 @@ def rigid_loop(stage: str, reading: str) -> Any:
 
 
 def structure_path(stage: str, condition: Condition = NOMINAL) -> Any:
-    """Return the flexible structure from motor force (N) to encoder (m), as a ``StateSpace``.
-
-    Raises
-    ------
-    UnstableLoop
-        If the structure cannot be held by the loop it is used in.
-    """
+    """Return the flexible structure from motor force (N) to encoder (m), as a ``StateSpace``."""
     import control
 
-    system = closed_loop(stage_named(stage), condition)
-    n = 2 * build_structure(stage_named(stage), condition).size
-    force = system.b[:n, [INPUTS.index("motor_force")]]
-    return control.ss(system.a[:n, :n], force, system.c[[OUTPUTS.index("delta_e")], :n], [[0.0]])
+    machine = stage_named(stage)
+    a, b = structure_state(machine, condition)
+    encoder = sensor_rows(machine, build_structure(machine, condition))["delta_e"]
+    seen = np.concatenate([encoder, np.zeros(encoder.size)])
+    return control.ss(a, b[:, [-1]], [seen], [[0.0]])
 
 
 def flexible_loop(stage: str, reading: str, condition: Condition = NOMINAL) -> Any:
-    """Return the open loop of a reading with the flexible structure in place of the rigid mass.
-
-    Raises
-    ------
-    UnstableLoop
-        If the structure cannot be held by the loop it is used in.
-    """
+    """Return the open loop of a reading with the flexible structure in place of the rigid mass."""
     import control
 
     shaping, plant = factors(stage, reading)
@@ -194,11 +183,6 @@ def simulated_loop(stage: str, condition: Condition = NOMINAL) -> Any:
     """Return the open loop that the simulation closes, factored as in `servo`.
 
     It is the corrected reading to within the rounding of the printed coefficients.
-
-    Raises
-    ------
-    UnstableLoop
-        If the structure cannot be held by this loop.
     """
     import control
 
@@ -339,8 +323,6 @@ def cases(stage: str, condition: Condition = NOMINAL) -> list[Case]:
     ------
     UnknownStage
         If there is no stage of that name.
-    UnstableLoop
-        If the structure in this condition cannot be held by the loop it is used in.
     """
     name = stage_named(stage).name
     product = f"({PLANT[name]}) × ({CONTROLLER[name]})"

@@ -121,6 +121,28 @@ def _force_columns(stage: Stage, structure: Structure) -> tuple[Array, Array]:
     return blocks, between(stage.motor_point.value)[0]
 
 
+def structure_state(stage: Stage, condition: Condition = NOMINAL) -> tuple[Array, Array]:
+    """Return the flexible structure in state space, its servo left out.
+
+    Returns
+    -------
+    a : (2 dof, 2 dof)
+        States are displacements and velocities.
+    b : (2 dof, 13)
+        Per unit of the 12 block forces, then of the motor force.
+    """
+    structure = build_structure(stage, condition)
+    n = structure.size
+    solved = np.linalg.solve(
+        structure.mass,
+        np.column_stack(
+            [-structure.stiffness, -structure.damping, *_force_columns(stage, structure)]
+        ),
+    )
+    a = np.vstack([np.eye(n, 2 * n, k=n), solved[:, : 2 * n]])
+    return a, np.vstack([np.zeros((n, 13)), solved[:, 2 * n :]])
+
+
 def closed_loop(
     stage: Stage, condition: Condition = NOMINAL, *, tuning: Tuning | None = None
 ) -> LinearSystem:
@@ -140,26 +162,21 @@ def closed_loop(
     servo = servo_matrices(tuning)
     n, m = structure.size, servo.b.size
     sensors = sensor_rows(stage, structure)
-    blocks, motor = _force_columns(stage, structure)
-    solve = np.linalg.solve(
-        structure.mass,
-        np.column_stack([-structure.stiffness, -structure.damping, blocks, motor]),
-    )
-    push = solve[:, -1]
+    moved, forced = structure_state(stage, condition)
+    push = forced[:, 12]
     encoder = sensors["delta_e"]
     translation = rigid_translation(structure)
 
     a = np.zeros((2 * n + m, 2 * n + m))
-    a[:n, n : 2 * n] = np.eye(n)
-    a[n : 2 * n, : 2 * n] = solve[:, : 2 * n]
-    a[n : 2 * n, 2 * n :] = tuning.force_constant * np.outer(push, servo.c)
+    a[: 2 * n, : 2 * n] = moved
+    a[: 2 * n, 2 * n :] = tuning.force_constant * np.outer(push, servo.c)
     # Negative feedback: the error drives the current that pushes against it.
     a[2 * n :, :n] = -np.outer(servo.b, encoder)
     a[2 * n :, 2 * n :] = servo.a
     b = np.zeros((2 * n + m, len(INPUTS)))
-    b[n : 2 * n, :12] = solve[:, 2 * n : 2 * n + 12]
+    b[: 2 * n, :12] = forced[:, :12]
     b[n : 2 * n, 12:15] = -translation
-    b[n : 2 * n, 15] = push
+    b[: 2 * n, 15] = push
     b[2 * n :, 16] = -servo.b
     carried = rigid_translation(structure)[:, 0].copy()
     carried[: 6 * PLATFORM] = 0.0

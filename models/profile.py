@@ -18,6 +18,9 @@ Array = NDArray[np.float64]
 # choice) lets a move to 100 mm/s just reach that acceleration.
 ACCELERATION = 5.0
 JERK = 250.0
+# Of a move: a day, and more strokes than the longest log shows.
+LONGEST_S = 86400.0
+MOST_STROKES = 1000
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,15 +49,21 @@ class Profile:
     jerk: float = JERK
 
     def __post_init__(self) -> None:
-        """Refuse a stroke on which the set velocity is never reached."""
+        """Refuse a move without end, or a stroke on which the set velocity is never reached."""
         for name in ("velocity", "stroke", "acceleration", "jerk"):
             value = getattr(self, name)
             if not (math.isfinite(value) and value > 0):
                 raise BadParameter(name, value, "a positive number")
-        if not self.dwell >= 0:
-            raise BadParameter("dwell", self.dwell, "0 s or more")
-        if self.strokes < 1:
-            raise BadParameter("strokes", self.strokes, "at least 1")
+        if not (math.isfinite(self.dwell) and self.dwell >= 0):
+            raise BadParameter("dwell", self.dwell, "0 s or more, finite")
+        if not 1 <= self.strokes <= MOST_STROKES:
+            raise BadParameter("strokes", self.strokes, f"1 to {MOST_STROKES}")
+        # Without the ramps, which are shorter than the strokes.
+        least_s = self.strokes * (self.stroke / self.velocity + self.dwell)
+        if least_s > LONGEST_S:
+            raise BadParameter(
+                "duration of all strokes", f"{least_s:.4g} s", f"at most {LONGEST_S:g} s"
+            )
         if self.constant_s <= 0:
             least = self.velocity * self.ramp_s
             raise BadParameter(

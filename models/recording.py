@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -34,6 +35,8 @@ ComplexArray = NDArray[np.complex128]
 
 SAMPLE_RATE_HZ = 20000.0
 DEFAULT_VELOCITY = 0.010
+# Of a log, s: 200 samples; and hardly more than the slowest move through the travel takes.
+SHORTEST_S, LONGEST_S = 0.01, 600.0
 # Room to accelerate and stop at both ends of the travel.
 _USABLE_TRAVEL = 0.95
 _SLOWEST = 0.5e-3
@@ -60,18 +63,30 @@ class Recording:
         return Recording(self.columns, {**metadata, **self.metadata})
 
 
+def sample_count(seconds: float) -> int:
+    """Return the count of samples in a log of some seconds.
+
+    Raises
+    ------
+    BadParameter
+        If that is no number, or the log would be shorter or longer than any can be.
+    """
+    if not SHORTEST_S <= seconds <= LONGEST_S:
+        raise BadParameter("seconds", seconds, f"{SHORTEST_S:g} to {LONGEST_S:g} s")
+    return round(seconds * SAMPLE_RATE_HZ)
+
+
 def move_velocity(stage: Stage, seconds: float, wanted: float = DEFAULT_VELOCITY) -> float:
     """Return the wanted velocity (m/s), or the highest that the travel allows for so long.
 
     Raises
     ------
     BadParameter
-        If the move would have to be slower than 0.5 mm/s, or lasts no time.
+        If the move would have to be slower than 0.5 mm/s, or no log can be as long or short.
     """
-    if not seconds > 0:
-        raise BadParameter("seconds", seconds, "a positive duration")
-    if not wanted >= _SLOWEST:
-        raise BadParameter("velocity", f"{wanted} m/s", f"at least {_SLOWEST} m/s")
+    sample_count(seconds)
+    if not (math.isfinite(wanted) and wanted >= _SLOWEST):
+        raise BadParameter("velocity", f"{wanted} m/s", f"at least {_SLOWEST} m/s, finite")
     usable = _USABLE_TRAVEL * stage.travel.value
     velocity = min(wanted, usable / seconds)
     if velocity < _SLOWEST:
@@ -155,7 +170,7 @@ def simulate_signals(
     rng: np.random.Generator,
 ) -> Array:
     """Return Δe (m), current (A) and two accelerations (m/s²) as sensed, (output, time)."""
-    samples = round(seconds * SAMPLE_RATE_HZ)
+    samples = sample_count(seconds)
     std = noise_levels(stage, np.asarray(velocity), SAMPLE_RATE_HZ)
     diagonal = shaken(stage, condition)
     outputs = simulate(diagonal, std, samples, sample_rate_hz=SAMPLE_RATE_HZ, rng=rng)

@@ -6,7 +6,8 @@ is of first or second order and stays in state space.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, fields
 from functools import lru_cache, reduce
 from typing import Any
 
@@ -25,6 +26,10 @@ class Biquad:
     frequency_hz: float
     damping_above: float
     damping_below: float
+
+    def __post_init__(self) -> None:
+        """Refuse numbers that are not positive."""
+        _refuse_not_positive(self)
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,10 +60,16 @@ class Tuning:
     resistance: float = 15.0
 
     def __post_init__(self) -> None:
-        """Refuse gains that are not positive."""
-        for name in ("position_gain", "velocity_p", "velocity_i", "divisor", "drive_gain"):
-            if not getattr(self, name) > 0:
-                raise BadParameter(name, getattr(self, name), "a positive gain")
+        """Refuse numbers that are not positive."""
+        _refuse_not_positive(self)
+
+
+def _refuse_not_positive(part: Biquad | Tuning) -> None:
+    """Raise if one of the numbers of a part is not positive or not finite."""
+    for field in fields(part):
+        value = getattr(part, field.name)
+        if isinstance(value, int | float) and not (math.isfinite(value) and value > 0):
+            raise BadParameter(field.name, value, "a positive number, finite")
 
 
 TUNINGS = {

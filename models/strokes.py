@@ -1,8 +1,8 @@
 """Recordings of strokes with their transients: acceleration, braking, dwell, there and back.
 
-Table 3 of the paper jumps by six to nine between 20 and 100 mm/s, where no law of friction does:
-its records are taken as windows of one fixed length about the middle of a full stroke.  A slow
-stroke fills the window with constant velocity; a fast one fits into it with its transients.
+Table 3 of the paper jumps by six between 20 and 100 mm/s, where no law of friction does.  We read
+its records as windows of one fixed length about the middle of a full stroke: a slow stroke fills
+the window with constant velocity, a fast one fits into it with its transients.
 """
 
 from __future__ import annotations
@@ -15,10 +15,11 @@ from models.errors import BadParameter
 from models.modal import diagonalise, propagate, stationary_state
 from models.plant import INPUTS, closed_loop
 from models.profile import Profile
-from models.recording import SAMPLE_RATE_HZ, Recording, sense, shaken, to_recording
+from models.recording import SAMPLE_RATE_HZ, Recording, sample_count, sense, shaken, to_recording
 from models.stages import NOMINAL, Condition, Stage, tuning_named
 
 Array = NDArray[np.float64]
+Orders = tuple[Array, NDArray[np.intp], NDArray[np.complex128]]
 
 # The paper's set velocities, m/s.
 VELOCITIES = (0.001, 0.005, 0.010, 0.020, 0.100, 0.200, 0.400)
@@ -28,6 +29,10 @@ WINDOW_S = 4.0
 # Friction turns round within this velocity, m/s (our choice).
 _TURNING = 5e-4
 _CHUNK = 1 << 15
+# What a transient leaves after this long is nothing: the slowest pole decays by 0.5 1/s.
+_FORGOTTEN_S = 20.0
+# Orders begin within this part of a second, though the stage has moved for long.
+_ORDERS_S = 2.0
 
 
 def full_stroke(stage: Stage, velocity: float) -> Profile:
@@ -59,14 +64,71 @@ def commands(stage: Stage, condition: Condition, reference: Array) -> Array:
     return inputs
 
 
-def _add_orders(inputs: Array, stage: Stage, reference: Array, rng: np.random.Generator) -> None:
+def _add_orders(inputs: Array, drawn: Orders, reference: Array) -> None:
     """Add the kinematic orders, which follow the position, to inputs (input, time)."""
     position, velocity = reference[:2]
     moving = np.tanh(np.abs(velocity) / _TURNING)
-    for cycles, index, amplitude in zip(*drawn_orders(stage, rng), strict=True):
+    for cycles, index, amplitude in zip(*drawn, strict=True):
         # The drive's anti-alias filter removes what is above half the sample rate.
         heard = moving * (cycles * np.abs(velocity) < SAMPLE_RATE_HZ / 2)
         inputs[index] += heard * (amplitude * np.exp(2j * np.pi * cycles * position)).real
+
+
+def _lead_in_s(profile: Profile, start: float) -> float:
+    """Return how long before a window (its start in s) the simulation has to begin, s.
+
+    Either the stage stands there, or it has moved evenly long enough to have forgotten how it got
+    into motion.
+    """
+    if start <= 0:
+        return 0.0
+    path = profile.position()
+    ramps = np.flatnonzero((path.c[0] != 0) | (path.c[1] != 0))
+    # The last moment before the window at which the reference accelerates.
+    before = [min(path.x[i + 1], start) for i in ramps if path.x[i] < start]
+    if start - max(before) >= _FORGOTTEN_S:
+        return _ORDERS_S
+    # Back to a moment that is steady itself: not within a ramp.
+    # Just before 0, where the stage stands: at 0 the reference has its first jerk already.
+    first = max(-0.01, start - _FORGOTTEN_S)
+    inside = [path.x[i] for i in ramps if path.x[i] < first < path.x[i + 1]]
+    return float(start - min([first, *(x - profile.ramp_s for x in inside)]))
+
+
+def commanded(
+    stage: Stage,
+    condition: Condition,
+    profile: Profile,
+    time: Array,
+    rng: np.random.Generator,
+) -> tuple[Array, Array]:
+    """Return what a move does to the outputs, its kinematic orders included, without noise.
+
+    Parameters
+    ----------
+    time : (time,)
+        Even times at the sample rate, s; 0 is the start of the first stroke.
+
+    Returns
+    -------
+    outputs : (output, time)
+    reference : (4, time)
+        Position, velocity, acceleration, jerk, SI.
+    """
+    lead = round(_lead_in_s(profile, float(time[0])) * SAMPLE_RATE_HZ)
+    early = time[0] - np.arange(lead, 0, -1) / SAMPLE_RATE_HZ
+    reference = profile.sampled(np.concatenate([early, time]))
+    direct = diagonalise(closed_loop(stage, condition))
+    # What is commanded at the first sample has been commanded for long.
+    state = -(direct.b @ commands(stage, condition, reference[:, :1])[:, 0]) / direct.poles
+    drawn = drawn_orders(stage, rng)
+    outputs = np.empty((direct.c.shape[0], reference.shape[1]))
+    for start in range(0, reference.shape[1], _CHUNK):
+        part = slice(start, start + _CHUNK)
+        inputs = commands(stage, condition, reference[:, part])
+        _add_orders(inputs, drawn, reference[:, part])
+        outputs[:, part], state = propagate(direct, state, inputs, SAMPLE_RATE_HZ)
+    return outputs[:, lead:], reference[:, lead:]
 
 
 def _noise_outputs(
@@ -106,20 +168,14 @@ def record_strokes(
     Raises
     ------
     BadParameter
-        If the window holds no sample, or the profile leaves the travel.
+        If the window is too short or too long, or the profile leaves the travel.
     """
-    if not round(seconds * SAMPLE_RATE_HZ) > 0:
-        raise BadParameter("seconds", seconds, "at least one sample")
+    samples = sample_count(seconds)
     if profile.stroke > stage.travel.value:
         raise BadParameter("stroke", f"{profile.stroke} m", f"at most {stage.travel.value} m")
-    time = np.arange(round(seconds * SAMPLE_RATE_HZ)) / SAMPLE_RATE_HZ
-    reference = profile.sampled(time + (profile.seconds - profile.dwell - seconds) / 2)
-    inputs = commands(stage, condition, reference)
-    direct = diagonalise(closed_loop(stage, condition))
-    # What was commanded long enough has settled before the window opens.
-    settled = -(direct.b @ inputs[:, 0]) / direct.poles
-    _add_orders(inputs, stage, reference, rng)
-    outputs, _ = propagate(direct, settled, inputs, SAMPLE_RATE_HZ)
+    start = (profile.seconds - profile.dwell - seconds) / 2
+    time = start + np.arange(samples) / SAMPLE_RATE_HZ
+    outputs, reference = commanded(stage, condition, profile, time, rng)
     outputs += _noise_outputs(stage, condition, reference[1], rng)
     sense(outputs, stage, reference[1], rng)
     return to_recording(stage, condition, outputs, reference[0], reference[1])

@@ -34,9 +34,14 @@ class Body:
     radii: tuple[float, float, float]
 
     def __post_init__(self) -> None:
-        """Refuse a body without inertia."""
+        """Refuse a body without inertia, and one that no distribution of mass can be."""
         if self.mass <= 0 or min(self.radii) <= 0:
             raise BadParameter(f"body {self.name}", (self.mass, self.radii), "positive inertia")
+        moments = sorted(radius**2 for radius in self.radii)
+        # A thin plate has equality, here with room for rounding.
+        if moments[2] > (moments[0] + moments[1]) * (1 + 1e-9):
+            needed = "no moment of inertia above the sum of the other two"
+            raise BadParameter(f"radii of gyration of {self.name}", self.radii, needed)
 
 
 @dataclass(frozen=True, slots=True)

@@ -24,8 +24,16 @@ from models.plant import (
     assurance,
     closed_loop,
     closed_loop_modes,
+    structure_state,
 )
-from models.recording import DEFAULT_VELOCITY, SAMPLE_RATE_HZ, Recording, record
+from models.recording import (
+    DEFAULT_VELOCITY,
+    LONGEST_S,
+    SAMPLE_RATE_HZ,
+    Recording,
+    record,
+    sample_count,
+)
 from models.stages import NOMINAL, Condition, Number, Stage, build_structure, tuning_named
 
 Array = NDArray[np.float64]
@@ -69,8 +77,9 @@ class Sweep:
             raise BadParameter("band", band, f"0 < low < high < {SAMPLE_RATE_HZ / 2:g} Hz")
         if not (math.isfinite(self.amplitude) and self.amplitude > 0):
             raise BadParameter("amplitude", self.amplitude, "a positive current, A")
-        if not self.low_hz * self.period >= 1:
-            raise BadParameter("period", self.period, f"at least {1 / self.low_hz:g} s: one cycle")
+        if not 1 / self.low_hz <= self.period <= LONGEST_S:
+            needed = f"{1 / self.low_hz:g} s, one cycle, to {LONGEST_S:g} s"
+            raise BadParameter("period", self.period, needed)
         if self.law not in _LAWS:
             raise BadParameter("law", self.law, " or ".join(_LAWS))
 
@@ -142,12 +151,12 @@ def record_sweep(
     BadParameter
         If the log is shorter than a period, or the sine so strong that the stage turns back.
     """
+    samples = sample_count(seconds)
     if not seconds >= sweep.period:
         raise BadParameter("seconds", seconds, f"at least one period of {sweep.period} s")
     moved = replace(stage, encoder_count=_STEPLESS)
     quiet = record(moved, condition, seconds=seconds, velocity=velocity, rng=rng)
     columns = {name: values.astype(float) for name, values in quiet.columns.items()}
-    samples = columns["current_a"].size
     parts = response(stage, sweep, condition, samples=samples)
     _refuse_turning_back(sweep, parts[OUTPUTS.index("delta_e")], quiet)
     for (name, unit), part in zip(_MOVED, parts, strict=True):
@@ -183,13 +192,9 @@ def without_loop(stage: Stage, condition: Condition = NOMINAL) -> dict[str, tupl
     ``current_a``: fed back, a current that the sensors cause is not an input.
     """
     structure = build_structure(stage, condition)
-    n = structure.size
-    a = np.zeros((2 * n, 2 * n))
-    a[:n, n:] = np.eye(n)
-    a[n:] = np.linalg.solve(structure.mass, -np.hstack([structure.stiffness, structure.damping]))
-    values, vectors = np.linalg.eig(a)
+    values, vectors = np.linalg.eig(structure_state(stage, condition)[0])
     upper = values.imag > 1.0
-    values, shapes = values[upper], vectors[:n, upper]
+    values, shapes = values[upper], vectors[: structure.size, upper]
     modes = [m for m in closed_loop_modes(stage, condition) if m.name in GUIDE_MODES]
     alike = assurance(structure.mass, np.column_stack([m.shape for m in modes]), shapes)
     apart = np.abs(np.log(np.abs([[v / m.eigenvalue for v in values] for m in modes])))

@@ -11,8 +11,10 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from models.formats import file_suffix, write_log
+from models.errors import BadParameter
+from models.formats import file_suffix, refuse_other_logs, write_log
 from models.profile import Profile
+from models.recording import sample_count
 from models.stages import NOMINAL, Condition, Stage
 from models.strokes import VELOCITIES, WINDOW_S, full_stroke, record_strokes
 
@@ -31,6 +33,10 @@ class Experiment:
     seconds: float = WINDOW_S
     seed: int = 0
 
+    def __post_init__(self) -> None:
+        """Refuse a window that no log can have."""
+        sample_count(self.seconds)
+
     @property
     def identity(self) -> str:
         """Identity of the machine that the seed makes."""
@@ -44,6 +50,20 @@ class Experiment:
         """Return the generator of one move: independent of which others are driven."""
         words = [self.seed, zlib.crc32(f"{self.stage.name}/velocities".encode())]
         return np.random.default_rng(np.random.SeedSequence([*words, round(velocity * 1e6)]))
+
+
+def _file_name(velocity: float, suffix: str) -> str:
+    """Return the name of the log of a velocity (m/s)."""
+    return f"velocity-{1e3 * velocity:08.3f}{suffix}"
+
+
+def _refuse_twins(velocities: tuple[float, ...]) -> None:
+    """Raise if two velocities (m/s) would share a file."""
+    names = [_file_name(velocity, "") for velocity in velocities]
+    for velocity, name in zip(velocities, names, strict=True):
+        if names.count(name) > 1:
+            needed = "velocities that differ by 0.001 mm/s or more"
+            raise BadParameter("velocity", f"{1e3 * velocity:g} mm/s, more than once", needed)
 
 
 def drive_velocities(
@@ -60,9 +80,18 @@ def drive_velocities(
     ----------
     progress
         Called with 1 after each log.
+
+    Raises
+    ------
+    BadParameter
+        If a velocity cannot be driven, or two would share a file.
+    OccupiedFolder
+        If the folder holds logs that would not be overwritten.
     """
     suffix = file_suffix(file_format)
     moves = [experiment.move(velocity) for velocity in velocities]
+    _refuse_twins(velocities)
+    refuse_other_logs(folder, [_file_name(velocity, suffix) for velocity in velocities])
     folder.mkdir(parents=True, exist_ok=True)
     rows, travel_km = [], 0.0
     for i, move in enumerate(moves):
@@ -80,7 +109,7 @@ def drive_velocities(
             "travel_km": round(travel_km, 6),
             "velocity_mm_s": round(move.velocity * 1e3, 6),
         }
-        name = f"velocity-{row['velocity_mm_s']:08.3f}{suffix}"
+        name = _file_name(move.velocity, suffix)
         write_log(recording.described(**row), folder / name, file_format)
         rows.append({"file": name, **row, "temperature_c": experiment.condition.temperature_c})
         if progress is not None:

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 
-from lmshealth.bandfit import BandFit, View, fit_band
+from lmshealth.bandfit import BandFit, View, _mask_towers, fit_band
 from lmshealth.spectra import Segment, periodogram
 from lmshealth.starts import Coarse, Target, coarsen
 from tests.signals import Mode, accelerations, make_log, sine, white
@@ -93,6 +93,20 @@ def test_a_line_is_kept_out_and_listed_with_its_amplitude() -> None:
     assert amplitude == pytest.approx(30.0, rel=0.1)
     off = (found.estimate - clean.estimate) / np.sqrt(np.diag(clean.cov))
     assert np.abs(off).max() < 1
+
+
+@pytest.mark.parametrize(("apart", "masked"), [(6, 0.0), (12, 5 / 12)])
+def test_towers_are_masked_unless_they_are_most_of_the_band(apart: int, masked: float) -> None:
+    """Five of every twelve ordinates are masked as lines; where it would be five of six, none."""
+    n, low, high = 60_000, 75, 165
+    values = both()
+    for k in range(low * 60, high * 60, apart):
+        values = values + sine(n, RATE, k / 60, 300.0)
+    view, coarse = view_of(values)
+    spectra = (view.spectra[0].band(low, high),)
+    masks = [np.ones(spectra[0].frequency.size, dtype=bool)]
+    _mask_towers(spectra, masks, coarse)
+    assert 1 - masks[0].mean() == pytest.approx(masked, abs=2e-3)
 
 
 def test_a_mode_far_from_where_it_is_sought_is_not_taken() -> None:

@@ -6,10 +6,13 @@ Question
 Method
     Per velocity and seed one window of 4 s about the middle of a full stroke of 280 mm, as
     `python -m models velocities` writes it; Δe and the accelerations are read as the paper reads
-    them.  Table 1 from the loops with the flexible modes inside, Table 2 from sine sweeps while
-    moving, Table 5 from the closed-loop modes.  Cells are means over seeds.  Negative control: the
-    same tables from constant velocity alone, without acceleration and braking.  ``printed/`` holds
-    the paper's numbers, errata included.
+    them.  Levels of friction, roughness and mains were set on these tables: agreement shows that
+    one small set of levels serves all of them.  Rows at multiples of 50 Hz hold mains whose
+    amplitude was set on that very row; the count is given without them too.  Table 1 from the
+    loops with the flexible modes inside, Table 2 from sine sweeps while moving, Table 5 from the
+    closed-loop modes.  Cells are means over seeds.  Negative control: the same tables from
+    constant velocity alone, without acceleration and braking.  ``printed/`` holds the paper's
+    numbers, errata included.
 Run time
     About three minutes on one processor.
 """
@@ -41,7 +44,7 @@ HERE = Path(__file__).parent
 # A frequency of Figure 18 depends strongly on velocity if it grows by this and gets this high.
 GROWTH, HIGH_MM_S2 = 10.0, 15.0
 
-_ELASTIC = "no such mode in three rigid bodies: housing, platform and load bend"
+_ELASTIC = "three rigid bodies have no such mode: bending parts or others"
 _FLOOR = "printed floor of the instrument: simulated accelerometers are quieter"
 _NO_LINE = "the paper's loop has lines or resonances there that three rigid bodies do not have"
 REASONS = {
@@ -103,7 +106,7 @@ def within(row: Row, factor: float) -> list[bool]:
 
 def verdict(row: Row) -> str:
     """Judge a row: by its worst cell, then by its trend over velocity."""
-    tight = {"Table 2": 1.1, "Table 5": 1.03}.get(row.table)
+    tight = {"Table 1": 1.05, "Table 2": 1.1, "Table 5": 1.03}.get(row.table)
     if tight is not None:
         if not all(within(row, tight)):
             return "not reproduced"
@@ -182,6 +185,9 @@ def summarise(rows: list[Row]) -> dict[str, str]:
             ("x max_magnitude_um", "y max_magnitude_um"), 1.5
         ),
         "table_6_7_mode_rows_within_3": count(tuple(modes), 3.0),
+        "table_6_7_mode_rows_without_mains_within_3": count(
+            tuple(name for name in modes if int(name.split()[1]) % 50), 3.0
+        ),
         "table_6_7_other_rows_within_3": count(tuple(others), 3.0),
         "std_of_x_below_y": f"{sum(np.less(spread['x'], spread['y']))} of 7",
         "std_grows_with_velocity": f"{rising['x']} of 6 steps (X), {rising['y']} of 6 (Y)",

@@ -1,5 +1,7 @@
 """Tests of the calibration to the paper's tables."""
 
+from dataclasses import fields
+
 import numpy as np
 import pytest
 
@@ -9,14 +11,14 @@ from models.stages import STAGES
 
 
 def test_tables_are_met():
-    """Roll and pitch are within 0.1 Hz, the rest of Table 5 within 3 %, of Table 2 within 4 %."""
+    """Roll and pitch are within 0.1 Hz, the rest of Table 5 within 3 %, of Table 2 within 5 %."""
     misfits = dict(zip(TARGETS, target_misfits(dict(STAGES)), strict=True))
     for target, misfit in misfits.items():
         off = abs(np.expm1(misfit))
         if target.mode in ("roll", "pitch"):
             assert off * target.frequency_hz < 0.1, target
         else:
-            assert off < (0.04 if target.source == "Table 2" else 0.03), target
+            assert off < (0.05 if target.source == "Table 2" else 0.03), target
 
 
 def test_free_numbers_stay_within_two_widths_of_their_priors():
@@ -35,6 +37,17 @@ def test_calibration_gives_the_stored_numbers():
             stored = getattr(STAGES[name], free.field)
             assert stored.source == "calibrated"
             assert getattr(found[name], free.field).value == pytest.approx(stored.value, rel=1e-4)
+
+
+def test_calibrated_means_calibrated():
+    """The numbers whose source says so are those that the calibration finds, and no others."""
+    for name, stage in STAGES.items():
+        said = {
+            field.name
+            for field in fields(stage)
+            if getattr(getattr(stage, field.name), "source", None) == "calibrated"
+        }
+        assert said == {free.field for free in FREE if name in free.stages}
 
 
 def test_no_other_mode_in_the_health_band_of_y():

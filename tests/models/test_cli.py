@@ -80,6 +80,61 @@ def test_wrong_usage_is_status_2():
     assert run("simulate", "lms-y").returncode == 2
 
 
+LIFE = ["simulate", "lms-y", "--life", "healthy", "--logs", "1", "--workers", "1"]
+STROKES = ["velocities", "lms-x", "--velocity", "400"]
+SWEEP = ["sweep", "lms-x", "--low", "100", "--period", "0.1", "--seconds", "1"]
+BOUNDS = "needed: 0.01 to 600 s"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "error"),
+    [
+        ([*LIFE, "--seconds", "0.00001"], f"seconds is 1e-05; {BOUNDS}"),
+        ([*LIFE, "--seconds", "nan"], f"seconds is nan; {BOUNDS}"),
+        ([*LIFE, "--seconds", "1e5"], f"seconds is 100000.0; {BOUNDS}"),
+        ([*STROKES, "--seconds", "nan"], f"seconds is nan; {BOUNDS}"),
+        ([*STROKES, "--seconds", "inf"], f"seconds is inf; {BOUNDS}"),
+        ([*STROKES, "--seconds", "1e9"], f"seconds is 1000000000.0; {BOUNDS}"),
+        ([*STROKES, "--seconds", "1e5"], f"seconds is 100000.0; {BOUNDS}"),
+        ([*STROKES, "--strokes", "100000000"], "strokes is 100000000; needed: 1 to 1000"),
+        ([*STROKES, "--dwell", "inf"], "dwell is inf; needed: 0 s or more, finite"),
+        (
+            [*STROKES, "--velocity", "400"],
+            "velocity is 400 mm/s, more than once; needed: "
+            "velocities that differ by 0.001 mm/s or more",
+        ),
+        ([*SWEEP, "--seconds", "inf"], f"seconds is inf; {BOUNDS}"),
+        ([*SWEEP, "--period", "inf"], "period is inf; needed: 0.01 s, one cycle, to 600 s"),
+        ([*SWEEP, "--velocity", "inf"], "velocity is inf m/s; needed: at least 0.0005 m/s, finite"),
+    ],
+)
+def test_numbers_without_meaning_are_one_line_and_no_file(tmp_path, arguments, error):
+    """Status 1, one line that says what was got and is needed, no traceback, nothing written."""
+    out = tmp_path / ("out.h5" if arguments[0] == "sweep" else "out")
+    done = run(*arguments, "--out", str(out))
+    assert (done.returncode, done.stderr) == (1, f"error: {error}\n")
+    assert not list(tmp_path.iterdir())
+
+
+def test_stale_logs_are_one_line(tmp_path):
+    """A folder with two logs is refused to a plan of one, with the way out of it."""
+    folder = ["--seconds", "0.1", "--out", str(tmp_path)]
+    assert run(*LIFE, "--logs", "2", *folder).returncode == 0
+    done = run(*LIFE, *folder)
+    assert done.returncode == 1
+    assert done.stderr == (
+        f"error: {tmp_path} holds log-0002.h5: "
+        "logs that this run would not write again (1) would stay; "
+        "needed: another folder (or remove them)\n"
+    )
+
+
+def test_help_says_that_the_velocity_is_lowered():
+    """The help of `sweep` says what becomes of a velocity that the travel does not allow."""
+    output = CliRunner().invoke(cli, ["sweep", "--help"]).output
+    assert "lowered to what the travel" in " ".join(output.split())
+
+
 def test_until_failure_needs_a_life_that_fails(tmp_path):
     """Following a healthy life to its failure is refused in one line before anything is made."""
     out = tmp_path / "life"

@@ -2,6 +2,7 @@
 
 import control
 import numpy as np
+import pandas as pd
 import pytest
 
 from models.equations import (
@@ -22,6 +23,7 @@ from models.equations import (
 )
 from models.errors import BadParameter, UnknownReading, UnknownStage
 from models.plant import closed_loop_modes
+from models.profile import Profile
 from models.servo import TUNINGS
 from models.servo import controller as factored_controller
 from models.stages import STAGES, stage_named
@@ -31,6 +33,7 @@ L, K_F, K_P, K_I, K_V, R = 1.24e-3, 12.9, 25.0, 21000.0, 15.0, 6.4
 MASS = {6: 23.5, 7: 25.0}
 SCALE = {6: 21.02, 7: 18.0}
 NAMES = sorted(STAGES)
+TABLE_3 = "studies/paper_tables/printed/table3.csv"
 S = 2j * np.pi * np.geomspace(0.01, 2000.0, 200)
 
 
@@ -202,13 +205,15 @@ def test_erratum_eq_11():
     assert PRINTED[11].denominator[9] == pytest.approx(1e6 * x[9], rel=3e-4)
 
 
-def test_erratum_table_3():
-    """At 100 mm/s Table 3 has X's deviation, 5.5 µm, far above both of its neighbours."""
-    x = {20: 0.6, 100: 5.5, 200: 2.6}
-    y = {20: 0.9, 100: 5.5, 200: 8.5}
-    assert x[100] == y[100]
-    assert not x[20] <= x[100] <= x[200]
-    assert y[20] <= y[100] <= y[200]
+def test_erratum_table_3(root):
+    """At 100 mm/s, and there only, Table 3 has one deviation and one mean for X and Y."""
+    table = pd.read_csv(root / TABLE_3, index_col=0)
+    same = table[["x_std_um", "x_mean_um"]].to_numpy() == table[["y_std_um", "y_mean_um"]]
+    assert list(table.index[same.all(axis=1)]) == [100]
+    assert list(table.index[same.any(axis=1)]) == [100]
+    # It is not X's: above 20 mm/s every other deviation is larger in Y.
+    assert table.loc[100, "x_std_um"] > table.loc[[200, 400], "x_std_um"].max()
+    assert table["y_std_um"].is_monotonic_increasing
 
 
 @pytest.mark.parametrize(("stage", "pair"), [("lms-x", (12.6, 36.8)), ("lms-y", (12.4, 36.6))])
@@ -227,11 +232,19 @@ def test_erratum_yaw_is_roll():
     assert nearest.name == "roll"
 
 
-def test_erratum_units_of_velocity():
-    """At 5000 mm/s² 400 mm/s is reached in 16 mm of the travel; in metres it would take 16 m."""
-    run = 0.400**2 / (2 * 5.0)
-    assert run == pytest.approx(0.016)
-    assert 1000 * run > STAGES["lms-x"].travel.value > run
+@pytest.mark.parametrize("name", NAMES)
+def test_erratum_units_of_velocity(root, name):
+    """In mm/s every velocity of Table 3 is reached on the travel; in m/s only the slowest is."""
+    printed = pd.read_csv(root / TABLE_3)["velocity_mm_s"]
+
+    def reached(velocity):
+        try:
+            return Profile(velocity, STAGES[name].travel.value).constant_s > 0
+        except BadParameter:
+            return False
+
+    assert all(reached(1e-3 * velocity) for velocity in printed)
+    assert [velocity for velocity in printed if reached(velocity)] == [1]
 
 
 @pytest.mark.parametrize("equation", [6, 7])

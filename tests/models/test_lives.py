@@ -10,7 +10,13 @@ import pyarrow.parquet as pq
 import pytest
 
 from models.degradation import LIVES
-from models.errors import BadParameter, UnknownFault, UnknownFormat, UnknownLife
+from models.errors import (
+    BadParameter,
+    OccupiedFolder,
+    UnknownFault,
+    UnknownFormat,
+    UnknownLife,
+)
 from models.lives import Plan, schedule, simulate_life
 from models.plant import closed_loop_modes
 from models.recording import COLUMNS
@@ -151,7 +157,9 @@ def test_healthy_life_stays_new():
         (BadParameter, ("lms-y", "both", 1, -1.0, 0)),
         (BadParameter, ("lms-y", "both", 1, 1.0, -1)),
         (BadParameter, ("lms-y", "both", 1, 1.0, 0, "csv", "tomorrow")),
-        (BadParameter, ("lms-y", "servo-retuning", 1, 1.0, 0, "csv", "failure")),
+        (BadParameter, ("lms-y", "servo-retuning", 2, 1.0, 0, "csv", "failure")),
+        (BadParameter, ("lms-y", "both", 1, 1e-5, 0)),
+        (BadParameter, ("lms-y", "both", 1, float("nan"), 0)),
     ],
 )
 def test_impossible_plan_is_refused(error, arguments):
@@ -228,6 +236,26 @@ def test_a_life_followed_to_its_failure_passes_it(name):
     assert passed == [v.travel_km >= failure for v in schedule(whole)]
     assert passed[-1] and not passed[0]
     assert schedule(now)[-1].travel_km <= 2000
+
+
+def test_a_life_until_its_failure_needs_two_logs():
+    """One log alone stands at the beginning: it is refused, of two the last is past the failure."""
+    with pytest.raises(BadParameter, match="logs is 1; needed: at least 2"):
+        Plan("lms-y", "both", 1, 1.0, 0, until="failure")
+    plan = Plan("lms-y", "both", 2, 1.0, 0, until="failure")
+    assert schedule(plan)[-1].travel_km > plan.draw_life().failure_km()
+
+
+@pytest.mark.parametrize("changed", [{"logs": 1}, {"file_format": "csv"}])
+def test_logs_of_another_plan_are_not_left_behind(tmp_path, changed):
+    """What would stay beside the new manifest is refused by name; the same plan runs again."""
+    plan = Plan("lms-y", "healthy", 2, 0.1, 0)
+    simulate_life(plan, tmp_path)
+    before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+    with pytest.raises(OccupiedFolder, match=r"holds log-000\d\.h5.* needed: another folder"):
+        simulate_life(replace(plan, **changed), tmp_path)
+    simulate_life(plan, tmp_path)
+    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
 
 
 def test_work_still_to_come_is_not_in_maintenance(tmp_path):

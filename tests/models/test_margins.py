@@ -10,7 +10,7 @@ from click.testing import CliRunner
 from models import margins as module
 from models.__main__ import cli
 from models.equations import READINGS, factors, ratio
-from models.errors import BadParameter, UnknownStage
+from models.errors import BadParameter, UnknownStage, UnstableLoop
 from models.margins import (
     GAIN_CROSSOVER,
     LOWER_CROSSOVER,
@@ -205,6 +205,19 @@ def test_sensitivities_add_to_one(name):
     assert np.abs(error).max() <= found.peak_sensitivity * (1 + 1e-9)
     assert np.abs(error).max() == pytest.approx(found.peak_sensitivity, rel=1e-4)
     assert hertz[np.argmax(np.abs(error))] == pytest.approx(found.peak_hz, rel=5e-3)
+
+
+def test_a_structure_that_the_loop_cannot_hold_is_judged_unstable():
+    """Where the simulation refuses to run, the same loop has the verdict, and grows as fast."""
+    loose = Condition(guide_damping=0.01)
+    with pytest.raises(UnstableLoop) as refused:
+        closed_loop(stage_named("lms-x"), loose)
+    found = margins(simulated_loop("lms-x", loose))
+    assert found.verdict == "unstable"
+    assert found.growth_per_s == pytest.approx(refused.value.growth_per_s, rel=1e-6)
+    judged = {(c.reading, c.structure): c.margins.verdict for c in cases("lms-x", loose)}
+    assert judged["corrected", "flexible"] == "unstable"
+    assert judged["corrected", "rigid"] == "meets"
 
 
 def test_textbook_loop():

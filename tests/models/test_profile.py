@@ -67,7 +67,9 @@ def test_durations_add_up():
         ("stroke", 0.01),
         ("jerk", float("nan")),
         ("dwell", -1.0),
+        ("dwell", float("inf")),
         ("strokes", 0),
+        ("strokes", 1001),
         ("acceleration", 0.0),
     ],
 )
@@ -76,3 +78,11 @@ def test_impossible_profiles_are_refused(field, value):
     wanted = {"velocity": 0.4, "stroke": 0.28, field: value}
     with pytest.raises(BadParameter, match=field):
         Profile(**wanted)
+
+
+def test_moves_end_within_a_day():
+    """Dwells and crawls of more than a day are refused, just less is driven."""
+    for wanted in ({"dwell": 86400.0}, {"velocity": 3e-6}, {"dwell": 900.0, "strokes": 100}):
+        with pytest.raises(BadParameter, match=r"duration of all strokes.* at most 86400 s"):
+            Profile(**{"velocity": 0.4, "stroke": 0.28, **wanted})
+    assert Profile(0.4, 0.28, dwell=86000.0).seconds == pytest.approx(86400, rel=0.01)

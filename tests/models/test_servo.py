@@ -1,6 +1,6 @@
 """Tests of the controllers."""
 
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
@@ -52,7 +52,13 @@ def test_current_loop_has_unit_gain():
     assert current_loop(TUNINGS["lms-x"]).dcgain() == pytest.approx(1.0)
 
 
-def test_negative_gain_is_refused():
-    """A loop of wrong sign raises before it is closed."""
-    with pytest.raises(BadParameter, match="drive_gain"):
-        replace(TUNINGS["lms-x"], drive_gain=-1.0)
+NUMBERS = [f.name for f in fields(TUNINGS["lms-x"]) if f.name not in ("name", "sections")]
+
+
+@pytest.mark.parametrize("value", [-1.0, 0.0, 0, float("nan"), float("inf")])
+def test_numbers_that_are_not_positive_are_refused(value):
+    """Every number of a tuning and of its sections is named, before a loop is closed."""
+    for part in (TUNINGS["lms-x"], TUNINGS["lms-x"].sections[0]):
+        for name in NUMBERS if part is TUNINGS["lms-x"] else part.__slots__:
+            with pytest.raises(BadParameter, match=f"{name} is {value}; needed: a positive"):
+                replace(part, **{name: value})

@@ -1,5 +1,7 @@
 """Tests of recordings with transients."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -9,7 +11,7 @@ from models.plant import INPUTS, OUTPUTS, closed_loop
 from models.profile import Profile
 from models.recording import COLUMNS, record
 from models.stages import NOMINAL, STAGES
-from models.strokes import VELOCITIES, commands, full_stroke, record_strokes
+from models.strokes import VELOCITIES, commanded, commands, full_stroke, record_strokes
 
 STAGE = STAGES["lms-y"]
 
@@ -85,6 +87,25 @@ def test_feedforward_takes_most_of_the_acceleration_off_the_loop():
         :, INPUTS.index("feedforward_current")
     ] * (STAGE.moving_mass.value / 12.9)
     assert np.all(np.abs(helped) < 0.1 * alone)
+
+
+@pytest.mark.parametrize(
+    ("velocity", "strokes", "dwell", "cut"),
+    [(0.4, 2, 0.5, 0.55), (0.4, 2, 0.5, 0.3), (0.4, 9, 0.0, 1.0), (0.1, 1, 0.5, 0.5)],
+)
+def test_a_short_window_is_the_middle_of_a_long_one(velocity, strokes, dwell, cut):
+    """Wherever a window opens, within a transient or after it, it shows what a longer one shows."""
+    profile = replace(full_stroke(STAGE, velocity), strokes=strokes, dwell=dwell)
+    middle = (profile.seconds - dwell) / 2
+    long = np.arange(round((profile.seconds + 1.0) * 20000)) / 20000 - 0.5
+    inside = np.abs(long - middle) < cut / 2
+    whole, short = (
+        commanded(STAGE, NOMINAL, profile, time, np.random.default_rng(3))[0]
+        for time in (long, long[inside])
+    )
+    # Friction turns round in no time, but the integrator meets what compensation leaves slowly.
+    for row, scale in zip(whole[:, inside] - short, np.abs(whole).max(axis=1), strict=True):
+        assert np.abs(row).max() < 2e-3 * scale
 
 
 def test_commands_rest_before_the_move():

@@ -1,10 +1,12 @@
 """Tests of rigid bodies and springs."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from models.errors import BadParameter
-from models.stages import PLATFORM, STAGES, Condition, build_structure, stage_named
+from models.stages import PLATFORM, STAGES, Condition, Number, build_structure, stage_named
 from models.structure import (
     GROUND,
     Body,
@@ -145,3 +147,24 @@ def test_body_without_inertia_is_refused():
     """A body of zero mass raises and names the body."""
     with pytest.raises(BadParameter, match="lump"):
         Body("lump", 0.0, (0.0, 0.0, 0.0), (0.1, 0.1, 0.1))
+
+
+def test_bodies_that_cannot_be_are_refused():
+    """A moment of inertia above the sum of the other two belongs to no distribution of mass."""
+    Body("plate", 1.0, (0.0, 0.0, 0.0), (3.0, 4.0, 5.0))
+    with pytest.raises(BadParameter, match=r"radii of gyration of rod.*sum of the other two"):
+        Body("rod", 1.0, (0.0, 0.0, 0.0), (0.3, 0.1, 0.1))
+
+
+def test_spreads_always_make_a_possible_body():
+    """Any three spreads give radii of gyration that a distribution of mass can have."""
+    rng = np.random.default_rng(0)
+    for spreads in np.exp(rng.normal(-2, 2, (200, 3))):
+        numbers = dict(
+            zip(
+                ("load_spread_feed", "load_spread_lateral", "load_spread_vertical"),
+                (Number(float(s), "m", "our choice") for s in spreads),
+                strict=True,
+            )
+        )
+        build_structure(replace(STAGES["lms-y"], **numbers))

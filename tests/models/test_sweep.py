@@ -13,7 +13,7 @@ from models.__main__ import cli
 from models.errors import BadParameter
 from models.formats import WRITERS
 from models.modal import diagonalise, frequency_response
-from models.plant import GUIDE_MODES, INPUTS, OUTPUTS, closed_loop
+from models.plant import GUIDE_MODES, INPUTS, OUTPUTS, closed_loop, structure_state
 from models.recording import COLUMNS, SAMPLE_RATE_HZ, record
 from models.servo import TUNINGS
 from models.stages import STAGES, Number, build_structure
@@ -123,24 +123,34 @@ def test_coherence_is_near_one_and_the_following_error_small(log_y):
     assert np.median(weak[band]) < 0.5
 
 
+@pytest.mark.parametrize("mode", GUIDE_MODES)
 @pytest.mark.parametrize("name", BOTH)
-def test_excitation_shows_the_closed_loop_and_the_whole_current_the_structure(name):
-    """The peak of pitch in a response stands where the poles with, or without, the servo are."""
+def test_excitation_shows_the_closed_loop_and_the_whole_current_the_structure(name, mode):
+    """Around a mode each response is, ten times nearer than the other, that of its matrices."""
     stage = STAGES[name]
-    mode, alone = without_loop(stage)["pitch"]
-    parts = response(stage, Sweep(60.0, 400.0, period=10.0), samples=200000)
-    spectrum = np.fft.rfft(parts)
-    sine = np.fft.rfft(Sweep(60.0, 400.0, period=10.0).one_period())
-    hertz = np.fft.rfftfreq(200000, 1 / SAMPLE_RATE_HZ)
-    near = np.abs(hertz / mode.frequency_hz - 1) < 0.03
-    open_hz = abs(alone) / (2 * np.pi)
-    for source, expected, other in (
-        (sine, mode.frequency_hz, open_hz),
-        (spectrum[OUTPUTS.index("current")], open_hz, mode.frequency_hz),
-    ):
-        gain = np.abs(spectrum[OUTPUTS.index("delta_e")] / source)
-        peak = hertz[near][np.argmax(gain[near])]
-        assert abs(peak - expected) < 0.3 * abs(expected - other), (peak, expected, other)
+    wave = Sweep(60.0, 400.0, period=10.0)
+    spectrum = np.fft.rfft(response(stage, wave, samples=wave.samples))
+    hertz = np.fft.rfftfreq(wave.samples, 1 / SAMPLE_RATE_HZ)
+    near = np.abs(hertz / without_loop(stage)[mode][0].frequency_hz - 1) < 0.03
+    delta_e, current = (spectrum[OUTPUTS.index(output), near] for output in ("delta_e", "current"))
+
+    loop = closed_loop(stage).driven_by(["motor_force"])
+    a, b = structure_state(stage)
+    encoder = loop.c[0, : len(a)]
+    closed, alone = (
+        TUNINGS[name].force_constant
+        * np.array(
+            [c @ np.linalg.solve(s * np.eye(len(c)) - a, b) for s in 2j * np.pi * hertz[near]]
+        )
+        for a, b, c in ((loop.a, loop.b[:, 0], loop.c[0]), (a, b[:, -1], encoder))
+    )
+
+    def off(source, expected):
+        return np.abs(np.abs(delta_e / source / expected) - 1).max()
+
+    sine = np.fft.rfft(wave.one_period())[near]
+    assert off(sine, closed) < 0.1 * off(sine, alone)
+    assert off(current, alone) < 0.1 * off(current, closed)
 
 
 @pytest.mark.parametrize("name", BOTH)
@@ -172,6 +182,7 @@ def test_same_seed_same_log_other_seed_other_log():
         ("amplitude", {"amplitude": 0.0}),
         ("amplitude", {"amplitude": float("nan")}),
         ("period", {"period": 0.01}),
+        ("period", {"period": float("inf")}),
         ("law", {"law": "square"}),
     ],
 )
@@ -186,6 +197,13 @@ def test_a_log_shorter_than_a_period_is_refused():
     """A sweep that does not end within the log is no sweep."""
     with pytest.raises(BadParameter, match="one period"):
         swept("lms-y", Sweep(), 2.0)
+
+
+@pytest.mark.parametrize("seconds", [float("inf"), float("nan"), 1e9])
+def test_a_log_without_end_is_refused(seconds):
+    """What no log can be as long as is named, whatever the period."""
+    with pytest.raises(BadParameter, match=r"seconds is .* 0\.01 to 600 s"):
+        swept("lms-y", SHORT, seconds)
 
 
 def test_a_sine_that_turns_the_platform_back_is_refused():
@@ -211,6 +229,36 @@ def test_command_writes_a_log_that_the_reader_takes(tmp_path, file_format):
         head = out.read_text(encoding="utf-8")[:2000]
         assert "# stage: LMS-7-Y" in head
         assert EXCITATION in head
+
+
+SHORT_SWEEP = ["sweep", "lms-x", "--low", "100", "--period", "0.1", "--seconds", "0.2", "--out"]
+
+
+@pytest.mark.parametrize("file_format", sorted(WRITERS))
+def test_suffix_says_the_format(tmp_path, file_format):
+    """Without --format the file has the name that was asked for, and the format of its suffix."""
+    out = tmp_path / f"sweep{WRITERS[file_format][0]}"
+    result = CliRunner().invoke(cli, [*SHORT_SWEEP, str(out)])
+    assert result.exit_code == 0, result.output
+    assert [path.name for path in tmp_path.iterdir()] == [out.name]
+    first = {"csv": b"# stage: LMS-0-X", "parquet": b"PAR1", "hdf5": b"\x89HDF"}[file_format]
+    assert out.read_bytes().startswith(first)
+
+
+@pytest.mark.parametrize(
+    ("name", "chosen", "needed"),
+    [
+        ("sweep.csv", ["--format", "hdf5"], r"ending in \.h5, the suffix of hdf5"),
+        ("sweep.txt", [], r"ending in \.csv or \.parquet or \.h5"),
+        ("sweep", [], r"ending in \.csv or \.parquet or \.h5"),
+    ],
+)
+def test_suffix_that_contradicts_is_refused(tmp_path, name, chosen, needed):
+    """A suffix of another format, of none, or none at all, writes nothing under another name."""
+    arguments = [*SHORT_SWEEP, str(tmp_path / name), *chosen]
+    with pytest.raises(BadParameter, match=rf"out is {name}; needed: a name {needed}"):
+        CliRunner().invoke(cli, arguments, catch_exceptions=False)
+    assert not list(tmp_path.iterdir())
 
 
 def test_modes_agree_with_the_command_line():

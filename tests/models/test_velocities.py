@@ -5,7 +5,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from models.errors import BadParameter
+from models.errors import BadParameter, OccupiedFolder
 from models.stages import STAGES
 from models.strokes import VELOCITIES
 from models.velocities import Experiment, drive_velocities
@@ -51,3 +51,28 @@ def test_impossible_velocities_are_refused_before_any_file(tmp_path):
     with pytest.raises(BadParameter, match="stroke"):
         drive_velocities(EXPERIMENT, tmp_path / "out", "hdf5", velocities=(0.1, 2.0))
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("seconds", [0.0, 0.0099, 600.1, float("nan"), float("inf")])
+def test_windows_that_no_log_can_have_are_refused(seconds):
+    """Nothing, ever, and what is no number are refused with the experiment."""
+    with pytest.raises(BadParameter, match=r"seconds is .*; needed: 0\.01 to 600 s"):
+        Experiment(STAGES["lms-x"], seconds=seconds)
+
+
+@pytest.mark.parametrize("second", [0.01, 0.0100004])
+def test_velocities_that_would_share_a_file_are_refused(tmp_path, second):
+    """Twice the same, or the same to the file name's digits, leaves no folder."""
+    with pytest.raises(BadParameter, match="10 mm/s, more than once"):
+        drive_velocities(EXPERIMENT, tmp_path / "out", "hdf5", velocities=(0.01, 0.1, second))
+    assert not (tmp_path / "out").exists()
+
+
+def test_logs_of_other_velocities_are_not_left_behind(tmp_path):
+    """Fewer velocities in the same folder are refused, the same ones are driven again."""
+    drive_velocities(EXPERIMENT, tmp_path, "hdf5", velocities=(0.01, 0.1))
+    before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+    with pytest.raises(OccupiedFolder, match=r"velocity-0010\.000\.h5"):
+        drive_velocities(EXPERIMENT, tmp_path, "hdf5", velocities=(0.1,))
+    drive_velocities(EXPERIMENT, tmp_path, "hdf5", velocities=(0.01, 0.1))
+    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
