@@ -6,7 +6,7 @@ import sys
 
 
 def test_readers_are_as_fast_as_their_libraries(root):
-    """No bounded reader takes twice its library's time, whatever else the machine does."""
+    """No bounded reader takes two and a half times its library's time, however busy the machine."""
     command = [sys.executable, "-W", "error", "-m", "studies.read_throughput.run", "--quick"]
     done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=root)
     assert done.returncode == 0, done.stdout + done.stderr
