@@ -5,13 +5,11 @@ from __future__ import annotations
 import json
 import os
 import sys
-import zlib
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 import click
-import numpy as np
 from rich import box
 from rich.console import Console
 from rich.progress import Progress
@@ -22,6 +20,7 @@ from models.errors import ModelError
 from models.faults import FAULTS
 from models.formats import WRITERS, format_of, write_log
 from models.lives import UNTIL, Plan, simulate_life
+from models.machines import machine_identity, stream
 from models.mapping import modal_map
 from models.margins import GAIN_MARGIN_DB, PHASE_MARGIN_DEG, TABLE_1, cases, margin_record
 from models.plant import SENSORS, closed_loop_modes
@@ -282,16 +281,15 @@ def sweep(stage: str, out: Path, file_format: str | None, **options: Any) -> Non
     chosen = format_of(out, file_format)
     wave = Sweep(*(options[name] for name in ("low", "high", "amplitude", "period", "law")))
     machine = stage_named(stage)
-    words = [options["seed"], zlib.crc32(f"{stage}/sweep".encode())]
     recording = record_sweep(
         machine,
         wave,
         Condition(options["preload"], options["mount"]),
         seconds=options["seconds"],
         velocity=options["velocity"] * 1e-3,
-        rng=np.random.default_rng(np.random.SeedSequence(words)),
+        rng=stream(stage, options["seed"], "sweep"),
     )
-    identity = f"LMS-{options['seed']}-{machine.identity_suffix}"
+    identity = machine_identity(machine, options["seed"])
     write_log(recording.described(stage=identity), out, chosen)
 
 

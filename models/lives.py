@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import os
-import zlib
 from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
@@ -20,11 +19,11 @@ from models.degradation import Life, life_named
 from models.errors import BadParameter
 from models.faults import fault_named
 from models.formats import file_suffix, refuse_other_logs, write_log
+from models.machines import COMMISSIONED, machine_identity, stream
 from models.plant import GUIDE_MODES, closed_loop_modes
-from models.recording import move_velocity, record
+from models.recording import move_velocity, payload_kg, record
 from models.stages import Condition, Stage, stage_named
 
-_START = datetime(2026, 3, 2, 8, 0, tzinfo=UTC)
 _KM_PER_DAY = 12.0
 _NOW_KM = (1400.0, 2000.0)
 # A life that is followed to its failure goes on for this part of it.
@@ -72,8 +71,7 @@ class Plan:
 
     def rng(self, step: str, log: int = 0) -> np.random.Generator:
         """Return the generator of one step of one log: independent of all others."""
-        words = [self.seed, zlib.crc32(f"{self.stage}/{step}".encode()), log]
-        return np.random.default_rng(np.random.SeedSequence(words))
+        return stream(self.stage, self.seed, step, log)
 
     def draw_life(self) -> Life:
         """Return the life with the laws of this seed."""
@@ -128,10 +126,10 @@ def schedule(plan: Plan) -> list[Visit]:
     # Within a shift of ±hours, never overtaking the neighbour.
     moments = np.maximum.accumulate(days + hours / 24) + np.arange(plan.logs) / 1440
     life, suffix = plan.draw_life(), file_suffix(plan.file_format)
-    identity = f"LMS-{plan.seed}-{stage_named(plan.stage).identity_suffix}"
+    identity = machine_identity(stage_named(plan.stage), plan.seed)
     visits = []
     for i in range(plan.logs):
-        moment = (_START + timedelta(days=float(moments[i]))).replace(microsecond=0)
+        moment = (COMMISSIONED + timedelta(days=float(moments[i]))).replace(microsecond=0)
         km = round(float(travel[i]), 3)
         temperature = round(life.climate.at(moment, plan.rng("temperature", i)), 2)
         condition = life.condition(km, temperature)
@@ -156,11 +154,6 @@ def _simulate_log(plan: Plan, visit: Visit, folder: Path) -> dict[str, object]:
     )
     write_log(recording, folder / visit.file, plan.file_format)
     return {**truth_row(stage, visit), "faults": " ".join(struck)}
-
-
-def payload_kg(stage: Stage, condition: Condition) -> float:
-    """Return what the platform carries, kg, to the gram."""
-    return round(stage.payload.value + condition.added_payload, 3)
 
 
 def truth_row(stage: Stage, visit: Visit) -> dict[str, object]:

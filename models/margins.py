@@ -160,8 +160,9 @@ def structure_path(stage: str, condition: Condition = NOMINAL) -> Any:
     import control
 
     machine = stage_named(stage)
-    a, b = structure_state(machine, condition)
-    encoder = sensor_rows(machine, build_structure(machine, condition))["delta_e"]
+    structure = build_structure(machine, condition)
+    a, b = structure_state(machine, structure)
+    encoder = sensor_rows(machine, structure)["delta_e"]
     seen = np.concatenate([encoder, np.zeros(encoder.size)])
     return control.ss(a, b[:, [-1]], [seen], [[0.0]])
 

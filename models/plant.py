@@ -1,4 +1,4 @@
-"""The stage inside its position loop: state space, closed-loop modes, participation."""
+"""The stage inside its position loop: state space and closed-loop modes."""
 
 from __future__ import annotations
 
@@ -121,8 +121,8 @@ def _force_columns(stage: Stage, structure: Structure) -> tuple[Array, Array]:
     return blocks, between(stage.motor_point.value)[0]
 
 
-def structure_state(stage: Stage, condition: Condition = NOMINAL) -> tuple[Array, Array]:
-    """Return the flexible structure in state space, its servo left out.
+def structure_state(stage: Stage, structure: Structure) -> tuple[Array, Array]:
+    """Return the flexible structure of a stage in state space, its servo left out.
 
     Returns
     -------
@@ -131,7 +131,6 @@ def structure_state(stage: Stage, condition: Condition = NOMINAL) -> tuple[Array
     b : (2 dof, 13)
         Per unit of the 12 block forces, then of the motor force.
     """
-    structure = build_structure(stage, condition)
     n = structure.size
     solved = np.linalg.solve(
         structure.mass,
@@ -162,7 +161,7 @@ def closed_loop(
     servo = servo_matrices(tuning)
     n, m = structure.size, servo.b.size
     sensors = sensor_rows(stage, structure)
-    moved, forced = structure_state(stage, condition)
+    moved, forced = structure_state(stage, structure)
     push = forced[:, 12]
     encoder = sensors["delta_e"]
     translation = rigid_translation(structure)
@@ -178,7 +177,7 @@ def closed_loop(
     b[n : 2 * n, 12:15] = -translation
     b[: 2 * n, 15] = push
     b[2 * n :, 16] = -servo.b
-    carried = rigid_translation(structure)[:, 0].copy()
+    carried = translation[:, 0].copy()
     carried[: 6 * PLATFORM] = 0.0
     b[n : 2 * n, 17] = -carried
     b[2 * n :, 18] = servo.feedforward

@@ -206,6 +206,11 @@ def record(
     return to_recording(stage, condition, signals, velocity * time, np.full(samples, velocity))
 
 
+def payload_kg(stage: Stage, condition: Condition) -> float:
+    """Return what the platform carries, kg, to the gram."""
+    return round(stage.payload.value + condition.added_payload, 3)
+
+
 def to_recording(
     stage: Stage, condition: Condition, signals: Array, position: Array, velocity: Array
 ) -> Recording:
@@ -214,7 +219,7 @@ def to_recording(
     metadata = {
         "sample_rate_hz": SAMPLE_RATE_HZ,
         "temperature_c": round(condition.temperature_c, 2),
-        "payload_kg": round(stage.payload.value + condition.added_payload, 3),
+        "payload_kg": payload_kg(stage, condition),
         "position_mm": 0.0,
     }
     stored = {n: v.astype(np.float32) for n, v in zip(COLUMNS, columns, strict=True)}

@@ -192,7 +192,7 @@ def without_loop(stage: Stage, condition: Condition = NOMINAL) -> dict[str, tupl
     ``current_a``: fed back, a current that the sensors cause is not an input.
     """
     structure = build_structure(stage, condition)
-    values, vectors = np.linalg.eig(structure_state(stage, condition)[0])
+    values, vectors = np.linalg.eig(structure_state(stage, structure)[0])
     upper = values.imag > 1.0
     values, shapes = values[upper], vectors[: structure.size, upper]
     modes = [m for m in closed_loop_modes(stage, condition) if m.name in GUIDE_MODES]

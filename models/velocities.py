@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import zlib
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from datetime import UTC, datetime, timedelta
+from datetime import timedelta
 from pathlib import Path
 
 import numpy as np
@@ -13,12 +12,12 @@ import pandas as pd
 
 from models.errors import BadParameter
 from models.formats import file_suffix, refuse_other_logs, write_log
+from models.machines import COMMISSIONED, machine_identity, stream
 from models.profile import Profile
 from models.recording import sample_count
 from models.stages import NOMINAL, Condition, Stage
 from models.strokes import VELOCITIES, WINDOW_S, full_stroke, record_strokes
 
-_START = datetime(2026, 3, 2, 8, 0, tzinfo=UTC)
 _EVERY = timedelta(minutes=2)
 
 
@@ -40,7 +39,7 @@ class Experiment:
     @property
     def identity(self) -> str:
         """Identity of the machine that the seed makes."""
-        return f"LMS-{self.seed}-{self.stage.identity_suffix}"
+        return machine_identity(self.stage, self.seed)
 
     def move(self, velocity: float) -> Profile:
         """Return the move at a set velocity (m/s)."""
@@ -48,8 +47,7 @@ class Experiment:
 
     def rng(self, velocity: float) -> np.random.Generator:
         """Return the generator of one move: independent of which others are driven."""
-        words = [self.seed, zlib.crc32(f"{self.stage.name}/velocities".encode())]
-        return np.random.default_rng(np.random.SeedSequence([*words, round(velocity * 1e6)]))
+        return stream(self.stage.name, self.seed, "velocities", round(velocity * 1e6))
 
 
 def _file_name(velocity: float, suffix: str) -> str:
@@ -105,7 +103,7 @@ def drive_velocities(
         travel_km += move.strokes * move.stroke * 1e-3
         row = {
             "stage": experiment.identity,
-            "recorded_at": (_START + i * _EVERY).isoformat(),
+            "recorded_at": (COMMISSIONED + i * _EVERY).isoformat(),
             "travel_km": round(travel_km, 6),
             "velocity_mm_s": round(move.velocity * 1e3, 6),
         }

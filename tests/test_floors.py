@@ -31,7 +31,7 @@ MODEL_FLOORS = [
     {"errors"},
     {"structure", "servo", "profile"},
     {"stages"},
-    {"plant", "equations"},
+    {"plant", "equations", "machines"},
     {"calibration", "mapping", "modal", "disturbance", "margins", "shapes"},
     {"recording"},
     {"formats", "degradation", "sweep", "strokes", "faults"},

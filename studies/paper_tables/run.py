@@ -21,7 +21,6 @@ from __future__ import annotations
 
 import argparse
 import json
-from collections import Counter
 from pathlib import Path
 from typing import Any
 
@@ -225,7 +224,7 @@ def markdown(answer: dict[str, Any]) -> str:
         "3, 4, 6 and 7: 1, 5, 10, 20, 100, 200, 400 mm/s. Made by `run.py`.",
         "",
     ]
-    tables = Counter(row["table"] for row in answer["rows"])
+    tables = dict.fromkeys(row["table"] for row in answer["rows"])
     for table in tables:
         rows = [row for row in answer["rows"] if row["table"] == table]
         width = max(len(row["printed"]) for row in rows)

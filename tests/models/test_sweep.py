@@ -135,7 +135,7 @@ def test_excitation_shows_the_closed_loop_and_the_whole_current_the_structure(na
     delta_e, current = (spectrum[OUTPUTS.index(output), near] for output in ("delta_e", "current"))
 
     loop = closed_loop(stage).driven_by(["motor_force"])
-    a, b = structure_state(stage)
+    a, b = structure_state(stage, build_structure(stage))
     encoder = loop.c[0, : len(a)]
     closed, alone = (
         TUNINGS[name].force_constant
