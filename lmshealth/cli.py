@@ -24,8 +24,8 @@ from lmshealth.magnitudes import (
     find_growth,
     read_magnitudes,
 )
-from lmshealth.parts import PARTS
 from lmshealth.results import Line, Modes
+from lmshealth.segments import PARTS
 
 if TYPE_CHECKING:
     from lmshealth.pipeline import RunResult

@@ -10,7 +10,7 @@ from lmshealth.arrays import FloatArray, freeze
 from lmshealth.errors import BadLog
 from lmshealth.harmonics import Harmonics, decompose
 from lmshealth.logs import Channel, Log
-from lmshealth.parts import Part, select_segments, set_velocity
+from lmshealth.segments import Part, select_segments, set_velocity
 
 COUNT = 100
 # Six counts of the paper's encoder, in m.

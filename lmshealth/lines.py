@@ -13,7 +13,8 @@ from scipy.stats import gamma
 from lmshealth.arrays import FloatArray
 from lmshealth.logs import Channel, Log
 from lmshealth.results import Line
-from lmshealth.spectra import Segment, as_acceleration, find_segments, lag_gain
+from lmshealth.segments import Segment, find_segments
+from lmshealth.spectra import as_acceleration, lag_gain
 from lmshealth.stage import Stage
 
 # Probability that noise and resonances alone show a line somewhere in the band of one spectrum.

@@ -12,8 +12,8 @@ from scipy.special import stdtr
 from lmshealth.errors import BadLog
 from lmshealth.harmonics import Harmonics, decompose
 from lmshealth.logs import Channel, Log
-from lmshealth.parts import Part, select_segments, set_velocity
 from lmshealth.results import Modes
+from lmshealth.segments import Part, select_segments, set_velocity
 from lmshealth.stage import Stage
 
 # Without a description: the rows of the paper's Tables 6 and 7.

@@ -19,7 +19,8 @@ from lmshealth.lines import find_lines, name_lines
 from lmshealth.logs import Channel, Log, Refusal
 from lmshealth.peaks import find_excess, find_peaks
 from lmshealth.results import Line, Modes
-from lmshealth.spectra import find_segments, periodogram
+from lmshealth.segments import find_segments
+from lmshealth.spectra import periodogram
 from lmshealth.stage import Stage
 from lmshealth.starts import Coarse, Target, coarsen, locate, shift_cost
 

@@ -1,46 +1,18 @@
-"""From samples to FFT ordinates: segments, periodograms and their expectation."""
+"""From samples to FFT ordinates: periodograms and their expectation."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from itertools import pairwise
-from typing import Literal
 
 import numpy as np
 from scipy import fft
 
 from lmshealth.arrays import FloatArray
-from lmshealth.logs import Channel, Log
+from lmshealth.logs import Channel
+from lmshealth.segments import Segment
 
-# Setpoint changes below this share of its largest value count as constant velocity.
-_VELOCITY_TOLERANCE = 1e-3
 # The second difference of a displacement reaches over this part of the shortest period.
 _LAG_PERIODS = 8.0
-# So long after a move, in s, the stage settles: some periods of the slowest modes and of the loop.
-_SETTLING = 0.5
-
-Kind = Literal["whole", "ramp", "constant", "settling", "idle"]
-
-
-@dataclass(frozen=True, slots=True)
-class Segment:
-    """A stretch of a log without gaps.
-
-    Attributes
-    ----------
-    start, stop : int
-        Half-open range of samples.
-    velocity : float
-        Mean set velocity in m/s; NaN where the log has no set point.
-    kind : str
-        ``constant`` velocity, ``ramp`` between two velocities, ``settling`` within half a second
-        after a move, ``idle`` at rest otherwise; ``whole`` where the log has no set point.
-    """
-
-    start: int
-    stop: int
-    velocity: float
-    kind: Kind = "whole"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -87,77 +59,6 @@ class Spectrum:
         ordinates = self.periodogram[first:last]
         amplitude = np.sqrt(2 * ordinates.sum() / self.duration)
         return float(self.frequency[first + int(np.argmax(ordinates))]), float(amplitude)
-
-
-def find_phases(log: Log) -> tuple[Segment, ...]:
-    """Cut a log where it has gaps and where its set point changes what it does.
-
-    Parameters
-    ----------
-    log : Log
-        Without a set point each gap-free piece is one segment.
-
-    Returns
-    -------
-    tuple of Segment
-        In order of time; together they are all of the log but its gaps.
-    """
-    velocity = log.reference_velocity
-    if velocity is None:
-        return tuple(Segment(start, stop, float("nan")) for start, stop in log.pieces)
-    scale = max((float(np.abs(velocity[a:b]).max()) for a, b in log.pieces), default=0.0)
-    settling = round(_SETTLING * log.sample_rate)
-    found: list[Segment] = []
-    for start, stop in log.pieces:
-        found += _phases(velocity[start:stop], start, scale, settling)
-    return tuple(found)
-
-
-def find_segments(log: Log, shortest: float) -> tuple[Segment, ...]:
-    """Cut a log into stretches without gaps in which it is stationary.
-
-    Parameters
-    ----------
-    log : Log
-        Without a set point each gap-free piece is one segment, and so it is of a log that never
-        moves (ambient vibration); else the stretches of constant velocity are.
-    shortest : float
-        Segments below this many seconds are left out.
-
-    Returns
-    -------
-    tuple of Segment
-        In order of time; empty if nothing is long enough.
-    """
-    phases = find_phases(log)
-    rests = all(phase.kind == "idle" for phase in phases)
-    n_least = max(8, round(shortest * log.sample_rate))
-    return tuple(
-        phase
-        for phase in phases
-        if (rests or phase.kind in ("constant", "whole")) and phase.stop - phase.start >= n_least
-    )
-
-
-def _phases(velocity: FloatArray, offset: int, scale: float, settling: int) -> list[Segment]:
-    """Cut a gap-free piece by its set velocity; ``settling`` in samples."""
-    moving = np.abs(velocity) > _VELOCITY_TOLERANCE * scale
-    # Steps are taken over 1 ms or so of samples: one sample of a slow ramp looks constant.
-    lag = max(1, min(20, velocity.size // 4))
-    change = np.abs(velocity[lag:] - velocity[:-lag]) > _VELOCITY_TOLERANCE * max(scale, 1e-12)
-    steady = moving.copy()
-    for shift in (0, lag):
-        steady[shift : shift + change.size] &= ~change
-    # Samples since the last one that moved; a piece that begins at rest is taken to be idle.
-    index = np.arange(velocity.size)
-    last = np.maximum.accumulate(np.where(moving, index, -settling - 1))
-    kinds: tuple[Kind, ...] = ("ramp", "constant", "settling", "idle")
-    code = np.where(moving, steady, np.where(index - last <= settling, 2, 3))
-    cuts = [0, *(np.flatnonzero(np.diff(code)) + 1).tolist(), velocity.size]
-    return [
-        Segment(offset + a, offset + b, float(np.mean(velocity[a:b])), kinds[int(code[a])])
-        for a, b in pairwise(cuts)
-    ]
 
 
 def periodogram(

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from lmshealth.bandfit import BandFit, View, _mask_towers, fit_band
-from lmshealth.spectra import Segment, periodogram
+from lmshealth.segments import Segment
+from lmshealth.spectra import periodogram
 from lmshealth.starts import Coarse, Target, coarsen
 from tests.signals import Mode, accelerations, make_log, sine, white
 

@@ -13,7 +13,7 @@ from lmshealth.lines import find_lines, name_lines, survey_lines
 from lmshealth.logs import Channel, Log
 from lmshealth.readers import read_log
 from lmshealth.results import Line
-from lmshealth.spectra import Segment
+from lmshealth.segments import Segment
 from tests.signals import (
     Mode,
     accelerations,

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from lmshealth.peaks import find_excess, find_peaks
-from lmshealth.spectra import Segment, Spectrum, periodogram
+from lmshealth.segments import Segment
+from lmshealth.spectra import Spectrum, periodogram
 from lmshealth.starts import Target
 from tests.signals import Mode, accelerations, make_log, sine, white
 

@@ -2,21 +2,13 @@
 
 from __future__ import annotations
 
-from itertools import pairwise
-
 import numpy as np
 import pytest
 
 from lmshealth.logs import Channel
-from lmshealth.spectra import (
-    Segment,
-    Spectrum,
-    find_phases,
-    find_segments,
-    periodogram,
-    periodogram_kernel,
-)
-from tests.signals import Mode, accelerations, density, make_log, sine, white
+from lmshealth.segments import Segment
+from lmshealth.spectra import Spectrum, periodogram, periodogram_kernel
+from tests.signals import Mode, accelerations, density, sine, white
 
 RATE = 2000.0
 
@@ -161,106 +153,6 @@ def test_spectrum_refuses_arrays_that_differ_in_shape() -> None:
     """Frequencies without ordinates are no spectrum."""
     with pytest.raises(ValueError, match="differ in shape"):
         Spectrum(np.arange(3.0), np.arange(4.0), 1.0, 0.0)
-
-
-# Segments
-
-
-def moves(rate: float = 20_000.0) -> tuple[np.ndarray, list[tuple[int, int, float]]]:
-    """Velocity set point of a move there and back with rests, and its constant stretches."""
-    ramp = np.arange(0, 0.08, 1 / rate) * 5.0  # 5 m/s² up to 0.4 m/s
-    top, rest = np.full(13_000, 0.4), np.zeros(4000)
-    there = np.concatenate([ramp, top, ramp[::-1]])
-    velocity = np.concatenate([rest, there, rest, -there, rest])
-    first = rest.size + ramp.size
-    second = first + top.size + ramp.size + rest.size + ramp.size
-    return velocity, [(first, first + top.size, 0.4), (second, second + top.size, -0.4)]
-
-
-def test_moves_are_cut_to_their_constant_velocity() -> None:
-    """Ramps and rests are left out, at most 2 ms of a stretch are lost, the velocity is exact."""
-    velocity, truth = moves()
-    log = make_log({"acc_a": np.zeros(velocity.size)}, 20_000.0, velocity=velocity)
-    segments = find_segments(log, 0.1)
-    assert len(segments) == len(truth)
-    for segment, (start, stop, speed) in zip(segments, truth, strict=True):
-        assert segment.velocity == pytest.approx(speed, rel=1e-9)
-        assert start <= segment.start + 1
-        assert segment.stop <= stop + 1
-        assert (stop - start) - (segment.stop - segment.start) <= 42
-
-
-def test_phases_are_all_of_a_move_and_named() -> None:
-    """Rest, ramp, constant velocity and settling follow each other without a hole."""
-    velocity, _ = moves()
-    log = make_log({"acc_a": np.zeros(velocity.size)}, 20_000.0, velocity=velocity)
-    phases = find_phases(log)
-    assert phases[0].start == 0
-    assert phases[-1].stop == velocity.size
-    assert all(a.stop == b.start for a, b in pairwise(phases))
-    long = [p.kind for p in phases if p.stop - p.start > 20]
-    move = ["ramp", "constant", "ramp", "settling"]
-    assert long == ["idle", *move, *move]
-
-
-def test_rest_becomes_idle_half_a_second_after_a_move() -> None:
-    """Settling ends after half a second, wherever the rest ends."""
-    velocity = np.concatenate([np.full(2000, 0.1), np.zeros(3000)])
-    phases = find_phases(make_log({"acc_a": np.zeros(5000)}, RATE, velocity=velocity))
-    settling, idle = phases[-2:]
-    assert (settling.kind, idle.kind) == ("settling", "idle")
-    assert settling.stop - settling.start == pytest.approx(0.5 * RATE, abs=1)
-    assert idle.stop == 5000
-
-
-def test_rest_beside_moves_is_not_stationary() -> None:
-    """In a log that moves, a gap-free piece at rest is no segment; moves there are."""
-    velocity = np.concatenate([np.full(2000, 0.1), np.zeros(2000)])
-    log = make_log(
-        {"acc_a": np.zeros(4000)}, RATE, velocity=velocity, pieces=((0, 1900), (2100, 4000))
-    )
-    assert [s.kind for s in find_segments(log, 0.1)] == ["constant"]
-
-
-def test_short_segments_are_left_out() -> None:
-    """A stretch below the shortest useful one is no segment."""
-    velocity, _ = moves()
-    log = make_log({"acc_a": np.zeros(velocity.size)}, 20_000.0, velocity=velocity)
-    assert find_segments(log, 0.66) == ()
-
-
-def test_gaps_cut_a_log_into_segments_without_a_velocity() -> None:
-    """Without a set point each gap-free piece is a segment of unknown velocity."""
-    log = make_log({"acc_a": np.zeros(3000)}, RATE, pieces=((0, 1000), (1010, 1040), (1100, 3000)))
-    segments = find_segments(log, 0.25)
-    assert [(s.start, s.stop) for s in segments] == [(0, 1000), (1100, 3000)]
-    assert all(np.isnan(s.velocity) for s in segments)
-
-
-def test_a_gap_inside_a_move_is_not_bridged() -> None:
-    """With a set point, segments still end at the gaps and start after them."""
-    velocity = np.full(4000, 0.1)
-    velocity[1900:2000] = np.nan
-    log = make_log(
-        {"acc_a": np.zeros(4000)}, RATE, velocity=velocity, pieces=((0, 1900), (2000, 4000))
-    )
-    segments = find_segments(log, 0.1)
-    assert [(s.start, s.stop, s.velocity) for s in segments] == [
-        (0, 1900, pytest.approx(0.1)),
-        (2000, 4000, pytest.approx(0.1)),
-    ]
-
-
-def test_a_record_at_rest_throughout_is_one_segment() -> None:
-    """Ambient vibration with the axis standing still is analysed, at velocity zero."""
-    log = make_log({"acc_a": np.zeros(4000)}, RATE, velocity=np.zeros(4000))
-    assert find_segments(log, 0.1) == (Segment(0, 4000, 0.0, "idle"),)
-
-
-def test_a_continuously_accelerating_sweep_has_no_segment() -> None:
-    """Where the velocity never stands still there is nothing to take."""
-    log = make_log({"acc_a": np.zeros(4000)}, RATE, velocity=np.linspace(0, 0.4, 4000))
-    assert find_segments(log, 0.05) == ()
 
 
 # The expected periodogram

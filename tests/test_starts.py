@@ -7,7 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lmshealth.spectra import Segment, periodogram
+from lmshealth.segments import Segment
+from lmshealth.spectra import periodogram
 from lmshealth.starts import Coarse, Target, coarsen, incoherent_fit, locate
 from tests.signals import Mode, accelerations, density, make_log, sine, white
 

@@ -6,13 +6,11 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
-from lmshealth.arrays import FloatArray
 from lmshealth.logs import Refusal
 from lmshealth.readers.columns import ColumnMap
 from lmshealth.readers.trouble import Unusable
+from lmshealth.samples import Samples
 
-# More than an hour of six channels at 20 kHz, in the 8 bytes a sample takes once it is read.
-LARGEST = 4 << 30
 # Honest recordings are noise and compress by single digits; constant ones are refused anyway.
 LARGEST_RATIO = 200
 SMALL_ENOUGH = 256 << 20
@@ -24,7 +22,7 @@ class Raw:
 
     Attributes
     ----------
-    columns : dict of str to ndarray
+    columns : dict of str to ndarray or Stored
         Wanted columns under their name in the file, each of shape ``(n_samples,)``.
     metadata : dict of str to str
         As the file has it.
@@ -34,7 +32,7 @@ class Raw:
         Channels that are wanted and cannot go with the others; their log is not named yet.
     """
 
-    columns: dict[str, FloatArray]
+    columns: dict[str, Samples]
     metadata: dict[str, str]
     present: tuple[str, ...]
     refused: tuple[Refusal, ...] = ()
@@ -64,7 +62,7 @@ class Format:
 
 def size_limit(stored: int) -> int:
     """Bound in bytes for the decoded content of a file of ``stored`` bytes."""
-    return min(LARGEST, max(SMALL_ENOUGH, LARGEST_RATIO * stored))
+    return max(SMALL_ENOUGH, LARGEST_RATIO * stored)
 
 
 def check_size(decoded: int, stored: int) -> None:

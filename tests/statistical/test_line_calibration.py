@@ -12,7 +12,7 @@ from scipy.stats import beta
 
 from lmshealth.lines import find_lines
 from lmshealth.logs import Channel
-from lmshealth.spectra import Segment
+from lmshealth.segments import Segment
 from tests.signals import Mode, accelerations
 
 _RATE, _N, _SPECTRA = 1000.0, 3000, 2000
