@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,7 +11,7 @@ from lmshealth.arrays import FloatArray, freeze
 from lmshealth.errors import BadLog
 from lmshealth.harmonics import Harmonics, decompose
 from lmshealth.logs import Channel, Log
-from lmshealth.segments import Part, select_segments, set_velocity
+from lmshealth.segments import Part, Segment, select_segments, set_velocity
 
 COUNT = 100
 # Six counts of the paper's encoder, in m.
@@ -32,7 +33,8 @@ class FollowingError:
     lowest, highest, std, mean : float
         Of all samples, in m.
     harmonics : Harmonics
-        Of the longest stretch without gaps.
+        Of the longest stretch without gaps, of a longer one than a minute at 20 kHz of its first
+        part.
     kept : ndarray
         Indices of the strongest harmonics, strongest first, shape ``(n_kept,)``.
     floor : float
@@ -146,20 +148,36 @@ def read_error(
             f"{needed / log.sample_rate:.3g} s: record longer or lower --count",
         )
 
-    def read(channel: Channel) -> FollowingError:
-        samples = np.concatenate([channel.values[s.start : s.stop] for s in segments])
+    velocity = set_velocity(log)
+    readings = []
+    for channel in channels:
+        lowest, highest, mean, std = _statistics(channel, segments)
         harmonics = decompose(channel.values[longest.start : longest.stop], log.sample_rate)
-        return FollowingError(
-            channel=channel.name,
-            velocity=set_velocity(log),
-            duration=samples.size / log.sample_rate,
-            lowest=float(samples.min()),
-            highest=float(samples.max()),
-            std=float(samples.std()),
-            mean=float(samples.mean()),
-            harmonics=harmonics,
-            kept=harmonics.strongest(count),
-            floor=floor,
+        readings.append(
+            FollowingError(
+                channel=channel.name,
+                velocity=velocity,
+                duration=sum(s.stop - s.start for s in segments) / log.sample_rate,
+                lowest=lowest,
+                highest=highest,
+                std=std,
+                mean=mean,
+                harmonics=harmonics,
+                kept=harmonics.strongest(count),
+                floor=floor,
+            )
         )
+    return tuple(readings)
 
-    return tuple(read(channel) for channel in channels)
+
+def _statistics(channel: Channel, segments: Sequence[Segment]) -> tuple[float, float, float, float]:
+    """Minimum, maximum, mean and standard deviation of all samples, one stretch at a time."""
+    size, low, high, mean, var = np.array(
+        [
+            (x.size, x.min(), x.max(), x.mean(), x.var())
+            for x in (channel.values[s.start : s.stop] for s in segments)
+        ]
+    ).T
+    total = float(np.average(mean, weights=size))
+    scatter = float(np.average(var + (mean - total) ** 2, weights=size))
+    return float(low.min()), float(high.max()), total, float(np.sqrt(scatter))

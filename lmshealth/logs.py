@@ -8,7 +8,8 @@ from typing import Literal
 
 import numpy as np
 
-from lmshealth.arrays import FloatArray, expect_shape, freeze
+from lmshealth.arrays import expect_shape, freeze
+from lmshealth.samples import Samples
 
 ChannelKind = Literal["displacement", "acceleration", "current"]
 
@@ -70,16 +71,18 @@ class Channel:
         Column name without its unit (``delta_e``, ``acc_feed``, ``current``).
     kind : str
         Physical quantity: ``displacement`` (m), ``acceleration`` (m/s²) or ``current`` (A).
-    values : ndarray
-        Samples in SI units, shape ``(n_samples,)``; NaN where a sample is missing.
+    values : ndarray or Stored
+        Samples in SI units, shape ``(n_samples,)``; NaN where a sample is missing. Those of a long
+        record are on disk: take a stretch of them, ``values[start:stop]``.
     """
 
     name: str
     kind: ChannelKind
-    values: FloatArray
+    values: Samples
 
     def __post_init__(self) -> None:
-        expect_shape("values", self.values, (self.values.size,))
+        if isinstance(self.values, np.ndarray):
+            expect_shape("values", self.values, (self.values.size,))
         freeze(self)
 
 
@@ -99,8 +102,8 @@ class Log:
         In Hz.
     channels : tuple of Channel
         Usable signals, all of the same length.
-    reference_velocity : ndarray or None
-        Set point in m/s, shape ``(n_samples,)``.
+    reference_velocity : ndarray, Stored or None
+        Set point in m/s, shape ``(n_samples,)``; NaN where it is missing.
     pieces : tuple of (int, int)
         Half-open sample ranges without gaps; one range covering everything when nothing is missing.
     refused : tuple of Refusal
@@ -112,7 +115,7 @@ class Log:
     metadata: Metadata
     sample_rate: float
     channels: tuple[Channel, ...]
-    reference_velocity: FloatArray | None
+    reference_velocity: Samples | None
     pieces: tuple[tuple[int, int], ...]
     refused: tuple[Refusal, ...]
 

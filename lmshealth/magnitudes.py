@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 from scipy.special import stdtr
@@ -13,7 +13,7 @@ from lmshealth.errors import BadLog
 from lmshealth.harmonics import Harmonics, decompose
 from lmshealth.logs import Channel, Log
 from lmshealth.results import Modes
-from lmshealth.segments import Part, select_segments, set_velocity
+from lmshealth.segments import Part, Segment, select_segments, set_velocity
 from lmshealth.stage import Stage
 
 # Without a description: the rows of the paper's Tables 6 and 7.
@@ -221,29 +221,15 @@ def read_magnitudes(
             f"no usable acc channel; there: {there}; needed acc_<name>_m_s2",
         )
     segments = select_segments(log, part)
-    stretches = [(s.start, s.stop) for s in segments]
-    usable = _usable(log, bands, max(b - a for a, b in stretches))
+    usable = _usable(log, bands, max(s.stop - s.start for s in segments))
     velocity = set_velocity(log)
-    magnitudes = []
-    for channel in channels:
-        parts = _decomposed(channel, log.sample_rate, stretches)
-        for band in usable:
-            magnitude, frequency, rms, dof = _read(parts, band)
-            magnitudes.append(
-                Magnitude(
-                    log=log.name,
-                    stage=log.metadata.stage or "",
-                    velocity=velocity,
-                    channel=channel.name,
-                    band=band,
-                    magnitude=magnitude,
-                    frequency=frequency,
-                    resolution=1 / parts[0].duration,
-                    rms=rms,
-                    dof=dof,
-                )
-            )
-    return tuple(magnitudes)
+    return tuple(
+        Magnitude(log.name, log.metadata.stage or "", velocity, channel.name, band, *reading)
+        for channel in channels
+        for band, reading in zip(
+            usable, _read(channel, log.sample_rate, segments, usable), strict=True
+        )
+    )
 
 
 def _usable(log: Log, bands: Iterable[Band], longest: int) -> list[Band]:
@@ -269,33 +255,48 @@ def _usable(log: Log, bands: Iterable[Band], longest: int) -> list[Band]:
     return usable
 
 
-def _decomposed(
-    channel: Channel, sample_rate: float, stretches: list[tuple[int, int]]
-) -> list[Harmonics]:
-    """Harmonics of each stretch, the longest first."""
-    ordered = sorted(stretches, key=lambda stretch: stretch[0] - stretch[1])
-    return [decompose(channel.values[a:b], sample_rate) for a, b in ordered if b - a > 1]
+class _Reading(NamedTuple):
+    """What a `Magnitude` says of a band."""
+
+    magnitude: float
+    frequency: float
+    resolution: float
+    rms: float
+    dof: int
 
 
-def _read(parts: list[Harmonics], band: Band) -> tuple[float, float, float, int]:
-    """Magnitude, its frequency, RMS and degrees of freedom of a band."""
-    inside = parts[0].between(band.low, band.high)
-    amplitude = parts[0].amplitude[inside]
+def _read(
+    channel: Channel, sample_rate: float, segments: Sequence[Segment], bands: Sequence[Band]
+) -> list[_Reading]:
+    """Read all bands of a channel, one stretch at a time, the longest first."""
+    ordered = sorted(segments, key=lambda s: s.start - s.stop)
+    strongest: list[tuple[float, float, float]] = []
+    total, seconds = np.zeros(len(bands)), np.zeros(len(bands))
+    dof = np.zeros(len(bands), dtype=int)
+    for segment in ordered:
+        if segment.stop - segment.start < 2:
+            continue
+        harmonics = decompose(channel.values[segment.start : segment.stop], sample_rate)
+        inside = [harmonics.between(band.low, band.high) for band in bands]
+        strongest = strongest or [_strongest(harmonics, own) for own in inside]
+        for i, own in enumerate(inside):
+            # A stretch too short for the band says nothing about it.
+            if own.stop - own.start >= _LEAST_ORDINATES - 1:
+                total[i] += harmonics.duration * float(harmonics.power[own].sum())
+                seconds[i] += harmonics.duration
+                dof[i] += 2 * (own.stop - own.start)
+    rms = np.sqrt(total / seconds)
+    return [
+        _Reading(*best, r, n)
+        for best, r, n in zip(strongest, rms.tolist(), dof.tolist(), strict=True)
+    ]
+
+
+def _strongest(harmonics: Harmonics, inside: slice) -> tuple[float, float, float]:
+    """Amplitude and frequency of the strongest harmonic of a band, and what is resolved."""
+    amplitude = harmonics.amplitude[inside]
     at = int(np.argmax(amplitude))
-    total, seconds, dof = 0.0, 0.0, 0
-    for harmonics in parts:
-        own = harmonics.between(band.low, band.high)
-        # A stretch too short for the band says nothing about it.
-        if own.stop - own.start >= _LEAST_ORDINATES - 1:
-            total += harmonics.duration * float(harmonics.power[own].sum())
-            seconds += harmonics.duration
-            dof += 2 * (own.stop - own.start)
-    return (
-        float(amplitude[at]),
-        float(parts[0].frequency[inside][at]),
-        float(np.sqrt(total / seconds)),
-        dof,
-    )
+    return float(amplitude[at]), float(harmonics.frequency[inside][at]), 1 / harmonics.duration
 
 
 def find_growth(magnitudes: Iterable[Magnitude]) -> tuple[Growth, ...]:

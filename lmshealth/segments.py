@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Literal, get_args
 
 import numpy as np
 
-from lmshealth.arrays import FloatArray
+from lmshealth.arrays import BoolArray, FloatArray
 from lmshealth.errors import BadLog
 from lmshealth.logs import Log
+from lmshealth.samples import MINUTE, Samples, blocks
 
 # Setpoint changes below this share of its largest value count as constant velocity.
 _VELOCITY_TOLERANCE = 1e-3
@@ -21,10 +22,13 @@ _SETTLING = 0.5
 # count: the top of a triangular move has one velocity for an instant.
 _SAME_VELOCITY = 0.01
 _LEAST_LENGTH = 0.05
+# A long stretch is cut into parts of so many times the shortest that resolves what is looked for.
+_MANY = 10
 
 Kind = Literal["whole", "ramp", "constant", "settling", "idle"]
 Part = Literal["record", "constant", "settling", "idle"]
 PARTS: tuple[Part, ...] = get_args(Part)
+_KINDS: tuple[Kind, ...] = ("ramp", "constant", "settling", "idle")
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,11 +68,14 @@ def find_phases(log: Log) -> tuple[Segment, ...]:
     velocity = log.reference_velocity
     if velocity is None:
         return tuple(Segment(start, stop, float("nan")) for start, stop in log.pieces)
-    scale = max((float(np.abs(velocity[a:b]).max()) for a, b in log.pieces), default=0.0)
+    scale = max(
+        (float(np.abs(part).max()) for a, b in log.pieces for _, part in blocks(velocity, a, b)),
+        default=0.0,
+    )
     settling = round(_SETTLING * log.sample_rate)
     found: list[Segment] = []
     for start, stop in log.pieces:
-        found += _phases(velocity[start:stop], start, scale, settling)
+        found += _phases(velocity, start, stop, scale, settling)
     return tuple(found)
 
 
@@ -86,37 +93,71 @@ def find_segments(log: Log, shortest: float) -> tuple[Segment, ...]:
     Returns
     -------
     tuple of Segment
-        In order of time; empty if nothing is long enough.
+        In order of time; empty if nothing is long enough. A stretch of more than a minute at
+        20 kHz is cut into parts of one length, each at least ten times ``shortest``.
     """
     phases = find_phases(log)
     rests = all(phase.kind == "idle" for phase in phases)
     n_least = max(8, round(shortest * log.sample_rate))
+    longest = max(MINUTE, _MANY * n_least)
     return tuple(
-        phase
+        part
         for phase in phases
         if (rests or phase.kind in ("constant", "whole")) and phase.stop - phase.start >= n_least
+        for part in _parts(phase, longest)
     )
 
 
-def _phases(velocity: FloatArray, offset: int, scale: float, settling: int) -> list[Segment]:
+def _parts(segment: Segment, longest: int) -> list[Segment]:
+    """Cut a segment into the fewest parts of one length; a few last samples may be left out."""
+    size = segment.stop - segment.start
+    n_parts = -(-size // longest)
+    each = size // n_parts
+    starts = [segment.start + k * each for k in range(n_parts)]
+    return [replace(segment, start=start, stop=start + each) for start in starts]
+
+
+def _phases(velocity: Samples, start: int, stop: int, scale: float, settling: int) -> list[Segment]:
     """Cut a gap-free piece by its set velocity; ``settling`` in samples."""
-    moving = np.abs(velocity) > _VELOCITY_TOLERANCE * scale
     # Steps are taken over 1 ms or so of samples: one sample of a slow ramp looks constant.
-    lag = max(1, min(20, velocity.size // 4))
+    lag = max(1, min(20, (stop - start) // 4))
+    # A piece that begins at rest is taken to be idle.
+    last_move = start - settling - 1
+    found: list[Segment] = []
+    for at, block in blocks(velocity, start, stop):
+        low, high = max(start, at - lag), min(stop, at + block.size + lag)
+        inner = slice(at - low, at - low + block.size)
+        steady = _steady(velocity[low:high], lag, scale)[inner]
+        moving = np.abs(block) > _VELOCITY_TOLERANCE * scale
+        index = np.arange(at, at + block.size)
+        last = np.maximum.accumulate(np.where(moving, index, last_move))
+        last_move = int(last[-1])
+        code = np.where(moving, steady, np.where(index - last <= settling, 2, 3))
+        cuts = [0, *(np.flatnonzero(np.diff(code)) + 1).tolist(), block.size]
+        for a, b in pairwise(cuts):
+            mean = float(np.mean(block[a:b]))
+            _join(found, Segment(at + a, at + b, mean, _KINDS[int(code[a])]))
+    return found
+
+
+def _steady(velocity: FloatArray, lag: int, scale: float) -> BoolArray:
+    """Tell which samples have the same velocity ``lag`` samples before and after."""
     change = np.abs(velocity[lag:] - velocity[:-lag]) > _VELOCITY_TOLERANCE * max(scale, 1e-12)
-    steady = moving.copy()
+    steady = np.ones(velocity.size, dtype=bool)
     for shift in (0, lag):
         steady[shift : shift + change.size] &= ~change
-    # Samples since the last one that moved; a piece that begins at rest is taken to be idle.
-    index = np.arange(velocity.size)
-    last = np.maximum.accumulate(np.where(moving, index, -settling - 1))
-    kinds: tuple[Kind, ...] = ("ramp", "constant", "settling", "idle")
-    code = np.where(moving, steady, np.where(index - last <= settling, 2, 3))
-    cuts = [0, *(np.flatnonzero(np.diff(code)) + 1).tolist(), velocity.size]
-    return [
-        Segment(offset + a, offset + b, float(np.mean(velocity[a:b])), kinds[int(code[a])])
-        for a, b in pairwise(cuts)
-    ]
+    return steady
+
+
+def _join(found: list[Segment], segment: Segment) -> None:
+    """Append a segment, or make it part of the one that it continues."""
+    if not found or found[-1].kind != segment.kind:
+        found.append(segment)
+        return
+    before = found[-1]
+    n, more = before.stop - before.start, segment.stop - segment.start
+    mean = (n * before.velocity + more * segment.velocity) / (n + more)
+    found[-1] = replace(before, stop=segment.stop, velocity=mean)
 
 
 def select_segments(log: Log, part: Part) -> tuple[Segment, ...]:
@@ -133,7 +174,7 @@ def select_segments(log: Log, part: Part) -> tuple[Segment, ...]:
     Returns
     -------
     tuple of Segment
-        At least one, in order of time.
+        At least one, in order of time; none is longer than a minute at 20 kHz.
 
     Raises
     ------
@@ -142,7 +183,8 @@ def select_segments(log: Log, part: Part) -> tuple[Segment, ...]:
         ``no-such-part`` where the log has no such stretch.
     """
     if part == "record" or (log.reference_velocity is None and part == "constant"):
-        return tuple(Segment(start, stop, float("nan")) for start, stop in log.pieces)
+        pieces = [Segment(start, stop, float("nan")) for start, stop in log.pieces]
+        return tuple(cut for piece in pieces for cut in _parts(piece, MINUTE))
     if log.reference_velocity is None:
         raise BadLog(
             log.name,
@@ -151,7 +193,7 @@ def select_segments(log: Log, part: Part) -> tuple[Segment, ...]:
             "reference_velocity_mm_s",
         )
     phases = find_phases(log)
-    chosen = tuple(phase for phase in phases if phase.kind == part)
+    chosen = tuple(cut for phase in phases if phase.kind == part for cut in _parts(phase, MINUTE))
     if not chosen:
         there = ", ".join(sorted({phase.kind for phase in phases}))
         raise BadLog(log.name, "no-such-part", f"no stretch is {part}; there: {there}")

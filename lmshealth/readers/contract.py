@@ -8,15 +8,16 @@ from typing import cast
 
 import numpy as np
 
-from lmshealth.arrays import BoolArray, FloatArray
 from lmshealth.logs import Channel, ChannelKind, Log, Refusal
 from lmshealth.readers.columns import ColumnMap
 from lmshealth.readers.metadata import parse_metadata
-from lmshealth.readers.quality import check_signal, missing_samples
+from lmshealth.readers.quality import ABSURD, check_signal, missing_stretches
 from lmshealth.readers.raw import Raw
-from lmshealth.readers.timeaxis import TimeAxis, pieces, time_axis
+from lmshealth.readers.setpoint import set_velocity
+from lmshealth.readers.timeaxis import IntArray, pieces, time_axis
 from lmshealth.readers.trouble import Unusable, listed
 from lmshealth.readers.units import Role, Signal
+from lmshealth.samples import Samples, Stored, in_unit
 
 _NEEDED = "needed delta_e_um or acc_<name>_m_s2 (or another unit of the contract)"
 _MEASURED: tuple[Role, ...] = ("displacement", "acceleration", "current")
@@ -25,10 +26,10 @@ _DYNAMIC = ("displacement", "acceleration")
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Series:
-    """A column in SI units, shape ``(n_samples,)``."""
+    """A column in SI units, shape ``(n_samples,)``; what is no measurement reads as NaN."""
 
     signal: Signal
-    values: FloatArray
+    values: Samples
 
 
 def to_log(
@@ -71,12 +72,15 @@ def to_log(
     channels, missing = _usable_channels(series, name, refused)
     reference = _first(series, "reference_velocity") or _first(series, "reference_position")
     gone = _reference_missing(reference, name, refused)
-    ranges = pieces(missing if gone is None else missing | gone, axis.breaks)
+    n_samples = series[0].values.size
+    ranges = pieces(n_samples, missing if gone is None else [*missing, gone], axis.breaks)
     if not ranges:
         raise Unusable("no-signal", f"no two samples in a row are complete; {_why(refused)}")
     velocity = None
     if reference is not None and gone is not None:
-        velocity = _velocity(reference, ranges, axis)
+        velocity = reference.values
+        if reference.signal.role == "reference_position":
+            velocity = set_velocity(velocity, ranges, axis.sample_rate)
     return Log(
         name=name,
         digest=digest,
@@ -109,9 +113,11 @@ def _series(raw: Raw, columns: ColumnMap) -> list[_Series]:
             signal = columns.signal(target)
         except Unusable as error:
             raise Unusable(error.reason, f"{error.detail}; {there}") from error
-        # A damaged float can be so large that its SI value is infinite: missing, not a warning.
-        with np.errstate(over="ignore", invalid="ignore"):
-            series.append(_Series(signal, values * signal.factor))
+        limit = np.inf if signal.role == "time" else ABSURD
+        if isinstance(values, Stored):
+            series.append(_Series(signal, values.scaled(signal.factor, limit)))
+        else:
+            series.append(_Series(signal, in_unit(values, signal.factor, limit)))
     names = [item.signal.name for item in series]
     if twice := sorted({item for item in names if names.count(item) > 1}):
         raise Unusable("columns", f"{listed(twice)} comes in more than one unit; {there}")
@@ -136,35 +142,26 @@ def _first(series: list[_Series], role: Role) -> _Series | None:
 
 def _usable_channels(
     series: list[_Series], name: str, refused: list[Refusal]
-) -> tuple[tuple[Channel, ...], BoolArray]:
-    """Keep the channels that can be used, and tell where any of them misses a sample."""
-    missing = np.zeros(series[0].values.size, dtype=bool)
+) -> tuple[tuple[Channel, ...], list[IntArray]]:
+    """Keep the channels that can be used, and tell where each of them misses samples."""
+    missing = []
     channels = []
     for item in series:
         if item.signal.role not in _MEASURED:
             continue
         try:
-            values, gone, note = _screened(item.values)
+            gone, note = missing_stretches(item.values)
+            check_signal(item.values)
         except Unusable as error:
             refused.append(Refusal(name, error.reason, error.detail, channel=item.signal.name))
             continue
         if note:
             refused.append(Refusal(name, "gaps", note, channel=item.signal.name))
-            missing |= gone
-        channels.append(Channel(item.signal.name, cast(ChannelKind, item.signal.role), values))
+        missing.append(gone)
+        channels.append(Channel(item.signal.name, cast(ChannelKind, item.signal.role), item.values))
     if not any(channel.kind in _DYNAMIC for channel in channels):
         raise Unusable("no-signal", f"no usable channel is left: {_why(refused)}")
     return tuple(channels), missing
-
-
-def _screened(values: FloatArray) -> tuple[FloatArray, BoolArray, str]:
-    """Judge a channel; what is missing becomes NaN."""
-    gone, note = missing_samples(values)
-    if not note:
-        check_signal(values)
-        return values, gone, note
-    check_signal(values[~gone])
-    return np.where(gone, np.nan, values), gone, note
 
 
 def _why(refused: list[Refusal]) -> str:
@@ -173,31 +170,15 @@ def _why(refused: list[Refusal]) -> str:
 
 def _reference_missing(
     reference: _Series | None, name: str, refused: list[Refusal]
-) -> BoolArray | None:
+) -> IntArray | None:
     """Tell where the set point is unknown; None when there is none that can be used."""
     if reference is None:
         return None
     try:
-        gone, note = missing_samples(reference.values)
+        gone, note = missing_stretches(reference.values)
     except Unusable as error:
         refused.append(Refusal(name, error.reason, error.detail, channel=reference.signal.name))
         return None
     if note:
         refused.append(Refusal(name, "gaps", note, channel=reference.signal.name))
     return gone
-
-
-def _velocity(
-    reference: _Series, ranges: tuple[tuple[int, int], ...], axis: TimeAxis
-) -> FloatArray:
-    """Give the set point's velocity in m/s, shape ``(n_samples,)``; NaN outside the pieces.
-
-    A position is differentiated piece by piece: across a gap the difference means nothing.
-    """
-    velocity = np.full(reference.values.size, np.nan)
-    for start, stop in ranges:
-        part = reference.values[start:stop]
-        if reference.signal.role == "reference_position":
-            part = np.gradient(part, 1 / axis.sample_rate)
-        velocity[start:stop] = part
-    return velocity

@@ -54,7 +54,7 @@ class Spool:
     def _write(self) -> None:
         try:
             if self._file is None:
-                self._file = tempfile.TemporaryFile(prefix="lmshealth-")
+                self._file = tempfile.TemporaryFile(prefix="lmshealth-")  # noqa: SIM115
             for values in self._parts:
                 self._file.write(np.ascontiguousarray(values).data)
         except OSError as error:

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lmshealth.arrays import BoolArray, FloatArray
 from lmshealth.readers.trouble import Unusable
+from lmshealth.samples import Samples, blocks
 
 IntArray = NDArray[np.int64]
 
@@ -47,12 +48,12 @@ def too_many(n_interruptions: int, n_samples: int) -> bool:
     return n_interruptions > max(ALWAYS_ALLOWED, BROKEN * n_samples)
 
 
-def time_axis(time: FloatArray | None, rate: float | None) -> TimeAxis:
+def time_axis(time: Samples | None, rate: float | None) -> TimeAxis:
     """Find the sample rate and the interruptions of a record.
 
     Parameters
     ----------
-    time : ndarray or None
+    time : ndarray, Stored or None
         Time stamps in s as recorded, shape ``(n_samples,)``.
     rate : float or None
         Sample rate in Hz that the metadata give.
@@ -69,63 +70,83 @@ def time_axis(time: FloatArray | None, rate: float | None) -> TimeAxis:
                 "time", "neither a column time_s nor the metadata sample_rate_hz; needed one"
             )
         return TimeAxis(rate, np.empty(0, dtype=np.int64), "")
-    steps = _steps(time)
-    interval = float(np.median(steps))
-    gap = steps > GAP * interval
-    odd = ~gap & (np.abs(steps / interval - 1) > JITTER)
-    n_gaps, n_odd = int(gap.sum()), int(odd.sum())
-    missing = np.round(steps[gap] / interval - 1).sum()
-    note = _note(n_gaps, missing, n_odd, steps.size, interval)
-    if too_many(n_gaps + n_odd, time.size):
+    _check_order(time)
+    interval, total, n_regular, n_gaps, missing = 0.0, 0.0, 0, 0, 0.0
+    breaks = [np.empty(0, dtype=np.int64)]
+    for at, stamps in blocks(time, overlap=1):
+        steps = np.diff(stamps)
+        # The first block tells what an interval is.
+        interval = interval or float(np.median(steps))
+        gap = steps > GAP * interval
+        irregular = gap | (np.abs(steps / interval - 1) > JITTER)
+        n_gaps += int(gap.sum())
+        missing += float(np.round(steps[gap] / interval - 1).sum())
+        total += float(steps[~irregular].sum())
+        n_regular += int(np.count_nonzero(~irregular))
+        breaks.append(np.flatnonzero(irregular) + at + 1)
+    where: IntArray = np.concatenate(breaks)
+    note = _note(n_gaps, missing, where.size - n_gaps, time.size - 1, interval)
+    if too_many(where.size, time.size):
         raise Unusable("time", f"{note}; needed uniform samples, export them at the sampling clock")
-    regular = steps[~gap & ~odd]
     # The mean over all regular intervals averages the rounding of time stamps out.
-    interval = float(regular.mean()) if regular.size else interval
-    return TimeAxis(_agreed(interval, rate), np.flatnonzero(gap | odd) + 1, note)
+    interval = total / n_regular if n_regular else interval
+    return TimeAxis(_agreed(interval, rate), where, note)
 
 
-def pieces(missing: BoolArray, breaks: IntArray) -> tuple[tuple[int, int], ...]:
+def pieces(
+    n_samples: int, missing: Sequence[IntArray], breaks: IntArray
+) -> tuple[tuple[int, int], ...]:
     """Cut a record into ranges without gaps.
 
     Parameters
     ----------
-    missing : ndarray of bool
-        Where a sample is missing, shape ``(n_samples,)``.
+    n_samples : int
+        Length of the record.
+    missing : sequence of ndarray
+        Of each channel the half-open ranges in which it has no samples, shape ``(n, 2)``.
     breaks : ndarray of int
-        Samples before which time is interrupted, shape ``(n_breaks,)``.
+        Samples before which time is interrupted, ascending, shape ``(n_breaks,)``.
 
     Returns
     -------
     tuple of (int, int)
         Half-open ranges of sample indices; single samples are left out.
     """
-    edge = np.zeros(missing.size + 1, dtype=bool)
-    edge[[0, -1]] = True
-    edge[breaks] = True
-    edge[1:-1] |= missing[1:] != missing[:-1]
-    bounds = np.flatnonzero(edge)
-    start, stop = bounds[:-1], bounds[1:]
-    keep = ~missing[start] & (stop - start >= SHORTEST_PIECE)
+    gone = np.concatenate([*missing, np.empty((0, 2), dtype=np.int64)])
+    gone = gone[np.argsort(gone[:, 0], kind="stable")]
+    # What is there begins where all that is missing so far has ended.
+    start = np.concatenate([[0], np.maximum.accumulate(gone[:, 1])])
+    stop = np.concatenate([gone[:, 0], [n_samples]])
+    there = start < stop
+    start, stop = start[there], stop[there]
+    inside = breaks[np.searchsorted(start, breaks) > np.searchsorted(stop, breaks, side="right")]
+    start, stop = np.sort(np.append(start, inside)), np.sort(np.append(stop, inside))
+    keep = stop - start >= SHORTEST_PIECE
     return tuple(zip(start[keep].tolist(), stop[keep].tolist(), strict=True))
 
 
-def _steps(time: FloatArray) -> FloatArray:
-    """Give the intervals in s, shape ``(n_samples - 1,)``, all of them positive."""
+def _check_order(time: Samples) -> None:
+    """Insist that time stamps are numbers and increase."""
     if time.size < SHORTEST_PIECE:
         raise Unusable("empty", f"{time.size} samples; needed at least {SHORTEST_PIECE}")
-    unknown = int(np.count_nonzero(~(np.abs(time) < 1e12)))
+    unknown = backwards = repeated = 0
+    first = None
+    for at, stamps in blocks(time, overlap=1):
+        steps = np.diff(stamps)
+        wrong = ~(steps > 0)
+        if wrong.any() and first is None:
+            first = at + int(np.argmax(wrong)) + 1
+        unknown += int(np.count_nonzero(~(np.abs(stamps[at > 0 :]) < 1e12)))
+        backwards += int(np.count_nonzero(steps < 0))
+        repeated += int(np.count_nonzero(steps == 0))
     if unknown:
         raise Unusable("time", f"{unknown} of {time.size} time stamps are no numbers")
-    steps = np.diff(time)
-    backwards, repeated = int((steps < 0).sum()), int((steps == 0).sum())
     if backwards or repeated:
-        first = int(np.argmax(steps <= 0)) + 1
         raise Unusable(
             "time",
             f"time_s runs backwards {backwards} times and stands still {repeated} times in "
             f"{time.size} samples, first at sample {first}; needed increasing time stamps",
         )
-    return np.asarray(steps, dtype=np.float64)
 
 
 def _note(n_gaps: int, missing: float, n_odd: int, n_steps: int, interval: float) -> str:

@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
-from lmshealth.readers.quality import check_signal, missing_samples
+from lmshealth.readers.quality import check_signal, missing_stretches
 from lmshealth.readers.trouble import Unusable
+from lmshealth.samples import BLOCK
 
 N = 40_000
 STEP = 4.88e-9
@@ -55,14 +56,35 @@ def test_flat():
         check_signal(np.full(100, 3.0))
 
 
-def test_missing_samples():
+def test_missing_stretches():
     """NaN, infinite and absurd samples are counted; too many of them end the channel."""
     values = np.ones(1000)
     values[[3, 4, 50, 70]] = np.nan, np.inf, 1e300, -np.inf
-    mask, note = missing_samples(values)
-    assert mask.sum() == 4 and "4 of 1000" in note and "3 stretches" in note
-    assert missing_samples(np.ones(5))[1] == ""
+    stretches, note = missing_stretches(values)
+    assert stretches.tolist() == [[3, 5], [50, 51], [70, 71]]
+    assert "4 of 1000" in note and "3 stretches" in note
+    assert missing_stretches(np.ones(5))[1] == ""
     values[:101] = np.nan
     for bad in (values, np.where(np.arange(1000) % 20 == 0, np.nan, 1.0)):
         with pytest.raises(Unusable, match="missing"):
-            missing_samples(bad)
+            missing_stretches(bad)
+
+
+def test_a_stretch_across_blocks_is_one():
+    """What is missing at the end of a block and at the beginning of the next is one stretch."""
+    values = np.ones(3 * BLOCK)
+    values[BLOCK - 2 : BLOCK + 3] = values[-1] = values[0] = np.nan
+    stretches, note = missing_stretches(values)
+    assert stretches.tolist() == [[0, 1], [BLOCK - 2, BLOCK + 3], [3 * BLOCK - 1, 3 * BLOCK]]
+    assert "7 of" in note and "3 stretches" in note
+
+
+def test_long_signals_are_judged_as_a_whole():
+    """A limit reached in the last block only is seen, and a rare extreme is no limit."""
+    values = np.tile(noise(1.0), 20)
+    check_signal(values)
+    cut = values.copy()
+    cut[-N:] = np.clip(cut[-N:], None, 0.5)
+    check_signal(cut)
+    with pytest.raises(Unusable, match="maximum"):
+        check_signal(np.minimum(values, 1.0))

@@ -5,6 +5,7 @@ import pytest
 
 from lmshealth.readers.timeaxis import pieces, time_axis
 from lmshealth.readers.trouble import Unusable
+from lmshealth.samples import BLOCK
 
 
 def test_rate_from_time():
@@ -36,7 +37,7 @@ def test_gaps_are_counted_and_split():
     time = np.delete(np.arange(1000) / 1000, [100, 101, 500])
     axis = time_axis(time, 1000.0)
     assert "2 gaps with 3 dropped samples" in axis.note
-    assert pieces(np.zeros(997, bool), axis.breaks) == ((0, 100), (100, 498), (498, 997))
+    assert pieces(997, [], axis.breaks) == ((0, 100), (100, 498), (498, 997))
 
 
 def test_one_hiccup_splits():
@@ -67,7 +68,24 @@ def test_disorder_is_refused():
 
 
 def test_pieces_around_missing_samples():
-    """Pieces leave missing samples and single samples out."""
-    missing = np.array([1, 0, 0, 1, 0, 1, 0, 0, 0, 1], dtype=bool)
-    assert pieces(missing, np.array([8])) == ((1, 3), (6, 8))
-    assert pieces(np.ones(3, bool), np.empty(0, int)) == ()
+    """Pieces leave missing samples of any channel and single samples out."""
+    one, other = np.array([[0, 1], [5, 6]]), np.array([[3, 4], [9, 10]])
+    assert pieces(10, [one, other], np.array([8])) == ((1, 3), (6, 8))
+    assert pieces(10, [np.array([[2, 9]]), np.array([[3, 5]])], np.array([4])) == ((0, 2),)
+    assert pieces(3, [np.array([[0, 3]])], np.empty(0, int)) == ()
+    assert pieces(8, [], np.array([4])) == ((0, 4), (4, 8))
+
+
+def test_long_time_axes_are_read_in_blocks():
+    """Gaps, odd intervals and disorder are found in every block, also at their edges."""
+    n = 2 * BLOCK + 1000
+    time = np.arange(n) / 20e3
+    time[BLOCK:] += 3 / 20e3
+    time[2 * BLOCK + 10 :] += 0.4 / 20e3
+    axis = time_axis(time, None)
+    assert axis.breaks.tolist() == [BLOCK, 2 * BLOCK + 10]
+    assert "1 gaps with 3 dropped" in axis.note and "1 of" in axis.note
+    assert axis.sample_rate == pytest.approx(20e3, rel=1e-9)
+    time[2 * BLOCK + 20] = 0.0
+    with pytest.raises(Unusable, match=f"backwards 1 times.*at sample {2 * BLOCK + 20};"):
+        time_axis(time, None)
