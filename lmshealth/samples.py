@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import weakref
 from collections.abc import Iterator
+from copy import copy
 from typing import IO
 
 import numpy as np
@@ -21,24 +23,17 @@ class Stored:
     Parameters
     ----------
     file : IO
-        Open for reading; it is kept open as long as any view of it lives.
+        Open for reading; closed with the last view of it.
     size : int
         Number of samples.
-    factor : float
-        What they are multiplied by when they are read.
-    limit : float
-        Magnitude from which on a sample is no measurement and read as NaN.
     """
 
-    __slots__ = ("_factor", "_file", "_limit", "size")
-
-    def __init__(
-        self, file: IO[bytes], size: int, *, factor: float = 1.0, limit: float = np.inf
-    ) -> None:
+    def __init__(self, file: IO[bytes], size: int) -> None:
         self._file = file
-        self._factor = factor
-        self._limit = limit
+        self._factor, self._limit = 1.0, np.inf
+        self._viewed: Stored | None = None
         self.size = size
+        weakref.finalize(self, file.close)
 
     def __getitem__(self, stretch: slice) -> FloatArray:
         """Read consecutive samples, shape ``(n,)``."""
@@ -50,8 +45,10 @@ class Stored:
         return in_unit(values, self._factor, self._limit)
 
     def scaled(self, factor: float, limit: float) -> Stored:
-        """View the samples in another unit, with a limit in that unit."""
-        return Stored(self._file, self.size, factor=self._factor * factor, limit=limit)
+        """View the samples times a factor; from a limit on they are no measurements but NaN."""
+        view = copy(self)
+        view._factor, view._limit, view._viewed = self._factor * factor, limit, self
+        return view
 
 
 Samples = FloatArray | Stored

@@ -8,6 +8,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
+from lmshealth import samples, segments
 from lmshealth.errors import BadLog
 from lmshealth.logs import Log, Metadata
 from lmshealth.segments import (
@@ -191,3 +192,39 @@ def test_a_continuously_accelerating_sweep_has_no_segment() -> None:
     """Where the velocity never stands still there is nothing to take."""
     log = make_log({"acc_a": np.zeros(4000)}, 2000.0, velocity=np.linspace(0, 0.4, 4000))
     assert find_segments(log, 0.05) == ()
+
+
+# Long records
+
+
+def test_phases_do_not_depend_on_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Moves, settling and rests are cut alike whether they are looked at in one block or many."""
+    velocity = strokes(0.1, -0.2, 0.1)
+    log = log_of(velocity)
+    whole = find_phases(log)
+    for size in (40, 333, 1000):
+        monkeypatch.setattr(samples, "BLOCK", size)
+        parts = find_phases(log)
+        assert [(p.start, p.stop, p.kind) for p in parts] == [
+            (p.start, p.stop, p.kind) for p in whole
+        ]
+        np.testing.assert_allclose([p.velocity for p in parts], [p.velocity for p in whole])
+
+
+def test_long_stretches_are_cut_into_equal_parts(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What is longer than the longest is cut; parts have one length and follow each other."""
+    monkeypatch.setattr(segments, "MINUTE", 1000)
+    log = make_log({"acc_a": np.zeros(3701)}, RATE, pieces=((0, 900), (1000, 3701)))
+    for parts in (find_segments(log, 0.0), select_segments(log, "record")):
+        assert [(p.start, p.stop) for p in parts] == [
+            (0, 900), (1000, 1900), (1900, 2800), (2800, 3700),
+        ]  # fmt: skip
+
+
+def test_parts_stay_long_enough_for_what_is_looked_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A narrow mode asks for long parts: ten times the shortest that resolves it."""
+    monkeypatch.setattr(segments, "MINUTE", 1000)
+    log = make_log({"acc_a": np.zeros(9000)}, RATE)
+    assert {p.stop - p.start for p in find_segments(log, 0.1)} == {1000}
+    assert {p.stop - p.start for p in find_segments(log, 0.45)} == {4500}
+    assert {p.stop - p.start for p in find_segments(log, 2.0)} == {9000}
