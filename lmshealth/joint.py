@@ -1,0 +1,462 @@
+"""Whittle likelihood of all channels that see one or several modes, with exact derivatives.
+
+The acceleration of mode i under a white modal force is h_i(f) = 1 / (1 - β² + 2iζβ), β = f_i/f.
+Modes of one structure are driven by partly common forces, and each channel sees each mode by its
+shape φ. The ordinates of all channels at one frequency are then complex normal with the matrix
+
+    E(f) = Φ D(f) Φᵀ + N(f),   D_ij = S_ij h_i h_j*,   S = L L*,   N_c = exp(e_c + d_c u),
+
+with u = -1 … 1 over the band. Averages W of n ordinates keep all there is to know where E hardly
+changes between them:
+
+    -ln p = Σ n (ln det E + tr E⁻¹ W).
+
+Unknowns, in this order: ln f (m), ln ζ (m), L row by row up to its diagonal, Φ but for the channel
+of each mode where it is one, then e_c and d_c of each channel. L is signed, and complex below the
+diagonal, in units of a start value: neither independent modes nor a single common force is a
+boundary. Of a single channel the spectrum tells 2m - 1 numbers of L only; there L is real, and
+neighbours share a force.
+
+Every slope of E has the form E_a = b ω* + ω bᵀ, where b is a column of Φ or a unit vector: a change
+of one mode or of one channel. That makes the Hessian a few matrix products.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from scipy.optimize import minimize
+
+from lmshealth.arrays import ComplexArray, FloatArray
+
+# Standard deviations of the weak normal priors about the start, which only keep directions
+# that the data do not see from running away: of ln f, ln ζ, forces, shapes, e_c and d_c.
+WEAK = (0.2, 2.0)
+_PRIOR_FORCE = 30.0
+_PRIOR_SHAPE = 30.0
+_PRIOR_NOISE = (5.0, 2.0)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Block:
+    """Ordinates of segments of one length within the band.
+
+    Attributes
+    ----------
+    frequency : ndarray
+        Of each mean, in Hz, shape ``(n,)``.
+    matrix : ndarray
+        Means of F F*, F the transform of all channels, shape ``(n, n_channels, n_channels)``.
+    count : ndarray
+        How many ordinates each mean is of, shape ``(n,)``.
+    grid : ndarray
+        Where the density is evaluated, in Hz, shape ``(n_grid,)``.
+    kernel : ndarray or None
+        Density to expected periodogram, shape ``(n, n_grid)``; None where they are the same.
+    """
+
+    frequency: FloatArray
+    matrix: ComplexArray
+    count: FloatArray
+    grid: FloatArray
+    kernel: FloatArray | None
+
+    def smear(self, density: ComplexArray) -> ComplexArray:
+        """Turn densities on the grid, frequency last, into expectations."""
+        return density if self.kernel is None else density @ self.kernel.T
+
+
+@dataclass(frozen=True, slots=True)
+class Layout:
+    """Which unknown is which.
+
+    Attributes
+    ----------
+    n_modes, n_channels : int
+        Numbers of modes and channels.
+    force : tuple of (int, int, complex)
+        Row, column and direction, 1 or i, of each unknown of L.
+    shape : tuple of (int, int)
+        Channel and mode of each unknown of Φ.
+    """
+
+    n_modes: int
+    n_channels: int
+    force: tuple[tuple[int, int, complex], ...]
+    shape: tuple[tuple[int, int], ...]
+
+    @property
+    def forces(self) -> slice:
+        """Unknowns of L."""
+        return slice(2 * self.n_modes, 2 * self.n_modes + len(self.force))
+
+    @property
+    def shapes(self) -> slice:
+        """Unknowns of Φ."""
+        return slice(self.forces.stop, self.forces.stop + len(self.shape))
+
+    @property
+    def size(self) -> int:
+        """Number of unknowns."""
+        return self.shapes.stop + 2 * self.n_channels
+
+
+def lay_out(reference: tuple[int, ...], n_channels: int) -> Layout:
+    """Lay the unknowns out; ``reference`` is the channel in which each mode's shape is one."""
+    m = len(reference)
+    force: list[tuple[int, int, complex]] = []
+    for i in range(m):
+        for j in range(i + 1) if n_channels > 1 else range(max(0, i - 1), i + 1):
+            force.append((i, j, 1.0))
+            if j < i and n_channels > 1:
+                force.append((i, j, 1j))
+    shape = tuple((c, i) for i in range(m) for c in range(n_channels) if c != reference[i])
+    return Layout(m, n_channels, tuple(force), shape)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Likelihood:
+    """Negative log posterior of a band with priors about a start.
+
+    Attributes
+    ----------
+    blocks : tuple of Block
+        One per length of segments.
+    layout : Layout
+        Which unknown is which.
+    start : ndarray
+        Start value and centre of the priors, shape ``(n_unknowns,)``.
+    scale : ndarray
+        Unit of the rows of L, shape ``(n_modes,)``.
+    centre : float
+        Geometric centre of the band in Hz.
+    spread : float
+        Half width of the band in ln f.
+    """
+
+    blocks: tuple[Block, ...]
+    layout: Layout
+    start: FloatArray
+    scale: FloatArray
+    centre: float
+    spread: float
+
+    @property
+    def prior_std(self) -> FloatArray:
+        """Standard deviations of the weak priors, shape ``(n_unknowns,)``."""
+        lay = self.layout
+        return np.concatenate(
+            [
+                np.repeat(WEAK, lay.n_modes),
+                np.full(len(lay.force), _PRIOR_FORCE),
+                np.full(len(lay.shape), _PRIOR_SHAPE),
+                np.tile(_PRIOR_NOISE, lay.n_channels),
+            ]
+        )
+
+    def value(self, p: FloatArray) -> float:
+        """Negative log posterior up to a constant."""
+        total = 0.5 * float(np.sum(((p - self.start) / self.prior_std) ** 2))
+        with np.errstate(over="ignore", invalid="ignore"):
+            try:
+                total += self.data_value(p)
+            except np.linalg.LinAlgError:
+                return np.inf
+        return total if np.isfinite(total) else np.inf
+
+    def data_value(self, p: FloatArray) -> float:
+        """Negative log likelihood without the priors."""
+        return sum(
+            _misfit(block, matrix)
+            for block, matrix in zip(self.blocks, self.expected(p), strict=True)
+        )
+
+    def expected(self, p: FloatArray) -> list[ComplexArray]:
+        """Compute E of each block, shape ``(n, n_channels, n_channels)``."""
+        return [_Point(self, p, block).expected for block in self.blocks]
+
+    def derivatives(self, p: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Exact gradient and Hessian of `value`, shapes ``(n_unknowns,)`` and square."""
+        gradient = (p - self.start) / self.prior_std**2
+        hessian = np.diag(1 / self.prior_std**2)
+        for block in self.blocks:
+            first, second = _Point(self, p, block).derivatives()
+            gradient = gradient + first
+            hessian = hessian + second
+        return gradient, hessian
+
+    def minimise(self, start: FloatArray) -> FloatArray:
+        """Find the posterior mode by Newton's method in a trust region.
+
+        Parameters
+        ----------
+        start : ndarray
+            Shape ``(n_unknowns,)``.
+
+        Returns
+        -------
+        ndarray
+            Where the search ended; the caller judges it by its Newton decrement.
+        """
+        last: list[FloatArray] = []
+
+        def gradient(p: FloatArray) -> FloatArray:
+            last[:] = [p.copy(), *self.derivatives(p)]
+            return last[1]
+
+        def hessian(p: FloatArray) -> FloatArray:
+            # The optimiser asks for the gradient at a point before it asks for the Hessian there.
+            return last[2] if np.array_equal(p, last[0]) else self.derivatives(p)[1]
+
+        found = minimize(
+            self.value,
+            start,
+            jac=gradient,
+            hess=hessian,
+            method="trust-exact",
+            options={"gtol": 1e-3, "maxiter": 100, "initial_trust_radius": 0.3},
+        )
+        return np.asarray(found.x)
+
+
+class _Point:
+    """The model of a block at one point; frequency is the last axis unless said otherwise."""
+
+    def __init__(self, likelihood: Likelihood, p: FloatArray, block: Block) -> None:
+        self._block, lay = block, likelihood.layout
+        self._layout, self._scale = lay, likelihood.scale
+        m = lay.n_modes
+        self._force = np.zeros((m, m), dtype=complex)
+        for value, (i, j, direction) in zip(p[lay.forces], lay.force, strict=True):
+            self._force[i, j] += likelihood.scale[i] * value * direction
+        self._phi = np.ones((lay.n_channels, m))
+        for value, (c, i) in zip(p[lay.shapes], lay.shape, strict=True):
+            self._phi[c, i] = value
+        # h and its derivatives by ln f and ln ζ, shape (6, modes, grid).
+        self._h = receptance(np.exp(p[:m, None]), np.exp(p[m : 2 * m, None]), block.grid)
+        self._u = np.log(block.frequency / likelihood.centre) / likelihood.spread
+        level, slope = p[lay.shapes.stop :].reshape(-1, 2).T[..., None]
+        self._noise = np.exp(level + slope * self._u)  # (channels, n)
+
+    @cached_property
+    def _s(self) -> ComplexArray:
+        return np.asarray(self._force @ self._force.conj().T)
+
+    @cached_property
+    def _modal(self) -> ComplexArray:
+        """D, shape ``(modes, modes, n)``."""
+        h = self._h[0]
+        return self._block.smear(self._s[..., None] * h[:, None] * h[None].conj())
+
+    @cached_property
+    def expected(self) -> ComplexArray:
+        """E, shape ``(n, channels, channels)``."""
+        expected = self._phi @ np.moveaxis(self._modal, -1, 0) @ self._phi.T
+        index = np.arange(self._layout.n_channels)
+        expected[:, index, index] += self._noise.T
+        return expected
+
+    def derivatives(self) -> tuple[FloatArray, FloatArray]:
+        """Gradient and Hessian of the misfit.
+
+        With R = E⁻¹, G = R - RWR and Y = 2RWR - R the gradient is Σ n tr G E_a and the Hessian
+        Σ n (tr E_a R E_b Y + tr G E_ab).
+        """
+        inverse = np.linalg.inv(self.expected)
+        turned = inverse @ self._block.matrix @ inverse
+        count = self._block.count[:, None, None]
+        g = np.moveaxis(count * (inverse - turned), 0, -1)
+        y = np.moveaxis(count * (2 * turned - inverse), 0, -1)
+        row, w = self._slopes()
+        basis = np.concatenate([self._phi, np.eye(self._layout.n_channels)], axis=1)
+        omega = np.tensordot(basis, w.conj(), axes=(1, 1))  # (channels, unknowns, n)
+        pull = np.tensordot(basis.T, g, axes=(1, 0))  # bᵀ G, (basis, channels, n)
+        gradient = 2 * np.einsum("cak,ack->a", omega, pull[row]).real
+        hessian = _products(basis, row, omega, np.moveaxis(inverse, 0, -1), y)
+        return gradient, hessian + self._curvature(w, g)
+
+    def _slopes(self) -> tuple[np.ndarray, ComplexArray]:
+        """Rows of the slopes of E in the basis of Φ's columns and the channels.
+
+        Of each unknown the index of b and its row w, E_a = b (basis w)ᵀ and its adjoint, shapes
+        ``(unknowns,)`` and ``(unknowns, modes + channels, n)``.
+        """
+        lay, m, h = self._layout, self._layout.n_modes, self._h
+        row = np.zeros(lay.size, dtype=int)
+        w = np.zeros((lay.size, m + lay.n_channels, self._block.frequency.size), dtype=complex)
+        adjoint = h[0].conj()
+        for i in range(m):
+            for q in (1, 2):
+                a = (q - 1) * m + i
+                row[a] = i
+                w[a, :m] = self._block.smear(self._s[i, :, None] * h[q, i] * adjoint)
+        pairs = self._block.smear(h[0][:, None] * adjoint[None])
+        for a, (i, j, direction) in enumerate(lay.force, start=lay.forces.start):
+            row[a] = i
+            pull = self._scale[i] * direction * self._force[:, j].conj()
+            w[a, :m] = pull[:, None] * pairs[i]
+        for a, (c, i) in enumerate(lay.shape, start=lay.shapes.start):
+            row[a] = m + c
+            w[a, :m] = self._modal[i]
+        for c in range(lay.n_channels):
+            a = lay.shapes.stop + 2 * c
+            row[a : a + 2] = m + c
+            w[a, m + c] = 0.5 * self._noise[c]
+            w[a + 1, m + c] = 0.5 * self._noise[c] * self._u
+        return row, w
+
+    def _curvature(self, w: ComplexArray, g: ComplexArray) -> FloatArray:
+        """Σ tr G E_ab over all pairs of unknowns, the counts in G."""
+        lay = self._layout
+        curvature = np.zeros((lay.size, lay.size))
+        pull = np.tensordot(self._phi.T, g, axes=(1, 0))  # Φᵀ G, (modes, channels, n)
+        b = _congruent(self._phi, g)  # (modes, modes, n)
+        if self._block.kernel is not None:
+            b = b @ self._block.kernel
+        turned = b.swapaxes(0, 1)
+        self._by_poles(curvature, turned)
+        self._by_forces(curvature, turned)
+        if lay.shape:
+            self._by_shapes(curvature, w, g, pull)
+        for c in range(lay.n_channels):
+            own = g[c, c].real * self._noise[c]
+            at = lay.shapes.stop + 2 * c
+            cross = float(own @ self._u)
+            curvature[at : at + 2, at : at + 2] += [
+                [own.sum(), cross],
+                [cross, own @ self._u**2],
+            ]
+        return curvature
+
+    def _by_poles(self, curvature: FloatArray, turned: ComplexArray) -> None:
+        """By ln f and ln ζ: Q = Σ_ij S_ij B_ji h_i h_j*."""
+        m, h = self._layout.n_modes, self._h
+        weight = self._s[..., None] * turned
+        second = {(1, 1): 3, (1, 2): 4, (2, 1): 4, (2, 2): 5}
+        pull = np.sum(weight * h[0].conj()[None], axis=1)
+        for (a, b), both in second.items():
+            term = np.einsum("ijk,ik,jk->ij", weight, h[a], h[b].conj())
+            term += np.diag(np.sum(pull * h[both], axis=-1))
+            rows, columns = slice((a - 1) * m, a * m), slice((b - 1) * m, b * m)
+            curvature[rows, columns] += 2 * term.real
+
+    def _by_forces(self, curvature: FloatArray, turned: ComplexArray) -> None:
+        """By two forces, and by a force and ln f or ln ζ."""
+        lay, m, h = self._layout, self._layout.n_modes, self._h
+        overlap = np.einsum("ijk,ik,jk->ij", turned, h[0], h[0].conj())
+        start = lay.forces.start
+        for a, (i, j, alpha) in enumerate(lay.force):
+            for b, (k, l, beta) in enumerate(lay.force):
+                if j == l:
+                    unit = self._scale[i] * self._scale[k] * alpha * np.conj(beta)
+                    curvature[start + a, start + b] += 2 * (unit * overlap[i, k]).real
+        for q in (1, 2):
+            mixed = np.einsum("ijk,ik,jk->ij", turned, h[q], h[0].conj())
+            for a, (i, j, alpha) in enumerate(lay.force, start=start):
+                # S changes in row and column i.
+                slope = self._scale[i] * alpha * self._force[:, j].conj()
+                term = np.zeros(m, dtype=complex)
+                term[i] = slope @ mixed[i]
+                term += slope.conj() * mixed[:, i]
+                columns = slice((q - 1) * m, q * m)
+                curvature[a, columns] += 2 * term.real
+                curvature[columns, a] += 2 * term.real
+
+    def _by_shapes(
+        self, curvature: FloatArray, w: ComplexArray, g: ComplexArray, pull: ComplexArray
+    ) -> None:
+        """By two shapes, and by a shape and what D depends on."""
+        lay, m = self._layout, self._layout.n_modes
+        channel, mode = np.array(lay.shape).T
+        own = np.tensordot(self._modal, g, axes=(2, 2))  # (i, j, d, c)
+        own = own[mode[:, None], mode, channel, channel[:, None]]
+        curvature[lay.shapes, lay.shapes] += 2 * own.real
+        inner = w[: lay.shapes.start, :m]
+        along = np.einsum("ajk,jck->ac", inner, pull)
+        across = np.tensordot(inner.conj(), pull, axes=(2, 2))  # (a, i, r, c)
+        row = np.concatenate([np.tile(np.arange(m), 2), [i for i, _, _ in lay.force]]).astype(int)
+        index = np.arange(row.size)
+        term = across[index[:, None], mode, row[:, None], channel]
+        term = term + np.where(row[:, None] == mode, along[:, channel], 0)
+        curvature[: lay.shapes.start, lay.shapes] += 2 * term.real
+        curvature[lay.shapes, : lay.shapes.start] += 2 * term.real.T
+
+
+def _products(
+    basis: FloatArray, row: np.ndarray, omega: ComplexArray, r: ComplexArray, y: ComplexArray
+) -> FloatArray:
+    """Σ tr E_a R E_b Y for slopes E_a = b_a ω_a* + ω_a b_aᵀ.
+
+    The trace is ω_a*R b_b · ω_b*Y b_a + ω_a*R ω_b · b_bᵀY b_a and both with R and Y exchanged,
+    of which the real part counts.
+    """
+    n = row.size
+    by_r, by_y = _applied(r, omega), _applied(y, omega)
+    left = np.tensordot(basis.T, by_r, axes=(1, 0)).conj()  # ω* R b: (basis, unknowns, n)
+    right = np.tensordot(basis.T, by_y, axes=(1, 0)).conj()
+    small_r, small_y = _congruent(basis, r), _congruent(basis, y)
+    groups = [(k, np.flatnonzero(row == k)) for k in range(basis.shape[1]) if (row == k).any()]
+    total = np.zeros((n, n))
+    for k, first in groups:
+        flat = omega[:, first].conj().swapaxes(0, 1).reshape(first.size, -1)
+        for l, second in groups:
+            if l < k:
+                continue
+            part = _real_product(left[l, first], right[k, second])
+            part += _real_product(right[l, first], left[k, second])
+            weighted = by_r[:, second] * small_y[l, k] + by_y[:, second] * small_r[l, k]
+            part += _real_product(flat, weighted.swapaxes(0, 1).reshape(second.size, -1))
+            total[np.ix_(first, second)] = part
+            total[np.ix_(second, first)] = part.T
+    return total
+
+
+def _congruent(basis: FloatArray, matrix: ComplexArray) -> ComplexArray:
+    """Bᵀ M B at each frequency, which is the last axis."""
+    half = np.tensordot(basis.T, matrix, axes=(1, 0))
+    return np.tensordot(half, basis, axes=(1, 0)).swapaxes(1, 2)
+
+
+def _applied(matrix: ComplexArray, vectors: ComplexArray) -> ComplexArray:
+    """Σ_d M_cd v_d at each frequency, shape ``(channels, unknowns, n)``."""
+    # One product per pair of channels: their axes are too short for a loop inside.
+    return np.array(
+        [sum(m * v for m, v in zip(row, vectors, strict=True)) for row in matrix]
+    )
+
+
+def _real_product(a: ComplexArray, b: ComplexArray) -> FloatArray:
+    """Re of Σ a b over the last axis, shape ``(n_a, n_b)``."""
+    return np.asarray(a.real @ b.real.T - a.imag @ b.imag.T)
+
+
+def _misfit(block: Block, expected: ComplexArray) -> float:
+    root = np.linalg.cholesky(expected)
+    white = np.linalg.solve(expected, block.matrix)
+    log_det = 2 * np.log(np.diagonal(root, axis1=-2, axis2=-1).real).sum(axis=-1)
+    return float(block.count @ (log_det + np.trace(white, axis1=-2, axis2=-1).real))
+
+
+def receptance(f: FloatArray, zeta: FloatArray, frequency: FloatArray) -> ComplexArray:
+    """Acceleration response h of modes and its derivatives by x = ln f and z = ln ζ.
+
+    Returns an array of shape ``(6, …, n)``: h, h_x, h_z, h_xx, h_xz, h_zz. With d = 1/h,
+    h_a = -d_a h² and h_ab = (2 d_a d_b h - d_ab) h².
+    """
+    beta = f / frequency
+    damping = 2j * zeta * beta
+    h = 1 / (1 - beta**2 + damping)
+    d_x, d_xx = damping - 2 * beta**2, damping - 4 * beta**2
+    square = h * h
+    return np.stack(
+        [
+            h,
+            -d_x * square,
+            -damping * square,
+            (2 * d_x * d_x * h - d_xx) * square,
+            (2 * d_x * damping * h - damping) * square,
+            (2 * damping * damping * h - damping) * square,
+        ]
+    )
