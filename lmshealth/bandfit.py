@@ -1,15 +1,17 @@
-"""Fit a cluster of neighbouring modes in one channel, and say which of them it sees."""
+"""Fit a cluster of neighbouring modes to all channels at once, and say which of them are there."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.stats import gamma
 
-from lmshealth.arrays import BoolArray, FloatArray
-from lmshealth.spectra import Spectrum
+from lmshealth.arrays import BoolArray, ComplexArray, FloatArray
+from lmshealth.spectra import CrossSpectrum, Spectrum
 from lmshealth.starts import Coarse, Target
-from lmshealth.whittle import WEAK, Block, Likelihood, make_block
+from lmshealth.whittle import Block, Likelihood, lay_out, make_block
 
 # The band of a fit reaches this many damping ratios from its modes: beyond, a resonance adds
 # little, and the noise need not be as simple as the model says.
@@ -27,50 +29,84 @@ _WORST_STD_LN_ZETA = 0.7
 # A damping off its start by more than this factor belongs to something else.
 _DAMPING_SPAN = 6.0
 _HEAVY = 0.1  # and above this, a hump that nobody expected is no mode
+# A shape begins by the sign it has within so many damping ratios of the resonance.
+_NEAR = 1.5
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class View:
-    """All segments of one channel in the frequency domain.
+    """A log in the frequency domain.
 
     Attributes
     ----------
-    channel, source : str
-        Name, and ``acc`` or ``delta_e``.
-    spectra : tuple of Spectrum
-        One per segment.
+    channels, sources : tuple of str
+        Names, and ``acc`` or ``delta_e``.
+    spectra : tuple of CrossSpectrum
+        Of its segments, or means over several.
     """
 
+    channels: tuple[str, ...]
+    sources: tuple[str, ...]
+    spectra: tuple[CrossSpectrum, ...]
+
+    @property
+    def source(self) -> str:
+        """The source of all channels, or ``joint``."""
+        return self.sources[0] if len(set(self.sources)) == 1 else "joint"
+
+    def single(self, index: int) -> tuple[Spectrum, ...]:
+        """Give the spectra of one channel."""
+        return tuple(spectrum.channel(index) for spectrum in self.spectra)
+
+    def only(self, index: Sequence[int]) -> View:
+        """Keep some channels."""
+        pick = np.ix_(index, index)
+        return View(
+            tuple(self.channels[c] for c in index),
+            tuple(self.sources[c] for c in index),
+            tuple(replace(s, matrix=s.matrix[(slice(None), *pick)]) for s in self.spectra),
+        )
+
+    def band(self, low: float, high: float) -> View:
+        """Cut out a band in Hz."""
+        cut = (spectrum.band(low, high) for spectrum in self.spectra)
+        return replace(self, spectra=tuple(s for s in cut if s.frequency.size))
+
+
+@dataclass(frozen=True, slots=True)
+class Sighting:
+    """A line in a channel: frequency in Hz, amplitude in m/s²."""
+
     channel: str
-    source: str
-    spectra: tuple[Spectrum, ...]
+    frequency: float
+    amplitude: float
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BandFit:
-    """Modes of a cluster that one channel sees.
+    """Modes of a cluster.
 
     Attributes
     ----------
     view : View
-        The channel.
+        The band, and the channels that see any of them.
     targets : tuple of Target
-        The modes it sees, at their start values.
+        The modes, at their start values.
     estimate : ndarray
         ``[ln f, ln ζ]``, shape ``(2 n_modes,)``.
     cov : ndarray
-        Their covariance, amplitudes and noise marginalised, shape ``(2 n_modes, 2 n_modes)``.
+        Their covariance, forces, shapes and noise marginalised, ``(2 n_modes, 2 n_modes)``.
     snr : ndarray
-        Modal signal-to-noise ratio, shape ``(n_modes,)``.
+        Modal signal-to-noise ratio of all channels together, shape ``(n_modes,)``.
+    best : tuple of str
+        The channel that sees each mode most clearly.
     clarity : ndarray
-        Log likelihood of the binned spectrum that each mode gains at its start value. Choosing
-        between channels by it, and not by the smallest standard deviation, does not favour
-        those that happen to show a low damping. Shape ``(n_modes,)``.
-    lines : ndarray
-        Frequency in Hz and amplitude in m/s² of the lines kept out, shape ``(n_lines, 2)``.
+        Log likelihood of the binned spectra that each mode gains at its start, ``(n_modes,)``.
+    lines : tuple of Sighting
+        Lines that were kept out.
     residual : Spectrum
-        Periodogram of the longest segment over what the fit expects: exponential about one
-        where the fit is right, and one where a line was masked.
+        Mean over the channels of what the ordinates that saw most are over what the fit expects:
+        scattered about one where the fit is right, and one where a line was masked.
     """
 
     view: View
@@ -78,19 +114,10 @@ class BandFit:
     estimate: FloatArray
     cov: FloatArray
     snr: FloatArray
+    best: tuple[str, ...]
     clarity: FloatArray
-    lines: FloatArray
+    lines: tuple[Sighting, ...]
     residual: Spectrum
-
-    def settled(self) -> tuple[Target, ...]:
-        """Its modes as another channel may take them for granted."""
-        m = len(self.targets)
-        std = np.sqrt(np.diag(self.cov)).tolist()
-        f, zeta = np.exp(self.estimate[:m]).tolist(), np.exp(self.estimate[m:]).tolist()
-        return tuple(
-            replace(t, frequency=f[i], damping_ratio=zeta[i], settled=(std[i], std[m + i]))
-            for i, t in enumerate(self.targets)
-        )
 
     def only(self, names: list[str]) -> BandFit:
         """Keep only the named modes; the others stay marginalised in the covariance."""
@@ -103,8 +130,34 @@ class BandFit:
             estimate=self.estimate[both],
             cov=self.cov[np.ix_(both, both)],
             snr=self.snr[index],
+            best=tuple(self.best[i] for i in index),
             clarity=self.clarity[index],
         )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Band:
+    """What a cluster is fitted to.
+
+    Attributes
+    ----------
+    view : View
+        The band, of the channels that see any of the modes, each in units of its noise.
+    unit : ndarray
+        Root of the noise in (m/s²)/Hz^½, shape ``(n_channels,)``.
+    coarse : tuple of Coarse
+        Their binned spectra in the same units.
+    masks : list of ndarray of bool
+        Ordinates of each spectrum that hold no line.
+    width : float
+        Smallest half-power bandwidth expected, in Hz.
+    """
+
+    view: View
+    unit: FloatArray
+    coarse: tuple[Coarse, ...]
+    masks: list[BoolArray]
+    width: float
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -114,152 +167,233 @@ class _Solution:
     misfit: float
 
 
+Missing = dict[str, tuple[str, str]]
+
+
 def fit_band(
-    view: View, coarse: Coarse, targets: tuple[Target, ...]
-) -> tuple[BandFit | None, dict[str, tuple[str, str]]]:
-    """Fit the modes of a cluster that a channel sees.
+    view: View, coarse: tuple[Coarse, ...], targets: tuple[Target, ...]
+) -> tuple[BandFit | None, Missing]:
+    """Fit the modes of a cluster to all channels that see any of them.
 
     Parameters
     ----------
     view : View
-        The channel.
-    coarse : Coarse
-        Its binned spectrum around the cluster, with its neighbours.
+        All channels.
+    coarse : tuple of Coarse
+        The binned spectrum of each around the cluster, with its neighbours.
     targets : tuple of Target
         The modes, placed where they are expected in this log.
 
     Returns
     -------
     fit : BandFit or None
-        None when the channel sees none of them; without modes where it sees lines only.
+        None when none of them is seen; without modes where there are lines only.
     missing : dict
         Reason and detail of each mode that is not in the fit, by name.
     """
-    missing: dict[str, tuple[str, str]] = {}
     seen, gains = _screen(coarse, targets)
-    for target in set(targets) - set(seen):
-        missing[target.name] = _absent(view, target, gains[target.name])
+    kept = {target.name for target in seen}
+    missing = {t.name: _absent(t, gains[t.name]) for t in targets if t.name not in kept}
     if not seen:
         return None, missing
-    spectra = _cut(view.spectra, seen)
-    masks = [np.ones(s.frequency.size, dtype=bool) for s in spectra]
-    if sum(mask.sum() for mask in masks) < 10 + 6 * len(seen):
-        n = sum(int(mask.sum()) for mask in masks)
-        detail = f"{n} Fourier frequencies in the band, needed {10 + 6 * len(seen)}: record longer"
+    low = min(t.band(BAND)[0] for t in seen)
+    high = max(t.band(BAND)[1] for t in seen)
+    cut = view.band(low, high)
+    n, needed = sum(s.frequency.size for s in cut.spectra), 10 + 6 * len(seen)
+    if n < needed:
+        detail = f"{n} Fourier frequencies in the band, needed {needed}: record longer"
         return None, missing | {t.name: ("too-short", detail) for t in seen}
-    _mask_towers(spectra, masks, coarse)
-    width = min(2 * t.frequency * t.damping_ratio for t in seen)
-    rounds = 0
-    while True:
-        blocks = tuple(make_block(s, mask, width) for s, mask in zip(spectra, masks, strict=True))
-        solution, seen = _fit_and_prune(view, coarse, blocks, seen, gains, missing)
-        if solution is None:
+    band = _prepare(cut, coarse, seen)
+    _mask_towers(band)
+    for _ in range(_MOST_LINE_ROUNDS):
+        solution, seen = _fit_and_prune(band, seen, gains, missing)
+        if not seen:
             return None, missing
-        rounds += 1
-        if rounds == _MOST_LINE_ROUNDS or not _mask_lines(spectra, masks, solution):
+        expected = _expected(band, solution)
+        if not _mask_lines(band, expected):
             break
-    fit = _conclude(view, seen, solution, missing)
+    fit = _conclude(band, seen, solution, missing)
     if fit is None:
         return None, missing
     clarity = np.array([gains[target.name] for target in seen])
-    residual = _residual(spectra, masks, solution)
-    fit = replace(fit, clarity=clarity, lines=_lines(spectra, masks), residual=residual)
-    return _keep_credible(fit, missing), missing
+    fit = replace(fit, clarity=clarity, lines=_lines(band), residual=_residual(band, expected))
+    return _keep_credible(fit, band.unit, missing), missing
 
 
-def _absent(view: View, target: Target, gain: float) -> tuple[str, str]:
+def _absent(target: Target, gain: float) -> tuple[str, str]:
     return (
         "not-excited",
-        f"no resonance near {target.frequency:.4g} Hz in {view.channel}: it would improve the log "
+        f"no resonance near {target.frequency:.4g} Hz in any channel: it would improve the log "
         f"likelihood by {max(gain, 0):.1f}; excite it more or record longer",
     )
 
 
+def _misfit(coarse: Sequence[Coarse], targets: tuple[Target, ...]) -> float:
+    return sum(channel.misfit(targets) for channel in coarse)
+
+
 def _screen(
-    coarse: Coarse, targets: tuple[Target, ...]
+    coarse: tuple[Coarse, ...], targets: tuple[Target, ...]
 ) -> tuple[tuple[Target, ...], dict[str, float]]:
-    """Drop modes without which the binned spectrum is described as well; refine start dampings."""
+    """Drop modes without which the binned spectra are described as well; refine start dampings."""
     scaled = min(
-        (tuple(_damped(target, c) for target in targets) for c in (0.5, 1.0, 2.0)),
-        key=coarse.misfit,
+        (
+            tuple(replace(t, damping_ratio=t.damping_ratio * c) for t in targets)
+            for c in (0.5, 1.0, 2.0)
+        ),
+        key=lambda candidates: _misfit(coarse, candidates),
     )
     kept = scaled
     gains: dict[str, float] = {}
     while kept:
-        full = coarse.misfit(kept)
-        losses = [coarse.misfit(kept[:i] + kept[i + 1 :]) - full for i in range(len(kept))]
+        full = _misfit(coarse, kept)
+        losses = [_misfit(coarse, kept[:i] + kept[i + 1 :]) - full for i in range(len(kept))]
         gains |= {t.name: loss for t, loss in zip(kept, losses, strict=True)}
-        open_losses = [np.inf if t.settled else x for t, x in zip(kept, losses, strict=True)]
-        worst = int(np.argmin(open_losses))
-        if open_losses[worst] >= _ABSENT:
+        worst = int(np.argmin(losses))
+        if losses[worst] >= _ABSENT:
             break
         kept = kept[:worst] + kept[worst + 1 :]
     return kept, gains
 
 
-def _damped(target: Target, factor: float) -> Target:
-    if target.settled is not None:
-        return target
-    return replace(target, damping_ratio=target.damping_ratio * factor)
+def _prepare(view: View, coarse: tuple[Coarse, ...], seen: tuple[Target, ...]) -> _Band:
+    """Choose the channels that see any of the modes, and put each in units of its noise."""
+    gains = [channel.misfit(()) - channel.misfit(seen) for channel in coarse]
+    index = [c for c, gain in enumerate(gains) if gain >= _ABSENT] or [int(np.argmax(gains))]
+    used = [coarse[c] for c in index]
+    noise = np.array([max(c.strengths(seen)[1], 1e-2 * c.level.min()) for c in used])
+    unit = np.sqrt(noise)
+    chosen = view.only(index)
+    spectra = tuple(replace(s, matrix=s.matrix / np.outer(unit, unit)) for s in chosen.spectra)
+    return _Band(
+        replace(chosen, spectra=spectra),
+        unit,
+        tuple(replace(c, level=c.level / n) for c, n in zip(used, noise, strict=True)),
+        [np.ones(s.frequency.size, dtype=bool) for s in spectra],
+        min(2 * t.frequency * t.damping_ratio for t in seen),
+    )
 
 
-def _cut(spectra: tuple[Spectrum, ...], targets: tuple[Target, ...]) -> tuple[Spectrum, ...]:
-    low = min(t.band(BAND)[0] for t in targets)
-    high = max(t.band(BAND)[1] for t in targets)
-    return tuple(spectrum.band(low, high) for spectrum in spectra)
+def _alike(spectra: Sequence[CrossSpectrum]) -> list[list[int]]:
+    """Group the indices of spectra that have the same frequencies."""
+    groups: dict[tuple[float, int], list[int]] = {}
+    for i, spectrum in enumerate(spectra):
+        groups.setdefault((spectrum.duration, spectrum.frequency.size), []).append(i)
+    return list(groups.values())
 
 
 def _fit_and_prune(
-    view: View,
-    coarse: Coarse,
-    blocks: tuple[Block, ...],
-    seen: tuple[Target, ...],
-    gains: dict[str, float],
-    missing: dict[str, tuple[str, str]],
-) -> tuple[_Solution | None, tuple[Target, ...]]:
+    band: _Band, seen: tuple[Target, ...], gains: dict[str, float], missing: Missing
+) -> tuple[_Solution, tuple[Target, ...]]:
     """Fit all modes seen; leave out, one by one, those that the evidence does not ask for."""
-    n_ordinates = sum(block.periodogram.size for block in blocks)
-    solution = _solve(coarse, blocks, seen)
-    while seen:
-        doubtful = [
-            i for i, t in enumerate(seen) if gains[t.name] < _BEYOND_DOUBT and t.settled is None
-        ]
-        evidence: dict[int, tuple[float, _Solution | None]] = {}
-        for i in doubtful:
-            rest = seen[:i] + seen[i + 1 :]
-            without = _solve(coarse, blocks, rest)
-            extra = solution.p.size - without.p.size
-            gain = 2 * (without.misfit - solution.misfit)
-            evidence[i] = (gain - extra * np.log(n_ordinates) - _EVIDENCE_MARGIN, without)
-        refuted = {i: e for i, e in evidence.items() if e[0] < 0}
-        if not refuted:
-            return solution, seen
-        worst = min(refuted, key=lambda i: refuted[i][0])
-        missing[seen[worst].name] = _absent(view, seen[worst], gains[seen[worst].name])
-        seen = seen[:worst] + seen[worst + 1 :]
-        solution = refuted[worst][1] or solution
-    return None, ()
-
-
-def _solve(coarse: Coarse, blocks: tuple[Block, ...], targets: tuple[Target, ...]) -> _Solution:
-    """Find the posterior mode for a set of modes by a trust-region Newton method."""
-    f = np.array([target.frequency for target in targets])
-    zeta = np.array([target.damping_ratio for target in targets])
-    strength, noise = coarse.strengths(targets)
-    m = len(targets)
-    # A strength of zero would leave the mode without a gradient.
-    floor = 0.01 * coarse.level.min() * 4 * zeta**2
-    noise = max(noise, 1e-2 * coarse.level.min())
-    start = np.concatenate(
-        [np.log(f), np.log(zeta), np.ones(m), np.zeros(max(m - 1, 0)), [np.log(noise), 0.0]]
+    n_ordinates = sum(
+        s.count * int(mask.sum()) for s, mask in zip(band.view.spectra, band.masks, strict=True)
     )
-    low = min(block.frequency[0] for block in blocks)
-    high = max(block.frequency[-1] for block in blocks)
+
+    def evidence(full: _Solution, less: _Solution) -> float:
+        """Twice the log evidence (BIC) for what one solution has and the other has not."""
+        extra = full.p.size - less.p.size
+        return float(2 * (less.misfit - full.misfit) - extra * np.log(n_ordinates))
+
+    blocks = _blocks(band, merge=True)
+    solution = _solve(band, blocks, seen)
+    common = _common(solution)
+    richer = _solve(band, blocks, seen, common)
+    solution = richer
+    while seen:
+        doubtful = [i for i, t in enumerate(seen) if gains[t.name] < _BEYOND_DOUBT]
+        without = {i: _solve(band, blocks, seen[:i] + seen[i + 1 :], common) for i in doubtful}
+        for_mode = {i: evidence(solution, w) - _EVIDENCE_MARGIN for i, w in without.items()}
+        worst = min(for_mode, key=lambda i: for_mode[i], default=None)
+        if worst is None or for_mode[worst] >= 0:
+            break
+        missing[seen[worst].name] = _absent(seen[worst], gains[seen[worst].name])
+        seen, solution = seen[:worst] + seen[worst + 1 :], without[worst]
+    return solution, seen
+
+
+def _common(solution: _Solution) -> FloatArray:
+    """Find what the channels have in common beside the modes, as loadings of their noise.
+
+    The first principal component of the correlations that a fit with independent noise leaves.
+    """
+    likelihood = solution.likelihood
+    n_channels = likelihood.layout.n_channels
+    total, count = np.zeros((n_channels, n_channels)), 0.0
+    for block, expected in zip(likelihood.blocks, likelihood.expected(solution.p), strict=True):
+        root = np.linalg.inv(np.linalg.cholesky(expected))
+        white = root @ block.matrix @ np.conj(np.swapaxes(root, -1, -2))
+        total += np.tensordot(block.count, white.real, axes=1)
+        count += float(block.count.sum())
+    power, vectors = np.linalg.eigh(total / count)
+    share = np.clip((power[-1] - 1) / power[-1], 0.05, 0.95)
+    return np.asarray(vectors[:, -1] * np.sqrt(share))
+
+
+def _blocks(band: _Band, *, merge: bool) -> tuple[Block, ...]:
+    spectra = band.view.spectra
+    return tuple(
+        make_block(
+            [spectra[i] for i in group],
+            [band.masks[i] for i in group],
+            band.width,
+            merge=merge,
+        )
+        for group in _alike(spectra)
+    )
+
+
+def _solve(
+    band: _Band,
+    blocks: tuple[Block, ...],
+    targets: tuple[Target, ...],
+    common: FloatArray | None = None,
+) -> _Solution:
+    """Find the posterior mode for a set of modes by a trust-region Newton method.
+
+    ``common`` holds the loadings of a background, shape ``(n_channels,)``, where there is one.
+    """
+    zeta = np.array([target.damping_ratio for target in targets])
+    # A strength of zero would leave a mode without a gradient.
+    amplitude = np.sqrt(
+        [
+            np.maximum(c.strengths(targets)[0], 0.01 * c.level.min() * 4 * zeta**2)
+            for c in band.coarse
+        ]
+    )
+    signed = amplitude.copy()
+    for i, target in enumerate(targets):
+        best = int(amplitude[:, i].argmax())
+        signed[:, i] *= [_sign(blocks, target, c, best) for c in range(len(band.coarse))]
+    noise = np.zeros(len(band.coarse))
+    slopes: list[float] = []
+    if common is not None:
+        signed = np.column_stack([signed, common])
+        slopes, noise = [0.0], np.log(1 - common**2)
+    reference = np.abs(signed).argmax(axis=0)
+    unit = signed[reference, np.arange(reference.size)]
+    scale = np.abs(unit)
+    first = np.ones(scale.size)
+    if common is not None:
+        scale[-1], first[-1] = 1.0, abs(unit[-1])
+    layout = lay_out(len(targets), tuple(reference.tolist()), len(band.coarse))
+    start = np.concatenate(
+        [
+            np.log([target.frequency for target in targets]),
+            np.log(zeta),
+            slopes,
+            [first[i] * (i == j) for i, j, _ in layout.force],
+            [signed[c, i] / unit[i] for c, i in layout.shape],
+            np.column_stack([noise, np.zeros_like(noise)]).ravel(),
+        ]
+    )
+    low = min(float(block.frequency[0]) for block in blocks)
+    high = max(float(block.frequency[-1]) for block in blocks)
     likelihood = Likelihood(
         blocks=blocks,
+        layout=layout,
         start=start,
-        belief=np.array([t.settled or WEAK for t in targets]).reshape(m, 2).T.ravel(),
-        scale=np.sqrt(np.maximum(strength, floor)),
+        scale=scale,
         centre=float(np.sqrt(low * high)),
         spread=float(np.log(high / low) / 2),
     )
@@ -267,7 +401,17 @@ def _solve(coarse: Coarse, blocks: tuple[Block, ...], targets: tuple[Target, ...
     return _Solution(likelihood, p, likelihood.data_value(p))
 
 
-def _mask_towers(spectra: tuple[Spectrum, ...], masks: list[BoolArray], coarse: Coarse) -> None:
+def _sign(blocks: tuple[Block, ...], target: Target, channel: int, reference: int) -> float:
+    """Tell whether two channels move alike where a mode stands."""
+    low, high = target.band(_NEAR)
+    alike = 0.0
+    for block in blocks:
+        near = (block.frequency >= low) & (block.frequency <= high)
+        alike += float(block.count[near] @ block.matrix[near, channel, reference].real)
+    return 1.0 if alike >= 0 else -1.0
+
+
+def _mask_towers(band: _Band) -> None:
     """Mask lines that tower over the medians around them, before a mode can settle on one.
 
     A mode that takes a strong line for its resonance leaves its own to its neighbour, which then
@@ -275,46 +419,61 @@ def _mask_towers(spectra: tuple[Spectrum, ...], masks: list[BoolArray], coarse: 
     mode whose damping is below about 1/15 of its nominal one stands as narrow as a line, and may
     lose its own peak.
     """
-    n_ordinates = sum(int(mask.sum()) for mask in masks)
-    threshold = 2 * np.log(n_ordinates / _LINE_FALSE_ALARM)
-    kept = [mask.copy() for mask in masks]
-    for spectrum, keep in zip(spectra, kept, strict=True):
-        level = np.interp(spectrum.frequency, coarse.frequency, coarse.level)
-        towers = np.flatnonzero(spectrum.periodogram > threshold * level)
-        for k in towers.tolist():
+    levels = [
+        np.stack([np.interp(s.frequency, c.frequency, c.level) for c in band.coarse], axis=-1)
+        for s in band.view.spectra
+    ]
+    _mask_above(band, [2 * level for level in levels])
+
+
+def _mask_lines(band: _Band, expected: list[ComplexArray]) -> bool:
+    """Mask ordinates that noise would not reach; tell whether there were new ones."""
+    return _mask_above(band, [np.diagonal(e, axis1=1, axis2=2).real for e in expected])
+
+
+def _mask_above(band: _Band, levels: list[FloatArray]) -> bool:
+    """Mask lines with their feet, wherever a channel shows one; tell whether there were any.
+
+    ``levels`` holds what noise would have in the mean, shape ``(n_ordinates, n_channels)`` each.
+    """
+    n_tests = len(band.coarse) * sum(int(mask.sum()) for mask in band.masks)
+    kept = [mask.copy() for mask in band.masks]
+    found = False
+    for spectrum, keep, level in zip(band.view.spectra, kept, levels, strict=True):
+        highest = gamma.isf(_LINE_FALSE_ALARM / n_tests, spectrum.count) / spectrum.count
+        ordinates = np.diagonal(spectrum.matrix, axis1=1, axis2=2).real
+        lines = keep & (ordinates > highest * level).any(axis=1)
+        found = found or bool(lines.any())
+        for k in np.flatnonzero(lines).tolist():
             keep[max(0, k - _LINE_BINS) : k + _LINE_BINS + 1] = False
-    # Towers everywhere are no lines, as in `_mask_lines`.
-    if sum(int(keep.sum()) for keep in kept) < n_ordinates // 2:
-        return
-    for mask, keep in zip(masks, kept, strict=True):
-        mask &= keep
-
-
-def _mask_lines(spectra: tuple[Spectrum, ...], masks: list[BoolArray], solution: _Solution) -> bool:
-    """Mask ordinates that no exponential variable would reach; tell whether there were new ones."""
-    n_ordinates = sum(int(mask.sum()) for mask in masks)
-    threshold = np.log(n_ordinates / _LINE_FALSE_ALARM)
-    new = False
-    for spectrum, mask, expected in zip(
-        spectra, masks, solution.likelihood.expected(solution.p), strict=True
-    ):
-        index = np.flatnonzero(mask)
-        for k in index[spectrum.periodogram[index] > threshold * expected].tolist():
-            mask[max(0, k - _LINE_BINS) : k + _LINE_BINS + 1] = False
-            new = True
     # A band that is mostly lines is no band of modes: keep at least half of it.
-    return new and sum(int(mask.sum()) for mask in masks) >= n_ordinates // 2
+    if sum(int(keep.sum()) for keep in kept) < sum(int(mask.sum()) for mask in band.masks) // 2:
+        return False
+    band.masks[:] = kept
+    return found
+
+
+def _expected(band: _Band, solution: _Solution) -> list[ComplexArray]:
+    """Give what each spectrum is expected to be over its band; infinite where it is masked."""
+    likelihood = replace(solution.likelihood, blocks=_blocks(band, merge=False))
+    n_channels = len(band.coarse)
+    nothing = np.diag(np.full(n_channels, np.inf)).astype(complex)
+    full = [np.tile(nothing, (mask.size, 1, 1)) for mask in band.masks]
+    for group, values in zip(
+        _alike(band.view.spectra), likelihood.expected(solution.p), strict=True
+    ):
+        kept = np.any([band.masks[i] for i in group], axis=0)
+        for i in group:
+            full[i][kept] = values
+    return full
 
 
 def _conclude(
-    view: View,
-    seen: tuple[Target, ...],
-    solution: _Solution,
-    missing: dict[str, tuple[str, str]],
+    band: _Band, seen: tuple[Target, ...], solution: _Solution, missing: Missing
 ) -> BandFit | None:
     """Turn the posterior mode into estimates with the inverse Hessian as covariance."""
-    m = len(seen)
-    gradient, hessian = solution.likelihood.derivatives(solution.p)
+    m, p, likelihood = len(seen), solution.p, solution.likelihood
+    gradient, hessian = likelihood.derivatives(p)
     try:
         factor = np.linalg.cholesky(hessian)
         decrement = float(np.sum(np.linalg.solve(factor, gradient) ** 2))
@@ -322,56 +481,66 @@ def _conclude(
     except np.linalg.LinAlgError:
         decrement, cov = np.inf, np.full((2 * m, 2 * m), np.nan)
     if not decrement < 1e-2:
-        detail = f"the fit in {view.channel} did not reach a maximum (decrement {decrement:.2g})"
+        detail = f"the fit did not reach a maximum (decrement {decrement:.2g}); record longer"
         missing.update({t.name: ("not-identified", detail) for t in seen})
         return None
-    p = solution.p
-    zeta = np.exp(p[m : 2 * m])
-    noise = np.exp(
-        p[-2] + p[-1] * (p[:m] - np.log(solution.likelihood.centre)) / (solution.likelihood.spread)
-    )
-    strength = (solution.likelihood.scale * p[2 * m : 3 * m]) ** 2
-    strength[1:] += (solution.likelihood.scale[1:] * p[3 * m : 4 * m - 1]) ** 2
+    ratio = likelihood.signal_to_noise(p)
+    names = band.view.channels
     return BandFit(
-        view=view,
+        view=band.view,
         targets=seen,
         estimate=p[: 2 * m],
         cov=cov,
-        snr=strength / (4 * zeta**2 * noise),
+        snr=ratio.sum(axis=0),
+        best=tuple(names[c] for c in ratio.argmax(axis=0)),
         clarity=np.full(m, np.nan),
-        lines=np.empty((0, 2)),
-        residual=view.spectra[0],
+        lines=(),
+        residual=band.view.spectra[0].channel(0),
     )
 
 
-def _residual(
-    spectra: tuple[Spectrum, ...], masks: list[BoolArray], solution: _Solution
-) -> Spectrum:
-    longest = int(np.argmax([s.duration for s in spectra]))
-    ratio = np.ones(spectra[longest].frequency.size)
-    expected = solution.likelihood.expected(solution.p)[longest]
-    ratio[masks[longest]] = spectra[longest].periodogram[masks[longest]] / expected
-    return replace(spectra[longest], periodogram=ratio)
+def _residual(band: _Band, expected: list[ComplexArray]) -> Spectrum:
+    """Compare the ordinates that saw most with what is expected: tr E⁻¹ W over the channels."""
+    most = _most(band.view.spectra)
+    spectrum, mask = band.view.spectra[most], band.masks[most]
+    n_channels = len(band.coarse)
+    ratio = np.ones(mask.size)
+    white = np.linalg.solve(expected[most][mask], spectrum.matrix[mask])
+    ratio[mask] = np.trace(white, axis1=1, axis2=2).real / n_channels
+    return replace(spectrum.channel(0), periodogram=ratio, count=spectrum.count * n_channels)
 
 
-def _lines(spectra: tuple[Spectrum, ...], masks: list[BoolArray]) -> FloatArray:
-    """Frequency and amplitude of what was masked in the longest segment, shape ``(n, 2)``."""
-    longest = int(np.argmax([s.duration for s in spectra]))
-    spectrum, mask = spectra[longest], masks[longest]
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], (~mask).astype(int), [0]])))
-    rows = [spectrum.sine(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True)]
-    return np.array(rows).reshape(-1, 2)
+def _most(spectra: Sequence[CrossSpectrum]) -> int:
+    """Index of the spectrum that saw most."""
+    return int(np.argmax([s.observed for s in spectra]))
 
 
-def _keep_credible(fit: BandFit, missing: dict[str, tuple[str, str]]) -> BandFit:
+def _lines(band: _Band) -> tuple[Sighting, ...]:
+    """Tell what was masked where most was seen, in the channels that show it best."""
+    most = _most(band.view.spectra)
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], (~band.masks[most]).astype(int), [0]])))
+    return tuple(
+        _sighting(band.view, band.unit, int(a), int(b))
+        for a, b in zip(edges[::2], edges[1::2], strict=True)
+    )
+
+
+def _sighting(view: View, unit: FloatArray, first: int, last: int) -> Sighting:
+    """Read a line within some ordinates, from the channel in which it stands out most."""
+    spectrum = view.spectra[_most(view.spectra)]
+    power = np.diagonal(spectrum.matrix[first:last], axis1=1, axis2=2).real.sum(axis=0)
+    c = int(np.argmax(power))
+    frequency, amplitude = spectrum.channel(c).sine(first, last)
+    return Sighting(view.channels[c], frequency, amplitude * float(unit[c]))
+
+
+def _keep_credible(fit: BandFit, unit: FloatArray, missing: Missing) -> BandFit:
     """Refuse modes whose estimate cannot be what it claims to be; what is a line becomes one."""
     m = len(fit.targets)
     f = np.exp(fit.estimate[:m])
-    spectrum = max(fit.view.spectra, key=lambda s: s.duration)
-    keep, lines = [], [fit.lines]
+    spectrum = fit.view.spectra[_most(fit.view.spectra)]
+    keep, lines = [], [*fit.lines]
     for i, target in enumerate(fit.targets):
-        if target.settled is not None:
-            continue
         why = _incredible(fit, i, spectrum.duration)
         if why is None:
             keep.append(target.name)
@@ -379,15 +548,14 @@ def _keep_credible(fit: BandFit, missing: dict[str, tuple[str, str]]) -> BandFit
         missing[target.name] = why
         if why[0] == "line-not-mode":
             k = int(np.searchsorted(spectrum.frequency, f[i]))
-            row = spectrum.sine(max(0, k - _LINE_BINS), k + _LINE_BINS + 1)
-            lines.append(np.array([row]))
-    return replace(fit.only(keep), lines=np.concatenate(lines))
+            lines.append(_sighting(fit.view, unit, max(0, k - _LINE_BINS), k + _LINE_BINS + 1))
+    return replace(fit.only(keep), lines=tuple(lines))
 
 
 def _incredible(fit: BandFit, i: int, duration: float) -> tuple[str, str] | None:
     """Say why a mode's estimate is not believed; None when it is."""
     m = len(fit.targets)
-    target, channel = fit.targets[i], fit.view.channel
+    target, channel = fit.targets[i], fit.best[i]
     f, zeta = float(np.exp(fit.estimate[i])), float(np.exp(fit.estimate[m + i]))
     std_f, std_zeta = np.sqrt(np.diag(fit.cov))[[i, m + i]].tolist()
     low = target.damping_ratio / _DAMPING_SPAN

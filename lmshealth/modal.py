@@ -1,7 +1,7 @@
-"""Identification of modes: the Whittle likelihood fitted cluster by cluster, channel by channel.
+"""Identification of modes: the Whittle likelihood of all channels, fitted cluster by cluster.
 
-A mode's estimate comes from the one channel that shows it most clearly: channels of one log
-share the excitation, so that their errors are not independent and may not be averaged as if.
+Channels of one log share the excitation, so that their errors are not independent: they come from
+one likelihood and are not averaged as if they were.
 """
 
 from __future__ import annotations
@@ -13,14 +13,14 @@ from itertools import combinations
 import numpy as np
 from scipy.special import softmax
 
-from lmshealth.bandfit import BAND, BandFit, View, fit_band
+from lmshealth.bandfit import BAND, BandFit, Missing, View, fit_band
 from lmshealth.errors import BadLog, BadStage
 from lmshealth.lines import find_lines, name_lines
 from lmshealth.logs import Channel, Log, Refusal
 from lmshealth.peaks import find_excess, find_peaks
 from lmshealth.results import Line, Modes
 from lmshealth.segments import find_segments
-from lmshealth.spectra import periodogram
+from lmshealth.spectra import cross_spectra
 from lmshealth.stage import Stage
 from lmshealth.starts import Coarse, Target, coarsen, locate, shift_cost
 
@@ -32,6 +32,7 @@ _CLEAR_NAME = 0.8
 _MOST_ROUNDS = 3
 # Shortest useful segment: half-power bandwidth times duration.
 _LEAST_RESOLUTION = 2.0
+_BEYOND = 4.0  # times the top of the band: more than any found mode's flanks reach
 _TOP = 0.45  # of the sample rate: anti-alias filters reach below Nyquist
 
 
@@ -70,28 +71,29 @@ def identify(
     seen: list[tuple[str, float, float]] = []
     if stage is not None:
         targets = _stage_targets(stage, band)
-        views = _transform(log, used, targets, band)
+        view = _transform(log, used, targets, band)
     else:
-        views = _transform(log, used, (), band)
-        targets, seen = _search(log, used, views, band)
-    best: list[BandFit] = []
+        view = _transform(log, used, (), band)
+        targets, seen = _search(log, used, view, band)
+    fits: list[BandFit] = []
     refused: list[Refusal] = []
     for cluster in _clusters(targets):
-        found = _fit_cluster(log, views, cluster, targets, known=stage is not None)
+        found = _fit_cluster(log, view, cluster, targets, known=stage is not None)
         for _ in range(_MOST_ROUNDS if stage is None else 0):
-            more = _unexplained(found.fits, cluster)
+            more = cluster if found.fit is None else _unexplained(found.fit, cluster)
             if len(more) == len(cluster):
                 break
             cluster = more
-            found = _fit_cluster(log, views, cluster, targets, known=False)
-        seen += [(fit.view.channel, *line) for fit in found.fits for line in fit.lines.tolist()]
-        best += found.best
+            found = _fit_cluster(log, view, cluster, targets, known=False)
+        if found.fit is not None:
+            seen += [(s.channel, s.frequency, s.amplitude) for s in found.fit.lines]
+            fits.append(found.fit)
         refused += found.refused
-    resolution = 1.5 / max(s.duration for view in views for s in view.spectra)
+    resolution = 1.5 / max(s.duration for s in view.spectra)
     lines = name_lines(seen, log, stage, resolution)
     if stage is not None:
-        return _collect(best, lines, (*log.refused, *refused))
-    return _renumber(_collect(_distinct(best), lines, log.refused))
+        return _collect(fits, lines, (*log.refused, *refused))
+    return _renumber(_collect(_distinct(fits), lines, log.refused))
 
 
 def _choose_channels(log: Log, names: Sequence[str] | None) -> tuple[Channel, ...]:
@@ -128,8 +130,8 @@ def _transform(
     channels: tuple[Channel, ...],
     targets: tuple[Target, ...],
     band: tuple[float, float] | None,
-) -> tuple[View, ...]:
-    """Transform every channel, up to the top of what is looked for."""
+) -> View:
+    """Transform every channel, as far up as anything is looked for."""
     top = max((target.band(BAND)[1] for target in targets), default=0.0)
     if top > log.sample_rate / 2:
         raise BadLog(
@@ -151,24 +153,23 @@ def _transform(
         )
     widest = max((target.search for target in targets), default=0.0)
     reach = (1 + widest) * top if targets else (band or (0.0, np.inf))[1]
-    return tuple(
-        View(
-            channel.name,
-            "delta_e" if channel.kind == "displacement" else "acc",
-            tuple(periodogram(channel, segment, log.sample_rate, reach) for segment in segments),
-        )
-        for channel in channels
+    # What is found without a description is fitted beyond the band as well.
+    ceiling = reach if targets else _BEYOND * reach
+    return View(
+        tuple(channel.name for channel in channels),
+        tuple("delta_e" if c.kind == "displacement" else "acc" for c in channels),
+        cross_spectra(channels, segments, log.sample_rate, reach, ceiling=ceiling),
     )
 
 
 def _search(
     log: Log,
     channels: tuple[Channel, ...],
-    views: tuple[View, ...],
+    view: View,
     band: tuple[float, float] | None,
 ) -> tuple[tuple[Target, ...], list[tuple[str, float, float]]]:
     """Find candidate modes, and lines in the longest segment, in the band."""
-    longest = max(s.duration for view in views for s in view.spectra)
+    longest = max(s.duration for s in view.spectra)
     low, high = band or (20 / longest, _TOP * log.sample_rate)
     low, high = max(low, 2 / longest), min(high, _TOP * log.sample_rate)
     held = max(0.0, (high - low) * longest)
@@ -185,7 +186,8 @@ def _search(
         for channel in channels
         for line in find_lines(channel, segment, log.sample_rate, (low, high)).tolist()
     ]
-    return find_peaks(tuple(view.spectra for view in views), low, high), lines
+    spectra = tuple(view.single(c) for c in range(len(channels)))
+    return find_peaks(spectra, low, high), lines
 
 
 def _clusters(targets: tuple[Target, ...]) -> list[tuple[Target, ...]]:
@@ -202,20 +204,19 @@ def _clusters(targets: tuple[Target, ...]) -> list[tuple[Target, ...]]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _ClusterResult:
-    fits: list[BandFit]  # of every channel
-    best: list[BandFit]  # each mode once
+    fit: BandFit | None
     refused: list[Refusal]
 
 
 def _fit_cluster(
     log: Log,
-    views: tuple[View, ...],
+    view: View,
     cluster: tuple[Target, ...],
     targets: tuple[Target, ...],
     *,
     known: bool,
 ) -> _ClusterResult:
-    """Fit a cluster in every channel and keep each mode from the channel that knows it best."""
+    """Fit a cluster to all channels together."""
     reach = [target.search if known else 0.0 for target in cluster]
     low = min(t.band(BAND)[0] * (1 - r) for t, r in zip(cluster, reach, strict=True))
     high = max(t.band(BAND)[1] * (1 + r) for t, r in zip(cluster, reach, strict=True))
@@ -223,50 +224,34 @@ def _fit_cluster(
     high = min(high, 0.49 * log.sample_rate)
     beside = tuple(t for t in targets if t not in cluster and low / 1.3 < t.frequency < 1.3 * high)
     coarse = tuple(
-        replace(coarsen(view.spectra, low, high, width), neighbours=beside) for view in views
+        replace(coarsen(view.single(c), low, high, width), neighbours=beside)
+        for c in range(len(view.channels))
     )
     placed = cluster
     if known:
         placed, coarse = locate(coarse, cluster)
-    fits: list[BandFit] = []
-    reasons: dict[str, tuple[str, str]] = {}
-    for view, binned in zip(views, coarse, strict=True):
-        fit, missing = fit_band(view, binned, placed)
-        # The most telling reason is that of the first channel that got as far as a fit.
-        for name, why in missing.items():
-            if name not in reasons or reasons[name][0] == "not-excited":
-                reasons[name] = why
-        if fit is not None:
-            fits.append(fit)
-    best = _best_channels(fits, [target.name for target in cluster])
-    best = [_in_company(fit, best, views, coarse) for fit in best]
-    if known:
-        best, unclear = _named(best, cluster)
-        reasons |= unclear
-    seen = {target.name for fit in best for target in fit.targets}
+    fit, reasons = fit_band(view, coarse, placed)
+    if known and fit is not None:
+        fit, unclear = _named(fit, cluster)
+        reasons = reasons | unclear
+    seen = set() if fit is None else {target.name for target in fit.targets}
     refused = [
         Refusal(log=log.name, mode=name, reason=reason, detail=detail)
         for name, (reason, detail) in reasons.items()
         if name not in seen
     ]
-    return _ClusterResult(fits, best, refused)
+    return _ClusterResult(fit, refused)
 
 
-def _named(
-    best: list[BandFit], cluster: tuple[Target, ...]
-) -> tuple[list[BandFit], dict[str, tuple[str, str]]]:
+def _named(fit: BandFit, cluster: tuple[Target, ...]) -> tuple[BandFit, Missing]:
     """Give the modes that were found the names that their frequencies speak for.
 
     Where fewer were found than sought, one may stand where another began. Every assignment that
     keeps the order is weighed by the prior of shifts; a mode whose name is not clear is refused.
     """
-    found = sorted(
-        (float(fit.estimate[i]), target.name)
-        for fit in best
-        for i, target in enumerate(fit.targets)
-    )
+    found = sorted((float(fit.estimate[i]), t.name) for i, t in enumerate(fit.targets))
     if not found or len(found) == len(cluster):
-        return best, {}
+        return fit, {}
     ln_f = np.array([f for f, _ in found])
     choices = list(combinations(cluster, len(found)))
     search = np.array([[target.search for target in choice] for choice in choices])
@@ -277,10 +262,10 @@ def _named(
     )
     cost[(np.abs(shifts) > np.log1p(search)).any(axis=1)] = np.inf
     if not np.isfinite(cost).any():
-        return best, {}
+        return fit, {}
     weight = softmax(-cost)
     names: dict[str, str] = {}
-    unclear: dict[str, tuple[str, str]] = {}
+    unclear: Missing = {}
     for i, (f, name) in enumerate(found):
         chance: dict[str, float] = {}
         for choice, w in zip(choices, weight.tolist(), strict=True):
@@ -292,66 +277,22 @@ def _named(
         told = ", ".join(f"{n} {100 * p:.0f} %" for n, p in chance.items() if p > 0.01)
         detail = f"the resonance at {np.exp(f):.5g} Hz may be {told}; its neighbours were not found"
         unclear |= {n: ("ambiguous", detail) for n in chance if chance[n] > 0.01}
-    kept = [fit.only([t.name for t in fit.targets if t.name in names]) for fit in best]
-    renamed = [
-        replace(fit, targets=tuple(replace(t, name=names[t.name]) for t in fit.targets))
-        for fit in kept
-    ]
-    return renamed, {n: why for n, why in unclear.items() if n not in names.values()}
+    kept = fit.only([t.name for t in fit.targets if t.name in names])
+    renamed = tuple(replace(t, name=names[t.name]) for t in kept.targets)
+    return replace(kept, targets=renamed), {
+        n: why for n, why in unclear.items() if n not in names.values()
+    }
 
 
-def _in_company(
-    fit: BandFit, best: list[BandFit], views: tuple[View, ...], coarse: tuple[Coarse, ...]
-) -> BandFit:
-    """Fit a channel again together with the modes that only other channels show.
-
-    A mode too weak to be seen here still interferes with the ones that are, and would bias them;
-    where and how damped it is, the other channels know.
-    """
-    own = fit.settled()
-    others = [t for other in best if other is not fit for t in other.settled()]
-    if not others:
-        return fit
-    free = tuple(replace(target, settled=None) for target in own)
-    company = tuple(sorted((*free, *others), key=lambda target: target.frequency))
-    binned = next(c for v, c in zip(views, coarse, strict=True) if v is fit.view)
-    again, _ = fit_band(fit.view, binned, company)
-    names = [target.name for target in own]
-    if again is None or not set(names) <= {target.name for target in again.targets}:
-        return fit
-    return again.only(names)
-
-
-def _best_channels(fits: list[BandFit], names: list[str]) -> list[BandFit]:
-    """Keep each mode in one fit only: accelerometers before Δe, then the clearest channel."""
-    choice: dict[str, int] = {}
-    for name in names:
-        ranked = [
-            (fit.view.source != "acc", -float(fit.clarity[i]), k)
-            for k, fit in enumerate(fits)
-            for i, target in enumerate(fit.targets)
-            if target.name == name
-        ]
-        if ranked:
-            choice[name] = min(ranked)[2]
-    return [
-        fit.only(chosen)
-        for k, fit in enumerate(fits)
-        if (chosen := [n for n in names if choice.get(n) == k])
-    ]
-
-
-def _unexplained(fits: list[BandFit], cluster: tuple[Target, ...]) -> tuple[Target, ...]:
-    """Add to a cluster what stands out of what its fits leave over."""
-    more = list(cluster)
-    for fit in fits:
-        candidate = find_excess(fit.residual)
-        if candidate is None or len(more) > _MOST_TOGETHER:
-            continue
-        near = (abs(candidate.frequency / t.frequency - 1) < t.damping_ratio for t in more)
-        if not any(near):
-            more.append(replace(candidate, name=f"{more[0].name}_and_{len(more)}"))
-    return tuple(sorted(more, key=lambda target: target.frequency))
+def _unexplained(fit: BandFit, cluster: tuple[Target, ...]) -> tuple[Target, ...]:
+    """Add to a cluster what stands out of what its fit leaves over."""
+    candidate = find_excess(fit.residual)
+    if candidate is None or len(cluster) > _MOST_TOGETHER:
+        return cluster
+    if any(abs(candidate.frequency / t.frequency - 1) < t.damping_ratio for t in cluster):
+        return cluster
+    more = replace(candidate, name=f"{cluster[0].name}_and_{len(cluster)}")
+    return tuple(sorted((*cluster, more), key=lambda target: target.frequency))
 
 
 def _distinct(fits: list[BandFit]) -> list[BandFit]:
@@ -385,12 +326,13 @@ def _collect(fits: list[BandFit], lines: tuple[Line, ...], refused: tuple[Refusa
     order = np.argsort(estimate[:n], kind="stable")
     both = np.concatenate([order, order + n])
     names = [target.name for fit in fits for target in fit.targets]
-    views = [fit.view for fit in fits for _ in fit.targets]
+    sources = [fit.view.source for fit in fits for _ in fit.targets]
+    channels = [name for fit in fits for name in fit.best]
     snr = np.concatenate([fit.snr for fit in fits]) if fits else np.empty(0)
     return Modes(
         names=tuple(names[i] for i in order),
-        sources=tuple(views[i].source for i in order),
-        channels=tuple(views[i].channel for i in order),
+        sources=tuple(sources[i] for i in order),
+        channels=tuple(channels[i] for i in order),
         ln_frequency=estimate[order],
         ln_damping=estimate[n + order],
         cov=cov[np.ix_(both, both)],

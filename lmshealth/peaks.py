@@ -35,13 +35,13 @@ def find_peaks(
     Parameters
     ----------
     channels : tuple of tuple of Spectrum
-        Segments of each channel.
+        Spectra of each channel.
     low, high : float
         Band in Hz.
     """
     found: list[tuple[float, float, float]] = []
     for spectra in channels:
-        longest = _without_lines(max(spectra, key=lambda spectrum: spectrum.duration))
+        longest = _without_lines(max(spectra, key=lambda spectrum: spectrum.observed))
         for scale in _SCALES:
             found += _stand_out(longest, low, high, scale)
     chosen: list[tuple[float, float, float]] = []
@@ -79,7 +79,7 @@ def _stand_out(
         last = np.maximum(np.searchsorted(spectrum.frequency, b), first + 1)
         last = np.minimum(last, spectrum.frequency.size)
         first = np.minimum(first, last - 1)
-        return (total[last] - total[first]) / (last - first), last - first
+        return (total[last] - total[first]) / (last - first), spectrum.count * (last - first)
 
     inner, n_inner = mean(centre * (1 - scale), centre * (1 + scale))
     left, n_left = mean(centre * (1 - 4 * scale), centre * (1 - 2 * scale))
@@ -113,7 +113,11 @@ def find_excess(residual: Spectrum) -> Target | None:
         last = np.searchsorted(residual.frequency, residual.frequency * (1 + scale))
         n = last - first
         # A window cut by the edge of the band is judged by what is left of it.
-        score = np.where(n >= _LEAST_OF_EXCESS, (total[last] - total[first]) / np.sqrt(n), 0.0)
+        weight = residual.count * n
+        enough = (n >= _LEAST_ORDINATES) & (weight >= _LEAST_OF_EXCESS)
+        score = np.sqrt(residual.count) * np.where(
+            enough, (total[last] - total[first]) / np.sqrt(n), 0.0
+        )
         k = int(np.argmax(score))
         best = max(best, (float(score[k]), float(residual.frequency[k]), scale))
     _, frequency, scale = best

@@ -10,6 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.stats import gamma
 
 from lmshealth.arrays import FloatArray
 from lmshealth.spectra import Spectrum
@@ -35,9 +36,6 @@ class Target:
         Start value.
     search : float
         Half width of the search, as a fraction of the frequency.
-    settled : (float, float) or None
-        Standard deviations of ln f and ln ζ where another channel has told them already: the
-        mode then takes part in the fit whether this channel shows it or not.
     nominal : float or None
         Where it was sought before it was placed, in Hz.
     """
@@ -46,7 +44,6 @@ class Target:
     frequency: float
     damping_ratio: float
     search: float
-    settled: tuple[float, float] | None = None
     nominal: float | None = None
 
     def band(self, widths: float) -> tuple[float, float]:
@@ -62,7 +59,8 @@ class Coarse:
     Attributes
     ----------
     frequency, level, count : ndarray
-        Mean frequency in Hz, density from the median, and number of ordinates, ``(n_bins,)``.
+        Mean frequency in Hz, density from the median, and number of ordinates of single segments,
+        ``(n_bins,)``.
     neighbours : tuple of Target
         Modes beside the band whose flanks reach into it.
     """
@@ -91,12 +89,12 @@ class Coarse:
 
 
 def coarsen(spectra: tuple[Spectrum, ...], low: float, high: float, width: float) -> Coarse:
-    """Bin the ordinates of all segments of a channel.
+    """Bin the ordinates of all spectra of a channel.
 
     Parameters
     ----------
     spectra : tuple of Spectrum
-        One per segment.
+        Of segments, or means over several.
     low, high : float
         Band in Hz.
     width : float
@@ -104,15 +102,21 @@ def coarsen(spectra: tuple[Spectrum, ...], low: float, high: float, width: float
     """
     cut = [spectrum.band(low, high) for spectrum in spectra]
     frequency = np.concatenate([s.frequency for s in cut])
-    ordinates = np.concatenate([s.periodogram for s in cut])
+    ordinates = np.concatenate([s.periodogram / _median(s.count) for s in cut])
+    count = np.concatenate([np.full(s.frequency.size, float(s.count)) for s in cut])
     order = np.argsort(frequency, kind="stable")
     n_bins = max(3, min(int((high - low) / width), frequency.size // 4))
     parts = np.array_split(order, n_bins)
     return Coarse(
         frequency=np.array([frequency[part].mean() for part in parts]),
-        level=np.array([max(np.median(ordinates[part]), 1e-300) for part in parts]) / np.log(2),
-        count=np.array([part.size for part in parts], dtype=float),
+        level=np.array([max(np.median(ordinates[part]), 1e-300) for part in parts]),
+        count=np.array([count[part].sum() for part in parts]),
     )
+
+
+def _median(count: int) -> float:
+    """Median of the mean of so many exponential variables."""
+    return float(gamma.ppf(0.5, count)) / count
 
 
 def incoherent_fit(

@@ -1,26 +1,38 @@
-"""Whittle likelihood of one channel that sees one or several modes, with exact derivatives.
+"""Whittle likelihood of all channels that see one or several modes, with exact derivatives.
 
 The acceleration of mode i under a white modal force is h_i(f) = 1 / (1 - β² + 2iζβ), β = f_i/f.
-Modes of one structure are driven by partly common forces, so their responses interfere. With m
-modes the spectrum of one channel can tell 2m - 1 numbers of the modal force matrix: neighbours
-share a force. Writing q_k for the response to the k-th independent force,
+Far modes and the motion of rigid bodies leave a background, h_r = exp(s_r u) with u = -1 … 1 over
+the band. Modes and background of one structure are driven by partly common forces, and each
+channel sees each of them by its shape φ. The ordinates of all channels at one frequency are then
+complex normal with the matrix
 
-    S(f) = Σ_k |q_k(f)|² + S_e(f),   q_k = a_kk h_k + a_(k+1)k h_(k+1),   S_e = exp(e_0 + e_1 u),
+    E(f) = Φ D(f) Φᵀ + N(f),   D_ij = S_ij h_i h_j*,   S = L L*,   N_c = exp(e_c + d_c u).
 
-with u = -1 … 1 over the band. Unknowns, in this order: ln f (m), ln ζ (m), a_kk (m),
-a_(k+1)k (m - 1), e_0, e_1. The amplitudes are signed and in units of a start value, so that
-zero coupling is an inner point, not a boundary.
+Averages W of n ordinates keep all there is to know where E hardly changes between them:
+
+    -ln p = Σ n (ln det E + tr E⁻¹ W).
+
+Unknowns, in this order: ln f (m), ln ζ (m), s_r, L row by row up to its diagonal, Φ but for the
+channel of each mode or background where it is one, then e_c and d_c of each channel. L is signed,
+and complex below the diagonal, in units of a start value: neither independent modes nor a single
+common force is a boundary. Of a single channel the spectrum tells 2m - 1 numbers of L only: there L
+is real and neighbours share a force, or each mode shares its own with the background.
+
+Every slope of E has the form E_a = b ω* + ω bᵀ, where b is a column of Φ or a unit vector: a change
+of one component or of one channel. That makes the Hessian a few matrix products.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from scipy.optimize import minimize
 
-from lmshealth.arrays import FloatArray
-from lmshealth.spectra import Spectrum, periodogram_kernel
+from lmshealth.arrays import BoolArray, ComplexArray, FloatArray
+from lmshealth.spectra import CrossSpectrum, Kernel, make_kernel
 
 # Below this many half-power bandwidths times duration the expected periodogram replaces the
 # density: the record no longer resolves the resonance.
@@ -29,70 +41,194 @@ _RESOLVED = 20.0
 # samples per Fourier bin, and its tails end this many bins outside the band.
 _SAMPLES_PER_BANDWIDTH = 12
 _MARGIN_BINS = 20
+_LEAST_BINS = 12.0
+# Where the second derivatives of h stand, by which first ones they are of.
+_SECOND = {(1, 1): 3, (1, 2): 4, (2, 1): 4, (2, 2): 5}
 
 # Standard deviations of the weak normal priors about the start, which only keep directions
-# that the data do not see from running away: of ln f and ln ζ, amplitudes, e_0 and e_1.
+# that the data do not see from running away: of ln f, ln ζ, forces, shapes, e_c and d_c.
 WEAK = (0.2, 2.0)
-_PRIOR_AMPLITUDE = 30.0
+_PRIOR_FORCE = 30.0
+_PRIOR_BACKGROUND = 1.0
+_PRIOR_SHAPE = 30.0
 _PRIOR_NOISE = (5.0, 2.0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Block:
-    """Ordinates of one segment within the band.
+    """Ordinates of segments of one length within the band, each a mean of some neighbours.
 
     Attributes
     ----------
     frequency : ndarray
-        Where the density is evaluated, in Hz, shape ``(n_grid,)``.
-    periodogram : ndarray
-        Shape ``(n,)``.
-    kernel : ndarray or None
-        Density to expected periodogram, shape ``(n, n_grid)``; None where they are the same.
+        Mean frequency in Hz, shape ``(n,)``.
+    matrix : ndarray
+        Means of F F*, F the transform of all channels, shape ``(n, n_channels, n_channels)``.
+    count : ndarray
+        How many ordinates of single segments each mean is of, shape ``(n,)``.
+    kernel : Kernel or None
+        Density to expected periodogram; None where they are the same.
     """
 
     frequency: FloatArray
-    periodogram: FloatArray
-    kernel: FloatArray | None
+    matrix: ComplexArray
+    count: FloatArray
+    kernel: Kernel | None
+
+    @property
+    def grid(self) -> FloatArray:
+        """Where the density is evaluated, in Hz, shape ``(n_grid,)``."""
+        return self.frequency if self.kernel is None else self.kernel.grid
+
+    def smear(self, density: ComplexArray) -> ComplexArray:
+        """Turn densities on the grid, frequency last, into expectations."""
+        return density if self.kernel is None else self.kernel.expect(density)
 
 
-def make_block(spectrum: Spectrum, keep: np.ndarray, bandwidth: float) -> Block:
-    """Prepare the ordinates of a segment for the likelihood.
+def make_block(
+    spectra: Sequence[CrossSpectrum], keep: Sequence[BoolArray], bandwidth: float, *, merge: bool
+) -> Block:
+    """Prepare the ordinates of segments of one length for the likelihood.
+
+    It needs of each frequency the mean over the spectra that are kept there, and their number.
 
     Parameters
     ----------
-    spectrum : Spectrum
-        Cut to the band.
-    keep : ndarray of bool
-        Ordinates that hold no line, shape ``(n_ordinates,)``.
+    spectra : sequence of CrossSpectrum
+        Of the same frequencies, cut to the band.
+    keep : sequence of ndarray of bool
+        Ordinates of each that hold no line, shape ``(n_ordinates,)``.
     bandwidth : float
         Smallest half-power bandwidth 2ζf expected, in Hz: decides whether the record resolves it.
+    merge : bool
+        Whether neighbours may be averaged where the density hardly changes between them.
     """
-    frequency, ordinates = spectrum.frequency[keep], spectrum.periodogram[keep]
-    if bandwidth * spectrum.duration >= _RESOLVED:
-        return Block(frequency, ordinates, None)
-    finer = int(np.clip(np.ceil(_SAMPLES_PER_BANDWIDTH / (bandwidth * spectrum.duration)), 2, 12))
-    step = 1 / (finer * spectrum.duration)
-    margin = _MARGIN_BINS / spectrum.duration
-    low = max(spectrum.frequency[0] - margin, step)
-    fine = np.arange(low, spectrum.frequency[-1] + margin, step)
-    return Block(fine, ordinates, periodogram_kernel(frequency, spectrum.duration, fine))
+    first = spectra[0]
+    count = np.zeros(first.frequency.size)
+    total = np.zeros_like(first.matrix)
+    for spectrum, mask in zip(spectra, keep, strict=True):
+        count += spectrum.count * mask
+        total += (spectrum.count * mask)[:, None, None] * spectrum.matrix
+    kept: BoolArray = count > 0
+    frequency, count, total = first.frequency[kept], count[kept], total[kept]
+    resolution = bandwidth * first.duration
+    if resolution < _RESOLVED:
+        finer = int(np.clip(np.ceil(_SAMPLES_PER_BANDWIDTH / resolution), 2, 12))
+        kernel = make_kernel(first, kept, finer, _MARGIN_BINS)
+        return Block(frequency, total / count[:, None, None], count, kernel)
+    n_segments = sum(spectrum.count for spectrum in spectra)
+    together = int(resolution / _bins_per_bandwidth(n_segments * resolution)) if merge else 1
+    if together > 1:
+        starts = np.arange(0, frequency.size, together)
+        weight = np.add.reduceat(count, starts)
+        frequency = np.add.reduceat(count * frequency, starts) / weight
+        total, count = np.add.reduceat(total, starts, axis=0), weight
+    return Block(frequency, total / count[:, None, None], count, None)
+
+
+def _bins_per_bandwidth(resolution: float) -> float:
+    """How finely a resonance must be sampled when neighbours are averaged.
+
+    The mean over a bin of the r-th part of the half-power bandwidth is below the peak by the share
+    1/(3r²), and the damping too wide by as much, of which the standard deviation is
+    (π B T)^-½; a thirtieth of it does not matter.
+    """
+    return max(_LEAST_BINS, float(np.sqrt(10.0 * np.sqrt(np.pi * resolution))))
+
+
+@dataclass(frozen=True, slots=True)
+class Layout:
+    """Which unknown is which.
+
+    Attributes
+    ----------
+    n_modes, n_components, n_channels : int
+        Numbers of modes, of modes and backgrounds, and of channels.
+    force : tuple of (int, int, complex)
+        Row, column and direction, 1 or i, of each unknown of L.
+    shape : tuple of (int, int)
+        Channel and component of each unknown of Φ.
+    """
+
+    n_modes: int
+    n_components: int
+    n_channels: int
+    force: tuple[tuple[int, int, complex], ...]
+    shape: tuple[tuple[int, int], ...]
+
+    @property
+    def pole(self) -> tuple[tuple[int, int], ...]:
+        """Component of each of the first unknowns, and which slope of h belongs to it."""
+        m = self.n_modes
+        return tuple(
+            (i % m if i < 2 * m else i - m, 1 + (m <= i < 2 * m)) for i in range(self.n_poles)
+        )
+
+    @property
+    def n_poles(self) -> int:
+        """Number of the first unknowns, those of h."""
+        return self.n_modes + self.n_components
+
+    @property
+    def forces(self) -> slice:
+        """Unknowns of L."""
+        return slice(self.n_poles, self.n_poles + len(self.force))
+
+    @property
+    def shapes(self) -> slice:
+        """Unknowns of Φ."""
+        return slice(self.forces.stop, self.forces.stop + len(self.shape))
+
+    @property
+    def size(self) -> int:
+        """Number of unknowns."""
+        return self.shapes.stop + 2 * self.n_channels
+
+
+def lay_out(n_modes: int, reference: tuple[int, ...], n_channels: int) -> Layout:
+    """Lay the unknowns out.
+
+    Parameters
+    ----------
+    n_modes : int
+        Components beyond are backgrounds.
+    reference : tuple of int
+        Of each component the channel in which its shape is one.
+    n_channels : int
+        Number of channels.
+    """
+    n = len(reference)
+    force: list[tuple[int, int, complex]] = []
+    for i in range(n):
+        for j in _columns(i, n_modes, n) if n_channels == 1 else range(i + 1):
+            force.append((i, j, 1.0))
+            if j < i and n_channels > 1:
+                force.append((i, j, 1j))
+    shape = tuple((c, i) for i in range(n) for c in range(n_channels) if c != reference[i])
+    return Layout(n_modes, n, n_channels, tuple(force), shape)
+
+
+def _columns(row: int, n_modes: int, n_components: int) -> range:
+    """Columns of L that a single channel tells; of a background its own part is noise."""
+    if n_components == n_modes:
+        return range(max(0, row - 1), row + 1)
+    return range(row, row + 1) if row < n_modes else range(n_modes)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Likelihood:
-    """Negative log posterior of a band of one channel with priors about a start.
+    """Negative log posterior of a band with priors about a start.
 
     Attributes
     ----------
     blocks : tuple of Block
-        One per segment.
+        One per length of segments.
+    layout : Layout
+        Which unknown is which.
     start : ndarray
         Start value and centre of the priors, shape ``(n_unknowns,)``.
-    belief : ndarray
-        Standard deviations of the priors of ln f and of ln ζ, shape ``(2 n_modes,)``.
     scale : ndarray
-        Unit of the amplitudes of each mode, shape ``(n_modes,)``.
+        Unit of the rows of L, shape ``(n_components,)``.
     centre : float
         Geometric centre of the band in Hz.
     spread : float
@@ -100,26 +236,26 @@ class Likelihood:
     """
 
     blocks: tuple[Block, ...]
+    layout: Layout
     start: FloatArray
-    belief: FloatArray
     scale: FloatArray
     centre: float
     spread: float
 
     @property
-    def n_modes(self) -> int:
-        """Number of modes."""
-        return self.scale.size
-
-    @property
     def prior_std(self) -> FloatArray:
         """Standard deviations of the weak priors, shape ``(n_unknowns,)``."""
-        m = self.n_modes
+        lay = self.layout
         return np.concatenate(
             [
-                self.belief,
-                np.full(max(2 * m - 1, 0), _PRIOR_AMPLITUDE),
-                _PRIOR_NOISE,
+                np.repeat(WEAK, lay.n_modes),
+                np.full(lay.n_components - lay.n_modes, _PRIOR_NOISE[1]),
+                [
+                    _PRIOR_FORCE if row < lay.n_modes else _PRIOR_BACKGROUND
+                    for row, _, _ in lay.force
+                ],
+                np.full(len(lay.shape), _PRIOR_SHAPE),
+                np.tile(_PRIOR_NOISE, lay.n_channels),
             ]
         )
 
@@ -127,17 +263,39 @@ class Likelihood:
         """Negative log posterior up to a constant."""
         total = 0.5 * float(np.sum(((p - self.start) / self.prior_std) ** 2))
         with np.errstate(over="ignore", invalid="ignore"):
-            for block in self.blocks:
-                total += _misfit(block, self._density(p, block.frequency))
+            try:
+                total += self.data_value(p)
+            except np.linalg.LinAlgError:
+                return np.inf
         return total if np.isfinite(total) else np.inf
 
     def data_value(self, p: FloatArray) -> float:
         """Negative log likelihood without the priors."""
-        return sum(_misfit(block, self._density(p, block.frequency)) for block in self.blocks)
+        return sum(
+            _misfit(block, matrix)
+            for block, matrix in zip(self.blocks, self.expected(p), strict=True)
+        )
 
-    def expected(self, p: FloatArray) -> list[FloatArray]:
-        """Compute the expected periodogram of each block."""
-        return [_expect(block, self._density(p, block.frequency)) for block in self.blocks]
+    def expected(self, p: FloatArray) -> list[ComplexArray]:
+        """Compute E of each block, shape ``(n, n_channels, n_channels)``."""
+        return [_Point(self, p, block).expected for block in self.blocks]
+
+    def signal_to_noise(self, p: FloatArray) -> FloatArray:
+        """Modal signal-to-noise ratios S φ² / (4 ζ² N), shape ``(n_channels, n_modes)``."""
+        m = self.layout.n_modes
+        at = Block(np.exp(p[:m]), np.empty((m, 0, 0), dtype=complex), np.ones(m), None)
+        point = _Point(self, p, at)
+        return point.strength[:, :m] / (4 * np.exp(2 * p[m : 2 * m]) * point.noise)
+
+    def derivatives(self, p: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Exact gradient and Hessian of `value`, shapes ``(n_unknowns,)`` and square."""
+        gradient = (p - self.start) / self.prior_std**2
+        hessian = np.diag(1 / self.prior_std**2)
+        for block in self.blocks:
+            first, second = _Point(self, p, block).derivatives()
+            gradient = gradient + first
+            hessian = hessian + second
+        return gradient, hessian
 
     def minimise(self, start: FloatArray) -> FloatArray:
         """Find the posterior mode by Newton's method in a trust region.
@@ -168,101 +326,249 @@ class Likelihood:
             jac=gradient,
             hess=hessian,
             method="trust-exact",
-            options={"gtol": 1e-3, "maxiter": 100, "initial_trust_radius": 0.1},
+            options={"gtol": 1e-3, "maxiter": 100, "initial_trust_radius": 0.3},
         )
         return np.asarray(found.x)
 
-    def derivatives(self, p: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Exact gradient and Hessian of `value`, shapes ``(n_unknowns,)`` and square."""
-        gradient = (p - self.start) / self.prior_std**2
-        hessian = np.diag(1 / self.prior_std**2)
-        for block in self.blocks:
-            density, first, second = self._expansion(p, block.frequency)
-            expected = _expect(block, density)
-            ratio = block.periodogram / expected
-            slope = (1 - ratio) / expected
-            if block.kernel is not None:
-                first_expected = first @ block.kernel.T
-                slope_grid = slope @ block.kernel
-            else:
-                first_expected, slope_grid = first, slope
-            gradient = gradient + first @ slope_grid
-            curvature = (2 * ratio - 1) / expected**2
-            hessian = hessian + (first_expected * curvature) @ first_expected.T
-            for (a, b), values in second.items():
-                term = float(values @ slope_grid)
-                hessian[a, b] += term
-                if a != b:
-                    hessian[b, a] += term
-        return gradient, hessian
 
-    def _noise(self, p: FloatArray, frequency: FloatArray) -> tuple[FloatArray, FloatArray]:
-        u = np.log(frequency / self.centre) / self.spread
-        return np.exp(p[-2] + p[-1] * u), u
+class _Point:
+    """The model of a block at one point; frequency is the last axis unless said otherwise."""
 
-    def _density(self, p: FloatArray, frequency: FloatArray) -> FloatArray:
-        m = self.n_modes
-        noise, _ = self._noise(p, frequency)
-        total = noise
-        h = [
-            self.scale[i] * _receptance(np.exp(p[i]), np.exp(p[m + i]), frequency)[0]
-            for i in range(m)
-        ]
-        for k in range(m):
-            q = p[2 * m + k] * h[k]
-            if k + 1 < m:
-                q = q + p[3 * m + k] * h[k + 1]
-            total = total + q.real**2 + q.imag**2
-        return total
+    def __init__(self, likelihood: Likelihood, p: FloatArray, block: Block) -> None:
+        self._block, lay = block, likelihood.layout
+        self._layout, self._scale = lay, likelihood.scale
+        m, n = lay.n_modes, lay.n_components
+        self._force = np.zeros((n, n), dtype=complex)
+        for value, (i, j, direction) in zip(p[lay.forces], lay.force, strict=True):
+            self._force[i, j] += likelihood.scale[i] * value * direction
+        self._phi = np.ones((lay.n_channels, n))
+        for value, (c, i) in zip(p[lay.shapes], lay.shape, strict=True):
+            self._phi[c, i] = value
+        on_grid = np.log(block.grid / likelihood.centre) / likelihood.spread
+        # h and its derivatives, shape (6, components, grid).
+        self._h = np.concatenate(
+            [
+                receptance(np.exp(p[:m, None]), np.exp(p[m : 2 * m, None]), block.grid),
+                _background(p[2 * m : lay.n_poles, None], on_grid),
+            ],
+            axis=1,
+        )
+        self._u = np.log(block.frequency / likelihood.centre) / likelihood.spread
+        level, slope = p[lay.shapes.stop :].reshape(-1, 2).T[..., None]
+        self.noise = np.exp(level + slope * self._u)  # (channels, n)
 
-    def _expansion(
-        self, p: FloatArray, frequency: FloatArray
-    ) -> tuple[FloatArray, FloatArray, dict[tuple[int, int], FloatArray]]:
-        """Density with its first and its non-zero second derivatives on the grid.
+    @cached_property
+    def _s(self) -> ComplexArray:
+        return np.asarray(self._force @ self._force.conj().T)
 
-        From S = Σ |q_k|²: S_a = 2 Re Σ q_k* q_ka and S_ab = 2 Re Σ (q_ka* q_kb + q_k* q_kab);
-        q_k depends on the two modes it drives and is linear in its amplitudes.
+    @property
+    def strength(self) -> FloatArray:
+        """PSD of each force as each channel sees it, shape ``(channels, components)``."""
+        return self._phi**2 * np.diag(self._s).real
+
+    @cached_property
+    def _modal(self) -> ComplexArray:
+        """D, shape ``(components, components, n)``."""
+        h = self._h[0]
+        return self._block.smear(self._s[..., None] * h[:, None] * h[None].conj())
+
+    @cached_property
+    def expected(self) -> ComplexArray:
+        """E, shape ``(n, channels, channels)``."""
+        expected = self._phi @ np.moveaxis(self._modal, -1, 0) @ self._phi.T
+        index = np.arange(self._layout.n_channels)
+        expected[:, index, index] += self.noise.T
+        return expected
+
+    def derivatives(self) -> tuple[FloatArray, FloatArray]:
+        """Gradient and Hessian of the misfit.
+
+        With R = E⁻¹, G = R - RWR and Y = 2RWR - R the gradient is Σ n tr G E_a and the Hessian
+        Σ n (tr E_a R E_b Y + tr G E_ab).
         """
-        m, n = self.n_modes, p.size
-        density, u = self._noise(p, frequency)
-        first = np.zeros((n, frequency.size))
-        first[n - 2], first[n - 1] = density, density * u
-        second = {
-            (n - 2, n - 2): density,
-            (n - 2, n - 1): density * u,
-            (n - 1, n - 1): density * u * u,
-        }
-        shapes = [
-            self.scale[i] * _receptance(np.exp(p[i]), np.exp(p[m + i]), frequency) for i in range(m)
-        ]
-        for k in range(m):
-            q, q_first, q_second = _force_response(p, shapes, k)
-            density = density + q.real**2 + q.imag**2
-            for a, value in q_first.items():
-                first[a] += 2 * (q.conj() * value).real
-            order = sorted(q_first)
-            for i, a in enumerate(order):
-                for b in order[i:]:
-                    term = q_first[a].conj() * q_first[b]
-                    if (a, b) in q_second:
-                        term = term + q.conj() * q_second[a, b]
-                    second[a, b] = second.get((a, b), 0.0) + 2 * term.real
-        return density, first, second
+        inverse = np.linalg.inv(self.expected)
+        turned = inverse @ self._block.matrix @ inverse
+        count = self._block.count[:, None, None]
+        g = np.moveaxis(count * (inverse - turned), 0, -1)
+        y = np.moveaxis(count * (2 * turned - inverse), 0, -1)
+        row, w = self._slopes()
+        basis = np.concatenate([self._phi, np.eye(self._layout.n_channels)], axis=1)
+        omega = np.tensordot(basis, w.conj(), axes=(1, 1))  # (channels, unknowns, n)
+        pull = np.tensordot(basis.T, g, axes=(1, 0))  # bᵀ G, (basis, channels, n)
+        gradient = 2 * np.einsum("cak,ack->a", omega, pull[row]).real
+        hessian = _products(basis, row, omega, np.moveaxis(inverse, 0, -1), y)
+        return gradient, hessian + self._curvature(w, g)
+
+    def _slopes(self) -> tuple[np.ndarray, ComplexArray]:
+        """Rows of the slopes of E in the basis of Φ's columns and the channels.
+
+        Of each unknown the index of b and its row w, E_a = b (basis w)ᵀ and its adjoint, shapes
+        ``(unknowns,)`` and ``(unknowns, components + channels, n)``.
+        """
+        lay, m, h = self._layout, self._layout.n_components, self._h
+        row = np.zeros(lay.size, dtype=int)
+        w = np.zeros((lay.size, m + lay.n_channels, self._block.frequency.size), dtype=complex)
+        adjoint = h[0].conj()
+        for a, (i, q) in enumerate(lay.pole):
+            row[a] = i
+            w[a, :m] = self._block.smear(self._s[i, :, None] * h[q, i] * adjoint)
+        pairs = self._block.smear(h[0][:, None] * adjoint[None])
+        for a, (i, j, direction) in enumerate(lay.force, start=lay.forces.start):
+            row[a] = i
+            pull = self._scale[i] * direction * self._force[:, j].conj()
+            w[a, :m] = pull[:, None] * pairs[i]
+        for a, (c, i) in enumerate(lay.shape, start=lay.shapes.start):
+            row[a] = m + c
+            w[a, :m] = self._modal[i]
+        for c in range(lay.n_channels):
+            a = lay.shapes.stop + 2 * c
+            row[a : a + 2] = m + c
+            w[a, m + c] = 0.5 * self.noise[c]
+            w[a + 1, m + c] = 0.5 * self.noise[c] * self._u
+        return row, w
+
+    def _curvature(self, w: ComplexArray, g: ComplexArray) -> FloatArray:
+        """Σ tr G E_ab over all pairs of unknowns, the counts in G."""
+        lay = self._layout
+        curvature = np.zeros((lay.size, lay.size))
+        pull = np.tensordot(self._phi.T, g, axes=(1, 0))  # Φᵀ G, (components, channels, n)
+        b = _congruent(self._phi, g)  # (components, components, n)
+        if self._block.kernel is not None:
+            b = self._block.kernel.spread(b)
+        turned = b.swapaxes(0, 1)
+        self._by_poles(curvature, turned)
+        self._by_forces(curvature, turned)
+        if lay.shape:
+            self._by_shapes(curvature, w, g, pull)
+        for c in range(lay.n_channels):
+            own = g[c, c].real * self.noise[c]
+            at = lay.shapes.stop + 2 * c
+            cross = float(own @ self._u)
+            curvature[at : at + 2, at : at + 2] += [
+                [own.sum(), cross],
+                [cross, own @ self._u**2],
+            ]
+        return curvature
+
+    def _by_poles(self, curvature: FloatArray, turned: ComplexArray) -> None:
+        """By two unknowns of h: Q = Σ_ij S_ij B_ji h_i h_j*."""
+        h, n = self._h, self._layout.n_poles
+        component, slope = np.array(self._layout.pole, dtype=int).reshape(-1, 2).T
+        weight = self._s[..., None] * turned
+        first = h[slope, component]
+        pairs = weight[component[:, None], component]
+        term = np.einsum("abk,ak,bk->ab", pairs, first, first.conj())
+        pull = np.sum(weight * h[0].conj()[None], axis=1)
+        for a in range(n):
+            for b in np.flatnonzero(component == component[a]):
+                term[a, b] += pull[component[a]] @ h[_SECOND[slope[a], slope[b]], component[a]]
+        curvature[:n, :n] += 2 * term.real
+
+    def _by_forces(self, curvature: FloatArray, turned: ComplexArray) -> None:
+        """By two forces, and by a force and an unknown of h."""
+        lay, h = self._layout, self._h
+        overlap = np.einsum("ijk,ik,jk->ij", turned, h[0], h[0].conj())
+        start = lay.forces.start
+        for a, (i, j, alpha) in enumerate(lay.force, start=start):
+            for b, (k, column, beta) in enumerate(lay.force, start=start):
+                if j == column:
+                    unit = self._scale[i] * self._scale[k] * alpha * np.conj(beta)
+                    curvature[a, b] += 2 * (unit * overlap[i, k]).real
+        component, slope = np.array(lay.pole, dtype=int).reshape(-1, 2).T
+        mixed = np.einsum("ajk,ak,jk->aj", turned[component], h[slope, component], h[0].conj())
+        for a, (i, j, alpha) in enumerate(lay.force, start=start):
+            # S changes in row and column i.
+            change = self._scale[i] * alpha * self._force[:, j].conj()
+            term = (
+                np.where(component == i, mixed @ change, 0) + change.conj()[component] * mixed[:, i]
+            )
+            curvature[a, : lay.n_poles] += 2 * term.real
+            curvature[: lay.n_poles, a] += 2 * term.real
+
+    def _by_shapes(
+        self, curvature: FloatArray, w: ComplexArray, g: ComplexArray, pull: ComplexArray
+    ) -> None:
+        """By two shapes, and by a shape and what D depends on."""
+        lay, m = self._layout, self._layout.n_components
+        channel, mode = np.array(lay.shape).T
+        own = np.tensordot(self._modal, g, axes=(2, 2))  # (i, j, d, c)
+        own = own[mode[:, None], mode, channel, channel[:, None]]
+        curvature[lay.shapes, lay.shapes] += 2 * own.real
+        inner = w[: lay.shapes.start, :m]
+        along = np.einsum("ajk,jck->ac", inner, pull)
+        across = np.tensordot(inner.conj(), pull, axes=(2, 2))  # (a, i, r, c)
+        row = np.array([i for i, *_ in (*lay.pole, *lay.force)], dtype=int)
+        index = np.arange(row.size)
+        term = across[index[:, None], mode, row[:, None], channel]
+        term = term + np.where(row[:, None] == mode, along[:, channel], 0)
+        curvature[: lay.shapes.start, lay.shapes] += 2 * term.real
+        curvature[lay.shapes, : lay.shapes.start] += 2 * term.real.T
 
 
-def _misfit(block: Block, density: FloatArray) -> float:
-    expected = _expect(block, density)
-    return float(np.sum(np.log(expected) + block.periodogram / expected))
+def _products(
+    basis: FloatArray, row: np.ndarray, omega: ComplexArray, r: ComplexArray, y: ComplexArray
+) -> FloatArray:
+    """Σ tr E_a R E_b Y for slopes E_a = b_a ω_a* + ω_a b_aᵀ.
+
+    The trace is ω_a*R b_b · ω_b*Y b_a + ω_a*R ω_b · b_bᵀY b_a and both with R and Y exchanged,
+    of which the real part counts.
+    """
+    n = row.size
+    by_r, by_y = _applied(r, omega), _applied(y, omega)
+    left = np.tensordot(basis.T, by_r, axes=(1, 0)).conj()  # ω* R b: (basis, unknowns, n)
+    right = np.tensordot(basis.T, by_y, axes=(1, 0)).conj()
+    small_r, small_y = _congruent(basis, r), _congruent(basis, y)
+    groups = [(k, np.flatnonzero(row == k)) for k in range(basis.shape[1]) if (row == k).any()]
+    total = np.zeros((n, n))
+    for k, first in groups:
+        flat = omega[:, first].conj().swapaxes(0, 1).reshape(first.size, -1)
+        for j, second in groups:
+            if j < k:
+                continue
+            part = _real_product(left[j, first], right[k, second])
+            part += _real_product(right[j, first], left[k, second])
+            weighted = by_r[:, second] * small_y[j, k] + by_y[:, second] * small_r[j, k]
+            part += _real_product(flat, weighted.swapaxes(0, 1).reshape(second.size, -1))
+            total[np.ix_(first, second)] = part
+            total[np.ix_(second, first)] = part.T
+    return total
 
 
-def _expect(block: Block, density: FloatArray) -> FloatArray:
-    return density if block.kernel is None else np.asarray(block.kernel @ density)
+def _congruent(basis: FloatArray, matrix: ComplexArray) -> ComplexArray:
+    """Bᵀ M B at each frequency, which is the last axis."""
+    half = np.tensordot(basis.T, matrix, axes=(1, 0))
+    return np.tensordot(half, basis, axes=(1, 0)).swapaxes(1, 2)
 
 
-def _receptance(f: float, zeta: float, frequency: FloatArray) -> np.ndarray:
-    """Acceleration response h of a mode and its derivatives by x = ln f and z = ln ζ.
+def _applied(matrix: ComplexArray, vectors: ComplexArray) -> ComplexArray:
+    """Σ_d M_cd v_d at each frequency, shape ``(channels, unknowns, n)``."""
+    # One product per pair of channels: their axes are too short for a loop inside.
+    return np.array([sum(m * v for m, v in zip(row, vectors, strict=True)) for row in matrix])
 
-    Returns an array of shape ``(6, n)``: h, h_x, h_z, h_xx, h_xz, h_zz. With d = 1/h,
+
+def _real_product(a: ComplexArray, b: ComplexArray) -> FloatArray:
+    """Re of Σ a b over the last axis, shape ``(n_a, n_b)``."""
+    return np.asarray(a.real @ b.real.T - a.imag @ b.imag.T)
+
+
+def _misfit(block: Block, expected: ComplexArray) -> float:
+    root = np.linalg.cholesky(expected)
+    white = np.linalg.solve(expected, block.matrix)
+    log_det = 2 * np.log(np.diagonal(root, axis1=-2, axis2=-1).real).sum(axis=-1)
+    return float(block.count @ (log_det + np.trace(white, axis1=-2, axis2=-1).real))
+
+
+def _background(slope: FloatArray, u: FloatArray) -> ComplexArray:
+    """Response exp(s u) and its derivatives by s, in the places of those by ln f."""
+    h = np.exp(slope * u)
+    none = np.zeros_like(h)
+    return np.stack([h, u * h, none, u * u * h, none, none]).astype(complex)
+
+
+def receptance(f: FloatArray, zeta: FloatArray, frequency: FloatArray) -> ComplexArray:
+    """Acceleration response h of modes and its derivatives by x = ln f and z = ln ζ.
+
+    Returns an array of shape ``(6, …, n)``: h, h_x, h_z, h_xx, h_xz, h_zz. With d = 1/h,
     h_a = -d_a h² and h_ab = (2 d_a d_b h - d_ab) h².
     """
     beta = f / frequency
@@ -280,27 +586,3 @@ def _receptance(f: float, zeta: float, frequency: FloatArray) -> np.ndarray:
             (2 * damping * damping * h - damping) * square,
         ]
     )
-
-
-def _force_response(
-    p: FloatArray, shapes: list[np.ndarray], k: int
-) -> tuple[np.ndarray, dict[int, np.ndarray], dict[tuple[int, int], np.ndarray]]:
-    """Response q_k to the k-th force with its derivatives by the unknowns it depends on."""
-    m = len(shapes)
-    driven = [(k, 2 * m + k)] + ([(k + 1, 3 * m + k)] if k + 1 < m else [])
-    q = sum(p[amplitude] * shapes[mode][0] for mode, amplitude in driven)
-    first: dict[int, np.ndarray] = {}
-    second: dict[tuple[int, int], np.ndarray] = {}
-    for mode, amplitude in driven:
-        h, h_x, h_z, h_xx, h_xz, h_zz = shapes[mode]
-        a = p[amplitude]
-        x, z = mode, m + mode
-        first |= {x: a * h_x, z: a * h_z, amplitude: h}
-        second |= {
-            (x, x): a * h_xx,
-            (x, z): a * h_xz,
-            (z, z): a * h_zz,
-            (x, amplitude): h_x,
-            (z, amplitude): h_z,
-        }
-    return np.asarray(q), first, second
