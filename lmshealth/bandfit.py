@@ -269,7 +269,7 @@ def _prepare(view: View, coarse: tuple[Coarse, ...], seen: tuple[Target, ...]) -
         replace(chosen, spectra=spectra),
         unit,
         tuple(replace(c, level=c.level / n) for c, n in zip(used, noise, strict=True)),
-        [np.ones(s.frequency.size, dtype=bool) for s in spectra],
+        [s.free.copy() for s in spectra],
         min(2 * t.frequency * t.damping_ratio for t in seen),
     )
 
@@ -297,12 +297,9 @@ def _fit_and_prune(
 
     blocks = _blocks(band, merge=True)
     solution = _solve(band, blocks, seen)
-    common = _common(solution)
-    richer = _solve(band, blocks, seen, common)
-    solution = richer
     while seen:
         doubtful = [i for i, t in enumerate(seen) if gains[t.name] < _BEYOND_DOUBT]
-        without = {i: _solve(band, blocks, seen[:i] + seen[i + 1 :], common) for i in doubtful}
+        without = {i: _solve(band, blocks, seen[:i] + seen[i + 1 :]) for i in doubtful}
         for_mode = {i: evidence(solution, w) - _EVIDENCE_MARGIN for i, w in without.items()}
         worst = min(for_mode, key=lambda i: for_mode[i], default=None)
         if worst is None or for_mode[worst] >= 0:
@@ -310,24 +307,6 @@ def _fit_and_prune(
         missing[seen[worst].name] = _absent(seen[worst], gains[seen[worst].name])
         seen, solution = seen[:worst] + seen[worst + 1 :], without[worst]
     return solution, seen
-
-
-def _common(solution: _Solution) -> FloatArray:
-    """Find what the channels have in common beside the modes, as loadings of their noise.
-
-    The first principal component of the correlations that a fit with independent noise leaves.
-    """
-    likelihood = solution.likelihood
-    n_channels = likelihood.layout.n_channels
-    total, count = np.zeros((n_channels, n_channels)), 0.0
-    for block, expected in zip(likelihood.blocks, likelihood.expected(solution.p), strict=True):
-        root = np.linalg.inv(np.linalg.cholesky(expected))
-        white = root @ block.matrix @ np.conj(np.swapaxes(root, -1, -2))
-        total += np.tensordot(block.count, white.real, axes=1)
-        count += float(block.count.sum())
-    power, vectors = np.linalg.eigh(total / count)
-    share = np.clip((power[-1] - 1) / power[-1], 0.05, 0.95)
-    return np.asarray(vectors[:, -1] * np.sqrt(share))
 
 
 def _blocks(band: _Band, *, merge: bool) -> tuple[Block, ...]:
@@ -343,16 +322,9 @@ def _blocks(band: _Band, *, merge: bool) -> tuple[Block, ...]:
     )
 
 
-def _solve(
-    band: _Band,
-    blocks: tuple[Block, ...],
-    targets: tuple[Target, ...],
-    common: FloatArray | None = None,
-) -> _Solution:
-    """Find the posterior mode for a set of modes by a trust-region Newton method.
-
-    ``common`` holds the loadings of a background, shape ``(n_channels,)``, where there is one.
-    """
+def _solve(band: _Band, blocks: tuple[Block, ...], targets: tuple[Target, ...]) -> _Solution:
+    """Find the posterior mode for a set of modes by a trust-region Newton method."""
+    n_channels = len(band.coarse)
     zeta = np.array([target.damping_ratio for target in targets])
     # A strength of zero would leave a mode without a gradient.
     amplitude = np.sqrt(
@@ -361,30 +333,19 @@ def _solve(
             for c in band.coarse
         ]
     )
-    signed = amplitude.copy()
-    for i, target in enumerate(targets):
-        best = int(amplitude[:, i].argmax())
-        signed[:, i] *= [_sign(blocks, target, c, best) for c in range(len(band.coarse))]
-    noise = np.zeros(len(band.coarse))
-    slopes: list[float] = []
-    if common is not None:
-        signed = np.column_stack([signed, common])
-        slopes, noise = [0.0], np.log(1 - common**2)
-    reference = np.abs(signed).argmax(axis=0)
-    unit = signed[reference, np.arange(reference.size)]
-    scale = np.abs(unit)
-    first = np.ones(scale.size)
-    if common is not None:
-        scale[-1], first[-1] = 1.0, abs(unit[-1])
-    layout = lay_out(len(targets), tuple(reference.tolist()), len(band.coarse))
+    reference = amplitude.argmax(axis=0).tolist()
+    scale = amplitude.max(axis=0)
+    layout = lay_out(reference, n_channels)
     start = np.concatenate(
         [
             np.log([target.frequency for target in targets]),
             np.log(zeta),
-            slopes,
-            [first[i] * (i == j) for i, j, _ in layout.force],
-            [signed[c, i] / unit[i] for c, i in layout.shape],
-            np.column_stack([noise, np.zeros_like(noise)]).ravel(),
+            np.zeros(layout.n_poles - 2 * len(targets)),
+            [float(i == j) for i, j in layout.force],
+            [
+                _sign(blocks, targets[i], c, reference[i]) * amplitude[c, i] / scale[i]
+                for c, i in layout.shape
+            ],
         ]
     )
     low = min(float(block.frequency[0]) for block in blocks)
@@ -393,7 +354,7 @@ def _solve(
         blocks=blocks,
         layout=layout,
         start=start,
-        scale=scale,
+        scale=np.concatenate([scale, np.ones(n_channels)]),
         centre=float(np.sqrt(low * high)),
         spread=float(np.log(high / low) / 2),
     )
@@ -518,7 +479,8 @@ def _most(spectra: Sequence[CrossSpectrum]) -> int:
 def _lines(band: _Band) -> tuple[Sighting, ...]:
     """Tell what was masked where most was seen, in the channels that show it best."""
     most = _most(band.view.spectra)
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], (~band.masks[most]).astype(int), [0]])))
+    masked = band.view.spectra[most].free & ~band.masks[most]
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], masked.astype(int), [0]])))
     return tuple(
         _sighting(band.view, band.unit, int(a), int(b))
         for a, b in zip(edges[::2], edges[1::2], strict=True)

@@ -22,7 +22,7 @@ from lmshealth.results import Line, Modes
 from lmshealth.segments import find_segments
 from lmshealth.spectra import cross_spectra
 from lmshealth.stage import Stage
-from lmshealth.starts import Coarse, Target, coarsen, locate, shift_cost
+from lmshealth.starts import Target, coarsen, locate, shift_cost
 
 # Modes whose bands touch are fitted together, but never more than this many.
 _MOST_TOGETHER = 4
@@ -75,6 +75,7 @@ def identify(
     else:
         view = _transform(log, used, (), band)
         targets, seen = _search(log, used, view, band)
+    seen += [(view.channels[c], f, a) for s in view.spectra for c, f, a in s.lines]
     fits: list[BandFit] = []
     refused: list[Refusal] = []
     for cluster in _clusters(targets):

@@ -12,6 +12,7 @@ from lmshealth.arrays import BoolArray, ComplexArray, FloatArray, freeze
 from lmshealth.logs import Channel
 from lmshealth.samples import MINUTE
 from lmshealth.segments import Segment
+from lmshealth.tones import remove_tones
 
 # The second difference of a displacement reaches over this part of the shortest period.
 _LAG_PERIODS = 8.0
@@ -90,6 +91,11 @@ class CrossSpectrum:
         Length of a segment in s.
     velocity : float
         Set velocity in m/s, NaN where unknown.
+    free : ndarray of bool
+        Ordinates at which no strong line stood, shape ``(n_ordinates,)``.
+    lines : tuple of (int, float, float)
+        Of each line that was taken out the index of its channel, frequency in Hz and amplitude in
+        m/s².
     count : int
         Number of segments of this length whose mean it is.
     """
@@ -98,6 +104,8 @@ class CrossSpectrum:
     matrix: ComplexArray
     duration: float
     velocity: float
+    free: BoolArray
+    lines: tuple[tuple[int, float, float], ...] = ()
     count: int = 1
 
     def __post_init__(self) -> None:
@@ -114,7 +122,13 @@ class CrossSpectrum:
         """Cut out the ordinates from low to high Hz."""
         first, last = np.searchsorted(self.frequency, [low, high])
         cut = slice(int(first), int(last))
-        return replace(self, frequency=self.frequency[cut], matrix=self.matrix[cut])
+        return replace(
+            self,
+            frequency=self.frequency[cut],
+            matrix=self.matrix[cut],
+            free=self.free[cut],
+            lines=tuple(line for line in self.lines if low <= line[1] < high),
+        )
 
     def channel(self, index: int) -> Spectrum:
         """Give the spectrum of one channel."""
@@ -175,8 +189,15 @@ def _cross_spectrum(
         if lag:
             transforms[:, c] *= lag_gain(frequency, lag, sample_rate)
     transforms *= np.sqrt(2 / (n * sample_rate))
+    transforms, free, tones = remove_tones(transforms)
+    step = sample_rate / n
+    lines = tuple(
+        # Σ I = A² T / 2 over the ordinates of a sine.
+        (tone.channel, (tone.ordinate + 1) * step, float(np.sqrt(2 * tone.power * step)))
+        for tone in tones
+    )
     matrix = transforms[:, :, None] * transforms[:, None].conj()
-    return CrossSpectrum(frequency, matrix, n / sample_rate, segment.velocity)
+    return CrossSpectrum(frequency, matrix, n / sample_rate, segment.velocity, free, lines)
 
 
 def _frequencies(n: int, sample_rate: float, ceiling: float) -> FloatArray:
@@ -211,10 +232,11 @@ def _same(one: Segment, other: Segment) -> bool:
 
 def _mean(spectra: Iterator[CrossSpectrum]) -> CrossSpectrum:
     first = next(spectra)
-    total, count = first.matrix, 1
+    total, free, lines, count = first.matrix, first.free, first.lines, 1
     for spectrum in spectra:
         total, count = total + spectrum.matrix, count + 1
-    return first if count == 1 else replace(first, matrix=total / count, count=count)
+        free, lines = free & spectrum.free, (*lines, *spectrum.lines)
+    return replace(first, matrix=total / count, free=free, lines=lines, count=count)
 
 
 def periodogram(

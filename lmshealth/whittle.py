@@ -1,22 +1,24 @@
 """Whittle likelihood of all channels that see one or several modes, with exact derivatives.
 
 The acceleration of mode i under a white modal force is h_i(f) = 1 / (1 - β² + 2iζβ), β = f_i/f.
-Far modes and the motion of rigid bodies leave a background, h_r = exp(s_r u) with u = -1 … 1 over
-the band. Modes and background of one structure are driven by partly common forces, and each
-channel sees each of them by its shape φ. The ordinates of all channels at one frequency are then
-complex normal with the matrix
+What a channel shows beside the modes, its floor, is h_c(f) = exp((e_c + d_c u + b_c u²) / 2) with
+u = -1 … 1 over the band. Modes and floors are driven by partly common forces: the floor of a channel is the
+tail of other modes and the motion of rigid bodies as well as noise, and it interferes with the
+modes. Each channel sees each mode by its shape φ. The ordinates of all channels at one frequency
+are then complex normal with the matrix
 
-    E(f) = Φ D(f) Φᵀ + N(f),   D_ij = S_ij h_i h_j*,   S = L L*,   N_c = exp(e_c + d_c u).
+    E(f) = Φ D(f) Φᵀ,   D_ij = S_ij h_i h_j*,   S = L Lᵀ,   Φ = [shapes, 1],
 
-Averages W of n ordinates keep all there is to know where E hardly changes between them:
+over modes and floors. Averages W of n ordinates keep all there is to know where E hardly changes
+between them:
 
     -ln p = Σ n (ln det E + tr E⁻¹ W).
 
-Unknowns, in this order: ln f (m), ln ζ (m), s_r, L row by row up to its diagonal, Φ but for the
-channel of each mode or background where it is one, then e_c and d_c of each channel. L is signed,
-and complex below the diagonal, in units of a start value: neither independent modes nor a single
-common force is a boundary. Of a single channel the spectrum tells 2m - 1 numbers of L only: there L
-is real and neighbours share a force, or each mode shares its own with the background.
+Unknowns, in this order: ln f (m), ln ζ (m), e_c, d_c and b_c of each channel, L row by row up to its
+diagonal, which is one for the floors, and the shapes but for the channel of each mode where it is
+one. L is real, for one force moves all modes in phase; it is signed, in units of a start value:
+neither independent modes nor a single common force is a boundary. A single channel does not tell
+which forces modes share among themselves; there each shares its own with the floor.
 
 Every slope of E has the form E_a = b ω* + ω bᵀ, where b is a column of Φ or a unit vector: a change
 of one component or of one channel. That makes the Hessian a few matrix products.
@@ -43,15 +45,16 @@ _SAMPLES_PER_BANDWIDTH = 12
 _MARGIN_BINS = 20
 _LEAST_BINS = 12.0
 # Where the second derivatives of h stand, by which first ones they are of.
-_SECOND = {(1, 1): 3, (1, 2): 4, (2, 1): 4, (2, 2): 5}
+_SECOND = np.array([[4, 5, 6], [5, 7, 8], [6, 8, 9]])
 
 # Standard deviations of the weak normal priors about the start, which only keep directions
 # that the data do not see from running away: of ln f, ln ζ, forces, shapes, e_c and d_c.
 WEAK = (0.2, 2.0)
 _PRIOR_FORCE = 30.0
-_PRIOR_BACKGROUND = 1.0
+_PRIOR_SHARED = 1.0
+_PRIOR_COMMON = 10.0
 _PRIOR_SHAPE = 30.0
-_PRIOR_NOISE = (5.0, 2.0)
+_PRIOR_FLOOR = (5.0, 2.0, 1.0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -142,77 +145,73 @@ class Layout:
 
     Attributes
     ----------
-    n_modes, n_components, n_channels : int
-        Numbers of modes, of modes and backgrounds, and of channels.
-    force : tuple of (int, int, complex)
-        Row, column and direction, 1 or i, of each unknown of L.
+    n_modes, n_channels : int
+        Numbers of modes and of channels, whose floors are the components after the modes.
+    force : tuple of (int, int)
+        Row and column of each unknown of L.
     shape : tuple of (int, int)
-        Channel and component of each unknown of Φ.
+        Channel and mode of each unknown of the shapes.
     """
 
     n_modes: int
-    n_components: int
     n_channels: int
-    force: tuple[tuple[int, int, complex], ...]
+    force: tuple[tuple[int, int], ...]
     shape: tuple[tuple[int, int], ...]
 
     @property
-    def pole(self) -> tuple[tuple[int, int], ...]:
-        """Component of each of the first unknowns, and which slope of h belongs to it."""
-        m = self.n_modes
-        return tuple(
-            (i % m if i < 2 * m else i - m, 1 + (m <= i < 2 * m)) for i in range(self.n_poles)
-        )
+    def n_components(self) -> int:
+        """Number of modes and floors."""
+        return self.n_modes + self.n_channels
 
     @property
     def n_poles(self) -> int:
-        """Number of the first unknowns, those of h."""
-        return self.n_modes + self.n_components
+        """Number of the first unknowns, those of h: two per mode, three per floor."""
+        return 2 * self.n_modes + 3 * self.n_channels
+
+    @property
+    def pole(self) -> list[tuple[int, int]]:
+        """Component of each of the first unknowns, and which derivative of h belongs to it."""
+        modes = [(i, q) for q in (1, 2) for i in range(self.n_modes)]
+        floors = [(i, q) for i in range(self.n_modes, self.n_components) for q in (1, 2, 3)]
+        return modes + floors
 
     @property
     def forces(self) -> slice:
         """Unknowns of L."""
         return slice(self.n_poles, self.n_poles + len(self.force))
 
+    def prior_force(self, row: int, column: int) -> float:
+        """Give the standard deviation of the prior of an unknown of L."""
+        if row < self.n_modes:
+            return _PRIOR_FORCE
+        return _PRIOR_SHARED if column < self.n_modes else _PRIOR_COMMON
+
     @property
     def shapes(self) -> slice:
-        """Unknowns of Φ."""
-        return slice(self.forces.stop, self.forces.stop + len(self.shape))
+        """Unknowns of the shapes."""
+        return slice(self.forces.stop, self.size)
 
     @property
     def size(self) -> int:
         """Number of unknowns."""
-        return self.shapes.stop + 2 * self.n_channels
+        return self.n_poles + len(self.force) + len(self.shape)
 
 
-def lay_out(n_modes: int, reference: tuple[int, ...], n_channels: int) -> Layout:
+def lay_out(reference: Sequence[int], n_channels: int) -> Layout:
     """Lay the unknowns out.
 
     Parameters
     ----------
-    n_modes : int
-        Components beyond are backgrounds.
-    reference : tuple of int
-        Of each component the channel in which its shape is one.
+    reference : sequence of int
+        Of each mode the channel in which its shape is one.
     n_channels : int
         Number of channels.
     """
-    n = len(reference)
-    force: list[tuple[int, int, complex]] = []
-    for i in range(n):
-        for j in _columns(i, n_modes, n) if n_channels == 1 else range(i + 1):
-            force.append((i, j, 1.0))
-            if j < i and n_channels > 1:
-                force.append((i, j, 1j))
-    shape = tuple((c, i) for i in range(n) for c in range(n_channels) if c != reference[i])
-    return Layout(n_modes, n, n_channels, tuple(force), shape)
-
-
-def _columns(row: int, n_modes: int, n_components: int) -> range:
-    """Columns of L that a single channel tells; of a background its own part is noise."""
-    if n_components == n_modes:
-        return range(max(0, row - 1), row + 1)
-    return range(row, row + 1) if row < n_modes else range(n_modes)
+    m = len(reference)
+    modes = [(i, j) for i in range(m) for j in range(i + 1) if n_channels > 1 or i == j]
+    floors = [(m + c, j) for c in range(n_channels) for j in range(m + c)]
+    shape = [(c, i) for i in range(m) for c in range(n_channels) if c != reference[i]]
+    return Layout(m, n_channels, (*modes, *floors), tuple(shape))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -228,7 +227,7 @@ class Likelihood:
     start : ndarray
         Start value and centre of the priors, shape ``(n_unknowns,)``.
     scale : ndarray
-        Unit of the rows of L, shape ``(n_components,)``.
+        Unit of the rows of L, shape ``(n_components,)``; one for the floors.
     centre : float
         Geometric centre of the band in Hz.
     spread : float
@@ -249,13 +248,9 @@ class Likelihood:
         return np.concatenate(
             [
                 np.repeat(WEAK, lay.n_modes),
-                np.full(lay.n_components - lay.n_modes, _PRIOR_NOISE[1]),
-                [
-                    _PRIOR_FORCE if row < lay.n_modes else _PRIOR_BACKGROUND
-                    for row, _, _ in lay.force
-                ],
+                np.tile(_PRIOR_FLOOR, lay.n_channels),
+                [lay.prior_force(*place) for place in lay.force],
                 np.full(len(lay.shape), _PRIOR_SHAPE),
-                np.tile(_PRIOR_NOISE, lay.n_channels),
             ]
         )
 
@@ -285,7 +280,7 @@ class Likelihood:
         m = self.layout.n_modes
         at = Block(np.exp(p[:m]), np.empty((m, 0, 0), dtype=complex), np.ones(m), None)
         point = _Point(self, p, at)
-        return point.strength[:, :m] / (4 * np.exp(2 * p[m : 2 * m]) * point.noise)
+        return point.strength / (4 * np.exp(2 * p[m : 2 * m]) * point.floor)
 
     def derivatives(self, p: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Exact gradient and Hessian of `value`, shapes ``(n_unknowns,)`` and square."""
@@ -335,36 +330,42 @@ class _Point:
     """The model of a block at one point; frequency is the last axis unless said otherwise."""
 
     def __init__(self, likelihood: Likelihood, p: FloatArray, block: Block) -> None:
-        self._block, lay = block, likelihood.layout
-        self._layout, self._scale = lay, likelihood.scale
+        self._block, self._scale = block, likelihood.scale
+        self._layout = lay = likelihood.layout
         m, n = lay.n_modes, lay.n_components
-        self._force = np.zeros((n, n), dtype=complex)
-        for value, (i, j, direction) in zip(p[lay.forces], lay.force, strict=True):
-            self._force[i, j] += likelihood.scale[i] * value * direction
-        self._phi = np.ones((lay.n_channels, n))
+        self._root = np.zeros((n, n))
+        self._root[range(m, n), range(m, n)] = 1.0
+        for value, (i, j) in zip(p[lay.forces], lay.force, strict=True):
+            self._root[i, j] = self._scale[i] * value
+        self._phi = np.eye(lay.n_channels, n, m)
+        self._phi[:, :m] = 1.0
         for value, (c, i) in zip(p[lay.shapes], lay.shape, strict=True):
             self._phi[c, i] = value
-        on_grid = np.log(block.grid / likelihood.centre) / likelihood.spread
-        # h and its derivatives, shape (6, components, grid).
+        u = np.log(block.grid / likelihood.centre) / likelihood.spread
+        # h and its derivatives, shape (10, components, grid).
         self._h = np.concatenate(
             [
                 receptance(np.exp(p[:m, None]), np.exp(p[m : 2 * m, None]), block.grid),
-                _background(p[2 * m : lay.n_poles, None], on_grid),
+                _floors(p[2 * m : lay.n_poles].reshape(-1, 3), u),
             ],
             axis=1,
         )
-        self._u = np.log(block.frequency / likelihood.centre) / likelihood.spread
-        level, slope = p[lay.shapes.stop :].reshape(-1, 2).T[..., None]
-        self.noise = np.exp(level + slope * self._u)  # (channels, n)
 
     @cached_property
-    def _s(self) -> ComplexArray:
-        return np.asarray(self._force @ self._force.conj().T)
+    def _s(self) -> FloatArray:
+        return np.asarray(self._root @ self._root.T)
 
     @property
     def strength(self) -> FloatArray:
-        """PSD of each force as each channel sees it, shape ``(channels, components)``."""
-        return self._phi**2 * np.diag(self._s).real
+        """PSD of each modal force as each channel sees it, shape ``(channels, modes)``."""
+        m = self._layout.n_modes
+        return self._phi[:, :m] ** 2 * np.diag(self._s)[:m]
+
+    @property
+    def floor(self) -> FloatArray:
+        """PSD of each floor, shape ``(channels, grid)``."""
+        m = self._layout.n_modes
+        return np.abs(self._h[0, m:]) ** 2 * np.diag(self._s)[m:, None]
 
     @cached_property
     def _modal(self) -> ComplexArray:
@@ -375,10 +376,7 @@ class _Point:
     @cached_property
     def expected(self) -> ComplexArray:
         """E, shape ``(n, channels, channels)``."""
-        expected = self._phi @ np.moveaxis(self._modal, -1, 0) @ self._phi.T
-        index = np.arange(self._layout.n_channels)
-        expected[:, index, index] += self.noise.T
-        return expected
+        return np.moveaxis(_congruent(self._phi.T, self._modal), -1, 0).copy()
 
     def derivatives(self) -> tuple[FloatArray, FloatArray]:
         """Gradient and Hessian of the misfit.
@@ -392,39 +390,32 @@ class _Point:
         g = np.moveaxis(count * (inverse - turned), 0, -1)
         y = np.moveaxis(count * (2 * turned - inverse), 0, -1)
         row, w = self._slopes()
-        basis = np.concatenate([self._phi, np.eye(self._layout.n_channels)], axis=1)
-        omega = np.tensordot(basis, w.conj(), axes=(1, 1))  # (channels, unknowns, n)
-        pull = np.tensordot(basis.T, g, axes=(1, 0))  # bᵀ G, (basis, channels, n)
+        # The columns of Φ for the floors are the unit vectors of the channels.
+        omega = np.tensordot(self._phi, w.conj(), axes=(1, 1))  # (channels, unknowns, n)
+        pull = np.tensordot(self._phi.T, g, axes=(1, 0))  # bᵀ G, (components, channels, n)
         gradient = 2 * np.einsum("cak,ack->a", omega, pull[row]).real
-        hessian = _products(basis, row, omega, np.moveaxis(inverse, 0, -1), y)
+        hessian = _products(self._phi, row, omega, np.moveaxis(inverse, 0, -1), y)
         return gradient, hessian + self._curvature(w, g)
 
     def _slopes(self) -> tuple[np.ndarray, ComplexArray]:
         """Rows of the slopes of E in the basis of Φ's columns and the channels.
 
-        Of each unknown the index of b and its row w, E_a = b (basis w)ᵀ and its adjoint, shapes
-        ``(unknowns,)`` and ``(unknowns, components + channels, n)``.
+        Of each unknown the index of b in the basis and its row w, E_a = b (Φ w)ᵀ and its adjoint,
+        shapes ``(unknowns,)`` and ``(unknowns, components, n)``.
         """
-        lay, m, h = self._layout, self._layout.n_components, self._h
+        lay, h = self._layout, self._h
         row = np.zeros(lay.size, dtype=int)
-        w = np.zeros((lay.size, m + lay.n_channels, self._block.frequency.size), dtype=complex)
-        adjoint = h[0].conj()
+        w = np.zeros((lay.size, lay.n_components, self._block.frequency.size), dtype=complex)
+        pairs = self._block.smear(h[0][:, None] * h[0][None].conj())
         for a, (i, q) in enumerate(lay.pole):
             row[a] = i
-            w[a, :m] = self._block.smear(self._s[i, :, None] * h[q, i] * adjoint)
-        pairs = self._block.smear(h[0][:, None] * adjoint[None])
-        for a, (i, j, direction) in enumerate(lay.force, start=lay.forces.start):
+            w[a] = self._block.smear(self._s[i, :, None] * h[q, i] * h[0].conj())
+        for a, (i, j) in enumerate(lay.force, start=lay.forces.start):
             row[a] = i
-            pull = self._scale[i] * direction * self._force[:, j].conj()
-            w[a, :m] = pull[:, None] * pairs[i]
+            w[a] = self._scale[i] * self._root[:, j, None] * pairs[i]
         for a, (c, i) in enumerate(lay.shape, start=lay.shapes.start):
-            row[a] = m + c
-            w[a, :m] = self._modal[i]
-        for c in range(lay.n_channels):
-            a = lay.shapes.stop + 2 * c
-            row[a : a + 2] = m + c
-            w[a, m + c] = 0.5 * self.noise[c]
-            w[a + 1, m + c] = 0.5 * self.noise[c] * self._u
+            row[a] = lay.n_modes + c
+            w[a] = self._modal[i]
         return row, w
 
     def _curvature(self, w: ComplexArray, g: ComplexArray) -> FloatArray:
@@ -440,20 +431,12 @@ class _Point:
         self._by_forces(curvature, turned)
         if lay.shape:
             self._by_shapes(curvature, w, g, pull)
-        for c in range(lay.n_channels):
-            own = g[c, c].real * self.noise[c]
-            at = lay.shapes.stop + 2 * c
-            cross = float(own @ self._u)
-            curvature[at : at + 2, at : at + 2] += [
-                [own.sum(), cross],
-                [cross, own @ self._u**2],
-            ]
         return curvature
 
     def _by_poles(self, curvature: FloatArray, turned: ComplexArray) -> None:
         """By two unknowns of h: Q = Σ_ij S_ij B_ji h_i h_j*."""
         h, n = self._h, self._layout.n_poles
-        component, slope = np.array(self._layout.pole, dtype=int).reshape(-1, 2).T
+        component, slope = np.array(self._layout.pole, dtype=int).T
         weight = self._s[..., None] * turned
         first = h[slope, component]
         pairs = weight[component[:, None], component]
@@ -461,29 +444,28 @@ class _Point:
         pull = np.sum(weight * h[0].conj()[None], axis=1)
         for a in range(n):
             for b in np.flatnonzero(component == component[a]):
-                term[a, b] += pull[component[a]] @ h[_SECOND[slope[a], slope[b]], component[a]]
+                term[a, b] += (
+                    pull[component[a]] @ h[_SECOND[slope[a] - 1, slope[b] - 1], component[a]]
+                )
         curvature[:n, :n] += 2 * term.real
 
     def _by_forces(self, curvature: FloatArray, turned: ComplexArray) -> None:
         """By two forces, and by a force and an unknown of h."""
         lay, h = self._layout, self._h
-        overlap = np.einsum("ijk,ik,jk->ij", turned, h[0], h[0].conj())
+        overlap = np.einsum("ijk,ik,jk->ij", turned, h[0], h[0].conj()).real
         start = lay.forces.start
-        for a, (i, j, alpha) in enumerate(lay.force, start=start):
-            for b, (k, column, beta) in enumerate(lay.force, start=start):
+        for a, (i, j) in enumerate(lay.force, start=start):
+            for b, (k, column) in enumerate(lay.force, start=start):
                 if j == column:
-                    unit = self._scale[i] * self._scale[k] * alpha * np.conj(beta)
-                    curvature[a, b] += 2 * (unit * overlap[i, k]).real
-        component, slope = np.array(lay.pole, dtype=int).reshape(-1, 2).T
-        mixed = np.einsum("ajk,ak,jk->aj", turned[component], h[slope, component], h[0].conj())
-        for a, (i, j, alpha) in enumerate(lay.force, start=start):
+                    curvature[a, b] += 2 * self._scale[i] * self._scale[k] * overlap[i, k]
+        component, slope = np.array(lay.pole, dtype=int).T
+        mixed = np.einsum("ajk,ak,jk->aj", turned[component], h[slope, component], h[0].conj()).real
+        for a, (i, j) in enumerate(lay.force, start=start):
             # S changes in row and column i.
-            change = self._scale[i] * alpha * self._force[:, j].conj()
-            term = (
-                np.where(component == i, mixed @ change, 0) + change.conj()[component] * mixed[:, i]
-            )
-            curvature[a, : lay.n_poles] += 2 * term.real
-            curvature[: lay.n_poles, a] += 2 * term.real
+            change = self._scale[i] * self._root[:, j]
+            term = np.where(component == i, mixed @ change, 0) + change[component] * mixed[:, i]
+            curvature[a, : lay.n_poles] += 2 * term
+            curvature[: lay.n_poles, a] += 2 * term
 
     def _by_shapes(
         self, curvature: FloatArray, w: ComplexArray, g: ComplexArray, pull: ComplexArray
@@ -494,7 +476,7 @@ class _Point:
         own = np.tensordot(self._modal, g, axes=(2, 2))  # (i, j, d, c)
         own = own[mode[:, None], mode, channel, channel[:, None]]
         curvature[lay.shapes, lay.shapes] += 2 * own.real
-        inner = w[: lay.shapes.start, :m]
+        inner = w[: lay.shapes.start]
         along = np.einsum("ajk,jck->ac", inner, pull)
         across = np.tensordot(inner.conj(), pull, axes=(2, 2))  # (a, i, r, c)
         row = np.array([i for i, *_ in (*lay.pole, *lay.force)], dtype=int)
@@ -558,17 +540,19 @@ def _misfit(block: Block, expected: ComplexArray) -> float:
     return float(block.count @ (log_det + np.trace(white, axis1=-2, axis2=-1).real))
 
 
-def _background(slope: FloatArray, u: FloatArray) -> ComplexArray:
-    """Response exp(s u) and its derivatives by s, in the places of those by ln f."""
-    h = np.exp(slope * u)
-    none = np.zeros_like(h)
-    return np.stack([h, u * h, none, u * u * h, none, none]).astype(complex)
+def _floors(p: FloatArray, u: FloatArray) -> ComplexArray:
+    """Response exp((e + d u + b u²) / 2) of floors with these unknowns, as `receptance` has it."""
+    basis = np.stack([np.ones_like(u), u, u * u]) / 2
+    h = np.exp(p @ basis)
+    pairs = [basis[a] * basis[b] for a in range(3) for b in range(a, 3)]
+    return np.stack([h, *(h * slope for slope in [*basis, *pairs])]).astype(complex)
 
 
 def receptance(f: FloatArray, zeta: FloatArray, frequency: FloatArray) -> ComplexArray:
     """Acceleration response h of modes and its derivatives by x = ln f and z = ln ζ.
 
-    Returns an array of shape ``(6, …, n)``: h, h_x, h_z, h_xx, h_xz, h_zz. With d = 1/h,
+    Returns an array of shape ``(10, …, n)``: h, its first derivatives by three unknowns and its
+    second ones (11, 12, 13, 22, 23, 33), of which the third does not exist here. With d = 1/h,
     h_a = -d_a h² and h_ab = (2 d_a d_b h - d_ab) h².
     """
     beta = f / frequency
@@ -576,13 +560,18 @@ def receptance(f: FloatArray, zeta: FloatArray, frequency: FloatArray) -> Comple
     h = 1 / (1 - beta**2 + damping)
     d_x, d_xx = damping - 2 * beta**2, damping - 4 * beta**2
     square = h * h
+    none = np.zeros_like(h)
     return np.stack(
         [
             h,
             -d_x * square,
             -damping * square,
+            none,
             (2 * d_x * d_x * h - d_xx) * square,
             (2 * d_x * damping * h - damping) * square,
+            none,
             (2 * damping * damping * h - damping) * square,
+            none,
+            none,
         ]
     )
