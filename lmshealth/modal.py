@@ -111,7 +111,8 @@ def _choose_channels(log: Log, names: Sequence[str] | None) -> tuple[Channel, ..
         usable = tuple(channel for channel in usable if channel.name in names)
     if not usable:
         raise BadLog(log.name, "no-signal", "no delta_e or acc channel is left to analyse")
-    return usable
+    # The order in which a file has its channels decides nothing, not even a rounding.
+    return tuple(sorted(usable, key=lambda channel: channel.name))
 
 
 def _stage_targets(stage: Stage, band: tuple[float, float] | None) -> tuple[Target, ...]:

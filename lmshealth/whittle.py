@@ -2,10 +2,10 @@
 
 The acceleration of mode i under a white modal force is h_i(f) = 1 / (1 - β² + 2iζβ), β = f_i/f.
 What a channel shows beside the modes, its floor, is h_c(f) = exp((e_c + d_c u + b_c u²) / 2) with
-u = -1 … 1 over the band. Modes and floors are driven by partly common forces: the floor of a channel is the
-tail of other modes and the motion of rigid bodies as well as noise, and it interferes with the
-modes. Each channel sees each mode by its shape φ. The ordinates of all channels at one frequency
-are then complex normal with the matrix
+u = -1 … 1 over the band. Modes and floors are driven by partly common forces: the floor of a
+channel is the tail of other modes and the motion of rigid bodies as well as noise, and it
+interferes with the modes. Each channel sees each mode by its shape φ. The ordinates of all
+channels at one frequency are then complex normal with the matrix
 
     E(f) = Φ D(f) Φᵀ,   D_ij = S_ij h_i h_j*,   S = L Lᵀ,   Φ = [shapes, 1],
 
@@ -14,11 +14,10 @@ between them:
 
     -ln p = Σ n (ln det E + tr E⁻¹ W).
 
-Unknowns, in this order: ln f (m), ln ζ (m), e_c, d_c and b_c of each channel, L row by row up to its
-diagonal, which is one for the floors, and the shapes but for the channel of each mode where it is
-one. L is real, for one force moves all modes in phase; it is signed, in units of a start value:
-neither independent modes nor a single common force is a boundary. A single channel does not tell
-which forces modes share among themselves; there each shares its own with the floor.
+Unknowns, in this order: ln f (m), ln ζ (m), e_c, d_c and b_c of each channel, L row by row up to
+its diagonal, which is one for the floors, and the shapes but for the channel of each mode where it
+is one. L is real, for one force moves all modes in phase; it is signed, in units of a start value:
+neither independent modes nor a single common force is a boundary.
 
 Every slope of E has the form E_a = b ω* + ω bᵀ, where b is a column of Φ or a unit vector: a change
 of one component or of one channel. That makes the Hessian a few matrix products.
@@ -208,7 +207,8 @@ def lay_out(reference: Sequence[int], n_channels: int) -> Layout:
         Number of channels.
     """
     m = len(reference)
-    modes = [(i, j) for i in range(m) for j in range(i + 1) if n_channels > 1 or i == j]
+    # A single channel tells no more than which forces neighbours share.
+    modes = [(i, j) for i in range(m) for j in range(i + 1) if n_channels > 1 or i - j < 2]
     floors = [(m + c, j) for c in range(n_channels) for j in range(m + c)]
     shape = [(c, i) for i in range(m) for c in range(n_channels) if c != reference[i]]
     return Layout(m, n_channels, (*modes, *floors), tuple(shape))
@@ -363,9 +363,10 @@ class _Point:
 
     @property
     def floor(self) -> FloatArray:
-        """PSD of each floor, shape ``(channels, grid)``."""
+        """PSD of what each floor does not share with a mode, shape ``(channels, grid)``."""
         m = self._layout.n_modes
-        return np.abs(self._h[0, m:]) ** 2 * np.diag(self._s)[m:, None]
+        own = np.sum(self._root[m:, m:] ** 2, axis=1)
+        return np.abs(self._h[0, m:]) ** 2 * own[:, None]
 
     @cached_property
     def _modal(self) -> ComplexArray:
@@ -471,7 +472,7 @@ class _Point:
         self, curvature: FloatArray, w: ComplexArray, g: ComplexArray, pull: ComplexArray
     ) -> None:
         """By two shapes, and by a shape and what D depends on."""
-        lay, m = self._layout, self._layout.n_components
+        lay = self._layout
         channel, mode = np.array(lay.shape).T
         own = np.tensordot(self._modal, g, axes=(2, 2))  # (i, j, d, c)
         own = own[mode[:, None], mode, channel, channel[:, None]]
