@@ -9,9 +9,11 @@ import numpy as np
 from scipy.stats import gamma
 
 from lmshealth.arrays import BoolArray, ComplexArray, FloatArray
+from lmshealth.blocks import Block, make_block
+from lmshealth.posterior import marginalise
 from lmshealth.spectra import CrossSpectrum, Spectrum
 from lmshealth.starts import Coarse, Target
-from lmshealth.whittle import Block, Likelihood, lay_out, make_block
+from lmshealth.whittle import Likelihood, lay_out
 
 # The band of a fit reaches this many damping ratios from its modes: beyond, a resonance adds
 # little, and the noise need not be as simple as the model says.
@@ -28,6 +30,8 @@ _WORST_STD_LN_F = 0.03
 _WORST_STD_LN_ZETA = 0.7
 # A damping off its start by more than this factor belongs to something else.
 _DAMPING_SPAN = 6.0
+# Newton decrement of a fit that has arrived.
+_WORST_DECREMENT = 1e-2
 _HEAVY = 0.1  # and above this, a hump that nobody expected is no mode
 # A shape begins by the sign it has within so many damping ratios of the resonance.
 _NEAR = 1.5
@@ -432,16 +436,10 @@ def _expected(band: _Band, solution: _Solution) -> list[ComplexArray]:
 def _conclude(
     band: _Band, seen: tuple[Target, ...], solution: _Solution, missing: Missing
 ) -> BandFit | None:
-    """Turn the posterior mode into estimates with the inverse Hessian as covariance."""
+    """Turn the posterior into estimates with their covariance."""
     m, p, likelihood = len(seen), solution.p, solution.likelihood
-    gradient, hessian = likelihood.derivatives(p)
-    try:
-        factor = np.linalg.cholesky(hessian)
-        decrement = float(np.sum(np.linalg.solve(factor, gradient) ** 2))
-        cov = np.asarray(np.linalg.inv(hessian)[: 2 * m, : 2 * m], dtype=np.float64)
-    except np.linalg.LinAlgError:
-        decrement, cov = np.inf, np.full((2 * m, 2 * m), np.nan)
-    if not decrement < 1e-2:
+    estimate, cov, decrement = marginalise(likelihood, p)
+    if not decrement < _WORST_DECREMENT:
         detail = f"the fit did not reach a maximum (decrement {decrement:.2g}); record longer"
         missing.update({t.name: ("not-identified", detail) for t in seen})
         return None
@@ -450,7 +448,7 @@ def _conclude(
     return BandFit(
         view=band.view,
         targets=seen,
-        estimate=p[: 2 * m],
+        estimate=estimate,
         cov=cov,
         snr=ratio.sum(axis=0),
         best=tuple(names[c] for c in ratio.argmax(axis=0)),

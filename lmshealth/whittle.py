@@ -32,110 +32,20 @@ from functools import cached_property
 import numpy as np
 from scipy.optimize import minimize
 
-from lmshealth.arrays import BoolArray, ComplexArray, FloatArray
-from lmshealth.spectra import CrossSpectrum, Kernel, make_kernel
+from lmshealth.arrays import ComplexArray, FloatArray
+from lmshealth.blocks import Block
 
-# Below this many half-power bandwidths times duration the expected periodogram replaces the
-# density: the record no longer resolves the resonance.
-_RESOLVED = 20.0
-# The density is sampled this finely per half-power bandwidth; the kernel itself asks for two
-# samples per Fourier bin, and its tails end this many bins outside the band.
-_SAMPLES_PER_BANDWIDTH = 12
-_MARGIN_BINS = 20
-_LEAST_BINS = 12.0
 # Where the second derivatives of h stand, by which first ones they are of.
 _SECOND = np.array([[4, 5, 6], [5, 7, 8], [6, 8, 9]])
 
-# Standard deviations of the weak normal priors about the start, which only keep directions
-# that the data do not see from running away: of ln f, ln ζ, forces, shapes, e_c and d_c.
+# Standard deviations of the weak normal priors about the start, which only keep directions that
+# the data do not see from running away: of ln f, ln ζ, forces, shapes, floors.
 WEAK = (0.2, 2.0)
 _PRIOR_FORCE = 30.0
 _PRIOR_SHARED = 1.0
-_PRIOR_COMMON = 10.0
+_PRIOR_COMMON = 3.0
 _PRIOR_SHAPE = 30.0
 _PRIOR_FLOOR = (5.0, 2.0, 1.0)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Block:
-    """Ordinates of segments of one length within the band, each a mean of some neighbours.
-
-    Attributes
-    ----------
-    frequency : ndarray
-        Mean frequency in Hz, shape ``(n,)``.
-    matrix : ndarray
-        Means of F F*, F the transform of all channels, shape ``(n, n_channels, n_channels)``.
-    count : ndarray
-        How many ordinates of single segments each mean is of, shape ``(n,)``.
-    kernel : Kernel or None
-        Density to expected periodogram; None where they are the same.
-    """
-
-    frequency: FloatArray
-    matrix: ComplexArray
-    count: FloatArray
-    kernel: Kernel | None
-
-    @property
-    def grid(self) -> FloatArray:
-        """Where the density is evaluated, in Hz, shape ``(n_grid,)``."""
-        return self.frequency if self.kernel is None else self.kernel.grid
-
-    def smear(self, density: ComplexArray) -> ComplexArray:
-        """Turn densities on the grid, frequency last, into expectations."""
-        return density if self.kernel is None else self.kernel.expect(density)
-
-
-def make_block(
-    spectra: Sequence[CrossSpectrum], keep: Sequence[BoolArray], bandwidth: float, *, merge: bool
-) -> Block:
-    """Prepare the ordinates of segments of one length for the likelihood.
-
-    It needs of each frequency the mean over the spectra that are kept there, and their number.
-
-    Parameters
-    ----------
-    spectra : sequence of CrossSpectrum
-        Of the same frequencies, cut to the band.
-    keep : sequence of ndarray of bool
-        Ordinates of each that hold no line, shape ``(n_ordinates,)``.
-    bandwidth : float
-        Smallest half-power bandwidth 2ζf expected, in Hz: decides whether the record resolves it.
-    merge : bool
-        Whether neighbours may be averaged where the density hardly changes between them.
-    """
-    first = spectra[0]
-    count = np.zeros(first.frequency.size)
-    total = np.zeros_like(first.matrix)
-    for spectrum, mask in zip(spectra, keep, strict=True):
-        count += spectrum.count * mask
-        total += (spectrum.count * mask)[:, None, None] * spectrum.matrix
-    kept: BoolArray = count > 0
-    frequency, count, total = first.frequency[kept], count[kept], total[kept]
-    resolution = bandwidth * first.duration
-    if resolution < _RESOLVED:
-        finer = int(np.clip(np.ceil(_SAMPLES_PER_BANDWIDTH / resolution), 2, 12))
-        kernel = make_kernel(first, kept, finer, _MARGIN_BINS)
-        return Block(frequency, total / count[:, None, None], count, kernel)
-    n_segments = sum(spectrum.count for spectrum in spectra)
-    together = int(resolution / _bins_per_bandwidth(n_segments * resolution)) if merge else 1
-    if together > 1:
-        starts = np.arange(0, frequency.size, together)
-        weight = np.add.reduceat(count, starts)
-        frequency = np.add.reduceat(count * frequency, starts) / weight
-        total, count = np.add.reduceat(total, starts, axis=0), weight
-    return Block(frequency, total / count[:, None, None], count, None)
-
-
-def _bins_per_bandwidth(resolution: float) -> float:
-    """How finely a resonance must be sampled when neighbours are averaged.
-
-    The mean over a bin of the r-th part of the half-power bandwidth is below the peak by the share
-    1/(3r²), and the damping too wide by as much, of which the standard deviation is
-    (π B T)^-½; a thirtieth of it does not matter.
-    """
-    return max(_LEAST_BINS, float(np.sqrt(10.0 * np.sqrt(np.pi * resolution))))
 
 
 @dataclass(frozen=True, slots=True)
@@ -184,6 +94,23 @@ class Layout:
         if row < self.n_modes:
             return _PRIOR_FORCE
         return _PRIOR_SHARED if column < self.n_modes else _PRIOR_COMMON
+
+    @property
+    def shared(self) -> list[int]:
+        """Unknowns of L by which floors share the forces of modes."""
+        m, first = self.n_modes, self.forces.start
+        return [first + a for a, (i, j) in enumerate(self.force) if i >= m > j]
+
+    @property
+    def common(self) -> list[int]:
+        """Unknowns of L by which floors share the forces of other floors."""
+        m, first = self.n_modes, self.forces.start
+        return [first + a for a, (_, j) in enumerate(self.force) if j >= m]
+
+    @property
+    def bends(self) -> list[int]:
+        """Unknowns b of the floors."""
+        return list(range(2 * self.n_modes + 2, self.n_poles, 3))
 
     @property
     def shapes(self) -> slice:
