@@ -6,25 +6,38 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.stats import gamma
 
-from lmshealth.arrays import BoolArray, ComplexArray, FloatArray
-from lmshealth.blocks import Block, make_block
+from lmshealth.arrays import ComplexArray, FloatArray
+from lmshealth.band import (
+    ABSENT,
+    LINE_BINS,
+    Band,
+    Sighting,
+    View,
+    alike,
+    find_sightings,
+    index_of_most,
+    make_blocks,
+    mask_lines,
+    mask_towers,
+    prepare,
+    read_sighting,
+    sign,
+)
+from lmshealth.blocks import Block
+from lmshealth.layout import lay_out
 from lmshealth.posterior import marginalise
-from lmshealth.spectra import CrossSpectrum, Spectrum
+from lmshealth.spectra import Spectrum
 from lmshealth.starts import Coarse, Target
-from lmshealth.whittle import Likelihood, lay_out
+from lmshealth.whittle import Likelihood
 
 # The band of a fit reaches this many damping ratios from its modes: beyond, a resonance adds
 # little, and the noise need not be as simple as the model says.
 BAND = 8.0
-# Probability that noise alone makes a line somewhere in the band.
-_LINE_FALSE_ALARM = 1e-3
-_LINE_BINS = 2
 _MOST_LINE_ROUNDS = 4
-# Binned log likelihood gained by a mode: below the first it is absent, above the second beyond
-# doubt, between them it is fitted both ways.
-_ABSENT, _BEYOND_DOUBT = 3.0, 60.0
+# Binned log likelihood gained by a mode: above this it is beyond doubt, between `ABSENT` and this
+# it is fitted both ways.
+_BEYOND_DOUBT = 60.0
 _EVIDENCE_MARGIN = 10.0
 _WORST_STD_LN_F = 0.03
 _WORST_STD_LN_ZETA = 0.7
@@ -33,57 +46,6 @@ _DAMPING_SPAN = 6.0
 # Newton decrement of a fit that has arrived.
 _WORST_DECREMENT = 1e-2
 _HEAVY = 0.1  # and above this, a hump that nobody expected is no mode
-# A shape begins by the sign it has within so many damping ratios of the resonance.
-_NEAR = 1.5
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class View:
-    """A log in the frequency domain.
-
-    Attributes
-    ----------
-    channels, sources : tuple of str
-        Names, and ``acc`` or ``delta_e``.
-    spectra : tuple of CrossSpectrum
-        Of its segments, or means over several.
-    """
-
-    channels: tuple[str, ...]
-    sources: tuple[str, ...]
-    spectra: tuple[CrossSpectrum, ...]
-
-    @property
-    def source(self) -> str:
-        """The source of all channels, or ``joint``."""
-        return self.sources[0] if len(set(self.sources)) == 1 else "joint"
-
-    def single(self, index: int) -> tuple[Spectrum, ...]:
-        """Give the spectra of one channel."""
-        return tuple(spectrum.channel(index) for spectrum in self.spectra)
-
-    def only(self, index: Sequence[int]) -> View:
-        """Keep some channels."""
-        pick = np.ix_(index, index)
-        return View(
-            tuple(self.channels[c] for c in index),
-            tuple(self.sources[c] for c in index),
-            tuple(replace(s, matrix=s.matrix[(slice(None), *pick)]) for s in self.spectra),
-        )
-
-    def band(self, low: float, high: float) -> View:
-        """Cut out a band in Hz."""
-        cut = (spectrum.band(low, high) for spectrum in self.spectra)
-        return replace(self, spectra=tuple(s for s in cut if s.frequency.size))
-
-
-@dataclass(frozen=True, slots=True)
-class Sighting:
-    """A line in a channel: frequency in Hz, amplitude in m/s²."""
-
-    channel: str
-    frequency: float
-    amplitude: float
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -140,31 +102,6 @@ class BandFit:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Band:
-    """What a cluster is fitted to.
-
-    Attributes
-    ----------
-    view : View
-        The band, of the channels that see any of the modes, each in units of its noise.
-    unit : ndarray
-        Root of the noise in (m/s²)/Hz^½, shape ``(n_channels,)``.
-    coarse : tuple of Coarse
-        Their binned spectra in the same units.
-    masks : list of ndarray of bool
-        Ordinates of each spectrum that hold no line.
-    width : float
-        Smallest half-power bandwidth expected, in Hz.
-    """
-
-    view: View
-    unit: FloatArray
-    coarse: tuple[Coarse, ...]
-    masks: list[BoolArray]
-    width: float
-
-
-@dataclass(frozen=True, slots=True, eq=False)
 class _Solution:
     likelihood: Likelihood
     p: FloatArray
@@ -207,20 +144,22 @@ def fit_band(
     if n < needed:
         detail = f"{n} Fourier frequencies in the band, needed {needed}: record longer"
         return None, missing | {t.name: ("too-short", detail) for t in seen}
-    band = _prepare(cut, coarse, seen)
-    _mask_towers(band)
+    band = prepare(cut, coarse, seen)
+    mask_towers(band)
     for _ in range(_MOST_LINE_ROUNDS):
         solution, seen = _fit_and_prune(band, seen, gains, missing)
         if not seen:
             return None, missing
         expected = _expected(band, solution)
-        if not _mask_lines(band, expected):
+        if not mask_lines(band, expected):
             break
     fit = _conclude(band, seen, solution, missing)
     if fit is None:
         return None, missing
     clarity = np.array([gains[target.name] for target in seen])
-    fit = replace(fit, clarity=clarity, lines=_lines(band), residual=_residual(band, expected))
+    fit = replace(
+        fit, clarity=clarity, lines=find_sightings(band), residual=_residual(band, expected)
+    )
     return _keep_credible(fit, band.unit, missing), missing
 
 
@@ -254,40 +193,14 @@ def _screen(
         losses = [_misfit(coarse, kept[:i] + kept[i + 1 :]) - full for i in range(len(kept))]
         gains |= {t.name: loss for t, loss in zip(kept, losses, strict=True)}
         worst = int(np.argmin(losses))
-        if losses[worst] >= _ABSENT:
+        if losses[worst] >= ABSENT:
             break
         kept = kept[:worst] + kept[worst + 1 :]
     return kept, gains
 
 
-def _prepare(view: View, coarse: tuple[Coarse, ...], seen: tuple[Target, ...]) -> _Band:
-    """Choose the channels that see any of the modes, and put each in units of its noise."""
-    gains = [channel.misfit(()) - channel.misfit(seen) for channel in coarse]
-    index = [c for c, gain in enumerate(gains) if gain >= _ABSENT] or [int(np.argmax(gains))]
-    used = [coarse[c] for c in index]
-    noise = np.array([max(c.strengths(seen)[1], 1e-2 * c.level.min()) for c in used])
-    unit = np.sqrt(noise)
-    chosen = view.only(index)
-    spectra = tuple(replace(s, matrix=s.matrix / np.outer(unit, unit)) for s in chosen.spectra)
-    return _Band(
-        replace(chosen, spectra=spectra),
-        unit,
-        tuple(replace(c, level=c.level / n) for c, n in zip(used, noise, strict=True)),
-        [s.free.copy() for s in spectra],
-        min(2 * t.frequency * t.damping_ratio for t in seen),
-    )
-
-
-def _alike(spectra: Sequence[CrossSpectrum]) -> list[list[int]]:
-    """Group the indices of spectra that have the same frequencies."""
-    groups: dict[tuple[float, int], list[int]] = {}
-    for i, spectrum in enumerate(spectra):
-        groups.setdefault((spectrum.duration, spectrum.frequency.size), []).append(i)
-    return list(groups.values())
-
-
 def _fit_and_prune(
-    band: _Band, seen: tuple[Target, ...], gains: dict[str, float], missing: Missing
+    band: Band, seen: tuple[Target, ...], gains: dict[str, float], missing: Missing
 ) -> tuple[_Solution, tuple[Target, ...]]:
     """Fit all modes seen; leave out, one by one, those that the evidence does not ask for."""
     n_ordinates = sum(
@@ -299,7 +212,7 @@ def _fit_and_prune(
         extra = full.p.size - less.p.size
         return float(2 * (less.misfit - full.misfit) - extra * np.log(n_ordinates))
 
-    blocks = _blocks(band, merge=True)
+    blocks = make_blocks(band, merge=True)
     solution = _solve(band, blocks, seen)
     while seen:
         doubtful = [i for i, t in enumerate(seen) if gains[t.name] < _BEYOND_DOUBT]
@@ -313,20 +226,7 @@ def _fit_and_prune(
     return solution, seen
 
 
-def _blocks(band: _Band, *, merge: bool) -> tuple[Block, ...]:
-    spectra = band.view.spectra
-    return tuple(
-        make_block(
-            [spectra[i] for i in group],
-            [band.masks[i] for i in group],
-            band.width,
-            merge=merge,
-        )
-        for group in _alike(spectra)
-    )
-
-
-def _solve(band: _Band, blocks: tuple[Block, ...], targets: tuple[Target, ...]) -> _Solution:
+def _solve(band: Band, blocks: tuple[Block, ...], targets: tuple[Target, ...]) -> _Solution:
     """Find the posterior mode for a set of modes by a trust-region Newton method."""
     n_channels = len(band.coarse)
     zeta = np.array([target.damping_ratio for target in targets])
@@ -347,7 +247,7 @@ def _solve(band: _Band, blocks: tuple[Block, ...], targets: tuple[Target, ...]) 
             np.zeros(layout.n_poles - 2 * len(targets)),
             [float(i == j) for i, j in layout.force],
             [
-                _sign(blocks, targets[i], c, reference[i]) * amplitude[c, i] / scale[i]
+                sign(blocks, targets[i], c, reference[i]) * amplitude[c, i] / scale[i]
                 for c, i in layout.shape
             ],
         ]
@@ -366,66 +266,14 @@ def _solve(band: _Band, blocks: tuple[Block, ...], targets: tuple[Target, ...]) 
     return _Solution(likelihood, p, likelihood.data_value(p))
 
 
-def _sign(blocks: tuple[Block, ...], target: Target, channel: int, reference: int) -> float:
-    """Tell whether two channels move alike where a mode stands."""
-    low, high = target.band(_NEAR)
-    alike = 0.0
-    for block in blocks:
-        near = (block.frequency >= low) & (block.frequency <= high)
-        alike += float(block.count[near] @ block.matrix[near, channel, reference].real)
-    return 1.0 if alike >= 0 else -1.0
-
-
-def _mask_towers(band: _Band) -> None:
-    """Mask lines that tower over the medians around them, before a mode can settle on one.
-
-    A mode that takes a strong line for its resonance leaves its own to its neighbour, which then
-    bears the wrong name. Twice the threshold leaves room for what the bins do not resolve. A lone
-    mode whose damping is below about 1/15 of its nominal one stands as narrow as a line, and may
-    lose its own peak.
-    """
-    levels = [
-        np.stack([np.interp(s.frequency, c.frequency, c.level) for c in band.coarse], axis=-1)
-        for s in band.view.spectra
-    ]
-    _mask_above(band, [2 * level for level in levels])
-
-
-def _mask_lines(band: _Band, expected: list[ComplexArray]) -> bool:
-    """Mask ordinates that noise would not reach; tell whether there were new ones."""
-    return _mask_above(band, [np.diagonal(e, axis1=1, axis2=2).real for e in expected])
-
-
-def _mask_above(band: _Band, levels: list[FloatArray]) -> bool:
-    """Mask lines with their feet, wherever a channel shows one; tell whether there were any.
-
-    ``levels`` holds what noise would have in the mean, shape ``(n_ordinates, n_channels)`` each.
-    """
-    n_tests = len(band.coarse) * sum(int(mask.sum()) for mask in band.masks)
-    kept = [mask.copy() for mask in band.masks]
-    found = False
-    for spectrum, keep, level in zip(band.view.spectra, kept, levels, strict=True):
-        highest = gamma.isf(_LINE_FALSE_ALARM / n_tests, spectrum.count) / spectrum.count
-        ordinates = np.diagonal(spectrum.matrix, axis1=1, axis2=2).real
-        lines = keep & (ordinates > highest * level).any(axis=1)
-        found = found or bool(lines.any())
-        for k in np.flatnonzero(lines).tolist():
-            keep[max(0, k - _LINE_BINS) : k + _LINE_BINS + 1] = False
-    # A band that is mostly lines is no band of modes: keep at least half of it.
-    if sum(int(keep.sum()) for keep in kept) < sum(int(mask.sum()) for mask in band.masks) // 2:
-        return False
-    band.masks[:] = kept
-    return found
-
-
-def _expected(band: _Band, solution: _Solution) -> list[ComplexArray]:
+def _expected(band: Band, solution: _Solution) -> list[ComplexArray]:
     """Give what each spectrum is expected to be over its band; infinite where it is masked."""
-    likelihood = replace(solution.likelihood, blocks=_blocks(band, merge=False))
+    likelihood = replace(solution.likelihood, blocks=make_blocks(band, merge=False))
     n_channels = len(band.coarse)
     nothing = np.diag(np.full(n_channels, np.inf)).astype(complex)
     full = [np.tile(nothing, (mask.size, 1, 1)) for mask in band.masks]
     for group, values in zip(
-        _alike(band.view.spectra), likelihood.expected(solution.p), strict=True
+        alike(band.view.spectra), likelihood.expected(solution.p), strict=True
     ):
         kept = np.any([band.masks[i] for i in group], axis=0)
         for i in group:
@@ -434,7 +282,7 @@ def _expected(band: _Band, solution: _Solution) -> list[ComplexArray]:
 
 
 def _conclude(
-    band: _Band, seen: tuple[Target, ...], solution: _Solution, missing: Missing
+    band: Band, seen: tuple[Target, ...], solution: _Solution, missing: Missing
 ) -> BandFit | None:
     """Turn the posterior into estimates with their covariance."""
     m, p, likelihood = len(seen), solution.p, solution.likelihood
@@ -458,9 +306,9 @@ def _conclude(
     )
 
 
-def _residual(band: _Band, expected: list[ComplexArray]) -> Spectrum:
+def _residual(band: Band, expected: list[ComplexArray]) -> Spectrum:
     """Compare the ordinates that saw most with what is expected: tr E⁻¹ W over the channels."""
-    most = _most(band.view.spectra)
+    most = index_of_most(band.view.spectra)
     spectrum, mask = band.view.spectra[most], band.masks[most]
     n_channels = len(band.coarse)
     ratio = np.ones(mask.size)
@@ -469,36 +317,11 @@ def _residual(band: _Band, expected: list[ComplexArray]) -> Spectrum:
     return replace(spectrum.channel(0), periodogram=ratio, count=spectrum.count * n_channels)
 
 
-def _most(spectra: Sequence[CrossSpectrum]) -> int:
-    """Index of the spectrum that saw most."""
-    return int(np.argmax([s.observed for s in spectra]))
-
-
-def _lines(band: _Band) -> tuple[Sighting, ...]:
-    """Tell what was masked where most was seen, in the channels that show it best."""
-    most = _most(band.view.spectra)
-    masked = band.view.spectra[most].free & ~band.masks[most]
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], masked.astype(int), [0]])))
-    return tuple(
-        _sighting(band.view, band.unit, int(a), int(b))
-        for a, b in zip(edges[::2], edges[1::2], strict=True)
-    )
-
-
-def _sighting(view: View, unit: FloatArray, first: int, last: int) -> Sighting:
-    """Read a line within some ordinates, from the channel in which it stands out most."""
-    spectrum = view.spectra[_most(view.spectra)]
-    power = np.diagonal(spectrum.matrix[first:last], axis1=1, axis2=2).real.sum(axis=0)
-    c = int(np.argmax(power))
-    frequency, amplitude = spectrum.channel(c).sine(first, last)
-    return Sighting(view.channels[c], frequency, amplitude * float(unit[c]))
-
-
 def _keep_credible(fit: BandFit, unit: FloatArray, missing: Missing) -> BandFit:
     """Refuse modes whose estimate cannot be what it claims to be; what is a line becomes one."""
     m = len(fit.targets)
     f = np.exp(fit.estimate[:m])
-    spectrum = fit.view.spectra[_most(fit.view.spectra)]
+    spectrum = fit.view.spectra[index_of_most(fit.view.spectra)]
     keep, lines = [], [*fit.lines]
     for i, target in enumerate(fit.targets):
         why = _incredible(fit, i, spectrum.duration)
@@ -508,7 +331,7 @@ def _keep_credible(fit: BandFit, unit: FloatArray, missing: Missing) -> BandFit:
         missing[target.name] = why
         if why[0] == "line-not-mode":
             k = int(np.searchsorted(spectrum.frequency, f[i]))
-            lines.append(_sighting(fit.view, unit, max(0, k - _LINE_BINS), k + _LINE_BINS + 1))
+            lines.append(read_sighting(fit.view, unit, max(0, k - LINE_BINS), k + LINE_BINS + 1))
     return replace(fit.only(keep), lines=tuple(lines))
 
 

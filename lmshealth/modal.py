@@ -13,7 +13,8 @@ from itertools import combinations
 import numpy as np
 from scipy.special import softmax
 
-from lmshealth.bandfit import BAND, BandFit, Missing, View, fit_band
+from lmshealth.band import View
+from lmshealth.bandfit import BAND, BandFit, Missing, fit_band
 from lmshealth.errors import BadLog, BadStage
 from lmshealth.lines import find_lines, name_lines
 from lmshealth.logs import Channel, Log, Refusal

@@ -1,10 +1,10 @@
 """From the likelihood of a band to estimates: what is not asked for is integrated out.
 
 How much of a floor is driven by the forces of the modes or of other floors, and how far it bends,
-one log hardly tells, and yet all of it moves the estimates: by a standard deviation or two where they are neglected,
-while a third of the information is lost where nothing is supposed about them. They are therefore
-given a normal prior of unknown width, and the posterior is averaged over its evidence: floors of
-sensor noise end up with narrow ones, floors of the structure's own motion with wide ones.
+one log hardly tells. Yet all of it moves the estimates, by a standard deviation or two where it is
+neglected, while a third of the information is lost where nothing is supposed about it. It is
+therefore given a normal prior of unknown width, and the posterior is averaged over its evidence:
+floors of sensor noise end up with narrow ones, floors of the structure's own motion with wide ones.
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ from scipy.special import softmax
 from lmshealth.arrays import FloatArray
 from lmshealth.whittle import Likelihood
 
-# Standard deviations of the parts that a floor shares with modes and with other floors, in units of
-# its own, and of its bend; the last ones are those of the likelihood.
+# Standard deviations of the parts that a floor shares with modes and with other floors, in units
+# of its own, and of its bend; the last ones are those of the likelihood.
 _WIDTHS = ((0.03, 0.1, 0.3, 1.0), (0.03, 0.3, 3.0), (0.1, 0.3, 1.0))
 
 

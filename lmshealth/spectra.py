@@ -360,7 +360,7 @@ class Kernel:
     transform: FloatArray
     norm: FloatArray
 
-    def expect(self, density: ComplexArray) -> ComplexArray:
+    def expect(self, density: ComplexArray | FloatArray) -> ComplexArray:
         """Give the expected ordinates, shape ``(..., n)``, of densities ``(..., n_grid)``."""
         return np.asarray(self._convolve(density)[..., self.place] / self.norm)
 
@@ -370,7 +370,7 @@ class Kernel:
         on_grid[..., self.place] = values / self.norm
         return self._convolve(on_grid)
 
-    def _convolve(self, values: ComplexArray) -> ComplexArray:
+    def _convolve(self, values: ComplexArray | FloatArray) -> ComplexArray:
         size = self.transform.size
         turned = fft.fft(values, size, axis=-1) * self.transform
         return np.asarray(fft.ifft(turned, size, axis=-1)[..., : self.grid.size])

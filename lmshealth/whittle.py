@@ -25,7 +25,6 @@ of one component or of one channel. That makes the Hessian a few matrix products
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -34,6 +33,7 @@ from scipy.optimize import minimize
 
 from lmshealth.arrays import ComplexArray, FloatArray
 from lmshealth.blocks import Block
+from lmshealth.layout import Layout
 
 # Where the second derivatives of h stand, by which first ones they are of.
 _SECOND = np.array([[4, 5, 6], [5, 7, 8], [6, 8, 9]])
@@ -46,99 +46,6 @@ _PRIOR_SHARED = 1.0
 _PRIOR_COMMON = 3.0
 _PRIOR_SHAPE = 30.0
 _PRIOR_FLOOR = (5.0, 2.0, 1.0)
-
-
-@dataclass(frozen=True, slots=True)
-class Layout:
-    """Which unknown is which.
-
-    Attributes
-    ----------
-    n_modes, n_channels : int
-        Numbers of modes and of channels, whose floors are the components after the modes.
-    force : tuple of (int, int)
-        Row and column of each unknown of L.
-    shape : tuple of (int, int)
-        Channel and mode of each unknown of the shapes.
-    """
-
-    n_modes: int
-    n_channels: int
-    force: tuple[tuple[int, int], ...]
-    shape: tuple[tuple[int, int], ...]
-
-    @property
-    def n_components(self) -> int:
-        """Number of modes and floors."""
-        return self.n_modes + self.n_channels
-
-    @property
-    def n_poles(self) -> int:
-        """Number of the first unknowns, those of h: two per mode, three per floor."""
-        return 2 * self.n_modes + 3 * self.n_channels
-
-    @property
-    def pole(self) -> list[tuple[int, int]]:
-        """Component of each of the first unknowns, and which derivative of h belongs to it."""
-        modes = [(i, q) for q in (1, 2) for i in range(self.n_modes)]
-        floors = [(i, q) for i in range(self.n_modes, self.n_components) for q in (1, 2, 3)]
-        return modes + floors
-
-    @property
-    def forces(self) -> slice:
-        """Unknowns of L."""
-        return slice(self.n_poles, self.n_poles + len(self.force))
-
-    def prior_force(self, row: int, column: int) -> float:
-        """Give the standard deviation of the prior of an unknown of L."""
-        if row < self.n_modes:
-            return _PRIOR_FORCE
-        return _PRIOR_SHARED if column < self.n_modes else _PRIOR_COMMON
-
-    @property
-    def shared(self) -> list[int]:
-        """Unknowns of L by which floors share the forces of modes."""
-        m, first = self.n_modes, self.forces.start
-        return [first + a for a, (i, j) in enumerate(self.force) if i >= m > j]
-
-    @property
-    def common(self) -> list[int]:
-        """Unknowns of L by which floors share the forces of other floors."""
-        m, first = self.n_modes, self.forces.start
-        return [first + a for a, (_, j) in enumerate(self.force) if j >= m]
-
-    @property
-    def bends(self) -> list[int]:
-        """Unknowns b of the floors."""
-        return list(range(2 * self.n_modes + 2, self.n_poles, 3))
-
-    @property
-    def shapes(self) -> slice:
-        """Unknowns of the shapes."""
-        return slice(self.forces.stop, self.size)
-
-    @property
-    def size(self) -> int:
-        """Number of unknowns."""
-        return self.n_poles + len(self.force) + len(self.shape)
-
-
-def lay_out(reference: Sequence[int], n_channels: int) -> Layout:
-    """Lay the unknowns out.
-
-    Parameters
-    ----------
-    reference : sequence of int
-        Of each mode the channel in which its shape is one.
-    n_channels : int
-        Number of channels.
-    """
-    m = len(reference)
-    # A single channel tells no more than which forces neighbours share.
-    modes = [(i, j) for i in range(m) for j in range(i + 1) if n_channels > 1 or i - j < 2]
-    floors = [(m + c, j) for c in range(n_channels) for j in range(m + c)]
-    shape = [(c, i) for i in range(m) for c in range(n_channels) if c != reference[i]]
-    return Layout(m, n_channels, (*modes, *floors), tuple(shape))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -172,11 +79,14 @@ class Likelihood:
     def prior_std(self) -> FloatArray:
         """Standard deviations of the weak priors, shape ``(n_unknowns,)``."""
         lay = self.layout
+        forces = np.full(len(lay.force), _PRIOR_FORCE)
+        forces[np.array(lay.shared, dtype=int) - lay.forces.start] = _PRIOR_SHARED
+        forces[np.array(lay.common, dtype=int) - lay.forces.start] = _PRIOR_COMMON
         return np.concatenate(
             [
                 np.repeat(WEAK, lay.n_modes),
                 np.tile(_PRIOR_FLOOR, lay.n_channels),
-                [lay.prior_force(*place) for place in lay.force],
+                forces,
                 np.full(len(lay.shape), _PRIOR_SHAPE),
             ]
         )
@@ -286,14 +196,14 @@ class _Point:
     def strength(self) -> FloatArray:
         """PSD of each modal force as each channel sees it, shape ``(channels, modes)``."""
         m = self._layout.n_modes
-        return self._phi[:, :m] ** 2 * np.diag(self._s)[:m]
+        return np.asarray(self._phi[:, :m] ** 2 * np.diag(self._s)[:m])
 
     @property
     def floor(self) -> FloatArray:
         """PSD of what each floor does not share with a mode, shape ``(channels, grid)``."""
         m = self._layout.n_modes
         own = np.sum(self._root[m:, m:] ** 2, axis=1)
-        return np.abs(self._h[0, m:]) ** 2 * own[:, None]
+        return np.asarray(np.abs(self._h[0, m:]) ** 2 * own[:, None])
 
     @cached_property
     def _modal(self) -> ComplexArray:
@@ -447,7 +357,7 @@ def _products(
 def _congruent(basis: FloatArray, matrix: ComplexArray) -> ComplexArray:
     """Bᵀ M B at each frequency, which is the last axis."""
     half = np.tensordot(basis.T, matrix, axes=(1, 0))
-    return np.tensordot(half, basis, axes=(1, 0)).swapaxes(1, 2)
+    return np.asarray(np.tensordot(half, basis, axes=(1, 0)).swapaxes(1, 2))
 
 
 def _applied(matrix: ComplexArray, vectors: ComplexArray) -> ComplexArray:

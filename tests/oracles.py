@@ -257,3 +257,49 @@ def binomial_band(hits: int, n: int, level: float = 0.999) -> tuple[float, float
     low = 0.0 if hits == 0 else float(stats.beta.ppf(tail, hits, n - hits + 1))
     high = 1.0 if hits == n else float(stats.beta.ppf(1 - tail, hits + 1, n - hits))
     return low, high
+
+
+def channel_covariance(
+    frequency: FloatArray,
+    *,
+    resonances: Sequence[tuple[float, float]],
+    floors: Sequence[FloatArray],
+    root: FloatArray,
+    shapes: FloatArray,
+) -> np.ndarray[tuple[int, int, int], np.dtype[np.complex128]]:
+    """Covariance of the transforms of all channels under white forces, force by force.
+
+    Each ``resonance`` is a natural frequency in Hz and a damping ratio, each ``floor`` a real
+    response ``(n_frequencies,)``; row i of ``root`` says how strongly each force drives resonance
+    or floor i, row c of ``shapes`` how strongly each resonance moves channel c.
+    """
+    n_channels, m = shapes.shape
+    cov = np.zeros((frequency.size, n_channels, n_channels), dtype=complex)
+    for k, f in enumerate(frequency):
+        w = 2 * np.pi * f
+        moves = np.zeros((n_channels, root.shape[1]), dtype=complex)
+        for i, (natural, zeta) in enumerate(resonances):
+            w_n = 2 * np.pi * natural
+            # Of x¨ + 2ζω_n x˙ + ω_n² x = force under exp(iωt), as an acceleration.
+            response = -(w**2) / (w_n**2 - w**2 + 2j * zeta * w_n * w)
+            for c in range(n_channels):
+                moves[c] += shapes[c, i] * response * root[i]
+        for c in range(n_channels):
+            moves[c] += floors[c][k] * root[m + c]
+        for force in range(root.shape[1]):
+            cov[k] += np.outer(moves[:, force], moves[:, force].conj())
+    return cov
+
+
+def complex_normal_log_density(
+    ordinates: np.ndarray[tuple[int, int], np.dtype[np.complex128]],
+    cov: np.ndarray[tuple[int, int, int], np.dtype[np.complex128]],
+) -> float:
+    """Log density of independent circular complex normal vectors, one covariance each."""
+    total = 0.0
+    for vector, matrix in zip(ordinates, cov, strict=True):
+        # Real and imaginary parts as one real normal vector of twice the size.
+        real = np.block([[matrix.real, -matrix.imag], [matrix.imag, matrix.real]]) / 2
+        parts = np.concatenate([vector.real, vector.imag])
+        total += stats.multivariate_normal.logpdf(parts, cov=real)
+    return float(total)

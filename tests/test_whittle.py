@@ -1,212 +1,268 @@
-"""The likelihood of a band: its derivatives, its density, its invariances and its maximum."""
+"""The likelihood of a band: its density, derivatives, averages, invariances and maximum."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from itertools import product
 
 import numpy as np
 import pytest
 
-from lmshealth.spectra import Spectrum, periodogram_kernel
-from lmshealth.whittle import Block, Likelihood, make_block
-from tests.signals import Mode, density, expected_spectrum
+from lmshealth.blocks import Block, _bins_per_bandwidth, make_block
+from lmshealth.segments import Segment
+from lmshealth.spectra import CrossSpectrum, cross_spectra
+from lmshealth.whittle import Likelihood, lay_out
+from tests.oracles import channel_covariance, complex_normal_log_density
+from tests.signals import Mode, accelerations, density, make_log
 
-MODES = (Mode(105.0, 0.015, 1.0), Mode(120.0, 0.02, 2.0), Mode(135.0, 0.025, 1.5))
-NOISE = 0.01
+SHAPES = ((1.0, 0.4, -0.3, 0.2), (0.3, 1.0, 0.5, -0.6), (-0.4, 0.2, 1.0, 0.3))
+MODES = tuple(
+    Mode(f, zeta, psd, shape)
+    for (f, zeta, psd), shape in zip(
+        [(105.0, 0.015, 1.0), (120.0, 0.02, 2.0), (135.0, 0.025, 1.5)], SHAPES, strict=True
+    )
+)
+NOISE = 0.5
 BAND = (80.0, 170.0)
+LAYOUTS = list(product(range(4), range(1, 5)))
 
 
-def everything(spectrum: Spectrum) -> np.ndarray:
-    """Keep all ordinates."""
-    return np.ones(spectrum.frequency.size, dtype=bool)
+def flat_point(modes: Sequence[Mode], n_channels: int, noise: float = NOISE) -> np.ndarray:
+    """Give the unknowns of independent forces and white floors."""
+    layout = lay_out([i % n_channels for i in range(len(modes))], n_channels)
+    return np.concatenate(
+        [
+            np.log([mode.frequency for mode in modes]),
+            np.log([mode.damping for mode in modes]),
+            np.tile([np.log(noise), 0.0, 0.0], n_channels),
+            [float(i == j) for i, j in layout.force],
+            [modes[i].shape[c] / modes[i].shape[i % n_channels] for c, i in layout.shape],
+        ]
+    )
 
 
 def likelihood(
-    modes: Sequence[Mode], blocks: Sequence[Block], off: float = 0.0, noise: float = NOISE
+    modes: Sequence[Mode], n_channels: int, blocks: Sequence[Block], noise: float = NOISE
 ) -> Likelihood:
-    """Build a likelihood whose start is off the truth by a share ``off`` of every unknown."""
-    m = len(modes)
-    start = np.concatenate(
-        [
-            np.log([mode.frequency * (1 + 0.03 * off) for mode in modes]),
-            np.log([mode.damping * (1 + 0.5 * off) for mode in modes]),
-            np.ones(m),
-            np.zeros(m - 1),
-            [np.log(noise) + off, 0.0],
-        ]
-    )
+    """Build a likelihood that starts at the truth; mode i is one in channel i."""
+    reference = [i % n_channels for i in range(len(modes))]
+    size = [m.shape[c] * np.sqrt(m.psd) for m, c in zip(modes, reference, strict=True)]
     return Likelihood(
         blocks=tuple(blocks),
-        start=start,
-        belief=np.repeat([0.2, 2.0], m),
-        scale=np.sqrt([mode.psd * (1 + off) for mode in modes]),
+        layout=lay_out(reference, n_channels),
+        start=flat_point(modes, n_channels, noise),
+        scale=np.concatenate([size, np.ones(n_channels)]),
         centre=float(np.sqrt(BAND[0] * BAND[1])),
         spread=float(np.log(BAND[1] / BAND[0]) / 2),
     )
 
 
-def noisy_blocks(modes: Sequence[Mode], duration: float, n: int = 1) -> list[Block]:
-    """Make blocks of exponential ordinates; short durations come with their kernel."""
-    rng = np.random.default_rng(11)
-    spectrum = expected_spectrum(modes, duration, *BAND, NOISE)
-    blocks = []
-    for _ in range(n):
-        drawn = spectrum.periodogram * rng.exponential(size=spectrum.frequency.size)
-        noisy = replace(spectrum, periodogram=drawn)
-        width = min(2 * mode.frequency * mode.damping for mode in modes)
-        blocks.append(make_block(noisy, everything(noisy), width))
-    return blocks
+def other_point(target: Likelihood, seed: int = 0) -> np.ndarray:
+    """Give a point with coherent forces and bent floors."""
+    rng = np.random.default_rng(seed)
+    m = target.layout.n_modes
+    p = target.start + rng.normal(0, 0.3, target.layout.size)
+    p[:m] = target.start[:m] + rng.normal(0, 0.02, m)
+    return p
 
 
-@pytest.mark.parametrize("duration", [2.0, 20.0])
-@pytest.mark.parametrize("m", [1, 2, 3])
-def test_derivatives_are_those_of_the_value(m: int, duration: float) -> None:
-    """Gradient and Hessian agree with central differences, with the kernel and without."""
-    modes = MODES[:m]
-    target = likelihood(modes, noisy_blocks(modes, duration))
-    assert (target.blocks[0].kernel is not None) == (duration < 5)
-    p = target.start + np.random.default_rng(m).normal(0, 0.1, target.start.size)
-    p[:m] = target.start[:m] + 0.01
-    gradient, hessian = target.derivatives(p)
-    step = 1e-5 * np.eye(p.size)
-    by_value = [(target.value(p + h) - target.value(p - h)) / 2e-5 for h in step]
-    by_gradient = [
-        (target.derivatives(p + h)[0] - target.derivatives(p - h)[0]) / 2e-5 for h in step
-    ]
-    np.testing.assert_allclose(gradient, by_value, atol=2e-6 * np.abs(gradient).max())
-    size = np.sqrt(np.outer(np.diag(hessian), np.diag(hessian)).clip(1.0))
-    np.testing.assert_allclose(hessian / size, np.array(by_gradient) / size, atol=1e-6)
-    np.testing.assert_allclose(hessian, hessian.T, rtol=1e-12, atol=1e-12 * np.abs(hessian).max())
-    # Negative control: the comparison notices one entry that is off by a thousandth.
-    wrong = hessian / size
-    wrong[0, 0] *= 1.001
-    assert not np.allclose(wrong, np.array(by_gradient) / size, rtol=0, atol=1e-6)
-
-
-def test_density_of_one_mode_is_the_textbook_resonance() -> None:
-    """One mode has S / ((1 - β²)² + (2ζβ)²) + S_e, β = f_n / f."""
-    (block,) = noisy_blocks(MODES[:1], 20.0)
-    target = likelihood(MODES[:1], [block])
-    (found,) = target.expected(target.start)
-    beta, zeta = 105.0 / block.frequency, 0.015
-    np.testing.assert_allclose(
-        found, 1.0 / ((1 - beta**2) ** 2 + (2 * zeta * beta) ** 2) + NOISE, rtol=1e-12
+def covariance(target: Likelihood, p: np.ndarray, frequency: np.ndarray) -> np.ndarray:
+    """Read the unknowns as documented, and let the oracle turn them into a covariance."""
+    m, n = target.layout.n_modes, target.layout.n_channels
+    e, d, b = p[2 * m : 2 * m + 3 * n].reshape(n, 3).T
+    u = np.log(frequency / target.centre) / target.spread
+    root, at = np.eye(m + n), 2 * m + 3 * n
+    for i in range(m + n):
+        for j in range(i + 1 if i < m else i):
+            if n == 1 and i < m and i - j > 1:  # one channel: neighbours alone share forces
+                continue
+            root[i, j] = target.scale[i] * p[at]
+            at += 1
+    shapes = np.ones((n, m))
+    for i, c in product(range(m), range(n)):
+        if c != i % n:
+            shapes[c, i] = p[at]
+            at += 1
+    assert at == p.size
+    return channel_covariance(
+        frequency,
+        resonances=np.exp(p[: 2 * m].reshape(2, m).T),
+        floors=[np.exp((e[c] + d[c] * u + b[c] * u**2) / 2) for c in range(n)],
+        root=root,
+        shapes=shapes,
     )
 
 
-def test_density_of_coherent_forces_adds_amplitudes_before_squaring() -> None:
-    """The first force drives two modes as |a h₁ + b h₂|², the second the second mode alone."""
-    modes = MODES[:2]
-    (block,) = noisy_blocks(modes, 20.0)
-    target = likelihood(modes, [block])
+def frequencies(duration: float) -> np.ndarray:
+    """Fourier frequencies of the band."""
+    return np.arange(np.ceil(BAND[0] * duration), BAND[1] * duration) / duration
+
+
+def spectrum_of(matrix: np.ndarray, duration: float, count: int = 1) -> CrossSpectrum:
+    """Wrap matrices of all frequencies of the band."""
+    f = frequencies(duration)
+    return CrossSpectrum(f, matrix, duration, float("nan"), np.ones(f.size, dtype=bool), (), count)
+
+
+def block_of(spectra: Sequence[CrossSpectrum], *, merge: bool = False) -> Block:
+    """Keep all ordinates; the bandwidth is that of the lightest mode of these tests."""
+    keep = [np.ones(s.frequency.size, dtype=bool) for s in spectra]
+    return make_block(spectra, keep, 2 * 105.0 * 0.015, merge=merge)
+
+
+def drawn(cov: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Draw complex normal vectors, shape ``(n, n_channels)``."""
+    white = rng.standard_normal((2, *cov.shape[:2])) / np.sqrt(2)
+    return np.einsum("kcd,kd->kc", np.linalg.cholesky(cov), white[0] + 1j * white[1])
+
+
+def noisy(m: int, n: int, duration: float, count: int = 1) -> Likelihood:
+    """Draw data from m modes in n channels under independent forces."""
+    truth = likelihood(MODES[:m], n, [])
+    cov = covariance(truth, truth.start, frequencies(duration))
+    rng = np.random.default_rng([m, n])
+    parts = [drawn(cov, rng) for _ in range(count)]
+    mean = sum(x[:, :, None] * x[:, None].conj() for x in parts) / count
+    return replace(truth, blocks=(block_of([spectrum_of(mean, duration, count)]),))
+
+
+def scatter_free(modes: Sequence[Mode], n: int, duration: float, noise: float = NOISE, count=1):
+    """Give a likelihood whose data are their own expectation."""
+    truth = likelihood(modes, n, [], noise)
+    f = frequencies(duration)
+    empty = block_of([spectrum_of(np.tile(np.eye(n) + 0j, (f.size, 1, 1)), duration, count)])
+    (expected,) = replace(truth, blocks=(empty,)).expected(truth.start)
+    return replace(truth, blocks=(replace(empty, matrix=expected),))
+
+
+# What is expected of the ordinates
+
+
+@pytest.mark.parametrize(("m", "n"), LAYOUTS)
+def test_covariance_is_that_of_forces_through_resonances_and_floors(m: int, n: int) -> None:
+    """E is what the equation of motion makes of white forces, in phase and size, entry by entry."""
+    target = noisy(m, n, 8.0)
+    p = other_point(target)
+    (found,) = target.expected(p)
+    truth = covariance(target, p, frequencies(8.0))
+    np.testing.assert_allclose(found, truth, rtol=1e-10, atol=1e-10 * np.abs(truth).max())
+
+
+def test_channels_follow_a_common_force_as_they_do_in_time() -> None:
+    """Records of two channels moved by one force through two modes prefer E to its conjugate."""
+    modes = [replace(MODES[0], shape=(1.0, 0.3)), replace(MODES[1], shape=(0.4, -1.0))]
+    # The same seed makes the same force.
+    x = sum(accelerations(np.random.default_rng(1), [m], 60_000, 1000.0, 0.0) for m in modes)
+    x = x + accelerations(np.random.default_rng(2), [Mode(1.0, 1.0, 1e-9, (1, 1))], 60_000, 1e3, 1)
+    log = make_log({"acc_a": x[0], "acc_b": x[1]}, 1000.0)
+    (spectrum,) = cross_spectra(log.channels, [Segment(0, 60_000, 0.0)], 1000.0, 200.0)
+    cut = spectrum.band(*BAND)
+    target = likelihood(modes, 2, [block_of([cut])], 1.0)
     p = target.start.copy()
-    a, c, b = 0.8, 0.5, -1.7  # a_11, a_22, a_21 in units of the scale
-    p[4:7] = a, c, b
-    p[-1] = 0.4
-    h = [mode.response(block.frequency) * np.sqrt(mode.psd) for mode in modes]
-    u = np.log(block.frequency / target.centre) / target.spread
-    noise = NOISE * np.exp(0.4 * u)
-    truth = np.abs(a * h[0] + b * h[1]) ** 2 + np.abs(c * h[1]) ** 2 + noise
-    np.testing.assert_allclose(target.expected(p)[0], truth, rtol=1e-12)
-    # Negative control: powers added without interference are something else.
-    apart = np.abs(a * h[0]) ** 2 + np.abs(b * h[1]) ** 2 + np.abs(c * h[1]) ** 2 + noise
-    assert np.abs(apart / truth - 1).max() > 0.1
+    p[target.layout.forces][:] = [1.0, 1.0, 0.0, *[0.0] * 5]  # the second force drives nothing
+    p[target.layout.forces.start + 2] = 1e-3
+    right = target.data_value(p)
+    mirrored = replace(target, blocks=(block_of([replace(cut, matrix=cut.matrix.conj())]),))
+    assert mirrored.data_value(p) - right > 1000
+    # Each ordinate of each channel adds one, give or take its scatter.
+    (expected,) = target.expected(p)
+    n_free = cut.frequency.size * 2
+    quadratic = right - np.linalg.slogdet(expected)[1].sum()
+    assert abs(quadratic - n_free) < 4.5 * np.sqrt(n_free)
 
 
-def test_the_expected_periodogram_is_the_kernel_times_the_density() -> None:
-    """A short block expects the density smeared by its kernel on its own ordinates."""
-    spectrum = expected_spectrum(MODES[:1], 2.0, *BAND, NOISE)
-    block = make_block(spectrum, everything(spectrum), 2 * 105.0 * 0.015)
-    assert block.kernel is not None
-    target = likelihood(MODES[:1], [block])
-    kernel = periodogram_kernel(spectrum.frequency, 2.0, block.frequency)
-    smeared = kernel @ density(MODES[:1], block.frequency, NOISE)
-    np.testing.assert_allclose(target.expected(target.start)[0], smeared, rtol=1e-12)
+@pytest.mark.parametrize(("m", "n"), [(0, 2), (1, 1), (1, 3), (2, 2), (3, 4)])
+def test_value_is_the_log_density_of_the_raw_ordinates(m: int, n: int) -> None:
+    """The misfit is minus the log density of complex normal ordinates, but for a constant."""
+    truth = likelihood(MODES[:m], n, [])
+    p = other_point(truth)
+    f = frequencies(8.0)
+    x = drawn(covariance(truth, truth.start, f), np.random.default_rng(5))
+    block = block_of([spectrum_of(x[:, :, None] * x[:, None].conj(), 8.0)])
+    target = replace(truth, blocks=(block,))
+    naive = -complex_normal_log_density(x, covariance(target, p, f))
+    # Re and Im have half the variance each: no other constant is left than the power of π.
+    assert target.data_value(p) == pytest.approx(naive - n * f.size * np.log(np.pi), rel=1e-11)
+    prior = 0.5 * np.sum(((p - target.start) / target.prior_std) ** 2)
+    assert target.value(p) == pytest.approx(target.data_value(p) + prior, rel=1e-13)
 
 
-def test_a_block_forgets_what_is_masked() -> None:
-    """Masked ordinates are in neither kind of block; the density is still smeared across them."""
-    for duration in (2.0, 20.0):
-        spectrum = expected_spectrum(MODES[:1], duration, *BAND, NOISE)
-        keep = everything(spectrum)
-        keep[3:9] = False
-        block = make_block(spectrum, keep, 3.15)
-        np.testing.assert_array_equal(block.periodogram, spectrum.periodogram[keep])
-        if block.kernel is None:
-            np.testing.assert_array_equal(block.frequency, spectrum.frequency[keep])
-        else:
-            assert block.kernel.shape == (keep.sum(), block.frequency.size)
+def test_one_mode_in_equal_noise_is_the_eigenvalue_form() -> None:
+    """With the best shape of one mode the value is the textbook form with the largest eigenvalue.
+
+    (n - 1) N ln S_e + Σ ln(S D + S_e) + (Σ|F|² - λ_max(A)) / S_e, A = Σ Re(F F*) / (1 + S_e/(S D)).
+    """
+    target = noisy(1, 3, 30.0)
+    (block,) = target.blocks
+    f, zeta, noise, s = 104.6, 0.017, 0.6, 1.3
+    beta = f / block.frequency
+    d = s / ((1 - beta**2) ** 2 + (2 * zeta * beta) ** 2)
+    a = np.sum(block.matrix.real / (1 + noise / d)[:, None, None], axis=0)
+    largest, vectors = np.linalg.eigh(a)
+    power = np.trace(block.matrix, axis1=1, axis2=2).real.sum()
+    au = 2 * f_size(block) * np.log(noise) + np.sum(np.log(d + noise))
+    au += (power - largest[-1]) / noise
+    p = flat_point(MODES[:1], 3, noise)
+    shape = vectors[:, -1]
+    p[:2] = np.log([f, zeta])
+    p[target.layout.forces.start] = np.sqrt(s) * shape[0]  # the scale is one
+    p[target.layout.shapes] = shape[1:] / shape[0]
+    assert target.data_value(p) == pytest.approx(au, rel=1e-11)
+    p[target.layout.shapes.start] += 0.01
+    assert target.data_value(p) > au
 
 
-def test_the_order_of_segments_does_not_matter() -> None:
-    """Permuted segments give the same value, gradient and maximum."""
-    blocks = noisy_blocks(MODES[:2], 3.0, n=4)
-    one, other = likelihood(MODES[:2], blocks, 0.3), likelihood(MODES[:2], blocks[::-1], 0.3)
-    assert one.value(one.start) == pytest.approx(other.value(other.start), rel=1e-13)
-    np.testing.assert_allclose(one.minimise(one.start), other.minimise(other.start), atol=1e-7)
+def f_size(block: Block) -> int:
+    """Count the ordinates of a block."""
+    return int(block.count.sum())
 
 
-def test_scaled_data_move_nothing_but_amplitudes() -> None:
-    """Data times 10⁶ with starts scaled alike give the same f, ζ, curvature and amplitudes."""
-    blocks = noisy_blocks(MODES[:2], 8.0)
-    one = likelihood(MODES[:2], blocks, 0.2)
-    loud = [replace(block, periodogram=1e6 * block.periodogram) for block in blocks]
-    start = one.start.copy()
-    start[-2] += np.log(1e6)
-    other = replace(one, blocks=tuple(loud), start=start, scale=1e3 * one.scale)
-    p, q = one.minimise(one.start), other.minimise(start)
-    q[-2] -= np.log(1e6)
-    np.testing.assert_allclose(p, q, atol=1e-7)
-    q[-2] += np.log(1e6)
-    np.testing.assert_allclose(one.derivatives(p)[1], other.derivatives(q)[1], rtol=1e-5, atol=1e-4)
-
-
-@pytest.mark.parametrize("duration", [1.5, 30.0])
-@pytest.mark.parametrize("m", [1, 2, 3])
-def test_the_maximum_on_scatter_free_data_is_the_truth(m: int, duration: float) -> None:
-    """On expected data f is found to 10⁻⁴ and ζ to 2 % from a start 3 % and 50 % off."""
-    modes = MODES[:m]
-    spectrum = expected_spectrum(modes, duration, *BAND, NOISE)
-    width = min(2 * mode.frequency * mode.damping for mode in modes)
-    block = make_block(spectrum, everything(spectrum), width)
-    if block.kernel is not None:
-        smeared = block.kernel @ density(modes, block.frequency, NOISE)
-        block = replace(block, periodogram=smeared)
-    off = 0.4 if m > 1 else 1.0
-    target = likelihood(modes, [block] * 8, off)
-    p = target.minimise(target.start)
-    np.testing.assert_allclose(p[:m], np.log([mode.frequency for mode in modes]), atol=1e-4)
-    np.testing.assert_allclose(p[m : 2 * m], np.log([mode.damping for mode in modes]), atol=0.02)
-
-
-def test_without_the_kernel_a_short_record_reads_too_much_damping() -> None:
-    """Negative control: plain Whittle on smeared data is off by more than 5 % in ζ."""
-    spectrum = expected_spectrum(MODES[:1], 1.5, *BAND, NOISE)
-    block = make_block(spectrum, everything(spectrum), 3.15)
-    assert block.kernel is not None
-    smeared = block.kernel @ density(MODES[:1], block.frequency, NOISE)
-    plain = Block(spectrum.frequency, smeared, None)
-    target = likelihood(MODES[:1], [plain] * 8)
-    assert np.exp(target.minimise(target.start)[1]) > 1.05 * 0.015
-
-
-def test_a_belief_pulls_as_a_normal_prior() -> None:
-    """The value is the misfit of the data plus half the squared distance in beliefs."""
-    weak = likelihood(MODES[:1], noisy_blocks(MODES[:1], 20.0))
-    sure = replace(weak, belief=np.array([1e-4, 1e-3]))
-    p = weak.start.copy()
-    p[:2] += 3e-4, 2e-3
-    assert sure.value(p) - sure.data_value(p) == pytest.approx((3**2 + 2**2) / 2, rel=1e-6)
-    assert weak.data_value(p) == sure.data_value(p)
-    start = sure.start.copy()
-    found = sure.minimise(start)
-    assert np.abs(found[:2] - start[:2]).max() < 1e-3
-
-
-def test_nonsense_is_infinitely_unlikely_not_an_error() -> None:
-    """Unknowns that overflow have the value inf, so that a search turns back."""
-    target = likelihood(MODES[:1], noisy_blocks(MODES[:1], 20.0))
+def test_signal_to_noise_is_that_of_the_modes_in_each_channel() -> None:
+    """S φ² / (4 ζ² N) at the truth, N being a floor's own noise without what a mode drives."""
+    target = noisy(2, 3, 8.0)
     p = target.start.copy()
-    p[-2] = 2000.0
-    assert target.value(p) == np.inf
+    p[target.layout.shared] = 0.7
+    found = target.signal_to_noise(p)
+    for c, i in product(range(3), range(2)):
+        mode = MODES[i]
+        assert found[c, i] == pytest.approx(mode.snr(NOISE) * mode.shape[c] ** 2, rel=1e-10)
+
+
+# Derivatives
+
+
+@pytest.mark.parametrize("duration", [1.0, 20.0])
+@pytest.mark.parametrize(("m", "n"), LAYOUTS)
+def test_derivatives_are_those_of_the_value(m: int, n: int, duration: float) -> None:
+    """Gradient and Hessian agree with central differences, with the kernel and without."""
+    target = noisy(m, n, duration, count=3)
+    (block,) = target.blocks
+    assert (block.kernel is not None) == (duration < 5)
+    if block.kernel is None:
+        cut = slice(200, 1400, 13)
+        block = Block(block.frequency[cut], block.matrix[cut], 1.0 + block.count[cut], None)
+        target = replace(target, blocks=(block,))
+    p = other_point(target, m + 1)
+    gradient, hessian = target.derivatives(p)
+    # In units in which all unknowns weigh alike, along some directions that mix them all.
+    unit = 1 / np.sqrt(np.abs(hessian).max(axis=0))
+    along = np.random.default_rng(n).normal(size=(p.size, 4))
+
+    def slope(f: Callable[[np.ndarray], np.ndarray | float]) -> np.ndarray:
+        """Differentiate along the directions to the fourth order."""
+        near, far = (
+            np.array([(f(p + h * unit * v) - f(p - h * unit * v)) / (2 * h) for v in along.T])
+            for h in (2e-3, 4e-3)
+        )
+        return np.asarray((4 * near - far).T / 3)
+
+    expected = unit * gradient @ along
+    np.testing.assert_allclose(slope(target.value), expected, atol=1e-6 * np.abs(expected).max())
+    ours = unit[:, None] * hessian * unit
+    by_gradient = slope(lambda q: unit * target.derivatives(q)[0])
+    np.testing.assert_allclose(ours @ along, by_gradient, atol=5e-6)
+    np.testing.assert_allclose(ours, ours.T, atol=1e-8)
+    # Negative control: the comparison notices one entry that is off by a thousandth.
+    ours[np.unravel_index(np.argmax(np.abs(ours)), ours.shape)] *= 1.001
+    assert not np.allclose(ours @ along, by_gradient, rtol=0, atol=5e-5)
