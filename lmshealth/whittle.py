@@ -222,17 +222,17 @@ class _Point:
         With R = E⁻¹, G = R - RWR and Y = 2RWR - R the gradient is Σ n tr G E_a and the Hessian
         Σ n (tr E_a R E_b Y + tr G E_ab).
         """
-        inverse = np.linalg.inv(self.expected)
+        inverse: ComplexArray = np.linalg.inv(self.expected)
         turned = inverse @ self._block.matrix @ inverse
         count = self._block.count[:, None, None]
-        g = np.moveaxis(count * (inverse - turned), 0, -1)
-        y = np.moveaxis(count * (2 * turned - inverse), 0, -1)
+        g = (count * (inverse - turned)).transpose(1, 2, 0)
+        y = (count * (2 * turned - inverse)).transpose(1, 2, 0)
         row, w = self._slopes()
         # The columns of Φ for the floors are the unit vectors of the channels.
         omega = np.tensordot(self._phi, w.conj(), axes=(1, 1))  # (channels, unknowns, n)
         pull = np.tensordot(self._phi.T, g, axes=(1, 0))  # bᵀ G, (components, channels, n)
         gradient = 2 * np.einsum("cak,ack->a", omega, pull[row]).real
-        hessian = _products(self._phi, row, omega, np.moveaxis(inverse, 0, -1), y)
+        hessian = _products(self._phi, row, omega, inverse.transpose(1, 2, 0), y)
         return gradient, hessian + self._curvature(w, g)
 
     def _slopes(self) -> tuple[np.ndarray, ComplexArray]:

@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 
 from lmshealth.blocks import Block, _bins_per_bandwidth, make_block
+from lmshealth.layout import lay_out
 from lmshealth.segments import Segment
 from lmshealth.spectra import CrossSpectrum, cross_spectra
-from lmshealth.whittle import Likelihood, lay_out
+from lmshealth.whittle import Likelihood
 from tests.oracles import channel_covariance, complex_normal_log_density
 from tests.signals import Mode, accelerations, density, make_log
 
@@ -266,3 +267,212 @@ def test_derivatives_are_those_of_the_value(m: int, n: int, duration: float) -> 
     # Negative control: the comparison notices one entry that is off by a thousandth.
     ours[np.unravel_index(np.argmax(np.abs(ours)), ours.shape)] *= 1.001
     assert not np.allclose(ours @ along, by_gradient, rtol=0, atol=5e-5)
+
+
+# Averages
+
+
+def test_a_mean_over_segments_says_what_they_say_apart() -> None:
+    """One block of means has the value and derivatives of the sum over single segments."""
+    for duration in (1.0, 8.0):
+        truth = likelihood(MODES[:2], 2, [])
+        cov, rng = covariance(truth, truth.start, frequencies(duration)), np.random.default_rng(3)
+        parts = [drawn(cov, rng) for _ in range(5)]
+        matrices = [x[:, :, None] * x[:, None].conj() for x in parts]
+        apart = [block_of([spectrum_of(w, duration)]) for w in matrices]
+        pooled = block_of([spectrum_of(w, duration) for w in matrices])
+        counted = block_of([spectrum_of(np.mean(matrices, axis=0), duration, 5)])
+        assert set(counted.count) == {5.0}
+        p = other_point(truth)
+        one, *others = (replace(truth, blocks=b) for b in (tuple(apart), (pooled,), (counted,)))
+        for other in others:
+            assert other.data_value(p) == pytest.approx(one.data_value(p), rel=1e-12)
+            for a, b in zip(other.derivatives(p), one.derivatives(p), strict=True):
+                np.testing.assert_allclose(a, b, rtol=1e-8, atol=1e-9 * np.abs(b).max())
+
+
+def test_averaged_neighbours_say_what_they_say_apart_where_nothing_changes() -> None:
+    """Of channels that show white floors alone the mean of neighbours loses nothing."""
+    one, merged = (
+        replace(noisy(0, 2, 60.0), blocks=(block_of([s], merge=merge),))
+        for merge in (False, True)
+        for s in [spectrum_of(noisy(0, 2, 60.0).blocks[0].matrix, 60.0)]
+    )
+    (few,), (many,) = merged.blocks, one.blocks
+    assert few.frequency.size < many.frequency.size / 5
+    assert few.count.sum() == many.count.sum()
+    p = one.start.copy()
+    p[0] += 0.3
+    p[one.layout.common] = 0.4
+    assert merged.data_value(p) == pytest.approx(one.data_value(p), rel=1e-12)
+    p[1] = 1.0
+    assert merged.data_value(p) != pytest.approx(one.data_value(p), rel=1e-9)
+
+
+@pytest.mark.parametrize(("duration", "n_segments"), [(40.0, 1), (300.0, 1), (60.0, 30)])
+def test_averaging_neighbours_moves_nothing_by_a_twentieth_of_its_uncertainty(
+    duration: float, n_segments: int
+) -> None:
+    """On data without scatter the shift of ln f and ln ζ by averaging is below σ / 20."""
+    exact = scatter_free(MODES[:1], 2, duration, count=n_segments)
+    (block,) = exact.blocks
+    merged = block_of([spectrum_of(block.matrix, duration, n_segments)], merge=True)
+    assert merged.count[0] >= 2 * n_segments
+    target = replace(exact, blocks=(merged,))
+    p = target.minimise(target.start)
+    std = np.sqrt(np.diag(np.linalg.inv(target.derivatives(p)[1])))
+    off = ((p - target.start) / std)[:2]
+    assert np.abs(off).max() < 0.05
+    # Negative control: with a quarter of the bins the damping moves by more.
+    coarse = duration * 2 * 105.0 * 0.015 / (_bins_per_bandwidth(1e3 * duration) / 4)
+    assert coarse > 2
+
+
+def test_a_block_forgets_what_is_masked_in_all_segments() -> None:
+    """Ordinates count as often as they are kept; a short record still expects them smeared."""
+    for duration in (2.0, 8.0):
+        one, other = (
+            spectrum_of(noisy(1, 2, duration, count).blocks[0].matrix, duration, count)
+            for count in (1, 3)
+        )
+        keep = np.ones((2, one.frequency.size), dtype=bool)
+        keep[0, 3:9] = False
+        keep[1, 6:12] = False
+        block = make_block([one, other], list(keep), 3.15, merge=False)
+        kept = keep.any(axis=0)
+        np.testing.assert_array_equal(block.frequency, one.frequency[kept])
+        np.testing.assert_array_equal(block.count, (keep[0] + 3 * keep[1])[kept])
+        np.testing.assert_allclose(block.matrix[4], other.matrix[4], rtol=1e-14)
+        mean = (one.matrix[0] + 3 * other.matrix[0]) / 4
+        np.testing.assert_allclose(block.matrix[0], mean, rtol=1e-12)
+        assert (block.kernel is None) == (duration > 5)
+        if block.kernel is not None:
+            full = block_of([one])
+            p = other_point(likelihood(MODES[:1], 2, []))
+            some, every = (likelihood(MODES[:1], 2, [b]).expected(p)[0] for b in (block, full))
+            np.testing.assert_allclose(some, every[kept], rtol=1e-9)
+
+
+# Invariances
+
+
+def posterior(target: Likelihood) -> tuple[np.ndarray, np.ndarray]:
+    """Mode and covariance of ln f and ln ζ."""
+    p = target.minimise(target.start)
+    m = 2 * target.layout.n_modes
+    return p[:m], np.linalg.inv(target.derivatives(p)[1])[:m, :m]
+
+
+def assert_same(one: Likelihood, other: Likelihood) -> None:
+    """Both give the same ln f and ln ζ, to a hundredth of their uncertainty, and covariance."""
+    (a, cov), (b, other_cov) = posterior(one), posterior(other)
+    std = np.sqrt(np.diag(cov))
+    np.testing.assert_allclose(a / std, b / std, atol=1e-2)
+    np.testing.assert_allclose(cov / np.outer(std, std), other_cov / np.outer(std, std), atol=1e-2)
+
+
+def test_the_unit_of_a_channel_and_the_phase_of_all_do_not_matter() -> None:
+    """A channel a thousand times louder and phases turned at random leave modes as they are."""
+    one = noisy(2, 3, 7.0)
+    truth = covariance(one, one.start, frequencies(7.0))
+    x = drawn(truth, np.random.default_rng(8))
+    unit = np.array([1.0, 1.0, 1e3])
+    phase = np.exp(2j * np.pi * np.random.default_rng(9).random((len(x), 1)))
+    one, other = (
+        replace(one, blocks=(block_of([spectrum_of(v[:, :, None] * v[:, None].conj(), 7.0)]),))
+        for v in (x, x * unit * phase)
+    )
+    start = other.start.copy()
+    m = 2
+    start[2 * m + 6] += 2 * np.log(1e3)
+    shapes = start[other.layout.shapes]
+    for at, (c, _) in enumerate(other.layout.shape):
+        shapes[at] *= unit[c]
+    assert_same(one, replace(other, start=start))
+
+
+def test_the_order_of_channels_does_not_matter() -> None:
+    """Permuted channels give the same f, ζ and covariance."""
+    one = noisy(2, 3, 7.0)
+    order = [2, 0, 1]
+    modes = [replace(m, shape=tuple(np.array(m.shape)[order])) for m in MODES[:2]]
+    (block,) = one.blocks
+    turned = replace(block, matrix=block.matrix[:, order][:, :, order])
+    assert_same(one, likelihood(modes, 3, [turned]))
+
+
+def test_the_order_of_blocks_does_not_matter() -> None:
+    """Permuted blocks of different lengths have the same value and derivatives."""
+    blocks = [noisy(1, 2, t).blocks[0] for t in (2.0, 8.0)]
+    one, other = (likelihood(MODES[:1], 2, b) for b in (blocks, blocks[::-1]))
+    p = other_point(one)
+    assert one.value(p) == pytest.approx(other.value(p), rel=1e-14)
+    np.testing.assert_allclose(one.derivatives(p)[1], other.derivatives(p)[1], rtol=1e-12)
+
+
+@pytest.mark.parametrize("n", [2, 4])
+def test_copies_of_a_channel_say_as_much_as_one_with_less_noise(n: int) -> None:
+    """With n channels of one mode f, ζ and S are as sure as with one of an n-th of the noise."""
+    mode = replace(MODES[0], shape=(1.0,) * n)
+    many = scatter_free([mode], n, 7.0)
+    one = scatter_free([mode], 1, 7.0, NOISE / n)
+    plain = scatter_free([mode], 1, 7.0)
+    # The floors known, so that priors play no part.
+    about = [
+        t.derivatives(t.start)[1][np.ix_(index, index)]
+        for t in (many, one, plain)
+        for index in [[0, 1, t.layout.forces.start]]
+    ]
+    np.testing.assert_allclose(about[0], about[1], rtol=1e-6, atol=1e-3)
+    # The noise is far below the mode: n channels are hardly surer than one. Counted as if they
+    # were independent, each would add as much as the first.
+    assert about[0][0, 0] / about[2][0, 0] < 1.1
+
+
+def test_priors_are_too_weak_to_matter() -> None:
+    """In 7 s priors but those of what floors share are worth less than 1 % of any deviation."""
+    target = noisy(2, 3, 7.0)
+    p = target.minimise(target.start)
+    layout, hessian = target.layout, target.derivatives(p)[1]
+    own = np.diag(1 / target.prior_std**2)
+    kept = [*layout.shared, *layout.common, *layout.bends]
+    own[kept, kept] = 0.0
+    with_priors, without = (np.sqrt(np.diag(np.linalg.inv(h))) for h in (hessian, hessian - own))
+    np.testing.assert_allclose(with_priors[:4], without[:4], rtol=0.01)
+
+
+# The maximum
+
+
+@pytest.mark.parametrize("duration", [1.5, 7.0])
+@pytest.mark.parametrize(("m", "n"), [(1, 1), (2, 1), (1, 3), (2, 3), (3, 3), (3, 4)])
+def test_the_maximum_on_scatter_free_data_is_the_truth(m: int, n: int, duration: float) -> None:
+    """On expected data the search comes back to f and ζ from starts 1 % and 30 % off."""
+    exact = scatter_free(MODES[:m], n, duration, count=20)
+    start = exact.start.copy()
+    start[:m] += 0.01
+    start[m : 2 * m] += 0.3
+    start[2 * m : exact.layout.n_poles : 3] += 0.5
+    target = replace(exact, start=start, scale=1.2 * exact.scale)
+    p = target.minimise(start)
+    hessian = target.derivatives(p)[1]
+    gradient = target.derivatives(p)[0]
+    assert gradient @ np.linalg.solve(hessian, gradient) < 1e-4
+    std = np.sqrt(np.diag(np.linalg.inv(hessian)))[: 2 * m]
+    assert (np.abs(p - exact.start)[: 2 * m] / std).max() < 0.2
+
+
+def test_without_the_kernel_a_short_record_reads_too_much_damping() -> None:
+    """Negative control: plain Whittle on smeared data is off by more than 5 % in ζ."""
+    exact = scatter_free(MODES[:1], 2, 1.5, count=8)
+    assert exact.blocks[0].kernel is not None
+    plain = replace(exact, blocks=(replace(exact.blocks[0], kernel=None),))
+    assert np.exp(plain.minimise(plain.start)[1]) > 1.05 * 0.015
+
+
+def test_nonsense_is_infinitely_unlikely_not_an_error() -> None:
+    """Unknowns that overflow have the value inf, so that a search turns back."""
+    target = noisy(1, 2, 8.0)
+    p = target.start.copy()
+    p[2] = 2000.0
+    assert target.value(p) == np.inf
