@@ -222,7 +222,7 @@ class _Point:
         With R = E⁻¹, G = R - RWR and Y = 2RWR - R the gradient is Σ n tr G E_a and the Hessian
         Σ n (tr E_a R E_b Y + tr G E_ab).
         """
-        inverse: ComplexArray = np.linalg.inv(self.expected)
+        inverse = np.asarray(np.linalg.inv(self.expected), dtype=np.complex128)
         turned = inverse @ self._block.matrix @ inverse
         count = self._block.count[:, None, None]
         g = (count * (inverse - turned)).transpose(1, 2, 0)

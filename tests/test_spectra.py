@@ -7,8 +7,15 @@ import pytest
 
 from lmshealth.logs import Channel
 from lmshealth.segments import Segment
-from lmshealth.spectra import Spectrum, periodogram, periodogram_kernel
-from tests.signals import Mode, accelerations, density, sine, white
+from lmshealth.spectra import (
+    CrossSpectrum,
+    Kernel,
+    Spectrum,
+    cross_spectra,
+    make_kernel,
+    periodogram,
+)
+from tests.signals import Mode, accelerations, density, displacements, sine, white
 
 RATE = 2000.0
 
@@ -158,6 +165,15 @@ def test_spectrum_refuses_arrays_that_differ_in_shape() -> None:
 # The expected periodogram
 
 
+def kernel_of(
+    frequency: np.ndarray, duration: float, *, margin: int = 60, keep: np.ndarray | None = None
+) -> Kernel:
+    """Prepare the expectation of all ordinates, eight samples of the density each."""
+    spectrum = Spectrum(frequency.copy(), np.ones(frequency.size), duration, float("nan"))
+    keep = np.ones(frequency.size, dtype=bool) if keep is None else keep
+    return make_kernel(spectrum, keep, 8, margin)
+
+
 def autocovariance(mode: Mode, noise: float, n: int) -> np.ndarray:
     """Autocovariance at lags 0 … n - 1 by the cosine transform of the density."""
     size = 1 << 18
@@ -175,9 +191,9 @@ def test_the_kernel_gives_the_expected_periodogram_of_a_short_record() -> None:
     frequency = np.arange(160, 241) / duration
     cosines = np.cos(2 * np.pi * np.outer(frequency, lags) / RATE)
     oracle = 2 / RATE * (2 * cosines @ weighted - weighted[0])
-    fine = np.arange(1 / (8 * duration), RATE / 2, 1 / (8 * duration))
-    kernel = periodogram_kernel(frequency, duration, fine)
-    np.testing.assert_allclose(kernel @ density([mode], fine, noise), oracle, rtol=5e-3)
+    kernel = kernel_of(frequency, duration)
+    smeared = kernel.expect(density([mode], kernel.grid, noise)).real
+    np.testing.assert_allclose(smeared, oracle, rtol=5e-3)
     # Negative control: the density itself is no such expectation.
     bias = density([mode], frequency, noise) / oracle - 1
     assert np.abs(bias).max() > 0.1
@@ -192,17 +208,148 @@ def test_short_records_average_to_the_expected_periodogram() -> None:
     ]
     mean = np.mean([spectrum.periodogram for spectrum in spectra], axis=0)
     frequency, duration = spectra[0].frequency, spectra[0].duration
-    fine = np.arange(1 / (8 * duration), RATE / 2, 1 / (8 * duration))
-    kernel = periodogram_kernel(frequency, duration, fine)
-    ratio = mean / (kernel @ density([mode], fine, noise))
+    kernel = kernel_of(frequency, duration)
+    ratio = mean / kernel.expect(density([mode], kernel.grid, noise)).real
     assert np.abs(ratio - 1).max() * np.sqrt(n_records) < 4.5
     naive = mean / density([mode], frequency, noise)
     assert np.abs(naive - 1).max() * np.sqrt(n_records) > 4.5
 
 
-def test_kernel_rows_sum_to_one() -> None:
-    """A constant density stays itself, also where the grid ends close by."""
-    fine = np.arange(90.0, 110.0, 0.05)
-    kernel = periodogram_kernel(np.arange(90.0, 110.0, 0.5), 2.0, fine)
-    np.testing.assert_allclose(kernel.sum(axis=1), 1.0, rtol=1e-12)
-    assert (kernel >= 0).all()
+@pytest.mark.parametrize("margin", [2, 40])
+def test_a_constant_density_stays_itself(margin: int) -> None:
+    """Weights of every ordinate add up to one, also where the grid ends close by."""
+    kernel = kernel_of(np.arange(90.0, 110.0, 0.5), 2.0, margin=margin)
+    np.testing.assert_allclose(kernel.expect(np.ones(kernel.grid.size)), 1.0, rtol=1e-12)
+
+
+def test_spreading_is_the_transpose_of_expecting() -> None:
+    """⟨a, K b⟩ = ⟨Kᵀ a, b⟩ for complex arrays of several axes, with ordinates left out."""
+    keep = np.arange(40) % 7 != 3
+    kernel = kernel_of(np.arange(90.0, 110.0, 0.5), 2.0, keep=keep)
+    rng = np.random.default_rng(13)
+    a, b = (
+        rng.standard_normal((3, 3, n)) + 1j * rng.standard_normal((3, 3, n))
+        for n in (int(keep.sum()), kernel.grid.size)
+    )
+    left = np.sum(a * kernel.expect(b), axis=-1)
+    right = np.sum(kernel.spread(a) * b, axis=-1)
+    np.testing.assert_allclose(left, right, rtol=1e-11)
+
+
+def test_the_kernel_is_the_fejer_kernel_on_its_grid() -> None:
+    """Row by row it is T sinc²(T (f - f')), normalised."""
+    frequency = np.arange(90.0, 110.0, 0.5)
+    kernel = kernel_of(frequency, 2.0)
+    rows = kernel.expect(np.eye(kernel.grid.size)).real.T
+    naive = np.sinc(2.0 * (frequency[:, None] - kernel.grid)) ** 2
+    np.testing.assert_allclose(rows, naive / naive.sum(axis=1, keepdims=True), atol=1e-13)
+
+
+# All channels at once
+
+
+def transform(
+    channels: dict[str, np.ndarray],
+    segments: list[Segment],
+    top: float = 400.0,
+    ceiling: float = np.inf,
+) -> tuple[CrossSpectrum, ...]:
+    """Transform channels; those named delta_e are displacements."""
+    made = [
+        Channel(name, "displacement" if name == "delta_e" else "acceleration", values.copy())
+        for name, values in channels.items()
+    ]
+    return cross_spectra(made, segments, RATE, top, ceiling=ceiling)
+
+
+def test_the_diagonal_holds_the_periodograms_of_the_channels() -> None:
+    """Each channel alone is what its own periodogram says; together they are Hermitian, rank 1."""
+    rng, n = np.random.default_rng(14), 8000
+    values = {"acc_a": rng.normal(size=n), "acc_b": rng.normal(size=n) + np.linspace(0, 9, n)}
+    (found,) = transform(values, [Segment(0, n, 0.3)])
+    assert (found.duration, found.velocity, found.count) == (n / RATE, 0.3, 1)
+    for index, name in enumerate(values):
+        alone, own = whole(values[name]), found.channel(index)
+        np.testing.assert_array_equal(own.frequency, alone.frequency)
+        np.testing.assert_allclose(own.periodogram, alone.periodogram, rtol=1e-10)
+    adjoint = found.matrix.conj().swapaxes(1, 2)
+    np.testing.assert_allclose(found.matrix, adjoint, rtol=1e-12)
+    power = np.diagonal(found.matrix, axis1=1, axis2=2).real
+    np.testing.assert_allclose(np.abs(found.matrix[:, 0, 1]) ** 2, power.prod(axis=1), rtol=1e-10)
+    assert not found.matrix.flags.writeable
+
+
+def test_what_a_displacement_and_an_accelerometer_see_is_in_phase() -> None:
+    """Δe and the acceleration of one motion have the same transform, sign and phase included."""
+    mode, n = [Mode(105.0, 0.02)], 16_000
+    x = displacements(np.random.default_rng(15), mode, n, RATE, 0.0)[0]
+    a = accelerations(np.random.default_rng(15), mode, n, RATE, 0.0)[0]
+    (found,) = transform({"acc_a": a, "delta_e": x}, [Segment(0, n, 0.0)], 200.0)
+    cut = found.band(95.0, 115.0)
+    ratio = cut.matrix[:, 0, 1] / cut.matrix[:, 0, 0]
+    np.testing.assert_allclose(np.abs(ratio - 1), 0.0, atol=0.05)
+
+
+def test_a_delayed_channel_lags_by_its_phase() -> None:
+    """F_a F_b* of a channel b that is k samples late has the phase +2πfk over the sample rate."""
+    values = np.random.default_rng(16).normal(size=8010)
+    late = {"acc_a": values[5:8005], "acc_b": values[:8000]}
+    (found,) = transform(late, [Segment(0, 8000, 0.0)])
+    cut = found.band(100.0, 110.0)
+    phase = np.angle(cut.matrix[:, 0, 1] * np.exp(-2j * np.pi * cut.frequency * 5 / RATE))
+    assert np.median(np.abs(phase)) < 0.05
+
+
+def test_long_parts_of_one_velocity_are_averaged_and_short_ones_are_not() -> None:
+    """Long stretches to and fro make one mean; another velocity and short moves stay apart."""
+    n = 600_000
+    values = {"acc_a": np.random.default_rng(17).normal(size=4 * n)}
+    parts = [Segment(k * n, (k + 1) * n, v) for k, v in enumerate((0.2, -0.2, 0.4, 0.2))]
+    pooled, fast = transform(values, parts, ceiling=400.0)
+    assert (pooled.count, fast.count, fast.velocity) == (3, 1, 0.4)
+    assert pooled.observed == 3 * n / RATE
+    single = [transform(values, [part], ceiling=400.0)[0] for part in parts]
+    mean = (single[0].matrix + single[1].matrix + single[3].matrix) / 3
+    np.testing.assert_allclose(pooled.matrix, mean, rtol=1e-10)
+    short = [Segment(k * 2000, (k + 1) * 2000, 0.2) for k in range(3)]
+    assert [s.count for s in transform(values, short)] == [1, 1, 1]
+
+
+def test_a_strong_line_is_out_of_the_matrix_and_on_the_list() -> None:
+    """Its ordinates are not free, its frequency and amplitude are told, and bands cut it along."""
+    n = 40_000
+    values = white(np.random.default_rng(18), 1.0, n, RATE)
+    lined = values + sine(n, RATE, 150.01, 100.0)
+    clean, dirty = (transform({"acc_a": v}, [Segment(0, n, 0.0)])[0] for v in (values, lined))
+    ((index, frequency, amplitude),) = dirty.lines
+    assert (index, frequency) == (0, pytest.approx(150.01, abs=0.02))
+    assert amplitude == pytest.approx(100.0, rel=0.01)
+    assert clean.lines == ()
+    assert clean.free.all()
+    lost = dirty.frequency[~dirty.free]
+    assert 0 < lost.size < 20
+    assert np.abs(lost - 150.01).max() < 0.5
+    free = dirty.free
+    left, truth = (s.matrix[free].real.sum() for s in (dirty, clean))
+    assert left == pytest.approx(truth, rel=5e-3)
+    assert dirty.band(100.0, 200.0).lines == dirty.lines
+    assert dirty.band(200.0, 300.0).lines == ()
+    assert dirty.band(149.0, 151.0).free.sum() < dirty.band(149.0, 151.0).frequency.size
+
+
+def test_a_line_in_one_part_of_a_mean_is_masked_in_the_mean() -> None:
+    """An ordinate is free when it is in all parts."""
+    n = 600_000
+    values = white(np.random.default_rng(19), 1.0, 2 * n, RATE)
+    values[n:] += sine(n, RATE, 150.01, 100.0)
+    parts = [Segment(k * n, (k + 1) * n, 0.2) for k in range(2)]
+    (pooled,) = transform({"acc_a": values}, parts, ceiling=200.0)
+    assert pooled.count == 2
+    assert len(pooled.lines) == 1
+    assert not pooled.band(150.0, 150.02).free.all()
+
+
+def test_cross_spectrum_refuses_arrays_that_differ_in_length() -> None:
+    """Frequencies without matrices are no spectrum."""
+    with pytest.raises(ValueError, match="differ in length"):
+        CrossSpectrum(np.arange(3.0), np.zeros((4, 1, 1)) + 0j, 1.0, 0.0, np.ones(3, dtype=bool))

@@ -1,141 +1,37 @@
-"""The likelihood of a band: its density, derivatives, averages, invariances and maximum."""
+"""The likelihood of a band: its density, derivatives, invariances and maximum."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 from itertools import product
 
 import numpy as np
 import pytest
 
-from lmshealth.blocks import Block, _bins_per_bandwidth, make_block
-from lmshealth.layout import lay_out
+from lmshealth.blocks import Block
 from lmshealth.segments import Segment
-from lmshealth.spectra import CrossSpectrum, cross_spectra
+from lmshealth.spectra import cross_spectra
 from lmshealth.whittle import Likelihood
-from tests.oracles import channel_covariance, complex_normal_log_density
-from tests.signals import Mode, accelerations, density, make_log
-
-SHAPES = ((1.0, 0.4, -0.3, 0.2), (0.3, 1.0, 0.5, -0.6), (-0.4, 0.2, 1.0, 0.3))
-MODES = tuple(
-    Mode(f, zeta, psd, shape)
-    for (f, zeta, psd), shape in zip(
-        [(105.0, 0.015, 1.0), (120.0, 0.02, 2.0), (135.0, 0.025, 1.5)], SHAPES, strict=True
-    )
+from tests.bands import (
+    BAND,
+    MODES,
+    NOISE,
+    block_of,
+    covariance,
+    drawn,
+    flat_point,
+    frequencies,
+    likelihood,
+    noisy,
+    other_point,
+    scatter_free,
+    spectrum_of,
 )
-NOISE = 0.5
-BAND = (80.0, 170.0)
+from tests.oracles import complex_normal_log_density
+from tests.signals import Mode, accelerations, make_log
+
 LAYOUTS = list(product(range(4), range(1, 5)))
-
-
-def flat_point(modes: Sequence[Mode], n_channels: int, noise: float = NOISE) -> np.ndarray:
-    """Give the unknowns of independent forces and white floors."""
-    layout = lay_out([i % n_channels for i in range(len(modes))], n_channels)
-    return np.concatenate(
-        [
-            np.log([mode.frequency for mode in modes]),
-            np.log([mode.damping for mode in modes]),
-            np.tile([np.log(noise), 0.0, 0.0], n_channels),
-            [float(i == j) for i, j in layout.force],
-            [modes[i].shape[c] / modes[i].shape[i % n_channels] for c, i in layout.shape],
-        ]
-    )
-
-
-def likelihood(
-    modes: Sequence[Mode], n_channels: int, blocks: Sequence[Block], noise: float = NOISE
-) -> Likelihood:
-    """Build a likelihood that starts at the truth; mode i is one in channel i."""
-    reference = [i % n_channels for i in range(len(modes))]
-    size = [m.shape[c] * np.sqrt(m.psd) for m, c in zip(modes, reference, strict=True)]
-    return Likelihood(
-        blocks=tuple(blocks),
-        layout=lay_out(reference, n_channels),
-        start=flat_point(modes, n_channels, noise),
-        scale=np.concatenate([size, np.ones(n_channels)]),
-        centre=float(np.sqrt(BAND[0] * BAND[1])),
-        spread=float(np.log(BAND[1] / BAND[0]) / 2),
-    )
-
-
-def other_point(target: Likelihood, seed: int = 0) -> np.ndarray:
-    """Give a point with coherent forces and bent floors."""
-    rng = np.random.default_rng(seed)
-    m = target.layout.n_modes
-    p = target.start + rng.normal(0, 0.3, target.layout.size)
-    p[:m] = target.start[:m] + rng.normal(0, 0.02, m)
-    return p
-
-
-def covariance(target: Likelihood, p: np.ndarray, frequency: np.ndarray) -> np.ndarray:
-    """Read the unknowns as documented, and let the oracle turn them into a covariance."""
-    m, n = target.layout.n_modes, target.layout.n_channels
-    e, d, b = p[2 * m : 2 * m + 3 * n].reshape(n, 3).T
-    u = np.log(frequency / target.centre) / target.spread
-    root, at = np.eye(m + n), 2 * m + 3 * n
-    for i in range(m + n):
-        for j in range(i + 1 if i < m else i):
-            if n == 1 and i < m and i - j > 1:  # one channel: neighbours alone share forces
-                continue
-            root[i, j] = target.scale[i] * p[at]
-            at += 1
-    shapes = np.ones((n, m))
-    for i, c in product(range(m), range(n)):
-        if c != i % n:
-            shapes[c, i] = p[at]
-            at += 1
-    assert at == p.size
-    return channel_covariance(
-        frequency,
-        resonances=np.exp(p[: 2 * m].reshape(2, m).T),
-        floors=[np.exp((e[c] + d[c] * u + b[c] * u**2) / 2) for c in range(n)],
-        root=root,
-        shapes=shapes,
-    )
-
-
-def frequencies(duration: float) -> np.ndarray:
-    """Fourier frequencies of the band."""
-    return np.arange(np.ceil(BAND[0] * duration), BAND[1] * duration) / duration
-
-
-def spectrum_of(matrix: np.ndarray, duration: float, count: int = 1) -> CrossSpectrum:
-    """Wrap matrices of all frequencies of the band."""
-    f = frequencies(duration)
-    return CrossSpectrum(f, matrix, duration, float("nan"), np.ones(f.size, dtype=bool), (), count)
-
-
-def block_of(spectra: Sequence[CrossSpectrum], *, merge: bool = False) -> Block:
-    """Keep all ordinates; the bandwidth is that of the lightest mode of these tests."""
-    keep = [np.ones(s.frequency.size, dtype=bool) for s in spectra]
-    return make_block(spectra, keep, 2 * 105.0 * 0.015, merge=merge)
-
-
-def drawn(cov: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Draw complex normal vectors, shape ``(n, n_channels)``."""
-    white = rng.standard_normal((2, *cov.shape[:2])) / np.sqrt(2)
-    return np.einsum("kcd,kd->kc", np.linalg.cholesky(cov), white[0] + 1j * white[1])
-
-
-def noisy(m: int, n: int, duration: float, count: int = 1) -> Likelihood:
-    """Draw data from m modes in n channels under independent forces."""
-    truth = likelihood(MODES[:m], n, [])
-    cov = covariance(truth, truth.start, frequencies(duration))
-    rng = np.random.default_rng([m, n])
-    parts = [drawn(cov, rng) for _ in range(count)]
-    mean = sum(x[:, :, None] * x[:, None].conj() for x in parts) / count
-    return replace(truth, blocks=(block_of([spectrum_of(mean, duration, count)]),))
-
-
-def scatter_free(modes: Sequence[Mode], n: int, duration: float, noise: float = NOISE, count=1):
-    """Give a likelihood whose data are their own expectation."""
-    truth = likelihood(modes, n, [], noise)
-    f = frequencies(duration)
-    empty = block_of([spectrum_of(np.tile(np.eye(n) + 0j, (f.size, 1, 1)), duration, count)])
-    (expected,) = replace(truth, blocks=(empty,)).expected(truth.start)
-    return replace(truth, blocks=(replace(empty, matrix=expected),))
-
 
 # What is expected of the ordinates
 
@@ -267,90 +163,6 @@ def test_derivatives_are_those_of_the_value(m: int, n: int, duration: float) -> 
     # Negative control: the comparison notices one entry that is off by a thousandth.
     ours[np.unravel_index(np.argmax(np.abs(ours)), ours.shape)] *= 1.001
     assert not np.allclose(ours @ along, by_gradient, rtol=0, atol=5e-5)
-
-
-# Averages
-
-
-def test_a_mean_over_segments_says_what_they_say_apart() -> None:
-    """One block of means has the value and derivatives of the sum over single segments."""
-    for duration in (1.0, 8.0):
-        truth = likelihood(MODES[:2], 2, [])
-        cov, rng = covariance(truth, truth.start, frequencies(duration)), np.random.default_rng(3)
-        parts = [drawn(cov, rng) for _ in range(5)]
-        matrices = [x[:, :, None] * x[:, None].conj() for x in parts]
-        apart = [block_of([spectrum_of(w, duration)]) for w in matrices]
-        pooled = block_of([spectrum_of(w, duration) for w in matrices])
-        counted = block_of([spectrum_of(np.mean(matrices, axis=0), duration, 5)])
-        assert set(counted.count) == {5.0}
-        p = other_point(truth)
-        one, *others = (replace(truth, blocks=b) for b in (tuple(apart), (pooled,), (counted,)))
-        for other in others:
-            assert other.data_value(p) == pytest.approx(one.data_value(p), rel=1e-12)
-            for a, b in zip(other.derivatives(p), one.derivatives(p), strict=True):
-                np.testing.assert_allclose(a, b, rtol=1e-8, atol=1e-9 * np.abs(b).max())
-
-
-def test_averaged_neighbours_say_what_they_say_apart_where_nothing_changes() -> None:
-    """Of channels that show white floors alone the mean of neighbours loses nothing."""
-    one, merged = (
-        replace(noisy(0, 2, 60.0), blocks=(block_of([s], merge=merge),))
-        for merge in (False, True)
-        for s in [spectrum_of(noisy(0, 2, 60.0).blocks[0].matrix, 60.0)]
-    )
-    (few,), (many,) = merged.blocks, one.blocks
-    assert few.frequency.size < many.frequency.size / 5
-    assert few.count.sum() == many.count.sum()
-    p = one.start.copy()
-    p[0] += 0.3
-    p[one.layout.common] = 0.4
-    assert merged.data_value(p) == pytest.approx(one.data_value(p), rel=1e-12)
-    p[1] = 1.0
-    assert merged.data_value(p) != pytest.approx(one.data_value(p), rel=1e-9)
-
-
-@pytest.mark.parametrize(("duration", "n_segments"), [(40.0, 1), (300.0, 1), (60.0, 30)])
-def test_averaging_neighbours_moves_nothing_by_a_twentieth_of_its_uncertainty(
-    duration: float, n_segments: int
-) -> None:
-    """On data without scatter the shift of ln f and ln ζ by averaging is below σ / 20."""
-    exact = scatter_free(MODES[:1], 2, duration, count=n_segments)
-    (block,) = exact.blocks
-    merged = block_of([spectrum_of(block.matrix, duration, n_segments)], merge=True)
-    assert merged.count[0] >= 2 * n_segments
-    target = replace(exact, blocks=(merged,))
-    p = target.minimise(target.start)
-    std = np.sqrt(np.diag(np.linalg.inv(target.derivatives(p)[1])))
-    off = ((p - target.start) / std)[:2]
-    assert np.abs(off).max() < 0.05
-    # Negative control: with a quarter of the bins the damping moves by more.
-    coarse = duration * 2 * 105.0 * 0.015 / (_bins_per_bandwidth(1e3 * duration) / 4)
-    assert coarse > 2
-
-
-def test_a_block_forgets_what_is_masked_in_all_segments() -> None:
-    """Ordinates count as often as they are kept; a short record still expects them smeared."""
-    for duration in (2.0, 8.0):
-        one, other = (
-            spectrum_of(noisy(1, 2, duration, count).blocks[0].matrix, duration, count)
-            for count in (1, 3)
-        )
-        keep = np.ones((2, one.frequency.size), dtype=bool)
-        keep[0, 3:9] = False
-        keep[1, 6:12] = False
-        block = make_block([one, other], list(keep), 3.15, merge=False)
-        kept = keep.any(axis=0)
-        np.testing.assert_array_equal(block.frequency, one.frequency[kept])
-        np.testing.assert_array_equal(block.count, (keep[0] + 3 * keep[1])[kept])
-        np.testing.assert_allclose(block.matrix[4], other.matrix[4], rtol=1e-14)
-        mean = (one.matrix[0] + 3 * other.matrix[0]) / 4
-        np.testing.assert_allclose(block.matrix[0], mean, rtol=1e-12)
-        assert (block.kernel is None) == (duration > 5)
-        if block.kernel is not None:
-            full = block_of([one])
-            p = other_point(likelihood(MODES[:1], 2, []))
-            some, every = (likelihood(MODES[:1], 2, [b]).expected(p)[0] for b in (block, full))
-            np.testing.assert_allclose(some, every[kept], rtol=1e-9)
 
 
 # Invariances

@@ -1,0 +1,136 @@
+"""Likelihoods of bands with known truth: three modes in up to four channels, white floors."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from itertools import product
+
+import numpy as np
+
+from lmshealth.blocks import Block, make_block
+from lmshealth.layout import lay_out
+from lmshealth.spectra import CrossSpectrum
+from lmshealth.whittle import Likelihood
+from tests.oracles import channel_covariance
+from tests.signals import Mode
+
+SHAPES = ((1.0, 0.4, -0.3, 0.2), (0.3, 1.0, 0.5, -0.6), (-0.4, 0.2, 1.0, 0.3))
+MODES = tuple(
+    Mode(f, zeta, psd, shape)
+    for (f, zeta, psd), shape in zip(
+        [(105.0, 0.015, 1.0), (120.0, 0.02, 2.0), (135.0, 0.025, 1.5)], SHAPES, strict=True
+    )
+)
+NOISE = 0.5
+BAND = (80.0, 170.0)
+
+
+def flat_point(modes: Sequence[Mode], n_channels: int, noise: float = NOISE) -> np.ndarray:
+    """Give the unknowns of independent forces and white floors."""
+    layout = lay_out([i % n_channels for i in range(len(modes))], n_channels)
+    return np.concatenate(
+        [
+            np.log([mode.frequency for mode in modes]),
+            np.log([mode.damping for mode in modes]),
+            np.tile([np.log(noise), 0.0, 0.0], n_channels),
+            [float(i == j) for i, j in layout.force],
+            [modes[i].shape[c] / modes[i].shape[i % n_channels] for c, i in layout.shape],
+        ]
+    )
+
+
+def likelihood(
+    modes: Sequence[Mode], n_channels: int, blocks: Sequence[Block], noise: float = NOISE
+) -> Likelihood:
+    """Build a likelihood that starts at the truth; mode i is one in channel i."""
+    reference = [i % n_channels for i in range(len(modes))]
+    size = [m.shape[c] * np.sqrt(m.psd) for m, c in zip(modes, reference, strict=True)]
+    return Likelihood(
+        blocks=tuple(blocks),
+        layout=lay_out(reference, n_channels),
+        start=flat_point(modes, n_channels, noise),
+        scale=np.concatenate([size, np.ones(n_channels)]),
+        centre=float(np.sqrt(BAND[0] * BAND[1])),
+        spread=float(np.log(BAND[1] / BAND[0]) / 2),
+    )
+
+
+def other_point(target: Likelihood, seed: int = 0) -> np.ndarray:
+    """Give a point with coherent forces and bent floors."""
+    rng = np.random.default_rng(seed)
+    m = target.layout.n_modes
+    p = target.start + rng.normal(0, 0.3, target.layout.size)
+    p[:m] = target.start[:m] + rng.normal(0, 0.02, m)
+    return p
+
+
+def covariance(target: Likelihood, p: np.ndarray, frequency: np.ndarray) -> np.ndarray:
+    """Read the unknowns as documented, and let the oracle turn them into a covariance."""
+    m, n = target.layout.n_modes, target.layout.n_channels
+    e, d, b = p[2 * m : 2 * m + 3 * n].reshape(n, 3).T
+    u = np.log(frequency / target.centre) / target.spread
+    root, at = np.eye(m + n), 2 * m + 3 * n
+    for i in range(m + n):
+        for j in range(i + 1 if i < m else i):
+            if n == 1 and i < m and i - j > 1:  # one channel: neighbours alone share forces
+                continue
+            root[i, j] = target.scale[i] * p[at]
+            at += 1
+    shapes = np.ones((n, m))
+    for i, c in product(range(m), range(n)):
+        if c != i % n:
+            shapes[c, i] = p[at]
+            at += 1
+    assert at == p.size
+    return channel_covariance(
+        frequency,
+        resonances=np.exp(p[: 2 * m].reshape(2, m).T),
+        floors=[np.exp((e[c] + d[c] * u + b[c] * u**2) / 2) for c in range(n)],
+        root=root,
+        shapes=shapes,
+    )
+
+
+def frequencies(duration: float) -> np.ndarray:
+    """Fourier frequencies of the band."""
+    return np.arange(np.ceil(BAND[0] * duration), BAND[1] * duration) / duration
+
+
+def spectrum_of(matrix: np.ndarray, duration: float, count: int = 1) -> CrossSpectrum:
+    """Wrap matrices of all frequencies of the band."""
+    f = frequencies(duration)
+    return CrossSpectrum(f, matrix, duration, float("nan"), np.ones(f.size, dtype=bool), (), count)
+
+
+def block_of(spectra: Sequence[CrossSpectrum], *, merge: bool = False) -> Block:
+    """Keep all ordinates; the bandwidth is that of the lightest mode of these tests."""
+    keep = [np.ones(s.frequency.size, dtype=bool) for s in spectra]
+    return make_block(spectra, keep, 2 * 105.0 * 0.015, merge=merge)
+
+
+def drawn(cov: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Draw complex normal vectors, shape ``(n, n_channels)``."""
+    white = rng.standard_normal((2, *cov.shape[:2])) / np.sqrt(2)
+    return np.einsum("kcd,kd->kc", np.linalg.cholesky(cov), white[0] + 1j * white[1])
+
+
+def noisy(m: int, n: int, duration: float, count: int = 1) -> Likelihood:
+    """Draw data from m modes in n channels under independent forces."""
+    truth = likelihood(MODES[:m], n, [])
+    cov = covariance(truth, truth.start, frequencies(duration))
+    rng = np.random.default_rng([m, n])
+    parts = [drawn(cov, rng) for _ in range(count)]
+    mean = sum(x[:, :, None] * x[:, None].conj() for x in parts) / count
+    return replace(truth, blocks=(block_of([spectrum_of(mean, duration, count)]),))
+
+
+def scatter_free(
+    modes: Sequence[Mode], n: int, duration: float, noise: float = NOISE, count: int = 1
+) -> Likelihood:
+    """Give a likelihood whose data are their own expectation."""
+    truth = likelihood(modes, n, [], noise)
+    f = frequencies(duration)
+    empty = block_of([spectrum_of(np.tile(np.eye(n) + 0j, (f.size, 1, 1)), duration, count)])
+    (expected,) = replace(truth, blocks=(empty,)).expected(truth.start)
+    return replace(truth, blocks=(replace(empty, matrix=expected),))
