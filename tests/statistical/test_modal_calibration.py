@@ -83,8 +83,8 @@ def _judge(off: np.ndarray) -> None:
 
 
 def test_intervals_from_one_record_cover_as_stated(rng: np.random.Generator) -> None:
-    """95 % intervals of 500 records cover f and ζ within the Monte-Carlo error."""
-    _judge(_deviations(acceleration_log(rng, [_MODE], 20.0, _RATE, 1.0) for _ in range(500)))
+    """95 % intervals of 400 records cover f and ζ within the Monte-Carlo error."""
+    _judge(_deviations(acceleration_log(rng, [_MODE], 20.0, _RATE, 1.0) for _ in range(400)))
 
 
 def _short_moves(rng: np.random.Generator) -> Log:
@@ -95,8 +95,8 @@ def _short_moves(rng: np.random.Generator) -> Log:
 
 
 def test_intervals_from_short_moves_cover_as_stated(rng: np.random.Generator) -> None:
-    """95 % intervals of 200 logs of short moves cover f and ζ within the Monte-Carlo error."""
-    _judge(_deviations(_short_moves(rng) for _ in range(200)))
+    """95 % intervals of 150 logs of short moves cover f and ζ within the Monte-Carlo error."""
+    _judge(_deviations(_short_moves(rng) for _ in range(150)))
 
 
 def test_intervals_of_three_modes_in_three_channels_cover_as_stated(
@@ -171,7 +171,7 @@ def test_intervals_of_joint_sources_cover_as_stated(rng: np.random.Generator) ->
     """
     logs = [_three_sensors(rng) for _ in range(100)]
     _judge(_deviations(logs))
-    averaged = np.array([_averaged(log) for log in logs[:60]])
+    averaged = np.array([_averaged(log) for log in logs])
     for column, name in enumerate(("frequency", "damping")):
         found = _coverage(averaged[:, column])
         print(f"{name}, called independent: {found}")
