@@ -140,7 +140,7 @@ def draw_moves(ax: Axes, modes: dict[str, Any]) -> None:
     strengths = [row["times_peak"] for row in modes["strengths"]]
     ax.set_xticks(strengths, [f"{s:g}" for s in strengths])
     ax.minorticks_off()
-    ax.set_xlabel("amplitude of the line over the mode's peak ordinate")
+    ax.set_xlabel("line over the mode's peak, amplitudes")
     ax.set_ylabel("move of the mode's frequency in σ")
     ax.set_title("Lines on a mode", fontsize=10)
     ax.legend(fontsize=7, loc="lower right")
