@@ -74,8 +74,8 @@ def draw_detection(ax: Axes, kinds: dict[str, list[dict[str, Any]]]) -> None:
     rows = kinds["white, 3 s"]
     ratio = [row["ratio_db"] for row in rows]
     for key, style, label in (
-        ("best_known_frequency", ":", "best, frequency and noise known"),
-        ("best_any_frequency", "--", "best of all frequencies, noise known"),
+        ("best_known_frequency", ":", "bound, frequency known"),
+        ("best_any_frequency", "--", "bound, frequency unknown"),
     ):
         ax.plot(ratio, [row[key] for row in rows], style, color=BLACK, label=label)
     ax.set_xlabel("ordinate of the line over the noise in dB")
@@ -108,11 +108,11 @@ def draw_company(ax: Axes, beside: list[dict[str, Any]], strokes: list[dict[str,
     """Draw what is found beside a strong line, and in strokes together."""
     for contrast, colour, marker in zip((20, 30), (BLUE, ORANGE), "os", strict=True):
         rows = [row for row in beside if row["contrast_db"] == contrast]
-        label = f"25 dB beside {25 + contrast} dB, over ordinates"
+        label = f"beside {25 + contrast} dB"
         ax.plot([row["gap"] for row in rows], [row["share_found"] for row in rows], marker + "-",
                 ms=4, color=colour, label=label)  # fmt: skip
     for key, style in (("together", "D-"), ("alone", "D:")):
-        label = f"{strokes[0]['ratio_db']:g} dB, strokes {key}, over their count"
+        label = f"strokes {key}"
         ax.plot([row["strokes"] for row in strokes], [row[key] for row in strokes], style, ms=4,
                 color=GREEN, label=label)  # fmt: skip
     ax.set_xscale("log", base=2)
@@ -120,8 +120,9 @@ def draw_company(ax: Axes, beside: list[dict[str, Any]], strokes: list[dict[str,
     ax.set_ylim(-0.03, 1.03)
     ax.set_xlabel("ordinates apart, or count of strokes")
     ax.set_ylabel("share found")
-    ax.set_title("Lines in company", fontsize=10)
-    ax.legend(fontsize=7, loc="center right")
+    title = f"Lines of 25 dB in company, of {strokes[0]['ratio_db']:g} dB in strokes"
+    ax.set_title(title, fontsize=10)
+    ax.legend(fontsize=7, loc="center right", bbox_to_anchor=(1.0, 0.25))
     ax.grid(alpha=0.25)
 
 

@@ -14,8 +14,14 @@ Method
     told in the σ of its frequency. Negative controls that must fail: the test with a threshold
     that does not share the declared rate among its frequencies; the highest ordinate against the
     median of its neighbours; a mode identified without masks.
+Answer
+    No declared rate is raised, in white and coloured noise and in five resonances of 0.2 to 2 %.
+    Raised it is by a resonance narrower than an ordinate whose skirts drown in the noise. Half of
+    the lines are found at 17 dB over the noise of an ordinate, 95 % at 20 dB: 6 dB above the bound
+    for a detector that knows the noise. Lines up to ten times the mode's peak move it by less than
+    σ in 19 of 20 cases; at thirty times in four of ten only: their foot reaches beyond the masks.
 Run time
-    Some six minutes on one processor.
+    Nine minutes on one processor.
 """
 
 from __future__ import annotations
@@ -101,7 +107,7 @@ def verdicts(answer: dict[str, Any]) -> dict[str, bool]:
         "strokes show together what each does not": (
             answer["strokes"][-1]["together"] - answer["strokes"][-1]["alone"] > 0.5
         ),
-        "lines up to 10 times the peak move a mode by less than a sigma": all(
+        "lines up to 10 times the peak move a mode by less than a sigma in 19 of 20": all(
             row["share_beyond_one"] <= 0.05 for row in moved if row["times_peak"] <= 10
         ),
         "without masks they do not": any(
