@@ -6,16 +6,18 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.ndimage import median_filter
 from scipy.stats import gamma
 
 from lmshealth.arrays import BoolArray, ComplexArray, FloatArray
 from lmshealth.blocks import Block, make_block
-from lmshealth.spectra import CrossSpectrum, Spectrum
+from lmshealth.spectra import CrossSpectrum, Spectrum, median_ordinate
 from lmshealth.starts import Coarse, Target
 
 # Probability that noise alone makes a line somewhere in the band.
 _LINE_FALSE_ALARM = 1e-3
 LINE_BINS = 2
+_BESIDE = 41  # ordinates: a line is less than half as wide
 # Binned log likelihood gained by a mode below which it is absent.
 ABSENT = 3.0
 # A shape begins by the sign it has within so many damping ratios of the resonance.
@@ -163,7 +165,23 @@ def mask_towers(band: Band) -> None:
 
 def mask_lines(band: Band, expected: list[ComplexArray]) -> bool:
     """Mask ordinates that noise would not reach; tell whether there were new ones."""
-    return _mask_above(band, [np.diagonal(e, axis1=1, axis2=2).real for e in expected])
+    levels = [
+        _beside(spectrum, np.diagonal(e, axis1=1, axis2=2).real)
+        for spectrum, e in zip(band.view.spectra, expected, strict=True)
+    ]
+    return _mask_above(band, levels)
+
+
+def _beside(spectrum: CrossSpectrum, expected: FloatArray) -> FloatArray:
+    """Raise what a mean is expected to be to the level about it: what a fit lacks is no line.
+
+    A single periodogram scatters too much for that, and lines tower over what its fit lacks.
+    """
+    if spectrum.count == 1:
+        return expected
+    ordinates = np.diagonal(spectrum.matrix, axis1=1, axis2=2).real
+    ratio = ordinates / expected / median_ordinate(spectrum.count)
+    return np.asarray(expected * median_filter(ratio, (_BESIDE, 1)).clip(1.0))
 
 
 def _mask_above(band: Band, levels: list[FloatArray]) -> bool:

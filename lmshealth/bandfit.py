@@ -27,7 +27,7 @@ from lmshealth.band import (
 from lmshealth.blocks import Block
 from lmshealth.layout import lay_out
 from lmshealth.posterior import marginalise
-from lmshealth.spectra import Spectrum
+from lmshealth.spectra import WANDER, Spectrum
 from lmshealth.starts import Coarse, Target
 from lmshealth.whittle import Likelihood
 
@@ -349,6 +349,8 @@ def _incredible(fit: BandFit, i: int, duration: float) -> tuple[str, str] | None
             f"{f:.5g} Hz in {channel} is narrower ({2 * zeta * f:.2g} Hz) than a record of "
             f"{duration:.3g} s resolves",
         )
+    if target.nominal is None and 2 * zeta < WANDER:
+        return "line-not-mode", f"{f:.5g} Hz in {channel} is as narrow as a line that wanders"
     sought = target.nominal or target.frequency
     if abs(np.log(f / sought)) > np.log1p(target.search) or not low < zeta < high:
         return (

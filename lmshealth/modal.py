@@ -31,8 +31,9 @@ _MOST_TOGETHER = 4
 _CLEAR_NAME = 0.8
 # Without a description, so many times what a fit leaves over is searched for further modes.
 _MOST_ROUNDS = 3
-# Shortest useful segment: half-power bandwidth times duration.
-_LEAST_RESOLUTION = 2.0
+# Shortest useful segment: half-power bandwidth times duration; without a description, periods of
+# the top of the band.
+_LEAST_RESOLUTION, _LEAST_PERIODS = 2.0, 10.0
 _BEYOND = 4.0  # times the top of the band: more than any found mode's flanks reach
 _TOP = 0.45  # of the sample rate: anti-alias filters reach below Nyquist
 
@@ -76,17 +77,17 @@ def identify(
     else:
         view = _transform(log, used, (), band)
         targets, seen = _search(log, used, view, band)
+        known = [frequency for _, frequency, _ in seen]
+        view = replace(view, spectra=tuple(s.without(known) for s in view.spectra))
     seen += [(view.channels[c], f, a) for s in view.spectra for c, f, a in s.lines]
     fits: list[BandFit] = []
     refused: list[Refusal] = []
     for cluster in _clusters(targets):
-        found = _fit_cluster(log, view, cluster, targets, known=stage is not None)
-        for _ in range(_MOST_ROUNDS if stage is None else 0):
-            more = cluster if found.fit is None else _unexplained(found.fit, cluster)
-            if len(more) == len(cluster):
-                break
-            cluster = more
-            found = _fit_cluster(log, view, cluster, targets, known=False)
+        if stage is not None:
+            found = _fit_cluster(log, view, cluster, targets, known=True)
+        else:
+            own = _territory(cluster, targets)
+            found = _fit_further(log, view.band(*own), cluster, targets)
         if found.fit is not None:
             seen += [(s.channel, s.frequency, s.amplitude) for s in found.fit.lines]
             fits.append(found.fit)
@@ -143,21 +144,22 @@ def _transform(
             f"{log.sample_rate:g} Hz cannot show modes up to {top:.0f} Hz; "
             f"needed is at least {2 * top:.0f} Hz",
         )
-    narrowest = min((2 * t.damping_ratio * t.frequency for t in targets), default=np.inf)
-    needed = _LEAST_RESOLUTION / narrowest
+    widest = max((target.search for target in targets), default=0.0)
+    reach = (1 + widest) * top if targets else (band or (0.0, np.inf))[1]
+    # What is found without a description is fitted beyond the band as well.
+    ceiling = reach if targets else _BEYOND * reach
+    needed = _LEAST_PERIODS / min(reach, _TOP * log.sample_rate)
+    if targets:
+        needed = _LEAST_RESOLUTION / min(2 * t.damping_ratio * t.frequency for t in targets)
     segments = find_segments(log, needed)
     if not segments:
         longest = max((b - a for a, b in log.pieces), default=0) / log.sample_rate
         raise BadLog(
             log.name,
             "too-short",
-            f"no stretch of constant velocity without gaps lasts {needed:.3g} s, which the "
-            f"narrowest mode needs; the longest piece without gaps has {longest:.3g} s",
+            f"no stretch of constant velocity without gaps lasts {needed:.3g} s, which is needed "
+            f"for what is looked for; the longest piece without gaps has {longest:.3g} s",
         )
-    widest = max((target.search for target in targets), default=0.0)
-    reach = (1 + widest) * top if targets else (band or (0.0, np.inf))[1]
-    # What is found without a description is fitted beyond the band as well.
-    ceiling = reach if targets else _BEYOND * reach
     return View(
         tuple(channel.name for channel in channels),
         tuple("delta_e" if c.kind == "displacement" else "acc" for c in channels),
@@ -190,7 +192,7 @@ def _search(
         for line in find_lines(channel, segment, log.sample_rate, (low, high)).tolist()
     ]
     spectra = tuple(view.single(c) for c in range(len(channels)))
-    return find_peaks(spectra, low, high), lines
+    return find_peaks(spectra, low, high, [frequency for _, frequency, _ in lines]), lines
 
 
 def _clusters(targets: tuple[Target, ...]) -> list[tuple[Target, ...]]:
@@ -246,6 +248,29 @@ def _fit_cluster(
     return _ClusterResult(fit, refused)
 
 
+def _territory(cluster: tuple[Target, ...], targets: tuple[Target, ...]) -> tuple[float, float]:
+    """Frequencies that are nearer to a cluster than to the modes beside it."""
+    first, last = cluster[0].frequency, cluster[-1].frequency
+    below = [t.frequency for t in targets if t.frequency < first]
+    above = [t.frequency for t in targets if t.frequency > last]
+    low = np.sqrt(max(below) * first) if below else 0.0
+    return float(low), float(np.sqrt(last * min(above))) if above else np.inf
+
+
+def _fit_further(
+    log: Log, view: View, cluster: tuple[Target, ...], targets: tuple[Target, ...]
+) -> _ClusterResult:
+    """Fit a cluster that was found, with what stands out of what its fit leaves over."""
+    found = _fit_cluster(log, view, cluster, targets, known=False)
+    for _ in range(_MOST_ROUNDS):
+        more = cluster if found.fit is None else _unexplained(found.fit, cluster)
+        if len(more) == len(cluster):
+            break
+        cluster = more
+        found = _fit_cluster(log, view, cluster, targets, known=False)
+    return found
+
+
 def _named(fit: BandFit, cluster: tuple[Target, ...]) -> tuple[BandFit, Missing]:
     """Give the modes that were found the names that their frequencies speak for.
 
@@ -289,7 +314,9 @@ def _named(fit: BandFit, cluster: tuple[Target, ...]) -> tuple[BandFit, Missing]
 
 def _unexplained(fit: BandFit, cluster: tuple[Target, ...]) -> tuple[Target, ...]:
     """Add to a cluster what stands out of what its fit leaves over."""
-    candidate = find_excess(fit.residual)
+    # What is narrower than that would have stood out by itself, unless it is a line.
+    narrowest = 0.5 * min(target.damping_ratio for target in cluster)
+    candidate = find_excess(fit.residual, narrowest)
     if candidate is None or len(cluster) > _MOST_TOGETHER:
         return cluster
     if any(abs(candidate.frequency / t.frequency - 1) < t.damping_ratio for t in cluster):

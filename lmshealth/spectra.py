@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import fft
+from scipy.stats import gamma
 
 from lmshealth.arrays import BoolArray, ComplexArray, FloatArray, freeze
 from lmshealth.logs import Channel
@@ -20,6 +21,8 @@ _LAG_PERIODS = 8.0
 _SAME_VELOCITY = 0.01
 # Parts of a stretch that is cut have at least so many samples: only they are averaged.
 _LEAST_PART = MINUTE // 2
+# A line keeps its phase for about a thousand periods: so wide it is, as a share of its frequency.
+WANDER = 1e-3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -63,6 +66,17 @@ class Spectrum:
         first, last = np.searchsorted(self.frequency, [low, high])
         cut = slice(int(first), int(last))
         return replace(self, frequency=self.frequency[cut], periodogram=self.periodogram[cut])
+
+    def near(self, line: float) -> slice:
+        """Ordinates that a line may reach: it wanders, and its foot is two ordinates wide."""
+        return _near(self.frequency, self.duration, line)
+
+    def clear_of(self, lines: Sequence[float]) -> BoolArray:
+        """Tell which ordinates no line at one of these frequencies reaches."""
+        clear = np.ones(self.frequency.size, dtype=bool)
+        for line in lines:
+            clear[self.near(line)] = False
+        return clear
 
     def density(self, low: float, high: float) -> tuple[float, int]:
         """Mean ordinate from low to high Hz and its degrees of freedom, 2 count per ordinate."""
@@ -130,10 +144,28 @@ class CrossSpectrum:
             lines=tuple(line for line in self.lines if low <= line[1] < high),
         )
 
+    def without(self, lines: Sequence[float]) -> CrossSpectrum:
+        """Give up the ordinates that lines at these frequencies in Hz may reach."""
+        free = self.free.copy()
+        for line in lines:
+            free[_near(self.frequency, self.duration, line)] = False
+        return replace(self, free=free)
+
     def channel(self, index: int) -> Spectrum:
         """Give the spectrum of one channel."""
         own = self.matrix[:, index, index].real.copy()
         return Spectrum(self.frequency, own, self.duration, self.velocity, self.count)
+
+
+def _near(frequency: FloatArray, duration: float, line: float) -> slice:
+    half = max(WANDER * line, 2 / duration)
+    first, last = np.searchsorted(frequency, [line - half, line + half])
+    return slice(int(first), int(last))
+
+
+def median_ordinate(count: int) -> float:
+    """Median of the mean of so many exponential variables."""
+    return float(gamma.ppf(0.5, count)) / count
 
 
 def cross_spectra(
@@ -317,7 +349,12 @@ def as_acceleration(
     if channel.kind != "displacement":
         return x, 0
     lag = max(1, int(sample_rate / (_LAG_PERIODS * top)))
-    return (x[2 * lag :] - 2 * x[lag:-lag] + x[: -2 * lag]) * sample_rate**2, lag
+    # In place: of a long segment each intermediate array would be as large as a minute of samples.
+    difference: FloatArray = x[2 * lag :] + x[: -2 * lag]
+    difference -= x[lag:-lag]
+    difference -= x[lag:-lag]
+    difference *= sample_rate**2
+    return difference, lag
 
 
 def lag_gain(frequency: FloatArray, lag: int, sample_rate: float) -> FloatArray:

@@ -10,10 +10,9 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.stats import gamma
 
 from lmshealth.arrays import FloatArray
-from lmshealth.spectra import Spectrum
+from lmshealth.spectra import Spectrum, median_ordinate
 
 _COMMON_STEPS = 41
 _OWN_STEPS = 15
@@ -102,7 +101,7 @@ def coarsen(spectra: tuple[Spectrum, ...], low: float, high: float, width: float
     """
     cut = [spectrum.band(low, high) for spectrum in spectra]
     frequency = np.concatenate([s.frequency for s in cut])
-    ordinates = np.concatenate([s.periodogram / _median(s.count) for s in cut])
+    ordinates = np.concatenate([s.periodogram / median_ordinate(s.count) for s in cut])
     count = np.concatenate([np.full(s.frequency.size, float(s.count)) for s in cut])
     order = np.argsort(frequency, kind="stable")
     n_bins = max(3, min(int((high - low) / width), frequency.size // 4))
@@ -112,11 +111,6 @@ def coarsen(spectra: tuple[Spectrum, ...], low: float, high: float, width: float
         level=np.array([max(np.median(ordinates[part]), 1e-300) for part in parts]),
         count=np.array([count[part].sum() for part in parts]),
     )
-
-
-def _median(count: int) -> float:
-    """Median of the mean of so many exponential variables."""
-    return float(gamma.ppf(0.5, count)) / count
 
 
 def incoherent_fit(

@@ -1,6 +1,6 @@
 """Whittle likelihood of all channels that see one or several modes, with exact derivatives.
 
-The acceleration of mode i under a white modal force is h_i(f) = 1 / (1 - β² + 2iζβ), β = f_i/f.
+The acceleration of mode i under a white modal force is h_i(f) = 1 / (1 - β² - 2iζβ), β = f_i/f.
 What a channel shows beside the modes, its floor, is h_c(f) = exp((e_c + d_c u + b_c u²) / 2) with
 u = -1 … 1 over the band. Modes and floors are driven by partly common forces: the floor of a
 channel is the tail of other modes and the motion of rigid bodies as well as noise, and it
@@ -394,7 +394,7 @@ def receptance(f: FloatArray, zeta: FloatArray, frequency: FloatArray) -> Comple
     h_a = -d_a h² and h_ab = (2 d_a d_b h - d_ab) h².
     """
     beta = f / frequency
-    damping = 2j * zeta * beta
+    damping = -2j * zeta * beta
     h = 1 / (1 - beta**2 + damping)
     d_x, d_xx = damping - 2 * beta**2, damping - 4 * beta**2
     square = h * h

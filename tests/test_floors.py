@@ -15,7 +15,7 @@ FLOORS = [
     {"results"},
     {"readers", "segments", "harmonics", "priors", "modalmap", "tones", "layout"},
     {"laws", "spectra", "following"},
-    {"stage", "blocks", "starts"},
+    {"stage", "blocks", "starts", "linetest"},
     {"peaks", "band", "whittle", "lines", "magnitudes"},
     {"posterior"},
     {"bandfit"},
