@@ -12,7 +12,7 @@ from scipy.stats import gamma
 from lmshealth.arrays import BoolArray, ComplexArray, FloatArray
 from lmshealth.blocks import Block, make_block
 from lmshealth.spectra import CrossSpectrum, Spectrum, median_ordinate
-from lmshealth.starts import Coarse, Target
+from lmshealth.starts import Coarse, Target, misfits, strengths
 
 # Probability that noise alone makes a line somewhere in the band.
 _LINE_FALSE_ALARM = 1e-3
@@ -87,23 +87,20 @@ class Band:
         Their binned spectra in the same units.
     masks : list of ndarray of bool
         Ordinates of each spectrum that hold no line.
-    width : float
-        Smallest half-power bandwidth expected, in Hz.
     """
 
     view: View
     unit: FloatArray
     coarse: tuple[Coarse, ...]
     masks: list[BoolArray]
-    width: float
 
 
 def prepare(view: View, coarse: tuple[Coarse, ...], seen: tuple[Target, ...]) -> Band:
     """Choose the channels that see any of the modes, and put each in units of its noise."""
-    gains = [channel.misfit(()) - channel.misfit(seen) for channel in coarse]
+    gains = misfits(coarse, ()) - misfits(coarse, seen)
     index = [c for c, gain in enumerate(gains) if gain >= ABSENT] or [int(np.argmax(gains))]
     used = [coarse[c] for c in index]
-    noise = np.array([max(c.strengths(seen)[1], 1e-2 * c.level.min()) for c in used])
+    noise = np.maximum(strengths(used, seen)[1], [1e-2 * c.level.min() for c in used])
     unit = np.sqrt(noise)
     chosen = view.only(index)
     spectra = tuple(replace(s, matrix=s.matrix / np.outer(unit, unit)) for s in chosen.spectra)
@@ -112,7 +109,6 @@ def prepare(view: View, coarse: tuple[Coarse, ...], seen: tuple[Target, ...]) ->
         unit,
         tuple(replace(c, level=c.level / n) for c, n in zip(used, noise, strict=True)),
         [s.free.copy() for s in spectra],
-        min(2 * t.frequency * t.damping_ratio for t in seen),
     )
 
 
@@ -124,15 +120,14 @@ def alike(spectra: Sequence[CrossSpectrum]) -> list[list[int]]:
     return list(groups.values())
 
 
-def make_blocks(band: Band, *, merge: bool) -> tuple[Block, ...]:
-    """Prepare the ordinates for the likelihood; ``merge`` as in `make_block`."""
+def make_blocks(
+    band: Band, bandwidth: float, near: Sequence[float] | None = None
+) -> tuple[Block, ...]:
+    """Prepare the ordinates for the likelihood; ``bandwidth`` and ``near`` as in `make_block`."""
     spectra = band.view.spectra
     return tuple(
         make_block(
-            [spectra[i] for i in group],
-            [band.masks[i] for i in group],
-            band.width,
-            merge=merge,
+            [spectra[i] for i in group], [band.masks[i] for i in group], bandwidth, near=near
         )
         for group in alike(spectra)
     )

@@ -28,7 +28,7 @@ from lmshealth.blocks import Block
 from lmshealth.layout import lay_out
 from lmshealth.posterior import marginalise
 from lmshealth.spectra import WANDER, Spectrum
-from lmshealth.starts import Coarse, Target
+from lmshealth.starts import Coarse, Target, misfits, strengths
 from lmshealth.whittle import Likelihood
 
 # The band of a fit reaches this many damping ratios from its modes: beyond, a resonance adds
@@ -43,6 +43,8 @@ _WORST_STD_LN_F = 0.03
 _WORST_STD_LN_ZETA = 0.7
 # A damping off its start by more than this factor belongs to something else.
 _DAMPING_SPAN = 6.0
+# Bins made for a resonance are fine enough for one that is narrower by this factor.
+_NARROWER = 0.7
 # Newton decrement of a fit that has arrived.
 _WORST_DECREMENT = 1e-2
 _HEAVY = 0.1  # and above this, a hump that nobody expected is no mode
@@ -172,7 +174,7 @@ def _absent(target: Target, gain: float) -> tuple[str, str]:
 
 
 def _misfit(coarse: Sequence[Coarse], targets: tuple[Target, ...]) -> float:
-    return sum(channel.misfit(targets) for channel in coarse)
+    return float(misfits(coarse, targets).sum())
 
 
 def _screen(
@@ -212,7 +214,8 @@ def _fit_and_prune(
         extra = full.p.size - less.p.size
         return float(2 * (less.misfit - full.misfit) - extra * np.log(n_ordinates))
 
-    blocks = make_blocks(band, merge=True)
+    bandwidth = min(2 * t.frequency * t.damping_ratio for t in seen)
+    blocks = make_blocks(band, bandwidth, [target.frequency for target in seen])
     solution = _solve(band, blocks, seen)
     while seen:
         doubtful = [i for i, t in enumerate(seen) if gains[t.name] < _BEYOND_DOUBT]
@@ -223,7 +226,22 @@ def _fit_and_prune(
             break
         missing[seen[worst].name] = _absent(seen[worst], gains[seen[worst].name])
         seen, solution = seen[:worst] + seen[worst + 1 :], without[worst]
-    return solution, seen
+    return _refined(band, solution, seen) if seen else solution, seen
+
+
+def _refined(band: Band, solution: _Solution, seen: tuple[Target, ...]) -> _Solution:
+    """Go on with bins as fine as the resonances ask for that were found, if they are not yet."""
+    m = len(seen)
+    f, zeta = np.exp(solution.p[:m]), np.exp(solution.p[m : 2 * m])
+    bandwidth, expected = 2 * zeta * f, [2 * t.frequency * t.damping_ratio for t in seen]
+    apart = np.abs(f - [target.frequency for target in seen])
+    if (apart < bandwidth / 2).all() and bandwidth.min() > _NARROWER * min(expected):
+        return solution
+    least = max(float(bandwidth.min()), min(expected) / _DAMPING_SPAN)
+    blocks = make_blocks(band, least, f.tolist())
+    likelihood = replace(solution.likelihood, blocks=blocks)
+    p = likelihood.minimise(solution.p)
+    return _Solution(likelihood, p, likelihood.data_value(p))
 
 
 def _solve(band: Band, blocks: tuple[Block, ...], targets: tuple[Target, ...]) -> _Solution:
@@ -231,12 +249,8 @@ def _solve(band: Band, blocks: tuple[Block, ...], targets: tuple[Target, ...]) -
     n_channels = len(band.coarse)
     zeta = np.array([target.damping_ratio for target in targets])
     # A strength of zero would leave a mode without a gradient.
-    amplitude = np.sqrt(
-        [
-            np.maximum(c.strengths(targets)[0], 0.01 * c.level.min() * 4 * zeta**2)
-            for c in band.coarse
-        ]
-    )
+    least = np.outer([0.01 * channel.level.min() for channel in band.coarse], 4 * zeta**2)
+    amplitude = np.sqrt(np.maximum(strengths(band.coarse, targets)[0], least))
     reference = amplitude.argmax(axis=0).tolist()
     scale = amplitude.max(axis=0)
     layout = lay_out(reference, n_channels)
@@ -268,7 +282,9 @@ def _solve(band: Band, blocks: tuple[Block, ...], targets: tuple[Target, ...]) -
 
 def _expected(band: Band, solution: _Solution) -> list[ComplexArray]:
     """Give what each spectrum is expected to be over its band; infinite where it is masked."""
-    likelihood = replace(solution.likelihood, blocks=make_blocks(band, merge=False))
+    m = solution.likelihood.layout.n_modes
+    bandwidth = float(np.min(2 * np.exp(solution.p[:m] + solution.p[m : 2 * m])))
+    likelihood = replace(solution.likelihood, blocks=make_blocks(band, bandwidth))
     n_channels = len(band.coarse)
     nothing = np.diag(np.full(n_channels, np.inf)).astype(complex)
     full = [np.tile(nothing, (mask.size, 1, 1)) for mask in band.masks]

@@ -53,7 +53,11 @@ class Block:
 
 
 def make_block(
-    spectra: Sequence[CrossSpectrum], keep: Sequence[BoolArray], bandwidth: float, *, merge: bool
+    spectra: Sequence[CrossSpectrum],
+    keep: Sequence[BoolArray],
+    bandwidth: float,
+    *,
+    near: Sequence[float] | None = None,
 ) -> Block:
     """Prepare the ordinates of segments of one length for the likelihood.
 
@@ -67,8 +71,9 @@ def make_block(
         Ordinates of each that hold no line, shape ``(n_ordinates,)``.
     bandwidth : float
         Smallest half-power bandwidth 2ζf expected, in Hz: decides whether the record resolves it.
-    merge : bool
-        Whether neighbours may be averaged where the density hardly changes between them.
+    near : sequence of float, optional
+        Resonances in Hz: neighbours are averaged where the density hardly changes between them.
+        By default none are.
     """
     first = spectra[0]
     count = np.zeros(first.frequency.size)
@@ -83,14 +88,28 @@ def make_block(
         finer = int(np.clip(np.ceil(_SAMPLES_PER_BANDWIDTH / resolution), 2, 12))
         kernel = make_kernel(first, kept, finer, _MARGIN_BINS)
         return Block(frequency, total / count[:, None, None], count, kernel)
-    n_segments = sum(spectrum.count for spectrum in spectra)
-    together = int(resolution / _bins_per_bandwidth(n_segments * resolution)) if merge else 1
-    if together > 1:
-        starts = np.arange(0, frequency.size, together)
+    if near is not None:
+        n_segments = sum(spectrum.count for spectrum in spectra)
+        fine = _bins_per_bandwidth(n_segments * resolution) / bandwidth
+        starts = _bins(first.frequency, near, bandwidth, fine)[kept]
+        starts = np.flatnonzero(np.diff(starts, prepend=-1))
         weight = np.add.reduceat(count, starts)
         frequency = np.add.reduceat(count * frequency, starts) / weight
         total, count = np.add.reduceat(total, starts, axis=0), weight
     return Block(frequency, total / count[:, None, None], count, None)
+
+
+def _bins(
+    frequency: FloatArray, near: Sequence[float], bandwidth: float, fine: float
+) -> np.ndarray[tuple[int], np.dtype[np.intp]]:
+    """Number of the bin of each ordinate: ``fine`` of them per Hz at a resonance.
+
+    On its flank, at x half bandwidths, the logarithm of the density changes over x half
+    bandwidths: bins may be as much wider.
+    """
+    distance = np.min([np.abs(frequency - f) for f in near], axis=0) / (bandwidth / 2)
+    step = frequency[1] - frequency[0]
+    return np.asarray(np.cumsum(fine * step / np.hypot(1.0, distance)), dtype=np.intp)
 
 
 def _bins_per_bandwidth(resolution: float) -> float:

@@ -41,34 +41,48 @@ def marginalise(likelihood: Likelihood, p: FloatArray) -> tuple[FloatArray, Floa
     decrement : float
         Newton decrement g H⁻¹ g at the mode; infinite where it is none.
     """
-    n = 2 * likelihood.layout.n_modes
+    n, layout = 2 * likelihood.layout.n_modes, likelihood.layout
     gradient, hessian = likelihood.derivatives(p)
     try:
         factor = np.linalg.cholesky(hessian)
     except np.linalg.LinAlgError:
         return p[:n], np.full((n, n), np.nan), np.inf
     decrement = float(np.sum(np.linalg.solve(factor, gradient) ** 2))
-    layout = likelihood.layout
     groups = (layout.shared, layout.common, layout.bends)
-    widest = [widths[-1] for widths in _WIDTHS]
-    weights, means, covs = [], [], []
-    for widths in product(*_WIDTHS):
-        # What the narrower prior has more than the one that is in the Hessian.
-        extra = np.zeros(p.size)
-        for index, width, most in zip(groups, widths, widest, strict=True):
-            extra[index] = width**-2 - most**-2
-        narrowed = hessian + np.diag(extra)
-        shift = -np.linalg.solve(narrowed, extra * p)
-        moved = p + shift
-        cost = 0.5 * float(shift @ hessian @ shift + extra @ moved**2)
-        n_each = [len(index) for index in groups]
-        weights.append(
-            -cost - 0.5 * np.linalg.slogdet(narrowed)[1] - float(np.log(widths) @ n_each)
-        )
-        means.append(moved[:n])
-        covs.append(np.linalg.inv(narrowed)[:n, :n])
-    weight = softmax(weights)
-    mean = weight @ np.array(means)
-    apart = np.array(means) - mean
-    cov = np.tensordot(weight, np.array(covs), axes=1) + (weight[:, None] * apart).T @ apart
-    return mean, np.asarray(cov, dtype=np.float64), decrement
+    index = np.array([unknown for group in groups for unknown in group], dtype=int)
+    cov = np.linalg.inv(hessian)
+    precision = np.linalg.inv(cov[np.ix_(index, index)])
+    follow = cov[:n, index] @ precision  # how ln f and ln ζ move with these unknowns
+    weight, mean, narrowed = _narrow(p[index], precision, [len(group) for group in groups])
+    moved = (mean - p[index]) @ follow.T
+    estimate = p[:n] + weight @ moved
+    apart = p[:n] + moved - estimate
+    less = cov[np.ix_(index, index)] - np.tensordot(weight, narrowed, axes=1)
+    cov = cov[:n, :n] - follow @ less @ follow.T + (weight[:, None] * apart).T @ apart
+    return estimate, np.asarray(cov, dtype=np.float64), decrement
+
+
+def _narrow(
+    x: FloatArray, precision: FloatArray, sizes: list[int]
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Try narrower priors on groups of unknowns that are near-normal under the widest ones.
+
+    Returns
+    -------
+    weight : ndarray
+        Evidence of each choice of widths, which add up to one, shape ``(n_choices,)``.
+    mean, cov : ndarray
+        Of the unknowns, shapes ``(n_choices, n)`` and ``(n_choices, n, n)``.
+    """
+    widths = np.array(list(product(*_WIDTHS)))
+    widest = np.array([w[-1] for w in _WIDTHS])
+    # What the narrower prior has more than the one that is in the precision.
+    extra = np.repeat(widths**-2 - widest**-2, sizes, axis=1)
+    narrower = precision + extra[:, :, None] * np.eye(x.size)
+    cov = np.linalg.inv(narrower)
+    mean = cov @ (precision @ x)
+    shift = mean - x
+    cost = np.einsum("ki,ij,kj->k", shift, precision, shift) + np.sum(extra * mean**2, axis=1)
+    log_det = np.linalg.slogdet(narrower)[1]
+    weight = softmax(-0.5 * (cost + log_det) - np.log(widths) @ sizes)
+    return np.asarray(weight), mean, cov

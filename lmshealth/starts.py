@@ -7,6 +7,7 @@ once by an incoherent sum of resonances on a coarsely binned spectrum.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -69,23 +70,6 @@ class Coarse:
     count: FloatArray
     neighbours: tuple[Target, ...] = ()
 
-    def misfit(self, targets: tuple[Target, ...]) -> float:
-        """Whittle misfit of these targets, the neighbours and a white noise."""
-        return float(self._fit(targets)[1])
-
-    def strengths(self, targets: tuple[Target, ...]) -> tuple[FloatArray, float]:
-        """Modal PSD of each target, shape ``(n_targets,)``, and the noise PSD."""
-        strength = self._fit(targets)[0]
-        return strength[: len(targets)], float(strength[-1])
-
-    def _fit(self, targets: tuple[Target, ...]) -> tuple[FloatArray, FloatArray]:
-        everything = (*targets, *self.neighbours)
-        return incoherent_fit(
-            self,
-            np.array([target.frequency for target in everything]),
-            np.array([target.damping_ratio for target in everything]),
-        )
-
 
 def coarsen(spectra: tuple[Spectrum, ...], low: float, high: float, width: float) -> Coarse:
     """Bin the ordinates of all spectra of a channel.
@@ -105,56 +89,87 @@ def coarsen(spectra: tuple[Spectrum, ...], low: float, high: float, width: float
     count = np.concatenate([np.full(s.frequency.size, float(s.count)) for s in cut])
     order = np.argsort(frequency, kind="stable")
     n_bins = max(3, min(int((high - low) / width), frequency.size // 4))
-    parts = np.array_split(order, n_bins)
+    # The first bins hold one ordinate more than the others.
+    size, n_larger = divmod(frequency.size, n_bins)
+    larger, smaller = np.split(order, [n_larger * (size + 1)])
+    parts = [larger.reshape(n_larger, size + 1), smaller.reshape(n_bins - n_larger, size)]
     return Coarse(
-        frequency=np.array([frequency[part].mean() for part in parts]),
-        level=np.array([max(np.median(ordinates[part]), 1e-300) for part in parts]),
-        count=np.array([count[part].sum() for part in parts]),
+        frequency=np.concatenate([frequency[part].mean(axis=1) for part in parts]),
+        level=np.concatenate([np.median(ordinates[part], axis=1) for part in parts]).clip(1e-300),
+        count=np.concatenate([count[part].sum(axis=1) for part in parts]),
+    )
+
+
+def misfits(coarse: Sequence[Coarse], targets: tuple[Target, ...]) -> FloatArray:
+    """Whittle misfit of these targets, the neighbours and a white noise, ``(n_channels,)``."""
+    return _fit_targets(coarse, targets)[1]
+
+
+def strengths(
+    coarse: Sequence[Coarse], targets: tuple[Target, ...]
+) -> tuple[FloatArray, FloatArray]:
+    """Modal PSD of each target, ``(n_channels, n_targets)``, and noise PSD, ``(n_channels,)``."""
+    strength, _ = _fit_targets(coarse, targets)
+    return strength[:, : len(targets)], strength[:, -1]
+
+
+def _fit_targets(
+    coarse: Sequence[Coarse], targets: tuple[Target, ...]
+) -> tuple[FloatArray, FloatArray]:
+    everything = (*targets, *coarse[0].neighbours)
+    return incoherent_fit(
+        coarse,
+        np.array([target.frequency for target in everything]),
+        np.array([target.damping_ratio for target in everything]),
     )
 
 
 def incoherent_fit(
-    coarse: Coarse, f: FloatArray, zeta: FloatArray
+    coarse: Sequence[Coarse], f: FloatArray, zeta: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Fit strengths of resonances and a white noise to a binned spectrum, for many candidates.
+    """Fit strengths of resonances and white noises to binned spectra, for many candidates.
 
     The strengths maximise the Whittle likelihood by multiplicative updates, which keep them
     positive; least squares would be ruled by the bins that happen to be low.
 
     Parameters
     ----------
-    coarse : Coarse
-        Binned spectrum.
+    coarse : sequence of Coarse
+        Binned spectrum of each channel; all have the same bins.
     f, zeta : ndarray
         Natural frequencies in Hz and damping ratios, shape ``(..., n_modes)``.
 
     Returns
     -------
     strength : ndarray
-        Modal PSD of each mode, then the noise PSD, shape ``(..., n_modes + 1)``.
+        Modal PSD of each mode, then the noise PSD, shape ``(n_channels, ..., n_modes + 1)``.
     misfit : ndarray
-        Whittle misfit of the binned spectrum, shape ``(...)``.
+        Whittle misfit of the binned spectra, shape ``(n_channels, ...)``.
 
     References
     ----------
     Fevotte2009
     """
-    beta = f[..., None, :] / coarse.frequency[:, None]
+    frequency, count = coarse[0].frequency, coarse[0].count
+    beta = f[..., None, :] / frequency[:, None]
     shapes = 1 / ((1 - beta**2) ** 2 + (2 * zeta[..., None, :] * beta) ** 2)
     design = np.concatenate([shapes, np.ones((*shapes.shape[:-1], 1))], axis=-1)
     unit = design.mean(axis=-2)
     design = design / unit[..., None, :]
+    levels = np.stack([channel.level for channel in coarse])
+    levels = levels.reshape(len(coarse), *[1] * (f.ndim - 1), count.size)
     # Every part starts with an equal share of the mean level.
-    weight = np.full(unit.shape, float(np.average(coarse.level, weights=coarse.count)))
-    weight /= weight.shape[-1]
+    weight = np.average(levels, axis=-1, weights=count)[..., None] / unit.shape[-1]
+    weight = weight * np.ones(unit.shape)
     turned = np.swapaxes(design, -1, -2)
     for _ in range(_UPDATES):
         model = (design @ weight[..., None])[..., 0]
-        pull = turned @ (coarse.count * coarse.level / model**2)[..., None]
-        push = turned @ (coarse.count / model)[..., None]
+        share = count / model
+        pull = turned @ (share * levels / model)[..., None]
+        push = turned @ share[..., None]
         weight = weight * np.sqrt(pull / push)[..., 0] ** _STRIDE
     model = (design @ weight[..., None])[..., 0]
-    misfit = np.sum(coarse.count * (np.log(model) + coarse.level / model), axis=-1)
+    misfit = np.sum(count * (np.log(model) + levels / model), axis=-1)
     return weight / unit, np.asarray(misfit)
 
 
@@ -188,7 +203,7 @@ def locate(
     Parameters
     ----------
     coarse : tuple of Coarse
-        Binned spectrum of each channel; all have the same neighbours.
+        Binned spectrum of each channel; all have the same bins and neighbours.
     targets : tuple of Target
         A cluster of modes.
 
@@ -208,8 +223,7 @@ def locate(
     def best(shifts: FloatArray) -> FloatArray:
         cost = shift_cost(shifts, search, own)
         f = nominal * np.exp(shifts)
-        for channel in coarse:
-            cost += incoherent_fit(channel, f, np.broadcast_to(zeta, f.shape))[1]
+        cost += incoherent_fit(coarse, f, np.broadcast_to(zeta, f.shape))[1].sum(axis=0)
         return np.asarray(shifts[int(np.argmin(cost))])
 
     reach = float(np.log1p(search.min()))

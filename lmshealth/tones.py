@@ -18,15 +18,21 @@ from lmshealth.arrays import BoolArray, ComplexArray, FloatArray
 # An ordinate this many times the median of those beside it is suspected of being a tone.
 _TOWERING = 60.0
 _BESIDE = (3, 4, 5, 6, 7, 8)
-# Numbers of polynomials of the wandering amplitude, tried one after the other, and ordinates to
-# either side that they are fitted to.
-_TERMS = (4, 8, 12)
+# Numbers of polynomials of the wandering amplitude, of which the fewest are taken that leave about
+# as little in the ordinates beside the tone as the most do, and ordinates to either side that they
+# are fitted to.
+_TERMS = (4, 8, 12, 16, 24)
+_AS_LITTLE = 1.5
 _REACH = 400
 # A resonance towers, too, but no polynomial explains its surroundings: of a tone they come down to
 # this many times what is further away.
 _LEFT_OVER = 4.0
 _NEAR, _FAR = 10, 40
-_MOST_TONES = 200
+_MOST_TONES, _MOST_ROUNDS = 200, 4
+# Tones fitted together, the strongest first; suspects this near to a stronger one are its foot.
+_TOGETHER, _FOOT = 6, 4
+# Share of the level that the skirt of a tone may have where it is left in.
+_SKIRT = 0.05
 
 
 class Tone(NamedTuple):
@@ -57,61 +63,141 @@ def remove_tones(transforms: ComplexArray) -> tuple[ComplexArray, BoolArray, tup
     tones : tuple of Tone
         Each in the channel that shows it most clearly.
     """
-    power = transforms.real**2 + transforms.imag**2
     free = np.ones(len(transforms), dtype=bool)
     if len(transforms) < 3 * _FAR:
         return transforms, free, ()
-    contrast = _contrast(power)
     # With time counted from the middle of the segment every other ordinate changes its sign.
     turn = np.where(np.arange(len(transforms)) % 2, -1.0, 1.0)[:, None]
     rest = transforms * turn
     tones: list[Tone] = []
-    suspects = np.flatnonzero(contrast.max(axis=1) > _TOWERING)
-    for at in suspects[np.argsort(-contrast[suspects].max(axis=1))][:_MOST_TONES].tolist():
-        if not free[at]:
-            continue
-        channel = int(contrast[at].argmax())
-        near = slice(max(0, at - _REACH), at + _REACH + 1)
-        found = _without_tone(rest[near], at - near.start, channel)
-        if found is None:
-            continue
-        cleaned, off, foot = found
-        lost = rest[near, channel] - cleaned[:, channel]
-        tones.append(Tone(channel, at + off, float(np.sum(np.abs(lost) ** 2))))
-        rest[near] = cleaned
-        free[max(0, at - foot) : at + foot + 1] = False
+    for _ in range(_MOST_ROUNDS):
+        found = _take_out(rest, free, [k for k in _towering(_filled(rest, free)) if free[k]])
+        tones += found
+        if not found:
+            break
     return rest * turn, free, tuple(tones)
 
 
+def _take_out(rest: ComplexArray, free: BoolArray, peaks: list[int]) -> list[Tone]:
+    """Take out of ``rest`` and of ``free`` what is a tone of some peaks."""
+    tones = []
+    for at in peaks:
+        near = slice(max(0, at - _REACH), at + _REACH + 1)
+        # Where others stand they are fitted, too.
+        others = [k for k in peaks if k != at and near.start <= k < near.stop and free[k]]
+        places = [_place(rest, k) for k in (at, *others[: _TOGETHER - 1])]
+        found = _fit_tone(rest[near], np.array(places) - near.start)
+        if found is None:
+            continue
+        terms, size, level = found
+        # What the noise adds by itself is not the tone's.
+        power = np.sum(
+            np.abs(_basis(near.stop - near.start, places[0] - near.start, terms) @ size) ** 2,
+            axis=0,
+        )
+        channel = int(np.argmax(power / level))
+        tones.append(
+            Tone(channel, places[0], float(max(power[channel] - terms * level[channel], 0.0)))
+        )
+        # Its skirt falls with the square of the distance.
+        reach = max(_REACH, int(np.sqrt(np.max(power / level) / _SKIRT) / np.pi))
+        reached = slice(max(0, at - reach), at + reach + 1)
+        own = rest[reached]
+        rest[reached] = own - _basis(len(own), places[0] - reached.start, terms) @ size
+        foot = _foot(terms)
+        free[max(0, at - foot) : at + foot + 1] = False
+    return tones
+
+
+def _filled(rest: ComplexArray, free: BoolArray) -> FloatArray:
+    """Power, where a tone stood as high as beside it."""
+    power = rest.real**2 + rest.imag**2
+    edges = np.flatnonzero(np.diff(np.concatenate([[1], free, [1]])))
+    for first, last in edges.reshape(-1, 2).tolist():
+        beside = np.r_[max(0, first - _NEAR) : first, last : last + _NEAR]
+        power[first:last] = np.median(power[beside[beside < len(power)]], axis=0)
+    return power
+
+
+def _towering(power: FloatArray) -> list[int]:
+    """List ordinates that tower over those beside them, the highest of neighbours alone."""
+    contrast = _contrast(power).max(axis=1)
+    suspects = np.flatnonzero(contrast > _TOWERING)
+    peaks: list[int] = []
+    for at in suspects[np.argsort(-power[suspects].max(axis=1), kind="stable")].tolist():
+        if all(abs(at - peak) > _FOOT for peak in peaks):
+            peaks.append(at)
+    return peaks[:_MOST_TONES]
+
+
+def _place(rest: ComplexArray, at: int) -> float:
+    """Where a tone stands about its highest ordinate.
+
+    δ above it the three have 1/δ, 1/(1 - δ) and -1/(1 + δ) times the same number.
+    """
+    below, own, above = rest[[max(0, at - 1), at, min(at + 1, len(rest) - 1)]]
+    channel = int(np.argmax(np.abs(own)))
+    ratio = float(((above - below) / own)[channel].real)
+    return at + ratio / (1 + float(np.hypot(1, ratio)))
+
+
 def _contrast(power: FloatArray) -> FloatArray:
-    """Ratio of each ordinate to the median of those three to eight beside it."""
+    """Ratio of each ordinate to the median of those three to eight beside it, if that is large."""
     widest, n = _BESIDE[-1], len(power)
     padded = np.pad(power, ((widest, widest), (0, 0)), mode="reflect")
-    beside = [padded[widest + k : widest + k + n] for b in _BESIDE for k in (-b, b)]
-    return np.asarray(power / np.median(beside, axis=0).clip(1e-300))
+    beside = np.array([padded[widest + k : widest + k + n] for b in _BESIDE for k in (-b, b)])
+    # The median is not below the least: most ordinates do not need it.
+    contrast = power / beside.min(axis=0).clip(1e-300)
+    large = contrast > _TOWERING
+    contrast[large] = power[large] / np.median(beside[:, large], axis=0).clip(1e-300)
+    return np.asarray(contrast)
 
 
-def _without_tone(
-    rest: ComplexArray, at: int, channel: int
-) -> tuple[ComplexArray, float, int] | None:
-    """Take a tone out of all channels about an ordinate.
+def _fit_tone(
+    rest: ComplexArray, places: FloatArray
+) -> tuple[int, ComplexArray, FloatArray] | None:
+    """Fit the first of some tones by polynomials, as few as will do.
 
-    Returns what is left, how far the tone stands off that ordinate, and to how many ordinates the
-    fit takes the noise out as well; None where no polynomial explains it.
+    Returns their number, their sizes in each channel, and the level of what is beside the tone;
+    None where no polynomial explains it.
     """
-    first = max(0, at - 1)
-    power = np.abs(rest[first : at + 2, channel]) ** 2
-    place = first + float(np.arange(power.size) @ power / power.sum())
-    off = np.arange(len(rest)) - place
-    distance = np.abs(off)
+    apart = np.abs(np.arange(len(rest)) - places[:, None])
+    widest = _foot(_TERMS[-1])
+    # Where other tones stand the noise is fitted, too.
+    alone = (apart[1:] > widest).all(axis=0)
+
+    def left(fit: ComplexArray, inner: int, outer: int) -> FloatArray:
+        there = alone & (apart[0] > inner) & (apart[0] <= outer)
+        if not there.any():
+            return np.full(rest.shape[1], np.nan)
+        return np.asarray(np.median(np.abs(fit[there]) ** 2, axis=0) / np.log(2))
+
+    sizes, fits = [], []
     for terms in _TERMS:
-        basis = spherical_jn(np.arange(terms), np.pi * distance[:, None])
-        basis[:, 1::2] *= np.sign(off)[:, None]
-        cleaned = rest - basis @ np.linalg.lstsq(basis, rest, rcond=None)[0]
-        foot = terms // 2 + 1
-        around = np.abs(cleaned[:, channel]) ** 2
-        close = around[(distance > foot) & (distance <= foot + _NEAR)]
-        far = around[(distance > foot + _NEAR) & (distance <= foot + _FAR)]
-        if close.mean() <= _LEFT_OVER * far.mean():
-            return cleaned, place - at, foot
-    return None
+        basis = np.hstack([_basis(len(rest), place, terms) for place in places])
+        size = np.linalg.lstsq(basis, rest, rcond=None)[0]
+        sizes.append(size[:terms])
+        fits.append(rest - basis @ size)
+    level = left(fits[-1], widest, widest + _NEAR)
+    far = left(fits[-1], widest + _NEAR, widest + _FAR)
+    channel = int(np.argmax(np.sum(np.abs(sizes[-1]) ** 2, axis=0) / level))
+    if not level[channel] <= _LEFT_OVER * far[channel]:
+        return None
+    enough = [
+        (left(fit, _foot(terms), _foot(terms) + _NEAR) <= _AS_LITTLE * level).all()
+        for fit, terms in zip(fits, _TERMS, strict=True)
+    ]
+    best = int(np.argmax(enough)) if any(enough) else -1
+    return _TERMS[best], sizes[best], level
+
+
+def _foot(terms: int) -> int:
+    return terms // 2 + 1
+
+
+def _basis(n: int, place: float, terms: int) -> FloatArray:
+    """Transforms of the polynomials at n ordinates, shape ``(n, n_terms)``."""
+    off = np.arange(n) - place
+    basis = spherical_jn(np.arange(terms), np.pi * np.abs(off)[:, None])
+    basis[:, 1::2] *= np.sign(off)[:, None]
+    return np.asarray(basis)

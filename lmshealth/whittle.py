@@ -29,7 +29,8 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from scipy.optimize import minimize
+from scipy.linalg import cho_factor, cho_solve
+from scipy.optimize import OptimizeResult, minimize
 
 from lmshealth.arrays import ComplexArray, FloatArray
 from lmshealth.blocks import Block
@@ -38,6 +39,8 @@ from lmshealth.layout import Layout
 # Where the second derivatives of h stand, by which first ones they are of.
 _SECOND = np.array([[4, 5, 6], [5, 7, 8], [6, 8, 9]])
 
+# Newton decrement, a square in standard deviations, below which no further step is worth it.
+_ARRIVED = 1e-5
 # Standard deviations of the weak normal priors about the start, which only keep directions that
 # the data do not see from running away: of ln f, ln ζ, forces, shapes, floors.
 WEAK = (0.2, 2.0)
@@ -144,21 +147,29 @@ class Likelihood:
         """
         last: list[FloatArray] = []
 
-        def gradient(p: FloatArray) -> FloatArray:
-            last[:] = [p.copy(), *self.derivatives(p)]
-            return last[1]
+        def derivatives(p: FloatArray) -> list[FloatArray]:
+            # The optimiser asks for gradient and Hessian of a point in an order of its own.
+            if not last or not np.array_equal(p, last[0]):
+                last[:] = [p.copy(), *self.derivatives(p)]
+            return last
 
-        def hessian(p: FloatArray) -> FloatArray:
-            # The optimiser asks for the gradient at a point before it asks for the Hessian there.
-            return last[2] if np.array_equal(p, last[0]) else self.derivatives(p)[1]
+        def arrived(intermediate_result: OptimizeResult) -> None:
+            _, gradient, hessian = derivatives(intermediate_result.x)
+            try:
+                step = cho_solve(cho_factor(hessian), gradient)
+            except np.linalg.LinAlgError:
+                return
+            if gradient @ step < _ARRIVED:
+                raise StopIteration
 
         found = minimize(
             self.value,
             start,
-            jac=gradient,
-            hess=hessian,
+            jac=lambda p: derivatives(p)[1],
+            hess=lambda p: derivatives(p)[2],
             method="trust-exact",
-            options={"gtol": 1e-3, "maxiter": 100, "initial_trust_radius": 0.3},
+            callback=arrived,
+            options={"gtol": 1e-9, "maxiter": 100, "initial_trust_radius": 0.3},
         )
         return np.asarray(found.x)
 
@@ -219,21 +230,23 @@ class _Point:
     def derivatives(self) -> tuple[FloatArray, FloatArray]:
         """Gradient and Hessian of the misfit.
 
-        With R = E⁻¹, G = R - RWR and Y = 2RWR - R the gradient is Σ n tr G E_a and the Hessian
-        Σ n (tr E_a R E_b Y + tr G E_ab).
+        With E = C Cᴴ, T_a = C⁻¹ E_a C⁻ᴴ and V = C⁻¹ W C⁻ᴴ the gradient is Σ n tr (1 - V) T_a and
+        the Hessian Σ n (tr T_a T_b (2V - 1) + tr G E_ab), G = C⁻ᴴ (1 - V) C⁻¹.
         """
-        inverse = np.asarray(np.linalg.inv(self.expected), dtype=np.complex128)
-        turned = inverse @ self._block.matrix @ inverse
-        count = self._block.count[:, None, None]
-        g = (count * (inverse - turned)).transpose(1, 2, 0)
-        y = (count * (2 * turned - inverse)).transpose(1, 2, 0)
+        count, eye = self._block.count, np.eye(self._layout.n_channels)
+        whiten = np.linalg.inv(np.linalg.cholesky(self.expected))
+        adjoint = whiten.conj().swapaxes(1, 2)
+        excess = eye - whiten @ self._block.matrix @ adjoint
         row, w = self._slopes()
         # The columns of Φ for the floors are the unit vectors of the channels.
-        omega = np.tensordot(self._phi, w.conj(), axes=(1, 1))  # (channels, unknowns, n)
-        pull = np.tensordot(self._phi.T, g, axes=(1, 0))  # bᵀ G, (components, channels, n)
-        gradient = 2 * np.einsum("cak,ack->a", omega, pull[row]).real
-        hessian = _products(self._phi, row, omega, inverse.transpose(1, 2, 0), y)
-        return gradient, hessian + self._curvature(w, g)
+        basis = _frequency_last(whiten @ self._phi)
+        half = basis[:, row][:, None] * _combined(basis, w.conj().swapaxes(0, 1))[None].conj()
+        slopes = half + half.conj().swapaxes(0, 1)  # (channels, channels, unknowns, n)
+        gradient = _inner(slopes, (_frequency_last(excess) * count)[:, :, None])
+        turned = _combined(_frequency_last(eye - 2 * excess), slopes)
+        hessian = _inner(slopes, turned * count)
+        g = _frequency_last(adjoint @ (count[:, None, None] * excess) @ whiten)
+        return gradient[:, 0], hessian + self._curvature(w, g)
 
     def _slopes(self) -> tuple[np.ndarray, ComplexArray]:
         """Rows of the slopes of E in the basis of Φ's columns and the channels.
@@ -316,42 +329,11 @@ class _Point:
         curvature[lay.shapes, lay.shapes] += 2 * own.real
         inner = w[: lay.shapes.start]
         along = np.einsum("ajk,jck->ac", inner, pull)
-        across = np.tensordot(inner.conj(), pull, axes=(2, 2))  # (a, i, r, c)
         row = np.array([i for i, *_ in (*lay.pole, *lay.force)], dtype=int)
-        index = np.arange(row.size)
-        term = across[index[:, None], mode, row[:, None], channel]
-        term = term + np.where(row[:, None] == mode, along[:, channel], 0)
+        across = inner.conj() @ pull[row].swapaxes(1, 2)  # (a, i, c)
+        term = across[:, mode, channel] + np.where(row[:, None] == mode, along[:, channel], 0)
         curvature[: lay.shapes.start, lay.shapes] += 2 * term.real
         curvature[lay.shapes, : lay.shapes.start] += 2 * term.real.T
-
-
-def _products(
-    basis: FloatArray, row: np.ndarray, omega: ComplexArray, r: ComplexArray, y: ComplexArray
-) -> FloatArray:
-    """Σ tr E_a R E_b Y for slopes E_a = b_a ω_a* + ω_a b_aᵀ.
-
-    The trace is ω_a*R b_b · ω_b*Y b_a + ω_a*R ω_b · b_bᵀY b_a and both with R and Y exchanged,
-    of which the real part counts.
-    """
-    n = row.size
-    by_r, by_y = _applied(r, omega), _applied(y, omega)
-    left = np.tensordot(basis.T, by_r, axes=(1, 0)).conj()  # ω* R b: (basis, unknowns, n)
-    right = np.tensordot(basis.T, by_y, axes=(1, 0)).conj()
-    small_r, small_y = _congruent(basis, r), _congruent(basis, y)
-    groups = [(k, np.flatnonzero(row == k)) for k in range(basis.shape[1]) if (row == k).any()]
-    total = np.zeros((n, n))
-    for k, first in groups:
-        flat = omega[:, first].conj().swapaxes(0, 1).reshape(first.size, -1)
-        for j, second in groups:
-            if j < k:
-                continue
-            part = _real_product(left[j, first], right[k, second])
-            part += _real_product(right[j, first], left[k, second])
-            weighted = by_r[:, second] * small_y[j, k] + by_y[:, second] * small_r[j, k]
-            part += _real_product(flat, weighted.swapaxes(0, 1).reshape(second.size, -1))
-            total[np.ix_(first, second)] = part
-            total[np.ix_(second, first)] = part.T
-    return total
 
 
 def _congruent(basis: FloatArray, matrix: ComplexArray) -> ComplexArray:
@@ -360,15 +342,21 @@ def _congruent(basis: FloatArray, matrix: ComplexArray) -> ComplexArray:
     return np.asarray(np.tensordot(half, basis, axes=(1, 0)).swapaxes(1, 2))
 
 
-def _applied(matrix: ComplexArray, vectors: ComplexArray) -> ComplexArray:
-    """Σ_d M_cd v_d at each frequency, shape ``(channels, unknowns, n)``."""
-    # One product per pair of channels: their axes are too short for a loop inside.
+def _combined(matrix: ComplexArray, vectors: ComplexArray) -> ComplexArray:
+    """Σ_d M_cd v_d at each frequency, the last axis; axes between are carried along."""
+    # One product per pair: their axes are too short for a loop inside.
     return np.array([sum(m * v for m, v in zip(row, vectors, strict=True)) for row in matrix])
 
 
-def _real_product(a: ComplexArray, b: ComplexArray) -> FloatArray:
-    """Re of Σ a b over the last axis, shape ``(n_a, n_b)``."""
-    return np.asarray(a.real @ b.real.T - a.imag @ b.imag.T)
+def _inner(a: ComplexArray, b: ComplexArray) -> FloatArray:
+    """Σ tr A_i B_j of Hermitian matrices ``(channels, channels, i or j, n)``, shape ``(i, j)``."""
+    pairs = zip(a.reshape(-1, *a.shape[2:]), b.reshape(-1, *b.shape[2:]), strict=True)
+    parts = (np.ascontiguousarray(x).view(float) @ y.view(float).T for x, y in pairs)
+    return np.asarray(sum(parts))
+
+
+def _frequency_last(matrices: ComplexArray) -> ComplexArray:
+    return np.ascontiguousarray(np.moveaxis(matrices, 0, -1), dtype=np.complex128)
 
 
 def _misfit(block: Block, expected: ComplexArray) -> float:

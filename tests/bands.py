@@ -106,7 +106,8 @@ def spectrum_of(matrix: np.ndarray, duration: float, count: int = 1) -> CrossSpe
 def block_of(spectra: Sequence[CrossSpectrum], *, merge: bool = False) -> Block:
     """Keep all ordinates; the bandwidth is that of the lightest mode of these tests."""
     keep = [np.ones(s.frequency.size, dtype=bool) for s in spectra]
-    return make_block(spectra, keep, 2 * 105.0 * 0.015, merge=merge)
+    near = [mode.frequency for mode in MODES] if merge else None
+    return make_block(spectra, keep, 2 * 105.0 * 0.015, near=near)
 
 
 def drawn(cov: np.ndarray, rng: np.random.Generator) -> np.ndarray:

@@ -95,7 +95,7 @@ def test_a_tower_in_any_channel_is_masked_with_its_foot_and_read(channel: int) -
     assert sighting.frequency == pytest.approx(LOW + k / SECONDS)
     # Σ I = A² T / 2.
     assert sighting.amplitude == pytest.approx(size * np.sqrt(2 / SECONDS), rel=0.1)
-    (block,) = make_blocks(band, merge=False)
+    (block,) = make_blocks(band, 3.15)
     assert block.frequency.size == band.masks[0].size - 5
 
 
@@ -131,7 +131,7 @@ def test_a_line_that_moves_is_masked_in_each_segment_where_it_stands() -> None:
     for i, mask in enumerate(band.masks):
         assert not mask[2198 + 200 * i : 2203 + 200 * i].any()
         assert mask.sum() == mask.size - 5
-    (block,) = make_blocks(band, merge=False)
+    (block,) = make_blocks(band, 3.15)
     assert block.count.sum() == 3 * (3000 - 5)
     assert set(block.count) == {2.0, 3.0}
 
@@ -145,5 +145,5 @@ def test_segments_of_one_length_make_one_block() -> None:
 
 def test_shapes_start_with_the_sign_that_channels_have() -> None:
     """Where the mode stands the second channel moves against the first."""
-    blocks = make_blocks(band_of(spectrum(10)), merge=False)
+    blocks = make_blocks(band_of(spectrum(10)), 3.15)
     assert [sign(blocks, ROLL, c, 0) for c in range(2)] == [1.0, -1.0]

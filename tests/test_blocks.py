@@ -101,7 +101,7 @@ def test_a_block_forgets_what_is_masked_in_all_segments() -> None:
         keep = np.ones((2, one.frequency.size), dtype=bool)
         keep[0, 3:9] = False
         keep[1, 6:12] = False
-        block = make_block([one, other], list(keep), 3.15, merge=False)
+        block = make_block([one, other], list(keep), 3.15)
         kept = keep.any(axis=0)
         np.testing.assert_array_equal(block.frequency, one.frequency[kept])
         np.testing.assert_array_equal(block.count, (keep[0] + 3 * keep[1])[kept])
