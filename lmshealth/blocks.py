@@ -11,8 +11,8 @@ from lmshealth.arrays import BoolArray, ComplexArray, FloatArray
 from lmshealth.spectra import CrossSpectrum, Kernel, make_kernel
 
 # Below this many half-power bandwidths times duration the expected periodogram replaces the
-# density: the record no longer resolves the resonance. A mean over parts is surer than a part, and
-# its bias shows the more: it needs as many times more.
+# density: the record no longer resolves the resonance. Many segments are surer than one, and
+# their common bias shows the more: they need as many times more.
 _RESOLVED = 20.0
 # The density is sampled this finely per half-power bandwidth; the kernel itself asks for two
 # samples per Fourier bin, and its tails end this many bins outside the band.
@@ -84,12 +84,12 @@ def make_block(
     kept: BoolArray = count > 0
     frequency, count, total = first.frequency[kept], count[kept], total[kept]
     resolution = bandwidth * first.duration
-    if resolution < _RESOLVED * max(spectrum.count for spectrum in spectra):
+    n_segments = sum(spectrum.count for spectrum in spectra)
+    if resolution < _RESOLVED * n_segments:
         finer = int(np.clip(np.ceil(_SAMPLES_PER_BANDWIDTH / resolution), 2, 12))
         kernel = make_kernel(first, kept, finer, _MARGIN_BINS)
         return Block(frequency, total / count[:, None, None], count, kernel)
     if near is not None:
-        n_segments = sum(spectrum.count for spectrum in spectra)
         fine = _bins_per_bandwidth(n_segments * resolution) / bandwidth
         starts = _bins(first.frequency, near, bandwidth, fine)[kept]
         starts = np.flatnonzero(np.diff(starts, prepend=-1))

@@ -25,7 +25,7 @@ from tests.bands import (
 
 def test_a_mean_over_segments_says_what_they_say_apart() -> None:
     """One block of means has the value and derivatives of the sum over single segments."""
-    for duration in (1.0, 8.0):
+    for duration in (1.0, 40.0):
         truth = likelihood(MODES[:2], 2, [])
         cov, rng = covariance(truth, truth.start, frequencies(duration)), np.random.default_rng(3)
         parts = [drawn(cov, rng) for _ in range(5)]
@@ -60,7 +60,7 @@ def test_averaged_neighbours_say_what_they_say_apart_where_nothing_changes() -> 
     assert merged.data_value(p) != pytest.approx(one.data_value(p), rel=1e-9)
 
 
-@pytest.mark.parametrize(("duration", "n_segments"), [(40.0, 1), (300.0, 1), (60.0, 30)])
+@pytest.mark.parametrize(("duration", "n_segments"), [(40.0, 1), (300.0, 1), (300.0, 3)])
 def test_averaging_neighbours_moves_nothing_by_a_thirtieth_of_its_uncertainty(
     duration: float, n_segments: int
 ) -> None:
@@ -93,7 +93,7 @@ def _shift(exact: Likelihood, block: Block) -> float:
 
 def test_a_block_forgets_what_is_masked_in_all_segments() -> None:
     """Ordinates count as often as they are kept; a short record still expects them smeared."""
-    for duration in (2.0, 8.0):
+    for duration in (2.0, 40.0):
         one, other = (
             spectrum_of(noisy(1, 2, duration, count).blocks[0].matrix, duration, count)
             for count in (1, 3)

@@ -80,8 +80,8 @@ def test_a_target_has_a_band_about_it() -> None:
 def test_strengths_of_a_scatter_free_spectrum_are_found() -> None:
     """Two resonances and noise of very different size are given back within 10 %."""
     modes = [Mode(105.0, 0.015, 2e-4), Mode(140.0, 0.02, 5e-2)]
-    strength, _ = incoherent_fit(
-        scatter_free(modes, 3e-2), np.array([105.0, 140.0]), np.array([0.015, 0.02])
+    (strength,), _ = incoherent_fit(
+        (scatter_free(modes, 3e-2),), np.array([105.0, 140.0]), np.array([0.015, 0.02])
     )
     np.testing.assert_allclose(strength, [2e-4, 5e-2, 3e-2], rtol=0.1)
 
