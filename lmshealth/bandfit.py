@@ -43,6 +43,12 @@ _WORST_STD_LN_F = 0.03
 _WORST_STD_LN_ZETA = 0.7
 # A damping off its start by more than this factor belongs to something else.
 _DAMPING_SPAN = 6.0
+# Variance of what a fit leaves, over that of noise, from which on it is called loose or not
+# believed, and the ordinates that must be there to tell.
+_LOOSE, _WORST_DISPERSION, _LEAST_TO_COMPARE = 1.5, 3.0, 30
+# Fourier frequencies in the half-power bandwidth below which the resolution limits the damping, and
+# share of the search beyond which an estimate is at its bound.
+_RESOLVED, _AT_BOUND = 4.0, 0.9
 # Bins made for a resonance are fine enough for one that is narrower by this factor.
 _NARROWER = 0.7
 # Newton decrement of a fit that has arrived.
@@ -66,6 +72,10 @@ class BandFit:
         Their covariance, forces, shapes and noise marginalised, ``(2 n_modes, 2 n_modes)``.
     snr : ndarray
         Modal signal-to-noise ratio of all channels together, shape ``(n_modes,)``.
+    dispersion : ndarray
+        Variance of what the fit leaves about each mode over that of noise, shape ``(n_modes,)``.
+    flags : tuple of str
+        As in `Modes`.
     best : tuple of str
         The channel that sees each mode most clearly.
     clarity : ndarray
@@ -82,6 +92,8 @@ class BandFit:
     estimate: FloatArray
     cov: FloatArray
     snr: FloatArray
+    dispersion: FloatArray
+    flags: tuple[str, ...]
     best: tuple[str, ...]
     clarity: FloatArray
     lines: tuple[Sighting, ...]
@@ -98,6 +110,8 @@ class BandFit:
             estimate=self.estimate[both],
             cov=self.cov[np.ix_(both, both)],
             snr=self.snr[index],
+            dispersion=self.dispersion[index],
+            flags=tuple(self.flags[i] for i in index),
             best=tuple(self.best[i] for i in index),
             clarity=self.clarity[index],
         )
@@ -159,9 +173,15 @@ def fit_band(
     if fit is None:
         return None, missing
     clarity = np.array([gains[target.name] for target in seen])
+    residual = _residual(band, expected)
     fit = replace(
-        fit, clarity=clarity, lines=find_sightings(band), residual=_residual(band, expected)
+        fit,
+        clarity=clarity,
+        lines=find_sightings(band),
+        residual=residual,
+        dispersion=_dispersion(residual, *np.exp(fit.estimate).reshape(2, -1)),
     )
+    fit = replace(fit, flags=tuple(_flags(fit, i) for i in range(len(seen))))
     return _keep_credible(fit, band.unit, missing), missing
 
 
@@ -315,6 +335,8 @@ def _conclude(
         estimate=estimate,
         cov=cov,
         snr=ratio.sum(axis=0),
+        dispersion=np.full(m, np.nan),
+        flags=("",) * m,
         best=tuple(names[c] for c in ratio.argmax(axis=0)),
         clarity=np.full(m, np.nan),
         lines=(),
@@ -331,6 +353,36 @@ def _residual(band: Band, expected: list[ComplexArray]) -> Spectrum:
     white = np.linalg.solve(expected[most][mask], spectrum.matrix[mask])
     ratio[mask] = np.trace(white, axis1=1, axis2=2).real / n_channels
     return replace(spectrum.channel(0), periodogram=ratio, count=spectrum.count * n_channels)
+
+
+def _dispersion(residual: Spectrum, f: FloatArray, zeta: FloatArray) -> FloatArray:
+    """Compare the scatter of what is left within two half-power bandwidths with that of noise."""
+    off = np.abs(residual.frequency - f[:, None])
+    near = (off < 2 * (zeta * f)[:, None]) & (residual.periodogram != 1.0)
+    left = residual.count * (residual.periodogram - 1.0) ** 2
+    n = near.sum(axis=1)
+    return np.where(n >= _LEAST_TO_COMPARE, near @ left / n.clip(1), np.nan)
+
+
+def _flags(fit: BandFit, i: int) -> str:
+    """Name what to bear in mind of a mode."""
+    m, target = len(fit.targets), fit.targets[i]
+    f, zeta = np.exp(fit.estimate[[i, m + i]]).tolist()
+    duration = fit.view.spectra[index_of_most(fit.view.spectra)].duration
+    shift = abs(np.log(f / (target.nominal or target.frequency))) / np.log1p(target.search)
+    low, high = _damping_span(target)
+    flags = {
+        "resolution-limited": 2 * zeta * f * duration < _RESOLVED,
+        "at-bound": shift > _AT_BOUND or not low / _AT_BOUND < zeta < high * _AT_BOUND,
+        "loose-fit": bool(fit.dispersion[i] > _LOOSE),
+    }
+    return " ".join(name for name, raised in flags.items() if raised)
+
+
+def _damping_span(target: Target) -> tuple[float, float]:
+    """Give the dampings that are believed of a target."""
+    zeta = target.damping_ratio
+    return zeta / _DAMPING_SPAN, min(zeta * _DAMPING_SPAN, max(_HEAVY, 2 * zeta))
 
 
 def _keep_credible(fit: BandFit, unit: FloatArray, missing: Missing) -> BandFit:
@@ -357,8 +409,7 @@ def _incredible(fit: BandFit, i: int, duration: float) -> tuple[str, str] | None
     target, channel = fit.targets[i], fit.best[i]
     f, zeta = float(np.exp(fit.estimate[i])), float(np.exp(fit.estimate[m + i]))
     std_f, std_zeta = np.sqrt(np.diag(fit.cov))[[i, m + i]].tolist()
-    low = target.damping_ratio / _DAMPING_SPAN
-    high = min(target.damping_ratio * _DAMPING_SPAN, max(_HEAVY, 2 * target.damping_ratio))
+    low, high = _damping_span(target)
     if 2 * zeta * f * duration < 1:
         return (
             "line-not-mode",
@@ -367,6 +418,12 @@ def _incredible(fit: BandFit, i: int, duration: float) -> tuple[str, str] | None
         )
     if target.nominal is None and 2 * zeta < WANDER:
         return "line-not-mode", f"{f:.5g} Hz in {channel} is as narrow as a line that wanders"
+    if fit.dispersion[i] > _WORST_DISPERSION:
+        return (
+            "poor-fit",
+            f"what the fit leaves about {f:.5g} Hz scatters {fit.dispersion[i]:.1f} times as much "
+            "as noise: lines, unsteady running or a strike; choose a steadier part of the log",
+        )
     sought = target.nominal or target.frequency
     if abs(np.log(f / sought)) > np.log1p(target.search) or not low < zeta < high:
         return (

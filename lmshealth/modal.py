@@ -358,7 +358,11 @@ def _collect(fits: list[BandFit], lines: tuple[Line, ...], refused: tuple[Refusa
     names = [target.name for fit in fits for target in fit.targets]
     sources = [fit.view.source for fit in fits for _ in fit.targets]
     channels = [name for fit in fits for name in fit.best]
-    snr = np.concatenate([fit.snr for fit in fits]) if fits else np.empty(0)
+    snr, dispersion = (
+        np.concatenate([np.empty(0), *(getattr(fit, name) for fit in fits)])
+        for name in ("snr", "dispersion")
+    )
+    flags = [flag for fit in fits for flag in fit.flags]
     return Modes(
         names=tuple(names[i] for i in order),
         sources=tuple(sources[i] for i in order),
@@ -367,6 +371,8 @@ def _collect(fits: list[BandFit], lines: tuple[Line, ...], refused: tuple[Refusa
         ln_damping=estimate[n + order],
         cov=cov[np.ix_(both, both)],
         snr=snr[order],
+        dispersion=dispersion[order],
+        flags=tuple(flags[i] for i in order),
         lines=lines,
         refused=refused,
     )

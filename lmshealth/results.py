@@ -65,6 +65,15 @@ class Modes:
         Covariance of ``[ln_frequency, ln_damping]``, shape ``(2 n_modes, 2 n_modes)``.
     snr : ndarray
         Modal signal-to-noise ratio S / (4 ζ² S_e), shape ``(n_modes,)``.
+    dispersion : ndarray
+        Variance of what the fit leaves about each mode over what noise has: about one where the
+        model is right, more where lines, other modes or changing conditions are in the data; NaN
+        where it was not measured. Shape ``(n_modes,)``.
+    flags : tuple of str
+        What to bear in mind of each mode, separated by blanks: ``resolution-limited`` where the
+        half-power bandwidth spans few Fourier frequencies, ``at-bound`` where frequency or
+        damping is at the end of what was searched, ``loose-fit`` where the dispersion is clearly
+        more than one.
     lines : tuple of Line
         Spectral lines that were kept out of the likelihood.
     refused : tuple of Refusal
@@ -78,6 +87,8 @@ class Modes:
     ln_damping: FloatArray
     cov: FloatArray
     snr: FloatArray
+    dispersion: FloatArray
+    flags: tuple[str, ...]
     lines: tuple[Line, ...]
     refused: tuple[Refusal, ...]
 
@@ -85,7 +96,7 @@ class Modes:
         n = len(self.names)
         if len(set(zip(self.names, self.sources, strict=True))) != n:
             raise ValueError(f"mode names are not unique per source: {self.names}")
-        for name in ("ln_frequency", "ln_damping", "snr"):
+        for name in ("ln_frequency", "ln_damping", "snr", "dispersion"):
             expect_shape(name, getattr(self, name), (n,))
         expect_shape("cov", self.cov, (2 * n, 2 * n))
         freeze(self)

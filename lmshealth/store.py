@@ -128,6 +128,8 @@ def _to_json(outcome: Reading | tuple[Refusal, ...]) -> str:
                 "ln_damping": modes.ln_damping.tolist(),
                 "cov": modes.cov.tolist(),
                 "snr": modes.snr.tolist(),
+                "dispersion": [None if np.isnan(x) else x for x in modes.dispersion.tolist()],
+                "flags": modes.flags,
                 "lines": [
                     [line.frequency, line.amplitude, line.unit, line.kind, line.channel]
                     for line in modes.lines
@@ -166,6 +168,8 @@ def _modes(content: dict[str, Any], log: str) -> Modes:
         ln_damping=np.array(content["ln_damping"], dtype=float),
         cov=np.array(content["cov"], dtype=float).reshape(2 * n, 2 * n),
         snr=np.array(content["snr"], dtype=float),
+        dispersion=np.array(content["dispersion"], dtype=float),
+        flags=tuple(content["flags"]),
         lines=tuple(Line(*row) for row in content["lines"]),
         refused=tuple(Refusal(log=log, **row) for row in content["refused"]),
     )

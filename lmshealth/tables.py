@@ -24,7 +24,8 @@ _RUL_LEVELS = (0.05, 0.10, 0.25, 0.50, 0.75, 0.90, 0.95)
 
 COLUMNS = {
     "modes": "log stage recorded_at travel_km temperature_c mode source channel frequency_hz "
-    "frequency_std_hz damping_ratio damping_ratio_std correlation_f_zeta snr",
+    "frequency_std_hz damping_ratio damping_ratio_std correlation_f_zeta snr dispersion "
+    "flags",
     "modes_cov": "log source_a mode_a source_b mode_b cov_ln_f",
     "track": "stage recorded_at travel_km mode frequency_hz frequency_std_hz damping_ratio "
     "damping_ratio_std drift drift_std nis nis_dof noise_scale",
@@ -75,6 +76,8 @@ def modes_rows(log: str, metadata: Metadata, modes: Modes) -> list[Row]:
             "damping_ratio_std": float(modes.damping_ratio_std[i]),
             "correlation_f_zeta": float(modes.correlation[i]),
             "snr": float(modes.snr[i]),
+            "dispersion": float(modes.dispersion[i]),
+            "flags": modes.flags[i],
         }
         for i in range(len(modes.names))
     ]

@@ -47,11 +47,12 @@ def print_modes(rows: Sequence[Row], refused: Sequence[Row]) -> None:
             else f"{row['frequency_hz']:.3f} ± {row['frequency_std_hz']:.3f}",
             f"{100 * row['damping_ratio']:.2f} ± {100 * row['damping_ratio_std']:.2f}",
             f"{row['snr']:.3g}",
+            row["flags"],
         )
         for row in rows
     ]
     title = "Modes (± one standard deviation)" if rows else "No modes found"
-    _print(title, ("log", "mode", "channel"), ("frequency Hz", "damping %", "SNR"), cells)
+    _print(title, ("log", "mode", "channel"), ("frequency Hz", "damping %", "SNR", "note"), cells)
     _print_refused(refused)
 
 

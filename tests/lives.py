@@ -280,6 +280,8 @@ def make_reading(
             ln_damping=np.log(0.01) + 0.1 * np.arange(m),
             cov=root @ root.T + 1e-8 * np.eye(2 * m),
             snr=np.full(m, 200.0),
+            dispersion=np.ones(m),
+            flags=("",) * m,
             lines=(),
             refused=(),
         ),

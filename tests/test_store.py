@@ -27,6 +27,8 @@ def reading(n: int = 2, log: str = "a.h5") -> Reading:
         ln_damping=np.log(rng.uniform(1e-3, 0.1, n)),
         cov=cov @ cov.T,
         snr=np.exp(rng.normal(5, 3, n)),
+        dispersion=np.ones(n),
+        flags=("",) * n,
         lines=(Line(50.0 + 1e-13, 1 / 3, "m/s²", "mains", "acc_x"),),
         refused=(Refusal(log, "not-excited", "näher 126.4 Hz", mode="yaw"),),
     )

@@ -32,6 +32,8 @@ def two_modes(coupled: float = 2e-7) -> Modes:
         ln_damping=np.log([0.02, 0.03]),
         cov=cov,
         snr=np.array([100.0, 50.0]),
+        dispersion=np.ones(2),
+        flags=("",) * 2,
         lines=(Line(50.0, 0.1, "m/s²", "mains", "acc_x"),),
         refused=(),
     )
@@ -228,7 +230,8 @@ def test_the_columns_are_those_of_the_contract() -> None:
     """Every column of the public contract is in its table."""
     wanted = {
         "modes": "log stage recorded_at travel_km temperature_c mode source frequency_hz "
-        "frequency_std_hz damping_ratio damping_ratio_std correlation_f_zeta snr",
+        "frequency_std_hz damping_ratio damping_ratio_std correlation_f_zeta snr dispersion "
+        "flags",
         "events": "stage recorded_at travel_km kind mode source size std evidence",
         "verdict": "stage recorded_at verdict probability",
         "refused": "log channel mode source reason detail",
