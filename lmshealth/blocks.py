@@ -102,7 +102,7 @@ def make_block(
 def _bins(
     frequency: FloatArray, near: Sequence[float], bandwidth: float, fine: float
 ) -> np.ndarray[tuple[int], np.dtype[np.intp]]:
-    """Number of the bin of each ordinate: ``fine`` of them per Hz at a resonance.
+    """Give each ordinate the number of its bin: ``fine`` of them per Hz at a resonance.
 
     On its flank, at x half bandwidths, the logarithm of the density changes over x half
     bandwidths: bins may be as much wider.

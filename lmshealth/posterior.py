@@ -79,7 +79,7 @@ def _narrow(
     # What the narrower prior has more than the one that is in the precision.
     extra = np.repeat(widths**-2 - widest**-2, sizes, axis=1)
     narrower = precision + extra[:, :, None] * np.eye(x.size)
-    cov = np.linalg.inv(narrower)
+    cov = np.asarray(np.linalg.inv(narrower), dtype=np.float64)
     mean = cov @ (precision @ x)
     shift = mean - x
     cost = np.einsum("ki,ij,kj->k", shift, precision, shift) + np.sum(extra * mean**2, axis=1)

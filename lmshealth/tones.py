@@ -176,7 +176,7 @@ def _fit_tone(
     for terms in _TERMS:
         basis = np.hstack([_basis(len(rest), place, terms) for place in places])
         size = np.linalg.lstsq(basis, rest, rcond=None)[0]
-        sizes.append(size[:terms])
+        sizes.append(np.asarray(size[:terms], dtype=np.complex128))
         fits.append(rest - basis @ size)
     level = left(fits[-1], widest, widest + _NEAR)
     far = left(fits[-1], widest + _NEAR, widest + _FAR)
@@ -196,7 +196,7 @@ def _foot(terms: int) -> int:
 
 
 def _basis(n: int, place: float, terms: int) -> FloatArray:
-    """Transforms of the polynomials at n ordinates, shape ``(n, n_terms)``."""
+    """Transform the polynomials at n ordinates, shape ``(n, n_terms)``."""
     off = np.arange(n) - place
     basis = spherical_jn(np.arange(terms), np.pi * np.abs(off)[:, None])
     basis[:, 1::2] *= np.sign(off)[:, None]

@@ -153,20 +153,26 @@ class Likelihood:
                 last[:] = [p.copy(), *self.derivatives(p)]
             return last
 
+        def gradient(p: FloatArray) -> FloatArray:
+            return derivatives(p)[1]
+
+        def hessian(p: FloatArray) -> FloatArray:
+            return derivatives(p)[2]
+
         def arrived(intermediate_result: OptimizeResult) -> None:
-            _, gradient, hessian = derivatives(intermediate_result.x)
+            _, slope, curvature = derivatives(np.asarray(intermediate_result.x))
             try:
-                step = cho_solve(cho_factor(hessian), gradient)
+                step = cho_solve(cho_factor(curvature), slope)
             except np.linalg.LinAlgError:
                 return
-            if gradient @ step < _ARRIVED:
+            if slope @ step < _ARRIVED:
                 raise StopIteration
 
         found = minimize(
             self.value,
             start,
-            jac=lambda p: derivatives(p)[1],
-            hess=lambda p: derivatives(p)[2],
+            jac=gradient,
+            hess=hessian,
             method="trust-exact",
             callback=arrived,
             options={"gtol": 1e-9, "maxiter": 100, "initial_trust_radius": 0.3},
@@ -355,7 +361,7 @@ def _inner(a: ComplexArray, b: ComplexArray) -> FloatArray:
     return np.asarray(sum(parts))
 
 
-def _frequency_last(matrices: ComplexArray) -> ComplexArray:
+def _frequency_last(matrices: ComplexArray | FloatArray) -> ComplexArray:
     return np.ascontiguousarray(np.moveaxis(matrices, 0, -1), dtype=np.complex128)
 
 

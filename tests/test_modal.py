@@ -16,10 +16,10 @@ from scipy.signal import lfilter
 
 from lmshealth import modal, segments, spectra
 from lmshealth.bandfit import fit_band
-from lmshealth.errors import BadLog, BadStage
+from lmshealth.errors import BadLog
 from lmshealth.logs import Channel, Log
 from lmshealth.modal import identify
-from lmshealth.readers import load_columns, read_log
+from lmshealth.readers import read_log
 from lmshealth.results import Modes
 from lmshealth.samples import MINUTE, Stored
 from lmshealth.starts import Coarse, Target
