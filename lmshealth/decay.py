@@ -16,7 +16,7 @@ from scipy import ndimage, stats
 from lmshealth.arrays import FloatArray
 from lmshealth.errors import BadLog, BadStage
 from lmshealth.logs import Channel, Log, Refusal
-from lmshealth.naming import assign
+from lmshealth.naming import DAMPING_SPAN, assign
 from lmshealth.results import Modes
 from lmshealth.ringing import Estimate, Ringing, estimate, find_ringing, stationarity
 from lmshealth.segments import Segment, select_segments
@@ -38,6 +38,8 @@ _TOP = 0.45  # of the sample rate: anti-alias filters reach below Nyquist
 # probability below which it is said not to be.
 _SKIPS = (0.0, 0.1, 0.2, 0.3, 0.4, 0.5)
 _NOT_STATIONARY = 1e-3
+# What a later beginning may mend in the loudest mode.
+_TOO_EARLY = ("too-uncertain", "too-close")
 _WORST_STD_LN_F = 0.03
 # A damping that is fewer than so many standard deviations off zero may be a line's.
 _LEAST_DAMPING = 3.0
@@ -226,33 +228,45 @@ def _ringing(
     for group, (low, high) in _groups(peaks, duration):
         reach = _reach(duration, group[-1])
         ends = max(low - reach, 1.5 / duration), min(high + reach, 0.49 * log.sample_rate)
-        found, settled = _settled(cuts, log.sample_rate, ends, source == "delta_e")
         inside = max(low, limits[0]), min(high, limits[1])
-        if found.likelihood.n_modes:
-            bands.append(_judged(found, source, channels, inside, settled))
+        names = tuple(c.name for c in channels)
+        bands += _settled(cuts, log.sample_rate, ends, _View(source, names, inside))
     return bands
 
 
+@dataclass(frozen=True, slots=True)
+class _View:
+    """Of what kind and name the channels are, and between which Hz modes are asked for."""
+
+    source: str
+    channels: tuple[str, ...]
+    inside: tuple[float, float]
+
+
 def _settled(
-    cuts: list[list[FloatArray]], sample_rate: float, ends: tuple[float, float], displacement: bool
-) -> tuple[Ringing, bool]:
+    cuts: list[list[FloatArray]], sample_rate: float, ends: tuple[float, float], view: _View
+) -> list[_Band]:
     """Begin the decays later until they are sums of distinct modes in stationary noise.
 
     Right after a stop a machine is still moving and not yet linear. Two poles that a Fourier
-    frequency does not part are its way of telling so; where they stay, they are modes.
+    frequency does not part, or a loud one that is not known, are its way of telling so.
     """
-    fits: list[tuple[Ringing, bool]] = []
+    fallen: list[tuple[Ringing, bool]] = []
     for cut in cuts:
         blocks = tuple(make_block(samples, sample_rate, *ends) for samples in cut)
-        found = find_ringing(blocks, displacement=displacement)
+        found = find_ringing(blocks, displacement=view.source == "delta_e")
         if not found.likelihood.n_modes:
             break
         stationary = stationarity(found) > _NOT_STATIONARY
-        fits.append((found, stationary))
-        f = np.sort(found.frequency)
-        if stationary and (np.diff(f) > 1 / blocks[0].duration).all():
-            return found, True
-    return next((fit for fit in fits if fit[1]), fits[0] if fits else (found, True))
+        if stationary and (np.diff(np.sort(found.frequency)) > 1 / blocks[0].duration).all():
+            band = _judged(found, stationary, view)
+            loudest = max(band.poles, key=lambda pole: pole.snr.max(), default=None)
+            if loudest is None or loudest.why is None or loudest.why[0] not in _TOO_EARLY:
+                return [band]
+        fallen.append((found, stationary))
+    if not fallen:
+        return []
+    return [_judged(*next((fit for fit in fallen if fit[1]), fallen[0]), view)]
 
 
 def _sought(target: Target, f: float, slack: float = 1.0) -> bool:
@@ -296,22 +310,16 @@ def _groups(peaks: list[float], duration: float) -> list[tuple[list[float], tupl
     return shared
 
 
-def _judged(
-    found: Ringing,
-    source: str,
-    channels: tuple[Channel, ...],
-    inside: tuple[float, float],
-    settled: bool,
-) -> _Band:
+def _judged(found: Ringing, stationary: bool, view: _View) -> _Band:
     """Say of every pole of a band inside its limits whether it is believed."""
     result = estimate(found)
     m = found.likelihood.n_modes
     f, zeta = np.exp(result.mean[:m]), np.exp(result.mean[m:])
-    kept = [i for i in range(m) if inside[0] <= f[i] <= inside[1]]
+    kept = [i for i in range(m) if view.inside[0] <= f[i] <= view.inside[1]]
     poles = []
     for i in kept:
         why = _incredible(found, result, i)
-        if not settled:
+        if not stationary:
             why = (
                 "not-linear",
                 f"what rings at {f[i]:.5g} Hz is no sum of decays in stationary noise, however "
@@ -319,8 +327,9 @@ def _judged(
             )
         poles.append(_Pole(float(f[i]), float(zeta[i]), found.snr(i), why))
     both = np.array([*kept, *(m + i for i in kept)], dtype=int)
-    names = tuple(c.name for c in channels)
-    return _Band(source, names, tuple(poles), result.mean[both], result.cov[np.ix_(both, both)])
+    return _Band(
+        view.source, view.channels, tuple(poles), result.mean[both], result.cov[np.ix_(both, both)]
+    )
 
 
 def _incredible(found: Ringing, result: Estimate, i: int) -> tuple[str, str] | None:
@@ -425,12 +434,13 @@ def _named(
             if pole.why is None
         ]
         there.sort(key=lambda item: item[1].poles[item[0]].frequency)
-        names, unclear = assign([band.poles[i].frequency for i, band in there], missing)
+        seen = [(band.poles[i].frequency, band.poles[i].damping) for i, band in there]
+        names, unclear = assign(seen, missing)
         rows += [(n, i, band) for n, (i, band) in zip(names, there, strict=True) if n]
         reasons |= {name: ("ambiguous", detail) for name, detail in unclear.items()}
-    seen = {name for name, _, _ in rows}
+    named = {name for name, _, _ in rows}
     for target in targets:
-        if target.name not in seen:
+        if target.name not in named:
             why = reasons.get(target.name) or _why_not(target, bands)
             refused.append(Refusal(log.name, why[0], why[1], mode=target.name))
     return rows, refused
@@ -438,14 +448,14 @@ def _named(
 
 def _why_not(target: Target, bands: list[_Band]) -> tuple[str, str]:
     """Say why a mode was not found: what was seen where it should be, or that nothing was."""
-    seen = [
-        (float(pole.snr.max()), pole.why)
-        for band in bands
-        for pole in band.poles
-        if pole.why is not None and _sought(target, pole.frequency)
-    ]
-    if seen:
-        return max(seen)[1]
+    near = [p for band in bands for p in band.poles if _sought(target, p.frequency)]
+    if near:
+        loudest = max(near, key=lambda pole: pole.snr.max())
+        return loudest.why or (
+            "outside-search",
+            f"what rings at {loudest.frequency:.5g} Hz with damping {loudest.damping:.2g} is not "
+            f"within a factor of {DAMPING_SPAN:g} of the damping {target.damping_ratio:.2g}",
+        )
     return (
         "not-excited",
         f"nothing rings within {100 * target.search:.0f} % of {target.frequency:.4g} Hz; excite "

@@ -13,6 +13,8 @@ from lmshealth.starts import Target
 _MATCH = 3.5
 # Probability from which on a found mode is given its name; below the second nobody asks for it.
 _CLEAR, _UNLIKELY = 0.8, 0.01
+# A damping off its target's by more than this factor belongs to something else.
+DAMPING_SPAN = 6.0
 
 
 def assign(frequency: list[float], targets: tuple[Target, ...]) -> tuple[list[str], dict[str, str]]:
@@ -23,8 +25,8 @@ def assign(frequency: list[float], targets: tuple[Target, ...]) -> tuple[list[st
 
     Parameters
     ----------
-    frequency : list of float
-        What was found, ascending, in Hz.
+    found : list of (float, float)
+        Frequency in Hz and damping ratio of what was found, ascending in frequency.
     targets : tuple of Target
         What was sought, ascending.
 
@@ -37,21 +39,14 @@ def assign(frequency: list[float], targets: tuple[Target, ...]) -> tuple[list[st
     """
     ways: list[dict[int, int]] = []
     weights: list[float] = []
-    for k in range(min(len(frequency), len(targets)) + 1):
-        for found in combinations(range(len(frequency)), k):
+    for k in range(min(len(found), len(targets)) + 1):
+        for some in combinations(range(len(found)), k):
             for sought in combinations(range(len(targets)), k):
-                shift = np.log(
-                    [
-                        frequency[i] / targets[j].frequency
-                        for i, j in zip(found, sought, strict=True)
-                    ]
-                )
-                search = np.array([targets[j].search for j in sought])
-                if (np.abs(shift) > np.log1p(search)).any():
-                    continue
-                ways.append(dict(zip(found, sought, strict=True)))
-                weights.append(k * _MATCH - _cost(shift, search))
-    chance = np.zeros((len(frequency), len(targets)))
+                pairs = list(zip(some, sought, strict=True))
+                if all(may_be(targets[j], *found[i]) for i, j in pairs):
+                    ways.append(dict(pairs))
+                    weights.append(k * _MATCH - _cost(found, targets, pairs))
+    chance = np.zeros((len(found), len(targets)))
     for way, weight in zip(ways, softmax(weights), strict=True):
         for i, j in way.items():
             chance[i, j] += weight
@@ -63,15 +58,26 @@ def assign(frequency: list[float], targets: tuple[Target, ...]) -> tuple[list[st
     for j, target in enumerate(targets):
         likely = np.flatnonzero(chance[:, j] > _UNLIKELY)
         if target.name not in names and likely.size:
-            told = ", ".join(f"{frequency[i]:.5g} Hz {100 * chance[i, j]:.0f} %" for i in likely)
+            told = ", ".join(f"{found[i][0]:.5g} Hz {100 * chance[i, j]:.0f} %" for i in likely)
             unclear[target.name] = f"which resonance it is cannot be told: {told}"
     return names, unclear
 
 
-def _cost(shift: np.ndarray, search: np.ndarray) -> float:
-    """Negative log prior of shifts of ln f."""
-    if not shift.size:
+def may_be(target: Target, f: float, zeta: float) -> bool:
+    """Tell whether something found is near enough to a target, in frequency and in damping."""
+    near = abs(np.log(f / target.frequency)) <= np.log1p(target.search)
+    return bool(near and abs(np.log(zeta / target.damping_ratio)) < np.log(DAMPING_SPAN))
+
+
+def _cost(
+    found: list[tuple[float, float]], targets: tuple[Target, ...], pairs: list[tuple[int, int]]
+) -> float:
+    """Negative log prior of the shifts of ln f."""
+    if not pairs:
         return 0.0
-    common = shift.mean()
-    cost = 0.5 * (common / (search.mean() / 2)) ** 2
-    return float(cost + 0.5 * np.sum(((shift - common) / (search / 6)) ** 2))
+    shift = np.log([found[i][0] / targets[j].frequency for i, j in pairs])
+    search = np.array([targets[j].search for _, j in pairs])
+    own = shift - shift.mean()
+    return float(
+        0.5 * (shift.mean() / (search.mean() / 2)) ** 2 + 0.5 * np.sum((own / (search / 6)) ** 2)
+    )
