@@ -15,7 +15,7 @@ FLOORS = [
     {"results"},
     {"readers", "segments", "harmonics", "priors", "modalmap"},
     {"laws", "spectra", "following"},
-    {"stage", "whittle", "starts"},
+    {"stage", "whittle", "starts", "linetest"},
     {"peaks", "bandfit", "lines", "magnitudes"},
     {"modal", "history", "sampling"},
     {"tracking", "maintenance"},
