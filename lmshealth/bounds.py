@@ -13,6 +13,9 @@ from lmshealth.transient import Block, TransientLikelihood, pole_columns, unit_l
 
 # Steps of the differences by which several modes' densities are differentiated, in ln.
 _STEP = 1e-5
+# Of the logarithm of the noise's level beforehand: without it an ever smaller noise would still
+# cost what an unknown part of its shape does.
+_NOISE_STD = 3.0
 
 
 def band_factors(kappa: FloatArray | float) -> tuple[FloatArray, FloatArray]:
@@ -127,7 +130,7 @@ def ambient_bound(
         ]
     )
     fisher = slopes @ slopes.T
-    fisher[3, 3] += (n_channels - 1) * f.size
+    fisher[3, 3] += (n_channels - 1) * f.size + _NOISE_STD**-2
     return _marginal(fisher, 2)
 
 
@@ -179,7 +182,7 @@ def joint_bound(
         forces = force.copy()
         for k, (i, j) in enumerate(pairs):
             size = np.sqrt((force[i, i] * force[j, j]).real)
-            forces[i, j] += size * (p[-2 * k - 2] + 1j * p[-2 * k - 3])
+            forces[i, j] += size * (p[-2 * k - 2] + 1j * p[-2 * k - 1])
             forces[j, i] = forces[i, j].conj()
         # A shape's length stands for the strength of its force.
         paths = response[:, None, :] * p[2 * m : 2 * m + n * m].reshape(n, m)
@@ -199,6 +202,8 @@ def joint_bound(
     ]
     stacked = np.array(slopes)
     fisher = np.einsum("qkab,rkba->qr", stacked, stacked, optimize=True).real
+    level = 2 * m + n * m
+    fisher[level, level] += _NOISE_STD**-2
     return _marginal(fisher, 2 * m)
 
 

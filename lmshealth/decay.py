@@ -395,7 +395,7 @@ _Row = tuple[str, int, _Band]
 
 
 def _numbered(log: Log, bands: list[_Band]) -> tuple[list[_Row], list[Refusal]]:
-    """Number what rings, and do not ask Δe about a mode that accelerometers show."""
+    """Give numbers to what rings; Δe is not asked about what accelerometers show."""
     rows: list[_Row] = []
     reasons: list[tuple[float, tuple[str, str]]] = []
     for band in bands:

@@ -17,7 +17,9 @@ _CLEAR, _UNLIKELY = 0.8, 0.01
 DAMPING_SPAN = 6.0
 
 
-def assign(frequency: list[float], targets: tuple[Target, ...]) -> tuple[list[str], dict[str, str]]:
+def assign(
+    found: list[tuple[float, float]], targets: tuple[Target, ...]
+) -> tuple[list[str], dict[str, str]]:
     """Weigh all ways to name found modes that keep the order of the targets.
 
     Wear moves all modes of a guide together: their common shift is taken to be half of the search,
