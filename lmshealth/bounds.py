@@ -9,7 +9,8 @@ from __future__ import annotations
 import numpy as np
 
 from lmshealth.arrays import FloatArray
-from lmshealth.transient import Block, TransientLikelihood, pole_columns, unit_level
+from lmshealth.restricted import TransientLikelihood, unit_level
+from lmshealth.transient import Block, pole_columns
 
 # Steps of the differences by which several modes' densities are differentiated, in ln.
 _STEP = 1e-5

@@ -15,8 +15,8 @@ from scipy import ndimage, stats
 
 from lmshealth.arrays import FloatArray
 from lmshealth.errors import BadLog, BadStage
-from lmshealth.logs import Channel, Log, Refusal
-from lmshealth.naming import DAMPING_SPAN, assign
+from lmshealth.logs import Channel, Log
+from lmshealth.naming import Band, Pole, is_near, name_modes
 from lmshealth.results import Modes
 from lmshealth.ringing import Estimate, Ringing, estimate, find_ringing, stationarity
 from lmshealth.segments import Segment, select_segments
@@ -44,29 +44,9 @@ _WORST_STD_LN_F = 0.03
 # A damping that is fewer than so many standard deviations off zero may be a line's.
 _LEAST_DAMPING = 3.0
 _FADED, _HEAVY = 0.6, 0.1
+_LINE = "line-not-mode"
 # Mean square of a mode's vibration at the stops over that of its ambient response.
 _EXCITED = 16.0
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Pole:
-    """A mode of a band before it has a name."""
-
-    frequency: float
-    damping: float
-    snr: FloatArray  # per channel
-    why: tuple[str, str] | None  # it is refused
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Band:
-    """What a band of one kind of channels shows."""
-
-    source: str
-    channels: tuple[str, ...]
-    poles: tuple[_Pole, ...]
-    mean: FloatArray
-    cov: FloatArray
 
 
 def identify_decays(
@@ -86,8 +66,7 @@ def identify_decays(
     stage : Stage, optional
         Says which modes to look for; without it all that rings in the band is found.
     segments : sequence of Segment, optional
-        The decays. By default those that follow the moves of the set point; of a log without set
-        point each gap-free piece is one.
+        The decays; by default what follows the moves of the set point.
     channels : sequence of str, optional
         Use only these channels.
     band : (float, float), optional
@@ -104,6 +83,8 @@ def identify_decays(
     ------
     BadLog
         If no channel or decay is left, or nothing rings and no stage says what should.
+    BadStage
+        If the stage has no mode in the band.
     """
     usable = [c for c in log.channels if c.kind != "current"]
     used = [c for c in usable if channels is None or c.name in channels]
@@ -115,20 +96,18 @@ def identify_decays(
     decays = _stops(log, segments)
     targets = _targets(stage, band)
     limits = _limits(log, decays, targets, band)
-    found: list[_Band] = []
+    found: list[Band] = []
     for source, kind in (("acc", "acceleration"), ("delta_e", "displacement")):
         group = tuple(c for c in used if c.kind == kind)
         if group:
             found += _ringing(log, group, source, decays, limits, targets)
-    return _collect(log, stage, targets, found)
+    return name_modes(log, targets, found)
 
 
 def _stops(log: Log, segments: Sequence[Segment] | None) -> tuple[Segment, ...]:
     """Find the decays; those less than half as long as the longest would only cost."""
-    if segments is None and log.reference_velocity is not None:
+    if segments is None:
         segments = select_segments(log, "settling")
-    elif segments is None:
-        segments = [Segment(start, stop, float("nan")) for start, stop in log.pieces]
     longest = max((s.stop - s.start for s in segments), default=0)
     if longest < 8:
         raise BadLog(log.name, "too-short", f"the longest decay has {longest} samples")
@@ -217,13 +196,13 @@ def _ringing(
     decays: tuple[Segment, ...],
     limits: tuple[float, float],
     targets: tuple[Target, ...],
-) -> list[_Band]:
+) -> list[Band]:
     """Fit, band by band, all that rings where modes are looked for."""
     cuts = [_cut(log, channels, decays, skip) for skip in _SKIPS]
     duration = cuts[0][0].shape[1] / log.sample_rate
     peaks = _peaks(cuts[0][0], log.sample_rate, limits)
     if targets:
-        peaks = [f for f in peaks if any(_sought(t, f, 1.2) for t in targets)]
+        peaks = [f for f in peaks if any(is_near(t, f, slack=1.2) for t in targets)]
     bands = []
     for group, (low, high) in _groups(peaks, duration):
         reach = _reach(duration, group[-1])
@@ -245,32 +224,36 @@ class _View:
 
 def _settled(
     cuts: list[list[FloatArray]], sample_rate: float, ends: tuple[float, float], view: _View
-) -> list[_Band]:
+) -> list[Band]:
     """Begin the decays later until they are sums of distinct modes in stationary noise.
 
     Right after a stop a machine is still moving and not yet linear. Two poles that a Fourier
     frequency does not part, or a loud one that is not known, are its way of telling so.
     """
-    fallen: list[tuple[Ringing, bool]] = []
+    never: Ringing | None = None
+    early: Band | None = None
     for cut in cuts:
         blocks = tuple(make_block(samples, sample_rate, *ends) for samples in cut)
         found = find_ringing(blocks, displacement=view.source == "delta_e")
         if not found.likelihood.n_modes:
             break
-        stationary = stationarity(found) > _NOT_STATIONARY
-        if stationary and (np.diff(np.sort(found.frequency)) > 1 / blocks[0].duration).all():
-            band = _judged(found, stationary, view)
-            loudest = max(band.poles, key=lambda pole: pole.snr.max(), default=None)
-            if loudest is None or loudest.why is None or loudest.why[0] not in _TOO_EARLY:
+        if stationarity(found) <= _NOT_STATIONARY:
+            never = never or found
+            continue
+        distinct = bool((np.diff(np.sort(found.frequency)) > 1 / blocks[0].duration).all())
+        if distinct or early is None:
+            band = _judged(found, view)
+            if distinct and not _too_early(band):
                 return [band]
-        fallen.append((found, stationary))
-    if not fallen:
-        return []
-    return [_judged(*next((fit for fit in fallen if fit[1]), fallen[0]), view)]
+            early = early or band
+    if early is None and never is not None:
+        return [_not_linear(never, view)]
+    return [early] if early is not None else []
 
 
-def _sought(target: Target, f: float, slack: float = 1.0) -> bool:
-    return bool(abs(np.log(f / target.frequency)) <= slack * np.log1p(target.search))
+def _too_early(band: Band) -> bool:
+    loudest = max((*band.poles, *band.doubted), key=lambda pole: pole.snr.max(), default=None)
+    return loudest is not None and loudest.why is not None and loudest.why[0] in _TOO_EARLY
 
 
 def _reach(duration: float, f: float) -> float:
@@ -310,38 +293,69 @@ def _groups(peaks: list[float], duration: float) -> list[tuple[list[float], tupl
     return shared
 
 
-def _judged(found: Ringing, stationary: bool, view: _View) -> _Band:
+def _judged(found: Ringing, view: _View) -> Band:
     """Say of every pole of a band inside its limits whether it is believed."""
-    result = estimate(found)
-    m = found.likelihood.n_modes
-    f, zeta = np.exp(result.mean[:m]), np.exp(result.mean[m:])
-    kept = [i for i in range(m) if view.inside[0] <= f[i] <= view.inside[1]]
-    poles = []
-    for i in kept:
-        why = _incredible(found, result, i)
-        if not stationary:
-            why = (
-                "not-linear",
-                f"what rings at {f[i]:.5g} Hz is no sum of decays in stationary noise, however "
-                "late in the decay it is begun",
-            )
-        poles.append(_Pole(float(f[i]), float(zeta[i]), found.snr(i), why))
-    both = np.array([*kept, *(m + i for i in kept)], dtype=int)
-    return _Band(
-        view.source, view.channels, tuple(poles), result.mean[both], result.cov[np.ix_(both, both)]
+    kept, lines = _inside(found, view), found.is_line()
+    doubted = [
+        _pole(found, i, (_LINE, f"{found.frequency[i]:.5g} Hz does not fade"))
+        for i in kept
+        if lines[i]
+    ]
+    kept = [i for i in kept if not lines[i]]
+    if not kept:
+        return Band(view.source, view.channels, (), np.empty(0), np.empty((0, 0)), tuple(doubted))
+    result = estimate(found, kept)
+    poles = [_pole(found, i, _incredible(found, i, result, k)) for k, i in enumerate(kept)]
+    sure = [k for k, pole in enumerate(poles) if pole.why is None]
+    doubted += [pole for pole in poles if pole.why is not None]
+    own = np.array([*sure, *(len(kept) + k for k in sure)], dtype=int)
+    return Band(
+        source=view.source,
+        channels=view.channels,
+        poles=tuple(poles[k] for k in sure),
+        mean=result.mean[own],
+        cov=result.cov[np.ix_(own, own)],
+        doubted=tuple(doubted),
     )
 
 
-def _incredible(found: Ringing, result: Estimate, i: int) -> tuple[str, str] | None:
-    """Say why a pole is not believed to be a mode with that estimate; None when it is."""
-    m = found.likelihood.n_modes
-    f, zeta = float(np.exp(result.mean[i])), float(np.exp(result.mean[m + i]))
-    std_f, std_zeta = np.sqrt(np.diag(result.cov))[[i, m + i]].tolist()
+def _not_linear(found: Ringing, view: _View) -> Band:
+    """Refuse all that rings in a band."""
+    doubted = tuple(
+        _pole(
+            found,
+            i,
+            (
+                "not-linear",
+                f"what rings at {found.frequency[i]:.5g} Hz is no sum of decays in stationary "
+                "noise, however late in the decay it is begun",
+            ),
+        )
+        for i in _inside(found, view)
+    )
+    return Band(view.source, view.channels, (), np.empty(0), np.empty((0, 0)), doubted)
+
+
+def _inside(found: Ringing, view: _View) -> list[int]:
+    low, high = view.inside
+    return [i for i, f in enumerate(found.frequency.tolist()) if low <= f <= high]
+
+
+def _pole(found: Ringing, i: int, why: tuple[str, str] | None) -> Pole:
+    f, zeta = float(found.frequency[i]), float(found.damping_ratio[i])
+    return Pole(f, zeta, found.snr(i), why)
+
+
+def _incredible(found: Ringing, i: int, result: Estimate, k: int) -> tuple[str, str] | None:
+    """Say why the k-th estimate, of pole i, is not believed to be of a mode; None when it is."""
+    n = result.excitation.size
+    f, zeta = np.exp(result.mean[[k, n + k]]).tolist()
+    std_f, std_zeta = np.sqrt(np.diag(result.cov))[[k, n + k]].tolist()
     duration = found.likelihood.blocks[0].duration
     faded = 1 - np.exp(-2 * np.pi * f * zeta * duration)
     if std_zeta > 1 / _LEAST_DAMPING and faded < _FADED:
         return (
-            "line-not-mode",
+            _LINE,
             f"{f:.5g} Hz fades by {100 * faded:.2g} % in {duration:.3g} s, its damping is known to "
             f"{100 * min(std_zeta, 9.99):.0f} % only: it may be a line; record on after the stop",
         )
@@ -351,113 +365,13 @@ def _incredible(found: Ringing, result: Estimate, i: int) -> tuple[str, str] | N
             f"{f:.5g} Hz is known to {100 * std_f:.2g} % only, its damping {zeta:.2g} to "
             f"{100 * std_zeta:.0f} %; record more stops or excite more",
         )
-    if result.excitation[i] < _EXCITED:
+    if result.excitation[k] < _EXCITED:
         return (
             "not-excited",
-            f"{f:.5g} Hz vibrates after the stop with {np.sqrt(result.excitation[i]):.2g} times "
+            f"{f:.5g} Hz vibrates after the stop with {np.sqrt(result.excitation[k]):.2g} times "
             f"its ambient response; needed is {np.sqrt(_EXCITED):.2g}: stop harder",
         )
-    apart = np.abs(np.delete(result.mean[:m] - result.mean[i], i))
+    apart = np.abs(np.log(np.delete(found.frequency, i) / f))
     if apart.size and apart.min() < 2 * std_f:
         return ("too-close", f"{f:.5g} Hz has another pole {apart.min() * f:.2g} Hz from it")
     return None
-
-
-def _collect(
-    log: Log, stage: Stage | None, targets: tuple[Target, ...], bands: list[_Band]
-) -> Modes:
-    """Name what was found and join it into one result."""
-    chosen, refused = _named(log, targets, bands) if stage is not None else _numbered(log, bands)
-    rows = sorted(chosen, key=lambda row: row[2].poles[row[1]].frequency)
-    n = len(rows)
-    mean, cov = np.empty(2 * n), np.zeros((2 * n, 2 * n))
-    for a, (_, i, band) in enumerate(rows):
-        m = len(band.poles)
-        mean[[a, n + a]] = band.mean[[i, m + i]]
-        for b, (_, j, other) in enumerate(rows):
-            if other is band:
-                cov[np.ix_([a, n + a], [b, n + b])] = band.cov[np.ix_([i, m + i], [j, m + j])]
-    best = [int(np.argmax(band.poles[i].snr)) for _, i, band in rows]
-    return Modes(
-        names=tuple(name for name, _, _ in rows),
-        sources=tuple(band.source for _, _, band in rows),
-        channels=tuple(band.channels[c] for c, (_, _, band) in zip(best, rows, strict=True)),
-        ln_frequency=mean[:n],
-        ln_damping=mean[n:],
-        cov=cov,
-        snr=np.array([band.poles[i].snr.max() for _, i, band in rows]),
-        lines=(),
-        refused=(*log.refused, *refused),
-    )
-
-
-_Row = tuple[str, int, _Band]
-
-
-def _numbered(log: Log, bands: list[_Band]) -> tuple[list[_Row], list[Refusal]]:
-    """Give numbers to what rings; Δe is not asked about what accelerometers show."""
-    rows: list[_Row] = []
-    reasons: list[tuple[float, tuple[str, str]]] = []
-    for band in bands:
-        for i, pole in enumerate(band.poles):
-            known = any(
-                abs(pole.frequency / row[2].poles[row[1]].frequency - 1) < 2 * pole.damping
-                for row in rows
-                if row[2].source != band.source
-            )
-            if pole.why is not None:
-                reasons.append((float(pole.snr.max()), pole.why))
-            elif not known:
-                rows.append(("", i, band))
-    if not rows:
-        nothing = ("not-excited", "nothing rings in the band: stop harder, or look elsewhere")
-        reason, detail = max(reasons)[1] if reasons else nothing
-        raise BadLog(log.name, reason, detail)
-    rows.sort(key=lambda row: row[2].poles[row[1]].frequency)
-    return [(f"mode_{k}", i, band) for k, (_, i, band) in enumerate(rows, 1)], []
-
-
-def _named(
-    log: Log, targets: tuple[Target, ...], bands: list[_Band]
-) -> tuple[list[_Row], list[Refusal]]:
-    """Give names by frequency: accelerometers first, then Δe for what they do not show."""
-    rows: list[_Row] = []
-    refused: list[Refusal] = []
-    reasons: dict[str, tuple[str, str]] = {}
-    for source in ("acc", "delta_e"):
-        missing = tuple(t for t in targets if t.name not in {name for name, _, _ in rows})
-        there = [
-            (i, band)
-            for band in bands
-            if band.source == source
-            for i, pole in enumerate(band.poles)
-            if pole.why is None
-        ]
-        there.sort(key=lambda item: item[1].poles[item[0]].frequency)
-        seen = [(band.poles[i].frequency, band.poles[i].damping) for i, band in there]
-        names, unclear = assign(seen, missing)
-        rows += [(n, i, band) for n, (i, band) in zip(names, there, strict=True) if n]
-        reasons |= {name: ("ambiguous", detail) for name, detail in unclear.items()}
-    named = {name for name, _, _ in rows}
-    for target in targets:
-        if target.name not in named:
-            why = reasons.get(target.name) or _why_not(target, bands)
-            refused.append(Refusal(log.name, why[0], why[1], mode=target.name))
-    return rows, refused
-
-
-def _why_not(target: Target, bands: list[_Band]) -> tuple[str, str]:
-    """Say why a mode was not found: what was seen where it should be, or that nothing was."""
-    near = [p for band in bands for p in band.poles if _sought(target, p.frequency)]
-    if near:
-        loudest = max(near, key=lambda pole: pole.snr.max())
-        return loudest.why or (
-            "outside-search",
-            f"what rings at {loudest.frequency:.5g} Hz with damping {loudest.damping:.2g} is not "
-            f"within a factor of {DAMPING_SPAN:g} of the damping {target.damping_ratio:.2g}",
-        )
-    return (
-        "not-excited",
-        f"nothing rings within {100 * target.search:.0f} % of {target.frequency:.4g} Hz; excite "
-        "it more, or look for it while the stage moves",
-    )

@@ -2,24 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import stats
 
-from lmshealth.arrays import FloatArray
-from lmshealth.transient import (
-    Block,
-    BlockFit,
-    ComplexArray,
-    Optimum,
-    TransientLikelihood,
-    average_ambient,
-    maximise,
-    stack,
-    transient,
-    unit_level,
-)
+from lmshealth.arrays import BoolArray, FloatArray
+from lmshealth.decayfit import Optimum, average_ambient, invert, maximise
+from lmshealth.restricted import BlockFit, TransientLikelihood, unit_level
+from lmshealth.transient import Block, ComplexArray, stack, transient
 
 MOST_POLES = 6
 # Log likelihood beyond the Bayesian information criterion that a further pole must bring.
@@ -27,6 +19,8 @@ _EVIDENCE_MARGIN = 5.0
 # Poles tried per Fourier frequency, and their dampings.
 _TRIALS, _DAMPINGS = 4.0, np.geomspace(2e-4, 0.1, 10)
 _FIRST_LEVEL = 0.3  # of the ambient response
+# A line's damping is within this share of the least that can be told from none.
+_AT_BOUND = 0.01
 # Log likelihood that is not worth a step while poles are counted.
 _ROUGH = 0.02
 
@@ -56,6 +50,11 @@ class Ringing:
         """Damping ratios, shape ``(n_modes,)``."""
         m = self.likelihood.n_modes
         return np.exp(self.optimum.p[m : 2 * m])
+
+    def is_line(self) -> BoolArray:
+        """Tell which modes do not fade at all over the record, shape ``(n_modes,)``."""
+        m, p = self.likelihood.n_modes, self.optimum.p
+        return np.asarray(p[m : 2 * m] < self.likelihood.least_damping(p) + _AT_BOUND)
 
     def sizes(self, mode: int) -> list[ComplexArray]:
         """Complex size of a mode's transient, per block of ``(n_channels, n_segments)``."""
@@ -112,12 +111,12 @@ class Estimate:
     Attributes
     ----------
     mean : ndarray
-        ``[ln f, ln ζ]``, shape ``(2 n_modes,)``.
+        ``[ln f, ln ζ]`` of n modes, shape ``(2 n,)``.
     cov : ndarray
-        Shape ``(2 n_modes, 2 n_modes)``.
+        Shape ``(2 n, 2 n)``.
     excitation : ndarray
         Mean square of each mode's vibration at the stops over that of its ambient response,
-        shape ``(n_modes,)``.
+        shape ``(n,)``.
     """
 
     mean: FloatArray
@@ -222,31 +221,40 @@ def _shape(sizes: ComplexArray, noise: FloatArray) -> FloatArray:
     return np.asarray(np.linalg.svd(seen, full_matrices=False)[0][:, 0] * scale)
 
 
-def estimate(found: Ringing) -> Estimate:
-    """Average the modes of a band over their ambient responses.
+def estimate(found: Ringing, modes: Sequence[int] | None = None) -> Estimate:
+    """Average modes of a band over their ambient responses.
 
     Parameters
     ----------
     found : Ringing
         With at least one mode.
+    modes : sequence of int, optional
+        Which, at least one; by default all.
     """
-    m = found.likelihood.n_modes
-    p = found.optimum.p + 0.0
-    levels = np.arange(2 * m, 3 * m)
-    free = np.delete(np.arange(p.size), levels)
-    mean, scales = np.empty(2 * m), np.zeros((2 * m, 2 * m))
+    likelihood, m = found.likelihood, found.likelihood.n_modes
+    modes = range(m) if modes is None else modes
+    p = found.optimum.p.copy()
+    at_bound = m + np.flatnonzero(found.is_line())
+    free = np.setdiff1d(np.arange(p.size), [*range(2 * m, 3 * m), *at_bound])
     averages = []
     # The ambient response of one mode hardly tells on another: each is averaged over in turn.
-    for i in range(m):
-        averages.append(average_ambient(found.likelihood, p, i, free))
-        p[levels[i]] = averages[i].mean[levels[i]]
-    joint = found.likelihood.invert(maximise(found.likelihood, p, free), free)[0][: 2 * m, : 2 * m]
-    for i, average in enumerate(averages):
-        own = np.array([i, m + i])
-        mean[own] = average.mean[own]
-        wide = np.linalg.cholesky(average.cov[np.ix_(own, own)])
-        scales[np.ix_(own, own)] = wide @ np.linalg.inv(np.linalg.cholesky(joint[np.ix_(own, own)]))
-    excitation = [found.excitation(i, float(p[levels[i]])) for i in range(m)]
+    for i in modes:
+        averages.append(average_ambient(likelihood, p, i, free))
+        p[2 * m + i] = averages[-1].mean[2 * m + i]
+    own = np.array([*modes, *(m + i for i in modes)])
+    n = len(modes)
+    inverse = np.zeros((p.size, p.size))
+    inverse[np.ix_(free, free)] = invert(likelihood, maximise(likelihood, p, free), free)[0]
+    joint = inverse[np.ix_(own, own)]
+    mean, scales = np.empty(2 * n), np.zeros((2 * n, 2 * n))
+    for k, average in enumerate(averages):
+        pair = np.array([k, n + k])
+        mean[pair] = average.mean[own[pair]]
+        # The joint covariance is stretched until each mode has that of its average.
+        wide = np.linalg.cholesky(average.cov[np.ix_(own[pair], own[pair])])
+        narrow = np.linalg.cholesky(joint[np.ix_(pair, pair)])
+        scales[np.ix_(pair, pair)] = wide @ np.linalg.inv(narrow)
+    excitation = [found.excitation(i, float(p[2 * m + i])) for i in modes]
     return Estimate(mean, scales @ joint @ scales.T, np.array(excitation))
 
 

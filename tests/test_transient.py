@@ -5,17 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from lmshealth.transient import (
-    Block,
-    TransientLikelihood,
-    average_ambient,
-    make_block,
-    maximise,
-    pole_columns,
-    stack,
-    transient,
-    unit_level,
-)
+from lmshealth.decayfit import average_ambient, invert, maximise
+from lmshealth.restricted import TransientLikelihood, unit_level
+from lmshealth.transient import Block, make_block, pole_columns, stack, transient
 from tests.stops import Ring, ring, stop
 
 RATE = 400.0
@@ -177,5 +169,5 @@ def test_the_average_over_the_ambient_response_is_the_posterior_s_moments() -> N
         # Of a standard deviation from samples the relative error is about √(κ/4n) with a heavy tail.
         assert own[j] == pytest.approx(std[j], rel=4 / np.sqrt(effective))
         assert abs(found.mean[j] - mean[j]) < 4 / np.sqrt(effective) * std[j]
-    held = np.sqrt(np.diag(likelihood.invert(optimum, np.array([0, 1, 3, 4]))[0]))
+    held = np.sqrt(np.diag(invert(likelihood, optimum, np.array([0, 1, 3, 4]))[0]))
     assert own[0] > 1.05 * held[0]
