@@ -86,13 +86,7 @@ def identify_decays(
     BadStage
         If the stage has no mode in the band.
     """
-    usable = [c for c in log.channels if c.kind != "current"]
-    used = [c for c in usable if channels is None or c.name in channels]
-    if not used:
-        there = ", ".join(c.name for c in usable) or "none"
-        raise BadLog(
-            log.name, "no-signal", f"no delta_e or acc channel to analyse; usable: {there}"
-        )
+    used = _choose_channels(log, channels)
     decays = _stops(log, segments)
     targets = _targets(stage, band)
     limits = _limits(log, decays, targets, band)
@@ -102,6 +96,19 @@ def identify_decays(
         if group:
             found += _ringing(log, group, source, decays, limits, targets)
     return name_modes(log, targets, found)
+
+
+def _choose_channels(log: Log, names: Sequence[str] | None) -> tuple[Channel, ...]:
+    usable = {c.name: c for c in log.channels if c.kind in ("displacement", "acceleration")}
+    chosen = list(usable) if names is None else list(names)
+    unknown = sorted(set(chosen) - set(usable))
+    if unknown:
+        raise BadLog(
+            log.name, "channel", f"no usable channel {unknown}; there are {sorted(usable)}"
+        )
+    if not chosen:
+        raise BadLog(log.name, "no-signal", "no delta_e or acc channel is left to analyse")
+    return tuple(channel for name, channel in usable.items() if name in chosen)
 
 
 def _stops(log: Log, segments: Sequence[Segment] | None) -> tuple[Segment, ...]:

@@ -211,12 +211,12 @@ class TransientLikelihood:
         damping, down = p[m : 2 * m], gradient[m : 2 * m] > 0
         low = (damping <= self.least_damping(p) + _AT_BOUND) & down
         high = (damping >= np.log(_HEAVIEST) - _AT_BOUND) & ~down
-        return np.setdiff1d(free, m + np.flatnonzero(low | high))
+        return np.asarray(np.setdiff1d(free, m + np.flatnonzero(low | high)))
 
     def density(self, block: Block, p: FloatArray) -> FloatArray:
         """Give the noise's power spectral density, ``(n_ordinates, n_channels, n_channels)``."""
         directions, level, _ = self._noise(block, p)
-        return np.einsum("jk,ja,jb->kab", level, directions, directions)
+        return np.asarray(np.einsum("jk,ja,jb->kab", level, directions, directions))
 
     def _evaluate_block(self, block: Block, p: FloatArray) -> Evaluation:
         m, n, n_segments = self.n_modes, self.n_channels, block.ordinates.shape[0]
@@ -351,10 +351,10 @@ def _volume_slope(
         By ln f and ln ζ of each mode, shape ``(2 n_modes,)``.
     """
     n, m = whiten.shape[1], turned.shape[1]
-    inverse = linalg.solve_triangular(r, q.T, check_finite=False)
-    inverse = inverse.reshape(n, columns.shape[1], -1, n)
+    whitened = linalg.solve_triangular(r, q.T, check_finite=False)
     plain_q, plain_r = np.linalg.qr(columns)
     plain = linalg.solve_triangular(plain_r, plain_q.T, check_finite=False)
-    weight = np.einsum("cpka,kac->pk", inverse, whiten) - n * plain
+    whitened = np.reshape(whitened, (n, columns.shape[1], -1, n))
+    weight = np.einsum("cpka,kac->pk", whitened, whiten) - n * plain
     weight = weight[columns.shape[1] - 2 * m :].reshape(m, 2, columns.shape[0])
     return np.asarray(np.einsum("ipk,dikp->di", weight, turned).ravel())

@@ -78,7 +78,8 @@ class Ringing:
         own = slice(mode, mode + 1)
         top = np.abs(transient(block, self.frequency[own], self.damping_ratio[own])).max()
         n_samples = block.sample_rate * block.duration
-        return np.mean(np.abs(size) ** 2, axis=1) * (top / n_samples) ** 2 / self.white_level()
+        mean = np.mean(np.abs(size) ** 2, axis=1) * (top / n_samples) ** 2
+        return np.asarray(mean / self.white_level())
 
     def excitation(self, mode: int, level: float) -> float:
         """Mean square of a mode's vibration at the stops over that of its ambient response.

@@ -1,4 +1,4 @@
-"""Synthetic logs of what rings after a stop: decays, the ambient response of the same modes, noise."""
+"""Synthetic logs of what rings after a stop: decays, ambient response of their modes, noise."""
 
 from __future__ import annotations
 
@@ -33,13 +33,13 @@ class Ring:
 
     @property
     def mode(self) -> Mode:
-        """The mode under the force that makes that response: its variance is π f S / (4 ζ)."""
+        """Mode under the force that makes that response: its variance is π f S / (4 ζ)."""
         psd = self.ambient**2 * 4 * self.damping / (np.pi * self.frequency)
         return Mode(self.frequency, self.damping, psd, self.shape)
 
 
 def ring(f: float, zeta: float, amplitude: float, phase: float, n: int, rate: float) -> np.ndarray:
-    """Samples of a decaying cosine, shape ``(n,)``."""
+    """Sample a decaying cosine, shape ``(n,)``."""
     t, omega = np.arange(n) / rate, 2 * np.pi * f
     fade = np.exp(-zeta * omega * t)
     return amplitude * fade * np.cos(omega * np.sqrt(1 - zeta**2) * t + phase)
@@ -79,5 +79,5 @@ def stop_log(
 
 
 def whole(log: Log) -> list[Segment]:
-    """Each piece of a log as a segment."""
+    """Make each piece of a log a segment."""
     return [Segment(start, end, 0.0) for start, end in log.pieces]
