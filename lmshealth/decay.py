@@ -238,7 +238,7 @@ def _settled(
     frequency does not part, or a loud one that is not known, are its way of telling so.
     """
     never: Ringing | None = None
-    early: Band | None = None
+    early: Ringing | None = None
     for cut in cuts:
         blocks = tuple(make_block(samples, sample_rate, *ends) for samples in cut)
         found = find_ringing(blocks, displacement=view.source == "delta_e")
@@ -247,15 +247,14 @@ def _settled(
         if stationarity(found) <= _NOT_STATIONARY:
             never = never or found
             continue
-        distinct = bool((np.diff(np.sort(found.frequency)) > 1 / blocks[0].duration).all())
-        if distinct or early is None:
+        early = early or found
+        if (np.diff(np.sort(found.frequency)) > 1 / blocks[0].duration).all():
             band = _judged(found, view)
-            if distinct and not _too_early(band):
+            if not _too_early(band):
                 return [band]
-            early = early or band
-    if early is None and never is not None:
-        return [_not_linear(never, view)]
-    return [early] if early is not None else []
+    if early is not None:
+        return [_judged(early, view)]
+    return [_not_linear(never, view)] if never is not None else []
 
 
 def _too_early(band: Band) -> bool:
