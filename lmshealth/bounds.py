@@ -6,11 +6,13 @@ on, and what an identification is measured by.
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
+
 import numpy as np
 
-from lmshealth.arrays import FloatArray
+from lmshealth.arrays import FloatArray, expect_shape
 from lmshealth.restricted import TransientLikelihood, unit_level
-from lmshealth.transient import Block, pole_columns
+from lmshealth.transient import Block, ComplexArray, pole_columns
 
 # Steps of the differences by which several modes' densities are differentiated, in ln.
 _STEP = 1e-5
@@ -135,138 +137,149 @@ def ambient_bound(
     return _marginal(fisher, 2)
 
 
-def joint_bound(
-    frequency: FloatArray,
-    damping_ratio: FloatArray,
-    shapes: FloatArray,
-    force: FloatArray,
-    noise: float,
-    duration: float,
-    *,
-    band: tuple[float, float],
-) -> FloatArray:
-    """Bound the joint covariance of several, possibly close, modes from ambient accelerations.
+@dataclass(frozen=True, slots=True, eq=False)
+class Vibration:
+    """Modes as channels see them.
 
-    The channels have the power spectral density matrix Φ D Φᵀ + S_e I with D = H S Hᴴ, where S is
-    that of the modal forces. Unknown besides frequencies and dampings are shapes, strengths,
-    the coherence of forces that are coherent, and the noise's level.
-
-    Parameters
+    Attributes
     ----------
     frequency, damping_ratio : ndarray
         Natural frequencies in Hz and damping ratios, shape ``(n_modes,)``.
     shapes : ndarray
-        Φ, shape ``(n_channels, n_modes)``.
+        Φ, real, shape ``(n_channels, n_modes)``.
+    """
+
+    frequency: FloatArray
+    damping_ratio: FloatArray
+    shapes: FloatArray
+
+    def __post_init__(self) -> None:
+        n_modes = self.frequency.size
+        expect_shape("damping_ratio", self.damping_ratio, (n_modes,))
+        expect_shape("shapes", self.shapes, (len(self.shapes), n_modes))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Recording:
+    """What is recorded of them.
+
+    Attributes
+    ----------
+    noise : ndarray
+        One-sided power spectral density of each channel's white noise, (m/s²)²/Hz, shape
+        ``(n_channels,)``.
+    duration : float
+        In s.
+    band : (float, float)
+        In which all is looked at, in Hz.
+    """
+
+    noise: FloatArray
+    duration: float
+    band: tuple[float, float]
+
+
+def joint_bound(modes: Vibration, force: FloatArray, recording: Recording) -> FloatArray:
+    """Bound the joint covariance of several, possibly close, modes from ambient accelerations.
+
+    The channels have the power spectral density matrix Φ D Φᵀ + diag(S_e) with D = H S Hᴴ, where S
+    is that of the modal forces. Unknown besides frequencies and dampings are shapes, strengths,
+    the coherence of forces that are coherent, and each channel's noise.
+
+    Parameters
+    ----------
+    modes : Vibration
+        The modes.
     force : ndarray
         S, Hermitian, (m/s²)²/Hz, shape ``(n_modes, n_modes)``. Where it is diagonal the forces
         are taken to be known as independent.
-    noise : float
-        S_e, (m/s²)²/Hz, the same in every channel.
-    duration : float
-        Of the record in s.
-    band : (float, float)
-        Band in Hz.
+    recording : Recording
+        One record. Of several records of one length the bound is that over their number.
 
     Returns
     -------
     ndarray
         Covariance of ``[ln f, ln ζ]``, shape ``(2 n_modes, 2 n_modes)``.
     """
-    m, n = len(frequency), shapes.shape[0]
-    f = _fourier(duration, band)
+    n, m = modes.shapes.shape
+    f = _fourier(recording.duration, recording.band)
     pairs = [(i, j) for i in range(m) for j in range(i) if force[i, j] != 0]
-    force = np.asarray(force, dtype=complex)
+    levels = slice(2 * m + n * m, 2 * m + n * m + n)
 
-    def density(p: FloatArray) -> np.ndarray:
+    def density(p: FloatArray) -> ComplexArray:
         beta = np.exp(p[:m]) / f[:, None]
         response = 1 / (1 - beta**2 - 2j * np.exp(p[m : 2 * m]) * beta)
-        forces = force.copy()
-        for k, (i, j) in enumerate(pairs):
-            size = np.sqrt((force[i, i] * force[j, j]).real)
-            forces[i, j] += size * (p[-2 * k - 2] + 1j * p[-2 * k - 1])
+        forces = np.array(force, dtype=complex)
+        coherence = p[levels.stop :].reshape(-1, 2) @ [1, 1j]
+        for (i, j), change in zip(pairs, coherence, strict=True):
+            forces[i, j] += np.sqrt((force[i, i] * force[j, j]).real) * change
             forces[j, i] = forces[i, j].conj()
         # A shape's length stands for the strength of its force.
-        paths = response[:, None, :] * p[2 * m : 2 * m + n * m].reshape(n, m)
-        noisy = np.exp(p[2 * m + n * m]) * np.eye(n)
-        return np.asarray(paths @ forces @ np.swapaxes(paths.conj(), 1, 2) + noisy)
+        paths = response[:, None, :] * p[2 * m : levels.start].reshape(n, m)
+        seen = paths @ forces @ np.swapaxes(paths.conj(), 1, 2)
+        return np.asarray(seen + np.diag(np.exp(p[levels])))
 
-    start = np.concatenate(
-        [np.log(frequency), np.log(damping_ratio), np.ravel(shapes), [np.log(noise)],
-         np.zeros(2 * len(pairs))]
-    )  # fmt: skip
-    inverse = np.linalg.inv(density(start))
+    ends = [np.log(modes.frequency), np.log(modes.damping_ratio), np.ravel(modes.shapes)]
+    start = np.concatenate([*ends, np.log(recording.noise), np.zeros(2 * len(pairs))])
     scale = np.ones(start.size)
-    scale[2 * m : 2 * m + n * m] = np.abs(shapes).max()
-    slopes = [
-        inverse @ (density(start + step) - density(start - step)) / (2 * _STEP)
-        for step in _STEP * np.diag(scale)
-    ]
-    stacked = np.array(slopes)
-    fisher = np.einsum("qkab,rkba->qr", stacked, stacked, optimize=True).real
-    level = 2 * m + n * m
-    fisher[level, level] += _NOISE_STD**-2
+    scale[2 * m : levels.start] = np.abs(modes.shapes).max()
+    inverse = np.linalg.inv(density(start))
+    slopes = np.array(
+        [
+            inverse @ (density(start + step) - density(start - step)) / (2 * _STEP)
+            for step in _STEP * np.diag(scale)
+        ]
+    )
+    fisher = np.einsum("qkab,rkba->qr", slopes, slopes, optimize=True).real
+    place = np.arange(levels.start, levels.stop)
+    fisher[place, place] += _NOISE_STD**-2
     return _marginal(fisher, 2 * m)
 
 
 def decay_bound(
-    frequency: float,
-    damping_ratio: float,
-    amplitude: FloatArray,
-    noise: FloatArray,
-    ambient: float,
-    *,
-    duration: float,
-    band: tuple[float, float],
+    modes: Vibration, amplitude: ComplexArray, ambient: FloatArray, recording: Recording
 ) -> FloatArray:
-    """Bound the covariance of one mode's estimate from free decays in noise and its own response.
+    """Bound the joint covariance of modes from free decays in noise and their own response.
 
-    Unknown besides frequency and damping are amplitude and phase of every decay in every channel,
-    and the levels of both noises; what leaks into the band is known to be nothing.
+    Unknown besides frequencies and dampings are amplitude and phase of every decay in every
+    channel, and the levels of all noises; what leaks into the band is known to be nothing.
 
     Parameters
     ----------
-    frequency, damping_ratio : float
-        Natural frequency in Hz and damping ratio.
+    modes : Vibration
+        The modes.
     amplitude : ndarray of complex
-        Of the acceleration at the beginning of each decay, shape ``(n_decays, n_channels)``; its
-        real parts' ratios between channels are those of the ambient response too.
-    noise : ndarray
-        White noise's one-sided power spectral density of each channel, shape ``(n_channels,)``.
-    ambient : float
-        One-sided power spectral density S of the modal force per mass in the first channel.
-    duration : float
-        Of each decay in s.
-    band : (float, float)
-        Band in Hz.
+        Of each mode's acceleration at the beginning of each decay, m/s², shape
+        ``(n_decays, n_modes)``.
+    ambient : ndarray
+        One-sided power spectral density S of each mode's force, (m/s²)²/Hz, shape ``(n_modes,)``.
+        Where it is 0 it is known to be.
+    recording : Recording
+        Each decay.
 
     Returns
     -------
     ndarray
-        Covariance of ``[ln f, ln ζ]``, shape ``(2, 2)``.
+        Covariance of ``[ln f, ln ζ]``, shape ``(2 n_modes, 2 n_modes)``.
     """
-    amplitude = np.atleast_2d(amplitude)
-    n_decays, n = amplitude.shape
+    n, m = modes.shapes.shape
+    f, zeta, duration = modes.frequency, modes.damping_ratio, recording.duration
     # So fast that nothing aliases; the band alone counts.
-    size = int(np.ceil(20 * band[1] * duration))
-    rate = size / duration
-    k = np.arange(np.ceil(band[0] * duration), np.floor(band[1] * duration) + 1)
-    block = Block(
-        k / duration, np.empty((n_decays, k.size, n)), duration, rate, np.empty((k.size, 0))
-    )
-    columns, _ = pole_columns(block, np.array([frequency]), np.array([damping_ratio]))
-    exponent = 2 * np.pi * frequency * (-damping_ratio + 1j * np.sqrt(1 - damping_ratio**2))
-    size = amplitude * (1 - np.exp(exponent * duration)) / 2 * np.sqrt(2 * duration)
-    stacked = np.einsum("rp,psc->src", columns[0], np.stack([size.real, size.imag]))
-    ordinates = stacked[:, : k.size] + 1j * stacked[:, k.size :]
-    shape = (amplitude[0] / amplitude[0, 0]).real
-    block = Block(block.frequency, ordinates, duration, rate, block.base)
-    unit = unit_level(frequency, damping_ratio, duration)
-    likelihood = TransientLikelihood((block,), shape[None], np.array([unit]), np.log(noise))
-    level = np.sqrt(ambient * unit)
-    p = np.concatenate([np.log([frequency, damping_ratio]), [level], np.log(noise), np.zeros(n)])
-    fisher = likelihood.evaluate(p).fisher
-    known = np.arange(3 + n) if level > 0 else np.delete(np.arange(3 + n), 2)
-    return _marginal(fisher[np.ix_(known, known)], 2)
+    n_samples = int(np.ceil(20 * recording.band[1] * duration))
+    fourier = _fourier(duration, recording.band)
+    nothing = np.empty((fourier.size, 0))
+    block = Block(fourier, nothing, duration, n_samples / duration, nothing)
+    columns, _ = pole_columns(block, f, zeta)
+    exponent = 2 * np.pi * f * (-zeta + 1j * np.sqrt(1 - zeta**2))
+    sizes = amplitude * (1 - np.exp(exponent * duration)) * np.sqrt(duration / 2)
+    stacked = np.einsum("mrp,psm,cm->src", columns, [sizes.real, sizes.imag], modes.shapes)
+    block = replace(block, ordinates=stacked[:, : fourier.size] + 1j * stacked[:, fourier.size :])
+    units = np.array([unit_level(*pair, duration) for pair in zip(f, zeta, strict=True)])
+    levels = np.log(recording.noise)
+    likelihood = TransientLikelihood((block,), modes.shapes.T, units, levels)
+    p = np.concatenate([np.log(f), np.log(zeta), np.sqrt(ambient * units), levels, np.zeros(n)])
+    unknown = np.delete(np.arange(3 * m + n), 2 * m + np.flatnonzero(ambient == 0))
+    return _marginal(likelihood.evaluate(p).fisher[np.ix_(unknown, unknown)], 2 * m)
 
 
 def _fourier(duration: float, band: tuple[float, float]) -> FloatArray:
