@@ -149,55 +149,57 @@ def average_ambient(
     place = 2 * likelihood.n_modes + mode
     start = p.copy()
     start[place] = max(abs(p[place]), _FIRST_LEVEL)
-    levels = _levels(likelihood, start, place, free, _COARSE)
-    best = max(levels, key=lambda level: _weight(level, place, _log_det(level, free)))
+    weight, levels = _levels(likelihood, start, place, free, _COARSE)
+    best = levels[int(np.argmax(weight))]
     metric = likelihood.metric(best.at)
     spread = float(np.sqrt(np.linalg.inv(metric)[place, place])) / best.p[place]
     if _SPREADS * spread < _COARSE:
-        levels = _levels(likelihood, best.p, place, free, _SPREADS * spread)
-    inverses, log_dets = zip(*(invert(likelihood, level, free) for level in levels), strict=True)
-    weights = softmax([_weight(at, place, d) for at, d in zip(levels, log_dets, strict=True)])
+        weight, levels = _levels(likelihood, best.p, place, free, _SPREADS * spread)
+    weights, most = softmax(weight), int(np.argmax(weight))
+    inverses = np.array([np.linalg.inv(level.at.fisher[np.ix_(free, free)]) for level in levels])
+    # The Hessian is costly: what it is over the Fisher information is taken from the best level.
+    wide = np.linalg.cholesky(invert(likelihood, levels[most], free))
+    stretch = wide @ np.linalg.inv(np.linalg.cholesky(inverses[most]))
     where = np.array([level.p for level in levels])
     mean = weights @ where
     cov = (where - mean).T @ (weights[:, None] * (where - mean))
-    cov[np.ix_(free, free)] += np.tensordot(weights, np.array(inverses), 1)
+    cov[np.ix_(free, free)] += stretch @ np.tensordot(weights, inverses, 1) @ stretch.T
     return Average(mean, cov)
 
 
 def _levels(
     likelihood: TransientLikelihood, p: FloatArray, place: int, free: IntArray, step: float
-) -> list[Optimum]:
-    """Maximise at levels in both directions from a first one, until they are too unlikely."""
+) -> tuple[FloatArray, list[Optimum]]:
+    """Maximise at levels in both directions from a first one, until they are too unlikely.
+
+    Returns
+    -------
+    weights : ndarray
+        Log posterior of each level, the others integrated, under Jeffreys' prior on a log grid.
+    levels : list of Optimum
+        The levels.
+    """
     found: list[tuple[float, Optimum]] = []
     for way in (1, -1):
         at = p.copy()
         if way < 0:
             at[place] *= np.exp(-step)
         while at[place] > _LEAST_LEVEL:
-            optimum = maximise(likelihood, at, free)
-            weight = _weight(optimum, place, _log_det(optimum, free))
-            found.append((weight, optimum))
-            if weight < max(weight for weight, _ in found) - _UNLIKELY:
+            level = maximise(likelihood, at, free)
+            fisher = level.at.fisher
+            log_det = np.linalg.slogdet(fisher[np.ix_(free, free)])[1]
+            prior = 0.5 * np.log(fisher[place, place]) + np.log(at[place])
+            found.append((float(prior - level.at.value - log_det / 2), level))
+            if found[-1][0] < max(weight for weight, _ in found) - _UNLIKELY:
                 break
-            at = optimum.p.copy()
+            at = level.p.copy()
             at[place] *= np.exp(way * step)
     best = max(weight for weight, _ in found)
-    return [optimum for weight, optimum in found if weight > best - _UNLIKELY]
+    kept = [item for item in found if item[0] > best - _UNLIKELY]
+    return np.array([weight for weight, _ in kept]), [level for _, level in kept]
 
 
-def _log_det(optimum: Optimum, free: IntArray) -> float:
-    return float(np.linalg.slogdet(optimum.at.fisher[np.ix_(free, free)])[1])
-
-
-def _weight(optimum: Optimum, place: int, log_det: float) -> float:
-    """Log posterior of a level, the others integrated, under Jeffreys' prior on a log grid."""
-    prior = 0.5 * np.log(optimum.at.fisher[place, place]) + np.log(optimum.p[place])
-    return float(prior - optimum.at.value - log_det / 2)
-
-
-def invert(
-    likelihood: TransientLikelihood, optimum: Optimum, free: IntArray
-) -> tuple[FloatArray, float]:
+def invert(likelihood: TransientLikelihood, optimum: Optimum, free: IntArray) -> FloatArray:
     """Invert the Hessian, or the Fisher information where that has no inverse.
 
     Parameters
@@ -211,17 +213,14 @@ def invert(
 
     Returns
     -------
-    inverse : ndarray
+    ndarray
         Covariance of the free parameters, shape ``(n_free, n_free)``.
-    log_det : float
-        Logarithm of the determinant of what was inverted.
     """
     try:
         factor = np.linalg.cholesky(_hessian(likelihood, optimum, free))
     except np.linalg.LinAlgError:
         factor = np.linalg.cholesky(optimum.at.fisher[np.ix_(free, free)])
-    inverse = linalg.cho_solve((factor, True), np.eye(free.size))
-    return inverse, 2 * float(np.log(np.diag(factor)).sum())
+    return np.asarray(linalg.cho_solve((factor, True), np.eye(free.size)))
 
 
 def _hessian(likelihood: TransientLikelihood, optimum: Optimum, free: IntArray) -> FloatArray:

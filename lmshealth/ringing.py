@@ -245,7 +245,7 @@ def estimate(found: Ringing, modes: Sequence[int] | None = None) -> Estimate:
     own = np.array([*modes, *(m + i for i in modes)])
     n = len(modes)
     inverse = np.zeros((p.size, p.size))
-    inverse[np.ix_(free, free)] = invert(likelihood, maximise(likelihood, p, free), free)[0]
+    inverse[np.ix_(free, free)] = invert(likelihood, maximise(likelihood, p, free), free)
     joint = inverse[np.ix_(own, own)]
     mean, scales = np.empty(2 * n), np.zeros((2 * n, 2 * n))
     for k, average in enumerate(averages):

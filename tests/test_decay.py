@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import os
+from collections.abc import Callable
 from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,6 +16,8 @@ from lmshealth.logs import Log
 from lmshealth.results import Modes
 from lmshealth.segments import Segment
 from lmshealth.stage import Stage
+from studies.decays.beam import judge_beam, one_beam
+from studies.decays.stops import one_machine
 from tests.signals import deviations, make_log, make_stage, sine
 from tests.stops import Ring, stop, stop_log, whole
 
@@ -212,3 +217,23 @@ def test_what_cannot_be_analysed_is_said() -> None:
     moving = make_log({"acc_0": np.zeros(800)}, RATE, velocity=np.full(800, 0.1))
     with pytest.raises(BadLog, match="no-such-part"):
         identify_decays(moving, stage)
+
+
+def test_a_real_beam_gives_its_frequencies(needs: Callable[[str], None]) -> None:
+    """Dwells of a beam on a roller: right to 0.15 Hz or refused, and so is the unexcited first."""
+    needs("data")
+    rows = one_beam(Path(os.environ["LMSHEALTH_DATA"]), 0)
+    assert len(rows) == 11
+    assert all(judge_beam(rows).values()), rows
+    assert rows[0]["refused"] == "not-excited"
+
+
+@pytest.mark.parametrize("name", ["lms-x", "lms-y"])
+def test_simulated_stages_tell_their_modes_after_a_stop(name: str) -> None:
+    """A stage with all its modes, its loop and mains: what is not refused is right."""
+    rows = one_machine(name, 0)
+    seen = [row for row in rows if row["f_hz"] is not None]
+    assert len(seen) > len(rows) / 2
+    for row in seen:
+        assert abs(row["off_f"]) < 0.005, row
+        assert max(abs(row["z_f"]), abs(row["z_zeta"])) < 4, row
