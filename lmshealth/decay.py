@@ -24,9 +24,11 @@ from lmshealth.stage import Stage
 from lmshealth.starts import Target
 from lmshealth.transient import make_block
 
-# A band reaches so many Fourier frequencies, and so many half-power half widths, beyond its modes;
+# A band reaches so many Fourier frequencies, and such a share of the frequency, beyond its modes;
 # modes closer than that are fitted together, but never more than a few.
-_REACH, _WIDTHS, _MOST_TOGETHER = 14.0, 6.0, 4
+_REACH, _SHARE, _MOST_TOGETHER = 20.0, 0.06, 4
+# So near to the end of a band, in Fourier frequencies, no mode is believed.
+_EDGE = 3.0
 # Decays as long as each other within this share are cut to one length.
 _SAME_LENGTH = 0.95
 # Probability that noise alone makes a peak somewhere, and how many neighbours tell its level.
@@ -213,7 +215,7 @@ def _ringing(
     bands = []
     for group, (low, high) in _groups(peaks, duration):
         reach = _reach(duration, group[-1])
-        ends = max(low - reach, 1.5 / duration), min(high + reach, 0.49 * log.sample_rate)
+        ends = max(group[0] - reach, 1.5 / duration), min(group[-1] + reach, 0.49 * log.sample_rate)
         inside = max(low, limits[0]), min(high, limits[1])
         names = tuple(c.name for c in channels)
         bands += _settled(cuts, log.sample_rate, ends, _View(source, names, inside))
@@ -263,7 +265,7 @@ def _too_early(band: Band) -> bool:
 
 
 def _reach(duration: float, f: float) -> float:
-    return max(_REACH / duration, _WIDTHS * 0.01 * f)
+    return max(_REACH / duration, _SHARE * f)
 
 
 def _peaks(samples: FloatArray, sample_rate: float, limits: tuple[float, float]) -> list[float]:
@@ -282,7 +284,10 @@ def _peaks(samples: FloatArray, sample_rate: float, limits: tuple[float, float])
 
 
 def _groups(peaks: list[float], duration: float) -> list[tuple[list[float], tuple[float, float]]]:
-    """Group peaks whose bands overlap, and share what lies between the groups out to them."""
+    """Group peaks whose bands overlap, and share out to them what lies in between.
+
+    A mode on the flank of a louder one is no peak, but the fit of the louder one's band finds it.
+    """
     groups: list[list[float]] = []
     for f in peaks:
         close = bool(groups) and f - groups[-1][-1] < _reach(duration, f)
@@ -292,10 +297,10 @@ def _groups(peaks: list[float], duration: float) -> list[tuple[list[float], tupl
             groups.append([f])
     shared = []
     for k, group in enumerate(groups):
-        half = _reach(duration, group[-1]) / 2
-        before = (group[0] - groups[k - 1][-1]) / 2 if k else half
-        after = (groups[k + 1][0] - group[-1]) / 2 if k + 1 < len(groups) else half
-        shared.append((group, (group[0] - min(half, before), group[-1] + min(half, after))))
+        most = _reach(duration, group[-1]) - _EDGE / duration
+        before = (group[0] - groups[k - 1][-1]) / 2 if k else most
+        after = (groups[k + 1][0] - group[-1]) / 2 if k + 1 < len(groups) else most
+        shared.append((group, (group[0] - min(most, before), group[-1] + min(most, after))))
     return shared
 
 

@@ -1,4 +1,4 @@
-"""Do intervals of f and ζ from free decays cover as often as they say?
+"""Coverage of intervals of f and ζ from free decays.
 
 Three stops of one second from a mode at 60 Hz with ζ = 1 %, whose ambient response is a twentieth
 of what each stop excites. A coverage passes when its 99.9 % Clopper-Pearson interval holds 95 %:
