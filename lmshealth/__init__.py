@@ -6,6 +6,7 @@ samples to the date. Inside the package all quantities are in SI units.
 
 from importlib.metadata import version
 
+from lmshealth.decay import identify_decays
 from lmshealth.errors import LmshealthError
 from lmshealth.history import Reading, build_history
 from lmshealth.inference import infer
@@ -26,6 +27,7 @@ __all__ = [
     "assess",
     "build_history",
     "identify",
+    "identify_decays",
     "infer",
     "judge",
     "load_stage",

@@ -143,10 +143,19 @@ _PART = click.option(
     epilog=_examples(
         "modes log.h5 --stage lms-y",
         "modes export.csv --columns map.toml --band 80 200 --format json",
+        "modes moves.h5 --stage lms-y --part settling",
     )
 )
 @_LOGS
 @_STAGE
+@click.option(
+    "--part",
+    type=click.Choice(["constant", "settling"]),
+    default="constant",
+    show_default=True,
+    help="Use what vibrates at constant velocity, or all of a log that never moves; or what "
+    "decays after the moves.",
+)
 @_COLUMNS
 @click.option("--channels", help="Use only these channels, separated by commas.")
 @click.option("--band", nargs=2, type=float, metavar="LOW HIGH", help="Use only this band, in Hz.")
@@ -154,9 +163,11 @@ _PART = click.option(
 @click.pass_context
 def modes(ctx: click.Context, /, logs: tuple[Path, ...], style: str, **options: Any) -> None:
     """Identify the modes of single logs: frequency and damping with their uncertainty."""
+    from lmshealth.decay import identify_decays
     from lmshealth.modal import identify
     from lmshealth.tables import frame, lines_rows, modes_rows, refused_rows
 
+    look = identify_decays if options["part"] == "settling" else identify
     stage, columns = _loaded(options["stage"], options["columns"])
     band = _checked_band(options["band"])
     channels = (
@@ -168,7 +179,7 @@ def modes(ctx: click.Context, /, logs: tuple[Path, ...], style: str, **options: 
         lambda log: (
             log.name,
             log.metadata,
-            identify(log, stage, channels=channels, band=band),
+            look(log, stage, channels=channels, band=band),
         ),
     )
     rows = [row for log, metadata, own in found for row in modes_rows(log, metadata, own)]

@@ -223,7 +223,7 @@ def test_the_program_runs_as_a_process(folder: Path, stage: Path) -> None:
     assert len(strict(done.stdout)["modes"]) == 2
 
 
-# error and spectrum
+# Logs of strokes
 
 
 @pytest.fixture(scope="module")
@@ -234,6 +234,24 @@ def strokes(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
         Experiment(STAGES["lms-y"]), folder, "hdf5", velocities=(0.005, 0.02, 0.1, 0.4)
     )
     return sorted(folder.glob("*.h5"))
+
+
+def test_modes_of_what_settles(strokes: list[Path]) -> None:
+    """A stop from 400 mm/s tells the modes, with a stage or without; a log without is refused."""
+    arguments = ("--part", "settling", "--format", "json")
+    result = call("modes", strokes[-1], strokes[0], "--stage", "lms-y", *arguments)
+    assert result.exit_code == 3
+    assert "no-such-part" in result.stderr
+    content = strict(result.stdout)
+    assert [row["mode"] for row in content["modes"]] == ["roll", "pitch", "yaw"]
+    assert all(set(row) == MODE_KEYS for row in content["modes"])
+    found = [row["frequency_hz"] for row in content["modes"]]
+    assert found == pytest.approx([126.4, 136.6, 155.0], rel=2e-3)
+    assert [row["reason"] for row in content["refused"]] == ["no-such-part"]
+    bare = strict(call("modes", strokes[-1], "--band", 110, 145, *arguments).stdout)
+    numbered = [(row["mode"], row["frequency_hz"]) for row in bare["modes"]]
+    assert numbered == [("mode_1", pytest.approx(126.4, rel=2e-3)),
+                        ("mode_2", pytest.approx(136.6, rel=2e-3))]  # fmt: skip
 
 
 def test_error_as_json_lists_every_harmonic(strokes: list[Path]) -> None:

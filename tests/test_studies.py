@@ -85,3 +85,10 @@ def test_line_test(root: Path) -> None:
     """Alarms stay as declared, lines are found and leave modes in peace; controls do not."""
     answer = json.loads(run_study(root, "line_test"))
     assert all(answer["passed"].values())
+
+
+def test_decays(root: Path) -> None:
+    """Intervals of f and ζ from decays cover, narrower ones do not, machines are told right."""
+    answer = json.loads(run_study(root, "decays"))
+    assert all(answer["passed"].values())
+    assert {"intervals cover", "narrow intervals do not"} <= set(answer["passed"])

@@ -1,0 +1,131 @@
+"""Simulated stops: decays that begin at random phases, ambient responses, white noise."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from lmshealth.bounds import Recording, Vibration, decay_bound
+from lmshealth.logs import Channel, Log, Metadata
+
+RATE = 400.0
+
+
+@dataclass(frozen=True)
+class Case:
+    """Stops of a machine.
+
+    Attributes
+    ----------
+    name : str
+        What it is about.
+    modes : tuple of (float, float)
+        Natural frequency in Hz and damping ratio.
+    n_stops : int
+        Decays in a log.
+    seconds : float
+        Length of each.
+    ambient, noise : float
+        Standard deviations of the ambient response and of the noise of a sample over the
+        amplitude right after a stop.
+    n_channels : int
+        Channels with independent noise; shapes alternate in sign.
+    """
+
+    name: str
+    modes: tuple[tuple[float, float], ...]
+    n_stops: int = 1
+    seconds: float = 1.0
+    ambient: float = 0.03
+    noise: float = 0.02
+    n_channels: int = 1
+
+    def vibration(self) -> Vibration:
+        """Give the true modes."""
+        f, zeta = np.array(self.modes).T
+        shapes = [
+            [(-1.0) ** (i * c) * (1 - 0.2 * c) for i in range(f.size)]
+            for c in range(self.n_channels)
+        ]
+        return Vibration(f, zeta, np.array(shapes))
+
+    def bound(self) -> np.ndarray:
+        """Bound standard deviations of ln f and ln ζ, shape ``(2, n_modes)``.
+
+        Decays begin at random phases, of which the bound is nearly free: phases spread evenly are
+        taken.
+        """
+        modes = self.vibration()
+        f, zeta = modes.frequency, modes.damping_ratio
+        phase = np.linspace(0, np.pi, self.n_stops, endpoint=False)[:, None] + np.arange(f.size)
+        reach = max(20.0, 8 * float(np.max(zeta * f)))
+        band = (float(f.min()) - reach, min(float(f.max()) + reach, 0.48 * RATE))
+        noise = np.full(self.n_channels, self.noise**2 * 2 / RATE)
+        ambient = self.ambient**2 * 4 * zeta / (np.pi * f)
+        cov = decay_bound(modes, np.exp(1j * phase), ambient, Recording(noise, self.seconds, band))
+        return np.asarray(np.sqrt(np.diag(cov)).reshape(2, -1))
+
+
+GUIDE = ((105.0, 0.015), (120.0, 0.02), (135.0, 0.025))
+CLOSE = ((60.37, 0.005), (62.4, 0.005))
+CASES = (
+    Case("0.1 %, one stop", ((60.37, 0.001),)),
+    Case("1 %, one stop", ((60.37, 0.01),)),
+    Case("3 %, one stop", ((60.37, 0.03),)),
+    Case("1 %, one stop, loud noise", ((60.37, 0.01),), noise=0.1),
+    Case("1 %, one stop, faint noise", ((60.37, 0.01),), noise=0.002),
+    Case("0.1 %, five stops", ((60.37, 0.001),), n_stops=5, ambient=0.1),
+    Case("1 %, five stops", ((60.37, 0.01),), n_stops=5, ambient=0.1),
+    Case("2 Hz apart, four stops", CLOSE, n_stops=4, n_channels=2),
+    Case("guide modes, eight stops", GUIDE, n_stops=8, seconds=0.5, n_channels=2),
+)
+# Without an ambient response: one stop cannot rule it out, and intervals may be too wide.
+QUIET = (
+    Case("1 %, one stop, quiet", ((60.37, 0.01),), ambient=0.0),
+    Case("1 %, five stops, quiet", ((60.37, 0.01),), n_stops=5, ambient=0.0),
+)
+
+
+def simulate(case: Case, rng: np.random.Generator) -> np.ndarray:
+    """Make the accelerations after each stop, shape ``(n_stops, n_channels, n_samples)``."""
+    n = round(case.seconds * RATE)
+    t = np.arange(n) / RATE
+    x = case.noise * rng.standard_normal((case.n_stops, case.n_channels, n))
+    for shape, (f, zeta) in zip(case.vibration().shapes.T, case.modes, strict=True):
+        omega = 2 * np.pi * f
+        for stop in x:
+            phase = rng.uniform(0, 2 * np.pi)
+            wave = np.exp(-zeta * omega * t)
+            wave *= np.cos(omega * np.sqrt(1 - zeta**2) * t + phase)
+            stop += np.outer(shape, wave + _shaken(rng, f, zeta, case.ambient, n))
+    return x
+
+
+def _shaken(rng: np.random.Generator, f: float, zeta: float, std: float, n: int) -> np.ndarray:
+    """Make the response of a mode to a white force, cut from a circle longer than its memory."""
+    size = 1 << int(np.ceil(np.log2(3 * n + 2 * RATE / (zeta * f))))
+    hertz = np.arange(size // 2 + 1) * RATE / size
+    response = hertz**2 / (f**2 - hertz**2 + 2j * zeta * f * hertz)
+    force = rng.standard_normal((2, hertz.size))
+    circle = np.fft.irfft(response * (force[0] + 1j * force[1]), size)
+    # The variance of the part around the resonance is π f S / (4 ζ).
+    psd = 2 * 2 / (size * RATE)
+    return np.asarray(circle[:n] * std / np.sqrt(np.pi * f * psd / (4 * zeta)))
+
+
+def to_log(x: np.ndarray) -> Log:
+    """Join stops to a log whose pieces are one decay each."""
+    n_stops, n_channels, n = x.shape
+    return Log(
+        name="simulated",
+        digest="0" * 64,
+        metadata=Metadata(),
+        sample_rate=RATE,
+        channels=tuple(
+            Channel(f"acc_{c}", "acceleration", x[:, c].ravel()) for c in range(n_channels)
+        ),
+        reference_velocity=None,
+        pieces=tuple((k * n, (k + 1) * n) for k in range(n_stops)),
+        refused=(),
+    )

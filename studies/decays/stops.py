@@ -1,0 +1,46 @@
+"""Simulated stages: what they do after real moves, with all their modes, loop, mains and noise."""
+
+from __future__ import annotations
+
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lmshealth import identify_decays, load_stage, read_log
+from models.plant import closed_loop_modes
+from models.stages import STAGES
+from models.velocities import Experiment, drive_velocities
+
+VELOCITIES = (0.1, 0.4)
+
+
+def one_machine(name: str, seed: int) -> list[dict[str, Any]]:
+    """Identify the modes after strokes at two velocities; one row per tracked mode and log."""
+    truth = {mode.name: mode for mode in closed_loop_modes(STAGES[name])}
+    stage = load_stage(name)
+    rows = []
+    with tempfile.TemporaryDirectory() as scratch:
+        folder = Path(scratch)
+        drive_velocities(Experiment(STAGES[name], seed=seed), folder, "hdf5", velocities=VELOCITIES)
+        for path in sorted(folder.glob("*.h5")):
+            found = identify_decays(read_log(path), stage)
+            std = np.sqrt(np.diag(found.cov)).reshape(2, -1)
+            for mode in stage.modes:
+                row: dict[str, Any] = {"stage": name, "seed": seed, "log": path.stem}
+                row |= {"mode": mode.name, "f_hz": None, "refused": ""}
+                if mode.name in found.names:
+                    i, true = found.names.index(mode.name), truth[mode.name]
+                    off_f = found.ln_frequency[i] - np.log(true.frequency_hz)
+                    off_zeta = found.ln_damping[i] - np.log(true.damping_ratio)
+                    row["f_hz"] = float(found.frequency[i])
+                    row["off_f"] = float(off_f)
+                    row["z_f"], row["z_zeta"] = (
+                        float(off_f / std[0, i]),
+                        float(off_zeta / std[1, i]),
+                    )
+                else:
+                    row["refused"] = next(r.reason for r in found.refused if r.mode == mode.name)
+                rows.append(row)
+    return rows
