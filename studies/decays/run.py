@@ -29,7 +29,7 @@ Answer
     120 modes, none for another, in intervals that cover 98 and 99 %. The beam is right to 0.05 Hz
     in 28 dwells and refused in 5, among them the three that nothing excites.
 Run time
-    Thirteen minutes on one processor, half a minute with ``--quick``.
+    Thirteen minutes on one processor, forty seconds with ``--quick``.
 Data
     Folder ``dropbear_ds8`` of LMSHEALTH_DATA; left out where it is not set.
 """
