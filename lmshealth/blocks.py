@@ -8,7 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from lmshealth.arrays import BoolArray, ComplexArray, FloatArray
-from lmshealth.spectra import CrossSpectrum, Kernel, make_kernel
+from lmshealth.kernel import Kernel, make_kernel
+from lmshealth.spectra import CrossSpectrum
 
 # Below this many half-power bandwidths times duration the expected periodogram replaces the
 # density: the record no longer resolves the resonance. Many segments are surer than one, and

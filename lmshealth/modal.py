@@ -21,7 +21,7 @@ from lmshealth.logs import Channel, Log, Refusal
 from lmshealth.peaks import find_excess, find_peaks
 from lmshealth.results import Line, Modes
 from lmshealth.segments import find_segments
-from lmshealth.spectra import cross_spectra
+from lmshealth.spectra import ANY_RESONANCE, Resonances, cross_spectra
 from lmshealth.stage import Stage
 from lmshealth.starts import Target, coarsen, locate, shift_cost
 
@@ -163,8 +163,22 @@ def _transform(
     return View(
         tuple(channel.name for channel in channels),
         tuple("delta_e" if c.kind == "displacement" else "acc" for c in channels),
-        cross_spectra(channels, segments, log.sample_rate, reach, ceiling=ceiling),
+        cross_spectra(
+            channels,
+            segments,
+            log.sample_rate,
+            reach,
+            ceiling=ceiling,
+            resonances=tuple(_expected(target) for target in targets) or ANY_RESONANCE,
+        ),
     )
+
+
+def _expected(target: Target) -> Resonances:
+    """Say where a mode may stand; its damping may be half of what is known of it."""
+    low, high = target.band(1.0)
+    low, high = low * (1 - target.search), high * (1 + target.search)
+    return Resonances(low, high, target.damping_ratio / 2)
 
 
 def _search(

@@ -113,6 +113,8 @@ def name_modes(log: Log, targets: tuple[Target, ...], bands: list[Band]) -> Mode
         ln_damping=mean[n:],
         cov=cov,
         snr=np.array([own.max() for own in snr]),
+        dispersion=np.full(n, np.nan),
+        flags=("",) * n,
         lines=(),
         refused=(*log.refused, *refused),
     )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from scipy import fft
@@ -19,6 +20,8 @@ from lmshealth.tones import remove_tones
 _LAG_PERIODS = 8.0
 # Set velocities closer than this are one.
 _SAME_VELOCITY = 0.01
+# A resonance is no line if it is so many ordinates wide.
+_TOLD_APART = 8.0
 # Parts of a stretch that is cut have at least so many samples: only they are averaged.
 _LEAST_PART = MINUTE // 2
 # A line keeps its phase for about a thousand periods: so wide it is, as a share of its frequency.
@@ -168,6 +171,23 @@ def median_ordinate(count: int) -> float:
     return float(gamma.ppf(0.5, count)) / count
 
 
+class Resonances(NamedTuple):
+    """Where resonances may stand, in Hz, and the least damping ratio that they may have."""
+
+    low: float
+    high: float
+    damping_ratio: float
+
+    def like_lines(self, frequency: FloatArray, duration: float) -> BoolArray:
+        """Tell at which frequencies a segment does not tell them from lines."""
+        width = 2 * self.damping_ratio * frequency * duration
+        within = (frequency >= self.low) & (frequency <= self.high)
+        return np.asarray(within & (width < _TOLD_APART))
+
+
+ANY_RESONANCE = (Resonances(0.0, np.inf, 0.005),)
+
+
 def cross_spectra(
     channels: Sequence[Channel],
     segments: Sequence[Segment],
@@ -175,6 +195,7 @@ def cross_spectra(
     top: float,
     *,
     ceiling: float = np.inf,
+    resonances: Sequence[Resonances] = ANY_RESONANCE,
 ) -> tuple[CrossSpectrum, ...]:
     """Transform all channels segment by segment, and average the parts of long stretches.
 
@@ -192,6 +213,9 @@ def cross_spectra(
         In Hz.
     top, ceiling : float
         In Hz, as in `periodogram`.
+    resonances : sequence of Resonances
+        Where resonances may stand: in a segment too short to tell them from lines nothing is
+        taken out there.
 
     Returns
     -------
@@ -199,14 +223,22 @@ def cross_spectra(
         Each at the place of its first segment.
     """
     return tuple(
-        _mean(_cross_spectrum(channels, part, sample_rate, top, ceiling) for part in group)
+        _mean(
+            _cross_spectrum(channels, part, sample_rate, (top, ceiling), resonances)
+            for part in group
+        )
         for group in _exchangeable(segments)
     )
 
 
 def _cross_spectrum(
-    channels: Sequence[Channel], segment: Segment, sample_rate: float, top: float, ceiling: float
+    channels: Sequence[Channel],
+    segment: Segment,
+    sample_rate: float,
+    reach: tuple[float, float],
+    resonances: Sequence[Resonances],
 ) -> CrossSpectrum:
+    top, ceiling = reach
     parts = [as_acceleration(channel, segment, sample_rate, top) for channel in channels]
     # A second difference has no values at the ends: there the others are cut, too.
     short = max(lag for _, lag in parts)
@@ -221,7 +253,8 @@ def _cross_spectrum(
         if lag:
             transforms[:, c] *= lag_gain(frequency, lag, sample_rate)
     transforms *= np.sqrt(2 / (n * sample_rate))
-    transforms, free, tones = remove_tones(transforms)
+    spared = np.any([r.like_lines(frequency, n / sample_rate) for r in resonances], axis=0)
+    transforms, free, tones = remove_tones(transforms, n / sample_rate, spared)
     step = sample_rate / n
     lines = tuple(
         # Σ I = A² T / 2 over the ordinates of a sine.
@@ -365,80 +398,3 @@ def lag_gain(frequency: FloatArray, lag: int, sample_rate: float) -> FloatArray:
     """
     half = np.pi * frequency / sample_rate
     return np.asarray((half / np.abs(np.sin(lag * half)).clip(1e-6)) ** 2)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Kernel:
-    """Turns a power spectral density into the expected periodogram.
-
-    A record of length T sees the density convolved with the Fejér kernel T sinc²(T (f - f')).
-    Where the density is given at multiples of 1/(rT), the Fourier frequencies are every r-th of
-    them, and the transform of the kernel does it. Weights are normalised so that a constant
-    density stays itself.
-
-    Attributes
-    ----------
-    grid : ndarray
-        Where the density is given, in Hz, shape ``(n_grid,)``.
-    place : ndarray of int
-        Where on the grid the expected ordinates stand, shape ``(n,)``.
-    transform : ndarray
-        Of the kernel about its centre, long enough for the whole grid.
-    norm : ndarray
-        Sum of the weights of each ordinate, shape ``(n,)``.
-
-    References
-    ----------
-    Sykulski2019
-    """
-
-    grid: FloatArray
-    place: np.ndarray[tuple[int], np.dtype[np.intp]]
-    transform: FloatArray
-    norm: FloatArray
-
-    def expect(self, density: ComplexArray | FloatArray) -> ComplexArray:
-        """Give the expected ordinates, shape ``(..., n)``, of densities ``(..., n_grid)``."""
-        return np.asarray(self._convolve(density)[..., self.place] / self.norm)
-
-    def spread(self, values: ComplexArray) -> ComplexArray:
-        """Transpose of `expect`: from ordinates, ``(..., n)``, onto the grid, ``(..., n_grid)``."""
-        on_grid = np.zeros((*values.shape[:-1], self.grid.size), dtype=complex)
-        on_grid[..., self.place] = values / self.norm
-        return self._convolve(on_grid)
-
-    def _convolve(self, values: ComplexArray | FloatArray) -> ComplexArray:
-        size = self.transform.size
-        turned = fft.fft(values, size, axis=-1) * self.transform
-        return np.asarray(fft.ifft(turned, size, axis=-1)[..., : self.grid.size])
-
-
-def make_kernel(
-    spectrum: Spectrum | CrossSpectrum, keep: BoolArray, finer: int, margin: int
-) -> Kernel:
-    """Prepare the expected periodogram of some ordinates of a spectrum.
-
-    Parameters
-    ----------
-    spectrum : Spectrum
-        A band of Fourier frequencies.
-    keep : ndarray of bool
-        Which ordinates are asked for, shape ``(n_ordinates,)``.
-    finer : int
-        So many frequencies of the grid per Fourier frequency.
-    margin : int
-        The grid reaches so many Fourier frequencies beyond the band.
-    """
-    first, last = np.rint(spectrum.frequency[[0, -1]] * spectrum.duration).astype(int).tolist()
-    index = np.arange(max((first - margin) * finer, 1), (last + margin) * finer)
-    size = 2 * fft.next_fast_len(index.size)
-    # Even about its centre: its transform is real.
-    off = np.minimum(np.arange(size), size - np.arange(size))
-    transform = fft.fft(np.sinc(off / finer) ** 2).real
-    kernel = Kernel(
-        grid=index / (finer * spectrum.duration),
-        place=np.arange(first, last + 1)[keep] * finer - index[0],
-        transform=transform,
-        norm=np.ones(int(keep.sum())),
-    )
-    return replace(kernel, norm=kernel.expect(np.ones(index.size)).real)

@@ -22,6 +22,9 @@ _BESIDE = (3, 4, 5, 6, 7, 8)
 # as little in the ordinates beside the tone as the most do, and ordinates to either side that they
 # are fitted to.
 _TERMS = (4, 8, 12, 16, 24)
+# A line's amplitude and phase change over seconds, those of a mode faster: so many polynomials per
+# second describe the one and not the other.
+_TERMS_PER_SECOND = 0.6
 _AS_LITTLE = 1.5
 _REACH = 400
 # A resonance towers, too, but no polynomial explains its surroundings: of a tone they come down to
@@ -46,13 +49,20 @@ class Tone(NamedTuple):
     power: float
 
 
-def remove_tones(transforms: ComplexArray) -> tuple[ComplexArray, BoolArray, tuple[Tone, ...]]:
+def remove_tones(
+    transforms: ComplexArray, duration: float, spared: BoolArray
+) -> tuple[ComplexArray, BoolArray, tuple[Tone, ...]]:
     """Take out the tones of a segment.
 
     Parameters
     ----------
     transforms : ndarray
         Of all channels at consecutive Fourier frequencies, shape ``(n_ordinates, n_channels)``.
+    duration : float
+        Of the segment in s.
+    spared : ndarray of bool
+        Ordinates at which a resonance may stand that is as narrow as a tone, shape
+        ``(n_ordinates,)``.
 
     Returns
     -------
@@ -69,41 +79,41 @@ def remove_tones(transforms: ComplexArray) -> tuple[ComplexArray, BoolArray, tup
     # With time counted from the middle of the segment every other ordinate changes its sign.
     turn = np.where(np.arange(len(transforms)) % 2, -1.0, 1.0)[:, None]
     rest = transforms * turn
+    choice = tuple(k for k in _TERMS if k <= max(_TERMS[0], _TERMS_PER_SECOND * duration))
     tones: list[Tone] = []
     for _ in range(_MOST_ROUNDS):
-        found = _take_out(rest, free, [k for k in _towering(_filled(rest, free)) if free[k]])
+        peaks = [k for k in _towering(_filled(rest, free)) if free[k] and not spared[k]]
+        found = _take_out(rest, free, peaks, choice)
         tones += found
         if not found:
             break
     return rest * turn, free, tuple(tones)
 
 
-def _take_out(rest: ComplexArray, free: BoolArray, peaks: list[int]) -> list[Tone]:
+def _take_out(
+    rest: ComplexArray, free: BoolArray, peaks: list[int], choice: tuple[int, ...]
+) -> list[Tone]:
     """Take out of ``rest`` and of ``free`` what is a tone of some peaks."""
     tones = []
     for at in peaks:
-        near = slice(max(0, at - _REACH), at + _REACH + 1)
+        near = slice(max(0, at - _REACH), min(at + _REACH + 1, len(rest)))
         # Where others stand they are fitted, too.
         others = [k for k in peaks if k != at and near.start <= k < near.stop and free[k]]
-        places = [_place(rest, k) for k in (at, *others[: _TOGETHER - 1])]
-        found = _fit_tone(rest[near], np.array(places) - near.start)
+        places = np.array([_place(rest, k) for k in (at, *others[: _TOGETHER - 1])])
+        found = _fit_tone(rest[near], places - near.start, choice)
         if found is None:
             continue
-        terms, size, level = found
-        # What the noise adds by itself is not the tone's.
-        power = np.sum(
-            np.abs(_basis(near.stop - near.start, places[0] - near.start, terms) @ size) ** 2,
-            axis=0,
-        )
+        size, level = found
+        terms = len(size)
+        power = np.sum(np.abs(_basis(near, places[0], terms) @ size) ** 2, axis=0)
         channel = int(np.argmax(power / level))
-        tones.append(
-            Tone(channel, places[0], float(max(power[channel] - terms * level[channel], 0.0)))
-        )
+        # What the noise adds by itself is not the tone's.
+        own = max(0.0, float(power[channel] - terms * level[channel]))
+        tones.append(Tone(channel, float(places[0]), own))
         # Its skirt falls with the square of the distance.
         reach = max(_REACH, int(np.sqrt(np.max(power / level) / _SKIRT) / np.pi))
-        reached = slice(max(0, at - reach), at + reach + 1)
-        own = rest[reached]
-        rest[reached] = own - _basis(len(own), places[0] - reached.start, terms) @ size
+        reached = slice(max(0, at - reach), min(at + reach + 1, len(rest)))
+        rest[reached] -= _basis(reached, places[0], terms) @ size
         foot = _foot(terms)
         free[max(0, at - foot) : at + foot + 1] = False
     return tones
@@ -154,15 +164,15 @@ def _contrast(power: FloatArray) -> FloatArray:
 
 
 def _fit_tone(
-    rest: ComplexArray, places: FloatArray
-) -> tuple[int, ComplexArray, FloatArray] | None:
-    """Fit the first of some tones by polynomials, as few as will do.
+    rest: ComplexArray, places: FloatArray, choice: tuple[int, ...]
+) -> tuple[ComplexArray, FloatArray] | None:
+    """Fit the first of some tones by polynomials, as few of the choice as will do.
 
-    Returns their number, their sizes in each channel, and the level of what is beside the tone;
-    None where no polynomial explains it.
+    Returns their sizes in each channel, shape ``(n_terms, n_channels)``, and the level of what is
+    beside the tone, ``(n_channels,)``; None where no polynomial explains it.
     """
     apart = np.abs(np.arange(len(rest)) - places[:, None])
-    widest = _foot(_TERMS[-1])
+    widest = _foot(choice[-1])
     # Where other tones stand the noise is fitted, too.
     alone = (apart[1:] > widest).all(axis=0)
 
@@ -173,8 +183,8 @@ def _fit_tone(
         return np.asarray(np.median(np.abs(fit[there]) ** 2, axis=0) / np.log(2))
 
     sizes, fits = [], []
-    for terms in _TERMS:
-        basis = np.hstack([_basis(len(rest), place, terms) for place in places])
+    for terms in choice:
+        basis = np.hstack([_basis(slice(0, len(rest)), place, terms) for place in places])
         size = np.linalg.lstsq(basis, rest, rcond=None)[0]
         sizes.append(np.asarray(size[:terms], dtype=np.complex128))
         fits.append(rest - basis @ size)
@@ -183,21 +193,20 @@ def _fit_tone(
     channel = int(np.argmax(np.sum(np.abs(sizes[-1]) ** 2, axis=0) / level))
     if not level[channel] <= _LEFT_OVER * far[channel]:
         return None
-    enough = [
-        (left(fit, _foot(terms), _foot(terms) + _NEAR) <= _AS_LITTLE * level).all()
-        for fit, terms in zip(fits, _TERMS, strict=True)
-    ]
-    best = int(np.argmax(enough)) if any(enough) else -1
-    return _TERMS[best], sizes[best], level
+    for size, fit in zip(sizes, fits, strict=True):
+        foot = _foot(len(size))
+        if (left(fit, foot, foot + _NEAR) <= _AS_LITTLE * level).all():
+            return size, level
+    return sizes[-1], level
 
 
 def _foot(terms: int) -> int:
     return terms // 2 + 1
 
 
-def _basis(n: int, place: float, terms: int) -> FloatArray:
-    """Transform the polynomials at n ordinates, shape ``(n, n_terms)``."""
-    off = np.arange(n) - place
+def _basis(ordinates: slice, place: float, terms: int) -> FloatArray:
+    """Transform the polynomials, shape ``(n_ordinates, n_terms)``."""
+    off = np.arange(ordinates.start, ordinates.stop) - place
     basis = spherical_jn(np.arange(terms), np.pi * np.abs(off)[:, None])
     basis[:, 1::2] *= np.sign(off)[:, None]
     return np.asarray(basis)

@@ -62,9 +62,7 @@ def accelerations(
     return _log({f"acc_{c}": row for c, row in enumerate(values)}, RATE, pieces)
 
 
-def fused(
-    rng: np.random.Generator, modes: tuple[Truth, ...], noise: float, seconds: float
-) -> Log:
+def fused(rng: np.random.Generator, modes: tuple[Truth, ...], noise: float, seconds: float) -> Log:
     """Make accelerometers and a following error that all see the same motion.
 
     The sensor of the following error is as good at 120 Hz as the accelerometers, no better at any

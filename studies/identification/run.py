@@ -59,7 +59,9 @@ def main() -> None:
     # Two workers fill two cores: threads inside linear algebra would get in their way.
     os.environ.update(dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1"))
     tasks = [
-        (k, first, min(first + CHUNK, seeds[k])) for k in cases for first in range(0, seeds[k], CHUNK)
+        (k, first, min(first + CHUNK, seeds[k]))
+        for k in cases
+        for first in range(0, seeds[k], CHUNK)
     ]
     with ProcessPoolExecutor(2, mp_context=get_context("spawn")) as pool:
         parts = list(pool.map(identify_some, *zip(*tasks, strict=True)))
