@@ -7,6 +7,7 @@ samples to the date. Inside the package all quantities are in SI units.
 from importlib.metadata import version
 
 from lmshealth.errors import LmshealthError
+from lmshealth.frf import read_frf
 from lmshealth.history import Reading, build_history
 from lmshealth.inference import infer
 from lmshealth.modal import identify
@@ -30,6 +31,7 @@ __all__ = [
     "judge",
     "load_stage",
     "prognose",
+    "read_frf",
     "read_log",
     "run",
     "track",
