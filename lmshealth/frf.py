@@ -21,6 +21,7 @@ from lmshealth.segments import find_phases
 _TOP = 0.45  # of the sample rate: anti-alias filters reach below Nyquist
 # The second difference of a displacement reaches over this part of the shortest period.
 _LAG_PERIODS = 8.0
+_FEWEST_SAMPLES = 256
 # Standard deviations of a mean coherence beyond what noise alone shows.
 _ANSWERS = 5.0
 # What is not reported as a mode: known this badly, or in power so few times the distortion around.
@@ -130,9 +131,15 @@ def _stretch(log: Log) -> tuple[int, int]:
     if all(phase.kind == "idle" for phase in phases):
         kinds = ("idle", "idle")
     able = [phase for phase in phases if phase.kind in kinds]
-    if not able:
-        raise BadLog(log.name, "too-short", "no stretch of constant velocity without gaps")
-    longest = max(able, key=lambda phase: phase.stop - phase.start)
+    longest = max(able, key=lambda phase: phase.stop - phase.start, default=None)
+    if longest is None or longest.stop - longest.start < _FEWEST_SAMPLES:
+        n = 0 if longest is None else longest.stop - longest.start
+        raise BadLog(
+            log.name,
+            "too-short",
+            f"the longest stretch of constant velocity without gaps has {n} samples, "
+            f"{n / log.sample_rate:.3g} s; needed are at least {_FEWEST_SAMPLES}",
+        )
     return longest.start, longest.stop
 
 

@@ -27,7 +27,8 @@ _FREEDOM = 16
 _TRANSIENT = 1e-3
 # Stretches of a record, half overlapping, that a coherence is averaged over.
 _STRETCHES = 8
-_FEWEST_LINES, _MOST_LINES = 16, 20_000
+# Lines that a fit needs, more where they must tell the noise too, and can take.
+_FEWEST_LINES, _FEWEST_OF_RECORD, _MOST_LINES = 16, 64, 20_000
 _ROUNDING = 1e-9  # of what is largest
 
 
@@ -147,7 +148,7 @@ def from_periods(pair: Pair, band: tuple[float, float], period: float) -> tuple[
         spectra = spectra[:, 1:]
     n = spectra.shape[1]
     excited = _is_excited(spectra[0]) & (np.abs(spectra[0]).max(axis=0) > _ROUNDING * strongest)
-    _check_lines(pair, int(excited.sum()), band)
+    _check_lines(pair, int(excited.sum()), band, _FEWEST_LINES)
     frequency, spectra = frequency[excited], spectra[:, :, excited]
     given, answer = spectra.mean(axis=1)
     response = answer / given
@@ -218,7 +219,7 @@ def from_record(pair: Pair, band: tuple[float, float]) -> tuple[Frf, Ordinates]:
     size, rate = pair.signals[0].size, pair.log.sample_rate
     step = rate / size
     first, last = max(1, int(np.ceil(band[0] / step))), int(band[1] / step)
-    _check_lines(pair, last - first + 1, band)
+    _check_lines(pair, last - first + 1, band, _FEWEST_OF_RECORD)
     lines: FloatArray = np.arange(first, last + 1, dtype=np.float64) * step
     given, answer = (
         np.asarray(fft.rfft(x - x.mean())[first : last + 1], dtype=np.complex128)
@@ -267,13 +268,13 @@ def _estimates(
     return h1, h2, hv, np.minimum(coherence, 1.0)
 
 
-def _check_lines(pair: Pair, n: int, band: tuple[float, float]) -> None:
+def _check_lines(pair: Pair, n: int, band: tuple[float, float], fewest: int) -> None:
     where = f"between {band[0]:.4g} and {band[1]:.4g} Hz"
-    if n < _FEWEST_LINES:
+    if n < fewest:
         raise BadLog(
             pair.log.name,
-            "not-excited" if n == 0 else "band-too-narrow",
-            f"{pair.names[0]} excites {n} lines {where}; needed are at least {_FEWEST_LINES}: "
+            "not-excited" if n <= 0 else "band-too-narrow",
+            f"{pair.names[0]} excites {max(n, 0)} lines {where}; needed are at least {fewest}: "
             "choose a wider band, or record longer (a longer period has more lines)",
         )
     if n > _MOST_LINES:

@@ -217,6 +217,25 @@ def test_a_band_beyond_the_sample_rate_or_the_excitation_is_refused() -> None:
     assert refusal(driven(), "current", "acc_x", band=(60, 61)).reason == "band-too-narrow"
 
 
+def test_a_short_record_is_refused_with_its_length() -> None:
+    """Samples and seconds that there are; a record of few lines says what a fit needs."""
+    log = driven(random=True)
+    short = make_log({c.name: c.values[:100] for c in log.channels}, RATE)
+    error = refusal(short, "current", "acc_x")
+    assert error.reason == "too-short"
+    assert "100 samples, 0.25 s" in error.detail
+    brief = make_log({c.name: c.values[:300] for c in log.channels}, RATE)
+    assert refusal(brief, "current", "acc_x", band=BAND).reason == "band-too-narrow"
+
+
+def test_a_log_that_only_accelerates_is_refused() -> None:
+    """Without constant velocity there is nothing to read."""
+    log = driven(random=True)
+    n = log.channels[0].values.size
+    ramp = replace(log, reference_velocity=np.linspace(0, 1, n))
+    assert refusal(ramp, "current", "acc_x").reason == "too-short"
+
+
 def test_a_sine_excites_too_few_lines() -> None:
     """A pure tone repeats itself, but has one line."""
     t = np.arange(8000) / RATE
