@@ -5,9 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.ndimage import median_filter
+from scipy.stats import gamma
 
 from lmshealth.arrays import BoolArray, FloatArray
-from lmshealth.spectra import Spectrum
+from lmshealth.spectra import WANDER, Spectrum, View, median_ordinate
 from lmshealth.starts import Coarse, Target
 from lmshealth.whittle import WEAK, Block, Likelihood, make_block
 
@@ -17,6 +19,7 @@ BAND = 8.0
 # Probability that noise alone makes a line somewhere in the band.
 _LINE_FALSE_ALARM = 1e-3
 _LINE_BINS = 2
+_BESIDE = 41  # ordinates: a line is less than half as wide
 _MOST_LINE_ROUNDS = 4
 # Binned log likelihood gained by a mode: below the first it is absent, above the second beyond
 # doubt, between them it is fitted both ways.
@@ -27,23 +30,6 @@ _WORST_STD_LN_ZETA = 0.7
 # A damping off its start by more than this factor belongs to something else.
 _DAMPING_SPAN = 6.0
 _HEAVY = 0.1  # and above this, a hump that nobody expected is no mode
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class View:
-    """All segments of one channel in the frequency domain.
-
-    Attributes
-    ----------
-    channel, source : str
-        Name, and ``acc`` or ``delta_e``.
-    spectra : tuple of Spectrum
-        One per segment.
-    """
-
-    channel: str
-    source: str
-    spectra: tuple[Spectrum, ...]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -67,10 +53,11 @@ class BandFit:
         between channels by it, and not by the smallest standard deviation, does not favour
         those that happen to show a low damping. Shape ``(n_modes,)``.
     lines : ndarray
-        Frequency in Hz and amplitude in m/s² of the lines kept out, shape ``(n_lines, 2)``.
+        Frequency in Hz and amplitude in m/s² of the lines kept out but for those known beforehand,
+        shape ``(n_lines, 2)``.
     residual : Spectrum
-        Periodogram of the longest segment over what the fit expects: exponential about one
-        where the fit is right, and one where a line was masked.
+        Periodogram that saw most over what the fit expects: scattered about one where the fit is
+        right, and one where a line was masked.
     """
 
     view: View
@@ -142,16 +129,19 @@ def fit_band(
     if not seen:
         return None, missing
     spectra = _cut(view.spectra, seen)
-    masks = [np.ones(s.frequency.size, dtype=bool) for s in spectra]
-    if sum(mask.sum() for mask in masks) < 10 + 6 * len(seen):
-        n = sum(int(mask.sum()) for mask in masks)
-        detail = f"{n} Fourier frequencies in the band, needed {10 + 6 * len(seen)}: record longer"
+    masks = [spectrum.clear_of(view.lines) for spectrum in spectra]
+    n, needed = sum(int(mask.sum()) for mask in masks), 10 + 6 * len(seen)
+    if n < needed:
+        detail = f"{n} Fourier frequencies in the band, needed {needed}: record longer"
         return None, missing | {t.name: ("too-short", detail) for t in seen}
     _mask_towers(spectra, masks, coarse)
     width = min(2 * t.frequency * t.damping_ratio for t in seen)
     rounds = 0
     while True:
-        blocks = tuple(make_block(s, mask, width) for s, mask in zip(spectra, masks, strict=True))
+        blocks = tuple(
+            make_block([spectra[i] for i in group], [masks[i] for i in group], width)
+            for group, _ in _groups(spectra, masks)
+        )
         solution, seen = _fit_and_prune(view, coarse, blocks, seen, gains, missing)
         if solution is None:
             return None, missing
@@ -161,9 +151,13 @@ def fit_band(
     fit = _conclude(view, seen, solution, missing)
     if fit is None:
         return None, missing
-    clarity = np.array([gains[target.name] for target in seen])
-    residual = _residual(spectra, masks, solution)
-    fit = replace(fit, clarity=clarity, lines=_lines(spectra, masks), residual=residual)
+    k = _most(spectra)
+    fit = replace(
+        fit,
+        clarity=np.array([gains[target.name] for target in seen]),
+        lines=_lines(spectra[k], masks[k] | ~spectra[k].clear_of(view.lines)),
+        residual=_residual(spectra[k], masks[k], _expected(spectra, masks, solution)[k]),
+    )
     return _keep_credible(fit, missing), missing
 
 
@@ -198,8 +192,7 @@ def _screen(
 
 
 def _damped(target: Target, factor: float) -> Target:
-    if target.settled is not None:
-        return target
+    factor = factor if target.settled is None else 1.0
     return replace(target, damping_ratio=target.damping_ratio * factor)
 
 
@@ -207,6 +200,17 @@ def _cut(spectra: tuple[Spectrum, ...], targets: tuple[Target, ...]) -> tuple[Sp
     low = min(t.band(BAND)[0] for t in targets)
     high = max(t.band(BAND)[1] for t in targets)
     return tuple(spectrum.band(low, high) for spectrum in spectra)
+
+
+def _groups(
+    spectra: tuple[Spectrum, ...], masks: list[BoolArray]
+) -> list[tuple[list[int], BoolArray]]:
+    """Group the indices of spectra of the same frequencies, with what any of them keeps."""
+    groups: dict[tuple[float, int], list[int]] = {}
+    for i, spectrum in enumerate(spectra):
+        groups.setdefault((spectrum.duration, spectrum.frequency.size), []).append(i)
+    kept = [np.any([masks[i] for i in group], axis=0) for group in groups.values()]
+    return [(group, keep) for group, keep in zip(groups.values(), kept, strict=True) if keep.any()]
 
 
 def _fit_and_prune(
@@ -218,7 +222,7 @@ def _fit_and_prune(
     missing: dict[str, tuple[str, str]],
 ) -> tuple[_Solution | None, tuple[Target, ...]]:
     """Fit all modes seen; leave out, one by one, those that the evidence does not ask for."""
-    n_ordinates = sum(block.periodogram.size for block in blocks)
+    n_ordinates = sum(float(block.count.sum()) for block in blocks)
     solution = _solve(coarse, blocks, seen)
     while seen:
         doubtful = [
@@ -275,35 +279,65 @@ def _mask_towers(spectra: tuple[Spectrum, ...], masks: list[BoolArray], coarse: 
     mode whose damping is below about 1/15 of its nominal one stands as narrow as a line, and may
     lose its own peak.
     """
-    n_ordinates = sum(int(mask.sum()) for mask in masks)
-    threshold = 2 * np.log(n_ordinates / _LINE_FALSE_ALARM)
-    kept = [mask.copy() for mask in masks]
-    for spectrum, keep in zip(spectra, kept, strict=True):
-        level = np.interp(spectrum.frequency, coarse.frequency, coarse.level)
-        towers = np.flatnonzero(spectrum.periodogram > threshold * level)
-        for k in towers.tolist():
-            keep[max(0, k - _LINE_BINS) : k + _LINE_BINS + 1] = False
-    # Towers everywhere are no lines, as in `_mask_lines`.
-    if sum(int(keep.sum()) for keep in kept) < n_ordinates // 2:
-        return
-    for mask, keep in zip(masks, kept, strict=True):
-        mask &= keep
+    p_value = _LINE_FALSE_ALARM / sum(int(mask.sum()) for mask in masks)
+    towers = [
+        s.periodogram
+        > 2 * _highest(s.count, p_value) * np.interp(s.frequency, coarse.frequency, coarse.level)
+        for s in spectra
+    ]
+    _mask_around(masks, towers)
 
 
 def _mask_lines(spectra: tuple[Spectrum, ...], masks: list[BoolArray], solution: _Solution) -> bool:
-    """Mask ordinates that no exponential variable would reach; tell whether there were new ones."""
-    n_ordinates = sum(int(mask.sum()) for mask in masks)
-    threshold = np.log(n_ordinates / _LINE_FALSE_ALARM)
-    new = False
-    for spectrum, mask, expected in zip(
-        spectra, masks, solution.likelihood.expected(solution.p), strict=True
-    ):
-        index = np.flatnonzero(mask)
-        for k in index[spectrum.periodogram[index] > threshold * expected].tolist():
-            mask[max(0, k - _LINE_BINS) : k + _LINE_BINS + 1] = False
-            new = True
+    """Mask ordinates that noise would not reach; tell whether there were new ones."""
+    p_value = _LINE_FALSE_ALARM / sum(int(mask.sum()) for mask in masks)
+    expected = _expected(spectra, masks, solution)
+    lines = [
+        mask & (s.periodogram > _highest(s.count, p_value) * _beside(s, e))
+        for s, mask, e in zip(spectra, masks, expected, strict=True)
+    ]
+    return _mask_around(masks, lines)
+
+
+def _beside(spectrum: Spectrum, expected: FloatArray) -> FloatArray:
+    """Raise what a mean is expected to be to the level about it: what a fit lacks is no line.
+
+    A single periodogram scatters too much for that, and lines tower over what its fit lacks.
+    """
+    if spectrum.count == 1:
+        return expected
+    ratio = spectrum.periodogram / expected / median_ordinate(spectrum.count)
+    return np.asarray(expected * median_filter(ratio, _BESIDE).clip(1.0))
+
+
+def _highest(count: int, p_value: float) -> float:
+    """Level that the mean of so many exponential variables passes with a probability."""
+    return float(gamma.isf(p_value, count)) / count
+
+
+def _mask_around(masks: list[BoolArray], lines: list[BoolArray]) -> bool:
+    """Mask lines with their feet; tell whether there were any."""
+    kept = [mask.copy() for mask in masks]
+    for keep, line in zip(kept, lines, strict=True):
+        for k in np.flatnonzero(line).tolist():
+            keep[max(0, k - _LINE_BINS) : k + _LINE_BINS + 1] = False
     # A band that is mostly lines is no band of modes: keep at least half of it.
-    return new and sum(int(mask.sum()) for mask in masks) >= n_ordinates // 2
+    if sum(int(keep.sum()) for keep in kept) < sum(int(mask.sum()) for mask in masks) // 2:
+        return False
+    masks[:] = kept
+    return any(bool(line.any()) for line in lines)
+
+
+def _expected(
+    spectra: tuple[Spectrum, ...], masks: list[BoolArray], solution: _Solution
+) -> list[FloatArray]:
+    """Spread what each spectrum is expected to be over its band; infinite where it is masked."""
+    full = [np.full(mask.size, np.inf) for mask in masks]
+    values = solution.likelihood.expected(solution.p)
+    for (group, kept), expected in zip(_groups(spectra, masks), values, strict=True):
+        for i in group:
+            full[i][kept] = expected
+    return full
 
 
 def _conclude(
@@ -344,20 +378,17 @@ def _conclude(
     )
 
 
-def _residual(
-    spectra: tuple[Spectrum, ...], masks: list[BoolArray], solution: _Solution
-) -> Spectrum:
-    longest = int(np.argmax([s.duration for s in spectra]))
-    ratio = np.ones(spectra[longest].frequency.size)
-    expected = solution.likelihood.expected(solution.p)[longest]
-    ratio[masks[longest]] = spectra[longest].periodogram[masks[longest]] / expected
-    return replace(spectra[longest], periodogram=ratio)
+def _most(spectra: tuple[Spectrum, ...]) -> int:
+    """Index of the spectrum that saw most."""
+    return int(np.argmax([s.observed for s in spectra]))
 
 
-def _lines(spectra: tuple[Spectrum, ...], masks: list[BoolArray]) -> FloatArray:
-    """Frequency and amplitude of what was masked in the longest segment, shape ``(n, 2)``."""
-    longest = int(np.argmax([s.duration for s in spectra]))
-    spectrum, mask = spectra[longest], masks[longest]
+def _residual(spectrum: Spectrum, mask: BoolArray, expected: FloatArray) -> Spectrum:
+    return replace(spectrum, periodogram=np.where(mask, spectrum.periodogram / expected, 1.0))
+
+
+def _lines(spectrum: Spectrum, mask: BoolArray) -> FloatArray:
+    """Frequency and amplitude of what was masked, shape ``(n, 2)``."""
     edges = np.flatnonzero(np.diff(np.concatenate([[0], (~mask).astype(int), [0]])))
     rows = [spectrum.sine(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True)]
     return np.array(rows).reshape(-1, 2)
@@ -367,7 +398,7 @@ def _keep_credible(fit: BandFit, missing: dict[str, tuple[str, str]]) -> BandFit
     """Refuse modes whose estimate cannot be what it claims to be; what is a line becomes one."""
     m = len(fit.targets)
     f = np.exp(fit.estimate[:m])
-    spectrum = max(fit.view.spectra, key=lambda s: s.duration)
+    spectrum = fit.view.spectra[_most(fit.view.spectra)]
     keep, lines = [], [fit.lines]
     for i, target in enumerate(fit.targets):
         if target.settled is not None:
@@ -398,6 +429,8 @@ def _incredible(fit: BandFit, i: int, duration: float) -> tuple[str, str] | None
             f"{f:.5g} Hz in {channel} is narrower ({2 * zeta * f:.2g} Hz) than a record of "
             f"{duration:.3g} s resolves",
         )
+    if target.nominal is None and 2 * zeta < WANDER:
+        return "line-not-mode", f"{f:.5g} Hz in {channel} is as narrow as a line that wanders"
     sought = target.nominal or target.frequency
     if abs(np.log(f / sought)) > np.log1p(target.search) or not low < zeta < high:
         return (

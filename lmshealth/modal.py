@@ -13,14 +13,14 @@ from itertools import combinations
 import numpy as np
 from scipy.special import softmax
 
-from lmshealth.bandfit import BAND, BandFit, View, fit_band
+from lmshealth.bandfit import BAND, BandFit, fit_band
 from lmshealth.errors import BadLog, BadStage
 from lmshealth.lines import find_lines, name_lines
 from lmshealth.logs import Channel, Log, Refusal
 from lmshealth.peaks import find_excess, find_peaks
 from lmshealth.results import Line, Modes
 from lmshealth.segments import find_segments
-from lmshealth.spectra import periodogram
+from lmshealth.spectra import View, average_spectra
 from lmshealth.stage import Stage
 from lmshealth.starts import Coarse, Target, coarsen, locate, shift_cost
 
@@ -30,8 +30,10 @@ _MOST_TOGETHER = 4
 _CLEAR_NAME = 0.8
 # Without a description, so many times what a fit leaves over is searched for further modes.
 _MOST_ROUNDS = 3
-# Shortest useful segment: half-power bandwidth times duration.
-_LEAST_RESOLUTION = 2.0
+# Shortest useful segment: half-power bandwidth times duration; without a description, periods of
+# the top of the band.
+_LEAST_RESOLUTION, _LEAST_PERIODS = 2.0, 10.0
+_BEYOND = 4.0  # times the top of the band: more than any found mode's flanks reach
 _TOP = 0.45  # of the sample rate: anti-alias filters reach below Nyquist
 
 
@@ -74,24 +76,25 @@ def identify(
     else:
         views = _transform(log, used, (), band)
         targets, seen = _search(log, used, views, band)
+        lines = tuple(sorted(frequency for _, frequency, _ in seen))
+        views = tuple(replace(view, lines=lines) for view in views)
     best: list[BandFit] = []
     refused: list[Refusal] = []
     for cluster in _clusters(targets):
-        found = _fit_cluster(log, views, cluster, targets, known=stage is not None)
-        for _ in range(_MOST_ROUNDS if stage is None else 0):
-            more = _unexplained(found.fits, cluster)
-            if len(more) == len(cluster):
-                break
-            cluster = more
-            found = _fit_cluster(log, views, cluster, targets, known=False)
+        if stage is not None:
+            found = _fit_channels(log, views, cluster, targets, known=True)
+        else:
+            own = _territory(cluster, targets)
+            found = _fit_further(log, tuple(v.band(*own) for v in views), cluster, targets)
         seen += [(fit.view.channel, *line) for fit in found.fits for line in fit.lines.tolist()]
-        best += found.best
-        refused += found.refused
+        chosen, why = _choose(found, known=stage is not None)
+        best += chosen
+        refused += [Refusal(log.name, *reason, mode=name) for name, reason in why.items()]
     resolution = 1.5 / max(s.duration for view in views for s in view.spectra)
-    lines = name_lines(seen, log, stage, resolution)
+    named = name_lines(seen, log, stage, resolution)
     if stage is not None:
-        return _collect(best, lines, (*log.refused, *refused))
-    return _renumber(_collect(_distinct(best), lines, log.refused))
+        return _collect(best, named, (*log.refused, *refused))
+    return _renumber(_collect(_distinct(best), named, log.refused))
 
 
 def _choose_channels(log: Log, names: Sequence[str] | None) -> tuple[Channel, ...]:
@@ -129,7 +132,7 @@ def _transform(
     targets: tuple[Target, ...],
     band: tuple[float, float] | None,
 ) -> tuple[View, ...]:
-    """Transform every channel, up to the top of what is looked for."""
+    """Transform every channel, as far up as anything is looked for."""
     top = max((target.band(BAND)[1] for target in targets), default=0.0)
     if top > log.sample_rate / 2:
         raise BadLog(
@@ -138,24 +141,27 @@ def _transform(
             f"{log.sample_rate:g} Hz cannot show modes up to {top:.0f} Hz; "
             f"needed is at least {2 * top:.0f} Hz",
         )
-    narrowest = min((2 * t.damping_ratio * t.frequency for t in targets), default=np.inf)
-    needed = _LEAST_RESOLUTION / narrowest
+    widest = max((target.search for target in targets), default=0.0)
+    reach = (1 + widest) * top if targets else (band or (0.0, np.inf))[1]
+    # What is found without a description is fitted beyond the band as well.
+    ceiling = reach if targets else _BEYOND * reach
+    needed = _LEAST_PERIODS / min(reach, _TOP * log.sample_rate)
+    if targets:
+        needed = _LEAST_RESOLUTION / min(2 * t.damping_ratio * t.frequency for t in targets)
     segments = find_segments(log, needed)
     if not segments:
         longest = max((b - a for a, b in log.pieces), default=0) / log.sample_rate
         raise BadLog(
             log.name,
             "too-short",
-            f"no stretch of constant velocity without gaps lasts {needed:.3g} s, which the "
-            f"narrowest mode needs; the longest piece without gaps has {longest:.3g} s",
+            f"no stretch of constant velocity without gaps lasts {needed:.3g} s, which is needed "
+            f"for what is looked for; the longest piece without gaps has {longest:.3g} s",
         )
-    widest = max((target.search for target in targets), default=0.0)
-    reach = (1 + widest) * top if targets else (band or (0.0, np.inf))[1]
     return tuple(
         View(
             channel.name,
             "delta_e" if channel.kind == "displacement" else "acc",
-            tuple(periodogram(channel, segment, log.sample_rate, reach) for segment in segments),
+            average_spectra(channel, segments, log.sample_rate, reach, ceiling=ceiling),
         )
         for channel in channels
     )
@@ -185,7 +191,8 @@ def _search(
         for channel in channels
         for line in find_lines(channel, segment, log.sample_rate, (low, high)).tolist()
     ]
-    return find_peaks(tuple(view.spectra for view in views), low, high), lines
+    frequencies = [frequency for _, frequency, _ in lines]
+    return find_peaks(tuple(view.spectra for view in views), low, high, frequencies), lines
 
 
 def _clusters(targets: tuple[Target, ...]) -> list[tuple[Target, ...]]:
@@ -201,21 +208,25 @@ def _clusters(targets: tuple[Target, ...]) -> list[tuple[Target, ...]]:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _ClusterResult:
-    fits: list[BandFit]  # of every channel
-    best: list[BandFit]  # each mode once
-    refused: list[Refusal]
+class _Found:
+    """What the channels show of a cluster."""
+
+    cluster: tuple[Target, ...]
+    views: tuple[View, ...]
+    coarse: tuple[Coarse, ...]  # of every channel
+    fits: list[BandFit]  # of every channel that shows some of it
+    reasons: dict[str, tuple[str, str]]  # for which a mode is missing in a channel
 
 
-def _fit_cluster(
+def _fit_channels(
     log: Log,
     views: tuple[View, ...],
     cluster: tuple[Target, ...],
     targets: tuple[Target, ...],
     *,
     known: bool,
-) -> _ClusterResult:
-    """Fit a cluster in every channel and keep each mode from the channel that knows it best."""
+) -> _Found:
+    """Fit a cluster in every channel."""
     reach = [target.search if known else 0.0 for target in cluster]
     low = min(t.band(BAND)[0] * (1 - r) for t, r in zip(cluster, reach, strict=True))
     high = max(t.band(BAND)[1] * (1 + r) for t, r in zip(cluster, reach, strict=True))
@@ -238,18 +249,42 @@ def _fit_cluster(
                 reasons[name] = why
         if fit is not None:
             fits.append(fit)
-    best = _best_channels(fits, [target.name for target in cluster])
-    best = [_in_company(fit, best, views, coarse) for fit in best]
+    return _Found(cluster, views, coarse, fits, reasons)
+
+
+def _territory(cluster: tuple[Target, ...], targets: tuple[Target, ...]) -> tuple[float, float]:
+    """Frequencies that are nearer to a cluster than to the modes beside it."""
+    first, last = cluster[0].frequency, cluster[-1].frequency
+    below = [t.frequency for t in targets if t.frequency < first]
+    above = [t.frequency for t in targets if t.frequency > last]
+    low = np.sqrt(max(below) * first) if below else 0.0
+    return float(low), float(np.sqrt(last * min(above))) if above else np.inf
+
+
+def _fit_further(
+    log: Log, views: tuple[View, ...], cluster: tuple[Target, ...], targets: tuple[Target, ...]
+) -> _Found:
+    """Fit a cluster that was found, with what stands out of what its fits leave over."""
+    found = _fit_channels(log, views, cluster, targets, known=False)
+    for _ in range(_MOST_ROUNDS):
+        more = _unexplained(found.fits, cluster)
+        if len(more) == len(cluster):
+            break
+        cluster = more
+        found = _fit_channels(log, views, cluster, targets, known=False)
+    return found
+
+
+def _choose(found: _Found, *, known: bool) -> tuple[list[BandFit], dict[str, tuple[str, str]]]:
+    """Keep each mode from the channel that knows it best; say why the others are missing."""
+    best = _best_channels(found.fits, [target.name for target in found.cluster])
+    best = [_in_company(fit, best, found) for fit in best]
+    reasons = found.reasons
     if known:
-        best, unclear = _named(best, cluster)
-        reasons |= unclear
+        best, unclear = _named(best, found.cluster)
+        reasons = reasons | unclear
     seen = {target.name for fit in best for target in fit.targets}
-    refused = [
-        Refusal(log=log.name, mode=name, reason=reason, detail=detail)
-        for name, (reason, detail) in reasons.items()
-        if name not in seen
-    ]
-    return _ClusterResult(fits, best, refused)
+    return best, {name: why for name, why in reasons.items() if name not in seen}
 
 
 def _named(
@@ -300,9 +335,7 @@ def _named(
     return renamed, {n: why for n, why in unclear.items() if n not in names.values()}
 
 
-def _in_company(
-    fit: BandFit, best: list[BandFit], views: tuple[View, ...], coarse: tuple[Coarse, ...]
-) -> BandFit:
+def _in_company(fit: BandFit, best: list[BandFit], found: _Found) -> BandFit:
     """Fit a channel again together with the modes that only other channels show.
 
     A mode too weak to be seen here still interferes with the ones that are, and would bias them;
@@ -314,7 +347,7 @@ def _in_company(
         return fit
     free = tuple(replace(target, settled=None) for target in own)
     company = tuple(sorted((*free, *others), key=lambda target: target.frequency))
-    binned = next(c for v, c in zip(views, coarse, strict=True) if v is fit.view)
+    binned = next(c for v, c in zip(found.views, found.coarse, strict=True) if v is fit.view)
     again, _ = fit_band(fit.view, binned, company)
     names = [target.name for target in own]
     if again is None or not set(names) <= {target.name for target in again.targets}:
@@ -344,8 +377,10 @@ def _best_channels(fits: list[BandFit], names: list[str]) -> list[BandFit]:
 def _unexplained(fits: list[BandFit], cluster: tuple[Target, ...]) -> tuple[Target, ...]:
     """Add to a cluster what stands out of what its fits leave over."""
     more = list(cluster)
+    # What is narrower than that would have stood out by itself, unless it is a line.
+    narrowest = 0.5 * min(target.damping_ratio for target in cluster)
     for fit in fits:
-        candidate = find_excess(fit.residual)
+        candidate = find_excess(fit.residual, narrowest)
         if candidate is None or len(more) > _MOST_TOGETHER:
             continue
         near = (abs(candidate.frequency / t.frequency - 1) < t.damping_ratio for t in more)

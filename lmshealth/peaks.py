@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from lmshealth.arrays import BoolArray, FloatArray
-from lmshealth.spectra import Spectrum
+from lmshealth.spectra import Spectrum, median_ordinate
 from lmshealth.starts import Target
 
 # Half widths of the sought peaks, as fractions of the frequency: about 1.5 damping ratios.
@@ -18,12 +19,16 @@ _LEAST_ORDINATES = 4
 # skewed that noise reaches it.
 _EXCESS = 5.0
 _LEAST_OF_EXCESS = 16
+_MOST_NARROW = 20
 _TOWERING = 60.0
 _BESIDE = (3, 4, 5, 6, 7, 8)
 
 
 def find_peaks(
-    channels: tuple[tuple[Spectrum, ...], ...], low: float, high: float
+    channels: tuple[tuple[Spectrum, ...], ...],
+    low: float,
+    high: float,
+    lines: Sequence[float] = (),
 ) -> tuple[Target, ...]:
     """List candidate modes of all channels in a band, ascending in frequency.
 
@@ -35,13 +40,15 @@ def find_peaks(
     Parameters
     ----------
     channels : tuple of tuple of Spectrum
-        Segments of each channel.
+        Spectra of each channel.
     low, high : float
         Band in Hz.
+    lines : sequence of float
+        Frequencies in Hz at which a line stands: what rises there is no resonance.
     """
     found: list[tuple[float, float, float]] = []
     for spectra in channels:
-        longest = _without_lines(max(spectra, key=lambda spectrum: spectrum.duration))
+        longest = _without_lines(max(spectra, key=lambda spectrum: spectrum.observed), lines)
         for scale in _SCALES:
             found += _stand_out(longest, low, high, scale)
     chosen: list[tuple[float, float, float]] = []
@@ -79,7 +86,7 @@ def _stand_out(
         last = np.maximum(np.searchsorted(spectrum.frequency, b), first + 1)
         last = np.minimum(last, spectrum.frequency.size)
         first = np.minimum(first, last - 1)
-        return (total[last] - total[first]) / (last - first), last - first
+        return (total[last] - total[first]) / (last - first), spectrum.count * (last - first)
 
     inner, n_inner = mean(centre * (1 - scale), centre * (1 + scale))
     left, n_left = mean(centre * (1 - 4 * scale), centre * (1 - 2 * scale))
@@ -93,19 +100,35 @@ def _stand_out(
     return [(float(contrast[i]), float(centre[i]), scale) for i in index]
 
 
-def find_excess(residual: Spectrum) -> Target | None:
+def find_excess(residual: Spectrum, narrowest: float = 0.0) -> Target | None:
     """Find what a fit leaves over: the place and scale where its residual is most above one.
 
     Parameters
     ----------
     residual : Spectrum
         Periodogram over its expectation, exponential about one where the fit is right.
+    narrowest : float
+        Damping ratio from which on an excess counts; narrower ones are laid flat.
 
     Returns
     -------
     Target or None
         None where nothing stands out.
     """
+    ordinates = residual.periodogram.copy()
+    for _ in range(_MOST_NARROW):
+        frequency, scale = _most_above_one(replace(residual, periodogram=ordinates.copy()))
+        if scale == 0.0:
+            return None
+        if scale >= 1.5 * narrowest:
+            return Target("excess", frequency, scale / 1.5, min(max(3 * scale, 0.02), 0.15))
+        reach = frequency * np.array([1 - 4 * scale, 1 + 4 * scale])
+        ordinates[slice(*np.searchsorted(residual.frequency, reach).tolist())] = 1.0
+    return None
+
+
+def _most_above_one(residual: Spectrum) -> tuple[float, float]:
+    """Frequency and scale of the clearest excess; zeros where there is none."""
     total = np.concatenate([[0.0], np.cumsum(residual.periodogram - 1.0)])
     best = (_EXCESS, 0.0, 0.0)
     for scale in _SCALES:
@@ -113,13 +136,13 @@ def find_excess(residual: Spectrum) -> Target | None:
         last = np.searchsorted(residual.frequency, residual.frequency * (1 + scale))
         n = last - first
         # A window cut by the edge of the band is judged by what is left of it.
-        score = np.where(n >= _LEAST_OF_EXCESS, (total[last] - total[first]) / np.sqrt(n), 0.0)
+        weight = residual.count * n
+        enough = (n >= _LEAST_ORDINATES) & (weight >= _LEAST_OF_EXCESS)
+        score = np.where(enough, (total[last] - total[first]) / np.sqrt(n), 0.0)
+        score *= np.sqrt(residual.count)
         k = int(np.argmax(score))
         best = max(best, (float(score[k]), float(residual.frequency[k]), scale))
-    _, frequency, scale = best
-    if scale == 0.0:
-        return None
-    return Target("excess", frequency, scale / 1.5, min(max(3 * scale, 0.02), 0.15))
+    return best[1], best[2]
 
 
 def _towering(spectrum: Spectrum) -> tuple[BoolArray, FloatArray]:
@@ -132,11 +155,22 @@ def _towering(spectrum: Spectrum) -> tuple[BoolArray, FloatArray]:
     n = spectrum.periodogram.size
     beside = [padded[widest + k : widest + k + n] for b in _BESIDE for k in (-b, b)]
     level = np.median(beside, axis=0)
-    towering = spectrum.periodogram > _TOWERING * level
+    tower = _TOWERING * median_ordinate(1) / median_ordinate(spectrum.count)
+    towering = spectrum.periodogram > tower * level
     # The foot of a line that falls between two ordinates is two more wide.
     return np.convolve(towering, np.ones(5), mode="same") > 0, np.asarray(level)
 
 
-def _without_lines(spectrum: Spectrum) -> Spectrum:
+def _without_lines(spectrum: Spectrum, lines: Sequence[float]) -> Spectrum:
+    """Lay the ordinates of lines at the level beside them."""
     mask, level = _towering(spectrum)
-    return replace(spectrum, periodogram=np.where(mask, level, spectrum.periodogram))
+    ordinates = np.where(mask, level, spectrum.periodogram)
+    clear = spectrum.clear_of(lines)
+    for line in lines:
+        reach = spectrum.near(line)
+        width = reach.stop - reach.start
+        around = slice(max(0, reach.start - width), reach.stop + width)
+        beside = ordinates[around][clear[around]]
+        if beside.size:
+            ordinates[reach] = np.median(beside) / median_ordinate(spectrum.count)
+    return replace(spectrum, periodogram=ordinates)

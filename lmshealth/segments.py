@@ -7,6 +7,7 @@ from itertools import pairwise
 from typing import Literal, get_args
 
 import numpy as np
+from scipy import fft
 
 from lmshealth.arrays import BoolArray, FloatArray
 from lmshealth.errors import BadLog
@@ -112,7 +113,10 @@ def _parts(segment: Segment, longest: int) -> list[Segment]:
     """Cut a segment into the fewest parts of one length; a few last samples may be left out."""
     size = segment.stop - segment.start
     n_parts = -(-size // longest)
-    each = size // n_parts
+    if n_parts == 1:
+        return [segment]
+    # Lengths with large prime factors would cost the transform three times the memory.
+    each = fft.prev_fast_len(size // n_parts, real=True)
     starts = [segment.start + k * each for k in range(n_parts)]
     return [replace(segment, start=start, stop=start + each) for start in starts]
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from lmshealth.arrays import FloatArray
-from lmshealth.spectra import Spectrum
+from lmshealth.spectra import Spectrum, median_ordinate
 
 _COMMON_STEPS = 41
 _OWN_STEPS = 15
@@ -62,7 +62,8 @@ class Coarse:
     Attributes
     ----------
     frequency, level, count : ndarray
-        Mean frequency in Hz, density from the median, and number of ordinates, ``(n_bins,)``.
+        Mean frequency in Hz, density from the median, and number of ordinates of single segments,
+        ``(n_bins,)``.
     neighbours : tuple of Target
         Modes beside the band whose flanks reach into it.
     """
@@ -91,12 +92,12 @@ class Coarse:
 
 
 def coarsen(spectra: tuple[Spectrum, ...], low: float, high: float, width: float) -> Coarse:
-    """Bin the ordinates of all segments of a channel.
+    """Bin the ordinates of all spectra of a channel.
 
     Parameters
     ----------
     spectra : tuple of Spectrum
-        One per segment.
+        Of segments, or means over several.
     low, high : float
         Band in Hz.
     width : float
@@ -104,14 +105,15 @@ def coarsen(spectra: tuple[Spectrum, ...], low: float, high: float, width: float
     """
     cut = [spectrum.band(low, high) for spectrum in spectra]
     frequency = np.concatenate([s.frequency for s in cut])
-    ordinates = np.concatenate([s.periodogram for s in cut])
+    ordinates = np.concatenate([s.periodogram / median_ordinate(s.count) for s in cut])
+    count = np.concatenate([np.full(s.frequency.size, float(s.count)) for s in cut])
     order = np.argsort(frequency, kind="stable")
     n_bins = max(3, min(int((high - low) / width), frequency.size // 4))
     parts = np.array_split(order, n_bins)
     return Coarse(
         frequency=np.array([frequency[part].mean() for part in parts]),
-        level=np.array([max(np.median(ordinates[part]), 1e-300) for part in parts]) / np.log(2),
-        count=np.array([part.size for part in parts], dtype=float),
+        level=np.array([max(np.median(ordinates[part]), 1e-300) for part in parts]),
+        count=np.array([count[part].sum() for part in parts]),
     )
 
 

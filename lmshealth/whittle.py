@@ -14,21 +14,28 @@ zero coupling is an inner point, not a boundary.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.optimize import minimize
 
-from lmshealth.arrays import FloatArray
-from lmshealth.spectra import Spectrum, periodogram_kernel
+from lmshealth.arrays import BoolArray, FloatArray
+from lmshealth.spectra import Kernel, Spectrum, make_kernel
 
 # Below this many half-power bandwidths times duration the expected periodogram replaces the
-# density: the record no longer resolves the resonance.
+# density: the record no longer resolves the resonance. A mean over parts is surer than a part, and
+# its bias shows the more: it needs as many times more.
 _RESOLVED = 20.0
 # The density is sampled this finely per half-power bandwidth; the kernel itself asks for two
 # samples per Fourier bin, and its tails end this many bins outside the band.
 _SAMPLES_PER_BANDWIDTH = 12
 _MARGIN_BINS = 20
+# Where a half-power bandwidth holds so many times more ordinates than that, their means over
+# neighbours tell where the maximum is; all of them tell the maximum.
+_MEANS_PER_BANDWIDTH, _MANY = 64, 16
+
+Complex = np.ndarray[tuple[int, ...], np.dtype[np.complex128]]
 
 # Standard deviations of the weak normal priors about the start, which only keep directions
 # that the data do not see from running away: of ln f and ln ζ, amplitudes, e_0 and e_1.
@@ -39,7 +46,7 @@ _PRIOR_NOISE = (5.0, 2.0)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Block:
-    """Ordinates of one segment within the band.
+    """Ordinates of one spectrum within the band.
 
     Attributes
     ----------
@@ -47,36 +54,61 @@ class Block:
         Where the density is evaluated, in Hz, shape ``(n_grid,)``.
     periodogram : ndarray
         Shape ``(n,)``.
-    kernel : ndarray or None
-        Density to expected periodogram, shape ``(n, n_grid)``; None where they are the same.
+    kernel : Kernel or None
+        Density to expected periodogram; None where they are the same.
+    count : ndarray
+        Of how many exponential variables each ordinate is the mean, shape ``(n,)``.
+    alike : int
+        Over so many neighbours the density hardly changes.
     """
 
     frequency: FloatArray
     periodogram: FloatArray
-    kernel: FloatArray | None
+    kernel: Kernel | None
+    count: FloatArray
+    alike: int = 1
+
+    def thinned(self) -> Block:
+        """Replace neighbours that are alike by their means."""
+        if self.kernel is not None or self.alike < _MANY:
+            return self
+        first = np.arange(0, self.count.size, self.alike)
+        count = np.add.reduceat(self.count, first)
+        frequency, ordinates = (
+            np.add.reduceat(self.count * values, first) / count
+            for values in (self.frequency, self.periodogram)
+        )
+        return Block(frequency, ordinates, None, count)
 
 
-def make_block(spectrum: Spectrum, keep: np.ndarray, bandwidth: float) -> Block:
-    """Prepare the ordinates of a segment for the likelihood.
+def make_block(spectra: Sequence[Spectrum], keep: Sequence[BoolArray], bandwidth: float) -> Block:
+    """Prepare the ordinates of spectra of the same frequencies for the likelihood.
+
+    It needs of each frequency the mean over the spectra that are kept there, and their number.
 
     Parameters
     ----------
-    spectrum : Spectrum
+    spectra : sequence of Spectrum
         Cut to the band.
-    keep : ndarray of bool
-        Ordinates that hold no line, shape ``(n_ordinates,)``.
+    keep : sequence of ndarray of bool
+        Ordinates of each that hold no line, shape ``(n_ordinates,)``.
     bandwidth : float
         Smallest half-power bandwidth 2ζf expected, in Hz: decides whether the record resolves it.
     """
-    frequency, ordinates = spectrum.frequency[keep], spectrum.periodogram[keep]
-    if bandwidth * spectrum.duration >= _RESOLVED:
-        return Block(frequency, ordinates, None)
-    finer = int(np.clip(np.ceil(_SAMPLES_PER_BANDWIDTH / (bandwidth * spectrum.duration)), 2, 12))
-    step = 1 / (finer * spectrum.duration)
-    margin = _MARGIN_BINS / spectrum.duration
-    low = max(spectrum.frequency[0] - margin, step)
-    fine = np.arange(low, spectrum.frequency[-1] + margin, step)
-    return Block(fine, ordinates, periodogram_kernel(frequency, spectrum.duration, fine))
+    first = spectra[0]
+    count, total = np.zeros(first.frequency.size), np.zeros(first.frequency.size)
+    for spectrum, mask in zip(spectra, keep, strict=True):
+        count += spectrum.count * mask
+        total += spectrum.count * mask * spectrum.periodogram
+    kept: BoolArray = count > 0
+    ordinates, count = total[kept] / count[kept], count[kept]
+    resolution = bandwidth * first.duration
+    if resolution >= _RESOLVED * max(s.count for s in spectra):
+        alike = int(resolution / _MEANS_PER_BANDWIDTH)
+        return Block(first.frequency[kept], ordinates, None, count, alike)
+    finer = int(np.clip(np.ceil(_SAMPLES_PER_BANDWIDTH / resolution), 2, 12))
+    kernel = make_kernel(first, kept, finer, _MARGIN_BINS)
+    return Block(kernel.grid, ordinates, kernel, count)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -86,7 +118,7 @@ class Likelihood:
     Attributes
     ----------
     blocks : tuple of Block
-        One per segment.
+        One per length of segments.
     start : ndarray
         Start value and centre of the priors, shape ``(n_unknowns,)``.
     belief : ndarray
@@ -152,6 +184,9 @@ class Likelihood:
         ndarray
             Where the search ended; the caller judges it by its Newton decrement.
         """
+        thinned = tuple(block.thinned() for block in self.blocks)
+        if sum(b.count.size for b in thinned) < sum(b.count.size for b in self.blocks):
+            start = replace(self, blocks=thinned).minimise(start)
         last: list[FloatArray] = []
 
         def gradient(p: FloatArray) -> FloatArray:
@@ -177,23 +212,28 @@ class Likelihood:
         gradient = (p - self.start) / self.prior_std**2
         hessian = np.diag(1 / self.prior_std**2)
         for block in self.blocks:
-            density, first, second = self._expansion(p, block.frequency)
+            noise, u = self._noise(p, block.frequency)
+            forces = self._forces(p, block.frequency)
+            density, first = noise, np.zeros((p.size, noise.size))
+            first[-2], first[-1] = noise, noise * u
+            for force in forces:
+                density = density + force.q.real**2 + force.q.imag**2
+                first[force.index] += 2 * (force.q.conj() * force.first).real
             expected = _expect(block, density)
             ratio = block.periodogram / expected
-            slope = (1 - ratio) / expected
+            slope = block.count * (1 - ratio) / expected
             if block.kernel is not None:
-                first_expected = first @ block.kernel.T
-                slope_grid = slope @ block.kernel
+                first_expected = block.kernel.expect(first)
+                slope_grid = block.kernel.spread(slope)
             else:
                 first_expected, slope_grid = first, slope
             gradient = gradient + first @ slope_grid
-            curvature = (2 * ratio - 1) / expected**2
+            curvature = block.count * (2 * ratio - 1) / expected**2
             hessian = hessian + (first_expected * curvature) @ first_expected.T
-            for (a, b), values in second.items():
-                term = float(values @ slope_grid)
-                hessian[a, b] += term
-                if a != b:
-                    hessian[b, a] += term
+            powers = np.array([np.ones_like(u), u])
+            hessian[-2:, -2:] += (powers * (noise * slope_grid)) @ powers.T
+            for force in forces:
+                hessian[np.ix_(force.index, force.index)] += force.curvature(slope_grid)
         return gradient, hessian
 
     def _noise(self, p: FloatArray, frequency: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -204,10 +244,7 @@ class Likelihood:
         m = self.n_modes
         noise, _ = self._noise(p, frequency)
         total = noise
-        h = [
-            self.scale[i] * _receptance(np.exp(p[i]), np.exp(p[m + i]), frequency)[0]
-            for i in range(m)
-        ]
+        h = [self.scale[i] * _response(np.exp(p[i]), np.exp(p[m + i]), frequency) for i in range(m)]
         for k in range(m):
             q = p[2 * m + k] * h[k]
             if k + 1 < m:
@@ -215,51 +252,76 @@ class Likelihood:
             total = total + q.real**2 + q.imag**2
         return total
 
-    def _expansion(
-        self, p: FloatArray, frequency: FloatArray
-    ) -> tuple[FloatArray, FloatArray, dict[tuple[int, int], FloatArray]]:
-        """Density with its first and its non-zero second derivatives on the grid.
-
-        From S = Σ |q_k|²: S_a = 2 Re Σ q_k* q_ka and S_ab = 2 Re Σ (q_ka* q_kb + q_k* q_kab);
-        q_k depends on the two modes it drives and is linear in its amplitudes.
-        """
-        m, n = self.n_modes, p.size
-        density, u = self._noise(p, frequency)
-        first = np.zeros((n, frequency.size))
-        first[n - 2], first[n - 1] = density, density * u
-        second = {
-            (n - 2, n - 2): density,
-            (n - 2, n - 1): density * u,
-            (n - 1, n - 1): density * u * u,
-        }
+    def _forces(self, p: FloatArray, frequency: FloatArray) -> list[_Force]:
+        """Responses to the forces, each with the unknowns of the two modes that it drives."""
+        m = self.n_modes
         shapes = [
             self.scale[i] * _receptance(np.exp(p[i]), np.exp(p[m + i]), frequency) for i in range(m)
         ]
+        forces = []
         for k in range(m):
-            q, q_first, q_second = _force_response(p, shapes, k)
-            density = density + q.real**2 + q.imag**2
-            for a, value in q_first.items():
-                first[a] += 2 * (q.conj() * value).real
-            order = sorted(q_first)
-            for i, a in enumerate(order):
-                for b in order[i:]:
-                    term = q_first[a].conj() * q_first[b]
-                    if (a, b) in q_second:
-                        term = term + q.conj() * q_second[a, b]
-                    second[a, b] = second.get((a, b), 0.0) + 2 * term.real
-        return density, first, second
+            driven = [(k, 2 * m + k)] + ([(k + 1, 3 * m + k)] if k + 1 < m else [])
+            index = [unknown for mode, a in driven for unknown in (mode, m + mode, a)]
+            forces.append(_Force(np.array(index), [(p[a], shapes[mode]) for mode, a in driven]))
+        return forces
+
+
+class _Force:
+    """Response q to one force, with its derivatives; q is linear in its amplitudes.
+
+    From S = |q|²: S_a = 2 Re q* q_a and S_ab = 2 Re (q_a* q_b + q* q_ab).
+
+    Parameters
+    ----------
+    index : ndarray of int
+        Of ln f, ln ζ and the amplitude of each mode it drives, shape ``(3 n_driven,)``.
+    driven : list of (float, ndarray)
+        Amplitude and `_receptance` of each.
+    """
+
+    def __init__(
+        self, index: np.ndarray[tuple[int], np.dtype[np.intp]], driven: list[tuple[float, Complex]]
+    ) -> None:
+        self.index = index
+        self._driven = driven
+        self.q = np.asarray(sum(a * shape[0] for a, shape in driven))
+        self.first = np.empty((index.size, self.q.size), dtype=np.complex128)
+        for k, (a, shape) in enumerate(driven):
+            np.multiply(a, shape[1:3], out=self.first[3 * k : 3 * k + 2])
+            self.first[3 * k + 2] = shape[0]
+
+    def curvature(self, weight: FloatArray) -> FloatArray:
+        """Sum of the second derivatives of S, each frequency with a weight, square."""
+        parts = self.first.view(np.float64)
+        total = (parts * np.repeat(weight, 2)) @ parts.T
+        turned = weight * self.q.conj()
+        for k, (a, shape) in enumerate(self._driven):
+            x, z, amplitude = 3 * k, 3 * k + 1, 3 * k + 2
+            h_x, h_z, h_xx, h_xz, h_zz = (shape[1:] @ turned).real
+            total[x, x] += a * h_xx
+            total[z, z] += a * h_zz
+            for i, j, value in ((x, z, a * h_xz), (x, amplitude, h_x), (z, amplitude, h_z)):
+                total[i, j] += value
+                total[j, i] += value
+        return np.asarray(2 * total)
 
 
 def _misfit(block: Block, density: FloatArray) -> float:
     expected = _expect(block, density)
-    return float(np.sum(np.log(expected) + block.periodogram / expected))
+    return float(np.sum(block.count * (np.log(expected) + block.periodogram / expected)))
 
 
 def _expect(block: Block, density: FloatArray) -> FloatArray:
-    return density if block.kernel is None else np.asarray(block.kernel @ density)
+    return density if block.kernel is None else block.kernel.expect(density)
 
 
-def _receptance(f: float, zeta: float, frequency: FloatArray) -> np.ndarray:
+def _response(f: float, zeta: float, frequency: FloatArray) -> Complex:
+    """Acceleration response h of a mode, shape ``(n,)``."""
+    beta = f / frequency
+    return np.asarray(1 / (1 - beta**2 + 2j * zeta * beta))
+
+
+def _receptance(f: float, zeta: float, frequency: FloatArray) -> Complex:
     """Acceleration response h of a mode and its derivatives by x = ln f and z = ln ζ.
 
     Returns an array of shape ``(6, n)``: h, h_x, h_z, h_xx, h_xz, h_zz. With d = 1/h,
@@ -267,40 +329,15 @@ def _receptance(f: float, zeta: float, frequency: FloatArray) -> np.ndarray:
     """
     beta = f / frequency
     damping = 2j * zeta * beta
-    h = 1 / (1 - beta**2 + damping)
-    d_x, d_xx = damping - 2 * beta**2, damping - 4 * beta**2
+    d_x = damping - 2 * beta**2
+    result = np.empty((6, frequency.size), dtype=np.complex128)
+    result[0] = 1 / (1 - beta**2 + damping)
+    h = result[0]
     square = h * h
-    return np.stack(
-        [
-            h,
-            -d_x * square,
-            -damping * square,
-            (2 * d_x * d_x * h - d_xx) * square,
-            (2 * d_x * damping * h - damping) * square,
-            (2 * damping * damping * h - damping) * square,
-        ]
-    )
-
-
-def _force_response(
-    p: FloatArray, shapes: list[np.ndarray], k: int
-) -> tuple[np.ndarray, dict[int, np.ndarray], dict[tuple[int, int], np.ndarray]]:
-    """Response q_k to the k-th force with its derivatives by the unknowns it depends on."""
-    m = len(shapes)
-    driven = [(k, 2 * m + k)] + ([(k + 1, 3 * m + k)] if k + 1 < m else [])
-    q = sum(p[amplitude] * shapes[mode][0] for mode, amplitude in driven)
-    first: dict[int, np.ndarray] = {}
-    second: dict[tuple[int, int], np.ndarray] = {}
-    for mode, amplitude in driven:
-        h, h_x, h_z, h_xx, h_xz, h_zz = shapes[mode]
-        a = p[amplitude]
-        x, z = mode, m + mode
-        first |= {x: a * h_x, z: a * h_z, amplitude: h}
-        second |= {
-            (x, x): a * h_xx,
-            (x, z): a * h_xz,
-            (z, z): a * h_zz,
-            (x, amplitude): h_x,
-            (z, amplitude): h_z,
-        }
-    return np.asarray(q), first, second
+    twice = 2 * h
+    result[1] = -d_x * square
+    result[2] = -damping * square
+    result[3] = (twice * d_x * d_x - (damping - 4 * beta**2)) * square
+    result[4] = (twice * d_x - 1) * damping * square
+    result[5] = (twice * damping - 1) * damping * square
+    return result

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from lmshealth.bandfit import BandFit, View, _mask_towers, fit_band
+from lmshealth.bandfit import BandFit, _mask_towers, fit_band
 from lmshealth.segments import Segment
-from lmshealth.spectra import periodogram
+from lmshealth.spectra import Spectrum, View, periodogram
 from lmshealth.starts import Coarse, Target, coarsen
 from tests.signals import Mode, accelerations, make_log, sine, white
 
@@ -94,6 +95,117 @@ def test_a_line_is_kept_out_and_listed_with_its_amplitude() -> None:
     assert amplitude == pytest.approx(30.0, rel=0.1)
     off = (found.estimate - clean.estimate) / np.sqrt(np.diag(clean.cov))
     assert np.abs(off).max() < 1
+
+
+def test_a_line_known_beforehand_is_masked() -> None:
+    """Where a line is said to stand nothing is read, and it is not found once more."""
+    view, coarse = view_of(both())
+    found, _ = fit_band(replace(view, lines=(110.0,)), coarse, (ROLL, PITCH))
+    clean, _ = fit_band(view, coarse, (ROLL, PITCH))
+    assert found is not None
+    assert clean is not None
+    reach = found.residual.near(110.0)
+    assert reach.stop - reach.start > 10
+    assert (found.residual.periodogram[reach] == 1).all()
+    assert (clean.residual.periodogram[reach] != 1).all()
+    assert found.lines.shape == (0, 2)
+    assert np.abs((found.estimate - clean.estimate) / np.sqrt(np.diag(clean.cov))).max() < 0.5
+
+
+def test_a_band_that_known_lines_cover_is_too_short() -> None:
+    """Where lines leave nothing to fit, the mode is refused with what is left."""
+    view, coarse = view_of(both())
+    everywhere = tuple(np.arange(80.0, 160.0, 0.1).tolist())
+    found, missing = fit_band(replace(view, lines=everywhere), coarse, (ROLL,))
+    assert found is None
+    assert missing["roll"][0] == "too-short"
+
+
+def mean_of(values: np.ndarray, count: int) -> Spectrum:
+    """Average the periodograms of equal parts."""
+    (channel,) = make_log({"acc_a": values}, RATE).channels
+    n = values.size // count
+    parts = [
+        periodogram(channel, Segment(k * n, (k + 1) * n, float("nan")), RATE) for k in range(count)
+    ]
+    mean = np.mean([part.periodogram for part in parts], axis=0)
+    return replace(parts[0], periodogram=mean, count=count)
+
+
+def fit_mean(spectrum: Spectrum) -> BandFit:
+    """Fit both modes to one spectrum."""
+    found, missing = fit_band(
+        View("acc_a", "acc", (spectrum,)), coarsen((spectrum,), 75.0, 165.0, 0.8), (ROLL, PITCH)
+    )
+    assert found is not None
+    assert missing == {}
+    return found
+
+
+def test_the_mean_of_parts_is_as_sure_as_the_whole_record() -> None:
+    """Ten parts of 20 s averaged have their truth within 4σ, and the σ of 200 s within a tenth."""
+    values = both(seed=7, n=200_000)
+    whole, mean = fit_mean(mean_of(values, 1)), fit_mean(mean_of(values, 10))
+    std = np.sqrt(np.diag(mean.cov))
+    truth = np.log([105.0, 125.0, 0.015, 0.02])
+    assert np.abs((mean.estimate - truth) / std).max() < 4
+    np.testing.assert_allclose(std, np.sqrt(np.diag(whole.cov)), rtol=0.1)
+    # Negative control: taken for a single periodogram it would be three times less sure.
+    once = fit_mean(replace(mean_of(values, 10), count=1))
+    assert (np.sqrt(np.diag(once.cov)) > 2 * std).all()
+
+
+def test_the_mean_of_parts_shows_lines_that_none_of_them_shows() -> None:
+    """A line six times above the noise of a part is masked in the mean of ten, noise never is."""
+    clean = both(seed=8, n=200_000)
+    level, _ = mean_of(clean, 10).density(113.0, 115.0)
+    dirty = clean + sine(200_000, RATE, 114.0, float(np.sqrt(2 * 6 * level / 20.0)))
+    assert fit_mean(mean_of(clean, 10)).lines.shape == (0, 2)
+    (row,) = fit_mean(mean_of(dirty, 10)).lines
+    assert row[0] == pytest.approx(114.0, abs=0.1)
+    # Negative control: by the threshold of a single periodogram it would not be seen.
+    assert fit_mean(replace(mean_of(dirty, 10), count=1)).lines.shape == (0, 2)
+
+
+def test_what_a_fit_of_a_sure_mean_lacks_is_no_line() -> None:
+    """A mode that nobody looks for is left over for the search, and not masked as lines."""
+    modes = [Mode(105.0, 0.015), Mode(112.0, 0.01, 0.05)]
+    values = accelerations(np.random.default_rng(10), modes, 1_200_000, RATE, 0.5)[0]
+    mean = mean_of(values, 60)
+    found, _ = fit_band(View("acc_a", "acc", (mean,)), coarsen((mean,), 90.0, 120.0, 0.8), (ROLL,))
+    assert found is not None
+    assert found.residual.band(111.0, 113.0).periodogram.max() > 2
+    assert found.lines.shape == (0, 2)
+
+
+def test_a_stretch_too_short_for_the_band_does_no_harm() -> None:
+    """A segment of six samples beside a record leaves the fit as it is."""
+    view, coarse = view_of(both())
+    (channel,) = make_log({"acc_a": both(n=6)}, RATE).channels
+    tiny = periodogram(channel, Segment(0, 6, float("nan")), RATE)
+    alone, _ = fit_band(view, coarse, (ROLL, PITCH))
+    beside, _ = fit_band(replace(view, spectra=(*view.spectra, tiny)), coarse, (ROLL, PITCH))
+    assert alone is not None
+    assert beside is not None
+    np.testing.assert_allclose(beside.estimate, alone.estimate, atol=1e-9)
+
+
+@pytest.mark.parametrize(("nominal", "reason"), [(None, "line-not-mode"), (105.0, None)])
+def test_a_peak_as_narrow_as_mains_is_no_mode_unless_sought(
+    nominal: float | None, reason: str | None
+) -> None:
+    """Of ζ = 0.03 % a resonance cannot be told from a line that wanders, though it is resolved."""
+    mode, n = Mode(105.0, 0.0003), 400_000
+    values = accelerations(np.random.default_rng(9), [mode], n, RATE, 0.5)[0]
+    (channel,) = make_log({"acc_a": values}, RATE).channels
+    spectra = (periodogram(channel, Segment(0, n, float("nan")), RATE),)
+    target = Target("roll", 105.0, 0.0005, 0.02, nominal=nominal)
+    found, missing = fit_band(
+        View("acc_a", "acc", spectra), coarsen(spectra, 103.0, 107.0, 0.02), (target,)
+    )
+    assert found is not None
+    assert [t.name for t in found.targets] == ([] if reason else ["roll"])
+    assert reason is None or missing["roll"][0] == reason
 
 
 @pytest.mark.parametrize(("apart", "masked"), [(6, 0.0), (12, 5 / 12)])

@@ -15,7 +15,7 @@ FLOORS = [
     {"results"},
     {"readers", "segments", "harmonics", "priors", "modalmap"},
     {"laws", "spectra", "following", "periods", "rational", "noise"},
-    {"stage", "whittle", "starts", "responses", "responsefit"},
+    {"stage", "whittle", "starts", "linetest", "responses", "responsefit"},
     {"peaks", "bandfit", "lines", "magnitudes"},
     {"modal", "frf", "history", "sampling"},
     {"tracking", "maintenance"},

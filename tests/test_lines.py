@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +13,7 @@ from lmshealth.lines import find_lines, name_lines, survey_lines
 from lmshealth.logs import Channel, Log
 from lmshealth.readers import read_log
 from lmshealth.results import Line
-from lmshealth.segments import Segment
+from lmshealth.segments import Segment, find_segments
 from tests.signals import (
     Mode,
     accelerations,
@@ -148,6 +148,53 @@ def test_lines_that_follow_the_velocity_are_orders() -> None:
         assert [line.kind for line in found] == [kind] * 3 + ["unknown"]
         np.testing.assert_allclose([f.frequency for f in found], [75, 90, 107.5, 333], atol=0.05)
         np.testing.assert_allclose([f.amplitude for f in found], [1, 1, 1, 0.5], rtol=0.1)
+
+
+def stroking(rng: np.random.Generator, velocities: Sequence[float], amplitude: float) -> Log:
+    """Make strokes of half a second to and fro, at rest between, with an order of 4 mm."""
+    values, speeds = [white(rng, 1e-2, 300, RATE)], [np.zeros(300)]
+    for k, velocity in enumerate(velocities):
+        phase = rng.uniform(0, 2 * np.pi)
+        line = sine(500, RATE, velocity / 0.004, amplitude, phase)
+        values += [line + white(rng, 1e-2, 500, RATE), white(rng, 1e-2, 300, RATE)]
+        speeds += [np.full(500, velocity * (-1) ** k), np.zeros(300)]
+    return make_log({"acc_a": np.concatenate(values)}, RATE, velocity=np.concatenate(speeds))
+
+
+def test_short_strokes_show_their_order_together() -> None:
+    """Of twelve strokes to and fro none shows the order; together they do within 0.2 ordinates."""
+    log = stroking(np.random.default_rng(10), [0.41] * 12, 0.6)
+    (line,) = survey_lines(log, log.channels, make_stage([("r", 105.0, 0.02)], order_mm=4.0), BAND)
+    assert line.kind == "ball pass"
+    assert line.frequency == pytest.approx(102.5, abs=0.4)
+    assert line.amplitude == pytest.approx(0.6, rel=0.25)
+    channel, segments = log.channels[0], find_segments(log, 0.2)
+    assert len(segments) == 12
+    alone = [find_lines(channel, segment, RATE, BAND, 0.01 / 12) for segment in segments]
+    assert not any(found.size for found in alone)
+
+
+def test_strokes_of_different_velocities_stay_apart() -> None:
+    """Twelve strokes at twelve velocities have no line in common, two times twelve have two."""
+    rng = np.random.default_rng(11)
+    log = stroking(rng, np.linspace(0.2, 0.6, 12).tolist(), 0.6)
+    assert survey_lines(log, log.channels, None, BAND) == ()
+    log = stroking(rng, [0.41, 0.41, 0.55, 0.55] * 6, 0.6)
+    found = survey_lines(log, log.channels, None, BAND)
+    assert [line.kind for line in found] == ["order of 4 mm"] * 2
+    np.testing.assert_allclose([line.frequency for line in found], [102.5, 137.5], atol=0.4)
+
+
+def test_pieces_of_a_log_without_set_point_are_searched_together() -> None:
+    """Ten pieces between gaps show a line that none of them shows."""
+    rng = np.random.default_rng(12)
+    values = white(rng, 1e-2, 6000, RATE) + sine(6000, RATE, 141.0, 0.6)
+    pieces = [(k, k + 500) for k in range(0, 6000, 600)]
+    log = make_log({"acc_a": values}, RATE, pieces=pieces)
+    (line,) = survey_lines(log, log.channels, None, BAND)
+    assert line.frequency == pytest.approx(141.0, abs=0.4)
+    whole = make_log({"acc_a": values}, RATE, pieces=pieces[:1])
+    assert survey_lines(whole, whole.channels, None, BAND) == ()
 
 
 def test_a_line_that_stands_still_is_no_order() -> None:

@@ -3,18 +3,26 @@
 from __future__ import annotations
 
 import os
+import tempfile
+import tracemalloc
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 
+from lmshealth import modal, segments, spectra
+from lmshealth.bandfit import fit_band
 from lmshealth.errors import BadLog, BadStage
-from lmshealth.logs import Log
+from lmshealth.logs import Channel, Log
 from lmshealth.modal import identify
 from lmshealth.readers import load_columns, read_log
 from lmshealth.results import Modes
+from lmshealth.samples import MINUTE, Stored
+from lmshealth.starts import Coarse, Target
 from tests.signals import (
     Mode,
     acceleration_log,
@@ -202,6 +210,77 @@ def test_a_channel_that_does_not_see_a_mode_does_no_harm() -> None:
     assert np.abs(deviations(found, "roll", 105.0, 0.015)).max() < 4
 
 
+# Long records
+
+
+def cut_after(monkeypatch: pytest.MonkeyPatch, seconds: float) -> None:
+    """Cut records of RATE into parts of at most so many seconds."""
+    monkeypatch.setattr(segments, "MINUTE", round(seconds * RATE))
+    monkeypatch.setattr(spectra, "_LEAST_PART", round(seconds * RATE) // 2)
+
+
+@pytest.mark.parametrize("kind", ["acc", "delta_e"])
+def test_a_record_in_parts_says_what_it_says_as_a_whole(
+    monkeypatch: pytest.MonkeyPatch, kind: str
+) -> None:
+    """Cut into ten, a record gives its modes within half a σ, and as sure within a tenth."""
+    quiet = 1.0 / (2 * np.pi * 105.0) ** 4
+    make, noise = (accelerations, 0.5) if kind == "acc" else (displacements, quiet)
+    modes = [Mode(105.0, 0.015), Mode(120.0, 0.02)]
+    log = make_log({kind: make(rng(30), modes, 200_000, RATE, noise)[0]}, RATE)
+    stage = make_stage([("roll", 105.0, 0.015), ("pitch", 120.0, 0.02)])
+    whole = identify(log, stage)
+    cut_after(monkeypatch, 20.0)
+    found = identify(log, stage)
+    assert found.names == ("roll", "pitch")
+    std = np.sqrt(np.diag(whole.cov))
+    np.testing.assert_allclose(np.sqrt(np.diag(found.cov)), std, rtol=0.1)
+    off = np.concatenate(
+        [found.ln_frequency - whole.ln_frequency, found.ln_damping - whole.ln_damping]
+    )
+    assert np.abs(off / std).max() < 0.5
+    assert np.abs(deviations(found, "roll", 105.0, 0.015)).max() < 4
+
+
+def test_modes_of_a_record_in_parts_are_found_without_a_description(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Three modes and no other are found in the mean over ten parts."""
+    cut_after(monkeypatch, 20.0)
+    modes = [Mode(60.0, 0.01), Mode(120.0, 0.02), Mode(210.0, 0.008)]
+    found = identify(acceleration_log(rng(31), modes, 200, RATE, 0.2), band=(30.0, 400.0))
+    assert found.names == ("mode_1", "mode_2", "mode_3")
+    for name, mode in zip(found.names, modes, strict=True):
+        assert np.abs(deviations(found, name, mode.frequency, mode.damping)).max() < 4
+
+
+def test_a_long_record_does_not_fill_the_memory() -> None:
+    """Ten minutes at 20 kHz on disk are identified in less than four times one minute of them."""
+    rate, n, f, zeta = 20_000.0, 10 * MINUTE, 120.0, 0.02
+    # A resonator in two poles: near them it moves as the mode does.
+    pole = np.exp(2j * np.pi * f / rate * (np.sqrt(1 - zeta**2) + 1j * zeta))
+    generator, channels = rng(32), []
+    for name in ("acc_a", "acc_b"):
+        file = tempfile.TemporaryFile()  # noqa: SIM115
+        state = np.zeros(2)
+        for _ in range(n // MINUTE):
+            force = generator.normal(size=MINUTE)
+            moved, state = lfilter([1e-3], [1, -2 * pole.real, abs(pole) ** 2], force, zi=state)
+            (moved + generator.normal(size=MINUTE)).tofile(file)
+        file.flush()
+        channels.append(Channel(name, "acceleration", Stored(file, n)))  # type: ignore[arg-type]
+    log = replace(make_log({"acc": np.zeros(n)}, rate), channels=tuple(channels))
+    tracemalloc.start()
+    try:
+        found = identify(log, make_stage([("roll", f, zeta)]))
+        _, peak = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert found.names == ("roll",)
+    assert found.frequency[0] == pytest.approx(f, rel=0.01)
+    assert peak < 4 * len(channels) * MINUTE * 8
+
+
 # Refusals
 
 
@@ -346,12 +425,92 @@ def test_modes_are_found_in_a_band_and_named_in_order() -> None:
         assert np.abs(deviations(found, name, mode.frequency, mode.damping)).max() < 4
 
 
+@pytest.fixture
+def fitted(monkeypatch: pytest.MonkeyPatch) -> list[tuple[spectra.View, tuple[Target, ...]]]:
+    """List the views and targets that are fitted."""
+    seen: list[tuple[spectra.View, tuple[Target, ...]]] = []
+
+    def spy(view: spectra.View, coarse: Coarse, targets: tuple[Target, ...]) -> Any:
+        seen.append((view, targets))
+        return fit_band(view, coarse, targets)
+
+    monkeypatch.setattr(modal, "fit_band", spy)
+    return seen
+
+
+def test_a_cluster_is_fitted_where_no_other_stands(
+    fitted: list[tuple[spectra.View, tuple[Target, ...]]],
+) -> None:
+    """What was found further down or up is not in the band of a cluster, and not found again."""
+    modes = [Mode(60.0, 0.04), Mode(120.0, 0.03), Mode(210.0, 0.03)]
+    found = identify(acceleration_log(rng(25), modes, 60, RATE, 0.1), band=(30.0, 400.0))
+    assert len(found.names) == 3
+    for view, _ in fitted:
+        low, high = view.spectra[0].frequency[[0, -1]]
+        assert sum(low < mode.frequency < high for mode in modes) == 1
+
+
+def test_spectra_reach_as_far_as_modes_are_looked_for(
+    fitted: list[tuple[spectra.View, tuple[Target, ...]]],
+) -> None:
+    """A mode of 105 Hz, sought within 15 %, with eight damping ratios beside it: to 135 Hz."""
+    identify(one_mode_log(), make_stage(ROLL))
+    reach = 1.15 * 105.0 * (1 + 8 * 0.015)
+    (ends,) = {float(view.spectra[0].frequency[-1]) for view, _ in fitted}
+    assert reach - 1 / 60 <= ends < reach
+
+
+def test_lines_that_are_found_are_neither_sought_nor_fitted(
+    fitted: list[tuple[spectra.View, tuple[Target, ...]]],
+) -> None:
+    """Mains of 100 Hz that wander by 0.1 Hz are no candidate, and masked in every fit."""
+    n = 60_000
+    phase = 2 * np.pi * np.cumsum(100 + 0.1 * np.sin(2 * np.pi * np.arange(n) / 25_000)) / RATE
+    values = accelerations(rng(26), [Mode(105.0, 0.015)], n, RATE, 0.5)[0] + 40.0 * np.sin(phase)
+    found = identify(make_log({"acc_a": values}, RATE), band=(60.0, 200.0))
+    assert found.names == ("mode_1",)
+    assert fitted
+    for view, targets in fitted:
+        assert any(abs(line - 100.0) < 0.15 for line in view.lines)
+        assert all(abs(target.frequency - 100.0) > 1 for target in targets)
+
+
 def test_a_very_light_damping_is_found_without_a_description() -> None:
     """A resonance of ζ = 0.2 % that towers over the noise in 60 s is not overlooked."""
     log = acceleration_log(rng(18), [Mode(120.0, 0.002)], 60, RATE, 1.0)
     found = identify(log, band=(40.0, 300.0))
     assert found.names == ("mode_1",)
     assert np.abs(deviations(found, "mode_1", 120.0, 0.002)).max() < 4
+
+
+def test_mains_that_wander_are_no_mode_and_leave_the_others_alone() -> None:
+    """Mains of 100 Hz that wander by 0.05 Hz are a line on the flank of a mode, and no mode."""
+    n, mode = 60_000, Mode(105.0, 0.015)
+    values = accelerations(rng(23), [mode], n, RATE, 0.5)[0]
+    phase = 2 * np.pi * np.cumsum(100 + 0.05 * np.sin(2 * np.pi * np.arange(n) / 25_000)) / RATE
+    clean, dirty = (
+        identify(make_log({"acc_a": signal}, RATE), band=(60.0, 200.0))
+        for signal in (values, values + 20.0 * np.sin(phase))
+    )
+    assert dirty.names == ("mode_1",)
+    assert np.abs(deviations(dirty, "mode_1", mode.frequency, mode.damping)).max() < 4
+    assert abs(dirty.ln_frequency[0] - clean.ln_frequency[0]) < np.sqrt(clean.cov[0, 0])
+    assert "mains" in {line.kind for line in dirty.lines}
+
+
+def test_stretches_of_an_instant_are_passed_over() -> None:
+    """The top of a triangular move, too short for the band to be seen in it, does no harm."""
+    rate, mode = 20_000.0, Mode(60.0, 0.02)
+    down, up = np.linspace(0.1, -0.1, 4000), np.linspace(-0.1, 0.1, 4000)
+    move = np.full(200_000, 0.1)
+    velocity = np.concatenate([move, down, np.full(60, -0.1), up, move])
+    quiet = 1.0 / (2 * np.pi * 60.0) ** 4
+    values = displacements(rng(24), [mode], velocity.size, rate, quiet)[0]
+    log = make_log({"delta_e": values}, rate, velocity=velocity)
+    assert min(s.stop - s.start for s in segments.find_segments(log, 0.0)) < 60
+    found = identify(log, band=(30.0, 80.0))
+    assert found.names == ("mode_1",)
+    assert np.abs(deviations(found, "mode_1", mode.frequency, mode.damping)).max() < 4
 
 
 def test_modes_outside_the_band_are_left_alone() -> None:
@@ -411,6 +570,18 @@ def test_a_building_in_the_wind_shows_its_three_modes(needs: Callable[[str], Non
     assert len(found.names) == 3
     np.testing.assert_allclose(found.frequency, [1.88, 2.42, 2.69], rtol=5e-3)
     assert ((found.damping_ratio > 0.008) & (found.damping_ratio < 0.025)).all()
+
+
+def test_a_vibrating_machine_shows_its_modes_and_not_its_mains(
+    needs: Callable[[str], None],
+) -> None:
+    """Without a description four broad resonances stand out; mains and the motor's lines do not."""
+    needs("data")
+    (path,) = (Path(os.environ["LMSHEALTH_DATA"]) / "uff58_samples").glob("MPSTD*.uff")
+    found = identify(read_log(path), band=(20.0, 200.0))
+    np.testing.assert_allclose(found.frequency, [40.5, 115.0, 123.0, 141.5], rtol=0.02)
+    assert ((found.damping_ratio > 0.01) & (found.damping_ratio < 0.05)).all()
+    assert {50, 100} <= {round(line.frequency) for line in found.lines if line.kind == "mains"}
 
 
 def test_a_model_frame_shows_its_first_mode(needs: Callable[[str], None], tmp_path: Path) -> None:

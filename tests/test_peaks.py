@@ -61,6 +61,85 @@ def test_a_line_is_no_peak() -> None:
     assert not near(find_peaks((transform(values),), 20.0, 300.0), 50.0)
 
 
+def test_a_wandering_line_that_is_known_is_no_peak() -> None:
+    """Mains wandering by a few ordinates look like a resonance until they are named as a line."""
+    n, rng = 60_000, np.random.default_rng(7)
+    frequency = 150.0 + 0.1 * np.sin(2 * np.pi * np.arange(n) / n * 2.4)
+    phase = 2 * np.pi * np.cumsum(frequency) / RATE
+    spectra = transform(white(rng, 1.0, n, RATE) + 3.0 * np.sin(phase))
+    assert near(find_peaks((spectra,), 20.0, 300.0), 150.0)
+    assert not near(find_peaks((spectra,), 20.0, 300.0, [150.0]), 150.0)
+
+
+def test_a_resonance_beside_a_known_line_is_kept() -> None:
+    """Only the ordinates that a line reaches are laid flat."""
+    values = accelerations(np.random.default_rng(8), [Mode(120.0, 0.01)], 60_000, RATE, 0.1)[0]
+    spectra = transform(values + sine(60_000, RATE, 119.0, 30.0))
+    assert near(find_peaks((spectra,), 40.0, 300.0, [119.0]), 120.0, 0.02)
+
+
+def means(rng: np.random.Generator, hump: np.ndarray, count: int) -> Spectrum:
+    """Draw the mean of some periodograms of 20 s about a density."""
+    frequency = np.arange(400, 400 + hump.size) / 20.0
+    drawn = hump * rng.gamma(count, 1 / count, size=hump.size)
+    return Spectrum(frequency, drawn, 20.0, 0.0, count)
+
+
+def test_means_show_peaks_that_single_records_hide() -> None:
+    """A hump of 40 % above the noise stands out of the mean of 30 records, and not of one."""
+    frequency = np.arange(400, 6000) / 20.0
+    hump = 1 + 0.4 / (1 + ((frequency - 126.4) / 1.5) ** 2)
+    rng = np.random.default_rng(9)
+    for count, seen in ((1, 0), (30, 8)):
+        found = [find_peaks(((means(rng, hump, count),),), 30.0, 280.0) for _ in range(8)]
+        assert sum(near(targets, 126.4, 0.02) for targets in found) == seen
+
+
+def test_means_leave_over_what_single_records_hide() -> None:
+    """A fit that lacks 20 % over 3 Hz is found out by the mean of 30 records, and not by one."""
+    frequency = np.arange(400, 6000) / 20.0
+    hump = 1 + 0.2 / (1 + ((frequency - 126.4) / 1.5) ** 2)
+    rng = np.random.default_rng(13)
+    for count, seen in ((1, 0), (30, 8)):
+        found = [find_excess(means(rng, hump, count)) for _ in range(8)]
+        assert sum(one is not None for one in found) == seen
+        assert all(abs(one.frequency - 126.4) < 3 for one in found if one is not None)
+
+
+def test_the_noise_of_means_has_hardly_any_peaks() -> None:
+    """Twenty means of ten records give at most one candidate together, and no excess."""
+    rng = np.random.default_rng(10)
+    spectra = [means(rng, np.ones(5600), 10) for _ in range(20)]
+    assert sum(len(find_peaks(((s,),), 30.0, 280.0)) for s in spectra) <= 1
+    assert [find_excess(s) for s in spectra] == [None] * 20
+
+
+def test_lines_tower_in_means_as_in_single_records() -> None:
+    """An ordinate as far above the others as a sine of one record is no peak of a mean either."""
+    rng = np.random.default_rng(11)
+    for count in (1, 10):
+        density = np.ones(5600)
+        density[2000] = 400.0
+        line = means(rng, density, count)
+        assert find_peaks(((line,),), 30.0, 280.0) == ()
+
+
+def test_an_excess_narrower_than_asked_for_does_not_count() -> None:
+    """Where only broad humps are looked for, one beside a narrow one is found, or none."""
+    frequency = np.arange(2000, 3500) / 20.0
+    narrow = 30 / (1 + ((frequency - 126.4) / 0.1) ** 2)
+    broad = 1 / (1 + ((frequency - 150.0) / 3.0) ** 2)
+    noise = np.random.default_rng(12).exponential(size=frequency.size)
+    for more, there in ((0.0, False), (broad, True)):
+        residual = Spectrum(frequency, noise * (1 + narrow + more), 20.0, 0.0)
+        found = find_excess(residual)
+        assert found is not None
+        assert abs(found.frequency - 126.4) < 0.3
+        wide = find_excess(residual, 0.01)
+        assert (wide is not None) == there
+        assert wide is None or abs(wide.frequency - 150.0) < 4.0
+
+
 def test_peaks_do_not_depend_on_the_unit() -> None:
     """Signals in another unit have the same candidates."""
     values = accelerations(np.random.default_rng(5), [Mode(120.0, 0.01)], 30_000, RATE, 0.1)[0]

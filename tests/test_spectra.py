@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import tempfile
+
 import numpy as np
 import pytest
 
+from lmshealth import spectra
 from lmshealth.logs import Channel
+from lmshealth.samples import Stored
 from lmshealth.segments import Segment
-from lmshealth.spectra import Spectrum, periodogram, periodogram_kernel
+from lmshealth.spectra import Kernel, Spectrum, View, average_spectra, make_kernel, periodogram
 from tests.signals import Mode, accelerations, density, sine, white
 
 RATE = 2000.0
@@ -155,6 +159,129 @@ def test_spectrum_refuses_arrays_that_differ_in_shape() -> None:
         Spectrum(np.arange(3.0), np.arange(4.0), 1.0, 0.0)
 
 
+@pytest.mark.parametrize("kind", ["acceleration", "displacement"])
+def test_ordinates_from_the_ceiling_on_are_not_kept(kind: str) -> None:
+    """Below the ceiling nothing changes, and what is above it holds no memory."""
+    values = np.random.default_rng(8).normal(size=4000)
+    channel = Channel("x", kind, values)  # type: ignore[arg-type]
+    all_of_it, cut = (
+        periodogram(channel, Segment(0, 4000, 0.1), RATE, 200.0, ceiling=ceiling)
+        for ceiling in (np.inf, 250.0)
+    )
+    below = all_of_it.frequency < 250.0
+    assert 0 < below.sum() < all_of_it.frequency.size
+    np.testing.assert_array_equal(cut.periodogram, all_of_it.periodogram[below])
+    assert cut.frequency.base is None
+    assert cut.periodogram.base is None
+
+
+def test_a_line_reaches_as_far_as_it_wanders() -> None:
+    """A thousandth of its frequency to either side, and never less than two ordinates."""
+    spectrum = whole(np.zeros(20_000))  # of 10 s
+    assert spectrum.frequency[spectrum.near(800.0)] == pytest.approx(np.arange(7992, 8008) / 10)
+    assert spectrum.frequency[spectrum.near(50.04)] == pytest.approx([49.9, 50.0, 50.1, 50.2])
+    assert spectrum.frequency[spectrum.near(5000.0)].size == 0
+    clear = spectrum.clear_of([800.0, 50.04])
+    assert (~clear).sum() == 16 + 4
+    assert not clear[spectrum.near(50.04)].any()
+
+
+# Means over segments
+
+
+def parts(*lengths: int, velocity: float = 0.1) -> list[Segment]:
+    """Give segments that follow each other."""
+    ends = np.cumsum(lengths).tolist()
+    return [Segment(end - n, end, velocity) for n, end in zip(lengths, ends, strict=True)]
+
+
+def averaged(values: np.ndarray | Stored, segments: list[Segment]) -> tuple[Spectrum, ...]:
+    """Transform an acceleration."""
+    return average_spectra(Channel("x", "acceleration", values), segments, RATE, 500.0)  # type: ignore[arg-type]
+
+
+@pytest.fixture
+def short_minute(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Take 1000 samples for a part of a long stretch."""
+    monkeypatch.setattr(spectra, "_LEAST_PART", 1000)
+
+
+@pytest.mark.usefixtures("short_minute")
+def test_parts_of_a_long_stretch_are_averaged() -> None:
+    """Three parts of one length have one spectrum, the mean of theirs, in memory or on disk."""
+    values = np.random.default_rng(20).normal(size=3000)
+    with tempfile.TemporaryFile() as file:
+        values.tofile(file)
+        file.flush()
+        (mean,) = averaged(values, parts(1000, 1000, 1000))
+        (on_disk,) = averaged(Stored(file, values.size), parts(1000, 1000, 1000))
+    each = [whole(part).periodogram for part in values.reshape(3, 1000)]
+    np.testing.assert_allclose(mean.periodogram, np.mean(each, axis=0), rtol=1e-12)
+    np.testing.assert_array_equal(on_disk.periodogram, mean.periodogram)
+    assert (mean.count, mean.duration, mean.observed) == (3, 0.5, 1.5)
+    assert mean.band(100.0, 200.0).count == 3
+
+
+@pytest.mark.usefixtures("short_minute")
+@pytest.mark.parametrize(
+    ("segments", "counts"),
+    [
+        (parts(999, 999), [1, 1]),  # short moves
+        (parts(1000, 1200, 1000, 1200), [2, 2]),
+        (parts(1000, velocity=0.1) + parts(1000, velocity=-0.1005), [2]),
+        (parts(1000, velocity=0.1) + parts(1000, velocity=0.102), [1, 1]),
+        (parts(1000, 1000, velocity=float("nan")), [2]),
+        (parts(1000, velocity=0.0) + parts(1000, velocity=float("nan")), [1, 1]),
+    ],
+)
+def test_only_what_is_alike_is_averaged(segments: list[Segment], counts: list[int]) -> None:
+    """Long segments of one length and one speed are; short moves and others stay apart."""
+    values = np.random.default_rng(21).normal(size=4400)
+    found = averaged(values, segments)
+    assert [spectrum.count for spectrum in found] == counts
+    assert sum(s.observed for s in found) == pytest.approx(
+        sum(s.stop - s.start for s in segments) / RATE
+    )
+
+
+@pytest.mark.usefixtures("short_minute")
+def test_means_have_the_degrees_of_freedom_they_state() -> None:
+    """The density of a band of five parts scatters over seeds as χ² of its degrees says."""
+    rng = np.random.default_rng(22)
+    readings = [
+        averaged(white(rng, 2.0, 5000, RATE), parts(*[1000] * 5))[0].density(100.0, 150.0)
+        for _ in range(500)
+    ]
+    level = np.array([level for level, _ in readings])
+    (dof,) = {dof for _, dof in readings}
+    assert dof == 2 * 5 * 25
+    assert abs(level.mean() / 2 - 1) < 4.5 * np.sqrt(2 / dof / 500)
+    # Negative control: the degrees of a single part would be told.
+    for wrong, off in ((1.0, False), (5.0, True)):
+        told = abs(level.var() / (2**2 * 2 * wrong / dof) - 1) > 4.5 * np.sqrt(2.5 / 500)
+        assert told == off
+
+
+@pytest.mark.usefixtures("short_minute")
+def test_a_sine_reads_its_amplitude_in_the_mean_of_parts() -> None:
+    """The mean over parts reads the amplitude that each of them reads."""
+    frequency = 100 * RATE / 1000
+    (mean,) = averaged(sine(4000, RATE, frequency, 0.02), parts(*[1000] * 4))
+    at = int(np.argmax(mean.periodogram))
+    assert mean.sine(at - 2, at + 3) == (
+        pytest.approx(frequency), pytest.approx(0.02, rel=1e-3)
+    )  # fmt: skip
+
+
+def test_a_view_is_cut_as_its_spectra_are() -> None:
+    """A band of a view holds the bands of its spectra, with the same name and lines."""
+    spectrum = whole(np.random.default_rng(23).normal(size=4000))
+    cut = View("x", "acc", (spectrum, spectrum), (50.0,)).band(100.0, 200.0)
+    assert (cut.channel, cut.source, cut.lines) == ("x", "acc", (50.0,))
+    for each in cut.spectra:
+        np.testing.assert_array_equal(each.frequency, spectrum.band(100.0, 200.0).frequency)
+
+
 # The expected periodogram
 
 
@@ -166,6 +293,43 @@ def autocovariance(mode: Mode, noise: float, n: int) -> np.ndarray:
     return np.fft.irfft(values, size)[:n] * RATE / 2
 
 
+def kernel_of(low: int, high: int, duration: float, finer: int = 8, margin: int = 100) -> Kernel:
+    """Give the kernel of the Fourier frequencies of some numbers."""
+    frequency = np.arange(low, high) / duration
+    spectrum = Spectrum(frequency, np.ones(frequency.size), duration, float("nan"))
+    return make_kernel(spectrum, np.ones(frequency.size, dtype=bool), finer, margin)
+
+
+def weights(frequency: np.ndarray, duration: float, grid: np.ndarray) -> np.ndarray:
+    """Fejér kernel between frequencies and a grid, rows summing to one."""
+    raw = np.sinc(duration * (frequency[:, None] - grid)) ** 2
+    return raw / raw.sum(axis=1, keepdims=True)
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "duration", "finer"),
+    [(3, 60, 0.67, 12), (300, 420, 3.0, 5), (5560, 7645, 69.5, 2)],
+)
+def test_the_kernel_is_that_of_fejer(low: int, high: int, duration: float, finer: int) -> None:
+    """The transform gives what the dense matrix gives, and so does its transpose."""
+    rng = np.random.default_rng(1)
+    frequency = np.arange(low, high) / duration
+    keep = rng.random(frequency.size) > 0.1
+    spectrum = Spectrum(frequency, np.ones(frequency.size), duration, float("nan"))
+    kernel = make_kernel(spectrum, keep, finer, 20)
+    dense = weights(frequency[keep], duration, kernel.grid)
+    # A resonance a million times above the floor, narrower than the record resolves.
+    values = density([Mode(100.0, 0.002)], kernel.grid, 0.05)
+    np.testing.assert_allclose(kernel.expect(values), dense @ values, rtol=1e-9)
+    both = kernel.expect(np.stack([values, np.ones(values.size)]))
+    np.testing.assert_allclose(both, [dense @ values, np.ones(keep.sum())], rtol=1e-9)
+    slope = rng.normal(size=int(keep.sum()))
+    np.testing.assert_allclose(kernel.spread(slope), slope @ dense, atol=1e-12)
+    # Negative control: weights of a record a thousandth longer are told from these.
+    other = weights(frequency[keep], 1.001 * duration, kernel.grid) @ values
+    assert np.abs(other / kernel.expect(values) - 1).max() > 1e-6
+
+
 def test_the_kernel_gives_the_expected_periodogram_of_a_short_record() -> None:
     """On 4 half-power bandwidths per bin the kernel agrees with the sum over autocovariances."""
     mode, noise, n = Mode(100.0, 0.01), 0.5, 4000
@@ -175,9 +339,9 @@ def test_the_kernel_gives_the_expected_periodogram_of_a_short_record() -> None:
     frequency = np.arange(160, 241) / duration
     cosines = np.cos(2 * np.pi * np.outer(frequency, lags) / RATE)
     oracle = 2 / RATE * (2 * cosines @ weighted - weighted[0])
-    fine = np.arange(1 / (8 * duration), RATE / 2, 1 / (8 * duration))
-    kernel = periodogram_kernel(frequency, duration, fine)
-    np.testing.assert_allclose(kernel @ density([mode], fine, noise), oracle, rtol=5e-3)
+    kernel = kernel_of(160, 241, duration, margin=1760)
+    expected = kernel.expect(density([mode], kernel.grid, noise))
+    np.testing.assert_allclose(expected, oracle, rtol=5e-3)
     # Negative control: the density itself is no such expectation.
     bias = density([mode], frequency, noise) / oracle - 1
     assert np.abs(bias).max() > 0.1
@@ -192,17 +356,17 @@ def test_short_records_average_to_the_expected_periodogram() -> None:
     ]
     mean = np.mean([spectrum.periodogram for spectrum in spectra], axis=0)
     frequency, duration = spectra[0].frequency, spectra[0].duration
-    fine = np.arange(1 / (8 * duration), RATE / 2, 1 / (8 * duration))
-    kernel = periodogram_kernel(frequency, duration, fine)
-    ratio = mean / (kernel @ density([mode], fine, noise))
+    first = round(frequency[0] * duration)
+    kernel = kernel_of(first, first + frequency.size, duration, margin=1780)
+    ratio = mean / kernel.expect(density([mode], kernel.grid, noise))
     assert np.abs(ratio - 1).max() * np.sqrt(n_records) < 4.5
     naive = mean / density([mode], frequency, noise)
     assert np.abs(naive - 1).max() * np.sqrt(n_records) > 4.5
 
 
-def test_kernel_rows_sum_to_one() -> None:
-    """A constant density stays itself, also where the grid ends close by."""
-    fine = np.arange(90.0, 110.0, 0.05)
-    kernel = periodogram_kernel(np.arange(90.0, 110.0, 0.5), 2.0, fine)
-    np.testing.assert_allclose(kernel.sum(axis=1), 1.0, rtol=1e-12)
-    assert (kernel >= 0).all()
+@pytest.mark.parametrize("margin", [1, 20])
+def test_a_constant_density_stays_itself(margin: int) -> None:
+    """White noise is expected at its density, also where the grid ends close by."""
+    kernel = kernel_of(2, 40, 2.0, margin=margin)
+    assert kernel.grid[0] > 0
+    np.testing.assert_allclose(kernel.expect(np.full(kernel.grid.size, 3.0)), 3.0, rtol=1e-12)

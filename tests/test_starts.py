@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from lmshealth.segments import Segment
-from lmshealth.spectra import periodogram
+from lmshealth.spectra import Spectrum, periodogram
 from lmshealth.starts import Coarse, Target, coarsen, incoherent_fit, locate
 from tests.signals import Mode, accelerations, density, make_log, sine, white
 
@@ -35,6 +35,22 @@ def test_bins_read_the_density_of_white_noise() -> None:
     # A median of 40 exponentials scatters by 1/√40 of its mean over ln 2.
     off = (coarse.level.mean() / level - 1) * np.log(2) * np.sqrt(coarse.count.sum())
     assert abs(off) < 4.5
+
+
+@pytest.mark.parametrize("count", [2, 10])
+def test_bins_read_the_density_from_means_too(count: int) -> None:
+    """Beside single segments and means over parts, bins read the density, each with its weight."""
+    rng, n = np.random.default_rng(3), 40_000
+    frequency = np.arange(1, n + 1) / n * 500.0
+    single = Spectrum(frequency, 3.0 * rng.exponential(size=n), n / 500.0, 0.1)
+    mean = Spectrum(frequency, 3.0 * rng.gamma(count, 1 / count, size=n), n / 500.0, 0.1, count)
+    for spectra_, weight in (((mean,), count), ((single, mean), count + 1)):
+        coarse = coarsen(spectra_, 0.0, 600.0, 1.0)
+        assert coarse.count.sum() == weight * n
+        assert abs(coarse.level.mean() / 3.0 - 1) < 4.5 / np.log(2) / np.sqrt(n)
+    # Negative control: the median of exponentials would read too much.
+    once = coarsen((replace(mean, count=1),), 0.0, 600.0, 1.0)
+    assert once.level.mean() / 3.0 - 1 > 0.15
 
 
 def test_a_line_does_not_move_the_bins() -> None:

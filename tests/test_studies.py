@@ -72,3 +72,16 @@ def test_simulation_cost(root: Path) -> None:
     assert answer["passed"]["memory"]
     assert row["peer_over_ours"] > 1.5
     assert row["record_30s_cpu_s"] < 0.8 * row["record_60s_cpu_s"]
+
+
+def test_readings(root: Path) -> None:
+    """Readings are calibrated, slopes cover, and only what a file cannot give is not met."""
+    answer = json.loads(run_study(root, "readings"))
+    failed = {name for name, fine in answer["passed"].items() if not fine}
+    assert failed == set(answer["not_met"])
+
+
+def test_line_test(root: Path) -> None:
+    """Alarms stay as declared, lines are found and leave modes in peace; controls do not."""
+    answer = json.loads(run_study(root, "line_test"))
+    assert all(answer["passed"].values())

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 from lmshealth.errors import BadTable
 from lmshealth.logs import Refusal
-from lmshealth.readers.formats import format_of
+from lmshealth.readers.formats import is_log
 from lmshealth.readers.metadata import KEYS
 from lmshealth.readers.reading import shown
 from lmshealth.readers.trouble import listed
@@ -27,7 +27,7 @@ class Found(NamedTuple):
     Attributes
     ----------
     logs : tuple of Path
-        Files with a registered suffix, sorted.
+        Files with a suffix of the log contract, sorted.
     refused : tuple of Refusal
         Files that look like logs and must not or cannot be opened, named relative to the folder.
     """
@@ -76,7 +76,7 @@ def find_logs(folder: str | Path) -> Found:
     logs: list[Path] = []
     refused: list[Refusal] = []
     for path in _walk(root, refused):
-        if path.name in NOT_LOGS or format_of(path) is None:
+        if path.name in NOT_LOGS or not is_log(path):
             continue
         trouble = _trouble(path, root)
         if trouble is None:

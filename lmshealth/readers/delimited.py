@@ -1,108 +1,103 @@
-"""CSV and gzipped CSV: leading ``# key: value`` lines, a header line, rows of numbers."""
+"""Delimited text: leading ``# key: value`` lines, a header line, rows of numbers."""
 
 from __future__ import annotations
 
 import csv
 import gzip
-import io
+import re
 import warnings
 from collections.abc import Callable
 from functools import partial
+from io import BufferedIOBase
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from lmshealth.arrays import FloatArray
 from lmshealth.readers.columns import ColumnMap, CsvLayout
-from lmshealth.readers.raw import Format, Raw, check_size, not_numeric, wanted
+from lmshealth.readers.raw import Format, Raw, not_numeric, wanted
+from lmshealth.readers.spool import spools
+from lmshealth.readers.text import Text
 from lmshealth.readers.trouble import Unusable, listed
+from lmshealth.samples import MINUTE, Samples
 
 _GZIP_MAGIC = b"\x1f\x8b"
-_BLOCK = 1 << 20
 _BOM = b"\xef\xbb\xbf"
+# Rows are read so many at a time, and fewer of wide tables: what they take stays in the cache.
+_ROWS = 1 << 16
+_FIELDS = 1 << 18
+# What pandas says of a row with more fields than it was told.
+_LONG_ROW = re.compile(r"in line (\d+), saw (\d+)")
 
 
 def _load_plain(path: Path, columns: ColumnMap) -> Raw:
-    size = path.stat().st_size
-    check_size(size, size)
-    return parse_text(path.read_bytes(), columns)
+    with path.open("rb") as stream:
+        return parse_text(stream, path.stat().st_size, columns)
 
 
 def _load_gzip(path: Path, columns: ColumnMap) -> Raw:
-    stored = path.stat().st_size
-    # Unpacked block by block, so that a bomb is stopped before it fills the memory.
-    blocks: list[bytes] = []
-    decoded = 0
     with gzip.open(path, "rb") as stream:
-        while block := stream.read(_BLOCK):
-            decoded += len(block)
-            check_size(decoded, stored)
-            blocks.append(block)
-    return parse_text(b"".join(blocks), columns)
+        return parse_text(stream, path.stat().st_size, columns)
 
 
-def parse_text(data: bytes, columns: ColumnMap) -> Raw:
-    """Read delimited text.
+def parse_text(stream: BufferedIOBase, stored: int, columns: ColumnMap) -> Raw:
+    """Read delimited text block by block.
 
     Parameters
     ----------
-    data : bytes
+    stream : BufferedIOBase
         UTF-8 text, with or without byte order mark.
+    stored : int
+        Bytes on disk.
     columns : ColumnMap
         Wanted columns and the layout.
 
     Raises
     ------
     Unusable
-        With the reasons ``empty``, ``corrupt``, ``metadata`` and ``columns``.
+        With the reasons ``empty``, ``corrupt``, ``too-large``, ``metadata`` and ``columns``.
     """
-    if b"\0" in data:
-        raise Unusable("corrupt", f"NUL byte at offset {data.index(0)}; needed UTF-8 text")
     layout = columns.csv
-    start = _skip(data, layout.skip_rows)
-    metadata, start = _leading_lines(data, start)
-    names, start = _header(data, start, layout)
+    text = Text(stream, stored)
+    _skip(text, layout.skip_rows)
+    metadata = _leading_lines(text)
+    names = _header(text, layout)
     chosen = wanted(names, columns)
     if twice := sorted({name for name in chosen if names.count(name) > 1}):
         raise Unusable("columns", f"the header names {listed(twice)} more than once")
     if not chosen:
         return Raw({}, metadata, tuple(names))
-    _check_last_line(data, start, len(names), layout.delimiter)
-    table = _numbers(data, start, names, chosen, layout.delimiter)
-    return Raw(table, metadata, tuple(names))
+    places = {name: names.index(name) for name in chosen}
+    return Raw(_numbers(text, len(names), places, layout.delimiter), metadata, tuple(names))
 
 
-def _line(data: bytes, start: int) -> tuple[str, int]:
-    """Give the line that begins at ``start`` and where the next one begins."""
-    end = data.find(b"\n", start)
-    end = len(data) if end < 0 else end + 1
+def _line(text: Text) -> str:
+    """Read a line of the head."""
+    start = text.position
+    line = text.line()
     try:
-        return data[start:end].decode("utf-8").rstrip("\r\n"), end
+        return line.decode("utf-8")
     except UnicodeDecodeError as error:
         raise Unusable(
             "corrupt",
-            f"byte {data[start + error.start]:#04x} at offset {start + error.start} is not UTF-8; "
+            f"byte {line[error.start]:#04x} at offset {start + error.start} is not UTF-8; "
             "save the file as UTF-8",
         ) from error
 
 
-def _skip(data: bytes, n_lines: int) -> int:
-    """Give the offset behind the first lines, which may be in any encoding."""
-    start = len(_BOM) if data.startswith(_BOM) else 0
+def _skip(text: Text, n_lines: int) -> None:
+    """Pass over the byte order mark and the first lines, which may be in any encoding."""
+    first = text.line()
+    text.seek(len(_BOM) if first.startswith(_BOM) else 0)
     for _ in range(n_lines):
-        end = data.find(b"\n", start)
-        if end < 0:
-            return len(data)
-        start = end + 1
-    return start
+        text.line()
 
 
-def _leading_lines(data: bytes, start: int) -> tuple[dict[str, str], int]:
+def _leading_lines(text: Text) -> dict[str, str]:
     """Read the leading ``# key: value`` lines; those without a colon are remarks."""
     metadata: dict[str, str] = {}
-    while start < len(data):
-        line, following = _line(data, start)
+    start = text.position
+    while line := _line(text):
         if line.strip() and not line.startswith("#"):
             break
         key, colon, value = line.lstrip("# \t").partition(":")
@@ -111,97 +106,126 @@ def _leading_lines(data: bytes, start: int) -> tuple[dict[str, str], int]:
             raise Unusable(
                 "metadata", f"{key} is given twice, as {metadata[key]!r} and {value!r}; keep one"
             )
-        start = following
-    return metadata, start
+        start = text.position
+    text.seek(start)
+    return metadata
 
 
-def _header(data: bytes, start: int, layout: CsvLayout) -> tuple[list[str], int]:
-    """Name the columns; the offset stays where it is when no line of the file does it."""
-    if start >= len(data):
+def _header(text: Text, layout: CsvLayout) -> list[str]:
+    """Name the columns; the text stays where it is when no line of the file does it."""
+    start = text.position
+    line = _line(text).rstrip("\r\n")
+    if not line:
         raise Unusable("empty", "no header line and no rows; needed a header line and rows")
-    line, following = _line(data, start)
     try:
         fields = next(csv.reader([line], delimiter=layout.delimiter), [])
     except csv.Error as error:
         raise Unusable("corrupt", f"header line cannot be read: {error}") from error
     if layout.header is True:
-        return [field.strip() for field in fields], following
+        return [field.strip() for field in fields]
+    text.seek(start)
     if layout.header is False:
-        return [str(i) for i in range(len(fields))], start
+        return [str(i) for i in range(len(fields))]
     if len(layout.header) != len(fields):
         raise Unusable(
             "columns",
             f"[csv] header names {len(layout.header)} columns, the first row has {len(fields)}",
         )
-    return list(layout.header), start
-
-
-def _check_last_line(data: bytes, start: int, n_fields: int, delimiter: str) -> None:
-    """Refuse a file that was cut in the middle of a row; pandas would fill the row with NaN."""
-    if start >= len(data):
-        raise Unusable("empty", "a header line and no rows; needed rows")
-    if data.endswith((b"\n", b"\r")):
-        return
-    last = data[max(data.rfind(b"\n"), start - 1) + 1 :]
-    n_found = last.count(delimiter.encode()) + 1
-    if n_found < n_fields:
-        raise Unusable(
-            "corrupt",
-            f"the last row is cut off: {n_found} of {n_fields} fields; copy the file again",
-        )
+    return list(layout.header)
 
 
 def _numbers(
-    data: bytes, start: int, names: list[str], chosen: list[str], delimiter: str
-) -> dict[str, FloatArray]:
-    """Read the wanted columns from ``start`` on, ``(n_rows,)`` each, NaN where a field is empty."""
+    text: Text, n_fields: int, places: dict[str, int], delimiter: str
+) -> dict[str, Samples]:
+    """Read the wanted columns, ``(n_rows,)`` each, NaN where a field is empty."""
     import pandas as pd
 
+    start = text.position
+    text.rows_begin(n_fields, delimiter)
     read = partial(
-        pd.read_csv, sep=delimiter, header=None, names=list(range(len(names))), index_col=False
+        pd.read_csv,
+        text,
+        sep=delimiter,
+        header=None,
+        names=list(range(n_fields + _spare(pd.__version__))),
+        index_col=False,
+        # A block is small enough as a whole.
+        low_memory=False,
+        chunksize=max(1, min(_ROWS, _FIELDS // n_fields)),
     )
-    places = {name: names.index(name) for name in chosen}
     with warnings.catch_warnings():
         # A row longer than the header is a warning in pandas and a loss of data here.
         warnings.simplefilter("error", pd.errors.ParserWarning)
-        # Columns that are not wanted may hold anything.
-        warnings.simplefilter("ignore", pd.errors.DtypeWarning)
         try:
             numbers = dict.fromkeys(places.values(), np.float64)
-            table: Any = read(_from(data, start), dtype=numbers)
+            return _spooled(partial(read, dtype=numbers), text, places)
         except (ValueError, pd.errors.ParserWarning):
             # Takes twice as long, understands blanks, and knows what is wrong.
-            table = _carefully(read, _from(data, start))
-    for name, place in places.items():
-        if table[place].dtype.kind not in "fiu":
-            raise not_numeric(name, _first_text(table[place].tolist()))
-    return {name: np.array(table[place], dtype=np.float64) for name, place in places.items()}
+            text.seek(start)
+            return _carefully(partial(read, skipinitialspace=True), text, places)
 
 
-def _from(data: bytes, start: int) -> io.BytesIO:
-    """Open bytes at an offset, without copying them."""
-    stream = io.BytesIO(data)
-    stream.seek(start)
-    return stream
+def _spooled(read: Callable[[], Any], text: Text, places: dict[str, int]) -> dict[str, Samples]:
+    """Take the rows block by block."""
+    n_rows = 0
+    # How many rows there are nobody knows: memory for a minute is taken as it is filled.
+    with spools(places, expected=MINUTE) as taken, read() as blocks:
+        for table in blocks:
+            text.rows_end()
+            _check_width(table, text.n_fields, n_rows)
+            for name, place in places.items():
+                if table[place].dtype.kind not in "fiu":
+                    raise not_numeric(name, _first_text(table[place].tolist(), n_rows))
+                taken[name].append(table[place].to_numpy())
+            n_rows += len(table)
+    if not n_rows:
+        raise Unusable("empty", "a header line and no rows; needed rows")
+    return {name: spool.samples() for name, spool in taken.items()}
 
 
-def _carefully(read: Callable[..., Any], stream: io.BytesIO) -> Any:
-    """Read rows as whole columns, or say why that cannot be done."""
+def _carefully(read: Callable[[], Any], text: Text, places: dict[str, int]) -> dict[str, Samples]:
+    """Take the rows as whole blocks, or say why that cannot be done."""
     import pandas as pd
 
     try:
-        return read(stream, low_memory=False, skipinitialspace=True)
+        return _spooled(read, text, places)
+    except pd.errors.EmptyDataError as error:
+        raise Unusable("empty", "a header line and no rows; needed rows") from error
     except (pd.errors.ParserError, pd.errors.ParserWarning, UnicodeDecodeError) as error:
+        if found := _LONG_ROW.search(str(error)):
+            raise Unusable("corrupt", _too_long(found[1], found[2], text.n_fields)) from error
         raise Unusable("corrupt", f"rows cannot be read: {error}") from error
 
 
-def _first_text(values: list[object]) -> str:
+def _spare(pandas_version: str) -> int:
+    """Give the number of columns more than the header has, for what a row may have too much.
+
+    Before 3.1 pandas drops it from the first row of a block (pandas-dev/pandas pull request 66944).
+    """
+    major, minor = pandas_version.split(".")[:2]
+    return int((int(major), int(minor)) < (3, 1))
+
+
+def _check_width(table: Any, n_fields: int, n_before: int) -> None:
+    """Refuse rows with something in a spare column."""
+    for place in table.columns[n_fields:]:
+        spilled = table[place].notna().to_numpy()
+        if spilled.any():
+            row = n_before + int(spilled.argmax()) + 1
+            raise Unusable("corrupt", _too_long(row, f"{n_fields + 1} or more", n_fields))
+
+
+def _too_long(row: object, found: str, needed: int) -> str:
+    return f"row {row} has {found} fields, the first line {needed}; copy the file again"
+
+
+def _first_text(values: list[object], n_before: int) -> str:
     """Quote the first field that is no number, with its row."""
     for i, value in enumerate(values):
         try:
             float(value)  # type: ignore[arg-type]
         except (TypeError, ValueError):
-            return f"{str(value)[:40]!r} in row {i + 1}"
+            return f"{str(value)[:40]!r} in row {n_before + i + 1}"
     return "text"
 
 

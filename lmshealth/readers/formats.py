@@ -18,12 +18,23 @@ from lmshealth.readers.uff import UFF
 FORMATS: tuple[Format, ...] = (HDF5, PARQUET, TDMS, MAT, CSV_GZ, UFF, CSV)
 SUFFIXES: tuple[str, ...] = tuple(sorted(s for form in FORMATS for s in form.suffixes))
 
+# Exporters call delimited text so, and people their notes: read where a file is named, and not
+# looked for in folders.
+TEXT_SUFFIXES = (".txt", ".tsv", ".dat")
+
 _HEAD = 4096
+
+
+def is_log(path: Path) -> bool:
+    """Tell by its name whether a file of a folder is a log."""
+    return path.name.lower().endswith(SUFFIXES)
 
 
 def format_of(path: Path) -> Format | None:
     """Find the format that a file's name promises; None for an unregistered suffix."""
     name = path.name.lower()
+    if name.removesuffix(".gz").endswith(TEXT_SUFFIXES):
+        return CSV_GZ if name.endswith(".gz") else CSV
     return next((form for form in FORMATS if name.endswith(form.suffixes)), None)
 
 
@@ -45,7 +56,8 @@ def load(path: Path, columns: ColumnMap) -> Raw:
     """
     form = format_of(path)
     if form is None:
-        raise Unusable("format", f"unknown suffix; needed one of {listed(SUFFIXES)}")
+        known = (*SUFFIXES, *TEXT_SUFFIXES)
+        raise Unusable("format", f"unknown suffix; needed one of {listed(known)}")
     with path.open("rb") as stream:
         head = stream.read(_HEAD)
     if not head:

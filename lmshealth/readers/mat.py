@@ -1,105 +1,96 @@
-"""MAT: variables, fields of structs and columns of matrices, each by the name MATLAB calls it.
-
-What scipy is given has been walked through before: it trusts the sizes that a file claims.
-"""
+"""MAT: variables, fields of structs and columns of matrices, each by the name MATLAB calls it."""
 
 from __future__ import annotations
 
-import io
-import mmap
+import os
 import re
 import struct
-import zlib
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
+from dataclasses import replace
+from math import prod
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import IO, NamedTuple
 
-import numpy as np
-
-from lmshealth.arrays import FloatArray
 from lmshealth.readers.columns import ColumnMap
-from lmshealth.readers.matwalk import (
-    COMPRESSED,
-    HEADER,
-    MATRIX,
-    TAG,
-    Walker,
-    cut_off,
-)
+from lmshealth.readers.matbytes import PackedBytes, PlainBytes, cut_off
+from lmshealth.readers.matwalk import COMPRESSED, MATRIX, NUMBERS, TAG, TEXT, Array, Walker
 from lmshealth.readers.metadata import KEYS
 from lmshealth.readers.raw import Format, Raw, check_size, not_numeric
+from lmshealth.readers.spool import spools
 from lmshealth.readers.trouble import Unusable, listed
+from lmshealth.samples import Samples
 
+_HEADER = 128
 _ORDERS = {b"\x00\x01IM": "<", b"\x01\x00MI": ">"}
 _HDF5_INSIDE = (b"\x00\x02IM", b"\x02\x00MI")
-# Type, dimensions and name of a variable; MATLAB's names have 63 characters at most.
-_PEEK = 512
 # A matrix with more columns than this is no table of signals.
 _MOST_COLUMNS = 1000
+# What has more arrays is no log, and would fill the memory with their names.
+_MOST_ARRAYS = 20_000
 
 
-class _Element(NamedTuple):
+class _Variable(NamedTuple):
     """A variable where it stands in the file, with its tag."""
 
     name: str
-    kind: int
+    packed: bool
     start: int
     size: int
 
 
 def _load(path: Path, columns: ColumnMap) -> Raw:
-    with path.open("rb") as stream, mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ) as file:
-        order = _order(file)
-        elements = list(_elements(file, order))
-        names = [element.name for element in elements]
+    with path.open("rb") as stream:
+        order = _order(stream)
+        variables = list(_variables(stream, order))
+        names = [variable.name for variable in variables]
         chosen = _chosen(names, columns)
         if twice := sorted({name for name in chosen if names.count(name) > 1}):
             raise Unusable("columns", f"the file holds {listed(twice)} more than once")
-        values = _values(file, order, [e for e in elements if e.name in chosen], path)
-    leaves = dict(_leaves(values, chosen, columns.mat.variable))
-    read = {name: _float64(name, leaves[name]) for name in leaves if columns.target(name)}
-    metadata = {key: _text(key, leaves[key]) for key in KEYS if key in leaves}
-    others = [name for name in names if name and name not in chosen]
-    return Raw(read, metadata, (*leaves, *others))
+        wanted = [variable for variable in variables if variable.name in chosen]
+        arrays = _arrays(stream, order, wanted, columns.mat.variable)
+        raw = _raw(arrays, columns, os.fstat(stream.fileno()).st_size)
+    others = tuple(name for name in names if name and name not in chosen)
+    return replace(raw, present=raw.present + others)
 
 
-def _order(file: mmap.mmap) -> str:
+def _order(stream: IO[bytes]) -> str:
     """Tell the order of bytes; refuse the version that is something else inside."""
-    version = file[HEADER - 4 : HEADER]
+    version = stream.read(_HEADER)[-4:]
     if version in _HDF5_INSIDE:
         raise Unusable("format", "MAT-file of version 7.3; save it in MATLAB with the option -v7")
     return _ORDERS[version]
 
 
-def _elements(file: mmap.mmap, order: str) -> Iterator[_Element]:
-    """Find the variables by their tags, without unpacking them.
+def _variables(stream: IO[bytes], order: str) -> Iterator[_Variable]:
+    """Find the variables by their tags, and read their names.
 
     Raises
     ------
     Unusable
         With reason ``corrupt`` where the file ends before its variables do.
     """
-    at = HEADER
-    while at < len(file):
-        if at + TAG > len(file):
+    end = os.fstat(stream.fileno()).st_size
+    at = _HEADER
+    while at < end:
+        if at + TAG > end:
             raise cut_off(at)
-        kind, size = struct.unpack(order + "II", file[at : at + TAG])
+        stream.seek(at)
+        kind, size = struct.unpack(order + "II", stream.read(TAG))
         if kind not in (COMPRESSED, MATRIX):
             raise Unusable("corrupt", f"no variable begins at byte {at}; copy the file again")
-        if at + TAG + size > len(file):
+        if at + TAG + size > end:
             raise cut_off(at)
-        yield _Element(_name(file, order, at, kind, size), kind, at, TAG + size)
+        found = _Variable("", kind == COMPRESSED, at, TAG + size)
+        yield found._replace(name=_walker(stream, order, found).name())
         at += TAG + size
 
 
-def _name(file: mmap.mmap, order: str, at: int, kind: int, size: int) -> str:
-    """Read the name of a variable from its first bytes; empty where it has none."""
-    stop = at + TAG + size
-    if kind == COMPRESSED:
-        begin = zlib.decompressobj().decompress(file[at + TAG : min(stop, at + _PEEK)], _PEEK)
-    else:
-        begin = file[at : min(stop, at + _PEEK)]
-    return Walker(begin, order, partial=True).name()
+def _walker(stream: IO[bytes], order: str, variable: _Variable) -> Walker:
+    if not variable.packed:
+        stream.seek(variable.start)
+        return Walker(PlainBytes(stream), order)
+    stream.seek(variable.start + TAG)
+    return Walker(PackedBytes(stream, variable.size - TAG), order)
 
 
 def _chosen(names: list[str], columns: ColumnMap) -> set[str]:
@@ -116,92 +107,81 @@ def _chosen(names: list[str], columns: ColumnMap) -> set[str]:
     return {name for name in names if name and (name in known or columns.target(name))}
 
 
-def _values(file: mmap.mmap, order: str, elements: list[_Element], path: Path) -> dict[str, Any]:
-    """Read variables with scipy, after each of them has been walked through."""
-    from scipy.io import loadmat
-
-    values: dict[str, Any] = {}
-    plain = [element for element in elements if element.kind == MATRIX]
-    with memoryview(file) as view:
-        for element in plain:
-            with view[element.start : element.start + element.size] as part:
-                Walker(part, order).check(element.name)
-    if plain:
-        values |= loadmat(str(path), variable_names=[element.name for element in plain])
-    total = 0
-    for element in elements:
-        if element.kind == COMPRESSED:
-            unpacked = _unpacked(file, order, element, total)
-            total += len(unpacked)
-            Walker(unpacked, order).check(element.name)
-            one: Any = io.BytesIO(file[:HEADER] + unpacked)
-            del unpacked
-            values |= loadmat(one)
-    return values
+def _arrays(
+    stream: IO[bytes], order: str, variables: Iterable[_Variable], inside: str | None
+) -> Iterator[Array]:
+    """Give the arrays of variables; inside one variable without its name."""
+    end = os.fstat(stream.fileno()).st_size
+    unpacked = 0
+    for variable in variables:
+        walker = _walker(stream, order, variable)
+        unpacked += walker.size
+        check_size(unpacked, end)
+        yield from walker.arrays(variable.name, inside=variable.name == inside)
 
 
-def _unpacked(file: mmap.mmap, order: str, element: _Element, before: int) -> bytes:
-    """Unpack a variable; with those before it, it must stay within bounded memory."""
-    packed = file[element.start + TAG : element.start + element.size]
-    claim = TAG + _claim(packed, order)
-    check_size(before + claim, len(file))
-    unpacker = zlib.decompressobj()
-    # One byte more than claimed makes zlib go on to its checksum.
-    plain = unpacker.decompress(packed, claim + 1)
-    if len(plain) != claim or not unpacker.eof:
-        raise Unusable("corrupt", f"variable {element.name!r} is damaged; copy the file again")
-    return plain
+def _raw(arrays: Iterable[Array], columns: ColumnMap, size: int) -> Raw:
+    """Read what is wanted of the arrays of a file of ``size`` bytes."""
+    n_samples = 0
+    read: dict[str, Samples] = {}
+    metadata: dict[str, str] = {}
+    present: list[str] = []
+    for k, array in enumerate(arrays):
+        for name, n in _columns(array):
+            present.append(name)
+            if columns.target(name) is not None:
+                _check_series(array, name, n)
+                n_samples += n
+                # MATLAB stores whole numbers in fewer bytes than they take here.
+                check_size(8 * n_samples, size)
+                read[name] = _samples(array, n)
+            elif name in KEYS:
+                metadata[name] = _text(array, name)
+            elif array.what == NUMBERS:
+                array.skip(n)
+        if k + len(present) > _MOST_ARRAYS:
+            raise Unusable("columns", f"more than {_MOST_ARRAYS} arrays; save the log by itself")
+    return Raw(read, metadata, tuple(present))
 
 
-def _claim(packed: bytes, order: str) -> int:
-    """Read how many bytes a compressed variable says it has."""
-    tag = zlib.decompressobj().decompress(packed, TAG)
-    kind, size = struct.unpack(order + "II", tag)
-    if kind != MATRIX:
-        raise Unusable("corrupt", "what is compressed is no variable; copy the file again")
-    return int(size)
+def _columns(array: Array) -> Iterator[tuple[str, int]]:
+    """Give the columns of a matrix, or an array itself, with their numbers of entries."""
+    n_columns = array.shape[1] if len(array.shape) == 2 and 1 not in array.shape else None
+    if array.what != NUMBERS or n_columns is None or n_columns > _MOST_COLUMNS:
+        yield array.name, prod(array.shape)
+        return
+    for k in range(n_columns):
+        yield f"{array.name}(:,{k + 1})", array.shape[0]
 
 
-def _leaves(
-    values: dict[str, Any], chosen: set[str], variable: str | None
-) -> Iterator[tuple[str, Any]]:
-    """Give the arrays by the names MATLAB has for them; inside ``variable`` without its name."""
-    for name in values:
-        if name in chosen:
-            is_struct = values[name].dtype.names is not None
-            yield from _named("" if name == variable and is_struct else name, values[name])
+def _check_series(array: Array, name: str, n: int) -> None:
+    if array.what != NUMBERS:
+        raise not_numeric(name, array.what)
+    if n not in array.shape:
+        raise not_numeric(name, f"numbers of shape {array.shape}")
 
 
-def _named(name: str, value: Any) -> Iterator[tuple[str, Any]]:
-    if value.dtype.names is not None:
-        for k, item in enumerate(value.flat):
-            whole = name if value.size == 1 else f"{name}({k + 1})"
-            for field in value.dtype.names:
-                yield from _named(f"{whole}.{field}" if whole else field, item[field])
-    elif value.ndim == 2 and 1 not in value.shape and value.shape[1] <= _MOST_COLUMNS:
-        for k in range(value.shape[1]):
-            yield f"{name}(:,{k + 1})", value[:, k]
-    else:
-        yield name, value
+def _samples(array: Array, n: int) -> Samples:
+    with spools([array.name], expected=n) as taken:
+        for block in array.numbers(n):
+            taken[array.name].append(block)
+        return taken[array.name].samples()
 
 
-def _float64(name: str, value: Any) -> FloatArray:
-    if value.dtype.kind not in "fiu" or value.size != max(value.shape, default=1):
-        raise not_numeric(name, f"{value.dtype} of shape {value.shape}")
-    return np.asarray(value, dtype=np.float64).ravel()
-
-
-def _text(key: str, value: Any) -> str:
+def _text(array: Array, key: str) -> str:
     """Read a single number or line of text."""
-    if value.size == 1 and value.dtype.kind in "fiuU":
-        return str(value.item())
-    if value.size == 0 and value.dtype.kind == "U":
-        return ""
+    n = prod(array.shape)
+    if array.what == NUMBERS and n == 1:
+        value = next(array.numbers(1)).item()
+        # An integer may be stored as one or not.
+        return str(int(value) if float(value).is_integer() else value)
+    if array.what == TEXT and (n == 0 or array.shape[0] == 1):
+        return array.text()
     raise Unusable("metadata", f"{key} is no single text or number; write it as text")
 
 
 def _sniff(head: bytes) -> bool:
-    version = head[HEADER - 4 : HEADER]
+    version = head[_HEADER - 4 : _HEADER]
     return version in _ORDERS or (version in _HDF5_INSIDE and head.startswith(b"MATLAB"))
 
 

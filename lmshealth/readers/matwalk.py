@@ -1,175 +1,252 @@
-"""The tags of a MAT-file of version 5: checked before anything believes the sizes they claim."""
+"""The arrays in a variable of a MAT-file of version 5, none of whose sizes is believed unseen."""
 
 from __future__ import annotations
 
 import struct
+from collections.abc import Iterator
+from dataclasses import dataclass
 from math import prod
 from typing import NamedTuple
 
+import numpy as np
+
+from lmshealth.readers.matbytes import PlainBytes, cut_off
 from lmshealth.readers.trouble import Unusable
 
-HEADER = 128
 TAG = 8
 MATRIX, COMPRESSED = 14, 15
+NUMBERS, TEXT = "numbers", "text"
 
 _INT8, _INT32, _UINT32 = 1, 5, 6
-# Integers, floats, and text in UTF-8, UTF-16 and UTF-32; numbers 8, 10 and 11 do not exist.
-_PLAIN = frozenset({1, 2, 3, 4, 5, 6, 7, 9, 12, 13, 16, 17, 18})
-_CELL, _STRUCT, _CHAR = 1, 2, 4
+# Whatever the class of an array, MATLAB stores its numbers in the smallest type that holds them.
+_TYPES = dict(zip((1, 2, 3, 4, 5, 6, 7, 9, 12, 13), "bBhHiIfdqQ", strict=True))
+_ENCODINGS = {1: "latin-1", 2: "latin-1", 4: "utf-16", 16: "utf-8", 17: "utf-16", 18: "utf-32"}
+_STRUCT, _CHAR, _OPAQUE = 2, 4, 17
 _NUMERIC = range(6, 16)
-_REFUSED = {3: "an object", 5: "a sparse matrix", 16: "a function", 17: "an object"}
+_OBJECT = "an object or a function (save plain arrays or structs)"
+_OTHERS = {1: "cells", 3: _OBJECT, 5: "a sparse matrix", 16: _OBJECT, 17: _OBJECT}
 _COMPLEX = 1 << 11
 _DEEPEST = 32
 _MOST_DIMENSIONS = 32
+# Names and short text are read whole.
+_LONGEST = 1 << 20
+_LONGEST_NAME = 64
+_BLOCK = 1 << 20
 
 
-class _Data(NamedTuple):
-    """One data element: its type, where its bytes are, and where the next one begins."""
+class _Element(NamedTuple):
+    """A data element whose tag is read: its type, its size, and where the next one begins."""
 
     kind: int
-    start: int
-    stop: int
+    size: int
     after: int
 
 
-def cut_off(at: int) -> Unusable:
-    """Say that something is larger than what holds it."""
-    return Unusable("corrupt", f"what begins at byte {at} is cut off; copy the file again")
+@dataclass(frozen=True, slots=True, eq=False)
+class Array:
+    """An array whose content comes next: it is read before the walk goes on, or never.
+
+    Attributes
+    ----------
+    name : str
+        As MATLAB calls it.
+    shape : tuple of int
+        As in MATLAB, whose arrays are stored column after column.
+    what : str
+        What it holds: `NUMBERS`, `TEXT`, or words for a message.
+    """
+
+    name: str
+    shape: tuple[int, ...]
+    what: str
+    _source: PlainBytes
+    _order: str
+    _kind: int = 0
+    _size: int = 0
+
+    def numbers(self, n: int) -> Iterator[np.ndarray]:
+        """Read the next ``n`` numbers in blocks, as they are stored."""
+        dtype = np.dtype(self._order + _TYPES[self._kind])
+        left = n * dtype.itemsize
+        while left > 0:
+            block = self._source.read(min(left, _BLOCK))
+            left -= len(block)
+            yield np.frombuffer(block, dtype=dtype)
+
+    def skip(self, n: int) -> None:
+        """Pass over the next ``n`` numbers."""
+        self._source.skip(n * struct.calcsize("=" + _TYPES[self._kind]))
+
+    def text(self) -> str:
+        """Read text."""
+        if self._size > _LONGEST:
+            raise cut_off(self._source.at)
+        encoding = _ENCODINGS[self._kind]
+        if encoding in ("utf-16", "utf-32"):
+            encoding += "-le" if self._order == "<" else "-be"
+        return str(self._source.read(self._size), encoding)
 
 
 class Walker:
-    """Walks through one uncompressed variable.
+    """Walks through one variable.
 
     Parameters
     ----------
-    data : bytes or memoryview
-        The variable with its tag.
+    source : PlainBytes
+        Its bytes, with its tag.
     order : str
         Order of bytes as `struct` writes it.
-    partial : bool
-        Whether these are only its first bytes.
+
+    Attributes
+    ----------
+    size : int
+        Number of bytes that the variable claims to have.
+
+    Raises
+    ------
+    Unusable
+        With reason ``corrupt`` for something else than a variable.
     """
 
-    def __init__(self, data: bytes | memoryview, order: str, *, partial: bool = False) -> None:
-        self._data = data
+    def __init__(self, source: PlainBytes, order: str) -> None:
+        self._source = source
         self._order = order
-        self._partial = partial
+        kind, size = struct.unpack(order + "II", source.read(TAG))
+        if kind != MATRIX:
+            raise Unusable("corrupt", "what is compressed is no variable; copy the file again")
+        self.size = TAG + size
 
     def name(self) -> str:
         """Read the variable's name; empty for those without, which no map can mean."""
-        outer = self._element(0, len(self._data))
-        if outer.start == outer.stop:
+        if self.size == TAG or self._flags(self.size)[0] == _OPAQUE:
             return ""
-        kind, _, at = self._flags(outer)
-        if kind == 17:  # objects of newer classes say their names elsewhere
-            return ""
-        _, at = self._dimensions(at, outer.stop)
-        found = self._element(at, outer.stop)
-        return str(self._data[found.start : found.stop], "latin-1")
+        self._shape(self.size)
+        return self._name(self.size)
 
-    def check(self, name: str) -> None:
-        """Refuse what scipy must not be given.
+    def arrays(self, name: str, *, inside: bool) -> Iterator[Array]:
+        """Give all arrays that are no structs.
+
+        Parameters
+        ----------
+        name : str
+            Of the variable.
+        inside : bool
+            Whether the fields of a struct are called without the name of the variable.
 
         Raises
         ------
         Unusable
-            With reason ``columns`` for objects, functions and sparse matrices, with reason
-            ``corrupt`` where sizes contradict each other.
+            With reason ``corrupt`` where sizes contradict each other.
         """
-        outer = self._element(0, len(self._data))
-        if outer.kind != MATRIX or outer.after != len(self._data):
-            raise cut_off(0)
-        self._matrix(outer, name, 0)
+        yield from self._matrix(name, self.size, 0, inside=inside)
+        self._go(self.size)
+        self._source.finish()
 
-    def _element(self, at: int, stop: int) -> _Data:
-        """Read the tag of a data element inside ``stop``."""
+    def _go(self, at: int) -> None:
+        self._source.skip(at - self._source.at)
+
+    def _element(self, stop: int) -> _Element:
+        """Read the tag of a data element, which ends at ``stop`` or before."""
+        at = self._source.at
         if at + TAG > stop:
             raise cut_off(at)
-        first, size = struct.unpack_from(self._order + "II", self._data, at)
-        if first >> 16:  # up to four bytes stand inside the tag itself
-            kind, size, start = first & 0xFFFF, first >> 16, at + 4
-            after = at + TAG
-            if size > 4:
-                raise cut_off(at)
+        (kind,) = struct.unpack(self._order + "I", self._source.read(4))
+        if kind >> 16:  # up to four bytes stand inside the tag itself
+            kind, size, after = kind & 0xFFFF, kind >> 16, at + TAG
         else:
-            kind, start = first, at + TAG
-            padding = 0 if kind == MATRIX else -size % 8
-            after = start + size + padding
-        if self._partial:
-            return _Data(kind, start, min(start + size, stop), min(after, stop))
-        if start + size > stop:
+            (size,) = struct.unpack(self._order + "I", self._source.read(4))
+            after = at + TAG + size + (0 if kind == MATRIX else -size % 8)
+        # The last element need not be padded.
+        after = min(after, stop)
+        if self._source.at + size > after:
             raise cut_off(at)
-        return _Data(kind, start, start + size, min(after, stop))
+        return _Element(kind, size, after)
 
-    def _integers(self, data: _Data) -> tuple[int, ...]:
-        count = (data.stop - data.start) // 4
-        return struct.unpack_from(f"{self._order}{count}i", self._data, data.start)
+    def _read(self, stop: int, kind: int) -> bytes:
+        """Read a short data element of a type."""
+        found = self._element(stop)
+        if found.kind != kind or found.size > _LONGEST:
+            raise cut_off(self._source.at)
+        content = self._source.read(found.size)
+        self._go(found.after)
+        return content
 
-    def _flags(self, outer: _Data) -> tuple[int, bool, int]:
-        """Read class, whether complex, and where the dimensions begin."""
-        data = self._element(outer.start, outer.stop)
-        if data.kind != _UINT32 or data.stop - data.start != 8:
+    def _integers(self, stop: int) -> tuple[int, ...]:
+        content = self._read(stop, _INT32)
+        return struct.unpack(f"{self._order}{len(content) // 4}i", content)
+
+    def _flags(self, stop: int) -> tuple[int, bool]:
+        """Read class, and whether complex."""
+        content = self._read(stop, _UINT32)
+        if len(content) != 8:
             raise Unusable("corrupt", "a variable does not say its class; copy the file again")
-        (word,) = struct.unpack_from(self._order + "I", self._data, data.start)
-        return word & 0xFF, bool(word & _COMPLEX), data.after
+        (word,) = struct.unpack_from(self._order + "I", content)
+        return word & 0xFF, bool(word & _COMPLEX)
 
-    def _dimensions(self, at: int, stop: int) -> tuple[int, int]:
-        """Read the number of entries, and where the name begins."""
-        data = self._element(at, stop)
-        sizes = self._integers(data)
-        if data.kind != _INT32 or not 1 <= len(sizes) <= _MOST_DIMENSIONS or min(sizes) < 0:
-            raise Unusable("corrupt", f"impossible dimensions at byte {at}; copy the file again")
-        return prod(sizes), data.after
+    def _shape(self, stop: int) -> tuple[int, ...]:
+        sizes = self._integers(stop)
+        if not 1 <= len(sizes) <= _MOST_DIMENSIONS or min(sizes) < 0:
+            raise Unusable("corrupt", "a variable of impossible dimensions; copy the file again")
+        return sizes
 
-    def _matrix(self, outer: _Data, name: str, depth: int) -> None:
-        if outer.start == outer.stop:
+    def _name(self, stop: int) -> str:
+        return str(self._read(stop, _INT8), "latin-1")
+
+    def _matrix(self, name: str, stop: int, depth: int, *, inside: bool = False) -> Iterator[Array]:
+        if self._source.at == stop:
+            yield Array(name, (0, 0), NUMBERS, self._source, self._order)
             return
         if depth > _DEEPEST:
-            raise Unusable("corrupt", f"variable {name!r} is nested deeper than {_DEEPEST}")
-        kind, is_complex, at = self._flags(outer)
-        if kind in _REFUSED:
-            raise Unusable(
-                "columns", f"variable {name!r} holds {_REFUSED[kind]}; save plain arrays or structs"
-            )
-        n_entries, at = self._dimensions(at, outer.stop)
-        label = self._element(at, outer.stop)
-        if label.kind != _INT8:
-            raise cut_off(at)
-        if kind in (_CELL, _STRUCT):
-            n_fields, at = 1, label.after
-            if kind == _STRUCT:
-                n_fields, at = self._fields(at, outer.stop)
-            self._children(n_entries * n_fields, at, outer.stop, name, depth)
-        elif kind == _CHAR or kind in _NUMERIC:
-            at = label.after
-            for _ in range(2 if is_complex else 1):
-                at = self._values(n_entries, at, outer.stop)
+            raise Unusable("corrupt", f"{name[:80]!r} is nested deeper than {_DEEPEST}")
+        kind, is_complex = self._flags(stop)
+        shape: tuple[int, ...] = ()
+        # Objects of newer classes have other parts.
+        if kind != _OPAQUE:
+            shape = self._shape(stop)
+            self._name(stop)
+        if kind == _STRUCT:
+            yield from self._struct("" if inside else name, prod(shape), stop, depth)
+        elif kind in _OTHERS:
+            yield Array(name, shape, _OTHERS[kind], self._source, self._order)
+        elif kind == _CHAR:
+            content = self._content(stop, _ENCODINGS)
+            yield Array(name, shape, TEXT, self._source, self._order, content.kind, content.size)
+        elif kind in _NUMERIC:
+            content = self._content(stop, _TYPES)
+            if content.size != prod(shape) * struct.calcsize("=" + _TYPES[content.kind]):
+                raise cut_off(self._source.at)
+            what = "complex numbers" if is_complex else NUMBERS
+            yield Array(name, shape, what, self._source, self._order, content.kind, content.size)
         else:
-            raise Unusable("corrupt", f"variable {name!r} is of the unknown class {kind}")
+            raise Unusable("corrupt", f"{name[:80]!r} is of the unknown class {kind}")
 
-    def _fields(self, at: int, stop: int) -> tuple[int, int]:
-        """Count the fields of a struct, and tell where their values begin."""
-        length = self._element(at, stop)
-        sizes = self._integers(length)
-        names = self._element(length.after, stop)
-        n_bytes = names.stop - names.start
-        if length.kind != _INT32 or len(sizes) != 1 or sizes[0] < 1 or n_bytes % sizes[0]:
-            raise Unusable("corrupt", f"impossible fields at byte {at}; copy the file again")
-        return n_bytes // sizes[0], names.after
+    def _content(self, stop: int, kinds: dict[int, str]) -> _Element:
+        found = self._element(stop)
+        if found.kind not in kinds:
+            raise cut_off(self._source.at)
+        return found
 
-    def _children(self, count: int, at: int, stop: int, name: str, depth: int) -> None:
-        if count * TAG > stop - at:
-            raise cut_off(at)
-        for _ in range(count):
-            child = self._element(at, stop)
-            if child.kind != MATRIX:
-                raise Unusable("corrupt", f"no array at byte {at} of {name!r}; copy the file again")
-            self._matrix(child, name, depth + 1)
-            at = child.after
+    def _struct(self, name: str, n_items: int, stop: int, depth: int) -> Iterator[Array]:
+        fields = self._fields(stop)
+        if n_items * len(fields) * TAG > stop - self._source.at:
+            raise cut_off(self._source.at)
+        for k in range(n_items if fields else 0):
+            whole = name if n_items == 1 else f"{name}({k + 1})"
+            for field in fields:
+                found = self._element(stop)
+                if found.kind != MATRIX:
+                    raise cut_off(self._source.at)
+                label = f"{whole}.{field}" if whole else field
+                yield from self._matrix(label, self._source.at + found.size, depth + 1)
+                self._go(found.after)
 
-    def _values(self, n_entries: int, at: int, stop: int) -> int:
-        """Check numbers or characters; an entry takes a byte at least."""
-        data = self._element(at, stop)
-        if data.kind not in _PLAIN or n_entries > data.stop - data.start:
-            raise cut_off(at)
-        return data.after
+    def _fields(self, stop: int) -> list[str]:
+        """Read the names of a struct's fields."""
+        length = sum(self._integers(stop))
+        names = self._read(stop, _INT8)
+        if not 1 <= length <= _LONGEST_NAME or len(names) % length:
+            raise Unusable("corrupt", "a struct of impossible fields; copy the file again")
+        return [
+            str(names[k : k + length].split(b"\0")[0], "latin-1")
+            for k in range(0, len(names), length)
+        ]

@@ -5,14 +5,15 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from lmshealth.arrays import FloatArray
 from lmshealth.readers.columns import ColumnMap
 from lmshealth.readers.raw import Format, Raw, check_size, missing_library, not_numeric, wanted
+from lmshealth.readers.spool import spools
 from lmshealth.readers.trouble import Unusable, listed
+from lmshealth.samples import BLOCK, MINUTE, Samples
 
 _MAGIC = b"PAR1"
+# Of each column so many bytes of the file are read ahead.
+_BUFFER = 1 << 20
 # Written by the libraries about themselves, nothing the user said about the log.
 _LIBRARY_KEYS = frozenset({b"pandas", b"ARROW:schema"})
 
@@ -22,8 +23,10 @@ def _load(path: Path, columns: ColumnMap) -> Raw:
         import pyarrow.parquet as pq
     except ImportError as error:
         raise missing_library("Parquet", "pyarrow") from error
-    # Without pre_buffer the columns are streamed; with it the whole file is held twice.
-    with pq.ParquetFile(path, pre_buffer=False, page_checksum_verification=True) as file:
+    # With pre_buffer, or without a buffer's size, a row group is held whole, and one may be all.
+    with pq.ParquetFile(
+        path, pre_buffer=False, buffer_size=_BUFFER, page_checksum_verification=True
+    ) as file:
         schema = file.schema_arrow
         names = list(schema.names)
         chosen = wanted(names, columns)
@@ -32,9 +35,8 @@ def _load(path: Path, columns: ColumnMap) -> Raw:
         for name in chosen:
             _check_type(name, schema.field(name).type)
         check_size(8 * file.metadata.num_rows * len(chosen), path.stat().st_size)
-        table = file.read(columns=chosen, use_threads=False) if chosen else None
+        read = _columns(file, chosen) if chosen else {}
         metadata = _text(schema.metadata)
-    read = {name: _float64(table.column(name)) for name in chosen} if table is not None else {}
     return Raw(read, metadata, tuple(names))
 
 
@@ -45,9 +47,15 @@ def _check_type(name: str, kind: Any) -> None:
         raise not_numeric(name, f"values of type {kind}")
 
 
-def _float64(column: Any) -> FloatArray:
-    """Convert a column, nulls to NaN, shape ``(n_rows,)``."""
-    return np.array(column.to_numpy(), dtype=np.float64)
+def _columns(file: Any, chosen: list[str]) -> dict[str, Samples]:
+    """Read columns, beyond a minute block by block; nulls as NaN, shape ``(n_rows,)`` each."""
+    n_rows = file.metadata.num_rows
+    size = max(1, n_rows) if n_rows <= MINUTE else BLOCK
+    with spools(chosen) as taken:
+        for batch in file.iter_batches(size, columns=chosen, use_threads=False):
+            for name, spool in taken.items():
+                spool.append(batch.column(name).to_numpy(zero_copy_only=False))
+    return {name: spool.samples() for name, spool in taken.items()}
 
 
 def _text(metadata: dict[bytes, bytes] | None) -> dict[str, str]:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import tempfile
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from typing import IO
 
 import numpy as np
@@ -16,9 +18,15 @@ class Spool:
     """Takes the samples of one column in blocks.
 
     The temporary file of a long column has no name and is gone with the last `Stored` of it.
+
+    Parameters
+    ----------
+    expected : int
+        Number of samples, where it is known: up to a minute of them need not be joined then.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, expected: int = 0) -> None:
+        self._memory = np.empty(expected if 0 < expected <= MINUTE else 0)
         self._parts: list[FloatArray] = []
         self._size = 0
         self._file: IO[bytes] | None = None
@@ -36,9 +44,13 @@ class Spool:
         Unusable
             With reason ``too-large`` where the disk is full.
         """
-        values = np.asarray(block, dtype=np.float64)
-        self._size += values.size
-        self._parts.append(values)
+        start, self._size = self._size, self._size + block.size
+        if self._size <= self._memory.size:
+            self._memory[start : self._size] = block
+            return
+        if self._memory.size:
+            self._parts, self._memory = [self._memory[:start]], np.empty(0)
+        self._parts.append(np.asarray(block, dtype=np.float64))
         if self._file is not None or self._size > MINUTE:
             self._write()
 
@@ -47,9 +59,16 @@ class Spool:
         if self._file is not None:
             self._file.flush()
             return Stored(self._file, self._size)
+        if self._memory.size:
+            return self._memory[: self._size]
         if len(self._parts) != 1:
             self._parts = [np.concatenate(self._parts) if self._parts else np.empty(0)]
         return self._parts[0]
+
+    def close(self) -> None:
+        """Give up the file of what was taken and will not be asked for."""
+        if self._file is not None:
+            self._file.close()
 
     def _write(self) -> None:
         try:
@@ -64,3 +83,23 @@ class Spool:
                 f"({error.strerror}); set TMPDIR to a folder on a larger disk",
             ) from error
         self._parts.clear()
+
+
+@contextmanager
+def spools(names: Iterable[str], *, expected: int = 0) -> Iterator[dict[str, Spool]]:
+    """Make a spool for each column; where reading fails, their files are closed.
+
+    Parameters
+    ----------
+    names : iterable of str
+        The columns.
+    expected : int
+        Number of samples of each, where it is known.
+    """
+    opened = {name: Spool(expected) for name in names}
+    try:
+        yield opened
+    except BaseException:
+        for spool in opened.values():
+            spool.close()
+        raise

@@ -3,21 +3,24 @@
 from __future__ import annotations
 
 import logging
+import os
 import re
 import struct
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 
-from lmshealth.arrays import FloatArray
 from lmshealth.readers.channels import Chosen, Described, choose, present
 from lmshealth.readers.columns import ColumnMap
 from lmshealth.readers.metadata import KEYS
 from lmshealth.readers.raw import Format, Raw, check_size, missing_library, not_numeric
+from lmshealth.readers.spool import spools
+from lmshealth.readers.tdmsdata import raw_samples
 from lmshealth.readers.trouble import Unusable, listed
+from lmshealth.samples import Samples
 
 _MAGIC = b"TDSm"
 # Lead-in of a segment: tag, table of contents, version, length of the rest, offset of its samples.
@@ -48,7 +51,7 @@ def _load(path: Path, columns: ColumnMap) -> Raw:
         _check_scales([channel.properties for channel in channels])
         described = _described(channels)
         chosen = choose(described, columns)
-        read = _read(file, {name: channels[k] for name, k in chosen.columns.items()}, path)
+        read = _read(file, {name: channels[k] for name, k in chosen.columns.items()}, stream)
         metadata = _metadata(file.properties, channels, chosen)
     return Raw(read, metadata, present(described), chosen.refused)
 
@@ -130,24 +133,30 @@ def _rate(increment: object) -> float | None:
     return 1 / float(increment)
 
 
-def _read(file: Any, chosen: dict[str, Any], path: Path) -> dict[str, FloatArray]:
+def _read(file: Any, chosen: dict[str, Any], stream: IO[bytes]) -> dict[str, Samples]:
     """Read the wanted channels in one pass, each of shape ``(n_samples,)``."""
+    from nptdms.tdms import ChannelDataChunk
+
     for name, channel in chosen.items():
         if channel.dtype.kind not in "fiu":
             raise not_numeric(name, f"values of type {channel.dtype}")
-    check_size(8 * sum(len(channel) for channel in chosen.values()), path.stat().st_size)
-    read = {name: np.full(len(channel), np.nan) for name, channel in chosen.items()}
-    filled = dict.fromkeys(chosen, 0)
-    # Channel by channel would read interleaved samples as often as there are channels.
-    for chunk in file.data_chunks() if chosen else ():
+    n_samples = sum(len(channel) for channel in chosen.values())
+    check_size(8 * n_samples, os.fstat(stream.fileno()).st_size)
+    names = {channel.path: name for name, channel in chosen.items()}
+    longest = max(map(len, chosen.values()), default=0)
+    with spools(chosen, expected=longest) as taken:
+        # npTDMS keeps to itself where the samples are.
+        for segment in file._reader._segments:
+            for path, raw in raw_samples(stream, segment, names):
+                name = names[path]
+                # Only asking for its samples scales a chunk.
+                taken[name].append(ChannelDataChunk(chosen[name], raw, taken[name].size)[:])
         for name, channel in chosen.items():
-            values = chunk[channel.group_name][channel.name][:]
-            read[name][filled[name] : filled[name] + len(values)] = values
-            filled[name] += len(values)
-    for name, channel in chosen.items():
-        if filled[name] != len(channel):
-            raise Unusable("corrupt", f"{name}: {filled[name]} of {len(channel)} samples are there")
-    return read
+            if taken[name].size != len(channel):
+                raise Unusable(
+                    "corrupt", f"{name}: {taken[name].size} of {len(channel)} samples are there"
+                )
+        return {name: spool.samples() for name, spool in taken.items()}
 
 
 def _metadata(

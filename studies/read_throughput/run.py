@@ -2,83 +2,89 @@
 
 Question
     How long does each reader take, as a ratio to the bare library call that gives the same
-    columns in the same process, and which of the real samples are read, which refused and why?
+    columns in the same process? How much memory does it take for a long log? Which of the real
+    samples are read, which refused and why?
 Method
     One minute of four signals at 20 kHz with the metadata of a log, written once in each format.
     Bare call and reader take turns; the least processor time of each counts. Beside it what
     `read_log` takes as a whole, which also hashes the file and judges every sample. CSV is
-    compared with the faster one of pandas' C engine and pyarrow's reader. Then every UFF58, TDMS,
-    MAT and CSV file of the real samples is read without and with its column map.
+    compared with the faster one of pandas' C engine and pyarrow's reader. Then ten minutes of the
+    same signals, read in a process of its own by the reader and by the bare call: the peak of its
+    memory, less what it had after a short file, in minutes of the log (8 bytes for each sample of
+    each channel), and the processor time. The bare call is the control: it holds all of the log,
+    and what the reader puts on disk costs time that it does not. Then every UFF58, TDMS,
+    MAT and delimited file of the real samples is read without and with its column map.
 Run time
-    About a minute.
+    About ten minutes, and 2 GB of disk.
 Data
-    All folders of LMSHEALTH_DATA; without them only the times are measured.
+    All folders of LMSHEALTH_DATA; without them only times and memory are measured.
 """
 
 from __future__ import annotations
 
 import argparse
-import contextlib
-import gzip
 import json
 import os
-import shutil
 import tempfile
 import time
 import tomllib
-import warnings
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-import h5py
 import msgspec
-import numpy as np
-import pandas as pd
-import pyarrow as pa
-import pyarrow.csv
-import pyarrow.parquet as pq
-import pyuff
-import scipy.io
-from nptdms import ChannelObject, RootObject, TdmsFile, TdmsWriter
 
 from lmshealth.errors import BadLog
 from lmshealth.readers import ColumnMap, read_log
 from lmshealth.readers.formats import load
+from studies.read_throughput.files import BARE, RATE, Call, signals, write
+from studies.read_throughput.memory import needs
 from studies.read_throughput.samples import MAPS
 from studies.record import Stopwatch, keep
 
 HERE = Path(__file__).parent
-RATE = 20_000
 # Noise and fixed costs do not shrink with the file: the quick form is judged more mildly. An HDF5
 # reader that searched for damage as slowly as it might took 3.0 times the library.
 BOUND, QUICK_BOUND = 1.3, 2.5
 BOUNDED = ("log.h5", "log.parquet", "log.tdms", "plain.mat", "packed.mat", "log.csv")
-META = {
-    "stage": "demo-Y",
-    "recorded_at": "2026-03-01T08:30:00+01:00",
-    "travel_km": "123.5",
-    "sample_rate_hz": str(RATE),
-}
+# Of the log held in memory at once.
+MOST_MINUTES = 4
+LONG_MINUTES, QUICK_MINUTES = 10, 5
+QUICK_MEMORY = ("log.h5", "log.parquet", "log.csv.gz", "packed.mat")
 SUFFIXES = (".uff", ".tdms", ".mat", ".csv", ".gz")
 
 
 def main() -> None:
-    """Run the study; ``--quick`` reads half a minute instead of a whole and records nothing."""
+    """Run the study; ``--quick`` reads less of fewer formats and records nothing."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--quick", action="store_true")
     quick = parser.parse_args().quick
     watch = Stopwatch()
     with tempfile.TemporaryDirectory() as folder:
-        write(Path(folder), RATE * (30 if quick else 60))
-        times = {name: compare(Path(folder) / name, call) for name, call in BARE.items()}
+        columns = signals(RATE * (30 if quick else 60))
+        times = {
+            name: compare(write(Path(folder) / name, columns), BARE[name])
+            for name in (BOUNDED if quick else BARE)
+        }
+    long = QUICK_MINUTES if quick else LONG_MINUTES
+    memory = {
+        name: long_log(name, long, ("delta_e_um",) if quick else tuple(columns))
+        for name in (QUICK_MEMORY if quick else BARE)
+    }
     bound = QUICK_BOUND if quick else BOUND
     answer = {
         "seed": 0,
         "times": times,
         "bound": bound,
         "passed": {name: times[name]["ratio"] <= bound for name in BOUNDED},
+        "memory_minutes": long,
+        "memory": memory,
+        "memory_bound": MOST_MINUTES,
+        "memory_passed": {
+            name: row["minutes_of_reader"] < MOST_MINUTES < row["minutes_of_library"]
+            for name, row in memory.items()
+        },
         "samples": samples() if "LMSHEALTH_DATA" in os.environ else None,
     }
     if not quick:
@@ -88,100 +94,6 @@ def main() -> None:
     print(json.dumps(answer, indent=1))
 
 
-def write(folder: Path, n: int) -> None:
-    """Write the same log in every format."""
-    rng = np.random.default_rng(0)
-    columns = {
-        "delta_e_um": rng.normal(0, 0.05, n),
-        "acc_feed_m_s2": rng.normal(0, 0.3, n),
-        "acc_pitch_m_s2": rng.normal(0, 0.3, n),
-        "reference_velocity_mm_s": np.full(n, 100.0),
-    }
-    with h5py.File(folder / "log.h5", "w") as file:
-        for name, values in columns.items():
-            file[name] = values
-        file.attrs.update(META)
-    table = pa.table(columns).replace_schema_metadata(META)
-    pq.write_table(table, folder / "log.parquet", use_dictionary=False)
-    with TdmsWriter(str(folder / "log.tdms")) as writer:
-        for start in range(0, n, RATE):
-            second = slice(start, start + RATE)
-            channels = [ChannelObject("log", k, v[second]) for k, v in columns.items()]
-            writer.write_segment([RootObject(META), *channels])
-    scipy.io.savemat(folder / "plain.mat", columns | META)
-    scipy.io.savemat(folder / "packed.mat", columns | META, do_compression=True)
-    with (folder / "log.csv").open("w") as stream:
-        stream.writelines(f"# {key}: {value}\n" for key, value in META.items())
-        pd.DataFrame(columns).to_csv(stream, index=False)
-    with (folder / "log.csv").open("rb") as text, gzip.open(folder / "log.csv.gz", "wb", 1) as to:
-        shutil.copyfileobj(text, to)
-    for kind in ("ascii", "binary"):
-        write_uff(folder / f"{kind}.uff", columns, binary=int(kind == "binary"))
-
-
-def write_uff(path: Path, columns: dict[str, Any], *, binary: int) -> None:
-    """Write time records, each under its column's name."""
-    file = pyuff.UFF(str(path))
-    for name, values in columns.items():
-        record = pyuff.prepare_58(
-            binary=binary, id1=name, func_type=1, rsp_node=1, rsp_dir=1, ref_node=0, ref_dir=0,
-            data=values, x=np.arange(values.size) / RATE, abscissa_spacing=1,
-            abscissa_min=0.0, abscissa_inc=1 / RATE, abscissa_spec_data_type=17,
-            ordinate_spec_data_type=0, orddenom_spec_data_type=0,
-        )  # fmt: skip
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", ResourceWarning)  # pyuff leaves the file open
-            file.write_sets([record], mode="add")
-
-
-def bare_hdf5(path: Path) -> object:
-    """Read every dataset with h5py."""
-    with h5py.File(path) as file:
-        return {name: file[name][()] for name in file}
-
-
-def bare_parquet(path: Path) -> object:
-    """Read every column with pyarrow."""
-    table = pq.read_table(path)
-    return {name: table.column(name).to_numpy() for name in table.column_names}
-
-
-def bare_tdms(path: Path) -> object:
-    """Read every channel with npTDMS."""
-    file = TdmsFile.read(path)
-    return {channel.name: channel[:] for group in file.groups() for channel in group.channels()}
-
-
-def bare_pandas(path: Path) -> object:
-    """Read every column with pandas; it unpacks gzip by itself."""
-    return dict(pd.read_csv(path, skiprows=len(META), engine="c").items())
-
-
-def bare_arrow(path: Path) -> object:
-    """Read every column with pyarrow; it unpacks gzip by itself."""
-    skip = pyarrow.csv.ReadOptions(skip_rows=len(META))
-    table = pyarrow.csv.read_csv(path, read_options=skip)
-    return {name: table.column(name).to_numpy() for name in table.column_names}
-
-
-def bare_uff(path: Path) -> object:
-    """Read every data set with pyuff."""
-    return pyuff.UFF(str(path)).read_sets()
-
-
-BARE: dict[str, tuple[Callable[[Path], object], ...]] = {
-    "log.h5": (bare_hdf5,),
-    "log.parquet": (bare_parquet,),
-    "log.tdms": (bare_tdms,),
-    "plain.mat": (scipy.io.loadmat,),
-    "packed.mat": (scipy.io.loadmat,),
-    "log.csv": (bare_pandas, bare_arrow),
-    "log.csv.gz": (bare_pandas, bare_arrow),
-    "ascii.uff": (bare_uff,),
-    "binary.uff": (bare_uff,),
-}
-
-
 def cost(work: Callable[[], object]) -> float:
     """Return the processor time of one call in s, over all threads."""
     start = time.process_time()
@@ -189,7 +101,7 @@ def cost(work: Callable[[], object]) -> float:
     return time.process_time() - start
 
 
-def compare(path: Path, calls: tuple[Callable[[Path], object], ...]) -> dict[str, Any]:
+def compare(path: Path, calls: tuple[Call, ...]) -> dict[str, Any]:
     """Let libraries and reader take turns on one file."""
     rounds = 2 if path.suffix == ".uff" else 9
     libraries: dict[str, list[float]] = {call.__name__: [] for call in calls}
@@ -213,6 +125,25 @@ def compare(path: Path, calls: tuple[Callable[[Path], object], ...]) -> dict[str
     }
 
 
+def long_log(name: str, n_minutes: int, chosen: tuple[str, ...]) -> dict[str, float]:
+    """Give the peak memory of reader and library, in minutes of the log, and their time."""
+    with tempfile.TemporaryDirectory() as folder:
+        (Path(folder) / "short").mkdir()
+        paths = Path(folder) / name, Path(folder) / "short" / name
+        for path, seconds in zip(paths, (60 * n_minutes, 1), strict=True):
+            columns = signals(RATE * seconds)
+            write(path, {key: columns[key] for key in chosen})
+        del columns
+        found = needs(*paths)
+    minute = 8 * 60 * RATE * len(chosen)
+    return {
+        "minutes_of_reader": round(found["reader"]["bytes"] / minute, 2),
+        "minutes_of_library": round(found["library"]["bytes"] / minute, 2),
+        "cpu_s_of_reader": round(found["reader"]["cpu_s"], 3),
+        "cpu_s_of_library": round(found["library"]["cpu_s"], 3),
+    }
+
+
 def samples() -> dict[str, dict[str, str]]:
     """Read every sample without and with its column map."""
     data = Path(os.environ["LMSHEALTH_DATA"])
@@ -221,16 +152,12 @@ def samples() -> dict[str, dict[str, str]]:
 
 
 def outcomes(path: Path, data: Path) -> dict[str, str]:
-    """Say what becomes of one sample; text under another suffix is offered as CSV."""
+    """Say what becomes of one sample."""
     name = path.relative_to(data).as_posix()
     found = {"as it is": outcome(path, ColumnMap(), name)}
     if name in MAPS:
         columns = msgspec.convert(tomllib.loads(MAPS[name]), ColumnMap)
-        with contextlib.ExitStack() as stack:
-            if path.name.endswith(".txt.gz"):
-                folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
-                path = Path(shutil.copyfile(path, folder / "renamed.csv.gz"))
-            found["with its map"] = outcome(path, columns, name)
+        found["with its map"] = outcome(path, columns, name)
     return found
 
 

@@ -11,11 +11,11 @@ HEADER = "file,stage,travel_km,baseline\n"
 
 
 def test_find_logs(tmp_path):
-    """Logs are found by suffix, sorted; tables beside them and hidden files are none."""
+    """Logs are found by suffix, sorted; tables and texts beside them and hidden files are none."""
     (tmp_path / "sub").mkdir()
     (tmp_path / ".git").mkdir()
     names = ["b.csv", "a.H5", "sub/c.csv.gz", "sub/manifest.csv", "maintenance.csv", "truth.csv"]
-    for name in [*names, "notes.txt", ".git/d.csv", "._b.csv"]:
+    for name in [*names, "notes.txt", "notes.txt.gz", "sub/x.dat", ".git/d.csv", "._b.csv"]:
         (tmp_path / name).write_bytes(b"")
     found = find_logs(tmp_path)
     logs, refused = found

@@ -1,7 +1,13 @@
 """Delimited text: layouts, damage, and what must not be guessed."""
 
+import gzip
+import io
+
+import numpy as np
+import pandas as pd
 import pytest
 
+from lmshealth.readers import delimited, read_log, text
 from lmshealth.readers.columns import ColumnMap, CsvLayout
 from lmshealth.readers.delimited import parse_text
 from lmshealth.readers.trouble import Unusable
@@ -9,8 +15,13 @@ from lmshealth.readers.trouble import Unusable
 
 def parse(text, **layout):
     """Parse text or bytes with a layout."""
+    return parse_with(text, ColumnMap(csv=CsvLayout(**layout)))
+
+
+def parse_with(text, columns):
+    """Parse text or bytes by a column map."""
     data = text if isinstance(text, bytes) else text.encode()
-    return parse_text(data, ColumnMap(csv=CsvLayout(**layout)))
+    return parse_text(io.BytesIO(data), len(data), columns)
 
 
 def test_leading_lines():
@@ -33,7 +44,7 @@ def test_layout():
     raw = parse("1,2\n3,4\n", header=["delta_e_um", "x"])
     assert raw.columns["delta_e_um"].tolist() == [1.0, 3.0]
     numbered = ColumnMap(columns={"delta_e_um": "1"}, csv=CsvLayout(header=False))
-    assert parse_text(b"1,2\n3,4\n", numbered).columns["1"].tolist() == [2.0, 4.0]
+    assert parse_with(b"1,2\n3,4\n", numbered).columns["1"].tolist() == [2.0, 4.0]
 
 
 @pytest.mark.parametrize(
@@ -42,7 +53,8 @@ def test_layout():
         ("", "empty", "header"),
         ("# stage: A\n", "empty", "header"),
         ("delta_e_um\n", "empty", "rows"),
-        ("delta_e_um,b\n1,2\n3,4,5\n", "corrupt", "3"),
+        ("delta_e_um,b\n1,2\n3,4,5\n", "corrupt", "row 2 has 3"),
+        ("delta_e_um,b\n1,2\n3,4,5,6\n", "corrupt", "row 2 has 4 fields, the first line 2"),
         ("delta_e_um,b\n1,2,9\n3,4,5\n", "corrupt", ""),
         ("delta_e_um,b\n1,2\n3", "corrupt", "1 of 2"),
         ("delta_e_um\n1\noops\n", "columns", "'oops' in row 2"),
@@ -71,7 +83,7 @@ def test_blanks_around_numbers():
     raw = parse("delta_e_um, b, c\n 1 , 2,  \n 3 ,\t4, 5\n")
     assert raw.columns["delta_e_um"].tolist() == [1.0, 3.0]
     both = ColumnMap(columns={"delta_e_um": "delta_e_um", "acc_c_g": "c"})
-    raw = parse_text(b"delta_e_um, c\n1,\n2, 5\n", both)
+    raw = parse_with(b"delta_e_um, c\n1,\n2, 5\n", both)
     assert str(raw.columns["c"].tolist()) == "[nan, 5.0]"
 
 
@@ -79,3 +91,88 @@ def test_text_beside_numbers():
     """A column that nobody wants may change from numbers to text."""
     rows = "".join(f"{k},{k if k < 200_000 else 'late'}\n" for k in range(200_100))
     assert parse("delta_e_um,note\n" + rows).columns["delta_e_um"][-1] == 200_099.0
+
+
+@pytest.fixture
+def small_blocks(monkeypatch):
+    """Read ten rows at a time."""
+    monkeypatch.setattr(delimited, "_ROWS", 10)
+
+
+@pytest.mark.parametrize("version", [pd.__version__, "2.2.3"])
+@pytest.mark.parametrize("place", [0, 9, 10, 11, 20, 34])
+@pytest.mark.parametrize("row", ["7,8,9", "7,8,9,10", "7,8,x", "x,8,9"])
+def test_long_row_anywhere(small_blocks, monkeypatch, version, place, row):
+    """A row with too many fields is found at every place of a block, and its number is said."""
+    monkeypatch.setattr(pd, "__version__", version)
+    rows = ["1,2"] * 35
+    rows[place] = row
+    with pytest.raises(Unusable) as caught:
+        parse("delta_e_um,b\n" + "\n".join(rows) + "\n")
+    assert caught.value.reason == "corrupt"
+    # What is wrong with the very first row is a warning of pandas, without a number.
+    assert place == 0 or f"row {place + 1} has" in caught.value.detail
+
+
+def test_delimiter_behind_the_last_field(small_blocks):
+    """An empty field behind the last, as some exporters write it, is none."""
+    raw = parse("delta_e_um,b\n" + "1,2,\n" * 25)
+    assert raw.columns["delta_e_um"].tolist() == [1.0] * 25
+
+
+def test_row_of_a_late_text(small_blocks):
+    """The row of a text is counted from the first row, not from its block's."""
+    with pytest.raises(Unusable, match="'oops' in row 24"):
+        parse("delta_e_um\n" + "1\n" * 23 + "oops\n" + "1\n" * 5)
+
+
+def test_late_blanks(small_blocks):
+    """When a late block needs the careful way, no row comes twice."""
+    rows = "".join(f"{k},{k}\n" for k in range(25)) + "25 , 25\n"
+    values = parse("delta_e_um,b\n" + rows).columns["delta_e_um"]
+    assert values.tolist() == list(range(26))
+
+
+@pytest.mark.parametrize(
+    ("rows", "word"),
+    [
+        ("1,2\n" * 300_000 + "3", "1 of 2"),
+        ("1,2\n" * 300_000 + "\0", f"NUL byte at offset {13 + 1_200_000}"),
+        ("1,2\n" * 300_000 + '"1,2\n' + "1,2\n" * 600_000, "quote"),
+        ("1,2\n" * 300_000 + "1" * 2_000_000, f"offset {13 + 1_200_000} is longer"),
+    ],
+)
+def test_late_damage(monkeypatch, rows, word):
+    """Damage far behind the head is found as the text streams by."""
+    monkeypatch.setattr(text, "LONGEST_BLOCK", 1 << 21)
+    monkeypatch.setattr(delimited, "_ROWS", 10_000)
+    with pytest.raises(Unusable) as caught:
+        parse("delta_e_um,b\n" + rows)
+    assert caught.value.reason == "corrupt" and word in caught.value.detail
+
+
+def test_header_without_end():
+    """A file that is one long line is not held whole to name its columns."""
+    with pytest.raises(Unusable, match="longer than 1048576 bytes"):
+        parse("delta_e_um," * 200_000)
+
+
+def test_values_are_those_of_pandas():
+    """Blocks change no digit of what pandas reads at once, quick or carefully."""
+    values = np.random.default_rng(0).normal(size=(150_000, 2)) * [1e-9, 1e5]
+    lines = [f"{one!r},{other!r}\n" for one, other in values.tolist()]
+    data = "delta_e_um,acc_x_g\n" + "".join(lines)
+    whole = pd.read_csv(io.StringIO(data))
+    for content in (data, data.replace("\n", " \n", 3)):
+        raw = parse(content)
+        for name in whole.columns:
+            np.testing.assert_array_equal(raw.columns[name], whole[name].to_numpy())
+
+
+@pytest.mark.parametrize("name", ["log.txt", "LOG.TSV", "log.dat", "log.txt.gz", "log.tsv.gz"])
+def test_names_of_text(make, name):
+    """Delimited text is read under the names that exporters give it."""
+    data = make("log.csv").read_bytes()
+    path = make("log.csv").with_name(name)
+    path.write_bytes(gzip.compress(data) if name.endswith(".gz") else data)
+    assert len(read_log(path).channels) == 2

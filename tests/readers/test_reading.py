@@ -13,7 +13,7 @@ import pytest
 
 from lmshealth import readers
 from lmshealth.errors import BadLog
-from lmshealth.readers import content_digest, read_log, require_identity
+from lmshealth.readers import content_digest, raw, read_log, require_identity
 
 ALL = ["log.csv", "log.csv.gz", "log.parquet", "log.h5", "log.hdf5", "log.tdms", "log.mat"]
 
@@ -104,10 +104,11 @@ def test_unknown_suffix(tmp_path):
     refused(tmp_path / "log.xyz", "format", ".parquet", ".csv.gz")
 
 
-def test_gzip_bomb(tmp_path):
-    """A gzip bomb is stopped before it is unpacked."""
+def test_gzip_bomb(tmp_path, monkeypatch):
+    """A gzip bomb is stopped while it is unpacked."""
+    monkeypatch.setattr(raw, "SMALL_ENOUGH", 1 << 20)
     member = gzip.compress(b"0\n" * (1 << 24), 9)
-    (tmp_path / "bomb.csv.gz").write_bytes(member * 10)
+    (tmp_path / "bomb.csv.gz").write_bytes(gzip.compress(b"delta_e_um\n") + member)
     refused(tmp_path / "bomb.csv.gz", "too-large")
 
 

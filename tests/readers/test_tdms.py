@@ -106,6 +106,17 @@ def test_properties_are_metadata(tmp_path):
     assert read_log(path).metadata.recorded_at.year == 2026
 
 
+def test_velocity_is_metadata(tmp_path):
+    """The velocity at which a log was recorded is read in m/s; what is no number is refused."""
+    channel = ("x", NOISE, {"unit_string": "g", **RATE})
+    for said in (-100.0, "-100", 100):
+        path = write(tmp_path / "log.tdms", channel, root={"velocity_mm_s": said})
+        assert read_log(path).metadata.velocity == pytest.approx(0.001 * float(said), rel=1e-15)
+    assert read_log(write(tmp_path / "log.tdms", channel)).metadata.velocity is None
+    path = write(tmp_path / "log.tdms", channel, root={"velocity_mm_s": "fast"})
+    refused(path, "metadata", "velocity_mm_s", "'fast'")
+
+
 def test_scaled_samples(tmp_path):
     """Raw counts are scaled as the properties say."""
     scale = {

@@ -147,14 +147,6 @@ def test_damaged_tag(tmp_path):
     refused(path, "corrupt")
 
 
-def test_too_large(tmp_path):
-    """A file that would fill the memory is refused unread; it may be sparse on the disk."""
-    path = write(tmp_path / "log.uff")
-    with path.open("r+b") as stream:
-        stream.truncate(1 << 30)
-    refused(path, "too-large", "split the recording")
-
-
 def test_without_pyuff(tmp_path, monkeypatch):
     """Without pyuff the error names the extra to install."""
     monkeypatch.setitem(sys.modules, "pyuff", None)

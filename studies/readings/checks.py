@@ -1,0 +1,80 @@
+"""How a figure is asked, measured and judged; and the command line called as a user does."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from typing import Any
+
+from studies.record import clopper_pearson
+
+Check = dict[str, Any]
+
+# A mean is unbiased within so many of its standard errors, and a distribution is the one said to
+# be if its test has such a p-value or a larger one: a right reading fails once in 10,000 studies.
+STANDARD_ERRORS, P_VALUE = 4.0, 1e-4
+# A rate is the nominal one if its interval of this level holds it.
+LEVEL = 0.999
+
+
+def below(measured: float, limit: float) -> Check:
+    """Ask for less than a limit."""
+    return {"asked": f"below {limit:g}", "measured": measured, "passed": bool(measured < limit)}
+
+
+def at_least(measured: float, limit: float) -> Check:
+    """Ask for a limit or more."""
+    return {"asked": f"at least {limit:g}", "measured": measured, "passed": measured >= limit}
+
+
+def unbiased(measured: float, truth: float, error: float) -> Check:
+    """Ask for the truth within some standard errors."""
+    return {
+        "asked": f"{truth:.6g} within {STANDARD_ERRORS:g} standard errors",
+        "measured": measured,
+        "standard_error": error,
+        "passed": bool(abs(measured - truth) < STANDARD_ERRORS * error),
+    }
+
+
+def likely(p_value: float, distribution: str) -> Check:
+    """Ask for a distribution that a test does not reject."""
+    return {
+        "asked": f"{distribution}: p above {P_VALUE:g}",
+        "measured": p_value,
+        "passed": bool(p_value > P_VALUE),
+    }
+
+
+def rate(hits: int, trials: int, nominal: float) -> Check:
+    """Ask for a rate whose Clopper-Pearson interval holds the nominal one."""
+    low, high = clopper_pearson(hits, trials, LEVEL)
+    return {
+        "asked": f"{nominal:g} inside its {100 * LEVEL:g} % Clopper-Pearson interval",
+        "measured": hits / trials,
+        "interval": [low, high],
+        "trials": trials,
+        "passed": low <= nominal <= high,
+    }
+
+
+def control(check: Check) -> Check:
+    """Ask a check to fail."""
+    return {
+        **check,
+        "asked": f"to be refused, which was: {check['asked']}",
+        "passed": not check["passed"],
+    }
+
+
+def command(*arguments: str) -> dict[str, Any]:
+    """Call the command line and return the JSON that it prints."""
+    done = subprocess.run(
+        [sys.executable, "-m", "lmshealth", *arguments, "--format", "json"],
+        capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    if done.returncode:
+        raise SystemExit(f"lmshealth {arguments[0]} ended with {done.returncode}: {done.stderr}")
+    content: dict[str, Any] = json.loads(done.stdout)
+    return content
