@@ -22,6 +22,7 @@ _TOP = 0.45  # of the sample rate: anti-alias filters reach below Nyquist
 # The second difference of a displacement reaches over this part of the shortest period.
 _LAG_PERIODS = 8.0
 _FEWEST_SAMPLES = 256
+_FEWEST_PER_PERIOD = 32
 # Standard deviations of a mean coherence beyond what noise alone shows.
 _ANSWERS = 5.0
 # What is not reported as a mode: known this badly, or in power so few times the distortion around.
@@ -158,6 +159,13 @@ def _signals(
 def _period(log: Log, values: FloatArray, stated: float | None) -> float | None:
     """Find the period of the excitation in samples; None where it does not repeat."""
     duration = values.size / log.sample_rate
+    if stated is not None and stated * log.sample_rate < _FEWEST_PER_PERIOD:
+        raise BadLog(
+            log.name,
+            "period",
+            f"a period of {stated:g} s has {stated * log.sample_rate:.3g} samples, needed are at "
+            f"least {_FEWEST_PER_PERIOD}; it is stated in seconds",
+        )
     if stated is not None and stated > duration / 2:
         raise BadLog(
             log.name,

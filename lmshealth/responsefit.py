@@ -10,6 +10,7 @@ from scipy.optimize import minimize_scalar
 from lmshealth.arrays import BoolArray, FloatArray, freeze
 from lmshealth.noise import smooth_noise
 from lmshealth.rational import (
+    HEAVY,
     ComplexArray,
     Order,
     Ordinates,
@@ -21,15 +22,17 @@ from lmshealth.rational import (
 )
 
 _MOST_MODES = 8
-# Powers of s beside the modes, downwards and upwards. To leave out the fourth would bias modes by
-# half their standard deviation where others stand 25 % beside the band, to fit it costs 5 % of it.
-# They enter in twos: an even one for what is elastic, an odd one for what is lost.
-_FEWEST_POWERS, _MOST_POWERS, _POWER_STEP = 4, 8, 2
+# Powers of s beside the modes, downwards and upwards. Modes beside the band, too weak for a power to
+# show by itself, bias those in it by up to one standard deviation where only four are fitted, by
+# half of one where six are; that costs a few percent of it. Powers enter in twos: an even one for
+# what is elastic, an odd one for what is lost.
+_FEWEST_POWERS, _MOST_POWERS, _POWER_STEP = 6, 8, 2
 # Gain in -2 ln L that a mode needs beyond the Bayesian information criterion: a place for it is
-# searched for, and the best of many places gains by chance. A power needs less (Akaike's
-# criterion): one too weak to be seen would bias the modes by more than it costs.
+# searched for, and the best of many places gains by chance. A background, of powers and of poles
+# damped too heavily to be modes, needs less (Akaike's criterion, per unknown): nobody reads it,
+# and what it lacks, too weak to be seen, would bias the modes by more than it costs.
 _EVIDENCE_MARGIN = 10.0
-_POWER_COSTS = 2.0
+_BACKGROUND_COSTS = 2.0
 # Lines over which the noise of a record that does not repeat is averaged.
 _NOISE_LINES = 41
 # Gain in -2 ln L before anything else has moved, from which on a larger model is fitted.
@@ -39,8 +42,9 @@ _DISTORTED = 6.6
 # Two modes within a half-power bandwidth are believed where they leave so much less distortion.
 _LESS_DISTORTED = 1 / 3
 _ROUNDS = 4
-# From this condition on of the Fisher information nothing is known.
-_SINGULAR = 1e14
+# Standard deviation of ln f and ln ζ before anything is measured: what data say nothing about stays
+# as unknown as that, and leaves all else as it is.
+_PRIOR_STD = 10.0
 # Probability that noise alone gives an outlier somewhere, and share of lines that may be outliers.
 _FALSE_ALARM, _MOST_OUTLIERS = 1e-3, 0.1
 
@@ -173,11 +177,13 @@ class _State:
 
     @property
     def penalty(self) -> float:
-        """What modes and powers must gain to be worth it."""
-        m, order = self.order.n_modes, self.order
+        """What modes and background must gain to be worth it."""
+        order = self.order
         each = 4 if self.ordinates.periodic else 6
-        modes = m * (each * np.log(2 * self.variance.size) + _EVIDENCE_MARGIN)
-        return float(modes + _POWER_COSTS * (order.high - order.low))
+        heavy = int(np.count_nonzero(order.modes[1] > HEAVY))
+        modes = each * np.log(2 * self.variance.size) + _EVIDENCE_MARGIN
+        background = _BACKGROUND_COSTS * (each * heavy + order.high - order.low)
+        return float((order.n_modes - heavy) * modes + background)
 
 
 def _gain(larger: _State, smaller: _State) -> float:
@@ -358,19 +364,14 @@ def _covariances(state: _State) -> tuple[FloatArray, FloatArray]:
     """
     ordinates = state.ordinates
     slope = slopes(ordinates, state.order, state.variance, state.solution)
-    information = slope.T @ slope
-    if information.size == 0:
-        return information, information
-    if np.linalg.cond(information) > _SINGULAR:
-        unknown = np.diag(np.full(information.shape[0], np.inf))
-        return unknown, unknown
-    inverse: FloatArray = np.linalg.inv(information).astype(np.float64)
+    prior = np.eye(slope.shape[1]) / _PRIOR_STD**2
+    inverse = np.asarray(np.linalg.inv(slope.T @ slope + prior), dtype=np.float64)
     if not ordinates.periodic:
         freedom = min(_NOISE_LINES, state.variance.size)
-        by_noise = np.asarray(inverse * (freedom / (freedom - 2)))
+        by_noise = inverse * (freedom / (freedom - 2))
         return by_noise, by_noise * state.alike
     share = np.tile(ordinates.noise / state.variance, 2)[:, None]
-    by_noise = np.asarray(inverse @ (slope.T @ (share * slope)) @ inverse)
+    by_noise = inverse @ (slope.T @ (share * slope) + prior) @ inverse
     by_noise *= (ordinates.freedom - 1) / (ordinates.freedom - 2)
     by_distortion = inverse @ (slope.T @ ((1 - share) * slope)) @ inverse
     f, zeta = state.order.modes

@@ -18,9 +18,10 @@ from lmshealth.periods import cut_periods
 from lmshealth.rational import ComplexArray, Ordinates
 
 # A line is excited from this share of the strongest amplitude of the input on, and from so many
-# times its noise: with less, noise of the input would bias the response.
+# times its noise in power: with less, noise of the input where that is weak at a resonance would
+# bias the damping by more than half its standard deviation.
 EXCITED = 0.2
-_CLEAR = 10.0
+_CLEAR = 30.0
 # Complex degrees of freedom that a variance needs; of few periods neighbouring lines help out.
 _FREEDOM = 16
 # Probability that the first of equal periods is taken for a transient.
@@ -127,18 +128,18 @@ def from_periods(pair: Pair, band: tuple[float, float], period: float) -> tuple[
     Raises
     ------
     BadLog
-        If the record holds less than two periods, or too few lines of the band are excited.
+        If the record holds less than two periods, too few lines of the band are excited, or the
+        input is not the same in every period.
     """
-    log, rate = pair.log, pair.log.sample_rate
-    size = pair.signals[0].size
-    if size < 2 * period:
-        raise BadLog(
-            log.name,
-            "period",
-            f"{size / rate:.4g} s hold less than two periods of {period / rate:.4g} s; "
-            "record longer",
-        )
+    rate = pair.log.sample_rate
     spectra, period = cut_periods(pair.signals, period)
+    if spectra.shape[1] < 2:
+        raise BadLog(
+            pair.log.name,
+            "period",
+            f"{pair.signals[0].size / rate:.4g} s hold less than two whole periods of "
+            f"{period / rate:.4g} s; record longer",
+        )
     frequency: FloatArray = np.arange(spectra.shape[2], dtype=np.float64) * (rate / period)
     inside = (frequency >= band[0]) & (frequency <= band[1]) & (frequency > 0)
     strongest = np.abs(spectra[0]).max()
@@ -147,8 +148,7 @@ def from_periods(pair: Pair, band: tuple[float, float], period: float) -> tuple[
     if _is_transient(spectra[1]):
         spectra = spectra[:, 1:]
     n = spectra.shape[1]
-    excited = _is_excited(spectra[0]) & (np.abs(spectra[0]).max(axis=0) > _ROUNDING * strongest)
-    _check_lines(pair, int(excited.sum()), band, _FEWEST_LINES)
+    excited = _excited(pair, spectra[0], strongest, period / rate, band)
     frequency, spectra = frequency[excited], spectra[:, :, excited]
     given, answer = spectra.mean(axis=1)
     response = answer / given
@@ -179,11 +179,25 @@ def from_periods(pair: Pair, band: tuple[float, float], period: float) -> tuple[
     return frf, Ordinates(frequency, given, answer, noise, freedom, periodic=True)
 
 
-def _is_excited(given: ComplexArray) -> BoolArray:
+def _excited(
+    pair: Pair, given: ComplexArray, strongest: float, period: float, band: tuple[float, float]
+) -> BoolArray:
     """Tell which lines stand out of the others and of the noise, from ``(n_periods, n_lines)``."""
     power = np.abs(given.mean(axis=0)) ** 2
     noise = np.var(given, axis=0, ddof=1) / given.shape[0]
-    return np.asarray((power >= EXCITED**2 * power.max(initial=0.0)) & (power > _CLEAR * noise))
+    strong = power >= EXCITED**2 * power.max(initial=0.0)
+    strong &= np.abs(given).max(axis=0) > _ROUNDING * strongest
+    _check_lines(pair, int(strong.sum()), band, _FEWEST_LINES)
+    excited = np.asarray(strong & (power > _CLEAR * noise))
+    if excited.sum() < _FEWEST_LINES:
+        raise BadLog(
+            pair.log.name,
+            "period",
+            f"{pair.names[0]} does not repeat itself after {period:.4g} s: of its {strong.sum()} "
+            f"lines {excited.sum()} stand out of what differs between periods; state another "
+            "period or none, or excite more",
+        )
+    return excited
 
 
 def _is_transient(answer: ComplexArray) -> bool:

@@ -28,6 +28,7 @@ from studies.frf_modes.records import (
     multisine,
     periodic,
 )
+from studies.frf_modes.run import scatter_over_periods
 from tests.signals import make_log
 
 SIZE = 1600
@@ -82,6 +83,13 @@ def test_a_random_input_needs_no_whole_number_of_anything() -> None:
     log = driven(random=True, periods=5)
     cut = make_log({c.name: c.values[123:-77] for c in log.channels}, RATE)
     assert np.abs(off(read_frf(cut, "current", "acc_x", band=BAND))).max() < 4
+
+
+def test_without_noise_the_modes_are_exact() -> None:
+    """Modes beside the band are all that keeps a simulation from being fitted to rounding."""
+    modes = read_frf(driven(Machine(white=0.0, process=0.0)), "current", "acc_x", band=BAND).modes
+    assert modes.frequency == pytest.approx([62, 90], rel=1e-6)
+    assert modes.damping_ratio == pytest.approx([0.015, 0.02], rel=1e-4)
 
 
 def test_units_do_not_matter_to_modes() -> None:
@@ -210,6 +218,16 @@ def test_a_period_longer_than_half_the_record_is_refused() -> None:
     assert "12 s" in error.detail
 
 
+def test_a_stated_period_that_cannot_be_is_refused() -> None:
+    """Milliseconds for seconds; and seconds for an input that does not repeat."""
+    error = refusal(driven(), "current", "acc_x", period=0.004)
+    assert error.reason == "period"
+    assert "1.6 samples" in error.detail
+    error = refusal(driven(random=True), "current", "acc_x", band=BAND, period=4.0)
+    assert error.reason == "period"
+    assert "current does not repeat itself after 4 s" in error.detail
+
+
 def test_a_band_beyond_the_sample_rate_or_the_excitation_is_refused() -> None:
     """Above 0.45 of the sample rate nothing is shown; where nothing is excited nothing is told."""
     assert refusal(driven(), "current", "acc_x", band=(190, 300)).reason == "sample-rate"
@@ -330,7 +348,9 @@ def test_two_encoders_and_experiments_of_a_linear_guide_agree(
             assert reading.fit.distortion > 0.05
             assert reading.fit.chi_square > 100
     f, f_std, zeta, zeta_std = np.array(found).T
-    assert ((f > 13.2) & (f < 14.1)).all()
+    # What its authors' data give: 13.3 to 14.1 Hz, 5 to 8 %.
+    assert ((f - 2 * f_std < 14.1) & (f + 2 * f_std > 13.3)).all()
+    assert f == pytest.approx(13.5, abs=0.5)
     assert ((zeta - 2 * zeta_std < 0.08) & (zeta + 2 * zeta_std > 0.05)).all()
     for i, j in ((0, 2), (1, 3), (0, 1), (2, 3)):
         assert abs(f[i] - f[j]) < 2 * np.hypot(f_std[i], f_std[j])
@@ -366,18 +386,8 @@ def test_the_motor_side_has_an_antiresonance(bench: Callable[[str], Log]) -> Non
 
 
 def test_noise_of_a_bench_is_its_scatter_over_periods(bench: Callable[[str], Log]) -> None:
-    """Six logs of three periods each scatter by what one of them says of its noise."""
-    log = bench(BENCH)
-    found, stated = [], []
-    for k in range(6):
-        cut = slice(5000 + k * 7500, 12_500 + k * 7500)
-        channels = tuple(Channel(c.name, c.kind, c.values[cut]) for c in log.channels)
-        part = replace(log, channels=channels, pieces=((0, 7500),))
-        reading = read_frf(part, "current", "delta_e_load", band=(60.0, 100.0))
-        assert len(reading.modes.names) == 1
-        found.append(reading.modes.ln_frequency[0])
-        i = int(np.argmin(np.abs(reading.fit.estimate - reading.modes.ln_frequency[0])))
-        stated.append(np.sqrt(reading.fit.noise_cov[i, i]))
-    # Chi over its degrees of freedom lies in this range but for 1 in 1000 on either side.
-    ratio = np.std(found, ddof=1) / np.sqrt(np.mean(np.square(stated)))
-    assert 0.2 < ratio < 2.03
+    """Left out one by one, 19 periods scatter by what is stated; a third of it would fail."""
+    found = scatter_over_periods(bench(BENCH), "delta_e_load", None)
+    for ratio in found["stated_over_scatter"]:
+        assert 0.7 < ratio < 2
+        assert not 0.7 < ratio / 3 < 2

@@ -120,13 +120,29 @@ def test_a_transient_in_the_first_period_is_left_out() -> None:
     assert from_periods(pair(given, answer), BAND, SIZE)[0].n_averages == 5
 
 
+def test_an_input_that_does_not_repeat_has_no_periods() -> None:
+    """White noise cut as if it were periodic: said so, and not that nothing is excited."""
+    given, answer = at_random(np.random.default_rng(9), Machine(), 6 * SIZE)
+    with pytest.raises(BadLog, match=r"period.* current does not repeat itself after 4 s"):
+        from_periods(pair(given, answer), BAND, SIZE)
+
+
+def test_two_periods_are_enough_and_less_are_not() -> None:
+    """Two of 1600 samples, though one was taken to be a little longer; not of 1600.3 in 3201."""
+    given, answer = periodic(np.random.default_rng(10), Machine(), SIZE, 2)
+    assert from_periods(pair(given, answer), BAND, SIZE + 1e-3)[0].n_averages == 2
+    more = [np.append(x, x[:1]) for x in (given, answer)]
+    with pytest.raises(BadLog, match="less than two whole periods"):
+        from_periods(pair(*more), BAND, SIZE + 0.3)
+
+
 def test_too_few_lines_and_too_many_are_refused() -> None:
     """A narrow band says how many lines it has; a wide one of a long record asks for a band."""
     with pytest.raises(BadLog, match=r"band-too-narrow.* 9 lines"):
         from_periods(pair(*periodic(np.random.default_rng(5), QUIET, SIZE, 4)), (60.0, 62.0), SIZE)
     with pytest.raises(BadLog, match=r"not-excited.* 0 lines"):
         from_periods(pair(*periodic(np.random.default_rng(5), QUIET, SIZE, 4)), (150, 160), SIZE)
-    with pytest.raises(BadLog, match=r"period.*less than two periods"):
+    with pytest.raises(BadLog, match=r"period.*less than two whole periods of 8.75 s"):
         from_periods(pair(*periodic(np.random.default_rng(5), QUIET, SIZE, 4)), BAND, 3500.0)
     long = np.random.default_rng(5).standard_normal(60_000)
     with pytest.raises(BadLog, match="band-too-wide"):

@@ -85,3 +85,16 @@ def test_line_test(root: Path) -> None:
     """Alarms stay as declared, lines are found and leave modes in peace; controls do not."""
     answer = json.loads(run_study(root, "line_test"))
     assert all(answer["passed"].values())
+
+
+def test_frf_modes(root: Path, needs: Callable[[str], None]) -> None:
+    """A dozen seeds per case cover, and two real benches give what is known of them."""
+    needs("data")
+    answer = json.loads(run_study(root, "frf_modes"))
+    assert all(answer["passed"].values())
+    # Intervals 1.5 times as narrow hold less, which so few seeds tell only all together.
+    parts = [case[what] for case in answer["cases"].values() for what in ("frequency", "damping")]
+    narrow, stated = (
+        sum(part[key]["share"] for part in parts) for key in ("control_narrower", "coverage")
+    )
+    assert narrow < stated

@@ -31,19 +31,24 @@ def draw_responses(ax: Axes, pictures: dict[str, Any], bench: str) -> None:
 
 
 def draw_coverage(ax: Axes, cases: dict[str, Any]) -> None:
-    """Draw every coverage with its exact interval, and the halved ones that must fail."""
+    """Draw every coverage with its exact interval, and the controls that must fail."""
     labels = []
     for name, case in cases.items():
-        parts = {what: case[what]["coverage"] for what in ("frequency", "damping")}
-        for what, part in (parts | {"halved": case["coverage_halved"]}).items():
+        for what in ("frequency", "damping"):
             k = len(labels)
-            colour = "#999999" if what == "halved" else COLOURS[0]
-            ax.plot([part["low"], part["high"]], [k, k], lw=3, color=colour)
-            ax.plot(part["share"], k, "o", color=colour)
-            labels.append(f"{name}: {what}")
+            for part, colour, marker in (
+                ("control_narrower", "#999999", "<"),
+                ("control_wider", "#999999", ">"),
+                ("coverage", COLOURS[0], "o"),
+            ):
+                row = case[what][part]
+                ax.plot([row["low"], row["high"]], [k, k], lw=2.5, color=colour)
+                ax.plot(row["share"], k, marker, ms=5, color=colour)
+            labels.append(f"{name}: {'f' if what == 'frequency' else 'ζ'}")
     ax.axvline(0.95, color="#009e73", lw=1)
     ax.set_yticks(range(len(labels)), labels, fontsize=8)
     ax.invert_yaxis()
+    ax.set_title("simulated machines (grey: 1.5 times as narrow ◂, as wide ▸)", fontsize=10)
     ax.set_xlabel("coverage of 95 % intervals, with 99.9 % interval")
     ax.grid(alpha=0.25, axis="x")
 
@@ -62,27 +67,33 @@ def draw_modes(ax: Axes, rows: dict[str, Any], title: str) -> None:
     ax.grid(alpha=0.25)
 
 
-def draw_sweeps(ax: Axes, rows: list[dict[str, Any]]) -> None:
-    """Draw what three sensors say of pitch in every sweep, less the truth."""
-    sensors = [name for name in rows[0] if name != "seed"]
-    for k, sensor in enumerate(sensors):
-        x = np.array([row["seed"] for row in rows]) + 0.2 * (k - 1)
-        error = [1e3 * row[sensor]["error_hz"] for row in rows]
-        std = [2e3 * row[sensor]["std_hz"] for row in rows]
-        ax.errorbar(x, error, std, fmt="os^"[k], ms=3.5, lw=0.9, label=sensor)
-    ax.axhline(0.0, color="#009e73", lw=1)
-    ax.set_title("sweeps of simulated Y: pitch less eigenvalue", fontsize=10)
-    ax.set_xlabel("seed")
-    ax.set_ylabel("mHz, ±2σ")
+def draw_sweeps(ax: Axes, sweeps: dict[str, list[dict[str, Any]]]) -> None:
+    """Draw how far pitch is off by each sensor, in stated standard deviations."""
+    labels = []
+    for name, rows in sweeps.items():
+        for sensor in (key for key in rows[0] if key != "seed"):
+            f, zeta = zip(*(row[sensor]["z"] for row in rows), strict=True)
+            k = len(labels)
+            x = np.linspace(-0.25, 0.25, len(rows))
+            first = not labels
+            ax.plot(k + x, f, "o", ms=3.5, color=COLOURS[0], label="f" if first else None)
+            ax.plot(k + x, zeta, "s", ms=3.5, mfc="none", color=COLOURS[1],
+                    label="ζ" if first else None)  # fmt: skip
+            labels.append(f"{name}: {sensor}")
+    for level in (-1.96, 1.96):
+        ax.axhline(level, color="#009e73", lw=1)
+    ax.set_xticks(range(len(labels)), labels, rotation=60, ha="right", fontsize=8)
+    ax.set_title("sweeps of simulated stages: pitch, 8 seeds", fontsize=10)
+    ax.set_ylabel("error over stated σ")
     ax.legend(frameon=False, fontsize=8)
-    ax.grid(alpha=0.25)
+    ax.grid(alpha=0.25, axis="y")
 
 
 def main() -> None:
     """Draw benches above, simulated machines below."""
     matplotlib.rcParams["svg.hashsalt"] = "frf_modes"
     result = json.loads((HERE / "result.json").read_text())
-    figure = Figure(figsize=(12.0, 7.0), layout="constrained")
+    figure = Figure(figsize=(14.0, 8.5), layout="constrained")
     axes = figure.subplots(2, 3)
     draw_responses(axes[0, 0], result["pictures"], "linear guide")
     draw_modes(axes[0, 1], result["linear_guide"], "linear guide: friction moves it")

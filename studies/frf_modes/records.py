@@ -35,6 +35,8 @@ class Machine:
         the machine answers like the current, as a share of the current's.
     input_noise : float
         Of the measured current, as a share of its standard deviation.
+    cubic : float
+        Of the motor: what the cube adds to the force at one standard deviation. Poles stay.
     """
 
     modes: tuple[tuple[float, float, float], ...] = MODES
@@ -42,6 +44,7 @@ class Machine:
     white: float = 0.1
     process: float = 0.1
     input_noise: float = 0.0
+    cubic: float = 0.0
 
     def response(self, hertz: Array) -> Array:
         """Return the response at frequencies above 0, (line,)."""
@@ -82,7 +85,7 @@ def periodic(
 ) -> tuple[Array, Array]:
     """Return current and sensor under a multisine that has been going on for ever."""
     given = multisine(rng, size)
-    answer = machine.answer(given)
+    answer = machine.answer(given + machine.cubic * given**3)
     return machine.noise(rng, np.tile(given, periods), np.tile(answer, periods))
 
 
