@@ -22,8 +22,8 @@ from lmshealth.rational import (
 )
 
 _MOST_MODES = 8
-# Powers of s beside the modes, downwards and upwards. Modes beside the band, too weak for a power to
-# show by itself, bias those in it by up to one standard deviation where only four are fitted, by
+# Powers of s beside the modes, downwards and upwards. Modes beside the band, too weak for a power
+# to show by itself, bias those in it by up to one standard deviation where four are fitted, by
 # half of one where six are; that costs a few percent of it. Powers enter in twos: an even one for
 # what is elastic, an odd one for what is lost.
 _FEWEST_POWERS, _MOST_POWERS, _POWER_STEP = 6, 8, 2

@@ -88,7 +88,7 @@ def test_line_test(root: Path) -> None:
 
 
 def test_frf_modes(root: Path, needs: Callable[[str], None]) -> None:
-    """A dozen seeds per case cover, and two real benches give what is known of them."""
+    """A few seeds per case cover, and two real benches give what is known of them."""
     needs("data")
     answer = json.loads(run_study(root, "frf_modes"))
     assert all(answer["passed"].values())

@@ -14,7 +14,8 @@ Method
     by numerical derivatives.
     (2) A sine sweeps through the current of the simulated stages X and Y while they move: pitch
     from three sensors against the eigenvalue of the closed loop. In a band around it z must be
-    standard normal; over all that is excited, from 20 Hz on, it is recorded.
+    standard normal; over all that is excited, from 20 Hz on, below 2 in root mean square: modes too
+    weak to be seen bias there.
     (3) A linear guide with friction (two experiments, two encoders) and a bench of two inertias
     (motor and load side): against the values of the data's readers, sides and experiments against
     each other, noise-only uncertainty against the jackknife over periods.
@@ -87,8 +88,8 @@ SECONDS = 14.0
 SWEEPS = {
     "lms-y": (Sweep(100.0, 175.0, amplitude=0.3, period=3.5), None),
     "lms-x": (Sweep(150.0, 400.0, amplitude=0.3, period=3.5), (180.0, 365.0)),
-    "lms-y, wide": (Sweep(20.0, 1000.0, amplitude=0.3, period=4.6), None),
-    "lms-x, wide": (Sweep(20.0, 1000.0, amplitude=0.3, period=4.6), None),
+    "lms-y, wide": (Sweep(20.0, 1000.0, amplitude=0.3, period=4.1), None),
+    "lms-x, wide": (Sweep(20.0, 1000.0, amplitude=0.3, period=4.1), None),
 }
 GUIDE = ("lsb250_linear_guide/open/exp1.mat", "lsb250_linear_guide/open/exp2.mat")
 BENCH = "fditools_two_inertia_bench/open/MultisineTypeA.mat"
@@ -101,14 +102,14 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=400)
     options = parser.parse_args()
     watch = Stopwatch()
-    seeds = 12 if options.quick else options.seeds
+    seeds = 8 if options.quick else options.seeds
     cases = {name: summarise(name, [one_seed(name, k) for k in range(seeds)]) for name in CASES}
     answer: dict[str, Any] = {"n_seeds": seeds, "cases": cases}
     swept: dict[str, Any] = {}
     if not options.quick:
         swept = {name: [one_sweep(name, seed) for seed in range(8)] for name in SWEEPS}
         answer["sweeps"] = {name: summarise_sweeps(rows) for name, rows in swept.items()}
-    benches, pictures = read_benches(Path(os.environ["LMSHEALTH_DATA"]))
+    benches, pictures = read_benches(Path(os.environ["LMSHEALTH_DATA"]), quick=options.quick)
     answer |= benches
     answer["passed"] = judge(answer, quick=options.quick)
     print(json.dumps(answer, indent=1))
@@ -292,7 +293,7 @@ def summarise_sweeps(rows: list[dict[str, Any]]) -> dict[str, Any]:
     return found
 
 
-def read_benches(data: Path) -> tuple[dict[str, Any], dict[str, Any]]:
+def read_benches(data: Path, *, quick: bool) -> tuple[dict[str, Any], dict[str, Any]]:
     """Return what the benches say, and pictures of two of their responses."""
     guide = {}
     pictures = {}
@@ -313,8 +314,10 @@ def read_benches(data: Path) -> tuple[dict[str, Any], dict[str, Any]]:
         inside = (frequency > 40) & (frequency < 70)
         lowest = np.argmin(np.abs(reading.fit.response[inside]))
         bench[output]["antiresonance_hz"] = float(frequency[inside][lowest])
-        for name, band in (("", None), (", 40 to 120 Hz", (40.0, 120.0))):
-            bench[output][f"scatter{name}"] = scatter_over_periods(log, output, band)
+        bench[output]["scatter"] = scatter_over_periods(log, output, None)
+        if not quick:
+            narrow = scatter_over_periods(log, output, (40.0, 120.0))
+            bench[output]["scatter_40_to_120_hz"] = narrow
     return {"linear_guide": guide, "two_inertias": bench}, pictures
 
 
@@ -422,12 +425,16 @@ def judge(answer: dict[str, Any], *, quick: bool) -> dict[str, bool]:
             if exact
             for control in ("control_narrower", "control_wider")
         )
+        sweeps = [
+            ("wide" in name, row)
+            for name, part in answer["sweeps"].items()
+            for row in part.values()
+        ]
         passed["sweeps around pitch: z is standard normal"] = all(
-            p > 0.001
-            for name, sensors in answer["sweeps"].items()
-            if "wide" not in name
-            for row in sensors.values()
-            for p in row["p"]
+            p > 0.001 for wide, row in sweeps if not wide for p in row["p"]
+        )
+        passed["wide sweeps: z below 2 on average"] = all(
+            rms < 2 for wide, row in sweeps if wide for rms in row["z_rms"]
         )
     return passed
 
