@@ -101,7 +101,7 @@ def read_frf(
         )
     pair = _signals(log, (given, answer), start, stop)
     samples = _period(log, pair[0], period)
-    band = _excited_band(pair[0], log.sample_rate, (low, min(high, top)))
+    band = _excited_band(pair[0], log.sample_rate, (low, min(high, top)), samples)
     lag = 0
     if answer.kind == "displacement":
         lag = max(1, int(log.sample_rate / (_LAG_PERIODS * band[1])))
@@ -177,9 +177,12 @@ def _period(log: Log, values: FloatArray, stated: float | None) -> float | None:
 
 
 def _excited_band(
-    values: FloatArray, sample_rate: float, band: tuple[float, float]
+    values: FloatArray, sample_rate: float, band: tuple[float, float], period: float | None
 ) -> tuple[float, float]:
     """Cut a band down to where the input is excited."""
+    if period is not None:
+        # Of parts of a period, lines would differ by how near they stand to a harmonic.
+        values = values[values.size - round(int(values.size / period) * period) :]
     amplitude = np.abs(fft.rfft(values - values.mean()))
     frequency = np.arange(amplitude.size) * sample_rate / values.size
     amplitude[(frequency < band[0]) | (frequency > band[1])] = 0.0

@@ -41,6 +41,8 @@ _WORTH = 2.0
 _DISTORTED = 6.6
 # Two modes within a half-power bandwidth are believed where they leave so much less distortion.
 _LESS_DISTORTED = 1 / 3
+# Lines of an end of the band.
+_END = 3
 _ROUNDS = 4
 # Standard deviation of ln f and ln ζ before anything is measured: what data say nothing about stays
 # as unknown as that, and leaves all else as it is.
@@ -253,7 +255,7 @@ def _grow(state: _State) -> _State:
             for order in _larger(state)
             if order.unknowns(state.ordinates.periodic) < state.variance.size
         ]
-        gains = [_gain(t, state) if _told_apart(t, state) else -np.inf for t in trials]
+        gains = [_gain(t, state) if _is_meant(t, state) else -np.inf for t in trials]
         if not gains or max(gains) <= 0:
             return state
         best = trials[int(np.argmax(gains))]
@@ -283,8 +285,15 @@ def _larger(state: _State) -> list[Order]:
     return [o for o, gain in zip(larger, gains, strict=True) if gain > _WORTH]
 
 
-def _told_apart(trial: _State, before: _State) -> bool:
-    """Tell whether modes within a half-power bandwidth are more than one distorted resonance."""
+def _is_meant(trial: _State, before: _State) -> bool:
+    """Tell whether modes are more than one distorted resonance, and more than a band's end.
+
+    Modes within a half-power bandwidth must leave much less distortion. What is narrower than a
+    line at an end of the band stands for a mode beyond it.
+    """
+    narrow = ~_wide_enough(trial)
+    if narrow[:_END].any() or narrow[-_END:].any():
+        return False
     f, zeta = trial.order.modes
     half = zeta * f
     near = np.abs(f[:, None] - f) < np.maximum(half[:, None], half)

@@ -108,6 +108,19 @@ def test_the_default_band_is_where_the_input_is_excited() -> None:
     assert frf.frequency[[0, -1]] == pytest.approx([40, 120], abs=0.3)
 
 
+def test_a_part_of_a_period_does_not_cut_the_default_band() -> None:
+    """A multisine that falls to a quarter, for five and a half periods: used from end to end."""
+    spectrum = np.fft.rfft(multisine(np.random.default_rng(6), SIZE))
+    spectrum[160:481] *= np.geomspace(1, 0.25, 321)
+    given = np.fft.irfft(spectrum)
+    signals = Machine().noise(np.random.default_rng(7), *(
+        np.tile(x, 6)[SIZE // 2 :] for x in (given, Machine().answer(given))
+    ))  # fmt: skip
+    frf = read_frf(make_log({"current": signals[0], "acc_x": signals[1]}, RATE), "current",
+                   "acc_x").frf  # fmt: skip
+    assert frf.frequency[[0, -1]] == pytest.approx([40, 120], abs=0.3)
+
+
 def test_a_period_off_by_half_a_percent_is_put_right() -> None:
     """A stated period is taken for what it is: about right."""
     log = driven()
