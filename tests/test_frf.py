@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.signal import chirp
 
 from lmshealth.errors import BadLog
 from lmshealth.frf import FrfReading, read_frf
@@ -108,17 +109,17 @@ def test_the_default_band_is_where_the_input_is_excited() -> None:
     assert frf.frequency[[0, -1]] == pytest.approx([40, 120], abs=0.3)
 
 
-def test_a_part_of_a_period_does_not_cut_the_default_band() -> None:
-    """A multisine that falls to a quarter, for five and a half periods: used from end to end."""
-    spectrum = np.fft.rfft(multisine(np.random.default_rng(6), SIZE))
-    spectrum[160:481] *= np.geomspace(1, 0.25, 321)
-    given = np.fft.irfft(spectrum)
-    signals = Machine().noise(np.random.default_rng(7), *(
-        np.tile(x, 6)[SIZE // 2 :] for x in (given, Machine().answer(given))
-    ))  # fmt: skip
-    frf = read_frf(make_log({"current": signals[0], "acc_x": signals[1]}, RATE), "current",
-                   "acc_x").frf  # fmt: skip
-    assert frf.frequency[[0, -1]] == pytest.approx([40, 120], abs=0.3)
+def test_a_part_of_a_period_does_not_move_the_default_band() -> None:
+    """A sweep downwards, louder below, ends at the same line from 5 periods and from 4.4."""
+    t = np.arange(SIZE) / RATE
+    given = np.tile(chirp(t, 5, SIZE / RATE, 180, method="logarithmic")[::-1], 6)
+    signals = Machine().noise(np.random.default_rng(7), given, Machine().answer(given))
+    ends = [
+        read_frf(make_log({"current": signals[0][cut:], "acc_x": signals[1][cut:]}, RATE),
+                 "current", "acc_x").frf.frequency[-1]
+        for cut in (SIZE, 2560)
+    ]  # fmt: skip
+    assert ends[0] == pytest.approx(ends[1])
 
 
 def test_a_period_off_by_half_a_percent_is_put_right() -> None:
@@ -190,6 +191,18 @@ def test_the_whole_current_shows_the_machine_without_its_servo(sweep: Log) -> No
     i = int(np.argmin(np.abs(modes.frequency - closed.frequency_hz)))
     assert abs(modes.frequency[i] - abs(alone) / (2 * np.pi)) < 4 * modes.frequency_std[i]
     assert abs(modes.frequency[i] - closed.frequency_hz) > 4 * modes.frequency_std[i]
+
+
+def test_a_resonance_beyond_the_band_leaves_no_lines_at_its_end(tmp_path: Path) -> None:
+    """Pitch of X at 271.6 Hz bends what is below 250 Hz; those lines are answers all the same."""
+    sweep = Sweep(20.0, 1000.0, amplitude=0.3, period=4.1)
+    recording = record_sweep(stage_named("lms-x"), sweep, seconds=14.0,
+                             rng=np.random.default_rng([100, 42]))  # fmt: skip
+    write_log(recording, tmp_path / "sweep.h5", "hdf5")
+    log = read_log(tmp_path / "sweep.h5")
+    reading = read_frf(log, "current_excitation", "delta_e", band=(18.0, 250.0))
+    assert not (reading.fit.outliers[:, 0] > 230).any()
+    assert reading.modes.frequency[0] == pytest.approx(47.6, abs=4 * reading.modes.frequency_std[0])
 
 
 # What cannot be read

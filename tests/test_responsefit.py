@@ -87,14 +87,6 @@ def test_a_response_without_modes_has_none() -> None:
     assert fit.cov.shape == (fit.estimate.size,) * 2
 
 
-def test_a_mode_beyond_the_band_is_no_line_at_its_end() -> None:
-    """A resonance 2 % above the last line is not taken for lines that are no answer."""
-    fit = fit_response(measured(respond(((62.0, 0.015), (122.0, 0.02))), 0.003))
-    assert not fit.outliers.size
-    inside = frequencies(fit) < LINES[-1]
-    assert frequencies(fit)[inside & (frequencies(fit) > 50)] == pytest.approx([62.0], abs=0.01)
-
-
 def test_close_modes_are_told_apart_where_the_noise_allows() -> None:
     """One half-power bandwidth apart: two modes under little noise, one under much."""
     close = ((80.0, 0.01), (81.6, 0.01))
