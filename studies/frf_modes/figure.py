@@ -48,7 +48,7 @@ def draw_coverage(ax: Axes, cases: dict[str, Any]) -> None:
     ax.axvline(0.95, color="#009e73", lw=1)
     ax.set_yticks(range(len(labels)), labels, fontsize=8)
     ax.invert_yaxis()
-    ax.set_title("simulated machines (grey: 1.5 times as narrow ◂, as wide ▸)", fontsize=10)
+    ax.set_title("simulated; grey: 1.5 × as narrow ◂, wide ▸", fontsize=10)
     ax.set_xlabel("coverage of 95 % intervals, with 99.9 % interval")
     ax.grid(alpha=0.25, axis="x")
 
