@@ -8,6 +8,7 @@ from importlib.metadata import version
 
 from lmshealth.decay import identify_decays
 from lmshealth.errors import LmshealthError
+from lmshealth.frf import read_frf
 from lmshealth.history import Reading, build_history
 from lmshealth.inference import infer
 from lmshealth.modal import identify
@@ -32,6 +33,7 @@ __all__ = [
     "judge",
     "load_stage",
     "prognose",
+    "read_frf",
     "read_log",
     "run",
     "track",

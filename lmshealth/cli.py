@@ -298,6 +298,61 @@ def spectrum(ctx: click.Context, /, logs: tuple[Path, ...], style: str, **option
     _exit(ctx, found, lost)
 
 
+@main.command(
+    epilog=_examples(
+        "frf sweep.h5 --input current_excitation --output acc_pitch --band 95 175",
+        "frf bench.mat --columns map.toml --input current --output delta_e --period 1",
+    )
+)
+@click.argument("log", type=click.Path(path_type=Path))
+@click.option("--input", "source", required=True, metavar="NAME", help="Channel of the excitation.")
+@click.option("--output", required=True, metavar="NAME", help="Channel of the answer.")
+@click.option(
+    "--band",
+    nargs=2,
+    type=float,
+    metavar="LOW HIGH",
+    help="Use only this band, in Hz; default where the input is excited.",
+)
+@click.option(
+    "--period",
+    type=click.FloatRange(0, min_open=True),
+    metavar="S",
+    help="Period of the excitation in s, to 1 %; default found from the input, if it repeats.",
+)
+@_COLUMNS
+@_FORMAT
+@click.pass_context
+def frf(ctx: click.Context, /, log: Path, style: str, **options: Any) -> None:
+    """Measure the frequency response from one channel to another, and identify its modes.
+
+    An input that repeats is averaged over whole periods, any other over stretches. csv lists the
+    modes; json has the response with H1, H2, Hv and coherence too.
+    """
+    from lmshealth.frf import read_frf
+    from lmshealth.tables import fit_row, frame, frf_rows, lines_rows, modes_rows, refused_rows
+
+    _, columns = _loaded(None, options["columns"])
+    band, period = _checked_band(options["band"]), options["period"]
+    names = (options["source"], options["output"])
+    found, lost = _each(
+        [log], columns, lambda it: (it, read_frf(it, *names, band=band, period=period))
+    )
+    rows = [row for it, own in found for row in modes_rows(it.name, it.metadata, own.modes)]
+    fits = [fit_row(it.name, own) for it, own in found]
+    response = [row for it, own in found for row in frf_rows(it.name, own)]
+    refused = refused_rows([*lost, *(r for _, own in found for r in own.modes.refused)])
+    if style == "csv":
+        click.echo(frame("modes", rows).to_csv(index=False), nl=False)
+    elif style == "json":
+        lines = [{"log": it.name, **r} for it, own in found for r in lines_rows(own.modes.lines)]
+        content = {"modes": rows, "fit": fits, "frf": response, "lines": lines}
+        terminal.print_json({**content, "refused": refused})
+    elif found:
+        terminal.print_frf(fits[0], response, rows, refused)
+    _exit(ctx, found, lost)
+
+
 _Survey = tuple[str, tuple[Magnitude, ...], tuple[Line, ...], tuple[Refusal, ...]]
 
 

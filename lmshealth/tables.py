@@ -12,6 +12,7 @@ import pandas as pd
 
 from lmshealth.arrays import FloatArray
 from lmshealth.following import FollowingError
+from lmshealth.frf import FrfReading
 from lmshealth.history import Reading
 from lmshealth.logs import Metadata, Refusal
 from lmshealth.magnitudes import Growth, Magnitude
@@ -53,6 +54,10 @@ LOOKS = {
     "share_explained_above_floor",
     "magnitudes": "log stage velocity_mm_s channel band kind low_hz high_hz placed_by "
     "magnitude_mm_s2 strongest_hz line rms_mm_s2 dof slope slope_std p_value grows",
+    "frf": "log frequency_hz gain phase_rad gain_std coherence h1_gain h1_phase_rad h2_gain "
+    "h2_phase_rad hv_gain hv_phase_rad fit_gain fit_phase_rad",
+    "fit": "log input output period_s n_averages n_lines low_hz high_hz mean_coherence "
+    "chi_square distortion colour",
 }
 
 Row = dict[str, Any]
@@ -125,6 +130,47 @@ def harmonics_rows(log: str, error: FollowingError) -> list[Row]:
         }
         for i in error.kept.tolist()
     ]
+
+
+def frf_rows(log: str, reading: FrfReading) -> list[Row]:
+    """List a frequency response, one row per line, in SI units of the output per the input's."""
+    frf, fit = reading.frf, reading.fit
+    lines = fit.ordinates.frequency
+    fitted = np.interp(frf.frequency, lines, fit.response.real) + 1j * np.interp(
+        frf.frequency, lines, fit.response.imag
+    )
+    columns: dict[str, FloatArray] = {"frequency_hz": frf.frequency}
+    for name, response in (
+        ("", frf.response),
+        ("h1_", frf.h1),
+        ("h2_", frf.h2),
+        ("hv_", frf.hv),
+        ("fit_", fitted),
+    ):
+        columns |= {f"{name}gain": np.abs(response), f"{name}phase_rad": np.angle(response)}
+    columns |= {"gain_std": frf.std, "coherence": frf.coherence}
+    names = LOOKS["frf"].split()[1:]
+    rows = zip(*(columns[name].tolist() for name in names), strict=True)
+    return [{"log": log, **dict(zip(names, row, strict=True))} for row in rows]
+
+
+def fit_row(log: str, reading: FrfReading) -> Row:
+    """Give how a frequency response was measured and how well its modes describe it."""
+    frf, fit = reading.frf, reading.fit
+    return {
+        "log": log,
+        "input": frf.input,
+        "output": frf.output,
+        "period_s": frf.period,
+        "n_averages": float(frf.n_averages),
+        "n_lines": frf.frequency.size,
+        "low_hz": float(frf.frequency[0]),
+        "high_hz": float(frf.frequency[-1]),
+        "mean_coherence": float(frf.coherence.mean()),
+        "chi_square": fit.chi_square,
+        "distortion": fit.distortion,
+        "colour": fit.colour,
+    }
 
 
 def magnitudes_rows(

@@ -18,6 +18,8 @@ from rich.table import Table
 
 from lmshealth.tables import Row
 
+# So many lines of a frequency response are shown.
+_MOST_LINES = 12
 # More velocities than these do not fit beside each other.
 _MOST_VELOCITIES = 7
 
@@ -54,6 +56,42 @@ def print_modes(rows: Sequence[Row], refused: Sequence[Row]) -> None:
     title = "Modes (± one standard deviation)" if rows else "No modes found"
     _print(title, ("log", "mode", "channel"), ("frequency Hz", "damping %", "SNR", "note"), cells)
     _print_refused(refused)
+
+
+def print_frf(fit: Row, frf: Sequence[Row], rows: Sequence[Row], refused: Sequence[Row]) -> None:
+    """Print a frequency response at some of its lines, what it was read from, and its modes."""
+    step = max(1, -(-len(frf) // _MOST_LINES))
+    cells = [
+        (
+            f"{row['frequency_hz']:.5g}",
+            f"{row['gain']:.4g} ± {row['gain_std']:.2g}",
+            f"{math.degrees(row['phase_rad']):.1f}",
+            f"{row['coherence']:.4f}",
+            f"{row['fit_gain']:.4g}",
+        )
+        for row in frf[step // 2 :: step]
+    ]
+    title = f"Response of {fit['output']} to {fit['input']}, {len(cells)} of {len(frf)} lines"
+    _print(title, (), ("Hz", "gain (SI)", "phase °", "coherence", "fit"), cells)
+    click.echo(_averages(fit))
+    if fit["distortion"] > 0:
+        click.echo(
+            f"Beyond the noise (reduced chi-square {fit['chi_square']:.3g}) the fit misses "
+            f"{_percent(fit['distortion'])} of the response:\n"
+            "nonlinear, or a term is lacking; the standard deviations are widened by it."
+        )
+    if fit["colour"] > 0:
+        click.echo(
+            f"Errors of neighbouring lines correlate by {fit['colour']:.2f}: standard deviations "
+            "are widened."
+        )
+    print_modes(rows, refused)
+
+
+def _averages(fit: Row) -> str:
+    if math.isnan(fit["period_s"]):
+        return f"H1 of {fit['n_averages']:.0f} stretches: the input does not repeat."
+    return f"Mean of {fit['n_averages']:.0f} periods of {fit['period_s']:.6g} s."
 
 
 def print_error(rows: Sequence[Row], refused: Sequence[Row]) -> None:

@@ -15,11 +15,12 @@ from pathlib import Path
 import h5py
 import numpy as np
 
-from lmshealth.logs import Channel, Log, Metadata
+from lmshealth.logs import Channel, ChannelKind, Log, Metadata
 from lmshealth.results import Modes
 from lmshealth.spectra import Spectrum
 from lmshealth.stage import Description, ModeSpec, Order, Stage
 
+_KINDS: dict[str, ChannelKind] = {"delta": "displacement", "current": "current"}
 _CIRCLE = 3  # lengths of the record on the circle it is cut from
 
 
@@ -114,7 +115,7 @@ def make_log(
     pieces: Sequence[tuple[int, int]] | None = None,
     metadata: Metadata = Metadata(),  # noqa: B008
 ) -> Log:
-    """Make a log; channels named ``delta_e`` are displacements, all others accelerations."""
+    """Make a log; channels are of the kind that their names say, else accelerations."""
     n = len(next(iter(signals.values())))
     return Log(
         name="synthetic.h5",
@@ -122,11 +123,7 @@ def make_log(
         metadata=metadata,
         sample_rate=rate,
         channels=tuple(
-            Channel(
-                name,
-                "displacement" if name.startswith("delta_e") else "acceleration",
-                np.array(values),
-            )
+            Channel(name, _KINDS.get(name.split("_")[0], "acceleration"), np.array(values))
             for name, values in signals.items()
         ),
         reference_velocity=velocity,

@@ -17,6 +17,7 @@ from lmshealth.cli import main
 from lmshealth.tables import COLUMNS, LOOKS
 from models.stages import STAGES
 from models.velocities import Experiment, drive_velocities
+from studies.frf_modes.records import BAND, MODES, RATE, Machine, periodic
 from tests.signals import Mode, accelerations, write_archive, write_archive_stage, write_log
 
 MODE_KEYS = set(COLUMNS["modes"].split())
@@ -68,7 +69,7 @@ def stage(folder: Path) -> Path:
 
 def test_every_command_has_help_with_an_example() -> None:
     """``--help`` of each command shows how it is called."""
-    assert set(main.commands) >= {"run", "modes", "error", "spectrum"}
+    assert set(main.commands) >= {"run", "modes", "error", "spectrum", "frf"}
     for name in main.commands:
         result = call(name, "--help")
         assert result.exit_code == 0
@@ -111,6 +112,10 @@ def test_the_version_is_told() -> None:
         ("error", "log.h5", "--part", "ramp"),
         ("spectrum",),
         ("spectrum", "log.h5", "--band", "200", "80"),
+        ("frf", "log.h5"),
+        ("frf", "log.h5", "--input", "current"),
+        ("frf", "log.h5", "--input", "current", "--output", "acc_x", "--period", "0"),
+        ("frf", "log.h5", "--input", "current", "--output", "acc_x", "--band", "200", "80"),
         ("nonsense",),
     ],
 )
@@ -341,6 +346,73 @@ def test_spectrum_refuses_what_it_cannot_read(folder: Path, tmp_path: Path) -> N
         call("spectrum", folder / "bare.csv", tmp_path / "short.csv", "--band", 10, 200).exit_code
         == 3
     )
+
+
+# frf
+
+
+@pytest.fixture(scope="module")
+def bench(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Drive a machine by a multisine of 4 s for 20 s; the export calls its columns otherwise."""
+    folder = tmp_path_factory.mktemp("bench")
+    signals = periodic(np.random.default_rng(9), Machine(), 1600, 5)
+    np.savetxt(folder / "bench.csv", np.column_stack(signals), header="U,ACC", delimiter=",",
+               comments="")  # fmt: skip
+    (folder / "map.toml").write_text(
+        f'sample_rate_hz = {RATE}\n[columns]\ncurrent_a = "U"\nacc_x_m_s2 = "ACC"\n'
+    )
+    return folder
+
+
+def frf(bench: Path, *more: object) -> Result:
+    """Ask for the response of the bench."""
+    return call(
+        "frf", bench / "bench.csv", "--columns", bench / "map.toml",
+        "--input", "current", "--output", "acc_x", *more,
+    )  # fmt: skip
+
+
+def test_frf_as_json_has_the_response_and_its_modes(bench: Path) -> None:
+    """Modes as everywhere, the response line by line, how it was measured and fitted."""
+    result = frf(bench, "--band", *BAND, "--period", 4, "--format", "json")
+    assert (result.exit_code, result.stderr) == (0, "")
+    content = strict(result.stdout)
+    assert set(content) == {"modes", "fit", "frf", "lines", "refused"}
+    assert all(set(mode) >= MODE_KEYS for mode in content["modes"])
+    assert [mode["source"] for mode in content["modes"]] == ["frf", "frf"]
+    for mode, (f, _, _) in zip(content["modes"], MODES, strict=False):
+        assert mode["frequency_hz"] == pytest.approx(f, rel=2e-3)
+    (fit,) = content["fit"]
+    assert set(fit) == set(LOOKS["fit"].split())
+    assert fit["period_s"] == pytest.approx(4)
+    assert fit["n_lines"] == len(content["frf"]) == 305
+    for row in content["frf"]:
+        assert set(row) == set(LOOKS["frf"].split())
+    keys = ("gain", "fit_gain", "gain_std")
+    gain, fitted, std = np.array([[row[k] for k in keys] for row in content["frf"]], dtype=float).T
+    assert np.abs((gain - fitted) / std).max() < 5
+
+
+def test_frf_as_csv_lists_modes_and_as_a_table_both(bench: Path) -> None:
+    """CSV is a table of modes that `track` reads; people see lines of the response too."""
+    rows = list(csv.DictReader(io.StringIO(frf(bench, "--format", "csv").stdout)))
+    assert set(rows[0]) >= MODE_KEYS
+    shown = frf(bench).stdout
+    assert "Response of acc_x to current" in shown
+    assert "coherence" in shown
+    assert "periods of 4 s" in shown
+    assert "mode_1" in shown
+    assert max(len(line) for line in shown.splitlines()) <= 80
+
+
+def test_frf_that_cannot_be_read_is_status_1_with_one_line(bench: Path) -> None:
+    """A missing channel is named with those that are there, in every format."""
+    for style in ("table", "csv", "json"):
+        result = frf(bench, "--output", "acc_y", "--format", style)
+        assert result.exit_code == 1
+        assert "['current', 'acc_x']" in result.stderr
+        assert len(result.stderr.splitlines()) == 1
+    assert "does not fit twice" in frf(bench, "--period", 11).stderr
 
 
 # run

@@ -5,11 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from lmshealth.spectra import (
-    Kernel,
-    Spectrum,
-    make_kernel,
-)
+from lmshealth.kernel import Kernel, make_kernel
+from lmshealth.logs import Channel
+from lmshealth.segments import Segment
+from lmshealth.spectra import Spectrum, periodogram
 from tests.signals import Mode, accelerations, density
 
 RATE = 2000.0
@@ -22,6 +21,12 @@ def kernel_of(
     spectrum = Spectrum(frequency.copy(), np.ones(frequency.size), duration, float("nan"))
     keep = np.ones(frequency.size, dtype=bool) if keep is None else keep
     return make_kernel(spectrum, keep, 8, margin)
+
+
+def whole(values: np.ndarray) -> Spectrum:
+    """Transform a record."""
+    segment = Segment(0, values.size, float("nan"))
+    return periodogram(Channel("x", "acceleration", values), segment, RATE)
 
 
 def autocovariance(mode: Mode, noise: float, n: int) -> np.ndarray:
