@@ -25,6 +25,7 @@ of one component or of one channel. That makes the Hessian a few matrix products
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -39,8 +40,8 @@ from lmshealth.layout import Layout
 # Where the second derivatives of h stand, by which first ones they are of.
 _SECOND = np.array([[4, 5, 6], [5, 7, 8], [6, 8, 9]])
 
-# Newton decrement, a square in standard deviations, below which no further step is worth it.
-_ARRIVED = 1e-5
+# Newton decrement, a square in standard deviations, from which on one full step is enough.
+_ARRIVED = 1e-3
 # Standard deviations of the weak normal priors about the start, which only keep directions that
 # the data do not see from running away: of ln f, ln ζ, forces, shapes, floors.
 WEAK = (0.2, 2.0)
@@ -159,13 +160,17 @@ class Likelihood:
         def hessian(p: FloatArray) -> FloatArray:
             return derivatives(p)[2]
 
-        def arrived(intermediate_result: OptimizeResult) -> None:
-            _, slope, curvature = derivatives(np.asarray(intermediate_result.x))
+        def newton_step(p: FloatArray) -> tuple[FloatArray, float]:
+            """Give the full step and its decrement; infinite where the Hessian has no inverse."""
+            _, slope, curvature = derivatives(p)
             try:
-                step = cho_solve(cho_factor(curvature), slope)
+                step = -cho_solve(cho_factor(curvature), slope)
             except np.linalg.LinAlgError:
-                return
-            if slope @ step < _ARRIVED:
+                return np.zeros_like(p), np.inf
+            return step, float(-slope @ step)
+
+        def arrived(intermediate_result: OptimizeResult) -> None:
+            if newton_step(np.asarray(intermediate_result.x))[1] < _ARRIVED:
                 raise StopIteration
 
         found = minimize(
@@ -177,7 +182,9 @@ class Likelihood:
             callback=arrived,
             options={"gtol": 1e-9, "maxiter": 100, "initial_trust_radius": 0.3},
         )
-        return np.asarray(found.x)
+        step, decrement = newton_step(np.asarray(found.x))
+        # So near no step goes too far, and one more makes it exact.
+        return np.asarray(found.x + step if decrement < _ARRIVED else found.x)
 
 
 class _Point:
@@ -260,20 +267,24 @@ class _Point:
         Of each unknown the index of b in the basis and its row w, E_a = b (Φ w)ᵀ and its adjoint,
         shapes ``(unknowns,)`` and ``(unknowns, components, n)``.
         """
-        lay, h = self._layout, self._h
-        row = np.zeros(lay.size, dtype=int)
-        w = np.zeros((lay.size, lay.n_components, self._block.frequency.size), dtype=complex)
-        pairs = self._block.smear(h[0][:, None] * h[0][None].conj())
-        for a, (i, q) in enumerate(lay.pole):
-            row[a] = i
-            w[a] = self._block.smear(self._s[i, :, None] * h[q, i] * h[0].conj())
-        for a, (i, j) in enumerate(lay.force, start=lay.forces.start):
-            row[a] = i
-            w[a] = self._scale[i] * self._root[:, j, None] * pairs[i]
-        for a, (c, i) in enumerate(lay.shape, start=lay.shapes.start):
-            row[a] = lay.n_modes + c
-            w[a] = self._modal[i]
-        return row, w
+        lay, h, s = self._layout, self._h, self._s
+        pole, slope = _columns(lay.pole)
+        driven, _ = _columns(lay.force)
+        by_pole = s[pole, :, None] * h[slope, pole][:, None] * h[0].conj()
+        pairs = self._block.smear(h[0][:, None] * h[0].conj())
+        w = [self._block.smear(by_pole), self._change[..., None] * pairs[driven]]
+        row = [pole, driven]
+        if lay.shape:
+            channel, mode = _columns(lay.shape)
+            row.append(lay.n_modes + channel)
+            w.append(self._modal[mode])
+        return np.concatenate(row), np.concatenate(w)
+
+    @cached_property
+    def _change(self) -> FloatArray:
+        """Change of the row and column of S that belong to each force, ``(forces, components)``."""
+        driven, force = _columns(self._layout.force)
+        return np.asarray(self._scale[driven, None] * self._root.T[force])
 
     def _curvature(self, w: ComplexArray, g: ComplexArray) -> FloatArray:
         """Σ tr G E_ab over all pairs of unknowns, the counts in G."""
@@ -293,43 +304,40 @@ class _Point:
     def _by_poles(self, curvature: FloatArray, turned: ComplexArray) -> None:
         """By two unknowns of h: Q = Σ_ij S_ij B_ji h_i h_j*."""
         h, n = self._h, self._layout.n_poles
-        component, slope = np.array(self._layout.pole, dtype=int).T
+        component, slope = _columns(self._layout.pole)
         weight = self._s[..., None] * turned
         first = h[slope, component]
         pairs = weight[component[:, None], component]
         term = np.einsum("abk,ak,bk->ab", pairs, first, first.conj())
         pull = np.sum(weight * h[0].conj()[None], axis=1)
-        for a in range(n):
-            for b in np.flatnonzero(component == component[a]):
-                term[a, b] += (
-                    pull[component[a]] @ h[_SECOND[slope[a] - 1, slope[b] - 1], component[a]]
-                )
+        # Of the second derivatives of h those of one component are not zero.
+        one, other = np.nonzero(component[:, None] == component)
+        second = h[_SECOND[slope[one] - 1, slope[other] - 1], component[one]]
+        term[one, other] += np.sum(pull[component[one]] * second, axis=1)
         curvature[:n, :n] += 2 * term.real
 
     def _by_forces(self, curvature: FloatArray, turned: ComplexArray) -> None:
         """By two forces, and by a force and an unknown of h."""
         lay, h = self._layout, self._h
+        driven, force = _columns(lay.force)
         overlap = np.einsum("ijk,ik,jk->ij", turned, h[0], h[0].conj()).real
-        start = lay.forces.start
-        for a, (i, j) in enumerate(lay.force, start=start):
-            for b, (k, column) in enumerate(lay.force, start=start):
-                if j == column:
-                    curvature[a, b] += 2 * self._scale[i] * self._scale[k] * overlap[i, k]
-        component, slope = np.array(lay.pole, dtype=int).T
+        overlap *= np.outer(self._scale, self._scale)
+        same = force[:, None] == force
+        curvature[lay.forces, lay.forces] += 2 * same * overlap[driven[:, None], driven]
+        component, slope = _columns(lay.pole)
         mixed = np.einsum("ajk,ak,jk->aj", turned[component], h[slope, component], h[0].conj()).real
-        for a, (i, j) in enumerate(lay.force, start=start):
-            # S changes in row and column i.
-            change = self._scale[i] * self._root[:, j]
-            term = np.where(component == i, mixed @ change, 0) + change[component] * mixed[:, i]
-            curvature[a, : lay.n_poles] += 2 * term
-            curvature[: lay.n_poles, a] += 2 * term
+        # S changes in row and column.
+        term = (driven[:, None] == component) * (self._change @ mixed.T)
+        term += self._change[:, component] * mixed[:, driven].T
+        curvature[lay.forces, : lay.n_poles] += 2 * term
+        curvature[: lay.n_poles, lay.forces] += 2 * term.T
 
     def _by_shapes(
         self, curvature: FloatArray, w: ComplexArray, g: ComplexArray, pull: ComplexArray
     ) -> None:
         """By two shapes, and by a shape and what D depends on."""
         lay = self._layout
-        channel, mode = np.array(lay.shape).T
+        channel, mode = _columns(lay.shape)
         own = np.tensordot(self._modal, g, axes=(2, 2))  # (i, j, d, c)
         own = own[mode[:, None], mode, channel, channel[:, None]]
         curvature[lay.shapes, lay.shapes] += 2 * own.real
@@ -340,6 +348,10 @@ class _Point:
         term = across[:, mode, channel] + np.where(row[:, None] == mode, along[:, channel], 0)
         curvature[: lay.shapes.start, lay.shapes] += 2 * term.real
         curvature[lay.shapes, : lay.shapes.start] += 2 * term.real.T
+
+
+def _columns(pairs: Sequence[tuple[int, int]]) -> np.ndarray[tuple[int, int], np.dtype[np.intp]]:
+    return np.array(pairs, dtype=np.intp).reshape(-1, 2).T
 
 
 def _congruent(basis: FloatArray, matrix: ComplexArray) -> ComplexArray:
