@@ -17,8 +17,8 @@ from lmshealth.spectra import Spectrum, median_ordinate
 
 _COMMON_STEPS = 41
 _OWN_STEPS = 15
-# Multiplicative updates, and their exponent over the one that is proved to be monotone.
-# Updates that converge, and that suffice to tell candidates apart.
+# Multiplicative updates that converge, and that suffice to tell candidates apart; their exponent
+# over the one that is proved to be monotone.
 _UPDATES, _FEW_UPDATES = 25, 10
 _STRIDE = 1.8
 
