@@ -13,7 +13,7 @@ FLOORS = [
     {"samples"},
     {"logs"},
     {"results"},
-    {"readers", "segments", "harmonics", "priors", "modalmap", "tones", "layout"},
+    {"readers", "segments", "harmonics", "priors", "modalmap", "tones", "layout", "components"},
     {"laws", "spectra", "following", "transient", "periods", "rational", "noise"},
     {"stage", "kernel", "starts", "linetest", "restricted", "responses", "responsefit"},
     {"blocks"},
