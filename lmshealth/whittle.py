@@ -130,6 +130,13 @@ class Likelihood:
             hessian = hessian + second
         return gradient, hessian
 
+    def shapes(self, p: FloatArray) -> FloatArray:
+        """Shapes of the modes, shape ``(n_channels, n_modes)``."""
+        phi = np.ones((self.layout.n_channels, self.layout.n_modes))
+        if self.layout.shape:
+            phi[tuple(_columns(self.layout.shape))] = p[self.layout.shapes]
+        return phi
+
     def signal_to_noise(self, p: FloatArray) -> FloatArray:
         """Modal signal-to-noise ratios S φ² / (4 ζ² N), shape ``(n_channels, n_modes)``."""
         m = self.layout.n_modes
@@ -226,10 +233,7 @@ class _Point:
         self._root[range(m, n), range(m, n)] = 1.0
         for value, (i, j) in zip(p[lay.forces], lay.force, strict=True):
             self._root[i, j] = self._scale[i] * value
-        self._phi = np.eye(lay.n_channels, n, m)
-        self._phi[:, :m] = 1.0
-        for value, (c, i) in zip(p[lay.shapes], lay.shape, strict=True):
-            self._phi[c, i] = value
+        self._phi = np.concatenate([likelihood.shapes(p), np.eye(lay.n_channels)], axis=1)
         self._poles = p[:m, None], p[m : 2 * m, None]
         self._tilts = p[2 * m : lay.n_poles].reshape(-1, 3)
         self._u = np.log(block.grid / likelihood.centre) / likelihood.spread

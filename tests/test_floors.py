@@ -20,6 +20,7 @@ FLOORS = [
     {"peaks", "band", "whittle", "lines", "magnitudes", "decayfit", "bounds", "naming"},
     {"posterior"},
     {"bandfit"},
+    {"separation"},
     {"modal", "frf", "history", "sampling", "ringing"},
     {"tracking", "maintenance", "decay"},
     {"inference"},
