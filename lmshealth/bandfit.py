@@ -52,7 +52,7 @@ _RESOLVED, _AT_BOUND = 4.0, 0.9
 # Bins made for a resonance are fine enough for one that is narrower by this factor.
 _NARROWER = 0.7
 # Newton decrement of a fit that has arrived.
-_WORST_DECREMENT = 1e-2
+_WORST_DECREMENT = 0.1
 _HEAVY = 0.1  # and above this, a hump that nobody expected is no mode
 
 

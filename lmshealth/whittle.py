@@ -41,8 +41,9 @@ from lmshealth.layout import Layout
 
 T = TypeVar("T")
 
-# Newton decrement, a square in standard deviations, from which on one full step is enough.
-_ARRIVED = 1e-3
+# Newton decrement, a square in standard deviations, from which on one full step is enough; along
+# a valley as flat as that of two modes at one place, after so many steps, a larger one.
+_ARRIVED, _NEARLY, _MANY_STEPS = 1e-3, 0.1, 25
 # Standard deviations of the weak normal priors about the start, which only keep directions that
 # the data do not see from running away: of ln f, ln ζ, forces, shapes, floors.
 WEAK = (0.2, 2.0)
@@ -184,8 +185,11 @@ class Likelihood:
                 return np.zeros_like(p), np.inf
             return step, float(-slope @ step)
 
+        steps = iter(range(1, 1000))
+
         def arrived(intermediate_result: OptimizeResult) -> None:
-            if newton_step(np.asarray(intermediate_result.x))[1] < _ARRIVED:
+            near = _ARRIVED if next(steps) < _MANY_STEPS else _NEARLY
+            if 0 <= newton_step(np.asarray(intermediate_result.x))[1] < near:
                 raise StopIteration
 
         found = minimize(
@@ -195,11 +199,11 @@ class Likelihood:
             hess=hessian,
             method="trust-exact",
             callback=arrived,
-            options={"gtol": 1e-9, "maxiter": 40, "initial_trust_radius": 0.3},
+            options={"gtol": 1e-9, "maxiter": 60, "initial_trust_radius": 0.3},
         )
         step, decrement = newton_step(np.asarray(found.x))
         # So near no step goes too far, and one more makes it exact.
-        return np.asarray(found.x + step if decrement < _ARRIVED else found.x)
+        return np.asarray(found.x + step if decrement < _NEARLY else found.x)
 
 
 class _Last(Generic[T]):
