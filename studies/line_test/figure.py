@@ -130,7 +130,7 @@ def draw_moves(ax: Axes, modes: dict[str, Any]) -> None:
     """Draw how far each line moves the mode."""
     rows = modes["rows"] + modes["orders"]
     for key, colour, marker, shift, label in (
-        ("moved_without_masks", PINK, "x", 1.12, "without masks (control)"),
+        ("moved_with_lines_left_in", PINK, "x", 1.12, "lines left in (control)"),
         ("moved", BLUE, "o", 0.9, "as identified"),
     ):
         kept = [row for row in rows if row[key] is not None]
