@@ -394,7 +394,7 @@ def test_dispersion_of_noise_is_about_one(count: int) -> None:
 
 
 def test_dispersion_is_that_of_what_stands_near_the_mode_and_is_not_masked() -> None:
-    """What is beyond two bandwidths, or masked as a line, does not count; twice the scatter does."""
+    """What is further away, or masked as a line, does not count; twice the scatter does."""
     values = scatter(1)
     noise = residual(values)
     near = np.abs(noise.frequency - 105.0) < 2 * 0.02 * 105.0
