@@ -13,6 +13,7 @@ from lmshealth.samples import Stored
 from lmshealth.segments import Segment
 from lmshealth.spectra import (
     CrossSpectrum,
+    Resonances,
     Spectrum,
     cross_spectra,
     periodogram,
@@ -387,3 +388,54 @@ def test_a_sine_reads_its_amplitude_in_the_mean_of_parts() -> None:
     assert mean.sine(at - 2, at + 3) == (
         pytest.approx(frequency), pytest.approx(0.02, rel=1e-3)
     )  # fmt: skip
+
+
+# What a line may reach, and where a resonance may stand
+
+
+def test_without_gives_up_what_lines_reach_and_nothing_else() -> None:
+    """Ordinates that lines reach are no longer free; those that were not stay so."""
+    values = np.random.default_rng(24).normal(size=20_000)
+    (found,) = transform({"acc_a": values}, [Segment(0, 20_000, 0.1)])
+    once = found.without([150.04])
+    assert found.free.all()
+    assert found.frequency[~once.free] == pytest.approx([149.9, 150.0, 150.1, 150.2])
+    twice = once.without([800.0, 50.04])
+    lost = ~found.channel(0).clear_of([150.04, 800.0, 50.04])
+    np.testing.assert_array_equal(twice.free, ~lost)
+    np.testing.assert_array_equal(twice.matrix, found.matrix)
+
+
+def test_resonances_look_like_lines_where_a_segment_does_not_resolve_them() -> None:
+    """Within their band, and below eight ordinates in the half-power bandwidth 2ζf."""
+    frequency = np.array([89.0, 90.0, 99.0, 101.0, 110.0, 111.0])
+    expected = Resonances(90.0, 110.0, 0.02)
+    # 2 · 0.02 · 100 Hz · 2 s is eight.
+    assert expected.like_lines(frequency, 2.0).tolist() == [False, True, True, False, False, False]
+    assert not expected.like_lines(frequency, 3.0).any()
+    assert expected.like_lines(frequency, 1.0).sum() == 4
+
+
+def test_a_resonance_of_a_short_move_is_not_taken_for_a_tone() -> None:
+    """In 60 moves of 0.67 s a mode one ordinate wide is left where it may stand."""
+    n, mode = 1340, Mode(130.0, 0.006, 4 * 0.006**2 * 300)
+    kept = {}
+    for name, expected in (
+        ("there", Resonances(110.0, 150.0, 0.005)),
+        ("elsewhere", Resonances(300.0, 350.0, 0.005)),
+    ):
+        free = []
+        for seed in range(60):
+            values = accelerations(np.random.default_rng(seed), [mode], n, RATE, 1.0)[0]
+            (found,) = cross_spectra(
+                [Channel("acc_a", "acceleration", values)],
+                [Segment(0, n, 0.1)],
+                RATE,
+                400.0,
+                resonances=(expected,),
+            )
+            free.append(found.band(120.0, 140.0).free.all())
+        kept[name] = sum(free)
+    assert kept["there"] == 60
+    # Negative control: where none is expected about half of the moves lose it.
+    assert kept["elsewhere"] < 45
