@@ -275,6 +275,17 @@ def test_a_line_known_beforehand_is_masked() -> None:
     assert np.abs((result.estimate - clean.estimate) / np.sqrt(np.diag(clean.cov))).max() < 0.5
 
 
+def test_a_band_that_known_lines_cover_is_too_short() -> None:
+    """Where lines leave nothing to fit, the mode is refused with what is left."""
+    view, coarse = view_of(both())
+    everywhere = np.arange(80.0, 160.0, 0.1).tolist()
+    told = replace(view, spectra=tuple(s.without(everywhere) for s in view.spectra))
+    result, missing = fit_band(told, coarse, (ROLL,))
+    assert result is None
+    assert missing["roll"][0] == "too-short"
+    assert missing["roll"][1].startswith("0 Fourier frequencies")
+
+
 def mean_of(values: np.ndarray, count: int) -> CrossSpectrum:
     """Average the spectra of equal parts."""
     made = make_log({f"acc_{k}": row for k, row in enumerate(values)}, RATE).channels

@@ -14,8 +14,13 @@ Method
     not show is refused, not guessed. Negative controls that must disagree: a response on a stage
     of 5 % less preload; the response to the motor's whole current, which has the poles of the
     stage without its servo.
+Answer
+    Every mode that two methods show has the same frequency in all of them, and that of the closed
+    loop. Pitch is known to 1 mHz from a response of Y, 7 mHz of X, and to 0.2 to 0.35 Hz from an
+    undisturbed move. Roll shows in the accelerometers, in 12 of 20 responses of Y, in none of X,
+    and never in the following error. Both controls disagree.
 Run time
-    About three minutes on two processors for 20 seeds of both stages.
+    Seven minutes of processor time on two processors for 20 seeds of both stages.
 """
 
 from __future__ import annotations
