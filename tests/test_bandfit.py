@@ -283,7 +283,7 @@ def test_a_band_that_known_lines_cover_is_too_short() -> None:
     result, missing = fit_band(told, coarse, (ROLL,))
     assert result is None
     assert missing["roll"][0] == "too-short"
-    assert missing["roll"][1].startswith("0 Fourier frequencies")
+    assert "hold no line, needed 16" in missing["roll"][1]
 
 
 def mean_of(values: np.ndarray, count: int) -> CrossSpectrum:
