@@ -32,7 +32,7 @@ _REACH = 400
 # this many times what is further away.
 _LEFT_OVER = 4.0
 _NEAR, _FAR = 10, 40
-_MOST_TONES, _MOST_ROUNDS = 200, 4
+_MOST_TONES, _MOST_ROUNDS = 30, 4
 # Tones fitted together, the strongest first; suspects this near to a stronger one are its foot.
 _TOGETHER, _FOOT = 6, 4
 # Share of the level that the skirt of a tone may have where it is left in.
