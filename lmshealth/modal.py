@@ -98,7 +98,19 @@ def identify(
     lines = name_lines(seen, log, stage, resolution)
     if stage is not None:
         return _collect(fits, lines, (*log.refused, *refused))
-    return _renumber(_collect(_distinct(fits), lines, log.refused))
+    modes = _renumber(_collect(_distinct(fits), lines, log.refused))
+    return modes if modes.names else replace(modes, refused=(*log.refused, _nothing(log, lines)))
+
+
+def _nothing(log: Log, lines: tuple[Line, ...]) -> Refusal:
+    """Say that nothing was found where nothing was sought by name."""
+    told = f"{len(lines)} lines, which are no modes" if lines else "no line either"
+    return Refusal(
+        log.name,
+        "not-excited",
+        f"no resonance stands out of the noise in any channel; {told}: excite the machine, record "
+        "longer, or look in another band",
+    )
 
 
 def _transform(

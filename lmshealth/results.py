@@ -73,7 +73,7 @@ class Modes:
         What to bear in mind of each mode, separated by blanks: ``resolution-limited`` where the
         half-power bandwidth spans few Fourier frequencies, ``at-bound`` where frequency or
         damping is at the end of what was searched, ``loose-fit`` where the dispersion is clearly
-        more than one.
+        more than one, ``cluster`` where one stands for two that cannot be told apart.
     lines : tuple of Line
         Spectral lines that were kept out of the likelihood.
     refused : tuple of Refusal

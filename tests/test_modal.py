@@ -325,7 +325,9 @@ def test_white_noise_has_no_mode() -> None:
         assert found.names == ()
         assert found.cov.shape == (0, 0)
         assert {why(found, name) for name, *_ in LMS_Y} == {"not-excited"}
-        assert identify(log, band=(20.0, 400.0)).names == ()
+        sought = identify(log, band=(20.0, 400.0))
+        assert sought.names == ()
+        assert [refusal.reason for refusal in sought.refused] == ["not-excited"]
 
 
 def test_mains_are_a_line_and_no_mode() -> None:
@@ -343,7 +345,9 @@ def test_a_pure_sine_is_a_line_and_no_mode(frequency: float) -> None:
     sought = identify(log, make_stage(ROLL))
     assert sought.names == ()
     assert why(sought, "roll") in ("not-excited", "line-not-mode")
-    assert identify(log, band=(20.0, 400.0)).names == ()
+    anything = identify(log, band=(20.0, 400.0))
+    assert anything.names == ()
+    assert "lines, which are no modes" in anything.refused[0].detail
     (line,) = sought.lines
     assert line.frequency == pytest.approx(frequency, abs=0.02)
     assert line.amplitude == pytest.approx(30.0, rel=0.01)
