@@ -86,7 +86,9 @@ def _stand_out(
         last = np.maximum(np.searchsorted(spectrum.frequency, b), first + 1)
         last = np.minimum(last, spectrum.frequency.size)
         first = np.minimum(first, last - 1)
-        return (total[last] - total[first]) / (last - first), spectrum.count * (last - first)
+        # A channel may be silent.
+        level = ((total[last] - total[first]) / (last - first)).clip(1e-300)
+        return level, spectrum.count * (last - first)
 
     inner, n_inner = mean(centre * (1 - scale), centre * (1 + scale))
     left, n_left = mean(centre * (1 - 4 * scale), centre * (1 - 2 * scale))

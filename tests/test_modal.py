@@ -623,3 +623,14 @@ def test_two_of_three_modes_keep_their_names() -> None:
         signal = accelerations(rng(seed), modes, round(20 * RATE), RATE, 0.01)[0]
         found = identify(make_log({"acc_a": signal}, RATE), stage)
         assert found.names == ("roll", "yaw")
+
+
+def test_a_silent_channel_has_no_mode_and_does_no_harm() -> None:
+    """A channel of one value is passed over, alone with a reason, sought or not."""
+    log = make_log({"acc_a": np.full(60_000, 3.0)}, RATE)
+    assert identify(log, band=(20.0, 400.0)).refused[0].reason == "not-excited"
+    assert why(identify(log, make_stage(ROLL)), "roll") == "not-excited"
+    values = accelerations(rng(60), [Mode(105.0, 0.015)], 60_000, RATE, 0.5)[0]
+    log = make_log({"acc_a": np.full(60_000, 3.0), "acc_b": values}, RATE)
+    assert identify(log, make_stage(ROLL)).names == ("roll",)
+    assert identify(log, band=(20.0, 400.0)).names == ("mode_1",)
