@@ -13,6 +13,7 @@ from lmshealth.history import Reading, build_history
 from lmshealth.inference import infer
 from lmshealth.modal import identify
 from lmshealth.pipeline import Settings, assess, run
+from lmshealth.planning import plan
 from lmshealth.prognosis import prognose
 from lmshealth.readers import read_log
 from lmshealth.stage import load_stage
@@ -32,6 +33,7 @@ __all__ = [
     "infer",
     "judge",
     "load_stage",
+    "plan",
     "prognose",
     "read_frf",
     "read_log",

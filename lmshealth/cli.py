@@ -17,15 +17,18 @@ import click
 from lmshealth import terminal
 from lmshealth.errors import BadLog, LmshealthError
 from lmshealth.logs import Log, Refusal
-from lmshealth.magnitudes import (
-    GRID_BAND,
-    Magnitude,
-    choose_bands,
-    find_growth,
-    read_magnitudes,
+from lmshealth.magnitudes import find_growth
+from lmshealth.options import (
+    COLUMNS,
+    DETECT,
+    FORMAT,
+    LOGS,
+    PART,
+    SHARE,
+    STAGE,
+    checked_band,
+    examples,
 )
-from lmshealth.results import Line, Modes
-from lmshealth.segments import PARTS
 
 if TYPE_CHECKING:
     from lmshealth.pipeline import RunResult
@@ -54,12 +57,6 @@ class _Group(click.Group):
             ctx.exit(_FAILED)
 
 
-def _examples(*lines: str) -> str:
-    """Write examples that stand unwrapped at the end of a command's help."""
-    # click leaves a paragraph alone that begins with a backspace.
-    return "\n".join(["\b", "Examples:", *(f"    lmshealth {line}" for line in lines)])
-
-
 @click.group(
     cls=_Group,
     context_settings={"help_option_names": ["-h", "--help"]},
@@ -71,7 +68,7 @@ def main() -> None:
     """Tell how much guide preload and mount stiffness a linear-motor stage has left."""
 
 
-@main.command(epilog=_examples("run logs/ --stage lms-y --out result/"))
+@main.command(epilog=examples("run logs/ --stage lms-y --out result/"))
 @click.argument("logs", type=click.Path(exists=True, file_okay=False, path_type=Path))
 @click.option(
     "--stage",
@@ -118,36 +115,15 @@ def run(
     ctx.exit(_SOME_REFUSED if result.n_refused else _DONE)
 
 
-_LOGS = click.argument("logs", nargs=-1, required=True, type=click.Path(path_type=Path))
-_STAGE = click.option("--stage", help="Stage description: a .toml file or a shipped name.")
-_COLUMNS = click.option(
-    "--columns", type=click.Path(path_type=Path), help="Column map of the export."
-)
-_FORMAT = click.option(
-    "--format",
-    "style",
-    type=click.Choice(["table", "csv", "json"]),
-    default="table",
-    show_default=True,
-)
-_PART = click.option(
-    "--part",
-    type=click.Choice(PARTS),
-    default="record",
-    show_default=True,
-    help="Read all of the log, or what its set point says is this.",
-)
-
-
 @main.command(
-    epilog=_examples(
+    epilog=examples(
         "modes log.h5 --stage lms-y",
         "modes export.csv --columns map.toml --band 80 200 --format json",
         "modes moves.h5 --stage lms-y --part settling",
     )
 )
-@_LOGS
-@_STAGE
+@LOGS
+@STAGE
 @click.option(
     "--part",
     type=click.Choice(["constant", "settling"]),
@@ -156,10 +132,10 @@ _PART = click.option(
     help="Use what vibrates at constant velocity, or all of a log that never moves; or what "
     "decays after the moves.",
 )
-@_COLUMNS
+@COLUMNS
 @click.option("--channels", help="Use only these channels, separated by commas.")
 @click.option("--band", nargs=2, type=float, metavar="LOW HIGH", help="Use only this band, in Hz.")
-@_FORMAT
+@FORMAT
 @click.pass_context
 def modes(ctx: click.Context, /, logs: tuple[Path, ...], style: str, **options: Any) -> None:
     """Identify the modes of single logs: frequency and damping with their uncertainty."""
@@ -169,7 +145,7 @@ def modes(ctx: click.Context, /, logs: tuple[Path, ...], style: str, **options: 
 
     look = identify_decays if options["part"] == "settling" else identify
     stage, columns = _loaded(options["stage"], options["columns"])
-    band = _checked_band(options["band"])
+    band = checked_band(options["band"])
     channels = (
         [name.strip() for name in options["channels"].split(",")] if (options["channels"]) else None
     )
@@ -195,12 +171,12 @@ def modes(ctx: click.Context, /, logs: tuple[Path, ...], style: str, **options: 
 
 
 @main.command(
-    epilog=_examples(
+    epilog=examples(
         "error velocities/*.h5",
         "error log.h5 --count 20 --floor-nm 50 --part settling --format json",
     )
 )
-@_LOGS
+@LOGS
 @click.option(
     "--count",
     type=click.IntRange(1),
@@ -215,9 +191,9 @@ def modes(ctx: click.Context, /, logs: tuple[Path, ...], style: str, **options: 
     show_default=True,
     help="Then count those above this amplitude.",
 )
-@_PART
-@_COLUMNS
-@_FORMAT
+@PART
+@COLUMNS
+@FORMAT
 @click.pass_context
 def error(ctx: click.Context, /, logs: tuple[Path, ...], style: str, **options: Any) -> None:
     """Read the following error: statistics, strongest harmonics, bandwidth, maximum magnitude.
@@ -252,13 +228,13 @@ def error(ctx: click.Context, /, logs: tuple[Path, ...], style: str, **options: 
 
 
 @main.command(
-    epilog=_examples(
+    epilog=examples(
         "spectrum velocities/*.h5 --stage lms-y",
         "spectrum velocities/*.h5 --band 10 400 --format csv",
     )
 )
-@_LOGS
-@_STAGE
+@LOGS
+@STAGE
 @click.option(
     "--band",
     nargs=2,
@@ -266,9 +242,9 @@ def error(ctx: click.Context, /, logs: tuple[Path, ...], style: str, **options: 
     metavar="LOW HIGH",
     help="Only modes, grid and lines of this band, in Hz; default 10 to 400 without a stage.",
 )
-@_PART
-@_COLUMNS
-@_FORMAT
+@PART
+@COLUMNS
+@FORMAT
 @click.pass_context
 def spectrum(ctx: click.Context, /, logs: tuple[Path, ...], style: str, **options: Any) -> None:
     """Read the accelerometers: magnitude per modal frequency and velocity, and which grow.
@@ -277,17 +253,18 @@ def spectrum(ctx: click.Context, /, logs: tuple[Path, ...], style: str, **option
     grid of every 10 Hz. A magnitude is the amplitude of the strongest harmonic of a band. Lines
     are found by a test that shows one where there is none in 1 % of channels.
     """
+    from lmshealth.survey import survey
     from lmshealth.tables import frame, growth_rows, lines_rows, magnitudes_rows, refused_rows
 
     stage, columns = _loaded(options["stage"], options["columns"])
-    band = _checked_band(options["band"])
-    found, lost = _each(logs, columns, lambda log: _survey(log, stage, band, options["part"]))
-    magnitudes = [item for _, own, _, _ in found for item in own]
+    band = checked_band(options["band"])
+    found, lost = _each(logs, columns, lambda log: survey(log, stage, band, part=options["part"]))
+    magnitudes = [item for own in found for item in own.magnitudes]
     growth = find_growth(magnitudes)
-    known = [(log, line) for log, _, seen, _ in found for line in seen]
+    known = [(own.log, line) for own in found for line in own.lines]
     rows = magnitudes_rows(magnitudes, growth, known)
-    lines = [{"log": log, **row} for log, _, seen, _ in found for row in lines_rows(seen)]
-    refused = refused_rows([*lost, *(refusal for *_, its in found for refusal in its)])
+    lines = [{"log": own.log, **row} for own in found for row in lines_rows(own.lines)]
+    refused = refused_rows([*lost, *(refusal for own in found for refusal in own.refused)])
     if style == "csv":
         click.echo(frame("magnitudes", rows).to_csv(index=False), nl=False)
     elif style == "json":
@@ -299,7 +276,7 @@ def spectrum(ctx: click.Context, /, logs: tuple[Path, ...], style: str, **option
 
 
 @main.command(
-    epilog=_examples(
+    epilog=examples(
         "frf sweep.h5 --input current_excitation --output acc_pitch --band 95 175",
         "frf bench.mat --columns map.toml --input current --output delta_e --period 1",
     )
@@ -320,8 +297,8 @@ def spectrum(ctx: click.Context, /, logs: tuple[Path, ...], style: str, **option
     metavar="S",
     help="Period of the excitation in s, to 1 %; default found from the input, if it repeats.",
 )
-@_COLUMNS
-@_FORMAT
+@COLUMNS
+@FORMAT
 @click.pass_context
 def frf(ctx: click.Context, /, log: Path, style: str, **options: Any) -> None:
     """Measure the frequency response from one channel to another, and identify its modes.
@@ -333,7 +310,7 @@ def frf(ctx: click.Context, /, log: Path, style: str, **options: Any) -> None:
     from lmshealth.tables import fit_row, frame, frf_rows, lines_rows, modes_rows, refused_rows
 
     _, columns = _loaded(None, options["columns"])
-    band, period = _checked_band(options["band"]), options["period"]
+    band, period = checked_band(options["band"]), options["period"]
     names = (options["source"], options["output"])
     found, lost = _each(
         [log], columns, lambda it: (it, read_frf(it, *names, band=band, period=period))
@@ -353,29 +330,58 @@ def frf(ctx: click.Context, /, log: Path, style: str, **options: Any) -> None:
     _exit(ctx, found, lost)
 
 
-_Survey = tuple[str, tuple[Magnitude, ...], tuple[Line, ...], tuple[Refusal, ...]]
-
-
-def _survey(log: Log, stage: Stage | None, band: tuple[float, float] | None, part: Any) -> _Survey:
-    """Read the accelerometers of a log: its name, magnitudes, lines and refusals."""
-    from lmshealth.lines import survey_lines
-    from lmshealth.modal import identify
-
-    accelerometers = [c for c in log.channels if c.kind == "acceleration"]
-    found: Modes | None = None
-    if stage is not None and accelerometers:
-        try:
-            found = identify(log, stage, channels=[c.name for c in accelerometers])
-        except BadLog:
-            found = None  # its modes are read where the description has them
-    bands = choose_bands(stage, found, band)
-    magnitudes = read_magnitudes(log, bands, part=part)
-    widest = band or (
-        min([GRID_BAND[0], *(b.low for b in bands)]),
-        max([GRID_BAND[1], *(b.high for b in bands)]),
+@main.command(
+    epilog=examples(
+        "plan --stage lms-y --detect guide_preload=0.05",
+        "plan --stage lms-y --detect guide_preload=0.1 --detect mount_stiffness=0.1 --seconds 45",
     )
-    lines = survey_lines(log, accelerometers, stage, widest)
-    return log.name, magnitudes, lines, log.refused
+)
+@click.option("--stage", required=True, help="Stage description: a .toml file or a shipped name.")
+@DETECT
+@click.option("--power", type=SHARE, default=0.95, show_default=True, help="To see that loss.")
+@click.option(
+    "--false-alarm",
+    type=SHARE,
+    default=0.01,
+    show_default=True,
+    help="Probability to call a loss where there is none.",
+)
+@click.option(
+    "--seconds",
+    type=click.FloatRange(0, min_open=True),
+    multiple=True,
+    help="Length of a log; may be given several times. Default 10 to 600 s.",
+)
+@click.option(
+    "--format", "style", type=click.Choice(["table", "json"]), default="table", show_default=True
+)
+def plan(stage: str, detections: list[tuple[str, float]], style: str, **options: Any) -> None:
+    """Plan logs: how long and how many they must be for a loss to be seen.
+
+    The best that can be had from vibration at constant velocity, by the Cramér-Rao bound: logs of
+    now are compared with those of the baseline, as long, at the same temperature.
+    """
+    from lmshealth.planning import DURATIONS
+    from lmshealth.planning import plan as make_plan
+    from lmshealth.stage import load_stage
+    from lmshealth.tables import plan_rows
+
+    loaded = load_stage(stage)
+    plans = [
+        make_plan(
+            loaded,
+            *detection,
+            power=options["power"],
+            false_alarm=options["false_alarm"],
+            durations=options["seconds"] or DURATIONS,
+        )
+        for detection in detections
+    ]
+    content = plan_rows(plans)
+    if style == "json":
+        terminal.print_json(content)
+    else:
+        terminal.print_plans(**content)
 
 
 def _loaded(stage: str | None, columns: Path | None) -> tuple[Stage | None, ColumnMap | None]:
@@ -408,14 +414,6 @@ def _exit(ctx: click.Context, found: Sequence[object], lost: Sequence[Refusal]) 
     for refusal in lost:
         click.echo(f"lmshealth: {refusal.log}: {refusal.reason}: {refusal.detail}", err=True)
     ctx.exit(_DONE if not lost else _SOME_REFUSED if found else _FAILED)
-
-
-def _checked_band(band: tuple[float, float] | None) -> tuple[float, float] | None:
-    if band and not 0 <= band[0] < band[1]:
-        raise click.BadParameter(
-            f"needs 0 <= LOW < HIGH, got {band[0]:g} {band[1]:g}", param_hint="--band"
-        )
-    return band or None
 
 
 def _tell(result: RunResult) -> None:

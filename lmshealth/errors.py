@@ -35,6 +35,10 @@ class BadStage(LmshealthError):
     """A stage description or modal map that cannot be used."""
 
 
+class BadQuestion(LmshealthError):
+    """A question that a stage description cannot answer."""
+
+
 class OutsideMap(LmshealthError):
     """Health parameters outside the grid of the modal map; maps are never extrapolated."""
 

@@ -35,7 +35,7 @@ _CLEAR_NAME = 0.8
 _MOST_ROUNDS = 3
 # Shortest useful segment: half-power bandwidth times duration; without a description, periods of
 # the top of the band.
-_LEAST_RESOLUTION, _LEAST_PERIODS = 2.0, 10.0
+LEAST_RESOLUTION, _LEAST_PERIODS = 2.0, 10.0
 _BEYOND = 4.0  # times the top of the band: more than any found mode's flanks reach
 _TOP = 0.45  # of the sample rate: anti-alias filters reach below Nyquist
 
@@ -134,7 +134,7 @@ def _transform(
     ceiling = reach if targets else _BEYOND * reach
     needed = _LEAST_PERIODS / min(reach, _TOP * log.sample_rate)
     if targets:
-        needed = _LEAST_RESOLUTION / min(2 * t.damping_ratio * t.frequency for t in targets)
+        needed = LEAST_RESOLUTION / min(2 * t.damping_ratio * t.frequency for t in targets)
     segments = find_segments(log, needed)
     if not segments:
         longest = max((b - a for a, b in log.pieces), default=0) / log.sample_rate

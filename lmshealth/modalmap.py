@@ -228,9 +228,9 @@ def sensitivities(modal_map: ModalMap, at: FloatArray, step: float = 1e-4) -> Fl
     modal_map : ModalMap
         The surrogate.
     at : ndarray
-        ln parameters, shape ``(n_parameters,)``, at least ``step`` inside the grid.
+        ln parameters inside the grid, shape ``(n_parameters,)``.
     step : float
-        Half width of the central difference, in ln parameter.
+        Half width of the difference in ln parameter: central, one-sided where the grid ends.
 
     Returns
     -------
@@ -238,5 +238,6 @@ def sensitivities(modal_map: ModalMap, at: FloatArray, step: float = 1e-4) -> Fl
         Shape ``(n_modes, n_parameters)``.
     """
     shifts = step * np.eye(at.size)
-    up, down = (modal_map.ln_frequency(at + sign * shifts) for sign in (1, -1))
-    return np.asarray((up - down).T / (2 * step))
+    up, down = np.minimum(at + shifts, modal_map.high), np.maximum(at - shifts, modal_map.low)
+    change = modal_map.ln_frequency(up) - modal_map.ln_frequency(down)
+    return np.asarray(change.T / np.diag(up - down))

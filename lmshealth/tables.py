@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from dataclasses import astuple
 from datetime import datetime
 from itertools import combinations
 from typing import Any
@@ -16,6 +17,7 @@ from lmshealth.frf import FrfReading
 from lmshealth.history import Reading
 from lmshealth.logs import Metadata, Refusal
 from lmshealth.magnitudes import Growth, Magnitude
+from lmshealth.planning import Plan
 from lmshealth.results import Line, Modes, Prognosis
 from lmshealth.summary import Assessment
 
@@ -56,6 +58,9 @@ LOOKS = {
     "magnitude_mm_s2 strongest_hz line rms_mm_s2 dof slope slope_std p_value grows",
     "frf": "log frequency_hz gain phase_rad gain_std coherence h1_gain h1_phase_rad h2_gain "
     "h2_phase_rad hv_gain hv_phase_rad fit_gain fit_phase_rad",
+    "detect": "parameter loss power false_alarm n_baseline seconds_for_one_log",
+    "plan": "parameter loss seconds_per_log n_logs hindrance power_of_one_log "
+    "smallest_loss_of_one_log smallest_loss",
     "fit": "log input output period_s n_averages n_lines low_hz high_hz mean_coherence "
     "chi_square distortion colour",
 }
@@ -233,6 +238,19 @@ def growth_rows(growth: Iterable[Growth]) -> list[Row]:
         }
         for g in growth
     ]
+
+
+def plan_rows(plans: Sequence[Plan]) -> dict[str, list[Row]]:
+    """List what plans were asked for, and what logs can do, one row per length of log."""
+    asked = [
+        (p.parameter, p.loss, p.power, p.false_alarm, p.n_baseline, p.duration_of_one)
+        for p in plans
+    ]
+    efforts = [(p.parameter, p.loss, *astuple(effort)) for p in plans for effort in p.efforts]
+    return {
+        name: [dict(zip(LOOKS[name].split(), row, strict=True)) for row in rows]
+        for name, rows in (("detect", asked), ("plan", efforts))
+    }
 
 
 def lines_rows(lines: Iterable[Line]) -> list[Row]:

@@ -146,6 +146,54 @@ def print_magnitudes(rows: Sequence[Row], lines: Sequence[Row], refused: Sequenc
     _print_refused(refused)
 
 
+_HINDRANCES = {
+    "too-short": ("log too short", "its modes cannot be identified."),
+    "baseline": ("baseline too short", "more logs now do not help, more or longer ones there do."),
+    "parameters": ("hidden", "other parameters change the modes alike; track further modes."),
+}
+
+
+def print_plans(detect: Sequence[Row], plan: Sequence[Row]) -> None:
+    """Print what logs of several lengths can do, one table per loss to be seen."""
+    for asked in detect:
+        name, n_baseline = asked["parameter"], asked["n_baseline"]
+        cells = [
+            (
+                f"{row['seconds_per_log']:g}",
+                _HINDRANCES[row["hindrance"]][0] if row["hindrance"] else str(row["n_logs"]),
+                _share(row["power_of_one_log"]),
+                _share(row["smallest_loss_of_one_log"]),
+                _share(row["smallest_loss"]),
+            )
+            for row in plan
+            if row["parameter"] == name and row["loss"] == asked["loss"]
+        ]
+        heads = ("s per log", "logs", "power, 1 log", "loss, 1 log", f"loss, {n_baseline} logs")
+        _print(
+            f"{name}: to see a loss of {_percent(asked['loss'])} with power {asked['power']:g}, "
+            f"false alarms {asked['false_alarm']:g}",
+            (),
+            heads,
+            cells,
+        )
+        alone = asked["seconds_for_one_log"]
+        click.echo(
+            f"One log is enough from {alone} s on.\n"
+            if alone
+            else "No one log of an hour is enough.\n"
+        )
+    for kind in dict.fromkeys(row["hindrance"] for row in plan if row["hindrance"]):
+        click.echo(": ".join(_HINDRANCES[kind]))
+    click.echo(
+        "At best. Baseline and logs now are of one length; loss: the smallest seen.\n"
+        "Not counted: temperature, wander between logs, errors of the map."
+    )
+
+
+def _share(value: float) -> str:
+    return "–" if math.isnan(value) else _percent(value)
+
+
 def _print_lines(lines: Sequence[Row]) -> None:
     """Print each line once for all logs."""
     groups: dict[tuple[str, str, float], list[Row]] = {}

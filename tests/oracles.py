@@ -303,3 +303,16 @@ def complex_normal_log_density(
         parts = np.concatenate([vector.real, vector.imag])
         total += stats.multivariate_normal.logpdf(parts, cov=real)
     return float(total)
+
+
+def planned_std(slopes: FloatArray, noise: FloatArray, column: int, *, prior_std: float) -> float:
+    """Invert the joint information for the standard deviation of one of two parameters.
+
+    ``slopes`` is ``(n_modes, 2)``, ``noise`` the variance of each mode's drift; the other
+    parameter has a prior, this one has none.
+    """
+    information = np.zeros((2, 2))
+    for row, variance in zip(slopes, noise, strict=True):
+        information += np.outer(row, row) / variance
+    information[1 - column, 1 - column] += prior_std**-2
+    return float(np.sqrt(np.linalg.inv(information)[column, column]))

@@ -69,7 +69,7 @@ def stage(folder: Path) -> Path:
 
 def test_every_command_has_help_with_an_example() -> None:
     """``--help`` of each command shows how it is called."""
-    assert set(main.commands) >= {"run", "modes", "error", "spectrum", "frf"}
+    assert set(main.commands) >= {"run", "modes", "error", "spectrum", "frf", "plan"}
     for name in main.commands:
         result = call(name, "--help")
         assert result.exit_code == 0
@@ -116,6 +116,11 @@ def test_the_version_is_told() -> None:
         ("frf", "log.h5", "--input", "current"),
         ("frf", "log.h5", "--input", "current", "--output", "acc_x", "--period", "0"),
         ("frf", "log.h5", "--input", "current", "--output", "acc_x", "--band", "200", "80"),
+        ("plan", "--stage", "lms-y"),
+        ("plan", "--detect", "guide_preload=0.05"),
+        ("plan", "--stage", "lms-y", "--detect", "guide_preload"),
+        ("plan", "--stage", "lms-y", "--detect", "guide_preload=0.05", "--power", "1"),
+        ("plan", "--stage", "lms-y", "--detect", "guide_preload=0.05", "--format", "csv"),
         ("nonsense",),
     ],
 )
@@ -413,6 +418,73 @@ def test_frf_that_cannot_be_read_is_status_1_with_one_line(bench: Path) -> None:
         assert "['current', 'acc_x']" in result.stderr
         assert len(result.stderr.splitlines()) == 1
     assert "does not fit twice" in frf(bench, "--period", 11).stderr
+
+
+# plan
+
+PLAN = ("plan", "--stage", "lms-y", "--detect")
+
+
+def test_plan_as_json_has_what_was_asked_and_one_row_per_length() -> None:
+    """Two losses, three lengths of which one is too short: nulls there, no NaN."""
+    lengths = ("--seconds", 0.2, "--seconds", 10, "--seconds", 60)
+    detect = ("guide_preload=0.05", "--detect", "mount_stiffness=0.02")
+    result = call(*PLAN, *detect, *lengths, "--format", "json")
+    assert (result.exit_code, result.stderr) == (0, "")
+    content = strict(result.stdout)
+    assert set(content) == {"detect", "plan"}
+    assert all(set(row) == set(LOOKS["detect"].split()) for row in content["detect"])
+    assert all(set(row) == set(LOOKS["plan"].split()) for row in content["plan"])
+    assert [(row["parameter"], row["loss"], row["n_baseline"]) for row in content["detect"]] == [
+        ("guide_preload", 0.05, 5), ("mount_stiffness", 0.02, 5),
+    ]  # fmt: skip
+    assert [row["seconds_per_log"] for row in content["plan"]] == [0.2, 10, 60] * 2
+    short = content["plan"][0]
+    assert (short["n_logs"], short["hindrance"], short["power_of_one_log"]) == (
+        None, "too-short", None,
+    )  # fmt: skip
+    assert isinstance(content["plan"][2]["n_logs"], int)
+
+
+def test_plan_as_a_table_follows_power_and_false_alarms() -> None:
+    """People see the answer in a line; asking for less needs less."""
+    shown = call(*PLAN, "guide_preload=0.05")
+    assert shown.exit_code == 0
+    assert "s per log" in shown.stdout
+    assert "One log is enough from" in shown.stdout
+    asked = (*PLAN, "guide_preload=0.05", "--format", "json")
+    easy = call(*asked, "--power", 0.8, "--false-alarm", 0.05)
+    needed = [
+        strict(text)["detect"][0]["seconds_for_one_log"]
+        for text in (call(*asked).stdout, easy.stdout)
+    ]
+    assert needed[1] < needed[0]  # type: ignore[operator]
+
+
+@pytest.mark.parametrize(
+    ("stage", "detect", "said"),
+    [
+        ("lms-x", "mount_stiffness=0.1", "do not show mount_stiffness"),
+        ("lms-y", "preload=0.1", "there are ['guide_preload', 'mount_stiffness']"),
+        ("lms-y", "guide_preload=5", "between 0 and 1"),
+        ("lms-z", "guide_preload=0.1", "no stage description"),
+    ],
+)
+def test_plan_without_an_answer_is_status_1_with_one_line(
+    stage: str, detect: str, said: str
+) -> None:
+    """What cannot be seen, is unknown, or is no fraction."""
+    result = call("plan", "--stage", stage, "--detect", detect)
+    assert (result.exit_code, result.stdout) == (1, "")
+    assert said in result.stderr
+    assert len(result.stderr.splitlines()) == 1
+
+
+def test_plan_needs_a_map(stage: Path) -> None:
+    """A description of modes alone cannot be planned with."""
+    result = call("plan", "--stage", stage, "--detect", "guide_preload=0.05")
+    assert result.exit_code == 1
+    assert "[map]" in result.stderr
 
 
 # run

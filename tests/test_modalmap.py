@@ -50,6 +50,15 @@ def test_sensitivities_are_the_derivatives_of_the_formula(small: ModalMap) -> No
     np.testing.assert_allclose(sensitivities(small, at), known, atol=1e-9)
 
 
+@pytest.mark.parametrize("end", [0, -1])
+def test_sensitivities_are_one_sided_where_the_grid_ends(small: ModalMap, end: int) -> None:
+    """A baseline may stand at the corner of the map, off by the bend over one step only."""
+    at = np.array([small.low, small.high])[end]
+    known = np.column_stack([SENSITIVITY[name][:2] for name in NAMES])
+    known[:, 0] += 2 * BEND * at[0]
+    np.testing.assert_allclose(sensitivities(small, at), known, atol=1.1e-4 * BEND)
+
+
 def test_the_order_of_rows_and_columns_does_not_matter(tmp_path: Path, small: ModalMap) -> None:
     """Shuffled rows, and columns in another order, make the same surrogate."""
     head, *rows = map_rows(NAMES)

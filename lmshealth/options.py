@@ -1,0 +1,67 @@
+"""Options of the command line that several commands share, and how their values are read."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from lmshealth.segments import PARTS
+
+LOGS = click.argument("logs", nargs=-1, required=True, type=click.Path(path_type=Path))
+STAGE = click.option("--stage", help="Stage description: a .toml file or a shipped name.")
+COLUMNS = click.option(
+    "--columns", type=click.Path(path_type=Path), help="Column map of the export."
+)
+FORMAT = click.option(
+    "--format",
+    "style",
+    type=click.Choice(["table", "csv", "json"]),
+    default="table",
+    show_default=True,
+)
+PART = click.option(
+    "--part",
+    type=click.Choice(PARTS),
+    default="record",
+    show_default=True,
+    help="Read all of the log, or what its set point says is this.",
+)
+SHARE = click.FloatRange(0, 1, min_open=True, max_open=True)
+
+
+def examples(*lines: str) -> str:
+    """Write examples that stand unwrapped at the end of a command's help."""
+    # click leaves a paragraph alone that begins with a backspace.
+    return "\n".join(["\b", "Examples:", *(f"    lmshealth {line}" for line in lines)])
+
+
+def checked_band(band: tuple[float, float] | None) -> tuple[float, float] | None:
+    """Refuse a band whose ends are not in order."""
+    if band and not 0 <= band[0] < band[1]:
+        raise click.BadParameter(
+            f"needs 0 <= LOW < HIGH, got {band[0]:g} {band[1]:g}", param_hint="--band"
+        )
+    return band or None
+
+
+def _detections(
+    ctx: click.Context, option: click.Parameter, values: tuple[str, ...]
+) -> list[tuple[str, float]]:
+    """Read each NAME=LOSS once."""
+    pairs = [value.split("=") for value in dict.fromkeys(values)]
+    try:
+        return [(name, float(loss)) for name, loss in pairs]
+    except ValueError as error:
+        raise click.BadParameter(f"needs NAME=LOSS with a number, got {values}") from error
+
+
+DETECT = click.option(
+    "--detect",
+    "detections",
+    multiple=True,
+    required=True,
+    metavar="NAME=LOSS",
+    callback=_detections,
+    help="Parameter, and which fraction of it is lost; may be given several times.",
+)
