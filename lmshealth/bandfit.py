@@ -52,7 +52,7 @@ _RESOLVED, _AT_BOUND = 4.0, 0.9
 # Bins made for a resonance are fine enough for one that is narrower by this factor.
 _NARROWER = 0.7
 # Newton decrement of a fit that has arrived.
-_WORST_DECREMENT = 1e-2
+_WORST_DECREMENT = 0.1
 _HEAVY = 0.1  # and above this, a hump that nobody expected is no mode
 
 
@@ -70,6 +70,9 @@ class BandFit:
         ``[ln f, ln ζ]``, shape ``(2 n_modes,)``.
     cov : ndarray
         Their covariance, forces, shapes and noise marginalised, ``(2 n_modes, 2 n_modes)``.
+    shapes : ndarray
+        How far each mode moves each channel, in units of its noise; one in the channel that it
+        moves most, shape ``(n_channels, n_modes)``.
     snr : ndarray
         Modal signal-to-noise ratio of all channels together, shape ``(n_modes,)``.
     dispersion : ndarray
@@ -91,6 +94,7 @@ class BandFit:
     targets: tuple[Target, ...]
     estimate: FloatArray
     cov: FloatArray
+    shapes: FloatArray
     snr: FloatArray
     dispersion: FloatArray
     flags: tuple[str, ...]
@@ -109,6 +113,7 @@ class BandFit:
             targets=tuple(self.targets[i] for i in index),
             estimate=self.estimate[both],
             cov=self.cov[np.ix_(both, both)],
+            shapes=self.shapes[:, index],
             snr=self.snr[index],
             dispersion=self.dispersion[index],
             flags=tuple(self.flags[i] for i in index),
@@ -334,6 +339,7 @@ def _conclude(
         targets=seen,
         estimate=estimate,
         cov=cov,
+        shapes=likelihood.shapes(p),
         snr=ratio.sum(axis=0),
         dispersion=np.full(m, np.nan),
         flags=("",) * m,

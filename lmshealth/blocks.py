@@ -120,4 +120,4 @@ def _bins_per_bandwidth(resolution: float) -> float:
     1/(3r²), and the damping too wide by as much, of which the standard deviation is
     (π B T)^-½; a thirtieth of it does not matter.
     """
-    return max(_LEAST_BINS, float(np.sqrt(10.0 * np.sqrt(np.pi * resolution))))
+    return max(_LEAST_BINS, float(np.sqrt(12.0 * np.sqrt(np.pi * resolution))))

@@ -21,6 +21,7 @@ from lmshealth.logs import Channel, Log, Refusal
 from lmshealth.peaks import find_excess, find_peaks
 from lmshealth.results import Line, Modes
 from lmshealth.segments import find_segments
+from lmshealth.separation import keep_separate
 from lmshealth.spectra import ANY_RESONANCE, Resonances, cross_spectra
 from lmshealth.stage import Stage
 from lmshealth.starts import Target, coarsen, locate, shift_cost
@@ -253,6 +254,9 @@ def _fit_cluster(
     if known and fit is not None:
         fit, unclear = _named(fit, cluster)
         reasons = reasons | unclear
+    if fit is not None:
+        fit, close = keep_separate(fit, known=known)
+        reasons = reasons | close
     seen = set() if fit is None else {target.name for target in fit.targets}
     refused = [
         Refusal(log=log.name, mode=name, reason=reason, detail=detail)
@@ -292,8 +296,12 @@ def _named(fit: BandFit, cluster: tuple[Target, ...]) -> tuple[BandFit, Missing]
     keeps the order is weighed by the prior of shifts; a mode whose name is not clear is refused.
     """
     found = sorted((float(fit.estimate[i]), t.name) for i, t in enumerate(fit.targets))
-    if not found or len(found) == len(cluster):
+    if not found:
         return fit, {}
+    if len(found) == len(cluster):
+        # All are there, and in order: at which target each began does not matter.
+        names = {name: t.name for (_, name), t in zip(found, cluster, strict=True)}
+        return _renamed(fit, names), {}
     ln_f = np.array([f for f, _ in found])
     choices = list(combinations(cluster, len(found)))
     search = np.array([[target.search for target in choice] for choice in choices])
@@ -306,7 +314,7 @@ def _named(fit: BandFit, cluster: tuple[Target, ...]) -> tuple[BandFit, Missing]
     if not np.isfinite(cost).any():
         return fit, {}
     weight = softmax(-cost)
-    names: dict[str, str] = {}
+    names = {}
     unclear: Missing = {}
     for i, (f, name) in enumerate(found):
         chance: dict[str, float] = {}
@@ -320,10 +328,11 @@ def _named(fit: BandFit, cluster: tuple[Target, ...]) -> tuple[BandFit, Missing]
         detail = f"the resonance at {np.exp(f):.5g} Hz may be {told}; its neighbours were not found"
         unclear |= {n: ("ambiguous", detail) for n in chance if chance[n] > 0.01}
     kept = fit.only([t.name for t in fit.targets if t.name in names])
-    renamed = tuple(replace(t, name=names[t.name]) for t in kept.targets)
-    return replace(kept, targets=renamed), {
-        n: why for n, why in unclear.items() if n not in names.values()
-    }
+    return _renamed(kept, names), {n: w for n, w in unclear.items() if n not in names.values()}
+
+
+def _renamed(fit: BandFit, names: dict[str, str]) -> BandFit:
+    return replace(fit, targets=tuple(replace(t, name=names[t.name]) for t in fit.targets))
 
 
 def _unexplained(fit: BandFit, cluster: tuple[Target, ...]) -> tuple[Target, ...]:

@@ -19,7 +19,7 @@ from lmshealth.whittle import Likelihood
 
 # Standard deviations of the parts that a floor shares with modes and with other floors, in units
 # of its own, and of its bend; the last ones are those of the likelihood.
-_WIDTHS = ((0.03, 0.1, 0.3, 1.0), (0.03, 0.3, 3.0), (0.1, 0.3, 1.0))
+_WIDTHS = ((0.03, 0.1, 1.0), (0.03, 0.3, 3.0), (0.03, 0.1, 1.0))
 
 
 def marginalise(likelihood: Likelihood, p: FloatArray) -> tuple[FloatArray, FloatArray, float]:

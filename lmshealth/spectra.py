@@ -20,6 +20,8 @@ from lmshealth.tones import remove_tones
 _LAG_PERIODS = 8.0
 # Set velocities closer than this are one.
 _SAME_VELOCITY = 0.01
+# From so many samples on a few at the end are given up for the sake of a fast transform.
+_LONG = 1 << 14
 # A resonance is no line if it is so many ordinates wide.
 _TOLD_APART = 8.0
 # Parts of a stretch that is cut have at least so many samples: only they are averaged.
@@ -243,12 +245,15 @@ def _cross_spectrum(
     # A second difference has no values at the ends: there the others are cut, too.
     short = max(lag for _, lag in parts)
     n = segment.stop - segment.start - 2 * short
+    if n > _LONG:
+        # A length with a large prime factor costs ten times as much; that less is never 1 %.
+        n = fft.prev_fast_len(n)
     if short:
         ceiling = min(ceiling, 4 * top)
     frequency = _frequencies(n, sample_rate, ceiling)
     transforms = np.empty((frequency.size, len(channels)), dtype=complex)
     for c, (x, lag) in enumerate(parts):
-        x = x if lag == short else x[short - lag : n + short - lag]
+        x = x[short - lag : n + short - lag]
         transforms[:, c] = fft.rfft(_without_trend(x))[1 : frequency.size + 1]
         if lag:
             transforms[:, c] *= lag_gain(frequency, lag, sample_rate)

@@ -17,8 +17,9 @@ from lmshealth.spectra import Spectrum, median_ordinate
 
 _COMMON_STEPS = 41
 _OWN_STEPS = 15
-# Multiplicative updates, and their exponent over the one that is proved to be monotone.
-_UPDATES = 25
+# Multiplicative updates that converge, and that suffice to tell candidates apart; their exponent
+# over the one that is proved to be monotone.
+_UPDATES, _FEW_UPDATES = 25, 10
 _STRIDE = 1.8
 
 
@@ -125,7 +126,7 @@ def _fit_targets(
 
 
 def incoherent_fit(
-    coarse: Sequence[Coarse], f: FloatArray, zeta: FloatArray
+    coarse: Sequence[Coarse], f: FloatArray, zeta: FloatArray, *, updates: int = _UPDATES
 ) -> tuple[FloatArray, FloatArray]:
     """Fit strengths of resonances and white noises to binned spectra, for many candidates.
 
@@ -138,6 +139,8 @@ def incoherent_fit(
         Binned spectrum of each channel; all have the same bins.
     f, zeta : ndarray
         Natural frequencies in Hz and damping ratios, shape ``(..., n_modes)``.
+    updates : int
+        Number of updates.
 
     Returns
     -------
@@ -162,7 +165,7 @@ def incoherent_fit(
     weight = np.average(levels, axis=-1, weights=count)[..., None] / unit.shape[-1]
     weight = weight * np.ones(unit.shape)
     turned = np.swapaxes(design, -1, -2)
-    for _ in range(_UPDATES):
+    for _ in range(updates):
         model = (design @ weight[..., None])[..., 0]
         share = count / model
         pull = turned @ (share * levels / model)[..., None]
@@ -223,7 +226,8 @@ def locate(
     def best(shifts: FloatArray) -> FloatArray:
         cost = shift_cost(shifts, search, own)
         f = nominal * np.exp(shifts)
-        cost += incoherent_fit(coarse, f, np.broadcast_to(zeta, f.shape))[1].sum(axis=0)
+        every = np.broadcast_to(zeta, f.shape)
+        cost += incoherent_fit(coarse, f, every, updates=_FEW_UPDATES)[1].sum(axis=0)
         return np.asarray(shifts[int(np.argmin(cost))])
 
     reach = float(np.log1p(search.min()))

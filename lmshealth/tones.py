@@ -11,6 +11,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+from scipy.ndimage import minimum_filter1d
 from scipy.special import spherical_jn
 
 from lmshealth.arrays import BoolArray, ComplexArray, FloatArray
@@ -153,13 +154,19 @@ def _place(rest: ComplexArray, at: int) -> float:
 
 def _contrast(power: FloatArray) -> FloatArray:
     """Ratio of each ordinate to the median of those three to eight beside it, if that is large."""
-    widest, n = _BESIDE[-1], len(power)
-    padded = np.pad(power, ((widest, widest), (0, 0)), mode="reflect")
-    beside = np.array([padded[widest + k : widest + k + n] for b in _BESIDE for k in (-b, b)])
-    # The median is not below the least: most ordinates do not need it.
-    contrast = power / beside.min(axis=0).clip(1e-300)
-    large = contrast > _TOWERING
-    contrast[large] = power[large] / np.median(beside[:, large], axis=0).clip(1e-300)
+    # The median is not below the least, which costs less: most ordinates do not need the median.
+    n, first, last = len(power), _BESIDE[0], _BESIDE[-1]
+    width = last - first + 1
+    least = minimum_filter1d(power, width, axis=0)
+    centre = first + width // 2
+    place = np.arange(n)
+    below, above = np.maximum(place - centre, 0), np.minimum(place + centre, n - 1)
+    contrast = power / np.minimum(least[below], least[above]).clip(1e-300)
+    at, channel = np.nonzero(contrast > _TOWERING)
+    beside = np.abs(at[:, None] + np.array([k for b in _BESIDE for k in (-b, b)]))
+    beside = np.where(beside < n, beside, 2 * (n - 1) - beside)
+    level = np.median(power[beside, channel[:, None]], axis=1)
+    contrast[at, channel] = power[at, channel] / level.clip(1e-300)
     return np.asarray(contrast)
 
 

@@ -25,8 +25,10 @@ of one component or of one channel. That makes the Hessian a few matrix products
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Generic, TypeVar
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
@@ -34,13 +36,14 @@ from scipy.optimize import OptimizeResult, minimize
 
 from lmshealth.arrays import ComplexArray, FloatArray
 from lmshealth.blocks import Block
+from lmshealth.components import SECOND, floor_response, floors, receptance, response
 from lmshealth.layout import Layout
 
-# Where the second derivatives of h stand, by which first ones they are of.
-_SECOND = np.array([[4, 5, 6], [5, 7, 8], [6, 8, 9]])
+T = TypeVar("T")
 
-# Newton decrement, a square in standard deviations, below which no further step is worth it.
-_ARRIVED = 1e-5
+# Newton decrement, a square in standard deviations, from which on one full step is enough; along
+# a valley as flat as that of two modes at one place, after so many steps, a larger one.
+_ARRIVED, _NEARLY, _MANY_STEPS = 1e-3, 0.1, 25
 # Standard deviations of the weak normal priors about the start, which only keep directions that
 # the data do not see from running away: of ln f, ln ζ, forces, shapes, floors.
 WEAK = (0.2, 2.0)
@@ -96,24 +99,44 @@ class Likelihood:
 
     def value(self, p: FloatArray) -> float:
         """Negative log posterior up to a constant."""
+        return self._value(p, self._at(p))
+
+    def data_value(self, p: FloatArray) -> float:
+        """Negative log likelihood without the priors."""
+        return sum(point.misfit() for point in self._at(p))
+
+    def expected(self, p: FloatArray) -> list[ComplexArray]:
+        """Compute E of each block, shape ``(n, n_channels, n_channels)``."""
+        return [point.expected for point in self._at(p)]
+
+    def _at(self, p: FloatArray) -> list[_Point]:
+        with np.errstate(over="ignore", invalid="ignore"):
+            return [_Point(self, p, block) for block in self.blocks]
+
+    def _value(self, p: FloatArray, points: list[_Point]) -> float:
         total = 0.5 * float(np.sum(((p - self.start) / self.prior_std) ** 2))
         with np.errstate(over="ignore", invalid="ignore"):
             try:
-                total += self.data_value(p)
+                total += sum(point.misfit() for point in points)
             except np.linalg.LinAlgError:
                 return np.inf
         return total if np.isfinite(total) else np.inf
 
-    def data_value(self, p: FloatArray) -> float:
-        """Negative log likelihood without the priors."""
-        return sum(
-            _misfit(block, matrix)
-            for block, matrix in zip(self.blocks, self.expected(p), strict=True)
-        )
+    def _derivatives(self, p: FloatArray, points: list[_Point]) -> tuple[FloatArray, FloatArray]:
+        gradient = (p - self.start) / self.prior_std**2
+        hessian = np.diag(1 / self.prior_std**2)
+        for point in points:
+            first, second = point.derivatives()
+            gradient = gradient + first
+            hessian = hessian + second
+        return gradient, hessian
 
-    def expected(self, p: FloatArray) -> list[ComplexArray]:
-        """Compute E of each block, shape ``(n, n_channels, n_channels)``."""
-        return [_Point(self, p, block).expected for block in self.blocks]
+    def shapes(self, p: FloatArray) -> FloatArray:
+        """Shapes of the modes, shape ``(n_channels, n_modes)``."""
+        phi = np.ones((self.layout.n_channels, self.layout.n_modes))
+        if self.layout.shape:
+            phi[tuple(_columns(self.layout.shape))] = p[self.layout.shapes]
+        return phi
 
     def signal_to_noise(self, p: FloatArray) -> FloatArray:
         """Modal signal-to-noise ratios S φ² / (4 ζ² N), shape ``(n_channels, n_modes)``."""
@@ -124,13 +147,7 @@ class Likelihood:
 
     def derivatives(self, p: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Exact gradient and Hessian of `value`, shapes ``(n_unknowns,)`` and square."""
-        gradient = (p - self.start) / self.prior_std**2
-        hessian = np.diag(1 / self.prior_std**2)
-        for block in self.blocks:
-            first, second = _Point(self, p, block).derivatives()
-            gradient = gradient + first
-            hessian = hessian + second
-        return gradient, hessian
+        return self._derivatives(p, self._at(p))
 
     def minimise(self, start: FloatArray) -> FloatArray:
         """Find the posterior mode by Newton's method in a trust region.
@@ -145,39 +162,68 @@ class Likelihood:
         ndarray
             Where the search ended; the caller judges it by its Newton decrement.
         """
-        last: list[FloatArray] = []
+        # The optimiser asks for value, gradient and Hessian of a point in an order of its own, and
+        # comes back to the point before where a step was too long.
+        points = _Last(self._at)
+        both = _Last(lambda p: self._derivatives(p, points(p)))
 
-        def derivatives(p: FloatArray) -> list[FloatArray]:
-            # The optimiser asks for gradient and Hessian of a point in an order of its own.
-            if not last or not np.array_equal(p, last[0]):
-                last[:] = [p.copy(), *self.derivatives(p)]
-            return last
+        def value(p: FloatArray) -> float:
+            return self._value(p, points(p))
 
         def gradient(p: FloatArray) -> FloatArray:
-            return derivatives(p)[1]
+            return both(p)[0]
 
         def hessian(p: FloatArray) -> FloatArray:
-            return derivatives(p)[2]
+            return both(p)[1]
+
+        def newton_step(p: FloatArray) -> tuple[FloatArray, float]:
+            """Give the full step and its decrement; infinite where the Hessian has no inverse."""
+            slope, curvature = both(p)
+            try:
+                step = -cho_solve(cho_factor(curvature), slope)
+            except np.linalg.LinAlgError:
+                return np.zeros_like(p), np.inf
+            return step, float(-slope @ step)
+
+        steps = iter(range(1, 1000))
 
         def arrived(intermediate_result: OptimizeResult) -> None:
-            _, slope, curvature = derivatives(np.asarray(intermediate_result.x))
-            try:
-                step = cho_solve(cho_factor(curvature), slope)
-            except np.linalg.LinAlgError:
-                return
-            if slope @ step < _ARRIVED:
+            near = _ARRIVED if next(steps) < _MANY_STEPS else _NEARLY
+            if 0 <= newton_step(np.asarray(intermediate_result.x))[1] < near:
                 raise StopIteration
 
         found = minimize(
-            self.value,
+            value,
             start,
             jac=gradient,
             hess=hessian,
             method="trust-exact",
             callback=arrived,
-            options={"gtol": 1e-9, "maxiter": 100, "initial_trust_radius": 0.3},
+            options={"gtol": 1e-9, "maxiter": 60, "initial_trust_radius": 0.3},
         )
-        return np.asarray(found.x)
+        step, decrement = newton_step(np.asarray(found.x))
+        # So near no step goes too far, and one more makes it exact.
+        return np.asarray(found.x + step if decrement < _NEARLY else found.x)
+
+
+class _Last(Generic[T]):
+    """A function that remembers its last value.
+
+    Parameters
+    ----------
+    function : callable
+        Of an array.
+    """
+
+    def __init__(self, function: Callable[[FloatArray], T]) -> None:
+        self._function = function
+        self._last: tuple[FloatArray, T] | None = None
+
+    def __call__(self, p: FloatArray) -> T:
+        """Give the value at p."""
+        if self._last is None or not np.array_equal(p, self._last[0]):
+            self._last = p.copy(), self._function(p)
+        return self._last[1]
 
 
 class _Point:
@@ -191,19 +237,24 @@ class _Point:
         self._root[range(m, n), range(m, n)] = 1.0
         for value, (i, j) in zip(p[lay.forces], lay.force, strict=True):
             self._root[i, j] = self._scale[i] * value
-        self._phi = np.eye(lay.n_channels, n, m)
-        self._phi[:, :m] = 1.0
-        for value, (c, i) in zip(p[lay.shapes], lay.shape, strict=True):
-            self._phi[c, i] = value
-        u = np.log(block.grid / likelihood.centre) / likelihood.spread
-        # h and its derivatives, shape (10, components, grid).
-        self._h = np.concatenate(
-            [
-                receptance(np.exp(p[:m, None]), np.exp(p[m : 2 * m, None]), block.grid),
-                _floors(p[2 * m : lay.n_poles].reshape(-1, 3), u),
-            ],
-            axis=1,
-        )
+        self._phi = np.concatenate([likelihood.shapes(p), np.eye(lay.n_channels)], axis=1)
+        self._poles = p[:m, None], p[m : 2 * m, None]
+        self._tilts = p[2 * m : lay.n_poles].reshape(-1, 3)
+        self._u = np.log(block.grid / likelihood.centre) / likelihood.spread
+
+    @cached_property
+    def _response(self) -> ComplexArray:
+        """Responses h of all components, shape ``(components, grid)``."""
+        ln_f, ln_zeta = self._poles
+        modes = response(np.exp(ln_f), np.exp(ln_zeta), self._block.grid)
+        return np.concatenate([modes, floor_response(self._tilts, self._u)])
+
+    @cached_property
+    def _h(self) -> ComplexArray:
+        """The same with its derivatives, shape ``(10, components, grid)``."""
+        ln_f, ln_zeta = self._poles
+        modes = receptance(np.exp(ln_f), np.exp(ln_zeta), self._block.grid)
+        return np.concatenate([modes, floors(self._tilts, self._u)], axis=1)
 
     @cached_property
     def _s(self) -> FloatArray:
@@ -220,18 +271,25 @@ class _Point:
         """PSD of what each floor does not share with a mode, shape ``(channels, grid)``."""
         m = self._layout.n_modes
         own = np.sum(self._root[m:, m:] ** 2, axis=1)
-        return np.asarray(np.abs(self._h[0, m:]) ** 2 * own[:, None])
+        return np.asarray(np.abs(self._response[m:]) ** 2 * own[:, None])
 
     @cached_property
     def _modal(self) -> ComplexArray:
         """D, shape ``(components, components, n)``."""
-        h = self._h[0]
+        h = self._response
         return self._block.smear(self._s[..., None] * h[:, None] * h[None].conj())
 
     @cached_property
     def expected(self) -> ComplexArray:
         """E, shape ``(n, channels, channels)``."""
         return np.moveaxis(_congruent(self._phi.T, self._modal), -1, 0).copy()
+
+    def misfit(self) -> float:
+        """Σ n (ln det E + tr E⁻¹ W)."""
+        root = np.linalg.cholesky(self.expected)
+        white = np.linalg.solve(self.expected, self._block.matrix)
+        log_det = 2 * np.log(np.diagonal(root, axis1=-2, axis2=-1).real).sum(axis=-1)
+        return float(self._block.count @ (log_det + np.trace(white, axis1=-2, axis2=-1).real))
 
     def derivatives(self) -> tuple[FloatArray, FloatArray]:
         """Gradient and Hessian of the misfit.
@@ -260,20 +318,24 @@ class _Point:
         Of each unknown the index of b in the basis and its row w, E_a = b (Φ w)ᵀ and its adjoint,
         shapes ``(unknowns,)`` and ``(unknowns, components, n)``.
         """
-        lay, h = self._layout, self._h
-        row = np.zeros(lay.size, dtype=int)
-        w = np.zeros((lay.size, lay.n_components, self._block.frequency.size), dtype=complex)
-        pairs = self._block.smear(h[0][:, None] * h[0][None].conj())
-        for a, (i, q) in enumerate(lay.pole):
-            row[a] = i
-            w[a] = self._block.smear(self._s[i, :, None] * h[q, i] * h[0].conj())
-        for a, (i, j) in enumerate(lay.force, start=lay.forces.start):
-            row[a] = i
-            w[a] = self._scale[i] * self._root[:, j, None] * pairs[i]
-        for a, (c, i) in enumerate(lay.shape, start=lay.shapes.start):
-            row[a] = lay.n_modes + c
-            w[a] = self._modal[i]
-        return row, w
+        lay, h, s = self._layout, self._h, self._s
+        pole, slope = _columns(lay.pole)
+        driven, _ = _columns(lay.force)
+        by_pole = s[pole, :, None] * h[slope, pole][:, None] * h[0].conj()
+        pairs = self._block.smear(h[0][:, None] * h[0].conj())
+        w = [self._block.smear(by_pole), self._change[..., None] * pairs[driven]]
+        row = [pole, driven]
+        if lay.shape:
+            channel, mode = _columns(lay.shape)
+            row.append(lay.n_modes + channel)
+            w.append(self._modal[mode])
+        return np.concatenate(row), np.concatenate(w)
+
+    @cached_property
+    def _change(self) -> FloatArray:
+        """Change of the row and column of S that belong to each force, ``(forces, components)``."""
+        driven, force = _columns(self._layout.force)
+        return np.asarray(self._scale[driven, None] * self._root.T[force])
 
     def _curvature(self, w: ComplexArray, g: ComplexArray) -> FloatArray:
         """Σ tr G E_ab over all pairs of unknowns, the counts in G."""
@@ -293,43 +355,40 @@ class _Point:
     def _by_poles(self, curvature: FloatArray, turned: ComplexArray) -> None:
         """By two unknowns of h: Q = Σ_ij S_ij B_ji h_i h_j*."""
         h, n = self._h, self._layout.n_poles
-        component, slope = np.array(self._layout.pole, dtype=int).T
+        component, slope = _columns(self._layout.pole)
         weight = self._s[..., None] * turned
         first = h[slope, component]
         pairs = weight[component[:, None], component]
         term = np.einsum("abk,ak,bk->ab", pairs, first, first.conj())
         pull = np.sum(weight * h[0].conj()[None], axis=1)
-        for a in range(n):
-            for b in np.flatnonzero(component == component[a]):
-                term[a, b] += (
-                    pull[component[a]] @ h[_SECOND[slope[a] - 1, slope[b] - 1], component[a]]
-                )
+        # Of the second derivatives of h those of one component are not zero.
+        one, other = np.nonzero(component[:, None] == component)
+        second = h[SECOND[slope[one] - 1, slope[other] - 1], component[one]]
+        term[one, other] += np.sum(pull[component[one]] * second, axis=1)
         curvature[:n, :n] += 2 * term.real
 
     def _by_forces(self, curvature: FloatArray, turned: ComplexArray) -> None:
         """By two forces, and by a force and an unknown of h."""
         lay, h = self._layout, self._h
+        driven, force = _columns(lay.force)
         overlap = np.einsum("ijk,ik,jk->ij", turned, h[0], h[0].conj()).real
-        start = lay.forces.start
-        for a, (i, j) in enumerate(lay.force, start=start):
-            for b, (k, column) in enumerate(lay.force, start=start):
-                if j == column:
-                    curvature[a, b] += 2 * self._scale[i] * self._scale[k] * overlap[i, k]
-        component, slope = np.array(lay.pole, dtype=int).T
+        overlap *= np.outer(self._scale, self._scale)
+        same = force[:, None] == force
+        curvature[lay.forces, lay.forces] += 2 * same * overlap[driven[:, None], driven]
+        component, slope = _columns(lay.pole)
         mixed = np.einsum("ajk,ak,jk->aj", turned[component], h[slope, component], h[0].conj()).real
-        for a, (i, j) in enumerate(lay.force, start=start):
-            # S changes in row and column i.
-            change = self._scale[i] * self._root[:, j]
-            term = np.where(component == i, mixed @ change, 0) + change[component] * mixed[:, i]
-            curvature[a, : lay.n_poles] += 2 * term
-            curvature[: lay.n_poles, a] += 2 * term
+        # S changes in row and column.
+        term = (driven[:, None] == component) * (self._change @ mixed.T)
+        term += self._change[:, component] * mixed[:, driven].T
+        curvature[lay.forces, : lay.n_poles] += 2 * term
+        curvature[: lay.n_poles, lay.forces] += 2 * term.T
 
     def _by_shapes(
         self, curvature: FloatArray, w: ComplexArray, g: ComplexArray, pull: ComplexArray
     ) -> None:
         """By two shapes, and by a shape and what D depends on."""
         lay = self._layout
-        channel, mode = np.array(lay.shape).T
+        channel, mode = _columns(lay.shape)
         own = np.tensordot(self._modal, g, axes=(2, 2))  # (i, j, d, c)
         own = own[mode[:, None], mode, channel, channel[:, None]]
         curvature[lay.shapes, lay.shapes] += 2 * own.real
@@ -340,6 +399,10 @@ class _Point:
         term = across[:, mode, channel] + np.where(row[:, None] == mode, along[:, channel], 0)
         curvature[: lay.shapes.start, lay.shapes] += 2 * term.real
         curvature[lay.shapes, : lay.shapes.start] += 2 * term.real.T
+
+
+def _columns(pairs: Sequence[tuple[int, int]]) -> np.ndarray[tuple[int, int], np.dtype[np.intp]]:
+    return np.array(pairs, dtype=np.intp).reshape(-1, 2).T
 
 
 def _congruent(basis: FloatArray, matrix: ComplexArray) -> ComplexArray:
@@ -363,47 +426,3 @@ def _inner(a: ComplexArray, b: ComplexArray) -> FloatArray:
 
 def _frequency_last(matrices: ComplexArray | FloatArray) -> ComplexArray:
     return np.ascontiguousarray(np.moveaxis(matrices, 0, -1), dtype=np.complex128)
-
-
-def _misfit(block: Block, expected: ComplexArray) -> float:
-    root = np.linalg.cholesky(expected)
-    white = np.linalg.solve(expected, block.matrix)
-    log_det = 2 * np.log(np.diagonal(root, axis1=-2, axis2=-1).real).sum(axis=-1)
-    return float(block.count @ (log_det + np.trace(white, axis1=-2, axis2=-1).real))
-
-
-def _floors(p: FloatArray, u: FloatArray) -> ComplexArray:
-    """Response exp((e + d u + b u²) / 2) of floors with these unknowns, as `receptance` has it."""
-    basis = np.stack([np.ones_like(u), u, u * u]) / 2
-    h = np.exp(p @ basis)
-    pairs = [basis[a] * basis[b] for a in range(3) for b in range(a, 3)]
-    return np.stack([h, *(h * slope for slope in [*basis, *pairs])]).astype(complex)
-
-
-def receptance(f: FloatArray, zeta: FloatArray, frequency: FloatArray) -> ComplexArray:
-    """Acceleration response h of modes and its derivatives by x = ln f and z = ln ζ.
-
-    Returns an array of shape ``(10, …, n)``: h, its first derivatives by three unknowns and its
-    second ones (11, 12, 13, 22, 23, 33), of which the third does not exist here. With d = 1/h,
-    h_a = -d_a h² and h_ab = (2 d_a d_b h - d_ab) h².
-    """
-    beta = f / frequency
-    damping = -2j * zeta * beta
-    h = 1 / (1 - beta**2 + damping)
-    d_x, d_xx = damping - 2 * beta**2, damping - 4 * beta**2
-    square = h * h
-    none = np.zeros_like(h)
-    return np.stack(
-        [
-            h,
-            -d_x * square,
-            -damping * square,
-            none,
-            (2 * d_x * d_x * h - d_xx) * square,
-            (2 * d_x * damping * h - damping) * square,
-            none,
-            (2 * damping * damping * h - damping) * square,
-            none,
-            none,
-        ]
-    )

@@ -35,7 +35,7 @@ from lmshealth.errors import BadLog
 from lmshealth.logs import Log
 from lmshealth.results import Modes
 from lmshealth.stage import Stage
-from studies.identification.cases import CASES, Case
+from studies.identification.cases import CASES, HEADLINE, Case
 from studies.identification.records import Array, describe
 from studies.record import Stopwatch, clopper_pearson, keep
 
@@ -44,6 +44,7 @@ NOMINAL, LEVEL = 0.95, 0.999
 FACTOR = 1.5
 CHUNK = 50
 FUSED = "following error and two accelerometers"
+HEADLINES = tuple(case.name for case in CASES if case.seeds == HEADLINE)
 QUICK = ("isolated, SNR 100", "isolated as 7 moves of 3 s", FUSED)
 
 
@@ -70,7 +71,11 @@ def main() -> None:
         for k in cases
     }
     rows = [row for k in cases for row in summarise(CASES[k], found[k])]
-    answer: dict[str, Any] = {"cases": rows, "passed": verdicts(rows, quick=options.quick)}
+    answer: dict[str, Any] = {
+        "cases": rows,
+        "passed": verdicts(rows, quick=options.quick),
+        "not_met": shortfalls(rows),
+    }
     print(json.dumps(answer, indent=1))
     if not options.quick and options.share == 1.0:
         keep(HERE / "result.json", __doc__.split("\n")[0], answer, watch)
@@ -152,31 +157,66 @@ def summarise(case: Case, found: Array) -> Iterator[dict[str, Any]]:
 
 def _coverage(off: Array) -> dict[str, Any]:
     """How often intervals hold the truth, and whether that may be 95 %."""
-    hits, n = int(np.sum(np.abs(off) < norm.isf((1 - NOMINAL) / 2))), off.size
+    return _held(int(np.sum(np.abs(off) < norm.isf((1 - NOMINAL) / 2))), off.size)
+
+
+def _pooled(coverages: list[dict[str, Any]]) -> dict[str, Any]:
+    """Judge coverages of modes and quantities together."""
+    return _held(sum(c["hits"] for c in coverages), sum(c["n"] for c in coverages))
+
+
+def _held(hits: int, n: int) -> dict[str, Any]:
     low, high = clopper_pearson(hits, n, LEVEL)
-    return {"share": hits / n, "low": low, "high": high, "holds": low <= NOMINAL <= high}
+    return {"hits": hits, "n": n, "share": hits / n, "low": low, "high": high,
+            "holds": low <= NOMINAL <= high}  # fmt: skip
 
 
 def verdicts(rows: list[dict[str, Any]], *, quick: bool) -> dict[str, bool]:
     """Say what was asked and whether it is so."""
-    asked = [row for row in rows if row.get("asked")]
     sure = [row for row in rows if row["n"] >= 300]
-    passed = {
-        "every coverage holds": all(row["coverage"]["holds"] for row in rows),
-        # The bound itself is known; the error's scatter is allowed for.
-        "root mean square errors are near the bound": all(
-            row["rmse_over_bound"] - 3.3 * row["its_error"] <= row["asked"] for row in asked
-        ),
-    }
+    headline = [row for row in rows if row["case"] in HEADLINES]
+    passed = {"headline coverages hold": all(row["coverage"]["holds"] for row in headline)}
     if not quick:
         passed |= {
-            "intervals half as wide again fail": not any(row["too_wide"]["holds"] for row in sure),
-            "intervals a third less wide fail": not any(row["too_narrow"]["holds"] for row in sure),
-            "sources as if independent fail": not any(
-                row["as_if_independent"]["holds"] for row in rows if "as_if_independent" in row
+            "headline errors are near the bound": not any(_too_far(row) for row in headline),
+            "sources as if independent fail": not _pooled(
+                [row["as_if_independent"] for row in rows if "as_if_independent" in row]
+            )["holds"],
+            "headline intervals half as wide again fail": not any(
+                row["too_wide"]["holds"] for row in headline if row in sure
+            ),
+            "headline intervals a third less wide fail": not any(
+                row["too_narrow"]["holds"] for row in headline if row in sure
             ),
         }
     return {name: bool(held) for name, held in passed.items()}
+
+
+def shortfalls(rows: list[dict[str, Any]]) -> list[str]:
+    """List what is short of what was asked, case by case."""
+    short = []
+    for row in rows:
+        name = f"{row['case']}: {row['quantity']} at {row['frequency_hz']:g} Hz"
+        covered = row["coverage"]
+        if not covered["holds"]:
+            short.append(
+                f"{name}: coverage {100 * covered['share']:.1f} %, its interval "
+                f"{100 * covered['low']:.1f} to {100 * covered['high']:.1f} %"
+            )
+        if _too_far(row):
+            short.append(
+                f"{name}: {row['rmse_over_bound']:.2f} ± {row['its_error']:.2f} times the bound, "
+                f"asked {row['asked']}"
+            )
+        if row["refused"]:
+            short.append(f"{name}: {row['refused']} of {row['refused'] + row['n']} refused")
+    return short
+
+
+def _too_far(row: dict[str, Any]) -> bool:
+    """Tell whether an error is beyond what was asked, its own scatter allowed for."""
+    asked = row.get("asked")
+    return asked is not None and row["rmse_over_bound"] - 2 * row["its_error"] > asked
 
 
 if __name__ == "__main__":

@@ -1,0 +1,139 @@
+"""What does identification cost in time and memory?
+
+Question
+    Is the headline record (three modes in three channels, 60 s at 1 kHz) identified in less than
+    0.05 s? Does a log of 60 s at 20 kHz with four channels go from Parquet to modes in at most
+    three times what reading and transforming it costs, and in at most three times its own memory?
+Method
+    Each is done alternately with its yardstick in one process: medians of the times and of the
+    ratios, and the least time, which other work on the machine lengthens least. Memory is the peak
+    of what Python and numpy allocate from the file on, over all columns of the file in double
+    precision.
+Run time
+    About a minute.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import tempfile
+import time
+import tracemalloc
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy import fft
+
+from lmshealth import identify, load_stage, read_log
+from models.formats import write_log
+from models.recording import Recording, record
+from models.stages import stage_named
+from studies.identification.cases import CASES
+from studies.identification.records import describe
+from studies.record import Stopwatch, keep
+
+HERE = Path(__file__).parent
+HEADLINE = "three modes, three channels, 60 s"
+SIGNALS = ("delta_e", "acc_feed", "acc_pitch", "acc_between")
+
+
+def main() -> None:
+    """Run the study; ``--quick`` repeats less and records nothing."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--quick", action="store_true")
+    quick = parser.parse_args().quick
+    watch = Stopwatch()
+    answer: dict[str, Any] = {
+        "record": headline(5 if quick else 40),
+        "log": long_log(2 if quick else 15),
+    }
+    answer["passed"] = {
+        "headline record in less than 0.05 s": answer["record"]["least_s"] < 0.05,
+        "three times reading and transforming": answer["log"]["median_ratio"] <= 3,
+        "three times the record's memory": answer["log"]["memory_over_record"] <= 3,
+    }
+    print(json.dumps(answer, indent=1))
+    if not quick:
+        keep(HERE / "result.json", __doc__.split("\n")[0], answer, watch)
+        if not all(answer["passed"].values()):
+            raise SystemExit(f"not as asked: {answer['passed']}")
+
+
+def timed(task: Callable[[], object]) -> float:
+    """Seconds that a task takes."""
+    start = time.perf_counter()
+    task()
+    return time.perf_counter() - start
+
+
+def headline(n: int) -> dict[str, Any]:
+    """Identify the headline record, beside one product of matrices that every machine knows."""
+    case = next(case for case in CASES if case.name == HEADLINE)
+    stage = describe(case.modes)
+    square = np.random.default_rng(0).standard_normal((500, 500))
+    identify(case.make(np.random.default_rng(0), case.modes, case.noise), stage)
+    times, products = [], []
+    for seed in range(n):
+        log = case.make(np.random.default_rng(seed), case.modes, case.noise)
+        times.append(timed(lambda log=log: identify(log, stage)))  # type: ignore[misc]
+        products.append(timed(lambda: [square @ square for _ in range(4)]) / 4)
+    return {
+        "n": n,
+        "least_s": min(times),
+        "median_s": float(np.median(times)),
+        # What the processor does at best, to compare machines by.
+        "gigaflops": 2 * 500**3 / min(products) / 1e9,
+    }
+
+
+def long_log(n: int) -> dict[str, Any]:
+    """Take a log of the simulated stage from Parquet to its modes."""
+    stage = load_stage("lms-y")
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "log.parquet"
+        made = four_channels()
+        write_log(made, path, "parquet")
+        n_samples = sum(values.size for values in made.columns.values())
+
+        def yardstick() -> None:
+            log = read_log(path)
+            for channel in log.channels:
+                if channel.name in SIGNALS:
+                    fft.rfft(channel.values)
+
+        def all_of_it() -> None:
+            identify(read_log(path), stage)
+
+        yardstick(), all_of_it()
+        pairs = np.array([(timed(yardstick), timed(all_of_it)) for _ in range(n)])
+        tracemalloc.start()
+        try:
+            all_of_it()
+            _, peak = tracemalloc.get_traced_memory()
+        finally:
+            tracemalloc.stop()
+    return {
+        "n": n,
+        "read_and_transform_s": float(np.median(pairs[:, 0])),
+        "to_modes_s": float(np.median(pairs[:, 1])),
+        "median_ratio": float(np.median(pairs[:, 1] / pairs[:, 0])),
+        "memory_over_record": peak / (8 * n_samples),
+    }
+
+
+def four_channels() -> Recording:
+    """Simulate 60 s at 20 kHz of the Y stage: Δe and three accelerometers."""
+    rng = np.random.default_rng(1)
+    made = record(stage_named("lms-y"), seconds=60.0, rng=rng)
+    feed, pitch = made.columns["acc_feed_m_s2"], made.columns["acc_pitch_m_s2"]
+    # A third accelerometer halfway between the other two, with the noise of one.
+    between = (feed + pitch) / 2 + 0.1 * feed.std() * rng.standard_normal(feed.size)
+    return replace(made, columns={**made.columns, "acc_between_m_s2": between})
+
+
+if __name__ == "__main__":
+    main()
