@@ -33,7 +33,9 @@ def test_modes_peers(root: Path, needs: Callable[[str], None]) -> None:
     answer = json.loads(run_study(root, "modes_peers"))
     assert all(answer["passed"].values())
     tools = answer["cases"][0]["tools"]
-    assert all(set(tools[name]["coverage"]) == {"ln f", "ln zeta"} for name in ("SSI-cov", "VarPLSCF"))
+    assert all(
+        set(tools[name]["coverage"]) == {"ln f", "ln zeta"} for name in ("SSI-cov", "VarPLSCF")
+    )
     assert tools["FDD"]["against_ours"]["ln f"]["it_is"] == "behind"
 
 

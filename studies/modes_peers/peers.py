@@ -100,7 +100,7 @@ def _ours(log: Log, case: Case) -> Array:
 
 
 def _samples(log: Log) -> Array:
-    """Samples of all moves in a row, shape ``(n_samples, n_channels)``."""
+    """Join the samples of all moves, shape ``(n_samples, n_channels)``."""
     values = np.stack([channel.values[:] for channel in log.channels], axis=1)
     return np.concatenate([values[start:stop] for start, stop in log.pieces])
 

@@ -26,8 +26,8 @@ import json
 import os
 import time
 from concurrent.futures import ProcessPoolExecutor
-from importlib.util import find_spec
 from importlib.metadata import version
+from importlib.util import find_spec
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import subprocess
 import sys
 import tempfile
@@ -50,23 +49,21 @@ def compare_parts(record: np.ndarray[Any, Any], full: Modes) -> list[dict[str, A
     n, rows = record.shape[0] // PARTS, []
     for k in range(PARTS):
         part = identify(to_log(record[k * n : (k + 1) * n], SAMPLE_RATE), load_stage(str(STAGE)))
-        m = len(full.names)
-        off = np.concatenate([part.ln_frequency, part.ln_damping])
-        off = off - np.concatenate([full.ln_frequency, full.ln_damping])
-        score = off / np.sqrt(np.diag(part.cov))
-        rows += [
-            {
-                "part": k,
-                "mode": name,
+        std = np.sqrt(np.diag(part.cov)).reshape(2, -1)
+        for name in full.names:
+            row: dict[str, Any] = {"part": k, "mode": name}
+            rows.append(row)
+            if name not in part.names:
+                continue
+            i, j = part.names.index(name), full.names.index(name)
+            row |= {
                 "f_hz": float(part.frequency[i]),
                 "f_std_hz": float(part.frequency_std[i]),
                 "zeta": float(part.damping_ratio[i]),
                 "zeta_std": float(part.damping_ratio_std[i]),
-                "f_off_in_std": float(score[i]),
-                "zeta_off_in_std": float(score[m + i]),
+                "f_off_in_std": float((part.ln_frequency[i] - full.ln_frequency[j]) / std[0, i]),
+                "zeta_off_in_std": float((part.ln_damping[i] - full.ln_damping[j]) / std[1, i]),
             }
-            for i, name in enumerate(part.names)
-        ]
     return rows
 
 

@@ -31,7 +31,7 @@ def draw_building(top: Axes, bottom: Axes, name: str, building: dict[str, Any]) 
         ax.errorbar(minutes, value, 2 * error, fmt="o", ms=3.5, lw=1, color=DATA,
                     label="5-minute log, ±2σ")  # fmt: skip
         names = ("f_hz", "f_std_hz") if short == "f" else ("zeta", "zeta_std")
-        for row in parts:
+        for row in (row for row in parts if "f_hz" in row):
             middle = length * (row["part"] + 0.5)
             ax.errorbar(middle, unit * row[names[0]], 2 * unit * row[names[1]], length / 2 - 1,
                         fmt="s", ms=5, lw=2, color=STEPPED,

@@ -42,8 +42,8 @@ HERE = Path(__file__).parent
 OUTSIDE = 1.959963984540054
 NOT_MET = {
     "shear frame: documented frequencies inside": (
-        "the set was integrated in steps of 1/12 s, which lowers frequencies by up to 3 %: what the "
-        "trapezoidal rule makes of the documented values lies inside"
+        "what they are after an integration by the trapezoidal rule in steps of 1/12 s, up to 3 % "
+        "lower, lies inside"
     ),
     "shear frame: documented dampings inside": (
         "of the five modes' dampings that of the highest lies 2.1 standard deviations above; two "
@@ -87,8 +87,8 @@ def judge_building(building: dict[str, Any]) -> dict[str, bool]:
     """Say whether the building is what it is known to be."""
     modes = building["modes"].values()
     low, _, high = building["stiffness"].values()
-    inside = [abs(p[key]) < OUTSIDE for p in building["parts"]
-              for key in ("f_off_in_std", "zeta_off_in_std")]  # fmt: skip
+    seen = [part for part in building["parts"] if "f_hz" in part]
+    inside = [abs(p[key]) < OUTSIDE for p in seen for key in ("f_off_in_std", "zeta_off_in_std")]
     return {
         "building: every window gives every mode": all(
             mode["n_windows"] == building["n_windows"] for mode in modes
@@ -103,6 +103,7 @@ def judge_building(building: dict[str, Any]) -> dict[str, bool]:
             for mode in modes
             for kind in ("median", "full")
         ),
+        "building: every third gives every mode": len(seen) == len(building["parts"]),
         "building: intervals of each third hold the whole": all(inside),
         "building: halved intervals hold less": all(
             mode["frequency_hz_coverage_95_control_half_std"] < mode["frequency_hz_coverage_95"]
