@@ -203,7 +203,7 @@ class Likelihood:
         )
         step, decrement = newton_step(np.asarray(found.x))
         # So near no step goes too far, and one more makes it exact.
-        return np.asarray(found.x + step if decrement < _NEARLY else found.x)
+        return np.asarray(found.x + step if decrement < _ARRIVED else found.x)
 
 
 class _Last(Generic[T]):
