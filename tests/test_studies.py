@@ -114,6 +114,21 @@ def test_line_test(root: Path) -> None:
     assert all(answer["passed"].values())
 
 
+def test_identification(root: Path) -> None:
+    """Some records of three kinds are covered as stated, and no mode of them is refused."""
+    answer = json.loads(run_study(root, "identification"))
+    assert all(answer["passed"].values())
+    assert not [line for line in answer["not_met"] if "refused" in line]
+
+
+def test_identification_speed(root: Path) -> None:
+    """A log of a minute takes at most a few times what reading it takes, and fits into memory."""
+    answer = json.loads(run_study(root, "identification_speed"))
+    assert answer["passed"]["three times the record's memory"]
+    # Other work on the machine stretches the two unlike each other.
+    assert answer["log"]["median_ratio"] < 6
+
+
 def test_decays(root: Path) -> None:
     """Intervals of f and ζ from decays cover, narrower ones do not, machines are told right."""
     answer = json.loads(run_study(root, "decays"))

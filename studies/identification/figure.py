@@ -1,0 +1,88 @@
+"""Draw figure.svg from result.json: coverage of every case, and errors over their bound."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+HERE = Path(__file__).parent
+QUANTITIES = {"ln f": ("#0072b2", "o", -0.18), "ln zeta": ("#d55e00", "s", 0.18)}
+NAMES = {"ln f": "frequency", "ln zeta": "damping"}
+
+
+def main() -> None:
+    """Draw."""
+    matplotlib.rcParams |= {"svg.hashsalt": "lmshealth", "font.size": 8}
+    rows = json.loads((HERE / "result.json").read_text(encoding="utf-8"))["cases"]
+    cases = list(dict.fromkeys(row["case"] for row in rows))
+    figure = Figure(figsize=(10, 0.42 * len(cases) + 1.4), layout="constrained")
+    left, right = figure.subplots(1, 2, sharey=True)
+    draw_coverage(left, cases, rows)
+    draw_efficiency(right, cases, rows)
+    left.set_yticks(range(len(cases)), cases)
+    left.set_ylim(len(cases) - 0.4, -0.6)
+    figure.savefig(HERE / "figure.svg", metadata={"Date": None})
+
+
+def places(cases: list[str], rows: list[dict[str, Any]]) -> list[tuple[float, dict[str, Any]]]:
+    """Put the modes of a case beside each other, in the order of their frequencies."""
+    found = []
+    for row in rows:
+        same = [r for r in rows if r["case"] == row["case"] and r["quantity"] == row["quantity"]]
+        spread = 0.09 * (same.index(row) - (len(same) - 1) / 2)
+        y = cases.index(row["case"]) + QUANTITIES[row["quantity"]][2] + spread
+        found.append((y, row))
+    return found
+
+
+def draw_coverage(ax: Axes, cases: list[str], rows: list[dict[str, Any]]) -> None:
+    """Draw the share of intervals that hold the truth, with its 99.9 % interval."""
+    for quantity, (colour, marker, _) in QUANTITIES.items():
+        own = [(y, row) for y, row in places(cases, rows) if row["quantity"] == quantity]
+        for y, row in own:
+            part = row["coverage"]
+            ax.plot([100 * part["low"], 100 * part["high"]], [y, y], lw=1, color=colour)
+        ax.plot(
+            [100 * row["coverage"]["share"] for _, row in own], [y for y, _ in own], marker,
+            ms=3, color=colour, label=NAMES[quantity], ls="",
+        )  # fmt: skip
+    narrow, wide = (
+        [100 * row[key]["share"] for _, row in places(cases, rows)]
+        for key in ("too_narrow", "too_wide")
+    )
+    y = [place for place, _ in places(cases, rows)]
+    ax.plot(narrow, y, "|", ms=4, color="#999999", label="1.5 times narrower or wider")
+    ax.plot(wide, y, "|", ms=4, color="#999999")
+    ax.axvline(95, color="black", lw=0.8)
+    ax.set_xlabel("95 % intervals that hold the truth, in % (bars: 99.9 % Clopper-Pearson)")
+    ax.legend(loc="upper left", frameon=True, framealpha=0.9)
+    ax.grid(axis="x", alpha=0.25)
+
+
+def draw_efficiency(ax: Axes, cases: list[str], rows: list[dict[str, Any]]) -> None:
+    """Draw root mean square errors over the Cramér-Rao bound, with one standard error."""
+    for y, row in places(cases, rows):
+        if "rmse_over_bound" not in row:
+            continue
+        colour, marker, _ = QUANTITIES[row["quantity"]]
+        ax.errorbar(row["rmse_over_bound"], y, xerr=row["its_error"], fmt=marker, ms=3, lw=1,
+                    color=colour)  # fmt: skip
+        if row["asked"] is not None:
+            ax.plot(row["asked"], y, "|", ms=7, color="#009e73")
+    for k, case in enumerate(cases):
+        if all("rmse_over_bound" not in row for row in rows if row["case"] == case):
+            ax.text(1.0, k, " no bound computed", va="center", color="#777777")
+    ax.axvline(1, color="black", lw=0.8)
+    ax.plot([], [], "|", ms=7, color="#009e73", label="asked: no more than this")
+    ax.set_xlabel("root mean square error over the Cramér-Rao bound (bars: one standard error)")
+    ax.legend(loc="upper right", frameon=True, framealpha=0.9)
+    ax.grid(axis="x", alpha=0.25)
+
+
+if __name__ == "__main__":
+    main()
