@@ -19,7 +19,17 @@ Method
     building's windows with all standard deviations halved. FRFs and decays of real machines are in
     the studies `frf_modes` (two-inertia bench, linear guide) and `decays` (beam with a roller).
 Answer
-    ANSWER
+    Mostly. All three modes of the building are in all 18 logs, medians within 0.3 % of the
+    published frequencies, dampings 1.4 to 1.6 %; the verdict is healthy. Its intervals are too
+    narrow for f: those of the windows hold the value of the whole in 72 to 89 %, windows scatter by
+    1.2 to 1.5 times what is said (ζ: 89 to 100 %, 0.9 to 1.3 times); of those of the thirds 16 of
+    18, the others are 2.1 σ off. With another damping in the description the whole record gives
+    frequencies up to 7 σ, 0.4 %, apart. Every mode of the frame on the table is right on every
+    floor where it is not refused, and seen on one at least: there are too few Fourier frequencies,
+    or a damping seven times below the guess; the stiffness ratio is 4.68. The light frame is right
+    in 7 of 7 frequencies and dampings, the weak mode beside the mains too, and the mains are no
+    mode. The shear frame's frequencies are not those documented but those of its integration, 5 of
+    5; of its dampings 4 of 5 lie inside.
 Run time
     About a minute on one processor.
 Data
@@ -43,8 +53,8 @@ HERE = Path(__file__).parent
 OUTSIDE = 1.959963984540054
 NOT_MET = {
     "building: intervals of each third hold the whole": (
-        "16 of 18 do, two of f are 2.1 standard deviations off: what the windows scatter is up to "
-        "1.5 times what is said"
+        "some frequencies of a third are little more than two standard deviations off: windows "
+        "scatter by more than is said as well"
     ),
     "building: frequencies do not depend on the described damping": (
         "the band of the fit follows from it, the noise of a real building is not as simple as the "
@@ -55,8 +65,8 @@ NOT_MET = {
         "lower, lies inside"
     ),
     "shear frame: documented dampings inside": (
-        "of the five modes' dampings that of the highest lies 2.1 standard deviations above; two "
-        "in ten intervals of f and ζ against stepped values would be no chance, one may be"
+        "of five dampings that of the highest mode lies just outside; no reason was found, of "
+        "so many intervals one may miss by chance"
     ),
 }
 
