@@ -161,9 +161,9 @@ def fit_band(
     low = min(t.band(BAND)[0] for t in seen)
     high = max(t.band(BAND)[1] for t in seen)
     cut = view.band(low, high)
-    n, needed = sum(s.frequency.size for s in cut.spectra), 10 + 6 * len(seen)
+    n, needed = sum(int(s.free.sum()) for s in cut.spectra), 10 + 6 * len(seen)
     if n < needed:
-        detail = f"{n} Fourier frequencies in the band, needed {needed}: record longer"
+        detail = f"{n} Fourier frequencies in the band hold no line, needed {needed}: record longer"
         return None, missing | {t.name: ("too-short", detail) for t in seen}
     band = prepare(cut, coarse, seen)
     mask_towers(band)

@@ -15,7 +15,7 @@ import numpy as np
 from scipy import ndimage, stats
 
 from lmshealth.arrays import FloatArray
-from lmshealth.errors import BadLog, BadStage
+from lmshealth.errors import BadLog
 from lmshealth.logs import Channel, Log
 from lmshealth.naming import Band, Pole, is_near, name_modes
 from lmshealth.results import Modes
@@ -23,6 +23,7 @@ from lmshealth.ringing import Estimate, Ringing, estimate, find_ringing, station
 from lmshealth.segments import Segment, select_segments
 from lmshealth.stage import Stage
 from lmshealth.starts import Target
+from lmshealth.targets import choose_channels, choose_targets
 from lmshealth.transient import make_block
 
 # A band reaches so many Fourier frequencies, and such a share of the frequency, beyond its modes;
@@ -89,9 +90,9 @@ def identify_decays(
     BadStage
         If the stage has no mode in the band.
     """
-    used = _choose_channels(log, channels)
+    used = choose_channels(log, channels)
     decays = _stops(log, segments)
-    targets = _targets(stage, band)
+    targets = () if stage is None else choose_targets(stage, band)
     limits = _limits(log, decays, targets, band)
     found: list[Band] = []
     for source, kind in (("acc", "acceleration"), ("delta_e", "displacement")):
@@ -99,19 +100,6 @@ def identify_decays(
         if group:
             found += _ringing(log, group, source, decays, limits, targets)
     return name_modes(log, targets, found)
-
-
-def _choose_channels(log: Log, names: Sequence[str] | None) -> tuple[Channel, ...]:
-    usable = {c.name: c for c in log.channels if c.kind in ("displacement", "acceleration")}
-    chosen = list(usable) if names is None else list(names)
-    unknown = sorted(set(chosen) - set(usable))
-    if unknown:
-        raise BadLog(
-            log.name, "channel", f"no usable channel {unknown}; there are {sorted(usable)}"
-        )
-    if not chosen:
-        raise BadLog(log.name, "no-signal", "no delta_e or acc channel is left to analyse")
-    return tuple(channel for name, channel in usable.items() if name in chosen)
 
 
 def _stops(log: Log, segments: Sequence[Segment] | None) -> tuple[Segment, ...]:
@@ -122,20 +110,6 @@ def _stops(log: Log, segments: Sequence[Segment] | None) -> tuple[Segment, ...]:
     if longest < 8:
         raise BadLog(log.name, "too-short", f"the longest decay has {longest} samples")
     return tuple(s for s in segments if s.stop - s.start >= longest / 2)
-
-
-def _targets(stage: Stage | None, band: tuple[float, float] | None) -> tuple[Target, ...]:
-    if stage is None:
-        return ()
-    low, high = band or (0.0, np.inf)
-    targets = tuple(
-        Target(mode.name, mode.frequency_hz, mode.damping_ratio, mode.search)
-        for mode in sorted(stage.modes, key=lambda mode: mode.frequency_hz)
-        if low <= mode.frequency_hz <= high
-    )
-    if not targets:
-        raise BadStage(f"{stage.name}: no [[mode]] lies between {low:g} and {high:g} Hz")
-    return targets
 
 
 def _limits(

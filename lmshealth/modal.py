@@ -15,7 +15,7 @@ from scipy.special import softmax
 
 from lmshealth.band import View
 from lmshealth.bandfit import BAND, BandFit, Missing, fit_band
-from lmshealth.errors import BadLog, BadStage
+from lmshealth.errors import BadLog
 from lmshealth.lines import find_lines, name_lines
 from lmshealth.logs import Channel, Log, Refusal
 from lmshealth.peaks import find_excess, find_peaks
@@ -25,6 +25,7 @@ from lmshealth.separation import keep_separate
 from lmshealth.spectra import ANY_RESONANCE, Resonances, cross_spectra
 from lmshealth.stage import Stage
 from lmshealth.starts import Target, coarsen, locate, shift_cost
+from lmshealth.targets import choose_channels, choose_targets
 
 # Modes whose bands touch are fitted together, but never more than this many.
 _MOST_TOGETHER = 4
@@ -70,10 +71,10 @@ def identify(
     BadLog
         If no channel is left, or the record is too short or too slow for the modes.
     """
-    used = _choose_channels(log, channels)
+    used = choose_channels(log, channels)
     seen: list[tuple[str, float, float]] = []
     if stage is not None:
-        targets = _stage_targets(stage, band)
+        targets = choose_targets(stage, band)
         view = _transform(log, used, targets, band)
     else:
         view = _transform(log, used, (), band)
@@ -98,36 +99,6 @@ def identify(
     if stage is not None:
         return _collect(fits, lines, (*log.refused, *refused))
     return _renumber(_collect(_distinct(fits), lines, log.refused))
-
-
-def _choose_channels(log: Log, names: Sequence[str] | None) -> tuple[Channel, ...]:
-    usable = tuple(c for c in log.channels if c.kind in ("displacement", "acceleration"))
-    if names is not None:
-        unknown = set(names) - {channel.name for channel in usable}
-        if unknown:
-            raise BadLog(
-                log.name,
-                "channel",
-                f"no usable channel {sorted(unknown)}; there are "
-                f"{[channel.name for channel in usable]}",
-            )
-        usable = tuple(channel for channel in usable if channel.name in names)
-    if not usable:
-        raise BadLog(log.name, "no-signal", "no delta_e or acc channel is left to analyse")
-    # The order in which a file has its channels decides nothing, not even a rounding.
-    return tuple(sorted(usable, key=lambda channel: channel.name))
-
-
-def _stage_targets(stage: Stage, band: tuple[float, float] | None) -> tuple[Target, ...]:
-    low, high = band or (0.0, np.inf)
-    targets = tuple(
-        Target(mode.name, mode.frequency_hz, mode.damping_ratio, mode.search)
-        for mode in sorted(stage.modes, key=lambda mode: mode.frequency_hz)
-        if low <= mode.frequency_hz <= high
-    )
-    if not targets:
-        raise BadStage(f"{stage.name}: no [[mode]] lies between {low:g} and {high:g} Hz")
-    return targets
 
 
 def _transform(

@@ -32,7 +32,7 @@ _REACH = 400
 # this many times what is further away.
 _LEFT_OVER = 4.0
 _NEAR, _FAR = 10, 40
-_MOST_TONES, _MOST_ROUNDS = 200, 4
+_MOST_TONES, _MOST_ROUNDS = 30, 4
 # Tones fitted together, the strongest first; suspects this near to a stronger one are its foot.
 _TOGETHER, _FOOT = 6, 4
 # Share of the level that the skirt of a tone may have where it is left in.
@@ -106,7 +106,11 @@ def _take_out(
             continue
         size, level = found
         terms = len(size)
-        power = np.sum(np.abs(_basis(near, places[0], terms) @ size) ** 2, axis=0)
+        tone = _basis(near, places[0], terms) @ size
+        # Of tones too near to each other, as of a comb, one alone may be larger than all together.
+        if _energy(rest[near] - tone, level) > _energy(rest[near], level):
+            continue
+        power = np.sum(np.abs(tone) ** 2, axis=0)
         channel = int(np.argmax(power / level))
         # What the noise adds by itself is not the tone's.
         own = max(0.0, float(power[channel] - terms * level[channel]))
@@ -205,6 +209,10 @@ def _fit_tone(
         if (left(fit, foot, foot + _NEAR) <= _AS_LITTLE * level).all():
             return size, level
     return sizes[-1], level
+
+
+def _energy(rest: ComplexArray, level: FloatArray) -> float:
+    return float(np.sum(np.abs(rest) ** 2 / level))
 
 
 def _foot(terms: int) -> int:

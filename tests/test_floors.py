@@ -16,7 +16,7 @@ FLOORS = [
     {"readers", "segments", "harmonics", "priors", "modalmap", "tones", "layout", "components"},
     {"laws", "spectra", "following", "transient", "periods", "rational", "noise"},
     {"stage", "kernel", "starts", "linetest", "restricted", "responses", "responsefit"},
-    {"blocks"},
+    {"blocks", "targets"},
     {"peaks", "band", "whittle", "lines", "magnitudes", "decayfit", "bounds", "naming"},
     {"posterior"},
     {"bandfit"},

@@ -19,7 +19,7 @@ from lmshealth.bandfit import fit_band
 from lmshealth.errors import BadLog
 from lmshealth.logs import Channel, Log
 from lmshealth.modal import identify
-from lmshealth.readers import read_log
+from lmshealth.readers import load_columns, read_log
 from lmshealth.results import Modes
 from lmshealth.samples import MINUTE, Stored
 from lmshealth.starts import Coarse, Target
@@ -578,3 +578,44 @@ def test_a_vibrating_machine_shows_its_modes_and_not_its_mains(
     assert ((found.damping_ratio > 0.01) & (found.damping_ratio < 0.05)).all()
     assert np.abs(found.frequency - np.array([[50.0], [100.0], [150.0]])).min() > 1
     assert {50, 100} <= {round(line.frequency) for line in found.lines if line.kind == "mains"}
+
+
+def test_a_model_frame_shows_its_first_mode(needs: Callable[[str], None], tmp_path: Path) -> None:
+    """An export of another program, read through a column map, shows 3.69 Hz within 0.15 Hz."""
+    needs("data")
+    folder = Path(os.environ["LMSHEALTH_DATA"]) / "shake_3storey" / "open"
+    (tmp_path / "map.toml").write_text(
+        'sample_rate_hz = 120\n[columns]\nacc_x_m_s2 = "Acc_X"\nacc_y_m_s2 = "Acc_Y"\n'
+        "[csv]\nskip_rows = 7\n"
+    )
+    log = read_log(
+        folder / "Flexible_BonusEvent_1st.csv", columns=load_columns(tmp_path / "map.toml")
+    )
+    found = identify(log, make_stage([("first", 3.7, 0.03)], search=0.1))
+    assert found.names == ("first",)
+    assert found.frequency[0] == pytest.approx(3.69, abs=0.15)
+
+
+@pytest.mark.parametrize("lonely", ["roll", "pitch"])
+def test_a_lonely_resonance_is_not_named_by_guessing(lonely: str) -> None:
+    """Where one of three close modes is excited, its name is not clear: refused, not guessed."""
+    nominal = {"roll": 126.4, "pitch": 136.6, "yaw": 155.0}
+    stage = make_stage([(name, f, 0.017) for name, f in nominal.items()])
+    for seed in range(6):
+        mode = Mode(nominal[lonely], 0.017)
+        signal = accelerations(rng(seed), [mode], round(20 * RATE), RATE, 0.01)[0]
+        found = identify(make_log({"acc_a": signal}, RATE), stage)
+        assert found.names == ()
+        assert {r.mode for r in found.refused} == set(nominal)
+        assert "ambiguous" in {r.reason for r in found.refused}
+
+
+def test_two_of_three_modes_keep_their_names() -> None:
+    """The distance between two resonances tells which of three they are."""
+    nominal = {"roll": 126.4, "pitch": 136.6, "yaw": 155.0}
+    stage = make_stage([(name, f, 0.017) for name, f in nominal.items()])
+    for seed in range(4):
+        modes = [Mode(nominal[name], 0.017) for name in ("roll", "yaw")]
+        signal = accelerations(rng(seed), modes, round(20 * RATE), RATE, 0.01)[0]
+        found = identify(make_log({"acc_a": signal}, RATE), stage)
+        assert found.names == ("roll", "yaw")

@@ -1,14 +1,19 @@
-"""Spectra: what a periodogram reads, which stretches of a log it takes, and what it expects."""
+"""Spectra: what a periodogram reads, and which stretches of a log are averaged."""
 
 from __future__ import annotations
+
+import tempfile
 
 import numpy as np
 import pytest
 
+from lmshealth import spectra
 from lmshealth.logs import Channel
+from lmshealth.samples import Stored
 from lmshealth.segments import Segment
 from lmshealth.spectra import (
     CrossSpectrum,
+    Resonances,
     Spectrum,
     cross_spectra,
     periodogram,
@@ -160,7 +165,31 @@ def test_spectrum_refuses_arrays_that_differ_in_shape() -> None:
         Spectrum(np.arange(3.0), np.arange(4.0), 1.0, 0.0)
 
 
-# The expected periodogram
+@pytest.mark.parametrize("kind", ["acceleration", "displacement"])
+def test_ordinates_from_the_ceiling_on_are_not_kept(kind: str) -> None:
+    """Below the ceiling nothing changes, and what is above it holds no memory."""
+    values = np.random.default_rng(8).normal(size=4000)
+    channel = Channel("x", kind, values)  # type: ignore[arg-type]
+    all_of_it, cut = (
+        periodogram(channel, Segment(0, 4000, 0.1), RATE, 200.0, ceiling=ceiling)
+        for ceiling in (np.inf, 250.0)
+    )
+    below = all_of_it.frequency < 250.0
+    assert 0 < below.sum() < all_of_it.frequency.size
+    np.testing.assert_array_equal(cut.periodogram, all_of_it.periodogram[below])
+    assert cut.frequency.base is None
+    assert cut.periodogram.base is None
+
+
+def test_a_line_reaches_as_far_as_it_wanders() -> None:
+    """A thousandth of its frequency to either side, and never less than two ordinates."""
+    spectrum = whole(np.zeros(20_000))  # of 10 s
+    assert spectrum.frequency[spectrum.near(800.0)] == pytest.approx(np.arange(7992, 8008) / 10)
+    assert spectrum.frequency[spectrum.near(50.04)] == pytest.approx([49.9, 50.0, 50.1, 50.2])
+    assert spectrum.frequency[spectrum.near(5000.0)].size == 0
+    clear = spectrum.clear_of([800.0, 50.04])
+    assert (~clear).sum() == 16 + 4
+    assert not clear[spectrum.near(50.04)].any()
 
 
 # All channels at once
@@ -271,3 +300,142 @@ def test_cross_spectrum_refuses_arrays_that_differ_in_length() -> None:
     """Frequencies without matrices are no spectrum."""
     with pytest.raises(ValueError, match="differ in length"):
         CrossSpectrum(np.arange(3.0), np.zeros((4, 1, 1)) + 0j, 1.0, 0.0, np.ones(3, dtype=bool))
+
+
+# Means over segments
+
+
+def parts(*lengths: int, velocity: float = 0.1) -> list[Segment]:
+    """Give segments that follow each other."""
+    ends = np.cumsum(lengths).tolist()
+    return [Segment(end - n, end, velocity) for n, end in zip(lengths, ends, strict=True)]
+
+
+def averaged(values: np.ndarray | Stored, segments: list[Segment]) -> tuple[Spectrum, ...]:
+    """Transform an acceleration."""
+    channel = Channel("x", "acceleration", values)  # type: ignore[arg-type]
+    return tuple(s.channel(0) for s in cross_spectra([channel], segments, RATE, 500.0))
+
+
+@pytest.fixture
+def short_minute(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Take 1000 samples for a part of a long stretch."""
+    monkeypatch.setattr(spectra, "_LEAST_PART", 1000)
+
+
+@pytest.mark.usefixtures("short_minute")
+def test_parts_of_a_long_stretch_are_averaged() -> None:
+    """Three parts of one length have one spectrum, the mean of theirs, in memory or on disk."""
+    values = np.random.default_rng(20).normal(size=3000)
+    with tempfile.TemporaryFile() as file:
+        values.tofile(file)
+        file.flush()
+        (mean,) = averaged(values, parts(1000, 1000, 1000))
+        (on_disk,) = averaged(Stored(file, values.size), parts(1000, 1000, 1000))
+    each = [whole(part).periodogram for part in values.reshape(3, 1000)]
+    np.testing.assert_allclose(mean.periodogram, np.mean(each, axis=0), rtol=1e-12)
+    np.testing.assert_array_equal(on_disk.periodogram, mean.periodogram)
+    assert (mean.count, mean.duration, mean.observed) == (3, 0.5, 1.5)
+    assert mean.band(100.0, 200.0).count == 3
+
+
+@pytest.mark.usefixtures("short_minute")
+@pytest.mark.parametrize(
+    ("segments", "counts"),
+    [
+        (parts(999, 999), [1, 1]),  # short moves
+        (parts(1000, 1200, 1000, 1200), [2, 2]),
+        (parts(1000, velocity=0.1) + parts(1000, velocity=-0.1005), [2]),
+        (parts(1000, velocity=0.1) + parts(1000, velocity=0.102), [1, 1]),
+        (parts(1000, 1000, velocity=float("nan")), [2]),
+        (parts(1000, velocity=0.0) + parts(1000, velocity=float("nan")), [1, 1]),
+    ],
+)
+def test_only_what_is_alike_is_averaged(segments: list[Segment], counts: list[int]) -> None:
+    """Long segments of one length and one speed are; short moves and others stay apart."""
+    values = np.random.default_rng(21).normal(size=4400)
+    found = averaged(values, segments)
+    assert [spectrum.count for spectrum in found] == counts
+    assert sum(s.observed for s in found) == pytest.approx(
+        sum(s.stop - s.start for s in segments) / RATE
+    )
+
+
+@pytest.mark.usefixtures("short_minute")
+def test_means_have_the_degrees_of_freedom_they_state() -> None:
+    """The density of a band of five parts scatters over seeds as χ² of its degrees says."""
+    rng = np.random.default_rng(22)
+    readings = [
+        averaged(white(rng, 2.0, 5000, RATE), parts(*[1000] * 5))[0].density(100.0, 150.0)
+        for _ in range(500)
+    ]
+    level = np.array([level for level, _ in readings])
+    (dof,) = {dof for _, dof in readings}
+    assert dof == 2 * 5 * 25
+    assert abs(level.mean() / 2 - 1) < 4.5 * np.sqrt(2 / dof / 500)
+    # Negative control: the degrees of a single part would be told.
+    for wrong, off in ((1.0, False), (5.0, True)):
+        told = abs(level.var() / (2**2 * 2 * wrong / dof) - 1) > 4.5 * np.sqrt(2.5 / 500)
+        assert told == off
+
+
+@pytest.mark.usefixtures("short_minute")
+def test_a_sine_reads_its_amplitude_in_the_mean_of_parts() -> None:
+    """The mean over parts reads the amplitude that each of them reads."""
+    frequency = 100 * RATE / 1000
+    (mean,) = averaged(sine(4000, RATE, frequency, 0.02), parts(*[1000] * 4))
+    at = int(np.argmax(mean.periodogram))
+    assert mean.sine(at - 2, at + 3) == (
+        pytest.approx(frequency), pytest.approx(0.02, rel=1e-3)
+    )  # fmt: skip
+
+
+# What a line may reach, and where a resonance may stand
+
+
+def test_without_gives_up_what_lines_reach_and_nothing_else() -> None:
+    """Ordinates that lines reach are no longer free; those that were not stay so."""
+    values = np.random.default_rng(24).normal(size=20_000)
+    (found,) = transform({"acc_a": values}, [Segment(0, 20_000, 0.1)])
+    once = found.without([150.04])
+    assert found.free.all()
+    assert found.frequency[~once.free] == pytest.approx([149.9, 150.0, 150.1, 150.2])
+    twice = once.without([800.0, 50.04])
+    lost = ~found.channel(0).clear_of([150.04, 800.0, 50.04])
+    np.testing.assert_array_equal(twice.free, ~lost)
+    np.testing.assert_array_equal(twice.matrix, found.matrix)
+
+
+def test_resonances_look_like_lines_where_a_segment_does_not_resolve_them() -> None:
+    """Within their band, and below eight ordinates in the half-power bandwidth 2ζf."""
+    frequency = np.array([89.0, 90.0, 99.0, 101.0, 110.0, 111.0])
+    expected = Resonances(90.0, 110.0, 0.02)
+    # 2 · 0.02 · 100 Hz · 2 s is eight.
+    assert expected.like_lines(frequency, 2.0).tolist() == [False, True, True, False, False, False]
+    assert not expected.like_lines(frequency, 3.0).any()
+    assert expected.like_lines(frequency, 1.0).sum() == 4
+
+
+def test_a_resonance_of_a_short_move_is_not_taken_for_a_tone() -> None:
+    """In 60 moves of 0.67 s a mode one ordinate wide is left where it may stand."""
+    n, mode = 1340, Mode(130.0, 0.006, 4 * 0.006**2 * 300)
+    kept = {}
+    for name, expected in (
+        ("there", Resonances(110.0, 150.0, 0.005)),
+        ("elsewhere", Resonances(300.0, 350.0, 0.005)),
+    ):
+        free = []
+        for seed in range(60):
+            values = accelerations(np.random.default_rng(seed), [mode], n, RATE, 1.0)[0]
+            (found,) = cross_spectra(
+                [Channel("acc_a", "acceleration", values)],
+                [Segment(0, n, 0.1)],
+                RATE,
+                400.0,
+                resonances=(expected,),
+            )
+            free.append(found.band(120.0, 140.0).free.all())
+        kept[name] = sum(free)
+    assert kept["there"] == 60
+    # Negative control: where none is expected about half of the moves lose it.
+    assert kept["elsewhere"] < 45

@@ -182,6 +182,27 @@ def test_too_few_ordinates_are_left_as_they_are(n: int) -> None:
     np.testing.assert_array_equal(rest, raw)
 
 
+def test_what_is_spared_is_left_and_the_rest_is_not() -> None:
+    """Of two tones the one that may be a resonance stays; both go where none may stand."""
+    raw = transform(noise(8) + sine(N, RATE, 150.02, 100.0) + sine(N, RATE, 300.02, 100.0))
+    spared = SPARED.copy()
+    spared[at(140.0) : at(160.0)] = True
+    rest, free, tones = remove_tones(raw, SECONDS, spared)
+    assert [read(tone)[0] for tone in tones] == [pytest.approx(300.02, abs=0.02)]
+    assert free[around(150.0)].all()
+    peak = around(150.02, 2)
+    np.testing.assert_allclose(rest[peak], raw[peak], rtol=0.01)
+    assert len(remove_tones(raw, SECONDS, SPARED)[2]) == 2
+
+
+def test_a_comb_too_close_to_be_told_apart_does_not_grow() -> None:
+    """Of an excitation that repeats, every third ordinate towers: nothing is put in there."""
+    raw = transform(np.tile(noise(9)[: N // 3], 3)[: N - 2] + 0.01 * noise(10)[: N - 2])[:600]
+    rest, _, _ = remove_tones(raw, SECONDS, SPARED[:600])
+    assert np.isfinite(rest).all()
+    assert np.sum(np.abs(rest) ** 2) < np.sum(np.abs(raw) ** 2)
+
+
 # Beside a mode
 
 

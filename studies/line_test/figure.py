@@ -127,10 +127,10 @@ def draw_company(ax: Axes, beside: list[dict[str, Any]], strokes: list[dict[str,
 
 
 def draw_moves(ax: Axes, modes: dict[str, Any]) -> None:
-    """Draw how far each line moves the mode."""
+    """Draw how far each line moves the mode, and how often it is refused."""
     rows = modes["rows"] + modes["orders"]
     for key, colour, marker, shift, label in (
-        ("moved_without_masks", PINK, "x", 1.12, "without masks (control)"),
+        ("moved_with_lines_left_in", PINK, "x", 1.12, "lines left in (control)"),
         ("moved", BLUE, "o", 0.9, "as identified"),
     ):
         kept = [row for row in rows if row[key] is not None]
@@ -138,12 +138,18 @@ def draw_moves(ax: Axes, modes: dict[str, Any]) -> None:
                   [max(abs(row[key]), 1e-3) for row in kept], marker, ms=3, alpha=0.6,
                   color=colour, label=label)  # fmt: skip
     ax.axhline(1.0, color=BLACK, lw=1)
+    for row in modes["strengths"]:
+        for key, colour, y in (("_with_lines_left_in", PINK, 0.94), ("", BLUE, 0.88)):
+            ax.text(row["times_peak"], y, f"{row['refused' + key]}", color=colour, fontsize=7,
+                    ha="center", transform=ax.get_xaxis_transform())  # fmt: skip
+    ax.set_ylim(top=3e2)
     strengths = [row["times_peak"] for row in modes["strengths"]]
     ax.set_xticks(strengths, [f"{s:g}" for s in strengths])
     ax.minorticks_off()
     ax.set_xlabel("line over the mode's peak, amplitudes")
     ax.set_ylabel("move of the mode's frequency in σ")
-    ax.set_title("Lines on a mode", fontsize=10)
+    n = modes["strengths"][0]["n"]
+    ax.set_title(f"Lines on a mode; on top: refused of {n}", fontsize=10)
     ax.legend(fontsize=7, loc="lower right")
     ax.grid(alpha=0.25)
 

@@ -54,7 +54,10 @@ CLEAR = 3.0
 MOST_MISSED = 0.05
 QUANTITIES = ("ln f", "ln zeta")
 NOT_MET = {
-    "no peer is clearly more accurate": "NOTMET"
+    "no peer is clearly more accurate": (
+        "VarPLSCF has a tenth less error of f from moves of 0.67 s: it uses correlations of the whole "
+        "band, where we use the few Fourier frequencies about the modes"
+    )
 }
 
 

@@ -35,14 +35,14 @@ def draw_response(gain: list[Axes], coherence: Axes, example: dict[str, Any]) ->
         hertz = part["frequency_hz"]
         ax.semilogy(hertz, scale * np.array(part["gain"]), ".", ms=3, color=colour,
                     label="measured")  # fmt: skip
-        ax.semilogy(hertz, scale * np.array(part["fit"]), lw=1, color="black", label="fit")
+        ax.semilogy(part["fit_hz"], scale * np.array(part["fit"]), lw=1, color="black", label="fit")
         ax.set_title(f"FRF, current to {label}", fontsize=10)
         ax.set_ylabel(f"gain in {unit}")
         ax.legend(frameon=False, fontsize=8)
         ax.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
         ax.yaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
         ax.yaxis.set_minor_formatter(NullFormatter())
-        missing = 1 - np.array(part["coherence"])
+        missing = part["missing_coherence"]
         coherence.semilogy(hertz, missing, ".", ms=3, color=colour, label=label)
     coherence.set_title("what is missing of a coherence of 1", fontsize=10)
     coherence.set_ylabel("1 - coherence")

@@ -6,16 +6,21 @@ Question
     an undisturbed move, (3) from its accelerometers. Do the frequencies agree within their
     uncertainties, and with the eigenvalues of the closed loop?
 Method
-    Every method has logs of its own (20 s, sweeps 28 s), so that errors are independent. (1) is a
-    weighted least-squares fit of poles and residues, its weights from the noise between the
-    sweep's lines, each mode from the sensor that shows it most clearly; (2) and (3) are
+    Every method has logs of its own (20 s, sweeps 28 s), so that errors are independent. (1) is
+    `lmshealth.read_frf` in a band around the modes, which are found without a description and
+    called by the nearest of it, each from the sensor that shows it most clearly; (2) and (3) are
     `lmshealth.identify` on those channels alone. Differences over their standard deviation (z)
     must be standard normal: chi-squared, and the mean over all seeds. A mode that a method does
     not show is refused, not guessed. Negative controls that must disagree: a response on a stage
     of 5 % less preload; the response to the motor's whole current, which has the poles of the
     stage without its servo.
+Answer
+    Every mode that two methods show has the same frequency in all of them, and that of the closed
+    loop. Pitch is known to 1 mHz from a response of Y, 7 mHz of X, and to 0.2 to 0.35 Hz from an
+    undisturbed move. Roll shows in the accelerometers, in 12 of 20 responses of Y, in none of X,
+    and never in the following error. Both controls disagree.
 Run time
-    About three minutes on two processors for 20 seeds of both stages.
+    Seven minutes of processor time on two processors for 20 seeds of both stages.
 """
 
 from __future__ import annotations
@@ -35,7 +40,8 @@ from typing import Any
 import numpy as np
 from scipy.stats import chi2
 
-from lmshealth import identify, load_stage, read_log
+from lmshealth import identify, load_stage, read_frf, read_log
+from lmshealth.frf import FrfReading
 from lmshealth.logs import Log
 from lmshealth.stage import ModeSpec
 from models.formats import write_log
@@ -44,7 +50,6 @@ from models.recording import record
 from models.stages import NOMINAL, Condition, stage_named
 from models.sweep import Sweep, record_sweep, without_loop
 from studies.record import Stopwatch, keep
-from studies.three_methods.frf import find_modes, measure, model
 
 HERE = Path(__file__).parent
 SECONDS = 20.0
@@ -55,13 +60,15 @@ SWEEPS = {
     "lms-y": Sweep(90.0, 180.0, amplitude=0.4, period=PERIOD),
     "lms-x": Sweep(70.0, 330.0, amplitude=0.4, period=PERIOD),
 }
-# Bands in which modes are fitted together.
+# Bands in which modes are read together.
 BANDS = {
     "lms-y": {("roll", "pitch", "yaw"): (95.0, 175.0)},
     "lms-x": {("roll",): (74.0, 106.0), ("yaw",): (130.0, 190.0), ("pitch",): (225.0, 320.0)},
 }
 CHANNELS = {"delta_e": ("delta_e",), "accelerometers": ("acc_feed", "acc_pitch")}
 METHODS = ("frf", *CHANNELS)
+# So far from its description, in ln f, a mode of a response is still called by it.
+SEARCH = 0.04
 WORN = Condition(guide_preload=0.95)
 # The modes that the paper ties to guide preload.
 WATCHED = ("roll", "pitch")
@@ -132,19 +139,27 @@ def swept(name: str, seed: int, folder: Path, condition: Condition = NOMINAL) ->
     return written(record_sweep(stage, sweep, condition, seconds=SWEEP_SECONDS, rng=rng), folder)
 
 
-def sought(name: str, names: tuple[str, ...]) -> tuple[ModeSpec, ...]:
+def read(name: str, log: Log, source: str, sensor: str, modes: tuple[str, ...]) -> FrfReading:
+    """Read the response of a sensor to a current in the band of some modes."""
+    return read_frf(log, source, sensor, band=BANDS[name][modes], period=PERIOD)
+
+
+def sought(name: str, modes: tuple[str, ...]) -> tuple[ModeSpec, ...]:
     """Return modes of the stage's description: where a user would look for them."""
-    return tuple(mode for mode in load_stage(name).modes if mode.name in names)
+    return tuple(mode for mode in load_stage(name).modes if mode.name in modes)
 
 
 def by_response(name: str, log: Log, source: str) -> Estimates:
     """Return f and its standard deviation by the frequency response to a current."""
     best: dict[str, tuple[float, float, float]] = {}
-    for sensor, (names, band) in product(SENSORS, BANDS[name].items()):
-        response = measure(log, source, sensor, band, PERIOD)
-        found, _ = find_modes(response, sought(name, names))
-        # The clearest sensor, not the one that happens to be the most certain.
-        best |= {m: e for m, e in found.items() if m not in best or e[2] > best[m][2]}
+    for sensor, names in product(SENSORS, BANDS[name]):
+        modes = read(name, log, source, sensor, names).modes
+        rows = np.stack([modes.frequency, modes.frequency_std, modes.snr], axis=-1)
+        for f, std, snr in rows.tolist():
+            off, mode = min((abs(np.log(f / m.frequency_hz)), m.name) for m in sought(name, names))
+            # The clearest sensor, not the one that happens to be the most certain.
+            if off < SEARCH and (mode not in best or snr > best[mode][2]):
+                best[mode] = (f, std, snr)
     return {m: best[m][:2] if m in best else "not seen in the response" for m in GUIDE_MODES}
 
 
@@ -259,16 +274,20 @@ def example_response(name: str) -> dict[str, Any]:
     """Return the responses of one log with their fits, for the figure."""
     with tempfile.TemporaryDirectory() as scratch:
         log = swept(name, 0, Path(scratch))
-    ((names, band),) = BANDS[name].items()
+    (names,) = BANDS[name]
     example: dict[str, Any] = {"stage": name}
     for sensor in ("delta_e", "acc_pitch"):
-        response = measure(log, "current_excitation", sensor, band, PERIOD)
-        _, theta = find_modes(response, sought(name, names))
+        reading = read(name, log, "current_excitation", sensor, names)
+        frf, fit = reading.frf, reading.fit
+        columns = {
+            "frequency_hz": frf.frequency,
+            "gain": np.abs(frf.response),
+            "missing_coherence": 1 - frf.coherence,
+            "fit_hz": fit.ordinates.frequency,
+            "fit": np.abs(fit.response),
+        }
         example[sensor] = {
-            "frequency_hz": response.hertz.round(3).tolist(),
-            "gain": [float(f"{x:.5g}") for x in np.abs(response.value)],
-            "fit": [float(f"{x:.5g}") for x in np.abs(model(response, theta)[0])],
-            "coherence": response.coherence.round(7).tolist(),
+            key: [float(f"{x:.5g}") for x in values] for key, values in columns.items()
         }
     return example
 
