@@ -199,7 +199,7 @@ class Likelihood:
             hess=hessian,
             method="trust-exact",
             callback=arrived,
-            options={"gtol": 1e-9, "maxiter": 60, "initial_trust_radius": 0.3},
+            options={"gtol": 1e-9, "maxiter": 100, "initial_trust_radius": 0.3},
         )
         step, decrement = newton_step(np.asarray(found.x))
         # So near no step goes too far, and one more makes it exact.

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import shutil
 from collections.abc import Callable
+from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
@@ -21,6 +22,9 @@ def _missing(name: str) -> str | None:
         if not folder:
             return "LMSHEALTH_DATA is not set: it names the folder of real measurements"
         return None if Path(folder).is_dir() else f"LMSHEALTH_DATA={folder} is no folder"
+    if name == "peers":
+        missing = [module for module in ("pyoma2", "pyOMA") if find_spec(module) is None]
+        return f"{' and '.join(missing)}: pip install '.[peers]'" if missing else None
     raise ValueError(f"unknown need {name!r}")
 
 

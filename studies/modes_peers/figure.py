@@ -1,0 +1,93 @@
+"""Draw figure.svg from result.json: errors, coverage, time and memory of every program."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+HERE = Path(__file__).parent
+COLOURS, MARKERS = ("#0072b2", "#d55e00", "#009e73"), "osD"
+SHIFT = 0.24
+QUANTITIES = {"ln f": "natural frequency", "ln zeta": "damping ratio"}
+
+
+def draw_errors(ax: Axes, cases: list[dict[str, Any]], quantity: str) -> None:
+    """Draw root mean square errors over the bound, a mark for each mode."""
+    for k, case in enumerate(cases):
+        for y, row in enumerate(case["tools"].values()):
+            told = [m for m in row["modes"] if m["quantity"] == quantity]
+            over = [m["rmse_over_bound"] for m in told if "rmse_over_bound" in m]
+            ax.plot(over, np.full(len(over), y + SHIFT * (k - 1)), MARKERS[k], ms=4,
+                    color=COLOURS[k], alpha=0.8)  # fmt: skip
+    ax.axvline(1, color="black", lw=1)
+    ax.set_xscale("log")
+    ax.set_xticks([1, 2, 5, 10, 20], ["1", "2", "5", "10", "20"])
+    ax.minorticks_off()
+    ax.set_xlabel("RMSE over the Cramér-Rao bound")
+    ax.set_title(f"Error of the {QUANTITIES[quantity]}", fontsize=10)
+
+
+def draw_coverage(ax: Axes, cases: list[dict[str, Any]]) -> None:
+    """Draw how often 95 % intervals hold the truth, full marks for f and open ones for ζ."""
+    for k, case in enumerate(cases):
+        for y, row in enumerate(case["tools"].values()):
+            for quantity, part in row["coverage"].items():
+                here = y + SHIFT * (k - 1) + (0.06 if quantity == "ln f" else -0.06)
+                ax.plot([part["low"], part["high"]], [here, here], lw=1.2, color=COLOURS[k])
+                ax.plot(part["share"], here, MARKERS[k], ms=4, color=COLOURS[k],
+                        mfc=COLOURS[k] if quantity == "ln f" else "white")  # fmt: skip
+    for y, row in enumerate(cases[0]["tools"].values()):
+        if not row["coverage"]:
+            ax.text(0.75, y, "no intervals", fontsize=7, ha="center", va="center")
+    ax.axvline(0.95, color="black", lw=1)
+    ax.set_xlim(0.5, 1.01)
+    ax.set_xlabel("share, 99.9 % interval")
+    ax.set_title("Coverage of 95 % intervals\n(full: frequency, open: damping)", fontsize=10)
+
+
+def draw_costs(ax: Axes, cases: list[dict[str, Any]], key: str, label: str, title: str) -> None:
+    """Draw time or memory."""
+    for k, case in enumerate(cases):
+        for y, row in enumerate(case["tools"].values()):
+            ax.plot(row[key], y + SHIFT * (k - 1), MARKERS[k], ms=4, color=COLOURS[k])
+    ax.set_xscale("log")
+    low, high = ax.get_xlim()
+    ticks = [t for t in (0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 50, 100) if low <= t <= high]
+    ax.set_xticks(ticks, [f"{tick:g}" for tick in ticks])
+    ax.minorticks_off()
+    ax.set_xlabel(label)
+    ax.set_title(title, fontsize=10)
+
+
+def main() -> None:
+    """Draw five panels that share the list of programs."""
+    matplotlib.rcParams["svg.hashsalt"] = "modes_peers"
+    result = json.loads((HERE / "result.json").read_text())
+    cases = result["cases"]
+    figure = Figure(figsize=(14.0, 5.2), layout="constrained")
+    axes = figure.subplots(1, 5, sharey=True)
+    draw_errors(axes[0], cases, "ln f")
+    draw_errors(axes[1], cases, "ln zeta")
+    draw_coverage(axes[2], cases)
+    draw_costs(axes[3], cases, "time_over_ours", "time over that of lmshealth", "Time of a record")
+    axes[3].axvline(1, color="black", lw=1)
+    draw_costs(axes[4], cases, "peak_mb", "peak above what was held, MB", "Memory")
+    names = list(cases[0]["tools"])
+    axes[0].set_yticks(range(len(names)), names)
+    axes[0].invert_yaxis()
+    for ax in axes:
+        ax.grid(alpha=0.25, axis="x")
+    for k, case in enumerate(cases):
+        axes[0].plot([], [], MARKERS[k], color=COLOURS[k], label=case["case"])
+    figure.legend(loc="outside lower center", ncols=3, frameon=False)
+    figure.savefig(HERE / "figure.svg", metadata={"Date": None})
+
+
+if __name__ == "__main__":
+    main()
