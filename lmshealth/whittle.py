@@ -307,8 +307,7 @@ class _Point:
         half = basis[:, row][:, None] * _combined(basis, w.conj().swapaxes(0, 1))[None].conj()
         slopes = half + half.conj().swapaxes(0, 1)  # (channels, channels, unknowns, n)
         gradient = _inner(slopes, (_frequency_last(excess) * count)[:, :, None])
-        turned = _combined(_frequency_last(eye - 2 * excess), slopes)
-        hessian = _inner(slopes, turned * count)
+        hessian = _inner(slopes, _combined(_frequency_last(eye - 2 * excess) * count, slopes))
         g = _frequency_last(adjoint @ (count[:, None, None] * excess) @ whiten)
         return gradient[:, 0], hessian + self._curvature(w, g)
 

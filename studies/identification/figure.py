@@ -59,7 +59,7 @@ def draw_coverage(ax: Axes, cases: list[str], rows: list[dict[str, Any]]) -> Non
     ax.plot(narrow, y, "|", ms=4, color="#999999", label="1.5 times narrower or wider")
     ax.plot(wide, y, "|", ms=4, color="#999999")
     ax.axvline(95, color="black", lw=0.8)
-    ax.set_xlabel("95 % intervals that hold the truth, in % (bars: 99.9 % Clopper-Pearson)")
+    ax.set_xlabel("95 % intervals that hold the truth, in %;\nbars: 99.9 % Clopper-Pearson")
     ax.legend(loc="upper left", frameon=True, framealpha=0.9)
     ax.grid(axis="x", alpha=0.25)
 
@@ -79,7 +79,7 @@ def draw_efficiency(ax: Axes, cases: list[str], rows: list[dict[str, Any]]) -> N
             ax.text(1.0, k, " no bound computed", va="center", color="#777777")
     ax.axvline(1, color="black", lw=0.8)
     ax.plot([], [], "|", ms=7, color="#009e73", label="asked: no more than this")
-    ax.set_xlabel("root mean square error over the Cramér-Rao bound (bars: one standard error)")
+    ax.set_xlabel("root mean square error over the Cramér-Rao bound;\nbars: one standard error")
     ax.legend(loc="upper right", frameon=True, framealpha=0.9)
     ax.grid(axis="x", alpha=0.25)
 

@@ -12,6 +12,12 @@ Method
     channels with shapes, forces and noise unknown, in the band of the fit. Negative controls that
     must fail: all intervals half as wide again, or two thirds as wide; the following error and the
     accelerometers identified one by one and averaged as if they were independent.
+Answer
+    All 68 coverages hold 95 %, those of 2,000 records 93.9 to 96.2 %; all controls fail. Errors are
+    1.01 to 1.07 times the bound for one mode in three channels, 1.02 to 1.06 for two modes three
+    bandwidths apart, 1.03 to 1.20 for three modes together. Short of what was asked: in a single
+    channel 1.10 to 1.23, because it cannot tell a floor that moves with the mode from one that does
+    not, and allows for both.
 Run time
     About twenty minutes on two processors.
 """
