@@ -30,7 +30,7 @@ def marginalise(likelihood: Likelihood, p: FloatArray) -> tuple[FloatArray, Floa
     likelihood : Likelihood
         With its priors.
     p : ndarray
-        Its posterior mode, shape ``(n_unknowns,)``.
+        Its posterior mode, or near it, shape ``(n_unknowns,)``.
 
     Returns
     -------
@@ -48,6 +48,8 @@ def marginalise(likelihood: Likelihood, p: FloatArray) -> tuple[FloatArray, Floa
     except np.linalg.LinAlgError:
         return p[:n], np.full((n, n), np.nan), np.inf
     decrement = float(np.sum(np.linalg.solve(factor, gradient) ** 2))
+    # Where the search ended the slope is not quite zero: the normal stands a little further.
+    p = p - np.linalg.solve(hessian, gradient)
     groups = (layout.shared, layout.common, layout.bends)
     index = np.array([unknown for group in groups for unknown in group], dtype=int)
     cov = np.linalg.inv(hessian)

@@ -41,9 +41,9 @@ from lmshealth.layout import Layout
 
 T = TypeVar("T")
 
-# Newton decrement, a square in standard deviations, from which on one full step is enough; along
-# a valley as flat as that of two modes at one place, after so many steps, a larger one.
-_ARRIVED, _NEARLY, _MANY_STEPS = 1e-3, 0.1, 25
+# Newton decrement, a square in standard deviations, from which on no further step is worth it;
+# along a valley as flat as that of two modes at one place, after so many steps, a larger one.
+_ARRIVED, _NEARLY, _MANY_STEPS = 1e-4, 0.1, 25
 # Standard deviations of the weak normal priors about the start, which only keep directions that
 # the data do not see from running away: of ln f, ln ζ, forces, shapes, floors.
 WEAK = (0.2, 2.0)
@@ -176,20 +176,19 @@ class Likelihood:
         def hessian(p: FloatArray) -> FloatArray:
             return both(p)[1]
 
-        def newton_step(p: FloatArray) -> tuple[FloatArray, float]:
-            """Give the full step and its decrement; infinite where the Hessian has no inverse."""
+        def decrement(p: FloatArray) -> float:
+            """Give the Newton decrement; infinite where there is no minimum near."""
             slope, curvature = both(p)
             try:
-                step = -cho_solve(cho_factor(curvature), slope)
+                return float(slope @ cho_solve(cho_factor(curvature), slope))
             except np.linalg.LinAlgError:
-                return np.zeros_like(p), np.inf
-            return step, float(-slope @ step)
+                return np.inf
 
         steps = iter(range(1, 1000))
 
         def arrived(intermediate_result: OptimizeResult) -> None:
             near = _ARRIVED if next(steps) < _MANY_STEPS else _NEARLY
-            if 0 <= newton_step(np.asarray(intermediate_result.x))[1] < near:
+            if decrement(np.asarray(intermediate_result.x)) < near:
                 raise StopIteration
 
         found = minimize(
@@ -201,9 +200,7 @@ class Likelihood:
             callback=arrived,
             options={"gtol": 1e-9, "maxiter": 100, "initial_trust_radius": 0.3},
         )
-        step, decrement = newton_step(np.asarray(found.x))
-        # So near no step goes too far, and one more makes it exact.
-        return np.asarray(found.x + step if decrement < _ARRIVED else found.x)
+        return np.asarray(found.x)
 
 
 class _Last(Generic[T]):
