@@ -58,7 +58,8 @@ def draw_costs(ax: Axes, cases: list[dict[str, Any]], key: str, label: str, titl
             ax.plot(row[key], y + SHIFT * (k - 1), MARKERS[k], ms=4, color=COLOURS[k])
     ax.set_xscale("log")
     low, high = ax.get_xlim()
-    ticks = [t for t in (0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 50, 100) if low <= t <= high]
+    steps = (0.1, 1, 10, 100) if high / low > 500 else (0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 50)
+    ticks = [tick for tick in steps if low <= tick <= high]
     ax.set_xticks(ticks, [f"{tick:g}" for tick in ticks])
     ax.minorticks_off()
     ax.set_xlabel(label)

@@ -13,20 +13,19 @@ Method
     the pole nearest to the truth. None of them takes moves: these are strung together. Errors are
     compared record by record; "even" is a mean difference of squares within three of its standard
     errors. Programs take turns on each record, on one thread; a time is the median of its ratio to
-    ours. Memory is the peak above what was held before, in a process of its own. Negative
-    control: our intervals, two thirds as wide, must not cover in all cases together.
+    ours. Memory is the peak above what was held after a short record, in a process of its own.
+    Negative control: our intervals, two thirds as wide, must not cover in all cases together.
 Answer
-    Not in every column. No program has clearly less error in these 40 records, and none that gives
-    intervals is faster and as good. FDD, EFDD, FSDD and pLSCF have 1.0 to 8 times the bound where
-    we have 0.9 to 1.3, for their windows and peaks. Covariance driven SSI is even in one piece (1.0
-    to 1.5), and 0.9 to 1.4 times as slow; without intervals it takes a third to a half of our time,
-    because it solves no nonlinear problem. Of moves strung together it takes a fifth, with 1.2 to
-    1.9 times the bound for ζ. Data driven SSI has up to a fifth less error in one piece, which 40
-    records do not tell from chance, for 18 to 24 times our time and 50 to 70 times our memory; its
-    intervals hold 81 to 90 %. VarPLSCF is the best of them: intervals cover, errors are 1.0 to 1.4
-    times the bound, 2 to 8 times our time. Of moves its errors are a tenth less than ours, at 2.5
-    standard errors of the mean; over 60 records, in an earlier run, at 3.2. Our memory is the
-    least.
+    Not in every column. In these 40 records no program has clearly less error. FDD, EFDD, FSDD and
+    pLSCF have 1.0 to 8 times the bound where we have 0.9 to 1.3, for their windows and peaks.
+    Covariance driven SSI is even in one piece and takes 0.9 to 1.4 times our time; without
+    intervals a third to a half, because it solves no nonlinear problem. Of moves strung together it
+    takes a fifth to a half, with 1.2 to 1.9 times the bound for ζ, and its intervals of ζ fail.
+    Data driven SSI has up to a fifth less error in one piece, which 40 records do not tell from
+    chance, for 18 to 24 times our time and 47 to 71 times our memory; its intervals hold 81 to
+    90 %. VarPLSCF is the best of them: intervals cover, errors are 0.9 to 1.4 times the bound, for
+    2 to 8 times our time. Of moves its errors are a tenth less than ours, at 2.5 standard errors of
+    the mean; over 60 records, in an earlier run, at 3.2. Our memory is the least.
 Run time
     About ten minutes on one processor. Needs the extra ``peers``.
 """
