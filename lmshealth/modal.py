@@ -29,6 +29,8 @@ from lmshealth.targets import choose_channels, choose_targets
 
 # Modes whose bands touch are fitted together, but never more than this many.
 _MOST_TOGETHER = 4
+# Factor between the bandwidths of modes that are fitted together.
+_ALIKE = 8.0
 # Probability from which on a found mode is given its name.
 _CLEAR_NAME = 0.8
 # Without a description, so many times what a fit leaves over is searched for further modes.
@@ -197,7 +199,12 @@ def _clusters(targets: tuple[Target, ...]) -> list[tuple[Target, ...]]:
     """Group targets whose fitting bands overlap."""
     groups: list[list[Target]] = []
     for target in targets:
-        close = bool(groups) and target.band(BAND)[0] < groups[-1][-1].band(BAND)[1]
+        last = groups[-1][-1] if groups else target
+        close = bool(groups) and target.band(BAND)[0] < last.band(BAND)[1]
+        # Beside a broad resonance a narrow one is a line's business: it would ask for the finest
+        # resolution over all of the band.
+        ratio = (target.frequency * target.damping_ratio) / (last.frequency * last.damping_ratio)
+        close = close and 1 / _ALIKE < ratio < _ALIKE
         if close and len(groups[-1]) < _MOST_TOGETHER:
             groups[-1].append(target)
         else:

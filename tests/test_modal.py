@@ -634,3 +634,11 @@ def test_a_silent_channel_has_no_mode_and_does_no_harm() -> None:
     log = make_log({"acc_a": np.full(60_000, 3.0), "acc_b": values}, RATE)
     assert identify(log, make_stage(ROLL)).names == ("roll",)
     assert identify(log, band=(20.0, 400.0)).names == ("mode_1",)
+
+
+def test_a_narrow_peak_is_not_fitted_with_a_broad_one() -> None:
+    """Their bands overlap, but their widths differ by more than eight: each has its own cluster."""
+    broad = Target("broad", 200.0, 0.0107, 0.05)
+    narrow, alike = Target("narrow", 184.0, 0.0007, 0.02), Target("alike", 184.0, 0.008, 0.02)
+    assert [len(group) for group in modal._clusters((narrow, broad))] == [1, 1]
+    assert [len(group) for group in modal._clusters((alike, broad))] == [2]
