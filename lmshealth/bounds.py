@@ -10,9 +10,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from lmshealth.arrays import FloatArray, expect_shape
+from lmshealth.arrays import ComplexArray, FloatArray, expect_shape
 from lmshealth.restricted import TransientLikelihood, unit_level
-from lmshealth.transient import Block, ComplexArray, pole_columns
+from lmshealth.transient import Block, pole_columns
 
 # Steps of the differences by which several modes' densities are differentiated, in ln.
 _STEP = 1e-5

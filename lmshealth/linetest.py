@@ -14,15 +14,12 @@ from functools import lru_cache
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import fft
 from scipy.linalg import toeplitz
 from scipy.stats import f as fisher
 from scipy.stats import gamma
 
-from lmshealth.arrays import FloatArray
-
-ComplexArray = NDArray[np.complex128]
+from lmshealth.arrays import ComplexArray, FloatArray
 
 # Tapers of the test: its neighbourhood is half as many ordinates to either side.
 _TAPERS = 7

@@ -5,12 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import fft
 
-from lmshealth.arrays import FloatArray
-
-ComplexArray = NDArray[np.complex128]
+from lmshealth.arrays import ComplexArray, FloatArray
 
 # A signal that correlates with itself by this much after a lag, and after all its multiples, has
 # at least as much of it in common as is noise.

@@ -12,12 +12,9 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
-from lmshealth.arrays import BoolArray, FloatArray, freeze
-
-ComplexArray = NDArray[np.complex128]
+from lmshealth.arrays import BoolArray, ComplexArray, FloatArray, freeze
 
 # A transient of a band is smooth: powers of s in it.
 _TRANSIENT_POWERS = (-1, 0, 1)

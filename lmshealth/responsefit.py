@@ -7,11 +7,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.optimize import minimize_scalar
 
-from lmshealth.arrays import BoolArray, FloatArray, freeze
+from lmshealth.arrays import BoolArray, ComplexArray, FloatArray, freeze
 from lmshealth.noise import smooth_noise
 from lmshealth.rational import (
     HEAVY,
-    ComplexArray,
     Order,
     Ordinates,
     Solution,

@@ -10,12 +10,12 @@ from scipy import fft, signal
 from scipy.ndimage import uniform_filter1d
 from scipy.stats import f as fisher
 
-from lmshealth.arrays import BoolArray, FloatArray, expect_shape, freeze
+from lmshealth.arrays import BoolArray, ComplexArray, FloatArray, expect_shape, freeze
 from lmshealth.errors import BadLog
 from lmshealth.logs import Log
 from lmshealth.noise import smooth_noise
 from lmshealth.periods import cut_periods
-from lmshealth.rational import ComplexArray, Ordinates
+from lmshealth.rational import Ordinates
 
 # A line is excited from this share of the strongest amplitude of the input on, and from so many
 # times its noise in power: with less, noise of the input where that is weak at a resonance would

@@ -8,10 +8,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy import stats
 
-from lmshealth.arrays import BoolArray, FloatArray
+from lmshealth.arrays import BoolArray, ComplexArray, FloatArray
 from lmshealth.decayfit import Optimum, average_ambient, invert, maximise
 from lmshealth.restricted import BlockFit, TransientLikelihood, unit_level
-from lmshealth.transient import Block, ComplexArray, stack, transient
+from lmshealth.transient import Block, stack, transient
 
 MOST_POLES = 6
 # Log likelihood beyond the Bayesian information criterion that a further pole must bring.

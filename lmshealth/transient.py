@@ -10,12 +10,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import fft
 
-from lmshealth.arrays import FloatArray
-
-ComplexArray = NDArray[np.complex128]
+from lmshealth.arrays import ComplexArray, FloatArray
 
 # Degree of the polynomial, over the band, of what leaks into it from outside.
 _DEGREE = 2
