@@ -29,6 +29,7 @@ from lmshealth.layout import lay_out
 from lmshealth.posterior import marginalise
 from lmshealth.spectra import WANDER, Spectrum
 from lmshealth.starts import Coarse, Target, misfits, strengths
+from lmshealth.targets import WORST_STD_LN_F, WORST_STD_LN_ZETA
 from lmshealth.whittle import Likelihood
 
 # The band of a fit reaches this many damping ratios from its modes: beyond, a resonance adds
@@ -39,8 +40,6 @@ _MOST_LINE_ROUNDS = 4
 # it is fitted both ways.
 _BEYOND_DOUBT = 60.0
 _EVIDENCE_MARGIN = 10.0
-_WORST_STD_LN_F = 0.03
-_WORST_STD_LN_ZETA = 0.7
 # A damping off its start by more than this factor belongs to something else.
 _DAMPING_SPAN = 6.0
 # Variance of what a fit leaves, over that of noise, from which on it is called loose or not
@@ -438,7 +437,7 @@ def _incredible(fit: BandFit, i: int, duration: float) -> tuple[str, str] | None
             f"{100 * target.search:.0f} % of {sought:.5g} Hz, damping from {low:.2g} "
             f"to {high:.2g}",
         )
-    if std_f > _WORST_STD_LN_F or std_zeta > _WORST_STD_LN_ZETA:
+    if std_f > WORST_STD_LN_F or std_zeta > WORST_STD_LN_ZETA:
         return (
             "too-uncertain",
             f"{f:.5g} Hz in {channel} is known to {100 * std_f:.2g} % only, its damping to "

@@ -23,7 +23,7 @@ from lmshealth.ringing import Estimate, Ringing, estimate, find_ringing, station
 from lmshealth.segments import Segment, select_segments
 from lmshealth.stage import Stage
 from lmshealth.starts import Target
-from lmshealth.targets import choose_channels, choose_targets
+from lmshealth.targets import USABLE, WORST_STD_LN_F, choose_channels, choose_targets
 from lmshealth.transient import make_block
 
 # A band reaches so many Fourier frequencies, and such a share of the frequency, beyond its modes;
@@ -37,14 +37,12 @@ _SAME_LENGTH = 0.95
 _FALSE_ALARM, _AROUND = 1e-3, 24
 # Periods of the lowest mode that a decay must hold; ordinates that a band must.
 _PERIODS, _LEAST_ORDINATES = 4.0, 12
-_TOP = 0.45  # of the sample rate: anti-alias filters reach below Nyquist
 # Shares of a decay that are left out until the rest is one in stationary noise, and the
 # probability below which it is said not to be.
 _SKIPS = (0.0, 0.1, 0.2, 0.3, 0.4, 0.5)
 _NOT_STATIONARY = 1e-3
 # What a later beginning may mend in the loudest mode.
 _TOO_EARLY = ("too-uncertain", "too-close")
-_WORST_STD_LN_F = 0.03
 # A damping that is fewer than so many standard deviations off zero may be a line's.
 _LEAST_DAMPING = 3.0
 _FADED, _HEAVY = 0.6, 0.1
@@ -120,7 +118,7 @@ def _limits(
 ) -> tuple[float, float]:
     """Find where modes are looked for, and insist that the decays resolve it."""
     duration = max(s.stop - s.start for s in decays) / log.sample_rate
-    least, top = _PERIODS / duration, _TOP * log.sample_rate
+    least, top = _PERIODS / duration, USABLE * log.sample_rate
     if targets:
         low = min(t.frequency / (1 + t.search) for t in targets)
         high = max(t.frequency * (1 + t.search) for t in targets)
@@ -131,7 +129,7 @@ def _limits(
             log.name,
             "sample-rate",
             f"{log.sample_rate:g} Hz cannot show modes up to {high:.0f} Hz; needed is at least "
-            f"{high / _TOP:.0f} Hz",
+            f"{high / USABLE:.0f} Hz",
         )
     low, high = max(low, least), min(high, top)
     if high * duration < _PERIODS + _LEAST_ORDINATES:
@@ -350,7 +348,7 @@ def _incredible(found: Ringing, i: int, result: Estimate, k: int) -> tuple[str, 
             f"{f:.5g} Hz fades by {100 * faded:.2g} % in {duration:.3g} s, its damping is known to "
             f"{100 * min(std_zeta, 9.99):.0f} % only: it may be a line; record on after the stop",
         )
-    if std_f > _WORST_STD_LN_F or std_zeta > 1 / _LEAST_DAMPING or zeta > _HEAVY:
+    if std_f > WORST_STD_LN_F or std_zeta > 1 / _LEAST_DAMPING or zeta > _HEAVY:
         return (
             "too-uncertain",
             f"{f:.5g} Hz is known to {100 * std_f:.2g} % only, its damping {zeta:.2g} to "

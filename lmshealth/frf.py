@@ -17,16 +17,15 @@ from lmshealth.responsefit import ResponseFit, fit_response
 from lmshealth.responses import EXCITED, Frf, Pair, from_periods, from_record
 from lmshealth.results import Line, Modes
 from lmshealth.segments import find_phases
+from lmshealth.targets import USABLE, WORST_STD_LN_F, WORST_STD_LN_ZETA
 
-_TOP = 0.45  # of the sample rate: anti-alias filters reach below Nyquist
 # The second difference of a displacement reaches over this part of the shortest period.
 _LAG_PERIODS = 8.0
 _FEWEST_SAMPLES = 256
 _FEWEST_PER_PERIOD = 32
 # Standard deviations of a mean coherence beyond what noise alone shows.
 _ANSWERS = 5.0
-# What is not reported as a mode: known this badly, or in power so few times the distortion around.
-_WORST_STD_LN_F, _WORST_STD_LN_ZETA = 0.03, 0.7
+# Power of a mode over that of the distortion around it, below which it is not reported.
 _LEAST_OVER_DISTORTION = 16.0
 
 
@@ -91,7 +90,7 @@ def read_frf(
     if input == output:
         raise BadLog(log.name, "channel", f"{input} is both input and output; needed are two")
     start, stop = _stretch(log)
-    top = _TOP * log.sample_rate
+    top = USABLE * log.sample_rate
     low, high = band or (0.0, top)
     if low >= top:
         raise BadLog(
@@ -276,7 +275,7 @@ def _incredible(frf: Frf, fit: ResponseFit, i: int) -> tuple[str, str] | None:
             f"its power is {fit.over_distortion[i]:.2g} times that of the distortion around it, "
             f"needed {_LEAST_OVER_DISTORTION:g}: a nonlinearity may show as much; excite less",
         )
-    if std_f > _WORST_STD_LN_F or std_zeta > _WORST_STD_LN_ZETA:
+    if std_f > WORST_STD_LN_F or std_zeta > WORST_STD_LN_ZETA:
         return (
             "too-uncertain",
             f"known to {100 * std_f:.2g} % only, its damping to {100 * std_zeta:.0f} %; record "
@@ -290,5 +289,6 @@ def _lines(log: Log, output: Channel, fit: ResponseFit) -> tuple[Line, ...]:
     frequency, amplitude = fit.outliers.T
     if output.kind == "displacement":
         amplitude = amplitude * (2 * np.pi * frequency) ** 2
-    seen = zip([output.name] * frequency.size, frequency.tolist(), amplitude.tolist(), strict=True)
+    pairs = zip(frequency.tolist(), amplitude.tolist(), strict=True)
+    seen = [(output.name, f, a) for f, a in pairs]
     return name_lines(seen, log, None, fit.ordinates.spacing)

@@ -77,13 +77,13 @@ def _find_together(
 
 
 def name_lines(
-    seen: Iterable[tuple[str, float, float]], log: Log, stage: Stage | None, resolution: float
+    seen: Sequence[tuple[str, float, float]], log: Log, stage: Stage | None, resolution: float
 ) -> tuple[Line, ...]:
     """Tell what each line is: an order of the velocity, mains, or unknown.
 
     Parameters
     ----------
-    seen : iterable of (str, float, float)
+    seen : sequence of (str, float, float)
         Channel, frequency in Hz and amplitude in m/s² of each; one line may stand there twice.
     log : Log
         Says how fast the stage moved.
@@ -97,6 +97,8 @@ def name_lines(
     tuple of Line
         Ascending in frequency, each line once per channel.
     """
+    if not seen:
+        return ()
     velocities = [segment.velocity for segment in find_segments(log, 0.0)]
     bases = _bases(stage, velocities)
     named = [

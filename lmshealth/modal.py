@@ -25,7 +25,7 @@ from lmshealth.separation import keep_separate
 from lmshealth.spectra import ANY_RESONANCE, Resonances, cross_spectra
 from lmshealth.stage import Stage
 from lmshealth.starts import Target, coarsen, locate, shift_cost
-from lmshealth.targets import choose_channels, choose_targets
+from lmshealth.targets import USABLE, choose_channels, choose_targets
 
 # Modes whose bands touch are fitted together, but never more than this many.
 _MOST_TOGETHER = 4
@@ -39,7 +39,6 @@ _MOST_ROUNDS = 3
 # the top of the band.
 LEAST_RESOLUTION, _LEAST_PERIODS = 2.0, 10.0
 _BEYOND = 4.0  # times the top of the band: more than any found mode's flanks reach
-_TOP = 0.45  # of the sample rate: anti-alias filters reach below Nyquist
 
 
 def identify(
@@ -134,7 +133,7 @@ def _transform(
     reach = (1 + widest) * top if targets else (band or (0.0, np.inf))[1]
     # What is found without a description is fitted beyond the band as well.
     ceiling = reach if targets else _BEYOND * reach
-    needed = _LEAST_PERIODS / min(reach, _TOP * log.sample_rate)
+    needed = _LEAST_PERIODS / min(reach, USABLE * log.sample_rate)
     if targets:
         needed = LEAST_RESOLUTION / min(2 * t.damping_ratio * t.frequency for t in targets)
     segments = find_segments(log, needed)
@@ -175,8 +174,8 @@ def _search(
 ) -> tuple[tuple[Target, ...], list[tuple[str, float, float]]]:
     """Find candidate modes, and lines in the longest segment, in the band."""
     longest = max(s.duration for s in view.spectra)
-    low, high = band or (20 / longest, _TOP * log.sample_rate)
-    low, high = max(low, 2 / longest), min(high, _TOP * log.sample_rate)
+    low, high = band or (20 / longest, USABLE * log.sample_rate)
+    low, high = max(low, 2 / longest), min(high, USABLE * log.sample_rate)
     held = max(0.0, (high - low) * longest)
     if held < 50:
         raise BadLog(
@@ -196,20 +195,23 @@ def _search(
 
 
 def _clusters(targets: tuple[Target, ...]) -> list[tuple[Target, ...]]:
-    """Group targets whose fitting bands overlap."""
+    """Group neighbouring targets that belong together."""
     groups: list[list[Target]] = []
     for target in targets:
-        last = groups[-1][-1] if groups else target
-        close = bool(groups) and target.band(BAND)[0] < last.band(BAND)[1]
-        # Beside a broad resonance a narrow one is a line's business: it would ask for the finest
-        # resolution over all of the band.
-        ratio = (target.frequency * target.damping_ratio) / (last.frequency * last.damping_ratio)
-        close = close and 1 / _ALIKE < ratio < _ALIKE
-        if close and len(groups[-1]) < _MOST_TOGETHER:
-            groups[-1].append(target)
+        last = groups[-1] if groups else []
+        if last and len(last) < _MOST_TOGETHER and _belong_together(last[-1], target):
+            last.append(target)
         else:
             groups.append([target])
     return [tuple(group) for group in groups]
+
+
+def _belong_together(lower: Target, upper: Target) -> bool:
+    """Tell whether the bands of two targets overlap and their bandwidths are alike."""
+    # Beside a broad resonance a narrow one is a line's business: it would ask for the finest
+    # resolution over all of the band.
+    ratio = (upper.frequency * upper.damping_ratio) / (lower.frequency * lower.damping_ratio)
+    return upper.band(BAND)[0] < lower.band(BAND)[1] and 1 / _ALIKE < ratio < _ALIKE
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -15,7 +15,7 @@ from lmshealth.arrays import FloatArray
 from lmshealth.errors import BadLog
 from lmshealth.logs import Log, Refusal
 from lmshealth.results import Modes
-from lmshealth.starts import Target
+from lmshealth.starts import Target, shift_cost
 
 # What a named mode gains over a mode missed and a stranger found, in log likelihood.
 _MATCH = 3.5
@@ -252,9 +252,6 @@ def _cost(
     """Negative log prior of the shifts of ln f."""
     if not pairs:
         return 0.0
-    shift = np.log([found[i][0] / targets[j].frequency for i, j in pairs])
+    shift = np.log([[found[i][0] / targets[j].frequency for i, j in pairs]])
     search = np.array([targets[j].search for _, j in pairs])
-    own = shift - shift.mean()
-    return float(
-        0.5 * (shift.mean() / (search.mean() / 2)) ** 2 + 0.5 * np.sum((own / (search / 6)) ** 2)
-    )
+    return float(shift_cost(shift, search, len(pairs))[0])

@@ -44,15 +44,15 @@ def marginalise(likelihood: Likelihood, p: FloatArray) -> tuple[FloatArray, Floa
     n, layout = 2 * likelihood.layout.n_modes, likelihood.layout
     gradient, hessian = likelihood.derivatives(p)
     try:
-        factor = np.linalg.cholesky(hessian)
+        np.linalg.cholesky(hessian)  # it exists at a maximum alone
     except np.linalg.LinAlgError:
         return p[:n], np.full((n, n), np.nan), np.inf
-    decrement = float(np.sum(np.linalg.solve(factor, gradient) ** 2))
+    cov = np.linalg.inv(hessian)
     # Where the search ended the slope is not quite zero: the normal stands a little further.
-    p = p - np.linalg.solve(hessian, gradient)
+    step = cov @ gradient
+    p, decrement = p - step, float(gradient @ step)
     groups = (layout.shared, layout.common, layout.bends)
     index = np.array([unknown for group in groups for unknown in group], dtype=int)
-    cov = np.linalg.inv(hessian)
     precision = np.linalg.inv(cov[np.ix_(index, index)])
     follow = cov[:n, index] @ precision  # how ln f and ln ζ move with these unknowns
     weight, mean, narrowed = _narrow(p[index], precision, [len(group) for group in groups])

@@ -254,10 +254,7 @@ def _cross_spectrum(
     transforms = np.empty((frequency.size, len(channels)), dtype=complex)
     for c, (x, lag) in enumerate(parts):
         x = x[short - lag : n + short - lag]
-        transforms[:, c] = fft.rfft(_without_trend(x))[1 : frequency.size + 1]
-        if lag:
-            transforms[:, c] *= lag_gain(frequency, lag, sample_rate)
-    transforms *= np.sqrt(2 / (n * sample_rate))
+        transforms[:, c] = _transform(x, lag, frequency, sample_rate)
     spared = np.any([r.like_lines(frequency, n / sample_rate) for r in resonances], axis=0)
     transforms, free, tones = remove_tones(transforms, n / sample_rate, spared)
     step = sample_rate / n
@@ -349,16 +346,21 @@ def periodogram(
         displacement up to four times ``top`` if that is lower.
     """
     x, lag = as_acceleration(channel, segment, sample_rate, top)
-    n = x.size
-    x = _without_trend(x)
     if lag:
         ceiling = min(ceiling, 4 * top)
-    frequency = _frequencies(n, sample_rate, ceiling)
-    transform = fft.rfft(x)[1 : frequency.size + 1]
-    power = 2 / (n * sample_rate) * (transform.real**2 + transform.imag**2)
+    frequency = _frequencies(x.size, sample_rate, ceiling)
+    transform = _transform(x, lag, frequency, sample_rate)
+    power = transform.real**2 + transform.imag**2
+    return Spectrum(frequency, power, x.size / sample_rate, segment.velocity)
+
+
+def _transform(x: FloatArray, lag: int, frequency: FloatArray, sample_rate: float) -> ComplexArray:
+    """Transform what `as_acceleration` gives; the squared magnitude is the periodogram."""
+    transform: ComplexArray = fft.rfft(_without_trend(x))[1 : frequency.size + 1]
+    transform *= np.sqrt(2 / (x.size * sample_rate))
     if lag:
-        power = power * lag_gain(frequency, lag, sample_rate) ** 2
-    return Spectrum(frequency, power, n / sample_rate, segment.velocity)
+        transform *= lag_gain(frequency, lag, sample_rate)
+    return transform
 
 
 def _without_trend(x: FloatArray) -> FloatArray:

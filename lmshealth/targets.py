@@ -1,4 +1,4 @@
-"""What is asked of a log: of which channels, and which modes of a description."""
+"""What is asked of a log: which channels and modes, how far up, and how surely."""
 
 from __future__ import annotations
 
@@ -10,6 +10,10 @@ from lmshealth.errors import BadLog, BadStage
 from lmshealth.logs import Channel, Log
 from lmshealth.stage import Stage
 from lmshealth.starts import Target
+
+USABLE = 0.45  # of the sample rate: anti-alias filters reach below Nyquist
+# Standard deviations of ln f and ln ζ beyond which an estimate is not reported.
+WORST_STD_LN_F, WORST_STD_LN_ZETA = 0.03, 0.7
 
 
 def choose_channels(log: Log, names: Sequence[str] | None = None) -> tuple[Channel, ...]:
