@@ -173,19 +173,9 @@ def fit_band(
         expected = _expected(band, solution)
         if not mask_lines(band, expected):
             break
-    fit = _conclude(band, seen, solution, missing)
+    fit = _conclude(band, seen, solution, expected, gains, missing)
     if fit is None:
         return None, missing
-    clarity = np.array([gains[target.name] for target in seen])
-    residual = _residual(band, expected)
-    fit = replace(
-        fit,
-        clarity=clarity,
-        lines=find_sightings(band),
-        residual=residual,
-        dispersion=_dispersion(residual, *np.exp(fit.estimate).reshape(2, -1)),
-    )
-    fit = replace(fit, flags=tuple(_flags(fit, i) for i in range(len(seen))))
     return _keep_credible(fit, band.unit, missing), missing
 
 
@@ -322,17 +312,26 @@ def _expected(band: Band, solution: _Solution) -> list[ComplexArray]:
 
 
 def _conclude(
-    band: Band, seen: tuple[Target, ...], solution: _Solution, missing: Missing
+    band: Band,
+    seen: tuple[Target, ...],
+    solution: _Solution,
+    expected: list[ComplexArray],
+    gains: dict[str, float],
+    missing: Missing,
 ) -> BandFit | None:
-    """Turn the posterior into estimates with their covariance."""
-    m, p, likelihood = len(seen), solution.p, solution.likelihood
+    """Turn the posterior into estimates with their covariance, and look at what is left over."""
+    p, likelihood = solution.p, solution.likelihood
     estimate, cov, decrement = marginalise(likelihood, p)
     if not decrement < _WORST_DECREMENT:
         detail = f"the fit did not reach a maximum (decrement {decrement:.2g}); record longer"
         missing.update({t.name: ("not-identified", detail) for t in seen})
         return None
+    f, zeta = np.exp(estimate).reshape(2, -1)
     ratio = likelihood.signal_to_noise(p)
     names = band.view.channels
+    residual = _residual(band, expected)
+    dispersion = _dispersion(residual, f, zeta)
+    modes = zip(seen, f.tolist(), zeta.tolist(), dispersion.tolist(), strict=True)
     return BandFit(
         view=band.view,
         targets=seen,
@@ -340,12 +339,12 @@ def _conclude(
         cov=cov,
         shapes=likelihood.shapes(p),
         snr=ratio.sum(axis=0),
-        dispersion=np.full(m, np.nan),
-        flags=("",) * m,
+        dispersion=dispersion,
+        flags=tuple(_flags(*mode, residual.duration) for mode in modes),
         best=tuple(names[c] for c in ratio.argmax(axis=0)),
-        clarity=np.full(m, np.nan),
-        lines=(),
-        residual=band.view.spectra[0].channel(0),
+        clarity=np.array([gains[target.name] for target in seen]),
+        lines=find_sightings(band),
+        residual=residual,
     )
 
 
@@ -369,17 +368,14 @@ def _dispersion(residual: Spectrum, f: FloatArray, zeta: FloatArray) -> FloatArr
     return np.where(n >= _LEAST_TO_COMPARE, near @ left / n.clip(1), np.nan)
 
 
-def _flags(fit: BandFit, i: int) -> str:
-    """Name what to bear in mind of a mode."""
-    m, target = len(fit.targets), fit.targets[i]
-    f, zeta = np.exp(fit.estimate[[i, m + i]]).tolist()
-    duration = fit.view.spectra[index_of_most(fit.view.spectra)].duration
+def _flags(target: Target, f: float, zeta: float, dispersion: float, duration: float) -> str:
+    """Name what to bear in mind of a mode in segments of this duration."""
     shift = abs(np.log(f / (target.nominal or target.frequency))) / np.log1p(target.search)
     low, high = _damping_span(target)
     flags = {
         "resolution-limited": 2 * zeta * f * duration < _RESOLVED,
         "at-bound": shift > _AT_BOUND or not low / _AT_BOUND < zeta < high * _AT_BOUND,
-        "loose-fit": bool(fit.dispersion[i] > _LOOSE),
+        "loose-fit": dispersion > _LOOSE,
     }
     return " ".join(name for name, raised in flags.items() if raised)
 

@@ -1,4 +1,8 @@
-"""Likelihoods of bands with known truth: three modes in up to four channels, white floors."""
+"""Bands with known truth.
+
+Likelihoods of three modes in up to four channels with white floors; records of two modes and their
+fit.
+"""
 
 from __future__ import annotations
 
@@ -8,12 +12,16 @@ from itertools import product
 
 import numpy as np
 
+from lmshealth.band import View
+from lmshealth.bandfit import BandFit, fit_band
 from lmshealth.blocks import Block, make_block
 from lmshealth.layout import lay_out
-from lmshealth.spectra import CrossSpectrum
+from lmshealth.segments import Segment
+from lmshealth.spectra import CrossSpectrum, cross_spectra
+from lmshealth.starts import Coarse, Target, coarsen
 from lmshealth.whittle import Likelihood
 from tests.oracles import channel_covariance
-from tests.signals import Mode
+from tests.signals import Mode, accelerations, make_log
 
 SHAPES = ((1.0, 0.4, -0.3, 0.2), (0.3, 1.0, 0.5, -0.6), (-0.4, 0.2, 1.0, 0.3))
 MODES = tuple(
@@ -24,6 +32,9 @@ MODES = tuple(
 )
 NOISE = 0.5
 BAND = (80.0, 170.0)
+# Of records of two modes, and what is sought in them.
+RATE = 1000.0
+ROLL, PITCH = Target("roll", 105.0, 0.015, 0.15), Target("pitch", 125.0, 0.02, 0.15)
 
 
 def flat_point(modes: Sequence[Mode], n_channels: int, noise: float = NOISE) -> np.ndarray:
@@ -135,3 +146,37 @@ def scatter_free(
     empty = block_of([spectrum_of(np.tile(np.eye(n) + 0j, (f.size, 1, 1)), duration, count)])
     (expected,) = replace(truth, blocks=(empty,)).expected(truth.start)
     return replace(truth, blocks=(replace(empty, matrix=expected),))
+
+
+def view_of(channels: np.ndarray) -> tuple[View, tuple[Coarse, ...]]:
+    """Transform accelerometers, and bin them around the modes of these tests."""
+    rows = np.atleast_2d(channels)
+    made = make_log({f"acc_{k}": row for k, row in enumerate(rows)}, RATE).channels
+    view = View(
+        tuple(channel.name for channel in made),
+        ("acc",) * len(made),
+        cross_spectra(made, [Segment(0, rows.shape[1], float("nan"))], RATE, 200.0),
+    )
+    return view, tuple(coarsen(view.single(c), 75.0, 165.0, 0.8) for c in range(len(made)))
+
+
+def fit(
+    channels: np.ndarray, targets: Sequence[Target]
+) -> tuple[BandFit | None, dict[str, tuple[str, str]]]:
+    """Fit targets to the samples of accelerometers."""
+    view, coarse = view_of(channels)
+    return fit_band(view, coarse, tuple(targets))
+
+
+def found(channels: np.ndarray, targets: Sequence[Target] = (ROLL, PITCH)) -> BandFit:
+    """Fit targets of which all must be found."""
+    result, missing = fit(channels, targets)
+    assert result is not None
+    assert missing == {}
+    return result
+
+
+def both(seed: int = 1, n: int = 60_000, noise: float = 0.5, psd: float = 1.0) -> np.ndarray:
+    """Give two channels that show both modes, each of them one better."""
+    modes = [Mode(105.0, 0.015, psd, (1.0, -0.3)), Mode(125.0, 0.02, psd, (0.4, 1.0))]
+    return accelerations(np.random.default_rng(seed), modes, n, RATE, noise)

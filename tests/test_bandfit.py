@@ -12,46 +12,11 @@ from lmshealth.band import View
 from lmshealth.bandfit import BandFit, _dispersion, _flags, fit_band
 from lmshealth.segments import Segment
 from lmshealth.spectra import CrossSpectrum, Spectrum, cross_spectra
-from lmshealth.starts import Coarse, Target, coarsen
+from lmshealth.starts import Target, coarsen
+from tests.bands import PITCH, RATE, ROLL, both, fit, found, view_of
 from tests.signals import Mode, accelerations, displacements, make_log, sine, white
 
-RATE = 1000.0
-ROLL, PITCH = Target("roll", 105.0, 0.015, 0.15), Target("pitch", 125.0, 0.02, 0.15)
 TRUTH = np.log([105.0, 125.0, 0.015, 0.02])
-
-
-def view_of(channels: np.ndarray) -> tuple[View, tuple[Coarse, ...]]:
-    """Transform accelerometers, and bin them around the modes of these tests."""
-    rows = np.atleast_2d(channels)
-    made = make_log({f"acc_{k}": row for k, row in enumerate(rows)}, RATE).channels
-    view = View(
-        tuple(channel.name for channel in made),
-        ("acc",) * len(made),
-        cross_spectra(made, [Segment(0, rows.shape[1], float("nan"))], RATE, 200.0),
-    )
-    return view, tuple(coarsen(view.single(c), 75.0, 165.0, 0.8) for c in range(len(made)))
-
-
-def fit(
-    channels: np.ndarray, targets: Sequence[Target]
-) -> tuple[BandFit | None, dict[str, tuple[str, str]]]:
-    """Fit targets to the samples of accelerometers."""
-    view, coarse = view_of(channels)
-    return fit_band(view, coarse, tuple(targets))
-
-
-def found(channels: np.ndarray, targets: Sequence[Target] = (ROLL, PITCH)) -> BandFit:
-    """Fit targets of which all must be found."""
-    result, missing = fit(channels, targets)
-    assert result is not None
-    assert missing == {}
-    return result
-
-
-def both(seed: int = 1, n: int = 60_000, noise: float = 0.5, psd: float = 1.0) -> np.ndarray:
-    """Give two channels that show both modes, each of them one better."""
-    modes = [Mode(105.0, 0.015, psd, (1.0, -0.3)), Mode(125.0, 0.02, psd, (0.4, 1.0))]
-    return accelerations(np.random.default_rng(seed), modes, n, RATE, noise)
 
 
 def off(result: BandFit, truth: np.ndarray = TRUTH) -> np.ndarray:
@@ -435,7 +400,12 @@ def test_too_few_ordinates_tell_no_dispersion() -> None:
 
 def flags(result: BandFit) -> list[list[str]]:
     """List the flags of both modes."""
-    return [_flags(result, i).split() for i in range(2)]
+    values = zip(*np.exp(result.estimate).reshape(2, -1), result.dispersion, strict=True)
+    (duration,) = (spectrum.duration for spectrum in result.view.spectra)
+    return [
+        _flags(target, *value, duration).split()
+        for target, value in zip(result.targets, values, strict=True)
+    ]
 
 
 def test_a_good_fit_has_no_flags() -> None:

@@ -10,10 +10,8 @@ import pytest
 from lmshealth.bandfit import BandFit
 from lmshealth.modal import identify
 from lmshealth.separation import keep_separate
+from tests.bands import RATE, both, found
 from tests.signals import Mode, acceleration_log, make_stage
-from tests.test_bandfit import both, found
-
-RATE = 1000.0
 
 
 def brought_to(apart: float, fit: BandFit, shapes: list[list[float]]) -> BandFit:
