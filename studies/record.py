@@ -13,6 +13,8 @@ from typing import Any
 
 from scipy.stats import beta
 
+# How often intervals claim to hold the truth, and how sure the judgement of that is.
+NOMINAL, LEVEL = 0.95, 0.999
 _PACKAGES = ("lmshealth", "numpy", "scipy", "emcee", "filterpy")
 
 
@@ -51,3 +53,10 @@ def clopper_pearson(hits: int, trials: int, level: float = 0.95) -> tuple[float,
     low = float(beta.ppf(tail, hits, trials - hits + 1)) if hits else 0.0
     high = float(beta.ppf(1 - tail, hits + 1, trials - hits)) if hits < trials else 1.0
     return low, high
+
+
+def judge_coverage(hits: int, n: int) -> dict[str, Any]:
+    """Tell how often intervals hold the truth, and whether that may be as often as they claim."""
+    low, high = clopper_pearson(hits, n, LEVEL)
+    return {"hits": hits, "n": n, "share": hits / n, "low": low, "high": high,
+            "holds": low <= NOMINAL <= high}  # fmt: skip

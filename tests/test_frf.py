@@ -21,6 +21,8 @@ from models.stages import stage_named
 from models.sweep import Sweep, record_sweep, without_loop
 from studies.frf_modes.records import (
     BAND,
+    BENCH,
+    GUIDE,
     MAPS,
     MODES,
     RATE,
@@ -33,8 +35,6 @@ from studies.frf_modes.run import scatter_over_periods
 from tests.signals import make_log
 
 SIZE = 1600
-LSB = ("lsb250_linear_guide/open/exp1.mat", "lsb250_linear_guide/open/exp2.mat")
-BENCH = "fditools_two_inertia_bench/open/MultisineTypeA.mat"
 
 
 def driven(
@@ -360,7 +360,7 @@ def test_two_encoders_and_experiments_of_a_linear_guide_agree(
 ) -> None:
     """Friction moves the resonance by 0.3 Hz between experiments: it is within what is stated."""
     found = []
-    for name in LSB:
+    for name in GUIDE:
         log = bench(name)
         for output in ("delta_e_motor", "delta_e_load"):
             # The table that is played is 4999 samples long, whatever its author calls 5 s.

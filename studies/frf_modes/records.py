@@ -11,6 +11,8 @@ from typing import Any
 
 import numpy as np
 
+from studies.read_throughput import samples
+
 Array = np.ndarray[Any, Any]
 
 RATE = 400.0
@@ -96,10 +98,12 @@ def at_random(rng: np.random.Generator, machine: Machine, size: int) -> tuple[Ar
     return machine.noise(rng, given[:size], answer[:size])
 
 
+GUIDE = ("lsb250_linear_guide/open/exp1.mat", "lsb250_linear_guide/open/exp2.mat")
+BENCH = "fditools_two_inertia_bench/open/MultisineTypeA.mat"
 # What a user would write to read two real benches: a voltage stands where the contract has a
 # current, angles stand where it has lengths; modes do not depend on units.
 MAPS = {
-    "lsb250_linear_guide/open/exp1.mat": """
+    GUIDE[0]: """
 [columns]
 time_s = "X.Data"
 delta_e_motor_mm = "Y(1).Data"
@@ -110,18 +114,6 @@ current_input = 1.0
 [mat]
 variable = "exp1"
 """,
-    "fditools_two_inertia_bench/open/MultisineTypeA.mat": """
-[columns]
-time = "time"
-delta_e_motor = "theta_mx"
-delta_e_load = "theta_my"
-current_a = "iq_adx"
-[units]
-time = 1e-6
-delta_e_motor = 1.0
-delta_e_load = 1.0
-""",
+    BENCH: samples.MAPS[BENCH],
 }
-MAPS["lsb250_linear_guide/open/exp2.mat"] = MAPS["lsb250_linear_guide/open/exp1.mat"].replace(
-    "exp1", "exp2"
-)
+MAPS[GUIDE[1]] = MAPS[GUIDE[0]].replace("exp1", "exp2")

@@ -43,10 +43,9 @@ from lmshealth.results import Modes
 from lmshealth.stage import Stage
 from studies.identification.cases import CASES, HEADLINE, Case
 from studies.identification.records import Array, describe
-from studies.record import Stopwatch, clopper_pearson, keep
+from studies.record import NOMINAL, Stopwatch, judge_coverage, keep
 
 HERE = Path(__file__).parent
-NOMINAL, LEVEL = 0.95, 0.999
 FACTOR = 1.5
 CHUNK = 50
 FUSED = "following error and two accelerometers"
@@ -163,18 +162,12 @@ def summarise(case: Case, found: Array) -> Iterator[dict[str, Any]]:
 
 def _coverage(off: Array) -> dict[str, Any]:
     """How often intervals hold the truth, and whether that may be 95 %."""
-    return _held(int(np.sum(np.abs(off) < norm.isf((1 - NOMINAL) / 2))), off.size)
+    return judge_coverage(int(np.sum(np.abs(off) < norm.isf((1 - NOMINAL) / 2))), off.size)
 
 
 def _pooled(coverages: list[dict[str, Any]]) -> dict[str, Any]:
     """Judge coverages of modes and quantities together."""
-    return _held(sum(c["hits"] for c in coverages), sum(c["n"] for c in coverages))
-
-
-def _held(hits: int, n: int) -> dict[str, Any]:
-    low, high = clopper_pearson(hits, n, LEVEL)
-    return {"hits": hits, "n": n, "share": hits / n, "low": low, "high": high,
-            "holds": low <= NOMINAL <= high}  # fmt: skip
+    return judge_coverage(sum(c["hits"] for c in coverages), sum(c["n"] for c in coverages))
 
 
 def verdicts(rows: list[dict[str, Any]], *, quick: bool) -> dict[str, bool]:

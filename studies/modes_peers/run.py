@@ -49,7 +49,7 @@ from scipy.stats import norm
 from studies.identification.cases import CASES, Case
 from studies.identification.records import Array
 from studies.modes_peers.memory import peak_of
-from studies.record import Stopwatch, clopper_pearson, keep
+from studies.record import NOMINAL, Stopwatch, judge_coverage, keep
 
 HERE = Path(__file__).parent
 PACKAGES = {"pyoma2": "pyOMA-2", "pyOMA": "pyoma-toolbox"}
@@ -59,7 +59,7 @@ NAMES = (
     "two modes 3 bandwidths apart",
 )
 SEEDS, QUICK_SEEDS = 40, 8
-NOMINAL, LEVEL, NARROWER = 0.95, 0.999, 1.5
+NARROWER = 1.5
 CLEAR = 3.0
 # An order that misses more of the modes than this is not taken.
 MOST_MISSED = 0.05
@@ -214,9 +214,7 @@ def coverage(off: Array) -> dict[str, Any]:
         if part.size == 0:
             continue
         hits = int(np.sum(np.abs(part) < norm.isf((1 - NOMINAL) / 2)))
-        low, high = clopper_pearson(hits, part.size, LEVEL)
-        told[quantity] = {"share": hits / part.size, "n": part.size, "low": low, "high": high,
-                          "holds": low <= NOMINAL <= high}  # fmt: skip
+        told[quantity] = judge_coverage(hits, part.size)
     return told
 
 
@@ -235,8 +233,8 @@ def verdicts(cases: list[dict[str, Any]], *, quick: bool) -> dict[str, bool]:
         # One case alone has too few records to tell.
         narrow = [part for case in cases for part in case["control_narrower"].values()]
         n = sum(part["n"] for part in narrow)
-        hits = round(sum(part["share"] * part["n"] for part in narrow))
-        passed["intervals a third less wide fail"] = clopper_pearson(hits, n, LEVEL)[1] < NOMINAL
+        hits = sum(part["hits"] for part in narrow)
+        passed["intervals a third less wide fail"] = judge_coverage(hits, n)["high"] < NOMINAL
     return {name: bool(held) for name, held in passed.items()}
 
 
