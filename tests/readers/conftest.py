@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import gzip
+import subprocess
+import sys
 import warnings
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -111,3 +113,19 @@ def make(tmp_path: Path) -> Writer:
         )
 
     return make
+
+
+@pytest.fixture
+def peaks(root: Path) -> Callable[[Path, Path], tuple[int, int]]:
+    """Measure the bytes of memory that a file takes, in blocks and by the bare library.
+
+    A short one of its kind is read before, so that what is set up once does not count.
+    """
+
+    def peaks(short: Path, path: Path) -> tuple[int, int]:
+        command = [sys.executable, "-W", "ignore", "tests/readers/peak.py", str(short), str(path)]
+        done = subprocess.run(command, capture_output=True, text=True, check=True, cwd=root)
+        own, bare = (int(word) for word in done.stdout.split())
+        return own, bare
+
+    return peaks

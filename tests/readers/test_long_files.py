@@ -1,8 +1,6 @@
 """Files of many minutes take no more memory than a few minutes, and lose nothing."""
 
 import os
-import subprocess
-import sys
 
 import numpy as np
 import pytest
@@ -66,7 +64,7 @@ CASES = {
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_long_file(tmp_path, root, name):
+def test_long_file(tmp_path, peaks, name):
     """All samples are read, in less memory than four minutes of them; the library needs more."""
     write, options = CASES[name]
     n = LONG_RECORD if name.endswith(".uff") else LONG
@@ -79,9 +77,7 @@ def test_long_file(tmp_path, root, name):
     whole = pattern(n)
     for start, block in blocks(samples):
         np.testing.assert_array_equal(block, whole[start : start + block.size])
-    command = [sys.executable, "-W", "ignore", "tests/readers/peak.py", str(short), str(path)]
-    done = subprocess.run(command, capture_output=True, text=True, check=True, cwd=root)
-    own, bare = (int(word) for word in done.stdout.split())
+    own, bare = peaks(short, path)
     allowed = 4 * 8 * MINUTE * len(columns)
     assert own < allowed < bare, (own, bare)
 

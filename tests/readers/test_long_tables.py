@@ -1,8 +1,6 @@
 """Tables of many minutes take no more memory than a few minutes, and lose nothing."""
 
 import gzip
-import subprocess
-import sys
 
 import h5py
 import numpy as np
@@ -55,7 +53,7 @@ CASES = {
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_long_table(tmp_path, root, name):
+def test_long_table(tmp_path, peaks, name):
     """All samples are read, in less memory than four minutes of them; the library needs more."""
     path, short = tmp_path / name, tmp_path / f"short_{name}"
     n_periods = MINUTES[path.suffix] * MINUTE // PERIOD + 1
@@ -68,8 +66,6 @@ def test_long_table(tmp_path, root, name):
         whole = np.tile(pattern(column), n_periods)
         for start, block in blocks(samples):
             np.testing.assert_array_equal(block, whole[start : start + block.size])
-    command = [sys.executable, "-W", "ignore", "tests/readers/peak.py", str(short), str(path)]
-    done = subprocess.run(command, capture_output=True, text=True, check=True, cwd=root)
-    own, bare = (int(word) for word in done.stdout.split())
+    own, bare = peaks(short, path)
     allowed = 4 * 8 * MINUTE * len(columns)
     assert own < allowed < bare, (own, bare)
