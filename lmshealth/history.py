@@ -11,8 +11,9 @@ import numpy as np
 from lmshealth.arrays import FloatArray
 from lmshealth.errors import NotEnoughData
 from lmshealth.logs import Metadata, Refusal
-from lmshealth.results import History, Modes
+from lmshealth.results import Modes
 from lmshealth.stage import Stage
+from lmshealth.tracks import History
 
 # Between two logs ln f moves by temperature and wear, but not by more than this.
 _JUMP = 0.02

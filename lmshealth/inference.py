@@ -16,9 +16,10 @@ import numpy as np
 
 from lmshealth.arrays import FloatArray
 from lmshealth.errors import BadStage, NotConverged, NotEnoughData
-from lmshealth.results import Health, Track
+from lmshealth.results import Health
 from lmshealth.sampling import sample, stream
 from lmshealth.stage import Stage
+from lmshealth.tracks import Track
 
 _N_KEPT = 4000
 _PRIOR_DRAWS = 20_000

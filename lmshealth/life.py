@@ -26,8 +26,8 @@ from scipy.special import logsumexp, softmax
 from lmshealth.arrays import FloatArray
 from lmshealth.errors import NotEnoughData
 from lmshealth.inference import one_at_a_time
-from lmshealth.results import History
 from lmshealth.stage import ParameterSpec, Stage
+from lmshealth.tracks import History
 
 _INTERCEPT_STD = 0.1
 # Random walk of ln f over the history, and factor on the reported standard deviations, with priors.

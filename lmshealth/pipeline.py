@@ -22,12 +22,13 @@ from lmshealth.modal import identify
 from lmshealth.prognosis import prognose
 from lmshealth.readers import content_digest, find_logs, read_log, read_manifest, require_identity
 from lmshealth.report import write_report
-from lmshealth.results import Health, History, Prognosis, Track
+from lmshealth.results import Health, Prognosis
 from lmshealth.stage import Stage
 from lmshealth.store import Store, beside, result_key
 from lmshealth.summary import Assessment, judge
 from lmshealth.tables import all_tables
 from lmshealth.tracking import track
+from lmshealth.tracks import History, Track
 
 Progress = Callable[[str, int, int], None]
 """Called with what is being done, how much is done, and how much there is."""

@@ -15,7 +15,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from lmshealth.arrays import FloatArray
-from lmshealth.results import Health, History, Prognosis, Track
+from lmshealth.results import Health, Prognosis
+from lmshealth.tracks import History, Track
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -9,9 +9,10 @@ import numpy as np
 from lmshealth.arrays import FloatArray
 from lmshealth.errors import BadStage, NotEnoughData
 from lmshealth.life import LifeLikelihood, limited
-from lmshealth.results import History, Prognosis
+from lmshealth.results import Prognosis
 from lmshealth.sampling import find_start, sample, stream
 from lmshealth.stage import Stage
+from lmshealth.tracks import History
 
 _STEP = 1 << 20  # far from the epochs that health counts its streams by
 _N_DRAWS = 10_000

@@ -21,9 +21,10 @@ import numpy as np
 from lmshealth import plots
 from lmshealth.arrays import FloatArray
 from lmshealth.logs import Refusal
-from lmshealth.results import Effect, Health, History, Prognosis, Track
+from lmshealth.results import Health, Prognosis
 from lmshealth.stage import ParameterSpec
 from lmshealth.summary import Assessment
+from lmshealth.tracks import Effect, History, Track
 
 _KM = 1000.0
 _GAP = "\u202f"  # narrow space that does not break: between a number and its unit

@@ -108,11 +108,15 @@ class Order(_Part, frozen=True):
 
 
 class Covariate(_Part, frozen=True):
-    """A measured number that moves frequencies without wear."""
+    """A measured number that moves frequencies without wear.
+
+    ``curvature_std`` is the prior standard deviation of what its square does, per unit squared.
+    """
 
     name: str
     reference: float
     prior_std: Positive
+    curvature_std: Annotated[float, Meta(ge=0)] = 0.0
 
 
 class Loop(_Part, frozen=True):

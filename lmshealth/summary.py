@@ -9,8 +9,9 @@ import numpy as np
 
 from lmshealth.arrays import BoolArray
 from lmshealth.logs import Refusal
-from lmshealth.results import Health, History, Judgement, Prognosis, Track, Verdict
+from lmshealth.results import Health, Judgement, Prognosis, Verdict
 from lmshealth.stage import ParameterSpec, Stage
+from lmshealth.tracks import History, Track
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -1,62 +1,30 @@
 """Kalman filter over a machine's life: modes followed with every uncertainty used.
 
-The state of one mode is [ℓ, ℓ̇, ln ζ, ℓ₀, b₁ … b_c]: ln frequency at the covariates' reference, its
-rate, ln damping, an exact copy of ℓ at the baseline, and one coefficient per covariate. The copy
-makes the filter's covariance hold Cov(ℓ, ℓ₀), so that the drift ℓ - ℓ₀ has the right variance and
-the error of the baseline stays common to all epochs. All modes share one filter, because their
-estimates may be correlated.
-
-How much a mode wanders by itself is not known. The filter is run on a grid of process noises and
-averaged by their evidence so far: maximising it instead collapses to zero and makes the tracker
-overconfident.
+All modes share one state space, because their estimates may be correlated, and one bank of
+filters, which averages over what is not known of the process. What happens at once is told from
+drift: steps that maintenance declares are let happen where they did, others are found and let
+happen from then on. No epoch knows of later logs; `smooth` does.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from itertools import product
+from dataclasses import dataclass, field
 
 import numpy as np
-from filterpy.kalman import KalmanFilter
-from scipy.special import softmax
+from scipy import stats
 
 from lmshealth.arrays import FloatArray
+from lmshealth.bank import Bank, Filter
 from lmshealth.errors import NotEnoughData
-from lmshealth.results import Effect, History, Track
-from lmshealth.stage import Covariate, Stage
+from lmshealth.events import MEMORY, Finding, Watch, explain, reborn, threshold
+from lmshealth.stage import Stage
+from lmshealth.statespace import JUMP_STD, MOVES, StateSpace, state_space
+from lmshealth.tracks import Effect, Event, History, Step, Track
 
-_LEVEL, _RATE, _DAMPING, _BASE = range(4)
-_N_OWN = 4
-
-# Priors. Rates and process noises are per length of the history: what a mode does in a life.
-_LN_F_STD = 0.1
-_LN_ZETA_STD = 1.0
-_RATE_STD = 0.3
-_DAMPING_WALK = 0.3
-_UNKNOWN_COVARIATE_STD = 0.001
-# Grids averaged over: random walk of ln f and of its rate over the history, factor on R's std.
-_LEVEL_WALKS = (1e-5, 3e-4, 1e-3, 3e-3, 1e-2)
-_RATE_WALKS = (1e-3, 3e-2, 1e-1, 3e-1)
-_NOISE_SCALES = (1.0, 1.5, 2.25)
-_NOISE_SCALE_PRIOR = (0.9, 0.07, 0.03)
-
-
-@dataclass(frozen=True, slots=True)
-class _Setting:
-    level_walk: float
-    rate_walk: float
-    noise_scale: float
-    log_prior: float
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Run:
-    """Filtered states of one setting: shapes (n, d), (n, d, d), (n,), (n,)."""
-
-    mean: FloatArray
-    cov: FloatArray
-    log_evidence: FloatArray
-    nis: FloatArray
+# Innovations further out are hardly believed before the next log is there.
+_FAR = 6.0
+# A filter is widened once its innovations are less probable than that.
+_WIDEN = 5e-4
 
 
 def track(history: History, stage: Stage | None = None) -> Track:
@@ -67,7 +35,8 @@ def track(history: History, stage: Stage | None = None) -> Track:
     history : History
         Modal estimates with covariance; missing ones are NaN.
     stage : Stage, optional
-        Its covariates are regressed out. Without it every covariate present is, about its median.
+        Its covariates are regressed out, and rates are counted per its horizon. Without it every
+        covariate present is, about its median, and rates are counted per length of the history.
 
     Returns
     -------
@@ -78,193 +47,340 @@ def track(history: History, stage: Stage | None = None) -> Track:
     ------
     NotEnoughData
         If there is no estimate at all.
+
+    References
+    ----------
+    BarShalom2001.
     """
     if not np.isfinite(history.ln_frequency).any():
         raise NotEnoughData(f"{history.stage}: no modal estimate in {len(history.logs)} logs")
-    covariates = _covariates(history, stage)
-    problem = _Problem(history, covariates)
-    settings = [
-        _Setting(level, rate, scale, float(np.log(prior)))
-        for level, rate, (scale, prior) in product(
-            _LEVEL_WALKS, _RATE_WALKS, zip(_NOISE_SCALES, _NOISE_SCALE_PRIOR, strict=True)
-        )
-    ]
-    return _average(problem, settings, [problem.run(setting) for setting in settings])
+    return _Follower(history, state_space(history, stage, history.steps)).follow()
 
 
-def _covariates(history: History, stage: Stage | None) -> tuple[Covariate, ...]:
-    """Covariates that are asked for and known in at least one log."""
-    if stage is not None:
-        wanted = stage.description.covariate
-    else:
-        wanted = tuple(
-            Covariate(name, float(np.nanmedian(values)), _UNKNOWN_COVARIATE_STD)
-            for name, values in history.covariates.items()
-            if np.isfinite(values).any()
-        )
-    return tuple(
-        covariate
-        for covariate in wanted
-        if covariate.name in history.covariates
-        and np.isfinite(history.covariates[covariate.name]).any()
-    )
+@dataclass(slots=True, eq=False)
+class _Record:
+    """What is published of every epoch."""
+
+    mean: FloatArray
+    cov: FloatArray
+    nis: FloatArray
+    scale: FloatArray
 
 
-class _Problem:
-    """What all settings share: measurements, their matrices, and the prior."""
+@dataclass(slots=True, eq=False)
+class _Found:
+    """Events, and steps that were found, as they come."""
 
-    def __init__(self, history: History, covariates: tuple[Covariate, ...]) -> None:
+    events: list[Event] = field(default_factory=list)
+    findings: dict[int, tuple[Finding, int]] = field(default_factory=dict)
+    alarmed: bool = False
+    tested: tuple[int, int] = (-1, -1)
+
+
+class _Follower:
+    """Takes a bank of filters through a history, and starts new chapters where something happened.
+
+    A chapter begins where a step does: the state stays, the settings start anew.
+    """
+
+    def __init__(self, history: History, space: StateSpace) -> None:
         self.history = history
-        self.covariates = covariates
-        self.n_modes = len(history.modes)
-        self.size = _N_OWN + len(covariates)
-        self.clock = history.clock()
-        self.span = max(float(np.ptp(self.clock)), 1e-9)
-        self.offset = np.zeros((len(history.logs), len(covariates)))
-        # What an unknown covariate adds to the variance of ln f.
-        self.unknown = np.zeros(len(history.logs))
-        for k, covariate in enumerate(covariates):
-            values = history.covariates[covariate.name]
-            known = np.isfinite(values)
-            spread = max(float(np.std(values[known])), 1.0)
-            self.offset[:, k] = np.where(known, values - covariate.reference, 0.0)
-            self.unknown += np.where(known, 0.0, (covariate.prior_std * spread) ** 2)
+        self.filters = Filter(space, history.baselines)
+        self.resets = {step.first for step in history.steps if step.kind == "reset"}
+        n, rows = len(history.logs), 2 * len(history.series)
+        size = 4 * len(history.modes)
+        self.record = _Record(
+            np.empty((n, size)),
+            np.empty((n, size, size)),
+            np.zeros(n),
+            np.ones((n, len(self.filters.sources))),
+        )
+        self.watch = Watch(n, rows)
+        self.memory: dict[int, Bank] = {}
+        # Rows of a log that are taken for outliers, until an event explains them.
+        self.doubted: dict[int, np.ndarray] = {}
+        self.found = _Found()
 
-    def index(self, part: int) -> np.ndarray:
-        """Positions of one part of the state of every mode, shape ``(n_modes,)``."""
-        return part + self.size * np.arange(self.n_modes)
+    def follow(self) -> Track:
+        """Filter log by log."""
+        bank = self.filters.start()
+        for k in range(len(self.history.logs)):
+            if k in self.resets and k:
+                bank = reborn(bank, self.filters)
+                self.watch.first = k
+                self.found.alarmed = False
+            bank = self._step(bank, k, doubting=k not in self.resets)
+            bank = self._look_for_events(bank, k)
+            self._publish(bank, k)
+        return self._result(bank)
 
-    def prior(self) -> tuple[FloatArray, FloatArray]:
-        """Mean and covariance before the first log; the centre is each mode's first estimate."""
-        mean = np.zeros(self.size * self.n_modes)
-        std = np.zeros_like(mean)
-        for values, part, width in (
-            (self.history.ln_frequency, _LEVEL, _LN_F_STD),
-            (self.history.ln_damping, _DAMPING, _LN_ZETA_STD),
-        ):
-            first = np.argmax(np.isfinite(values), axis=0)
-            mean[self.index(part)] = np.nan_to_num(values[first, np.arange(self.n_modes)])
-            std[self.index(part)] = width
-        std[self.index(_RATE)] = _RATE_STD / self.span
-        for k, covariate in enumerate(self.covariates):
-            std[self.index(_N_OWN + k)] = covariate.prior_std
-        return mean, np.diag(std**2)
+    def _step(self, bank: Bank, k: int, *, doubting: bool = True) -> Bank:
+        """Take the bank over one log and remember it.
 
-    def transition(self, step: float, setting: _Setting) -> tuple[FloatArray, FloatArray]:
-        """Transition matrix and process noise over so many metres."""
-        size = self.size * self.n_modes
-        move, noise = np.eye(size), np.zeros((size, size))
-        level, rate, damping = (self.index(part) for part in (_LEVEL, _RATE, _DAMPING))
-        move[level, rate] = step
-        walk = setting.level_walk**2 / self.span
-        bend = (setting.rate_walk / self.span) ** 2 / self.span
-        noise[level, level] = walk * step + bend * step**3 / 3
-        noise[level, rate] = noise[rate, level] = bend * step**2 / 2
-        noise[rate, rate] = bend * step
-        noise[damping, damping] = _DAMPING_WALK**2 / self.span * step
-        return move, noise
+        What lies far off is an outlier or the beginning of something. It is hardly believed until
+        the next log tells which; two in a row are believed.
+        """
+        self.filters.move(bank, k)
+        surprise = self.filters.see(bank, k)
+        self.doubted.pop(k, None)
+        far = np.abs(surprise.innovation) > _FAR
+        in_a_row = {k - 1, k - 2} <= self.doubted.keys()
+        if doubting and far.any() and k - 1 in self.memory and not in_a_row:
+            self.doubted[k] = self._of_same_modes(surprise.rows[far])
+            bank = self.memory[k - 1].copy()
+            self.filters.move(bank, k)
+            self.filters.see(bank, k, self.doubted[k])
+        bank = bank.pruned()
+        self.watch.add(k, surprise)
+        self.record.nis[k] = surprise.nis
+        self.memory[k] = bank.copy()
+        self.memory.pop(k - MEMORY, None)
+        return bank
 
-    def measurement(self, k: int, scale: float) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Rows that exist at log k: values, matrix and covariance."""
-        values = np.concatenate([self.history.ln_frequency[k], self.history.ln_damping[k]])
-        rows = np.flatnonzero(np.isfinite(values))
-        matrix = np.zeros((2 * self.n_modes, self.size * self.n_modes))
-        modes = np.arange(self.n_modes)
-        matrix[modes, self.index(_LEVEL)] = 1
-        for j in range(len(self.covariates)):
-            matrix[modes, self.index(_N_OWN + j)] = self.offset[k, j]
-        matrix[self.n_modes + modes, self.index(_DAMPING)] = 1
-        noise = self.history.cov[k] * scale**2
-        noise[modes, modes] += self.unknown[k]
-        return values[rows], matrix[rows], noise[np.ix_(rows, rows)]
+    def _of_same_modes(self, rows: np.ndarray) -> np.ndarray:
+        """Mark all rows of the modes of some rows, shape ``(2 n_series,)``."""
+        mode = np.tile(self.history.mode_of(), 2)
+        return np.isin(mode, mode[rows])
 
-    def copy_baseline(self, kalman: KalmanFilter) -> None:
-        """Make ℓ₀ an exact copy of ℓ."""
-        duplicate = np.eye(self.size * self.n_modes)
-        duplicate[self.index(_BASE)] = duplicate[self.index(_LEVEL)]
-        kalman.x = duplicate @ kalman.x
-        kalman.P = duplicate @ kalman.P @ duplicate.T
+    def _again(self, filters: Filter, bank: Bank, first: int, last: int) -> Bank:
+        """Filter some logs again under another explanation."""
+        for k in range(first, last + 1):
+            filters.move(bank, k)
+            filters.see(bank, k)
+            bank = bank.pruned()
+        return bank
 
-    def run(self, setting: _Setting) -> _Run:
-        """Filter the whole history with one setting."""
-        n, size = len(self.history.logs), self.size * self.n_modes
-        kalman = KalmanFilter(dim_x=size, dim_z=2 * self.n_modes)
-        kalman.x, kalman.P = self.prior()
-        mean, cov = np.empty((n, size)), np.empty((n, size, size))
-        evidence, nis = np.zeros(n), np.zeros(n)
-        for k in range(n):
-            if k:
-                move, noise = self.transition(float(self.clock[k] - self.clock[k - 1]), setting)
-                kalman.predict(F=move, Q=noise)
-            if k == self.history.baseline:
-                self.copy_baseline(kalman)
-            values, matrix, noise = self.measurement(k, setting.noise_scale)
-            if values.size:
-                kalman.update(values, R=noise, H=matrix)
-                # The filter's own log_likelihood costs more than the step itself.
-                nis[k] = kalman.y @ kalman.SI @ kalman.y
-                log_det = np.linalg.slogdet(kalman.S)[1]
-                evidence[k] = -0.5 * (nis[k] + log_det + values.size * np.log(2 * np.pi))
-            mean[k], cov[k] = kalman.x, kalman.P
-        return _Run(mean, cov, np.cumsum(evidence), nis)
+    def _publish(self, bank: Bank, k: int) -> None:
+        record = self.record
+        size = record.mean.shape[1]
+        mean, cov = bank.collapse(size)
+        if k in self.doubted:
+            # As likely the first log after a step: nobody can tell yet, and that is what is said.
+            step = Step("step", k, np.arange(len(self.history.logs)) >= k, declared=False)
+            stepped = Filter(self.filters.space.with_step(step), self.filters.copies)
+            other = self._again(stepped, self.memory[k - 1].padded(stepped.space.size), k, k)
+            moved, spread = other.collapse(size)
+            off = 0.5 * (moved - mean)
+            mean, cov = mean + off, 0.5 * (cov + spread) + np.outer(off, off)
+        record.mean[k], record.cov[k] = mean, cov
+        record.scale[k] = bank.weight @ bank.settings.scales
+
+    def _look_for_events(self, bank: Bank, k: int) -> Bank:
+        """Raise the alarm of a drift, and explain what looks like more than that."""
+        found = self.found
+        suspect = self.watch.suspect(k)
+        evidence = bank.log_bayes_factor()
+        # A single log that leans may be an outlier, or the first after a step: the next one tells.
+        if evidence >= threshold() and (suspect is None or k - suspect > 1):
+            self._alarm(bank, k, evidence)
+        # What was weighed a moment ago is weighed again once there is notably more to it.
+        if suspect is None or self._just_tested(suspect, k):
+            return bank
+        found.tested = (suspect, k)
+        finding = explain(
+            lambda filters, begun, first: self._again(filters, begun, first, k),
+            self.filters,
+            self.memory,
+            k,
+            suspect,
+        )
+        if finding is None or not finding.believed:
+            return bank
+        return self._adopt(finding, bank, k)
+
+    def _just_tested(self, suspect: int, k: int) -> bool:
+        before, when = self.found.tested
+        return abs(before - suspect) <= 2 and k - when < (k - suspect) / 4
+
+    def _adopt(self, finding: Finding, bank: Bank, k: int) -> Bank:
+        """Take what was found for true, from its first log on."""
+        j = finding.first
+        if finding.kind == "drift":
+            if self.found.alarmed or not finding.damage:
+                return bank
+            begun = reborn(self.memory[j - 1], self.filters)
+        else:
+            there = np.arange(len(self.history.logs)) >= j
+            step = Step(finding.kind, j, there, finding.source, declared=False)  # type: ignore[arg-type]
+            self.filters = Filter(self.filters.space.with_step(step), self.history.baselines)
+            self.found.findings[len(self.filters.space.steps) - 1] = (finding, k)
+            size = self.filters.space.size
+            for when, known in self.memory.items():
+                self.memory[when] = known.padded(size)
+            begun = reborn(self.memory[j - 1], self.filters)
+        self.watch.first = j + 1
+        for again in range(j, k + 1):
+            begun = self._step(begun, again, doubting=False)
+        if finding.damage:
+            self._alarm(begun, k, finding.log_bayes_factor)
+        return begun
+
+    def _alarm(self, bank: Bank, k: int, evidence: float) -> None:
+        """Raise the alarm once in every chapter between resets."""
+        if self.found.alarmed:
+            return
+        self.found.alarmed = True
+        mean, cov = bank.collapse(self.record.mean.shape[1])
+        contrast = self.filters.space.drift()
+        drift, std = contrast @ mean, np.sqrt(np.diag(contrast @ cov @ contrast.T))
+        i = int(np.argmax(np.abs(drift) / np.maximum(std, 1e-12)))
+        self.found.events.append(
+            Event(
+                kind="alarm",
+                epoch=k,
+                mode=self.history.modes[i],
+                source="",
+                size=float(drift[i]),
+                std=float(std[i]),
+                evidence=evidence,
+                declared=False,
+                found_at=k,
+            )
+        )
+
+    def _result(self, bank: Bank) -> Track:
+        history, record, space = self.history, self.record, self.filters.space
+        contrast = space.drift()
+        drift = record.mean @ contrast.T
+        drift_cov = np.einsum("mi,kij,nj->kmn", contrast, record.cov, contrast)
+        early = np.arange(len(history.logs)) < history.baselines[0]
+        drift[early], drift_cov[early] = np.nan, np.nan
+        # At a baseline ℓ and ℓ₀ are the same; rounding must not make an epoch of it.
+        clock = history.clock()
+        for first in history.baselines:
+            still = (clock == clock[first]) & (np.arange(clock.size) >= first)
+            drift[still], drift_cov[still] = 0.0, 0.0
+        dof = _surprising(history)
+        widening = _widening(record.nis, dof, self.watch.innovations)
+        std = np.sqrt(np.einsum("kii->ki", record.cov)) * widening[:, None]
+        return Track(
+            stage=history.stage,
+            logs=history.logs,
+            recorded_at=history.recorded_at,
+            travel=history.travel,
+            modes=history.modes,
+            sources=self.filters.sources,
+            ln_frequency=record.mean[:, space.level],
+            ln_frequency_std=std[:, space.level],
+            ln_damping=record.mean[:, space.damping],
+            ln_damping_std=std[:, space.damping],
+            drift=drift,
+            drift_cov=drift_cov * widening[:, None, None] ** 2,
+            effects=_effects(space, bank, self.filters.sources),
+            events=tuple(
+                sorted([*self.found.events, *self._events(bank)], key=lambda event: event.epoch)
+            ),
+            steps=space.steps,
+            nis=record.nis,
+            nis_dof=dof,
+            outliers=tuple(
+                (k, mode)
+                for k, rows in sorted(self.doubted.items())
+                for i, mode in enumerate(history.modes)
+                if rows[: len(history.series)][history.mode_of() == i].any()
+            ),
+            innovations=self.watch.innovations,
+            noise_scale=record.scale,
+            widening=widening,
+        )
+
+    def _events(self, bank: Bank) -> list[Event]:
+        """Tell the steps, found and declared, mode by mode."""
+        space, m = self.filters.space, len(self.history.modes)
+        mean, cov = bank.collapse()
+        events: list[Event] = []
+        for j, step in enumerate(space.steps):
+            if step.kind == "reset":
+                continue
+            jump = space.jump(j)
+            # Of grease the damping, of all else the frequency.
+            own = slice(jump.start, jump.start + m)
+            if step.kind == "regreasing":
+                own = slice(jump.start + m, jump.stop)
+            size, spread = mean[own], cov[own, own]
+            finding, found_at = self.found.findings.get(j, (None, step.first))
+            evidence = finding.log_bayes_factor if finding else _evidence(space, step, size, spread)
+            events += [
+                Event(
+                    kind=step.kind,
+                    epoch=step.first,
+                    mode=mode,
+                    source=step.source,
+                    size=float(size[i]),
+                    std=float(np.sqrt(max(spread[i, i], 0.0))),
+                    evidence=evidence,
+                    declared=step.declared,
+                    found_at=found_at,
+                )
+                for i, mode in enumerate(self.history.modes)
+            ]
+        return events
 
 
-def _average(problem: _Problem, settings: list[_Setting], runs: list[_Run]) -> Track:
-    """Average the runs by their evidence up to each epoch."""
-    history = problem.history
-    prior = np.array([setting.log_prior for setting in settings])
-    evidence = np.stack([run.log_evidence for run in runs]) + prior[:, None]
-    weight = softmax(evidence, axis=0)
-    # An innovation is judged by what was believed before it.
-    before = softmax(np.column_stack([prior, evidence[:, :-1]]), axis=0)
-    mean = np.einsum("gk,gki->ki", weight, [run.mean for run in runs])
-    cov = np.einsum("gk,gkij->kij", weight, [run.cov for run in runs])
-    for g, run in enumerate(runs):
-        off = run.mean - mean
-        cov += weight[g][:, None, None] * off[:, :, None] * off[:, None, :]
-    level, base = problem.index(_LEVEL), problem.index(_BASE)
-    contrast = np.zeros((problem.n_modes, mean.shape[1]))
-    modes = np.arange(problem.n_modes)
-    contrast[modes, level] = 1
-    contrast[modes, base] = -1
-    drift = mean @ contrast.T
-    drift_cov = np.einsum("mi,kij,nj->kmn", contrast, cov, contrast)
-    early = np.arange(len(history.logs)) < history.baseline
-    drift[early], drift_cov[early] = np.nan, np.nan
-    # At the baseline ℓ and ℓ₀ are the same; rounding must not make an epoch of it.
-    still = (problem.clock == 0) & ~early
-    drift[still], drift_cov[still] = 0.0, 0.0
-    std = np.sqrt(np.einsum("kii->ki", cov))
-    scales = np.array([setting.noise_scale for setting in settings])
-    return Track(
-        stage=history.stage,
-        logs=history.logs,
-        recorded_at=history.recorded_at,
-        travel=history.travel,
-        modes=history.modes,
-        ln_frequency=mean[:, level],
-        ln_frequency_std=std[:, level],
-        ln_damping=mean[:, problem.index(_DAMPING)],
-        ln_damping_std=std[:, problem.index(_DAMPING)],
-        drift=drift,
-        drift_cov=drift_cov,
-        effects=_effects(problem, mean[-1], std[-1]),
-        nis=np.einsum("gk,gk->k", before, [run.nis for run in runs]),
-        nis_dof=_predicted(history),
-        noise_scale=scales @ weight,
-    )
+def _evidence(space: StateSpace, step: Step, size: FloatArray, spread: FloatArray) -> float:
+    """Log Bayes factor of a declared step: the density ratio at no jump [Dickey1971]."""
+    prior = JUMP_STD[step.kind][1 if step.kind == "regreasing" else 0]
+    log_det = np.linalg.slogdet(spread)[1] - 2 * size.size * np.log(prior)
+    return float(0.5 * (log_det + size @ np.linalg.solve(spread, size)))
 
 
-def _predicted(history: History) -> FloatArray:
+def _surprising(history: History) -> FloatArray:
     """Count the measurements of each log that could surprise: the first of a mode cannot."""
-    there = np.isfinite(np.hstack([history.ln_frequency, history.ln_damping]))
-    again = there & (np.cumsum(there, axis=0) > 1)
-    return np.asarray(again.sum(axis=1, dtype=float))
+    there = np.isfinite(history.ln_frequency)
+    again = np.zeros_like(there)
+    for mode in history.modes:
+        own = history.columns(mode)
+        seen = np.cumsum(there[:, own].any(axis=1)) > 1
+        again[:, own] = there[:, own] & seen[:, None]
+    return np.asarray(2.0 * again.sum(axis=1))
 
 
-def _effects(problem: _Problem, mean: FloatArray, std: FloatArray) -> tuple[Effect, ...]:
-    return tuple(
-        Effect(mode, covariate.name, float(mean[i]), float(std[i]))
-        for k, covariate in enumerate(problem.covariates)
-        for mode, i in zip(problem.history.modes, problem.index(_N_OWN + k).tolist(), strict=True)
-    )
+def _widening(nis: FloatArray, dof: FloatArray, innovations: FloatArray) -> FloatArray:
+    """Factor on standard deviations up to each log, one while the innovations are consistent.
+
+    Innovations that are larger than their bound widen by the ratio; that go on from log to log, by
+    what an autocorrelation takes of the number of independent ones.
+    """
+    total, degrees = np.cumsum(np.where(dof > 0, nis, 0.0)), np.cumsum(dof)
+    bound = stats.chi2.isf(_WIDEN, np.maximum(degrees, 1.0))
+    factor = np.where(degrees > 0, np.maximum(total / bound, 1.0), 1.0)
+    products = np.zeros_like(innovations)
+    products[1:] = innovations[1:] * innovations[:-1]
+    there = np.isfinite(products)
+    there[0] = False
+    n = np.cumsum(there.sum(axis=1))
+    squares = np.cumsum(np.nansum(innovations**2, axis=1))
+    count = np.cumsum(np.isfinite(innovations).sum(axis=1))
+    size = squares / np.maximum(count, 1)
+    mean = np.cumsum(np.where(there, products, 0.0).sum(axis=1)) / np.maximum(n, 1)
+    rho = np.clip(mean / np.maximum(size, 1e-12), -0.9, 0.9)
+    clear = rho * np.sqrt(n) > stats.norm.isf(_WIDEN)
+    factor = factor * np.where(clear, (1 + rho) / (1 - rho), 1.0)
+    return np.asarray(np.sqrt(factor))
+
+
+def _effects(space: StateSpace, bank: Bank, sources: tuple[str, ...]) -> tuple[Effect, ...]:
+    """Tell what moves the modes without wear, after the last log."""
+    modes = space.history.modes
+    mean, cov = bank.collapse()
+    std = np.sqrt(np.maximum(np.diag(cov), 0.0))
+    places = [(one.name, space.regressor(j).start) for j, one in enumerate(space.regressed)]
+    places += [
+        (f"{step.kind}:{step.name or step.source}", space.jump(j).start)
+        for j, step in enumerate(space.steps)
+        if step.kind not in MOVES
+    ]
+    effects = [
+        Effect(mode, name, float(mean[first + i]), float(std[first + i]))
+        for name, first in places
+        for i, mode in enumerate(modes)
+    ]
+    for j, i in enumerate(space.biased):
+        at, one = space.first_bias + 2 * j, space.history.series[i]
+        effects.append(Effect(one.mode, f"bias:{one.source}", float(mean[at]), float(std[at])))
+    for s, source in enumerate(sources):
+        values = bank.settings.scales[:, s]
+        scale = float(bank.weight @ values)
+        spread = float(np.sqrt(bank.weight @ (values - scale) ** 2))
+        effects.append(Effect("", f"scale:{source}", scale, spread))
+    return tuple(effects)

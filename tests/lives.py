@@ -17,8 +17,9 @@ import numpy as np
 from lmshealth.arrays import FloatArray
 from lmshealth.history import Reading
 from lmshealth.logs import Metadata
-from lmshealth.results import Health, History, Modes, Prognosis, Track
+from lmshealth.results import Health, Modes, Prognosis
 from lmshealth.stage import Stage, load_stage
+from lmshealth.tracks import History, Track
 
 MODES = ("roll", "pitch", "yaw")
 FREQUENCY = np.array([126.4, 136.6, 155.0])

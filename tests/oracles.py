@@ -9,7 +9,7 @@ import numpy as np
 from scipy import stats
 
 from lmshealth.arrays import FloatArray
-from lmshealth.results import History
+from lmshealth.tracks import History
 
 
 @dataclass(frozen=True)

@@ -12,10 +12,11 @@ from lmshealth import inference
 from lmshealth.arrays import FloatArray
 from lmshealth.errors import BadStage, NotConverged, NotEnoughData
 from lmshealth.inference import EpochPosterior, draw_prior, epochs_to_infer, infer, one_at_a_time
-from lmshealth.results import Health, Track
+from lmshealth.results import Health
 from lmshealth.sampling import Sample
 from lmshealth.stage import Stage
 from lmshealth.tracking import track
+from lmshealth.tracks import Track
 from tests.lives import (
     AXES,
     FOOT,

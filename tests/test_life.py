@@ -12,8 +12,8 @@ from lmshealth import life
 from lmshealth.arrays import FloatArray
 from lmshealth.errors import NotEnoughData
 from lmshealth.life import LifeLikelihood, limited
-from lmshealth.results import History
 from lmshealth.stage import Stage
+from lmshealth.tracks import History
 from tests.lives import (
     FADING,
     FOOT,

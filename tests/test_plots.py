@@ -18,7 +18,8 @@ from lmshealth import plots
 from lmshealth.arrays import FloatArray
 from lmshealth.laws import HertzWear, Law, Loosening
 from lmshealth.priors import Lognormal, Normal
-from lmshealth.results import Effect, Health, History, Prognosis, Track
+from lmshealth.results import Health, Prognosis
+from lmshealth.tracks import Effect, History, Track
 
 MODES = ("roll", "pitch", "yaw")
 PARAMETERS = ("guide_preload", "mount_stiffness")

@@ -14,8 +14,9 @@ from lmshealth import life, sampling
 from lmshealth.errors import BadStage, NotEnoughData
 from lmshealth.life import LifeLikelihood
 from lmshealth.prognosis import _usage, prognose
-from lmshealth.results import History, Prognosis
+from lmshealth.results import Prognosis
 from lmshealth.stage import Stage
+from lmshealth.tracks import History
 from tests.lives import (
     FADING,
     FOOT,

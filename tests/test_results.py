@@ -11,7 +11,8 @@ import pytest
 
 from lmshealth.errors import BadLog
 from lmshealth.logs import Channel, Log, Metadata
-from lmshealth.results import History, Modes
+from lmshealth.results import Modes
+from lmshealth.tracks import History
 from tests.signals import make_log
 
 

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from lmshealth.arrays import FloatArray
-from lmshealth.results import History
 from lmshealth.stage import Stage
 from lmshealth.summary import degraded_below, judge, service_date
+from lmshealth.tracks import History
 from tests.lives import (
     FOOT,
     FREQUENCY,

@@ -10,10 +10,11 @@ import pytest
 
 from lmshealth.history import Reading
 from lmshealth.logs import Metadata, Refusal
-from lmshealth.results import Effect, Health, History, Judgement, Line, Modes, Prognosis, Track
+from lmshealth.results import Health, Judgement, Line, Modes, Prognosis
 from lmshealth.stage import Stage, load_stage
 from lmshealth.summary import Assessment
 from lmshealth.tables import COLUMNS, all_tables, frame, lines_rows, modes_rows
+from lmshealth.tracks import Effect, History, Track
 from tests.signals import write_archive_stage
 
 WHEN = datetime(2026, 3, 1, 8, tzinfo=UTC)

@@ -11,9 +11,9 @@ from scipy.special import softmax
 
 from lmshealth import tracking
 from lmshealth.errors import NotEnoughData
-from lmshealth.results import History, Track
 from lmshealth.stage import Stage
 from lmshealth.tracking import track
+from lmshealth.tracks import History, Track
 from tests.lives import DAMPING, FREQUENCY, make_history, make_stage, rough_history
 from tests.oracles import Wander, batch, kalman
 

@@ -14,8 +14,8 @@ from lmshealth import life
 from lmshealth.arrays import FloatArray
 from lmshealth.inference import EpochPosterior, draw_prior
 from lmshealth.life import LifeLikelihood
-from lmshealth.results import History
 from lmshealth.stage import Stage
+from lmshealth.tracks import History
 from tests.lives import (
     AXES,
     FADING,

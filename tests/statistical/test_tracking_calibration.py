@@ -15,9 +15,9 @@ from scipy import stats
 
 from lmshealth import tracking
 from lmshealth.arrays import FloatArray
-from lmshealth.results import History
 from lmshealth.stage import Stage
 from lmshealth.tracking import track
+from lmshealth.tracks import History
 from tests.lives import DAMPING, FREQUENCY, make_history, make_stage
 from tests.oracles import DAMPING_WALK, RATE_STD, Wander, binomial_band
 

@@ -1,0 +1,254 @@
+"""Events told from drift: what happened to a machine at once, found in the innovations.
+
+Innovations that lean one way over the last logs raise a suspicion. Only then every explanation is
+weighed: the bank is taken back to before the suspected log, the step is let happen, and the logs
+are filtered again. The gain in evidence is an exact Bayes factor B_j of a step at log j.
+
+A healthy machine is judged again and again, and at every log something might have happened. With
+prior probabilities π_j of the place that sum to one, Σ_j π_j B_j is under the hypothesis that
+nothing happened a martingale of mean one [Ville1939], so that the probability that it ever reaches
+1/α is at most α, however many logs are looked at. What is not looked at only makes it smaller.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from lmshealth.arrays import FloatArray
+from lmshealth.bank import Bank, Filter, Settings, Surprise
+from lmshealth.tracks import Step, StepKind
+
+FindingKind = StepKind | Literal["drift"]
+
+FALSE_ALARMS = 0.01
+# An alarm may come from a drift since the baseline, from a drift that begins later, or from a step.
+_ROUTES = 3
+_WINDOWS = np.array([2, 4, 8, 16, 32, 64])
+MEMORY = int(_WINDOWS.max()) + 4
+# Innovations of a window that lean less, in standard deviations, are no suspicion. An event needs
+# more than five to be believed.
+_SUSPICIOUS = 4.0
+# Logs about the suspected one that are tried as the first that sees it.
+_ABOUT = np.array([-2, -1, 0, 1, 2])
+# How likely a retuning, and anything else, changes the following error below 40 Hz; and how far
+# such a change is expected to reach, in standard deviations between logs, squared.
+_LOOP_CHANGES = (0.99, 0.02)
+_LOOP_REACH = 100.0
+_LOOP_BEFORE, _LOOP_LEAST = 12, 3
+
+
+class Watch:
+    """Sums of standardised innovations over windows that end at the last log.
+
+    Parameters
+    ----------
+    n_logs, n_rows : int
+        Size of the history.
+    """
+
+    def __init__(self, n_logs: int, n_rows: int) -> None:
+        self.innovations = np.full((n_logs, n_rows), np.nan)
+        self._sum = np.zeros((n_logs + 1, n_rows))
+        self._count = np.zeros((n_logs + 1, n_rows))
+        self.first = 1
+
+    def add(self, k: int, surprise: Surprise) -> None:
+        """Take note of log k; a log that is filtered again replaces what was noted."""
+        self.innovations[k] = np.nan
+        self.innovations[k, surprise.rows] = surprise.innovation
+        self._sum[k + 1], self._count[k + 1] = self._sum[k], self._count[k]
+        self._sum[k + 1, surprise.rows] += surprise.innovation
+        self._count[k + 1, surprise.rows] += 1
+
+    def suspect(self, k: int) -> int | None:
+        """Give the log since which innovations lean most, if they lean suspiciously."""
+        start = k + 1 - _WINDOWS
+        start = start[start >= self.first]
+        if start.size == 0:
+            return None
+        count = np.maximum(self._count[k + 1] - self._count[start], 1)
+        lean = np.abs(self._sum[k + 1] - self._sum[start]) / np.sqrt(count)
+        window = int(np.argmax(lean.max(axis=1)))
+        return int(start[window]) if lean[window].max() > _SUSPICIOUS else None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Finding:
+    """The best explanation of what the last logs show.
+
+    Attributes
+    ----------
+    kind : str
+        Of the step, or ``drift`` where a rate begins.
+    source : str
+        The sensor's source; else empty.
+    first : int
+        First log that sees it.
+    log_bayes_factor : float
+        Against nothing having happened, the unknown place counted in.
+    log_odds : float
+        Against all other explanations together.
+    """
+
+    kind: FindingKind
+    source: str
+    first: int
+    log_bayes_factor: float
+    log_odds: float
+
+    @property
+    def believed(self) -> bool:
+        """Whether nothing having happened is ruled out at the declared rate."""
+        return self.log_bayes_factor >= threshold(1)
+
+    @property
+    def damage(self) -> bool:
+        """Whether it is damage, and no other explanation is left at the declared rate."""
+        least = threshold(_ROUTES)
+        return self.kind in ("step", "drift") and min(self.log_bayes_factor, self.log_odds) >= least
+
+
+def threshold(routes: int = _ROUTES) -> float:
+    """Log Bayes factor from which an alarm is raised that may come by so many routes."""
+    return float(np.log(routes / FALSE_ALARMS))
+
+
+def explain(
+    advance: Callable[[Filter, Bank, int], Bank],
+    filters: Filter,
+    memory: dict[int, Bank],
+    now: int,
+    suspect: int,
+) -> Finding | None:
+    """Weigh every explanation of what happened about a suspected log.
+
+    Parameters
+    ----------
+    advance : callable
+        Takes filters, a bank and a log, and gives the bank after the logs from there to `now`.
+    filters : Filter
+        Of the history.
+    memory : dict of int to Bank
+        Banks after each of the last logs.
+    now : int
+        The last log.
+    suspect : int
+        First log that may see it.
+
+    Returns
+    -------
+    Finding or None
+        None where there is no place for it.
+    """
+    space = filters.space
+    places = [j for j in (suspect + _ABOUT).tolist() if j - 1 in memory and 0 < j < now]
+    kinds: list[tuple[StepKind, str]] = [("step", ""), ("regreasing", ""), ("servo", "")]
+    if len(filters.sources) > 1:
+        kinds += [("sensor", source) for source in filters.sources]
+    gains: dict[tuple[FindingKind, str, int], float] = {}
+    for j in places:
+        nothing = memory[now].log_evidence - memory[j - 1].log_evidence
+        place = -float(np.log(j * (j + 1)))
+        for kind, source in kinds:
+            step = Step(kind, j, np.arange(len(space.history.logs)) >= j, source, declared=False)
+            changed = Filter(space.with_step(step), filters.copies)
+            before = memory[j - 1].padded(changed.space.size)
+            after = advance(changed, before, j)
+            gain = after.log_evidence - memory[j - 1].log_evidence - nothing
+            gain += loop_evidence(space.history.loop_error, j, now, kind)
+            gains[kind, source, j] = gain + place - float(np.log(len(kinds)))
+        gains["drift", "", j] = _drift(advance, filters, memory[j - 1], j) - nothing + place
+    if not gains:
+        return None
+    (best, source, first), gain = max(gains.items(), key=lambda item: item[1])
+    others = [0.0] + [g for key, g in gains.items() if key[:2] != (best, source)]
+    # A step and a drift that begins there are both damage.
+    if best in ("step", "drift"):
+        others = [0.0] + [g for key, g in gains.items() if key[0] not in ("step", "drift")]
+    return Finding(best, source, first, gain, gain - float(np.logaddexp.reduce(others)))
+
+
+def _drift(
+    advance: Callable[[Filter, Bank, int], Bank], filters: Filter, before: Bank, j: int
+) -> float:
+    """Log evidence of the logs from j on if a healthy machine begins to change there."""
+    if not before.settings.healthy.any():
+        return -np.inf
+    begun = reborn(before.only(before.settings.healthy), filters)
+    begun = begun.only(~begun.settings.healthy)
+    begun.log_weight -= begun.log_evidence
+    return advance(filters, begun, j).log_evidence
+
+
+def reborn(bank: Bank, filters: Filter) -> Bank:
+    """Begin a new chapter: the state and what is known of the noise stay, settings start anew."""
+    grid, own = filters.grid, bank.settings
+    scales, place = np.unique(own.scales, axis=0, return_inverse=True)
+    weight = np.bincount(place.ravel(), weights=bank.weight)
+    match = (grid.scales[:, None, :] == scales[None]).all(axis=2)
+    grid, match = grid.only(match.any(axis=1)), match[match.any(axis=1)]
+    share = np.log(np.maximum(match @ weight, 1e-12))
+    dynamics = grid.log_prior - _per_scale(grid)
+    n = grid.rate_std.size
+    mean, cov = np.empty((n, bank.mean.shape[1])), np.empty((n, *bank.cov.shape[1:]))
+    for group in (True, False):
+        members = bank.settings.healthy == group
+        state = (bank.only(members) if members.any() else bank).collapse()
+        mean[grid.healthy == group], cov[grid.healthy == group] = state
+    # A healthy machine has no rate, whatever it had before.
+    rates = np.arange(filters.space.rate.start, filters.space.rate.stop)
+    still = np.ix_(np.flatnonzero(grid.healthy), rates)
+    mean[still] = 0.0
+    cov[still] = 0.0
+    cov[np.flatnonzero(grid.healthy)[:, None], :, rates] = 0.0
+    new = Bank(grid, dynamics + share, mean, cov)
+    filters.open_rates(new)
+    return new
+
+
+def _per_scale(grid: Settings) -> FloatArray:
+    """Log prior of the scales of each setting, shape ``(n,)``."""
+    _, place = np.unique(grid.scales, axis=0, return_inverse=True)
+    place = place.ravel()
+    total = np.bincount(place, weights=np.exp(grid.log_prior))
+    return np.asarray(np.log(total[place]))
+
+
+def loop_evidence(loop_error: FloatArray, first: int, now: int, kind: str) -> float:
+    """Log evidence that the following error below 40 Hz brings for a kind of step.
+
+    The logarithms before and after are two samples of unknown variance; the Bayes factor of a
+    difference of their means is closed [Gonen2005]. A retuning nearly always makes one, other
+    events seldom.
+
+    Parameters
+    ----------
+    loop_error : ndarray
+        RMS in m, shape ``(n_logs,)``, NaN where unknown.
+    first, now : int
+        First log after the step, and the last log.
+    kind : str
+        Of the step.
+    """
+    with np.errstate(divide="ignore", invalid="ignore"):
+        values = np.log(loop_error)
+    values = np.where(np.isfinite(values), values, np.nan)
+    before = values[max(first - _LOOP_BEFORE, 0) : first]
+    after = values[first : min(now, first + _LOOP_BEFORE) + 1]
+    before, after = before[np.isfinite(before)], after[np.isfinite(after)]
+    if before.size < _LOOP_LEAST or after.size < 1:
+        return 0.0
+    dof = before.size + after.size - 2
+    effective = before.size * after.size / (before.size + after.size)
+    rest = before.size * before.var() + after.size * after.var()
+    variance = max(float(rest) / dof, 1e-12)
+    t2 = effective * float(before.mean() - after.mean()) ** 2 / variance
+    reach = 1 + _LOOP_REACH * effective
+    changed = 0.5 * (dof + 1) * (np.log1p(t2 / dof) - np.log1p(t2 / (dof * reach)))
+    changed -= 0.5 * np.log(reach)
+    chance = _LOOP_CHANGES[0 if kind == "servo" else 1]
+    return float(np.logaddexp(np.log(chance) + changed, np.log1p(-chance)))
