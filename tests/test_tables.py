@@ -13,7 +13,7 @@ from lmshealth.logs import Metadata, Refusal
 from lmshealth.results import Effect, Health, History, Judgement, Line, Modes, Prognosis, Track
 from lmshealth.stage import Stage, load_stage
 from lmshealth.summary import Assessment
-from lmshealth.tables import COLUMNS, all_tables, frame, lines_rows, modes_rows
+from lmshealth.tables import COLUMNS, all_tables, frame, modes_rows
 from tests.signals import write_archive_stage
 
 WHEN = datetime(2026, 3, 1, 8, tzinfo=UTC)
@@ -111,7 +111,7 @@ def test_empty_tables_have_their_columns() -> None:
 def test_modes_leave_with_units_in_their_names() -> None:
     """Hz, km and °C stand in the table; the std of f is f times the std of ln f."""
     metadata = Metadata("test-A", WHEN, 123_400.0, {"temperature_c": 21.5})
-    table = frame("modes", modes_rows("a.h5", metadata, two_modes()))
+    table = frame(COLUMNS["modes"], modes_rows("a.h5", metadata, two_modes()))
     row = table.iloc[0]
     assert (row["mode"], row["source"], row["channel"]) == ("roll", "acc", "acc_x")
     assert row["recorded_at"] == "2026-03-01T08:00:00+00:00"
@@ -123,21 +123,9 @@ def test_modes_leave_with_units_in_their_names() -> None:
 
 def test_unknown_metadata_are_empty_cells() -> None:
     """A log that says nothing about itself leaves empty cells, never a text like nan."""
-    text = frame("modes", modes_rows("a.h5", Metadata(), two_modes())).to_csv(index=False)
+    text = frame(COLUMNS["modes"], modes_rows("a.h5", Metadata(), two_modes())).to_csv(index=False)
     assert text.splitlines()[1].startswith("a.h5,,,,,roll,acc,")
     assert "nan" not in text.lower()
-
-
-def test_lines_have_the_keys_of_the_contract() -> None:
-    """A line is told by frequency, amplitude with unit, kind and channel."""
-    (row,) = lines_rows(two_modes().lines)
-    assert row == {
-        "frequency_hz": 50.0,
-        "amplitude": 0.1,
-        "unit": "m/s²",
-        "kind": "mains",
-        "channel": "acc_x",
-    }
 
 
 def test_covariances_between_modes_are_listed_once_and_zeros_left_out() -> None:
