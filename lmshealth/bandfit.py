@@ -73,6 +73,8 @@ class BandFit:
     shapes : ndarray
         How far each mode moves each channel, in units of its noise; one in the channel that it
         moves most, shape ``(n_channels, n_modes)``.
+    unit : ndarray
+        Root of the noise of each channel in (m/s²)/Hz^½, shape ``(n_channels,)``.
     snr : ndarray
         Modal signal-to-noise ratio of all channels together, shape ``(n_modes,)``.
     dispersion : ndarray
@@ -95,6 +97,7 @@ class BandFit:
     estimate: FloatArray
     cov: FloatArray
     shapes: FloatArray
+    unit: FloatArray
     snr: FloatArray
     dispersion: FloatArray
     flags: tuple[str, ...]
@@ -340,6 +343,7 @@ def _conclude(
         estimate=estimate,
         cov=cov,
         shapes=likelihood.shapes(p),
+        unit=band.unit,
         snr=ratio.sum(axis=0),
         dispersion=np.full(m, np.nan),
         flags=("",) * m,

@@ -140,6 +140,8 @@ def run(
 def modes(ctx: click.Context, /, logs: tuple[Path, ...], style: str, **options: Any) -> None:
     """Identify the modes of single logs: frequency and damping with their uncertainty."""
     from lmshealth.decay import identify_decays
+    from lmshealth.following import loop_error
+    from lmshealth.history import Reading
     from lmshealth.looks import lines_rows
     from lmshealth.modal import identify
     from lmshealth.tables import COLUMNS, frame, modes_rows, refused_rows
@@ -153,18 +155,20 @@ def modes(ctx: click.Context, /, logs: tuple[Path, ...], style: str, **options: 
     found, lost = _each(
         logs,
         columns,
-        lambda log: (
+        lambda log: Reading(
             log.name,
+            log.digest,
             log.metadata,
             look(log, stage, channels=channels, band=band),
+            loop_error(log),
         ),
     )
-    rows = [row for log, metadata, own in found for row in modes_rows(log, metadata, own)]
-    refused = refused_rows([*lost, *(refusal for _, _, own in found for refusal in own.refused)])
+    rows = [row for reading in found for row in modes_rows(reading)]
+    refused = refused_rows([*lost, *(r for reading in found for r in reading.modes.refused)])
     if style == "csv":
         click.echo(frame(COLUMNS["modes"], rows).to_csv(index=False), nl=False)
     elif style == "json":
-        lines = [{"log": log, **row} for log, _, own in found for row in lines_rows(own.lines)]
+        lines = [{"log": r.log, **row} for r in found for row in lines_rows(r.modes.lines)]
         terminal.print_json({"modes": rows, "lines": lines, "refused": refused})
     else:
         terminal.print_modes(rows, refused)
@@ -310,6 +314,7 @@ def frf(ctx: click.Context, /, log: Path, style: str, **options: Any) -> None:
     modes; json has the response with H1, H2, Hv and coherence too.
     """
     from lmshealth.frf import read_frf
+    from lmshealth.history import Reading
     from lmshealth.looks import fit_row, frf_rows, lines_rows
     from lmshealth.tables import COLUMNS, frame, modes_rows, refused_rows
 
@@ -319,7 +324,8 @@ def frf(ctx: click.Context, /, log: Path, style: str, **options: Any) -> None:
     found, lost = _each(
         [log], columns, lambda it: (it, read_frf(it, *names, band=band, period=period))
     )
-    rows = [row for it, own in found for row in modes_rows(it.name, it.metadata, own.modes)]
+    readings = [Reading(it.name, it.digest, it.metadata, own.modes) for it, own in found]
+    rows = [row for reading in readings for row in modes_rows(reading)]
     fits = [fit_row(it.name, own) for it, own in found]
     response = [row for it, own in found for row in frf_rows(it.name, own)]
     refused = refused_rows([*lost, *(r for _, own in found for r in own.modes.refused)])

@@ -12,17 +12,18 @@ import pandas as pd
 
 from lmshealth.arrays import FloatArray
 from lmshealth.history import Reading
-from lmshealth.logs import Metadata, Refusal
-from lmshealth.results import Modes, Prognosis
+from lmshealth.logs import Refusal
+from lmshealth.readers.metadata import COVARIATES
+from lmshealth.results import Prognosis
 from lmshealth.summary import Assessment
 
-_KM = 1000.0
+_KM, _MICRO = 1000.0, 1e-6
 _RUL_LEVELS = (0.05, 0.10, 0.25, 0.50, 0.75, 0.90, 0.95)
 
 COLUMNS = {
-    "modes": "log stage recorded_at travel_km temperature_c mode source channel frequency_hz "
-    "frequency_std_hz damping_ratio damping_ratio_std correlation_f_zeta snr dispersion "
-    "flags",
+    "modes": "log stage recorded_at travel_km temperature_c payload_kg position_mm servo_id "
+    "delta_e_below_40hz_um mode source channel frequency_hz frequency_std_hz damping_ratio "
+    "damping_ratio_std correlation_f_zeta snr dispersion flags",
     "modes_cov": "log source_a mode_a source_b mode_b cov_ln_f",
     "track": "stage recorded_at travel_km mode frequency_hz frequency_std_hz damping_ratio "
     "damping_ratio_std drift drift_std nis nis_dof noise_scale",
@@ -45,15 +46,21 @@ COLUMNS = {
 Row = dict[str, Any]
 
 
-def modes_rows(log: str, metadata: Metadata, modes: Modes) -> list[Row]:
-    """List the estimates of one log, one row per mode."""
+def modes_rows(reading: Reading) -> list[Row]:
+    """List the estimates of one log, one row per mode, with a column per channel of a shape."""
+    metadata, modes, error = reading.metadata, reading.modes, reading.loop_error
+    circumstances = {
+        "log": reading.log,
+        "stage": metadata.stage,
+        "recorded_at": _moment(metadata.recorded_at),
+        "travel_km": None if metadata.travel is None else metadata.travel / _KM,
+        **{name: metadata.covariates.get(name) for name in COVARIATES},
+        "servo_id": metadata.servo_id,
+        "delta_e_below_40hz_um": None if error is None else error / _MICRO,
+    }
     return [
         {
-            "log": log,
-            "stage": metadata.stage,
-            "recorded_at": _moment(metadata.recorded_at),
-            "travel_km": None if metadata.travel is None else metadata.travel / _KM,
-            "temperature_c": metadata.covariates.get("temperature_c"),
+            **circumstances,
             "mode": modes.names[i],
             "source": modes.sources[i],
             "channel": modes.channels[i],
@@ -65,6 +72,10 @@ def modes_rows(log: str, metadata: Metadata, modes: Modes) -> list[Row]:
             "snr": float(modes.snr[i]),
             "dispersion": float(modes.dispersion[i]),
             "flags": modes.flags[i],
+            **{
+                f"shape_{channel}": float(own)
+                for channel, own in zip(modes.shape_channels, modes.shapes[i], strict=True)
+            },
         }
         for i in range(len(modes.names))
     ]
@@ -78,8 +89,17 @@ def refused_rows(refused: Iterable[Refusal]) -> list[Row]:
 
 
 def frame(columns: str, rows: Sequence[Row]) -> pd.DataFrame:
-    """Make a table of rows, with its columns, separated by blanks, even when it is empty."""
-    return pd.DataFrame(list(rows), columns=columns.split())
+    """Make a table of rows.
+
+    Parameters
+    ----------
+    columns : str
+        Those that every table of its kind has, separated by blanks.
+    rows : sequence of dict
+        What else they hold is appended, in the order in which it comes.
+    """
+    order = dict.fromkeys([*columns.split(), *(name for row in rows for name in row)])
+    return pd.DataFrame(list(rows), columns=list(order))
 
 
 def all_tables(
@@ -88,7 +108,7 @@ def all_tables(
     """Make all tables of a run, keyed by file name without ending."""
     rows: dict[str, list[Row]] = {name: [] for name in COLUMNS}
     for reading in readings:
-        rows["modes"] += modes_rows(reading.log, reading.metadata, reading.modes)
+        rows["modes"] += modes_rows(reading)
         rows["modes_cov"] += _modes_cov_rows(reading)
     for assessment in assessments:
         rows["track"] += _track_rows(assessment)
