@@ -72,6 +72,8 @@ class BandFit:
     shapes : ndarray
         How far each mode moves each channel, in units of its noise; one in the channel that it
         moves most, shape ``(n_channels, n_modes)``.
+    unit : ndarray
+        Root of the noise of each channel in (m/s²)/Hz^½, shape ``(n_channels,)``.
     snr : ndarray
         Modal signal-to-noise ratio of all channels together, shape ``(n_modes,)``.
     dispersion : ndarray
@@ -94,6 +96,7 @@ class BandFit:
     estimate: FloatArray
     cov: FloatArray
     shapes: FloatArray
+    unit: FloatArray
     snr: FloatArray
     dispersion: FloatArray
     flags: tuple[str, ...]
@@ -338,6 +341,7 @@ def _conclude(
         estimate=estimate,
         cov=cov,
         shapes=likelihood.shapes(p),
+        unit=band.unit,
         snr=ratio.sum(axis=0),
         dispersion=dispersion,
         flags=tuple(_flags(*mode, residual.duration) for mode in modes),

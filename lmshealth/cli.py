@@ -140,8 +140,11 @@ def run(
 def modes(ctx: click.Context, /, logs: tuple[Path, ...], style: str, **options: Any) -> None:
     """Identify the modes of single logs: frequency and damping with their uncertainty."""
     from lmshealth.decay import identify_decays
+    from lmshealth.following import loop_error
+    from lmshealth.history import Reading
+    from lmshealth.looks import lines_rows
     from lmshealth.modal import identify
-    from lmshealth.tables import frame, lines_rows, modes_rows, refused_rows
+    from lmshealth.tables import COLUMNS, frame, modes_rows, refused_rows
 
     look = identify_decays if options["part"] == "settling" else identify
     stage, columns = _loaded(options["stage"], options["columns"])
@@ -152,18 +155,20 @@ def modes(ctx: click.Context, /, logs: tuple[Path, ...], style: str, **options: 
     found, lost = _each(
         logs,
         columns,
-        lambda log: (
+        lambda log: Reading(
             log.name,
+            log.digest,
             log.metadata,
             look(log, stage, channels=channels, band=band),
+            loop_error(log),
         ),
     )
-    rows = [row for log, metadata, own in found for row in modes_rows(log, metadata, own)]
-    refused = refused_rows([*lost, *(refusal for _, _, own in found for refusal in own.refused)])
+    rows = [row for reading in found for row in modes_rows(reading)]
+    refused = refused_rows([*lost, *(r for reading in found for r in reading.modes.refused)])
     if style == "csv":
-        click.echo(frame("modes", rows).to_csv(index=False), nl=False)
+        click.echo(frame(COLUMNS["modes"], rows).to_csv(index=False), nl=False)
     elif style == "json":
-        lines = [{"log": log, **row} for log, _, own in found for row in lines_rows(own.lines)]
+        lines = [{"log": r.log, **row} for r in found for row in lines_rows(r.modes.lines)]
         terminal.print_json({"modes": rows, "lines": lines, "refused": refused})
     else:
         terminal.print_modes(rows, refused)
@@ -202,7 +207,8 @@ def error(ctx: click.Context, /, logs: tuple[Path, ...], style: str, **options: 
     lists each of them. Their cosines, added up, rebuild the following error.
     """
     from lmshealth.following import read_error
-    from lmshealth.tables import error_row, frame, harmonics_rows, refused_rows
+    from lmshealth.looks import LOOKS, error_row, harmonics_rows
+    from lmshealth.tables import frame, refused_rows
 
     _, columns = _loaded(None, options["columns"])
     count, floor = options["count"], 1e-9 * options["floor_nm"]
@@ -218,7 +224,7 @@ def error(ctx: click.Context, /, logs: tuple[Path, ...], style: str, **options: 
     rows = [error_row(log, item) for log, _, own in found for item in own]
     refused = refused_rows([*lost, *(refusal for _, its, _ in found for refusal in its)])
     if style == "csv":
-        click.echo(frame("error", rows).to_csv(index=False), nl=False)
+        click.echo(frame(LOOKS["error"], rows).to_csv(index=False), nl=False)
     elif style == "json":
         kept = [row for log, _, own in found for item in own for row in harmonics_rows(log, item)]
         terminal.print_json({"error": rows, "harmonics": kept, "refused": refused})
@@ -253,8 +259,9 @@ def spectrum(ctx: click.Context, /, logs: tuple[Path, ...], style: str, **option
     grid of every 10 Hz. A magnitude is the amplitude of the strongest harmonic of a band. Lines
     are found by a test that shows one where there is none in 1 % of channels.
     """
+    from lmshealth.looks import LOOKS, growth_rows, lines_rows, magnitudes_rows
     from lmshealth.survey import survey
-    from lmshealth.tables import frame, growth_rows, lines_rows, magnitudes_rows, refused_rows
+    from lmshealth.tables import frame, refused_rows
 
     stage, columns = _loaded(options["stage"], options["columns"])
     band = checked_band(options["band"])
@@ -266,7 +273,7 @@ def spectrum(ctx: click.Context, /, logs: tuple[Path, ...], style: str, **option
     lines = [{"log": own.log, **row} for own in found for row in lines_rows(own.lines)]
     refused = refused_rows([*lost, *(refusal for own in found for refusal in own.refused)])
     if style == "csv":
-        click.echo(frame("magnitudes", rows).to_csv(index=False), nl=False)
+        click.echo(frame(LOOKS["magnitudes"], rows).to_csv(index=False), nl=False)
     elif style == "json":
         content = {"magnitudes": rows, "growth": growth_rows(growth), "lines": lines}
         terminal.print_json({**content, "refused": refused})
@@ -307,7 +314,9 @@ def frf(ctx: click.Context, /, log: Path, style: str, **options: Any) -> None:
     modes; json has the response with H1, H2, Hv and coherence too.
     """
     from lmshealth.frf import read_frf
-    from lmshealth.tables import fit_row, frame, frf_rows, lines_rows, modes_rows, refused_rows
+    from lmshealth.history import Reading
+    from lmshealth.looks import fit_row, frf_rows, lines_rows
+    from lmshealth.tables import COLUMNS, frame, modes_rows, refused_rows
 
     _, columns = _loaded(None, options["columns"])
     band, period = checked_band(options["band"]), options["period"]
@@ -315,12 +324,13 @@ def frf(ctx: click.Context, /, log: Path, style: str, **options: Any) -> None:
     found, lost = _each(
         [log], columns, lambda it: (it, read_frf(it, *names, band=band, period=period))
     )
-    rows = [row for it, own in found for row in modes_rows(it.name, it.metadata, own.modes)]
+    readings = [Reading(it.name, it.digest, it.metadata, own.modes) for it, own in found]
+    rows = [row for reading in readings for row in modes_rows(reading)]
     fits = [fit_row(it.name, own) for it, own in found]
     response = [row for it, own in found for row in frf_rows(it.name, own)]
     refused = refused_rows([*lost, *(r for _, own in found for r in own.modes.refused)])
     if style == "csv":
-        click.echo(frame("modes", rows).to_csv(index=False), nl=False)
+        click.echo(frame(COLUMNS["modes"], rows).to_csv(index=False), nl=False)
     elif style == "json":
         lines = [{"log": it.name, **r} for it, own in found for r in lines_rows(own.modes.lines)]
         content = {"modes": rows, "fit": fits, "frf": response, "lines": lines}
@@ -361,10 +371,10 @@ def plan(stage: str, detections: list[tuple[str, float]], style: str, **options:
     The best that can be had from vibration at constant velocity, by the Cramér-Rao bound: logs of
     now are compared with those of the baseline, as long, at the same temperature.
     """
+    from lmshealth.looks import plan_rows
     from lmshealth.planning import DURATIONS
     from lmshealth.planning import plan as make_plan
     from lmshealth.stage import load_stage
-    from lmshealth.tables import plan_rows
 
     loaded = load_stage(stage)
     plans = [

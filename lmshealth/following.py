@@ -1,4 +1,4 @@
-"""The following error as the paper reads it: statistics, strongest harmonics, bandwidth."""
+"""The following error: what the paper reads of it, and what the control loop leaves of it."""
 
 from __future__ import annotations
 
@@ -6,16 +6,21 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy import signal
 
 from lmshealth.arrays import FloatArray, freeze
 from lmshealth.errors import BadLog
 from lmshealth.harmonics import Harmonics, decompose
 from lmshealth.logs import Channel, Log
-from lmshealth.segments import Part, Segment, select_segments, set_velocity
+from lmshealth.segments import Part, Segment, find_segments, select_segments, set_velocity
 
 COUNT = 100
 # Six counts of the paper's encoder, in m.
 FLOOR = 30e-9
+# Hz: a servo works below its crossover, and modes of guide and mounts stand above.
+_LOOP_BAND = (1.0, 40.0)
+# Periods of its lower end that a stretch must hold: a line takes the slower ones away.
+_LOOP_PERIODS = 2.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -168,6 +173,54 @@ def read_error(
             )
         )
     return tuple(readings)
+
+
+def loop_error(log: Log) -> float | None:
+    """Measure the following error from 1 to 40 Hz: what the control loop leaves.
+
+    It tells a retuned servo from wear. In this band the loop gain alone decides how much of a
+    disturbance is left: a retuning moves it by tens of per cent or more, while wear shifts modes
+    that stand above. Disturbances change with velocity, so that only logs of one velocity compare.
+
+    Parameters
+    ----------
+    log : Log
+        Stretches of constant velocity of two seconds or more are used, as for modes, each less
+        its line.
+
+    Returns
+    -------
+    float or None
+        Root of the mean square in m, stretches weighted by their durations, several channels
+        alike. None where no channel tells the following error, no stretch resolves 1 Hz, or the
+        sample rate does not show 40 Hz.
+    """
+    low, high = _LOOP_BAND
+    channels = [channel for channel in log.channels if channel.kind == "displacement"]
+    segments = find_segments(log, _LOOP_PERIODS / low)
+    if not channels or not segments or log.sample_rate <= 2 * high:
+        return None
+    weights = [s.stop - s.start for s in segments]
+    squares = [
+        np.average(
+            [_mean_square(c.values[s.start : s.stop], log.sample_rate) for s in segments],
+            weights=weights,
+        )
+        for c in channels
+    ]
+    return float(np.sqrt(np.mean(squares)))
+
+
+def _mean_square(values: FloatArray, sample_rate: float) -> float:
+    """Mean square of what a stretch holds in the loop's band.
+
+    The window keeps drift below the band and lines above it from leaking in.
+    """
+    frequency, density = signal.periodogram(
+        values, sample_rate, window="hann", detrend=signal.detrend, scaling="density"
+    )
+    inside = (frequency >= _LOOP_BAND[0]) & (frequency <= _LOOP_BAND[1])
+    return float(density[inside].sum() * sample_rate / values.size)
 
 
 def _statistics(channel: Channel, segments: Sequence[Segment]) -> tuple[float, float, float, float]:

@@ -248,6 +248,8 @@ def _modes(log: Log, frf: Frf, output: Channel, fit: ResponseFit) -> Modes:
         snr=fit.snr[kept],
         dispersion=np.full(kept.size, np.nan),
         flags=("",) * kept.size,
+        shape_channels=(),
+        shapes=np.empty((kept.size, 0)),
         lines=_lines(log, output, fit),
         refused=(*log.refused, *refused),
     )

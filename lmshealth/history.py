@@ -34,12 +34,16 @@ class Reading:
         With identity, moment and odometer.
     modes : Modes
         Its modal estimates.
+    loop_error : float or None
+        RMS of the following error from 1 to 40 Hz in m, see `loop_error` of `following`; None
+        where it was not measured.
     """
 
     log: str
     digest: str
     metadata: Metadata
     modes: Modes
+    loop_error: float | None = None
 
 
 def in_order(readings: Sequence[Reading]) -> tuple[Reading, ...]:

@@ -13,6 +13,7 @@ from itertools import combinations
 import numpy as np
 from scipy.special import softmax
 
+from lmshealth.arrays import FloatArray
 from lmshealth.band import View
 from lmshealth.bandfit import BAND, BandFit, Missing, fit_band
 from lmshealth.errors import BadLog
@@ -98,8 +99,8 @@ def identify(
     resolution = 1.5 / max(s.duration for s in view.spectra)
     lines = name_lines(seen, log, stage, resolution)
     if stage is not None:
-        return _collect(fits, lines, (*log.refused, *refused))
-    modes = _renumber(_collect(_distinct(fits), lines, log.refused))
+        return _collect(fits, view.channels, lines, (*log.refused, *refused))
+    modes = _renumber(_collect(_distinct(fits), view.channels, lines, log.refused))
     return modes if modes.names else replace(modes, refused=(*log.refused, _nothing(log, lines)))
 
 
@@ -357,7 +358,12 @@ def _distinct(fits: list[BandFit]) -> list[BandFit]:
     return [fit.only([t.name for t in fit.targets if t.name in names]) for fit in fits]
 
 
-def _collect(fits: list[BandFit], lines: tuple[Line, ...], refused: tuple[Refusal, ...]) -> Modes:
+def _collect(
+    fits: list[BandFit],
+    channels: tuple[str, ...],
+    lines: tuple[Line, ...],
+    refused: tuple[Refusal, ...],
+) -> Modes:
     sizes = [len(fit.targets) for fit in fits]
     n = sum(sizes)
     cov = np.zeros((2 * n, 2 * n))
@@ -372,25 +378,39 @@ def _collect(fits: list[BandFit], lines: tuple[Line, ...], refused: tuple[Refusa
     both = np.concatenate([order, order + n])
     names = [target.name for fit in fits for target in fit.targets]
     sources = [fit.view.source for fit in fits for _ in fit.targets]
-    channels = [name for fit in fits for name in fit.best]
+    best = [name for fit in fits for name in fit.best]
     snr, dispersion = (
         np.concatenate([np.empty(0), *(getattr(fit, name) for fit in fits)])
         for name in ("snr", "dispersion")
     )
     flags = [flag for fit in fits for flag in fit.flags]
+    nothing = np.empty((0, len(channels)))
+    shapes = np.concatenate([nothing, *(_shapes(fit, channels) for fit in fits)])
     return Modes(
         names=tuple(names[i] for i in order),
         sources=tuple(sources[i] for i in order),
-        channels=tuple(channels[i] for i in order),
+        channels=tuple(best[i] for i in order),
         ln_frequency=estimate[order],
         ln_damping=estimate[n + order],
         cov=cov[np.ix_(both, both)],
         snr=snr[order],
         dispersion=dispersion[order],
         flags=tuple(flags[i] for i in order),
+        shape_channels=channels,
+        shapes=shapes[order],
         lines=lines,
         refused=refused,
     )
+
+
+def _shapes(fit: BandFit, channels: tuple[str, ...]) -> FloatArray:
+    """Give shapes in units of acceleration, NaN in the channels that the fit left out."""
+    own = (fit.unit[:, None] * fit.shapes).T
+    own = own / np.linalg.norm(own, axis=1, keepdims=True)
+    largest = np.take_along_axis(own, np.abs(own).argmax(axis=1, keepdims=True), axis=1)
+    shapes = np.full((len(own), len(channels)), np.nan)
+    shapes[:, [channels.index(name) for name in fit.view.channels]] = own * np.sign(largest)
+    return shapes
 
 
 def _renumber(modes: Modes) -> Modes:

@@ -115,6 +115,8 @@ def name_modes(log: Log, targets: tuple[Target, ...], bands: list[Band]) -> Mode
         snr=np.array([own.max() for own in snr]),
         dispersion=np.full(n, np.nan),
         flags=("",) * n,
+        shape_channels=(),
+        shapes=np.empty((n, 0)),
         lines=(),
         refused=(*log.refused, *refused),
     )

@@ -14,6 +14,7 @@ from importlib.metadata import version
 from pathlib import Path
 
 from lmshealth.errors import BadLog, LmshealthError, NothingUsable
+from lmshealth.following import loop_error
 from lmshealth.history import Reading, build_history, in_order
 from lmshealth.inference import epochs_to_infer, infer
 from lmshealth.logs import Refusal
@@ -300,7 +301,8 @@ def identify_log(task: _Task, stages: tuple[Stage, ...]) -> Outcome:
                 f"stage {log.metadata.stage!r} matches none of the descriptions "
                 f"{[s.description.match.stage for s in stages]}; give its description by --stage",
             )
-        return Reading(task.name, log.digest, log.metadata, identify(log, stage))
+        modes = identify(log, stage)
+        return Reading(task.name, log.digest, log.metadata, modes, loop_error(log))
     except BadLog as error:
         return (Refusal(task.name, error.reason, error.detail),)
     except Exception as error:  # one log must not end the batch, whatever our mistake

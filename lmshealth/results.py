@@ -74,6 +74,12 @@ class Modes:
         half-power bandwidth spans few Fourier frequencies, ``at-bound`` where frequency or
         damping is at the end of what was searched, ``loose-fit`` where the dispersion is clearly
         more than one, ``cluster`` where one stands for two that cannot be told apart.
+    shape_channels : tuple of str
+        The channels that shapes tell of; none where shapes were not identified.
+    shapes : ndarray
+        Acceleration of each channel in each mode, the following error's as its second derivative,
+        shape ``(n_modes, n_shape_channels)``. Of each mode they have unit Euclidean norm, and the
+        largest is positive; NaN in channels that did not see it.
     lines : tuple of Line
         Spectral lines that were kept out of the likelihood.
     refused : tuple of Refusal
@@ -89,6 +95,8 @@ class Modes:
     snr: FloatArray
     dispersion: FloatArray
     flags: tuple[str, ...]
+    shape_channels: tuple[str, ...]
+    shapes: FloatArray
     lines: tuple[Line, ...]
     refused: tuple[Refusal, ...]
 
@@ -99,6 +107,7 @@ class Modes:
         for name in ("ln_frequency", "ln_damping", "snr", "dispersion"):
             expect_shape(name, getattr(self, name), (n,))
         expect_shape("cov", self.cov, (2 * n, 2 * n))
+        expect_shape("shapes", self.shapes, (n, len(self.shape_channels)))
         freeze(self)
 
     @property

@@ -21,12 +21,13 @@ from sqlalchemy.engine import URL, make_url
 from sqlalchemy.exc import ArgumentError, SQLAlchemyError
 from sqlalchemy.orm import DeclarativeBase, Mapped, Session, mapped_column
 
+from lmshealth.arrays import FloatArray
 from lmshealth.errors import LmshealthError
 from lmshealth.history import Reading
 from lmshealth.logs import Metadata, Refusal
 from lmshealth.results import Line, Modes
 
-SCHEMA = 1
+SCHEMA = 2  # part of the name of the table: what an older one holds is not read
 
 
 class StoreError(LmshealthError):
@@ -120,6 +121,7 @@ def _to_json(outcome: Reading | tuple[Refusal, ...]) -> str:
                 "baseline": metadata.baseline,
                 "description": metadata.description,
             },
+            "loop_error": outcome.loop_error,
             "modes": {
                 "names": modes.names,
                 "sources": modes.sources,
@@ -128,8 +130,10 @@ def _to_json(outcome: Reading | tuple[Refusal, ...]) -> str:
                 "ln_damping": modes.ln_damping.tolist(),
                 "cov": modes.cov.tolist(),
                 "snr": modes.snr.tolist(),
-                "dispersion": [None if np.isnan(x) else x for x in modes.dispersion.tolist()],
+                "dispersion": _without_nan(modes.dispersion),
                 "flags": modes.flags,
+                "shape_channels": modes.shape_channels,
+                "shapes": _without_nan(modes.shapes),
                 "lines": [
                     [line.frequency, line.amplitude, line.unit, line.kind, line.channel]
                     for line in modes.lines
@@ -138,6 +142,13 @@ def _to_json(outcome: Reading | tuple[Refusal, ...]) -> str:
             },
         }
     )
+
+
+def _without_nan(values: FloatArray) -> Any:
+    """Put None, which JSON knows, in the place of what is missing."""
+    known = values.astype(object)
+    known[np.isnan(values)] = None
+    return known.tolist()
 
 
 def _refusal(refusal: Refusal) -> dict[str, str]:
@@ -155,6 +166,7 @@ def _from_json(text: str, log: str) -> Reading | tuple[Refusal, ...]:
         digest=content["digest"],
         metadata=Metadata(recorded_at=moment and datetime.fromisoformat(moment), **metadata),
         modes=_modes(content["modes"], log),
+        loop_error=content["loop_error"],
     )
 
 
@@ -170,6 +182,8 @@ def _modes(content: dict[str, Any], log: str) -> Modes:
         snr=np.array(content["snr"], dtype=float),
         dispersion=np.array(content["dispersion"], dtype=float),
         flags=tuple(content["flags"]),
+        shape_channels=tuple(content["shape_channels"]),
+        shapes=np.array(content["shapes"], dtype=float).reshape(n, len(content["shape_channels"])),
         lines=tuple(Line(*row) for row in content["lines"]),
         refused=tuple(Refusal(log=log, **row) for row in content["refused"]),
     )

@@ -283,6 +283,8 @@ def make_reading(
             snr=np.full(m, 200.0),
             dispersion=np.ones(m),
             flags=("",) * m,
+            shape_channels=(),
+            shapes=np.empty((m, 0)),
             lines=(),
             refused=(),
         ),

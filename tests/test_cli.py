@@ -14,7 +14,8 @@ import pytest
 from click.testing import CliRunner, Result
 
 from lmshealth.cli import main
-from lmshealth.tables import COLUMNS, LOOKS
+from lmshealth.looks import LOOKS
+from lmshealth.tables import COLUMNS
 from models.stages import STAGES
 from models.velocities import Experiment, drive_velocities
 from studies.frf_modes.records import BAND, MODES, RATE, Machine, periodic

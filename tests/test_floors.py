@@ -28,7 +28,7 @@ FLOORS = [
     {"prognosis"},
     {"summary", "plots"},
     {"store", "tables", "report"},
-    {"pipeline", "terminal", "options"},
+    {"pipeline", "terminal", "options", "looks"},
     {"cli"},
     {"__main__"},
 ]

@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 
 from lmshealth.errors import BadLog
-from lmshealth.following import read_error
+from lmshealth.following import loop_error, read_error
 from lmshealth.readers import read_log
 from models.stages import STAGES
 from models.strokes import record_strokes
 from models.velocities import Experiment, drive_velocities
 from studies.paper_tables.tables import error_reading
-from tests.signals import make_log
+from tests.signals import make_log, sine
 
 RATE = 2000.0
 N = 8000
@@ -102,6 +102,53 @@ def test_a_record_too_short_names_the_seconds_needed() -> None:
         read_error(log)
     assert caught.value.reason == "too-short"
     assert read_error(log, count=50)[0].kept.size == 50
+
+
+def sines(n: int, *given: tuple[float, float]) -> np.ndarray:
+    """Sum sines of frequencies in Hz and amplitudes in m."""
+    return sum((sine(n, RATE, f, a) for f, a in given), np.zeros(n))
+
+
+def test_the_loop_error_is_the_rms_of_what_lies_in_its_band() -> None:
+    """Of sines only those from 1 to 40 Hz count, nor do an offset and a slope."""
+    inside = ((3.0, 2e-6), (25.0, 1e-6))
+    outside = ((0.2, 1e-6), (50.0, 5e-6), (126.4, 1e-5))
+    slope = 1e-4 + np.linspace(0, 1e-5, 10 * N)
+    expected = np.sqrt((2e-6**2 + 1e-6**2) / 2)
+    for given in (inside, inside + outside):
+        found = loop_error(make_log({"delta_e": sines(10 * N, *given) + slope}, RATE))
+        assert found == pytest.approx(expected, rel=1e-3)
+    alone = loop_error(make_log({"delta_e": sines(10 * N, *outside) + slope}, RATE))
+    assert alone is not None
+    assert alone < 0.01 * expected
+
+
+def test_stretches_count_by_their_durations_and_moves_do_not() -> None:
+    """Of 4 s at 1 µm and 8 s at 3 µm the mean square is (1 + 2 · 9)/3; ramps are left out."""
+    n = round(4 * RATE)
+    ramp = np.linspace(0.1, 0.2, N // 4)
+    velocity = np.concatenate([np.full(n, 0.1), ramp, np.full(2 * n, 0.2)])
+    amplitude = np.concatenate([np.full(n, 1e-6), np.full(ramp.size, 1e-3), np.full(2 * n, 3e-6)])
+    log = make_log({"delta_e": amplitude * sine(velocity.size, RATE, 10.0, 1.0)}, RATE,
+                   velocity=velocity)  # fmt: skip
+    # Some samples of the ramp's ends look constant, and the window keeps them small.
+    assert loop_error(log) == pytest.approx(1e-6 * np.sqrt(19 / 3 / 2), rel=0.01)
+
+
+def test_channels_of_following_error_count_alike() -> None:
+    """Two of 1 and 3 µm have the mean of their squares; an accelerometer does not count."""
+    signals = {"delta_e_a": sines(N, (10.0, 1e-6)), "delta_e_b": sines(N, (10.0, 3e-6))}
+    log = make_log({**signals, "acc_a": sines(N, (10.0, 1.0))}, RATE)
+    assert loop_error(log) == pytest.approx(1e-6 * np.sqrt(5 / 2), rel=1e-3)
+
+
+def test_a_log_that_does_not_show_the_loops_band_has_no_loop_error() -> None:
+    """Without following error, in less than two seconds, below 80 Hz: None, never a zero."""
+    x = sines(N, (10.0, 1e-6))
+    assert loop_error(make_log({"delta_e": x}, RATE)) is not None
+    assert loop_error(make_log({"acc_a": x}, RATE)) is None
+    assert loop_error(make_log({"delta_e": x[: round(1.9 * RATE)]}, RATE)) is None
+    assert loop_error(make_log({"delta_e": x}, 80.0)) is None
 
 
 @pytest.mark.parametrize("name", ["lms-x", "lms-y"])

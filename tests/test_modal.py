@@ -168,6 +168,42 @@ def test_following_error_and_accelerometers_are_one_source() -> None:
     assert np.mean(np.square(off)) < 2.5
 
 
+@pytest.mark.parametrize("noise", [(0.5, 0.5, 0.5), (0.5, 50.0, 0.05), (20.0, 0.05, 0.5)])
+def test_shapes_are_accelerations_whatever_the_noise_of_each_channel(
+    noise: tuple[float, float, float],
+) -> None:
+    """Shapes of three neighbours are within 0.05 of the truth, of unit norm, largest positive."""
+    truth = np.array([[0.9, 0.6, -0.4], [0.5, -1.0, 0.7], [-0.6, 0.5, 1.0]])
+    truth /= np.linalg.norm(truth, axis=1, keepdims=True)
+    modes = [Mode(f, z, 1.0, tuple(s)) for (_, f, z), s in zip(LMS_Y, truth, strict=True)]
+    n = 60_000
+    signals = accelerations(rng(4), modes, n, RATE, 0.0)
+    named = zip("abc", signals, noise, strict=True)
+    log = make_log({f"acc_{c}": x + white(rng(9), own, n, RATE) for c, x, own in named}, RATE)
+    found = identify(log, make_stage(LMS_Y))
+    assert found.names == ("roll", "pitch", "yaw")
+    assert found.shape_channels == ("acc_a", "acc_b", "acc_c")
+    expected = truth * np.sign(np.take_along_axis(truth, np.abs(truth).argmax(1)[:, None], 1))
+    np.testing.assert_allclose(found.shapes, expected, rtol=0, atol=0.05)
+    np.testing.assert_allclose(np.linalg.norm(found.shapes, axis=1), 1.0, rtol=1e-12)
+
+
+def test_the_following_error_counts_as_an_acceleration_in_a_shape() -> None:
+    """Δe of 0.8 beside accelerometers of 1.0 and 0.6 has that part of the shape."""
+    found = identify(joint_log(3, 60_000), make_stage(ROLL))
+    assert found.shape_channels == ("acc_0", "acc_1", "delta_e")
+    np.testing.assert_allclose(found.shapes, np.array([[1.0, 0.6, 0.8]]) / np.sqrt(2), atol=0.03)
+
+
+def test_a_channel_that_shows_nothing_has_no_part_in_a_shape() -> None:
+    """It is missing there, and what is left has unit norm."""
+    seen = accelerations(rng(5), [Mode(105.0, 0.015, 1.0, (0.6, -0.8))], 30_000, RATE, 0.5)
+    log = make_log({"acc_a": seen[0], "acc_b": np.full(30_000, 3.0), "acc_c": seen[1]}, RATE)
+    found = identify(log, make_stage(ROLL))
+    assert found.shape_channels == ("acc_a", "acc_b", "acc_c")
+    np.testing.assert_allclose(found.shapes, [[-0.6, np.nan, 0.8]], atol=0.03)
+
+
 def test_more_channels_make_no_interval_wider_and_none_counts_for_itself() -> None:
     """Three channels are at least as sure as each, and the mode is not counted three times."""
     ratios = []
@@ -531,6 +567,7 @@ def test_the_order_of_channels_does_not_matter() -> None:
         assert one.channels == other.channels
         np.testing.assert_array_equal(one.ln_frequency, other.ln_frequency)
         np.testing.assert_array_equal(one.cov, other.cov)
+        np.testing.assert_array_equal(one.shapes, other.shapes)
 
 
 @pytest.mark.parametrize("factor", [1e-6, 1e4])
@@ -544,6 +581,7 @@ def test_the_unit_of_the_signal_does_not_matter(factor: float) -> None:
     np.testing.assert_allclose(one.ln_damping, other.ln_damping, rtol=0, atol=1e-5)
     np.testing.assert_allclose(np.diag(one.cov), np.diag(other.cov), rtol=1e-3)
     np.testing.assert_allclose(one.snr, other.snr, rtol=1e-3)
+    np.testing.assert_allclose(one.shapes, other.shapes, rtol=0, atol=1e-5)
 
 
 def test_longer_records_are_surer() -> None:

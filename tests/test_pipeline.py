@@ -7,6 +7,8 @@ import shutil
 from dataclasses import dataclass
 from pathlib import Path
 
+import h5py
+import numpy as np
 import pytest
 
 from lmshealth.errors import NothingUsable
@@ -14,7 +16,7 @@ from lmshealth.inference import epochs_to_infer, infer
 from lmshealth.pipeline import RunResult, Settings, run
 from lmshealth.stage import Stage, load_stage
 from lmshealth.tables import COLUMNS
-from tests.signals import write_archive, write_archive_stage, write_log
+from tests.signals import sine, write_archive, write_archive_stage, write_log
 
 N_LOGS = 6
 
@@ -164,6 +166,26 @@ def test_a_manifest_overrides_and_is_part_of_the_key(tmp_path: Path, modes_only:
     again = run(logs, [modes_only], tmp_path / "out")
     assert again.n_remembered == 1
     assert {row["travel_km"] for row in rows(tmp_path / "out" / "modes.csv")} == {"0.0", "777.0"}
+
+
+def test_what_tracking_needs_of_each_log_is_in_the_table(tmp_path: Path, modes_only: Stage) -> None:
+    """Loop error, tuning and shapes are there, also when the store remembers the log."""
+    logs = tmp_path / "logs"
+    with h5py.File(write_log(logs / "a.h5", 1.0, 0), "a") as file:
+        n = file["acc_feed_m_s2"].size
+        file["delta_e_um"] = sine(n, float(file.attrs["sample_rate_hz"]), 10.0, 2.0)
+        file.attrs["servo_id"] = "stiff"
+    write_log(logs / "b.h5", 1.0, 1)
+    for n_remembered in (0, 2):
+        assert run(logs, [modes_only], tmp_path / "out").n_remembered == n_remembered
+        row, *_, without = rows(tmp_path / "out" / "modes.csv")
+        assert float(row["delta_e_below_40hz_um"]) == pytest.approx(np.sqrt(2), rel=1e-3)
+        assert (row["servo_id"], row["shape_acc_feed"], row["shape_delta_e"]) == (
+            "stiff",
+            "1.0",
+            "",
+        )
+        assert without["delta_e_below_40hz_um"] == without["servo_id"] == ""
 
 
 def test_each_log_goes_to_the_first_description_that_takes_it(tmp_path: Path) -> None:

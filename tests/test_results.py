@@ -30,6 +30,8 @@ def two_modes() -> Modes:
         snr=np.array([100.0, 50.0]),
         dispersion=np.ones(2),
         flags=("",) * 2,
+        shape_channels=(),
+        shapes=np.empty((2, 0)),
         lines=(),
         refused=(),
     )
@@ -76,6 +78,8 @@ def test_modes_standard_deviations_are_first_order_of_the_logarithms() -> None:
 def test_modes_refuse_wrong_shapes_and_a_name_twice_in_one_source() -> None:
     """A covariance of another size and a doubled name are refused; another source is another."""
     modes = two_modes()
+    with pytest.raises(ValueError, match=r"shapes has shape \(2, 0\), needed \(2, 1\)"):
+        replace(modes, shape_channels=("acc_0",))
     with pytest.raises(ValueError, match=r"cov has shape \(2, 2\), needed \(4, 4\)"):
         replace(modes, cov=np.eye(2))
     with pytest.raises(ValueError, match="not unique"):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sqlite3
 from datetime import datetime, timedelta, timezone
 from pathlib import Path
 
@@ -11,7 +12,7 @@ import pytest
 from lmshealth.history import Reading
 from lmshealth.logs import Metadata, Refusal
 from lmshealth.results import Line, Modes
-from lmshealth.store import Store, StoreError, result_key
+from lmshealth.store import SCHEMA, Store, StoreError, result_key
 
 
 def reading(n: int = 2, log: str = "a.h5") -> Reading:
@@ -29,6 +30,8 @@ def reading(n: int = 2, log: str = "a.h5") -> Reading:
         snr=np.exp(rng.normal(5, 3, n)),
         dispersion=np.ones(n),
         flags=("",) * n,
+        shape_channels=("acc_x", "acc_y", "delta_e"),
+        shapes=rng.choice([np.nan, 1 / 3, -0.1], (n, 3)),
         lines=(Line(50.0 + 1e-13, 1 / 3, "m/s²", "mains", "acc_x"),),
         refused=(Refusal(log, "not-excited", "näher 126.4 Hz", mode="yaw"),),
     )
@@ -41,7 +44,7 @@ def reading(n: int = 2, log: str = "a.h5") -> Reading:
         baseline=True,
         description="small",
     )
-    return Reading(log, "d" * 64, metadata, modes)
+    return Reading(log, "d" * 64, metadata, modes, 1e-6 / 3)
 
 
 @pytest.fixture
@@ -62,14 +65,15 @@ def test_a_reading_comes_back_bit_for_bit(url: str, n: int) -> None:
     reader.close()
     assert isinstance(got, Reading)
     assert (got.log, got.digest, got.metadata) == (put.log, put.digest, put.metadata)
+    assert got.loop_error == put.loop_error
     assert got.metadata.recorded_at is not None
     assert got.metadata.recorded_at.utcoffset() == timedelta(hours=1)
-    for name in ("ln_frequency", "ln_damping", "cov", "snr"):
+    for name in ("ln_frequency", "ln_damping", "cov", "snr", "dispersion", "shapes"):
         one, other = getattr(got.modes, name), getattr(put.modes, name)
         assert one.dtype == other.dtype
         assert one.shape == other.shape
         assert one.tobytes() == other.tobytes(), name
-    for name in ("names", "sources", "channels", "lines", "refused"):
+    for name in ("names", "sources", "channels", "shape_channels", "lines", "refused"):
         assert getattr(got.modes, name) == getattr(put.modes, name)
 
 
@@ -82,6 +86,7 @@ def test_missing_metadata_stay_missing(url: str) -> None:
     store.close()
     assert isinstance(got, Reading)
     assert got.metadata == Metadata()
+    assert got.loop_error is None
 
 
 def test_refusals_come_back_under_the_present_name(url: str) -> None:
@@ -110,6 +115,18 @@ def test_what_is_not_there_is_none(url: str) -> None:
     """An unknown key is no error."""
     store = Store(url)
     assert store.get("nothing", "a.h5") is None
+    store.close()
+
+
+def test_what_an_older_version_kept_is_not_read(url: str, tmp_path: Path) -> None:
+    """Rows of an older layout stay where they are, and their logs are done again."""
+    with sqlite3.connect(tmp_path / "store.sqlite") as older:
+        older.execute(f"CREATE TABLE identified_{SCHEMA - 1} (key TEXT, log TEXT, outcome TEXT)")
+        older.execute(f"INSERT INTO identified_{SCHEMA - 1} VALUES ('k', 'a.h5', '{{}}')")
+    store = Store(url)
+    assert store.get("k", "a.h5") is None
+    store.put("k", "a.h5", reading())
+    assert isinstance(store.get("k", "a.h5"), Reading)
     store.close()
 
 

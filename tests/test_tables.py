@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from datetime import UTC, datetime
 
 import numpy as np
@@ -13,7 +14,7 @@ from lmshealth.logs import Metadata, Refusal
 from lmshealth.results import Health, Judgement, Line, Modes, Prognosis
 from lmshealth.stage import Stage, load_stage
 from lmshealth.summary import Assessment
-from lmshealth.tables import COLUMNS, all_tables, frame, lines_rows, modes_rows
+from lmshealth.tables import COLUMNS, all_tables, frame, modes_rows
 from lmshealth.tracks import Effect, History, Track
 from tests.signals import write_archive_stage
 
@@ -35,6 +36,8 @@ def two_modes(coupled: float = 2e-7) -> Modes:
         snr=np.array([100.0, 50.0]),
         dispersion=np.ones(2),
         flags=("",) * 2,
+        shape_channels=("acc_x", "acc_y"),
+        shapes=np.array([[1.0, np.nan], [-0.6, 0.8]]),
         lines=(Line(50.0, 0.1, "m/s²", "mains", "acc_x"),),
         refused=(),
     )
@@ -111,34 +114,40 @@ def test_empty_tables_have_their_columns() -> None:
 
 def test_modes_leave_with_units_in_their_names() -> None:
     """Hz, km and °C stand in the table; the std of f is f times the std of ln f."""
-    metadata = Metadata("test-A", WHEN, 123_400.0, {"temperature_c": 21.5})
-    table = frame("modes", modes_rows("a.h5", metadata, two_modes()))
+    covariates = {"temperature_c": 21.5, "payload_kg": 4.0, "position_mm": -20.0}
+    metadata = Metadata("test-A", WHEN, 123_400.0, covariates, servo_id="stiff")
+    reading = Reading("a.h5", "d", metadata, two_modes(), 1.5e-6)
+    table = frame(COLUMNS["modes"], modes_rows(reading))
     row = table.iloc[0]
     assert (row["mode"], row["source"], row["channel"]) == ("roll", "acc", "acc_x")
     assert row["recorded_at"] == "2026-03-01T08:00:00+00:00"
     assert row["travel_km"] == pytest.approx(123.4)
     assert row["temperature_c"] == 21.5
+    assert (row["payload_kg"], row["position_mm"], row["servo_id"]) == (4.0, -20.0, "stiff")
+    assert row["delta_e_below_40hz_um"] == pytest.approx(1.5)
     assert row["frequency_std_hz"] == pytest.approx(62.0e-3)
     assert row["damping_ratio_std"] == pytest.approx(0.02 * 0.1)
 
 
 def test_unknown_metadata_are_empty_cells() -> None:
     """A log that says nothing about itself leaves empty cells, never a text like nan."""
-    text = frame("modes", modes_rows("a.h5", Metadata(), two_modes())).to_csv(index=False)
-    assert text.splitlines()[1].startswith("a.h5,,,,,roll,acc,")
+    reading = Reading("a.h5", "d", Metadata(), two_modes())
+    text = frame(COLUMNS["modes"], modes_rows(reading)).to_csv(index=False)
+    assert text.splitlines()[1].startswith("a.h5,,,,,,,,,roll,acc,")
     assert "nan" not in text.lower()
 
 
-def test_lines_have_the_keys_of_the_contract() -> None:
-    """A line is told by frequency, amplitude with unit, kind and channel."""
-    (row,) = lines_rows(two_modes().lines)
-    assert row == {
-        "frequency_hz": 50.0,
-        "amplitude": 0.1,
-        "unit": "m/s²",
-        "kind": "mains",
-        "channel": "acc_x",
-    }
+def test_shapes_have_a_column_per_channel_after_all_others() -> None:
+    """Channels of any log of the table; an empty cell where a log or a mode has no such part."""
+    alone = replace(two_modes(), shape_channels=("delta_e",), shapes=np.ones((2, 1)))
+    both = {"a": two_modes(), "b": alone}
+    readings = [Reading(log, "d", Metadata(), modes) for log, modes in both.items()]
+    table = all_tables(readings, [], [])["modes"]
+    own = ["shape_acc_x", "shape_acc_y", "shape_delta_e"]
+    assert list(table.columns) == [*COLUMNS["modes"].split(), *own]
+    nan = np.nan
+    expected = [[1.0, nan, nan], [-0.6, 0.8, nan], [nan, nan, 1.0], [nan, nan, 1.0]]
+    np.testing.assert_array_equal(table[own], expected)
 
 
 def test_covariances_between_modes_are_listed_once_and_zeros_left_out() -> None:
@@ -230,7 +239,8 @@ def test_refusals_are_rows() -> None:
 def test_the_columns_are_those_of_the_contract() -> None:
     """Every column of the public contract is in its table."""
     wanted = {
-        "modes": "log stage recorded_at travel_km temperature_c mode source frequency_hz "
+        "modes": "log stage recorded_at travel_km temperature_c payload_kg position_mm servo_id "
+        "delta_e_below_40hz_um mode source frequency_hz "
         "frequency_std_hz damping_ratio damping_ratio_std correlation_f_zeta snr dispersion "
         "flags",
         "events": "stage recorded_at travel_km kind mode source size std evidence",

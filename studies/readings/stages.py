@@ -14,6 +14,7 @@ from scipy.stats import mannwhitneyu, spearmanr
 
 from lmshealth.following import read_error
 from lmshealth.logs import Log
+from lmshealth.looks import error_row
 from lmshealth.magnitudes import (
     Band,
     Growth,
@@ -24,7 +25,6 @@ from lmshealth.magnitudes import (
 )
 from lmshealth.readers import read_log
 from lmshealth.stage import load_stage
-from lmshealth.tables import error_row
 from models.stages import STAGES
 from models.velocities import Experiment, drive_velocities
 from studies.paper_tables.tables import FILES, PRINTED_GROWING, printed
