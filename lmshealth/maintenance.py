@@ -37,11 +37,12 @@ def read_maintenance(folder: Path) -> tuple[Action, ...]:
     """
     actions: list[Action] = []
     for path in sorted(folder.rglob("maintenance.csv")):
-        actions += _read(path)
+        actions += read_actions(path)
     return tuple(sorted(actions, key=lambda action: action.recorded_at))
 
 
-def _read(path: Path) -> list[Action]:
+def read_actions(path: Path) -> list[Action]:
+    """Read one table of maintenance, as `read_maintenance` does."""
     try:
         table = pd.read_csv(path, dtype=str, keep_default_na=False)
     except (OSError, ValueError) as error:
@@ -65,9 +66,7 @@ def _read(path: Path) -> list[Action]:
     return actions
 
 
-def maintenance_notes(
-    actions: Sequence[Action], moments: Sequence[datetime | None]
-) -> list[str]:
+def maintenance_notes(actions: Sequence[Action], moments: Sequence[datetime | None]) -> list[str]:
     """Say what the reader of a report must know of the work on a machine.
 
     Parameters

@@ -64,9 +64,7 @@ class Regressor:
     unknown: FloatArray
 
 
-def regressors(
-    covariates: Mapping[str, FloatArray], stage: Stage | None
-) -> tuple[Regressor, ...]:
+def regressors(covariates: Mapping[str, FloatArray], stage: Stage | None) -> tuple[Regressor, ...]:
     """Take the covariates that are asked for and known in at least one log.
 
     Without a stage every covariate present is taken, about its median. Keys are column names,
