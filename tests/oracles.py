@@ -13,7 +13,6 @@ from scipy.linalg import cho_factor, cho_solve
 from lmshealth.arrays import FloatArray
 from lmshealth.tracks import History, Series
 
-
 # The model of a mode: prior standard deviations, and the walk of ln damping in a life.
 LEVEL_STD, DAMPING_STD, DAMPING_WALK = 0.1, 1.0, 0.5
 BIAS = (0.005, 0.2)
@@ -75,6 +74,11 @@ def _unknown(history: History, known: Known, k: int) -> float:
 def _offset(history: History, name: str, reference: float, k: int) -> float:
     value = float(history.covariates[name][k])
     return 0.0 if np.isnan(value) else value - reference
+
+
+def _first(table: FloatArray) -> float:
+    """Give the first value that is there, log by log, series by series."""
+    return next(float(value) for row in table for value in row if not np.isnan(value))
 
 
 def _reference(history: History, mode: str) -> Series:
@@ -159,19 +163,7 @@ class Textbook:
                 q[level, rate] = q[rate, level] = bend * tick**2 / 2 + anew * tick
                 q[rate, rate] = bend * tick + anew
                 q[at["damping", i], at["damping", i]] = DAMPING_WALK**2 / life * tick
-        for j, step in enumerate(history.steps):
-            if step.first != k:
-                continue
-            for i in history.modes:
-                for part, moved, std in zip(
-                    ("jump f", "jump z"), ("level", "damping"), JUMPS[step.kind], strict=True
-                ):
-                    pushed = [at[part, j, i]]
-                    if step.kind in ("step", "regreasing", "reset"):
-                        pushed.append(at[moved, i])
-                    for a in pushed:
-                        for c in pushed:
-                            q[a, c] += std**2
+        q += self._begun(k)
         if k in history.baselines:
             copy = np.eye(len(at))
             for i in history.modes:
@@ -179,6 +171,22 @@ class Textbook:
                 copy[at["base", i], at["level", i]] = 1
             f, q = copy @ f, copy @ q @ copy.T
         return f, q
+
+    def _begun(self, k: int) -> FloatArray:
+        """Give the noise of the steps that begin at log k."""
+        q = np.zeros((len(self.at), len(self.at)))
+        for j, step in enumerate(self.history.steps):
+            if step.first != k:
+                continue
+            for i in self.history.modes:
+                for part, moved, std in zip(
+                    ("jump f", "jump z"), ("level", "damping"), JUMPS[step.kind], strict=True
+                ):
+                    pushed = [self.at[part, j, i]]
+                    if step.kind in ("step", "regreasing", "reset"):
+                        pushed.append(self.at[moved, i])
+                    q[np.ix_(pushed, pushed)] += std**2
+        return q
 
     def seen(self, k: int) -> FloatArray:
         """Give the measurement matrix of log k, all rows."""
@@ -251,56 +259,67 @@ def filterpy_loop(history: History, wander: Wander, known: Known) -> Followed:
     return Followed(*(np.array(part) for part in zip(*out, strict=True)))
 
 
-def batch(history: History, wander: Wander, known: Known, *, smoothed: bool = False) -> Followed:
-    """Condition the whole joint Gaussian on the logs so far, or on all, without any recursion.
+def _levels(history: History, wander: Wander, known: Known) -> tuple[np.ndarray, np.ndarray]:
+    """Covariance of ln f, and of ln ζ, of one mode over all logs, ``(n, n)`` each.
 
-    With t the ticks since the first log, ln f of a mode has the covariance
-    σ² + σ_r² t t' + walk min(t, t') + bend min² (3 max − min)/6 + Σ jump² where both come after it;
-    the data add covariates, biases, jumps of what is read, and noise.
+    With t the ticks since the first log, that of ln f is
+    σ² + σ_r² t t' + walk min(t, t') + bend min² (3 max − min)/6 + Σ jump² where both come after it.
     """
-    n, m, r = len(history.logs), len(history.modes), len(history.series)
-    # Wide priors under sharp estimates take eleven digits: the sums are made with extended precision.
     t = (history.clock() - history.clock()[0]).astype(np.longdouble) / known.life
     low, high = np.minimum.outer(t, t), np.maximum.outer(t, t)
-    after = [np.arange(n) >= step.first for step in history.steps]
     level = LEVEL_STD**2 + wander.rate**2 * np.outer(t, t) + wander.level**2 * low
     level += wander.bend**2 * low**2 * (3 * high - low) / 6
     damping = DAMPING_STD**2 + DAMPING_WALK**2 * low
     for k in known.reopened:
         since = np.maximum(t - t[k - 1], 0.0)
         level += wander.rate**2 * np.outer(since, since)
-    for step, then in zip(history.steps, after, strict=True):
+    for step in history.steps:
         if step.kind in ("step", "regreasing", "reset"):
+            then = np.arange(t.size) >= step.first
             level += JUMPS[step.kind][0] ** 2 * np.outer(then, then)
             damping += JUMPS[step.kind][1] ** 2 * np.outer(then, then)
+    return level, damping
+
+
+def _readings(history: History, known: Known, a: Series, c: Series, part: int) -> np.ndarray:
+    """Covariance of how two series of a mode are read wrongly in common, ``(n, n)``."""
+    n = len(history.logs)
     read = np.zeros((n, n), dtype=np.longdouble)
-    for name, reference, std, curvature in known.covariates:
+    for name, reference, std, curvature in known.covariates if part == 0 else ():
         offset = np.array([_offset(history, name, reference, k) for k in range(n)], np.longdouble)
         read += std**2 * np.outer(offset, offset) + curvature**2 * np.outer(offset**2, offset**2)
+    if a == c and a != _reference(history, a.mode):
+        read += BIAS[part] ** 2
+    for step in history.steps:
+        one_sensor = step.kind == "sensor" and {a.source, c.source} == {step.source}
+        if step.kind == "servo" or one_sensor:
+            there = step.there.astype(float)
+            read += JUMPS[step.kind][part] ** 2 * np.outer(there, there)
+    return read
+
+
+def batch(history: History, wander: Wander, known: Known, *, smoothed: bool = False) -> Followed:
+    """Condition the whole joint Gaussian on the logs so far, or on all, without any recursion.
+
+    Wide priors under sharp estimates cost eleven digits: sums are made with extended precision.
+    """
+    n, m, r = len(history.logs), len(history.modes), len(history.series)
     # Data in the order (log, [ln f, ln ζ] of all series); truth in the order (log, part, mode).
     total = np.zeros((n, 2, r, n, 2, r), dtype=np.longdouble)
     cross = np.zeros((n, 2, m, n, 2, r), dtype=np.longdouble)
     own = np.zeros((n, 2, m, n, 2, m), dtype=np.longdouble)
     centre, prior = np.zeros((n, 2, r)), np.zeros((n, 2, m))
     values = np.stack([history.ln_frequency, history.ln_damping], axis=1)
-    for part, (truth, bias) in enumerate(zip((level, damping), BIAS, strict=True)):
+    for part, truth in enumerate(_levels(history, wander, known)):
         for i, mode in enumerate(history.modes):
-            series = [a for a, one in enumerate(history.series) if one.mode == mode]
-            first = [v for row in values[:, part, series] for v in row if not np.isnan(v)][0]
+            series = [(a, one) for a, one in enumerate(history.series) if one.mode == mode]
+            first = _first(values[:, part, [a for a, _ in series]])
             own[:, part, i, :, part, i], prior[:, part, i] = truth, first
-            for a in series:
+            for a, one in series:
                 centre[:, part, a], cross[:, part, i, :, part, a] = first, truth
-                for c in series:
-                    total[:, part, a, :, part, c] += truth + (read if part == 0 else 0.0)
-                    if a == c and history.series[a] != _reference(history, mode):
-                        total[:, part, a, :, part, c] += bias**2
-                    for step in history.steps:
-                        sources = {history.series[a].source, history.series[c].source}
-                        here = step.kind == "sensor" and sources == {step.source}
-                        if step.kind == "servo" or here:
-                            there = step.there.astype(float)
-                            jump = JUMPS[step.kind][part]
-                            total[:, part, a, :, part, c] += jump**2 * np.outer(there, there)
+                for c, other in series:
+                    read = _readings(history, known, one, other, part)
+                    total[:, part, a, :, part, c] = truth + read
     total = total.reshape(n * 2 * r, -1)
     for k in range(n):
         _, noise, rows = _data(history, known, wander, k)
@@ -311,7 +330,7 @@ def batch(history: History, wander: Wander, known: Known, *, smoothed: bool = Fa
     for k in range(n):
         use = np.flatnonzero(~np.isnan(off) & (smoothed | (np.arange(off.size) < 2 * r * (k + 1))))
         solved, log_det = _solve(total[np.ix_(use, use)], np.c_[off[use], cross[:, use].T])
-        mean = (prior + cross[:, use] @ solved[:, 0]).reshape(n, 2, m)
+        mean = prior + cross[:, use] @ solved[:, 0]
         cov = own - cross[:, use] @ solved[:, 1:]
         base = max([b for b in history.baselines if b <= k], default=0)
         told = np.zeros((3, m, n, 2, m))
@@ -320,8 +339,14 @@ def batch(history: History, wander: Wander, known: Known, *, smoothed: bool = Fa
             told[2, i, base, 0, i] -= 1
         flat = told.reshape(3 * m, -1)
         evidence = -0.5 * (off[use] @ solved[:, 0] + log_det + use.size * np.log(2 * np.pi))
-        said = (flat @ mean.ravel()).reshape(3, m)
-        out.append((said, (flat @ cov @ flat.T).reshape(3, m, 3, m), evidence, np.nan))
+        out.append(
+            (
+                (flat @ mean).reshape(3, m),
+                (flat @ cov @ flat.T).reshape(3, m, 3, m),
+                evidence,
+                np.nan,
+            )
+        )
     return Followed(*(np.array(part, dtype=float) for part in zip(*out, strict=True)))
 
 

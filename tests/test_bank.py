@@ -69,7 +69,7 @@ def run(history: History, stage: Stage, grid: Settings | None = None) -> list[tu
 
 
 def told(history: History, stage: Stage, wander: Wander) -> Followed:
-    """What the bank says under one setting, as the oracles say it."""
+    """Tell what the bank says under one setting, as the oracles say it."""
     space = state_space(history, stage, history.steps)
     sources = Filter(space, ()).sources
     m = space.n_modes
@@ -171,7 +171,7 @@ def test_evidence_of_a_drift_is_that_of_one_group_over_the_other(stage: Stage) -
 
 
 def test_pruning_changes_next_to_nothing(stage: Stage) -> None:
-    """Dropping what carries under 1e-5 of its group's best moves nothing by a hundredth of a std.
+    """Dropping what carries under 1e-5 of its group's best moves nothing by a thousandth of a std.
 
     Negative control: dropping all but the likeliest does.
     """
@@ -193,8 +193,8 @@ def test_pruning_changes_next_to_nothing(stage: Stage) -> None:
         least = min(least, banks[1].weight.size)
         healthy = banks[1].settings.healthy
         assert healthy.any() and not healthy.all()
-    print(moved.max(), narrowed.max(), poorest.max(), least)
-    assert max(moved.max(), narrowed.max()) < 0.01 < poorest.max()
+    assert max(moved.max(), narrowed.max()) < 1e-3
+    assert poorest.max() > 0.1
     assert least < settings(1).rate_std.size / 2
 
 
@@ -228,7 +228,7 @@ def test_copies_of_a_bank_are_its_own(stage: Stage) -> None:
 
 
 def test_what_is_doubted_is_hardly_believed(stage: Stage) -> None:
-    """A doubted mode moves the state by what an error 20 times as large would, at a cost."""
+    """A doubted log moves the state by a hundredth of what it did at most, at a cost."""
     history = rough_history(np.random.default_rng(8))
     filters = Filter(state_space(history, stage), history.baselines)
     filters.grid = one(SETTINGS[0], ("acc",))
@@ -239,10 +239,10 @@ def test_what_is_doubted_is_hardly_believed(stage: Stage) -> None:
         filters.move(at, 1)
     before = plain.mean[0].copy()
     surprise = filters.see(plain, 1)
-    filters.see(doubted, 1, np.array([True, False, True, False]))
+    filters.see(doubted, 1, np.full(4, True))
     level = filters.space.level.start
     moved = np.abs(plain.mean[0] - before)[level], np.abs(doubted.mean[0] - before)[level]
-    assert moved[1] < 0.02 * moved[0]
+    assert moved[1] < 0.01 * moved[0]
     assert surprise.rows.tolist() == [0, 1, 2, 3]
     assert doubted.log_weight[0] < plain.log_weight[0]
 
