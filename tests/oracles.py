@@ -131,9 +131,7 @@ class Textbook:
                 ("level", history.ln_frequency, LEVEL_STD),
                 ("damping", history.ln_damping, DAMPING_STD),
             ):
-                x[self.at[part, i]] = [v for row in table[:, own] for v in row if not np.isnan(v)][
-                    0
-                ]
+                x[self.at[part, i]] = _first(table[:, own])
                 p[self.at[part, i]] = std**2
             p[self.at["rate", i]] = (self.wander.rate / self.known.life) ** 2
             for name, _, std, curvature in self.known.covariates:
