@@ -206,7 +206,7 @@ class Filter:
         history = space.history
         self.values = np.hstack([history.ln_frequency, history.ln_damping])
         self.there = np.isfinite(self.values)
-        self.whole = self.there.all(axis=1)
+        self.whole: BoolArray = np.asarray(self.there.all(axis=1))
         self.all = np.arange(self.values.shape[1])
         self.sources = tuple(dict.fromkeys(one.source for one in history.series))
         place = [self.sources.index(one.source) for one in history.series]
@@ -275,7 +275,7 @@ class Filter:
 
         Rows that are doubted, ``(2 n_series,)``, are taken for outliers: hardly believed.
         """
-        rows = self.all if self.whole[k] else np.flatnonzero(self.there[k])
+        rows: np.ndarray = self.all if self.whole[k] else np.flatnonzero(self.there[k])
         matrix, value = self.space.matrix[k, rows], self.values[k, rows]
         if value.size == 0:
             return Surprise(np.array([], dtype=int), np.array([]), 0.0)
@@ -286,7 +286,7 @@ class Filter:
         i = self.all[: value.size]
         spread[:, i, i] += self.extra[k, rows]
         if doubted is not None:
-            outlying = i[doubted[rows]]
+            outlying = np.flatnonzero(doubted[rows])
             spread[:, outlying, outlying] *= _OUTLIER_REACH**2
             bank.log_weight += np.log(_OUTLIERS)
         root = np.linalg.cholesky(spread)

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import click
 
 from lmshealth import terminal
+from lmshealth.commands import COMMANDS
 from lmshealth.errors import BadLog, LmshealthError
 from lmshealth.logs import Log, Refusal
 from lmshealth.magnitudes import find_growth
@@ -439,3 +440,7 @@ def _tell(result: RunResult) -> None:
         )
         click.echo(f"{judgement.stage}: {judgement.verdict}{sure}. {judgement.why}")
     click.echo(f"Report: {result.index}")
+
+
+for _command in COMMANDS:
+    main.add_command(_command)

@@ -1,23 +1,28 @@
-"""Histories: the modal estimates of one stage put in order."""
+"""Histories: the modal estimates of one machine put in order, each given to its mode."""
 
 from __future__ import annotations
 
 from bisect import bisect_right
 from collections.abc import Sequence
 from dataclasses import dataclass
+from datetime import UTC, datetime
 
 import numpy as np
 
 from lmshealth.arrays import FloatArray
+from lmshealth.association import Association, Estimates, associate
 from lmshealth.errors import NotEnoughData
 from lmshealth.logs import Metadata, Refusal
+from lmshealth.maintenance import RESETS, Action
 from lmshealth.results import Modes
 from lmshealth.stage import Stage
-from lmshealth.tracks import History
+from lmshealth.statespace import regressors
+from lmshealth.tracks import History, Series, Step, StepKind
 
-# Between two logs ln f moves by temperature and wear, but not by more than this.
-_JUMP = 0.02
-_JUMP_SIGMAS = 6.0
+# Sources in the order in which they stand where a mode has several.
+_SOURCES = ("joint", "acc", "frf", "delta_e")
+_KINDS: dict[str, StepKind] = {"regrease": "regreasing", "servo": "servo", "sensor": "sensor"}
+_NO_MOMENT = datetime.max.replace(tzinfo=UTC)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -36,7 +41,7 @@ class Reading:
         Its modal estimates.
     loop_error : float or None
         RMS of the following error from 1 to 40 Hz in m, see `loop_error` of `following`; None
-        where it was not measured.
+        where the log does not tell.
     """
 
     log: str
@@ -48,27 +53,34 @@ class Reading:
 
 def in_order(readings: Sequence[Reading]) -> tuple[Reading, ...]:
     """Sort readings by the moment of recording, then by name."""
-    return tuple(sorted(readings, key=lambda r: (r.metadata.recorded_at, r.log)))
+    return tuple(sorted(readings, key=lambda r: (r.metadata.recorded_at or _NO_MOMENT, r.log)))
 
 
-def build_history(readings: Sequence[Reading], stage: Stage) -> tuple[History, list[Refusal]]:
-    """Line up the tracked modes of one machine.
+def build_history(
+    readings: Sequence[Reading], stage: Stage | None = None, actions: Sequence[Action] = ()
+) -> tuple[History, list[Refusal]]:
+    """Line up the modes of one machine.
 
     Parameters
     ----------
     readings : sequence of Reading
-        Logs of one machine in any order, with identity, moment and odometer.
-    stage : Stage
-        Says which modes are tracked.
+        Logs of one machine in any order, with identity and moment; the odometer is the clock where
+        every log has it, else the time is.
+    stage : Stage, optional
+        Says which modes are tracked; without it all are, and those without a name are named by
+        their frequency.
+    actions : sequence of Action
+        What was done to the machine. Work on guide or mount opens a new baseline; a regreasing, a
+        retuning and a new sensor are steps, as is every change of ``servo_id``.
 
     Returns
     -------
     history : History
-        In the order of recording. Its baseline is the first log that the manifest declares one,
-        else the first log.
+        In the order of recording. Its first baseline is the first log that the manifest declares
+        one, else the first log.
     refused : list of Refusal
-        Logs whose odometer contradicts the others, which are left out, and jumps of a frequency
-        that no second log confirms, which are missing.
+        Logs whose odometer contradicts the others, which are left out, and estimates that cannot
+        be given to a mode, which are missing.
 
     Raises
     ------
@@ -76,23 +88,42 @@ def build_history(readings: Sequence[Reading], stage: Stage) -> tuple[History, l
         If there is no reading.
     """
     if not readings:
-        raise NotEnoughData(f"{stage.name}: no usable log")
+        name = "" if stage is None else f"{stage.name}: "
+        raise NotEnoughData(f"{name}no usable log")
     ordered, refused = _without_contradictions(in_order(readings))
-    tracked = [mode.name for mode in stage.modes if mode.tracked]
-    found = {name for reading in ordered for name in reading.modes.names}
-    modes = tuple(name for name in tracked if name in found)
-    estimates = _estimates(ordered, modes)
-    refused += _refuse_unconfirmed(ordered, modes, estimates)
+    travel = np.array(
+        [np.nan if r.metadata.travel is None else r.metadata.travel for r in ordered], dtype=float
+    )
+    moments = tuple(r.metadata.recorded_at or _NO_MOMENT for r in ordered)
+    has_odometer = bool(np.isfinite(travel).all())
+    clock = travel if has_odometer else np.array([moment.timestamp() for moment in moments])
+    covariates = _covariates(ordered)
+    steps = _steps(ordered, actions)
+    resets = [step.first for step in steps if step.kind == "reset"]
+    regressed = regressors(covariates, stage)
+    estimates = _estimates(ordered, stage)
+    found = associate(
+        estimates,
+        clock,
+        offsets=np.array([one.values for one in regressed]).reshape(-1, len(ordered)).T,
+        prior_std=np.array([one.prior_std for one in regressed]),
+        jumps=[step.first for step in steps],
+    )
+    refused += _doubts(ordered, estimates, found)
+    modes, series, columns = _line_up(estimates, found, stage)
     declared = [k for k, reading in enumerate(ordered) if reading.metadata.baseline]
     history = History(
         stage=str(ordered[0].metadata.stage),
         logs=tuple(reading.log for reading in ordered),
-        recorded_at=tuple(r.metadata.recorded_at for r in ordered if r.metadata.recorded_at),
-        travel=np.array([reading.metadata.travel for reading in ordered], dtype=float),
-        covariates=_covariates(ordered),
+        recorded_at=moments,
+        travel=travel if has_odometer else np.full_like(travel, np.nan),
+        covariates=covariates,
         modes=modes,
-        **estimates,
-        baseline=declared[0] if declared else 0,
+        series=series,
+        **columns,
+        loop_error=np.array([r.loop_error or np.nan for r in ordered], dtype=float),
+        baselines=_baselines(declared, resets, len(ordered)),
+        steps=steps,
     )
     return history, refused
 
@@ -104,6 +135,8 @@ def _without_contradictions(
 
     One mistyped odometer contradicts all logs after or before it; it is the odd one out that goes.
     """
+    if any(reading.metadata.travel is None for reading in ordered):
+        return ordered, []
     travel = [float(reading.metadata.travel or 0.0) for reading in ordered]
     # Longest non-decreasing subsequence: the lowest end of a run of each length, and its log.
     ends: list[float] = []
@@ -131,53 +164,6 @@ def _without_contradictions(
     return tuple(ordered[k] for k in sorted(kept)), refused
 
 
-def _refuse_unconfirmed(
-    ordered: Sequence[Reading], modes: tuple[str, ...], estimates: dict[str, FloatArray]
-) -> list[Refusal]:
-    """Take out jumps of a frequency that no second log confirms.
-
-    A peak under a wrong name looks like a sudden loss. A real one is there in the next log too, so
-    that a jump costs one log and no more. Only earlier logs are looked at.
-    """
-    ln_f, m = estimates["ln_frequency"], len(modes)
-    variance = np.einsum("kii->ki", estimates["cov"])[:, :m]
-    refused: list[Refusal] = []
-    places: list[tuple[int, int]] = []
-    for i, mode in enumerate(modes):
-        accepted: list[int] = []
-        doubted: int | None = None
-        for k in np.flatnonzero(np.isfinite(ln_f[:, i])).tolist():
-            recent = accepted[-3:]
-            near = not recent or _agree(ln_f[k, i], variance[k, i], ln_f[recent, i])
-            confirmed = doubted is not None and _agree(
-                ln_f[k, i], variance[k, i] + variance[doubted, i], ln_f[[doubted], i]
-            )
-            if near or confirmed:
-                # A confirmed jump begins a new level: the logs before it are no measure any more.
-                accepted = [*(accepted if near else []), k]
-                doubted = None
-                continue
-            doubted = k
-            expected = float(np.exp(ln_f[recent[-1], i]))
-            detail = (
-                f"{np.exp(ln_f[k, i]):.5g} Hz after {expected:.5g} Hz: a jump that the log before "
-                "does not show; it is believed once the next log confirms it"
-            )
-            refused.append(Refusal(log=ordered[k].log, mode=mode, reason="jump", detail=detail))
-            places.append((k, i))
-    # Only now, because a doubted value is what the next log is compared with.
-    for k, i in places:
-        ln_f[k, i] = estimates["ln_damping"][k, i] = np.nan
-        for row in (i, m + i):
-            estimates["cov"][k, row], estimates["cov"][k, :, row] = np.nan, np.nan
-    return refused
-
-
-def _agree(value: float, variance: float, others: FloatArray) -> bool:
-    reach = max(_JUMP_SIGMAS * float(np.sqrt(variance)), _JUMP)
-    return bool(np.min(np.abs(value - others)) <= reach)
-
-
 def _covariates(ordered: Sequence[Reading]) -> dict[str, FloatArray]:
     names = sorted({name for reading in ordered for name in reading.metadata.covariates})
     return {
@@ -186,17 +172,140 @@ def _covariates(ordered: Sequence[Reading]) -> dict[str, FloatArray]:
     }
 
 
-def _estimates(ordered: Sequence[Reading], modes: tuple[str, ...]) -> dict[str, FloatArray]:
-    n, m = len(ordered), len(modes)
-    ln_f, ln_zeta = np.full((n, m), np.nan), np.full((n, m), np.nan)
-    cov = np.full((n, 2 * m, 2 * m), np.nan)
-    for k, reading in enumerate(ordered):
-        own = reading.modes
-        pairs = [(modes.index(name), i) for i, name in enumerate(own.names) if name in modes]
+def _steps(ordered: Sequence[Reading], actions: Sequence[Action]) -> tuple[Step, ...]:
+    """Say what is known to have happened between the logs."""
+    moments = [reading.metadata.recorded_at for reading in ordered]
+    steps: list[Step] = []
+    ids = np.array([reading.metadata.servo_id or "" for reading in ordered])
+    known = [name for name in dict.fromkeys(ids.tolist()) if name]
+    for name in known[1:]:
+        there = ids == name
+        steps.append(Step("servo", int(np.argmax(there)), there, name=name))
+    retuned = {step.first for step in steps}
+    for action in sorted(actions, key=lambda action: action.recorded_at):
+        later = np.array([m is not None and m >= action.recorded_at for m in moments])
+        first = int(np.argmax(later))
+        # Before the first log and after the last nothing is seen of it.
+        if not later.any() or first == 0:
+            continue
+        kind: StepKind = "reset" if action.action in RESETS else _KINDS[action.action]
+        # A retuning that comes with a new servo_id is one step, not two.
+        if kind == "servo" and first in retuned:
+            continue
+        name = action.recorded_at.date().isoformat()
+        steps.append(Step(kind, first, np.arange(len(ordered)) >= first, name=name))
+    return tuple(sorted(steps, key=lambda step: step.first))
+
+
+def _baselines(declared: list[int], resets: list[int], n_logs: int) -> tuple[int, ...]:
+    """Give the log at which each baseline begins: the first declared one since the last reset."""
+    begins = [0, *resets]
+    ends = [*resets, n_logs]
+    chosen = [
+        next((k for k in declared if begin <= k < end), begin)
+        for begin, end in zip(begins, ends, strict=True)
+    ]
+    return tuple(dict.fromkeys(chosen))
+
+
+def _estimates(ordered: Sequence[Reading], stage: Stage | None) -> list[Estimates]:
+    """Give what each log says of the modes that are tracked, with shapes over all channels."""
+    tracked = None if stage is None else {mode.name for mode in stage.modes if mode.tracked}
+    channels = list(dict.fromkeys(c for r in ordered for c in r.modes.shape_channels))
+    estimates = []
+    for reading in ordered:
+        modes = reading.modes
+        named = [_named(modes, i, stage) for i in range(len(modes.names))]
+        kept = np.array([i for i, n in enumerate(named) if tracked is None or n in tracked], int)
+        shapes = np.full((kept.size, len(channels)), np.nan)
+        places = [channels.index(channel) for channel in modes.shape_channels]
+        shapes[:, places] = modes.shapes[kept]
+        both = np.concatenate([kept, kept + len(modes.names)])
+        estimates.append(
+            Estimates(
+                names=tuple(named[i] for i in kept),
+                sources=tuple(modes.sources[i] for i in kept),
+                ln_frequency=modes.ln_frequency[kept],
+                ln_damping=modes.ln_damping[kept],
+                cov=modes.cov[np.ix_(both, both)],
+                shapes=shapes,
+            )
+        )
+    return estimates
+
+
+def _named(modes: Modes, i: int, stage: Stage | None) -> str:
+    """Name of an estimate; without one, that of the nearest mode of the stage within its search."""
+    if modes.names[i] or stage is None:
+        return modes.names[i]
+    away = {
+        mode.name: abs(float(modes.frequency[i]) / mode.frequency_hz - 1)
+        for mode in stage.modes
+        if mode.tracked and abs(float(modes.frequency[i]) / mode.frequency_hz - 1) <= mode.search
+    }
+    return min(away, key=lambda name: away[name], default="")
+
+
+def _doubts(
+    ordered: Sequence[Reading], estimates: Sequence[Estimates], found: Association
+) -> list[Refusal]:
+    """Tell which estimates are given to no mode. Of a jump the tracker decides."""
+    return [
+        Refusal(
+            log=ordered[doubt.epoch].log,
+            mode=estimates[doubt.epoch].names[doubt.estimate],
+            source=estimates[doubt.epoch].sources[doubt.estimate],
+            reason=doubt.reason,
+            detail=doubt.detail,
+        )
+        for doubt in found.doubts
+        if doubt.reason != "jump"
+    ]
+
+
+def _line_up(
+    estimates: Sequence[Estimates], found: Association, stage: Stage | None
+) -> tuple[tuple[str, ...], tuple[Series, ...], dict[str, FloatArray]]:
+    """Give every mode and source its column; what is missing is NaN."""
+    jumps = {
+        (d.epoch, d.estimate): estimates[d.epoch].names[d.estimate]
+        for d in found.doubts
+        if d.reason == "jump"
+    }
+    given = [
+        [jumps.get((k, i), mode) for i, mode in enumerate(own)]
+        for k, own in enumerate(found.assigned)
+    ]
+    seen = {
+        (mode, source)
+        for own, one in zip(given, estimates, strict=True)
+        for mode, source in zip(own, one.sources, strict=True)
+        if mode is not None
+    }
+    order = found.modes
+    if stage is not None:
+        order = tuple(mode.name for mode in stage.modes if mode.tracked)
+    modes = tuple(mode for mode in order if any(mode == name for name, _ in seen))
+    sources = sorted({source for _, source in seen}, key=_rank)
+    series = tuple(Series(m, s) for m in modes for s in sources if (m, s) in seen)
+    places = {(one.mode, one.source): i for i, one in enumerate(series)}
+    n, r = len(estimates), len(series)
+    ln_f, ln_zeta = np.full((n, r), np.nan), np.full((n, r), np.nan)
+    cov = np.full((n, 2 * r, 2 * r), np.nan)
+    for k, (own, one) in enumerate(zip(given, estimates, strict=True)):
+        pairs = [
+            (places[mode, source], i)
+            for i, (mode, source) in enumerate(zip(own, one.sources, strict=True))
+            if mode is not None and (mode, source) in places
+        ]
         if not pairs:
             continue
         to, of = (np.array(side) for side in zip(*pairs, strict=True))
-        ln_f[k, to], ln_zeta[k, to] = own.ln_frequency[of], own.ln_damping[of]
-        to, of = np.concatenate([to, to + m]), np.concatenate([of, of + len(own.names)])
-        cov[k][np.ix_(to, to)] = own.cov[np.ix_(of, of)]
-    return {"ln_frequency": ln_f, "ln_damping": ln_zeta, "cov": cov}
+        ln_f[k, to], ln_zeta[k, to] = one.ln_frequency[of], one.ln_damping[of]
+        to, of = np.concatenate([to, to + r]), np.concatenate([of, of + len(own)])
+        cov[k][np.ix_(to, to)] = one.cov[np.ix_(of, of)]
+    return modes, series, {"ln_frequency": ln_f, "ln_damping": ln_zeta, "cov": cov}
+
+
+def _rank(source: str) -> tuple[int, str]:
+    return (_SOURCES.index(source) if source in _SOURCES else len(_SOURCES), source)

@@ -1,7 +1,8 @@
 """Likelihood of a whole life: degradation laws against the ln frequencies of all logs.
 
 For the informative modes of all logs since the baseline, y = H(θ) + a + b (T - T_ref) + walk + ε.
-The intercept a, the covariate coefficients b and the random walk are Gaussian and marginalised into
+The intercept a, the covariate coefficients b and the random walk are Gaussian, as are the biases of
+sources and what retunings shift, and marginalised into
 
     Σ = R + I ⊗ [σ_a² 1 1ᵀ + σ_b² T Tᵀ + q² min(s, s')],
 
@@ -27,6 +28,7 @@ from lmshealth.arrays import FloatArray
 from lmshealth.errors import NotEnoughData
 from lmshealth.inference import one_at_a_time
 from lmshealth.stage import ParameterSpec, Stage
+from lmshealth.statespace import BIAS_STD, JUMP_STD, MOVES, regressors
 from lmshealth.tracks import History
 
 _INTERCEPT_STD = 0.1
@@ -66,13 +68,20 @@ class LifeLikelihood:
 
     def __init__(self, history: History, stage: Stage) -> None:
         self.stage = stage
-        seen = np.any(np.isfinite(history.ln_frequency[history.baseline :]), axis=0).tolist()
-        self.modes = tuple(
-            name
+        if not history.has_odometer:
+            raise NotEnoughData(
+                f"{history.stage}: not every log has travel_km, and laws of a life count by the "
+                "odometer; add it to manifest.csv"
+            )
+        seen = np.any(np.isfinite(history.ln_frequency[history.baseline :]), axis=0)
+        columns = [
+            i
             for name in stage.informative
-            if name in history.modes and seen[history.modes.index(name)]
-        )
-        columns = [history.modes.index(name) for name in self.modes]
+            for i in (history.columns(name) if name in history.modes else [])
+            if seen[i]
+        ]
+        self.series = tuple(history.series[i] for i in columns)
+        self.modes = tuple(dict.fromkeys(one.mode for one in self.series))
         ln_f = history.ln_frequency[history.baseline :, columns]
         self.clock = history.clock()[history.baseline :]
         self.now = float(self.clock.max(initial=0.0))
@@ -83,11 +92,15 @@ class LifeLikelihood:
             )
         self.laws = tuple(parameter.law for parameter in stage.parameters)
         self.sizes = tuple(len(law.names) for law in self.laws)
-        # Mode-major order of the data: all logs of the first mode, then of the second.
+        # Series-major order of the data: all logs of the first series, then of the second.
         flat = ln_f.T.ravel()
         self.rows = np.flatnonzero(np.isfinite(flat))
-        self.mode_of = np.repeat(np.arange(len(self.modes)), self.clock.size)[self.rows]
-        centre = np.nanmean(ln_f, axis=0)
+        self.mode_of_series = np.array([self.modes.index(one.mode) for one in self.series])
+        series = np.repeat(np.arange(len(self.series)), self.clock.size)[self.rows]
+        self.mode_of = self.mode_of_series[series]
+        centre = np.array(
+            [np.nanmean(ln_f[:, self.mode_of_series == i]) for i in range(len(self.modes))]
+        )
         self.y = flat[self.rows] - centre[self.mode_of]
         self.grid = self._whiten(history, columns)
 
@@ -185,42 +198,55 @@ class LifeLikelihood:
         n_modes = len(self.modes)
         flat = one_at_a_time(self.stage, x.reshape(-1, n_parameters))
         drift = self.stage.drift(flat, self.modes).reshape(-1, n, n_logs, n_modes)
-        drift = np.swapaxes(drift, 2, 3).reshape(-1, n, n_modes * n_logs)[..., self.rows]
+        drift = np.swapaxes(drift, 2, 3)[:, :, self.mode_of_series]
+        drift = drift.reshape(n_parameters + 1, n, -1)[..., self.rows]
         model_std = self.stage.description.map.model_std if self.stage.description.map else 0.0
         own = self.mode_of[:, None] == np.arange(n_modes)
         spread = np.einsum("pnd,dm->ndpm", model_std * drift[1:], own)
         return self.y - drift[0], spread.reshape(n, self.rows.size, -1)
 
     def _whiten(self, history: History, columns: list[int]) -> list[_Whitening]:
-        n_logs, n_modes = self.clock.size, len(self.modes)
+        n_logs, n_series = self.clock.size, len(self.series)
         cov = history.cov[history.baseline :][:, columns][:, :, columns]
-        noise = np.zeros((n_modes, n_logs, n_modes, n_logs))
+        noise = np.zeros((n_series, n_logs, n_series, n_logs))
         for k in range(n_logs):
             noise[:, k, :, k] = np.nan_to_num(cov[k])
+        same = np.equal.outer(self.mode_of_series, self.mode_of_series)
         common = np.full((n_logs, n_logs), _INTERCEPT_STD**2)
-        for covariate in self.stage.description.covariate:
-            values = history.covariates.get(covariate.name, np.full(len(history.logs), np.nan))
-            values = values[history.baseline :]
-            known = np.isfinite(values)
-            if not known.any():
-                continue
-            offset = np.where(known, values - covariate.reference, 0.0)
-            common += covariate.prior_std**2 * np.outer(offset, offset)
-            spread = max(float(np.std(values[known])), 1.0)
-            common += np.diag(np.where(known, 0.0, (covariate.prior_std * spread) ** 2))
+        for regressor in regressors(history.covariates, self.stage):
+            values = regressor.values[history.baseline :]
+            common += regressor.prior_std**2 * np.outer(values, values)
+            common += np.diag(regressor.unknown[history.baseline :])
         shared = np.minimum.outer(self.clock, self.clock) / self.now
-        size = n_modes * n_logs
+        size = n_series * n_logs
+        fixed = np.kron(same, common) + self._offsets(history)
         grid = []
         for walk, (scale, prior) in product(
             _WALKS, zip(_NOISE_SCALES, _NOISE_SCALE_PRIOR, strict=True)
         ):
-            total = scale**2 * noise.reshape(size, size)
-            total = total + np.kron(np.eye(n_modes), common + walk**2 * shared)
+            total = scale**2 * noise.reshape(size, size) + fixed
+            total = total + np.kron(same, walk**2 * shared)
             factor = np.linalg.cholesky(total[np.ix_(self.rows, self.rows)])
             inverse = solve_triangular(factor, np.eye(self.rows.size), lower=True)
             log_det = float(np.sum(np.log(np.diag(factor))))
             grid.append(_Whitening(walk, scale, inverse, float(np.log(prior)) - log_det))
         return grid
+
+    def _offsets(self, history: History) -> FloatArray:
+        """Covariance of what shifts readings without wear: sources, retunings, new sensors."""
+        same = np.equal.outer(self.mode_of_series, self.mode_of_series)
+        # The intercept is the first series'; each further one of a mode has its own bias.
+        further = np.tril(same, -1).any(axis=1).astype(float)
+        total = np.kron(np.diag(further), np.full((self.clock.size,) * 2, BIAS_STD[0] ** 2))
+        for step in history.steps:
+            if step.kind in MOVES:
+                continue
+            there = step.there[history.baseline :].astype(float)
+            seen = [step.source in ("", one.source) for one in self.series]
+            total += np.kron(
+                same * np.outer(seen, seen), JUMP_STD[step.kind][0] ** 2 * np.outer(there, there)
+            )
+        return total
 
 
 def _quadratic(

@@ -10,15 +10,12 @@ from pathlib import Path
 import pandas as pd
 
 from lmshealth.errors import BadTable
-from lmshealth.history import Reading
 
 _NEEDED = ("stage", "recorded_at", "action")
 # Work on guide or mount changes what "the state at baseline" means.
 RESETS = ("preload-adjust", "guide-replaced", "mount-tightened")
-# A regreasing moves dampings, which health is not read from.
-HARMLESS = ("regrease",)
-# These step frequencies or readings without wear.
-STEPS = ("servo", "sensor")
+# These move dampings, closed loop and readings at once, without wear.
+STEPS = ("regrease", "servo", "sensor")
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,11 +37,12 @@ def read_maintenance(folder: Path) -> tuple[Action, ...]:
     """
     actions: list[Action] = []
     for path in sorted(folder.rglob("maintenance.csv")):
-        actions += _read(path)
+        actions += read_actions(path)
     return tuple(sorted(actions, key=lambda action: action.recorded_at))
 
 
-def _read(path: Path) -> list[Action]:
+def read_actions(path: Path) -> list[Action]:
+    """Read one table of maintenance, as `read_maintenance` does."""
     try:
         table = pd.read_csv(path, dtype=str, keep_default_na=False)
     except (OSError, ValueError) as error:
@@ -52,7 +50,7 @@ def _read(path: Path) -> list[Action]:
     missing = [name for name in _NEEDED if name not in table.columns]
     if missing:
         raise BadTable(f"{path}: no column {missing}; there are {list(table.columns)}")
-    known = (*RESETS, *HARMLESS, *STEPS)
+    known = (*RESETS, *STEPS)
     actions = []
     for number, row in enumerate(table.itertuples(index=False), start=2):
         where = f"{path}, line {number}"
@@ -68,49 +66,26 @@ def _read(path: Path) -> list[Action]:
     return actions
 
 
-def after_last_reset(
-    readings: Sequence[Reading], actions: Sequence[Action]
-) -> tuple[list[Reading], list[str]]:
-    """Keep the logs since the last work on guide or mount.
+def maintenance_notes(actions: Sequence[Action], moments: Sequence[datetime | None]) -> list[str]:
+    """Say what the reader of a report must know of the work on a machine.
 
     Parameters
     ----------
-    readings : sequence of Reading
-        Logs of one machine.
     actions : sequence of Action
         Its maintenance, in the order of time.
-
-    Returns
-    -------
-    readings : list of Reading
-        Those after the last reset; all of them when there is no log after it.
-    notes : list of str
-        What the reader of the report must know about it.
+    moments : sequence of datetime or None
+        When its logs were recorded.
     """
     notes = []
-    kept = list(readings)
     resets = [action for action in actions if action.action in RESETS]
-    if resets:
-        last = resets[-1]
-        later = [
-            r
-            for r in readings
-            if r.metadata.recorded_at and (r.metadata.recorded_at >= last.recorded_at)
-        ]
-        moment = last.recorded_at.date().isoformat()
-        if later:
-            kept = later
+    for action in resets:
+        before = sum(moment is not None and moment < action.recorded_at for moment in moments)
+        told = f"{action.action} on {action.recorded_at.date().isoformat()}"
+        if before == len(moments):
+            notes.append(f"{told}: no log since, so nothing is known after it.")
+        elif before:
             notes.append(
-                f"{last.action} on {moment} opened a new baseline: all fractions are relative to "
-                f"the state after it, and {len(readings) - len(later)} earlier logs are left out."
+                f"{told} opened a new baseline: fractions are relative to the state after it, and "
+                f"{before} earlier logs only tell what temperature, load and loop do."
             )
-        else:
-            notes.append(f"{last.action} on {moment}: no log since, so nothing is known after it.")
-    begin = min((r.metadata.recorded_at for r in kept if r.metadata.recorded_at), default=None)
-    for action in actions:
-        if action.action in STEPS and begin is not None and action.recorded_at > begin:
-            notes.append(
-                f"{action.action} on {action.recorded_at.date().isoformat()} may have stepped the "
-                "frequencies; drifts across it are not corrected for that."
-            )
-    return kept, notes
+    return notes

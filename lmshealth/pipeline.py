@@ -18,7 +18,7 @@ from lmshealth.following import loop_error
 from lmshealth.history import Reading, build_history, in_order
 from lmshealth.inference import epochs_to_infer, infer
 from lmshealth.logs import Refusal
-from lmshealth.maintenance import Action, after_last_reset, read_maintenance
+from lmshealth.maintenance import Action, maintenance_notes, read_maintenance
 from lmshealth.modal import identify
 from lmshealth.prognosis import prognose
 from lmshealth.readers import content_digest, find_logs, read_log, read_manifest, require_identity
@@ -28,7 +28,7 @@ from lmshealth.stage import Stage
 from lmshealth.store import Store, beside, result_key
 from lmshealth.summary import Assessment, judge
 from lmshealth.tables import all_tables
-from lmshealth.tracking import track
+from lmshealth.tracking import believed, doubted, track
 from lmshealth.tracks import History, Track
 
 Progress = Callable[[str, int, int], None]
@@ -359,13 +359,15 @@ def assess(
     Assessment
         What the data do not carry is None, with the reason among the notes.
     """
-    used, notes = after_last_reset(readings, actions)
-    history, refused = build_history(used, stage)
-    partial = [refusal for reading in used for refusal in reading.modes.refused]
+    history, refused = build_history(readings, stage, actions)
+    notes = maintenance_notes(actions, [reading.metadata.recorded_at for reading in readings])
+    partial = [refusal for reading in readings for refusal in reading.modes.refused]
     own = int(hashlib.sha256(f"{history.stage}\n{stage.digest}".encode()).hexdigest()[:12], 16)
     seed = (settings.seed, own)
     followed, health, prognosis = _results(history, stage, settings.epochs, seed, pool, notes)
-    digests = {reading.log: reading.digest for reading in used}
+    if followed is not None:
+        refused += doubted(history, followed)
+    digests = {reading.log: reading.digest for reading in readings}
     return Assessment(
         stage=stage,
         history=history,
@@ -373,7 +375,7 @@ def assess(
         track=followed,
         health=health,
         prognosis=prognosis,
-        judgement=judge(stage, history, health),
+        judgement=judge(stage, history, health, followed),
         refused=tuple([*partial, *refused]),
         notes=tuple(notes),
         seed=settings.seed,
@@ -393,6 +395,7 @@ def _results(
     health: Health | None = None
     try:
         followed = track(history, stage)
+        history = believed(history, followed)
         if not stage.parameters:
             return followed, None, None
         # The life needs the longest of all: it is begun before the epochs and fetched after them.

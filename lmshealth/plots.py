@@ -106,8 +106,8 @@ def plot_frequencies(ax: Axes, history: History, track: Track | None, mode: str)
     its 95 % band has the covariates at their reference. Without a track of this mode the line
     is left out.
     """
-    column = history.modes.index(mode)
-    _logs(ax, history, column, history.ln_frequency[:, column], 1.0)
+    for column in history.columns(mode):
+        _logs(ax, history, column, history.ln_frequency[:, column], 1.0)
     if track is not None and mode in track.modes:
         k = track.modes.index(mode)
         level = track.ln_frequency[:, k]
@@ -127,9 +127,12 @@ def plot_frequencies(ax: Axes, history: History, track: Track | None, mode: str)
 
 def plot_damping(ax: Axes, history: History, track: Track | None, mode: str) -> Axes:
     """Plot the damping ratio of a mode against the odometer, as `plot_frequencies` does."""
-    column = history.modes.index(mode)
-    level = history.ln_damping[:, column]
-    top = _logs(ax, history, len(history.modes) + column, level, 100.0)
+    columns = history.columns(mode)
+    level = history.ln_damping[:, columns]
+    top = max(
+        _logs(ax, history, len(history.series) + column, history.ln_damping[:, column], 100.0)
+        for column in columns
+    )
     if track is not None and mode in track.modes:
         k = track.modes.index(mode)
         _filtered(ax, track.travel, track.ln_damping[:, k], track.ln_damping_std[:, k], 100.0)

@@ -207,7 +207,7 @@ def _evidence(assessment: Assessment) -> dict[str, Any]:
         "pairs": [] if health is None else _pairs(health),
         "picture": _pictures(assessment),
         "surprise": None if track is None else _surprise(track),
-        "noise_scale": None if track is None else float(track.noise_scale[-1]),
+        "noise_scale": None if track is None else float(track.noise_scale[-1].max()),
         "largest_drift": float(np.nanmax(drift, initial=0.0)),
         "law": prognosis and _fit(prognosis.chi_square, prognosis.degrees_of_freedom),
         "effects": [] if track is None else [_effect_row(effect) for effect in track.effects],
@@ -382,7 +382,7 @@ def _effect_row(effect: Effect) -> tuple[str, str, str, bool]:
 def _seen(history: History) -> list[str]:
     """Modes that at least one log gave."""
     found = np.isfinite(history.ln_frequency)
-    return [mode for k, mode in enumerate(history.modes) if found[:, k].any()]
+    return [mode for mode in history.modes if found[:, history.columns(mode)].any()]
 
 
 def _health(assessment: Assessment) -> Health | None:

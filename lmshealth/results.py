@@ -52,7 +52,7 @@ class Modes:
     Attributes
     ----------
     names : tuple of str
-        Mode names, unique per source.
+        Mode names, unique per source; empty where another program gave none.
     sources : tuple of str
         ``acc``, ``delta_e``, ``frf`` or ``joint`` per mode.
     channels : tuple of str
@@ -102,7 +102,8 @@ class Modes:
 
     def __post_init__(self) -> None:
         n = len(self.names)
-        if len(set(zip(self.names, self.sources, strict=True))) != n:
+        named = [pair for pair in zip(self.names, self.sources, strict=True) if pair[0]]
+        if len(set(named)) != len(named):
             raise ValueError(f"mode names are not unique per source: {self.names}")
         for name in ("ln_frequency", "ln_damping", "snr", "dispersion"):
             expect_shape(name, getattr(self, name), (n,))

@@ -13,6 +13,7 @@ of the baseline stays common to all epochs.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -63,23 +64,24 @@ class Regressor:
     unknown: FloatArray
 
 
-def regressors(history: History, stage: Stage | None) -> tuple[Regressor, ...]:
+def regressors(covariates: Mapping[str, FloatArray], stage: Stage | None) -> tuple[Regressor, ...]:
     """Take the covariates that are asked for and known in at least one log.
 
-    Without a stage every covariate present is taken, about its median.
+    Without a stage every covariate present is taken, about its median. Keys are column names,
+    values of shape ``(n_logs,)``.
     """
     wanted = (
         stage.description.covariate
         if stage is not None
         else tuple(
             Covariate(name, float(np.nanmedian(values)), UNKNOWN_COVARIATE_STD)
-            for name, values in history.covariates.items()
+            for name, values in covariates.items()
             if np.isfinite(values).any()
         )
     )
     found: list[Regressor] = []
     for covariate in wanted:
-        values = history.covariates.get(covariate.name)
+        values = covariates.get(covariate.name)
         if values is None or not np.isfinite(values).any():
             continue
         known = np.isfinite(values)
@@ -101,7 +103,7 @@ def state_space(history: History, stage: Stage | None, steps: tuple[Step, ...] =
     life = float(np.ptp(history.clock()))
     if stage is not None and history.has_odometer:
         life = stage.description.usage.horizon_km * _KM
-    return StateSpace(history, regressors(history, stage), life or 1.0, steps)
+    return StateSpace(history, regressors(history.covariates, stage), life or 1.0, steps)
 
 
 class StateSpace:

@@ -6,12 +6,13 @@ from dataclasses import dataclass
 from datetime import date, timedelta
 
 import numpy as np
+from scipy.special import expit
 
 from lmshealth.arrays import BoolArray
 from lmshealth.logs import Refusal
 from lmshealth.results import Health, Judgement, Prognosis, Verdict
 from lmshealth.stage import ParameterSpec, Stage
-from lmshealth.tracks import History, Track
+from lmshealth.tracks import Event, History, Track
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -75,7 +76,9 @@ def degraded_below(parameter: ParameterSpec) -> float:
     return parameter.baseline - DEGRADED_SHARE * (parameter.baseline - limit)
 
 
-def judge(stage: Stage, history: History, health: Health | None) -> Judgement:
+def judge(
+    stage: Stage, history: History, health: Health | None, track: Track | None = None
+) -> Judgement:
     """Say in one word what the last epoch shows, with its posterior probability.
 
     Parameters
@@ -86,17 +89,24 @@ def judge(stage: Stage, history: History, health: Health | None) -> Judgement:
         All logs.
     health : Health or None
         Posterior of the parameters; None when they could not be inferred.
+    track : Track, optional
+        Says whether something happened at once since the baseline.
 
     Returns
     -------
     Judgement
         ``not-enough-data`` when there are fewer logs than make a baseline, when the sampler did
-        not converge, or when the data say nothing about any parameter.
+        not converge, or when the data say nothing about any parameter; ``step`` when the modes
+        jumped since the baseline and nobody said why.
     """
+    jumps = [] if track is None else unexplained_steps(track, history.baseline)
+    if jumps:
+        return _judge_step(stage, history, health, jumps)
     needed = stage.description.baseline.logs
     reason = ""
-    if len(history.logs) < needed:
-        reason = f"{len(history.logs)} usable logs, a baseline needs {needed}."
+    since = len(history.logs) - history.baseline
+    if since < needed:
+        reason = f"{since} usable logs since the baseline began; it needs {needed}."
     elif health is None:
         reason = "The logs do not carry the health parameters."
     elif not health.converged[-1]:
@@ -108,6 +118,34 @@ def judge(stage: Stage, history: History, health: Health | None) -> Judgement:
             history.stage, history.recorded_at[-1], "not-enough-data", float("nan"), reason
         )
     return _judge_posterior(stage, history, health)
+
+
+def unexplained_steps(track: Track, baseline: int) -> list[Event]:
+    """Give the steps of the modes since a log that no maintenance declares, one per mode."""
+    return [
+        event
+        for event in track.events
+        if event.kind == "step" and not event.declared and event.epoch > baseline
+    ]
+
+
+def _judge_step(
+    stage: Stage, history: History, health: Health | None, jumps: list[Event]
+) -> Judgement:
+    last = max(event.epoch for event in jumps)
+    sizes = ", ".join(
+        f"{event.mode} {100 * event.size:+.1f} %".replace("-", "−")
+        for event in jumps
+        if event.epoch == last
+    )
+    when = history.recorded_at[last].date().isoformat()
+    why = (
+        f"The frequencies jumped before the log of {when} ({sizes}), and no maintenance tells why."
+    )
+    if health is not None and health.converged[-1] and health.told().any():
+        why += " " + _why(stage, health, np.flatnonzero(health.told()).tolist())
+    evidence = max(event.evidence for event in jumps)
+    return Judgement(history.stage, history.recorded_at[-1], "step", float(expit(evidence)), why)
 
 
 def _judge_posterior(stage: Stage, history: History, health: Health) -> Judgement:

@@ -16,6 +16,7 @@ from lmshealth.logs import Refusal
 from lmshealth.readers.metadata import COVARIATES
 from lmshealth.results import Prognosis
 from lmshealth.summary import Assessment
+from lmshealth.tracks import Smoothed, Track
 
 _KM, _MICRO = 1000.0, 1e-6
 _RUL_LEVELS = (0.05, 0.10, 0.25, 0.50, 0.75, 0.90, 0.95)
@@ -26,10 +27,10 @@ COLUMNS = {
     "damping_ratio_std correlation_f_zeta snr dispersion flags",
     "modes_cov": "log source_a mode_a source_b mode_b cov_ln_f",
     "track": "stage recorded_at travel_km mode frequency_hz frequency_std_hz damping_ratio "
-    "damping_ratio_std drift drift_std nis nis_dof noise_scale",
+    "damping_ratio_std drift drift_std nis nis_dof noise_scale widening",
     "track_cov": "stage recorded_at mode_a mode_b cov_drift",
     "effects": "stage mode covariate coefficient std",
-    "events": "stage recorded_at travel_km kind mode source size std evidence",
+    "events": "stage recorded_at travel_km kind mode source size std evidence declared known_at",
     "health": "stage recorded_at travel_km parameter median q05 q25 q75 q95 ess r_hat converged "
     "informed",
     "prognosis": "stage parameter limit "
@@ -111,9 +112,11 @@ def all_tables(
         rows["modes"] += modes_rows(reading)
         rows["modes_cov"] += _modes_cov_rows(reading)
     for assessment in assessments:
-        rows["track"] += _track_rows(assessment)
-        rows["track_cov"] += _track_cov_rows(assessment)
-        rows["effects"] += _effects_rows(assessment)
+        if assessment.track is not None:
+            rows["track"] += track_rows(assessment.track)
+            rows["track_cov"] += track_cov_rows(assessment.track)
+            rows["effects"] += effects_rows(assessment.track)
+            rows["events"] += events_rows(assessment.track)
         rows["health"] += _health_rows(assessment)
         rows["prognosis"] += _prognosis_rows(assessment)
         rows["verdict"].append(
@@ -148,10 +151,8 @@ def _modes_cov_rows(reading: Reading) -> list[Row]:
     ]
 
 
-def _track_rows(assessment: Assessment) -> list[Row]:
-    track = assessment.track
-    if track is None:
-        return []
+def track_rows(track: Track, smoothed: Smoothed | None = None) -> list[Row]:
+    """List a track, one row per epoch and mode; what is smoothed has columns of its own."""
     drift_std = np.sqrt(np.einsum("kii->ki", track.drift_cov))
     frequency, damping = np.exp(track.ln_frequency), np.exp(track.ln_damping)
     return [
@@ -168,17 +169,17 @@ def _track_rows(assessment: Assessment) -> list[Row]:
             "drift_std": drift_std[k, i],
             "nis": track.nis[k],
             "nis_dof": track.nis_dof[k],
-            "noise_scale": track.noise_scale[k],
+            "noise_scale": track.noise_scale[k].max(),
+            "widening": track.widening[k],
+            **({} if smoothed is None else _smoothed_columns(smoothed, k, i)),
         }
         for k in range(len(track.logs))
         for i, mode in enumerate(track.modes)
     ]
 
 
-def _track_cov_rows(assessment: Assessment) -> list[Row]:
-    track = assessment.track
-    if track is None:
-        return []
+def track_cov_rows(track: Track) -> list[Row]:
+    """List the covariances between drifts of one epoch, one row per pair of modes."""
     return [
         {
             "stage": track.stage,
@@ -192,10 +193,8 @@ def _track_cov_rows(assessment: Assessment) -> list[Row]:
     ]
 
 
-def _effects_rows(assessment: Assessment) -> list[Row]:
-    track = assessment.track
-    if track is None:
-        return []
+def effects_rows(track: Track) -> list[Row]:
+    """List what moves modes without wear, one row per mode and cause."""
     return [
         {
             "stage": track.stage,
@@ -206,6 +205,38 @@ def _effects_rows(assessment: Assessment) -> list[Row]:
         }
         for effect in track.effects
     ]
+
+
+def events_rows(track: Track) -> list[Row]:
+    """List what happened to a machine, one row per event and mode."""
+    return [
+        {
+            "stage": track.stage,
+            "recorded_at": _moment(track.recorded_at[event.epoch]),
+            "travel_km": track.travel[event.epoch] / _KM,
+            "kind": event.kind,
+            "mode": event.mode,
+            "source": event.source,
+            "size": event.size,
+            "std": event.std,
+            "evidence": event.evidence,
+            "declared": event.declared,
+            "known_at": _moment(track.recorded_at[event.found_at]),
+        }
+        for event in track.events
+    ]
+
+
+def _smoothed_columns(smoothed: Smoothed, k: int, i: int) -> Row:
+    frequency, damping = np.exp(smoothed.ln_frequency[k, i]), np.exp(smoothed.ln_damping[k, i])
+    return {
+        "frequency_hz_smoothed": frequency,
+        "frequency_std_hz_smoothed": frequency * smoothed.ln_frequency_std[k, i],
+        "damping_ratio_smoothed": damping,
+        "damping_ratio_std_smoothed": damping * smoothed.ln_damping_std[k, i],
+        "drift_smoothed": smoothed.drift[k, i],
+        "drift_std_smoothed": smoothed.drift_std[k, i],
+    }
 
 
 def _health_rows(assessment: Assessment) -> list[Row]:

@@ -11,12 +11,14 @@ from pathlib import Path
 from typing import Any
 
 import click
+import numpy as np
 from rich import box
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
 from lmshealth.tables import Row
+from lmshealth.tracks import Track
 
 # So many lines of a frequency response are shown.
 _MOST_LINES = 12
@@ -56,6 +58,56 @@ def print_modes(rows: Sequence[Row], refused: Sequence[Row]) -> None:
     title = "Modes (± one standard deviation)" if rows else "No modes found"
     _print(title, ("log", "mode", "channel"), ("frequency Hz", "damping %", "SNR", "note"), cells)
     _print_refused(refused)
+
+
+def print_track(track: Track) -> None:
+    """Print where the modes of a machine stand, what happened to it, and whether to believe it."""
+    std = np.sqrt(np.einsum("kii->ki", track.drift_cov))
+    cells: list[tuple[str, ...]] = [
+        (
+            mode,
+            f"{np.exp(level):.3f} ± {np.exp(level) * track.ln_frequency_std[-1, i]:.3f}",
+            f"{100 * track.drift[-1, i]:+.3f} ± {100 * std[-1, i]:.3f}",
+            f"{100 * np.exp(zeta):.2f} ± {100 * np.exp(zeta) * track.ln_damping_std[-1, i]:.2f}",
+        )
+        for i, (mode, level, zeta) in enumerate(
+            zip(track.modes, track.ln_frequency[-1], track.ln_damping[-1], strict=True)
+        )
+    ]
+    title = f"{track.stage}: modes after {len(track.logs)} logs (± one standard deviation)"
+    _print(title, ("mode",), ("frequency Hz", "drift %", "damping %"), cells)
+    happened = [
+        (
+            f"{track.recorded_at[event.epoch]:%Y-%m-%d}",
+            event.kind,
+            event.mode,
+            f"{100 * event.size:+.2f} ± {100 * event.std:.2f}",
+            f"{event.evidence:.1f}",
+            "declared" if event.declared else "found",
+        )
+        for event in track.events
+    ]
+    if happened:
+        numbers = ("size %", "ln Bayes factor")
+        cells = [(*row[:3], row[5], *row[3:5]) for row in happened]
+        _print("What happened", ("since", "kind", "mode", ""), numbers, cells)
+    click.echo(_consistent(track))
+
+
+def _consistent(track: Track) -> str:
+    """Say whether the filter's innovations are what it expects."""
+    found = track.consistency()
+    told = (
+        f"normalised innovations squared {found.nis:.2f} (expected 1, p = {found.p_value:.2g}), "
+        f"autocorrelation {found.autocorrelation:+.2f} (p = {found.autocorrelation_p_value:.2g})"
+    )
+    if found.holds:
+        return f"The filter agrees with its logs: {told}."
+    return (
+        f"The filter does NOT agree with its logs: {told}; its standard deviations are widened "
+        f"{track.widening[-1]:.2f} times. A cause may be missing: a covariate, a retuning, or "
+        "standard deviations that are not what they say."
+    )
 
 
 def print_frf(fit: Row, frf: Sequence[Row], rows: Sequence[Row], refused: Sequence[Row]) -> None:

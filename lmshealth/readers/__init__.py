@@ -25,9 +25,11 @@ pandas, scipy, h5py, pyarrow, npTDMS and pyuff are imported when the first file 
 
 from lmshealth.readers.archive import Found, Manifest, find_logs, read_manifest
 from lmshealth.readers.columns import ColumnMap, load_columns
+from lmshealth.readers.metadata import COVARIATES
 from lmshealth.readers.reading import content_digest, read_log, require_identity
 
 __all__ = [
+    "COVARIATES",
     "ColumnMap",
     "Found",
     "Manifest",

@@ -1,0 +1,121 @@
+"""Commands that go on from tables instead of logs."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from lmshealth import terminal
+from lmshealth.errors import BadTable
+from lmshealth.options import STAGE, examples
+
+if TYPE_CHECKING:
+    from lmshealth.logs import Refusal
+    from lmshealth.tables import Row
+    from lmshealth.tracks import History, Smoothed, Track
+
+_TABLE = click.Path(exists=True, dir_okay=False, path_type=Path)
+_TABLES = ("track", "track_cov", "effects", "events", "refused")
+_OUT = click.Path(dir_okay=False, path_type=Path)
+
+
+@click.command(
+    epilog=examples(
+        "track result/modes.csv --stage lms-y --out track.csv --events events.csv",
+        "track other_program.csv --out track.csv --effects effects.csv --smooth",
+    )
+)
+@click.argument("table", metavar="MODES.csv", type=_TABLE)
+@STAGE
+@click.option("--out", required=True, type=_OUT, help="Where the track goes.")
+@click.option("--cov", type=_TABLE, help="Cross terms; default modes_cov.csv beside MODES.csv.")
+@click.option("--maintenance", type=_TABLE, help="What was done, as maintenance.csv.")
+@click.option("--track-cov", type=_OUT, help="Where the covariances of the drifts go.")
+@click.option("--effects", type=_OUT, help="Where go the effects of what is no wear.")
+@click.option("--events", type=_OUT, help="Where go steps, retunings and alarms.")
+@click.option("--refused", type=_OUT, help="Where goes what was given to no mode, and why.")
+@click.option("--smooth", "smoothed", is_flag=True, help="Add columns that know of later logs.")
+@click.pass_context
+def track(ctx: click.Context, /, table: Path, out: Path, **options: Any) -> None:
+    """Follow modes through a table of estimates, ours or another program's.
+
+    Needed are the columns recorded_at, frequency_hz and frequency_std_hz. The clock is travel_km
+    where every row has it, else the time. Without a mode name modes are born from the estimates;
+    without --stage every covariate column is regressed, about its median.
+    """
+    from lmshealth.estimates import read_estimates
+    from lmshealth.history import build_history
+    from lmshealth.maintenance import read_actions
+    from lmshealth.smoothing import smooth
+    from lmshealth.stage import load_stage
+    from lmshealth.tracking import believed, doubted
+    from lmshealth.tracking import track as follow
+
+    stage = load_stage(options["stage"]) if options["stage"] else None
+    cov = options["cov"] or table.with_name("modes_cov.csv")
+    read = read_estimates(table, cross_terms=cov if cov.exists() else None, stage=stage)
+    actions = read_actions(options["maintenance"]) if options["maintenance"] else ()
+    rows: dict[str, list[Row]] = {name: [] for name in _TABLES}
+    notes = list(read.notes)
+    for machine in dict.fromkeys(reading.metadata.stage for reading in read.readings):
+        own = [reading for reading in read.readings if reading.metadata.stage == machine]
+        history, lost = build_history(own, stage, [a for a in actions if a.stage == machine])
+        followed = follow(history, stage)
+        lost += doubted(history, followed)
+        later = None
+        if options["smoothed"]:
+            later = smooth(believed(history, followed), followed, stage)
+        for name, found in _rows(followed, later, lost).items():
+            rows[name] += found
+        notes += _notes(history, lost)
+        terminal.print_track(followed)
+    for note in notes:
+        click.echo(f"note: {note}", err=True)
+    _write(rows, {"track": out} | {name: options[name] for name in _TABLES[1:]})
+
+
+def _rows(track: Track, smoothed: Smoothed | None, refused: list[Refusal]) -> dict[str, list[Row]]:
+    """Give the rows of all tables that can be asked for."""
+    from lmshealth import tables
+
+    return {
+        "track": tables.track_rows(track, smoothed),
+        "track_cov": tables.track_cov_rows(track),
+        "effects": tables.effects_rows(track),
+        "events": tables.events_rows(track),
+        "refused": tables.refused_rows(refused),
+    }
+
+
+def _notes(history: History, refused: list[Refusal]) -> list[str]:
+    """Say what the reader of a track must know of its machine."""
+    notes = []
+    if not history.has_odometer:
+        notes.append(f"{history.stage}: not every log has travel_km, so the clock is the time")
+    if len(history.logs) == 1:
+        notes.append(f"{history.stage}: one log is the baseline; nothing can have drifted yet")
+    reasons = Counter(refusal.reason for refusal in refused)
+    if reasons:
+        told = ", ".join(f"{count} {reason}" for reason, count in reasons.items())
+        notes.append(f"{history.stage}: not believed: {told}; --refused FILE lists them")
+    return notes
+
+
+def _write(rows: dict[str, list[Row]], targets: dict[str, Path | None]) -> None:
+    """Write the tables that were asked for."""
+    from lmshealth.tables import COLUMNS, frame
+
+    for name, target in targets.items():
+        if target is None:
+            continue
+        try:
+            target.write_text(frame(COLUMNS[name], rows[name]).to_csv(index=False))
+        except OSError as error:
+            raise BadTable(f"{target}: cannot be written: {error.strerror}") from error
+
+
+COMMANDS: Sequence[click.Command] = (track,)

@@ -1,0 +1,385 @@
+"""Who is who, as several hypotheses at once: what speaks for each, which are kept.
+
+Every hypothesis has its own filters and two weights: names follow the mode, or names follow the
+order of frequencies. A peak finder that numbers its peaks gives wrong names after a crossing, all
+of them and for good, so that how names are given must be asked once and not at every estimate.
+"""
+
+from __future__ import annotations
+
+import heapq
+from dataclasses import dataclass
+from itertools import combinations
+
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+from scipy.special import hyp1f1, logsumexp, ndtr
+
+from lmshealth.arrays import FloatArray
+from lmshealth.filterbank import Bank, Innovations, IntArray, Readings
+
+# Probability that a source shows a mode in a log, and spurious estimates per log and unit of ln f.
+SHOWN, _SPURIOUS = 0.8, 0.1
+# Density of a stranger's ln ζ: anything within an order of magnitude.
+_STRANGER_ZETA = 0.3
+# Probability that a name is right, given how names are given.
+_NAME_RIGHT = 0.98
+# Concentration of a shape about its mode's: exp(κ MAC), a direction known to 0.13 rad.
+_CONCENTRATION = 30.0
+# Explanations of a log, and hypotheses, with less of the weight of the best are hopeless; so many
+# explanations are tried under each hypothesis, and so many hypotheses kept.
+_HOPELESS = float(np.log(1e-7))
+_MOST_EACH, _MOST = 12, 24
+# Probability that a declared intervention changes the order of frequencies, where the sizes of the
+# steps alone would allow it: modes step together.
+_REORDERED = 0.05
+# Nearer than this in ln f modes may veer, in so many of all logs.
+_VEERING, _EXCHANGE = 0.03, 0.02
+# Hypotheses that differ by less than this, in squared standard deviations, become one.
+_SAME = 1.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Scan:
+    """What one source shows in one log.
+
+    Attributes
+    ----------
+    epoch : int
+        The log.
+    rows : ndarray
+        Which of the log's estimates these are.
+    names : ndarray
+        Index of the mode that each name means; -1 without a name, the number of modes for a name
+        that no mode has.
+    readings : Readings
+        The estimates.
+    row : ndarray
+        Observation row ``[1, 0, covariates]``.
+    """
+
+    epoch: int
+    rows: IntArray
+    names: IntArray
+    readings: Readings
+    row: FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Hypotheses:
+    """Hypotheses with their weights.
+
+    Attributes
+    ----------
+    bank : Bank
+        Filters of m modes under h hypotheses.
+    log_weights : ndarray
+        With names by mode and by order, shape ``(h, 2)``; their exponentials add up to 1.
+    labels : ndarray
+        Mode of each estimate of the present log, shape ``(h, n)``; -1 for none.
+    """
+
+    bank: Bank
+    log_weights: FloatArray
+    labels: IntArray
+
+    def chances(self, n_modes: int) -> FloatArray:
+        """Return the probability of each mode, last of none, for each estimate: ``(n, m + 1)``."""
+        weights = np.exp(logsumexp(self.log_weights, axis=1))
+        hits = self.labels[:, :, None] == np.append(np.arange(n_modes), -1)
+        return np.asarray(np.einsum("h,hnm->nm", weights, hits))
+
+
+def stranger_gains(innovations: Innovations) -> FloatArray:
+    """Return log odds of being seen of a mode against being a stranger and the mode unseen."""
+    known = np.isfinite(innovations.var_zeta)
+    stranger = np.log(_SPURIOUS) + np.where(known, np.log(_STRANGER_ZETA), 0.0)
+    seen = np.log(SHOWN / (1 - SHOWN))
+    return np.asarray(innovations.log_density() + seen - stranger)
+
+
+def best_assignments(
+    score: FloatArray, least: float, most: int
+) -> list[tuple[float, tuple[int, ...]]]:
+    """Find the best one-to-one assignments of rows to columns or to nothing.
+
+    The best is an optimal assignment; the others are the best of what remains when its pairs are
+    forbidden one after the other [Murty1968]_.
+
+    Parameters
+    ----------
+    score : ndarray
+        Gain of each pair over leaving its row alone, ``(n, m)``; -inf where not allowed.
+    least : float
+        Assignments below the best by more than this (a negative number) are left out.
+    most : int
+        At most so many.
+
+    Returns
+    -------
+    list of (float, tuple of int)
+        Gain and the column of each row, -1 for nothing; the best first.
+    """
+    n, m = score.shape
+    cost = np.full((n, m + n), np.inf)
+    cost[:, :m] = -score
+    cost[range(n), range(m, m + n)] = 0.0
+    rows = np.arange(n)
+
+    def solve(own: FloatArray) -> tuple[float, IntArray] | None:
+        try:
+            columns = linear_sum_assignment(own)[1]
+        except ValueError:  # nothing is left
+            return None
+        return float(own[rows, columns].sum()), columns
+
+    first = solve(cost)
+    assert first is not None, "every row may be left alone"
+    heap = [(first[0], 0, first[1], cost, 0)]
+    count = 0
+    found: list[tuple[float, tuple[int, ...]]] = []
+    while heap and len(found) < most:
+        total, _, columns, own, fixed = heapq.heappop(heap)
+        found.append((-total, tuple(c if c < m else -1 for c in columns.tolist())))
+        own = own.copy()
+        for row in range(fixed, n):
+            column = columns[row]
+            value = own[row, column]
+            own[row, column] = np.inf
+            other = solve(own)
+            if other is not None and first[0] - other[0] >= least:
+                count += 1
+                heapq.heappush(heap, (other[0], count, other[1], own.copy(), row))
+            own[row], own[:, column] = np.inf, np.inf
+            own[row, column] = value
+    return found
+
+
+def shape_gains(shapes: FloatArray, of_modes: FloatArray) -> FloatArray:
+    """Tell what shapes say, against shapes of any direction.
+
+    A Watson distribution about the shape of the mode: density exp(κ MAC) / M(1/2, n/2, κ) over the
+    channels that both have [Mardia2000]_, with the modal assurance criterion [Allemang2003]_.
+
+    Parameters
+    ----------
+    shapes : ndarray
+        Of estimates, ``(n, n_channels)``.
+    of_modes : ndarray
+        Of modes, ``(h, m, n_channels)``.
+
+    Returns
+    -------
+    ndarray
+        Log likelihood ratio, ``(h, n, m)``; 0 where fewer than two channels are common.
+    """
+    both = np.isfinite(shapes)[:, None] & np.isfinite(of_modes)[:, None]
+    a = np.where(both, shapes[:, None], 0.0)
+    b = np.where(both, of_modes[:, None], 0.0)
+    scale = np.sum(a * a, -1) * np.sum(b * b, -1)
+    common = both.sum(-1)
+    known = (common > 1) & (scale > 0)
+    mac = np.sum(a * b, -1) ** 2 / np.where(known, scale, 1.0)
+    norm = np.log(hyp1f1(0.5, np.arange(shapes.shape[1] + 1) / 2 + 1e-300, _CONCENTRATION))
+    return np.where(known, _CONCENTRATION * mac - norm[common], 0.0)
+
+
+def name_gains(
+    names: IntArray, order: IntArray, readings: Readings, seen: tuple[FloatArray, FloatArray]
+) -> FloatArray:
+    """Tell what names say, against a stranger that bears any name.
+
+    Parameters
+    ----------
+    names : ndarray
+        Of each estimate: index of the mode it means, -1 without a name, the number of modes for
+        a name that no mode has.
+    order : ndarray
+        Modes that have names, in the order that names follow.
+    readings : Readings
+        The estimates.
+    seen : (ndarray, ndarray)
+        Where ln f of each mode is predicted, and its variance, ``(h, m)``.
+
+    Returns
+    -------
+    ndarray
+        Log likelihood ratios with names by mode and by order, ``(h, n, m, 2)``.
+    """
+    at, var = seen
+    (h, m), n, k = at.shape, names.size, order.size
+    gains = np.zeros((h, n, m, 2))
+    if k == 0 or (names < 0).all():
+        return gains
+    wrong = (1 - _NAME_RIGHT) / max(k - 1, 1)
+    named = (names >= 0)[:, None]
+    hit = names[:, None] == np.arange(m)
+    by_mode = np.where(hit, _NAME_RIGHT, wrong)
+    # Distribution of how many of the other named modes lie below an estimate.
+    spread = np.sqrt(var[:, None] + readings.var_f[:, None])
+    below = ndtr((readings.ln_f[:, None] - at[:, None]) / spread)[..., order]
+    place = np.full(m + 1, -1)
+    place[order] = np.arange(k)
+    wanted = place[np.where(named[:, 0], names, m)]
+    by_order = np.full((h, n, m), 1.0 / k)
+    for j, mode in enumerate(order.tolist()):
+        chance = np.zeros((h, n, k + 1))
+        chance[..., 0] = 1.0
+        for other in range(k):
+            if other != j:
+                p = below[..., other, None]
+                moved = np.concatenate([np.zeros((h, n, 1)), chance[..., :-1]], -1)
+                chance = (1 - p) * chance + p * moved
+        right = np.where(wanted >= 0, chance[:, np.arange(n), wanted], 0.0)
+        by_order[..., mode] = wrong + (_NAME_RIGHT - wrong) * right
+    gains[..., 0] = np.where(named, np.log(by_mode * k), 0.0)
+    gains[..., 1] = np.where(named, np.log(by_order * k), 0.0)
+    return gains
+
+
+def explain(now: Hypotheses, scan: Scan, order: IntArray, *, opened: bool) -> Hypotheses:
+    """Follow all explanations of a scan that are not hopeless.
+
+    Parameters
+    ----------
+    now : Hypotheses
+        With filters predicted to the log; their sum of weights is 1.
+    scan : Scan
+        What is to be explained.
+    order : ndarray
+        Modes that have names, in the order that names follow.
+    opened : bool
+        Whether frequencies may step in this log.
+
+    Returns
+    -------
+    Hypotheses
+        Each with its filters updated and its labels of the scan's estimates.
+    """
+    if scan.readings.shapes.shape[1] > 1:
+        now = _exchanged(now, scan)
+    seen = now.bank.seen(scan.row)
+    gains = stranger_gains(now.bank.compare(scan.readings, scan.row))
+    gains += shape_gains(scan.readings.shapes, now.bank.shapes)
+    names = name_gains(scan.names, order, scan.readings, seen)
+    own = now.log_weights - logsumexp(now.log_weights, axis=1, keepdims=True)
+    score = gains + logsumexp(own[:, None, None] + names, axis=-1)
+    score[score < _HOPELESS] = -np.inf
+    parents, labels, weights = [], [], []
+    for h, own_score in enumerate(score):
+        for _, columns in best_assignments(own_score, _HOPELESS, _MOST_EACH):
+            taken = [(i, t) for i, t in enumerate(columns) if t >= 0]
+            weight = now.log_weights[h].copy()
+            for i, t in taken:
+                weight += gains[h, i, t] + names[h, i, t]
+            if opened and _is_reordered(seen[0][h], scan.readings.ln_f, taken):
+                weight += np.log(_REORDERED)
+            parents.append(h)
+            labels.append(columns)
+            weights.append(weight)
+    log_weights = np.array(weights)
+    total = logsumexp(log_weights, axis=1)
+    kept = np.flatnonzero(total > total.max() + _HOPELESS)
+    chosen = np.array(labels, dtype=int).reshape(len(labels), scan.rows.size)[kept]
+    bank = now.bank.take(np.array(parents)[kept])
+    at, rows = np.nonzero(chosen >= 0)
+    bank.absorb((at, chosen[at, rows]), scan.readings.pick(rows), scan.row)
+    return Hypotheses(bank, normalised(log_weights[kept]), chosen)
+
+
+def _is_reordered(at: FloatArray, ln_f: FloatArray, taken: list[tuple[int, int]]) -> bool:
+    """Tell whether modes stand in another order of frequency than before."""
+    modes = [t for _, t in sorted(taken, key=lambda pair: float(ln_f[pair[0]]))]
+    return bool((np.diff(at[modes]) < 0).any())
+
+
+def _exchanged(now: Hypotheses, scan: Scan) -> Hypotheses:
+    """Add hypotheses in which two near modes have exchanged levels.
+
+    Modes that veer come near and turn away, while their shapes go over: what keeps its shape has
+    stepped to the other's level, and goes on at its own rate.
+    """
+    at = now.bank.seen(scan.row)[0][0]
+    for t, u in combinations(range(at.size), 2):
+        if abs(at[t] - at[u]) > _VEERING or not (now.bank.n_shapes[:, [t, u]] > 0).all():
+            continue
+        other = now.bank.take(np.arange(len(now.bank.mean)))
+        levels = other.mean[:, [t, u], 0]
+        other.mean[:, [u, t], 0] = levels
+        # Rates were learned on the way to the other's level: the step is known to half its size.
+        other.cov[:, [t, u], 0, 0] += 0.25 * np.diff(levels) ** 2
+        weights = (now.log_weights + np.log(1 - _EXCHANGE), now.log_weights + np.log(_EXCHANGE))
+        now = Hypotheses(
+            now.bank.stack(other), np.concatenate(weights), np.concatenate([now.labels] * 2)
+        )
+    return now
+
+
+def normalised(log_weights: FloatArray) -> FloatArray:
+    """Return log weights whose exponentials add up to 1."""
+    return np.asarray(log_weights - logsumexp(log_weights))
+
+
+def reduce_hypotheses(kept: Hypotheses) -> Hypotheses:
+    """Join hypotheses that are the same by now and drop those without weight.
+
+    What is joined keeps mean and covariance of the mixture [Salmond1990]_. Labels of the present
+    log are those of the heaviest: read the chances before.
+
+    Parameters
+    ----------
+    kept : Hypotheses
+        Of any weights.
+    """
+    total = logsumexp(kept.log_weights, axis=1)
+    order = np.argsort(-total)
+    order = order[total[order] > total[order[0]] + _HOPELESS]
+    bank, weights = kept.bank.take(order), kept.log_weights[order]
+    left = np.ones(order.size, dtype=bool)
+    leaders: list[int] = []
+    for i in range(order.size):
+        if not left[i]:
+            continue
+        group = np.flatnonzero(left)
+        group = group[_distance(bank, i, group) < _SAME]
+        left[group] = False
+        _merge(bank, i, group, np.exp(logsumexp(weights[group], axis=1) - total[order[0]]))
+        weights[i] = logsumexp(weights[group], axis=0)
+        leaders.append(i)
+    heaviest = sorted(leaders, key=lambda i: -float(logsumexp(weights[i])))[:_MOST]
+    rows = np.array(heaviest)
+    return Hypotheses(bank.take(rows), normalised(weights[rows]), kept.labels[order[rows]])
+
+
+def _distance(bank: Bank, i: int, group: IntArray) -> FloatArray:
+    """Squared distance of hypotheses of a group to one, in its standard deviations."""
+    std = np.sqrt(np.einsum("mii->mi", bank.cov[i]))
+    std = np.where(std > 0, std, 1.0)
+    off = (bank.mean[group] - bank.mean[i]) / std
+    # Correlations: states of different units would make the solution ill-conditioned.
+    cov = bank.cov[i] / (std[:, :, None] * std[:, None, :]) + 1e-9 * np.eye(std.shape[-1])
+    total = np.sum(off * np.linalg.solve(cov, off[..., None])[..., 0], axis=(1, 2))
+    known = np.isfinite(bank.var_zeta[i])
+    var = np.where(known, bank.var_zeta[i], 1.0)
+    damping = np.where(known, (bank.ln_zeta[group] - bank.ln_zeta[i]) ** 2 / var, 0.0)
+    total += damping.sum(-1)
+    product = np.nansum(bank.shapes[group] * bank.shapes[i], axis=-1)
+    apart = np.where((bank.n_shapes[i] > 0) & (bank.n_shapes[group] > 0), 1 - product**2, 0.0)
+    return np.asarray(total + _CONCENTRATION * apart.sum(-1))
+
+
+def _merge(bank: Bank, i: int, group: IntArray, weights: FloatArray) -> None:
+    if group.size == 1:
+        return
+    share = weights / weights.sum()
+    mean = np.einsum("g,gmd->md", share, bank.mean[group])
+    off = bank.mean[group] - mean
+    bank.cov[i] = np.einsum("g,gmde->mde", share, bank.cov[group]) + np.einsum(
+        "g,gmd,gme->mde", share, off, off
+    )
+    bank.mean[i] = mean
+    ln_zeta = share @ bank.ln_zeta[group]
+    known = np.isfinite(bank.var_zeta[group]).all(0)
+    spread = np.where(known, bank.var_zeta[group], 0.0) + (bank.ln_zeta[group] - ln_zeta) ** 2
+    bank.var_zeta[i] = np.where(known, share @ spread, bank.var_zeta[i])
+    bank.ln_zeta[i] = np.where(known, ln_zeta, bank.ln_zeta[i])

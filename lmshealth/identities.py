@@ -1,0 +1,225 @@
+"""The modes of one machine as they become known, log by log."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from lmshealth.arrays import FloatArray
+from lmshealth.filterbank import Bank, IntArray, Readings
+from lmshealth.hypotheses import Hypotheses, Scan, explain, normalised, reduce_hypotheses
+from lmshealth.newcomers import Newcomers
+
+# Posterior probability from which on a label is given.
+SURE = 0.95
+# Inside the first, in standard deviations, an estimate is its mode's if no other mode is inside
+# the second, and its shape has at least the MAC.
+_NEAR, _FAR = 4.0, 12.0
+_SAME_SHAPE = 0.8
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Verdict:
+    """What became of the estimates of a scan.
+
+    Attributes
+    ----------
+    scan : Scan
+        The estimates.
+    modes : list of int
+        Mode of each, -1 for none.
+    chances : ndarray
+        Probability of each mode known before, last of none, ``(n, m + 1)``; empty where all was
+        plain.
+    expected : ndarray
+        Where ln f of each mode was expected, ``(m,)``.
+    """
+
+    scan: Scan
+    modes: list[int]
+    chances: FloatArray
+    expected: FloatArray
+
+
+class Identities:
+    """Modes known so far, under all hypotheses, and what may become one.
+
+    Parameters
+    ----------
+    prior_std : ndarray
+        Of the covariates' coefficients, shape ``(n_covariates,)``.
+    n_channels : int
+        Channels of shapes.
+
+    Attributes
+    ----------
+    names : list of str
+        Of the modes, in the order in which they were found.
+    first : list of float
+        Their first ln f.
+    """
+
+    def __init__(self, prior_std: FloatArray, n_channels: int) -> None:
+        self.names: list[str] = []
+        self.first: list[float] = []
+        self._prior_std = prior_std
+        self._shaped = n_channels > 1
+        # Modes that names mean, ascending in first frequency.
+        self._order = np.empty(0, dtype=int)
+        bank = Bank.empty(prior_std.size, n_channels)
+        self._now = Hypotheses(bank, normalised(np.zeros((1, 2))), np.empty((1, 0), dtype=int))
+        self._new = Newcomers(prior_std.size, n_channels)
+        self._groups: dict[tuple[tuple[str, ...], ...], list[tuple[IntArray, IntArray]]] = {}
+        self._row = np.empty(0)
+        self._scale, self._epoch, self._opened = 0.0, 0, False
+
+    def move(self, k: int, step: float, scale: float, offsets: FloatArray, *, opened: bool) -> None:
+        """Go to the next log.
+
+        Parameters
+        ----------
+        k : int
+            Its number.
+        step, scale : float
+            Step to it and length of a life, on the clock.
+        offsets : ndarray
+            Its covariates, shape ``(n_covariates,)``.
+        opened : bool
+            Whether frequencies may have stepped.
+        """
+        self._epoch, self._scale, self._opened = k, scale, opened
+        self._row = np.concatenate([(1.0, 0.0), offsets])
+        self._now.bank.predict(step, scale, k, opened=opened)
+        if self._new:
+            self._new.bank.predict(step, scale, k, opened=opened)
+
+    def see(
+        self, names: tuple[str, ...], sources: tuple[str, ...], readings: Readings
+    ) -> list[Verdict]:
+        """Take in the estimates of the log, source by source."""
+        verdicts: list[Verdict] = []
+        gone: set[int] = set()
+        back: set[int] = set()
+        for g in range(len(self._grouped(names, sources))):
+            rows, meant = self._grouped(names, sources)[g]
+            own = readings if rows.size == len(names) else readings.pick(rows)
+            scan = Scan(self._epoch, rows, meant, own, self._row)
+            verdict = self._plain(scan)
+            if verdict is None:
+                verdict = self._weigh(scan, names, gone)
+                back.update(np.flatnonzero((verdict.chances[:, :-1] > 0.5).any(0)).tolist())
+            else:
+                back.update(verdict.modes)
+            verdicts.append(verdict)
+        if self._new:
+            self._new.forget(self._epoch, gone, back)
+        return verdicts
+
+    def _grouped(
+        self, names: tuple[str, ...], sources: tuple[str, ...]
+    ) -> list[tuple[IntArray, IntArray]]:
+        """Rows of each source, and which modes their names mean."""
+        if (names, sources) not in self._groups:
+            index = {name: i for i, name in enumerate(self.names)}
+            unknown = len(self.names)
+            meant = np.array([index.get(n, unknown) if n else -1 for n in names], dtype=int)
+            each = [np.flatnonzero(np.array(sources) == s) for s in dict.fromkeys(sources)]
+            self._groups[names, sources] = [(rows, meant[rows]) for rows in each]
+        return self._groups[names, sources]
+
+    def _plain(self, scan: Scan) -> Verdict | None:
+        """Take a scan that has one explanation; None where it may have others."""
+        bank, new = self._now.bank, scan.readings
+        if len(bank.mean) > 1 or self._opened or not bank.n_modes:
+            return None
+        at, var = (side[0] for side in bank.seen(scan.row))
+        squared = (new.ln_f[:, None] - at) ** 2 / (new.var_f[:, None] + var)
+        rows, modes = np.nonzero(squared < _FAR**2)
+        if rows.size != scan.rows.size or np.unique(modes).size < rows.size:
+            return None
+        if (rows != np.arange(rows.size)).any() or (squared[rows, modes] > _NEAR**2).any():
+            return None
+        named = scan.names >= 0
+        # Names by order and by mode must be the same.
+        if named.any() and not (
+            np.array_equal(scan.names[named], modes[named]) and (np.diff(at[self._order]) > 0).all()
+        ):
+            return None
+        if not self._is_usual(modes, new):
+            return None
+        bank.absorb((np.zeros_like(modes), modes), new, scan.row)
+        return Verdict(scan, modes.tolist(), np.empty((0, 0)), at)
+
+    def _is_usual(self, modes: IntArray, new: Readings) -> bool:
+        """Tell whether dampings and shapes are those of the modes."""
+        bank = self._now.bank
+        off = (new.ln_zeta - bank.ln_zeta[0, modes]) ** 2
+        if (off > _NEAR**2 * (new.var_zeta + bank.var_zeta[0, modes])).any():
+            return False
+        if not self._shaped:
+            return True
+        mac = np.nansum(new.shapes * bank.shapes[0, modes], axis=-1) ** 2
+        return bool((mac > _SAME_SHAPE).all())
+
+    def _weigh(self, scan: Scan, names: tuple[str, ...], gone: set[int]) -> Verdict:
+        """Follow all explanations of a scan and choose labels that are sure."""
+        expected = self._now.bank.seen(scan.row)[0][0]
+        grown = explain(self._now, scan, self._order, opened=self._opened)
+        self._now = reduce_hypotheses(grown)
+        m = len(self.names)
+        chances = grown.chances(m)
+        best = np.where(chances.argmax(1) < m, chances.argmax(1), -1)
+        modes = np.where(chances.max(1) >= SURE, best, -1).tolist()
+        lone = np.flatnonzero(chances[:, -1] > 0.5).tolist()
+        for i in lone:
+            name = names[scan.rows[i]]
+            if name and name not in self.names:
+                modes[i] = self._found(scan.readings.pick(np.array([i])), name)
+        left = np.array([i for i in lone if modes[i] < 0], dtype=int)
+        # A name whose mode is seen elsewhere in this log tells nothing.
+        free = (scan.names < m) & ~np.isin(scan.names, best)
+        meant = np.where(free, scan.names, -1)[left]
+        rest = Scan(scan.epoch, scan.rows[left], meant, scan.readings.pick(left), scan.row)
+        confirmed = self._new.watch(rest, self._prior_std, self._scale)
+        for i, j in zip(left.tolist(), confirmed, strict=True):
+            if j is not None:
+                modes[i] = self._confirm(j)
+                gone.add(j)
+        return Verdict(scan, modes, chances, expected)
+
+    def _found(self, reading: Readings, name: str) -> int:
+        """Begin a mode at the first estimate that has its name."""
+        bank = self._now.bank.found(reading, self._row, self._prior_std, self._scale)
+        self._now = replace(self._now, bank=bank)
+        mode = self._enrol(name, float(reading.ln_f[0]))
+        by_first = np.argsort([self.first[i] for i in (*self._order, mode)], kind="stable")
+        self._order = np.append(self._order, mode)[by_first]
+        return mode
+
+    def _confirm(self, j: int) -> int:
+        """Make a newcomer a mode, or the new level of the mode that it is named after."""
+        new = self._new.bank.keep(np.array([j]))
+        mode = self._new.name(j)
+        bank = self._now.bank
+        if mode >= 0:
+            bank.mean[:, mode], bank.cov[:, mode] = new.mean[0, 0], new.cov[0, 0]
+            bank.ln_zeta[:, mode], bank.var_zeta[:, mode] = new.ln_zeta[0, 0], new.var_zeta[0, 0]
+            return mode
+        self._now = replace(self._now, bank=bank.join(new))
+        ln_f = float(new.seen(self._row)[0][0, 0])
+        return self._enrol(self._unique(float(np.exp(ln_f))), ln_f)
+
+    def _enrol(self, name: str, ln_f: float) -> int:
+        self.names.append(name)
+        self.first.append(ln_f)
+        self._groups.clear()
+        return len(self.names) - 1
+
+    def _unique(self, frequency: float) -> str:
+        """Name a mode by its frequency, with as many digits as tell it from others."""
+        for digits in range(6):
+            name = f"{frequency:.{digits}f}_hz"
+            if name not in self.names:
+                return name
+        return f"{name[:-3]}_{len(self.names)}_hz"
