@@ -19,7 +19,7 @@ from lmshealth.history import Reading
 from lmshealth.logs import Metadata
 from lmshealth.results import Health, Modes, Prognosis
 from lmshealth.stage import Stage, load_stage
-from lmshealth.tracks import History, Track
+from lmshealth.tracks import History, Series, Step, StepKind, Track
 
 MODES = ("roll", "pitch", "yaw")
 FREQUENCY = np.array([126.4, 136.6, 155.0])
@@ -133,7 +133,7 @@ def make_history(
     temperature: FloatArray | None = None,
     baseline: int = 0,
 ) -> History:
-    """Make a history of the first modes; where ln frequency is NaN, all of the mode is missing."""
+    """Make a history of the first modes by accelerometers; NaN ln f: all of the mode is missing."""
     n, m = ln_frequency.shape
     travel = np.linspace(2.0e5, 2.2e6, n) if travel is None else travel
     if cov is None:
@@ -152,11 +152,18 @@ def make_history(
         travel=np.array(travel, dtype=float),
         covariates={} if temperature is None else {"temperature_c": np.array(temperature)},
         modes=MODES[:m],
+        series=tuple(Series(mode, "acc") for mode in MODES[:m]),
         ln_frequency=np.array(ln_frequency),
         ln_damping=ln_damping,
         cov=cov,
-        baseline=baseline,
+        loop_error=np.full(n, np.nan),
+        baselines=(baseline,),
     )
+
+
+def since(kind: StepKind, first: int, n: int, source: str = "", name: str = "") -> Step:
+    """Make a declared step that all logs from one on see."""
+    return Step(kind, first, np.arange(n) >= first, source, name)
 
 
 def rough_history(rng: np.random.Generator, *, baseline: int = 0, n: int = 10) -> History:
@@ -182,6 +189,56 @@ def rough_history(rng: np.random.Generator, *, baseline: int = 0, n: int = 10) -
     )
 
 
+def awkward_history(rng: np.random.Generator, n: int = 16) -> History:
+    """Make a history of two modes by two sources in which everything that a history may have is.
+
+    Irregular odometer that stands still once, errors common to both sources, series that miss here
+    and there, one log without any, unknown covariates, a second baseline after work, and steps of
+    every kind, of which a retuning is taken back.
+    """
+    m, r = 2, 4
+    series = tuple(Series(mode, source) for source in ("acc", "delta_e") for mode in MODES[:m])
+    travel = np.cumsum(np.r_[3e5, rng.uniform(1e4, 4e5, n - 1)])
+    travel[6] = travel[5]
+    temperature, payload = 21 + 5 * rng.standard_normal(n), 40 + 20 * rng.random(n)
+    std = np.r_[np.tile([2e-3, 1e-3], 2), np.tile([0.05, 0.08], 2)]
+    # Both sources see the same excitation: most of their errors is common.
+    common = np.kron(np.eye(2), np.kron(np.sqrt([[0.1, 0.9], [0.0, 1.0]]), np.eye(m)))
+    root = std[:, None] * (common + 0.2 * rng.standard_normal((n, 2 * r, 2 * r)))
+    cov = root @ np.swapaxes(root, 1, 2)
+    noise = (root @ rng.standard_normal((n, 2 * r, 1)))[:, :, 0]
+    level = np.log(FREQUENCY[:m]) - 0.02 * (travel - travel[0])[:, None] / np.ptp(travel)
+    level = level - 4e-4 * (temperature[:, None] - 21) - 1e-5 * (payload[:, None] - 50) ** 2
+    level[9:] += 0.03
+    values = np.hstack([level, level + 2e-3, np.tile(np.log(DAMPING[:m]), (n, 2))]) + noise
+    values[2, [0, 4]] = values[7, [3, 7]] = values[11, [0, 1, 4, 5]] = values[4] = np.nan
+    gone = np.isnan(values)
+    cov[gone[:, :, None] | gone[:, None, :]] = np.nan
+    temperature[3] = payload[[3, 8]] = np.nan
+    servo = Step("servo", 5, (np.arange(n) >= 5) & (np.arange(n) < 12), name="v2")
+    return History(
+        stage="AX-1",
+        logs=tuple(f"{k:03d}.csv" for k in range(n)),
+        recorded_at=tuple(START + timedelta(days=7 * k) for k in range(n)),
+        travel=travel,
+        covariates={"temperature_c": temperature, "payload_kg": payload},
+        modes=MODES[:m],
+        series=series,
+        ln_frequency=values[:, :r],
+        ln_damping=values[:, r:],
+        cov=cov,
+        loop_error=np.full(n, np.nan),
+        baselines=(1, 9),
+        steps=(
+            since("step", 3, n),
+            servo,
+            since("regreasing", 6, n),
+            since("reset", 9, n),
+            since("sensor", 13, n, source="delta_e"),
+        ),
+    )
+
+
 def make_track(drift: FloatArray, cov: FloatArray) -> Track:
     """Make a track of given drifts ``(n, m)`` with covariances ``(n, m, m)``."""
     n, m = drift.shape
@@ -192,6 +249,7 @@ def make_track(drift: FloatArray, cov: FloatArray) -> Track:
         recorded_at=tuple(START + timedelta(days=7 * k) for k in range(n)),
         travel=np.linspace(0.0, 1e6, n),
         modes=MODES[:m],
+        sources=("acc",),
         ln_frequency=np.log(FREQUENCY[:m]) + drift,
         ln_frequency_std=std,
         ln_damping=np.tile(np.log(DAMPING[:m]), (n, 1)),
@@ -199,9 +257,14 @@ def make_track(drift: FloatArray, cov: FloatArray) -> Track:
         drift=np.array(drift),
         drift_cov=np.array(cov),
         effects=(),
+        events=(),
+        steps=(),
+        outliers=(),
         nis=np.full(n, 2.0 * m),
         nis_dof=np.full(n, 2.0 * m),
-        noise_scale=np.ones(n),
+        innovations=np.zeros((n, 2 * m)),
+        noise_scale=np.ones((n, 1)),
+        widening=np.ones(n),
     )
 
 

@@ -2,179 +2,359 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from filterpy.kalman import KalmanFilter
 from scipy import stats
+from scipy.linalg import cho_factor, cho_solve
 
 from lmshealth.arrays import FloatArray
-from lmshealth.tracks import History
+from lmshealth.tracks import History, Series
+
+# The model of a mode: prior standard deviations, and the walk of ln damping in a life.
+LEVEL_STD, DAMPING_STD, DAMPING_WALK = 0.1, 1.0, 0.5
+BIAS = (0.005, 0.2)
+# Standard deviations of the jumps of ln f and ln ζ.
+JUMPS = {
+    "step": (0.03, 0.3),
+    "regreasing": (0.0, 0.3),
+    "servo": (0.01, 0.2),
+    "sensor": (0.005, 0.2),
+    "reset": (0.05, 0.5),
+}
 
 
 @dataclass(frozen=True)
 class Wander:
-    """Process noises over a history and the factor on the reported standard deviations."""
+    """One setting: walks and rate of ln f in a life, factors on the std of each source."""
 
     level: float
     rate: float
-    scale: float = 1.0
+    bend: float
+    scales: Mapping[str, float]
+
+
+@dataclass(frozen=True)
+class Known:
+    """What a stage says: ticks of a life, and covariates ``(name, reference, std, curvature)``.
+
+    Rates are unknown anew in front of the logs in ``reopened``.
+    """
+
+    life: float
+    covariates: Sequence[tuple[str, float, float, float]] = ()
+    reopened: Sequence[int] = ()
 
 
 @dataclass(frozen=True)
 class Followed:
-    """What a tracker says: drifts ``(n, m)``, their covariances, and the log evidence so far."""
+    """What a tracker says: means and variances by quantity, the log evidence so far, and NIS.
 
-    ln_frequency: FloatArray
-    ln_frequency_std: FloatArray
-    drift: FloatArray
-    drift_cov: FloatArray
+    ``mean`` is ``(n, 3, m)`` and ``cov`` ``(n, 3, m, 3, m)`` of ln f, ln ζ and the drift.
+    """
+
+    mean: FloatArray
+    cov: FloatArray
     log_evidence: FloatArray
     nis: FloatArray
 
 
-# The model of a mode: prior standard deviations, and the walk of ln damping over a history.
-LEVEL_STD, DAMPING_STD, RATE_STD, DAMPING_WALK = 0.1, 1.0, 0.3, 0.3
+def _unknown(history: History, known: Known, k: int) -> float:
+    """Variance of ln f in a log for want of its covariates."""
+    total = 0.0
+    for name, _, std, _ in known.covariates:
+        values = history.covariates[name]
+        if np.isnan(values[k]):
+            total += (std * max(float(np.nanstd(values)), 1.0)) ** 2
+    return total
 
 
-def _covariate(history: History, reference: float) -> tuple[FloatArray, FloatArray, float]:
-    """Offset of the temperature (0 where unknown), where it is unknown, and its spread."""
-    values = history.covariates["temperature_c"]
-    unknown = np.isnan(values)
-    return (
-        np.where(unknown, 0.0, values - reference),
-        unknown,
-        max(float(np.std(values[~unknown])), 1.0),
-    )
+def _offset(history: History, name: str, reference: float, k: int) -> float:
+    value = float(history.covariates[name][k])
+    return 0.0 if np.isnan(value) else value - reference
+
+
+def _first(table: FloatArray) -> float:
+    """Give the first value that is there, log by log, series by series."""
+    return next(float(value) for row in table for value in row if not np.isnan(value))
+
+
+def _reference(history: History, mode: str) -> Series:
+    """Series of a mode that the others are measured against: the most frequent, else the first."""
+    own = [one for one in history.series if one.mode == mode]
+    counts = [np.isfinite(history.ln_frequency[:, history.series.index(one)]).sum() for one in own]
+    return own[int(np.argmax(counts))]
 
 
 def _data(
-    history: History, k: int, scale: float, extra: float
+    history: History, known: Known, wander: Wander, k: int
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Values of one log that exist, their covariance, and their rows in [ln f, ln ζ]."""
-    m = len(history.modes)
+    r = len(history.series)
     values = np.r_[history.ln_frequency[k], history.ln_damping[k]]
-    cov = np.array(history.cov[k]) * scale**2
-    for i in range(m):
-        cov[i, i] += extra
+    cov = np.array(history.cov[k])
+    for a in range(2 * r):
+        for c in range(2 * r):
+            cov[a, c] *= wander.scales[history.series[a % r].source]
+            cov[a, c] *= wander.scales[history.series[c % r].source]
+    for a in range(r):
+        cov[a, a] += _unknown(history, known, k)
     rows = np.flatnonzero(~np.isnan(values))
     return values[rows], cov[np.ix_(rows, rows)], rows
 
 
-def kalman(
-    history: History, wander: Wander, *, reference: float = 21.0, b_std: float = 1e-3
-) -> Followed:
-    """Filter by the five textbook equations, with one joint state for all modes.
+class Textbook:
+    """The state space written out by names of its entries, one log and one entry at a time."""
 
-    The state is [ℓ, ℓ̇, ln ζ, b, ℓ₀], each for all modes. ℓ₀ is unknown, and without meaning, until
-    the baseline log is reached, where it becomes equal to ℓ.
-    """
-    n, m = len(history.logs), len(history.modes)
-    span = history.travel[-1] - history.travel[0]
-    offset, unknown, spread = _covariate(history, reference)
-    level, rate, damping, b, base = (np.arange(m) + part * m for part in range(5))
-    x, p = np.zeros(5 * m), np.zeros((5 * m, 5 * m))
-    for i in range(m):
-        seen = np.flatnonzero(~np.isnan(history.ln_frequency[:, i]))[0]
-        x[level[i]], x[damping[i]] = history.ln_frequency[seen, i], history.ln_damping[seen, i]
-        p[level[i], level[i]] = LEVEL_STD**2
-        p[rate[i], rate[i]] = (RATE_STD / span) ** 2
-        p[damping[i], damping[i]] = DAMPING_STD**2
-        p[b[i], b[i]] = b_std**2
-    out: dict[str, list[FloatArray]] = {name: [] for name in ("f", "s", "d", "c", "e", "n")}
-    evidence = 0.0
-    for k in range(n):
+    def __init__(self, history: History, wander: Wander, known: Known) -> None:
+        self.history, self.wander, self.known = history, wander, known
+        parts = ("level", "rate", "damping", "base")
+        self.names: list[tuple[object, ...]] = [(p, i) for i in history.modes for p in parts]
+        for name, _, _, curvature in known.covariates:
+            self.names += [(name, i) for i in history.modes]
+            self.names += [(name + "^2", i) for i in history.modes if curvature]
+        for one in history.series:
+            if one != _reference(history, one.mode):
+                self.names += [("bias f", one), ("bias z", one)]
+        for j in range(len(history.steps)):
+            self.names += [(part, j, i) for i in history.modes for part in ("jump f", "jump z")]
+        self.at = {name: k for k, name in enumerate(self.names)}
+
+    def prior(self) -> tuple[FloatArray, FloatArray]:
+        """Mean and covariance before the first log; jumps have not happened yet."""
+        history, x, p = self.history, np.zeros(len(self.names)), np.zeros(len(self.names))
+        for i in history.modes:
+            own = [c for c, one in enumerate(history.series) if one.mode == i]
+            for part, table, std in (
+                ("level", history.ln_frequency, LEVEL_STD),
+                ("damping", history.ln_damping, DAMPING_STD),
+            ):
+                x[self.at[part, i]] = _first(table[:, own])
+                p[self.at[part, i]] = std**2
+            p[self.at["rate", i]] = (self.wander.rate / self.known.life) ** 2
+            for name, _, std, curvature in self.known.covariates:
+                p[self.at[name, i]] = std**2
+                if curvature:
+                    p[self.at[name + "^2", i]] = curvature**2
+        for name in self.names:
+            if name[0] == "bias f":
+                p[self.at[name]] = BIAS[0] ** 2
+            if name[0] == "bias z":
+                p[self.at[name]] = BIAS[1] ** 2
+        return x, np.diag(p)
+
+    def moved(self, k: int) -> tuple[FloatArray, FloatArray]:
+        """Transition into log k and its noise: first time goes by, then steps, then the copy."""
+        history, at, wander, life = self.history, self.at, self.wander, self.known.life
+        f, q = np.eye(len(at)), np.zeros((len(at), len(at)))
         if k > 0:
-            step = history.travel[k] - history.travel[k - 1]
-            f, q = np.eye(5 * m), np.zeros((5 * m, 5 * m))
-            walk, bend = wander.level**2 / span, wander.rate**2 / span**3
-            for i in range(m):
-                f[level[i], rate[i]] = step
-                q[level[i], level[i]] = walk * step + bend * step**3 / 3
-                q[level[i], rate[i]] = q[rate[i], level[i]] = bend * step**2 / 2
-                q[rate[i], rate[i]] = bend * step
-                q[damping[i], damping[i]] = DAMPING_WALK**2 / span * step
-            x, p = f @ x, f @ p @ f.T + q
-        if k == history.baseline:
-            copy = np.eye(5 * m)
-            copy[base, base] = 0
-            copy[base, level] = 1
-            x, p = copy @ x, copy @ p @ copy.T
-        h = np.zeros((2 * m, 5 * m))
-        for i in range(m):
-            h[i, level[i]], h[i, b[i]], h[m + i, damping[i]] = 1, offset[k], 1
-        extra = (b_std * spread) ** 2 if unknown[k] else 0.0
-        y, r, rows = _data(history, k, wander.scale, extra)
+            tick = float(history.clock()[k] - history.clock()[k - 1])
+            walk, bend = wander.level**2 / life, wander.bend**2 / life**3
+            for i in history.modes:
+                level, rate = at["level", i], at["rate", i]
+                # A rate that is unknown anew is so from the log before on.
+                anew = (wander.rate / life) ** 2 if k in self.known.reopened else 0.0
+                f[level, rate] = tick
+                q[level, level] = walk * tick + bend * tick**3 / 3 + anew * tick**2
+                q[level, rate] = q[rate, level] = bend * tick**2 / 2 + anew * tick
+                q[rate, rate] = bend * tick + anew
+                q[at["damping", i], at["damping", i]] = DAMPING_WALK**2 / life * tick
+        q += self._begun(k)
+        if k in history.baselines:
+            copy = np.eye(len(at))
+            for i in history.modes:
+                copy[at["base", i], at["base", i]] = 0
+                copy[at["base", i], at["level", i]] = 1
+            f, q = copy @ f, copy @ q @ copy.T
+        return f, q
+
+    def _begun(self, k: int) -> FloatArray:
+        """Give the noise of the steps that begin at log k."""
+        q = np.zeros((len(self.at), len(self.at)))
+        for j, step in enumerate(self.history.steps):
+            if step.first != k:
+                continue
+            for i in self.history.modes:
+                for part, moved, std in zip(
+                    ("jump f", "jump z"), ("level", "damping"), JUMPS[step.kind], strict=True
+                ):
+                    pushed = [self.at[part, j, i]]
+                    if step.kind in ("step", "regreasing", "reset"):
+                        pushed.append(self.at[moved, i])
+                    q[np.ix_(pushed, pushed)] += std**2
+        return q
+
+    def seen(self, k: int) -> FloatArray:
+        """Give the measurement matrix of log k, all rows."""
+        history, at, r = self.history, self.at, len(self.history.series)
+        h = np.zeros((2 * r, len(at)))
+        for a, one in enumerate(history.series):
+            h[a, at["level", one.mode]] = h[r + a, at["damping", one.mode]] = 1
+            for name, reference, _, curvature in self.known.covariates:
+                offset = _offset(history, name, reference, k)
+                h[a, at[name, one.mode]] = offset
+                if curvature:
+                    h[a, at[name + "^2", one.mode]] = offset**2
+            if ("bias f", one) in at:
+                h[a, at["bias f", one]] = h[r + a, at["bias z", one]] = 1
+            for j, step in enumerate(history.steps):
+                everywhere = step.kind == "servo"
+                here = step.kind == "sensor" and step.source == one.source
+                if (everywhere or here) and step.there[k]:
+                    h[a, at["jump f", j, one.mode]] = h[r + a, at["jump z", j, one.mode]] = 1
+        return h
+
+    def told(self) -> FloatArray:
+        """Give the contrasts that make ln f, ln ζ and drift of a state."""
+        c = np.zeros((3, len(self.history.modes), len(self.at)))
+        for i, mode in enumerate(self.history.modes):
+            c[0, i, self.at["level", mode]] = c[1, i, self.at["damping", mode]] = 1
+            c[2, i, self.at["level", mode]] = 1
+            c[2, i, self.at["base", mode]] = -1
+        return c
+
+
+def kalman(history: History, wander: Wander, known: Known) -> Followed:
+    """Filter by the five textbook equations."""
+    book = Textbook(history, wander, known)
+    (x, p), told, evidence = book.prior(), book.told(), 0.0
+    out = []
+    for k in range(len(history.logs)):
+        f, q = book.moved(k)
+        x, p = f @ x, f @ p @ f.T + q
+        y, r, rows = _data(history, known, wander, k)
         nis = 0.0
         if rows.size:
-            h = h[rows]
+            h = book.seen(k)[rows]
             s = h @ p @ h.T + r
-            gain = p @ h.T @ np.linalg.inv(s)
+            gain = np.linalg.solve(s, h @ p).T
             innovation = y - h @ x
-            nis = float(innovation @ np.linalg.inv(s) @ innovation)
+            nis = float(innovation @ np.linalg.solve(s, innovation))
             evidence += stats.multivariate_normal.logpdf(innovation, cov=s)
-            x, p = x + gain @ innovation, p - gain @ s @ gain.T
-        contrast = np.zeros((m, 5 * m))
-        contrast[np.arange(m), level], contrast[np.arange(m), base] = 1, -1
-        out["f"].append(x[level])
-        out["s"].append(np.sqrt(np.diag(p)[level]))
-        out["d"].append(contrast @ x)
-        out["c"].append(contrast @ p @ contrast.T)
-        out["e"].append(np.array(evidence))
-        out["n"].append(np.array(nis))
-    return Followed(*(np.array(out[name]) for name in ("f", "s", "d", "c", "e", "n")))
+            x, p = x + gain @ innovation, p - gain @ h @ p
+        out.append((told @ x, np.einsum("pia,ab,qjb->piqj", told, p, told), evidence, nis))
+    return Followed(*(np.array(part) for part in zip(*out, strict=True)))
 
 
-def batch(
-    history: History, wander: Wander, *, reference: float = 21.0, b_std: float = 1e-3
-) -> Followed:
-    """Condition the whole joint Gaussian on the logs so far, without any recursion.
+def filterpy_loop(history: History, wander: Wander, known: Known) -> Followed:
+    """Filter by filterpy, log by log."""
+    book = Textbook(history, wander, known)
+    kalman = KalmanFilter(dim_x=len(book.names), dim_z=1)
+    (kalman.x, kalman.P), told, evidence = book.prior(), book.told(), 0.0
+    out = []
+    for k in range(len(history.logs)):
+        f, q = book.moved(k)
+        kalman.predict(F=f, Q=q)
+        y, r, rows = _data(history, known, wander, k)
+        nis = 0.0
+        if rows.size:
+            kalman.update(y, R=r, H=book.seen(k)[rows])
+            nis, evidence = float(kalman.mahalanobis) ** 2, evidence + float(kalman.log_likelihood)
+        cov = np.einsum("pia,ab,qjb->piqj", told, kalman.P, told)
+        out.append((told @ kalman.x, cov, evidence, nis))
+    return Followed(*(np.array(part) for part in zip(*out, strict=True)))
 
-    ℓ has the covariance σ² + σ_r² t t' + walk min(t, t') + bend min²(3 max − min)/6, t from the
-    first log; the data are ℓ + b ΔT and ln ζ with noise.
+
+def _levels(history: History, wander: Wander, known: Known) -> tuple[np.ndarray, np.ndarray]:
+    """Covariance of ln f, and of ln ζ, of one mode over all logs, ``(n, n)`` each.
+
+    With t the ticks since the first log, that of ln f is
+    σ² + σ_r² t t' + walk min(t, t') + bend min² (3 max − min)/6 + Σ jump² where both come after it.
     """
-    n, m = len(history.logs), len(history.modes)
-    t = history.travel - history.travel[0]
-    span = t[-1]
-    offset, unknown, spread = _covariate(history, reference)
+    t = (history.clock() - history.clock()[0]).astype(np.longdouble) / known.life
     low, high = np.minimum.outer(t, t), np.maximum.outer(t, t)
-    level = LEVEL_STD**2 + (RATE_STD / span) ** 2 * np.outer(t, t)
-    level += wander.level**2 / span * low + wander.rate**2 / span**3 * low**2 * (3 * high - low) / 6
-    damping = DAMPING_STD**2 + DAMPING_WALK**2 / span * low
-    # Data in the order (log, [ln f, ln ζ] of all modes); levels in the order (log, mode).
-    signal = np.zeros((n, 2 * m, n, 2 * m))
-    cross, own = np.zeros((n, m, n, 2 * m)), np.zeros((n, m, n, m))
-    noise = np.zeros_like(signal)
-    centre, values = np.zeros((n, 2 * m)), np.full((n, 2 * m), np.nan)
-    for i in range(m):
-        signal[:, i, :, i] = level + b_std**2 * np.outer(offset, offset)
-        signal[:, m + i, :, m + i] = damping
-        cross[:, i, :, i] = level
-        own[:, i, :, i] = level
-        seen = np.flatnonzero(~np.isnan(history.ln_frequency[:, i]))[0]
-        centre[:, i], centre[:, m + i] = history.ln_frequency[seen, i], history.ln_damping[seen, i]
+    level = LEVEL_STD**2 + wander.rate**2 * np.outer(t, t) + wander.level**2 * low
+    level += wander.bend**2 * low**2 * (3 * high - low) / 6
+    damping = DAMPING_STD**2 + DAMPING_WALK**2 * low
+    for k in known.reopened:
+        since = np.maximum(t - t[k - 1], 0.0)
+        level += wander.rate**2 * np.outer(since, since)
+    for step in history.steps:
+        if step.kind in ("step", "regreasing", "reset"):
+            then = np.arange(t.size) >= step.first
+            level += JUMPS[step.kind][0] ** 2 * np.outer(then, then)
+            damping += JUMPS[step.kind][1] ** 2 * np.outer(then, then)
+    return level, damping
+
+
+def _readings(history: History, known: Known, a: Series, c: Series, part: int) -> np.ndarray:
+    """Covariance of how two series of a mode are read wrongly in common, ``(n, n)``."""
+    n = len(history.logs)
+    read = np.zeros((n, n), dtype=np.longdouble)
+    for name, reference, std, curvature in known.covariates if part == 0 else ():
+        offset = np.array([_offset(history, name, reference, k) for k in range(n)], np.longdouble)
+        read += std**2 * np.outer(offset, offset) + curvature**2 * np.outer(offset**2, offset**2)
+    if a == c and a != _reference(history, a.mode):
+        read += BIAS[part] ** 2
+    for step in history.steps:
+        one_sensor = step.kind == "sensor" and {a.source, c.source} == {step.source}
+        if step.kind == "servo" or one_sensor:
+            there = step.there.astype(float)
+            read += JUMPS[step.kind][part] ** 2 * np.outer(there, there)
+    return read
+
+
+def batch(history: History, wander: Wander, known: Known, *, smoothed: bool = False) -> Followed:
+    """Condition the whole joint Gaussian on the logs so far, or on all, without any recursion.
+
+    Wide priors under sharp estimates cost eleven digits: sums are made with extended precision.
+    """
+    n, m, r = len(history.logs), len(history.modes), len(history.series)
+    # Data in the order (log, [ln f, ln ζ] of all series); truth in the order (log, part, mode).
+    total = np.zeros((n, 2, r, n, 2, r), dtype=np.longdouble)
+    cross = np.zeros((n, 2, m, n, 2, r), dtype=np.longdouble)
+    own = np.zeros((n, 2, m, n, 2, m), dtype=np.longdouble)
+    centre, prior = np.zeros((n, 2, r)), np.zeros((n, 2, m))
+    values = np.stack([history.ln_frequency, history.ln_damping], axis=1)
+    for part, truth in enumerate(_levels(history, wander, known)):
+        for i, mode in enumerate(history.modes):
+            series = [(a, one) for a, one in enumerate(history.series) if one.mode == mode]
+            first = _first(values[:, part, [a for a, _ in series]])
+            own[:, part, i, :, part, i], prior[:, part, i] = truth, first
+            for a, one in series:
+                centre[:, part, a], cross[:, part, i, :, part, a] = first, truth
+                for c, other in series:
+                    read = _readings(history, known, one, other, part)
+                    total[:, part, a, :, part, c] = truth + read
+    total = total.reshape(n * 2 * r, -1)
     for k in range(n):
-        extra = (b_std * spread) ** 2 if unknown[k] else 0.0
-        y, r, rows = _data(history, k, wander.scale, extra)
-        values[k, rows] = y
-        noise[k, rows[:, None], k, rows] = r
-    total = (signal + noise).reshape(2 * n * m, -1)
-    cross, own = cross.reshape(n * m, -1), own.reshape(n * m, -1)
-    off = (values - centre).ravel()
-    results = []
+        _, noise, rows = _data(history, known, wander, k)
+        total[np.ix_(rows + 2 * r * k, rows + 2 * r * k)] += noise
+    cross, own = cross.reshape(n * 2 * m, -1), own.reshape(n * 2 * m, -1)
+    off, prior = (values - centre).ravel(), prior.ravel()
+    out = []
     for k in range(n):
-        rows = np.flatnonzero(~np.isnan(values.ravel()) & (np.arange(off.size) < 2 * m * (k + 1)))
-        gain = cross[:, rows] @ np.linalg.inv(total[np.ix_(rows, rows)])
-        mean = (centre[:, :m].ravel() + gain @ off[rows]).reshape(n, m)
-        cov = (own - gain @ cross[:, rows].T).reshape(n, m, n, m)
-        base = history.baseline
-        drift_cov = (
-            cov[k, :, k, :] - cov[k, :, base, :] - cov[base, :, k, :] + cov[base, :, base, :]
+        use = np.flatnonzero(~np.isnan(off) & (smoothed | (np.arange(off.size) < 2 * r * (k + 1))))
+        solved, log_det = _solve(total[np.ix_(use, use)], np.c_[off[use], cross[:, use].T])
+        mean = prior + cross[:, use] @ solved[:, 0]
+        cov = own - cross[:, use] @ solved[:, 1:]
+        base = max([b for b in history.baselines if b <= k], default=0)
+        told = np.zeros((3, m, n, 2, m))
+        for i in range(m):
+            told[0, i, k, 0, i] = told[1, i, k, 1, i] = told[2, i, k, 0, i] = 1
+            told[2, i, base, 0, i] -= 1
+        flat = told.reshape(3 * m, -1)
+        evidence = -0.5 * (off[use] @ solved[:, 0] + log_det + use.size * np.log(2 * np.pi))
+        out.append(
+            (
+                (flat @ mean).reshape(3, m),
+                (flat @ cov @ flat.T).reshape(3, m, 3, m),
+                evidence,
+                np.nan,
+            )
         )
-        evidence = stats.multivariate_normal.logpdf(off[rows], cov=total[np.ix_(rows, rows)])
-        std = np.sqrt(np.diag(cov[k, :, k, :]))
-        results.append((mean[k], std, mean[k] - mean[base], drift_cov, evidence, np.nan))
-    return Followed(*(np.array(part) for part in zip(*results, strict=True)))
+    return Followed(*(np.array(part, dtype=float) for part in zip(*out, strict=True)))
+
+
+def _solve(matrix: np.ndarray, right: np.ndarray) -> tuple[np.ndarray, float]:
+    """Solve in extended precision, by refining what a Cholesky factor gives, and the log det."""
+    factor = cho_factor(matrix.astype(float), lower=True)
+    solved = np.zeros_like(right, dtype=np.longdouble)
+    for _ in range(4):
+        solved += cho_solve(factor, (right - matrix @ solved).astype(float))
+    return solved, 2 * float(np.log(np.diag(factor[0])).sum())
 
 
 def epoch_log_posterior(
