@@ -24,7 +24,17 @@ FLOORS = [
         "components",
         "filterbank",
     },
-    {"laws", "spectra", "following", "transient", "periods", "rational", "noise", "hypotheses"},
+    {
+        "laws",
+        "spectra",
+        "following",
+        "transient",
+        "periods",
+        "rational",
+        "noise",
+        "hypotheses",
+        "estimates",
+    },
     {
         "stage",
         "kernel",
