@@ -155,7 +155,7 @@ def explain(
         place = -float(np.log(j * (j + 1)))
         for kind, source in kinds:
             step = Step(kind, j, np.arange(len(space.history.logs)) >= j, source, declared=False)
-            changed = Filter(space.with_step(step), filters.copies)
+            changed = filters.with_step(step)
             before = memory[j - 1].padded(changed.space.size)
             after = advance(changed, before, j)
             gain = after.log_evidence - memory[j - 1].log_evidence - nothing
