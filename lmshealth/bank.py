@@ -135,8 +135,7 @@ class Bank:
     @property
     def weight(self) -> FloatArray:
         """Posterior probability of each setting, shape ``(n_settings,)``."""
-        weight = np.exp(self.log_weight - self.log_weight.max())
-        return np.asarray(weight / weight.sum())
+        return np.asarray(np.exp(self.log_weight - self.log_evidence))
 
     @property
     def log_evidence(self) -> float:
@@ -154,12 +153,10 @@ class Bank:
 
     def pruned(self) -> Bank:
         """Drop what carries next to nothing of its group; both groups stay."""
-        healthy = self.settings.healthy
-        keep = np.zeros(healthy.size, dtype=bool)
-        for group in (healthy, ~healthy):
-            if group.any():
-                best = self.log_weight[group].max()
-                keep |= group & (self.log_weight > best + _NEGLIGIBLE)
+        group = self.settings.healthy.astype(int)
+        best = np.full(2, -np.inf)
+        np.maximum.at(best, group, self.log_weight)
+        keep = self.log_weight > best[group] + _NEGLIGIBLE
         return self if keep.all() else self.only(keep)
 
     def collapse(self, size: int | None = None) -> tuple[FloatArray, FloatArray]:
@@ -168,7 +165,8 @@ class Bank:
         weight, mean = self.weight, self.mean[:, part]
         centre = weight @ mean
         off = mean - centre
-        cov = np.einsum("g,gij->ij", weight, self.cov[:, part, part])
+        n = centre.size
+        cov = (weight @ self.cov[:, part, part].reshape(-1, n * n)).reshape(n, n)
         return centre, cov + (off * weight[:, None]).T @ off
 
 
@@ -294,15 +292,15 @@ class Filter:
             spread[:, outlying, outlying] *= _OUTLIER_REACH**2
             bank.log_weight += np.log(_OUTLIERS)
         root = np.linalg.cholesky(spread)
-        half = np.linalg.inv(root)
         off = value - bank.mean @ matrix.T
-        white = (half @ off[:, :, None])[:, :, 0]
-        gain = half @ np.swapaxes(crossed, 1, 2)
-        nis = np.square(white).sum(axis=1)
+        right = np.concatenate([off[:, :, None], np.swapaxes(crossed, 1, 2)], axis=2)
+        whitened = np.linalg.solve(root, right)
+        white, gain = whitened[:, :, 0], whitened[:, :, 1:]
+        nis = np.einsum("gi,gi->g", white, white)
         weight = bank.weight
         bank.mean += (white[:, None, :] @ gain)[:, 0, :]
         bank.cov -= np.swapaxes(gain, 1, 2) @ gain
-        log_det = np.log(root[:, i, i]).sum(axis=1)
+        log_det = np.log(np.einsum("gii->gi", root)).sum(axis=1)
         bank.log_weight += -0.5 * nis - log_det - 0.5 * value.size * np.log(2 * np.pi)
         likely = int(np.argmax(weight))
         std = np.sqrt(spread[likely, i, i])
