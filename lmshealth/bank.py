@@ -13,6 +13,7 @@ on.
 from __future__ import annotations
 
 from collections.abc import Collection
+from copy import copy
 from dataclasses import dataclass, fields
 from itertools import product
 from math import prod
@@ -134,8 +135,7 @@ class Bank:
     @property
     def weight(self) -> FloatArray:
         """Posterior probability of each setting, shape ``(n_settings,)``."""
-        weight = np.exp(self.log_weight - self.log_weight.max())
-        return np.asarray(weight / weight.sum())
+        return np.asarray(np.exp(self.log_weight - self.log_evidence))
 
     @property
     def log_evidence(self) -> float:
@@ -153,12 +153,10 @@ class Bank:
 
     def pruned(self) -> Bank:
         """Drop what carries next to nothing of its group; both groups stay."""
-        healthy = self.settings.healthy
-        keep = np.zeros(healthy.size, dtype=bool)
-        for group in (healthy, ~healthy):
-            if group.any():
-                best = self.log_weight[group].max()
-                keep |= group & (self.log_weight > best + _NEGLIGIBLE)
+        group = self.settings.healthy.astype(int)
+        best = np.full(2, -np.inf)
+        np.maximum.at(best, group, self.log_weight)
+        keep = self.log_weight > best[group] + _NEGLIGIBLE
         return self if keep.all() else self.only(keep)
 
     def collapse(self, size: int | None = None) -> tuple[FloatArray, FloatArray]:
@@ -167,7 +165,8 @@ class Bank:
         weight, mean = self.weight, self.mean[:, part]
         centre = weight @ mean
         off = mean - centre
-        cov = np.tensordot(weight, self.cov[:, part, part], axes=1)
+        n = centre.size
+        cov = (weight @ self.cov[:, part, part].reshape(-1, n * n)).reshape(n, n)
         return centre, cov + (off * weight[:, None]).T @ off
 
 
@@ -212,9 +211,15 @@ class Filter:
         place = [self.sources.index(one.source) for one in history.series]
         self.scale_of = np.array(place + place, dtype=int)
         self.grid = settings(len(self.sources))
-        self.noise = np.array(history.cov)
+        self.noise = history.cov
         self.extra = np.zeros((len(history.logs), 2 * len(history.series)))
         self.extra[:, : len(history.series)] = space.unknown()[:, None]
+
+    def with_step(self, step: Step) -> Filter:
+        """Give the same for a state space with one more step."""
+        changed = copy(self)
+        changed.space = self.space.with_step(step)
+        return changed
 
     def start(self) -> Bank:
         """Begin before the first log, with all settings."""
@@ -227,8 +232,7 @@ class Filter:
 
     def open_rates(self, bank: Bank) -> None:
         """Let every changing setting have a rate anew."""
-        rates = np.arange(self.space.rate.start, self.space.rate.stop)
-        bank.cov[:, rates, rates] += bank.settings.rate_std[:, None] ** 2
+        _diagonal(bank.cov, self.space.rate)[:] += bank.settings.rate_std[:, None] ** 2
 
     def begin(self, bank: Bank, step: Step, j: int) -> None:
         """Let a step happen now; it is the j-th of the state space."""
@@ -254,13 +258,11 @@ class Filter:
             cov[:, :, level] += tick * cov[:, :, rate]
             own = bank.settings.level_walk[:, None] ** 2
             bend = bank.settings.rate_walk[:, None] ** 2
-            i = np.arange(level.start, level.stop)
-            j, z = i + space.n_modes, i + 2 * space.n_modes
-            cov[:, i, i] += own * tick + bend * tick**3 / 3
-            cov[:, i, j] += bend * tick**2 / 2
-            cov[:, j, i] += bend * tick**2 / 2
-            cov[:, j, j] += bend * tick
-            cov[:, z, z] += DAMPING_WALK**2 * tick
+            _diagonal(cov, level)[:] += own * tick + bend * tick**3 / 3
+            _diagonal(cov, level, rate)[:] += bend * tick**2 / 2
+            _diagonal(cov, rate, level)[:] += bend * tick**2 / 2
+            _diagonal(cov, rate)[:] += bend * tick
+            _diagonal(cov, space.damping)[:] += DAMPING_WALK**2 * tick
         for number, step in enumerate(space.steps):
             if step.first == k:
                 self.begin(bank, step, number)
@@ -276,7 +278,7 @@ class Filter:
         Rows that are doubted, ``(2 n_series,)``, are taken for outliers: hardly believed.
         """
         rows: np.ndarray = self.all if self.whole[k] else np.flatnonzero(self.there[k])
-        matrix, value = self.space.matrix[k, rows], self.values[k, rows]
+        matrix, value = self.space.matrix(k)[rows], self.values[k, rows]
         if value.size == 0:
             return Surprise(np.array([], dtype=int), np.array([]), 0.0)
         scales = bank.settings.scales[:, self.scale_of[rows]]
@@ -290,16 +292,22 @@ class Filter:
             spread[:, outlying, outlying] *= _OUTLIER_REACH**2
             bank.log_weight += np.log(_OUTLIERS)
         root = np.linalg.cholesky(spread)
-        half = np.linalg.inv(root)
         off = value - bank.mean @ matrix.T
-        white = (half @ off[:, :, None])[:, :, 0]
-        gain = half @ np.swapaxes(crossed, 1, 2)
-        nis = np.square(white).sum(axis=1)
+        right = np.concatenate([off[:, :, None], np.swapaxes(crossed, 1, 2)], axis=2)
+        whitened = np.linalg.solve(root, right)
+        white, gain = whitened[:, :, 0], whitened[:, :, 1:]
+        nis = np.einsum("gi,gi->g", white, white)
         weight = bank.weight
         bank.mean += (white[:, None, :] @ gain)[:, 0, :]
         bank.cov -= np.swapaxes(gain, 1, 2) @ gain
-        log_det = np.log(root[:, i, i]).sum(axis=1)
+        log_det = np.log(np.einsum("gii->gi", root)).sum(axis=1)
         bank.log_weight += -0.5 * nis - log_det - 0.5 * value.size * np.log(2 * np.pi)
         likely = int(np.argmax(weight))
         std = np.sqrt(spread[likely, i, i])
         return Surprise(rows, off[likely] / std, float(weight @ nis))
+
+
+def _diagonal(cov: FloatArray, rows: slice, columns: slice | None = None) -> FloatArray:
+    """Give the diagonals of a block of matrices as a view to write to, ``(n, n_modes)``."""
+    block: FloatArray = np.einsum("kii->ki", cov[:, rows, rows if columns is None else columns])
+    return block

@@ -72,8 +72,8 @@ class Watch:
             return None
         count = np.maximum(self._count[k + 1] - self._count[start], 1)
         lean = np.abs(self._sum[k + 1] - self._sum[start]) / np.sqrt(count)
-        window = int(np.argmax(lean.max(axis=1)))
-        return int(start[window]) if lean[window].max() > _SUSPICIOUS else None
+        window, row = np.unravel_index(np.argmax(lean), lean.shape)
+        return int(start[window]) if lean[window, row] > _SUSPICIOUS else None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -144,24 +144,15 @@ def explain(
     Finding or None
         None where there is no place for it.
     """
-    space = filters.space
-    places = [j for j in (suspect + _ABOUT).tolist() if j - 1 in memory and 0 < j < now]
-    kinds: list[tuple[StepKind, str]] = [("step", ""), ("regreasing", ""), ("servo", "")]
-    if len(filters.sources) > 1:
-        kinds += [("sensor", source) for source in filters.sources]
+    # The suspected log comes first: where nothing is to be gained there, nothing is close by.
+    about = sorted((suspect + _ABOUT).tolist(), key=lambda j: abs(j - suspect))
     gains: dict[tuple[FindingKind, str, int], float] = {}
-    for j in places:
-        nothing = memory[now].log_evidence - memory[j - 1].log_evidence
-        place = -float(np.log(j * (j + 1)))
-        for kind, source in kinds:
-            step = Step(kind, j, np.arange(len(space.history.logs)) >= j, source, declared=False)
-            changed = Filter(space.with_step(step), filters.copies)
-            before = memory[j - 1].padded(changed.space.size)
-            after = advance(changed, before, j)
-            gain = after.log_evidence - memory[j - 1].log_evidence - nothing
-            gain += loop_evidence(space.history.loop_error, j, now, kind)
-            gains[kind, source, j] = gain + place - float(np.log(len(kinds)))
-        gains["drift", "", j] = _drift(advance, filters, memory[j - 1], j) - nothing + place
+    for j in about:
+        if j - 1 not in memory or not 0 < j < now:
+            continue
+        gains |= _weigh(advance, filters, memory, now, j)
+        if max(gains.values()) < 0:
+            break
     if not gains:
         return None
     (best, source, first), gain = max(gains.items(), key=lambda item: item[1])
@@ -170,6 +161,32 @@ def explain(
     if best in ("step", "drift"):
         others = [0.0] + [g for key, g in gains.items() if key[0] not in ("step", "drift")]
     return Finding(best, source, first, gain, gain - float(np.logaddexp.reduce(others)))
+
+
+def _weigh(
+    advance: Callable[[Filter, Bank, int], Bank],
+    filters: Filter,
+    memory: dict[int, Bank],
+    now: int,
+    j: int,
+) -> dict[tuple[FindingKind, str, int], float]:
+    """Log Bayes factors of everything that may have happened at log j."""
+    kinds: list[tuple[StepKind, str]] = [("step", ""), ("regreasing", ""), ("servo", "")]
+    if len(filters.sources) > 1:
+        kinds += [("sensor", source) for source in filters.sources]
+    history, before = filters.space.history, memory[j - 1]
+    place = -float(np.log(j * (j + 1)))
+    gains: dict[tuple[FindingKind, str, int], float] = {}
+    for kind, source in kinds:
+        step = Step(kind, j, np.arange(len(history.logs)) >= j, source, declared=False)
+        changed = filters.with_step(step)
+        after = advance(changed, before.padded(changed.space.size), j)
+        gain = after.log_evidence - memory[now].log_evidence
+        gain += loop_evidence(history.loop_error, j, now, kind)
+        gains[kind, source, j] = gain + place - float(np.log(len(kinds)))
+    nothing = memory[now].log_evidence - before.log_evidence
+    gains["drift", "", j] = _drift(advance, filters, before, j) - nothing + place
+    return gains
 
 
 def _drift(

@@ -81,7 +81,7 @@ def smooth_one(filters: Filter, setting: Settings) -> tuple[FloatArray, FloatArr
             scale = setting.scales[0, filters.scale_of[rows]]
             noise = filters.noise[k][np.ix_(rows, rows)] * np.outer(scale, scale)
             noise += np.diag(filters.extra[k, rows])
-            kalman.update(filters.values[k, rows], R=noise, H=space.matrix[k, rows])
+            kalman.update(filters.values[k, rows], R=noise, H=space.matrix(k)[rows])
         means[k], covs[k] = kalman.x, kalman.P
     # An exact copy of ℓ, and jumps that have not happened yet, make covariances singular.
     smoothed = kalman.rts_smoother(means, covs, moves, noises, inv=np.linalg.pinv)

@@ -14,6 +14,7 @@ of the baseline stays common to all epochs.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from copy import copy
 from dataclasses import dataclass
 
 import numpy as np
@@ -129,8 +130,6 @@ class StateSpace:
         Length of the state.
     ticks : ndarray
         Parts of a life between each log and the one before, shape ``(n_logs,)``.
-    matrix : ndarray
-        Measurement matrices of ``[ln f, ln ζ]``, shape ``(n_logs, 2 n_series, size)``.
     """
 
     def __init__(
@@ -150,12 +149,28 @@ class StateSpace:
         self.first_step = self.first_bias + 2 * len(self.biased)
         self.size = self.first_step + 2 * m * len(steps)
         self.ticks = np.diff(history.clock(), prepend=history.clock()[:1]) / life
-        self.matrix = self._matrix()
-        self.matrix.setflags(write=False)
+        self._fixed = self._without_steps()
+        self._read = [(step, self._reading(step)) for step in steps]
 
     def with_step(self, step: Step) -> StateSpace:
         """Give the same with one more step at its end: the state only grows."""
-        return StateSpace(self.history, self.regressed, self.life, (*self.steps, step))
+        longer = copy(self)
+        longer.steps = (*self.steps, step)
+        longer.size = self.size + 2 * self.n_modes
+        longer._read = [*self._read, (step, self._reading(step))]
+        return longer
+
+    def matrix(self, k: int) -> FloatArray:
+        """Give the measurement matrix of ``[ln f, ln ζ]`` of log k, ``(2 n_series, size)``."""
+        fixed: FloatArray = self._fixed[k]
+        if not self.steps:
+            return fixed
+        matrix = np.zeros((fixed.shape[0], self.size))
+        matrix[:, : self.first_step] = fixed
+        for j, (step, reading) in enumerate(self._read):
+            if step.there[k]:
+                matrix[:, self.jump(j)] = reading
+        return matrix
 
     def regressor(self, j: int) -> slice:
         """Where the coefficients of a regressor stand."""
@@ -176,10 +191,11 @@ class StateSpace:
             biased += [i for i in own if i != reference]
         return tuple(biased)
 
-    def _matrix(self) -> FloatArray:
-        history, m, r = self.history, self.n_modes, len(self.history.series)
+    def _without_steps(self) -> FloatArray:
+        """Give what all logs see of a state without steps, ``(n_logs, 2 n_series, first_step)``."""
+        history, r = self.history, len(self.history.series)
         mode, series = history.mode_of(), np.arange(r)
-        matrix = np.zeros((len(history.logs), 2 * r, self.size))
+        matrix = np.zeros((len(history.logs), 2 * r, self.first_step))
         matrix[:, series, mode] = 1
         matrix[:, r + series, self.damping.start + mode] = 1
         for j, regressor in enumerate(self.regressed):
@@ -187,14 +203,20 @@ class StateSpace:
         for j, i in enumerate(self.biased):
             matrix[:, i, self.first_bias + 2 * j] = 1
             matrix[:, r + i, self.first_bias + 2 * j + 1] = 1
-        for j, step in enumerate(self.steps):
-            if step.kind in MOVES:
-                continue
-            first = self.jump(j).start
-            for i in series[[step.source in ("", one.source) for one in history.series]]:
-                matrix[step.there, i, first + mode[i]] = 1
-                matrix[step.there, r + i, first + m + mode[i]] = 1
         return matrix
+
+    def _reading(self, step: Step) -> FloatArray:
+        """Give how a log reads the jumps of a step, ``(2 n_series, 2 n_modes)``.
+
+        What moves the modes themselves is read in them.
+        """
+        series, r, m = self.history.series, len(self.history.series), self.n_modes
+        reading = np.zeros((2 * r, 2 * m))
+        if step.kind not in MOVES:
+            for i, mode in enumerate(self.history.mode_of()):
+                if step.source in ("", series[i].source):
+                    reading[i, mode] = reading[r + i, m + mode] = 1
+        return reading
 
     def prior(self) -> tuple[FloatArray, FloatArray]:
         """Mean and covariance before the first log, without rates and steps.

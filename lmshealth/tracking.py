@@ -158,7 +158,7 @@ class _Follower:
         if k in self.doubted:
             # As likely the first log after a step: nobody can tell yet, and that is what is said.
             step = Step("step", k, np.arange(len(self.history.logs)) >= k, declared=False)
-            stepped = Filter(self.filters.space.with_step(step), self.filters.copies)
+            stepped = self.filters.with_step(step)
             other = self._again(stepped, self.memory[k - 1].padded(stepped.space.size), k, k)
             moved, spread = other.collapse(size)
             off = 0.5 * (moved - mean)
@@ -203,7 +203,7 @@ class _Follower:
         else:
             there = np.arange(len(self.history.logs)) >= j
             step = Step(finding.kind, j, there, finding.source, declared=False)
-            self.filters = Filter(self.filters.space.with_step(step), self.history.baselines)
+            self.filters = self.filters.with_step(step)
             self.found.findings[len(self.filters.space.steps) - 1] = (finding, k)
             size = self.filters.space.size
             for when, known in self.memory.items():

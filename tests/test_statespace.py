@@ -1,0 +1,192 @@
+"""What the state of a machine holds, and how logs see it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from lmshealth.stage import Stage
+from lmshealth.statespace import LN_F_STD, LN_ZETA_STD, UNKNOWN_COVARIATE_STD, state_space
+from lmshealth.tracks import History
+from tests.lives import PRELOAD, awkward_history, make_history, make_stage, rough_history, since
+
+TWO = """
+[[covariate]]
+name = "temperature_c"
+reference = 21.0
+prior_std = 0.001
+curvature_std = 0.0001
+
+[[covariate]]
+name = "payload_kg"
+reference = 50.0
+prior_std = 0.0005
+
+[[covariate]]
+name = "humidity"
+reference = 0.5
+prior_std = 0.01
+
+[usage]
+horizon_km = 10000
+"""
+
+
+@pytest.fixture(scope="module")
+def stage(tmp_path_factory: pytest.TempPathFactory) -> Stage:
+    """Three covariates, of which histories have two, and a horizon of 10,000 km."""
+    return make_stage(tmp_path_factory.mktemp("stage"), (PRELOAD,), tail=TWO)
+
+
+@pytest.fixture
+def history() -> History:
+    """Make two modes by two sources with steps of every kind."""
+    return awkward_history(np.random.default_rng(1))
+
+
+def test_the_state_is_laid_out_without_gaps(history: History, stage: Stage) -> None:
+    """Blocks of two modes follow one another: 4, three regressors, two biased series, steps."""
+    space = state_space(history, stage, history.steps)
+    places = [space.level, space.rate, space.damping, space.base]
+    places += [space.regressor(j) for j in range(3)]
+    assert [one.name for one in space.regressed] == [
+        "temperature_c",
+        "temperature_c^2",
+        "payload_kg",
+    ]
+    places.append(slice(space.first_bias, space.first_step))
+    places += [space.jump(j) for j in range(5)]
+    ends = [0, *(place.stop for place in places)]
+    assert [place.start for place in places] == ends[:-1]
+    assert ends[-1] == space.size == 14 + 2 * 2 + 5 * 4
+
+
+def test_ticks_are_parts_of_the_horizon(history: History, stage: Stage) -> None:
+    """With a stage a life is its horizon, without one it is the length of the history."""
+    gaps = np.diff(history.travel)
+    np.testing.assert_allclose(state_space(history, stage).ticks, np.r_[0, gaps / 1e7])
+    bare = state_space(history, None)
+    np.testing.assert_allclose(bare.ticks, np.r_[0, gaps / np.ptp(history.travel)])
+
+
+def test_without_odometer_ticks_are_of_time(history: History, stage: Stage) -> None:
+    """A horizon in km says nothing of days: rates are counted per length of the history."""
+    timed = replace(history, travel=np.full(len(history.logs), np.nan))
+    np.testing.assert_allclose(state_space(timed, stage).ticks, np.r_[0, np.full(15, 1 / 15)])
+
+
+def test_a_history_without_length_has_ticks_of_nothing(stage: Stage) -> None:
+    """Logs at one place are divided by one, not by nothing."""
+    history = make_history(np.full((4, 2), 4.8), travel=np.full(4, 1e5))
+    assert (state_space(history, None).ticks == 0).all()
+
+
+def test_covariates_are_about_their_reference_and_0_where_unknown(
+    history: History, stage: Stage
+) -> None:
+    """Offsets and their squares stand in the measurement matrix of ln f alone."""
+    space = state_space(history, stage)
+    temperature = history.covariates["temperature_c"]
+    for k in (0, 3):
+        offset = 0.0 if np.isnan(temperature[k]) else temperature[k] - 21
+        matrix = space.matrix(k)
+        for i, mode in enumerate([0, 1, 0, 1]):
+            assert matrix[i, space.regressor(0).start + mode] == offset
+            assert matrix[i, space.regressor(1).start + mode] == offset**2
+            assert matrix[i, space.regressor(0).start + 1 - mode] == 0
+        assert (matrix[4:, space.regressor(0).start : space.first_bias] == 0).all()
+
+
+def test_unknown_covariates_widen_ln_f(history: History, stage: Stage) -> None:
+    """Each unknown value brings the variance of what it may do, and only there."""
+    unknown = state_space(history, stage).unknown()
+    temperature, payload = history.covariates["temperature_c"], history.covariates["payload_kg"]
+    spread = 0.001 * np.nanstd(temperature), 0.0005 * np.nanstd(payload)
+    assert unknown[3] == pytest.approx(spread[0] ** 2 + spread[1] ** 2)
+    assert unknown[8] == pytest.approx(spread[1] ** 2)
+    assert (np.delete(unknown, [3, 8]) == 0).all()
+
+
+def test_without_a_stage_covariates_are_about_their_median(history: History) -> None:
+    """Every covariate present is taken, with a common prior and without curvature."""
+    space = state_space(history, None)
+    assert [one.name for one in space.regressed] == ["temperature_c", "payload_kg"]
+    for one in space.regressed:
+        values = history.covariates[one.name]
+        known = np.isfinite(values)
+        np.testing.assert_allclose(one.values[known], values[known] - np.nanmedian(values))
+        assert one.prior_std == UNKNOWN_COVARIATE_STD
+
+
+def test_a_covariate_that_is_never_known_is_left_out(history: History) -> None:
+    """A column of nothing has no coefficient."""
+    empty = {"temperature_c": np.full(len(history.logs), np.nan)}
+    for covariates in ({}, empty):
+        assert state_space(replace(history, covariates=covariates), None).regressed == ()
+
+
+def test_the_most_frequent_series_of_a_mode_has_no_bias(history: History, stage: Stage) -> None:
+    """Others are measured against it; of equals the first is the reference."""
+    # Accelerometers miss 4 and 11 of both modes and 2 of one, Δe 4 of both and 7 of the other.
+    count = np.isfinite(history.ln_frequency).sum(axis=0)
+    assert count.tolist() == [13, 14, 15, 14]
+    space = state_space(history, stage)
+    assert space.biased == (0, 3)
+    matrix = space.matrix(0)[:, space.first_bias : space.first_step]
+    expected = np.zeros((8, 4))
+    expected[0, 0] = expected[4, 1] = expected[3, 2] = expected[7, 3] = 1
+    np.testing.assert_array_equal(matrix, expected)
+
+
+def test_steps_are_read_where_they_are_there(history: History, stage: Stage) -> None:
+    """A retuning shows in all series until it is taken back, a sensor's in its own source.
+
+    What moves the modes themselves is read in them.
+    """
+    space = state_space(history, stage, history.steps)
+    for k in range(len(history.logs)):
+        matrix = space.matrix(k)
+        for j, step in enumerate(history.steps):
+            expected = np.zeros((8, 4))
+            if step.kind == "servo" and step.there[k]:
+                expected = np.kron(np.eye(2), np.tile(np.eye(2), (2, 1)))
+            if step.kind == "sensor" and step.there[k]:
+                expected[[2, 3, 6, 7], [0, 1, 2, 3]] = 1
+            np.testing.assert_array_equal(matrix[:, space.jump(j)], expected)
+
+
+def test_one_more_step_only_makes_the_state_longer(history: History, stage: Stage) -> None:
+    """With a step at its end the state space is the one made with all steps."""
+    short = state_space(history, stage, history.steps[:-1])
+    longer, whole = short.with_step(history.steps[-1]), state_space(history, stage, history.steps)
+    assert longer.size == whole.size == short.size + 4
+    assert longer.steps == history.steps
+    for k in (0, 4, 14):
+        np.testing.assert_array_equal(longer.matrix(k), whole.matrix(k))
+        np.testing.assert_array_equal(longer.matrix(k)[:, : short.size], short.matrix(k))
+
+
+def test_the_prior_is_about_the_first_estimates(stage: Stage) -> None:
+    """The centre of each mode is its first estimate by any source; rates and steps are not yet."""
+    history = rough_history(np.random.default_rng(2))
+    ln_f = history.ln_frequency.copy()
+    ln_f[0, 1] = np.nan
+    history = replace(history, ln_frequency=ln_f, steps=(since("step", 3, 10),))
+    space = state_space(history, stage, history.steps)
+    mean, cov = space.prior()
+    assert mean[space.level].tolist() == [ln_f[0, 0], ln_f[1, 1]]
+    assert mean[space.damping].tolist() == history.ln_damping[0].tolist()
+    std = np.sqrt(np.diag(cov))
+    np.testing.assert_allclose(std[space.level], LN_F_STD)
+    np.testing.assert_allclose(std[space.damping], LN_ZETA_STD)
+    for nothing in (space.rate, space.base, space.jump(0)):
+        assert (std[nothing] == 0).all()
+
+
+def test_the_drift_is_the_level_less_its_copy(history: History, stage: Stage) -> None:
+    """The contrast takes ℓ₀ from ℓ, mode by mode."""
+    space = state_space(history, stage)
+    state = np.arange(8.0)
+    np.testing.assert_array_equal(space.drift() @ state, state[space.level] - state[space.base])
