@@ -407,7 +407,8 @@ def life_log_likelihood(
     values = history.covariates["temperature_c"][first:]
     unknown = np.isnan(values)
     offset = np.where(unknown, 0.0, values - reference)
-    spread = max(float(np.std(values[~unknown])), 1.0)
+    # What is not known of one log spreads as it does over all of them.
+    spread = max(float(np.nanstd(history.covariates["temperature_c"])), 1.0)
     ln_f = history.ln_frequency[first:]
     where = [(k, i) for k in range(clock.size) for i in range(m) if not np.isnan(ln_f[k, i])]
     centre = [np.mean(ln_f[~np.isnan(ln_f[:, i]), i]) for i in range(m)]
