@@ -17,55 +17,13 @@ from typing import Literal
 
 import numpy as np
 
-from lmshealth.arrays import FloatArray, expect_shape, freeze
+from lmshealth.arrays import FloatArray
 from lmshealth.errors import BadTable, NotEnoughData
-from lmshealth.filterbank import LEAST_LOGS, Readings
-from lmshealth.identities import SURE, Identities, Verdict
+from lmshealth.estimates import Estimates, Table
+from lmshealth.filterbank import LEAST_LOGS
+from lmshealth.identities import SURE, Identities, Log, Verdict
 
 Reason = Literal["ambiguous", "jump", "spurious"]
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Estimates:
-    """What one log says.
-
-    Attributes
-    ----------
-    names : tuple of str
-        Names that the identification gave, empty where it gave none.
-    sources : tuple of str
-        What each was seen by. Two estimates of one source are never of one mode.
-    ln_frequency, ln_damping : ndarray
-        Of each estimate, shape ``(n,)``, of f in Hz and of the ratio ζ; ln ζ is NaN where unknown.
-    cov : ndarray
-        Covariance of ``[ln f, ln ζ]``, ``(2 n, 2 n)``; NaN where ln ζ is unknown.
-    shapes : ndarray
-        Real shapes, ``(n, n_channels)``, of any length; NaN where a channel is absent.
-
-    Raises
-    ------
-    ValueError
-        If shapes of arrays do not belong together.
-    """
-
-    names: tuple[str, ...]
-    sources: tuple[str, ...]
-    ln_frequency: FloatArray
-    ln_damping: FloatArray
-    cov: FloatArray
-    shapes: FloatArray
-
-    def __post_init__(self) -> None:
-        n = len(self.names)
-        if len(self.sources) != n:
-            raise ValueError(f"sources has {len(self.sources)} entries, needed {n}")
-        expect_shape("ln_frequency", self.ln_frequency, (n,))
-        expect_shape("ln_damping", self.ln_damping, (n,))
-        expect_shape("cov", self.cov, (2 * n, 2 * n))
-        if self.shapes.ndim != 2:
-            raise ValueError(f"shapes has {self.shapes.ndim} dimensions, needed 2")
-        expect_shape("shapes", self.shapes, (n, self.shapes.shape[1]))
-        freeze(self)
 
 
 @dataclass(frozen=True, slots=True)
@@ -149,16 +107,20 @@ def associate(
     """
     clock, offsets, prior_std = (np.asarray(a, float) for a in (clock, offsets, prior_std))
     _check(epochs, clock, offsets, prior_std, jumps)
+    table = Table(epochs, offsets, prior_std)
     identities = Identities(prior_std, epochs[0].shapes.shape[1])
     scales = _scales(clock)
     assigned: list[tuple[str | None, ...]] = []
     doubts: list[Doubt] = []
     for k, estimates in enumerate(epochs):
-        step = float(clock[k] - clock[k - 1]) if k else 0.0
-        identities.move(k, step, scales[k], offsets[k], opened=k in jumps)
-        labels: list[str | None] = [None] * len(estimates.names)
-        names, readings = estimates.names, _readings(k, estimates)
-        for verdict in identities.see(names, estimates.sources, readings):
+        names, opened = estimates.names, k in jumps
+        log = Log(k, float(clock[k]), scales[k], offsets[k], opened, names, estimates.sources)
+        if table.plain[k] and not opened and identities.settled and assigned[-1] == names:
+            identities.defer(log, table)
+            assigned.append(names)
+            continue
+        labels: list[str | None] = [None] * len(names)
+        for verdict in identities.see(log, table):
             for i, (row, mode) in enumerate(zip(verdict.scan.rows, verdict.modes, strict=True)):
                 if mode >= 0:
                     labels[row] = identities.names[mode]
@@ -228,36 +190,6 @@ def _check(
     wrong = sorted(k for k in jumps if not 0 <= k < n)
     if wrong:
         raise BadTable(f"jumps at epochs {wrong}: there are epochs 0 to {n - 1}")
-
-
-def _readings(k: int, estimates: Estimates) -> Readings:
-    n = len(estimates.names)
-    var = estimates.cov.diagonal()
-    var_f, var_zeta = var[:n], var[n:]
-    good = np.isfinite(estimates.ln_frequency) & np.isfinite(var_f) & (var_f > 0)
-    damped = np.isfinite(estimates.ln_damping)
-    good &= ~damped | (np.isfinite(var_zeta) & (var_zeta > 0))
-    if not good.all():
-        i = int(np.flatnonzero(~good)[0])
-        raise BadTable(
-            f"epoch {k}, estimate {i} ({estimates.names[i] or 'without a name'}): ln f "
-            f"{estimates.ln_frequency[i]:g} with variance {var_f[i]:g}, ln ζ "
-            f"{estimates.ln_damping[i]:g} with variance {var_zeta[i]:g}: needed finite values "
-            "with positive variances; leave out what has none"
-        )
-    shapes = estimates.shapes
-    if shapes.shape[1]:
-        norm = np.sqrt(np.nansum(shapes**2, axis=-1, keepdims=True))
-        shapes = shapes / np.where(norm > 0, norm, np.nan)
-    if damped.all():
-        return Readings(estimates.ln_frequency, var_f, estimates.ln_damping, var_zeta, shapes)
-    return Readings(
-        estimates.ln_frequency,
-        var_f,
-        np.where(damped, estimates.ln_damping, 0.0),
-        np.where(damped, var_zeta, np.inf),
-        shapes,
-    )
 
 
 def _scales(clock: FloatArray) -> list[float]:

@@ -1,294 +1,171 @@
-"""Tables of modal estimates, ours or another program's, read as what logs said."""
+"""Modal estimates of many logs as a table, and which of its rows need no second look."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from datetime import datetime
-from itertools import pairwise
-from pathlib import Path
-from typing import Any
+from itertools import combinations
 
 import numpy as np
-import pandas as pd
 
-from lmshealth.arrays import FloatArray
+from lmshealth.arrays import BoolArray, FloatArray, expect_shape, freeze
 from lmshealth.errors import BadTable
-from lmshealth.history import Reading
-from lmshealth.logs import Metadata
-from lmshealth.readers import COVARIATES
-from lmshealth.results import Modes
-from lmshealth.stage import Stage
+from lmshealth.filterbank import Readings
 
-_KM, _MICRO = 1000.0, 1e-6
-_NEEDED = ("recorded_at", "frequency_hz", "frequency_std_hz")
-_DAMPING = ("damping_ratio", "damping_ratio_std")
-_NUMBERS = (
-    *_NEEDED[1:],
-    *_DAMPING,
-    "travel_km",
-    "correlation_f_zeta",
-    "snr",
-    "delta_e_below_40hz_um",
-)
-# What belongs to a log and not to one of its estimates.
-_OF_LOG = ("stage", "recorded_at", "travel_km", "servo_id", "delta_e_below_40hz_um", "baseline")
-_SHAPE = "shape_"
-_TOLD = 3
-_UNKNOWN_SOURCE = "unknown"
+# What ln f may differ by from the log before, beyond its error and covariates, and by how much more
+# modes must be apart from each other, to be plain.
+_STILL, _APART = 0.005, 0.03
+_SIGMAS = 4.0
+_SAME_SHAPE = 0.8
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class EstimateTable:
-    """What a table says.
+class Estimates:
+    """What one log says.
 
     Attributes
     ----------
-    readings : tuple of Reading
-        One per log, in the order of the table.
-    notes : tuple of str
-        What its reader must know: what was missing, and what is assumed instead.
+    names : tuple of str
+        Names that the identification gave, empty where it gave none.
+    sources : tuple of str
+        What each was seen by. Two estimates of one source are never of one mode.
+    ln_frequency, ln_damping : ndarray
+        Of each estimate, shape ``(n,)``, of f in Hz and of the ratio ζ; ln ζ is NaN where unknown.
+    cov : ndarray
+        Covariance of ``[ln f, ln ζ]``, ``(2 n, 2 n)``; NaN where ln ζ is unknown.
+    shapes : ndarray
+        Real shapes, ``(n, n_channels)``, of any length; NaN where a channel is absent.
+
+    Raises
+    ------
+    ValueError
+        If shapes of arrays do not belong together.
     """
 
-    readings: tuple[Reading, ...]
-    notes: tuple[str, ...]
+    names: tuple[str, ...]
+    sources: tuple[str, ...]
+    ln_frequency: FloatArray
+    ln_damping: FloatArray
+    cov: FloatArray
+    shapes: FloatArray
+
+    def __post_init__(self) -> None:
+        n = len(self.names)
+        if len(self.sources) != n:
+            raise ValueError(f"sources has {len(self.sources)} entries, needed {n}")
+        expect_shape("ln_frequency", self.ln_frequency, (n,))
+        expect_shape("ln_damping", self.ln_damping, (n,))
+        expect_shape("cov", self.cov, (2 * n, 2 * n))
+        if self.shapes.ndim != 2:
+            raise ValueError(f"shapes has {self.shapes.ndim} dimensions, needed 2")
+        expect_shape("shapes", self.shapes, (n, self.shapes.shape[1]))
+        freeze(self)
 
 
-def read_estimates(
-    path: Path, *, cross_terms: Path | None = None, stage: Stage | None = None
-) -> EstimateTable:
-    """Read a table in the columns of ``modes.csv``.
-
-    Needed are ``recorded_at``, ``frequency_hz`` and ``frequency_std_hz``; a row is one estimate.
-    Without ``log`` the rows of one moment are one log, without ``stage`` all are of one machine.
+class Table:
+    """Estimates of all logs, checked.
 
     Parameters
     ----------
-    path : Path
-        The table.
-    cross_terms : Path, optional
-        Covariances between estimates of one log, in the columns of ``modes_cov.csv``.
-    stage : Stage, optional
-        Its covariates are read too, and other mode names than its own are refused.
+    epochs : sequence of Estimates
+        One for each log, with equally many channels.
+    offsets : ndarray
+        Covariates about their references, ``(n_epochs, n_covariates)``.
+    prior_std : ndarray
+        Of their coefficients, ``(n_covariates,)``.
+
+    Attributes
+    ----------
+    plain : ndarray
+        Logs that show the same names as the log before, all of them where they were and far from
+        each other, shape ``(n_epochs,)``: it takes no filter to tell who is who there.
 
     Raises
     ------
     BadTable
-        If a table cannot be read, a column is missing, a value makes no sense, an estimate stands
-        there twice, or rows of one log contradict each other.
+        If an estimate is not finite or has no positive variance.
     """
-    table = _read(path)
-    missing = [name for name in _NEEDED if name not in table.columns]
-    if missing:
-        raise BadTable(f"{path}: no column {missing}; there are {list(table.columns)}")
-    if table.empty:
-        raise BadTable(f"{path}: no row; needed is at least one estimate")
-    covariates = [*COVARIATES]
-    if stage is not None:
-        covariates += [c.name for c in stage.description.covariate if c.name not in covariates]
-    notes: list[str] = []
-    _tidy(path, table, covariates, notes)
-    _drop_bad_damping(table, notes)
-    _check(path, table, stage)
-    terms = None if cross_terms is None else _read_terms(cross_terms)
-    shapes = [name for name in table.columns if name.startswith(_SHAPE)]
-    readings = tuple(
-        _reading(path, str(log), rows, [c for c in covariates if c in table.columns], shapes, terms)
-        for (_, log), rows in table.groupby(["stage", "log"], sort=False)
-    )
-    moments = [reading.metadata.recorded_at for reading in readings]
-    if any(a and b and a > b for a, b in pairwise(moments)):
-        notes.append("the logs are not in the order of time; they are put in it")
-    if terms is None and any(len(set(reading.modes.sources)) > 1 for reading in readings):
-        notes.append(
-            "logs with several sources, but no covariances between them: their errors are taken "
-            "for independent, which overstates what they know together; give modes_cov.csv"
-        )
-    return EstimateTable(readings, tuple(notes))
 
+    def __init__(
+        self, epochs: Sequence[Estimates], offsets: FloatArray, prior_std: FloatArray
+    ) -> None:
+        self._start = np.cumsum([0, *(len(e.names) for e in epochs)]).tolist()
+        every = [(e.cov.diagonal(), len(e.names)) for e in epochs]
+        self._ln_f = np.concatenate([e.ln_frequency for e in epochs])
+        self._ln_zeta = np.concatenate([e.ln_damping for e in epochs])
+        self._var_f = np.concatenate([var[:n] for var, n in every])
+        self._var_zeta = np.concatenate([var[n:] for var, n in every])
+        self._shapes = np.concatenate([e.shapes for e in epochs])
+        self._check(epochs)
+        unknown = ~np.isfinite(self._ln_zeta)
+        self._ln_zeta[unknown], self._var_zeta[unknown] = 0.0, np.inf
+        if self._shapes.shape[1]:
+            norm = np.sqrt(np.nansum(self._shapes**2, axis=1, keepdims=True))
+            self._shapes /= np.where(norm > 0, norm, np.nan)
+        self.plain = self._screen(epochs, np.abs(np.diff(offsets, axis=0)) @ prior_std)
 
-def _read(path: Path) -> pd.DataFrame:
-    try:
-        return pd.read_csv(path, dtype=str, keep_default_na=False)
-    except (OSError, ValueError) as error:
-        raise BadTable(f"{path}: cannot be read as a table: {error}") from error
-
-
-def _where(table: pd.DataFrame, wrong: pd.Series[bool]) -> str:
-    """Name the first lines of the file that are meant."""
-    lines = [str(int(i) + 2) for i in table.index[wrong]]
-    more = f" and {len(lines) - _TOLD} more" if len(lines) > _TOLD else ""
-    return f"line {', '.join(lines[:_TOLD])}{more}"
-
-
-def _tidy(path: Path, table: pd.DataFrame, covariates: list[str], notes: list[str]) -> None:
-    """Turn text into numbers and moments, and fill in what may be missing, in place."""
-    shapes = [name for name in table.columns if name.startswith(_SHAPE)]
-    for name in (*_NUMBERS, *covariates, *shapes):
-        if name not in table.columns:
-            continue
-        given = table[name].str.strip() != ""
-        table[name] = pd.to_numeric(table[name], errors="coerce")
-        wrong = given & ~np.isfinite(table[name])
-        if wrong.any():
-            raise BadTable(f"{path}, {_where(table, wrong)}: {name} is no finite number")
-    for name, fallback in (("mode", ""), ("source", _UNKNOWN_SOURCE), ("servo_id", "")):
-        if name not in table.columns:
-            table[name] = fallback
-    if "stage" not in table.columns:
-        table["stage"] = path.stem
-        notes.append(f"no column stage: all rows are taken for one machine, {path.stem}")
-    if "log" not in table.columns:
-        table["log"] = table["recorded_at"]
-    for name in _DAMPING:
-        if name not in table.columns:
-            table[name] = np.nan
-    table["recorded_at"] = [_moment(path, i, text) for i, text in table["recorded_at"].items()]
-
-
-def _drop_bad_damping(table: pd.DataFrame, notes: list[str]) -> None:
-    """Forget dampings that are no estimates; the frequencies beside them are."""
-    bad = (table["damping_ratio"].notna() & ~(table["damping_ratio"] > 0)) | (
-        table["damping_ratio"].notna() & ~(table["damping_ratio_std"] > 0)
-    )
-    if bad.any():
-        table.loc[bad, list(_DAMPING)] = np.nan
-        notes.append(
-            f"{int(bad.sum())} damping ratios without a positive value and standard deviation "
-            f"({_where(table, bad)}) are not used; the frequencies beside them are"
+    def readings(self, k: int) -> Readings:
+        """Return the estimates of a log."""
+        own = slice(self._start[k], self._start[k + 1])
+        return Readings(
+            self._ln_f[own],
+            self._var_f[own],
+            self._ln_zeta[own],
+            self._var_zeta[own],
+            self._shapes[own],
         )
 
-
-def _moment(path: Path, index: Any, text: str) -> datetime:
-    where = f"{path}, line {int(index) + 2}: recorded_at {text!r}"
-    try:
-        moment = datetime.fromisoformat(text)
-    except ValueError as error:
-        raise BadTable(f"{where} is no ISO date, such as 2026-03-01T06:00:00+00:00") from error
-    if moment.tzinfo is None:
-        raise BadTable(f"{where} needs a time zone, such as {text}+00:00")
-    return moment
-
-
-def _check(path: Path, table: pd.DataFrame, stage: Stage | None) -> None:
-    """Refuse what would be wrong all the way to the report."""
-    for name, what in (
-        ("frequency_hz", "a frequency"),
-        (
-            "frequency_std_hz",
-            "the standard deviation of a frequency, without which nothing is known",
-        ),
-    ):
-        wrong = ~(table[name] > 0)
-        if wrong.any():
-            got = table.loc[wrong, name].iloc[0]
-            told = "missing" if np.isnan(got) else f"{got:g}"
-            raise BadTable(
-                f"{path}, {_where(table, wrong)}: {name} is {told}; needed is {what}, a positive "
-                "number; leave rows out that have none"
-            )
-    named = table[table["mode"] != ""]
-    twice = named.duplicated(["stage", "log", "mode", "source"], keep=False)
-    if twice.any():
-        first = named[twice].iloc[0]
+    def _check(self, epochs: Sequence[Estimates]) -> None:
+        good = np.isfinite(self._ln_f) & np.isfinite(self._var_f) & (self._var_f > 0)
+        fine = np.isfinite(self._var_zeta) & (self._var_zeta > 0)
+        good &= fine | ~np.isfinite(self._ln_zeta)
+        if good.all():
+            return
+        at = int(np.flatnonzero(~good)[0])
+        k = int(np.searchsorted(self._start, at, side="right")) - 1
+        i = at - self._start[k]
         raise BadTable(
-            f"{path}, {_where(named, twice)}: {first['mode']} by {first['source']} stands there "
-            f"twice for log {first['log']}; leave the column mode empty where names are not unique"
+            f"epoch {k}, estimate {i} ({epochs[k].names[i] or 'without a name'}): ln f "
+            f"{self._ln_f[at]:g} with variance {self._var_f[at]:g}, ln ζ {self._ln_zeta[at]:g} "
+            f"with variance {self._var_zeta[at]:g}: needed finite values with positive "
+            "variances; leave out what has none, and give ln ζ as NaN where it is not known"
         )
-    if stage is not None:
-        known = [mode.name for mode in stage.modes]
-        strange = sorted(set(named["mode"]) - set(known))
-        if strange:
-            raise BadTable(
-                f"{path}: modes {strange} are none of {stage.name}, which has {known}; rename "
-                "them, or leave the column mode empty to let them be found by their frequency"
-            )
 
+    def _screen(self, epochs: Sequence[Estimates], moved: FloatArray) -> BoolArray:
+        plain = np.zeros(len(epochs), dtype=bool)
+        first = 0
+        for k in range(1, len(epochs) + 1):
+            if (
+                k < len(epochs)
+                and epochs[k].names == epochs[first].names
+                and (epochs[k].sources == epochs[first].sources)
+            ):
+                continue
+            head = epochs[first]
+            own = set(zip(head.names, head.sources, strict=True))
+            if k - first > 1 and head.names and all(head.names) and len(own) == len(head.names):
+                plain[first + 1 : k] = self._screen_run(head.names, first, k, moved[first : k - 1])
+            first = k
+        return plain
 
-def _read_terms(path: Path) -> pd.DataFrame:
-    table = _read(path)
-    needed = ["log", "source_a", "mode_a", "source_b", "mode_b", "cov_ln_f"]
-    missing = [name for name in needed if name not in table.columns]
-    if missing:
-        raise BadTable(f"{path}: no column {missing}; there are {list(table.columns)}")
-    table["cov_ln_f"] = pd.to_numeric(table["cov_ln_f"], errors="coerce")
-    wrong = ~np.isfinite(table["cov_ln_f"])
-    if wrong.any():
-        raise BadTable(f"{path}, {_where(table, wrong)}: cov_ln_f is no finite number")
-    return table
-
-
-def _reading(
-    path: Path,
-    log: str,
-    rows: pd.DataFrame,
-    covariates: Sequence[str],
-    shapes: Sequence[str],
-    terms: pd.DataFrame | None,
-) -> Reading:
-    """Make the reading of one log from its rows."""
-    for name in (*_OF_LOG, *covariates):
-        if name in rows.columns and rows[name].nunique(dropna=False) > 1:
-            values = list(dict.fromkeys(rows[name]))[:2]
-            raise BadTable(f"{path}: log {log} has {name} {values[0]} and {values[1]}; needed: one")
-    first = rows.iloc[0]
-    loop = first.get("delta_e_below_40hz_um", np.nan)
-    travel = first.get("travel_km", np.nan)
-    flag = str(first.get("baseline", "")).strip().lower()
-    metadata = Metadata(
-        stage=str(first["stage"]),
-        recorded_at=first["recorded_at"],
-        travel=None if np.isnan(travel) else float(travel) * _KM,
-        covariates={c: float(first[c]) for c in covariates if np.isfinite(first[c])},
-        servo_id=str(first["servo_id"]) or None,
-        baseline=flag in ("true", "1", "yes") if flag else None,
-    )
-    frequency = rows["frequency_hz"].to_numpy(float)
-    damping = rows["damping_ratio"].to_numpy(float)
-    n = frequency.size
-    modes = Modes(
-        names=tuple(rows["mode"]),
-        sources=tuple(rows["source"]),
-        channels=tuple(rows["channel"]) if "channel" in rows.columns else ("",) * n,
-        ln_frequency=np.log(frequency),
-        ln_damping=np.log(damping),
-        cov=_covariance(path, log, rows, terms),
-        snr=rows["snr"].to_numpy(float) if "snr" in rows.columns else np.full(n, np.nan),
-        dispersion=np.full(n, np.nan),
-        flags=("",) * n,
-        shape_channels=tuple(name[len(_SHAPE) :] for name in shapes),
-        shapes=rows[list(shapes)].to_numpy(float),
-        lines=(),
-        refused=(),
-    )
-    loop_error = float(loop) * _MICRO if np.isfinite(loop) and loop > 0 else None
-    return Reading(log, "", metadata, modes, loop_error)
-
-
-def _covariance(path: Path, log: str, rows: pd.DataFrame, terms: pd.DataFrame | None) -> FloatArray:
-    """Covariance of ``[ln f, ln ζ]`` of one log, ``(2 n, 2 n)``, NaN where ln ζ is unknown."""
-    n = len(rows)
-    std_f = (rows["frequency_std_hz"] / rows["frequency_hz"]).to_numpy(float)
-    std_z = (rows["damping_ratio_std"] / rows["damping_ratio"]).to_numpy(float)
-    cov = np.diag(np.concatenate([std_f, std_z]) ** 2)
-    if "correlation_f_zeta" in rows.columns:
-        rho = rows["correlation_f_zeta"].fillna(0.0).to_numpy(float)
-        if (np.abs(rho) >= 1).any():
-            raise BadTable(f"{path}: log {log}: correlation_f_zeta reaches 1; needed is less")
-        i = np.arange(n)
-        cov[i, n + i] = cov[n + i, i] = rho * std_f * std_z
-    if terms is not None:
-        place = {key: i for i, key in enumerate(zip(rows["mode"], rows["source"], strict=True))}
-        for term in terms[terms["log"] == log].itertuples():
-            a = place.get((str(term.mode_a), str(term.source_a)))
-            b = place.get((str(term.mode_b), str(term.source_b)))
-            if a is not None and b is not None and a != b:
-                cov[a, b] = cov[b, a] = term.cov_ln_f
-        if np.linalg.eigvalsh(cov[:n, :n])[0] <= 0:
-            raise BadTable(
-                f"{path}: log {log}: variances and cross terms are no covariance; its least "
-                "eigenvalue is not positive"
-            )
-    unknown = np.concatenate([np.zeros(n, dtype=bool), np.isnan(std_z)])
-    cov[unknown], cov[:, unknown] = np.nan, np.nan
-    return cov
+    def _screen_run(
+        self, names: tuple[str, ...], first: int, stop: int, moved: FloatArray
+    ) -> BoolArray:
+        """Screen logs from the second on that show the same names."""
+        n = len(names)
+        own = slice(self._start[first], self._start[stop])
+        ln_f, var_f = self._ln_f[own].reshape(-1, n), self._var_f[own].reshape(-1, n)
+        ln_zeta, var_zeta = self._ln_zeta[own].reshape(-1, n), self._var_zeta[own].reshape(-1, n)
+        reach = _STILL + moved[:, None] + _SIGMAS * np.sqrt(var_f[1:] + var_f[:-1])
+        # Where a damping is unknown its variance is infinite.
+        far = _SIGMAS * np.sqrt(var_zeta[1:] + var_zeta[:-1])
+        fine = (np.diff(ln_f, axis=0) / reach) ** 2 + (np.diff(ln_zeta, axis=0) / far) ** 2 <= 1
+        if self._shapes.shape[1] > 1:
+            shapes = self._shapes[own].reshape(-1, n, self._shapes.shape[1])
+            fine &= np.nansum(shapes[1:] * shapes[:-1], axis=2) ** 2 >= _SAME_SHAPE
+        plain = fine.all(1)
+        gap = _APART + reach.max(1)
+        for i, j in combinations(range(n), 2):
+            if names[i] != names[j]:
+                plain &= np.abs(ln_f[1:, i] - ln_f[1:, j]) >= gap
+        return np.asarray(plain)

@@ -10,8 +10,9 @@ from datetime import UTC, datetime
 import numpy as np
 
 from lmshealth.arrays import FloatArray
-from lmshealth.association import Association, Estimates, associate
+from lmshealth.association import Association, associate
 from lmshealth.errors import NotEnoughData
+from lmshealth.estimates import Estimates
 from lmshealth.logs import Metadata, Refusal
 from lmshealth.maintenance import RESETS, Action
 from lmshealth.results import Modes

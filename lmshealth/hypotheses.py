@@ -15,7 +15,7 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 from scipy.special import hyp1f1, logsumexp, ndtr
 
-from lmshealth.arrays import FloatArray
+from lmshealth.arrays import BoolArray, FloatArray
 from lmshealth.filterbank import Bank, Innovations, IntArray, Readings
 
 # Probability that a source shows a mode in a log, and spurious estimates per log and unit of ln f.
@@ -184,57 +184,78 @@ def shape_gains(shapes: FloatArray, of_modes: FloatArray) -> FloatArray:
     return np.where(known, _CONCENTRATION * mac - norm[common], 0.0)
 
 
-def name_gains(
-    names: IntArray, order: IntArray, readings: Readings, seen: tuple[FloatArray, FloatArray]
-) -> FloatArray:
-    """Tell what names say, against a stranger that bears any name.
+def name_gains(names: IntArray, labels: IntArray, order: IntArray) -> FloatArray:
+    """Tell what names say if they follow the mode, against a stranger that bears any name.
 
     Parameters
     ----------
     names : ndarray
-        Of each estimate: index of the mode it means, -1 without a name, the number of modes for
-        a name that no mode has.
+        Index of the mode that each estimate's name means, ``(n,)``: see `Scan`.
+    labels : ndarray
+        Modes that estimates are held to be of, ``(..., n)``; -1 for none.
     order : ndarray
-        Modes that have names, in the order that names follow.
-    readings : Readings
-        The estimates.
-    seen : (ndarray, ndarray)
-        Where ln f of each mode is predicted, and its variance, ``(h, m)``.
+        Modes that have names.
 
     Returns
     -------
     ndarray
-        Log likelihood ratios with names by mode and by order, ``(h, n, m, 2)``.
+        Log likelihood ratio of each, ``(..., n)``.
     """
-    at, var = seen
-    (h, m), n, k = at.shape, names.size, order.size
-    gains = np.zeros((h, n, m, 2))
-    if k == 0 or (names < 0).all():
-        return gains
+    k = max(order.size, 1)
     wrong = (1 - _NAME_RIGHT) / max(k - 1, 1)
-    named = (names >= 0)[:, None]
-    hit = names[:, None] == np.arange(m)
-    by_mode = np.where(hit, _NAME_RIGHT, wrong)
-    # Distribution of how many of the other named modes lie below an estimate.
-    spread = np.sqrt(var[:, None] + readings.var_f[:, None])
-    below = ndtr((readings.ln_f[:, None] - at[:, None]) / spread)[..., order]
-    place = np.full(m + 1, -1)
-    place[order] = np.arange(k)
-    wanted = place[np.where(named[:, 0], names, m)]
-    by_order = np.full((h, n, m), 1.0 / k)
-    for j, mode in enumerate(order.tolist()):
-        chance = np.zeros((h, n, k + 1))
-        chance[..., 0] = 1.0
-        for other in range(k):
-            if other != j:
-                p = below[..., other, None]
-                moved = np.concatenate([np.zeros((h, n, 1)), chance[..., :-1]], -1)
-                chance = (1 - p) * chance + p * moved
-        right = np.where(wanted >= 0, chance[:, np.arange(n), wanted], 0.0)
-        by_order[..., mode] = wrong + (_NAME_RIGHT - wrong) * right
-    gains[..., 0] = np.where(named, np.log(by_mode * k), 0.0)
-    gains[..., 1] = np.where(named, np.log(by_order * k), 0.0)
-    return gains
+    gain = np.log(np.where(labels == names, _NAME_RIGHT, wrong) * k)
+    return np.where((names >= 0) & (labels >= 0), gain, 0.0)
+
+
+def order_gains(
+    scan: Scan, labels: IntArray, order: IntArray, seen: tuple[FloatArray, FloatArray]
+) -> FloatArray:
+    """Tell what names say if they follow the order of frequencies.
+
+    Modes that the log shows have the order of their estimates, whichever mode is which; others are
+    below an estimate with the probability that their filter gives.
+
+    Parameters
+    ----------
+    scan : Scan
+        The estimates.
+    labels : ndarray
+        Modes that they are held to be of, ``(c, n)``; -1 for none.
+    order : ndarray
+        Modes that have names, in the order that names follow.
+    seen : (ndarray, ndarray)
+        Where ln f of each mode is predicted, and its variance, each ``(c, m)``.
+
+    Returns
+    -------
+    ndarray
+        Log likelihood ratio against a stranger that bears any name, ``(c, n)``.
+    """
+    k, (c, n) = order.size, labels.shape
+    if k == 0 or (scan.names < 0).all():
+        return np.zeros((c, n))
+    at, var = (side[:, order] for side in seen)
+    own = labels[:, :, None] == order
+    ln_f = scan.readings.ln_f
+    spread = np.sqrt(var[:, None] + scan.readings.var_f[:, None])
+    below = ndtr((ln_f[:, None] - at[:, None]) / spread)
+    shown = own.any(1)
+    place = np.einsum("cnk,n->ck", own, ln_f)
+    below = np.where(shown[:, None], place[:, None] < ln_f[:, None], below)
+    below = np.where(own, 0.0, below)
+    # Distribution of how many modes lie below each estimate, one mode after the other.
+    count = np.zeros((c, n, k + 1))
+    count[..., 0] = 1.0
+    for other in range(k):
+        p = below[..., other, None]
+        count[..., 1:] = (1 - p) * count[..., 1:] + p * count[..., :-1]
+        count[..., :1] *= 1 - p
+    rank = np.argmax(scan.names[:, None] == order, axis=1)
+    known = np.isin(scan.names, order)
+    right = np.where(known, count[:, np.arange(n), rank], 0.0)
+    wrong = (1 - _NAME_RIGHT) / max(k - 1, 1)
+    gain = np.log((wrong + (_NAME_RIGHT - wrong) * right) * k)
+    return np.where((scan.names >= 0) & own.any(-1), gain, 0.0)
 
 
 def explain(now: Hypotheses, scan: Scan, order: IntArray, *, opened: bool) -> Hypotheses:
@@ -258,39 +279,53 @@ def explain(now: Hypotheses, scan: Scan, order: IntArray, *, opened: bool) -> Hy
     """
     if scan.readings.shapes.shape[1] > 1:
         now = _exchanged(now, scan)
-    seen = now.bank.seen(scan.row)
     gains = stranger_gains(now.bank.compare(scan.readings, scan.row))
     gains += shape_gains(scan.readings.shapes, now.bank.shapes)
-    names = name_gains(scan.names, order, scan.readings, seen)
-    own = now.log_weights - logsumexp(now.log_weights, axis=1, keepdims=True)
-    score = gains + logsumexp(own[:, None, None] + names, axis=-1)
-    score[score < _HOPELESS] = -np.inf
-    parents, labels, weights = [], [], []
-    for h, own_score in enumerate(score):
-        for _, columns in best_assignments(own_score, _HOPELESS, _MOST_EACH):
-            taken = [(i, t) for i, t in enumerate(columns) if t >= 0]
-            weight = now.log_weights[h].copy()
-            for i, t in taken:
-                weight += gains[h, i, t] + names[h, i, t]
-            if opened and _is_reordered(seen[0][h], scan.readings.ln_f, taken):
-                weight += np.log(_REORDERED)
-            parents.append(h)
-            labels.append(columns)
-            weights.append(weight)
-    log_weights = np.array(weights)
+    parents, labels = _assignments(now, gains, scan, order)
+    at, var = now.bank.seen(scan.row)
+    seen = (at[parents], var[parents])
+    rows = np.arange(scan.rows.size)
+    # One more column, for none.
+    gains = np.concatenate([gains, np.zeros((*gains.shape[:2], 1))], axis=2)
+    told = gains[parents[:, None], rows, labels].sum(1)
+    log_weights = now.log_weights[parents] + told[:, None]
+    log_weights[:, 0] += name_gains(scan.names, labels, order).sum(1)
+    log_weights[:, 1] += order_gains(scan, labels, order, seen).sum(1)
+    if opened:
+        log_weights += np.log(_REORDERED) * _is_reordered(scan, labels, seen[0])[:, None]
     total = logsumexp(log_weights, axis=1)
     kept = np.flatnonzero(total > total.max() + _HOPELESS)
-    chosen = np.array(labels, dtype=int).reshape(len(labels), scan.rows.size)[kept]
-    bank = now.bank.take(np.array(parents)[kept])
-    at, rows = np.nonzero(chosen >= 0)
-    bank.absorb((at, chosen[at, rows]), scan.readings.pick(rows), scan.row)
+    chosen, bank = labels[kept], now.bank.take(parents[kept])
+    each, shown = np.nonzero(chosen >= 0)
+    bank.absorb((each, chosen[each, shown]), scan.readings.pick(shown), scan.row)
     return Hypotheses(bank, normalised(log_weights[kept]), chosen)
 
 
-def _is_reordered(at: FloatArray, ln_f: FloatArray, taken: list[tuple[int, int]]) -> bool:
+def _assignments(
+    now: Hypotheses, gains: FloatArray, scan: Scan, order: IntArray
+) -> tuple[IntArray, IntArray]:
+    """Enumerate assignments under each hypothesis: its number, and modes of the estimates."""
+    own = now.log_weights - logsumexp(now.log_weights, axis=1, keepdims=True)
+    by_mode = name_gains(scan.names[:, None], np.arange(gains.shape[2]), order)
+    # Names by order say the same of all assignments, unless modes are missing.
+    by_order = np.where(scan.names >= 0, np.log(_NAME_RIGHT * max(order.size, 1)), 0.0)[:, None]
+    score = gains + np.logaddexp(own[:, :1, None] + by_mode, own[:, 1:, None] + by_order)
+    score[score < _HOPELESS] = -np.inf
+    parents, labels = [], []
+    for h, own_score in enumerate(score):
+        for _, columns in best_assignments(own_score, _HOPELESS, _MOST_EACH):
+            parents.append(h)
+            labels.append(columns)
+    return np.array(parents), np.array(labels, dtype=int).reshape(-1, scan.rows.size)
+
+
+def _is_reordered(scan: Scan, labels: IntArray, at: FloatArray) -> BoolArray:
     """Tell whether modes stand in another order of frequency than before."""
-    modes = [t for _, t in sorted(taken, key=lambda pair: float(ln_f[pair[0]]))]
-    return bool((np.diff(at[modes]) < 0).any())
+    rising = np.argsort(scan.readings.ln_f)
+    turned = []
+    for modes, own in zip(labels[:, rising], at, strict=True):
+        turned.append(bool((np.diff(own[modes[modes >= 0]]) < 0).any()))
+    return np.array(turned)
 
 
 def _exchanged(now: Hypotheses, scan: Scan) -> Hypotheses:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections import deque
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from lmshealth.arrays import FloatArray
+from lmshealth.estimates import Table
 from lmshealth.filterbank import Bank, IntArray, Readings
 from lmshealth.hypotheses import Hypotheses, Scan, explain, normalised, reduce_hypotheses
 from lmshealth.newcomers import Newcomers
@@ -17,6 +19,35 @@ SURE = 0.95
 # the second, and its shape has at least the MAC.
 _NEAR, _FAR = 4.0, 12.0
 _SAME_SHAPE = 0.8
+# Filters that catch up need no more logs than these: older ones have no pull any more.
+_MEMORY = 64
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Log:
+    """A log as far as it matters who is who.
+
+    Attributes
+    ----------
+    epoch : int
+        Its number.
+    clock, scale : float
+        Its place and the length of a life, on the clock.
+    offsets : ndarray
+        Its covariates, shape ``(n_covariates,)``.
+    opened : bool
+        Whether frequencies may have stepped before it.
+    names, sources : tuple of str
+        Of its estimates.
+    """
+
+    epoch: int
+    clock: float
+    scale: float
+    offsets: FloatArray
+    opened: bool
+    names: tuple[str, ...]
+    sources: tuple[str, ...]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -58,6 +89,8 @@ class Identities:
         Of the modes, in the order in which they were found.
     first : list of float
         Their first ln f.
+    settled : bool
+        Whether there is one hypothesis, nothing else to watch, and modes are in order.
     """
 
     def __init__(self, prior_std: FloatArray, n_channels: int) -> None:
@@ -71,55 +104,72 @@ class Identities:
         self._now = Hypotheses(bank, normalised(np.zeros((1, 2))), np.empty((1, 0), dtype=int))
         self._new = Newcomers(prior_std.size, n_channels)
         self._groups: dict[tuple[tuple[str, ...], ...], list[tuple[IntArray, IntArray]]] = {}
+        self._deferred: deque[tuple[Log, Readings]] = deque(maxlen=_MEMORY)
+        self._clock: float | None = None
+        self._scale = 0.0
         self._row = np.empty(0)
-        self._scale, self._epoch, self._opened = 0.0, 0, False
+        self.settled = False
 
-    def move(self, k: int, step: float, scale: float, offsets: FloatArray, *, opened: bool) -> None:
-        """Go to the next log.
+    def see(self, log: Log, table: Table) -> list[Verdict]:
+        """Take in a log, source by source.
 
         Parameters
         ----------
-        k : int
-            Its number.
-        step, scale : float
-            Step to it and length of a life, on the clock.
-        offsets : ndarray
-            Its covariates, shape ``(n_covariates,)``.
-        opened : bool
-            Whether frequencies may have stepped.
+        log : Log
+            The log, none before it to follow.
+        table : Table
+            Holds its estimates.
         """
-        self._epoch, self._scale, self._opened = k, scale, opened
-        self._row = np.concatenate([(1.0, 0.0), offsets])
-        self._now.bank.predict(step, scale, k, opened=opened)
-        if self._new:
-            self._new.bank.predict(step, scale, k, opened=opened)
-
-    def see(
-        self, names: tuple[str, ...], sources: tuple[str, ...], readings: Readings
-    ) -> list[Verdict]:
-        """Take in the estimates of the log, source by source."""
+        self._catch_up()
+        self._move(log)
+        readings = table.readings(log.epoch)
         verdicts: list[Verdict] = []
         gone: set[int] = set()
         back: set[int] = set()
-        for g in range(len(self._grouped(names, sources))):
-            rows, meant = self._grouped(names, sources)[g]
-            own = readings if rows.size == len(names) else readings.pick(rows)
-            scan = Scan(self._epoch, rows, meant, own, self._row)
-            verdict = self._plain(scan)
+        for g in range(len(self._grouped(log))):
+            rows, meant = self._grouped(log)[g]
+            own = readings if rows.size == len(log.names) else readings.pick(rows)
+            scan = Scan(log.epoch, rows, meant, own, self._row)
+            verdict = None if log.opened else self._plain(scan)
             if verdict is None:
-                verdict = self._weigh(scan, names, gone)
+                verdict = self._weigh(scan, log, gone)
                 back.update(np.flatnonzero((verdict.chances[:, :-1] > 0.5).any(0)).tolist())
             else:
                 back.update(verdict.modes)
             verdicts.append(verdict)
         if self._new:
-            self._new.forget(self._epoch, gone, back)
+            self._new.forget(log.epoch, gone, back)
+        self.settled = len(self._now.bank.mean) == 1 and not self._new and self._in_order()
         return verdicts
 
-    def _grouped(
-        self, names: tuple[str, ...], sources: tuple[str, ...]
-    ) -> list[tuple[IntArray, IntArray]]:
+    def defer(self, log: Log, table: Table) -> None:
+        """Take a log at its names while there is one hypothesis; filters follow when needed."""
+        self._deferred.append((log, table.readings(log.epoch)))
+
+    def _catch_up(self) -> None:
+        for log, readings in self._deferred:
+            self._move(log)
+            for rows, meant in self._grouped(log):
+                own = readings if rows.size == len(log.names) else readings.pick(rows)
+                self._now.bank.absorb((np.zeros_like(meant), meant), own, self._row)
+        self._deferred.clear()
+
+    def _move(self, log: Log) -> None:
+        step = log.clock - self._clock if self._clock is not None else 0.0
+        self._clock, self._scale = log.clock, log.scale
+        self._row = np.concatenate([(1.0, 0.0), log.offsets])
+        self._now.bank.predict(step, log.scale, log.epoch, opened=log.opened)
+        if self._new:
+            self._new.bank.predict(step, log.scale, log.epoch, opened=log.opened)
+
+    def _in_order(self) -> bool:
+        """Tell whether names by order and by mode are the same."""
+        at = self._now.bank.seen(self._row)[0][0, self._order]
+        return bool((np.diff(at) > 0).all())
+
+    def _grouped(self, log: Log) -> list[tuple[IntArray, IntArray]]:
         """Rows of each source, and which modes their names mean."""
+        names, sources = log.names, log.sources
         if (names, sources) not in self._groups:
             index = {name: i for i, name in enumerate(self.names)}
             unknown = len(self.names)
@@ -131,7 +181,7 @@ class Identities:
     def _plain(self, scan: Scan) -> Verdict | None:
         """Take a scan that has one explanation; None where it may have others."""
         bank, new = self._now.bank, scan.readings
-        if len(bank.mean) > 1 or self._opened or not bank.n_modes:
+        if len(bank.mean) > 1 or not bank.n_modes:
             return None
         at, var = (side[0] for side in bank.seen(scan.row))
         squared = (new.ln_f[:, None] - at) ** 2 / (new.var_f[:, None] + var)
@@ -162,10 +212,10 @@ class Identities:
         mac = np.nansum(new.shapes * bank.shapes[0, modes], axis=-1) ** 2
         return bool((mac > _SAME_SHAPE).all())
 
-    def _weigh(self, scan: Scan, names: tuple[str, ...], gone: set[int]) -> Verdict:
+    def _weigh(self, scan: Scan, log: Log, gone: set[int]) -> Verdict:
         """Follow all explanations of a scan and choose labels that are sure."""
         expected = self._now.bank.seen(scan.row)[0][0]
-        grown = explain(self._now, scan, self._order, opened=self._opened)
+        grown = explain(self._now, scan, self._order, opened=log.opened)
         self._now = reduce_hypotheses(grown)
         m = len(self.names)
         chances = grown.chances(m)
@@ -173,7 +223,7 @@ class Identities:
         modes = np.where(chances.max(1) >= SURE, best, -1).tolist()
         lone = np.flatnonzero(chances[:, -1] > 0.5).tolist()
         for i in lone:
-            name = names[scan.rows[i]]
+            name = log.names[scan.rows[i]]
             if name and name not in self.names:
                 modes[i] = self._found(scan.readings.pick(np.array([i])), name)
         left = np.array([i for i in lone if modes[i] < 0], dtype=int)

@@ -16,7 +16,6 @@ import numpy as np
 
 from lmshealth.arrays import FloatArray
 from lmshealth.results import Health, Prognosis
-from lmshealth.tracks import History, Track
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -99,50 +98,6 @@ def svg(
     return text.replace("<svg ", '<svg aria-hidden="true" focusable="false" ', 1)
 
 
-def plot_frequencies(ax: Axes, history: History, track: Track | None, mode: str) -> Axes:
-    """Plot the natural frequency of a mode against the odometer.
-
-    Each log's estimate with ± 2 standard deviations as it was measured; the filtered line with
-    its 95 % band has the covariates at their reference. Without a track of this mode the line
-    is left out.
-    """
-    for column in history.columns(mode):
-        _logs(ax, history, column, history.ln_frequency[:, column], 1.0)
-    if track is not None and mode in track.modes:
-        k = track.modes.index(mode)
-        level = track.ln_frequency[:, k]
-        _filtered(ax, track.travel, level, track.ln_frequency_std[:, k], 1.0)
-        base = np.exp(level - track.drift[:, k])
-        if np.isfinite(base).any():
-            value = float(base[np.isfinite(base)][-1])
-            ax.axhline(value, color=GREEN, lw=1.1, ls=(0, (5, 3)), label="baseline")
-    # A healthy mode must not look like a drama: at least 1 % of the frequency is shown.
-    low, high = ax.get_ylim()
-    middle = (low + high) / 2
-    if high - low < 0.01 * middle:
-        ax.set_ylim(0.995 * middle, 1.005 * middle)
-    ax.set_ylabel("natural frequency in Hz")
-    return _odometer(ax)
-
-
-def plot_damping(ax: Axes, history: History, track: Track | None, mode: str) -> Axes:
-    """Plot the damping ratio of a mode against the odometer, as `plot_frequencies` does."""
-    columns = history.columns(mode)
-    level = history.ln_damping[:, columns]
-    top = max(
-        _logs(ax, history, len(history.series) + column, history.ln_damping[:, column], 100.0)
-        for column in columns
-    )
-    if track is not None and mode in track.modes:
-        k = track.modes.index(mode)
-        _filtered(ax, track.travel, track.ln_damping[:, k], track.ln_damping_std[:, k], 100.0)
-    # A log that hardly saw the mode has bars without end; they may leave the picture.
-    if top > 0:
-        ax.set_ylim(0, 1.08 * min(top, 300 * float(np.exp(np.nanmax(level)))))
-    ax.set_ylabel("damping ratio in %")
-    return _odometer(ax)
-
-
 def plot_posterior(ax: Axes, health: Health, parameters: tuple[str, ...]) -> Axes:
     """Plot the joint posterior of the last epoch.
 
@@ -188,7 +143,7 @@ def plot_health(ax: Axes, health: Health, parameter: str, limit: float | None) -
     _levels(ax, limit)
     _room(ax, bands, limit)
     ax.set_ylabel("% of baseline")
-    return _odometer(ax)
+    return odometer(ax)
 
 
 def plot_life(
@@ -225,7 +180,7 @@ def plot_life(
     ax.set_xlim(left - 0.01 * (right - left), right + 0.02 * (right - left))
     ax.set_ylim(0, max(top, 1.04 * float(np.max(bands[4][travel <= right], initial=0.0))))
     ax.set_ylabel("% of baseline")
-    _odometer(ax)
+    odometer(ax)
     if not shown:
         ax.set_xlabel(f"odometer in km (horizon at {end:.0f} km, not shown)")
     return ax
@@ -258,57 +213,10 @@ def plot_survival(ax: Axes, prognosis: Prognosis, *, max_risk: float | None = No
     return _legend(ax)
 
 
-def plot_nis(ax: Axes, track: Track) -> Axes:
-    """Plot the normalised innovation squared of each epoch and its 95 % chi-square band."""
-    seen = (track.nis_dof > 0) & np.isfinite(track.nis)
-    x, nis = track.travel[seen] / _KM, track.nis[seen]
-    low, high = chi_square_band(track.nis_dof[seen])
-    ax.fill_between(x, low, high, step="mid", color=BLUE, alpha=0.18, lw=0, label="95 % band")
-    inside = (nis >= low) & (nis <= high)
-    ax.plot(x[inside], nis[inside], "o", color=BLUE, ms=4, label="inside")
-    if not inside.all():
-        ax.plot(x[~inside], nis[~inside], "D", color=RED, ms=5, label="outside")
-    if nis.size and nis.max() > 4 * high.max():
-        ax.set_yscale("log")
-        ax.set_ylabel("NIS (log scale)")
-    else:
-        ax.set_ylim(bottom=0)
-        ax.set_ylabel("NIS")
-    return _odometer(ax)
-
-
-def chi_square_band(dof: FloatArray) -> FloatArray:
-    """Bounds that hold a chi-square variable with 95 %, shape ``(2, ...)``."""
-    from scipy.special import gammaincinv
-
-    return np.stack([2 * gammaincinv(dof / 2, level) for level in (0.025, 0.975)])
-
-
-def _logs(ax: Axes, history: History, row: int, level: FloatArray, unit: float) -> float:
-    """Draw logarithmic estimates with ± 2 standard deviations; return the top of the bars."""
-    std = np.sqrt(history.cov[:, row, row])
-    seen = np.isfinite(level) & np.isfinite(std)
-    bounds = unit * np.exp(level[seen] + np.array([-2, 0, 2])[:, None] * std[seen])
-    _bars(ax, history.travel[seen], bounds, "each log, ±2σ", 3)
-    return float(np.max(bounds[2], initial=0.0))
-
-
-def _bars(ax: Axes, travel: FloatArray, bounds: FloatArray, label: str, size: float) -> None:
+def bars(ax: Axes, travel: FloatArray, bounds: FloatArray, label: str, size: float) -> None:
     """Draw points with bars from low, middle and high values, shape ``(3, n)``."""
     style: Any = {"fmt": "o", "color": MUTED, "elinewidth": 0.7, "alpha": 0.85}
     ax.errorbar(travel / _KM, bounds[1], np.diff(bounds, axis=0), ms=size, label=label, **style)
-
-
-def _filtered(
-    ax: Axes, travel: FloatArray, level: FloatArray, std: FloatArray, unit: float
-) -> None:
-    """Draw the filtered line with its 95 % band, above the logs."""
-    x, reach = travel / _KM, 1.96 * std
-    low, high = unit * np.exp(level - reach), unit * np.exp(level + reach)
-    ax.fill_between(x, low, high, color=BLUE, alpha=0.25, lw=0, zorder=3)
-    marker = "o" if travel.size < 3 else ""
-    name = "filtered, 95 % band"
-    ax.plot(x, unit * np.exp(level), color=BLUE, lw=1.8, marker=marker, zorder=4, label=name)
 
 
 def _bands(ax: Axes, x: FloatArray, bands: FloatArray, name: str, *, told: bool) -> None:
@@ -353,7 +261,7 @@ def _epochs(ax: Axes, health: Health, parameter: str) -> float:
     bounds = 100 * health.quantile(_LEVELS[::2])[:, :, health.parameters.index(parameter)]
     # Twenty bars are enough to judge by; the last epoch is always among them.
     some = np.arange(bounds.shape[1])[:: -max(1, bounds.shape[1] // 20)]
-    _bars(ax, health.travel[some], bounds[:, some], "epochs, 90 %", 2.5)
+    bars(ax, health.travel[some], bounds[:, some], "epochs, 90 %", 2.5)
     return min(float(bounds[2].max()), 160.0)
 
 
@@ -431,7 +339,8 @@ def _quantiles(values: FloatArray, levels: tuple[float, ...]) -> FloatArray:
     return np.asarray(np.quantile(values, levels, method="inverted_cdf"))
 
 
-def _odometer(ax: Axes) -> Axes:
+def odometer(ax: Axes) -> Axes:
+    """Finish a picture over the odometer: axis and legend."""
     ax.set_xlabel("odometer in km")
     return _legend(ax)
 

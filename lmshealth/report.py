@@ -24,11 +24,21 @@ from lmshealth.logs import Refusal
 from lmshealth.results import Health, Prognosis
 from lmshealth.stage import ParameterSpec
 from lmshealth.summary import Assessment
-from lmshealth.tracks import Effect, History, Track
+from lmshealth.trackplots import chi_square_band, plot_damping, plot_frequencies, plot_nis
+from lmshealth.tracks import Effect, Event, History, Track
+from lmshealth.wording import (
+    GAP,
+    LEVELS,
+    day_count,
+    km,
+    left,
+    moment,
+    percent,
+    quantiles,
+    signed,
+    spell,
+)
 
-_KM = 1000.0
-_GAP = "\u202f"  # narrow space that does not break: between a number and its unit
-_LEVELS = np.array([0.05, 0.5, 0.95])
 _UNITS = {"c": "°C", "kg": "kg", "mm": "mm"}
 _FLEET_TOP = 1.5  # length of all gauges of the index, as a fraction of baseline
 
@@ -142,7 +152,7 @@ def _environment() -> Any:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    pages.filters |= {"spell": _spell, "moment": _moment, "km": _km}
+    pages.filters |= {"spell": spell, "moment": moment, "km": km}
     return pages
 
 
@@ -181,14 +191,14 @@ def _summary(assessment: Assessment, by: date | None, top: float | None) -> dict
     judgement, prognosis = assessment.judgement, assessment.prognosis
     specs = assessment.stage.parameters
     words = {"preload": ("preload",), "mount": ("mount",), "both": ("preload", "mount")}
-    lost = [_spell(s.name) for s in specs if s.word in words.get(judgement.verdict, ())]
+    lost = [spell(s.name) for s in specs if s.word in words.get(judgement.verdict, ())]
     lives = [] if prognosis is None else [_life(prognosis, k) for k in range(len(prognosis.limits))]
     return {
         "assessment": assessment,
         "identity": judgement.stage,
         "lost": " and ".join(lost) or judgement.verdict,
         "tone": {"healthy": "good", "not-enough-data": "open"}.get(judgement.verdict, "bad"),
-        "probability": _percent(judgement.probability) if judgement.probability >= 0 else "",
+        "probability": percent(judgement.probability) if judgement.probability >= 0 else "",
         "gauges": list(_gauges(assessment, top)),
         "lives": lives,
         "service": _service(assessment, by),
@@ -207,6 +217,8 @@ def _evidence(assessment: Assessment) -> dict[str, Any]:
         "pairs": [] if health is None else _pairs(health),
         "picture": _pictures(assessment),
         "surprise": None if track is None else _surprise(track),
+        "happened": [] if track is None else list(_happened(track)),
+        "filter": None if track is None else _filter_health(track),
         "noise_scale": None if track is None else float(track.noise_scale[-1].max()),
         "largest_drift": float(np.nanmax(drift, initial=0.0)),
         "law": prognosis and _fit(prognosis.chi_square, prognosis.degrees_of_freedom),
@@ -229,20 +241,20 @@ def _gauges(assessment: Assessment, top: float | None) -> Iterator[Gauge]:
 
 
 def _gauge(spec: ParameterSpec | None, health: Health, column: int, top: float) -> Gauge:
-    low, middle, high = health.quantile(_LEVELS)[:, -1, column]
+    low, middle, high = health.quantile(LEVELS)[:, -1, column]
     limit = _limit(spec)
     places = {"low": low, "median": middle, "high": high, "baseline": 1.0, "limit": limit or 0.0}
-    below = "" if limit is None else _percent(np.mean(health.samples[-1, :, column] < limit))
+    below = "" if limit is None else percent(np.mean(health.samples[-1, :, column] < limit))
     return Gauge(
-        name=_spell(health.parameters[column]),
+        name=spell(health.parameters[column]),
         told=bool(health.told()[column]),
         converged=bool(health.converged[-1]),
-        share=_percent(float(health.informed[-1, column])),
-        value=f"{100 * middle:.0f}{_GAP}%",
-        interval=f"{100 * low:.0f} to {100 * high:.0f}{_GAP}%",
+        share=percent(float(health.informed[-1, column])),
+        value=f"{100 * middle:.0f}{GAP}%",
+        interval=f"{100 * low:.0f} to {100 * high:.0f}{GAP}%",
         below=below,
-        limit="" if limit is None else f"{100 * limit:.3g}{_GAP}%",
-        unit=f"{spec.baseline:g}{_GAP}{spec.unit}" if spec and spec.unit else "",
+        limit="" if limit is None else f"{100 * limit:.3g}{GAP}%",
+        unit=f"{spec.baseline:g}{GAP}{spec.unit}" if spec and spec.unit else "",
         places={key: round(100 * min(float(v) / top, 1.0), 2) for key, v in places.items()},
     )
 
@@ -263,26 +275,26 @@ def _service(assessment: Assessment, by: date | None) -> Service:
         planned = decision.next_service
         if planned is not None:
             ahead = (planned - today).days
-            planned_risk = _percent(float(np.mean(_days(prognosis)[:, -1] <= ahead)))
-    return Service(kind, by, f"{100 * decision.max_risk:.3g}{_GAP}%", planned, planned_risk)
+            planned_risk = percent(float(np.mean(_days(prognosis)[:, -1] <= ahead)))
+    return Service(kind, by, f"{100 * decision.max_risk:.3g}{GAP}%", planned, planned_risk)
 
 
 def _life(prognosis: Prognosis, column: int) -> Life:
     name, limit = prognosis.parameters[column], float(prognosis.limits[column])
     travel = prognosis.remaining[:, column]
-    km = _quantiles(np.where(travel > prognosis.horizon, np.inf, travel))
-    days = _quantiles(_days(prognosis)[:, column])
-    low, middle, high = _quantiles(
+    distance = quantiles(np.where(travel > prognosis.horizon, np.inf, travel))
+    days = quantiles(_days(prognosis)[:, column])
+    low, middle, high = quantiles(
         100 * prognosis.health[:, min(column, prognosis.health.shape[1] - 1)]
     )
     return Life(
-        name="any limit" if name == "any" else _spell(name),
-        limit="" if np.isnan(limit) else f"{100 * limit:.3g}{_GAP}%",
-        km=tuple(_left(v, f"beyond {_km(prognosis.horizon)}", _km(v)) for v in km),
-        days=tuple(_left(v, "beyond", _day_count(v)) for v in days),
-        past=_percent(float(prognosis.already_past()[column])),
-        beyond=_percent(float(prognosis.beyond_horizon()[column])),
-        now="" if name == "any" else f"{middle:.0f}{_GAP}% ({low:.0f} to {high:.0f}{_GAP}%)",
+        name="any limit" if name == "any" else spell(name),
+        limit="" if np.isnan(limit) else f"{100 * limit:.3g}{GAP}%",
+        km=tuple(left(v, f"beyond {km(prognosis.horizon)}", km(v)) for v in distance),
+        days=tuple(left(v, "beyond", day_count(v)) for v in days),
+        past=percent(float(prognosis.already_past()[column])),
+        beyond=percent(float(prognosis.beyond_horizon()[column])),
+        now="" if name == "any" else f"{middle:.0f}{GAP}% ({low:.0f} to {high:.0f}{GAP}%)",
     )
 
 
@@ -291,7 +303,7 @@ def _pictures(assessment: Assessment) -> dict[tuple[str, str], str]:
     history, track, prognosis = assessment.history, assessment.track, assessment.prognosis
     health, risk = _health(assessment), assessment.stage.description.decision.max_risk
     draw: dict[tuple[str, str], Any] = {}
-    pair = {"frequency": plots.plot_frequencies, "damping": plots.plot_damping}
+    pair = {"frequency": plot_frequencies, "damping": plot_damping}
     for mode in _seen(history):
         for kind, plot in pair.items():
             draw[kind, mode] = partial(plot, history=history, track=track, mode=mode)
@@ -300,17 +312,17 @@ def _pictures(assessment: Assessment) -> dict[tuple[str, str], str]:
             draw["posterior", key] = partial(plots.plot_posterior, health=health, parameters=names)
         limits = {spec.name: _limit(spec) for spec in assessment.stage.parameters}
         for name in health.parameters:
-            draw["health", _spell(name)] = partial(
+            draw["health", spell(name)] = partial(
                 plots.plot_health, health=health, parameter=name, limit=limits.get(name)
             )
     if prognosis is not None:
         for name in prognosis.parameters[:-1]:
-            draw["life", _spell(name)] = partial(
+            draw["life", spell(name)] = partial(
                 plots.plot_life, prognosis=prognosis, parameter=name, health=health
             )
         draw["survival", "any"] = partial(plots.plot_survival, prognosis=prognosis, max_risk=risk)
     if track is not None and _surprise(track) is not None:
-        draw["nis", "all"] = partial(plots.plot_nis, track=track)
+        draw["nis", "all"] = partial(plot_nis, track=track)
     return {key: _inline(one, f"p{k}") for k, (key, one) in enumerate(draw.items())}
 
 
@@ -323,10 +335,10 @@ def _pairs(health: Health) -> list[tuple[tuple[str, ...], str, float]]:
     """Parameters to draw against each other, their title, and the correlation of the draws."""
     names = health.parameters
     if len(names) == 1:
-        return [(names, _spell(names[0]), 0.0)]
+        return [(names, spell(names[0]), 0.0)]
     rho = np.corrcoef(np.log(health.samples[-1]).T)
     return [
-        ((names[i], names[j]), f"{_spell(names[i])} against {_spell(names[j])}", float(rho[i, j]))
+        ((names[i], names[j]), f"{spell(names[i])} against {spell(names[j])}", float(rho[i, j]))
         for i, j in combinations(range(len(names)), 2)
     ]
 
@@ -340,11 +352,11 @@ def _mode_rows(track: Track) -> Iterator[tuple[str, ...]]:
         zeta = 100 * np.exp(track.ln_damping[-1, k])
         if np.isfinite([level, drift]).all():
             yield (
-                _spell(mode),
-                f"{np.exp(level - drift):.2f}{_GAP}Hz",
-                f"{np.exp(level):.2f} ± {std:.2f}{_GAP}Hz",
-                f"{_signed(100 * drift, 2)} ± {100 * drift_std:.2f}{_GAP}%",
-                f"{zeta:.2f} ± {zeta * track.ln_damping_std[-1, k]:.2f}{_GAP}%",
+                spell(mode),
+                f"{np.exp(level - drift):.2f}{GAP}Hz",
+                f"{np.exp(level):.2f} ± {std:.2f}{GAP}Hz",
+                f"{signed(100 * drift, 2)} ± {100 * drift_std:.2f}{GAP}%",
+                f"{zeta:.2f} ± {zeta * track.ln_damping_std[-1, k]:.2f}{GAP}%",
             )
 
 
@@ -352,7 +364,7 @@ def _surprise(track: Track) -> tuple[int, int, Fit] | None:
     """Count epochs inside the band of their NIS, all epochs, and judge their sum."""
     seen = (track.nis_dof > 0) & np.isfinite(track.nis)
     nis, dof = track.nis[seen], track.nis_dof[seen]
-    low, high = plots.chi_square_band(dof)
+    low, high = chi_square_band(dof)
     total = _fit(float(nis.sum()), float(dof.sum()))
     inside = int(np.sum((nis >= low) & (nis <= high)))
     return None if total is None else (inside, nis.size, total)
@@ -361,22 +373,61 @@ def _surprise(track: Track) -> tuple[int, int, Fit] | None:
 def _fit(value: float, dof: float) -> Fit | None:
     if dof <= 0:
         return None
-    low, high = plots.chi_square_band(np.array(dof, dtype=float)).tolist()
+    low, high = chi_square_band(np.array(dof, dtype=float)).tolist()
     side = "above" if value > high else "below" if value < low else "inside"
     return Fit(value, dof, low, high, side)
+
+
+def _happened(track: Track) -> Iterator[dict[str, Any]]:
+    """Tell each event once, with what it did to every mode."""
+    groups: dict[tuple[str, int, str], list[Event]] = {}
+    for event in track.events:
+        groups.setdefault((event.kind, event.epoch, event.source), []).append(event)
+    for (kind, epoch, source), events in groups.items():
+        first = events[0]
+        yield {
+            "kind": kind,
+            "source": source,
+            "since": track.recorded_at[epoch],
+            "travel": km(track.travel[epoch]) if np.isfinite(track.travel[epoch]) else "–",
+            "known": track.recorded_at[first.found_at],
+            "declared": first.declared,
+            "sizes": [
+                f"{spell(event.mode)} {signed(100 * event.size, 2)} ± {100 * event.std:.2f}{GAP}%"
+                for event in events
+            ],
+            "of": "damping" if kind == "regreasing" else "frequency",
+            "evidence": f"{first.evidence:.1f}".replace("-", "−"),
+        }
+
+
+def _filter_health(track: Track) -> dict[str, Any]:
+    """Say whether the filter agrees with its logs, and how far it is widened."""
+    found = track.consistency()
+    return {
+        "holds": found.holds,
+        "autocorrelation": signed(found.autocorrelation, 2),
+        "p_value": f"{found.autocorrelation_p_value:.2g}",
+        "widening": float(track.widening[-1]),
+    }
 
 
 def _effect_row(effect: Effect) -> tuple[str, str, str, bool]:
     """Mode, covariate, coefficient in ‰ per unit, and whether it differs from zero."""
     name, _, unit = effect.covariate.rpartition("_")
-    if effect.covariate.startswith("bias:"):
-        name, per = f"offset of {effect.covariate[5:]}", ""
+    kind, colon, which = effect.covariate.partition(":")
+    if kind == "scale":
+        value = f"{effect.coefficient:.2f} ± {effect.std:.2f} times"
+        return "–", f"standard deviations of {which}", value, abs(effect.coefficient - 1) > 0.05
+    if colon:
+        told = {"bias": "offset of", "servo": "tuning", "sensor": "sensor since"}
+        name, per = f"{told.get(kind, kind)} {which}", ""
     elif name and unit in _UNITS:
         per = f" per {_UNITS[unit]}"
     else:
         name, per = effect.covariate, " per unit"
-    value = f"{_signed(1e3 * effect.coefficient, 3)} ± {1e3 * effect.std:.3f}{_GAP}‰{per}"
-    return _spell(effect.mode), _spell(name), value, abs(effect.coefficient) > 2 * effect.std
+    value = f"{signed(1e3 * effect.coefficient, 3)} ± {1e3 * effect.std:.3f}{GAP}‰{per}"
+    return spell(effect.mode), spell(name), value, abs(effect.coefficient) > 2 * effect.std
 
 
 def _seen(history: History) -> list[str]:
@@ -400,49 +451,3 @@ def _days(prognosis: Prognosis) -> FloatArray:
     with np.errstate(divide="ignore", invalid="ignore"):
         days = prognosis.remaining / prognosis.usage[:, None]
     return np.where(prognosis.remaining > prognosis.horizon, np.inf, days)
-
-
-def _spell(name: str) -> str:
-    return name.replace("_", " ")
-
-
-def _moment(when: datetime) -> str:
-    return when.strftime("%Y-%m-%d %H:%M %Z").strip()
-
-
-def _percent(probability: float | np.floating[Any]) -> str:
-    """Probability as text; draws cannot prove 0 or 1."""
-    if probability < 0.01:
-        return f"below 1{_GAP}%"
-    if probability > 0.99:
-        return f"above 99{_GAP}%"
-    return f"{100 * probability:.0f}{_GAP}%"
-
-
-def _signed(value: float, digits: int) -> str:
-    return f"{value:+.{digits}f}".replace("-", "−")
-
-
-def _number(value: float) -> str:
-    """Three significant digits, thousands apart."""
-    rounded = float(f"{value:.3g}")
-    digits = 0 if not abs(rounded) < 10 or rounded.is_integer() else 1
-    return f"{rounded:,.{digits}f}".replace(",", _GAP).replace("-", "−")
-
-
-def _km(metres: float) -> str:
-    return f"{_number(metres / _KM)}{_GAP}km"
-
-
-def _day_count(days: float) -> str:
-    years = f" ({days / 365.25:.1f} years)" if days >= 1000 else ""
-    return f"{_number(days)}{_GAP}days{years}"
-
-
-def _quantiles(values: FloatArray) -> list[float]:
-    """5, 50 and 95 % of draws that may be infinite: always one of the draws."""
-    return [float(q) for q in np.quantile(values, _LEVELS, method="inverted_cdf")]
-
-
-def _left(value: float, beyond: str, text: str) -> str:
-    return "already passed" if value <= 0 else beyond if np.isinf(value) else text

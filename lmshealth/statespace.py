@@ -87,6 +87,9 @@ def regressors(covariates: Mapping[str, FloatArray], stage: Stage | None) -> tup
             continue
         known = np.isfinite(values)
         offset = np.where(known, values - covariate.reference, 0.0)
+        # What never leaves its reference moves nothing.
+        if not offset.any():
+            continue
         spread = max(float(np.std(values[known])), 1.0)
         unknown = np.where(known, 0.0, (covariate.prior_std * spread) ** 2)
         found.append(Regressor(covariate.name, offset, covariate.prior_std, unknown))

@@ -8,15 +8,13 @@ from pathlib import Path
 import pytest
 
 from lmshealth.errors import BadTable
-from lmshealth.maintenance import RESETS, Action, after_last_reset, read_maintenance
-from tests.lives import START, make_reading
+from lmshealth.maintenance import RESETS, STEPS, Action, maintenance_notes, read_maintenance
+from tests.lives import START
 
 HEAD = "stage,recorded_at,action\n"
 
 
-def logs(n: int = 4) -> list:
-    """Make readings one day apart from the start."""
-    return [make_reading(str(k), k, 1e5 * k, {"roll": 4.8}) for k in range(n)]
+MOMENTS = [START + timedelta(days=k) for k in range(4)]
 
 
 def done(action: str, day: float) -> Action:
@@ -61,38 +59,24 @@ def test_a_record_that_breaks_its_contract_is_refused(
 
 @pytest.mark.parametrize("action", RESETS)
 def test_work_on_guide_or_mount_opens_a_new_baseline(action: str) -> None:
-    """Logs before the work are left out, the log at its very moment is kept, and a note says so."""
-    kept, notes = after_last_reset(logs(), [done(action, 2)])
-    assert [r.log for r in kept] == ["2", "3"]
+    """The reader is told what earlier logs are still good for; a log at that moment is later."""
+    notes = maintenance_notes([done(action, 2)], MOMENTS)
     assert len(notes) == 1
     assert action in notes[0]
     assert "2 earlier logs" in notes[0]
 
 
-def test_the_last_reset_counts() -> None:
-    """Of several resets the last one opens the life."""
-    kept, _ = after_last_reset(logs(), [done("guide-replaced", 0.5), done("mount-tightened", 2.5)])
-    assert [r.log for r in kept] == ["3"]
-
-
-def test_a_reset_without_later_logs_keeps_all_and_says_so() -> None:
+def test_a_reset_without_later_logs_says_so() -> None:
     """Nothing is known after the last work, which the reader is told."""
-    kept, notes = after_last_reset(logs(), [done("preload-adjust", 9)])
-    assert len(kept) == 4
-    assert "no log since" in notes[0]
+    assert "no log since" in maintenance_notes([done("preload-adjust", 9)], MOMENTS)[0]
 
 
-def test_a_regreasing_changes_nothing() -> None:
-    """Work that moves dampings alone leaves logs and notes as they are."""
-    kept, notes = after_last_reset(logs(), [done("regrease", 2)])
-    assert len(kept) == 4
-    assert notes == []
+def test_a_reset_before_the_first_log_needs_no_word() -> None:
+    """The life that the logs show begins after it."""
+    assert maintenance_notes([done("guide-replaced", -1)], MOMENTS) == []
 
 
-def test_a_retuning_inside_the_life_is_told() -> None:
-    """A servo or sensor change after the first kept log is noted, one before it is not."""
-    actions = [done("servo", 0.5), done("mount-tightened", 1.5), done("sensor", 2.5)]
-    kept, notes = after_last_reset(logs(), actions)
-    assert [r.log for r in kept] == ["2", "3"]
-    assert len(notes) == 2
-    assert "sensor" in notes[1]
+@pytest.mark.parametrize("action", STEPS)
+def test_work_that_leaves_guide_and_mount_needs_no_word(action: str) -> None:
+    """What it did stands among the events."""
+    assert maintenance_notes([done(action, 2)], MOMENTS) == []

@@ -14,12 +14,12 @@ import pytest
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from lmshealth import plots
+from lmshealth import plots, trackplots
 from lmshealth.arrays import FloatArray
 from lmshealth.laws import HertzWear, Law, Loosening
 from lmshealth.priors import Lognormal, Normal
 from lmshealth.results import Health, Prognosis
-from lmshealth.tracks import Effect, History, Track
+from lmshealth.tracks import Effect, History, Series, Track
 
 MODES = ("roll", "pitch", "yaw")
 PARAMETERS = ("guide_preload", "mount_stiffness")
@@ -63,7 +63,9 @@ def make_history(stage: str, travel: FloatArray, truth: FloatArray, seed: int = 
         ln_frequency=ln_f,
         ln_damping=ln_z,
         cov=cov,
-        baseline=0,
+        series=tuple(Series(mode, "acc") for mode in MODES),
+        loop_error=np.full(n, np.nan),
+        baselines=(0,),
     )
 
 
@@ -91,7 +93,13 @@ def make_track(history: History, truth: FloatArray, seed: int = 2) -> Track:
         effects=tuple(Effect(mode, "temperature_c", -1.2e-4, 1.5e-5) for mode in history.modes),
         nis=rng.chisquare(dof),
         nis_dof=dof,
-        noise_scale=np.ones(n),
+        noise_scale=np.ones((n, 1)),
+        sources=("acc",),
+        events=(),
+        steps=(),
+        outliers=(),
+        innovations=rng.standard_normal((n, 2 * m)),
+        widening=np.ones(n),
     )
 
 
@@ -216,7 +224,7 @@ def test_import_leaves_matplotlib_alone() -> None:
 
 def test_frequencies_in_hz_over_km(ax: Axes, history: History, track: Track) -> None:
     """Logs, filtered line and baseline stand at the right numbers, missing logs are left out."""
-    assert plots.plot_frequencies(ax, history, track, "roll") is ax
+    assert trackplots.plot_frequencies(ax, history, track, "roll") is ax
     points = np.asarray(ax.lines[0].get_xydata())
     assert len(points) == EPOCHS - 1
     np.testing.assert_allclose(points[-1, 0], history.travel[-1] / 1000)
@@ -229,21 +237,21 @@ def test_frequencies_in_hz_over_km(ax: Axes, history: History, track: Track) -> 
 
 def test_frequency_without_track(ax: Axes, history: History) -> None:
     """Without a track the logs alone are shown."""
-    plots.plot_frequencies(ax, history, None, "yaw")
+    trackplots.plot_frequencies(ax, history, None, "yaw")
     assert labels(ax) == ["each log, ±2σ"]
 
 
 def test_quiet_mode_is_no_drama(ax: Axes, history: History) -> None:
     """A mode that hardly moves is shown on a scale of at least 1 %."""
     still = replace(history, ln_frequency=np.full_like(history.ln_frequency, np.log(100.0)))
-    plots.plot_frequencies(ax, replace(still, cov=1e-12 * history.cov), None, "yaw")
+    trackplots.plot_frequencies(ax, replace(still, cov=1e-12 * history.cov), None, "yaw")
     low, high = ax.get_ylim()
     assert high - low >= 0.99
 
 
 def test_damping_in_percent_from_zero(ax: Axes, history: History, track: Track) -> None:
     """Damping is in percent and its axis starts at zero."""
-    plots.plot_damping(ax, history, track, "pitch")
+    trackplots.plot_damping(ax, history, track, "pitch")
     assert ax.get_ylim()[0] == 0
     assert ax.get_ylim()[1] < 10
     assert "%" in ax.get_ylabel()
@@ -333,7 +341,7 @@ def test_nis_band_is_chi_square(ax: Axes, track: Track) -> None:
 
     nis = track.nis.copy()
     nis[3], nis[4] = 60.0, np.nan
-    plots.plot_nis(ax, replace(track, nis=nis))
+    trackplots.plot_nis(ax, replace(track, nis=nis))
     seen = np.isfinite(nis)
     cdf = chi2.cdf(nis[seen], track.nis_dof[seen])
     assert data(ax, "outside")[0].size == np.sum((cdf < 0.025) | (cdf > 0.975))
@@ -344,7 +352,7 @@ def test_svg_repeats_and_stands_alone(history: History, track: Track) -> None:
     """Same input, same bytes; other salt, no identifier in common; nothing from outside."""
 
     def draw(ax: Axes) -> Axes:
-        return plots.plot_frequencies(ax, history, track, "roll")
+        return trackplots.plot_frequencies(ax, history, track, "roll")
 
     one, two = plots.svg(draw, salt="a"), plots.svg(draw, salt="a")
     assert one == two

@@ -12,7 +12,7 @@ import pytest
 from lmshealth.errors import BadLog
 from lmshealth.logs import Channel, Log, Metadata
 from lmshealth.results import Modes
-from lmshealth.tracks import History
+from lmshealth.tracks import History, Series
 from tests.signals import make_log
 
 
@@ -49,7 +49,9 @@ def history(**changes: object) -> History:
         "ln_frequency": np.full((3, 1), np.log(100.0)),
         "ln_damping": np.full((3, 1), np.log(0.02)),
         "cov": np.tile(1e-6 * np.eye(2), (3, 1, 1)),
-        "baseline": 1,
+        "series": (Series("roll", "acc"),),
+        "loop_error": np.full(3, np.nan),
+        "baselines": (1,),
     }
     return History(**(parts | changes))  # type: ignore[arg-type]
 
@@ -106,8 +108,8 @@ def test_history_clock_starts_at_the_baseline() -> None:
 
 def test_history_refuses_a_baseline_that_is_not_there_and_wrong_shapes() -> None:
     """A baseline outside the logs and estimates of another shape are refused."""
-    with pytest.raises(ValueError, match="baseline is log 3 of 3"):
-        history(baseline=3)
+    with pytest.raises(ValueError, match=r"baselines are logs \(3,\) of 3"):
+        history(baselines=(3,))
     with pytest.raises(ValueError, match="ln_damping"):
         history(ln_damping=np.zeros((3, 2)))
 

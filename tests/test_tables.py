@@ -15,10 +15,11 @@ from lmshealth.results import Health, Judgement, Line, Modes, Prognosis
 from lmshealth.stage import Stage, load_stage
 from lmshealth.summary import Assessment
 from lmshealth.tables import COLUMNS, all_tables, frame, modes_rows
-from lmshealth.tracks import Effect, History, Track
+from lmshealth.tracks import Effect, Event, History, Series, Smoothed, Track
 from tests.signals import write_archive_stage
 
 WHEN = datetime(2026, 3, 1, 8, tzinfo=UTC)
+EVENT = Event("step", 1, "roll", "", -0.02, 0.001, 31.5, declared=False, found_at=1)
 LEVELS = ("q05", "q10", "q25", "q50", "q75", "q90", "q95")
 
 
@@ -74,13 +75,15 @@ def assessment(stage: Stage, foretold: Prognosis | None) -> Assessment:
     shape = np.full((2, 2), 0.01)
     drift_cov = np.tile(np.array([[1e-6, 5e-7], [5e-7, 4e-6]]), (2, 1, 1))
     history = History(
-        "test-A", ("a.h5", "b.h5"), two, travel, {}, ("roll", "pitch"), np.log(100 * shape),
-        np.log(shape), np.tile(np.eye(4), (2, 1, 1)), 0,
+        "test-A", ("a.h5", "b.h5"), two, travel, {}, ("roll", "pitch"),
+        (Series("roll", "acc"), Series("pitch", "acc")), np.log(100 * shape),
+        np.log(shape), np.tile(np.eye(4), (2, 1, 1)), np.full(2, np.nan), (0,),
     )  # fmt: skip
     track = Track(
-        "test-A", ("a.h5", "b.h5"), two, travel, ("roll", "pitch"), np.log(6200 * shape),
-        0.1 * shape, np.log(2 * shape), shape, -shape, drift_cov,
-        (Effect("roll", "temperature_c", -1e-4, 2e-5),), np.ones(2), np.full(2, 4.0), np.ones(2),
+        "test-A", ("a.h5", "b.h5"), two, travel, ("roll", "pitch"), ("acc",),
+        np.log(6200 * shape), 0.1 * shape, np.log(2 * shape), shape, -shape, drift_cov,
+        (Effect("roll", "temperature_c", -1e-4, 2e-5),), (EVENT,), (), (), np.ones(2),
+        np.full(2, 4.0), np.zeros((2, 4)), np.ones((2, 1)), np.ones(2),
     )  # fmt: skip
     draws = np.random.default_rng(1).normal(0.9, 0.01, (2, 500, 1))
     health = Health(

@@ -177,7 +177,9 @@ def _log(
     order = np.argsort(values)
     values, seen, modes = values[order], seen[order], [modes[i] for i in order]
     n = len(modes)
-    zeta = np.log(0.015) + STD_ZETA * rng.standard_normal(n)
+    # What is spurious has any damping; modes have the same, so that it does not tell them.
+    spread = np.where(np.array(modes, dtype=int) < 0, 1.0, STD_ZETA)
+    zeta = np.log(0.015) + spread * rng.standard_normal(n)
     estimates = Estimates(
         names=_named(modes, values, ln_f, names) if kind.named else ("",) * n,
         sources=("acc",) * n,

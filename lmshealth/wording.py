@@ -1,0 +1,66 @@
+"""Numbers in words, as pages for people write them."""
+
+from __future__ import annotations
+
+from datetime import datetime
+from typing import Any
+
+import numpy as np
+
+from lmshealth.arrays import FloatArray
+
+_KM = 1000.0
+GAP = "\u202f"  # narrow space that does not break: between a number and its unit
+LEVELS = np.array([0.05, 0.5, 0.95])
+
+
+def spell(name: str) -> str:
+    """Write a name in words."""
+    return name.replace("_", " ")
+
+
+def moment(when: datetime) -> str:
+    """Write a moment for people."""
+    return when.strftime("%Y-%m-%d %H:%M %Z").strip()
+
+
+def percent(probability: float | np.floating[Any]) -> str:
+    """Write a probability; draws cannot prove 0 or 1."""
+    if probability < 0.01:
+        return f"below 1{GAP}%"
+    if probability > 0.99:
+        return f"above 99{GAP}%"
+    return f"{100 * probability:.0f}{GAP}%"
+
+
+def signed(value: float, digits: int) -> str:
+    """Write a number with its sign."""
+    return f"{value:+.{digits}f}".replace("-", "−")
+
+
+def number(value: float) -> str:
+    """Write three significant digits, thousands apart."""
+    rounded = float(f"{value:.3g}")
+    digits = 0 if not abs(rounded) < 10 or rounded.is_integer() else 1
+    return f"{rounded:,.{digits}f}".replace(",", GAP).replace("-", "−")
+
+
+def km(metres: float) -> str:
+    """Write a distance given in m."""
+    return f"{number(metres / _KM)}{GAP}km"
+
+
+def day_count(days: float) -> str:
+    """Write a number of days, with years where there are many."""
+    years = f" ({days / 365.25:.1f} years)" if days >= 1000 else ""
+    return f"{number(days)}{GAP}days{years}"
+
+
+def quantiles(values: FloatArray) -> list[float]:
+    """Give 5, 50 and 95 % of draws that may be infinite: always one of the draws."""
+    return [float(q) for q in np.quantile(values, LEVELS, method="inverted_cdf")]
+
+
+def left(value: float, beyond: str, text: str) -> str:
+    """Write what is left of a life."""
+    return "already passed" if value <= 0 else beyond if np.isinf(value) else text
