@@ -107,13 +107,21 @@ class _Follower:
         bank = self.filters.start()
         for k in range(len(self.history.logs)):
             if k in self.resets and k:
-                bank = reborn(bank, self.filters)
-                self.watch.first = k
+                bank = self._begin_chapter(bank, k)
                 self.found.alarmed = False
             bank = self._step(bank, k, doubting=k not in self.resets)
             bank = self._look_for_events(bank, k)
             self._publish(bank, k)
         return self._result(bank)
+
+    def _begin_chapter(self, bank: Bank, watched: int) -> Bank:
+        """Start the settings anew, and watch from some log on.
+
+        Evidence is counted from here: what is remembered of the chapter before is no measure.
+        """
+        self.watch.first = watched
+        self.memory.clear()
+        return reborn(bank, self.filters)
 
     def _step(self, bank: Bank, k: int, *, doubting: bool = True) -> Bank:
         """Take the bank over one log and remember it.
@@ -196,20 +204,17 @@ class _Follower:
     def _adopt(self, finding: Finding, bank: Bank, k: int) -> Bank:
         """Take what was found for true, from its first log on."""
         j = finding.first
+        before = self.memory[j - 1]
         if finding.kind == "drift":
             if self.found.alarmed or not finding.damage:
                 return bank
-            begun = reborn(self.memory[j - 1], self.filters)
         else:
             there = np.arange(len(self.history.logs)) >= j
             step = Step(finding.kind, j, there, finding.source, declared=False)
             self.filters = self.filters.with_step(step)
             self.found.findings[len(self.filters.space.steps) - 1] = (finding, k)
-            size = self.filters.space.size
-            for when, known in self.memory.items():
-                self.memory[when] = known.padded(size)
-            begun = reborn(self.memory[j - 1], self.filters)
-        self.watch.first = j + 1
+            before = before.padded(self.filters.space.size)
+        begun = self._begin_chapter(before, j + 1)
         for again in range(j, k + 1):
             begun = self._step(begun, again, doubting=False)
         if finding.damage:
