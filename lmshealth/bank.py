@@ -179,7 +179,7 @@ class Surprise:
     rows : ndarray of int
         Rows of ``[ln f, ln ζ]`` that the log has.
     innovation : ndarray
-        Standardised by its own variance under the likeliest setting, shape ``(n_rows,)``.
+        Standardised by its mean and variance over all settings, shape ``(n_rows,)``.
     nis : float
         Normalised innovation squared, averaged over the settings.
     """
@@ -302,9 +302,9 @@ class Filter:
         bank.cov -= np.swapaxes(gain, 1, 2) @ gain
         log_det = np.log(np.einsum("gii->gi", root)).sum(axis=1)
         bank.log_weight += -0.5 * nis - log_det - 0.5 * value.size * np.log(2 * np.pi)
-        likely = int(np.argmax(weight))
-        std = np.sqrt(spread[likely, i, i])
-        return Surprise(rows, off[likely] / std, float(weight @ nis))
+        centre = weight @ off
+        variance = weight @ (np.einsum("gii->gi", spread) + (off - centre) ** 2)
+        return Surprise(rows, centre / np.sqrt(variance), float(weight @ nis))
 
 
 def _diagonal(cov: FloatArray, rows: slice, columns: slice | None = None) -> FloatArray:
