@@ -196,26 +196,24 @@ class Bank:
         )
         return self.join(new)
 
-    def predict(self, step: float, scale: float, n_logs: int, *, opened: bool = False) -> None:
+    def predict(self, step: float, scale: float, *, opened: bool = False) -> None:
         """Move all filters on by a step of the clock.
 
         Parameters
         ----------
         step, scale : float
             Step and length of a life on the clock; a scale of 0 moves nothing.
-        n_logs : int
-            Logs so far: while there are few, rates are held within their prior.
         opened : bool
             Whether levels may step here.
         """
         mean, cov = self.mean, self.cov
         if scale:
-            if n_logs <= LEAST_LOGS:
-                most = (_RATE_STD / scale) ** 2
-                shrink = np.sqrt(np.minimum(1.0, most / np.maximum(cov[..., 1, 1], 1e-300)))
-                mean[..., 1] *= shrink
-                cov[..., 1, :] *= shrink[..., None]
-                cov[..., :, 1] *= shrink[..., None]
+            # A life that proves longer than was thought has lower rates than were thought.
+            most = (_RATE_STD / scale) ** 2
+            shrink = np.sqrt(np.minimum(1.0, most / cov[..., 1, 1]))
+            mean[..., 1] *= shrink
+            cov[..., 1, :] *= shrink[..., None]
+            cov[..., :, 1] *= shrink[..., None]
             share = step / scale
             mean[..., 0] += step * mean[..., 1]
             cov[..., 0, :] += step * cov[..., 1, :]

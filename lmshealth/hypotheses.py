@@ -376,7 +376,7 @@ def reduce_hypotheses(kept: Hypotheses) -> Hypotheses:
         if not left[i]:
             continue
         group = np.flatnonzero(left)
-        group = group[_distance(bank, i, group) < _SAME]
+        group = group[(group == i) | (_distance(bank, i, group) < _SAME)]
         left[group] = False
         _merge(bank, i, group, np.exp(logsumexp(weights[group], axis=1) - total[order[0]]))
         weights[i] = logsumexp(weights[group], axis=0)

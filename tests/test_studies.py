@@ -148,3 +148,11 @@ def test_frf_modes(root: Path, needs: Callable[[str], None]) -> None:
         sum(part[key]["share"] for part in parts) for key in ("control_narrower", "coverage")
     )
     assert narrow < stated
+
+
+def test_crossings(root: Path) -> None:
+    """Some lives of each kind are never swapped silently, and both controls may be."""
+    answer = json.loads(run_study(root, "crossings"))
+    few = {"a best guess swaps there", "most labels are recovered", "the nearest swaps"}
+    assert all(fine for name, fine in answer["passed"].items() if name not in few)
+    assert answer["kinds"]["crossing, unnamed"]["nearest_lives_swapped"]["hits"] == 3
