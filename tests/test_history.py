@@ -119,9 +119,7 @@ def test_drift_within_reach_is_no_jump(stage: Stage) -> None:
 
 def test_every_source_of_a_mode_has_its_column(stage: Stage) -> None:
     """Logs with and without accelerometers make one mode of two series."""
-    readings = [
-        make_reading(str(k), k, 1e5 * k, {"roll": 4.8, "pitch": 4.9}) for k in range(4)
-    ]
+    readings = [make_reading(str(k), k, 1e5 * k, {"roll": 4.8, "pitch": 4.9}) for k in range(4)]
     readings[2] = replace(
         readings[2], modes=replace(readings[2].modes, sources=("delta_e", "delta_e"))
     )
@@ -142,9 +140,7 @@ def test_a_new_tuning_is_a_step_of_the_servo(stage: Stage) -> None:
     """A change of servo_id, declared by maintenance as well, is one step; its logs see it."""
     readings = [
         replace(r, metadata=replace(r.metadata, servo_id="b" if k in (2, 3) else "a"))
-        for k, r in enumerate(
-            make_reading(str(k), k, 1e5 * k, {"roll": 4.8}) for k in range(5)
-        )
+        for k, r in enumerate(make_reading(str(k), k, 1e5 * k, {"roll": 4.8}) for k in range(5))
     ]
     told = [Action("AX-1", START + timedelta(days=1.5), "servo")]
     history, _ = build_history(readings, stage, told)

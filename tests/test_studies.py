@@ -156,3 +156,10 @@ def test_crossings(root: Path) -> None:
     few = {"a best guess swaps there", "most labels are recovered", "the nearest swaps"}
     assert all(fine for name, fine in answer["passed"].items() if name not in few)
     assert answer["kinds"]["crossing, unnamed"]["nearest_lives_swapped"]["hits"] == 3
+
+
+def test_beam_track(root: Path, needs: Callable[[str], None]) -> None:
+    """The tracked state of a real beam returns to its start, told and not told of the roller."""
+    needs("data")
+    answer = json.loads(run_study(root, "beam_track"))
+    assert all(answer["passed"].values())
