@@ -118,7 +118,7 @@ def test_what_makes_no_sense_is_refused_with_its_line(
     tmp_path: Path, text: str, needle: str
 ) -> None:
     """The error names the file, the line, what was got and what is needed."""
-    with pytest.raises(BadTable, match="modes.csv") as caught:
+    with pytest.raises(BadTable, match=r"modes\.csv") as caught:
         read(tmp_path, text)
     assert needle in str(caught.value)
 
