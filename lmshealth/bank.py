@@ -21,7 +21,14 @@ from math import prod
 import numpy as np
 
 from lmshealth.arrays import BoolArray, FloatArray
-from lmshealth.statespace import DAMPING_WALK, JUMP_STD, MOVES, StateSpace
+from lmshealth.statespace import (
+    DAMPING_WALK,
+    JUMP_STD,
+    LN_F_STD,
+    LN_ZETA_STD,
+    MOVES,
+    StateSpace,
+)
 from lmshealth.tracks import Step
 
 # Random walk of ln f per life of a healthy machine, and of one that changes with its rate per life
@@ -34,8 +41,8 @@ HEALTHY_PRIOR = 0.1
 # seldom ones are given fewer.
 _SCALES = ((0.5, 0.02), (0.7, 0.05), (1.0, 0.8), (1.5, 0.08), (2.25, 0.03), (4.0, 0.02))
 _MOST_SCALED = 3
-# Share of logs that hold an outlier, and how many times further it may lie than others.
-_OUTLIERS, _OUTLIER_REACH = 0.01, 20.0
+# Share of logs that hold an outlier.
+_OUTLIERS = 0.01
 # A setting that has less than this share of its group's best is dropped.
 _NEGLIGIBLE = float(np.log(1e-5))
 
@@ -177,7 +184,7 @@ class Surprise:
     Attributes
     ----------
     rows : ndarray of int
-        Rows of ``[ln f, ln ζ]`` that the log has.
+        Rows of ``[ln f, ln ζ]`` that the log has, without those taken for outliers.
     innovation : ndarray
         Standardised by its mean and variance over all settings, shape ``(n_rows,)``.
     nis : float
@@ -198,10 +205,14 @@ class Filter:
         The state and how logs see it.
     copies : collection of int
         Logs at which a baseline begins.
+    reopened : collection of int
+        Logs before which rates are unknown anew.
     """
 
-    def __init__(self, space: StateSpace, copies: Collection[int]) -> None:
-        self.space, self.copies = space, frozenset(copies)
+    def __init__(
+        self, space: StateSpace, copies: Collection[int], reopened: Collection[int] = ()
+    ) -> None:
+        self.space, self.copies, self.reopened = space, frozenset(copies), frozenset(reopened)
         history = space.history
         self.values = np.hstack([history.ln_frequency, history.ln_damping])
         self.there = np.isfinite(self.values)
@@ -212,6 +223,7 @@ class Filter:
         self.scale_of = np.array(place + place, dtype=int)
         self.grid = settings(len(self.sources))
         self.noise = history.cov
+        self.anywhere = np.repeat(np.square([LN_F_STD, LN_ZETA_STD]), len(history.series))
         self.extra = np.zeros((len(history.logs), 2 * len(history.series)))
         self.extra[:, : len(history.series)] = space.unknown()[:, None]
 
@@ -252,6 +264,8 @@ class Filter:
         space, tick = self.space, float(self.space.ticks[k])
         level, rate = space.level, space.rate
         mean, cov = bank.mean, bank.cov
+        if k in self.reopened:
+            self.open_rates(bank)
         if tick > 0:
             mean[:, level] += tick * mean[:, rate]
             cov[:, level, :] += tick * cov[:, rate, :]
@@ -289,7 +303,8 @@ class Filter:
         spread[:, i, i] += self.extra[k, rows]
         if doubted is not None:
             outlying = np.flatnonzero(doubted[rows])
-            spread[:, outlying, outlying] *= _OUTLIER_REACH**2
+            # It may lie anywhere, and so tells none of the settings from another.
+            spread[:, outlying, outlying] += self.anywhere[rows[outlying]]
             bank.log_weight += np.log(_OUTLIERS)
         root = np.linalg.cholesky(spread)
         off = value - bank.mean @ matrix.T
@@ -304,7 +319,17 @@ class Filter:
         bank.log_weight += -0.5 * nis - log_det - 0.5 * value.size * np.log(2 * np.pi)
         centre = weight @ off
         variance = weight @ (np.einsum("gii->gi", spread) + (off - centre) ** 2)
-        return Surprise(rows, centre / np.sqrt(variance), float(weight @ nis))
+        innovation = centre / np.sqrt(variance)
+        if doubted is None:
+            return Surprise(rows, innovation, float(weight @ nis))
+        rest = np.flatnonzero(~doubted[rows])
+        nis = _nis(off[:, rest], spread[:, rest[:, None], rest])
+        return Surprise(rows[rest], innovation[rest], float(weight @ nis))
+
+
+def _nis(off: FloatArray, spread: FloatArray) -> FloatArray:
+    """Normalised innovations squared under every setting, shape ``(n_settings,)``."""
+    return np.asarray(np.einsum("gi,gi->g", off, np.linalg.solve(spread, off[:, :, None])[:, :, 0]))
 
 
 def _diagonal(cov: FloatArray, rows: slice, columns: slice | None = None) -> FloatArray:

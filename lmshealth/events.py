@@ -48,6 +48,13 @@ class Watch:
     ----------
     n_logs, n_rows : int
         Size of the history.
+
+    Attributes
+    ----------
+    innovations : ndarray
+        Standardised, NaN where there is none or an outlier, shape ``(n_logs, n_rows)``.
+    first : int
+        First log of a window.
     """
 
     def __init__(self, n_logs: int, n_rows: int) -> None:
@@ -56,10 +63,13 @@ class Watch:
         self._count = np.zeros((n_logs + 1, n_rows))
         self.first = 1
 
-    def add(self, k: int, surprise: Surprise) -> None:
-        """Take note of log k; a log that is filtered again replaces what was noted."""
+    def add(self, k: int, surprise: Surprise, kept: Surprise) -> None:
+        """Take note of log k, with and without outliers.
+
+        A log that is filtered again replaces what was noted.
+        """
         self.innovations[k] = np.nan
-        self.innovations[k, surprise.rows] = surprise.innovation
+        self.innovations[k, kept.rows] = kept.innovation
         self._sum[k + 1], self._count[k + 1] = self._sum[k], self._count[k]
         self._sum[k + 1, surprise.rows] += surprise.innovation
         self._count[k + 1, surprise.rows] += 1

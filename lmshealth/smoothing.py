@@ -32,7 +32,9 @@ def smooth(history: History, followed: Track, stage: Stage | None = None) -> Smo
     Rauch1965.
     """
     space = state_space(history, stage, followed.steps)
-    filters = Filter(space, history.baselines)
+    # Where a chapter begins the track lets rates be unknown anew.
+    begun = {step.first for step in followed.steps if step.kind == "reset" or not step.declared}
+    filters = Filter(space, history.baselines, begun - {0})
     bank = filters.start()
     for k in range(len(history.logs)):
         filters.move(bank, k)

@@ -6,7 +6,7 @@ For M modes the state is
 
 each but the biases in blocks of M: ln frequency at the covariates' reference, its rate, ln damping,
 a copy of ℓ at the baseline; a coefficient per regressor; the bias of ln f and of ln ζ of every
-series but the first of its mode; and for every step the jumps of ln f and of ln ζ. The copy ℓ₀
+series but the first seen of its mode; and for every step the jumps of ln f and of ln ζ. The copy ℓ₀
 makes the covariance hold Cov(ℓ, ℓ₀), so that the drift ℓ - ℓ₀ has the right variance and the error
 of the baseline stays common to all epochs.
 """
@@ -18,6 +18,7 @@ from copy import copy
 from dataclasses import dataclass
 
 import numpy as np
+import pandas as pd
 
 from lmshealth.arrays import FloatArray
 from lmshealth.stage import Covariate, Stage
@@ -90,7 +91,8 @@ def regressors(covariates: Mapping[str, FloatArray], stage: Stage | None) -> tup
         # What never leaves its reference moves nothing.
         if not offset.any():
             continue
-        spread = max(float(np.std(values[known])), 1.0)
+        # Of the values up to each log: no log knows of later ones.
+        spread = pd.Series(values).expanding().std(ddof=0).fillna(0.0).clip(lower=1.0).to_numpy()
         unknown = np.where(known, 0.0, (covariate.prior_std * spread) ** 2)
         found.append(Regressor(covariate.name, offset, covariate.prior_std, unknown))
         if covariate.curvature_std:
@@ -182,13 +184,14 @@ class StateSpace:
         return slice(first, first + 2 * self.n_modes)
 
     def _biased(self) -> tuple[int, ...]:
-        """Series that are measured against another: all of a mode but its most frequent."""
-        count = np.isfinite(self.history.ln_frequency).sum(axis=0)
+        """Series that are measured against another: all of a mode but the one seen first."""
+        there = np.isfinite(self.history.ln_frequency)
+        first = np.where(there.any(axis=0), there.argmax(axis=0), len(there))
         biased: list[int] = []
         for mode in self.history.modes:
             own = self.history.columns(mode)
-            reference = max(own, key=lambda i: (count[i], -i), default=None)
-            biased += [i for i in own if i != reference]
+            reference = min(own, key=lambda i: (first[i], i), default=None)
+            biased += [i for i in self.history.columns(mode) if i != reference]
         return tuple(biased)
 
     def _without_steps(self) -> FloatArray:

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from scipy import stats
 
-from lmshealth.arrays import FloatArray
+from lmshealth.arrays import BoolArray, FloatArray
 from lmshealth.bank import Bank, Filter
 from lmshealth.errors import NotEnoughData
 from lmshealth.events import MEMORY, Finding, Watch, explain, reborn, threshold
@@ -66,6 +66,8 @@ class _Record:
     cov: FloatArray
     nis: FloatArray
     scale: FloatArray
+    widening: FloatArray
+    settled: int = 0
 
 
 @dataclass(slots=True, eq=False)
@@ -95,6 +97,7 @@ class _Follower:
             np.empty((n, size, size)),
             np.zeros(n),
             np.ones((n, len(self.filters.sources))),
+            np.ones(n),
         )
         self.watch = Watch(n, rows)
         self.memory: dict[int, Bank] = {}
@@ -130,7 +133,7 @@ class _Follower:
         the next log tells which; two in a row are believed.
         """
         self.filters.move(bank, k)
-        surprise = self.filters.see(bank, k)
+        kept = surprise = self.filters.see(bank, k)
         self.doubted.pop(k, None)
         far = np.abs(surprise.innovation) > _FAR
         in_a_row = {k - 1, k - 2} <= self.doubted.keys()
@@ -138,10 +141,10 @@ class _Follower:
             self.doubted[k] = self._of_same_modes(surprise.rows[far])
             bank = self.memory[k - 1].copy()
             self.filters.move(bank, k)
-            self.filters.see(bank, k, self.doubted[k])
+            kept = self.filters.see(bank, k, self.doubted[k])
         bank = bank.pruned()
-        self.watch.add(k, surprise)
-        self.record.nis[k] = surprise.nis
+        self.watch.add(k, surprise, kept)
+        self.record.nis[k] = kept.nis
         self.memory[k] = bank.copy()
         self.memory.pop(k - MEMORY, None)
         return bank
@@ -214,12 +217,37 @@ class _Follower:
             self.filters = self.filters.with_step(step)
             self.found.findings[len(self.filters.space.steps) - 1] = (finding, k)
             before = before.padded(self.filters.space.size)
+        self._settle(k)
         begun = self._begin_chapter(before, j + 1)
         for again in range(j, k + 1):
             begun = self._step(begun, again, doubting=False)
         if finding.damage:
             self._alarm(begun, k, finding.log_bayes_factor)
         return begun
+
+    def _settle(self, k: int) -> None:
+        """Keep how much the logs before k are widened: filtered again they are judged anew."""
+        record = self.record
+        factor = _widening(record.nis[:k], self._dof()[:k], self.watch.innovations[:k])
+        record.widening[record.settled : k] = factor[record.settled :]
+        record.settled = k
+
+    def _dof(self) -> FloatArray:
+        """Count the measurements of each log that could surprise: the first of a mode cannot."""
+        history = self.history
+        there = np.isfinite(self.watch.innovations)
+        for mode in history.modes:
+            own = np.array(history.columns(mode), dtype=int)
+            seen = np.cumsum(np.isfinite(history.ln_frequency[:, own]).any(axis=1)) > 1
+            there[:, np.r_[own, own + len(history.series)]] &= seen[:, None]
+        return np.asarray(there.sum(axis=1), dtype=float)
+
+    def _unseen(self) -> BoolArray:
+        """Mark ln f and ln ζ of modes that no log has seen yet, ``(n_logs, 4 n_modes)``."""
+        there = np.isfinite(self.history.ln_frequency)
+        modes = [there[:, self.history.columns(mode)].any(axis=1) for mode in self.history.modes]
+        unseen = ~np.logical_or.accumulate(np.transpose(modes), axis=0)
+        return np.tile(unseen, 4)
 
     def _alarm(self, bank: Bank, k: int, evidence: float) -> None:
         """Raise the alarm once in every chapter between resets."""
@@ -256,9 +284,10 @@ class _Follower:
         for first in history.baselines:
             still = (clock == clock[first]) & (np.arange(clock.size) >= first)
             drift[still], drift_cov[still] = 0.0, 0.0
-        dof = _surprising(history)
-        widening = _widening(record.nis, dof, self.watch.innovations)
+        self._settle(len(history.logs))
+        widening = record.widening
         std = np.sqrt(np.einsum("kii->ki", record.cov)) * widening[:, None]
+        record.mean[self._unseen()], std[self._unseen()] = np.nan, np.nan
         return Track(
             stage=history.stage,
             logs=history.logs,
@@ -278,7 +307,7 @@ class _Follower:
             ),
             steps=space.steps,
             nis=record.nis,
-            nis_dof=dof,
+            nis_dof=self._dof(),
             outliers=tuple(
                 (k, mode)
                 for k, rows in sorted(self.doubted.items())
@@ -328,17 +357,6 @@ def _evidence(space: StateSpace, step: Step, size: FloatArray, spread: FloatArra
     prior = JUMP_STD[step.kind][1 if step.kind == "regreasing" else 0]
     log_det = np.linalg.slogdet(spread)[1] - 2 * size.size * np.log(prior)
     return float(0.5 * (log_det + size @ np.linalg.solve(spread, size)))
-
-
-def _surprising(history: History) -> FloatArray:
-    """Count the measurements of each log that could surprise: the first of a mode cannot."""
-    there = np.isfinite(history.ln_frequency)
-    again = np.zeros_like(there)
-    for mode in history.modes:
-        own = history.columns(mode)
-        seen = np.cumsum(there[:, own].any(axis=1)) > 1
-        again[:, own] = there[:, own] & seen[:, None]
-    return np.asarray(2.0 * again.sum(axis=1))
 
 
 def _widening(nis: FloatArray, dof: FloatArray, innovations: FloatArray) -> FloatArray:

@@ -249,7 +249,8 @@ class Track:
     sources : tuple of str
         Sources of estimates.
     ln_frequency, ln_frequency_std, ln_damping, ln_damping_std : ndarray
-        Filtered (no future data), covariates at their reference, shape ``(n_epochs, n_modes)``.
+        Filtered (no future data), covariates at their reference, shape ``(n_epochs, n_modes)``;
+        NaN before the first estimate of a mode.
     drift : ndarray
         ln frequency minus its value at the baseline before it, shape ``(n_epochs, n_modes)``.
     drift_cov : ndarray
@@ -264,10 +265,11 @@ class Track:
         Epochs and modes whose estimates lie so far off that they were hardly believed, and that no
         later log confirmed.
     nis : ndarray
-        Normalised innovation squared, shape ``(n_epochs,)``.
+        Normalised innovation squared, shape ``(n_epochs,)``. Logs that were filtered again with an
+        event have that of the last time.
     nis_dof : ndarray
         Its degrees of freedom, shape ``(n_epochs,)``; the first estimate of a mode has none,
-        because the filter starts from it.
+        because the filter starts from it, and outliers have none.
     innovations : ndarray
         Standardised innovations of ``[ln f, ln ζ]`` of all series, ``(n_epochs, 2 n_series)``.
     noise_scale : ndarray

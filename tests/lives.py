@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
+from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from itertools import product
 from pathlib import Path
@@ -211,7 +212,8 @@ def awkward_history(rng: np.random.Generator, n: int = 16) -> History:
     level = level - 4e-4 * (temperature[:, None] - 21) - 1e-5 * (payload[:, None] - 50) ** 2
     level[9:] += 0.03
     values = np.hstack([level, level + 2e-3, np.tile(np.log(DAMPING[:m]), (n, 2))]) + noise
-    values[2, [0, 4]] = values[7, [3, 7]] = values[11, [0, 1, 4, 5]] = values[4] = np.nan
+    for k, rows in ((0, [1, 5]), (2, [0, 4]), (4, range(8)), (7, [3, 7]), (11, [0, 1, 4, 5])):
+        values[k, list(rows)] = np.nan
     gone = np.isnan(values)
     cov[gone[:, :, None] | gone[:, None, :]] = np.nan
     temperature[3] = payload[[3, 8]] = np.nan
@@ -235,6 +237,56 @@ def awkward_history(rng: np.random.Generator, n: int = 16) -> History:
             since("regreasing", 6, n),
             since("reset", 9, n),
             since("sensor", 13, n, source="delta_e"),
+        ),
+    )
+
+
+def seen_by(
+    rng: np.random.Generator,
+    ln_frequency: FloatArray,
+    ln_damping: FloatArray,
+    *,
+    sources: Sequence[str] = ("acc", "delta_e"),
+    std: tuple[float, float] = (5e-4, 0.05),
+    common: float = 0.9,
+    bias: float = 2e-3,
+) -> History:
+    """Make a history of true modes ``(n, m)`` seen by sources whose errors are correlated.
+
+    Every source but the first reads ln f too high by a multiple of the bias.
+    """
+    n, m = ln_frequency.shape
+    s = len(sources)
+    shared = np.kron(np.full((s, s), common) + (1 - common) * np.eye(s), np.eye(m))
+    spread = np.repeat(std, s * m)
+    cov = np.outer(spread, spread) * np.kron(np.eye(2), shared)
+    noise = rng.multivariate_normal(np.zeros(2 * s * m), cov, size=n, method="cholesky")
+    ln_f = np.hstack([ln_frequency + j * bias for j in range(s)])
+    history = make_history(ln_frequency, ln_damping=ln_damping)
+    return replace(
+        history,
+        series=tuple(Series(mode, source) for source in sources for mode in history.modes),
+        ln_frequency=ln_f + noise[:, : s * m],
+        ln_damping=np.tile(ln_damping, s) + noise[:, s * m :],
+        cov=np.tile(cov, (n, 1, 1)),
+    )
+
+
+def cut(history: History, n: int) -> History:
+    """Give the first logs of a history."""
+    return replace(
+        history,
+        logs=history.logs[:n],
+        recorded_at=history.recorded_at[:n],
+        travel=history.travel[:n],
+        covariates={name: values[:n] for name, values in history.covariates.items()},
+        ln_frequency=history.ln_frequency[:n],
+        ln_damping=history.ln_damping[:n],
+        cov=history.cov[:n],
+        loop_error=history.loop_error[:n],
+        baselines=tuple(first for first in history.baselines if first < n),
+        steps=tuple(
+            replace(step, there=step.there[:n]) for step in history.steps if step.first < n
         ),
     )
 

@@ -67,7 +67,9 @@ def _unknown(history: History, known: Known, k: int) -> float:
     for name, _, std, _ in known.covariates:
         values = history.covariates[name]
         if np.isnan(values[k]):
-            total += (std * max(float(np.nanstd(values)), 1.0)) ** 2
+            so_far = values[:k][~np.isnan(values[:k])]
+            spread = float(np.std(so_far)) if so_far.size else 0.0
+            total += (std * max(spread, 1.0)) ** 2
     return total
 
 
@@ -82,10 +84,12 @@ def _first(table: FloatArray) -> float:
 
 
 def _reference(history: History, mode: str) -> Series:
-    """Series of a mode that the others are measured against: the most frequent, else the first."""
-    own = [one for one in history.series if one.mode == mode]
-    counts = [np.isfinite(history.ln_frequency[:, history.series.index(one)]).sum() for one in own]
-    return own[int(np.argmax(counts))]
+    """Series of a mode that the others are measured against: the one that is seen first."""
+    for row in history.ln_frequency:
+        for one, value in zip(history.series, row, strict=True):
+            if one.mode == mode and not np.isnan(value):
+                return one
+    raise AssertionError(f"{mode} is never seen")
 
 
 def _data(
@@ -407,8 +411,7 @@ def life_log_likelihood(
     values = history.covariates["temperature_c"][first:]
     unknown = np.isnan(values)
     offset = np.where(unknown, 0.0, values - reference)
-    # What is not known of one log spreads as it does over all of them.
-    spread = max(float(np.nanstd(history.covariates["temperature_c"])), 1.0)
+    known = Known(1.0, (("temperature_c", reference, b_std, 0.0),))
     ln_f = history.ln_frequency[first:]
     where = [(k, i) for k in range(clock.size) for i in range(m) if not np.isnan(ln_f[k, i])]
     centre = [np.mean(ln_f[~np.isnan(ln_f[:, i]), i]) for i in range(m)]
@@ -422,7 +425,7 @@ def life_log_likelihood(
                     if k == o:
                         cov[a, c] += scale**2 * history.cov[first + k][i, j]
                     if k == o and i == j and unknown[k]:
-                        cov[a, c] += (b_std * spread) ** 2
+                        cov[a, c] += _unknown(history, known, first + k)
                     if i == j:
                         cov[a, c] += intercept_std**2 + b_std**2 * offset[k] * offset[o]
                         cov[a, c] += walk**2 * min(clock[k], clock[o]) / clock.max()

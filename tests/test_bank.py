@@ -228,7 +228,7 @@ def test_copies_of_a_bank_are_its_own(stage: Stage) -> None:
 
 
 def test_what_is_doubted_is_hardly_believed(stage: Stage) -> None:
-    """A doubted log moves the state by a hundredth of what it did at most, at a cost."""
+    """A doubted log moves the state by a fiftieth of what it did at most, at a cost."""
     history = rough_history(np.random.default_rng(8))
     filters = Filter(state_space(history, stage), history.baselines)
     filters.grid = one(SETTINGS[0], ("acc",))
@@ -242,7 +242,7 @@ def test_what_is_doubted_is_hardly_believed(stage: Stage) -> None:
     filters.see(doubted, 1, np.full(4, True))
     level = filters.space.level.start
     moved = np.abs(plain.mean[0] - before)[level], np.abs(doubted.mean[0] - before)[level]
-    assert moved[1] < 0.01 * moved[0]
+    assert moved[1] < 0.02 * moved[0]
     assert surprise.rows.tolist() == [0, 1, 2, 3]
     assert doubted.log_weight[0] < plain.log_weight[0]
 
