@@ -17,8 +17,10 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
+from scipy import stats
 
-from lmshealth.arrays import FloatArray
+from lmshealth.arrays import BoolArray, FloatArray
 from lmshealth.bank import Bank, Filter, Settings, Surprise
 from lmshealth.tracks import Step, StepKind
 
@@ -39,18 +41,24 @@ _ABOUT = np.array([-2, -1, 0, 1, 2])
 _LOOP_CHANGES = (0.99, 0.02)
 _LOOP_REACH = 100.0
 _LOOP_BEFORE, _LOOP_LEAST = 12, 3
+# Two following errors in a row that both differ from those before with this p-value are a leap.
+_LOOP_LEAP = 1e-3
 
 
 class Watch:
-    """Sums of standardised innovations over windows that end at the last log.
+    """Sums of standardised innovations over windows that end at the last log; leaps of the loop.
 
     Parameters
     ----------
-    n_logs, n_rows : int
-        Size of the history.
+    n_rows : int
+        Rows of estimates that a log has at most.
+    loop_error : ndarray
+        RMS in m, shape ``(n_logs,)``, NaN where unknown.
     """
 
-    def __init__(self, n_logs: int, n_rows: int) -> None:
+    def __init__(self, n_rows: int, loop_error: FloatArray) -> None:
+        n_logs = loop_error.size
+        self.leaps = np.flatnonzero(_leaps(loop_error))
         self.innovations = np.full((n_logs, n_rows), np.nan)
         self._sum = np.zeros((n_logs + 1, n_rows))
         self._count = np.zeros((n_logs + 1, n_rows))
@@ -65,7 +73,14 @@ class Watch:
         self._count[k + 1, surprise.rows] += 1
 
     def suspect(self, k: int) -> int | None:
-        """Give the log since which innovations lean most, if they lean suspiciously."""
+        """Give the log since which the loop, or else innovations, differ suspiciously.
+
+        A leap of the following error tells its log better than innovations do, and a retuning that
+        moves the modes little would pass for drift before they tell it at all.
+        """
+        leaps = self.leaps[(self.leaps >= self.first) & (self.leaps < k)]
+        if leaps.size and k - leaps[-1] <= _LOOP_BEFORE:
+            return int(leaps[-1])
         start = k + 1 - _WINDOWS
         start = start[start >= self.first]
         if start.size == 0:
@@ -218,6 +233,33 @@ def _per_scale(grid: Settings) -> FloatArray:
     return np.asarray(np.log(total[place]))
 
 
+def _leaps(loop_error: FloatArray) -> BoolArray:
+    """Tell the logs since which two following errors in a row differ from the dozen before."""
+    values = _logarithms(loop_error)
+    leaps = np.zeros(values.size, dtype=bool)
+    if values.size < _LOOP_LEAST + 2:
+        return leaps
+    padded = np.concatenate([np.full(_LOOP_BEFORE, np.nan), values])
+    before = sliding_window_view(padded, _LOOP_BEFORE)[: values.size]
+    there = np.isfinite(before)
+    n = np.maximum(there.sum(axis=1), 2)
+    mean = np.where(there, before, 0.0).sum(axis=1) / n
+    square = np.where(there, before - mean[:, None], 0.0) ** 2
+    std = np.sqrt(square.sum(axis=1) / (n - 1) * (1 + 1 / n))
+    enough = (there.sum(axis=1) >= _LOOP_LEAST) & (std > 0)
+    reach = std * stats.t.isf(_LOOP_LEAP / 2, n - 1)
+    off = np.stack([values[:-1], values[1:]]) - mean[:-1]
+    same = (np.abs(off) > reach[:-1]).all(axis=0) & (off[0] * off[1] > 0)
+    leaps[:-1] = same & enough[:-1]
+    return leaps
+
+
+def _logarithms(loop_error: FloatArray) -> FloatArray:
+    with np.errstate(divide="ignore", invalid="ignore"):
+        values = np.log(loop_error)
+    return np.where(np.isfinite(values), values, np.nan)
+
+
 def loop_evidence(loop_error: FloatArray, first: int, now: int, kind: str) -> float:
     """Log evidence that the following error below 40 Hz brings for a kind of step.
 
@@ -234,9 +276,7 @@ def loop_evidence(loop_error: FloatArray, first: int, now: int, kind: str) -> fl
     kind : str
         Of the step.
     """
-    with np.errstate(divide="ignore", invalid="ignore"):
-        values = np.log(loop_error)
-    values = np.where(np.isfinite(values), values, np.nan)
+    values = _logarithms(loop_error)
     before = values[max(first - _LOOP_BEFORE, 0) : first]
     after = values[first : min(now, first + _LOOP_BEFORE) + 1]
     before, after = before[np.isfinite(before)], after[np.isfinite(after)]

@@ -95,7 +95,7 @@ class _Follower:
             np.zeros(n),
             np.ones((n, len(self.filters.sources))),
         )
-        self.watch = Watch(n, rows)
+        self.watch = Watch(rows, history.loop_error)
         self.memory: dict[int, Bank] = {}
         # Rows of a log that are taken for outliers, until an event explains them.
         self.doubted: dict[int, np.ndarray] = {}
