@@ -34,6 +34,9 @@ MEMORY = int(_WINDOWS.max()) + 4
 # Innovations of a window that lean less, in standard deviations, are no suspicion. An event needs
 # more than five to be believed.
 _SUSPICIOUS = 4.0
+# Of which kind an event is often shows a few logs later only. Until one is so much likelier than
+# all others, or so many logs have passed, nothing is settled.
+_CLEAR, _PATIENCE = float(np.log(10.0)), 8
 # Logs about the suspected one that are tried as the first that sees it.
 _ABOUT = np.array([-2, -1, 0, 1, 2])
 # How likely a retuning, and anything else, changes the following error below 40 Hz; and how far
@@ -42,7 +45,7 @@ _LOOP_CHANGES = (0.99, 0.02)
 _LOOP_REACH = 100.0
 _LOOP_BEFORE, _LOOP_LEAST = 12, 3
 # Two following errors in a row that both differ from those before with this p-value are a leap.
-_LOOP_LEAP = 1e-3
+_LOOP_LEAP = 0.01
 
 
 class Watch:
@@ -71,6 +74,11 @@ class Watch:
         self._sum[k + 1], self._count[k + 1] = self._sum[k], self._count[k]
         self._sum[k + 1, surprise.rows] += surprise.innovation
         self._count[k + 1, surprise.rows] += 1
+
+    def settle(self, steps: tuple[Step, ...]) -> None:
+        """Suspect nothing where the following error leaps at a step that is known."""
+        open_ones = [j for j in self.leaps.tolist() if not _known(steps, j)]
+        self.leaps = np.array(open_ones, dtype=int)
 
     def suspect(self, k: int) -> int | None:
         """Give the log since which the loop, or else innovations, differ suspiciously.
@@ -119,6 +127,10 @@ class Finding:
     def believed(self) -> bool:
         """Whether nothing having happened is ruled out at the declared rate."""
         return self.log_bayes_factor >= threshold(1)
+
+    def settled(self, now: int) -> bool:
+        """Whether its kind is clear, or no more logs are waited for."""
+        return self.log_odds >= _CLEAR or now - self.first >= _PATIENCE
 
     @property
     def damage(self) -> bool:
@@ -169,13 +181,18 @@ def explain(
         nothing = memory[now].log_evidence - memory[j - 1].log_evidence
         place = -float(np.log(j * (j + 1)))
         for kind, source in kinds:
+            # What is known to have happened explains what the following error does there.
+            known = _known(space.steps, j)
+            loop = None if known else loop_evidence(space.history.loop_error, j, now, kind)
+            # Without it nothing tells a retuning from damage.
+            if kind == "servo" and loop is None:
+                continue
             step = Step(kind, j, np.arange(len(space.history.logs)) >= j, source, declared=False)
             changed = Filter(space.with_step(step), filters.copies)
             before = memory[j - 1].padded(changed.space.size)
             after = advance(changed, before, j)
             gain = after.log_evidence - memory[j - 1].log_evidence - nothing
-            gain += loop_evidence(space.history.loop_error, j, now, kind)
-            gains[kind, source, j] = gain + place - float(np.log(len(kinds)))
+            gains[kind, source, j] = gain + (loop or 0.0) + place - float(np.log(len(kinds)))
         gains["drift", "", j] = _drift(advance, filters, memory[j - 1], j) - nothing + place
     if not gains:
         return None
@@ -233,6 +250,12 @@ def _per_scale(grid: Settings) -> FloatArray:
     return np.asarray(np.log(total[place]))
 
 
+def _known(steps: tuple[Step, ...], j: int) -> bool:
+    """Tell whether a step that is known begins or ends about a log."""
+    there = [step.there[max(j + _ABOUT[0] - 1, 0) : j + _ABOUT[-1] + 1] for step in steps]
+    return any(part.any() and not part.all() for part in there)
+
+
 def _leaps(loop_error: FloatArray) -> BoolArray:
     """Tell the logs since which two following errors in a row differ from the dozen before."""
     values = _logarithms(loop_error)
@@ -260,7 +283,7 @@ def _logarithms(loop_error: FloatArray) -> FloatArray:
     return np.where(np.isfinite(values), values, np.nan)
 
 
-def loop_evidence(loop_error: FloatArray, first: int, now: int, kind: str) -> float:
+def loop_evidence(loop_error: FloatArray, first: int, now: int, kind: str) -> float | None:
     """Log evidence that the following error below 40 Hz brings for a kind of step.
 
     The logarithms before and after are two samples of unknown variance; the Bayes factor of a
@@ -275,13 +298,18 @@ def loop_evidence(loop_error: FloatArray, first: int, now: int, kind: str) -> fl
         First log after the step, and the last log.
     kind : str
         Of the step.
+
+    Returns
+    -------
+    float or None
+        None where too few are known.
     """
     values = _logarithms(loop_error)
     before = values[max(first - _LOOP_BEFORE, 0) : first]
     after = values[first : min(now, first + _LOOP_BEFORE) + 1]
     before, after = before[np.isfinite(before)], after[np.isfinite(after)]
     if before.size < _LOOP_LEAST or after.size < 1:
-        return 0.0
+        return None
     dof = before.size + after.size - 2
     effective = before.size * after.size / (before.size + after.size)
     rest = before.size * before.var() + after.size * after.var()
