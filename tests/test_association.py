@@ -157,6 +157,29 @@ def test_modes_that_veer_are_known_by_their_shapes() -> None:
     assert set(found.assigned[-20:]) == {("b", "a")}
 
 
+def test_modes_that_veer_slowly_are_known_by_their_shapes() -> None:
+    """Shapes that take half of the life to go over are not followed to the other mode."""
+    half = np.linspace(-0.03, 0.03, N)
+    reach, angle = np.hypot(half, 0.01), 0.5 * np.arctan2(0.01, half)
+    rows = [
+        say(4.8 + np.array([-r, r]), "ab",
+            shapes=np.array([[-np.sin(t), np.cos(t), 0], [np.cos(t), np.sin(t), 0]]))
+        for r, t in zip(reach, angle, strict=True)
+    ]  # fmt: skip
+    found = run(rows)
+    assert set(found.assigned[:15]) == {("a", "b")}
+    assert set(found.assigned[-10:]) == {("b", "a")}
+
+
+def test_sensors_that_are_moved_cost_no_label(rng: np.random.Generator) -> None:
+    """All shapes change at once: frequencies alone tell from then on."""
+    rows = []
+    for k, row in enumerate(steady(rng, 30)):
+        shapes = np.eye(4)[2 * (k >= 15) :][:2] + 0.05 * rng.standard_normal((2, 4))
+        rows.append(say(row, "ab", shapes=shapes))
+    assert run(rows).assigned == (("a", "b"),) * 30
+
+
 def test_labels_use_no_later_log(rng: np.random.Generator) -> None:
     """A life cut short has the labels that the whole life has there."""
     rows = crossing(rng)

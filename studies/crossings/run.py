@@ -39,7 +39,7 @@ from studies.crossings.lives import KINDS, Kind, Life, make_life
 from studies.record import Stopwatch, clopper_pearson, keep
 
 HERE = Path(__file__).parent
-SEED = 20261123
+SEED = 20261124
 N_LIVES = 200
 EXAMPLES = ("crossing, named by order", "veering, with shapes", "merging")
 
