@@ -136,15 +136,10 @@ def _doubt(verdict: Verdict, i: int, name: str, modes: list[str]) -> Doubt:
     """Say why an estimate is given to no mode."""
     scan, chances = verdict.scan, verdict.chances[i]
     frequency = float(np.exp(scan.readings.ln_f[i]))
-    own = int(scan.names[i])
     reason: Reason
-    if (
-        0 <= own < chances.size - 1
-        and own not in verdict.modes
-        and (chances[own] + chances[-1] >= SURE)
-    ):
+    if i in verdict.jumps:
         reason = "jump"
-        expected = float(np.exp(verdict.expected[own]))
+        expected = float(np.exp(verdict.expected[scan.names[i]]))
         detail = (
             f"{frequency:.5g} Hz named {name}, expected at {expected:.5g} Hz: a jump that the log "
             "before does not show; it is believed once the next log confirms it"

@@ -20,8 +20,8 @@ Answer
     tells, all of which is said to be ambiguous. After the crossing 91 % of the estimates named by
     order are labelled, 97 % without names (names by order speak against a crossing), 88 % with
     gaps, and all with shapes. The rest stays ambiguous: slopes too alike. Where shapes mix, labels
-    go over a few logs early or late. One spurious estimate in 28 is taken for a mode that the log misses;
-    none founds a track. Of 60,000 estimates of modes well apart none is refused.
+    go over a few logs early or late. One spurious estimate in 28 is taken for a mode that the log
+    misses; none founds a track. Of 60,000 estimates of modes well apart none is refused.
 Run time
     Five minutes of one processor.
 """
