@@ -186,7 +186,7 @@ class Surprise:
     rows : ndarray of int
         Rows of ``[ln f, ln ζ]`` that the log has, without those taken for outliers.
     innovation : ndarray
-        Standardised by its own variance under the likeliest setting, shape ``(n_rows,)``.
+        Standardised by its mean and variance over all settings, shape ``(n_rows,)``.
     nis : float
         Normalised innovation squared, averaged over the settings.
     """
@@ -317,8 +317,9 @@ class Filter:
         bank.cov -= np.swapaxes(gain, 1, 2) @ gain
         log_det = np.log(np.einsum("gii->gi", root)).sum(axis=1)
         bank.log_weight += -0.5 * nis - log_det - 0.5 * value.size * np.log(2 * np.pi)
-        likely = int(np.argmax(weight))
-        innovation = off[likely] / np.sqrt(spread[likely, i, i])
+        centre = weight @ off
+        variance = weight @ (np.einsum("gii->gi", spread) + (off - centre) ** 2)
+        innovation = centre / np.sqrt(variance)
         if doubted is None:
             return Surprise(rows, innovation, float(weight @ nis))
         rest = np.flatnonzero(~doubted[rows])

@@ -17,8 +17,10 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
+from scipy import stats
 
-from lmshealth.arrays import FloatArray
+from lmshealth.arrays import BoolArray, FloatArray
 from lmshealth.bank import Bank, Filter, Settings, Surprise
 from lmshealth.tracks import Step, StepKind
 
@@ -32,6 +34,9 @@ MEMORY = int(_WINDOWS.max()) + 4
 # Innovations of a window that lean less, in standard deviations, are no suspicion. An event needs
 # more than five to be believed.
 _SUSPICIOUS = 4.0
+# Of which kind an event is often shows a few logs later only. Until one is so much likelier than
+# all others, or so many logs have passed, nothing is settled.
+_CLEAR, _PATIENCE = float(np.log(10.0)), 8
 # Logs about the suspected one that are tried as the first that sees it.
 _ABOUT = np.array([-2, -1, 0, 1, 2])
 # How likely a retuning, and anything else, changes the following error below 40 Hz; and how far
@@ -39,15 +44,19 @@ _ABOUT = np.array([-2, -1, 0, 1, 2])
 _LOOP_CHANGES = (0.99, 0.02)
 _LOOP_REACH = 100.0
 _LOOP_BEFORE, _LOOP_LEAST = 12, 3
+# Two following errors in a row that both differ from those before with this p-value are a leap.
+_LOOP_LEAP = 0.01
 
 
 class Watch:
-    """Sums of standardised innovations over windows that end at the last log.
+    """Sums of standardised innovations over windows that end at the last log; leaps of the loop.
 
     Parameters
     ----------
-    n_logs, n_rows : int
-        Size of the history.
+    n_rows : int
+        Rows of estimates that a log has at most.
+    loop_error : ndarray
+        RMS in m, shape ``(n_logs,)``, NaN where unknown.
 
     Attributes
     ----------
@@ -55,9 +64,13 @@ class Watch:
         Standardised, NaN where there is none or an outlier, shape ``(n_logs, n_rows)``.
     first : int
         First log of a window.
+    leaps : ndarray of int
+        Logs since which the following error differs, and nothing known explains it.
     """
 
-    def __init__(self, n_logs: int, n_rows: int) -> None:
+    def __init__(self, n_rows: int, loop_error: FloatArray) -> None:
+        n_logs = loop_error.size
+        self.leaps = np.flatnonzero(_leaps(loop_error))
         self.innovations = np.full((n_logs, n_rows), np.nan)
         self._sum = np.zeros((n_logs + 1, n_rows))
         self._count = np.zeros((n_logs + 1, n_rows))
@@ -74,8 +87,20 @@ class Watch:
         self._sum[k + 1, surprise.rows] += surprise.innovation
         self._count[k + 1, surprise.rows] += 1
 
+    def settle(self, steps: tuple[Step, ...]) -> None:
+        """Suspect nothing where the following error leaps at a step that is known."""
+        open_ones = [j for j in self.leaps.tolist() if not _known(steps, j)]
+        self.leaps = np.array(open_ones, dtype=int)
+
     def suspect(self, k: int) -> int | None:
-        """Give the log since which innovations lean most, if they lean suspiciously."""
+        """Give the log since which the loop, or else innovations, differ suspiciously.
+
+        A leap of the following error tells its log better than innovations do, and a retuning that
+        moves the modes little would pass for drift before they tell it at all.
+        """
+        leaps = self.leaps[(self.leaps >= self.first) & (self.leaps < k)]
+        if leaps.size and k - leaps[-1] <= _LOOP_BEFORE:
+            return int(leaps[-1])
         start = k + 1 - _WINDOWS
         start = start[start >= self.first]
         if start.size == 0:
@@ -114,6 +139,10 @@ class Finding:
     def believed(self) -> bool:
         """Whether nothing having happened is ruled out at the declared rate."""
         return self.log_bayes_factor >= threshold(1)
+
+    def settled(self, now: int) -> bool:
+        """Whether its kind is clear, or no more logs are waited for."""
+        return self.log_odds >= _CLEAR or now - self.first >= _PATIENCE
 
     @property
     def damage(self) -> bool:
@@ -187,12 +216,17 @@ def _weigh(
     history, before = filters.space.history, memory[j - 1]
     place = -float(np.log(j * (j + 1)))
     gains: dict[tuple[FindingKind, str, int], float] = {}
+    # What is known to have happened explains what the following error does there.
+    known = _known(filters.space.steps, j)
     for kind, source in kinds:
+        loop = None if known else loop_evidence(history.loop_error, j, now, kind)
+        # Without it nothing tells a retuning from damage.
+        if kind == "servo" and loop is None:
+            continue
         step = Step(kind, j, np.arange(len(history.logs)) >= j, source, declared=False)
         changed = filters.with_step(step)
         after = advance(changed, before.padded(changed.space.size), j)
-        gain = after.log_evidence - memory[now].log_evidence
-        gain += loop_evidence(history.loop_error, j, now, kind)
+        gain = after.log_evidence - memory[now].log_evidence + (loop or 0.0)
         gains[kind, source, j] = gain + place - float(np.log(len(kinds)))
     nothing = memory[now].log_evidence - before.log_evidence
     gains["drift", "", j] = _drift(advance, filters, before, j) - nothing + place
@@ -245,7 +279,40 @@ def _per_scale(grid: Settings) -> FloatArray:
     return np.asarray(np.log(total[place]))
 
 
-def loop_evidence(loop_error: FloatArray, first: int, now: int, kind: str) -> float:
+def _known(steps: tuple[Step, ...], j: int) -> bool:
+    """Tell whether a step that is known begins or ends about a log."""
+    there = [step.there[max(j + _ABOUT[0] - 1, 0) : j + _ABOUT[-1] + 1] for step in steps]
+    return any(part.any() and not part.all() for part in there)
+
+
+def _leaps(loop_error: FloatArray) -> BoolArray:
+    """Tell the logs since which two following errors in a row differ from the dozen before."""
+    values = _logarithms(loop_error)
+    leaps = np.zeros(values.size, dtype=bool)
+    if values.size < _LOOP_LEAST + 2:
+        return leaps
+    padded = np.concatenate([np.full(_LOOP_BEFORE, np.nan), values])
+    before = sliding_window_view(padded, _LOOP_BEFORE)[: values.size]
+    there = np.isfinite(before)
+    n = np.maximum(there.sum(axis=1), 2)
+    mean = np.where(there, before, 0.0).sum(axis=1) / n
+    square = np.where(there, before - mean[:, None], 0.0) ** 2
+    std = np.sqrt(square.sum(axis=1) / (n - 1) * (1 + 1 / n))
+    enough = (there.sum(axis=1) >= _LOOP_LEAST) & (std > 0)
+    reach = std * stats.t.isf(_LOOP_LEAP / 2, n - 1)
+    off = np.stack([values[:-1], values[1:]]) - mean[:-1]
+    same = (np.abs(off) > reach[:-1]).all(axis=0) & (off[0] * off[1] > 0)
+    leaps[:-1] = same & enough[:-1]
+    return leaps
+
+
+def _logarithms(loop_error: FloatArray) -> FloatArray:
+    with np.errstate(divide="ignore", invalid="ignore"):
+        values = np.log(loop_error)
+    return np.where(np.isfinite(values), values, np.nan)
+
+
+def loop_evidence(loop_error: FloatArray, first: int, now: int, kind: str) -> float | None:
     """Log evidence that the following error below 40 Hz brings for a kind of step.
 
     The logarithms before and after are two samples of unknown variance; the Bayes factor of a
@@ -260,15 +327,18 @@ def loop_evidence(loop_error: FloatArray, first: int, now: int, kind: str) -> fl
         First log after the step, and the last log.
     kind : str
         Of the step.
+
+    Returns
+    -------
+    float or None
+        None where too few are known.
     """
-    with np.errstate(divide="ignore", invalid="ignore"):
-        values = np.log(loop_error)
-    values = np.where(np.isfinite(values), values, np.nan)
+    values = _logarithms(loop_error)
     before = values[max(first - _LOOP_BEFORE, 0) : first]
     after = values[first : min(now, first + _LOOP_BEFORE) + 1]
     before, after = before[np.isfinite(before)], after[np.isfinite(after)]
     if before.size < _LOOP_LEAST or after.size < 1:
-        return 0.0
+        return None
     dof = before.size + after.size - 2
     effective = before.size * after.size / (before.size + after.size)
     rest = before.size * before.var() + after.size * after.var()

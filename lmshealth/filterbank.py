@@ -26,12 +26,13 @@ _LEVEL_WALK, _RATE_WALK, _DAMPING_WALK = 3e-3, 0.1, 0.3
 # A declared intervention may step a mode by so much.
 _STEP_STD = 0.05
 # Share of stray estimates, and by how much these stray in ln f and ln ζ.
-_STRAY = 0.05
+STRAY = 0.05
 _STRAY_F, _STRAY_ZETA = 0.01, 0.7
 # No life is thought to be shorter than so many logs: early logs do not know its length.
 LEAST_LOGS = 50
-# A shape is the mean of about so many.
-_SHAPE_MEMORY = 30.0
+# A shape is the mean of the first so many: one that turns later is seen to turn, and not followed
+# until it is another mode's.
+_N_SHAPES = 10
 _UNKNOWN_RATE = 1e100
 
 
@@ -94,8 +95,8 @@ class Innovations:
 def _components(x: FloatArray, var: FloatArray, reach: float) -> tuple[FloatArray, FloatArray]:
     """Log densities of what is expected and of what is stray, each with its share."""
     wide = var + reach**2
-    usual = np.log(1 - _STRAY) - 0.5 * (x**2 / var + np.log(2 * np.pi * var))
-    stray = np.log(_STRAY) - 0.5 * (x**2 / wide + np.log(2 * np.pi * wide))
+    usual = np.log(1 - STRAY) - 0.5 * (x**2 / var + np.log(2 * np.pi * var))
+    stray = np.log(STRAY) - 0.5 * (x**2 / wide + np.log(2 * np.pi * wide))
     return usual, stray
 
 
@@ -196,26 +197,24 @@ class Bank:
         )
         return self.join(new)
 
-    def predict(self, step: float, scale: float, n_logs: int, *, opened: bool = False) -> None:
+    def predict(self, step: float, scale: float, *, opened: bool = False) -> None:
         """Move all filters on by a step of the clock.
 
         Parameters
         ----------
         step, scale : float
             Step and length of a life on the clock; a scale of 0 moves nothing.
-        n_logs : int
-            Logs so far: while there are few, rates are held within their prior.
         opened : bool
             Whether levels may step here.
         """
         mean, cov = self.mean, self.cov
         if scale:
-            if n_logs <= LEAST_LOGS:
-                most = (_RATE_STD / scale) ** 2
-                shrink = np.sqrt(np.minimum(1.0, most / np.maximum(cov[..., 1, 1], 1e-300)))
-                mean[..., 1] *= shrink
-                cov[..., 1, :] *= shrink[..., None]
-                cov[..., :, 1] *= shrink[..., None]
+            # A life that proves longer than was thought has lower rates than were thought.
+            most = (_RATE_STD / scale) ** 2
+            shrink = np.sqrt(np.minimum(1.0, most / cov[..., 1, 1]))
+            mean[..., 1] *= shrink
+            cov[..., 1, :] *= shrink[..., None]
+            cov[..., :, 1] *= shrink[..., None]
             share = step / scale
             mean[..., 0] += step * mean[..., 1]
             cov[..., 0, :] += step * cov[..., 1, :]
@@ -293,7 +292,7 @@ class Bank:
         before, count = self.shapes[at], self.n_shapes[at] + there
         sign = np.sign(np.nansum(before * shapes, axis=-1))
         turned = np.where(sign == 0, 1.0, sign)[:, None] * shapes
-        gain = 1 / np.minimum(np.maximum(count, 1.0), _SHAPE_MEMORY)
+        gain = np.where(count <= _N_SHAPES, 1 / np.maximum(count, 1.0), 0.0)
         mean = np.where(np.isfinite(before), before, turned)
         mean = np.where(known, mean + gain[:, None] * (turned - mean), mean)
         norm = np.sqrt(np.nansum(mean**2, axis=-1))

@@ -17,11 +17,16 @@ from lmshealth.logs import Metadata, Refusal
 from lmshealth.maintenance import RESETS, Action
 from lmshealth.results import Modes
 from lmshealth.stage import Stage
-from lmshealth.statespace import regressors
+from lmshealth.statespace import Regressor, regressors
 from lmshealth.tracks import History, Series, Step, StepKind
 
 # Sources in the order in which they stand where a mode has several.
 _SOURCES = ("joint", "acc", "frf", "delta_e")
+# From one log to the next ln f stays within that, and so many standard deviations of its error and
+# of what covariates may do.
+_STILL = 0.003
+_JUMP_SIGMAS = 6.0
+_PRIOR_SIGMAS = 2.0
 _KINDS: dict[str, StepKind] = {"regrease": "regreasing", "servo": "servo", "sensor": "sensor"}
 _NO_MOMENT = datetime.max.replace(tzinfo=UTC)
 
@@ -108,7 +113,7 @@ def build_history(
         clock,
         offsets=np.array([one.values for one in regressed]).reshape(-1, len(ordered)).T,
         prior_std=np.array([one.prior_std for one in regressed]),
-        jumps=[step.first for step in steps],
+        jumps={step.first for step in steps} | _common_jumps(estimates, regressed),
     )
     refused += _doubts(ordered, estimates, found)
     modes, series, columns = _line_up(estimates, found, stage)
@@ -233,6 +238,49 @@ def _estimates(ordered: Sequence[Reading], stage: Stage | None) -> list[Estimate
             )
         )
     return estimates
+
+
+def _common_jumps(estimates: Sequence[Estimates], regressed: Sequence[Regressor]) -> set[int]:
+    """Find logs in which several named modes are off together, and none where another mode was.
+
+    A crash moves all modes at once: their names are then worth more than their places. Where a
+    place is another mode's, the names may be wrong, and it is no such log.
+    """
+    last: dict[tuple[str, str], tuple[float, float, int]] = {}
+    jumps: set[int] = set()
+    for k, own in enumerate(estimates):
+        keys = list(zip(own.names, own.sources, strict=True))
+        before = [last.get(key) for key in keys]
+        variance = np.diag(own.cov)[: len(keys)]
+        off: list[int] = []
+        taken = False
+        for i, (key, known) in enumerate(zip(keys, before, strict=True)):
+            if not key[0] or known is None:
+                continue
+            reach = _STILL + sum(
+                _PRIOR_SIGMAS * one.prior_std * abs(float(one.values[k] - one.values[known[2]]))
+                for one in regressed
+            )
+            if abs(own.ln_frequency[i] - known[0]) <= reach + _reach(variance[i], known[1]):
+                continue
+            off.append(i)
+            taken |= any(
+                abs(own.ln_frequency[i] - place) <= reach + _reach(variance[i], spread)
+                for other, (place, spread, _) in last.items()
+                if other[0] != key[0] and other[1] == key[1]
+            )
+        if len({keys[i][0] for i in off}) > 1 and not taken:
+            jumps.add(k)
+        last |= {
+            key: (float(own.ln_frequency[i]), float(variance[i]), k)
+            for i, key in enumerate(keys)
+            if key[0]
+        }
+    return jumps
+
+
+def _reach(variance: float, other: float) -> float:
+    return _JUMP_SIGMAS * float(np.sqrt(variance + other))
 
 
 def _named(modes: Modes, i: int, stage: Stage | None) -> str:

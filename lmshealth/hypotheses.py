@@ -16,7 +16,7 @@ from scipy.optimize import linear_sum_assignment
 from scipy.special import hyp1f1, logsumexp, ndtr
 
 from lmshealth.arrays import BoolArray, FloatArray
-from lmshealth.filterbank import Bank, Innovations, IntArray, Readings
+from lmshealth.filterbank import STRAY, Bank, Innovations, IntArray, Readings
 
 # Probability that a source shows a mode in a log, and spurious estimates per log and unit of ln f.
 SHOWN, _SPURIOUS = 0.8, 0.1
@@ -159,7 +159,8 @@ def shape_gains(shapes: FloatArray, of_modes: FloatArray) -> FloatArray:
     """Tell what shapes say, against shapes of any direction.
 
     A Watson distribution about the shape of the mode: density exp(κ MAC) / M(1/2, n/2, κ) over the
-    channels that both have [Mardia2000]_, with the modal assurance criterion [Allemang2003]_.
+    channels that both have [Mardia2000]_, with the modal assurance criterion [Allemang2003]_. A
+    small share is stray, of any direction: sensors are moved.
 
     Parameters
     ----------
@@ -181,7 +182,8 @@ def shape_gains(shapes: FloatArray, of_modes: FloatArray) -> FloatArray:
     known = (common > 1) & (scale > 0)
     mac = np.sum(a * b, -1) ** 2 / np.where(known, scale, 1.0)
     norm = np.log(hyp1f1(0.5, np.arange(shapes.shape[1] + 1) / 2 + 1e-300, _CONCENTRATION))
-    return np.where(known, _CONCENTRATION * mac - norm[common], 0.0)
+    usual = np.log(1 - STRAY) + _CONCENTRATION * mac - norm[common]
+    return np.where(known, np.logaddexp(usual, np.log(STRAY)), 0.0)
 
 
 def name_gains(names: IntArray, labels: IntArray, order: IntArray) -> FloatArray:
@@ -376,7 +378,7 @@ def reduce_hypotheses(kept: Hypotheses) -> Hypotheses:
         if not left[i]:
             continue
         group = np.flatnonzero(left)
-        group = group[_distance(bank, i, group) < _SAME]
+        group = group[(group == i) | (_distance(bank, i, group) < _SAME)]
         left[group] = False
         _merge(bank, i, group, np.exp(logsumexp(weights[group], axis=1) - total[order[0]]))
         weights[i] = logsumexp(weights[group], axis=0)

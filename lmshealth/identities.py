@@ -158,9 +158,9 @@ class Identities:
         step = log.clock - self._clock if self._clock is not None else 0.0
         self._clock, self._scale = log.clock, log.scale
         self._row = np.concatenate([(1.0, 0.0), log.offsets])
-        self._now.bank.predict(step, log.scale, log.epoch, opened=log.opened)
+        self._now.bank.predict(step, log.scale, opened=log.opened)
         if self._new:
-            self._new.bank.predict(step, log.scale, log.epoch, opened=log.opened)
+            self._new.bank.predict(step, log.scale, opened=log.opened)
 
     def _in_order(self) -> bool:
         """Tell whether names by order and by mode are the same."""

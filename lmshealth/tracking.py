@@ -78,6 +78,8 @@ class _Found:
     findings: dict[int, tuple[Finding, int]] = field(default_factory=dict)
     alarmed: bool = False
     tested: tuple[int, int] = (-1, -1)
+    # Believed to have happened, but not yet what it was.
+    open: Finding | None = None
 
 
 class _Follower:
@@ -99,7 +101,8 @@ class _Follower:
             np.ones((n, len(self.filters.sources))),
             np.ones(n),
         )
-        self.watch = Watch(n, rows)
+        self.watch = Watch(rows, history.loop_error)
+        self.watch.settle(space.steps)
         self.memory: dict[int, Bank] = {}
         # Rows of a log that are taken for outliers, until an event explains them.
         self.doubted: dict[int, np.ndarray] = {}
@@ -181,24 +184,28 @@ class _Follower:
         """Raise the alarm of a drift, and explain what looks like more than that."""
         found = self.found
         suspect = self.watch.suspect(k)
-        evidence = bank.log_bayes_factor()
-        # A single log that leans may be an outlier, or the first after a step: the next one tells.
-        if evidence >= threshold() and (suspect is None or k - suspect > 1):
-            self._alarm(bank, k, evidence)
         # What was weighed a moment ago is weighed again once there is notably more to it.
-        if suspect is None or self._just_tested(suspect, k):
-            return bank
-        found.tested = (suspect, k)
-        finding = explain(
-            lambda filters, begun, first: self._again(filters, begun, first, k),
-            self.filters,
-            self.memory,
-            k,
-            suspect,
-        )
-        if finding is None or not finding.believed:
-            return bank
-        return self._adopt(finding, bank, k)
+        if suspect is not None and not self._just_tested(suspect, k):
+            found.tested = (suspect, k)
+            found.open = None
+            finding = explain(
+                lambda filters, begun, first: self._again(filters, begun, first, k),
+                self.filters,
+                self.memory,
+                k,
+                suspect,
+            )
+            if finding is not None and finding.believed:
+                if finding.settled(k):
+                    return self._adopt(finding, bank, k)
+                found.open = finding
+        # A single log that leans may be an outlier, or the first after a step: the next one tells.
+        # Of what is not settled yet, later logs tell whether it is damage.
+        waiting = found.open is not None and not found.open.settled(k)
+        evidence = bank.log_bayes_factor()
+        if evidence >= threshold() and not waiting and (suspect is None or k - suspect > 1):
+            self._alarm(bank, k, evidence)
+        return bank
 
     def _just_tested(self, suspect: int, k: int) -> bool:
         before, when = self.found.tested
@@ -216,6 +223,7 @@ class _Follower:
             step = Step(finding.kind, j, there, finding.source, declared=False)
             self.filters = self.filters.with_step(step)
             self.found.findings[len(self.filters.space.steps) - 1] = (finding, k)
+            self.watch.settle(self.filters.space.steps)
             before = before.padded(self.filters.space.size)
         self._settle(k)
         begun = self._begin_chapter(before, j + 1)

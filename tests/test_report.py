@@ -238,6 +238,7 @@ def test_no_log_at_all(make: Maker, tmp_path: Path) -> None:
         ln_frequency=history.ln_frequency[:0],
         ln_damping=history.ln_damping[:0],
         cov=history.cov[:0],
+        loop_error=history.loop_error[:0],
     )
     text = words(one(tmp_path, replace(bare, history=empty, digests=())))
     assert "0 logs used" in text

@@ -157,3 +157,18 @@ def test_frf_modes(root: Path, needs: Callable[[str], None]) -> None:
         sum(part[key]["share"] for part in parts) for key in ("control_narrower", "coverage")
     )
     assert narrow < stated
+
+
+def test_crossings(root: Path) -> None:
+    """Some lives of each kind are never swapped silently, and both controls may be."""
+    answer = json.loads(run_study(root, "crossings"))
+    few = {"a best guess swaps there", "most labels are recovered", "the nearest swaps"}
+    assert all(fine for name, fine in answer["passed"].items() if name not in few)
+    assert answer["kinds"]["crossing, unnamed"]["nearest_lives_swapped"]["hits"] == 3
+
+
+def test_beam_track(root: Path, needs: Callable[[str], None]) -> None:
+    """The tracked state of a real beam returns to its start, told and not told of the roller."""
+    needs("data")
+    answer = json.loads(run_study(root, "beam_track"))
+    assert all(answer["passed"].values())

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from datetime import timedelta
 from pathlib import Path
 
@@ -12,7 +13,7 @@ import pytest
 from lmshealth.arrays import FloatArray
 from lmshealth.stage import Stage
 from lmshealth.summary import degraded_below, judge, service_date
-from lmshealth.tracks import History
+from lmshealth.tracks import Event, History, Track
 from tests.lives import (
     FOOT,
     FREQUENCY,
@@ -23,6 +24,7 @@ from tests.lives import (
     make_history,
     make_prognosis,
     make_stage,
+    make_track,
 )
 
 
@@ -84,10 +86,41 @@ def test_a_parameter_the_logs_do_not_tell_is_left_out(stage: Stage) -> None:
     assert "Mount stiffness: these logs do not tell." in found.why
 
 
+def stepped(*, declared: bool = False, epoch: int = 5, evidence: float = 30.0) -> Track:
+    """Make a track with one step of roll and pitch."""
+    events = tuple(
+        Event("step", epoch, mode, "", size, 0.001, evidence, declared, epoch + 1)
+        for mode, size in (("roll", -0.03), ("pitch", 0.002))
+    )
+    bare = make_track(np.zeros((8, 2)), np.tile(1e-6 * np.eye(2), (8, 1, 1)))
+    return replace(bare, events=events)
+
+
+def test_a_jump_that_nobody_explains_is_the_verdict(stage: Stage) -> None:
+    """The word is step, with what jumped and what health is left; its odds are the evidence's."""
+    health = make_health(around(0.99, 0.6))
+    found = judge(stage, logs(8), health, stepped(evidence=3.0))
+    assert found.verdict == "step"
+    assert found.probability == pytest.approx(1 / (1 + np.exp(-3.0)))
+    assert "roll −3.0 %" in found.why
+    assert "pitch +0.2 %" in found.why
+    assert "Mount stiffness is at 60 %" in found.why
+    # Also where the logs do not carry health.
+    assert judge(stage, logs(8), None, stepped()).verdict == "step"
+
+
+def test_a_jump_that_is_explained_or_past_is_not_the_verdict(stage: Stage) -> None:
+    """Declared steps, and those before the last overhaul, leave the word to health."""
+    health = make_health(around(0.99, 0.99))
+    assert judge(stage, logs(8), health, stepped(declared=True)).verdict == "healthy"
+    serviced = replace(logs(8), baselines=(0, 2))
+    assert judge(stage, serviced, health, stepped(epoch=1)).verdict == "healthy"
+
+
 @pytest.mark.parametrize(
     ("n_logs", "options", "needle"),
     [
-        (3, {}, "3 usable logs, a baseline needs 5"),
+        (3, {}, "3 usable logs since the baseline began; it needs 5"),
         (8, {"converged": False}, "did not converge"),
         (8, {"informed": (0.2, 0.4)}, "move the prior of no parameter"),
     ],

@@ -14,7 +14,7 @@ from lmshealth.logs import Metadata, Refusal
 from lmshealth.results import Health, Judgement, Line, Modes, Prognosis
 from lmshealth.stage import Stage, load_stage
 from lmshealth.summary import Assessment
-from lmshealth.tables import COLUMNS, all_tables, frame, modes_rows
+from lmshealth.tables import COLUMNS, all_tables, frame, modes_rows, track_rows
 from lmshealth.tracks import Effect, Event, History, Series, Smoothed, Track
 from tests.signals import write_archive_stage
 
@@ -252,3 +252,22 @@ def test_the_columns_are_those_of_the_contract() -> None:
     }
     for name, columns in wanted.items():
         assert set(columns.split()) <= set(COLUMNS[name].split())
+
+
+def test_events_and_smoothed_columns_leave_with_their_units(stage: Stage) -> None:
+    """An event has one row per mode, in km and ISO moments; smoothing adds columns in Hz."""
+    made = assessment(stage, None)
+    table = all_tables([], [made], [])["events"]
+    row = table.iloc[0]
+    assert (row["kind"], row["mode"], row["size"], row["evidence"]) == ("step", "roll", -0.02, 31.5)
+    assert row["travel_km"] == 500.0
+    assert row["recorded_at"] == row["known_at"] == "2026-04-01T08:00:00+00:00"
+    assert not row["declared"]
+    assert made.track is not None
+    level = np.full((2, 2), np.log(100.0))
+    smoothed = Smoothed(level, 0.01 * level, level, level, 0 * level, np.full((2, 2), 1e-3))
+    rows = track_rows(made.track, smoothed)
+    assert rows[0]["frequency_hz_smoothed"] == pytest.approx(100.0)
+    assert rows[0]["frequency_std_hz_smoothed"] == pytest.approx(np.log(100.0))
+    assert rows[3]["drift_std_smoothed"] == 1e-3
+    assert "frequency_hz_smoothed" not in track_rows(made.track)[0]

@@ -6,9 +6,11 @@ from collections import Counter
 from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from studies.crossings.lives import Life
 
+N_AFTER = 15
 Labels = Sequence[Sequence[str | None]]
 
 
@@ -48,6 +50,17 @@ def _owners(life: Life, labels: Labels) -> dict[str, int]:
             if label is not None:
                 shown.setdefault(label, []).append(mode)
     return {label: Counter(modes[:5]).most_common(1)[0][0] for label, modes in shown.items()}
+
+
+def recovered(life: Life, labels: Labels) -> NDArray[np.float64]:
+    """Return the share labelled in each of the first logs after the crossing; NaN without one."""
+    share = np.full(N_AFTER, np.nan)
+    for j, k in enumerate(range(life.after, min(life.after + N_AFTER, len(labels)))):
+        own = [
+            label is not None for label, i in zip(labels[k], life.truth[k], strict=True) if i >= 0
+        ]
+        share[j] = np.mean(own) if own else np.nan
+    return share
 
 
 def nearest(life: Life) -> Labels:

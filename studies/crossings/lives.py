@@ -198,4 +198,3 @@ def _named(modes: list[int], values: Array, ln_f: Array, names: list[str]) -> tu
     places = np.sort(ln_f)
     told = [names[int(np.argmin(np.abs(places - value)))] for value in values]
     return tuple(name if told.index(name) == i else "" for i, name in enumerate(told))
-

@@ -1,0 +1,53 @@
+"""Draw figure.svg from result.json: the beam followed blind, and told where its roller is."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+HERE = Path(__file__).parent
+COLOURS = ("#0072b2", "#d55e00", "#009e73")
+MARKERS = ("o", "s", "^")
+
+
+def draw(ax: Axes, repeats: list[dict[str, Any]], kind: str) -> None:
+    """Draw the drift of every dwell with two standard deviations."""
+    ax.axhline(0, color="black", lw=0.8)
+    for r, colour, marker in zip(repeats, COLOURS, MARKERS, strict=False):
+        own = r[kind]
+        x = np.arange(len(own["drift"])) + 1 + 0.16 * (r["repeat"] - 1)
+        label = f"repeat {r['repeat'] + 1}"
+        y, std = 100 * np.array(own["drift"]), 200 * np.array(own["drift_std"])
+        ax.errorbar(x, y, std, fmt=marker, color=colour, ms=4, elinewidth=1, capsize=2, label=label)
+        back = own["returned_at"]
+        ax.plot(x[back], y[back], marker, ms=11, mfc="none", mec=colour)
+    ax.set_xlabel("dwell that the beam could be read in")
+    ax.grid(alpha=0.3)
+
+
+def main() -> None:
+    """Draw the study."""
+    result = json.loads((HERE / "result.json").read_text())
+    style = {"svg.hashsalt": "beam_track", "font.size": 9}
+    with matplotlib.rc_context(style):
+        figure = Figure(figsize=(9, 4), layout="constrained")
+        left, right = figure.subplots(1, 2)
+        draw(left, result["repeats"], "blind")
+        left.set_ylim(-30, 60)
+        left.set_title("nothing known but the estimates")
+        left.set_ylabel("drift of ln f since the first dwell in %, ± 2σ")
+        draw(right, result["repeats"], "told")
+        right.set_title("roller position told, taken out")
+        right.legend(loc="upper right")
+        figure.suptitle("Tracked beam through ramp and return; circles: back at the first position")
+        figure.savefig(HERE / "figure.svg", metadata={"Date": None})
+
+
+if __name__ == "__main__":
+    main()

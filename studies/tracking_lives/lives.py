@@ -1,0 +1,242 @@
+"""Lives as a tracker sees them: what is really so at every log, and estimates of it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from datetime import datetime
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lmshealth.tracks import History, Series, Step
+from models.degradation import draw_laws
+from models.lives import Plan, Visit, schedule
+from models.plant import GUIDE_MODES, closed_loop_modes
+from models.recording import payload_kg
+from models.stages import NOMINAL, Condition, stage_named
+
+Array = NDArray[np.float64]
+
+SECONDS = 20.0
+DAMAGED = ("preload-wear", "mount-loosening", "both", "sudden-loosening", "crash")
+HEALTHY = ("healthy", "temperature-only", "payload-change", "servo-retuning", "regreasing")
+COVARIATES = ("temperature_c", "payload_kg")
+LOSS = 0.05  # of preload, spread over a life
+
+
+def rng_of(*key: int) -> np.random.Generator:
+    """Return the generator of a part."""
+    return np.random.default_rng([20261206, *key])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Life:
+    """What is really so at every log.
+
+    Attributes
+    ----------
+    stage, kind : str
+        As in `models.lives`.
+    seed : int
+        Of its plan.
+    recorded_at : tuple of datetime
+        When, shape ``(n,)`` as all that follows.
+    travel : ndarray
+        Odometer in m.
+    covariates : dict of str to ndarray
+        Temperature in °C and payload in kg.
+    servo : ndarray of str
+        Which tuning.
+    event : int or None
+        First log after what happens once in this kind of life.
+    ln_frequency, ln_damping : ndarray
+        Of roll, pitch and yaw, shape ``(n, 3)``.
+    drift : ndarray
+        Of ln frequency since the first log at the reference temperature, the nominal payload and
+        the tuning of commissioning, shape ``(n, 3)``.
+    """
+
+    stage: str
+    kind: str
+    seed: int
+    recorded_at: tuple[datetime, ...]
+    travel: Array
+    covariates: dict[str, Array]
+    servo: NDArray[np.str_]
+    event: int | None
+    ln_frequency: Array
+    ln_damping: Array
+    drift: Array
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Estimates:
+    """What identification gives of every log of a life.
+
+    Attributes
+    ----------
+    ln_frequency, ln_damping : ndarray
+        Shape ``(n, 3)``, NaN where a mode was not found.
+    cov : ndarray
+        Of both, shape ``(n, 6, 6)``.
+    loop_error : ndarray
+        RMS of the following error from 1 to 40 Hz in m, shape ``(n,)``.
+    """
+
+    ln_frequency: Array
+    ln_damping: Array
+    cov: Array
+    loop_error: Array
+
+
+def plan_of(stage: str, kind: str, seed: int, logs: int = 40) -> Plan:
+    """Plan a life of logs of 20 s."""
+    return Plan(stage, kind, logs, SECONDS, seed)
+
+
+def life_of(plan: Plan) -> Life:
+    """Take a life from its plan."""
+    return _life(plan, schedule(plan))
+
+
+def losing_life(plan: Plan) -> Life:
+    """Take a life from its plan, and let the guide lose preload evenly from log to log."""
+    visits = schedule(plan)
+    step = LOSS / (len(visits) - 1)
+    lost = [
+        replace(visit, condition=replace(visit.condition, guide_preload=1 - step * visit.index))
+        for visit in visits
+    ]
+    return _life(plan, lost)
+
+
+def _life(plan: Plan, visits: list[Visit]) -> Life:
+    stage = stage_named(plan.stage)
+    conditions = [visit.condition for visit in visits]
+    seen = np.array([_modes(plan.stage, condition) for condition in conditions])
+    own = np.array([_modes(plan.stage, _at_reference(condition))[0] for condition in conditions])
+    travel_km = np.array([visit.travel_km for visit in visits])
+    event = int(np.searchsorted(travel_km, draw_laws(plan.rng("laws")).event_km))
+    happens = plan.life in ("crash", "sudden-loosening", "regreasing", "servo-retuning")
+    return Life(
+        stage=plan.stage,
+        kind=plan.life,
+        seed=plan.seed,
+        recorded_at=tuple(visit.recorded_at for visit in visits),
+        travel=1000.0 * travel_km,
+        covariates={
+            "temperature_c": np.array([one.temperature_c for one in conditions]),
+            "payload_kg": np.array([payload_kg(stage, one) for one in conditions]),
+        },
+        servo=np.array([one.servo_id for one in conditions]),
+        event=event if happens and event < len(visits) else None,
+        ln_frequency=seen[:, 0],
+        ln_damping=seen[:, 1],
+        drift=own - own[0],
+    )
+
+
+def _at_reference(condition: Condition) -> Condition:
+    """Give what wear and grease alone have made of a stage."""
+    return replace(
+        NOMINAL,
+        guide_preload=condition.guide_preload,
+        mount_stiffness=condition.mount_stiffness,
+        guide_damping=condition.guide_damping,
+    )
+
+
+@lru_cache(maxsize=4096)
+def _modes(stage: str, condition: Condition) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    """Return ln frequency and ln damping of the guide modes."""
+    modes = {mode.name: mode for mode in closed_loop_modes(stage_named(stage), condition)}
+    return (
+        tuple(float(np.log(modes[name].frequency_hz)) for name in GUIDE_MODES),
+        tuple(float(np.log(modes[name].damping_ratio)) for name in GUIDE_MODES),
+    )
+
+
+def drawn(life: Life, sizes: Estimates, sizes_of: Life, rng: np.random.Generator) -> Estimates:
+    """Draw estimates about the truth, each with the covariance of some really identified log.
+
+    Parameters
+    ----------
+    life : Life
+        The truth.
+    sizes, sizes_of : Estimates and Life
+        Logs that were really identified, of both tunings, and their truth.
+    rng : Generator
+        Random numbers.
+    """
+    n = len(life.recorded_at)
+    picked = np.empty(n, dtype=int)
+    loop = np.empty(n)
+    for tuning in ("commissioning", "retuned"):
+        own, like = life.servo == tuning, np.flatnonzero(sizes_of.servo == tuning)
+        picked[own] = rng.choice(like, own.sum())
+        values = np.log(sizes.loop_error[like])
+        scatter = values.std(ddof=1) * rng.standard_normal(own.sum())
+        loop[own] = np.exp(values.mean() + scatter)
+    cov = sizes.cov[picked]
+    errors = np.linalg.cholesky(cov) @ rng.standard_normal((n, cov.shape[1], 1))
+    m = life.ln_frequency.shape[1]
+    return Estimates(
+        life.ln_frequency + errors[:, :m, 0], life.ln_damping + errors[:, m:, 0], cov, loop
+    )
+
+
+def history_of(
+    life: Life,
+    estimates: Estimates,
+    *,
+    declared: bool = True,
+    covariates: tuple[str, ...] = COVARIATES,
+    loop_error: bool = True,
+) -> History:
+    """Make the history that a tracker is given.
+
+    Parameters
+    ----------
+    declared : bool
+        Whether logs carry their ``servo_id`` and maintenance tells of regreasing.
+    covariates : tuple of str
+        Which of them are known.
+    loop_error : bool
+        Whether the following error is there.
+    """
+    n = len(life.recorded_at)
+    return History(
+        stage=f"{life.stage} {life.kind} {life.seed}",
+        logs=tuple(f"log-{k + 1:04d}" for k in range(n)),
+        recorded_at=life.recorded_at,
+        travel=life.travel,
+        covariates={name: life.covariates[name] for name in covariates},
+        modes=GUIDE_MODES,
+        series=tuple(Series(mode, "joint") for mode in GUIDE_MODES),
+        ln_frequency=estimates.ln_frequency,
+        ln_damping=estimates.ln_damping,
+        cov=estimates.cov,
+        loop_error=estimates.loop_error if loop_error else np.full(n, np.nan),
+        baselines=(0,),
+        steps=_declared(life) if declared else (),
+    )
+
+
+def _declared(life: Life) -> tuple[Step, ...]:
+    """Tell what maintenance and metadata know."""
+    k = life.event
+    if k is None or life.kind not in ("regreasing", "servo-retuning"):
+        return ()
+    there = np.arange(life.travel.size) >= k
+    if life.kind == "regreasing":
+        return (Step("regreasing", k, there, name=f"{life.recorded_at[k]:%Y-%m-%d}"),)
+    return (Step("servo", k, there, name=str(life.servo[k])),)
+
+
+def many(
+    make: Callable[[Plan], Life], stage: str, kind: str, seeds: range, logs: int
+) -> list[Life]:
+    """Take lives of one kind, one per seed."""
+    return [make(plan_of(stage, kind, seed, logs)) for seed in seeds]

@@ -1,0 +1,60 @@
+"""Lives simulated at 20 kHz and identified log by log, kept in a folder."""
+
+from __future__ import annotations
+
+import tempfile
+from pathlib import Path
+
+import numpy as np
+
+from lmshealth import identify, read_log
+from lmshealth.following import loop_error
+from lmshealth.readers import find_logs, read_manifest
+from lmshealth.stage import load_stage
+from models.lives import Plan, simulate_life
+from models.plant import GUIDE_MODES
+from studies.tracking_lives.lives import Estimates
+
+_FIELDS = ("ln_frequency", "ln_damping", "cov", "loop_error")
+
+
+def identified(plan: Plan, cache: Path | None = None) -> Estimates:
+    """Simulate a life and identify its logs, unless a folder keeps it from before.
+
+    The folder is to be emptied when simulation or identification change.
+    """
+    name = f"{plan.stage}.{plan.life}.{plan.seed}.{plan.logs}x{plan.seconds:g}s.npz"
+    if cache is not None and (cache / name).exists():
+        with np.load(cache / name) as kept:
+            return Estimates(*(kept[field] for field in _FIELDS))
+    with tempfile.TemporaryDirectory() as folder:
+        simulate_life(plan, Path(folder))
+        estimates = _identify_all(Path(folder), plan)
+    if cache is not None:
+        cache.mkdir(parents=True, exist_ok=True)
+        # Under its name only when it is whole: others may read at the same time.
+        part = cache / f"part.{name}"
+        np.savez(part, **{field: getattr(estimates, field) for field in _FIELDS})
+        part.rename(cache / name)
+    return estimates
+
+
+def _identify_all(folder: Path, plan: Plan) -> Estimates:
+    """Identify the logs of a folder, which stand in the order of recording."""
+    stage, manifest = load_stage(plan.stage), read_manifest(folder)
+    n, m = plan.logs, len(GUIDE_MODES)
+    ln_f, ln_zeta, loop = np.full((n, m), np.nan), np.full((n, m), np.nan), np.full(n, np.nan)
+    cov = np.full((n, 2 * m, 2 * m), np.nan)
+    for k, path in enumerate(find_logs(folder).logs):
+        log = read_log(path, overrides=manifest.overrides(path), name=path.name)
+        modes = identify(log, stage)
+        # Those that were found: where they stand in the result, and where they belong.
+        at = [i for i, name in enumerate(modes.names) if name in GUIDE_MODES]
+        to = [GUIDE_MODES.index(modes.names[i]) for i in at]
+        ln_f[k, to], ln_zeta[k, to] = modes.ln_frequency[at], modes.ln_damping[at]
+        rows = np.ix_([*to, *(i + m for i in to)], [*to, *(i + m for i in to)])
+        own = np.array([*at, *(i + len(modes.names) for i in at)], dtype=int)
+        cov[k][rows] = modes.cov[np.ix_(own, own)]
+        error = loop_error(log)
+        loop[k] = np.nan if error is None else error
+    return Estimates(ln_f, ln_zeta, cov, loop)

@@ -1,0 +1,119 @@
+"""Commands on tables: what they write, what they say, how they fail."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from click.testing import CliRunner, Result
+
+from lmshealth.cli import main
+from tests.lives import FADING, make_stage
+
+N = 30
+
+
+@pytest.fixture
+def estimates(tmp_path: Path) -> Path:
+    """Write estimates of two modes of a machine whose roll jumps by -3 % at log 20."""
+    rng = np.random.default_rng(4)
+    rows = []
+    for k in range(N):
+        for mode, f in (("roll", 126.4), ("pitch", 136.6)):
+            jump = 0.97 if mode == "roll" and k >= 20 else 1.0
+            rows.append(
+                {
+                    "stage": "AX-1",
+                    "log": f"{k:03d}",
+                    "recorded_at": f"2026-03-{k + 1:02d}T06:00:00+00:00",
+                    "travel_km": 100.0 * k,
+                    "temperature_c": 21 + rng.standard_normal(),
+                    "mode": mode,
+                    "source": "acc",
+                    "frequency_hz": f * jump * (1 + 1e-3 * rng.standard_normal()),
+                    "frequency_std_hz": 1e-3 * f,
+                    "damping_ratio": 0.015 * np.exp(0.05 * rng.standard_normal()),
+                    "damping_ratio_std": 0.015 * 0.05,
+                }
+            )
+    table = pd.DataFrame(rows)
+    table["temperature_c"] = table.groupby("log")["temperature_c"].transform("first")
+    path = tmp_path / "modes.csv"
+    table.to_csv(path, index=False)
+    return path
+
+
+def run(*words: object) -> Result:
+    """Run the command line."""
+    return CliRunner().invoke(main, ["track", *map(str, words)])
+
+
+def test_a_table_becomes_track_effects_and_events(estimates: Path, tmp_path: Path) -> None:
+    """Every file that is asked for is written; the jump is an event and an alarm."""
+    stage = make_stage(tmp_path / "stage", (FADING,))
+    assert stage.modes
+    out = {name: tmp_path / f"{name}.csv" for name in ("track", "effects", "events", "track_cov")}
+    result = run(
+        estimates, "--stage", tmp_path / "stage" / "small.toml", "--out", out["track"],
+        "--effects", out["effects"], "--events", out["events"], "--track-cov", out["track_cov"],
+        "--smooth",
+    )  # fmt: skip
+    assert result.exit_code == 0, result.output
+    track = pd.read_csv(out["track"])
+    assert len(track) == 2 * N
+    last = track[(track["mode"] == "roll")].iloc[-1]
+    assert abs(last["drift"] - np.log(0.97)) < 3 * last["drift_std"]
+    assert abs(last["drift_smoothed"] - last["drift"]) < 0.3 * last["drift_std"]
+    events = pd.read_csv(out["events"])
+    steps = events[events["kind"] == "step"]
+    assert set(steps["recorded_at"]) == {"2026-03-21T06:00:00+00:00"}
+    assert "alarm" in set(events["kind"])
+    assert set(pd.read_csv(out["effects"])["covariate"]) == {"temperature_c", "scale:acc"}
+    assert len(pd.read_csv(out["track_cov"])) == N
+    assert "What happened" in result.output
+
+
+def test_without_stage_and_names_modes_are_born(estimates: Path, tmp_path: Path) -> None:
+    """Unnamed estimates make two modes, named by their frequency."""
+    table = pd.read_csv(estimates).drop(columns=["mode", "source", "stage", "travel_km"])
+    bare = tmp_path / "other.csv"
+    table[table["recorded_at"] < "2026-03-21"].to_csv(bare, index=False)
+    result = run(bare, "--out", tmp_path / "track.csv")
+    assert result.exit_code == 0, result.output
+    names = sorted(set(pd.read_csv(tmp_path / "track.csv")["mode"]))
+    assert [name[:2] + name[-3:] for name in names] == ["12_hz", "13_hz"]
+    assert "all rows are taken for one machine, other" in result.stderr
+    assert "the clock is the time" in result.stderr
+
+
+def test_one_log_is_the_baseline(estimates: Path, tmp_path: Path) -> None:
+    """One epoch is no failure: nothing has drifted, which is said."""
+    single = tmp_path / "single.csv"
+    pd.read_csv(estimates).iloc[:2].to_csv(single, index=False)
+    result = run(single, "--out", tmp_path / "track.csv")
+    assert result.exit_code == 0, result.output
+    track = pd.read_csv(tmp_path / "track.csv")
+    assert (track["drift"] == 0).all()
+    assert "one log is the baseline" in result.stderr
+
+
+def test_bad_tables_are_one_line_and_status_1(estimates: Path, tmp_path: Path) -> None:
+    """The line names the file, the line of it and what is wrong."""
+    table = pd.read_csv(estimates)
+    table.loc[3, "frequency_std_hz"] = -1.0
+    bad = tmp_path / "bad.csv"
+    table.to_csv(bad, index=False)
+    result = run(bad, "--out", tmp_path / "track.csv")
+    assert result.exit_code == 1
+    assert result.stderr.count("\n") == 1
+    assert "line 5: frequency_std_hz is -1" in result.stderr
+    assert not (tmp_path / "track.csv").exists()
+
+
+def test_an_output_that_cannot_be_written_is_told(estimates: Path, tmp_path: Path) -> None:
+    """The folder is missing: status 1 and the reason."""
+    result = run(estimates, "--out", tmp_path / "nowhere" / "track.csv")
+    assert result.exit_code == 1
+    assert "cannot be written" in result.stderr
