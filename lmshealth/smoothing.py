@@ -13,6 +13,8 @@ from lmshealth.tracks import History, Smoothed, Track
 
 # Settings with less of the posterior are left out.
 _SHARE = 1e-3
+# Eigenvalues of correlations below are rounding.
+_SINGULAR = 1e-10
 
 
 def smooth(history: History, followed: Track, stage: Stage | None = None) -> Smoothed:
@@ -85,9 +87,19 @@ def smooth_one(filters: Filter, setting: Settings) -> tuple[FloatArray, FloatArr
             noise += np.diag(filters.extra[k, rows])
             kalman.update(filters.values[k, rows], R=noise, H=space.matrix(k)[rows])
         means[k], covs[k] = kalman.x, kalman.P
-    # An exact copy of ℓ, and jumps that have not happened yet, make covariances singular.
-    smoothed = kalman.rts_smoother(means, covs, moves, noises, inv=np.linalg.pinv)
+    smoothed = kalman.rts_smoother(means, covs, moves, noises, inv=_inverse)
     return smoothed[0], smoothed[1]
+
+
+def _inverse(cov: FloatArray) -> FloatArray:
+    """Invert a covariance where it is not singular.
+
+    An exact copy of ℓ, and jumps that have not happened yet, make it singular. Of the correlations,
+    because variances of ln ζ lie ten orders of magnitude above those that ln f wanders by.
+    """
+    std = np.sqrt(np.maximum(np.diag(cov), 0.0))
+    scale = np.outer(np.where(std > 0, std, 1.0), np.where(std > 0, std, 1.0))
+    return np.asarray(np.linalg.pinv(cov / scale, rcond=_SINGULAR, hermitian=True) / scale)
 
 
 def transition(filters: Filter, setting: Settings, k: int) -> tuple[FloatArray, FloatArray]:

@@ -52,6 +52,15 @@ def test_modes_peers_without_peers(root: Path) -> None:
     assert ".[peers]" in done.stderr
 
 
+def test_tracking_filter(root: Path) -> None:
+    """Errors of the filter are as large as it says, and its numbers are those of filterpy."""
+    answer = json.loads(run_study(root, "tracking_filter"))
+    assert all(answer["passed"].values())
+    programs = {row["program"] for row in answer["speed"]["programs"]}
+    # Peers are compared where they are installed.
+    assert len(programs) == 5 - len(answer["speed"]["missing"])
+
+
 def test_demo_life(root: Path) -> None:
     """A short degrading life is recognised, and its truth lies where the posterior does."""
     life = json.loads(run_study(root, "demo_life").splitlines()[0])

@@ -1,0 +1,207 @@
+"""Lives drawn from the tracker's own model, with what is true behind them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lmshealth.bank import Filter, Settings, settings
+from lmshealth.stage import Stage, load_stage
+from lmshealth.statespace import BIAS_STD, DAMPING_WALK, state_space
+from lmshealth.tracks import History, Series
+
+Array = NDArray[np.float64]
+HORIZON = 2e7  # m of travel in a life
+REFERENCE, TEMPERATURE_STD = 21.0, 1e-3
+MODES = ("roll", "pitch")
+LEVEL, DAMPING = np.log([126.4, 136.6]), np.log([0.018, 0.015])
+START = datetime(2026, 3, 1, tzinfo=UTC)
+DESCRIPTION = f"""
+name = "small"
+[[mode]]
+name = "roll"
+frequency_hz = 126.4
+damping_ratio = 0.018
+[[mode]]
+name = "pitch"
+frequency_hz = 136.6
+damping_ratio = 0.015
+[[covariate]]
+name = "temperature_c"
+reference = {REFERENCE}
+prior_std = {TEMPERATURE_STD}
+[usage]
+horizon_km = {HORIZON / 1000}
+"""
+
+
+@dataclass(frozen=True)
+class Life:
+    """A history, the setting it was drawn with, and the truth ``(n_logs, n_modes)``."""
+
+    history: History
+    setting: Settings
+    level: Array
+    damping: Array
+
+    def truth(self) -> dict[str, Array]:
+        """Give ln f, ln ζ and drift since the first log."""
+        return {"ln f": self.level, "ln ζ": self.damping, "drift": self.level - self.level[0]}
+
+
+def stage() -> Stage:
+    """Describe the machine: two modes, temperature, a life of 20,000 km."""
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "small.toml"
+        path.write_text(DESCRIPTION, encoding="utf-8")
+        return load_stage(str(path))
+
+
+def draw(rng: np.random.Generator, sources: tuple[str, ...] = ("acc",)) -> Life:
+    """Draw a life of 20 to 40 logs: setting, rates, walks, coefficients, biases and errors.
+
+    Errors of the estimates of a log are correlated, by 0.9 where two sources see one mode; a
+    tenth of the estimates and of the temperatures are missing.
+    """
+    grid = settings(len(sources))
+    chosen = grid.only(rng.choice(grid.rate_std.size, size=1, p=np.exp(grid.log_prior)))
+    n, m, r = int(rng.integers(20, 41)), len(MODES), len(MODES) * len(sources)
+    travel = np.cumsum(np.r_[1e5, HORIZON * rng.uniform(0.002, 0.05, n - 1)])
+    level, damping = _walk(rng, chosen, np.diff(travel) / HORIZON)
+    temperature, read = _temperature(rng, n)
+    mode = np.tile(np.arange(m), len(sources))
+    bias = rng.standard_normal((2, r)) * np.array(BIAS_STD)[:, None]
+    bias[:, :m] = 0.0
+    cov = _covariance(rng, n, len(sources))
+    scales = np.tile(np.repeat(chosen.scales[0], m), 2)
+    noise = (np.linalg.cholesky(cov) @ rng.standard_normal((n, 2 * r, 1)))[:, :, 0] * scales
+    values = np.hstack([(level + read)[:, mode] + bias[0], damping[:, mode] + bias[1]]) + noise
+    missing = rng.random((n, r)) < 0.1
+    missing[0] = False
+    gone = np.hstack([missing, missing])
+    values[gone] = np.nan
+    cov[gone[:, :, None] | gone[:, None, :]] = np.nan
+    history = History(
+        stage="AX-1",
+        logs=tuple(f"{k:03d}.csv" for k in range(n)),
+        recorded_at=tuple(START + timedelta(days=k) for k in range(n)),
+        travel=travel,
+        covariates={"temperature_c": temperature},
+        modes=MODES,
+        series=tuple(Series(name, source) for source in sources for name in MODES),
+        ln_frequency=values[:, :r],
+        ln_damping=values[:, r:],
+        cov=cov,
+        loop_error=np.full(n, np.nan),
+        baselines=(0,),
+    )
+    return Life(history, chosen, level, damping)
+
+
+def _walk(rng: np.random.Generator, chosen: Settings, ticks: Array) -> tuple[Array, Array]:
+    """Let both modes wander: ln f and ln ζ, ``(n_logs, n_modes)`` each."""
+    m = len(MODES)
+    rate = chosen.rate_std * rng.standard_normal(m)
+    level, damping = [LEVEL], [DAMPING]
+    for tick in ticks:
+        # The integral of a walk, and the walk itself, over one tick.
+        bend = chosen.rate_walk * np.sqrt(tick) * rng.standard_normal(m)
+        rest = chosen.rate_walk * np.sqrt(tick**3 / 12) * rng.standard_normal(m)
+        own = chosen.level_walk * np.sqrt(tick) * rng.standard_normal(m)
+        level.append(level[-1] + rate * tick + bend * tick / 2 + rest + own)
+        rate = rate + bend
+        damping.append(damping[-1] + DAMPING_WALK * np.sqrt(tick) * rng.standard_normal(m))
+    return np.array(level), np.array(damping)
+
+
+def _temperature(rng: np.random.Generator, n: int) -> tuple[Array, Array]:
+    """Draw temperatures, some unknown, and what they do to ln f of both modes."""
+    temperature = REFERENCE + 5 * rng.standard_normal(n)
+    temperature[1:][rng.random(n - 1) < 0.1] = np.nan
+    read = np.empty((n, len(MODES)))
+    coefficient = TEMPERATURE_STD * rng.standard_normal(len(MODES))
+    for k in range(n):
+        known = temperature[:k][np.isfinite(temperature[:k])]
+        spread = max(float(np.std(known)), 1.0) if known.size else 1.0
+        unknown = TEMPERATURE_STD * spread * rng.standard_normal(len(MODES))
+        offset = temperature[k] - REFERENCE
+        read[k] = unknown if np.isnan(offset) else coefficient * offset
+    return temperature, read
+
+
+def _covariance(rng: np.random.Generator, n: int, n_sources: int) -> Array:
+    """Draw covariances of ``[ln f, ln ζ]`` of all series, ``(n, 2 n_series, 2 n_series)``."""
+    m = len(MODES)
+    std = np.exp(np.log([5e-4, 0.05])[:, None] + 0.3 * rng.standard_normal((n, 2, 1)))
+    std = np.repeat(std, m * n_sources, axis=2).reshape(n, -1)
+    # Modes, and ln f with ln ζ, are correlated by chance; sources of one mode by 0.9.
+    root = np.eye(2 * m) + 0.3 * rng.standard_normal((n, 2 * m, 2 * m))
+    own = root @ np.swapaxes(root, 1, 2)
+    size = np.sqrt(np.einsum("kii->ki", own))
+    own = (own / (size[:, :, None] * size[:, None, :])).reshape(n, 2, m, 2, m)
+    common = 0.9 + 0.1 * np.eye(n_sources)
+    both = np.einsum("kpiqj,ab->kpaiqbj", own, common).reshape(n, std.shape[1], -1)
+    return np.asarray(both * std[:, :, None] * std[:, None, :])
+
+
+def alone(history: History, source: str) -> History:
+    """Give the history that one source alone makes."""
+    own = np.array([i for i, one in enumerate(history.series) if one.source == source])
+    both = np.r_[own, own + len(history.series)]
+    return replace(
+        history,
+        series=tuple(history.series[i] for i in own),
+        ln_frequency=history.ln_frequency[:, own],
+        ln_damping=history.ln_damping[:, own],
+        cov=history.cov[:, both[:, None], both],
+    )
+
+
+def without_common_errors(history: History) -> History:
+    """Give the history as if the errors of two sources had nothing to do with each other."""
+    source = np.array([one.source for one in history.series] * 2)
+    same = source[:, None] == source
+    return replace(history, cov=np.where(np.isnan(history.cov) | same, history.cov, 0.0))
+
+
+@dataclass(frozen=True)
+class Filtered:
+    """What the filter of the right setting says.
+
+    ``mean`` is ``(n_logs, n_modes)`` of ln f, ln ζ and drift, ``cov`` its covariance; ``nis`` the
+    normalised innovation squared of every log and ``dof`` its degrees of freedom.
+    """
+
+    mean: dict[str, Array]
+    cov: dict[str, Array]
+    nis: Array
+    dof: Array
+
+
+def filtered(life: Life, machine: Stage) -> Filtered:
+    """Filter a life by the setting it was drawn with."""
+    space = state_space(life.history, machine)
+    filters = Filter(space, life.history.baselines)
+    filters.grid = replace(life.setting, log_prior=np.zeros(1))
+    bank, n, m = filters.start(), len(life.history.logs), space.n_modes
+    contrasts = {name: np.zeros((m, space.size)) for name in ("ln f", "ln ζ", "drift")}
+    contrasts["ln f"][:, space.level] = contrasts["drift"][:, space.level] = np.eye(m)
+    contrasts["drift"][:, space.base] = -np.eye(m)
+    contrasts["ln ζ"][:, space.damping] = np.eye(m)
+    mean = {name: np.empty((n, m)) for name in contrasts}
+    cov = {name: np.empty((n, m, m)) for name in contrasts}
+    nis = np.empty(n)
+    for k in range(n):
+        filters.move(bank, k)
+        nis[k] = filters.see(bank, k).nis
+        for name, contrast in contrasts.items():
+            mean[name][k] = contrast @ bank.mean[0]
+            cov[name][k] = contrast @ bank.cov[0] @ contrast.T
+    # The prior is centred on the first log, which surprises nobody.
+    dof = 2.0 * np.isfinite(life.history.ln_frequency).sum(axis=1)
+    return Filtered(mean, cov, nis[1:], dof[1:])

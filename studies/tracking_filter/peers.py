@@ -1,0 +1,246 @@
+"""Other filters on the same numbers: filterpy log by log, simdkalman, statsmodels."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from datetime import timedelta
+from importlib.metadata import version
+from importlib.util import find_spec
+from typing import Any
+
+import numpy as np
+from filterpy.kalman import KalmanFilter
+
+from lmshealth.bank import Filter, Settings
+from lmshealth.stage import Stage
+from lmshealth.statespace import (
+    DAMPING_WALK,
+    LN_F_STD,
+    LN_ZETA_STD,
+    Regressor,
+    StateSpace,
+    state_space,
+)
+from lmshealth.tracking import track
+from lmshealth.tracks import History, Series
+from studies.tracking_filter.lives import START, Array, Life, draw, filtered
+
+PEERS = ("simdkalman", "statsmodels")
+STD = (5e-4, 0.05)
+# One setting for all: walk of ln f, its rate per life, and no walk of the rate.
+LEVEL_WALK, RATE_STD = 1e-3, 0.03
+
+
+@dataclass(frozen=True)
+class Loop:
+    """What a plain loop says of ln f, ``(n_logs, n_modes)`` each, and of the drift."""
+
+    level: Array
+    level_std: Array
+    drift: Array
+    drift_std: Array
+
+
+def filterpy_loop(
+    history: History, setting: Settings, life: float, regressed: tuple[Regressor, ...] = ()
+) -> Loop:
+    """Filter one setting by filterpy, log by log: [ln f, rate, ln ζ, baseline, coefficients]."""
+    m, n = len(history.modes), len(history.logs)
+    level, rate, damping, base = (slice(part * m, (part + 1) * m) for part in range(4))
+    size = (4 + len(regressed)) * m
+    kalman = KalmanFilter(dim_x=size, dim_z=2 * m)
+    prior = [LN_F_STD, setting.rate_std[0], LN_ZETA_STD, 0.0, *(r.prior_std for r in regressed)]
+    kalman.x = np.zeros(size)
+    kalman.x[level], kalman.x[damping] = history.ln_frequency[0], history.ln_damping[0]
+    kalman.P = np.diag(np.square(np.repeat(prior, m)))
+    values = np.hstack([history.ln_frequency, history.ln_damping])
+    ticks = np.diff(history.travel, prepend=history.travel[0]) / life
+    eye = np.eye(m)
+    states, covs = np.empty((n, size)), np.empty((n, size, size))
+    for k, tick in enumerate(ticks):
+        f, q = np.eye(size), np.zeros((size, size))
+        bend = setting.rate_walk[0] ** 2
+        f[level, rate] = tick * eye
+        q[level, level] = (setting.level_walk[0] ** 2 * tick + bend * tick**3 / 3) * eye
+        q[level, rate] = q[rate, level] = bend * tick**2 / 2 * eye
+        q[rate, rate] = bend * tick * eye
+        q[damping, damping] = DAMPING_WALK**2 * tick * eye
+        kalman.predict(F=f, Q=q)
+        if k == 0:
+            copy = np.eye(size)
+            copy[base, base], copy[base, level] = 0.0, eye
+            kalman.x, kalman.P = copy @ kalman.x, copy @ kalman.P @ copy.T
+        h = np.zeros((2 * m, size))
+        h[:m, level] = h[m:, damping] = eye
+        noise = history.cov[k] * setting.scales[0, 0] ** 2
+        for j, one in enumerate(regressed):
+            h[:m, (4 + j) * m : (5 + j) * m] = one.values[k] * eye
+            noise = noise + np.diag(np.r_[np.full(m, one.unknown[k]), np.zeros(m)])
+        rows = np.flatnonzero(np.isfinite(values[k]))
+        if rows.size:
+            kalman.update(values[k, rows], R=noise[np.ix_(rows, rows)], H=h[rows])
+        states[k], covs[k] = kalman.x, kalman.P
+    variance = np.einsum("kii->ki", covs)
+    both = np.einsum("kii->ki", covs[:, level, base])
+    return Loop(
+        states[:, level],
+        np.sqrt(variance[:, level]),
+        states[:, level] - states[:, base],
+        np.sqrt(np.maximum(variance[:, level] + variance[:, base] - 2 * both, 0.0)),
+    )
+
+
+def deviation(rng: np.random.Generator, n: int, machine: Stage) -> dict[str, float]:
+    """Compare the bank with filterpy on drawn lives: largest difference in standard deviations."""
+    worst = {"ln f": 0.0, "std of ln f": 0.0, "drift": 0.0}
+    for _ in range(n):
+        life: Life = draw(rng)
+        found = filtered(life, machine)
+        space = state_space(life.history, machine)
+        book = filterpy_loop(life.history, life.setting, space.life, space.regressed)
+        std = np.sqrt(np.einsum("kii->ki", found.cov["ln f"]))
+        # Drifts of machines that hardly wander have next to no std, but numbers of ln f.
+        wide = np.maximum(book.drift_std, 0.1 * std)
+        for name, off in (
+            ("ln f", (found.mean["ln f"] - book.level) / std),
+            ("std of ln f", std / book.level_std - 1),
+            ("drift", (found.mean["drift"] - book.drift) / wide),
+        ):
+            worst[name] = max(worst[name], float(np.abs(off).max()))
+    return {"lives": n, **worst}
+
+
+def long_life(n: int, m: int) -> History:
+    """Make a long healthy life of evenly spaced logs with errors of one constant size."""
+    rng = np.random.default_rng(7)
+    std = np.repeat(STD, m)
+    walk = np.cumsum(rng.standard_normal((n, m)) * LEVEL_WALK / np.sqrt(n), axis=0)
+    modes = tuple(f"mode {i + 1}" for i in range(m))
+    return History(
+        stage="AX-1",
+        logs=tuple(f"{k:05d}.csv" for k in range(n)),
+        recorded_at=tuple(START + timedelta(hours=k) for k in range(n)),
+        travel=1e3 * np.arange(n),
+        covariates={},
+        modes=modes,
+        series=tuple(Series(mode, "acc") for mode in modes),
+        ln_frequency=5 + walk + STD[0] * rng.standard_normal((n, m)),
+        ln_damping=-4 + STD[1] * rng.standard_normal((n, m)),
+        cov=np.tile(np.diag(std**2), (n, 1, 1)),
+        loop_error=np.full(n, np.nan),
+        baselines=(0,),
+    )
+
+
+def one_setting() -> Settings:
+    """Give the setting that all of them can express."""
+    return Settings(
+        np.array([LEVEL_WALK]), np.array([RATE_STD]), np.zeros(1), np.ones((1, 1)), np.zeros(1)
+    )
+
+
+def bank_of_one(history: History) -> tuple[Array, Array]:
+    """Filter by the bank with one setting: ln f and its std, ``(n_logs, n_modes)``."""
+    space: StateSpace = state_space(history, None)
+    filters = Filter(space, history.baselines)
+    filters.grid = one_setting()
+    bank, n = filters.start(), len(history.logs)
+    mean, variance = np.empty((n, space.n_modes)), np.empty((n, space.n_modes))
+    for k in range(n):
+        filters.move(bank, k)
+        filters.see(bank, k)
+        mean[k] = bank.mean[0, space.level]
+        variance[k] = np.diag(bank.cov[0])[space.level]
+    return mean, np.sqrt(variance)
+
+
+def by_simdkalman(history: History) -> tuple[Array, Array]:
+    """Filter ln f of all modes as series of their own by simdkalman."""
+    import simdkalman
+
+    tick = 1 / (len(history.logs) - 1)
+    kalman = simdkalman.KalmanFilter(
+        state_transition=np.array([[1.0, tick], [0.0, 1.0]]),
+        process_noise=np.diag([LEVEL_WALK**2 * tick, 0.0]),
+        observation_model=np.array([[1.0, 0.0]]),
+        observation_noise=STD[0] ** 2,
+    )
+    first = np.stack([history.ln_frequency[0], np.zeros(len(history.modes))], axis=1)
+    found = kalman.compute(
+        history.ln_frequency.T,
+        0,
+        initial_value=first[:, :, None],
+        initial_covariance=np.diag([LN_F_STD**2, RATE_STD**2]),
+        smoothed=False,
+        filtered=True,
+    ).filtered.states
+    return found.mean[:, :, 0].T, np.sqrt(found.cov[:, :, 0, 0]).T
+
+
+def by_statsmodels(history: History) -> tuple[Array, Array]:
+    """Filter ln f mode by mode by the local linear trend of statsmodels, variances given.
+
+    Its trend counts per log: ticks are taken into the numbers. It takes a covariance that changes
+    by less than 1e-19 for steady, which variances of 1e-8 are not: that is switched off.
+    """
+    from statsmodels.tsa.statespace.structural import UnobservedComponents
+
+    tick = 1 / (len(history.logs) - 1)
+    means, stds = [], []
+    for column in history.ln_frequency.T:
+        model = UnobservedComponents(column, level="lltrend")
+        model.ssm.tolerance = 0.0
+        model.ssm.initialize_known(
+            np.array([column[0], 0.0]), np.diag([LN_F_STD**2, (RATE_STD * tick) ** 2])
+        )
+        found = model.filter([STD[0] ** 2, LEVEL_WALK**2 * tick, 0.0])
+        means.append(found.filtered_state[0])
+        stds.append(np.sqrt(found.filtered_state_cov[0, 0]))
+    return np.array(means).T, np.array(stds).T
+
+
+def seconds(work: Callable[[], Any]) -> float:
+    """Measure processor time."""
+    begin = time.process_time()
+    work()
+    return time.process_time() - begin
+
+
+def speed(n: int, m: int, repeats: int) -> dict[str, Any]:
+    """Compare numbers and processor time on one long life; programs take turns."""
+    history = long_life(n, m)
+    missing = [name for name in PEERS if find_spec(name) is None]
+    mean, std = bank_of_one(history)
+    life = float(np.ptp(history.travel))
+    others: dict[str, Callable[[], tuple[Array, Array]]] = {}
+    if "simdkalman" not in missing:
+        others["simdkalman"] = lambda: by_simdkalman(history)
+    if "statsmodels" not in missing:
+        others["statsmodels"] = lambda: by_statsmodels(history)
+    work: dict[str, Callable[[], Any]] = {
+        "filterpy, one setting": lambda: filterpy_loop(history, one_setting(), life),
+        "bank, one setting": lambda: bank_of_one(history),
+        "track, all settings": lambda: track(history),
+        **others,
+    }
+    times: dict[str, list[float]] = {name: [] for name in work}
+    for _ in range(repeats):
+        for name, run in work.items():
+            times[name].append(seconds(run))
+    loop = filterpy_loop(history, one_setting(), life)
+    numbers = {"filterpy, one setting": (loop.level, loop.level_std)}
+    numbers |= {name: run() for name, run in others.items()}
+    rows = []
+    for name, taken in times.items():
+        ratios = np.array(taken) / times["filterpy, one setting"]
+        row: dict[str, Any] = {"program": name, "cpu_s": min(taken),
+                               "times_filterpy": float(np.median(ratios))}  # fmt: skip
+        if name in numbers:
+            other, other_std = numbers[name]
+            row["deviation"] = float(np.abs((other - mean) / std).max())
+            row["deviation_of_std"] = float(np.abs(other_std / std - 1).max())
+        rows.append(row)
+    versions = {name: version(name) for name in PEERS if name not in missing}
+    return {"epochs": n, "modes": m, "programs": rows, "missing": missing, "versions": versions}
