@@ -67,7 +67,7 @@ HERE = Path(__file__).parent
 CASES = [("lms-y", kind) for kind in HEALTHY + DAMAGED] + [("lms-x", kind) for kind in HEALTHY]
 # Kinds whose cause is declared by somebody, or not.
 DECLARABLE = ("servo-retuning", "regreasing")
-FIRST_SEED, RAW_SEED, SIZES_SEED = 5000, 100, 7
+FIRST_SEED, RAW_SEED, SIZES_SEED = 6000, 100, 7
 # Alarms of damage, and events found, of all.
 ENOUGH = 0.95
 # Of more lives than that the sizes are taken from a dozen logs and not from eight.
