@@ -22,6 +22,8 @@ from lmshealth.tracks import History, Series, Step, StepKind
 
 # Sources in the order in which they stand where a mode has several.
 _SOURCES = ("joint", "acc", "frf", "delta_e")
+# So many logs in a row without a clear identity are worth a word.
+_LATE = 3
 # From one log to the next ln f stays within that, and so many standard deviations of its error and
 # of what covariates may do.
 _STILL = 0.003
@@ -357,3 +359,21 @@ def _line_up(
 
 def _rank(source: str) -> tuple[int, str]:
     return (_SOURCES.index(source) if source in _SOURCES else len(_SOURCES), source)
+
+
+def ambiguity_notes(history: History, refused: Sequence[Refusal]) -> list[str]:
+    """Say which modes can no longer be told apart, so that nothing new is known of them."""
+    last = history.logs[-_LATE:]
+    doubted = {
+        name: {
+            r.log for r in refused if r.reason == "ambiguous" and r.mode == name and r.log in last
+        }
+        for name in history.modes
+    }
+    lost = [name for name, logs in doubted.items() if len(last) == _LATE == len(logs)]
+    if not lost:
+        return []
+    return [
+        f"{' and '.join(lost)}: the last {_LATE} logs do not tell which mode their estimates are of, "
+        "so that nothing new is known; logs with more channels would tell modes by their shapes."
+    ]
