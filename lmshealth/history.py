@@ -365,9 +365,7 @@ def ambiguity_notes(history: History, refused: Sequence[Refusal]) -> list[str]:
     """Say which modes can no longer be told apart, so that nothing new is known of them."""
     last = history.logs[-_LATE:]
     doubted = {
-        name: {
-            r.log for r in refused if r.reason == "ambiguous" and r.mode == name and r.log in last
-        }
+        name: {r.log for r in refused if (r.reason, r.mode) == ("ambiguous", name)} & set(last)
         for name in history.modes
     }
     lost = [name for name, logs in doubted.items() if len(last) == _LATE == len(logs)]

@@ -24,8 +24,9 @@ from lmshealth.logs import Refusal
 from lmshealth.results import Health, Prognosis
 from lmshealth.stage import ParameterSpec
 from lmshealth.summary import Assessment
-from lmshealth.trackplots import chi_square_band, plot_damping, plot_frequencies, plot_nis
-from lmshealth.tracks import Effect, Event, History, Track
+from lmshealth.trackfacts import effect_row, filter_health, fit, happened, mode_rows, surprise
+from lmshealth.trackplots import plot_damping, plot_frequencies, plot_nis
+from lmshealth.tracks import History
 from lmshealth.wording import (
     GAP,
     LEVELS,
@@ -35,11 +36,9 @@ from lmshealth.wording import (
     moment,
     percent,
     quantiles,
-    signed,
     spell,
 )
 
-_UNITS = {"c": "°C", "kg": "kg", "mm": "mm"}
 _FLEET_TOP = 1.5  # length of all gauges of the index, as a fraction of baseline
 
 
@@ -81,17 +80,6 @@ class Life:
     past: str
     beyond: str
     now: str
-
-
-@dataclass(frozen=True, slots=True)
-class Fit:
-    """A chi-square beside its 95 % band: ``side`` is ``inside``, ``above`` or ``below`` it."""
-
-    value: float
-    dof: float
-    low: float
-    high: float
-    side: str
 
 
 def write_report(
@@ -212,17 +200,17 @@ def _evidence(assessment: Assessment) -> dict[str, Any]:
     drift = np.zeros(1) if track is None else np.abs(track.drift[-1])
     return {
         "health": health,
-        "modes": [] if track is None else list(_mode_rows(track)),
+        "modes": [] if track is None else list(mode_rows(track)),
         "seen": _seen(history),
         "pairs": [] if health is None else _pairs(health),
         "picture": _pictures(assessment),
-        "surprise": None if track is None else _surprise(track),
-        "happened": [] if track is None else list(_happened(track)),
-        "filter": None if track is None else _filter_health(track),
+        "surprise": None if track is None else surprise(track),
+        "happened": [] if track is None else list(happened(track)),
+        "filter": None if track is None else filter_health(track),
         "noise_scale": None if track is None else float(track.noise_scale[-1].max()),
         "largest_drift": float(np.nanmax(drift, initial=0.0)),
-        "law": prognosis and _fit(prognosis.chi_square, prognosis.degrees_of_freedom),
-        "effects": [] if track is None else [_effect_row(effect) for effect in track.effects],
+        "law": prognosis and fit(prognosis.chi_square, prognosis.degrees_of_freedom),
+        "effects": [] if track is None else [effect_row(effect) for effect in track.effects],
         "reasons": Counter(item.reason for item in assessment.refused).most_common(),
         "hashes": list(zip(history.logs, assessment.digests, strict=False)),
     }
@@ -321,7 +309,7 @@ def _pictures(assessment: Assessment) -> dict[tuple[str, str], str]:
                 plots.plot_life, prognosis=prognosis, parameter=name, health=health
             )
         draw["survival", "any"] = partial(plots.plot_survival, prognosis=prognosis, max_risk=risk)
-    if track is not None and _surprise(track) is not None:
+    if track is not None and surprise(track) is not None:
         draw["nis", "all"] = partial(plot_nis, track=track)
     return {key: _inline(one, f"p{k}") for k, (key, one) in enumerate(draw.items())}
 
@@ -341,93 +329,6 @@ def _pairs(health: Health) -> list[tuple[tuple[str, ...], str, float]]:
         ((names[i], names[j]), f"{spell(names[i])} against {spell(names[j])}", float(rho[i, j]))
         for i, j in combinations(range(len(names)), 2)
     ]
-
-
-def _mode_rows(track: Track) -> Iterator[tuple[str, ...]]:
-    """Name, baseline, present value, change and damping of each mode."""
-    for k, mode in enumerate(track.modes):
-        level, drift = track.ln_frequency[-1, k], track.drift[-1, k]
-        drift_std = np.sqrt(track.drift_cov[-1, k, k])
-        std = np.exp(level) * track.ln_frequency_std[-1, k]
-        zeta = 100 * np.exp(track.ln_damping[-1, k])
-        if np.isfinite([level, drift]).all():
-            yield (
-                spell(mode),
-                f"{np.exp(level - drift):.2f}{GAP}Hz",
-                f"{np.exp(level):.2f} ± {std:.2f}{GAP}Hz",
-                f"{signed(100 * drift, 2)} ± {100 * drift_std:.2f}{GAP}%",
-                f"{zeta:.2f} ± {zeta * track.ln_damping_std[-1, k]:.2f}{GAP}%",
-            )
-
-
-def _surprise(track: Track) -> tuple[int, int, Fit] | None:
-    """Count epochs inside the band of their NIS, all epochs, and judge their sum."""
-    seen = (track.nis_dof > 0) & np.isfinite(track.nis)
-    nis, dof = track.nis[seen], track.nis_dof[seen]
-    low, high = chi_square_band(dof)
-    total = _fit(float(nis.sum()), float(dof.sum()))
-    inside = int(np.sum((nis >= low) & (nis <= high)))
-    return None if total is None else (inside, nis.size, total)
-
-
-def _fit(value: float, dof: float) -> Fit | None:
-    if dof <= 0:
-        return None
-    low, high = chi_square_band(np.array(dof, dtype=float)).tolist()
-    side = "above" if value > high else "below" if value < low else "inside"
-    return Fit(value, dof, low, high, side)
-
-
-def _happened(track: Track) -> Iterator[dict[str, Any]]:
-    """Tell each event once, with what it did to every mode."""
-    groups: dict[tuple[str, int, str], list[Event]] = {}
-    for event in track.events:
-        groups.setdefault((event.kind, event.epoch, event.source), []).append(event)
-    for (kind, epoch, source), events in groups.items():
-        first, of = events[0], ", damping" if kind == "regreasing" else ""
-        yield {
-            "kind": kind,
-            "source": source,
-            "since": track.recorded_at[epoch],
-            "travel": km(track.travel[epoch]) if np.isfinite(track.travel[epoch]) else "–",
-            "known": track.recorded_at[first.found_at],
-            "declared": first.declared,
-            "sizes": [
-                f"{spell(event.mode)}{of} {signed(100 * event.size, 2)} ± "
-                f"{100 * event.std:.2f}{GAP}%"
-                for event in events
-            ],
-            "evidence": f"{first.evidence:.1f}".replace("-", "−"),
-        }
-
-
-def _filter_health(track: Track) -> dict[str, Any]:
-    """Say whether the filter agrees with its logs, and how far it is widened."""
-    found = track.consistency()
-    return {
-        "holds": found.holds,
-        "autocorrelation": signed(found.autocorrelation, 2),
-        "p_value": f"{found.autocorrelation_p_value:.2g}",
-        "widening": float(track.widening[-1]),
-    }
-
-
-def _effect_row(effect: Effect) -> tuple[str, str, str, bool]:
-    """Mode, covariate, coefficient in ‰ per unit, and whether it differs from zero."""
-    name, _, unit = effect.covariate.rpartition("_")
-    kind, colon, which = effect.covariate.partition(":")
-    if kind == "scale":
-        value = f"{effect.coefficient:.2f} ± {effect.std:.2f} times"
-        return "–", f"standard deviations of {which}", value, abs(effect.coefficient - 1) > 0.05
-    if colon:
-        told = {"bias": "offset of", "servo": "tuning", "sensor": "sensor since"}
-        name, per = f"{told.get(kind, kind)} {which}", ""
-    elif name and unit in _UNITS:
-        per = f" per {_UNITS[unit]}"
-    else:
-        name, per = effect.covariate, " per unit"
-    value = f"{signed(1e3 * effect.coefficient, 3)} ± {1e3 * effect.std:.3f}{GAP}‰{per}"
-    return spell(effect.mode), spell(name), value, abs(effect.coefficient) > 2 * effect.std
 
 
 def _seen(history: History) -> list[str]:

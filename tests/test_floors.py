@@ -70,6 +70,7 @@ FLOORS = [
     {"prognosis"},
     {"summary", "plots"},
     {"store", "tables", "trackplots"},
+    {"trackfacts"},
     {"report"},
     {"pipeline", "terminal", "options", "looks"},
     {"commands"},
