@@ -372,6 +372,7 @@ def ambiguity_notes(history: History, refused: Sequence[Refusal]) -> list[str]:
     if not lost:
         return []
     return [
-        f"{' and '.join(lost)}: the last {_LATE} logs do not tell which mode their estimates are of, "
-        "so that nothing new is known; logs with more channels would tell modes by their shapes."
+        f"{' and '.join(lost)}: the last {_LATE} logs do not tell which mode their estimates are "
+        "of, so that nothing new is known; logs with more channels would tell modes by their "
+        "shapes."
     ]
