@@ -109,11 +109,11 @@ def associate(
     _check(epochs, clock, offsets, prior_std, jumps)
     table = Table(epochs, offsets, prior_std)
     identities = Identities(prior_std, epochs[0].shapes.shape[1])
-    scales = _scales(clock)
+    scales, declared = _scales(clock), frozenset(jumps)
     assigned: list[tuple[str | None, ...]] = []
     doubts: list[Doubt] = []
     for k, estimates in enumerate(epochs):
-        names, opened = estimates.names, k in jumps
+        names, opened = estimates.names, k in declared
         log = Log(k, float(clock[k]), scales[k], offsets[k], opened, names, estimates.sources)
         if table.plain[k] and not opened and identities.settled and assigned[-1] == names:
             identities.defer(log, table)
@@ -137,18 +137,18 @@ def _doubt(verdict: Verdict, i: int, name: str, modes: list[str]) -> Doubt:
     scan, chances = verdict.scan, verdict.chances[i]
     frequency = float(np.exp(scan.readings.ln_f[i]))
     reason: Reason
-    if chances[-1] < SURE:
-        reason = "ambiguous"
-        told = [*modes[: chances.size - 1], "no known mode"]
-        parts = [f"{told[j]} {chances[j]:.0%}" for j in np.argsort(-chances) if chances[j] > 0.005]
-        detail = f"{frequency:.5g} Hz may be of {' or '.join(parts)}: the logs so far do not tell"
-    elif 0 <= scan.names[i] < chances.size - 1 and scan.names[i] not in verdict.modes:
+    if i in verdict.jumps:
         reason = "jump"
         expected = float(np.exp(verdict.expected[scan.names[i]]))
         detail = (
             f"{frequency:.5g} Hz named {name}, expected at {expected:.5g} Hz: a jump that the log "
             "before does not show; it is believed once the next log confirms it"
         )
+    elif chances[-1] < SURE:
+        reason = "ambiguous"
+        told = [*modes[: chances.size - 1], "no known mode"]
+        parts = [f"{told[j]} {chances[j]:.0%}" for j in np.argsort(-chances) if chances[j] > 0.005]
+        detail = f"{frequency:.5g} Hz may be of {' or '.join(parts)}: the logs so far do not tell"
     else:
         reason = "spurious"
         detail = (

@@ -22,6 +22,8 @@ from lmshealth.tracks import History, Series, Step, StepKind
 
 # Sources in the order in which they stand where a mode has several.
 _SOURCES = ("joint", "acc", "frf", "delta_e")
+# So many logs in a row without a clear identity are worth a word.
+_LATE = 3
 # From one log to the next ln f stays within that, and so many standard deviations of its error and
 # of what covariates may do.
 _STILL = 0.003
@@ -241,35 +243,34 @@ def _estimates(ordered: Sequence[Reading], stage: Stage | None) -> list[Estimate
 
 
 def _common_jumps(estimates: Sequence[Estimates], regressed: Sequence[Regressor]) -> set[int]:
-    """Find logs in which several named modes are off together, and none where another mode was.
+    """Find logs in which several named modes are off at once, at places where no other mode was.
 
-    A crash moves all modes at once: their names are then worth more than their places. Where a
-    place is another mode's, the names may be wrong, and it is no such log.
+    A crash moves all modes: their names are then worth more than their places. Where the places
+    are those of other modes, the names may be wrong, and it is no such log.
     """
     last: dict[tuple[str, str], tuple[float, float, int]] = {}
     jumps: set[int] = set()
     for k, own in enumerate(estimates):
         keys = list(zip(own.names, own.sources, strict=True))
-        before = [last.get(key) for key in keys]
         variance = np.diag(own.cov)[: len(keys)]
-        off: list[int] = []
-        taken = False
-        for i, (key, known) in enumerate(zip(keys, before, strict=True)):
-            if not key[0] or known is None:
+        elsewhere = set()
+        for i, key in enumerate(keys):
+            if not key[0] or key not in last:
                 continue
-            reach = _STILL + sum(
-                _PRIOR_SIGMAS * one.prior_std * abs(float(one.values[k] - one.values[known[2]]))
+            change = sum(
+                one.prior_std * abs(float(one.values[k] - one.values[last[key][2]]))
                 for one in regressed
             )
-            if abs(own.ln_frequency[i] - known[0]) <= reach + _reach(variance[i], known[1]):
-                continue
-            off.append(i)
-            taken |= any(
-                abs(own.ln_frequency[i] - place) <= reach + _reach(variance[i], spread)
+            near = [
+                other
                 for other, (place, spread, _) in last.items()
-                if other[0] != key[0] and other[1] == key[1]
-            )
-        if len({keys[i][0] for i in off}) > 1 and not taken:
+                if other[1] == key[1]
+                and abs(own.ln_frequency[i] - place)
+                <= _STILL + _PRIOR_SIGMAS * change + _reach(variance[i], spread)
+            ]
+            if not near:
+                elsewhere.add(key[0])
+        if len(elsewhere) > 1:
             jumps.add(k)
         last |= {
             key: (float(own.ln_frequency[i]), float(variance[i]), k)
@@ -358,3 +359,21 @@ def _line_up(
 
 def _rank(source: str) -> tuple[int, str]:
     return (_SOURCES.index(source) if source in _SOURCES else len(_SOURCES), source)
+
+
+def ambiguity_notes(history: History, refused: Sequence[Refusal]) -> list[str]:
+    """Say which modes can no longer be told apart, so that nothing new is known of them."""
+    last = history.logs[-_LATE:]
+    doubted = {
+        name: {
+            r.log for r in refused if r.reason == "ambiguous" and r.mode == name and r.log in last
+        }
+        for name in history.modes
+    }
+    lost = [name for name, logs in doubted.items() if len(last) == _LATE == len(logs)]
+    if not lost:
+        return []
+    return [
+        f"{' and '.join(lost)}: the last {_LATE} logs do not tell which mode their estimates are of, "
+        "so that nothing new is known; logs with more channels would tell modes by their shapes."
+    ]

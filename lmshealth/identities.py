@@ -65,12 +65,15 @@ class Verdict:
         plain.
     expected : ndarray
         Where ln f of each mode was expected, ``(m,)``.
+    jumps : tuple of int
+        Estimates that are of the mode that their name means, far from where it was, or of none.
     """
 
     scan: Scan
     modes: list[int]
     chances: FloatArray
     expected: FloatArray
+    jumps: tuple[int, ...] = ()
 
 
 class Identities:
@@ -133,9 +136,7 @@ class Identities:
             verdict = None if log.opened else self._plain(scan)
             if verdict is None:
                 verdict = self._weigh(scan, log, gone)
-                back.update(np.flatnonzero((verdict.chances[:, :-1] > 0.5).any(0)).tolist())
-            else:
-                back.update(verdict.modes)
+            back.update(mode for mode in verdict.modes if mode >= 0)
             verdicts.append(verdict)
         if self._new:
             self._new.forget(log.epoch, gone, back)
@@ -221,22 +222,21 @@ class Identities:
         chances = grown.chances(m)
         best = np.where(chances.argmax(1) < m, chances.argmax(1), -1)
         modes = np.where(chances.max(1) >= SURE, best, -1).tolist()
-        lone = np.flatnonzero(chances[:, -1] > 0.5).tolist()
-        for i in lone:
+        jumps = [i for i in range(len(modes)) if modes[i] < 0 and _is_jump(i, scan, chances, best)]
+        for i in np.flatnonzero(chances[:, -1] > 0.5).tolist():
             name = log.names[scan.rows[i]]
             if name and name not in self.names:
                 modes[i] = self._found(scan.readings.pick(np.array([i])), name)
-        left = np.array([i for i in lone if modes[i] < 0], dtype=int)
-        # A name whose mode is seen elsewhere in this log tells nothing.
-        free = (scan.names < m) & ~np.isin(scan.names, best)
-        meant = np.where(free, scan.names, -1)[left]
+        lone = [i for i, mode in enumerate(modes) if mode < 0 and chances[i, -1] > 0.5]
+        left = np.array(sorted({*lone, *jumps}), dtype=int)
+        meant = np.where(np.isin(left, jumps), scan.names[left], -1)
         rest = Scan(scan.epoch, scan.rows[left], meant, scan.readings.pick(left), scan.row)
         confirmed = self._new.watch(rest, self._prior_std, self._scale)
         for i, j in zip(left.tolist(), confirmed, strict=True):
             if j is not None:
                 modes[i] = self._confirm(j)
                 gone.add(j)
-        return Verdict(scan, modes, chances, expected)
+        return Verdict(scan, modes, chances, expected, tuple(jumps))
 
     def _found(self, reading: Readings, name: str) -> int:
         """Begin a mode at the first estimate that has its name."""
@@ -273,3 +273,14 @@ class Identities:
             if name not in self.names:
                 return name
         return f"{name[:-3]}_{len(self.names)}_hz"
+
+
+def _is_jump(i: int, scan: Scan, chances: FloatArray, best: IntArray) -> bool:
+    """Tell whether an estimate is of the mode that its name means or of none.
+
+    A name whose mode is seen elsewhere in the log tells nothing.
+    """
+    own = int(scan.names[i])
+    if not 0 <= own < chances.shape[1] - 1 or own in np.delete(best, i):
+        return False
+    return bool(chances[i, own] + chances[i, -1] >= SURE)

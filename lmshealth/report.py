@@ -384,7 +384,7 @@ def _happened(track: Track) -> Iterator[dict[str, Any]]:
     for event in track.events:
         groups.setdefault((event.kind, event.epoch, event.source), []).append(event)
     for (kind, epoch, source), events in groups.items():
-        first = events[0]
+        first, of = events[0], ", damping" if kind == "regreasing" else ""
         yield {
             "kind": kind,
             "source": source,
@@ -393,10 +393,10 @@ def _happened(track: Track) -> Iterator[dict[str, Any]]:
             "known": track.recorded_at[first.found_at],
             "declared": first.declared,
             "sizes": [
-                f"{spell(event.mode)} {signed(100 * event.size, 2)} ± {100 * event.std:.2f}{GAP}%"
+                f"{spell(event.mode)}{of} {signed(100 * event.size, 2)} ± "
+                f"{100 * event.std:.2f}{GAP}%"
                 for event in events
             ],
-            "of": "damping" if kind == "regreasing" else "frequency",
             "evidence": f"{first.evidence:.1f}".replace("-", "−"),
         }
 

@@ -55,8 +55,8 @@ def clopper_pearson(hits: int, trials: int, level: float = 0.95) -> tuple[float,
     return low, high
 
 
-def judge_coverage(hits: int, n: int) -> dict[str, Any]:
+def judge_coverage(hits: int, n: int, nominal: float = NOMINAL) -> dict[str, Any]:
     """Tell how often intervals hold the truth, and whether that may be as often as they claim."""
     low, high = clopper_pearson(hits, n, LEVEL)
     return {"hits": hits, "n": n, "share": hits / n, "low": low, "high": high,
-            "holds": low <= NOMINAL <= high}  # fmt: skip
+            "holds": low <= nominal <= high}  # fmt: skip

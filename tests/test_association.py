@@ -200,6 +200,15 @@ def test_a_jump_is_believed_once_the_next_log_confirms_it(rng: np.random.Generat
     assert "named b" in found.doubts[0].detail
 
 
+@pytest.mark.parametrize("step", [0.01, 0.04, 0.06])
+def test_jumps_of_any_size_cost_at_most_one_estimate(rng: np.random.Generator, step: float) -> None:
+    """One per cent is followed at once, what is more waits for the next log as a jump."""
+    ln_f = steady(rng, 30)
+    ln_f[15:, 1] -= step
+    doubts = run([say(row, "ab") for row in ln_f]).doubts
+    assert [(d.epoch, d.reason) for d in doubts] == ([(15, "jump")] if step > 0.03 else [])
+
+
 def test_a_single_outlier_stays_refused(rng: np.random.Generator) -> None:
     """A peak under a wrong name moves nothing."""
     ln_f = steady(rng, 30)

@@ -16,7 +16,7 @@ from lmshealth.events import Finding, Watch, loop_evidence, reborn, threshold
 from lmshealth.stage import Stage
 from lmshealth.statespace import state_space
 from lmshealth.tracking import track
-from lmshealth.tracks import History, Track
+from lmshealth.tracks import History, Step, Track
 from tests.lives import DAMPING, FREQUENCY, make_stage, rough_history, seen_by, since
 from tests.test_bank import SETTINGS, one, run
 
@@ -110,6 +110,15 @@ def test_the_same_jumps_without_the_loop_are_damage(stage: Stage) -> None:
     tracks = [track(life(seed, **given), stage) for seed in range(8)]
     assert not any(("servo", PLACE, "") in told(found) for found in tracks)
     assert sum(bool(found.alarms) for found in tracks) >= 6
+
+
+def test_a_declared_retuning_is_not_found_again(stage: Stage) -> None:
+    """What is declared explains its jumps and its following error."""
+    step = Step("servo", PLACE, np.arange(N_LOGS) >= PLACE, name="second")
+    found = track(replace(life(3, **HAPPENINGS["servo"]), steps=(step,)), stage)
+    assert {(e.kind, e.declared) for e in found.events} == {("servo", True)}
+    std = np.sqrt(np.diag(found.drift_cov[-1]))
+    assert (np.abs(found.drift[-1]) < 4 * std).all()
 
 
 def test_nothing_is_found_in_quiet_lives(stage: Stage) -> None:

@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from lmshealth.errors import NotEnoughData
-from lmshealth.history import build_history, in_order
+from lmshealth.history import ambiguity_notes, build_history, in_order
+from lmshealth.logs import Refusal
 from lmshealth.maintenance import Action
 from lmshealth.stage import Stage
 from lmshealth.tracking import believed, doubted, track
@@ -206,3 +207,12 @@ def test_no_reading_is_refused(stage: Stage) -> None:
     """A history of nothing names the stage."""
     with pytest.raises(NotEnoughData, match="small: no usable log"):
         build_history([], stage)
+
+
+def test_modes_that_can_no_longer_be_told_apart_are_told(stage: Stage) -> None:
+    """Three logs in a row without a clear identity make a note, two do not."""
+    readings = [make_reading(str(k), k, 1e5 * k, {"roll": 4.8}) for k in range(5)]
+    history, _ = build_history(readings, stage)
+    doubts = [Refusal(str(k), "ambiguous", "", mode="roll") for k in range(5)]
+    assert "roll: the last 3 logs do not tell" in ambiguity_notes(history, doubts[2:])[0]
+    assert ambiguity_notes(history, doubts[:4]) == []

@@ -123,6 +123,21 @@ def test_line_test(root: Path) -> None:
     assert all(answer["passed"].values())
 
 
+def test_tracking_lives(root: Path) -> None:
+    """A few lives of each kind cover and alarm as asked; what must be known and is not alarms."""
+    answer = json.loads(run_study(root, "tracking_lives"))
+    failed = {name for name, fine in answer["passed"].items() if not fine}
+    # So few lives tell narrow intervals by their share alone.
+    assert failed <= {"halved covariances do not cover"}
+    shares = [
+        row["coverage"]["90"]["share_of_all"]
+        for row in answer["lives"]
+        if row["kind"] in ("preload-wear", "mount-loosening", "both", "crash")
+    ]
+    assert answer["halved"]["90"]["share_of_all"] < min(shares) + 0.05
+    assert answer["power"]["over_best_that_learns"] < 2
+
+
 def test_identification(root: Path) -> None:
     """Some records of three kinds are covered as stated, and no mode of them is refused."""
     answer = json.loads(run_study(root, "identification"))

@@ -59,7 +59,7 @@ def draw_swaps(ax: Axes, result: dict[str, Any]) -> None:
     ax.set_xlim(-0.03, 1.03)
     ax.set_xlabel("share of lives, 95 % interval")
     ax.set_title(f"Silent swaps in {result['lives']} lives", fontsize=10)
-    ax.legend(fontsize=7)
+    ax.legend(fontsize=7, loc="upper center")
     ax.grid(alpha=0.25, axis="x")
 
 
@@ -89,7 +89,7 @@ def draw_shares(ax: Axes, kinds: dict[str, dict[str, Any]]) -> None:
             ax.text(value + 0.01, at, f"{100 * value:.1f} %", va="center", fontsize=7)
     ax.set_yticks(range(len(kinds)), list(kinds), fontsize=8)
     ax.invert_yaxis()
-    ax.set_xlim(0, 1.6)
+    ax.set_xlim(0, 2.6)
     ax.set_xticks([0, 0.5, 1])
     ax.set_xlabel("share of estimates labelled")
     ax.set_title("Labels given", fontsize=10)

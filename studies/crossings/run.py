@@ -15,9 +15,15 @@ Method
     controls that must fail: each estimate to the mode that was last seen nearest; and the best
     guess in place of a label of 95 %, where nothing tells.
 Answer
-    ANSWER
+    No life is swapped silently in 200 of each kind: below 1.8 % each with 95 % confidence. The
+    nearest swaps every crossing and half of the merged lives; so does the best guess where nothing
+    tells, all of which is said to be ambiguous. After the crossing 91 % of the estimates named by
+    order are labelled, 97 % without names (names by order speak against a crossing), 88 % with
+    gaps, and all with shapes. The rest stays ambiguous: slopes too alike. Where shapes mix, labels
+    go over a few logs early or late. One spurious estimate in 28 is taken for a mode that the log
+    misses; none founds a track. Of 60,000 estimates of modes well apart none is refused.
 Run time
-    MINUTES
+    Five minutes of one processor.
 """
 
 from __future__ import annotations

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from datetime import datetime
 from functools import lru_cache
@@ -233,10 +232,3 @@ def _declared(life: Life) -> tuple[Step, ...]:
     if life.kind == "regreasing":
         return (Step("regreasing", k, there, name=f"{life.recorded_at[k]:%Y-%m-%d}"),)
     return (Step("servo", k, there, name=str(life.servo[k])),)
-
-
-def many(
-    make: Callable[[Plan], Life], stage: str, kind: str, seeds: range, logs: int
-) -> list[Life]:
-    """Take lives of one kind, one per seed."""
-    return [make(plan_of(stage, kind, seed, logs)) for seed in seeds]
