@@ -20,9 +20,19 @@ Method
     life, one setting, regular logs: the largest difference of ln f in standard deviations, and
     processor time as a multiple of the plain filterpy loop, the median over the turns.
 Answer
-    ANSWER
+    Yes. Over 2,000 lives the mean squares of errors and innovations are 0.97 to 1.01 of what the
+    filter says, all in their bands; with half the covariance 1.3 to 1.7. Quantiles of the average
+    over settings cover 50 to 52 and 90 to 92 % in 1,000 lives. The published mean and standard
+    deviation are on the safe side: taken for a normal distribution they cover 56 to 59 and 92 to
+    93 %, as the average has heavier tails, and their squared errors are 0.80 to 0.85 of what they
+    say. Reported covariances of half the size are found out: 54 and 89 %. Two sources cover as one
+    does, with intervals a tenth narrower; taken for independent they cover 36 and 72 %. ln f is
+    that of filterpy, simdkalman and statsmodels to 2e-11 standard deviations. Tracking 10,000
+    epochs of five modes takes 4.4 times the filterpy loop of one setting, 2.2 s on a processor
+    shared with other work, where 2 s were asked for; statsmodels, whose loop is compiled and holds
+    ln f alone, takes 0.4 times.
 Run time
-    A quarter of an hour of one processor. simdkalman and statsmodels come with the extra
+    Two minutes of one processor. simdkalman and statsmodels come with the extra
     ``peers``; without them their rows are missing.
 """
 
