@@ -30,7 +30,7 @@ def draw_sums(ax: Axes, known: dict[str, Any]) -> None:
     ax.set_ylim(len(names) - 0.4, -0.9)
     ax.set_xlabel("mean square in units of what the filter says")
     ax.set_title(f"True setting, {known['lives']:,} lives", fontsize=10)
-    ax.legend(fontsize=7, loc="upper right", ncols=1)
+    ax.legend(fontsize=7, loc="lower right")
 
 
 def draw_coverage(ax: Axes, rows: dict[str, list[dict[str, Any]]], title: str) -> None:

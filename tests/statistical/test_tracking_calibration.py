@@ -38,7 +38,7 @@ def test_intervals_of_the_tracker_cover(rng: np.random.Generator, machine: Stage
     Its mean and standard deviation, as of a normal distribution, cover no less; with half the width
     they do. Half the reported covariance is no control here: the tracker finds it out.
     """
-    found = averaged(rng, 160, 40, machine)
+    found = averaged(rng, 300, 40, machine)
     for name, rows in found["mixture"].items():
         for row in rows:
             assert row["holds"], f"{name}: {row}"
