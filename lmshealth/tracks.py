@@ -122,7 +122,47 @@ class History:
             raise ValueError(f"baselines are logs {self.baselines} of {n}")
         if {one.mode for one in self.series} - set(self.modes):
             raise ValueError(f"series {self.series} of modes that are not among {self.modes}")
+        self._expect_order()
+        self._expect_errors()
         freeze(self)
+
+    def _expect_order(self) -> None:
+        """Insist on logs in the order of recording, and on an odometer that never runs backwards.
+
+        Raises
+        ------
+        ValueError
+            Naming the log that comes too late.
+        """
+        for name, ticks in (
+            ("recorded_at", [moment.timestamp() for moment in self.recorded_at]),
+            ("travel", self.travel if self.has_odometer else []),
+        ):
+            back = np.flatnonzero(np.diff(ticks) < 0)
+            if back.size:
+                raise ValueError(
+                    f"{name} runs backwards at {self.logs[back[0] + 1]}: sort the logs"
+                )
+
+    def _expect_errors(self) -> None:
+        """Insist on a covariance of every estimate.
+
+        Raises
+        ------
+        ValueError
+            Naming a log and a series whose estimate has none, or a variance that is not positive.
+        """
+        there = np.isfinite(np.hstack([self.ln_frequency, self.ln_damping]))
+        variance = np.einsum("kii->ki", self.cov)
+        both = there[:, :, None] & there[:, None, :]
+        wrong = (there & ~(variance > 0)) | (both & ~np.isfinite(self.cov)).any(axis=2)
+        if wrong.any():
+            k, row = np.argwhere(wrong)[0]
+            one = self.series[row % len(self.series)]
+            raise ValueError(
+                f"{self.logs[k]}: {one.mode} by {one.source} has an estimate of variance "
+                f"{variance[k, row]:g}, or without covariances; needed are positive ones"
+            )
 
     @property
     def baseline(self) -> int:

@@ -243,7 +243,8 @@ def test_frequency_without_track(ax: Axes, history: History) -> None:
 
 def test_quiet_mode_is_no_drama(ax: Axes, history: History) -> None:
     """A mode that hardly moves is shown on a scale of at least 1 %."""
-    still = replace(history, ln_frequency=np.full_like(history.ln_frequency, np.log(100.0)))
+    flat = np.where(np.isnan(history.ln_frequency), np.nan, np.log(100.0))
+    still = replace(history, ln_frequency=flat)
     trackplots.plot_frequencies(ax, replace(still, cov=1e-12 * history.cov), None, "yaw")
     low, high = ax.get_ylim()
     assert high - low >= 0.99

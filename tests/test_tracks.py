@@ -66,6 +66,33 @@ def test_histories_that_contradict_themselves_are_refused(
         replace(history, **{field: value})
 
 
+@pytest.mark.parametrize("variance", [np.nan, 0.0, -1e-6])
+def test_estimates_without_errors_are_refused(history: History, variance: float) -> None:
+    """No std, none at all and a negative variance are named, with their log and series."""
+    cov = np.array(history.cov)
+    cov[5, 2, 2] = variance
+    with pytest.raises(ValueError, match=r"005.csv: roll by delta_e has an estimate of variance"):
+        replace(history, cov=cov)
+    cov = np.array(history.cov)
+    cov[5, 2, 3] = np.nan
+    with pytest.raises(ValueError, match=r"005.csv: roll by delta_e .* without covariances"):
+        replace(history, cov=cov)
+
+
+def test_logs_out_of_order_are_refused(history: History) -> None:
+    """A clock or an odometer that runs backwards is named; logs at one moment are not refused."""
+    moments = list(history.recorded_at)
+    moments[4], moments[5] = moments[5], moments[4]
+    with pytest.raises(ValueError, match=r"recorded_at runs backwards at 005.csv"):
+        replace(history, recorded_at=tuple(moments))
+    travel = np.array(history.travel)
+    travel[7] = travel[8] + 1
+    with pytest.raises(ValueError, match=r"travel runs backwards at 008.csv"):
+        replace(history, travel=travel)
+    moments[5] = moments[4] = moments[3]
+    assert replace(history, recorded_at=tuple(moments)).clock().size == 16
+
+
 def test_arrays_are_read_only(history: History) -> None:
     """Nobody writes to a history, a step or a track."""
     followed = make_track(np.zeros((3, 2)), np.zeros((3, 2, 2)))

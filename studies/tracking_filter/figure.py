@@ -30,7 +30,7 @@ def draw_sums(ax: Axes, known: dict[str, Any]) -> None:
     ax.set_ylim(len(names) - 0.4, -0.9)
     ax.set_xlabel("mean square in units of what the filter says")
     ax.set_title(f"True setting, {known['lives']:,} lives", fontsize=10)
-    ax.legend(fontsize=7, loc="upper right", ncols=1)
+    ax.legend(fontsize=7, loc="lower right")
 
 
 def draw_coverage(ax: Axes, rows: dict[str, list[dict[str, Any]]], title: str) -> None:
@@ -74,7 +74,9 @@ def main() -> None:
     figure = Figure(figsize=(11.0, 6.5), layout="constrained")
     axes = figure.subplots(2, 2)
     draw_sums(axes[0, 0], result["known_setting"])
-    rows = dict(average["coverage"]) | {"drift, half width\n(control)": average["control"]}
+    rows = {f"{name}, quantiles": levels for name, levels in average["mixture"].items()}
+    rows |= {f"{name}, ± std": levels for name, levels in average["coverage"].items()}
+    rows |= {"drift, half width\n(control)": average["control"]}
     draw_coverage(axes[0, 1], rows, f"Tracker, {average['lives']:,} lives")
     names = {
         "both": "both",

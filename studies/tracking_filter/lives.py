@@ -9,6 +9,7 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import stats
 
 from lmshealth.bank import Filter, Settings, settings
 from lmshealth.stage import Stage, load_stage
@@ -205,3 +206,24 @@ def filtered(life: Life, machine: Stage) -> Filtered:
     # The prior is centred on the first log, which surprises nobody.
     dof = 2.0 * np.isfinite(life.history.ln_frequency).sum(axis=1)
     return Filtered(mean, cov, nis[1:], dof[1:])
+
+
+def mixture(life: Life, machine: Stage, k: int, i: int) -> dict[str, float]:
+    """Probability that the average over all settings gives to less than the truth, at one log."""
+    space = state_space(life.history, machine)
+    filters = Filter(space, life.history.baselines)
+    bank = filters.start()
+    for j in range(k + 1):
+        filters.move(bank, j)
+        filters.see(bank, j)
+        bank = bank.pruned()
+    levels, bases = space.level.start + i, space.base.start + i
+    places = {"ln f": [levels], "ln ζ": [space.damping.start + i], "drift": [levels, bases]}
+    below = {}
+    for name, own in places.items():
+        sign = np.array([1.0, -1.0])[: len(own)]
+        mean = bank.mean[:, own] @ sign
+        variance = np.einsum("a,gab,b->g", sign, bank.cov[:, own][:, :, own], sign)
+        off = (life.truth()[name][k, i] - mean) / np.sqrt(np.maximum(variance, 1e-24))
+        below[name] = float(bank.weight @ stats.norm.cdf(off))
+    return below
