@@ -188,7 +188,7 @@ class Surprise:
     innovation : ndarray
         Standardised by its mean and variance over all settings, shape ``(n_rows,)``.
     nis : float
-        Normalised innovation squared, averaged over the settings.
+        Normalised innovation squared, by mean and covariance over all settings.
     """
 
     rows: np.ndarray
@@ -317,19 +317,25 @@ class Filter:
         bank.cov -= np.swapaxes(gain, 1, 2) @ gain
         log_det = np.log(np.einsum("gii->gi", root)).sum(axis=1)
         bank.log_weight += -0.5 * nis - log_det - 0.5 * value.size * np.log(2 * np.pi)
-        centre = weight @ off
-        variance = weight @ (np.einsum("gii->gi", spread) + (off - centre) ** 2)
-        innovation = centre / np.sqrt(variance)
-        if doubted is None:
-            return Surprise(rows, innovation, float(weight @ nis))
-        rest = np.flatnonzero(~doubted[rows])
-        nis = _nis(off[:, rest], spread[:, rest[:, None], rest])
-        return Surprise(rows[rest], innovation[rest], float(weight @ nis))
+        return _surprise(rows, weight, off, spread, doubted)
 
 
-def _nis(off: FloatArray, spread: FloatArray) -> FloatArray:
-    """Normalised innovations squared under every setting, shape ``(n_settings,)``."""
-    return np.asarray(np.einsum("gi,gi->g", off, np.linalg.solve(spread, off[:, :, None])[:, :, 0]))
+def _surprise(
+    rows: np.ndarray,
+    weight: FloatArray,
+    off: FloatArray,
+    spread: FloatArray,
+    doubted: np.ndarray | None,
+) -> Surprise:
+    """Judge innovations by their mean and covariance over all settings, without outliers."""
+    centre = weight @ off
+    rest = off - centre
+    cov = np.tensordot(weight, spread, axes=1) + (rest * weight[:, None]).T @ rest
+    if doubted is not None:
+        kept = np.flatnonzero(~doubted[rows])
+        rows, centre, cov = rows[kept], centre[kept], cov[np.ix_(kept, kept)]
+    nis = float(centre @ np.linalg.solve(cov, centre))
+    return Surprise(rows, centre / np.sqrt(cov.diagonal()), nis)
 
 
 def _diagonal(cov: FloatArray, rows: slice, columns: slice | None = None) -> FloatArray:

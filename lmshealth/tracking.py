@@ -384,9 +384,10 @@ def _widening(nis: FloatArray, dof: FloatArray, innovations: FloatArray) -> Floa
     squares = np.cumsum(np.nansum(innovations**2, axis=1))
     count = np.cumsum(np.isfinite(innovations).sum(axis=1))
     size = squares / np.maximum(count, 1)
-    mean = np.cumsum(np.where(there, products, 0.0).sum(axis=1)) / np.maximum(n, 1)
-    rho = np.clip(mean / np.maximum(size, 1e-12), -0.9, 0.9)
-    clear = rho * np.sqrt(n) > stats.norm.isf(_WIDEN)
+    sums = np.where(there, products, 0.0).sum(axis=1)
+    rho = np.clip(np.cumsum(sums) / np.maximum(n, 1) / np.maximum(size, 1e-12), -0.9, 0.9)
+    # As in `consistency`, the sums over a log are what is independent.
+    clear = np.cumsum(sums) > stats.norm.isf(_WIDEN) * np.sqrt(np.cumsum(sums**2))
     factor = factor * np.where(clear, (1 + rho) / (1 - rho), 1.0)
     return np.asarray(np.sqrt(factor))
 

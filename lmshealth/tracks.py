@@ -404,11 +404,14 @@ def consistency(nis: FloatArray, dof: FloatArray, innovations: FloatArray) -> Co
     pairs = innovations[1:] * innovations[:-1]
     there = np.isfinite(pairs)
     n = int(there.sum())
+    # Series of one log may have errors in common: the sums over a log are the independent ones.
+    sums = np.where(there, pairs, 0.0).sum(axis=1)
+    scale = float(np.sqrt(np.sum(sums**2)))
     size = float(np.mean(innovations[np.isfinite(innovations)] ** 2)) if n else 1.0
     correlation = float(pairs[there].mean()) / max(size, 1e-12) if n else 0.0
     return Consistency(
         nis=total / degrees if degrees else 1.0,
         p_value=float(2 * min(tail, 1 - tail)),
         autocorrelation=correlation,
-        autocorrelation_p_value=float(2 * stats.norm.sf(abs(correlation) * np.sqrt(n))),
+        autocorrelation_p_value=float(2 * stats.norm.sf(abs(sums.sum()) / scale)) if n else 1.0,
     )
