@@ -21,6 +21,15 @@ Method
     in raw.json; ``--cache`` names a folder that keeps their estimates. Of so many seeds every one
     is used of the kinds healthy, temperature, payload and retuning on LMS-Y, and every fourth of
     the others.
+Answer
+    Intervals of 90 and 50 % cover in all five kinds of damage; of healthy lives they hold the truth
+    in 98 to 100 % and 79 to 88 %. Of 4,200 healthy tracks one alarms, all 1,500 damaged ones do.
+    Temperature, payload or retuning unknown alarm in 68 to 100 of 100 lives; halved covariances
+    cover 83 % of 90. The loss of 5 % is told in 300 of 300 lives, after 23 logs in the median:
+    1.4 times the optimum that has to learn what a tracker must, 2.2 times the one that knows it.
+    Retunings are found in all lives, crashes and broken bolts in all but two of 600, as a rule with
+    their second log; regreasings in 267 of 300 on LMS-Y, where some move little, and all on LMS-X.
+    Raw lives are few, and agree.
 Run time
     A quarter of an hour of one processor; of raw lives half a minute each, where not kept.
 """
