@@ -208,7 +208,7 @@ class _Follower:
             begun = reborn(self.memory[j - 1], self.filters)
         else:
             there = np.arange(len(self.history.logs)) >= j
-            step = Step(finding.kind, j, there, finding.source, declared=False)  # type: ignore[arg-type]
+            step = Step(finding.kind, j, there, finding.source, declared=False)
             self.filters = Filter(self.filters.space.with_step(step), self.history.baselines)
             self.found.findings[len(self.filters.space.steps) - 1] = (finding, k)
             self.watch.settle(self.filters.space.steps)

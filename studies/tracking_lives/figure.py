@@ -114,8 +114,8 @@ def draw_events(ax: Axes, rows: list[dict[str, Any]]) -> None:
     for y, row in enumerate(rows):
         interval(ax, y, row["events"]["found_right"], BLUE, "o")
         until = row["events"]["logs_until"]
-        ax.text(0.61, y, f"after {until['q50']:g} of its logs (95 %: {until['q95']:.0f})", va="center",
-                fontsize=7)  # fmt: skip
+        when = f"{until['q50']:g} after its first log (95 %: {until['q95']:.0f})"
+        ax.text(0.61, y, when, va="center", fontsize=7)
     ax.set_yticks(range(len(rows)), [label(row) for row in rows])
     ax.invert_yaxis()
     ax.set_xlim(0.6, 1.01)

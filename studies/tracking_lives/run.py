@@ -77,6 +77,7 @@ CASES = [("lms-y", kind) for kind in HEALTHY + DAMAGED] + [("lms-x", kind) for k
 # Kinds whose cause is declared by somebody, or not.
 DECLARABLE = ("servo-retuning", "regreasing")
 FIRST_SEED, RAW_SEED, SIZES_SEED = 6000, 100, 7
+CONTROLS = 100  # lives at most of each negative control
 # Alarms of damage, and events found, of all.
 ENOUGH = 0.95
 # Of more lives than that the sizes are taken from a dozen logs and not from eight.
@@ -114,7 +115,7 @@ def study(n: int) -> dict[str, Any]:
             for life in lives(stage, kind, n)
         ]
         rows += judged(drawn_lives)
-        blind += controls(drawn_lives[: max(n // 3, 1)])
+        blind += controls(drawn_lives[:CONTROLS])
         if kind in DAMAGED:
             narrow += halved(drawn_lives)
     answer = {
