@@ -330,7 +330,8 @@ def _surprise(
     """Judge innovations by their mean and covariance over all settings, without outliers."""
     centre = weight @ off
     rest = off - centre
-    cov = np.tensordot(weight, spread, axes=1) + (rest * weight[:, None]).T @ rest
+    n = centre.size
+    cov = (weight @ spread.reshape(-1, n * n)).reshape(n, n) + (rest * weight[:, None]).T @ rest
     if doubted is not None:
         kept = np.flatnonzero(~doubted[rows])
         rows, centre, cov = rows[kept], centre[kept], cov[np.ix_(kept, kept)]
@@ -340,5 +341,7 @@ def _surprise(
 
 def _diagonal(cov: FloatArray, rows: slice, columns: slice | None = None) -> FloatArray:
     """Give the diagonals of a block of matrices as a view to write to, ``(n, n_modes)``."""
-    block: FloatArray = np.einsum("kii->ki", cov[:, rows, rows if columns is None else columns])
-    return block
+    size, other = cov.shape[1], rows if columns is None else columns
+    first = rows.start * size + other.start
+    # Along a diagonal a matrix in a row steps by its size and one.
+    return cov.reshape(-1, size * size)[:, first :: size + 1][:, : rows.stop - rows.start]

@@ -51,6 +51,8 @@ _LOOP_LEAP = 0.01
 class Watch:
     """Sums of standardised innovations over windows that end at the last log; leaps of the loop.
 
+    Beside every row all frequencies are summed, and all dampings, as grease moves all of them.
+
     Parameters
     ----------
     n_rows : int
@@ -72,8 +74,9 @@ class Watch:
         n_logs = loop_error.size
         self.leaps = np.flatnonzero(_leaps(loop_error))
         self.innovations = np.full((n_logs, n_rows), np.nan)
-        self._sum = np.zeros((n_logs + 1, n_rows))
-        self._count = np.zeros((n_logs + 1, n_rows))
+        self._rows = np.hstack([np.eye(n_rows), np.repeat(np.eye(2), n_rows // 2, axis=0)])
+        self._sum = np.zeros((n_logs + 1, n_rows + 2))
+        self._count = np.zeros((n_logs + 1, n_rows + 2))
         self.first = 1
 
     def add(self, k: int, surprise: Surprise, kept: Surprise) -> None:
@@ -83,9 +86,9 @@ class Watch:
         """
         self.innovations[k] = np.nan
         self.innovations[k, kept.rows] = kept.innovation
-        self._sum[k + 1], self._count[k + 1] = self._sum[k], self._count[k]
-        self._sum[k + 1, surprise.rows] += surprise.innovation
-        self._count[k + 1, surprise.rows] += 1
+        own = self._rows[surprise.rows]
+        self._sum[k + 1] = self._sum[k] + surprise.innovation @ own
+        self._count[k + 1] = self._count[k] + own.sum(axis=0)
 
     def settle(self, steps: tuple[Step, ...]) -> None:
         """Suspect nothing where the following error leaps at a step that is known."""

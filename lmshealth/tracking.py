@@ -197,8 +197,12 @@ class _Follower:
             )
             if finding is not None and finding.believed:
                 if finding.settled(k):
-                    return self._adopt(finding, bank, k)
-                found.open = finding
+                    adopted = self._adopt(finding, bank, k)
+                    # A drift that is no damage yet leaves all as it was, the alarm too.
+                    if adopted is not bank:
+                        return adopted
+                else:
+                    found.open = finding
         # A single log that leans may be an outlier, or the first after a step: the next one tells.
         # Of what is not settled yet, later logs tell whether it is damage.
         waiting = found.open is not None and not found.open.settled(k)

@@ -53,7 +53,7 @@ def draw_coverage(ax: Axes, result: dict[str, Any], raw: dict[str, Any]) -> None
     ax.set_xlim(0.2, 1.02)
     ax.set_xlabel("share of intervals of the drift that hold the truth")
     ax.set_title("Coverage", fontsize=10)
-    ax.legend(fontsize=7, loc="lower left")
+    ax.legend(fontsize=7, loc="upper left")
     ax.grid(axis="x", alpha=0.25)
 
 
@@ -83,7 +83,7 @@ def draw_alarms(ax: Axes, result: dict[str, Any], raw: dict[str, Any]) -> None:
     ax.invert_yaxis()
     ax.set_xlabel("share of lives with an alarm (none: left edge), 99.9 % interval")
     ax.set_title("Alarms, 1 % declared", fontsize=10)
-    ax.legend(fontsize=7, loc="center")
+    ax.legend(fontsize=7, loc="upper right")
     ax.grid(axis="x", alpha=0.25)
 
 
@@ -114,8 +114,8 @@ def draw_events(ax: Axes, rows: list[dict[str, Any]]) -> None:
     for y, row in enumerate(rows):
         interval(ax, y, row["events"]["found_right"], BLUE, "o")
         until = row["events"]["logs_until"]
-        ax.text(0.61, y, f"{until['q50']:g} logs later (95 %: {until['q95']:g})", va="center",
-                fontsize=7)  # fmt: skip
+        when = f"{until['q50']:g} after its first log (95 %: {until['q95']:.0f})"
+        ax.text(0.61, y, when, va="center", fontsize=7)
     ax.set_yticks(range(len(rows)), [label(row) for row in rows])
     ax.invert_yaxis()
     ax.set_xlim(0.6, 1.01)

@@ -21,6 +21,15 @@ Method
     in raw.json; ``--cache`` names a folder that keeps their estimates. Of so many seeds every one
     is used of the kinds healthy, temperature, payload and retuning on LMS-Y, and every fourth of
     the others.
+Answer
+    Intervals of 90 and 50 % cover in all five kinds of damage; of healthy lives they hold the truth
+    in 98 to 100 % and 79 to 88 %. Of 4,200 healthy tracks one alarms, all 1,500 damaged ones do.
+    Temperature, payload or retuning unknown alarm in 68 to 100 of 100 lives; halved covariances
+    cover 83 % of 90. The loss of 5 % is told in 300 of 300 lives, after 23 logs in the median:
+    1.4 times the optimum that has to learn what a tracker must, 2.2 times the one that knows it.
+    Retunings are found in all lives, crashes and broken bolts in all but two of 600, as a rule with
+    their second log; regreasings in 267 of 300 on LMS-Y, where some move little, and all on LMS-X.
+    Raw lives are few, and agree.
 Run time
     A quarter of an hour of one processor; of raw lives half a minute each, where not kept.
 """
@@ -68,6 +77,7 @@ CASES = [("lms-y", kind) for kind in HEALTHY + DAMAGED] + [("lms-x", kind) for k
 # Kinds whose cause is declared by somebody, or not.
 DECLARABLE = ("servo-retuning", "regreasing")
 FIRST_SEED, RAW_SEED, SIZES_SEED = 6000, 100, 7
+CONTROLS = 100  # lives at most of each negative control
 # Alarms of damage, and events found, of all.
 ENOUGH = 0.95
 # Of more lives than that the sizes are taken from a dozen logs and not from eight.
@@ -105,7 +115,7 @@ def study(n: int) -> dict[str, Any]:
             for life in lives(stage, kind, n)
         ]
         rows += judged(drawn_lives)
-        blind += controls(drawn_lives[: max(n // 3, 1)])
+        blind += controls(drawn_lives[:CONTROLS])
         if kind in DAMAGED:
             narrow += halved(drawn_lives)
     answer = {
