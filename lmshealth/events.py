@@ -223,8 +223,8 @@ def _weigh(
     known = _known(filters.space.steps, j)
     for kind, source in kinds:
         loop = None if known else loop_evidence(history.loop_error, j, now, kind)
-        # Without it nothing tells a retuning from damage.
-        if kind == "servo" and loop is None:
+        # Where the loop has not changed, or nothing is known of it, it was not tuned.
+        if kind == "servo" and (loop is None or loop < 0):
             continue
         step = Step(kind, j, np.arange(len(history.logs)) >= j, source, declared=False)
         changed = filters.with_step(step)

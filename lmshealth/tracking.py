@@ -184,6 +184,9 @@ class _Follower:
         """Raise the alarm of a drift, and explain what looks like more than that."""
         found = self.found
         suspect = self.watch.suspect(k)
+        if found.open is not None and suspect is not None:
+            # What is believed to have happened keeps its place until it is settled.
+            suspect = found.open.first
         # What was weighed a moment ago is weighed again once there is notably more to it.
         if suspect is not None and not self._just_tested(suspect, k):
             found.tested = (suspect, k)

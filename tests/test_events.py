@@ -192,26 +192,37 @@ def test_leaps_of_the_loop_are_suspected() -> None:
     lone = error.copy()
     lone[15] *= 1.5
     error[20:] *= 1.5
-    watch = Watch(1, error)
+    watch = Watch(2, error)
     assert watch.suspect(20) is None
     assert watch.suspect(21) == 20
-    assert Watch(1, lone).suspect(16) is None
+    assert Watch(2, lone).suspect(16) is None
     watch.settle((since("servo", 20, 30),))
     assert watch.suspect(21) is None
 
 
 def test_windows_do_not_reach_before_the_chapter() -> None:
     """What leaned before an event is explained by it."""
-    watch = Watch(1, np.full(10, np.nan))
-    rows = np.arange(1)
+    watch = Watch(2, np.full(10, np.nan))
+    rows = np.arange(2)
     for k in range(6):
-        own = Surprise(rows, np.array([4.0]), 16.0)
+        own = Surprise(rows, np.array([4.0, 0.0]), 16.0)
         watch.add(k, own, own)
     assert watch.suspect(5) == 2
     watch.first = 4
     assert watch.suspect(5) == 4
     watch.first = 5
     assert watch.suspect(5) is None
+
+
+def test_what_moves_all_dampings_is_suspected_before_each_of_them() -> None:
+    """Four rows that lean by 2.2 together lean as far as one by 4.4; one alone does not."""
+    for leaning, suspected in (((0, 0, 1, 1), 10), ((0, 0, 1, 0), None)):
+        watch, rows = Watch(4, np.full(20, np.nan)), np.arange(4)
+        for k in range(12):
+            lean = 2.2 * (k >= 10) * np.array(leaning)
+            own = Surprise(rows, lean, float(lean @ lean))
+            watch.add(k, own, own)
+        assert watch.suspect(11) == suspected
 
 
 def student_bayes_factor(before: FloatArray, after: FloatArray) -> float:
