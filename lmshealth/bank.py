@@ -297,7 +297,9 @@ class Filter:
             return Surprise(np.array([], dtype=int), np.array([]), 0.0)
         scales = bank.settings.scales[:, self.scale_of[rows]]
         noise = self.noise[k] if self.whole[k] else self.noise[k][np.ix_(rows, rows)]
-        crossed = bank.cov @ matrix.T
+        n, size = bank.mean.shape
+        # One product of all states with the matrix instead of one each.
+        crossed = (bank.cov.reshape(-1, size) @ matrix.T).reshape(n, size, -1)
         spread = matrix @ crossed + noise * scales[:, :, None] * scales[:, None, :]
         i = self.all[: value.size]
         spread[:, i, i] += self.extra[k, rows]
@@ -307,15 +309,15 @@ class Filter:
             spread[:, outlying, outlying] += self.anywhere[rows[outlying]]
             bank.log_weight += np.log(_OUTLIERS)
         root = np.linalg.cholesky(spread)
+        half = np.linalg.inv(root)
         off = value - bank.mean @ matrix.T
-        right = np.concatenate([off[:, :, None], np.swapaxes(crossed, 1, 2)], axis=2)
-        whitened = np.linalg.solve(root, right)
-        white, gain = whitened[:, :, 0], whitened[:, :, 1:]
-        nis = np.einsum("gi,gi->g", white, white)
+        white = (half @ off[:, :, None])[:, :, 0]
+        gain = half @ np.swapaxes(crossed, 1, 2)
+        nis = np.square(white).sum(axis=1)
         weight = bank.weight
         bank.mean += (white[:, None, :] @ gain)[:, 0, :]
         bank.cov -= np.swapaxes(gain, 1, 2) @ gain
-        log_det = np.log(np.einsum("gii->gi", root)).sum(axis=1)
+        log_det = np.log(root[:, i, i]).sum(axis=1)
         bank.log_weight += -0.5 * nis - log_det - 0.5 * value.size * np.log(2 * np.pi)
         return _surprise(rows, weight, off, spread, doubted)
 
