@@ -61,7 +61,10 @@ def track(ctx: click.Context, /, table: Path, out: Path, **options: Any) -> None
     actions = read_actions(options["maintenance"]) if options["maintenance"] else ()
     rows: dict[str, list[Row]] = {name: [] for name in _TABLES}
     notes = list(read.notes)
-    for machine in dict.fromkeys(reading.metadata.stage for reading in read.readings):
+    machines = dict.fromkeys(str(reading.metadata.stage) for reading in read.readings)
+    for name in dict.fromkeys(a.stage for a in actions if a.stage not in machines):
+        notes.append(f"maintenance of {name} is not used: the table has {', '.join(machines)}")
+    for machine in machines:
         own = [reading for reading in read.readings if reading.metadata.stage == machine]
         history, lost = build_history(own, stage, [a for a in actions if a.stage == machine])
         followed = follow(history, stage)
@@ -115,6 +118,7 @@ def _write(rows: dict[str, list[Row]], targets: dict[str, Path | None]) -> None:
         if target is None:
             continue
         try:
+            target.parent.mkdir(parents=True, exist_ok=True)
             target.write_text(frame(COLUMNS[name], rows[name]).to_csv(index=False))
         except OSError as error:
             raise BadTable(f"{target}: cannot be written: {error.strerror}") from error
