@@ -96,9 +96,9 @@ def _rows(track: Track, smoothed: Smoothed | None, refused: list[Refusal]) -> di
 
 def _notes(history: History, refused: list[Refusal]) -> list[str]:
     """Say what the reader of a track must know of its machine."""
-    from lmshealth.history import ambiguity_notes
+    from lmshealth.history import lost_notes
 
-    notes = [f"{history.stage}: {note}" for note in ambiguity_notes(history, refused)]
+    notes = [f"{history.stage}: {note}" for note in lost_notes(history, refused)]
     if not history.has_odometer:
         notes.append(f"{history.stage}: not every log has travel_km, so the clock is the time")
     if len(history.logs) == 1:
