@@ -61,7 +61,10 @@ def track(ctx: click.Context, /, table: Path, out: Path, **options: Any) -> None
     actions = read_actions(options["maintenance"]) if options["maintenance"] else ()
     rows: dict[str, list[Row]] = {name: [] for name in _TABLES}
     notes = list(read.notes)
-    for machine in dict.fromkeys(reading.metadata.stage for reading in read.readings):
+    machines = dict.fromkeys(str(reading.metadata.stage) for reading in read.readings)
+    for name in dict.fromkeys(a.stage for a in actions if a.stage not in machines):
+        notes.append(f"maintenance of {name} is not used: the table has {', '.join(machines)}")
+    for machine in machines:
         own = [reading for reading in read.readings if reading.metadata.stage == machine]
         history, lost = build_history(own, stage, [a for a in actions if a.stage == machine])
         followed = follow(history, stage)
@@ -93,9 +96,9 @@ def _rows(track: Track, smoothed: Smoothed | None, refused: list[Refusal]) -> di
 
 def _notes(history: History, refused: list[Refusal]) -> list[str]:
     """Say what the reader of a track must know of its machine."""
-    from lmshealth.history import ambiguity_notes
+    from lmshealth.history import lost_notes
 
-    notes = [f"{history.stage}: {note}" for note in ambiguity_notes(history, refused)]
+    notes = [f"{history.stage}: {note}" for note in lost_notes(history, refused)]
     if not history.has_odometer:
         notes.append(f"{history.stage}: not every log has travel_km, so the clock is the time")
     if len(history.logs) == 1:
@@ -115,6 +118,7 @@ def _write(rows: dict[str, list[Row]], targets: dict[str, Path | None]) -> None:
         if target is None:
             continue
         try:
+            target.parent.mkdir(parents=True, exist_ok=True)
             target.write_text(frame(COLUMNS[name], rows[name]).to_csv(index=False))
         except OSError as error:
             raise BadTable(f"{target}: cannot be written: {error.strerror}") from error

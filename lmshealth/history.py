@@ -361,18 +361,24 @@ def _rank(source: str) -> tuple[int, str]:
     return (_SOURCES.index(source) if source in _SOURCES else len(_SOURCES), source)
 
 
-def ambiguity_notes(history: History, refused: Sequence[Refusal]) -> list[str]:
-    """Say which modes can no longer be told apart, so that nothing new is known of them."""
+def lost_notes(history: History, refused: Sequence[Refusal]) -> list[str]:
+    """Say which modes are no longer seen or told apart, so that nothing new is known of them."""
     last = history.logs[-_LATE:]
     doubted = {
         name: {r.log for r in refused if (r.reason, r.mode) == ("ambiguous", name)} & set(last)
         for name in history.modes
     }
     lost = [name for name, logs in doubted.items() if len(last) == _LATE == len(logs)]
-    if not lost:
-        return []
-    return [
-        f"{' and '.join(lost)}: the last {_LATE} logs do not tell which mode their estimates are "
-        "of, so that nothing new is known; logs with more channels would tell modes by their "
-        "shapes."
-    ]
+    notes = []
+    if lost:
+        notes.append(
+            f"{' and '.join(lost)}: the last {_LATE} logs do not tell which mode their estimates "
+            "are of, so that nothing new is known; logs with more channels would tell modes by "
+            "their shapes."
+        )
+    for name in history.modes:
+        seen, _ = np.nonzero(np.isfinite(history.ln_frequency[:, history.columns(name)]))
+        missed = len(history.logs) - 1 - int(seen.max(initial=-1))
+        if missed >= _LATE and name not in lost:
+            notes.append(f"{name}: no estimate in the last {missed} logs; nothing new is known.")
+    return notes

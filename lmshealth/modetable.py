@@ -35,6 +35,8 @@ _NUMBERS = (
 _OF_LOG = ("stage", "recorded_at", "travel_km", "servo_id", "delta_e_below_40hz_um", "baseline")
 _SHAPE = "shape_"
 _TOLD = 3
+# Relative standard deviations below drown in the rounding of variances.
+_FINEST = 1e-7
 _UNKNOWN_SOURCE = "unknown"
 
 
@@ -78,9 +80,7 @@ def read_estimates(
         there twice, or rows of one log contradict each other.
     """
     table = _read(path)
-    missing = [name for name in _NEEDED if name not in table.columns]
-    if missing:
-        raise BadTable(f"{path}: no column {missing}; there are {list(table.columns)}")
+    _demand(path, table, _NEEDED)
     if table.empty:
         raise BadTable(f"{path}: no row; needed is at least one estimate")
     covariates = [*COVARIATES]
@@ -96,15 +96,49 @@ def read_estimates(
         _reading(path, str(log), rows, [c for c in covariates if c in table.columns], shapes, terms)
         for (_, log), rows in table.groupby(["stage", "log"], sort=False)
     )
-    moments = [reading.metadata.recorded_at for reading in readings]
-    if any(a and b and a > b for a, b in pairwise(moments)):
-        notes.append("the logs are not in the order of time; they are put in it")
-    if terms is None and any(len(set(reading.modes.sources)) > 1 for reading in readings):
+    return EstimateTable(readings, (*notes, *_order_notes(readings), *_term_notes(table, terms)))
+
+
+def _order_notes(readings: Sequence[Reading]) -> list[str]:
+    """Say which machines' logs are sorted."""
+    machines: dict[str, list[datetime]] = {}
+    for reading in readings:
+        if reading.metadata.recorded_at is not None:
+            machines.setdefault(str(reading.metadata.stage), []).append(
+                reading.metadata.recorded_at
+            )
+    return [
+        f"{machine}: the logs are not in the order of time; they are put in it"
+        for machine, moments in machines.items()
+        if any(a > b for a, b in pairwise(moments))
+    ]
+
+
+def _term_notes(table: pd.DataFrame, terms: pd.DataFrame | None) -> list[str]:
+    """Say which cross terms are of no use, and which are missing."""
+    notes, told = [], set()
+    if terms is not None:
+        known = set(zip(table["log"], table["mode"], table["source"], strict=True))
+        ends = [
+            list(zip(terms["log"], terms[f"mode_{end}"], terms[f"source_{end}"], strict=True))
+            for end in ("a", "b")
+        ]
+        used = np.array([a in known and b in known for a, b in zip(*ends, strict=True)], dtype=bool)
+        if not used.all():
+            notes.append(
+                f"{int((~used).sum())} of {used.size} cross terms are of estimates that the table "
+                f"does not have ({_where(terms, pd.Series(~used, terms.index))}); they are not used"
+            )
+        told = set(terms["log"][used & (terms["source_a"] != terms["source_b"])])
+    several = table.groupby("log")["source"].nunique() > 1
+    lone = [str(log) for log in several.index[several] if log not in told]
+    if lone:
         notes.append(
-            "logs with several sources, but no covariances between them: their errors are taken "
-            "for independent, which overstates what they know together; give modes_cov.csv"
+            f"{len(lone)} logs with several sources, but no covariances between them "
+            f"({lone[0]}): their errors are taken for independent, which overstates what they "
+            "know together; give modes_cov.csv"
         )
-    return EstimateTable(readings, tuple(notes))
+    return notes
 
 
 def _read(path: Path) -> pd.DataFrame:
@@ -112,6 +146,14 @@ def _read(path: Path) -> pd.DataFrame:
         return pd.read_csv(path, dtype=str, keep_default_na=False)
     except (OSError, ValueError) as error:
         raise BadTable(f"{path}: cannot be read as a table: {error}") from error
+
+
+def _demand(path: Path, table: pd.DataFrame, needed: Sequence[str]) -> None:
+    """Refuse a table that lacks columns."""
+    missing = [name for name in needed if name not in table.columns]
+    if missing:
+        told = "; columns are parted by commas" if len(table.columns) == 1 else ""
+        raise BadTable(f"{path}: no column {missing}; there are {list(table.columns)}{told}")
 
 
 def _where(table: pd.DataFrame, wrong: pd.Series[bool]) -> str:
@@ -195,6 +237,13 @@ def _check(path: Path, table: pd.DataFrame, stage: Stage | None) -> None:
             f"{path}, {_where(named, twice)}: {first['mode']} by {first['source']} stands there "
             f"twice for log {first['log']}; leave the column mode empty where names are not unique"
         )
+    fine = table["frequency_std_hz"] < _FINEST * table["frequency_hz"]
+    if fine.any():
+        raise BadTable(
+            f"{path}, {_where(table, fine)}: frequency_std_hz is "
+            f"{table.loc[fine, 'frequency_std_hz'].iloc[0]:g}, below {_FINEST:g} of the frequency; "
+            "needed is one that a measurement can have, in Hz"
+        )
     if stage is not None:
         known = [mode.name for mode in stage.modes]
         strange = sorted(set(named["mode"]) - set(known))
@@ -207,10 +256,7 @@ def _check(path: Path, table: pd.DataFrame, stage: Stage | None) -> None:
 
 def _read_terms(path: Path) -> pd.DataFrame:
     table = _read(path)
-    needed = ["log", "source_a", "mode_a", "source_b", "mode_b", "cov_ln_f"]
-    missing = [name for name in needed if name not in table.columns]
-    if missing:
-        raise BadTable(f"{path}: no column {missing}; there are {list(table.columns)}")
+    _demand(path, table, ("log", "source_a", "mode_a", "source_b", "mode_b", "cov_ln_f"))
     table["cov_ln_f"] = pd.to_numeric(table["cov_ln_f"], errors="coerce")
     wrong = ~np.isfinite(table["cov_ln_f"])
     if wrong.any():

@@ -15,7 +15,7 @@ from pathlib import Path
 
 from lmshealth.errors import BadLog, LmshealthError, NothingUsable
 from lmshealth.following import loop_error
-from lmshealth.history import Reading, ambiguity_notes, build_history, in_order
+from lmshealth.history import Reading, build_history, in_order, lost_notes
 from lmshealth.inference import epochs_to_infer, infer
 from lmshealth.logs import Refusal
 from lmshealth.maintenance import Action, maintenance_notes, read_maintenance
@@ -361,7 +361,7 @@ def assess(
     """
     history, refused = build_history(readings, stage, actions)
     notes = maintenance_notes(actions, [reading.metadata.recorded_at for reading in readings])
-    notes += ambiguity_notes(history, refused)
+    notes += lost_notes(history, refused)
     partial = [refusal for reading in readings for refusal in reading.modes.refused]
     own = int(hashlib.sha256(f"{history.stage}\n{stage.digest}".encode()).hexdigest()[:12], 16)
     seed = (settings.seed, own)

@@ -11,7 +11,7 @@ from lmshealth.stage import Stage
 from lmshealth.statespace import state_space
 from lmshealth.tracks import History, Smoothed, Track
 
-# Settings with less of the posterior are left out.
+# Settings that together have less of the posterior are left out.
 _SHARE = 1e-3
 # Eigenvalues of correlations below are rounding.
 _SINGULAR = 1e-10
@@ -42,7 +42,8 @@ def smooth(history: History, followed: Track, stage: Stage | None = None) -> Smo
         filters.move(bank, k)
         filters.see(bank, k)
         bank = bank.pruned()
-    bank = bank.only(bank.weight > _SHARE)
+    order = np.argsort(bank.weight)
+    bank = bank.only(order[np.cumsum(bank.weight[order]) > _SHARE])
     weight = bank.weight
     runs = [smooth_one(filters, bank.settings.only(np.array([g]))) for g in range(weight.size)]
     mean = np.einsum("g,gki->ki", weight, [run[0] for run in runs])
@@ -57,6 +58,8 @@ def smooth(history: History, followed: Track, stage: Stage | None = None) -> Smo
     early = np.arange(len(history.logs)) < history.baselines[0]
     drift[early], variance[early] = np.nan, np.nan
     std = np.sqrt(np.maximum(np.einsum("kii->ki", cov), 0.0)) * followed.widening[:, None]
+    unseen = space.damping.start + np.flatnonzero(np.isnan(followed.ln_damping).all(axis=0))
+    mean[:, unseen], std[:, unseen] = np.nan, np.nan
     return Smoothed(
         ln_frequency=mean[:, space.level],
         ln_frequency_std=std[:, space.level],

@@ -134,7 +134,7 @@ def _judge_step(
 ) -> Judgement:
     last = max(event.epoch for event in jumps)
     sizes = ", ".join(
-        f"{event.mode} {100 * event.size:+.1f} %".replace("-", "−")
+        f"{event.mode} {100 * np.expm1(event.size):+.1f} %".replace("-", "−")
         for event in jumps
         if event.epoch == last
     )

@@ -19,6 +19,7 @@ from rich.table import Table
 
 from lmshealth.tables import Row
 from lmshealth.tracks import Track
+from lmshealth.wording import change
 
 # So many lines of a frequency response are shown.
 _MOST_LINES = 12
@@ -67,8 +68,10 @@ def print_track(track: Track) -> None:
         (
             mode,
             f"{np.exp(level):.3f} ± {np.exp(level) * track.ln_frequency_std[-1, i]:.3f}",
-            f"{100 * track.drift[-1, i]:+.3f} ± {100 * std[-1, i]:.3f}",
-            f"{100 * np.exp(zeta):.2f} ± {100 * np.exp(zeta) * track.ln_damping_std[-1, i]:.2f}",
+            "{:+.3f} ± {:.3f}".format(*change(track.drift[-1, i], std[-1, i])),
+            f"{100 * np.exp(zeta):.2f} ± {100 * np.exp(zeta) * track.ln_damping_std[-1, i]:.2f}"
+            if np.isfinite(zeta)
+            else "–",
         )
         for i, (mode, level, zeta) in enumerate(
             zip(track.modes, track.ln_frequency[-1], track.ln_damping[-1], strict=True)
@@ -81,7 +84,7 @@ def print_track(track: Track) -> None:
             f"{track.recorded_at[event.epoch]:%Y-%m-%d}",
             event.kind,
             event.mode,
-            f"{100 * event.size:+.2f} ± {100 * event.std:.2f}",
+            "{:+.2f} ± {:.2f}".format(*change(event.size, event.std)),
             f"{event.evidence:.1f}",
             "declared" if event.declared else "found",
         )
@@ -103,11 +106,14 @@ def _consistent(track: Track) -> str:
     )
     if found.holds:
         return f"The filter agrees with its logs: {told}."
-    return (
-        f"The filter does NOT agree with its logs: {told}; its standard deviations are widened "
-        f"{track.widening[-1]:.2f} times. A cause may be missing: a covariate, a retuning, or "
-        "standard deviations that are not what they say."
-    )
+    if track.widening[-1] > 1:
+        meant = (
+            f"its standard deviations are widened {track.widening[-1]:.2f} times. A cause may be "
+            "missing: a covariate, a retuning, or standard deviations that are not what they say."
+        )
+    else:
+        meant = "the logs vary less than it expects, so that its own are rather too wide."
+    return f"The filter does NOT agree with its logs: {told}; {meant}"
 
 
 def print_frf(fit: Row, frf: Sequence[Row], rows: Sequence[Row], refused: Sequence[Row]) -> None:

@@ -10,7 +10,7 @@ import numpy as np
 
 from lmshealth.trackplots import chi_square_band
 from lmshealth.tracks import Effect, Event, Track
-from lmshealth.wording import GAP, km, signed, spell
+from lmshealth.wording import GAP, change, km, signed, spell
 
 _UNITS = {"c": "°C", "kg": "kg", "mm": "mm"}
 
@@ -33,14 +33,20 @@ def mode_rows(track: Track) -> Iterator[tuple[str, ...]]:
         drift_std = np.sqrt(track.drift_cov[-1, k, k])
         std = np.exp(level) * track.ln_frequency_std[-1, k]
         zeta = 100 * np.exp(track.ln_damping[-1, k])
+        told = f"{zeta:.2f} ± {zeta * track.ln_damping_std[-1, k]:.2f}{GAP}%"
         if np.isfinite([level, drift]).all():
             yield (
                 spell(mode),
                 f"{np.exp(level - drift):.2f}{GAP}Hz",
                 f"{np.exp(level):.2f} ± {std:.2f}{GAP}Hz",
-                f"{signed(100 * drift, 2)} ± {100 * drift_std:.2f}{GAP}%",
-                f"{zeta:.2f} ± {zeta * track.ln_damping_std[-1, k]:.2f}{GAP}%",
+                _change(drift, drift_std),
+                told if np.isfinite(zeta) else "–",
             )
+
+
+def _change(ln: float, std: float) -> str:
+    value, spread = change(ln, std)
+    return f"{signed(value, 2)} ± {spread:.2f}{GAP}%"
 
 
 def surprise(track: Track) -> tuple[int, int, Fit] | None:
@@ -77,9 +83,7 @@ def happened(track: Track) -> Iterator[dict[str, Any]]:
             "known": track.recorded_at[first.found_at],
             "declared": first.declared,
             "sizes": [
-                f"{spell(event.mode)}{of} {signed(100 * event.size, 2)} ± "
-                f"{100 * event.std:.2f}{GAP}%"
-                for event in events
+                f"{spell(event.mode)}{of} {_change(event.size, event.std)}" for event in events
             ],
             "evidence": f"{first.evidence:.1f}".replace("-", "−"),
         }

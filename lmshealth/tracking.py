@@ -26,6 +26,7 @@ from lmshealth.tracks import Effect, Event, History, Step, Track
 _FAR = 6.0
 # A filter is widened once its innovations are less probable than that.
 _WIDEN = 5e-4
+_ROUNDING = 1e-15  # of the variance of a drift
 
 
 def track(history: History, stage: Stage | None = None) -> Track:
@@ -54,7 +55,8 @@ def track(history: History, stage: Stage | None = None) -> Track:
     BarShalom2001.
     """
     if not np.isfinite(history.ln_frequency).any():
-        raise NotEnoughData(f"{history.stage}: no modal estimate in {len(history.logs)} logs")
+        told = f"{history.stage}: no modal estimate in {len(history.logs)} logs is of a known mode"
+        raise NotEnoughData(f"{told}; without a name it is known once three logs show it")
     return _Follower(history, state_space(history, stage, history.steps)).follow()
 
 
@@ -258,11 +260,12 @@ class _Follower:
         return np.asarray(there.sum(axis=1), dtype=float)
 
     def _unseen(self) -> BoolArray:
-        """Mark ln f and ln ζ of modes that no log has seen yet, ``(n_logs, 4 n_modes)``."""
-        there = np.isfinite(self.history.ln_frequency)
-        modes = [there[:, self.history.columns(mode)].any(axis=1) for mode in self.history.modes]
-        unseen = ~np.logical_or.accumulate(np.transpose(modes), axis=0)
-        return np.tile(unseen, 4)
+        """Mark ln f and ln ζ that no log has seen yet, ``(n_logs, 4 n_modes)``."""
+        there = np.isfinite([self.history.ln_frequency, self.history.ln_damping])
+        seen = np.logical_or.accumulate(there, axis=1)
+        modes = [seen[:, :, self.history.columns(m)].any(axis=2) for m in self.history.modes]
+        ln_f, ln_zeta = ~np.stack(modes, axis=2)
+        return np.hstack([ln_f, ln_f, ln_zeta, ln_f])
 
     def _alarm(self, bank: Bank, k: int, evidence: float) -> None:
         """Raise the alarm once in every chapter between resets."""
@@ -294,10 +297,11 @@ class _Follower:
         drift_cov = np.einsum("mi,kij,nj->kmn", contrast, record.cov, contrast)
         early = np.arange(len(history.logs)) < history.baselines[0]
         drift[early], drift_cov[early] = np.nan, np.nan
-        # At a baseline ℓ and ℓ₀ are the same; rounding must not make an epoch of it.
-        clock = history.clock()
+        # At a baseline, and on its spot until something happens, ℓ and ℓ₀ are the same.
+        clock, spread = history.clock(), np.einsum("kmm->km", drift_cov).max(axis=1)
         for first in history.baselines:
-            still = (clock == clock[first]) & (np.arange(clock.size) >= first)
+            still = (clock == clock[first]) & (np.arange(clock.size) > first) & (spread < _ROUNDING)
+            still[first] = True
             drift[still], drift_cov[still] = 0.0, 0.0
         self._settle(len(history.logs))
         widening = record.widening

@@ -38,6 +38,11 @@ def signed(value: float, digits: int) -> str:
     return f"{value:+.{digits}f}".replace("-", "−")
 
 
+def change(ln: float, std: float) -> tuple[float, float]:
+    """Turn the change of a logarithm and its standard deviation into percent of what was before."""
+    return 100 * float(np.expm1(ln)), 100 * float(np.exp(ln)) * std
+
+
 def number(value: float) -> str:
     """Write three significant digits, thousands apart."""
     rounded = float(f"{value:.3g}")

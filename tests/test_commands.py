@@ -113,7 +113,28 @@ def test_bad_tables_are_one_line_and_status_1(estimates: Path, tmp_path: Path) -
 
 
 def test_an_output_that_cannot_be_written_is_told(estimates: Path, tmp_path: Path) -> None:
-    """The folder is missing: status 1 and the reason."""
-    result = run(estimates, "--out", tmp_path / "nowhere" / "track.csv")
+    """A file stands where a folder is needed: status 1 and the reason. Folders are made."""
+    result = run(estimates, "--out", estimates / "track.csv")
     assert result.exit_code == 1
     assert "cannot be written" in result.stderr
+    assert run(estimates, "--out", tmp_path / "new" / "track.csv").exit_code == 0
+    assert (tmp_path / "new" / "track.csv").exists()
+
+
+def test_maintenance_of_other_machines_is_told(estimates: Path, tmp_path: Path) -> None:
+    """A name that the table does not have may be a slip of the pen."""
+    actions = tmp_path / "maintenance.csv"
+    actions.write_text("stage,recorded_at,action\nAX-9,2026-03-02T00:00:00Z,servo\n")
+    result = run(estimates, "--out", tmp_path / "track.csv", "--maintenance", actions)
+    assert result.exit_code == 0, result.output
+    assert "maintenance of AX-9 is not used" in result.stderr
+
+
+def test_fewer_logs_than_a_birth_takes_are_told(estimates: Path, tmp_path: Path) -> None:
+    """Two logs without names know no mode yet: status 1 and what is needed."""
+    table = pd.read_csv(estimates)
+    two = table[table["recorded_at"].isin(table["recorded_at"].unique()[:2])]
+    two.drop(columns="mode").to_csv(tmp_path / "two.csv", index=False)
+    result = run(tmp_path / "two.csv", "--out", tmp_path / "track.csv")
+    assert result.exit_code == 1
+    assert "known once three logs show it" in result.stderr

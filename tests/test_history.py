@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from lmshealth.errors import NotEnoughData
-from lmshealth.history import ambiguity_notes, build_history, in_order
+from lmshealth.history import build_history, in_order, lost_notes
 from lmshealth.logs import Refusal
 from lmshealth.maintenance import Action
 from lmshealth.stage import Stage
@@ -214,5 +214,18 @@ def test_modes_that_can_no_longer_be_told_apart_are_told(stage: Stage) -> None:
     readings = [make_reading(str(k), k, 1e5 * k, {"roll": 4.8}) for k in range(5)]
     history, _ = build_history(readings, stage)
     doubts = [Refusal(str(k), "ambiguous", "", mode="roll") for k in range(5)]
-    assert "roll: the last 3 logs do not tell" in ambiguity_notes(history, doubts[2:])[0]
-    assert ambiguity_notes(history, doubts[:4]) == []
+    assert "roll: the last 3 logs do not tell" in lost_notes(history, doubts[2:])[0]
+    assert lost_notes(history, doubts[:4]) == []
+
+
+def test_a_mode_that_is_no_longer_seen_is_told(stage: Stage) -> None:
+    """Three logs without it are worth a word, two are not."""
+    logs = [
+        make_reading(f"{day}", day, 1e5 * day, {"roll": 4.8} | ({"pitch": 4.9} if day < 4 else {}))
+        for day in range(1, 7)
+    ]
+    history, refused = build_history(logs, stage)
+    told = lost_notes(history, refused)
+    assert told == ["pitch: no estimate in the last 3 logs; nothing new is known."]
+    history, refused = build_history(logs[:5], stage)
+    assert lost_notes(history, refused) == []

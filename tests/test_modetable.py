@@ -34,22 +34,23 @@ def stage(tmp_path: Path) -> Stage:
     return make_stage(tmp_path / "stage", (FADING,))
 
 
+def _write(tmp_path: Path, text: str, terms: str) -> tuple[Path, Path | None]:
+    path, cross = tmp_path / "modes.csv", tmp_path / "modes_cov.csv"
+    path.write_text(text)
+    cross.write_text("log,source_a,mode_a,source_b,mode_b,cov_ln_f\n" + terms)
+    return path, cross if terms else None
+
+
 def read(tmp_path: Path, text: str, terms: str = "", stage: Stage | None = None) -> list[Reading]:
     """Write tables and read them."""
-    path = tmp_path / "modes.csv"
-    path.write_text(text)
-    cross = None
-    if terms:
-        cross = tmp_path / "modes_cov.csv"
-        cross.write_text("log,source_a,mode_a,source_b,mode_b,cov_ln_f\n" + terms)
+    path, cross = _write(tmp_path, text, terms)
     return list(read_estimates(path, cross_terms=cross, stage=stage).readings)
 
 
-def notes(tmp_path: Path, text: str) -> str:
-    """Read a table and give what is said about it."""
-    path = tmp_path / "modes.csv"
-    path.write_text(text)
-    return "\n".join(read_estimates(path).notes)
+def notes(tmp_path: Path, text: str, terms: str = "") -> str:
+    """Read tables and give what is said about them."""
+    path, cross = _write(tmp_path, text, terms)
+    return "\n".join(read_estimates(path, cross_terms=cross).notes)
 
 
 def test_a_row_becomes_an_estimate_in_si_units(tmp_path: Path) -> None:
@@ -94,6 +95,13 @@ def test_what_is_assumed_is_said(tmp_path: Path) -> None:
     assert "line 2" in notes(tmp_path, text)
     text = HEAD + row() + row(source="delta_e")
     assert "give modes_cov.csv" in notes(tmp_path, text)
+    terms = "a,acc,roll,delta_e,roll,1e-8\n"
+    assert notes(tmp_path, text, terms) == ""
+    told = notes(tmp_path, text, terms.replace("delta_e,roll", "delta_e,heave"))
+    assert "1 of 1 cross terms are of estimates that the table does not have (line 2)" in told
+    assert "give modes_cov.csv" in told
+    text = HEAD + row(day=2) + row(log="b", day=1).replace("AX-1", "AX-2")
+    assert notes(tmp_path, text) == ""
     assert notes(tmp_path, HEAD + row()) == ""
 
 
@@ -104,6 +112,8 @@ def test_what_is_assumed_is_said(tmp_path: Path) -> None:
         ("recorded_at,frequency_hz\n2026-03-01T06:00:00Z,1\n", "no column ['frequency_std_hz']"),
         (HEAD + row(std=""), "line 2: frequency_std_hz is missing"),
         (HEAD + row(std=-0.1), "line 2: frequency_std_hz is -0.1"),
+        (HEAD + row(std=1e-9), "line 2: frequency_std_hz is 1e-09, below 1e-07 of the frequency"),
+        ("recorded_at;frequency_hz\n1;2\n", "columns are parted by commas"),
         (HEAD + row(f=0), "line 2: frequency_hz is 0"),
         (HEAD + row(f="fast"), "line 2: frequency_hz is no finite number"),
         (HEAD + row(f="inf"), "line 2: frequency_hz is no finite number"),

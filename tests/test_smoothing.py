@@ -13,10 +13,10 @@ from lmshealth.smoothing import smooth, smooth_one
 from lmshealth.stage import Stage
 from lmshealth.statespace import state_space
 from lmshealth.tracking import track
-from tests.lives import PRELOAD, awkward_history, make_stage, rough_history
+from tests.lives import PRELOAD, awkward_history, make_history, make_stage, rough_history
 from tests.oracles import Wander, batch
 from tests.test_bank import ALONE, KNOWN, SETTINGS, TWO, one
-from tests.test_tracking import quiet, still
+from tests.test_tracking import quiet, std_of, still
 
 
 @pytest.fixture(scope="module")
@@ -79,15 +79,30 @@ def test_settings_are_averaged_by_their_evidence(stage: Stage) -> None:
         assert np.abs(own_std[later] / std[later] - 1).max() < 0.02
 
 
-def test_the_last_epoch_is_the_tracks(stage: Stage) -> None:
-    """At the last log filter and smoother know the same."""
-    history = quiet(np.random.default_rng(3))
+@pytest.mark.parametrize("n", [1, 2, 40])
+def test_the_last_epoch_is_the_tracks(stage: Stage, n: int) -> None:
+    """At the last log filter and smoother know the same, however few logs there are."""
+    history = quiet(np.random.default_rng(3), n)
     followed = track(history, stage)
     found = smooth(history, followed, stage)
     for name in ("ln_frequency", "ln_damping", "drift"):
-        std = found.drift_std if name == "drift" else getattr(followed, f"{name}_std")
-        off = (getattr(found, name)[-1] - getattr(followed, name)[-1]) / std[-1]
-        assert np.abs(off).max() < 0.02
+        own = found.drift_std if name == "drift" else getattr(found, f"{name}_std")
+        std = std_of(followed) if name == "drift" else getattr(followed, f"{name}_std")
+        off = getattr(found, name)[-1] - getattr(followed, name)[-1]
+        assert (np.abs(off) <= 0.02 * std[-1] + 1e-9).all()
+        np.testing.assert_allclose(own[-1], std[-1], rtol=0.02, atol=1e-9)
+
+
+def test_damping_that_no_log_tells_is_unknown(stage: Stage) -> None:
+    """What the filter does not say later logs do not say either."""
+    quiet_life = quiet(np.random.default_rng(4), 6)
+    ln_damping = np.array(quiet_life.ln_damping)
+    ln_damping[:, 0] = np.nan
+    history = make_history(quiet_life.ln_frequency, ln_damping=ln_damping)
+    found = smooth(history, track(history, stage), stage)
+    assert np.isnan(found.ln_damping[:, 0]).all()
+    assert np.isnan(found.ln_damping_std[:, 0]).all()
+    assert np.isfinite(found.ln_damping[:, 1]).all()
 
 
 def test_later_logs_make_early_epochs_sharper(stage: Stage) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 
+import numpy as np
 import pytest
 
 from lmshealth.terminal import (
@@ -14,8 +15,11 @@ from lmshealth.terminal import (
     print_magnitudes,
     print_modes,
     print_plans,
+    print_track,
     progress_bars,
 )
+from lmshealth.tracking import track
+from tests.lives import DAMPING, FREQUENCY, make_history
 
 NAN = float("nan")
 
@@ -195,3 +199,28 @@ def test_plans_are_one_table_each_and_say_why_there_is_none(
     assert "No one log of an hour" in second
     assert "hidden" not in shown
     assert max(len(line) for line in shown.splitlines()) <= 80
+
+
+def test_changes_are_percent_of_what_was_before(capsys: pytest.CaptureFixture[str]) -> None:
+    """Half the frequency is 50 % less, not ln 2; a damping that nobody told is a dash."""
+    ln_f = np.log(FREQUENCY[:1]) - np.log(2) * (np.arange(8) >= 4)[:, None]
+    history = make_history(ln_f, ln_damping=np.full((8, 1), np.nan), std=1e-3)
+    print_track(track(history))
+    shown = capsys.readouterr().out
+    assert "-50.0" in shown
+    assert "-69.3" not in shown
+    assert "–" in shown
+    assert "nan" not in shown
+
+
+def test_a_filter_that_is_too_cautious_is_not_said_to_be_widened(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """Logs that vary less than they say ask for no missing cause."""
+    ln_f = np.tile(np.log(FREQUENCY[:2]), (40, 1))
+    ln_zeta = np.tile(np.log(DAMPING[:2]), (40, 1))
+    print_track(track(make_history(ln_f, ln_damping=ln_zeta, std=1e-3)))
+    shown = capsys.readouterr().out
+    assert "does NOT agree" in shown
+    assert "rather too wide" in shown
+    assert "widened" not in shown

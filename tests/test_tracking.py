@@ -127,6 +127,29 @@ def test_logs_on_the_spot_of_the_baseline_have_no_drift(stage: Stage) -> None:
     assert (found.drift_cov[:4] == 0).all()
 
 
+def test_a_step_where_the_machine_stands_is_a_drift(stage: Stage) -> None:
+    """A bolt may loosen where the odometer stands still: events and drift agree."""
+    ln_f, ln_zeta = still(np.random.default_rng(7), 12)
+    ln_f[6:] -= 0.02
+    parked = replace(make_history(ln_f, ln_damping=ln_zeta, std=5e-4), travel=np.full(12, 1e5))
+    found = track(parked, stage)
+    assert {(event.kind, event.epoch) for event in found.events} >= {("step", 6)}
+    assert (found.drift[:6] == 0).all()
+    assert (np.abs(found.drift[7:] + 0.02) < 5 * std_of(found)[7:]).all()
+    assert (std_of(found)[6:] > 0).all()
+
+
+def test_damping_that_no_log_tells_is_unknown(stage: Stage) -> None:
+    """A mode of which only frequencies are given has no damping, and the others keep theirs."""
+    ln_f, ln_zeta = still(np.random.default_rng(8), 6)
+    ln_zeta[:, 0] = np.nan
+    found = track(make_history(ln_f, ln_damping=ln_zeta), stage)
+    assert np.isnan(found.ln_damping[:, 0]).all()
+    assert np.isnan(found.ln_damping_std[:, 0]).all()
+    assert np.isfinite(found.ln_damping[:, 1]).all()
+    assert np.isfinite(found.ln_frequency).all()
+
+
 def test_nothing_is_said_before_the_baseline(stage: Stage) -> None:
     """With the baseline in the middle earlier drifts are NaN, and later ones are not."""
     found = track(rough_history(np.random.default_rng(7), baseline=3), stage)
