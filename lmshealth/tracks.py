@@ -17,8 +17,9 @@ from lmshealth.arrays import BoolArray, FloatArray, expect_shape, freeze
 StepKind = Literal["step", "regreasing", "servo", "sensor", "reset"]
 EventKind = Literal["step", "regreasing", "servo", "sensor", "alarm"]
 
-# Below this probability of their innovations a filter is not consistent with its data.
-_INCONSISTENT = 1e-3
+# Below this probability of their innovations a filter is not consistent with its data: where it
+# makes results too sure of themselves, and where it only makes them too cautious.
+_TOO_SURE, _TOO_CAUTIOUS = 1e-3, 1e-6
 
 
 @dataclass(frozen=True, slots=True)
@@ -266,8 +267,10 @@ class Consistency:
 
     @property
     def holds(self) -> bool:
-        """Whether neither is improbable."""
-        return min(self.p_value, self.autocorrelation_p_value) >= _INCONSISTENT
+        """Whether neither is improbable; an average is somewhat cautious with quiet machines."""
+        least = _TOO_SURE if self.nis > 1 else _TOO_CAUTIOUS
+        least_of_all = _TOO_SURE if self.autocorrelation > 0 else _TOO_CAUTIOUS
+        return self.p_value >= least and self.autocorrelation_p_value >= least_of_all
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -413,5 +416,5 @@ def consistency(nis: FloatArray, dof: FloatArray, innovations: FloatArray) -> Co
         nis=total / degrees if degrees else 1.0,
         p_value=float(2 * min(tail, 1 - tail)),
         autocorrelation=correlation,
-        autocorrelation_p_value=float(2 * stats.norm.sf(abs(sums.sum()) / scale)) if n else 1.0,
+        autocorrelation_p_value=float(2 * stats.norm.sf(abs(sums.sum()) / scale)) if scale else 1.0,
     )
