@@ -47,12 +47,11 @@ def track(ctx: click.Context, /, table: Path, out: Path, **options: Any) -> None
     where every row has it, else the time. Without a mode name modes are born from the estimates;
     without --stage every covariate column is regressed, about its median.
     """
-    from lmshealth.history import build_history
+    from lmshealth.history import believed, build_history, doubted
     from lmshealth.maintenance import read_actions
     from lmshealth.modetable import read_estimates
     from lmshealth.smoothing import smooth
     from lmshealth.stage import load_stage
-    from lmshealth.tracking import believed, doubted
     from lmshealth.tracking import track as follow
 
     stage = load_stage(options["stage"]) if options["stage"] else None

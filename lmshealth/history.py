@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from bisect import bisect_right
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 
 import numpy as np
@@ -18,7 +18,7 @@ from lmshealth.maintenance import RESETS, Action
 from lmshealth.results import Modes
 from lmshealth.stage import Stage
 from lmshealth.statespace import Regressor, regressors
-from lmshealth.tracks import History, Series, Step, StepKind
+from lmshealth.tracks import History, Series, Step, StepKind, Track
 
 # Sources in the order in which they stand where a mode has several.
 _SOURCES = ("joint", "acc", "frf", "delta_e")
@@ -382,3 +382,31 @@ def lost_notes(history: History, refused: Sequence[Refusal]) -> list[str]:
         if missed >= _LATE and name not in lost:
             notes.append(f"{name}: no estimate in the last {missed} logs; nothing new is known.")
     return notes
+
+
+def believed(history: History, followed: Track) -> History:
+    """Give a history as its track takes it: with all steps, without the outliers."""
+    values = [np.array(part) for part in (history.ln_frequency, history.ln_damping, history.cov)]
+    ln_f, ln_zeta, cov = values
+    r = len(history.series)
+    for k, mode in followed.outliers:
+        own = history.columns(mode)
+        ln_f[k, own] = ln_zeta[k, own] = np.nan
+        both = [*own, *(r + i for i in own)]
+        cov[k, both], cov[k][:, both] = np.nan, np.nan
+    return replace(history, ln_frequency=ln_f, ln_damping=ln_zeta, cov=cov, steps=followed.steps)
+
+
+def doubted(history: History, followed: Track) -> list[Refusal]:
+    """Tell which estimates the track hardly believed."""
+    refused = []
+    for k, mode in followed.outliers:
+        i, own = followed.modes.index(mode), history.columns(mode)
+        found = float(np.exp(np.nanmean(history.ln_frequency[k, own])))
+        before = float(np.exp(followed.ln_frequency[max(k - 1, 0), i]))
+        detail = (
+            f"{found:.5g} Hz, or its damping, lies far from what all logs before it tell "
+            f"({before:.5g} Hz): a jump is believed once the next log confirms it"
+        )
+        refused.append(Refusal(log=history.logs[k], mode=mode, reason="jump", detail=detail))
+    return refused

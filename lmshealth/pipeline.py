@@ -15,7 +15,7 @@ from pathlib import Path
 
 from lmshealth.errors import BadLog, LmshealthError, NothingUsable
 from lmshealth.following import loop_error
-from lmshealth.history import Reading, build_history, in_order, lost_notes
+from lmshealth.history import Reading, believed, build_history, doubted, in_order, lost_notes
 from lmshealth.inference import epochs_to_infer, infer
 from lmshealth.logs import Refusal
 from lmshealth.maintenance import Action, maintenance_notes, read_maintenance
@@ -28,7 +28,7 @@ from lmshealth.stage import Stage
 from lmshealth.store import Store, beside, result_key
 from lmshealth.summary import Assessment, judge
 from lmshealth.tables import all_tables
-from lmshealth.tracking import believed, doubted, track
+from lmshealth.tracking import track
 from lmshealth.tracks import History, Track
 
 Progress = Callable[[str, int, int], None]

@@ -8,7 +8,7 @@ happen from then on. No epoch knows of later logs; `smooth` does.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 from scipy import stats
@@ -17,7 +17,6 @@ from lmshealth.arrays import BoolArray, FloatArray
 from lmshealth.bank import Bank, Filter
 from lmshealth.errors import NotEnoughData
 from lmshealth.events import MEMORY, Finding, Watch, explain, reborn, threshold
-from lmshealth.logs import Refusal
 from lmshealth.stage import Stage
 from lmshealth.statespace import JUMP_STD, MOVES, StateSpace, state_space
 from lmshealth.tracks import Effect, Event, History, Step, Track
@@ -428,31 +427,3 @@ def _effects(space: StateSpace, bank: Bank, sources: tuple[str, ...]) -> tuple[E
         spread = float(np.sqrt(bank.weight @ (values - scale) ** 2))
         effects.append(Effect("", f"scale:{source}", scale, spread))
     return tuple(effects)
-
-
-def believed(history: History, followed: Track) -> History:
-    """Give a history as its track takes it: with all steps, without the outliers."""
-    values = [np.array(part) for part in (history.ln_frequency, history.ln_damping, history.cov)]
-    ln_f, ln_zeta, cov = values
-    r = len(history.series)
-    for k, mode in followed.outliers:
-        own = history.columns(mode)
-        ln_f[k, own] = ln_zeta[k, own] = np.nan
-        both = [*own, *(r + i for i in own)]
-        cov[k, both], cov[k][:, both] = np.nan, np.nan
-    return replace(history, ln_frequency=ln_f, ln_damping=ln_zeta, cov=cov, steps=followed.steps)
-
-
-def doubted(history: History, followed: Track) -> list[Refusal]:
-    """Tell which estimates the track hardly believed."""
-    refused = []
-    for k, mode in followed.outliers:
-        i, own = followed.modes.index(mode), history.columns(mode)
-        found = float(np.exp(np.nanmean(history.ln_frequency[k, own])))
-        before = float(np.exp(followed.ln_frequency[max(k - 1, 0), i]))
-        detail = (
-            f"{found:.5g} Hz, or its damping, lies far from what all logs before it tell "
-            f"({before:.5g} Hz): a jump is believed once the next log confirms it"
-        )
-        refused.append(Refusal(log=history.logs[k], mode=mode, reason="jump", detail=detail))
-    return refused

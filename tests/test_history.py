@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 
 from lmshealth.errors import NotEnoughData
-from lmshealth.history import build_history, in_order, lost_notes
+from lmshealth.history import believed, build_history, doubted, in_order, lost_notes
 from lmshealth.logs import Refusal
 from lmshealth.maintenance import Action
 from lmshealth.stage import Stage
-from lmshealth.tracking import believed, doubted, track
+from lmshealth.tracking import track
 from lmshealth.tracks import Series
 from tests.lives import FADING, START, make_reading, make_stage
 
