@@ -23,7 +23,7 @@ from lmshealth.estimates import Estimates, Table
 from lmshealth.filterbank import LEAST_LOGS
 from lmshealth.identities import SURE, Identities, Log, Verdict
 
-Reason = Literal["ambiguous", "jump", "spurious"]
+Reason = Literal["ambiguous", "jump", "unconfirmed"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,7 +35,7 @@ class Doubt:
     epoch, estimate : int
         Which it is.
     reason : str
-        ``ambiguous``, ``jump`` or ``spurious``.
+        ``ambiguous``, ``jump`` or ``unconfirmed``.
     detail : str
         What is known, in a sentence.
     """
@@ -150,7 +150,7 @@ def _doubt(verdict: Verdict, i: int, name: str, modes: list[str]) -> Doubt:
         parts = [f"{told[j]} {chances[j]:.0%}" for j in np.argsort(-chances) if chances[j] > 0.005]
         detail = f"{frequency:.5g} Hz may be of {' or '.join(parts)}: the logs so far do not tell"
     else:
-        reason = "spurious"
+        reason = "unconfirmed"
         detail = (
             f"{frequency:.5g} Hz is of no known mode; it is believed to be one once three logs "
             "show it"

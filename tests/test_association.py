@@ -250,7 +250,7 @@ def test_spurious_estimates_found_no_tracks(rng: np.random.Generator) -> None:
         rows.append(say([*row, *extra], ["a", "b", *("" for _ in extra)]))
     found = run(rows)
     assert found.modes == ("a", "b")
-    assert {doubt.reason for doubt in found.doubts} == {"spurious"}
+    assert {doubt.reason for doubt in found.doubts} == {"unconfirmed"}
     assert "three logs" in found.doubts[0].detail
 
 
