@@ -19,7 +19,7 @@ Answer
     because a ramp of 40 % is no slow wear, which the tracker says. A dwell that lies far off
     and that no later one confirms is named an outlier: the turning point, twice, and the last.
 Run time
-    Ten seconds.
+    Half a minute of one processor.
 Data
     Folder ``dropbear_ds8`` of LMSHEALTH_DATA, needed.
 """
