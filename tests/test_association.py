@@ -143,32 +143,19 @@ def test_shapes_tell_where_frequencies_merge(rng: np.random.Generator) -> None:
         assert label == tuple("ab"[i] for i in order)
 
 
-def test_modes_that_veer_are_known_by_their_shapes() -> None:
-    """Frequencies turn away from each other, shapes go over: labels go with the shapes."""
+@pytest.mark.parametrize(("gap", "first", "last"), [(0.003, 20, 20), (0.01, 15, 10)])
+def test_modes_that_veer_are_known_by_their_shapes(gap: float, first: int, last: int) -> None:
+    """Frequencies turn away from each other, shapes go over, at once or in half of the life."""
     half = np.linspace(-0.03, 0.03, N)
-    reach, angle = np.hypot(half, 0.003), 0.5 * np.arctan2(0.003, half)
+    reach, angle = np.hypot(half, gap), 0.5 * np.arctan2(gap, half)
     rows = [
         say(4.8 + np.array([-r, r]), "ab",
             shapes=np.array([[-np.sin(t), np.cos(t), 0], [np.cos(t), np.sin(t), 0]]))
         for r, t in zip(reach, angle, strict=True)
     ]  # fmt: skip
     found = run(rows)
-    assert set(found.assigned[:20]) == {("a", "b")}
-    assert set(found.assigned[-20:]) == {("b", "a")}
-
-
-def test_modes_that_veer_slowly_are_known_by_their_shapes() -> None:
-    """Shapes that take half of the life to go over are not followed to the other mode."""
-    half = np.linspace(-0.03, 0.03, N)
-    reach, angle = np.hypot(half, 0.01), 0.5 * np.arctan2(0.01, half)
-    rows = [
-        say(4.8 + np.array([-r, r]), "ab",
-            shapes=np.array([[-np.sin(t), np.cos(t), 0], [np.cos(t), np.sin(t), 0]]))
-        for r, t in zip(reach, angle, strict=True)
-    ]  # fmt: skip
-    found = run(rows)
-    assert set(found.assigned[:15]) == {("a", "b")}
-    assert set(found.assigned[-10:]) == {("b", "a")}
+    assert set(found.assigned[:first]) == {("a", "b")}
+    assert set(found.assigned[-last:]) == {("b", "a")}
 
 
 def test_sensors_that_are_moved_cost_no_label(rng: np.random.Generator) -> None:
