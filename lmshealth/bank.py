@@ -169,12 +169,7 @@ class Bank:
     def collapse(self, size: int | None = None) -> tuple[FloatArray, FloatArray]:
         """Mean and covariance over all settings, of the first so many entries of the state."""
         part = slice(size)
-        weight, mean = self.weight, self.mean[:, part]
-        centre = weight @ mean
-        off = mean - centre
-        n = centre.size
-        cov = (weight @ self.cov[:, part, part].reshape(-1, n * n)).reshape(n, n)
-        return centre, cov + (off * weight[:, None]).T @ off
+        return _mixture(self.weight, self.mean[:, part], self.cov[:, part, part])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -321,6 +316,25 @@ class Filter:
         bank.log_weight += -0.5 * nis - log_det - 0.5 * value.size * np.log(2 * np.pi)
         return _surprise(rows, weight, off, spread, doubted)
 
+    def advance(self, bank: Bank, first: int, last: int) -> Bank:
+        """Take a bank over the logs from one to another, both included; it is used up."""
+        for k in range(first, last + 1):
+            self.move(bank, k)
+            self.see(bank, k)
+            bank = bank.pruned()
+        return bank
+
+
+def _mixture(
+    weight: FloatArray, mean: FloatArray, cov: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Mean and covariance of a mixture of ``(n, size)`` means and ``(n, size, size)`` ones."""
+    centre = weight @ mean
+    off = mean - centre
+    n = centre.size
+    within = (weight @ cov.reshape(-1, n * n)).reshape(n, n)
+    return centre, within + (off * weight[:, None]).T @ off
+
 
 def _surprise(
     rows: np.ndarray,
@@ -330,10 +344,7 @@ def _surprise(
     doubted: np.ndarray | None,
 ) -> Surprise:
     """Judge innovations by their mean and covariance over all settings, without outliers."""
-    centre = weight @ off
-    rest = off - centre
-    n = centre.size
-    cov = (weight @ spread.reshape(-1, n * n)).reshape(n, n) + (rest * weight[:, None]).T @ rest
+    centre, cov = _mixture(weight, off, spread)
     if doubted is not None:
         kept = np.flatnonzero(~doubted[rows])
         rows, centre, cov = rows[kept], centre[kept], cov[np.ix_(kept, kept)]

@@ -39,8 +39,7 @@ _OUT = click.Path(dir_okay=False, path_type=Path)
 @click.option("--events", type=_OUT, help="Where go steps, retunings and alarms.")
 @click.option("--refused", type=_OUT, help="Where goes what was given to no mode, and why.")
 @click.option("--smooth", "smoothed", is_flag=True, help="Add columns that know of later logs.")
-@click.pass_context
-def track(ctx: click.Context, /, table: Path, out: Path, **options: Any) -> None:
+def track(table: Path, out: Path, **options: Any) -> None:
     """Follow modes through a table of estimates, ours or another program's.
 
     Needed are the columns recorded_at, frequency_hz and frequency_std_hz. The clock is travel_km

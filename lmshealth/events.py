@@ -12,7 +12,6 @@ nothing happened a martingale of mean one [Ville1939], so that the probability t
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
@@ -159,19 +158,11 @@ def threshold(routes: int = _ROUTES) -> float:
     return float(np.log(routes / FALSE_ALARMS))
 
 
-def explain(
-    advance: Callable[[Filter, Bank, int], Bank],
-    filters: Filter,
-    memory: dict[int, Bank],
-    now: int,
-    suspect: int,
-) -> Finding | None:
+def explain(filters: Filter, memory: dict[int, Bank], now: int, suspect: int) -> Finding | None:
     """Weigh every explanation of what happened about a suspected log.
 
     Parameters
     ----------
-    advance : callable
-        Takes filters, a bank and a log, and gives the bank after the logs from there to `now`.
     filters : Filter
         Of the history.
     memory : dict of int to Bank
@@ -192,7 +183,7 @@ def explain(
     for j in about:
         if j - 1 not in memory or not 0 < j < now:
             continue
-        gains |= _weigh(advance, filters, memory, now, j)
+        gains |= _weigh(filters, memory, now, j)
         if max(gains.values()) < 0:
             break
     if not gains:
@@ -206,11 +197,7 @@ def explain(
 
 
 def _weigh(
-    advance: Callable[[Filter, Bank, int], Bank],
-    filters: Filter,
-    memory: dict[int, Bank],
-    now: int,
-    j: int,
+    filters: Filter, memory: dict[int, Bank], now: int, j: int
 ) -> dict[tuple[FindingKind, str, int], float]:
     """Log Bayes factors of everything that may have happened at log j."""
     kinds: list[tuple[StepKind, str]] = [("step", ""), ("regreasing", ""), ("servo", "")]
@@ -226,26 +213,23 @@ def _weigh(
         # Where the loop has not changed, or nothing is known of it, it was not tuned.
         if kind == "servo" and (loop is None or loop < 0):
             continue
-        step = Step(kind, j, np.arange(len(history.logs)) >= j, source, declared=False)
-        changed = filters.with_step(step)
-        after = advance(changed, before.padded(changed.space.size), j)
+        changed = filters.with_step(Step.found(kind, j, len(history.logs), source))
+        after = changed.advance(before.padded(changed.space.size), j, now)
         gain = after.log_evidence - memory[now].log_evidence + (loop or 0.0)
         gains[kind, source, j] = gain + place - float(np.log(len(kinds)))
     nothing = memory[now].log_evidence - before.log_evidence
-    gains["drift", "", j] = _drift(advance, filters, before, j) - nothing + place
+    gains["drift", "", j] = _drift(filters, before, now, j) - nothing + place
     return gains
 
 
-def _drift(
-    advance: Callable[[Filter, Bank, int], Bank], filters: Filter, before: Bank, j: int
-) -> float:
+def _drift(filters: Filter, before: Bank, now: int, j: int) -> float:
     """Log evidence of the logs from j on if a healthy machine begins to change there."""
     if not before.settings.healthy.any():
         return -np.inf
     begun = reborn(before.only(before.settings.healthy), filters)
     begun = begun.only(~begun.settings.healthy)
     begun.log_weight -= begun.log_evidence
-    return advance(filters, begun, j).log_evidence
+    return filters.advance(begun, j, now).log_evidence
 
 
 def reborn(bank: Bank, filters: Filter) -> Bank:

@@ -288,12 +288,10 @@ def _named(modes: Modes, i: int, stage: Stage | None) -> str:
     """Name of an estimate; without one, that of the nearest mode of the stage within its search."""
     if modes.names[i] or stage is None:
         return modes.names[i]
-    away = {
-        mode.name: abs(float(modes.frequency[i]) / mode.frequency_hz - 1)
-        for mode in stage.modes
-        if mode.tracked and abs(float(modes.frequency[i]) / mode.frequency_hz - 1) <= mode.search
-    }
-    return min(away, key=lambda name: away[name], default="")
+    found = float(modes.frequency[i])
+    away = {m.name: abs(found / m.frequency_hz - 1) for m in stage.modes if m.tracked}
+    near = [m.name for m in stage.modes if m.tracked and away[m.name] <= m.search]
+    return min(near, key=lambda name: away[name], default="")
 
 
 def _doubts(
@@ -335,7 +333,8 @@ def _line_up(
     order = found.modes
     if stage is not None:
         order = tuple(mode.name for mode in stage.modes if mode.tracked)
-    modes = tuple(mode for mode in order if any(mode == name for name, _ in seen))
+    named = {mode for mode, _ in seen}
+    modes = tuple(mode for mode in order if mode in named)
     sources = sorted({source for _, source in seen}, key=_rank)
     series = tuple(Series(m, s) for m in modes for s in sources if (m, s) in seen)
     places = {(one.mode, one.source): i for i, one in enumerate(series)}

@@ -96,6 +96,7 @@ class LifeLikelihood:
         flat = ln_f.T.ravel()
         self.rows = np.flatnonzero(np.isfinite(flat))
         self.mode_of_series = np.array([self.modes.index(one.mode) for one in self.series])
+        self.same_mode = np.equal.outer(self.mode_of_series, self.mode_of_series)
         series = np.repeat(np.arange(len(self.series)), self.clock.size)[self.rows]
         self.mode_of = self.mode_of_series[series]
         centre = np.array(
@@ -211,7 +212,7 @@ class LifeLikelihood:
         noise = np.zeros((n_series, n_logs, n_series, n_logs))
         for k in range(n_logs):
             noise[:, k, :, k] = np.nan_to_num(cov[k])
-        same = np.equal.outer(self.mode_of_series, self.mode_of_series)
+        same = self.same_mode
         common = np.full((n_logs, n_logs), _INTERCEPT_STD**2)
         for regressor in regressors(history.covariates, self.stage):
             values = regressor.values[history.baseline :]
@@ -234,7 +235,7 @@ class LifeLikelihood:
 
     def _offsets(self, history: History) -> FloatArray:
         """Covariance of what shifts readings without wear: sources, retunings, new sensors."""
-        same = np.equal.outer(self.mode_of_series, self.mode_of_series)
+        same = self.same_mode
         # The intercept is the first series'; each further one of a mode has its own bias.
         further = np.tril(same, -1).any(axis=1).astype(float)
         total = np.kron(np.diag(further), np.full((self.clock.size,) * 2, BIAS_STD[0] ** 2))

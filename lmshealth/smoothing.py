@@ -37,11 +37,7 @@ def smooth(history: History, followed: Track, stage: Stage | None = None) -> Smo
     # Where a chapter begins the track lets rates be unknown anew.
     begun = {step.first for step in followed.steps if step.kind == "reset" or not step.declared}
     filters = Filter(space, history.baselines, begun - {0})
-    bank = filters.start()
-    for k in range(len(history.logs)):
-        filters.move(bank, k)
-        filters.see(bank, k)
-        bank = bank.pruned()
+    bank = filters.advance(filters.start(), 0, len(history.logs) - 1)
     order = np.argsort(bank.weight)
     bank = bank.only(order[np.cumsum(bank.weight[order]) > _SHARE])
     weight = bank.weight

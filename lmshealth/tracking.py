@@ -19,7 +19,7 @@ from lmshealth.errors import NotEnoughData
 from lmshealth.events import MEMORY, Finding, Watch, explain, reborn, threshold
 from lmshealth.stage import Stage
 from lmshealth.statespace import JUMP_STD, MOVES, StateSpace, state_space
-from lmshealth.tracks import Effect, Event, History, Step, Track
+from lmshealth.tracks import Effect, Event, History, Step, Track, neighbours
 
 # Innovations further out are hardly believed before the next log is there.
 _FAR = 6.0
@@ -158,23 +158,14 @@ class _Follower:
         mode = np.tile(self.history.mode_of(), 2)
         return np.isin(mode, mode[rows])
 
-    def _again(self, filters: Filter, bank: Bank, first: int, last: int) -> Bank:
-        """Filter some logs again under another explanation."""
-        for k in range(first, last + 1):
-            filters.move(bank, k)
-            filters.see(bank, k)
-            bank = bank.pruned()
-        return bank
-
     def _publish(self, bank: Bank, k: int) -> None:
         record = self.record
         size = record.mean.shape[1]
         mean, cov = bank.collapse(size)
         if k in self.doubted:
             # As likely the first log after a step: nobody can tell yet, and that is what is said.
-            step = Step("step", k, np.arange(len(self.history.logs)) >= k, declared=False)
-            stepped = self.filters.with_step(step)
-            other = self._again(stepped, self.memory[k - 1].padded(stepped.space.size), k, k)
+            stepped = self.filters.with_step(Step.found("step", k, len(self.history.logs)))
+            other = stepped.advance(self.memory[k - 1].padded(stepped.space.size), k, k)
             moved, spread = other.collapse(size)
             off = 0.5 * (moved - mean)
             mean, cov = mean + off, 0.5 * (cov + spread) + np.outer(off, off)
@@ -192,13 +183,7 @@ class _Follower:
         if suspect is not None and not self._just_tested(suspect, k):
             found.tested = (suspect, k)
             found.open = None
-            finding = explain(
-                lambda filters, begun, first: self._again(filters, begun, first, k),
-                self.filters,
-                self.memory,
-                k,
-                suspect,
-            )
+            finding = explain(self.filters, self.memory, k, suspect)
             if finding is not None and finding.believed:
                 if finding.settled(k):
                     adopted = self._adopt(finding, bank, k)
@@ -227,8 +212,7 @@ class _Follower:
             if self.found.alarmed or not finding.damage:
                 return bank
         else:
-            there = np.arange(len(self.history.logs)) >= j
-            step = Step(finding.kind, j, there, finding.source, declared=False)
+            step = Step.found(finding.kind, j, len(self.history.logs), finding.source)
             self.filters = self.filters.with_step(step)
             self.found.findings[len(self.filters.space.steps) - 1] = (finding, k)
             self.watch.settle(self.filters.space.steps)
@@ -305,7 +289,8 @@ class _Follower:
         self._settle(len(history.logs))
         widening = record.widening
         std = np.sqrt(np.einsum("kii->ki", record.cov)) * widening[:, None]
-        record.mean[self._unseen()], std[self._unseen()] = np.nan, np.nan
+        unseen = self._unseen()
+        record.mean[unseen], std[unseen] = np.nan, np.nan
         return Track(
             stage=history.stage,
             logs=history.logs,
@@ -386,17 +371,12 @@ def _widening(nis: FloatArray, dof: FloatArray, innovations: FloatArray) -> Floa
     total, degrees = np.cumsum(np.where(dof > 0, nis, 0.0)), np.cumsum(dof)
     bound = stats.chi2.isf(_WIDEN, np.maximum(degrees, 1.0))
     factor = np.where(degrees > 0, np.maximum(total / bound, 1.0), 1.0)
-    products = np.zeros_like(innovations)
-    products[1:] = innovations[1:] * innovations[:-1]
-    there = np.isfinite(products)
-    there[0] = False
-    n = np.cumsum(there.sum(axis=1))
+    sums, counts = neighbours(innovations)
+    n = np.cumsum(counts)
     squares = np.cumsum(np.nansum(innovations**2, axis=1))
     count = np.cumsum(np.isfinite(innovations).sum(axis=1))
     size = squares / np.maximum(count, 1)
-    sums = np.where(there, products, 0.0).sum(axis=1)
     rho = np.clip(np.cumsum(sums) / np.maximum(n, 1) / np.maximum(size, 1e-12), -0.9, 0.9)
-    # As in `consistency`, the sums over a log are what is independent.
     clear = np.cumsum(sums) > stats.norm.isf(_WIDEN) * np.sqrt(np.cumsum(sums**2))
     factor = factor * np.where(clear, (1 + rho) / (1 - rho), 1.0)
     return np.asarray(np.sqrt(factor))

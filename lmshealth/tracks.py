@@ -63,6 +63,11 @@ class Step:
     def __post_init__(self) -> None:
         freeze(self)
 
+    @classmethod
+    def found(cls, kind: StepKind, first: int, n_logs: int, source: str = "") -> Step:
+        """Make a step that nobody declared, and that all logs from one on see."""
+        return cls(kind, first, np.arange(n_logs) >= first, source, declared=False)
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class History:
@@ -387,6 +392,17 @@ class Smoothed:
         freeze(self)
 
 
+def neighbours(innovations: FloatArray) -> tuple[FloatArray, np.ndarray]:
+    """Multiply innovations by those of the log before: sums over each log, and how many they are.
+
+    Series of one log may have errors in common: the sums over a log are what is independent.
+    """
+    products = np.full_like(innovations, np.nan)
+    products[1:] = innovations[1:] * innovations[:-1]
+    there = np.isfinite(products)
+    return np.where(there, products, 0.0).sum(axis=1), there.sum(axis=1)
+
+
 def consistency(nis: FloatArray, dof: FloatArray, innovations: FloatArray) -> Consistency:
     """Judge innovations: their sum of squares by χ², their independence by the autocorrelation.
 
@@ -404,14 +420,11 @@ def consistency(nis: FloatArray, dof: FloatArray, innovations: FloatArray) -> Co
     judged = dof > 0
     total, degrees = float(nis[judged].sum()), float(dof[judged].sum())
     tail = stats.chi2.sf(total, degrees) if degrees else 0.5
-    pairs = innovations[1:] * innovations[:-1]
-    there = np.isfinite(pairs)
-    n = int(there.sum())
-    # Series of one log may have errors in common: the sums over a log are the independent ones.
-    sums = np.where(there, pairs, 0.0).sum(axis=1)
+    sums, counts = neighbours(innovations)
+    n = int(counts.sum())
     scale = float(np.sqrt(np.sum(sums**2)))
     size = float(np.mean(innovations[np.isfinite(innovations)] ** 2)) if n else 1.0
-    correlation = float(pairs[there].mean()) / max(size, 1e-12) if n else 0.0
+    correlation = float(sums.sum()) / n / max(size, 1e-12) if n else 0.0
     return Consistency(
         nis=total / degrees if degrees else 1.0,
         p_value=float(2 * min(tail, 1 - tail)),

@@ -70,6 +70,19 @@ name = "temperature_c"
 reference = 21.0
 prior_std = 0.001
 """
+# Temperature with a curvature, and payload.
+TWO = """
+[[covariate]]
+name = "temperature_c"
+reference = 21.0
+prior_std = 0.001
+curvature_std = 0.0001
+
+[[covariate]]
+name = "payload_kg"
+reference = 50.0
+prior_std = 0.0005
+"""
 
 
 def true_drift(names: Sequence[str], x: FloatArray) -> FloatArray:

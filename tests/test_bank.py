@@ -13,21 +13,9 @@ from lmshealth.bank import HEALTHY_PRIOR, Bank, Filter, Settings, settings
 from lmshealth.stage import Stage
 from lmshealth.statespace import state_space
 from lmshealth.tracks import History
-from tests.lives import PRELOAD, awkward_history, make_stage, rough_history
+from tests.lives import PRELOAD, TWO, awkward_history, make_stage, rough_history
 from tests.oracles import Followed, Known, Wander, batch, filterpy_loop, kalman
 
-TWO = """
-[[covariate]]
-name = "temperature_c"
-reference = 21.0
-prior_std = 0.001
-curvature_std = 0.0001
-
-[[covariate]]
-name = "payload_kg"
-reference = 50.0
-prior_std = 0.0005
-"""
 KNOWN = Known(2e7, (("temperature_c", 21.0, 0.001, 0.0001), ("payload_kg", 50.0, 0.0005, 0.0)))
 ALONE = Known(2e7, (("temperature_c", 21.0, 0.001, 0.0001),))
 SETTINGS = [

@@ -13,9 +13,9 @@ from lmshealth.smoothing import smooth, smooth_one
 from lmshealth.stage import Stage
 from lmshealth.statespace import state_space
 from lmshealth.tracking import track
-from tests.lives import PRELOAD, awkward_history, make_history, make_stage, rough_history
+from tests.lives import PRELOAD, TWO, awkward_history, make_history, make_stage, rough_history
 from tests.oracles import Wander, batch
-from tests.test_bank import ALONE, KNOWN, SETTINGS, TWO, one
+from tests.test_bank import ALONE, KNOWN, SETTINGS, one
 from tests.test_tracking import quiet, std_of, still
 
 

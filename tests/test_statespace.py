@@ -10,20 +10,19 @@ import pytest
 from lmshealth.stage import Stage
 from lmshealth.statespace import LN_F_STD, LN_ZETA_STD, UNKNOWN_COVARIATE_STD, state_space
 from lmshealth.tracks import History
-from tests.lives import PRELOAD, awkward_history, make_history, make_stage, rough_history, since
+from tests.lives import (
+    PRELOAD,
+    TWO,
+    awkward_history,
+    make_history,
+    make_stage,
+    rough_history,
+    since,
+)
 
-TWO = """
-[[covariate]]
-name = "temperature_c"
-reference = 21.0
-prior_std = 0.001
-curvature_std = 0.0001
-
-[[covariate]]
-name = "payload_kg"
-reference = 50.0
-prior_std = 0.0005
-
+THREE = (
+    TWO
+    + """
 [[covariate]]
 name = "humidity"
 reference = 0.5
@@ -32,12 +31,13 @@ prior_std = 0.01
 [usage]
 horizon_km = 10000
 """
+)
 
 
 @pytest.fixture(scope="module")
 def stage(tmp_path_factory: pytest.TempPathFactory) -> Stage:
     """Three covariates, of which histories have two, and a horizon of 10,000 km."""
-    return make_stage(tmp_path_factory.mktemp("stage"), (PRELOAD,), tail=TWO)
+    return make_stage(tmp_path_factory.mktemp("stage"), (PRELOAD,), tail=THREE)
 
 
 @pytest.fixture

@@ -20,6 +20,7 @@ from lmshealth.tracks import History, Track
 from tests.lives import (
     DAMPING,
     FREQUENCY,
+    TWO,
     awkward_history,
     cut,
     make_history,
@@ -29,7 +30,7 @@ from tests.lives import (
     since,
 )
 from tests.oracles import JUMPS, Known, Wander, filterpy_loop
-from tests.test_bank import KNOWN, SETTINGS, TWO, one
+from tests.test_bank import KNOWN, SETTINGS, one
 
 PUBLISHED = (
     "ln_frequency",
