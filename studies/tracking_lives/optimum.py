@@ -14,7 +14,7 @@ import numpy as np
 
 from lmshealth.events import FALSE_ALARMS
 from lmshealth.statespace import LN_F_STD
-from studies.tracking_lives.lives import Array, Estimates, Life
+from studies.lives import Array, Estimates, Life
 
 _TEMPERATURE_STD = 0.001  # per K, as in the descriptions of the stages
 _BOUND = float(np.log(1 / FALSE_ALARMS))

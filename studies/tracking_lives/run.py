@@ -47,8 +47,7 @@ from unittest.mock import patch
 import numpy as np
 
 from lmshealth import bank
-from studies.record import LEVEL, Stopwatch, clopper_pearson, keep
-from studies.tracking_lives.lives import (
+from studies.lives import (
     DAMAGED,
     HEALTHY,
     Estimates,
@@ -59,8 +58,9 @@ from studies.tracking_lives.lives import (
     plan_of,
     rng_of,
 )
+from studies.raw_lives import identified, measured
+from studies.record import LEVEL, Stopwatch, clopper_pearson, keep
 from studies.tracking_lives.optimum import optimum
-from studies.tracking_lives.raw import identified
 from studies.tracking_lives.trials import (
     DECLARED_RATE,
     MOST,
@@ -76,7 +76,7 @@ HERE = Path(__file__).parent
 CASES = [("lms-y", kind) for kind in HEALTHY + DAMAGED] + [("lms-x", kind) for kind in HEALTHY]
 # Kinds whose cause is declared by somebody, or not.
 DECLARABLE = ("servo-retuning", "regreasing")
-FIRST_SEED, RAW_SEED, SIZES_SEED = 6000, 100, 7
+FIRST_SEED, RAW_SEED = 6000, 100
 CONTROLS = 100  # lives at most of each negative control
 # Alarms of damage, and events found, of all.
 ENOUGH = 0.95
@@ -126,12 +126,6 @@ def study(n: int) -> dict[str, Any]:
         "power": power(sizes["lms-y"], n),
     }
     return answer | {"passed": verdicts(answer)}
-
-
-def measured(stage: str, logs: int) -> tuple[Estimates, Life]:
-    """Simulate and identify a few logs of both tunings."""
-    plan = plan_of(stage, "servo-retuning", SIZES_SEED, logs)
-    return identified(plan), life_of(plan)
 
 
 def described(sizes: Estimates, life: Life) -> dict[str, Any]:

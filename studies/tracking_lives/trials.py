@@ -14,8 +14,8 @@ from scipy import stats
 from lmshealth.stage import Stage, load_stage
 from lmshealth.tracking import track
 from lmshealth.tracks import History, Track
+from studies.lives import HEALTHY, Array, Estimates, Life, history_of, rng_of
 from studies.record import LEVEL, clopper_pearson, judge_coverage
-from studies.tracking_lives.lives import HEALTHY, Array, Estimates, Life, history_of, rng_of
 
 STAGES = ("lms-y", "lms-x")
 NOMINALS = (0.9, 0.5)

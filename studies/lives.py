@@ -1,7 +1,11 @@
-"""Lives as a tracker sees them: what is really so at every log, and estimates of it."""
+"""Lives as a tracker sees them: what is really so at every log, and estimates of it.
+
+Several studies judge by them, see tracking_lives and health_robustness.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime
 from functools import lru_cache
@@ -50,6 +54,8 @@ class Life:
         Which tuning.
     event : int or None
         First log after what happens once in this kind of life.
+    health : ndarray
+        Guide preload and mount stiffness as fractions of commissioning, shape ``(n, 2)``.
     ln_frequency, ln_damping : ndarray
         Of roll, pitch and yaw, shape ``(n, 3)``.
     drift : ndarray
@@ -65,6 +71,7 @@ class Life:
     covariates: dict[str, Array]
     servo: NDArray[np.str_]
     event: int | None
+    health: Array
     ln_frequency: Array
     ln_damping: Array
     drift: Array
@@ -97,7 +104,7 @@ def plan_of(stage: str, kind: str, seed: int, logs: int = 40) -> Plan:
 
 def life_of(plan: Plan) -> Life:
     """Take a life from its plan."""
-    return _life(plan, schedule(plan))
+    return life_with(plan, schedule(plan))
 
 
 def losing_life(plan: Plan) -> Life:
@@ -108,10 +115,11 @@ def losing_life(plan: Plan) -> Life:
         replace(visit, condition=replace(visit.condition, guide_preload=1 - step * visit.index))
         for visit in visits
     ]
-    return _life(plan, lost)
+    return life_with(plan, lost)
 
 
-def _life(plan: Plan, visits: list[Visit]) -> Life:
+def life_with(plan: Plan, visits: Sequence[Visit]) -> Life:
+    """Take a life whose visits are those of its plan, with other conditions."""
     stage = stage_named(plan.stage)
     conditions = [visit.condition for visit in visits]
     seen = np.array([_modes(plan.stage, condition) for condition in conditions])
@@ -131,6 +139,7 @@ def _life(plan: Plan, visits: list[Visit]) -> Life:
         },
         servo=np.array([one.servo_id for one in conditions]),
         event=event if happens and event < len(visits) else None,
+        health=np.array([(one.guide_preload, one.mount_stiffness) for one in conditions]),
         ln_frequency=seen[:, 0],
         ln_damping=seen[:, 1],
         drift=own - own[0],

@@ -13,9 +13,16 @@ from lmshealth.readers import find_logs, read_manifest
 from lmshealth.stage import load_stage
 from models.lives import Plan, simulate_life
 from models.plant import GUIDE_MODES
-from studies.tracking_lives.lives import Estimates
+from studies.lives import Estimates, Life, life_of, plan_of
 
 _FIELDS = ("ln_frequency", "ln_damping", "cov", "loop_error")
+_SIZES_SEED = 7
+
+
+def measured(stage: str, logs: int) -> tuple[Estimates, Life]:
+    """Simulate and identify a few logs of both tunings, for `studies.lives.drawn`."""
+    plan = plan_of(stage, "servo-retuning", _SIZES_SEED, logs)
+    return identified(plan), life_of(plan)
 
 
 def identified(plan: Plan, cache: Path | None = None) -> Estimates:
