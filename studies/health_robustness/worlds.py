@@ -1,0 +1,187 @@
+"""Machines for the study: lives with what is true of their health, and maps that are wrong."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cache
+from pathlib import Path
+
+import msgspec
+import numpy as np
+
+from lmshealth.modalmap import read_map
+from lmshealth.stage import Stage, load_stage
+from models.lives import Visit, schedule
+from models.mapping import modal_map
+from models.plant import GUIDE_MODES
+from models.stages import stage_named
+from studies.lives import HEALTHY, Array, Estimates, Life, life_of, life_with, plan_of
+
+PARAMETERS = ("guide_preload", "mount_stiffness")
+# How a parameter goes, as its law in the description sees it: as that law says; it stays where it
+# began, which no law does that always loses something; or otherwise.
+LAW, STILL, BROKEN = "law", "still", "broken"
+_COURSES = {
+    "preload-wear": (LAW, STILL),
+    "mount-loosening": (STILL, LAW),
+    "both": (LAW, LAW),
+    "sudden-loosening": (STILL, BROKEN),
+    "crash": (BROKEN, BROKEN),
+}
+# Plants whose map is believed in place of the true one: what is wrong, by which factor.
+WRONG_PLANTS: dict[str, dict[str, float]] = {
+    "masses 10 % more, load 10 % higher": {
+        "moving_mass": 1.1, "housing_mass": 1.1, "load_height": 1.1},
+    "preload exponent 5 % more": {"preload_exponent": 1.05},
+    "guide 10 % stiffer": {"block_stiffness": 1.1},
+    "blocks 10 % farther apart": {"block_half_spacing": 1.1},
+}  # fmt: skip
+_KM = 1000.0
+_REDRAWS = 200
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Case:
+    """One life, its estimates, and the truth that is asked for.
+
+    Attributes
+    ----------
+    life : Life
+        What is so at every log.
+    estimates : Estimates
+        What identification gives.
+    health : ndarray
+        Fractions of their value at the first log, shape ``(n_logs, 2)``.
+    passage : ndarray
+        Travel in m since the first log at which each limit is reached, infinite if never,
+        shape ``(2,)``.
+    courses : tuple of str
+        How each parameter goes.
+    """
+
+    life: Life
+    estimates: Estimates
+    health: Array
+    passage: Array
+    courses: tuple[str, str]
+
+
+@cache
+def stage_with(name: str, model_std: float, plant: str = "") -> Stage:
+    """Load a description with another error of its map, or with the map of a wrong plant."""
+    stage = load_stage(name)
+    assert stage.description.map is not None
+    spec = msgspec.structs.replace(stage.description.map, model_std=model_std)
+    surrogate = _wrong_map(name, plant) if plant else stage.modal_map
+    return replace(
+        stage,
+        description=msgspec.structs.replace(stage.description, map=spec),
+        modal_map=surrogate,
+    )
+
+
+@cache
+def _wrong_map(name: str, plant: str):  # type: ignore[no-untyped-def]
+    """Make the map of a stage with some numbers wrong."""
+    stage = stage_named(name)
+    wrong = {}
+    for field, factor in WRONG_PLANTS[plant].items():
+        number = getattr(stage, field)
+        value = number.value
+        scaled = tuple(factor * x for x in value) if isinstance(value, tuple) else factor * value
+        wrong[field] = replace(number, value=scaled)
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "map.csv"
+        modal_map(replace(stage, **wrong)).to_csv(path, index=False)
+        return read_map(str(path), PARAMETERS)
+
+
+def modelled(stage: str, kind: str, seed: int, identify: Callable[[Life], Estimates]) -> Case:
+    """Take a life of `models` and estimates of it."""
+    plan = plan_of(stage, kind, seed)
+    life = life_of(plan)
+    limits = plan.draw_life().limits_km()
+    ends = [np.inf if limits[name] is None else _KM * limits[name] for name in PARAMETERS]
+    return Case(
+        life,
+        identify(life),
+        life.health / life.health[0],
+        np.array(ends) - life.travel[0],
+        _COURSES.get(kind, (STILL, STILL)),
+    )
+
+
+def on_path(stage: str, seed: int, rng: np.random.Generator) -> Life:
+    """Take a life that ends at health drawn from the prior and goes there evenly."""
+    description = load_stage(stage)
+    assert description.modal_map is not None
+    while True:
+        last = np.array([p.prior.quantile(rng.uniform()) for p in description.parameters])
+        if description.modal_map.inside(np.log(last)[None]).all():
+            break
+    kind, visits = _healthy(stage, seed, rng)
+    s = np.array([visit.travel_km - visits[0].travel_km for visit in visits])
+    health = last ** (s / s[-1])[:, None]
+    return life_with(plan_of(stage, kind, seed), _with_health(visits, health))
+
+
+def by_law(stage: str, seed: int, rng: np.random.Generator) -> tuple[Life, Array]:
+    """Take a life by laws drawn from their priors: the life, and where its limits are, in m.
+
+    Only lives that stay inside the map until now are possible for who believes in the map.
+    """
+    description = load_stage(stage)
+    assert description.modal_map is not None
+    kind, visits = _healthy(stage, seed, rng)
+    s = _KM * np.array([visit.travel_km - visits[0].travel_km for visit in visits])
+    for _ in range(_REDRAWS):
+        drawn = [p.law.natural(p.law.draw(rng, 1, s[-1]), s[-1]) for p in description.parameters]
+        laws = [p.law for p in description.parameters]
+        health = np.stack([law.health(own, s)[0] for law, own in zip(laws, drawn, strict=True)], -1)
+        if health.min() > 0 and description.modal_map.inside(np.log(health)).all():
+            break
+    else:
+        raise RuntimeError(f"{stage}: no life of {_REDRAWS} stays inside the map")
+    ends = [
+        law.passage(own, p.limit.below)[0] if p.limit else np.inf
+        for law, own, p in zip(laws, drawn, description.parameters, strict=True)
+    ]
+    life = life_with(plan_of(stage, kind, seed), _with_health(visits, health))
+    return life, np.array(ends)
+
+
+def _healthy(stage: str, seed: int, rng: np.random.Generator) -> tuple[str, list[Visit]]:
+    """Draw which effects without wear a life has: hall, payload, retuning, grease or none."""
+    kind = str(rng.choice(HEALTHY))
+    return kind, schedule(plan_of(stage, kind, seed))
+
+
+def _with_health(visits: list[Visit], health: Array) -> list[Visit]:
+    return [
+        replace(visit, condition=replace(
+            visit.condition, guide_preload=float(preload), mount_stiffness=float(mount)))
+        for visit, (preload, mount) in zip(visits, health, strict=True)
+    ]  # fmt: skip
+
+
+def alone(stage: Stage, health: Array) -> Array:
+    """Drifts of the modes by each parameter alone, shape ``(n_parameters, n_points, n_modes)``."""
+    x = np.log(health)
+    only = np.zeros((x.shape[1], *x.shape))
+    for j in range(x.shape[1]):
+        only[j, :, j] = x[:, j]
+    return np.stack([stage.drift(own, GUIDE_MODES) for own in only])
+
+
+def elsewhere(life: Life, model_std: float, rng: np.random.Generator) -> Life:
+    """Move a life to a machine whose sensitivities are not those of its map.
+
+    What each parameter alone does to each mode is more or less by a relative error of standard
+    deviation `model_std`, the same over the whole life: the map is then wrong by as much.
+    """
+    parts = alone(load_stage(life.stage), life.health)
+    error = model_std * rng.standard_normal((parts.shape[0], 1, parts.shape[2]))
+    moved = np.sum(error * parts, axis=0)
+    return replace(life, ln_frequency=life.ln_frequency + moved, drift=life.drift + moved)
