@@ -53,8 +53,10 @@ from studies.health_robustness.trials import (
     tracked,
 )
 from studies.health_robustness.worlds import (
+    BROKEN,
     LAW,
     PARAMETERS,
+    STILL,
     WRONG_PLANTS,
     Case,
     by_law,
@@ -113,7 +115,7 @@ def main() -> None:
 
 # How many lives: of each kind, of these by laws; on paths, by laws, by laws in the other stage,
 # by laws with maps of wrong plants, and compared with chains.
-FULL = {"kind": 20, "kind_law": 10, "path": 200, "law": 100, "other": 50, "plants": 30, "chains": 5,
+FULL = {"kind": 20, "kind_law": 10, "path": 150, "law": 100, "other": 30, "plants": 20, "chains": 5,
         "sized": 12}  # fmt: skip
 QUICK = {"kind": 2, "kind_law": 1, "path": 12, "law": 2, "other": 1, "plants": 1, "chains": 1,
          "sized": 8}  # fmt: skip
@@ -168,8 +170,9 @@ def judged(cases: list[Case], n_law: int, lost: list[str]) -> list[Row]:
         found["last"].append(at_epoch(case, followed, stage, last, rng))
     for case, history in pairs[:n_law]:
         whole_life(found, case, history, Arm("coherent", MAP_STD), lost)
-    courses = (*cases[0].courses, LAW if LAW in cases[0].courses else cases[0].courses[0])
-    return rows(found, {"stage": life.stage, "kind": life.kind}, courses)
+    own = cases[0].courses
+    together = next(course for course in (BROKEN, STILL, LAW) if course in own)
+    return rows(found, {"stage": life.stage, "kind": life.kind}, (*own, together))
 
 
 def whole_life(
