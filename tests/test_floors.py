@@ -24,6 +24,7 @@ FLOORS = [
         "components",
         "maintenance",
         "wording",
+        "rowfile",
         "filterbank",
     },
     {
@@ -35,6 +36,7 @@ FLOORS = [
         "rational",
         "noise",
         "hypotheses",
+        "tracktable",
         "estimates",
     },
     {
@@ -60,10 +62,10 @@ FLOORS = [
         "association",
         "bank",
     },
-    {"posterior", "events"},
+    {"posterior", "events", "laplace"},
     {"bandfit"},
     {"separation"},
-    {"modal", "frf", "history", "sampling", "ringing"},
+    {"modal", "frf", "history", "ringing", "sampling"},
     {"tracking", "smoothing", "decay", "survey", "planning", "modetable"},
     {"inference"},
     {"life"},
