@@ -118,7 +118,7 @@ def epoch_draws(
     modes = tuple(name for name in stage.informative if name in track.modes)
     columns = [track.modes.index(name) for name in modes]
     cov = shrink * track.drift_cov[epoch][np.ix_(columns, columns)]
-    posterior = EpochPosterior(stage, modes, track.drift[epoch][columns], cov)
+    posterior = EpochPosterior.of(stage, modes, track.drift[epoch][columns], cov)
     draws = _believed(posterior.log_probability, posterior.draw_prior(rng, 1000), rng, 8000)
     return Draws(np.exp(draws.points), draws.weight)
 

@@ -115,7 +115,7 @@ def main() -> None:
 
 # How many lives: of each kind, of these by laws; on paths, by laws, by laws in the other stage,
 # by laws with maps of wrong plants, and compared with chains.
-FULL = {"kind": 20, "kind_law": 10, "path": 150, "law": 100, "other": 30, "plants": 20, "chains": 5,
+FULL = {"kind": 20, "kind_law": 20, "path": 150, "law": 100, "other": 50, "plants": 30, "chains": 5,
         "sized": 12}  # fmt: skip
 QUICK = {"kind": 2, "kind_law": 1, "path": 12, "law": 2, "other": 1, "plants": 1, "chains": 1,
          "sized": 8}  # fmt: skip

@@ -115,12 +115,7 @@ def modelled(stage: str, kind: str, seed: int, identify: Callable[[Life], Estima
 
 def on_path(stage: str, seed: int, rng: np.random.Generator) -> Life:
     """Take a life that ends at health drawn from the prior and goes there evenly."""
-    description = load_stage(stage)
-    assert description.modal_map is not None
-    while True:
-        last = np.array([p.prior.quantile(rng.uniform()) for p in description.parameters])
-        if description.modal_map.inside(np.log(last)[None]).all():
-            break
+    last = np.exp(load_stage(stage).prior.draw(rng, 1)[0])
     kind, visits = _healthy(stage, seed, rng)
     s = np.array([visit.travel_km - visits[0].travel_km for visit in visits])
     health = last ** (s / s[-1])[:, None]
