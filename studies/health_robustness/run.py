@@ -41,7 +41,7 @@ import numpy as np
 
 from lmshealth.inference import infer
 from lmshealth.prognosis import prognose
-from studies.health_robustness.posteriors import TooFew, epoch_draws, life_draws, quantiles
+from studies.health_robustness.posteriors import epoch_draws, life_draws
 from studies.health_robustness.trials import (
     ENDS,
     Answer,
@@ -65,6 +65,7 @@ from studies.health_robustness.worlds import (
     on_path,
     stage_with,
 )
+from studies.importance import TooFew, quantiles
 from studies.lives import DAMAGED, HEALTHY, Estimates, Life, drawn, plan_of, rng_of
 from studies.raw_lives import identified, measured
 from studies.record import Stopwatch, keep

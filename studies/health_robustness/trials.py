@@ -11,8 +11,9 @@ import numpy as np
 from lmshealth.stage import Stage
 from lmshealth.tracking import track
 from lmshealth.tracks import History, Track
-from studies.health_robustness.posteriors import Draws, epoch_draws, life_draws, place, quantiles
+from studies.health_robustness.posteriors import epoch_draws, life_draws
 from studies.health_robustness.worlds import PARAMETERS, Case, alone
+from studies.importance import Draws, place, quantiles
 from studies.lives import Array, history_of
 from studies.record import judge_coverage
 
