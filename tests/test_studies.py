@@ -187,3 +187,25 @@ def test_beam_track(root: Path, needs: Callable[[str], None]) -> None:
     needs("data")
     answer = json.loads(run_study(root, "beam_track"))
     assert all(answer["passed"].values())
+
+
+def test_health_robustness(root: Path) -> None:
+    """Health is covered on a few lives of each kind, and less without the error of a wrong map."""
+    answer = json.loads(run_study(root, "health_robustness"))
+    failed = {name for name, fine in answer["passed"].items() if not fine}
+    # So few lives tell narrow intervals by their share alone.
+    assert all(name.startswith("control") for name in failed)
+
+    def share(world: str, arm: str) -> float:
+        rows = [row for row in answer["fleets"]
+                if (row["world"], row["arm"], row["what"]) == (world, arm, "last")]  # fmt: skip
+        return sum(row["90"]["hits"] for row in rows) / sum(row["90"]["n"] for row in rows)
+
+    assert share("map 5 % wrong", "no error term") < share("map 5 % wrong", "coherent") - 0.1
+    assert answer["not_drawn"] == []
+
+
+def test_detectability(root: Path) -> None:
+    """The posterior finds planned losses as often as planned; the mount of X is not shown."""
+    answer = json.loads(run_study(root, "detectability"))
+    assert all(answer["passed"].values())

@@ -115,11 +115,11 @@ def main() -> None:
 
 
 # How many lives: of each kind, of these by laws; on paths, by laws, by laws in the other stage,
-# by laws with maps of wrong plants, and compared with chains.
-FULL = {"kind": 20, "kind_law": 20, "path": 150, "law": 100, "other": 50, "plants": 30, "chains": 5,
-        "sized": 12}  # fmt: skip
-QUICK = {"kind": 2, "kind_law": 1, "path": 12, "law": 2, "other": 1, "plants": 1, "chains": 1,
-         "sized": 8}  # fmt: skip
+# by laws with maps of so many wrong plants, and compared with chains; logs that sizes are from.
+FULL = {"kind": 20, "kind_law": 20, "path": 150, "law": 100, "other": 50, "plants": 30, "maps": 4,
+        "chains": 5, "sized": 12}  # fmt: skip
+QUICK = {"kind": 1, "kind_law": 1, "path": 12, "law": 1, "other": 1, "plants": 1, "maps": 1,
+         "chains": 1, "sized": 8}  # fmt: skip
 
 
 def study(n: dict[str, int]) -> Row:
@@ -139,7 +139,7 @@ def study(n: dict[str, int]) -> Row:
     answer: Row = {
         "lives": lives,
         "fleets": fleets,
-        "plants": wrong_plants("lms-y", n["path"], n["plants"], sizes, lost),
+        "plants": wrong_plants("lms-y", n, sizes, lost),
         "demo": demo(n["path"] // 2, sizes),
         "chains": chains(n["chains"], sizes),
         "not_drawn": lost,
@@ -251,12 +251,12 @@ def _drawn(
         yield Case(seen, drawn(seen, *sizes[stage], rng), life.health, passage, (LAW, LAW))
 
 
-def wrong_plants(stage: str, n_path: int, n_law: int, sizes: Sizes, lost: list[str]) -> list[Row]:
+def wrong_plants(stage: str, n: dict[str, int], sizes: Sizes, lost: list[str]) -> list[Row]:
     """Judge the same lives with maps of plants that are not theirs."""
-    followed = tracked(histories(on_paths(stage, n_path, sizes)), stage_with(stage, MAP_STD))
-    laws = histories(by_laws_drawn(stage, n_law, sizes))
+    followed = tracked(histories(on_paths(stage, n["path"], sizes)), stage_with(stage, MAP_STD))
+    laws = histories(by_laws_drawn(stage, n["plants"], sizes))
     result = []
-    for plant in WRONG_PLANTS:
+    for plant in list(WRONG_PLANTS)[-n["maps"] :]:
         for arm in (Arm("no error term", 0.0), Arm("coherent", MAP_STD)):
             found: dict[str, list[list[Answer]]] = {
                 "last": [last_of(*one, arm, plant) for one in followed], "now": [], "left": []

@@ -142,12 +142,12 @@ def summed(answers: list[Answer]) -> dict[str, Any]:
     for name in ("z", "error"):
         values = np.array([getattr(one, name) for one in answers])
         values = values[np.isfinite(values)]
-        told = values.size > 1
+        n = values.size
         row[name] = {
-            "n": values.size,
-            "mean": float(values.mean()) if told else None,
-            "se": float(values.std(ddof=1) / np.sqrt(values.size)) if told else None,
-            "rms": float(np.sqrt(np.mean(values**2))) if told else None,
+            "n": n,
+            "mean": float(values.mean()) if n else None,
+            "se": float(values.std(ddof=1) / np.sqrt(n)) if n > 1 else None,
+            "rms": float(np.sqrt(np.mean(values**2))) if n else None,
         }
     widths = np.array([one.width for one in answers])
     row["width"] = float(np.median(widths)) if np.isfinite(np.median(widths)) else None

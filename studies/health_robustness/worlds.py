@@ -11,7 +11,7 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
-from lmshealth.modalmap import read_map
+from lmshealth.modalmap import ModalMap, read_map
 from lmshealth.stage import Stage, load_stage
 from models.lives import Visit, schedule
 from models.mapping import modal_map
@@ -83,7 +83,7 @@ def stage_with(name: str, model_std: float, plant: str = "") -> Stage:
 
 
 @cache
-def _wrong_map(name: str, plant: str):  # type: ignore[no-untyped-def]
+def _wrong_map(name: str, plant: str) -> ModalMap:
     """Make the map of a stage with some numbers wrong."""
     stage = stage_named(name)
     wrong = {}

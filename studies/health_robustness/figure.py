@@ -1,0 +1,148 @@
+"""Draw figure.svg from result.json and raw.json: coverage and bias, by kinds, arms and plants."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+HERE = Path(__file__).parent
+BLUE, ORANGE, BLACK = "#0072b2", "#d55e00", "#000000"
+PARAMETERS = {"guide_preload": (BLUE, "o", "preload"), "mount_stiffness": (ORANGE, "s", "mount")}
+WHAT = {"last": "last log, no law", "now": "now, by laws", "left": "remaining life"}
+Row = dict[str, Any]
+
+
+def coverage(
+    ax: Axes, rows: list[Row], named: Callable[[Row], str], names: list[str], raw: list[Row]
+) -> None:
+    """Draw how often intervals hold the truth, one line per name."""
+    nominal = "90"
+    ax.axvline(float(nominal) / 100, color=BLACK, ls="--", lw=1)
+    for row in rows:
+        colour, marker, _ = PARAMETERS.get(row["parameter"], (BLACK, "D", "first of both"))
+        place = list(PARAMETERS).index(row["parameter"]) if row["parameter"] in PARAMETERS else 2
+        y, own = names.index(named(row)) + 0.2 * (place - 0.5), row[nominal]
+        ax.plot([own["low"], own["high"]], [y, y], lw=1.3, color=colour, alpha=0.6)
+        ax.plot(own["share"], y, marker, ms=4, color=colour)
+    for row in raw:
+        if named(row) in names and row["parameter"] in PARAMETERS:
+            colour = PARAMETERS[row["parameter"]][0]
+            ax.plot(row[nominal]["share"], names.index(named(row)) + 0.36, "x", ms=4, color=colour)
+    ax.set_yticks(range(len(names)), names)
+    ax.set_ylim(len(names) - 0.4, -0.6)
+    ax.set_xlim(-0.02, 1.02)
+    ax.set_xlabel(f"share of {nominal} % intervals holding the truth")
+    ax.grid(axis="x", alpha=0.25)
+
+
+def bias(
+    ax: Axes, rows: list[Row], named: Callable[[Row], str], names: list[str], raw: list[Row]
+) -> None:
+    """Draw how far medians are off on average."""
+    ax.axvline(0, color=BLACK, lw=1)
+    for row in rows:
+        colour, marker, _ = PARAMETERS[row["parameter"]]
+        y = names.index(named(row)) + 0.2 * (list(PARAMETERS).index(row["parameter"]) - 0.5)
+        mean, se = row["error"]["mean"], row["error"]["se"] or 0.0
+        ax.plot([100 * (mean - 2 * se), 100 * (mean + 2 * se)], [y, y], lw=1.3, color=colour)
+        ax.plot(100 * mean, y, marker, ms=4, color=colour)
+    for row in raw:
+        if named(row) in names:
+            mean, colour = row["error"]["mean"], PARAMETERS[row["parameter"]][0]
+            ax.plot(100 * mean, names.index(named(row)) + 0.36, "x", ms=4, color=colour)
+    ax.set_yticks(range(len(names)), names)
+    ax.set_ylim(len(names) - 0.4, -0.6)
+    ax.set_xscale("symlog", linthresh=2)
+    ticks = (-20, -5, -2, 0, 2, 5, 20)
+    ax.set_xticks(ticks, [str(tick) for tick in ticks])
+    ax.set_xlabel("mean error of the median in %, ± 2 std errors")
+    ax.grid(axis="x", alpha=0.25)
+
+
+def kind(row: Row) -> str:
+    """Name a kind of life."""
+    return f"{row['stage'][-1].upper()} {row['kind']}"
+
+
+def fleet(row: Row) -> str:
+    """Name an arm of drawn lives."""
+    return f"{row['world']}:\n{row['arm']}"
+
+
+def plant(row: Row) -> str:
+    """Name a wrong plant."""
+    return f"{row['plant']}:\n{'with' if row['arm'] == 'coherent' else 'no'} error term"
+
+
+def draw_demo(ax: Axes, rows: list[Row]) -> None:
+    """Draw how wide intervals of the demo's kind of life are, and what lies in their middle."""
+    names = named_in(rows, fleet)
+    for row in rows:
+        colour, _, _ = PARAMETERS[row["parameter"]]
+        y = names.index(fleet(row)) + 0.36 * (list(PARAMETERS).index(row["parameter"]) - 0.5)
+        ax.barh(y, 100 * row["width"], 0.32, color=colour)
+        rms = 3.29 * row["error"]["rms"]
+        ax.plot(100 * rms, y, "|", ms=11, mew=2, color=BLACK)
+        ax.text(100 * row["width"] + 0.2, y, f"{100 * row['third']:.0f} % in a third", va="center",
+                fontsize=7)  # fmt: skip
+    ax.plot([], [], "|", ms=11, mew=2, color=BLACK, label="3.29 × rms error of the median")
+    ax.set_yticks(range(len(names)), names)
+    ax.set_xlim(0, 1.6 * max(100 * row["width"] for row in rows))
+    ax.set_xlabel("median width of the 90 % interval in %")
+    ax.set_title("Y, both wear, last log\n(a third of an interval holds 42 %)", fontsize=10)
+    ax.set_ylim(len(names) - 0.1, -0.6)
+    ax.legend(fontsize=7, loc="lower right")
+
+
+def named_in(rows: list[Row], named: Callable[[Row], str]) -> list[str]:
+    """Names of rows, each once."""
+    return list(dict.fromkeys(named(row) for row in rows))
+
+
+def of(rows: list[Row], what: str) -> list[Row]:
+    """Rows of one question."""
+    return [row for row in rows if row["what"] == what]
+
+
+def main() -> None:
+    """Draw."""
+    matplotlib.rcParams |= {"svg.hashsalt": "lmshealth", "font.size": 8}
+    result = json.loads((HERE / "result.json").read_text(encoding="utf-8"))
+    kept = HERE / "raw.json"
+    raw = json.loads(kept.read_text(encoding="utf-8"))["lives"] if kept.exists() else []
+    figure = Figure(figsize=(13, 15), layout="constrained")
+    top, middle, bottom = figure.subfigures(3, 1, height_ratios=(2.1, 1.3, 1.5))
+    lives, fleets, plants = result["lives"], result["fleets"], result["plants"]
+    axes = top.subplots(1, 3, sharey=True)
+    names = named_in(lives, kind)
+    coverage(axes[0], of(lives, "last"), kind, names, of(raw, "last"))
+    axes[0].set_title("Kinds of lives: last log, no law", fontsize=10)
+    bias(axes[1], of(lives, "last"), kind, names, of(raw, "last"))
+    axes[1].set_title("The same: bias", fontsize=10)
+    bias(axes[2], of(lives, "now"), kind, names, of(raw, "now"))
+    axes[2].set_title("Health now by laws of the whole life: bias", fontsize=10)
+    axes = middle.subplots(1, 3, sharey=True)
+    own = [row for row in fleets if row["stage"] == "lms-y"]
+    for ax, (what, title) in zip(axes, WHAT.items(), strict=True):
+        coverage(ax, of(own, what), fleet, named_in(own, fleet), [])
+        ax.set_title(f"Y, drawn from the priors: {title}", fontsize=10)
+    left, right = bottom.subfigures(1, 2, width_ratios=(2, 1.1))
+    for ax, (what, title) in zip(left.subplots(1, 2, sharey=True), WHAT.items(), strict=False):
+        coverage(ax, of(plants, what), plant, named_in(plants, plant), [])
+        ax.set_title(f"Y, a wrong plant's map: {title}", fontsize=10)
+    draw_demo(right.subplots(), result["demo"])
+    for colour, marker, what in (*PARAMETERS.values(), (BLACK, "D", "first limit of both"),
+                                 (BLACK, "x", "raw lives")):  # fmt: skip
+        axes[2].plot([], [], marker, color=colour, label=what)
+    axes[2].legend(fontsize=7, loc="lower left")
+    figure.savefig(HERE / "figure.svg", metadata={"Date": None})
+
+
+if __name__ == "__main__":
+    main()
