@@ -15,9 +15,9 @@ MODE, PARAMETER = "beam", "roller_v"
 DEGREES = (1, 2, 3, 4)
 # The map reaches beyond the calibrated positions by this share, and has so many points.
 _BEYOND, _POINTS = 0.02, 13
-_STAGE = """\
+_LOOK = """\
 name = "beam"
-source = "free decays of repeats 0 and 1 of the movable roller, DROPBEAR data set 8"
+source = "movable roller, DROPBEAR data set 8"
 
 [match]
 stage = "beam"
@@ -27,12 +27,14 @@ name = "{mode}"
 frequency_hz = {hz}
 damping_ratio = {zeta}
 search = {search}
-
-# The reading of the roller's position sensor; its scale to millimetres is not told.
+"""
+_HEALTH = """
+# The reading of the roller's position sensor; its scale to millimetres is not told. The map is
+# made from repeats 0 and 1, the baseline is the mean position of their first dwells that were read.
 [[parameter]]
 name = "{parameter}"
 unit = "V"
-baseline = {baseline:.4f}   # mean position of the first excited dwells of repeats 0 and 1
+baseline = {baseline:.4f}
 prior = {{ kind = "uniform", low = {low:.4f}, high = {high:.4f} }}
 
 [map]
@@ -95,6 +97,13 @@ def calibrate(read: pd.DataFrame, *, degree: int | None = None) -> Calibration:
     )
 
 
+def write_look(folder: Path) -> Path:
+    """Write a description that says what to look for only, and return its path."""
+    path = folder / "look.toml"
+    path.write_text(_look(), encoding="utf-8")
+    return path
+
+
 def write_stage(calibration: Calibration, folder: Path, *, model_std: float | None = None) -> Path:
     """Write a stage description and its map beside it, and return the description's path."""
     folder.mkdir(parents=True, exist_ok=True)
@@ -106,21 +115,21 @@ def write_stage(calibration: Calibration, folder: Path, *, model_std: float | No
     }
     pd.DataFrame(rows).to_csv(folder / "roller.map.csv", index=False, float_format="%.9g")
     path = folder / "roller.toml"
-    path.write_text(
-        _STAGE.format(
-            mode=MODE,
-            hz=BEAM.frequency_hz,
-            zeta=BEAM.damping_ratio,
-            search=BEAM.search,
-            parameter=PARAMETER,
-            baseline=calibration.baseline,
-            low=calibration.low,
-            high=calibration.high,
-            model_std=calibration.model_std if model_std is None else model_std,
-        ),
-        encoding="utf-8",
+    health = _HEALTH.format(
+        parameter=PARAMETER,
+        baseline=calibration.baseline,
+        low=calibration.low,
+        high=calibration.high,
+        model_std=calibration.model_std if model_std is None else model_std,
     )
+    path.write_text(_look() + health, encoding="utf-8")
     return path
+
+
+def _look() -> str:
+    return _LOOK.format(
+        mode=MODE, hz=BEAM.frequency_hz, zeta=BEAM.damping_ratio, search=BEAM.search
+    )
 
 
 def places(read: pd.DataFrame) -> pd.Series[int]:
