@@ -247,7 +247,7 @@ def test_simulated_stages_tell_their_modes_after_a_stop(name: str) -> None:
 
 
 def test_a_mode_that_creeps_ends_in_no_runaway_pole() -> None:
-    """Of a frequency that settles after the stop no pole goes to infinity, and the mode is found."""
+    """A frequency that settles after the stop sends no pole to infinity, and is found."""
     rng = np.random.default_rng(3)
     rate, t = 1000.0, np.arange(500) / 1000.0
     creeping = 26.2 * (1 + 5e-4 * np.exp(-t / 0.1))

@@ -15,13 +15,13 @@ Method
     parameter's baseline by definition, so that nine of ten dwells are inferred. Controls: the map
     taken for exact and drifts for four times as well known; a straight line for a map.
 Answer
-    Yes. In repeat 2 all ten excited dwells are read and the first is refused; nine of nine measured
-    positions lie inside their 90 % intervals of ±7 to ±25 mV, on a travel of 2.14 V. They are off by
-    8 mV at most, half a standard deviation in rms: the intervals are cautious. Most of that is
-    hysteresis: at inner positions the same frequency reads 3 to 5 mV higher on the way back, which a
-    map of one curve takes for its own error of 0.8 %. Up and down agree within half of what their
-    intervals allow. A map taken for exact, with drifts said to be four times as well known, holds
-    four of nine; a straight line holds one.
+    Yes. In repeat 2 all ten excited dwells are read and the first is refused. Nine of nine
+    measured positions lie inside their 90 % intervals of ±7 to ±25 mV, on a travel of 2.14 V.
+    They are off by 8 mV at most, half a standard deviation in rms: the intervals are cautious. Most
+    of that is hysteresis: at inner positions the same frequency reads 3 to 6 mV higher on the way
+    back, which a map of one curve takes for its own error of 0.8 %. Up and down agree within half
+    of what their intervals allow. A map taken for exact, with drifts said to be four times as well
+    known, holds five of nine; a straight line holds one.
 Run time
     Two minutes of a busy processor.
 Data
