@@ -134,9 +134,11 @@ def read_map(path: str, parameters: tuple[str, ...]) -> ModalMap:
         If columns are missing, values are not positive, or the grid is not full.
     """
     try:
-        table = pd.read_csv(path)
+        # Blank lines count, so that a row is told by its line.
+        table = pd.read_csv(path, skip_blank_lines=False).dropna(how="all")
     except (OSError, ValueError) as error:
-        raise BadStage(f"{path}: cannot read the modal map: {error}") from error
+        why = getattr(error, "strerror", None) or error
+        raise BadStage(f"{path}: cannot read the modal map: {why}") from error
     missing = {*parameters, "mode", "frequency_hz"} - set(table.columns)
     if missing:
         raise BadStage(f"{path}: no column {sorted(missing)}; there are {list(table.columns)}")
@@ -146,21 +148,29 @@ def read_map(path: str, parameters: tuple[str, ...]) -> ModalMap:
             f"{path}: columns {sorted(extra)} are no parameter of the stage description; "
             "describe them as [[parameter]] or make the map without them"
         )
-    try:
-        numbers = table[[*parameters, "frequency_hz"]].to_numpy(dtype=float)
-    except ValueError as error:
-        raise BadStage(f"{path}: a cell holds no number: {error}") from error
-    if not (np.isfinite(numbers) & (numbers > 0)).all():
-        raise BadStage(f"{path}: parameters and frequencies must be positive numbers")
+    numbers = table[[*parameters, "frequency_hz"]].apply(pd.to_numeric, errors="coerce")
+    for name, column in numbers.items():
+        wrong = ~(np.isfinite(column) & (column > 0)).to_numpy()
+        if wrong.any():
+            cell = table[name].iloc[wrong.argmax()]
+            raise BadStage(
+                f"{_line(path, table, wrong)}: {name} is {cell}; needed is a positive number"
+            )
+    table = table.assign(**numbers, mode=table["mode"].astype(str))
+    twice = table.duplicated([*parameters, "mode"]).to_numpy()
+    if twice.any():
+        raise BadStage(f"{_line(path, table, twice)}: a mode stands twice at one grid point")
     return _fit(path, table, parameters)
 
 
+def _line(path: str, table: pd.DataFrame, wrong: BoolArray) -> str:
+    """Name the line of the first row that is meant; the first line has the columns' names."""
+    return f"{path}: line {table.index[wrong][0] + 2}"
+
+
 def _fit(path: str, table: pd.DataFrame, parameters: tuple[str, ...]) -> ModalMap:
-    modes = tuple(table["mode"].astype(str).unique())
-    try:
-        wide = table.pivot(index=list(parameters), columns="mode", values="frequency_hz")
-    except ValueError as error:
-        raise BadStage(f"{path}: a mode stands twice at one grid point: {error}") from error
+    modes = tuple(table["mode"].unique())
+    wide = table.pivot(index=list(parameters), columns="mode", values="frequency_hz")
     axes = [np.unique(table[name]) for name in parameters]
     n_grid = int(np.prod([axis.size for axis in axes]))
     values = wide[list(modes)].to_numpy(dtype=float)
@@ -170,7 +180,8 @@ def _fit(path: str, table: pd.DataFrame, parameters: tuple[str, ...]) -> ModalMa
             f"with modes {list(modes)} needs {n_grid * len(modes)}"
         )
     if min(axis.size for axis in axes) < 3:
-        raise BadStage(f"{path}: every parameter needs at least 3 grid values")
+        sizes = {name: axis.size for name, axis in zip(parameters, axes, strict=True)}
+        raise BadStage(f"{path}: every parameter needs at least 3 grid values, there are {sizes}")
     points = np.log(wide.index.to_frame().to_numpy(dtype=float))
     low, high = points.min(axis=0), points.max(axis=0)
     unit = 2 * (points - low) / (high - low) - 1

@@ -9,7 +9,7 @@ import pytest
 
 FLOORS = [
     {"errors"},
-    {"arrays"},
+    {"arrays", "toml"},
     {"samples"},
     {"logs"},
     {"results", "tracks"},

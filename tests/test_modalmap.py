@@ -161,9 +161,12 @@ def test_the_edge_of_the_grid_is_inside(small: ModalMap) -> None:
         (lambda rows: [r.replace("mount_stiffness", "foot") for r in rows], "mount_stiffness"),
         (lambda rows: [rows[0] + ",load", *(r + ",1" for r in rows[1:])], "load.*no parameter"),
         (lambda rows: rows[:-1], "97 values where a full grid of 49"),
-        (lambda rows: [*rows, rows[-1]], "twice"),
-        (lambda rows: [*rows[:-1], rows[-1].rsplit(",", 1)[0] + ",-3"], "positive"),
-        (lambda rows: [*rows[:-1], rows[-1].rsplit(",", 1)[0] + ","], "positive"),
+        (lambda rows: [*rows, rows[-1]], "line 100: .*twice"),
+        (lambda rows: [*rows[:-1], rows[-1].rsplit(",", 1)[0] + ",-3"], "line 99: .*-3.*positive"),
+        (
+            lambda rows: [*rows[:-1], rows[-1].rsplit(",", 1)[0] + ","],
+            "line 99: frequency_hz is nan.*positive",
+        ),
     ],
     ids=["no-frequency", "no-parameter", "extra", "hole", "twice", "negative", "empty"],
 )
@@ -175,17 +178,18 @@ def test_a_map_that_breaks_its_contract_is_refused(tmp_path: Path, change, needl
 
 
 def test_text_where_numbers_belong_is_refused_as_such(tmp_path: Path) -> None:
-    """A word in a number column is an error of the map, not a traceback."""
+    """A word in a number column is an error of the map, told by its line; blank lines count."""
     rows = map_rows(NAMES)
     rows[3] = "low" + rows[3][rows[3].index(",") :]
-    with pytest.raises(BadStage, match=r"map\.csv"):
+    rows.insert(2, "")
+    with pytest.raises(BadStage, match=r"map\.csv: line 5: guide_preload is low; needed"):
         read_map(write(tmp_path, rows), NAMES)
 
 
 def test_too_few_grid_values_are_refused(tmp_path: Path) -> None:
     """Two values of a parameter make no surrogate."""
     rows = ["p,mode,frequency_hz", "1,roll,100", "2,roll,120"]
-    with pytest.raises(BadStage, match="at least 3"):
+    with pytest.raises(BadStage, match=r"at least 3 grid values.*'p': 2"):
         read_map(write(tmp_path, rows), ("p",))
 
 
