@@ -167,7 +167,13 @@ class JointPrior:
             below, mass = self._mass(prior, self.low[j], self.high[j])
             columns.append(np.log(prior.quantile(below + mass * level[:, j])))
         # Rounding of quantiles must not leave the box.
-        return np.clip(np.column_stack(columns), self.low, self.high)
+        return np.asarray(np.clip(np.column_stack(columns), self.low, self.high))
+
+    @property
+    def support(self) -> tuple[FloatArray, FloatArray]:
+        """Ends of the ln parameters that are possible, in the box; each ``(n_parameters,)``."""
+        low, high = self.quantile(np.array([[0.0], [1.0]]))
+        return low, high
 
     def draw(self, rng: np.random.Generator, n: int) -> FloatArray:
         """Draw ln parameters, shape ``(n, n_parameters)``."""

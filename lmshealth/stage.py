@@ -24,7 +24,7 @@ from lmshealth.errors import BadStage
 from lmshealth.laws import AnyLaw, Unchanging
 from lmshealth.logs import Metadata
 from lmshealth.modalmap import ModalMap, read_map
-from lmshealth.priors import Prior
+from lmshealth.priors import JointPrior, Prior
 from lmshealth.toml import Keys, decode, place
 
 Positive = Annotated[float, Meta(gt=0, le=sys.float_info.max)]
@@ -204,6 +204,18 @@ class Stage:
         """Ln of the parameters at baseline, shape ``(n_parameters,)``."""
         return np.log([parameter.baseline for parameter in self.parameters])
 
+    @cached_property
+    def prior(self) -> JointPrior:
+        """Priors of the health parameters, cut where the map ends."""
+        if self.modal_map is None:
+            raise BadStage(f"{self.name}: no [[parameter]] with a [map]")
+        names = tuple(parameter.name for parameter in self.parameters)
+        priors = tuple(parameter.prior for parameter in self.parameters)
+        try:
+            return JointPrior(names, priors, self.modal_map.low, self.modal_map.high)
+        except BadStage as error:
+            raise BadStage(f"{self.name}: {error}") from error
+
     def takes(self, metadata: Metadata) -> bool:
         """Tell whether a log belongs to this description."""
         if metadata.description is not None:
@@ -322,14 +334,19 @@ def _troubles(description: Description) -> Iterator[tuple[Keys, str]]:
 
 def _map_troubles(description: Description, modal_map: ModalMap) -> Iterator[tuple[Keys, str]]:
     """Say in what a description does not fit its map, and by which key."""
+    ends = np.array([modal_map.low, modal_map.high])
     for k, parameter in enumerate(description.parameter):
-        low, high = modal_map.low[k], modal_map.high[k]
+        low, high = ends[:, k]
         if not low <= np.log(parameter.baseline) <= high:
             yield (
                 ("parameter", k, "baseline"),
                 f"the baseline {parameter.baseline:g} of {parameter.name} lies outside the modal "
                 f"map, which reaches from {np.exp(low):.4g} to {np.exp(high):.4g}",
             )
+        try:
+            JointPrior((parameter.name,), (parameter.prior,), *ends[:, [k]])
+        except BadStage as error:
+            yield ("parameter", k, "prior"), str(error)
     if not any(mode.tracked and mode.name in modal_map.modes for mode in description.mode):
         yield (
             ("map", "file"),
