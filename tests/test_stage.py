@@ -125,6 +125,14 @@ def test_a_baseline_outside_the_map_is_refused(tmp_path: Path) -> None:
         make_stage(tmp_path, (PRELOAD + "\n", MOUNT.replace("limit =", "baseline = 9.0\nlimit =")))
 
 
+def test_a_prior_beyond_the_map_is_refused(tmp_path: Path) -> None:
+    """A prior that the map does not reach says nothing about this machine."""
+    inside = 'kind = "lognormal", median = 1.0, sigma = 0.3'
+    far = MOUNT.replace(inside, 'kind = "uniform", low = 5, high = 6')
+    with pytest.raises(BadStage, match=r"line 18: parameter\[1\]\.prior: .*mount_stiffness puts"):
+        make_stage(tmp_path, (PRELOAD, far))
+
+
 def test_a_map_without_any_tracked_mode_is_refused(tmp_path: Path) -> None:
     """A map whose modes are none of the description's says nothing, and both lists are told."""
     text = stage_text().replace('name = "roll"', 'name = "bounce"').replace('"pitch"', '"sway"')
