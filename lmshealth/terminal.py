@@ -8,6 +8,7 @@ import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from textwrap import wrap
 from typing import Any
 
 import click
@@ -246,6 +247,90 @@ def print_plans(detect: Sequence[Row], plan: Sequence[Row]) -> None:
         "At best. Baseline and logs now are of one length; loss: the smallest seen.\n"
         "Not counted: temperature, wander between logs, errors of the map."
     )
+
+
+_VERDICTS = {
+    "told": "told",
+    "longer-logs": "by longer logs",
+    "together": "with others only",
+    "not-told": "not identifiable",
+}
+
+
+def print_stage(content: dict[str, list[Row]]) -> None:
+    """Print what a stage description covers and can tell, then what that comes to."""
+    (stage,), parameters = content["stage"], content["parameters"]
+    cells = [
+        (
+            row["mode"],
+            "yes" if row["tracked"] else "no",
+            f"{row['frequency_hz']:.1f}",
+            f"{row['searched_low_hz']:.0f}-{row['searched_high_hz']:.0f}",
+            *(_hertz(row[key]) for key in ("map_hz", "map_at_limits_hz")),
+            *(_power(row[key]) for key in ("surrogate_error_ln_f", "logs_reach_ln_f")),
+        )
+        for row in content["modes"]
+    ]
+    heads = ("Hz", "searched", "map Hz", "at limits", "map error", "logs reach")
+    _print(f"{stage['name']}: modes", ("mode", "followed"), heads, cells)
+    if parameters:
+        logs = f"{stage['n_logs']} logs of {stage['seconds_per_log']:g} s"
+        click.echo(f"map error, logs reach: of ln f; the drift between {logs} and {logs}.\n")
+        _print_parameters(parameters, logs)
+        _print_sensitivities(content)
+    for row in content["findings"]:
+        text = wrap(row["text"], 78, initial_indent="+ " if row["good"] else "! ")
+        click.echo("\n  ".join(text))
+
+
+def _print_parameters(parameters: Sequence[Row], logs: str) -> None:
+    cells = [
+        (
+            row["parameter"],
+            f"{row['baseline']:g}",
+            "–" if row["limit"] is None else f"{row['limit']:g}",
+            f"{row['prior_q05']:.3g}-{row['prior_q95']:.3g}",
+            f"{row['map_low']:.3g}-{row['map_high']:.3g}",
+            _percent(row["prior_below_map"] + row["prior_above_map"]),
+        )
+        for row in parameters
+    ]
+    heads = ("baseline", "limit", "prior 90 %", "map", "prior beyond")
+    _print("Health parameters", ("parameter",), heads, cells)
+    cells = [
+        (
+            row["parameter"],
+            *(_percent(row[f"{key}_std_ln"]) for key in ("prior", "logs", "endless_logs")),
+            _percent(row["informed"]),
+            _VERDICTS[row["verdict"]],
+        )
+        for row in parameters
+    ]
+    heads = ("prior", logs, "endless logs", "informed", "verdict")
+    _print("Known to (± one standard deviation)", ("parameter",), heads, cells)
+
+
+def _print_sensitivities(content: dict[str, list[Row]]) -> None:
+    names = [row["parameter"] for row in content["parameters"]]
+    cells: dict[str, list[str]] = {}
+    for row in content["sensitivities"]:
+        ends = [row["at_baseline"], row["at_limits"]]
+        shown = [f"{slope:.2g}" for slope in ends if not math.isnan(slope)]
+        cells.setdefault(row["mode"], []).append(" → ".join(shown))
+    title = "Sensitivity d ln f / d ln parameter, at the baseline → at the limits"
+    _print(title, ("mode",), names, [(mode, *own) for mode, own in cells.items()])
+    for row in content["correlations"]:
+        pair = f"{row['parameter_a']} and {row['parameter_b']}"
+        click.echo(f"Correlation of {pair}: {row['correlation']:+.2f}")
+    click.echo()
+
+
+def _hertz(value: float) -> str:
+    return "–" if math.isnan(value) else f"{value:.1f}"
+
+
+def _power(value: float) -> str:
+    return "–" if math.isnan(value) else f"{value:.0e}"
 
 
 def _share(value: float) -> str:
