@@ -2,9 +2,9 @@
 
 After N logs now and at the baseline the ln parameters x have the covariance P, for small changes,
 as `sight` has it. The data inform about parameter j by 1 - P_jj / Λ_j, one minus the share of its
-prior's variance that is left. Where the other parameters were known, 1 / Q_jj would be left, Q being
-the inverse of P; that is also the variance of the combination Σ_k (Q_jk / Q_jj) x_k, the one with
-x_j in it that is known best.
+prior's variance that is left. Were the other parameters known, 1 / Q_jj would be left, Q being the
+inverse of P. That is also the variance of the combination Σ_k (Q_jk / Q_jj) x_k, of all with x_j in
+them the one known best.
 """
 
 from __future__ import annotations

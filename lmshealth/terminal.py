@@ -7,8 +7,8 @@ import math
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from itertools import combinations
 from pathlib import Path
-from textwrap import wrap
 from typing import Any
 
 import click
@@ -18,6 +18,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
+from lmshealth.results import Health
 from lmshealth.tables import Row
 from lmshealth.tracks import Track
 from lmshealth.wording import change
@@ -58,7 +59,9 @@ def print_modes(rows: Sequence[Row], refused: Sequence[Row]) -> None:
         for row in rows
     ]
     title = "Modes (± one standard deviation)" if rows else "No modes found"
-    _print(title, ("log", "mode", "channel"), ("frequency Hz", "damping %", "SNR", "note"), cells)
+    print_table(
+        title, ("log", "mode", "channel"), ("frequency Hz", "damping %", "SNR", "note"), cells
+    )
     _print_refused(refused)
 
 
@@ -79,7 +82,7 @@ def print_track(track: Track) -> None:
         )
     ]
     title = f"{track.stage}: modes after {len(track.logs)} logs (± one standard deviation)"
-    _print(title, ("mode",), ("frequency Hz", "drift %", "damping %"), cells)
+    print_table(title, ("mode",), ("frequency Hz", "drift %", "damping %"), cells)
     happened = [
         (
             f"{track.recorded_at[event.epoch]:%Y-%m-%d}",
@@ -94,8 +97,42 @@ def print_track(track: Track) -> None:
     if happened:
         numbers = ("size %", "ln Bayes factor")
         cells = [(*row[:3], row[5], *row[3:5]) for row in happened]
-        _print("What happened", ("since", "kind", "mode", ""), numbers, cells)
+        print_table("What happened", ("since", "kind", "mode", ""), numbers, cells)
     click.echo(_consistent(track))
+
+
+def print_health(health: Health) -> None:
+    """Print what is left of each parameter at the last epoch, and on what that rests."""
+    low, middle, high = health.quantile(np.array([0.05, 0.5, 0.95]))[:, -1]
+    cells = [
+        (
+            name,
+            f"{middle[j]:.3f}",
+            f"{low[j]:.3f} to {high[j]:.3f}",
+            f"{100 * health.informed[-1, j]:.0f}",
+            f"{health.prior_shift[-1, j]:+.2f} σ, × {health.prior_ratio[-1, j]:.2f}",
+            f"{health.ess[-1, j]:.0f}",
+            f"{health.r_hat[-1, j]:.4f}",
+        )
+        for j, name in enumerate(health.parameters)
+    ]
+    numbers = ("median", "90 % interval", "data %", "prior × 2", "ESS", "R-hat")
+    title = (
+        f"{health.stage}: health at {health.recorded_at[-1]:%Y-%m-%d}, the last of "
+        f"{len(health.recorded_at)} epochs"
+    )
+    print_table(title, ("parameter",), numbers, cells)
+    click.echo(
+        "data: share of the prior's variance that they removed; prior × 2: how far the median "
+        "moves, and how much wider the interval gets, with priors twice as wide."
+    )
+    for j, k in combinations(range(len(health.parameters)), 2):
+        rho = health.correlation[-1, j, k]
+        click.echo(f"Correlation of {health.parameters[j]} and {health.parameters[k]}: {rho:+.2f}.")
+    for name in np.array(health.parameters)[~health.told()]:
+        click.echo(f"{name}: these drifts do not tell it; this is its prior.")
+    for when in np.flatnonzero(~health.converged):
+        click.echo(f"The sampler did not converge at {health.recorded_at[when]:%Y-%m-%d}.")
 
 
 def _consistent(track: Track) -> str:
@@ -131,7 +168,7 @@ def print_frf(fit: Row, frf: Sequence[Row], rows: Sequence[Row], refused: Sequen
         for row in frf[step // 2 :: step]
     ]
     title = f"Response of {fit['output']} to {fit['input']}, {len(cells)} of {len(frf)} lines"
-    _print(title, (), ("Hz", "gain (SI)", "phase °", "coherence", "fit"), cells)
+    print_table(title, (), ("Hz", "gain (SI)", "phase °", "coherence", "fit"), cells)
     click.echo(_averages(fit))
     if fit["distortion"] > 0:
         click.echo(
@@ -168,7 +205,7 @@ def print_error(rows: Sequence[Row], refused: Sequence[Row]) -> None:
         )
         for row in rows
     ]
-    _print("Following error (µm)", texts, ("mm/s", "s", "min", "max", "std", "mean"), first)
+    print_table("Following error (µm)", texts, ("mm/s", "s", "min", "max", "std", "mean"), first)
     second = [
         (
             *_labels(row, several),
@@ -183,7 +220,7 @@ def print_error(rows: Sequence[Row], refused: Sequence[Row]) -> None:
     count, floor = max(row["n_harmonics"] for row in rows), rows[0]["floor_nm"]
     title = f"Strongest harmonics: {count}, and those of them above {floor:g} nm"
     heads = ("max µm", "at Hz", "wide Hz", "share", "above", "wide Hz", "share")
-    _print(title, texts, heads, second)
+    print_table(title, texts, heads, second)
     click.echo("wide: highest minus lowest frequency; share: of the variance that they rebuild.")
     _print_refused(refused)
 
@@ -228,7 +265,7 @@ def print_plans(detect: Sequence[Row], plan: Sequence[Row]) -> None:
             if row["parameter"] == name and row["loss"] == asked["loss"]
         ]
         heads = ("s per log", "logs", "power, 1 log", "loss, 1 log", f"loss, {n_baseline} logs")
-        _print(
+        print_table(
             f"{name}: to see a loss of {_percent(asked['loss'])} with power {asked['power']:g}, "
             f"false alarms {asked['false_alarm']:g}",
             (),
@@ -247,90 +284,6 @@ def print_plans(detect: Sequence[Row], plan: Sequence[Row]) -> None:
         "At best. Baseline and logs now are of one length; loss: the smallest seen.\n"
         "Not counted: temperature, wander between logs, errors of the map."
     )
-
-
-_VERDICTS = {
-    "told": "told",
-    "longer-logs": "by longer logs",
-    "together": "with others only",
-    "not-told": "not identifiable",
-}
-
-
-def print_stage(content: dict[str, list[Row]]) -> None:
-    """Print what a stage description covers and can tell, then what that comes to."""
-    (stage,), parameters = content["stage"], content["parameters"]
-    cells = [
-        (
-            row["mode"],
-            "yes" if row["tracked"] else "no",
-            f"{row['frequency_hz']:.1f}",
-            f"{row['searched_low_hz']:.0f}-{row['searched_high_hz']:.0f}",
-            *(_hertz(row[key]) for key in ("map_hz", "map_at_limits_hz")),
-            *(_power(row[key]) for key in ("surrogate_error_ln_f", "logs_reach_ln_f")),
-        )
-        for row in content["modes"]
-    ]
-    heads = ("Hz", "searched", "map Hz", "at limits", "map error", "logs reach")
-    _print(f"{stage['name']}: modes", ("mode", "followed"), heads, cells)
-    if parameters:
-        logs = f"{stage['n_logs']} logs of {stage['seconds_per_log']:g} s"
-        click.echo(f"map error, logs reach: of ln f; the drift between {logs} and {logs}.\n")
-        _print_parameters(parameters, logs)
-        _print_sensitivities(content)
-    for row in content["findings"]:
-        text = wrap(row["text"], 78, initial_indent="+ " if row["good"] else "! ")
-        click.echo("\n  ".join(text))
-
-
-def _print_parameters(parameters: Sequence[Row], logs: str) -> None:
-    cells = [
-        (
-            row["parameter"],
-            f"{row['baseline']:g}",
-            "–" if row["limit"] is None else f"{row['limit']:g}",
-            f"{row['prior_q05']:.3g}-{row['prior_q95']:.3g}",
-            f"{row['map_low']:.3g}-{row['map_high']:.3g}",
-            _percent(row["prior_below_map"] + row["prior_above_map"]),
-        )
-        for row in parameters
-    ]
-    heads = ("baseline", "limit", "prior 90 %", "map", "prior beyond")
-    _print("Health parameters", ("parameter",), heads, cells)
-    cells = [
-        (
-            row["parameter"],
-            *(_percent(row[f"{key}_std_ln"]) for key in ("prior", "logs", "endless_logs")),
-            _percent(row["informed"]),
-            _VERDICTS[row["verdict"]],
-        )
-        for row in parameters
-    ]
-    heads = ("prior", logs, "endless logs", "informed", "verdict")
-    _print("Known to (± one standard deviation)", ("parameter",), heads, cells)
-
-
-def _print_sensitivities(content: dict[str, list[Row]]) -> None:
-    names = [row["parameter"] for row in content["parameters"]]
-    cells: dict[str, list[str]] = {}
-    for row in content["sensitivities"]:
-        ends = [row["at_baseline"], row["at_limits"]]
-        shown = [f"{slope:.2g}" for slope in ends if not math.isnan(slope)]
-        cells.setdefault(row["mode"], []).append(" → ".join(shown))
-    title = "Sensitivity d ln f / d ln parameter, at the baseline → at the limits"
-    _print(title, ("mode",), names, [(mode, *own) for mode, own in cells.items()])
-    for row in content["correlations"]:
-        pair = f"{row['parameter_a']} and {row['parameter_b']}"
-        click.echo(f"Correlation of {pair}: {row['correlation']:+.2f}")
-    click.echo()
-
-
-def _hertz(value: float) -> str:
-    return "–" if math.isnan(value) else f"{value:.1f}"
-
-
-def _power(value: float) -> str:
-    return "–" if math.isnan(value) else f"{value:.0e}"
 
 
 def _share(value: float) -> str:
@@ -352,7 +305,7 @@ def _print_lines(lines: Sequence[Row]) -> None:
         )
         for (channel, kind, _), rows in sorted(groups.items())
     ]
-    _print("Lines", ("channel", "kind"), ("Hz", "largest mm/s²", "in logs"), cells)
+    print_table("Lines", ("channel", "kind"), ("Hz", "largest mm/s²", "in logs"), cells)
 
 
 def _print_channel(title: str, rows: Sequence[Row]) -> None:
@@ -382,7 +335,7 @@ def _print_channel(title: str, rows: Sequence[Row]) -> None:
         for band, own in cells.items()
     ]
     heads = tuple("?" if speed < 0 else f"{speed:g}" for speed in speeds)
-    _print(f"{title}: mm/s² at velocities in mm/s", ("band",), (*heads, "grows"), table)
+    print_table(f"{title}: mm/s² at velocities in mm/s", ("band",), (*heads, "grows"), table)
 
 
 def _band_name(row: Row) -> str:
@@ -425,12 +378,13 @@ def _percent(share: float) -> str:
 def _print_refused(rows: Sequence[Row]) -> None:
     names = ("log", "channel", "mode", "reason", "detail")
     if rows:
-        _print("Refused", names, (), [tuple(row[name] for name in names) for row in rows])
+        print_table("Refused", names, (), [tuple(row[name] for name in names) for row in rows])
 
 
-def _print(
+def print_table(
     title: str, texts: Sequence[str], numbers: Sequence[str], cells: Sequence[Sequence[str]]
 ) -> None:
+    """Print a table: columns of text to the left, columns of numbers to the right."""
     table = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False)
     for name in texts:
         table.add_column(name, overflow="fold")

@@ -24,6 +24,7 @@ FLOORS = [
         "components",
         "maintenance",
         "wording",
+        "rowfile",
         "filterbank",
     },
     {
@@ -35,6 +36,7 @@ FLOORS = [
         "rational",
         "noise",
         "hypotheses",
+        "tracktable",
         "estimates",
     },
     {
@@ -74,6 +76,7 @@ FLOORS = [
     {"trackfacts"},
     {"report"},
     {"pipeline", "terminal", "options", "looks"},
+    {"stageview"},
     {"commands"},
     {"cli"},
     {"__main__"},

@@ -129,8 +129,9 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     """Put draws of the seed alone in the place of the sampler, to see which seeds it is given."""
 
     def fake(_: object, __: object, seed: np.random.SeedSequence) -> Sample:
-        draws = 0.1 * np.random.default_rng(seed).standard_normal((500, 2))
-        return Sample(draws=draws, ess=np.full(2, 500.0), r_hat=np.ones(2))
+        draws = 0.1 * np.random.default_rng(seed).standard_normal((4, 1000, 2))
+        full = np.full(2, 4000.0)
+        return Sample(draws, full, full, r_hat=np.ones(2), autocorrelation_time=np.ones(2))
 
     monkeypatch.setattr(inference, "sample", fake)
 
