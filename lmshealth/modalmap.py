@@ -156,6 +156,9 @@ def read_map(path: str, parameters: tuple[str, ...]) -> ModalMap:
             raise BadStage(
                 f"{_line(path, table, wrong)}: {name} is {cell}; needed is a positive number"
             )
+    unnamed = table["mode"].isna().to_numpy()
+    if unnamed.any():
+        raise BadStage(f"{_line(path, table, unnamed)}: a mode without a name")
     table = table.assign(**numbers, mode=table["mode"].astype(str))
     twice = table.duplicated([*parameters, "mode"]).to_numpy()
     if twice.any():

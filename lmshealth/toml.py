@@ -134,7 +134,7 @@ def _told(error: str, table: Any, schema: Type) -> tuple[Keys, str]:
         error = f"there are {_listed(tags)}"
     if "got" not in error and not isinstance(value, dict | list):
         error = f"{error}, got {value!r}"
-    return keys, error.replace("`object`", "a table").replace("`array`", "an array")
+    return keys, error.replace("object", "table")
 
 
 def _tags(schema: Type, keys: Keys) -> list[object]:

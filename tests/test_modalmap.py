@@ -160,6 +160,7 @@ def test_the_edge_of_the_grid_is_inside(small: ModalMap) -> None:
         (lambda rows: [r.replace("frequency_hz", "hz") for r in rows], "no column.*frequency_hz"),
         (lambda rows: [r.replace("mount_stiffness", "foot") for r in rows], "mount_stiffness"),
         (lambda rows: [rows[0] + ",load", *(r + ",1" for r in rows[1:])], "load.*no parameter"),
+        (lambda rows: [r.replace("pitch", "") for r in rows], "line 3: a mode without a name"),
         (lambda rows: rows[:-1], "97 values where a full grid of 49"),
         (lambda rows: [*rows, rows[-1]], "line 100: .*twice"),
         (lambda rows: [*rows[:-1], rows[-1].rsplit(",", 1)[0] + ",-3"], "line 99: .*-3.*positive"),
@@ -168,7 +169,7 @@ def test_the_edge_of_the_grid_is_inside(small: ModalMap) -> None:
             "line 99: frequency_hz is nan.*positive",
         ),
     ],
-    ids=["no-frequency", "no-parameter", "extra", "hole", "twice", "negative", "empty"],
+    ids=["no-frequency", "no-parameter", "extra", "no-name", "hole", "twice", "negative", "empty"],
 )
 def test_a_map_that_breaks_its_contract_is_refused(tmp_path: Path, change, needle: str) -> None:
     """The error names the file and what is missing."""

@@ -156,7 +156,7 @@ def test_a_file_that_is_no_toml_is_refused(tmp_path: Path) -> None:
 
 def test_a_description_needs_a_mode(tmp_path: Path) -> None:
     """An empty list of modes leaves nothing to look for."""
-    with pytest.raises(BadStage, match=r"line 2: mode: Expected an array of length >= 1"):
+    with pytest.raises(BadStage, match=r"line 2: mode: Expected `array` of length >= 1"):
         load(tmp_path, 'name = "odd"\nmode = []\n')
 
 

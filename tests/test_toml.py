@@ -96,8 +96,8 @@ def test_a_key_that_is_missing_is_told_by_its_table(
         ("size = 1", "line 1: size: unknown key; known are name, part"),
         ("part = []", "name: missing"),
         ("name = 3", "line 1: name: Expected `str`, got `int`"),
-        ('name = "a"\npart = 3', "line 2: part: Expected an array, got `int`"),
-        ('name = "a"\npart = [3]', "line 2: part[0]: Expected a table, got `int`"),
+        ('name = "a"\npart = 3', "line 2: part: Expected `array`, got `int`"),
+        ('name = "a"\npart = [3]', "line 2: part[0]: Expected `table`, got `int`"),
         (
             'name = "a"\n[[part]]\nkind = "leaf"\nsize = -1',
             "line 4: part[0].size: Expected `float` > 0.0, got -1",
