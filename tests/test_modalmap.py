@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.polynomial import Chebyshev
 
 from lmshealth.errors import BadStage, OutsideMap
 from lmshealth.modalmap import ModalMap, read_map
@@ -117,6 +118,21 @@ def test_leave_out_error_bounds_the_error_between_grid_points(tmp_path: Path) ->
     assert found.leave_out_error[0] < 0.1
 
 
+def test_leave_out_error_is_that_of_fits_without_a_point(tmp_path: Path) -> None:
+    """The largest miss of numpy's fits of the same degree, each without one inner point."""
+    axis = np.geomspace(0.2, 1.5, 9)
+    f = 100 * np.exp(0.3 * np.tanh(2 * np.log(axis)))
+    rows = [f"{p:.17g},roll,{value:.17g}" for p, value in zip(axis, f, strict=True)]
+    found = read_map(write(tmp_path, ["p,mode,frequency_hz", *rows]), ("p",))
+    x, degree = np.log(axis), found.coefficients.shape[0] - 1
+    misses = []
+    for k in range(1, 8):
+        rest = np.delete(np.arange(9), k)
+        fit = Chebyshev.fit(x[rest], np.log(f[rest]), degree, domain=[x[0], x[-1]])
+        misses.append(abs(fit(x[k]) - np.log(f[k])))
+    assert found.leave_out_error[0] == pytest.approx(max(misses), rel=1e-9)
+
+
 @pytest.mark.parametrize("n", [3, 4, 5])
 def test_a_map_of_one_parameter_with_few_values_is_enough(tmp_path: Path, n: int) -> None:
     """Three to five values of one parameter make a map that meets a straight line exactly."""
@@ -204,12 +220,13 @@ def test_a_map_that_is_not_there_is_refused(tmp_path: Path) -> None:
 def test_shipped_maps_are_smooth_and_hold_their_nominal_frequencies(name: str) -> None:
     """Shipped maps leave out at most 1e-5 and give the nominal frequencies at baseline.
 
-    In Y roll and pitch cross on mounts stiffer than new, where they repel each other: 3e-5.
+    In Y roll and pitch, named by their shapes, cross on mounts stiffer than new although they repel
+    each other there: no smooth surrogate meets that, the error is 1.5e-5.
     """
     assert name in shipped()
     stage = load_stage(name)
     assert stage.modal_map is not None
-    limit = 3e-5 if name == "lms-y" else 1e-5
+    limit = 2e-5 if name == "lms-y" else 1e-5
     assert (stage.modal_map.leave_out_error <= limit).all()
     base = stage.modal_map.ln_frequency(stage.baseline_point[None])[0]
     for mode in stage.modes:
