@@ -211,10 +211,7 @@ class Stage:
             raise BadStage(f"{self.name}: no [[parameter]] with a [map]")
         names = tuple(parameter.name for parameter in self.parameters)
         priors = tuple(parameter.prior for parameter in self.parameters)
-        try:
-            return JointPrior(names, priors, self.modal_map.low, self.modal_map.high)
-        except BadStage as error:
-            raise BadStage(f"{self.name}: {error}") from error
+        return JointPrior(names, priors, self.modal_map.low, self.modal_map.high)
 
     def takes(self, metadata: Metadata) -> bool:
         """Tell whether a log belongs to this description."""
