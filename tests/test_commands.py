@@ -1,7 +1,8 @@
-"""Commands on tables: what they write, what they say, how they fail."""
+"""Commands on tables and descriptions: what they write, what they say, how they fail."""
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,7 @@ from click.testing import CliRunner, Result
 
 from lmshealth.cli import main
 from lmshealth.tables import COLUMNS
-from tests.lives import FADING, make_stage, true_drift
+from tests.lives import FADING, FOOT, MOUNT, make_stage, true_drift
 
 N = 30
 
@@ -142,6 +143,9 @@ def test_fewer_logs_than_a_birth_takes_are_told(estimates: Path, tmp_path: Path)
     assert "known once three logs show it" in result.stderr
 
 
+# infer
+
+
 @pytest.fixture
 def drifts(tmp_path: Path) -> Path:
     """Write drifts of two machines, the second one's preload lower, with their cross terms."""
@@ -239,3 +243,79 @@ def test_a_machine_without_drifts_is_told_and_the_others_go_on(
     result = infer(drifts, "--stage", toml, "--out", tmp_path / "none.csv")
     assert result.exit_code == 1
     assert not (tmp_path / "none.csv").exists()
+
+
+# stage
+
+
+def check(*words: object) -> Result:
+    """Check a stage description on the command line."""
+    return CliRunner().invoke(main, ["stage", *map(str, words)])
+
+
+def test_a_description_in_order_is_told_in_tables_and_sentences(tmp_path: Path) -> None:
+    """Status 0, nothing on standard error; what the X stage cannot see is no failure."""
+    make_stage(tmp_path)
+    for reference in (tmp_path / "small.toml", "lms-x"):
+        result = check(reference)
+        assert (result.exit_code, result.stderr) == (0, "")
+        assert "Sensitivity" in result.stdout
+    assert "mount_stiffness is not identifiable" in result.stdout
+
+
+@pytest.mark.parametrize("parameters", [(), (FADING,), (FADING, FOOT, MOUNT)])
+def test_as_json_it_has_numbers_and_null(tmp_path: Path, parameters: tuple[str, ...]) -> None:
+    """Rows for as many parameters as there are; what is missing is null, never NaN."""
+    make_stage(tmp_path, parameters)
+
+    def refuse(word: str) -> None:
+        raise AssertionError(f"{word} is no JSON")
+
+    result = check(tmp_path / "small.toml", "--format", "json")
+    content = json.loads(result.stdout, parse_constant=refuse)
+    n = len(parameters)
+    assert [len(content[key]) for key in ("stage", "modes", "parameters")] == [1, 2, n]
+    assert [len(content[key]) for key in ("sensitivities", "correlations")] == [
+        2 * n,
+        n * (n - 1) / 2,
+    ]
+    assert {row["verdict"] for row in content["parameters"]} <= {"told", "not-told"}
+    assert (content["stage"][0]["model_std"] is None) == (n == 0)
+    assert content["findings"][0]["topic"] == "parameters"
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ("damping_ratio = 0.018", "damping_ratio = 1.8", "line 5: mode[0].damping_ratio: "),
+        ("limit =", "limits =", "line 13: parameter[0].limits: unknown key; known are name, prior"),
+        ('"map.csv"', '"gone.csv"', "line 27: map.file: there is no file "),
+        ("[map]", "[map", "line 26: no TOML: "),
+    ],
+)
+def test_a_slip_is_one_line_and_status_1(tmp_path: Path, old: str, new: str, said: str) -> None:
+    """The line names file, line, key, and what is needed."""
+    make_stage(tmp_path)
+    path = tmp_path / "small.toml"
+    path.write_text(path.read_text().replace(old, new, 1))
+    result = check(path)
+    assert (result.exit_code, result.stdout) == (1, "")
+    assert result.stderr.startswith(f"lmshealth: {path}: {said}")
+    assert result.stderr.count("\n") == 1
+
+
+def test_a_map_that_is_none_and_names_nobody_knows(tmp_path: Path) -> None:
+    """A cell that is no number has its line; unknown names are told which ones there are."""
+    make_stage(tmp_path)
+    table = tmp_path / "map.csv"
+    table.write_text(table.read_text().replace("\n0.2", "\na", 1))
+    result = check(tmp_path / "small.toml")
+    assert result.exit_code == 1
+    assert "map.csv: line 2: guide_preload is a" in result.stderr
+    assert "needed is a positive number" in result.stderr
+    assert "lms-x, lms-y" in check("lms-z").stderr
+    for path in (tmp_path / "gone.toml", tmp_path / "folder.toml"):
+        (tmp_path / "folder.toml").mkdir(exist_ok=True)
+        result = check(path)
+        assert result.exit_code == 1
+        assert f"{path}: cannot read the stage description: " in result.stderr
