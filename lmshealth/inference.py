@@ -28,9 +28,9 @@ from lmshealth.tracks import Drifts, Track
 
 _N_KEPT = 1000  # draws of each ensemble
 _N_SEARCHED, _PRIOR_POINTS = 200, 4096
-# How much wider the priors are made to see what hangs on them, and how many effective draws
-# reweighting must leave; with fewer the wider posterior is sampled itself.
-_WIDER, _LEAST_REWEIGHTED = 2.0, 1000
+# How much wider the priors are made to see what hangs on them, and what share of the draws must be
+# left of them by reweighting; with less, draws do not reach far enough and new ones are made.
+_WIDER, _LEAST_SHARE = 2.0, 0.8
 _LEVELS = (0.05, 0.5, 0.95)
 
 
@@ -379,9 +379,7 @@ def _wider_quantiles(
     x, wider = found.flat, posterior.widened()
     log_weight = wider.prior.log_density(x) - posterior.prior.log_density(x)
     weight = np.exp(log_weight - log_weight.max())
-    if weight.sum() ** 2 / np.sum(weight**2) / x.shape[0] * found.ess_bulk.min() < (
-        _LEAST_REWEIGHTED
-    ):
+    if weight.sum() ** 2 / np.sum(weight**2) < _LEAST_SHARE * weight.size:
         return np.quantile(_draw(wider, seed)[0].flat, _LEVELS, axis=0)
     return np.column_stack(
         [np.quantile(column, _LEVELS, weights=weight, method="inverted_cdf") for column in x.T]

@@ -209,3 +209,11 @@ def test_detectability(root: Path) -> None:
     """The posterior finds planned losses as often as planned; the mount of X is not shown."""
     answer = json.loads(run_study(root, "detectability"))
     assert all(answer["passed"].values())
+
+
+def test_movable_roller(root: Path, needs: Callable[[str], None]) -> None:
+    """A roller under a real beam is where the posterior says, and two wrong ways lose it."""
+    needs("data")
+    answer = json.loads(run_study(root, "movable_roller"))
+    assert all(answer["passed"].values())
+    assert all(control["inside"] < 8 for control in answer["controls"].values())

@@ -30,13 +30,14 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from lmshealth.bandfit import BAND
-from lmshealth.bounds import ambient_bound, long_record_law
+from lmshealth.bounds import long_record_law
 from lmshealth.errors import BadQuestion
 from lmshealth.inference import EpochPosterior
 from lmshealth.planning import plan
-from lmshealth.stage import ModeSpec, Stage, load_stage
+from lmshealth.sight import sight_of
+from lmshealth.stage import Stage, load_stage
 from models.lives import Plan
+from models.plant import GUIDE_MODES
 from studies.importance import Array, believed
 from studies.lives import life_of, rng_of
 from studies.raw_lives import identified
@@ -52,8 +53,6 @@ COUNTS = (1, 2, 3, 5, 8, 12, 20, 30, 50, 100)
 CHECKED = ((20.0, 1), (60.0, 5), (300.0, 20))
 RAW_DURATIONS, RAW_LOGS = (10.0, 20.0, 60.0, 120.0), 16
 SEED = 31
-# Of ln parameter, and of the map's sensitivities, in the descriptions: where sampling begins.
-_PRIOR_STD, _SHIPPED_STD = 0.3, 0.05
 Row = dict[str, Any]
 
 
@@ -139,12 +138,10 @@ def checks(name: str, parameter: str, trials: int) -> list[Row]:
         loss = found.efforts[0].smallest_loss_many
         for arm, (model_std, free) in arms.items():
             stage = stage_with(name, model_std=model_std)
+            variance = sight_of(stage).drift_variance(duration, n, n)
             rng = rng_of(SEED, ASKED.index((name, parameter)), point, len(arm))
             hits, false = (
-                sum(
-                    called(stage, parameter, size, drift_variance(stage, duration, n), free, rng)
-                    for _ in range(trials)
-                )
+                sum(called(stage, parameter, size, variance, free, rng) for _ in range(trials))
                 for size in (loss, 0.0)
             )
             low, high = clopper_pearson(false, trials, LEVEL)
@@ -157,19 +154,6 @@ def checks(name: str, parameter: str, trials: int) -> list[Row]:
     return rows
 
 
-def drift_variance(stage: Stage, duration: float, n: int) -> Array:
-    """Variance of the drift of each informative mode between n logs and n of the baseline."""
-    own = [mode for mode in stage.modes if mode.name in stage.informative]
-    return np.array([2 / n * log_variance(mode, duration) for mode in own])
-
-
-def log_variance(mode: ModeSpec, duration: float) -> float:
-    """Bound the variance of ln f from one log."""
-    f, zeta = mode.frequency_hz, mode.damping_ratio
-    band = (f * (1 - BAND * zeta), f * (1 + BAND * zeta))
-    return float(ambient_bound(f, zeta, mode.snr, duration, band=band)[0, 0])
-
-
 def called(
     stage: Stage, parameter: str, loss: float, variance: Array, free: bool,
     rng: np.random.Generator,
@@ -178,40 +162,34 @@ def called(
     j = [p.name for p in stage.parameters].index(parameter)
     x = stage.prior.draw(rng, 1)[0] if free else stage.baseline_point.copy()
     x[j] = stage.baseline_point[j] + np.log1p(-loss)
-    modes = tuple(mode.name for mode in stage.modes if mode.name in stage.informative)
+    modes = stage.informative
     drift = stage.drift(x[None], modes)[0] + np.sqrt(variance) * rng.standard_normal(variance.size)
     posterior = EpochPosterior.of(stage, modes, drift, np.diag(variance))
-    draws = believed(posterior.log_probability, _about(stage, x, modes, variance, rng), rng, 1200)
+    draws = believed(posterior.log_probability, _about(stage, x, variance, rng), rng, 1200)
     lost = draws.weight @ (draws.points[:, j] < stage.baseline_point[j])
     return bool(lost > 1 - FALSE_ALARM)
 
 
-def _about(
-    stage: Stage, x: Array, modes: tuple[str, ...], variance: Array, rng: np.random.Generator
-) -> Array:
-    """Draw points about the truth, wider than any posterior: where sampling begins."""
+def _about(stage: Stage, x: Array, variance: Array, rng: np.random.Generator) -> Array:
+    """Draw points about the truth, wider than the posterior: where sampling begins."""
     assert stage.modal_map is not None
-    rows = [stage.modal_map.modes.index(name) for name in modes]
-    slopes = stage.modal_map.gradient(x[None])[0, rows]
-    known = np.linalg.inv((slopes.T / variance) @ slopes + np.eye(x.size) / _PRIOR_STD**2)
-    spread = known + np.diag((2 * _SHIPPED_STD * x) ** 2)
-    points = x + 2.5 * rng.standard_normal((400, x.size)) @ np.linalg.cholesky(spread).T
+    cov = np.linalg.inv(sight_of(stage).precision(variance))
+    points = x + 3 * rng.standard_normal((400, x.size)) @ np.linalg.cholesky(cov).T
     return np.clip(points, stage.modal_map.low, stage.modal_map.high)
 
 
 def law(name: str) -> Row:
     """Tell the standard deviation of ln f of one log against its length: bound and law."""
-    modes = load_stage(name).modes
+    sight = sight_of(load_stage(name))
+    bound = np.sqrt([sight.log_variance(duration) for duration in DURATIONS])
     return {
         "stage": name,
         "durations_s": list(DURATIONS),
-        "bound": {
-            mode.name: [float(np.sqrt(log_variance(mode, T))) for T in DURATIONS] for mode in modes
-        },
+        "bound": {mode.name: bound[:, i].tolist() for i, mode in enumerate(sight.modes)},
         "long_record": {
             mode.name: long_record_law(mode.frequency_hz, mode.damping_ratio,
                                        np.array(DURATIONS))[0].tolist()
-            for mode in modes
+            for mode in sight.modes
         },
     }  # fmt: skip
 
@@ -220,12 +198,13 @@ def measured(name: str, duration: float, logs: int) -> Row:
     """Simulate logs of a machine that does not change, identify them, compare with the truth."""
     simulated = Plan(name, "healthy", logs, duration, SEED)
     life, found = life_of(simulated), identified(simulated)
-    order = ("roll", "pitch", "yaw")
+    sight = sight_of(load_stage(name))
     off = found.ln_frequency - life.ln_frequency
-    std = np.sqrt(np.einsum("kii->ki", found.cov)[:, : len(order)])
-    bound = {m.name: np.sqrt(log_variance(m, duration)) for m in load_stage(name).modes}
+    std = np.sqrt(np.einsum("kii->ki", found.cov)[:, : len(GUIDE_MODES)])
+    names = [mode.name for mode in sight.modes]
+    bound = dict(zip(names, np.sqrt(sight.log_variance(duration)), strict=True))
     rows = {}
-    for i, mode in enumerate(order):
+    for i, mode in enumerate(GUIDE_MODES):
         there = np.isfinite(off[:, i])
         n = int(there.sum())
         rms = float(np.sqrt(np.mean(off[there, i] ** 2)))
