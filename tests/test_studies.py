@@ -195,3 +195,12 @@ def test_movable_roller(root: Path, needs: Callable[[str], None]) -> None:
     answer = json.loads(run_study(root, "movable_roller"))
     assert all(answer["passed"].values())
     assert all(control["inside"] < 8 for control in answer["controls"].values())
+
+
+def test_sampling_speed(root: Path) -> None:
+    """Posteriors are those of a grid and of filterpy, and no other way to them is faster."""
+    answer = json.loads(run_study(root, "sampling_speed"))
+    assert all(answer["passed"].values())
+    programs = {row["program"] for row in answer["epoch"]["programs"]}
+    # Peers are compared where they are installed.
+    assert len(programs) == 5 - len(answer["epoch"]["missing"])
