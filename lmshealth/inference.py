@@ -3,26 +3,35 @@
 The drifts δ of the tracked modes have covariance C from the filter. The modal map predicts h(x);
 its sensitivities are believed to a relative standard deviation m, so that the error of mode i has
 the variance E_i(x) = Σ_j (m h_i^j)², h^j being the drift that parameter j causes alone. Then
-δ ~ N(h(x), C + E(x)), with x the ln parameters.
+δ ~ N(h(x), C + E(x)), with x the ln parameters. The errors of a map are the same at all epochs of a
+life: every epoch by itself is judged rightly, but not the difference of two.
+
+Machines that share a part, such as one guide that serves two configurations, have one posterior of
+all their parameters, the shared ones once: their likelihoods multiply.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from datetime import datetime
 
 import numpy as np
 
 from lmshealth.arrays import FloatArray
 from lmshealth.errors import BadStage, NotConverged, NotEnoughData
+from lmshealth.laplace import approximate
+from lmshealth.priors import JointPrior, joined
 from lmshealth.results import Health
-from lmshealth.sampling import sample, stream
+from lmshealth.sampling import Sample, flattened, sample, start_from_prior, start_near, stream, thin
 from lmshealth.stage import Stage
 from lmshealth.tracks import Track
 
-_N_KEPT = 4000
-_PRIOR_DRAWS = 20_000
+_N_KEPT = 1000  # draws of each ensemble
+_N_SEARCHED, _PRIOR_POINTS = 200, 4096
+# How much wider the priors are made to see what hangs on them, and how many effective draws
+# reweighting must leave; with fewer the wider posterior is sampled itself.
+_WIDER, _LEAST_REWEIGHTED = 2.0, 1000
+_LEVELS = (0.05, 0.5, 0.95)
 
 
 def epochs_to_infer(track: Track, stage: Stage, most: int) -> tuple[int, ...]:
@@ -67,6 +76,92 @@ def infer(
     NotEnoughData
         If no mode of the track is on the map, or there is no epoch after the baseline.
     """
+    modes = _usable_modes(track, stage)
+    chosen = _chosen(track, stage, epochs)
+    tasks = [EpochPosterior.of(stage, *_seen(track, modes, k)) for k in chosen]
+    return _infer_all(track.stage, track, chosen, tasks, seed, mapper)
+
+
+def infer_together(
+    machines: Sequence[tuple[Track, Stage]],
+    shared: Sequence[str],
+    seed: int | Sequence[int],
+    *,
+    epochs: Sequence[int] | None = None,
+    mapper: Callable[..., object] = map,
+) -> Health:
+    """Infer the health of machines that share parts, such as one guide that serves both.
+
+    Epochs are those of the first machine. Of every other one its last epoch not later counts: what
+    is shared is taken not to have changed since then, and all baselines to be of the same state of
+    what is shared.
+
+    Parameters
+    ----------
+    machines : sequence of (Track, Stage)
+        At least two.
+    shared : sequence of str
+        Parameters that are one; the others are named ``<machine>:<parameter>``.
+    seed, epochs, mapper
+        As in `infer`; epochs count those of the first machine.
+
+    Raises
+    ------
+    BadStage
+        If a description does not have a shared parameter, or another prior of it.
+    NotEnoughData
+        As in `infer`; also if another machine has no epoch yet.
+    """
+    names, columns = _places(machines, shared)
+    modes = [_usable_modes(track, stage) for track, stage in machines]
+    first, stage = machines[0]
+    tasks, kept = [], []
+    for k in _chosen(first, stage, epochs):
+        views, priors = [], []
+        for (track, own), used, places in zip(machines, modes, columns, strict=True):
+            row = k if track is first else _last_before(track, own, first, k)
+            if row is not None:
+                views.append(View(own, *_seen(track, used, row), places))
+                priors.append(own.prior)
+        if len(views) == len(machines):
+            prior = joined(priors, columns)
+            prior = JointPrior(names, prior.priors, prior.low, prior.high)
+            tasks.append(EpochPosterior(prior, tuple(views)))
+            kept.append(k)
+    if not kept:
+        raise NotEnoughData(
+            f"{first.stage}: at none of its epochs had {machines[1][0].stage} one before; "
+            "name the machine whose logs end last first"
+        )
+    label = " + ".join(track.stage for track, _ in machines)
+    return _infer_all(label, first, tuple(kept), tasks, seed, mapper)
+
+
+def _places(
+    machines: Sequence[tuple[Track, Stage]], shared: Sequence[str]
+) -> tuple[tuple[str, ...], list[tuple[int, ...]]]:
+    """Name all parameters, and say where those of each machine stand among them."""
+    names: list[str] = []
+    columns = []
+    for track, stage in machines:
+        own = [parameter.name for parameter in stage.parameters]
+        missing = [name for name in shared if name not in own]
+        if missing:
+            raise BadStage(f"{stage.name}: no parameter {missing} to share; there are {own}")
+        full = [name if name in shared else f"{track.stage}:{name}" for name in own]
+        names += [name for name in full if name not in names]
+        columns.append(tuple(names.index(name) for name in full))
+    return tuple(names), columns
+
+
+def _last_before(track: Track, stage: Stage, first: Track, k: int) -> int | None:
+    """Last usable epoch of a track not later than one of another track."""
+    usable = epochs_to_infer(track, stage, len(track.logs))
+    before = [row for row in usable if track.recorded_at[row] <= first.recorded_at[k]]
+    return before[-1] if before else None
+
+
+def _usable_modes(track: Track, stage: Stage) -> tuple[str, ...]:
     if not stage.parameters:
         raise BadStage(f"{stage.name}: no [[parameter]] to infer")
     modes = tuple(name for name in stage.informative if name in track.modes)
@@ -74,76 +169,101 @@ def infer(
         raise NotEnoughData(
             f"{track.stage}: none of the modes {list(stage.informative)} was tracked"
         )
+    return modes
+
+
+def _chosen(track: Track, stage: Stage, epochs: Sequence[int] | None) -> tuple[int, ...]:
     chosen = tuple(epochs if epochs is not None else epochs_to_infer(track, stage, 40))
     if not chosen:
         raise NotEnoughData(f"{track.stage}: no epoch after the baseline")
+    return chosen
+
+
+def _seen(
+    track: Track, modes: tuple[str, ...], k: int
+) -> tuple[tuple[str, ...], FloatArray, FloatArray]:
+    """Modes, their drifts and covariance at an epoch."""
     columns = [track.modes.index(name) for name in modes]
-    tasks = [
-        EpochPosterior(stage, modes, track.drift[k][columns], _block(track.drift_cov[k], columns))
-        for k in chosen
-    ]
-    results = list(mapper(_infer_epoch, tasks, [seed] * len(tasks), chosen))  # type: ignore[call-overload]
-    return _collect(track, stage, chosen, results)
-
-
-def _block(matrix: FloatArray, index: list[int]) -> FloatArray:
-    return np.array(matrix[np.ix_(index, index)])
+    return modes, track.drift[k][columns], np.array(track.drift_cov[k][np.ix_(columns, columns)])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class EpochPosterior:
-    """Log posterior of the ln parameters at one epoch.
+class View:
+    """What one machine shows at one epoch.
 
     Attributes
     ----------
     stage : Stage
-        Parameters, priors and modal map.
+        Its modal map.
     modes : tuple of str
         Modes used.
     drift : ndarray
         Shape ``(n_modes,)``.
     cov : ndarray
         Its covariance, shape ``(n_modes, n_modes)``.
+    columns : tuple of int
+        Where its parameters stand among all.
     """
 
     stage: Stage
     modes: tuple[str, ...]
     drift: FloatArray
     cov: FloatArray
+    columns: tuple[int, ...]
 
-    def log_prior(self, x: FloatArray) -> FloatArray:
-        """Log prior of ln parameters, truncated at the map's grid, shape ``(n_points,)``."""
-        total = np.where(self._map_holds(x), 0.0, -np.inf)
-        for j, parameter in enumerate(self.stage.parameters):
-            total = total + parameter.prior.log_density(np.exp(x[:, j])) + x[:, j]
-        return np.asarray(total)
+    def log_likelihood(self, x: FloatArray) -> FloatArray:
+        """Log likelihood of all ln parameters, inside the map, shape ``(n_points,)``."""
+        own = x[:, self.columns]
+        n, n_parameters = own.shape
+        drift = self.stage.drift(one_at_a_time(self.stage, own), self.modes)
+        drift = drift.reshape(n_parameters + 1, n, -1)
+        model_std = self.stage.description.map.model_std if self.stage.description.map else 0.0
+        error = model_std**2 * np.sum(drift[1:] ** 2, axis=0)
+        cov = self.cov + error[:, :, None] * np.eye(len(self.modes))
+        off = self.drift - drift[0]
+        solved = np.linalg.solve(cov, off[..., None])[..., 0]
+        return np.asarray(-0.5 * (np.sum(off * solved, axis=1) + np.linalg.slogdet(cov)[1]))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class EpochPosterior:
+    """Log posterior of the ln parameters at one epoch, of one machine or several together.
+
+    Attributes
+    ----------
+    prior : JointPrior
+        Of all parameters.
+    views : tuple of View
+        One per machine.
+    """
+
+    prior: JointPrior
+    views: tuple[View, ...]
+
+    @classmethod
+    def of(
+        cls, stage: Stage, modes: tuple[str, ...], drift: FloatArray, cov: FloatArray
+    ) -> EpochPosterior:
+        """Make that of a single machine; see `View`."""
+        columns = tuple(range(len(stage.parameters)))
+        return cls(stage.prior, (View(stage, modes, drift, cov, columns),))
 
     def log_probability(self, x: FloatArray) -> FloatArray:
         """Log posterior of ln parameters up to a constant, shape ``(n_points,)``."""
-        total = self.log_prior(x)
+        total = self.prior.log_density(x)
         inside = np.isfinite(total)
-        if inside.any():
-            total[inside] += self._log_likelihood(x[inside])
+        for view in self.views:
+            if inside.any():
+                total[inside] += view.log_likelihood(x[inside])
         return total
 
     def draw_prior(self, rng: np.random.Generator, n: int) -> FloatArray:
         """Draw ln parameters from the prior inside the map, shape ``(n, n_parameters)``."""
-        return draw_prior(self.stage, rng, n)
+        return self.prior.draw(rng, n)
 
-    def _map_holds(self, x: FloatArray) -> np.ndarray:
-        assert self.stage.modal_map is not None  # infer() has checked
-        return self.stage.modal_map.inside(x)
-
-    def _log_likelihood(self, x: FloatArray) -> FloatArray:
-        n, n_parameters = x.shape
-        drift = self.stage.drift(one_at_a_time(self.stage, x), self.modes)
-        drift = drift.reshape(n_parameters + 1, n, -1)
-        model_std = self.stage.description.map.model_std if self.stage.description.map else 0.0
-        own = model_std**2 * np.sum(drift[1:] ** 2, axis=0)
-        cov = self.cov + own[:, :, None] * np.eye(len(self.modes))
-        off = self.drift - drift[0]
-        solved = np.linalg.solve(cov, off[..., None])[..., 0]
-        return np.asarray(-0.5 * (np.sum(off * solved, axis=1) + np.linalg.slogdet(cov)[1]))
+    def widened(self) -> EpochPosterior:
+        """Give the posterior with priors twice as wide."""
+        return EpochPosterior(self.prior.widened(_WIDER), self.views)
 
 
 def one_at_a_time(stage: Stage, x: FloatArray) -> FloatArray:
@@ -170,60 +290,131 @@ def one_at_a_time(stage: Stage, x: FloatArray) -> FloatArray:
     return stacked.reshape(-1, x.shape[1])
 
 
-def draw_prior(stage: Stage, rng: np.random.Generator, n: int) -> FloatArray:
-    """Draw ln parameters from the priors, truncated at the map, shape ``(n, n_parameters)``."""
-    found = np.empty((0, len(stage.parameters)))
-    for _ in range(100):
-        values = np.column_stack(
-            [p.prior.quantile(rng.uniform(1e-12, 1 - 1e-12, n)) for p in stage.parameters]
-        )
-        x = np.log(values[np.all(values > 0, axis=1)])
-        assert stage.modal_map is not None  # a stage with parameters has a map
-        found = np.concatenate([found, x[stage.modal_map.inside(x)]])
-        if found.shape[0] >= n:
-            return found[:n]
-    raise BadStage(f"{stage.name}: the priors put almost nothing inside the modal map")
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class _Epoch:
-    draws: FloatArray
-    ess: FloatArray
+    """Posterior of one epoch; ln parameters, arrays of shape ``(n_parameters,)`` if not told."""
+
+    draws: FloatArray  # (n_ensembles, n_draws, n_parameters)
+    ess_bulk: FloatArray
+    ess_tail: FloatArray
     r_hat: FloatArray
     converged: bool
+    laplace_shift: FloatArray
+    laplace_ratio: FloatArray
+    prior_shift: FloatArray
+    prior_ratio: FloatArray
+
+
+def draw(posterior: EpochPosterior, seed: np.random.SeedSequence) -> Sample:
+    """Draw ln parameters from the posterior of an epoch.
+
+    Raises
+    ------
+    NotConverged
+        With the chains.
+    """
+    return _draw(posterior, seed)[0]
+
+
+def _draw(
+    posterior: EpochPosterior, seed: np.random.SeedSequence
+) -> tuple[Sample, FloatArray, FloatArray]:
+    """Sample, and the mean and width it has by Laplace's approximation."""
+    begin = posterior.prior.quantile(_spread(_N_SEARCHED, len(posterior.prior.names)))
+    low, high = posterior.prior.support
+    normal = approximate(posterior.log_probability, begin, low, high)
+    if normal is None:
+        start = start_from_prior(posterior.log_probability, posterior.draw_prior)
+        nothing = np.full(low.size, np.nan)
+        return sample(posterior.log_probability, start, seed), nothing, nothing
+    start = start_near(normal.mode, normal.cov, posterior.log_probability)
+    return sample(posterior.log_probability, start, seed), normal.mode, normal.std
+
+
+def _spread(n: int, n_dim: int) -> FloatArray:
+    """Levels that fill the unit cube evenly, the same ones every time: ``(n, n_dim)``."""
+    from scipy.stats import qmc
+
+    return np.asarray(qmc.Halton(n_dim, scramble=False).random(n + 1)[1:])
 
 
 def _infer_epoch(posterior: EpochPosterior, seed: int | Sequence[int], epoch: int) -> _Epoch:
+    chain_seed, wider_seed = stream(seed, epoch).spawn(2)
+    unknown = np.full(len(posterior.prior.names), np.nan)
     try:
-        found = sample(posterior.log_probability, posterior.draw_prior, stream(seed, epoch))
+        found, mode, std = _draw(posterior, chain_seed)
+        wider = _wider_quantiles(posterior, found, wider_seed)
     except NotConverged as error:
         chains = np.asarray(error.chains)
-        draws = chains.reshape(-1, chains.shape[-1])
-        bad = np.full(draws.shape[1], np.nan)
-        return _Epoch(_thin(draws), bad, bad, converged=False)
-    return _Epoch(_thin(found.draws), found.ess, found.r_hat, converged=True)
+        if chains.ndim != 4:  # no start: the description is at fault, not this epoch
+            raise
+        draws = thin(flattened(chains), _N_KEPT)
+        return _Epoch(draws, unknown, unknown, unknown, False, *[unknown] * 4)
+    x = found.flat
+    low, middle, high = np.quantile(x, _LEVELS, axis=0)
+    return _Epoch(
+        draws=found.thinned(_N_KEPT),
+        ess_bulk=found.ess_bulk,
+        ess_tail=found.ess_tail,
+        r_hat=found.r_hat,
+        converged=True,
+        laplace_shift=(x.mean(axis=0) - mode) / std,
+        laplace_ratio=x.std(axis=0) / std,
+        prior_shift=(wider[1] - middle) / x.std(axis=0),
+        prior_ratio=(wider[2] - wider[0]) / (high - low),
+    )
 
 
-def _thin(draws: FloatArray) -> FloatArray:
-    index = np.linspace(0, draws.shape[0] - 1, _N_KEPT).round().astype(int)
-    return np.asarray(draws[index])
+def _wider_quantiles(
+    posterior: EpochPosterior, found: Sample, seed: np.random.SeedSequence
+) -> FloatArray:
+    """Quantiles of the ln parameters under priors twice as wide, shape ``(3, n_parameters)``."""
+    x, wider = found.flat, posterior.widened()
+    log_weight = wider.prior.log_density(x) - posterior.prior.log_density(x)
+    weight = np.exp(log_weight - log_weight.max())
+    if weight.sum() ** 2 / np.sum(weight**2) / x.shape[0] * found.ess_bulk.min() < (
+        _LEAST_REWEIGHTED
+    ):
+        return np.quantile(_draw(wider, seed)[0].flat, _LEVELS, axis=0)
+    return np.column_stack(
+        [np.quantile(column, _LEVELS, weights=weight, method="inverted_cdf") for column in x.T]
+    )
 
 
-def _collect(track: Track, stage: Stage, chosen: tuple[int, ...], results: list[_Epoch]) -> Health:
-    prior = draw_prior(stage, np.random.default_rng(0), _PRIOR_DRAWS)
-    prior_std = prior.std(axis=0)
-    low, high = np.quantile(np.exp(prior), [0.05, 0.95], axis=0)
-    x = np.stack([result.draws for result in results])
-    recorded: tuple[datetime, ...] = tuple(track.recorded_at[k] for k in chosen)
+def _infer_all(
+    name: str,
+    track: Track,
+    chosen: tuple[int, ...],
+    tasks: Sequence[EpochPosterior],
+    seed: int | Sequence[int],
+    mapper: Callable[..., object],
+) -> Health:
+    found: list[_Epoch] = list(mapper(_infer_epoch, tasks, [seed] * len(tasks), chosen))  # type: ignore[call-overload]
+    prior = tasks[0].prior
+    grid = prior.quantile((np.arange(1, _PRIOR_POINTS + 1) / (_PRIOR_POINTS + 1))[:, None])
+    low, high = prior.quantile(np.array([[0.05], [0.95]]))
+    x = np.stack([one.draws for one in found])
+    flat = x.reshape(len(found), -1, x.shape[-1])
+
+    def stacked(what: str) -> FloatArray:
+        return np.stack([getattr(one, what) for one in found])
+
     return Health(
-        stage=track.stage,
-        recorded_at=recorded,
+        stage=name,
+        recorded_at=tuple(track.recorded_at[k] for k in chosen),
         travel=track.travel[list(chosen)],
-        parameters=tuple(parameter.name for parameter in stage.parameters),
-        samples=np.exp(x),
-        ess=np.stack([result.ess for result in results]),
-        r_hat=np.stack([result.r_hat for result in results]),
-        converged=np.array([result.converged for result in results]),
-        informed=np.clip(1 - (x.std(axis=1) / prior_std) ** 2, 0, 1),
-        prior_width=high - low,
+        parameters=prior.names,
+        chains=np.exp(x),
+        ess_bulk=stacked("ess_bulk"),
+        ess_tail=stacked("ess_tail"),
+        r_hat=stacked("r_hat"),
+        converged=np.array([one.converged for one in found]),
+        informed=np.clip(1 - flat.var(axis=1) / grid.var(axis=0), 0, 1),
+        prior_width=np.exp(high) - np.exp(low),
+        correlation=np.stack([np.atleast_2d(np.corrcoef(one, rowvar=False)) for one in flat]),
+        laplace_shift=stacked("laplace_shift"),
+        laplace_ratio=stacked("laplace_ratio"),
+        prior_shift=stacked("prior_shift"),
+        prior_ratio=stacked("prior_ratio"),
+        seed=tuple(np.atleast_1d(seed).tolist()),
     )

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import pandas as pd
+from numpy.polynomial.chebyshev import chebder
 
 from lmshealth.arrays import BoolArray, FloatArray
 from lmshealth.errors import BadStage, OutsideMap
@@ -76,6 +77,37 @@ class ModalMap:
         OutsideMap
             If a point lies outside the grid; maps are never extrapolated.
         """
+        return _evaluate(self.coefficients, self._unit(x))
+
+    def gradient(self, x: FloatArray) -> FloatArray:
+        """Differentiate ln frequency by the ln parameters, for many points in one call.
+
+        The derivative is that of the polynomial, so that it holds at the ends of the grid too.
+
+        Parameters
+        ----------
+        x : ndarray
+            ln parameters, shape ``(n_points, n_parameters)``.
+
+        Returns
+        -------
+        ndarray
+            d ln frequency / d ln parameter, shape ``(n_points, n_modes, n_parameters)``.
+
+        Raises
+        ------
+        OutsideMap
+            If a point lies outside the grid; maps are never extrapolated.
+        """
+        unit = self._unit(x)
+        slopes = [
+            _evaluate(chebder(self.coefficients, scl=scale, axis=axis), unit)
+            for axis, scale in enumerate(2 / (self.high - self.low))
+        ]
+        return np.stack(slopes, axis=-1)
+
+    def _unit(self, x: FloatArray) -> FloatArray:
+        """Scale points to the range -1 to 1 of the polynomials; refuse those outside."""
         inside = self.inside(x)
         if not inside.all():
             worst = np.exp(x[~inside][0])
@@ -83,20 +115,7 @@ class ModalMap:
                 f"parameters {dict(zip(self.parameters, worst.tolist(), strict=True))} lie outside "
                 f"the modal map ({np.exp(self.low)} to {np.exp(self.high)}); make a wider map"
             )
-        return self._evaluate(x)
-
-    def _evaluate(self, x: FloatArray) -> FloatArray:
-        unit = 2 * (x - self.low) / (self.high - self.low) - 1
-        shape = self.coefficients.shape
-        # The last parameter axis is contracted by one matrix product for all points and modes;
-        # what is left is small.
-        basis = _polynomials(unit[:, -1], shape[-2])
-        last = np.moveaxis(self.coefficients, -2, 0).reshape(shape[-2], -1)
-        value = (basis @ last).reshape(-1, *shape[:-2], shape[-1])
-        for axis in reversed(range(len(self.parameters) - 1)):
-            basis = _polynomials(unit[:, axis], shape[axis])
-            value = np.einsum("n...km,nk->n...m", value, basis)
-        return np.asarray(value)
+        return np.asarray(2 * (x - self.low) / (self.high - self.low) - 1)
 
 
 def read_map(path: str, parameters: tuple[str, ...]) -> ModalMap:
@@ -166,6 +185,20 @@ def _fit(path: str, table: pd.DataFrame, parameters: tuple[str, ...]) -> ModalMa
     )
 
 
+def _evaluate(coefficients: FloatArray, unit: FloatArray) -> FloatArray:
+    """Sum a tensor Chebyshev series at points ``(n_points, n_parameters)`` from -1 to 1."""
+    shape = coefficients.shape
+    # The last parameter axis is contracted by one matrix product for all points and modes;
+    # what is left is small.
+    basis = _polynomials(unit[:, -1], shape[-2])
+    last = np.moveaxis(coefficients, -2, 0).reshape(shape[-2], -1)
+    value = (basis @ last).reshape(-1, *shape[:-2], shape[-1])
+    for axis in reversed(range(unit.shape[1] - 1)):
+        basis = _polynomials(unit[:, axis], shape[axis])
+        value = np.einsum("n...km,nk->n...m", value, basis)
+    return np.asarray(value)
+
+
 def _polynomials(unit: FloatArray, n: int) -> FloatArray:
     """Chebyshev polynomials 0 … n-1 at points from -1 to 1, shape ``(n_points, n)``."""
     # numpy's chebvander spends more on bookkeeping than on the few points of a step of walkers.
@@ -218,26 +251,3 @@ def _choose_degrees(
             break
     assert best is not None  # sizes are at least 3: degree 1 is always tried
     return best
-
-
-def sensitivities(modal_map: ModalMap, at: FloatArray, step: float = 1e-4) -> FloatArray:
-    """Differentiate ln frequency by ln parameter.
-
-    Parameters
-    ----------
-    modal_map : ModalMap
-        The surrogate.
-    at : ndarray
-        ln parameters inside the grid, shape ``(n_parameters,)``.
-    step : float
-        Half width of the difference in ln parameter: central, one-sided where the grid ends.
-
-    Returns
-    -------
-    ndarray
-        Shape ``(n_modes, n_parameters)``.
-    """
-    shifts = step * np.eye(at.size)
-    up, down = np.minimum(at + shifts, modal_map.high), np.maximum(at - shifts, modal_map.low)
-    change = modal_map.ln_frequency(up) - modal_map.ln_frequency(down)
-    return np.asarray(change.T / np.diag(up - down))

@@ -42,7 +42,6 @@ from lmshealth.bandfit import BAND
 from lmshealth.bounds import ambient_bound
 from lmshealth.errors import BadQuestion, BadStage
 from lmshealth.modal import LEAST_RESOLUTION
-from lmshealth.modalmap import sensitivities
 from lmshealth.stage import ModeSpec, ParameterSpec, Stage
 
 DURATIONS = (10.0, 20.0, 60.0, 120.0, 300.0, 600.0)
@@ -276,7 +275,7 @@ def _view(stage: Stage, parameter: str, loss: float) -> _View:
     lost[j] += np.log1p(-loss)
     stage.modal_map.ln_frequency(lost[None])  # it refuses what lies beyond its grid
     rows = [stage.modal_map.modes.index(name) for name in stage.informative]
-    slopes = sensitivities(stage.modal_map, stage.baseline_point)[rows]
+    slopes = stage.modal_map.gradient(stage.baseline_point[None])[0, rows]
     prior = np.array([_prior_variance(stage, k, p) for k, p in enumerate(stage.parameters)])
     others, others_prior = np.delete(slopes, j, axis=1), np.delete(prior, j)
     wrong = stage.description.map.model_std**2 * others**2 @ others_prior

@@ -10,7 +10,7 @@ from lmshealth.arrays import FloatArray
 from lmshealth.errors import BadStage, NotEnoughData
 from lmshealth.life import LifeLikelihood, limited
 from lmshealth.results import Prognosis
-from lmshealth.sampling import find_start, sample, stream
+from lmshealth.sampling import sample, start_from_prior, stream, thin
 from lmshealth.stage import Stage
 from lmshealth.tracks import History
 
@@ -98,13 +98,13 @@ def _posterior(
     """Draw sampling coordinates from the posterior: draws, worst ESS, worst R-hat."""
     if likelihood.n_dim == 0:
         return np.empty((_N_DRAWS, 0)), float("inf"), 1.0
-    points = find_start(
-        likelihood.log_probability, likelihood.draw_prior, np.random.default_rng(start), 300
-    )
-    likelihood.narrow(points())
-    found = sample(likelihood.log_probability, likelihood.draw_prior, seed)
-    index = np.linspace(0, found.draws.shape[0] - 1, _N_DRAWS).round().astype(int)
-    return found.draws[index], float(found.ess.min()), float(found.r_hat.max())
+    begin = start_from_prior(likelihood.log_probability, likelihood.draw_prior, 300)
+    likelihood.narrow(begin(np.random.default_rng(start)))
+    begin = start_from_prior(likelihood.log_probability, likelihood.draw_prior, 300)
+    found = sample(likelihood.log_probability, begin, seed)
+    draws = thin(found.draws, _N_DRAWS // found.draws.shape[0])
+    ess = min(found.ess_bulk.min(), found.ess_tail.min())
+    return draws.reshape(-1, draws.shape[-1]), float(ess), float(found.r_hat.max())
 
 
 def _curve_grid(remaining: FloatArray, since: float, horizon: float) -> FloatArray:

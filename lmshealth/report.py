@@ -320,11 +320,11 @@ def _inline(draw: Any, salt: str) -> str:
 
 
 def _pairs(health: Health) -> list[tuple[tuple[str, ...], str, float]]:
-    """Parameters to draw against each other, their title, and the correlation of the draws."""
+    """Parameters to draw against each other, their title, and their correlation."""
     names = health.parameters
     if len(names) == 1:
         return [(names, spell(names[0]), 0.0)]
-    rho = np.corrcoef(np.log(health.samples[-1]).T)
+    rho = health.correlation[-1]
     return [
         ((names[i], names[j]), f"{spell(names[i])} against {spell(names[j])}", float(rho[i, j]))
         for i, j in combinations(range(len(names)), 2)

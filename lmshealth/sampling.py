@@ -9,21 +9,24 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.random import MT19937, RandomState
 
-from lmshealth.arrays import FloatArray
+from lmshealth.arrays import FloatArray, freeze
 from lmshealth.errors import NotConverged
+from lmshealth.laplace import LogProbability
 
 if TYPE_CHECKING:
     import emcee
 
-LogProbability = Callable[[FloatArray], FloatArray]
-"""Log density of many points at once: ``(n_points, n_dim)`` to ``(n_points,)``."""
+Start = Callable[[np.random.Generator], FloatArray]
+"""Draws the points inside the support that an ensemble begins from: ``(n_walkers, n_dim)``."""
 
 _N_ENSEMBLES = 4
 _AUTOCORRELATION_TIMES = 50
 _R_HAT = 1.01
 _FIRST_STEPS = 600
 _MOST_STEPS = 20_000
+_LEAST_WALKERS = 24
 _START_ROUNDS = 6
+_START_ATTEMPTS = 100
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -33,16 +36,40 @@ class Sample:
     Attributes
     ----------
     draws : ndarray
-        Shape ``(n_draws, n_dim)``; neighbours come from different walkers and ensembles.
-    ess : ndarray
-        Effective sample size from the autocorrelation times, shape ``(n_dim,)``.
+        Of every ensemble, after burn-in, step by step and walker by walker, shape
+        ``(n_ensembles, n_draws, n_dim)``.
+    ess_bulk, ess_tail : ndarray
+        Effective sample size of all ensembles together for the middle of the posterior and for
+        its 5 and 95 % quantiles, shape ``(n_dim,)``.
     r_hat : ndarray
         Rank-normalised split R-hat over the independent ensembles, shape ``(n_dim,)``.
+    autocorrelation_time : ndarray
+        In steps, the longest of the ensembles, shape ``(n_dim,)``.
     """
 
     draws: FloatArray
-    ess: FloatArray
+    ess_bulk: FloatArray
+    ess_tail: FloatArray
     r_hat: FloatArray
+    autocorrelation_time: FloatArray
+
+    def __post_init__(self) -> None:
+        freeze(self)
+
+    def thinned(self, n: int) -> FloatArray:
+        """Take so many draws of each ensemble, evenly: ``(n_ensembles, n, n_dim)``."""
+        return thin(self.draws, n)
+
+    @property
+    def flat(self) -> FloatArray:
+        """Draws of all ensembles by turns, shape ``(n_ensembles n_draws, n_dim)``."""
+        return np.swapaxes(self.draws, 0, 1).reshape(-1, self.draws.shape[-1])
+
+
+def thin(draws: FloatArray, n: int) -> FloatArray:
+    """Take so many draws along the second axis, evenly."""
+    index = np.linspace(0, draws.shape[1] - 1, n).round().astype(int)
+    return np.asarray(draws[:, index])
 
 
 def stream(seed: int | Sequence[int], *steps: int) -> np.random.SeedSequence:
@@ -50,11 +77,7 @@ def stream(seed: int | Sequence[int], *steps: int) -> np.random.SeedSequence:
     return np.random.SeedSequence([*np.atleast_1d(seed).tolist(), *steps])
 
 
-def sample(
-    log_probability: LogProbability,
-    draw_prior: Callable[[np.random.Generator, int], FloatArray],
-    seed: np.random.SeedSequence,
-) -> Sample:
+def sample(log_probability: LogProbability, start: Start, seed: np.random.SeedSequence) -> Sample:
     """Sample a posterior with several independent emcee ensembles.
 
     Every ensemble has its own start and its own random stream: walkers of one ensemble depend on
@@ -64,8 +87,8 @@ def sample(
     ----------
     log_probability : callable
         Vectorised log density; -inf outside its support.
-    draw_prior : callable
-        Draws points of the right order of magnitude: ``(rng, n)`` to ``(n, n_dim)``.
+    start : callable
+        Where an ensemble begins.
     seed : SeedSequence
         Of all randomness.
 
@@ -79,8 +102,7 @@ def sample(
     streams = seed.spawn(2 * _N_ENSEMBLES)
     samplers = []
     for start_seed, chain_seed in zip(streams[::2], streams[1::2], strict=True):
-        start = find_start(log_probability, draw_prior, np.random.default_rng(start_seed))
-        points = start()
+        points = start(np.random.default_rng(start_seed))
         sampler = emcee.EnsembleSampler(
             *points.shape,
             log_probability,
@@ -114,10 +136,10 @@ def _run(samplers: list[tuple[emcee.EnsembleSampler, emcee.State]]) -> Sample:
         burn = int(min(10 * tau.max(), n_steps / 2))
         kept = chains[:, burn:]
         enough = kept.shape[1] >= _AUTOCORRELATION_TIMES * tau.max()
-        r_hat = _r_hat(kept)
-        if enough and (r_hat < _R_HAT).all():
+        if enough and (_diagnose("rhat", kept) < _R_HAT).all():
             break
         if n_steps >= _MOST_STEPS:
+            r_hat = _diagnose("rhat", kept)
             raise NotConverged(
                 f"after {n_steps} steps the autocorrelation time is {tau.max():.0f} and R-hat "
                 f"{r_hat.max():.3f}; needed are {_AUTOCORRELATION_TIMES} autocorrelation times "
@@ -126,67 +148,97 @@ def _run(samplers: list[tuple[emcee.EnsembleSampler, emcee.State]]) -> Sample:
             )
         wanted = int(1.1 * (_AUTOCORRELATION_TIMES + 10) * tau.max())
         target = min(max(wanted, n_steps + n_steps // 2), _MOST_STEPS)
-    n_draws = kept.shape[0] * kept.shape[1] * kept.shape[2]
-    # Time first, so that any thinning of the draws takes from all ensembles alike.
-    draws = np.swapaxes(kept, 0, 1).reshape(n_draws, -1)
-    return Sample(draws=draws, ess=n_draws / tau, r_hat=r_hat)
+    # What has a time scale along a chain must see the walkers one after the other.
+    walkers = np.swapaxes(kept, 1, 2)
+    return Sample(
+        draws=flattened(kept),
+        ess_bulk=_diagnose("ess", walkers, method="bulk"),
+        ess_tail=_diagnose("ess", walkers, method="tail", prob=(0.05, 0.95)),
+        r_hat=_diagnose("rhat", kept),
+        autocorrelation_time=tau,
+    )
 
 
-def _r_hat(chains: FloatArray) -> FloatArray:
-    """R-hat over ensembles, shape ``(n_dim,)``."""
+def flattened(chains: FloatArray) -> FloatArray:
+    """Join steps and walkers: ``(n_ensembles, n_draws, n_dim)``."""
+    return chains.reshape(chains.shape[0], -1, chains.shape[-1])
+
+
+def _diagnose(what: str, chains: FloatArray, **options: Any) -> FloatArray:
+    """Ask arviz about each dimension, an ensemble being a chain, shape ``(n_dim,)``."""
     from arviz_stats.base.array import array_stats  # late: it costs more than numpy to import
 
-    n_ensembles, n_steps, n_walkers, n_dim = chains.shape
-    flat = chains.reshape(n_ensembles, n_steps * n_walkers, n_dim)
-    rhat: Any = array_stats.rhat  # the library has no types
-    return np.array([float(rhat(flat[..., d], chain_axis=0, draw_axis=1)) for d in range(n_dim)])
+    ask: Any = getattr(array_stats, what)  # the library has no types
+    flat = flattened(chains)
+    axes = {"chain_axis": 0, "draw_axis": 1}
+    return np.array([float(ask(flat[..., d], **axes, **options)) for d in range(flat.shape[-1])])
 
 
-def find_start(
+def _n_walkers(n_dim: int) -> int:
+    """Choose the walkers of an ensemble: a step of many costs hardly more than one of few."""
+    return max(_LEAST_WALKERS, 8 * n_dim)
+
+
+def start_near(centre: FloatArray, cov: FloatArray, log_probability: LogProbability) -> Start:
+    """Begin about a point, twice as wide as a normal distribution, inside the support."""
+    factor = 2 * np.linalg.cholesky(cov)
+
+    def start(rng: np.random.Generator) -> FloatArray:
+        n = _n_walkers(centre.size)
+        found = np.empty((0, centre.size))
+        for _ in range(_START_ATTEMPTS):
+            points = centre + rng.standard_normal((n, centre.size)) @ factor.T
+            found = np.concatenate([found, points[np.isfinite(log_probability(points))]])
+            if found.shape[0] >= n:
+                return found[:n]
+        raise NotConverged(
+            f"of {_START_ATTEMPTS * n} points about the posterior's mode {found.shape[0]} lie "
+            "inside the modal map: widen the map or the prior",
+            found,
+        )
+
+    return start
+
+
+def start_from_prior(
     log_probability: LogProbability,
     draw_prior: Callable[[np.random.Generator, int], FloatArray],
-    rng: np.random.Generator,
     n_draws: int = 1000,
-) -> Callable[[], FloatArray]:
-    """Narrow the prior down to the posterior by a few rounds of importance sampling.
+) -> Start:
+    """Begin where a few rounds of importance sampling narrow the prior down to the posterior.
 
     Parameters
     ----------
-    log_probability, draw_prior : callable
+    log_probability : callable
         As in `sample`.
-    rng : Generator
-        Of all randomness.
+    draw_prior : callable
+        Draws points of the right order of magnitude: ``(rng, n)`` to ``(n, n_dim)``.
     n_draws : int
         Points per round.
-
-    Returns
-    -------
-    callable
-        Draws distinct start points of one ensemble inside the support, ``(n_walkers, n_dim)``.
     """
-    points = draw_prior(rng, n_draws)
-    n_dim = points.shape[1]
-    proposal = np.zeros(points.shape[0])
-    for _ in range(_START_ROUNDS):
-        log_weight = log_probability(points) - proposal
-        if not np.isfinite(log_weight).any():
-            raise NotConverged(
-                "no draw of the prior lies inside the modal map: widen the map or the prior", points
-            )
-        weight = _tempered(log_weight, 10 * n_dim)
-        mean = weight @ points
-        off = points - mean
-        # Twice the variance: a proposal must be wider than what it is to find.
-        cov = 2 * (weight[:, None] * off).T @ off + 1e-16 * np.eye(n_dim)
-        factor = np.linalg.cholesky(cov)
-        unit = rng.standard_normal((n_draws, n_dim))
-        points = mean + unit @ factor.T
-        proposal = -0.5 * np.sum(unit**2, axis=1)
-    log_weight = log_probability(points) - proposal
 
-    def start() -> FloatArray:
-        n = max(16, 6 * n_dim)
-        weight = _tempered(log_weight, 2 * n)
+    def start(rng: np.random.Generator) -> FloatArray:
+        points = draw_prior(rng, n_draws)
+        n_dim = points.shape[1]
+        proposal = np.zeros(points.shape[0])
+        for _ in range(_START_ROUNDS):
+            log_weight = log_probability(points) - proposal
+            if not np.isfinite(log_weight).any():
+                raise NotConverged(
+                    "no draw of the prior lies inside the modal map: widen the map or the prior",
+                    points,
+                )
+            weight = _tempered(log_weight, 10 * n_dim)
+            mean = weight @ points
+            off = points - mean
+            # Twice the variance: a proposal must be wider than what it is to find.
+            cov = 2 * (weight[:, None] * off).T @ off + 1e-16 * np.eye(n_dim)
+            factor = np.linalg.cholesky(cov)
+            unit = rng.standard_normal((n_draws, n_dim))
+            points = mean + unit @ factor.T
+            proposal = -0.5 * np.sum(unit**2, axis=1)
+        n = _n_walkers(n_dim)
+        weight = _tempered(log_probability(points) - proposal, 2 * n)
         chosen = rng.choice(points.shape[0], size=n, replace=False, p=weight)
         return np.asarray(points[chosen])
 

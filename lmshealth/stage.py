@@ -23,7 +23,7 @@ from lmshealth.errors import BadStage
 from lmshealth.laws import AnyLaw, Unchanging
 from lmshealth.logs import Metadata
 from lmshealth.modalmap import ModalMap, read_map
-from lmshealth.priors import Prior
+from lmshealth.priors import JointPrior, Prior
 
 Positive = Annotated[float, Meta(gt=0)]
 Share = Annotated[float, Meta(gt=0, lt=1)]
@@ -220,6 +220,18 @@ class Stage:
     def baseline_point(self) -> FloatArray:
         """Ln of the parameters at baseline, shape ``(n_parameters,)``."""
         return np.log([parameter.baseline for parameter in self.parameters])
+
+    @cached_property
+    def prior(self) -> JointPrior:
+        """Priors of the health parameters, cut where the map ends."""
+        if self.modal_map is None:
+            raise BadStage(f"{self.name}: no [[parameter]] with a [map]")
+        names = tuple(parameter.name for parameter in self.parameters)
+        priors = tuple(parameter.prior for parameter in self.parameters)
+        try:
+            return JointPrior(names, priors, self.modal_map.low, self.modal_map.high)
+        except BadStage as error:
+            raise BadStage(f"{self.name}: {error}") from error
 
     def takes(self, metadata: Metadata) -> bool:
         """Tell whether a log belongs to this description."""

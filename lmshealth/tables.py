@@ -14,7 +14,7 @@ from lmshealth.arrays import FloatArray
 from lmshealth.history import Reading
 from lmshealth.logs import Refusal
 from lmshealth.readers.metadata import COVARIATES
-from lmshealth.results import Prognosis
+from lmshealth.results import Health, Prognosis
 from lmshealth.summary import Assessment
 from lmshealth.tracks import Smoothed, Track
 
@@ -32,7 +32,7 @@ COLUMNS = {
     "effects": "stage mode covariate coefficient std",
     "events": "stage recorded_at travel_km kind mode source size std evidence declared known_at",
     "health": "stage recorded_at travel_km parameter median q05 q25 q75 q95 ess r_hat converged "
-    "informed",
+    "informed ess_bulk ess_tail laplace_shift laplace_ratio prior_shift prior_ratio",
     "prognosis": "stage parameter limit "
     + " ".join(
         f"rul_{unit}_q{100 * level:02.0f}"
@@ -117,7 +117,8 @@ def all_tables(
             rows["track_cov"] += track_cov_rows(assessment.track)
             rows["effects"] += effects_rows(assessment.track)
             rows["events"] += events_rows(assessment.track)
-        rows["health"] += _health_rows(assessment)
+        if assessment.health is not None:
+            rows["health"] += health_rows(assessment.health)
         rows["prognosis"] += _prognosis_rows(assessment)
         rows["verdict"].append(
             {
@@ -227,6 +228,14 @@ def events_rows(track: Track) -> list[Row]:
     ]
 
 
+def health_rows(health: Health) -> list[Row]:
+    """List a posterior of health, one row per epoch and parameter."""
+    return [
+        {str(name): value for name, value in row.items()}
+        for row in health.to_frame().to_dict("records")
+    ]
+
+
 def _smoothed_columns(smoothed: Smoothed, k: int, i: int) -> Row:
     frequency, damping = np.exp(smoothed.ln_frequency[k, i]), np.exp(smoothed.ln_damping[k, i])
     return {
@@ -237,32 +246,6 @@ def _smoothed_columns(smoothed: Smoothed, k: int, i: int) -> Row:
         "drift_smoothed": smoothed.drift[k, i],
         "drift_std_smoothed": smoothed.drift_std[k, i],
     }
-
-
-def _health_rows(assessment: Assessment) -> list[Row]:
-    health = assessment.health
-    if health is None:
-        return []
-    q05, q25, median, q75, q95 = health.quantile(np.array([0.05, 0.25, 0.5, 0.75, 0.95]))
-    return [
-        {
-            "stage": health.stage,
-            "recorded_at": _moment(health.recorded_at[k]),
-            "travel_km": health.travel[k] / _KM,
-            "parameter": name,
-            "median": median[k, j],
-            "q05": q05[k, j],
-            "q25": q25[k, j],
-            "q75": q75[k, j],
-            "q95": q95[k, j],
-            "ess": health.ess[k, j],
-            "r_hat": health.r_hat[k, j],
-            "converged": bool(health.converged[k]),
-            "informed": health.informed[k, j],
-        }
-        for k in range(len(health.recorded_at))
-        for j, name in enumerate(health.parameters)
-    ]
 
 
 def _prognosis_rows(assessment: Assessment) -> list[Row]:

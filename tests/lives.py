@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from lmshealth.arrays import FloatArray
+from lmshealth.arrays import BoolArray, FloatArray
 from lmshealth.history import Reading
 from lmshealth.logs import Metadata
 from lmshealth.results import Health, Modes, Prognosis
@@ -341,18 +341,48 @@ def make_health(
     informed: Sequence[float] = (0.9, 0.9),
 ) -> Health:
     """Make the health of one epoch from draws, shape ``(n_draws, n_parameters)``."""
-    p = len(parameters)
-    return Health(
-        stage="AX-1",
+    return health_of(
+        np.array(samples)[None],
         recorded_at=(START,),
         travel=np.array([1e6]),
         parameters=tuple(parameters),
-        samples=np.array(samples)[None],
-        ess=np.full((1, p), 1000.0),
-        r_hat=np.full((1, p), 1.001),
         converged=np.array([converged]),
         informed=np.array([informed], dtype=float),
+    )
+
+
+def health_of(
+    samples: FloatArray,
+    *,
+    recorded_at: tuple[datetime, ...],
+    travel: FloatArray,
+    parameters: tuple[str, ...],
+    converged: BoolArray,
+    informed: FloatArray,
+    stage: str = "AX-1",
+) -> Health:
+    """Make a health of draws, ``(n_epochs, n_draws, n_parameters)``; the rest is unremarkable."""
+    n, n_draws, p = samples.shape
+    with np.errstate(invalid="ignore"):  # draws that are all alike have no correlation
+        rho = [np.atleast_2d(np.corrcoef(one, rowvar=False)) for one in samples]
+    return Health(
+        stage=stage,
+        recorded_at=recorded_at,
+        travel=travel,
+        parameters=parameters,
+        chains=samples.reshape(n, 4, n_draws // 4, p),
+        ess_bulk=np.full((n, p), 2150.0),
+        ess_tail=np.full((n, p), 1000.0),
+        r_hat=np.full((n, p), 1.001),
+        converged=converged,
+        informed=informed,
         prior_width=np.ones(p),
+        correlation=np.stack(rho),
+        laplace_shift=np.full((n, p), 0.02),
+        laplace_ratio=np.full((n, p), 1.01),
+        prior_shift=np.full((n, p), 0.01),
+        prior_ratio=np.full((n, p), 1.02),
+        seed=(0,),
     )
 
 

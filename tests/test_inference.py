@@ -11,7 +11,7 @@ from scipy import stats
 from lmshealth import inference
 from lmshealth.arrays import FloatArray
 from lmshealth.errors import BadStage, NotConverged, NotEnoughData
-from lmshealth.inference import EpochPosterior, draw_prior, epochs_to_infer, infer, one_at_a_time
+from lmshealth.inference import EpochPosterior, epochs_to_infer, infer, one_at_a_time
 from lmshealth.results import Health
 from lmshealth.sampling import Sample
 from lmshealth.stage import Stage
@@ -84,7 +84,7 @@ def inside(n: int, seed: int = 1) -> FloatArray:
 def test_log_posterior_is_the_textbook_one(tmp_path: Path, model_std: float) -> None:
     """Many points in one call equal one point at a time by the formula, map error included."""
     stage = make_stage(tmp_path, model_std=model_std)
-    posterior = EpochPosterior(stage, ("roll", "pitch"), true_drift(NAMES, TRUTH)[:2], COV)
+    posterior = EpochPosterior.of(stage, ("roll", "pitch"), true_drift(NAMES, TRUTH)[:2], COV)
     x = inside(60)
     found = posterior.log_probability(x)
     known = np.array([book(point, model_std) for point in x])
@@ -200,7 +200,7 @@ def test_draws_never_leave_the_map(stage: Stage) -> None:
 
 def test_outside_the_map_is_impossible_and_raises_nothing(stage: Stage) -> None:
     """Points outside have log probability minus infinity beside finite ones inside."""
-    posterior = EpochPosterior(stage, ("roll", "pitch"), true_drift(NAMES, TRUTH)[:2], COV)
+    posterior = EpochPosterior.of(stage, ("roll", "pitch"), true_drift(NAMES, TRUTH)[:2], COV)
     x = np.array([[0.0, 0.0], [-9.0, 0.0], [0.0, 9.0], [-0.1, -0.1]])
     found = posterior.log_probability(x)
     assert np.isfinite(found).tolist() == [True, False, False, True]
@@ -210,7 +210,7 @@ def test_outside_the_map_is_impossible_and_raises_nothing(stage: Stage) -> None:
 
 def test_the_prior_is_cut_at_the_map(stage: Stage) -> None:
     """Prior draws are lognormal between the edges of the grid, each parameter by itself."""
-    x = draw_prior(stage, np.random.default_rng(12), 20_000)
+    x = stage.prior.draw(np.random.default_rng(12), 20_000)
     assert x.shape == (20_000, 2)
     for j, name in enumerate(NAMES):
         low, high = np.log(AXES[name][[0, -1]])
@@ -224,7 +224,7 @@ def test_a_prior_far_from_the_map_is_refused(tmp_path: Path) -> None:
     far = PRELOAD.replace("median = 1.0", "median = 1000.0").replace("sigma = 0.3", "sigma = 0.01")
     stage = make_stage(tmp_path, (far,))
     with pytest.raises(BadStage, match="almost nothing inside"):
-        draw_prior(stage, np.random.default_rng(1), 100)
+        stage.prior.draw(np.random.default_rng(1), 100)
 
 
 def test_one_at_a_time_moves_one_parameter(stage: Stage) -> None:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from lmshealth.errors import BadStage, OutsideMap
-from lmshealth.modalmap import ModalMap, read_map, sensitivities
+from lmshealth.modalmap import ModalMap, read_map
 from lmshealth.stage import load_stage, shipped
 from tests.lives import BEND, FREQUENCY, SENSITIVITY, map_rows, true_drift
 
@@ -42,21 +42,43 @@ def test_a_polynomial_map_is_reproduced_exactly(small: ModalMap) -> None:
     assert (small.leave_out_error < 1e-12).all()
 
 
-def test_sensitivities_are_the_derivatives_of_the_formula(small: ModalMap) -> None:
-    """Central differences give d ln f / d ln parameter."""
-    at = np.log([0.7, 0.9])
-    known = np.column_stack([SENSITIVITY[name][:2] for name in NAMES])
-    known[:, 0] += 2 * BEND * at[0]
-    np.testing.assert_allclose(sensitivities(small, at), known, atol=1e-9)
+def test_the_gradient_is_that_of_the_formula(small: ModalMap) -> None:
+    """The derivative of a quadratic map is known everywhere, the corners of the grid included."""
+    corners = np.array([small.low, small.high, [small.low[0], small.high[1]]])
+    x = np.concatenate([points(small), corners])
+    known = np.stack([np.tile(SENSITIVITY[name][:2], (len(x), 1)) for name in NAMES], axis=-1)
+    known[:, :, 0] += 2 * BEND * x[:, :1]
+    np.testing.assert_allclose(small.gradient(x), known, atol=1e-11)
 
 
-@pytest.mark.parametrize("end", [0, -1])
-def test_sensitivities_are_one_sided_where_the_grid_ends(small: ModalMap, end: int) -> None:
-    """A baseline may stand at the corner of the map, off by the bend over one step only."""
-    at = np.array([small.low, small.high])[end]
-    known = np.column_stack([SENSITIVITY[name][:2] for name in NAMES])
-    known[:, 0] += 2 * BEND * at[0]
-    np.testing.assert_allclose(sensitivities(small, at), known, atol=1.1e-4 * BEND)
+@pytest.mark.parametrize("names", [NAMES[:1], (*NAMES, "foot")], ids=["one", "three"])
+def test_the_gradient_has_one_slope_per_mode_and_parameter(
+    tmp_path: Path, names: tuple[str, ...]
+) -> None:
+    """Axes are points, modes, parameters, however many parameters there are."""
+    found = read_map(write(tmp_path, map_rows(names)), names)
+    x = points(found, 7)
+    known = np.stack([np.tile(SENSITIVITY[name][:2], (7, 1)) for name in names], axis=-1)
+    known[:, :, 0] += 2 * BEND * x[:, :1]
+    np.testing.assert_allclose(found.gradient(x), known, atol=1e-10)
+
+
+@pytest.mark.parametrize("name", ["lms-x", "lms-y"])
+def test_the_gradient_is_the_limit_of_differences(name: str) -> None:
+    """On curved maps central differences inside, and one-sided ones at the corners, approach it."""
+    stage = load_stage(name)
+    assert stage.modal_map is not None
+    found, step = stage.modal_map, 1e-4
+    inner = 0.99 * points(found, 50) + 0.005 * (found.low + found.high)
+    for k, shift in enumerate(step * np.eye(2)):
+        change = found.ln_frequency(inner + shift) - found.ln_frequency(inner - shift)
+        np.testing.assert_allclose(found.gradient(inner)[:, :, k], change / (2 * step), atol=1e-6)
+        for corner, inward in ((found.low, shift), (found.high, -shift)):
+            at = corner + np.outer([0, 1, 2], inward)
+            f = found.ln_frequency(at)
+            # Three points take the bend out of a one-sided difference.
+            change = (-3 * f[0] + 4 * f[1] - f[2]) / (2 * inward[k])
+            np.testing.assert_allclose(found.gradient(corner[None])[0, :, k], change, atol=1e-5)
 
 
 def test_the_order_of_rows_and_columns_does_not_matter(tmp_path: Path, small: ModalMap) -> None:
@@ -120,8 +142,9 @@ def test_a_map_is_never_extrapolated(small: ModalMap) -> None:
     x = points(small, 5)
     x[3, 1] = small.high[1] + 1e-3
     assert small.inside(x).tolist() == [True, True, True, False, True]
-    with pytest.raises(OutsideMap, match=r"mount_stiffness.*make a wider map"):
-        small.ln_frequency(x)
+    for ask in (small.ln_frequency, small.gradient):
+        with pytest.raises(OutsideMap, match=r"mount_stiffness.*make a wider map"):
+            ask(x)
 
 
 def test_the_edge_of_the_grid_is_inside(small: ModalMap) -> None:
@@ -195,7 +218,7 @@ def test_the_x_stage_does_not_see_its_mount_and_the_y_stage_does() -> None:
     for name in ("lms-x", "lms-y"):
         stage = load_stage(name)
         assert stage.modal_map is not None
-        slopes[name] = np.abs(sensitivities(stage.modal_map, stage.baseline_point))
+        slopes[name] = np.abs(stage.modal_map.gradient(stage.baseline_point[None])[0])
     assert slopes["lms-x"][:, 1].max() < 0.1
     assert slopes["lms-y"][:, 1].max() > 0.15
     assert (slopes["lms-y"][:, 0].max()) > 0.05

@@ -20,6 +20,7 @@ from lmshealth.laws import HertzWear, Law, Loosening
 from lmshealth.priors import Lognormal, Normal
 from lmshealth.results import Health, Prognosis
 from lmshealth.tracks import Effect, History, Series, Track
+from tests.lives import health_of
 
 MODES = ("roll", "pitch", "yaw")
 PARAMETERS = ("guide_preload", "mount_stiffness")
@@ -115,17 +116,14 @@ def make_health(
     both = min(informed) > 0.5
     white = rng.standard_normal((n, 1500, 2))
     white = white @ root.T if both else white
-    return Health(
+    return health_of(
+        np.exp(np.log(truth)[:, None] + std[:, None] * white),
         stage=history.stage,
         recorded_at=history.recorded_at,
         travel=history.travel,
         parameters=PARAMETERS,
-        samples=np.exp(np.log(truth)[:, None] + std[:, None] * white),
-        ess=np.full((n, 2), 2150.0),
-        r_hat=np.full((n, 2), 1.004),
         converged=np.ones(n, dtype=bool),
         informed=np.tile(np.array(informed), (n, 1)),
-        prior_width=np.array([1.03, 1.03]),
     )
 
 

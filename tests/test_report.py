@@ -33,6 +33,10 @@ from tests.test_plots import (
 )
 
 Maker = Callable[..., Assessment]
+PER_PARAMETER = (
+    *("ess_bulk", "ess_tail", "r_hat", "informed", "laplace_shift", "laplace_ratio"),
+    *("prior_shift", "prior_ratio"),
+)
 DECISION = "[decision]\nmax_risk = 0.05\nnext_service = 2027-03-01\n"
 
 
@@ -278,11 +282,10 @@ def test_one_parameter_without_limit(make: Maker, tmp_path: Path) -> None:
     single = replace(
         health,
         parameters=health.parameters[:1],
-        samples=health.samples[..., :1],
-        ess=health.ess[:, :1],
-        r_hat=health.r_hat[:, :1],
-        informed=health.informed[:, :1],
+        chains=health.chains[..., :1],
         prior_width=health.prior_width[:1],
+        correlation=health.correlation[:, :1, :1],
+        **{name: getattr(health, name)[:, :1] for name in PER_PARAMETER},
     )
     text = words(one(tmp_path, replace(assessment, stage=stage, health=single, prognosis=None)))
     assert "sets no limit" in text

@@ -11,11 +11,12 @@ import pytest
 
 from lmshealth.history import Reading
 from lmshealth.logs import Metadata, Refusal
-from lmshealth.results import Health, Judgement, Line, Modes, Prognosis
+from lmshealth.results import Judgement, Line, Modes, Prognosis
 from lmshealth.stage import Stage, load_stage
 from lmshealth.summary import Assessment
 from lmshealth.tables import COLUMNS, all_tables, frame, modes_rows, track_rows
 from lmshealth.tracks import Effect, Event, History, Series, Smoothed, Track
+from tests.lives import health_of
 from tests.signals import write_archive_stage
 
 WHEN = datetime(2026, 3, 1, 8, tzinfo=UTC)
@@ -86,9 +87,9 @@ def assessment(stage: Stage, foretold: Prognosis | None) -> Assessment:
         np.full(2, 4.0), np.zeros((2, 4)), np.ones((2, 1)), np.ones(2),
     )  # fmt: skip
     draws = np.random.default_rng(1).normal(0.9, 0.01, (2, 500, 1))
-    health = Health(
-        "test-A", two, travel, ("guide_preload",), draws, np.full((2, 1), 400.0),
-        np.full((2, 1), 1.001), np.array([True, False]), np.full((2, 1), 0.9), np.array([1.0]),
+    health = health_of(
+        draws, recorded_at=two, travel=travel, parameters=("guide_preload",),
+        converged=np.array([True, False]), informed=np.full((2, 1), 0.9), stage="test-A",
     )  # fmt: skip
     verdict = Judgement("test-A", two[-1], "healthy", 0.8, "")
     return Assessment(stage, history, ("d", "e"), track, health, foretold, verdict, (), (), 0)

@@ -12,7 +12,7 @@ import numpy as np
 
 from lmshealth import life
 from lmshealth.arrays import FloatArray
-from lmshealth.inference import EpochPosterior, draw_prior
+from lmshealth.inference import EpochPosterior
 from lmshealth.life import LifeLikelihood
 from lmshealth.stage import Stage
 from lmshealth.tracks import History
@@ -84,7 +84,7 @@ def test_health_is_calibrated_and_is_not_without_its_map_error(
     stage = make_stage(tmp_path / "honest", n_modes=3)
     proud = make_stage(tmp_path / "proud", n_modes=3, model_std=0.0)
     cov = 4e-7 * (0.7 * np.eye(3) + 0.3)
-    truth = draw_prior(stage, rng, N_EPOCHS)
+    truth = stage.prior.draw(rng, N_EPOCHS)
     found, wrong = [], []
     for x in truth:
         drift = true_drift(NAMES, x)
@@ -92,7 +92,7 @@ def test_health_is_calibrated_and_is_not_without_its_map_error(
             alone = true_drift(NAMES, x * (np.arange(2) == j))
             drift = drift + 0.05 * rng.standard_normal(3) * alone
         drift = rng.multivariate_normal(drift, cov)
-        found.append(marginals(EpochPosterior(stage, MODES, drift, cov), x))
+        found.append(marginals(EpochPosterior.of(stage, MODES, drift, cov), x))
         wrong.append(marginals(EpochPosterior(proud, MODES, drift, cov), x))
     for j in range(2):
         check(np.array(found)[:, j], calibrated=True)

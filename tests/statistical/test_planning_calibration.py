@@ -14,7 +14,6 @@ import numpy as np
 import pytest
 
 from lmshealth.bounds import ambient_bound
-from lmshealth.inference import draw_prior
 from lmshealth.planning import plan
 from lmshealth.stage import Stage
 from tests.lives import DAMPING, FREQUENCY, SENSITIVITY, make_stage
@@ -28,7 +27,7 @@ def _called(rng: np.random.Generator, stage: Stage, loss: float, n_modes: int) -
     """Count tests that call a loss of the mount, from single logs."""
     slopes = np.column_stack([SENSITIVITY[p.name][:n_modes] for p in stage.parameters])
     noise = np.array([_variance(k) for k in range(n_modes)])
-    prior = draw_prior(stage, rng, 200_000)[:, 0]
+    prior = stage.prior.draw(rng, 200_000)[:, 0]
     x = np.column_stack([rng.normal(0.0, prior.std(), _N), np.full(_N, np.log1p(-loss))])
     before = rng.normal(size=(_N, _BASELINE, n_modes)).mean(axis=1)
     drifts = x @ slopes.T + np.sqrt(noise) * (rng.normal(size=(_N, n_modes)) - before)
