@@ -16,7 +16,7 @@ from lmshealth.tracks import History, Series, Step
 
 Array = NDArray[np.float64]
 START = datetime(2026, 3, 1, tzinfo=UTC)
-N_LOGS = 30
+N_LOGS = 60
 # Odometer now since the baseline in km: median, and standard deviation of its logarithm.
 NOW_KM = 2000.0, 0.7
 
