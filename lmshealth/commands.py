@@ -10,13 +10,14 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from lmshealth import terminal
-from lmshealth.errors import BadTable
+from lmshealth.errors import BadTable, NotEnoughData
 from lmshealth.options import STAGE, examples
 
 if TYPE_CHECKING:
     from lmshealth.logs import Refusal
+    from lmshealth.results import Health
     from lmshealth.tables import Row
-    from lmshealth.tracks import History, Smoothed, Track
+    from lmshealth.tracks import Drifts, History, Smoothed, Track
 
 _TABLE = click.Path(exists=True, dir_okay=False, path_type=Path)
 _TABLES = ("track", "track_cov", "effects", "events", "refused")
@@ -115,11 +116,133 @@ def _write(rows: dict[str, list[Row]], targets: dict[str, Path | None]) -> None:
     for name, target in targets.items():
         if target is None:
             continue
+        _write_text(target, frame(COLUMNS[name], rows[name]).to_csv(index=False))
+
+
+def _write_text(target: Path, text: str) -> None:
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        target.write_text(text)
+    except OSError as error:
+        raise BadTable(f"{target}: cannot be written: {error.strerror}") from error
+
+
+@click.command(
+    epilog=examples(
+        "infer result/track.csv --stage lms-y --out health.csv --posterior health.nc",
+        "infer y/track.csv --stage lms-y --with x/track.csv lms-x --shared guide_preload "
+        "--out health.csv",
+    )
+)
+@click.argument("table", metavar="TRACK.csv", type=_TABLE)
+@click.option("--stage", required=True, help="Stage description: a .toml file or a shipped name.")
+@click.option("--out", required=True, type=_OUT, help="Where the health goes.")
+@click.option("--cov", type=_TABLE, help="Cross terms; default track_cov.csv beside TRACK.csv.")
+@click.option("--posterior", type=_OUT, help="Where all draws go, as NetCDF that ArviZ reads.")
+@click.option(
+    "--with",
+    "others",
+    nargs=2,
+    multiple=True,
+    metavar="TRACK.csv STAGE",
+    help="Another machine that shares a part with the first; see --shared.",
+)
+@click.option(
+    "--shared", multiple=True, metavar="PARAMETER", help="What the machines have in common."
+)
+@click.option(
+    "--epochs",
+    type=click.IntRange(1),
+    default=40,
+    show_default=True,
+    help="Infer health at no more than this many epochs per machine.",
+)
+@click.option("--seed", type=click.IntRange(0), default=0, show_default=True)
+@click.pass_context
+def infer(ctx: click.Context, /, table: Path, **options: Any) -> None:
+    """Infer what is left of the health parameters, epoch by epoch, from a track.
+
+    Needed are the columns recorded_at, mode, drift and drift_std of a table in the form of
+    track.csv. With --with and --shared, machines that share a part, such as one guide in two
+    configurations, are inferred together at the epochs of the first.
+    """
+    from lmshealth.tables import COLUMNS, frame, health_rows
+
+    if bool(options["others"]) != bool(options["shared"]):
+        raise click.UsageError("--with and --shared need each other: which parameter is shared?")
+    found, lost = _inferred(table, options)
+    for health in found:
+        terminal.print_health(health)
+    for why in lost:
+        click.echo(f"lmshealth: {why}", err=True)
+    if not found:
+        ctx.exit(1)
+    rows = [row for health in found for row in health_rows(health)]
+    _write_text(options["out"], frame(COLUMNS["health"], rows).to_csv(index=False))
+    if options["posterior"]:
+        _write_posterior(options["posterior"], found)
+    ctx.exit(3 if lost else 0)
+
+
+def _inferred(table: Path, options: dict[str, Any]) -> tuple[list[Health], list[str]]:
+    """Infer all machines of a table; one that cannot be is told and left out."""
+    from lmshealth.inference import epochs_to_infer, infer_together
+    from lmshealth.inference import infer as infer_one
+    from lmshealth.sampling import seed_of
+    from lmshealth.stage import load_stage
+
+    stage = load_stage(options["stage"])
+    machines = _drifts(table, options["cov"])
+    if options["others"]:
+        together = [(_only(table, machines), stage)]
+        for path, reference in options["others"]:
+            own = _drifts(Path(path), None)
+            together.append((_only(Path(path), own), load_stage(reference)))
+        names = [f"{drifts.stage}\n{own.digest}" for drifts, own in together]
+        epochs = epochs_to_infer(*together[0], options["epochs"])
+        seed = seed_of(options["seed"], *names)
+        return [infer_together(together, options["shared"], seed, epochs=epochs)], []
+    found, lost = [], []
+    for drifts in machines:
+        seed = seed_of(options["seed"], drifts.stage, stage.digest)
         try:
-            target.parent.mkdir(parents=True, exist_ok=True)
-            target.write_text(frame(COLUMNS[name], rows[name]).to_csv(index=False))
-        except OSError as error:
-            raise BadTable(f"{target}: cannot be written: {error.strerror}") from error
+            epochs = epochs_to_infer(drifts, stage, options["epochs"])
+            found.append(infer_one(drifts, stage, seed, epochs=epochs))
+        except NotEnoughData as why:
+            lost.append(str(why))
+    return found, lost
 
 
-COMMANDS: Sequence[click.Command] = (track,)
+def _drifts(table: Path, cov: Path | None) -> tuple[Drifts, ...]:
+    from lmshealth.tracktable import read_drifts
+
+    beside = table.with_name("track_cov.csv")
+    read = read_drifts(table, cross_terms=cov or (beside if beside.exists() else None))
+    for note in read.notes:
+        click.echo(f"note: {table}: {note}", err=True)
+    return read.machines
+
+
+def _only(table: Path, machines: tuple[Drifts, ...]) -> Drifts:
+    if len(machines) > 1:
+        raise BadTable(
+            f"{table}: {len(machines)} machines ({', '.join(m.stage for m in machines)}); needed "
+            "is a table of the one that shares a part"
+        )
+    return machines[0]
+
+
+def _write_posterior(path: Path, found: Sequence[Health]) -> None:
+    """Write all draws: of one machine as ArviZ has it, of several under the name of each."""
+    from xarray import DataTree  # late: it takes a second to import
+
+    trees = {health.stage.replace("/", "_"): health.to_arviz() for health in found}
+    tree = next(iter(trees.values())) if len(trees) == 1 else DataTree.from_dict(trees)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        tree.to_netcdf(path, engine="h5netcdf")
+    except OSError as error:
+        raise BadTable(f"{path}: cannot be written: {error.strerror or error}") from error
+
+
+COMMANDS: Sequence[click.Command] = (track, infer)

@@ -17,28 +17,27 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lmshealth.arrays import FloatArray
+from lmshealth.arrays import BoolArray, FloatArray
 from lmshealth.errors import BadStage, NotConverged, NotEnoughData
 from lmshealth.laplace import approximate
 from lmshealth.priors import JointPrior, joined
 from lmshealth.results import Health
 from lmshealth.sampling import Sample, flattened, sample, start_from_prior, start_near, stream, thin
 from lmshealth.stage import Stage
-from lmshealth.tracks import Track
+from lmshealth.tracks import Drifts, Track
 
 _N_KEPT = 1000  # draws of each ensemble
 _N_SEARCHED, _PRIOR_POINTS = 200, 4096
-# How much wider the priors are made to see what hangs on them, and how many effective draws
-# reweighting must leave; with fewer the wider posterior is sampled itself.
-_WIDER, _LEAST_REWEIGHTED = 2.0, 1000
+# How much wider the priors are made to see what hangs on them, and what share of the draws must be
+# left of them by reweighting; with less, draws do not reach far enough and new ones are made.
+_WIDER, _LEAST_SHARE = 2.0, 0.8
 _LEVELS = (0.05, 0.5, 0.95)
 
 
-def epochs_to_infer(track: Track, stage: Stage, most: int) -> tuple[int, ...]:
+def epochs_to_infer(track: Drifts | Track, stage: Stage, most: int) -> tuple[int, ...]:
     """Choose at most so many epochs after the baseline, always with the last one."""
     columns = [track.modes.index(name) for name in stage.informative if name in track.modes]
-    variance = np.einsum("kii->ki", track.drift_cov)[:, columns]
-    usable = np.flatnonzero(np.all(np.isfinite(variance) & (variance > 0), axis=1))
+    usable = np.flatnonzero(_drifted(track)[:, columns].any(axis=1))
     if usable.size <= most:
         return tuple(usable.tolist())
     # Counted from the last, which a single epoch must be.
@@ -47,7 +46,7 @@ def epochs_to_infer(track: Track, stage: Stage, most: int) -> tuple[int, ...]:
 
 
 def infer(
-    track: Track,
+    track: Drifts | Track,
     stage: Stage,
     seed: int | Sequence[int],
     *,
@@ -58,7 +57,7 @@ def infer(
 
     Parameters
     ----------
-    track : Track
+    track : Drifts or Track
         Drifts with covariance.
     stage : Stage
         Parameters, priors and modal map.
@@ -83,7 +82,7 @@ def infer(
 
 
 def infer_together(
-    machines: Sequence[tuple[Track, Stage]],
+    machines: Sequence[tuple[Drifts | Track, Stage]],
     shared: Sequence[str],
     seed: int | Sequence[int],
     *,
@@ -98,7 +97,7 @@ def infer_together(
 
     Parameters
     ----------
-    machines : sequence of (Track, Stage)
+    machines : sequence of (Drifts or Track, Stage)
         At least two.
     shared : sequence of str
         Parameters that are one; the others are named ``<machine>:<parameter>``.
@@ -138,7 +137,7 @@ def infer_together(
 
 
 def _places(
-    machines: Sequence[tuple[Track, Stage]], shared: Sequence[str]
+    machines: Sequence[tuple[Drifts | Track, Stage]], shared: Sequence[str]
 ) -> tuple[tuple[str, ...], list[tuple[int, ...]]]:
     """Name all parameters, and say where those of each machine stand among them."""
     names: list[str] = []
@@ -154,14 +153,14 @@ def _places(
     return tuple(names), columns
 
 
-def _last_before(track: Track, stage: Stage, first: Track, k: int) -> int | None:
+def _last_before(track: Drifts | Track, stage: Stage, first: Drifts | Track, k: int) -> int | None:
     """Last usable epoch of a track not later than one of another track."""
-    usable = epochs_to_infer(track, stage, len(track.logs))
+    usable = epochs_to_infer(track, stage, len(track.recorded_at))
     before = [row for row in usable if track.recorded_at[row] <= first.recorded_at[k]]
     return before[-1] if before else None
 
 
-def _usable_modes(track: Track, stage: Stage) -> tuple[str, ...]:
+def _usable_modes(track: Drifts | Track, stage: Stage) -> tuple[str, ...]:
     if not stage.parameters:
         raise BadStage(f"{stage.name}: no [[parameter]] to infer")
     modes = tuple(name for name in stage.informative if name in track.modes)
@@ -172,17 +171,25 @@ def _usable_modes(track: Track, stage: Stage) -> tuple[str, ...]:
     return modes
 
 
-def _chosen(track: Track, stage: Stage, epochs: Sequence[int] | None) -> tuple[int, ...]:
+def _chosen(track: Drifts | Track, stage: Stage, epochs: Sequence[int] | None) -> tuple[int, ...]:
     chosen = tuple(epochs if epochs is not None else epochs_to_infer(track, stage, 40))
     if not chosen:
         raise NotEnoughData(f"{track.stage}: no epoch after the baseline")
     return chosen
 
 
+def _drifted(track: Drifts | Track) -> BoolArray:
+    """Tell which drifts are there and not those of the baseline, ``(n_epochs, n_modes)``."""
+    variance = np.einsum("kii->ki", track.drift_cov)
+    return np.asarray(np.isfinite(track.drift) & np.isfinite(variance) & (variance > 0))
+
+
 def _seen(
-    track: Track, modes: tuple[str, ...], k: int
+    track: Drifts | Track, modes: tuple[str, ...], k: int
 ) -> tuple[tuple[str, ...], FloatArray, FloatArray]:
-    """Modes, their drifts and covariance at an epoch."""
+    """Modes that are there at an epoch, their drifts and covariance."""
+    there = _drifted(track)[k]
+    modes = tuple(name for name in modes if there[track.modes.index(name)])
     columns = [track.modes.index(name) for name in modes]
     return modes, track.drift[k][columns], np.array(track.drift_cov[k][np.ix_(columns, columns)])
 
@@ -372,9 +379,7 @@ def _wider_quantiles(
     x, wider = found.flat, posterior.widened()
     log_weight = wider.prior.log_density(x) - posterior.prior.log_density(x)
     weight = np.exp(log_weight - log_weight.max())
-    if weight.sum() ** 2 / np.sum(weight**2) / x.shape[0] * found.ess_bulk.min() < (
-        _LEAST_REWEIGHTED
-    ):
+    if weight.sum() ** 2 / np.sum(weight**2) < _LEAST_SHARE * weight.size:
         return np.quantile(_draw(wider, seed)[0].flat, _LEVELS, axis=0)
     return np.column_stack(
         [np.quantile(column, _LEVELS, weights=weight, method="inverted_cdf") for column in x.T]
@@ -383,7 +388,7 @@ def _wider_quantiles(
 
 def _infer_all(
     name: str,
-    track: Track,
+    track: Drifts | Track,
     chosen: tuple[int, ...],
     tasks: Sequence[EpochPosterior],
     seed: int | Sequence[int],

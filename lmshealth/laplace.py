@@ -18,7 +18,7 @@ LogProbability = Callable[[FloatArray], FloatArray]
 
 # Steps of differences: first in units of the box, then of the standard deviation found with them,
 # where rounding (1e-15 over its square) and the fourth derivative both are negligible.
-_FIRST_STEP, _STEP = 1e-4, 0.05
+_FIRST_STEP, _STEP = 1e-4, 0.01
 _SEARCHES = 3
 
 

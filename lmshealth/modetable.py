@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from datetime import datetime
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -18,6 +17,7 @@ from lmshealth.history import Reading
 from lmshealth.logs import Metadata
 from lmshealth.readers import COVARIATES
 from lmshealth.results import Modes
+from lmshealth.rowfile import lines, read_rows, to_moments, to_numbers
 from lmshealth.stage import Stage
 
 _KM, _MICRO = 1000.0, 1e-6
@@ -34,7 +34,6 @@ _NUMBERS = (
 # What belongs to a log and not to one of its estimates.
 _OF_LOG = ("stage", "recorded_at", "travel_km", "servo_id", "delta_e_below_40hz_um", "baseline")
 _SHAPE = "shape_"
-_TOLD = 3
 # Relative standard deviations below drown in the rounding of variances.
 _FINEST = 1e-7
 _UNKNOWN_SOURCE = "unknown"
@@ -79,8 +78,7 @@ def read_estimates(
         If a table cannot be read, a column is missing, a value makes no sense, an estimate stands
         there twice, or rows of one log contradict each other.
     """
-    table = _read(path)
-    _demand(path, table, _NEEDED)
+    table = read_rows(path, _NEEDED)
     if table.empty:
         raise BadTable(f"{path}: no row; needed is at least one estimate")
     covariates = [*COVARIATES]
@@ -127,7 +125,7 @@ def _term_notes(table: pd.DataFrame, terms: pd.DataFrame | None) -> list[str]:
         if not used.all():
             notes.append(
                 f"{int((~used).sum())} of {used.size} cross terms are of estimates that the table "
-                f"does not have ({_where(terms, pd.Series(~used, terms.index))}); they are not used"
+                f"does not have ({lines(terms, pd.Series(~used, terms.index))}); they are not used"
             )
         told = set(terms["log"][used & (terms["source_a"] != terms["source_b"])])
     several = table.groupby("log")["source"].nunique() > 1
@@ -141,39 +139,10 @@ def _term_notes(table: pd.DataFrame, terms: pd.DataFrame | None) -> list[str]:
     return notes
 
 
-def _read(path: Path) -> pd.DataFrame:
-    try:
-        return pd.read_csv(path, dtype=str, keep_default_na=False)
-    except (OSError, ValueError) as error:
-        raise BadTable(f"{path}: cannot be read as a table: {error}") from error
-
-
-def _demand(path: Path, table: pd.DataFrame, needed: Sequence[str]) -> None:
-    """Refuse a table that lacks columns."""
-    missing = [name for name in needed if name not in table.columns]
-    if missing:
-        told = "; columns are parted by commas" if len(table.columns) == 1 else ""
-        raise BadTable(f"{path}: no column {missing}; there are {list(table.columns)}{told}")
-
-
-def _where(table: pd.DataFrame, wrong: pd.Series[bool]) -> str:
-    """Name the first lines of the file that are meant."""
-    lines = [str(int(i) + 2) for i in table.index[wrong]]
-    more = f" and {len(lines) - _TOLD} more" if len(lines) > _TOLD else ""
-    return f"line {', '.join(lines[:_TOLD])}{more}"
-
-
 def _tidy(path: Path, table: pd.DataFrame, covariates: list[str], notes: list[str]) -> None:
     """Turn text into numbers and moments, and fill in what may be missing, in place."""
     shapes = [name for name in table.columns if name.startswith(_SHAPE)]
-    for name in (*_NUMBERS, *covariates, *shapes):
-        if name not in table.columns:
-            continue
-        given = table[name].str.strip() != ""
-        table[name] = pd.to_numeric(table[name], errors="coerce")
-        wrong = given & ~np.isfinite(table[name])
-        if wrong.any():
-            raise BadTable(f"{path}, {_where(table, wrong)}: {name} is no finite number")
+    to_numbers(path, table, (*_NUMBERS, *covariates, *shapes))
     for name, fallback in (("mode", ""), ("source", _UNKNOWN_SOURCE), ("servo_id", "")):
         if name not in table.columns:
             table[name] = fallback
@@ -185,7 +154,7 @@ def _tidy(path: Path, table: pd.DataFrame, covariates: list[str], notes: list[st
     for name in _DAMPING:
         if name not in table.columns:
             table[name] = np.nan
-    table["recorded_at"] = [_moment(path, i, text) for i, text in table["recorded_at"].items()]
+    to_moments(path, table)
 
 
 def _drop_bad_damping(table: pd.DataFrame, notes: list[str]) -> None:
@@ -197,19 +166,8 @@ def _drop_bad_damping(table: pd.DataFrame, notes: list[str]) -> None:
         table.loc[bad, list(_DAMPING)] = np.nan
         notes.append(
             f"{int(bad.sum())} damping ratios without a positive value and standard deviation "
-            f"({_where(table, bad)}) are not used; the frequencies beside them are"
+            f"({lines(table, bad)}) are not used; the frequencies beside them are"
         )
-
-
-def _moment(path: Path, index: Any, text: str) -> datetime:
-    where = f"{path}, line {int(index) + 2}: recorded_at {text!r}"
-    try:
-        moment = datetime.fromisoformat(text)
-    except ValueError as error:
-        raise BadTable(f"{where} is no ISO date, such as 2026-03-01T06:00:00+00:00") from error
-    if moment.tzinfo is None:
-        raise BadTable(f"{where} needs a time zone, such as {text}+00:00")
-    return moment
 
 
 def _check(path: Path, table: pd.DataFrame, stage: Stage | None) -> None:
@@ -226,7 +184,7 @@ def _check(path: Path, table: pd.DataFrame, stage: Stage | None) -> None:
             got = table.loc[wrong, name].iloc[0]
             told = "missing" if np.isnan(got) else f"{got:g}"
             raise BadTable(
-                f"{path}, {_where(table, wrong)}: {name} is {told}; needed is {what}, a positive "
+                f"{path}, {lines(table, wrong)}: {name} is {told}; needed is {what}, a positive "
                 "number; leave rows out that have none"
             )
     named = table[table["mode"] != ""]
@@ -234,13 +192,13 @@ def _check(path: Path, table: pd.DataFrame, stage: Stage | None) -> None:
     if twice.any():
         first = named[twice].iloc[0]
         raise BadTable(
-            f"{path}, {_where(named, twice)}: {first['mode']} by {first['source']} stands there "
+            f"{path}, {lines(named, twice)}: {first['mode']} by {first['source']} stands there "
             f"twice for log {first['log']}; leave the column mode empty where names are not unique"
         )
     fine = table["frequency_std_hz"] < _FINEST * table["frequency_hz"]
     if fine.any():
         raise BadTable(
-            f"{path}, {_where(table, fine)}: frequency_std_hz is "
+            f"{path}, {lines(table, fine)}: frequency_std_hz is "
             f"{table.loc[fine, 'frequency_std_hz'].iloc[0]:g}, below {_FINEST:g} of the frequency; "
             "needed is one that a measurement can have, in Hz"
         )
@@ -255,12 +213,10 @@ def _check(path: Path, table: pd.DataFrame, stage: Stage | None) -> None:
 
 
 def _read_terms(path: Path) -> pd.DataFrame:
-    table = _read(path)
-    _demand(path, table, ("log", "source_a", "mode_a", "source_b", "mode_b", "cov_ln_f"))
-    table["cov_ln_f"] = pd.to_numeric(table["cov_ln_f"], errors="coerce")
-    wrong = ~np.isfinite(table["cov_ln_f"])
-    if wrong.any():
-        raise BadTable(f"{path}, {_where(table, wrong)}: cov_ln_f is no finite number")
+    table = read_rows(path, ("log", "source_a", "mode_a", "source_b", "mode_b", "cov_ln_f"))
+    to_numbers(path, table, ("cov_ln_f",))
+    if table["cov_ln_f"].isna().any():
+        raise BadTable(f"{path}, {lines(table, table['cov_ln_f'].isna())}: cov_ln_f is empty")
     return table
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import logging
 import multiprocessing
 import signal
@@ -24,6 +23,7 @@ from lmshealth.prognosis import prognose
 from lmshealth.readers import content_digest, find_logs, read_log, read_manifest, require_identity
 from lmshealth.report import write_report
 from lmshealth.results import Health, Prognosis
+from lmshealth.sampling import seed_of
 from lmshealth.stage import Stage
 from lmshealth.store import Store, beside, result_key
 from lmshealth.summary import Assessment, judge
@@ -363,8 +363,7 @@ def assess(
     notes = maintenance_notes(actions, [reading.metadata.recorded_at for reading in readings])
     notes += lost_notes(history, refused)
     partial = [refusal for reading in readings for refusal in reading.modes.refused]
-    own = int(hashlib.sha256(f"{history.stage}\n{stage.digest}".encode()).hexdigest()[:12], 16)
-    seed = (settings.seed, own)
+    seed = seed_of(settings.seed, history.stage, stage.digest)
     followed, health, prognosis = _results(history, stage, settings.epochs, seed, pool, notes)
     if followed is not None:
         refused += doubted(history, followed)

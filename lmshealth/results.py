@@ -284,7 +284,7 @@ class Health:
             {"posterior": posterior, "checks_data": checks},
             coords=coords,
             dims={name: ["epoch"] for name in (*posterior, *checks)},
-            attrs={"/": {"stage": self.stage, "seed": list(self.seed)}},
+            attrs={"/": {"stage": self.stage, "seed": " ".join(map(str, self.seed))}},
         )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -75,6 +76,12 @@ def thin(draws: FloatArray, n: int) -> FloatArray:
 def stream(seed: int | Sequence[int], *steps: int) -> np.random.SeedSequence:
     """Name a random stream by the user's seed, the input, and the step of the computation."""
     return np.random.SeedSequence([*np.atleast_1d(seed).tolist(), *steps])
+
+
+def seed_of(seed: int, *inputs: str) -> tuple[int, int]:
+    """Make the seed of a computation from the user's and from what goes in, by its hash."""
+    digest = hashlib.sha256("\n".join(inputs).encode()).hexdigest()
+    return seed, int(digest[:12], 16)
 
 
 def sample(log_probability: LogProbability, start: Start, seed: np.random.SeedSequence) -> Sample:

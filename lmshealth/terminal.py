@@ -7,6 +7,7 @@ import math
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from itertools import combinations
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
+from lmshealth.results import Health
 from lmshealth.tables import Row
 from lmshealth.tracks import Track
 from lmshealth.wording import change
@@ -95,6 +97,40 @@ def print_track(track: Track) -> None:
         cells = [(*row[:3], row[5], *row[3:5]) for row in happened]
         _print("What happened", ("since", "kind", "mode", ""), numbers, cells)
     click.echo(_consistent(track))
+
+
+def print_health(health: Health) -> None:
+    """Print what is left of each parameter at the last epoch, and on what that rests."""
+    low, middle, high = health.quantile(np.array([0.05, 0.5, 0.95]))[:, -1]
+    cells = [
+        (
+            name,
+            f"{middle[j]:.3f}",
+            f"{low[j]:.3f} to {high[j]:.3f}",
+            f"{100 * health.informed[-1, j]:.0f}",
+            f"{health.prior_shift[-1, j]:+.2f} σ, × {health.prior_ratio[-1, j]:.2f}",
+            f"{health.ess[-1, j]:.0f}",
+            f"{health.r_hat[-1, j]:.4f}",
+        )
+        for j, name in enumerate(health.parameters)
+    ]
+    numbers = ("median", "90 % interval", "data %", "prior × 2", "ESS", "R-hat")
+    title = (
+        f"{health.stage}: health at {health.recorded_at[-1]:%Y-%m-%d}, the last of "
+        f"{len(health.recorded_at)} epochs"
+    )
+    _print(title, ("parameter",), numbers, cells)
+    click.echo(
+        "data: share of the prior's variance that they removed; prior × 2: how far the median "
+        "moves, and how much wider the interval gets, with priors twice as wide."
+    )
+    for j, k in combinations(range(len(health.parameters)), 2):
+        rho = health.correlation[-1, j, k]
+        click.echo(f"Correlation of {health.parameters[j]} and {health.parameters[k]}: {rho:+.2f}.")
+    for name in np.array(health.parameters)[~health.told()]:
+        click.echo(f"{name}: these drifts do not tell it; this is its prior.")
+    for when in np.flatnonzero(~health.converged):
+        click.echo(f"The sampler did not converge at {health.recorded_at[when]:%Y-%m-%d}.")
 
 
 def _consistent(track: Track) -> str:

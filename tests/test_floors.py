@@ -24,6 +24,7 @@ FLOORS = [
         "components",
         "maintenance",
         "wording",
+        "rowfile",
         "filterbank",
     },
     {
@@ -35,6 +36,7 @@ FLOORS = [
         "rational",
         "noise",
         "hypotheses",
+        "tracktable",
         "estimates",
     },
     {

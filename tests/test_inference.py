@@ -2,16 +2,28 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from datetime import timedelta
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
+import xarray
+from arviz_stats.base.array import array_stats
 from scipy import stats
 
 from lmshealth import inference
 from lmshealth.arrays import FloatArray
 from lmshealth.errors import BadStage, NotConverged, NotEnoughData
-from lmshealth.inference import EpochPosterior, epochs_to_infer, infer, one_at_a_time
+from lmshealth.inference import (
+    EpochPosterior,
+    epochs_to_infer,
+    infer,
+    infer_together,
+    one_at_a_time,
+)
+from lmshealth.priors import Uniform
 from lmshealth.results import Health
 from lmshealth.sampling import Sample
 from lmshealth.stage import Stage
@@ -21,6 +33,7 @@ from tests.lives import (
     AXES,
     FOOT,
     FREQUENCY,
+    MOUNT,
     PRELOAD,
     make_history,
     make_stage,
@@ -129,8 +142,9 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     """Put draws of the seed alone in the place of the sampler, to see which seeds it is given."""
 
     def fake(_: object, __: object, seed: np.random.SeedSequence) -> Sample:
-        draws = 0.1 * np.random.default_rng(seed).standard_normal((500, 2))
-        return Sample(draws=draws, ess=np.full(2, 500.0), r_hat=np.ones(2))
+        draws = 0.1 * np.random.default_rng(seed).standard_normal((4, 1000, 2))
+        full = np.full(2, 4000.0)
+        return Sample(draws, full, full, r_hat=np.ones(2), autocorrelation_time=np.ones(2))
 
     monkeypatch.setattr(inference, "sample", fake)
 
@@ -309,3 +323,158 @@ def test_a_track_of_the_baseline_alone_is_refused(stage: Stage) -> None:
     """Nothing after the baseline is not enough."""
     with pytest.raises(NotEnoughData, match="no epoch after the baseline"):
         infer(epochs([]), stage, 1)
+
+
+def test_laplace_stands_beside_the_sampler(
+    tmp_path: Path, stage: Stage, worn: Track, health: Health
+) -> None:
+    """Both agree where the posterior is all but normal; where it is not, by how much is told."""
+    sure = infer(worn, make_stage(tmp_path, model_std=0.0), 5, epochs=[2])
+    assert (np.abs(sure.laplace_shift) < 0.06).all()
+    assert (np.abs(sure.laplace_ratio - 1) < 0.04).all()
+    # The error of the map grows with the loss and bends the posterior.
+    assert (np.abs(health.laplace_ratio[1] - 1) > 0.05).all()
+    # A prior that ends inside the posterior: no normal distribution is like it, and it is said.
+    cut = make_stage_with(stage, low=0.76)
+    found = infer(worn, cut, 5, epochs=[2])
+    assert np.isnan(found.laplace_shift).all()
+    assert np.isnan(found.laplace_ratio).all()
+    assert found.converged.all()
+    assert found.samples[..., 0].min() > 0.76
+
+
+def make_stage_with(stage: Stage, low: float) -> Stage:
+    """Give the stage with a uniform prior of the preload from low upwards."""
+    preload, mount = stage.parameters
+    bounded = msgspec.structs.replace(preload, prior=Uniform(low, 1.2))
+    description = msgspec.structs.replace(stage.description, parameter=(bounded, mount))
+    return Stage(description, stage.modal_map, stage.digest)
+
+
+def test_what_the_prior_does_is_told(tmp_path: Path, worn: Track, health: Health) -> None:
+    """Priors twice as wide hardly move what the data tell, and widen by twice what they do not."""
+    assert (np.abs(health.prior_shift) < 0.2).all()
+    assert (np.abs(health.prior_ratio - 1) < 0.05).all()
+    blind = infer(worn, make_stage(tmp_path, (PRELOAD, MOUNT, FOOT)), 6, epochs=[2])
+    ratio = blind.prior_ratio[0, 2]
+    # The foot has no sensitivity; its doubled prior is cut a little at the map.
+    assert 1.85 < ratio < 2.05
+    assert abs(blind.prior_shift[0, 2]) < 0.1
+    assert blind.informed[0, 2] < 0.05
+
+
+def test_reweighting_and_sampling_agree(stage: Stage, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The wider posterior is the same by weights on the draws and by chains of its own.
+
+    Where weights would be far from even, chains are taken: what weights would say is too narrow.
+    """
+    cov = 60 * COV
+    track = epochs([true_drift(NAMES, TRUTH)[:2]], cov)
+    monkeypatch.setattr(inference, "_LEAST_SHARE", 0.0)
+    weighted = infer(track, stage, 9)
+    monkeypatch.setattr(inference, "_LEAST_SHARE", 1.1)
+    sampled = infer(track, stage, 9)
+    assert (weighted.prior_ratio > 1.05).any()
+    np.testing.assert_array_equal(weighted.samples, sampled.samples)
+    np.testing.assert_allclose(weighted.prior_ratio, sampled.prior_ratio, rtol=0.06)
+    np.testing.assert_allclose(weighted.prior_shift, sampled.prior_shift, atol=0.08)
+
+
+def test_correlation_is_that_of_the_draws(health: Health) -> None:
+    """Preload and mount trade off, and by how much is told."""
+    for k in range(2):
+        known = np.corrcoef(np.log(health.samples[k]).T)
+        np.testing.assert_allclose(health.correlation[k], known, atol=1e-12)
+    assert (health.correlation[:, 0, 1] < -0.5).all()
+
+
+def test_a_mode_that_is_missing_at_an_epoch_is_done_without(stage: Stage) -> None:
+    """An epoch with one of two modes is inferred from that one; one without any is no epoch."""
+    drift = np.vstack([np.zeros(2), np.tile(true_drift(NAMES, TRUTH)[:2], (3, 1))])
+    cov = np.stack([np.zeros((2, 2)), COV, COV, COV])
+    drift[2, 1], cov[2, 1], cov[2, :, 1] = np.nan, np.nan, np.nan
+    drift[3], cov[3] = np.nan, np.nan
+    track = make_track(drift, cov)
+    assert epochs_to_infer(track, stage, 10) == (1, 2)
+    found = infer(track, stage, 3)
+    assert (found.informed[1] < found.informed[0]).all()
+    assert found.converged.all()
+
+
+def two_machines(stage: Stage, offset: timedelta) -> list[tuple[Track, Stage]]:
+    """Two machines of one description and one preload, whose mounts differ; one logs later."""
+    machines = []
+    for k, mount in enumerate((np.log(0.9), np.log(0.7))):
+        x = np.array([TRUTH[0], mount])
+        track = epochs([true_drift(NAMES, share * x)[:2] for share in (0.5, 1.0)], 100 * COV)
+        moments = tuple(moment + k * offset for moment in track.recorded_at)
+        machines.append((replace(track, stage=f"AX-{k}", recorded_at=moments), stage))
+    return machines
+
+
+def test_a_shared_guide_is_known_better(stage: Stage) -> None:
+    """Two machines on one guide tell its preload better than either; their mounts stay their own.
+
+    The posterior is that of a grid over all three parameters.
+    """
+    machines = two_machines(stage, timedelta(0))
+    alone = [infer(*machine, 4, epochs=[2]) for machine in machines]
+    both = infer_together(machines, ["guide_preload"], 4, epochs=[2])
+    assert both.parameters == ("guide_preload", "AX-0:mount_stiffness", "AX-1:mount_stiffness")
+    assert both.stage == "AX-0 + AX-1"
+    assert both.converged.all()
+    std = np.log(both.samples[0]).std(axis=0)
+    assert all(std[0] < np.log(one.samples[0, :, 0]).std() for one in alone)
+    axis = np.linspace(-0.9, 0.35, 120)
+    grid = np.stack(np.meshgrid(axis, axis, indexing="ij"), -1).reshape(-1, 2)
+    marginal = np.zeros(axis.size)
+    for shown, own in machines:
+        view = EpochPosterior.of(own, ("roll", "pitch"), shown.drift[2], shown.drift_cov[2])
+        value = view.views[0].log_likelihood(grid).reshape(120, 120) - 0.5 * (axis / 0.3) ** 2
+        marginal += np.logaddexp.reduce(value, axis=1)
+    marginal += -0.5 * (axis / 0.3) ** 2
+    density = np.exp(marginal - marginal.max())
+    known = np.interp([0.05, 0.5, 0.95], np.cumsum(density) / density.sum(), axis)
+    found = np.log(both.quantile(np.array([0.05, 0.5, 0.95]))[:, 0, 0])
+    np.testing.assert_allclose(found, known, atol=0.012)
+
+
+def test_epochs_of_the_first_meet_the_last_of_the_others(stage: Stage) -> None:
+    """An epoch takes what the other machine showed last; where that is nothing yet, it is none."""
+    later = two_machines(stage, timedelta(days=7))
+    found = infer_together(later, ["guide_preload"], 4)
+    assert found.recorded_at == (later[0][0].recorded_at[2],)
+    too_late = two_machines(stage, timedelta(days=70))
+    with pytest.raises(NotEnoughData, match="AX-1 one before"):
+        infer_together(too_late, ["guide_preload"], 4)
+
+
+def test_what_is_not_there_cannot_be_shared(stage: Stage) -> None:
+    """A shared parameter that a description lacks is refused with those that it has."""
+    with pytest.raises(BadStage, match=r"no parameter \['belt'\] to share; there are"):
+        infer_together(two_machines(stage, timedelta(0)), ["belt"], 4)
+
+
+def test_health_is_a_table(health: Health) -> None:
+    """One row per epoch and parameter, with quantiles, checks and correlations."""
+    table = health.to_frame()
+    assert len(table) == 4
+    last = table.iloc[-1]
+    assert last["parameter"] == "mount_stiffness"
+    assert last["q05"] < last["median"] < last["q95"]
+    assert last["correlation_mount_stiffness"] == 1
+    assert last["correlation_guide_preload"] == health.correlation[1, 1, 0]
+    assert last["ess"] == min(last["ess_bulk"], last["ess_tail"])
+    assert table["converged"].all()
+
+
+def test_health_goes_to_arviz_and_back(health: Health, tmp_path: Path) -> None:
+    """NetCDF keeps draws by ensemble and epoch, and arviz finds its R-hat in them."""
+    health.to_arviz().to_netcdf(tmp_path / "health.nc", engine="h5netcdf")
+    tree = xarray.open_datatree(tmp_path / "health.nc", engine="h5netcdf")
+    draws = tree["posterior/guide_preload"]
+    assert draws.dims == ("chain", "draw", "epoch")
+    np.testing.assert_array_equal(draws.to_numpy(), np.moveaxis(health.chains[..., 0], 0, 2))
+    np.testing.assert_array_equal(tree["checks_data/r_hat_guide_preload"], health.r_hat[:, 0])
+    assert tree.attrs["seed"] == "5"
+    assert float(array_stats.rhat(draws.to_numpy()[..., 1])) < 1.02

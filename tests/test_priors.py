@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from lmshealth.priors import Lognormal, Normal, Prior, Uniform
+from lmshealth.errors import BadStage
+from lmshealth.priors import JointPrior, Lognormal, Normal, Prior, Uniform, joined
 
 PAIRS = [
     (Lognormal(2.0, 0.4), stats.lognorm(0.4, scale=2.0)),
@@ -44,3 +45,72 @@ def test_an_impossible_prior_is_refused(kind: type, arguments: tuple[float, floa
     """Widths of 0 and medians of 0 are no distributions."""
     with pytest.raises(ValueError, match="needs"):
         kind(*arguments)
+
+
+@pytest.mark.parametrize(("prior", "book"), PAIRS)
+def test_probabilities_are_those_of_scipy(prior: Prior, book: object) -> None:
+    """Distribution functions are those of the textbook, far tails and impossible values too."""
+    x = np.array([-1.0, 0.0, 1e-3, 0.6, 1.9, 2.4, 40.0])
+    np.testing.assert_allclose(prior.probability(x), book.cdf(x), atol=1e-14)
+
+
+@pytest.mark.parametrize(("prior", "book"), PAIRS)
+def test_a_widened_prior_keeps_its_middle(prior: Prior, book: object) -> None:
+    """Twice as wide means twice the distance of quantiles, in the logarithm of a lognormal."""
+    level = np.array([0.05, 0.5, 0.95])
+    one, two = prior.quantile(level), prior.widened(2.0).quantile(level)
+    if isinstance(prior, Lognormal):
+        one, two = np.log(one), np.log(two)
+    np.testing.assert_allclose(two[1], one[1])
+    np.testing.assert_allclose(two[2] - two[0], 2 * (one[2] - one[0]))
+
+
+@pytest.fixture
+def joint() -> JointPrior:
+    """One prior of each kind over a box that cuts the first two."""
+    low, high = np.log([1.0, 0.5, 0.4]), np.log([3.0, 4.0, 3.0])
+    return JointPrior(("a", "b", "c"), tuple(prior for prior, _ in PAIRS), low, high)
+
+
+def test_a_joint_prior_is_cut_to_its_box(joint: JointPrior) -> None:
+    """Draws have the truncated distribution, and quantiles of 0 and 1 are the ends of it."""
+    x = np.exp(joint.draw(np.random.default_rng(3), 20_000))
+    for j, (_, book) in enumerate(PAIRS):
+        below, upto = book.cdf(np.exp([joint.low[j], joint.high[j]]))
+
+        def cut(
+            values: np.ndarray, book: object = book, a: float = below, b: float = upto
+        ) -> object:
+            return np.clip((book.cdf(values) - a) / (b - a), 0, 1)
+
+        assert stats.kstest(x[:, j], cut).pvalue > 1e-4
+        assert stats.kstest(1.02 * x[:, j], cut).pvalue < 1e-4  # negative control
+    low, high = joint.support
+    np.testing.assert_allclose(np.exp(low), [1.0, 0.5, 0.5])
+    np.testing.assert_allclose(np.exp(high), [3.0, 4.0, 2.5])
+
+
+def test_a_joint_density_is_that_of_the_logarithms(joint: JointPrior) -> None:
+    """Differences are those of the textbook densities with the Jacobian; outside it is zero."""
+    x = np.log([[1.5, 1.0, 0.6], [2.5, 3.9, 2.4], [0.9, 1.0, 0.6], [1.5, 1.0, 2.6]])
+    found = joint.log_density(x)
+    known = sum(b.logpdf(np.exp(x[:2, j])) + x[:2, j] for j, (_, b) in enumerate(PAIRS))
+    np.testing.assert_allclose(np.diff(found[:2]), np.diff(known))
+    assert np.isneginf(found[2:]).all()
+
+
+def test_shared_parameters_stand_once(joint: JointPrior) -> None:
+    """What two machines share has the box that both allow; their own parameters stay apart."""
+    other = JointPrior(("b", "d"), (PAIRS[1][0], Lognormal(1.0, 0.2)), *np.log([[1, 0.5], [9, 2]]))
+    both = joined([joint, other], [(0, 1, 2), (1, 3)])
+    assert both.names == ("a", "b", "c", "d")
+    np.testing.assert_allclose(np.exp(both.low), [1.0, 1.0, 0.4, 0.5])
+    np.testing.assert_allclose(np.exp(both.high), [3.0, 4.0, 3.0, 2.0])
+    assert both.priors[3] == Lognormal(1.0, 0.2)
+
+
+def test_shared_parameters_need_one_prior(joint: JointPrior) -> None:
+    """One parameter with two priors is refused with both."""
+    other = JointPrior(("b",), (Lognormal(1.0, 0.2),), *np.log([[0.5], [2.0]]))
+    with pytest.raises(BadStage, match=r"b is to be one parameter.*std=3.*sigma=0\.2"):
+        joined([joint, other], [(0, 1, 2), (1,)])

@@ -59,10 +59,6 @@ def test_a_sample_carries_its_evidence(drawn: Sample) -> None:
     for ess in (drawn.ess_bulk, drawn.ess_tail):
         assert (ess < drawn.flat.shape[0]).all()
         assert (ess > 1000).all()
-    # The same by emcee's autocorrelation time, which is another estimator.
-    np.testing.assert_allclose(
-        drawn.ess_bulk, drawn.flat.shape[0] / drawn.autocorrelation_time, rtol=0.35
-    )
     assert (drawn.r_hat < 1.01).all()
 
 
@@ -104,11 +100,11 @@ def test_ensembles_of_one_process_differ(drawn: Sample) -> None:
 
 def test_sample_sizes_are_honest() -> None:
     """Means of independent samples scatter by as much as their effective sample size says."""
-    found = [sample(gaussian, begin, stream(7, 20 + k)) for k in range(20)]
+    found = [sample(gaussian, begin, stream(7, 20 + k)) for k in range(12)]
     means = np.array([one.flat.mean(axis=0) for one in found])
     ess = np.mean([one.ess_bulk for one in found], axis=0)
     ratio = np.var(means, axis=0, ddof=1) / (np.diag(COV) / ess)
-    low, high = stats.chi2.ppf([5e-4, 1 - 5e-4], 19) / 19
+    low, high = stats.chi2.ppf([5e-4, 1 - 5e-4], 11) / 11
     assert ((low < ratio) & (ratio < high)).all(), ratio
     # Negative control: draws counted as independent ones.
     assert (ratio * found[0].flat.shape[0] / ess > high).all()
