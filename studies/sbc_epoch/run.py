@@ -98,9 +98,7 @@ def one(kind: str, life: int) -> Row:
     found = infer(told, believed, [SEED, part, life], epochs=drawn.epochs)
     truth = np.exp(drawn.truth)
     return {
-        "rank": [
-            rank(truth[k], thinned(found.samples[k]), rng) for k in range(len(drawn.epochs))
-        ],
+        "rank": [rank(truth[k], thinned(found.samples[k]), rng) for k in range(len(drawn.epochs))],
         "informed": found.informed[-1].round(4).tolist(),
         "converged": bool(found.converged.all()),
     }

@@ -53,7 +53,9 @@ def draw(rng: np.random.Generator, machine: Stage) -> Life:
     values = level[:, mode] + _offsets(rng, series, mode, steps)
     cov = _covariance(rng, mode)
     scale = rng.choice(model._NOISE_SCALES, p=model._NOISE_SCALE_PRIOR)
-    values += scale * (np.linalg.cholesky(cov) @ rng.standard_normal((N_LOGS, mode.size, 1)))[..., 0]
+    values += (
+        scale * (np.linalg.cholesky(cov) @ rng.standard_normal((N_LOGS, mode.size, 1)))[..., 0]
+    )
     return Life(_history(rng, machine, travel, covariates, series, steps, values, cov), theta)
 
 
@@ -89,7 +91,9 @@ def _path(machine: Stage, clock: Array, theta: tuple[Array, ...]) -> Array:
     return np.column_stack([p.baseline * p.law.health(t[None], clock)[0] for p, t in pairs])
 
 
-def _modes(rng: np.random.Generator, machine: Stage, clock: Array, theta: tuple[Array, ...]) -> Array:
+def _modes(
+    rng: np.random.Generator, machine: Stage, clock: Array, theta: tuple[Array, ...]
+) -> Array:
     """Ln f of the modes: wear through a map that is wrong, an intercept, and a random walk."""
     assert machine.description.map is not None
     names, x = machine.informative, np.log(_path(machine, clock, theta))
