@@ -26,10 +26,11 @@ class Life:
     truth: Array
 
 
-def believing(machine: Stage, model_std: float) -> Stage:
-    """Give the same stage with another error of its map."""
+def believing(machine: Stage, share: float) -> Stage:
+    """Give the same stage with a share of the error of its map."""
     assert machine.description.map is not None
-    spec = msgspec.structs.replace(machine.description.map, model_std=model_std)
+    less = share * machine.description.map.model_std
+    spec = msgspec.structs.replace(machine.description.map, model_std=less)
     return replace(machine, description=msgspec.structs.replace(machine.description, map=spec))
 
 
