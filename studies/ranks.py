@@ -41,6 +41,9 @@ _PACKAGE = Path(__file__).parents[1] / "lmshealth"
 _POINTS = np.arange(1, 64) / 64
 _SIMULATIONS = 20_000
 BLUE, ORANGE, BLACK = "#0072b2", "#d55e00", "#000000"
+# Told apart by colour-blind eyes, and in pairs by the dash.
+COLOURS = (BLUE, "#56b4e9", ORANGE, "#e69f00", "#009e73", "#cc79a7", BLACK, "#999999", "#b8a000")
+_DASHES = ("-", "--")
 
 
 def thinned(draws: Array) -> Array:
@@ -175,12 +178,13 @@ def draw_ecdf(
     for n in {str(row["n"]) for row in rows.values()}:
         low, high = (np.r_[0, bands_of[n][side], 0] for side in ("low", "high"))
         ax.fill_between(grid, low, high, color=BLACK, alpha=0.12, lw=0)
-    for (name, row), colour in zip(rows.items(), colours, strict=False):
-        ax.plot(grid, np.r_[0, row["ecdf_difference"], 0], lw=1.2, color=colour, label=name)
+    for i, ((name, row), colour) in enumerate(zip(rows.items(), colours, strict=False)):
+        off = np.r_[0, row["ecdf_difference"], 0]
+        ax.plot(grid, off, _DASHES[i % 2], lw=1.2, color=colour, label=name)
     ax.axhline(0.0, color=BLACK, lw=0.6)
     ax.set_xlim(0, 1)
     ax.set_title(title, fontsize=9)
     ax.set_xlabel("rank of the truth (share of draws below)", fontsize=8)
     ax.set_ylabel("distribution minus uniform", fontsize=8)
     ax.tick_params(labelsize=7)
-    ax.legend(fontsize=7)
+    ax.legend(fontsize=6, loc="lower center", bbox_to_anchor=(0.5, -0.02), framealpha=0.6)
