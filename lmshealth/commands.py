@@ -245,4 +245,30 @@ def _write_posterior(path: Path, found: Sequence[Health]) -> None:
         raise BadTable(f"{path}: cannot be written: {error.strerror or error}") from error
 
 
-COMMANDS: Sequence[click.Command] = (track, infer)
+@click.command(epilog=examples("stage lms-y", "stage my-stage.toml --format json"))
+@click.argument("reference", metavar="STAGE")
+@click.option(
+    "--format", "style", type=click.Choice(["table", "json"]), default="table", show_default=True
+)
+def stage(reference: str, style: str) -> None:
+    """Check a stage description, and say what its modes can tell.
+
+    STAGE is a .toml file or a shipped name. A slip is told with its line and key. Else: how far the
+    modal map reaches, how good its surrogate is, what the parameters do to the modes, and which of
+    them logs can tell, at best (the Cramér-Rao bound of vibration at constant velocity).
+    """
+    from lmshealth.examination import examine
+    from lmshealth.findings import findings
+    from lmshealth.looks import stage_rows
+    from lmshealth.stage import load_stage
+    from lmshealth.stageview import print_stage
+
+    examined = examine(load_stage(reference))
+    content = stage_rows(examined, findings(examined))
+    if style == "json":
+        terminal.print_json(content)
+    else:
+        print_stage(content)
+
+
+COMMANDS: Sequence[click.Command] = (track, infer, stage)

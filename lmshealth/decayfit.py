@@ -20,6 +20,9 @@ _FIRST_LEVEL, _LEAST_LEVEL, _UNLIKELY = 0.5, 0.1, 6.0
 # Largest step of their logarithm, and the step in standard deviations of a level that is known: a
 # sum over a normal density in such steps is exact to 1e-5.
 _COARSE, _SPREADS = 0.6, 1.3
+# Longest steps, of half a Fourier frequency, that a mode may move by when its ambient response is
+# raised.
+_STAYS = 2.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -151,6 +154,12 @@ def average_ambient(
     start[place] = max(abs(p[place]), _FIRST_LEVEL)
     weight, levels = _levels(likelihood, start, place, free, _COARSE)
     best = levels[int(np.argmax(weight))]
+    if abs(best.p[mode] - p[mode]) > _STAYS * likelihood.reach(p)[mode]:
+        # An ambient response far above a clean decay's noise drives the mode out of its place, and
+        # another pole takes it: the response is raised from the least one on.
+        start[place] = max(abs(p[place]), _LEAST_LEVEL * (1 + _STEP_TOLERANCE))
+        weight, levels = _levels(likelihood, start, place, free, _COARSE)
+        best = levels[int(np.argmax(weight))]
     metric = likelihood.metric(best.at)
     spread = float(np.sqrt(np.linalg.inv(metric)[place, place])) / best.p[place]
     if _SPREADS * spread < _COARSE:

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import astuple
+from dataclasses import asdict, astuple
+from itertools import combinations
 
 import numpy as np
 
 from lmshealth.arrays import FloatArray
+from lmshealth.examination import USUAL_DURATION, Coverage, Examination, ModeCheck, Telling
+from lmshealth.findings import Finding
 from lmshealth.following import FollowingError
 from lmshealth.frf import FrfReading
 from lmshealth.magnitudes import Growth, Magnitude
@@ -191,6 +194,81 @@ def plan_rows(plans: Sequence[Plan]) -> dict[str, list[Row]]:
     return {
         name: [dict(zip(LOOKS[name].split(), row, strict=True)) for row in rows]
         for name, rows in (("detect", asked), ("plan", efforts))
+    }
+
+
+def stage_rows(examined: Examination, found: Sequence[Finding]) -> dict[str, list[Row]]:
+    """List what an examination of a stage description measured, and what it comes to."""
+    names = [telling.parameter for telling in examined.tellings]
+    return {
+        "stage": [
+            {
+                "name": examined.name,
+                "model_std": examined.model_std,
+                "n_logs": examined.n_logs,
+                "seconds_per_log": USUAL_DURATION,
+            }
+        ],
+        "modes": [_mode_row(check) for check in examined.modes],
+        "parameters": [
+            _parameter_row(coverage, telling)
+            for coverage, telling in zip(examined.coverage, examined.tellings, strict=True)
+        ],
+        "sensitivities": [
+            {
+                "mode": mode,
+                "parameter": name,
+                "at_baseline": float(examined.slopes[i, j]),
+                "at_limits": float(examined.limit_slopes[i, j]),
+            }
+            for i, mode in enumerate(examined.informative)
+            for j, name in enumerate(names)
+        ],
+        "correlations": [
+            {"parameter_a": names[i], "parameter_b": names[j], "correlation": float(value)}
+            for i, j in combinations(range(len(names)), 2)
+            for value in [examined.correlation[i, j]]
+        ],
+        "findings": [asdict(finding) for finding in found],
+    }
+
+
+def _mode_row(check: ModeCheck) -> Row:
+    low, high = check.searched
+    return {
+        "mode": check.mode.name,
+        "frequency_hz": check.mode.frequency_hz,
+        "searched_low_hz": low,
+        "searched_high_hz": high,
+        "tracked": check.mode.tracked,
+        "informs": check.informs,
+        "map_hz": check.map_frequency,
+        "map_at_limits_hz": check.limit_frequency,
+        "surrogate_error_ln_f": check.surrogate_error,
+        "logs_reach_ln_f": check.reached,
+    }
+
+
+def _parameter_row(coverage: Coverage, telling: Telling) -> Row:
+    spec = coverage.parameter
+    levels = ("q005", "q05", "q95", "q995")
+    return {
+        "parameter": spec.name,
+        "baseline": spec.baseline,
+        "limit": spec.limit.below if spec.limit else None,
+        "limit_on_map": coverage.holds_limit if spec.limit else None,
+        "map_low": coverage.low,
+        "map_high": coverage.high,
+        **{f"prior_{key}": value for key, value in zip(levels, coverage.prior, strict=True)},
+        "prior_below_map": coverage.below,
+        "prior_above_map": coverage.above,
+        "prior_std_ln": telling.prior_std,
+        "logs_std_ln": telling.usual_std,
+        "endless_logs_std_ln": telling.endless_std,
+        "exact_map_std_ln": telling.exact_map_std,
+        "others_known_std_ln": telling.known_std,
+        "informed": telling.informed(telling.usual_std),
+        "verdict": telling.verdict,
     }
 
 

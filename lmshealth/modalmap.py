@@ -18,7 +18,6 @@ from lmshealth.errors import BadStage, OutsideMap
 
 _MAX_DEGREE = 14
 _NEGLIGIBLE = 1e-6  # error of ln frequency that no measurement comes near
-_FOLDS = 5
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -34,7 +33,8 @@ class ModalMap:
     coefficients : ndarray
         Tensor Chebyshev coefficients, shape ``(d_1 + 1, ..., d_P + 1, n_modes)``.
     leave_out_error : ndarray
-        Largest error of ln frequency at grid points left out of the fit, ``(n_modes,)``.
+        Largest error of ln frequency at inner grid points, each left out of the fit,
+        ``(n_modes,)``.
     """
 
     parameters: tuple[str, ...]
@@ -134,9 +134,11 @@ def read_map(path: str, parameters: tuple[str, ...]) -> ModalMap:
         If columns are missing, values are not positive, or the grid is not full.
     """
     try:
-        table = pd.read_csv(path)
+        # Blank lines count, so that a row is told by its line.
+        table = pd.read_csv(path, skip_blank_lines=False).dropna(how="all")
     except (OSError, ValueError) as error:
-        raise BadStage(f"{path}: cannot read the modal map: {error}") from error
+        why = getattr(error, "strerror", None) or error
+        raise BadStage(f"{path}: cannot read the modal map: {why}") from error
     missing = {*parameters, "mode", "frequency_hz"} - set(table.columns)
     if missing:
         raise BadStage(f"{path}: no column {sorted(missing)}; there are {list(table.columns)}")
@@ -146,21 +148,32 @@ def read_map(path: str, parameters: tuple[str, ...]) -> ModalMap:
             f"{path}: columns {sorted(extra)} are no parameter of the stage description; "
             "describe them as [[parameter]] or make the map without them"
         )
-    try:
-        numbers = table[[*parameters, "frequency_hz"]].to_numpy(dtype=float)
-    except ValueError as error:
-        raise BadStage(f"{path}: a cell holds no number: {error}") from error
-    if not (np.isfinite(numbers) & (numbers > 0)).all():
-        raise BadStage(f"{path}: parameters and frequencies must be positive numbers")
+    numbers = table[[*parameters, "frequency_hz"]].apply(pd.to_numeric, errors="coerce")
+    for name, column in numbers.items():
+        wrong = ~(np.isfinite(column) & (column > 0)).to_numpy()
+        if wrong.any():
+            cell = table[name].iloc[wrong.argmax()]
+            raise BadStage(
+                f"{_line(path, table, wrong)}: {name} is {cell}; needed is a positive number"
+            )
+    unnamed = table["mode"].isna().to_numpy()
+    if unnamed.any():
+        raise BadStage(f"{_line(path, table, unnamed)}: a mode without a name")
+    table = table.assign(**numbers, mode=table["mode"].astype(str))
+    twice = table.duplicated([*parameters, "mode"]).to_numpy()
+    if twice.any():
+        raise BadStage(f"{_line(path, table, twice)}: a mode stands twice at one grid point")
     return _fit(path, table, parameters)
 
 
+def _line(path: str, table: pd.DataFrame, wrong: BoolArray) -> str:
+    """Name the line of the first row that is meant; the first line has the columns' names."""
+    return f"{path}: line {table.index[wrong][0] + 2}"
+
+
 def _fit(path: str, table: pd.DataFrame, parameters: tuple[str, ...]) -> ModalMap:
-    modes = tuple(table["mode"].astype(str).unique())
-    try:
-        wide = table.pivot(index=list(parameters), columns="mode", values="frequency_hz")
-    except ValueError as error:
-        raise BadStage(f"{path}: a mode stands twice at one grid point: {error}") from error
+    modes = tuple(table["mode"].unique())
+    wide = table.pivot(index=list(parameters), columns="mode", values="frequency_hz")
     axes = [np.unique(table[name]) for name in parameters]
     n_grid = int(np.prod([axis.size for axis in axes]))
     values = wide[list(modes)].to_numpy(dtype=float)
@@ -170,7 +183,8 @@ def _fit(path: str, table: pd.DataFrame, parameters: tuple[str, ...]) -> ModalMa
             f"with modes {list(modes)} needs {n_grid * len(modes)}"
         )
     if min(axis.size for axis in axes) < 3:
-        raise BadStage(f"{path}: every parameter needs at least 3 grid values")
+        sizes = {name: axis.size for name, axis in zip(parameters, axes, strict=True)}
+        raise BadStage(f"{path}: every parameter needs at least 3 grid values, there are {sizes}")
     points = np.log(wide.index.to_frame().to_numpy(dtype=float))
     low, high = points.min(axis=0), points.max(axis=0)
     unit = 2 * (points - low) / (high - low) - 1
@@ -228,23 +242,21 @@ def _least_squares(unit: FloatArray, values: FloatArray, degrees: list[int]) -> 
 def _choose_degrees(
     unit: FloatArray, values: FloatArray, sizes: list[int]
 ) -> tuple[list[int], FloatArray]:
-    """Choose one degree for all axes by the error at points left out.
+    """Choose one degree for all axes by the error at points left out, each by itself.
 
     Corners and edges stay in: without them the fit would extrapolate, which it is never asked to.
+    What a fit without a point misses there is r / (1 - h), with the residual r and the leverage h
+    of the fit with it.
     """
-    interior = np.flatnonzero(np.all(np.abs(unit) < 1 - 1e-9, axis=1))
-    folds = [fold for k in range(_FOLDS) if (fold := interior[k::_FOLDS]).size]
+    interior = np.all(np.abs(unit) < 1 - 1e-9, axis=1)
     best: tuple[list[int], FloatArray] | None = None
     for degree in range(1, min(max(sizes) - 1, _MAX_DEGREE) + 1):
         # One degree less than the axis can carry, so that leaving points out stays well posed.
         degrees = [min(degree, size - 2) for size in sizes]
-        error = np.zeros(values.shape[1])
-        for fold in folds:
-            keep = np.setdiff1d(np.arange(unit.shape[0]), fold)
-            coefficients = _least_squares(unit[keep], values[keep], degrees)
-            flat = coefficients.reshape(-1, values.shape[1])
-            miss = np.abs(_basis(unit[fold], degrees) @ flat - values[fold])
-            error = np.maximum(error, miss.max(axis=0, initial=0.0))
+        span = np.linalg.qr(_basis(unit, degrees))[0]
+        residual = values - span @ (span.T @ values)
+        rest = 1 - np.sum(span**2, axis=1)
+        error = np.abs(residual / rest[:, None])[interior].max(axis=0)
         if best is None or error.max() < best[1].max():
             best = degrees, error
         if error.max() < _NEGLIGIBLE:

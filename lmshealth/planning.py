@@ -1,11 +1,8 @@
 """Planning: how long and how many logs must be, for a loss of health to be seen.
 
-Two groups of logs are compared, those of now and those of the baseline, all of one length T. The
-drifts δ of the modes between them have the covariance C = R(T) (1/N + 1/N_baseline), where R is the
-Cramér-Rao bound of ln f of one log: independent from log to log, and from mode to mode. With the
-sensitivities S of the modal map at the baseline, δ = S x + ε for small changes x of the
-ln parameters. All parameters but the one asked for, j, are unknown, with the variances Λ of their
-priors, and that one is estimated by generalised least squares:
+Logs of now are compared with those of the baseline, as `sight` has it: drifts δ = S x + ε of the
+modes with the covariance C. All parameters but the one asked for, j, are unknown, with the
+variances Λ of their priors, and that one is estimated by generalised least squares:
 
     V = C + S_o Λ_o S_oᵀ,    x̂ = s_jᵀ V⁻¹ δ / (s_jᵀ V⁻¹ s_j),    σ² = 1 / (s_jᵀ V⁻¹ s_j).
 
@@ -31,23 +28,17 @@ from __future__ import annotations
 
 from bisect import bisect_left
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 from scipy.special import ndtr, ndtri
 
-from lmshealth.arrays import FloatArray
-from lmshealth.bandfit import BAND
-from lmshealth.bounds import ambient_bound
-from lmshealth.errors import BadQuestion, BadStage
-from lmshealth.modal import LEAST_RESOLUTION
-from lmshealth.stage import ModeSpec, ParameterSpec, Stage
+from lmshealth.errors import BadQuestion
+from lmshealth.sight import LONGEST, MOST_LOGS, Sight, sight_of
+from lmshealth.stage import Stage
 
 DURATIONS = (10.0, 20.0, 60.0, 120.0, 300.0, 600.0)
-# What is more than this is no plan: further logs would add nothing that the baseline lets through.
-_MOST_LOGS, _LONGEST = 10_000, 3600
-_PRIOR_POINTS = 4096
 
 Hindrance = Literal["too-short", "baseline", "parameters", ""]
 
@@ -153,22 +144,23 @@ def plan(
     Au2014
     """
     test = _Test(power, false_alarm)
-    view = _view(stage, parameter, loss)
-    view.expect_shown(stage)
+    sight = sight_of(stage)
+    j = _asked(stage, parameter, loss)
+    _expect_shown(stage, sight, j)
     size = -np.log1p(-loss)
 
     def power_of(duration: float, n_logs: int) -> float:
-        return test.power(size, view.std(view.drift_variance(duration, n_logs)))
+        return test.power(size, sight.std(j, sight.drift_variance(duration, n_logs)))
 
-    seconds = range(max(1, int(np.ceil(view.least_duration))), _LONGEST + 1)
+    seconds = range(max(1, int(np.ceil(sight.least_duration))), LONGEST + 1)
     place = bisect_left(seconds, power, key=lambda duration: power_of(duration, 1))
     return Plan(
         parameter=parameter,
         loss=loss,
         power=power,
         false_alarm=false_alarm,
-        n_baseline=view.n_baseline,
-        efforts=tuple(_effort(view, test, size, duration) for duration in durations),
+        n_baseline=sight.n_baseline,
+        efforts=tuple(_effort(sight, j, test, size, duration) for duration in durations),
         duration_of_one=seconds[place] if place < len(seconds) else None,
     )
 
@@ -196,73 +188,8 @@ class _Test:
         return float(-np.expm1(-std * (ndtri(self.wanted) - ndtri(self.false_alarm))))
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _View:
-    """One parameter as the modes show it.
-
-    ``own`` and ``others`` are sensitivities d ln f / d ln parameter, shapes ``(n_modes,)`` and
-    ``(n_modes, n_others)``, with the variances of ln parameter in the priors.
-    """
-
-    parameter: str
-    modes: tuple[ModeSpec, ...]
-    own: FloatArray
-    own_prior: float
-    others: FloatArray
-    others_prior: FloatArray
-    map_error: FloatArray
-    least_duration: float
-    n_baseline: int
-    # Bounds by length of log: many questions are asked of few lengths.
-    known: dict[float, FloatArray] = field(default_factory=dict)
-
-    def log_variance(self, duration: float) -> FloatArray:
-        """Bound the variance of ln f of each mode in one log, shape ``(n_modes,)``."""
-        if duration not in self.known:
-            self.known[duration] = np.array([_bound(mode, duration) for mode in self.modes])
-        return self.known[duration]
-
-    def drift_variance(
-        self, duration: float, n_logs: int, n_baseline: int | None = None
-    ) -> FloatArray:
-        """Bound the variance of the drift of each mode, shape ``(n_modes,)``."""
-        return self.log_variance(duration) * (1 / n_logs + 1 / (n_baseline or self.n_baseline))
-
-    def std(self, noise: FloatArray) -> float:
-        """Tell how well drifts with this noise, shape ``(n_modes,)``, estimate ln parameter."""
-        cov = np.diag(noise) + (self.others * self.others_prior) @ self.others.T
-        information = float(self.own @ np.linalg.solve(cov, self.own))
-        return float(1 / np.sqrt(information)) if information > 0 else np.inf
-
-    def expect_shown(self, stage: Stage) -> None:
-        """Refuse a parameter of which even endless logs would tell less than its prior does.
-
-        Then only the map's own error is left, in what the other parameters do to the modes.
-        """
-        endless = self.drift_variance(_LONGEST, _MOST_LOGS, _MOST_LOGS)
-        std, prior = self.std(endless + self.map_error), np.sqrt(self.own_prior)
-        # Half of the prior's variance would be left: results call that not told by the data.
-        if std < prior:
-            return
-        moved = ", ".join(
-            f"{mode.name} {slope:.2g}" for mode, slope in zip(self.modes, self.own, strict=True)
-        )
-        rest = [p.name for p in stage.parameters if p.name != self.parameter]
-        known = f"to {100 * std:.0f} %" if std < 1 else "no better than by guessing"
-        raise BadQuestion(
-            f"{stage.name}: the modes do not show {self.parameter}: ln f moves by so much per ln "
-            f"of it: {moved}. Besides what {', '.join(rest) or 'nothing else'} does to them it "
-            f"would be known {known} even from endless logs, the prior alone knows it to "
-            f"{100 * prior:.0f} %. Track a mode that depends on it more, or improve the map"
-        )
-
-
-def _view(stage: Stage, parameter: str, loss: float) -> _View:
-    if stage.modal_map is None or stage.description.map is None:
-        raise BadStage(
-            f"{stage.name}: no [map], so nothing links health to frequencies; "
-            "describe [[parameter]] and [map]"
-        )
+def _asked(stage: Stage, parameter: str, loss: float) -> int:
+    """Find the parameter, and refuse a loss that is none or lies beyond the map."""
     names = [p.name for p in stage.parameters]
     if parameter not in names:
         raise BadQuestion(f"{stage.name}: no parameter {parameter!r}; there are {names}")
@@ -273,59 +200,46 @@ def _view(stage: Stage, parameter: str, loss: float) -> _View:
     j = names.index(parameter)
     lost = stage.baseline_point.copy()
     lost[j] += np.log1p(-loss)
-    stage.modal_map.ln_frequency(lost[None])  # it refuses what lies beyond its grid
-    rows = [stage.modal_map.modes.index(name) for name in stage.informative]
-    slopes = stage.modal_map.gradient(stage.baseline_point[None])[0, rows]
-    prior = np.array([_prior_variance(stage, k, p) for k, p in enumerate(stage.parameters)])
-    others, others_prior = np.delete(slopes, j, axis=1), np.delete(prior, j)
-    wrong = stage.description.map.model_std**2 * others**2 @ others_prior
-    return _View(
-        parameter=parameter,
-        modes=tuple(mode for mode in stage.modes if mode.name in stage.informative),
-        own=slopes[:, j],
-        own_prior=float(prior[j]),
-        others=others,
-        others_prior=others_prior,
-        map_error=wrong + stage.modal_map.leave_out_error[rows] ** 2,
-        least_duration=LEAST_RESOLUTION
-        / min(2 * mode.damping_ratio * mode.frequency_hz for mode in stage.modes),
-        n_baseline=stage.description.baseline.logs,
+    stage.drift(lost[None], stage.informative)  # the map refuses what lies beyond its grid
+    return j
+
+
+def _expect_shown(stage: Stage, sight: Sight, j: int) -> None:
+    """Refuse a parameter of which even endless logs would tell less than its prior does.
+
+    Then only the map's own error is left, in what the other parameters do to the modes.
+    """
+    cov = np.linalg.inv(sight.precision(sight.endless_variance()))
+    # Half of the prior's variance would be left: results call that not told by the data.
+    if cov[j, j] < sight.prior[j] / 2:
+        return
+    name = sight.parameters[j]
+    moved = ", ".join(
+        f"{mode.name} {slope:.2g}"
+        for mode, slope in zip(sight.modes, sight.slopes[:, j], strict=True)
+    )
+    rest = [other for other in sight.parameters if other != name]
+    raise BadQuestion(
+        f"{stage.name}: the modes do not show {name}: ln f moves by so much per ln of it: {moved}. "
+        f"Besides what {', '.join(rest) or 'nothing else'} does to them it would be known to "
+        f"{100 * np.sqrt(cov[j, j]):.0f} % even from endless logs, the prior alone knows it to "
+        f"{100 * np.sqrt(sight.prior[j]):.0f} %. Track a mode that depends on it more, or improve "
+        "the map"
     )
 
 
-def _prior_variance(stage: Stage, column: int, parameter: ParameterSpec) -> float:
-    """Variance of ln parameter in its prior, which ends where the map does."""
-    assert stage.modal_map is not None  # _view() has checked
-    levels = (np.arange(_PRIOR_POINTS) + 0.5) / _PRIOR_POINTS
-    values = parameter.prior.quantile(levels)
-    x = np.log(values[values > 0])
-    x = x[(x >= stage.modal_map.low[column]) & (x <= stage.modal_map.high[column])]
-    if x.size < 2:
-        raise BadStage(
-            f"{stage.name}: the prior of {parameter.name} puts almost nothing inside the modal map"
-        )
-    return float(np.var(x))
-
-
-def _bound(mode: ModeSpec, duration: float) -> float:
-    """Bound the variance of ln f in the band that identification uses."""
-    f, zeta = mode.frequency_hz, mode.damping_ratio
-    band = (f * (1 - BAND * zeta), f * (1 + BAND * zeta))
-    return float(ambient_bound(f, zeta, mode.snr, duration, band=band)[0, 0])
-
-
-def _effort(view: _View, test: _Test, size: float, duration: float) -> Effort:
-    if duration < view.least_duration:
+def _effort(sight: Sight, j: int, test: _Test, size: float, duration: float) -> Effort:
+    if duration < sight.least_duration:
         return Effort(duration, None, "too-short")
 
     def std(n_logs: int, n_baseline: int | None = None) -> float:
-        return view.std(view.drift_variance(duration, n_logs, n_baseline))
+        return sight.std(j, sight.drift_variance(duration, n_logs, n_baseline))
 
-    counts = range(1, _MOST_LOGS + 1)
+    counts = range(1, MOST_LOGS + 1)
     place = bisect_left(counts, test.wanted, key=lambda n: test.power(size, std(n)))
     hindrance: Hindrance = ""
     if place == len(counts):
-        best = test.power(size, std(_MOST_LOGS, _MOST_LOGS))
+        best = test.power(size, std(MOST_LOGS, MOST_LOGS))
         hindrance = "baseline" if best >= test.wanted else "parameters"
     return Effort(
         duration=duration,
@@ -333,5 +247,5 @@ def _effort(view: _View, test: _Test, size: float, duration: float) -> Effort:
         hindrance=hindrance,
         power=test.power(size, std(1)),
         smallest_loss=test.smallest_loss(std(1)),
-        smallest_loss_many=test.smallest_loss(std(view.n_baseline)),
+        smallest_loss_many=test.smallest_loss(std(sight.n_baseline)),
     )

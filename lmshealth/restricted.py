@@ -23,7 +23,9 @@ IntArray = NDArray[np.intp]
 
 # A decay of less than this share over the record is none, and damping cannot be that heavy.
 _LEAST_DECAY, _HEAVIEST = 0.01, 0.5
-# Of the logarithm of a damping: this near to its bound it stands there.
+# A pole further off the band than this factor only runs away.
+_BEYOND = 2.0
+# Of the logarithm of a frequency or damping: this near to its bound it stands there.
 _AT_BOUND = 1e-6
 # Standard deviations of the logarithm of the white noise about what is seen between the peaks, and
 # of its slope over half of the band.
@@ -173,11 +175,20 @@ class TransientLikelihood:
         )
 
     def clip(self, p: FloatArray) -> FloatArray:
-        """Keep dampings where a decay can be told from a line and from nothing."""
+        """Keep poles about the band, and dampings where they are no line's and not nothing's."""
         m = self.n_modes
         kept = p + 0.0
-        kept[m : 2 * m] = np.clip(p[m : 2 * m], self.least_damping(p), np.log(_HEAVIEST))
+        # The bound of a damping goes with its frequency.
+        kept[:m] = np.clip(p[:m], *(bound[:m] for bound in self._bounds(p)))
+        kept[: 2 * m] = np.clip(kept[: 2 * m], *self._bounds(kept))
         return kept
+
+    def _bounds(self, p: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Give the least and the most of ln f and ln ζ of each mode, both ``(2 n_modes,)``."""
+        low, high = self._band
+        ones = np.ones(self.n_modes)
+        least = np.concatenate([np.log(low / _BEYOND) * ones, self.least_damping(p)])
+        return least, np.concatenate([np.log(high * _BEYOND) * ones, np.log(_HEAVIEST) * ones])
 
     def least_damping(self, p: FloatArray) -> FloatArray:
         """Give ln ζ of each mode below which it is a line, shape ``(n_modes,)``."""
@@ -206,12 +217,12 @@ class TransientLikelihood:
         return reach
 
     def movable(self, p: FloatArray, gradient: FloatArray, free: IntArray) -> IntArray:
-        """Leave out dampings that stand at their bound and press against it."""
-        m = self.n_modes
-        damping, down = p[m : 2 * m], gradient[m : 2 * m] > 0
-        low = (damping <= self.least_damping(p) + _AT_BOUND) & down
-        high = (damping >= np.log(_HEAVIEST) - _AT_BOUND) & ~down
-        return np.asarray(np.setdiff1d(free, m + np.flatnonzero(low | high)))
+        """Leave out frequencies and dampings that stand at their bound and press against it."""
+        poles = slice(2 * self.n_modes)
+        least, most = self._bounds(p)
+        down = gradient[poles] > 0
+        low, high = p[poles] <= least + _AT_BOUND, p[poles] >= most - _AT_BOUND
+        return np.asarray(np.setdiff1d(free, np.flatnonzero(np.where(down, low, high))))
 
     def density(self, block: Block, p: FloatArray) -> FloatArray:
         """Give the noise's power spectral density, ``(n_ordinates, n_channels, n_channels)``."""

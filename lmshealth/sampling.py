@@ -23,9 +23,9 @@ Start = Callable[[np.random.Generator], FloatArray]
 _N_ENSEMBLES = 4
 _AUTOCORRELATION_TIMES = 50
 _R_HAT = 1.01
-_FIRST_STEPS = 600
+_FIRST_STEPS = 250
 _MOST_STEPS = 20_000
-_LEAST_WALKERS = 24
+_LEAST_WALKERS = 32
 _MOST_ROUNDS = 60
 _START_ATTEMPTS = 100
 
@@ -114,10 +114,16 @@ def sample(log_probability: LogProbability, start: Start, seed: np.random.SeedSe
             *points.shape,
             log_probability,
             vectorize=True,
+            # Proposals from a kernel density of the other walkers need a quarter of the steps that
+            # differences of walkers do, but keep away from tails that no walker is in; differences
+            # do not. Taken whole (gamma0 = 1) they jump between modes of the posterior.
             # Not DESnookerMove: that of emcee 3.1.6 does not keep the target (its step is not along
-            # a unit vector), and narrows a Gaussian of six dimensions by 9 %. Differences taken
-            # whole (gamma0 = 1) jump between modes of the posterior.
-            moves=[(emcee.moves.DEMove(), 0.8), (emcee.moves.DEMove(gamma0=1.0), 0.2)],
+            # a unit vector), and narrows a Gaussian of six dimensions by 9 %.
+            moves=[
+                (emcee.moves.KDEMove(), 0.7),
+                (emcee.moves.DEMove(), 0.2),
+                (emcee.moves.DEMove(gamma0=1.0), 0.1),
+            ],
         )
         # emcee ignores a Generator, and without a seed two samplers of one process are alike.
         state = emcee.State(
@@ -183,7 +189,7 @@ def _diagnose(what: str, chains: FloatArray, **options: Any) -> FloatArray:
 
 def _n_walkers(n_dim: int) -> int:
     """Choose the walkers of an ensemble: a step of many costs hardly more than one of few."""
-    return max(_LEAST_WALKERS, 8 * n_dim)
+    return max(_LEAST_WALKERS, 16 * n_dim)
 
 
 def start_near(centre: FloatArray, cov: FloatArray, log_probability: LogProbability) -> Start:

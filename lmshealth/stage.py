@@ -6,6 +6,8 @@ The TOML file carries units in its keys; this module is the door where it is che
 from __future__ import annotations
 
 import hashlib
+import sys
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from datetime import date
 from fnmatch import fnmatchcase
@@ -14,7 +16,6 @@ from importlib import resources
 from pathlib import Path
 from typing import Annotated, Literal
 
-import msgspec
 import numpy as np
 from msgspec import Meta, Struct
 
@@ -24,14 +25,10 @@ from lmshealth.laws import AnyLaw, Unchanging
 from lmshealth.logs import Metadata
 from lmshealth.modalmap import ModalMap, read_map
 from lmshealth.priors import JointPrior, Prior
+from lmshealth.toml import Keys, decode, place
 
-Positive = Annotated[float, Meta(gt=0)]
+Positive = Annotated[float, Meta(gt=0, le=sys.float_info.max)]
 Share = Annotated[float, Meta(gt=0, lt=1)]
-
-
-def _check_band(key: str, low: float, high: float) -> None:
-    if not low < high:
-        raise ValueError(f"{key} reaches from {low:g} to {high:g} Hz: needed low < high")
 
 
 class _Part(Struct, frozen=True, forbid_unknown_fields=True):
@@ -61,9 +58,6 @@ class Watch(_Part, frozen=True):
 
     low_hz: Positive
     high_hz: Positive
-
-    def __post_init__(self) -> None:
-        _check_band("[[watch]]", self.low_hz, self.high_hz)
 
 
 class Limit(_Part, frozen=True):
@@ -151,7 +145,7 @@ class Description(_Part, frozen=True):
     """The stage description as written."""
 
     name: str
-    mode: tuple[ModeSpec, ...]
+    mode: Annotated[tuple[ModeSpec, ...], Meta(min_length=1)]
     source: str = ""
     match: Match = Match()
     health_band_hz: tuple[Positive, Positive] | None = None
@@ -164,17 +158,6 @@ class Description(_Part, frozen=True):
     baseline: Baseline = Baseline()
     decision: Decision = Decision()
     usage: Usage = Usage()
-
-    def __post_init__(self) -> None:
-        if self.health_band_hz is not None:
-            _check_band("health_band_hz", *self.health_band_hz)
-        for kind in ("mode", "parameter", "covariate"):
-            names = [part.name for part in getattr(self, kind)]
-            twice = {name for name in names if names.count(name) > 1}
-            if twice:
-                raise ValueError(f"[[{kind}]] names must be unique, twice: {sorted(twice)}")
-        if self.parameter and self.map is None:
-            raise ValueError("[[parameter]] needs a [map] that says what it does to the modes")
 
 
 @dataclass(frozen=True)
@@ -228,10 +211,7 @@ class Stage:
             raise BadStage(f"{self.name}: no [[parameter]] with a [map]")
         names = tuple(parameter.name for parameter in self.parameters)
         priors = tuple(parameter.prior for parameter in self.parameters)
-        try:
-            return JointPrior(names, priors, self.modal_map.low, self.modal_map.high)
-        except BadStage as error:
-            raise BadStage(f"{self.name}: {error}") from error
+        return JointPrior(names, priors, self.modal_map.low, self.modal_map.high)
 
     def takes(self, metadata: Metadata) -> bool:
         """Tell whether a log belongs to this description."""
@@ -297,38 +277,76 @@ def load_stage(reference: str) -> Stage:
             f"or one of {', '.join(shipped())}"
         )
     try:
-        text = path.read_bytes()
-        description = msgspec.toml.decode(text, type=Description)
+        content = path.read_bytes()
+        description = decode(content, Description)
     except OSError as error:
         raise BadStage(f"{path}: cannot read the stage description: {error.strerror}") from error
-    except (msgspec.MsgspecError, ValueError) as error:
+    except ValueError as error:
         raise BadStage(f"{path}: {error}") from error
-    digest = hashlib.sha256(text)
+    _refuse(path, content, _troubles(description))
+    digest = hashlib.sha256(content)
     modal_map = None
     if description.map is not None and description.parameter:
         map_path = path.parent / description.map.file
         names = tuple(parameter.name for parameter in description.parameter)
+        if not map_path.is_file():
+            _refuse(path, content, [(("map", "file"), f"there is no file {map_path}")])
         modal_map = read_map(str(map_path), names)
         digest.update(map_path.read_bytes())
-        _check_map(path, description, modal_map)
+        _refuse(path, content, _map_troubles(description, modal_map))
     return Stage(description=description, modal_map=modal_map, digest=digest.hexdigest())
 
 
-def _check_map(path: Path, description: Description, modal_map: ModalMap) -> None:
-    base = np.log([parameter.baseline for parameter in description.parameter])
-    if not modal_map.inside(base[None]).all():
-        raise BadStage(f"{path}: the baseline of the parameters lies outside the modal map")
-    known = [
-        mode.name for mode in description.mode if mode.tracked and mode.name in modal_map.modes
+def _refuse(path: Path, content: bytes, troubles: Iterable[tuple[Keys, str]]) -> None:
+    """Refuse a description for the first of its troubles, if it has any."""
+    for keys, trouble in troubles:
+        raise BadStage(f"{path}: {place(content, *keys)}: {trouble}")
+
+
+def _troubles(description: Description) -> Iterator[tuple[Keys, str]]:
+    """Say what is wrong between the parts of a description, and by which key."""
+    bands: list[tuple[Keys, tuple[float, float]]] = [
+        (("watch", k), (band.low_hz, band.high_hz)) for k, band in enumerate(description.watch)
     ]
-    if not known:
-        raise BadStage(
-            f"{path}: the map has modes {list(modal_map.modes)}, but none of them is a tracked "
-            f"[[mode]] ({[mode.name for mode in description.mode]})"
-        )
-    for parameter in description.parameter:
+    if description.health_band_hz is not None:
+        bands.append((("health_band_hz",), description.health_band_hz))
+    for keys, (low, high) in bands:
+        if not low < high:
+            yield keys, f"reaches from {low:g} to {high:g} Hz: needed low < high"
+    for kind in ("mode", "parameter", "covariate"):
+        names = [part.name for part in getattr(description, kind)]
+        for k, name in enumerate(names):
+            if name in names[:k]:
+                yield (kind, k, "name"), f"[[{kind}]] names must be unique, twice: {name!r}"
+    if description.parameter and description.map is None:
+        yield ("parameter", 0), "[[parameter]] needs a [map] that says what it does to the modes"
+    for k, parameter in enumerate(description.parameter):
         if parameter.limit is not None and parameter.limit.below >= parameter.baseline:
-            raise BadStage(
-                f"{path}: {parameter.name}: limit {parameter.limit.below} must lie below the "
-                f"baseline {parameter.baseline}"
+            yield (
+                ("parameter", k, "limit", "below"),
+                f"{parameter.name}: limit {parameter.limit.below:g} must lie below the baseline "
+                f"{parameter.baseline:g}",
             )
+
+
+def _map_troubles(description: Description, modal_map: ModalMap) -> Iterator[tuple[Keys, str]]:
+    """Say in what a description does not fit its map, and by which key."""
+    ends = np.array([modal_map.low, modal_map.high])
+    for k, parameter in enumerate(description.parameter):
+        low, high = ends[:, k]
+        if not low <= np.log(parameter.baseline) <= high:
+            yield (
+                ("parameter", k, "baseline"),
+                f"the baseline {parameter.baseline:g} of {parameter.name} lies outside the modal "
+                f"map, which reaches from {np.exp(low):.4g} to {np.exp(high):.4g}",
+            )
+        try:
+            JointPrior((parameter.name,), (parameter.prior,), *ends[:, [k]])
+        except BadStage as error:
+            yield ("parameter", k, "prior"), str(error)
+    if not any(mode.tracked and mode.name in modal_map.modes for mode in description.mode):
+        yield (
+            ("map", "file"),
+            f"the map has modes {list(modal_map.modes)}, but none of them is a tracked [[mode]] "
+            f"({[mode.name for mode in description.mode]})",
+        )

@@ -59,7 +59,9 @@ def print_modes(rows: Sequence[Row], refused: Sequence[Row]) -> None:
         for row in rows
     ]
     title = "Modes (± one standard deviation)" if rows else "No modes found"
-    _print(title, ("log", "mode", "channel"), ("frequency Hz", "damping %", "SNR", "note"), cells)
+    print_table(
+        title, ("log", "mode", "channel"), ("frequency Hz", "damping %", "SNR", "note"), cells
+    )
     _print_refused(refused)
 
 
@@ -80,7 +82,7 @@ def print_track(track: Track) -> None:
         )
     ]
     title = f"{track.stage}: modes after {len(track.logs)} logs (± one standard deviation)"
-    _print(title, ("mode",), ("frequency Hz", "drift %", "damping %"), cells)
+    print_table(title, ("mode",), ("frequency Hz", "drift %", "damping %"), cells)
     happened = [
         (
             f"{track.recorded_at[event.epoch]:%Y-%m-%d}",
@@ -95,7 +97,7 @@ def print_track(track: Track) -> None:
     if happened:
         numbers = ("size %", "ln Bayes factor")
         cells = [(*row[:3], row[5], *row[3:5]) for row in happened]
-        _print("What happened", ("since", "kind", "mode", ""), numbers, cells)
+        print_table("What happened", ("since", "kind", "mode", ""), numbers, cells)
     click.echo(_consistent(track))
 
 
@@ -119,7 +121,7 @@ def print_health(health: Health) -> None:
         f"{health.stage}: health at {health.recorded_at[-1]:%Y-%m-%d}, the last of "
         f"{len(health.recorded_at)} epochs"
     )
-    _print(title, ("parameter",), numbers, cells)
+    print_table(title, ("parameter",), numbers, cells)
     click.echo(
         "data: share of the prior's variance that they removed; prior × 2: how far the median "
         "moves, and how much wider the interval gets, with priors twice as wide."
@@ -166,7 +168,7 @@ def print_frf(fit: Row, frf: Sequence[Row], rows: Sequence[Row], refused: Sequen
         for row in frf[step // 2 :: step]
     ]
     title = f"Response of {fit['output']} to {fit['input']}, {len(cells)} of {len(frf)} lines"
-    _print(title, (), ("Hz", "gain (SI)", "phase °", "coherence", "fit"), cells)
+    print_table(title, (), ("Hz", "gain (SI)", "phase °", "coherence", "fit"), cells)
     click.echo(_averages(fit))
     if fit["distortion"] > 0:
         click.echo(
@@ -203,7 +205,7 @@ def print_error(rows: Sequence[Row], refused: Sequence[Row]) -> None:
         )
         for row in rows
     ]
-    _print("Following error (µm)", texts, ("mm/s", "s", "min", "max", "std", "mean"), first)
+    print_table("Following error (µm)", texts, ("mm/s", "s", "min", "max", "std", "mean"), first)
     second = [
         (
             *_labels(row, several),
@@ -218,7 +220,7 @@ def print_error(rows: Sequence[Row], refused: Sequence[Row]) -> None:
     count, floor = max(row["n_harmonics"] for row in rows), rows[0]["floor_nm"]
     title = f"Strongest harmonics: {count}, and those of them above {floor:g} nm"
     heads = ("max µm", "at Hz", "wide Hz", "share", "above", "wide Hz", "share")
-    _print(title, texts, heads, second)
+    print_table(title, texts, heads, second)
     click.echo("wide: highest minus lowest frequency; share: of the variance that they rebuild.")
     _print_refused(refused)
 
@@ -263,7 +265,7 @@ def print_plans(detect: Sequence[Row], plan: Sequence[Row]) -> None:
             if row["parameter"] == name and row["loss"] == asked["loss"]
         ]
         heads = ("s per log", "logs", "power, 1 log", "loss, 1 log", f"loss, {n_baseline} logs")
-        _print(
+        print_table(
             f"{name}: to see a loss of {_percent(asked['loss'])} with power {asked['power']:g}, "
             f"false alarms {asked['false_alarm']:g}",
             (),
@@ -303,7 +305,7 @@ def _print_lines(lines: Sequence[Row]) -> None:
         )
         for (channel, kind, _), rows in sorted(groups.items())
     ]
-    _print("Lines", ("channel", "kind"), ("Hz", "largest mm/s²", "in logs"), cells)
+    print_table("Lines", ("channel", "kind"), ("Hz", "largest mm/s²", "in logs"), cells)
 
 
 def _print_channel(title: str, rows: Sequence[Row]) -> None:
@@ -333,7 +335,7 @@ def _print_channel(title: str, rows: Sequence[Row]) -> None:
         for band, own in cells.items()
     ]
     heads = tuple("?" if speed < 0 else f"{speed:g}" for speed in speeds)
-    _print(f"{title}: mm/s² at velocities in mm/s", ("band",), (*heads, "grows"), table)
+    print_table(f"{title}: mm/s² at velocities in mm/s", ("band",), (*heads, "grows"), table)
 
 
 def _band_name(row: Row) -> str:
@@ -376,12 +378,13 @@ def _percent(share: float) -> str:
 def _print_refused(rows: Sequence[Row]) -> None:
     names = ("log", "channel", "mode", "reason", "detail")
     if rows:
-        _print("Refused", names, (), [tuple(row[name] for name in names) for row in rows])
+        print_table("Refused", names, (), [tuple(row[name] for name in names) for row in rows])
 
 
-def _print(
+def print_table(
     title: str, texts: Sequence[str], numbers: Sequence[str], cells: Sequence[Sequence[str]]
 ) -> None:
+    """Print a table: columns of text to the left, columns of numbers to the right."""
     table = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False)
     for name in texts:
         table.add_column(name, overflow="fold")

@@ -70,7 +70,7 @@ def stage(folder: Path) -> Path:
 
 def test_every_command_has_help_with_an_example() -> None:
     """``--help`` of each command shows how it is called."""
-    assert set(main.commands) >= {"run", "modes", "error", "spectrum", "frf", "plan"}
+    assert set(main.commands) >= {"run", "modes", "error", "spectrum", "frf", "plan", "stage"}
     for name in main.commands:
         result = call(name, "--help")
         assert result.exit_code == 0

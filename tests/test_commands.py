@@ -1,16 +1,19 @@
-"""Commands on tables: what they write, what they say, how they fail."""
+"""Commands on tables and descriptions: what they write, what they say, how they fail."""
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
+import xarray
 from click.testing import CliRunner, Result
 
 from lmshealth.cli import main
-from tests.lives import FADING, make_stage
+from lmshealth.tables import COLUMNS
+from tests.lives import FADING, FOOT, MOUNT, make_stage, true_drift
 
 N = 30
 
@@ -138,3 +141,181 @@ def test_fewer_logs_than_a_birth_takes_are_told(estimates: Path, tmp_path: Path)
     result = run(tmp_path / "two.csv", "--out", tmp_path / "track.csv")
     assert result.exit_code == 1
     assert "known once three logs show it" in result.stderr
+
+
+# infer
+
+
+@pytest.fixture
+def drifts(tmp_path: Path) -> Path:
+    """Write drifts of two machines, the second one's preload lower, with their cross terms."""
+    rows, terms = [], []
+    for stage, preload in (("AX-1", 0.9), ("AX-2", 0.7)):
+        make_stage(tmp_path / "stage")
+        for k, share in enumerate((0.0, 0.5, 1.0)):
+            moment = f"2026-03-{k + 1:02d}T06:00:00+00:00"
+            drift = true_drift(("guide_preload", "mount_stiffness"), share * np.log([preload, 0.9]))
+            for mode, size in zip(("roll", "pitch"), drift, strict=False):
+                rows.append((stage, moment, 100.0 * k, mode, size, 1e-3 * (k > 0)))
+            terms.append((stage, moment, "roll", "pitch", 3e-7 * (k > 0)))
+    columns = ["stage", "recorded_at", "travel_km", "mode", "drift", "drift_std"]
+    path = tmp_path / "track.csv"
+    pd.DataFrame(rows, columns=columns).to_csv(path, index=False)
+    columns = ["stage", "recorded_at", "mode_a", "mode_b", "cov_drift"]
+    pd.DataFrame(terms, columns=columns).to_csv(tmp_path / "track_cov.csv", index=False)
+    return path
+
+
+def infer(*words: object) -> Result:
+    """Run the command on drifts."""
+    return CliRunner().invoke(main, ["infer", *map(str, words)])
+
+
+def test_drifts_become_health(drifts: Path, tmp_path: Path) -> None:
+    """Every machine has its epochs in the table and its draws in the file; the truth is inside."""
+    toml = tmp_path / "stage" / "small.toml"
+    out, draws = tmp_path / "new" / "health.csv", tmp_path / "health.nc"
+    result = infer(drifts, "--stage", toml, "--out", out, "--posterior", draws)
+    assert result.exit_code == 0, result.output
+    table = pd.read_csv(out)
+    assert list(table.columns[:11]) == COLUMNS["health"].split()[:11]
+    last = table[table["recorded_at"].str.startswith("2026-03-03")].set_index(
+        ["stage", "parameter"]
+    )
+    for stage, preload in (("AX-1", 0.9), ("AX-2", 0.7)):
+        row = last.loc[stage, "guide_preload"]
+        assert row["q05"] < preload < row["q95"]
+        assert f"{stage}: health at 2026-03-03" in result.stdout
+    tree = xarray.open_datatree(draws, engine="h5netcdf")
+    median = np.median(tree["AX-2/posterior/guide_preload"][..., -1])
+    assert median == pytest.approx(last.loc["AX-2", "guide_preload"]["median"])
+
+
+def test_the_seed_alone_decides(drifts: Path, tmp_path: Path) -> None:
+    """The same seed gives the same file to the byte, another one another file."""
+    toml = tmp_path / "stage" / "small.toml"
+    outs = [tmp_path / f"{k}.csv" for k in range(3)]
+    for out, seed in zip(outs, (0, 0, 1), strict=True):
+        result = infer(drifts, "--stage", toml, "--out", out, "--seed", seed, "--epochs", 1)
+        assert result.exit_code == 0
+    assert outs[0].read_bytes() == outs[1].read_bytes() != outs[2].read_bytes()
+
+
+def test_machines_that_share_a_guide_are_inferred_together(drifts: Path, tmp_path: Path) -> None:
+    """One table for both; the shared preload once, the mounts under the names of the machines."""
+    toml = tmp_path / "stage" / "small.toml"
+    table = pd.read_csv(drifts)
+    paths = []
+    for stage in ("AX-1", "AX-2"):
+        paths.append(tmp_path / stage / "track.csv")
+        paths[-1].parent.mkdir()
+        table[table["stage"] == stage].to_csv(paths[-1], index=False)
+    out = tmp_path / "health.csv"
+    words = [paths[0], "--stage", toml, "--with", paths[1], toml, "--out", out, "--epochs", 1]
+    result = infer(*words, "--shared", "guide_preload")
+    assert result.exit_code == 0, result.output
+    assert set(pd.read_csv(out)["parameter"]) == {
+        "guide_preload",
+        "AX-1:mount_stiffness",
+        "AX-2:mount_stiffness",
+    }
+    assert infer(*words).exit_code == 2
+    words[0] = drifts
+    result = infer(*words, "--shared", "guide_preload")
+    assert result.exit_code == 1
+    assert "2 machines (AX-1, AX-2); needed is a table of the one" in result.stderr
+
+
+def test_a_machine_without_drifts_is_told_and_the_others_go_on(
+    drifts: Path, tmp_path: Path
+) -> None:
+    """Status 3 where one of two machines has nothing to infer from, 1 where none has."""
+    toml = tmp_path / "stage" / "small.toml"
+    table = pd.read_csv(drifts)
+    table.loc[table["stage"] == "AX-2", "mode"] += "2"
+    table.to_csv(drifts, index=False)
+    out = tmp_path / "health.csv"
+    result = infer(drifts, "--stage", toml, "--out", out)
+    assert result.exit_code == 3
+    assert "AX-2: none of the modes ['roll', 'pitch'] was tracked" in result.stderr
+    assert set(pd.read_csv(out)["stage"]) == {"AX-1"}
+    table[table["stage"] == "AX-2"].to_csv(drifts, index=False)
+    result = infer(drifts, "--stage", toml, "--out", tmp_path / "none.csv")
+    assert result.exit_code == 1
+    assert not (tmp_path / "none.csv").exists()
+
+
+# stage
+
+
+def check(*words: object) -> Result:
+    """Check a stage description on the command line."""
+    return CliRunner().invoke(main, ["stage", *map(str, words)])
+
+
+def test_a_description_in_order_is_told_in_tables_and_sentences(tmp_path: Path) -> None:
+    """Status 0, nothing on standard error; what the X stage cannot see is no failure."""
+    make_stage(tmp_path)
+    for reference in (tmp_path / "small.toml", "lms-x"):
+        result = check(reference)
+        assert (result.exit_code, result.stderr) == (0, "")
+        assert "Sensitivity" in result.stdout
+    assert "mount_stiffness is not identifiable" in result.stdout
+
+
+@pytest.mark.parametrize("parameters", [(), (FADING,), (FADING, FOOT, MOUNT)])
+def test_as_json_it_has_numbers_and_null(tmp_path: Path, parameters: tuple[str, ...]) -> None:
+    """Rows for as many parameters as there are; what is missing is null, never NaN."""
+    make_stage(tmp_path, parameters)
+
+    def refuse(word: str) -> None:
+        raise AssertionError(f"{word} is no JSON")
+
+    result = check(tmp_path / "small.toml", "--format", "json")
+    content = json.loads(result.stdout, parse_constant=refuse)
+    n = len(parameters)
+    assert [len(content[key]) for key in ("stage", "modes", "parameters")] == [1, 2, n]
+    assert [len(content[key]) for key in ("sensitivities", "correlations")] == [
+        2 * n,
+        n * (n - 1) / 2,
+    ]
+    assert {row["verdict"] for row in content["parameters"]} <= {"told", "not-told"}
+    assert (content["stage"][0]["model_std"] is None) == (n == 0)
+    assert content["findings"][0]["topic"] == "parameters"
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ("damping_ratio = 0.018", "damping_ratio = 1.8", "line 5: mode[0].damping_ratio: "),
+        ("limit =", "limits =", "line 13: parameter[0].limits: unknown key; known are name, prior"),
+        ('"map.csv"', '"gone.csv"', "line 27: map.file: there is no file "),
+        ("[map]", "[map", "line 26: no TOML: "),
+    ],
+)
+def test_a_slip_is_one_line_and_status_1(tmp_path: Path, old: str, new: str, said: str) -> None:
+    """The line names file, line, key, and what is needed."""
+    make_stage(tmp_path)
+    path = tmp_path / "small.toml"
+    path.write_text(path.read_text().replace(old, new, 1))
+    result = check(path)
+    assert (result.exit_code, result.stdout) == (1, "")
+    assert result.stderr.startswith(f"lmshealth: {path}: {said}")
+    assert result.stderr.count("\n") == 1
+
+
+def test_a_map_that_is_none_and_names_nobody_knows(tmp_path: Path) -> None:
+    """A cell that is no number has its line; unknown names are told which ones there are."""
+    make_stage(tmp_path)
+    table = tmp_path / "map.csv"
+    table.write_text(table.read_text().replace("\n0.2", "\na", 1))
+    result = check(tmp_path / "small.toml")
+    assert result.exit_code == 1
+    assert "map.csv: line 2: guide_preload is a" in result.stderr
+    assert "needed is a positive number" in result.stderr
+    assert "lms-x, lms-y" in check("lms-z").stderr
+    for path in (tmp_path / "gone.toml", tmp_path / "folder.toml"):
+        (tmp_path / "folder.toml").mkdir(exist_ok=True)
+        result = check(path)
+        assert result.exit_code == 1
+        assert f"{path}: cannot read the stage description: " in result.stderr

@@ -19,7 +19,7 @@ from lmshealth.stage import Stage
 from studies.decays.beam import judge_beam, one_beam
 from studies.decays.stops import one_machine
 from tests.signals import deviations, make_log, make_stage, sine
-from tests.stops import Ring, stop, stop_log, whole
+from tests.stops import Ring, ring, stop, stop_log, whole
 
 RATE = 400.0
 MODES = [("roll", 60.0, 0.01), ("pitch", 85.0, 0.01)]
@@ -244,3 +244,21 @@ def test_simulated_stages_tell_their_modes_after_a_stop(name: str) -> None:
     for row in seen:
         assert row["nearest"] == row["mode"], row
         assert max(abs(row["z_f"]), abs(row["z_zeta"])) < 4, row
+
+
+def test_a_mode_that_creeps_ends_in_no_runaway_pole() -> None:
+    """A frequency that settles after the stop sends no pole to infinity, and is found."""
+    rng = np.random.default_rng(3)
+    rate, t = 1000.0, np.arange(500) / 1000.0
+    creeping = 26.2 * (1 + 5e-4 * np.exp(-t / 0.1))
+    phase = 2 * np.pi * np.cumsum(creeping) / rate + rng.uniform(0, 2 * np.pi)
+    fading = np.exp(-2 * np.pi * 26.2 * 0.007 * t) * np.cos(phase)
+    second = ring(24.1, 0.01, 0.3, rng.uniform(0, 2 * np.pi), 500, rate)
+    noise = 1e-4 * rng.standard_normal((2, 500))
+    log = make_log(
+        {"acc_0": fading + second + noise[0], "acc_1": 1.4 * fading + 0.8 * second + noise[1]}, rate
+    )
+    stage = make_stage([("beam", 33.0, 0.002)], search=0.3)
+    modes = identify_decays(log, stage, segments=whole(log))
+    # Within what it creeps by.
+    assert modes.frequency == pytest.approx([26.2], rel=5e-4)

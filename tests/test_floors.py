@@ -9,7 +9,7 @@ import pytest
 
 FLOORS = [
     {"errors"},
-    {"arrays"},
+    {"arrays", "toml"},
     {"samples"},
     {"logs"},
     {"results", "tracks"},
@@ -66,8 +66,9 @@ FLOORS = [
     {"bandfit"},
     {"separation"},
     {"modal", "frf", "history", "ringing", "sampling"},
-    {"tracking", "smoothing", "decay", "survey", "planning", "modetable"},
-    {"inference"},
+    {"tracking", "smoothing", "decay", "survey", "sight", "modetable"},
+    {"inference", "planning", "examination"},
+    {"findings"},
     {"life"},
     {"prognosis"},
     {"summary", "plots"},
@@ -75,6 +76,7 @@ FLOORS = [
     {"trackfacts"},
     {"report"},
     {"pipeline", "terminal", "options", "looks"},
+    {"stageview"},
     {"commands"},
     {"cli"},
     {"__main__"},

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.polynomial import Chebyshev
 
 from lmshealth.errors import BadStage, OutsideMap
 from lmshealth.modalmap import ModalMap, read_map
@@ -117,6 +118,21 @@ def test_leave_out_error_bounds_the_error_between_grid_points(tmp_path: Path) ->
     assert found.leave_out_error[0] < 0.1
 
 
+def test_leave_out_error_is_that_of_fits_without_a_point(tmp_path: Path) -> None:
+    """The largest miss of numpy's fits of the same degree, each without one inner point."""
+    axis = np.geomspace(0.2, 1.5, 9)
+    f = 100 * np.exp(0.3 * np.tanh(2 * np.log(axis)))
+    rows = [f"{p:.17g},roll,{value:.17g}" for p, value in zip(axis, f, strict=True)]
+    found = read_map(write(tmp_path, ["p,mode,frequency_hz", *rows]), ("p",))
+    x, degree = np.log(axis), found.coefficients.shape[0] - 1
+    misses = []
+    for k in range(1, 8):
+        rest = np.delete(np.arange(9), k)
+        fit = Chebyshev.fit(x[rest], np.log(f[rest]), degree, domain=[x[0], x[-1]])
+        misses.append(abs(fit(x[k]) - np.log(f[k])))
+    assert found.leave_out_error[0] == pytest.approx(max(misses), rel=1e-9)
+
+
 @pytest.mark.parametrize("n", [3, 4, 5])
 def test_a_map_of_one_parameter_with_few_values_is_enough(tmp_path: Path, n: int) -> None:
     """Three to five values of one parameter make a map that meets a straight line exactly."""
@@ -160,12 +176,16 @@ def test_the_edge_of_the_grid_is_inside(small: ModalMap) -> None:
         (lambda rows: [r.replace("frequency_hz", "hz") for r in rows], "no column.*frequency_hz"),
         (lambda rows: [r.replace("mount_stiffness", "foot") for r in rows], "mount_stiffness"),
         (lambda rows: [rows[0] + ",load", *(r + ",1" for r in rows[1:])], "load.*no parameter"),
+        (lambda rows: [r.replace("pitch", "") for r in rows], "line 3: a mode without a name"),
         (lambda rows: rows[:-1], "97 values where a full grid of 49"),
-        (lambda rows: [*rows, rows[-1]], "twice"),
-        (lambda rows: [*rows[:-1], rows[-1].rsplit(",", 1)[0] + ",-3"], "positive"),
-        (lambda rows: [*rows[:-1], rows[-1].rsplit(",", 1)[0] + ","], "positive"),
+        (lambda rows: [*rows, rows[-1]], "line 100: .*twice"),
+        (lambda rows: [*rows[:-1], rows[-1].rsplit(",", 1)[0] + ",-3"], "line 99: .*-3.*positive"),
+        (
+            lambda rows: [*rows[:-1], rows[-1].rsplit(",", 1)[0] + ","],
+            "line 99: frequency_hz is nan.*positive",
+        ),
     ],
-    ids=["no-frequency", "no-parameter", "extra", "hole", "twice", "negative", "empty"],
+    ids=["no-frequency", "no-parameter", "extra", "no-name", "hole", "twice", "negative", "empty"],
 )
 def test_a_map_that_breaks_its_contract_is_refused(tmp_path: Path, change, needle: str) -> None:
     """The error names the file and what is missing."""
@@ -175,17 +195,18 @@ def test_a_map_that_breaks_its_contract_is_refused(tmp_path: Path, change, needl
 
 
 def test_text_where_numbers_belong_is_refused_as_such(tmp_path: Path) -> None:
-    """A word in a number column is an error of the map, not a traceback."""
+    """A word in a number column is an error of the map, told by its line; blank lines count."""
     rows = map_rows(NAMES)
     rows[3] = "low" + rows[3][rows[3].index(",") :]
-    with pytest.raises(BadStage, match=r"map\.csv"):
+    rows.insert(2, "")
+    with pytest.raises(BadStage, match=r"map\.csv: line 5: guide_preload is low; needed"):
         read_map(write(tmp_path, rows), NAMES)
 
 
 def test_too_few_grid_values_are_refused(tmp_path: Path) -> None:
     """Two values of a parameter make no surrogate."""
     rows = ["p,mode,frequency_hz", "1,roll,100", "2,roll,120"]
-    with pytest.raises(BadStage, match="at least 3"):
+    with pytest.raises(BadStage, match=r"at least 3 grid values.*'p': 2"):
         read_map(write(tmp_path, rows), ("p",))
 
 
@@ -199,12 +220,13 @@ def test_a_map_that_is_not_there_is_refused(tmp_path: Path) -> None:
 def test_shipped_maps_are_smooth_and_hold_their_nominal_frequencies(name: str) -> None:
     """Shipped maps leave out at most 1e-5 and give the nominal frequencies at baseline.
 
-    In Y roll and pitch cross on mounts stiffer than new, where they repel each other: 3e-5.
+    In Y roll and pitch, named by their shapes, cross on mounts stiffer than new although they repel
+    each other there: no smooth surrogate meets that, the error is 1.5e-5.
     """
     assert name in shipped()
     stage = load_stage(name)
     assert stage.modal_map is not None
-    limit = 3e-5 if name == "lms-y" else 1e-5
+    limit = 2e-5 if name == "lms-y" else 1e-5
     assert (stage.modal_map.leave_out_error <= limit).all()
     base = stage.modal_map.ln_frequency(stage.baseline_point[None])[0]
     for mode in stage.modes:

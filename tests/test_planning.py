@@ -14,7 +14,7 @@ from lmshealth.bounds import ambient_bound, long_record_law
 from lmshealth.errors import BadQuestion, BadStage, OutsideMap
 from lmshealth.planning import Plan, plan
 from lmshealth.stage import Stage, load_stage
-from tests.lives import DAMPING, FOOT, FREQUENCY, MOUNT, PRELOAD, SENSITIVITY, make_stage
+from tests.lives import DAMPING, FOOT, FREQUENCY, PRELOAD, SENSITIVITY, make_stage
 from tests.oracles import planned_std
 from tests.signals import write_archive_stage
 
@@ -184,13 +184,3 @@ def test_questions_without_an_answer_are_refused(one: Stage, tmp_path: Path) -> 
     bare = load_stage(str(write_archive_stage(tmp_path, health=False)))
     with pytest.raises(BadStage, match=r"no \[map\]"):
         plan(bare, "guide_preload", 0.05)
-
-
-def test_a_prior_beyond_the_map_is_refused(tmp_path: Path) -> None:
-    """A prior whose middle the map does not reach says nothing about the others."""
-    far = MOUNT.replace(
-        'kind = "lognormal", median = 1.0, sigma = 0.3', 'kind = "uniform", low = 5, high = 6'
-    )
-    stage = make_stage(tmp_path, (PRELOAD, far))
-    with pytest.raises(BadStage, match="prior of mount_stiffness"):
-        plan(stage, "guide_preload", 0.05)

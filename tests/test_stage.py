@@ -32,28 +32,59 @@ def load(folder: Path, text: str) -> Stage:
 @pytest.mark.parametrize(
     ("old", "new", "needle"),
     [
-        ("damping_ratio = 0.018", "damping_ratio = 1.8", r"\$\.mode\[0\]\.damping_ratio"),
-        ("damping_ratio = 0.015", "damping = 0.015", r"\$\.mode\[1\]"),
-        ("sigma = 0.3", 'sigma = "wide"', r"\$\.parameter\[.*\]\.prior\.sigma"),
-        ('kind = "hertz-wear"', 'kind = "rust"', r"\$\.parameter\[.*\]\.law"),
-        ("below = 0.6", "below = -1", r"\$\.parameter\[.*\]\.limit\.below"),
-        ("model_std = 0.05", "model_std = 1.5", r"\$\.map\.model_std"),
-        ("prior_std = 0.001", "prior_std = 0", r"\$\.covariate\[0\]\.prior_std"),
-        ("reference = 21.0", "referense = 21.0", r"referense.*\$\.covariate\[0\]|reference"),
-        ('name = "small"', 'nam = "small"', "nam"),
-        ("median = 1.0, sigma = 0.3", "median = -1.0, sigma = 0.3", "median and sigma above 0"),
-        ('name = "pitch"', 'name = "roll"', r"\[\[mode\]\] names must be unique.*roll"),
-        ('name = "mount_stiffness"', 'name = "guide_preload"', r"\[\[parameter\]\].*unique"),
-        ('[map]\nfile = "map.csv"\nmodel_std = 0.05', "", r"\[\[parameter\]\] needs a \[map\]"),
-        ('file = "map.csv"', 'file = "gone.csv"', r"gone\.csv"),
-        ("below = 0.7", "below = 1.2", "mount_stiffness: limit 1.2 must lie below"),
+        (
+            "damping_ratio = 0.018",
+            "damping_ratio = 1.8",
+            r"line 5: mode\[0\]\.damping_ratio: .* < 1.0, got 1.8",
+        ),
+        ("damping_ratio = 0.015", "damping = 0.015", r"line 9: mode\[1\]\.damping: unknown key"),
+        ("frequency_hz = 136.6\n", "", r"line 6: mode\[1\]\.frequency_hz: missing"),
+        ("= 126.4", "= inf", r"line 4: mode\[0\]\.frequency_hz: .*got inf"),
+        ("sigma = 0.3", 'sigma = "wide"', r"line 12: parameter\[0\]\.prior\.sigma"),
+        (
+            '"hertz-wear"',
+            '"rust"',
+            r"line 14: parameter\[0\]\.law\.kind: there are hertz-wear, loo",
+        ),
+        ("below = 0.6", "below = -1", r"line 13: parameter\[0\]\.limit\.below"),
+        ("floor = {", "flor = {", r"line 24: parameter\[1\]\.law\.flor: .*kind, life_km, floor"),
+        ("model_std = 0.05", "model_std = 1.5", r"line 28: map\.model_std"),
+        ("prior_std = 0.001", "prior_std = 0", r"line 33: covariate\[0\]\.prior_std"),
+        ("reference = 21.0", "referense = 21.0", r"line 32: covariate\[0\]\.referense"),
+        ('name = "small"', 'nam = "small"', "line 1: nam: unknown key"),
+        (
+            "median = 1.0, sigma = 0.3",
+            "median = -1.0, sigma = 0.3",
+            r"line 12: parameter\[0\]\.prior: .*median and sigma above 0",
+        ),
+        (
+            'name = "pitch"',
+            'name = "roll"',
+            r"line 7: mode\[1\]\.name: \[\[mode\]\] names must be unique.*roll",
+        ),
+        (
+            'name = "mount_stiffness"',
+            'name = "guide_preload"',
+            r"line 17: parameter\[1\]\.name: \[\[parameter\]\].*unique",
+        ),
+        (
+            '[map]\nfile = "map.csv"\nmodel_std = 0.05',
+            "",
+            r"line 10: parameter\[0\]: \[\[parameter\]\] needs a \[map\]",
+        ),
+        ('file = "map.csv"', 'file = "gone.csv"', r"line 27: map\.file: .*gone\.csv"),
+        (
+            "below = 0.7",
+            "below = 1.2",
+            r"line 19: parameter\[1\]\.limit\.below: mount_stiffness: limit 1.2 must lie below",
+        ),
         ('name = "mount_stiffness"', 'name = "mount"', r"map\.csv: no column \['mount'\]"),
     ],
 )
 def test_a_description_that_breaks_the_schema_is_refused(
     tmp_path: Path, old: str, new: str, needle: str
 ) -> None:
-    """Each slip is refused with the path of its key, or the part and the name."""
+    """Each slip is refused with its line and key, and what was got or is needed."""
     text = stage_text()
     assert old in text
     with pytest.raises(BadStage, match=needle):
@@ -87,8 +118,19 @@ def test_covariate_names_are_unique(tmp_path: Path) -> None:
 
 def test_a_baseline_outside_the_map_is_refused(tmp_path: Path) -> None:
     """The state at baseline has to be on the map."""
-    with pytest.raises(BadStage, match="baseline of the parameters lies outside"):
+    with pytest.raises(
+        BadStage,
+        match=r"line 20: parameter\[1\]\.baseline: the baseline 9 of mount_stiffness lies out",
+    ):
         make_stage(tmp_path, (PRELOAD + "\n", MOUNT.replace("limit =", "baseline = 9.0\nlimit =")))
+
+
+def test_a_prior_beyond_the_map_is_refused(tmp_path: Path) -> None:
+    """A prior that the map does not reach says nothing about this machine."""
+    inside = 'kind = "lognormal", median = 1.0, sigma = 0.3'
+    far = MOUNT.replace(inside, 'kind = "uniform", low = 5, high = 6')
+    with pytest.raises(BadStage, match=r"line 18: parameter\[1\]\.prior: .*mount_stiffness puts"):
+        make_stage(tmp_path, (PRELOAD, far))
 
 
 def test_a_map_without_any_tracked_mode_is_refused(tmp_path: Path) -> None:
@@ -107,9 +149,15 @@ def test_a_file_that_is_not_there_and_a_name_nobody_knows(tmp_path: Path) -> Non
 
 
 def test_a_file_that_is_no_toml_is_refused(tmp_path: Path) -> None:
-    """Broken syntax names the file."""
-    with pytest.raises(BadStage, match=r"odd\.toml"):
-        load(tmp_path, "name = [")
+    """Broken syntax names the file and the line."""
+    with pytest.raises(BadStage, match=r"odd\.toml: line 2: no TOML: "):
+        load(tmp_path, 'name = "odd"\nmode = }\n')
+
+
+def test_a_description_needs_a_mode(tmp_path: Path) -> None:
+    """An empty list of modes leaves nothing to look for."""
+    with pytest.raises(BadStage, match=r"line 2: mode: Expected `array` of length >= 1"):
+        load(tmp_path, 'name = "odd"\nmode = []\n')
 
 
 def test_drift_is_zero_at_baseline_and_follows_the_map(stage: Stage) -> None:
@@ -187,9 +235,9 @@ def test_shipped_stages_have_the_papers_health_band(name: str, band: tuple[float
 @pytest.mark.parametrize(
     ("line", "key"),
     [
-        ("health_band_hz = [150, 10]", "health_band_hz"),
-        ("health_band_hz = [10]", "health_band_hz"),
-        ("[[watch]]\nlow_hz = 20\nhigh_hz = 20", "watch"),
+        ("health_band_hz = [150, 10]", "line 2: health_band_hz: reaches from 150 to 10 Hz"),
+        ("health_band_hz = [10]", "line 2: health_band_hz: .*length 2"),
+        ("[[watch]]\nlow_hz = 20\nhigh_hz = 20", r"line 2: watch\[0\]: .*needed low < high"),
     ],
 )
 def test_a_band_that_is_none_is_named(tmp_path: Path, line: str, key: str) -> None:

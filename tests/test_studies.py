@@ -187,3 +187,11 @@ def test_beam_track(root: Path, needs: Callable[[str], None]) -> None:
     needs("data")
     answer = json.loads(run_study(root, "beam_track"))
     assert all(answer["passed"].values())
+
+
+def test_movable_roller(root: Path, needs: Callable[[str], None]) -> None:
+    """A roller under a real beam is where the posterior says, and two wrong ways lose it."""
+    needs("data")
+    answer = json.loads(run_study(root, "movable_roller"))
+    assert all(answer["passed"].values())
+    assert all(control["inside"] < 8 for control in answer["controls"].values())

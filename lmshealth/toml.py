@@ -1,0 +1,176 @@
+"""TOML into structs, with every slip told by its line and key."""
+
+from __future__ import annotations
+
+import re
+import tomllib
+from collections.abc import Iterable, Iterator
+from typing import Any, TypeVar
+
+import msgspec
+from msgspec.inspect import StructType, Type, UnionType, VarTupleType, type_info
+
+Kind = TypeVar("Kind")
+Keys = tuple[str | int, ...]
+
+_PLACE = re.compile(r" - at `\$(?P<path>.*)`$")
+_STEP = re.compile(r"\.([^.\[]+)|\[(\d+)\]")
+_FIELD = re.compile(r"Object (?P<what>contains unknown|missing required) field `(?P<field>.*)`$")
+
+
+def decode(content: bytes, kind: type[Kind]) -> Kind:
+    """Read TOML into a struct.
+
+    Parameters
+    ----------
+    content : bytes
+        The file.
+    kind : type
+        A msgspec struct.
+
+    Raises
+    ------
+    ValueError
+        If the file is no TOML or breaks the schema: the message has line, key, what was got and
+        what is needed.
+    """
+    text = _text(content)
+    try:
+        table = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        line = 1 + max((last for _, last, _ in _statements(text)), default=0)
+        raise ValueError(f"line {line}: no TOML: {error}") from error
+    except RecursionError as error:
+        raise ValueError("no TOML that can be read: it is nested too deeply") from error
+    try:
+        return msgspec.convert(table, kind)
+    except msgspec.ValidationError as error:
+        keys, message = _told(str(error), table, type_info(kind))
+        raise ValueError(f"{place(content, *keys)}: {message}") from error
+
+
+def place(content: bytes, *keys: str | int) -> str:
+    """Name a key of a TOML file, and the line on which it stands.
+
+    Parameters
+    ----------
+    content : bytes
+        The file; it has to be TOML.
+    keys : str or int
+        Names of tables and keys, and places in arrays. For a key that is not there the line is
+        that of the table which lacks it.
+
+    Returns
+    -------
+    str
+        For example ``line 12: mode[1].damping_ratio``.
+    """
+    shown = "".join(f"[{key}]" if isinstance(key, int) else f".{key}" for key in keys)
+    line = _line(_text(content), keys)
+    return (f"line {line}: " if line else "") + shown.lstrip(".")
+
+
+def _text(content: bytes) -> str:
+    try:
+        return content.decode("utf-8-sig").replace("\r\n", "\n")
+    except UnicodeDecodeError as error:
+        line = content.count(b"\n", 0, error.start) + 1
+        raise ValueError(f"line {line}: byte {content[error.start]:#04x} is not UTF-8") from error
+
+
+def _line(text: str, keys: Keys) -> int | None:
+    """Find the line that brings a key, or the table which lacks it; None for the file itself."""
+    table = tomllib.loads(text)
+    while keys and not _holds(table, keys):
+        keys = keys[:-1]
+    brought = (first for first, _, table in _statements(text) if _holds(table, keys))
+    return next(brought) if keys else None
+
+
+def _statements(text: str) -> Iterator[tuple[int, int, dict[str, Any]]]:
+    """Yield first and last line of each statement with what the file holds up to there.
+
+    A statement ends where the file cut off there is TOML.
+    """
+    lines, first = text.split("\n"), 1
+    for last in range(1, len(lines) + 1):
+        try:
+            table = tomllib.loads("\n".join(lines[:last]))
+        except tomllib.TOMLDecodeError:
+            continue  # a string or an array goes on in the next line
+        yield first, last, table
+        first = last + 1
+
+
+def _holds(table: Any, keys: Keys) -> bool:
+    try:
+        _value(table, keys)
+    except (KeyError, IndexError, TypeError):
+        return False
+    return True
+
+
+def _value(table: Any, keys: Keys) -> Any:
+    for key in keys:
+        table = table[key]
+    return table
+
+
+def _told(error: str, table: Any, schema: Type) -> tuple[Keys, str]:
+    """Turn msgspec's message into the keys that are meant, and what is to be said of them."""
+    path = _PLACE.search(error)
+    keys: Keys = ()
+    if path:
+        error = error[: path.start()]
+        keys = tuple(name or int(index) for name, index in _STEP.findall(path["path"]))
+    if field := _FIELD.match(error):
+        name = field["field"]
+        tags = _tags(schema, (*keys, name))
+        if "missing" in field["what"]:
+            return (*keys, name), f"missing; there are {_listed(tags)}" if tags else "missing"
+        return (*keys, name), f"unknown key; known are {_listed(_fields(schema, keys, table))}"
+    value = _value(table, keys)
+    if error.startswith("Invalid value") and (tags := _tags(schema, keys)):
+        error = f"there are {_listed(tags)}"
+    if "got" not in error and not isinstance(value, dict | list):
+        error = f"{error}, got {value!r}"
+    return keys, error.replace("object", "table")
+
+
+def _tags(schema: Type, keys: Keys) -> list[object]:
+    """List what a key may hold that says which of several structs is meant."""
+    return [part.tag for part in _structs(schema, keys[:-1]) if part.tag_field == keys[-1]]
+
+
+def _fields(schema: Type, keys: Keys, table: Any) -> list[str]:
+    parts = _structs(schema, keys)
+    own = _value(table, keys)
+    meant = [part for part in parts if part.tag_field and part.tag == own.get(part.tag_field)]
+    part = (meant or parts)[0]
+    tag = [part.tag_field] if part.tag_field else []
+    return [*tag, *(field.encode_name for field in part.fields)]
+
+
+def _structs(schema: Type, keys: Keys) -> list[StructType]:
+    """List the structs that may stand at a place of the schema."""
+    types = list(_branches(schema))
+    for key in keys:
+        types = [inner for one in types for inner in _inside(one, key)]
+    return [one for one in types if isinstance(one, StructType)]
+
+
+def _inside(schema: Type, key: str | int) -> Iterable[Type]:
+    if isinstance(schema, VarTupleType):
+        yield from _branches(schema.item_type)
+    if isinstance(schema, StructType):
+        for field in schema.fields:
+            if field.encode_name == key:
+                yield from _branches(field.type)
+
+
+def _branches(schema: Type) -> Iterable[Type]:
+    return schema.types if isinstance(schema, UnionType) else (schema,)
+
+
+def _listed(names: Iterable[object]) -> str:
+    return ", ".join(map(str, names))

@@ -1,0 +1,241 @@
+"""Ways to the posterior of one epoch: ours, a plain loop with the eigenproblem, nested samplers."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import emcee
+import numpy as np
+from emcee.autocorr import integrated_time
+from numpy.random import MT19937, RandomState
+from numpy.typing import NDArray
+
+from lmshealth.inference import EpochPosterior, draw
+from lmshealth.priors import JointPrior
+from lmshealth.sampling import start_from_prior, stream
+from lmshealth.stage import Stage, load_stage
+from models.mapping import guide_frequencies
+from models.stages import stage_named
+
+Array = NDArray[np.float64]
+TRUTH = np.log([[0.8, 0.9]])
+# What two dozen logs of 20 s reach; the baseline is common to the modes of a log.
+STD, COMMON = 1e-3, 5e-4
+LEVELS = np.array([0.05, 0.5, 0.95])
+N_WALKERS = 32
+MISSING = "not installed; pip install '.[peers]'"
+
+
+def epoch_posterior(stage: Stage) -> EpochPosterior:
+    """Make the posterior of an epoch of LMS-Y with a fifth of the preload gone."""
+    modes = stage.informative
+    n = len(modes)
+    cov = STD**2 * np.eye(n) + COMMON**2 * np.ones((n, n))
+    return EpochPosterior.of(stage, modes, stage.drift(TRUTH, modes)[0], cov)
+
+
+@dataclass(frozen=True, slots=True)
+class Found:
+    """Quantiles of ln parameters, ``(3, n)``, effective sample size, and processor time in s."""
+
+    quantiles: Array
+    ess: float
+    cpu_s: float
+
+
+def timed(work: Callable[[], tuple[Array, float]]) -> Found:
+    """Measure processor time, so that what else runs on the machine hardly counts."""
+    begin = time.process_time()
+    quantiles, ess = work()
+    return Found(quantiles, ess, time.process_time() - begin)
+
+
+def exact(posterior: EpochPosterior, points: int) -> Array:
+    """Quantiles by a grid over the posterior, found from coarse to fine."""
+    low, high = posterior.prior.support
+    for n in (121, 121, points):
+        axes = [np.linspace(a, b, n) for a, b in zip(low, high, strict=True)]
+        grid = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 2)
+        value = posterior.log_probability(grid).reshape(n, n)
+        density = np.exp(value - value.max())
+        likely = np.argwhere(density > 1e-9)
+        first, last = likely.min(axis=0) - 1, likely.max(axis=0) + 1
+        low = np.array([axis[max(k, 0)] for axis, k in zip(axes, first, strict=True)])
+        high = np.array([axis[min(k, n - 1)] for axis, k in zip(axes, last, strict=True)])
+    columns = []
+    for j in range(2):
+        marginal = density.sum(axis=1 - j)
+        share = (np.cumsum(marginal) - 0.5 * marginal) / marginal.sum()
+        columns.append(np.interp(LEVELS, share, axes[j]))
+    return np.column_stack(columns)
+
+
+def ours(posterior: EpochPosterior, seed: int) -> Found:
+    """Draw as `lmshealth infer` does: Laplace's start, four ensembles, arviz's judgement."""
+
+    def work() -> tuple[Array, float]:
+        found = draw(posterior, stream(seed))
+        ess = min(found.ess_bulk.min(), found.ess_tail.min())
+        return np.quantile(found.flat, LEVELS, axis=0), float(ess)
+
+    return timed(work)
+
+
+def plain_loop(posterior: EpochPosterior, seed: int, steps: int, long: int) -> dict[str, Any]:
+    """Time emcee's default with one walker at a time and the plant solved for each.
+
+    So few steps tell no autocorrelation time. It is that of the same moves on the same density,
+    evaluated by the surrogate over many more steps.
+    """
+    machine, view = stage_named("lms-y"), posterior.views[0]
+    model_std = view.stage.description.map.model_std  # type: ignore[union-attr]
+    base = guide_frequencies(machine, 1.0, 1.0)
+
+    def drift(preload: float, mount: float) -> Array:
+        found = guide_frequencies(machine, preload, mount)
+        return np.array([np.log(found[name] / base[name]) for name in view.modes])
+
+    def log_probability(x: Array) -> float:
+        prior = float(posterior.prior.log_density(x[None])[0])
+        if not np.isfinite(prior):
+            return -np.inf
+        preload, mount = np.exp(x)
+        own = drift(preload, 1.0) ** 2 + drift(1.0, mount) ** 2
+        cov = view.cov + model_std**2 * np.diag(own)
+        off = view.drift - drift(preload, mount)
+        return prior - 0.5 * float(off @ np.linalg.solve(cov, off) + np.linalg.slogdet(cov)[1])
+
+    rng = np.random.default_rng(seed)
+    begin = start_from_prior(posterior.log_probability, posterior.draw_prior)(rng)[:N_WALKERS]
+    same = np.array([log_probability(x) for x in begin[:5]])
+    difference = np.ptp(same - posterior.log_probability(begin[:5]))
+    state = emcee.State(begin, random_state=RandomState(MT19937(seed)).get_state(legacy=False))
+    sampler = emcee.EnsembleSampler(N_WALKERS, 2, log_probability)
+    clock = time.process_time()
+    sampler.run_mcmc(state, steps)
+    cpu = (time.process_time() - clock) / steps
+    sampler = emcee.EnsembleSampler(N_WALKERS, 2, posterior.log_probability, vectorize=True)
+    sampler.run_mcmc(state, long)
+    tau = float(np.max(integrated_time(sampler.get_chain()[long // 5 :], tol=0, quiet=True)))
+    return {
+        "program": "emcee, plain loop with the eigenproblem inside",
+        "steps_measured": steps,
+        "autocorrelation_time": tau,
+        "ms_per_likelihood": 1e3 * cpu / N_WALKERS,
+        "ess_per_s": N_WALKERS / tau / cpu,
+        "largest_difference_of_log_probability": float(difference),
+    }
+
+
+def walker_loop(posterior: EpochPosterior, seed: int, steps: int) -> dict[str, Any]:
+    """Time emcee's default with the surrogate, but one walker at a time."""
+    rng = np.random.default_rng(seed)
+    begin = start_from_prior(posterior.log_probability, posterior.draw_prior)(rng)[:N_WALKERS]
+    state = emcee.State(begin, random_state=RandomState(MT19937(seed)).get_state(legacy=False))
+    sampler = emcee.EnsembleSampler(
+        N_WALKERS, 2, lambda x: float(posterior.log_probability(x[None])[0])
+    )
+    clock = time.process_time()
+    sampler.run_mcmc(state, steps)
+    cpu = time.process_time() - clock
+    tau = float(np.max(integrated_time(sampler.get_chain()[steps // 5 :], tol=0, quiet=True)))
+    return {
+        "program": "emcee, plain loop over our surrogate",
+        "steps_measured": steps,
+        "autocorrelation_time": tau,
+        "ess_per_s": N_WALKERS * steps / tau / cpu,
+    }
+
+
+def by_dynesty(posterior: EpochPosterior, seed: int) -> Found:
+    """Run dynesty's nested sampler as its guide does, with our surrogate one point at a time."""
+    import dynesty
+
+    prior = posterior.prior
+
+    def work() -> tuple[Array, float]:
+        sampler = dynesty.NestedSampler(
+            lambda x: float(_log_likelihood(posterior, x[None])[0]),
+            lambda u: prior.quantile(u[None])[0],
+            2,
+            rstate=np.random.default_rng(seed),
+        )
+        sampler.run_nested(print_progress=False)
+        weight = sampler.results.importance_weights()
+        return _weighted(sampler.results.samples, weight)
+
+    return timed(work)
+
+
+def by_nautilus(posterior: EpochPosterior, seed: int) -> Found:
+    """Run nautilus with our surrogate for all points at once."""
+    import nautilus
+
+    prior: JointPrior = posterior.prior
+
+    def work() -> tuple[Array, float]:
+        sampler = nautilus.Sampler(
+            prior.quantile,
+            lambda x: _log_likelihood(posterior, x),
+            n_dim=2,
+            vectorized=True,
+            pass_dict=False,
+            seed=seed,
+        )
+        sampler.run(verbose=False, n_eff=10_000)
+        points, log_weight, _ = sampler.posterior()
+        return _weighted(points, np.exp(log_weight - log_weight.max()))
+
+    return timed(work)
+
+
+def _log_likelihood(posterior: EpochPosterior, x: Array) -> Array:
+    return posterior.views[0].log_likelihood(x)
+
+
+def _weighted(points: Array, weight: Array) -> tuple[Array, float]:
+    ess = float(weight.sum() ** 2 / np.sum(weight**2))
+    quantiles = [
+        np.quantile(column, LEVELS, weights=weight, method="inverted_cdf") for column in points.T
+    ]
+    return np.column_stack(quantiles), ess
+
+
+def compare(seed: int, turns: int, *, quick: bool) -> dict[str, Any]:
+    """Let all ways take turns, and hold their quantiles to those of a grid."""
+    posterior = epoch_posterior(load_stage("lms-y"))
+    known = exact(posterior, 401)
+    ways: dict[str, Callable[[EpochPosterior, int], Found]] = {"lmshealth": ours}
+    missing = []
+    for name, way in (("dynesty", by_dynesty), ("nautilus", by_nautilus)):
+        try:
+            __import__(name)
+        except ImportError:
+            missing.append(f"{name}: {MISSING}")
+        else:
+            ways[name] = way
+    found: dict[str, list[Found]] = {name: [] for name in ways}
+    for turn in range(turns):
+        for name, way in ways.items():
+            found[name].append(way(posterior, seed + turn))
+    width = (known[2] - known[0]) / (2 * 1.645)
+    rows: list[dict[str, Any]] = []
+    for name, runs in found.items():
+        off = np.array([np.abs(run.quantiles - known) / width for run in runs])
+        rows.append(
+            {
+                "program": name,
+                "cpu_s": float(np.median([run.cpu_s for run in runs])),
+                "ess": float(np.median([run.ess for run in runs])),
+                "ess_per_s": float(np.median([run.ess / run.cpu_s for run in runs])),
+                "rms_error_of_quantiles": float(np.sqrt(np.mean(off**2))),
+            }
+        )
+    rows.append(walker_loop(posterior, seed, 300 if quick else 3000))
+    rows.append(plain_loop(posterior, seed, 3 if quick else 60, 2000 if quick else 20_000))
+    for row in rows:
+        row["ours_is_times_faster"] = rows[0]["ess_per_s"] / row["ess_per_s"]
+    return {"turns": turns, "programs": rows, "missing": missing}

@@ -1,0 +1,156 @@
+"""The posterior of a whole life: its time, and its likelihood beside a loop over filterpy."""
+
+from __future__ import annotations
+
+import time
+from datetime import UTC, datetime, timedelta
+from typing import Any
+
+import numpy as np
+from filterpy.kalman import KalmanFilter
+from numpy.typing import NDArray
+
+from lmshealth.inference import one_at_a_time
+from lmshealth.life import LifeLikelihood
+from lmshealth.prognosis import prognose
+from lmshealth.sampling import start_from_prior
+from lmshealth.stage import Stage, load_stage
+from lmshealth.tracks import History, Series
+
+Array = NDArray[np.float64]
+MODES = ("roll", "pitch")
+NOISE, WALK, TEMPERATURE = 8e-4, 5e-4, -8e-4
+START = datetime(2026, 3, 1, tzinfo=UTC)
+# Priors of life.py that a filter must know too.
+INTERCEPT_STD, TEMPERATURE_STD, REFERENCE = 0.1, 1e-3, 21.0
+
+
+def degrading_life(stage: Stage, n: int, rng: np.random.Generator) -> History:
+    """Make a life of wear and loosening as two modes show it, with temperature and a walk."""
+    travel = np.linspace(0.0, 3e6, n)
+    preload = (1 - travel / 9e6) ** 1.5
+    mount = 0.75 + 0.25 * np.exp(-travel / 2e6)
+    temperature = REFERENCE + 4 * rng.standard_normal(n)
+    walk = WALK / np.sqrt(n) * np.cumsum(rng.standard_normal((n, 2)), axis=0)
+    specs = {mode.name: mode for mode in stage.modes}
+    level = np.log([specs[name].frequency_hz for name in MODES])
+    drift = stage.drift(np.log(np.column_stack([preload, mount])), MODES)
+    warm = TEMPERATURE * (temperature - REFERENCE)[:, None]
+    ln_f = level + drift + warm + walk + NOISE * rng.standard_normal((n, 2))
+    cov = np.tile(np.diag([NOISE**2, NOISE**2, 0.05**2, 0.05**2]), (n, 1, 1))
+    return History(
+        stage="AX-Y",
+        logs=tuple(f"{k:04d}" for k in range(n)),
+        recorded_at=tuple(START + timedelta(days=2 * k) for k in range(n)),
+        travel=travel,
+        covariates={"temperature_c": temperature},
+        modes=MODES,
+        series=tuple(Series(name, "acc") for name in MODES),
+        ln_frequency=ln_f,
+        ln_damping=np.tile(np.log([specs[name].damping_ratio for name in MODES]), (n, 1)),
+        cov=cov,
+        loop_error=np.full(n, np.nan),
+        baselines=(0,),
+    )
+
+
+def by_filterpy(
+    history: History, drift: Array, alone: Array, *, walk: float, scale: float, model_std: float
+) -> float:
+    """Log likelihood of one life, log by log: intercept with its walk, temperature, map errors.
+
+    ``drift`` (n_logs, n_modes) is that of the life, ``alone`` (n_parameters, n_logs, n_modes) of
+    each parameter.
+    """
+    total = 0.0
+    clock = history.clock() / history.clock().max()
+    warm = history.covariates["temperature_c"] - REFERENCE
+    n_states = 2 + alone.shape[0]
+    for i in range(len(history.modes)):
+        filtered = KalmanFilter(dim_x=n_states, dim_z=1)
+        filtered.x = np.zeros(n_states)
+        filtered.P = np.diag([INTERCEPT_STD**2, TEMPERATURE_STD**2, *[model_std**2] * len(alone)])
+        filtered.F = np.eye(n_states)
+        y = history.ln_frequency[:, i] - history.ln_frequency[:, i].mean() - drift[:, i]
+        past = 0.0
+        for k in range(y.size):
+            filtered.predict(Q=np.diag([walk**2 * (clock[k] - past), *[0.0] * (n_states - 1)]))
+            past = clock[k]
+            h = np.array([[1.0, warm[k], *alone[:, k, i]]])
+            filtered.update(np.array([y[k]]), R=np.array([[scale**2 * NOISE**2]]), H=h)
+            s = float(filtered.S[0, 0])
+            total -= 0.5 * (float(filtered.y[0]) ** 2 / s + np.log(s))
+    return total
+
+
+def likelihoods(history: History, stage: Stage, walkers: int, looped: int) -> dict[str, Any]:
+    """Compare the time of a walker and the values, at one point of the grid of settings."""
+    likelihood = LifeLikelihood(history, stage)
+    begin = start_from_prior(likelihood.log_probability, likelihood.draw_prior, 300)
+    y = np.concatenate([begin(np.random.default_rng(k)) for k in range(8)])[:walkers]
+    n_all = likelihood.grid.walk.size
+    likelihood.narrow(y)
+    n_narrow = likelihood.grid.walk.size
+    best = int(np.argmax(likelihood.grid.log_weight - 0.5 * likelihood.grid.rest))
+    likelihood.grid = likelihood.grid.chosen(np.arange(n_narrow) == best)
+    walk, scale = float(likelihood.grid.walk[0]), float(likelihood.grid.noise_scale[0])
+    found = likelihood.log_probability(y) - likelihood.log_prior(y)
+    turns = max(400 // walkers, 1)
+    clock = time.process_time()
+    for _ in range(turns):
+        likelihood.log_probability(y)
+    ours = (time.process_time() - clock) / turns / walkers
+    assert stage.description.map is not None
+    x = np.log(likelihood.health(y[:looped], history.clock()))
+    clock = time.process_time()
+    book = []
+    for path in x:
+        flat = stage.drift(one_at_a_time(stage, path), MODES).reshape(3, -1, 2)
+        book.append(
+            by_filterpy(
+                history,
+                flat[0],
+                flat[1:],
+                walk=walk,
+                scale=scale,
+                model_std=stage.description.map.model_std,
+            )
+        )
+    loop = (time.process_time() - clock) / looped
+    return {
+        "logs": len(history.logs),
+        "modes": len(MODES),
+        "settings": {"all": n_all, "kept": n_narrow},
+        "walkers": walkers,
+        "us_per_walker": 1e6 * ours,
+        "us_per_walker_by_filterpy": 1e6 * loop,
+        "times_faster": loop / ours,
+        # Up to a constant, which is that of the grid's prior.
+        "largest_difference": float(np.ptp(found[:looped] - np.array(book))),
+        "spread_of_values": float(np.ptp(book)),
+    }
+
+
+def life_posterior(seed: int, turns: int, *, quick: bool) -> dict[str, Any]:
+    """Time the whole posterior with its convergence."""
+    stage = load_stage("lms-y")
+    rng = np.random.default_rng(seed)
+    history = degrading_life(stage, 40 if quick else 100, rng)
+    runs = []
+    for turn in range(turns):
+        wall, cpu = time.perf_counter(), time.process_time()
+        found = prognose(history, stage, seed + turn)
+        runs.append(
+            {
+                "cpu_s": time.process_time() - cpu,
+                "wall_s": time.perf_counter() - wall,
+                "ess": found.ess,
+                "r_hat": found.r_hat,
+            }
+        )
+    return {
+        "runs": runs,
+        "cpu_s": float(np.median([run["cpu_s"] for run in runs])),
+        "worst_r_hat": max(run["r_hat"] for run in runs),
+        "likelihood": likelihoods(history, stage, 64, 3 if quick else 20),
+    }
