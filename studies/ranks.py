@@ -112,8 +112,9 @@ def bands(rows: Iterable[Row]) -> dict[str, Any]:
     }
 
 
+@cache
 def digest(*names: str) -> str:
-    """SHA-256 over modules of the package: lives of other code are no evidence for this one."""
+    """Tell the code of modules of the package: lives of other code are no evidence for this."""
     total = hashlib.sha256()
     for name in names:
         total.update((_PACKAGE / f"{name}.py").read_bytes())
@@ -121,7 +122,10 @@ def digest(*names: str) -> str:
 
 
 def collect(
-    path: Path | None, code: str, tasks: Iterable[tuple[str, int]], work: Callable[..., Row]
+    path: Path | None,
+    code: Callable[[str], str],
+    tasks: Iterable[tuple[str, int]],
+    work: Callable[..., Row],
 ) -> list[Row]:
     """Do tasks one after the other, but for those that a file already has.
 
@@ -129,8 +133,8 @@ def collect(
     ----------
     path : Path or None
         Where a line of JSON is added for every task that is done.
-    code : str
-        Says by which code; lines of other code are not used.
+    code : callable
+        Says of a kind by which code it is done; lines of other code are not used.
     tasks : iterable of (str, int)
         What, and the number of the life.
     work : callable
@@ -139,12 +143,13 @@ def collect(
     done: dict[tuple[str, int], Row] = {}
     if path is not None and path.exists():
         lines = [json.loads(line) for line in path.read_text().splitlines()]
-        done = {(row["kind"], row["life"]): row for row in lines if row["code"] == code}
+        right = [row for row in lines if row["code"] == code(row["kind"])]
+        done = {(row["kind"], row["life"]): row for row in right}
     rows = []
     for kind, life in tasks:
         row = done.get((kind, life))
         if row is None:
-            row = {"kind": kind, "life": life, "code": code} | work(kind, life)
+            row = {"kind": kind, "life": life, "code": code(kind)} | work(kind, life)
             if path is not None:
                 with path.open("a") as file:
                     file.write(json.dumps(row) + "\n")

@@ -14,8 +14,9 @@ Method
     `EpochPosterior` are independent, by importance sampling; those of `infer`, on some of the
     same lives, are its chains. Ranks among 127 draws, ties at random, are held to the simultaneous
     band of their distribution at 99.9 %, and coverages to their 99.9 % Clopper-Pearson interval.
-    Negative controls that must fail: half the covariance of the drifts is told; half of that and
-    half the variance of the map's error; a map is taken for exact that is wrong by 5 %.
+    Negative controls that must fail: half of all covariances is told, those of the drifts and of
+    the map's error; a map is taken for exact that is wrong by 5 %. Told beside them: half of the
+    covariance of the drifts alone.
 Answer
     ANSWER
 Run time
@@ -62,12 +63,13 @@ DRIFTS, HALVED, EXACT = (
     "covariance of the drifts halved", "all covariances halved", "map taken as exact",
 )  # fmt: skip
 LIVES = {
-    ONE: 4000, SHARED: 1000, X: 1000, CHAINS: 500, DRIFTS: 4000, HALVED: 1000, EXACT: 1000,
+    ONE: 4000, SHARED: 1000, X: 1000, CHAINS: 500, DRIFTS: 1000, HALVED: 1000, EXACT: 1000,
 }  # fmt: skip
 QUICK = {ONE: 100, SHARED: 20, X: 20, CHAINS: 3, HALVED: 250, EXACT: 50}
 # Share of the map's true error that is believed.
 _LESS = {HALVED: np.sqrt(0.5), EXACT: 0.0}
-CODE = ("inference", "laplace", "sampling", "modalmap", "priors", "stage")
+# What a posterior is made of, and what chains are made of.
+MODEL, SAMPLER = ("inference", "modalmap", "priors", "stage"), ("laplace", "sampling")
 
 
 def main() -> None:
@@ -78,7 +80,7 @@ def main() -> None:
     options = parser.parse_args()
     watch, plan = Stopwatch(), QUICK if options.quick else LIVES
     tasks = [(kind, life) for kind, n in plan.items() for life in range(n)]
-    rows = collect(options.lives, digest(*CODE), tasks, one)
+    rows = collect(options.lives, code, tasks, one)
     answer: dict[str, Any] = {"seed": SEED, "lives": plan} | judged(rows)
     answer["passed"] = verdicts(answer["ranks"])
     answer["bands"] = bands(row for part in answer["ranks"].values() for row in part.values())
@@ -88,6 +90,11 @@ def main() -> None:
     failed = [name for name, fine in answer["passed"].items() if not fine]
     if failed:
         raise SystemExit(f"not as asked: {failed}")
+
+
+def code(kind: str) -> str:
+    """Tell by which code lives of a kind are done."""
+    return digest(*MODEL, *(SAMPLER if kind == CHAINS else ()))
 
 
 @cache
@@ -151,9 +158,7 @@ def verdicts(found: dict[str, dict[str, Row]]) -> dict[str, bool]:
     """Say what was asked and whether it is so."""
     checks = {f"ranks are uniform: {kind}": uniform(found[kind]) for kind in (ONE, SHARED, X)}
     checks[f"ranks are uniform: {CHAINS}"] = uniform(found[CHAINS])
-    for kind in (DRIFTS, HALVED, EXACT):
-        if kind not in found:
-            continue
+    for kind in (HALVED, EXACT):
         checks[f"they are not: {kind}"] = not any(
             row["inside_band"] for row in found[kind].values()
         )
