@@ -18,7 +18,8 @@ from lmshealth.examination import (
 )
 
 # A prior cut by more than this is not the one that was described; a correlation of more than this
-# is worth knowing; an exponent below this, times the priors' widths, is left out.
+# is worth knowing; an exponent below this, times the priors' widths, is left out, and so small a
+# share of what logs reach is no limit.
 _CUT, _CORRELATED, _SLIGHT = 0.01, 0.5, 0.05
 
 
@@ -147,6 +148,8 @@ def _surrogate(examined: Examination) -> Finding:
         text += (
             " It limits what can be told: make the map's grid denser, above all where modes cross."
         )
+    elif not good and share < _SLIGHT:
+        text += " It does not limit what can be told."
     return Finding("map", good, text)
 
 

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from xarray import DataTree
 
 # Share of the prior variance that data must have removed before a value is shown.
-_INFORMED = 0.5
+INFORMED = 0.5
 # What else is known about a posterior of health, one number per epoch and parameter.
 _CHECKS = ("ess_bulk", "ess_tail", "laplace_shift", "laplace_ratio", "prior_shift", "prior_ratio")
 
@@ -232,7 +232,7 @@ class Health:
 
     def told(self) -> BoolArray:
         """Tell which parameters the last epoch's data tell, not the prior, ``(n_parameters,)``."""
-        return np.asarray(self.informed[-1] >= _INFORMED)
+        return np.asarray(self.informed[-1] >= INFORMED)
 
     def quantile(self, level: float | FloatArray) -> FloatArray:
         """Quantiles of every parameter at every epoch, shape ``(..., n_epochs, n_parameters)``."""

@@ -88,7 +88,11 @@ def test_a_prior_and_a_limit_beyond_the_map(tmp_path: Path) -> None:
 
 def test_a_surrogate_is_judged_by_target_and_logs(fine: Examination) -> None:
     """Above the target is a fault; above what logs reach it needs a denser grid."""
-    for error, needle in ((2e-5, "more than the 1e-05 wanted"), (2e-3, "grid denser")):
+    for error, needle in (
+        (1.1e-5, "more than the 1e-05 wanted"),
+        (1.1e-5, "does not limit"),
+        (2e-3, "grid denser"),
+    ):
         modes = (replace(fine.modes[0], surrogate_error=error), fine.modes[1])
         (text,) = faults(replace(fine, modes=modes))
         assert needle in text

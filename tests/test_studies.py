@@ -197,6 +197,15 @@ def test_movable_roller(root: Path, needs: Callable[[str], None]) -> None:
     assert all(control["inside"] < 8 for control in answer["controls"].values())
 
 
+def test_sampling_speed(root: Path) -> None:
+    """Posteriors are those of a grid and of filterpy, and no other way to them is faster."""
+    answer = json.loads(run_study(root, "sampling_speed"))
+    assert all(answer["passed"].values())
+    programs = {row["program"] for row in answer["epoch"]["programs"]}
+    # Peers are compared where they are installed.
+    assert len(programs) == 5 - len(answer["epoch"]["missing"])
+
+
 def test_sbc_epoch(root: Path) -> None:
     """Ranks of health at an epoch are uniform; halved covariances and exact maps are found out."""
     answer = json.loads(run_study(root, "sbc_epoch"))
