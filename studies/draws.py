@@ -59,8 +59,6 @@ def draw(
         if effective > 20 * mean.size:
             mean = weight @ points
             cov = np.cov(points, rowvar=False, aweights=weight)
-        if effective > 0.2 * size:
-            size = 4 * _N
-        else:
-            size = min(2 * size, 4 * _N)
+        # Points are plenty where the proposal is right, and dear before.
+        size = min(2 * size, 4 * _N) if effective < 0.2 * size else 4 * _N
     return None

@@ -192,4 +192,4 @@ def draw_ecdf(
     ax.set_xlabel("rank of the truth (share of draws below)", fontsize=8)
     ax.set_ylabel("distribution minus uniform", fontsize=8)
     ax.tick_params(labelsize=7)
-    ax.legend(fontsize=6, loc="lower center", bbox_to_anchor=(0.5, -0.02), framealpha=0.6)
+    ax.legend(fontsize=6, loc="upper center", bbox_to_anchor=(0.5, -0.16), ncol=2, frameon=False)

@@ -20,7 +20,7 @@ def main() -> None:
     matplotlib.rcParams["svg.hashsalt"] = "sbc_life"
     result = json.loads((HERE / "result.json").read_text())
     ranks: dict[str, dict[str, Any]] = result["ranks"]
-    figure = Figure(figsize=(11.0, 7.0), layout="constrained")
+    figure = Figure(figsize=(11.0, 8.0), layout="constrained")
     left, right = figure.subfigures(1, 2, width_ratios=[1.0, 1.25])
     axes = left.subplots(3, 3, sharex=True, sharey=True)
     for ax, (name, row) in zip(axes.flat, ranks["posterior"].items(), strict=True):

@@ -121,7 +121,7 @@ def _covariates(rng: np.random.Generator) -> dict[str, Array]:
 def _covariate_effects(
     rng: np.random.Generator, machine: Stage, covariates: dict[str, Array], n_modes: int
 ) -> Array:
-    """What covariates do to ln f of each mode, where they are known and where they are not."""
+    """Draw what covariates do to ln f of each mode, be they known or not."""
     total = np.zeros((N_LOGS, n_modes))
     for one in regressors(covariates, machine):
         total += np.outer(one.values, one.prior_std * rng.standard_normal(n_modes))
@@ -143,7 +143,7 @@ def _steps(rng: np.random.Generator, series: tuple[Series, ...]) -> tuple[Step, 
 def _offsets(
     rng: np.random.Generator, series: tuple[Series, ...], mode: Array, steps: tuple[Step, ...]
 ) -> Array:
-    """What shifts readings without wear: the bias of a second source, and steps."""
+    """Draw what shifts readings without wear: the bias of a second source, and steps."""
     second = [one.mode in {other.mode for other in series[:i]} for i, one in enumerate(series)]
     total = np.tile(second * rng.normal(0, BIAS_STD[0], len(series)), (N_LOGS, 1))
     for step in steps:

@@ -58,7 +58,7 @@ from studies.ranks import (
 )
 from studies.record import Stopwatch, keep
 from studies.sbc_epoch.lives import believing
-from studies.sbc_life.lives import Life, draw
+from studies.sbc_life.lives import draw
 
 HERE = Path(__file__).parent
 SEED = 20261123
@@ -67,7 +67,10 @@ HALVED, EXACT, ERRORS = "all covariances halved", "map taken as exact", "reporte
 LIVES = {ONE: 2000, CHAINS: 100, HALVED: 500, EXACT: 500, ERRORS: 500}
 QUICK = {ONE: 40, CHAINS: 1, HALVED: 40}
 # What a posterior is made of, and what chains are made of.
-MODEL, SAMPLER = ("life", "laws", "inference", "modalmap", "priors", "stage"), ("prognosis", "sampling")
+MODEL, SAMPLER = (
+    ("life", "laws", "inference", "modalmap", "priors", "stage"),
+    ("prognosis", "sampling"),
+)
 LAWS = ("life of preload", "exponent of preload", "floor of mount", "length of mount")
 HEALTH = ("preload now", "mount now")
 REMAINING = ("remaining, preload", "remaining, mount", "remaining, first of both")

@@ -11,7 +11,6 @@ from pathlib import Path
 import numpy as np
 
 from lmshealth import life
-from lmshealth.arrays import FloatArray
 from lmshealth.life import LifeLikelihood
 from lmshealth.stage import Stage
 from lmshealth.tracks import History
