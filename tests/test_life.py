@@ -190,6 +190,15 @@ def test_settings_count_data_and_parameters(stage: Stage) -> None:
     assert chi_square > 0
 
 
+def test_settings_of_draws_are_the_mean_of_each(stage: Stage) -> None:
+    """Every draw of a posterior tells of walk and noise alike, likely ones no more than others."""
+    likelihood = LifeLikelihood(rough_history(np.random.default_rng(12)), stage)
+    y = coordinates(likelihood, 6)
+    alone = [likelihood.settings(draw[None])[:2] for draw in y]
+    np.testing.assert_allclose(likelihood.settings(y)[:2], np.mean(alone, axis=0))
+    assert np.ptp(alone, axis=0).min() > 1e-6
+
+
 def test_chi_square_of_a_life_as_stated_is_near_its_degrees_of_freedom(tmp_path: Path) -> None:
     """Data with the stated errors give χ² per degree of freedom near 1; doubled errors do not."""
     stage = make_stage(tmp_path, (FADING,), tail="")
