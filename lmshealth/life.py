@@ -31,7 +31,7 @@ from scipy.special import softmax
 from lmshealth.arrays import BoolArray, FloatArray
 from lmshealth.errors import NotEnoughData
 from lmshealth.inference import one_at_a_time
-from lmshealth.stage import ParameterSpec, Stage
+from lmshealth.stage import Stage
 from lmshealth.statespace import BIAS_STD, JUMP_STD, MOVES, regressors
 from lmshealth.tracks import History
 
@@ -311,8 +311,3 @@ class LifeLikelihood:
                 same * np.outer(seen, seen), JUMP_STD[step.kind][0] ** 2 * np.outer(there, there)
             )
         return total
-
-
-def limited(stage: Stage) -> list[tuple[int, ParameterSpec]]:
-    """Parameters that have a limit, with their position."""
-    return [(j, p) for j, p in enumerate(stage.parameters) if p.limit is not None]
