@@ -10,7 +10,8 @@ from lmshealth.decay import identify_decays
 from lmshealth.errors import LmshealthError
 from lmshealth.frf import read_frf
 from lmshealth.history import Reading, build_history
-from lmshealth.inference import infer
+from lmshealth.inference import infer, infer_together
+from lmshealth.lifefit import fit_life
 from lmshealth.modal import identify
 from lmshealth.pipeline import Settings, assess, run
 from lmshealth.planning import plan
@@ -28,9 +29,11 @@ __all__ = [
     "Settings",
     "assess",
     "build_history",
+    "fit_life",
     "identify",
     "identify_decays",
     "infer",
+    "infer_together",
     "judge",
     "load_stage",
     "plan",

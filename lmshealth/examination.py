@@ -15,6 +15,7 @@ from typing import Literal
 import numpy as np
 
 from lmshealth.arrays import FloatArray, freeze
+from lmshealth.results import INFORMED
 from lmshealth.sight import Sight, sight_of
 from lmshealth.stage import ModeSpec, ParameterSpec, Stage
 
@@ -22,7 +23,6 @@ from lmshealth.stage import ModeSpec, ParameterSpec, Stage
 SURROGATE_TARGET = 1e-5
 # Logs as they are usual; so many now as the baseline has.
 USUAL_DURATION = 60.0
-_INFORMED = 0.5  # of results: less is not told by the data
 
 Verdict = Literal["told", "longer-logs", "together", "not-told"]
 
@@ -297,5 +297,5 @@ def _tell(sight: Sight, j: int, usual: FloatArray) -> Telling:
         ("longer-logs", found.endless_std),
         ("together", found.known_std),
     )
-    told = (verdict for verdict, std in cases if found.informed(std) >= _INFORMED)
+    told = (verdict for verdict, std in cases if found.informed(std) >= INFORMED)
     return replace(found, verdict=next(told, "not-told"))

@@ -23,6 +23,7 @@ from lmshealth.laplace import approximate
 from lmshealth.priors import JointPrior, joined
 from lmshealth.results import Health
 from lmshealth.sampling import Sample, flattened, sample, start_from_prior, start_near, stream, thin
+from lmshealth.sight import identifiable, sight_of
 from lmshealth.stage import Stage
 from lmshealth.tracks import Drifts, Track
 
@@ -416,6 +417,11 @@ def _infer_all(
         converged=np.array([one.converged for one in found]),
         informed=np.clip(1 - flat.var(axis=1) / grid.var(axis=0), 0, 1),
         prior_width=np.exp(high) - np.exp(low),
+        identifiable=identifiable(
+            [sight_of(view.stage) for view in tasks[0].views],
+            [view.columns for view in tasks[0].views],
+            grid.var(axis=0),
+        ),
         correlation=np.stack([np.atleast_2d(np.corrcoef(one, rowvar=False)) for one in flat]),
         laplace_shift=stacked("laplace_shift"),
         laplace_ratio=stacked("laplace_ratio"),

@@ -26,12 +26,12 @@ from itertools import product
 
 import numpy as np
 from scipy.linalg import qr, solve_triangular
-from scipy.special import logsumexp, softmax
+from scipy.special import softmax
 
 from lmshealth.arrays import BoolArray, FloatArray
 from lmshealth.errors import NotEnoughData
 from lmshealth.inference import one_at_a_time
-from lmshealth.stage import ParameterSpec, Stage
+from lmshealth.stage import Stage
 from lmshealth.statespace import BIAS_STD, JUMP_STD, MOVES, regressors
 from lmshealth.tracks import History
 
@@ -189,10 +189,11 @@ class LifeLikelihood:
         return float(walk), float(scale), float(weight @ chi_square), self.y.size - self.n_dim
 
     def _weights(self, y: FloatArray) -> FloatArray:
+        """Posterior probability of each point of the grid, by draws of the posterior."""
         x, inside = self._path(y, np.isfinite(self.log_prior(y)))
         if not inside.any():
             raise NotEnoughData(f"{self.stage.name}: no life of the prior stays inside the map")
-        return np.asarray(softmax(logsumexp(self._terms(x), axis=1)))
+        return np.asarray(softmax(self._terms(x), axis=0).mean(axis=1))
 
     def _path(self, y: FloatArray, possible: BoolArray) -> tuple[FloatArray, BoolArray]:
         """Ln parameters at the nodes of the lives that stay inside the map, and which these are."""
@@ -310,8 +311,3 @@ class LifeLikelihood:
                 same * np.outer(seen, seen), JUMP_STD[step.kind][0] ** 2 * np.outer(there, there)
             )
         return total
-
-
-def limited(stage: Stage) -> list[tuple[int, ParameterSpec]]:
-    """Parameters that have a limit, with their position."""
-    return [(j, p) for j, p in enumerate(stage.parameters) if p.limit is not None]

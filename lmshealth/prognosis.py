@@ -8,15 +8,14 @@ import numpy as np
 
 from lmshealth.arrays import FloatArray
 from lmshealth.errors import BadStage, NotEnoughData
-from lmshealth.life import LifeLikelihood, limited
+from lmshealth.lifefit import fit_life
 from lmshealth.results import Prognosis
-from lmshealth.sampling import sample, start_from_prior, stream, thin
-from lmshealth.stage import Stage
+from lmshealth.sampling import stream
+from lmshealth.stage import ParameterSpec, Stage
 from lmshealth.tracks import History
 
-_STEP = 1 << 20  # far from the epochs that health counts its streams by
-_N_DRAWS = 10_000
-_N_CURVE = 121
+_STEP = 1 << 21
+_N_CURVE, _EVERY = 121, 5
 _SECONDS_PER_DAY = 86_400.0
 _KM = 1000.0
 _LEVELS = (0.05, 0.25, 0.5, 0.75, 0.95)
@@ -51,25 +50,27 @@ def prognose(history: History, stage: Stage, seed: int | Sequence[int]) -> Progn
     ends = limited(stage)
     if not ends:
         raise BadStage(f"{stage.name}: no [[parameter]] has a limit, so there is no end of life")
-    likelihood = LifeLikelihood(history, stage)
-    streams = stream(seed, _STEP).spawn(3)
-    y, ess, r_hat = _posterior(likelihood, streams[0], streams[1])
-    rng = np.random.default_rng(streams[2])
-    walk, noise_scale, chi_square, dof = likelihood.settings(y[:500])
-    remaining = np.empty((_N_DRAWS, len(ends) + 1))
-    parts = likelihood.split(y)
+    # Health has its streams by epoch, the life its own; this one is of the usage alone.
+    rng = np.random.default_rng(stream(seed, _STEP))
+    life = fit_life(history, stage, seed)
+    theta = [life.theta(j) for j, _ in ends]
+    laws = [parameter.law for _, parameter in ends]
     since = history.travel[-1] - history.travel[history.baseline]
-    for column, (j, parameter) in enumerate(ends):
+    remaining = np.empty((theta[0].shape[0], len(ends) + 1))
+    for column, (_, parameter) in enumerate(ends):
         assert parameter.limit is not None  # limited() has chosen
-        theta = likelihood.laws[j].natural(parts[j], likelihood.now)
         limit = parameter.limit.below / parameter.baseline
-        remaining[:, column] = likelihood.laws[j].passage(theta, limit) - since
+        remaining[:, column] = laws[column].passage(theta[column], limit) - since
     remaining[:, -1] = remaining[:, :-1].min(axis=1)
     horizon = stage.description.usage.horizon_km * _KM
     travel = _curve_grid(remaining[:, -1], since, horizon)
-    positions = [j for j, _ in ends]
     unit = np.array([parameter.baseline for _, parameter in ends])
-    curves = likelihood.health(y[:2000], travel)[..., positions] * unit
+
+    def health(moments: FloatArray, every: int) -> FloatArray:
+        paths = zip(laws, theta, strict=True)
+        values = np.stack([law.health(own[::every], moments) for law, own in paths], axis=-1)
+        return np.asarray(values * unit)
+
     start = history.travel[history.baseline]
     return Prognosis(
         stage=history.stage,
@@ -78,33 +79,18 @@ def prognose(history: History, stage: Stage, seed: int | Sequence[int]) -> Progn
         parameters=(*(p.name for _, p in ends), "any"),
         limits=np.array([p.limit.below for _, p in ends if p.limit] + [np.nan]),
         remaining=remaining,
-        usage=_usage(history, stage, rng),
+        usage=_usage(history, stage, rng, remaining.shape[0]),
         horizon=horizon,
-        health=likelihood.health(y, np.array([since]))[:, 0, positions] * unit,
+        health=health(np.array([since]), 1)[:, 0],
         curve_travel=travel + start,
-        curve_quantiles=np.quantile(curves, _LEVELS, axis=0),
-        chi_square=chi_square,
-        degrees_of_freedom=dof,
-        walk=walk,
-        noise_scale=noise_scale,
-        ess=ess,
-        r_hat=r_hat,
+        curve_quantiles=np.quantile(health(travel, _EVERY), _LEVELS, axis=0),
+        chi_square=life.chi_square,
+        degrees_of_freedom=life.degrees_of_freedom,
+        walk=life.walk,
+        noise_scale=life.noise_scale,
+        ess=life.ess,
+        r_hat=life.worst_r_hat,
     )
-
-
-def _posterior(
-    likelihood: LifeLikelihood, start: np.random.SeedSequence, seed: np.random.SeedSequence
-) -> tuple[FloatArray, float, float]:
-    """Draw sampling coordinates from the posterior: draws, worst ESS, worst R-hat."""
-    if likelihood.n_dim == 0:
-        return np.empty((_N_DRAWS, 0)), float("inf"), 1.0
-    begin = start_from_prior(likelihood.log_probability, likelihood.draw_prior, 300)
-    likelihood.narrow(begin(np.random.default_rng(start)))
-    begin = start_from_prior(likelihood.log_probability, likelihood.draw_prior, 300)
-    found = sample(likelihood.log_probability, begin, seed)
-    draws = thin(found.draws, _N_DRAWS // found.draws.shape[0])
-    ess = min(found.ess_bulk.min(), found.ess_tail.min())
-    return draws.reshape(-1, draws.shape[-1]), float(ess), float(found.r_hat.max())
 
 
 def _curve_grid(remaining: FloatArray, since: float, horizon: float) -> FloatArray:
@@ -113,7 +99,7 @@ def _curve_grid(remaining: FloatArray, since: float, horizon: float) -> FloatArr
     return np.linspace(0.0, since + min(max(1.3 * ahead, 0.5 * since), horizon), _N_CURVE)
 
 
-def _usage(history: History, stage: Stage, rng: np.random.Generator) -> FloatArray:
+def _usage(history: History, stage: Stage, rng: np.random.Generator, n_draws: int) -> FloatArray:
     """Draw the travel per day in m.
 
     Learned from the odometer: increments between logs are taken as independent, so that the total
@@ -121,7 +107,7 @@ def _usage(history: History, stage: Stage, rng: np.random.Generator) -> FloatArr
     """
     stated = stage.description.usage.km_per_day
     if stated is not None:
-        return np.full(_N_DRAWS, stated * _KM)
+        return np.full(n_draws, stated * _KM)
     seconds = np.array([moment.timestamp() for moment in history.recorded_at])
     days = np.diff(seconds) / _SECONDS_PER_DAY
     steps = np.diff(history.travel)
@@ -134,4 +120,9 @@ def _usage(history: History, stage: Stage, rng: np.random.Generator) -> FloatArr
     residual = steps[used] - rate * days[used]
     n = int(used.sum())
     relative = np.sqrt(n / (n - 1) * np.sum(residual**2)) / steps[used].sum()
-    return np.asarray(rate * np.exp(relative * rng.standard_normal(_N_DRAWS)))
+    return np.asarray(rate * np.exp(relative * rng.standard_normal(n_draws)))
+
+
+def limited(stage: Stage) -> list[tuple[int, ParameterSpec]]:
+    """Parameters that have a limit, with their position."""
+    return [(j, p) for j, p in enumerate(stage.parameters) if p.limit is not None]

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from xarray import DataTree
 
 # Share of the prior variance that data must have removed before a value is shown.
-_INFORMED = 0.5
+INFORMED = 0.5
 # What else is known about a posterior of health, one number per epoch and parameter.
 _CHECKS = ("ess_bulk", "ess_tail", "laplace_shift", "laplace_ratio", "prior_shift", "prior_ratio")
 
@@ -178,6 +178,10 @@ class Health:
         how much the data, and not the prior, say; shape ``(n_epochs, n_parameters)``.
     prior_width : ndarray
         Width of the prior's 90 % interval, shape ``(n_parameters,)``.
+    identifiable : ndarray of bool
+        Whether endless logs would tell a parameter, on average over the priors. One that they
+        would not may still be informed by chance: while nothing has drifted, the map's error does
+        not count. Shape ``(n_parameters,)``.
     correlation : ndarray
         Of the logarithms in the posterior, shape ``(n_epochs, n_parameters, n_parameters)``.
     laplace_shift, laplace_ratio : ndarray
@@ -202,6 +206,7 @@ class Health:
     converged: BoolArray
     informed: FloatArray
     prior_width: FloatArray
+    identifiable: BoolArray
     correlation: FloatArray
     laplace_shift: FloatArray
     laplace_ratio: FloatArray
@@ -216,6 +221,7 @@ class Health:
             expect_shape(name, getattr(self, name), (n, p))
         expect_shape("correlation", self.correlation, (n, p, p))
         expect_shape("prior_width", self.prior_width, (p,))
+        expect_shape("identifiable", self.identifiable, (p,))
         expect_shape("travel", self.travel, (n,))
         expect_shape("converged", self.converged, (n,))
         freeze(self)
@@ -232,7 +238,7 @@ class Health:
 
     def told(self) -> BoolArray:
         """Tell which parameters the last epoch's data tell, not the prior, ``(n_parameters,)``."""
-        return np.asarray(self.informed[-1] >= _INFORMED)
+        return np.asarray(self.identifiable & (self.informed[-1] >= INFORMED))
 
     def quantile(self, level: float | FloatArray) -> FloatArray:
         """Quantiles of every parameter at every epoch, shape ``(..., n_epochs, n_parameters)``."""
@@ -246,6 +252,7 @@ class Health:
         columns |= {name: getattr(self, name) for name in ("ess", "r_hat")}
         n, p = len(self.recorded_at), len(self.parameters)
         columns["converged"] = np.repeat(self.converged[:, None], p, axis=1)
+        columns["identifiable"] = np.tile(self.identifiable, (n, 1))
         columns |= {name: getattr(self, name) for name in ("informed", *_CHECKS)}
         columns |= {
             f"correlation_{name}": self.correlation[:, :, j]

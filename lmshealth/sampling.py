@@ -26,7 +26,7 @@ _R_HAT = 1.01
 _FIRST_STEPS = 250
 _MOST_STEPS = 20_000
 _LEAST_WALKERS = 32
-_START_ROUNDS = 6
+_MOST_ROUNDS = 60
 _START_ATTEMPTS = 100
 
 
@@ -218,7 +218,10 @@ def start_from_prior(
     draw_prior: Callable[[np.random.Generator, int], FloatArray],
     n_draws: int = 1000,
 ) -> Start:
-    """Begin where a few rounds of importance sampling narrow the prior down to the posterior.
+    """Begin where rounds of importance sampling narrow the prior down to the posterior.
+
+    They end when the weights of a round need no flattening any more: earlier than that the points
+    may lie tens of log units below the posterior.
 
     Parameters
     ----------
@@ -233,33 +236,35 @@ def start_from_prior(
     def start(rng: np.random.Generator) -> FloatArray:
         points = draw_prior(rng, n_draws)
         n_dim = points.shape[1]
+        n = _n_walkers(n_dim)
         proposal = np.zeros(points.shape[0])
-        for _ in range(_START_ROUNDS):
+        for k in range(_MOST_ROUNDS):
             log_weight = log_probability(points) - proposal
             if not np.isfinite(log_weight).any():
                 raise NotConverged(
                     "no draw of the prior lies inside the modal map: widen the map or the prior",
                     points,
                 )
-            weight = _tempered(log_weight, 10 * n_dim)
+            weight, power = _tempered(log_weight, 10 * n_dim)
+            if k and power == 1 and np.isfinite(log_weight).sum() >= 2 * n:
+                break
             mean = weight @ points
             off = points - mean
-            # Twice the variance: a proposal must be wider than what it is to find.
-            cov = 2 * (weight[:, None] * off).T @ off + 1e-16 * np.eye(n_dim)
+            # A proposal must be wider than what it is to find; flattened weights see to that too.
+            cov = 1.3 * (weight[:, None] * off).T @ off + 1e-16 * np.eye(n_dim)
             factor = np.linalg.cholesky(cov)
             unit = rng.standard_normal((n_draws, n_dim))
             points = mean + unit @ factor.T
             proposal = -0.5 * np.sum(unit**2, axis=1)
-        n = _n_walkers(n_dim)
-        weight = _tempered(log_probability(points) - proposal, 2 * n)
+        weight, _ = _tempered(log_probability(points) - proposal, 2 * n)
         chosen = rng.choice(points.shape[0], size=n, replace=False, p=weight)
         return np.asarray(points[chosen])
 
     return start
 
 
-def _tempered(log_weight: FloatArray, least: float) -> FloatArray:
-    """Weights, flattened by a power until they hold so many effective draws."""
+def _tempered(log_weight: FloatArray, least: float) -> tuple[FloatArray, float]:
+    """Weights, flattened by a power until they hold so many effective draws, and that power."""
     low, high = 0.0, 1.0
     top = np.where(np.isfinite(log_weight), log_weight - np.max(log_weight), -np.inf)
     support = np.isfinite(top)
@@ -270,11 +275,11 @@ def _tempered(log_weight: FloatArray, least: float) -> FloatArray:
         return np.asarray(value / value.sum())
 
     if 1 / np.sum(weights(1.0) ** 2) >= least:
-        return weights(1.0)
+        return weights(1.0), 1.0
     for _ in range(30):
         middle = (low + high) / 2
         if 1 / np.sum(weights(middle) ** 2) >= least:
             low = middle
         else:
             high = middle
-    return weights(low)
+    return weights(low), low

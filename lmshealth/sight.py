@@ -11,15 +11,17 @@ E = m² (S ∘ S) Λ and the surrogate's own.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 
-from lmshealth.arrays import FloatArray
+from lmshealth.arrays import BoolArray, FloatArray
 from lmshealth.bandfit import BAND
 from lmshealth.bounds import ambient_bound
 from lmshealth.errors import BadStage
 from lmshealth.modal import LEAST_RESOLUTION
+from lmshealth.results import INFORMED
 from lmshealth.stage import ModeSpec, Stage
 
 # What is more than this is no plan: what is left then, no logs take away.
@@ -107,6 +109,33 @@ class Sight:
         error = self.model_std**2 * self.slopes**2 @ self.prior + self.leave_out**2
         weighted = self.slopes / (noise + error)[:, None]
         return np.asarray(np.diag(1 / self.prior) + self.slopes.T @ weighted)
+
+
+def identifiable(
+    sights: Sequence[Sight], columns: Sequence[Sequence[int]], prior: FloatArray
+) -> BoolArray:
+    """Tell which of all parameters endless logs would tell, of one machine or of several together.
+
+    Parameters
+    ----------
+    sights : sequence of Sight
+        One per machine.
+    columns : sequence of sequence of int
+        Where the parameters of each stand among all.
+    prior : ndarray
+        Variances of all ln parameters in their priors, shape ``(n_parameters,)``.
+
+    Returns
+    -------
+    ndarray of bool
+        Shape ``(n_parameters,)``.
+    """
+    precision = np.diag(1 / prior)
+    for sight, places in zip(sights, columns, strict=True):
+        told = sight.precision(sight.endless_variance()) - np.diag(1 / sight.prior)
+        precision[np.ix_(places, places)] += told
+    left = np.diag(np.linalg.inv(precision))
+    return np.asarray(1 - left / prior >= INFORMED)
 
 
 def sight_of(stage: Stage) -> Sight:

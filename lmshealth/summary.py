@@ -178,7 +178,9 @@ def _why(stage: Stage, health: Health, told: list[int]) -> str:
     sentences = []
     for j, parameter in enumerate(stage.parameters):
         name = parameter.name.replace("_", " ").capitalize()
-        if j not in told:
+        if not health.identifiable[j]:
+            sentences.append(f"{name}: the tracked modes cannot tell.")
+        elif j not in told:
             sentences.append(f"{name}: these logs do not tell.")
         elif parameter.unit:
             sentences.append(

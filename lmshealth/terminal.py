@@ -129,8 +129,11 @@ def print_health(health: Health) -> None:
     for j, k in combinations(range(len(health.parameters)), 2):
         rho = health.correlation[-1, j, k]
         click.echo(f"Correlation of {health.parameters[j]} and {health.parameters[k]}: {rho:+.2f}.")
-    for name in np.array(health.parameters)[~health.told()]:
-        click.echo(f"{name}: these drifts do not tell it; this is its prior.")
+    for j, name in enumerate(health.parameters):
+        if not health.identifiable[j]:
+            click.echo(f"{name}: not identifiable by the tracked modes; see lmshealth stage.")
+        elif not health.told()[j]:
+            click.echo(f"{name}: these drifts do not tell it; this is its prior.")
     for when in np.flatnonzero(~health.converged):
         click.echo(f"The sampler did not converge at {health.recorded_at[when]:%Y-%m-%d}.")
 

@@ -443,6 +443,31 @@ def binomial_band(hits: int, n: int, level: float = 0.999) -> tuple[float, float
     return low, high
 
 
+def check_coverage(levels_of_truth: FloatArray, calibrated: bool) -> None:
+    """Hold the coverage of central 50 and 90 % intervals to its band, or outside of it.
+
+    Parameters
+    ----------
+    levels_of_truth : ndarray
+        Posterior probability below the truth, one per life.
+    calibrated : bool
+        Whether both coverages have to agree, or the 90 % one must be too low.
+    """
+    for level in (0.5, 0.9):
+        hits = int(np.sum(np.abs(levels_of_truth - 0.5) < level / 2))
+        low, high = binomial_band(hits, levels_of_truth.size)
+        if calibrated:
+            assert low <= level <= high, f"{level:.0%} intervals cover {low:.3f} to {high:.3f}"
+        elif level == 0.9:
+            assert high < level, f"{level:.0%} intervals cover {low:.3f} to {high:.3f}"
+
+
+def cdf_at(axis: FloatArray, density: FloatArray, truth: float) -> float:
+    """Probability below the truth of a density on an even axis."""
+    total = np.cumsum(density) - 0.5 * density
+    return float(np.interp(truth, axis, total / density.sum()))
+
+
 def channel_covariance(
     frequency: FloatArray,
     *,

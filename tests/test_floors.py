@@ -70,6 +70,7 @@ FLOORS = [
     {"inference", "planning", "examination"},
     {"findings"},
     {"life"},
+    {"lifefit"},
     {"prognosis"},
     {"summary", "plots"},
     {"store", "tables", "trackplots"},

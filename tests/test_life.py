@@ -11,7 +11,7 @@ import pytest
 from lmshealth import life
 from lmshealth.arrays import FloatArray
 from lmshealth.errors import NotEnoughData
-from lmshealth.life import LifeLikelihood, limited
+from lmshealth.life import LifeLikelihood
 from lmshealth.stage import Stage
 from lmshealth.tracks import History
 from tests.lives import (
@@ -190,6 +190,15 @@ def test_settings_count_data_and_parameters(stage: Stage) -> None:
     assert chi_square > 0
 
 
+def test_settings_of_draws_are_the_mean_of_each(stage: Stage) -> None:
+    """Every draw of a posterior tells of walk and noise alike, likely ones no more than others."""
+    likelihood = LifeLikelihood(rough_history(np.random.default_rng(12)), stage)
+    y = coordinates(likelihood, 6)
+    alone = [likelihood.settings(draw[None])[:2] for draw in y]
+    np.testing.assert_allclose(likelihood.settings(y)[:2], np.mean(alone, axis=0))
+    assert np.ptp(alone, axis=0).min() > 1e-6
+
+
 def test_chi_square_of_a_life_as_stated_is_near_its_degrees_of_freedom(tmp_path: Path) -> None:
     """Data with the stated errors give χ² per degree of freedom near 1; doubled errors do not."""
     stage = make_stage(tmp_path, (FADING,), tail="")
@@ -218,12 +227,6 @@ def test_laws_without_parameters_take_no_coordinate(tmp_path: Path) -> None:
     np.testing.assert_allclose(health[:, 0], 1)
 
 
-def test_limited_parameters_keep_their_position(tmp_path: Path) -> None:
-    """Parameters with a limit are found with their place among all."""
-    stage = make_stage(tmp_path, (FOOT, PRELOAD))
-    assert [(j, p.name) for j, p in limited(stage)] == [(1, "guide_preload")]
-
-
 @pytest.mark.parametrize(
     ("ln_f", "travel"),
     [
@@ -248,3 +251,27 @@ def test_baseline_units_do_not_matter(tmp_path: Path) -> None:
     y = np.array([[0.1], [0.3]])
     health = likelihood.health(y, np.array([likelihood.now]))
     np.testing.assert_allclose(health[:, 0, 0], [0.9, 0.7])
+
+
+def test_many_logs_are_told_by_few_nodes(stage: Stage) -> None:
+    """Of 80 logs two dozen nodes are enough, and what follows between them is right to 1e-7."""
+    rng = np.random.default_rng(12)
+    n = 80
+    history = make_history(
+        np.log(FREQUENCY[:2]) + 1e-3 * rng.standard_normal((n, 2)),
+        temperature=21 + rng.standard_normal(n),
+    )
+    likelihood = LifeLikelihood(history, stage)
+    assert likelihood.nodes.size < 24
+    y = coordinates(likelihood, 20, seed=5)
+    x = np.log([healths(likelihood, point, likelihood.clock) for point in y])
+    drift = np.moveaxis(true_drift(NAMES, x)[..., :2], 1, 2)
+    told = drift[..., likelihood.nodes] @ likelihood.weights.T
+    np.testing.assert_allclose(told, drift, atol=1e-7)
+    # Negative control: a node less than half of them does not tell.
+    few = np.linalg.lstsq(drift[..., likelihood.nodes[:6]].reshape(-1, 6), drift.reshape(-1, n))[0]
+    told = drift[..., likelihood.nodes[:6]] @ few
+    assert np.abs(told - drift).max() > 1e-6
+    found = likelihood.log_probability(y[:2]) - likelihood.log_prior(y[:2])
+    known = np.array([book(history, likelihood, point, 0.05) for point in y[:2]])
+    np.testing.assert_allclose(np.diff(found), np.diff(known), atol=1e-5)

@@ -13,7 +13,7 @@ import pytest
 from lmshealth import life, sampling
 from lmshealth.errors import BadStage, NotEnoughData
 from lmshealth.life import LifeLikelihood
-from lmshealth.prognosis import _usage, prognose
+from lmshealth.prognosis import _usage, limited, prognose
 from lmshealth.results import Prognosis
 from lmshealth.stage import Stage
 from lmshealth.tracks import History
@@ -22,6 +22,7 @@ from tests.lives import (
     FOOT,
     FREQUENCY,
     MOUNT,
+    PRELOAD,
     START,
     TEMPERATURE,
     make_history,
@@ -175,7 +176,7 @@ def test_usage_is_learned_from_the_odometer(unstated: Stage) -> None:
     history = make_history(
         np.tile(np.log(FREQUENCY[:2]), (41, 1)), travel=np.r_[0, np.cumsum(steps)]
     )
-    usage = _usage(history, unstated, np.random.default_rng(8))
+    usage = _usage(history, unstated, np.random.default_rng(8), 10_000)
     rate = steps.sum() / (40 * 7)
     relative = np.std(steps, ddof=1) / np.sqrt(40) / steps.mean()
     assert np.median(usage) == pytest.approx(rate, rel=5 * relative / 80)
@@ -187,10 +188,10 @@ def test_an_odometer_that_tells_no_usage_is_refused(unstated: Stage) -> None:
     history = fading_life(1e-4)
     once = replace(history, recorded_at=(START,) * 8)
     with pytest.raises(NotEnoughData, match=r"state \[usage\] km_per_day"):
-        _usage(once, unstated, np.random.default_rng(9))
+        _usage(once, unstated, np.random.default_rng(9), 10_000)
     twice = replace(history, recorded_at=(START,) * 4 + (START + timedelta(days=9),) * 4)
     with pytest.raises(NotEnoughData, match="km_per_day"):
-        _usage(twice, unstated, np.random.default_rng(9))
+        _usage(twice, unstated, np.random.default_rng(9), 10_000)
 
 
 def test_without_a_limit_there_is_no_end(tmp_path: Path) -> None:
@@ -221,3 +222,9 @@ def test_a_floor_above_the_limit_never_fails_and_one_below_does(tmp_path: Path) 
     assert 0.05 < infinite.mean() < 0.95
     assert np.isfinite(found.remaining[~infinite]).all()
     assert found.health.shape == (10_000, 1)
+
+
+def test_limited_parameters_keep_their_position(tmp_path: Path) -> None:
+    """Parameters with a limit are found with their place among all."""
+    stage = make_stage(tmp_path, (FOOT, PRELOAD))
+    assert [(j, p.name) for j, p in limited(stage)] == [(1, "guide_preload")]

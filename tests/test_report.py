@@ -284,6 +284,7 @@ def test_one_parameter_without_limit(make: Maker, tmp_path: Path) -> None:
         parameters=health.parameters[:1],
         chains=health.chains[..., :1],
         prior_width=health.prior_width[:1],
+        identifiable=health.identifiable[:1],
         correlation=health.correlation[:, :1, :1],
         **{name: getattr(health, name)[:, :1] for name in PER_PARAMETER},
     )

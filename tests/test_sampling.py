@@ -217,6 +217,21 @@ def test_starts_find_a_posterior_far_narrower_than_the_prior() -> None:
     assert points.std() > 3e-4
 
 
+def test_starts_go_on_until_they_have_arrived() -> None:
+    """A ridge that is a ten thousandth of the prior wide is reached, by few draws a round."""
+    slope = np.array([1.0, 0.99, -0.98, 1.01])
+
+    def ridge(x: FloatArray) -> FloatArray:
+        across = (x - 1.0) @ slope / 3e-4
+        return -0.5 * (across**2 + np.sum(((x - 1.0) / 0.1) ** 2, axis=1))
+
+    def prior(rng: np.random.Generator, n: int) -> FloatArray:
+        return 3 * rng.standard_normal((n, 4))
+
+    points = start_from_prior(ridge, prior, 300)(np.random.default_rng(4))
+    assert ridge(points).min() > -30
+
+
 def test_a_prior_outside_the_support_is_refused() -> None:
     """Where no draw of the prior is possible the error says what to widen, with the draws."""
     with pytest.raises(NotConverged, match="widen the map or the prior") as caught:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +10,8 @@ import pytest
 
 from lmshealth.bounds import ambient_bound
 from lmshealth.errors import BadStage
-from lmshealth.sight import Sight, sight_of
+from lmshealth.sight import Sight, identifiable, sight_of
+from lmshealth.stage import load_stage
 from tests.lives import DAMPING, FREQUENCY, MOUNT, PRELOAD, SENSITIVITY, make_stage
 
 NAMES = ("guide_preload", "mount_stiffness")
@@ -92,3 +94,14 @@ def test_without_a_map_there_is_nothing_to_see(tmp_path: Path) -> None:
     """The error says what to describe."""
     with pytest.raises(BadStage, match=r"no \[map\].*describe \[\[parameter\]\]"):
         sight_of(make_stage(tmp_path, ()))
+
+
+def test_what_is_identifiable_is_said_before_any_log() -> None:
+    """In X the mount is not, in Y both are; a shared guide makes the mount of X no better."""
+    x, y = (sight_of(load_stage(name)) for name in ("lms-x", "lms-y"))
+    assert identifiable([x], [(0, 1)], x.prior).tolist() == [True, False]
+    assert identifiable([y], [(0, 1)], y.prior).tolist() == [True, True]
+    prior = np.append(y.prior, x.prior[1])
+    assert identifiable([y, x], [(0, 1), (0, 2)], prior).tolist() == [True, True, False]
+    exact = replace(x, model_std=0.0)
+    assert identifiable([exact], [(0, 1)], x.prior).tolist() == [True, True]

@@ -217,3 +217,33 @@ def test_movable_roller(root: Path, needs: Callable[[str], None]) -> None:
     answer = json.loads(run_study(root, "movable_roller"))
     assert all(answer["passed"].values())
     assert all(control["inside"] < 8 for control in answer["controls"].values())
+
+
+def test_sampling_speed(root: Path) -> None:
+    """Posteriors are those of a grid and of filterpy, and no other way to them is faster."""
+    answer = json.loads(run_study(root, "sampling_speed"))
+    assert all(answer["passed"].values())
+    programs = {row["program"] for row in answer["epoch"]["programs"]}
+    # Peers are compared where they are installed.
+    assert len(programs) == 5 - len(answer["epoch"]["missing"])
+
+
+def test_sbc_epoch(root: Path) -> None:
+    """Ranks of health at an epoch are uniform; halved covariances and exact maps are found out."""
+    answer = json.loads(run_study(root, "sbc_epoch"))
+    assert all(answer["passed"].values())
+    assert answer["chains_not_converged"] == 0
+
+
+def test_sbc_life(root: Path) -> None:
+    """Ranks of laws, health and remaining life are uniform; with half the covariance some are not.
+
+    So few lives tell halved covariances by all coverages together.
+    """
+    answer = json.loads(run_study(root, "sbc_life"))
+    assert all(answer["passed"].values())
+    share = {
+        kind: sum(row["coverage"][1]["share"] for row in answer["ranks"][kind].values()) / 9
+        for kind in ("posterior", "all covariances halved")
+    }
+    assert share["all covariances halved"] < 0.82 < share["posterior"]

@@ -1,0 +1,44 @@
+"""Draw figure.svg from result.json: rank histograms, and distributions of ranks in their bands."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+from matplotlib.figure import Figure
+
+from studies.ranks import COLOURS, draw_ecdf, draw_histogram
+
+HERE = Path(__file__).parent
+SHOWN = ("preload now", "mount now", "remaining, first of both")
+
+
+def main() -> None:
+    """Draw histograms on the left, distributions on the right."""
+    matplotlib.rcParams["svg.hashsalt"] = "sbc_life"
+    result = json.loads((HERE / "result.json").read_text())
+    ranks: dict[str, dict[str, Any]] = result["ranks"]
+    figure = Figure(figsize=(11.0, 8.0), layout="constrained")
+    left, right = figure.subfigures(1, 2, width_ratios=[1.0, 1.25])
+    axes = left.subplots(3, 3, sharex=True, sharey=True)
+    for ax, (name, row) in zip(axes.flat, ranks["posterior"].items(), strict=True):
+        draw_histogram(ax, row, name)
+    left.supylabel("ranks per bin over expected", fontsize=8)
+    left.supxlabel("rank of the truth (share of draws below)", fontsize=8)
+    panels = right.subplots(2, 2)
+    lives = ranks["posterior"][SHOWN[0]]["n"]
+    draw_ecdf(panels[0, 0], ranks["posterior"], result["bands"], f"All, {lives:,} lives", COLOURS)
+    for ax, kind in zip(
+        panels.flat[1:],
+        ("by prognose", "all covariances halved", "map taken as exact"),
+        strict=True,
+    ):
+        rows = {name: ranks[kind][name] for name in SHOWN}
+        draw_ecdf(ax, rows, result["bands"], f"{kind}, {rows[SHOWN[0]]['n']:,} lives", COLOURS)
+    figure.savefig(HERE / "figure.svg", metadata={"Date": None})
+
+
+if __name__ == "__main__":
+    main()
