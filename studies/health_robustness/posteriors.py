@@ -12,7 +12,8 @@ import numpy as np
 
 from lmshealth import life as life_module
 from lmshealth.inference import EpochPosterior
-from lmshealth.life import LifeLikelihood, limited
+from lmshealth.life import LifeLikelihood
+from lmshealth.prognosis import limited
 from lmshealth.stage import Stage
 from lmshealth.tracks import History, Track
 from studies.importance import Draws, believed, explore
@@ -38,12 +39,14 @@ def life_draws(
     Parameters
     ----------
     noise_known : bool
-        Whether the stated covariance is believed; otherwise a factor on it is averaged over.
+        Whether the stated covariance is all; otherwise a factor on it and a random walk of the
+        frequencies are averaged over, and take what it does not explain.
     """
     if noise_known:
         with (
             patch.object(life_module, "_NOISE_SCALES", (1.0,)),
             patch.object(life_module, "_NOISE_SCALE_PRIOR", (1.0,)),
+            patch.object(life_module, "_WALKS", life_module._WALKS[:1]),
         ):
             likelihood = LifeLikelihood(history, stage)
     else:

@@ -12,6 +12,7 @@ import msgspec
 import numpy as np
 
 from lmshealth.modalmap import ModalMap, read_map
+from lmshealth.sight import identifiable, sight_of
 from lmshealth.stage import Stage, load_stage
 from models.lives import Visit, schedule
 from models.mapping import modal_map
@@ -80,6 +81,14 @@ def stage_with(name: str, model_std: float, plant: str = "") -> Stage:
         description=msgspec.structs.replace(stage.description, map=spec),
         modal_map=surrogate,
     )
+
+
+@cache
+def told(name: str) -> dict[str, bool]:
+    """Say which parameters the modes of a stage tell at all; ``any`` stands for all of them."""
+    sight = sight_of(load_stage(name))
+    shown = identifiable([sight], [range(len(sight.parameters))], sight.prior)
+    return {**dict(zip(sight.parameters, shown.tolist(), strict=True)), "any": bool(shown.all())}
 
 
 @cache
