@@ -103,7 +103,7 @@ def main() -> None:
     options = parser.parse_args()
     watch = Stopwatch()
     if options.raw:
-        answer: Row = {"lives": raw(options.raw, options.cache)}
+        answer = raw(options.raw, options.cache)
     else:
         answer = study(QUICK if options.quick else FULL)
     print(json.dumps(answer, indent=1))
@@ -331,9 +331,10 @@ def _worst(apart: list[np.ndarray]) -> float:
     return float(np.max(apart))
 
 
-def raw(seeds: int, cache: Path | None) -> list[Row]:
+def raw(seeds: int, cache: Path | None) -> Row:
     """Judge lives that were simulated and identified, as many of each kind as tracking_lives."""
-    result, lost = [], []
+    result: list[Row] = []
+    lost: list[str] = []
     for stage in STAGES:
         for kind in KINDS if stage == "lms-y" else HEALTHY:
             often = stage == "lms-y" and kind in HEALTHY and kind != "regreasing"
@@ -343,7 +344,7 @@ def raw(seeds: int, cache: Path | None) -> list[Row]:
                 for seed in range(RAW_SEED, RAW_SEED + seeds, 1 if often else 4)
             ]  # fmt: skip
             result += judged(cases, len(cases), lost)
-    return result
+    return {"lives": result, "not_drawn": lost}
 
 
 def verdicts(answer: Row) -> dict[str, bool]:
