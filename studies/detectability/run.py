@@ -15,14 +15,14 @@ Method
     their scatter about the truth.
 Answer
     One log of 20 s against one shows 5.0 % of preload and 4.4 % of mount stiffness on LMS-Y and
-    2.7 % of preload on LMS-X; five of 60 s against five 1.3, 1.2 and 0.8 %; twenty of 300 s against
-    twenty 0.3, 0.3 and 0.2 %. The mount of X is refused: no log shows it. At all nine points the
-    posterior's power (93 to 97 %) and false alarms (0.7 to 2.3 %) are the planned ones, as shipped too
-    as long as the other parameter is as it was. Where the other may be anywhere in its prior the
-    map's 5 % decide on LMS-Y: the power of the same losses falls to 68 and 79 % from single logs
-    and to 6 % from the most, which is what planning leaves out; false alarms stay below the
-    declared. Standard deviations of simulated logs are 1.0 to 1.3 times the bound, most where logs
-    are long, and their errors agree with them within chance.
+    2.7 % of preload on LMS-X; five of 60 s against five 1.3, 1.2 and 0.8 %; twenty of 300 s
+    against twenty 0.3, 0.3 and 0.2 %. The mount of X is refused: no log shows it. At all nine
+    points the posterior's power (93 to 97 %) and false alarms (0.7 to 2.3 %) are the planned
+    ones, as shipped too as long as the other parameter is as it was. Where the other may be
+    anywhere in its prior the map's 5 % decide on LMS-Y: the power of the same losses falls to 68
+    and 79 % from single logs and to 6 % from the most, which is what planning leaves out; false
+    alarms stay below the declared. Standard deviations of simulated logs are 1.0 to 1.3 times the
+    bound, most where logs are long, and their errors agree with them within chance.
 Run time
     Six minutes of one processor.
 """

@@ -89,7 +89,8 @@ def draw_demo(ax: Axes, rows: list[Row]) -> None:
         ax.barh(y, 100 * row["width"], 0.32, color=colour)
         rms = 3.29 * row["error"]["rms"]
         ax.plot(100 * rms, y, "|", ms=11, mew=2, color=BLACK)
-        ax.text(100 * row["width"] + 0.2, y, f"{100 * row['third']:.0f} % in a third", va="center",
+        side = 100 * max(row["width"], rms) + 0.2
+        ax.text(side, y, f"{100 * row['third']:.0f} % in a third", va="center",
                 fontsize=7)  # fmt: skip
     ax.plot([], [], "|", ms=11, mew=2, color=BLACK, label="3.29 × rms error of the median")
     ax.set_yticks(range(len(names)), names)
@@ -116,6 +117,13 @@ def main() -> None:
     result = json.loads((HERE / "result.json").read_text(encoding="utf-8"))
     kept = HERE / "raw.json"
     raw = json.loads(kept.read_text(encoding="utf-8"))["lives"] if kept.exists() else []
+    more = HERE / "control.json"
+    if more.exists():
+        control = json.loads(more.read_text(encoding="utf-8"))["fleets"]
+        arms = {(row["stage"], row["arm"]) for row in control}
+        result["fleets"] = control + [
+            row for row in result["fleets"] if (row["stage"], row["arm"]) not in arms
+        ]
     figure = Figure(figsize=(13, 15), layout="constrained")
     top, middle, bottom = figure.subfigures(3, 1, height_ratios=(2.1, 1.3, 1.5))
     lives, fleets, plants = result["lives"], result["fleets"], result["plants"]

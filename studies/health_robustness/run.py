@@ -23,9 +23,31 @@ Method
     log, or coherent. Controls that must fail: no error term where the map is wrong; covariances
     halved. Maps of four wrong plants are robustness figures only.
 Answer
-    TO BE WRITTEN
+    Lives of ten kinds, 400 drawn and 104 raw: of parameters that the modes tell, 90 % intervals
+    at an epoch hold the truth in 97 to 99 % (raw 90 to 100 %), 50 % ones in 71 to 89 %; medians
+    are off by 0.3 % at most in the mean where nothing is damaged, by 1.5 % after damage, most
+    after crashes. That they are too wide is the error term of a map that is right: of lives of
+    the demo's kind it doubles the widths (7.5 and 6.5 % against 3.5 and 2.8 %) while the medians
+    stay where they are, so that 80 % lie inside the middle third; without it 44 to 46 % do, where
+    42 % should, and as many with a map that is really 5 % wrong. Drift variances and priors have
+    no part.
+
+    Drawn lives, a map 5 % wrong: with the coherent error term intervals cover in all questions
+    (86 to 96 % on LMS-Y); without it 59 to 82 %, taken as new at every log 67 to 84 %. Map right
+    and no error term: 90 to 99 %. Plants with masses and load 10 % off need no error term; where
+    guide or preload law are off by 5 to 10 % preload or mount drop to 60 to 72 % without it and
+    are held with it. Sensitivities 18 % wrong (blocks farther apart) are more than it says: 37 to
+    67 %, with it 84 and 97 %.
+
+    Not held: laws that always lose. Where a parameter stays as it was, health by the laws is 0.3
+    to 1.3 % too low on LMS-Y, its central intervals never hold a health of one, and the other one
+    is 1 % too high; after a crash or a broken bolt it is off by 10 to 15 %, where epochs are not.
+    The mount of X is its prior: schedules that lose a fifth of it are read as if nothing was
+    lost.
+
+    CONTROL
 Run time
-    TO BE WRITTEN
+    A quarter of an hour of one processor; raw lives that are kept, a minute.
 """
 
 from __future__ import annotations
@@ -77,12 +99,13 @@ KINDS = HEALTHY + DAMAGED
 FIRST_SEED, RAW_SEED = 8000, 100
 MAP_STD = 0.05  # as the descriptions have it
 RIGHT, WRONG = "map right", "map 5 % wrong"
+HALVED = Arm("no error term, R halved", 0.0, shrink=0.5)
 # World, and what the estimator believes there.
-ARMS = {
+ARMS: dict[str, tuple[Arm, ...]] = {
     RIGHT: (
         Arm("no error term", 0.0),
         Arm("coherent", MAP_STD),
-        Arm("no error term, R halved", 0.0, shrink=0.5),
+        HALVED,
     ),
     WRONG: (
         Arm("no error term", 0.0),
@@ -99,17 +122,20 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--quick", action="store_true")
     parser.add_argument("--raw", type=int, default=0, metavar="SEEDS")
+    parser.add_argument("--control", type=int, default=0, metavar="LIVES")
     parser.add_argument("--cache", type=Path, help="folder that keeps estimates of raw lives")
     options = parser.parse_args()
     watch = Stopwatch()
+    name = "result"
     if options.raw:
-        answer = raw(options.raw, options.cache)
+        name, answer = "raw", raw(options.raw, options.cache)
+    elif options.control:
+        name, answer = "control", control(options.control)
     else:
         answer = study(QUICK if options.quick else FULL)
     print(json.dumps(answer, indent=1))
     if not options.quick:
-        path = HERE / ("raw.json" if options.raw else "result.json")
-        keep(path, __doc__.split("\n")[0], answer, watch)
+        keep(HERE / f"{name}.json", __doc__.split("\n")[0], answer, watch)
     failed = [name for name, fine in answer.get("passed", {}).items() if not fine]
     if failed and not options.quick:
         raise SystemExit(f"not as asked: {failed}")
@@ -211,10 +237,13 @@ def rows(found: dict[str, list[list[Answer]]], head: Row, courses: tuple[str, ..
     ]
 
 
-def drawn_fleets(stage: str, n_path: int, n_law: int, sizes: Sizes, lost: list[str]) -> list[Row]:
+def drawn_fleets(
+    stage: str, n_path: int, n_law: int, sizes: Sizes, lost: list[str],
+    worlds: dict[str, tuple[Arm, ...]] = ARMS,
+) -> list[Row]:  # fmt: skip
     """Judge lives on paths and by laws, drawn from the priors, in both worlds and all arms."""
     result = []
-    for world, arms in ARMS.items():
+    for world, arms in worlds.items():
         paths = on_paths(stage, n_path, sizes, world)
         followed = tracked(histories(paths), stage_with(stage, MAP_STD))
         laws = histories(by_laws_drawn(stage, n_law, sizes, world))
@@ -345,6 +374,25 @@ def raw(seeds: int, cache: Path | None) -> Row:
             ]  # fmt: skip
             result += judged(cases, len(cases), lost)
     return {"lives": result, "not_drawn": lost}
+
+
+def control(n: int) -> Row:
+    """Judge more lives with halved covariances, which must not cover."""
+    lost: list[str] = []
+    sizes = {"lms-y": measured("lms-y", FULL["sized"])}
+    rows = drawn_fleets("lms-y", n, n, sizes, lost, {RIGHT: (HALVED,)})
+    failing = {
+        what: all(row["90"]["high"] < 0.9 for row in rows if row["what"] == what)
+        for what in ("last", "now")
+    }
+    return {
+        "fleets": rows,
+        "not_drawn": lost,
+        "passed": {
+            "halved covariances fail at epochs": failing["last"],
+            "halved covariances fail by the laws": failing["now"],
+        },
+    }
 
 
 def verdicts(answer: Row) -> dict[str, bool]:
