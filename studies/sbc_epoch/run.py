@@ -35,8 +35,9 @@ from typing import Any
 
 import numpy as np
 
-from lmshealth.inference import EpochPosterior, infer
+from lmshealth.epoch import EpochPosterior
 from lmshealth.inference import draw as draw_chains
+from lmshealth.inference import infer
 from lmshealth.sampling import stream
 from lmshealth.stage import Stage, load_stage
 from studies.draws import draw as draw_points
