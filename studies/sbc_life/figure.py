@@ -32,7 +32,7 @@ def main() -> None:
     draw_ecdf(panels[0, 0], ranks["posterior"], result["bands"], f"All, {lives:,} lives", COLOURS)
     for ax, kind in zip(
         panels.flat[1:],
-        ("by prognose", "all covariances halved", "map taken as exact"),
+        ("by chains", "all covariances halved", "map taken as exact"),
         strict=True,
     ):
         rows = {name: ranks[kind][name] for name in SHOWN}
