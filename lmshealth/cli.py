@@ -22,9 +22,11 @@ from lmshealth.magnitudes import find_growth
 from lmshealth.options import (
     COLUMNS,
     DETECT,
+    EPOCHS,
     FORMAT,
     LOGS,
     PART,
+    SEED,
     SHARE,
     STAGE,
     checked_band,
@@ -86,14 +88,8 @@ def main() -> None:
 )
 @click.option("--store", help="SQLAlchemy URL of the store; default a SQLite file in --out.")
 @click.option("--workers", type=click.IntRange(1), help="Processes; default one per processor.")
-@click.option(
-    "--epochs",
-    type=click.IntRange(1),
-    default=40,
-    show_default=True,
-    help="Infer health at no more than this many epochs per stage.",
-)
-@click.option("--seed", type=click.IntRange(0), default=0, show_default=True)
+@EPOCHS
+@SEED
 @click.pass_context
 def run(
     ctx: click.Context, /, logs: Path, stages: tuple[str, ...], out: Path, **options: Any

@@ -11,7 +11,7 @@ import click
 
 from lmshealth import terminal
 from lmshealth.errors import BadTable, NotEnoughData
-from lmshealth.options import STAGE, examples
+from lmshealth.options import EPOCHS, SEED, STAGE, examples
 
 if TYPE_CHECKING:
     from lmshealth.logs import Refusal
@@ -150,14 +150,8 @@ def _write_text(target: Path, text: str) -> None:
 @click.option(
     "--shared", multiple=True, metavar="PARAMETER", help="What the machines have in common."
 )
-@click.option(
-    "--epochs",
-    type=click.IntRange(1),
-    default=40,
-    show_default=True,
-    help="Infer health at no more than this many epochs per machine.",
-)
-@click.option("--seed", type=click.IntRange(0), default=0, show_default=True)
+@EPOCHS
+@SEED
 @click.pass_context
 def infer(ctx: click.Context, /, table: Path, **options: Any) -> None:
     """Infer what is left of the health parameters, epoch by epoch, from a track.

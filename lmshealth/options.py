@@ -27,6 +27,14 @@ PART = click.option(
     show_default=True,
     help="Read all of the log, or what its set point says is this.",
 )
+EPOCHS = click.option(
+    "--epochs",
+    type=click.IntRange(1),
+    default=40,
+    show_default=True,
+    help="Infer health at no more than this many epochs per machine.",
+)
+SEED = click.option("--seed", type=click.IntRange(0), default=0, show_default=True)
 SHARE = click.FloatRange(0, 1, min_open=True, max_open=True)
 
 

@@ -225,3 +225,9 @@ def test_sbc_life(root: Path) -> None:
         for kind in ("posterior", "all covariances halved")
     }
     assert share["all covariances halved"] < 0.82 < share["posterior"]
+
+
+def test_one_guide(root: Path) -> None:
+    """The preload of a shared guide is known better, and the mount of X is never claimed."""
+    answer = json.loads(run_study(root, "one_guide"))
+    assert all(answer["passed"].values())

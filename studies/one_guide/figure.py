@@ -1,0 +1,78 @@
+"""Draw figure.svg from result.json: widths of what is known alone and together, and coverages."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+HERE = Path(__file__).parent
+BLUE, ORANGE, GREEN, BLACK = "#0072b2", "#d55e00", "#009e73", "#000000"
+
+
+def rows_of(answer: dict[str, Any]) -> list[tuple[str, dict[str, Any]]]:
+    """Name every parameter of every way."""
+    return [
+        (f"{way}: {name.split(':')[-1].replace('_', ' ')}" + machine(name), own)
+        for way, parameters in answer["ways"].items()
+        for name, own in parameters.items()
+    ]
+
+
+def machine(name: str) -> str:
+    """Say whose parameter one of several is."""
+    return f" of {name.split(':')[0][-1].upper()}" if ":" in name else ""
+
+
+def draw_widths(ax: Axes, rows: list[tuple[str, dict[str, Any]]]) -> None:
+    """Draw the median width of the 90 % interval of ln parameter, hatched where it is no claim."""
+    for y, (_, own) in enumerate(rows):
+        claimed = own["told"] > 0.5
+        ax.barh(y, 100 * own["median_width"], color=BLUE if claimed else "white", height=0.6,
+                edgecolor=BLACK, hatch=None if claimed else "///", lw=0.8)  # fmt: skip
+        text = f"{100 * own['median_width']:.1f} %"
+        ax.text(108 * own["median_width"], y, text if claimed else f"{text}, not claimed",
+                va="center", fontsize=8)  # fmt: skip
+    ax.set_xscale("log")
+    ax.set_xlim(1, 600)
+    ax.set_yticks(range(len(rows)), [name for name, _ in rows], fontsize=8)
+    ax.set_ylim(len(rows) - 0.4, -0.6)
+    ax.set_xlabel("median width of the 90 % interval of ln parameter")
+    ax.set_title("What is known", fontsize=10)
+
+
+def draw_coverage(ax: Axes, rows: list[tuple[str, list[dict[str, Any]], bool]]) -> None:
+    """Draw coverages of 50 and 90 % intervals with their Clopper-Pearson intervals."""
+    for y, (_, levels, control) in enumerate(rows):
+        for row in levels:
+            ax.plot([row["low"], row["high"]], [y, y], lw=2, color=ORANGE if control else BLUE)
+            ax.plot(row["share"], y, "x" if control else "o", color=ORANGE if control else BLUE,
+                    ms=5)  # fmt: skip
+    for level in (0.5, 0.9):
+        ax.axvline(level, color=BLACK, lw=0.8, ls="--")
+    ax.set_yticks(range(len(rows)), [name for name, _, _ in rows], fontsize=8)
+    ax.set_ylim(len(rows) - 0.5, -0.5)
+    ax.set_xlim(0, 1.02)
+    ax.set_xlabel("share of 50 and 90 % intervals that hold the truth, with 99.9 % interval")
+    ax.set_title("Whether intervals cover (×: controls that must not)", fontsize=10)
+
+
+def main() -> None:
+    """Draw the figure."""
+    answer = json.loads((HERE / "result.json").read_text(encoding="utf-8"))
+    matplotlib.rcParams["svg.hashsalt"] = "one_guide"
+    fig = Figure(figsize=(11.5, 4.2), layout="constrained")
+    left, right = fig.subplots(1, 2)
+    rows = rows_of(answer)
+    draw_widths(left, rows)
+    controls = [(f"control: {name}", own, True) for name, own in answer["controls"].items()]
+    draw_coverage(right, [(name, own["coverage"], False) for name, own in rows] + controls)
+    fig.savefig(HERE / "figure.svg", metadata={"Date": None})
+
+
+if __name__ == "__main__":
+    main()
