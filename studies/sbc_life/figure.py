@@ -24,7 +24,7 @@ def main() -> None:
     left, right = figure.subfigures(1, 2, width_ratios=[1.0, 1.25])
     axes = left.subplots(3, 3, sharex=True, sharey=True)
     for ax, (name, row) in zip(axes.flat, ranks["posterior"].items(), strict=True):
-        draw_histogram(ax, row, name)
+        draw_histogram(ax, row, name.replace(", ", ",\n"))
     left.supylabel("ranks per bin over expected", fontsize=8)
     left.supxlabel("rank of the truth (share of draws below)", fontsize=8)
     panels = right.subplots(2, 2)
