@@ -27,7 +27,8 @@ Answer
     of what one does not know after so many logs most is the error of the map.
 Run time
     Of one processor some 25 lives a second, and a second for each of the chains of `infer`. With
-    ``--lives FILE`` lives done before are not done again, and the recorded time is that of the rest.
+    ``--lives FILE`` lives done before are not done again, and the recorded time is that of the
+    rest.
 """
 
 from __future__ import annotations
