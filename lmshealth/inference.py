@@ -1,14 +1,4 @@
-"""Health without a law: posterior of the health parameters at one epoch, from the drifts.
-
-The drifts δ of the tracked modes have covariance C from the filter. The modal map predicts h(x);
-its sensitivities are believed to a relative standard deviation m, so that the error of mode i has
-the variance E_i(x) = Σ_j (m h_i^j)², h^j being the drift that parameter j causes alone. Then
-δ ~ N(h(x), C + E(x)), with x the ln parameters. The errors of a map are the same at all epochs of a
-life: every epoch by itself is judged rightly, but not the difference of two.
-
-Machines that share a part, such as one guide that serves two configurations, have one posterior of
-all their parameters, the shared ones once: their likelihoods multiply.
-"""
+"""Health without a law: the health parameters at single epochs, from the drifts of the modes."""
 
 from __future__ import annotations
 
@@ -18,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from lmshealth.arrays import BoolArray, FloatArray
+from lmshealth.epoch import EpochPosterior, View
 from lmshealth.errors import BadStage, NotConverged, NotEnoughData
 from lmshealth.laplace import approximate
 from lmshealth.priors import JointPrior, joined
@@ -29,10 +20,11 @@ from lmshealth.tracks import Drifts, Track
 
 _N_KEPT = 1000  # draws of each ensemble
 _N_SEARCHED, _PRIOR_POINTS = 200, 4096
-# How much wider the priors are made to see what hangs on them, and what share of the draws must be
-# left of them by reweighting; with less, draws do not reach far enough and new ones are made.
-_WIDER, _LEAST_SHARE = 2.0, 0.8
+# What share of the draws must be left by reweighting them for wider priors: with less, they do not
+# reach far enough and new ones are made.
+_LEAST_SHARE = 0.8
 _LEVELS = (0.05, 0.5, 0.95)
+_N_JUDGED = 500  # draws by which the fit is judged
 
 
 def epochs_to_infer(track: Drifts | Track, stage: Stage, most: int) -> tuple[int, ...]:
@@ -175,7 +167,10 @@ def _usable_modes(track: Drifts | Track, stage: Stage) -> tuple[str, ...]:
 def _chosen(track: Drifts | Track, stage: Stage, epochs: Sequence[int] | None) -> tuple[int, ...]:
     chosen = tuple(epochs if epochs is not None else epochs_to_infer(track, stage, 40))
     if not chosen:
-        raise NotEnoughData(f"{track.stage}: no epoch after the baseline")
+        raise NotEnoughData(
+            f"{track.stage}: no epoch has a drift of any of the modes {list(stage.informative)} "
+            "with a standard deviation above 0; those of the baseline itself have none"
+        )
     return chosen
 
 
@@ -196,109 +191,6 @@ def _seen(
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class View:
-    """What one machine shows at one epoch.
-
-    Attributes
-    ----------
-    stage : Stage
-        Its modal map.
-    modes : tuple of str
-        Modes used.
-    drift : ndarray
-        Shape ``(n_modes,)``.
-    cov : ndarray
-        Its covariance, shape ``(n_modes, n_modes)``.
-    columns : tuple of int
-        Where its parameters stand among all.
-    """
-
-    stage: Stage
-    modes: tuple[str, ...]
-    drift: FloatArray
-    cov: FloatArray
-    columns: tuple[int, ...]
-
-    def log_likelihood(self, x: FloatArray) -> FloatArray:
-        """Log likelihood of all ln parameters, inside the map, shape ``(n_points,)``."""
-        own = x[:, self.columns]
-        n, n_parameters = own.shape
-        drift = self.stage.drift(one_at_a_time(self.stage, own), self.modes)
-        drift = drift.reshape(n_parameters + 1, n, -1)
-        model_std = self.stage.description.map.model_std if self.stage.description.map else 0.0
-        error = model_std**2 * np.sum(drift[1:] ** 2, axis=0)
-        cov = self.cov + error[:, :, None] * np.eye(len(self.modes))
-        off = self.drift - drift[0]
-        solved = np.linalg.solve(cov, off[..., None])[..., 0]
-        return np.asarray(-0.5 * (np.sum(off * solved, axis=1) + np.linalg.slogdet(cov)[1]))
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class EpochPosterior:
-    """Log posterior of the ln parameters at one epoch, of one machine or several together.
-
-    Attributes
-    ----------
-    prior : JointPrior
-        Of all parameters.
-    views : tuple of View
-        One per machine.
-    """
-
-    prior: JointPrior
-    views: tuple[View, ...]
-
-    @classmethod
-    def of(
-        cls, stage: Stage, modes: tuple[str, ...], drift: FloatArray, cov: FloatArray
-    ) -> EpochPosterior:
-        """Make that of a single machine; see `View`."""
-        columns = tuple(range(len(stage.parameters)))
-        return cls(stage.prior, (View(stage, modes, drift, cov, columns),))
-
-    def log_probability(self, x: FloatArray) -> FloatArray:
-        """Log posterior of ln parameters up to a constant, shape ``(n_points,)``."""
-        total = self.prior.log_density(x)
-        inside = np.isfinite(total)
-        for view in self.views:
-            if inside.any():
-                total[inside] += view.log_likelihood(x[inside])
-        return total
-
-    def draw_prior(self, rng: np.random.Generator, n: int) -> FloatArray:
-        """Draw ln parameters from the prior inside the map, shape ``(n, n_parameters)``."""
-        return self.prior.draw(rng, n)
-
-    def widened(self) -> EpochPosterior:
-        """Give the posterior with priors twice as wide."""
-        return EpochPosterior(self.prior.widened(_WIDER), self.views)
-
-
-def one_at_a_time(stage: Stage, x: FloatArray) -> FloatArray:
-    """Stack points with copies in which one parameter at a time leaves its baseline.
-
-    Parameters
-    ----------
-    stage : Stage
-        Says where the baseline is.
-    x : ndarray
-        ln parameters, shape ``(n_points, n_parameters)``.
-
-    Returns
-    -------
-    ndarray
-        The points, then for each parameter the points with all others at baseline,
-        shape ``((1 + n_parameters) n_points, n_parameters)``.
-    """
-    stacked = np.empty((x.shape[1] + 1, *x.shape))
-    stacked[0] = x
-    stacked[1:] = stage.baseline_point
-    for j in range(x.shape[1]):
-        stacked[1 + j, :, j] = x[:, j]
-    return stacked.reshape(-1, x.shape[1])
-
-
-@dataclass(frozen=True, slots=True, eq=False)
 class _Epoch:
     """Posterior of one epoch; ln parameters, arrays of shape ``(n_parameters,)`` if not told."""
 
@@ -311,6 +203,8 @@ class _Epoch:
     laplace_ratio: FloatArray
     prior_shift: FloatArray
     prior_ratio: FloatArray
+    fit: float
+    at_edge: BoolArray
 
 
 def draw(posterior: EpochPosterior, seed: np.random.SeedSequence) -> Sample:
@@ -357,7 +251,19 @@ def _infer_epoch(posterior: EpochPosterior, seed: int | Sequence[int], epoch: in
         if chains.ndim != 4:  # no start: the description is at fault, not this epoch
             raise
         draws = thin(flattened(chains), _N_KEPT)
-        return _Epoch(draws, unknown, unknown, unknown, False, *[unknown] * 4)
+        return _Epoch(
+            draws=draws,
+            ess_bulk=unknown,
+            ess_tail=unknown,
+            r_hat=unknown,
+            converged=False,
+            laplace_shift=unknown,
+            laplace_ratio=unknown,
+            prior_shift=unknown,
+            prior_ratio=unknown,
+            fit=np.nan,
+            at_edge=np.zeros(unknown.size, dtype=bool),
+        )
     x = found.flat
     low, middle, high = np.quantile(x, _LEVELS, axis=0)
     return _Epoch(
@@ -370,6 +276,8 @@ def _infer_epoch(posterior: EpochPosterior, seed: int | Sequence[int], epoch: in
         laplace_ratio=x.std(axis=0) / std,
         prior_shift=(wider[1] - middle) / x.std(axis=0),
         prior_ratio=(wider[2] - wider[0]) / (high - low),
+        fit=posterior.fit(x[:: x.shape[0] // _N_JUDGED]),
+        at_edge=posterior.at_edge(x),
     )
 
 
@@ -427,5 +335,7 @@ def _infer_all(
         laplace_ratio=stacked("laplace_ratio"),
         prior_shift=stacked("prior_shift"),
         prior_ratio=stacked("prior_ratio"),
+        fit=np.array([one.fit for one in found]),
+        at_edge=np.stack([one.at_edge for one in found]),
         seed=tuple(np.atleast_1d(seed).tolist()),
     )

@@ -29,8 +29,8 @@ from scipy.linalg import qr, solve_triangular
 from scipy.special import softmax
 
 from lmshealth.arrays import BoolArray, FloatArray
+from lmshealth.epoch import one_at_a_time
 from lmshealth.errors import NotEnoughData
-from lmshealth.inference import one_at_a_time
 from lmshealth.stage import Stage
 from lmshealth.statespace import BIAS_STD, JUMP_STD, MOVES, regressors
 from lmshealth.tracks import History

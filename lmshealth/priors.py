@@ -25,8 +25,8 @@ class Lognormal(
     sigma: float
 
     def __post_init__(self) -> None:
-        if not (self.median > 0 and self.sigma > 0):
-            raise ValueError(f"lognormal needs median and sigma above 0, got {self}")
+        if not (0 < self.median < np.inf and 0 < self.sigma < np.inf):
+            raise ValueError(f"lognormal needs finite median and sigma above 0, got {self}")
 
     def log_density(self, x: FloatArray) -> FloatArray:
         """Log density at x > 0 up to a constant; -inf elsewhere."""
@@ -59,8 +59,8 @@ class Normal(
     std: float
 
     def __post_init__(self) -> None:
-        if not self.std > 0:
-            raise ValueError(f"normal needs std above 0, got {self}")
+        if not (np.isfinite(self.mean) and 0 < self.std < np.inf):
+            raise ValueError(f"normal needs a finite mean and a finite std above 0, got {self}")
 
     def log_density(self, x: FloatArray) -> FloatArray:
         """Log density up to a constant."""
@@ -88,8 +88,8 @@ class Uniform(
     high: float
 
     def __post_init__(self) -> None:
-        if not self.high > self.low:
-            raise ValueError(f"uniform needs high above low, got {self}")
+        if not -np.inf < self.low < self.high < np.inf:
+            raise ValueError(f"uniform needs finite ends, high above low, got {self}")
 
     def log_density(self, x: FloatArray) -> FloatArray:
         """Zero inside, -inf outside (a constant is left out)."""

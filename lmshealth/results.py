@@ -22,6 +22,8 @@ if TYPE_CHECKING:
 
 # Share of the prior variance that data must have removed before a value is shown.
 INFORMED = 0.5
+# Drifts this improbable are of something that is not on the map.
+_UNEXPLAINED = 1e-4
 # What else is known about a posterior of health, one number per epoch and parameter.
 _CHECKS = ("ess_bulk", "ess_tail", "laplace_shift", "laplace_ratio", "prior_shift", "prior_ratio")
 
@@ -191,6 +193,11 @@ class Health:
     prior_shift, prior_ratio : ndarray
         With priors twice as wide the median of the logarithm moves by so many posterior standard
         deviations, and its 90 % interval is so many times as wide, ``(n_epochs, n_parameters)``.
+    fit : ndarray
+        Probability that drifts lie as far from the map as these do at best, shape ``(n_epochs,)``.
+    at_edge : ndarray of bool
+        Whether the posterior is piled up at an end of the map, which is then a bound of it and not
+        of the parameter, shape ``(n_epochs, n_parameters)``.
     seed : tuple of int
         Of all random streams; the same one gives the same chains.
     """
@@ -212,6 +219,8 @@ class Health:
     laplace_ratio: FloatArray
     prior_shift: FloatArray
     prior_ratio: FloatArray
+    fit: FloatArray
+    at_edge: BoolArray
     seed: tuple[int, ...]
 
     def __post_init__(self) -> None:
@@ -222,8 +231,9 @@ class Health:
         expect_shape("correlation", self.correlation, (n, p, p))
         expect_shape("prior_width", self.prior_width, (p,))
         expect_shape("identifiable", self.identifiable, (p,))
-        expect_shape("travel", self.travel, (n,))
-        expect_shape("converged", self.converged, (n,))
+        for name in ("travel", "converged", "fit"):
+            expect_shape(name, getattr(self, name), (n,))
+        expect_shape("at_edge", self.at_edge, (n, p))
         freeze(self)
 
     @property
@@ -238,7 +248,12 @@ class Health:
 
     def told(self) -> BoolArray:
         """Tell which parameters the last epoch's data tell, not the prior, ``(n_parameters,)``."""
-        return np.asarray(self.identifiable & (self.informed[-1] >= INFORMED))
+        return np.asarray(self.explained & self.identifiable & (self.informed[-1] >= INFORMED))
+
+    @property
+    def explained(self) -> bool:
+        """Whether some state of the parameters explains the drifts of the last epoch."""
+        return not self.fit[-1] < _UNEXPLAINED
 
     def quantile(self, level: float | FloatArray) -> FloatArray:
         """Quantiles of every parameter at every epoch, shape ``(..., n_epochs, n_parameters)``."""
@@ -248,11 +263,13 @@ class Health:
         """Make the table of ``health.csv``: one row per epoch and parameter, odometer in km."""
         levels = {"median": 0.5, "q05": 0.05, "q25": 0.25, "q75": 0.75, "q95": 0.95}
         quantiles = self.quantile(np.array(list(levels.values())))
-        columns: dict[str, FloatArray] = dict(zip(levels, quantiles, strict=True))
+        columns: dict[str, FloatArray | BoolArray] = dict(zip(levels, quantiles, strict=True))
         columns |= {name: getattr(self, name) for name in ("ess", "r_hat")}
         n, p = len(self.recorded_at), len(self.parameters)
         columns["converged"] = np.repeat(self.converged[:, None], p, axis=1)
         columns["identifiable"] = np.tile(self.identifiable, (n, 1))
+        columns["at_edge"] = self.at_edge
+        columns["fit"] = np.repeat(self.fit[:, None], p, axis=1)
         columns |= {name: getattr(self, name) for name in ("informed", *_CHECKS)}
         columns |= {
             f"correlation_{name}": self.correlation[:, :, j]
@@ -285,7 +302,7 @@ class Health:
             for what in ("informed", "r_hat", *_CHECKS)
             for j, name in enumerate(self.parameters)
         }
-        checks |= {"travel_m": self.travel, "converged": self.converged}
+        checks |= {"travel_m": self.travel, "converged": self.converged, "fit": self.fit}
         posterior = {name: draws[..., j] for j, name in enumerate(self.parameters)}
         return arviz_base.from_dict(
             {"posterior": posterior, "checks_data": checks},

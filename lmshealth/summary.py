@@ -96,7 +96,8 @@ def judge(
     -------
     Judgement
         ``not-enough-data`` when there are fewer logs than make a baseline, when the sampler did
-        not converge, or when the data say nothing about any parameter; ``step`` when the modes
+        not converge, when no state of the parameters explains the drifts, or when the data say
+        nothing about any parameter; ``step`` when the modes
         jumped since the baseline and nobody said why.
     """
     jumps = [] if track is None else unexplained_steps(track, history.baseline)
@@ -111,6 +112,11 @@ def judge(
         reason = "The logs do not carry the health parameters."
     elif not health.converged[-1]:
         reason = "The sampler did not converge, so nothing is claimed."
+    elif not health.explained:
+        reason = (
+            "No state of the parameters on the map explains the drifts "
+            f"(p = {health.fit[-1]:.1g}): something else moved the modes, or the map is wrong."
+        )
     elif not health.told().any():
         reason = "These logs move the prior of no parameter: the stage looks the same either way."
     if reason or health is None:

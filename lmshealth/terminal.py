@@ -110,9 +110,9 @@ def print_health(health: Health) -> None:
             f"{middle[j]:.3f}",
             f"{low[j]:.3f} to {high[j]:.3f}",
             f"{100 * health.informed[-1, j]:.0f}",
-            f"{health.prior_shift[-1, j]:+.2f} σ, × {health.prior_ratio[-1, j]:.2f}",
+            f"{health.prior_shift[-1, j]:+.2f} σ × {health.prior_ratio[-1, j]:.2f}",
             f"{health.ess[-1, j]:.0f}",
-            f"{health.r_hat[-1, j]:.4f}",
+            f"{health.r_hat[-1, j]:.3f}",
         )
         for j, name in enumerate(health.parameters)
     ]
@@ -129,10 +129,17 @@ def print_health(health: Health) -> None:
     for j, k in combinations(range(len(health.parameters)), 2):
         rho = health.correlation[-1, j, k]
         click.echo(f"Correlation of {health.parameters[j]} and {health.parameters[k]}: {rho:+.2f}.")
+    if not health.explained:
+        click.echo(
+            f"No state of the parameters on the map explains these drifts (p = {health.fit[-1]:.1g}"
+            "): nothing is claimed. Look for what else moved the modes, or for a wrong map."
+        )
     for j, name in enumerate(health.parameters):
+        if health.at_edge[-1, j]:
+            click.echo(f"{name} stands at the edge of the map: this is a bound; widen the map.")
         if not health.identifiable[j]:
             click.echo(f"{name}: not identifiable by the tracked modes; see lmshealth stage.")
-        elif not health.told()[j]:
+        elif health.explained and not health.told()[j]:
             click.echo(f"{name}: these drifts do not tell it; this is its prior.")
     for when in np.flatnonzero(~health.converged):
         click.echo(f"The sampler did not converge at {health.recorded_at[when]:%Y-%m-%d}.")

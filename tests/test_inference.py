@@ -21,7 +21,6 @@ from lmshealth.inference import (
     epochs_to_infer,
     infer,
     infer_together,
-    one_at_a_time,
 )
 from lmshealth.priors import Uniform
 from lmshealth.results import Health
@@ -40,7 +39,7 @@ from tests.lives import (
     make_track,
     true_drift,
 )
-from tests.oracles import epoch_log_posterior
+from tests.test_epoch import book
 
 NAMES = ("guide_preload", "mount_stiffness")
 TRUTH = np.log([0.75, 0.85])
@@ -70,38 +69,6 @@ def worn() -> Track:
 def health(stage: Stage, worn: Track) -> Health:
     """Posterior of both epochs."""
     return infer(worn, stage, 5)
-
-
-def book(x: FloatArray, stage_std: float = 0.05, drift: FloatArray | None = None) -> float:
-    """Log posterior at one point by the formula behind the map."""
-    alone = np.array([true_drift(NAMES, np.where(np.arange(2) == j, x, 0.0)) for j in range(2)])
-    return epoch_log_posterior(
-        x,
-        true_drift(NAMES, TRUTH)[:2] if drift is None else drift,
-        COV,
-        predicted=true_drift(NAMES, x)[:2],
-        alone=alone[:, :2],
-        model_std=stage_std,
-        medians=(1.0, 1.0),
-        sigmas=(0.3, 0.3),
-    )
-
-
-def inside(n: int, seed: int = 1) -> FloatArray:
-    """Draw ln parameters all over the map."""
-    low, high = (np.log([AXES[name][k] for name in NAMES]) for k in (0, -1))
-    return np.random.default_rng(seed).uniform(low, high, (n, 2))
-
-
-@pytest.mark.parametrize("model_std", [0.0, 0.05, 0.2])
-def test_log_posterior_is_the_textbook_one(tmp_path: Path, model_std: float) -> None:
-    """Many points in one call equal one point at a time by the formula, map error included."""
-    stage = make_stage(tmp_path, model_std=model_std)
-    posterior = EpochPosterior.of(stage, ("roll", "pitch"), true_drift(NAMES, TRUTH)[:2], COV)
-    x = inside(60)
-    found = posterior.log_probability(x)
-    known = np.array([book(point, model_std) for point in x])
-    np.testing.assert_allclose(found - found[0], known - known[0], rtol=1e-9, atol=1e-7)
 
 
 def test_posterior_quantiles_are_those_of_a_grid(stage: Stage, health: Health) -> None:
@@ -212,16 +179,6 @@ def test_draws_never_leave_the_map(stage: Stage) -> None:
         assert found.samples[..., j].max() <= AXES[name][-1] * (1 + 1e-12)
 
 
-def test_outside_the_map_is_impossible_and_raises_nothing(stage: Stage) -> None:
-    """Points outside have log probability minus infinity beside finite ones inside."""
-    posterior = EpochPosterior.of(stage, ("roll", "pitch"), true_drift(NAMES, TRUTH)[:2], COV)
-    x = np.array([[0.0, 0.0], [-9.0, 0.0], [0.0, 9.0], [-0.1, -0.1]])
-    found = posterior.log_probability(x)
-    assert np.isfinite(found).tolist() == [True, False, False, True]
-    assert np.isneginf(found[1:3]).all()
-    assert np.isneginf(posterior.log_probability(x[1:3])).all()
-
-
 def test_the_prior_is_cut_at_the_map(stage: Stage) -> None:
     """Prior draws are lognormal between the edges of the grid, each parameter by itself."""
     x = stage.prior.draw(np.random.default_rng(12), 20_000)
@@ -231,13 +188,6 @@ def test_the_prior_is_cut_at_the_map(stage: Stage) -> None:
         cut = stats.truncnorm(low / 0.3, high / 0.3, scale=0.3)
         assert stats.kstest(x[:, j], cut.cdf).pvalue > 1e-4
     assert stats.kstest(x[:, 0], stats.norm(0, 0.25).cdf).pvalue < 1e-4  # negative control
-
-
-def test_one_at_a_time_moves_one_parameter(stage: Stage) -> None:
-    """The stack is the points, then each parameter alone with the other at baseline."""
-    x = np.array([[-0.1, -0.2], [-0.3, -0.4]])
-    known = [[-0.1, -0.2], [-0.3, -0.4], [-0.1, 0], [-0.3, 0], [0, -0.2], [0, -0.4]]
-    np.testing.assert_array_equal(one_at_a_time(stage, x), known)
 
 
 def test_epochs_are_spread_and_end_with_the_last(stage: Stage) -> None:
@@ -313,7 +263,7 @@ def test_a_track_without_modes_of_the_map_is_refused(stage: Stage) -> None:
 
 def test_a_track_of_the_baseline_alone_is_refused(stage: Stage) -> None:
     """Nothing after the baseline is not enough."""
-    with pytest.raises(NotEnoughData, match="no epoch after the baseline"):
+    with pytest.raises(NotEnoughData, match="no epoch has a drift of any"):
         infer(epochs([]), stage, 1)
 
 
@@ -470,3 +420,27 @@ def test_health_goes_to_arviz_and_back(health: Health, tmp_path: Path) -> None:
     np.testing.assert_array_equal(tree["checks_data/r_hat_guide_preload"], health.r_hat[:, 0])
     assert tree.attrs["seed"] == "5"
     assert float(array_stats.rhat(draws.to_numpy()[..., 1])) < 1.02
+
+
+def test_drifts_that_no_state_explains_claim_nothing(tmp_path: Path) -> None:
+    """Modes that moved against the map are told as such, and nothing is told from them."""
+    stage = make_stage(tmp_path, n_modes=3)
+    right = true_drift(NAMES, TRUTH)
+    cov = 1e-6 * np.eye(3)
+    fine = infer(epochs([right], cov), stage, 1)
+    assert fine.fit[-1] > 0.01
+    assert fine.explained
+    assert fine.told().all()
+    wrong = infer(epochs([right * [1, -1, 1]], cov), stage, 1)
+    assert wrong.fit[-1] < 1e-6
+    assert not wrong.explained
+    assert not wrong.told().any()
+
+
+def test_a_posterior_at_the_edge_of_the_map_is_a_bound(stage: Stage) -> None:
+    """Drifts further than the map reaches pile up at its end, which is told by parameter."""
+    edge = np.log([AXES["guide_preload"][0], 0.9])
+    beyond = infer(epochs([1.3 * true_drift(NAMES, edge)[:2]], COV), stage, 1)
+    assert beyond.at_edge[-1].tolist() == [True, False]
+    inside = infer(epochs([true_drift(NAMES, TRUTH)[:2]], COV), stage, 1)
+    assert not inside.at_edge.any()

@@ -39,10 +39,18 @@ def test_outside_the_support_is_minus_infinity() -> None:
 
 @pytest.mark.parametrize(
     ("kind", "arguments"),
-    [(Lognormal, (0.0, 1.0)), (Lognormal, (1.0, 0.0)), (Normal, (0.0, 0.0)), (Uniform, (1.0, 1.0))],
+    [
+        (Lognormal, (0.0, 1.0)),
+        (Lognormal, (1.0, 0.0)),
+        (Lognormal, (1.0, np.inf)),
+        (Normal, (0.0, 0.0)),
+        (Normal, (np.nan, 1.0)),
+        (Uniform, (1.0, 1.0)),
+        (Uniform, (-np.inf, 1.0)),
+    ],
 )
 def test_an_impossible_prior_is_refused(kind: type, arguments: tuple[float, float]) -> None:
-    """Widths of 0 and medians of 0 are no distributions."""
+    """Widths of 0 or without end, medians of 0 and numbers that are none are no distributions."""
     with pytest.raises(ValueError, match="needs"):
         kind(*arguments)
 

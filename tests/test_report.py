@@ -35,7 +35,7 @@ from tests.test_plots import (
 Maker = Callable[..., Assessment]
 PER_PARAMETER = (
     *("ess_bulk", "ess_tail", "r_hat", "informed", "laplace_shift", "laplace_ratio"),
-    *("prior_shift", "prior_ratio"),
+    *("prior_shift", "prior_ratio", "at_edge"),
 )
 DECISION = "[decision]\nmax_risk = 0.05\nnext_service = 2027-03-01\n"
 

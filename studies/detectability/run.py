@@ -39,8 +39,8 @@ import msgspec
 import numpy as np
 
 from lmshealth.bounds import long_record_law
+from lmshealth.epoch import EpochPosterior
 from lmshealth.errors import BadQuestion
-from lmshealth.inference import EpochPosterior
 from lmshealth.planning import plan
 from lmshealth.sight import sight_of
 from lmshealth.stage import Stage, load_stage

@@ -11,7 +11,7 @@ from unittest.mock import patch
 import numpy as np
 
 from lmshealth import life as life_module
-from lmshealth.inference import EpochPosterior
+from lmshealth.epoch import EpochPosterior
 from lmshealth.life import LifeLikelihood
 from lmshealth.prognosis import limited
 from lmshealth.stage import Stage

@@ -13,7 +13,8 @@ from emcee.autocorr import integrated_time
 from numpy.random import MT19937, RandomState
 from numpy.typing import NDArray
 
-from lmshealth.inference import EpochPosterior, draw
+from lmshealth.epoch import EpochPosterior
+from lmshealth.inference import draw
 from lmshealth.priors import JointPrior
 from lmshealth.sampling import start_from_prior, stream
 from lmshealth.stage import Stage, load_stage

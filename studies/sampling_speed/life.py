@@ -10,7 +10,7 @@ import numpy as np
 from filterpy.kalman import KalmanFilter
 from numpy.typing import NDArray
 
-from lmshealth.inference import one_at_a_time
+from lmshealth.epoch import one_at_a_time
 from lmshealth.life import LifeLikelihood
 from lmshealth.prognosis import prognose
 from lmshealth.sampling import start_from_prior

@@ -24,7 +24,7 @@ def main() -> None:
     left, right = figure.subfigures(1, 2, width_ratios=[1.0, 1.25])
     axes = left.subplots(3, 3, sharex=True, sharey=True)
     for ax, (name, row) in zip(axes.flat, ranks["posterior"].items(), strict=True):
-        draw_histogram(ax, row, name)
+        draw_histogram(ax, row, name.replace(", ", ",\n"))
     left.supylabel("ranks per bin over expected", fontsize=8)
     left.supxlabel("rank of the truth (share of draws below)", fontsize=8)
     panels = right.subplots(2, 2)
@@ -32,7 +32,7 @@ def main() -> None:
     draw_ecdf(panels[0, 0], ranks["posterior"], result["bands"], f"All, {lives:,} lives", COLOURS)
     for ax, kind in zip(
         panels.flat[1:],
-        ("by prognose", "all covariances halved", "map taken as exact"),
+        ("by chains", "all covariances halved", "map taken as exact"),
         strict=True,
     ):
         rows = {name: ranks[kind][name] for name in SHOWN}

@@ -11,7 +11,8 @@ from pathlib import Path
 import numpy as np
 
 from lmshealth.arrays import FloatArray
-from lmshealth.inference import EpochPosterior, draw
+from lmshealth.epoch import EpochPosterior
+from lmshealth.inference import draw
 from lmshealth.sampling import stream
 from tests.lives import AXES, MODES, make_stage, true_drift
 from tests.oracles import cdf_at, check_coverage
