@@ -17,7 +17,8 @@ if TYPE_CHECKING:
     from lmshealth.logs import Refusal
     from lmshealth.results import Health
     from lmshealth.tables import Row
-    from lmshealth.tracks import Drifts, History, Smoothed, Track
+    from lmshealth.tracks import History, Smoothed, Track
+    from lmshealth.tracktable import Drifts
 
 _TABLE = click.Path(exists=True, dir_okay=False, path_type=Path)
 _TABLES = ("track", "track_cov", "effects", "events", "refused")
@@ -142,7 +143,7 @@ def _write_text(target: Path, text: str) -> None:
 @click.option(
     "--with",
     "others",
-    nargs=2,
+    type=(_TABLE, str),
     multiple=True,
     metavar="TRACK.csv STAGE",
     help="Another machine that shares a part with the first; see --shared.",
@@ -190,8 +191,7 @@ def _inferred(table: Path, options: dict[str, Any]) -> tuple[list[Health], list[
     if options["others"]:
         together = [(_only(table, machines), stage)]
         for path, reference in options["others"]:
-            own = _drifts(Path(path), None)
-            together.append((_only(Path(path), own), load_stage(reference)))
+            together.append((_only(path, _drifts(path, None)), load_stage(reference)))
         names = [f"{drifts.stage}\n{own.digest}" for drifts, own in together]
         epochs = epochs_to_infer(*together[0], options["epochs"])
         seed = seed_of(options["seed"], *names)

@@ -9,20 +9,23 @@ import numpy as np
 
 from lmshealth.arrays import BoolArray, FloatArray
 from lmshealth.epoch import EpochPosterior, View
-from lmshealth.errors import BadStage, NotConverged, NotEnoughData
+from lmshealth.errors import BadStage, BadTable, NotConverged, NotEnoughData
 from lmshealth.laplace import approximate
 from lmshealth.priors import JointPrior, joined
 from lmshealth.results import Health
 from lmshealth.sampling import Sample, flattened, sample, start_from_prior, start_near, stream, thin
 from lmshealth.sight import identifiable, sight_of
 from lmshealth.stage import Stage
-from lmshealth.tracks import Drifts, Track
+from lmshealth.tracks import Track
+from lmshealth.tracktable import Drifts
 
 _N_KEPT = 1000  # draws of each ensemble
 _N_SEARCHED, _PRIOR_POINTS = 200, 4096
 # What share of the draws must be left by reweighting them for wider priors: with less, they do not
 # reach far enough and new ones are made.
 _LEAST_SHARE = 0.8
+# Priors that the map keeps from getting wider by this say nothing about what hangs on them.
+_LEAST_WIDENING = 1.2
 _LEVELS = (0.05, 0.5, 0.95)
 _N_JUDGED = 500  # draws by which the fit is judged
 
@@ -101,6 +104,8 @@ def infer_together(
     ------
     BadStage
         If a description does not have a shared parameter, or another prior of it.
+    BadTable
+        If two machines have one name.
     NotEnoughData
         As in `infer`; also if another machine has no epoch yet.
     """
@@ -133,6 +138,13 @@ def _places(
     machines: Sequence[tuple[Drifts | Track, Stage]], shared: Sequence[str]
 ) -> tuple[tuple[str, ...], list[tuple[int, ...]]]:
     """Name all parameters, and say where those of each machine stand among them."""
+    machine_names = [track.stage for track, _ in machines]
+    twice = [name for k, name in enumerate(machine_names) if name in machine_names[:k]]
+    if twice:
+        raise BadTable(
+            f"two machines are called {twice[0]!r}; their own parameters need names apart: give "
+            "the tables a column stage"
+        )
     names: list[str] = []
     columns = []
     for track, stage in machines:
@@ -245,12 +257,12 @@ def _infer_epoch(posterior: EpochPosterior, seed: int | Sequence[int], epoch: in
     unknown = np.full(len(posterior.prior.names), np.nan)
     try:
         found, mode, std = _draw(posterior, chain_seed)
-        wider = _wider_quantiles(posterior, found, wider_seed)
     except NotConverged as error:
         chains = np.asarray(error.chains)
         if chains.ndim != 4:  # no start: the description is at fault, not this epoch
             raise
         draws = thin(flattened(chains), _N_KEPT)
+        x = draws.reshape(-1, draws.shape[-1])
         return _Epoch(
             draws=draws,
             ess_bulk=unknown,
@@ -261,11 +273,15 @@ def _infer_epoch(posterior: EpochPosterior, seed: int | Sequence[int], epoch: in
             laplace_ratio=unknown,
             prior_shift=unknown,
             prior_ratio=unknown,
-            fit=np.nan,
-            at_edge=np.zeros(unknown.size, dtype=bool),
+            fit=posterior.fit(x[:: x.shape[0] // _N_JUDGED]),
+            at_edge=posterior.at_edge(x),
         )
     x = found.flat
     low, middle, high = np.quantile(x, _LEVELS, axis=0)
+    try:
+        wider = _wider_quantiles(posterior, found, wider_seed)
+    except NotConverged:  # what the check cannot say does not touch the posterior itself
+        wider = np.full((len(_LEVELS), x.shape[1]), np.nan)
     return _Epoch(
         draws=found.thinned(_N_KEPT),
         ess_bulk=found.ess_bulk,
@@ -284,7 +300,22 @@ def _infer_epoch(posterior: EpochPosterior, seed: int | Sequence[int], epoch: in
 def _wider_quantiles(
     posterior: EpochPosterior, found: Sample, seed: np.random.SeedSequence
 ) -> FloatArray:
-    """Quantiles of the ln parameters under priors twice as wide, shape ``(3, n_parameters)``."""
+    """Quantiles of the ln parameters under priors twice as wide, shape ``(3, n_parameters)``.
+
+    NaN for a parameter whose prior hardly gets wider, because the map ends.
+    """
+    quantiles = _under_wider_priors(posterior, found, seed)
+    ends = np.array([[_LEVELS[0]], [_LEVELS[-1]]])
+    before, after = (
+        np.ptp(prior.quantile(ends), axis=0)
+        for prior in (posterior.prior, posterior.widened().prior)
+    )
+    return np.where(after < _LEAST_WIDENING * before, np.nan, quantiles)
+
+
+def _under_wider_priors(
+    posterior: EpochPosterior, found: Sample, seed: np.random.SeedSequence
+) -> FloatArray:
     x, wider = found.flat, posterior.widened()
     log_weight = wider.prior.log_density(x) - posterior.prior.log_density(x)
     weight = np.exp(log_weight - log_weight.max())
@@ -325,11 +356,7 @@ def _infer_all(
         converged=np.array([one.converged for one in found]),
         informed=np.clip(1 - flat.var(axis=1) / grid.var(axis=0), 0, 1),
         prior_width=np.exp(high) - np.exp(low),
-        identifiable=identifiable(
-            [sight_of(view.stage) for view in tasks[0].views],
-            [view.columns for view in tasks[0].views],
-            grid.var(axis=0),
-        ),
+        identifiable=_identifiable(tasks, grid.var(axis=0)),
         correlation=np.stack([np.atleast_2d(np.corrcoef(one, rowvar=False)) for one in flat]),
         laplace_shift=stacked("laplace_shift"),
         laplace_ratio=stacked("laplace_ratio"),
@@ -339,3 +366,15 @@ def _infer_all(
         at_edge=np.stack([one.at_edge for one in found]),
         seed=tuple(np.atleast_1d(seed).tolist()),
     )
+
+
+def _identifiable(tasks: Sequence[EpochPosterior], prior: FloatArray) -> BoolArray:
+    """Tell what the modes that an epoch has could tell, ``(n_epochs, n_parameters)``."""
+    known: dict[tuple[tuple[str, ...], ...], BoolArray] = {}
+    sights = [sight_of(view.stage) for view in tasks[0].views]
+    for task in tasks:
+        modes = tuple(view.modes for view in task.views)
+        if modes not in known:
+            cut = [sight.through(own) for sight, own in zip(sights, modes, strict=True)]
+            known[modes] = identifiable(cut, [view.columns for view in task.views], prior)
+    return np.stack([known[tuple(view.modes for view in task.views)] for task in tasks])

@@ -18,6 +18,7 @@ from lmshealth.arrays import FloatArray
 from lmshealth.priors import Prior, Uniform
 
 _KM = 1000.0
+_LEAST_MASS = 0.01
 
 
 class Law(Protocol):
@@ -41,6 +42,13 @@ class Law(Protocol):
 
     def passage(self, theta: FloatArray, limit: float) -> FloatArray:
         """Travel in m at which health falls to the limit, inf if never, shape ``(n,)``."""
+
+
+def _expect_mass(name: str, prior: Prior, low: float, high: float) -> None:
+    """Insist on a prior that is not all but surely outside of what makes sense."""
+    below, upto = prior.probability(np.array([low, high]))
+    if upto - below < _LEAST_MASS:
+        raise ValueError(f"{name} must lie between {low:g} and {high:g}, got {prior}")
 
 
 def _draw(prior: Prior, rng: np.random.Generator, n: int) -> FloatArray:
@@ -67,6 +75,11 @@ class HertzWear(
     life_km: Prior
     exponent: Uniform = Uniform(0.7, 1.6)
     outer: ClassVar[float] = 1.5
+
+    def __post_init__(self) -> None:
+        _expect_mass("life_km", self.life_km, 0.0, np.inf)
+        if not self.exponent.low > 0:
+            raise ValueError(f"exponent needs a range above 0, got {self.exponent}")
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -113,6 +126,10 @@ class Loosening(
 
     life_km: Prior
     floor: Prior
+
+    def __post_init__(self) -> None:
+        _expect_mass("life_km", self.life_km, 0.0, np.inf)
+        _expect_mass("floor", self.floor, 0.0, 1.0)
 
     @property
     def names(self) -> tuple[str, ...]:

@@ -41,7 +41,8 @@ _WALKS = (1e-5, 5e-4, 1.5e-3, 5e-3, 1.5e-2)
 _NOISE_SCALES = (1.0, 1.5, 2.25)
 _NOISE_SCALE_PRIOR = (0.9, 0.07, 0.03)
 _NEGLIGIBLE = 0.01
-# Lives that show how smooth lives are, and how far off ln f may be between the nodes.
+# Lives that show how smooth lives are; what QR may leave of theirs, in ln f. Others are met within
+# some 1e-6, those of a posterior within 1e-8.
 _N_EXAMPLES, _ROUGHEST = 300, 1e-8
 
 

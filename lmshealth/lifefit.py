@@ -8,6 +8,7 @@ from itertools import pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
+import pandas as pd
 
 from lmshealth.arrays import FloatArray, expect_shape, freeze
 from lmshealth.life import LifeLikelihood
@@ -100,6 +101,25 @@ class LifePosterior:
     def worst_r_hat(self) -> float:
         """The largest R-hat."""
         return float(np.max(self.r_hat, initial=1.0))
+
+    def to_frame(self) -> pd.DataFrame:
+        """Make a table with a row per law parameter, then per health parameter now."""
+        draws = np.concatenate([self.chains, self.health], axis=2)
+        levels = {"median": 0.5, "q05": 0.05, "q25": 0.25, "q75": 0.75, "q95": 0.95}
+        quantiles = np.quantile(draws, list(levels.values()), axis=(0, 1))
+        missing = np.full(len(self.parameters), np.nan)
+        checks = {
+            name: np.append(getattr(self, name), missing)
+            for name in ("ess_bulk", "ess_tail", "r_hat", "informed")
+        }
+        return pd.DataFrame(
+            {
+                "stage": self.stage,
+                "parameter": (*self.laws, *self.parameters),
+                **dict(zip(levels, quantiles, strict=True)),
+                **checks,
+            }
+        )
 
     def to_arviz(self) -> DataTree:
         """Give law parameters and health now to ArviZ, the ensembles as chains; see `Health`."""

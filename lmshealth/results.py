@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from itertools import combinations
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
@@ -181,9 +182,9 @@ class Health:
     prior_width : ndarray
         Width of the prior's 90 % interval, shape ``(n_parameters,)``.
     identifiable : ndarray of bool
-        Whether endless logs would tell a parameter, on average over the priors. One that they
-        would not may still be informed by chance: while nothing has drifted, the map's error does
-        not count. Shape ``(n_parameters,)``.
+        Whether endless logs with the modes of an epoch would tell a parameter, on average over the
+        priors. One that they would not may still be informed by chance: while nothing has drifted,
+        the map's error does not count. Shape ``(n_epochs, n_parameters)``.
     correlation : ndarray
         Of the logarithms in the posterior, shape ``(n_epochs, n_parameters, n_parameters)``.
     laplace_shift, laplace_ratio : ndarray
@@ -192,9 +193,11 @@ class Health:
         its; NaN also where no normal distribution approximates. Shape ``(n_epochs, n_parameters)``.
     prior_shift, prior_ratio : ndarray
         With priors twice as wide the median of the logarithm moves by so many posterior standard
-        deviations, and its 90 % interval is so many times as wide, ``(n_epochs, n_parameters)``.
+        deviations, and its 90 % interval is so many times as wide; the map cuts these priors too,
+        NaN where it hardly lets them be wider. Shape ``(n_epochs, n_parameters)``.
     fit : ndarray
-        Probability that drifts lie as far from the map as these do at best, shape ``(n_epochs,)``.
+        Probability, at most, that drifts lie as far from the map as these do at best, shape
+        ``(n_epochs,)``.
     at_edge : ndarray of bool
         Whether the posterior is piled up at an end of the map, which is then a bound of it and not
         of the parameter, shape ``(n_epochs, n_parameters)``.
@@ -230,10 +233,10 @@ class Health:
             expect_shape(name, getattr(self, name), (n, p))
         expect_shape("correlation", self.correlation, (n, p, p))
         expect_shape("prior_width", self.prior_width, (p,))
-        expect_shape("identifiable", self.identifiable, (p,))
         for name in ("travel", "converged", "fit"):
             expect_shape(name, getattr(self, name), (n,))
-        expect_shape("at_edge", self.at_edge, (n, p))
+        for name in ("at_edge", "identifiable"):
+            expect_shape(name, getattr(self, name), (n, p))
         freeze(self)
 
     @property
@@ -248,7 +251,8 @@ class Health:
 
     def told(self) -> BoolArray:
         """Tell which parameters the last epoch's data tell, not the prior, ``(n_parameters,)``."""
-        return np.asarray(self.explained & self.identifiable & (self.informed[-1] >= INFORMED))
+        claimed = bool(self.converged[-1]) and self.explained
+        return np.asarray(claimed & self.identifiable[-1] & (self.informed[-1] >= INFORMED))
 
     @property
     def explained(self) -> bool:
@@ -267,9 +271,10 @@ class Health:
         columns |= {name: getattr(self, name) for name in ("ess", "r_hat")}
         n, p = len(self.recorded_at), len(self.parameters)
         columns["converged"] = np.repeat(self.converged[:, None], p, axis=1)
-        columns["identifiable"] = np.tile(self.identifiable, (n, 1))
+        columns["identifiable"] = self.identifiable
         columns["at_edge"] = self.at_edge
         columns["fit"] = np.repeat(self.fit[:, None], p, axis=1)
+        columns["prior_width"] = np.tile(self.prior_width, (n, 1))
         columns |= {name: getattr(self, name) for name in ("informed", *_CHECKS)}
         columns |= {
             f"correlation_{name}": self.correlation[:, :, j]
@@ -299,8 +304,12 @@ class Health:
         draws = np.moveaxis(self.chains, 0, 2)  # chain, draw, epoch
         checks = {
             f"{what}_{name}": getattr(self, what)[:, j]
-            for what in ("informed", "r_hat", *_CHECKS)
+            for what in ("informed", "identifiable", "at_edge", "r_hat", *_CHECKS)
             for j, name in enumerate(self.parameters)
+        }
+        checks |= {
+            f"correlation_{a}_{b}": self.correlation[:, i, j]
+            for (i, a), (j, b) in combinations(enumerate(self.parameters), 2)
         }
         checks |= {"travel_m": self.travel, "converged": self.converged, "fit": self.fit}
         posterior = {name: draws[..., j] for j, name in enumerate(self.parameters)}

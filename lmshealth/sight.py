@@ -12,7 +12,7 @@ E = m² (S ∘ S) Λ and the surrogate's own.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -78,6 +78,17 @@ class Sight:
     ) -> FloatArray:
         """Bound the variance of the drift of each mode, shape ``(n_modes,)``."""
         return self.log_variance(duration) * (1 / n_logs + 1 / (n_baseline or self.n_baseline))
+
+    def through(self, modes: Sequence[str]) -> Sight:
+        """Give the sight through some of the modes."""
+        rows = [k for k, mode in enumerate(self.modes) if mode.name in modes]
+        return replace(
+            self,
+            modes=tuple(self.modes[k] for k in rows),
+            slopes=self.slopes[rows],
+            leave_out=self.leave_out[rows],
+            _known={},
+        )
 
     def endless_variance(self) -> FloatArray:
         """Bound the variance of the drifts by logs without end, shape ``(n_modes,)``."""

@@ -184,7 +184,7 @@ def _why(stage: Stage, health: Health, told: list[int]) -> str:
     sentences = []
     for j, parameter in enumerate(stage.parameters):
         name = parameter.name.replace("_", " ").capitalize()
-        if not health.identifiable[j]:
+        if not health.identifiable[-1, j]:
             sentences.append(f"{name}: the tracked modes cannot tell.")
         elif j not in told:
             sentences.append(f"{name}: these logs do not tell.")

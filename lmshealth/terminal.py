@@ -27,6 +27,8 @@ from lmshealth.wording import change
 _MOST_LINES = 12
 # More velocities than these do not fit beside each other.
 _MOST_VELOCITIES = 7
+# A posterior this far from its Laplace approximation, in mean and ln width, is worth a word.
+_ODD_SHIFT, _ODD_RATIO = 0.5, 0.3
 
 
 def print_json(content: dict[str, list[Row]]) -> None:
@@ -108,7 +110,7 @@ def print_health(health: Health) -> None:
         (
             name,
             f"{middle[j]:.3f}",
-            f"{low[j]:.3f} to {high[j]:.3f}",
+            f"{low[j]:.3f} to {high[j]:.3f}" if health.converged[-1] else "not converged",
             f"{100 * health.informed[-1, j]:.0f}",
             f"{health.prior_shift[-1, j]:+.2f} σ × {health.prior_ratio[-1, j]:.2f}",
             f"{health.ess[-1, j]:.0f}",
@@ -124,7 +126,8 @@ def print_health(health: Health) -> None:
     print_table(title, ("parameter",), numbers, cells)
     click.echo(
         "data: share of the prior's variance that they removed; prior × 2: how far the median "
-        "moves, and how much wider the interval gets, with priors twice as wide."
+        "moves, and how much wider the interval gets, with priors twice as wide, as far as the "
+        "map reaches."
     )
     for j, k in combinations(range(len(health.parameters)), 2):
         rho = health.correlation[-1, j, k]
@@ -137,10 +140,16 @@ def print_health(health: Health) -> None:
     for j, name in enumerate(health.parameters):
         if health.at_edge[-1, j]:
             click.echo(f"{name} stands at the edge of the map: this is a bound; widen the map.")
-        if not health.identifiable[j]:
+        shift, ratio = health.laplace_shift[-1, j], health.laplace_ratio[-1, j]
+        if abs(shift) > _ODD_SHIFT or abs(np.log(ratio)) > _ODD_RATIO:
+            click.echo(
+                f"{name}: far from normal; Laplace's approximation lies {shift:+.1f} σ lower, and "
+                f"the posterior is {ratio:.2f} times as wide."
+            )
+        if not health.identifiable[-1, j]:
             click.echo(f"{name}: not identifiable by the tracked modes; see lmshealth stage.")
         elif health.explained and not health.told()[j]:
-            click.echo(f"{name}: these drifts do not tell it; this is its prior.")
+            click.echo(f"{name}: these drifts tell too little of it for a claim.")
     for when in np.flatnonzero(~health.converged):
         click.echo(f"The sampler did not converge at {health.recorded_at[when]:%Y-%m-%d}.")
 

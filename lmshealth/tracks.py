@@ -279,31 +279,6 @@ class Consistency:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Drifts:
-    """What health is inferred from: a track without the rest of it.
-
-    Attributes
-    ----------
-    stage, recorded_at, travel, modes, drift, drift_cov
-        As in `Track`.
-    """
-
-    stage: str
-    recorded_at: tuple[datetime, ...]
-    travel: FloatArray
-    modes: tuple[str, ...]
-    drift: FloatArray
-    drift_cov: FloatArray
-
-    def __post_init__(self) -> None:
-        n, m = len(self.recorded_at), len(self.modes)
-        expect_shape("travel", self.travel, (n,))
-        expect_shape("drift", self.drift, (n, m))
-        expect_shape("drift_cov", self.drift_cov, (n, m, m))
-        freeze(self)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
 class Track:
     """Modes followed over a machine's life by a Kalman filter.
 

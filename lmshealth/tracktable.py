@@ -10,14 +10,40 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from lmshealth.arrays import FloatArray
+from lmshealth.arrays import FloatArray, expect_shape, freeze
 from lmshealth.errors import BadTable
 from lmshealth.rowfile import lines, read_rows, to_moments, to_numbers
-from lmshealth.tracks import Drifts
 
 _KM = 1000.0
+# A factor of 20 in frequency; and what drowns in the rounding of ln frequency.
+_WIDEST, _FINEST = 3.0, 1e-9
 _NEEDED = ("recorded_at", "mode", "drift", "drift_std")
 _TERMS = ("recorded_at", "mode_a", "mode_b", "cov_drift")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Drifts:
+    """What health is inferred from: a track without the rest of it.
+
+    Attributes
+    ----------
+    stage, recorded_at, travel, modes, drift, drift_cov
+        As in `tracks.Track`.
+    """
+
+    stage: str
+    recorded_at: tuple[datetime, ...]
+    travel: FloatArray
+    modes: tuple[str, ...]
+    drift: FloatArray
+    drift_cov: FloatArray
+
+    def __post_init__(self) -> None:
+        n, m = len(self.recorded_at), len(self.modes)
+        expect_shape("travel", self.travel, (n,))
+        expect_shape("drift", self.drift, (n, m))
+        expect_shape("drift_cov", self.drift_cov, (n, m, m))
+        freeze(self)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -63,12 +89,13 @@ def read_drifts(path: Path, *, cross_terms: Path | None = None) -> DriftTable:
         notes.append(f"no column stage: all rows are taken for one machine, {path.stem}")
     to_numbers(path, table, ("drift", "drift_std", "travel_km"))
     to_moments(path, table)
-    negative = table["drift_std"] < 0
-    if negative.any():
-        raise BadTable(
-            f"{path}, {lines(table, negative)}: drift_std is "
-            f"{table.loc[negative, 'drift_std'].iloc[0]:g}; needed is a standard deviation"
-        )
+    std = table["drift_std"]
+    _refuse(path, table, "drift", table["drift"].abs() > _WIDEST, "a change of ln frequency")
+    wrong = (std < 0) | (std > _WIDEST) | ((std > 0) & (std < _FINEST))
+    _refuse(path, table, "drift_std", wrong, "a standard deviation of ln frequency, 0 at baseline")
+    nameless = table["stage"].str.strip() == ""
+    if nameless.any():
+        raise BadTable(f"{path}, {lines(table, nameless)}: stage is empty; needed is a name")
     terms = None
     if cross_terms is not None:
         terms = _read_terms(cross_terms, str(table["stage"].iloc[0]))
@@ -82,6 +109,12 @@ def read_drifts(path: Path, *, cross_terms: Path | None = None) -> DriftTable:
         for stage, rows in table.groupby("stage", sort=False)
     )
     return DriftTable(machines, tuple(notes))
+
+
+def _refuse(path: Path, table: pd.DataFrame, name: str, wrong: pd.Series[bool], what: str) -> None:
+    if wrong.any():
+        got = table.loc[wrong, name].iloc[0]
+        raise BadTable(f"{path}, {lines(table, wrong)}: {name} is {got:g}; needed is {what}")
 
 
 def _read_terms(path: Path, only_machine: str) -> pd.DataFrame:

@@ -58,16 +58,6 @@ def rank(truth: Array, draws: Array, rng: np.random.Generator) -> list[float]:
     return [round(float(value), 6) for value in share]
 
 
-def narrowed(draws: Array) -> Array:
-    """Halve the variance of draws about their median; infinite ones stay where they are."""
-    middle = np.median(draws, axis=0)
-    fixed = ~np.isfinite(draws) | ~np.isfinite(middle)
-    with np.errstate(invalid="ignore"):
-        closer = middle + (draws - middle) / np.sqrt(2)
-    return np.where(fixed, draws, closer)
-
-
-@cache
 def band(n: int) -> tuple[Array, Array]:
     """Give the simultaneous band of the distribution of n ranks, minus that of a uniform one."""
     rng = np.random.default_rng(n)

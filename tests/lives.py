@@ -377,7 +377,7 @@ def health_of(
         converged=converged,
         informed=informed,
         prior_width=np.ones(p),
-        identifiable=np.ones(p, dtype=bool),
+        identifiable=np.ones((n, p), dtype=bool),
         correlation=np.stack(rho),
         laplace_shift=np.full((n, p), 0.02),
         laplace_ratio=np.full((n, p), 1.01),

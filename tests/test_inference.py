@@ -15,7 +15,7 @@ from scipy import stats
 
 from lmshealth import inference
 from lmshealth.arrays import FloatArray
-from lmshealth.errors import BadStage, NotConverged, NotEnoughData
+from lmshealth.errors import BadStage, BadTable, NotConverged, NotEnoughData
 from lmshealth.inference import (
     EpochPosterior,
     epochs_to_infer,
@@ -285,10 +285,10 @@ def test_laplace_stands_beside_the_sampler(
     assert found.samples[..., 0].min() > 0.76
 
 
-def make_stage_with(stage: Stage, low: float) -> Stage:
-    """Give the stage with a uniform prior of the preload from low upwards."""
+def make_stage_with(stage: Stage, low: float, high: float = 1.2) -> Stage:
+    """Give the stage with a uniform prior of the preload."""
     preload, mount = stage.parameters
-    bounded = msgspec.structs.replace(preload, prior=Uniform(low, 1.2))
+    bounded = msgspec.structs.replace(preload, prior=Uniform(low, high))
     description = msgspec.structs.replace(stage.description, parameter=(bounded, mount))
     return Stage(description, stage.modal_map, stage.digest)
 
@@ -444,3 +444,67 @@ def test_a_posterior_at_the_edge_of_the_map_is_a_bound(stage: Stage) -> None:
     assert beyond.at_edge[-1].tolist() == [True, False]
     inside = infer(epochs([true_drift(NAMES, TRUTH)[:2]], COV), stage, 1)
     assert not inside.at_edge.any()
+
+
+def test_machines_of_one_name_are_refused(stage: Stage) -> None:
+    """Two machines of one name would have their own parameters taken for one."""
+    machines = [
+        (replace(track, stage="track"), own) for track, own in two_machines(stage, timedelta(0))
+    ]
+    with pytest.raises(BadTable, match=r"two machines are called 'track'.*column stage"):
+        infer_together(machines, ["guide_preload"], 4)
+
+
+def test_nothing_is_told_by_what_did_not_converge(
+    stage: Stage, worn: Track, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """However narrow its draws, an epoch without convergence tells nothing; its edge is told."""
+    low = np.log(AXES["guide_preload"][0])
+
+    def fail(*_: object) -> None:
+        raise NotConverged("stuck", np.full((4, 50, 32, 2), [low, -0.1]))
+
+    monkeypatch.setattr(inference, "sample", fail)
+    found = infer(worn, stage, 1)
+    assert (found.informed > 0.9).all()
+    assert not found.told().any()
+    assert found.at_edge[-1].tolist() == [True, False]
+    assert found.fit[-1] < 1e-6
+
+
+def test_a_check_that_fails_leaves_the_posterior(
+    stage: Stage, worn: Track, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Where only the posterior under wider priors does not converge, only its check is missing."""
+    right = infer(worn, stage, 5, epochs=[2])
+
+    def fail(*_: object) -> FloatArray:
+        raise NotConverged("stuck", np.zeros((4, 50, 32, 2)))
+
+    monkeypatch.setattr(inference, "_under_wider_priors", fail)
+    found = infer(worn, stage, 5, epochs=[2])
+    assert found.converged.all()
+    np.testing.assert_array_equal(found.samples, right.samples)
+    assert np.isnan(found.prior_shift).all()
+    assert np.isnan(found.prior_ratio).all()
+
+
+def test_a_prior_as_wide_as_the_map_has_no_check(stage: Stage, worn: Track) -> None:
+    """Where the map keeps a prior from getting wider nothing is said of what hangs on it."""
+    found = infer(worn, make_stage_with(stage, low=0.21), 5, epochs=[2])
+    assert np.isfinite(found.prior_ratio[0, 1])
+    low, high = AXES["guide_preload"][[0, -1]]
+    whole = make_stage_with(stage, low=float(low), high=float(high))
+    found = infer(worn, whole, 5, epochs=[2])
+    assert np.isnan(found.prior_ratio[0, 0])
+    assert np.isfinite(found.prior_ratio[0, 1])
+
+
+def test_what_is_identifiable_goes_by_the_modes_of_an_epoch(tmp_path: Path) -> None:
+    """One mode of two tells the mount beside the preload, but not the preload beside the mount."""
+    stage = make_stage(tmp_path)
+    drift = np.vstack([np.zeros(2), np.tile(true_drift(NAMES, TRUTH)[:2], (2, 1))])
+    cov = np.stack([np.zeros((2, 2)), COV, COV])
+    drift[2, 1], cov[2, 1], cov[2, :, 1] = np.nan, np.nan, np.nan
+    found = infer(make_track(drift, cov), stage, 3)
+    assert found.identifiable.tolist() == [[True, True], [False, True]]

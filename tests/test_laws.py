@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from itertools import pairwise
 
 import numpy as np
 import pytest
 from scipy.optimize import brentq
 
-from lmshealth.laws import AnyLaw, HertzWear, Linear, Loosening, Power, Unchanging
+from lmshealth.laws import AnyLaw, HertzWear, Law, Linear, Loosening, Power, Unchanging
 from lmshealth.priors import Lognormal, Normal, Uniform
 
 NOW = 1.7e6
@@ -151,3 +152,21 @@ def test_far_off_walkers_raise_no_warning(law: AnyLaw, y: list[float]) -> None:
     assert not np.isposinf(law.log_prior(point, NOW)).any()
     health = law.health(law.natural(point, NOW), np.array([0.0, NOW]))
     assert health.shape == (1, 2)
+
+
+@pytest.mark.parametrize(
+    ("law", "told"),
+    [
+        (lambda: HertzWear(life_km=Uniform(-5.0, -1.0)), "life_km must lie between 0 and inf"),
+        (lambda: HertzWear(Lognormal(8000, 1), Uniform(-0.7, 1.6)), "exponent needs a range above"),
+        (
+            lambda: Loosening(Lognormal(4000, 1), Uniform(1.3, 2.0)),
+            "floor must lie between",
+        ),
+        (lambda: Loosening(Normal(-9.0, 1.0), Uniform(0.3, 1.0)), "life_km must lie between"),
+    ],
+)
+def test_laws_that_cannot_be_are_refused(law: Callable[[], Law], told: str) -> None:
+    """Priors outside of what makes sense are refused before anything is drawn from them."""
+    with pytest.raises(ValueError, match=told):
+        law()

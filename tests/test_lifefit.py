@@ -141,6 +141,15 @@ def test_a_life_goes_to_arviz_and_back(found: LifePosterior, tmp_path: Path) -> 
     assert float(tree["checks_data/chi_square"]) == found.chi_square
 
 
+def test_a_life_is_a_table(found: LifePosterior) -> None:
+    """Laws with their checks, then health now, one row each."""
+    table = found.to_frame().set_index("parameter")
+    assert list(table.index) == [*found.laws, *found.parameters]
+    assert table.loc["guide_preload", "median"] == np.median(found.health[..., 0])
+    assert table.loc["guide_preload.life_m", "informed"] == found.informed[0]
+    assert (table["q05"] < table["q95"]).all()
+
+
 def test_no_life_without_convergence(
     history: History, stage: Stage, monkeypatch: pytest.MonkeyPatch
 ) -> None:

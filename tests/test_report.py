@@ -35,7 +35,7 @@ from tests.test_plots import (
 Maker = Callable[..., Assessment]
 PER_PARAMETER = (
     *("ess_bulk", "ess_tail", "r_hat", "informed", "laplace_shift", "laplace_ratio"),
-    *("prior_shift", "prior_ratio", "at_edge"),
+    *("prior_shift", "prior_ratio", "at_edge", "identifiable"),
 )
 DECISION = "[decision]\nmax_risk = 0.05\nnext_service = 2027-03-01\n"
 
@@ -284,7 +284,6 @@ def test_one_parameter_without_limit(make: Maker, tmp_path: Path) -> None:
         parameters=health.parameters[:1],
         chains=health.chains[..., :1],
         prior_width=health.prior_width[:1],
-        identifiable=health.identifiable[:1],
         correlation=health.correlation[:, :1, :1],
         **{name: getattr(health, name)[:, :1] for name in PER_PARAMETER},
     )

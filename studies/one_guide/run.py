@@ -32,7 +32,7 @@ from numpy.typing import NDArray
 from lmshealth.inference import infer, infer_together
 from lmshealth.results import Health
 from lmshealth.stage import Stage, load_stage
-from lmshealth.tracks import Drifts
+from lmshealth.tracktable import Drifts
 from models.mapping import guide_frequencies
 from models.stages import stage_named
 from studies.record import Stopwatch, judge_coverage, keep

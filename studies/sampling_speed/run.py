@@ -41,7 +41,7 @@ import numpy as np
 
 from lmshealth.inference import infer
 from lmshealth.stage import load_stage
-from lmshealth.tracks import Drifts
+from lmshealth.tracktable import Drifts
 from studies.record import Stopwatch, keep
 from studies.sampling_speed.contestants import compare, epoch_posterior
 from studies.sampling_speed.life import START, life_posterior

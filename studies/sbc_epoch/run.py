@@ -77,7 +77,7 @@ QUICK = {ONE: 100, SHARED: 20, X: 20, CHAINS: 3, HALVED: 250, EXACT: 50}
 # Share of the map's true error that is believed.
 _LESS = {HALVED: np.sqrt(0.5), EXACT: 0.0}
 # What a posterior is made of, and what chains are made of.
-MODEL, SAMPLER = ("inference", "modalmap", "priors", "stage"), ("laplace", "sampling")
+MODEL, SAMPLER = ("epoch", "modalmap", "priors", "stage"), ("laplace", "sampling")
 
 
 def main() -> None:

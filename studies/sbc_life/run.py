@@ -75,7 +75,7 @@ LIVES = {ONE: 1000, CHAINS: 100, HALVED: 300, EXACT: 300, ERRORS: 300}
 QUICK = {ONE: 40, CHAINS: 1, HALVED: 40}
 # What a posterior is made of, and what chains are made of.
 MODEL, SAMPLER = (
-    ("life", "laws", "modalmap", "priors", "stage", "statespace"),
+    ("epoch", "life", "laws", "modalmap", "priors", "stage", "statespace"),
     ("lifefit", "sampling"),
 )
 LAWS = ("life of preload", "exponent of preload", "floor of mount", "length of mount")
