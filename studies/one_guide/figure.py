@@ -57,7 +57,7 @@ def draw_coverage(ax: Axes, rows: list[tuple[str, list[dict[str, Any]], bool]]) 
     ax.set_yticks(range(len(rows)), [name for name, _, _ in rows], fontsize=8)
     ax.set_ylim(len(rows) - 0.5, -0.5)
     ax.set_xlim(0, 1.02)
-    ax.set_xlabel("share of 50 and 90 % intervals that hold the truth, with 99.9 % interval")
+    ax.set_xlabel("share of 50 and 90 % intervals that hold the truth")
     ax.set_title("Whether intervals cover (×: controls that must not)", fontsize=10)
 
 

@@ -13,7 +13,11 @@ Method
     fail: the two guides are taken for one, but are not, their preloads being drawn apart; the
     intervals of the preload, shrunk to half their width, cover as much.
 Answer
-    ANSWER
+    From X the preload is known to 2.8 % (median width of the 90 % interval), from Y to 5.7 %, from
+    both to 2.4 %, half of what Y alone says; the mount of Y then to 4.1 instead of 5.6 %. In 150
+    pairs all intervals cover within their bands; the lowest, the preload's of 50 % from X, hold 37
+    and 39 %. The mount of X is never claimed: its interval of 76 % is four fifths of its prior's.
+    Two guides taken for one cover 22 and 45 %, intervals of half the width 22 and 50 %.
 Run time
     A quarter of an hour of one processor.
 """
