@@ -112,9 +112,11 @@ def print_health(health: Health) -> None:
             f"{middle[j]:.3f}",
             f"{low[j]:.3f} to {high[j]:.3f}" if health.converged[-1] else "not converged",
             f"{100 * health.informed[-1, j]:.0f}",
-            f"{health.prior_shift[-1, j]:+.2f} σ × {health.prior_ratio[-1, j]:.2f}",
-            f"{health.ess[-1, j]:.0f}",
-            f"{health.r_hat[-1, j]:.3f}",
+            f"{health.prior_shift[-1, j]:+.2f} σ × {health.prior_ratio[-1, j]:.2f}".replace(
+                "+nan σ × nan", "–"
+            ),
+            f"{health.ess[-1, j]:.0f}".replace("nan", "–"),
+            f"{health.r_hat[-1, j]:.3f}".replace("nan", "–"),
         )
         for j, name in enumerate(health.parameters)
     ]

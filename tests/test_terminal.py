@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ import pytest
 from lmshealth.terminal import (
     print_error,
     print_frf,
+    print_health,
     print_json,
     print_magnitudes,
     print_modes,
@@ -19,7 +21,7 @@ from lmshealth.terminal import (
     progress_bars,
 )
 from lmshealth.tracking import track
-from tests.lives import DAMPING, FREQUENCY, make_history
+from tests.lives import DAMPING, FREQUENCY, make_health, make_history
 
 NAN = float("nan")
 
@@ -224,3 +226,32 @@ def test_a_filter_that_is_too_cautious_is_not_said_to_be_widened(
     assert "does NOT agree" in shown
     assert "rather too wide" in shown
     assert "widened" not in shown
+
+
+def test_health_that_did_not_converge_shows_no_interval(capsys: pytest.CaptureFixture[str]) -> None:
+    """What was not found is no number; what stands at an edge or fits nothing is told."""
+    sure = make_health(np.random.default_rng(1).lognormal(-0.2, 0.02, (40, 2)))
+    print_health(sure)
+    told = capsys.readouterr().out
+    assert " to " in told
+    assert "Correlation of guide_preload and mount_stiffness" in told
+    nothing = np.full((1, 2), np.nan)
+    lost = replace(
+        sure, converged=np.array([False]), ess_bulk=nothing, ess_tail=nothing, r_hat=nothing,
+        prior_shift=nothing, prior_ratio=nothing, laplace_shift=nothing, laplace_ratio=nothing,
+        fit=np.array([1e-9]), at_edge=np.array([[True, False]]),
+    )  # fmt: skip
+    print_health(lost)
+    told = capsys.readouterr().out
+    assert "nan" not in told
+    assert told.count("not converged") == 2
+    assert "p = 1e-09): nothing is claimed" in told
+    assert "guide_preload stands at the edge of the map" in told
+    assert "mount_stiffness stands" not in told
+    odd = replace(
+        sure, laplace_shift=np.array([[0.9, 0.0]]), identifiable=np.array([[True, False]])
+    )
+    print_health(odd)
+    told = capsys.readouterr().out
+    assert "guide_preload: far from normal; Laplace's approximation lies +0.9 σ lower" in told
+    assert "mount_stiffness: not identifiable" in told
