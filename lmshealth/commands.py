@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -165,7 +165,8 @@ def infer(ctx: click.Context, /, table: Path, **options: Any) -> None:
 
     if bool(options["others"]) != bool(options["shared"]):
         raise click.UsageError("--with and --shared need each other: which parameter is shared?")
-    found, lost = _inferred(table, options)
+    with terminal.progress_bars() as progress:
+        found, lost = _inferred(table, options, progress)
     for health in found:
         terminal.print_health(health)
     for why in lost:
@@ -179,7 +180,9 @@ def infer(ctx: click.Context, /, table: Path, **options: Any) -> None:
     ctx.exit(3 if lost else 0)
 
 
-def _inferred(table: Path, options: dict[str, Any]) -> tuple[list[Health], list[str]]:
+def _inferred(
+    table: Path, options: dict[str, Any], progress: Callable[[str, int, int], None]
+) -> tuple[list[Health], list[str]]:
     """Infer all machines of a table; one that cannot be is told and left out."""
     from lmshealth.inference import epochs_to_infer, infer_together
     from lmshealth.inference import infer as infer_one
@@ -195,16 +198,31 @@ def _inferred(table: Path, options: dict[str, Any]) -> tuple[list[Health], list[
         names = [f"{drifts.stage}\n{own.digest}" for drifts, own in together]
         epochs = epochs_to_infer(*together[0], options["epochs"])
         seed = seed_of(options["seed"], *names)
-        return [infer_together(together, options["shared"], seed, epochs=epochs)], []
+        mapper = _counted("together", progress)
+        shared = options["shared"]
+        return [infer_together(together, shared, seed, epochs=epochs, mapper=mapper)], []
     found, lost = [], []
     for drifts in machines:
         seed = seed_of(options["seed"], drifts.stage, stage.digest)
         try:
             epochs = epochs_to_infer(drifts, stage, options["epochs"])
-            found.append(infer_one(drifts, stage, seed, epochs=epochs))
+            mapper = _counted(drifts.stage, progress)
+            found.append(infer_one(drifts, stage, seed, epochs=epochs, mapper=mapper))
         except NotEnoughData as why:
             lost.append(str(why))
     return found, lost
+
+
+def _counted(what: str, progress: Callable[[str, int, int], None]) -> Callable[..., Iterator[Any]]:
+    """Make a ``map`` that tells how much of it is done."""
+
+    def mapper(function: Callable[..., Any], *columns: Sequence[Any]) -> Iterator[Any]:
+        total = len(columns[0])
+        for k, result in enumerate(map(function, *columns)):
+            progress(what, k + 1, total)
+            yield result
+
+    return mapper
 
 
 def _drifts(table: Path, cov: Path | None) -> tuple[Drifts, ...]:
