@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -121,11 +122,18 @@ def _write(rows: dict[str, list[Row]], targets: dict[str, Path | None]) -> None:
 
 
 def _write_text(target: Path, text: str) -> None:
+    with _writing(target):
+        target.write_text(text)
+
+
+@contextmanager
+def _writing(target: Path) -> Iterator[None]:
+    """Make the folder of a file, and say what keeps the file from being written."""
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
-        target.write_text(text)
+        yield
     except OSError as error:
-        raise BadTable(f"{target}: cannot be written: {error.strerror}") from error
+        raise BadTable(f"{target}: cannot be written: {error.strerror or error}") from error
 
 
 @click.command(
@@ -250,11 +258,8 @@ def _write_posterior(path: Path, found: Sequence[Health]) -> None:
 
     trees = {health.stage.replace("/", "_"): health.to_arviz() for health in found}
     tree = next(iter(trees.values())) if len(trees) == 1 else DataTree.from_dict(trees)
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
+    with _writing(path):
         tree.to_netcdf(path, engine="h5netcdf")
-    except OSError as error:
-        raise BadTable(f"{path}: cannot be written: {error.strerror or error}") from error
 
 
 @click.command(epilog=examples("stage lms-y", "stage my-stage.toml --format json"))

@@ -16,6 +16,7 @@ from lmshealth.examination import (
     ModeCheck,
     Telling,
 )
+from lmshealth.results import INFORMED
 
 # A prior cut by more than this is not the one that was described; a correlation of more than this
 # is worth knowing; an exponent below this, times the priors' widths, is left out, and so small a
@@ -99,7 +100,7 @@ def _told(examined: Examination, telling: Telling) -> Finding:
 
 
 def _hindrance(telling: Telling) -> str:
-    if telling.informed(telling.exact_map_std) >= 0.5:
+    if telling.informed(telling.exact_map_std) >= INFORMED:
         return (
             "What it does to the modes is less than the map's error (model_std) in what the others "
             f"do; with an exact map it would be {_share(telling.exact_map_std)}. Track a mode that "

@@ -20,7 +20,7 @@ from lmshealth.tracks import Track
 from lmshealth.tracktable import Drifts
 
 _N_KEPT = 1000  # draws of each ensemble
-_N_SEARCHED, _PRIOR_POINTS = 200, 4096
+_N_SEARCHED = 200
 # What share of the draws must be left by reweighting them for wider priors: with less, they do not
 # reach far enough and new ones are made.
 _LEAST_SHARE = 0.8
@@ -112,11 +112,12 @@ def infer_together(
     names, columns = _places(machines, shared)
     modes = [_usable_modes(track, stage) for track, stage in machines]
     first, stage = machines[0]
+    usable = {t.stage: epochs_to_infer(t, own, len(t.recorded_at)) for t, own in machines}
     tasks, kept = [], []
     for k in _chosen(first, stage, epochs):
         views, priors = [], []
         for (track, own), used, places in zip(machines, modes, columns, strict=True):
-            row = k if track is first else _last_before(track, own, first, k)
+            row = k if track is first else _last_before(track, usable[track.stage], first, k)
             if row is not None:
                 views.append(View(own, *_seen(track, used, row), places))
                 priors.append(own.prior)
@@ -158,9 +159,10 @@ def _places(
     return tuple(names), columns
 
 
-def _last_before(track: Drifts | Track, stage: Stage, first: Drifts | Track, k: int) -> int | None:
+def _last_before(
+    track: Drifts | Track, usable: Sequence[int], first: Drifts | Track, k: int
+) -> int | None:
     """Last usable epoch of a track not later than one of another track."""
-    usable = epochs_to_infer(track, stage, len(track.recorded_at))
     before = [row for row in usable if track.recorded_at[row] <= first.recorded_at[k]]
     return before[-1] if before else None
 
@@ -336,7 +338,7 @@ def _infer_all(
 ) -> Health:
     found: list[_Epoch] = list(mapper(_infer_epoch, tasks, [seed] * len(tasks), chosen))  # type: ignore[call-overload]
     prior = tasks[0].prior
-    grid = prior.quantile((np.arange(1, _PRIOR_POINTS + 1) / (_PRIOR_POINTS + 1))[:, None])
+    variance = prior.variance
     low, high = prior.quantile(np.array([[0.05], [0.95]]))
     x = np.stack([one.draws for one in found])
     flat = x.reshape(len(found), -1, x.shape[-1])
@@ -354,9 +356,9 @@ def _infer_all(
         ess_tail=stacked("ess_tail"),
         r_hat=stacked("r_hat"),
         converged=np.array([one.converged for one in found]),
-        informed=np.clip(1 - flat.var(axis=1) / grid.var(axis=0), 0, 1),
+        informed=np.clip(1 - flat.var(axis=1) / variance, 0, 1),
         prior_width=np.exp(high) - np.exp(low),
-        identifiable=_identifiable(tasks, grid.var(axis=0)),
+        identifiable=_identifiable(tasks, variance),
         correlation=np.stack([np.atleast_2d(np.corrcoef(one, rowvar=False)) for one in flat]),
         laplace_shift=stacked("laplace_shift"),
         laplace_ratio=stacked("laplace_ratio"),

@@ -12,7 +12,8 @@ import pandas as pd
 
 from lmshealth.arrays import FloatArray, expect_shape, freeze
 from lmshealth.life import LifeLikelihood
-from lmshealth.sampling import Sample, sample, start_from_prior, stream, thin
+from lmshealth.results import QUANTILES
+from lmshealth.sampling import Sample, sample, start_from_prior, stream
 from lmshealth.stage import Stage
 from lmshealth.tracks import History
 
@@ -105,8 +106,7 @@ class LifePosterior:
     def to_frame(self) -> pd.DataFrame:
         """Make a table with a row per law parameter, then per health parameter now."""
         draws = np.concatenate([self.chains, self.health], axis=2)
-        levels = {"median": 0.5, "q05": 0.05, "q25": 0.25, "q75": 0.75, "q95": 0.95}
-        quantiles = np.quantile(draws, list(levels.values()), axis=(0, 1))
+        quantiles = np.quantile(draws, list(QUANTILES.values()), axis=(0, 1))
         missing = np.full(len(self.parameters), np.nan)
         checks = {
             name: np.append(getattr(self, name), missing)
@@ -116,7 +116,7 @@ class LifePosterior:
             {
                 "stage": self.stage,
                 "parameter": (*self.laws, *self.parameters),
-                **dict(zip(levels, quantiles, strict=True)),
+                **dict(zip(QUANTILES, quantiles, strict=True)),
                 **checks,
             }
         )
@@ -164,7 +164,7 @@ def fit_life(history: History, stage: Stage, seed: int | Sequence[int]) -> LifeP
     likelihood = LifeLikelihood(history, stage)
     begin_seed, chain_seed = stream(seed, _STEP).spawn(2)
     found = _draw(likelihood, begin_seed, chain_seed)
-    y = thin(found.draws, _N_KEPT)
+    y = found.thinned(_N_KEPT)
     flat = y.reshape(y.shape[0] * y.shape[1], likelihood.n_dim)
     walk, noise_scale, chi_square, dof = likelihood.settings(flat[:: flat.shape[0] // _N_SETTINGS])
     theta = _natural(likelihood, flat)

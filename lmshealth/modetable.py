@@ -17,7 +17,7 @@ from lmshealth.history import Reading
 from lmshealth.logs import Metadata
 from lmshealth.readers import COVARIATES
 from lmshealth.results import Modes
-from lmshealth.rowfile import lines, read_rows, to_moments, to_numbers
+from lmshealth.rowfile import lines, name_machine, read_rows, to_moments, to_numbers
 from lmshealth.stage import Stage
 
 _KM, _MICRO = 1000.0, 1e-6
@@ -146,9 +146,7 @@ def _tidy(path: Path, table: pd.DataFrame, covariates: list[str], notes: list[st
     for name, fallback in (("mode", ""), ("source", _UNKNOWN_SOURCE), ("servo_id", "")):
         if name not in table.columns:
             table[name] = fallback
-    if "stage" not in table.columns:
-        table["stage"] = path.stem
-        notes.append(f"no column stage: all rows are taken for one machine, {path.stem}")
+    notes += name_machine(path, table)
     if "log" not in table.columns:
         table["log"] = table["recorded_at"]
     for name in _DAMPING:

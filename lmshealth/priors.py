@@ -14,6 +14,7 @@ from lmshealth.errors import BadStage
 
 # A prior with less than this inside the map is about another machine than the map is.
 _LEAST_INSIDE = 1e-6
+_N_LEVELS = 4096
 
 
 class Lognormal(
@@ -174,6 +175,12 @@ class JointPrior:
         """Ends of the ln parameters that are possible, in the box; each ``(n_parameters,)``."""
         low, high = self.quantile(np.array([[0.0], [1.0]]))
         return low, high
+
+    @property
+    def variance(self) -> FloatArray:
+        """Variances of the ln parameters, shape ``(n_parameters,)``."""
+        levels = (np.arange(_N_LEVELS) + 0.5) / _N_LEVELS
+        return np.asarray(self.quantile(levels[:, None]).var(axis=0))
 
     def draw(self, rng: np.random.Generator, n: int) -> FloatArray:
         """Draw ln parameters, shape ``(n, n_parameters)``."""

@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 
 # Share of the prior variance that data must have removed before a value is shown.
 INFORMED = 0.5
+# What tables say of a posterior.
+QUANTILES = {"median": 0.5, "q05": 0.05, "q25": 0.25, "q75": 0.75, "q95": 0.95}
 # Drifts this improbable are of something that is not on the map.
 _UNEXPLAINED = 1e-4
 # What else is known about a posterior of health, one number per epoch and parameter.
@@ -265,9 +267,8 @@ class Health:
 
     def to_frame(self) -> pd.DataFrame:
         """Make the table of ``health.csv``: one row per epoch and parameter, odometer in km."""
-        levels = {"median": 0.5, "q05": 0.05, "q25": 0.25, "q75": 0.75, "q95": 0.95}
-        quantiles = self.quantile(np.array(list(levels.values())))
-        columns: dict[str, FloatArray | BoolArray] = dict(zip(levels, quantiles, strict=True))
+        quantiles = self.quantile(np.array(list(QUANTILES.values())))
+        columns: dict[str, FloatArray | BoolArray] = dict(zip(QUANTILES, quantiles, strict=True))
         columns |= {name: getattr(self, name) for name in ("ess", "r_hat")}
         n, p = len(self.recorded_at), len(self.parameters)
         columns["converged"] = np.repeat(self.converged[:, None], p, axis=1)

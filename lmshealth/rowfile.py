@@ -34,6 +34,14 @@ def read_rows(path: Path, needed: Sequence[str]) -> pd.DataFrame:
     return table
 
 
+def name_machine(path: Path, table: pd.DataFrame) -> list[str]:
+    """Fill in the column stage where there is none, in place, and give the note that says so."""
+    if "stage" in table.columns:
+        return []
+    table["stage"] = path.stem
+    return [f"no column stage: all rows are taken for one machine, {path.stem}"]
+
+
 def lines(table: pd.DataFrame, wrong: pd.Series[bool]) -> str:
     """Name the first lines of the file that are meant."""
     found = [str(int(i) + 2) for i in table.index[wrong]]

@@ -149,10 +149,10 @@ def _run(samplers: list[tuple[emcee.EnsembleSampler, emcee.State]]) -> Sample:
         burn = int(min(10 * tau.max(), n_steps / 2))
         kept = chains[:, burn:]
         enough = kept.shape[1] >= _AUTOCORRELATION_TIMES * tau.max()
-        if enough and (_diagnose("rhat", kept) < _R_HAT).all():
+        r_hat = _diagnose("rhat", kept)
+        if enough and (r_hat < _R_HAT).all():
             break
         if n_steps >= _MOST_STEPS:
-            r_hat = _diagnose("rhat", kept)
             raise NotConverged(
                 f"after {n_steps} steps the autocorrelation time is {tau.max():.0f} and R-hat "
                 f"{r_hat.max():.3f}; needed are {_AUTOCORRELATION_TIMES} autocorrelation times "
@@ -167,7 +167,7 @@ def _run(samplers: list[tuple[emcee.EnsembleSampler, emcee.State]]) -> Sample:
         draws=flattened(kept),
         ess_bulk=_diagnose("ess", walkers, method="bulk"),
         ess_tail=_diagnose("ess", walkers, method="tail", prob=(0.05, 0.95)),
-        r_hat=_diagnose("rhat", kept),
+        r_hat=r_hat,
         autocorrelation_time=tau,
     )
 

@@ -26,7 +26,6 @@ from lmshealth.stage import ModeSpec, Stage
 
 # What is more than this is no plan: what is left then, no logs take away.
 MOST_LOGS, LONGEST = 10_000, 3600
-_PRIOR_POINTS = 4096
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -163,12 +162,11 @@ def sight_of(stage: Stage) -> Sight:
             "describe [[parameter]] and [map]"
         )
     rows = [stage.modal_map.modes.index(name) for name in stage.informative]
-    levels = (np.arange(_PRIOR_POINTS) + 0.5) / _PRIOR_POINTS
     return Sight(
         parameters=stage.prior.names,
         modes=tuple(mode for mode in stage.modes if mode.name in stage.informative),
         slopes=stage.modal_map.gradient(stage.baseline_point[None])[0, rows],
-        prior=stage.prior.quantile(levels[:, None]).var(axis=0),
+        prior=stage.prior.variance,
         model_std=stage.description.map.model_std,
         leave_out=stage.modal_map.leave_out_error[rows],
         n_baseline=stage.description.baseline.logs,

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from textwrap import wrap
 
 import click
 
 from lmshealth.tables import Row
-from lmshealth.terminal import print_table
+from lmshealth.terminal import or_dash, print_table
 
 _VERDICTS = {
     "told": "told",
@@ -39,8 +38,8 @@ def _print_modes(stage: Row, rows: Sequence[Row]) -> None:
             "yes" if row["tracked"] else "no",
             f"{row['frequency_hz']:.1f}",
             f"{row['searched_low_hz']:.0f}-{row['searched_high_hz']:.0f}",
-            *(_number(row[key], ".1f") for key in ("map_hz", "map_at_limits_hz")),
-            *(_number(row[key], ".1e") for key in ("surrogate_error_ln_f", "logs_reach_ln_f")),
+            *(or_dash(row[key], ".1f") for key in ("map_hz", "map_at_limits_hz")),
+            *(or_dash(row[key], ".1e") for key in ("surrogate_error_ln_f", "logs_reach_ln_f")),
         )
         for row in rows
     ]
@@ -89,7 +88,7 @@ def _print_sensitivities(content: dict[str, list[Row]]) -> None:
     names = [row["parameter"] for row in content["parameters"]]
     cells: dict[str, list[str]] = {}
     for row in content["sensitivities"]:
-        ends = [_number(row[key], ".2g") for key in ("at_baseline", "at_limits")]
+        ends = [or_dash(row[key], ".2g") for key in ("at_baseline", "at_limits")]
         cells.setdefault(row["mode"], []).append(" → ".join(ends))
     title = "Sensitivity d ln f / d ln parameter, at the baseline → at the limits"
     print_table(title, ("mode",), names, [(mode, *own) for mode, own in cells.items()])
@@ -101,10 +100,6 @@ def _print_sensitivities(content: dict[str, list[Row]]) -> None:
 
 def _print_text(text: str, mark: str = "") -> None:
     click.echo("\n".join(wrap(mark + text, _WIDTH, subsequent_indent=" " * len(mark))))
-
-
-def _number(value: float, form: str) -> str:
-    return "–" if math.isnan(value) else f"{value:{form}}"
 
 
 def _percent(share: float) -> str:

@@ -112,11 +112,11 @@ def print_health(health: Health) -> None:
             f"{middle[j]:.3f}",
             f"{low[j]:.3f} to {high[j]:.3f}" if health.converged[-1] else "not converged",
             f"{100 * health.informed[-1, j]:.0f}",
-            f"{health.prior_shift[-1, j]:+.2f} σ × {health.prior_ratio[-1, j]:.2f}".replace(
-                "+nan σ × nan", "–"
-            ),
-            f"{health.ess[-1, j]:.0f}".replace("nan", "–"),
-            f"{health.r_hat[-1, j]:.3f}".replace("nan", "–"),
+            "–"
+            if math.isnan(health.prior_ratio[-1, j])
+            else f"{health.prior_shift[-1, j]:+.2f} σ × {health.prior_ratio[-1, j]:.2f}",
+            or_dash(health.ess[-1, j], ".0f"),
+            or_dash(health.r_hat[-1, j], ".3f"),
         )
         for j, name in enumerate(health.parameters)
     ]
@@ -381,6 +381,11 @@ def _mean(values: Sequence[float]) -> str:
 def _labels(row: Row, several: bool) -> tuple[str, ...]:
     name = Path(row["log"]).name
     return (name, row["channel"]) if several else (name,)
+
+
+def or_dash(value: float, form: str) -> str:
+    """Write a number in a form, and a dash where there is none."""
+    return "–" if math.isnan(value) else f"{value:{form}}"
 
 
 def _number(value: float) -> str:

@@ -12,7 +12,7 @@ import pandas as pd
 
 from lmshealth.arrays import FloatArray, expect_shape, freeze
 from lmshealth.errors import BadTable
-from lmshealth.rowfile import lines, read_rows, to_moments, to_numbers
+from lmshealth.rowfile import lines, name_machine, read_rows, to_moments, to_numbers
 
 _KM = 1000.0
 # A factor of 20 in frequency; and what drowns in the rounding of ln frequency.
@@ -84,9 +84,7 @@ def read_drifts(path: Path, *, cross_terms: Path | None = None) -> DriftTable:
     if table.empty:
         raise BadTable(f"{path}: no row; needed is at least one drift")
     notes = []
-    if "stage" not in table.columns:
-        table["stage"] = path.stem
-        notes.append(f"no column stage: all rows are taken for one machine, {path.stem}")
+    notes += name_machine(path, table)
     to_numbers(path, table, ("drift", "drift_std", "travel_km"))
     to_moments(path, table)
     std = table["drift_std"]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import platform
 import time
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
@@ -45,6 +45,40 @@ def keep(path: Path, question: str, answer: Mapping[str, Any], watch: Stopwatch)
         },
     }
     path.write_text(json.dumps(content, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+
+
+def conclude(
+    record: Path,
+    question: str,
+    answer: Mapping[str, Any],
+    watch: Stopwatch,
+    *,
+    quick: bool,
+    not_met: Iterable[str] = (),
+) -> None:
+    """Print what a study found, record it unless it is the quick form, and fail where it fails.
+
+    Parameters
+    ----------
+    record : Path
+        Where the result goes.
+    question : str
+        First line of the study's docstring.
+    answer : mapping
+        With ``passed``, whether each thing asked is so.
+    watch : Stopwatch
+        Of the study.
+    quick : bool
+        Whether it is the quick form.
+    not_met : iterable of str
+        What is known not to be so.
+    """
+    print(json.dumps(answer, indent=1))
+    if not quick:
+        keep(record, question, answer, watch)
+    failed = [name for name, fine in answer["passed"].items() if not fine]
+    if not set(failed) <= set(not_met):
+        raise SystemExit(f"not as asked: {failed}")
 
 
 def clopper_pearson(hits: int, trials: int, level: float = 0.95) -> tuple[float, float]:

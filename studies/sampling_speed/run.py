@@ -32,7 +32,6 @@ Run time
 from __future__ import annotations
 
 import argparse
-import json
 import time
 from pathlib import Path
 from typing import Any
@@ -42,7 +41,7 @@ import numpy as np
 from lmshealth.inference import infer
 from lmshealth.stage import load_stage
 from lmshealth.tracktable import Drifts
-from studies.record import Stopwatch, keep
+from studies.record import Stopwatch, conclude
 from studies.sampling_speed.contestants import compare, epoch_posterior
 from studies.sampling_speed.life import START, life_posterior
 
@@ -82,12 +81,8 @@ def main() -> None:
         "life": life_posterior(SEED, 1 if quick else 7, quick=quick),
     }
     answer["passed"] = verdicts(answer, quick=quick)
-    print(json.dumps(answer, indent=1))
-    if not quick:
-        keep(HERE / "result.json", __doc__.split("\n")[0], answer, watch)
-    failed = [name for name, fine in answer["passed"].items() if not fine]
-    if failed:
-        raise SystemExit(f"not as asked: {failed}")
+    question = __doc__.split("\n")[0]
+    conclude(HERE / "result.json", question, answer, watch, quick=quick)
 
 
 def verdicts(answer: dict[str, Any], *, quick: bool) -> dict[str, bool]:

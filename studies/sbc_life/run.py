@@ -37,7 +37,6 @@ Run time
 from __future__ import annotations
 
 import argparse
-import json
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -63,7 +62,7 @@ from studies.ranks import (
     thinned,
     uniform,
 )
-from studies.record import Stopwatch, keep
+from studies.record import Stopwatch, conclude
 from studies.sbc_epoch.lives import believing
 from studies.sbc_life.lives import draw
 
@@ -96,12 +95,8 @@ def main() -> None:
     answer: dict[str, Any] = {"seed": SEED, "lives": plan} | judged(rows)
     answer["passed"] = verdicts(answer["ranks"])
     answer["bands"] = bands(row for part in answer["ranks"].values() for row in part.values())
-    print(json.dumps(answer, indent=None if options.quick else 1))
-    if not options.quick:
-        keep(HERE / "result.json", __doc__.split("\n")[0], answer, watch)
-    failed = [name for name, fine in answer["passed"].items() if not fine]
-    if failed:
-        raise SystemExit(f"not as asked: {failed}")
+    question = __doc__.split("\n")[0]
+    conclude(HERE / "result.json", question, answer, watch, quick=options.quick)
 
 
 def code(kind: str) -> str:

@@ -38,13 +38,12 @@ Run time
 from __future__ import annotations
 
 import argparse
-import json
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from studies.record import Stopwatch, keep
+from studies.record import Stopwatch, conclude
 from studies.tracking_filter.lives import stage
 from studies.tracking_filter.peers import deviation, speed
 from studies.tracking_filter.trials import averaged, known_setting, two_sources
@@ -74,12 +73,8 @@ def main() -> None:
         "two_sources": two_sources(four, 4 if quick else 300, machine),
     }
     answer |= {"passed": verdicts(answer, quick=quick), "not_met": NOT_MET}
-    print(json.dumps(answer, indent=1))
-    if not quick:
-        keep(HERE / "result.json", __doc__.split("\n")[0], answer, watch)
-    failed = [name for name, fine in answer["passed"].items() if not fine]
-    if not set(failed) <= set(NOT_MET):
-        raise SystemExit(f"not as asked: {failed}")
+    question = __doc__.split("\n")[0]
+    conclude(HERE / "result.json", question, answer, watch, quick=quick, not_met=NOT_MET)
 
 
 def verdicts(answer: dict[str, Any], *, quick: bool) -> dict[str, bool]:
