@@ -30,6 +30,7 @@ from lmshealth.summary import Assessment, judge
 from lmshealth.tables import all_tables
 from lmshealth.tracking import track
 from lmshealth.tracks import History, Track
+from lmshealth.waterfall import Waterfall, read_levels
 
 Progress = Callable[[str, int, int], None]
 """Called with what is being done, how much is done, and how much there is."""
@@ -302,7 +303,9 @@ def identify_log(task: _Task, stages: tuple[Stage, ...]) -> Outcome:
                 f"{[s.description.match.stage for s in stages]}; give its description by --stage",
             )
         modes = identify(log, stage)
-        return Reading(task.name, log.digest, log.metadata, modes, loop_error(log))
+        return Reading(
+            task.name, log.digest, log.metadata, modes, loop_error(log), read_levels(log, stage)
+        )
     except BadLog as error:
         return (Refusal(task.name, error.reason, error.detail),)
     except Exception as error:  # one log must not end the batch, whatever our mistake
@@ -367,11 +370,12 @@ def assess(
     followed, health, prognosis = _results(history, stage, settings.epochs, seed, pool, notes)
     if followed is not None:
         refused += doubted(history, followed)
-    digests = {reading.log: reading.digest for reading in readings}
+    own = {reading.log: reading for reading in readings}
+    used = [own[log] for log in history.logs]
     return Assessment(
         stage=stage,
         history=history,
-        digests=tuple(digests[log] for log in history.logs),
+        digests=tuple(reading.digest for reading in used),
         track=followed,
         health=health,
         prognosis=prognosis,
@@ -379,6 +383,7 @@ def assess(
         refused=tuple([*partial, *refused]),
         notes=tuple(notes),
         seed=settings.seed,
+        waterfall=Waterfall.stack([(reading.levels, reading.modes.lines) for reading in used]),
     )
 
 

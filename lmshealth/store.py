@@ -26,8 +26,9 @@ from lmshealth.errors import LmshealthError
 from lmshealth.history import Reading
 from lmshealth.logs import Metadata, Refusal
 from lmshealth.results import Line, Modes
+from lmshealth.waterfall import Levels
 
-SCHEMA = 2  # part of the name of the table: what an older one holds is not read
+SCHEMA = 3  # part of the name of the table: what an older one holds is not read
 
 
 class StoreError(LmshealthError):
@@ -108,7 +109,7 @@ class Store:
 def _to_json(outcome: Reading | tuple[Refusal, ...]) -> str:
     if not isinstance(outcome, Reading):
         return json.dumps({"refused": [_refusal(refusal) for refusal in outcome]})
-    metadata, modes = outcome.metadata, outcome.modes
+    metadata, modes, levels = outcome.metadata, outcome.modes, outcome.levels
     return json.dumps(
         {
             "digest": outcome.digest,
@@ -122,6 +123,7 @@ def _to_json(outcome: Reading | tuple[Refusal, ...]) -> str:
                 "description": metadata.description,
             },
             "loop_error": outcome.loop_error,
+            "levels": levels and [levels.low, levels.high, _without_nan(levels.level)],
             "modes": {
                 "names": modes.names,
                 "sources": modes.sources,
@@ -160,13 +162,14 @@ def _from_json(text: str, log: str) -> Reading | tuple[Refusal, ...]:
     if "modes" not in content:
         return tuple(Refusal(log=log, **row) for row in content["refused"])
     metadata = content["metadata"]
-    moment = metadata.pop("recorded_at")
+    moment, levels = metadata.pop("recorded_at"), content["levels"]
     return Reading(
         log=log,
         digest=content["digest"],
         metadata=Metadata(recorded_at=moment and datetime.fromisoformat(moment), **metadata),
         modes=_modes(content["modes"], log),
         loop_error=content["loop_error"],
+        levels=levels and Levels(*levels[:2], np.array(levels[2], dtype=float)),
     )
 
 

@@ -56,6 +56,7 @@ FLOORS = [
         "whittle",
         "lines",
         "magnitudes",
+        "waterfall",
         "decayfit",
         "bounds",
         "naming",

@@ -13,6 +13,7 @@ from lmshealth.history import Reading
 from lmshealth.logs import Metadata, Refusal
 from lmshealth.results import Line, Modes
 from lmshealth.store import SCHEMA, Store, StoreError, result_key
+from lmshealth.waterfall import Levels
 
 
 def reading(n: int = 2, log: str = "a.h5") -> Reading:
@@ -44,7 +45,8 @@ def reading(n: int = 2, log: str = "a.h5") -> Reading:
         baseline=True,
         description="small",
     )
-    return Reading(log, "d" * 64, metadata, modes, 1e-6 / 3)
+    levels = Levels(100 / 3, 200 / 3, rng.choice([np.nan, 1 / 3], 5))
+    return Reading(log, "d" * 64, metadata, modes, 1e-6 / 3, levels)
 
 
 @pytest.fixture
@@ -68,6 +70,9 @@ def test_a_reading_comes_back_bit_for_bit(url: str, n: int) -> None:
     assert got.loop_error == put.loop_error
     assert got.metadata.recorded_at is not None
     assert got.metadata.recorded_at.utcoffset() == timedelta(hours=1)
+    assert got.levels is not None and put.levels is not None
+    assert got.levels.edges.tobytes() == put.levels.edges.tobytes()
+    assert got.levels.level.tobytes() == put.levels.level.tobytes()
     for name in ("ln_frequency", "ln_damping", "cov", "snr", "dispersion", "shapes"):
         one, other = getattr(got.modes, name), getattr(put.modes, name)
         assert one.dtype == other.dtype
@@ -87,6 +92,7 @@ def test_missing_metadata_stay_missing(url: str) -> None:
     assert isinstance(got, Reading)
     assert got.metadata == Metadata()
     assert got.loop_error is None
+    assert got.levels is None
 
 
 def test_refusals_come_back_under_the_present_name(url: str) -> None:
