@@ -2,20 +2,22 @@
 
 They return the Axes. Names of modes and parameters are those of the results; travel is shown in
 km, health in % of baseline. Colours come from the palette of Okabe and Ito, and nothing is told
-by colour alone. `svg` turns one of them into an inline picture.
+by colour alone. `svg` turns one of them into an inline picture, in which `hints` show values where
+the pointer rests.
 """
 
 from __future__ import annotations
 
 import re
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from lmshealth.arrays import FloatArray
 from lmshealth.results import Health, Prognosis
+from lmshealth.wording import GAP, km, moment, spell, whole_km
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -50,13 +52,16 @@ _STYLE: dict[str, Any] = {
     **dict.fromkeys(("xtick.labelcolor", "ytick.labelcolor"), INK),
 }
 _KM = 1000.0
+# Of what is drawn as an image; more than screens show, so that a page can be zoomed and printed.
+_DPI = 200
+# A picture carries no more hints than that: what is denser no pointer can tell apart.
+_MOST_HINTS = 300
 _LEVELS = np.array([0.05, 0.25, 0.5, 0.75, 0.95])
 _GRID_POINTS = 72
+SIZE = (4.8, 2.8)  # of a picture in inches
 
 
-def svg(
-    draw: Callable[[Axes], object], *, salt: str, size: tuple[float, float] = (4.8, 2.8)
-) -> str:
+def svg(draw: Callable[[Axes], object], *, salt: str, size: tuple[float, float] = SIZE) -> str:
     """Draw one picture as an SVG element for the inside of a page.
 
     The same input gives the same bytes. Colours follow the style sheet of the page (``--ink``,
@@ -85,8 +90,9 @@ def svg(
         warnings.filterwarnings("ignore", message="Glyph .* missing")
         figure = Figure(figsize=size, layout="constrained", facecolor="none")
         draw(figure.add_subplot())
-        figure.savefig(target, format="svg", metadata=nothing)
-    text = target.getvalue()
+        figure.savefig(target, format="svg", metadata=nothing, dpi=_DPI)
+    text = _LINK.sub(r'<g class="hint"><title>\1</title>', target.getvalue())
+    text = text.replace("</a>", "</g>")
     text = re.sub(r"(?s)<!--.*?-->|<metadata>.*?</metadata>", "", text[text.index("<svg") :])
     # Glyphs and groups carry the same identifiers in every file: give each picture its own.
     text = re.sub(r'(\sid="|href="#|url\(#)', rf"\g<1>{salt}-", text)
@@ -96,6 +102,28 @@ def svg(
     text = re.sub(r'\sd="[^"]*"', lambda d: re.sub(r"(\.\d\d)\d+", r"\1", d[0]), text)
     text = re.sub(r"\n\s*", "\n", text).strip()
     return text.replace("<svg ", '<svg aria-hidden="true" focusable="false" ', 1)
+
+
+# Hints travel as the addresses of links, the only text that matplotlib gives each of many artists.
+_LINK = re.compile(r'<a xlink:href="([^"]*)"[^>]*>')
+
+
+def hints(ax: Axes, x: FloatArray, y: FloatArray, texts: Sequence[str]) -> None:
+    """Lay invisible discs over points, which `svg` turns into titles shown by browsers.
+
+    Parameters
+    ----------
+    ax : Axes
+        In its data coordinates.
+    x, y : ndarray
+        Shape ``(n,)``.
+    texts : sequence of str
+        What is shown at each point; line breaks are kept.
+    """
+    some = slice(None, None, -(-len(texts) // _MOST_HINTS) or 1)
+    # Opaque by one part in 255: what is not drawn at all feels no pointer.
+    discs = ax.scatter(x[some], y[some], s=80, color=INK, alpha=1 / 255, lw=0, zorder=9)
+    discs.set_urls(list(texts[some]))
 
 
 def plot_posterior(ax: Axes, health: Health, parameters: tuple[str, ...]) -> Axes:
@@ -136,6 +164,13 @@ def plot_health(ax: Axes, health: Health, parameter: str, limit: float | None) -
     told = _tells(health, parameter)
     name = "each epoch by itself" if told else "mostly assumption, not measured"
     _bands(ax, health.travel / _KM, bands, name, told=told)
+    if told:  # what is not told has no values to show
+        texts = [
+            f"{moment(when)}, {whole_km(travel)}\n{spell(parameter)} {q[2]:.1f}{GAP}%, "
+            f"90{GAP}%: {q[0]:.1f} to {q[4]:.1f}{GAP}%"
+            for when, travel, q in zip(health.recorded_at, health.travel, bands.T, strict=True)
+        ]
+        hints(ax, health.travel / _KM, bands[2], texts)
     failed = ~health.converged
     if failed.any():
         where = health.travel[failed] / _KM
@@ -168,7 +203,7 @@ def plot_life(
     end = now + prognosis.horizon / _KM
     low, middle, high = _quantiles(prognosis.remaining[:, column], (0.05, 0.5, 0.95)) / _KM
     if np.isfinite(low) and low < prognosis.horizon / _KM:
-        _passage(ax, now + np.array([low, middle, high]), 100 * limit)
+        _passage(ax, now, np.array([low, middle, high]), 100 * limit)
     right = min(end, now + max(1.3 * high, 0.25 * now)) if np.isfinite(high) else end
     shown = right >= 0.55 * end
     if shown:
@@ -203,6 +238,10 @@ def plot_survival(ax: Axes, prognosis: Prognosis, *, max_risk: float | None = No
         elif several:
             line = dashes[k % len(dashes)]
             ax.plot(ahead, 100 * (1 - past), color=MUTED, lw=1.2, ls=line, label=_spell(name))
+    some = np.linspace(0, end, 25)
+    chance = 100 * (1 - np.searchsorted(ordered[:, -1], some, side="right") / ordered.shape[0])
+    texts = [f"after {x:,.0f}{GAP}km: {y:.0f}{GAP}%" for x, y in zip(some, chance, strict=True)]
+    hints(ax, some, chance, [text.replace(",", GAP) for text in texts])
     if max_risk is not None:
         accepted = f"accepted risk {100 * max_risk:.3g} %"
         ax.axhline(100 * (1 - max_risk), color=RED, lw=1.2, ls=(0, (5, 2)), label=accepted)
@@ -265,13 +304,22 @@ def _epochs(ax: Axes, health: Health, parameter: str) -> float:
     return min(float(bounds[2].max()), 160.0)
 
 
-def _passage(ax: Axes, where: FloatArray, level: float) -> None:
+def _passage(ax: Axes, now: float, ahead: FloatArray, level: float) -> None:
     """Mark where the limit is reached: 5 to 95 % as a bar on the limit, the median as a point."""
-    finite = where[np.isfinite(where)]
+    where = now + ahead
     right = where[2] if np.isfinite(where[2]) else 1e9  # runs out of the picture
-    ax.plot([finite[0], right], [level, level], color=RED, lw=5, alpha=0.55, solid_capstyle="butt")
+    ax.plot([where[0], right], [level, level], color=RED, lw=5, alpha=0.55, solid_capstyle="butt")
     if np.isfinite(where[1]):
         ax.plot(where[1], level, "D", color=RED, mec=PAPER, ms=6, zorder=5, label="limit reached")
+    names = ("Early (5 %)", "Median", "Late (95 %)")
+    marks = [
+        (x, f"{name}: in {km(_KM * a)}, at {whole_km(_KM * x)}")
+        for x, a, name in zip(where, ahead, names)
+        if np.isfinite(x)
+    ]
+    hints(
+        ax, np.array([x for x, _ in marks]), np.full(len(marks), level), [text for _, text in marks]
+    )
 
 
 def _regions(ax: Axes, draws: FloatArray) -> None:

@@ -25,7 +25,7 @@ from lmshealth.results import Health, Prognosis
 from lmshealth.stage import ParameterSpec
 from lmshealth.summary import Assessment
 from lmshealth.trackfacts import effect_row, filter_health, fit, happened, mode_rows, surprise
-from lmshealth.trackplots import plot_damping, plot_frequencies, plot_nis
+from lmshealth.trackplots import plot_damping, plot_frequencies, plot_nis, plot_waterfall
 from lmshealth.tracks import History
 from lmshealth.wording import (
     GAP,
@@ -39,6 +39,7 @@ from lmshealth.wording import (
     spell,
 )
 
+_SIZES = {"waterfall": (4.8, 3.6)}  # in inches, where a kind of picture needs more than usual
 _FLEET_TOP = 1.5  # length of all gauges of the index, as a fraction of baseline
 
 
@@ -309,14 +310,19 @@ def _pictures(assessment: Assessment) -> dict[tuple[str, str], str]:
                 plots.plot_life, prognosis=prognosis, parameter=name, health=health
             )
         draw["survival", "any"] = partial(plots.plot_survival, prognosis=prognosis, max_risk=risk)
+    if assessment.waterfall is not None:
+        draw["waterfall", "all"] = partial(
+            plot_waterfall, waterfall=assessment.waterfall, history=history, track=track
+        )
     if track is not None and surprise(track) is not None:
         draw["nis", "all"] = partial(plot_nis, track=track)
-    return {key: _inline(one, f"p{k}") for k, (key, one) in enumerate(draw.items())}
+    return {key: _inline(one, key[0], f"p{k}") for k, (key, one) in enumerate(draw.items())}
 
 
-def _inline(draw: Any, salt: str) -> str:
+def _inline(draw: Any, kind: str, salt: str) -> str:
+    size = _SIZES.get(kind, plots.SIZE)
     # The HTML parser knows these namespaces; without them the page names no address at all.
-    return re.sub(r'\sxmlns(:xlink)?="[^"]*"', "", plots.svg(draw, salt=salt))
+    return re.sub(r'\sxmlns(:xlink)?="[^"]*"', "", plots.svg(draw, salt=salt, size=size))
 
 
 def _pairs(health: Health) -> list[tuple[tuple[str, ...], str, float]]:

@@ -55,6 +55,11 @@ def km(metres: float) -> str:
     return f"{number(metres / _KM)}{GAP}km"
 
 
+def whole_km(metres: float) -> str:
+    """Write a distance given in m to the kilometre."""
+    return f"{metres / _KM:,.0f}{GAP}km".replace(",", GAP)
+
+
 def day_count(days: float) -> str:
     """Write a number of days, with years where there are many."""
     years = f" ({days / 365.25:.1f} years)" if days >= 1000 else ""

@@ -110,7 +110,7 @@ def make(tmp_path: Path) -> Maker:
 @pytest.fixture
 def blank(monkeypatch: pytest.MonkeyPatch) -> None:
     """Leave pictures out where a test reads words only."""
-    monkeypatch.setattr(plots, "svg", lambda draw, *, salt: f'<svg id="{salt}"></svg>')
+    monkeypatch.setattr(plots, "svg", lambda draw, *, salt, size: f'<svg id="{salt}"></svg>')
 
 
 def nothing(assessment: Assessment) -> Assessment:

@@ -81,10 +81,11 @@ def test_following_error_counts_as_acceleration() -> None:
     turned = np.fft.rfft(acceleration)
     turned[1:] /= -((2 * np.pi * frequency[1:]) ** 2)
     turned[0] = 0.0
-    one = read_levels(make_log({"acc_a": acceleration}, RATE), STAGE)
-    other = read_levels(make_log({"delta_e": np.fft.irfft(turned, N)}, RATE), STAGE)
+    one = read_levels(make_log({"acc_a": acceleration}, RATE), STAGE, n_bins=40)
+    other = read_levels(make_log({"delta_e": np.fft.irfft(turned, N)}, RATE), STAGE, n_bins=40)
     assert one is not None and other is not None
-    assert np.median(np.abs(one.level - other.level)) < 0.2
+    # Read as it is, a displacement would be tilted by 13 dB over the band.
+    assert np.abs(one.level - other.level).max() < 1.0
 
 
 def test_what_cannot_be_read_is_missing() -> None:
