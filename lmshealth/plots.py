@@ -91,8 +91,8 @@ def svg(draw: Callable[[Axes], object], *, salt: str, size: tuple[float, float] 
         figure = Figure(figsize=size, layout="constrained", facecolor="none")
         draw(figure.add_subplot())
         figure.savefig(target, format="svg", metadata=nothing, dpi=_DPI)
-    text = _LINK.sub(r'<g class="hint"><title>\1</title>', target.getvalue())
-    text = text.replace("</a>", "</g>")
+    text = _LINK.sub(r'<g class="hint" fill-opacity="0.004"><title>\1</title>', target.getvalue())
+    text = text.replace("</a>", "</g>").replace(_CLEAR, "")
     text = re.sub(r"(?s)<!--.*?-->|<metadata>.*?</metadata>", "", text[text.index("<svg") :])
     # Glyphs and groups carry the same identifiers in every file: give each picture its own.
     text = re.sub(r'(\sid="|href="#|url\(#)', rf"\g<1>{salt}-", text)
@@ -105,6 +105,7 @@ def svg(draw: Callable[[Axes], object], *, salt: str, size: tuple[float, float] 
 
 
 # Hints travel as the addresses of links, the only text that matplotlib gives each of many artists.
+_CLEAR = f' style="fill: {INK}; fill-opacity: 0.003922"'
 _LINK = re.compile(r'<a xlink:href="([^"]*)"[^>]*>')
 
 
@@ -151,7 +152,7 @@ def plot_posterior(ax: Axes, health: Health, parameters: tuple[str, ...]) -> Axe
         _regions(ax, draws)
         ax.set_ylabel(f"{_spell(parameters[1])} in % of baseline")
     ax.set_xlabel(f"{_spell(parameters[0])} in % of baseline")
-    return _legend(ax)
+    return legend(ax)
 
 
 def plot_health(ax: Axes, health: Health, parameter: str, limit: float | None) -> Axes:
@@ -249,7 +250,7 @@ def plot_survival(ax: Axes, prognosis: Prognosis, *, max_risk: float | None = No
     ax.set_ylim(0, 103)
     ax.set_xlabel("travel from now in km" + (" (ends at the horizon)" if end == horizon else ""))
     ax.set_ylabel("probability in %")
-    return _legend(ax)
+    return legend(ax)
 
 
 def bars(ax: Axes, travel: FloatArray, bounds: FloatArray, label: str, size: float) -> None:
@@ -311,15 +312,10 @@ def _passage(ax: Axes, now: float, ahead: FloatArray, level: float) -> None:
     ax.plot([where[0], right], [level, level], color=RED, lw=5, alpha=0.55, solid_capstyle="butt")
     if np.isfinite(where[1]):
         ax.plot(where[1], level, "D", color=RED, mec=PAPER, ms=6, zorder=5, label="limit reached")
-    names = ("Early (5 %)", "Median", "Late (95 %)")
-    marks = [
-        (x, f"{name}: in {km(_KM * a)}, at {whole_km(_KM * x)}")
-        for x, a, name in zip(where, ahead, names)
-        if np.isfinite(x)
-    ]
-    hints(
-        ax, np.array([x for x, _ in marks]), np.full(len(marks), level), [text for _, text in marks]
-    )
+    for x, far, name in zip(where, ahead, ("Early (5 %)", "Median", "Late (95 %)"), strict=True):
+        if np.isfinite(x):
+            text = f"{name}: in {km(_KM * far)}, at {whole_km(_KM * x)}"
+            hints(ax, np.array([x]), np.array([level]), [text])
 
 
 def _regions(ax: Axes, draws: FloatArray) -> None:
@@ -390,10 +386,10 @@ def _quantiles(values: FloatArray, levels: tuple[float, ...]) -> FloatArray:
 def odometer(ax: Axes) -> Axes:
     """Finish a picture over the odometer: axis and legend."""
     ax.set_xlabel("odometer in km")
-    return _legend(ax)
+    return legend(ax)
 
 
-def _legend(ax: Axes) -> Axes:
+def legend(ax: Axes) -> Axes:
     """Put the legend above the picture, where it covers nothing."""
     handles, labels = ax.get_legend_handles_labels()
     lengths = np.array([len(label) for label in labels])

@@ -169,7 +169,7 @@ def _from_json(text: str, log: str) -> Reading | tuple[Refusal, ...]:
         metadata=Metadata(recorded_at=moment and datetime.fromisoformat(moment), **metadata),
         modes=_modes(content["modes"], log),
         loop_error=content["loop_error"],
-        levels=levels and Levels(*levels[:2], np.array(levels[2], dtype=float)),
+        levels=levels and Levels(levels[0], levels[1], np.array(levels[2], dtype=float)),
     )
 
 

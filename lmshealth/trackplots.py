@@ -8,11 +8,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from lmshealth.arrays import FloatArray
-from lmshealth.plots import BLUE, GREEN, INK, RED, bars, hints, odometer
+from lmshealth.influences import Influence
+from lmshealth.plots import BLUE, GREEN, INK, MUTED, RED, bars, hints, legend, odometer
 from lmshealth.results import Line
 from lmshealth.tracks import History, Track
 from lmshealth.waterfall import Waterfall
-from lmshealth.wording import GAP, moment, spell, whole_km
+from lmshealth.wording import GAP, covariate, moment, signed, spell, whole_km
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -96,12 +97,19 @@ def plot_nis(ax: Axes, track: Track) -> Axes:
 
 
 def plot_waterfall(
-    ax: Axes, waterfall: Waterfall, history: History, track: Track | None = None
+    ax: Axes,
+    waterfall: Waterfall,
+    history: History,
+    track: Track | None = None,
+    *,
+    moved: FloatArray | None = None,
 ) -> Axes:
     """Plot the spectra of all logs side by side: odometer, frequency, level in dB as colour.
 
     The filtered frequencies of the modes stand above with their 95 % bands, and every line of a
-    log at its place. Where no log stands for longer than usual there is a gap.
+    log at its place. Where no log stands for longer than usual there is a gap. ``moved`` is how far
+    covariates have moved ln f, shape ``(n_logs, n_modes)``: with it the modes stand where the logs
+    saw them, else at the covariates' reference.
     """
     sides = _columns(history.travel / _KM)
     x, level = sides.ravel(), np.full((waterfall.level.shape[1], 2 * len(sides) - 1), np.nan)
@@ -114,17 +122,44 @@ def plot_waterfall(
     bar = ax.figure.colorbar(picture, ax=ax, extend="both", pad=0.02, aspect=30)
     bar.set_label("level in dB")
     bar.outline.set_visible(False)
-    _column_hints(ax, sides, waterfall, history, track)
+    _column_hints(ax, sides, waterfall, history)
     _waterfall_lines(ax, waterfall, history)
     if track is not None:
         for k in range(len(track.modes)):
-            _on_image(ax, track, k)
+            _on_image(ax, track, k, 0.0 if moved is None else moved[:, k])
     ax.grid(visible=False)
     ax.set_ylim(waterfall.edges[0], waterfall.edges[-1])
     if waterfall.edges[-1] > _WIDE * waterfall.edges[0]:
         ax.set_yscale("log")
     ax.set_ylabel("frequency in Hz")
     return odometer(ax)
+
+
+def plot_influence(ax: Axes, influence: Influence, history: History) -> Axes:
+    """Plot what a covariate does to the frequency of a mode, before and after it is taken out.
+
+    Changes are in % of the frequency at the covariate's reference, without wear and whatever else
+    is known to move the mode. Of the line a 95 % band is shown where the effect is a straight one.
+    """
+    x, before, after = influence.values, 100 * influence.measured, 100 * influence.corrected
+    grid = np.linspace(float(x.min()), float(x.max()), 60)
+    line, std = 100 * influence.explained(grid), influence.explained_std(grid)
+    if std is not None:
+        reach = 196 * std
+        ax.fill_between(grid, line - reach, line + reach, color=BLUE, alpha=0.18, lw=0)
+    ax.plot(grid, line, color=BLUE, lw=1.6, label="taken out")
+    ax.plot(x, before, "o", mfc="none", mec=MUTED, ms=4.5, mew=1.0, label="as measured")
+    ax.plot(x, after, "o", color=INK, ms=2.8, label="corrected")
+    name, unit = covariate(influence.covariate)
+    texts = [
+        f"{title(history, k)}\n{name} {value:.4g}{GAP}{unit}\n"
+        f"as measured {signed(a, 2)}{GAP}%, corrected {signed(b, 2)}{GAP}%"
+        for k, value, a, b in zip(influence.epochs.tolist(), x, before, after, strict=True)
+    ]
+    hints(ax, x, before, texts)
+    ax.set_xlabel(f"{name} in {unit}".replace("$", r"\$") if unit else name.replace("$", r"\$"))
+    ax.set_ylabel("change of frequency in %")
+    return legend(ax)
 
 
 def chi_square_band(dof: FloatArray) -> FloatArray:
@@ -204,9 +239,7 @@ def _shown_levels(waterfall: Waterfall) -> tuple[float, float]:
     return 5 * float(np.floor(low / 5)), 5 * float(np.ceil(high / 5))
 
 
-def _column_hints(
-    ax: Axes, sides: FloatArray, waterfall: Waterfall, history: History, track: Track | None
-) -> None:
+def _column_hints(ax: Axes, sides: FloatArray, waterfall: Waterfall, history: History) -> None:
     """Let each column tell its log, and where it has the modes."""
     from matplotlib.collections import PolyCollection
 
@@ -245,9 +278,9 @@ def _waterfall_lines(ax: Axes, waterfall: Waterfall, history: History) -> None:
         hints(ax, x, y, texts)
 
 
-def _on_image(ax: Axes, track: Track, k: int) -> None:
+def _on_image(ax: Axes, track: Track, k: int, moved: FloatArray | float) -> None:
     """Draw the filtered line of a mode and its 95 % band so that they show on every colour."""
-    level, reach = track.ln_frequency[:, k], 1.96 * track.ln_frequency_std[:, k]
+    level, reach = track.ln_frequency[:, k] + moved, 1.96 * track.ln_frequency_std[:, k]
     x = track.travel / _KM
     name = None if k else "tracked modes, 95 % band"
     ax.fill_between(x, np.exp(level - reach), np.exp(level + reach), fc=_WHITE, alpha=0.4, lw=0)

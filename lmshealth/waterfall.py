@@ -102,9 +102,10 @@ def read_levels(log: Log, stage: Stage, *, n_bins: int = BINS) -> Levels | None:
     """Read how strongly a log shows each frequency of the band of the tracked modes.
 
     Stretches of constant velocity are cut into parts that resolve the bins, and their periodograms
-    are averaged, each by its duration, within every bin. A channel counts in units of its own median over the band, and the level is the mean
-    of all channels: logs of different velocity, load or sensors are then alike but for where they
-    have their resonances, which is what is to be compared. Absolute levels are lost.
+    are averaged, each by its duration, within every bin. A channel counts in units of its own
+    median over the band, and the level is the mean of all channels: logs of different velocity,
+    load or sensors are then alike but for where they have their resonances, which is what is to be
+    compared. Absolute levels are lost.
 
     Parameters
     ----------

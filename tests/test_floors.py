@@ -68,7 +68,7 @@ FLOORS = [
     {"separation"},
     {"modal", "frf", "history", "ringing", "sampling"},
     {"tracking", "smoothing", "decay", "survey", "sight", "modetable", "epoch"},
-    {"inference", "planning", "examination", "life"},
+    {"inference", "planning", "examination", "life", "influences"},
     {"findings"},
     {"lifefit"},
     {"prognosis"},
