@@ -33,7 +33,8 @@ class Influence:
         The covariate in these logs, shape ``(n,)``.
     measured : ndarray
         ln f less all that moves it but this covariate: wear, steps, biases and other covariates,
-        as all logs together tell them; shape ``(n,)``.
+        as all logs together tell them; shape ``(n,)``. Their level follows the logs, so that what
+        is left scatters less than the estimates are uncertain.
     """
 
     mode: str
