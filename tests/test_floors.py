@@ -49,7 +49,7 @@ FLOORS = [
         "responsefit",
         "newcomers",
     },
-    {"blocks", "targets", "identities", "statespace"},
+    {"blocks", "targets", "identities", "statespace", "decision"},
     {
         "peaks",
         "band",

@@ -179,7 +179,7 @@ def words(page: Page) -> str:
 def test_worn_stage_says_it_first(make: Maker, tmp_path: Path) -> None:
     """Verdict, probability, reason, date and remaining life stand on the first screen."""
     assessment = make()
-    by = assessment.service_by()
+    by = assessment.service().by
     assert by is not None
     text = words(one(tmp_path, assessment))
     first = text[: text.index("Frequencies and damping")]
@@ -358,7 +358,7 @@ def test_index_is_sorted_by_risk(make: Maker, tmp_path: Path) -> None:
     assert [path.stem for path in paths] == ["worn", "unknown", "safe", "index"]
     text = words(Page(paths[-1]))
     assert text.index("worn") < text.index("unknown") < text.index("safe") < text.index("stray.csv")
-    assert f"By {worn.service_by()}" in text
+    assert f"By {worn.service().by}" in text
 
 
 def test_empty_fleet(tmp_path: Path) -> None:
