@@ -195,7 +195,8 @@ def reached_before(prognosis: Prognosis, day: date) -> Reached:
 
 def remaining_days(prognosis: Prognosis) -> FloatArray:
     """Give the draws of the remaining days, infinite past the horizon, as `remaining` is shaped."""
-    days = prognosis.remaining / prognosis.usage[:, None]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        days = prognosis.remaining / prognosis.usage[:, None]
     return np.where(prognosis.remaining > prognosis.horizon, np.inf, days)
 
 

@@ -18,6 +18,8 @@ from lmshealth.wording import GAP, LEVELS, chance, percent, quantiles, spell
 _KM = 1000.0
 # So many machines are told one by one, and so many have a row in a table.
 _FEW, _MOST_ROWS = 3, 20
+# Laws less probable than that are not named.
+_SEEN = 0.01
 
 
 def print_assessments(assessments: Sequence[Assessment]) -> None:
@@ -75,6 +77,8 @@ def print_life(prognosis: Prognosis, service: Service, rows: Sequence[Row]) -> N
         f"at {prognosis.travel / _KM:,.0f} km"
     )
     print_table(title, ("until",), ("%", "km", "hours", "days", "date"), cells)
+    for text in (*_laws(prognosis), *_untold(prognosis)):
+        click.echo(text)
     click.echo(_advice(prognosis, service))
     click.echo()
 
@@ -107,6 +111,25 @@ def _life_cells(prognosis: Prognosis, row: Row) -> Iterator[tuple[str, ...]]:
             continue
         travel, hours = (f"{row[f'rul_{unit}_{key}']:,.0f}" for unit in ("km", "hours"))
         yield text, share, travel, hours, f"{days:,.1f}", _day(day_after(prognosis, days))
+
+
+def _laws(prognosis: Prognosis) -> Iterator[str]:
+    """Say which laws each parameter follows, and how probably."""
+    for name in prognosis.parameters[:-1]:
+        told = [
+            f"{law.kind}{f' from {law.begin / _KM:,.0f} km' if law.begin else ''} "
+            f"{_plain(percent(law.probability))}"
+            for law in prognosis.laws
+            if law.parameter == name and law.probability >= _SEEN
+        ]
+        if told:
+            yield f"Law of {spell(name)}: {', '.join(told)}."
+
+
+def _untold(prognosis: Prognosis) -> Iterator[str]:
+    names = ", ".join(spell(name) for name in prognosis.untold)
+    if names:
+        yield f"The modes cannot tell {names}: its limit is no part of this."
 
 
 def _day(day: date | None) -> str:

@@ -155,6 +155,7 @@ def make_prognosis(
         recorded_at=history.recorded_at[-1],
         travel=float(history.travel[-1]),
         parameters=(*PARAMETERS, "any"),
+        untold=(),
         limits=np.array([*limits, np.nan]),
         remaining=np.column_stack([remaining, remaining.min(axis=1)]),
         usage=12e3 * np.exp(rng.normal(0, 0.08, n)),
@@ -164,10 +165,12 @@ def make_prognosis(
         curve_quantiles=np.stack(
             [np.quantile(c, [0.05, 0.25, 0.5, 0.75, 0.95], axis=0) for c in curves], axis=-1
         ),
+        laws=(),
         chi_square=121.4,
         degrees_of_freedom=115,
         walk=8e-4,
         noise_scale=1.02,
+        deviation=0.0,
         ess=1830.0,
         r_hat=1.006,
     )
