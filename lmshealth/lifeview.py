@@ -117,13 +117,16 @@ def _laws(prognosis: Prognosis) -> Iterator[str]:
     """Say which laws each parameter follows, and how probably."""
     for name in prognosis.parameters[:-1]:
         told = [
-            f"{law.kind}{f' from {law.begin / _KM:,.0f} km' if law.begin else ''} "
-            f"{_plain(percent(law.probability))}"
+            f"{law.kind}{_begin(law.begin)} {_plain(percent(law.probability))}"
             for law in prognosis.laws
             if law.parameter == name and law.probability >= _SEEN
         ]
         if told:
             yield f"Law of {spell(name)}: {', '.join(told)}."
+
+
+def _begin(travel: float) -> str:
+    return f" from {travel / _KM:,.0f} km after the baseline" if travel else ""
 
 
 def _untold(prognosis: Prognosis) -> Iterator[str]:

@@ -11,7 +11,7 @@ import pytest
 
 from lmshealth.decision import decide, reached_before
 from lmshealth.lifeview import due, print_assessments, print_life
-from lmshealth.results import Prognosis
+from lmshealth.results import LawWeight, Prognosis
 from lmshealth.stage import Decision
 from lmshealth.summary import Assessment
 from lmshealth.tables import prognosis_rows
@@ -68,6 +68,18 @@ def test_what_is_past_the_horizon_has_no_number(said: Said) -> None:
     idle = make_prognosis(np.full(9, 9e6), np.full(9, 1.0))
     text = shown(idle, Decision(), said)
     assert "no date" in text and "past any" in text and "no calendar" in text
+
+
+def test_laws_and_what_no_mode_tells_are_named(said: Said) -> None:
+    """Laws with their probability, improbable ones left out; a limit nobody sees is no part."""
+    life = make_prognosis(np.full(9, 1e6), np.full(9, 1e4))
+    assert "Law of" not in shown(life, Decision(), said)
+    weights = (("linear", 0.0, 0.7), ("none", 3e5, 0.295), ("power", 0.0, 0.005))
+    laws = tuple(LawWeight("guide_preload", *weight) for weight in weights)
+    text = shown(replace(life, laws=laws, untold=("mount_stiffness",)), Decision(), said)
+    told = "Law of guide preload: linear 70 %, none from 300 km after the baseline 30 %."
+    assert told in text and "power" not in text
+    assert "The modes cannot tell mount stiffness" in text
 
 
 def test_a_few_machines_are_told_in_full(make: Callable[..., Assessment], said: Said) -> None:
