@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from xarray import DataTree
 
 _STEP = 1 << 20  # far from the epochs that health counts its streams by
-_N_ENSEMBLES, _N_KEPT, _N_PRIOR, _N_SETTINGS = 4, 2500, 10_000, 500
+_N_ENSEMBLES, _N_PRIOR, _N_SETTINGS = 4, 10_000, 500
 _N_ROUGH, _N_FINE = 600, 2000
 # A course less probable than the first is told of no more, and one less probable than the second
 # is drawn by importance sampling alone: chains of it would not change what all draws say.
@@ -238,7 +238,14 @@ def _quantiles(draws: FloatArray) -> dict[str, float]:
     return {name: float(np.quantile(draws, level)) for name, level in QUANTILES.items()}
 
 
-def fit_life(history: History, stage: Stage, seed: int | Sequence[int]) -> LifePosterior:
+def fit_life(
+    history: History,
+    stage: Stage,
+    seed: int | Sequence[int],
+    *,
+    chains: bool = True,
+    n_draws: int = 10_000,
+) -> LifePosterior:
     """Fit the degradation laws of a stage to all logs since its baseline.
 
     Every course that the laws and the steps allow is weighed by its evidence; those that are
@@ -252,6 +259,11 @@ def fit_life(history: History, stage: Stage, seed: int | Sequence[int]) -> LifeP
         Laws, priors, covariates and modal map.
     seed : int or sequence of int
         Of all randomness.
+    chains : bool
+        Whether emcee samples the probable courses; else they too are drawn by importance sampling,
+        which is worth at least 400 draws, in a fraction of the time.
+    n_draws : int
+        Of all ensembles, a multiple of 4.
 
     Raises
     ------
@@ -264,7 +276,8 @@ def fit_life(history: History, stage: Stage, seed: int | Sequence[int]) -> LifeP
     likelihood = LifeLikelihood(history, stage)
     explore_seed, chain_seed, off_seed = stream(seed, _STEP).spawn(3)
     found = _explored(likelihood, explore_seed)
-    ways = _ways(found, chain_seed)
+    n_kept = n_draws // _N_ENSEMBLES
+    ways = _ways(found, chain_seed, n_kept, _WORTH_CHAINS if chains else np.inf)
     rng = np.random.default_rng(off_seed)
     now = np.array([likelihood.now])
     health, off, rate, settings = [], [], [], []
@@ -281,7 +294,7 @@ def fit_life(history: History, stage: Stage, seed: int | Sequence[int]) -> LifeP
     with np.errstate(invalid="ignore"):  # health that never changes has no correlation
         flat = np.log(both.reshape(-1, both.shape[-1]))
         correlation = np.atleast_2d(np.corrcoef(flat, rowvar=False))
-    share = np.array([way.share for way in ways]) / _N_KEPT
+    share = np.array([way.share for way in ways]) / n_kept
     walk, noise_scale, deviation, chi_square = (float(v) for v in share @ np.array(settings))
     return LifePosterior(
         stage=history.stage,
@@ -344,28 +357,30 @@ def _fine(look: _Look, rng: np.random.Generator) -> _Look:
     return _Look(density, explore_well(density.log_probability, start, rng, _N_FINE))
 
 
-def _ways(found: Sequence[_Look], seed: np.random.SeedSequence) -> tuple[Way, ...]:
+def _ways(
+    found: Sequence[_Look], seed: np.random.SeedSequence, n_kept: int, worth_chains: float
+) -> tuple[Way, ...]:
     """Sample the courses that are probable, and share the draws among them."""
     probability = softmax([look.value for look in found])
     order = [k for k in np.argsort(-probability) if probability[k] >= _LEAST_PROBABILITY]
     kept = probability[order] / probability[order].sum()
     # Rounded so that they add up.
-    shares = np.diff(np.round(np.cumsum(kept) * _N_KEPT), prepend=0).astype(int)
+    shares = np.diff(np.round(np.cumsum(kept) * n_kept), prepend=0).astype(int)
     seeds = seed.spawn(len(found))
     ways = []
     for k, share, own in zip(order, shares, kept, strict=True):
         density, weighted = found[k].density, found[k].draws
-        draws = _drawn(density, weighted, seeds[k], chains=own >= _WORTH_CHAINS)
+        draws = _drawn(density, weighted, seeds[k], n_kept, chains=own >= worth_chains)
         ways.append(
             Way(
                 density=density,
                 probability=float(own),
                 evidence_std=float(np.sqrt(1 / weighted.ess)) if density.course.n_dim else 0.0,
-                coordinates=draws.thinned(_N_KEPT),
+                coordinates=draws.thinned(n_kept),
                 ess_bulk=draws.ess_bulk,
                 ess_tail=draws.ess_tail,
                 r_hat=draws.r_hat,
-                informed=_informed(density.course, draws.thinned(_N_KEPT)),
+                informed=_informed(density.course, draws.thinned(n_kept)),
                 share=int(share),
             )
         )
@@ -373,16 +388,21 @@ def _ways(found: Sequence[_Look], seed: np.random.SeedSequence) -> tuple[Way, ..
 
 
 def _drawn(
-    density: LifeDensity, weighted: Weighted, seed: np.random.SeedSequence, *, chains: bool
+    density: LifeDensity,
+    weighted: Weighted,
+    seed: np.random.SeedSequence,
+    n_kept: int,
+    *,
+    chains: bool,
 ) -> Sample:
     """Draw coordinates from the posterior of a course."""
     n_dim = density.course.n_dim
     if n_dim and chains:
         start = start_among(weighted.points, weighted.weight)
         return sample(density.log_probability, start, seed)
-    draws = weighted.resampled(np.random.default_rng(seed), _N_ENSEMBLES * _N_KEPT)
+    draws = weighted.resampled(np.random.default_rng(seed), _N_ENSEMBLES * n_kept)
     worth, unknown = np.full(n_dim, weighted.ess), np.full(n_dim, np.nan)
-    return Sample(draws.reshape(_N_ENSEMBLES, _N_KEPT, n_dim), worth, worth, unknown, unknown)
+    return Sample(draws.reshape(_N_ENSEMBLES, n_kept, n_dim), worth, worth, unknown, unknown)
 
 
 def _informed(course: Course, y: FloatArray) -> FloatArray:
