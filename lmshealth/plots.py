@@ -60,6 +60,7 @@ _MOST_HINTS = 300
 _LEVELS = np.array([0.05, 0.25, 0.5, 0.75, 0.95])
 _GRID_POINTS = 72
 SIZE = (4.8, 2.8)  # of a picture in inches
+ROOM = 72  # characters that fit on a line of its legend
 
 
 def svg(draw: Callable[[Axes], object], *, salt: str, size: tuple[float, float] = SIZE) -> str:
@@ -388,18 +389,18 @@ def _quantiles(values: FloatArray, levels: tuple[float, ...]) -> FloatArray:
     return np.asarray(np.quantile(values, levels, method="inverted_cdf"))
 
 
-def odometer(ax: Axes) -> Axes:
+def odometer(ax: Axes, *, room: int = ROOM) -> Axes:
     """Finish a picture over the odometer: axis and legend."""
     ax.set_xlabel("odometer in km")
-    return legend(ax)
+    return legend(ax, room=room)
 
 
-def legend(ax: Axes) -> Axes:
-    """Put the legend above the picture, where it covers nothing."""
+def legend(ax: Axes, *, room: int = ROOM) -> Axes:
+    """Put the legend above the picture, where it covers nothing; ``room`` characters are a line."""
     handles, labels = ax.get_legend_handles_labels()
     lengths = np.array([len(label) for label in labels])
     columns = max(min(4, len(labels)), 1)
-    while columns > 1 and sum(p.max() + 6 for p in np.array_split(lengths, columns)) > 72:
+    while columns > 1 and sum(p.max() + 6 for p in np.array_split(lengths, columns)) > room:
         columns -= 1
     place: Any = {"loc": "lower left", "bbox_to_anchor": (0, 1), "borderaxespad": 0.2}
     ax.legend(handles, labels, ncols=columns, columnspacing=1.2, handlelength=1.8, **place)

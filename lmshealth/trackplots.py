@@ -132,7 +132,7 @@ def plot_waterfall(
     if waterfall.edges[-1] > _WIDE * waterfall.edges[0]:
         ax.set_yscale("log")
     ax.set_ylabel("frequency in Hz")
-    return odometer(ax)
+    return odometer(ax, room=54)  # the bar of colours takes the rest
 
 
 def plot_influence(ax: Axes, influence: Influence, history: History) -> Axes:

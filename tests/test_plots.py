@@ -437,6 +437,17 @@ def test_waterfall_of_one_log_or_of_a_machine_at_rest(
     assert low < few.travel[0] / 1000 < high
 
 
+def test_waterfall_keeps_its_width_beside_long_names(history: History) -> None:
+    """A line with a long name takes a line of the legend, not the room of the picture."""
+    waterfall = make_waterfall(history)
+    long = replace(waterfall.lines[0][0], kind="a disturbance of unknown origin")
+    waterfall = replace(waterfall, lines=((long,), *waterfall.lines[1:]))
+    figure = Figure(figsize=(4.8, 3.6), layout="constrained")
+    ax = trackplots.plot_waterfall(figure.add_subplot(), waterfall, history)
+    figure.draw_without_rendering()
+    assert ax.get_position().width > 0.6
+
+
 def test_wide_waterfall_is_logarithmic(ax: Axes, history: History) -> None:
     """A band over more than two octaves has a logarithmic axis."""
     waterfall = replace(make_waterfall(history), edges=np.geomspace(20.0, 2000.0, 81))
