@@ -18,7 +18,7 @@ PAGES = HERE.parents[1] / "demo" / "result"
 
 
 def main(folder: Path = PAGES) -> None:
-    """Write report.png in few colours, so that it stays small."""
+    """Write report.png down to the end of the first screen, in few colours: it stays small."""
     pages = [path for path in sorted(folder.glob("*.html")) if path.name != "index.html"]
     if not pages:
         sys.exit(f"{folder} holds no report: run `make demo` first")
@@ -27,11 +27,15 @@ def main(folder: Path = PAGES) -> None:
         browser = play.chromium.launch(
             executable_path=shutil.which("chromium"), args=["--no-sandbox"]
         )
-        page = browser.new_page(viewport={"width": 1120, "height": 690})
+        page = browser.new_page(viewport={"width": 1120, "height": 900})
         page.goto(pages[0].resolve().as_uri())
-        page.screenshot(path=target)
+        box = page.locator("section.first").bounding_box()
+        below = box["y"] + box["height"] if box else 690.0
+        page.screenshot(path=target, clip={"x": 0, "y": 0, "width": 1120, "height": below + 16})
         browser.close()
-    Image.open(target).convert("RGB").quantize(96).save(target, optimize=True)
+    Image.open(target).convert("RGB").quantize(128, Image.Quantize.MAXCOVERAGE).save(
+        target, optimize=True
+    )
 
 
 if __name__ == "__main__":
