@@ -123,10 +123,15 @@ def hints(ax: Axes, x: FloatArray, y: FloatArray, texts: Sequence[str]) -> None:
     texts : sequence of str
         What is shown at each point; line breaks are kept.
     """
-    some = slice(None, None, -(-len(texts) // _MOST_HINTS) or 1)
+    some = few(len(texts))
     # Opaque by one part in 255: what is not drawn at all feels no pointer.
     discs = ax.scatter(x[some], y[some], s=80, color=INK, alpha=1 / 255, lw=0, zorder=9)
     discs.set_urls(list(texts[some]))
+
+
+def few(n: int) -> slice:
+    """Choose as many of n things, evenly, as may have hints."""
+    return slice(None, None, -(-n // _MOST_HINTS) or 1)
 
 
 def plot_posterior(ax: Axes, health: Health, parameters: tuple[str, ...]) -> Axes:

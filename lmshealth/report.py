@@ -296,7 +296,7 @@ def _track_pictures(
     for mode in _seen(history):
         for kind, plot in pair.items():
             draw[kind, mode] = partial(plot, history=history, track=track, mode=mode)
-    if waterfall is not None:
+    if waterfall is not None and history.has_odometer:
         moved = None if track is None else covariate_shifts(history, track, assessment.stage)
         draw["waterfall", "all"] = partial(
             plot_waterfall, waterfall=waterfall, history=history, track=track, moved=moved

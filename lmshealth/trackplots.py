@@ -9,7 +9,7 @@ import numpy as np
 
 from lmshealth.arrays import FloatArray
 from lmshealth.influences import Influence
-from lmshealth.plots import BLUE, GREEN, INK, MUTED, RED, bars, hints, legend, odometer
+from lmshealth.plots import BLUE, GREEN, INK, MUTED, RED, bars, few, hints, legend, odometer
 from lmshealth.results import Line
 from lmshealth.tracks import History, Track
 from lmshealth.waterfall import Waterfall
@@ -106,10 +106,10 @@ def plot_waterfall(
 ) -> Axes:
     """Plot the spectra of all logs side by side: odometer, frequency, level in dB as colour.
 
-    The filtered frequencies of the modes stand above with their 95 % bands, and every line of a
-    log at its place. Where no log stands for longer than usual there is a gap. ``moved`` is how far
-    covariates have moved ln f, shape ``(n_logs, n_modes)``: with it the modes stand where the logs
-    saw them, else at the covariates' reference.
+    The history has an odometer. The filtered frequencies of the modes stand above with their 95 %
+    bands, and every line of a log at its place. Where no log stands for longer than usual there is
+    a gap. ``moved`` is how far covariates have moved ln f, shape ``(n_logs, n_modes)``: with it the
+    modes stand where the logs saw them, else at the covariates' reference.
     """
     sides = _columns(history.travel / _KM)
     x, level = sides.ravel(), np.full((waterfall.level.shape[1], 2 * len(sides) - 1), np.nan)
@@ -244,9 +244,11 @@ def _column_hints(ax: Axes, sides: FloatArray, waterfall: Waterfall, history: Hi
     from matplotlib.collections import PolyCollection
 
     low, high = waterfall.edges[[0, -1]]
-    corners = [[(a, low), (a, high), (b, high), (b, low)] for a, b in sides]
+    some = few(len(sides))
+    corners = [[(a, low), (a, high), (b, high), (b, low)] for a, b in sides[some]]
     columns = PolyCollection(corners, facecolor=INK, alpha=1 / 255, lw=0)
-    columns.set_urls([title(history, k) + _found(history, k) for k in range(len(sides))])
+    texts = [title(history, k) + _found(history, k) for k in range(len(sides))]
+    columns.set_urls(texts[some])
     ax.add_collection(columns)
 
 
