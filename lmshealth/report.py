@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import date, datetime
 from functools import partial
@@ -20,6 +20,7 @@ import numpy as np
 
 from lmshealth import plots
 from lmshealth.arrays import FloatArray
+from lmshealth.changes import Reported, changes, reported
 from lmshealth.logs import Refusal
 from lmshealth.results import Health, Prognosis
 from lmshealth.stage import ParameterSpec
@@ -87,6 +88,7 @@ def write_report(
     assessments: Sequence[Assessment],
     refused: Sequence[Refusal],
     *,
+    earlier: Mapping[str, Reported] | None = None,
     generated: datetime | None = None,
 ) -> list[Path]:
     """Write one page per stage, and ``index.html``.
@@ -101,6 +103,8 @@ def write_report(
         One per stage.
     refused : sequence of Refusal
         Logs that belong to no stage.
+    earlier : mapping of str to Reported, optional
+        By stage, what its last report said.
     generated : datetime or None
         Moment to print on the pages; nothing is printed for None.
 
@@ -118,6 +122,7 @@ def write_report(
     for assessment, name in zip(ranked, names, strict=True):
         by = assessment.service_by()
         row = _summary(assessment, by, None) | common
+        row |= _changes(assessment, (earlier or {}).get(assessment.judgement.stage))
         text = pages.get_template("stage.html.j2").render(row | _evidence(assessment))
         (folder / name).write_text(text, encoding="utf-8", newline="\n")
         rows.append(_summary(assessment, by, _FLEET_TOP) | {"file": name})
@@ -191,6 +196,12 @@ def _summary(assessment: Assessment, by: date | None, top: float | None) -> dict
         "lives": lives,
         "service": _service(assessment, by),
     }
+
+
+def _changes(assessment: Assessment, before: Reported | None) -> dict[str, Any]:
+    """Say what is new since the last report."""
+    news = () if before is None else changes(before, reported(assessment))
+    return {"before": before, "news": news}
 
 
 def _evidence(assessment: Assessment) -> dict[str, Any]:

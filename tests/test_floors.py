@@ -9,7 +9,7 @@ import pytest
 
 FLOORS = [
     {"errors"},
-    {"arrays", "toml"},
+    {"arrays", "toml", "packing"},
     {"samples"},
     {"logs"},
     {"results", "tracks"},
@@ -72,9 +72,9 @@ FLOORS = [
     {"lifefit"},
     {"prognosis"},
     {"summary", "plots"},
-    {"store", "tables", "trackplots"},
-    {"trackfacts"},
-    {"report"},
+    {"changes", "tables", "trackplots"},
+    {"store", "trackfacts"},
+    {"report", "intake"},
     {"pipeline", "terminal", "options", "looks"},
     {"stageview"},
     {"commands"},
