@@ -9,7 +9,7 @@ import pytest
 
 FLOORS = [
     {"errors"},
-    {"arrays", "toml", "packing"},
+    {"arrays", "toml", "packing", "pdf"},
     {"samples"},
     {"logs"},
     {"results", "tracks"},
