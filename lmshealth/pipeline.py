@@ -111,7 +111,7 @@ def run(
                 f"{folder}: no usable log: {len(taken.logs)} found, {_n_lost(taken, fleet)} "
                 f"refused; {out / 'refused.csv'} says why"
             )
-        store.keep_refused(folder, fleet.refused)
+        store.keep_refused((a.history.stage for a in fleet.assessments), fleet.refused)
     pages = write_report(out, fleet.assessments, fleet.refused, earlier=fleet.earlier)
     n_copies = len({r.log for r in fleet.refused if r.reason == "duplicate"})
     return RunResult(

@@ -9,14 +9,14 @@ from __future__ import annotations
 
 import logging
 import re
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
-from sqlalchemy import LargeBinary, String, Text, create_engine, delete, inspect, select
+from sqlalchemy import LargeBinary, String, Text, create_engine, delete, inspect, select, update
 from sqlalchemy.engine import URL, make_url
 from sqlalchemy.exc import ArgumentError, SQLAlchemyError
 from sqlalchemy.orm import DeclarativeBase, Mapped, Session, mapped_column
@@ -52,13 +52,17 @@ class _Identified(_Base):
 
 
 class _Assessed(_Base):
-    """The present assessment of each machine: earlier ones would be megabytes each."""
+    """The present assessment of each machine: earlier ones would be megabytes each.
+
+    Beside it stands what the run that reported it last refused of logs that belong to no machine.
+    """
 
     __tablename__ = f"assessed_{SCHEMA}"
 
     machine: Mapped[str] = mapped_column(Text, primary_key=True)
     key: Mapped[str] = mapped_column(String(64))
     content: Mapped[bytes] = mapped_column(LargeBinary)
+    refused: Mapped[bytes] = mapped_column(LargeBinary)
 
 
 class _Reported(_Base):
@@ -69,15 +73,6 @@ class _Reported(_Base):
     number: Mapped[int] = mapped_column(primary_key=True)
     machine: Mapped[str] = mapped_column(Text, index=True)
     key: Mapped[str] = mapped_column(String(64))
-    content: Mapped[bytes] = mapped_column(LargeBinary)
-
-
-class _Refused(_Base):
-    """The logs of a folder that belong to no machine."""
-
-    __tablename__ = f"refused_{SCHEMA}"
-
-    folder: Mapped[str] = mapped_column(Text, primary_key=True)
     content: Mapped[bytes] = mapped_column(LargeBinary)
 
 
@@ -182,18 +177,18 @@ class Store:
         content = pack(assessment)
         again = _Reported.machine == machine, _Reported.key == key
         with self._session() as session:
-            session.merge(_Assessed(machine=machine, key=key, content=content))
+            session.merge(_Assessed(machine=machine, key=key, content=content, refused=pack(())))
             session.execute(delete(_Reported).where(*again))
             said = pack(reported(assessment))
             session.add(_Reported(machine=machine, key=key, content=said))
         kept: Assessment = unpack(content, Assessment)
         return kept
 
-    def keep_refused(self, folder: Path, refused: tuple[Refusal, ...]) -> None:
-        """Keep which logs of a folder belong to no machine, instead of what was kept of it."""
-        row = _Refused(folder=folder.resolve().as_posix(), content=pack(refused))
+    def keep_refused(self, machines: Iterable[str], refused: tuple[Refusal, ...]) -> None:
+        """Keep which logs of no machine were refused by the run that reported these machines."""
+        query = update(_Assessed).where(_Assessed.machine.in_(list(machines)))
         with self._session() as session:
-            session.merge(row)
+            session.execute(query.values(refused=pack(refused)))
 
     def earlier(self, machine: str, key: str) -> Reported | None:
         """Give what the newest assessment of a machine with another key said; None for none."""
@@ -213,13 +208,13 @@ class Store:
         StoreError
             If there is no assessment that this version can read.
         """
+        query = select(_Assessed.machine, _Assessed.key, _Assessed.refused)
         with self._session() as session:
-            keys = {
-                row.machine: row.key
-                for row in session.execute(select(_Assessed.machine, _Assessed.key))
-            }
-            folders = session.scalars(select(_Refused.content).order_by(_Refused.folder)).all()
-        found = {machine: self.recall(machine, key) for machine, key in sorted(keys.items())}
+            rows = session.execute(query.order_by(_Assessed.machine)).all()
+        keys = {machine: key for machine, key, _ in rows}
+        # Machines of one run have the same: it is listed once.
+        refused = dict.fromkeys(row.refused for row in rows)
+        found = {machine: self.recall(machine, key) for machine, key in keys.items()}
         assessments = tuple(one for one in found.values() if one is not None)
         if not assessments:
             state = "no assessment" if not found else "only what another version of lmshealth kept"
@@ -229,7 +224,7 @@ class Store:
         before = {machine: self.earlier(machine, keys[machine]) for machine in found}
         return Fleet(
             assessments=assessments,
-            refused=tuple(r for rows in folders for r in _read(rows, tuple[Refusal, ...]) or ()),
+            refused=tuple(r for own in refused for r in _read(own, tuple[Refusal, ...]) or ()),
             earlier={machine: said for machine, said in before.items() if said is not None},
             unread=tuple(machine for machine, one in found.items() if one is None),
         )
@@ -254,13 +249,16 @@ def _as_it_is(url: URL) -> URL:
     name = url.database or ":memory:"
     if url.get_backend_name() != "sqlite" or name == ":memory:":
         return url
+    if not name.startswith("file:") and not Path(name).exists():
+        raise ValueError("there is no such file; `lmshealth run LOGS --store URL` makes it")
     path = name if name.startswith("file:") else f"file:{quote(name)}"
     return url.set(database=path).update_query_dict({"mode": "rw", "uri": "true"})
 
 
 def _why(error: Exception) -> str:
     """Say in one line what went wrong, without SQLAlchemy's statements and addresses."""
-    return str(getattr(error, "orig", None) or error).strip().splitlines()[0]
+    text = str(getattr(error, "orig", None) or error).strip()
+    return text.splitlines()[0] if text else type(error).__name__
 
 
 def _read(content: bytes, kind: Any) -> Any:

@@ -9,6 +9,7 @@ import shutil
 import sqlite3
 import subprocess
 import sys
+from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
 
@@ -662,9 +663,10 @@ def test_a_machine_that_cannot_be_read_is_told_and_the_others_are_written(tmp_pa
 
 
 def test_pdfs_stand_beside_the_pages_of_run_and_report(
-    folder: Path, stage: Path, tmp_path: Path
+    folder: Path, stage: Path, tmp_path: Path, needs: Callable[[str], None]
 ) -> None:
     """One per stage, under the name of its page; none without being asked for."""
+    needs("pdf")
     out = tmp_path / "out"
     arguments = ("run", folder / "good", "--stage", stage, "--out", out, "--workers", 1)
     assert call(*arguments).exit_code == 0

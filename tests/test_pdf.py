@@ -6,6 +6,7 @@ import re
 import subprocess
 import sys
 import zlib
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -14,6 +15,12 @@ from lmshealth.pdf import PdfError, write_pdfs
 from lmshealth.plots import GREEN, RED
 from lmshealth.report import write_report
 from tests.assessments import worn
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _library(needs: Callable[[str], None]) -> None:
+    """Skip all where the library is not there."""
+    needs("pdf")
 
 
 @pytest.fixture(scope="module")
@@ -88,6 +95,18 @@ def test_a_missing_library_is_named(small: Path, monkeypatch: pytest.MonkeyPatch
     with pytest.raises(PdfError, match=r'pip install "lmshealth\[pdf\]"'):
         write_pdfs([small])
     assert not small.with_suffix(".pdf").exists()
+
+
+def test_missing_libraries_of_the_library_are_named(
+    small: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Where Pango is not installed the error says which Debian packages have it."""
+    (tmp_path / "weasyprint.py").write_text("raise OSError('cannot load library pango')")
+    monkeypatch.delitem(sys.modules, "weasyprint", raising=False)
+    monkeypatch.syspath_prepend(tmp_path)
+    with pytest.raises(PdfError, match="libpangoft2") as caught:
+        write_pdfs([small])
+    assert "cannot load library pango" in str(caught.value)
 
 
 def test_a_page_that_cannot_be_laid_out_is_named(

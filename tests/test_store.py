@@ -216,7 +216,7 @@ def test_pages_from_the_store_are_those_of_what_was_kept(url: str, tmp_path: Pat
     refused = (Refusal("x.h5", "no-stage", "näher"),)
     store = Store(url)
     kept = [store.keep(name, "k1", worn(tmp_path, name)) for name in ("M8-Y", "M7-Y")]
-    store.keep_refused(tmp_path, refused)
+    store.keep_refused(("M7-Y", "M8-Y"), refused)
     fleet = store.fleet()
     store.close()
     assert (fleet.refused, fleet.earlier, fleet.unread) == (refused, {}, ())
@@ -261,13 +261,18 @@ def test_the_earlier_report_is_the_newest_of_another_key(url: str, tmp_path: Pat
     store.close()
 
 
-def test_refused_logs_are_those_of_each_folder_now(url: str, tmp_path: Path) -> None:
-    """A later run replaces what was refused in its folder, and in no other."""
+def test_refused_logs_are_those_of_the_last_run_of_each_machine(url: str, tmp_path: Path) -> None:
+    """A later run replaces what an earlier one refused, where it reported the same machines."""
+    one, two, three = ((Refusal(log, "gap", ""),) * 2 for log in ("one", "two", "three"))
     store = Store(url)
-    store.keep("A", "k1", worn(tmp_path))
-    for folder, log in (("b", "old"), ("a", "other"), ("b", "new")):
-        store.keep_refused(tmp_path / folder, (Refusal(log, "gap", ""),))
-    assert [refusal.log for refusal in store.fleet().refused] == ["other", "new"]
+    for machine in ("A", "B", "C"):
+        store.keep(machine, "k1", worn(tmp_path))
+    assert store.fleet().refused == ()
+    store.keep_refused(("A", "B"), one)
+    store.keep_refused(("C",), two)
+    assert store.fleet().refused == (*one, *two)
+    store.keep_refused(("A", "B"), three)
+    assert store.fleet().refused == (*three, *two)
     store.close()
 
 
