@@ -51,7 +51,7 @@ class Reported:
     horizon : float
         Travel in m past which nothing is claimed.
     service_by : date or None
-        Last day on which the accepted risk is kept.
+        Last day for the service; None where none is asked for.
     """
 
     recorded_at: datetime
@@ -92,7 +92,7 @@ def reported(assessment: Assessment) -> Reported:
         health=told,
         remaining=remaining,
         horizon=np.inf if prognosis is None else prognosis.horizon,
-        service_by=assessment.service_by(),
+        service_by=assessment.service().by,
     )
 
 

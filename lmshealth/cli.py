@@ -429,17 +429,12 @@ def _exit(ctx: click.Context, found: Sequence[object], lost: Sequence[Refusal]) 
 
 
 def _tell(result: RunResult) -> None:
+    from lmshealth.lifeview import print_assessments
+
     used = result.n_logs - result.n_refused
     again = f", {result.n_remembered} of them known from before" if result.n_remembered else ""
     click.echo(f"{used} of {result.n_logs} logs analysed{again}.")
-    for assessment in result.assessments:
-        judgement = assessment.judgement
-        sure = (
-            ""
-            if judgement.probability != judgement.probability
-            else (f" ({100 * judgement.probability:.0f} %)")
-        )
-        click.echo(f"{judgement.stage}: {judgement.verdict}{sure}. {judgement.why}")
+    print_assessments(result.assessments)
     click.echo(f"Report: {result.index}")
 
 

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from lmshealth.arrays import FloatArray
+from lmshealth.decision import Service
 from lmshealth.results import Health, Prognosis
 
 if TYPE_CHECKING:
@@ -186,8 +187,11 @@ def plot_life(
     return ax
 
 
-def plot_survival(ax: Axes, prognosis: Prognosis, *, max_risk: float | None = None) -> Axes:
-    """Plot the probability of not having reached a limit against the travel ahead."""
+def plot_survival(ax: Axes, prognosis: Prognosis, *, service: Service | None = None) -> Axes:
+    """Plot the probability of not having reached a limit against the travel ahead.
+
+    With a service the risk that its day keeps is drawn: the accepted one, or that of least costs.
+    """
     horizon = prognosis.horizon / _KM
     last = _quantiles(prognosis.remaining[:, -1], (0.99,))[0] / _KM
     end = min(horizon, max(1.2 * last, horizon / 50)) if np.isfinite(last) else horizon
@@ -203,9 +207,10 @@ def plot_survival(ax: Axes, prognosis: Prognosis, *, max_risk: float | None = No
         elif several:
             line = dashes[k % len(dashes)]
             ax.plot(ahead, 100 * (1 - past), color=MUTED, lw=1.2, ls=line, label=_spell(name))
-    if max_risk is not None:
-        accepted = f"accepted risk {100 * max_risk:.3g} %"
-        ax.axhline(100 * (1 - max_risk), color=RED, lw=1.2, ls=(0, (5, 2)), label=accepted)
+    if service is not None and service.kept_risk is not None:
+        what = "accepted risk" if service.max_risk else "risk at least costs"
+        label = f"{what} {100 * service.kept_risk:.3g} %"
+        ax.axhline(100 * (1 - service.kept_risk), color=RED, lw=1.2, ls=(0, (5, 2)), label=label)
     ax.set_xlim(0, end)
     ax.set_ylim(0, 103)
     ax.set_xlabel("travel from now in km" + (" (ends at the horizon)" if end == horizon else ""))

@@ -9,7 +9,7 @@ import re
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from datetime import date, datetime
+from datetime import datetime
 from functools import partial
 from importlib import metadata
 from itertools import combinations
@@ -19,8 +19,8 @@ from typing import Any
 import numpy as np
 
 from lmshealth import plots
-from lmshealth.arrays import FloatArray
 from lmshealth.changes import Reported, changes, reported
+from lmshealth.decision import Service, remaining_days
 from lmshealth.logs import Refusal
 from lmshealth.results import Health, Prognosis
 from lmshealth.stage import ParameterSpec
@@ -31,6 +31,7 @@ from lmshealth.tracks import History
 from lmshealth.wording import (
     GAP,
     LEVELS,
+    chance,
     day_count,
     km,
     left,
@@ -57,17 +58,6 @@ class Gauge:
     limit: str
     unit: str
     places: dict[str, float]
-
-
-@dataclass(frozen=True, slots=True)
-class Service:
-    """What to do: kind is ``now``, ``by`` a date, ``later`` than the horizon, or ``unknown``."""
-
-    kind: str
-    by: date | None
-    risk: str
-    planned: date | None
-    planned_risk: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,18 +104,17 @@ def write_report(
         The pages of the stages, worst first, then the index.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    ranked = sorted(assessments, key=_urgency)
+    ranked = sorted(assessments, key=Assessment.urgency)
     names = _file_names(ranked)
     pages = _environment()
     common = {"generated": generated, "version": metadata.version("lmshealth")}
     rows = []
     for assessment, name in zip(ranked, names, strict=True):
-        by = assessment.service_by()
-        row = _summary(assessment, by, None) | common
+        row = _summary(assessment, None) | common
         row |= _changes(assessment, (earlier or {}).get(assessment.judgement.stage))
         text = pages.get_template("stage.html.j2").render(row | _evidence(assessment))
         (folder / name).write_text(text, encoding="utf-8", newline="\n")
-        rows.append(_summary(assessment, by, _FLEET_TOP) | {"file": name})
+        rows.append(_summary(assessment, _FLEET_TOP) | {"file": name})
     parameters = list(dict.fromkeys(gauge.name for row in rows for gauge in row["gauges"]))
     tones = Counter(row["tone"] for row in rows)
     context = {"rows": rows, "parameters": parameters, "tones": tones, "refused": refused}
@@ -165,21 +154,7 @@ def _file_names(assessments: Sequence[Assessment]) -> list[str]:
     return [names[k] for k in range(len(assessments))]
 
 
-def _urgency(assessment: Assessment) -> tuple[int, float, float, str]:
-    """Sort by risk: days until the accepted risk is used up; unknown before safe."""
-    identity, prognosis = assessment.judgement.stage, assessment.prognosis
-    verdict = assessment.judgement.verdict
-    if verdict == "not-enough-data":
-        return 1, 0.0, 0.0, identity
-    if prognosis is None:
-        return (1 if verdict == "healthy" else 0), 0.0, 0.0, identity
-    risk = assessment.stage.description.decision.max_risk
-    days = float(np.quantile(_days(prognosis)[:, -1], risk, method="inverted_cdf"))
-    group = 2 if verdict == "healthy" and np.isinf(days) else 0
-    return group, days, float(prognosis.beyond_horizon()[-1]), identity
-
-
-def _summary(assessment: Assessment, by: date | None, top: float | None) -> dict[str, Any]:
+def _summary(assessment: Assessment, top: float | None) -> dict[str, Any]:
     """Collect what both the first screen of a page and a row of the index say."""
     judgement, prognosis = assessment.judgement, assessment.prognosis
     specs = assessment.stage.parameters
@@ -194,7 +169,7 @@ def _summary(assessment: Assessment, by: date | None, top: float | None) -> dict
         "probability": percent(judgement.probability) if judgement.probability >= 0 else "",
         "gauges": list(_gauges(assessment, top)),
         "lives": lives,
-        "service": _service(assessment, by),
+        "service": _service(assessment.service()),
     }
 
 
@@ -258,31 +233,25 @@ def _gauge(spec: ParameterSpec | None, health: Health, column: int, top: float) 
     )
 
 
-def _service(assessment: Assessment, by: date | None) -> Service:
-    """Say until when the accepted risk holds; never a date that the data do not carry."""
-    prognosis, decision = assessment.prognosis, assessment.stage.description.decision
-    planned, planned_risk, kind = None, "", "unknown"
-    if prognosis is not None:
-        today = prognosis.recorded_at.date()
-        passed = prognosis.already_past()[-1] > decision.max_risk
-        if passed or (by is not None and by <= today):
-            kind = "now"
-        elif by is not None:
-            kind = "by"
-        elif prognosis.beyond_horizon()[-1] >= 1 - decision.max_risk:
-            kind = "later"
-        planned = decision.next_service
-        if planned is not None:
-            ahead = (planned - today).days
-            planned_risk = percent(float(np.mean(_days(prognosis)[:, -1] <= ahead)))
-    return Service(kind, by, f"{100 * decision.max_risk:.3g}{GAP}%", planned, planned_risk)
+def _service(service: Service) -> dict[str, Any]:
+    """Put in words when to service, and by what that was chosen."""
+    ratio = service.cost_ratio
+    return {
+        "kind": service.kind,
+        "by": service.by,
+        "accepted": service.max_risk and f"{100 * service.max_risk:.3g}{GAP}%",
+        "times": ratio and f"{ratio:.3g}",
+        "risk": percent(service.risk),
+        "planned": service.planned,
+        "planned_risk": chance(*service.planned_risk),
+    }
 
 
 def _life(prognosis: Prognosis, column: int) -> Life:
     name, limit = prognosis.parameters[column], float(prognosis.limits[column])
     travel = prognosis.remaining[:, column]
     distance = quantiles(np.where(travel > prognosis.horizon, np.inf, travel))
-    days = quantiles(_days(prognosis)[:, column])
+    days = quantiles(remaining_days(prognosis)[:, column])
     low, middle, high = quantiles(
         100 * prognosis.health[:, min(column, prognosis.health.shape[1] - 1)]
     )
@@ -300,7 +269,7 @@ def _life(prognosis: Prognosis, column: int) -> Life:
 def _pictures(assessment: Assessment) -> dict[tuple[str, str], str]:
     """Draw every picture of a page, by kind and by what it shows."""
     history, track, prognosis = assessment.history, assessment.track, assessment.prognosis
-    health, risk = _health(assessment), assessment.stage.description.decision.max_risk
+    health = _health(assessment)
     draw: dict[tuple[str, str], Any] = {}
     pair = {"frequency": plot_frequencies, "damping": plot_damping}
     for mode in _seen(history):
@@ -319,7 +288,8 @@ def _pictures(assessment: Assessment) -> dict[tuple[str, str], str]:
             draw["life", spell(name)] = partial(
                 plots.plot_life, prognosis=prognosis, parameter=name, health=health
             )
-        draw["survival", "any"] = partial(plots.plot_survival, prognosis=prognosis, max_risk=risk)
+        service = assessment.service()
+        draw["survival", "any"] = partial(plots.plot_survival, prognosis=prognosis, service=service)
     if track is not None and surprise(track) is not None:
         draw["nis", "all"] = partial(plot_nis, track=track)
     return {key: _inline(one, f"p{k}") for k, (key, one) in enumerate(draw.items())}
@@ -356,10 +326,3 @@ def _health(assessment: Assessment) -> Health | None:
 def _limit(spec: ParameterSpec | None) -> float | None:
     """Limit as a fraction of the baseline."""
     return None if spec is None or spec.limit is None else spec.limit.below / spec.baseline
-
-
-def _days(prognosis: Prognosis) -> FloatArray:
-    """Draws of the remaining days, infinite past the horizon."""
-    with np.errstate(divide="ignore", invalid="ignore"):
-        days = prognosis.remaining / prognosis.usage[:, None]
-    return np.where(prognosis.remaining > prognosis.horizon, np.inf, days)

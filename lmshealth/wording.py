@@ -33,6 +33,16 @@ def percent(probability: float | np.floating[Any]) -> str:
     return f"{100 * probability:.0f}{GAP}%"
 
 
+def chance(at_least: float, at_most: float) -> str:
+    """Write a probability that is known between two values."""
+    low, high = percent(at_least), percent(at_most)
+    if low == high:
+        return low
+    if at_least < 0.01:
+        return f"at most {high}"
+    return f"at least {low}" if at_most > 0.99 else f"{low} to {high}"
+
+
 def signed(value: float, digits: int) -> str:
     """Write a number with its sign."""
     return f"{value:+.{digits}f}".replace("-", "−")

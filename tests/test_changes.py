@@ -118,7 +118,7 @@ def test_a_report_is_told_by_the_numbers_of_its_page(tmp_path: Path) -> None:
     expected = assessment.health.quantile(np.array([0.05, 0.5, 0.95]))[:, -1]
     assert list(said.health) == ["guide_preload", "mount_stiffness"]
     np.testing.assert_array_equal(np.array(list(said.health.values())).T, expected)
-    assert said.service_by == assessment.service_by()
+    assert said.service_by == assessment.service().by
     assert (said.n_logs, said.travel) == (40, 1.72e6)
     assert said.remaining is not None
     share = np.mean(assessment.prognosis.remaining[:, -1] <= said.remaining[1])

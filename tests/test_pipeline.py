@@ -12,8 +12,10 @@ from typing import Any
 import h5py
 import numpy as np
 import pytest
+from click.testing import CliRunner
 
 from lmshealth import pipeline
+from lmshealth.cli import main
 from lmshealth.errors import NothingUsable
 from lmshealth.history import Reading
 from lmshealth.inference import epochs_to_infer, infer
@@ -103,6 +105,20 @@ def test_the_only_epoch_asked_for_is_the_last(done: Done) -> None:
     assert assessment.track is not None
     for most in (1, 2, 3):
         assert epochs_to_infer(assessment.track, done.stage, most)[-1] == N_LOGS - 1
+
+
+def test_prognose_goes_on_from_the_table_to_the_same_numbers(done: Done, tmp_path: Path) -> None:
+    """The command on the run's table of modes, with its seed, gives the run's remaining life."""
+    toml, out = done.logs.parent / "stage" / "small.toml", tmp_path / "prognosis.csv"
+    words = ["prognose", done.out / "modes.csv", "--stage", toml, "--out", out]
+    result = CliRunner().invoke(main, [str(word) for word in words])
+    assert result.exit_code == 0, result.output
+    ours, theirs = rows(out), rows(done.out / "prognosis.csv")
+    assert [row.keys() for row in ours] == [row.keys() for row in theirs]
+    for own, other in zip(ours, theirs, strict=True):
+        assert own["service_by"] == other["service_by"]
+        for key in [key for key in own if key.startswith(("rul_", "probability_"))]:
+            assert float(own[key]) == pytest.approx(float(other[key]), rel=1e-6)
 
 
 def test_every_bad_log_is_listed_with_its_reason(done: Done) -> None:

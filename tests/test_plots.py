@@ -16,9 +16,11 @@ from matplotlib.figure import Figure
 
 from lmshealth import plots, trackplots
 from lmshealth.arrays import FloatArray
+from lmshealth.decision import decide
 from lmshealth.laws import HertzWear, Law, Loosening
 from lmshealth.priors import Lognormal, Normal
 from lmshealth.results import Health, Prognosis
+from lmshealth.stage import Decision
 from lmshealth.tracks import Effect, History, Series, Track
 from tests.lives import health_of
 
@@ -153,6 +155,7 @@ def make_prognosis(
         recorded_at=history.recorded_at[-1],
         travel=float(history.travel[-1]),
         parameters=(*PARAMETERS, "any"),
+        untold=(),
         limits=np.array([*limits, np.nan]),
         remaining=np.column_stack([remaining, remaining.min(axis=1)]),
         usage=12e3 * np.exp(rng.normal(0, 0.08, n)),
@@ -162,10 +165,12 @@ def make_prognosis(
         curve_quantiles=np.stack(
             [np.quantile(c, [0.05, 0.25, 0.5, 0.75, 0.95], axis=0) for c in curves], axis=-1
         ),
+        laws=(),
         chi_square=121.4,
         degrees_of_freedom=115,
         walk=8e-4,
         noise_scale=1.02,
+        deviation=0.0,
         ess=1830.0,
         r_hat=1.006,
     )
@@ -319,11 +324,23 @@ def test_life_shows_now_limit_and_horizon(ax: Axes, prognosis: Prognosis, health
 
 def test_survival_is_the_share_of_draws(ax: Axes, prognosis: Prognosis) -> None:
     """The curve is the share of draws that have not reached a limit."""
-    plots.plot_survival(ax, prognosis, max_risk=0.05)
+    plots.plot_survival(ax, prognosis, service=decide(prognosis, Decision()))
     x, y = data(ax, "no limit reached")
     share = [100 * np.mean(prognosis.remaining[:, -1] > km * 1000) for km in x]
     np.testing.assert_allclose(y, share)
     assert "accepted risk 5 %" in labels(ax)
+
+
+def test_survival_shows_the_risk_of_least_costs(ax: Axes, prognosis: Prognosis) -> None:
+    """Where costs choose the day the line is at its risk; where they choose none there is none."""
+    service = decide(prognosis, Decision(cost_ratio=20.0))
+    plots.plot_survival(ax, prognosis, service=service)
+    label = f"risk at least costs {100 * service.risk:.3g} %"
+    np.testing.assert_allclose(data(ax, label)[1], 100 * (1 - service.risk))
+    endless = replace(prognosis, remaining=np.full_like(prognosis.remaining, np.inf))
+    bare = Figure().add_subplot()
+    plots.plot_survival(bare, endless, service=decide(endless, Decision(cost_ratio=20.0)))
+    assert len(bare.get_lines()) == len(ax.get_lines()) - 1
 
 
 def test_survival_without_end(ax: Axes, prognosis: Prognosis) -> None:

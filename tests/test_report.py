@@ -13,13 +13,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from msgspec import structs
 
 from lmshealth import plots
 from lmshealth.changes import reported
 from lmshealth.logs import Refusal
 from lmshealth.report import write_report
-from lmshealth.results import Judgement
-from lmshealth.stage import Stage, load_stage
+from lmshealth.results import Judgement, Prognosis
+from lmshealth.stage import Decision, Stage, load_stage
 from lmshealth.summary import Assessment
 from tests.test_plots import (
     FREQUENCY,
@@ -180,7 +181,7 @@ def words(page: Page) -> str:
 def test_worn_stage_says_it_first(make: Maker, tmp_path: Path) -> None:
     """Verdict, probability, reason, date and remaining life stand on the first screen."""
     assessment = make()
-    by = assessment.service_by()
+    by = assessment.service().by
     assert by is not None
     text = words(one(tmp_path, assessment))
     first = text[: text.index("Frequencies and damping")]
@@ -288,6 +289,32 @@ def test_limit_already_passed_means_now(make: Maker, tmp_path: Path) -> None:
     assert "Service Now" in text and "already passed" in text
 
 
+@pytest.mark.usefixtures("blank")
+def test_a_day_of_least_costs_says_so(make: Maker, tmp_path: Path) -> None:
+    """With a ratio of costs page, table and picture have the day of least costs and its risk."""
+    assessment = make()
+    by_costs = Decision(cost_ratio=3.0)
+    stage = assessment.stage
+    chosen = replace(stage, description=structs.replace(stage.description, decision=by_costs))
+    assessment = replace(assessment, stage=chosen)
+    service = assessment.service()
+    assert service.by is not None and service.by != make().service().by
+    text = words(one(tmp_path, assessment))
+    assert f"By {service.by.isoformat()} The day of least costs per travel" in text
+    assert "a failure costs 3 times a planned service" in text
+    assert "risk on the day of least costs" in text and "accepted risk" not in text
+    assert assessment.urgency()[1] == service.wait
+    healthy = replace(assessment, prognosis=endless(assessment))
+    assert "saves costs, where a failure costs 3 times" in words(one(tmp_path, healthy))
+
+
+def endless(assessment: Assessment) -> Prognosis:
+    """Return the life of a machine that never reaches a limit."""
+    assert assessment.prognosis is not None
+    never = np.full_like(assessment.prognosis.remaining, np.inf)
+    return replace(assessment.prognosis, remaining=never)
+
+
 def test_one_parameter_without_limit(make: Maker, tmp_path: Path) -> None:
     """A stage with one parameter and no limit has a density, and says why it has no life."""
     (tmp_path / "one").mkdir()
@@ -374,7 +401,7 @@ def test_index_is_sorted_by_risk(make: Maker, tmp_path: Path) -> None:
     assert [path.stem for path in paths] == ["worn", "unknown", "safe", "index"]
     text = words(Page(paths[-1]))
     assert text.index("worn") < text.index("unknown") < text.index("safe") < text.index("stray.csv")
-    assert f"By {worn.service_by()}" in text
+    assert f"By {worn.service().by}" in text
 
 
 def test_empty_fleet(tmp_path: Path) -> None:

@@ -198,7 +198,7 @@ def test_an_assessment_comes_back_bit_for_bit(url: str, tmp_path: Path) -> None:
     assert list(leaves(kept)) == expected
     assert list(leaves(got)) == expected
     assert got.stage.takes(reading().metadata) == put.stage.takes(reading().metadata)
-    assert got.service_by() == put.service_by()
+    assert got.service() == put.service()
 
 
 def test_what_an_assessment_lacks_it_lacks_again(url: str, tmp_path: Path) -> None:
