@@ -40,6 +40,7 @@ EPOCHS = click.option(
     help="Infer health at no more than this many epochs per machine.",
 )
 SEED = click.option("--seed", type=click.IntRange(0), default=0, show_default=True)
+PDF = click.option("--pdf", is_flag=True, help="Also write a PDF beside the page of each stage.")
 SHARE = click.FloatRange(0, 1, min_open=True, max_open=True)
 
 

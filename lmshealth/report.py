@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from functools import partial
@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 
 from lmshealth import plots
+from lmshealth.changes import Reported, changes, reported
 from lmshealth.decision import Service, remaining_days
 from lmshealth.influences import Influence, covariate_shifts, find_influences
 from lmshealth.logs import Refusal
@@ -97,6 +98,7 @@ def write_report(
     assessments: Sequence[Assessment],
     refused: Sequence[Refusal],
     *,
+    earlier: Mapping[str, Reported] | None = None,
     generated: datetime | None = None,
 ) -> list[Path]:
     """Write one page per stage, and ``index.html``.
@@ -111,6 +113,8 @@ def write_report(
         One per stage.
     refused : sequence of Refusal
         Logs that belong to no stage.
+    earlier : mapping of str to Reported, optional
+        By stage, what its last report said.
     generated : datetime or None
         Moment to print on the pages; nothing is printed for None.
 
@@ -127,6 +131,7 @@ def write_report(
     rows = []
     for assessment, name in zip(ranked, names, strict=True):
         row = _summary(assessment, None) | common
+        row |= _changes(assessment, (earlier or {}).get(assessment.judgement.stage))
         text = pages.get_template("stage.html.j2").render(row | _evidence(assessment))
         (folder / name).write_text(text, encoding="utf-8", newline="\n")
         rows.append(_summary(assessment, _FLEET_TOP) | {"file": name})
@@ -186,6 +191,12 @@ def _summary(assessment: Assessment, top: float | None) -> dict[str, Any]:
         "lives": lives,
         "service": _service(assessment.service()),
     }
+
+
+def _changes(assessment: Assessment, before: Reported | None) -> dict[str, Any]:
+    """Say what is new since the last report."""
+    news = () if before is None else changes(before, reported(assessment))
+    return {"before": before, "news": news}
 
 
 def _evidence(assessment: Assessment) -> dict[str, Any]:

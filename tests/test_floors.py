@@ -9,7 +9,7 @@ import pytest
 
 FLOORS = [
     {"errors"},
-    {"arrays", "toml"},
+    {"arrays", "toml", "packing", "pdf"},
     {"samples"},
     {"logs"},
     {"results", "tracks"},
@@ -73,9 +73,9 @@ FLOORS = [
     {"lifefit"},
     {"prognosis"},
     {"summary", "plots"},
-    {"store", "tables", "trackplots"},
-    {"trackfacts"},
-    {"report"},
+    {"changes", "tables", "trackplots"},
+    {"store", "trackfacts"},
+    {"report", "intake"},
     {"pipeline", "terminal", "options", "looks", "files"},
     {"stageview", "lifeview"},
     {"lifecommands"},

@@ -19,6 +19,7 @@ from msgspec import structs
 
 from lmshealth import plots
 from lmshealth.arrays import FloatArray
+from lmshealth.changes import reported
 from lmshealth.influences import find_influences
 from lmshealth.logs import Refusal
 from lmshealth.report import write_report
@@ -198,6 +199,21 @@ def test_worn_stage_says_it_first(make: Maker, tmp_path: Path) -> None:
     assert re.search(r"Median [\d ]+ km [\d ]+ days", first)
     assert "service planned for 2027-03-01" in first
     assert first.index("Loss of") < first.index("Health now") < first.index("Remaining life")
+
+
+@pytest.mark.usefixtures("blank")
+def test_what_is_new_follows_the_first_screen(make: Maker, tmp_path: Path) -> None:
+    """The earlier report of this stage is compared with, another stage's is not."""
+    before = replace(reported(make(wear_km=400000, floor=0.98)), n_logs=28)
+    for identity, said in (
+        ("M7-Y", "Verdict was healthy (97 %), now loss of preload and mount stiffness (93 %)."),
+        ("M8-Y", "This is the first report on this stage"),
+    ):
+        page = Page(write_report(tmp_path, [make()], (), earlier={identity: before})[0])
+        text = words(page)
+        place = text.index(said)
+        assert text.index("Mind this") < place < text.index("Tracked modes")
+        assert ("on 28 logs up to" in text) == (identity == "M7-Y")
 
 
 @pytest.mark.usefixtures("blank")
