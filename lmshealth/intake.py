@@ -21,6 +21,7 @@ from lmshealth.packing import fingerprint
 from lmshealth.readers import content_digest, find_logs, read_log, read_manifest, require_identity
 from lmshealth.stage import Stage
 from lmshealth.store import Outcome, Store
+from lmshealth.waterfall import read_levels
 
 Progress = Callable[[str, int, int], None]
 """Called with what is being done, how much is done, and how much there is."""
@@ -229,7 +230,9 @@ def identify_log(task: _Task, stages: tuple[Stage, ...]) -> Outcome:
                 f"{[s.description.match.stage for s in stages]}; give its description by --stage",
             )
         modes = identify(log, stage)
-        return Reading(task.name, log.digest, log.metadata, modes, loop_error(log))
+        return Reading(
+            task.name, log.digest, log.metadata, modes, loop_error(log), read_levels(log, stage)
+        )
     except BadLog as error:
         return (Refusal(task.name, error.reason, error.detail),)
     except Exception as error:  # one log must not end the batch, whatever our mistake

@@ -25,6 +25,7 @@ from lmshealth.summary import Assessment, judge
 from lmshealth.tables import all_tables
 from lmshealth.tracking import track
 from lmshealth.tracks import History, Track
+from lmshealth.waterfall import Waterfall
 
 
 @dataclass(frozen=True, slots=True)
@@ -215,11 +216,12 @@ def assess(
     followed, health, prognosis = _results(history, stage, settings.epochs, seed, pool, notes)
     if followed is not None:
         refused += doubted(history, followed)
-    digests = {reading.log: reading.digest for reading in readings}
+    own = {reading.log: reading for reading in readings}
+    used = [own[log] for log in history.logs]
     return Assessment(
         stage=stage,
         history=history,
-        digests=tuple(digests[log] for log in history.logs),
+        digests=tuple(reading.digest for reading in used),
         track=followed,
         health=health,
         prognosis=prognosis,
@@ -227,6 +229,7 @@ def assess(
         refused=tuple([*partial, *refused]),
         notes=tuple(notes),
         seed=settings.seed,
+        waterfall=Waterfall.stack([(reading.levels, reading.modes.lines) for reading in used]),
     )
 
 

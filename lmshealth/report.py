@@ -21,17 +21,36 @@ import numpy as np
 from lmshealth import plots
 from lmshealth.changes import Reported, changes, reported
 from lmshealth.decision import Service, remaining_days
+from lmshealth.influences import Influence, covariate_shifts, find_influences
 from lmshealth.logs import Refusal
 from lmshealth.results import Health, Prognosis
 from lmshealth.stage import ParameterSpec
 from lmshealth.summary import Assessment
-from lmshealth.trackfacts import effect_row, filter_health, fit, happened, mode_rows, surprise
-from lmshealth.trackplots import plot_damping, plot_frequencies, plot_nis
+from lmshealth.trackfacts import (
+    effect_row,
+    filter_health,
+    fit,
+    happened,
+    mode_rows,
+    mode_use,
+    other_effects,
+    surprise,
+    taken_out,
+    untouched,
+)
+from lmshealth.trackplots import (
+    plot_damping,
+    plot_frequencies,
+    plot_influence,
+    plot_nis,
+    plot_waterfall,
+)
 from lmshealth.tracks import History
 from lmshealth.wording import (
     GAP,
     LEVELS,
     chance,
+    covariate,
     day_count,
     km,
     left,
@@ -41,6 +60,7 @@ from lmshealth.wording import (
     spell,
 )
 
+_SIZES = {"waterfall": (4.8, 3.6), "influence": (3.8, 2.6)}  # in inches, unlike others
 _FLEET_TOP = 1.5  # length of all gauges of the index, as a fraction of baseline
 
 
@@ -182,21 +202,25 @@ def _changes(assessment: Assessment, before: Reported | None) -> dict[str, Any]:
 def _evidence(assessment: Assessment) -> dict[str, Any]:
     """Collect what the rest of a stage's page shows."""
     track, prognosis, history = assessment.track, assessment.prognosis, assessment.history
-    health = _health(assessment)
+    health, stage = _health(assessment), assessment.stage
+    influences = () if track is None else find_influences(history, track, stage)
     drift = np.zeros(1) if track is None else np.abs(track.drift[-1])
     return {
         "health": health,
         "modes": [] if track is None else list(mode_rows(track)),
         "seen": _seen(history),
         "pairs": [] if health is None else _pairs(health),
-        "picture": _pictures(assessment),
+        "picture": _pictures(assessment, influences),
+        "taken_out": list(taken_out(influences)),
+        "untouched": untouched(history, stage),
+        "mode_use": list(mode_use(history, track, stage, assessment.refused)),
         "surprise": None if track is None else surprise(track),
         "happened": [] if track is None else list(happened(track)),
         "filter": None if track is None else filter_health(track),
         "noise_scale": None if track is None else float(track.noise_scale[-1].max()),
         "largest_drift": float(np.nanmax(drift, initial=0.0)),
         "law": prognosis and fit(prognosis.chi_square, prognosis.degrees_of_freedom),
-        "effects": [] if track is None else [effect_row(effect) for effect in track.effects],
+        "effects": [] if track is None else [effect_row(effect) for effect in other_effects(track)],
         "reasons": Counter(item.reason for item in assessment.refused).most_common(),
         "hashes": list(zip(history.logs, assessment.digests, strict=False)),
     }
@@ -266,15 +290,42 @@ def _life(prognosis: Prognosis, column: int) -> Life:
     )
 
 
-def _pictures(assessment: Assessment) -> dict[tuple[str, str], str]:
+def _pictures(
+    assessment: Assessment, influences: Sequence[Influence]
+) -> dict[tuple[str, ...], str]:
     """Draw every picture of a page, by kind and by what it shows."""
-    history, track, prognosis = assessment.history, assessment.track, assessment.prognosis
-    health = _health(assessment)
-    draw: dict[tuple[str, str], Any] = {}
+    draw = _track_pictures(assessment, influences) | _health_pictures(assessment)
+    return {key: _inline(one, key[0], f"p{k}") for k, (key, one) in enumerate(draw.items())}
+
+
+def _track_pictures(
+    assessment: Assessment, influences: Sequence[Influence]
+) -> dict[tuple[str, ...], Any]:
+    history, track, waterfall = assessment.history, assessment.track, assessment.waterfall
+    draw: dict[tuple[str, ...], Any] = {}
     pair = {"frequency": plot_frequencies, "damping": plot_damping}
     for mode in _seen(history):
         for kind, plot in pair.items():
             draw[kind, mode] = partial(plot, history=history, track=track, mode=mode)
+    if waterfall is not None and history.has_odometer:
+        moved = None if track is None else covariate_shifts(history, track, assessment.stage)
+        draw["waterfall", "all"] = partial(
+            plot_waterfall, waterfall=waterfall, history=history, track=track, moved=moved
+        )
+    for one in influences:
+        if one.values.size:
+            name = covariate(one.covariate)[0]
+            draw["influence", name, one.mode] = partial(
+                plot_influence, influence=one, history=history
+            )
+    if track is not None and surprise(track) is not None:
+        draw["nis", "all"] = partial(plot_nis, track=track)
+    return draw
+
+
+def _health_pictures(assessment: Assessment) -> dict[tuple[str, ...], Any]:
+    prognosis, health = assessment.prognosis, _health(assessment)
+    draw: dict[tuple[str, ...], Any] = {}
     if health is not None:
         for names, key, _ in _pairs(health):
             draw["posterior", key] = partial(plots.plot_posterior, health=health, parameters=names)
@@ -290,14 +341,13 @@ def _pictures(assessment: Assessment) -> dict[tuple[str, str], str]:
             )
         service = assessment.service()
         draw["survival", "any"] = partial(plots.plot_survival, prognosis=prognosis, service=service)
-    if track is not None and surprise(track) is not None:
-        draw["nis", "all"] = partial(plot_nis, track=track)
-    return {key: _inline(one, f"p{k}") for k, (key, one) in enumerate(draw.items())}
+    return draw
 
 
-def _inline(draw: Any, salt: str) -> str:
+def _inline(draw: Any, kind: str, salt: str) -> str:
+    size = _SIZES.get(kind, plots.SIZE)
     # The HTML parser knows these namespaces; without them the page names no address at all.
-    return re.sub(r'\sxmlns(:xlink)?="[^"]*"', "", plots.svg(draw, salt=salt))
+    return re.sub(r'\sxmlns(:xlink)?="[^"]*"', "", plots.svg(draw, salt=salt, size=size))
 
 
 def _pairs(health: Health) -> list[tuple[tuple[str, ...], str, float]]:

@@ -13,6 +13,7 @@ from lmshealth.logs import Refusal
 from lmshealth.results import Health, Judgement, Prognosis, Verdict
 from lmshealth.stage import ParameterSpec, Stage
 from lmshealth.tracks import Event, History, Track
+from lmshealth.waterfall import Waterfall
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -41,6 +42,8 @@ class Assessment:
         What the reader must know beside the numbers, one sentence each.
     seed : int
         Of all random streams.
+    waterfall : Waterfall or None
+        Spectra of the logs of the history; None where no log shows the band of its modes.
     """
 
     stage: Stage
@@ -53,6 +56,7 @@ class Assessment:
     refused: tuple[Refusal, ...]
     notes: tuple[str, ...]
     seed: int
+    waterfall: Waterfall | None = None
 
     def service(self) -> Service:
         """Choose the day of the service as the description asks."""

@@ -11,12 +11,19 @@ from lmshealth.arrays import FloatArray
 
 _KM = 1000.0
 GAP = "\u202f"  # narrow space that does not break: between a number and its unit
+_UNITS = {"c": "°C", "kg": "kg", "mm": "mm"}
 LEVELS = np.array([0.05, 0.5, 0.95])
 
 
 def spell(name: str) -> str:
     """Write a name in words."""
     return name.replace("_", " ")
+
+
+def covariate(column: str) -> tuple[str, str]:
+    """Split the name of a covariate's column into words and its unit, empty where unknown."""
+    name, _, unit = column.rpartition("_")
+    return (spell(name), _UNITS[unit]) if name and unit in _UNITS else (spell(column), "")
 
 
 def moment(when: datetime) -> str:
@@ -63,6 +70,11 @@ def number(value: float) -> str:
 def km(metres: float) -> str:
     """Write a distance given in m."""
     return f"{number(metres / _KM)}{GAP}km"
+
+
+def whole_km(metres: float) -> str:
+    """Write a distance given in m to the kilometre."""
+    return f"{metres / _KM:,.0f}{GAP}km".replace(",", GAP)
 
 
 def day_count(days: float) -> str:

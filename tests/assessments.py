@@ -14,7 +14,14 @@ from lmshealth.logs import Refusal
 from lmshealth.results import Judgement
 from lmshealth.summary import Assessment
 from lmshealth.tracks import Event, Step
-from tests.test_plots import life, make_health, make_history, make_prognosis, make_track
+from tests.test_plots import (
+    life,
+    make_health,
+    make_history,
+    make_prognosis,
+    make_track,
+    make_waterfall,
+)
 from tests.test_report import write_stage
 
 
@@ -37,6 +44,7 @@ def worn(folder: Path, identity: str = "M7-Y") -> Assessment:
         refused=(Refusal("a.csv", "gap", "31 % are missing", channel="acc_feed"),),
         notes=("The temperature of 3 logs is missing.",),
         seed=0,
+        waterfall=make_waterfall(history),
     )
 
 

@@ -121,6 +121,21 @@ def test_prognose_goes_on_from_the_table_to_the_same_numbers(done: Done, tmp_pat
             assert float(own[key]) == pytest.approx(float(other[key]), rel=1e-6)
 
 
+def test_spectra_of_all_logs_reach_the_page(done: Done) -> None:
+    """The spectra hold every used log in order, strongest where its modes are."""
+    (assessment,) = done.result.assessments
+    waterfall, history = assessment.waterfall, assessment.history
+    assert waterfall is not None
+    assert waterfall.level.shape[0] == len(history.logs) == N_LOGS
+    # Pitch, at 105 Hz when new, is the only mode in the upper half of the band.
+    edges = waterfall.edges
+    upper = np.sqrt(edges[1:] * edges[:-1])[edges[1:] > 85]
+    strongest = upper[np.argmax(waterfall.level[:, edges[1:] > 85], axis=1)]
+    pitch = np.exp(history.ln_frequency[:, history.columns("pitch")[0]])
+    np.testing.assert_allclose(strongest, pitch, rtol=0.04)
+    assert "Spectra over life" in done.result.pages[0].read_text(encoding="utf-8")
+
+
 def test_every_bad_log_is_listed_with_its_reason(done: Done) -> None:
     """The copy, the broken file and the foreign machine are refused by name; the rest is used."""
     refused = {row["log"]: row for row in rows(done.out / "refused.csv")}

@@ -17,6 +17,7 @@ from lmshealth.packing import pack
 from lmshealth.report import write_report
 from lmshealth.results import Line, Modes
 from lmshealth.store import SCHEMA, Store, StoreError, beside
+from lmshealth.waterfall import Levels
 from tests.assessments import leaves, worn
 
 
@@ -49,7 +50,8 @@ def reading(n: int = 2, log: str = "a.h5") -> Reading:
         baseline=True,
         description="small",
     )
-    return Reading(log, "d" * 64, metadata, modes, 1e-6 / 3)
+    levels = Levels(100 / 3, 200 / 3, rng.choice([np.nan, 1 / 3], 5))
+    return Reading(log, "d" * 64, metadata, modes, 1e-6 / 3, levels)
 
 
 @pytest.fixture
@@ -82,6 +84,7 @@ def test_missing_metadata_stay_missing(url: str) -> None:
     assert isinstance(got, Reading)
     assert got.metadata == Metadata()
     assert got.loop_error is None
+    assert got.levels is None
 
 
 def test_refusals_come_back_under_the_present_name(url: str) -> None:
