@@ -29,6 +29,7 @@ from matplotlib.axes import Axes
 from numpy.typing import NDArray
 from scipy import stats
 
+from lmshealth.metrics import place
 from studies.record import LEVEL, judge_coverage
 
 Array = NDArray[np.float64]
@@ -53,9 +54,7 @@ def thinned(draws: Array) -> Array:
 
 def rank(truth: Array, draws: Array, rng: np.random.Generator) -> list[float]:
     """Rank truths ``(n,)`` among draws ``(n_draws, n)``, as a share from 0 to 1."""
-    below, tied = np.sum(draws < truth, axis=0), np.sum(draws == truth, axis=0)
-    share = (below + rng.uniform(size=truth.size) * (tied + 1)) / (len(draws) + 1)
-    return [round(float(value), 6) for value in share]
+    return [round(float(value), 6) for value in place(draws, truth, rng)]
 
 
 def band(n: int) -> tuple[Array, Array]:

@@ -11,7 +11,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from scipy.stats import beta
+from lmshealth.metrics import clopper_pearson
 
 # How often intervals claim to hold the truth, and how sure the judgement of that is.
 NOMINAL, LEVEL = 0.95, 0.999
@@ -79,14 +79,6 @@ def conclude(
     failed = [name for name, fine in answer["passed"].items() if not fine]
     if not set(failed) <= set(not_met):
         raise SystemExit(f"not as asked: {failed}")
-
-
-def clopper_pearson(hits: int, trials: int, level: float = 0.95) -> tuple[float, float]:
-    """Exact interval of a proportion."""
-    tail = (1 - level) / 2
-    low = float(beta.ppf(tail, hits, trials - hits + 1)) if hits else 0.0
-    high = float(beta.ppf(1 - tail, hits + 1, trials - hits)) if hits < trials else 1.0
-    return low, high
 
 
 def judge_coverage(hits: int, n: int, nominal: float = NOMINAL) -> dict[str, Any]:
