@@ -87,7 +87,8 @@ def test_cumulative_relative_accuracy() -> None:
     """The mean over moments, or the weighted one."""
     accuracy = np.array([[0.5, 1.0], [0.9, 0.0]])
     np.testing.assert_allclose(cumulative_relative_accuracy(accuracy), [0.7, 0.5])
-    np.testing.assert_allclose(cumulative_relative_accuracy(accuracy, np.array([1, 3])), [0.8, 0.25])
+    weighted = cumulative_relative_accuracy(accuracy, np.array([1, 3]))
+    np.testing.assert_allclose(weighted, [0.8, 0.25])
 
 
 def test_prognostic_horizon_asks_for_all_later_moments() -> None:
