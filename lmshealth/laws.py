@@ -2,13 +2,14 @@
 
 A law is a small object: its free parameters with their priors, the health it predicts, the
 travel at which it crosses a limit, and sampling coordinates in which the posterior of a partly
-worn machine is close to a Gaussian. Travel is in m from the baseline; health is a fraction of
-its baseline value.
+worn machine is close to a Gaussian. Travel is in m from where the law begins, health is a fraction
+of its value there. Where a parameter has several laws, ``weight`` says how probable each is
+beforehand, in proportion.
 """
 
 from __future__ import annotations
 
-from typing import ClassVar, Protocol
+from typing import Annotated, ClassVar, Protocol
 
 import msgspec
 import numpy as np
@@ -25,6 +26,14 @@ class Law(Protocol):
     """What prognosis needs of a degradation law; ``y`` are sampling coordinates."""
 
     @property
+    def weight(self) -> float:
+        """How probable it is beforehand, in proportion to the other laws of the parameter."""
+
+    @property
+    def kind(self) -> str:
+        """What the stage description calls it."""
+
+    @property
     def names(self) -> tuple[str, ...]:
         """Names of the natural parameters; their number is the number of coordinates."""
 
@@ -38,10 +47,10 @@ class Law(Protocol):
         """Draw coordinates from the prior, shape ``(n, k)``."""
 
     def health(self, theta: FloatArray, travel: FloatArray) -> FloatArray:
-        """Health at each travel, shape ``(n, n_travel)``."""
+        """Health at each travel, the same for all or each one's own: ``(n, n_travel)``."""
 
-    def passage(self, theta: FloatArray, limit: float) -> FloatArray:
-        """Travel in m at which health falls to the limit, inf if never, shape ``(n,)``."""
+    def passage(self, theta: FloatArray, limit: FloatArray) -> FloatArray:
+        """Travel in m at which health falls to each one's limit, inf if never, shape ``(n,)``."""
 
 
 def _expect_mass(name: str, prior: Prior, low: float, high: float) -> None:
@@ -63,9 +72,18 @@ def _draw_length(prior: Prior, rng: np.random.Generator, n: int) -> FloatArray:
     return _KM * km
 
 
-class HertzWear(
-    msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="hertz-wear", tag_field="kind"
-):
+class _Law(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """What all laws have."""
+
+    weight: Annotated[float, msgspec.Meta(gt=0, le=1e6)] = 1.0
+
+    @property
+    def kind(self) -> str:
+        """What the stage description calls it."""
+        return str(self.__struct_config__.tag)
+
+
+class HertzWear(_Law, frozen=True, tag="hertz-wear", tag_field="kind"):
     """Preload lost by wear of the rolling contacts: P(s) = (1 - (s / s_w)^n)^1.5.
 
     The elastic approach shrinks with travel as (s / s_w)^n, and the contact force goes with its
@@ -96,7 +114,7 @@ class HertzWear(
         """Log prior density with |d(s_w, n)/d(y1, y2)| = (s_w / n) (dn/dy2)."""
         life, n = self.natural(y, now).T
         slope = log_expit(y[:, 1]) + log_expit(-y[:, 1])
-        return np.asarray(self.life_km.log_density(life / _KM) + np.log(life / n) + slope)
+        return np.asarray(self.life_km.log_density(life / _KM) + np.log(life / _KM / n) + slope)
 
     def draw(self, rng: np.random.Generator, n: int, now: float) -> FloatArray:
         """Draw coordinates from the prior."""
@@ -111,17 +129,13 @@ class HertzWear(
         left = 1 - (np.maximum(travel, 0) / life) ** n
         return np.asarray(np.maximum(left, 0) ** self.outer)
 
-    def passage(self, theta: FloatArray, limit: float) -> FloatArray:
+    def passage(self, theta: FloatArray, limit: FloatArray) -> FloatArray:
         """Travel at the limit, in closed form."""
-        if limit >= 1:
-            return np.zeros(theta.shape[0])
-        loss = 1 - limit ** (1 / self.outer)
+        loss = 1 - np.minimum(limit, 1.0) ** (1 / self.outer)
         return np.asarray(theta[:, 0] * loss ** (1 / theta[:, 1]))
 
 
-class Loosening(
-    msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="loosening", tag_field="kind"
-):
+class Loosening(_Law, frozen=True, tag="loosening", tag_field="kind"):
     """Joint that settles towards a floor: k(s) = k_f + (1 - k_f) exp(-s / s_m)."""
 
     life_km: Prior
@@ -148,7 +162,7 @@ class Loosening(
         inside = (floor >= 0) & (floor < 1)
         rest = np.where(inside, 1 - floor, 1.0)
         value = self.floor.log_density(floor) + self.life_km.log_density(life / _KM)
-        return np.where(inside, value + np.log(rest * life), -np.inf)
+        return np.where(inside, value + np.log(rest * life / _KM), -np.inf)
 
     def draw(self, rng: np.random.Generator, n: int, now: float) -> FloatArray:
         """Draw coordinates from the prior."""
@@ -161,7 +175,7 @@ class Loosening(
         floor, life = theta[:, :1], theta[:, 1:]
         return np.asarray(floor + (1 - floor) * np.exp(-np.maximum(travel, 0) / life))
 
-    def passage(self, theta: FloatArray, limit: float) -> FloatArray:
+    def passage(self, theta: FloatArray, limit: FloatArray) -> FloatArray:
         """Travel at the limit, in closed form; inf where the floor lies above it."""
         floor, life = theta.T
         reached = floor < limit
@@ -169,15 +183,13 @@ class Loosening(
         return np.where(reached, life * np.log(np.maximum(ratio, 1.0)), np.inf)
 
 
-class Power(HertzWear, frozen=True, forbid_unknown_fields=True, tag="power", tag_field="kind"):
+class Power(HertzWear, frozen=True, tag="power", tag_field="kind"):
     """Loss as a power of travel: h(s) = 1 - (s / s_p)^n, for parameters without a physics."""
 
     outer: ClassVar[float] = 1.0
 
 
-class Linear(
-    msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="linear", tag_field="kind"
-):
+class Linear(_Law, frozen=True, tag="linear", tag_field="kind"):
     """Loss in proportion to travel: h(s) = 1 - r s. A rate below 0 is a gain."""
 
     rate_per_km: Prior
@@ -192,8 +204,9 @@ class Linear(
         return y / now
 
     def log_prior(self, y: FloatArray, now: float) -> FloatArray:
-        """Log prior density; the Jacobian is constant."""
-        return self.rate_per_km.log_density(y[:, 0] / now * _KM)
+        """Log prior density with dr/dy1 = 1 / now."""
+        value = self.rate_per_km.log_density(y[:, 0] / now * _KM)
+        return np.asarray(value + np.log(_KM / now))
 
     def draw(self, rng: np.random.Generator, n: int, now: float) -> FloatArray:
         """Draw coordinates from the prior."""
@@ -201,18 +214,17 @@ class Linear(
 
     def health(self, theta: FloatArray, travel: FloatArray) -> FloatArray:
         """Health, never below 0."""
-        return np.asarray(np.maximum(1 - theta * travel, 0))
+        return np.asarray(np.maximum(1 - theta * np.maximum(travel, 0), 0))
 
-    def passage(self, theta: FloatArray, limit: float) -> FloatArray:
+    def passage(self, theta: FloatArray, limit: FloatArray) -> FloatArray:
         """Travel at the limit; inf where nothing is lost."""
         rate = theta[:, 0]
         losing = rate > 0
-        return np.where(losing, max(1 - limit, 0.0) / np.where(losing, rate, 1.0), np.inf)
+        passed = np.maximum(1 - limit, 0.0) / np.where(losing, rate, 1.0)
+        return np.where(losing | (limit >= 1), passed, np.inf)
 
 
-class Unchanging(
-    msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="none", tag_field="kind"
-):
+class Unchanging(_Law, frozen=True, tag="none", tag_field="kind"):
     """No degradation: h(s) = 1."""
 
     @property
@@ -234,11 +246,11 @@ class Unchanging(
 
     def health(self, theta: FloatArray, travel: FloatArray) -> FloatArray:
         """Return ones."""
-        return np.ones((theta.shape[0], travel.size))
+        return np.ones((theta.shape[0], travel.shape[-1]))
 
-    def passage(self, theta: FloatArray, limit: float) -> FloatArray:
-        """Never."""
-        return np.full(theta.shape[0], np.inf)
+    def passage(self, theta: FloatArray, limit: FloatArray) -> FloatArray:
+        """Never, unless it begins at the limit."""
+        return np.where(np.broadcast_to(limit, theta.shape[:1]) >= 1, 0.0, np.inf)
 
 
 AnyLaw = HertzWear | Loosening | Power | Linear | Unchanging

@@ -1,18 +1,21 @@
-"""Likelihood of a whole life: degradation laws against the ln frequencies of all logs.
+"""The likelihood of a whole life: courses of health against the ln frequencies of all logs.
 
-For the informative modes of all logs since the baseline, y = H(θ) + a + b (T - T_ref) + walk + ε.
-The intercept a, the covariate coefficients b and the random walk are Gaussian, as are the biases of
-sources and what retunings shift, and marginalised into
+For the informative modes of all logs since the baseline, y = H(θ) + S g + a + b (T - T_ref) + walk
++ ε. The intercept a, the covariate coefficients b and the random walk are Gaussian, as are the
+biases of sources and what retunings shift, and marginalised into
 
-    Σ = R + I ⊗ [σ_a² 1 1ᵀ + σ_b² T Tᵀ + q² min(s, s')],
+    Σ = R + I ⊗ [σ_a² 1 1ᵀ + σ_b² T Tᵀ + q² min(s, s')] + S Sᵀ ⊗ d² min(s, s') / s_h,
 
-so that errors common to all epochs stay common. The map's sensitivities are wrong by a relative
+so that errors common to all epochs stay common. The last part is of the deviation g: health is its
+law times exp(g), with g a Gaussian process of standard deviation d at the horizon s_h, which the
+modes see by the sensitivities S at the baseline. The map's sensitivities are wrong by a relative
 error m, the same over the whole life: with V the whitened contribution of each parameter to each
 mode times m, M = I + VᵀV and w = Vᵀ r,
 
     ln L = -½ rᵀr + ½ wᵀ M⁻¹ w - ½ ln|M| - ln|chol Σ|,   r = chol(Σ)⁻¹ (y - H(θ)).
 
-The walk q and a factor on R are not known either: ln L is averaged over a grid of both.
+The walk q, the deviation d and a factor on R are not known either: ln L is averaged over a grid of
+them.
 
 Lives are smooth: what their drifts are at all logs follows linearly from what they are at few of
 them, the nodes. H(θ) = W h(θ) with h at the nodes, and by A = L⁻¹ W = Q R, L = chol(Σ), the data
@@ -21,14 +24,14 @@ shrink to Qᵀ L⁻¹ y and W to R, so that what a walker costs hardly depends o
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from itertools import product
 
 import numpy as np
 from scipy.linalg import qr, solve_triangular
-from scipy.special import softmax
 
 from lmshealth.arrays import BoolArray, FloatArray
+from lmshealth.courses import Course, courses_of
 from lmshealth.epoch import one_at_a_time
 from lmshealth.errors import NotEnoughData
 from lmshealth.stage import Stage
@@ -36,18 +39,22 @@ from lmshealth.statespace import BIAS_STD, JUMP_STD, MOVES, regressors
 from lmshealth.tracks import History
 
 _INTERCEPT_STD = 0.1
-# Random walk of ln f over the history, and factor on the reported standard deviations, with priors.
+# Random walk of ln f over the history, factor on the reported standard deviations, and standard
+# deviation of ln health about its law at the horizon, with priors.
 _WALKS = (1e-5, 5e-4, 1.5e-3, 5e-3, 1.5e-2)
 _NOISE_SCALES = (1.0, 1.5, 2.25)
 _NOISE_SCALE_PRIOR = (0.9, 0.07, 0.03)
-_NEGLIGIBLE = 0.01
+_DEVIATIONS = (0.0, 0.04, 0.15)
+_DEVIATION_PRIOR = (0.6, 0.3, 0.1)
 # Lives that show how smooth lives are; what QR may leave of theirs, in ln f. Others are met within
 # some 1e-6, those of a posterior within 1e-8.
 _N_EXAMPLES, _ROUGHEST = 300, 1e-8
+# With more steps than these every piece of a life is too short for a law.
+_MOST_STEPS = 3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Grid:
+class Grid:
     """Whitened data at every point of the grid; the point is the first axis.
 
     ``design`` is R of each mode, shape ``(n_points, n_modes, n_nodes, n_rows)``, ``target`` is
@@ -57,18 +64,34 @@ class _Grid:
 
     walk: FloatArray
     noise_scale: FloatArray
+    deviation: FloatArray
     design: FloatArray
     target: FloatArray
     rest: FloatArray
     log_weight: FloatArray
 
-    def chosen(self, which: BoolArray) -> _Grid:
+    def chosen(self, which: BoolArray) -> Grid:
         """Keep some of the points."""
-        return _Grid(*(getattr(self, name)[which] for name in self.__slots__))
+        return Grid(*(getattr(self, field.name)[which] for field in fields(self)))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Covariance:
+    """Parts of Σ, all of shape ``(n_data, n_data)``: the last three go with grid values."""
+
+    fixed: FloatArray
+    noise: FloatArray
+    walk: FloatArray
+    deviation: FloatArray
+
+    def factor(self, walk: float, noise_scale: float, deviation: float) -> FloatArray:
+        """Give chol(Σ) at a point of the grid."""
+        total = self.fixed + noise_scale**2 * self.noise + walk**2 * self.walk
+        return np.asarray(np.linalg.cholesky(total + deviation**2 * self.deviation))
 
 
 class LifeLikelihood:
-    """Log likelihood and prior of all law parameters, vectorised over walkers.
+    """What all logs of a life say, whichever course it took; vectorised over walkers.
 
     Parameters
     ----------
@@ -80,8 +103,8 @@ class LifeLikelihood:
     Raises
     ------
     NotEnoughData
-        If fewer than three logs after the baseline hold an informative mode, or the odometer
-        has not moved.
+        If fewer than three logs after the baseline hold an informative mode, the odometer has not
+        moved, or the modes jumped more than three times.
     """
 
     def __init__(self, history: History, stage: Stage) -> None:
@@ -108,8 +131,6 @@ class LifeLikelihood:
                 f"{history.stage}: {np.isfinite(ln_f).any(axis=1).sum()} logs with a mode of the "
                 f"map over {self.now / 1000:.4g} km; a life needs at least 3 logs and some travel"
             )
-        self.laws = tuple(parameter.law for parameter in stage.parameters)
-        self.sizes = tuple(len(law.names) for law in self.laws)
         # Series-major order of the data: all logs of the first series, then of the second.
         flat = ln_f.T.ravel()
         self.rows = np.flatnonzero(np.isfinite(flat))
@@ -122,102 +143,91 @@ class LifeLikelihood:
             [np.nanmean(ln_f[:, self.mode_of_series == i]) for i in range(len(self.modes))]
         )
         self.y = flat[self.rows] - centre[self.mode_of]
+        self.steps = _steps(history)
+        self.courses = courses_of(stage.parameters, self.steps, self.now)
+        # What only ever keeps its value does not deviate from that either.
+        free = [any(law.names for law in parameter.laws) for parameter in stage.parameters]
+        self.free = np.array(free, dtype=float)
+        self.horizon = stage.description.usage.horizon_km * 1000.0
+        self.slopes = _slopes(stage, self.modes) * self.free
         self.nodes, self.weights = self._choose_nodes()
-        # Laws are monotonic: a life is inside the map where its ends are.
-        self.checked = np.append(self.clock[self.nodes], [self.clock.min(), self.clock.max()])
-        self.grid = self._whiten(history, columns)
+        # Laws are monotonic: a life is inside the map where its ends and those of its jumps are.
+        ends = [self.clock.min(), self.clock.max(), *self.steps, *np.nextafter(self.steps, 0)]
+        self.checked = np.append(self.clock[self.nodes], ends)
+        self.covariance = self._covariance(history, columns)
+        self.grid = self._whiten()
 
-    @property
-    def n_dim(self) -> int:
-        """Number of law parameters."""
-        return sum(self.sizes)
+    def ln_health(
+        self, course: Course, y: FloatArray, clock: FloatArray
+    ) -> tuple[FloatArray, BoolArray]:
+        """Ln parameters at moments of lives, and which lives are inside the map at all of them."""
+        assert self.stage.modal_map is not None  # prognose() has checked
+        health = course.health(course.natural(y), clock)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            x = np.log(health * [p.baseline for p in self.stage.parameters])
+        return x, np.asarray(self.stage.modal_map.inside(x).all(axis=1))
 
-    def split(self, y: FloatArray) -> list[FloatArray]:
-        """Cut sampling coordinates into those of each law, ``(n, n_dim)`` to ``(n, k)`` each."""
-        return np.split(y, np.cumsum(self.sizes)[:-1], axis=1)
+    def terms(self, grid: Grid, x: FloatArray) -> FloatArray:
+        """Log likelihood of each grid point and walker, with the grid's prior, ``(n_grid, n)``."""
+        chi_square, log_det = self.quadratic(grid, x)
+        return np.asarray(grid.log_weight[:, None] - 0.5 * (chi_square + log_det))
 
-    def health(self, y: FloatArray, travel: FloatArray) -> FloatArray:
-        """Health parameters at each travel, shape ``(n, n_travel, n_parameters)``."""
-        return np.stack(
-            [
-                law.health(law.natural(part, self.now), travel)
-                for law, part in zip(self.laws, self.split(y), strict=True)
-            ],
-            axis=-1,
-        )
+    def quadratic(self, grid: Grid, x: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """χ² with the map error marginalised and its log determinant, both ``(n_grid, n)``."""
+        r, v, m = self._residuals(grid, x)
+        w = (v @ r[..., None])[..., 0]
+        solved = np.linalg.solve(m, w[..., None])[..., 0]
+        chi_square = grid.rest[:, None] + np.sum(r * r, axis=2) - np.sum(w * solved, axis=2)
+        return chi_square, np.linalg.slogdet(m)[1]
 
-    def log_prior(self, y: FloatArray) -> FloatArray:
-        """Log prior of the sampling coordinates, shape ``(n,)``."""
-        parts = zip(self.laws, self.split(y), strict=True)
-        total = np.zeros(y.shape[0])
-        for law, part in parts:
-            total = total + law.log_prior(part, self.now)
-        return np.where(np.isnan(total), -np.inf, total)
-
-    def draw_prior(self, rng: np.random.Generator, n: int) -> FloatArray:
-        """Draw sampling coordinates from the prior, shape ``(n, n_dim)``."""
-        return np.column_stack([law.draw(rng, n, self.now) for law in self.laws])
-
-    def log_probability(self, y: FloatArray) -> FloatArray:
-        """Log posterior up to a constant; -inf where a life leaves the map, shape ``(n,)``."""
-        total = self.log_prior(y)
-        x, inside = self._path(y, np.isfinite(total))
-        total = np.where(inside, total, -np.inf)
-        if inside.any():
-            # As scipy's logsumexp, at a tenth of its time for so few points.
-            total[inside] += np.logaddexp.reduce(self._terms(x), axis=0)
-        return total
-
-    def narrow(self, y: FloatArray) -> None:
-        """Drop grid points that carry next to nothing of the posterior at these coordinates."""
-        self.grid = self.grid.chosen(self._weights(y) > _NEGLIGIBLE)
-
-    def settings(self, y: FloatArray) -> tuple[float, float, float, int]:
-        """Averaged walk and noise scale, χ² and degrees of freedom at these coordinates.
+    def deviation(
+        self, grid: Grid, k: int, x: FloatArray, moments: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """Mean and covariance of ln health about its law, given a life and all data.
 
         Parameters
         ----------
-        y : ndarray
-            Coordinates inside the support, shape ``(n, n_dim)``.
+        grid : Grid
+            Points of the grid.
+        k : int
+            Which of them.
+        x : ndarray
+            Ln parameters at the nodes, shape ``(n, n_nodes, n_parameters)``.
+        moments : ndarray
+            Travel in m since the baseline, past or future, shape ``(n_moments,)``.
+
+        Returns
+        -------
+        mean : ndarray
+            Shape ``(n, n_moments, n_parameters)``.
+        cov : ndarray
+            Between the parameters, shape ``(n, n_moments, n_parameters, n_parameters)``.
         """
-        weight = self._weights(y)
-        centre = y.mean(axis=0, keepdims=True)
-        x, inside = self._path(centre, np.isfinite(self.log_prior(centre)))
-        if not inside.all():
-            x, _ = self._path(y[:1], np.array([True]))
-        chi_square = self._quadratic(x)[0][:, 0]
-        walk, scale = weight @ self.grid.walk, weight @ self.grid.noise_scale
-        return float(walk), float(scale), float(weight @ chi_square), self.y.size - self.n_dim
+        deviation = float(grid.deviation[k])
+        point = grid.chosen(np.arange(grid.walk.size) == k)
+        factor = self.covariance.factor(float(grid.walk[k]), float(grid.noise_scale[k]), deviation)
+        unit = deviation**2 / self.horizon
+        shared = unit * np.minimum.outer(moments, self.clock[self.log_of])
+        cross = shared[:, None] * self.slopes[self.mode_of].T  # (n_moments, n_parameters, n_data)
+        n_moments, p, n_data = cross.shape
+        a = solve_triangular(factor, cross.reshape(-1, n_data).T, lower=True)
+        u, q, _ = self._reduced(factor)
+        b = (a.T @ q).reshape(n_moments, p, -1)
+        r, v, m = (part[0] for part in self._residuals(point, x))
+        solved = np.linalg.solve(m, v)  # M⁻¹ V
+        explained = np.einsum("nvr,nr->nv", solved, r)
+        fitted = point.target[0] - r + np.einsum("nv,nvr->nr", explained, v)
+        mean = (a.T @ u).reshape(n_moments, p) - np.einsum("nr,mpr->nmp", fitted, b)
+        own = a.T.reshape(n_moments, p, n_data)
+        before = unit * moments[:, None, None] * np.diag(self.free)
+        known = before - own @ np.swapaxes(own, 1, 2)
+        left = np.einsum("mpr,nvr->nmpv", b, v)
+        right = np.einsum("nvr,mpr->nmvp", solved, b)
+        return mean, known + left @ right
 
-    def _weights(self, y: FloatArray) -> FloatArray:
-        """Posterior probability of each point of the grid, by draws of the posterior."""
-        x, inside = self._path(y, np.isfinite(self.log_prior(y)))
-        if not inside.any():
-            raise NotEnoughData(f"{self.stage.name}: no life of the prior stays inside the map")
-        return np.asarray(softmax(self._terms(x), axis=0).mean(axis=1))
-
-    def _path(self, y: FloatArray, possible: BoolArray) -> tuple[FloatArray, BoolArray]:
-        """Ln parameters at the nodes of the lives that stay inside the map, and which these are."""
-        x, inside = self._ln_health(y, self.checked)
-        inside &= possible
-        return x[inside, : self.nodes.size], inside
-
-    def _ln_health(self, y: FloatArray, clock: FloatArray) -> tuple[FloatArray, BoolArray]:
-        """Ln parameters at moments of lives, and which lives are inside the map at all of them."""
-        assert self.stage.modal_map is not None  # prognose() has checked
-        health = self.health(y, clock) * [p.baseline for p in self.stage.parameters]
-        with np.errstate(divide="ignore", invalid="ignore"):
-            x = np.log(health)
-        return x, np.asarray(self.stage.modal_map.inside(x).all(axis=1))
-
-    def _terms(self, x: FloatArray) -> FloatArray:
-        """Log likelihood of each grid point and walker, with the grid's prior, ``(n_grid, n)``."""
-        chi_square, log_det = self._quadratic(x)
-        return np.asarray(self.grid.log_weight[:, None] - 0.5 * (chi_square + log_det))
-
-    def _quadratic(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """χ² with the map error marginalised and its log determinant, both ``(n_grid, n)``."""
-        grid, drift = self.grid, self._drifts(x)
+    def _residuals(self, grid: Grid, x: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Whitened residuals, the map's errors by rows, and I + VVᵀ, grid points first."""
+        drift = self._drifts(x)
         n_modes, n_paths, n, n_nodes = drift.shape
         white = drift.reshape(n_modes, -1, n_nodes) @ grid.design
         white = white.reshape(-1, n_modes, n_paths, n, grid.target.shape[1])
@@ -225,11 +235,7 @@ class LifeLikelihood:
         model_std = self.stage.description.map.model_std if self.stage.description.map else 0.0
         # Errors last but one: of each parameter in each mode.
         v = np.moveaxis(model_std * white[:, :, 1:], 3, 1).reshape(*r.shape[:2], -1, r.shape[2])
-        w = (v @ r[..., None])[..., 0]
-        m = np.eye(v.shape[2]) + v @ np.swapaxes(v, 2, 3)
-        solved = np.linalg.solve(m, w[..., None])[..., 0]
-        chi_square = grid.rest[:, None] + np.sum(r * r, axis=2) - np.sum(w * solved, axis=2)
-        return chi_square, np.linalg.slogdet(m)[1]
+        return r, v, np.eye(v.shape[2]) + v @ np.swapaxes(v, 2, 3)
 
     def _drifts(self, x: FloatArray) -> FloatArray:
         """Drifts along lives, then those of each parameter alone: ``(n_modes, 1 + p, n, n_x)``."""
@@ -250,12 +256,17 @@ class LifeLikelihood:
         weights : ndarray
             Shape ``(n_logs, n_nodes)``.
         """
-        y = self.draw_prior(np.random.default_rng(0), _N_EXAMPLES)
-        x, inside = self._ln_health(y, self.clock)
-        if not inside.any():
+        rng, examples = np.random.default_rng(0), []
+        for course in self.courses:
+            y = course.draw(rng, _N_EXAMPLES if course.n_dim else 1)
+            x, inside = self.ln_health(course, y, self.clock)
+            if inside.any():
+                examples.append(self._drifts(x[inside]).reshape(-1, self.clock.size))
+        if not examples:
             raise NotEnoughData(f"{self.stage.name}: no life of the prior stays inside the map")
-        examples = self._drifts(x[inside]).reshape(-1, self.clock.size)
-        _, r, order = qr(examples, mode="economic", pivoting=True)
+        # Columns of R are as those of what it is made of.
+        joined = np.concatenate([qr(one, mode="r")[0][: self.clock.size] for one in examples])
+        _, r, order = qr(joined, mode="economic", pivoting=True)
         n = max(int(np.sum(np.abs(np.diag(r)) > _ROUGHEST)), 1)
         weights = np.zeros((self.clock.size, n))
         weights[order[:n], np.arange(n)] = 1.0
@@ -263,7 +274,7 @@ class LifeLikelihood:
             weights[order[n:]] = solve_triangular(r[:n, :n], r[:n, n:]).T
         return order[:n], weights
 
-    def _whiten(self, history: History, columns: list[int]) -> _Grid:
+    def _covariance(self, history: History, columns: list[int]) -> _Covariance:
         n_logs, n_series = self.clock.size, len(self.series)
         cov = history.cov[history.baseline :][:, columns][:, :, columns]
         noise = np.zeros((n_series, n_logs, n_series, n_logs))
@@ -275,27 +286,40 @@ class LifeLikelihood:
             values = regressor.values[history.baseline :]
             common += regressor.prior_std**2 * np.outer(values, values)
             common += np.diag(regressor.unknown[history.baseline :])
-        shared = np.minimum.outer(self.clock, self.clock) / self.now
-        size = n_series * n_logs
-        fixed = np.kron(same, common) + self._offsets(history)
+        shared = np.minimum.outer(self.clock, self.clock)
+        slopes = self.slopes[self.mode_of_series]
+        size, own = n_series * n_logs, np.ix_(self.rows, self.rows)
+        return _Covariance(
+            fixed=(np.kron(same, common) + self._offsets(history))[own],
+            noise=noise.reshape(size, size)[own],
+            walk=np.kron(same, shared / self.now)[own],
+            deviation=np.kron(slopes @ slopes.T, shared / self.horizon)[own],
+        )
+
+    def _reduced(self, factor: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Give L⁻¹ y, and Q and R of L⁻¹ W for the nodes of all modes."""
         own = self.mode_of[:, None] == np.arange(len(self.modes))
         shapes = own[:, :, None] * self.weights[self.log_of][:, None]
         shapes = shapes.reshape(self.rows.size, -1)
+        both = solve_triangular(factor, np.column_stack([shapes, self.y]), lower=True)
+        q, r = np.linalg.qr(both[:, :-1])
+        return both[:, -1], q, r
+
+    def _whiten(self) -> Grid:
         points = []
-        for walk, (scale, prior) in product(
-            _WALKS, zip(_NOISE_SCALES, _NOISE_SCALE_PRIOR, strict=True)
+        for walk, (scale, scale_prior), (deviation, deviation_prior) in product(
+            _WALKS,
+            zip(_NOISE_SCALES, _NOISE_SCALE_PRIOR, strict=True),
+            zip(_DEVIATIONS, _DEVIATION_PRIOR, strict=True),
         ):
-            total = scale**2 * noise.reshape(size, size) + fixed
-            total = total + np.kron(same, walk**2 * shared)
-            factor = np.linalg.cholesky(total[np.ix_(self.rows, self.rows)])
-            both = solve_triangular(factor, np.column_stack([shapes, self.y]), lower=True)
-            q, r = np.linalg.qr(both[:, :-1])
-            target = q.T @ both[:, -1]
-            log_det = np.sum(np.log(np.diag(factor)))
+            factor = self.covariance.factor(walk, scale, deviation)
+            u, q, r = self._reduced(factor)
+            target = q.T @ u
+            log_weight = np.log(scale_prior * deviation_prior) - np.sum(np.log(np.diag(factor)))
             design = r.T.reshape(len(self.modes), -1, target.size)
-            rest = np.sum(both[:, -1] ** 2) - np.sum(target**2)
-            points.append((walk, scale, design, target, rest, np.log(prior) - log_det))
-        return _Grid(*(np.array(column) for column in zip(*points, strict=True)))
+            rest = np.sum(u**2) - np.sum(target**2)
+            points.append((walk, scale, deviation, design, target, rest, log_weight))
+        return Grid(*(np.array(column) for column in zip(*points, strict=True)))
 
     def _offsets(self, history: History) -> FloatArray:
         """Covariance of what shifts readings without wear: sources, retunings, new sensors."""
@@ -312,3 +336,22 @@ class LifeLikelihood:
                 same * np.outer(seen, seen), JUMP_STD[step.kind][0] ** 2 * np.outer(there, there)
             )
         return total
+
+
+def _steps(history: History) -> tuple[float, ...]:
+    """Travel since the baseline at which the modes jumped, between two logs each."""
+    clock = history.clock()
+    first = {s.first for s in history.steps if s.kind == "step" and s.first > history.baseline}
+    if len(first) > _MOST_STEPS:
+        raise NotEnoughData(
+            f"{history.stage}: the modes jumped {len(first)} times since the baseline; no law of "
+            "a life holds over so many; maintenance.csv can declare a new baseline"
+        )
+    return tuple(float((clock[k - 1] + clock[k]) / 2) for k in sorted(first))
+
+
+def _slopes(stage: Stage, modes: tuple[str, ...]) -> FloatArray:
+    """D ln f / d ln parameter at the baseline, shape ``(n_modes, n_parameters)``."""
+    assert stage.modal_map is not None  # prognose() has checked
+    rows = [stage.modal_map.modes.index(name) for name in modes]
+    return np.asarray(stage.modal_map.gradient(stage.baseline_point[None])[0, rows])

@@ -15,6 +15,7 @@ from lmshealth.errors import BadStage
 # A prior with less than this inside the map is about another machine than the map is.
 _LEAST_INSIDE = 1e-6
 _N_LEVELS = 4096
+_HALF_LN_2PI = 0.5 * np.log(2 * np.pi)
 
 
 class Lognormal(
@@ -30,11 +31,11 @@ class Lognormal(
             raise ValueError(f"lognormal needs finite median and sigma above 0, got {self}")
 
     def log_density(self, x: FloatArray) -> FloatArray:
-        """Log density at x > 0 up to a constant; -inf elsewhere."""
+        """Log density at x > 0; -inf elsewhere."""
         with np.errstate(invalid="ignore", divide="ignore"):
             log_x = np.log(x)
             value = -0.5 * ((log_x - np.log(self.median)) / self.sigma) ** 2 - log_x
-        return np.where(x > 0, value, -np.inf)
+        return np.where(x > 0, value - np.log(self.sigma) - _HALF_LN_2PI, -np.inf)
 
     def quantile(self, level: FloatArray) -> FloatArray:
         """Quantile function, elementwise."""
@@ -64,8 +65,9 @@ class Normal(
             raise ValueError(f"normal needs a finite mean and a finite std above 0, got {self}")
 
     def log_density(self, x: FloatArray) -> FloatArray:
-        """Log density up to a constant."""
-        return -0.5 * ((x - self.mean) / self.std) ** 2
+        """Log density."""
+        value = -0.5 * ((x - self.mean) / self.std) ** 2
+        return np.asarray(value - np.log(self.std) - _HALF_LN_2PI)
 
     def quantile(self, level: FloatArray) -> FloatArray:
         """Quantile function, elementwise."""
@@ -93,8 +95,9 @@ class Uniform(
             raise ValueError(f"uniform needs finite ends, high above low, got {self}")
 
     def log_density(self, x: FloatArray) -> FloatArray:
-        """Zero inside, -inf outside (a constant is left out)."""
-        return np.where((x > self.low) & (x < self.high), 0.0, -np.inf)
+        """Log density inside, -inf outside."""
+        inside = (x > self.low) & (x < self.high)
+        return np.where(inside, -np.log(self.high - self.low), -np.inf)
 
     def quantile(self, level: FloatArray) -> FloatArray:
         """Quantile function, elementwise."""

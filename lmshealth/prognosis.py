@@ -1,4 +1,4 @@
-"""Remaining useful life: when the laws of a life reach their limits."""
+"""Remaining useful life: when health reaches its limits."""
 
 from __future__ import annotations
 
@@ -8,9 +8,11 @@ import numpy as np
 
 from lmshealth.arrays import FloatArray
 from lmshealth.errors import BadStage, NotEnoughData
-from lmshealth.lifefit import fit_life
-from lmshealth.results import Prognosis
+from lmshealth.lifefit import LifePosterior, fit_life
+from lmshealth.passage import first_passage
+from lmshealth.results import LawWeight, Prognosis
 from lmshealth.sampling import stream
+from lmshealth.sight import identifiable, sight_of
 from lmshealth.stage import ParameterSpec, Stage
 from lmshealth.tracks import History
 
@@ -36,61 +38,124 @@ def prognose(history: History, stage: Stage, seed: int | Sequence[int]) -> Progn
     Returns
     -------
     Prognosis
-        10,000 draws. Runs that never reach a limit are kept, as infinite.
+        10,000 draws. Runs that never reach a limit are kept, as infinite. Parameters that the
+        modes cannot tell are left out, and named.
 
     Raises
     ------
     BadStage
         If no health parameter has a limit.
     NotEnoughData
-        If the history is too short.
+        If the history is too short, or the modes tell no parameter that has a limit.
     NotConverged
         If the sampler did not converge.
     """
-    ends = limited(stage)
-    if not ends:
+    if not limited(stage):
         raise BadStage(f"{stage.name}: no [[parameter]] has a limit, so there is no end of life")
-    # Health has its streams by epoch, the life its own; this one is of the usage alone.
-    rng = np.random.default_rng(stream(seed, _STEP))
+    # Health has its streams by epoch, the life its own; these are of what comes after.
+    seeds = stream(seed, _STEP).spawn(3)
     life = fit_life(history, stage, seed)
-    theta = [life.theta(j) for j, _ in ends]
-    laws = [parameter.law for _, parameter in ends]
-    since = history.travel[-1] - history.travel[history.baseline]
-    remaining = np.empty((theta[0].shape[0], len(ends) + 1))
-    for column, (_, parameter) in enumerate(ends):
-        assert parameter.limit is not None  # limited() has chosen
-        limit = parameter.limit.below / parameter.baseline
-        remaining[:, column] = laws[column].passage(theta[column], limit) - since
-    remaining[:, -1] = remaining[:, :-1].min(axis=1)
+    told = told_limits(stage, life.modes)
+    if not told:
+        raise NotEnoughData(
+            f"{history.stage}: {', '.join(life.modes)} cannot tell any parameter that has a limit, "
+            "however many logs there are; `lmshealth stage` says what each mode tells"
+        )
     horizon = stage.description.usage.horizon_km * _KM
+    since = float(history.travel[-1] - history.travel[history.baseline])
+    remaining = remaining_travel(
+        life, told, np.random.default_rng(seeds[0]), now=since, horizon=horizon
+    )
+    usage = _usage(history, stage, np.random.default_rng(seeds[1]), remaining[:, -1], horizon)
     travel = _curve_grid(remaining[:, -1], since, horizon)
-    unit = np.array([parameter.baseline for _, parameter in ends])
-
-    def health(moments: FloatArray, every: int) -> FloatArray:
-        paths = zip(laws, theta, strict=True)
-        values = np.stack([law.health(own[::every], moments) for law, own in paths], axis=-1)
-        return np.asarray(values * unit)
-
-    start = history.travel[history.baseline]
+    columns = [j for j, _ in told]
+    unit = np.array([parameter.baseline for _, parameter in told])
+    curve = _curve(life, travel, np.random.default_rng(seeds[2]))[..., columns] * unit
     return Prognosis(
         stage=history.stage,
         recorded_at=history.recorded_at[-1],
         travel=float(history.travel[-1]),
-        parameters=(*(p.name for _, p in ends), "any"),
-        limits=np.array([p.limit.below for _, p in ends if p.limit] + [np.nan]),
+        parameters=(*(p.name for _, p in told), "any"),
+        untold=tuple(p.name for j, p in limited(stage) if j not in columns),
+        limits=np.array([p.limit.below for _, p in told if p.limit] + [np.nan]),
         remaining=remaining,
-        usage=_usage(history, stage, rng, remaining.shape[0]),
+        usage=usage,
         horizon=horizon,
-        health=health(np.array([since]), 1)[:, 0],
-        curve_travel=travel + start,
-        curve_quantiles=np.quantile(health(travel, _EVERY), _LEVELS, axis=0),
+        health=life.health.reshape(-1, len(life.parameters))[:, columns] * unit,
+        curve_travel=travel + history.travel[history.baseline],
+        curve_quantiles=np.quantile(curve, _LEVELS, axis=0),
+        laws=tuple(
+            LawWeight(p.name, kind, begin, probability)
+            for _, p in told
+            for (kind, begin), probability in life.laws(p.name).items()
+        ),
         chi_square=life.chi_square,
         degrees_of_freedom=life.degrees_of_freedom,
         walk=life.walk,
         noise_scale=life.noise_scale,
+        deviation=life.deviation,
         ess=life.ess,
         r_hat=life.worst_r_hat,
     )
+
+
+def remaining_travel(
+    life: LifePosterior,
+    told: Sequence[tuple[int, ParameterSpec]],
+    rng: np.random.Generator,
+    *,
+    now: float,
+    horizon: float,
+) -> FloatArray:
+    """Draw the travel left to each limit, and to the first of them.
+
+    Parameters
+    ----------
+    life : LifePosterior
+        Draws of the laws and of how far health is off them.
+    told : sequence of (int, ParameterSpec)
+        Parameters with a limit, and where they stand among all.
+    rng : Generator
+        Of all randomness.
+    now, horizon : float
+        Travel in m since the baseline, and from now, past which nothing is claimed.
+
+    Returns
+    -------
+    ndarray
+        In m, shape ``(n_draws, n_limits + 1)``, in the order of the draws of `life`.
+    """
+    parts = []
+    for way, off, rate in life.each():
+        theta = way.course.split(way.course.natural(way.own))
+        columns = [
+            first_passage(
+                way.course.branches[j],
+                theta[j],
+                off[:, j],
+                rate,
+                rng,
+                now=now,
+                limit=parameter.limit.below / parameter.baseline,
+                horizon=horizon,
+            )
+            for j, parameter in told
+            if parameter.limit is not None
+        ]
+        found = np.column_stack([*columns, np.min(columns, axis=0)])
+        parts.append(found.reshape(life.rate.shape[0], way.share, -1))
+    joined = np.concatenate(parts, axis=1)
+    return joined.reshape(-1, joined.shape[-1])
+
+
+def _curve(life: LifePosterior, travel: FloatArray, rng: np.random.Generator) -> FloatArray:
+    """Draw health at travels since the baseline, ``(n, n_travel, n_parameters)``."""
+    curves = []
+    for way, _, _ in life.each():
+        y = way.own[::_EVERY]
+        off, _ = way.density.deviations(y, travel, rng)
+        curves.append(way.course.health(way.course.natural(y), travel) * np.exp(off))
+    return np.concatenate(curves)
 
 
 def _curve_grid(remaining: FloatArray, since: float, horizon: float) -> FloatArray:
@@ -99,30 +164,45 @@ def _curve_grid(remaining: FloatArray, since: float, horizon: float) -> FloatArr
     return np.linspace(0.0, since + min(max(1.3 * ahead, 0.5 * since), horizon), _N_CURVE)
 
 
-def _usage(history: History, stage: Stage, rng: np.random.Generator, n_draws: int) -> FloatArray:
-    """Draw the travel per day in m.
+def _usage(
+    history: History,
+    stage: Stage,
+    rng: np.random.Generator,
+    remaining: FloatArray,
+    horizon: float,
+) -> FloatArray:
+    """Draw the mean travel per day in m over the remaining life.
 
-    Learned from the odometer: increments between logs are taken as independent, so that the total
-    over the total time has the relative error of a ratio estimate.
+    Learned from the odometer: increments between logs are taken as independent, their variance in
+    proportion to the time between. What is not known of the mean rate is then Student's t, and the
+    rate over the time to come scatters about it, the less the longer that is.
     """
     stated = stage.description.usage.km_per_day
     if stated is not None:
-        return np.full(n_draws, stated * _KM)
+        return np.full(remaining.size, stated * _KM)
     seconds = np.array([moment.timestamp() for moment in history.recorded_at])
-    days = np.diff(seconds) / _SECONDS_PER_DAY
-    steps = np.diff(history.travel)
-    used = days > 0
-    if used.sum() < 2 or steps[used].sum() <= 0:
+    days, steps = np.diff(seconds) / _SECONDS_PER_DAY, np.diff(history.travel)
+    days, steps = days[days > 0], steps[days > 0]
+    if days.size < 2 or steps.sum() <= 0:
         raise NotEnoughData(
             f"{history.stage}: the odometer does not tell the usage; state [usage] km_per_day"
         )
-    rate = steps[used].sum() / days[used].sum()
-    residual = steps[used] - rate * days[used]
-    n = int(used.sum())
-    relative = np.sqrt(n / (n - 1) * np.sum(residual**2)) / steps[used].sum()
-    return np.asarray(rate * np.exp(relative * rng.standard_normal(n_draws)))
+    total, rate = days.sum(), steps.sum() / days.sum()
+    per_day = np.sum((steps - rate * days) ** 2 / days) / (days.size - 1)
+    ahead = np.clip(remaining, 0.01 * horizon, horizon) / rate
+    mean = rng.standard_t(days.size - 1, remaining.size) / np.sqrt(total)
+    scatter = mean + rng.standard_normal(remaining.size) / np.sqrt(ahead)
+    # A machine that moves at all moves forward: relative errors are those of the logarithm.
+    return np.asarray(rate * np.exp(np.sqrt(per_day) / rate * scatter))
 
 
 def limited(stage: Stage) -> list[tuple[int, ParameterSpec]]:
     """Parameters that have a limit, with their position."""
     return [(j, p) for j, p in enumerate(stage.parameters) if p.limit is not None]
+
+
+def told_limits(stage: Stage, modes: Sequence[str]) -> list[tuple[int, ParameterSpec]]:
+    """Parameters that have a limit and that endless logs with some modes would tell."""
+    sight = sight_of(stage).through(modes)
+    seen = identifiable([sight], [range(len(stage.parameters))], stage.prior.variance)
+    return [(j, p) for j, p in limited(stage) if seen[j]]

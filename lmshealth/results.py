@@ -322,6 +322,28 @@ class Health:
         )
 
 
+@dataclass(frozen=True, slots=True)
+class LawWeight:
+    """How probable it is that a parameter follows a law.
+
+    Attributes
+    ----------
+    parameter : str
+        Name of the health parameter.
+    kind : str
+        The law, as in the stage description.
+    begin : float
+        Travel in m since the baseline at which it begins: 0, or that of a step.
+    probability : float
+        In the posterior.
+    """
+
+    parameter: str
+    kind: str
+    begin: float
+    probability: float
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Prognosis:
     """Remaining useful life with everything that is not known about it.
@@ -336,23 +358,28 @@ class Prognosis:
         Odometer at that moment, in m.
     parameters : tuple of str
         Names of the health parameters with a limit, then ``any`` (the first limit reached).
+    untold : tuple of str
+        Parameters with a limit of which the modes cannot tell how far off it is: nothing is said of
+        them, and they are no part of ``any``.
     limits : ndarray
         Limit of each parameter, NaN for ``any``, shape ``(n_parameters + 1,)``.
     remaining : ndarray
         Draws of the remaining travel in m, negative when the limit is already passed and infinite
         when it is never reached, shape ``(n_draws, n_parameters + 1)``.
     usage : ndarray
-        Draws of the travel per day in m, shape ``(n_draws,)``.
+        Draws of the mean travel per day in m until the end, shape ``(n_draws,)``.
     horizon : float
         Travel in m past which nothing is claimed.
     health : ndarray
-        Draws of the parameters with a limit now according to their laws,
+        Draws of the same parameters now, by their laws and how far health is off these,
         shape ``(n_draws, n_parameters)``.
     curve_travel : ndarray
         Odometer grid in m of the life curves, shape ``(n_grid,)``.
     curve_quantiles : ndarray
         5, 25, 50, 75, 95 % quantiles of the same on that grid,
         shape ``(5, n_grid, n_parameters)``.
+    laws : tuple of LawWeight
+        Of each parameter, the most probable law first.
     chi_square : float
         Of the residuals at the posterior mean.
     degrees_of_freedom : int
@@ -362,6 +389,8 @@ class Prognosis:
         for beside the laws, averaged over its evidence.
     noise_scale : float
         Factor on the reported standard deviations that the data ask for, averaged likewise.
+    deviation : float
+        Standard deviation at the horizon of ln health about its laws, averaged likewise.
     ess, r_hat : float
         Worst over the law parameters.
     """
@@ -370,6 +399,7 @@ class Prognosis:
     recorded_at: datetime
     travel: float
     parameters: tuple[str, ...]
+    untold: tuple[str, ...]
     limits: FloatArray
     remaining: FloatArray
     usage: FloatArray
@@ -377,10 +407,12 @@ class Prognosis:
     health: FloatArray
     curve_travel: FloatArray
     curve_quantiles: FloatArray
+    laws: tuple[LawWeight, ...]
     chi_square: float
     degrees_of_freedom: int
     walk: float
     noise_scale: float
+    deviation: float
     ess: float
     r_hat: float
 

@@ -213,6 +213,18 @@ def start_near(centre: FloatArray, cov: FloatArray, log_probability: LogProbabil
     return start
 
 
+def start_among(points: FloatArray, weight: FloatArray) -> Start:
+    """Begin at some of many weighted draws of the posterior itself, none twice."""
+
+    def start(rng: np.random.Generator) -> FloatArray:
+        n = _n_walkers(points.shape[1])
+        # Flattened where few draws have all the weight.
+        flat, _ = _tempered(np.log(np.maximum(weight, 1e-300)), 2 * n)
+        return np.asarray(points[rng.choice(points.shape[0], size=n, replace=False, p=flat)])
+
+    return start
+
+
 def start_from_prior(
     log_probability: LogProbability,
     draw_prior: Callable[[np.random.Generator, int], FloatArray],

@@ -69,8 +69,9 @@ class Limit(_Part, frozen=True):
 class ParameterSpec(_Part, frozen=True):
     """A health parameter to infer.
 
-    ``verdict`` is the word of verdict.csv that its loss is told by; by default ``preload`` for a
-    parameter with preload in its name and ``mount`` for any other.
+    ``law`` may be several, of which it follows one. ``verdict`` is the word of verdict.csv that its
+    loss is told by; by default ``preload`` for a parameter with preload in its name and ``mount``
+    for any other.
     """
 
     name: str
@@ -78,8 +79,13 @@ class ParameterSpec(_Part, frozen=True):
     baseline: Positive = 1.0
     unit: str = ""
     limit: Limit | None = None
-    law: AnyLaw = Unchanging()
+    law: AnyLaw | Annotated[tuple[AnyLaw, ...], Meta(min_length=1)] = Unchanging()
     verdict: Literal["preload", "mount", ""] = ""
+
+    @property
+    def laws(self) -> tuple[AnyLaw, ...]:
+        """Laws that it may follow, at least one."""
+        return self.law if isinstance(self.law, tuple) else (self.law,)
 
     @property
     def word(self) -> Literal["preload", "mount"]:
@@ -321,12 +327,21 @@ def _troubles(description: Description) -> Iterator[tuple[Keys, str]]:
     if description.parameter and description.map is None:
         yield ("parameter", 0), "[[parameter]] needs a [map] that says what it does to the modes"
     for k, parameter in enumerate(description.parameter):
-        if parameter.limit is not None and parameter.limit.below >= parameter.baseline:
-            yield (
-                ("parameter", k, "limit", "below"),
-                f"{parameter.name}: limit {parameter.limit.below:g} must lie below the baseline "
-                f"{parameter.baseline:g}",
-            )
+        yield from _parameter_troubles(k, parameter)
+
+
+def _parameter_troubles(k: int, parameter: ParameterSpec) -> Iterator[tuple[Keys, str]]:
+    """Say what is wrong within a parameter, the k-th."""
+    kinds = [law.kind for law in parameter.laws]
+    for j, kind in enumerate(kinds):
+        if kind in kinds[:j]:
+            yield ("parameter", k, "law", j), f"{parameter.name}: two laws of the kind {kind!r}"
+    if parameter.limit is not None and parameter.limit.below >= parameter.baseline:
+        yield (
+            ("parameter", k, "limit", "below"),
+            f"{parameter.name}: limit {parameter.limit.below:g} must lie below the baseline "
+            f"{parameter.baseline:g}",
+        )
 
 
 def _map_troubles(description: Description, modal_map: ModalMap) -> Iterator[tuple[Keys, str]]:

@@ -8,8 +8,9 @@ from datetime import UTC, datetime, timedelta
 import numpy as np
 from numpy.typing import NDArray
 
+from lmshealth import courses
 from lmshealth import life as model
-from lmshealth.laws import HertzWear, Loosening
+from lmshealth.laws import HertzWear, Law, Loosening
 from lmshealth.stage import ParameterSpec, Stage
 from lmshealth.statespace import BIAS_STD, JUMP_STD, regressors
 from lmshealth.tracks import History, Series, Step
@@ -21,12 +22,63 @@ N_LOGS = 60
 NOW_KM = 2000.0, 0.7
 
 
+# Lives in which the modes jump once, and how far ahead in m a life is followed step by step.
+STEPS, FINE = 0.15, 2000.0
+
+
+@dataclass(frozen=True)
+class Part:
+    """What really becomes of a health parameter.
+
+    Attributes
+    ----------
+    law : Law
+        Of the course it takes.
+    theta : ndarray
+        Natural parameters of the law, lengths in m.
+    begin, step : float
+        Travel in m at which the law begins, and at which health jumps (inf: never).
+    jump : float
+        Factor of the jump.
+    off : ndarray
+        Ln of health over its law at each log, shape ``(n_logs,)``.
+    rate : float
+        Variance of it per m.
+    """
+
+    law: Law
+    theta: Array
+    begin: float
+    step: float
+    jump: float
+    off: Array
+    rate: float
+
+    def by_law(self, travel: Array) -> Array:
+        """Health by the law and the jump alone, at travels since the baseline."""
+        health = self.law.health(self.theta[None], np.maximum(travel - self.begin, 0.0))[0]
+        return np.asarray(health * np.where(travel >= self.step, self.jump, 1.0))
+
+    def left(self, rng: np.random.Generator, now: float, limit: float, horizon: float) -> float:
+        """Follow the parameter from now on until its limit, in m; inf past the horizon."""
+        start = limit * np.exp(-self.off[-1]) / (self.jump if now >= self.step else 1.0)
+        closed = self.begin + self.law.passage(self.theta[None], np.array([start]))[0] - now
+        if self.rate == 0 or closed <= 0:
+            return float(closed) if closed <= horizon else np.inf
+        ahead = np.arange(0.0, horizon, FINE)
+        walk = np.cumsum(np.sqrt(self.rate * FINE) * rng.standard_normal(ahead.size - 1))
+        with np.errstate(divide="ignore"):
+            health = np.log(self.by_law(now + ahead[1:])) + self.off[-1] + walk
+        below = np.flatnonzero(health <= np.log(limit))
+        return float(ahead[1 + below[0]]) if below.size else np.inf
+
+
 @dataclass(frozen=True)
 class Life:
-    """A history, and the law parameters behind it: an array for every health parameter."""
+    """A history, and what is true of it: a part for every health parameter."""
 
     history: History
-    theta: tuple[Array, ...]
+    parts: tuple[Part, ...]
 
     @property
     def now(self) -> float:
@@ -35,19 +87,24 @@ class Life:
 
 
 def draw(rng: np.random.Generator, machine: Stage) -> Life:
-    """Draw a life of 60 logs.
+    """Draw a life of 60 logs, in which roll and pitch are seen.
 
     In half of the lives a second source sees pitch. A twentieth of estimates and temperatures is
-    missing; now and then the servo is retuned, or the second source's sensor is changed.
+    missing; now and then the servo is retuned, the second source's sensor is changed, or health
+    jumps.
     """
+    names = machine.informative[:2]
     travel = _travel(rng)
-    theta = _theta(rng, machine, travel - travel[0])
-    names = machine.informative
+    clock = travel - travel[0]
+    first = int(rng.integers(5, N_LOGS - 5)) if rng.random() < STEPS else None
+    parts = _parts(rng, machine, clock, first)
     series = tuple(Series(name, "acc") for name in names)
     if rng.random() < 0.5:
         series = (*series, Series("pitch", "delta_e"))
     covariates, steps = _covariates(rng), _steps(rng, series)
-    level = _modes(rng, machine, travel - travel[0], theta)
+    if first is not None:
+        steps = tuple(sorted([*steps, Step.found("step", first, N_LOGS)], key=lambda s: s.first))
+    level = _modes(rng, machine, names, clock, _path(machine, clock, parts))
     level += _covariate_effects(rng, machine, covariates, len(names))
     mode = np.array([names.index(one.mode) for one in series])
     values = level[:, mode] + _offsets(rng, series, mode, steps)
@@ -56,7 +113,7 @@ def draw(rng: np.random.Generator, machine: Stage) -> Life:
     values += (
         scale * (np.linalg.cholesky(cov) @ rng.standard_normal((N_LOGS, mode.size, 1)))[..., 0]
     )
-    return Life(_history(rng, machine, travel, covariates, series, steps, values, cov), theta)
+    return Life(_history(rng, names, travel, covariates, series, steps, values, cov), parts)
 
 
 def _travel(rng: np.random.Generator) -> Array:
@@ -65,38 +122,67 @@ def _travel(rng: np.random.Generator) -> Array:
     return np.asarray(1e5 + now * np.r_[0.0, np.sort(rng.uniform(size=N_LOGS - 2)), 1.0])
 
 
-def _theta(rng: np.random.Generator, machine: Stage, clock: Array) -> tuple[Array, ...]:
-    """Draw law parameters from the priors of the description, until a life stays inside the map."""
+def _parts(
+    rng: np.random.Generator, machine: Stage, clock: Array, first: int | None
+) -> tuple[Part, ...]:
+    """Draw courses and deviations from their priors, until a life stays inside the map."""
     assert machine.modal_map is not None
+    step = np.inf if first is None else float(clock[first - 1 : first + 1].mean())
     while True:
-        theta = tuple(_of_law(rng, parameter) for parameter in machine.parameters)
-        path = _path(machine, clock, theta)
+        deviation = rng.choice(model._DEVIATIONS, p=model._DEVIATION_PRIOR)
+        rate = deviation**2 / (1000 * machine.description.usage.horizon_km)
+        parts = tuple(_part(rng, one, clock, step, rate) for one in machine.parameters)
         with np.errstate(divide="ignore"):
-            if machine.modal_map.inside(np.log(path)).all():
-                return theta
+            if machine.modal_map.inside(np.log(_path(machine, clock, parts))).all():
+                return parts
 
 
-def _of_law(rng: np.random.Generator, parameter: ParameterSpec) -> Array:
+def _part(
+    rng: np.random.Generator, parameter: ParameterSpec, clock: Array, step: float, rate: float
+) -> Part:
+    """Draw what becomes of a parameter: its law, where that begins, and how health wanders."""
+    weight = np.array([law.weight for law in parameter.laws])
+    law = parameter.laws[rng.choice(weight.size, p=weight / weight.sum())]
+    anew = np.isfinite(step) and law.names and rng.random() < 0.5
+    steps = np.sqrt(rate * np.diff(clock, prepend=0.0)) * rng.standard_normal(clock.size)
+    return Part(
+        law=law,
+        theta=_of_law(rng, law),
+        begin=step if anew else 0.0,
+        step=step,
+        jump=float(np.exp(courses._JUMP.std * rng.standard_normal())),
+        off=np.cumsum(steps),
+        rate=float(rate),
+    )
+
+
+def _of_law(rng: np.random.Generator, law: Law) -> Array:
     """Draw the natural parameters of a law, lengths in m."""
-    law, (first, second) = parameter.law, rng.uniform(size=(2, 1))
+    first, second = rng.uniform(size=(2, 1))
     if isinstance(law, HertzWear):
         return np.concatenate([1000 * law.life_km.quantile(first), law.exponent.quantile(second)])
-    assert isinstance(law, Loosening)
-    return np.concatenate([law.floor.quantile(first), 1000 * law.life_km.quantile(second)])
+    if isinstance(law, Loosening):
+        return np.concatenate([law.floor.quantile(first), 1000 * law.life_km.quantile(second)])
+    return np.empty(0)
 
 
-def _path(machine: Stage, clock: Array, theta: tuple[Array, ...]) -> Array:
+def _path(machine: Stage, clock: Array, parts: tuple[Part, ...]) -> Array:
     """Health parameters along a life, ``(n_logs, n_parameters)``."""
-    pairs = zip(machine.parameters, theta, strict=True)
-    return np.column_stack([p.baseline * p.law.health(t[None], clock)[0] for p, t in pairs])
+    pairs = zip(machine.parameters, parts, strict=True)
+    columns = [p.baseline * part.by_law(clock) * np.exp(part.off) for p, part in pairs]
+    return np.column_stack(columns)
 
 
 def _modes(
-    rng: np.random.Generator, machine: Stage, clock: Array, theta: tuple[Array, ...]
+    rng: np.random.Generator,
+    machine: Stage,
+    names: tuple[str, ...],
+    clock: Array,
+    path: Array,
 ) -> Array:
-    """Ln f of the modes: wear through a map that is wrong, an intercept, and a random walk."""
+    """Ln f of the modes: health through a map that is wrong, an intercept, and a random walk."""
     assert machine.description.map is not None
-    names, x = machine.informative, np.log(_path(machine, clock, theta))
+    x = np.log(path)
     level = machine.drift(x, names)
     for j in range(x.shape[1]):
         alone = np.tile(machine.baseline_point, (clock.size, 1))
@@ -163,7 +249,7 @@ def _covariance(rng: np.random.Generator, mode: Array) -> Array:
 
 def _history(
     rng: np.random.Generator,
-    machine: Stage,
+    names: tuple[str, ...],
     travel: Array,
     covariates: dict[str, Array],
     series: tuple[Series, ...],
@@ -187,7 +273,7 @@ def _history(
         recorded_at=tuple(START + timedelta(days=k) for k in range(N_LOGS)),
         travel=travel,
         covariates=covariates,
-        modes=machine.informative,
+        modes=names,
         series=series,
         ln_frequency=values,
         ln_damping=damping,
