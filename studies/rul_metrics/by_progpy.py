@@ -90,7 +90,7 @@ def predicted(
         Processor time.
     """
     n = states["travel"].size
-    chosen = np.linspace(0, n - 1, N_SAMPLES).round().astype(int)
+    chosen = rng.choice(n, N_SAMPLES, replace=False)
     rows = [{name: float(values[i]) for name, values in states.items()} for i in chosen]
     predictor = MonteCarlo(Wearing(rng=rng))
     begin = time.process_time()

@@ -10,7 +10,7 @@ import numpy as np
 from lmshealth.epoch import EpochPosterior
 from lmshealth.laplace import approximate
 from lmshealth.lifefit import LifePosterior, fit_life
-from lmshealth.prognosis import limited
+from lmshealth.prognosis import limited, remaining_travel, told_limits
 from lmshealth.stage import Stage
 from lmshealth.tracking import track
 from lmshealth.tracks import History
@@ -18,6 +18,7 @@ from studies.lives import Array
 
 N_DRAWS = 10_000
 _N_BEGIN = 64
+_KM = 1000.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -48,33 +49,40 @@ def ours(history: History, stage: Stage, seed: list[int]) -> Futures:
     life = fit_life(history, stage, seed)
     fitted = time.process_time()
     now = float(history.travel[-1] - history.travel[history.baseline])
-    remaining = _remaining(life, stage, now)
+    remaining = remaining_travel(
+        life,
+        told_limits(stage, life.modes),
+        np.random.default_rng(seed),
+        now=now,
+        horizon=stage.description.usage.horizon_km * _KM,
+    )[:, -1]
     ended = time.process_time()
     return Futures(remaining, _states(life, now), fitted - begin, ended - fitted)
 
 
-def _remaining(life: LifePosterior, stage: Stage, now: float) -> Array:
-    ends = [
-        parameter.law.passage(life.theta(j), parameter.limit.below / parameter.baseline)
-        for j, parameter in limited(stage)
-        if parameter.limit is not None
-    ]
-    return np.min(ends, axis=0) - now
-
-
 def _states(life: LifePosterior, now: float) -> dict[str, Array]:
-    wear, loosening = life.theta(0), life.theta(1)
-    none = np.zeros(wear.shape[0])
-    return {
-        "travel": none + now / 1000,
-        "life": wear[:, 0] / 1000,
-        "exponent": wear[:, 1],
-        "floor": loosening[:, 0],
-        "length": loosening[:, 1] / 1000,
-        "off_preload": none,
-        "off_mount": none,
-        "rate": none,
-    }
+    """Write every draw as wear and loosening; of what never changes nothing is ever lost."""
+    parts = []
+    for way, off, rate in life.each():
+        never = np.full(rate.size, np.inf), np.ones(rate.size)
+        theta = way.course.split(way.course.natural(way.own))
+        pairs = zip(way.course.branches, theta, strict=True)
+        by_law = {branch.law.kind: own for branch, own in pairs}
+        wear = by_law["hertz-wear"].T if "hertz-wear" in by_law else never
+        floor, length = by_law["loosening"].T if "loosening" in by_law else never[::-1]
+        parts.append(
+            {
+                "travel": np.full(rate.size, now / _KM),
+                "life": wear[0] / _KM,
+                "exponent": wear[1],
+                "floor": floor,
+                "length": length / _KM,
+                "off_preload": off[:, 0],
+                "off_mount": off[:, 1],
+                "rate": rate * _KM,
+            }
+        )
+    return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
 
 
 def health_index(history: History, stage: Stage) -> tuple[Array, Array]:
