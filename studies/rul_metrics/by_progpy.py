@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import time
 import warnings
+from typing import Any, ClassVar
 
 import numpy as np
 from progpy import PrognosticsModel
@@ -17,17 +18,26 @@ N_SAMPLES = 1000
 _STEP_KM = 10.0
 
 
-class Wearing(PrognosticsModel):  # type: ignore[misc]
+class Wearing(PrognosticsModel):
     """A stage whose guide wears and whose mount loosens; its time is travel in km.
 
     The parameters of the laws are states that stay as they are. Ln of health over its law wanders.
     """
 
-    inputs: list[str] = []  # noqa: RUF012
-    states = ["travel", "life", "exponent", "floor", "length", "off_preload", "off_mount", "rate"]  # noqa: RUF012
-    outputs = ["preload", "mount"]  # noqa: RUF012
-    events = ["end"]  # noqa: RUF012
-    default_parameters = {  # noqa: RUF012
+    inputs: ClassVar[list[str]] = []
+    states: ClassVar[list[str]] = [
+        "travel",
+        "life",
+        "exponent",
+        "floor",
+        "length",
+        "off_preload",
+        "off_mount",
+        "rate",
+    ]
+    outputs: ClassVar[list[str]] = ["preload", "mount"]
+    events: ClassVar[list[str]] = ["end"]
+    default_parameters: ClassVar[dict[str, Any]] = {
         "preload_limit": 0.6,
         "mount_limit": 0.7,
         "process_noise": 0,
@@ -35,7 +45,7 @@ class Wearing(PrognosticsModel):  # type: ignore[misc]
         "rng": np.random.default_rng(0),
     }
 
-    def next_state(self, x, u, dt):  # type: ignore[no-untyped-def]
+    def next_state(self, x: Any, u: Any, dt: float) -> Any:
         """Go on by some km."""
         x["travel"] += dt
         if x["rate"] > 0:
@@ -45,22 +55,22 @@ class Wearing(PrognosticsModel):  # type: ignore[misc]
             x["off_mount"] += step * second
         return x
 
-    def _health(self, x) -> tuple[float, float]:  # type: ignore[no-untyped-def]
+    def _health(self, x: Any) -> tuple[float, float]:
         left = max(1 - (x["travel"] / x["life"]) ** x["exponent"], 0.0)
         lost = (1 - x["floor"]) * -math.expm1(-x["travel"] / x["length"])
         return left**1.5 * math.exp(x["off_preload"]), (1 - lost) * math.exp(x["off_mount"])
 
-    def output(self, x):  # type: ignore[no-untyped-def]
+    def output(self, x: Any) -> Any:
         """Give health."""
         return self.OutputContainer(dict(zip(self.outputs, self._health(x), strict=True)))
 
-    def event_state(self, x) -> dict[str, float]:  # type: ignore[no-untyped-def]
+    def event_state(self, x: Any) -> dict[str, float]:
         """Give the smaller share of what may be lost that is left."""
         limits = self.parameters["preload_limit"], self.parameters["mount_limit"]
         pairs = zip(self._health(x), limits, strict=True)
         return {"end": min((own - limit) / (1 - limit) for own, limit in pairs)}
 
-    def threshold_met(self, x) -> dict[str, bool]:  # type: ignore[no-untyped-def]
+    def threshold_met(self, x: Any) -> dict[str, bool]:
         """Tell whether a limit is reached."""
         preload, mount = self._health(x)
         limits = self.parameters["preload_limit"], self.parameters["mount_limit"]
