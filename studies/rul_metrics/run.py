@@ -62,7 +62,7 @@ from lmshealth.metrics import (
 from lmshealth.stage import Stage, load_stage
 from studies.lives import Array, rng_of
 from studies.ranks import collect, digest
-from studies.record import Stopwatch, conclude
+from studies.record import LEVEL, Stopwatch, as_row, conclude
 from studies.rul_metrics.bound import bound, share_within
 from studies.rul_metrics.forecasts import linear, ours
 from studies.rul_metrics.lives import CUTS, KINDS, STAGE, Case, case_of, cut
@@ -238,7 +238,10 @@ def way(cuts: list[Row], name: str, bounds: Row) -> Row:
         "median_accuracy": float(np.median(column["accuracy"])),
         "crps_km": float(column["crps_km"].mean()),
         "crps_more_than_ours_km": _mean(np.array(less)),
-        "coverage": [_coverage(column["place"], nominal) for nominal in (0.5, 0.9)],
+        "coverage": [
+            {"nominal": level} | as_row(coverage(column["place"], level, level=LEVEL))
+            for level in (0.5, 0.9)
+        ],
         "places": np.sort(column["place"]).round(4).tolist(),
         "beyond": float(column["beyond"].mean()),
         "width_over_left": float(np.median((column["high_km"] - column["low_km"]) / np.array(
@@ -254,12 +257,6 @@ def way(cuts: list[Row], name: str, bounds: Row) -> Row:
 def _mean(values: Array) -> Row:
     error = float(values.std(ddof=1) / np.sqrt(values.size)) if values.size > 1 else None
     return {"mean": float(values.mean()) if values.size else None, "se": error}
-
-
-def _coverage(places: Array, nominal: float) -> Row:
-    found = coverage(places, nominal)
-    return {"nominal": nominal, "hits": found.hits, "n": found.n, "share": found.share,
-            "low": found.low, "high": found.high, "holds": found.holds}  # fmt: skip
 
 
 def whole(rows: list[Row]) -> Row:
