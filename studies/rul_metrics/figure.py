@@ -17,7 +17,8 @@ BLACK, GREY = "#000000", "#777777"
 # Colour, marker, dash, name, and by how much it stands aside.
 WAYS = {
     "lmshealth": ("#0072b2", "o", "-", "lmshealth", -1.5),
-    "progpy": ("#009e73", "^", "--", "progpy, same draws", 0.0),
+    "progpy": ("#009e73", "^", "--", "progpy, same draws", -0.4),
+    "progpy, all runs kept": ("#e69f00", "v", ":", "progpy, all runs kept", 0.7),
     "line": ("#d55e00", "s", "-.", "line through health", 1.5),
 }
 CONTROL = ("#cc79a7", ":", "control: a third of the spread")

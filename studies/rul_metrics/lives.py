@@ -15,6 +15,7 @@ from studies.raw_lives import measured
 
 STAGE = "lms-y"
 KINDS = ("preload-wear", "mount-loosening", "both")
+HEALTHY = "healthy"
 N_LOGS = 60
 MODES = ("roll", "pitch")
 CUTS = (0.3, 0.5, 0.7, 0.9)
@@ -36,7 +37,7 @@ class Case:
     history : History
         Estimates of roll and pitch at all logs.
     end : float
-        Odometer in m at which the first limit is reached.
+        Odometer in m at which the first limit is reached; infinite if none ever is.
     """
 
     life: Life
@@ -46,14 +47,15 @@ class Case:
 
 
 def case_of(kind: str, number: int) -> Case:
-    """Draw a life of a kind, and estimates of its modes."""
-    seed = FIRST_SEED + len(KINDS) * number + KINDS.index(kind)
-    plan = Plan(STAGE, kind, N_LOGS, SECONDS, seed, until="failure")
+    """Draw a life of a kind, and estimates of its modes; healthy ones go on until now."""
+    at, until = (*KINDS, HEALTHY).index(kind), "now" if kind == HEALTHY else "failure"
+    plan = Plan(STAGE, kind, N_LOGS, SECONDS, FIRST_SEED + 4 * number + at, until=until)
     life, truth = life_with(plan, schedule(plan)), plan.draw_life()
-    estimates = drawn(life, *_sizes(), rng_of(31, KINDS.index(kind), number))
+    estimates = drawn(life, *_sizes(), rng_of(31, at, number))
     end = truth.failure_km()
-    assert end is not None  # all of these kinds reach a limit
-    return Case(life, truth, seen(history_of(life, estimates)), _KM * end)
+    return Case(
+        life, truth, seen(history_of(life, estimates)), np.inf if end is None else _KM * end
+    )
 
 
 @cache

@@ -15,7 +15,9 @@ Method
     travel with its prediction interval, both parameters together.
     progpy: the same draws of the laws' parameters, 1,000 of the 10,000, as states of a
     `PrognosticsModel` with the same laws, in steps of 10 km. Runs that do not end before the
-    horizon have no time of event, and its statistics are of the others: so they are here.
+    horizon have no time of event, and its statistics are of the others: so they are here. Told
+    beside it: the same with all runs kept. All lives here do end, which rewards leaving out runs
+    that do not; so all ways are asked about six healthy lives too, which do not.
     Bound: Fisher's information of the laws' parameters from all ln frequencies, intercepts,
     temperature coefficients and priors marginalised, carried to the remaining life by its
     gradient; its share is that of normal errors of this size. It is told which parameters lose
@@ -43,7 +45,6 @@ from typing import Any
 
 import numpy as np
 
-from lmshealth.errors import NotConverged
 from lmshealth.metrics import (
     alpha_lambda,
     clopper_pearson,
@@ -64,20 +65,18 @@ from studies.lives import Array, rng_of
 from studies.ranks import collect, digest
 from studies.record import LEVEL, Stopwatch, as_row, conclude
 from studies.rul_metrics.bound import bound, share_within
-from studies.rul_metrics.forecasts import linear, ours
-from studies.rul_metrics.lives import CUTS, KINDS, STAGE, Case, case_of, cut
+from studies.rul_metrics.lives import CUTS, HEALTHY, KINDS, STAGE, Case, case_of, cut
+from studies.rul_metrics.ways import CONTROL, LINE, MISSING, OURS, PROGPY, WAYS, all_ways
 
 HERE = Path(__file__).parent
 SEED = 20261124
-LIVES = 20  # of each kind
+LIVES, UNENDING = 20, 6  # of each kind, and healthy ones
 ALPHA, RISK = 0.2, 0.05
 # The prognostic horizon: half of the draws within a tenth of the whole life.
 NEAR, MASS = 0.1, 0.5
-OURS, LINE, PROGPY, CONTROL = "lmshealth", "line", "progpy", "a third of the spread"
 BOUNDS = {"map right": 0.0, "map to 5 %": 0.05}
 MAIN_CUT = 0.7
 FUTURES_S = 0.1
-MISSING = "progpy: not installed; pip install '.[peers]'"
 # What remaining life and health index are made of.
 CODE = (
     *("courses", "density", "importance", "laws", "life", "lifefit", "passage", "prognosis"),
@@ -95,11 +94,14 @@ def main() -> None:
     options = parser.parse_args()
     watch = Stopwatch()
     tasks = [(kind, number) for number in range(LIVES) for kind in KINDS]
+    tasks += [(HEALTHY, number) for number in range(UNENDING)]
     if options.quick:
-        tasks = [(KINDS[-1], 0)]
+        tasks = [(KINDS[-1], 0), (HEALTHY, 0)]
     rows = collect(options.lives, code, tasks, one)
-    answer: Row = {"seed": SEED, "lives": len(rows), "alpha": ALPHA, "risk": RISK}
-    answer |= judged(rows)
+    ending = [row for row in rows if row["kind"] != HEALTHY]
+    answer: Row = {"seed": SEED, "lives": len(ending), "alpha": ALPHA, "risk": RISK}
+    answer |= judged(ending)
+    answer["healthy"] = healthy([row for row in rows if row["kind"] == HEALTHY])
     answer["missing"] = [] if find_spec("progpy") else [MISSING]
     answer["passed"] = verdicts(answer, quick=options.quick)
     question = __doc__.split("\n")[0]
@@ -118,8 +120,10 @@ def machine() -> Stage:
 
 
 def one(kind: str, number: int) -> Row:
-    """Follow a life, and look ahead at every cut."""
+    """Follow a life, and look ahead at every cut; at a healthy one's last log alone."""
     case = case_of(kind, number)
+    if kind == HEALTHY:
+        return unending(case, number)
     return {"end_km": case.end / _KM, "cuts": [ahead(case, kind, number, k) for k in CUTS]}
 
 
@@ -128,40 +132,43 @@ def ahead(case: Case, kind: str, number: int, share: float) -> Row:
     history, stage = cut(case, share), machine()
     key = [KINDS.index(kind), number, round(100 * share)]
     rng, left = rng_of(32, *key), case.end - float(history.travel[-1])
-    horizon = stage.description.usage.horizon_km * _KM
-    row: Row = {"share": share, "logs": len(history.logs), "left_km": left / _KM, "ways": {}}
-    row["bound_km"] = {
-        name: bound(case, history, stage, model_std) / _KM for name, model_std in BOUNDS.items()
+    draws, seconds = all_ways(history, stage, [SEED, *key], rng)
+    return {
+        "share": share,
+        "left_km": left / _KM,
+        "bound_km": {
+            name: bound(case, history, stage, model_std) / _KM for name, model_std in BOUNDS.items()
+        },
+        "ways": {name: scored(own, left, case.end, rng) for name, own in draws.items()},
+        "seconds": seconds,
     }
-    row["ways"][LINE] = scored(linear(history, stage, rng), left, case.end, horizon, rng)
-    try:
-        found = ours(history, stage, [SEED, *key])
-    except NotConverged:
-        return row
-    middle = np.median(found.remaining)
-    with np.errstate(invalid="ignore"):  # where the median never ends, nor does the control
-        narrow = middle + (found.remaining - middle) / 3
-    narrow = np.where(np.isfinite(found.remaining), narrow, found.remaining)
-    row["ways"][OURS] = scored(found.remaining, left, case.end, horizon, rng)
-    row["ways"][CONTROL] = scored(narrow, left, case.end, horizon, rng)
-    row["seconds"] = {"posterior": found.posterior_s, OURS: found.futures_s}
-    if find_spec("progpy"):
-        from studies.rul_metrics.by_progpy import predicted  # late: it need not be installed
-
-        ends, seconds = predicted(found.states, horizon, rng)
-        ended = ends[np.isfinite(ends)]
-        row["seconds"][PROGPY] = seconds
-        if ended.size:
-            row["ways"][PROGPY] = scored(ended, left, case.end, horizon, rng)
-            row["ways"][PROGPY]["dropped"] = 1 - ended.size / ends.size
-    return row
 
 
-def scored(draws: Array, left: float, end: float, horizon: float, rng: np.random.Generator) -> Row:
+def unending(case: Case, number: int) -> Row:
+    """Look ahead where no limit is ever reached."""
+    draws, _ = all_ways(case.history, machine(), [SEED, number], rng_of(33, number))
+    return {
+        "ways": {
+            name: {
+                "beyond": float(np.mean(own > horizon())),
+                "median_km": float(np.median(np.minimum(own, horizon()))) / _KM,
+                "crps_km": crps(own[:, None], [np.inf], horizon=horizon()).item() / _KM,
+            }
+            for name, own in draws.items()
+        }
+    }
+
+
+def horizon() -> float:
+    """Travel in m past which nothing is claimed."""
+    return machine().description.usage.horizon_km * _KM
+
+
+def scored(draws: Array, left: float, end: float, rng: np.random.Generator) -> Row:
     """Score draws of the remaining life."""
-    x = draws[:, None]
-    service = service_at(x, RISK, horizon=horizon)
-    low, median, high = np.quantile(np.minimum(draws, horizon), [0.05, 0.5, 0.95])
+    x, far = draws[:, None], horizon()
+    service = service_at(x, RISK, horizon=far)
+    low, median, high = np.quantile(np.minimum(draws, far), [0.05, 0.5, 0.95])
     values = {
         "low_km": low / _KM,
         "median_km": median / _KM,
@@ -169,12 +176,12 @@ def scored(draws: Array, left: float, end: float, horizon: float, rng: np.random
         "accurate": alpha_lambda(x, [left], ALPHA)[0],
         "mass": mass_within(x, [left], ALPHA * left)[0],
         "near": within(x, [left], NEAR * end, mass=MASS)[0],
-        "accuracy": relative_accuracy(np.minimum(x, horizon), [left])[0],
-        "crps_km": crps(x, [left], horizon=horizon)[0] / _KM,
-        "place": place(x, [left], rng, horizon=horizon)[0],
-        "beyond": np.mean(draws > horizon),
+        "accuracy": relative_accuracy(np.minimum(x, far), [left])[0],
+        "crps_km": crps(x, [left], horizon=far)[0] / _KM,
+        "place": place(x, [left], rng, horizon=far)[0],
+        "beyond": np.mean(draws > far),
         "broken": unexpected_breaks(service, [left])[0],
-        "unexploited_km": unexploited_life(service, [left], horizon=horizon)[0] / _KM,
+        "unexploited_km": unexploited_life(service, [left], horizon=far)[0] / _KM,
     }
     return {name: value.item() for name, value in values.items()}
 
@@ -204,7 +211,7 @@ def summed(cuts: list[Row], share: float) -> Row:
         }
         for name in BOUNDS
     }  # fmt: skip
-    ways = {name: way(cuts, name, bounds) for name in (OURS, LINE, PROGPY, CONTROL)}
+    ways = {name: way(cuts, name, bounds) for name in WAYS}
     return {
         "share": share,
         "n": len(cuts),
@@ -249,8 +256,6 @@ def way(cuts: list[Row], name: str, bounds: Row) -> Row:
         "broken": int(column["broken"].sum()),
         "unexploited_km": float(column["unexploited_km"].mean()),
     }  # fmt: skip
-    if name == PROGPY:
-        found["dropped"] = float(np.mean([row["dropped"] for row in rows]))
     return found
 
 
@@ -264,7 +269,7 @@ def whole(rows: list[Row]) -> Row:
     left = np.array([[one["left_km"] for one in row["cuts"]] for row in rows]).T
     end = np.array([row["end_km"] for row in rows])
     found = {}
-    for name in (OURS, LINE, PROGPY):
+    for name in WAYS:
         own = [[one["ways"].get(name, {}) for one in row["cuts"]] for row in rows]
         if not any(one for row in own for one in row):
             continue
@@ -277,6 +282,17 @@ def whole(rows: list[Row]) -> Row:
             "never_good": int(np.sum(horizon == 0)),
             "cumulative_accuracy": float(np.nanmedian(cumulative)),
         }
+    return found
+
+
+def healthy(rows: list[Row]) -> Row:
+    """Sum up what is said of lives without an end, in means over them."""
+    found = {}
+    for name in WAYS:
+        own = [row["ways"][name] for row in rows if name in row["ways"]]
+        if own:
+            means = {key: float(np.mean([one[key] for one in own])) for key in own[0]}
+            found[name] = {"n": len(own)} | means
     return found
 
 
