@@ -214,10 +214,10 @@ def crps(draws: FloatArray, truth: ArrayLike, *, horizon: ArrayLike = np.inf) ->
     x, y = np.minimum(draws, horizon), np.minimum(truth, horizon)
     if not (np.isfinite(x).all() and np.isfinite(y).all()):
         raise ValueError("draws or truths that never end have no finite score: state a horizon")
-    n = x.shape[0]
+    off, n = x - y, x.shape[0]
     # Half the mean distance of two draws, Σ |x_i - x_j| / (2 n²), from their order.
     order = (2 * np.arange(1, n + 1) - n - 1) / n**2
-    return np.asarray(np.mean(np.abs(x - y), axis=0) - order @ np.sort(x, axis=0))
+    return np.asarray(np.mean(np.abs(off), axis=0) - order @ np.sort(off, axis=0))
 
 
 def place(

@@ -137,6 +137,7 @@ def test_crps_without_end_needs_a_horizon() -> None:
     with pytest.raises(ValueError, match="state a horizon"):
         crps(np.array([[1.0]]), [NEVER])
     assert crps(np.array([[1.0]]), [NEVER], horizon=4.0) == 3.0
+    assert crps(np.full((9, 1), NEVER), [NEVER], horizon=2e7) == 0.0
 
 
 @pytest.mark.parametrize("horizon", [NEVER, 1.5])

@@ -17,11 +17,11 @@ BLACK, GREY = "#000000", "#777777"
 # Colour, marker, dash, name, and by how much it stands aside.
 WAYS = {
     "lmshealth": ("#0072b2", "o", "-", "lmshealth", -1.5),
-    "progpy": ("#009e73", "^", "--", "progpy, same draws", -0.4),
-    "progpy, all runs kept": ("#e69f00", "v", ":", "progpy, all runs kept", 0.7),
+    "progpy": ("#009e73", "^", "--", "progpy, same draws", 0.0),
     "line": ("#d55e00", "s", "-.", "line through health", 1.5),
 }
-CONTROL = ("#cc79a7", ":", "control: a third of the spread")
+CONTROL = ("#cc79a7", ":", "control: a tenth of the spread")
+KEPT = "progpy, all runs kept"
 MAIN_CUT = 0.7
 Row = dict[str, Any]
 
@@ -63,7 +63,7 @@ def draw_accuracy(ax: Axes, cuts: list[Row]) -> None:
     ax.set_ylim(0, 103)
     ax.set_ylabel("% of medians within ± 20 % of what is left")
     ax.set_title("α-λ accuracy, 95 % intervals", fontsize=10)
-    ax.legend(fontsize=7, loc="lower center")
+    ax.legend(fontsize=7, loc="upper center", bbox_to_anchor=(0.5, -0.17), ncol=3, frameon=False)
 
 
 def draw_score(ax: Axes, cuts: list[Row]) -> None:
@@ -73,6 +73,10 @@ def draw_score(ax: Axes, cuts: list[Row]) -> None:
         score = [row["ways"][name]["crps_km"] for row in cuts]
         ax.plot([100 * row["share"] for row in cuts], score, dash, marker=marker, ms=5,
                 color=colour, label=label)  # fmt: skip
+    if all(KEPT in row["ways"] for row in cuts):
+        kept = [row["ways"][KEPT]["crps_km"] for row in cuts]
+        ax.plot([100 * row["share"] for row in cuts], kept, ":", marker="v", mfc="none", ms=8,
+                color=WAYS["progpy"][0], label="progpy, runs without end kept")  # fmt: skip
     label_cuts(ax, cuts)
     ax.set_ylim(bottom=0)
     ax.set_ylabel("mean CRPS in km (0 is best)")
@@ -84,7 +88,7 @@ def draw_places(ax: Axes, row: Row) -> None:
     """Draw the distribution of the truth's places at one cut."""
     ax.plot([0, 1], [0, 1], color=BLACK, lw=0.8)
     styles = {name: (WAYS[name][0], WAYS[name][2], WAYS[name][3]) for name in drawn([row])}
-    for name, (colour, dash, label) in (styles | {"a third of the spread": CONTROL}).items():
+    for name, (colour, dash, label) in (styles | {"a tenth of the spread": CONTROL}).items():
         x = np.sort(row["ways"][name]["places"])
         ax.step(np.r_[0, x, 1], np.r_[0, np.arange(1, x.size + 1) / x.size, 1], dash, where="post",
                 color=colour, lw=1.4, label=label)  # fmt: skip
@@ -98,24 +102,21 @@ def draw_places(ax: Axes, row: Row) -> None:
 
 
 def draw_services(ax: Axes, cuts: list[Row], risk: float) -> None:
-    """Draw what services by a stated risk miss, and what they throw away."""
-    for name in drawn(cuts):
+    """Draw what services by a stated risk throw away, and how many lives end before them."""
+    shares = [100 * row["share"] for row in cuts]
+    for k, name in enumerate(drawn(cuts)):
         colour, marker, dash, label, _ = WAYS[name]
-        broken = [100 * row["ways"][name]["broken"] / row["n"] for row in cuts]
-        wasted = [100 * row["ways"][name]["unexploited_km"] / row["left_km"] for row in cuts]
-        ax.plot(wasted, broken, dash, color=colour, marker=marker, ms=5, lw=0.8, label=label)
-        for row, x, y in zip(cuts, wasted, broken, strict=True):
-            ax.annotate(f"{100 * row['share']:.0f}", (x, y), (4, 4), textcoords="offset points",
-                        fontsize=7, color=colour)  # fmt: skip
-    ax.axhline(100 * risk, color=GREY, lw=1, ls="--")
-    ax.text(99, 100 * risk + 1, "risk taken", fontsize=7, ha="right", color=GREY)
-    ax.set_xlim(0, 100)
-    ax.set_ylim(-2, 100)
-    ax.set_xlabel("unexploited: mean, in % of the median life left")
-    ax.set_ylabel("% of lives that break before")
-    ax.set_title(f"Service at {100 * risk:.0f} % risk (numbers: cut)", fontsize=10)
-    ax.grid(alpha=0.25)
-    ax.legend(fontsize=7)
+        wasted = [100 * row["ways"][name]["unexploited_km"] / row["mean_left_km"] for row in cuts]
+        ax.plot(shares, wasted, dash, color=colour, marker=marker, ms=5, label=label)
+        for row, x in zip(cuts, shares, strict=True):
+            broken = 100 * row["ways"][name]["broken"] / row["n"]
+            ax.text(x, 101 + 7 * k, f"{broken:.0f} %", fontsize=8, ha="center", color=colour)
+    ax.text(0.0, 1.21, "ended before their service:", fontsize=8, transform=ax.transAxes)
+    label_cuts(ax, cuts)
+    ax.set_ylim(0, 100)
+    ax.set_ylabel("life unexploited, % of what is left")
+    ax.set_title(f"Service at {100 * risk:.0f} % risk", fontsize=10, pad=52)
+    ax.legend(fontsize=7, loc="lower left")
 
 
 def main() -> None:

@@ -13,7 +13,7 @@ from studies.lives import Array
 from studies.rul_metrics.forecasts import linear, ours
 
 OURS, LINE, PROGPY = "lmshealth", "line", "progpy"
-KEPT, CONTROL = "progpy, all runs kept", "a third of the spread"
+KEPT, CONTROL = "progpy, all runs kept", "a tenth of the spread"
 WAYS = (OURS, LINE, PROGPY, KEPT, CONTROL)
 MISSING = "progpy: not installed; pip install '.[peers]'"
 
@@ -65,8 +65,8 @@ def _from_now(draws: dict[str, Array]) -> dict[str, Array]:
 
 
 def _narrowed(draws: Array) -> Array:
-    """Shrink draws to a third of their distance from the median, where there is one."""
+    """Shrink draws to a tenth of their distance from the median, where there is one."""
     middle = np.median(draws)
     if not np.isfinite(middle):
         return draws
-    return np.asarray(middle + (draws - middle) / 3)
+    return np.asarray(middle + (draws - middle) / 10)
