@@ -29,7 +29,8 @@ from matplotlib.axes import Axes
 from numpy.typing import NDArray
 from scipy import stats
 
-from studies.record import LEVEL, judge_coverage
+from lmshealth.metrics import coverage, place
+from studies.record import LEVEL, as_row
 
 Array = NDArray[np.float64]
 Row = dict[str, Any]
@@ -53,9 +54,7 @@ def thinned(draws: Array) -> Array:
 
 def rank(truth: Array, draws: Array, rng: np.random.Generator) -> list[float]:
     """Rank truths ``(n,)`` among draws ``(n_draws, n)``, as a share from 0 to 1."""
-    below, tied = np.sum(draws < truth, axis=0), np.sum(draws == truth, axis=0)
-    share = (below + rng.uniform(size=truth.size) * (tied + 1)) / (len(draws) + 1)
-    return [round(float(value), 6) for value in share]
+    return [round(float(value), 6) for value in place(draws, truth, rng)]
 
 
 def band(n: int) -> tuple[Array, Array]:
@@ -77,9 +76,7 @@ def judge(ranks: Array) -> Row:
         "inside_band": bool(np.all((low <= off) & (off <= high))),
         "p_value": float(stats.chisquare(counts).pvalue),
         "coverage": [
-            {"nominal": level}
-            | judge_coverage(int(np.sum(np.abs(ranks - 0.5) < level / 2)), n, level)
-            for level in (0.5, 0.9)
+            {"nominal": level} | as_row(coverage(ranks, level, level=LEVEL)) for level in (0.5, 0.9)
         ],
         "histogram": counts.tolist(),
         "ecdf_difference": off.round(5).tolist(),

@@ -11,7 +11,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from scipy.stats import beta
+from lmshealth.metrics import Coverage, clopper_pearson
 
 # How often intervals claim to hold the truth, and how sure the judgement of that is.
 NOMINAL, LEVEL = 0.95, 0.999
@@ -81,16 +81,12 @@ def conclude(
         raise SystemExit(f"not as asked: {failed}")
 
 
-def clopper_pearson(hits: int, trials: int, level: float = 0.95) -> tuple[float, float]:
-    """Exact interval of a proportion."""
-    tail = (1 - level) / 2
-    low = float(beta.ppf(tail, hits, trials - hits + 1)) if hits else 0.0
-    high = float(beta.ppf(1 - tail, hits + 1, trials - hits)) if hits < trials else 1.0
-    return low, high
-
-
 def judge_coverage(hits: int, n: int, nominal: float = NOMINAL) -> dict[str, Any]:
     """Tell how often intervals hold the truth, and whether that may be as often as they claim."""
-    low, high = clopper_pearson(hits, n, LEVEL)
-    return {"hits": hits, "n": n, "share": hits / n, "low": low, "high": high,
-            "holds": low <= nominal <= high}  # fmt: skip
+    return as_row(Coverage(nominal, hits, n, *clopper_pearson(hits, n, LEVEL)))
+
+
+def as_row(found: Coverage) -> dict[str, Any]:
+    """Write a coverage down."""
+    return {"hits": found.hits, "n": found.n, "share": found.share, "low": found.low,
+            "high": found.high, "holds": found.holds}  # fmt: skip

@@ -26,6 +26,7 @@ FLOORS = [
         "wording",
         "rowfile",
         "filterbank",
+        "metrics",
     },
     {
         "laws",

@@ -263,3 +263,17 @@ def test_one_guide(root: Path) -> None:
     """The preload of a shared guide is known better, and the mount of X is never claimed."""
     answer = json.loads(run_study(root, "one_guide"))
     assert all(answer["passed"].values())
+
+
+def test_rul_metrics(root: Path) -> None:
+    """A life that wears and loosens is told at every cut, by all ways that are installed."""
+    answer = json.loads(run_study(root, "rul_metrics"))
+    assert all(answer["passed"].values())
+    ways = {"lmshealth", "line", "a tenth of the spread"}
+    if not answer["missing"]:  # peers are compared where they are installed
+        ways |= {"progpy", "progpy, all runs kept"}
+    for cut in answer["cuts"]:
+        assert set(cut["ways"]) == ways
+        # Knowing that the map is right can only help.
+        bounds = cut["bound"]
+        assert bounds["map right"]["accurate"] > bounds["map to 5 %"]["accurate"]

@@ -40,9 +40,10 @@ from numpy.typing import NDArray
 
 from lmshealth import identities
 from lmshealth.association import Association, associate
+from lmshealth.metrics import clopper_pearson
 from studies.crossings.judging import judge, nearest, recovered
 from studies.crossings.lives import KINDS, Kind, Life, make_life
-from studies.record import Stopwatch, clopper_pearson, keep
+from studies.record import Stopwatch, keep
 
 HERE = Path(__file__).parent
 SEED = 20261124

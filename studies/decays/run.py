@@ -47,12 +47,13 @@ import numpy as np
 from scipy import optimize
 
 from lmshealth import identify_decays
+from lmshealth.metrics import clopper_pearson
 from lmshealth.segments import Segment
 from lmshealth.stage import Description, ModeSpec, Stage
 from studies.decays.beam import REPEATS, judge_beam, one_beam
 from studies.decays.cases import CASES, QUIET, RATE, Case, simulate, to_log
 from studies.decays.stops import one_machine
-from studies.record import Stopwatch, clopper_pearson, keep
+from studies.record import Stopwatch, keep
 
 HERE = Path(__file__).parent
 LEVEL, Z = 0.999, 1.959963984540054

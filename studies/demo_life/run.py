@@ -29,7 +29,8 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from studies.record import Stopwatch, clopper_pearson, keep
+from lmshealth.metrics import clopper_pearson
+from studies.record import Stopwatch, keep
 
 HERE = Path(__file__).parent
 PARAMETERS = ("guide_preload", "mount_stiffness")

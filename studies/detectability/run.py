@@ -41,6 +41,7 @@ import numpy as np
 from lmshealth.bounds import long_record_law
 from lmshealth.epoch import EpochPosterior
 from lmshealth.errors import BadQuestion
+from lmshealth.metrics import clopper_pearson
 from lmshealth.planning import plan
 from lmshealth.sight import sight_of
 from lmshealth.stage import Stage, load_stage
@@ -49,7 +50,7 @@ from models.plant import GUIDE_MODES
 from studies.importance import Array, believed
 from studies.lives import life_of, rng_of
 from studies.raw_lives import identified
-from studies.record import LEVEL, Stopwatch, clopper_pearson, judge_coverage, keep
+from studies.record import LEVEL, Stopwatch, judge_coverage, keep
 
 HERE = Path(__file__).parent
 POWER, FALSE_ALARM = 0.95, 0.01

@@ -8,9 +8,9 @@ import numpy as np
 
 from lmshealth.lines import find_lines
 from lmshealth.logs import Channel
+from lmshealth.metrics import clopper_pearson
 from lmshealth.segments import Segment
 from studies.line_test.signals import BAND, RATE, Array
-from studies.record import clopper_pearson
 
 SHORT, LONG = 3.0, 30.0
 USUAL = 0.01

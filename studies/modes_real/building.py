@@ -15,10 +15,10 @@ import pandas as pd
 from scipy.stats import norm
 
 from lmshealth import identify, load_stage
+from lmshealth.metrics import clopper_pearson
 from lmshealth.results import Modes
 from studies.modes_real.make_map import PUBLISHED, PUBLISHED_DAMPING
 from studies.modes_real.sets import identify_known, to_log
-from studies.record import clopper_pearson
 
 STAGE = Path(__file__).parent / "building.toml"
 SAMPLE_RATE = 100.0

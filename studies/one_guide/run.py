@@ -33,12 +33,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lmshealth.inference import infer, infer_together
+from lmshealth.metrics import coverage
 from lmshealth.results import Health
 from lmshealth.stage import Stage, load_stage
 from lmshealth.tracktable import Drifts
 from models.mapping import guide_frequencies
 from models.stages import stage_named
-from studies.record import Stopwatch, conclude, judge_coverage
+from studies.record import LEVEL, Stopwatch, as_row, conclude
 
 Array = NDArray[np.float64]
 HERE = Path(__file__).parent
@@ -108,9 +109,7 @@ def judged(rows: list[dict[str, Any]], level_name: str = "level") -> list[dict[s
     """Judge the coverage of central intervals."""
     levels = np.array([row[level_name] for row in rows])
     return [
-        {"nominal": nominal}
-        | judge_coverage(int(np.sum(np.abs(levels - 0.5) < nominal / 2)), levels.size, nominal)
-        for nominal in LEVELS
+        {"nominal": nominal} | as_row(coverage(levels, nominal, level=LEVEL)) for nominal in LEVELS
     ]
 
 

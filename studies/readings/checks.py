@@ -7,7 +7,7 @@ import subprocess
 import sys
 from typing import Any
 
-from studies.record import clopper_pearson
+from lmshealth.metrics import clopper_pearson
 
 Check = dict[str, Any]
 

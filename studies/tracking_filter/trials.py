@@ -8,10 +8,11 @@ from typing import Any
 import numpy as np
 from scipy import stats
 
+from lmshealth.metrics import clopper_pearson
 from lmshealth.stage import Stage
 from lmshealth.tracking import track
 from lmshealth.tracks import History
-from studies.record import LEVEL, clopper_pearson
+from studies.record import LEVEL
 from studies.tracking_filter.lives import (
     Array,
     Life,

@@ -47,6 +47,7 @@ from unittest.mock import patch
 import numpy as np
 
 from lmshealth import bank
+from lmshealth.metrics import clopper_pearson
 from studies.lives import (
     DAMAGED,
     HEALTHY,
@@ -59,7 +60,7 @@ from studies.lives import (
     rng_of,
 )
 from studies.raw_lives import identified, measured
-from studies.record import LEVEL, Stopwatch, clopper_pearson, keep
+from studies.record import LEVEL, Stopwatch, keep
 from studies.tracking_lives.optimum import optimum
 from studies.tracking_lives.trials import (
     DECLARED_RATE,

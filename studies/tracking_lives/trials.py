@@ -11,11 +11,12 @@ from typing import Any
 import numpy as np
 from scipy import stats
 
+from lmshealth.metrics import clopper_pearson
 from lmshealth.stage import Stage, load_stage
 from lmshealth.tracking import track
 from lmshealth.tracks import History, Track
 from studies.lives import HEALTHY, Array, Estimates, Life, history_of, rng_of
-from studies.record import LEVEL, clopper_pearson, judge_coverage
+from studies.record import LEVEL, judge_coverage
 
 STAGES = ("lms-y", "lms-x")
 NOMINALS = (0.9, 0.5)

@@ -12,8 +12,8 @@ from __future__ import annotations
 import numpy as np
 
 from lmshealth.frf import read_frf
+from lmshealth.metrics import clopper_pearson
 from studies.frf_modes.records import BAND, MODES, RATE, Machine, at_random, periodic
-from studies.record import clopper_pearson
 from tests.signals import make_log
 
 _Z = 1.959963984540054
