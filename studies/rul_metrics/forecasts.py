@@ -64,7 +64,8 @@ def _states(life: LifePosterior, now: float) -> dict[str, Array]:
     """Write every draw as wear and loosening; of what never changes nothing is ever lost."""
     parts = []
     for way, off, rate in life.each():
-        never = np.full(rate.size, np.inf), np.ones(rate.size)
+        n = rate.shape[0]
+        never = np.full(n, np.inf), np.ones(n)
         theta = way.course.split(way.course.natural(way.own))
         pairs = zip(way.course.branches, theta, strict=True)
         by_law = {branch.law.kind: own for branch, own in pairs}
@@ -72,14 +73,14 @@ def _states(life: LifePosterior, now: float) -> dict[str, Array]:
         floor, length = by_law["loosening"].T if "loosening" in by_law else never[::-1]
         parts.append(
             {
-                "travel": np.full(rate.size, now / _KM),
+                "travel": np.full(n, now / _KM),
                 "life": wear[0] / _KM,
                 "exponent": wear[1],
                 "floor": floor,
                 "length": length / _KM,
                 "off_preload": off[:, 0],
                 "off_mount": off[:, 1],
-                "rate": rate * _KM,
+                "rate": rate[:, 0] * _KM,  # the same of both
             }
         )
     return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}

@@ -72,7 +72,7 @@ from studies.rul_metrics.ways import CONTROL, LINE, MISSING, OURS, PROGPY, WAYS,
 
 HERE = Path(__file__).parent
 SEED = 20261124
-LIVES, UNENDING = 20, 6  # of each kind, and healthy ones
+LIVES, UNENDING = 16, 6  # of each kind, and healthy ones
 ALPHA, RISK = 0.2, 0.05
 # The prognostic horizon: half of the draws within a tenth of the whole life.
 NEAR, MASS = 0.1, 0.5
