@@ -20,6 +20,7 @@ from models.mapping import modal_map
 from models.plant import GUIDE_MODES
 from models.stages import stage_named
 from studies.lives import HEALTHY, Array, Estimates, Life, life_of, life_with, plan_of
+from studies.sbc_life.run import always_losing
 
 PARAMETERS = ("guide_preload", "mount_stiffness")
 # Plants whose map is believed in place of the true one: what is wrong, by which factor.
@@ -49,18 +50,24 @@ class Case:
     passage : ndarray
         Travel in m since the first log at which each limit is reached, infinite if never,
         shape ``(2,)``.
+    losing : bool
+        Whether it is known that every parameter loses.
     """
 
     life: Life
     estimates: Estimates
     health: Array
     passage: Array
+    losing: bool = False
 
 
 @cache
-def stage_with(name: str, model_std: float, plant: str = "") -> Stage:
-    """Load a description with another error of its map, or with the map of a wrong plant."""
-    stage = load_stage(name)
+def stage_with(name: str, model_std: float, plant: str = "", *, losing: bool = False) -> Stage:
+    """Load a description with another error of its map, or with the map of a wrong plant.
+
+    With ``losing`` it has no law by which a parameter keeps its value.
+    """
+    stage = always_losing(load_stage(name)) if losing else load_stage(name)
     assert stage.description.map is not None
     spec = msgspec.structs.replace(stage.description.map, model_std=model_std)
     surrogate = _wrong_map(name, plant) if plant else stage.modal_map
@@ -121,10 +128,10 @@ def on_path(stage: str, seed: int, rng: np.random.Generator) -> Life:
 def by_law(stage: str, seed: int, rng: np.random.Generator) -> tuple[Life, Array]:
     """Take a life whose course is drawn from its prior: the life, and where its limits are, in m.
 
-    Each parameter follows one of its laws, and does not deviate from it. Only lives that stay
-    inside the map until now are possible for who believes in the map.
+    Each parameter follows one of the laws by which it loses, and does not deviate from it. Only
+    lives that stay inside the map until now are possible for who believes in the map.
     """
-    description = load_stage(stage)
+    description = always_losing(load_stage(stage))
     assert description.modal_map is not None
     kind, visits = _healthy(stage, seed, rng)
     s = _KM * np.array([visit.travel_km - visits[0].travel_km for visit in visits])
