@@ -23,7 +23,9 @@ _KM = 1000.0
 _LEVELS = (0.05, 0.25, 0.5, 0.75, 0.95)
 
 
-def prognose(history: History, stage: Stage, seed: int | Sequence[int]) -> Prognosis:
+def prognose(
+    history: History, stage: Stage, seed: int | Sequence[int], *, chains: bool = True
+) -> Prognosis:
     """Infer the degradation laws of a stage and the travel left to each limit.
 
     Parameters
@@ -34,6 +36,8 @@ def prognose(history: History, stage: Stage, seed: int | Sequence[int]) -> Progn
         Laws, limits, modal map and usage.
     seed : int or sequence of int
         Of all randomness.
+    chains : bool
+        As in `fit_life`.
 
     Returns
     -------
@@ -54,7 +58,7 @@ def prognose(history: History, stage: Stage, seed: int | Sequence[int]) -> Progn
         raise BadStage(f"{stage.name}: no [[parameter]] has a limit, so there is no end of life")
     # Health has its streams by epoch, the life its own; these are of what comes after.
     seeds = stream(seed, _STEP).spawn(3)
-    life = fit_life(history, stage, seed)
+    life = fit_life(history, stage, seed, chains=chains)
     told = told_limits(stage, life.modes)
     if not told:
         raise NotEnoughData(
