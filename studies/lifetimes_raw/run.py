@@ -12,9 +12,10 @@ Method
     of a room, payload, friction, lines, quantisation. Logs are identified, tracked and prognosed as
     `lmshealth run` does, but by importance sampling in the place of chains. The map of the
     description is that of this very plant, so that intervals with its error of 5 % must be too
-    wide; the test is with the map believed, the other is told beside it. Ranks among 127 draws, ties and censored lives at random, are held to their
-    simultaneous band at 99.9 %, and coverages to their 99.9 % Clopper-Pearson interval. Negative
-    control that must fail: the same draws pulled to half their distance from their median.
+    wide; the test is with the map believed, the other is told beside it. Ranks among 127 draws,
+    ties and censored lives at random, are held to their simultaneous band at 99.9 %, and coverages
+    to their 99.9 % Clopper-Pearson interval. Negative control that must fail: the same draws pulled
+    to half their distance from their median.
 
     What happens after the cut is not foretold: a crash or a loosened bolt to come is in no law, and
     these lives have none. It does not touch the ranks of the others.
