@@ -4,7 +4,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 DEMO := demo
 
-.PHONY: demo test check clean
+.PHONY: demo picture test check clean
 
 demo: .venv/installed
 	@rm -rf $(DEMO)
@@ -12,6 +12,11 @@ demo: .venv/installed
 	@$(BIN)/python -m models simulate lms-y --life both --logs 40 --seconds 20 --seed 3 --out $(DEMO)/logs
 	@echo "Analysing its logs ..."
 	@$(BIN)/lmshealth run $(DEMO)/logs --stage lms-y --out $(DEMO)/result
+
+# The picture in the README, from the report of the demo.
+picture: .venv/installed
+	@test -d $(DEMO)/result || $(MAKE) demo
+	$(BIN)/python -m studies.demo_life.picture $(DEMO)/result
 
 # Tests run side by side: threads inside linear algebra would only get in their way.
 test: export OPENBLAS_NUM_THREADS = 1

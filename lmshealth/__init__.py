@@ -7,6 +7,7 @@ samples to the date. Inside the package all quantities are in SI units.
 from importlib.metadata import version
 
 from lmshealth.decay import identify_decays
+from lmshealth.decision import decide
 from lmshealth.errors import LmshealthError
 from lmshealth.frf import read_frf
 from lmshealth.history import Reading, build_history
@@ -29,6 +30,7 @@ __all__ = [
     "Settings",
     "assess",
     "build_history",
+    "decide",
     "fit_life",
     "identify",
     "identify_decays",

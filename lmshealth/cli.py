@@ -26,12 +26,14 @@ from lmshealth.options import (
     FORMAT,
     LOGS,
     PART,
+    PDF,
     SEED,
     SHARE,
     STAGE,
     checked_band,
     examples,
 )
+from lmshealth.pdf import write_pdfs
 
 if TYPE_CHECKING:
     from lmshealth.pipeline import RunResult
@@ -90,6 +92,7 @@ def main() -> None:
 @click.option("--workers", type=click.IntRange(1), help="Processes; default one per processor.")
 @EPOCHS
 @SEED
+@PDF
 @click.pass_context
 def run(
     ctx: click.Context, /, logs: Path, stages: tuple[str, ...], out: Path, **options: Any
@@ -109,6 +112,8 @@ def run(
     with terminal.progress_bars() as progress:
         result = run_pipeline(logs, loaded, out, settings, progress)
     _tell(result)
+    if options["pdf"]:
+        write_pdfs(result.pages)
     ctx.exit(_SOME_REFUSED if result.n_refused else _DONE)
 
 
@@ -424,17 +429,12 @@ def _exit(ctx: click.Context, found: Sequence[object], lost: Sequence[Refusal]) 
 
 
 def _tell(result: RunResult) -> None:
+    from lmshealth.lifeview import print_assessments
+
     used = result.n_logs - result.n_refused
     again = f", {result.n_remembered} of them known from before" if result.n_remembered else ""
     click.echo(f"{used} of {result.n_logs} logs analysed{again}.")
-    for assessment in result.assessments:
-        judgement = assessment.judgement
-        sure = (
-            ""
-            if judgement.probability != judgement.probability
-            else (f" ({100 * judgement.probability:.0f} %)")
-        )
-        click.echo(f"{judgement.stage}: {judgement.verdict}{sure}. {judgement.why}")
+    print_assessments(result.assessments)
     click.echo(f"Report: {result.index}")
 
 

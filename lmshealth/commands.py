@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -12,7 +12,10 @@ import click
 
 from lmshealth import terminal
 from lmshealth.errors import BadTable, NotEnoughData
-from lmshealth.options import EPOCHS, SEED, STAGE, examples
+from lmshealth.files import write_draws, write_text
+from lmshealth.lifecommands import prognose
+from lmshealth.options import COV, EPOCHS, MAINTENANCE, OUT, PDF, SEED, STAGE, TABLE, examples
+from lmshealth.pdf import write_pdfs
 
 if TYPE_CHECKING:
     from lmshealth.logs import Refusal
@@ -21,9 +24,7 @@ if TYPE_CHECKING:
     from lmshealth.tracks import History, Smoothed, Track
     from lmshealth.tracktable import Drifts
 
-_TABLE = click.Path(exists=True, dir_okay=False, path_type=Path)
 _TABLES = ("track", "track_cov", "effects", "events", "refused")
-_OUT = click.Path(dir_okay=False, path_type=Path)
 
 
 @click.command(
@@ -32,15 +33,15 @@ _OUT = click.Path(dir_okay=False, path_type=Path)
         "track other_program.csv --out track.csv --effects effects.csv --smooth",
     )
 )
-@click.argument("table", metavar="MODES.csv", type=_TABLE)
+@click.argument("table", metavar="MODES.csv", type=TABLE)
 @STAGE
-@click.option("--out", required=True, type=_OUT, help="Where the track goes.")
-@click.option("--cov", type=_TABLE, help="Cross terms; default modes_cov.csv beside MODES.csv.")
-@click.option("--maintenance", type=_TABLE, help="What was done, as maintenance.csv.")
-@click.option("--track-cov", type=_OUT, help="Where the covariances of the drifts go.")
-@click.option("--effects", type=_OUT, help="Where go the effects of what is no wear.")
-@click.option("--events", type=_OUT, help="Where go steps, retunings and alarms.")
-@click.option("--refused", type=_OUT, help="Where goes what was given to no mode, and why.")
+@click.option("--out", required=True, type=OUT, help="Where the track goes.")
+@COV
+@MAINTENANCE
+@click.option("--track-cov", type=OUT, help="Where the covariances of the drifts go.")
+@click.option("--effects", type=OUT, help="Where go the effects of what is no wear.")
+@click.option("--events", type=OUT, help="Where go steps, retunings and alarms.")
+@click.option("--refused", type=OUT, help="Where goes what was given to no mode, and why.")
 @click.option("--smooth", "smoothed", is_flag=True, help="Add columns that know of later logs.")
 def track(table: Path, out: Path, **options: Any) -> None:
     """Follow modes through a table of estimates, ours or another program's.
@@ -49,25 +50,19 @@ def track(table: Path, out: Path, **options: Any) -> None:
     where every row has it, else the time. Without a mode name modes are born from the estimates;
     without --stage every covariate column is regressed, about its median.
     """
-    from lmshealth.history import believed, build_history, doubted
-    from lmshealth.maintenance import read_actions
-    from lmshealth.modetable import read_estimates
+    from lmshealth.history import believed, doubted
+    from lmshealth.modetable import read_machines
     from lmshealth.smoothing import smooth
     from lmshealth.stage import load_stage
     from lmshealth.tracking import track as follow
 
     stage = load_stage(options["stage"]) if options["stage"] else None
-    cov = options["cov"] or table.with_name("modes_cov.csv")
-    read = read_estimates(table, cross_terms=cov if cov.exists() else None, stage=stage)
-    actions = read_actions(options["maintenance"]) if options["maintenance"] else ()
+    read = read_machines(
+        table, stage, cross_terms=options["cov"], maintenance=options["maintenance"]
+    )
     rows: dict[str, list[Row]] = {name: [] for name in _TABLES}
     notes = list(read.notes)
-    machines = dict.fromkeys(str(reading.metadata.stage) for reading in read.readings)
-    for name in dict.fromkeys(a.stage for a in actions if a.stage not in machines):
-        notes.append(f"maintenance of {name} is not used: the table has {', '.join(machines)}")
-    for machine in machines:
-        own = [reading for reading in read.readings if reading.metadata.stage == machine]
-        history, lost = build_history(own, stage, [a for a in actions if a.stage == machine])
+    for history, lost in read.machines:
         followed = follow(history, stage)
         lost += doubted(history, followed)
         later = None
@@ -118,22 +113,7 @@ def _write(rows: dict[str, list[Row]], targets: dict[str, Path | None]) -> None:
     for name, target in targets.items():
         if target is None:
             continue
-        _write_text(target, frame(COLUMNS[name], rows[name]).to_csv(index=False))
-
-
-def _write_text(target: Path, text: str) -> None:
-    with _writing(target):
-        target.write_text(text)
-
-
-@contextmanager
-def _writing(target: Path) -> Iterator[None]:
-    """Make the folder of a file, and say what keeps the file from being written."""
-    try:
-        target.parent.mkdir(parents=True, exist_ok=True)
-        yield
-    except OSError as error:
-        raise BadTable(f"{target}: cannot be written: {error.strerror or error}") from error
+        write_text(target, frame(COLUMNS[name], rows[name]).to_csv(index=False))
 
 
 @click.command(
@@ -143,15 +123,15 @@ def _writing(target: Path) -> Iterator[None]:
         "--out health.csv",
     )
 )
-@click.argument("table", metavar="TRACK.csv", type=_TABLE)
+@click.argument("table", metavar="TRACK.csv", type=TABLE)
 @click.option("--stage", required=True, help="Stage description: a .toml file or a shipped name.")
-@click.option("--out", required=True, type=_OUT, help="Where the health goes.")
-@click.option("--cov", type=_TABLE, help="Cross terms; default track_cov.csv beside TRACK.csv.")
-@click.option("--posterior", type=_OUT, help="Where all draws go, as NetCDF that ArviZ reads.")
+@click.option("--out", required=True, type=OUT, help="Where the health goes.")
+@click.option("--cov", type=TABLE, help="Cross terms; default track_cov.csv beside TRACK.csv.")
+@click.option("--posterior", type=OUT, help="Where all draws go, as NetCDF that ArviZ reads.")
 @click.option(
     "--with",
     "others",
-    type=(_TABLE, str),
+    type=(TABLE, str),
     multiple=True,
     metavar="TRACK.csv STAGE",
     help="Another machine that shares a part with the first; see --shared.",
@@ -182,9 +162,10 @@ def infer(ctx: click.Context, /, table: Path, **options: Any) -> None:
     if not found:
         ctx.exit(1)
     rows = [row for health in found for row in health_rows(health)]
-    _write_text(options["out"], frame(COLUMNS["health"], rows).to_csv(index=False))
+    write_text(options["out"], frame(COLUMNS["health"], rows).to_csv(index=False))
     if options["posterior"]:
-        _write_posterior(options["posterior"], found)
+        trees = [health.to_arviz() for health in found]
+        write_draws(options["posterior"], [health.stage for health in found], trees)
     ctx.exit(3 if lost else 0)
 
 
@@ -252,14 +233,41 @@ def _only(table: Path, machines: tuple[Drifts, ...]) -> Drifts:
     return machines[0]
 
 
-def _write_posterior(path: Path, found: Sequence[Health]) -> None:
-    """Write all draws: of one machine as ArviZ has it, of several under the name of each."""
-    from xarray import DataTree  # late: it takes a second to import
+@click.command(
+    epilog=examples(
+        "report --store sqlite:///result/lmshealth.sqlite --out pages/",
+        "report --store postgresql+psycopg://me@host/fleet --out pages/ --pdf",
+    )
+)
+@click.option("--store", required=True, metavar="URL", help="What `run` has filled, by its URL.")
+@click.option(
+    "--out",
+    type=click.Path(file_okay=False, path_type=Path),
+    required=True,
+    help="Folder of the pages.",
+)
+@PDF
+@click.pass_context
+def report(ctx: click.Context, /, store: str, out: Path, pdf: bool) -> None:
+    """Write the pages of all machines in a store, without their logs.
 
-    trees = {health.stage.replace("/", "_"): health.to_arviz() for health in found}
-    tree = next(iter(trees.values())) if len(trees) == 1 else DataTree.from_dict(trees)
-    with _writing(path):
-        tree.to_netcdf(path, engine="h5netcdf")
+    They are those that `run` wrote last for each machine, byte for byte.
+    """
+    from lmshealth.report import write_report
+    from lmshealth.store import Store
+
+    with closing(Store(store, create=False)) as opened:
+        fleet = opened.fleet()
+    *pages, index = write_report(out, fleet.assessments, fleet.refused, earlier=fleet.earlier)
+    click.echo(f"Report: {index}")
+    for machine in fleet.unread:
+        click.echo(
+            f"lmshealth: {machine}: not readable for this version of lmshealth; run its logs again",
+            err=True,
+        )
+    if pdf:
+        write_pdfs(pages)
+    ctx.exit(3 if fleet.unread else 0)
 
 
 @click.command(epilog=examples("stage lms-y", "stage my-stage.toml --format json"))
@@ -288,4 +296,4 @@ def stage(reference: str, style: str) -> None:
         print_stage(content)
 
 
-COMMANDS: Sequence[click.Command] = (track, infer, stage)
+COMMANDS: Sequence[click.Command] = (track, infer, prognose, report, stage)

@@ -175,8 +175,9 @@ def courses_of(
         total = sum(law.weight for law in parameter.laws)
         own: list[tuple[Branch, float]] = []
         for law in parameter.laws:
-            # What has no parameters cannot begin anew.
-            begins = (0.0, steps[-1]) if steps and law.names else (0.0,)
+            # What has no parameters, or no travel after the step, cannot begin anew.
+            anew = bool(law.names) and any(0 < step < now for step in steps[-1:])
+            begins = (0.0, steps[-1]) if anew else (0.0,)
             share = law.weight / total / len(begins)
             own += [(Branch(law, begin, tuple(steps)), share) for begin in begins]
         choices.append(own)

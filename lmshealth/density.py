@@ -99,7 +99,7 @@ class LifeDensity:
         off : ndarray
             Independent from moment to moment, shape ``(n, n_moments, n_parameters)``.
         rate : ndarray
-            Variance that is added per m of travel to come, shape ``(n,)``.
+            Variance that is added per m of travel to come, shape ``(n, n_parameters)``.
         """
         # Without coordinates all draws are of one life.
         one = y[:1] if not self.course.n_dim else y
@@ -115,7 +115,8 @@ class LifeDensity:
             least = 1e-15 * np.eye(cov.shape[-1])
             unit = rng.standard_normal((own.sum(), *mean.shape[1:], 1))
             off[own] = mean + (np.linalg.cholesky(cov + least) @ unit)[..., 0]
-        return off * self.life.free, self.grid.deviation[point] ** 2 / self.life.horizon
+        rate = self.grid.deviation[point, None] ** 2 / self.life.horizon
+        return off * self.life.free, rate * self.life.free
 
     def _weights(self, y: FloatArray) -> FloatArray:
         """Probability of each point of the grid at each of some coordinates, ``(n_grid, n)``."""

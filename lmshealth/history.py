@@ -19,6 +19,7 @@ from lmshealth.results import Modes
 from lmshealth.stage import Stage
 from lmshealth.statespace import Regressor, regressors
 from lmshealth.tracks import History, Series, Step, StepKind, Track
+from lmshealth.waterfall import Levels
 
 # Sources in the order in which they stand where a mode has several.
 _SOURCES = ("joint", "acc", "frf", "delta_e")
@@ -50,6 +51,8 @@ class Reading:
     loop_error : float or None
         RMS of the following error from 1 to 40 Hz in m, see `loop_error` of `following`; None
         where the log does not tell.
+    levels : Levels or None
+        The band of the tracked modes, for people to look at; None where the log does not show it.
     """
 
     log: str
@@ -57,6 +60,7 @@ class Reading:
     metadata: Metadata
     modes: Modes
     loop_error: float | None = None
+    levels: Levels | None = None
 
 
 def in_order(readings: Sequence[Reading]) -> tuple[Reading, ...]:

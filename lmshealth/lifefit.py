@@ -114,8 +114,7 @@ class LifePosterior:
     off : ndarray
         Ln of health over its law now, like `health`.
     rate : ndarray
-        Variance of ln health about its law that every m of travel to come adds, shape
-        ``(n_ensembles, n_draws)``.
+        Variance of ln health about its law that every m of travel to come adds, like `health`.
     correlation : ndarray
         Of the logarithms of health now, shape ``(n_parameters, n_parameters)``; NaN where a
         parameter never changes.
@@ -145,9 +144,10 @@ class LifePosterior:
     seed: tuple[int, ...]
 
     def __post_init__(self) -> None:
-        shape, p = self.rate.shape, len(self.parameters)
-        expect_shape("health", self.health, (*shape, p))
-        expect_shape("off", self.off, (*shape, p))
+        shape, p = self.health.shape, len(self.parameters)
+        expect_shape("health", self.health, (*shape[:2], p))
+        expect_shape("off", self.off, shape)
+        expect_shape("rate", self.rate, shape)
         expect_shape("correlation", self.correlation, (p, p))
         if sum(way.share for way in self.ways) != shape[1]:
             raise ValueError("the ways do not share the draws among them")
@@ -159,8 +159,8 @@ class LifePosterior:
         for way in self.ways:
             part = slice(first, first + way.share)
             first = part.stop
-            off = self.off[:, part].reshape(-1, self.off.shape[-1])
-            yield way, off, self.rate[:, part].ravel()
+            off, rate = (x[:, part].reshape(-1, x.shape[-1]) for x in (self.off, self.rate))
+            yield way, off, rate
 
     def laws(self, parameter: str) -> dict[tuple[str, float], float]:
         """Probability of each law of a parameter, by its kind and the travel it begins at."""
@@ -288,7 +288,7 @@ def fit_life(
         shape = (_N_ENSEMBLES, way.share, own_off.shape[-1])
         health.append((by_law * np.exp(own_off)).reshape(shape))
         off.append(own_off.reshape(shape))
-        rate.append(own_rate.reshape(shape[:2]))
+        rate.append(own_rate.reshape(shape))
         settings.append(way.density.settings(y[:: max(1, y.shape[0] // _N_SETTINGS)]))
     both = np.concatenate(health, axis=1)
     with np.errstate(invalid="ignore"):  # health that never changes has no correlation

@@ -13,12 +13,14 @@ import pandas as pd
 
 from lmshealth.arrays import FloatArray
 from lmshealth.errors import BadTable
-from lmshealth.history import Reading
-from lmshealth.logs import Metadata
+from lmshealth.history import Reading, build_history
+from lmshealth.logs import Metadata, Refusal
+from lmshealth.maintenance import read_actions
 from lmshealth.readers import COVARIATES
 from lmshealth.results import Modes
 from lmshealth.rowfile import lines, name_machine, read_rows, to_moments, to_numbers
 from lmshealth.stage import Stage
+from lmshealth.tracks import History
 
 _KM, _MICRO = 1000.0, 1e-6
 _NEEDED = ("recorded_at", "frequency_hz", "frequency_std_hz")
@@ -95,6 +97,65 @@ def read_estimates(
         for (_, log), rows in table.groupby(["stage", "log"], sort=False)
     )
     return EstimateTable(readings, (*notes, *_order_notes(readings), *_term_notes(table, terms)))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Machines:
+    """What a table says, machine by machine.
+
+    Attributes
+    ----------
+    machines : tuple of History and list of Refusal
+        Each with what was not used of it, in the order of the table.
+    notes : tuple of str
+        What its reader must know.
+    """
+
+    machines: tuple[tuple[History, list[Refusal]], ...]
+    notes: tuple[str, ...]
+
+
+def read_machines(
+    path: Path,
+    stage: Stage | None = None,
+    *,
+    cross_terms: Path | None = None,
+    maintenance: Path | None = None,
+) -> Machines:
+    """Read a table in the columns of ``modes.csv`` into a history per machine.
+
+    Parameters
+    ----------
+    path : Path
+        The table, see `read_estimates`.
+    stage : Stage, optional
+        What the machines are.
+    cross_terms : Path, optional
+        Without it those of a ``modes_cov.csv`` beside the table are used.
+    maintenance : Path, optional
+        What was done, in the columns of ``maintenance.csv``.
+
+    Raises
+    ------
+    BadTable
+        As `read_estimates` does.
+    """
+    beside = path.with_name("modes_cov.csv")
+    terms = cross_terms or (beside if beside.exists() else None)
+    read = read_estimates(path, cross_terms=terms, stage=stage)
+    actions = read_actions(maintenance) if maintenance else []
+    own: dict[str, list[Reading]] = {}
+    for reading in read.readings:
+        own.setdefault(str(reading.metadata.stage), []).append(reading)
+    notes = [
+        f"maintenance of {name} is not used: the table has {', '.join(own)}"
+        for name in dict.fromkeys(action.stage for action in actions if action.stage not in own)
+    ]
+    machines = tuple(
+        build_history(readings, stage, [action for action in actions if action.stage == name])
+        for name, readings in own.items()
+    )
+    return Machines(machines, (*read.notes, *notes))
 
 
 def _order_notes(readings: Sequence[Reading]) -> list[str]:

@@ -8,6 +8,9 @@ import click
 
 from lmshealth.segments import PARTS
 
+TABLE = click.Path(exists=True, dir_okay=False, path_type=Path)
+OUT = click.Path(dir_okay=False, path_type=Path)
+
 LOGS = click.argument("logs", nargs=-1, required=True, type=click.Path(path_type=Path))
 STAGE = click.option("--stage", help="Stage description: a .toml file or a shipped name.")
 COLUMNS = click.option(
@@ -27,6 +30,8 @@ PART = click.option(
     show_default=True,
     help="Read all of the log, or what its set point says is this.",
 )
+COV = click.option("--cov", type=TABLE, help="Cross terms; default modes_cov.csv beside MODES.csv.")
+MAINTENANCE = click.option("--maintenance", type=TABLE, help="What was done, as maintenance.csv.")
 EPOCHS = click.option(
     "--epochs",
     type=click.IntRange(1),
@@ -35,6 +40,7 @@ EPOCHS = click.option(
     help="Infer health at no more than this many epochs per machine.",
 )
 SEED = click.option("--seed", type=click.IntRange(0), default=0, show_default=True)
+PDF = click.option("--pdf", is_flag=True, help="Also write a PDF beside the page of each stage.")
 SHARE = click.FloatRange(0, 1, min_open=True, max_open=True)
 
 

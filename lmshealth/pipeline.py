@@ -2,41 +2,30 @@
 
 from __future__ import annotations
 
-import logging
-import multiprocessing
-import signal
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import BrokenExecutor, Executor, ProcessPoolExecutor, as_completed
-from contextlib import contextmanager
+from collections.abc import Sequence
+from concurrent.futures import Executor
+from contextlib import closing
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
 
-from lmshealth.errors import BadLog, LmshealthError, NothingUsable
-from lmshealth.following import loop_error
-from lmshealth.history import Reading, believed, build_history, doubted, in_order, lost_notes
+from lmshealth.errors import LmshealthError, NothingUsable
+from lmshealth.history import Reading, believed, build_history, doubted, lost_notes
 from lmshealth.inference import epochs_to_infer, infer
-from lmshealth.logs import Refusal
+from lmshealth.intake import Intake, Progress, processes, take_in
 from lmshealth.maintenance import Action, maintenance_notes, read_maintenance
-from lmshealth.modal import identify
+from lmshealth.packing import fingerprint
 from lmshealth.prognosis import prognose
-from lmshealth.readers import content_digest, find_logs, read_log, read_manifest, require_identity
 from lmshealth.report import write_report
 from lmshealth.results import Health, Prognosis
 from lmshealth.sampling import seed_of
 from lmshealth.stage import Stage
-from lmshealth.store import Store, beside, result_key
+from lmshealth.store import Fleet, Store, beside
 from lmshealth.summary import Assessment, judge
 from lmshealth.tables import all_tables
 from lmshealth.tracking import track
 from lmshealth.tracks import History, Track
-
-Progress = Callable[[str, int, int], None]
-"""Called with what is being done, how much is done, and how much there is."""
-
-_logger = logging.getLogger(__name__)
-
-Outcome = Reading | tuple[Refusal, ...]
+from lmshealth.waterfall import Waterfall
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,15 +74,6 @@ class RunResult:
     n_remembered: int
 
 
-@dataclass(frozen=True, slots=True)
-class _Task:
-    path: Path
-    name: str
-    overrides: dict[str, str]
-    digest: str
-    key: str
-
-
 def run(
     folder: Path,
     stages: Sequence[Stage],
@@ -122,48 +102,44 @@ def run(
         If there is no log, or every log was refused; ``refused.csv`` is written all the same.
     """
     out.mkdir(parents=True, exist_ok=True)
-    archive = find_logs(folder)
-    # Output inside the folder of logs is no log.
-    inside = out.resolve()
-    found = [path for path in archive.logs if inside not in path.resolve().parents]
-    store = Store(settings.store or beside(out))
-    try:
-        actions = read_maintenance(folder)
-        tasks, refused = _tasks(folder, found, stages, progress)
-        outcomes, n_remembered = _identify_all(tasks, stages, store, settings.workers, progress)
-        readings = in_order([o for o in outcomes if isinstance(o, Reading)])
-        with _workers(settings.workers) as pool:
-            assessments = _assess_all(readings, stages, actions, settings, pool, progress)
-    finally:
-        store.close()
-    lost = [r for outcome in outcomes if not isinstance(outcome, Reading) for r in outcome]
-    contradicted = [r for a in assessments for r in a.refused if r.reason == "odometer"]
-    jumps = [r for a in assessments for r in a.refused if r.reason == "jump"]
-    whole = [*archive.refused, *refused, *lost, *contradicted]
-    partial = [*(r for reading in readings for r in reading.modes.refused), *jumps]
-    tables = all_tables(readings, assessments, [*whole, *partial])
-    for name, table in tables.items():
-        _write_table(out / f"{name}.csv", table.to_csv(index=False))
-    n_logs = len(found) + len(archive.refused)
-    # A row of a manifest that names no log is listed, but no log is lost by it; nor by a copy.
-    names = {path.relative_to(folder).as_posix() for path in found}
-    names |= {refusal.log for refusal in archive.refused}
-    n_refused = len({r.log for r in whole if r.log in names and r.reason != "duplicate"})
-    n_copies = len({r.log for r in whole if r.reason == "duplicate"})
-    if not readings:
-        raise NothingUsable(
-            f"{folder}: no usable log: {n_logs} found, {n_refused} refused; "
-            f"{out / 'refused.csv'} says why"
-        )
-    pages = write_report(out, assessments, whole)
+    actions = read_maintenance(folder)
+    with closing(Store(settings.store or beside(out))) as store:
+        taken = take_in(folder, stages, store, out=out, workers=settings.workers, progress=progress)
+        fleet = _assess_all(taken, stages, actions, store, settings, progress)
+        _write_tables(out, taken, fleet)
+        if not taken.readings:
+            raise NothingUsable(
+                f"{folder}: no usable log: {len(taken.logs)} found, {_n_lost(taken, fleet)} "
+                f"refused; {out / 'refused.csv'} says why"
+            )
+        store.keep_refused((a.history.stage for a in fleet.assessments), fleet.refused)
+    pages = write_report(out, fleet.assessments, fleet.refused, earlier=fleet.earlier)
+    n_copies = len({r.log for r in fleet.refused if r.reason == "duplicate"})
     return RunResult(
         index=out / "index.html",
         pages=tuple(page for page in pages if page.name != "index.html"),
-        assessments=assessments,
-        n_logs=n_logs - n_copies,
-        n_refused=n_refused,
-        n_remembered=n_remembered,
+        assessments=fleet.assessments,
+        n_logs=len(taken.logs) - n_copies,
+        n_refused=_n_lost(taken, fleet),
+        n_remembered=taken.n_remembered,
     )
+
+
+def _n_lost(taken: Intake, fleet: Fleet) -> int:
+    """Count the logs that are refused as a whole.
+
+    A row of a manifest that names no log is listed, but no log is lost by it; nor by a copy.
+    """
+    lost = {r.log for r in fleet.refused if r.reason != "duplicate"}
+    return len(lost & taken.logs)
+
+
+def _write_tables(out: Path, taken: Intake, fleet: Fleet) -> None:
+    partial = [r for reading in taken.readings for r in reading.modes.refused]
+    jumps = [r for a in fleet.assessments for r in a.refused if r.reason == "jump"]
+    refused = [*fleet.refused, *partial, *jumps]
+    for name, table in all_tables(taken.readings, fleet.assessments, refused).items():
+        _write_table(out / f"{name}.csv", table.to_csv(index=False))
 
 
 def _write_table(path: Path, text: str) -> None:
@@ -173,163 +149,36 @@ def _write_table(path: Path, text: str) -> None:
     part.replace(path)
 
 
-@contextmanager
-def _workers(n: int) -> Iterator[Executor | None]:
-    if n <= 1:
-        yield None
-        return
-    # Spawned, not forked: a fork would share locks of threads that do not come along.
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(n, mp_context=context, initializer=_leave_interrupts) as pool:
-        try:
-            yield pool
-        except BaseException:
-            pool.shutdown(wait=False, cancel_futures=True)
-            raise
-
-
-def _leave_interrupts() -> None:
-    """Let Ctrl-C be the parent's alone: workers would each print where they stood."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-
-
-def _tasks(
-    folder: Path, found: Sequence[Path], stages: Sequence[Stage], progress: Progress
-) -> tuple[list[_Task], list[Refusal]]:
-    """Name every log by its content; the same content twice is one log."""
-    manifest = read_manifest(folder)
-    tasks: list[_Task] = []
-    refused: list[Refusal] = list(manifest.refused)
-    seen: dict[str, str] = {}
-    circumstances = [version("lmshealth"), *(stage.digest for stage in stages)]
-    for k, path in enumerate(found):
-        progress("reading", k, len(found))
-        name = path.relative_to(folder).as_posix()
-        try:
-            digest = content_digest(path)
-        except BadLog as error:
-            refused.append(Refusal(name, error.reason, error.detail))
-            continue
-        if digest in seen:
-            detail = f"same content as {seen[digest]}, which is analysed"
-            refused.append(Refusal(name, "duplicate", detail))
-            continue
-        seen[digest] = name
-        overrides = manifest.overrides(path)
-        key = result_key(digest, *circumstances, repr(sorted(overrides.items())))
-        tasks.append(_Task(path, name, overrides, digest, key))
-    progress("reading", len(found), len(found))
-    return tasks, refused
-
-
-def _identify_all(
-    tasks: Sequence[_Task],
-    stages: Sequence[Stage],
-    store: Store,
-    workers: int,
-    progress: Progress,
-) -> tuple[list[Outcome], int]:
-    """Identify all logs that the store does not know; results in the order of the tasks."""
-    outcomes: dict[str, Outcome] = {}
-    for task in tasks:
-        known = store.get(task.key, task.name)
-        if known is not None:
-            outcomes[task.key] = known
-    n_remembered = len(outcomes)
-    progress("identifying", n_remembered, len(tasks))
-    open_tasks = [task for task in tasks if task.key not in outcomes]
-    for task, outcome in _carry_out(open_tasks, tuple(stages), workers):
-        store.put(task.key, task.name, outcome)
-        outcomes[task.key] = outcome
-        progress("identifying", len(outcomes), len(tasks))
-    return [outcomes[task.key] for task in tasks], n_remembered
-
-
-def _carry_out(
-    tasks: Sequence[_Task], stages: tuple[Stage, ...], workers: int
-) -> Iterator[tuple[_Task, Outcome]]:
-    """Identify logs in the order in which they are done.
-
-    A library that a damaged file crashes takes its process along. The logs that were under way
-    are then done again, each in a process of its own, so that only the one is lost.
-    """
-    if workers <= 1 or len(tasks) <= 1:
-        for task in tasks:
-            yield task, identify_log(task, stages)
-        return
-    left = list(tasks)
-    while left:
-        done: set[str] = set()
-        try:
-            with _workers(workers) as pool:
-                assert pool is not None  # more than one worker
-                futures = {pool.submit(identify_log, task, stages): task for task in left}
-                for future in as_completed(futures):
-                    outcome = future.result()
-                    done.add(futures[future].key)
-                    yield futures[future], outcome
-            return
-        except BrokenExecutor:
-            left = [task for task in left if task.key not in done]
-            # Tasks are begun in order: the one that did it is among the first.
-            suspects, left = left[: 2 * workers + 1], left[2 * workers + 1 :]
-            for task in suspects:
-                yield task, _alone(task, stages)
-
-
-def _alone(task: _Task, stages: tuple[Stage, ...]) -> Outcome:
-    """Identify one log in a process of its own, and survive that process."""
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(1, mp_context=context) as pool:
-        try:
-            return pool.submit(identify_log, task, stages).result()
-        except BrokenExecutor:
-            detail = "reading it ended the process that read it: the file is damaged, or too large"
-            return (Refusal(task.name, "corrupt", detail),)
-
-
-def identify_log(task: _Task, stages: tuple[Stage, ...]) -> Outcome:
-    """Read and identify one log; what goes wrong with it is its refusal, never an exception."""
-    try:
-        log = read_log(task.path, overrides=task.overrides, name=task.name)
-        require_identity(log)
-        stage = next((stage for stage in stages if stage.takes(log.metadata)), None)
-        if stage is None:
-            raise BadLog(
-                task.name,
-                "no-stage",
-                f"stage {log.metadata.stage!r} matches none of the descriptions "
-                f"{[s.description.match.stage for s in stages]}; give its description by --stage",
-            )
-        modes = identify(log, stage)
-        return Reading(task.name, log.digest, log.metadata, modes, loop_error(log))
-    except BadLog as error:
-        return (Refusal(task.name, error.reason, error.detail),)
-    except Exception as error:  # one log must not end the batch, whatever our mistake
-        _logger.exception("%s", task.name)
-        detail = f"{type(error).__name__}: {error}; please report this with the log"
-        return (Refusal(task.name, "internal", detail),)
-
-
 def _assess_all(
-    readings: Sequence[Reading],
+    taken: Intake,
     stages: Sequence[Stage],
     actions: Sequence[Action],
+    store: Store,
     settings: Settings,
-    pool: Executor | None,
     progress: Progress,
-) -> tuple[Assessment, ...]:
+) -> Fleet:
+    """Assess every machine of which anything has changed; the store remembers the others."""
     machines: dict[str, list[Reading]] = {}
-    for reading in readings:
+    for reading in taken.readings:
         machines.setdefault(str(reading.metadata.stage), []).append(reading)
-    assessments = []
-    for k, (name, own) in enumerate(sorted(machines.items())):
-        progress("assessing", k, len(machines))
-        stage = next(stage for stage in stages if stage.takes(own[0].metadata))
-        relevant = [action for action in actions if action.stage == name]
-        assessments.append(assess(own, stage, relevant, settings, pool))
+    assessments: list[Assessment] = []
+    earlier = {}
+    with processes(settings.workers) as pool:
+        for k, (name, own) in enumerate(sorted(machines.items())):
+            progress("assessing", k, len(machines))
+            stage = next(stage for stage in stages if stage.takes(own[0].metadata))
+            relevant = [action for action in actions if action.stage == name]
+            given = (own, stage.digest, relevant, settings.epochs, settings.seed)
+            key = fingerprint(version("lmshealth"), *given)
+            known = store.recall(name, key)
+            if known is None:
+                known = store.keep(name, key, assess(own, stage, relevant, settings, pool))
+            assessments.append(known)
+            if (said := store.earlier(name, key)) is not None:
+                earlier[name] = said
     progress("assessing", len(machines), len(machines))
-    return tuple(assessments)
+    contradicted = [r for a in assessments for r in a.refused if r.reason == "odometer"]
+    return Fleet(tuple(assessments), (*taken.refused, *contradicted), earlier)
 
 
 def assess(
@@ -367,11 +216,12 @@ def assess(
     followed, health, prognosis = _results(history, stage, settings.epochs, seed, pool, notes)
     if followed is not None:
         refused += doubted(history, followed)
-    digests = {reading.log: reading.digest for reading in readings}
+    own = {reading.log: reading for reading in readings}
+    used = [own[log] for log in history.logs]
     return Assessment(
         stage=stage,
         history=history,
-        digests=tuple(digests[log] for log in history.logs),
+        digests=tuple(reading.digest for reading in used),
         track=followed,
         health=health,
         prognosis=prognosis,
@@ -379,6 +229,7 @@ def assess(
         refused=tuple([*partial, *refused]),
         notes=tuple(notes),
         seed=settings.seed,
+        waterfall=Waterfall.stack([(reading.levels, reading.modes.lines) for reading in used]),
     )
 
 

@@ -2,20 +2,23 @@
 
 They return the Axes. Names of modes and parameters are those of the results; travel is shown in
 km, health in % of baseline. Colours come from the palette of Okabe and Ito, and nothing is told
-by colour alone. `svg` turns one of them into an inline picture.
+by colour alone. `svg` turns one of them into an inline picture, in which `hints` show values where
+the pointer rests.
 """
 
 from __future__ import annotations
 
 import re
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from lmshealth.arrays import FloatArray
+from lmshealth.decision import Service
 from lmshealth.results import Health, Prognosis
+from lmshealth.wording import GAP, km, moment, spell, whole_km
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -50,13 +53,17 @@ _STYLE: dict[str, Any] = {
     **dict.fromkeys(("xtick.labelcolor", "ytick.labelcolor"), INK),
 }
 _KM = 1000.0
+# Of what is drawn as an image; more than screens show, so that a page can be zoomed and printed.
+_DPI = 200
+# A picture carries no more hints than that: what is denser no pointer can tell apart.
+_MOST_HINTS = 300
 _LEVELS = np.array([0.05, 0.25, 0.5, 0.75, 0.95])
 _GRID_POINTS = 72
+SIZE = (4.8, 2.8)  # of a picture in inches
+ROOM = 72  # characters that fit on a line of its legend
 
 
-def svg(
-    draw: Callable[[Axes], object], *, salt: str, size: tuple[float, float] = (4.8, 2.8)
-) -> str:
+def svg(draw: Callable[[Axes], object], *, salt: str, size: tuple[float, float] = SIZE) -> str:
     """Draw one picture as an SVG element for the inside of a page.
 
     The same input gives the same bytes. Colours follow the style sheet of the page (``--ink``,
@@ -85,8 +92,9 @@ def svg(
         warnings.filterwarnings("ignore", message="Glyph .* missing")
         figure = Figure(figsize=size, layout="constrained", facecolor="none")
         draw(figure.add_subplot())
-        figure.savefig(target, format="svg", metadata=nothing)
-    text = target.getvalue()
+        figure.savefig(target, format="svg", metadata=nothing, dpi=_DPI)
+    text = _LINK.sub(r'<g class="hint" fill-opacity="0.004"><title>\1</title>', target.getvalue())
+    text = text.replace("</a>", "</g>").replace(_CLEAR, "")
     text = re.sub(r"(?s)<!--.*?-->|<metadata>.*?</metadata>", "", text[text.index("<svg") :])
     # Glyphs and groups carry the same identifiers in every file: give each picture its own.
     text = re.sub(r'(\sid="|href="#|url\(#)', rf"\g<1>{salt}-", text)
@@ -96,6 +104,34 @@ def svg(
     text = re.sub(r'\sd="[^"]*"', lambda d: re.sub(r"(\.\d\d)\d+", r"\1", d[0]), text)
     text = re.sub(r"\n\s*", "\n", text).strip()
     return text.replace("<svg ", '<svg aria-hidden="true" focusable="false" ', 1)
+
+
+# Hints travel as the addresses of links, the only text that matplotlib gives each of many artists.
+_CLEAR = f' style="fill: {INK}; fill-opacity: 0.003922"'
+_LINK = re.compile(r'<a xlink:href="([^"]*)"[^>]*>')
+
+
+def hints(ax: Axes, x: FloatArray, y: FloatArray, texts: Sequence[str]) -> None:
+    """Lay invisible discs over points, which `svg` turns into titles shown by browsers.
+
+    Parameters
+    ----------
+    ax : Axes
+        In its data coordinates.
+    x, y : ndarray
+        Shape ``(n,)``.
+    texts : sequence of str
+        What is shown at each point; line breaks are kept.
+    """
+    some = few(len(texts))
+    # Opaque by one part in 255: what is not drawn at all feels no pointer.
+    discs = ax.scatter(x[some], y[some], s=80, color=INK, alpha=1 / 255, lw=0, zorder=9)
+    discs.set_urls(list(texts[some]))
+
+
+def few(n: int) -> slice:
+    """Choose as many of n things, evenly, as may have hints."""
+    return slice(None, None, -(-n // _MOST_HINTS) or 1)
 
 
 def plot_posterior(ax: Axes, health: Health, parameters: tuple[str, ...]) -> Axes:
@@ -123,7 +159,7 @@ def plot_posterior(ax: Axes, health: Health, parameters: tuple[str, ...]) -> Axe
         _regions(ax, draws)
         ax.set_ylabel(f"{_spell(parameters[1])} in % of baseline")
     ax.set_xlabel(f"{_spell(parameters[0])} in % of baseline")
-    return _legend(ax)
+    return legend(ax)
 
 
 def plot_health(ax: Axes, health: Health, parameter: str, limit: float | None) -> Axes:
@@ -136,6 +172,13 @@ def plot_health(ax: Axes, health: Health, parameter: str, limit: float | None) -
     told = _tells(health, parameter)
     name = "each epoch by itself" if told else "mostly assumption, not measured"
     _bands(ax, health.travel / _KM, bands, name, told=told)
+    if told:  # what is not told has no values to show
+        texts = [
+            f"{moment(when)}, {whole_km(travel)}\n{spell(parameter)} {q[2]:.1f}{GAP}%, "
+            f"90{GAP}%: {q[0]:.1f} to {q[4]:.1f}{GAP}%"
+            for when, travel, q in zip(health.recorded_at, health.travel, bands.T, strict=True)
+        ]
+        hints(ax, health.travel / _KM, bands[2], texts)
     failed = ~health.converged
     if failed.any():
         where = health.travel[failed] / _KM
@@ -168,7 +211,7 @@ def plot_life(
     end = now + prognosis.horizon / _KM
     low, middle, high = _quantiles(prognosis.remaining[:, column], (0.05, 0.5, 0.95)) / _KM
     if np.isfinite(low) and low < prognosis.horizon / _KM:
-        _passage(ax, now + np.array([low, middle, high]), 100 * limit)
+        _passage(ax, now, np.array([low, middle, high]), 100 * limit)
     right = min(end, now + max(1.3 * high, 0.25 * now)) if np.isfinite(high) else end
     shown = right >= 0.55 * end
     if shown:
@@ -186,8 +229,11 @@ def plot_life(
     return ax
 
 
-def plot_survival(ax: Axes, prognosis: Prognosis, *, max_risk: float | None = None) -> Axes:
-    """Plot the probability of not having reached a limit against the travel ahead."""
+def plot_survival(ax: Axes, prognosis: Prognosis, *, service: Service | None = None) -> Axes:
+    """Plot the probability of not having reached a limit against the travel ahead.
+
+    With a service the risk that its day keeps is drawn: the accepted one, or that of least costs.
+    """
     horizon = prognosis.horizon / _KM
     last = _quantiles(prognosis.remaining[:, -1], (0.99,))[0] / _KM
     end = min(horizon, max(1.2 * last, horizon / 50)) if np.isfinite(last) else horizon
@@ -203,14 +249,19 @@ def plot_survival(ax: Axes, prognosis: Prognosis, *, max_risk: float | None = No
         elif several:
             line = dashes[k % len(dashes)]
             ax.plot(ahead, 100 * (1 - past), color=MUTED, lw=1.2, ls=line, label=_spell(name))
-    if max_risk is not None:
-        accepted = f"accepted risk {100 * max_risk:.3g} %"
-        ax.axhline(100 * (1 - max_risk), color=RED, lw=1.2, ls=(0, (5, 2)), label=accepted)
+    some = np.linspace(0, end, 25)
+    chance = 100 * (1 - np.searchsorted(ordered[:, -1], some, side="right") / ordered.shape[0])
+    texts = [f"after {x:,.0f}{GAP}km: {y:.0f}{GAP}%" for x, y in zip(some, chance, strict=True)]
+    hints(ax, some, chance, [text.replace(",", GAP) for text in texts])
+    if service is not None and service.kept_risk is not None:
+        what = "accepted risk" if service.max_risk else "risk at least costs"
+        label = f"{what} {100 * service.kept_risk:.3g} %"
+        ax.axhline(100 * (1 - service.kept_risk), color=RED, lw=1.2, ls=(0, (5, 2)), label=label)
     ax.set_xlim(0, end)
     ax.set_ylim(0, 103)
     ax.set_xlabel("travel from now in km" + (" (ends at the horizon)" if end == horizon else ""))
     ax.set_ylabel("probability in %")
-    return _legend(ax)
+    return legend(ax)
 
 
 def bars(ax: Axes, travel: FloatArray, bounds: FloatArray, label: str, size: float) -> None:
@@ -265,13 +316,17 @@ def _epochs(ax: Axes, health: Health, parameter: str) -> float:
     return min(float(bounds[2].max()), 160.0)
 
 
-def _passage(ax: Axes, where: FloatArray, level: float) -> None:
+def _passage(ax: Axes, now: float, ahead: FloatArray, level: float) -> None:
     """Mark where the limit is reached: 5 to 95 % as a bar on the limit, the median as a point."""
-    finite = where[np.isfinite(where)]
+    where = now + ahead
     right = where[2] if np.isfinite(where[2]) else 1e9  # runs out of the picture
-    ax.plot([finite[0], right], [level, level], color=RED, lw=5, alpha=0.55, solid_capstyle="butt")
+    ax.plot([where[0], right], [level, level], color=RED, lw=5, alpha=0.55, solid_capstyle="butt")
     if np.isfinite(where[1]):
         ax.plot(where[1], level, "D", color=RED, mec=PAPER, ms=6, zorder=5, label="limit reached")
+    for x, far, name in zip(where, ahead, ("Early (5 %)", "Median", "Late (95 %)"), strict=True):
+        if np.isfinite(x):
+            text = f"{name}: in {km(_KM * far)}, at {whole_km(_KM * x)}"
+            hints(ax, np.array([x]), np.array([level]), [text])
 
 
 def _regions(ax: Axes, draws: FloatArray) -> None:
@@ -339,18 +394,18 @@ def _quantiles(values: FloatArray, levels: tuple[float, ...]) -> FloatArray:
     return np.asarray(np.quantile(values, levels, method="inverted_cdf"))
 
 
-def odometer(ax: Axes) -> Axes:
+def odometer(ax: Axes, *, room: int = ROOM) -> Axes:
     """Finish a picture over the odometer: axis and legend."""
     ax.set_xlabel("odometer in km")
-    return _legend(ax)
+    return legend(ax, room=room)
 
 
-def _legend(ax: Axes) -> Axes:
-    """Put the legend above the picture, where it covers nothing."""
+def legend(ax: Axes, *, room: int = ROOM) -> Axes:
+    """Put the legend above the picture, where it covers nothing; ``room`` characters are a line."""
     handles, labels = ax.get_legend_handles_labels()
     lengths = np.array([len(label) for label in labels])
     columns = max(min(4, len(labels)), 1)
-    while columns > 1 and sum(p.max() + 6 for p in np.array_split(lengths, columns)) > 72:
+    while columns > 1 and sum(p.max() + 6 for p in np.array_split(lengths, columns)) > room:
         columns -= 1
     place: Any = {"loc": "lower left", "bbox_to_anchor": (0, 1), "borderaxespad": 0.2}
     ax.legend(handles, labels, ncols=columns, columnspacing=1.2, handlelength=1.8, **place)

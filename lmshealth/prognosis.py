@@ -133,7 +133,7 @@ def remaining_travel(
                 way.course.branches[j],
                 theta[j],
                 off[:, j],
-                rate,
+                rate[:, j],
                 rng,
                 now=now,
                 limit=parameter.limit.below / parameter.baseline,

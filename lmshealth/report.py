@@ -7,9 +7,9 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from datetime import date, datetime
+from datetime import datetime
 from functools import partial
 from importlib import metadata
 from itertools import combinations
@@ -19,17 +19,38 @@ from typing import Any
 import numpy as np
 
 from lmshealth import plots
-from lmshealth.arrays import FloatArray
+from lmshealth.changes import Reported, changes, reported
+from lmshealth.decision import Service, remaining_days
+from lmshealth.influences import Influence, covariate_shifts, find_influences
 from lmshealth.logs import Refusal
 from lmshealth.results import Health, Prognosis
 from lmshealth.stage import ParameterSpec
 from lmshealth.summary import Assessment
-from lmshealth.trackfacts import effect_row, filter_health, fit, happened, mode_rows, surprise
-from lmshealth.trackplots import plot_damping, plot_frequencies, plot_nis
+from lmshealth.trackfacts import (
+    effect_row,
+    filter_health,
+    fit,
+    happened,
+    mode_rows,
+    mode_use,
+    other_effects,
+    surprise,
+    taken_out,
+    untouched,
+)
+from lmshealth.trackplots import (
+    plot_damping,
+    plot_frequencies,
+    plot_influence,
+    plot_nis,
+    plot_waterfall,
+)
 from lmshealth.tracks import History
 from lmshealth.wording import (
     GAP,
     LEVELS,
+    chance,
+    covariate,
     day_count,
     km,
     left,
@@ -39,6 +60,7 @@ from lmshealth.wording import (
     spell,
 )
 
+_SIZES = {"waterfall": (4.8, 3.6), "influence": (3.8, 2.6)}  # in inches, unlike others
 _FLEET_TOP = 1.5  # length of all gauges of the index, as a fraction of baseline
 
 
@@ -59,17 +81,6 @@ class Gauge:
 
 
 @dataclass(frozen=True, slots=True)
-class Service:
-    """What to do: kind is ``now``, ``by`` a date, ``later`` than the horizon, or ``unknown``."""
-
-    kind: str
-    by: date | None
-    risk: str
-    planned: date | None
-    planned_risk: str
-
-
-@dataclass(frozen=True, slots=True)
 class Life:
     """Remaining life of one limit, as text: 5, 50, 95 %; ``now`` is health by the law."""
 
@@ -87,6 +98,7 @@ def write_report(
     assessments: Sequence[Assessment],
     refused: Sequence[Refusal],
     *,
+    earlier: Mapping[str, Reported] | None = None,
     generated: datetime | None = None,
 ) -> list[Path]:
     """Write one page per stage, and ``index.html``.
@@ -101,6 +113,8 @@ def write_report(
         One per stage.
     refused : sequence of Refusal
         Logs that belong to no stage.
+    earlier : mapping of str to Reported, optional
+        By stage, what its last report said.
     generated : datetime or None
         Moment to print on the pages; nothing is printed for None.
 
@@ -110,17 +124,17 @@ def write_report(
         The pages of the stages, worst first, then the index.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    ranked = sorted(assessments, key=_urgency)
+    ranked = sorted(assessments, key=Assessment.urgency)
     names = _file_names(ranked)
     pages = _environment()
     common = {"generated": generated, "version": metadata.version("lmshealth")}
     rows = []
     for assessment, name in zip(ranked, names, strict=True):
-        by = assessment.service_by()
-        row = _summary(assessment, by, None) | common
+        row = _summary(assessment, None) | common
+        row |= _changes(assessment, (earlier or {}).get(assessment.judgement.stage))
         text = pages.get_template("stage.html.j2").render(row | _evidence(assessment))
         (folder / name).write_text(text, encoding="utf-8", newline="\n")
-        rows.append(_summary(assessment, by, _FLEET_TOP) | {"file": name})
+        rows.append(_summary(assessment, _FLEET_TOP) | {"file": name})
     parameters = list(dict.fromkeys(gauge.name for row in rows for gauge in row["gauges"]))
     tones = Counter(row["tone"] for row in rows)
     context = {"rows": rows, "parameters": parameters, "tones": tones, "refused": refused}
@@ -160,21 +174,7 @@ def _file_names(assessments: Sequence[Assessment]) -> list[str]:
     return [names[k] for k in range(len(assessments))]
 
 
-def _urgency(assessment: Assessment) -> tuple[int, float, float, str]:
-    """Sort by risk: days until the accepted risk is used up; unknown before safe."""
-    identity, prognosis = assessment.judgement.stage, assessment.prognosis
-    verdict = assessment.judgement.verdict
-    if verdict == "not-enough-data":
-        return 1, 0.0, 0.0, identity
-    if prognosis is None:
-        return (1 if verdict == "healthy" else 0), 0.0, 0.0, identity
-    risk = assessment.stage.description.decision.max_risk
-    days = float(np.quantile(_days(prognosis)[:, -1], risk, method="inverted_cdf"))
-    group = 2 if verdict == "healthy" and np.isinf(days) else 0
-    return group, days, float(prognosis.beyond_horizon()[-1]), identity
-
-
-def _summary(assessment: Assessment, by: date | None, top: float | None) -> dict[str, Any]:
+def _summary(assessment: Assessment, top: float | None) -> dict[str, Any]:
     """Collect what both the first screen of a page and a row of the index say."""
     judgement, prognosis = assessment.judgement, assessment.prognosis
     specs = assessment.stage.parameters
@@ -189,28 +189,38 @@ def _summary(assessment: Assessment, by: date | None, top: float | None) -> dict
         "probability": percent(judgement.probability) if judgement.probability >= 0 else "",
         "gauges": list(_gauges(assessment, top)),
         "lives": lives,
-        "service": _service(assessment, by),
+        "service": _service(assessment.service()),
     }
+
+
+def _changes(assessment: Assessment, before: Reported | None) -> dict[str, Any]:
+    """Say what is new since the last report."""
+    news = () if before is None else changes(before, reported(assessment))
+    return {"before": before, "news": news}
 
 
 def _evidence(assessment: Assessment) -> dict[str, Any]:
     """Collect what the rest of a stage's page shows."""
     track, prognosis, history = assessment.track, assessment.prognosis, assessment.history
-    health = _health(assessment)
+    health, stage = _health(assessment), assessment.stage
+    influences = () if track is None else find_influences(history, track, stage)
     drift = np.zeros(1) if track is None else np.abs(track.drift[-1])
     return {
         "health": health,
         "modes": [] if track is None else list(mode_rows(track)),
         "seen": _seen(history),
         "pairs": [] if health is None else _pairs(health),
-        "picture": _pictures(assessment),
+        "picture": _pictures(assessment, influences),
+        "taken_out": list(taken_out(influences)),
+        "untouched": untouched(history, stage),
+        "mode_use": list(mode_use(history, track, stage, assessment.refused)),
         "surprise": None if track is None else surprise(track),
         "happened": [] if track is None else list(happened(track)),
         "filter": None if track is None else filter_health(track),
         "noise_scale": None if track is None else float(track.noise_scale[-1].max()),
         "largest_drift": float(np.nanmax(drift, initial=0.0)),
         "law": prognosis and fit(prognosis.chi_square, prognosis.degrees_of_freedom),
-        "effects": [] if track is None else [effect_row(effect) for effect in track.effects],
+        "effects": [] if track is None else [effect_row(effect) for effect in other_effects(track)],
         "reasons": Counter(item.reason for item in assessment.refused).most_common(),
         "hashes": list(zip(history.logs, assessment.digests, strict=False)),
     }
@@ -247,31 +257,25 @@ def _gauge(spec: ParameterSpec | None, health: Health, column: int, top: float) 
     )
 
 
-def _service(assessment: Assessment, by: date | None) -> Service:
-    """Say until when the accepted risk holds; never a date that the data do not carry."""
-    prognosis, decision = assessment.prognosis, assessment.stage.description.decision
-    planned, planned_risk, kind = None, "", "unknown"
-    if prognosis is not None:
-        today = prognosis.recorded_at.date()
-        passed = prognosis.already_past()[-1] > decision.max_risk
-        if passed or (by is not None and by <= today):
-            kind = "now"
-        elif by is not None:
-            kind = "by"
-        elif prognosis.beyond_horizon()[-1] >= 1 - decision.max_risk:
-            kind = "later"
-        planned = decision.next_service
-        if planned is not None:
-            ahead = (planned - today).days
-            planned_risk = percent(float(np.mean(_days(prognosis)[:, -1] <= ahead)))
-    return Service(kind, by, f"{100 * decision.max_risk:.3g}{GAP}%", planned, planned_risk)
+def _service(service: Service) -> dict[str, Any]:
+    """Put in words when to service, and by what that was chosen."""
+    ratio = service.cost_ratio
+    return {
+        "kind": service.kind,
+        "by": service.by,
+        "accepted": service.max_risk and f"{100 * service.max_risk:.3g}{GAP}%",
+        "times": ratio and f"{ratio:.3g}",
+        "risk": percent(service.risk),
+        "planned": service.planned,
+        "planned_risk": chance(*service.planned_risk),
+    }
 
 
 def _life(prognosis: Prognosis, column: int) -> Life:
     name, limit = prognosis.parameters[column], float(prognosis.limits[column])
     travel = prognosis.remaining[:, column]
     distance = quantiles(np.where(travel > prognosis.horizon, np.inf, travel))
-    days = quantiles(_days(prognosis)[:, column])
+    days = quantiles(remaining_days(prognosis)[:, column])
     low, middle, high = quantiles(
         100 * prognosis.health[:, min(column, prognosis.health.shape[1] - 1)]
     )
@@ -286,15 +290,42 @@ def _life(prognosis: Prognosis, column: int) -> Life:
     )
 
 
-def _pictures(assessment: Assessment) -> dict[tuple[str, str], str]:
+def _pictures(
+    assessment: Assessment, influences: Sequence[Influence]
+) -> dict[tuple[str, ...], str]:
     """Draw every picture of a page, by kind and by what it shows."""
-    history, track, prognosis = assessment.history, assessment.track, assessment.prognosis
-    health, risk = _health(assessment), assessment.stage.description.decision.max_risk
-    draw: dict[tuple[str, str], Any] = {}
+    draw = _track_pictures(assessment, influences) | _health_pictures(assessment)
+    return {key: _inline(one, key[0], f"p{k}") for k, (key, one) in enumerate(draw.items())}
+
+
+def _track_pictures(
+    assessment: Assessment, influences: Sequence[Influence]
+) -> dict[tuple[str, ...], Any]:
+    history, track, waterfall = assessment.history, assessment.track, assessment.waterfall
+    draw: dict[tuple[str, ...], Any] = {}
     pair = {"frequency": plot_frequencies, "damping": plot_damping}
     for mode in _seen(history):
         for kind, plot in pair.items():
             draw[kind, mode] = partial(plot, history=history, track=track, mode=mode)
+    if waterfall is not None and history.has_odometer:
+        moved = None if track is None else covariate_shifts(history, track, assessment.stage)
+        draw["waterfall", "all"] = partial(
+            plot_waterfall, waterfall=waterfall, history=history, track=track, moved=moved
+        )
+    for one in influences:
+        if one.values.size:
+            name = covariate(one.covariate)[0]
+            draw["influence", name, one.mode] = partial(
+                plot_influence, influence=one, history=history
+            )
+    if track is not None and surprise(track) is not None:
+        draw["nis", "all"] = partial(plot_nis, track=track)
+    return draw
+
+
+def _health_pictures(assessment: Assessment) -> dict[tuple[str, ...], Any]:
+    prognosis, health = assessment.prognosis, _health(assessment)
+    draw: dict[tuple[str, ...], Any] = {}
     if health is not None:
         for names, key, _ in _pairs(health):
             draw["posterior", key] = partial(plots.plot_posterior, health=health, parameters=names)
@@ -308,15 +339,15 @@ def _pictures(assessment: Assessment) -> dict[tuple[str, str], str]:
             draw["life", spell(name)] = partial(
                 plots.plot_life, prognosis=prognosis, parameter=name, health=health
             )
-        draw["survival", "any"] = partial(plots.plot_survival, prognosis=prognosis, max_risk=risk)
-    if track is not None and surprise(track) is not None:
-        draw["nis", "all"] = partial(plot_nis, track=track)
-    return {key: _inline(one, f"p{k}") for k, (key, one) in enumerate(draw.items())}
+        service = assessment.service()
+        draw["survival", "any"] = partial(plots.plot_survival, prognosis=prognosis, service=service)
+    return draw
 
 
-def _inline(draw: Any, salt: str) -> str:
+def _inline(draw: Any, kind: str, salt: str) -> str:
+    size = _SIZES.get(kind, plots.SIZE)
     # The HTML parser knows these namespaces; without them the page names no address at all.
-    return re.sub(r'\sxmlns(:xlink)?="[^"]*"', "", plots.svg(draw, salt=salt))
+    return re.sub(r'\sxmlns(:xlink)?="[^"]*"', "", plots.svg(draw, salt=salt, size=size))
 
 
 def _pairs(health: Health) -> list[tuple[tuple[str, ...], str, float]]:
@@ -345,10 +376,3 @@ def _health(assessment: Assessment) -> Health | None:
 def _limit(spec: ParameterSpec | None) -> float | None:
     """Limit as a fraction of the baseline."""
     return None if spec is None or spec.limit is None else spec.limit.below / spec.baseline
-
-
-def _days(prognosis: Prognosis) -> FloatArray:
-    """Draws of the remaining days, infinite past the horizon."""
-    with np.errstate(divide="ignore", invalid="ignore"):
-        days = prognosis.remaining / prognosis.usage[:, None]
-    return np.where(prognosis.remaining > prognosis.horizon, np.inf, days)

@@ -29,6 +29,9 @@ from lmshealth.toml import Keys, decode, place
 
 Positive = Annotated[float, Meta(gt=0, le=sys.float_info.max)]
 Share = Annotated[float, Meta(gt=0, lt=1)]
+CostRatio = Annotated[float, Meta(gt=1, le=sys.float_info.max)]
+
+_MAX_RISK = 0.05
 
 
 class _Part(Struct, frozen=True, forbid_unknown_fields=True):
@@ -134,10 +137,22 @@ class Baseline(_Part, frozen=True):
 
 
 class Decision(_Part, frozen=True):
-    """What the service date is chosen for."""
+    """What the service date is chosen for.
 
-    max_risk: Share = 0.05
+    Either for a risk, of having reached a limit, or for least costs: ``cost_ratio`` is the cost of
+    a failure over that of a planned service.
+    """
+
+    max_risk: Share | None = None
+    cost_ratio: CostRatio | None = None
     next_service: date | None = None
+
+    @property
+    def accepted(self) -> float | None:
+        """The accepted risk, 5 % where nothing is said; None where costs decide."""
+        if self.cost_ratio is not None:
+            return None
+        return _MAX_RISK if self.max_risk is None else self.max_risk
 
 
 class Usage(_Part, frozen=True):
@@ -326,6 +341,7 @@ def _troubles(description: Description) -> Iterator[tuple[Keys, str]]:
                 yield (kind, k, "name"), f"[[{kind}]] names must be unique, twice: {name!r}"
     if description.parameter and description.map is None:
         yield ("parameter", 0), "[[parameter]] needs a [map] that says what it does to the modes"
+    yield from _decision_troubles(description.decision)
     for k, parameter in enumerate(description.parameter):
         yield from _parameter_troubles(k, parameter)
 
@@ -341,6 +357,16 @@ def _parameter_troubles(k: int, parameter: ParameterSpec) -> Iterator[tuple[Keys
             ("parameter", k, "limit", "below"),
             f"{parameter.name}: limit {parameter.limit.below:g} must lie below the baseline "
             f"{parameter.baseline:g}",
+        )
+
+
+def _decision_troubles(decision: Decision) -> Iterator[tuple[Keys, str]]:
+    """Say whether two things would choose the service date."""
+    if decision.max_risk is not None and decision.cost_ratio is not None:
+        yield (
+            ("decision", "cost_ratio"),
+            f"cost_ratio = {decision.cost_ratio:g} and max_risk = {decision.max_risk:g} would each "
+            "choose a service date: give one of them",
         )
 
 

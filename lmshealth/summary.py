@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from datetime import date, timedelta
 
 import numpy as np
 from scipy.special import expit
 
 from lmshealth.arrays import BoolArray
+from lmshealth.decision import Service, decide
 from lmshealth.logs import Refusal
 from lmshealth.results import Health, Judgement, Prognosis, Verdict
 from lmshealth.stage import ParameterSpec, Stage
 from lmshealth.tracks import Event, History, Track
+from lmshealth.waterfall import Waterfall
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -41,6 +42,8 @@ class Assessment:
         What the reader must know beside the numbers, one sentence each.
     seed : int
         Of all random streams.
+    waterfall : Waterfall or None
+        Spectra of the logs of the history; None where no log shows the band of its modes.
     """
 
     stage: Stage
@@ -53,12 +56,22 @@ class Assessment:
     refused: tuple[Refusal, ...]
     notes: tuple[str, ...]
     seed: int
+    waterfall: Waterfall | None = None
 
-    def service_by(self) -> date | None:
-        """Last day on which the risk accepted by the description is kept; None without one."""
+    def service(self) -> Service:
+        """Choose the day of the service as the description asks."""
+        return decide(self.prognosis, self.stage.description.decision)
+
+    def urgency(self) -> tuple[int, float, float, str]:
+        """Give a key that sorts by risk: days until the service; unknown before safe."""
+        identity, verdict = self.judgement.stage, self.judgement.verdict
+        if verdict == "not-enough-data":
+            return 1, 0.0, 0.0, identity
         if self.prognosis is None:
-            return None
-        return service_date(self.prognosis, self.stage.description.decision.max_risk)
+            return (1 if verdict == "healthy" else 0), 0.0, 0.0, identity
+        days = self.service().wait
+        group = 2 if verdict == "healthy" and np.isinf(days) else 0
+        return group, days, float(self.prognosis.beyond_horizon()[-1]), identity
 
 
 # A parameter counts as degraded once this share of what it may lose is gone.
@@ -199,23 +212,3 @@ def _why(stage: Stage, health: Health, told: list[int]) -> str:
                 f"(90 %: {low_j:.0f} to {high_j:.0f} %)."
             )
     return " ".join(sentences)
-
-
-def service_date(prognosis: Prognosis, max_risk: float) -> date | None:
-    """Find the last day on which the risk of having passed any limit is at most ``max_risk``.
-
-    Returns
-    -------
-    date or None
-        None when that day lies past the horizon: no service is asked for. A limit that is passed
-        already with more than that risk gives the day of the last log.
-    """
-    remaining = float(np.quantile(prognosis.remaining[:, -1], max_risk, method="lower"))
-    if remaining > prognosis.horizon:
-        return None
-    days = prognosis.remaining[:, -1] / prognosis.usage
-    wait = max(float(np.quantile(days, max_risk, method="lower")), 0.0)
-    try:
-        return (prognosis.recorded_at + timedelta(days=wait)).date()
-    except OverflowError:  # past the calendar: the machine hardly moves
-        return None

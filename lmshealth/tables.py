@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from datetime import datetime
+from datetime import date, datetime
 from itertools import combinations
 from typing import Any
 
@@ -11,6 +11,7 @@ import numpy as np
 import pandas as pd
 
 from lmshealth.arrays import FloatArray
+from lmshealth.decision import Reached, Service, remaining_days
 from lmshealth.history import Reading
 from lmshealth.logs import Refusal
 from lmshealth.readers.metadata import COVARIATES
@@ -19,7 +20,7 @@ from lmshealth.summary import Assessment
 from lmshealth.tracks import Smoothed, Track
 
 _KM, _MICRO = 1000.0, 1e-6
-_RUL_LEVELS = (0.05, 0.10, 0.25, 0.50, 0.75, 0.90, 0.95)
+RUL_LEVELS = (0.05, 0.10, 0.25, 0.50, 0.75, 0.90, 0.95)
 
 COLUMNS = {
     "modes": "log stage recorded_at travel_km temperature_c payload_kg position_mm servo_id "
@@ -38,9 +39,10 @@ COLUMNS = {
     + " ".join(
         f"rul_{unit}_q{100 * level:02.0f}"
         for unit in ("km", "hours", "days")
-        for level in _RUL_LEVELS
+        for level in RUL_LEVELS
     )
-    + " censored_from probability_beyond_horizon probability_already_past service_by",
+    + " censored_from probability_beyond_horizon probability_already_past service service_by "
+    "service_risk",
     "verdict": "stage recorded_at verdict probability",
     "refused": "log channel mode source reason detail",
 }
@@ -120,7 +122,8 @@ def all_tables(
             rows["events"] += events_rows(assessment.track)
         if assessment.health is not None:
             rows["health"] += health_rows(assessment.health)
-        rows["prognosis"] += _prognosis_rows(assessment)
+        if assessment.prognosis is not None:
+            rows["prognosis"] += prognosis_rows(assessment.prognosis, assessment.service())
         rows["verdict"].append(
             {
                 "stage": assessment.judgement.stage,
@@ -249,40 +252,55 @@ def _smoothed_columns(smoothed: Smoothed, k: int, i: int) -> Row:
     }
 
 
-def _prognosis_rows(assessment: Assessment) -> list[Row]:
-    prognosis = assessment.prognosis
-    if prognosis is None:
-        return []
+def prognosis_rows(
+    prognosis: Prognosis, service: Service, before: tuple[date, Reached] | None = None
+) -> list[Row]:
+    """List a remaining life, one row per limit and one for any of them.
+
+    Parameters
+    ----------
+    prognosis : Prognosis
+        The draws.
+    service : Service
+        What they lead to; told in the row of any limit.
+    before : tuple of date and Reached, optional
+        A day, and the probabilities to have reached a limit before it: in columns of their own.
+    """
     beyond, past = prognosis.beyond_horizon(), prognosis.already_past()
+    days = remaining_days(prognosis)
     rows = []
     for j, name in enumerate(prognosis.parameters):
-        rows.append(
-            {
-                "stage": prognosis.stage,
-                "parameter": name,
-                "limit": prognosis.limits[j],
-                **_rul(prognosis, prognosis.remaining[:, j]),
-                "probability_beyond_horizon": beyond[j],
-                "probability_already_past": past[j],
-                "service_by": assessment.service_by() if name == "any" else None,
+        row = {
+            "stage": prognosis.stage,
+            "parameter": name,
+            "limit": prognosis.limits[j],
+            **_rul(prognosis, j, days[:, j]),
+            "probability_beyond_horizon": beyond[j],
+            "probability_already_past": past[j],
+            "service": service.kind if name == "any" else None,
+            "service_by": service.by if name == "any" else None,
+            "service_risk": service.risk if name == "any" else None,
+        }
+        if before is not None:
+            day, reached = before
+            row |= {
+                "before": day,
+                "probability_at_least": reached.at_least[j],
+                "probability_at_most": reached.at_most[j],
             }
-        )
+        rows.append(row)
     return rows
 
 
-def _rul(prognosis: Prognosis, remaining: FloatArray) -> Row:
+def _rul(prognosis: Prognosis, column: int, days: FloatArray) -> Row:
     """Quantiles of the remaining life; past the horizon they are empty, not numbers."""
-    left = np.maximum(remaining, 0)
-    days = left / prognosis.usage
+    travel = prognosis.remaining[:, column]
+    travel = np.where(travel > prognosis.horizon, np.inf, travel)
     row: Row = {}
-    censored = [
-        level
-        for level in _RUL_LEVELS
-        if np.quantile(left, level, method="lower") > prognosis.horizon
-    ]
-    for unit, values in (("km", left / _KM), ("hours", days * 24), ("days", days)):
-        for level in _RUL_LEVELS:
-            quantile = None if level in censored else np.quantile(values, level, method="lower")
-            row[f"rul_{unit}_q{100 * level:02.0f}"] = quantile
+    for unit, values in (("km", travel / _KM), ("hours", days * 24), ("days", days)):
+        found = np.quantile(np.maximum(values, 0), RUL_LEVELS, method="inverted_cdf")
+        for level, value in zip(RUL_LEVELS, found, strict=True):
+            row[f"rul_{unit}_q{100 * level:02.0f}"] = None if np.isinf(value) else float(value)
+    censored = [level for level, value in zip(RUL_LEVELS, found, strict=True) if np.isinf(value)]
     row["censored_from"] = censored[0] if censored else None
     return row

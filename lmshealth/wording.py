@@ -11,12 +11,19 @@ from lmshealth.arrays import FloatArray
 
 _KM = 1000.0
 GAP = "\u202f"  # narrow space that does not break: between a number and its unit
+_UNITS = {"c": "°C", "kg": "kg", "mm": "mm"}
 LEVELS = np.array([0.05, 0.5, 0.95])
 
 
 def spell(name: str) -> str:
     """Write a name in words."""
     return name.replace("_", " ")
+
+
+def covariate(column: str) -> tuple[str, str]:
+    """Split the name of a covariate's column into words and its unit, empty where unknown."""
+    name, _, unit = column.rpartition("_")
+    return (spell(name), _UNITS[unit]) if name and unit in _UNITS else (spell(column), "")
 
 
 def moment(when: datetime) -> str:
@@ -31,6 +38,16 @@ def percent(probability: float | np.floating[Any]) -> str:
     if probability > 0.99:
         return f"above 99{GAP}%"
     return f"{100 * probability:.0f}{GAP}%"
+
+
+def chance(at_least: float, at_most: float) -> str:
+    """Write a probability that is known between two values."""
+    low, high = percent(at_least), percent(at_most)
+    if low == high:
+        return low
+    if at_least < 0.01:
+        return f"at most {high}"
+    return f"at least {low}" if at_most > 0.99 else f"{low} to {high}"
 
 
 def signed(value: float, digits: int) -> str:
@@ -53,6 +70,11 @@ def number(value: float) -> str:
 def km(metres: float) -> str:
     """Write a distance given in m."""
     return f"{number(metres / _KM)}{GAP}km"
+
+
+def whole_km(metres: float) -> str:
+    """Write a distance given in m to the kilometre."""
+    return f"{metres / _KM:,.0f}{GAP}km".replace(",", GAP)
 
 
 def day_count(days: float) -> str:

@@ -22,6 +22,12 @@ def _missing(name: str) -> str | None:
         if not folder:
             return "LMSHEALTH_DATA is not set: it names the folder of real measurements"
         return None if Path(folder).is_dir() else f"LMSHEALTH_DATA={folder} is no folder"
+    if name == "pdf":
+        try:
+            import weasyprint  # noqa: F401
+        except (ImportError, OSError) as error:
+            return f"WeasyPrint or its libraries are not installed: {error}"
+        return None
     if name == "peers":
         missing = [module for module in ("pyoma2", "pyOMA") if find_spec(module) is None]
         return f"{' and '.join(missing)}: pip install '.[peers]'" if missing else None

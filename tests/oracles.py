@@ -387,52 +387,115 @@ def epoch_log_posterior(
     return float(value)
 
 
+@dataclass(frozen=True)
+class LifeBelief:
+    """What is believed of a whole life: errors that do not depend on its course.
+
+    ``slopes`` is ``(n_parameters, n_modes)``, what ln health does to ln frequency at the baseline.
+    """
+
+    slopes: FloatArray
+    horizon: float
+    model_std: float
+    intercept_std: float
+    reference: float = 21.0
+    b_std: float = 1e-3
+
+
+@dataclass(frozen=True)
+class LifeSetting:
+    """A point of the grid: walk, factor on standard deviations, deviation at the horizon."""
+
+    walk: float
+    scale: float
+    deviation: float
+    prior: float = 1.0
+
+
+def _life_data(history: History) -> tuple[list[tuple[int, int]], FloatArray, FloatArray]:
+    """Where there are data since the baseline, these about the mean of their mode, and travel."""
+    first = history.baseline
+    ln_f = history.ln_frequency[first:]
+    n, m = ln_f.shape
+    where = [(k, i) for k in range(n) for i in range(m) if not np.isnan(ln_f[k, i])]
+    centre = [np.mean(ln_f[~np.isnan(ln_f[:, i]), i]) for i in range(m)]
+    values = np.array([ln_f[k, i] - centre[i] for k, i in where])
+    return where, values, (history.travel - history.travel[first])[first:]
+
+
+def life_covariance(
+    history: History, alone: FloatArray, belief: LifeBelief, setting: LifeSetting
+) -> FloatArray:
+    """Covariance of all data of a life, entry by entry.
+
+    ``alone`` (n_parameters, n_logs, n_modes) is what each parameter does alone. The relative error
+    of each contribution is an explicit Gaussian: V Vᵀ is added to the covariance.
+    """
+    where, _, clock = _life_data(history)
+    first = history.baseline
+    values = history.covariates["temperature_c"][first:]
+    unknown = np.isnan(values)
+    offset = np.where(unknown, 0.0, values - belief.reference)
+    known = Known(1.0, (("temperature_c", belief.reference, belief.b_std, 0.0),))
+    cov = np.zeros((len(where), len(where)))
+    for a, (k, i) in enumerate(where):
+        for c, (o, j) in enumerate(where):
+            shared = min(clock[k], clock[o])
+            for slope in belief.slopes:
+                cov[a, c] += slope[i] * slope[j] * setting.deviation**2 * shared / belief.horizon
+            if k == o:
+                cov[a, c] += setting.scale**2 * history.cov[first + k][i, j]
+            if k == o and i == j and unknown[k]:
+                cov[a, c] += _unknown(history, known, first + k)
+            if i == j:
+                cov[a, c] += belief.intercept_std**2 + belief.b_std**2 * offset[k] * offset[o]
+                cov[a, c] += setting.walk**2 * shared / clock.max()
+                for own in alone:
+                    cov[a, c] += belief.model_std**2 * own[k, i] * own[o, i]
+    return cov
+
+
 def life_log_likelihood(
     history: History,
     predicted: FloatArray,
     alone: FloatArray,
-    *,
-    model_std: float,
-    walks: Sequence[float],
-    scales: Sequence[float],
-    scale_prior: Sequence[float],
-    intercept_std: float,
-    reference: float = 21.0,
-    b_std: float = 1e-3,
+    belief: LifeBelief,
+    grid: Sequence[LifeSetting],
 ) -> float:
-    """Log likelihood of a whole life as one dense multivariate normal, entry by entry.
+    """Log likelihood of a whole life as one dense multivariate normal, over a grid of settings.
 
-    ``predicted`` (n_logs, n_modes) is the drift of the law since the baseline, ``alone``
-    (n_parameters, n_logs, n_modes) what each parameter does alone. The relative error of each
-    contribution is an explicit Gaussian: V Vᵀ is added to the covariance.
+    ``predicted`` (n_logs, n_modes) is the drift of the laws since the baseline, ``alone`` as in
+    `life_covariance`.
     """
-    first, m = history.baseline, len(history.modes)
-    clock = (history.travel - history.travel[first])[first:]
-    values = history.covariates["temperature_c"][first:]
-    unknown = np.isnan(values)
-    offset = np.where(unknown, 0.0, values - reference)
-    known = Known(1.0, (("temperature_c", reference, b_std, 0.0),))
-    ln_f = history.ln_frequency[first:]
-    where = [(k, i) for k in range(clock.size) for i in range(m) if not np.isnan(ln_f[k, i])]
-    centre = [np.mean(ln_f[~np.isnan(ln_f[:, i]), i]) for i in range(m)]
-    r = np.array([ln_f[k, i] - centre[i] - predicted[k, i] for k, i in where])
-    logs = []
-    for walk in walks:
-        for scale, prior in zip(scales, scale_prior, strict=True):
-            cov = np.zeros((r.size, r.size))
-            for a, (k, i) in enumerate(where):
-                for c, (o, j) in enumerate(where):
-                    if k == o:
-                        cov[a, c] += scale**2 * history.cov[first + k][i, j]
-                    if k == o and i == j and unknown[k]:
-                        cov[a, c] += _unknown(history, known, first + k)
-                    if i == j:
-                        cov[a, c] += intercept_std**2 + b_std**2 * offset[k] * offset[o]
-                        cov[a, c] += walk**2 * min(clock[k], clock[o]) / clock.max()
-                        for own in alone:
-                            cov[a, c] += model_std**2 * own[k, i] * own[o, i]
-            logs.append(np.log(prior) + stats.multivariate_normal.logpdf(r, cov=cov))
+    where, values, _ = _life_data(history)
+    r = values - np.array([predicted[k, i] for k, i in where])
+    logs = [
+        np.log(setting.prior)
+        + stats.multivariate_normal.logpdf(r, cov=life_covariance(history, alone, belief, setting))
+        for setting in grid
+    ]
     return float(np.logaddexp.reduce(logs))
+
+
+def life_deviation(
+    history: History,
+    predicted: FloatArray,
+    alone: FloatArray,
+    belief: LifeBelief,
+    setting: LifeSetting,
+    moment: float,
+) -> tuple[FloatArray, FloatArray]:
+    """Mean and covariance between parameters of ln health about its laws, by conditioning."""
+    where, values, clock = _life_data(history)
+    r = values - np.array([predicted[k, i] for k, i in where])
+    inverse = np.linalg.inv(life_covariance(history, alone, belief, setting))
+    unit = setting.deviation**2 / belief.horizon
+    p = belief.slopes.shape[0]
+    cross = np.zeros((p, len(where)))
+    for j in range(p):
+        for c, (k, i) in enumerate(where):
+            cross[j, c] = unit * min(moment, clock[k]) * belief.slopes[j, i]
+    return cross @ inverse @ r, unit * moment * np.eye(p) - cross @ inverse @ cross.T
 
 
 def binomial_band(hits: int, n: int, level: float = 0.999) -> tuple[float, float]:

@@ -5,8 +5,12 @@ from __future__ import annotations
 import csv
 import io
 import json
+import shutil
+import sqlite3
 import subprocess
 import sys
+from collections.abc import Callable
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
@@ -15,11 +19,14 @@ from click.testing import CliRunner, Result
 
 from lmshealth.cli import main
 from lmshealth.looks import LOOKS
+from lmshealth.store import SCHEMA, Store, beside
 from lmshealth.tables import COLUMNS
 from models.stages import STAGES
 from models.velocities import Experiment, drive_velocities
 from studies.frf_modes.records import BAND, MODES, RATE, Machine, periodic
+from tests.assessments import worn
 from tests.signals import Mode, accelerations, write_archive, write_archive_stage, write_log
+from tests.test_report import nothing
 
 MODE_KEYS = set(COLUMNS["modes"].split())
 
@@ -70,7 +77,16 @@ def stage(folder: Path) -> Path:
 
 def test_every_command_has_help_with_an_example() -> None:
     """``--help`` of each command shows how it is called."""
-    assert set(main.commands) >= {"run", "modes", "error", "spectrum", "frf", "plan", "stage"}
+    assert set(main.commands) >= {
+        "run",
+        "modes",
+        "error",
+        "spectrum",
+        "frf",
+        "plan",
+        "stage",
+        "report",
+    }
     for name in main.commands:
         result = call(name, "--help")
         assert result.exit_code == 0
@@ -122,6 +138,8 @@ def test_the_version_is_told() -> None:
         ("plan", "--stage", "lms-y", "--detect", "guide_preload"),
         ("plan", "--stage", "lms-y", "--detect", "guide_preload=0.05", "--power", "1"),
         ("plan", "--stage", "lms-y", "--detect", "guide_preload=0.05", "--format", "csv"),
+        ("report", "--out", "pages"),
+        ("report", "--store", "sqlite:///store.sqlite"),
         ("nonsense",),
     ],
 )
@@ -579,3 +597,98 @@ def test_a_bad_description_is_status_1_with_one_line(folder: Path, tmp_path: Pat
     assert result.exit_code == 1
     assert "frequenzy_hz" in result.stderr
     assert len(result.stderr.splitlines()) == 1
+
+
+# report
+
+
+def test_report_writes_the_pages_of_run_without_its_logs(stage: Path, tmp_path: Path) -> None:
+    """Logs and description gone, every page is the same to the byte."""
+    logs = write_archive(tmp_path / "logs", 2)
+    (logs / "broken.h5").write_bytes(b"nothing")
+    own = shutil.copy(stage, tmp_path / "own.toml")
+    assert run(logs, own, tmp_path / "out").exit_code == 3
+    shutil.rmtree(logs)
+    Path(own).unlink()
+    url = f"sqlite:///{(tmp_path / 'out' / 'lmshealth.sqlite').as_posix()}"
+    result = call("report", "--store", url, "--out", tmp_path / "pages")
+    assert (result.exit_code, result.stderr) == (0, "")
+    assert str(tmp_path / "pages" / "index.html") in result.stdout
+    names = sorted(page.name for page in (tmp_path / "pages").iterdir())
+    assert names == ["index.html", "test-A.html"]
+    for name in names:
+        assert (tmp_path / "pages" / name).read_bytes() == (tmp_path / "out" / name).read_bytes()
+    assert "broken.h5" in (tmp_path / "pages" / "index.html").read_text()
+
+
+@pytest.mark.parametrize(
+    ("url", "said"),
+    [
+        ("sqlite:///{}/nowhere.sqlite", "nowhere.sqlite"),
+        ("sqlite:///{}/empty.sqlite", "no results"),
+        ("sqlite:///{}/text.sqlite", "not a database"),
+        ("no url at all", "no url at all"),
+        ("nosuch://me:hunter2@host/db?password=hunter2", "nosuch://host/db"),
+        ("postgresql+nosuch://me:hunter2@host/db", "host/db"),
+    ],
+)
+def test_a_store_that_has_no_report_is_status_1_with_one_line(
+    tmp_path: Path, url: str, said: str
+) -> None:
+    """Each kind is named without its password; no file is made and no page written."""
+    (tmp_path / "empty.sqlite").touch()
+    (tmp_path / "text.sqlite").write_text("these are my notes\n" * 100)
+    result = call("report", "--store", url.format(tmp_path.as_posix()), "--out", tmp_path / "pages")
+    assert result.exit_code == 1
+    assert said in result.stderr
+    assert "hunter2" not in result.stderr
+    assert len(result.stderr.splitlines()) == 1
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["empty.sqlite", "text.sqlite"]
+
+
+def test_a_machine_that_cannot_be_read_is_told_and_the_others_are_written(tmp_path: Path) -> None:
+    """One line names it, with status 3."""
+    store = Store(beside(tmp_path))
+    for name in ("M7-Y", "M8-Y"):
+        store.keep(name, "k1", nothing(worn(tmp_path, name)))
+    store.close()
+    with closing(sqlite3.connect(tmp_path / "lmshealth.sqlite")) as file, file:
+        file.execute(f"UPDATE assessed_{SCHEMA} SET content = x'00' WHERE machine = 'M8-Y'")
+    url = beside(tmp_path).render_as_string()
+    result = call("report", "--store", url, "--out", tmp_path / "pages")
+    assert result.exit_code == 3
+    assert "M8-Y" in result.stderr and len(result.stderr.splitlines()) == 1
+    names = sorted(page.name for page in (tmp_path / "pages").iterdir())
+    assert names == ["M7-Y.html", "index.html"]
+
+
+def test_pdfs_stand_beside_the_pages_of_run_and_report(
+    folder: Path, stage: Path, tmp_path: Path, needs: Callable[[str], None]
+) -> None:
+    """One per stage, under the name of its page; none without being asked for."""
+    needs("pdf")
+    out = tmp_path / "out"
+    arguments = ("run", folder / "good", "--stage", stage, "--out", out, "--workers", 1)
+    assert call(*arguments).exit_code == 0
+    assert list(out.glob("*.pdf")) == []
+    assert call(*arguments, "--pdf").exit_code == 0
+    assert [path.name for path in out.glob("*.pdf")] == ["test-A.pdf"]
+    url = beside(out).render_as_string()
+    assert call("report", "--store", url, "--out", tmp_path / "pages", "--pdf").exit_code == 0
+    again = (tmp_path / "pages" / "test-A.pdf").read_bytes()
+    assert again == (out / "test-A.pdf").read_bytes()
+
+
+def test_without_the_library_pages_are_written_and_the_lack_is_told(
+    folder: Path, stage: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Status 1 with one line that says what to install; the work is done and kept."""
+    monkeypatch.setitem(sys.modules, "weasyprint", None)
+    out = tmp_path / "out"
+    result = call(
+        "run", folder / "good", "--stage", stage, "--out", out, "--workers", 1, "--pdf"
+    )  # fmt: skip
+    assert result.exit_code == 1
+    assert 'pip install "lmshealth[pdf]"' in result.stderr
+    assert len(result.stderr.splitlines()) == 1
+    assert (out / "test-A.html").is_file() and (out / "lmshealth.sqlite").is_file()

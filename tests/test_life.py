@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,8 @@ import pytest
 
 from lmshealth import life
 from lmshealth.arrays import FloatArray
+from lmshealth.courses import Course
+from lmshealth.density import LifeDensity
 from lmshealth.errors import NotEnoughData
 from lmshealth.life import LifeLikelihood
 from lmshealth.stage import Stage
@@ -20,14 +23,18 @@ from tests.lives import (
     FREQUENCY,
     MOUNT,
     PRELOAD,
+    SENSITIVITY,
     make_history,
     make_stage,
     rough_history,
+    since,
     true_drift,
 )
-from tests.oracles import life_log_likelihood
+from tests.oracles import LifeBelief, LifeSetting, life_log_likelihood
 
 NAMES = ("guide_preload", "mount_stiffness")
+NO_PRELOAD = PRELOAD.replace("law = { kind", "law = [{ kind").replace("} }\n", "} }, NONE]\n")
+NO_PRELOAD = NO_PRELOAD.replace("NONE", '{ kind = "none", weight = 3 }')
 
 
 @pytest.fixture(scope="module")
@@ -36,71 +43,125 @@ def stage(tmp_path_factory: pytest.TempPathFactory) -> Stage:
     return make_stage(tmp_path_factory.mktemp("stage"))
 
 
-def coordinates(likelihood: LifeLikelihood, n: int = 6, seed: int = 1) -> FloatArray:
+def density_of(history: History, stage: Stage) -> LifeDensity:
+    """Give the density of the first course."""
+    likelihood = LifeLikelihood(history, stage)
+    return LifeDensity.of(likelihood, likelihood.courses[0])
+
+
+def coordinates(density: LifeDensity, n: int = 6, seed: int = 1) -> FloatArray:
     """Draw coordinates inside the support."""
-    y = likelihood.draw_prior(np.random.default_rng(seed), 200)
-    return y[np.isfinite(likelihood.log_probability(y))][:n]
+    y = density.draw_prior(np.random.default_rng(seed), 300)
+    return y[np.isfinite(density.log_probability(y))][:n]
 
 
-def healths(likelihood: LifeLikelihood, y: FloatArray, clock: FloatArray) -> FloatArray:
-    """Preload and mount by their laws written out, shape (n_logs, 2)."""
-    wear, loose = (
-        law.natural(part[None], likelihood.now)[0]
-        for law, part in zip(likelihood.laws, (y[:2], y[2:]), strict=True)
-    )
-    preload = (1 - (clock / wear[0]) ** wear[1]) ** 1.5
-    mount = loose[0] + (1 - loose[0]) * np.exp(-clock / loose[1])
-    return np.column_stack([preload, mount])
+def healths(course: Course, y: FloatArray, clock: FloatArray) -> FloatArray:
+    """Preload and mount by wear, loosening and jumps written out, shape (n_logs, 2)."""
+    columns = []
+    for branch, part in zip(course.branches, course.split(course.natural(y[None])), strict=True):
+        own, column = part[0], []
+        for s in clock:
+            since = max(s - branch.begin, 0.0)
+            if branch.law.kind == "hertz-wear":
+                health = (1 - (since / own[0]) ** own[1]) ** 1.5
+            elif branch.law.kind == "loosening":
+                health = own[0] + (1 - own[0]) * np.exp(-since / own[1])
+            else:
+                health = 1.0
+            for k, step in enumerate(branch.steps):
+                health *= own[len(branch.law.names) + k] if s > step else 1.0
+            column.append(health)
+        columns.append(column)
+    return np.array(columns).T
 
 
-def book(history: History, likelihood: LifeLikelihood, y: FloatArray, model_std: float) -> float:
+def book(history: History, density: LifeDensity, y: FloatArray, model_std: float) -> float:
     """Log likelihood of one set of coordinates by the dense oracle."""
-    x = np.log(healths(likelihood, y, history.clock()[history.baseline :]))
+    x = np.log(healths(density.course, y, history.clock()[history.baseline :]))
     alone = np.stack([true_drift(NAMES, x * (np.arange(2) == j))[:, :2] for j in range(2)])
-    return life_log_likelihood(
-        history,
-        true_drift(NAMES, x)[:, :2],
-        alone,
+    belief = LifeBelief(
+        slopes=np.array([SENSITIVITY[name][:2] for name in NAMES]),
+        horizon=density.life.stage.description.usage.horizon_km * 1000,
         model_std=model_std,
-        walks=life._WALKS,
-        scales=life._NOISE_SCALES,
-        scale_prior=life._NOISE_SCALE_PRIOR,
         intercept_std=life._INTERCEPT_STD,
     )
+    scales = zip(life._NOISE_SCALES, life._NOISE_SCALE_PRIOR, strict=True)
+    deviations = zip(life._DEVIATIONS, life._DEVIATION_PRIOR, strict=True)
+    grid = [
+        LifeSetting(walk, scale, deviation, p * q)
+        for walk, (scale, p), (deviation, q) in product(life._WALKS, scales, deviations)
+    ]
+    found = life_log_likelihood(history, true_drift(NAMES, x)[:, :2], alone, belief, grid)
+    return found + density.life.y.size / 2 * np.log(2 * np.pi)
 
 
+@pytest.fixture
+def short_grid(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Average over two values each, so that a plainly written oracle takes no long time."""
+    monkeypatch.setattr(life, "_WALKS", (5e-4, 5e-3))
+    monkeypatch.setattr(life, "_NOISE_SCALES", (1.0, 1.5))
+    monkeypatch.setattr(life, "_NOISE_SCALE_PRIOR", (0.9, 0.1))
+    monkeypatch.setattr(life, "_DEVIATIONS", (0.0, 0.15))
+    monkeypatch.setattr(life, "_DEVIATION_PRIOR", (0.6, 0.4))
+
+
+@pytest.mark.usefixtures("short_grid")
 @pytest.mark.parametrize("model_std", [0.0, 0.05, 0.3])
 @pytest.mark.parametrize("baseline", [0, 3])
 def test_likelihood_is_the_dense_multivariate_normal(
     tmp_path: Path, model_std: float, baseline: int
 ) -> None:
-    """Missing data, cross terms, unknown temperature, map error and grid: equal to 1e-9."""
+    """Missing data, cross terms, unknown temperature, map error, deviation and grid: to 1e-9."""
     stage = make_stage(tmp_path, model_std=model_std)
     history = rough_history(np.random.default_rng(2), baseline=baseline)
+    density = density_of(history, stage)
+    y = coordinates(density, 4)
+    found = density.log_probability(y) - density.course.log_prior(y)
+    known = np.array([book(history, density, point, model_std) for point in y])
+    np.testing.assert_allclose(found, known, rtol=1e-9, atol=1e-7)
+
+
+@pytest.mark.usefixtures("short_grid")
+def test_every_course_after_a_step_is_the_dense_normal(tmp_path: Path) -> None:
+    """Laws or none, jumps and laws begun anew: values, not only differences, are comparable."""
+    stage = make_stage(tmp_path, (NO_PRELOAD, MOUNT))
+    history = rough_history(np.random.default_rng(3))
+    history = replace(history, steps=(since("step", 5, 10),))
     likelihood = LifeLikelihood(history, stage)
-    y = coordinates(likelihood)
-    found = likelihood.log_probability(y) - likelihood.log_prior(y)
-    known = np.array([book(history, likelihood, point, model_std) for point in y])
-    np.testing.assert_allclose(np.diff(found), np.diff(known), rtol=1e-9, atol=1e-8)
+    assert likelihood.steps == (np.mean(history.clock()[4:6]),)
+    assert len(likelihood.courses) == 3 * 2
+    found, known = [], []
+    for course in likelihood.courses:
+        density = LifeDensity.of(likelihood, course)
+        y = coordinates(density, 1)
+        found.append((density.log_probability(y) - course.log_prior(y))[0])
+        known.append(book(history, density, y[0], 0.05))
+    np.testing.assert_allclose(found, known, rtol=1e-9, atol=1e-7)
+    assert np.ptp(found) > 0.1
 
 
-def test_a_wrong_map_error_is_noticed(stage: Stage) -> None:
-    """Negative control: the oracle with another map error differs by far more than rounding."""
+@pytest.mark.usefixtures("short_grid")
+@pytest.mark.parametrize("what", ["map error", "deviation"])
+def test_what_is_wrong_is_noticed(stage: Stage, what: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Negative control: the oracle with another error differs by far more than rounding."""
     history = rough_history(np.random.default_rng(2))
-    likelihood = LifeLikelihood(history, stage)
-    y = coordinates(likelihood)
-    found = likelihood.log_probability(y) - likelihood.log_prior(y)
-    known = np.array([book(history, likelihood, point, 0.0501) for point in y])
-    assert np.abs(np.diff(found) - np.diff(known)).max() > 1e-5
+    density = density_of(history, stage)
+    y = coordinates(density)
+    found = density.log_probability(y) - density.course.log_prior(y)
+    if what == "deviation":
+        monkeypatch.setattr(life, "_DEVIATIONS", (0.0, 0.151))
+    model_std = 0.0501 if what == "map error" else 0.05
+    known = np.array([book(history, density, point, model_std) for point in y])
+    assert np.abs(found - known).max() > 1e-5
 
 
 def test_walkers_do_not_see_each_other(stage: Stage) -> None:
     """A batch equals its walkers one at a time, also where some are impossible."""
-    likelihood = LifeLikelihood(rough_history(np.random.default_rng(3)), stage)
-    y = likelihood.draw_prior(np.random.default_rng(4), 40)
+    density = density_of(rough_history(np.random.default_rng(3)), stage)
+    y = density.draw_prior(np.random.default_rng(4), 40)
     y[5, 0] = 50.0  # preload gone long before now
-    together = likelihood.log_probability(y)
-    alone = np.concatenate([likelihood.log_probability(point[None]) for point in y])
+    together = density.log_probability(y)
+    alone = np.concatenate([density.log_probability(point[None]) for point in y])
     np.testing.assert_allclose(together, alone, rtol=1e-11)
     assert np.isneginf(together[5])
     assert np.isfinite(together).any()
@@ -108,17 +169,17 @@ def test_walkers_do_not_see_each_other(stage: Stage) -> None:
 
 def test_lives_that_leave_the_map_or_the_prior_are_impossible(stage: Stage) -> None:
     """Preload below the map, or a floor below 0 or outside its prior: minus infinity, no error."""
-    likelihood = LifeLikelihood(rough_history(np.random.default_rng(5)), stage)
-    inside = coordinates(likelihood, 1)[0]
-    now = likelihood.now
-    wear, loose = likelihood.laws
+    density = density_of(rough_history(np.random.default_rng(5)), stage)
+    inside = coordinates(density, 1)[0]
+    now = density.life.now
+    wear, loose = (branch.law for branch in density.course.branches)
     worn, below, low = inside.copy(), inside.copy(), inside.copy()
     worn[0] = 0.5  # s_w < now
     below[2] = 1.0  # floor below 0
     life_m = loose.natural(inside[None, 2:], now)[0, 1]
     low[2] = np.log(0.9 * -np.expm1(-now / life_m))  # floor 0.1, prior from 0.3
     assert wear.natural(worn[None, :2], now)[0, 0] < now
-    found = likelihood.log_probability(np.array([inside, worn, below, low]))
+    found = density.log_probability(np.array([inside, worn, below, low]))
     assert np.isfinite(found).tolist() == [True, False, False, False]
     assert np.isneginf(found[1:]).all()
 
@@ -127,7 +188,7 @@ def test_the_intercept_is_free(stage: Stage) -> None:
     """Moving every frequency by the same part in a hundred changes no difference of likelihood."""
     history = rough_history(np.random.default_rng(6))
     moved = replace(history, ln_frequency=history.ln_frequency + 0.01)
-    one, two = LifeLikelihood(history, stage), LifeLikelihood(moved, stage)
+    one, two = density_of(history, stage), density_of(moved, stage)
     y = coordinates(one)
     np.testing.assert_allclose(one.log_probability(y), two.log_probability(y), atol=1e-8)
 
@@ -144,7 +205,7 @@ def test_an_empty_log_changes_nothing(stage: Stage) -> None:
         cov=history.cov[keep],
         temperature=temperature[keep],
     )
-    one, two = LifeLikelihood(history, stage), LifeLikelihood(without, stage)
+    one, two = density_of(history, stage), density_of(without, stage)
     y = coordinates(one)
     np.testing.assert_allclose(one.log_probability(y), two.log_probability(y), rtol=1e-11)
 
@@ -153,78 +214,61 @@ def test_a_mode_that_vanished_before_the_baseline_is_left_out(stage: Stage) -> N
     """A mode without any estimate since the baseline adds nothing, and no warning."""
     ln_f = np.log(FREQUENCY[:2]) + 1e-3 * np.random.default_rng(8).standard_normal((8, 2))
     ln_f[2:, 1] = np.nan
-    likelihood = LifeLikelihood(make_history(ln_f, baseline=2), stage)
-    assert likelihood.y.size == 6
-    assert np.isfinite(likelihood.log_probability(coordinates(likelihood))).all()
+    density = density_of(make_history(ln_f, baseline=2), stage)
+    assert density.life.y.size == 6
+    assert np.isfinite(density.log_probability(coordinates(density))).all()
 
 
 def test_a_covariate_that_is_not_recorded_is_ignored(stage: Stage) -> None:
     """Without any temperature the likelihood is that of a stage without the covariate."""
     ln_f = np.log(FREQUENCY[:2]) + 1e-3 * np.random.default_rng(9).standard_normal((6, 2))
-    bare = LifeLikelihood(make_history(ln_f), stage)
-    reference = LifeLikelihood(make_history(ln_f, temperature=np.full(6, 21.0)), stage)
+    bare = density_of(make_history(ln_f), stage)
+    reference = density_of(make_history(ln_f, temperature=np.full(6, 21.0)), stage)
     y = coordinates(bare)
     np.testing.assert_allclose(bare.log_probability(y), reference.log_probability(y), rtol=1e-12)
-
-
-def test_narrowing_the_grid_keeps_the_likelihood(stage: Stage) -> None:
-    """Points of the grid that carry nothing can go: differences stay within a few hundredths."""
-    likelihood = LifeLikelihood(rough_history(np.random.default_rng(10)), stage)
-    y = coordinates(likelihood, 40)
-    full = likelihood.log_probability(y)
-    best = np.argsort(full)[-8:]
-    n = likelihood.grid.walk.size
-    likelihood.narrow(y[best])
-    less = likelihood.log_probability(y)[best]
-    assert 0 < likelihood.grid.walk.size < n
-    assert np.ptp(less - full[best]) < 0.15
-
-
-def test_settings_count_data_and_parameters(stage: Stage) -> None:
-    """Degrees of freedom are data minus law parameters; averages lie inside their grids."""
-    likelihood = LifeLikelihood(rough_history(np.random.default_rng(11)), stage)
-    walk, scale, chi_square, dof = likelihood.settings(coordinates(likelihood, 30))
-    assert dof == 2 * 10 - 4 - 4  # four estimates are missing, four law parameters
-    assert life._WALKS[0] <= walk <= life._WALKS[-1]
-    assert 1 <= scale <= life._NOISE_SCALES[-1]
-    assert chi_square > 0
-
-
-def test_settings_of_draws_are_the_mean_of_each(stage: Stage) -> None:
-    """Every draw of a posterior tells of walk and noise alike, likely ones no more than others."""
-    likelihood = LifeLikelihood(rough_history(np.random.default_rng(12)), stage)
-    y = coordinates(likelihood, 6)
-    alone = [likelihood.settings(draw[None])[:2] for draw in y]
-    np.testing.assert_allclose(likelihood.settings(y)[:2], np.mean(alone, axis=0))
-    assert np.ptp(alone, axis=0).min() > 1e-6
-
-
-def test_chi_square_of_a_life_as_stated_is_near_its_degrees_of_freedom(tmp_path: Path) -> None:
-    """Data with the stated errors give χ² per degree of freedom near 1; doubled errors do not."""
-    stage = make_stage(tmp_path, (FADING,), tail="")
-    rng = np.random.default_rng(12)
-    travel = np.linspace(0, 2e6, 60)
-    x = np.log(1 - 1e-7 * travel)[:, None]
-    clean = np.log(FREQUENCY[:2]) + true_drift(("guide_preload",), x)[:, :2]
-    noise = 1e-3 * rng.standard_normal((60, 2))
-    for factor, scale_is_one in ((1.0, True), (2.0, False)):
-        likelihood = LifeLikelihood(make_history(clean + factor * noise, travel=travel), stage)
-        _, scale, chi_square, dof = likelihood.settings(np.full((5, 1), 0.2))
-        assert abs(chi_square / dof - 1) < 5 * np.sqrt(2 / dof)
-        assert (scale < 1.1) == scale_is_one
 
 
 def test_laws_without_parameters_take_no_coordinate(tmp_path: Path) -> None:
     """An unchanging parameter among others keeps health 1 and needs no coordinate."""
     stage = make_stage(tmp_path, (PRELOAD, FOOT, MOUNT))
-    likelihood = LifeLikelihood(rough_history(np.random.default_rng(13)), stage)
-    assert likelihood.n_dim == 4
-    y = coordinates(likelihood, 5)
-    assert [part.shape for part in likelihood.split(y)] == [(5, 2), (5, 0), (5, 2)]
-    health = likelihood.health(y, np.array([0.0, likelihood.now]))
+    density = density_of(rough_history(np.random.default_rng(13)), stage)
+    course = density.course
+    assert course.n_dim == 4
+    y = coordinates(density, 5)
+    assert [part.shape for part in course.split(y)] == [(5, 2), (5, 0), (5, 2)]
+    health = course.health(course.natural(y), np.array([0.0, density.life.now]))
     assert health.shape == (5, 2, 3)
     assert (health[:, :, 1] == 1).all()
     np.testing.assert_allclose(health[:, 0], 1)
+    np.testing.assert_array_equal(density.life.free, [1, 0, 1])
+    assert (density.life.slopes[:, 1] == 0).all()
+
+
+def test_what_has_no_law_does_not_deviate(tmp_path: Path) -> None:
+    """A parameter that only keeps its value adds nothing to the covariance, seen or not."""
+    still = MOUNT[: MOUNT.index("[parameter.law]")]
+    history = rough_history(np.random.default_rng(13))
+    alone = LifeLikelihood(history, make_stage(tmp_path / "one", (PRELOAD,)))
+    beside = LifeLikelihood(history, make_stage(tmp_path / "two", (PRELOAD, still)))
+    free = LifeLikelihood(history, make_stage(tmp_path / "three", (PRELOAD, MOUNT)))
+    deviation = alone.covariance.deviation
+    np.testing.assert_allclose(beside.covariance.deviation, deviation, rtol=1e-9)
+    assert (free.covariance.deviation > 1.1 * deviation)[deviation > 0].all()
+
+
+@pytest.mark.parametrize("n", [3, 4])
+def test_a_life_of_many_steps_is_refused(stage: Stage, n: int) -> None:
+    """Three jumps since the baseline are as many as laws hold over; those before do not count."""
+    history = rough_history(np.random.default_rng(14), baseline=2)
+    steps = [since("step", k, 10) for k in (1, *range(4, 4 + n))]
+    history = replace(history, steps=tuple(steps))
+    if n == 3:
+        likelihood = LifeLikelihood(history, stage)
+        assert len(likelihood.steps) == 3
+        assert likelihood.courses[0].n_dim == 4 + 2 * 3
+        return
+    with pytest.raises(NotEnoughData, match=r"jumped 4 times.*declare a new baseline"):
+        LifeLikelihood(history, stage)
 
 
 @pytest.mark.parametrize(
@@ -247,12 +291,13 @@ def test_a_life_too_short_is_refused(
 def test_baseline_units_do_not_matter(tmp_path: Path) -> None:
     """A parameter in kN with baseline 1 kN is the same as a fraction: paths are relative."""
     stage = make_stage(tmp_path, (FADING,))
-    likelihood = LifeLikelihood(rough_history(np.random.default_rng(14)), stage)
-    y = np.array([[0.1], [0.3]])
-    health = likelihood.health(y, np.array([likelihood.now]))
+    density = density_of(rough_history(np.random.default_rng(14)), stage)
+    course, y = density.course, np.array([[0.1], [0.3]])
+    health = course.health(course.natural(y), np.array([density.life.now]))
     np.testing.assert_allclose(health[:, 0, 0], [0.9, 0.7])
 
 
+@pytest.mark.usefixtures("short_grid")
 def test_many_logs_are_told_by_few_nodes(stage: Stage) -> None:
     """Of 80 logs two dozen nodes are enough, and what follows between them is right to 1e-7."""
     rng = np.random.default_rng(12)
@@ -261,10 +306,11 @@ def test_many_logs_are_told_by_few_nodes(stage: Stage) -> None:
         np.log(FREQUENCY[:2]) + 1e-3 * rng.standard_normal((n, 2)),
         temperature=21 + rng.standard_normal(n),
     )
-    likelihood = LifeLikelihood(history, stage)
+    density = density_of(history, stage)
+    likelihood = density.life
     assert likelihood.nodes.size < 24
-    y = coordinates(likelihood, 20, seed=5)
-    x = np.log([healths(likelihood, point, likelihood.clock) for point in y])
+    y = coordinates(density, 20, seed=5)
+    x = np.log([healths(density.course, point, likelihood.clock) for point in y])
     drift = np.moveaxis(true_drift(NAMES, x)[..., :2], 1, 2)
     told = drift[..., likelihood.nodes] @ likelihood.weights.T
     np.testing.assert_allclose(told, drift, atol=1e-7)
@@ -272,6 +318,6 @@ def test_many_logs_are_told_by_few_nodes(stage: Stage) -> None:
     few = np.linalg.lstsq(drift[..., likelihood.nodes[:6]].reshape(-1, 6), drift.reshape(-1, n))[0]
     told = drift[..., likelihood.nodes[:6]] @ few
     assert np.abs(told - drift).max() > 1e-6
-    found = likelihood.log_probability(y[:2]) - likelihood.log_prior(y[:2])
-    known = np.array([book(history, likelihood, point, 0.05) for point in y[:2]])
+    found = density.log_probability(y[:2]) - density.course.log_prior(y[:2])
+    known = np.array([book(history, density, point, 0.05) for point in y[:2]])
     np.testing.assert_allclose(np.diff(found), np.diff(known), atol=1e-5)

@@ -4,17 +4,26 @@ from __future__ import annotations
 
 import csv
 import shutil
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
 import pytest
+from click.testing import CliRunner
 
+from lmshealth import pipeline
+from lmshealth.cli import main
 from lmshealth.errors import NothingUsable
+from lmshealth.history import Reading
 from lmshealth.inference import epochs_to_infer, infer
 from lmshealth.pipeline import RunResult, Settings, run
+from lmshealth.report import write_report
 from lmshealth.stage import Stage, load_stage
+from lmshealth.store import Store, beside
+from lmshealth.summary import Assessment
 from lmshealth.tables import COLUMNS
 from tests.signals import sine, write_archive, write_archive_stage, write_log
 
@@ -25,6 +34,11 @@ def rows(path: Path) -> list[dict[str, str]]:
     """Read a table."""
     with path.open(encoding="utf-8", newline="") as stream:
         return list(csv.DictReader(stream))
+
+
+def pages(out: Path) -> dict[str, bytes]:
+    """Read all pages of an output folder as bytes."""
+    return {path.name: path.read_bytes() for path in sorted(out.glob("*.html"))}
 
 
 def tables(out: Path) -> dict[str, bytes]:
@@ -41,6 +55,7 @@ class Done:
     stage: Stage
     result: RunResult
     written: dict[str, bytes]
+    pages: dict[str, bytes]
 
 
 @pytest.fixture(scope="module")
@@ -55,7 +70,7 @@ def done(tmp_path_factory: pytest.TempPathFactory) -> Done:
     write_log(logs / "foreign.h5", 1.0, 99, stage="other-Z")
     out = folder / "out"
     result = run(logs, [stage], out, Settings(epochs=2))
-    return Done(logs, out, stage, result, tables(out))
+    return Done(logs, out, stage, result, tables(out), pages(out))
 
 
 @pytest.fixture
@@ -92,6 +107,35 @@ def test_the_only_epoch_asked_for_is_the_last(done: Done) -> None:
         assert epochs_to_infer(assessment.track, done.stage, most)[-1] == N_LOGS - 1
 
 
+def test_prognose_goes_on_from_the_table_to_the_same_numbers(done: Done, tmp_path: Path) -> None:
+    """The command on the run's table of modes, with its seed, gives the run's remaining life."""
+    toml, out = done.logs.parent / "stage" / "small.toml", tmp_path / "prognosis.csv"
+    words = ["prognose", done.out / "modes.csv", "--stage", toml, "--out", out]
+    result = CliRunner().invoke(main, [str(word) for word in words])
+    assert result.exit_code == 0, result.output
+    ours, theirs = rows(out), rows(done.out / "prognosis.csv")
+    assert [row.keys() for row in ours] == [row.keys() for row in theirs]
+    for own, other in zip(ours, theirs, strict=True):
+        assert own["service_by"] == other["service_by"]
+        for key in [key for key in own if key.startswith(("rul_", "probability_"))]:
+            assert float(own[key]) == pytest.approx(float(other[key]), rel=1e-6)
+
+
+def test_spectra_of_all_logs_reach_the_page(done: Done) -> None:
+    """The spectra hold every used log in order, strongest where its modes are."""
+    (assessment,) = done.result.assessments
+    waterfall, history = assessment.waterfall, assessment.history
+    assert waterfall is not None
+    assert waterfall.level.shape[0] == len(history.logs) == N_LOGS
+    # Pitch, at 105 Hz when new, is the only mode in the upper half of the band.
+    edges = waterfall.edges
+    upper = np.sqrt(edges[1:] * edges[:-1])[edges[1:] > 85]
+    strongest = upper[np.argmax(waterfall.level[:, edges[1:] > 85], axis=1)]
+    pitch = np.exp(history.ln_frequency[:, history.columns("pitch")[0]])
+    np.testing.assert_allclose(strongest, pitch, rtol=0.04)
+    assert "Spectra over life" in done.result.pages[0].read_text(encoding="utf-8")
+
+
 def test_every_bad_log_is_listed_with_its_reason(done: Done) -> None:
     """The copy, the broken file and the foreign machine are refused by name; the rest is used."""
     refused = {row["log"]: row for row in rows(done.out / "refused.csv")}
@@ -106,13 +150,27 @@ def test_every_bad_log_is_listed_with_its_reason(done: Done) -> None:
     assert len({row["log"] for row in rows(done.out / "modes.csv")}) == N_LOGS
 
 
-def test_a_second_run_takes_all_from_the_store_and_the_truth_does_not_matter(done: Done) -> None:
-    """With truth.csv deleted a second run remembers every log and writes the same bytes."""
+def test_a_second_run_takes_all_from_the_store_and_the_truth_does_not_matter(
+    done: Done, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With truth.csv deleted a second run remembers every log and result: the same bytes."""
     (done.logs / "truth.csv").unlink()
+    monkeypatch.setattr(pipeline, "assess", None)  # nothing may be inferred again
     again = run(done.logs, [done.stage], done.out, Settings(epochs=2))
     # The broken file is told by its content and tried no more than once.
     assert again.n_remembered == N_LOGS + 2
     assert tables(done.out) == done.written
+    assert pages(done.out) == done.pages
+
+
+def test_pages_come_from_the_store_alone(done: Done, tmp_path: Path) -> None:
+    """Without logs and descriptions the pages of the machine and of the fleet are the same."""
+    shutil.copy(done.out / "lmshealth.sqlite", tmp_path)
+    store = Store(beside(tmp_path), create=False)
+    fleet = store.fleet()
+    store.close()
+    write_report(tmp_path, fleet.assessments, fleet.refused, earlier=fleet.earlier)
+    assert pages(tmp_path) == done.pages
 
 
 def test_results_do_not_depend_on_the_number_of_workers(done: Done, tmp_path: Path) -> None:
@@ -146,6 +204,59 @@ def test_a_changed_description_is_done_again(tmp_path: Path, modes_only: Stage) 
     path.write_text(path.read_text() + "# a remark\n")
     again = run(logs, [load_stage(str(path))], tmp_path / "out")
     assert again.n_remembered == 0
+
+
+@pytest.fixture
+def assessed(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """List the machines that are assessed and not remembered."""
+    machines: list[str] = []
+    whole = pipeline.assess
+
+    def listen(readings: Sequence[Reading], *given: Any) -> Assessment:
+        machines.append(str(readings[0].metadata.stage))
+        return whole(readings, *given)
+
+    monkeypatch.setattr(pipeline, "assess", listen)
+    return machines
+
+
+def test_only_what_is_stale_is_assessed_again(
+    tmp_path: Path, modes_only: Stage, assessed: list[str]
+) -> None:
+    """A log, maintenance, seed or number of epochs makes stale what depends on it, no more."""
+    logs, out = write_archive(tmp_path / "logs", 2), tmp_path / "out"
+    write_log(logs / "b.h5", 1.0, 7, stage="other-A")
+
+    def again(**options: int) -> list[str]:
+        assessed.clear()
+        run(logs, [modes_only], out, Settings(**options))
+        return list(assessed)
+
+    assert again() == ["other-A", "test-A"]
+    assert again() == again(workers=2) == []
+    write_log(logs / "c.h5", 1.0, 8, stage="other-A")
+    assert again() == ["other-A"]
+    text = "stage,recorded_at,travel_km,action\n"
+    (logs / "maintenance.csv").write_text(text + "test-A,2026-01-01T00:00:00+00:00,0,regrease\n")
+    assert again() == ["test-A"]
+    assert again(seed=1) == ["other-A", "test-A"]
+    assert again(seed=1, epochs=3) == ["other-A", "test-A"]
+    (logs / "broken.h5").write_bytes(b"nothing")
+    assert again(seed=1, epochs=3) == []
+
+
+def test_a_page_says_what_is_new_since_the_last_report(tmp_path: Path, modes_only: Stage) -> None:
+    """The first page has no earlier one; the next compares, and repeats while nothing changes."""
+    logs, out = write_archive(tmp_path / "logs", 2), tmp_path / "out"
+    run(logs, [modes_only], out)
+    assert "This is the first report on this stage" in (out / "test-A.html").read_text()
+    shutil.copy(write_archive(tmp_path / "more", 3) / "log-02.h5", logs)
+    run(logs, [modes_only], out)
+    second = (out / "test-A.html").read_text()
+    assert "Compared with the report on 2 logs" in second
+    assert "<li>1 log and " in second
+    run(logs, [modes_only], out)
+    assert (out / "test-A.html").read_text() == second
 
 
 def test_a_renamed_log_is_remembered(tmp_path: Path, modes_only: Stage) -> None:

@@ -12,15 +12,20 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 from matplotlib.axes import Axes
+from matplotlib.collections import QuadMesh
 from matplotlib.figure import Figure
 
 from lmshealth import plots, trackplots
 from lmshealth.arrays import FloatArray
+from lmshealth.decision import decide
+from lmshealth.influences import Influence
 from lmshealth.laws import HertzWear, Law, Loosening
 from lmshealth.priors import Lognormal, Normal
-from lmshealth.results import Health, Prognosis
+from lmshealth.results import Health, Line, Prognosis
+from lmshealth.stage import Decision
 from lmshealth.tracks import Effect, History, Series, Track
-from tests.lives import health_of
+from lmshealth.waterfall import Waterfall
+from tests.lives import cut, health_of
 
 MODES = ("roll", "pitch", "yaw")
 PARAMETERS = ("guide_preload", "mount_stiffness")
@@ -153,6 +158,7 @@ def make_prognosis(
         recorded_at=history.recorded_at[-1],
         travel=float(history.travel[-1]),
         parameters=(*PARAMETERS, "any"),
+        untold=(),
         limits=np.array([*limits, np.nan]),
         remaining=np.column_stack([remaining, remaining.min(axis=1)]),
         usage=12e3 * np.exp(rng.normal(0, 0.08, n)),
@@ -162,10 +168,12 @@ def make_prognosis(
         curve_quantiles=np.stack(
             [np.quantile(c, [0.05, 0.25, 0.5, 0.75, 0.95], axis=0) for c in curves], axis=-1
         ),
+        laws=(),
         chi_square=121.4,
         degrees_of_freedom=115,
         walk=8e-4,
         noise_scale=1.02,
+        deviation=0.0,
         ess=1830.0,
         r_hat=1.006,
     )
@@ -319,11 +327,23 @@ def test_life_shows_now_limit_and_horizon(ax: Axes, prognosis: Prognosis, health
 
 def test_survival_is_the_share_of_draws(ax: Axes, prognosis: Prognosis) -> None:
     """The curve is the share of draws that have not reached a limit."""
-    plots.plot_survival(ax, prognosis, max_risk=0.05)
+    plots.plot_survival(ax, prognosis, service=decide(prognosis, Decision()))
     x, y = data(ax, "no limit reached")
     share = [100 * np.mean(prognosis.remaining[:, -1] > km * 1000) for km in x]
     np.testing.assert_allclose(y, share)
     assert "accepted risk 5 %" in labels(ax)
+
+
+def test_survival_shows_the_risk_of_least_costs(ax: Axes, prognosis: Prognosis) -> None:
+    """Where costs choose the day the line is at its risk; where they choose none there is none."""
+    service = decide(prognosis, Decision(cost_ratio=20.0))
+    plots.plot_survival(ax, prognosis, service=service)
+    label = f"risk at least costs {100 * service.risk:.3g} %"
+    np.testing.assert_allclose(data(ax, label)[1], 100 * (1 - service.risk))
+    endless = replace(prognosis, remaining=np.full_like(prognosis.remaining, np.inf))
+    bare = Figure().add_subplot()
+    plots.plot_survival(bare, endless, service=decide(endless, Decision(cost_ratio=20.0)))
+    assert len(bare.get_lines()) == len(ax.get_lines()) - 1
 
 
 def test_survival_without_end(ax: Axes, prognosis: Prognosis) -> None:
@@ -345,6 +365,178 @@ def test_nis_band_is_chi_square(ax: Axes, track: Track) -> None:
     cdf = chi2.cdf(nis[seen], track.nis_dof[seen])
     assert data(ax, "outside")[0].size == np.sum((cdf < 0.025) | (cdf > 0.975))
     assert "log scale" in ax.get_ylabel()
+
+
+def make_waterfall(history: History) -> Waterfall:
+    """Make spectra with a peak at roll, a mains line in every log, and a log without levels."""
+    edges = np.geomspace(100.0, 180.0, 81)
+    centre = np.sqrt(edges[1:] * edges[:-1])
+    roll = np.exp(history.ln_frequency[:, 0])[:, None]
+    level = 12 - 3 * np.abs(centre - np.where(np.isnan(roll), FREQUENCY[0], roll)).clip(0, 6)
+    level[:, np.searchsorted(edges, 150.0) - 1] = 40.0
+    level[3] = np.nan
+    line = Line(150.0, 2e-3, "m/s²", "mains", "acc_feed")
+    return Waterfall(edges, level, tuple((line,) for _ in history.logs))
+
+
+def test_waterfall_shows_every_log_in_its_column(ax: Axes, history: History, track: Track) -> None:
+    """Colours are the levels, columns hold their logs, and lines do not decide the colours."""
+    waterfall = make_waterfall(history)
+    assert trackplots.plot_waterfall(ax, waterfall, history, track) is ax
+    mesh = next(c for c in ax.collections if isinstance(c, QuadMesh))
+    shown = np.ma.filled(mesh.get_array(), np.nan)[:, ::2].T
+    np.testing.assert_array_equal(shown, waterfall.level)
+    x = mesh.get_coordinates()[0, :, 0].reshape(-1, 2)
+    km = history.travel / 1000
+    assert (x[:, 0] < km).all() and (km < x[:, 1]).all()
+    assert mesh.get_clim() == (-10.0, 15.0)
+    np.testing.assert_allclose(data(ax, "mains line"), [km, np.full(EPOCHS, 150.0)])
+    np.testing.assert_allclose(
+        data(ax, "tracked modes, 95 % band")[1], np.exp(track.ln_frequency[:, 0])
+    )
+    assert ax.get_ylabel() == "frequency in Hz" and ax.get_yscale() == "linear"
+
+
+def test_waterfall_moves_the_modes_to_where_logs_saw_them(
+    ax: Axes, history: History, track: Track
+) -> None:
+    """What covariates did is added to the tracked frequencies."""
+    moved = np.linspace(0, 0.02, EPOCHS)[:, None] * np.ones(3)
+    trackplots.plot_waterfall(ax, make_waterfall(history), history, track, moved=moved)
+    np.testing.assert_allclose(
+        data(ax, "tracked modes, 95 % band")[1], np.exp(track.ln_frequency[:, 0] + moved[:, 0])
+    )
+
+
+def test_waterfall_leaves_a_gap_where_logs_are_missing(ax: Axes, history: History) -> None:
+    """Columns touch their neighbours, but not across a hole of several usual distances."""
+    travel = history.travel.copy()
+    travel[20:] += 10 * (travel[1] - travel[0])
+    apart = replace(history, travel=travel)
+    trackplots.plot_waterfall(ax, make_waterfall(apart), apart)
+    mesh = next(c for c in ax.collections if isinstance(c, QuadMesh))
+    left, right = mesh.get_coordinates()[0, :, 0].reshape(-1, 2).T
+    gaps = left[1:] - right[:-1]
+    usual = (travel[1] - travel[0]) / 1000
+    assert gaps[19] > 9 * usual
+    np.testing.assert_allclose(np.delete(gaps, 19), 0.0, atol=1e-9 * travel[-1])
+
+
+@pytest.mark.parametrize("still", [False, True])
+def test_waterfall_of_one_log_or_of_a_machine_at_rest(
+    ax: Axes, history: History, still: bool
+) -> None:
+    """One log is a column; several at one odometer are one place with some width."""
+    n = 5 if still else 1
+    few = cut(history, n)
+    few = replace(few, travel=np.full(n, few.travel[0]))
+    waterfall = make_waterfall(history)
+    own = Waterfall(waterfall.edges, waterfall.level[:n], waterfall.lines[:n])
+    trackplots.plot_waterfall(ax, own, few)
+    low, high = ax.get_xlim()
+    assert low < few.travel[0] / 1000 < high
+
+
+def test_waterfall_keeps_its_width_beside_long_names(history: History) -> None:
+    """A line with a long name takes a line of the legend, not the room of the picture."""
+    waterfall = make_waterfall(history)
+    long = replace(waterfall.lines[0][0], kind="a disturbance of unknown origin")
+    waterfall = replace(waterfall, lines=((long,), *waterfall.lines[1:]))
+    figure = Figure(figsize=(4.8, 3.6), layout="constrained")
+    ax = trackplots.plot_waterfall(figure.add_subplot(), waterfall, history)
+    figure.draw_without_rendering()
+    assert ax.get_position().width > 0.6
+
+
+def test_wide_waterfall_is_logarithmic(ax: Axes, history: History) -> None:
+    """A band over more than two octaves has a logarithmic axis."""
+    waterfall = replace(make_waterfall(history), edges=np.geomspace(20.0, 2000.0, 81))
+    trackplots.plot_waterfall(ax, waterfall, history)
+    assert ax.get_yscale() == "log"
+
+
+def test_influence_shows_before_and_after(ax: Axes, history: History) -> None:
+    """Points before and after stand at their numbers in %, the line is the effect with its band."""
+    values = history.covariates["temperature_c"]
+    effect = Effect("roll", "temperature_c", -1.2e-3, 1e-4)
+    rng = np.random.default_rng(5)
+    measured = -1.2e-3 * (values - 21) + 1e-4 * rng.standard_normal(EPOCHS)
+    one = Influence(
+        "roll", "temperature_c", 21.0, (effect,), np.arange(EPOCHS), np.array(values), measured
+    )
+    assert trackplots.plot_influence(ax, one, history) is ax
+    np.testing.assert_allclose(data(ax, "as measured"), [values, 100 * measured])
+    left = 100 * (measured + 1.2e-3 * (values - 21))
+    np.testing.assert_allclose(data(ax, "corrected"), [values, left])
+    x, y = data(ax, "taken out")
+    np.testing.assert_allclose(y, -0.12 * (x - 21))
+    band = next(c for c in ax.collections if c.get_alpha() == 0.18).get_paths()[0].vertices
+    np.testing.assert_allclose(
+        band[:, 1].max(), max(-0.12 * (x - 21) + 1.96e-2 * np.abs(x - 21)), rtol=1e-9
+    )
+    assert ax.get_xlabel() == "temperature in °C"
+    bent = replace(one, effects=(effect, replace(effect, covariate="temperature_c^2")))
+    plain = trackplots.plot_influence(Figure().add_subplot(), bent, history)
+    assert not [c for c in plain.collections if c.get_alpha() == 0.18]
+
+
+def titles(text: str) -> list[str]:
+    """Give what a picture tells where the pointer rests."""
+    tree = ElementTree.fromstring(text)
+    return [element.text or "" for element in tree.iter("{http://www.w3.org/2000/svg}title")]
+
+
+def test_hints_tell_the_values_of_points(history: History, track: Track) -> None:
+    """Every log that shows the mode has a title with its name and value on what feels a pointer."""
+    text = plots.svg(lambda ax: trackplots.plot_frequencies(ax, history, track, "roll"), salt="a")
+    told = titles(text)
+    seen = np.flatnonzero(np.isfinite(history.ln_frequency[:, 0]))
+    assert len(told) == seen.size
+    for one, k in zip(told, seen, strict=True):
+        assert one.startswith(f"{history.logs[k]}\n")
+        assert f"{np.exp(history.ln_frequency[k, 0]):.2f} ± " in one
+    assert "<a " not in text and text.count("</title>\n<use") + text.count("</title>\n<g") == len(
+        told
+    )
+
+
+def test_hints_of_dense_pictures_are_thinned() -> None:
+    """A thousand points have no more hints than a pointer can tell apart."""
+    x = np.arange(1000.0)
+    text = plots.svg(
+        lambda ax: plots.hints(ax, x, x, [f"point {k}" for k in range(1000)]), salt="a"
+    )
+    told = titles(text)
+    assert told[:2] == ["point 0", "point 4"] and len(told) == 250
+
+
+def test_hints_of_other_pictures(
+    history: History, track: Track, health: Health, prognosis: Prognosis
+) -> None:
+    """Health, passage, survival, NIS, columns and lines tell their numbers."""
+    told = titles(
+        plots.svg(lambda ax: plots.plot_health(ax, health, "guide_preload", 0.6), salt="a")
+    )
+    middle = 100 * np.median(health.samples[-1, :, 0])
+    assert len(told) == EPOCHS and f"guide preload {middle:.1f}" in told[-1]
+    told = titles(plots.svg(lambda ax: plots.plot_life(ax, prognosis, "guide_preload"), salt="a"))
+    assert [one.split(":")[0] for one in told] == ["Early (5 %)", "Median", "Late (95 %)"]
+    told = titles(plots.svg(lambda ax: plots.plot_survival(ax, prognosis), salt="a"))
+    assert told[0] == "after 0\u202fkm: 100\u202f%" and len(told) == 25
+    told = titles(plots.svg(lambda ax: trackplots.plot_nis(ax, track), salt="a"))
+    assert len(told) == EPOCHS and f"NIS {track.nis[-1]:.1f}" in told[-1]
+    waterfall = make_waterfall(history)
+    told = titles(plots.svg(lambda ax: trackplots.plot_waterfall(ax, waterfall, history), salt="a"))
+    assert len(told) == 2 * EPOCHS
+    assert f"yaw {np.exp(history.ln_frequency[0, 2]):.2f}" in told[0]
+    assert "mains line at 150.00\u202fHz, 0.002\u202fm/s² in acc_feed" in told[EPOCHS]
+
+
+def test_health_that_is_not_told_gives_no_values(history: History) -> None:
+    """What is mostly assumption shows no number under the pointer either."""
+    health = make_health(history, life(8000, 0.68)[1], (0.9, 0.1))
+    text = plots.svg(lambda ax: plots.plot_health(ax, health, PARAMETERS[1], None), salt="a")
+    assert titles(text) == []
 
 
 def test_svg_repeats_and_stands_alone(history: History, track: Track) -> None:
@@ -372,3 +564,12 @@ def test_svg_survives_hostile_names(prognosis: Prognosis) -> None:
     text = plots.svg(lambda ax: plots.plot_survival(ax, strange), salt="x")
     assert "<script" not in text
     ElementTree.fromstring(text)
+
+
+def test_hints_survive_hostile_names(history: History) -> None:
+    """Markup, quotes, formula signs and ends of links in a log's name are text in its title."""
+    evil = "'\"></a><script>alert(1)</script>$x_2$ url(#a) &amp;"
+    strange = replace(history, logs=(evil, *history.logs[1:]))
+    text = plots.svg(lambda ax: trackplots.plot_damping(ax, strange, None, "roll"), salt="x")
+    assert "<script" not in text
+    assert titles(text)[0].replace("#x-", "#").startswith(evil)

@@ -116,6 +116,25 @@ def test_covariate_names_are_unique(tmp_path: Path) -> None:
         make_stage(tmp_path, tail=tail)
 
 
+def test_one_thing_chooses_the_service_date(tmp_path: Path) -> None:
+    """A risk and a ratio of costs together are refused by line and key; 5 % where neither is."""
+    both = "[decision]\nmax_risk = 0.1\ncost_ratio = 20\n"
+    with pytest.raises(
+        BadStage,
+        match=r"line \d+: decision\.cost_ratio: cost_ratio = 20 and max_risk = 0\.1 would each",
+    ):
+        make_stage(tmp_path, tail=both)
+    with pytest.raises(BadStage, match=r"line \d+: decision\.cost_ratio: Expected `float` > 1"):
+        make_stage(tmp_path, tail="[decision]\ncost_ratio = 1.0\n")
+    for tail, risk, ratio in (
+        ("", 0.05, None),
+        ("[decision]\nmax_risk = 0.1\n", 0.1, None),
+        ("[decision]\ncost_ratio = 20\n", None, 20.0),
+    ):
+        decision = make_stage(tmp_path, tail=tail).description.decision
+        assert (decision.accepted, decision.cost_ratio) == (risk, ratio)
+
+
 def test_a_baseline_outside_the_map_is_refused(tmp_path: Path) -> None:
     """The state at baseline has to be on the map."""
     with pytest.raises(

@@ -8,6 +8,8 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
+PARTS = ("preload", "mount")
+
 
 def run_study(root: Path, name: str) -> str:
     """Run the quick form of a study from the project's folder."""
@@ -236,17 +238,25 @@ def test_sbc_epoch(root: Path) -> None:
 
 
 def test_sbc_life(root: Path) -> None:
-    """Ranks of laws, health and remaining life are uniform; with half the covariance some are not.
-
-    So few lives tell halved covariances by all coverages together.
-    """
+    """Ranks of health and remaining life are uniform; who takes every part to lose is found out."""
     answer = json.loads(run_study(root, "sbc_life"))
     assert all(answer["passed"].values())
-    share = {
-        kind: sum(row["coverage"][1]["share"] for row in answer["ranks"][kind].values()) / 9
-        for kind in ("posterior", "all covariances halved")
+    assert answer["not_converged"] == 0
+    # A part that keeps its health lies below all draws of who says that it cannot.
+    low = {
+        kind: sum(answer["ranks"][kind][f"{name} is lost"]["histogram"][0] for name in PARTS)
+        for kind in ("posterior", "every part taken to lose")
     }
-    assert share["all covariances halved"] < 0.82 < share["posterior"]
+    lives = {kind: answer["ranks"][kind]["preload now"]["n"] for kind in low}
+    assert low["posterior"] < 0.2 * 2 * lives["posterior"]
+    assert low["every part taken to lose"] > 0.25 * 2 * lives["every part taken to lose"]
+
+
+def test_lifetimes_raw(root: Path) -> None:
+    """From raw logs to the remaining life: two lives of eight logs are told, none refused."""
+    answer = json.loads(run_study(root, "lifetimes_raw"))
+    assert answer["refused"] == []
+    assert all(answer["passed"].values())
 
 
 def test_one_guide(root: Path) -> None:

@@ -1,10 +1,9 @@
-"""Verdicts in one word, and the day of the next service."""
+"""Verdicts in one word."""
 
 from __future__ import annotations
 
 import re
 from dataclasses import replace
-from datetime import timedelta
 from pathlib import Path
 
 import numpy as np
@@ -12,17 +11,15 @@ import pytest
 
 from lmshealth.arrays import FloatArray
 from lmshealth.stage import Stage
-from lmshealth.summary import degraded_below, judge, service_date
+from lmshealth.summary import degraded_below, judge
 from lmshealth.tracks import Event, History, Track
 from tests.lives import (
     FOOT,
     FREQUENCY,
     MOUNT,
     PRELOAD,
-    START,
     make_health,
     make_history,
-    make_prognosis,
     make_stage,
     make_track,
 )
@@ -147,34 +144,3 @@ def test_a_parameter_with_a_unit_is_told_in_it(tmp_path: Path) -> None:
     stage = make_stage(tmp_path, (PRELOAD.replace("limit", 'unit = "kN"\nlimit'), MOUNT))
     found = judge(stage, logs(8), make_health(around(0.8, 0.99)))
     assert re.search(r"Guide preload is 0\.(79|80)\d* kN \(90 %: 0\.79", found.why)
-
-
-def test_the_service_day_is_the_last_with_the_risk_allowed() -> None:
-    """With one draw in ten failing per day, a risk of 0.3 lasts to the day of the third."""
-    remaining = np.arange(1, 11) * 1e4
-    prognosis = make_prognosis(remaining, np.full(10, 1e4))
-    for risk, days in ((0.05, 1), (0.35, 4), (0.95, 9)):
-        day = service_date(prognosis, risk)
-        assert day == (START + timedelta(days=days)).date()
-        wait = (day - START.date()).days
-        assert np.mean(remaining / 1e4 < wait) <= risk
-
-
-def test_a_limit_that_is_passed_asks_for_service_today() -> None:
-    """More risk than allowed already: the day of the last log, not one before it."""
-    prognosis = make_prognosis(np.full(100, -5e5), np.full(100, 1e4))
-    assert service_date(prognosis, 0.05) == START.date()
-
-
-def test_no_service_is_asked_for_past_the_horizon() -> None:
-    """A quantile past the horizon, or never, is no date."""
-    assert service_date(make_prognosis(np.full(100, 2e7), np.full(100, 1e4)), 0.05) is None
-    assert service_date(make_prognosis(np.full(100, np.inf), np.full(100, 1e4)), 0.05) is None
-    few = np.r_[np.full(4, 1e5), np.full(96, np.inf)]
-    assert service_date(make_prognosis(few, np.full(100, 1e4)), 0.05) is None
-
-
-def test_an_idle_machine_needs_no_service_within_any_calendar() -> None:
-    """A day past the last one of the calendar is no date, and no error."""
-    prognosis = make_prognosis(np.full(100, 9e6), np.full(100, 1.0))
-    assert service_date(prognosis, 0.05) is None

@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from datetime import UTC, datetime
+from datetime import UTC, date, datetime
 
 import numpy as np
 import pandas as pd
 import pytest
 
+from lmshealth.decision import decide, reached_before
 from lmshealth.history import Reading
 from lmshealth.logs import Metadata, Refusal
 from lmshealth.results import Judgement, Line, Modes, Prognosis
-from lmshealth.stage import Stage, load_stage
+from lmshealth.stage import Decision, Stage, load_stage
 from lmshealth.summary import Assessment
-from lmshealth.tables import COLUMNS, all_tables, frame, modes_rows, track_rows
+from lmshealth.tables import COLUMNS, all_tables, frame, modes_rows, prognosis_rows, track_rows
 from lmshealth.tracks import Effect, Event, History, Series, Smoothed, Track
 from tests.lives import health_of
 from tests.signals import write_archive_stage
@@ -53,6 +54,7 @@ def prognosis(remaining: np.ndarray, usage: float = 10_000.0) -> Prognosis:
         recorded_at=WHEN,
         travel=5e5,
         parameters=("guide_preload", "any"),
+        untold=(),
         limits=np.array([0.6, np.nan]),
         remaining=np.column_stack([remaining, remaining]),
         usage=np.full(n, usage),
@@ -60,10 +62,12 @@ def prognosis(remaining: np.ndarray, usage: float = 10_000.0) -> Prognosis:
         health=np.full((n, 1), 0.9),
         curve_travel=np.array([0.0, 1.0]),
         curve_quantiles=np.ones((5, 2, 1)),
+        laws=(),
         chi_square=1.0,
         degrees_of_freedom=1,
         walk=0.0,
         noise_scale=1.0,
+        deviation=0.0,
         ess=1000.0,
         r_hat=1.0,
     )
@@ -222,7 +226,8 @@ def test_a_life_wholly_past_the_horizon_has_no_quantile_and_no_service(stage: St
     assert row["parameter"] == "any"
     assert row["censored_from"] == 0.05
     assert all(pd.isna(row[f"rul_km_{level}"]) for level in LEVELS)
-    assert pd.isna(row["service_by"])
+    assert pd.isna(row["service_by"]) and pd.isna(row["service_risk"])
+    assert row["service"] == "later"
 
 
 def test_a_limit_already_passed_has_no_life_left(stage: Stage) -> None:
@@ -231,6 +236,18 @@ def test_a_limit_already_passed_has_no_life_left(stage: Stage) -> None:
     assert (made["rul_km_q05"] == 0).all()
     assert (made["probability_already_past"] == 1).all()
     assert made["service_by"].iloc[1] == WHEN.date()
+    assert made["service"].iloc[1] == "now" and made["service"].isna().iloc[0]
+    assert made["service_risk"].iloc[1] == 1
+
+
+def test_a_day_that_is_asked_for_has_columns_of_its_own() -> None:
+    """The day and the two bounds of its probability stand after all other columns."""
+    life = prognosis(np.r_[np.full(50, 1e5), np.full(50, np.inf)])
+    day = date(2046, 1, 1)
+    before = day, reached_before(life, day)
+    table = frame(COLUMNS["prognosis"], prognosis_rows(life, decide(life, Decision()), before))
+    assert list(table.columns[-3:]) == ["before", "probability_at_least", "probability_at_most"]
+    assert table[table.columns[-3:]].to_numpy().tolist() == 2 * [[day, 0.5, 1.0]]
 
 
 def test_refusals_are_rows() -> None:

@@ -1,11 +1,13 @@
 """Take the README's picture: the first screen of the report that `make demo` wrote.
 
-Needs Debian's chromium and the demo's result; run it after `make demo`.
+Run by `make picture`; needs chromium. Another report is named as the only argument:
+`python -m studies.demo_life.picture FOLDER`.
 """
 
 from __future__ import annotations
 
 import shutil
+import sys
 from pathlib import Path
 
 from PIL import Image
@@ -15,20 +17,26 @@ HERE = Path(__file__).parent
 PAGES = HERE.parents[1] / "demo" / "result"
 
 
-def main() -> None:
-    """Write report.png in few colours, so that it stays small."""
-    page_path = next(path for path in sorted(PAGES.glob("*.html")) if path.name != "index.html")
+def main(folder: Path = PAGES) -> None:
+    """Write report.png down to the end of the first screen, in few colours: it stays small."""
+    pages = [path for path in sorted(folder.glob("*.html")) if path.name != "index.html"]
+    if not pages:
+        sys.exit(f"{folder} holds no report: run `make demo` first")
     target = HERE / "report.png"
     with sync_playwright() as play:
         browser = play.chromium.launch(
             executable_path=shutil.which("chromium"), args=["--no-sandbox"]
         )
-        page = browser.new_page(viewport={"width": 1120, "height": 690})
-        page.goto(page_path.as_uri())
-        page.screenshot(path=target)
+        page = browser.new_page(viewport={"width": 1120, "height": 900})
+        page.goto(pages[0].resolve().as_uri())
+        box = page.locator("section.first").bounding_box()
+        below = box["y"] + box["height"] if box else 690.0
+        page.screenshot(path=target, clip={"x": 0, "y": 0, "width": 1120, "height": below + 16})
         browser.close()
-    Image.open(target).convert("RGB").quantize(96).save(target, optimize=True)
+    Image.open(target).convert("RGB").quantize(128, Image.Quantize.MAXCOVERAGE).save(
+        target, optimize=True
+    )
 
 
 if __name__ == "__main__":
-    main()
+    main(*map(Path, sys.argv[1:2]))

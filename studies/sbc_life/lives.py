@@ -233,6 +233,8 @@ def _offsets(
     second = [one.mode in {other.mode for other in series[:i]} for i, one in enumerate(series)]
     total = np.tile(second * rng.normal(0, BIAS_STD[0], len(series)), (N_LOGS, 1))
     for step in steps:
+        if step.kind == "step":  # health itself jumps
+            continue
         jump = rng.normal(0, JUMP_STD[step.kind][0], len(series))[mode]
         seen = [step.source in ("", one.source) for one in series]
         total += np.outer(step.there, jump * seen)

@@ -1,0 +1,111 @@
+"""What the terminal says of remaining lives: the numbers of the tables, and words for the rest."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from datetime import date, timedelta
+
+import numpy as np
+import pytest
+
+from lmshealth.decision import decide, reached_before
+from lmshealth.lifeview import due, print_assessments, print_life
+from lmshealth.results import LawWeight, Prognosis
+from lmshealth.stage import Decision
+from lmshealth.summary import Assessment
+from lmshealth.tables import prognosis_rows
+from tests.lives import START, make_prognosis
+from tests.test_report import blind, make, nothing
+
+__all__ = ["make"]
+Said = Callable[[], str]
+
+
+@pytest.fixture
+def said(capsys: pytest.CaptureFixture[str]) -> Said:
+    """Return what was printed since the last time."""
+    return lambda: capsys.readouterr().out
+
+
+def shown(life: Prognosis, decision: Decision, said: Said, by: date | None = None) -> str:
+    """Print a life and return the text."""
+    before = None if by is None else (by, reached_before(life, by))
+    service = decide(life, decision)
+    print_life(life, service, prognosis_rows(life, service, before))
+    return said()
+
+
+def test_the_numbers_are_those_of_the_table(said: Said) -> None:
+    """A line per level with km, hours, days and the date; of one limit "any" is not repeated."""
+    life = make_prognosis(np.linspace(1e5, 1e6, 1001), np.full(1001, 1e4))
+    text = shown(life, Decision(next_service=date(2026, 4, 1)), said, date(2026, 4, 1))
+    row = prognosis_rows(life, decide(life, Decision()))[0]
+    line = next(line for line in text.splitlines() if " 50 " in line).split()
+    days = row["rul_days_q50"]
+    day = (START + timedelta(days=days)).date().isoformat()
+    km, hours = row["rul_km_q50"], row["rul_hours_q50"]
+    assert line[-5:] == ["50", f"{km:,.0f}", f"{hours:,.0f}", f"{days:,.1f}", day]
+    assert "guide preload below 0.6" in text and "any limit" not in text
+    assert "already: below 1 %" in text and "before 2026-04-01: 23 %" in text
+    service = decide(life, Decision())
+    assert f"Service: by {service.by} (accepted risk 5 %)" in text
+    assert "Before the service planned for 2026-04-01: 23 %" in text
+
+
+def test_what_is_past_the_horizon_has_no_number(said: Said) -> None:
+    """Censored levels say so; of a life that is past its limit the service is now."""
+    life = make_prognosis(np.r_[np.full(40, 1e6), np.full(60, np.inf)], np.full(100, 1e4))
+    text = shown(life, Decision(), said)
+    assert text.count("beyond 10,000 ") == 4 + 1
+    assert "beyond 10,000 km: 60 %" in text and "inf" not in text and "nan" not in text
+    late = make_prognosis(np.r_[np.full(90, -1e6), np.full(10, np.inf)], np.full(100, 1e4))
+    text = shown(late, Decision(cost_ratio=9.0), said)
+    assert "Service: now (least costs, where a failure costs 9 times a service)" in text
+    assert "reached already, at most: 90 %" in text
+    text = shown(make_prognosis(np.full(9, np.inf), np.full(9, 1e4)), Decision(), said)
+    assert "no service needed yet" in text and "Nothing asks for one within 10,000 km" in text
+    idle = make_prognosis(np.full(9, 9e6), np.full(9, 1.0))
+    text = shown(idle, Decision(), said)
+    assert "no date" in text and "past any" in text and "no calendar" in text
+
+
+def test_laws_and_what_no_mode_tells_are_named(said: Said) -> None:
+    """Laws with their probability, improbable ones left out; a limit nobody sees is no part."""
+    life = make_prognosis(np.full(9, 1e6), np.full(9, 1e4))
+    assert "Law of" not in shown(life, Decision(), said)
+    weights = (("linear", 0.0, 0.7), ("none", 3e5, 0.295), ("power", 0.0, 0.005))
+    laws = tuple(LawWeight("guide_preload", *weight) for weight in weights)
+    text = shown(replace(life, laws=laws, untold=("mount_stiffness",)), Decision(), said)
+    told = "Law of guide preload: linear 70 %, none from 300 km after the baseline 30 %."
+    assert told in text and "power" not in text
+    assert "The modes cannot tell mount stiffness" in text
+
+
+def test_a_few_machines_are_told_in_full(make: Callable[..., Assessment], said: Said) -> None:
+    """Verdict, gauges, remaining life of every limit and of any, and the service; worst first."""
+    good, bad = make("A", wear_km=400000, floor=0.98), make("B")
+    print_assessments([good, blind(bad), nothing(make("C"))])
+    text = said()
+    assert text.index("B: both (93 %). Roll") < text.index("C: not-enough-data. 2 logs")
+    assert text.index("C: not") < text.index("A: healthy (97 %)")
+    assert bad.health is not None
+    low, middle, high = 100 * bad.health.quantile(np.array([0.05, 0.5, 0.95]))[:, -1, 0]
+    assert f"guide preload {middle:.0f} % ({low:.0f} to {high:.0f})" in text
+    assert "mount stiffness not told" in text
+    assert text.count("any limit") == 2
+    assert f"Service: by {bad.service().by}" in text
+
+
+def test_many_machines_have_a_row_each(make: Callable[..., Assessment], said: Said) -> None:
+    """Twenty rows, the worst first, the rest counted; nothing runs off the terminal."""
+    good, bad = make("good", wear_km=400000, floor=0.98), make("worst")
+    fleet = [replace(good, judgement=replace(good.judgement, stage=f"M{k}")) for k in range(21)]
+    print_assessments([*fleet, bad])
+    text = said()
+    rows = [line for line in text.splitlines() if "healthy" in line or "both" in line]
+    assert len(rows) == 20 and rows[0].strip().startswith("worst")
+    assert due(bad.service()) in rows[0]
+    assert "22 stages" in text and "2 more stages" in text
+    assert max(map(len, text.splitlines())) <= 80
+    assert "…" not in text
