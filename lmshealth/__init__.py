@@ -19,8 +19,8 @@ from lmshealth.planning import plan
 from lmshealth.prognosis import prognose
 from lmshealth.readers import read_log
 from lmshealth.stage import load_stage
-from lmshealth.summary import judge
 from lmshealth.tracking import track
+from lmshealth.verdict import judge
 
 __version__ = version("lmshealth")
 

@@ -7,8 +7,8 @@ from datetime import date, datetime
 
 import numpy as np
 
-from lmshealth.results import Verdict
 from lmshealth.summary import Assessment
+from lmshealth.verdict import Verdict
 from lmshealth.wording import GAP, LEVELS, km, left, percent, quantiles, spell
 
 _WORDS: dict[Verdict, str] = {

@@ -10,6 +10,7 @@ from lmshealth.courses import Branch
 # Points up to where the law alone would be well past the limit, and from there to the horizon.
 _NEAR, _FAR = 24, 12
 _BEYOND = 1.5
+_RARE = 1e-9
 
 
 def first_passage(
@@ -27,8 +28,10 @@ def first_passage(
 
     Ln health is that of the law plus a Wiener process, which is ``off`` now. Without the process
     the passage is that of the law, in closed form. With it, the process is drawn at few moments,
-    and what it does between two of them is a Brownian bridge, which touches a straight limit with
-    probability exp(-2 a b / σ²), a and b its distances from the limit at both ends.
+    and what it does between two of them is a Brownian bridge over the variance v, which touches a
+    straight limit with probability exp(-2 a b / v), a and b its distances from the limit at both
+    ends; the odds of the part of the way at which it first does are inverse Gaussian, of mean
+    a / abs(b) and shape a² / v.
 
     Parameters
     ----------
@@ -54,6 +57,10 @@ def first_passage(
     ndarray
         In m, shape ``(n,)``: negative where it has been passed, by so much by the law; infinite
         where it is never reached or, if the process moves, not before the horizon.
+
+    References
+    ----------
+    Borodin2002 for the bridge.
     """
     left = branch.passage(theta, limit * np.exp(-off)) - now
     moving = (rate > 0) & (left > 0)
@@ -100,6 +107,9 @@ def _wandering(
     a, b, begin, length = (
         np.take_along_axis(part, first, axis=1)[:, 0] for part in (a, b, ahead[:, :-1], step)
     )
-    with np.errstate(invalid="ignore"):
-        share = np.where(np.isneginf(b), 0.5, a / (a + np.abs(b)))
-    return np.where(crossed.any(axis=1), begin + length * np.clip(share, 0, 1), np.inf)
+    # When a bridge of length T that touches 0 does so first: t / (T - t) is inverse Gaussian.
+    spread = rate * length
+    with np.errstate(divide="ignore", invalid="ignore"):
+        odds = rng.wald(np.clip(a / np.abs(b), _RARE, 1 / _RARE), np.maximum(a * a / spread, _RARE))
+    share = np.where(np.isneginf(b), 0.5, odds / (1 + odds))
+    return np.where(crossed.any(axis=1), begin + length * share, np.inf)

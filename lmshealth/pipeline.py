@@ -21,10 +21,11 @@ from lmshealth.results import Health, Prognosis
 from lmshealth.sampling import seed_of
 from lmshealth.stage import Stage
 from lmshealth.store import Fleet, Store, beside
-from lmshealth.summary import Assessment, judge
+from lmshealth.summary import Assessment
 from lmshealth.tables import all_tables
 from lmshealth.tracking import track
 from lmshealth.tracks import History, Track
+from lmshealth.verdict import judge
 from lmshealth.waterfall import Waterfall
 
 

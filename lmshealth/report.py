@@ -53,6 +53,7 @@ from lmshealth.wording import (
     covariate,
     day_count,
     km,
+    law_words,
     left,
     moment,
     percent,
@@ -219,6 +220,7 @@ def _evidence(assessment: Assessment) -> dict[str, Any]:
         "filter": None if track is None else filter_health(track),
         "noise_scale": None if track is None else float(track.noise_scale[-1].max()),
         "largest_drift": float(np.nanmax(drift, initial=0.0)),
+        "laws": [] if prognosis is None else list(_laws(prognosis)),
         "law": prognosis and fit(prognosis.chi_square, prognosis.degrees_of_freedom),
         "effects": [] if track is None else [effect_row(effect) for effect in other_effects(track)],
         "reasons": Counter(item.reason for item in assessment.refused).most_common(),
@@ -288,6 +290,13 @@ def _life(prognosis: Prognosis, column: int) -> Life:
         beyond=percent(float(prognosis.beyond_horizon()[column])),
         now="" if name == "any" else f"{middle:.0f}{GAP}% ({low:.0f} to {high:.0f}{GAP}%)",
     )
+
+
+def _laws(prognosis: Prognosis) -> Iterator[tuple[str, str, str, str]]:
+    """Say what each parameter may do: its name, the law, since when, and how probably."""
+    for law in prognosis.laws:
+        since = km(law.begin) if law.begin else ""
+        yield spell(law.parameter), law_words(law.kind), since, percent(law.probability)
 
 
 def _pictures(

@@ -10,7 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from itertools import combinations
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pandas as pd
@@ -432,31 +432,3 @@ class Prognosis:
     def already_past(self) -> FloatArray:
         """Probability that each limit has been passed already, shape ``(n_parameters + 1,)``."""
         return np.asarray(np.mean(self.remaining <= 0, axis=0))
-
-
-Verdict = Literal["healthy", "preload", "mount", "both", "step", "not-enough-data"]
-
-
-@dataclass(frozen=True, slots=True)
-class Judgement:
-    """What is said about a stage in one word, with its probability.
-
-    Attributes
-    ----------
-    stage : str
-        Identity of the machine.
-    recorded_at : datetime
-        The last log.
-    verdict : str
-        One of the words of ``verdict.csv``.
-    probability : float
-        Posterior probability of that word; NaN for ``not-enough-data``.
-    why : str
-        One sentence for the reader of the report.
-    """
-
-    stage: str
-    recorded_at: datetime
-    verdict: Verdict
-    probability: float
-    why: str

@@ -1,18 +1,17 @@
-"""What is said about a stage: the verdict, and everything the report tells, in one noun."""
+"""Everything that is said about a stage, in one noun."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import expit
 
-from lmshealth.arrays import BoolArray
 from lmshealth.decision import Service, decide
 from lmshealth.logs import Refusal
-from lmshealth.results import Health, Judgement, Prognosis, Verdict
-from lmshealth.stage import ParameterSpec, Stage
-from lmshealth.tracks import Event, History, Track
+from lmshealth.results import Health, Prognosis
+from lmshealth.stage import Stage
+from lmshealth.tracks import History, Track
+from lmshealth.verdict import Judgement
 from lmshealth.waterfall import Waterfall
 
 
@@ -72,143 +71,3 @@ class Assessment:
         days = self.service().wait
         group = 2 if verdict == "healthy" and np.isinf(days) else 0
         return group, days, float(self.prognosis.beyond_horizon()[-1]), identity
-
-
-# A parameter counts as degraded once this share of what it may lose is gone.
-DEGRADED_SHARE = 0.25
-_LOSS_WITHOUT_LIMIT = 0.4
-
-
-def degraded_below(parameter: ParameterSpec) -> float:
-    """Value of a parameter below which it counts as degraded."""
-    limit = (
-        parameter.limit.below
-        if parameter.limit
-        else (parameter.baseline * (1 - _LOSS_WITHOUT_LIMIT))
-    )
-    return parameter.baseline - DEGRADED_SHARE * (parameter.baseline - limit)
-
-
-def judge(
-    stage: Stage, history: History, health: Health | None, track: Track | None = None
-) -> Judgement:
-    """Say in one word what the last epoch shows, with its posterior probability.
-
-    Parameters
-    ----------
-    stage : Stage
-        Says what counts as degraded and which word tells it.
-    history : History
-        All logs.
-    health : Health or None
-        Posterior of the parameters; None when they could not be inferred.
-    track : Track, optional
-        Says whether something happened at once since the baseline.
-
-    Returns
-    -------
-    Judgement
-        ``not-enough-data`` when there are fewer logs than make a baseline, when the sampler did
-        not converge, when no state of the parameters explains the drifts, or when the data say
-        nothing about any parameter; ``step`` when the modes
-        jumped since the baseline and nobody said why.
-    """
-    jumps = [] if track is None else unexplained_steps(track, history.baseline)
-    if jumps:
-        return _judge_step(stage, history, health, jumps)
-    needed = stage.description.baseline.logs
-    reason = ""
-    since = len(history.logs) - history.baseline
-    if since < needed:
-        reason = f"{since} usable logs since the baseline began; it needs {needed}."
-    elif health is None:
-        reason = "The logs do not carry the health parameters."
-    elif not health.converged[-1]:
-        reason = "The sampler did not converge, so nothing is claimed."
-    elif not health.explained:
-        reason = (
-            "No state of the parameters on the map explains the drifts "
-            f"(p = {health.fit[-1]:.1g}): something else moved the modes, or the map is wrong."
-        )
-    elif not health.told().any():
-        reason = "These logs move the prior of no parameter: the stage looks the same either way."
-    if reason or health is None:
-        return Judgement(
-            history.stage, history.recorded_at[-1], "not-enough-data", float("nan"), reason
-        )
-    return _judge_posterior(stage, history, health)
-
-
-def unexplained_steps(track: Track, baseline: int) -> list[Event]:
-    """Give the steps of the modes since a log that no maintenance declares, one per mode."""
-    return [
-        event
-        for event in track.events
-        if event.kind == "step" and not event.declared and event.epoch > baseline
-    ]
-
-
-def _judge_step(
-    stage: Stage, history: History, health: Health | None, jumps: list[Event]
-) -> Judgement:
-    last = max(event.epoch for event in jumps)
-    sizes = ", ".join(
-        f"{event.mode} {100 * np.expm1(event.size):+.1f} %".replace("-", "−")
-        for event in jumps
-        if event.epoch == last
-    )
-    when = history.recorded_at[last].date().isoformat()
-    why = (
-        f"The frequencies jumped before the log of {when} ({sizes}), and no maintenance tells why."
-    )
-    if health is not None and health.converged[-1] and health.told().any():
-        why += " " + _why(stage, health, np.flatnonzero(health.told()).tolist())
-    evidence = max(event.evidence for event in jumps)
-    return Judgement(history.stage, history.recorded_at[-1], "step", float(expit(evidence)), why)
-
-
-def _judge_posterior(stage: Stage, history: History, health: Health) -> Judgement:
-    told = np.flatnonzero(health.told()).tolist()
-    lost: dict[str, BoolArray] = {
-        word: np.zeros(health.samples.shape[1], dtype=bool) for word in ("preload", "mount")
-    }
-    for j in told:
-        parameter = stage.parameters[j]
-        lost[parameter.word] |= health.samples[-1, :, j] < degraded_below(parameter)
-    preload, mount = lost["preload"], lost["mount"]
-    probabilities: dict[Verdict, float] = {
-        "healthy": float(np.mean(~preload & ~mount)),
-        "preload": float(np.mean(preload & ~mount)),
-        "mount": float(np.mean(mount & ~preload)),
-        "both": float(np.mean(preload & mount)),
-    }
-    verdict = max(probabilities, key=lambda word: probabilities[word])
-    return Judgement(
-        stage=history.stage,
-        recorded_at=history.recorded_at[-1],
-        verdict=verdict,
-        probability=probabilities[verdict],
-        why=_why(stage, health, told),
-    )
-
-
-def _why(stage: Stage, health: Health, told: list[int]) -> str:
-    low, middle, high = health.quantile(np.array([0.05, 0.5, 0.95]))[:, -1]
-    sentences = []
-    for j, parameter in enumerate(stage.parameters):
-        name = parameter.name.replace("_", " ").capitalize()
-        if not health.identifiable[-1, j]:
-            sentences.append(f"{name}: the tracked modes cannot tell.")
-        elif j not in told:
-            sentences.append(f"{name}: these logs do not tell.")
-        elif parameter.unit:
-            sentences.append(
-                f"{name} is {middle[j]:.4g} {parameter.unit} (90 %: {low[j]:.4g} to {high[j]:.4g})."
-            )
-        else:
-            low_j, middle_j, high_j = (100 * q[j] / parameter.baseline for q in (low, middle, high))
-            sentences.append(
-                f"{name} is at {middle_j:.0f} % of its baseline value "
-                f"(90 %: {low_j:.0f} to {high_j:.0f} %)."
-            )
-    return " ".join(sentences)

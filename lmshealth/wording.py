@@ -26,6 +26,18 @@ def covariate(column: str) -> tuple[str, str]:
     return (spell(name), _UNITS[unit]) if name and unit in _UNITS else (spell(column), "")
 
 
+def law_words(kind: str) -> str:
+    """Say what a law of a stage description does."""
+    words = {
+        "hertz-wear": "wear of the contacts (Hertz)",
+        "loosening": "loosening towards a floor",
+        "power": "loss as a power of travel",
+        "linear": "loss in proportion to travel",
+        "none": "no change",
+    }
+    return words.get(kind, kind)
+
+
 def moment(when: datetime) -> str:
     """Write a moment for people."""
     return when.strftime("%Y-%m-%d %H:%M %Z").strip()

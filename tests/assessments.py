@@ -11,9 +11,9 @@ import numpy as np
 from msgspec.structs import asdict
 
 from lmshealth.logs import Refusal
-from lmshealth.results import Judgement
 from lmshealth.summary import Assessment
 from lmshealth.tracks import Event, Step
+from lmshealth.verdict import Judgement
 from tests.test_plots import (
     life,
     make_health,

@@ -73,6 +73,7 @@ FLOORS = [
     {"findings", "density"},
     {"lifefit"},
     {"prognosis"},
+    {"verdict"},
     {"summary", "plots"},
     {"changes", "tables", "trackplots"},
     {"store", "trackfacts"},

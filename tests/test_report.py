@@ -23,10 +23,11 @@ from lmshealth.changes import reported
 from lmshealth.influences import find_influences
 from lmshealth.logs import Refusal
 from lmshealth.report import write_report
-from lmshealth.results import Judgement, Prognosis
+from lmshealth.results import Prognosis
 from lmshealth.stage import Decision, Stage, load_stage
 from lmshealth.summary import Assessment
 from lmshealth.tracks import Series
+from lmshealth.verdict import Judgement
 from tests.test_plots import (
     FREQUENCY,
     MODES,

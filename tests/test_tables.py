@@ -12,11 +12,12 @@ import pytest
 from lmshealth.decision import decide, reached_before
 from lmshealth.history import Reading
 from lmshealth.logs import Metadata, Refusal
-from lmshealth.results import Judgement, Line, Modes, Prognosis
+from lmshealth.results import Line, Modes, Prognosis
 from lmshealth.stage import Decision, Stage, load_stage
 from lmshealth.summary import Assessment
 from lmshealth.tables import COLUMNS, all_tables, frame, modes_rows, prognosis_rows, track_rows
 from lmshealth.tracks import Effect, Event, History, Series, Smoothed, Track
+from lmshealth.verdict import Judgement
 from tests.lives import health_of
 from tests.signals import write_archive_stage
 

@@ -41,14 +41,14 @@ import numpy as np
 from lmshealth.bounds import long_record_law
 from lmshealth.epoch import EpochPosterior
 from lmshealth.errors import BadQuestion
+from lmshealth.importance import explore_well
 from lmshealth.metrics import clopper_pearson
 from lmshealth.planning import plan
 from lmshealth.sight import sight_of
 from lmshealth.stage import Stage, load_stage
 from models.lives import Plan
 from models.plant import GUIDE_MODES
-from studies.importance import Array, believed
-from studies.lives import life_of, rng_of
+from studies.lives import Array, life_of, rng_of
 from studies.raw_lives import identified
 from studies.record import LEVEL, Stopwatch, judge_coverage, keep
 
@@ -174,7 +174,7 @@ def called(
     modes = stage.informative
     drift = stage.drift(x[None], modes)[0] + np.sqrt(variance) * rng.standard_normal(variance.size)
     posterior = EpochPosterior.of(stage, modes, drift, np.diag(variance))
-    draws = believed(posterior.log_probability, _about(stage, x, variance, rng), rng, 1200)
+    draws = explore_well(posterior.log_probability, _about(stage, x, variance, rng), rng, 1200)
     lost = draws.weight @ (draws.points[:, j] < stage.baseline_point[j])
     return bool(lost > 1 - FALSE_ALARM)
 

@@ -8,17 +8,18 @@ from typing import Any
 
 import numpy as np
 
+from lmshealth.history import believed
+from lmshealth.metrics import place
 from lmshealth.stage import Stage
 from lmshealth.tracking import track
 from lmshealth.tracks import History, Track
-from studies.health_robustness.posteriors import epoch_draws, life_draws
+from studies.health_robustness.posteriors import claimed, epoch_draws, life_draws
 from studies.health_robustness.worlds import PARAMETERS, Case, alone
-from studies.importance import Draws, place, quantiles
 from studies.lives import Array, history_of
 from studies.record import judge_coverage
 
 NOMINALS = (0.9, 0.5)
-_LEVELS = np.array([0.05, 0.25, 0.5, 0.75, 0.95])
+_LEVELS = (0.05, 0.5, 0.95)
 ENDS = (*PARAMETERS, "any")
 
 
@@ -69,65 +70,67 @@ class Arm:
     independent: float = 0.0
 
 
-def histories(cases: Iterable[Case]) -> list[tuple[Case, History]]:
-    """Make what the estimator is given."""
-    return [(case, history_of(case.life, case.estimates)) for case in cases]
+@dataclass(frozen=True, slots=True, eq=False)
+class Followed:
+    """A life as the estimator has it: its track, and the history as the track takes it.
+
+    That has the steps that the tracker found beside those declared, and no outliers.
+    """
+
+    case: Case
+    track: Track
+    history: History
 
 
-def tracked(pairs: list[tuple[Case, History]], stage: Stage) -> list[tuple[Case, Track]]:
+def followed(cases: Iterable[Case], stage: Stage) -> list[Followed]:
     """Track lives."""
-    return [(case, track(history, stage)) for case, history in pairs]
+    found = []
+    for case in cases:
+        history = history_of(case.life, case.estimates)
+        own = track(history, stage)
+        found.append(Followed(case, own, believed(history, own)))
+    return found
 
 
 def at_epoch(
-    case: Case, followed: Track, stage: Stage, epoch: int, rng: np.random.Generator,
-    shrink: float = 1.0,
-) -> list[Answer]:  # fmt: skip
+    one: Followed, stage: Stage, epoch: int, rng: np.random.Generator, shrink: float = 1.0
+) -> list[Answer]:
     """Ask for health at one epoch, without a law."""
-    draws = epoch_draws(followed, stage, epoch, rng, shrink)
-    return _health_answers(draws, case.health[epoch], rng)
+    draws = epoch_draws(one.track, stage, epoch, rng, shrink)
+    return _answers(np.log(draws), np.log(one.case.health[epoch]), rng)
 
 
 def by_laws(
-    case: Case, history: History, stage: Stage, arm: Arm, rng: np.random.Generator
+    one: Followed, stage: Stage, arm: Arm, rng: np.random.Generator
 ) -> tuple[list[Answer], list[Answer]]:
     """Ask for health now and for the travel left, by the laws, of the whole life."""
-    given = replace(history, cov=arm.shrink * history.cov)
+    case, cov = one.case, arm.shrink * one.history.cov
     if arm.independent:
         # As noise of each log, of the size that the error has where the truth is.
         parts = alone(stage, case.health)
-        cov = given.cov.copy()
         at = np.arange(parts.shape[2])
         cov[:, at, at] += arm.independent**2 * np.sum(parts**2, axis=0)
-        given = replace(given, cov=cov)
+    given = replace(one.history, cov=cov)
     now, left = life_draws(given, stage, rng, noise_known=arm.shrink != 1)
     ends = case.passage - (case.life.travel[-1] - case.life.travel[0])
-    truth = np.append(ends, ends.min())
-    return _health_answers(now, case.health[-1], rng), _left_answers(left, truth, rng)
+    truth = claimed(np.append(ends, ends.min()), stage)
+    return (
+        _answers(np.log(now), np.log(case.health[-1]), rng),
+        _answers(left / 1000, truth / 1000, rng),
+    )
 
 
-def _health_answers(draws: Draws, truth: Array, rng: np.random.Generator) -> list[Answer]:
-    logs = Draws(np.log(draws.points), draws.weight)
-    return _answers(logs, np.log(truth), rng)
-
-
-def _left_answers(draws: Draws, truth: Array, rng: np.random.Generator) -> list[Answer]:
-    return _answers(Draws(draws.points / 1000, draws.weight), truth / 1000, rng)
-
-
-def _answers(draws: Draws, truth: Array, rng: np.random.Generator) -> list[Answer]:
-    places, cuts = place(draws, truth, rng), quantiles(draws, _LEVELS)
+def _answers(draws: Array, truth: Array, rng: np.random.Generator) -> list[Answer]:
+    places = place(draws, truth, rng)
+    cuts = np.quantile(draws, _LEVELS, axis=0, method="inverted_cdf")
     answers = []
-    for j, (own, value) in enumerate(zip(places, truth, strict=True)):
-        low, _, middle, _, high = cuts[:, j]
-        with np.errstate(invalid="ignore"):  # lives that never end
-            mean = draws.weight @ draws.points[:, j]
-            std = np.sqrt(draws.weight @ (draws.points[:, j] - mean) ** 2)
-            error = middle - value
+    for own, value, column, (low, middle, high) in zip(places, truth, draws.T, cuts.T, strict=True):
+        # Lives that never end, and health that is surely as it was.
+        with np.errstate(invalid="ignore", divide="ignore"):
+            error, width = middle - value, high - low
             third = (low - middle) / 3 <= value - middle <= (high - middle) / 3
-            answers.append(
-                Answer(float(own), float(error), float(error / std), high - low, bool(third))
-            )
+            z = error / column.std()
+        answers.append(Answer(float(own), float(error), float(z), float(width), bool(third)))
     return answers
 
 
@@ -150,5 +153,7 @@ def summed(answers: list[Answer]) -> dict[str, Any]:
             "rms": float(np.sqrt(np.mean(values**2))) if n else None,
         }
     widths = np.array([one.width for one in answers])
-    row["width"] = float(np.median(widths)) if np.isfinite(np.median(widths)) else None
+    # Ends that are not in sight are as far apart as can be.
+    width = np.median(np.where(np.isnan(widths), np.inf, widths))
+    row["width"] = float(width) if np.isfinite(width) else None
     return row

@@ -11,6 +11,7 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
+from lmshealth.courses import courses_of
 from lmshealth.modalmap import ModalMap, read_map
 from lmshealth.sight import identifiable, sight_of
 from lmshealth.stage import Stage, load_stage
@@ -21,16 +22,6 @@ from models.stages import stage_named
 from studies.lives import HEALTHY, Array, Estimates, Life, life_of, life_with, plan_of
 
 PARAMETERS = ("guide_preload", "mount_stiffness")
-# How a parameter goes, as its law in the description sees it: as that law says; it stays where it
-# began, which no law does that always loses something; or otherwise.
-LAW, STILL, BROKEN = "law", "still", "broken"
-_COURSES = {
-    "preload-wear": (LAW, STILL),
-    "mount-loosening": (STILL, LAW),
-    "both": (LAW, LAW),
-    "sudden-loosening": (STILL, BROKEN),
-    "crash": (BROKEN, BROKEN),
-}
 # Plants whose map is believed in place of the true one: what is wrong, by which factor.
 WRONG_PLANTS: dict[str, dict[str, float]] = {
     "masses 10 % more, load 10 % higher": {
@@ -58,15 +49,12 @@ class Case:
     passage : ndarray
         Travel in m since the first log at which each limit is reached, infinite if never,
         shape ``(2,)``.
-    courses : tuple of str
-        How each parameter goes.
     """
 
     life: Life
     estimates: Estimates
     health: Array
     passage: Array
-    courses: tuple[str, str]
 
 
 @cache
@@ -118,7 +106,6 @@ def modelled(stage: str, kind: str, seed: int, identify: Callable[[Life], Estima
         identify(life),
         life.health / life.health[0],
         np.array(ends) - life.travel[0],
-        _COURSES.get(kind, (STILL, STILL)),
     )
 
 
@@ -132,25 +119,29 @@ def on_path(stage: str, seed: int, rng: np.random.Generator) -> Life:
 
 
 def by_law(stage: str, seed: int, rng: np.random.Generator) -> tuple[Life, Array]:
-    """Take a life by laws drawn from their priors: the life, and where its limits are, in m.
+    """Take a life whose course is drawn from its prior: the life, and where its limits are, in m.
 
-    Only lives that stay inside the map until now are possible for who believes in the map.
+    Each parameter follows one of its laws, and does not deviate from it. Only lives that stay
+    inside the map until now are possible for who believes in the map.
     """
     description = load_stage(stage)
     assert description.modal_map is not None
     kind, visits = _healthy(stage, seed, rng)
     s = _KM * np.array([visit.travel_km - visits[0].travel_km for visit in visits])
+    courses = courses_of(description.parameters, (), s[-1])
     for _ in range(_REDRAWS):
-        drawn = [p.law.natural(p.law.draw(rng, 1, s[-1]), s[-1]) for p in description.parameters]
-        laws = [p.law for p in description.parameters]
-        health = np.stack([law.health(own, s)[0] for law, own in zip(laws, drawn, strict=True)], -1)
+        course = courses[rng.choice(len(courses), p=[one.weight for one in courses])]
+        theta = course.natural(course.draw(rng, 1))
+        health = course.health(theta, s)[0]
         if health.min() > 0 and description.modal_map.inside(np.log(health)).all():
             break
     else:
         raise RuntimeError(f"{stage}: no life of {_REDRAWS} stays inside the map")
     ends = [
-        law.passage(own, p.limit.below)[0] if p.limit else np.inf
-        for law, own, p in zip(laws, drawn, description.parameters, strict=True)
+        branch.passage(own, p.limit.below)[0] if p.limit else np.inf
+        for branch, own, p in zip(
+            course.branches, course.split(theta), description.parameters, strict=True
+        )
     ]
     life = life_with(plan_of(stage, kind, seed), _with_health(visits, health))
     return life, np.array(ends)

@@ -13,6 +13,7 @@ Method
     it, where runs that never end count as such.
     Line: health of every epoch without a law (mode of the posterior of `infer`), least squares over
     travel with its prediction interval, both parameters together.
+    Ours: draws by importance sampling, course by course, in the place of chains.
     progpy: the same draws of the laws' parameters, 1,000 of the 10,000, as states of a
     `PrognosticsModel` with the same laws, in steps of 10 km. Runs that do not end before the
     horizon have no time of event, and its statistics are of the others: so they are here. Told
@@ -72,7 +73,7 @@ from studies.rul_metrics.ways import CONTROL, LINE, MISSING, OURS, PROGPY, WAYS,
 
 HERE = Path(__file__).parent
 SEED = 20261124
-LIVES, UNENDING = 20, 6  # of each kind, and healthy ones
+LIVES, UNENDING = 16, 6  # of each kind, and healthy ones
 ALPHA, RISK = 0.2, 0.05
 # The prognostic horizon: half of the draws within a tenth of the whole life.
 NEAR, MASS = 0.1, 0.5

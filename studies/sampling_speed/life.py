@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from typing import Any
 
@@ -10,6 +11,7 @@ import numpy as np
 from filterpy.kalman import KalmanFilter
 from numpy.typing import NDArray
 
+from lmshealth.density import LifeDensity
 from lmshealth.epoch import one_at_a_time
 from lmshealth.life import LifeLikelihood
 from lmshealth.prognosis import prognose
@@ -86,22 +88,25 @@ def by_filterpy(
 def likelihoods(history: History, stage: Stage, walkers: int, looped: int) -> dict[str, Any]:
     """Compare the time of a walker and the values, at one point of the grid of settings."""
     likelihood = LifeLikelihood(history, stage)
-    begin = start_from_prior(likelihood.log_probability, likelihood.draw_prior, 300)
+    # Both parts lose: of all courses the one with the most to draw.
+    course = max(likelihood.courses, key=lambda one: one.n_dim)
+    density = LifeDensity.of(likelihood, course)
+    begin = start_from_prior(density.log_probability, density.draw_prior, 300)
     y = np.concatenate([begin(np.random.default_rng(k)) for k in range(8)])[:walkers]
-    n_all = likelihood.grid.walk.size
-    likelihood.narrow(y)
-    n_narrow = likelihood.grid.walk.size
-    best = int(np.argmax(likelihood.grid.log_weight - 0.5 * likelihood.grid.rest))
-    likelihood.grid = likelihood.grid.chosen(np.arange(n_narrow) == best)
-    walk, scale = float(likelihood.grid.walk[0]), float(likelihood.grid.noise_scale[0])
-    found = likelihood.log_probability(y) - likelihood.log_prior(y)
+    density = density.narrowed(y)
+    grid, n_kept = density.grid, density.grid.walk.size
+    # A filter with health as given knows of no deviation from it.
+    value = np.where(grid.deviation == 0, grid.log_weight - 0.5 * grid.rest, -np.inf)
+    density = replace(density, grid=grid.chosen(np.arange(n_kept) == np.argmax(value)))
+    walk, scale = float(density.grid.walk[0]), float(density.grid.noise_scale[0])
+    found = density.log_probability(y) - course.log_prior(y)
     turns = max(400 // walkers, 1)
     clock = time.process_time()
     for _ in range(turns):
-        likelihood.log_probability(y)
+        density.log_probability(y)
     ours = (time.process_time() - clock) / turns / walkers
     assert stage.description.map is not None
-    x = np.log(likelihood.health(y[:looped], history.clock()))
+    x, _ = likelihood.ln_health(course, y[:looped], history.clock())
     clock = time.process_time()
     book = []
     for path in x:
@@ -120,7 +125,7 @@ def likelihoods(history: History, stage: Stage, walkers: int, looped: int) -> di
     return {
         "logs": len(history.logs),
         "modes": len(MODES),
-        "settings": {"all": n_all, "kept": n_narrow},
+        "settings": {"all": likelihood.grid.walk.size, "kept": n_kept},
         "walkers": walkers,
         "us_per_walker": 1e6 * ours,
         "us_per_walker_by_filterpy": 1e6 * loop,

@@ -42,11 +42,12 @@ from typing import Any
 import numpy as np
 
 from lmshealth.epoch import EpochPosterior
+from lmshealth.errors import NotConverged
+from lmshealth.importance import explore_well
 from lmshealth.inference import draw as draw_chains
 from lmshealth.inference import infer
 from lmshealth.sampling import stream
 from lmshealth.stage import Stage, load_stage
-from studies.draws import draw as draw_points
 from studies.ranks import (
     N_DRAWS,
     Array,
@@ -73,10 +74,12 @@ LIVES = {
     ONE: 4000, SHARED: 1000, X: 1000, CHAINS: 200, DRIFTS: 1000, HALVED: 1000, EXACT: 1000,
 }  # fmt: skip
 QUICK = {ONE: 100, SHARED: 20, X: 20, CHAINS: 3, HALVED: 250, EXACT: 50}
+# Points of the prior to begin from, and weighted ones of the posterior.
+N_PRIOR, N_POINTS = 500, 2000
 # Share of the map's true error that is believed.
 _LESS = {HALVED: np.sqrt(0.5), EXACT: 0.0}
 # What a posterior is made of, and what chains are made of.
-MODEL, SAMPLER = ("epoch", "modalmap", "priors", "stage"), ("laplace", "sampling")
+MODEL, SAMPLER = ("epoch", "importance", "modalmap", "priors", "stage"), ("laplace", "sampling")
 
 
 def main() -> None:
@@ -126,10 +129,13 @@ def one(kind: str, life: int) -> Row:
     for k in drawn.epochs:
         cov = told.drift_cov[k][np.ix_(columns, columns)]
         posterior = EpochPosterior.of(believed, names, told.drift[k][columns], cov)
-        points = draw_points(posterior.log_probability, posterior.draw_prior, rng, N_DRAWS)
-        if points is None:  # too far from any one normal distribution
-            points, chains = thinned(draw_chains(posterior, stream([SEED, life], k)).flat), 1
-        draws.append(points)
+        start = posterior.draw_prior(rng, N_PRIOR)
+        try:
+            found = explore_well(posterior.log_probability, start, rng, N_POINTS)
+            draws.append(found.resampled(rng, N_DRAWS))
+        except NotConverged:
+            draws.append(thinned(draw_chains(posterior, stream([SEED, life], k)).flat))
+            chains = 1
     return {"rank": ranks(drawn.truth, draws, rng), "chains": chains}
 
 

@@ -11,8 +11,8 @@ import pytest
 
 from lmshealth.arrays import FloatArray
 from lmshealth.stage import Stage
-from lmshealth.summary import degraded_below, judge
 from lmshealth.tracks import Event, History, Track
+from lmshealth.verdict import degraded_below, judge
 from tests.lives import (
     FOOT,
     FREQUENCY,
