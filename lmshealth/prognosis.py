@@ -183,8 +183,9 @@ def _usage(
     """Draw the mean travel per day in m over the remaining life.
 
     Learned from the odometer: increments between logs are taken as independent, their variance in
-    proportion to the time between. What is not known of the mean rate is then Student's t, and the
-    rate over the time to come scatters about it, the less the longer that is.
+    proportion to the time between. The rate over the time to come is then off the mean one by
+    Student's t: by what is not known of the mean, and by its own scatter, the less the longer that
+    time is.
     """
     stated = stage.description.usage.km_per_day
     if stated is not None:
@@ -199,8 +200,8 @@ def _usage(
     total, rate = days.sum(), steps.sum() / days.sum()
     per_day = np.sum((steps - rate * days) ** 2 / days) / (days.size - 1)
     ahead = np.clip(remaining, 0.01 * horizon, horizon) / rate
-    mean = rng.standard_t(days.size - 1, remaining.size) / np.sqrt(total)
-    scatter = mean + rng.standard_normal(remaining.size) / np.sqrt(ahead)
+    # Both the mean and what scatters about it have the variance that few increments tell.
+    scatter = rng.standard_t(days.size - 1, remaining.size) * np.sqrt(1 / total + 1 / ahead)
     # A machine that moves at all moves forward: relative errors are those of the logarithm.
     return np.asarray(rate * np.exp(np.sqrt(per_day) / rate * scatter))
 

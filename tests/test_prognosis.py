@@ -209,18 +209,19 @@ def test_a_short_life_has_the_usage_of_few_days(unstated: Stage) -> None:
     assert stats.kstest(off * np.sqrt(40), stats.norm.cdf).pvalue < 1e-3
 
 
-def test_usage_covers_what_comes(unstated: Stage) -> None:
-    """Of 20 weeks' logs intervals cover the travel of 20 weeks to come as often as stated."""
-    rng, n = np.random.default_rng(10), 20
+@pytest.mark.parametrize(("n", "weeks"), [(20, 20), (5, 3)])
+def test_usage_covers_what_comes(unstated: Stage, n: int, weeks: int) -> None:
+    """Intervals cover the travel of weeks to come as often as stated, also after few logs."""
+    rng = np.random.default_rng(10)
     levels, wrong = [], []
     for _ in range(400):
         history = moved(rng, n, 0.1)
-        truth = 1.4e5 / 7 * (1 + 0.1 * rng.standard_normal(n).mean())
-        for found, left in ((levels, n * 1.4e5), (wrong, 2e8)):
+        truth = 1.4e5 / 7 * (1 + 0.1 * rng.standard_normal(weeks).mean())
+        for found, left in ((levels, weeks * 1.4e5), (wrong, 2e8)):
             usage = _usage(history, unstated, rng, np.full(500, left), 2e8)
             found.append(np.mean(usage < truth))
     check_coverage(np.array(levels), calibrated=True)
-    # Negative control: the mean of years to come says too little of 20 weeks.
+    # Negative control: the mean of years to come says too little of few weeks.
     check_coverage(np.array(wrong), calibrated=False)
 
 
