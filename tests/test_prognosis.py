@@ -217,8 +217,8 @@ def test_usage_covers_what_comes(unstated: Stage, n: int, weeks: int) -> None:
     for _ in range(400):
         history = moved(rng, n, 0.1)
         truth = 1.4e5 / 7 * (1 + 0.1 * rng.standard_normal(weeks).mean())
-        for found, left in ((levels, weeks * 1.4e5), (wrong, 2e8)):
-            usage = _usage(history, unstated, rng, np.full(500, left), 2e8)
+        for found, left in ((levels, weeks * 1.4e5), (wrong, 4e7)):
+            usage = _usage(history, unstated, rng, np.full(500, left), 4e7)
             found.append(np.mean(usage < truth))
     check_coverage(np.array(levels), calibrated=True)
     # Negative control: the mean of years to come says too little of few weeks.
