@@ -17,13 +17,15 @@ from lmshealth.stage import ParameterSpec, Stage
 from lmshealth.tracks import History
 
 _STEP = 1 << 21
-_N_CURVE, _EVERY = 121, 5
+_N_CURVE, _N_COARSE, _EVERY = 101, 40, 5
 _SECONDS_PER_DAY = 86_400.0
 _KM = 1000.0
 _LEVELS = (0.05, 0.25, 0.5, 0.75, 0.95)
 
 
-def prognose(history: History, stage: Stage, seed: int | Sequence[int]) -> Prognosis:
+def prognose(
+    history: History, stage: Stage, seed: int | Sequence[int], *, chains: bool = True
+) -> Prognosis:
     """Infer the degradation laws of a stage and the travel left to each limit.
 
     Parameters
@@ -34,6 +36,8 @@ def prognose(history: History, stage: Stage, seed: int | Sequence[int]) -> Progn
         Laws, limits, modal map and usage.
     seed : int or sequence of int
         Of all randomness.
+    chains : bool
+        As in `fit_life`.
 
     Returns
     -------
@@ -54,7 +58,7 @@ def prognose(history: History, stage: Stage, seed: int | Sequence[int]) -> Progn
         raise BadStage(f"{stage.name}: no [[parameter]] has a limit, so there is no end of life")
     # Health has its streams by epoch, the life its own; these are of what comes after.
     seeds = stream(seed, _STEP).spawn(3)
-    life = fit_life(history, stage, seed)
+    life = fit_life(history, stage, seed, chains=chains)
     told = told_limits(stage, life.modes)
     if not told:
         raise NotEnoughData(
@@ -67,7 +71,7 @@ def prognose(history: History, stage: Stage, seed: int | Sequence[int]) -> Progn
         life, told, np.random.default_rng(seeds[0]), now=since, horizon=horizon
     )
     usage = _usage(history, stage, np.random.default_rng(seeds[1]), remaining[:, -1], horizon)
-    travel = _curve_grid(remaining[:, -1], since, horizon)
+    travel = _curve_grid(remaining, since, horizon)
     columns = [j for j, _ in told]
     unit = np.array([parameter.baseline for _, parameter in told])
     curve = _curve(life, travel, np.random.default_rng(seeds[2]))[..., columns] * unit
@@ -159,9 +163,14 @@ def _curve(life: LifePosterior, travel: FloatArray, rng: np.random.Generator) ->
 
 
 def _curve_grid(remaining: FloatArray, since: float, horizon: float) -> FloatArray:
-    """Travel since the baseline, far enough ahead to show when most lives end."""
-    ahead = float(np.quantile(np.minimum(remaining, horizon), 0.75))
-    return np.linspace(0.0, since + min(max(1.3 * ahead, 0.5 * since), horizon), _N_CURVE)
+    """Travel since the baseline, far enough ahead to show when each limit may be reached.
+
+    Fine to where the first of them mostly is, coarse from there to where the last one is.
+    """
+    late = np.quantile(np.minimum(remaining, horizon), 0.75, axis=0)
+    near, far = (min(max(1.3 * ahead, 0.5 * since), horizon) for ahead in (late[-1], late.max()))
+    fine = np.linspace(0.0, since + near, _N_CURVE)
+    return np.append(fine, np.linspace(since + near, since + far, _N_COARSE + 1)[1:])
 
 
 def _usage(
@@ -174,8 +183,9 @@ def _usage(
     """Draw the mean travel per day in m over the remaining life.
 
     Learned from the odometer: increments between logs are taken as independent, their variance in
-    proportion to the time between. What is not known of the mean rate is then Student's t, and the
-    rate over the time to come scatters about it, the less the longer that is.
+    proportion to the time between. The rate over the time to come is then off the mean one by
+    Student's t: by what is not known of the mean, and by its own scatter, the less the longer that
+    time is.
     """
     stated = stage.description.usage.km_per_day
     if stated is not None:
@@ -190,8 +200,8 @@ def _usage(
     total, rate = days.sum(), steps.sum() / days.sum()
     per_day = np.sum((steps - rate * days) ** 2 / days) / (days.size - 1)
     ahead = np.clip(remaining, 0.01 * horizon, horizon) / rate
-    mean = rng.standard_t(days.size - 1, remaining.size) / np.sqrt(total)
-    scatter = mean + rng.standard_normal(remaining.size) / np.sqrt(ahead)
+    # Both the mean and what scatters about it have the variance that few increments tell.
+    scatter = rng.standard_t(days.size - 1, remaining.size) * np.sqrt(1 / total + 1 / ahead)
     # A machine that moves at all moves forward: relative errors are those of the logarithm.
     return np.asarray(rate * np.exp(np.sqrt(per_day) / rate * scatter))
 

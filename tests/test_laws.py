@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from itertools import pairwise
 
+import msgspec
 import numpy as np
 import pytest
 from scipy.optimize import brentq
@@ -22,13 +23,16 @@ NAMES = ["hertz-wear", "loosening", "power", "linear"]
 
 
 def natural_log_prior(law: AnyLaw, theta: np.ndarray) -> float:
-    """Log prior of natural parameters, lengths in m, written out law by law."""
+    """Log prior density of natural parameters, lengths in m, written out law by law."""
+    per_km = np.log(1000)
     if isinstance(law, HertzWear):  # power is one of them
-        value = law.life_km.log_density(theta[:1] / 1000) + law.exponent.log_density(theta[1:])
+        value = law.life_km.log_density(theta[:1] / 1000) - per_km
+        value = value + law.exponent.log_density(theta[1:])
     elif isinstance(law, Loosening):
-        value = law.floor.log_density(theta[:1]) + law.life_km.log_density(theta[1:] / 1000)
+        value = law.life_km.log_density(theta[1:] / 1000) - per_km
+        value = value + law.floor.log_density(theta[:1])
     else:
-        value = law.rate_per_km.log_density(theta[:1] * 1000)
+        value = law.rate_per_km.log_density(theta[:1] * 1000) + per_km
     return float(value[0])
 
 
@@ -45,14 +49,14 @@ def numerical_log_jacobian(law: AnyLaw, y: np.ndarray) -> float:
 
 @pytest.mark.parametrize("law", LAWS, ids=NAMES)
 def test_prior_in_coordinates_is_the_natural_one_times_the_jacobian(law: AnyLaw) -> None:
-    """Log prior in coordinates minus natural log prior minus log Jacobian is one constant."""
+    """Log prior in coordinates is the natural one plus the log Jacobian: it has the integral 1."""
     y = law.draw(np.random.default_rng(1), 40, NOW)
     found = law.log_prior(y, NOW)
     known = [
         natural_log_prior(law, theta) + numerical_log_jacobian(law, point)
         for theta, point in zip(law.natural(y, NOW), y, strict=True)
     ]
-    np.testing.assert_allclose(np.diff(found - known), 0, atol=2e-5)
+    np.testing.assert_allclose(found, known, atol=2e-5)
 
 
 @pytest.mark.parametrize(
@@ -106,6 +110,49 @@ def test_closed_form_passage_is_the_root_of_health(law: AnyLaw) -> None:
                 assert travel == pytest.approx(root, rel=1e-8)
             else:
                 assert off(1e13) > -1e-12
+
+
+@pytest.mark.parametrize("law", [*LAWS, Unchanging()], ids=[*NAMES, "none"])
+def test_each_draw_may_have_its_own_limit(law: AnyLaw) -> None:
+    """An array of limits gives what each limit alone gives, up to those at the baseline."""
+    theta = law.natural(law.draw(np.random.default_rng(7), 40, NOW), NOW)
+    limit = np.linspace(0.1, 1.0, 40)
+    together = law.passage(theta, limit)
+    alone = [law.passage(row[None], float(one))[0] for row, one in zip(theta, limit, strict=True)]
+    np.testing.assert_array_equal(together, alone)
+    assert together[-1] == 0
+
+
+@pytest.mark.parametrize("law", [*LAWS, Unchanging()], ids=[*NAMES, "none"])
+def test_each_draw_may_have_its_own_travel(law: AnyLaw) -> None:
+    """Health at travels of each draw is that of each draw alone."""
+    theta = law.natural(law.draw(np.random.default_rng(8), 10, NOW), NOW)
+    travel = np.random.default_rng(9).uniform(-1e5, 4e6, (10, 3))
+    together = law.health(theta, travel)
+    assert together.shape == (10, 3)
+    alone = [law.health(row[None], own)[0] for row, own in zip(theta, travel, strict=True)]
+    np.testing.assert_array_equal(together, alone)
+
+
+@pytest.mark.parametrize("law", [*LAWS, Unchanging()], ids=[*NAMES, "none"])
+def test_before_it_begins_a_law_changes_nothing(law: AnyLaw) -> None:
+    """Travel below 0 is of a time before the law: health is whole."""
+    theta = law.natural(law.draw(np.random.default_rng(10), 20, NOW), NOW)
+    np.testing.assert_allclose(law.health(theta, np.array([-1e6, 0.0])), 1.0, atol=1e-14)
+
+
+@pytest.mark.parametrize(
+    ("law", "kind"), [*zip(LAWS, NAMES, strict=True), (Unchanging(), "none")], ids=[*NAMES, "none"]
+)
+def test_laws_have_a_kind_and_a_weight(law: AnyLaw, kind: str) -> None:
+    """A law is called as in a description, and counts as any other unless it is told."""
+    assert law.kind == kind
+    assert law.weight == 1
+    assert msgspec.structs.replace(law, weight=2.5).weight == 2.5
+    assert msgspec.convert(msgspec.to_builtins(law) | {"weight": 3}, AnyLaw).weight == 3
+    for weight in (0, -1.0, 1e7):
+        with pytest.raises(msgspec.ValidationError, match="weight"):
+            msgspec.convert(msgspec.to_builtins(law) | {"weight": weight}, AnyLaw)
 
 
 def test_health_starts_at_one_and_stays_above_zero() -> None:

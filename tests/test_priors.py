@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from scipy import stats
+from scipy.integrate import trapezoid
 
 from lmshealth.errors import BadStage
 from lmshealth.priors import JointPrior, Lognormal, Normal, Prior, Uniform, joined
@@ -17,11 +18,22 @@ PAIRS = [
 
 
 @pytest.mark.parametrize(("prior", "book"), PAIRS)
-def test_density_is_that_of_scipy_up_to_a_constant(prior: Prior, book: object) -> None:
-    """Differences of log densities are those of the textbook distribution."""
+def test_density_is_that_of_scipy(prior: Prior, book: object) -> None:
+    """Log densities are those of the textbook distribution, whose integral is 1."""
     x = np.array([0.6, 1.1, 1.9, 2.4])
-    found, known = prior.log_density(x), book.logpdf(x)
-    np.testing.assert_allclose(found - found[0], known - known[0], atol=1e-12)
+    np.testing.assert_allclose(prior.log_density(x), book.logpdf(x), atol=1e-12)
+
+
+@pytest.mark.parametrize(("prior", "book"), PAIRS)
+def test_densities_are_the_slope_of_probabilities(prior: Prior, book: object) -> None:
+    """What a density integrates to between two values is the probability between them."""
+    x = np.linspace(0.6, 2.4, 20_001)
+    mass = trapezoid(np.exp(prior.log_density(x)), x)
+    below, upto = prior.probability(np.array([0.6, 2.4]))
+    assert mass == pytest.approx(upto - below, rel=1e-8)
+    wide = prior.widened(2.0)
+    below, upto = wide.probability(np.array([0.6, 2.4]))
+    assert trapezoid(np.exp(wide.log_density(x)), x) == pytest.approx(upto - below, rel=1e-8)
 
 
 @pytest.mark.parametrize(("prior", "book"), PAIRS)

@@ -9,7 +9,15 @@ from scipy import stats
 from lmshealth import sampling
 from lmshealth.arrays import FloatArray
 from lmshealth.errors import NotConverged
-from lmshealth.sampling import Sample, Start, sample, start_from_prior, start_near, stream
+from lmshealth.sampling import (
+    Sample,
+    Start,
+    sample,
+    start_among,
+    start_from_prior,
+    start_near,
+    stream,
+)
 
 MEAN = np.array([0.3, -1.2])
 WALKERS = 32
@@ -196,6 +204,46 @@ def test_starts_are_inside_the_support_and_distinct(width: float) -> None:
         assert np.isfinite(box(points)).all()
         assert np.unique(points, axis=0).shape[0] == 32
         assert not np.array_equal(points, start(rng))
+
+
+@pytest.mark.parametrize(("n_dim", "walkers"), [(1, 32), (2, 32), (4, 64)])
+def test_starts_among_draws_are_some_of_them(n_dim: int, walkers: int) -> None:
+    """So many walkers as the dimensions ask for begin at draws, no two at the same."""
+    rng = np.random.default_rng(5)
+    points = rng.standard_normal((500, n_dim))
+    start = start_among(points, np.full(500, 1 / 500))
+    found = start(rng)
+    assert found.shape == (walkers, n_dim)
+    assert {tuple(point) for point in found} <= {tuple(point) for point in points}
+    assert np.unique(found, axis=0).shape[0] == walkers
+    assert not np.array_equal(found, start(rng))
+
+
+def test_starts_among_draws_follow_their_weight() -> None:
+    """Draws a little more probable are taken as much more often; those without weight never."""
+    points = np.arange(4000.0)[:, None]
+    weight = np.where(points[:, 0] < 2000, 3.0, 1.0) * (points[:, 0] % 2 == 0)
+    start, rng = start_among(points, weight / weight.sum()), np.random.default_rng(6)
+    found = np.concatenate([start(rng)[:, 0] for _ in range(60)])
+    assert (found % 2 == 0).all()
+    error = np.sqrt(0.75 * 0.25 / found.size)
+    assert abs(np.mean(found < 2000) - 0.75) < 4.5 * error
+    # Negative control: taken alike.
+    start = start_among(points, np.full(4000, 1 / 4000))
+    found = np.concatenate([start(rng)[:, 0] for _ in range(60)])
+    assert abs(np.mean(found < 2000) - 0.75) > 4.5 * error
+
+
+def test_starts_among_few_draws_of_weight_spread_out() -> None:
+    """Where one draw has all the weight the walkers still begin apart, the best ones first."""
+    points = np.linspace(0, 1, 400)[:, None]
+    log_weight = -0.5 * ((points[:, 0] - 0.5) / 1e-2) ** 2
+    weight = np.exp(log_weight - log_weight.max())
+    weight /= weight.sum()
+    assert 1 / np.sum(weight**2) < 20
+    found = start_among(points, weight)(np.random.default_rng(7))
+    assert np.unique(found).size == 32
+    assert np.median(np.abs(found - 0.5)) < 0.1
 
 
 def test_a_centre_outside_the_support_is_refused() -> None:

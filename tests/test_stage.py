@@ -232,7 +232,55 @@ def test_a_parameter_is_told_by_preload_or_mount(tmp_path: Path) -> None:
     words = FOOT + 'verdict = "preload"\n'
     stage = make_stage(tmp_path, (PRELOAD, MOUNT, words))
     assert [p.word for p in stage.parameters] == ["preload", "mount", "preload"]
-    assert isinstance(stage.parameters[2].law, Unchanging)
+    assert stage.parameters[2].laws == (Unchanging(),)
+
+
+WEAR = PRELOAD[PRELOAD.index('{ kind = "hertz-wear"') :].rstrip()
+
+
+def with_laws(*laws: str) -> str:
+    """Write a preload of several laws."""
+    start = PRELOAD[: PRELOAD.index("law = ")]
+    return f"{start}law = [{', '.join(laws)}]\n"
+
+
+def test_a_parameter_has_one_law_or_several(tmp_path: Path) -> None:
+    """One law stands alone, several in an array, in their order and with their weights."""
+    linear = 'rate_per_km = { kind = "normal", mean = 0.0, std = 2e-4 }'
+    parameter = with_laws(
+        WEAR, f'{{ kind = "linear", weight = 2.5, {linear} }}', '{ kind = "none" }'
+    )
+    stage = make_stage(tmp_path, (parameter, MOUNT))
+    preload, mount = (p.laws for p in stage.parameters)
+    assert [law.kind for law in preload] == ["hertz-wear", "linear", "none"]
+    assert [law.weight for law in preload] == [1.0, 2.5, 1.0]
+    assert preload[0] == make_stage(tmp_path / "alone").parameters[0].law
+    assert [law.kind for law in mount] == ["loosening"]
+
+
+@pytest.mark.parametrize(
+    ("laws", "needle"),
+    [
+        (
+            ('{ kind = "none" }', WEAR, WEAR),
+            r"line 14: parameter\[0\]\.law\[2\]: guide_preload: two laws of the kind 'hertz-wear'",
+        ),
+        ((), r"line 14: parameter\[0\]\.law: .*length >= 1"),
+        (
+            (WEAR, '{ kind = "rust" }'),
+            r"line 14: parameter\[0\]\.law\[1\]\.kind: there are hertz-w",
+        ),
+        (('{ kind = "none", weight = 0 }',), r"parameter\[0\]\.law\[0\]\.weight: .*> 0"),
+        (('{ kind = "none", wieght = 2 }',), r"parameter\[0\]\.law\[0\]\.wieght"),
+    ],
+    ids=["twice", "empty", "unknown", "weightless", "slip"],
+)
+def test_laws_that_are_none_are_refused_with_their_place(
+    tmp_path: Path, laws: tuple[str, ...], needle: str
+) -> None:
+    """Of several laws the one that is wrong is named by its place."""
+    with pytest.raises(BadStage, match=needle):
+        load(tmp_path, stage_text((with_laws(*laws), MOUNT)))
 
 
 @pytest.mark.parametrize("name", ["lms-x", "lms-y"])

@@ -13,6 +13,7 @@ Method
     it, where runs that never end count as such.
     Line: health of every epoch without a law (mode of the posterior of `infer`), least squares over
     travel with its prediction interval, both parameters together.
+    Ours: draws by importance sampling, course by course, in the place of chains.
     progpy: the same draws of the laws' parameters, 1,000 of the 10,000, as states of a
     `PrognosticsModel` with the same laws, in steps of 10 km. Runs that do not end before the
     horizon have no time of event, and its statistics are of the others: so they are here. Told
