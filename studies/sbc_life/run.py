@@ -67,7 +67,7 @@ HERE = Path(__file__).parent
 SEED = 20261123
 ONE, CHAINS = "posterior", "by chains"
 EXACT, LOSING = "map taken as exact", "every part taken to lose"
-LIVES = {ONE: 1000, CHAINS: 60, EXACT: 200, LOSING: 200}
+LIVES = {ONE: 1000, CHAINS: 40, EXACT: 100, LOSING: 100}
 QUICK = {ONE: 6, CHAINS: 1, LOSING: 6}
 N_POSTERIOR = 1024
 # What a posterior is made of, and what chains are made of.
