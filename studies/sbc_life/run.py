@@ -187,7 +187,7 @@ def verdicts(found: dict[str, dict[str, Row]]) -> dict[str, bool]:
     shown = {EXACT: HEALTH, LOSING: (*HEALTH, REMAINING[0])}
     for kind, names in shown.items():
         if kind in found and found[kind][HEALTH[0]]["n"] >= 0.9 * LIVES[kind]:  # fewer tell little
-            checks[f"they are not: {kind}"] = not all(found[kind][n]["inside_band"] for n in names)
+            checks[f"they are not: {kind}"] = not uniform({n: found[kind][n] for n in names})
     return checks
 
 
