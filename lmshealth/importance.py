@@ -46,7 +46,7 @@ class Weighted:
 
     @property
     def ess(self) -> float:
-        """Effective number of draws; its inverse is the relative variance of the evidence."""
+        """Effective number of draws; its inverse bounds the relative variance of the evidence."""
         return float(1 / np.sum(self.weight**2))
 
     def resampled(self, rng: np.random.Generator, n: int) -> FloatArray:

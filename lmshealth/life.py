@@ -124,7 +124,8 @@ class LifeLikelihood:
         self.series = tuple(history.series[i] for i in columns)
         self.modes = tuple(dict.fromkeys(one.mode for one in self.series))
         ln_f = history.ln_frequency[history.baseline :, columns]
-        self.clock = history.clock()[history.baseline :]
+        clock = _parted(history)
+        self.clock = clock[history.baseline :]
         self.now = float(self.clock.max(initial=0.0))
         if np.isfinite(ln_f).any(axis=1).sum() < 3 or self.now <= 0:
             raise NotEnoughData(
@@ -143,7 +144,7 @@ class LifeLikelihood:
             [np.nanmean(ln_f[:, self.mode_of_series == i]) for i in range(len(self.modes))]
         )
         self.y = flat[self.rows] - centre[self.mode_of]
-        self.steps = _steps(history)
+        self.steps = _steps(history, clock)
         self.courses = courses_of(stage.parameters, self.steps, self.now)
         # What only ever keeps its value does not deviate from that either.
         free = [any(law.names for law in parameter.laws) for parameter in stage.parameters]
@@ -207,7 +208,7 @@ class LifeLikelihood:
         point = grid.chosen(np.arange(grid.walk.size) == k)
         factor = self.covariance.factor(float(grid.walk[k]), float(grid.noise_scale[k]), deviation)
         unit = deviation**2 / self.horizon
-        shared = unit * np.minimum.outer(moments, self.clock[self.log_of])
+        shared = unit * np.maximum(np.minimum.outer(moments, self.clock[self.log_of]), 0.0)
         cross = shared[:, None] * self.slopes[self.mode_of].T  # (n_moments, n_parameters, n_data)
         n_moments, p, n_data = cross.shape
         a = solve_triangular(factor, cross.reshape(-1, n_data).T, lower=True)
@@ -286,7 +287,7 @@ class LifeLikelihood:
             values = regressor.values[history.baseline :]
             common += regressor.prior_std**2 * np.outer(values, values)
             common += np.diag(regressor.unknown[history.baseline :])
-        shared = np.minimum.outer(self.clock, self.clock)
+        shared = np.maximum(np.minimum.outer(self.clock, self.clock), 0.0)
         slopes = self.slopes[self.mode_of_series]
         size, own = n_series * n_logs, np.ix_(self.rows, self.rows)
         return _Covariance(
@@ -338,16 +339,30 @@ class LifeLikelihood:
         return total
 
 
-def _steps(history: History) -> tuple[float, ...]:
-    """Travel since the baseline at which the modes jumped, between two logs each."""
-    clock = history.clock()
+def _jumps(history: History) -> list[int]:
+    """First logs after the modes jumped, since the baseline."""
     first = {s.first for s in history.steps if s.kind == "step" and s.first > history.baseline}
+    return sorted(first)
+
+
+def _parted(history: History) -> FloatArray:
+    """Travel since the baseline; where none parts logs from a jump, those before stand 1 m back."""
+    clock = history.clock()
+    for k in reversed(_jumps(history)):
+        before = clock[:k]
+        before[before >= clock[k]] = clock[k] - 1.0
+    return clock
+
+
+def _steps(history: History, clock: FloatArray) -> tuple[float, ...]:
+    """Travel since the baseline at which the modes jumped, between two logs each."""
+    first = _jumps(history)
     if len(first) > _MOST_STEPS:
         raise NotEnoughData(
             f"{history.stage}: the modes jumped {len(first)} times since the baseline; no law of "
             "a life holds over so many; maintenance.csv can declare a new baseline"
         )
-    return tuple(float((clock[k - 1] + clock[k]) / 2) for k in sorted(first))
+    return tuple(float((clock[k - 1] + clock[k]) / 2) for k in first)
 
 
 def _slopes(stage: Stage, modes: tuple[str, ...]) -> FloatArray:

@@ -63,6 +63,9 @@ def first_passage(
     Borodin2002 for the bridge.
     """
     left = branch.passage(theta, limit * np.exp(-off)) - now
+    # What gains may have been under its limit before, after a jump: that is over.
+    above = branch.health(theta, np.array([now]))[:, 0] * np.exp(off) > limit
+    left[above & (left <= 0)] = np.inf
     moving = (rate > 0) & (left > 0)
     if moving.any():
         left[moving] = _wandering(

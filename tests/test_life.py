@@ -321,3 +321,25 @@ def test_many_logs_are_told_by_few_nodes(stage: Stage) -> None:
     found = density.log_probability(y[:2]) - density.course.log_prior(y[:2])
     known = np.array([book(history, density, point, 0.05) for point in y[:2]])
     np.testing.assert_allclose(np.diff(found), np.diff(known), atol=1e-5)
+
+
+@pytest.mark.parametrize("last_still", [1, 5, 9], ids=["at the baseline", "between", "at the end"])
+def test_a_step_without_travel_parts_the_logs(tmp_path: Path, last_still: int) -> None:
+    """Logs at one odometer lie on both sides of a step; without one they are of one moment."""
+    stage = make_stage(tmp_path, (FADING,))
+    travel = np.linspace(0.0, 2e6, 10)
+    travel[last_still] = travel[last_still - 1]
+    ln_f = np.log(FREQUENCY[:2]) + 1e-3 * np.random.default_rng(3).standard_normal((10, 2))
+    history = make_history(ln_f, travel=travel)
+    without = LifeLikelihood(history, stage)
+    stepped = LifeLikelihood(replace(history, steps=(since("step", last_still, 10),)), stage)
+    (step,) = stepped.steps
+    np.testing.assert_array_equal(stepped.clock < step, np.arange(10) < last_still)
+    np.testing.assert_allclose(stepped.clock, without.clock, atol=1.0)
+    assert without.clock[last_still] == without.clock[last_still - 1]
+    for course in stepped.courses:
+        density = LifeDensity.of(stepped, course)
+        y = coordinates(density, 20)
+        assert np.isfinite(density.log_probability(y)).all()
+        off, _ = density.deviations(y, np.array([0.0, stepped.now]), np.random.default_rng(4))
+        assert np.isfinite(off).all()

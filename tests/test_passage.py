@@ -196,3 +196,15 @@ def test_nothing_is_claimed_past_the_horizon() -> None:
     finite = np.isfinite(found)
     assert 0.05 < finite.mean() < 0.95
     assert found[finite].max() <= HORIZON
+
+
+def test_what_gains_is_not_past_a_limit_that_it_has_left_behind() -> None:
+    """After a jump below the limit a parameter that gains is above it again: nothing is ahead."""
+    branch = Branch(LINEAR, 0.0, (0.1 * NOW,))
+    natural = (-1e-6, 0.45)  # gains 100 % by now, of which the jump left 45 %
+    assert (branch.health(np.array([natural]), np.array([0.1 * NOW, NOW])) > 0.7).tolist() == [
+        [False, True]
+    ]
+    assert np.isinf(draw(branch, natural, off=0.0, rate=0.0, limit=0.7)).all()
+    # Negative control: one that has not come back is past it.
+    assert (draw(branch, (-1e-7, 0.45), off=0.0, rate=0.0, limit=0.7) <= 0).all()
