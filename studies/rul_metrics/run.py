@@ -31,7 +31,18 @@ Method
     a third might, as a map that is right is believed to 5 %, and intervals near the end are as much
     too wide.
 Answer
-    To be recorded.
+    At 70 % of life the median lies within a fifth of the truth in 46 of 48 lives (96 %, 86 to 99
+    %), 1.00 times as often as errors of the bound would (0.90 to 1.04); the line manages 24. The
+    score (CRPS) there is 62 km beside 289 km of the line and 63 km of progpy, which is given our
+    posterior and differs by its noise alone. The horizon from which on half of the draws lie within
+    a tenth of the whole life is 51 % of life on the average, that of the line 32 % where it is ever
+    good (39 of 48). 10,000 draws after the posterior take 18 ms, 1,000 of progpy 1.2 s; runs that
+    do not end it leaves out: of six healthy lives it says nothing of three, and 14,255 km of the
+    others, where we say with 99 % that no end comes before the horizon. Of services at a risk of 5
+    % none comes too late, of the line's four to seven of 48. Not better than others: at 30 % of
+    life the score is 591 km, as the line's (583 km), because a twentieth of the draws never end,
+    and so what is right for a machine of which little is known; and near the end intervals are too
+    wide (1.7 times the life left at 90 %), because the map is right and believed to 5 % only.
 Run time
     Half an hour of one processor. With ``--lives FILE`` lives done before are not done again, and
     the recorded time is that of the rest. progpy comes with the extra ``peers``; without it its
