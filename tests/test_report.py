@@ -285,6 +285,8 @@ def test_healthy_stage_without_visible_end(make: Maker, tmp_path: Path) -> None:
     text = words(one(tmp_path, assessment))
     assert "No service needed yet" in text
     assert "No end of life visible within 20 000 km" in text
+    seen = assessment.history.travel[-1] - assessment.history.travel[0]
+    assert f"The logs cover {seen / 1000:,.0f}".replace(",", " ") in text
     assert "beyond 20 000 km" in text
 
 
