@@ -12,7 +12,7 @@ import click
 from lmshealth import terminal
 from lmshealth.errors import NotConverged, NotEnoughData
 from lmshealth.files import write_draws, write_text
-from lmshealth.options import COV, MAINTENANCE, OUT, SEED, SHARE, TABLE, examples
+from lmshealth.options import COV, MAINTENANCE, OUT, SEED, SHARE, TABLE, Finite, examples
 
 if TYPE_CHECKING:
     from lmshealth.lifefit import LifePosterior
@@ -46,7 +46,7 @@ if TYPE_CHECKING:
 @click.option("--max-risk", type=SHARE, help="Service by the last day within this risk.")
 @click.option(
     "--cost-ratio",
-    type=click.FloatRange(1, min_open=True),
+    type=Finite(1, min_open=True),
     help="Service at least costs, where a failure costs so many times a planned service.",
 )
 @SEED

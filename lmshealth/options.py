@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
+from typing import Any
 
 import click
 
@@ -41,7 +43,22 @@ EPOCHS = click.option(
 )
 SEED = click.option("--seed", type=click.IntRange(0), default=0, show_default=True)
 PDF = click.option("--pdf", is_flag=True, help="Also write a PDF beside the page of each stage.")
-SHARE = click.FloatRange(0, 1, min_open=True, max_open=True)
+
+
+class Finite(click.FloatRange):
+    """A number in a range: NaN is in none of them, and infinity is no number to count with."""
+
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> float:
+        """Refuse what compares with nothing, or is without end."""
+        number = float(super().convert(value, param, ctx))
+        if not math.isfinite(number):
+            self.fail(f"{value} is no finite number.", param, ctx)
+        return number
+
+
+SHARE = Finite(0, 1, min_open=True, max_open=True)
 
 
 def examples(*lines: str) -> str:

@@ -59,6 +59,7 @@ from lmshealth.wording import (
     percent,
     quantiles,
     spell,
+    whole_km,
 )
 
 _SIZES = {"waterfall": (4.8, 3.6), "influence": (3.8, 2.6)}  # in inches, unlike others
@@ -155,7 +156,7 @@ def _environment() -> Any:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    pages.filters |= {"spell": spell, "moment": moment, "km": km}
+    pages.filters |= {"spell": spell, "moment": moment, "km": km, "whole_km": whole_km}
     return pages
 
 
@@ -205,7 +206,7 @@ def _evidence(assessment: Assessment) -> dict[str, Any]:
     track, prognosis, history = assessment.track, assessment.prognosis, assessment.history
     health, stage = _health(assessment), assessment.stage
     influences = () if track is None else find_influences(history, track, stage)
-    drift = np.zeros(1) if track is None else np.abs(track.drift[-1])
+    drift = np.zeros(1) if track is None else np.abs(np.expm1(track.drift[-1]))
     return {
         "health": health,
         "modes": [] if track is None else list(mode_rows(track)),
@@ -222,6 +223,8 @@ def _evidence(assessment: Assessment) -> dict[str, Any]:
         "largest_drift": float(np.nanmax(drift, initial=0.0)),
         "laws": [] if prognosis is None else list(_laws(prognosis)),
         "law": prognosis and fit(prognosis.chi_square, prognosis.degrees_of_freedom),
+        # Laws that leave nothing to sample, and improbable ones, have no chains to be judged.
+        "chained": prognosis is not None and bool(np.isfinite(prognosis.ess)),
         "effects": [] if track is None else [effect_row(effect) for effect in other_effects(track)],
         "reasons": Counter(item.reason for item in assessment.refused).most_common(),
         "hashes": list(zip(history.logs, assessment.digests, strict=False)),

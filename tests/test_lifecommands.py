@@ -154,3 +154,15 @@ def test_maintenance_of_other_machines_is_told(table: Path, toml: Path, tmp_path
     result = call(table, "--stage", toml, "--out", out, "--maintenance", actions)
     assert result.exit_code == 0, result.output
     assert "note: maintenance of AX-9 is not used: the table has AX-1, AX-2" in result.stderr
+
+
+@pytest.mark.parametrize("option", ["--max-risk", "--cost-ratio"])
+@pytest.mark.parametrize("value", ["nan", "inf"])
+def test_what_is_no_finite_number_is_wrong_usage(
+    table: Path, toml: Path, tmp_path: Path, option: str, value: str
+) -> None:
+    """Neither NaN nor infinity chooses a day: status 2, the option is named, nothing is written."""
+    out = tmp_path / "p.csv"
+    result = call(table, "--stage", toml, "--out", out, option, value)
+    assert result.exit_code == 2
+    assert option in result.stderr and not out.exists()

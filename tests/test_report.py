@@ -285,6 +285,8 @@ def test_healthy_stage_without_visible_end(make: Maker, tmp_path: Path) -> None:
     text = words(one(tmp_path, assessment))
     assert "No service needed yet" in text
     assert "No end of life visible within 20 000 km" in text
+    seen = assessment.history.travel[-1] - assessment.history.travel[0]
+    assert f"The logs cover {seen / 1000:,.0f}".replace(",", " ") in text
     assert "beyond 20 000 km" in text
 
 
@@ -509,6 +511,25 @@ def hostile(assessment: Assessment, evil: str) -> Assessment:
         notes=(evil,),
         judgement=replace(assessment.judgement, stage=evil, why=evil),
     )
+
+
+def test_numbers_of_a_page_agree_and_are_grounded(make: Maker, tmp_path: Path) -> None:
+    """The odometer is whole, the largest drift is that of the table, and no chains are no ESS."""
+    worn = make()
+    assert worn.prognosis is not None and worn.track is not None
+    drift = 100 * np.abs(np.expm1(worn.track.drift[-1])).max()
+    path = write_report(tmp_path / "a", [worn], ())[0]
+    text = path.read_text()
+    odometer = f"{worn.history.travel[-1] / 1000:,.0f}".replace(",", "\u202f")
+    assert f"odometer {odometer}\u202fkm" in text
+    assert f"the largest drift is {drift:.2f} %" in text
+    assert f"<td>{worn.prognosis.ess:.0f}</td>" in text
+    still = replace(worn, prognosis=replace(worn.prognosis, ess=np.inf, r_hat=1.0))
+    text = write_report(tmp_path / "b", [still], ())[0].read_text()
+    assert "<td>no chains needed</td>" in text and "<td>inf</td>" not in text
+    travel = np.full_like(worn.history.travel, np.nan)
+    lost = replace(worn, history=replace(worn.history, travel=travel), prognosis=None)
+    assert "odometer nan" not in write_report(tmp_path / "c", [lost], ())[0].read_text()
 
 
 @contextmanager
