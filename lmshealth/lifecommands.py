@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
+from numpy.linalg import LinAlgError
 
 from lmshealth import terminal
 from lmshealth.errors import NotConverged, NotEnoughData
@@ -81,6 +82,12 @@ def prognose(ctx: click.Context, /, table: Path, **options: Any) -> None:
     rows = []
     for life, _ in found:
         by: datetime | None = options["by"]
+        if by is not None and by.date() <= life.recorded_at.date():
+            click.echo(
+                f"note: {life.stage}: its last log is of {life.recorded_at.date()}; --by "
+                f"{by.date()} is not after it, so that nothing is foretold for that day",
+                err=True,
+            )
         before = None if by is None else (by.date(), reached_before(life, by.date()))
         service = decide(life, decision)
         own = prognosis_rows(life, service, before)
@@ -120,8 +127,10 @@ def _foretold(
     for k, history in enumerate(histories):
         try:
             found.append(_life(history, stage, options["seed"], options["posterior"] is not None))
-        except (NotEnoughData, NotConverged) as why:
+        except NotEnoughData as why:
             lost.append(str(why))
+        except (NotConverged, LinAlgError) as why:
+            lost.append(f"{history.stage}: {why}; are odometer and frequencies in their units?")
         progress("foretelling", k + 1, len(histories))
     return found, lost
 

@@ -9,6 +9,8 @@ from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
 
+from numpy.linalg import LinAlgError
+
 from lmshealth.errors import LmshealthError, NothingUsable
 from lmshealth.history import Reading, believed, build_history, doubted, lost_notes
 from lmshealth.inference import epochs_to_infer, infer
@@ -260,4 +262,9 @@ def _results(
         return followed, health, life.result() if life else prognose(history, stage, seed)
     except LmshealthError as error:
         notes.append(str(error))
-        return followed, health, None
+    except LinAlgError as error:  # one machine must not end the run
+        notes.append(
+            f"{history.stage}: its logs lead to a matrix without an inverse ({error}); please "
+            "report this with modes.csv"
+        )
+    return followed, health, None

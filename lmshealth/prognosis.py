@@ -202,8 +202,9 @@ def _usage(
     ahead = np.clip(remaining, 0.01 * horizon, horizon) / rate
     # Both the mean and what scatters about it have the variance that few increments tell.
     scatter = rng.standard_t(days.size - 1, remaining.size) * np.sqrt(1 / total + 1 / ahead)
-    # A machine that moves at all moves forward: relative errors are those of the logarithm.
-    return np.asarray(rate * np.exp(np.sqrt(per_day) / rate * scatter))
+    # A machine that moves at all moves forward: relative errors are those of the logarithm. Few
+    # logs have tails without end, of which a factor of e^5 is enough.
+    return np.asarray(rate * np.exp(np.clip(np.sqrt(per_day) / rate * scatter, -5.0, 5.0)))
 
 
 def limited(stage: Stage) -> list[tuple[int, ParameterSpec]]:
