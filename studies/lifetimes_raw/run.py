@@ -20,7 +20,12 @@ Method
     What happens after the cut is not foretold: a crash or a loosened bolt to come is in no law, and
     these lives have none. It does not touch the ranks of the others.
 Answer
-    ANSWER
+    Yes. With the map believed all six ranks of 100 raw lives stay inside their bands, intervals of
+    50 and 90 % cover 52 to 65 and 91 to 97 %; with the map's error 62 to 69 and 94 to 100 %, as
+    expected of a map that is right; draws pulled to half their distance are found out (72 and 74 %
+    of remaining life). Of 36 machines that reach no limit within the horizon 31 are told that no
+    end of life is visible, the others with a probability near it (95 % in the mean); of 64 that do,
+    none is. No machine was refused, and no step was seen where there was none.
 Run time
     An hour and a half of one processor for simulation and identification, kept in ``--cache``, and
     ten minutes for the posteriors, kept in ``--lives``.
