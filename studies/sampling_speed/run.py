@@ -24,7 +24,9 @@ Answer
     same surrogate, 26 and 25 times dynesty and nautilus, 3,200 times the loop with the eigenproblem
     inside. A converged epoch takes 1.0 s of processor time. Quantiles are those of a grid within a
     fiftieth of a standard deviation. On the same machine shared by four processes all times are
-    half as long again, ratios within a fifth. Lives: To be recorded.
+    half as long again, ratios within a fifth. Lives were recorded when one course was all; now that
+    courses are weighed a walker takes 15 µs, 333 times less than the loop over filterpy, and the
+    posterior of 100 logs 5.7 s (`life_posterior`).
 Run time
     Some minutes of one processor. dynesty and nautilus come with the extra ``peers``; without them
     their rows are missing.

@@ -26,7 +26,12 @@ Method
     Negative controls that must fail: a map is taken for exact that is wrong by 5 %; every part is
     taken to lose, while half of them do not.
 Answer
-    ANSWER
+    Yes. Over 1,000 lives all eight ranks stay inside their bands; intervals of 50 and 90 % cover 48
+    to 53 and 90 to 93 %, and a part wears as often as is said. By chains, in 40 lives, they cover
+    42 to 68 and 80 to 95 %, within their bands. With the map taken for exact 71 to 79 % of health
+    now are covered at 90 %, with every part taken to lose 63 to 76 %, in 100 lives each. Run with
+    the code before jumps were parted from logs at the same odometer, which these lives have not,
+    and before a linear law could gain.
 Run time
     Of one processor one to two seconds a life, eight after a jump, five to thirty for chains. With
     ``--lives FILE`` lives done before are not done again, and the recorded time is that of the
