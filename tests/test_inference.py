@@ -376,9 +376,14 @@ def test_a_shared_guide_is_known_better(stage: Stage) -> None:
         marginal += np.logaddexp.reduce(value, axis=1)
     marginal += -0.5 * (axis / 0.3) ** 2
     density = np.exp(marginal - marginal.max())
-    known = np.interp([0.05, 0.5, 0.95], np.cumsum(density) / density.sum(), axis)
-    found = np.log(both.quantile(np.array([0.05, 0.5, 0.95]))[:, 0, 0])
-    np.testing.assert_allclose(found, known, atol=0.012)
+    levels = np.array([0.05, 0.5, 0.95])
+    known = np.interp(levels, (np.cumsum(density) - 0.5 * density) / density.sum(), axis)
+    found = np.log(both.quantile(levels)[:, 0, 0])
+    # Standard error of a quantile: that of its level, over the density there.
+    height = np.interp(known, axis, density / density.sum() / (axis[1] - axis[0]))
+    error = np.sqrt(levels * (1 - levels) / both.ess[0, 0]) / height
+    assert (np.abs(found - known) < 4.5 * error).all()
+    assert (np.abs(found + 0.1 - known) > 4.5 * error).any()  # negative control
 
 
 def test_epochs_of_the_first_meet_the_last_of_the_others(stage: Stage) -> None:
