@@ -73,13 +73,12 @@ def reported(assessment: Assessment) -> Reported:
     health, prognosis = assessment.health, assessment.prognosis
     told: dict[str, Interval] = {}
     if health is not None and health.recorded_at:
-        low, middle, high = health.quantile(LEVELS)[:, -1]
+        low, middle, high = health.latest(LEVELS)
         for k in np.flatnonzero(health.told()).tolist():
             told[health.parameters[k]] = float(low[k]), float(middle[k]), float(high[k])
     remaining: Interval | None = None
     if prognosis is not None:
-        travel = prognosis.remaining[:, -1]
-        low, middle, high = quantiles(np.where(travel > prognosis.horizon, np.inf, travel))
+        low, middle, high = quantiles(prognosis.claimed()[:, -1])
         remaining = low, middle, high
     return Reported(
         recorded_at=judgement.recorded_at,

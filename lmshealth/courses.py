@@ -50,20 +50,21 @@ class Branch:
         jumps = (f"jump_{k + 1}" for k in range(len(self.steps)))
         return (*self.law.names, *jumps)
 
-    @property
-    def _n_law(self) -> int:
-        return len(self.law.names)
+    def _cut(self, values: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Cut coordinates, or natural parameters, into those of the law and the jumps."""
+        n = len(self.law.names)
+        return values[:, :n], values[:, n:]
 
     def natural(self, y: FloatArray, now: float) -> FloatArray:
         """Turn coordinates into natural parameters, ``(n, k)`` both; jumps are factors."""
-        own, jumps = y[:, : self._n_law], y[:, self._n_law :]
+        own, jumps = self._cut(y)
         # A far-off walker may ask for a jump beyond the range of floats; its prior is 0 anyway.
         jump = np.exp(np.clip(jumps, -300, 300))
         return np.hstack([self.law.natural(own, now - self.begin), jump])
 
     def log_prior(self, y: FloatArray, now: float) -> FloatArray:
         """Log prior density of the coordinates, shape ``(n,)``."""
-        own, jumps = y[:, : self._n_law], y[:, self._n_law :]
+        own, jumps = self._cut(y)
         total = self.law.log_prior(own, now - self.begin)
         return np.asarray(total + _JUMP.log_density(jumps).sum(axis=1))
 
@@ -77,7 +78,7 @@ class Branch:
 
         Shape ``(n, n_travel)``.
         """
-        own, jumps = theta[:, : self._n_law], theta[:, self._n_law :]
+        own, jumps = self._cut(theta)
         health = self.law.health(own, travel - self.begin)
         for step, jump in zip(self.steps, jumps.T, strict=True):
             health = health * np.where(travel >= step, jump[:, None], 1.0)
@@ -89,7 +90,7 @@ class Branch:
         As the parameter goes on after the last step: a limit that a step itself has jumped over
         was reached where the law, so lowered, would have reached it, not later than at the step.
         """
-        own, jumps = theta[:, : self._n_law], theta[:, self._n_law :]
+        own, jumps = self._cut(theta)
         left = np.broadcast_to(limit, own.shape[:1]) / jumps.prod(axis=1)
         return np.asarray(self.begin + self.law.passage(own, left))
 
@@ -176,7 +177,7 @@ def courses_of(
         own: list[tuple[Branch, float]] = []
         for law in parameter.laws:
             # What has no parameters, or no travel after the step, cannot begin anew.
-            anew = bool(law.names) and any(0 < step < now for step in steps[-1:])
+            anew = law.names and steps and 0 < steps[-1] < now
             begins = (0.0, steps[-1]) if anew else (0.0,)
             share = law.weight / total / len(begins)
             own += [(Branch(law, begin, tuple(steps)), share) for begin in begins]

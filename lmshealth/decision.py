@@ -196,8 +196,7 @@ def reached_before(prognosis: Prognosis, day: date) -> Reached:
 def remaining_days(prognosis: Prognosis) -> FloatArray:
     """Give the draws of the remaining days, infinite past the horizon, as `remaining` is shaped."""
     with np.errstate(divide="ignore", invalid="ignore"):
-        days = prognosis.remaining / prognosis.usage[:, None]
-    return np.where(prognosis.remaining > prognosis.horizon, np.inf, days)
+        return np.asarray(prognosis.claimed() / prognosis.usage[:, None])
 
 
 def day_after(prognosis: Prognosis, wait: float) -> date | None:

@@ -138,8 +138,7 @@ def _foretold(
 def _life(history: History, stage: Stage, seed: int, keep_posterior: bool) -> Life:
     """Track one machine and foretell it from what its track believes, as a run does."""
     from lmshealth.history import believed
-    from lmshealth.lifefit import fit_life
-    from lmshealth.prognosis import prognose as foretell
+    from lmshealth.prognosis import prognose_with_posterior
     from lmshealth.sampling import seed_of
     from lmshealth.tracking import track
 
@@ -150,6 +149,5 @@ def _life(history: History, stage: Stage, seed: int, keep_posterior: bool) -> Li
         )
     seeds = seed_of(seed, history.stage, stage.digest)
     trusted = believed(history, track(history, stage))
-    prognosis = foretell(trusted, stage, seeds)
-    # The same streams give the same posterior again.
-    return prognosis, fit_life(trusted, stage, seeds) if keep_posterior else None
+    prognosis, posterior = prognose_with_posterior(trusted, stage, seeds)
+    return prognosis, posterior if keep_posterior else None

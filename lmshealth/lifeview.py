@@ -172,7 +172,7 @@ def _gauges(health: Health | None) -> Iterator[str]:
     """Median and 90 % interval of each parameter that the logs tell."""
     if health is None or not health.recorded_at:
         return
-    told, values = health.told(), 100 * health.quantile(LEVELS)[:, -1]
+    told, values = health.told(), 100 * health.latest(LEVELS)
     for j, name in enumerate(health.parameters):
         low, middle, high = values[:, j]
         found = f"{middle:.0f} % ({low:.0f} to {high:.0f})" if told[j] else "not told"
@@ -182,11 +182,10 @@ def _gauges(health: Health | None) -> Iterator[str]:
 def _left(prognosis: Prognosis | None) -> str:
     if prognosis is None:
         return "–"
-    travel = prognosis.remaining[:, -1]
     end = f"beyond {prognosis.horizon / _KM:,.0f}"
     low, middle, high = (
         f"{max(value, 0.0) / _KM:,.0f}" if np.isfinite(value) else end
-        for value in quantiles(np.where(travel > prognosis.horizon, np.inf, travel))
+        for value in quantiles(prognosis.claimed()[:, -1])
     )
     return middle if low == high else f"{middle} ({low} to {high})"
 

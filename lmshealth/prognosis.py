@@ -54,6 +54,13 @@ def prognose(
     NotConverged
         If the sampler did not converge.
     """
+    return prognose_with_posterior(history, stage, seed, chains=chains)[0]
+
+
+def prognose_with_posterior(
+    history: History, stage: Stage, seed: int | Sequence[int], *, chains: bool = True
+) -> tuple[Prognosis, LifePosterior]:
+    """Prognose, and give the posterior that it rests on; see `prognose`."""
     if not limited(stage):
         raise BadStage(f"{stage.name}: no [[parameter]] has a limit, so there is no end of life")
     # Health has its streams by epoch, the life its own; these are of what comes after.
@@ -75,7 +82,7 @@ def prognose(
     columns = [j for j, _ in told]
     unit = np.array([parameter.baseline for _, parameter in told])
     curve = _curve(life, travel, np.random.default_rng(seeds[2]))[..., columns] * unit
-    return Prognosis(
+    found = Prognosis(
         stage=history.stage,
         recorded_at=history.recorded_at[-1],
         travel=float(history.travel[-1]),
@@ -101,6 +108,7 @@ def prognose(
         ess=life.ess,
         r_hat=life.worst_r_hat,
     )
+    return found, life
 
 
 def remaining_travel(

@@ -236,7 +236,7 @@ def _gauges(assessment: Assessment, top: float | None) -> Iterator[Gauge]:
     if health is None:
         return
     if top is None:  # one length for all gauges of a page, so that bars can be compared
-        highest = health.quantile(0.95)[-1].max()
+        highest = health.latest(0.95).max()
         top = float(np.clip(np.ceil(10 * highest + 0.5) / 10, 1.2, 2.0))
     for k, name in enumerate(health.parameters):
         spec = next((spec for spec in assessment.stage.parameters if spec.name == name), None)
@@ -244,7 +244,7 @@ def _gauges(assessment: Assessment, top: float | None) -> Iterator[Gauge]:
 
 
 def _gauge(spec: ParameterSpec | None, health: Health, column: int, top: float) -> Gauge:
-    low, middle, high = health.quantile(LEVELS)[:, -1, column]
+    low, middle, high = health.latest(LEVELS)[:, column]
     limit = _limit(spec)
     places = {"low": low, "median": middle, "high": high, "baseline": 1.0, "limit": limit or 0.0}
     below = "" if limit is None else percent(np.mean(health.samples[-1, :, column] < limit))
@@ -278,8 +278,7 @@ def _service(service: Service) -> dict[str, Any]:
 
 def _life(prognosis: Prognosis, column: int) -> Life:
     name, limit = prognosis.parameters[column], float(prognosis.limits[column])
-    travel = prognosis.remaining[:, column]
-    distance = quantiles(np.where(travel > prognosis.horizon, np.inf, travel))
+    distance = quantiles(prognosis.claimed()[:, column])
     days = quantiles(remaining_days(prognosis)[:, column])
     low, middle, high = quantiles(
         100 * prognosis.health[:, min(column, prognosis.health.shape[1] - 1)]

@@ -265,6 +265,10 @@ class Health:
         """Quantiles of every parameter at every epoch, shape ``(..., n_epochs, n_parameters)``."""
         return np.asarray(np.quantile(self.samples, level, axis=1))
 
+    def latest(self, level: float | FloatArray) -> FloatArray:
+        """Quantiles of every parameter at the last epoch, shape ``(..., n_parameters)``."""
+        return np.asarray(np.quantile(self.samples[-1], level, axis=0))
+
     def to_frame(self) -> pd.DataFrame:
         """Make the table of ``health.csv``: one row per epoch and parameter, odometer in km."""
         quantiles = self.quantile(np.array(list(QUANTILES.values())))
@@ -424,6 +428,10 @@ class Prognosis:
         expect_shape("health", self.health, (self.health.shape[0], n - 1))
         expect_shape("curve_quantiles", self.curve_quantiles, (5, self.curve_travel.size, n - 1))
         freeze(self)
+
+    def claimed(self) -> FloatArray:
+        """Draws of the remaining travel, infinite past the horizon, as `remaining` is shaped."""
+        return np.where(self.remaining > self.horizon, np.inf, self.remaining)
 
     def beyond_horizon(self) -> FloatArray:
         """Probability that each limit stays unreached to the horizon, ``(n_parameters + 1,)``."""

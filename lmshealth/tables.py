@@ -294,8 +294,7 @@ def prognosis_rows(
 
 def _rul(prognosis: Prognosis, column: int, days: FloatArray) -> Row:
     """Quantiles of the remaining life; past the horizon they are empty, not numbers."""
-    travel = prognosis.remaining[:, column]
-    travel = np.where(travel > prognosis.horizon, np.inf, travel)
+    travel = prognosis.claimed()[:, column]
     row: Row = {}
     for unit, values in (("km", travel / _KM), ("hours", days * 24), ("days", days)):
         found = np.quantile(np.maximum(values, 0), RUL_LEVELS, method="inverted_cdf")

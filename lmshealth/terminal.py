@@ -21,7 +21,7 @@ from rich.table import Table
 from lmshealth.results import Health
 from lmshealth.tables import Row
 from lmshealth.tracks import Track
-from lmshealth.wording import change
+from lmshealth.wording import LEVELS, change
 
 # So many lines of a frequency response are shown.
 _MOST_LINES = 12
@@ -105,7 +105,7 @@ def print_track(track: Track) -> None:
 
 def print_health(health: Health) -> None:
     """Print what is left of each parameter at the last epoch, and on what that rests."""
-    low, middle, high = health.quantile(np.array([0.05, 0.5, 0.95]))[:, -1]
+    low, middle, high = health.latest(LEVELS)
     cells = [
         (
             name,

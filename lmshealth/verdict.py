@@ -161,7 +161,7 @@ def _judge_posterior(stage: Stage, history: History, health: Health) -> Judgemen
 
 
 def _why(stage: Stage, health: Health, told: list[int]) -> str:
-    low, middle, high = health.quantile(np.array([0.05, 0.5, 0.95]))[:, -1]
+    low, middle, high = health.latest(np.array([0.05, 0.5, 0.95]))
     sentences = []
     for j, parameter in enumerate(stage.parameters):
         name = parameter.name.replace("_", " ").capitalize()

@@ -62,12 +62,12 @@ def table(tmp_path: Path) -> Path:
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     """Put a life with a known end in the place of the inference."""
 
-    def prognose(history: History, stage: Stage, seed: object) -> Prognosis:
+    def prognose(history: History, stage: Stage, seed: object) -> tuple[Prognosis, None]:
         made = make_prognosis(np.linspace(1e5, 1e6, 1000), np.full(1000, 1e4))
         object.__setattr__(made, "stage", history.stage)
-        return made
+        return made, None
 
-    monkeypatch.setattr(foretelling, "prognose", prognose)
+    monkeypatch.setattr(foretelling, "prognose_with_posterior", prognose)
 
 
 def call(*words: object) -> Result:
