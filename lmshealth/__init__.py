@@ -6,6 +6,7 @@ samples to the date. Inside the package all quantities are in SI units.
 
 from importlib.metadata import version
 
+from lmshealth.assessing import assess
 from lmshealth.decay import identify_decays
 from lmshealth.decision import decide
 from lmshealth.errors import LmshealthError
@@ -14,7 +15,7 @@ from lmshealth.history import Reading, build_history
 from lmshealth.inference import infer, infer_together
 from lmshealth.lifefit import fit_life
 from lmshealth.modal import identify
-from lmshealth.pipeline import Settings, assess, run
+from lmshealth.pipeline import Settings, run
 from lmshealth.planning import plan
 from lmshealth.prognosis import prognose
 from lmshealth.readers import read_log

@@ -7,6 +7,7 @@ from datetime import date, datetime
 
 import numpy as np
 
+from lmshealth.decision import Service
 from lmshealth.summary import Assessment
 from lmshealth.verdict import Verdict
 from lmshealth.wording import GAP, LEVELS, km, left, percent, quantiles, spell
@@ -67,8 +68,16 @@ class Reported:
     service_by: date | None
 
 
-def reported(assessment: Assessment) -> Reported:
-    """Keep of an assessment what a later report compares itself with."""
+def reported(assessment: Assessment, service: Service | None = None) -> Reported:
+    """Keep of an assessment what a later report compares itself with.
+
+    Parameters
+    ----------
+    assessment : Assessment
+        Of the stage.
+    service : Service or None
+        What `Assessment.service` gives, where it is known: to decide it takes time.
+    """
     history, judgement = assessment.history, assessment.judgement
     health, prognosis = assessment.health, assessment.prognosis
     told: dict[str, Interval] = {}
@@ -91,7 +100,7 @@ def reported(assessment: Assessment) -> Reported:
         health=told,
         remaining=remaining,
         horizon=np.inf if prognosis is None else prognosis.horizon,
-        service_by=assessment.service().by,
+        service_by=(service or assessment.service()).by,
     )
 
 

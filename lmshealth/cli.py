@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import click
 
 from lmshealth import terminal
+from lmshealth.batchcommands import report, run
 from lmshealth.commands import COMMANDS
 from lmshealth.errors import BadLog, LmshealthError
 from lmshealth.logs import Log, Refusal
@@ -22,21 +23,16 @@ from lmshealth.magnitudes import find_growth
 from lmshealth.options import (
     COLUMNS,
     DETECT,
-    EPOCHS,
     FORMAT,
     LOGS,
     PART,
-    PDF,
-    SEED,
     SHARE,
     STAGE,
     checked_band,
     examples,
 )
-from lmshealth.pdf import write_pdfs
 
 if TYPE_CHECKING:
-    from lmshealth.pipeline import RunResult
     from lmshealth.readers import ColumnMap
     from lmshealth.stage import Stage
 
@@ -71,50 +67,6 @@ class _Group(click.Group):
 @click.version_option(package_name="lmshealth")
 def main() -> None:
     """Tell how much guide preload and mount stiffness a linear-motor stage has left."""
-
-
-@main.command(epilog=examples("run logs/ --stage lms-y --out result/"))
-@click.argument("logs", type=click.Path(exists=True, file_okay=False, path_type=Path))
-@click.option(
-    "--stage",
-    "stages",
-    multiple=True,
-    required=True,
-    help="Stage description: a .toml file or a shipped name; may be given several times.",
-)
-@click.option(
-    "--out",
-    type=click.Path(file_okay=False, path_type=Path),
-    required=True,
-    help="Folder for tables and report.",
-)
-@click.option("--store", help="SQLAlchemy URL of the store; default a SQLite file in --out.")
-@click.option("--workers", type=click.IntRange(1), help="Processes; default one per processor.")
-@EPOCHS
-@SEED
-@PDF
-@click.pass_context
-def run(
-    ctx: click.Context, /, logs: Path, stages: tuple[str, ...], out: Path, **options: Any
-) -> None:
-    """Analyse a folder of logs: tables, verdict and report. Run again to go on."""
-    from lmshealth.pipeline import Settings
-    from lmshealth.pipeline import run as run_pipeline
-    from lmshealth.stage import load_stage
-
-    settings = Settings(
-        store=options["store"],
-        workers=options["workers"] or len(os.sched_getaffinity(0)),
-        epochs=options["epochs"],
-        seed=options["seed"],
-    )
-    loaded = [load_stage(reference) for reference in stages]
-    with terminal.progress_bars() as progress:
-        result = run_pipeline(logs, loaded, out, settings, progress)
-    _tell(result)
-    if options["pdf"]:
-        write_pdfs(result.pages)
-    ctx.exit(_SOME_REFUSED if result.n_refused else _DONE)
 
 
 @main.command(
@@ -428,15 +380,5 @@ def _exit(ctx: click.Context, found: Sequence[object], lost: Sequence[Refusal]) 
     ctx.exit(_DONE if not lost else _SOME_REFUSED if found else _FAILED)
 
 
-def _tell(result: RunResult) -> None:
-    from lmshealth.lifeview import print_assessments
-
-    used = result.n_logs - result.n_refused
-    again = f", {result.n_remembered} of them known from before" if result.n_remembered else ""
-    click.echo(f"{used} of {result.n_logs} logs analysed{again}.")
-    print_assessments(result.assessments)
-    click.echo(f"Report: {result.index}")
-
-
-for _command in COMMANDS:
+for _command in (run, *COMMANDS, report):
     main.add_command(_command)

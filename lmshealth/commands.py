@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,8 +13,17 @@ from lmshealth import terminal
 from lmshealth.errors import BadTable, NotEnoughData
 from lmshealth.files import write_draws, write_text
 from lmshealth.lifecommands import prognose
-from lmshealth.options import COV, EPOCHS, MAINTENANCE, OUT, PDF, SEED, STAGE, TABLE, examples
-from lmshealth.pdf import write_pdfs
+from lmshealth.options import (
+    COV,
+    EPOCHS,
+    MAINTENANCE,
+    OUT,
+    SEED,
+    STAGE,
+    TABLE,
+    examples,
+)
+from lmshealth.progress import progress_bars
 
 if TYPE_CHECKING:
     from lmshealth.logs import Refusal
@@ -153,7 +161,7 @@ def infer(ctx: click.Context, /, table: Path, **options: Any) -> None:
 
     if bool(options["others"]) != bool(options["shared"]):
         raise click.UsageError("--with and --shared need each other: which parameter is shared?")
-    with terminal.progress_bars() as progress:
+    with progress_bars() as progress:
         found, lost = _inferred(table, options, progress)
     for health in found:
         terminal.print_health(health)
@@ -233,43 +241,6 @@ def _only(table: Path, machines: tuple[Drifts, ...]) -> Drifts:
     return machines[0]
 
 
-@click.command(
-    epilog=examples(
-        "report --store sqlite:///result/lmshealth.sqlite --out pages/",
-        "report --store postgresql+psycopg://me@host/fleet --out pages/ --pdf",
-    )
-)
-@click.option("--store", required=True, metavar="URL", help="What `run` has filled, by its URL.")
-@click.option(
-    "--out",
-    type=click.Path(file_okay=False, path_type=Path),
-    required=True,
-    help="Folder of the pages.",
-)
-@PDF
-@click.pass_context
-def report(ctx: click.Context, /, store: str, out: Path, pdf: bool) -> None:
-    """Write the pages of all machines in a store, without their logs.
-
-    They are those that `run` wrote last for each machine, byte for byte.
-    """
-    from lmshealth.report import write_report
-    from lmshealth.store import Store
-
-    with closing(Store(store, create=False)) as opened:
-        fleet = opened.fleet()
-    *pages, index = write_report(out, fleet.assessments, fleet.refused, earlier=fleet.earlier)
-    click.echo(f"Report: {index}")
-    for machine in fleet.unread:
-        click.echo(
-            f"lmshealth: {machine}: not readable for this version of lmshealth; run its logs again",
-            err=True,
-        )
-    if pdf:
-        write_pdfs(pages)
-    ctx.exit(3 if fleet.unread else 0)
-
-
 @click.command(epilog=examples("stage lms-y", "stage my-stage.toml --format json"))
 @click.argument("reference", metavar="STAGE")
 @click.option(
@@ -296,4 +267,4 @@ def stage(reference: str, style: str) -> None:
         print_stage(content)
 
 
-COMMANDS: Sequence[click.Command] = (track, infer, prognose, report, stage)
+COMMANDS: Sequence[click.Command] = (track, infer, prognose, stage)

@@ -57,7 +57,7 @@ class LifeDensity:
 
     def narrowed(self, y: FloatArray) -> LifeDensity:
         """Drop grid points that together carry a hundredth of the posterior at coordinates."""
-        weight = self._weights(y).mean(axis=1)
+        weight = self.weights(y)
         order = np.argsort(weight)
         kept = np.ones(weight.size, dtype=bool)
         kept[order[np.cumsum(weight[order]) < _NEGLIGIBLE]] = False
@@ -71,7 +71,7 @@ class LifeDensity:
         y : ndarray
             Coordinates inside the support, shape ``(n, n_dim)``.
         """
-        weight, grid = self._weights(y).mean(axis=1), self.grid
+        weight, grid = self.weights(y), self.grid
         centre = y.mean(axis=0, keepdims=True)
         x, inside = self._path(centre, np.isfinite(self.course.log_prior(centre)))
         if not inside.all():
@@ -118,13 +118,13 @@ class LifeDensity:
         rate = self.grid.deviation[point, None] ** 2 / self.life.horizon
         return off * self.life.free, rate * self.life.free
 
-    def _weights(self, y: FloatArray) -> FloatArray:
-        """Probability of each point of the grid at each of some coordinates, ``(n_grid, n)``."""
+    def weights(self, y: FloatArray) -> FloatArray:
+        """Probability of each point of the grid, averaged over coordinates, ``(n_grid,)``."""
         x, inside = self._path(y, np.isfinite(self.course.log_prior(y)))
         if not inside.any():
             name = self.life.stage.name
             raise NotEnoughData(f"{name}: no life of the prior stays inside the map")
-        return np.asarray(softmax(self.life.terms(self.grid, x), axis=0))
+        return np.asarray(softmax(self.life.terms(self.grid, x), axis=0).mean(axis=1))
 
     def _path(self, y: FloatArray, possible: BoolArray) -> tuple[FloatArray, BoolArray]:
         """Ln parameters at the nodes of the lives that stay inside the map, and which these are."""

@@ -1,11 +1,12 @@
-"""Files that commands write: folders are made, and what keeps a file from being written is told."""
+"""Files that are written: whole or not at all, where they are asked for and nowhere else."""
 
 from __future__ import annotations
 
+import secrets
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import IO, TYPE_CHECKING
 
 from lmshealth.errors import BadTable
 
@@ -14,9 +15,54 @@ if TYPE_CHECKING:
 
 
 def write_text(target: Path, text: str) -> None:
-    """Write a text, folders included."""
-    with _writing(target):
-        target.write_text(text)
+    """Write a text as `replacing` does, folders included.
+
+    Raises
+    ------
+    BadTable
+        If it cannot be written.
+    """
+    with _writing(target), replacing(target) as stream:
+        stream.write(text)
+
+
+def write_bytes(target: Path, content: bytes) -> None:
+    """Write what is no text in the same way.
+
+    Raises
+    ------
+    BadTable
+        If it cannot be written.
+    """
+    with _writing(target), _in_place_of(target) as part, part.open("xb") as stream:
+        stream.write(content)
+
+
+@contextmanager
+def replacing(target: Path) -> Iterator[IO[str]]:
+    """Give a file to write that takes the place of another in one step, when it is whole.
+
+    A link that stands there is replaced, not followed.
+    """
+    # One name that is no text must not keep all others from being told.
+    odd = "backslashreplace"
+    with (
+        _in_place_of(target) as part,
+        part.open("x", encoding="utf-8", errors=odd, newline="\n") as stream,
+    ):
+        yield stream
+
+
+@contextmanager
+def _in_place_of(target: Path) -> Iterator[Path]:
+    """Give the path of a new file that becomes another when it is closed."""
+    # A name under which nobody can have laid a link, and which fits beside any other.
+    part = target.with_name(f".{secrets.token_hex(8)}.part")
+    try:
+        yield part
+        part.replace(target)
+    finally:
+        part.unlink(missing_ok=True)
 
 
 def write_draws(target: Path, stages: Sequence[str], trees: Sequence[DataTree]) -> None:

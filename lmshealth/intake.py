@@ -3,30 +3,49 @@
 from __future__ import annotations
 
 import logging
-import multiprocessing
-import signal
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import BrokenExecutor, Executor, ProcessPoolExecutor, as_completed
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from importlib.metadata import version
+from functools import partial
 from pathlib import Path
 
 from lmshealth.errors import BadLog
 from lmshealth.following import loop_error
-from lmshealth.history import Reading, in_order
-from lmshealth.logs import Refusal
+from lmshealth.history import Reading
+from lmshealth.logs import Log, Metadata, Refusal
 from lmshealth.modal import identify
-from lmshealth.packing import fingerprint
-from lmshealth.readers import content_digest, find_logs, read_log, read_manifest, require_identity
+from lmshealth.packing import VERSION, fingerprint
+from lmshealth.readers import (
+    content_digest,
+    find_logs,
+    format_name,
+    name_of,
+    read_log,
+    read_manifest,
+    require_identity,
+)
+from lmshealth.readers.trouble import visible
 from lmshealth.stage import Stage
-from lmshealth.store import Outcome, Store
+from lmshealth.store import Identified, Store
 from lmshealth.waterfall import read_levels
+from lmshealth.workers import Pool
 
 Progress = Callable[[str, int, int], None]
 """Called with what is being done, how much is done, and how much there is."""
 
+# Files hashed by one task.
+_BATCH = 16
+# Their refusal says something of the computer, not of the log: it may be otherwise next time.
+_PASSING = ("missing-file", "changed")
+
 _logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True, order=True)
+class Entry:
+    """A log of a machine: its name, and under what the store has its reading."""
+
+    log: str
+    key: str
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -35,8 +54,10 @@ class Intake:
 
     Attributes
     ----------
-    readings : tuple of Reading
-        In the order of recording.
+    machines : dict of str to tuple of Entry
+        Logs of each machine that gave a reading, by its identity.
+    descriptions : dict of str to str
+        Digest of the stage description of each machine.
     refused : tuple of Refusal
         Logs refused as a whole, copies, and rows of a manifest that name no log.
     logs : frozenset of str
@@ -45,7 +66,8 @@ class Intake:
         Logs that the store knew.
     """
 
-    readings: tuple[Reading, ...]
+    machines: dict[str, tuple[Entry, ...]]
+    descriptions: dict[str, str]
     refused: tuple[Refusal, ...]
     logs: frozenset[str]
     n_remembered: int
@@ -57,16 +79,20 @@ class _Task:
     name: str
     overrides: dict[str, str]
     digest: str
-    key: str
+
+    def key(self, description: str) -> str:
+        """Name what becomes of the log by all that it depends on."""
+        given = self.digest, format_name(self.path), sorted(self.overrides.items()), description
+        return fingerprint(VERSION, *given)
 
 
 def take_in(
     folder: Path,
     stages: Sequence[Stage],
     store: Store,
+    pool: Pool,
     *,
     out: Path,
-    workers: int = 1,
     progress: Progress = lambda what, done, total: None,
 ) -> Intake:
     """Identify every log of a folder that the store does not know yet.
@@ -79,163 +105,199 @@ def take_in(
         Each log goes to the first description that takes it.
     store : Store
         Knows what was done before, and keeps what is done now.
+    pool : Pool
+        Does the work; results do not depend on it.
     out : Path
         Folder of the output: nothing inside it is a log.
-    workers : int
-        Processes; results do not depend on it.
     progress : callable
         Told what is going on.
     """
+    folder = folder.absolute()  # workers may stand elsewhere
     archive = find_logs(folder)
     inside = out.resolve()
     found = [path for path in archive.logs if inside not in path.resolve().parents]
-    tasks, refused = _tasks(folder, found, stages, progress)
-    outcomes, n_remembered = _identify_all(tasks, stages, store, workers, progress)
-    lost = [r for outcome in outcomes if not isinstance(outcome, Reading) for r in outcome]
-    names = {path.relative_to(folder).as_posix() for path in found}
+    tasks, refused = _tasks(folder, found, pool, progress)
+    sorter = _Sorter(tuple(stages))
+    known = set()
+    for task, outcome in _remembered(tasks, stages, store):
+        sorter.add(task, outcome)
+        known.add(task.name)
+    progress("identifying", len(known), len(tasks))
+    left = [task for task in tasks if task.name not in known]
+    work = partial(identify_log, stages=tuple(stages))
+    for k, (task, outcome) in enumerate(pool.spread(work, left, _lost), start=1):
+        if outcome.lasting:
+            store.put(task.key(outcome.description), task.digest, outcome)
+        sorter.add(task, outcome)
+        progress("identifying", len(known) + k, len(tasks))
+    names = {name_of(path, folder) for path in found}
+    machines, descriptions, lost = sorter.sorted()
     return Intake(
-        readings=in_order([o for o in outcomes if isinstance(o, Reading)]),
+        machines=machines,
+        descriptions=descriptions,
         refused=(*archive.refused, *refused, *lost),
         logs=frozenset(names | {refusal.log for refusal in archive.refused}),
-        n_remembered=n_remembered,
+        n_remembered=len(known),
     )
 
 
-@contextmanager
-def processes(n: int) -> Iterator[Executor | None]:
-    """Start worker processes, and end them whatever happens; none for one worker."""
-    if n <= 1:
-        yield None
-        return
-    # Spawned, not forked: a fork would share locks of threads that do not come along.
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(n, mp_context=context, initializer=_leave_interrupts) as pool:
-        try:
-            yield pool
-        except BaseException:
-            pool.shutdown(wait=False, cancel_futures=True)
-            raise
+class _Sorter:
+    """Gives readings to machines, and keeps of each no more than its name."""
 
+    def __init__(self, stages: tuple[Stage, ...]) -> None:
+        self._order = [stage.digest for stage in stages]
+        self._found: dict[str, dict[str, list[Entry]]] = {}
+        self._lost: list[Refusal] = []
 
-def _leave_interrupts() -> None:
-    """Let Ctrl-C be the parent's alone: workers would each print where they stood."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    def add(self, task: _Task, found: Identified) -> None:
+        if isinstance(found.outcome, Reading):
+            own = self._found.setdefault(str(found.stage), {})
+            entry = Entry(task.name, task.key(found.description))
+            own.setdefault(found.description, []).append(entry)
+        else:
+            self._lost += found.outcome
+
+    def sorted(self) -> tuple[dict[str, tuple[Entry, ...]], dict[str, str], list[Refusal]]:
+        """Give the logs and the description of each machine, and what was refused, by name."""
+        machines, descriptions, lost = {}, {}, list(self._lost)
+        for name, by in sorted(self._found.items()):
+            most = max(by, key=lambda digest: (len(by[digest]), -self._order.index(digest)))
+            machines[name], descriptions[name] = tuple(sorted(by[most])), most
+            others = [entry for digest in by if digest != most for entry in by[digest]]
+            detail = (
+                f"{len(by[most])} logs of {name} belong to another stage description than this "
+                "one; a machine has one: see column description of manifest.csv"
+            )
+            lost += [Refusal(entry.log, "no-stage", detail) for entry in others]
+        return machines, descriptions, sorted(lost, key=lambda refusal: refusal.log)
 
 
 def _tasks(
-    folder: Path, found: Sequence[Path], stages: Sequence[Stage], progress: Progress
+    folder: Path, found: Sequence[Path], pool: Pool, progress: Progress
 ) -> tuple[list[_Task], list[Refusal]]:
     """Name every log by its content; the same content twice is one log."""
     manifest = read_manifest(folder)
     tasks: list[_Task] = []
     refused: list[Refusal] = list(manifest.refused)
-    seen: dict[str, str] = {}
-    circumstances = [version("lmshealth"), [stage.digest for stage in stages]]
-    for k, path in enumerate(found):
-        progress("reading", k, len(found))
-        name = path.relative_to(folder).as_posix()
+    digests: dict[Path, str] = {}
+    progress("reading", 0, len(found))
+    for _, part in pool.spread(_digests, _batches(found), _no_digests):
+        for path, (digest, refusal) in part.items():
+            digests[path] = digest
+            if refusal is not None:
+                refused.append(Refusal(name_of(path, folder), *refusal))
+        progress("reading", len(digests), len(found))
+    seen: dict[tuple[str, str], str] = {}
+    # Of copies the one that a manifest tells of is analysed: the others may lack what it says.
+    for path in sorted(found, key=lambda path: not manifest.names(path)):
+        name = name_of(path, folder)
+        # Under the name of another format it is no copy: only one of the two can be read.
+        content = digests[path], format_name(path)
+        if not digests[path]:
+            continue
         try:
-            digest = content_digest(path)
+            overrides = manifest.overrides(path)
         except BadLog as error:
             refused.append(Refusal(name, error.reason, error.detail))
             continue
-        if digest in seen:
-            detail = f"same content as {seen[digest]}, which is analysed"
+        if content in seen:
+            detail = f"same content as {seen[content]}, which stands for both"
             refused.append(Refusal(name, "duplicate", detail))
             continue
-        seen[digest] = name
-        overrides = manifest.overrides(path)
-        key = fingerprint(digest, circumstances, sorted(overrides.items()))
-        tasks.append(_Task(path, name, overrides, digest, key))
-    progress("reading", len(found), len(found))
+        seen[content] = name
+        tasks.append(_Task(path, name, overrides, digests[path]))
     return tasks, refused
 
 
-def _identify_all(
-    tasks: Sequence[_Task],
-    stages: Sequence[Stage],
-    store: Store,
-    workers: int,
-    progress: Progress,
-) -> tuple[list[Outcome], int]:
-    """Identify all logs that the store does not know; results in the order of the tasks."""
-    outcomes: dict[str, Outcome] = {}
-    for task in tasks:
-        known = store.get(task.key, task.name)
-        if known is not None:
-            outcomes[task.key] = known
-    n_remembered = len(outcomes)
-    progress("identifying", n_remembered, len(tasks))
-    open_tasks = [task for task in tasks if task.key not in outcomes]
-    for task, outcome in _carry_out(open_tasks, tuple(stages), workers):
-        outcomes[task.key] = store.put(task.key, outcome)
-        progress("identifying", len(outcomes), len(tasks))
-    return [outcomes[task.key] for task in tasks], n_remembered
+def _batches(found: Sequence[Path]) -> Iterator[tuple[Path, ...]]:
+    for first in range(0, len(found), _BATCH):
+        yield tuple(found[first : first + _BATCH])
 
 
-def _carry_out(
-    tasks: Sequence[_Task], stages: tuple[Stage, ...], workers: int
-) -> Iterator[tuple[_Task, Outcome]]:
-    """Identify logs in the order in which they are done.
+_Digests = dict[Path, tuple[str, tuple[str, str] | None]]
 
-    A library that a damaged file crashes takes its process along. The logs that were under way
-    are then done again, each in a process of its own, so that only the one is lost.
+
+def _digests(paths: Iterable[Path]) -> _Digests:
+    """Hash files; one that cannot be has an empty digest, and the reason."""
+    found: _Digests = {}
+    for path in paths:
+        try:
+            found[path] = content_digest(path), None
+        except BadLog as error:
+            found[path] = "", (error.reason, error.detail)
+    return found
+
+
+def _no_digests(paths: Iterable[Path], why: str) -> _Digests:
+    return {path: ("", ("missing-file", f"{why}: it cannot be read")) for path in paths}
+
+
+def _remembered(
+    tasks: Sequence[_Task], stages: Sequence[Stage], store: Store
+) -> Iterator[tuple[_Task, Identified]]:
+    """Yield what the store knows of logs and is still true.
+
+    That is what holds without a description, or came by the description that takes the log today.
     """
-    if workers <= 1 or len(tasks) <= 1:
-        for task in tasks:
-            yield task, identify_log(task, stages)
-        return
-    left = list(tasks)
-    while left:
-        done: set[str] = set()
-        try:
-            with processes(workers) as pool:
-                assert pool is not None  # more than one worker
-                futures = {pool.submit(identify_log, task, stages): task for task in left}
-                for future in as_completed(futures):
-                    outcome = future.result()
-                    done.add(futures[future].key)
-                    yield futures[future], outcome
-            return
-        except BrokenExecutor:
-            left = [task for task in left if task.key not in done]
-            # Tasks are begun in order: the one that did it is among the first.
-            suspects, left = left[: 2 * workers + 1], left[2 * workers + 1 :]
-            for task in suspects:
-                yield task, _alone(task, stages)
+    digests = ["", _none_of(stages), *(stage.digest for stage in stages)]
+    own = {task.key(digest): task for task in tasks for digest in digests}
+    for key, found in store.identified(own):
+        metadata = Metadata(stage=found.stage, description=found.asked)
+        if found.description in ("", _none_of(stages), _taker(stages, metadata)):
+            yield own[key], found.named(own[key].name)
 
 
-def _alone(task: _Task, stages: tuple[Stage, ...]) -> Outcome:
-    """Identify one log in a process of its own, and survive that process."""
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(1, mp_context=context) as pool:
-        try:
-            return pool.submit(identify_log, task, stages).result()
-        except BrokenExecutor:
-            detail = "reading it ended the process that read it: the file is damaged, or too large"
-            return (Refusal(task.name, "corrupt", detail),)
+def _taker(stages: Sequence[Stage], metadata: Metadata) -> str | None:
+    """Digest of the description that a log belongs to."""
+    return next((stage.digest for stage in stages if stage.takes(metadata)), None)
 
 
-def identify_log(task: _Task, stages: tuple[Stage, ...]) -> Outcome:
+def _none_of(stages: Sequence[Stage]) -> str:
+    """Stand for all descriptions, where none of them takes a log."""
+    return fingerprint([(stage.name, stage.description.match.stage) for stage in stages])
+
+
+def _lost(task: _Task, why: str) -> Identified:
+    refusal = Refusal(task.name, "corrupt", f"{why}: the file is damaged, or too large")
+    return Identified((refusal,), lasting=False)
+
+
+def identify_log(task: _Task, stages: tuple[Stage, ...]) -> Identified:
     """Read and identify one log; what goes wrong with it is its refusal, never an exception."""
+    by, stage, asked = "", None, None
     try:
         log = read_log(task.path, overrides=task.overrides, name=task.name)
+        if log.digest != task.digest:
+            raise BadLog(task.name, "changed", "it is being written to; run again")
         require_identity(log)
-        stage = next((stage for stage in stages if stage.takes(log.metadata)), None)
-        if stage is None:
-            raise BadLog(
-                task.name,
-                "no-stage",
-                f"stage {log.metadata.stage!r} matches none of the descriptions "
-                f"{[s.description.match.stage for s in stages]}; give its description by --stage",
-            )
-        modes = identify(log, stage)
-        return Reading(
-            task.name, log.digest, log.metadata, modes, loop_error(log), read_levels(log, stage)
-        )
+        stage, asked = log.metadata.stage, log.metadata.description
+        by = _taker(stages, log.metadata) or _none_of(stages)
+        outcome = _identified(log, stages)
+        return Identified(outcome, by, stage, asked)
     except BadLog as error:
-        return (Refusal(task.name, error.reason, error.detail),)
+        refusal = Refusal(task.name, error.reason, error.detail)
+        return Identified((refusal,), by, stage, asked, lasting=error.reason not in _PASSING)
+    except (OSError, MemoryError) as error:
+        why = visible(str(error)) or type(error).__name__
+        detail = f"{why}: the computer failed, not the log; run again"
+        return Identified((Refusal(task.name, "resources", detail),), lasting=False)
     except Exception as error:  # one log must not end the batch, whatever our mistake
         _logger.exception("%s", task.name)
-        detail = f"{type(error).__name__}: {error}; please report this with the log"
-        return (Refusal(task.name, "internal", detail),)
+        detail = visible(f"{type(error).__name__}: {error}; please report this with the log")
+        return Identified((Refusal(task.name, "internal", detail),), lasting=False)
+
+
+def _identified(log: Log, stages: tuple[Stage, ...]) -> Reading:
+    """Identify a log by the description that takes it."""
+    stage = next((stage for stage in stages if stage.takes(log.metadata)), None)
+    if stage is None:
+        raise BadLog(
+            log.name,
+            "no-stage",
+            f"stage {log.metadata.stage!r} matches none of the descriptions "
+            f"{[s.description.match.stage for s in stages]}; give its description by --stage",
+        )
+    modes = identify(log, stage)
+    return Reading(
+        log.name, log.digest, log.metadata, modes, loop_error(log), read_levels(log, stage)
+    )

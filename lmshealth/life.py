@@ -20,6 +20,7 @@ them.
 Lives are smooth: what their drifts are at all logs follows linearly from what they are at few of
 them, the nodes. H(θ) = W h(θ) with h at the nodes, and by A = L⁻¹ W = Q R, L = chol(Σ), the data
 shrink to Qᵀ L⁻¹ y and W to R, so that what a walker costs hardly depends on the number of logs.
+Of more than 400 logs neighbours are taken together before, see `condense`.
 """
 
 from __future__ import annotations
@@ -31,10 +32,11 @@ import numpy as np
 from scipy.linalg import qr, solve_triangular
 
 from lmshealth.arrays import BoolArray, FloatArray
+from lmshealth.condense import condensed
 from lmshealth.courses import Course, courses_of
 from lmshealth.epoch import one_at_a_time
 from lmshealth.errors import NotEnoughData
-from lmshealth.stage import Stage
+from lmshealth.stage import Scatter, Stage
 from lmshealth.statespace import BIAS_STD, JUMP_STD, MOVES, regressors
 from lmshealth.tracks import History
 
@@ -49,6 +51,8 @@ _DEVIATION_PRIOR = (0.6, 0.3, 0.1)
 # Lives that show how smooth lives are; what QR may leave of theirs, in ln f. Others are met within
 # some 1e-6, those of a posterior within 1e-8.
 _N_EXAMPLES, _ROUGHEST = 300, 1e-8
+# Of more logs neighbours are taken together.
+MOST_LOGS = 400
 # With more steps than these every piece of a life is too short for a law.
 _MOST_STEPS = 3
 
@@ -109,6 +113,7 @@ class LifeLikelihood:
 
     def __init__(self, history: History, stage: Stage) -> None:
         self.stage = stage
+        history = condensed(history, MOST_LOGS)
         if not history.has_odometer:
             raise NotEnoughData(
                 f"{history.stage}: not every log has travel_km, and laws of a life count by the "
@@ -307,16 +312,17 @@ class LifeLikelihood:
         return both[:, -1], q, r
 
     def _whiten(self) -> Grid:
-        points = []
-        for walk, (scale, scale_prior), (deviation, deviation_prior) in product(
-            _WALKS,
-            zip(_NOISE_SCALES, _NOISE_SCALE_PRIOR, strict=True),
-            zip(_DEVIATIONS, _DEVIATION_PRIOR, strict=True),
+        points, believed = [], scatter_of(self.stage)
+        for (walk, walk_prior), (scale, scale_prior), (deviation, deviation_prior) in product(
+            zip(_WALKS, believed.walk, strict=True),
+            zip(_NOISE_SCALES, believed.noise_scale, strict=True),
+            zip(_DEVIATIONS, believed.deviation, strict=True),
         ):
             factor = self.covariance.factor(walk, scale, deviation)
             u, q, r = self._reduced(factor)
             target = q.T @ u
-            log_weight = np.log(scale_prior * deviation_prior) - np.sum(np.log(np.diag(factor)))
+            prior = walk_prior * scale_prior * deviation_prior
+            log_weight = np.log(prior) - np.sum(np.log(np.diag(factor)))
             design = r.T.reshape(len(self.modes), -1, target.size)
             rest = np.sum(u**2) - np.sum(target**2)
             points.append((walk, scale, deviation, design, target, rest, log_weight))
@@ -337,6 +343,23 @@ class LifeLikelihood:
                 same * np.outer(seen, seen), JUMP_STD[step.kind][0] ** 2 * np.outer(there, there)
             )
         return total
+
+
+def scatter_of(stage: Stage) -> Scatter:
+    """Give what is believed of the scatter of a stage beforehand."""
+    if stage.scatter is not None:
+        return stage.scatter
+    return Scatter((1.0,) * len(_WALKS), _NOISE_SCALE_PRIOR, _DEVIATION_PRIOR)
+
+
+def expected_scatter(scatter: Scatter) -> tuple[float, float, float]:
+    """Give the means of walk, noise scale and deviation that are believed in beforehand."""
+    values = (_WALKS, _NOISE_SCALES, _DEVIATIONS)
+    priors = (scatter.walk, scatter.noise_scale, scatter.deviation)
+    walk, noise_scale, deviation = (
+        float(np.average(v, weights=p)) for v, p in zip(values, priors, strict=True)
+    )
+    return walk, noise_scale, deviation
 
 
 def _jumps(history: History) -> list[int]:

@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING, Any
 import click
 from numpy.linalg import LinAlgError
 
-from lmshealth import terminal
 from lmshealth.errors import NotConverged, NotEnoughData
 from lmshealth.files import write_draws, write_text
 from lmshealth.options import COV, MAINTENANCE, OUT, SEED, SHARE, TABLE, Finite, examples
+from lmshealth.progress import progress_bars
 
 if TYPE_CHECKING:
     from lmshealth.lifefit import LifePosterior
@@ -59,6 +59,7 @@ def prognose(ctx: click.Context, /, table: Path, **options: Any) -> None:
     out. The odometer is needed in every row. --max-risk and --cost-ratio stand in for [decision]
     of the stage description.
     """
+    from lmshealth.brief import life_brief
     from lmshealth.decision import decide, reached_before
     from lmshealth.history import lost_notes
     from lmshealth.lifeview import print_life
@@ -76,7 +77,7 @@ def prognose(ctx: click.Context, /, table: Path, **options: Any) -> None:
     ]
     for note in (*read.notes, *notes):
         click.echo(f"note: {note}", err=True)
-    with terminal.progress_bars() as progress:
+    with progress_bars() as progress:
         histories = [history for history, _ in read.machines]
         found, lost = _foretold(histories, stage, options, progress)
     rows = []
@@ -91,7 +92,7 @@ def prognose(ctx: click.Context, /, table: Path, **options: Any) -> None:
         before = None if by is None else (by.date(), reached_before(life, by.date()))
         service = decide(life, decision)
         own = prognosis_rows(life, service, before)
-        print_life(life, service, own)
+        print_life(life_brief(life, service, own))
         rows += own
     for why in lost:
         click.echo(f"lmshealth: {why}", err=True)

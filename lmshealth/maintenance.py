@@ -7,10 +7,14 @@ from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
 
-import pandas as pd
-
 from lmshealth.errors import BadTable
+from lmshealth.logs import Refusal
+from lmshealth.readers.archive import find_sheets, name_of
+from lmshealth.readers.metadata import parse_moment, parse_name
+from lmshealth.readers.sheets import Row, read_sheet
+from lmshealth.readers.trouble import Unusable, shown
 
+_FILE = "maintenance.csv"
 _NEEDED = ("stage", "recorded_at", "action")
 # Work on guide or mount changes what "the state at baseline" means.
 RESETS = ("preload-adjust", "guide-replaced", "mount-tightened")
@@ -27,57 +31,136 @@ class Action:
     action: str
 
 
-def read_maintenance(folder: Path) -> tuple[Action, ...]:
-    """Read every ``maintenance.csv`` below a folder, in the order of time.
+@dataclass(frozen=True, slots=True)
+class Unread:
+    """Something of ``maintenance.csv`` that is not understood.
+
+    Attributes
+    ----------
+    refusal : Refusal
+        What and why, under the name of the table.
+    stage : str or None
+        The machine that a row names, empty where it names none; None for a whole table.
+    """
+
+    refusal: Refusal
+    stage: str | None
+
+
+@dataclass(frozen=True, slots=True)
+class Maintenance:
+    """What was done, as far as it is understood.
+
+    Attributes
+    ----------
+    actions : tuple of Action
+        In the order of time.
+    unread : tuple of Unread
+        What may have been done besides.
+    """
+
+    actions: tuple[Action, ...] = ()
+    unread: tuple[Unread, ...] = ()
+
+    @property
+    def refused(self) -> tuple[Refusal, ...]:
+        """What is not understood, for ``refused.csv``."""
+        return tuple(one.refusal for one in self.unread)
+
+    def of(self, machine: str) -> Maintenance:
+        """Give what concerns one machine; what names none may concern any."""
+        return Maintenance(
+            tuple(action for action in self.actions if action.stage == machine),
+            tuple(one for one in self.unread if one.stage in (machine, "", None)),
+        )
+
+
+NOTHING_KNOWN = Maintenance()
+"""What is known where there is no table."""
+
+
+def read_maintenance(folder: Path) -> Maintenance:
+    """Read every ``maintenance.csv`` below a folder.
 
     Raises
     ------
     BadTable
-        If a column is missing, an action is unknown, or a moment has no time zone.
+        If it is no folder.
+    """
+    found = find_sheets(folder, _FILE)
+    actions: list[Action] = []
+    unread = [Unread(refusal, None) for refusal in found.refused]
+    for path in found.logs:
+        _read(path, name_of(path, folder), actions, unread)
+    return Maintenance(tuple(sorted(actions, key=lambda a: a.recorded_at)), tuple(unread))
+
+
+def read_actions(path: Path) -> tuple[Action, ...]:
+    """Read one table of maintenance, in the order of time.
+
+    Raises
+    ------
+    BadTable
+        If anything in it is not understood: who names one table can mend it.
     """
     actions: list[Action] = []
-    for path in sorted(folder.rglob("maintenance.csv")):
-        actions += read_actions(path)
-    return tuple(sorted(actions, key=lambda action: action.recorded_at))
+    unread: list[Unread] = []
+    _read(path, shown(path), actions, unread)
+    for one in unread:
+        raise BadTable(f"{one.refusal.log}, {one.refusal.detail}")
+    return tuple(sorted(actions, key=lambda a: a.recorded_at))
 
 
-def read_actions(path: Path) -> list[Action]:
-    """Read one table of maintenance, as `read_maintenance` does."""
+def _read(path: Path, name: str, actions: list[Action], unread: list[Unread]) -> None:
     try:
-        table = pd.read_csv(path, dtype=str, keep_default_na=False)
-    except (OSError, ValueError) as error:
-        raise BadTable(f"{path}: cannot be read: {error}") from error
-    missing = [name for name in _NEEDED if name not in table.columns]
-    if missing:
-        raise BadTable(f"{path}: no column {missing}; there are {list(table.columns)}")
-    known = (*RESETS, *STEPS)
-    actions = []
-    for number, row in enumerate(table.itertuples(index=False), start=2):
-        where = f"{path}, line {number}"
-        if str(row.action) not in known:
-            raise BadTable(f"{where}: action {row.action!r} is unknown; known are {list(known)}")
-        try:
-            moment = datetime.fromisoformat(str(row.recorded_at))
-        except ValueError as error:
-            raise BadTable(f"{where}: recorded_at {row.recorded_at!r} is no ISO date") from error
-        if moment.tzinfo is None:
-            raise BadTable(f"{where}: recorded_at {row.recorded_at!r} needs a time zone")
-        actions.append(Action(str(row.stage), moment, str(row.action)))
-    return actions
+        for row in read_sheet(path, _NEEDED):
+            try:
+                actions.append(_action(row))
+            except Unusable as error:
+                refusal = Refusal(name, "bad-row", f"{row.where}: {error.detail}")
+                unread.append(Unread(refusal, _machine(row)))
+    except Unusable as error:
+        unread.append(Unread(Refusal(name, error.reason, error.detail), None))
 
 
-def maintenance_notes(actions: Sequence[Action], moments: Sequence[datetime | None]) -> list[str]:
+def _action(row: Row) -> Action:
+    """Read a row; what is not used of it is not judged."""
+    if row.trouble:
+        raise Unusable("bad-row", row.trouble)
+    if row.cells["action"] not in (known := (*RESETS, *STEPS)):
+        raise Unusable(
+            "bad-row", f"action {row.cells['action'][:80]!r} is unknown; known are {list(known)}"
+        )
+    stage, moment = parse_name(row.cells, "stage"), parse_moment(row.cells)
+    if stage is None or moment is None:
+        raise Unusable("bad-row", "stage and recorded_at are needed")
+    return Action(stage, moment, row.cells["action"])
+
+
+def _machine(row: Row) -> str:
+    """Name the machine of a row that is not understood, as well as can be."""
+    try:
+        return parse_name(row.cells, "stage") or ""
+    except Unusable:
+        return ""
+
+
+def maintenance_notes(work: Maintenance, moments: Sequence[datetime | None]) -> list[str]:
     """Say what the reader of a report must know of the work on a machine.
 
     Parameters
     ----------
-    actions : sequence of Action
-        Its maintenance, in the order of time.
+    work : Maintenance
+        What was done to it.
     moments : sequence of datetime or None
         When its logs were recorded.
     """
-    notes = []
-    resets = [action for action in actions if action.action in RESETS]
+    notes = [
+        f"{one.refusal.log} is not fully understood ({one.refusal.detail}): if it tells of work on "
+        "this machine, nothing here knows of it."
+        for one in work.unread
+    ]
+    resets = [action for action in work.actions if action.action in RESETS]
     for action in resets:
         before = sum(moment is not None and moment < action.recorded_at for moment in moments)
         told = f"{action.action} on {action.recorded_at.date().isoformat()}"

@@ -141,7 +141,10 @@ def read_map(path: str, parameters: tuple[str, ...]) -> ModalMap:
         raise BadStage(f"{path}: cannot read the modal map: {why}") from error
     missing = {*parameters, "mode", "frequency_hz"} - set(table.columns)
     if missing:
-        raise BadStage(f"{path}: no column {sorted(missing)}; there are {list(table.columns)}")
+        # A description may name any file, and what is no map at all is nobody's business.
+        is_map = missing != {*parameters, "mode", "frequency_hz"}
+        there = f"there are {list(table.columns)}" if is_map else "it is no modal map"
+        raise BadStage(f"{path}: no column {sorted(missing)}; {there}")
     extra = set(table.columns) - {*parameters, "mode", "frequency_hz"}
     if extra:
         raise BadStage(

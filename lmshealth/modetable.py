@@ -143,7 +143,7 @@ def read_machines(
     beside = path.with_name("modes_cov.csv")
     terms = cross_terms or (beside if beside.exists() else None)
     read = read_estimates(path, cross_terms=terms, stage=stage)
-    actions = read_actions(maintenance) if maintenance else []
+    actions = read_actions(maintenance) if maintenance else ()
     own: dict[str, list[Reading]] = {}
     for reading in read.readings:
         own.setdefault(str(reading.metadata.stage), []).append(reading)

@@ -42,6 +42,15 @@ EPOCHS = click.option(
     help="Infer health at no more than this many epochs per machine.",
 )
 SEED = click.option("--seed", type=click.IntRange(0), default=0, show_default=True)
+WORKERS = click.option(
+    "--workers", type=click.IntRange(1), help="Processes; default one per processor."
+)
+SCHEDULER = click.option(
+    "--scheduler",
+    metavar="ADDRESS",
+    help="Work on a Dask cluster instead, by the address of its scheduler: it has this version of "
+    "lmshealth, and its workers see the logs under the same paths.",
+)
 PDF = click.option("--pdf", is_flag=True, help="Also write a PDF beside the page of each stage.")
 
 

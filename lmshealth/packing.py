@@ -8,10 +8,14 @@ from __future__ import annotations
 
 import hashlib
 import zlib
+from importlib.metadata import version
 from typing import Any
 
 import msgspec
 import numpy as np
+
+VERSION = version("lmshealth")
+"""Of the package, a part of the names of what it makes; asking anew takes a millisecond."""
 
 # What an array may hold: bool, numbers, text and moments. Objects would be addresses in memory.
 _KINDS = "biufcUMm"

@@ -9,6 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from lmshealth.errors import LmshealthError
+from lmshealth.files import write_bytes
+from lmshealth.svg import give_letters
 
 
 class PdfError(LmshealthError):
@@ -35,6 +37,7 @@ def write_pdfs(pages: Iterable[Path]) -> list[Path]:
     written = []
     for page in pages:
         text = page.read_text(encoding="utf-8").replace("</style>", f"{style}</style>", 1)
+        text = give_letters(text)
         # Pictures name colours of the style sheet, which are not looked up inside of them.
         text = re.sub(r"var\(--\w+, (#\w+)\)", r"\1", text)
         target = page.with_suffix(".pdf")
@@ -45,7 +48,7 @@ def write_pdfs(pages: Iterable[Path]) -> list[Path]:
                 f"{target}: cannot be made: {type(error).__name__} {error}; print {page} from a "
                 "browser instead"
             ) from error
-        target.write_bytes(content)
+        write_bytes(target, content)
         written.append(target)
     return written
 

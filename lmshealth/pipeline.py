@@ -2,33 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from concurrent.futures import Executor
-from contextlib import closing
-from dataclasses import dataclass
-from importlib.metadata import version
-from pathlib import Path
+from collections.abc import Iterator, Sequence
+from contextlib import AbstractContextManager, closing
+from dataclasses import dataclass, field
+from pathlib import Path, PurePosixPath
+from tempfile import TemporaryFile
 
-from numpy.linalg import LinAlgError
-
+from lmshealth.assessing import Machine
+from lmshealth.batch import Site, assess_all, logs_of, teach_all, tell_all
+from lmshealth.database import StoreError
 from lmshealth.errors import LmshealthError, NothingUsable
-from lmshealth.history import Reading, believed, build_history, doubted, lost_notes
-from lmshealth.inference import epochs_to_infer, infer
-from lmshealth.intake import Intake, Progress, processes, take_in
-from lmshealth.maintenance import Action, maintenance_notes, read_maintenance
-from lmshealth.packing import fingerprint
-from lmshealth.prognosis import prognose
-from lmshealth.report import write_report
-from lmshealth.results import Health, Prognosis
-from lmshealth.sampling import seed_of
+from lmshealth.index import IndexRow, file_names, worst_first, write_index
+from lmshealth.intake import Intake, Progress, take_in
+from lmshealth.logs import Refusal
+from lmshealth.maintenance import Maintenance, read_maintenance
+from lmshealth.readers import NOT_LOGS
 from lmshealth.stage import Stage
-from lmshealth.store import Fleet, Store, beside
-from lmshealth.summary import Assessment
-from lmshealth.tables import all_tables
-from lmshealth.tracking import track
-from lmshealth.tracks import History, Track
-from lmshealth.verdict import judge
-from lmshealth.waterfall import Waterfall
+from lmshealth.store import Store, beside
+from lmshealth.telling import Content, Tables, Telling
+from lmshealth.workers import Pool, cluster, processes
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,17 +32,24 @@ class Settings:
     store : str or None
         SQLAlchemy URL; None for a SQLite file beside the output.
     workers : int
-        Processes; results do not depend on it.
+        Processes of this machine; results do not depend on it.
+    scheduler : str or None
+        Address of a Dask scheduler, whose workers then take the place of processes.
     epochs : int
         Health is inferred at no more than this many epochs per stage.
     seed : int
         Of all randomness.
     """
 
-    store: str | None = None
+    store: str | None = field(default=None, repr=False)  # it may hold a password
     workers: int = 1
+    scheduler: str | None = None
     epochs: int = 40
     seed: int = 0
+
+    def pool(self) -> AbstractContextManager[Pool]:
+        """Open what does the work."""
+        return cluster(self.scheduler) if self.scheduler else processes(self.workers)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -61,20 +60,28 @@ class RunResult:
     ----------
     index : Path
         The front page of the report.
-    pages : tuple of Path
-        The page of each stage, in the order of `assessments`.
-    assessments : tuple of Assessment
-        One per stage.
+    rows : tuple of IndexRow
+        One per machine, worst first.
     n_logs, n_refused, n_remembered : int
         Different logs found, refused as a whole, and taken from the store.
+    n_unread : int
+        Rows of manifests and of maintenance that are not understood, or whole such tables.
+    failed : dict of str to str
+        Machines that could not be assessed, or told, and why.
     """
 
     index: Path
-    pages: tuple[Path, ...]
-    assessments: tuple[Assessment, ...]
+    rows: tuple[IndexRow, ...]
     n_logs: int
     n_refused: int
     n_remembered: int
+    n_unread: int
+    failed: dict[str, str]
+
+    @property
+    def pages(self) -> tuple[Path, ...]:
+        """Pages of the machines, which lie beside the index."""
+        return tuple(self.index.with_name(row.file) for row in self.rows)
 
 
 def run(
@@ -104,167 +111,185 @@ def run(
     NothingUsable
         If there is no log, or every log was refused; ``refused.csv`` is written all the same.
     """
-    out.mkdir(parents=True, exist_ok=True)
-    actions = read_maintenance(folder)
-    with closing(Store(settings.store or beside(out))) as store:
-        taken = take_in(folder, stages, store, out=out, workers=settings.workers, progress=progress)
-        fleet = _assess_all(taken, stages, actions, store, settings, progress)
-        _write_tables(out, taken, fleet)
-        if not taken.readings:
-            raise NothingUsable(
-                f"{folder}: no usable log: {len(taken.logs)} found, {_n_lost(taken, fleet)} "
-                f"refused; {out / 'refused.csv'} says why"
-            )
-        store.keep_refused((a.history.stage for a in fleet.assessments), fleet.refused)
-    pages = write_report(out, fleet.assessments, fleet.refused, earlier=fleet.earlier)
-    n_copies = len({r.log for r in fleet.refused if r.reason == "duplicate"})
+    _prepare(out)
+    work = read_maintenance(folder)
+    with settings.pool() as pool, closing(Store(settings.store or beside(out))) as store:
+        taken = take_in(folder, stages, store, pool, out=out, progress=progress)
+        refused = (*taken.refused, *work.refused)
+        machines = _machines(taken, stages, work, settings)
+        site = Site(store, pool, progress)
+        failed = assess_all(machines, site)
+        usable = [machine for machine in machines if machine.name not in failed]
+        rows, contradicted = _report(usable, refused, site, out, failed)
+    copies = {refusal.log for refusal in refused if refusal.reason == "duplicate"}
+    lost = ({refusal.log for refusal in refused} - copies | contradicted) & taken.logs
+    if not machines:
+        raise NothingUsable(
+            f"{folder}: no usable log: {len(taken.logs)} found, {len(lost)} refused; "
+            f"{out / 'refused.csv'} says why"
+        )
     return RunResult(
-        index=out / "index.html",
-        pages=tuple(page for page in pages if page.name != "index.html"),
-        assessments=fleet.assessments,
-        n_logs=len(taken.logs) - n_copies,
-        n_refused=_n_lost(taken, fleet),
+        index=write_index(out, rows, refused),
+        rows=rows,
+        n_logs=len(taken.logs - copies),
+        n_refused=len(lost),
         n_remembered=taken.n_remembered,
+        n_unread=sum(PurePosixPath(refusal.log).name in NOT_LOGS for refusal in refused),
+        failed=failed,
     )
 
 
-def _n_lost(taken: Intake, fleet: Fleet) -> int:
-    """Count the logs that are refused as a whole.
-
-    A row of a manifest that names no log is listed, but no log is lost by it; nor by a copy.
-    """
-    lost = {r.log for r in fleet.refused if r.reason != "duplicate"}
-    return len(lost & taken.logs)
-
-
-def _write_tables(out: Path, taken: Intake, fleet: Fleet) -> None:
-    partial = [r for reading in taken.readings for r in reading.modes.refused]
-    jumps = [r for a in fleet.assessments for r in a.refused if r.reason == "jump"]
-    refused = [*fleet.refused, *partial, *jumps]
-    for name, table in all_tables(taken.readings, fleet.assessments, refused).items():
-        _write_table(out / f"{name}.csv", table.to_csv(index=False))
-
-
-def _write_table(path: Path, text: str) -> None:
-    """Replace a file in one step, so that an interrupted run leaves no half table."""
-    part = path.with_suffix(".part")
-    part.write_text(text, encoding="utf-8")
-    part.replace(path)
-
-
-def _assess_all(
-    taken: Intake,
-    stages: Sequence[Stage],
-    actions: Sequence[Action],
+def report(
     store: Store,
-    settings: Settings,
-    progress: Progress,
-) -> Fleet:
-    """Assess every machine of which anything has changed; the store remembers the others."""
-    machines: dict[str, list[Reading]] = {}
-    for reading in taken.readings:
-        machines.setdefault(str(reading.metadata.stage), []).append(reading)
-    assessments: list[Assessment] = []
-    earlier = {}
-    with processes(settings.workers) as pool:
-        for k, (name, own) in enumerate(sorted(machines.items())):
-            progress("assessing", k, len(machines))
-            stage = next(stage for stage in stages if stage.takes(own[0].metadata))
-            relevant = [action for action in actions if action.stage == name]
-            given = (own, stage.digest, relevant, settings.epochs, settings.seed)
-            key = fingerprint(version("lmshealth"), *given)
-            known = store.recall(name, key)
-            if known is None:
-                known = store.keep(name, key, assess(own, stage, relevant, settings, pool))
-            assessments.append(known)
-            if (said := store.earlier(name, key)) is not None:
-                earlier[name] = said
-    progress("assessing", len(machines), len(machines))
-    contradicted = [r for a in assessments for r in a.refused if r.reason == "odometer"]
-    return Fleet(tuple(assessments), (*taken.refused, *contradicted), earlier)
-
-
-def assess(
-    readings: Sequence[Reading],
-    stage: Stage,
-    actions: Sequence[Action] = (),
+    out: Path,
     settings: Settings = Settings(),
-    pool: Executor | None = None,
-) -> Assessment:
-    """Take the readings of one machine through tracking, health, prognosis and verdict.
+    progress: Progress = lambda what, done, total: None,
+) -> RunResult:
+    """Write the pages of all machines in a store, without their logs.
 
     Parameters
     ----------
-    readings : sequence of Reading
-        Logs of one machine, at least one.
-    stage : Stage
-        Its description.
-    actions : sequence of Action
-        Its maintenance.
+    store : Store
+        Filled by `run`.
+    out : Path
+        Folder of the pages, made if needed.
     settings : Settings
-        Number of epochs and seed.
-    pool : Executor, optional
-        Epochs are spread over it.
+        Who does the work.
+    progress : callable
+        Told what is going on.
 
-    Returns
-    -------
-    Assessment
-        What the data do not carry is None, with the reason among the notes.
+    Raises
+    ------
+    StoreError
+        If there is no assessment that this version can read.
     """
-    history, refused = build_history(readings, stage, actions)
-    notes = maintenance_notes(actions, [reading.metadata.recorded_at for reading in readings])
-    notes += lost_notes(history, refused)
-    partial = [refusal for reading in readings for refusal in reading.modes.refused]
-    seed = seed_of(settings.seed, history.stage, stage.digest)
-    followed, health, prognosis = _results(history, stage, settings.epochs, seed, pool, notes)
-    if followed is not None:
-        refused += doubted(history, followed)
-    own = {reading.log: reading for reading in readings}
-    used = [own[log] for log in history.logs]
-    return Assessment(
-        stage=stage,
-        history=history,
-        digests=tuple(reading.digest for reading in used),
-        track=followed,
-        health=health,
-        prognosis=prognosis,
-        judgement=judge(stage, history, health, followed),
-        refused=tuple([*partial, *refused]),
-        notes=tuple(notes),
-        seed=settings.seed,
-        waterfall=Waterfall.stack([(reading.levels, reading.modes.lines) for reading in used]),
+    _prepare(out)
+    told = store.told()
+    files = file_names([one.machine for one in told])
+    rows, failed = dict[str, IndexRow](), dict[str, str]()
+    progress("reporting", 0, len(told))
+    with settings.pool() as pool:
+        contents = (
+            Content(
+                machine=one.machine,
+                file=files[one.machine],
+                assessment=store.assessment(one.machine, one.key),
+                logs=(),
+                before=store.earlier(one.machine, one.key),
+            )
+            for one in told
+        )
+        for name, telling in tell_all(contents, pool, out):
+            if isinstance(telling, str):
+                failed[name] = telling
+            else:
+                rows[name] = telling.page.row
+            progress("reporting", len(rows) + len(failed), len(told))
+    if not rows and not failed:
+        raise StoreError(
+            "the store holds only what another version of lmshealth kept; `lmshealth run LOGS "
+            "--store URL` fills it anew"
+        )
+    ranked = tuple(worst_first(rows.values()))
+    unread = "not readable for this version of lmshealth; run its logs again"
+    return RunResult(
+        index=write_index(out, ranked, store.refused(one.refused for one in told)),
+        rows=ranked,
+        n_logs=0,
+        n_refused=0,
+        n_remembered=0,
+        n_unread=0,
+        failed={one.machine: unread for one in told if one.machine not in rows} | failed,
     )
 
 
-def _results(
-    history: History,
-    stage: Stage,
-    most_epochs: int,
-    seed: tuple[int, int],
-    pool: Executor | None,
-    notes: list[str],
-) -> tuple[Track | None, Health | None, Prognosis | None]:
-    """Go as far as the data carry; what stops it becomes a note."""
-    followed: Track | None = None
-    health: Health | None = None
+def _prepare(out: Path) -> None:
+    """Make the folder of the output, and see whether it can be written to."""
     try:
-        followed = track(history, stage)
-        history = believed(history, followed)
-        if not stage.parameters:
-            return followed, None, None
-        # The life needs the longest of all: it is begun before the epochs and fetched after them.
-        has_limit = any(parameter.limit for parameter in stage.parameters)
-        life = pool.submit(prognose, history, stage, seed) if pool and has_limit else None
-        epochs = epochs_to_infer(followed, stage, most_epochs)
-        health = infer(followed, stage, seed, epochs=epochs, mapper=pool.map if pool else map)
-        if not has_limit:
-            return followed, health, None
-        return followed, health, life.result() if life else prognose(history, stage, seed)
-    except LmshealthError as error:
-        notes.append(str(error))
-    except LinAlgError as error:  # one machine must not end the run
-        notes.append(
-            f"{history.stage}: its logs lead to a matrix without an inverse ({error}); please "
-            "report this with modes.csv"
+        out.mkdir(parents=True, exist_ok=True)
+        TemporaryFile(dir=out).close()
+    except OSError as error:
+        raise LmshealthError(f"{out}: cannot be written to: {error.strerror}") from error
+
+
+def _machines(
+    taken: Intake, stages: Sequence[Stage], work: Maintenance, settings: Settings
+) -> list[Machine]:
+    """Put together what the assessment of each machine depends on."""
+    by_digest = {stage.digest: stage for stage in stages}
+    return [
+        Machine(
+            name=name,
+            logs=tuple((entry.log, entry.key) for entry in entries),
+            stage=by_digest[taken.descriptions[name]],
+            work=work.of(name),
+            epochs=settings.epochs,
+            seed=settings.seed,
         )
-    return followed, health, None
+        for name, entries in taken.machines.items()
+    ]
+
+
+def _report(
+    machines: Sequence[Machine],
+    refused: Sequence[Refusal],
+    site: Site,
+    out: Path,
+    failed: dict[str, str],
+) -> tuple[tuple[IndexRow, ...], set[str]]:
+    """Write pages and tables; give the rows of the index, and logs left out of a life."""
+    key = site.store.keep_refused(tuple(refused))
+    rows, contradicted = dict[str, IndexRow](), set[str]()
+    site.progress("reporting", 0, len(machines))
+    with Tables(out, [machine.name for machine in machines]) as tables:
+        tables.add_refused(refused)
+        for name, keys, telling in _told(machines, site, out, failed):
+            if telling is None:
+                tables.add(name, {})
+                continue
+            site.store.tell(name, keys[0], key, beside=keys)
+            tables.add(name, telling.tables)
+            contradicted |= set(telling.contradicted)
+            rows[name] = telling.page.row
+            site.progress("reporting", len(rows), len(machines))
+        tables.write()
+    return tuple(worst_first(rows.values())), contradicted
+
+
+def _told(
+    machines: Sequence[Machine], site: Site, out: Path, failed: dict[str, str]
+) -> Iterator[tuple[str, tuple[str, str], Telling | None]]:
+    """Tell machines, and yield the keys of what is told and of what that comes from.
+
+    One whose assessment has gone, or cannot be read, is assessed once more.
+    """
+    files = file_names([machine.name for machine in machines])
+    left, anew = {machine.name: machine for machine in machines}, frozenset[str]()
+    for _ in range(2):
+        keys, untaught = teach_all(machines, site, anew=anew)
+        failed |= untaught
+        contents = (_content(m, keys[m.name], files, site.store) for m in list(left.values()))
+        for name, telling in tell_all(contents, site.pool, out):
+            both = keys[name], left.pop(name).key
+            if isinstance(telling, str):
+                failed[name] = telling
+                yield name, both, None
+            else:
+                yield name, both, telling
+        if not left:
+            return
+        failed |= assess_all(list(left.values()), site, anew=True)
+        anew = frozenset(left)
+    for name in left:
+        failed.setdefault(name, "its assessment cannot be read back from the store")
+
+
+def _content(machine: Machine, key: str, files: dict[str, str], store: Store) -> Content:
+    """Fetch what is to be told of a machine."""
+    return Content(
+        machine=machine.name,
+        file=files[machine.name],
+        assessment=store.assessment(machine.name, key),
+        logs=logs_of(machine, store),
+        before=store.earlier(machine.name, key),
+    )

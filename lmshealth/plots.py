@@ -18,6 +18,7 @@ import numpy as np
 from lmshealth.arrays import FloatArray
 from lmshealth.decision import Service
 from lmshealth.results import Health, Prognosis
+from lmshealth.svg import lean
 from lmshealth.wording import GAP, km, moment, spell, whole_km
 
 if TYPE_CHECKING:
@@ -82,6 +83,7 @@ def svg(draw: Callable[[Axes], object], *, salt: str, size: tuple[float, float] 
     import io
 
     import matplotlib
+    from matplotlib.backends.backend_svg import FigureCanvasSVG
     from matplotlib.figure import Figure
 
     target = io.StringIO()
@@ -90,19 +92,18 @@ def svg(draw: Callable[[Axes], object], *, salt: str, size: tuple[float, float] 
     with matplotlib.rc_context(style), warnings.catch_warnings():
         # A name in a script the font lacks is drawn as boxes; the page itself spells it out.
         warnings.filterwarnings("ignore", message="Glyph .* missing")
-        figure = Figure(figsize=size, layout="constrained", facecolor="none")
+        figure = Figure(figsize=size, dpi=_DPI, layout="constrained", facecolor="none")
         draw(figure.add_subplot())
-        figure.savefig(target, format="svg", metadata=nothing, dpi=_DPI)
+        # By itself, because `savefig` goes through everything once more before.
+        canvas: Any = FigureCanvasSVG(figure)
+        canvas.print_svg(target, metadata=nothing)
     text = _LINK.sub(r'<g class="hint" fill-opacity="0.004"><title>\1</title>', target.getvalue())
     text = text.replace("</a>", "</g>").replace(_CLEAR, "")
-    text = re.sub(r"(?s)<!--.*?-->|<metadata>.*?</metadata>", "", text[text.index("<svg") :])
+    text = lean(text[text.index("<svg") :])
     # Glyphs and groups carry the same identifiers in every file: give each picture its own.
     text = re.sub(r'(\sid="|href="#|url\(#)', rf"\g<1>{salt}-", text)
     for colour, name in _NAMED.items():
         text = text.replace(colour, f"var(--{name}, {colour})")
-    # Two decimals of a point are finer than any screen or printer.
-    text = re.sub(r'\sd="[^"]*"', lambda d: re.sub(r"(\.\d\d)\d+", r"\1", d[0]), text)
-    text = re.sub(r"\n\s*", "\n", text).strip()
     return text.replace("<svg ", '<svg aria-hidden="true" focusable="false" ', 1)
 
 

@@ -47,6 +47,14 @@ class Lognormal(
             value = ndtr(np.log(np.divide(x, self.median)) / self.sigma)
         return np.where(np.asarray(x) > 0, value, 0.0)
 
+    def standard(self, x: FloatArray) -> FloatArray:
+        """Give what has a standard normal distribution: ln x off the median, in sigmas."""
+        return np.asarray(np.log(x / self.median) / self.sigma)
+
+    def placed(self, mean: float, std: float) -> Lognormal:
+        """Give the distribution whose `standard` has this mean and standard deviation here."""
+        return Lognormal(self.median * float(np.exp(self.sigma * mean)), self.sigma * std)
+
     def widened(self, factor: float) -> Lognormal:
         """Give one with the same median, wider by a factor in the logarithm."""
         return Lognormal(self.median, factor * self.sigma)
@@ -76,6 +84,14 @@ class Normal(
     def probability(self, x: FloatArray) -> FloatArray:
         """Distribution function, elementwise."""
         return np.asarray(ndtr((np.asarray(x) - self.mean) / self.std))
+
+    def standard(self, x: FloatArray) -> FloatArray:
+        """Give what has a standard normal distribution: x off the mean, in standard deviations."""
+        return np.asarray((x - self.mean) / self.std)
+
+    def placed(self, mean: float, std: float) -> Normal:
+        """Give the distribution whose `standard` has this mean and standard deviation here."""
+        return Normal(self.mean + self.std * mean, self.std * std)
 
     def widened(self, factor: float) -> Normal:
         """Give one with the same mean, wider by a factor."""

@@ -29,6 +29,14 @@ from lmshealth.toml import Keys, decode, place
 
 Positive = Annotated[float, Meta(gt=0, le=sys.float_info.max)]
 Share = Annotated[float, Meta(gt=0, lt=1)]
+# Names reach terminals, tables and pages: no control characters, nothing that turns the writing.
+Name = Annotated[
+    str,
+    Meta(
+        max_length=200,
+        pattern="^[^\x00-\x1f\x7f-\x9f\u200b-\u200f\u2028-\u202e\u2060-\u206f]*\\Z",
+    ),
+]
 CostRatio = Annotated[float, Meta(gt=1, le=sys.float_info.max)]
 
 _MAX_RISK = 0.05
@@ -47,10 +55,10 @@ class Match(_Part, frozen=True):
 class ModeSpec(_Part, frozen=True):
     """A mode to look for."""
 
-    name: str
+    name: Name
     frequency_hz: Positive
     damping_ratio: Share
-    direction: str = ""
+    direction: Name = ""
     snr: Positive = 100.0
     search: Share = 0.15
     tracked: bool = True
@@ -77,10 +85,10 @@ class ParameterSpec(_Part, frozen=True):
     for any other.
     """
 
-    name: str
+    name: Name
     prior: Prior
     baseline: Positive = 1.0
-    unit: str = ""
+    unit: Name = ""
     limit: Limit | None = None
     law: AnyLaw | Annotated[tuple[AnyLaw, ...], Meta(min_length=1)] = Unchanging()
     verdict: Literal["preload", "mount", ""] = ""
@@ -106,7 +114,7 @@ class MapSpec(_Part, frozen=True):
 class Order(_Part, frozen=True):
     """A line whose frequency is velocity over wavelength."""
 
-    name: str
+    name: Name
     wavelength_mm: Positive
 
 
@@ -116,7 +124,7 @@ class Covariate(_Part, frozen=True):
     ``curvature_std`` is the prior standard deviation of what its square does, per unit squared.
     """
 
-    name: str
+    name: Name
     reference: float
     prior_std: Positive
     curvature_std: Annotated[float, Meta(ge=0)] = 0.0
@@ -125,7 +133,7 @@ class Covariate(_Part, frozen=True):
 class Loop(_Part, frozen=True):
     """Rigid open loop of one tuning, descending powers of s in rad/s."""
 
-    id: str
+    id: Name
     numerator: tuple[float, ...]
     denominator: tuple[float, ...]
 
@@ -165,7 +173,7 @@ class Usage(_Part, frozen=True):
 class Description(_Part, frozen=True):
     """The stage description as written."""
 
-    name: str
+    name: Name
     mode: Annotated[tuple[ModeSpec, ...], Meta(min_length=1)]
     source: str = ""
     match: Match = Match()
@@ -181,6 +189,20 @@ class Description(_Part, frozen=True):
     usage: Usage = Usage()
 
 
+@dataclass(frozen=True, slots=True)
+class Scatter:
+    """How probable each value is that the scatter of logs about a life may have, in proportion.
+
+    Weights of the values of the life's grid, in its order: of the random walk of ln
+    frequency, of the factor on reported standard deviations, and of the deviation of ln health
+    from its law.
+    """
+
+    walk: tuple[float, ...]
+    noise_scale: tuple[float, ...]
+    deviation: tuple[float, ...]
+
+
 @dataclass(frozen=True)
 class Stage:
     """A checked stage description with its modal map.
@@ -193,11 +215,14 @@ class Stage:
         Surrogate of the map; None when there is no health parameter.
     digest : str
         SHA-256 over description and map: results carry it.
+    scatter : Scatter or None
+        What is believed of scatter beforehand; None for what every stage is believed to have.
     """
 
     description: Description
     modal_map: ModalMap | None
     digest: str
+    scatter: Scatter | None = None
 
     @property
     def name(self) -> str:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from lmshealth.decision import Service, decide
+from lmshealth.fleet import Learned, Lesson
 from lmshealth.logs import Refusal
 from lmshealth.results import Health, Prognosis
 from lmshealth.stage import Stage
@@ -43,6 +44,10 @@ class Assessment:
         Of all random streams.
     waterfall : Waterfall or None
         Spectra of the logs of the history; None where no log shows the band of its modes.
+    lesson : Lesson or None
+        What the machine teaches others of its description; None without a posterior of its life.
+    fleet : Learned or None
+        The prior that others have taught it; None where the prognosis rests on the description's.
     """
 
     stage: Stage
@@ -56,18 +61,20 @@ class Assessment:
     notes: tuple[str, ...]
     seed: int
     waterfall: Waterfall | None = None
+    lesson: Lesson | None = None
+    fleet: Learned | None = None
 
     def service(self) -> Service:
         """Choose the day of the service as the description asks."""
         return decide(self.prognosis, self.stage.description.decision)
 
-    def urgency(self) -> tuple[int, float, float, str]:
+    def urgency(self, service: Service) -> tuple[int, float, float, str]:
         """Give a key that sorts by risk: days until the service; unknown before safe."""
         identity, verdict = self.judgement.stage, self.judgement.verdict
         if verdict == "not-enough-data":
             return 1, 0.0, 0.0, identity
         if self.prognosis is None:
             return (1 if verdict == "healthy" else 0), 0.0, 0.0, identity
-        days = self.service().wait
+        days = service.wait
         group = 2 if verdict == "healthy" and np.isinf(days) else 0
         return group, days, float(self.prognosis.beyond_horizon()[-1]), identity

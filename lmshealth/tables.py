@@ -106,34 +106,35 @@ def frame(columns: str, rows: Sequence[Row]) -> pd.DataFrame:
     return pd.DataFrame(list(rows), columns=list(order))
 
 
-def all_tables(
-    readings: Sequence[Reading], assessments: Sequence[Assessment], refused: Sequence[Refusal]
-) -> dict[str, pd.DataFrame]:
-    """Make all tables of a run, keyed by file name without ending."""
+def tables_of(readings: Sequence[Reading], assessment: Assessment) -> dict[str, list[Row]]:
+    """List everything about one machine, by the name of the table, which is a file without ending.
+
+    Parameters
+    ----------
+    readings : sequence of Reading
+        Its logs.
+    assessment : Assessment
+        What they say together.
+    """
     rows: dict[str, list[Row]] = {name: [] for name in COLUMNS}
     for reading in readings:
         rows["modes"] += modes_rows(reading)
         rows["modes_cov"] += _modes_cov_rows(reading)
-    for assessment in assessments:
-        if assessment.track is not None:
-            rows["track"] += track_rows(assessment.track)
-            rows["track_cov"] += track_cov_rows(assessment.track)
-            rows["effects"] += effects_rows(assessment.track)
-            rows["events"] += events_rows(assessment.track)
-        if assessment.health is not None:
-            rows["health"] += health_rows(assessment.health)
-        if assessment.prognosis is not None:
-            rows["prognosis"] += prognosis_rows(assessment.prognosis, assessment.service())
-        rows["verdict"].append(
-            {
-                "stage": assessment.judgement.stage,
-                "recorded_at": _moment(assessment.judgement.recorded_at),
-                "verdict": assessment.judgement.verdict,
-                "probability": assessment.judgement.probability,
-            }
-        )
-    rows["refused"] = refused_rows(refused)
-    return {name: frame(COLUMNS[name], content) for name, content in rows.items()}
+    if assessment.track is not None:
+        rows["track"] = track_rows(assessment.track)
+        rows["track_cov"] = track_cov_rows(assessment.track)
+        rows["effects"] = effects_rows(assessment.track)
+        rows["events"] = events_rows(assessment.track)
+    if assessment.health is not None:
+        rows["health"] = health_rows(assessment.health)
+    if assessment.prognosis is not None:
+        rows["prognosis"] = prognosis_rows(assessment.prognosis, assessment.service())
+    judgement = assessment.judgement
+    verdict = judgement.verdict, judgement.probability
+    values = judgement.stage, _moment(judgement.recorded_at), *verdict
+    rows["verdict"] = [dict(zip(COLUMNS["verdict"].split(), values, strict=True))]
+    rows["refused"] = refused_rows(assessment.refused)
+    return rows
 
 
 def _moment(moment: datetime | None) -> str | None:

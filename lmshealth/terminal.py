@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-import sys
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from itertools import combinations
 from pathlib import Path
 from typing import Any
@@ -15,7 +13,6 @@ import click
 import numpy as np
 from rich import box
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
 from lmshealth.results import Health
@@ -65,6 +62,12 @@ def print_modes(rows: Sequence[Row], refused: Sequence[Row]) -> None:
         title, ("log", "mode", "channel"), ("frequency Hz", "damping %", "SNR", "note"), cells
     )
     _print_refused(refused)
+
+
+def print_failed(failed: dict[str, str]) -> None:
+    """Say on standard error of which machines nothing can be told, and why."""
+    for machine, why in failed.items():
+        click.echo(f"lmshealth: {machine}: {why}", err=True)
 
 
 def print_track(track: Track) -> None:
@@ -419,25 +422,5 @@ def print_table(
     for row in cells:
         table.add_row(*row)
     click.echo(title)
-    Console().print(table)
-
-
-@contextmanager
-def progress_bars() -> Iterator[Any]:
-    """Show bars on a terminal's standard error, and nothing anywhere else."""
-    with Progress(
-        TextColumn("{task.description:<12}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeRemainingColumn(),
-        console=Console(stderr=True),
-        disable=not sys.stderr.isatty(),
-    ) as bars:
-        known: dict[str, Any] = {}
-
-        def tell(what: str, done: int, total: int) -> None:
-            if what not in known:
-                known[what] = bars.add_task(what, total=total)
-            bars.update(known[what], completed=done, total=total)
-
-        yield tell
+    # What stands in the cells is text: brackets in it are no markup.
+    Console(markup=False, emoji=False, highlight=False).print(table)

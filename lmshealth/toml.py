@@ -4,11 +4,17 @@ from __future__ import annotations
 
 import re
 import tomllib
-from collections.abc import Iterable, Iterator
+from bisect import bisect_left
+from collections.abc import Callable, Iterable
 from typing import Any, TypeVar
 
 import msgspec
 from msgspec.inspect import StructType, Type, UnionType, VarTupleType, type_info
+
+# A hundred modes take a tenth of it; each line of it is read by itself where a slip is sought.
+_LONGEST = 1 << 17
+# A statement of more is a string or an array without end.
+_MOST_LINES = 500
 
 Kind = TypeVar("Kind")
 Keys = tuple[str | int, ...]
@@ -38,7 +44,7 @@ def decode(content: bytes, kind: type[Kind]) -> Kind:
     try:
         table = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
-        line = 1 + max((last for _, last, _ in _statements(text)), default=0)
+        line = _first(text, lambda table: table is None)
         raise ValueError(f"line {line}: no TOML: {error}") from error
     except RecursionError as error:
         raise ValueError("no TOML that can be read: it is nested too deeply") from error
@@ -71,6 +77,8 @@ def place(content: bytes, *keys: str | int) -> str:
 
 
 def _text(content: bytes) -> str:
+    if len(content) > _LONGEST:
+        raise ValueError(f"{len(content)} bytes are no description; needed at most {_LONGEST}")
     try:
         return content.decode("utf-8-sig").replace("\r\n", "\n")
     except UnicodeDecodeError as error:
@@ -83,23 +91,35 @@ def _line(text: str, keys: Keys) -> int | None:
     table = tomllib.loads(text)
     while keys and not _holds(table, keys):
         keys = keys[:-1]
-    brought = (first for first, _, table in _statements(text) if _holds(table, keys))
-    return next(brought) if keys else None
+    return _first(text, lambda table: _holds(table, keys)) if keys else None
 
 
-def _statements(text: str) -> Iterator[tuple[int, int, dict[str, Any]]]:
-    """Yield first and last line of each statement with what the file holds up to there.
+def _first(text: str, reached: Callable[[Any], bool]) -> int:
+    """Find the line at which the statement begins by which something is reached.
 
-    A statement ends where the file cut off there is TOML.
+    What is asked of is the file up to the end of a statement, or None where that is no TOML.
     """
-    lines, first = text.split("\n"), 1
+    lines, ends = text.split("\n"), _ends(text)
+    k = bisect_left(ends, True, key=lambda last: reached(_loaded("\n".join(lines[:last]))))
+    return 1 + ends[k - 1]
+
+
+def _ends(text: str) -> list[int]:
+    """List the lines at which statements end: a string or an array may go on in the next."""
+    lines, ends = text.split("\n"), [0]
     for last in range(1, len(lines) + 1):
-        try:
-            table = tomllib.loads("\n".join(lines[:last]))
-        except tomllib.TOMLDecodeError:
-            continue  # a string or an array goes on in the next line
-        yield first, last, table
-        first = last + 1
+        if last > ends[-1] + _MOST_LINES:
+            break
+        if _loaded("\n".join(lines[ends[-1] : last])) is not None:
+            ends.append(last)
+    return ends
+
+
+def _loaded(text: str) -> dict[str, Any] | None:
+    try:
+        return tomllib.loads(text)
+    except (tomllib.TOMLDecodeError, RecursionError):
+        return None
 
 
 def _holds(table: Any, keys: Keys) -> bool:
@@ -132,6 +152,8 @@ def _told(error: str, table: Any, schema: Type) -> tuple[Keys, str]:
     value = _value(table, keys)
     if error.startswith("Invalid value") and (tags := _tags(schema, keys)):
         error = f"there are {_listed(tags)}"
+    if "matching regex" in error:
+        error = "needed text without signs that cannot be seen"
     if "got" not in error and not isinstance(value, dict | list):
         error = f"{error}, got {value!r}"
     return keys, error.replace("object", "table")

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
+
+from studies import servers
 
 ROOT = Path(__file__).parent.parent
 
@@ -31,6 +33,10 @@ def _missing(name: str) -> str | None:
     if name == "peers":
         missing = [module for module in ("pyoma2", "pyOMA") if find_spec(module) is None]
         return f"{' and '.join(missing)}: pip install '.[peers]'" if missing else None
+    if name == "postgres":
+        return servers.missing_postgres()
+    if name == "distributed":
+        return servers.missing_distributed()
     raise ValueError(f"unknown need {name!r}")
 
 
@@ -53,3 +59,34 @@ def needs() -> Callable[[str], None]:
 def root() -> Path:
     """Folder of the project."""
     return ROOT
+
+
+@pytest.fixture(scope="session")
+def postgres(needs: Callable[[str], None]) -> Iterator[servers.Postgres]:
+    """Run a PostgreSQL server while tests run."""
+    needs("postgres")
+    with servers.postgres() as server:
+        yield server
+
+
+@pytest.fixture
+def database(postgres: servers.Postgres) -> Iterator[str]:
+    """Address of an empty PostgreSQL database that only one test sees."""
+    with postgres.database() as url:
+        yield url
+
+
+@pytest.fixture(params=["sqlite", "postgres"])
+def store_url(request: pytest.FixtureRequest, tmp_path: Path) -> str:
+    """Name a store that does not exist yet, of either kind."""
+    if request.param == "sqlite":
+        return f"sqlite:///{(tmp_path / 'store.sqlite').as_posix()}"
+    return str(request.getfixturevalue("database"))
+
+
+@pytest.fixture
+def cluster(needs: Callable[[str], None]) -> Iterator[servers.Cluster]:
+    """Run a Dask scheduler and two worker processes while one test runs."""
+    needs("distributed")
+    with servers.dask_cluster() as running:
+        yield running

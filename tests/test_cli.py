@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner, Result
 
+from lmshealth.assessing import packed
 from lmshealth.cli import main
 from lmshealth.looks import LOOKS
 from lmshealth.store import SCHEMA, Store, beside
@@ -627,7 +628,7 @@ def test_report_writes_the_pages_of_run_without_its_logs(stage: Path, tmp_path: 
         ("sqlite:///{}/nowhere.sqlite", "nowhere.sqlite"),
         ("sqlite:///{}/empty.sqlite", "no results"),
         ("sqlite:///{}/text.sqlite", "not a database"),
-        ("no url at all", "no url at all"),
+        ("no url at all", "no URL; a file is sqlite:///PATH"),
         ("nosuch://me:hunter2@host/db?password=hunter2", "nosuch://host/db"),
         ("postgresql+nosuch://me:hunter2@host/db", "host/db"),
     ],
@@ -650,10 +651,14 @@ def test_a_machine_that_cannot_be_read_is_told_and_the_others_are_written(tmp_pa
     """One line names it, with status 3."""
     store = Store(beside(tmp_path))
     for name in ("M7-Y", "M8-Y"):
-        store.keep(name, "k1", nothing(worn(tmp_path, name)))
+        store.keep(name, "k1", packed(nothing(worn(tmp_path, name))))
+        store.tell(name, "k1", "")
     store.close()
     with closing(sqlite3.connect(tmp_path / "lmshealth.sqlite")) as file, file:
-        file.execute(f"UPDATE assessed_{SCHEMA} SET content = x'00' WHERE machine = 'M8-Y'")
+        file.execute(
+            f"UPDATE assessed_{SCHEMA} SET content = x'00' WHERE machine = "
+            f"(SELECT machine FROM present_{SCHEMA} WHERE name = 'M8-Y')"
+        )
     url = beside(tmp_path).render_as_string()
     result = call("report", "--store", url, "--out", tmp_path / "pages")
     assert result.exit_code == 3

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from datetime import date, timedelta
 
 import numpy as np
 import pytest
 
+from lmshealth.brief import due, life_brief
 from lmshealth.decision import decide, reached_before
-from lmshealth.lifeview import due, print_assessments, print_life
+from lmshealth.index import index_row, worst_first
+from lmshealth.lifeview import print_briefs, print_life
 from lmshealth.results import LawWeight, Prognosis
 from lmshealth.stage import Decision
 from lmshealth.summary import Assessment
@@ -32,8 +34,14 @@ def shown(life: Prognosis, decision: Decision, said: Said, by: date | None = Non
     """Print a life and return the text."""
     before = None if by is None else (by, reached_before(life, by))
     service = decide(life, decision)
-    print_life(life, service, prognosis_rows(life, service, before))
+    print_life(life_brief(life, service, prognosis_rows(life, service, before)))
     return said()
+
+
+def print_fleet(assessments: Sequence[Assessment]) -> None:
+    """Print what a run says of machines."""
+    rows = worst_first(index_row(one, one.service(), "") for one in assessments)
+    print_briefs([row.brief for row in rows])
 
 
 def test_the_numbers_are_those_of_the_table(said: Said) -> None:
@@ -85,7 +93,7 @@ def test_laws_and_what_no_mode_tells_are_named(said: Said) -> None:
 def test_a_few_machines_are_told_in_full(make: Callable[..., Assessment], said: Said) -> None:
     """Verdict, gauges, remaining life of every limit and of any, and the service; worst first."""
     good, bad = make("A", wear_km=400000, floor=0.98), make("B")
-    print_assessments([good, blind(bad), nothing(make("C"))])
+    print_fleet([good, blind(bad), nothing(make("C"))])
     text = said()
     assert text.index("B: both (93 %). Roll") < text.index("C: not-enough-data. 2 logs")
     assert text.index("C: not") < text.index("A: healthy (97 %)")
@@ -101,7 +109,7 @@ def test_many_machines_have_a_row_each(make: Callable[..., Assessment], said: Sa
     """Twenty rows, the worst first, the rest counted; nothing runs off the terminal."""
     good, bad = make("good", wear_km=400000, floor=0.98), make("worst")
     fleet = [replace(good, judgement=replace(good.judgement, stage=f"M{k}")) for k in range(21)]
-    print_assessments([*fleet, bad])
+    print_fleet([*fleet, bad])
     text = said()
     rows = [line for line in text.splitlines() if "healthy" in line or "both" in line]
     assert len(rows) == 20 and rows[0].strip().startswith("worst")

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import csv
 import shutil
+import sqlite3
 from collections.abc import Sequence
-from dataclasses import dataclass
+from contextlib import closing
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,17 +16,22 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from lmshealth import pipeline
+from lmshealth import assessing, batch, intake, telling
+from lmshealth.assessing import packed
 from lmshealth.cli import main
-from lmshealth.errors import NothingUsable
+from lmshealth.errors import LmshealthError, NothingUsable
+from lmshealth.fleet import Learned
 from lmshealth.history import Reading
 from lmshealth.inference import epochs_to_infer, infer
-from lmshealth.pipeline import RunResult, Settings, run
-from lmshealth.report import write_report
+from lmshealth.life import scatter_of
+from lmshealth.logs import Log
+from lmshealth.pipeline import RunResult, Settings, report, run
+from lmshealth.results import Modes
 from lmshealth.stage import Stage, load_stage
-from lmshealth.store import Store, beside
+from lmshealth.store import SCHEMA, Store, beside, read
 from lmshealth.summary import Assessment
 from lmshealth.tables import COLUMNS
+from studies import servers
 from tests.signals import sine, write_archive, write_archive_stage, write_log
 
 N_LOGS = 6
@@ -44,6 +51,13 @@ def pages(out: Path) -> dict[str, bytes]:
 def tables(out: Path) -> dict[str, bytes]:
     """Read all tables of an output folder as bytes."""
     return {path.name: path.read_bytes() for path in sorted(out.glob("*.csv"))}
+
+
+def assessments(out: Path) -> list[Assessment]:
+    """Fetch what a run kept of its machines."""
+    with closing(Store(beside(out), create=False)) as store:
+        packed = [store.assessment(told.machine, told.key) for told in store.told()]
+    return [read(content, Assessment) for content in packed if content is not None]
 
 
 @dataclass(frozen=True)
@@ -101,7 +115,7 @@ def test_the_truth_is_found_in_the_tables(done: Done) -> None:
 
 def test_the_only_epoch_asked_for_is_the_last(done: Done) -> None:
     """However few epochs are inferred, the last one, which the verdict is about, is among them."""
-    (assessment,) = done.result.assessments
+    (assessment,) = assessments(done.out)
     assert assessment.track is not None
     for most in (1, 2, 3):
         assert epochs_to_infer(assessment.track, done.stage, most)[-1] == N_LOGS - 1
@@ -123,7 +137,7 @@ def test_prognose_goes_on_from_the_table_to_the_same_numbers(done: Done, tmp_pat
 
 def test_spectra_of_all_logs_reach_the_page(done: Done) -> None:
     """The spectra hold every used log in order, strongest where its modes are."""
-    (assessment,) = done.result.assessments
+    (assessment,) = assessments(done.out)
     waterfall, history = assessment.waterfall, assessment.history
     assert waterfall is not None
     assert waterfall.level.shape[0] == len(history.logs) == N_LOGS
@@ -155,7 +169,7 @@ def test_a_second_run_takes_all_from_the_store_and_the_truth_does_not_matter(
 ) -> None:
     """With truth.csv deleted a second run remembers every log and result: the same bytes."""
     (done.logs / "truth.csv").unlink()
-    monkeypatch.setattr(pipeline, "assess", None)  # nothing may be inferred again
+    monkeypatch.setattr(assessing, "assess", None)  # nothing may be inferred again
     again = run(done.logs, [done.stage], done.out, Settings(epochs=2))
     # The broken file is told by its content and tried no more than once.
     assert again.n_remembered == N_LOGS + 2
@@ -166,11 +180,10 @@ def test_a_second_run_takes_all_from_the_store_and_the_truth_does_not_matter(
 def test_pages_come_from_the_store_alone(done: Done, tmp_path: Path) -> None:
     """Without logs and descriptions the pages of the machine and of the fleet are the same."""
     shutil.copy(done.out / "lmshealth.sqlite", tmp_path)
-    store = Store(beside(tmp_path), create=False)
-    fleet = store.fleet()
-    store.close()
-    write_report(tmp_path, fleet.assessments, fleet.refused, earlier=fleet.earlier)
+    with closing(Store(beside(tmp_path), create=False)) as store:
+        again = report(store, tmp_path)
     assert pages(tmp_path) == done.pages
+    assert again.rows == done.result.rows
 
 
 def test_results_do_not_depend_on_the_number_of_workers(done: Done, tmp_path: Path) -> None:
@@ -179,9 +192,18 @@ def test_results_do_not_depend_on_the_number_of_workers(done: Done, tmp_path: Pa
     assert tables(tmp_path / "out") == done.written
 
 
+def test_results_on_a_cluster_are_those_of_this_machine(
+    done: Done, tmp_path: Path, cluster: servers.Cluster
+) -> None:
+    """Two workers of Dask with a fresh store write the same bytes, pages too."""
+    run(done.logs, [done.stage], tmp_path / "out", Settings(scheduler=cluster.address, epochs=2))
+    assert tables(tmp_path / "out") == done.written
+    assert pages(tmp_path / "out") == done.pages
+
+
 def test_another_seed_gives_other_draws(done: Done) -> None:
     """Negative control for the comparisons of bytes: a new seed changes the draws of health."""
-    (assessment,) = done.result.assessments
+    (assessment,) = assessments(done.out)
     assert assessment.track is not None
     one, other = (infer(assessment.track, done.stage, seed, epochs=(5,)) for seed in (1, 2))
     assert one.samples.tobytes() != other.samples.tobytes()
@@ -194,6 +216,170 @@ def test_output_inside_the_folder_of_logs_is_no_log(tmp_path: Path, modes_only: 
     again = run(logs, [modes_only], logs / "result")
     assert (first.n_logs, again.n_logs, again.n_refused) == (2, 2, 0)
     assert again.n_remembered == 2
+
+
+def test_descriptions_make_stale_what_is_theirs(tmp_path: Path) -> None:
+    """A change of one, or another one before it, leaves what came by others as it is."""
+    logs = write_archive(tmp_path / "logs", 2)
+    write_log(logs / "b.h5", 1.0, 7, stage="test-B")
+    paths = [write_archive_stage(tmp_path / name, health=False) for name in ("one", "two", "new")]
+    for path, ending in zip(paths[1:], ("B", "C"), strict=True):
+        path.write_text(path.read_text().replace("*-A", f"*-{ending}"))
+
+    def remembered(*which: Path) -> int:
+        stages = [load_stage(str(path)) for path in which]
+        return run(logs, stages, tmp_path / "out").n_remembered
+
+    one, two, new = paths
+    assert remembered(one, two) == 0
+    assert remembered(new, one, two) == 3
+    two.write_text(two.read_text() + "# a remark\n")
+    assert remembered(one, two) == 2
+    # Who comes first takes all: what the other gave is not of these logs any more.
+    new.write_text(new.read_text().replace("*-C", "*"))
+    assert remembered(new, one, two) == 0
+    assert remembered(one, two) == 3
+    # What no description takes is tried again when there is another one.
+    assert remembered(one) == 2
+    assert remembered(one) == 3
+    assert remembered(one, two) == 3
+
+
+def test_a_log_that_changes_while_it_is_read_is_done_again(
+    tmp_path: Path, modes_only: Stage, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What is still being written is refused for now, and not remembered."""
+    logs = write_archive(tmp_path / "logs", 2)
+    with monkeypatch.context() as patch:
+        patch.setattr(intake, "content_digest", lambda path: f"{path.name:0>64}")
+        with pytest.raises(NothingUsable):
+            run(logs, [modes_only], tmp_path / "out")
+    assert {row["reason"] for row in rows(tmp_path / "out" / "refused.csv")} == {"changed"}
+    again = run(logs, [modes_only], tmp_path / "out")
+    assert (again.n_remembered, again.n_refused) == (0, 0)
+
+
+@pytest.mark.parametrize("error", [OSError(28, "No space left on device"), MemoryError()])
+def test_what_the_computer_failed_at_is_tried_again(
+    tmp_path: Path, modes_only: Stage, monkeypatch: pytest.MonkeyPatch, error: Exception
+) -> None:
+    """A full disk or memory says nothing of a log: it is refused for now, and not remembered."""
+    logs = write_archive(tmp_path / "logs", 3)
+    whole = intake.identify
+
+    def fail(log: Log, stage: Stage) -> Modes:
+        if log.name == "log-01.h5":
+            raise error
+        return whole(log, stage)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(intake, "identify", fail)
+        first = run(logs, [modes_only], tmp_path / "out")
+    assert (first.n_refused, first.n_remembered) == (1, 0)
+    refused = rows(tmp_path / "out" / "refused.csv")
+    assert [(row["log"], row["reason"]) for row in refused] == [("log-01.h5", "resources")]
+    again = run(logs, [modes_only], tmp_path / "out")
+    assert (again.n_refused, again.n_remembered) == (0, 2)
+
+
+def test_one_machine_has_one_description(tmp_path: Path) -> None:
+    """Logs that a manifest gives to another description than most are refused by name."""
+    logs = write_archive(tmp_path / "logs", 3)
+    one, two = (write_archive_stage(tmp_path / name, health=False) for name in ("one", "two"))
+    two.write_text(two.read_text().replace('name = "small"', 'name = "other"', 1))
+    (logs / "manifest.csv").write_text("file,description\nlog-01.h5,other\n")
+    result = run(logs, [load_stage(str(path)) for path in (one, two)], tmp_path / "out")
+    assert result.n_refused == 1
+    (row,) = rows(tmp_path / "out" / "refused.csv")
+    assert (row["log"], row["reason"]) == ("log-01.h5", "no-stage")
+    assert "2 logs of test-A" in row["detail"]
+
+
+def test_an_assessment_that_cannot_be_read_is_made_again(
+    tmp_path: Path, modes_only: Stage, assessed: list[str]
+) -> None:
+    """Neither damage nor another run that forgets it keeps a machine from being told."""
+    logs, out = write_archive(tmp_path / "logs", 2), tmp_path / "out"
+    run(logs, [modes_only], out)
+    before = tables(out), pages(out)
+    with closing(sqlite3.connect(out / "lmshealth.sqlite")) as file, file:
+        file.execute(f"UPDATE assessed_{SCHEMA} SET content = x'00'")
+    run(logs, [modes_only], out)
+    assert assessed == ["test-A"] * 2
+    assert (tables(out), pages(out)) == before
+
+
+def test_an_assessment_that_never_can_be_read_does_not_end_the_batch(
+    tmp_path: Path, modes_only: Stage, monkeypatch: pytest.MonkeyPatch, assessed: list[str]
+) -> None:
+    """It is made once more, then its machine is named, and the run comes to its end."""
+    logs = write_archive(tmp_path / "logs", 2)
+    monkeypatch.setattr(telling, "read", lambda content, kind: None)
+    result = run(logs, [modes_only], tmp_path / "out")
+    assert result.rows == ()
+    assert result.failed == {"test-A": "its assessment cannot be read back from the store"}
+    assert len(assessed) <= 3
+
+
+def test_what_is_taught_is_taught_anew_where_it_cannot_be_read(
+    tmp_path: Path, modes_only: Stage, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A damaged assessment after the fleet's lesson is made again as well as the one before it."""
+    logs = write_archive(tmp_path / "logs", 2)
+    learned = Learned(3, (), scatter_of(modes_only))
+    monkeypatch.setattr(
+        batch, "_pupils", lambda machines, store: ((machine, learned) for machine in machines)
+    )
+    monkeypatch.setattr(
+        batch,
+        "taught",
+        lambda content, one: packed(replace(read(content, Assessment), fleet=one, notes=("t",))),
+    )
+    run(logs, [modes_only], tmp_path / "out")
+    before = pages(tmp_path / "out")
+    with closing(sqlite3.connect(tmp_path / "out" / "lmshealth.sqlite")) as file, file:
+        (n,) = file.execute(f"SELECT count(*) FROM assessed_{SCHEMA}").fetchone()
+        file.execute(f"UPDATE assessed_{SCHEMA} SET content = x'00'")
+    assert n == 2
+    result = run(logs, [modes_only], tmp_path / "out")
+    assert result.failed == {}
+    assert pages(tmp_path / "out") == before
+    (assessment,) = assessments(tmp_path / "out")
+    assert assessment.fleet == learned
+
+
+def test_a_folder_that_cannot_be_written_to_is_told(tmp_path: Path, modes_only: Stage) -> None:
+    """Before anything is done, and by its name."""
+    logs = write_archive(tmp_path / "logs", 2)
+    (tmp_path / "file").write_text("no folder")
+    for out in (tmp_path / "file", tmp_path / "file" / "below"):
+        with pytest.raises(LmshealthError, match=f"{out}: cannot be written to"):
+            run(logs, [modes_only], out)
+
+
+def test_settings_show_no_password() -> None:
+    """A store's address may hold one, and settings may reach a log of somebody's program."""
+    assert "hunter2" not in repr(Settings(store="postgresql://me:hunter2@host/db"))
+
+
+def test_a_machine_that_cannot_be_assessed_does_not_end_the_batch(
+    tmp_path: Path, modes_only: Stage, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It is named with the reason, and the others are told."""
+    logs = write_archive(tmp_path / "logs", 2)
+    write_log(logs / "b.h5", 1.0, 7, stage="other-A")
+    whole = assessing.assess
+
+    def fail(readings: Sequence[Reading], *given: Any, **options: Any) -> Assessment:
+        if readings[0].metadata.stage == "other-A":
+            raise ZeroDivisionError("a mistake of ours")
+        return whole(readings, *given, **options)
+
+    monkeypatch.setattr(assessing, "assess", fail)
+    result = run(logs, [modes_only], tmp_path / "out")
+    assert [row.identity for row in result.rows] == ["test-A"]
+    assert set(result.failed) == {"other-A"}
+    assert "a mistake of ours" in result.failed["other-A"]
 
 
 def test_a_changed_description_is_done_again(tmp_path: Path, modes_only: Stage) -> None:
@@ -210,13 +396,13 @@ def test_a_changed_description_is_done_again(tmp_path: Path, modes_only: Stage) 
 def assessed(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """List the machines that are assessed and not remembered."""
     machines: list[str] = []
-    whole = pipeline.assess
+    whole = assessing.assess
 
-    def listen(readings: Sequence[Reading], *given: Any) -> Assessment:
+    def listen(readings: Sequence[Reading], *given: Any, **options: Any) -> Assessment:
         machines.append(str(readings[0].metadata.stage))
-        return whole(readings, *given)
+        return whole(readings, *given, **options)
 
-    monkeypatch.setattr(pipeline, "assess", listen)
+    monkeypatch.setattr(assessing, "assess", listen)
     return machines
 
 
@@ -233,7 +419,7 @@ def test_only_what_is_stale_is_assessed_again(
         return list(assessed)
 
     assert again() == ["other-A", "test-A"]
-    assert again() == again(workers=2) == []
+    assert again() == []
     write_log(logs / "c.h5", 1.0, 8, stage="other-A")
     assert again() == ["other-A"]
     text = "stage,recorded_at,travel_km,action\n"
@@ -279,6 +465,26 @@ def test_a_manifest_overrides_and_is_part_of_the_key(tmp_path: Path, modes_only:
     assert {row["travel_km"] for row in rows(tmp_path / "out" / "modes.csv")} == {"0.0", "777.0"}
 
 
+def test_bad_rows_beside_the_logs_are_told_and_stop_nothing(
+    tmp_path: Path, modes_only: Stage
+) -> None:
+    """Logs are analysed, each bad row is listed, and the page of its machine tells of the work."""
+    logs, out = write_archive(tmp_path / "logs", 2), tmp_path / "out"
+    done = run(logs, [modes_only], out)
+    assert (done.n_refused, done.n_unread) == (0, 0)
+    (logs / "maintenance.csv").write_text(
+        "stage,recorded_at,action\ntest-A,2026-01-05T00:00:00Z,repainted\n"
+        "test-A,2026-01-01T00:00:00Z,servo\n"
+    )
+    (logs / "manifest.csv").write_text("file,travel_km\nlog-01.h5,1,2,3\n,5\n")
+    again = run(logs, [modes_only], out)
+    assert (again.n_logs, again.n_refused, again.n_unread) == (2, 1, 2)
+    refused = [(row["log"], row["reason"]) for row in rows(out / "refused.csv")]
+    tables = ["maintenance.csv", "manifest.csv"]
+    assert sorted(refused) == [(name, "bad-row") for name in ("log-01.h5", *tables)]
+    assert "action &#39;repainted&#39; is unknown" in (out / "test-A.html").read_text()
+
+
 def test_what_tracking_needs_of_each_log_is_in_the_table(tmp_path: Path, modes_only: Stage) -> None:
     """Loop error, tuning and shapes are there, also when the store remembers the log."""
     logs = tmp_path / "logs"
@@ -308,7 +514,8 @@ def test_each_log_goes_to_the_first_description_that_takes_it(tmp_path: Path) ->
     two.write_text(two.read_text().replace("*-A", "*-B"))
     result = run(logs, [load_stage(str(one)), load_stage(str(two))], tmp_path / "out")
     assert [page.name for page in result.pages] == ["test-A.html", "test-B.html"]
-    assert {a.judgement.verdict for a in result.assessments} == {"not-enough-data"}
+    found = assessments(tmp_path / "out")
+    assert {a.judgement.verdict for a in found} == {"not-enough-data"}
 
 
 def test_an_archive_of_bad_logs_only_is_an_error_with_its_reasons_written(
@@ -334,7 +541,7 @@ def test_an_empty_folder_is_an_error(tmp_path: Path, modes_only: Stage) -> None:
 
 
 def test_progress_is_told_to_its_end(tmp_path: Path, modes_only: Stage) -> None:
-    """The callback hears of reading, identifying and assessing, each up to its total."""
+    """The callback hears of every step of the work, each up to its total."""
     heard: dict[str, tuple[int, int]] = {}
 
     def hear(what: str, finished: int, total: int) -> None:
@@ -342,7 +549,8 @@ def test_progress_is_told_to_its_end(tmp_path: Path, modes_only: Stage) -> None:
         heard[what] = (finished, total)
 
     run(write_archive(tmp_path / "logs", 2), [modes_only], tmp_path / "out", progress=hear)
-    assert heard == {"reading": (2, 2), "identifying": (2, 2), "assessing": (1, 1)}
+    steps = {"reading": (2, 2), "identifying": (2, 2), "assessing": (1, 1), "reporting": (1, 1)}
+    assert heard == steps
 
 
 def test_an_interrupted_run_loses_nothing_that_was_done(tmp_path: Path, modes_only: Stage) -> None:
@@ -365,8 +573,8 @@ def test_assess_without_parameters_tracks_and_claims_nothing(
     tmp_path: Path, modes_only: Stage
 ) -> None:
     """A description of modes alone gives a track, no health, and no verdict."""
-    result = run(write_archive(tmp_path / "logs", 3), [modes_only], tmp_path / "out")
-    (assessment,) = result.assessments
+    run(write_archive(tmp_path / "logs", 3), [modes_only], tmp_path / "out")
+    (assessment,) = assessments(tmp_path / "out")
     assert assessment.track is not None
     assert assessment.health is None
     assert assessment.prognosis is None

@@ -134,3 +134,14 @@ def test_shared_parameters_need_one_prior(joint: JointPrior) -> None:
     other = JointPrior(("b",), (Lognormal(1.0, 0.2),), *np.log([[0.5], [2.0]]))
     with pytest.raises(BadStage, match=r"b is to be one parameter.*std=3.*sigma=0\.2"):
         joined([joint, other], [(0, 1, 2), (1,)])
+
+
+@pytest.mark.parametrize("prior", [Lognormal(2.0, 0.4), Normal(-1.0, 3.0)])
+def test_standard_values_are_standard_normal(prior: Lognormal | Normal) -> None:
+    """Quantiles become those of the standard normal, and another mean and width can be given."""
+    levels = np.array([0.01, 0.3, 0.5, 0.9])
+    z = stats.norm.ppf(levels)
+    np.testing.assert_allclose(prior.standard(prior.quantile(levels)), z, atol=1e-12)
+    placed = prior.placed(0.7, 0.5)
+    np.testing.assert_allclose(prior.standard(placed.quantile(levels)), 0.7 + 0.5 * z, atol=1e-12)
+    assert prior.placed(0.0, 1.0) == prior

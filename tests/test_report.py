@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import shutil
+import weakref
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -20,9 +21,10 @@ from msgspec import structs
 from lmshealth import plots
 from lmshealth.arrays import FloatArray
 from lmshealth.changes import reported
+from lmshealth.index import write_index
 from lmshealth.influences import find_influences
 from lmshealth.logs import Refusal
-from lmshealth.report import write_report
+from lmshealth.report import page_of, write_report
 from lmshealth.results import Prognosis
 from lmshealth.stage import Decision, Stage, load_stage
 from lmshealth.summary import Assessment
@@ -314,7 +316,7 @@ def test_a_day_of_least_costs_says_so(make: Maker, tmp_path: Path) -> None:
     assert f"By {service.by.isoformat()} The day of least costs per travel" in text
     assert "a failure costs 3 times a planned service" in text
     assert "risk on the day of least costs" in text and "accepted risk" not in text
-    assert assessment.urgency()[1] == service.wait
+    assert assessment.urgency(service)[1] == service.wait
     healthy = replace(assessment, prognosis=endless(assessment))
     assert "saves costs, where a failure costs 3 times" in words(one(tmp_path, healthy))
 
@@ -397,6 +399,45 @@ def test_same_input_same_bytes(make: Maker, tmp_path: Path) -> None:
     when = datetime(2027, 1, 2, 3, 4, tzinfo=UTC)
     index = write_report(tmp_path / "c", stages[1:], (), generated=when)[-1]
     assert "written 2027-01-02 03:04 UTC" in index.read_text(encoding="utf-8")
+
+
+@pytest.mark.usefixtures("blank")
+def test_only_one_assessment_is_held(make: Maker, tmp_path: Path) -> None:
+    """Each stage may be forgotten as soon as the next one is asked for."""
+    gone: list[weakref.ref[Any]] = []
+
+    def one_by_one() -> Iterator[Assessment]:
+        for identity in ("A", "B", "C"):
+            assessment = replace(make(identity), waterfall=None)
+            gone.append(weakref.ref(assessment.history.travel))
+            yield assessment
+            del assessment
+            assert all(one() is None for one in gone[:-1])
+
+    write_report(tmp_path / "out", one_by_one(), ())
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == [
+        *("A.html", "B.html", "C.html", "index.html")
+    ]
+
+
+@pytest.mark.usefixtures("blank")
+def test_a_page_needs_no_other_one(make: Maker, tmp_path: Path) -> None:
+    """Made alone, the same page and the same rows come out."""
+    stages = [make(), nothing(make("M8-Y"))]
+    *pages, index = write_report(tmp_path / "a", stages, ())
+    alone = [page_of(stage, path.name) for stage, path in zip(stages, pages, strict=True)]
+    assert [page.text for page in alone] == [path.read_text(encoding="utf-8") for path in pages]
+    again = write_index(tmp_path, [page.row for page in alone[::-1]], ())
+    assert again.read_bytes() == index.read_bytes()
+
+
+def test_the_service_is_decided_once_per_page(make: Maker, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The first screen, what is new, the pictures and the row of the index share one decision."""
+    assessment, asked = make(), []
+    decided = assessment.service()
+    monkeypatch.setattr(Assessment, "service", lambda self: asked.append(self) or decided)
+    page_of(assessment, "a.html", before=reported(assessment, decided))
+    assert asked == [assessment]
 
 
 @pytest.mark.usefixtures("blank")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sqlite3
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 from dataclasses import replace
 from datetime import datetime, timedelta, timezone
@@ -11,12 +12,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from lmshealth.assessing import packed
 from lmshealth.history import Reading
 from lmshealth.logs import Metadata, Refusal
 from lmshealth.packing import pack
-from lmshealth.report import write_report
 from lmshealth.results import Line, Modes
-from lmshealth.store import SCHEMA, Store, StoreError, beside
+from lmshealth.store import SCHEMA, Identified, Outcome, Store, StoreError, beside, read
+from lmshealth.summary import Assessment
 from lmshealth.waterfall import Levels
 from tests.assessments import leaves, worn
 
@@ -55,8 +57,24 @@ def reading(n: int = 2, log: str = "a.h5") -> Reading:
 
 
 @pytest.fixture
-def url(tmp_path: Path) -> str:
-    """Name a store that does not exist yet."""
+def url(store_url: str) -> str:
+    """Name a store that does not exist yet, of either kind."""
+    return store_url
+
+
+def put_in(store: Store, key: str, outcome: Outcome) -> None:
+    """Keep what became of a log."""
+    store.put(key, "d" * 64, Identified(outcome, "e" * 64, "test-A"))
+
+
+def got_from(store: Store, key: str, log: str) -> Outcome | None:
+    """Fetch what became of a log, under its present name."""
+    return next((found.named(log).outcome for _, found in store.identified([key])), None)
+
+
+@pytest.fixture
+def file_url(tmp_path: Path) -> str:
+    """Name a store in a file that does not exist yet."""
     return f"sqlite:///{(tmp_path / 'store.sqlite').as_posix()}"
 
 
@@ -65,10 +83,10 @@ def test_a_reading_comes_back_bit_for_bit(url: str, n: int) -> None:
     """Every float, name, line, refusal and metadatum is the same after a round trip."""
     put = reading(n)
     writer = Store(url)
-    assert isinstance(writer.put("k", put), Reading)
+    put_in(writer, "k", put)
     writer.close()
     reader = Store(url)
-    got = reader.get("k", put.log)
+    got = got_from(reader, "k", put.log)
     reader.close()
     assert isinstance(got, Reading)
     assert list(leaves(got)) == list(leaves(put))
@@ -78,8 +96,8 @@ def test_missing_metadata_stay_missing(url: str) -> None:
     """What a log did not say is None again, not a text or a zero."""
     put = Reading("a.h5", "d" * 64, Metadata(), reading(0).modes)
     store = Store(url)
-    store.put("k", put)
-    got = store.get("k", "a.h5")
+    put_in(store, "k", put)
+    got = got_from(store, "k", "a.h5")
     store.close()
     assert isinstance(got, Reading)
     assert got.metadata == Metadata()
@@ -91,9 +109,9 @@ def test_refusals_come_back_under_the_present_name(url: str) -> None:
     """A refused log is remembered too; renamed, it is refused under its new name."""
     refused = (Refusal("old.h5", "too-short", "0.3 s", channel="acc_x", source="acc"),)
     store = Store(url)
-    store.put("k", refused)
-    assert store.get("k", "old.h5") == refused
-    moved = store.get("k", "new.h5")
+    put_in(store, "k", refused)
+    assert got_from(store, "k", "old.h5") == refused
+    moved = got_from(store, "k", "new.h5")
     store.close()
     assert moved == (Refusal("new.h5", "too-short", "0.3 s", channel="acc_x", source="acc"),)
 
@@ -101,8 +119,8 @@ def test_refusals_come_back_under_the_present_name(url: str) -> None:
 def test_a_renamed_log_is_known_under_its_new_name(url: str) -> None:
     """The reading and the refusals inside it carry the name asked for."""
     store = Store(url)
-    store.put("k", reading())
-    got = store.get("k", "b.h5")
+    put_in(store, "k", reading())
+    got = got_from(store, "k", "b.h5")
     store.close()
     assert isinstance(got, Reading)
     assert got.log == "b.h5"
@@ -112,19 +130,19 @@ def test_a_renamed_log_is_known_under_its_new_name(url: str) -> None:
 def test_what_is_not_there_is_none(url: str) -> None:
     """An unknown key is no error."""
     store = Store(url)
-    assert store.get("nothing", "a.h5") is None
+    assert got_from(store, "nothing", "a.h5") is None
     store.close()
 
 
-def test_what_an_older_version_kept_is_not_read(url: str, tmp_path: Path) -> None:
+def test_what_an_older_version_kept_is_not_read(file_url: str, tmp_path: Path) -> None:
     """Rows of an older layout stay where they are, and their logs are done again."""
     with sqlite3.connect(tmp_path / "store.sqlite") as older:
         older.execute(f"CREATE TABLE identified_{SCHEMA - 1} (key TEXT, log TEXT, outcome TEXT)")
         older.execute(f"INSERT INTO identified_{SCHEMA - 1} VALUES ('k', 'a.h5', '{{}}')")
-    store = Store(url)
-    assert store.get("k", "a.h5") is None
-    store.put("k", reading())
-    assert isinstance(store.get("k", "a.h5"), Reading)
+    store = Store(file_url)
+    assert got_from(store, "k", "a.h5") is None
+    put_in(store, "k", reading())
+    assert isinstance(got_from(store, "k", "a.h5"), Reading)
     store.close()
 
 
@@ -132,8 +150,8 @@ def test_putting_twice_changes_nothing(url: str) -> None:
     """The same key again keeps one row with the same content."""
     store = Store(url)
     for _ in range(2):
-        store.put("k", reading())
-    got = store.get("k", "a.h5")
+        put_in(store, "k", reading())
+    got = got_from(store, "k", "a.h5")
     store.close()
     assert isinstance(got, Reading)
     assert got.modes.cov.tobytes() == reading().modes.cov.tobytes()
@@ -167,20 +185,20 @@ def test_a_file_that_is_no_store_is_named(tmp_path: Path) -> None:
     assert path.read_bytes() == before
 
 
-def test_a_damaged_store_is_named(url: str, tmp_path: Path) -> None:
+def test_a_damaged_store_is_named(file_url: str, tmp_path: Path) -> None:
     """A store damaged after its first page fails with a StoreError when it is read."""
-    store = Store(url)
+    store = Store(file_url)
     for number in range(40):
-        store.put(f"k{number}", reading(3))
+        put_in(store, f"k{number}", reading(3))
     store.close()
     path = tmp_path / "store.sqlite"
     data = bytearray(path.read_bytes())
     data[4096:] = b"\xff" * (len(data) - 4096)
     path.write_bytes(bytes(data))
     with pytest.raises(StoreError, match=r"store\.sqlite"):
-        damaged = Store(url)
+        damaged = Store(file_url)
         try:
-            damaged.get("k7", "a.h5")
+            got_from(damaged, "k7", "a.h5")
         finally:
             damaged.close()
 
@@ -188,17 +206,28 @@ def test_a_damaged_store_is_named(url: str, tmp_path: Path) -> None:
 # Assessments
 
 
+def keep(store: Store, machine: str, key: str, assessment: Assessment) -> None:
+    """Keep an assessment as a run does, and tell it."""
+    store.keep(machine, key, packed(assessment))
+    store.tell(machine, key, store.keep_refused(()))
+
+
+def recall(store: Store, machine: str, key: str) -> Assessment | None:
+    """Fetch an assessment, as far as it can be read."""
+    content = store.assessment(machine, key)
+    found: Assessment | None = None if content is None else read(content, Assessment)
+    return found
+
+
 def test_an_assessment_comes_back_bit_for_bit(url: str, tmp_path: Path) -> None:
     """Description, map, history, track, chains, draws, verdict: every leaf is the same."""
     put = worn(tmp_path)
-    store = Store(url)
-    kept = store.keep("M7-Y", "k1", put)
-    got = store.recall("M7-Y", "k1")
-    store.close()
+    with closing(Store(url)) as store:
+        keep(store, "M7-Y", "k1", put)
+        got = recall(store, "M7-Y", "k1")
     assert got is not None
     expected = list(leaves(put))
     assert sum(isinstance(leaf, tuple) and len(leaf) == 3 for _, leaf in expected) > 40
-    assert list(leaves(kept)) == expected
     assert list(leaves(got)) == expected
     assert got.stage.takes(reading().metadata) == put.stage.takes(reading().metadata)
     assert got.service() == put.service()
@@ -209,142 +238,146 @@ def test_what_an_assessment_lacks_it_lacks_again(url: str, tmp_path: Path) -> No
     put = worn(tmp_path)
     judgement = replace(put.judgement, verdict="not-enough-data", probability=np.nan)
     put = replace(put, track=None, health=None, prognosis=None, judgement=judgement)
-    store = Store(url)
-    assert list(leaves(store.keep("M7-Y", "k1", put))) == list(leaves(put))
-    store.close()
+    with closing(Store(url)) as store:
+        keep(store, "M7-Y", "k1", put)
+        got = recall(store, "M7-Y", "k1")
+    assert list(leaves(got)) == list(leaves(put))
 
 
-def test_pages_from_the_store_are_those_of_what_was_kept(url: str, tmp_path: Path) -> None:
-    """Pages of all machines are the same bytes, and so is the list of logs without a machine."""
-    refused = (Refusal("x.h5", "no-stage", "näher"),)
-    store = Store(url)
-    kept = [store.keep(name, "k1", worn(tmp_path, name)) for name in ("M8-Y", "M7-Y")]
-    store.keep_refused(("M7-Y", "M8-Y"), refused)
-    fleet = store.fleet()
-    store.close()
-    assert (fleet.refused, fleet.earlier, fleet.unread) == (refused, {}, ())
-    first = write_report(tmp_path / "one", kept, refused)
-    again = write_report(tmp_path / "two", fleet.assessments, fleet.refused)
-    assert [page.name for page in again] == [page.name for page in first]
-    assert [page.read_bytes() for page in again] == [page.read_bytes() for page in first]
-
-
-def test_only_the_present_assessment_is_kept_whole(url: str, tmp_path: Path) -> None:
-    """Another key takes the place of the one before, of the same machine only."""
-    store = Store(url)
-    one = worn(tmp_path)
-    for machine, key in (("A", "k1"), ("B", "k1"), ("A", "k2")):
-        store.keep(machine, key, one)
-    assert store.recall("A", "k1") is None
-    assert store.recall("A", "k2") is not None
-    assert store.recall("B", "k1") is not None
-    assert store.recall("C", "k1") is None
-    assert len(store.fleet().assessments) == 2
-    store.close()
+def test_only_what_is_told_and_what_it_comes_from_are_kept_whole(url: str, tmp_path: Path) -> None:
+    """Telling forgets the other assessments of the same machine, not of others."""
+    one = packed(worn(tmp_path))
+    with closing(Store(url)) as store:
+        for machine, key in (("A", "k1"), ("B", "k1"), ("A", "k2"), ("A", "k3")):
+            store.keep(machine, key, one)
+        assert store.has("A", "k1")
+        store.tell("A", "k3", "", beside=["k2"])
+        assert [store.has("A", key) for key in ("k1", "k2", "k3")] == [False, True, True]
+        assert store.assessment("A", "k1") is None
+        assert store.has("B", "k1")
+        assert not store.has("C", "k1")
+        assert [(told.machine, told.key) for told in store.told()] == [("A", "k3")]
 
 
 def test_the_earlier_report_is_the_newest_of_another_key(url: str, tmp_path: Path) -> None:
-    """Keeping the same again changes nothing; going back to a former state is news again."""
+    """Telling the same again changes nothing; going back to a former state is news again."""
     one = worn(tmp_path)
-    states = {key: replace(one, digests=(), seed=k) for k, key in enumerate(("k1", "k2", "k3"))}
-    words = dict(zip(states, ("healthy", "preload", "mount"), strict=True))
-    store = Store(url)
+    words = {"k1": "healthy", "k2": "preload", "k3": "mount"}
+    with closing(Store(url)) as store:
 
-    def keep(key: str) -> str | None:
-        judgement = replace(one.judgement, verdict=words[key])
-        store.keep("A", key, replace(states[key], judgement=judgement))
-        before = store.earlier("A", key)
-        return before and before.verdict
+        def tell(key: str) -> str | None:
+            judgement = replace(one.judgement, verdict=words[key])
+            keep(store, "A", key, replace(one, judgement=judgement))
+            before = store.earlier("A", key)
+            return before and before.verdict
 
-    assert [keep(key) for key in ("k1", "k1", "k2", "k2", "k1", "k3")] == [
-        *(None, None, "healthy", "healthy", "preload", "healthy")
-    ]
-    assert store.earlier("B", "k1") is None
-    assert store.fleet().earlier["A"].verdict == "healthy"
-    store.close()
+        assert [tell(key) for key in ("k1", "k1", "k2", "k2", "k1", "k3")] == [
+            *(None, None, "healthy", "healthy", "preload", "healthy")
+        ]
+        assert store.earlier("B", "k1") is None
 
 
 def test_refused_logs_are_those_of_the_last_run_of_each_machine(url: str, tmp_path: Path) -> None:
-    """A later run replaces what an earlier one refused, where it reported the same machines."""
-    one, two, three = ((Refusal(log, "gap", ""),) * 2 for log in ("one", "two", "three"))
-    store = Store(url)
-    for machine in ("A", "B", "C"):
-        store.keep(machine, "k1", worn(tmp_path))
-    assert store.fleet().refused == ()
-    store.keep_refused(("A", "B"), one)
-    store.keep_refused(("C",), two)
-    assert store.fleet().refused == (*one, *two)
-    store.keep_refused(("A", "B"), three)
-    assert store.fleet().refused == (*three, *two)
-    store.close()
+    """A later run replaces what an earlier one refused, where it told the same machines."""
+    one, two, three = ((Refusal(log, "gap", ""),) for log in ("one", "two", "three"))
+    with closing(Store(url)) as store:
+
+        def tell(machines: str, refused: tuple[Refusal, ...]) -> tuple[Refusal, ...]:
+            for machine in machines:
+                store.tell(machine, "k1", store.keep_refused(refused))
+            return store.refused(told.refused for told in store.told())
+
+        assert tell("ABC", ()) == ()
+        assert tell("AB", one) == one
+        assert tell("C", two) == (*one, *two)
+        assert tell("AB", three) == (*three, *two)
 
 
-@pytest.mark.parametrize("evil", ["'; DROP TABLE assessed_3; --", '" OR 1=1', "%", "..\n\t<b>", ""])
+@pytest.mark.parametrize(
+    "evil", ["'; DROP TABLE assessed_4; --", '" OR 1=1', "%", "..\n\t<b>", "", "x" * 100_000]
+)
 def test_names_of_machines_are_data(url: str, tmp_path: Path, evil: str) -> None:
-    """No name of a machine reaches another's rows, or the database itself."""
-    store = Store(url)
+    """No name of a machine reaches another's rows, or the database itself, however long it is."""
     one = worn(tmp_path)
-    store.keep("A", "k1", one)
-    store.keep(evil, "k2", replace(one, seed=7))
-    assert store.recall(evil, "k1") is None
-    assert store.earlier(evil, "k2") is None
-    got = store.recall(evil, "k2")
-    assert got is not None and got.seed == 7
-    assert store.recall("A", "k1") is not None
-    assert len(store.fleet().assessments) == 2
-    store.close()
+    with closing(Store(url)) as store:
+        keep(store, "A", "k1", one)
+        keep(store, evil, "k2", replace(one, seed=7))
+        assert recall(store, evil, "k1") is None
+        assert store.earlier(evil, "k2") is None
+        got = recall(store, evil, "k2")
+        assert got is not None and got.seed == 7
+        assert recall(store, "A", "k1") is not None
+        assert {told.machine for told in store.told()} == {"A", evil}
 
 
-def test_a_row_that_cannot_be_read_counts_as_absent(url: str, tmp_path: Path) -> None:
-    """Damaged or foreign rows are done again; the fleet names the machines it leaves out."""
-    store = Store(url)
-    store.put("k", reading())
-    for machine, key in (("A", "k0"), ("A", "k1"), ("A", "k2"), ("B", "k1")):
-        store.keep(machine, key, worn(tmp_path, machine))
-    with closing(sqlite3.connect(tmp_path / "store.sqlite")) as file, file:
-        file.execute(f"UPDATE identified_{SCHEMA} SET content = ?", (b"nonsense",))
-        file.execute(
-            f"UPDATE assessed_{SCHEMA} SET content = ? WHERE machine = 'B'", (pack({"stage": 3}),)
-        )
-        file.execute(f"UPDATE reported_{SCHEMA} SET content = x'00' WHERE key = 'k1'")
-    assert store.get("k", "a.h5") is None
-    assert store.recall("B", "k1") is None
-    fleet = store.fleet()
-    assert [one.judgement.stage for one in fleet.assessments] == ["A"]
-    assert fleet.unread == ("B",)
-    # The newest that can be read, two reports ago.
-    assert set(fleet.earlier) == {"A"}
-    store.put("k", reading())
-    assert isinstance(store.get("k", "a.h5"), Reading)
-    store.close()
+def test_a_row_that_cannot_be_read_counts_as_absent(file_url: str, tmp_path: Path) -> None:
+    """Damaged or foreign rows are as if they were not there, and may be written anew."""
+    with closing(Store(file_url)) as store:
+        put_in(store, "k", reading())
+        for machine, key in (("A", "k0"), ("A", "k1"), ("A", "k2"), ("B", "k1")):
+            keep(store, machine, key, worn(tmp_path, machine))
+        with closing(sqlite3.connect(tmp_path / "store.sqlite")) as file, file:
+            file.execute(f"UPDATE identified_{SCHEMA} SET content = ?", (b"nonsense",))
+            file.execute(
+                f"UPDATE assessed_{SCHEMA} SET content = ? WHERE key = 'k1'", (pack({"stage": 3}),)
+            )
+            file.execute(f"UPDATE reported_{SCHEMA} SET content = x'00' WHERE key = 'k1'")
+        assert got_from(store, "k", "a.h5") is None
+        assert recall(store, "B", "k1") is None
+        assert recall(store, "A", "k2") is not None
+        # The newest that can be read, two reports ago: of the three there is no other.
+        assert store.earlier("A", "k2") is not None
+        assert store.earlier("B", "k2") is None
+        put_in(store, "k", reading())
+        assert isinstance(got_from(store, "k", "a.h5"), Reading)
+
+
+def test_two_that_write_the_same_at_once_leave_one_row(url: str, tmp_path: Path) -> None:
+    """Of many threads that put, keep and tell the same, none fails and nothing is doubled."""
+    made = packed(worn(tmp_path))
+
+    def write(_: int) -> None:
+        with closing(Store(url)) as store:
+            for number in range(5):
+                put_in(store, f"k{number}", reading())
+            store.keep("A", "k1", made)
+            store.tell("A", "k1", store.keep_refused(()))
+
+    with ThreadPoolExecutor(6) as threads:
+        list(threads.map(write, range(12)))
+    with closing(Store(url)) as store:
+        assert len(store.told()) == 1
+        assert recall(store, "A", "k1") is not None
+        assert len(dict(store.identified(f"k{number}" for number in range(9)))) == 5
+        assert store.earlier("A", "k1") is None
 
 
 # Stores that are only looked at
 
 
-def test_a_store_that_is_not_there_is_not_made(url: str, tmp_path: Path) -> None:
+def test_a_store_that_is_not_there_is_not_made(file_url: str, tmp_path: Path) -> None:
     """Opened to be read, a missing file stays missing, also in SQLite's own notation."""
-    for missing in (url, url.replace("///", "///file:") + "?uri=true"):
+    for missing in (file_url, file_url.replace("///", "///file:") + "?uri=true"):
         with pytest.raises(StoreError, match=r"store\.sqlite"):
             Store(missing, create=False)
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_store_without_results_is_told_from_an_older_one(url: str, tmp_path: Path) -> None:
+def test_a_store_without_results_is_told_from_an_older_one(file_url: str, tmp_path: Path) -> None:
     """An empty file, tables of another version, and tables without a row are said each."""
     path = tmp_path / "store.sqlite"
     path.touch()
     with pytest.raises(StoreError, match="holds no results"):
-        Store(url, create=False)
+        Store(file_url, create=False)
     assert path.read_bytes() == b""
     with closing(sqlite3.connect(path)) as older, older:
         older.execute(f"CREATE TABLE identified_{SCHEMA - 1} (key TEXT)")
     with pytest.raises(StoreError, match="another version"):
-        Store(url, create=False)
-    store = Store(url)
-    store.put("k", reading())
+        Store(file_url, create=False)
+    store = Store(file_url)
+    put_in(store, "k", reading())
     with pytest.raises(StoreError, match="no assessment"):
-        store.fleet()
+        store.told()
     store.close()
 
 
@@ -353,8 +386,8 @@ def test_a_store_in_a_folder_of_any_name_is_opened_as_it_is(tmp_path: Path) -> N
     folder = tmp_path / "a b?c#d%20ü"
     folder.mkdir()
     store = Store(beside(folder))
-    store.keep("A", "k1", worn(tmp_path))
+    keep(store, "A", "k1", worn(tmp_path))
     store.close()
     again = Store(beside(folder), create=False)
-    assert len(again.fleet().assessments) == 1
+    assert len(again.told()) == 1
     again.close()

@@ -11,9 +11,9 @@ from pathlib import Path
 PARTS = ("preload", "mount")
 
 
-def run_study(root: Path, name: str) -> str:
-    """Run the quick form of a study from the project's folder."""
-    command = [sys.executable, "-W", "error", "-m", f"studies.{name}.run", "--quick"]
+def run_study(root: Path, name: str, part: str = "run") -> str:
+    """Run the quick form of a study, or of a part of it, from the project's folder."""
+    command = [sys.executable, "-W", "error", "-m", f"studies.{name}.{part}", "--quick"]
     done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=root)
     assert done.returncode == 0, done.stdout + done.stderr
     return done.stdout
@@ -277,3 +277,72 @@ def test_rul_metrics(root: Path) -> None:
         # Knowing that the map is right can only help.
         bounds = cut["bound"]
         assert bounds["map right"]["accurate"] > bounds["map to 5 %"]["accurate"]
+
+
+def test_fleet_prior(root: Path) -> None:
+    """What a fleet teaches is nearer to what can be known; what another fleet teaches is not."""
+    answer = json.loads(run_study(root, "fleet_prior"))
+    assert all(answer["passed"].values())
+    lost = {way: found["lost_km"][0] for way, found in answer["ways"].items()}
+    assert lost["known"] == 0
+    assert lost["learned"] < lost["description"]
+    assert lost["learned"] < lost["another fleet teaches"]
+
+
+def test_faults_kills(root: Path, needs: Callable[[str], None]) -> None:
+    """Batches whose runs are killed end as if uninterrupted, in both stores."""
+    needs("postgres")
+    answer = json.loads(run_study(root, "faults", "kills"))
+    assert all(answer["passed"].values())
+    assert {kind: found["n"] for kind, found in answer["kills"].items()} == {
+        "sqlite": 1,
+        "postgres": 1,
+    }
+
+
+def test_faults_losses(root: Path, needs: Callable[[str], None]) -> None:
+    """A full disk and a lost database are told in one line, and nothing is lost by them."""
+    needs("postgres")
+    answer = json.loads(run_study(root, "faults", "losses"))
+    assert all(answer["passed"].values())
+    assert answer["lost database"]["failed"] == 1
+    # Not every place lets a file system be made.
+    assert answer["full disk"] is None or answer["full disk"]["failed"] == 1
+
+
+def test_faults_workers(root: Path, needs: Callable[[str], None]) -> None:
+    """A batch on Dask whose worker is killed ends as if nothing had happened."""
+    needs("distributed")
+    answer = json.loads(run_study(root, "faults", "workers"))
+    assert all(answer["passed"].values())
+    assert answer["workers killed"]["n"] == 1
+
+
+def test_faults_damaged(root: Path) -> None:
+    """Of an archive with damage of many kinds every log is told right, and wrong tales are not."""
+    answer = json.loads(run_study(root, "faults", "damaged"))
+    assert all(answer["passed"].values())
+    assert answer["good_analysed"] == answer["good"] == 60
+    assert answer["damaged_told_right"] == answer["damaged"] > 20
+
+
+def test_faults_injection(root: Path) -> None:
+    """Some hostile names, files and addresses are text, reach nothing, and show no password."""
+    answer = json.loads(run_study(root, "faults", "injection"))
+    assert all(answer["passed"].values())
+    assert answer["stores"]["sqlite"]["pages"] == answer["stores"]["sqlite"]["machines"] + 1
+
+
+def test_faults_together(root: Path, needs: Callable[[str], None]) -> None:
+    """Of two runs that share a store one may be killed; both end as they do alone."""
+    needs("postgres")
+    answer = json.loads(run_study(root, "faults", "together"))
+    assert all(answer["passed"].values())
+    assert set(answer["pairs"]) == {"sqlite", "postgres"}
+
+
+def test_scale_index(root: Path, needs: Callable[[str], None]) -> None:
+    """The front page of many stages is light, and a row out of sight costs nothing."""
+    needs("chromium")
+    answer = json.loads(run_study(root, "scale", "index"))
+    assert all(answer["passed"].values())

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from datetime import UTC, date, datetime
 
@@ -15,7 +16,15 @@ from lmshealth.logs import Metadata, Refusal
 from lmshealth.results import Line, Modes, Prognosis
 from lmshealth.stage import Decision, Stage, load_stage
 from lmshealth.summary import Assessment
-from lmshealth.tables import COLUMNS, all_tables, frame, modes_rows, prognosis_rows, track_rows
+from lmshealth.tables import (
+    COLUMNS,
+    frame,
+    modes_rows,
+    prognosis_rows,
+    refused_rows,
+    tables_of,
+    track_rows,
+)
 from lmshealth.tracks import Effect, Event, History, Series, Smoothed, Track
 from lmshealth.verdict import Judgement
 from tests.lives import health_of
@@ -108,14 +117,19 @@ def stage(tmp_path_factory: pytest.TempPathFactory) -> Stage:
 
 def tables(stage: Stage, remaining: np.ndarray) -> dict[str, pd.DataFrame]:
     """Make the tables of one assessment with these draws of remaining travel."""
-    return all_tables([], [assessment(stage, prognosis(remaining))], [])
+    return frames([], assessment(stage, prognosis(remaining)))
+
+
+def frames(readings: Sequence[Reading], made: Assessment) -> dict[str, pd.DataFrame]:
+    """Make the tables of one machine."""
+    rows = tables_of(readings, made)
+    return {name: frame(COLUMNS[name], own) for name, own in rows.items()}
 
 
 def test_empty_tables_have_their_columns() -> None:
     """Nothing at all still makes every table with its header."""
-    made = all_tables([], [], [])
-    assert set(made) == set(COLUMNS)
-    for name, table in made.items():
+    for name in COLUMNS:
+        table = frame(COLUMNS[name], [])
         assert table.empty
         assert list(table.columns) == COLUMNS[name].split()
         assert table.to_csv(index=False) == ",".join(COLUMNS[name].split()) + "\n"
@@ -146,12 +160,12 @@ def test_unknown_metadata_are_empty_cells() -> None:
     assert "nan" not in text.lower()
 
 
-def test_shapes_have_a_column_per_channel_after_all_others() -> None:
+def test_shapes_have_a_column_per_channel_after_all_others(stage: Stage) -> None:
     """Channels of any log of the table; an empty cell where a log or a mode has no such part."""
     alone = replace(two_modes(), shape_channels=("delta_e",), shapes=np.ones((2, 1)))
     both = {"a": two_modes(), "b": alone}
     readings = [Reading(log, "d", Metadata(), modes) for log, modes in both.items()]
-    table = all_tables(readings, [], [])["modes"]
+    table = frames(readings, assessment(stage, None))["modes"]
     own = ["shape_acc_x", "shape_acc_y", "shape_delta_e"]
     assert list(table.columns) == [*COLUMNS["modes"].split(), *own]
     nan = np.nan
@@ -159,15 +173,15 @@ def test_shapes_have_a_column_per_channel_after_all_others() -> None:
     np.testing.assert_array_equal(table[own], expected)
 
 
-def test_covariances_between_modes_are_listed_once_and_zeros_left_out() -> None:
+def test_covariances_between_modes_are_listed_once_and_zeros_left_out(stage: Stage) -> None:
     """A cross term of ln f is one row; modes of separate fits have none."""
     readings = [Reading("a.h5", "d", Metadata(), two_modes())]
-    table = all_tables(readings, [], [])["modes_cov"]
+    table = frames(readings, assessment(stage, None))["modes_cov"]
     (row,) = table.to_dict("records")
     assert (row["log"], row["mode_a"], row["mode_b"]) == ("a.h5", "roll", "pitch")
     assert row["cov_ln_f"] == 2e-7
     apart = [Reading("a.h5", "d", Metadata(), two_modes(0.0))]
-    assert all_tables(apart, [], [])["modes_cov"].empty
+    assert frames(apart, assessment(stage, None))["modes_cov"].empty
 
 
 def test_track_and_its_covariance_agree(stage: Stage) -> None:
@@ -254,7 +268,7 @@ def test_a_day_that_is_asked_for_has_columns_of_its_own() -> None:
 def test_refusals_are_rows() -> None:
     """Log, channel, mode, source, reason and detail are told as they are."""
     refusal = Refusal("a.h5", "flat", 'all "0", really', channel="acc_x")
-    table = all_tables([], [], [refusal])["refused"]
+    table = frame(COLUMNS["refused"], refused_rows([refusal]))
     assert table.iloc[0].tolist() == ["a.h5", "acc_x", "", "", "flat", 'all "0", really']
 
 
@@ -276,7 +290,7 @@ def test_the_columns_are_those_of_the_contract() -> None:
 def test_events_and_smoothed_columns_leave_with_their_units(stage: Stage) -> None:
     """An event has one row per mode, in km and ISO moments; smoothing adds columns in Hz."""
     made = assessment(stage, None)
-    table = all_tables([], [made], [])["events"]
+    table = frames([], made)["events"]
     row = table.iloc[0]
     assert (row["kind"], row["mode"], row["size"], row["evidence"]) == ("step", "roll", -0.02, 31.5)
     assert row["travel_km"] == 500.0

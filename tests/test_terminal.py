@@ -9,6 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from lmshealth.progress import progress_bars
 from lmshealth.terminal import (
     print_error,
     print_frf,
@@ -18,7 +19,6 @@ from lmshealth.terminal import (
     print_modes,
     print_plans,
     print_track,
-    progress_bars,
 )
 from lmshealth.tracking import track
 from tests.lives import DAMPING, FREQUENCY, make_health, make_history

@@ -14,28 +14,36 @@
 ``metadata``        a value that cannot be what its key says, or a key that is needed
 ``time``            no sample rate, two that disagree, time stamps out of order or not uniform
 ``no-signal``       no usable channel of Δe or acceleration is left
+``bad-row``         what a manifest says of the log is no row of a table, or two that differ
 =================== ==============================================================================
 
 ``Log.refused`` lists channels that were left out (``flat``, ``clipped``, ``missing-samples``, and
 ``time`` for a sample rate of its own) and stretches that were (``gaps``: the channel itself is
 used, around them).
 
+`read_manifest` and `find_logs` list under the same reasons what else cannot be used; a row that
+names no log is told under the name of its table, reason ``bad-row``.
+
 pandas, scipy, h5py, pyarrow, npTDMS and pyuff are imported when the first file needs them.
 """
 
-from lmshealth.readers.archive import Found, Manifest, find_logs, read_manifest
+from lmshealth.readers.archive import NOT_LOGS, Found, Manifest, find_logs, name_of, read_manifest
 from lmshealth.readers.columns import ColumnMap, load_columns
+from lmshealth.readers.formats import format_name
 from lmshealth.readers.metadata import COVARIATES
 from lmshealth.readers.reading import content_digest, read_log, require_identity
 
 __all__ = [
     "COVARIATES",
+    "NOT_LOGS",
     "ColumnMap",
     "Found",
     "Manifest",
     "content_digest",
     "find_logs",
+    "format_name",
     "load_columns",
+    "name_of",
     "read_log",
     "read_manifest",
     "require_identity",

@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
-import csv
 import os
 import stat
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
 
-from lmshealth.errors import BadTable
+from lmshealth.errors import BadLog, BadTable
 from lmshealth.logs import Refusal
 from lmshealth.readers.formats import is_log
 from lmshealth.readers.metadata import KEYS
-from lmshealth.readers.reading import shown
-from lmshealth.readers.trouble import listed
+from lmshealth.readers.sheets import read_sheet
+from lmshealth.readers.trouble import Unusable, shown
 
 MANIFEST = "manifest.csv"
 NOT_LOGS = frozenset({MANIFEST, "maintenance.csv", "truth.csv"})
@@ -45,15 +44,32 @@ class Manifest:
     rows : dict of Path to dict of str to str
         Metadata by absolute path of the log, empty cells left out.
     refused : tuple of Refusal
-        Rows that name no log of the folder.
+        Manifests that cannot be read, and rows that name no log of the folder.
+    bad : dict of Path to str
+        By absolute path of the log, what is wrong with a row of it.
     """
 
     rows: dict[Path, dict[str, str]]
     refused: tuple[Refusal, ...]
+    bad: dict[Path, str]
+
+    def names(self, log: Path) -> bool:
+        """Tell whether a row is about this log."""
+        return _absolute(log) in self.rows
 
     def overrides(self, log: Path) -> dict[str, str]:
-        """Give the metadata that override what a log says; empty for a log without a row."""
-        return dict(self.rows.get(_absolute(log), {}))
+        """Give the metadata that override what a log says; empty for a log without a row.
+
+        Raises
+        ------
+        BadLog
+            With reason ``bad-row``: what a manifest says of the log cannot be understood, and what
+            the log says of itself is not what was meant.
+        """
+        path = _absolute(log)
+        if path in self.bad:
+            raise BadLog(shown(log), "bad-row", self.bad[path])
+        return dict(self.rows.get(path, {}))
 
 
 def find_logs(folder: str | Path) -> Found:
@@ -82,7 +98,7 @@ def find_logs(folder: str | Path) -> Found:
         if trouble is None:
             logs.append(path)
         else:
-            refused.append(Refusal(_inside(path, root), *trouble))
+            refused.append(Refusal(name_of(path, root), *trouble))
     return Found(tuple(logs), tuple(refused))
 
 
@@ -90,7 +106,7 @@ def read_manifest(folder: str | Path) -> Manifest:
     """Read every ``manifest.csv`` of a folder and its subfolders; it may have none.
 
     Paths in a manifest are relative to it. Where two manifests name a log, the one nearer to the
-    log has the last word.
+    log has the last word. A bad row refuses the log that it names, and nothing else.
 
     Parameters
     ----------
@@ -100,30 +116,51 @@ def read_manifest(folder: str | Path) -> Manifest:
     Raises
     ------
     BadTable
-        If it is no folder, if a manifest cannot be read, has no column ``file``, has rows longer
-        than its header, or names a log twice.
+        If it is no folder.
     """
     root = Path(folder)
-    rows: dict[Path, dict[str, str]] = {}
-    refused: list[Refusal] = []
-    found = [path for path in _walk(root, []) if path.name == MANIFEST]
-    for path in sorted(found, key=lambda path: (len(path.parts), path)):
-        trouble = _trouble(path, root)
-        if trouble is not None:
-            refused.append(Refusal(_inside(path, root), *trouble))
-            continue
-        for log, row in _rows(path, root, refused).items():
-            rows[log] = rows.get(log, {}) | row
-    return Manifest(rows, tuple(refused))
+    found = find_sheets(root, MANIFEST)
+    manifest = Manifest({}, (), {})
+    refused = list(found.refused)
+    for path in sorted(found.logs, key=lambda path: (len(path.parts), path)):
+        try:
+            refused += _add(manifest, path, root)
+        except Unusable as error:
+            refused.append(Refusal(name_of(path, root), error.reason, error.detail))
+    return replace(manifest, refused=tuple(refused))
+
+
+def find_sheets(folder: str | Path, name: str) -> Found:
+    """Find the tables of a name beside the logs of a folder, where `find_logs` looks for logs.
+
+    Parameters
+    ----------
+    folder : str or Path
+        The archive.
+    name : str
+        Such as ``manifest.csv``.
+
+    Raises
+    ------
+    BadTable
+        If it is no folder.
+    """
+    root = Path(folder)
+    paths = [path for path in _walk(root, []) if path.name == name]
+    troubles = {path: _trouble(path, root) for path in paths}
+    return Found(
+        tuple(path for path in paths if troubles[path] is None),
+        tuple(Refusal(name_of(path, root), *why) for path, why in troubles.items() if why),
+    )
+
+
+def name_of(path: Path, folder: Path) -> str:
+    """Name a file as the user knows it: relative to the folder of logs, and fit to be printed."""
+    return shown(path.relative_to(folder).as_posix())
 
 
 def _absolute(path: Path) -> Path:
     return Path(os.path.abspath(path))
-
-
-def _inside(path: Path, root: Path) -> str:
-    """Name a file as the user knows it: relative to the folder of logs."""
-    return shown(path.relative_to(root).as_posix())
 
 
 def _walk(root: Path, refused: list[Refusal]) -> Iterator[Path]:
@@ -132,7 +169,7 @@ def _walk(root: Path, refused: list[Refusal]) -> Iterator[Path]:
         raise BadTable(f"{shown(root)} is no folder")
 
     def unreadable(error: OSError) -> None:
-        folder = _inside(Path(error.filename), root)
+        folder = name_of(Path(error.filename), root)
         refused.append(Refusal(folder, "missing-file", f"cannot be opened: {error.strerror}"))
 
     for parent, folders, files in os.walk(root, onerror=unreadable):
@@ -140,7 +177,7 @@ def _walk(root: Path, refused: list[Refusal]) -> Iterator[Path]:
         here = Path(parent)
         for name in folders:
             if (here / name).is_symlink() and _escapes(here / name, root):
-                folder = _inside(here / name, root)
+                folder = name_of(here / name, root)
                 refused.append(Refusal(folder, "escapes", "a link out of the folder of logs"))
         yield from (here / name for name in sorted(files) if not name.startswith("."))
 
@@ -160,42 +197,26 @@ def _trouble(path: Path, root: Path) -> tuple[str, str] | None:
     return None if regular else ("missing-file", "is no regular file")
 
 
-def _rows(path: Path, root: Path, refused: list[Refusal]) -> dict[Path, dict[str, str]]:
-    """Read one manifest, by absolute path of the logs it names."""
-    rows: dict[Path, dict[str, str]] = {}
-    for line, row in _table(path):
-        file = row.pop("file").replace("\\", "/")
-        where = f"line {line} of {shown(path)}"
-        if not file:
-            raise BadTable(f"{where}: file is empty")
-        log = _absolute(path.parent / file)
-        if log in rows:
-            raise BadTable(f"{where}: {file} has a row already; keep one of them")
-        if not log.is_relative_to(_absolute(root)) or _escapes(log, root):
-            refused.append(Refusal(file, "escapes", f"{where} names a file out of the folder"))
+def _add(manifest: Manifest, path: Path, root: Path) -> Iterator[Refusal]:
+    """Add what one table says to a manifest; yield the rows that name no log of the folder."""
+    own: dict[Path, dict[str, str]] = {}
+    for where, cells, trouble in read_sheet(path, ("file",)):
+        place = f"{where} of {name_of(path, root)}"
+        file = cells["file"].replace("\\", "/")
+        if not file or "\0" in file:
+            detail = trouble or f"file is {file!r}, needed the path of a log"
+            yield Refusal(name_of(path, root), "bad-row", f"{where}: {detail}")
             continue
-        rows[log] = {key: row[key] for key in KEYS if row.get(key)}
-        if not os.path.lexists(log):
-            refused.append(Refusal(file, "missing-file", f"{where} names a file that is not there"))
-    return rows
-
-
-def _table(path: Path) -> Iterator[tuple[int, dict[str, str]]]:
-    """Yield line numbers and rows, cells stripped, missing ones empty."""
-    try:
-        with path.open(encoding="utf-8-sig", newline="") as stream:
-            reader = csv.DictReader(stream, skipinitialspace=True)
-            names = [name.strip() for name in reader.fieldnames or ()]
-            if names.count("file") != 1 or len(set(names)) != len(names):
-                raise BadTable(
-                    f"{shown(path)}: columns are {listed(names)}; needed each once, and file"
-                )
-            reader.fieldnames = names
-            for row in reader:
-                if None in row:
-                    raise BadTable(
-                        f"line {reader.line_num} of {shown(path)}: more cells than columns"
-                    )
-                yield reader.line_num, {key: (row[key] or "").strip() for key in names}
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise BadTable(f"{shown(path)}: {error}") from error
+        log = _absolute(path.parent / file)
+        if not log.is_relative_to(_absolute(root)) or _escapes(log, root):
+            yield Refusal(shown(file), "escapes", f"{place} names a file out of the folder")
+            continue
+        row = {key: cells[key] for key in KEYS if cells.get(key)}
+        if own.setdefault(log, row) != row:
+            trouble = trouble or f"{shown(file)} has another row already; keep one of them"
+        if trouble:
+            manifest.bad[log] = f"{place}: {trouble}"
+        if not os.path.isfile(log):
+            yield Refusal(shown(file), "missing-file", f"{place} names what is no file")
+    for log, row in own.items():
+        manifest.rows[log] = manifest.rows.get(log, {}) | row

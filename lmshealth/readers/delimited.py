@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import gzip
 import re
+import threading
 import warnings
 from collections.abc import Callable
 from functools import partial
@@ -21,6 +22,8 @@ from lmshealth.readers.text import Text
 from lmshealth.readers.trouble import Unusable, listed
 from lmshealth.samples import MINUTE, Samples
 
+# What becomes of warnings is a setting of the process, which threads share.
+_WARNINGS = threading.Lock()
 _GZIP_MAGIC = b"\x1f\x8b"
 _BOM = b"\xef\xbb\xbf"
 # Rows are read so many at a time, and fewer of wide tables: what they take stays in the cache.
@@ -153,7 +156,7 @@ def _numbers(
         low_memory=False,
         chunksize=max(1, min(_ROWS, _FIELDS // n_fields)),
     )
-    with warnings.catch_warnings():
+    with _WARNINGS, warnings.catch_warnings():
         # A row longer than the header is a warning in pandas and a loss of data here.
         warnings.simplefilter("error", pd.errors.ParserWarning)
         try:

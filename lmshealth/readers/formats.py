@@ -38,6 +38,12 @@ def format_of(path: Path) -> Format | None:
     return next((form for form in FORMATS if name.endswith(form.suffixes)), None)
 
 
+def format_name(path: Path) -> str:
+    """Name the format that a file's name promises: the same bytes are another log in another."""
+    form = format_of(path)
+    return "" if form is None else form.name
+
+
 def load(path: Path, columns: ColumnMap) -> Raw:
     """Read a file by the format its name promises and its first bytes confirm.
 

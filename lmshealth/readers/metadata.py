@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import unicodedata
 from collections.abc import Mapping
 from datetime import UTC, datetime
 
@@ -50,13 +51,13 @@ def parse_metadata(text: Mapping[str, str]) -> tuple[Metadata, float | None]:
     """
     given = {key: text[key].strip() for key in KEYS if text.get(key, "").strip()}
     metadata = Metadata(
-        stage=_name(given, "stage"),
-        recorded_at=_moment(given),
+        stage=parse_name(given, "stage"),
+        recorded_at=parse_moment(given),
         travel=_travel(given),
         covariates={key: _number(given, key) for key in COVARIATES if key in given},
-        servo_id=_name(given, "servo_id"),
+        servo_id=parse_name(given, "servo_id"),
         baseline=_boolean(given),
-        description=_name(given, "description"),
+        description=parse_name(given, "description"),
         velocity=_velocity(given),
     )
     return metadata, _sample_rate(given)
@@ -66,12 +67,22 @@ def _bad(given: Mapping[str, str], key: str, needed: str) -> Unusable:
     return Unusable("metadata", f"{key} is {given[key][:80]!r}, needed {needed}")
 
 
-def _name(given: Mapping[str, str], key: str) -> str | None:
-    if key not in given:
+def parse_name(given: Mapping[str, str], key: str) -> str | None:
+    """Read a name; None where there is none.
+
+    The two ways to write an accented letter, by one sign or by two, are one name: systems differ
+    in which of them they write, and a machine must not become two.
+
+    Raises
+    ------
+    Unusable
+        With reason ``metadata`` for a name with signs that cannot be seen, or a very long one.
+    """
+    if not given.get(key):
         return None
     if not given[key].isprintable() or len(given[key]) > _LONGEST_NAME:
         raise _bad(given, key, f"printable text of at most {_LONGEST_NAME} characters")
-    return given[key]
+    return unicodedata.normalize("NFC", given[key])
 
 
 def _number(given: Mapping[str, str], key: str) -> float:
@@ -85,8 +96,15 @@ def _number(given: Mapping[str, str], key: str) -> float:
     return value
 
 
-def _moment(given: Mapping[str, str]) -> datetime | None:
-    if "recorded_at" not in given:
+def parse_moment(given: Mapping[str, str]) -> datetime | None:
+    """Read ``recorded_at``; None where it is not given.
+
+    Raises
+    ------
+    Unusable
+        With reason ``metadata`` if it is no moment with a time zone.
+    """
+    if not given.get("recorded_at"):
         return None
     needed = "ISO 8601 with a time zone, such as 2026-03-01T08:30:00+01:00"
     try:

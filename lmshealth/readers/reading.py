@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import os
 import stat
 from collections.abc import Mapping
 from pathlib import Path
@@ -13,12 +12,7 @@ from lmshealth.logs import Log
 from lmshealth.readers.columns import ColumnMap
 from lmshealth.readers.contract import to_log
 from lmshealth.readers.formats import load
-from lmshealth.readers.trouble import Unusable
-
-
-def shown(path: str | Path) -> str:
-    """Write a path so that it can be printed and stored, whatever bytes its name has."""
-    return os.fsencode(path).decode("utf-8", "replace")
+from lmshealth.readers.trouble import Unusable, shown
 
 
 def read_log(
@@ -67,7 +61,8 @@ def content_digest(path: str | Path) -> str:
     Raises
     ------
     BadLog
-        With reason ``missing-file`` when there is nothing that can be read.
+        With reason ``missing-file`` when there is nothing that can be read, ``empty`` for 0 bytes:
+        empty files are no copies of each other.
     """
     try:
         return _digest(Path(path))
@@ -102,12 +97,15 @@ def _digest(file: Path) -> str:
     Raises
     ------
     Unusable
-        With reason ``missing-file`` when there is nothing that can be read.
+        With the reasons ``missing-file`` and ``empty``.
     """
     try:
+        found = file.stat()
         # A named pipe would be waited for until somebody writes to it.
-        if not stat.S_ISREG(file.stat().st_mode):
+        if not stat.S_ISREG(found.st_mode):
             raise Unusable("missing-file", "is no regular file")
+        if not found.st_size:
+            raise Unusable("empty", "0 bytes; copy the file again")
         with file.open("rb") as stream:
             return hashlib.file_digest(stream, "sha256").hexdigest()
     except (OSError, ValueError) as error:

@@ -46,11 +46,14 @@ class Spool:
         """
         start, self._size = self._size, self._size + block.size
         if self._size <= self._memory.size:
-            self._memory[start : self._size] = block
+            # Damaged bytes may be a NaN that complains when it is widened.
+            with np.errstate(invalid="ignore"):
+                self._memory[start : self._size] = block
             return
         if self._memory.size:
             self._parts, self._memory = [self._memory[:start]], np.empty(0)
-        self._parts.append(np.asarray(block, dtype=np.float64))
+        with np.errstate(invalid="ignore"):
+            self._parts.append(np.asarray(block, dtype=np.float64))
         if self._file is not None or self._size > MINUTE:
             self._write()
 

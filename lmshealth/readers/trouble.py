@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterable
+from pathlib import Path
 
 _SHOWN = 12
 
@@ -19,9 +21,10 @@ class Unusable(Exception):
     """
 
     def __init__(self, reason: str, detail: str) -> None:
-        super().__init__(f"{reason}: {detail}")
         self.reason = reason
-        self.detail = detail
+        # It quotes what the file says, and may reach a terminal.
+        self.detail = visible(detail)
+        super().__init__(f"{reason}: {self.detail}")
 
 
 def listed(names: Iterable[str]) -> str:
@@ -33,3 +36,18 @@ def listed(names: Iterable[str]) -> str:
     )
     more = len(all_names) - _SHOWN
     return (shown or "nothing") + (f" and {more} more" if more > 0 else "")
+
+
+def visible(text: str) -> str:
+    """Escape control characters, marks that turn the direction of writing, and halves of signs."""
+    if text.isprintable():
+        return text
+    return "".join(c if c.isprintable() else ascii(c)[1:-1] for c in text)
+
+
+def shown(path: str | Path) -> str:
+    """Write a path so that it can be printed and stored, whatever bytes its name has.
+
+    The backslash is doubled, so that different names stay different.
+    """
+    return visible(os.fsdecode(path).replace("\\", "\\\\"))

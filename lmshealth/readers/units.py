@@ -37,6 +37,8 @@ _SPELLINGS = str.maketrans(
 )
 _ALIASES = {"A": "a", "mA": "ma", "gn": "g", "m_s_s": "m_s2", "m_sec2": "m_s2"}
 
+_LONGEST_NAME = 200
+
 _DIMENSIONS: dict[Role, str] = {
     "displacement": "length",
     "acceleration": "acceleration",
@@ -113,11 +115,14 @@ def parse_column(column: str, unit: str | float | None = None) -> Signal:
     ------
     Unusable
         With reason ``unit`` when the unit is missing, unknown or of another quantity; with reason
-        ``columns`` when the contract knows no such column.
+        ``columns`` when the contract knows no such column, or it has signs that cannot be seen.
     """
     role = role_of(column)
     if role is None:
         raise Unusable("columns", f"{column!r} is no column of the log contract")
+    if not column.isprintable() or len(column) > _LONGEST_NAME:
+        needed = f"printable text of at most {_LONGEST_NAME} characters"
+        raise Unusable("columns", f"a column is called {column[:80]!r}, needed {needed}")
     suffix = next((unit for unit in _LONGEST_FIRST if column.endswith("_" + unit)), None)
     if unit is not None:
         return _with_unit(column, suffix, role, unit)

@@ -5,7 +5,7 @@ import os
 import pytest
 
 from lmshealth.errors import BadLog, BadTable
-from lmshealth.readers import find_logs, read_log, read_manifest
+from lmshealth.readers import find_logs, name_of, read_log, read_manifest
 
 HEADER = "file,stage,travel_km,baseline\n"
 
@@ -85,22 +85,62 @@ def test_rows_without_log(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "text",
+    ("text", "reason"),
     [
-        b"",
-        b"stage\nA\n",
-        b"file,file\na,b\n",
-        b"file,stage\na.csv,A,B\n",
-        b"file\na.csv\n./a.csv\n",
-        b"file,stage\n,A\n",
-        b"file\n\xff\n",
+        (b"", "empty"),
+        (b"stage\nA\n", "columns"),
+        (b"file,file\na,b\n", "columns"),
+        (b"file;stage\na;b\n", "columns"),
+        ("file,stage\na,b\n".encode("utf-16"), "columns"),
     ],
 )
-def test_bad_manifests(tmp_path, text):
-    """A manifest that cannot be understood is an error that names it."""
+def test_manifests_that_say_nothing(tmp_path, text, reason):
+    """A table that cannot be understood as a whole is one refusal, under its name."""
     (tmp_path / "manifest.csv").write_bytes(text)
-    with pytest.raises(BadTable, match="manifest"):
-        read_manifest(tmp_path)
+    manifest = read_manifest(tmp_path)
+    assert [(r.log, r.reason) for r in manifest.refused] == [("manifest.csv", reason)]
+    assert manifest.rows == {}
+
+
+def test_bad_rows_cost_their_log_only(make, tmp_path):
+    """A log whose row cannot be read or is contradicted is refused; the rows around it count."""
+    logs = {name: make(f"{name}.csv") for name in "abcde"}
+    (tmp_path / "manifest.csv").write_bytes(
+        b"file,stage,travel_km,remark\n"
+        b"a.csv,A,1,\xff is not used\n"
+        b"b.csv,B,1,,too,many\n"
+        b'c.csv,"C,1,\n'
+        b"d.csv,D,1,,,\n"
+        b",E,1,\n"
+        b"e.csv,E,1,\n./e.csv,E,2,\n./d.csv,D,1,twice the same\n"
+        b"f\0.csv,F,1,\n"
+    )
+    manifest = read_manifest(tmp_path)
+    assert manifest.overrides(logs["a"]) == {"stage": "A", "travel_km": "1"}
+    assert manifest.overrides(logs["d"]) == {"stage": "D", "travel_km": "1"}
+    for name, needle in {
+        "b": "line 3 of manifest.csv: 6 cells",
+        "c": "line 4",
+        "e": "another row",
+    }.items():
+        with pytest.raises(BadLog, match=needle) as caught:
+            manifest.overrides(logs[name])
+        assert caught.value.reason == "bad-row"
+    assert [(r.log, r.reason, r.detail.split(":")[0]) for r in manifest.refused] == [
+        ("manifest.csv", "bad-row", "line 6"),
+        ("manifest.csv", "bad-row", "line 10"),
+    ]
+
+
+def test_names_are_fit_to_be_printed_and_differ(tmp_path):
+    """Control characters, turned writing and foreign bytes are escaped; no two names become one."""
+    names = [b"a\x1b[31m.csv", b"a\\x1b[31m.csv", b"\xff.csv", b"\xfe.csv", "\u202eb.csv".encode()]
+    for name in names:
+        open(os.path.join(os.fsencode(tmp_path), name), "wb").close()
+    told = [name_of(path, tmp_path) for path in find_logs(tmp_path).logs]
+    assert len(set(told)) == len(names)
+    assert all(name.isprintable() for name in told)
+    assert {r"a\x1b[31m.csv", r"a\\x1b[31m.csv", r"\udcff.csv", r"\u202eb.csv"} <= set(told)
 
 
 def test_no_folder(tmp_path):

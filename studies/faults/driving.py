@@ -1,0 +1,279 @@
+"""Runs of the command line as a user starts them, and how what they leave is compared."""
+
+from __future__ import annotations
+
+import os
+import random
+import re
+import secrets
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, ExitStack, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import IO
+
+from sqlalchemy import create_engine, inspect, make_url, text
+
+from studies.faults.batch import write_machine, write_stages
+from studies.servers import MARK, Popen, marked, missing_postgres, postgres
+
+LONG_S = 1200.0  # no run takes as long
+ENDED_S = 60.0  # by then every process of a killed run has to be gone, on a busy machine too
+SOME_REFUSED = 3  # exit status of a run over the batch, which has damaged logs
+
+
+def make_batch(folder: Path, machines: Mapping[str, int], workers: int = 2) -> Batch:
+    """Write descriptions, and so many logs of each machine.
+
+    Parameters
+    ----------
+    folder : Path
+        Where to.
+    machines : mapping of str to int
+        How many logs of each machine; ``WORN-…`` have health, ``WATCHED-…`` only modes.
+    workers : int
+        Processes that analyse them.
+    """
+    for machine, n_logs in machines.items():
+        write_machine(folder / "logs", machine, n_logs)
+    return Batch(folder / "logs", write_stages(folder / "stages"), workers)
+
+
+@dataclass(frozen=True)
+class Batch:
+    """Logs, the descriptions of their machines, and by how many processes they are analysed."""
+
+    logs: Path
+    stages: tuple[Path, ...]
+    workers: int
+
+    def command(self, out: Path, store: str, *more: str) -> list[str]:
+        """Give the command that analyses the batch, health at one epoch: that is slow."""
+        stages = [word for stage in self.stages for word in ("--stage", str(stage))]
+        return [sys.executable, "-m", "lmshealth", "run", str(self.logs), *stages,
+                "--out", str(out), "--store", store, "--epochs", "1",
+                *(more or ("--workers", str(self.workers)))]  # fmt: skip
+
+
+class Run:
+    """A run in a process group of its own; all its processes carry a mark.
+
+    Parameters
+    ----------
+    command : sequence of str
+        What to run.
+    said : file
+        Takes what it writes to standard error.
+    """
+
+    def __init__(self, command: Sequence[str], said: IO[bytes]) -> None:
+        self.mark = secrets.token_hex()
+        self._said = said
+        self._process: Popen = subprocess.Popen(
+            command, stdout=subprocess.DEVNULL, stderr=self._said, start_new_session=True,
+            env={**os.environ, MARK: self.mark}, cwd=Path(__file__).parents[2],
+        )  # fmt: skip
+
+    def status(self, within_s: float = LONG_S) -> int | None:
+        """Wait for the end and give its status; None where it does not end so soon."""
+        try:
+            return self._process.wait(within_s)
+        except subprocess.TimeoutExpired:
+            return None
+
+    def begun(self, store: str) -> bool:
+        """Wait until the store has the first log; say whether it has, or the run ended before."""
+        while not (known := rows(store).get("identified")) and self.status(0.05) is None:
+            pass
+        return bool(known)
+
+    def said(self) -> list[str]:
+        """Give the lines that it wrote to standard error."""
+        self._said.seek(0)
+        return self._said.read().decode(errors="replace").splitlines()
+
+    def kill(self, how: str, rng: random.Random) -> bool:
+        """Disturb the run; say whether there was anything to disturb.
+
+        ``main`` kills its main process, ``worker`` one of its workers; ``SIGINT`` and ``SIGTERM``
+        reach the whole group, as from a terminal.
+        """
+        if self._process.poll() is not None:
+            return False
+        if how == "main":
+            self._process.kill()
+        elif how == "worker":
+            workers = [pid for pid, words in marked(self.mark).items() if "spawn_main" in words]
+            if not workers:
+                return False
+            os.kill(rng.choice(workers), signal.SIGKILL)
+        else:
+            os.killpg(self._process.pid, getattr(signal, how))
+        return True
+
+    def gone_after(self) -> float:
+        """Wait until none of its processes lives; give how long that took, in seconds.
+
+        Those that live still after `ENDED_S` are waited for no longer.
+        """
+        begin = time.monotonic()
+        # Its own end counts only when it is fetched: until then it is there, without a command.
+        while (took := time.monotonic() - begin) <= ENDED_S:
+            if self._process.poll() is not None and not marked(self.mark):
+                break
+            time.sleep(0.02)
+        return took
+
+    def end(self) -> None:
+        """Kill whatever still lives of it."""
+        for pid in (self._process.pid, *marked(self.mark)):
+            if pid != self._process.pid or self._process.poll() is None:
+                os.kill(pid, signal.SIGKILL)
+        self._process.wait()
+
+
+@contextmanager
+def running(command: Sequence[str]) -> Iterator[Run]:
+    """Start a run, and leave nothing of it behind."""
+    with tempfile.TemporaryFile() as said:
+        run = Run(command, said)
+        try:
+            yield run
+        finally:
+            run.end()
+
+
+def completed(command: Sequence[str], expected: int = SOME_REFUSED) -> float:
+    """Carry out a run to its end; give how long it took, in seconds."""
+    begin = time.monotonic()
+    with running(command) as run:
+        status = run.status()
+        if status != expected:
+            raise RuntimeError(f"{command} ended with {status}: {run.said()}")
+    return time.monotonic() - begin
+
+
+def one_line(said: Sequence[str]) -> bool:
+    """Say whether a failed run told why, in one line."""
+    return len(said) == 1 and said[0].startswith("lmshealth: ")
+
+
+# What a run leaves
+
+
+def differences(reference: Path, out: Path) -> list[str]:
+    """Compare two folders of output, tables row by row."""
+    names = {path.name for folder in (reference, out) for path in folder.iterdir()}
+    found = []
+    for name in sorted(names):
+        old, new = (_lines(folder / name) for folder in (reference, out))
+        if old != new:
+            more, less = Counter(new) - Counter(old), Counter(old) - Counter(new)
+            found.append(f"{name}: {more.total()} lines more, {less.total()} less, or their order")
+    return found
+
+
+def _lines(path: Path) -> list[str]:
+    return path.read_bytes().decode().splitlines(True) if path.is_file() else ["no such file"]
+
+
+def rows(store: str) -> dict[str, int]:
+    """Count the rows of every table of a store, their version left out of their names."""
+    if (
+        (file := make_url(store).database)
+        and store.startswith("sqlite")
+        and not Path(file).exists()
+    ):
+        return {}  # looking would make it
+    engine = create_engine(store)
+    try:
+        names = inspect(engine).get_table_names()
+        with engine.connect() as connection:
+            counts = {n: connection.execute(text(f'SELECT count(*) FROM "{n}"')) for n in names}
+            return {re.sub(r"_\d+$", "", n): int(count.scalar_one()) for n, count in counts.items()}
+    finally:
+        engine.dispose()
+
+
+@dataclass(frozen=True)
+class Reference:
+    """A batch, what an uninterrupted run made of it, and how long that took, in seconds."""
+
+    batch: Batch
+    out: Path
+    rows: dict[str, int]
+    seconds: float
+
+    def judge(self, out: Path, store: str) -> list[str]:
+        """List how output and store differ from the uninterrupted run's."""
+        found = differences(self.out, out)
+        if (now := rows(store)) != self.rows:
+            found.append(f"store: {now} rows, not {self.rows}")
+        return found
+
+
+def reference_of(batch: Batch, folder: Path) -> Reference:
+    """Analyse a batch without interruption."""
+    out = folder / "out"
+    store = f"sqlite:///{folder / 'reference.sqlite'}"
+    folder.mkdir(parents=True)
+    seconds = completed(batch.command(out, store))
+    return Reference(batch, out, rows(store), seconds)
+
+
+Stores = Callable[[], AbstractContextManager[str]]
+"""Gives the address of a new empty store."""
+
+
+@contextmanager
+def backends(folder: Path) -> Iterator[dict[str, Stores]]:
+    """Offer new stores of both kinds; PostgreSQL only where it can be started."""
+
+    @contextmanager
+    def file() -> Iterator[str]:
+        with tempfile.TemporaryDirectory(dir=folder) as own:
+            yield f"sqlite:///{own}/store.sqlite"
+
+    found: dict[str, Stores] = {"sqlite": file}
+    with ExitStack() as stack:
+        if missing_postgres() is None:
+            found["postgres"] = stack.enter_context(postgres()).database
+        yield found
+
+
+def control(reference: Reference, folder: Path) -> dict[str, bool]:
+    """Say of outputs that are wrong in one place each whether the comparison sees it."""
+    copy = folder / "control"
+
+    def seen(name: str, change: Callable[[list[str]], list[str]]) -> bool:
+        shutil.copytree(reference.out, copy)
+        lines = change(_lines(copy / name))
+        (copy / name).unlink()
+        if lines:
+            (copy / name).write_bytes("".join(lines).encode())
+        found = differences(reference.out, copy)
+        shutil.rmtree(copy)
+        return bool(found)
+
+    return {
+        "same": not seen("modes.csv", lambda lines: lines),
+        "row doubled": seen("modes.csv", lambda lines: [*lines, lines[1]]),
+        "row lost": seen("refused.csv", lambda lines: lines[:-1]),
+        "rows in another order": seen("modes.csv", lambda lines: [lines[0], *lines[:0:-1]]),
+        "last digit changed": seen(
+            "track.csv", lambda lines: [*lines[:-1], re.sub(r"\d(?=\D*$)", _next, lines[-1])]
+        ),
+        "page changed": seen("index.html", lambda lines: [*lines, "<p>"]),
+        "page lost": seen("index.html", lambda lines: []),
+    }
+
+
+def _next(digit: re.Match[str]) -> str:
+    return str((int(digit.group()) + 1) % 10)

@@ -1,0 +1,358 @@
+"""Does anything that a log, a table or an address says ever act, or reach outside the output?
+
+Question
+    Names of machines and files, metadata, cells of tables, descriptions and addresses may hold
+    SQL, markup, commands, paths, formulas and control characters; files may be links, pipes and
+    bombs. Is anything of it executed, is anything written outside the folder of the output, is
+    anything read that must not be, and is a password ever shown or kept?
+Method
+    An archive of hostile logs (`studies.faults.hostile`) is run and reported with a SQLite store,
+    and with PostgreSQL where there is one, at the most talkative level of logging. Everything
+    around is compared before and after by the hash of every file; a table that nobody may touch
+    stands in the database; whatever was printed, written and kept is searched for signs that
+    act, for markup that is not escaped, for passwords and for the content of files outside. Links
+    stand in the place of files of the output. Bombs are read one by one, and the memory that each
+    took is measured. Negative controls: each guard is given what it must notice.
+Answer
+    Nothing acts and nothing outside is touched, with either store: 32 machines are told by the
+    names they have, 17 logs that reach for more or hold what cannot be seen are refused. No
+    password is shown or kept, in 14 forms of addresses that are each tried three times. A bomb
+    takes no more than 223 MB with all libraries.
+Run time
+    Some eight minutes of one processor.
+"""
+
+from __future__ import annotations
+
+import argparse
+import html
+import json
+import os
+import resource
+import socket
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from sqlalchemy import create_engine
+
+from studies import servers
+from studies.faults import guards, hostile
+from studies.faults.damage import KINDS
+from studies.faults.logfiles import DESCRIPTION, Archive, Columns, log_of, recordings
+from studies.record import Stopwatch, conclude
+
+RECORD = Path(__file__).with_name("injection.json")
+PASSWORD = "s3cr3t-pa55w0rd"
+# Ways to write a password into an address; some of them are no addresses at all.
+ADDRESSES = (
+    "postgresql+psycopg://u:{}@127.0.0.1:1/db",
+    "postgresql://u:{}@127.0.0.1:1/db?connect_timeout=1",
+    "postgresql://u:a/{}@127.0.0.1:1/db",
+    "postgresql://u:a@{}@127.0.0.1:1/db",
+    "postgresql://u:a?{}@127.0.0.1:1/db",
+    "postgresql://u:a#{}@127.0.0.1:1/db",
+    "postgresql://u@127.0.0.1:{}/db",
+    "postgresql://u:%2F{}@127.0.0.1:1/db",
+    "postgresql://127.0.0.1:1/db?password={}",
+    "postgresql://127.0.0.1:1/db?sslpassword={}&bogus={}",
+    "sqlite:////nowhere/store.sqlite?timeout={}",
+    "mysql://u:{}@127.0.0.1/db",
+    "u:{}@127.0.0.1/db",
+    "host=127.0.0.1 password={}",
+)
+# What Python, its libraries and a minute of samples take, and the most that a bomb may add.
+_MOST_MEMORY = 400 << 20
+_TALKATIVE = (
+    "import logging, sys; logging.basicConfig(level=logging.DEBUG);"
+    "from lmshealth.cli import main; main(sys.argv[1:])"
+)
+Done = subprocess.CompletedProcess[str]
+
+
+def main() -> None:
+    """Run the study; ``--quick`` does a part of it and records nothing."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--quick", action="store_true")
+    quick = parser.parse_args().quick
+    watch = Stopwatch()
+    (base,) = recordings(1)
+    answer: dict[str, Any] = {"stores": {}, "controls": controls()}
+    with ExitStack() as stack:
+        kinds = ["sqlite"]
+        if not quick and servers.missing_postgres() is None:
+            kinds.append("postgresql")
+        for kind in kinds:
+            folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="hostile-")))
+            url, password = _store(kind, folder, stack)
+            answer["stores"][kind] = attack(folder, base, url, password, every=5 if quick else 1)
+        folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="addresses-")))
+        answer["addresses"] = addresses(folder, ADDRESSES[2:3] if quick else ADDRESSES)
+        answer["descriptions"] = [] if quick else descriptions(folder)
+        answer["network"] = network(folder)
+        answer["bombs"] = [] if quick else bombs(folder, base)
+    answer["passed"] = verdicts(answer)
+    conclude(RECORD, (__doc__ or "").split("\n")[0], answer, watch, quick=quick)
+
+
+def verdicts(answer: dict[str, Any]) -> dict[str, bool]:
+    """Say what was asked and whether it is so."""
+    stores = answer["stores"].values()
+    wrong = {name for store in stores for name, found in store["wrong"].items() if found}
+    names = {name for store in stores for name in store["wrong"]}
+    return {
+        **{name: name not in wrong for name in sorted(names)},
+        "no address shows its password": not answer["addresses"]["shown"],
+        "descriptions are refused in a line": not answer["descriptions"],
+        "nobody is called": not answer["network"],
+        "bombs stay small": all(
+            row["refused"] and row["peak_mb"] < _MOST_MEMORY >> 20 for row in answer["bombs"]
+        ),
+        "controls are noticed": all(answer["controls"].values()),
+    }
+
+
+def _store(kind: str, folder: Path, stack: ExitStack) -> tuple[str, str]:
+    """Give the address of a store with a planted table, and its password."""
+    if kind == "sqlite":
+        (folder / "out").mkdir()
+        return f"sqlite:///{folder / 'out' / 'lmshealth.sqlite'}", PASSWORD
+    server = stack.enter_context(servers.postgres())
+    return stack.enter_context(server.database()), server.password
+
+
+def lmshealth(*words: str | Path, cwd: Path, limit: Callable[[], None] | None = None) -> Done:
+    """Run a command at the most talkative level of logging."""
+    command = [sys.executable, "-c", _TALKATIVE, *(str(word) for word in words)]
+    paths = {"PYTHONPATH": os.pathsep.join(path for path in sys.path if path)}
+    return subprocess.run(
+        command, capture_output=True, cwd=cwd, check=False, text=True, errors="surrogateescape",
+        env=os.environ | paths, preexec_fn=limit,
+    )  # fmt: skip
+
+
+def attack(folder: Path, base: Columns, url: str, password: str, *, every: int) -> dict[str, Any]:
+    """Run and report a hostile archive, and look at everything that came of it."""
+    logs, out = folder / "logs", folder / "out"
+    machines, refused = hostile.make_hostile(folder, base, every=every)
+    (folder / "stage.toml").write_text(hostile.STAGE)
+    links = _links(folder, out)
+    guards.plant(url)
+    before = guards.snapshot(folder, [out])
+    words = ["--stage", folder / "stage.toml", "--store", url, "--workers", "1", "--epochs", "1"]
+    done = lmshealth("run", logs, *words, "--out", out, cwd=folder)
+    again = lmshealth("report", "--store", url, "--out", out / "again", cwd=folder)
+    # Who names a link means what it points to.
+    named = [path for path in sorted(logs.glob("*.csv")) if not path.is_symlink()]
+    single = [
+        lmshealth("modes", *named, "--format", style, cwd=folder)
+        for style in ("table", "csv", "json")[::every]
+    ]
+    printed = "".join(one.stdout + one.stderr for one in (done, again, *single))
+    changed = guards.differences(before, guards.snapshot(folder, [out]))
+    written = {
+        path: path.read_text() for path in out.rglob("*") if path.suffix in (".html", ".csv")
+    }
+    pages = {path: text for path, text in written.items() if path.suffix == ".html"}
+    kept = guards.everything_in(url)
+    texts = [printed, *written.values(), kept.decode("utf-8", "replace")]
+    told = pd.read_csv(out / "verdict.csv", dtype=str, keep_default_na=False)["stage"].tolist()
+    lost = set(pd.read_csv(out / "refused.csv", dtype=str, keep_default_na=False)["log"])
+    names = [path.name for path in out.iterdir() if path.suffix == ".html"]
+    shown = [html.unescape(text) for text in pages.values()]
+    own = {script for text in pages.values() for script in guards.scripts(text)}
+    return {
+        "machines": len(machines),
+        "logs_refused": len(refused),
+        "pages": len(names),
+        "exit_status": [done.returncode, again.returncode, *(one.returncode for one in single)],
+        "wrong": {
+            "nothing outside the output is changed": changed,
+            "no SQL is executed": guards.touched(url),
+            "every machine is told as it is named": sorted({*machines} ^ {*told}),
+            "every reaching log is refused": sorted({*refused} - lost),
+            "pages have names of their own": guards.bad_names(names)
+            + ([] if len(names) == len(machines) + 1 else [f"{len(names)} pages"]),
+            "no command is run": [str(p) for p in folder.rglob(hostile.MARK)],
+            "nothing printed or written acts": sorted(
+                {sign for text in (printed, *written.values()) for sign in guards.acting(text)}
+            ),
+            "pages load and run nothing": sorted(
+                {found for text in pages.values() for found in guards.loaded(text)}
+                | {script[:200] for script in own if "alert" in script}
+            ),
+            "no template is filled in": [
+                name for name in machines if not any(name in text for text in shown)
+            ],
+            "no file outside is read": [f"text {k}" for k, t in enumerate(texts) if _leaked(t)],
+            "no password is shown or kept": [
+                f"text {k}" for k, text in enumerate(texts) if password in text
+            ],
+            "links are replaced and not followed": [
+                str(link) for link in links if link.is_symlink()
+            ],
+            "no traceback": ["there is one"] if "Traceback" in printed else [],
+            "the exit status is that of refused logs": []
+            if (done.returncode, again.returncode) == (3, 0)
+            else [str(done.returncode), str(again.returncode), done.stderr[-500:]],
+        },
+    }  # fmt: skip
+
+
+def _links(folder: Path, out: Path) -> list[Path]:
+    """Lay links in the places of files that will be written."""
+    out.mkdir(exist_ok=True)
+    links = []
+    for name in ("index.html", "modes.csv", "refused.csv", "files.html", "health.csv"):
+        (folder / "outside" / f"victim-{name}").write_text("as it was")
+        links.append(out / name)
+        links[-1].symlink_to(folder / "outside" / f"victim-{name}")
+    links.append(out / "track.csv")
+    links[-1].symlink_to(folder / "outside" / "not-there")
+    return links
+
+
+def _leaked(text: str) -> bool:
+    """Tell whether a file outside was read: ours, or that of the system's users."""
+    return hostile.SECRET in text or "root:x:0" in text
+
+
+def addresses(folder: Path, forms: Sequence[str]) -> dict[str, Any]:
+    """Try addresses that hold a password, as stores and as schedulers."""
+    (folder / "logs").mkdir(exist_ok=True)
+    (folder / "stage.toml").write_text(DESCRIPTION)
+    shown, status = [], []
+    for form in forms:
+        address = form.format(*[PASSWORD] * 2)
+        words = ["run", "logs", "--stage", "stage.toml", "--out", "out"]
+        for more in (
+            [*words, "--store", address],
+            ["report", "--store", address, "--out", "out"],
+            [*words, "--scheduler", address.replace("postgresql", "tcp")],
+        ):
+            done = lmshealth(*more, cwd=folder)
+            status.append(done.returncode)
+            if PASSWORD in done.stdout + done.stderr or "Traceback" in done.stderr:
+                shown.append({"address": form, "command": more[0], "said": done.stderr[-600:]})
+    return {"tried": len(status), "exit_status": sorted(set(status)), "shown": shown}
+
+
+def descriptions(folder: Path) -> list[str]:
+    """Load descriptions that must be refused in one line."""
+    (folder / "outside").mkdir(exist_ok=True)
+    (folder / "outside" / "secret.txt").write_text(hostile.SECRET + "\n")
+    (folder / "stages").mkdir(exist_ok=True)
+    wrong = []
+    for name, content in hostile.BAD_STAGES.items():
+        path = folder / "stages" / "bad.toml"
+        path.write_text(content)
+        done = lmshealth("stage", path, cwd=folder)
+        said = done.stderr
+        fine = done.returncode == 1 and said.count("\n") == 1 and not guards.acting(said)
+        if not fine or hostile.SECRET in said + done.stdout:
+            wrong.append(f"{name}: {done.returncode} {said[-300:]}")
+    return wrong
+
+
+def network(folder: Path) -> list[str]:
+    """Name files by addresses of a server, and see whether anybody calls it."""
+    wrong = []
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        server.settimeout(0.1)
+        there = f"http://127.0.0.1:{server.getsockname()[1]}/x"
+        for words in (
+            ["modes", f"{there}.csv", f"{there}.h5", f"{there}.parquet"],
+            ["stage", f"{there}.toml"],
+            ["modes", "logs/none.csv", "--columns", f"{there}.toml"],
+            ["track", f"{there}.csv", "--out", "track.csv"],
+        ):
+            done = lmshealth(*words, cwd=folder)
+            try:
+                server.accept()[0].close()
+                wrong.append(f"{words[0]} called")
+            except TimeoutError:
+                pass
+            if done.returncode not in (1, 2):
+                wrong.append(f"{words[0]} ended with {done.returncode}")
+    return wrong
+
+
+def bombs(folder: Path, base: Columns) -> list[dict[str, Any]]:
+    """Read files that swell, and measure the memory that each takes."""
+    rows = []
+    archive = Archive(folder / "bombs")
+    archive.folder.mkdir()
+    for kind in KINDS:
+        if kind.reason != "too-large":
+            continue
+        for suffix in kind.suffixes:
+            path = archive.folder / f"bomb{suffix}"
+            log = log_of(base, 0, np.random.default_rng(0))
+            kind.make(archive, path, log, np.random.default_rng(0))
+            rows.append({"bomb": kind.name, "suffix": suffix, **_weigh(path, folder)})
+    return rows
+
+
+def _weigh(path: Path, folder: Path) -> dict[str, Any]:
+    """Read a log in a process of its own, and give its peak of memory in MB."""
+    script = (
+        "import json, resource, sys\nfrom lmshealth.readers import read_log\n"
+        "from lmshealth.errors import BadLog\n"
+        "try:\n    read_log(sys.argv[1]); reason = ''\n"
+        "except BadLog as error:\n    reason = error.reason\n"
+        "peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss >> 10\n"
+        "print(json.dumps({'refused': reason, 'peak_mb': peak}))"
+    )
+    command = [sys.executable, "-c", script, str(path)]
+    done = subprocess.run(
+        command, capture_output=True, text=True, check=True,
+        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_AS, (8 << 30, 8 << 30)),
+    )  # fmt: skip
+    found: dict[str, Any] = json.loads(done.stdout)
+    return found
+
+
+def controls() -> dict[str, bool]:
+    """Give every guard what it must notice."""
+    with tempfile.TemporaryDirectory(prefix="controls-") as name:
+        folder = Path(name)
+        victim, link = folder / "victim", folder / "out" / "index.html"
+        link.parent.mkdir()
+        victim.write_text("as it was")
+        link.symlink_to(victim)
+        before = guards.snapshot(folder, [link.parent])
+        link.write_text("followed")
+        followed = guards.differences(before, guards.snapshot(folder, [link.parent]))
+        url = f"sqlite:///{folder / 'store.sqlite'}"
+        guards.plant(url)
+        engine = create_engine(url)
+        raw = engine.raw_connection()
+        raw.driver_connection.executescript(  # type: ignore[union-attr]
+            f"CREATE TABLE t_1 (name TEXT); INSERT INTO t_1 VALUES ('{hostile.MACHINES[0]}');"
+        )
+        raw.close()
+        engine.dispose()
+        script = hostile.MACHINES[hostile.MACHINES.index("<script>alert(1)</script>")]
+        return {
+            "a link that is followed": followed == [repr(os.fsencode(victim))],
+            "a name in a statement": guards.touched(url) == ["the table is gone"],
+            "markup that is not escaped": bool(guards.scripts(f"<p>{script}</p>")),
+            "an attribute that is not closed": bool(
+                guards.loaded('<p title="" onmouseover="alert(1)">')
+            ),
+            "a page that loads": bool(guards.loaded('<script src="https://example.com/x.js">')),
+            "control characters": bool(guards.acting(hostile.UNSEEN[1])),
+            "writing turned about": bool(guards.acting(hostile.UNSEEN[2])),
+            "names of devices and twins": guards.bad_names(["CON.html", "a.html", "A.html"])
+            == ["CON.html", "a.html", "A.html"],
+        }
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,177 @@
+"""Does a batch that is killed again and again end as if nothing had happened?
+
+Question
+    When a run over 200 logs is killed at random moments and started again until it ends, in a
+    SQLite file and in PostgreSQL: are tables and pages those of a run without interruption, row by
+    row, is every log once in the store, and does no process stay?
+Method
+    The command line as users start it, with two worker processes. Kills come by a Poisson process,
+    so that no moment is spared: `kill -9` of the main process or of one worker, SIGINT or SIGTERM
+    to the group, as from a terminal. A run that ended is compared, and the next begins with an
+    empty store, until there were 100 kills. Of the machines one is young, and three others teach
+    it. Negative control: the comparison has to see one row doubled, lost or moved, one digit
+    changed, one page changed or lost.
+"""
+
+from __future__ import annotations
+
+import argparse
+import random
+import signal
+import sys
+import tempfile
+from collections import Counter
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from studies.faults.driving import (
+    ENDED_S,
+    SOME_REFUSED,
+    Reference,
+    Stores,
+    backends,
+    control,
+    make_batch,
+    one_line,
+    reference_of,
+    rows,
+    running,
+)
+from studies.record import Stopwatch, conclude
+
+HERE = Path(__file__).parent
+SEED = 20261122
+# Enough that three teach a fleet's prior to a fourth, which is young.
+MACHINES = {"WORN-A": 50, "WORN-B": 46, "WORN-C": 46, "WORN-D": 8, "WATCHED-A": 50}
+QUICK_MACHINES = {"WATCHED-A": 8}
+N_KILLS, QUICK_KILLS = 100, 1
+HOWS = {"main": 0.5, "worker": 0.2, "SIGINT": 0.15, "SIGTERM": 0.15}
+QUICK_HOWS = {"main": 1.0}
+ENDS = {"main": -signal.SIGKILL, "SIGTERM": -signal.SIGTERM}
+MOST_OTHER = 20  # runs that end otherwise, before it is of no use to go on
+PER_RUN, QUICK_PER_RUN = 3.0, 10.0  # kills in the mean, over the time that a run takes
+
+Row = dict[str, Any]
+
+
+def main() -> None:
+    """Run the study; ``--quick`` does a small part and records nothing."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--quick", action="store_true")
+    options = parser.parse_args()
+    watch, quick = Stopwatch(), options.quick
+    wanted = (QUICK_KILLS, QUICK_PER_RUN, QUICK_HOWS) if quick else (N_KILLS, PER_RUN, HOWS)
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        batch = make_batch(folder, *((QUICK_MACHINES, 1) if quick else (MACHINES, 2)))
+        reference = reference_of(batch, folder / "reference")
+        answer: Row = {
+            "seed": SEED,
+            "logs": len(list(batch.logs.rglob("*.h5"))),
+            "uninterrupted": {"seconds": round(reference.seconds, 1), "rows": reference.rows},
+            "kills": {},
+        }
+        with backends(folder) as kinds:
+            for kind, new_store in kinds.items():
+                answer["kills"][kind] = killed(reference, new_store, wanted)
+                print(kind, answer["kills"][kind], file=sys.stderr, flush=True)
+        answer["control"] = control(reference, folder)
+    answer["passed"] = verdicts(answer)
+    conclude(HERE / "kills.json", __doc__.split("\n")[0], answer, watch, quick=quick)
+
+
+def verdicts(answer: Row) -> dict[str, bool]:
+    """Say of each thing asked whether it is so."""
+    passed = {"the comparison sees what is wrong": all(answer["control"].values())}
+    for kind, found in answer["kills"].items():
+        passed[f"as uninterrupted, {kind}"] = not found["differences"]
+        passed[f"no process left, {kind}"] = found["slowest_end_s"] <= ENDED_S
+        passed[f"no other end, {kind}"] = not found["other_ends"]
+    return passed
+
+
+# Kills
+
+
+def killed(
+    reference: Reference, new_store: Stores, wanted: tuple[int, float, dict[str, float]]
+) -> Row:
+    """Kill runs of one batch after another until there were enough kills."""
+    kills = Kills([], *wanted, random.Random(SEED))
+    found: Row = {"batches": 0, "differences": [], "other_ends": []}
+    while len(kills.done) < kills.n:
+        with new_store() as store, tempfile.TemporaryDirectory() as name:
+            out = Path(name) / "out"
+            while not run_killed(reference, store, out, kills, found["other_ends"]):
+                pass
+            found["differences"] += reference.judge(out, store)
+            found["batches"] += 1
+    return found | {
+        "n": kills.n,
+        "how": dict(Counter(kill["how"] for kill in kills.done)),
+        "when": dict(Counter(kill["when"] for kill in kills.done)),
+        # An interpreter that is only starting tells an interrupt in its own way.
+        "interrupts_told_in_one_line": [kill["told"] for kill in kills.done if "told" in kill],
+        "slowest_end_s": max(kill["gone_s"] for kill in kills.done),
+    }
+
+
+@dataclass(frozen=True)
+class Kills:
+    """Kills that were; how many there shall be, how many per run, and in which ways."""
+
+    done: list[Row]
+    n: int
+    per_run: float
+    hows: dict[str, float]
+    rng: random.Random
+
+    def next(self, seconds: float) -> tuple[float, str]:
+        """Draw how long (s) to wait for the next, in a run that takes so long, and its way."""
+        wait_s = self.rng.expovariate(self.per_run / seconds)
+        return wait_s, self.rng.choices(list(self.hows), list(self.hows.values()))[0]
+
+
+def run_killed(
+    reference: Reference, store: str, out: Path, kills: Kills, other_ends: list[str]
+) -> bool:
+    """Start a run and kill it when the time comes; say whether it came to its end all the same."""
+    how = ""
+    with running(reference.batch.command(out, store, "--workers", "2")) as run:
+        while len(kills.done) < kills.n:
+            wait_s, wish = kills.next(reference.seconds)
+            if run.status(wait_s) is not None:
+                break
+            if not run.kill(wish, kills.rng):
+                continue
+            how = wish
+            kill = {"how": how, "when": when(reference, store, out), "gone_s": 0.0}
+            kills.done.append(kill)
+            if how != "worker":  # who loses a worker may go on
+                kill["gone_s"] = round(run.gone_after(), 2)
+                break
+        status, said = run.status(), run.said()
+    if how == "SIGINT":
+        kills.done[-1]["told"] = one_line(said)
+    elif status != SOME_REFUSED and status != ENDS.get(how) and not (how and one_line(said)):
+        other_ends.append(f"{how or 'not killed'}: {status}: {said[-3:]}")
+        if len(other_ends) > MOST_OTHER:
+            raise RuntimeError(f"the batch does not come to its end: {other_ends}")
+    return status == SOME_REFUSED
+
+
+def when(reference: Reference, store: str, out: Path) -> str:
+    """Say from the store how far a run was."""
+    now, full = rows(store), reference.rows
+    if not now.get("identified"):
+        return "before the first log was kept"
+    if now["identified"] < full["identified"]:
+        return "among the logs"
+    if now["assessed"] < full["assessed"]:
+        return "among the machines"
+    return "among the tables" if not (out / "index.html").exists() else "at the end"
+
+
+if __name__ == "__main__":
+    main()

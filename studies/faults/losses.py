@@ -1,0 +1,157 @@
+"""What becomes of a run whose disk is full, or whose database goes away?
+
+Question
+    Does a run tell in one line, with exit status 1, that the disk is full or that its database is
+    gone, without showing the password? Is nothing lost by it: does the next run end as if nothing
+    had happened?
+Method
+    Full disk: output and store, or output alone, on a file system of its own that is too small,
+    larger at each new run, until all finds room. Lost database: the PostgreSQL server is ended
+    without a word in the middle of a run, at random moments after the first log, and started again
+    before the next run. What is left in the end is compared with what a run without trouble leaves.
+    Negative control: see `kills`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import random
+import re
+import signal
+import subprocess
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from studies.faults.driving import (
+    SOME_REFUSED,
+    Reference,
+    completed,
+    make_batch,
+    one_line,
+    reference_of,
+    running,
+)
+from studies.record import Stopwatch, conclude
+from studies.servers import missing_postgres, postgres
+
+HERE = Path(__file__).parent
+SEED = 20261122
+MACHINES, QUICK_MACHINES = {"WORN-A": 40, "WATCHED-A": 40}, {"WATCHED-A": 6}
+N_LOST = 5
+SIZES, QUICK_SIZES = (0.05, 0.2, 0.4, 0.6, 0.75, 0.9, 4.0), (0.4, 4.0)
+
+Row = dict[str, Any]
+
+
+def main() -> None:
+    """Run the study; ``--quick`` does a small part and records nothing."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--quick", action="store_true")
+    options = parser.parse_args()
+    watch, quick = Stopwatch(), options.quick
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        batch = make_batch(folder, *((QUICK_MACHINES, 1) if quick else (MACHINES, 2)))
+        reference = reference_of(batch, folder / "reference")
+        answer: Row = {
+            "seed": SEED,
+            "full disk": full_disk(reference, folder / "both", QUICK_SIZES if quick else SIZES),
+            "full disk, output alone": None
+            if quick
+            else full_disk(reference, folder / "output", SIZES, with_store=False),
+            "lost database": lost_database(reference, *((1, 0.0) if quick else (N_LOST, 0.5))),
+        }
+    answer["passed"] = verdicts(answer)
+    conclude(HERE / "losses.json", __doc__.split("\n")[0], answer, watch, quick=quick)
+
+
+def verdicts(answer: Row) -> dict[str, bool]:
+    """Say of each thing asked whether it is so; what this machine does not allow is left out."""
+    passed = {}
+    for name, found in answer.items():
+        if isinstance(found, dict):
+            passed[f"it did fail, {name}"] = found["failed"] > 0
+            passed[f"told in one line, {name}"] = not found["other_ends"]
+            passed[f"as uninterrupted, {name}"] = not found["differences"]
+    return passed
+
+
+def full_disk(
+    reference: Reference, folder: Path, sizes: Sequence[float], *, with_store: bool = True
+) -> Row | None:
+    """Run on a file system that is too small, enlarge it and go on; None where none can be made.
+
+    Sizes are fractions of what output, and store where it is there too, need.
+    """
+    place, kept = folder / "disk", folder / "kept"
+    place.mkdir(parents=True)
+    # In a mount namespace of its own: whatever happens, the file system ends with the shell.
+    shell = ["unshare", *(["--map-root-user"] if os.geteuid() else []), "--mount", "sh", "-c"]
+    tried = subprocess.run([*shell, f"mount -t tmpfs none {place}"], capture_output=True)
+    if tried.returncode:
+        return None
+    store = (place if with_store else folder) / "store.sqlite"
+    first = reference.out.parent / "reference.sqlite"
+    needing = [*reference.out.iterdir(), *([first] if with_store else [])]
+    need = sum(path.stat().st_size for path in needing)
+    command = " ".join(reference.batch.command(place / "out", f"sqlite:///{store}"))
+    script = f"mount -t tmpfs -o size={need // 100} none {place}\n"
+    for k, size in enumerate(sizes):
+        script += f"mount -o remount,size={round(size * need)} {place}\n"
+        script += f"{command} >/dev/null 2>{folder}/said-{k}; echo $?\n"
+    script += f"cp -r {place} {kept}"
+    done = subprocess.run([*shell, script], capture_output=True, text=True, check=True)
+    ends = [
+        (int(status), (folder / f"said-{k}").read_text().splitlines())
+        for k, status in enumerate(done.stdout.split())
+    ]
+    store = kept / store.name if with_store else store
+    return {
+        "sizes_of_what_is_needed": sizes,
+        **_failures(ends),
+        "differences": reference.judge(kept / "out", f"sqlite:///{store}"),
+    }
+
+
+def lost_database(reference: Reference, n: int, latest: float) -> Row | None:
+    """End the database server in the middle of runs, start it, and run again.
+
+    It ends at a random moment between the first log and a part of a run's time later. A run that
+    did not need it any more is left out, until n have failed.
+    """
+    if missing_postgres() is not None:
+        return None
+    rng = random.Random(SEED)
+    ends: list[tuple[int | None, list[str]]] = []
+    differences: list[str] = []
+    with postgres() as server:
+        while sum(status != SOME_REFUSED for status, _ in ends) < n and len(ends) < 4 * n:
+            with server.database() as store, tempfile.TemporaryDirectory() as name:
+                command = reference.batch.command(Path(name) / "out", store)
+                with running(command) as run:
+                    run.begun(store)
+                    run.status(rng.uniform(0.0, latest) * reference.seconds)
+                    server.stop(signal.SIGQUIT)
+                    ends.append((run.status(), run.said()))
+                server.start()
+                if any(server.password in line for line in ends[-1][1]):
+                    differences.append("the password was shown")
+                completed(command)
+                differences += reference.judge(Path(name) / "out", store)
+    return {"runs": len(ends), **_failures(ends), "differences": differences}
+
+
+def _failures(ends: list[tuple[int | None, list[str]]]) -> Row:
+    """Tell what failed runs said, their addresses left out, and which ended in another way."""
+    failed = [said[0] for status, said in ends if status == 1 and one_line(said)]
+    other = [f"{end}: {said[-3:]}" for end, said in ends if end not in (1, SOME_REFUSED)]
+    other += [f"1: {said[-3:]}" for end, said in ends if end == 1 and not one_line(said)]
+    told = {re.sub(r"\w+:/\S+|'?/\S+", "…", line) for line in failed}
+    return {"failed": len(failed), "said": sorted(told), "other_ends": other}
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,153 @@
+"""Do two runs at once on one store get in each other's way?
+
+Question
+    Of two runs that share a store, a SQLite file or a PostgreSQL database, on the same folder of
+    logs or on two different ones: do both end, with the tables of a run alone, and is every log
+    once in the store, even where one of the two is killed?
+Method
+    Two command lines at once, each with an output folder of its own, started together or one a
+    random moment after the other: on the same logs, on those of other machines, and on the same
+    with some more; and again with one killed by `kill -9` at a random moment while the other goes
+    on. Each has to give the tables and pages that it gives alone. Only where one knows of more logs
+    pages are left out: what they say of the report before depends on which run comes first.
+    Negative control: see `kills`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import random
+import sys
+import tempfile
+from collections.abc import Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from studies.faults.driving import (
+    SOME_REFUSED,
+    Reference,
+    Stores,
+    backends,
+    completed,
+    differences,
+    make_batch,
+    reference_of,
+    rows,
+    running,
+)
+from studies.record import Stopwatch, conclude
+
+HERE = Path(__file__).parent
+SEED = 20261122
+ONE = {"WORN-A": 12, "WATCHED-A": 28}
+OTHER = {"WORN-B": 12, "WATCHED-B": 28}
+MORE = {"WORN-A": 14, "WATCHED-A": 30}  # begins with the logs of the first
+QUICK_ONE, QUICK_OTHER = {"WATCHED-A": 6}, {"WATCHED-B": 6}
+N_PAIRS = 3
+
+Row = dict[str, Any]
+
+
+def main() -> None:
+    """Run the study; ``--quick`` does a small part and records nothing."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--quick", action="store_true")
+    options = parser.parse_args()
+    watch, quick = Stopwatch(), options.quick
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        kinds_of_logs = (QUICK_ONE, QUICK_OTHER) if quick else (ONE, OTHER, MORE)
+        batches = [
+            make_batch(folder / str(k), machines, 1 if quick else 2)
+            for k, machines in enumerate(kinds_of_logs)
+        ]
+        alone = [reference_of(batch, batch.logs.parent / "alone") for batch in batches]
+        answer: Row = {"seed": SEED, "pairs": {}}
+        with backends(folder) as kinds:
+            for kind, new_store in kinds.items():
+                answer["pairs"][kind] = pairs(alone, new_store, 1 if quick else N_PAIRS, quick)
+                print(kind, answer["pairs"][kind], file=sys.stderr, flush=True)
+    answer["passed"] = {
+        f"{what}, {kind}": not found["wrong"]
+        for kind, cases in answer["pairs"].items()
+        for what, found in cases.items()
+    }
+    conclude(HERE / "together.json", __doc__.split("\n")[0], answer, watch, quick=quick)
+
+
+@dataclass(frozen=True)
+class Pair:
+    """Two runs and what each makes alone; the logs of the second are the same, other, or more."""
+
+    first: Reference
+    second: Reference
+    logs: str
+
+    def rows(self) -> dict[str, int]:
+        """Count what a store holds after both; of more logs, what can be said beforehand."""
+        one, two = self.first.rows, self.second.rows
+        if self.logs == "other":
+            return {name: one[name] + two[name] for name in one}
+        return (
+            two if self.logs == "same" else {name: two[name] for name in ("identified", "present")}
+        )
+
+    def wrong(self, store: str, outs: Sequence[Path]) -> list[str]:
+        """List what is not as in a run alone."""
+        found = []
+        for reference, out in zip((self.first, self.second), outs, strict=True):
+            lines = differences(reference.out, out)
+            found += [line for line in lines if self.logs != "more" or ".csv:" in line]
+        full, now = self.rows(), rows(store)
+        if any(now.get(name) != n for name, n in full.items()):
+            found.append(f"store: {now} rows, not {full}")
+        return found
+
+
+def pairs(alone: list[Reference], new_store: Stores, n: int, quick: bool) -> Row:
+    """Run two at once, n times in each way."""
+    rng = random.Random(SEED)
+    # The second run of a pair is the first once more, or one of the others.
+    kinds = dict(zip(("same", "other", "more"), alone, strict=False))
+    found: Row = {}
+    for logs, second in kinds.items():
+        for kill in (False, True):
+            if quick and (logs, kill) != ("other", True):
+                continue
+            pair = Pair(alone[0], second, logs)
+            # Every second pair is started together, the others one after the other.
+            gaps = [rng.uniform(0, pair.first.seconds) if k % 2 else 0.0 for k in range(n)]
+            wrong = [line for gap in gaps for line in one_pair(pair, new_store, gap, kill, rng)]
+            found[f"{logs} logs{', one killed' if kill else ''}"] = {"n": n, "wrong": wrong}
+    return found
+
+
+def one_pair(
+    pair: Pair, new_store: Stores, gap: float, kill: bool, rng: random.Random
+) -> list[str]:
+    """Run two at once, the second a gap (s) later; list what is not as in a run alone."""
+    found: list[str] = []
+    with new_store() as store, tempfile.TemporaryDirectory() as name, ExitStack() as stack:
+        outs = [Path(name) / "first", Path(name) / "second"]
+        commands = [
+            reference.batch.command(out, store)
+            for reference, out in zip((pair.first, pair.second), outs, strict=True)
+        ]
+        first = stack.enter_context(running(commands[0]))
+        first.status(gap)
+        second = stack.enter_context(running(commands[1]))
+        if kill:
+            second.status(rng.uniform(0.2, 1.0) * pair.second.seconds)
+            second.kill("main", rng)
+        ends = [first.status(), second.status()]
+        if ends[0] != SOME_REFUSED or (ends[1] != SOME_REFUSED and not kill):
+            found.append(f"ended with {ends}: {first.said()[-3:]}, {second.said()[-3:]}")
+        if kill:
+            completed(commands[1])
+        return found + pair.wrong(store, outs)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,130 @@
+"""Does a batch on a Dask cluster survive the death of its workers?
+
+Question
+    When workers of a Dask cluster are killed one after the other in the middle of a batch, and new
+    ones come: are tables and pages those of a run in one process, and is every log once in the
+    store? What becomes of a run whose scheduler is lost?
+Method
+    A real scheduler and two worker processes without nannies, and the command line with
+    ``--scheduler``. A random worker is killed by `kill -9` at random moments (a Poisson process)
+    and another started in its place, until ten were killed in the middle of a batch; each batch
+    begins with an empty store. Then the scheduler is killed in the middle of a run, and the next
+    run goes on with a new cluster. Negative control: see `kills`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import random
+import signal
+import sys
+import tempfile
+from pathlib import Path
+from typing import Any
+
+from studies.faults.driving import (
+    SOME_REFUSED,
+    Reference,
+    completed,
+    control,
+    make_batch,
+    one_line,
+    reference_of,
+    rows,
+    running,
+)
+from studies.record import Stopwatch, conclude
+from studies.servers import Cluster, dask_cluster, missing_distributed
+
+HERE = Path(__file__).parent
+SEED = 20261122
+MACHINES = {"WORN-A": 50, "WORN-B": 46, "WORN-C": 46, "WORN-D": 8, "WATCHED-A": 50}
+QUICK_MACHINES = {"WATCHED-A": 20}
+N_KILLS, QUICK_KILLS = 10, 1
+KILLS_PER_RUN, QUICK_PER_RUN = 3.0, 20.0  # in the mean, over the time that a run takes
+
+Row = dict[str, Any]
+
+
+def main() -> None:
+    """Run the study; ``--quick`` does a small part and records nothing."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--quick", action="store_true")
+    options = parser.parse_args()
+    watch, quick = Stopwatch(), options.quick
+    if why := missing_distributed():
+        sys.exit(why)
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        batch = make_batch(folder, *((QUICK_MACHINES, 1) if quick else (MACHINES, 2)))
+        reference = reference_of(batch, folder / "reference")
+        with dask_cluster() as cluster:
+            pace = (QUICK_KILLS, QUICK_PER_RUN) if quick else (N_KILLS, KILLS_PER_RUN)
+            killed = workers_killed(reference, cluster, *pace)
+        answer: Row = {
+            "seed": SEED,
+            "uninterrupted": {"seconds": round(reference.seconds, 1), "rows": reference.rows},
+            "workers killed": killed,
+            # A client waits long for its scheduler to come again.
+            "scheduler lost": None if quick else scheduler_lost(reference),
+            "control": control(reference, folder),
+        }
+    answer["passed"] = {
+        "as uninterrupted, workers killed": not killed["differences"],
+        "no other end, workers killed": not killed["other_ends"],
+        "the comparison sees what is wrong": all(answer["control"].values()),
+    }
+    if lost := answer["scheduler lost"]:
+        told = lost["status"] == 1 and one_line(lost["said"])
+        answer["passed"] |= {
+            "as uninterrupted, scheduler lost": not lost["differences"],
+            "told in one line, scheduler lost": told,
+        }
+    conclude(HERE / "workers.json", __doc__.split("\n")[0], answer, watch, quick=quick)
+
+
+def workers_killed(reference: Reference, cluster: Cluster, n_kills: int, per_run: float) -> Row:
+    """Kill workers of one batch after another until there were enough kills."""
+    rng = random.Random(SEED)
+    known: list[int] = []  # logs in the store at every kill
+    found: Row = {"batches": 0, "differences": [], "other_ends": []}
+    while len(known) < n_kills:
+        with tempfile.TemporaryDirectory() as name:
+            store, out = f"sqlite:///{name}/store.sqlite", Path(name) / "out"
+            command = reference.batch.command(out, store, "--scheduler", cluster.address)
+            with running(command) as run:
+                run.begun(store)
+                while len(known) < n_kills:
+                    wait_s = rng.expovariate(per_run / reference.seconds)
+                    if run.status(wait_s) is not None:
+                        break
+                    cluster.replace_worker(rng)
+                    known.append(rows(store).get("identified", 0))
+                if (status := run.status()) != SOME_REFUSED:
+                    found["other_ends"].append(f"{status}: {run.said()[-3:]}")
+                    completed(command)
+            found["differences"] += reference.judge(out, store)
+            found["batches"] += 1
+    return found | {"n": n_kills, "logs_known_at_kill": known}
+
+
+def scheduler_lost(reference: Reference) -> Row:
+    """Kill the scheduler in the middle of a run, and go on with another."""
+    rng = random.Random(SEED)
+    with tempfile.TemporaryDirectory() as name:
+        store, out = f"sqlite:///{name}/store.sqlite", Path(name) / "out"
+        with (
+            dask_cluster() as cluster,
+            running(reference.batch.command(out, store, "--scheduler", cluster.address)) as run,
+        ):
+            run.begun(store)
+            run.status(rng.uniform(0, 0.5) * reference.seconds)
+            cluster.scheduler.send_signal(signal.SIGKILL)
+            status, said = run.status(), run.said()
+        with dask_cluster() as cluster:
+            completed(reference.batch.command(out, store, "--scheduler", cluster.address))
+        return {"status": status, "said": said, "differences": reference.judge(out, store)}
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,105 @@
+"""Draw figure.svg from result.json: what is lost to who knows the fleet, coverages, and priors."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from studies.ranks import BLACK, BLUE, ORANGE
+
+HERE = Path(__file__).parent
+GREY = "#999999"
+NAMES = {
+    "description": "prior of the description",
+    "learned": "learned from its fleet",
+    "learned, laws alone": "learned, laws alone",
+    "known": "the fleet is known",
+    "only the worn teach": "only the worn teach",
+    "another fleet teaches": "another fleet teaches",
+}
+COLOURS = {"description": BLACK, "learned": BLUE, "learned, laws alone": BLUE, "known": GREY}
+
+
+def colour(way: str) -> str:
+    """Give the colour of a way: controls share one."""
+    return COLOURS.get(way, ORANGE)
+
+
+def draw_lost(ax: Axes, ways: dict[str, Any]) -> None:
+    """Draw what the score loses on average, with its standard error."""
+    for k, (way, found) in enumerate(ways.items()):
+        value, error = found["lost_km"]
+        ax.errorbar(value, k, xerr=error, fmt="o", color=colour(way), capsize=3)
+    ax.set_yticks(range(len(ways)), [NAMES[way] for way in ways], fontsize=9)
+    ax.invert_yaxis()
+    ax.set_xlim(left=-60)
+    ax.set_xlabel(
+        "score lost to who knows the fleet, km\n(CRPS, mean ± standard error over fleets)"
+    )
+    ax.grid(axis="x", lw=0.3)
+
+
+def draw_coverage(ax: Axes, ways: dict[str, Any]) -> None:
+    """Draw coverages of 50 and 90 % intervals with their Clopper-Pearson intervals."""
+    for nominal, marker in ((0, "s"), (1, "o")):
+        for k, (way, found) in enumerate(ways.items()):
+            one = found["coverage"][nominal]
+            at = k + (-0.12, 0.12)[nominal]
+            ax.plot([100 * one["low"], 100 * one["high"]], [at, at], color=colour(way), lw=1.2)
+            ax.plot(100 * one["share"], at, marker, color=colour(way), ms=5)
+        ax.axvline((50, 90)[nominal], color=BLACK, lw=0.8, ls="--")
+    ax.set_yticks(range(len(ways)), [""] * len(ways))
+    ax.set_ylim(len(ways) - 0.5, -0.5)
+    ax.set_xlim(0, 100)
+    ax.set_xlabel(
+        "true remaining lives in 50 % (squares) and\n90 % intervals (circles), % (bars: 99.9 %)"
+    )
+
+
+def draw_priors(ax: Axes, priors: list[dict[str, list[float]]]) -> None:
+    """Draw learned medians of life against true ones, with the learned spread."""
+    kept = [row for row in priors if "learned" in row]
+    true = np.array([row["true"] for row in kept])
+    learned = np.array([row["learned"] for row in kept])
+    width = learned[:, 0] * (np.exp(learned[:, 1]) - 1), learned[:, 0] * -np.expm1(-learned[:, 1])
+    ax.errorbar(
+        true[:, 0], learned[:, 0], yerr=(width[1], width[0]), fmt="none", ecolor=BLUE, alpha=0.3
+    )
+    dots = ax.scatter(
+        true[:, 0], learned[:, 0], c=100 * true[:, 2], cmap="cividis", vmin=0, vmax=100,
+        edgecolor=BLACK, lw=0.5, zorder=3,
+    )  # fmt: skip
+    both = np.r_[true[:, 0], learned[:, 0]]
+    ends = np.array([both.min() / 2, 2 * both.max()])
+    ax.plot(ends, ends, color=BLACK, lw=0.8)
+    ax.axhline(8000, color=BLACK, lw=0.8, ls=":")
+    ax.text(1.05 * ends[0], 8400, "description", fontsize=8)
+    ax.set(xscale="log", yscale="log", xlim=ends, ylim=ends, aspect="equal")
+    ax.set_xlabel("true median life of a fleet, km")
+    ax.set_ylabel("learned median, km (bars: ± one sigma)")
+    bar = ax.figure.colorbar(dots, ax=ax, shrink=0.8)
+    bar.set_label("machines of the fleet that wear, %")
+
+
+def main() -> None:
+    """Draw the three side by side."""
+    matplotlib.rcParams["svg.hashsalt"] = "fleet_prior"
+    result = json.loads((HERE / "result.json").read_text())
+    figure = Figure(figsize=(13.0, 4.2), layout="constrained")
+    axes = figure.subplots(1, 3, width_ratios=[1.0, 1.0, 1.25])
+    draw_lost(axes[0], result["ways"])
+    draw_coverage(axes[1], result["ways"])
+    draw_priors(axes[2], result["priors"])
+    title = f"{result['young']} young machines of {result['fleets']} fleets"
+    figure.suptitle(f"{title}, {result['teachers']} teachers each", fontsize=10)
+    figure.savefig(HERE / "figure.svg", metadata={"Date": None})
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,188 @@
+"""Fleets drawn from the model by which priors are learned, and lives of their machines."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime, timedelta
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from lmshealth import life as model
+from lmshealth.laws import HertzWear, Unchanging
+from lmshealth.stage import Scatter, Stage, load_stage
+from lmshealth.statespace import regressors
+from lmshealth.tracks import History, Series
+from studies.sbc_life.lives import Part
+
+Array = NDArray[np.float64]
+START = datetime(2026, 3, 1, tzinfo=UTC)
+
+
+@dataclass(frozen=True)
+class Age:
+    """How long machines have been followed: logs, and the odometer in km.
+
+    The odometer is lognormal, by its median and the standard deviation of its logarithm.
+    """
+
+    n_logs: int
+    median_km: float
+    sigma: float
+
+
+MATURE, YOUNG = Age(24, 2000.0, 0.7), Age(8, 200.0, 0.5)
+
+
+@dataclass(frozen=True)
+class Life:
+    """A history, and what is true of the preload."""
+
+    history: History
+    part: Part
+
+    @property
+    def now(self) -> float:
+        """Travel since the baseline in m."""
+        return float(np.ptp(self.history.travel))
+
+
+def machine() -> Stage:
+    """Load the stage that all machines are: that of Y, with a mount that keeps its stiffness."""
+    stage = load_stage("lms-y")
+    preload, mount = stage.parameters
+    return _with(stage, (preload, msgspec.structs.replace(mount, law=Unchanging())))
+
+
+def draw_fleet(rng: np.random.Generator, stage: Stage) -> Stage:
+    """Draw what is true of a fleet: the description with the fleet's own laws and scatter."""
+    between = rng.uniform()
+    mean = np.sqrt(1 - between) * rng.standard_normal()
+    preload, mount = stage.parameters
+    wear, none = preload.laws
+    assert isinstance(wear, HertzWear)
+    share = rng.uniform()
+    life_km = wear.life_km.placed(float(mean), float(np.sqrt(between)))
+    laws = (
+        msgspec.structs.replace(wear, life_km=life_km, weight=share),
+        msgspec.structs.replace(none, weight=1 - share),
+    )
+    believed = model.scatter_of(stage)
+    scatter = Scatter(*(_of_values(rng, getattr(believed, f)) for f in Scatter.__slots__))
+    own = _with(stage, (msgspec.structs.replace(preload, law=laws), mount))
+    return replace(own, scatter=scatter)
+
+
+def _of_values(rng: np.random.Generator, believed: tuple[float, ...]) -> tuple[float, ...]:
+    drawn = rng.dirichlet(len(believed) * np.array(believed) / sum(believed))
+    return tuple((drawn + 1e-9).tolist())
+
+
+def longer_lived(fleet: Stage, times: float) -> Stage:
+    """Give a fleet whose lives are so many times as long."""
+    preload, mount = fleet.parameters
+    wear, none = preload.laws
+    assert isinstance(wear, HertzWear)
+    prior = wear.life_km
+    longer = msgspec.structs.replace(prior, median=times * prior.median)
+    laws = (msgspec.structs.replace(wear, life_km=longer), none)
+    return _with(fleet, (msgspec.structs.replace(preload, law=laws), mount))
+
+
+def _with(stage: Stage, parameters: tuple[object, ...]) -> Stage:
+    description = msgspec.structs.replace(stage.description, parameter=parameters)
+    return replace(stage, description=description)
+
+
+def draw(rng: np.random.Generator, fleet: Stage, age: Age) -> Life:
+    """Draw a machine of a fleet; one that leaves the modal map is taken out at the log before."""
+    while True:
+        now = 1000 * age.median_km * np.exp(age.sigma * rng.standard_normal())
+        clock = now * np.r_[0.0, np.sort(rng.uniform(size=age.n_logs - 2)), 1.0]
+        part, path = _part(rng, fleet, clock)
+        n = _inside(fleet, path)
+        if n >= 4:
+            break
+    clock, path = clock[:n], path[:n]
+    part = replace(part, off=part.off[:n])
+    covariates = {
+        "temperature_c": 21 + 3 * rng.standard_normal(n),
+        "payload_kg": rng.choice([10.0, 20.0, 35.0], size=n),
+    }
+    names = fleet.informative[:2]
+    std = rng.uniform(3e-4, 2e-3) * np.exp(0.3 * rng.standard_normal((n, 2)))
+    scale = rng.choice(model._NOISE_SCALES, p=_shares(fleet, "noise_scale"))
+    values = _modes(rng, fleet, names, clock, path)
+    for one in regressors(covariates, fleet):
+        values += np.outer(one.values, one.prior_std * rng.standard_normal(2))
+    values += scale * std * rng.standard_normal((n, 2))
+    return Life(_history(names, clock, covariates, values, std), part)
+
+
+def _part(rng: np.random.Generator, fleet: Stage, clock: Array) -> tuple[Part, Array]:
+    """Draw what becomes of the preload, and the path of ln health parameters that this makes."""
+    preload = fleet.parameters[0]
+    weight = np.array([law.weight for law in preload.laws])
+    law = preload.laws[rng.choice(weight.size, p=weight / weight.sum())]
+    theta = np.empty(0)
+    if isinstance(law, HertzWear):
+        first, second = rng.uniform(size=(2, 1))
+        theta = np.r_[1000 * law.life_km.quantile(first), law.exponent.quantile(second)]
+    deviation = rng.choice(model._DEVIATIONS, p=_shares(fleet, "deviation"))
+    rate = float(deviation**2 / (1000 * fleet.description.usage.horizon_km))
+    steps = np.sqrt(rate * np.diff(clock, prepend=0.0)) * rng.standard_normal(clock.size)
+    part = Part(law, theta, 0.0, np.inf, 1.0, np.cumsum(steps), rate)
+    with np.errstate(divide="ignore"):
+        ln_preload = np.log(part.by_law(clock)) + part.off
+    return part, np.column_stack([ln_preload, np.zeros(clock.size)])
+
+
+def _inside(fleet: Stage, path: Array) -> int:
+    """Count the logs before a life leaves the modal map."""
+    assert fleet.modal_map is not None
+    inside = fleet.modal_map.inside(path)
+    return path.shape[0] if inside.all() else int(np.argmin(inside))
+
+
+def _modes(
+    rng: np.random.Generator, fleet: Stage, names: tuple[str, ...], clock: Array, path: Array
+) -> Array:
+    """Ln f of the modes: health through a map that is wrong, an intercept, and a random walk."""
+    assert fleet.description.map is not None
+    # The mount keeps its stiffness: the error of the map is that of the preload alone.
+    error = fleet.description.map.model_std * rng.standard_normal(len(names))
+    level = (1 + error) * fleet.drift(path, names)
+    walk = rng.choice(model._WALKS, p=_shares(fleet, "walk"))
+    steps = walk * np.sqrt(np.diff(clock, prepend=0.0) / clock[-1])
+    level = level + np.cumsum(steps[:, None] * rng.standard_normal(level.shape), axis=0)
+    known = np.log([mode.frequency_hz for mode in fleet.modes if mode.name in names])
+    return np.asarray(level + known + model._INTERCEPT_STD * rng.standard_normal(len(names)))
+
+
+def _shares(fleet: Stage, field: str) -> Array:
+    weight = np.array(getattr(model.scatter_of(fleet), field))
+    return np.asarray(weight / weight.sum())
+
+
+def _history(
+    names: tuple[str, ...], clock: Array, covariates: dict[str, Array], values: Array, std: Array
+) -> History:
+    n = clock.size
+    cov = np.zeros((n, 4, 4))
+    cov[:, [0, 1], [0, 1]] = std**2
+    cov[:, [2, 3], [2, 3]] = 0.05**2
+    return History(
+        stage="FLEET-1",
+        logs=tuple(f"{k:03d}" for k in range(n)),
+        recorded_at=tuple(START + timedelta(days=k) for k in range(n)),
+        travel=1e5 + clock,
+        covariates=covariates,
+        modes=names,
+        series=tuple(Series(name, "acc") for name in names),
+        ln_frequency=values,
+        ln_damping=np.full((n, 2), np.log(0.015)),
+        cov=cov,
+        loop_error=np.full(n, np.nan),
+        baselines=(0,),
+    )

@@ -1,0 +1,290 @@
+"""Does a prior learned from a fleet tell young machines more, and is it right in what it tells?
+
+Question
+    Of young machines of a fleet whose lives are not those that the description expects: does the
+    remaining life with a prior learned from the other machines lie nearer to what can be known than
+    with the description's prior, and do its intervals still cover as often as they claim?
+Method
+    Fleets are drawn from the model by which they are learned: median and scatter of the wear lives
+    of a fleet, the share of its machines that wear, and how its logs scatter, of a stage in Y whose
+    mount keeps its stiffness. Each has 16 machines of 24 logs that teach, their odometers lognormal
+    about 2,000 km; a machine that leaves the modal map is taken out at the log before. Young ones
+    have 8 logs about 200 km; they are drawn until four of a fleet are young by `is_young`. Logs
+    have errors of 0.03 to 0.2 %, unknown intercepts, effects of temperature and payload, a random
+    walk, a factor on the errors, a deviation of health from its law, and a map whose sensitivities
+    are wrong. All posteriors are drawn by importance sampling (``chains=False``). The remaining
+    life of every young machine, cut at the horizon, is told with the prior of the description, with
+    the one learned from its own fleet (also with the laws of that alone, its scatter left as
+    described), and with what is true of the fleet: nothing that is learned can be better. Compared
+    are the continuous ranked probability score (CRPS) of the truth, and how much of it is lost to
+    who knows the fleet: the integral of the squared difference of both distributions, which is what
+    the score loses on average, without the chance of single truths. Standard errors are those of
+    means over fleets. Coverages are held to their 99.9 % Clopper-Pearson interval.
+    Negative controls that must do worse: only machines teach that are seen to wear; a fleet teaches
+    whose lives are five times as long.
+Answer
+    Yes. Over 160 young machines of 40 fleets the CRPS falls from 3,531 to 2,668 km (by 863 ± 250),
+    to who knows the fleet 186 ± 56 km of it are lost instead of 963 ± 147, and intervals of 50 and
+    90 % cover 51 and 90 %, as do those of the description. Scatter that is learned too makes no
+    difference: 3 ± 9 km. Where only the worn teach 1,909 ± 339 km are lost, where a fleet of five
+    times the life teaches 1,327 ± 374, and its 90 % intervals cover 71 %. Coverage alone does not
+    find out the former: 42 and 86 % are within what 108 lives can tell.
+Run time
+    10 minutes of one processor. With ``--fleets FILE`` fleets done before are not done again.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Mapping
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lmshealth.fleet import Learned, Lesson, is_young, learn, lesson_of
+from lmshealth.laws import HertzWear
+from lmshealth.lifefit import LifePosterior, fit_life
+from lmshealth.metrics import coverage, crps, place
+from lmshealth.priors import Lognormal, Prior
+from lmshealth.prognosis import remaining_travel
+from lmshealth.stage import Stage
+from studies.fleet_prior.lives import MATURE, YOUNG, Life, draw, draw_fleet, longer_lived, machine
+from studies.ranks import Row, collect, digest
+from studies.record import LEVEL, Stopwatch, as_row, conclude
+
+Array = NDArray[np.float64]
+HERE = Path(__file__).parent
+SEED = 20261122
+FLEETS, QUICK = 40, 2
+# How many machines of a fleet teach, by its kind, and how many learn.
+FLEET, SMALL = "fleet", "small fleet"
+N_TEACHERS = {FLEET: 16, SMALL: 8}
+N_YOUNG, MOST_DRAWN = 4, 12
+# Fleets that are taught by another one too.
+FOREIGN_FLEETS, TIMES = 20, 5.0
+ENOUGH = 5  # fleets, of which a mean has a standard error
+N_POSTERIOR = 2000
+DESCRIPTION, LEARNED, LAWS, KNOWN = "description", "learned", "learned, laws alone", "known"
+WORN, FOREIGN = "only the worn teach", "another fleet teaches"
+WAYS = (DESCRIPTION, LEARNED, LAWS, KNOWN, WORN, FOREIGN)
+SEEN_TO_WEAR = 0.95
+SURE = 3.0  # standard errors
+_MODEL = ("courses", "density", "fleet", "importance", "laws", "life", "lifefit", "passage")
+
+
+def main() -> None:
+    """Run the study; ``--quick`` does a small part and records nothing."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--quick", action="store_true")
+    parser.add_argument("--fleets", type=Path, help="file of fleets done before, to go on with")
+    options = parser.parse_args()
+    watch = Stopwatch()
+    kind, n = (SMALL, QUICK) if options.quick else (FLEET, FLEETS)
+    tasks = [(kind, number) for number in range(n)]
+    rows = collect(options.fleets, lambda _: digest(*_MODEL), tasks, one)
+    answer: dict[str, Any] = {
+        "seed": SEED,
+        "fleets": n,
+        "teachers": N_TEACHERS[kind],
+        "young": sum(len(row["young"]) for row in rows),
+        "ways": {way: judged(rows, way) for way in WAYS},
+        "priors": [
+            {"true": row["true"]} | young["priors"] for row in rows for young in row["young"][:1]
+        ],
+    }
+    answer["passed"] = verdicts(answer["ways"], n)
+    question = __doc__.split("\n")[0]
+    conclude(HERE / "result.json", question, answer, watch, quick=options.quick)
+
+
+@cache
+def described() -> Stage:
+    """Give the description that nobody has taught."""
+    return machine()
+
+
+def horizon() -> float:
+    """Travel in m past which nothing is claimed."""
+    return 1000 * described().description.usage.horizon_km
+
+
+def one(kind: str, number: int) -> Row:
+    """Draw a fleet, let it teach its young machines, and score what is told of these."""
+    rng = np.random.default_rng([SEED, number])
+    fleet = draw_fleet(rng, described())
+    teachers = lessons(rng, fleet, kind, number)
+    worn = {k: lesson for k, lesson in teachers.items() if wears(lesson)}
+    schools = {LEARNED: teachers, WORN: worn}
+    if number < FOREIGN_FLEETS:
+        other = np.random.default_rng([SEED, number, 1])
+        schools[FOREIGN] = lessons(other, longer_lived(fleet, TIMES), kind, number)
+    wear = fleet.parameters[0].laws[0]
+    assert isinstance(wear, HertzWear)
+    row: Row = {"true": numbers(wear.life_km, wear.weight), "young": []}
+    for _ in range(MOST_DRAWN):
+        drawn = draw(rng, fleet, YOUNG)
+        own = posterior(drawn, described(), number)
+        lesson = lesson_of(described(), own)
+        if is_young(lesson):
+            row["young"].append(pupil(drawn, own, lesson, fleet, schools, number))
+        if len(row["young"]) == N_YOUNG:
+            break
+    return row
+
+
+def lessons(rng: np.random.Generator, fleet: Stage, kind: str, number: int) -> dict[str, Lesson]:
+    """Draw the grown machines of a fleet, and what each teaches."""
+    found = {}
+    for k in range(N_TEACHERS[kind]):
+        life = posterior(draw(rng, fleet, MATURE), described(), number)
+        found[f"grown-{k:02d}"] = lesson_of(described(), life)
+    return found
+
+
+def wears(lesson: Lesson) -> bool:
+    """Tell whether a machine is seen to wear."""
+    return lesson.laws["guide_preload"]["hertz-wear"].after >= SEEN_TO_WEAR
+
+
+def posterior(drawn: Life, stage: Stage, number: int) -> LifePosterior:
+    """Fit a life under a prior."""
+    return fit_life(drawn.history, stage, [SEED, number], chains=False, n_draws=N_POSTERIOR)
+
+
+def taught(lesson: Lesson, teachers: Mapping[str, Lesson]) -> Learned | None:
+    """Give what teachers teach a young machine; None if they are too few."""
+    return learn(described(), dict(teachers) | {"young": lesson}).get("young")
+
+
+def pupil(
+    drawn: Life,
+    own: LifePosterior,
+    lesson: Lesson,
+    fleet: Stage,
+    schools: Mapping[str, Mapping[str, Lesson]],
+    number: int,
+) -> Row:
+    """Score what is told of a young machine with every prior."""
+    rng = np.random.default_rng([SEED, number, 2])
+    limit = described().parameters[0].limit
+    assert limit is not None
+    truth = drawn.part.left(rng, drawn.now, limit.below, horizon())
+    told = {
+        DESCRIPTION: left(own, drawn.now),
+        KNOWN: left(posterior(drawn, fleet, number), drawn.now),
+    }
+    priors = {}
+    for way, teachers in schools.items():
+        if (prior := taught(lesson, teachers)) is None:
+            continue
+        stage = prior.onto(described())
+        told[way] = left(posterior(drawn, stage, number), drawn.now)
+        priors[way] = learned_numbers(prior)
+        if way == LEARNED:
+            laws = replace(stage, scatter=None)
+            told[LAWS] = left(posterior(drawn, laws, number), drawn.now)
+    return {
+        "priors": priors,
+        "km": round(drawn.now / 1000),
+        "truth_km": None if truth > horizon() else round(truth / 1000),
+        **{way: scored(draws, truth, told[KNOWN], rng) for way, draws in told.items()},
+    }
+
+
+def learned_numbers(prior: Learned) -> list[float]:
+    """Give median and sigma of wear lives in km, and the share that wears, as they were learned."""
+    law = prior.laws[0]
+    assert law.pace is not None
+    return numbers(law.pace[1], law.share[1])
+
+
+def numbers(prior: Prior, share: float) -> list[float]:
+    """Give median and sigma of a prior of lives, and the share that has one."""
+    assert isinstance(prior, Lognormal)
+    return [round(prior.median), round(prior.sigma, 3), round(share, 3)]
+
+
+def left(life: LifePosterior, now: float) -> Array:
+    """Draw the remaining life, in m."""
+    part = [(0, described().parameters[0])]
+    return remaining_travel(life, part, np.random.default_rng(SEED), now=now, horizon=horizon())[
+        :, 0
+    ]
+
+
+def scored(draws: Array, truth: float, known: Array, rng: np.random.Generator) -> Row:
+    """Give the place of the truth among draws, their score, and what it loses to who knows."""
+    column, y = draws[:, None], np.array([truth])
+    travel = np.linspace(0, horizon(), 4001)[:-1]
+    off = below(draws, travel) - below(known, travel)
+    return {
+        "place": float(place(column, y, rng, horizon=horizon())[0]),
+        "crps_km": float(crps(column, y, horizon=horizon())[0]) / 1000,
+        "lost_km": float(np.mean(off**2)) * horizon() / 1000,
+        "width_km": float(np.ptp(np.quantile(np.minimum(draws, horizon()), (0.05, 0.95)))) / 1000,
+    }
+
+
+def below(draws: Array, travel: Array) -> Array:
+    """Give the distribution of draws at some travels."""
+    return np.asarray(np.searchsorted(np.sort(draws), travel, side="right") / draws.size)
+
+
+def judged(rows: list[Row], way: str) -> dict[str, Any]:
+    """Judge what is told in one way, where it is told, with errors by fleet."""
+    fleets = [[one for one in row["young"] if way in one] for row in rows]
+    fleets = [young for young in fleets if young]
+    places = np.array([one[way]["place"] for young in fleets for one in young])
+    answer: dict[str, Any] = {
+        "lives": len(places),
+        "mean_place": round(float(places.mean()), 3),
+        "coverage": [
+            {"nominal": nominal} | as_row(coverage(places, nominal, level=LEVEL))
+            for nominal in (0.5, 0.9)
+        ],
+    }
+    for what in ("crps_km", "lost_km", "width_km"):
+        answer[what] = mean(np.array([np.mean([one[way][what] for one in y]) for y in fleets]))
+        off = [np.mean([one[way][what] - one[DESCRIPTION][what] for one in y]) for y in fleets]
+        answer[f"{what}_over_description"] = mean(np.array(off))
+        off = [
+            np.mean([one[way][what] - one[LEARNED][what] for one in y if LEARNED in one])
+            for y in fleets
+        ]
+        answer[f"{what}_over_learned"] = mean(np.array(off))
+    return answer
+
+
+def mean(values: Array) -> list[float]:
+    """Give a mean over fleets and its standard error; one fleet has none, which is told as 0."""
+    error = values.std(ddof=1) / np.sqrt(values.size) if values.size > 1 else 0.0
+    return [round(float(values.mean()), 4), round(float(error), 4)]
+
+
+def verdicts(ways: Mapping[str, dict[str, Any]], n: int) -> dict[str, bool]:
+    """Say what was asked and whether it is so."""
+
+    def surely(value: list[float], sign: int) -> bool:
+        return sign * value[0] > SURE * value[1]
+
+    found = {
+        f"intervals hold: {way}": all(c["holds"] for c in ways[way]["coverage"])
+        for way in (DESCRIPTION, LEARNED, LAWS, KNOWN)
+    }
+    if n < ENOUGH:
+        return found
+    gain = ways[LEARNED]
+    found["learned loses less than the description"] = surely(gain["lost_km_over_description"], -1)
+    found |= {
+        f"loses more: {way}": surely(ways[way]["lost_km_over_learned"], 1)
+        for way in (WORN, FOREIGN)
+    }
+    return found
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,146 @@
+"""How much faster do two workers identify an archive than one, and what would a cluster take?
+
+Question
+    Do two workers, of this machine and of Dask, identify logs at least 1.8 times as fast as one?
+    What serial work is left per log, and how many workers could it keep busy?
+Method
+    An archive of short logs, each worker count with an empty store, in turns. Time runs from the
+    first log identified to the last, so that starting is no part of it. Two cores of a machine that
+    other programs use, too, are seldom twice one: beside it, in the same turn, as many processes as
+    workers identify the same log again and again without `lmshealth run`; that is the bound.
+    Serial is what the main process alone does for a log while others work: its processor time.
+Answer
+    ANSWER
+Run time
+    RUNTIME
+"""
+
+from __future__ import annotations
+
+import argparse
+import tempfile
+import time
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lmshealth import Settings, identify, load_stage, read_log, run
+from studies.record import Stopwatch, conclude
+from studies.scale.archive import make_archive
+from studies.servers import dask_cluster
+
+HERE = Path(__file__).parent
+N_LOGS, QUICK_LOGS, TURNS = 200, 24, 3
+# Of the bound that the machine gives in the same turn, and against one worker.
+SPEEDUP = 1.8
+_BARE = 40  # identifications in each process of the bound
+
+Row = dict[str, Any]
+
+
+class Clock:
+    """Hears when the first and the last log are identified, and what that took this process."""
+
+    def __init__(self) -> None:
+        self.first = self.last = (0.0, 0.0, 0)
+
+    def __call__(self, what: str, done: int, total: int) -> None:
+        """Hear of progress, as `run` tells it."""
+        if what == "identifying" and done:
+            now = time.perf_counter(), time.process_time(), done
+            self.first = now if done == 1 else self.first
+            self.last = now
+
+    @property
+    def rate(self) -> float:
+        """Logs per second."""
+        return (self.last[2] - self.first[2]) / (self.last[0] - self.first[0])
+
+    @property
+    def serial(self) -> float:
+        """Processor time of this process in s per log."""
+        return (self.last[1] - self.first[1]) / (self.last[2] - self.first[2])
+
+
+def identified(folder: Path, settings: Settings) -> Clock:
+    """Analyse an archive with an empty store."""
+    clock = Clock()
+    with tempfile.TemporaryDirectory(dir=folder) as out:
+        run(folder / "logs", [load_stage(str(folder / "stage.toml"))], Path(out), settings, clock)
+    return clock
+
+
+def _again_and_again(folder: Path) -> float:
+    """Read and identify the same few logs without anything around it; logs per second."""
+    stage = load_stage(str(folder / "stage.toml"))
+    logs = sorted((folder / "logs").rglob("*.h5"))[:8]
+    begin = time.perf_counter()
+    for k in range(_BARE):
+        identify(read_log(logs[k % len(logs)]), stage)
+    return _BARE / (time.perf_counter() - begin)
+
+
+def bare(folder: Path, n: int) -> float:
+    """Give what so many processes identify in a second by themselves."""
+    with ProcessPoolExecutor(n, mp_context=get_context("spawn")) as pool:
+        list(pool.map(_loaded, range(n)))
+        return sum(pool.map(_again_and_again, [folder] * n))
+
+
+def _loaded(_: int) -> None:
+    """Import what is needed before the clock runs."""
+
+
+def turn(folder: Path) -> Row:
+    """Measure everything once."""
+    found: Row = {}
+    bound = [bare(folder, n) for n in (1, 2)]
+    found["bound"] = bound[1] / bound[0]
+    clocks = {}
+    for n in (1, 2):
+        with dask_cluster(n) as cluster:
+            clocks["dask", n] = identified(folder, Settings(scheduler=cluster.address))
+        clocks["local", n] = identified(folder, Settings(workers=n))
+    for kind in ("local", "dask"):
+        found[kind] = clocks[kind, 2].rate / clocks[kind, 1].rate
+        found[f"{kind}_serial_ms"] = 1e3 * clocks[kind, 2].serial
+        found[f"{kind}_rate"] = clocks[kind, 2].rate
+    return found
+
+
+def main() -> None:
+    """Run the study; ``--quick`` does a small archive and records nothing."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--quick", action="store_true")
+    quick = parser.parse_args().quick
+    watch = Stopwatch()
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        make_archive(folder, QUICK_LOGS if quick else N_LOGS)
+        turns = [turn(folder) for _ in range(1 if quick else TURNS)]
+    answer: Row = {
+        name: [round(float(v), 3) for v in np.quantile([t[name] for t in turns], (0, 0.5, 1))]
+        for name in turns[0]
+    }
+    answer |= {"logs": QUICK_LOGS if quick else N_LOGS, "turns": len(turns)}
+    answer["of the bound"] = {
+        kind: round(float(np.median([t[kind] / t["bound"] for t in turns])), 3)
+        for kind in ("local", "dask")
+    }
+    answer["workers kept busy"] = {
+        kind: int(2e3 / answer[f"{kind}_rate"][1] / answer[f"{kind}_serial_ms"][1])
+        for kind in ("local", "dask")
+    }
+    least = 0.5 if quick else SPEEDUP / 2  # a small archive only shows that it works
+    answer["passed"] = {
+        f"{kind}: 1.8 of 2": answer["of the bound"][kind] >= least for kind in ("local", "dask")
+    }
+    record = HERE / "speedup.json"
+    conclude(record, (__doc__ or "").split("\n")[0], answer, watch, quick=quick)
+
+
+if __name__ == "__main__":
+    main()

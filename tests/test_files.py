@@ -1,0 +1,73 @@
+"""Files: whole or not at all, in their place and nowhere else."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+
+from lmshealth.errors import BadTable
+from lmshealth.files import write_bytes, write_text
+
+
+def test_folders_are_made_and_nothing_else_is_left(tmp_path: Path) -> None:
+    """A text is written as UTF-8, twice over itself, with no half file beside it."""
+    target = tmp_path / "a" / "b" / "table.csv"
+    for text in ("Δe\n", "again\n"):
+        write_text(target, text)
+        assert target.read_bytes().decode() == text
+    assert os.listdir(target.parent) == ["table.csv"]
+
+
+def test_a_link_in_the_place_of_a_file_is_replaced(tmp_path: Path) -> None:
+    """What the link points to stays as it is, whether it is there or not."""
+    outside = tmp_path / "outside.txt"
+    outside.write_text("untouched")
+    (tmp_path / "out").mkdir()
+    for name, end in (("index.html", outside), ("page.html", tmp_path / "absent.txt")):
+        target = tmp_path / "out" / name
+        target.symlink_to(end)
+        write_text(target, "new")
+        assert target.read_text() == "new"
+        assert not target.is_symlink()
+    assert outside.read_text() == "untouched"
+    assert not (tmp_path / "absent.txt").exists()
+
+
+def test_a_file_is_as_readable_as_any_that_its_user_makes(tmp_path: Path) -> None:
+    """Others may read a report where the user lets them read new files."""
+    (tmp_path / "usual").touch()
+    write_text(tmp_path / "ours", "text")
+    assert (tmp_path / "ours").stat().st_mode == (tmp_path / "usual").stat().st_mode
+
+
+def test_an_interrupted_write_leaves_the_old_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Until all is written nothing has changed, and the half file goes."""
+    target = tmp_path / "table.csv"
+    write_text(target, "old")
+
+    def stop(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(Path, "replace", stop)
+    with pytest.raises(KeyboardInterrupt):
+        write_text(target, "new")
+    assert os.listdir(tmp_path) == ["table.csv"]
+    assert target.read_text() == "old"
+
+
+def test_what_is_no_text_is_written_as_its_number(tmp_path: Path) -> None:
+    """A lone half of a pair of signs keeps nothing from being written."""
+    write_text(tmp_path / "x", "\udcff")
+    assert (tmp_path / "x").read_bytes() == b"\\udcff"
+
+
+def test_what_cannot_be_written_is_told(tmp_path: Path) -> None:
+    """The file and the system's reason are named."""
+    (tmp_path / "file").touch()
+    for target in (tmp_path / "file" / "below", tmp_path / ("long" * 100)):
+        with pytest.raises(BadTable, match=r"cannot be written: [A-Z]"):
+            write_bytes(target, b"")

@@ -1,0 +1,227 @@
+"""Pools: everything is done once, whoever dies, and nothing stays when they are gone."""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from importlib.metadata import version
+from pathlib import Path
+
+import pytest
+
+from lmshealth import workers
+from lmshealth.workers import Pool, SchedulerError, processes
+from studies import servers
+
+
+def double(number: int) -> int:
+    """Give twice a number."""
+    return 2 * number
+
+
+def die_of_three(number: int) -> int:
+    """Give twice a number, and take the process along at 3."""
+    if number == 3:
+        os._exit(1)
+    return 2 * number
+
+
+def process_of(_: int) -> int:
+    """Say which process works."""
+    return os.getpid()
+
+
+def lost(number: int, why: str) -> int:
+    """Stand for what was lost."""
+    assert why
+    return -number
+
+
+@pytest.mark.parametrize("size", [1, 2])
+def test_everything_is_done_once(size: int) -> None:
+    """Each item comes back with its own result, also when there are more than fit in a window."""
+    with processes(size) as pool:
+        assert sorted(pool.spread(double, range(40), lost)) == [(k, 2 * k) for k in range(40)]
+        assert list(pool.spread(double, [], lost)) == []
+        assert pool.size == size
+
+
+@pytest.mark.parametrize("size", [1, 2])
+def test_few_items_are_taken_ahead_of_results(size: int) -> None:
+    """However many there are, no more are taken than some per worker: memory stays."""
+    taken = 0
+
+    def items() -> Iterator[int]:
+        nonlocal taken
+        while taken < 1000:
+            taken += 1
+            yield taken
+
+    with processes(size) as pool:
+        for done, _ in enumerate(pool.spread(double, items(), lost)):
+            assert taken <= done + 1 + 3 * size
+            if done == 50:
+                break
+
+
+def test_an_item_that_kills_its_process_is_lost_alone() -> None:
+    """The others are done, those that were under way too, and the pool works on."""
+    with processes(2) as pool:
+        found = dict(pool.spread(die_of_three, range(12), lost))
+        assert found == {k: 2 * k for k in range(12)} | {3: -3}
+        assert dict(pool.spread(double, range(5), lost)) == {k: 2 * k for k in range(5)}
+
+
+def test_a_killed_process_loses_nothing() -> None:
+    """What it was about is done again elsewhere."""
+    with processes(2) as pool:
+        (_, victim), *_ = pool.spread(process_of, [0], lost)
+        os.kill(victim, signal.SIGKILL)
+        assert dict(pool.spread(double, range(20), lost)) == {k: 2 * k for k in range(20)}
+
+
+def test_a_mistake_is_raised_here() -> None:
+    """What a function raises ends the batch with its own error."""
+    with processes(2) as pool, pytest.raises(TypeError):
+        list(pool.spread(double, [None], lost))  # type: ignore[list-item]
+
+
+def test_processes_end_with_a_parent_that_is_killed(root: Path) -> None:
+    """Nobody is left to work for nothing."""
+    code = (
+        "from lmshealth.workers import processes\nfrom tests.test_workers import lost, process_of\n"
+        "import time\n"
+        "if __name__ == '__main__':\n"
+        "    with processes(2) as pool:\n"
+        "        print(*{p for _, p in pool.spread(process_of, range(20), lost)}, flush=True)\n"
+        "        time.sleep(60)\n"
+    )
+    script = ["-c", code]
+    with subprocess.Popen(
+        [sys.executable, *script], stdout=subprocess.PIPE, text=True, cwd=root
+    ) as parent:
+        assert parent.stdout is not None
+        children = [int(word) for word in parent.stdout.readline().split()]
+        assert children and all(_is_there(child) for child in children)
+        parent.kill()
+    servers.wait_until(lambda: not any(_is_there(child) for child in children), "ending")
+
+
+def _is_there(process: int) -> bool:
+    try:
+        return "Z" not in Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0]
+    except FileNotFoundError:
+        return False
+
+
+# Dask
+
+
+def test_a_cluster_does_everything_once(cluster: servers.Cluster) -> None:
+    """Results are those of this process; an item that kills its workers is lost alone."""
+    with workers.cluster(cluster.address) as pool:
+        assert pool.size == 2
+        assert dict(pool.spread(double, range(40), lost)) == {k: 2 * k for k in range(40)}
+        # Dask gives up what four workers died of.
+        for _ in range(4):
+            cluster.add_worker()
+        found = dict(pool.spread(die_of_three, range(2, 5), lost))
+        assert found == {2: 4, 3: -3, 4: 8}
+
+
+def test_a_worker_of_a_cluster_may_be_killed(cluster: servers.Cluster) -> None:
+    """What it was about is done by another, and a worker that comes later works as all do."""
+    with workers.cluster(cluster.address) as pool:
+        tasks = pool.spread(slowly, range(12), lost)
+        found = dict([next(tasks)])
+        cluster.workers[0].kill()
+        cluster.add_worker()
+        found |= dict(tasks)
+        assert {k: number for k, (number, _) in found.items()} == {k: 2 * k for k in range(12)}
+        assert {threads for _, threads in found.values()} == {1}
+
+
+def slowly(number: int) -> tuple[int, int]:
+    """Give twice a number after a while, and on how many threads linear algebra works."""
+    from threadpoolctl import threadpool_info
+
+    time.sleep(0.2)
+    return 2 * number, max(library["num_threads"] for library in threadpool_info())
+
+
+def test_a_lost_scheduler_is_told(
+    cluster: servers.Cluster, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """It ends the batch with one error that says so, and with no other words."""
+    with (
+        pytest.raises(SchedulerError, match=f"lost the Dask scheduler {cluster.address}"),
+        workers.cluster(cluster.address) as pool,
+    ):
+        for _ in pool.spread(slowly, range(50), lost):
+            cluster.scheduler.kill()
+    assert capfd.readouterr().err == ""
+
+
+def test_a_worker_of_another_version_is_refused(
+    cluster: servers.Cluster, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its results would be kept under the name of this version."""
+    monkeypatch.setattr(workers, "version", lambda name: "0.0.1")
+    with (
+        pytest.raises(SchedulerError, match=f"lmshealth {version('lmshealth')}.*of 0.0.1"),
+        workers.cluster(cluster.address),
+    ):
+        pass
+
+
+@pytest.mark.parametrize(
+    ("address", "said"),
+    [
+        ("nonsense", "needed is an address"),
+        ("tcp://127.0.0.1", "needed is an address"),
+        ("tcp://me:hunter2@127.0.0.1:8786", "no user and no password"),
+        ("tcp://127.0.0.1:{port}", "refused"),
+        ("nosuch://127.0.0.1:{listening}", "unknown address scheme"),
+    ],
+)
+def test_an_address_that_is_none_is_told(
+    address: str, said: str, needs: Callable[[str], None]
+) -> None:
+    """Each is an error at once, without what is secret in it."""
+    needs("distributed")
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        full = address.format(port=servers.free_port(), listening=listener.getsockname()[1])
+        with pytest.raises(SchedulerError, match=said) as caught, workers.cluster(full):
+            pass
+    assert "hunter2" not in str(caught.value)
+
+
+def test_a_cluster_without_workers_is_told(
+    cluster: servers.Cluster, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Nobody waits for work that nobody does."""
+    from distributed import Client
+
+    for worker in cluster.workers:
+        worker.kill()
+    with Client(cluster.address, timeout=servers.WAIT_S, set_as_default=False) as client:
+        servers.wait_until(lambda: not client.nthreads(), "losing the workers")
+    monkeypatch.setattr(workers, "_TIMEOUT", 2)
+    with (
+        pytest.raises(SchedulerError, match="has no workers"),
+        workers.cluster(cluster.address),
+    ):
+        pass
+
+
+def test_a_pool_of_one_is_this_process() -> None:
+    """Nothing is started for it."""
+    with processes(1) as pool:
+        assert type(pool) is Pool
+        assert pool.executor is None
+        assert dict(pool.spread(process_of, [1], lost)) == {1: os.getpid()}
