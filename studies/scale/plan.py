@@ -12,9 +12,12 @@ Method
     process is serial, S = logs times its part. The time is the longer of the two. The efficiency
     of two is taken for that of many: this is a plan, no measurement.
 Answer
-    ANSWER
+    A log takes 0.47 s of processor time, a stage 111 s: 89 for health at 40 epochs, 18 for its
+    life, 4 for its page. One worker needs 439 hours, 8 need 60, 32 need 15, 128 need 3.7. Store
+    and pages take 33 and 6 GB. What breaks first is the main process, which takes 6.8 ms per log by
+    itself: 1.9 hours that no worker shortens, reached by some 230 workers.
 Run time
-    RUNTIME
+    Three minutes.
 """
 
 from __future__ import annotations
