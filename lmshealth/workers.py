@@ -102,8 +102,10 @@ class _Processes(Pool):
 
     def end(self) -> None:
         """End all processes at once, whatever they are about."""
-        self._ours.close()
+        # In this order: the executor's thread fails on a process that dies when a task was
+        # cancelled of which it does not know yet, and would leave this process waiting for ever.
         self.executor.shutdown(wait=False, cancel_futures=True)
+        self._ours.close()
 
     def spread(
         self,
@@ -317,8 +319,10 @@ def _open(size: int, end: Connection) -> ProcessPoolExecutor:
     executor = ProcessPoolExecutor(size, mp_context=context, initializer=_begin, initargs=(end,))
     try:
         with _uninterrupted():  # until they know that an interrupt is not meant for them
-            started = executor.submit(os.getpid)
-        started.result()
+            started = [executor.submit(os.getpid) for _ in range(size)]  # each starts one
+        wait(started)
+        for future in started:
+            future.result()
     except BrokenExecutor as error:
         raise LmshealthError(
             "worker processes end as they start: a script that asks for several workers has to do "

@@ -36,6 +36,12 @@ def process_of(_: int) -> int:
     return os.getpid()
 
 
+def dawdle(data: bytes) -> int:
+    """Take some time over much data."""
+    time.sleep(0.2)
+    return len(data)
+
+
 def lost(number: int, why: str) -> int:
     """Stand for what was lost."""
     assert why
@@ -110,6 +116,37 @@ def test_processes_end_with_a_parent_that_is_killed(root: Path) -> None:
         assert children and all(_is_there(child) for child in children)
         parent.kill()
     servers.wait_until(lambda: not any(_is_there(child) for child in children), "ending")
+
+
+@pytest.mark.parametrize(
+    "begun", ["pool.spread(dawdle, items, lost)", "pool.executor.map(len, items)"]
+)
+def test_an_interrupt_as_work_begins_leaves_nothing_that_waits(root: Path, begun: str) -> None:
+    """Processes that only start hear no interrupt, and what they were to do is let go."""
+    code = (
+        "import signal\nfrom lmshealth.workers import processes\n"
+        "from tests.test_workers import dawdle, lost\n"
+        "if __name__ == '__main__':\n"
+        "    signal.signal(signal.SIGINT, signal.default_int_handler)\n"
+        "    items = (bytes(2**21) for _ in range(400))\n"
+        "    with processes(2) as pool:\n"
+        "        print(flush=True)\n"
+        f"        list({begun})\n"
+    )
+    with subprocess.Popen(
+        [sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+        cwd=root, start_new_session=True,
+    ) as parent:  # fmt: skip
+        try:
+            assert parent.stdout is not None
+            parent.stdout.readline()
+            time.sleep(0.3)
+            os.killpg(parent.pid, signal.SIGINT)
+            _, said = parent.communicate(timeout=60)
+        finally:
+            parent.kill()
+    assert parent.returncode == -signal.SIGINT
+    assert said.count("Traceback") == 1, said
 
 
 def _is_there(process: int) -> bool:
