@@ -20,7 +20,6 @@ Run time
 
 from __future__ import annotations
 
-import argparse
 import html
 import shutil
 import tempfile
@@ -31,17 +30,16 @@ from typing import Any
 import numpy as np
 
 from lmshealth.index import IndexRow, write_index
-from studies.record import Stopwatch, conclude
+from studies.record import Study
 from studies.scale.rows import make_refused, make_rows
 
-HERE = Path(__file__).parent
 SOUGHT = "line04-m0417"
 # Of the page against the bare table, and of bytes per stage.
 BOUND_RATIO, BOUND_BYTES = 4.0, 1500
 _SETTLED = """() => new Promise((done) => requestAnimationFrame(() =>
     requestAnimationFrame(() => done(performance.now()))))"""
-# A paint is told some time after it was. The page forbids `eval`, which waiting for a condition from
-# outside would need.
+# A paint is told some time after it was. The page forbids `eval`, which waiting for a condition
+# from outside would need.
 _PAINT = """() => new Promise((done) => new PerformanceObserver((entries) => {
     for (const entry of entries.getEntriesByName("first-contentful-paint")) done(entry.startTime);
 }).observe({ type: "paint", buffered: true }))"""
@@ -127,10 +125,8 @@ def _summary(path: Path, own: Sequence[Mapping[str, Any]]) -> dict[str, float]:
 
 def main() -> None:
     """Run the study, or a small form of it."""
-    parser = argparse.ArgumentParser(description="Time the front page of a large fleet.")
-    parser.add_argument("--quick", action="store_true")
-    quick = parser.parse_args().quick
-    watched, (n, repeats) = Stopwatch(), (300, 3) if quick else (1000, 15)
+    study = Study(__file__, __doc__)
+    n, repeats = (300, 3) if study.quick else (1000, 15)
     with tempfile.TemporaryDirectory() as folder:
         pages = measure(write_pages(Path(folder), n), repeats)
     page, control, plain = pages["page"], pages["all laid out"], pages["bare"]
@@ -149,7 +145,7 @@ def main() -> None:
         "a key stroke takes a tenth of a load": answer["stroke_to_load"] <= 0.1,
         "control: slower with every row laid out": answer["control_to_bare"] > answer["to_bare"],
     }
-    conclude(HERE / "index.json", str(__doc__).split("\n", 1)[0], answer, watched, quick=quick)
+    study.conclude(answer)
 
 
 if __name__ == "__main__":

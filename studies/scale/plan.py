@@ -19,16 +19,16 @@ Run time
 
 from __future__ import annotations
 
-import argparse
 import json
 import tempfile
 import time
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from lmshealth import Settings, load_stage, run
 from models.lives import Plan, simulate_life
-from studies.record import Stopwatch, conclude
+from studies.record import Study
 
 HERE = Path(__file__).parent
 N_LOGS, N_STAGES = 1_000_000, 10_000
@@ -52,8 +52,9 @@ class Steps:
         self._step, self._since = what, now
 
 
-def one_stage(folder: Path, plan: Plan, epochs: int) -> Row:
+def one_stage(folder: Path, logs: int, seconds: float, epochs: int) -> Row:
     """Analyse a simulated life by one worker, and say what each step costs and keeps."""
+    plan = Plan("lms-y", "both", logs, seconds, 3)
     simulate_life(plan, folder / "logs", workers=2)
     steps, out = Steps(), folder / "out"
     stage = load_stage(plan.stage)
@@ -94,13 +95,11 @@ def plan_for(n_workers: int, stage: Row, serial_s: float, efficiency: float) -> 
 
 def main() -> None:
     """Run the study; ``--quick`` does a short life and records nothing."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--quick", action="store_true")
-    quick = parser.parse_args().quick
-    watch = Stopwatch()
+    study = Study(__file__, __doc__)
+    quick = study.quick
     n, seconds, epochs = (QUICK_LOGS, QUICK_SECONDS, 2) if quick else (LOGS, SECONDS, 40)
     with tempfile.TemporaryDirectory() as name:
-        stage = one_stage(Path(name), Plan("lms-y", "both", n, seconds, 3), epochs)
+        stage = study.trials.once(partial(one_stage, Path(name)), n, seconds, epochs)
     two = json.loads((HERE / "speedup.json").read_text(encoding="utf-8"))
     serial_s = 1e-3 * two["dask_serial_ms"][1]
     efficiency = min(two["of the bound"]["dask"], 1.0)
@@ -117,8 +116,7 @@ def main() -> None:
         "pages_gb": round(1e-3 * N_STAGES * stage["page_mb"], 1),
         "passed": {"more workers take less": plans[0]["hours"] > plans[-1]["hours"]},
     }
-    record = HERE / "plan.json"
-    conclude(record, (__doc__ or "").split("\n")[0], answer, watch, quick=quick)
+    study.conclude(answer)
 
 
 if __name__ == "__main__":
