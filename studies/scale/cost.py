@@ -44,7 +44,7 @@ from lmshealth.waterfall import read_levels
 from studies.record import Study, options
 from studies.scale.archive import make_archive
 
-SIZES, QUICK_SIZES = (100, 1_000, 10_000), (20, 40, 80)
+SIZES, QUICK_SIZES = (100, 1_000, 10_000), (3, 6, 12)
 LONGER = "longer and longer"
 EVERY = 21  # so that every recording that the logs are made of is among them
 # Of the cost of one more log, of what is added to the identification, and of memory.
