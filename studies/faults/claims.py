@@ -107,6 +107,15 @@ def injection(answer: Row) -> Iterator[Claim]:
             _control(answer, "controls"),
             not wrong,
         )
+    peaks = [row["peak_mb"] for row in answer["bombs"]]
+    if peaks:
+        yield Claim(
+            "memory that a file which swells takes, with all libraries",
+            f"{max(peaks)} MB at most",
+            f"{len(peaks)} kinds",
+            "",
+            answer["passed"]["bombs stay small"],
+        )
     tried = answer["addresses"]
     yield Claim(
         "addresses that show or keep their password",

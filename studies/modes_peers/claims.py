@@ -34,6 +34,13 @@ def result(answer: Row) -> Iterator[Claim]:
             + ("" if any(covers) else ", without intervals"),
             "ahead" not in told,
         )
+    bare = [
+        c["tools"][name]["time_over_ours"]
+        for c in cases
+        for name in c["tools"]
+        if "no intervals" in name
+    ]
+    yield Claim("time of SSI-cov without intervals, over ours", span(bare))
     held = {
         name: [
             c["holds"]
