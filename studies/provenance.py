@@ -51,7 +51,7 @@ def _digest(path: Path, name: str, also: tuple[str, ...]) -> str:
     total = hashlib.sha256(" ".join(version(library) for library in _LIBRARIES).encode())
     total.update("".join(ast.dump(statement) for statement in needed).encode())
     roots = _imports(needed) | {_file(module.split(".")) for module in also}
-    for module in sorted(_closure(frozenset(roots) - {None})):
+    for module in sorted(_closure({root for root in roots if root is not None})):
         total.update(module.relative_to(PROJECT).as_posix().encode())
         total.update(ast.dump(_tree(module)).encode())
     for package in ("lmshealth", "models"):
@@ -94,7 +94,7 @@ def _defined(statement: ast.stmt) -> set[str]:
     }
 
 
-def _closure(roots: frozenset[Path]) -> set[Path]:
+def _closure(roots: set[Path]) -> set[Path]:
     """Give modules and all that they import of the project."""
     found: set[Path] = set()
     left = set(roots)

@@ -114,7 +114,7 @@ def test_changed_module(written: Any, tmp_path: Path, monkeypatch: pytest.Monkey
     text = SCRIPT.replace("SCALE *", "place.__name__ and SCALE *")
     before = provenance.code_of(written(text).draw)
     assert provenance.code_of(written(text).draw) == before
-    modules = provenance._closure(frozenset({provenance.PROJECT / "lmshealth" / "metrics.py"}))
+    modules = provenance._closure({provenance.PROJECT / "lmshealth" / "metrics.py"})
     assert len(modules) > 1
     for module in sorted(modules):
         plain = provenance._tree(module)

@@ -74,8 +74,8 @@ def main() -> None:
         }
         with backends(folder) as kinds:
             for kind, new_store in kinds.items():
-                batch = partial(killed, reference, new_store, *wanted[1:])
-                answer["kills"][kind] = until_enough(study.trials, batch, kind, wanted[0])
+                work = partial(killed, reference, new_store, *wanted[1:])
+                answer["kills"][kind] = until_enough(study.trials, work, kind, wanted[0])
                 print(kind, answer["kills"][kind], file=sys.stderr, flush=True)
         answer["control"] = control(reference, folder)
     answer["passed"] = verdicts(answer)
@@ -95,11 +95,11 @@ def verdicts(answer: Row) -> dict[str, bool]:
 # Kills
 
 
-def until_enough(trials: Trials, batch: Callable[..., Row], kind: str, n: int) -> Row:
+def until_enough(trials: Trials, work: Callable[..., Row], kind: str, n: int) -> Row:
     """Kill runs of one batch after another until there were enough kills."""
     batches: list[Row] = []
     while (left := n - sum(len(own["kills"]) for own in batches)) > 0:
-        batches.append(trials.once(batch, kind, len(batches), left, also=PROGRAM))
+        batches.append(trials.once(work, kind, len(batches), left, also=PROGRAM))
     kills = [kill for own in batches for kill in own["kills"]]
     return {
         "batches": len(batches),
