@@ -7,6 +7,7 @@ import hashlib
 import sys
 from collections.abc import Callable, Iterable
 from functools import cache, partial
+from importlib import import_module
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -101,7 +102,10 @@ def _closure(roots: set[Path]) -> set[Path]:
     while left:
         module = left.pop()
         found.add(module)
-        left |= _imports(_tree(module).body) - found
+        # Who imports from a package has all of it that it begins with.
+        begun = {module.parent / "__init__.py"} - {_GATHERING}
+        left |= {path for path in begun if path.exists()} | _imports(_tree(module).body)
+        left -= found
     return found
 
 
@@ -112,17 +116,18 @@ def _imports(statements: Iterable[ast.stmt]) -> set[Path]:
         if isinstance(node, ast.Import):
             found |= {_file(alias.name.split(".")) for alias in node.names}
         elif isinstance(node, ast.ImportFrom):
-            for alias in node.names:
-                found |= _sources((node.module or "").split("."), alias.name)
+            package = (node.module or "").split(".")
+            found |= {_source(package, alias.name) for alias in node.names}
     return {path for path in found if path is not None}
 
 
-def _sources(package: list[str], name: str) -> set[Path | None]:
-    """Tell where a name comes from: a module of its own, a package, or what that gathers."""
+def _source(package: list[str], name: str) -> Path | None:
+    """Tell where a name comes from: a module of its own, or one that has it or gathers it."""
     path = _file([*package, name]) or _file(package)
-    if path != _GATHERING:
-        return {path}
-    return {*_imports(_reached(_tree(_GATHERING), {name}))}
+    if path == _GATHERING:
+        home = getattr(getattr(import_module(package[0]), name, None), "__module__", package[0])
+        path = _file(home.split("."))
+    return path
 
 
 def _file(parts: list[str]) -> Path | None:

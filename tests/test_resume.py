@@ -130,6 +130,18 @@ def test_changed_module(written: Any, tmp_path: Path, monkeypatch: pytest.Monkey
             assert provenance.code_of(script.draw) != before
 
 
+def test_gathered_names(written: Any) -> None:
+    """Of the package a trial needs the homes of the names it uses, and what these register."""
+    text = SCRIPT.replace("metrics import place", "import read_log as place", 1)
+    text = text.replace("from lmshealth.import", "from lmshealth import")
+    tree = provenance._tree(Path(written(text).__file__ or ""))
+    needed = provenance._closure(provenance._imports(tree.body))
+    names = {path.relative_to(provenance.PROJECT).as_posix() for path in needed}
+    assert {"lmshealth/readers/__init__.py", "lmshealth/errors.py"} <= names
+    assert any(name.startswith("lmshealth/readers/") and "hdf5" in name for name in names)
+    assert not {"lmshealth/report.py", "lmshealth/__init__.py"} & names
+
+
 def test_options_and_names_part_trials(written: Any, tmp_path: Path) -> None:
     """The same numbers given to other work, or with other options, are other trials."""
     script, path = written(SCRIPT), tmp_path / "study.jsonl"
