@@ -12,11 +12,7 @@ Talts2018 for the ranks, Sailynoja2022 for the bands of their distribution.
 
 from __future__ import annotations
 
-import hashlib
-import json
-from collections.abc import Callable, Iterable, Mapping
-from functools import cache
-from pathlib import Path
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import numpy as np
@@ -38,7 +34,6 @@ Row = dict[str, Any]
 # So few of the posterior's draws that they are as good as independent.
 N_DRAWS = 127
 N_BINS = 20
-_PACKAGE = Path(__file__).parents[1] / "lmshealth"
 _POINTS = np.arange(1, 64) / 64
 _SIMULATIONS = 20_000
 BLUE, ORANGE, BLACK = "#0072b2", "#d55e00", "#000000"
@@ -97,51 +92,6 @@ def bands(rows: Iterable[Row]) -> dict[str, Any]:
         str(n): {"low": band(n)[0].round(5).tolist(), "high": band(n)[1].round(5).tolist()}
         for n in sorted({row["n"] for row in rows})
     }
-
-
-@cache
-def digest(*names: str) -> str:
-    """Tell the code of modules of the package: lives of other code are no evidence for this."""
-    total = hashlib.sha256()
-    for name in names:
-        total.update((_PACKAGE / f"{name}.py").read_bytes())
-    return total.hexdigest()
-
-
-def collect(
-    path: Path | None,
-    code: Callable[[str], str],
-    tasks: Iterable[tuple[str, int]],
-    work: Callable[..., Row],
-) -> list[Row]:
-    """Do tasks one after the other, but for those that a file already has.
-
-    Parameters
-    ----------
-    path : Path or None
-        Where a line of JSON is added for every task that is done.
-    code : callable
-        Says of a kind by which code it is done; lines of other code are not used.
-    tasks : iterable of (str, int)
-        What, and the number of the life.
-    work : callable
-        Of both; gives what is to be kept.
-    """
-    done: dict[tuple[str, int], Row] = {}
-    if path is not None and path.exists():
-        lines = [json.loads(line) for line in path.read_text().splitlines()]
-        right = [row for row in lines if row["code"] == code(row["kind"])]
-        done = {(row["kind"], row["life"]): row for row in right}
-    rows = []
-    for kind, life in tasks:
-        row = done.get((kind, life))
-        if row is None:
-            row = {"kind": kind, "life": life, "code": code(kind)} | work(kind, life)
-            if path is not None:
-                with path.open("a") as file:
-                    file.write(json.dumps(row) + "\n")
-        rows.append(row)
-    return rows
 
 
 def draw_histogram(ax: Axes, row: Row, title: str, colour: str = BLUE) -> None:

@@ -1,9 +1,12 @@
-"""Lives simulated at 20 kHz and identified log by log, kept in a folder."""
+"""Lives simulated at 20 kHz and identified log by log, each once for all studies."""
 
 from __future__ import annotations
 
 import tempfile
+from dataclasses import astuple
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -14,36 +17,35 @@ from lmshealth.stage import load_stage
 from models.lives import Plan, simulate_life
 from models.plant import GUIDE_MODES
 from studies.lives import Estimates, Life, life_of, plan_of
+from studies.resume import Trials
 
+RAW = "raw_lives"  # name of the file that keeps them
 _FIELDS = ("ln_frequency", "ln_damping", "cov", "loop_error")
 _SIZES_SEED = 7
 
 
-def measured(stage: str, logs: int) -> tuple[Estimates, Life]:
+def measured(stage: str, logs: int, kept: Path | None = None) -> tuple[Estimates, Life]:
     """Simulate and identify a few logs of both tunings, for `studies.lives.drawn`."""
     plan = plan_of(stage, "servo-retuning", _SIZES_SEED, logs)
-    return identified(plan), life_of(plan)
+    return identified(plan, kept), life_of(plan)
 
 
 def identified(plan: Plan, cache: Path | None = None) -> Estimates:
-    """Simulate a life and identify its logs, unless a folder keeps it from before.
+    """Simulate a life and identify its logs, unless a file keeps that from before."""
+    told = Trials(cache).once(
+        partial(_identified, plan),
+        type(plan).__name__,
+        *astuple(plan),
+        also=[type(plan).__module__],
+    )
+    return Estimates(*(np.array(told[field], dtype=float) for field in _FIELDS))
 
-    The folder is to be emptied when simulation or identification change.
-    """
-    name = f"{plan.stage}.{plan.life}.{plan.seed}.{plan.logs}x{plan.seconds:g}s.npz"
-    if cache is not None and (cache / name).exists():
-        with np.load(cache / name) as kept:
-            return Estimates(*(kept[field] for field in _FIELDS))
+
+def _identified(plan: Plan, *_: object) -> dict[str, list[Any]]:
     with tempfile.TemporaryDirectory() as folder:
         simulate_life(plan, Path(folder))
         estimates = _identify_all(Path(folder), plan)
-    if cache is not None:
-        cache.mkdir(parents=True, exist_ok=True)
-        # Under its name only when it is whole: others may read at the same time.
-        part = cache / f"part.{name}"
-        np.savez(part, **{field: getattr(estimates, field) for field in _FIELDS})
-        part.rename(cache / name)
-    return estimates
+    return {field: getattr(estimates, field).tolist() for field in _FIELDS}
 
 
 def _identify_all(folder: Path, plan: Plan) -> Estimates:

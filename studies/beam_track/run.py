@@ -26,8 +26,6 @@ Data
 
 from __future__ import annotations
 
-import argparse
-import json
 import os
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -42,9 +40,8 @@ from lmshealth.stage import Covariate, Description, Stage
 from lmshealth.tracking import track
 from lmshealth.tracks import History
 from studies.decays.beam import BEAM, REPEATS, one_beam
-from studies.record import Stopwatch, keep
+from studies.record import Study
 
-HERE = Path(__file__).parent
 BEGIN = datetime(2026, 1, 1, tzinfo=UTC)
 SECONDS_A_DWELL = 1.2
 # ln f rises by a quarter per volt, and not quite in a straight line.
@@ -52,19 +49,11 @@ PRIOR_STD, CURVATURE_STD = 0.3, 0.05
 
 
 def main() -> None:
-    """Run the study and keep its result."""
-    parser = argparse.ArgumentParser()
-    parser.add_argument("--quick", action="store_true", help="one repeat, printed, not kept")
-    quick = parser.parse_args().quick
-    watch = Stopwatch()
+    """Run the study; ``--quick`` does one repeat and records nothing."""
+    study = Study(__file__, __doc__)
     folder = Path(os.environ["LMSHEALTH_DATA"])
-    repeats = [one_repeat(folder, repeat) for repeat in range(1 if quick else REPEATS)]
-    answer = {"repeats": repeats, "passed": judge(repeats)}
-    if quick:
-        print(json.dumps(answer))
-        return
-    question = "Does a tracked mode return to its start on a beam that is stiffened and released?"
-    keep(HERE / "result.json", question, answer, watch)
+    repeats = [one_repeat(folder, repeat) for repeat in range(1 if study.quick else REPEATS)]
+    study.conclude({"repeats": repeats, "passed": judge(repeats)})
 
 
 def one_repeat(folder: Path, repeat: int) -> dict[str, Any]:

@@ -28,10 +28,7 @@ Run time
 
 from __future__ import annotations
 
-import argparse
-import json
 from collections import Counter
-from pathlib import Path
 from typing import Any
 from unittest.mock import patch
 
@@ -43,9 +40,8 @@ from lmshealth.association import Association, associate
 from lmshealth.metrics import clopper_pearson
 from studies.crossings.judging import judge, nearest, recovered
 from studies.crossings.lives import KINDS, Kind, Life, make_life
-from studies.record import Stopwatch, keep
+from studies.record import Study
 
-HERE = Path(__file__).parent
 SEED = 20261124
 N_LIVES = 200
 EXAMPLES = ("crossing, named by order", "veering, with shapes", "merging")
@@ -53,25 +49,17 @@ EXAMPLES = ("crossing, named by order", "veering, with shapes", "merging")
 
 def main() -> None:
     """Run the study; ``--quick`` follows three lives of each kind and records nothing."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--quick", action="store_true")
-    quick = parser.parse_args().quick
-    watch = Stopwatch()
-    n = 3 if quick else N_LIVES
+    study = Study(__file__, __doc__)
+    n = 3 if study.quick else N_LIVES
+    found = study.trials.collect(of_kind, [(name, n) for name in KINDS])
     answer: dict[str, Any] = {
         "lives": n,
-        "kinds": {name: followed(name, kind, n) for name, kind in KINDS.items()},
-        "best_guess_where_nothing_tells": guessed(n),
+        "kinds": dict(zip(KINDS, found, strict=True)),
+        "best_guess_where_nothing_tells": study.trials.once(guessed, n),
     }
     answer["passed"] = verdicts(answer)
-    if quick:
-        print(json.dumps(answer))
-        return
-    answer["examples"] = {name: example(name) for name in EXAMPLES}
-    keep(HERE / "result.json", __doc__.split("\n")[0], answer, watch)
-    failed = [name for name, fine in answer["passed"].items() if not fine]
-    if failed:
-        raise SystemExit(f"not as asked: {failed}")
+    examples = {} if study.quick else {name: example(name) for name in EXAMPLES}
+    study.conclude(answer, beside={"examples": examples}, quick_may_fail=True)
 
 
 def life_of(name: str, seed: int) -> Life:
@@ -84,6 +72,11 @@ def labels_of(life: Life) -> Association:
     """Associate the estimates of a life."""
     n = len(life.epochs)
     return associate(life.epochs, life.clock, offsets=np.zeros((n, 0)), prior_std=np.zeros(0))
+
+
+def of_kind(name: str, n: int) -> dict[str, Any]:
+    """Count what becomes of lives of the kind of a name."""
+    return followed(name, KINDS[name], n)
 
 
 def followed(name: str, kind: Kind, n: int) -> dict[str, Any]:

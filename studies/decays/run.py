@@ -36,8 +36,6 @@ Data
 
 from __future__ import annotations
 
-import argparse
-import json
 import os
 import zlib
 from pathlib import Path
@@ -53,9 +51,9 @@ from lmshealth.stage import Description, ModeSpec, Stage
 from studies.decays.beam import REPEATS, judge_beam, one_beam
 from studies.decays.cases import CASES, QUIET, RATE, Case, simulate, to_log
 from studies.decays.stops import one_machine
-from studies.record import Stopwatch, keep
+from studies.record import Study
+from studies.resume import Trials
 
-HERE = Path(__file__).parent
 LEVEL, Z = 0.999, 1.959963984540054
 NOMINAL = 0.95
 # Factors on the intervals: the second and third are negative controls.
@@ -71,17 +69,17 @@ NOT_MET = {
 
 def main() -> None:
     """Run the study; ``--quick`` does fewer logs of one case and records nothing."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--quick", action="store_true")
-    quick = parser.parse_args().quick
-    watch = Stopwatch()
+    study = Study(__file__, __doc__)
+    quick, trials = study.quick, study.trials
     n_seeds = QUICK_SEEDS if quick else SEEDS
     cases = CASES[1:2] if quick else CASES
     data = os.environ.get("LMSHEALTH_DATA")
     answer: dict[str, Any] = {
         "n_seeds": n_seeds,
-        "cases": {case.name: run_case(case, n_seeds) for case in cases},
-        "quiet": {case.name: run_case(case, QUIET_SEEDS) for case in (() if quick else QUIET)},
+        "cases": {case.name: run_case(case, n_seeds, trials) for case in cases},
+        "quiet": {
+            case.name: run_case(case, QUIET_SEEDS, trials) for case in (() if quick else QUIET)
+        },
         "machines": judge_machines(1 if quick else MACHINES),
         "beam": [
             row
@@ -90,12 +88,10 @@ def main() -> None:
         ],
     }
     answer |= judge(answer, quick=quick)
-    print(json.dumps(answer, indent=1))
-    if not quick:
-        keep(HERE / "result.json", __doc__.split("\n")[0], answer, watch)
-    failed = {name for name, fine in answer["passed"].items() if not fine}
-    if failed != set(answer["not_met"]):
-        raise SystemExit(f"not as asked: {answer['passed']}")
+    study.conclude(answer, not_met=answer["not_met"])
+    # What is said not to be met and is met after all is to be told, too.
+    if met := [name for name in answer["not_met"] if answer["passed"][name]]:
+        raise SystemExit(f"met after all: {met}")
 
 
 def judge(answer: dict[str, Any], *, quick: bool) -> dict[str, Any]:
@@ -127,9 +123,9 @@ def judge(answer: dict[str, Any], *, quick: bool) -> dict[str, Any]:
     }
 
 
-def run_case(case: Case, n_seeds: int) -> dict[str, Any]:
+def run_case(case: Case, n_seeds: int, trials: Trials) -> dict[str, Any]:
     """Identify logs of a case; count what intervals cover, set scatter against the bound."""
-    rows = [one_log(case, seed) for seed in range(n_seeds)]
+    rows = trials.collect(one_named, [(case.name, seed) for seed in range(n_seeds)])
     bound, modes = case.bound(), []
     for i, (f, zeta) in enumerate(case.modes):
         kept = [row[f"mode {f}"] for row in rows if not isinstance(row[f"mode {f}"], str)]
@@ -158,6 +154,12 @@ def run_case(case: Case, n_seeds: int) -> dict[str, Any]:
         "noise": case.noise,
         "modes": modes,
     }
+
+
+def one_named(name: str, seed: int) -> dict[str, Any]:
+    """Identify one log of the case of a name."""
+    (case,) = (case for case in (*CASES, *QUIET) if case.name == name)
+    return one_log(case, seed)
 
 
 def one_log(case: Case, seed: int) -> dict[str, Any]:

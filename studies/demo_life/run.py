@@ -15,9 +15,6 @@ Run time
 
 from __future__ import annotations
 
-import argparse
-import hashlib
-import json
 import os
 import subprocess
 import sys
@@ -30,50 +27,27 @@ import numpy as np
 import pandas as pd
 
 from lmshealth.metrics import clopper_pearson
-from studies.record import Stopwatch, keep
+from studies.record import Study, options
 
 HERE = Path(__file__).parent
 PARAMETERS = ("guide_preload", "mount_stiffness")
+PROGRAMS = ("models.__main__", "lmshealth.__main__")
 PRIOR_WIDTH = float(np.diff(np.exp(0.3 * np.array([-1.6449, 1.6449])))[0])
 
 
 def main() -> None:
     """Run the study; ``--quick`` does one short life and records nothing."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--quick", action="store_true")
+    parser = options(__doc__)
     parser.add_argument("--seeds", type=int, default=10)
-    options = parser.parse_args()
-    watch = Stopwatch()
-    rows: dict[str, Any] = {}
-    path = HERE / "result.json"
-    code = code_digest()
-    if path.exists() and not options.quick:
-        before = json.loads(path.read_text())
-        if before.get("code") == code:  # lives of other code are no evidence for this one
-            rows = {str(row["seed"]): row for row in before["lives"]}
-    seeds = [1] if options.quick else range(1, options.seeds + 1)
-    for seed in seeds:
-        if str(seed) not in rows:
-            size = {"n_logs": 12, "seconds": 10, "epochs": 4} if options.quick else {}
-            rows[str(seed)] = one_life(seed, **size)
-        answer = {"seeds": list(seeds), "code": code} | summarise(list(rows.values()))
-        if not options.quick:
-            keep(path, __doc__.split("\n")[0], answer, watch)
-        print(json.dumps(rows[str(seed)]), flush=True)
-    if not options.quick:
-        answer = {**answer, "make_demo": time_demo()}
-        keep(path, __doc__.split("\n")[0], answer, watch)
-    print(json.dumps({k: v for k, v in answer.items() if k != "lives"}, indent=1))
-
-
-def code_digest() -> str:
-    """SHA-256 over the code and descriptions that a life goes through."""
-    digest = hashlib.sha256()
-    for package in ("lmshealth", "models"):
-        for path in sorted((HERE.parents[1] / package).rglob("*")):
-            if path.suffix in (".py", ".toml", ".csv"):
-                digest.update(path.name.encode() + path.read_bytes())
-    return digest.hexdigest()
+    study = Study(__file__, __doc__, parser.parse_args())
+    seeds = [1] if study.quick else list(range(1, study.options.seeds + 1))
+    size = (12, 10, 4) if study.quick else (40, 20, 40)
+    tasks = [(seed, *size) for seed in seeds]
+    lives = study.trials.collect(one_life, tasks, also=PROGRAMS)
+    answer = {"seeds": seeds} | summarise(lives)
+    if not study.quick:
+        answer["make_demo"] = time_demo()
+    study.conclude(answer, beside={"lives": lives})
 
 
 def one_life(seed: int, n_logs: int = 40, seconds: int = 20, epochs: int = 40) -> dict[str, Any]:
@@ -149,7 +123,7 @@ def summarise(lives: list[dict[str, Any]]) -> dict[str, Any]:
     answer["wall_s_median"] = {
         key: float(np.median([life[key] for life in lives])) for key in ("simulate_s", "run_s")
     }
-    return {**answer, "lives": lives}
+    return answer
 
 
 def coverage(rows: list[dict[str, float]], middle: str) -> dict[str, Any]:

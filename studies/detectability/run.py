@@ -29,10 +29,7 @@ Run time
 
 from __future__ import annotations
 
-import argparse
-import json
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import msgspec
@@ -50,9 +47,9 @@ from models.lives import Plan
 from models.plant import GUIDE_MODES
 from studies.lives import Array, life_of, rng_of
 from studies.raw_lives import identified
-from studies.record import LEVEL, Stopwatch, judge_coverage, keep
+from studies.record import LEVEL, Study, judge_coverage
+from studies.resume import Trials
 
-HERE = Path(__file__).parent
 POWER, FALSE_ALARM = 0.95, 0.01
 ASKED = (("lms-y", "guide_preload"), ("lms-y", "mount_stiffness"), ("lms-x", "guide_preload"))
 # What no log shows: the mount that the housing of X is bolted to over its full surface.
@@ -67,20 +64,12 @@ Row = dict[str, Any]
 
 def main() -> None:
     """Run the study; ``--quick`` checks less and records nothing."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--quick", action="store_true")
-    options = parser.parse_args()
-    watch = Stopwatch()
-    answer = study(*((40, (10.0,), 4) if options.quick else (300, RAW_DURATIONS, RAW_LOGS)))
-    print(json.dumps(answer, indent=1))
-    if not options.quick:
-        keep(HERE / "result.json", __doc__.split("\n")[0], answer, watch)
-    failed = [name for name, fine in answer["passed"].items() if not fine]
-    if failed and not options.quick:
-        raise SystemExit(f"not as asked: {failed}")
+    study = Study(__file__, __doc__)
+    asked = (40, (10.0,), 4) if study.quick else (300, RAW_DURATIONS, RAW_LOGS)
+    study.conclude(answered(study.trials, *asked), quick_may_fail=True)
 
 
-def study(trials: int, seconds: tuple[float, ...], logs: int) -> Row:
+def answered(trials: Trials, n: int, seconds: tuple[float, ...], logs: int) -> Row:
     """Plan, check by the real estimator, and measure what identification has."""
     answer: Row = {
         "power": POWER,
@@ -89,9 +78,11 @@ def study(trials: int, seconds: tuple[float, ...], logs: int) -> Row:
         "logs": list(COUNTS),
         "maps": [smallest_losses(*asked) for asked in ASKED],
         "unseen": refused(*UNSEEN),
-        "checks": [row for asked in ASKED for row in checks(*asked, trials)],
+        "checks": [
+            row for rows in trials.collect(checks, [(*asked, n) for asked in ASKED]) for row in rows
+        ],
         "law": law("lms-y"),
-        "identified": [measured("lms-y", duration, logs) for duration in seconds],
+        "identified": trials.collect(measured, [("lms-y", duration, logs) for duration in seconds]),
     }
     return answer | {"passed": verdicts(answer)}
 

@@ -24,7 +24,6 @@ Run time
 
 from __future__ import annotations
 
-import argparse
 import subprocess
 import sys
 import tempfile
@@ -39,9 +38,8 @@ import pandas as pd
 
 from studies.faults.damage import KINDS
 from studies.faults.logfiles import DESCRIPTION, SUFFIXES, Archive, log_of, recordings, write
-from studies.record import Stopwatch, conclude
+from studies.record import Study
 
-RECORD = Path(__file__).with_name("damaged.json")
 N_GOOD, N_GOOD_QUICK, N_BASES = 1000, 60, 4
 _SEED = 20261122
 # Of the quick form: every so many of the kinds, each in one format, without those that swell.
@@ -88,15 +86,13 @@ class Found:
 
 def main() -> None:
     """Run the study; ``--quick`` does a part of it and records nothing."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--quick", action="store_true")
-    quick = parser.parse_args().quick
-    watch = Stopwatch()
+    study = Study(__file__, __doc__)
+    quick = study.quick
     with tempfile.TemporaryDirectory(prefix="damaged-") as folder:
         expected = make_archive(Path(folder), quick)
         done = carry_out(Path(folder), workers=1 if quick else 2)
         answer = judge(expected, read_found(Path(folder) / "out"), done)
-    conclude(RECORD, (__doc__ or "").split("\n")[0], answer, watch, quick=quick)
+    study.conclude(answer)
 
 
 def make_archive(folder: Path, quick: bool) -> list[Expected]:

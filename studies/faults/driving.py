@@ -26,6 +26,8 @@ from studies.servers import MARK, Popen, marked, missing_postgres, postgres
 
 LONG_S = 1200.0  # no run takes as long
 ENDED_S = 60.0  # by then every process of a killed run has to be gone, on a busy machine too
+# What is started, and what its result depends on.
+PROGRAM = ("lmshealth.__main__",)
 SOME_REFUSED = 3  # exit status of a run over the batch, which has damaged logs
 
 

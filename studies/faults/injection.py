@@ -24,7 +24,6 @@ Run time
 
 from __future__ import annotations
 
-import argparse
 import html
 import json
 import os
@@ -35,6 +34,7 @@ import sys
 import tempfile
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -45,10 +45,10 @@ from sqlalchemy import create_engine
 from studies import servers
 from studies.faults import guards, hostile
 from studies.faults.damage import KINDS
+from studies.faults.driving import PROGRAM
 from studies.faults.logfiles import DESCRIPTION, Archive, Columns, log_of, recordings
-from studies.record import Stopwatch, conclude
+from studies.record import Study
 
-RECORD = Path(__file__).with_name("injection.json")
 PASSWORD = "s3cr3t-pa55w0rd"
 # Ways to write a password into an address; some of them are no addresses at all.
 ADDRESSES = (
@@ -78,10 +78,8 @@ Done = subprocess.CompletedProcess[str]
 
 def main() -> None:
     """Run the study; ``--quick`` does a part of it and records nothing."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--quick", action="store_true")
-    quick = parser.parse_args().quick
-    watch = Stopwatch()
+    study = Study(__file__, __doc__)
+    quick, once = study.quick, partial(study.trials.once, also=PROGRAM)
     (base,) = recordings(1)
     answer: dict[str, Any] = {"stores": {}, "controls": controls()}
     with ExitStack() as stack:
@@ -91,14 +89,17 @@ def main() -> None:
         for kind in kinds:
             folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="hostile-")))
             url, password = _store(kind, folder, stack)
-            answer["stores"][kind] = attack(folder, base, url, password, every=5 if quick else 1)
+            own = partial(attack, folder, base, url, password, every=5 if quick else 1)
+            answer["stores"][kind] = once(own, kind)
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="addresses-")))
-        answer["addresses"] = addresses(folder, ADDRESSES[2:3] if quick else ADDRESSES)
+        answer["addresses"] = once(
+            partial(addresses, folder), ADDRESSES[2:3] if quick else ADDRESSES
+        )
         answer["descriptions"] = [] if quick else descriptions(folder)
         answer["network"] = network(folder)
-        answer["bombs"] = [] if quick else bombs(folder, base)
+        answer["bombs"] = [] if quick else once(partial(bombs, folder, base))
     answer["passed"] = verdicts(answer)
-    conclude(RECORD, (__doc__ or "").split("\n")[0], answer, watch, quick=quick)
+    study.conclude(answer)
 
 
 def verdicts(answer: dict[str, Any]) -> dict[str, bool]:
@@ -137,7 +138,9 @@ def lmshealth(*words: str | Path, cwd: Path, limit: Callable[[], None] | None = 
     )  # fmt: skip
 
 
-def attack(folder: Path, base: Columns, url: str, password: str, *, every: int) -> dict[str, Any]:
+def attack(
+    folder: Path, base: Columns, url: str, password: str, _kind: str, *, every: int
+) -> dict[str, Any]:
     """Run and report a hostile archive, and look at everything that came of it."""
     logs, out = folder / "logs", folder / "out"
     machines, refused = hostile.make_hostile(folder, base, every=every)

@@ -15,18 +15,20 @@ Method
 
 from __future__ import annotations
 
-import argparse
 import random
 import signal
 import sys
 import tempfile
 from collections import Counter
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from studies.faults.driving import (
     ENDED_S,
+    PROGRAM,
     SOME_REFUSED,
     Reference,
     Stores,
@@ -38,9 +40,9 @@ from studies.faults.driving import (
     rows,
     running,
 )
-from studies.record import Stopwatch, conclude
+from studies.record import Study
+from studies.resume import Trials
 
-HERE = Path(__file__).parent
 SEED = 20261122
 # Enough that three teach a fleet's prior to a fourth, which is young.
 MACHINES = {"WORN-A": 50, "WORN-B": 46, "WORN-C": 46, "WORN-D": 8, "WATCHED-A": 50}
@@ -57,10 +59,8 @@ Row = dict[str, Any]
 
 def main() -> None:
     """Run the study; ``--quick`` does a small part and records nothing."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--quick", action="store_true")
-    options = parser.parse_args()
-    watch, quick = Stopwatch(), options.quick
+    study = Study(__file__, __doc__)
+    quick = study.quick
     wanted = (QUICK_KILLS, QUICK_PER_RUN, QUICK_HOWS) if quick else (N_KILLS, PER_RUN, HOWS)
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
@@ -74,11 +74,12 @@ def main() -> None:
         }
         with backends(folder) as kinds:
             for kind, new_store in kinds.items():
-                answer["kills"][kind] = killed(reference, new_store, wanted)
+                work = partial(killed, reference, new_store, *wanted[1:])
+                answer["kills"][kind] = until_enough(study.trials, work, kind, wanted[0])
                 print(kind, answer["kills"][kind], file=sys.stderr, flush=True)
         answer["control"] = control(reference, folder)
     answer["passed"] = verdicts(answer)
-    conclude(HERE / "kills.json", __doc__.split("\n")[0], answer, watch, quick=quick)
+    study.conclude(answer)
 
 
 def verdicts(answer: Row) -> dict[str, bool]:
@@ -94,27 +95,43 @@ def verdicts(answer: Row) -> dict[str, bool]:
 # Kills
 
 
-def killed(
-    reference: Reference, new_store: Stores, wanted: tuple[int, float, dict[str, float]]
-) -> Row:
+def until_enough(trials: Trials, work: Callable[..., Row], kind: str, n: int) -> Row:
     """Kill runs of one batch after another until there were enough kills."""
-    kills = Kills([], *wanted, random.Random(SEED))
-    found: Row = {"batches": 0, "differences": [], "other_ends": []}
-    while len(kills.done) < kills.n:
-        with new_store() as store, tempfile.TemporaryDirectory() as name:
-            out = Path(name) / "out"
-            while not run_killed(reference, store, out, kills, found["other_ends"]):
-                pass
-            found["differences"] += reference.judge(out, store)
-            found["batches"] += 1
-    return found | {
-        "n": kills.n,
-        "how": dict(Counter(kill["how"] for kill in kills.done)),
-        "when": dict(Counter(kill["when"] for kill in kills.done)),
+    batches: list[Row] = []
+    while (left := n - sum(len(own["kills"]) for own in batches)) > 0:
+        batches.append(trials.once(work, kind, len(batches), left, also=PROGRAM))
+    kills = [kill for own in batches for kill in own["kills"]]
+    return {
+        "batches": len(batches),
+        "differences": [line for own in batches for line in own["differences"]],
+        "other_ends": [line for own in batches for line in own["other_ends"]],
+        "n": n,
+        "how": dict(Counter(kill["how"] for kill in kills)),
+        "when": dict(Counter(kill["when"] for kill in kills)),
         # An interpreter that is only starting tells an interrupt in its own way.
-        "interrupts_told_in_one_line": [kill["told"] for kill in kills.done if "told" in kill],
-        "slowest_end_s": max(kill["gone_s"] for kill in kills.done),
+        "interrupts_told_in_one_line": [kill["told"] for kill in kills if "told" in kill],
+        "slowest_end_s": max(kill["gone_s"] for kill in kills),
     }
+
+
+def killed(
+    reference: Reference,
+    new_store: Stores,
+    per_run: float,
+    hows: dict[str, float],
+    kind: str,
+    number: int,
+    n: int,
+) -> Row:
+    """Kill runs of a batch, at most so many, until it has come to its end."""
+    kills = Kills([], n, per_run, hows, random.Random(f"{SEED} {kind} {number}"))
+    other_ends: list[str] = []
+    with new_store() as store, tempfile.TemporaryDirectory() as name:
+        out = Path(name) / "out"
+        while not run_killed(reference, store, out, kills, other_ends):
+            pass
+        differences = reference.judge(out, store)
+    return {"kills": kills.done, "differences": differences, "other_ends": other_ends}
 
 
 @dataclass(frozen=True)

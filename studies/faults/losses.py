@@ -14,7 +14,6 @@ Method
 
 from __future__ import annotations
 
-import argparse
 import os
 import random
 import re
@@ -22,10 +21,12 @@ import signal
 import subprocess
 import tempfile
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from studies.faults.driving import (
+    PROGRAM,
     SOME_REFUSED,
     Reference,
     completed,
@@ -34,10 +35,9 @@ from studies.faults.driving import (
     reference_of,
     running,
 )
-from studies.record import Stopwatch, conclude
+from studies.record import Study
 from studies.servers import missing_postgres, postgres
 
-HERE = Path(__file__).parent
 SEED = 20261122
 MACHINES, QUICK_MACHINES = {"WORN-A": 40, "WATCHED-A": 40}, {"WATCHED-A": 6}
 N_LOST = 5
@@ -48,24 +48,23 @@ Row = dict[str, Any]
 
 def main() -> None:
     """Run the study; ``--quick`` does a small part and records nothing."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--quick", action="store_true")
-    options = parser.parse_args()
-    watch, quick = Stopwatch(), options.quick
+    study = Study(__file__, __doc__)
+    quick, once = study.quick, study.trials.once
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         batch = make_batch(folder, *((QUICK_MACHINES, 1) if quick else (MACHINES, 2)))
         reference = reference_of(batch, folder / "reference")
+        sizes, lost = (QUICK_SIZES, (1, 0.0)) if quick else (SIZES, (N_LOST, 0.5))
+        both = partial(full_disk, reference, folder / "both", with_store=True)
+        output = partial(full_disk, reference, folder / "output", with_store=False)
         answer: Row = {
             "seed": SEED,
-            "full disk": full_disk(reference, folder / "both", QUICK_SIZES if quick else SIZES),
-            "full disk, output alone": None
-            if quick
-            else full_disk(reference, folder / "output", SIZES, with_store=False),
-            "lost database": lost_database(reference, *((1, 0.0) if quick else (N_LOST, 0.5))),
+            "full disk": once(both, sizes, also=PROGRAM),
+            "full disk, output alone": None if quick else once(output, sizes, also=PROGRAM),
+            "lost database": once(partial(lost_database, reference), *lost, also=PROGRAM),
         }
     answer["passed"] = verdicts(answer)
-    conclude(HERE / "losses.json", __doc__.split("\n")[0], answer, watch, quick=quick)
+    study.conclude(answer)
 
 
 def verdicts(answer: Row) -> dict[str, bool]:
@@ -80,7 +79,7 @@ def verdicts(answer: Row) -> dict[str, bool]:
 
 
 def full_disk(
-    reference: Reference, folder: Path, sizes: Sequence[float], *, with_store: bool = True
+    reference: Reference, folder: Path, sizes: Sequence[float], *, with_store: bool
 ) -> Row | None:
     """Run on a file system that is too small, enlarge it and go on; None where none can be made.
 

@@ -15,17 +15,18 @@ Method
 
 from __future__ import annotations
 
-import argparse
 import random
 import sys
 import tempfile
 from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from studies.faults.driving import (
+    PROGRAM,
     SOME_REFUSED,
     Reference,
     Stores,
@@ -37,9 +38,8 @@ from studies.faults.driving import (
     rows,
     running,
 )
-from studies.record import Stopwatch, conclude
+from studies.record import Study
 
-HERE = Path(__file__).parent
 SEED = 20261122
 ONE = {"WORN-A": 12, "WATCHED-A": 28}
 OTHER = {"WORN-B": 12, "WATCHED-B": 28}
@@ -47,15 +47,18 @@ MORE = {"WORN-A": 14, "WATCHED-A": 30}  # begins with the logs of the first
 QUICK_ONE, QUICK_OTHER = {"WATCHED-A": 6}, {"WATCHED-B": 6}
 N_PAIRS = 3
 
+# The second run of a pair is the first once more, or one of the others.
+OTHERS, KILLED = ("same", "other", "more"), ", one killed"
+WAYS = tuple(f"{logs} logs{kill}" for logs in OTHERS for kill in ("", KILLED))
+QUICK_WAY = (f"other logs{KILLED}",)
+
 Row = dict[str, Any]
 
 
 def main() -> None:
     """Run the study; ``--quick`` does a small part and records nothing."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--quick", action="store_true")
-    options = parser.parse_args()
-    watch, quick = Stopwatch(), options.quick
+    study = Study(__file__, __doc__)
+    quick, once = study.quick, study.trials.once
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         kinds_of_logs = (QUICK_ONE, QUICK_OTHER) if quick else (ONE, OTHER, MORE)
@@ -67,14 +70,18 @@ def main() -> None:
         answer: Row = {"seed": SEED, "pairs": {}}
         with backends(folder) as kinds:
             for kind, new_store in kinds.items():
-                answer["pairs"][kind] = pairs(alone, new_store, 1 if quick else N_PAIRS, quick)
+                n, of_kind = 1 if quick else N_PAIRS, partial(pairs, alone, new_store)
+                answer["pairs"][kind] = {
+                    way: once(of_kind, kind, way, n, also=PROGRAM)
+                    for way in (QUICK_WAY if quick else WAYS)
+                }
                 print(kind, answer["pairs"][kind], file=sys.stderr, flush=True)
     answer["passed"] = {
         f"{what}, {kind}": not found["wrong"]
         for kind, cases in answer["pairs"].items()
         for what, found in cases.items()
     }
-    conclude(HERE / "together.json", __doc__.split("\n")[0], answer, watch, quick=quick)
+    study.conclude(answer)
 
 
 @dataclass(frozen=True)
@@ -106,22 +113,16 @@ class Pair:
         return found
 
 
-def pairs(alone: list[Reference], new_store: Stores, n: int, quick: bool) -> Row:
-    """Run two at once, n times in each way."""
-    rng = random.Random(SEED)
-    # The second run of a pair is the first once more, or one of the others.
-    kinds = dict(zip(("same", "other", "more"), alone, strict=False))
-    found: Row = {}
-    for logs, second in kinds.items():
-        for kill in (False, True):
-            if quick and (logs, kill) != ("other", True):
-                continue
-            pair = Pair(alone[0], second, logs)
-            # Every second pair is started together, the others one after the other.
-            gaps = [rng.uniform(0, pair.first.seconds) if k % 2 else 0.0 for k in range(n)]
-            wrong = [line for gap in gaps for line in one_pair(pair, new_store, gap, kill, rng)]
-            found[f"{logs} logs{', one killed' if kill else ''}"] = {"n": n, "wrong": wrong}
-    return found
+def pairs(alone: list[Reference], new_store: Stores, kind: str, way: str, n: int) -> Row:
+    """Run two at once, n times in a way."""
+    rng = random.Random(f"{SEED} {kind} {way}")
+    logs = way.split()[0]
+    pair = Pair(alone[0], alone[OTHERS.index(logs)], logs)
+    # Every second pair is started together, the others one after the other.
+    gaps = [rng.uniform(0, pair.first.seconds) if k % 2 else 0.0 for k in range(n)]
+    kill = way.endswith(KILLED)
+    wrong = [line for gap in gaps for line in one_pair(pair, new_store, gap, kill, rng)]
+    return {"n": n, "wrong": wrong}
 
 
 def one_pair(

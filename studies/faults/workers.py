@@ -14,15 +14,16 @@ Method
 
 from __future__ import annotations
 
-import argparse
 import random
 import signal
 import sys
 import tempfile
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from studies.faults.driving import (
+    PROGRAM,
     SOME_REFUSED,
     Reference,
     completed,
@@ -33,10 +34,9 @@ from studies.faults.driving import (
     rows,
     running,
 )
-from studies.record import Stopwatch, conclude
+from studies.record import Study
 from studies.servers import Cluster, dask_cluster, missing_distributed
 
-HERE = Path(__file__).parent
 SEED = 20261122
 MACHINES = {"WORN-A": 50, "WORN-B": 46, "WORN-C": 46, "WORN-D": 8, "WATCHED-A": 50}
 QUICK_MACHINES = {"WATCHED-A": 20}
@@ -48,10 +48,8 @@ Row = dict[str, Any]
 
 def main() -> None:
     """Run the study; ``--quick`` does a small part and records nothing."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--quick", action="store_true")
-    options = parser.parse_args()
-    watch, quick = Stopwatch(), options.quick
+    study = Study(__file__, __doc__)
+    quick, once = study.quick, study.trials.once
     if why := missing_distributed():
         sys.exit(why)
     with tempfile.TemporaryDirectory() as name:
@@ -60,13 +58,15 @@ def main() -> None:
         reference = reference_of(batch, folder / "reference")
         with dask_cluster() as cluster:
             pace = (QUICK_KILLS, QUICK_PER_RUN) if quick else (N_KILLS, KILLS_PER_RUN)
-            killed = workers_killed(reference, cluster, *pace)
+            killed = once(partial(workers_killed, reference, cluster), *pace, also=PROGRAM)
         answer: Row = {
             "seed": SEED,
             "uninterrupted": {"seconds": round(reference.seconds, 1), "rows": reference.rows},
             "workers killed": killed,
             # A client waits long for its scheduler to come again.
-            "scheduler lost": None if quick else scheduler_lost(reference),
+            "scheduler lost": None
+            if quick
+            else once(partial(scheduler_lost, reference), also=PROGRAM),
             "control": control(reference, folder),
         }
     answer["passed"] = {
@@ -80,7 +80,7 @@ def main() -> None:
             "as uninterrupted, scheduler lost": not lost["differences"],
             "told in one line, scheduler lost": told,
         }
-    conclude(HERE / "workers.json", __doc__.split("\n")[0], answer, watch, quick=quick)
+    study.conclude(answer)
 
 
 def workers_killed(reference: Reference, cluster: Cluster, n_kills: int, per_run: float) -> Row:

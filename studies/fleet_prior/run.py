@@ -30,16 +30,14 @@ Answer
     times the life teaches 1,327 ± 374, and its 90 % intervals cover 71 %. Coverage alone does not
     find out the former: 42 and 86 % are within what 108 lives can tell.
 Run time
-    10 minutes of one processor. With ``--fleets FILE`` fleets done before are not done again.
+    10 minutes of one processor.
 """
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import cache
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -53,11 +51,10 @@ from lmshealth.priors import Lognormal, Prior
 from lmshealth.prognosis import remaining_travel
 from lmshealth.stage import Stage
 from studies.fleet_prior.lives import MATURE, YOUNG, Life, draw, draw_fleet, longer_lived, machine
-from studies.ranks import Row, collect, digest
-from studies.record import LEVEL, Stopwatch, as_row, conclude
+from studies.ranks import Row
+from studies.record import LEVEL, Study, as_row
 
 Array = NDArray[np.float64]
-HERE = Path(__file__).parent
 SEED = 20261122
 FLEETS, QUICK = 40, 2
 # How many machines of a fleet teach, by its kind, and how many learn.
@@ -78,14 +75,9 @@ _MODEL = ("courses", "density", "fleet", "importance", "laws", "life", "lifefit"
 
 def main() -> None:
     """Run the study; ``--quick`` does a small part and records nothing."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--quick", action="store_true")
-    parser.add_argument("--fleets", type=Path, help="file of fleets done before, to go on with")
-    options = parser.parse_args()
-    watch = Stopwatch()
-    kind, n = (SMALL, QUICK) if options.quick else (FLEET, FLEETS)
-    tasks = [(kind, number) for number in range(n)]
-    rows = collect(options.fleets, lambda _: digest(*_MODEL), tasks, one)
+    study = Study(__file__, __doc__)
+    kind, n = (SMALL, QUICK) if study.quick else (FLEET, FLEETS)
+    rows = study.trials.collect(one, [(kind, number) for number in range(n)])
     answer: dict[str, Any] = {
         "seed": SEED,
         "fleets": n,
@@ -97,8 +89,7 @@ def main() -> None:
         ],
     }
     answer["passed"] = verdicts(answer["ways"], n)
-    question = __doc__.split("\n")[0]
-    conclude(HERE / "result.json", question, answer, watch, quick=options.quick)
+    study.conclude(answer)
 
 
 @cache

@@ -29,8 +29,6 @@ Answer
 
 from __future__ import annotations
 
-import argparse
-import json
 import os
 import tempfile
 from dataclasses import dataclass, replace
@@ -60,9 +58,8 @@ from studies.frf_modes.records import (
     at_random,
     periodic,
 )
-from studies.record import Stopwatch, judge_coverage, keep
+from studies.record import Study, judge_coverage, options
 
-HERE = Path(__file__).parent
 NOT_MET = {
     "both modes always": "one of 400 records of the distorting motor gives another number of them",
     "wide sweeps: z below 2 on average": "in X modes too weak to be seen bias pitch: give a band",
@@ -103,28 +100,26 @@ SWEEPS = {
 
 def main() -> None:
     """Run the study; ``--quick`` does few seeds, leaves the sweeps out and records nothing."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--quick", action="store_true")
+    parser = options(__doc__)
     parser.add_argument("--seeds", type=int, default=400)
-    options = parser.parse_args()
-    watch = Stopwatch()
-    seeds = 8 if options.quick else options.seeds
-    cases = {name: summarise(name, [one_seed(name, k) for k in range(seeds)]) for name in CASES}
+    study = Study(__file__, __doc__, parser.parse_args())
+    quick, trials = study.quick, study.trials
+    seeds = 8 if quick else study.options.seeds
+    cases = {
+        name: summarise(name, trials.collect(one_seed, [(name, k) for k in range(seeds)]))
+        for name in CASES
+    }
     answer: dict[str, Any] = {"n_seeds": seeds, "cases": cases}
     swept: dict[str, Any] = {}
-    if not options.quick:
-        swept = {name: [one_sweep(name, seed) for seed in range(8)] for name in SWEEPS}
+    if not quick:
+        swept = {
+            name: trials.collect(one_sweep, [(name, seed) for seed in range(8)]) for name in SWEEPS
+        }
         answer["sweeps"] = {name: summarise_sweeps(rows) for name, rows in swept.items()}
-    benches, pictures = read_benches(Path(os.environ["LMSHEALTH_DATA"]), quick=options.quick)
+    benches, pictures = read_benches(Path(os.environ["LMSHEALTH_DATA"]), quick=quick)
     answer |= benches
-    answer |= {"passed": judge(answer, quick=options.quick), "not_met": NOT_MET}
-    print(json.dumps(answer, indent=1))
-    if not options.quick:
-        keep(HERE / "result.json", __doc__.split("\n")[0],
-             {**answer, "pictures": pictures, "sweep_rows": swept}, watch)  # fmt: skip
-    failed = {name for name, fine in answer["passed"].items() if not fine}
-    if not failed <= set(NOT_MET):
-        raise SystemExit(f"not as asked: {failed - set(NOT_MET)}")
+    answer |= {"passed": judge(answer, quick=quick), "not_met": NOT_MET}
+    study.conclude(answer, beside={"pictures": pictures, "sweep_rows": swept}, not_met=NOT_MET)
 
 
 def make_log(given: Array, answer: Array, displacement: bool) -> Log:

@@ -46,10 +46,9 @@ Run time
 
 from __future__ import annotations
 
-import argparse
-import json
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -80,14 +79,15 @@ from studies.health_robustness.worlds import (
     told,
 )
 from studies.lives import DAMAGED, HEALTHY, Array, Estimates, Life, drawn, plan_of, rng_of
-from studies.raw_lives import identified, measured
-from studies.record import Stopwatch, keep
+from studies.raw_lives import RAW, identified, measured
+from studies.record import Study, options
+from studies.resume import Trials
 
-HERE = Path(__file__).parent
 STAGES = ("lms-y", "lms-x")
 KINDS = HEALTHY + DAMAGED
 JUMPING = ("sudden-loosening", "crash")
 FIRST_SEED, RAW_SEED = 8000, 100
+SIZES = ("studies.raw_lives",)  # where the sizes of estimates come from
 MAP_STD = 0.05  # as the descriptions have it
 _LEVELS = (0.05, 0.5, 0.95)
 RIGHT, WRONG = "map right", "map 5 % wrong"
@@ -110,26 +110,18 @@ Row = dict[str, Any]
 
 def main() -> None:
     """Run the study; ``--quick`` does a few lives and records nothing."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--quick", action="store_true")
+    parser = options(__doc__)
     parser.add_argument("--raw", type=int, default=0, metavar="SEEDS")
     parser.add_argument("--control", type=int, default=0, metavar="LIVES")
-    parser.add_argument("--cache", type=Path, help="folder that keeps estimates of raw lives")
-    options = parser.parse_args()
-    watch = Stopwatch()
-    name = "result"
-    if options.raw:
-        name, answer = "raw", raw(options.raw, options.cache)
-    elif options.control:
-        name, answer = "control", control(options.control)
+    study = Study(__file__, __doc__, parser.parse_args())
+    kept, name = study.kept(RAW), "result"
+    if study.options.raw:
+        name, answer = "raw", raw(study.options.raw, kept)
+    elif study.options.control:
+        name, answer = "control", control(study.options.control, kept)
     else:
-        answer = study(QUICK if options.quick else FULL)
-    print(json.dumps(answer, indent=1))
-    if not options.quick:
-        keep(HERE / f"{name}.json", __doc__.split("\n")[0], answer, watch)
-    failed = [name for name, fine in answer.get("passed", {}).items() if not fine]
-    if failed and not options.quick:
-        raise SystemExit(f"not as asked: {failed}")
+        answer = drawn_lives(study.trials, QUICK if study.quick else FULL, kept)
+    study.conclude(answer, name=name, quick_may_fail=True)
 
 
 # How many lives: of each kind, of these by laws in Y and in X; on paths, by laws, by laws in X, by
@@ -140,29 +132,49 @@ QUICK = {"kind": 1, "kind_law": 1, "kind_other": 0, "path": 12, "law": 1, "other
          "plants": 1, "maps": 1, "chains": 1, "sized": 8}  # fmt: skip
 
 
-def study(n: dict[str, int]) -> Row:
+def drawn_lives(trials: Trials, n: dict[str, int], kept: Path | None) -> Row:
     """Draw all fleets and judge them."""
-    sizes = {stage: measured(stage, n["sized"]) for stage in STAGES}
-    lost: list[str] = []
-    lives = []
-    for stage, n_law in zip(STAGES, (n["kind_law"], n["kind_other"]), strict=True):
-        for i, kind in enumerate(KINDS):
-            cases = list(of_kind(stage, kind, n["kind"], sizes, i))
-            lives += judged(cases, n_law, lost)
-    fleets = [
-        row
-        for stage, law in (("lms-y", n["law"]), ("lms-x", n["other"]))
-        for row in drawn_fleets(stage, n["path"], law, sizes, lost)
-    ]
+    sizes = {stage: measured(stage, n["sized"], kept) for stage in STAGES}
+    n_law = dict(zip(STAGES, (n["kind_law"], n["kind_other"]), strict=True))
+    laws = dict(zip(STAGES, (n["law"], n["other"]), strict=True))
+    once, each = partial(trials.once, also=SIZES), partial(trials.collect, also=SIZES)
+    kinds = [(stage, kind, n["kind"], n_law[stage]) for stage in STAGES for kind in KINDS]
+    worlds = [(stage, world, n["path"], laws[stage]) for stage in STAGES for world in ARMS]
+    parts = {
+        "lives": each(partial(lives_of, sizes), kinds),
+        "fleets": each(partial(fleet_of, sizes), worlds),
+        "plants": [once(partial(plants_of, sizes), n["path"], n["plants"], n["maps"])],
+    }
     answer: Row = {
-        "lives": lives,
-        "fleets": fleets,
-        "plants": wrong_plants("lms-y", n, sizes, lost),
-        "demo": demo(n["path"] // 2, sizes),
-        "chains": chains(n["chains"], sizes),
-        "not_drawn": lost,
+        name: [row for part in found for row in part["rows"]] for name, found in parts.items()
+    }
+    answer |= {
+        "demo": once(partial(demo, sizes=sizes), n["path"] // 2),
+        "chains": once(partial(chains, sizes=sizes), n["chains"]),
+        "not_drawn": [line for found in parts.values() for part in found for line in part["lost"]],
     }
     return answer | {"passed": verdicts(answer)}
+
+
+def lives_of(sizes: Sizes, stage: str, kind: str, n: int, n_law: int) -> Row:
+    """Judge lives of one kind."""
+    lost: list[str] = []
+    cases = list(of_kind(stage, kind, n, sizes, KINDS.index(kind)))
+    return {"rows": judged(cases, n_law, lost), "lost": lost}
+
+
+def fleet_of(sizes: Sizes, stage: str, world: str, n_path: int, n_law: int) -> Row:
+    """Judge drawn lives in one world."""
+    lost: list[str] = []
+    rows = drawn_fleets(stage, n_path, n_law, sizes, lost, {world: ARMS[world]})
+    return {"rows": rows, "lost": lost}
+
+
+def plants_of(sizes: Sizes, n_path: int, n_law: int, n_maps: int) -> Row:
+    """Judge lives with maps of plants that are not theirs."""
+    lost: list[str] = []
+    n = {"path": n_path, "plants": n_law, "maps": n_maps}
+    return {"rows": wrong_plants("lms-y", n, sizes, lost), "lost": lost}
 
 
 def of_kind(stage: str, kind: str, n: int, sizes: Sizes, key: int) -> Iterator[Case]:
@@ -354,10 +366,10 @@ def raw(seeds: int, cache: Path | None) -> Row:
     return {"lives": result, "not_drawn": lost}
 
 
-def control(n: int) -> Row:
+def control(n: int, kept: Path | None) -> Row:
     """Judge more lives with halved covariances, which must not cover."""
     lost: list[str] = []
-    sizes = {"lms-y": measured("lms-y", FULL["sized"])}
+    sizes = {"lms-y": measured("lms-y", FULL["sized"], kept)}
     rows = drawn_fleets("lms-y", n, n, sizes, lost, {RIGHT: (HALVED,)})
     failing = {
         what: all(row["90"]["high"] < 0.9 for row in rows if row["what"] == what)

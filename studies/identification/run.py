@@ -24,13 +24,10 @@ Run time
 
 from __future__ import annotations
 
-import argparse
-import json
 import os
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -43,9 +40,8 @@ from lmshealth.results import Modes
 from lmshealth.stage import Stage
 from studies.identification.cases import CASES, HEADLINE, Case
 from studies.identification.records import Array, describe
-from studies.record import NOMINAL, Stopwatch, judge_coverage, keep
+from studies.record import NOMINAL, Study, judge_coverage
 
-HERE = Path(__file__).parent
 FACTOR = 1.5
 CHUNK = 50
 FUSED = "following error and two accelerometers"
@@ -55,13 +51,9 @@ QUICK = ("isolated, SNR 100", "isolated as 7 moves of 3 s", FUSED)
 
 def main() -> None:
     """Run the study; ``--quick`` does some records of some kinds and records nothing."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--quick", action="store_true")
-    parser.add_argument("--share", type=float, default=1.0, help="of the seeds")
-    options = parser.parse_args()
-    watch = Stopwatch()
-    cases = [k for k, case in enumerate(CASES) if not options.quick or case.name in QUICK]
-    seeds = {k: 40 if options.quick else round(options.share * CASES[k].seeds) for k in cases}
+    study = Study(__file__, __doc__)
+    cases = [k for k, case in enumerate(CASES) if not study.quick or case.name in QUICK]
+    seeds = {k: 40 if study.quick else CASES[k].seeds for k in cases}
     # Two workers fill two cores: threads inside linear algebra would get in their way.
     os.environ.update(dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1"))
     tasks = [
@@ -70,7 +62,7 @@ def main() -> None:
         for first in range(0, seeds[k], CHUNK)
     ]
     with ProcessPoolExecutor(2, mp_context=get_context("spawn")) as pool:
-        parts = list(pool.map(identify_some, *zip(*tasks, strict=True)))
+        parts = study.trials.collect(listed, tasks, pool=pool)
     found = {
         k: np.concatenate([p for (j, *_), p in zip(tasks, parts, strict=True) if j == k])
         for k in cases
@@ -78,14 +70,15 @@ def main() -> None:
     rows = [row for k in cases for row in summarise(CASES[k], found[k])]
     answer: dict[str, Any] = {
         "cases": rows,
-        "passed": verdicts(rows, quick=options.quick),
+        "passed": verdicts(rows, quick=study.quick),
         "not_met": shortfalls(rows),
     }
-    print(json.dumps(answer, indent=1))
-    if not options.quick and options.share == 1.0:
-        keep(HERE / "result.json", __doc__.split("\n")[0], answer, watch)
-    if not all(answer["passed"].values()):
-        raise SystemExit(f"not as asked: {answer['passed']}")
+    study.conclude(answer)
+
+
+def listed(k: int, first: int, last: int) -> list[Any]:
+    """Do `identify_some`, as lists."""
+    return identify_some(k, first, last).tolist()
 
 
 def identify_some(k: int, first: int, last: int) -> Array:

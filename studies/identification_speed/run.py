@@ -15,8 +15,6 @@ Run time
 
 from __future__ import annotations
 
-import argparse
-import json
 import tempfile
 import time
 import tracemalloc
@@ -34,33 +32,25 @@ from models.recording import Recording, record
 from models.stages import stage_named
 from studies.identification.cases import CASES
 from studies.identification.records import describe
-from studies.record import Stopwatch, keep
+from studies.record import Study
 
-HERE = Path(__file__).parent
 HEADLINE = "three modes, three channels, 60 s"
 SIGNALS = ("delta_e", "acc_feed", "acc_pitch", "acc_between")
 
 
 def main() -> None:
     """Run the study; ``--quick`` repeats less and records nothing."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--quick", action="store_true")
-    quick = parser.parse_args().quick
-    watch = Stopwatch()
+    study = Study(__file__, __doc__)
     answer: dict[str, Any] = {
-        "record": headline(5 if quick else 40),
-        "log": long_log(2 if quick else 15),
+        "record": headline(5 if study.quick else 40),
+        "log": long_log(2 if study.quick else 15),
     }
     answer["passed"] = {
         "headline record in less than 0.05 s": answer["record"]["least_s"] < 0.05,
         "three times reading and transforming": answer["log"]["median_ratio"] <= 3,
         "three times the record's memory": answer["log"]["memory_over_record"] <= 3,
     }
-    print(json.dumps(answer, indent=1))
-    if not quick:
-        keep(HERE / "result.json", __doc__.split("\n")[0], answer, watch)
-        if not all(answer["passed"].values()):
-            raise SystemExit(f"not as asked: {answer['passed']}")
+    study.conclude(answer, quick_may_fail=True)
 
 
 def timed(task: Callable[[], object]) -> float:

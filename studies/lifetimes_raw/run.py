@@ -27,13 +27,12 @@ Answer
     end of life is visible, the others with a probability near it (95 % in the mean); of 64 that do,
     none is. No machine was refused, and no step was seen where there was none.
 Run time
-    An hour and a half of one processor for simulation and identification, kept in ``--cache``, and
-    ten minutes for the posteriors, kept in ``--lives``.
+    An hour and a half of one processor for simulation and identification, and ten minutes
+    for the posteriors.
 """
 
 from __future__ import annotations
 
-import argparse
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -49,12 +48,11 @@ from lmshealth.stage import Stage, load_stage
 from lmshealth.tracking import track
 from studies.lifetimes_raw.lives import N_LOGS, STAGE, PriorPlan, plan_of
 from studies.lives import history_of, life_of
-from studies.ranks import N_DRAWS, Array, Row, bands, collect, digest, judge, rank, uniform
-from studies.raw_lives import identified
-from studies.record import Stopwatch, conclude
+from studies.ranks import N_DRAWS, Array, Row, bands, judge, rank, uniform
+from studies.raw_lives import RAW, identified
+from studies.record import Study
 from studies.sbc_epoch.lives import believing
 
-HERE = Path(__file__).parent
 SEED = 20261122
 BELIEVED, STATED = "map believed", "map error of 5 %"
 HALVED = "draws pulled to half their distance"
@@ -73,22 +71,15 @@ CODE = ("courses", "density", "importance", "laws", "life", "lifefit", "passage"
 
 def main() -> None:
     """Run the study; ``--quick`` does a small part and records nothing."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--quick", action="store_true")
-    parser.add_argument("--cache", type=Path, help="folder that keeps estimates of raw lives")
-    parser.add_argument("--lives", type=Path, help="file of lives done before, to go on with")
-    options = parser.parse_args()
-    watch = Stopwatch()
-    n, logs = (QUICK_LIVES, QUICK_LOGS) if options.quick else (N_LIVES, N_LOGS)
+    study = Study(__file__, __doc__)
+    n, logs = (QUICK_LIVES, QUICK_LOGS) if study.quick else (N_LIVES, N_LOGS)
     tasks = [(kind, seed) for kind in (BELIEVED, STATED) for seed in range(1, n + 1)]
-    one_of = partial(one, logs=logs, cache=options.cache)
-    rows = collect(options.lives, lambda _: digest(*CODE), tasks, one_of)
+    found = study.trials.collect(partial(one, logs=logs, cache=study.kept(RAW)), tasks)
+    rows = [{"kind": kind} | row for (kind, _), row in zip(tasks, found, strict=True)]
     answer = {"seed": SEED, "lives": n, "logs": logs} | judged(rows)
     answer["passed"] = verdicts(answer)
-    found = [row for part in answer["ranks"].values() for row in part.values()]
-    answer["bands"] = bands(found)
-    question = __doc__.split("\n")[0]
-    conclude(HERE / "result.json", question, answer, watch, quick=options.quick)
+    answer["bands"] = bands(row for part in answer["ranks"].values() for row in part.values())
+    study.conclude(answer)
 
 
 def one(kind: str, seed: int, *, logs: int, cache: Path | None) -> Row:

@@ -28,11 +28,8 @@ Run time
 
 from __future__ import annotations
 
-import argparse
-import json
 from collections.abc import Callable
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 from studies.line_test.crossing import modes
@@ -48,9 +45,8 @@ from studies.line_test.signals import (
     resonances,
 )
 from studies.line_test.trials import LONG, SHORT, USUAL, rated, rng_of, tested
-from studies.record import Stopwatch, keep
+from studies.record import Study
 
-HERE = Path(__file__).parent
 DECLARED = (0.05, 0.01, 0.001)
 BACKGROUNDS: dict[str, tuple[float, Density]] = {
     "white, 3 s": (SHORT, flat),
@@ -72,29 +68,23 @@ NOT_MET = {IN_PLACE: "lines of 3 times the peak are too weak to be told from a r
 
 def main() -> None:
     """Run the study; ``--quick`` does a small part of each question and records nothing."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--quick", action="store_true")
-    quick = parser.parse_args().quick
-    watch = Stopwatch()
+    study = Study(__file__, __doc__)
+    quick, once = study.quick, study.trials.once
     names = ["white, 3 s", "resonances of 0.5 %, 3 s"] if quick else list(BACKGROUNDS)
+    share = 0.1 if quick else 1.0
     answer: dict[str, Any] = {
-        "false_alarms": [alarms(name, 0.1 if quick else 1.0) for name in names],
-        "controls": controls(40 if quick else 400),
-        "border": border(0 if quick else 400),
-        "detection": detection(20 if quick else 200, SHORT if quick else LONG),
-        "beside": beside(10 if quick else 100),
-        "satellites": satellites(20 if quick else 400),
-        "strokes": strokes(6 if quick else 60),
-        "simulated_strokes": [] if quick else simulated_strokes(),
-        "modes": modes(1 if quick else 8),
+        "false_alarms": study.trials.collect(alarms, [(name, share) for name in names]),
+        "controls": once(controls, 40 if quick else 400),
+        "border": once(border, 0 if quick else 400),
+        "detection": once(detection, 20 if quick else 200, SHORT if quick else LONG),
+        "beside": once(beside, 10 if quick else 100),
+        "satellites": once(satellites, 20 if quick else 400),
+        "strokes": once(strokes, 6 if quick else 60),
+        "simulated_strokes": [] if quick else once(simulated_strokes),
+        "modes": once(modes, 1 if quick else 8),
     }
     answer |= {"passed": verdicts(answer), "not_met": NOT_MET}
-    print(json.dumps(answer, indent=1))
-    if not quick:
-        keep(HERE / "result.json", __doc__.split("\n")[0], answer, watch)
-    failed = {name for name, fine in answer["passed"].items() if not fine}
-    if not failed <= set(NOT_MET):
-        raise SystemExit(f"not as asked: {failed - set(NOT_MET)}")
+    study.conclude(answer, not_met=NOT_MET)
 
 
 def verdicts(answer: dict[str, Any]) -> dict[str, bool]:

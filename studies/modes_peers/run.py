@@ -32,15 +32,12 @@ Run time
 
 from __future__ import annotations
 
-import argparse
-import json
 import os
 import time
 from concurrent.futures import ProcessPoolExecutor
 from importlib.metadata import version
 from importlib.util import find_spec
 from multiprocessing import get_context
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -49,9 +46,8 @@ from scipy.stats import norm
 from studies.identification.cases import CASES, Case
 from studies.identification.records import Array
 from studies.modes_peers.memory import peak_of
-from studies.record import NOMINAL, Stopwatch, judge_coverage, keep
+from studies.record import NOMINAL, Study, judge_coverage
 
-HERE = Path(__file__).parent
 PACKAGES = {"pyoma2": "pyOMA-2", "pyOMA": "pyoma-toolbox"}
 NAMES = (
     "three modes, three channels, 60 s",
@@ -74,34 +70,28 @@ NOT_MET = {
 
 def main() -> None:
     """Run the study; ``--quick`` does a few records of one kind and records nothing."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--quick", action="store_true")
-    quick = parser.parse_args().quick
+    study = Study(__file__, __doc__)
     missing = [name for module, name in PACKAGES.items() if find_spec(module) is None]
     if missing:
         raise SystemExit(f"{' and '.join(missing)} not installed: pip install '.[peers]'")
-    watch = Stopwatch()
     # Threads inside linear algebra would make times depend on what else runs; bars are for people.
     threads = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS")
     os.environ.update(dict.fromkeys(threads, "1") | {"TQDM_DISABLE": "1"})
+    tasks = [
+        (name, QUICK_SEEDS if study.quick else SEEDS, study.quick)
+        for name in NAMES[: 1 if study.quick else None]
+    ]
     with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
-        cases = [
-            pool.submit(compare, name, QUICK_SEEDS if quick else SEEDS, quick).result()
-            for name in NAMES[: 1 if quick else None]
-        ]
+        cases = study.trials.collect(compare, tasks, pool=pool)
     answer: dict[str, Any] = {
         "versions": {name: version(name) for name in PACKAGES.values()},
         "cases": cases,
         "not_ahead_of": {case["case"]: not_ahead(case) for case in cases},
-        "passed": verdicts(cases, quick=quick),
+        "passed": verdicts(cases, quick=study.quick),
     }
     failed = {name for name, held in answer["passed"].items() if not held}
     answer["not_met"] = {name: why for name, why in NOT_MET.items() if name in failed}
-    print(json.dumps(answer, indent=1))
-    if not quick:
-        keep(HERE / "result.json", __doc__.split("\n")[0], answer, watch)
-    if failed - set(NOT_MET):
-        raise SystemExit(f"not as asked: {sorted(failed - set(NOT_MET))}")
+    study.conclude(answer, not_met=NOT_MET)
 
 
 def compare(name: str, seeds: int, quick: bool) -> dict[str, Any]:

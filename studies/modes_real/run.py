@@ -39,17 +39,14 @@ Data
 
 from __future__ import annotations
 
-import argparse
-import json
 import os
 from pathlib import Path
 from typing import Any
 
 from studies.modes_real.building import study_building
 from studies.modes_real.sets import study_koma, study_mpstd, study_shake, study_weimar
-from studies.record import Stopwatch, keep
+from studies.record import Study
 
-HERE = Path(__file__).parent
 OUTSIDE = 1.959963984540054
 NOT_MET = {
     "building: intervals of each third hold the whole": (
@@ -73,15 +70,13 @@ NOT_MET = {
 
 def main() -> None:
     """Run the study; ``--quick`` takes a third of the building and records nothing."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--quick", action="store_true")
-    quick = parser.parse_args().quick
+    study = Study(__file__, __doc__)
     if "LMSHEALTH_DATA" not in os.environ:
         raise SystemExit("LMSHEALTH_DATA is not set: it names the folder of real measurements")
-    watch, data = Stopwatch(), Path(os.environ["LMSHEALTH_DATA"])
+    data = Path(os.environ["LMSHEALTH_DATA"])
     answer: dict[str, Any] = {
         "seed": 0,
-        "building": study_building(data, quick=quick),
+        "building": study_building(data, quick=study.quick),
         "shake": study_shake(data),
         "shear_frame": study_koma(data),
         "light_frame": study_weimar(data),
@@ -90,11 +85,7 @@ def main() -> None:
     answer["passed"] = verdicts(answer)
     failed = {name for name, held in answer["passed"].items() if not held}
     answer["not_met"] = {name: why for name, why in NOT_MET.items() if name in failed}
-    print(json.dumps(answer, indent=1))
-    if not quick:
-        keep(HERE / "result.json", __doc__.split("\n")[0], answer, watch)
-    if failed - set(NOT_MET):
-        raise SystemExit(f"not as asked: {sorted(failed - set(NOT_MET))}")
+    study.conclude(answer, not_met=NOT_MET)
 
 
 def verdicts(answer: dict[str, Any]) -> dict[str, bool]:

@@ -30,7 +30,6 @@ Data
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
 import subprocess
@@ -52,9 +51,8 @@ from studies.movable_roller.calibration import (
     write_stage,
 )
 from studies.movable_roller.dwells import write_dwells
-from studies.record import Stopwatch, keep
+from studies.record import Study
 
-HERE = Path(__file__).parent
 NEW = 2  # the repeat that map and description do not know
 LEAST_INSIDE = 8
 _DONE, _SOME_REFUSED = 0, 3
@@ -63,21 +61,14 @@ _TOO_SURE = 0.25  # factor on standard deviations of the control
 
 
 def main() -> None:
-    """Run the study and keep its result."""
-    parser = argparse.ArgumentParser()
-    parser.add_argument("--quick", action="store_true", help="the same, printed, not kept")
-    quick = parser.parse_args().quick
-    watch = Stopwatch()
+    """Run the study; ``--quick`` does the same and records nothing."""
+    study = Study(__file__, __doc__)
     with tempfile.TemporaryDirectory() as scratch:
-        answer = study(Path(os.environ["LMSHEALTH_DATA"]), Path(scratch))
-    if quick:
-        print(json.dumps(answer))
-        return
-    question = "Is the position of a roller under a real beam where the posterior says it is?"
-    keep(HERE / "result.json", question, answer, watch)
+        answer = answered(Path(os.environ["LMSHEALTH_DATA"]), Path(scratch))
+    study.conclude(answer)
 
 
-def study(folder: Path, scratch: Path) -> dict[str, Any]:
+def answered(folder: Path, scratch: Path) -> dict[str, Any]:
     """Calibrate with two repeats and infer the third.
 
     Parameters

@@ -24,9 +24,7 @@ Run time
 
 from __future__ import annotations
 
-import argparse
 from datetime import UTC, datetime
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -39,10 +37,9 @@ from lmshealth.stage import Stage, load_stage
 from lmshealth.tracktable import Drifts
 from models.mapping import guide_frequencies
 from models.stages import stage_named
-from studies.record import LEVEL, Stopwatch, as_row, conclude
+from studies.record import LEVEL, Study, as_row
 
 Array = NDArray[np.float64]
-HERE = Path(__file__).parent
 SEED = 20261123
 LEVELS = (0.5, 0.9)
 NOISE, MAP_ERROR = 1e-3, 0.05
@@ -65,6 +62,11 @@ def drifts_of(stage: Stage, preload: float, mount: float, rng: np.random.Generat
     cov = NOISE**2 * (0.5 * np.eye(n) + 0.5)
     drift = ln_f(preload, mount) - new + wrong + rng.multivariate_normal(np.zeros(n), cov)
     return Drifts(stage.name, (WHEN,), np.array([1e6]), modes, drift[None], cov[None])
+
+
+def one_pair(seed: int, apart: bool) -> dict[str, Any]:
+    """Infer one pair of the shipped machines."""
+    return one_trial((load_stage("lms-x"), load_stage("lms-y")), seed, apart=apart)
 
 
 def one_trial(stages: tuple[Stage, Stage], seed: int, *, apart: bool) -> dict[str, Any]:
@@ -125,14 +127,10 @@ def summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
 
 def main() -> None:
     """Run the study; ``--quick`` does a few pairs and records nothing."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--quick", action="store_true")
-    quick = parser.parse_args().quick
-    watch = Stopwatch()
-    stages = (load_stage("lms-x"), load_stage("lms-y"))
-    n, n_control = (6, 4) if quick else (150, 60)
-    trials = [one_trial(stages, k, apart=False) for k in range(n)]
-    control = [one_trial(stages, 10_000 + k, apart=True) for k in range(n_control)]
+    study = Study(__file__, __doc__)
+    n, n_control = (6, 4) if study.quick else (150, 60)
+    trials = study.trials.collect(one_pair, [(k, False) for k in range(n)])
+    control = study.trials.collect(one_pair, [(10_000 + k, True) for k in range(n_control)])
     ways = {
         way: {name: summary([t[way][name] for t in trials]) for name in trials[0][way]}
         for way in ("X alone", "Y alone", "together")
@@ -148,9 +146,8 @@ def main() -> None:
             "half the width": judged([t["together"][SHARED] for t in trials], "half_level"),
         },
     }
-    answer["passed"] = verdicts(answer, quick=quick)
-    question = __doc__.split("\n")[0]
-    conclude(HERE / "result.json", question, answer, watch, quick=quick)
+    answer["passed"] = verdicts(answer, quick=study.quick)
+    study.conclude(answer)
 
 
 def verdicts(answer: dict[str, Any], *, quick: bool) -> dict[str, bool]:

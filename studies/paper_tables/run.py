@@ -19,8 +19,6 @@ Run time
 
 from __future__ import annotations
 
-import argparse
-import json
 from pathlib import Path
 from typing import Any
 
@@ -37,7 +35,7 @@ from studies.paper_tables.tables import (
     resonance_rows,
     velocity_rows,
 )
-from studies.record import Stopwatch, keep
+from studies.record import Study, options
 
 HERE = Path(__file__).parent
 # A frequency of Figure 18 depends strongly on velocity if it grows by this and gets this high.
@@ -60,13 +58,11 @@ REASONS = {
 
 def main() -> None:
     """Run the study; ``--quick`` takes two seeds, leaves out Table 2 and records nothing."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--quick", action="store_true")
+    parser = options(__doc__)
     parser.add_argument("--seeds", type=int, default=20)
-    options = parser.parse_args()
-    watch = Stopwatch()
-    seeds = 2 if options.quick else options.seeds
-    rows = loop_rows() + ([] if options.quick else resonance_rows()) + modal_rows()
+    study = Study(__file__, __doc__, parser.parse_args())
+    quick, seeds = study.quick, 2 if study.quick else study.options.seeds
+    rows = loop_rows() + ([] if quick else resonance_rows()) + modal_rows()
     moved = [row for axis in FILES for row in velocity_rows(axis, seeds)]
     control = [row for axis in FILES for row in velocity_rows(axis, 2, transients=False)]
     answer = {
@@ -74,12 +70,11 @@ def main() -> None:
         "summary": summarise(moved),
         "control_constant_velocity_only": summarise(control),
         "growing_with_velocity": {axis: growing(axis, moved) for axis in FILES},
-        "rows": [record(row) for row in (*rows, *moved)],
     }
-    if not options.quick:
-        keep(HERE / "result.json", __doc__.split("\n")[0], answer, watch)
-        (HERE / "tables.md").write_text(markdown(answer), encoding="utf-8")
-    print(json.dumps({k: v for k, v in answer.items() if k != "rows"}, indent=1))
+    told = [record(row) for row in (*rows, *moved)]
+    study.conclude(answer, beside={"rows": told})
+    if not quick:
+        (HERE / "tables.md").write_text(markdown({**answer, "rows": told}), encoding="utf-8")
 
 
 def ratios(row: Row) -> np.ndarray:

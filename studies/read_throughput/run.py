@@ -22,8 +22,6 @@ Data
 
 from __future__ import annotations
 
-import argparse
-import json
 import os
 import tempfile
 import time
@@ -41,9 +39,8 @@ from lmshealth.readers.formats import load
 from studies.read_throughput.files import BARE, RATE, Call, signals, write
 from studies.read_throughput.memory import needs
 from studies.read_throughput.samples import MAPS
-from studies.record import Stopwatch, keep
+from studies.record import Study
 
-HERE = Path(__file__).parent
 # Noise and fixed costs do not shrink with the file: the quick form is judged more mildly. An HDF5
 # reader that searched for damage as slowly as it might took 3.0 times the library.
 BOUND, QUICK_BOUND = 1.3, 2.5
@@ -57,21 +54,18 @@ SUFFIXES = (".uff", ".tdms", ".mat", ".csv", ".gz")
 
 def main() -> None:
     """Run the study; ``--quick`` reads less of fewer formats and records nothing."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--quick", action="store_true")
-    quick = parser.parse_args().quick
-    watch = Stopwatch()
-    with tempfile.TemporaryDirectory() as folder:
-        columns = signals(RATE * (30 if quick else 60))
-        times = {
-            name: compare(write(Path(folder) / name, columns), BARE[name])
-            for name in (BOUNDED if quick else BARE)
-        }
+    study = Study(__file__, __doc__)
+    if not study.quick and "LMSHEALTH_DATA" not in os.environ:
+        raise SystemExit("LMSHEALTH_DATA is not set: it names the folder of real measurements")
+    quick, trials = study.quick, study.trials
+    names = BOUNDED if quick else tuple(BARE)
+    found = trials.collect(timed, [(name, 30 if quick else 60) for name in names])
+    times = dict(zip(names, found, strict=True))
     long = QUICK_MINUTES if quick else LONG_MINUTES
-    memory = {
-        name: long_log(name, long, ("delta_e_um",) if quick else tuple(columns))
-        for name in (QUICK_MEMORY if quick else BARE)
-    }
+    names = QUICK_MEMORY if quick else tuple(BARE)
+    chosen = ("delta_e_um",) if quick else tuple(signals(1))
+    found = trials.collect(long_log, [(name, long, chosen) for name in names])
+    memory = dict(zip(names, found, strict=True))
     bound = QUICK_BOUND if quick else BOUND
     answer = {
         "seed": 0,
@@ -87,11 +81,13 @@ def main() -> None:
         },
         "samples": samples() if "LMSHEALTH_DATA" in os.environ else None,
     }
-    if not quick:
-        if answer["samples"] is None:
-            raise SystemExit("LMSHEALTH_DATA is not set: it names the folder of real measurements")
-        keep(HERE / "result.json", __doc__.split("\n")[0], answer, watch)
-    print(json.dumps(answer, indent=1))
+    study.conclude(answer, quick_may_fail=True)
+
+
+def timed(name: str, seconds: int) -> dict[str, Any]:
+    """Compare reader and libraries on a file of a format."""
+    with tempfile.TemporaryDirectory() as folder:
+        return compare(write(Path(folder) / name, signals(RATE * seconds)), BARE[name])
 
 
 def cost(work: Callable[[], object]) -> float:

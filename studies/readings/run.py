@@ -30,8 +30,6 @@ Data
 
 from __future__ import annotations
 
-import argparse
-import json
 import os
 import tempfile
 from pathlib import Path
@@ -43,27 +41,22 @@ from studies.readings.growth import known_growth, known_rms
 from studies.readings.real import NOT_MET, read_real
 from studies.readings.sines import read_sums
 from studies.readings.stages import read_stages
-from studies.record import Stopwatch, keep
-
-HERE = Path(__file__).parent
+from studies.record import Study
 
 
 def main() -> None:
     """Run the study; ``--quick`` takes fewer repetitions and records nothing."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--quick", action="store_true")
-    quick = parser.parse_args().quick
-    watch = Stopwatch()
+    study = Study(__file__, __doc__)
     data = os.environ.get("LMSHEALTH_DATA")
-    if not data and not quick:
+    if not data and not study.quick:
         raise SystemExit("LMSHEALTH_DATA is not set: it names the folder of real measurements")
     left_out = [] if data else ["LMSHEALTH_DATA is not set: real files were not read"]
-    answer = {"left_out": left_out, **judge(*read(quick, data))}
-    print(json.dumps({k: v for k, v in answer.items() if k != "details"}, indent=1))
-    if not quick:
-        keep(HERE / "result.json", __doc__.split("\n")[0], answer, watch)
-    if answer["surprises"]:
-        raise SystemExit(f"not as asked: {answer['surprises']}")
+    checks, details = read(study.quick, data)
+    answer = {"left_out": left_out, **judge(checks)}
+    study.conclude(answer, beside={"details": details}, not_met=answer["not_met"])
+    # What is said not to be met and is met after all is to be told, too.
+    if met := [name for name in answer["not_met"] if answer["passed"][name]]:
+        raise SystemExit(f"met after all: {met}")
 
 
 def read(quick: bool, data: str | None) -> tuple[dict[str, dict[str, Check]], dict[str, Any]]:
@@ -79,20 +72,13 @@ def read(quick: bool, data: str | None) -> tuple[dict[str, dict[str, Check]], di
     return checks, {name: value for _, own in parts.values() for name, value in own.items()}
 
 
-def judge(checks: dict[str, dict[str, Check]], details: dict[str, Any]) -> dict[str, Any]:
-    """Return the answer: what passed, what is known not to be met and why, and what is new."""
+def judge(checks: dict[str, dict[str, Check]]) -> dict[str, Any]:
+    """Return the answer: what passed, and what is known not to be met and why."""
     passed = {f"{part}: {name}": check["passed"] for part, own in checks.items()
               for name, check in own.items()}  # fmt: skip
     why = {f"real files: {name}": reason for name, reason in NOT_MET.items()}
     known = {name: reason for name, reason in why.items() if name in passed}
-    # What is said not to be met and is met after all is to be told, too.
-    return {
-        "passed": passed,
-        "not_met": known,
-        "surprises": [name for name, fine in passed.items() if fine == (name in known)],
-        "checks": checks,
-        "details": details,
-    }
+    return {"passed": passed, "not_met": known, "checks": checks}
 
 
 if __name__ == "__main__":

@@ -44,17 +44,14 @@ Answer
     and so what is right for a machine of which little is known; and near the end intervals are too
     wide (1.7 times the life left at 90 %), because the map is right and believed to 5 % only.
 Run time
-    Half an hour of one processor. With ``--lives FILE`` lives done before are not done again, and
-    the recorded time is that of the rest. progpy comes with the extra ``peers``; without it its
-    rows are missing.
+    Half an hour of one processor. progpy comes with the extra ``peers``; without it its rows
+    are missing.
 """
 
 from __future__ import annotations
 
-import argparse
 from functools import cache
 from importlib.util import find_spec
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -76,13 +73,11 @@ from lmshealth.metrics import (
 )
 from lmshealth.stage import Stage, load_stage
 from studies.lives import Array, rng_of
-from studies.ranks import collect, digest
-from studies.record import LEVEL, Stopwatch, as_row, conclude
+from studies.record import LEVEL, Study, as_row
 from studies.rul_metrics.bound import bound, share_within
 from studies.rul_metrics.lives import CUTS, HEALTHY, KINDS, STAGE, Case, case_of, cut
 from studies.rul_metrics.ways import CONTROL, LINE, MISSING, OURS, PROGPY, WAYS, all_ways
 
-HERE = Path(__file__).parent
 SEED = 20261124
 LIVES, UNENDING = 16, 6  # of each kind, and healthy ones
 ALPHA, RISK = 0.2, 0.05
@@ -106,29 +101,20 @@ Row = dict[str, Any]
 
 def main() -> None:
     """Run the study; ``--quick`` does one life and records nothing."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--quick", action="store_true")
-    parser.add_argument("--lives", type=Path, help="file of lives done before, to go on with")
-    options = parser.parse_args()
-    watch = Stopwatch()
+    study = Study(__file__, __doc__)
     tasks = [(kind, number) for number in range(LIVES) for kind in KINDS]
     tasks += [(HEALTHY, number) for number in range(UNENDING)]
-    if options.quick:
+    if study.quick:
         tasks = [(KINDS[-1], 0), (HEALTHY, 0)]
-    rows = collect(options.lives, code, tasks, one)
+    found = study.trials.collect(one, tasks)
+    rows = [{"kind": kind} | row for (kind, _), row in zip(tasks, found, strict=True)]
     ending = [row for row in rows if row["kind"] != HEALTHY]
     answer: Row = {"seed": SEED, "lives": len(ending), "alpha": ALPHA, "risk": RISK}
     answer |= judged(ending)
     answer["healthy"] = healthy([row for row in rows if row["kind"] == HEALTHY])
     answer["missing"] = [] if find_spec("progpy") else [MISSING]
-    answer["passed"] = verdicts(answer, quick=options.quick)
-    question = __doc__.split("\n")[0]
-    conclude(HERE / "result.json", question, answer, watch, quick=options.quick)
-
-
-def code(kind: str) -> str:
-    """Tell by which code lives are done."""
-    return digest(*CODE)
+    answer["passed"] = verdicts(answer, quick=study.quick)
+    study.conclude(answer)
 
 
 @cache

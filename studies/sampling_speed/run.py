@@ -34,9 +34,8 @@ Run time
 
 from __future__ import annotations
 
-import argparse
 import time
-from pathlib import Path
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -44,11 +43,10 @@ import numpy as np
 from lmshealth.inference import infer
 from lmshealth.stage import load_stage
 from lmshealth.tracktable import Drifts
-from studies.record import Stopwatch, conclude
+from studies.record import Study
 from studies.sampling_speed.contestants import compare, epoch_posterior
 from studies.sampling_speed.life import START, life_posterior
 
-HERE = Path(__file__).parent
 SEED = 20261122
 ESS_PER_S, EPOCH_S, LIFE_S, TIMES, R_HAT = 2000.0, 3.0, 10.0, 20.0, 1.01
 # Quantiles in standard deviations, and log likelihoods of lives.
@@ -71,21 +69,19 @@ def converged_epochs(seed: int, turns: int) -> dict[str, Any]:
 
 def main() -> None:
     """Run the study; ``--quick`` does little of it and records nothing."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--quick", action="store_true")
-    quick = parser.parse_args().quick
-    watch = Stopwatch()
+    study = Study(__file__, __doc__)
+    quick, once = study.quick, study.trials.once
+    turns = 1 if quick else 7
     # The first call imports what the libraries put off until then.
     converged_epochs(SEED, 1)
     answer: dict[str, Any] = {
         "seed": SEED,
-        "epoch": compare(SEED, 1 if quick else 7, quick=quick),
-        "converged_epoch": converged_epochs(SEED, 1 if quick else 7),
-        "life": life_posterior(SEED, 1 if quick else 7, quick=quick),
+        "epoch": once(partial(compare, quick=quick), SEED, turns),
+        "converged_epoch": once(converged_epochs, SEED, turns),
+        "life": once(partial(life_posterior, quick=quick), SEED, turns),
     }
     answer["passed"] = verdicts(answer, quick=quick)
-    question = __doc__.split("\n")[0]
-    conclude(HERE / "result.json", question, answer, watch, quick=quick)
+    study.conclude(answer)
 
 
 def verdicts(answer: dict[str, Any], *, quick: bool) -> dict[str, bool]:

@@ -26,17 +26,14 @@ Answer
     to 24 %. Half the covariance of the drifts alone is not seen in 1,000 lives (49 to 52 and 89 %):
     of what one does not know after so many logs most is the error of the map.
 Run time
-    Of one processor some 25 lives a second, and a second for each of the chains of `infer`. With
-    ``--lives FILE`` lives done before are not done again, and the recorded time is that of the
-    rest.
+    Of one processor some 25 lives a second, and a second for each of the chains of `infer`.
+    The recorded time is that after an interruption.
 """
 
 from __future__ import annotations
 
-import argparse
 from dataclasses import replace
 from functools import cache
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -53,17 +50,14 @@ from studies.ranks import (
     Array,
     Row,
     bands,
-    collect,
-    digest,
     judge,
     rank,
     thinned,
     uniform,
 )
-from studies.record import Stopwatch, conclude
+from studies.record import Study
 from studies.sbc_epoch.lives import believing, draw
 
-HERE = Path(__file__).parent
 SEED = 20261122
 EPOCHS = ("first third", "second third", "last")
 ONE, SHARED, X, CHAINS = "lms-y", "lms-y, three epochs of a life", "lms-x", "lms-y, by infer"
@@ -84,23 +78,15 @@ MODEL, SAMPLER = ("epoch", "importance", "modalmap", "priors", "stage"), ("lapla
 
 def main() -> None:
     """Run the study; ``--quick`` does a small part and records nothing."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--quick", action="store_true")
-    parser.add_argument("--lives", type=Path, help="file of lives done before, to go on with")
-    options = parser.parse_args()
-    watch, plan = Stopwatch(), QUICK if options.quick else LIVES
+    study = Study(__file__, __doc__)
+    plan = QUICK if study.quick else LIVES
     tasks = [(kind, life) for kind, n in plan.items() for life in range(n)]
-    rows = collect(options.lives, code, tasks, one)
+    found = study.trials.collect(one, tasks)
+    rows = [{"kind": kind} | row for (kind, _), row in zip(tasks, found, strict=True)]
     answer: dict[str, Any] = {"seed": SEED, "lives": plan} | judged(rows)
     answer["passed"] = verdicts(answer["ranks"])
     answer["bands"] = bands(row for part in answer["ranks"].values() for row in part.values())
-    question = __doc__.split("\n")[0]
-    conclude(HERE / "result.json", question, answer, watch, quick=options.quick)
-
-
-def code(kind: str) -> str:
-    """Tell by which code lives of a kind are done."""
-    return digest(*MODEL, *(SAMPLER if kind == CHAINS else ()))
+    study.conclude(answer)
 
 
 @cache

@@ -33,17 +33,14 @@ Answer
     the code before jumps were parted from logs at the same odometer, which these lives have not,
     and before a linear law could gain.
 Run time
-    Of one processor one to two seconds a life, eight after a jump, five to thirty for chains. With
-    ``--lives FILE`` lives done before are not done again, and the recorded time is that of the
-    rest.
+    Of one processor one to two seconds a life, eight after a jump, five to thirty for chains.
+    The recorded time is that after an interruption.
 """
 
 from __future__ import annotations
 
-import argparse
 from dataclasses import replace
 from functools import cache
-from pathlib import Path
 from typing import Any
 
 import msgspec
@@ -58,17 +55,14 @@ from studies.ranks import (
     Array,
     Row,
     bands,
-    collect,
-    digest,
     judge,
     rank,
     uniform,
 )
-from studies.record import Stopwatch, conclude
+from studies.record import Study
 from studies.sbc_epoch.lives import believing
 from studies.sbc_life.lives import Life, draw
 
-HERE = Path(__file__).parent
 SEED = 20261123
 ONE, CHAINS = "posterior", "by chains"
 EXACT, LOSING = "map taken as exact", "every part taken to lose"
@@ -91,23 +85,15 @@ QUANTITIES = (*LOSES, *HEALTH, "preload off its law", *REMAINING)
 
 def main() -> None:
     """Run the study; ``--quick`` does a small part and records nothing."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--quick", action="store_true")
-    parser.add_argument("--lives", type=Path, help="file of lives done before, to go on with")
-    options = parser.parse_args()
-    watch, plan = Stopwatch(), QUICK if options.quick else LIVES
+    study = Study(__file__, __doc__)
+    plan = QUICK if study.quick else LIVES
     tasks = [(kind, life) for kind, n in plan.items() for life in range(n)]
-    rows = collect(options.lives, code, tasks, one)
+    found = study.trials.collect(one, tasks)
+    rows = [{"kind": kind} | row for (kind, _), row in zip(tasks, found, strict=True)]
     answer: dict[str, Any] = {"seed": SEED, "lives": plan} | judged(rows)
     answer["passed"] = verdicts(answer["ranks"])
     answer["bands"] = bands(row for part in answer["ranks"].values() for row in part.values())
-    question = __doc__.split("\n")[0]
-    conclude(HERE / "result.json", question, answer, watch, quick=options.quick)
-
-
-def code(kind: str) -> str:
-    """Tell by which code lives of a kind are done."""
-    return digest(*MODEL, *(SAMPLER if kind == CHAINS else ()))
+    study.conclude(answer)
 
 
 @cache

@@ -20,12 +20,11 @@ Answer
     times for the version of the package). From the store 10,000 logs take two minutes, most of it
     drawing a hundred pages.
 Run time
-    Half an hour of one core; ``--done FILE`` goes on with what was measured before.
+    Half an hour of one core; the recorded time is that after an interruption.
 """
 
 from __future__ import annotations
 
-import argparse
 import json
 import resource
 import subprocess
@@ -42,10 +41,9 @@ from lmshealth import Settings, identify, load_stage, read_log, run
 from lmshealth.following import loop_error
 from lmshealth.stage import Stage
 from lmshealth.waterfall import read_levels
-from studies.record import Stopwatch, conclude
+from studies.record import Study, options
 from studies.scale.archive import make_archive
 
-HERE = Path(__file__).parent
 SIZES, QUICK_SIZES = (100, 1_000, 10_000), (3, 6, 12)
 LONGER = "longer and longer"
 EVERY = 21  # so that every recording that the logs are made of is among them
@@ -114,21 +112,11 @@ def alone(folder: Path) -> Row:
     return found
 
 
-def sized(done: Path | None, what: str, n_logs: int) -> tuple[Row, Row]:
-    """Analyse an archive of a size, and again with everything in the store; or look it up."""
-    known = json.loads(done.read_text()) if done is not None and done.exists() else {}
-    if what not in known:
-        known[what] = _sized(n_logs, longer=what == LONGER)
-        if done is not None:
-            done.write_text(json.dumps(known))
-    first, again = known[what]
-    return first, again
-
-
-def _sized(n_logs: int, *, longer: bool) -> tuple[Row, Row]:
+def sized(what: str, n_logs: int) -> tuple[Row, Row]:
+    """Analyse an archive of a size, and again with everything in the store."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        make_archive(folder, n_logs, longer=longer)
+        make_archive(folder, n_logs, longer=what == LONGER)
         return alone(folder), alone(folder)
 
 
@@ -148,20 +136,17 @@ def overhead_of(row: Row) -> float:
 
 def main() -> None:
     """Run the study; ``--quick`` does small archives and records nothing."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--quick", action="store_true")
+    parser = options(__doc__)
     parser.add_argument("--one", type=Path, help="only analyse this archive, and say what it cost")
-    parser.add_argument("--done", type=Path, help="file of what was measured before, to go on with")
-    options = parser.parse_args()
-    if options.one:
-        print(json.dumps(one_run(options.one)))
+    study = Study(__file__, __doc__, parser.parse_args())
+    if study.options.one:
+        print(json.dumps(one_run(study.options.one)))
         return
-    watch, quick, done = Stopwatch(), options.quick, options.done
+    quick, once = study.quick, study.trials.once
     sizes = QUICK_SIZES if quick else SIZES
-    both = [sized(done, str(n), n) for n in sizes]
-    first, again = zip(*both, strict=True)
-    uneven = first[0] if quick else sized(done, LONGER, 4 * sizes[0])[0]
-    beside = first[1] if quick else sized(done, "beside", sizes[1])[0]
+    first, again = zip(*(once(sized, "evenly", n) for n in sizes), strict=True)
+    uneven = first[0] if quick else once(sized, LONGER, 4 * sizes[0])[0]
+    beside = first[1] if quick else once(sized, "beside", sizes[1])[0]
     slopes = [marginal(*pair) for pair in pairwise(first)]
     largest = first[-1]
     answer = {
@@ -183,8 +168,7 @@ def main() -> None:
         "control is seen": quick or answer["control_ratio"] > (1 + 2 * FLAT) * slopes[0],
     }
     answer["passed"] = {name: bool(fine) for name, fine in answer["passed"].items()}
-    record = HERE / "cost.json"
-    conclude(record, (__doc__ or "").split("\n")[0], answer, watch, quick=quick)
+    study.conclude(answer)
 
 
 if __name__ == "__main__":

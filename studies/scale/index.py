@@ -20,7 +20,6 @@ Run time
 
 from __future__ import annotations
 
-import argparse
 import html
 import shutil
 import tempfile
@@ -31,10 +30,9 @@ from typing import Any
 import numpy as np
 
 from lmshealth.index import IndexRow, write_index
-from studies.record import Stopwatch, conclude
+from studies.record import Study
 from studies.scale.rows import make_refused, make_rows
 
-HERE = Path(__file__).parent
 SOUGHT = "line04-m0417"
 # Of the page against the bare table, and of bytes per stage.
 BOUND_RATIO, BOUND_BYTES = 4.0, 1500
@@ -127,10 +125,8 @@ def _summary(path: Path, own: Sequence[Mapping[str, Any]]) -> dict[str, float]:
 
 def main() -> None:
     """Run the study, or a small form of it."""
-    parser = argparse.ArgumentParser(description="Time the front page of a large fleet.")
-    parser.add_argument("--quick", action="store_true")
-    quick = parser.parse_args().quick
-    watched, (n, repeats) = Stopwatch(), (300, 3) if quick else (1000, 15)
+    study = Study(__file__, __doc__)
+    n, repeats = (300, 3) if study.quick else (1000, 15)
     with tempfile.TemporaryDirectory() as folder:
         pages = measure(write_pages(Path(folder), n), repeats)
     page, control, plain = pages["page"], pages["all laid out"], pages["bare"]
@@ -149,7 +145,7 @@ def main() -> None:
         "a key stroke takes a tenth of a load": answer["stroke_to_load"] <= 0.1,
         "control: slower with every row laid out": answer["control_to_bare"] > answer["to_bare"],
     }
-    conclude(HERE / "index.json", str(__doc__).split("\n", 1)[0], answer, watched, quick=quick)
+    study.conclude(answer)
 
 
 if __name__ == "__main__":

@@ -22,16 +22,16 @@ Run time
 
 from __future__ import annotations
 
-import argparse
 import json
 import tempfile
 import time
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from lmshealth import Settings, load_stage, run
 from models.lives import Plan, simulate_life
-from studies.record import Stopwatch, conclude
+from studies.record import Study
 
 HERE = Path(__file__).parent
 N_LOGS, N_STAGES = 1_000_000, 10_000
@@ -53,6 +53,12 @@ class Steps:
         now = time.process_time()
         self.seconds[self._step] = self.seconds.get(self._step, 0.0) + now - self._since
         self._step, self._since = what, now
+
+
+def staged(folder: Path, quick: bool) -> Row:
+    """Analyse the full life or a short one."""
+    life, epochs = (QUICK, 1) if quick else (FULL, 40)
+    return one_stage(folder, life, epochs)
 
 
 def one_stage(folder: Path, plan: Plan, epochs: int) -> Row:
@@ -102,13 +108,9 @@ def plan_for(n_workers: int, stage: Row, serial_s: float, efficiency: float) -> 
 
 def main() -> None:
     """Run the study; ``--quick`` does a short life and records nothing."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--quick", action="store_true")
-    quick = parser.parse_args().quick
-    watch = Stopwatch()
-    life, epochs = (QUICK, 1) if quick else (FULL, 40)
+    study = Study(__file__, __doc__)
     with tempfile.TemporaryDirectory() as name:
-        stage = one_stage(Path(name), life, epochs)
+        stage = study.trials.once(partial(staged, Path(name)), study.quick)
     two = json.loads((HERE / "speedup.json").read_text(encoding="utf-8"))
     serial_s = 1e-3 * two["dask_serial_ms"][1]
     efficiency = min(two["of the bound"]["dask"], 1.0)
@@ -125,8 +127,7 @@ def main() -> None:
         "pages_gb": round(1e-3 * N_STAGES * stage["page_mb"], 1),
         "passed": {"more workers take less": plans[0]["hours"] > plans[-1]["hours"]},
     }
-    record = HERE / "plan.json"
-    conclude(record, (__doc__ or "").split("\n")[0], answer, watch, quick=quick)
+    study.conclude(answer)
 
 
 if __name__ == "__main__":

@@ -20,10 +20,10 @@ Run time
 
 from __future__ import annotations
 
-import argparse
 import tempfile
 import time
 from concurrent.futures import ProcessPoolExecutor
+from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
@@ -31,11 +31,10 @@ from typing import Any
 import numpy as np
 
 from lmshealth import Settings, identify, load_stage, read_log, run
-from studies.record import Stopwatch, conclude
+from studies.record import Study
 from studies.scale.archive import make_archive
 from studies.servers import dask_cluster
 
-HERE = Path(__file__).parent
 N_LOGS, QUICK_LOGS, TURNS = 200, 6, 3
 # Of the bound that the machine gives in the same turn, and against one worker.
 SPEEDUP = 1.8
@@ -97,7 +96,7 @@ def _loaded(_: int) -> None:
     """Import what is needed before the clock runs."""
 
 
-def turn(folder: Path, each: int) -> Row:
+def one_turn(folder: Path, each: int, _: int) -> Row:
     """Measure everything once, the bound by so many logs in each process."""
     found: Row = {}
     bound = [bare(folder, n, each) for n in (1, 2)]
@@ -116,16 +115,14 @@ def turn(folder: Path, each: int) -> Row:
 
 def main() -> None:
     """Run the study; ``--quick`` does a small archive and records nothing."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--quick", action="store_true")
-    quick = parser.parse_args().quick
-    watch = Stopwatch()
+    study = Study(__file__, __doc__)
+    quick = study.quick
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         make_archive(folder, QUICK_LOGS if quick else N_LOGS)
-        turns = [
-            turn(folder, _QUICK_BARE if quick else _BARE) for _ in range(1 if quick else TURNS)
-        ]
+        each = _QUICK_BARE if quick else _BARE
+        tasks = [(each, k) for k in range(1 if quick else TURNS)]
+        turns = study.trials.collect(partial(one_turn, folder), tasks)
     answer: Row = {
         name: [round(float(v), 3) for v in np.quantile([t[name] for t in turns], (0, 0.5, 1))]
         for name in turns[0]
@@ -142,8 +139,7 @@ def main() -> None:
     answer["passed"] = {
         f"{kind}: 1.8 of 2": answer["of the bound"][kind] >= least for kind in ("local", "dask")
     }
-    record = HERE / "speedup.json"
-    conclude(record, (__doc__ or "").split("\n")[0], answer, watch, quick=quick)
+    study.conclude(answer)
 
 
 if __name__ == "__main__":

@@ -14,7 +14,6 @@ Run time
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
 import resource
@@ -23,7 +22,6 @@ import sys
 import time
 import warnings
 from collections.abc import Callable
-from pathlib import Path
 
 import numpy as np
 
@@ -31,9 +29,8 @@ from models.disturbance import noise_levels
 from models.plant import NOISE_INPUTS, closed_loop
 from models.recording import SAMPLE_RATE_HZ, record
 from models.stages import STAGES, stage_named
-from studies.record import Stopwatch, keep
+from studies.record import Study, options
 
-HERE = Path(__file__).parent
 SECONDS, PEER_SECONDS = 60.0, 2.0
 BOUND_S, BOUND_MB = 2.0, 500.0
 _THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
@@ -41,15 +38,13 @@ _THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
 
 def main() -> None:
     """Run the study; ``--quick`` measures one stage and records nothing."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--quick", action="store_true")
+    parser = options(__doc__)
     parser.add_argument("--child", choices=list(STAGES))
-    options = parser.parse_args()
-    if options.child:
-        print(json.dumps(measure(options.child)))
+    study = Study(__file__, __doc__, parser.parse_args())
+    if study.options.child:
+        print(json.dumps(measure(study.options.child)))
         return
-    watch = Stopwatch()
-    names = ["lms-y"] if options.quick else list(STAGES)
+    names = ["lms-y"] if study.quick else list(STAGES)
     found = {name: in_own_process(name) for name in names}
     answer = {
         "stages": found,
@@ -60,9 +55,7 @@ def main() -> None:
             "memory": all(row["peak_mb"] < BOUND_MB for row in found.values()),
         },
     }
-    if not options.quick:
-        keep(HERE / "result.json", __doc__.split("\n")[0], answer, watch)
-    print(json.dumps(answer, indent=1))
+    study.conclude(answer, quick_may_fail=True)
 
 
 def in_own_process(name: str) -> dict[str, float]:

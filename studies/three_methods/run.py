@@ -25,8 +25,6 @@ Run time
 
 from __future__ import annotations
 
-import argparse
-import json
 import os
 import tempfile
 import zlib
@@ -49,9 +47,8 @@ from models.plant import GUIDE_MODES, SENSORS
 from models.recording import record
 from models.stages import NOMINAL, Condition, stage_named
 from models.sweep import Sweep, record_sweep, without_loop
-from studies.record import Stopwatch, keep
+from studies.record import Study, options
 
-HERE = Path(__file__).parent
 SECONDS = 20.0
 # All of the travel at 10 mm/s, four periods long, around the guide modes; the amplitude is near
 # the largest at which the platform never turns back.
@@ -81,18 +78,16 @@ Estimates = dict[str, tuple[float, float] | str]
 
 def main() -> None:
     """Run the study; ``--quick`` does three seeds of stage Y and records nothing."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--quick", action="store_true")
+    parser = options(__doc__)
     parser.add_argument("--seeds", type=int, default=20)
-    options = parser.parse_args()
-    watch = Stopwatch()
-    seeds = range(3 if options.quick else options.seeds)
-    names = ["lms-y"] if options.quick else list(SWEEPS)
+    study = Study(__file__, __doc__, parser.parse_args())
+    seeds = range(3 if study.quick else study.options.seeds)
+    names = ["lms-y"] if study.quick else list(SWEEPS)
     # Two workers fill two cores: threads inside linear algebra would get in their way.
     os.environ.update(dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1"))
     tasks = [(name, seed) for name in names for seed in seeds]
     with ProcessPoolExecutor(2, mp_context=get_context("spawn")) as pool:
-        rows = list(pool.map(one_seed, *zip(*tasks, strict=True)))
+        rows = study.trials.collect(one_seed, tasks, pool=pool)
     stages = {name: summarise(name, [r for r in rows if r["stage"] == name]) for name in names}
     watched = stages["lms-y"]["modes"]
     answer = {
@@ -105,13 +100,8 @@ def main() -> None:
             ),
         },
     }
-    print(json.dumps(answer, indent=1))
-    if not options.quick:
-        example = example_response("lms-y")
-        keep(HERE / "result.json", __doc__.split("\n")[0],
-             {**answer, "example": example, "rows": rows}, watch)  # fmt: skip
-    if not all(answer["passed"].values()):
-        raise SystemExit(f"not as asked: {answer['passed']}")
+    example = None if study.quick else example_response("lms-y")
+    study.conclude(answer, beside={"example": example, "rows": rows})
 
 
 def generator(name: str, seed: int, step: str) -> np.random.Generator:

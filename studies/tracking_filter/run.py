@@ -37,18 +37,15 @@ Run time
 
 from __future__ import annotations
 
-import argparse
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from studies.record import Stopwatch, conclude
+from studies.record import Study
 from studies.tracking_filter.lives import stage
 from studies.tracking_filter.peers import deviation, speed
 from studies.tracking_filter.trials import averaged, known_setting, two_sources
 
-HERE = Path(__file__).parent
 SEED = 20260401
 # Largest differences from filterpy and from others, in standard deviations.
 SAME, SAME_AS_PEERS = 1e-9, 1e-6
@@ -59,10 +56,8 @@ NOT_MET = {IN_TIME: "a tenth more; see the multiple of the filterpy loop"}
 
 def main() -> None:
     """Run the study; ``--quick`` does a small part of each question and records nothing."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--quick", action="store_true")
-    quick = parser.parse_args().quick
-    watch, machine = Stopwatch(), stage()
+    study = Study(__file__, __doc__)
+    quick, machine = study.quick, stage()
     one, two, three, four = (np.random.default_rng([SEED, i]) for i in range(4))
     answer: dict[str, Any] = {
         "seed": SEED,
@@ -73,8 +68,7 @@ def main() -> None:
         "two_sources": two_sources(four, 4 if quick else 300, machine),
     }
     answer |= {"passed": verdicts(answer, quick=quick), "not_met": NOT_MET}
-    question = __doc__.split("\n")[0]
-    conclude(HERE / "result.json", question, answer, watch, quick=quick, not_met=NOT_MET)
+    study.conclude(answer, not_met=NOT_MET)
 
 
 def verdicts(answer: dict[str, Any], *, quick: bool) -> dict[str, bool]:

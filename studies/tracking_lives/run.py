@@ -18,7 +18,7 @@ Method
     The loss is spread evenly over 60 logs. Its optimum knows onset, direction and course: one knows
     also where the modes begin and what temperature does, the other learns it as a tracker must.
     With ``--raw`` lives are instead simulated at 20 kHz and identified log by log, and judged alike
-    in raw.json; ``--cache`` names a folder that keeps their estimates. Of so many seeds every one
+    in raw.json. Of so many seeds every one
     is used of the kinds healthy, temperature, payload and retuning on LMS-Y, and every fourth of
     the others.
 Answer
@@ -36,10 +36,9 @@ Run time
 
 from __future__ import annotations
 
-import argparse
-import json
 from collections.abc import Iterator
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 from unittest.mock import patch
@@ -59,8 +58,9 @@ from studies.lives import (
     plan_of,
     rng_of,
 )
-from studies.raw_lives import identified, measured
-from studies.record import LEVEL, Stopwatch, keep
+from studies.raw_lives import RAW, identified, measured
+from studies.record import LEVEL, Study, options
+from studies.resume import Trials
 from studies.tracking_lives.optimum import optimum
 from studies.tracking_lives.trials import (
     DECLARED_RATE,
@@ -73,7 +73,6 @@ from studies.tracking_lives.trials import (
     summed,
 )
 
-HERE = Path(__file__).parent
 CASES = [("lms-y", kind) for kind in HEALTHY + DAMAGED] + [("lms-x", kind) for kind in HEALTHY]
 # Kinds whose cause is declared by somebody, or not.
 DECLARABLE = ("servo-retuning", "regreasing")
@@ -83,50 +82,50 @@ CONTROLS = 100  # lives at most of each negative control
 ENOUGH = 0.95
 # Of more lives than that the sizes are taken from a dozen logs and not from eight.
 SIZED = 10
+SIZES = ("studies.raw_lives",)  # where the sizes of estimates come from
 Pairs = list[tuple[Life, Estimates]]
+Sizes = dict[str, tuple[Estimates, Life]]
 
 
 def main() -> None:
     """Run the study; ``--quick`` does a few lives of each kind and records nothing."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--quick", action="store_true")
+    parser = options(__doc__)
     parser.add_argument("--raw", type=int, default=0, metavar="SEEDS")
-    parser.add_argument("--cache", type=Path, help="folder that keeps estimates of raw lives")
-    options = parser.parse_args()
-    watch = Stopwatch()
-    answer = raw(options.raw, options.cache) if options.raw else study(6 if options.quick else 300)
-    print(json.dumps(answer, indent=1))
-    if not options.quick:
-        path = HERE / ("raw.json" if options.raw else "result.json")
-        keep(path, __doc__.split("\n")[0], answer, watch)
-    failed = {name for name, fine in answer["passed"].items() if not fine}
-    if failed and not options.quick:
-        raise SystemExit(f"not as asked: {failed}")
+    study = Study(__file__, __doc__, parser.parse_args())
+    kept, seeds = study.kept(RAW), study.options.raw
+    answer = (
+        raw(seeds, kept) if seeds else drawn_lives(study.trials, 6 if study.quick else 300, kept)
+    )
+    study.conclude(answer, name="raw" if seeds else "", quick_may_fail=True)
 
 
-def study(n: int) -> dict[str, Any]:
+def drawn_lives(trials: Trials, n: int, kept: Path | None) -> dict[str, Any]:
     """Draw, track and judge so many lives of each kind."""
-    sizes = {stage: measured(stage, 12 if n > SIZED else 8) for stage in STAGES}
-    rows: list[dict[str, Any]] = []
-    blind: list[dict[str, Any]] = []
-    narrow: list[Followed] = []
-    for i, (stage, kind) in enumerate(CASES):
-        drawn_lives = [
-            (life, drawn(life, *sizes[stage], rng_of(1, i, life.seed)))
-            for life in lives(stage, kind, n)
-        ]
-        rows += judged(drawn_lives)
-        blind += controls(drawn_lives[:CONTROLS])
-        if kind in DAMAGED:
-            narrow += halved(drawn_lives)
+    sizes = {stage: measured(stage, 12 if n > SIZED else 8, kept) for stage in STAGES}
+    found = trials.collect(partial(of_kind, sizes), [(i, n) for i in range(len(CASES))], also=SIZES)
     answer = {
         "sizes": {stage: described(*pair) for stage, pair in sizes.items()},
-        "lives": rows,
-        "controls": blind,
-        "halved": coverage(narrow),
-        "power": power(sizes["lms-y"], n),
+        "lives": [row for one in found for row in one["lives"]],
+        "controls": [row for one in found for row in one["controls"]],
+        "halved": trials.once(partial(halved, sizes), n, also=SIZES),
+        "power": trials.once(partial(power, sizes["lms-y"]), n, also=SIZES),
     }
     return answer | {"passed": verdicts(answer)}
+
+
+def of_kind(sizes: Sizes, i: int, n: int) -> dict[str, Any]:
+    """Draw, track and judge so many lives of one kind."""
+    pairs = pairs_of(sizes, i, n)
+    return {"lives": judged(pairs), "controls": controls(pairs[:CONTROLS])}
+
+
+def pairs_of(sizes: Sizes, i: int, n: int) -> Pairs:
+    """Draw so many lives of one kind."""
+    stage, kind = CASES[i]
+    return [
+        (life, drawn(life, *sizes[stage], rng_of(1, i, life.seed)))
+        for life in lives(stage, kind, n)
+    ]
 
 
 def described(sizes: Estimates, life: Life) -> dict[str, Any]:
@@ -172,11 +171,16 @@ def controls(pairs: Pairs) -> list[dict[str, Any]]:
     return [{"name": name, "stage": life.stage, "alarms": alarmed(follow(pairs, **known))}]
 
 
-def halved(pairs: Pairs) -> list[Followed]:
-    """Track lives whose covariances are stated half as large, by a filter that cannot learn it."""
-    small = [(life, replace(one, cov=one.cov / 2)) for life, one in pairs]
-    with patch.object(bank, "_SCALES", ((1.0, 1.0),)):
-        return follow(small)
+def halved(sizes: Sizes, n: int) -> dict[str, Any]:
+    """Judge lives whose covariances are stated half as large, by a filter that cannot learn it."""
+    found: list[Followed] = []
+    for i, (_, kind) in enumerate(CASES):
+        if kind in DAMAGED:
+            pairs = pairs_of(sizes, i, n)
+            small = [(life, replace(one, cov=one.cov / 2)) for life, one in pairs]
+            with patch.object(bank, "_SCALES", ((1.0, 1.0),)):
+                found += follow(small)
+    return coverage(found)
 
 
 def power(sizes: tuple[Estimates, Life], n: int) -> dict[str, Any]:

@@ -1,0 +1,174 @@
+"""Long studies go on after an interruption, with what was done by the same code alone."""
+
+from __future__ import annotations
+
+import json
+import sys
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
+from importlib.util import module_from_spec, spec_from_file_location
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import pytest
+
+from studies import provenance
+from studies.resume import Trials
+
+SCRIPT = '''
+from lmshealth.metrics import place
+
+SCALE = 2.0
+done = []
+
+
+def draw(kind, number, power=1):
+    """Draw one."""
+    done.append((kind, number))
+    return {"kind": kind, "draw": scaled(number) ** power, "none": float("nan")}
+
+
+def scaled(number):
+    return SCALE * number / 3  # no round number
+
+
+def told(rows):
+    return len(rows)
+'''
+TASKS = [("a", k) for k in range(5)] + [("b", 0)]
+
+
+@pytest.fixture
+def written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
+    """Write a script as a module, and forget what was known of its code."""
+
+    def write(text: str) -> ModuleType:
+        path = tmp_path / "script.py"
+        path.write_text(text)
+        for known in (provenance._digest, provenance._tree):
+            known.cache_clear()
+        spec = spec_from_file_location("script_of_a_study", path)
+        assert spec is not None and spec.loader is not None
+        module = module_from_spec(spec)
+        monkeypatch.setitem(sys.modules, "script_of_a_study", module)
+        spec.loader.exec_module(module)
+        return module
+
+    return write
+
+
+def test_interrupted_goes_on(written: Any, tmp_path: Path) -> None:
+    """A study that was interrupted does the rest only, and has the result of one that was not."""
+    script, path = written(SCRIPT), tmp_path / "kept" / "study.jsonl"
+
+    def failing(kind: str, number: int) -> Any:
+        if (kind, number) == ("a", 3):
+            raise KeyboardInterrupt
+        return script.draw(kind, number)
+
+    failing.__module__, failing.__qualname__ = "script_of_a_study", "draw"
+    with pytest.raises(KeyboardInterrupt):
+        Trials(path).collect(failing, TASKS)
+    script.done.clear()
+    found = Trials(path).collect(script.draw, TASKS)
+    assert script.done == TASKS[3:]
+    assert json.dumps(found) == json.dumps(Trials(None).collect(script.draw, TASKS))
+
+
+def test_line_cut_off(written: Any, tmp_path: Path) -> None:
+    """What was being written when a study ended is done again, and nothing else."""
+    script, path = written(SCRIPT), tmp_path / "study.jsonl"
+    whole = Trials(path).collect(script.draw, TASKS)
+    path.write_text(path.read_text()[:-20])
+    script.done.clear()
+    again = Trials(path).collect(script.draw, TASKS)
+    assert script.done == TASKS[-1:]
+    assert json.dumps(again) == json.dumps(whole)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "same"),
+    [
+        ("SCALE = 2.0", "SCALE = 3.0", False),
+        ("number / 3", "number / 4", False),
+        ("from lmshealth.metrics import place\n", "", True),
+        ("return len(rows)", "return 2 * len(rows)", True),
+        ('"""Draw one."""', '"""Draw another."""', True),
+        ("# no round number", "", True),
+    ],
+)
+def test_changed_code(written: Any, tmp_path: Path, old: str, new: str, same: bool) -> None:
+    """Trials are done anew when what they need has changed, not for anything beside it."""
+    path = tmp_path / "study.jsonl"
+    Trials(path).collect(written(SCRIPT).draw, TASKS)
+    assert old in SCRIPT
+    script = written(SCRIPT.replace(old, new))
+    found = Trials(path).collect(script.draw, TASKS)
+    assert script.done == ([] if same else TASKS)
+    assert json.dumps(found) == json.dumps(Trials(None).collect(script.draw, TASKS))
+
+
+def test_changed_module(written: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Trials are done anew when a module that they import has changed, however indirectly."""
+    text = SCRIPT.replace("SCALE *", "place.__name__ and SCALE *")
+    before = provenance.code_of(written(text).draw)
+    assert provenance.code_of(written(text).draw) == before
+    modules = provenance._closure({provenance.PROJECT / "lmshealth" / "metrics.py"})
+    assert len(modules) > 1
+    for module in sorted(modules):
+        plain = provenance._tree(module)
+        with monkeypatch.context() as patched:
+            changed = type(plain)([*plain.body, plain.body[0]], [])
+            real = provenance._tree.__wrapped__
+
+            def other(path: Path, at: Path = module, tree: Any = changed, own: Any = real) -> Any:
+                return tree if path == at else own(path)
+
+            script = written(text)
+            patched.setattr(provenance, "_tree", other)
+            assert provenance.code_of(script.draw) != before
+
+
+def test_gathered_names(written: Any) -> None:
+    """Of the package a trial needs the homes of the names it uses, and what these register."""
+    text = SCRIPT.replace("metrics import place", "import read_log as place", 1)
+    text = text.replace("from lmshealth.import", "from lmshealth import")
+    tree = provenance._tree(Path(written(text).__file__ or ""))
+    needed = provenance._closure(provenance._imports(tree.body))
+    names = {path.relative_to(provenance.PROJECT).as_posix() for path in needed}
+    assert {"lmshealth/readers/__init__.py", "lmshealth/errors.py"} <= names
+    assert any(name.startswith("lmshealth/readers/") and "hdf5" in name for name in names)
+    assert not {"lmshealth/report.py", "lmshealth/__init__.py"} & names
+
+
+def test_options_and_names_part_trials(written: Any, tmp_path: Path) -> None:
+    """The same numbers given to other work, or with other options, are other trials."""
+    script, path = written(SCRIPT), tmp_path / "study.jsonl"
+    plain, squared = (
+        Trials(path).once(work, "a", 2) for work in (script.draw, partial(script.draw, power=2))
+    )
+    assert squared["draw"] == pytest.approx(plain["draw"] ** 2)
+    assert Trials(path).once(script.scaled, 2) == plain["draw"]
+
+
+def test_kept_time_is_told(written: Any, tmp_path: Path) -> None:
+    """A study knows how long those trials took that it did not do again."""
+    script, path = written(SCRIPT), tmp_path / "study.jsonl"
+    Trials(path).collect(script.draw, TASKS)
+    rows = [json.loads(line) for line in path.read_text().splitlines()]
+    path.write_text("".join(json.dumps(row | {"seconds": 2.0}) + "\n" for row in rows))
+    trials = Trials(path)
+    trials.collect(script.draw, [*TASKS, ("b", 1)])
+    assert trials.kept_s == pytest.approx(2.0 * len(TASKS))
+
+
+def test_pool(written: Any, tmp_path: Path) -> None:
+    """In a pool trials come in the order of their tasks, and are kept alike."""
+    script, path = written(SCRIPT), tmp_path / "study.jsonl"
+    with ThreadPoolExecutor(2) as pool:
+        found = Trials(path).collect(script.draw, TASKS, pool=pool)
+    assert json.dumps(found) == json.dumps(Trials(None).collect(script.draw, TASKS))
+    script.done.clear()
+    Trials(path).collect(script.draw, TASKS)
+    assert script.done == []
