@@ -142,7 +142,7 @@ def test_the_fit_is_seldom_improbable(
 def test_a_shared_guide_is_calibrated(rng: np.random.Generator, claims: Claims) -> None:
     """Of an X and a Y machine with one guide, by the plants of `models`.
 
-    Control: draws half as far from their median.
+    Control: draws a quarter as far from their median.
     """
     x_stage, y_stage = load_stage("lms-x"), load_stage("lms-y")
     places, wrong = [], []
@@ -157,7 +157,7 @@ def test_a_shared_guide_is_calibrated(rng: np.random.Generator, claims: Claims) 
         draws = np.log(found.samples[0])
         middle = np.median(draws, axis=0)
         places.append(place(draws, truth, rng))
-        wrong.append(place(middle + 0.5 * (draws - middle), truth, rng))
+        wrong.append(place(middle + 0.25 * (draws - middle), truth, rng))
     for j, name in enumerate(claims.part.claims):
         claims.claim(name, uniform(np.array(places)[:, j]))
         claims.control(name, uniform(np.array(wrong)[:, j]))

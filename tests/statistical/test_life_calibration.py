@@ -157,7 +157,7 @@ def test_health_off_its_law_is_calibrated(
 
 
 def nearer(draws: FloatArray, factor: float) -> FloatArray:
-    """Bring draws nearer to their medians, those past the horizon cut."""
+    """Bring draws nearer to their medians."""
     middle = np.median(draws, axis=0)
     return np.asarray(middle + factor * (draws - middle))
 
@@ -165,8 +165,8 @@ def nearer(draws: FloatArray, factor: float) -> FloatArray:
 def test_ranks_of_whole_lives_are_uniform(rng: np.random.Generator, claims: Claims) -> None:
     """Of the shipped Y stage health now, whether a part wears and what remains is one more draw.
 
-    Controls: health half as far from its median, what remains a tenth as far, and the contrary of
-    whether a part wears.
+    Controls: health a third as far from its median, what remains and how far health is off its law
+    a tenth as far, and the contrary of whether a part wears.
     """
     places, wrong = [], []
     horizon = 1000 * machine().description.usage.horizon_km
@@ -177,7 +177,7 @@ def test_ranks_of_whole_lives_are_uniform(rng: np.random.Generator, claims: Clai
                          n_draws=N_POSTERIOR)  # fmt: skip
         draws = np.minimum(quantities(found, drawn.now, rng), horizon)
         draws = draws[rng.permutation(len(draws))[:N_DRAWS]]
-        worse = [1 - draws[:, :2], nearer(draws[:, 2:5], 0.5), nearer(draws[:, 5:], 0.1)]
+        worse = [1 - draws[:, :2], nearer(draws[:, 2:4], 1 / 3), nearer(draws[:, 4:], 0.1)]
         places.append(place(draws, truth, rng))
         wrong.append(place(np.hstack(worse), truth, rng))
     for name, right, rash in zip(

@@ -94,7 +94,7 @@ def test_a_second_source_does_no_harm(
 
 
 def test_modes_that_cross_are_not_swapped(rng: np.random.Generator, claims: Claims) -> None:
-    """At most a label in twenty is wrong, and so is any of a life after a crossing.
+    """A label is given where it is 95 % sure: one life in twenty at most is swapped unseen.
 
     Control: each estimate to the mode that was last seen nearest.
     """
