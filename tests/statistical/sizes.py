@@ -67,7 +67,7 @@ TESTS = {
     "test_losses_by_laws_are_calibrated": Part(250, ("loss by the law", "health now")),
     "test_health_off_its_law_is_calibrated": Part(250, ("health now, off its law",)),
     "test_ranks_of_whole_lives_are_uniform": Part(
-        90,
+        80,
         (
             "preload is lost",
             "mount is lost",

@@ -19,7 +19,7 @@ from lmshealth.fleet import is_young, lesson_of
 from lmshealth.life import LifeLikelihood
 from lmshealth.lifefit import fit_life
 from lmshealth.metrics import place
-from lmshealth.prognosis import _usage
+from lmshealth.prognosis import _usage, remaining_travel
 from lmshealth.stage import Stage
 from lmshealth.tracks import History
 from studies.fleet_prior.lives import YOUNG, draw_fleet
@@ -33,7 +33,6 @@ from studies.fleet_prior.run import (
     posterior,
     taught,
 )
-from studies.fleet_prior.run import left as remaining
 from studies.ranks import N_DRAWS
 from studies.sbc_life.lives import draw
 from studies.sbc_life.run import N_POSTERIOR, machine, quantities, true_quantities
@@ -210,7 +209,10 @@ def test_young_machines_are_told_right_by_their_fleet(
         else:
             continue
         told = posterior(young, prior.onto(described()), number)
-        draws = np.minimum(remaining(told, young.now)[:, None], horizon())
+        left = remaining_travel(
+            told, [(0, described().parameters[0])], rng, now=young.now, horizon=horizon()
+        )
+        draws = np.minimum(left, horizon())
         truth = np.array([young.part.left(rng, young.now, limit.below, horizon())])
         for factor, kept in ((1.0, places), (0.1, wrong)):
             kept.append(place(nearer(draws, factor), truth, rng, horizon=horizon())[0])
