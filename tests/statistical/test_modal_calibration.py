@@ -171,10 +171,10 @@ def _off_truth(found: Modes) -> np.ndarray:
 def test_intervals_of_joint_sources_cover(rng: np.random.Generator, claims: Claims) -> None:
     """Δe and accelerometers of one force in one likelihood.
 
-    Control beside half the width: single channels, averaged as if they were independent.
+    Control beside half the width: ζ of single channels, averaged as if they were independent; of f
+    so many records do not tell.
     """
     logs = [_three_sensors(rng) for _ in range(claims.trials)]
     _judge(claims, _deviations(logs))
     averaged = np.array([_averaged(log) for log in logs])
-    for name, own in zip(claims.part.claims, averaged.T, strict=True):
-        claims.control(name, covered(own))
+    claims.control(claims.part.claims[1], covered(averaged[:, 1]))
