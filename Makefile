@@ -1,10 +1,10 @@
-# Two commands do everything: `make demo` and `make test`. Both first make a virtual environment.
+# `make demo`, `make test` and `make statistics` do everything. Each first makes a virtual environment.
 
 PYTHON ?= python3
 BIN := .venv/bin
 DEMO := demo
 
-.PHONY: demo picture test check clean
+.PHONY: demo picture test statistics check clean
 
 demo: .venv/installed
 	@rm -rf $(DEMO)
@@ -19,10 +19,14 @@ picture: .venv/installed
 	$(BIN)/python -m studies.demo_life.picture $(DEMO)/result
 
 # Tests run side by side: threads inside linear algebra would only get in their way.
-test: export OPENBLAS_NUM_THREADS = 1
-test: export OMP_NUM_THREADS = 1
+test statistics: export OPENBLAS_NUM_THREADS = 1
+test statistics: export OMP_NUM_THREADS = 1
 test: .venv/installed check
-	$(BIN)/pytest -n 2
+	$(BIN)/pytest -n 2 -m "not statistical"
+
+# Is what is said of errors and intervals true? LMSHEALTH_SEED=7 draws all anew.
+statistics: .venv/installed
+	$(BIN)/pytest -n 2 --dist worksteal -m statistical
 
 check: .venv/installed
 	$(BIN)/ruff check .

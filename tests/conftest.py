@@ -13,6 +13,7 @@ import pytest
 from studies import servers
 
 ROOT = Path(__file__).parent.parent
+pytest_plugins = ["pytester", "tests.claims"]
 
 
 def _missing(name: str) -> str | None:

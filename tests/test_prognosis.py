@@ -32,7 +32,6 @@ from tests.lives import (
     make_stage,
     true_drift,
 )
-from tests.oracles import check_coverage
 
 KNOWN_USAGE = "[usage]\nkm_per_day = 20\nhorizon_km = 5000\n"
 STILL_MOUNT = MOUNT[: MOUNT.index("[parameter.law]")]
@@ -207,22 +206,6 @@ def test_a_short_life_has_the_usage_of_few_days(unstated: Stage) -> None:
     assert stats.kstest(off / spread, stats.norm.cdf).pvalue > 1e-3
     # Negative control: without the scatter of the week.
     assert stats.kstest(off * np.sqrt(40), stats.norm.cdf).pvalue < 1e-3
-
-
-@pytest.mark.parametrize(("n", "weeks"), [(20, 20), (5, 3)])
-def test_usage_covers_what_comes(unstated: Stage, n: int, weeks: int) -> None:
-    """Intervals cover the travel of weeks to come as often as stated, also after few logs."""
-    rng = np.random.default_rng(10)
-    levels, wrong = [], []
-    for _ in range(400):
-        history = moved(rng, n, 0.1)
-        truth = 1.4e5 / 7 * (1 + 0.1 * rng.standard_normal(weeks).mean())
-        for found, left in ((levels, weeks * 1.4e5), (wrong, 4e7)):
-            usage = _usage(history, unstated, rng, np.full(500, left), 4e7)
-            found.append(np.mean(usage < truth))
-    check_coverage(np.array(levels), calibrated=True)
-    # Negative control: the mean of years to come says too little of few weeks.
-    check_coverage(np.array(wrong), calibrated=False)
 
 
 def test_life_past_or_without_end_has_a_usage(unstated: Stage) -> None:

@@ -56,7 +56,7 @@ from studies.ranks import (
     uniform,
 )
 from studies.record import Study
-from studies.sbc_epoch.lives import believing, draw
+from studies.sbc_epoch.lives import Life, believing, draw
 
 SEED = 20261122
 EPOCHS = ("first third", "second third", "last")
@@ -109,7 +109,18 @@ def one(kind: str, life: int) -> Row:
         found = infer(told, believed, [SEED, life], epochs=drawn.epochs)
         draws = [np.log(thinned(own)) for own in found.samples]
         return {"rank": ranks(drawn.truth, draws, rng), "converged": bool(found.converged.all())}
-    names = believed.informative
+    place, chains = ranks_of(replace(drawn, track=told), believed, rng, [SEED, life])
+    return {"rank": place, "chains": chains}
+
+
+def ranks_of(
+    drawn: Life, believed: Stage, rng: np.random.Generator, key: list[int]
+) -> tuple[list[list[float]], int]:
+    """Rank the truth of each epoch, by chains of a key where importance sampling does not do.
+
+    Also tells whether it did not.
+    """
+    told, names = drawn.track, believed.informative
     columns = [told.modes.index(name) for name in names]
     draws, chains = [], 0
     for k in drawn.epochs:
@@ -120,9 +131,9 @@ def one(kind: str, life: int) -> Row:
             found = explore_well(posterior.log_probability, start, rng, N_POINTS)
             draws.append(found.resampled(rng, N_DRAWS))
         except NotConverged:
-            draws.append(thinned(draw_chains(posterior, stream([SEED, life], k)).flat))
+            draws.append(thinned(draw_chains(posterior, stream(key, k)).flat))
             chains = 1
-    return {"rank": ranks(drawn.truth, draws, rng), "chains": chains}
+    return ranks(drawn.truth, draws, rng), chains
 
 
 def ranks(truth: Array, draws: list[Array], rng: np.random.Generator) -> list[list[float]]:

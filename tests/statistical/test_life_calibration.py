@@ -1,7 +1,7 @@
 """Calibration of whole lives on truths drawn from the stated priors.
 
-Posteriors are integrated on grids, so that the check is of the model and not of the sampler. A
-coverage passes when its 99.9 % Clopper-Pearson interval holds the nominal value.
+Of lives that fade posteriors are integrated on grids, so that the check is of the model and not of
+the sampler; of the lives of the shipped description they are drawn, up to the remaining life.
 """
 
 from __future__ import annotations
@@ -15,9 +15,28 @@ import pytest
 from lmshealth import life
 from lmshealth.arrays import FloatArray
 from lmshealth.density import LifeDensity
+from lmshealth.fleet import is_young, lesson_of
 from lmshealth.life import LifeLikelihood
+from lmshealth.lifefit import fit_life
+from lmshealth.metrics import place
+from lmshealth.prognosis import _usage, remaining_travel
 from lmshealth.stage import Stage
 from lmshealth.tracks import History
+from studies.fleet_prior.lives import YOUNG, draw_fleet
+from studies.fleet_prior.lives import draw as draw_machine
+from studies.fleet_prior.run import (
+    MOST_DRAWN,
+    SMALL,
+    described,
+    horizon,
+    lessons,
+    posterior,
+    taught,
+)
+from studies.ranks import N_DRAWS
+from studies.sbc_life.lives import draw
+from studies.sbc_life.run import N_POSTERIOR, machine, quantities, true_quantities
+from tests.claims import Claims
 from tests.lives import (
     AXES,
     FADING,
@@ -28,9 +47,9 @@ from tests.lives import (
     make_stage,
     true_drift,
 )
-from tests.oracles import cdf_at, check_coverage
+from tests.oracles import cdf_at
+from tests.statistical.evidence import uniform
 
-N_LIVES = 300
 N_LOGS = 12
 HORIZON = 2e7
 
@@ -90,46 +109,125 @@ def level_of_health(
     return float(np.mean((1 - drawn) * np.exp(off[:, 0]) < truth))
 
 
-def test_lives_are_calibrated_and_are_not_without_their_map_error(
-    rng: np.random.Generator, tmp_path: Path
+def test_losses_by_laws_are_calibrated(
+    rng: np.random.Generator, claims: Claims, tmp_path: Path
 ) -> None:
     """All that is not known drawn from its prior: losses by the law are covered, and so is health.
 
-    Remaining life falls as the loss grows, so that its intervals cover when those of loss do.
-    Negative control: on the same lives a map that is taken as exact covers too little.
+    Control: on the same lives a map that is taken as exact.
     """
     honest = make_stage(tmp_path / "honest", (FADING,), model_std=0.2, tail=TEMPERATURE)
     proud = make_stage(tmp_path / "proud", (FADING,), model_std=0.0, tail=TEMPERATURE)
     found, health, wrong = [], [], []
-    for _ in range(N_LIVES):
+    for _ in range(claims.trials):
         history, loss, left = draw_history(rng, 0.2)
         density = density_of(history, honest)
         assert density.life.horizon == HORIZON
         found.append(cdf_at(*integrated(density), loss))
         health.append(level_of_health(density, rng, left))
-        wrong.append(cdf_at(*integrated(density_of(history, proud)), loss))
-    check_coverage(np.array(found), calibrated=True)
-    check_coverage(np.array(health), calibrated=True)
-    check_coverage(np.array(wrong), calibrated=False)
+        rash = density_of(history, proud)
+        wrong.append((cdf_at(*integrated(rash), loss), level_of_health(rash, rng, left)))
+    claims.claim("loss by the law", uniform(found))
+    claims.claim("health now", uniform(health))
+    for name, own in zip(claims.part.claims, np.transpose(wrong), strict=True):
+        claims.control(name, uniform(own))
 
 
-def test_health_off_its_law_is_calibrated_and_is_not_by_laws_alone(
-    rng: np.random.Generator, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_health_off_its_law_is_calibrated(
+    rng: np.random.Generator, claims: Claims, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Where most lives stray far from their law, by modes that wander little, health is covered.
 
-    Negative control: taken never to leave its law, it is covered too little.
+    Control: taken never to leave its law, it is not.
     """
     monkeypatch.setattr(life, "_WALKS", (1e-5, 5e-4, 1.5e-3))
     monkeypatch.setattr(life, "_DEVIATIONS", (0.0, 0.4))
     monkeypatch.setattr(life, "_DEVIATION_PRIOR", (0.1, 0.9))
     stage = make_stage(tmp_path, (FADING,), model_std=0.2, tail=TEMPERATURE)
     found, wrong = [], []
-    for _ in range(N_LIVES):
+    for _ in range(claims.trials):
         history, _, left = draw_history(rng, 0.2)
         density = density_of(history, stage)
         found.append(level_of_health(density, rng, left))
         lawful = replace(density, grid=density.grid.chosen(density.grid.deviation == 0))
         wrong.append(level_of_health(lawful, rng, left))
-    check_coverage(np.array(found), calibrated=True)
-    check_coverage(np.array(wrong), calibrated=False)
+    claims.claim("health now, off its law", uniform(found))
+    claims.control("health now, off its law", uniform(wrong))
+
+
+def test_ranks_of_whole_lives_are_uniform(rng: np.random.Generator, claims: Claims) -> None:
+    """Of the shipped Y stage health now, whether a part wears and what remains is one more draw.
+
+    Controls are of what narrower draws would hide where many of them tie: the contrary of whether a
+    part wears, a fifth less of health, and a quarter of what remains.
+    """
+    places, wrong = [], []
+    horizon = 1000 * machine().description.usage.horizon_km
+    for _ in range(claims.trials):
+        drawn = draw(rng, machine())
+        truth = np.minimum(true_quantities(drawn, rng), horizon)
+        found = fit_life(drawn.history, machine(), int(rng.integers(1 << 32)), chains=False,
+                         n_draws=N_POSTERIOR)  # fmt: skip
+        draws = np.minimum(quantities(found, drawn.now, rng), horizon)
+        draws = draws[rng.permutation(len(draws))[:N_DRAWS]]
+        worse = [1 - draws[:, :2], 0.8 * draws[:, 2:4], draws[:, 4:5] - 0.2, draws[:, 5:] / 4]
+        places.append(place(draws, truth, rng))
+        wrong.append(place(np.hstack(worse), truth, rng))
+    for name, right, rash in zip(
+        claims.part.claims, np.transpose(places), np.transpose(wrong), strict=True
+    ):
+        claims.claim(name, uniform(right))
+        claims.control(name, uniform(rash))
+
+
+def test_young_machines_are_told_right_by_their_fleet(
+    rng: np.random.Generator, claims: Claims
+) -> None:
+    """The true remaining life of a young machine is one more draw with the prior of its fleet.
+
+    One machine of each fleet counts, the first that is young. Control: a quarter of what remains.
+    """
+    limit = described().parameters[0].limit
+    assert limit is not None
+    places, wrong = [], []
+    while len(places) < claims.trials:
+        fleet = draw_fleet(rng, described())
+        number = int(rng.integers(1 << 32))
+        teachers = lessons(rng, fleet, SMALL, number)
+        for _ in range(MOST_DRAWN):
+            young = draw_machine(rng, fleet, YOUNG)
+            lesson = lesson_of(described(), posterior(young, described(), number))
+            if is_young(lesson) and (prior := taught(lesson, teachers)) is not None:
+                break
+        else:
+            continue
+        told = posterior(young, prior.onto(described()), number)
+        left = remaining_travel(
+            told, [(0, described().parameters[0])], rng, now=young.now, horizon=horizon()
+        )
+        draws = np.minimum(left, horizon())
+        truth = np.array([young.part.left(rng, young.now, limit.below, horizon())])
+        for factor, kept in ((1.0, places), (0.25, wrong)):
+            kept.append(place(factor * draws, truth, rng, horizon=horizon())[0])
+    claims.claim("remaining life", uniform(places))
+    claims.control("remaining life", uniform(wrong))
+
+
+def test_usage_covers_what_comes(rng: np.random.Generator, claims: Claims, tmp_path: Path) -> None:
+    """The travel of weeks to come is one more draw, also after few logs.
+
+    Control: the mean of years to come, which says too little of few weeks.
+    """
+    stage = make_stage(tmp_path, (FADING,))
+    for name, n, weeks in (("twenty weeks", 20, 20), ("three weeks", 5, 3)):
+        levels, wrong = [], []
+        for _ in range(claims.trials):
+            steps = 1.4e5 * (1 + 0.1 * rng.standard_normal(n))
+            still = np.tile(np.log(FREQUENCY[:2]), (n + 1, 1))
+            history = make_history(still, travel=np.r_[0, np.cumsum(steps)])
+            truth = 1.4e5 / 7 * (1 + 0.1 * rng.standard_normal(weeks).mean())
+            for found, left in ((levels, weeks * 1.4e5), (wrong, 4e7)):
+                usage = _usage(history, stage, rng, np.full(500, left), 4e7)
+                found.append(np.mean(usage < truth))
+        claims.claim(name, uniform(levels))
+        claims.control(name, uniform(wrong))
