@@ -20,7 +20,7 @@ HEAVY = (
     *("filterpy", "control", "jinja2", "dask", "distributed", "weasyprint", "xarray"),
 )
 # What a user's own program may look like: every name is used, and every result has its type.
-CLIENT = '''
+CLIENT = """
 from pathlib import Path
 
 import lmshealth
@@ -54,7 +54,7 @@ def assessed(folder: Path) -> str:
         (refused, both, laws, day, assessment.judgement.verdict, plan.duration_of_one, result)
     )
     return told
-'''
+"""
 
 
 def _run(*words: str) -> str:
