@@ -74,19 +74,6 @@ def logs(tmp_path_factory: pytest.TempPathFactory, root: Path) -> Path:
     folder = tmp_path_factory.mktemp("readme")
     words = ["simulate", "lms-y", "--life", "both", "--logs", "6", "--seconds", "10"]
     words += ["--seed", "3", "--workers", "1"]
-        "simulate",
-        "lms-y",
-        "--life",
-        "both",
-        "--logs",
-        "6",
-        "--seconds",
-        "10",
-        "--seed",
-        "3",
-        "--workers",
-        "1",
-    ]
     command = [sys.executable, "-m", "models", *words, "--out", str(folder / "logs")]
     subprocess.run(command, check=True, cwd=root, capture_output=True)
     return folder

@@ -346,3 +346,10 @@ def test_scale_index(root: Path, needs: Callable[[str], None]) -> None:
     needs("chromium")
     answer = json.loads(run_study(root, "scale", "index"))
     assert all(answer["passed"].values())
+
+
+def test_install(root: Path) -> None:
+    """Import and help take less than what any such program imports, all names more."""
+    answer = json.loads(run_study(root, "install"))
+    assert all(answer["passed"].values())
+    assert answer["start"]["times_bare"]["all names"] > 1
