@@ -4,7 +4,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 DEMO := demo
 
-.PHONY: demo picture test check clean
+.PHONY: demo picture test check bench clean
 
 demo: .venv/installed
 	@rm -rf $(DEMO)
@@ -23,6 +23,13 @@ test: export OPENBLAS_NUM_THREADS = 1
 test: export OMP_NUM_THREADS = 1
 test: .venv/installed check
 	$(BIN)/pytest -n 2
+
+# Every figure of speed beside its peer; with RECORD=--record into studies/bench/result.json.
+bench: export OPENBLAS_NUM_THREADS = 1
+bench: export OMP_NUM_THREADS = 1
+bench: .venv/installed
+	$(BIN)/pytest tests/bench -o python_files='bench_*.py' -p no:xdist \
+		--benchmark-timer=time.process_time --benchmark-columns=median $(RECORD)
 
 check: .venv/installed
 	$(BIN)/ruff check .
