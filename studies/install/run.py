@@ -11,7 +11,11 @@ Method
     that fills the disk's cache; programs take turns, the least of each counts, and the median of
     the ratios to `import numpy, scipy, pandas` in the same turn.
 Answer
-    ANSWER
+    Yes. It takes 0.08 s, a seventh of numpy, scipy and pandas, because every name is fetched when
+    it is first asked for; help takes 0.35 s, 0.6 times as long as these. Who uses all names at
+    once pays then: 3.3 s, 5.3 times as long. The machine was kept busy by other programs. An
+    installation takes 508 MB in 34 distributions; scipy, pandas and numpy are 295 MB of it,
+    lmshealth 3.7 MB.
 Run time
     Some minutes, most of it the installation.
 """

@@ -49,7 +49,7 @@ N_LOGS, N_SHORT = 1000, 24
 
 @pytest.fixture(scope="module")
 def stage() -> Stage:
-    """The Y stage."""
+    """Load the Y stage."""
     return load_stage("lms-y")
 
 
@@ -219,7 +219,7 @@ def test_tracking(race: Race) -> None:
 
 @pytest.fixture(scope="module")
 def minute() -> Iterator[Path]:
-    """A minute of four signals at 20 kHz in each format."""
+    """Write a minute of four signals at 20 kHz in each format."""
     with tempfile.TemporaryDirectory() as folder:
         columns = signals(60 * RATE)
         for name in BOUNDED:
