@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import pytest
@@ -36,22 +37,31 @@ def pytest_configure(config: pytest.Config) -> None:
 
 
 def pytest_terminal_summary(terminalreporter: Any, config: pytest.Config) -> None:
-    """Show all figures, and record them where that is asked for."""
+    """Show all figures, and record them where that is asked for; of some, beside the others."""
     figures = config.stash[_FIGURES]
+    if not figures:
+        return
     terminalreporter.section("figures")
     for line in table(figures):
         terminalreporter.write_line(line)
-    if figures and config.getoption("--record"):
-        before = json.loads(RECORD.read_text())["figures"] if RECORD.exists() else {}
-        answer = {"method": METHOD, "figures": before | figures}
+    if config.getoption("--record"):
+        known = json.loads(RECORD.read_text())["figures"] if RECORD.exists() else {}
+        others = known if config.getoption("keyword") else {}
+        answer = {
+            "method": METHOD,
+            "figures": others | figures,
+            # Whether the machine had other work.
+            "processors": os.cpu_count(),
+            "load": [round(load, 1) for load in os.getloadavg()],
+        }
         keep(RECORD, QUESTION, answer, config.stash[_WATCH])
 
 
 class Race:
     """Runs ours and a peer in turns, and holds what comes of it."""
 
-    def __init__(self, benchmark: BenchmarkFixture, figures: dict[str, dict[str, Any]]) -> None:
-        self._benchmark, self._figures = benchmark, figures
+    def __init__(self, request: pytest.FixtureRequest) -> None:
+        self._request = request
 
     def __call__(
         self,
@@ -75,9 +85,11 @@ class Race:
         def then_ours() -> None:
             amounts.append(_amount(ours()))
 
+        benchmark: BenchmarkFixture = self._request.getfixturevalue("benchmark")
+        assert benchmark._timer is time.process_time, "run `make bench`"
         peer(), ours()  # what is put off until the first call
-        self._benchmark.pedantic(then_ours, setup=first_the_peer, rounds=turns)
-        own = self._benchmark.stats.stats.data
+        benchmark.pedantic(then_ours, setup=first_the_peer, rounds=turns)
+        own = benchmark.stats.stats.data
         times = zip(own, amounts, theirs, strict=True)
         self.told([t / n / other for t, n, other in times], name=name, beside=beside,
                   at_most=at_most)  # fmt: skip
@@ -85,8 +97,7 @@ class Race:
     def told(self, ratios: Sequence[float], *, name: str, beside: str, at_most: float) -> None:
         """Hold ratios that were measured elsewhere."""
         figure = Figure(name, beside, at_most, tuple(ratios))
-        self._figures[name] = figure.row()
-        self._benchmark.extra_info.update(figure.row())
+        self._request.config.stash[_FIGURES][name] = figure.row()
         assert not figure.missed, figure.row()
 
 
@@ -95,7 +106,6 @@ def _amount(found: object) -> float:
 
 
 @pytest.fixture
-def race(benchmark: BenchmarkFixture, request: pytest.FixtureRequest) -> Iterator[Race]:
+def race(request: pytest.FixtureRequest) -> Race:
     """Hold a figure."""
-    assert benchmark._timer is time.process_time, "run `make bench`"
-    yield Race(benchmark, request.config.stash[_FIGURES])
+    return Race(request)
