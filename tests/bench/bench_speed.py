@@ -267,7 +267,7 @@ def test_two_workers(race: Race) -> None:
         make_archive(folder, N_SHORT)
 
         def turn() -> float:
-            one, two = (bare(folder, n) for n in (1, 2))
+            one, two = (bare(folder, n, N_SHORT) for n in (1, 2))
             rates = [identified(folder, Settings(workers=n)).rate for n in (1, 2)]
             return min(two / one, 2.0) / (rates[1] / rates[0])
 
