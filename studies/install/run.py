@@ -70,7 +70,7 @@ def main() -> None:
     watch = Stopwatch()
     answer: dict[str, Any] = {}
     if quick:
-        answer["start"] = started(Path(sys.executable), ROOT, turns=3)
+        answer["start"] = started(Path(sys.executable), ROOT, turns=2)
     else:
         with tempfile.TemporaryDirectory() as name:
             python = installed(Path(name))
