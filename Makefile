@@ -4,7 +4,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 DEMO := demo
 
-.PHONY: demo picture test statistics check clean
+.PHONY: demo picture test statistics bench check clean
 
 demo: .venv/installed
 	@rm -rf $(DEMO)
@@ -19,14 +19,18 @@ picture: .venv/installed
 	$(BIN)/python -m studies.demo_life.picture $(DEMO)/result
 
 # Tests run side by side: threads inside linear algebra would only get in their way.
-test statistics: export OPENBLAS_NUM_THREADS = 1
-test statistics: export OMP_NUM_THREADS = 1
+test statistics bench: export OPENBLAS_NUM_THREADS = 1
+test statistics bench: export OMP_NUM_THREADS = 1
 test: .venv/installed check
 	$(BIN)/pytest -n 2 -m "not statistical"
 
 # Is what is said of errors and intervals true? LMSHEALTH_SEED=7 draws all anew.
 statistics: .venv/installed
 	$(BIN)/pytest -n 2 --dist worksteal -m statistical
+
+# Every figure of speed beside its peer, into studies/bench/result.json.
+bench: .venv/installed
+	$(BIN)/python -m studies.bench.run
 
 check: .venv/installed
 	$(BIN)/ruff check .

@@ -136,6 +136,19 @@ def assess(
     -------
     Assessment
         What the data do not carry is None, with the reason among the notes.
+
+    Examples
+    --------
+    Two logs are not enough for a baseline, and that is what is said:
+
+    >>> import lmshealth
+    >>> from lmshealth import examples
+    >>> stage = lmshealth.load_stage("lms-y")
+    >>> found = lmshealth.assess(examples.readings()[:2], stage, epochs=1)
+    >>> found.judgement.verdict, found.judgement.why
+    ('not-enough-data', '2 usable logs since the baseline began; it needs 5.')
+    >>> found.notes[0].split("; ")[1]
+    'a life needs at least 3 logs and some travel'
     """
     history, refused = build_history(readings, stage, work.actions)
     notes = maintenance_notes(work, [reading.metadata.recorded_at for reading in readings])

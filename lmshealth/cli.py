@@ -19,7 +19,6 @@ from lmshealth.batchcommands import report, run
 from lmshealth.commands import COMMANDS
 from lmshealth.errors import BadLog, LmshealthError
 from lmshealth.logs import Log, Refusal
-from lmshealth.magnitudes import find_growth
 from lmshealth.options import (
     COLUMNS,
     DETECT,
@@ -214,6 +213,7 @@ def spectrum(ctx: click.Context, /, logs: tuple[Path, ...], style: str, **option
     are found by a test that shows one where there is none in 1 % of channels.
     """
     from lmshealth.looks import LOOKS, growth_rows, lines_rows, magnitudes_rows
+    from lmshealth.magnitudes import find_growth
     from lmshealth.survey import survey
     from lmshealth.tables import frame, refused_rows
 

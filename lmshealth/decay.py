@@ -59,7 +59,7 @@ def identify_decays(
     channels: Sequence[str] | None = None,
     band: tuple[float, float] | None = None,
 ) -> Modes:
-    """Identify the modes of a log from its free decays, with their covariance.
+    r"""Identify the modes of a log from its free decays, with their covariance.
 
     Parameters
     ----------
@@ -87,6 +87,26 @@ def identify_decays(
         If no channel or decay is left, or nothing rings and no stage says what should.
     BadStage
         If the stage has no mode in the band.
+
+    Examples
+    --------
+    After each of six moves of a second the stage rings at 85 Hz with a damping of 1 %:
+
+    >>> import numpy as np
+    >>> import lmshealth
+    >>> rng, rate = np.random.default_rng(1), 1000
+    >>> move, time = np.zeros(rate), np.arange(rate) / rate
+    >>> ring = np.exp(-2 * np.pi * 85 * 0.01 * time) * np.cos(2 * np.pi * 85 * time)
+    >>> acceleration = np.tile(np.r_[move, ring], 6) + 0.2 * rng.standard_normal(12 * rate)
+    >>> velocity = np.tile(np.r_[move + 100, move], 6)
+    >>> head = "# sample_rate_hz: 1000\nacc_pitch_m_s2,reference_velocity_mm_s"
+    >>> table = np.column_stack([acceleration, velocity])
+    >>> np.savetxt("stops.csv", table, delimiter=",", header=head, comments="")
+    >>> modes = lmshealth.identify_decays(lmshealth.read_log("stops.csv"), band=(40, 200))
+    >>> print(f"{modes.frequency[0]:.2f} ± {modes.frequency_std[0]:.2f} Hz")
+    85.02 ± 0.03 Hz
+    >>> print(f"{modes.damping_ratio[0]:.2%} ± {modes.damping_ratio_std[0]:.2%}")
+    0.97% ± 0.03%
     """
     used = choose_channels(log, channels)
     decays = _stops(log, segments)

@@ -84,6 +84,18 @@ def decide(prognosis: Prognosis | None, decision: Decision) -> Service:
         The remaining life; without one the kind is ``unknown``.
     decision : Decision
         The accepted risk or the ratio of costs, and the service that is planned.
+
+    Examples
+    --------
+    >>> import lmshealth
+    >>> from lmshealth import examples
+    >>> stage = lmshealth.load_stage("lms-y")
+    >>> prognosis = lmshealth.prognose(examples.history(), stage, seed=0, chains=False)
+    >>> service = lmshealth.decide(prognosis, stage.description.decision)
+    >>> service.kind, service.by.strftime("%B %Y"), service.max_risk
+    ('by', 'August 2026', 0.05)
+    >>> service.risk <= 0.05
+    True
     """
     kind: Literal["now", "by", "later", "unknown"] = "unknown"
     by, wait, risk = None, np.nan, np.nan

@@ -4,7 +4,17 @@ from __future__ import annotations
 
 
 class LmshealthError(Exception):
-    """Base of every error that lmshealth raises on purpose."""
+    """Base of every error that lmshealth raises on purpose.
+
+    Examples
+    --------
+    >>> import lmshealth
+    >>> try:
+    ...     lmshealth.read_log("nothing.h5")
+    ... except lmshealth.LmshealthError as error:
+    ...     print(error)
+    nothing.h5: missing-file: cannot be opened: No such file or directory
+    """
 
 
 class BadLog(LmshealthError):

@@ -36,7 +36,7 @@ _NO_MOMENT = datetime.max.replace(tzinfo=UTC)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Reading:
-    """What one log said.
+    r"""What one log said.
 
     Attributes
     ----------
@@ -53,6 +53,23 @@ class Reading:
         where the log does not tell.
     levels : Levels or None
         The band of the tracked modes, for people to look at; None where the log does not show it.
+
+    Examples
+    --------
+    Of a log of noise alone, which shows no mode:
+
+    >>> import numpy as np
+    >>> import lmshealth
+    >>> noise = np.random.default_rng(1).standard_normal(20_000)
+    >>> head = "# sample_rate_hz: 1000\n# stage: AX-3-Y\n# travel_km: 12.5\nacc_pitch_m_s2"
+    >>> np.savetxt("log.csv", noise, header=head, comments="")
+    >>> log = lmshealth.read_log("log.csv")
+    >>> modes = lmshealth.identify(log, lmshealth.load_stage("lms-y"))
+    >>> reading = lmshealth.Reading(log.name, log.digest, log.metadata, modes)
+    >>> reading.metadata.stage, reading.metadata.travel, reading.modes.names
+    ('AX-3-Y', 12500.0, ())
+    >>> [(refusal.mode, refusal.reason) for refusal in reading.modes.refused]
+    [('roll', 'not-excited'), ('pitch', 'not-excited'), ('yaw', 'not-excited')]
     """
 
     log: str
@@ -98,6 +115,17 @@ def build_history(
     ------
     NotEnoughData
         If there is no reading.
+
+    Examples
+    --------
+    >>> import lmshealth
+    >>> from lmshealth import examples
+    >>> stage = lmshealth.load_stage("lms-y")
+    >>> history, refused = lmshealth.build_history(examples.readings(), stage)
+    >>> len(history.logs), len(refused), history.modes
+    (24, 0, ('roll', 'pitch', 'yaw'))
+    >>> print(f"{history.travel[-1] / 1000:.0f} km")
+    1632 km
     """
     if not readings:
         name = "" if stage is None else f"{stage.name}: "

@@ -272,6 +272,22 @@ def fit_life(
         jumped too often.
     NotConverged
         If the sampler did not converge; carries the chains.
+
+    Examples
+    --------
+    What a simulated machine has left, and by which laws it lost the rest:
+
+    >>> import numpy as np
+    >>> import lmshealth
+    >>> from lmshealth import examples
+    >>> stage = lmshealth.load_stage("lms-y")
+    >>> life = lmshealth.fit_life(examples.history(), stage, seed=0, chains=False)
+    >>> [branch.law.kind for branch in life.ways[0].course.branches]
+    ['hertz-wear', 'loosening']
+    >>> for name, median in zip(life.parameters, np.median(life.health, axis=(0, 1))):
+    ...     print(f"{name}: {median:.0%}")
+    guide_preload: 72%
+    mount_stiffness: 87%
     """
     likelihood = LifeLikelihood(history, stage)
     explore_seed, chain_seed, off_seed = stream(seed, _STEP).spawn(3)

@@ -49,7 +49,7 @@ def identify(
     channels: Sequence[str] | None = None,
     band: tuple[float, float] | None = None,
 ) -> Modes:
-    """Identify the modes of a log with their covariance.
+    r"""Identify the modes of a log with their covariance.
 
     Parameters
     ----------
@@ -72,6 +72,27 @@ def identify(
     ------
     BadLog
         If no channel is left, or the record is too short or too slow for the modes.
+
+    Examples
+    --------
+    A minute of an accelerometer on something that rings at 126.4 Hz with a damping of 1.5 % while
+    white noise shakes it:
+
+    >>> import numpy as np
+    >>> from scipy.signal import lfilter
+    >>> import lmshealth
+    >>> rng, rate, frequency, damping = np.random.default_rng(1), 1000, 126.4, 0.015
+    >>> pole = np.exp(2 * np.pi * frequency / rate * (-damping + 1j * np.sqrt(1 - damping**2)))
+    >>> force, noise = rng.standard_normal((2, 60 * rate))
+    >>> shaken = lfilter([1, -2, 1], np.poly([pole, pole.conj()]), force) + 0.5 * noise
+    >>> head = "# sample_rate_hz: 1000\nacc_roll_m_s2"
+    >>> np.savetxt("log.csv", shaken, header=head, comments="")
+    >>> modes = lmshealth.identify(lmshealth.read_log("log.csv"), band=(100, 160))
+    >>> for f, f_std, zeta, zeta_std in zip(
+    ...     modes.frequency, modes.frequency_std, modes.damping_ratio, modes.damping_ratio_std
+    ... ):
+    ...     print(f"{f:.1f} ± {f_std:.1f} Hz, {zeta:.1%} ± {zeta_std:.1%}")
+    126.4 ± 0.1 Hz, 1.5% ± 0.1%
     """
     used = choose_channels(log, channels)
     seen: list[tuple[str, float, float]] = []

@@ -39,6 +39,14 @@ class Settings:
         Health is inferred at no more than this many epochs per stage.
     seed : int
         Of all randomness.
+
+    Examples
+    --------
+    Two processes, and a store for a team; the password that its address may hold is not shown:
+
+    >>> import lmshealth
+    >>> lmshealth.Settings(workers=2, store="postgresql://me:secret@host/fleet")
+    Settings(workers=2, scheduler=None, epochs=40, seed=0)
     """
 
     store: str | None = field(default=None, repr=False)  # it may hold a password
@@ -110,6 +118,27 @@ def run(
     ------
     NothingUsable
         If there is no log, or every log was refused; ``refused.csv`` is written all the same.
+
+    Examples
+    --------
+    A folder of one log, of noise alone: no mode is made up, and the pages say so.
+
+    >>> from pathlib import Path
+    >>> import numpy as np
+    >>> import pandas as pd
+    >>> import lmshealth
+    >>> Path("logs").mkdir()
+    >>> head = ["# sample_rate_hz: 1000", "# stage: AX-3-Y", "# travel_km: 12.5"]
+    >>> head += ["# recorded_at: 2026-07-12T06:00:00Z", "acc_pitch_m_s2"]
+    >>> noise = np.random.default_rng(1).standard_normal(20_000)
+    >>> np.savetxt("logs/one.csv", noise, header=chr(10).join(head), comments="")
+    >>> stage = lmshealth.load_stage("lms-y")
+    >>> result = lmshealth.run(Path("logs"), [stage], Path("result"))
+    >>> result.n_logs, result.n_refused, result.index.name
+    (1, 0, 'index.html')
+    >>> refused = pd.read_csv("result/refused.csv")
+    >>> dict(zip(refused["mode"], refused["reason"]))
+    {'roll': 'not-excited', 'pitch': 'not-excited', 'yaw': 'not-excited'}
     """
     _prepare(out)
     work = read_maintenance(folder)

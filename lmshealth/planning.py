@@ -142,6 +142,20 @@ def plan(
     References
     ----------
     Au2014
+
+    Examples
+    --------
+    How long must one log be to see that a twentieth of the preload is lost?
+
+    >>> import lmshealth
+    >>> stage = lmshealth.load_stage("lms-y")
+    >>> found = lmshealth.plan(stage, "guide_preload", 0.05)
+    >>> found.duration_of_one, found.n_baseline
+    (12, 5)
+    >>> for effort in found.efforts[:2]:
+    ...     print(f"{effort.duration:.0f} s: {effort.n_logs} of them, {effort.power:.0%} for one")
+    10 s: 2 of them, 91% for one
+    20 s: 1 of them, 100% for one
     """
     test = _Test(power, false_alarm)
     sight = sight_of(stage)

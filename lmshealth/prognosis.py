@@ -53,6 +53,21 @@ def prognose(
         If the history is too short, or the modes tell no parameter that has a limit.
     NotConverged
         If the sampler did not converge.
+
+    Examples
+    --------
+    A simulated machine, whose preload reaches its limit 824 km after the last log:
+
+    >>> import numpy as np
+    >>> import lmshealth
+    >>> from lmshealth import examples
+    >>> stage = lmshealth.load_stage("lms-y")
+    >>> prognosis = lmshealth.prognose(examples.history(), stage, seed=0, chains=False)
+    >>> prognosis.parameters
+    ('guide_preload', 'mount_stiffness', 'any')
+    >>> low, median, high = np.quantile(prognosis.remaining[:, -1], (0.05, 0.5, 0.95)) / 1000
+    >>> bool(low < 824 < high)
+    True
     """
     return prognose_with_posterior(history, stage, seed, chains=chains)[0]
 

@@ -7,7 +7,6 @@ from itertools import pairwise
 from typing import Literal, get_args
 
 import numpy as np
-from scipy import fft
 
 from lmshealth.arrays import BoolArray, FloatArray
 from lmshealth.errors import BadLog
@@ -111,6 +110,8 @@ def find_segments(log: Log, shortest: float) -> tuple[Segment, ...]:
 
 def _parts(segment: Segment, longest: int) -> list[Segment]:
     """Cut a segment into the fewest parts of one length; a few last samples may be left out."""
+    from scipy import fft  # late: the command line only names the parts
+
     size = segment.stop - segment.start
     n_parts = -(-size // longest)
     if n_parts == 1:

@@ -312,6 +312,21 @@ def load_stage(reference: str) -> Stage:
     ------
     BadStage
         If it cannot be found or read, breaks the schema, or its map does not fit.
+
+    Examples
+    --------
+    >>> import lmshealth
+    >>> stage = lmshealth.load_stage("lms-y")
+    >>> [(mode.name, mode.frequency_hz) for mode in stage.modes]
+    [('roll', 126.4), ('pitch', 136.6), ('yaw', 155.0)]
+    >>> [(parameter.name, parameter.limit.below) for parameter in stage.parameters]
+    [('guide_preload', 0.6), ('mount_stiffness', 0.7)]
+
+    By how much a fifth of the preload lost lowers roll and pitch, by its modal map:
+
+    >>> import numpy as np
+    >>> np.exp(stage.drift(np.log([[0.8, 1.0]]), ("roll", "pitch"))).round(3)
+    array([[0.979, 0.97 ]])
     """
     if reference.endswith(".toml"):
         path = Path(reference)

@@ -7,7 +7,7 @@ import math
 from collections.abc import Sequence
 from itertools import combinations
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 import numpy as np
@@ -15,10 +15,12 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
-from lmshealth.results import Health
-from lmshealth.tables import Row
-from lmshealth.tracks import Track
 from lmshealth.wording import LEVELS, change
+
+if TYPE_CHECKING:  # so that help comes without pandas and scipy
+    from lmshealth.results import Health
+    from lmshealth.tables import Row
+    from lmshealth.tracks import Track
 
 # So many lines of a frequency response are shown.
 _MOST_LINES = 12

@@ -80,6 +80,21 @@ def judge(
         not converge, when no state of the parameters explains the drifts, or when the data say
         nothing about any parameter; ``step`` when the modes
         jumped since the baseline and nobody said why.
+
+    Examples
+    --------
+    >>> import lmshealth
+    >>> from lmshealth import examples
+    >>> stage, history = lmshealth.load_stage("lms-y"), examples.history()
+    >>> track = lmshealth.track(history, stage)
+    >>> health = lmshealth.infer(track, stage, seed=0, epochs=[len(track.recorded_at) - 1])
+    >>> judgement = lmshealth.judge(stage, history, health, track)
+    >>> print(f"{judgement.verdict}, {judgement.probability:.1%}")
+    both, 99.9%
+    >>> judgement.why.split(".")[0]
+    'Guide preload is at 72 % of its baseline value (90 %: 70 to 75 %)'
+    >>> lmshealth.judge(stage, history, None).why
+    'The logs do not carry the health parameters.'
     """
     jumps = [] if track is None else unexplained_steps(track, history.baseline)
     if jumps:

@@ -71,7 +71,7 @@ FLOORS = [
     {"separation"},
     {"modal", "frf", "history", "ringing", "sampling", "importance", "passage"},
     {"tracking", "smoothing", "decay", "survey", "sight", "modetable", "epoch"},
-    {"inference", "planning", "examination", "life", "influences"},
+    {"inference", "planning", "examination", "life", "influences", "examples"},
     {"findings", "density"},
     {"lifefit"},
     {"prognosis"},

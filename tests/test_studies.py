@@ -368,3 +368,10 @@ def test_scale_plan(root: Path) -> None:
     assert all(answer["passed"].values())
     hours = [plan["hours"] for plan in answer["plans"]]
     assert hours == sorted(hours, reverse=True)
+
+
+def test_install(root: Path) -> None:
+    """Import and help take less than what any such program imports, all names more."""
+    answer = json.loads(run_study(root, "install"))
+    assert all(answer["passed"].values())
+    assert answer["start"]["times_bare"]["all names"] > 1

@@ -44,6 +44,23 @@ def read_log(
     ------
     BadLog
         Whatever is wrong with the file; see `lmshealth.readers` for the reasons.
+
+    Examples
+    --------
+    A log is a table with units in the names of its columns:
+
+    >>> import lmshealth
+    >>> rows = ["# sample_rate_hz: 1000", "# stage: AX-3-Y", "delta_e_um,acc_pitch_g"]
+    >>> rows += [f"{0.01 * (k % 7)},{0.002 * (k % 5)}" for k in range(2000)]
+    >>> with open("log.csv", "w") as file:
+    ...     print(*rows, sep=chr(10), file=file)
+    >>> log = lmshealth.read_log("log.csv")
+    >>> log.metadata.stage, log.sample_rate
+    ('AX-3-Y', 1000.0)
+    >>> [(channel.name, channel.kind) for channel in log.channels]
+    [('delta_e', 'displacement'), ('acc_pitch', 'acceleration')]
+    >>> print(f"{log.channels[0].values.max():.2g} m, {log.channels[1].values.max():.3g} m/s²")
+    6e-08 m, 0.0785 m/s²
     """
     file = Path(path)
     label = shown(path) if name is None else name

@@ -18,7 +18,8 @@ from __future__ import annotations
 import tempfile
 import time
 import tracemalloc
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -27,6 +28,7 @@ import numpy as np
 from scipy import fft
 
 from lmshealth import identify, load_stage, read_log
+from lmshealth.logs import Log
 from models.formats import write_log
 from models.recording import Recording, record
 from models.stages import stage_named
@@ -34,7 +36,7 @@ from studies.identification.cases import CASES
 from studies.identification.records import describe
 from studies.record import Study
 
-HEADLINE = "three modes, three channels, 60 s"
+CASE = next(case for case in CASES if case.name == "three modes, three channels, 60 s")
 SIGNALS = ("delta_e", "acc_feed", "acc_pitch", "acc_between")
 
 
@@ -60,15 +62,19 @@ def timed(task: Callable[[], object]) -> float:
     return time.perf_counter() - start
 
 
+def headline_log(seed: int) -> Log:
+    """Make the headline record."""
+    return CASE.make(np.random.default_rng(seed), CASE.modes, CASE.noise)
+
+
 def headline(n: int) -> dict[str, Any]:
     """Identify the headline record, beside one product of matrices that every machine knows."""
-    case = next(case for case in CASES if case.name == HEADLINE)
-    stage = describe(case.modes)
+    stage = describe(CASE.modes)
     square = np.random.default_rng(0).standard_normal((500, 500))
-    identify(case.make(np.random.default_rng(0), case.modes, case.noise), stage)
+    identify(headline_log(0), stage)
     times, products = [], []
     for seed in range(n):
-        log = case.make(np.random.default_rng(seed), case.modes, case.noise)
+        log = headline_log(seed)
         times.append(timed(lambda log=log: identify(log, stage)))  # type: ignore[misc]
         products.append(timed(lambda: [square @ square for _ in range(4)]) / 4)
     return {
@@ -82,22 +88,7 @@ def headline(n: int) -> dict[str, Any]:
 
 def long_log(n: int) -> dict[str, Any]:
     """Take a log of the simulated stage from Parquet to its modes."""
-    stage = load_stage("lms-y")
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "log.parquet"
-        made = four_channels()
-        write_log(made, path, "parquet")
-        n_samples = sum(values.size for values in made.columns.values())
-
-        def yardstick() -> None:
-            log = read_log(path)
-            for channel in log.channels:
-                if channel.name in SIGNALS:
-                    fft.rfft(channel.values)
-
-        def all_of_it() -> None:
-            identify(read_log(path), stage)
-
+    with parquet_log() as (yardstick, all_of_it, n_samples):
         yardstick(), all_of_it()
         pairs = np.array([(timed(yardstick), timed(all_of_it)) for _ in range(n)])
         tracemalloc.start()
@@ -113,6 +104,27 @@ def long_log(n: int) -> dict[str, Any]:
         "median_ratio": float(np.median(pairs[:, 1] / pairs[:, 0])),
         "memory_over_record": peak / (8 * n_samples),
     }
+
+
+@contextmanager
+def parquet_log() -> Iterator[tuple[Callable[[], None], Callable[[], None], int]]:
+    """Write that log; give what reads and transforms it, what takes it to modes, and its size."""
+    stage = load_stage("lms-y")
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "log.parquet"
+        made = four_channels()
+        write_log(made, path, "parquet")
+
+        def yardstick() -> None:
+            log = read_log(path)
+            for channel in log.channels:
+                if channel.name in SIGNALS:
+                    fft.rfft(channel.values)
+
+        def all_of_it() -> None:
+            identify(read_log(path), stage)
+
+        yield yardstick, all_of_it, sum(values.size for values in made.columns.values())
 
 
 def four_channels() -> Recording:

@@ -49,21 +49,29 @@ def ours(history: History, stage: Stage, seed: list[int]) -> Futures:
     # Chains would take five times as long, and say the same (sbc_life judges both).
     life = fit_life(history, stage, seed, chains=False)
     fitted = time.process_time()
-    now = float(history.travel[-1] - history.travel[history.baseline])
-    remaining = remaining_travel(
+    remaining = futures(life, history, stage, seed)
+    ended = time.process_time()
+    return Futures(remaining, states_of(life, history), fitted - begin, ended - fitted)
+
+
+def futures(life: LifePosterior, history: History, stage: Stage, seed: list[int]) -> Array:
+    """Draw the travel to the first limit from a posterior."""
+    return remaining_travel(
         life,
         told_limits(stage, life.modes),
         np.random.default_rng(seed),
-        now=now,
+        now=_since_baseline(history),
         horizon=stage.description.usage.horizon_km * _KM,
     )[:, -1]
-    ended = time.process_time()
-    return Futures(remaining, _states(life, now), fitted - begin, ended - fitted)
 
 
-def _states(life: LifePosterior, now: float) -> dict[str, Array]:
+def _since_baseline(history: History) -> float:
+    return float(history.travel[-1] - history.travel[history.baseline])
+
+
+def states_of(life: LifePosterior, history: History) -> dict[str, Array]:
     """Write every draw as wear and loosening; of what never changes nothing is ever lost."""
-    parts = []
+    now, parts = _since_baseline(history), []
     for way, off, rate in life.each():
         n = rate.shape[0]
         never = np.full(n, np.inf), np.ones(n)

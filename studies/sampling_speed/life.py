@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import time
-from dataclasses import replace
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime, timedelta
 from typing import Any
 
@@ -85,8 +86,30 @@ def by_filterpy(
     return total
 
 
-def likelihoods(history: History, stage: Stage, walkers: int, looped: int) -> dict[str, Any]:
-    """Compare the time of a walker and the values, at one point of the grid of settings."""
+@dataclass(frozen=True, slots=True, eq=False)
+class Walkers:
+    """Points of a life's posterior, at one point of the grid of settings, and both ways to it.
+
+    Attributes
+    ----------
+    ours, by_filterpy : callable
+        Give log likelihoods up to a constant, of so many walkers.
+    walkers, looped : int
+        How many ours has at once, and how many filterpy one after the other.
+    n_settings, n_kept : int
+        Of the grid, before and after it is cut to what is probable.
+    """
+
+    ours: Callable[[], Array]
+    by_filterpy: Callable[[], Array]
+    walkers: int
+    looped: int
+    n_settings: int
+    n_kept: int
+
+
+def two_ways(history: History, stage: Stage, walkers: int, looped: int) -> Walkers:
+    """Find points that the posterior holds probable, and both ways to their likelihood."""
     likelihood = LifeLikelihood(history, stage)
     # Both parts lose: of all courses the one with the most to draw.
     course = max(likelihood.courses, key=lambda one: one.n_dim)
@@ -99,39 +122,48 @@ def likelihoods(history: History, stage: Stage, walkers: int, looped: int) -> di
     value = np.where(grid.deviation == 0, grid.log_weight - 0.5 * grid.rest, -np.inf)
     density = replace(density, grid=grid.chosen(np.arange(n_kept) == np.argmax(value)))
     walk, scale = float(density.grid.walk[0]), float(density.grid.noise_scale[0])
-    found = density.log_probability(y) - course.log_prior(y)
+    prior = course.log_prior(y)
+    assert stage.description.map is not None
+    model_std = stage.description.map.model_std
+
+    def loop() -> Array:
+        x, _ = likelihood.ln_health(course, y[:looped], history.clock())
+        flats = [stage.drift(one_at_a_time(stage, path), MODES).reshape(3, -1, 2) for path in x]
+        setting = {"walk": walk, "scale": scale, "model_std": model_std}
+        return np.array([by_filterpy(history, flat[0], flat[1:], **setting) for flat in flats])
+
+    return Walkers(
+        lambda: density.log_probability(y) - prior,
+        loop,
+        y.shape[0],
+        looped,
+        likelihood.grid.walk.size,
+        n_kept,
+    )
+
+
+def likelihoods(history: History, stage: Stage, walkers: int, looped: int) -> dict[str, Any]:
+    """Compare the time of a walker and the values, at one point of the grid of settings."""
+    ways = two_ways(history, stage, walkers, looped)
+    found = ways.ours()
     turns = max(400 // walkers, 1)
     clock = time.process_time()
     for _ in range(turns):
-        density.log_probability(y)
+        ways.ours()
     ours = (time.process_time() - clock) / turns / walkers
-    assert stage.description.map is not None
-    x, _ = likelihood.ln_health(course, y[:looped], history.clock())
     clock = time.process_time()
-    book = []
-    for path in x:
-        flat = stage.drift(one_at_a_time(stage, path), MODES).reshape(3, -1, 2)
-        book.append(
-            by_filterpy(
-                history,
-                flat[0],
-                flat[1:],
-                walk=walk,
-                scale=scale,
-                model_std=stage.description.map.model_std,
-            )
-        )
+    book = ways.by_filterpy()
     loop = (time.process_time() - clock) / looped
     return {
         "logs": len(history.logs),
         "modes": len(MODES),
-        "settings": {"all": likelihood.grid.walk.size, "kept": n_kept},
+        "settings": {"all": ways.n_settings, "kept": ways.n_kept},
         "walkers": walkers,
         "us_per_walker": 1e6 * ours,
         "us_per_walker_by_filterpy": 1e6 * loop,
         "times_faster": loop / ours,
         # Up to a constant, which is that of the grid's prior.
-        "largest_difference": float(np.ptp(found[:looped] - np.array(book))),
+        "largest_difference": float(np.ptp(found[:looped] - book)),
         "spread_of_values": float(np.ptp(book)),
     }
 

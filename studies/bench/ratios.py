@@ -1,0 +1,79 @@
+"""Times told as ratios to something else in the same turn, and whether a figure is missed."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.stats import binom
+
+# Probability at most that a figure which is just held is said to be missed.
+FALSE_ALARM = 0.01
+
+
+@dataclass(frozen=True)
+class Figure:
+    """A figure that is held, and what was measured of it.
+
+    Attributes
+    ----------
+    name, peer : str
+        What is timed, and beside what.
+    at_most : float
+        The largest ratio of both times with which the figure is met.
+    ratios : tuple of float
+        One per turn.
+    """
+
+    name: str
+    peer: str
+    at_most: float
+    ratios: tuple[float, ...]
+
+    def __post_init__(self) -> None:
+        if binom.sf(len(self.ratios) - 1, len(self.ratios), 0.5) > FALSE_ALARM:
+            raise ValueError(f"{len(self.ratios)} turns can miss nothing; needed are more")
+
+    @property
+    def median(self) -> float:
+        """What is told of it."""
+        return float(np.median(self.ratios))
+
+    @property
+    def missed(self) -> bool:
+        """Whether more turns are above the bound than chance allows if the median were on it."""
+        above = sum(ratio > self.at_most for ratio in self.ratios)
+        return bool(binom.sf(above - 1, len(self.ratios), 0.5) < FALSE_ALARM)
+
+    def row(self) -> dict[str, Any]:
+        """Write it down."""
+        return {
+            "peer": self.peer,
+            "ratio": round(self.median, 5),
+            "least": round(min(self.ratios), 5),
+            "largest": round(max(self.ratios), 5),
+            "turns": len(self.ratios),
+            "at_most": round(self.at_most, 5),
+            "missed": self.missed,
+        }
+
+
+def table(rows: Mapping[str, Mapping[str, Any]]) -> Iterable[str]:
+    """Lay rows out in lines for a terminal."""
+    yield f"{'figure':<58}{'ratio':>10}{'least':>10}{'largest':>10}{'at most':>10}{'turns':>7}"
+    for name, row in rows.items():
+        numbers = "".join(f"{row[key]:>10.4g}" for key in ("ratio", "least", "largest", "at_most"))
+        yield f"{name:<58}{numbers}{row['turns']:>7}{'  MISSED' if row['missed'] else ''}"
+        yield f"    beside {row['peer']}"
+
+
+def recorded(study: str, *keys: str | int) -> Any:
+    """Look up what a study recorded."""
+    found: Any = json.loads((Path(__file__).parent.parent / study).read_text(encoding="utf-8"))
+    for key in keys:
+        found = found[key]
+    return found
