@@ -371,12 +371,14 @@ def _each(
     logs: Iterable[Path], columns: ColumnMap | None, look: Callable[[Log], Result]
 ) -> tuple[list[Result], list[Refusal]]:
     """Look at one log after the other; one that cannot be used is told and left out."""
-    from lmshealth.readers import read_log, read_manifest_beside
+    from lmshealth.readers import NOT_LOGS, read_log, read_manifest_beside
 
     found: list[Result] = []
     lost: list[Refusal] = []
     manifests: dict[Path, Manifest] = {}
-    for path in logs:
+    named = tuple(logs)
+    # Who says *.csv does not mean the manifest beside the logs.
+    for path in [path for path in named if path.name not in NOT_LOGS] or named:
         try:
             if path.parent not in manifests:
                 manifests[path.parent] = _noted(read_manifest_beside(path))

@@ -443,7 +443,7 @@ def test_frf_of_several_logs_is_a_table_for_track(bench: Path, tmp_path: Path) -
     )
     (tmp_path / "stage.toml").write_text(f'name = "m"\n[match]\nstage = "M"\n{modes}')
     result = call(
-        "frf", tmp_path / "a.csv", tmp_path / "b.csv", "--columns", bench / "map.toml",
+        "frf", *sorted(tmp_path.glob("*.csv")), "--columns", bench / "map.toml",
         "--input", "current", "--output", "acc_x", "--band", *BAND,
         "--stage", tmp_path / "stage.toml", "--format", "csv",
     )  # fmt: skip
