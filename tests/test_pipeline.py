@@ -469,7 +469,7 @@ def test_a_manifest_overrides_and_is_part_of_the_key(tmp_path: Path, modes_only:
 def test_foreign_columns_are_read_by_a_map_that_is_part_of_the_key(
     tmp_path: Path, modes_only: Stage
 ) -> None:
-    """Without its map an export is refused; with it it is a log like others, and with another new."""
+    """Without its map an export is refused, with it it is a log; another map makes it a new one."""
     logs, out = write_archive(tmp_path / "logs", 2), tmp_path / "out"
     for path in logs.glob("*.h5"):
         with h5py.File(path, "r+") as file:

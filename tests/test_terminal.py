@@ -135,8 +135,8 @@ def test_there_is_no_bar_where_there_is_no_terminal(capsys: pytest.CaptureFixtur
 def response_line(frequency: float) -> dict[str, object]:
     """Make a row of a frequency response."""
     return {
-        "log": "log", "frequency_hz": frequency, "gain": 0.01234, "gain_std": 1.2e-5, "phase_rad": -1.5708,
-        "coherence": 0.99, "fit_gain": 0.0123,
+        "log": "log", "frequency_hz": frequency, "gain": 0.01234, "gain_std": 1.2e-5,
+        "phase_rad": -1.5708, "coherence": 0.99, "fit_gain": 0.0123,
     }  # fmt: skip
 
 
