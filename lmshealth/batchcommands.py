@@ -17,6 +17,9 @@ from lmshealth.progress import progress_bars
 if TYPE_CHECKING:
     from lmshealth.pipeline import RunResult
 
+# An address on the command line is seen by everybody on the machine, with its password.
+STORE_VARIABLE = "LMSHEALTH_STORE"
+
 
 @click.command(
     epilog=examples(
@@ -42,6 +45,8 @@ if TYPE_CHECKING:
 )
 @click.option(
     "--store",
+    envvar=STORE_VARIABLE,
+    show_envvar=True,
     metavar="URL",
     help="Where results are kept: sqlite:///PATH, or a PostgreSQL database; default a file in "
     "--out.",
@@ -98,7 +103,14 @@ def _tell(result: RunResult) -> None:
         "report --store postgresql://me@host/fleet --out pages/ --pdf",
     )
 )
-@click.option("--store", required=True, metavar="URL", help="What `run` has filled, by its URL.")
+@click.option(
+    "--store",
+    envvar=STORE_VARIABLE,
+    show_envvar=True,
+    required=True,
+    metavar="URL",
+    help="What `run` has filled, by its URL.",
+)
 @click.option(
     "--out",
     type=click.Path(file_okay=False, path_type=Path),

@@ -697,6 +697,17 @@ def test_a_store_that_has_no_report_is_status_1_with_one_line(
     assert sorted(path.name for path in tmp_path.iterdir()) == ["empty.sqlite", "text.sqlite"]
 
 
+def test_the_store_may_be_named_by_the_environment(tmp_path: Path) -> None:
+    """An address with a password need not stand on the command line, where all can see it."""
+    store = tmp_path / "none.sqlite"
+    named = CliRunner().invoke(
+        main, ["report", "--out", str(tmp_path)], env={"LMSHEALTH_STORE": f"sqlite:///{store}"}
+    )
+    assert named.exit_code == 1
+    assert store.name in named.output
+    assert call("report", "--out", tmp_path).exit_code == 2
+
+
 def test_a_machine_that_cannot_be_read_is_told_and_the_others_are_written(tmp_path: Path) -> None:
     """One line names it, with status 3."""
     store = Store(beside(tmp_path))

@@ -372,3 +372,25 @@ def test_scale_index(root: Path, needs: Callable[[str], None]) -> None:
     needs("chromium")
     answer = json.loads(run_study(root, "scale", "index"))
     assert all(answer["passed"].values())
+
+
+def test_scale_cost(root: Path) -> None:
+    """Archives of several sizes are analysed, and what a log costs is told."""
+    answer = json.loads(run_study(root, "scale", "cost"))
+    assert all(answer["passed"].values())
+
+
+def test_scale_speedup(root: Path, needs: Callable[[str], None]) -> None:
+    """One and two workers, of this machine and of Dask, are timed beside bare processes."""
+    needs("distributed")
+    answer = json.loads(run_study(root, "scale", "speedup"))
+    assert all(answer["passed"].values())
+    assert answer["workers kept busy"].keys() == {"local", "dask"}
+
+
+def test_scale_plan(root: Path) -> None:
+    """The cost of a stage becomes that of an archive, which more workers shorten."""
+    answer = json.loads(run_study(root, "scale", "plan"))
+    assert all(answer["passed"].values())
+    hours = [plan["hours"] for plan in answer["plans"]]
+    assert hours == sorted(hours, reverse=True)

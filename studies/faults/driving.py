@@ -76,6 +76,9 @@ class Run:
     def __init__(self, command: Sequence[str], said: IO[bytes]) -> None:
         self.mark = secrets.token_hex()
         self._said = said
+        # What a shell runs in the background ignores interrupts, and so do its children.
+        if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+            signal.signal(signal.SIGINT, signal.default_int_handler)
         self._process: Popen = subprocess.Popen(
             command, stdout=subprocess.DEVNULL, stderr=self._said, start_new_session=True,
             env={**os.environ, MARK: self.mark}, cwd=Path(__file__).parents[2],

@@ -50,7 +50,7 @@ HOWS = {"main": 0.5, "worker": 0.2, "SIGINT": 0.15, "SIGTERM": 0.15}
 QUICK_HOWS = {"main": 1.0}
 ENDS = {"main": -signal.SIGKILL, "SIGTERM": -signal.SIGTERM}
 MOST_OTHER = 20  # runs that end otherwise, before it is of no use to go on
-PER_RUN, QUICK_PER_RUN = 3.0, 10.0  # kills in the mean, over the time that a run takes
+PER_RUN, QUICK_PER_RUN = 5.0, 10.0  # kills in the mean, over the time that a run takes
 
 Row = dict[str, Any]
 

@@ -46,7 +46,7 @@ from studies.record import Stopwatch, conclude
 from studies.scale.archive import make_archive
 
 HERE = Path(__file__).parent
-SIZES, QUICK_SIZES = (100, 1_000, 10_000), (20, 40, 80)
+SIZES, QUICK_SIZES = (100, 1_000, 10_000), (3, 6, 12)
 LONGER = "longer and longer"
 EVERY = 21  # so that every recording that the logs are made of is among them
 # Of the cost of one more log, of what is added to the identification, and of memory.

@@ -40,8 +40,8 @@ SOUGHT = "line04-m0417"
 BOUND_RATIO, BOUND_BYTES = 4.0, 1500
 _SETTLED = """() => new Promise((done) => requestAnimationFrame(() =>
     requestAnimationFrame(() => done(performance.now()))))"""
-# A paint is told some time after it was. The page forbids `eval`, which waiting for a condition from
-# outside would need.
+# A paint is told some time after it was. The page forbids `eval`, by which one would wait for it
+# from outside.
 _PAINT = """() => new Promise((done) => new PerformanceObserver((entries) => {
     for (const entry of entries.getEntriesByName("first-contentful-paint")) done(entry.startTime);
 }).observe({ type: "paint", buffered: true }))"""

@@ -12,9 +12,12 @@ Method
     process is serial, S = logs times its part. The time is the longer of the two. The efficiency
     of two is taken for that of many: this is a plan, no measurement.
 Answer
-    ANSWER
+    A log takes 0.47 s of processor time, a stage 111 s: 89 for health at 40 epochs, 18 for its
+    life, 4 for its page. One worker needs 439 hours, 8 need 60, 32 need 15, 128 need 3.7. Store
+    and pages take 33 and 6 GB. What breaks first is the main process, which takes 6.8 ms per log by
+    itself: 1.9 hours that no worker shortens, reached by some 230 workers.
 Run time
-    RUNTIME
+    Three minutes.
 """
 
 from __future__ import annotations
@@ -33,7 +36,7 @@ from studies.record import Stopwatch, conclude
 HERE = Path(__file__).parent
 N_LOGS, N_STAGES = 1_000_000, 10_000
 WORKERS = (1, 8, 32, 128, 512)
-LOGS, SECONDS, QUICK_LOGS, QUICK_SECONDS = 40, 20.0, 4, 5.0
+FULL, QUICK = Plan("lms-y", "both", 40, 20.0, 3), Plan("lms-x", "preload-wear", 5, 5.0, 3)
 
 Row = dict[str, Any]
 
@@ -53,19 +56,24 @@ class Steps:
 
 
 def one_stage(folder: Path, plan: Plan, epochs: int) -> Row:
-    """Analyse a simulated life by one worker, and say what each step costs and keeps."""
+    """Analyse a simulated life by one worker, and say what each step costs and keeps.
+
+    At one epoch the cost of epochs is not told, but counts as the life's.
+    """
     simulate_life(plan, folder / "logs", workers=2)
     steps, out = Steps(), folder / "out"
     stage = load_stage(plan.stage)
     run(folder / "logs", [stage], out, Settings(workers=1, epochs=epochs), steps)
     steps("ended", 0, 0)
-    # Once more at one epoch, from the same readings: the rest is what the epochs cost.
-    fewer = Steps()
-    run(folder / "logs", [stage], out, Settings(workers=1, epochs=1), fewer)
-    fewer("ended", 0, 0)
+    fewer = steps
+    if epochs > 1:
+        # Once more at one epoch, from the same readings: the rest is what the epochs cost.
+        fewer = Steps()
+        run(folder / "logs", [stage], out, Settings(workers=1, epochs=1), fewer)
+        fewer("ended", 0, 0)
     size = {
         "store": sum(p.stat().st_size for p in out.glob("*.sqlite*")),
-        "pages": sum(p.stat().st_size for p in out.glob("*-Y.html")),
+        "pages": sum(p.stat().st_size for p in out.glob("*.html") if p.name != "index.html"),
     }
     spent = steps.seconds
     return {
@@ -98,9 +106,9 @@ def main() -> None:
     parser.add_argument("--quick", action="store_true")
     quick = parser.parse_args().quick
     watch = Stopwatch()
-    n, seconds, epochs = (QUICK_LOGS, QUICK_SECONDS, 2) if quick else (LOGS, SECONDS, 40)
+    life, epochs = (QUICK, 1) if quick else (FULL, 40)
     with tempfile.TemporaryDirectory() as name:
-        stage = one_stage(Path(name), Plan("lms-y", "both", n, seconds, 3), epochs)
+        stage = one_stage(Path(name), life, epochs)
     two = json.loads((HERE / "speedup.json").read_text(encoding="utf-8"))
     serial_s = 1e-3 * two["dask_serial_ms"][1]
     efficiency = min(two["of the bound"]["dask"], 1.0)
