@@ -243,7 +243,7 @@ def test_a_line_of_the_tutorial_that_does_not_come_out_is_told(tmp_path: Path) -
     shown = "one 1.25 of 3\ntwo 2.5\nthree words\n"
     step = follow(Step("echo 'one 1.26   of 3'\necho 'three  words'\n", shown), tmp_path)
     assert step["shown_and_not_come_out"] == ["two 2.5"]
-    with pytest.raises(SystemExit, match=r"ended with 2: .*no-such-command"):
+    with pytest.raises(SystemExit, match=r"(?s)ended with 2: .*no-such-command"):
         follow(Step("lmshealth no-such-command\n", ""), tmp_path)
 
 

@@ -67,7 +67,7 @@ def main() -> None:
         raise SystemExit("LMSHEALTH_DATA is not set: it names the folder of real measurements")
     watch = Stopwatch()
     with tempfile.TemporaryDirectory() as scratch:
-        answer = study(Path(scratch))
+        answer = answered(Path(scratch))
     conclude(HERE / "result.json", __doc__.split("\n")[0], answer, watch, quick=quick)
 
 
@@ -82,7 +82,7 @@ def steps() -> list[Step]:
     return found
 
 
-def study(scratch: Path) -> dict[str, Any]:
+def answered(scratch: Path) -> dict[str, Any]:
     """Follow the tutorial in an empty folder, and compare what it concludes with what is true."""
     (scratch / "studies").symlink_to(HERE.parent)
     told = [follow(step, scratch) for step in steps()]
