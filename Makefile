@@ -40,7 +40,7 @@ check: .venv/installed
 # The stamp is newer than what it was made from, or the installation is done again.
 .venv/installed: pyproject.toml
 	$(PYTHON) -m venv .venv
-	$(BIN)/pip install --quiet --editable ".[dev]"
+	$(BIN)/pip install --quiet --disable-pip-version-check --editable ".[dev]"
 	@touch $@
 
 clean:

@@ -8,14 +8,13 @@ from __future__ import annotations
 import logging
 from collections.abc import Container, Iterable, Iterator, Sequence
 from concurrent.futures import CancelledError, Executor
-from dataclasses import dataclass
 from pathlib import Path
 
 from lmshealth.assessing import Machine, make, taught
 from lmshealth.errors import LmshealthError
 from lmshealth.files import write_text
 from lmshealth.fleet import Learned, Lesson, learn
-from lmshealth.intake import Progress
+from lmshealth.intake import Site
 from lmshealth.packing import fingerprint
 from lmshealth.readers.trouble import visible
 from lmshealth.store import Made, Store, read
@@ -27,15 +26,6 @@ _Job = tuple[Machine, tuple[tuple[str, bytes], ...]]
 _Lecture = tuple[Machine, str, bytes | None, Learned]
 
 _logger = logging.getLogger(__name__)
-
-
-@dataclass(frozen=True, slots=True)
-class Site:
-    """Where a batch is done: what remembers, what works, and who is told how far it is."""
-
-    store: Store
-    pool: Pool
-    progress: Progress = lambda what, done, total: None
 
 
 def assess_all(machines: Sequence[Machine], site: Site, *, anew: bool = False) -> dict[str, str]:

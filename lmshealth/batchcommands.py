@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from lmshealth import terminal
-from lmshealth.options import EPOCHS, PDF, SCHEDULER, SEED, WORKERS, examples
+from lmshealth.options import COLUMNS, EPOCHS, PDF, SCHEDULER, SEED, WORKERS, examples
 from lmshealth.pdf import write_pdfs
 from lmshealth.progress import progress_bars
 
@@ -24,6 +24,7 @@ STORE_VARIABLE = "LMSHEALTH_STORE"
 @click.command(
     epilog=examples(
         "run logs/ --stage lms-y --out result/",
+        "run exports/ --columns map.toml --stage my-stage.toml --out result/",
         "run archive/ --stage lms-x --stage lms-y --out result/ "
         "--store postgresql://me@host/fleet --scheduler tcp://host:8786",
     )
@@ -50,6 +51,7 @@ STORE_VARIABLE = "LMSHEALTH_STORE"
     help="Where results are kept: sqlite:///PATH, or a PostgreSQL database; default a file in "
     "--out.",
 )
+@COLUMNS
 @WORKERS
 @SCHEDULER
 @EPOCHS
@@ -62,6 +64,7 @@ def run(
     """Analyse a folder of logs: tables, verdict and report. Run again to go on."""
     from lmshealth.pipeline import Settings
     from lmshealth.pipeline import run as run_pipeline
+    from lmshealth.readers import load_columns
     from lmshealth.stage import load_stage
 
     settings = Settings(
@@ -70,6 +73,7 @@ def run(
         scheduler=options["scheduler"],
         epochs=options["epochs"],
         seed=options["seed"],
+        columns=load_columns(options["columns"]) if options["columns"] else None,
     )
     loaded = [load_stage(reference) for reference in stages]
     with progress_bars() as progress:

@@ -32,7 +32,7 @@ from lmshealth.options import (
 )
 
 if TYPE_CHECKING:
-    from lmshealth.readers import ColumnMap
+    from lmshealth.readers import ColumnMap, Manifest
     from lmshealth.stage import Stage
 
 Result = TypeVar("Result")
@@ -240,11 +240,14 @@ def spectrum(ctx: click.Context, /, logs: tuple[Path, ...], style: str, **option
     epilog=examples(
         "frf sweep.h5 --input current_excitation --output acc_pitch --band 95 175",
         "frf bench.mat --columns map.toml --input current --output delta_e --period 1",
+        "frf sweeps/*.h5 --input current_excitation --output acc_pitch --stage lms-y "
+        "--format csv > modes.csv",
     )
 )
-@click.argument("log", type=click.Path(path_type=Path))
+@LOGS
 @click.option("--input", "source", required=True, metavar="NAME", help="Channel of the excitation.")
 @click.option("--output", required=True, metavar="NAME", help="Channel of the answer.")
+@STAGE
 @click.option(
     "--band",
     nargs=2,
@@ -261,24 +264,30 @@ def spectrum(ctx: click.Context, /, logs: tuple[Path, ...], style: str, **option
 @COLUMNS
 @FORMAT
 @click.pass_context
-def frf(ctx: click.Context, /, log: Path, style: str, **options: Any) -> None:
-    """Measure the frequency response from one channel to another, and identify its modes.
+def frf(ctx: click.Context, /, logs: tuple[Path, ...], style: str, **options: Any) -> None:
+    """Measure the response of single logs from one channel to another, and identify its modes.
 
     An input that repeats is averaged over whole periods, any other over stretches. csv lists the
-    modes; json has the response with H1, H2, Hv and coherence too.
+    modes; json has the response with H1, H2, Hv and coherence too. With a stage modes are named as
+    it names them, wherever one alone lies where it is looked for.
     """
-    from lmshealth.frf import read_frf
+    from lmshealth.frf import name_modes, read_frf
     from lmshealth.history import Reading
     from lmshealth.looks import fit_row, frf_rows, lines_rows
     from lmshealth.tables import COLUMNS, frame, modes_rows, refused_rows
 
-    _, columns = _loaded(None, options["columns"])
+    stage, columns = _loaded(options["stage"], options["columns"])
     band, period = checked_band(options["band"]), options["period"]
     names = (options["source"], options["output"])
     found, lost = _each(
-        [log], columns, lambda it: (it, read_frf(it, *names, band=band, period=period))
+        logs, columns, lambda it: (it, read_frf(it, *names, band=band, period=period))
     )
-    readings = [Reading(it.name, it.digest, it.metadata, own.modes) for it, own in found]
+    readings = [
+        Reading(
+            it.name, it.digest, it.metadata, name_modes(own.modes, stage) if stage else own.modes
+        )
+        for it, own in found
+    ]
     rows = [row for reading in readings for row in modes_rows(reading)]
     fits = [fit_row(it.name, own) for it, own in found]
     response = [row for it, own in found for row in frf_rows(it.name, own)]
@@ -290,7 +299,7 @@ def frf(ctx: click.Context, /, log: Path, style: str, **options: Any) -> None:
         content = {"modes": rows, "fit": fits, "frf": response, "lines": lines}
         terminal.print_json({**content, "refused": refused})
     elif found:
-        terminal.print_frf(fits[0], response, rows, refused)
+        terminal.print_frf(fits, response, rows, refused)
     _exit(ctx, found, lost)
 
 
@@ -362,16 +371,32 @@ def _each(
     logs: Iterable[Path], columns: ColumnMap | None, look: Callable[[Log], Result]
 ) -> tuple[list[Result], list[Refusal]]:
     """Look at one log after the other; one that cannot be used is told and left out."""
-    from lmshealth.readers import read_log
+    from lmshealth.readers import NOT_LOGS, read_log, read_manifest_beside
 
     found: list[Result] = []
     lost: list[Refusal] = []
-    for path in logs:
+    manifests: dict[Path, Manifest] = {}
+    named = tuple(logs)
+    # Who says *.csv does not mean the manifest beside the logs.
+    for path in [path for path in named if path.name not in NOT_LOGS] or named:
         try:
-            found.append(look(read_log(path, columns=columns)))
+            if path.parent not in manifests:
+                manifests[path.parent] = _noted(read_manifest_beside(path))
+            overrides = manifests[path.parent].overrides(path)
+            found.append(look(read_log(path, columns=columns, overrides=overrides)))
         except BadLog as why:
             lost.append(Refusal(why.log, why.reason, why.detail))
     return found, lost
+
+
+def _noted(manifest: Manifest) -> Manifest:
+    """Say where a manifest as a whole, or a row that names no log, is not understood."""
+    from lmshealth.readers import MANIFEST
+
+    for refusal in manifest.refused:
+        if refusal.log == MANIFEST:
+            click.echo(f"note: {refusal.log}: {refusal.reason}: {refusal.detail}", err=True)
+    return manifest
 
 
 def _exit(ctx: click.Context, found: Sequence[object], lost: Sequence[Refusal]) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import fft
@@ -17,6 +17,7 @@ from lmshealth.responsefit import ResponseFit, fit_response
 from lmshealth.responses import EXCITED, Frf, Pair, from_periods, from_record
 from lmshealth.results import Line, Modes
 from lmshealth.segments import find_phases
+from lmshealth.stage import Stage
 from lmshealth.targets import USABLE, WORST_STD_LN_F, WORST_STD_LN_ZETA
 
 # The second difference of a displacement reaches over this part of the shortest period.
@@ -208,6 +209,28 @@ def _excited_band(
     # Half a line more at either end, lest rounding cost the last one.
     line = 0.5 * sample_rate / values.size
     return (excited[0] - line, excited[-1] + line) if excited.size else band
+
+
+def name_modes(modes: Modes, stage: Stage) -> Modes:
+    """Name modes as a stage description does, where there is no doubt.
+
+    Parameters
+    ----------
+    modes : Modes
+        Of one response.
+    stage : Stage
+        A mode has a name if it alone lies where the description looks for that name, and for no
+        other; all others have none, and `track` finds out whose they are.
+    """
+    described = [(spec.name, spec.frequency_hz, spec.search) for spec in stage.modes]
+    near = np.array(
+        [np.abs(modes.frequency / hz - 1) <= search for _, hz, search in described]
+    ).reshape(len(described), -1)
+    names = [""] * len(modes.names)
+    for mode, (name, _, _) in zip(near, described, strict=True):
+        if mode.sum() == 1 and near[:, mode].sum() == 1:
+            names[int(mode.argmax())] = name
+    return replace(modes, names=tuple(names))
 
 
 def _differenced(

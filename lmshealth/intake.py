@@ -15,6 +15,7 @@ from lmshealth.logs import Log, Metadata, Refusal
 from lmshealth.modal import identify
 from lmshealth.packing import VERSION, fingerprint
 from lmshealth.readers import (
+    ColumnMap,
     content_digest,
     find_logs,
     format_name,
@@ -38,6 +39,15 @@ _BATCH = 16
 _PASSING = ("missing-file", "changed")
 
 _logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class Site:
+    """Where a batch is done: what remembers, what works, and who is told how far it is."""
+
+    store: Store
+    pool: Pool
+    progress: Progress = lambda what, done, total: None
 
 
 @dataclass(frozen=True, slots=True, order=True)
@@ -79,21 +89,21 @@ class _Task:
     name: str
     overrides: dict[str, str]
     digest: str
+    columns: ColumnMap | None
 
     def key(self, description: str) -> str:
         """Name what becomes of the log by all that it depends on."""
-        given = self.digest, format_name(self.path), sorted(self.overrides.items()), description
-        return fingerprint(VERSION, *given)
+        as_read = format_name(self.path), sorted(self.overrides.items()), self.columns
+        return fingerprint(VERSION, self.digest, *as_read, description)
 
 
 def take_in(
     folder: Path,
     stages: Sequence[Stage],
-    store: Store,
-    pool: Pool,
+    site: Site,
     *,
     out: Path,
-    progress: Progress = lambda what, done, total: None,
+    columns: ColumnMap | None = None,
 ) -> Intake:
     """Identify every log of a folder that the store does not know yet.
 
@@ -103,33 +113,32 @@ def take_in(
         Read recursively; ``manifest.csv`` is understood.
     stages : sequence of Stage
         Each log goes to the first description that takes it.
-    store : Store
-        Knows what was done before, and keeps what is done now.
-    pool : Pool
-        Does the work; results do not depend on it.
+    site : Site
+        Its store knows what was done before, and keeps what is done now; results do not depend on
+        its pool.
     out : Path
         Folder of the output: nothing inside it is a log.
-    progress : callable
-        Told what is going on.
+    columns : ColumnMap, optional
+        How all of them are read; by default their columns are those of the log contract.
     """
     folder = folder.absolute()  # workers may stand elsewhere
     archive = find_logs(folder)
     inside = out.resolve()
     found = [path for path in archive.logs if inside not in path.resolve().parents]
-    tasks, refused = _tasks(folder, found, pool, progress)
+    tasks, refused = _tasks(folder, found, columns, site)
     sorter = _Sorter(tuple(stages))
     known = set()
-    for task, outcome in _remembered(tasks, stages, store):
+    for task, outcome in _remembered(tasks, stages, site.store):
         sorter.add(task, outcome)
         known.add(task.name)
-    progress("identifying", len(known), len(tasks))
+    site.progress("identifying", len(known), len(tasks))
     left = [task for task in tasks if task.name not in known]
     work = partial(identify_log, stages=tuple(stages))
-    for k, (task, outcome) in enumerate(pool.spread(work, left, _lost), start=1):
+    for k, (task, outcome) in enumerate(site.pool.spread(work, left, _lost), start=1):
         if outcome.lasting:
-            store.put(task.key(outcome.description), task.digest, outcome)
+            site.store.put(task.key(outcome.description), task.digest, outcome)
         sorter.add(task, outcome)
-        progress("identifying", len(known) + k, len(tasks))
+        site.progress("identifying", len(known) + k, len(tasks))
     names = {name_of(path, folder) for path in found}
     machines, descriptions, lost = sorter.sorted()
     return Intake(
@@ -173,20 +182,20 @@ class _Sorter:
 
 
 def _tasks(
-    folder: Path, found: Sequence[Path], pool: Pool, progress: Progress
+    folder: Path, found: Sequence[Path], columns: ColumnMap | None, site: Site
 ) -> tuple[list[_Task], list[Refusal]]:
     """Name every log by its content; the same content twice is one log."""
     manifest = read_manifest(folder)
     tasks: list[_Task] = []
     refused: list[Refusal] = list(manifest.refused)
     digests: dict[Path, str] = {}
-    progress("reading", 0, len(found))
-    for _, part in pool.spread(_digests, _batches(found), _no_digests):
+    site.progress("reading", 0, len(found))
+    for _, part in site.pool.spread(_digests, _batches(found), _no_digests):
         for path, (digest, refusal) in part.items():
             digests[path] = digest
             if refusal is not None:
                 refused.append(Refusal(name_of(path, folder), *refusal))
-        progress("reading", len(digests), len(found))
+        site.progress("reading", len(digests), len(found))
     seen: dict[tuple[str, str], str] = {}
     # Of copies the one that a manifest tells of is analysed: the others may lack what it says.
     for path in sorted(found, key=lambda path: not manifest.names(path)):
@@ -205,7 +214,7 @@ def _tasks(
             refused.append(Refusal(name, "duplicate", detail))
             continue
         seen[content] = name
-        tasks.append(_Task(path, name, overrides, digests[path]))
+        tasks.append(_Task(path, name, overrides, digests[path], columns))
     return tasks, refused
 
 
@@ -266,7 +275,7 @@ def identify_log(task: _Task, stages: tuple[Stage, ...]) -> Identified:
     """Read and identify one log; what goes wrong with it is its refusal, never an exception."""
     by, stage, asked = "", None, None
     try:
-        log = read_log(task.path, overrides=task.overrides, name=task.name)
+        log = read_log(task.path, columns=task.columns, overrides=task.overrides, name=task.name)
         if log.digest != task.digest:
             raise BadLog(task.name, "changed", "it is being written to; run again")
         require_identity(log)

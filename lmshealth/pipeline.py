@@ -9,14 +9,14 @@ from pathlib import Path, PurePosixPath
 from tempfile import TemporaryFile
 
 from lmshealth.assessing import Machine
-from lmshealth.batch import Site, assess_all, logs_of, teach_all, tell_all
+from lmshealth.batch import assess_all, logs_of, teach_all, tell_all
 from lmshealth.database import StoreError
 from lmshealth.errors import LmshealthError, NothingUsable
 from lmshealth.index import IndexRow, file_names, worst_first, write_index
-from lmshealth.intake import Intake, Progress, take_in
+from lmshealth.intake import Intake, Progress, Site, take_in
 from lmshealth.logs import Refusal
 from lmshealth.maintenance import Maintenance, read_maintenance
-from lmshealth.readers import NOT_LOGS
+from lmshealth.readers import NOT_LOGS, ColumnMap
 from lmshealth.stage import Stage
 from lmshealth.store import Store, beside
 from lmshealth.telling import Content, Tables, Telling
@@ -39,6 +39,8 @@ class Settings:
         Health is inferred at no more than this many epochs per stage.
     seed : int
         Of all randomness.
+    columns : ColumnMap or None
+        How logs are read; None where their columns are those of the log contract.
 
     Examples
     --------
@@ -46,7 +48,7 @@ class Settings:
 
     >>> import lmshealth
     >>> lmshealth.Settings(workers=2, store="postgresql://me:secret@host/fleet")
-    Settings(workers=2, scheduler=None, epochs=40, seed=0)
+    Settings(workers=2, scheduler=None, epochs=40, seed=0, columns=None)
     """
 
     store: str | None = field(default=None, repr=False)  # it may hold a password
@@ -54,6 +56,7 @@ class Settings:
     scheduler: str | None = None
     epochs: int = 40
     seed: int = 0
+    columns: ColumnMap | None = None
 
     def pool(self) -> AbstractContextManager[Pool]:
         """Open what does the work."""
@@ -143,10 +146,10 @@ def run(
     _prepare(out)
     work = read_maintenance(folder)
     with settings.pool() as pool, closing(Store(settings.store or beside(out))) as store:
-        taken = take_in(folder, stages, store, pool, out=out, progress=progress)
+        site = Site(store, pool, progress)
+        taken = take_in(folder, stages, site, out=out, columns=settings.columns)
         refused = (*taken.refused, *work.refused)
         machines = _machines(taken, stages, work, settings)
-        site = Site(store, pool, progress)
         failed = assess_all(machines, site)
         usable = [machine for machine in machines if machine.name not in failed]
         rows, contradicted = _report(usable, refused, site, out, failed)

@@ -180,8 +180,18 @@ def _consistent(track: Track) -> str:
     return f"The filter does NOT agree with its logs: {told}; {meant}"
 
 
-def print_frf(fit: Row, frf: Sequence[Row], rows: Sequence[Row], refused: Sequence[Row]) -> None:
-    """Print a frequency response at some of its lines, what it was read from, and its modes."""
+def print_frf(
+    fits: Sequence[Row], frf: Sequence[Row], rows: Sequence[Row], refused: Sequence[Row]
+) -> None:
+    """Print frequency responses at some of their lines, what they were read from, and modes."""
+    for fit in fits:
+        if len(fits) > 1:
+            click.echo(fit["log"])
+        _print_response(fit, [row for row in frf if row["log"] == fit["log"]])
+    print_modes(rows, refused)
+
+
+def _print_response(fit: Row, frf: Sequence[Row]) -> None:
     step = max(1, -(-len(frf) // _MOST_LINES))
     cells = [
         (
@@ -207,7 +217,6 @@ def print_frf(fit: Row, frf: Sequence[Row], rows: Sequence[Row], refused: Sequen
             f"Errors of neighbouring lines correlate by {fit['colour']:.2f}: standard deviations "
             "are widened."
         )
-    print_modes(rows, refused)
 
 
 def _averages(fit: Row) -> str:

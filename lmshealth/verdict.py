@@ -105,7 +105,12 @@ def judge(
     if since < needed:
         reason = f"{since} usable logs since the baseline began; it needs {needed}."
     elif health is None:
-        reason = "The logs do not carry the health parameters."
+        reason = (
+            "The logs do not carry the health parameters."
+            if stage.parameters
+            else "The stage description has no [[parameter]]: its modes are followed, and nothing "
+            "is said of the parts."
+        )
     elif not health.converged[-1]:
         reason = "The sampler did not converge, so nothing is claimed."
     elif not health.explained:

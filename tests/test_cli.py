@@ -430,6 +430,56 @@ def test_frf_as_csv_lists_modes_and_as_a_table_both(bench: Path) -> None:
     assert max(len(line) for line in shown.splitlines()) <= 80
 
 
+def test_frf_of_several_logs_is_a_table_for_track(bench: Path, tmp_path: Path) -> None:
+    """Modes are named by the description, dated by the manifest beside the logs, and tracked."""
+    for name in ("a.csv", "b.csv"):
+        shutil.copy(bench / "bench.csv", tmp_path / name)
+    (tmp_path / "manifest.csv").write_text(
+        "file,stage,recorded_at,travel_km\na.csv,M,2026-01-01T00:00Z,1\nb.csv,M,2026-01-02T00:00Z,2\n"
+    )
+    modes = "".join(
+        f'[[mode]]\nname = "{name}"\nfrequency_hz = {f}\ndamping_ratio = {zeta}\nsearch = 0.1\n'
+        for name, (f, zeta, _) in zip(("low", "high"), MODES, strict=False)
+    )
+    (tmp_path / "stage.toml").write_text(f'name = "m"\n[match]\nstage = "M"\n{modes}')
+    result = call(
+        "frf", *sorted(tmp_path.glob("*.csv")), "--columns", bench / "map.toml",
+        "--input", "current", "--output", "acc_x", "--band", *BAND,
+        "--stage", tmp_path / "stage.toml", "--format", "csv",
+    )  # fmt: skip
+    assert (result.exit_code, result.stderr) == (0, "")
+    told = list(csv.DictReader(io.StringIO(result.stdout)))
+    assert [row["mode"] for row in told] == ["low", "high"] * 2
+    assert [row["travel_km"] for row in told] == ["1.0", "1.0", "2.0", "2.0"]
+    (tmp_path / "modes.csv").write_text(result.stdout)
+    track = ("--stage", tmp_path / "stage.toml", "--out", tmp_path / "track.csv")
+    assert call("track", tmp_path / "modes.csv", *track).exit_code == 0
+
+
+def test_a_single_log_heeds_the_manifest_beside_it(folder: Path, tmp_path: Path) -> None:
+    """Its row has the last word, a bad one refuses the log, and other folders' are not read."""
+    log = Path(shutil.copy(folder / "good" / "log-00.h5", tmp_path))
+    manifest = tmp_path / "manifest.csv"
+    (tmp_path / "below").mkdir()
+    (tmp_path / "below" / "manifest.csv").write_text("file,stage\n../log-00.h5,never\n")
+
+    def stages() -> list[str]:
+        result = call("modes", log, "--stage", folder / "stage" / "small.toml", "--format", "csv")
+        return [row["stage"] for row in csv.DictReader(io.StringIO(result.stdout))]
+
+    assert set(stages()) == {"test-A"}
+    manifest.write_text("file,stage\nlog-00.h5,other\n")
+    assert set(stages()) == {"other"}
+    manifest.write_text("file,travel_km\nlog-00.h5,1\nlog-00.h5,2\n")
+    result = call("modes", log)
+    assert result.exit_code == 1
+    assert "bad-row" in result.stderr
+    manifest.write_bytes(b"")
+    result = call("modes", log, "--stage", folder / "stage" / "small.toml")
+    assert result.exit_code == 0
+    assert result.stderr.startswith("note: manifest.csv: ")
+
+
 def test_frf_that_cannot_be_read_is_status_1_with_one_line(bench: Path) -> None:
     """A missing channel is named with those that are there, in every format."""
     for style in ("table", "csv", "json"):

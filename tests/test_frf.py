@@ -13,9 +13,10 @@ import pytest
 from scipy.signal import chirp
 
 from lmshealth.errors import BadLog
-from lmshealth.frf import FrfReading, read_frf
+from lmshealth.frf import FrfReading, name_modes, read_frf
 from lmshealth.logs import Channel, Log, Refusal
 from lmshealth.readers import load_columns, read_log
+from lmshealth.stage import load_stage
 from models.formats import write_log
 from models.stages import stage_named
 from models.sweep import Sweep, record_sweep, without_loop
@@ -213,6 +214,25 @@ def refusal(log: Log, *names: str, **options: object) -> BadLog:
     with pytest.raises(BadLog) as caught:
         read_frf(log, *names, **options)  # type: ignore[arg-type]
     return caught.value
+
+
+def test_a_name_is_given_where_there_is_no_doubt(tmp_path: Path) -> None:
+    """One mode where a name is looked for has it; two there, or one for two names, have none."""
+    modes = replace(read_frf(driven(), "current", "acc_x", band=BAND).modes, names=("a", "b"))
+
+    def named(*looked_for: tuple[str, float, float]) -> tuple[str, ...]:
+        text = 'name = "m"\n[match]\nstage = "M"\n' + "".join(
+            f'[[mode]]\nname = "{name}"\nfrequency_hz = {f}\ndamping_ratio = 0.01\nsearch = {s}\n'
+            for name, f, s in looked_for
+        )
+        (tmp_path / "stage.toml").write_text(text)
+        return name_modes(modes, load_stage(str(tmp_path / "stage.toml"))).names
+
+    low, high = (f for f, _, _ in MODES[:2])
+    assert named(("low", low, 0.1), ("high", high, 0.1)) == ("low", "high")
+    assert named(("high", high, 0.1), ("none", 200.0, 0.1)) == ("", "high")
+    assert named(("both", (low + high) / 2, 0.5)) == ("", "")
+    assert named(("one", low, 0.05), ("two", low + 1, 0.05), ("high", high, 0.1)) == ("", "high")
 
 
 def test_channels_that_are_not_there_are_named_with_those_that_are() -> None:

@@ -26,6 +26,7 @@ from lmshealth.inference import epochs_to_infer, infer
 from lmshealth.life import scatter_of
 from lmshealth.logs import Log
 from lmshealth.pipeline import RunResult, Settings, report, run
+from lmshealth.readers import ColumnMap
 from lmshealth.results import Modes
 from lmshealth.stage import Stage, load_stage
 from lmshealth.store import SCHEMA, Store, beside, read
@@ -463,6 +464,24 @@ def test_a_manifest_overrides_and_is_part_of_the_key(tmp_path: Path, modes_only:
     again = run(logs, [modes_only], tmp_path / "out")
     assert again.n_remembered == 1
     assert {row["travel_km"] for row in rows(tmp_path / "out" / "modes.csv")} == {"0.0", "777.0"}
+
+
+def test_foreign_columns_are_read_by_a_map_that_is_part_of_the_key(
+    tmp_path: Path, modes_only: Stage
+) -> None:
+    """Without its map an export is refused, with it it is a log; another map makes it a new one."""
+    logs, out = write_archive(tmp_path / "logs", 2), tmp_path / "out"
+    for path in logs.glob("*.h5"):
+        with h5py.File(path, "r+") as file:
+            file.move("acc_feed_m_s2", "AI0")
+    with pytest.raises(NothingUsable):
+        run(logs, [modes_only], out, Settings())
+    columns = ColumnMap(columns={"acc_feed_m_s2": "AI0"})
+    result = run(logs, [modes_only], out, Settings(columns=columns))
+    assert (result.n_refused, result.n_remembered) == (0, 0)
+    assert run(logs, [modes_only], out, Settings(columns=columns)).n_remembered == 2
+    other = ColumnMap(columns={"acc_feed_g": "AI0"})
+    assert run(logs, [modes_only], out, Settings(columns=other)).n_remembered == 0
 
 
 def test_bad_rows_beside_the_logs_are_told_and_stop_nothing(

@@ -8,6 +8,10 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
+import pytest
+
+from studies.new_machine.run import Step, follow
+
 PARTS = ("preload", "mount")
 
 
@@ -219,6 +223,28 @@ def test_movable_roller(root: Path, needs: Callable[[str], None]) -> None:
     answer = json.loads(run_study(root, "movable_roller"))
     assert all(answer["passed"].values())
     assert all(control["inside"] < 8 for control in answer["controls"].values())
+
+
+def test_new_machine(root: Path, needs: Callable[[str], None]) -> None:
+    """The tutorial does what it says, command by command, and ends where the truth is."""
+    needs("data")
+    answer = json.loads(run_study(root, "new_machine"))
+    assert all(answer["passed"].values())
+    text = (root / "studies" / "new_machine" / "README.md").read_text(encoding="utf-8")
+    typed = [block.split("```")[0] for block in text.split("```sh\n")[1:]]
+    commands = [line for block in typed for line in block.replace("\\\n", "").splitlines()]
+    assert commands == [line for step in answer["steps"] for line in step["commands"]]
+    verbs = {line.split()[1] for line in commands if line.startswith("lmshealth")}
+    assert verbs == {"frf", "stage", "plan", "track", "infer", "prognose"}
+
+
+def test_a_line_of_the_tutorial_that_does_not_come_out_is_told(tmp_path: Path) -> None:
+    """Digits may differ, words may not; a command that fails ends the study with its error."""
+    shown = "one 1.25 of 3\ntwo 2.5\nthree words\n"
+    step = follow(Step("echo 'one 1.26   of 3'\necho 'three  words'\n", shown), tmp_path)
+    assert step["shown_and_not_come_out"] == ["two 2.5"]
+    with pytest.raises(SystemExit, match=r"(?s)ended with 2: .*no-such-command"):
+        follow(Step("lmshealth no-such-command\n", ""), tmp_path)
 
 
 def test_sampling_speed(root: Path) -> None:

@@ -135,15 +135,15 @@ def test_there_is_no_bar_where_there_is_no_terminal(capsys: pytest.CaptureFixtur
 def response_line(frequency: float) -> dict[str, object]:
     """Make a row of a frequency response."""
     return {
-        "frequency_hz": frequency, "gain": 0.01234, "gain_std": 1.2e-5, "phase_rad": -1.5708,
-        "coherence": 0.99, "fit_gain": 0.0123,
+        "log": "log", "frequency_hz": frequency, "gain": 0.01234, "gain_std": 1.2e-5,
+        "phase_rad": -1.5708, "coherence": 0.99, "fit_gain": 0.0123,
     }  # fmt: skip
 
 
 def fitted(**other: object) -> dict[str, object]:
     """Make a row of a fit."""
     row: dict[str, object] = {
-        "input": "current", "output": "acc_x", "period_s": 5.0, "n_averages": 4.0,
+        "log": "log", "input": "current", "output": "acc_x", "period_s": 5.0, "n_averages": 4.0,
         "chi_square": 1.02, "distortion": 0.0, "colour": 0.0,
     }  # fmt: skip
     return row | other
@@ -151,7 +151,7 @@ def fitted(**other: object) -> dict[str, object]:
 
 def test_a_response_is_shown_at_some_of_its_lines(capsys: pytest.CaptureFixture[str]) -> None:
     """A dozen of a thousand lines, what was averaged, and nothing of what is not there."""
-    print_frf(fitted(), [response_line(0.1 * k) for k in range(1, 1001)], [], [])
+    print_frf([fitted()], [response_line(0.1 * k) for k in range(1, 1001)], [], [])
     out = capsys.readouterr().out
     assert max(len(line) for line in out.splitlines()) <= 80
     assert out.count("0.01234 ± 1.2e-05") == 12
@@ -162,10 +162,21 @@ def test_a_response_is_shown_at_some_of_its_lines(capsys: pytest.CaptureFixture[
     assert "correlate" not in out
 
 
+def test_several_responses_are_told_apart(capsys: pytest.CaptureFixture[str]) -> None:
+    """Each response stands under the name of its log, with its own lines only."""
+    lines = [response_line(10.0), response_line(20.0) | {"log": "other"}]
+    print_frf([fitted(), fitted(log="other")], lines, [], [])
+    first, second = capsys.readouterr().out.split("\nother\n")
+    assert first.startswith("log\n")
+    assert "1 of 1 lines" in first
+    assert "1 of 1 lines" in second
+    assert "20" not in first
+
+
 def test_a_response_says_what_its_fit_misses(capsys: pytest.CaptureFixture[str]) -> None:
     """Distortion, errors that neighbours share, and an input that does not repeat."""
     fit = fitted(period_s=NAN, chi_square=300.0, distortion=0.061, colour=0.35)
-    print_frf(fit, [response_line(10.0)], [], [])
+    print_frf([fit], [response_line(10.0)], [], [])
     out = capsys.readouterr().out
     assert "does not repeat" in out
     assert "6.1 % of the response" in out

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from lmshealth.arrays import FloatArray
-from lmshealth.stage import Stage
+from lmshealth.stage import Stage, load_stage
 from lmshealth.tracks import Event, History, Track
 from lmshealth.verdict import degraded_below, judge
 from tests.lives import (
@@ -137,6 +137,18 @@ def test_without_health_there_is_no_word(stage: Stage) -> None:
     found = judge(stage, logs(8), None)
     assert found.verdict == "not-enough-data"
     assert "do not carry" in found.why
+
+
+def test_without_parameters_the_description_is_the_reason(tmp_path: Path) -> None:
+    """Where the description asks for no part, it is not the logs that lack something."""
+    path = tmp_path / "modes.toml"
+    path.write_text(
+        'name = "m"\n[match]\nstage = "M"\n'
+        '[[mode]]\nname = "roll"\nfrequency_hz = 120.0\ndamping_ratio = 0.01\n'
+    )
+    found = judge(load_stage(str(path)), logs(8), None)
+    assert found.verdict == "not-enough-data"
+    assert "no [[parameter]]" in found.why
 
 
 def test_a_parameter_with_a_unit_is_told_in_it(tmp_path: Path) -> None:

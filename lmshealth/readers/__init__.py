@@ -27,7 +27,16 @@ names no log is told under the name of its table, reason ``bad-row``.
 pandas, scipy, h5py, pyarrow, npTDMS and pyuff are imported when the first file needs them.
 """
 
-from lmshealth.readers.archive import NOT_LOGS, Found, Manifest, find_logs, name_of, read_manifest
+from lmshealth.readers.archive import (
+    MANIFEST,
+    NOT_LOGS,
+    Found,
+    Manifest,
+    find_logs,
+    name_of,
+    read_manifest,
+    read_manifest_beside,
+)
 from lmshealth.readers.columns import ColumnMap, load_columns
 from lmshealth.readers.formats import format_name
 from lmshealth.readers.metadata import COVARIATES
@@ -35,6 +44,7 @@ from lmshealth.readers.reading import content_digest, read_log, require_identity
 
 __all__ = [
     "COVARIATES",
+    "MANIFEST",
     "NOT_LOGS",
     "ColumnMap",
     "Found",
@@ -46,5 +56,6 @@ __all__ = [
     "name_of",
     "read_log",
     "read_manifest",
+    "read_manifest_beside",
     "require_identity",
 ]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import stat
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
@@ -120,9 +120,31 @@ def read_manifest(folder: str | Path) -> Manifest:
     """
     root = Path(folder)
     found = find_sheets(root, MANIFEST)
+    return _together(root, found.logs, found.refused)
+
+
+def read_manifest_beside(log: str | Path) -> Manifest:
+    """Read the ``manifest.csv`` in the folder of a log, and no other; there may be none.
+
+    Parameters
+    ----------
+    log : str or Path
+        The log, which need not exist.
+    """
+    root = Path(log).parent
+    path = root / MANIFEST
+    if not os.path.lexists(path):
+        return Manifest({}, (), {})
+    trouble = _trouble(path, root)
+    refused = (Refusal(MANIFEST, *trouble),) if trouble else ()
+    return _together(root, () if trouble else (path,), refused)
+
+
+def _together(root: Path, paths: Iterable[Path], refused: Iterable[Refusal]) -> Manifest:
+    """Read manifests of a folder, the nearest to the logs last."""
     manifest = Manifest({}, (), {})
-    refused = list(found.refused)
-    for path in sorted(found.logs, key=lambda path: (len(path.parts), path)):
+    refused = list(refused)
+    for path in sorted(paths, key=lambda path: (len(path.parts), path)):
         try:
             refused += _add(manifest, path, root)
         except Unusable as error:

@@ -122,7 +122,8 @@ def _series(raw: Raw, columns: ColumnMap) -> list[_Series]:
     if twice := sorted({item for item in names if names.count(item) > 1}):
         raise Unusable("columns", f"{listed(twice)} comes in more than one unit; {there}")
     if not any(item.signal.role in _DYNAMIC for item in series):
-        raise Unusable("columns", f"no signal: {_NEEDED}; {there}")
+        hint = "" if columns.columns else "; a column map (--columns) translates other names"
+        raise Unusable("columns", f"no signal: {_NEEDED}; {there}{hint}")
     _check_lengths(series)
     return series
 

@@ -138,7 +138,9 @@ def _with_unit(column: str, suffix: str | None, role: Role, unit: str | float) -
     """Read a column whose unit a column map gives; a name that has its own must not contradict."""
     if suffix is not None and _UNITS[suffix][0] == _DIMENSIONS[role]:
         raise Unusable(
-            "unit", f"column {column!r} carries the unit {suffix} and is given {unit!r} as well"
+            "unit",
+            f"column {column!r} carries the unit {suffix} and is given {unit!r} as well; name it "
+            f"{column.removesuffix('_' + suffix)!r} to read it by the latter",
         )
     if isinstance(unit, str):
         key = unit_key(unit)

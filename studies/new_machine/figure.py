@@ -1,0 +1,69 @@
+"""Draw figure.svg from result.json: the stiffness of both machines, told and true."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+import numpy as np
+from matplotlib.figure import Figure
+
+HERE = Path(__file__).parent
+STYLES = {
+    "bench-A": ("#0072b2", "o", "bench-A, as measured"),
+    "bench-B": ("#d55e00", "s", "bench-B, read as sampled slower and slower"),
+}
+HOURS_PER_WEEK = 168
+
+
+def draw(result: dict[str, Any]) -> Figure:
+    """Draw medians with 90 % intervals over the weeks, the truth, and when B reaches its limit."""
+    figure = Figure(figsize=(8, 3.6), layout="constrained")
+    ax = figure.subplots()
+    for name, (colour, marker, label) in STYLES.items():
+        own = [row for row in result["stiffness"] if row["stage"] == name]
+        week, low, mid, high, truth = (
+            np.array([row[key] for row in own])
+            for key in ("hours", "q05", "median", "q95", "truth")
+        )
+        week = week / HOURS_PER_WEEK
+        ax.plot(week, truth, color="black", lw=0.8, label="truth" if name == "bench-A" else None)
+        ax.errorbar(
+            week,
+            mid,
+            [mid - low, high - mid],
+            fmt=marker,
+            color=colour,
+            ms=4,
+            capsize=3,
+            label=label,
+        )
+    now = max(row["hours"] for row in result["stiffness"])
+    left = result["remaining"]
+    ends = [left["bench-B"][f"rul_km_{q}"] for q in ("q05", "q50", "q95")]
+    low, mid, high = ((now + hours) / HOURS_PER_WEEK for hours in ends)
+    ax.errorbar(
+        mid, result["limit"], xerr=[[mid - low], [high - mid]], fmt="s", color=STYLES["bench-B"][0],
+        mfc="none", ms=6, capsize=3, label="bench-B reaches the limit, 90 %",
+    )  # fmt: skip
+    true_end = (now + left["true_of_bench-B_h"]) / HOURS_PER_WEEK
+    ax.plot(true_end, result["limit"], "kx", ms=7, label="truth, if it goes on like this")
+    ax.axhline(result["limit"], color="#777777", lw=0.8, ls="--")
+    ax.set_xlabel("weeks, as the manifest says")
+    ax.set_ylabel("coupling stiffness / baseline")
+    ax.legend(fontsize=8)
+    ax.grid(alpha=0.3)
+    return figure
+
+
+def main() -> None:
+    """Draw the study."""
+    result = json.loads((HERE / "result.json").read_text())
+    with matplotlib.rc_context({"svg.hashsalt": "new_machine", "font.size": 9}):
+        draw(result).savefig(HERE / "figure.svg", metadata={"Date": None})
+
+
+if __name__ == "__main__":
+    main()

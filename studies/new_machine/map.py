@@ -1,0 +1,70 @@
+"""Write the modal map of two inertias on a spring: the whole physics of the bench.
+
+Free to turn together, inertias J_m and J_l on a stiffness k have one torsional mode,
+(2 π f)² = k (1/J_m + 1/J_l), and the motor's angle an antiresonance (2 π f_a)² = k / J_l: the two
+frequencies give J_l/J_m = (f/f_a)² − 1. Over their values at commissioning
+
+    f/f_0 = sqrt(κ (1 + r/λ) / (1 + r)),   κ = k/k_0, λ = J_l/J_l0, r = J_m/J_l0.
+
+With λ = 1 nothing of the inertias is left: f goes with the root of the stiffness.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import json
+from pathlib import Path
+
+import numpy as np
+
+STIFFNESS = np.geomspace(0.25, 2.5, 13)
+LOAD = np.geomspace(0.6, 1.7, 7)
+
+
+def main() -> None:
+    """Write the map."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("hz", type=float, help="of the mode at commissioning")
+    parser.add_argument("out", type=Path)
+    parser.add_argument(
+        "--motor",
+        type=Path,
+        metavar="FRF.json",
+        help="vary the load's inertia too; its share is told by the antiresonance of this response",
+    )
+    options = parser.parse_args()
+    write_map(options.out, options.hz, options.motor and read_antiresonance(options.motor))
+
+
+def read_antiresonance(path: Path) -> float:
+    """Find where the response of the motor's angle is least, to one line of it, in Hz."""
+    lines = json.loads(path.read_text(encoding="utf-8"))["frf"]
+    return float(min(lines, key=lambda line: line["gain"])["frequency_hz"])
+
+
+def write_map(path: Path, hz: float, antiresonance: float | None = None) -> None:
+    """Write the frequency over a grid of the stiffness, and of the load's inertia where asked.
+
+    Parameters
+    ----------
+    path : Path
+        Of the map.
+    hz, antiresonance : float
+        Of the mode, and of the motor's angle where the load is varied, in Hz.
+    """
+    motor_over_load = 0.0 if antiresonance is None else 1 / ((hz / antiresonance) ** 2 - 1)
+    loads = np.ones(1) if antiresonance is None else LOAD
+    names = ["coupling_stiffness", "load_inertia"][: 1 if antiresonance is None else 2]
+    with path.open("w", encoding="utf-8", newline="") as stream:
+        table = csv.writer(stream, lineterminator="\n")
+        table.writerow([*names, "mode", "frequency_hz"])
+        for stiffness in STIFFNESS:
+            for load in loads:
+                shift = stiffness * (1 + motor_over_load / load) / (1 + motor_over_load)
+                at = [f"{value:.6g}" for value in (stiffness, load)[: len(names)]]
+                table.writerow([*at, "torsion", f"{hz * np.sqrt(shift):.9g}"])
+
+
+if __name__ == "__main__":
+    main()
