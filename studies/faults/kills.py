@@ -11,6 +11,14 @@ Method
     empty store, until there were 100 kills. Of the machines one is young, and three others teach
     it. Negative control: the comparison has to see one row doubled, lost or moved, one digit
     changed, one page changed or lost.
+Answer
+    Yes. After 100 kills in SQLite and 100 in PostgreSQL (108 of the main process, 26 of a worker,
+    35 SIGINT, 31 SIGTERM; before the first log, among logs, machines and tables) seven batches came
+    to their end as if nothing had been: no line of a table or page and no row of a store differs,
+    and the last process of a killed run was gone within 11 s of a busy machine. An interrupt is
+    told in one line unless Python itself is still starting.
+Run time
+    Half an hour, most of it waiting for the next kill.
 """
 
 from __future__ import annotations
