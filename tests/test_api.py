@@ -93,6 +93,7 @@ def test_every_name_is_typed_and_told(name: str) -> None:
     assert inspect.isclass(found) or signature.return_annotation is not signature.empty
 
 
+@pytest.mark.slow
 def test_a_type_checker_knows_every_name(tmp_path: Path, root: Path) -> None:
     """A program that uses every name passes strict checks, and no result of it is of any type."""
     pytest.importorskip("mypy")
@@ -128,6 +129,7 @@ def test_import_leaves_heavy_libraries_alone(what: str) -> None:
     assert not set(told.split()) & set(HEAVY)
 
 
+@pytest.mark.slow
 def test_what_is_asked_for_brings_no_database() -> None:
     """Who reads, identifies and infers pays for no store, no pages and no pictures."""
     names = "read_log, identify, load_stage, track, infer, prognose, judge"

@@ -262,6 +262,7 @@ def test_sources_share_a_mode(rng: np.random.Generator) -> None:
     assert run(rows).assigned == (("a", "b", "a", "b"),) * 20
 
 
+@pytest.mark.slow
 def test_covariates_are_regressed(rng: np.random.Generator) -> None:
     """Swings of temperature that move modes by 1 % cost no label, and do if not told."""
     warm = 10 * np.sign(np.sin(np.arange(N))) + rng.standard_normal(N)

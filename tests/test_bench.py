@@ -13,6 +13,7 @@ def figure(ratios: np.ndarray, at_most: float = 1.0) -> Figure:
     return Figure("something", "something else", at_most, tuple(ratios.tolist()))
 
 
+@pytest.mark.slow
 def test_a_figure_that_is_just_held_is_hardly_ever_missed() -> None:
     """With the median on the bound, and noise of any size, at most 1 in 100 is said to be missed.
 

@@ -174,6 +174,7 @@ def test_close_modes_and_coherent_forces_cost_information() -> None:
     np.testing.assert_allclose(std(2.0, np.eye(2), -shapes), near, rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_a_simple_estimator_of_an_ambient_mode_reaches_its_bound_and_not_a_better_one() -> None:
     """Whittle fits of exponential ordinates scatter by the bound; at half of it they would not.
 

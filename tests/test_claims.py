@@ -151,6 +151,7 @@ def test_claim(claims, p):
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("p", "rejected", "code"), [((0.5, 0.9), 0, 0), ((0.01, 0.015, 0.9), 2, 1)]
 )

@@ -239,6 +239,7 @@ def test_chosen_channels_and_column_maps_reach_the_analysis(folder: Path, tmp_pa
     assert "acc_pitch" in unknown.stderr
 
 
+@pytest.mark.slow
 def test_the_program_runs_as_a_process(folder: Path, stage: Path) -> None:
     """From a shell: JSON on standard output, nothing on standard error, status 0."""
     start = [sys.executable, "-c", "from lmshealth.cli import main; main()"]
@@ -266,6 +267,7 @@ def strokes(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
     return sorted(folder.glob("*.h5"))
 
 
+@pytest.mark.slow
 def test_modes_of_what_settles(strokes: list[Path]) -> None:
     """A stop from 400 mm/s tells the modes, with a stage or without; a log without is refused."""
     arguments = ("--part", "settling", "--format", "json")
@@ -322,6 +324,7 @@ def test_error_of_a_part_and_its_refusals(strokes: list[Path], folder: Path) -> 
     assert len(result.stderr.splitlines()) == 1
 
 
+@pytest.mark.slow
 def test_spectrum_as_json_says_what_grows(strokes: list[Path]) -> None:
     """Pitch grows with velocity and is read by both accelerometers; 50 Hz is mains."""
     result = call("spectrum", *strokes, "--stage", "lms-y", "--format", "json")
@@ -565,6 +568,7 @@ def run(logs: Path, stage: Path | str, out: Path) -> Result:
     return call("run", logs, "--stage", stage, "--out", out, "--workers", 1)
 
 
+@pytest.mark.slow
 def test_a_clean_run_is_status_0_and_says_where_its_report_is(
     folder: Path, stage: Path, tmp_path: Path
 ) -> None:
@@ -653,6 +657,7 @@ def test_a_bad_description_is_status_1_with_one_line(folder: Path, tmp_path: Pat
 # report
 
 
+@pytest.mark.slow
 def test_report_writes_the_pages_of_run_without_its_logs(stage: Path, tmp_path: Path) -> None:
     """Logs and description gone, every page is the same to the byte."""
     logs = write_archive(tmp_path / "logs", 2)
@@ -708,6 +713,7 @@ def test_the_store_may_be_named_by_the_environment(tmp_path: Path) -> None:
     assert call("report", "--out", tmp_path).exit_code == 2
 
 
+@pytest.mark.slow
 def test_a_machine_that_cannot_be_read_is_told_and_the_others_are_written(tmp_path: Path) -> None:
     """One line names it, with status 3."""
     store = Store(beside(tmp_path))
@@ -728,6 +734,7 @@ def test_a_machine_that_cannot_be_read_is_told_and_the_others_are_written(tmp_pa
     assert names == ["M7-Y.html", "index.html"]
 
 
+@pytest.mark.slow
 def test_pdfs_stand_beside_the_pages_of_run_and_report(
     folder: Path, stage: Path, tmp_path: Path, needs: Callable[[str], None]
 ) -> None:

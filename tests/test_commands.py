@@ -171,6 +171,7 @@ def infer(*words: object) -> Result:
     return CliRunner().invoke(main, ["infer", *map(str, words)])
 
 
+@pytest.mark.slow
 def test_drifts_become_health(drifts: Path, tmp_path: Path) -> None:
     """Every machine has its epochs in the table and its draws in the file; the truth is inside."""
     toml = tmp_path / "stage" / "small.toml"
@@ -191,6 +192,7 @@ def test_drifts_become_health(drifts: Path, tmp_path: Path) -> None:
     assert median == pytest.approx(last.loc["AX-2", "guide_preload"]["median"])
 
 
+@pytest.mark.slow
 def test_the_seed_alone_decides(drifts: Path, tmp_path: Path) -> None:
     """The same seed gives the same file to the byte, another one another file."""
     toml = tmp_path / "stage" / "small.toml"
@@ -201,6 +203,7 @@ def test_the_seed_alone_decides(drifts: Path, tmp_path: Path) -> None:
     assert outs[0].read_bytes() == outs[1].read_bytes() != outs[2].read_bytes()
 
 
+@pytest.mark.slow
 def test_machines_that_share_a_guide_are_inferred_together(drifts: Path, tmp_path: Path) -> None:
     """One table for both; the shared preload once, the mounts under the names of the machines."""
     toml = tmp_path / "stage" / "small.toml"
@@ -226,6 +229,7 @@ def test_machines_that_share_a_guide_are_inferred_together(drifts: Path, tmp_pat
     assert "2 machines (AX-1, AX-2); needed is a table of the one" in result.stderr
 
 
+@pytest.mark.slow
 def test_a_machine_without_drifts_is_told_and_the_others_go_on(
     drifts: Path, tmp_path: Path
 ) -> None:

@@ -217,6 +217,7 @@ def output(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
+@pytest.mark.slow
 def test_an_output_folder_keeps_the_contract(output: Path) -> None:
     """Tables, their numbers and words, and the pages are as written in the contract."""
     assert complaints(output) == []

@@ -117,6 +117,7 @@ def test_a_following_error_rings_too() -> None:
     assert numbered.sources == ("acc",)
 
 
+@pytest.mark.slow
 def test_the_decay_begins_where_the_machine_is_linear() -> None:
     """A rattle right after the stop is left out, and the frequency is that of the ringing."""
     rng = np.random.default_rng(8)
@@ -126,6 +127,7 @@ def test_the_decay_begins_where_the_machine_is_linear() -> None:
     assert np.abs(deviations(modes, "roll", 60.0, 0.002)).max() < 4
 
 
+@pytest.mark.slow
 def test_a_softening_machine_gets_wide_intervals_or_none() -> None:
     """A frequency that rises by 1 % while the decay fades is refused or not taken for exact."""
     rng = np.random.default_rng(9)
@@ -179,6 +181,7 @@ def test_a_sine_is_a_line_and_not_a_mode() -> None:
     assert error.value.reason == "line-not-mode"
 
 
+@pytest.mark.slow
 def test_ambient_vibration_is_no_decay() -> None:
     """A stationary response of a lightly damped mode is refused: no stop has excited it."""
     reasons = []
@@ -226,6 +229,7 @@ def test_what_cannot_be_analysed_is_said() -> None:
         identify_decays(moving, stage)
 
 
+@pytest.mark.slow
 def test_a_real_beam_gives_its_frequencies(needs: Callable[[str], None]) -> None:
     """Dwells of a beam on a roller: right to 0.15 Hz or refused, and so is the unexcited first."""
     needs("data")
@@ -235,6 +239,7 @@ def test_a_real_beam_gives_its_frequencies(needs: Callable[[str], None]) -> None
     assert rows[0]["refused"] == "not-excited"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["lms-x", "lms-y"])
 def test_simulated_stages_tell_their_modes_after_a_stop(name: str) -> None:
     """A stage with all its modes, its loop and mains: what is not refused is right."""

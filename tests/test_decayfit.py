@@ -51,6 +51,7 @@ def test_a_level_that_is_well_known_is_averaged_in_fine_steps() -> None:
     assert (np.abs(off[:2]) < 0.2).all()
 
 
+@pytest.mark.slow
 def test_the_average_over_the_ambient_response_is_the_posterior_s_moments() -> None:
     """Mean and covariance agree with importance sampling of all parameters at once."""
     rng = np.random.default_rng(11)

@@ -126,6 +126,7 @@ def test_a_new_machine_is_replaced_at_the_age_of_the_known_equation(
     assert found == pytest.approx(expected, rel=0.02)
 
 
+@pytest.mark.slow
 def test_the_costs_of_an_old_machine_are_least_where_the_formula_says() -> None:
     """With an age, costs per travel by numerical integration are nowhere less than 0.1 % lower."""
     age, ratio, life = 4e5, 8.0, weibull_min(2.5, scale=SCALE)

@@ -94,6 +94,7 @@ def test_what_happened_is_found_with_its_kind_place_and_size(stage: Stage, kind:
     assert stats.chi2.ppf(5e-4, len(z)) < np.sum(np.square(z)) < stats.chi2.isf(5e-4, len(z))
 
 
+@pytest.mark.slow
 def test_a_step_is_damage_and_a_retuning_is_not(stage: Stage) -> None:
     """The alarm follows from a loosened bolt; what the loop explains, and grease, raise none."""
     alarms = {
@@ -121,6 +122,7 @@ def test_a_declared_retuning_is_not_found_again(stage: Stage) -> None:
     assert (np.abs(found.drift[-1]) < 4 * std).all()
 
 
+@pytest.mark.slow
 def test_nothing_is_found_in_quiet_lives(stage: Stage) -> None:
     """In 40 lives of two sources nothing happens, and nothing is found or doubted."""
     for seed in range(100, 140):

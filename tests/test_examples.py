@@ -40,6 +40,7 @@ def outcome(test: doctest.DocTest) -> str:
     return "".join(told)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", lmshealth.__all__)
 def test_example(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A user who pastes the example of a name, and nothing before it, sees what it says."""
@@ -84,6 +85,7 @@ def python_of(readme: Path) -> Iterator[str]:
     yield from re.findall(r"^```python\n(.*?)^```$", readme.read_text(), re.S | re.M)
 
 
+@pytest.mark.slow
 def test_python_of_the_readme(logs: Path, root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The example of the README goes from logs to a service date, and says what it prints."""
     (program,) = python_of(root / "README.md")

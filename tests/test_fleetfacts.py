@@ -6,6 +6,8 @@ import re
 from dataclasses import replace
 from pathlib import Path
 
+import pytest
+
 from lmshealth.fleet import Learned, LearnedLaw
 from lmshealth.fleetfacts import taught
 from lmshealth.life import expected_scatter, scatter_of
@@ -66,6 +68,7 @@ def test_expected_scatter_is_what_is_believed() -> None:
     assert scatter_of(stage) == scatter_of(replace(stage, digest="another"))
 
 
+@pytest.mark.slow
 def test_page_of_a_young_machine_names_what_it_was_taught(tmp_path: Path) -> None:
     """The page says from how many machines a prior was learned; without one it says nothing."""
     assessment = worn(tmp_path)

@@ -431,6 +431,7 @@ def test_the_motor_side_has_an_antiresonance(bench: Callable[[str], Log]) -> Non
     assert frequency[np.argmin(np.abs(reading.fit.response))] == pytest.approx(53, abs=1.5)
 
 
+@pytest.mark.slow
 def test_noise_of_a_bench_is_its_scatter_over_periods(bench: Callable[[str], Log]) -> None:
     """Left out one by one, 19 periods scatter by what is stated; a third of it would fail."""
     found = scatter_over_periods(bench(BENCH), "delta_e_load", None)

@@ -302,6 +302,7 @@ def test_no_name_is_ever_run(browser: Any, tmp_path: Path) -> None:
     assert seen == []
 
 
+@pytest.mark.slow
 def test_the_policy_lets_no_other_script_run(browser: Any, fleet: Path, tmp_path: Path) -> None:
     """Were something to get through all the same, the browser would refuse to run it."""
     text = fleet.read_text(encoding="utf-8")

@@ -71,6 +71,7 @@ def health(stage: Stage, worn: Track) -> Health:
     return infer(worn, stage, 5)
 
 
+@pytest.mark.slow
 def test_posterior_quantiles_are_those_of_a_grid(stage: Stage, health: Health) -> None:
     """Quantiles of the draws have the right probability on a 2-D grid, within Monte-Carlo error."""
     x = np.log(health.samples[-1])
@@ -97,6 +98,7 @@ def test_health_is_sharp_where_modes_tell_it(health: Health) -> None:
     assert (health.samples[0].mean(axis=0) > health.samples[1].mean(axis=0)).all()
 
 
+@pytest.mark.slow
 def test_map_error_widens_the_posterior(tmp_path: Path, worn: Track, health: Health) -> None:
     """A map that is believed less gives wider health, in proportion to the drift."""
     doubtful = infer(worn, make_stage(tmp_path, model_std=0.2), 5, epochs=[2])
@@ -146,6 +148,7 @@ def test_any_mapper_gives_the_same(stage: Stage, worn: Track) -> None:
     assert found.recorded_at == plain.recorded_at == worn.recorded_at[1:]
 
 
+@pytest.mark.slow
 def test_a_parameter_no_mode_sees_keeps_its_prior(tmp_path: Path) -> None:
     """Without sensitivity a parameter is uninformed and its posterior is its prior."""
     stage = make_stage(tmp_path, (PRELOAD, FOOT))
@@ -160,6 +163,7 @@ def test_a_parameter_no_mode_sees_keeps_its_prior(tmp_path: Path) -> None:
         assert abs(prior.cdf(np.quantile(x, level)) - level) < error
 
 
+@pytest.mark.slow
 def test_one_mode_cannot_tell_two_parameters(stage: Stage) -> None:
     """With one mode the posterior is a ridge: the product is sharp, the two are strongly tied."""
     drift = true_drift(NAMES, TRUTH)[:1]
@@ -170,6 +174,7 @@ def test_one_mode_cannot_tell_two_parameters(stage: Stage) -> None:
     assert (found.informed[0] < 0.95).all()
 
 
+@pytest.mark.slow
 def test_draws_never_leave_the_map(stage: Stage) -> None:
     """Drifts beyond what the map holds push draws to its edge, not over it."""
     x = np.log([AXES["guide_preload"][0], 1.0])
@@ -267,6 +272,7 @@ def test_a_track_of_the_baseline_alone_is_refused(stage: Stage) -> None:
         infer(epochs([]), stage, 1)
 
 
+@pytest.mark.slow
 def test_laplace_stands_beside_the_sampler(
     tmp_path: Path, stage: Stage, worn: Track, health: Health
 ) -> None:
@@ -293,6 +299,7 @@ def make_stage_with(stage: Stage, low: float, high: float = 1.2) -> Stage:
     return Stage(description, stage.modal_map, stage.digest)
 
 
+@pytest.mark.slow
 def test_what_the_prior_does_is_told(tmp_path: Path, worn: Track, health: Health) -> None:
     """Priors twice as wide hardly move what the data tell, and widen by twice what they do not."""
     assert (np.abs(health.prior_shift) < 0.2).all()
@@ -305,6 +312,7 @@ def test_what_the_prior_does_is_told(tmp_path: Path, worn: Track, health: Health
     assert blind.informed[0, 2] < 0.05
 
 
+@pytest.mark.slow
 def test_reweighting_and_sampling_agree(stage: Stage, monkeypatch: pytest.MonkeyPatch) -> None:
     """The wider posterior is the same by weights on the draws and by chains of its own.
 
@@ -330,6 +338,7 @@ def test_correlation_is_that_of_the_draws(health: Health) -> None:
     assert (health.correlation[:, 0, 1] < -0.5).all()
 
 
+@pytest.mark.slow
 def test_a_mode_that_is_missing_at_an_epoch_is_done_without(stage: Stage) -> None:
     """An epoch with one of two modes is inferred from that one; one without any is no epoch."""
     drift = np.vstack([np.zeros(2), np.tile(true_drift(NAMES, TRUTH)[:2], (3, 1))])
@@ -354,6 +363,7 @@ def two_machines(stage: Stage, offset: timedelta) -> list[tuple[Track, Stage]]:
     return machines
 
 
+@pytest.mark.slow
 def test_a_shared_guide_is_known_better(stage: Stage) -> None:
     """Two machines on one guide tell its preload better than either; their mounts stay their own.
 
@@ -386,6 +396,7 @@ def test_a_shared_guide_is_known_better(stage: Stage) -> None:
     assert (np.abs(found + 0.1 - known) > 4.5 * error).any()  # negative control
 
 
+@pytest.mark.slow
 def test_epochs_of_the_first_meet_the_last_of_the_others(stage: Stage) -> None:
     """An epoch takes what the other machine showed last; where that is nothing yet, it is none."""
     later = two_machines(stage, timedelta(days=7))
@@ -427,6 +438,7 @@ def test_health_goes_to_arviz_and_back(health: Health, tmp_path: Path) -> None:
     assert float(array_stats.rhat(draws.to_numpy()[..., 1])) < 1.02
 
 
+@pytest.mark.slow
 def test_drifts_that_no_state_explains_claim_nothing(tmp_path: Path) -> None:
     """Modes that moved against the map are told as such, and nothing is told from them."""
     stage = make_stage(tmp_path, n_modes=3)
@@ -442,6 +454,7 @@ def test_drifts_that_no_state_explains_claim_nothing(tmp_path: Path) -> None:
     assert not wrong.told().any()
 
 
+@pytest.mark.slow
 def test_a_posterior_at_the_edge_of_the_map_is_a_bound(stage: Stage) -> None:
     """Drifts further than the map reaches pile up at its end, which is told by parameter."""
     edge = np.log([AXES["guide_preload"][0], 0.9])
@@ -477,6 +490,7 @@ def test_nothing_is_told_by_what_did_not_converge(
     assert found.fit[-1] < 1e-6
 
 
+@pytest.mark.slow
 def test_a_check_that_fails_leaves_the_posterior(
     stage: Stage, worn: Track, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -494,6 +508,7 @@ def test_a_check_that_fails_leaves_the_posterior(
     assert np.isnan(found.prior_ratio).all()
 
 
+@pytest.mark.slow
 def test_a_prior_as_wide_as_the_map_has_no_check(stage: Stage, worn: Track) -> None:
     """Where the map keeps a prior from getting wider nothing is said of what hangs on it."""
     found = infer(worn, make_stage_with(stage, low=0.21), 5, epochs=[2])
@@ -505,6 +520,7 @@ def test_a_prior_as_wide_as_the_map_has_no_check(stage: Stage, worn: Track) -> N
     assert np.isfinite(found.prior_ratio[0, 1])
 
 
+@pytest.mark.slow
 def test_what_is_identifiable_goes_by_the_modes_of_an_epoch(tmp_path: Path) -> None:
     """One mode of two tells the mount beside the preload, but not the preload beside the mount."""
     stage = make_stage(tmp_path)

@@ -297,6 +297,7 @@ def test_baseline_units_do_not_matter(tmp_path: Path) -> None:
     np.testing.assert_allclose(health[:, 0, 0], [0.9, 0.7])
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("short_grid")
 def test_many_logs_are_told_by_few_nodes(stage: Stage) -> None:
     """Of 80 logs two dozen nodes are enough, and what follows between them is right to 1e-7."""

@@ -29,6 +29,7 @@ def test_free_numbers_stay_within_two_widths_of_their_priors():
             assert abs(np.log(value / free.median)) < 2 * free.width, free
 
 
+@pytest.mark.slow
 def test_calibration_gives_the_stored_numbers():
     """Running the calibration again gives the literals in stages.py."""
     found = calibrate()

@@ -53,6 +53,7 @@ def test_modes_agree_with_the_truth(tmp_path):
         assert modes[name] == pytest.approx(row[f"{name}_hz"], rel=1e-9)
 
 
+@pytest.mark.slow
 def test_map_has_its_columns(tmp_path):
     """The map holds the three guide modes over the grid."""
     out = tmp_path / "map.csv"
@@ -75,6 +76,7 @@ def test_errors_are_one_line_and_status_1():
     assert done.stderr == "error: unknown stage 'lms-z'; known: lms-x, lms-y\n"
 
 
+@pytest.mark.slow
 def test_wrong_usage_is_status_2():
     """A missing option is wrong usage."""
     assert run("simulate", "lms-y").returncode == 2
@@ -86,6 +88,7 @@ SWEEP = ["sweep", "lms-x", "--low", "100", "--period", "0.1", "--seconds", "1"]
 BOUNDS = "needed: 0.01 to 600 s"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("arguments", "error"),
     [
@@ -116,6 +119,7 @@ def test_numbers_without_meaning_are_one_line_and_no_file(tmp_path, arguments, e
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.slow
 def test_stale_logs_are_one_line(tmp_path):
     """A folder with two logs is refused to a plan of one, with the way out of it."""
     folder = ["--seconds", "0.1", "--out", str(tmp_path)]
@@ -135,6 +139,7 @@ def test_help_says_that_the_velocity_is_lowered():
     assert "lowered to what the travel" in " ".join(output.split())
 
 
+@pytest.mark.slow
 def test_until_failure_needs_a_life_that_fails(tmp_path):
     """Following a healthy life to its failure is refused in one line before anything is made."""
     out = tmp_path / "life"

@@ -251,6 +251,7 @@ def test_the_hall_moves_frequencies_as_a_damage_does():
     assert day + season > roll(1.0, 1.0) - roll(0.9, 1.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("stage", sorted(STAGES))
 def test_every_life_stays_stable_and_named(stage):
     """At the start, around the event, at failure and past it every mode has a name and decays."""

@@ -3,7 +3,10 @@
 import subprocess
 import sys
 
+import pytest
 
+
+@pytest.mark.slow
 def test_models_never_imports_lmshealth():
     """Importing the command line of the models loads nothing of lmshealth."""
     code = (

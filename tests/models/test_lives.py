@@ -112,6 +112,7 @@ def test_formats_hold_the_same(tmp_path, file_format):
             np.testing.assert_array_equal(table[name].to_numpy(), file[name][:])
 
 
+@pytest.mark.slow
 def test_files_do_not_depend_on_workers(tmp_path):
     """One process and two write the same bytes."""
     plan = Plan("lms-y", "preload-wear", 2, 0.5, 9)
@@ -213,6 +214,7 @@ def check_maintenance(work, truth, name):
             assert set(truth["servo_id"][~earlier]) == {"retuned"}
 
 
+@pytest.mark.slow
 def test_conditions_reach_the_workers(tmp_path):
     """The tuning is the same whether a log is made here or in another process."""
     plan = Plan("lms-x", "servo-retuning", 3, 0.5, 2)

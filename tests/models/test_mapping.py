@@ -1,6 +1,7 @@
 """Tests of the modal map."""
 
 import numpy as np
+import pytest
 
 from models.mapping import (
     MOUNT_RANGE,
@@ -20,6 +21,7 @@ def test_nodes_hold_the_ends():
     np.testing.assert_allclose(nodes[[0, -1]], (0.2, 2.2))
 
 
+@pytest.mark.slow
 def test_map_reproduces_points_left_out():
     """The Chebyshev fit meets ln f within 1e-5 for mounts up to as new, within 3e-5 everywhere.
 

@@ -86,6 +86,7 @@ def test_all_crossovers_are_found(name):
     assert [c.margin for c in others] == pytest.approx(20 * np.log10(gains), abs=1e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
 def test_a_denser_grid_finds_no_more(name, monkeypatch):
     """Four times the grid gives the same crossovers of the flexible loop."""
@@ -113,6 +114,7 @@ def test_a_sharp_resonance_is_not_missed(monkeypatch):
     assert not of_kind(margins(loop), GAIN_CROSSOVER)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", [UPPER_CROSSOVER, LOWER_CROSSOVER])
 @pytest.mark.parametrize("make", [rigid_loop, flexible_loop])
 @pytest.mark.parametrize("name", NAMES)
@@ -207,6 +209,7 @@ def test_sensitivities_add_to_one(name):
     assert hertz[np.argmax(np.abs(error))] == pytest.approx(found.peak_hz, rel=5e-3)
 
 
+@pytest.mark.slow
 def test_a_structure_that_the_loop_cannot_hold_is_judged_unstable():
     """Where the simulation refuses to run, the same loop has the verdict, and grows as fast."""
     loose = Condition(guide_damping=0.01)
@@ -242,6 +245,7 @@ def test_phase_of_a_full_turn_is_no_crossover():
     assert 2 * np.pi * only.frequency_hz == pytest.approx(np.tan(np.pi / 6), rel=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
 def test_printed_loops_do_not_work(name):
     """As printed the product of the equations is unstable, rigid and flexible, and says so."""
@@ -271,6 +275,7 @@ def test_crossovers_on_a_resonance_are_named():
     assert [rigid.near(c) for c in found.crossovers] == [None] * 5
 
 
+@pytest.mark.slow
 def test_command_as_json():
     """The JSON names every loop, its crossovers and what decides, with null and never NaN."""
     result = CliRunner().invoke(cli, ["margins", "lms-x", "--format", "json"])
@@ -292,6 +297,7 @@ def test_command_as_json():
     assert [row["decides"] for row in rows] == [True, True, True, False, False]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
 def test_command_as_table(name, monkeypatch):
     """At 100 columns no cell of the table is cut or broken."""

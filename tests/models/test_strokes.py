@@ -47,6 +47,7 @@ def test_transients_make_the_error_of_fast_moves():
     assert error[~late].max() > 5 * error[late].max()
 
 
+@pytest.mark.slow
 def test_slow_strokes_have_the_scatter_of_a_constant_move():
     """Without transients a window of a stroke is the stationary record of the same velocity."""
     stroke = [strokes(0.010, seed).columns for seed in range(6)]
@@ -113,6 +114,7 @@ def test_commands_rest_before_the_move():
     assert not commands(STAGE, NOMINAL, np.zeros((4, 10))).any()
 
 
+@pytest.mark.slow
 def test_error_grows_from_slow_to_fast_and_x_follows_better():
     """Standard deviations grow from 1 to 100 mm/s and X stays below Y, as in Table 3."""
     spread = {

@@ -82,6 +82,7 @@ def test_samples_that_look_like_a_heap(log):
     assert load(log, ColumnMap()).columns["acc_x_g"].size == 100
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("lists_files", [False, True])
 @pytest.mark.parametrize("library", LIBRARIES)
 def test_virtual_columns_end_no_process(tmp_path, library, lists_files):

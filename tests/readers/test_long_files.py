@@ -63,6 +63,7 @@ CASES = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", CASES)
 def test_long_file(tmp_path, peaks, name):
     """All samples are read, in less memory than four minutes of them; the library needs more."""

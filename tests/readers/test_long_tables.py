@@ -52,6 +52,7 @@ CASES = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", CASES)
 def test_long_table(tmp_path, peaks, name):
     """All samples are read, in less memory than four minutes of them; the library needs more."""

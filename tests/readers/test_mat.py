@@ -163,6 +163,7 @@ def test_nesting(tmp_path):
     refused(mat_file(tmp_path / "log.mat", inner), "corrupt", "nested")
 
 
+@pytest.mark.slow
 def test_bomb(tmp_path):
     """A variable that would swell to gigabytes is refused before it does."""
     squeeze = zlib.compressobj(9)

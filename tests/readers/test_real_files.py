@@ -113,6 +113,7 @@ def test_known_values(sample):
     np.testing.assert_allclose(channel.values, sine, atol=1e-4)
 
 
+@pytest.mark.slow
 def test_modes_of_a_uff_file(sample):
     """The command line finds the mode at 40.5 Hz, and no mode at the mains."""
     name = str(sample("uff58_samples/MPSTD#Set001_2024_10_08_10_27_07.uff"))
@@ -128,6 +129,7 @@ def test_modes_of_a_uff_file(sample):
     assert abs(mode["damping_ratio"] - 0.015) < 3 * mode["damping_ratio_std"]
 
 
+@pytest.mark.slow
 def test_mains_of_a_uff_file(sample):
     """The line at 50 Hz is called mains."""
     name = str(sample("uff58_samples/MPSTD#Set001_2024_10_08_10_27_07.uff"))

@@ -4,7 +4,10 @@ import json
 import subprocess
 import sys
 
+import pytest
 
+
+@pytest.mark.slow
 def test_readers_are_as_fast_as_their_libraries(root):
     """No bounded reader takes two and a half times its library's time, however busy the machine.
 
