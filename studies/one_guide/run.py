@@ -126,9 +126,9 @@ def summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
 
 
 def main() -> None:
-    """Run the study; ``--quick`` does a few pairs and records nothing."""
+    """Run the study; ``--quick`` does one pair and records nothing."""
     study = Study(__file__, __doc__)
-    n, n_control = (6, 4) if study.quick else (150, 60)
+    n, n_control = (1, 1) if study.quick else (150, 60)
     trials = study.trials.collect(one_pair, [(k, False) for k in range(n)])
     control = study.trials.collect(one_pair, [(10_000 + k, True) for k in range(n_control)])
     ways = {
