@@ -13,6 +13,7 @@ Talts2018 for the ranks, Sailynoja2022 for the bands of their distribution.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -52,6 +53,7 @@ def rank(truth: Array, draws: Array, rng: np.random.Generator) -> list[float]:
     return [round(float(value), 6) for value in place(draws, truth, rng)]
 
 
+@cache
 def band(n: int) -> tuple[Array, Array]:
     """Give the simultaneous band of the distribution of n ranks, minus that of a uniform one."""
     rng = np.random.default_rng(n)
