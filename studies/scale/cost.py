@@ -120,6 +120,15 @@ def sized(what: str, n_logs: int) -> tuple[Row, Row]:
         return alone(folder), alone(folder)
 
 
+def here(n_logs: int) -> tuple[Row, Row]:
+    """Do as `sized` in this process, but for one run of the smallest archive."""
+    again = alone if n_logs == QUICK_SIZES[0] else one_run
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        make_archive(folder, n_logs)
+        return one_run(folder), again(folder)
+
+
 def marginal(less: Row, more: Row, *, by: Row | None = None) -> float:
     """Cost of one more log, in yardsticks of the larger archive or of another one."""
     costs = [sum(row["seconds"].values()) - row["seconds"]["starting"] for row in (less, more)]
@@ -144,7 +153,8 @@ def main() -> None:
         return
     quick, once = study.quick, study.trials.once
     sizes = QUICK_SIZES if quick else SIZES
-    first, again = zip(*(once(sized, "evenly", n) for n in sizes), strict=True)
+    pairs = [once(here, n) if quick else once(sized, "evenly", n) for n in sizes]
+    first, again = zip(*pairs, strict=True)
     uneven = first[0] if quick else once(sized, LONGER, 4 * sizes[0])[0]
     beside = first[1] if quick else once(sized, "beside", sizes[1])[0]
     slopes = [marginal(*pair) for pair in pairwise(first)]
