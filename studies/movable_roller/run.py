@@ -282,7 +282,8 @@ def judge(answer: dict[str, Any]) -> dict[str, bool]:
         "all chains converged": all(row["converged"] for row in inferred),
         "the tracker believes every dwell": answer["doubted_by_tracker"] == 0,
         "controls cover too little": all(
-            control["inside"] < min(LEAST_INSIDE, control["inferred"]) for control in answer["controls"].values()
+            control["inside"] < min(LEAST_INSIDE, control["inferred"])
+            for control in answer["controls"].values()
         ),
     }
 

@@ -59,7 +59,7 @@ class Step(NamedTuple):
 
 
 def main() -> None:
-    """Follow the tutorial; ``--quick`` follows its first steps, up to the map, and records nothing."""
+    """Follow the tutorial; ``--quick`` goes as far as the map and records nothing."""
     study = Study(__file__, __doc__)
     if "LMSHEALTH_DATA" not in os.environ:
         raise SystemExit("LMSHEALTH_DATA is not set: it names the folder of real measurements")

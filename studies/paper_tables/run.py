@@ -64,7 +64,8 @@ def main() -> None:
     quick, seeds = study.quick, 1 if study.quick else study.options.seeds
     rows = loop_rows() + ([] if quick else resonance_rows()) + modal_rows()
     moved = [row for axis in FILES for row in velocity_rows(axis, seeds)]
-    control = [row for axis in FILES for row in velocity_rows(axis, min(seeds, 2), transients=False)]
+    few = min(seeds, 2)
+    control = [row for axis in FILES for row in velocity_rows(axis, few, transients=False)]
     answer = {
         "seeds": seeds,
         "summary": summarise(moved),

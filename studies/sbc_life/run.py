@@ -174,7 +174,8 @@ def judged(rows: list[Row]) -> dict[str, Any]:
 
 def verdicts(found: dict[str, dict[str, Row]]) -> dict[str, bool]:
     """Say what was asked and whether it is so."""
-    checks = {f"ranks are uniform: {kind}": uniform(found[kind]) for kind in (ONE, CHAINS) if kind in found}
+    told = [kind for kind in (ONE, CHAINS) if kind in found]
+    checks = {f"ranks are uniform: {kind}": uniform(found[kind]) for kind in told}
     shown = {EXACT: HEALTH, LOSING: (*HEALTH, REMAINING[0])}
     for kind, names in shown.items():
         if kind in found and found[kind][HEALTH[0]]["n"] >= 0.9 * LIVES[kind]:  # fewer tell little

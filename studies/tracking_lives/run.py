@@ -96,9 +96,7 @@ def main() -> None:
     parser.add_argument("--raw", type=int, default=0, metavar="SEEDS")
     study = Study(__file__, __doc__, parser.parse_args())
     kept, seeds = study.kept(RAW), study.options.raw
-    answer = (
-        raw(seeds, kept) if seeds else drawn_lives(study.trials, study.quick, kept)
-    )
+    answer = raw(seeds, kept) if seeds else drawn_lives(study.trials, study.quick, kept)
     study.conclude(answer, name="raw" if seeds else "", quick_may_fail=True)
 
 
