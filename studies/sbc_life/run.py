@@ -67,7 +67,7 @@ SEED = 20261123
 ONE, CHAINS = "posterior", "by chains"
 EXACT, LOSING = "map taken as exact", "every part taken to lose"
 LIVES = {ONE: 1000, CHAINS: 40, EXACT: 100, LOSING: 100}
-QUICK = {ONE: 2, LOSING: 2}
+QUICK = {ONE: 1, LOSING: 1}
 N_POSTERIOR = 1024
 # What a posterior is made of, and what chains are made of.
 MODEL, SAMPLER = (
