@@ -70,7 +70,7 @@ CODE = ("courses", "density", "importance", "laws", "life", "lifefit", "passage"
 
 
 def main() -> None:
-    """Run the study; ``--quick`` does one life of four logs with the map believed and records nothing."""
+    """Run the study; ``--quick`` does one life of four logs, and records nothing."""
     study = Study(__file__, __doc__)
     n, logs = (QUICK_LIVES, QUICK_LOGS) if study.quick else (N_LIVES, N_LOGS)
     kinds = (BELIEVED,) if study.quick else (BELIEVED, STATED)
