@@ -44,7 +44,7 @@ from lmshealth.waterfall import read_levels
 from studies.record import Study, options
 from studies.scale.archive import make_archive
 
-SIZES, QUICK_SIZES = (100, 1_000, 10_000), (3, 6, 12)
+SIZES, QUICK_SIZES = (100, 1_000, 10_000), (2, 4, 10)
 LONGER = "longer and longer"
 EVERY = 21  # so that every recording that the logs are made of is among them
 # Of the cost of one more log, of what is added to the identification, and of memory.
@@ -60,6 +60,7 @@ class Meter:
 
     def __init__(self, logs: list[Path], stage: Stage) -> None:
         self._logs, self._stage = logs, stage
+        self._every = min(EVERY, max(len(logs) // 2, 1))
         self._step, self._since = "starting", time.process_time()
         self.seconds: dict[str, float] = {}
         self.yardstick: list[tuple[float, float, float]] = []
@@ -68,7 +69,7 @@ class Meter:
         """Hear of progress, as `run` tells it."""
         spent = time.process_time() - self._since
         self.seconds[self._step] = self.seconds.get(self._step, 0.0) + spent
-        if what == "identifying" and done % EVERY == EVERY // 2:
+        if what == "identifying" and done and done % self._every == self._every // 2:
             self.yardstick.append(self._by_itself(self._logs[done - 1]))
         self._step, self._since = what, time.process_time()
 
@@ -171,14 +172,15 @@ def main() -> None:
     }
     loose = QUICK if quick else 1.0
     answer["passed"] = {
-        "flat": abs(np.log(slopes[1] / slopes[0])) <= loose * np.log1p(FLAT),
+        "flat": min(slopes) > 0 and abs(np.log(slopes[1] / slopes[0])) <= loose * np.log1p(FLAT),
         "little beside identification": answer["overhead"] <= loose * OVERHEAD,
         "memory stays": answer["memory_ratio"] <= (loose if quick else MEMORY),
         "all remembered": all(row["remembered"] == row["logs"] for row in again),
         "control is seen": quick or answer["control_ratio"] > (1 + 2 * FLAT) * slopes[0],
     }
     answer["passed"] = {name: bool(fine) for name, fine in answer["passed"].items()}
-    study.conclude(answer)
+    # What is imported late makes the first of a few logs dear.
+    study.conclude(answer, quick_may_fail=True)
 
 
 if __name__ == "__main__":

@@ -61,16 +61,15 @@ class Steps:
 
 def staged(folder: Path, quick: bool) -> Row:
     """Analyse the full life or a short one."""
-    if quick:  # without laws there is no life to be drawn, which takes most
-        return one_stage(folder, QUICK, 1, lawless(load_stage(QUICK.stage)))
+    if quick:  # health and life take most of the time by far
+        return one_stage(folder, QUICK, 1, without_health(load_stage(QUICK.stage)))
     return one_stage(folder, FULL, 40, load_stage(FULL.stage))
 
 
-def lawless(stage: Stage) -> Stage:
-    """Give the same stage without a law of any parameter."""
-    parameters = tuple(msgspec.structs.replace(p, law=()) for p in stage.parameters)
-    told = msgspec.structs.replace(stage.description, parameter=parameters)
-    return replace(stage, description=told)
+def without_health(stage: Stage) -> Stage:
+    """Give the same stage with its modes alone."""
+    told = msgspec.structs.replace(stage.description, parameter=(), map=None)
+    return replace(stage, description=told, modal_map=None)
 
 
 def one_stage(folder: Path, plan: Plan, epochs: int, stage: Stage) -> Row:
@@ -118,7 +117,7 @@ def plan_for(n_workers: int, stage: Row, serial_s: float, efficiency: float) -> 
 
 
 def main() -> None:
-    """Run the study; ``--quick`` does a short life without laws and records nothing."""
+    """Run the study; ``--quick`` does a short life without health and records nothing."""
     study = Study(__file__, __doc__)
     with tempfile.TemporaryDirectory() as name:
         stage = study.trials.once(partial(staged, Path(name)), study.quick)
