@@ -73,15 +73,15 @@ def main() -> None:
     study = Study(__file__, __doc__)
     quick, once = study.quick, study.trials.once
     names = ["white, 3 s", "resonances of 0.5 %, 3 s"] if quick else list(BACKGROUNDS)
-    share = 0.02 if quick else 1.0
+    share = 0.01 if quick else 1.0
     answer: dict[str, Any] = {
         "false_alarms": study.trials.collect(alarms, [(name, share) for name in names]),
-        "controls": once(controls, 20 if quick else 400),
+        "controls": once(controls, 10 if quick else 400),
         "border": once(border, 0 if quick else 400),
-        "detection": once(detection, 3 if quick else 200, SHORT if quick else LONG),
+        "detection": once(detection, 2 if quick else 200, SHORT if quick else LONG),
         "beside": once(beside, 2 if quick else 100),
         "satellites": once(satellites, 3 if quick else 400),
-        "strokes": once(strokes, 2 if quick else 60),
+        "strokes": once(strokes, 1 if quick else 60),
         "simulated_strokes": [] if quick else once(simulated_strokes),
         "modes": once(modes, *((1, QUICK_CROSSINGS, QUICK_PLACES) if quick else (8,))),
     }
