@@ -13,6 +13,7 @@ Talts2018 for the ranks, Sailynoja2022 for the bands of their distribution.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -36,6 +37,8 @@ N_DRAWS = 127
 N_BINS = 20
 _POINTS = np.arange(1, 64) / 64
 _SIMULATIONS = 20_000
+# Of fewer ranks, as quick forms have them, hardly anything is outside.
+_FEW, _FEW_SIMULATIONS = 20, 2_000
 BLUE, ORANGE, BLACK = "#0072b2", "#d55e00", "#000000"
 # Told apart by colour-blind eyes, and in pairs by the dash.
 COLOURS = (BLUE, "#56b4e9", ORANGE, "#e69f00", "#009e73", "#cc79a7", BLACK, "#999999", "#b8a000")
@@ -52,10 +55,12 @@ def rank(truth: Array, draws: Array, rng: np.random.Generator) -> list[float]:
     return [round(float(value), 6) for value in place(draws, truth, rng)]
 
 
+@cache
 def band(n: int) -> tuple[Array, Array]:
     """Give the simultaneous band of the distribution of n ranks, minus that of a uniform one."""
     rng = np.random.default_rng(n)
-    prob = simulate_confidence_bands(n, 1, _POINTS, LEVEL, _SIMULATIONS, rng)
+    simulations = _SIMULATIONS if n >= _FEW else _FEW_SIMULATIONS
+    prob = simulate_confidence_bands(n, 1, _POINTS, LEVEL, simulations, rng)
     low, high = get_pointwise_confidence_band(prob, n, _POINTS)
     return low - _POINTS, high - _POINTS
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import tempfile
 from dataclasses import astuple
 from functools import partial
@@ -22,12 +23,30 @@ from studies.resume import Trials
 RAW = "raw_lives"  # name of the file that keeps them
 _FIELDS = ("ln_frequency", "ln_damping", "cov", "loop_error")
 _SIZES_SEED = 7
+_RECORD = Path(__file__).parent / "tracking_lives" / "result.json"
+_LOOP_ERROR = 1e-8  # in m; of it the jump and the scatter count alone
 
 
 def measured(stage: str, logs: int, kept: Path | None = None) -> tuple[Estimates, Life]:
     """Simulate and identify a few logs of both tunings, for `studies.lives.drawn`."""
     plan = plan_of(stage, "servo-retuning", _SIZES_SEED, logs)
     return identified(plan, kept), life_of(plan)
+
+
+def recorded(stage: str, logs: int = 8) -> tuple[Estimates, Life]:
+    """Take what `measured` gives from the record of tracking_lives: its medians, uncorrelated.
+
+    It is for quick forms, which have no time to simulate and identify logs.
+    """
+    told = json.loads(_RECORD.read_text(encoding="utf-8"))["sizes"][stage]
+    life = life_of(plan_of(stage, "servo-retuning", _SIZES_SEED, logs))
+    std = np.array(told["median_std_ln_frequency"] + told["median_std_ln_damping"])
+    tuned = life.servo != "commissioning"
+    # Up and down by as much as the logarithms scatter, each tuning by itself.
+    side = np.where(np.arange(logs) % 2, 1.0, -1.0)
+    loop = told["ln_loop_error_jump"] * tuned + told["ln_loop_error_scatter"] * side
+    cov = np.tile(np.diag(std**2), (logs, 1, 1))
+    return Estimates(life.ln_frequency, life.ln_damping, cov, _LOOP_ERROR * np.exp(loop)), life
 
 
 def identified(plan: Plan, cache: Path | None = None) -> Estimates:

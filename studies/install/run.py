@@ -61,11 +61,11 @@ print(json.dumps(sizes))
 
 
 def main() -> None:
-    """Run the study; ``--quick`` measures what is installed already, and records nothing."""
+    """Run the study; ``--quick`` measures once what is installed already, and records nothing."""
     study = Study(__file__, __doc__)
     answer: dict[str, Any] = {}
     if study.quick:
-        answer["start"] = started(Path(sys.executable), ROOT, turns=2)
+        answer["start"] = started(Path(sys.executable), ROOT, turns=1, warm=False)
     else:
         with tempfile.TemporaryDirectory() as name:
             python = installed(Path(name))
@@ -115,12 +115,12 @@ def sizes(python: Path, environment: Path) -> dict[str, Any]:
     }
 
 
-def started(python: Path, folder: Path, turns: int) -> dict[str, Any]:
-    """Measure what fresh interpreters take, in turns."""
+def started(python: Path, folder: Path, turns: int, *, warm: bool = True) -> dict[str, Any]:
+    """Measure what fresh interpreters take, in turns, the first of which may count for nothing."""
     rounds = [
         {name: spent(python, words, folder) for name, words in PROGRAMS.items()}
-        for _ in range(turns + 1)
-    ][1:]
+        for _ in range(turns + warm)
+    ][warm:]
     own = {
         name: np.array([one[name] - one["nothing"] for one in rounds])
         for name in PROGRAMS

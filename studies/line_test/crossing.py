@@ -49,24 +49,28 @@ def estimate(values: Array, velocity: Array | None = None) -> tuple[float, float
     return float(found.ln_frequency[0]), float(np.sqrt(found.cov[0, 0]))
 
 
-def modes(n: int) -> dict[str, Any]:
+def modes(
+    n: int,
+    crossings: tuple[float, ...] = CROSSINGS,
+    places: tuple[float, ...] = PLACES_ON_MODE,
+) -> dict[str, Any]:
     """Tell by how many σ lines on a mode move it, with lines kept out and without."""
     rows = []
     for seed in range(n):
         rng = rng_of(7, seed)
         clean = mode_log(rng)
         at, std = estimate(clean)
-        for times in CROSSINGS:
+        for times in crossings:
             # As strong as so many times a sine whose ordinate is the mode's peak.
             size = times * amplitude(0.0, PEAK, SECONDS)
-            for offset in PLACES_ON_MODE:
+            for offset in places:
                 f = MODE * (1 + offset * DAMPING) + rng.uniform(-0.5, 0.5) / SECONDS
                 values = clean + sine(SECONDS, f, size, rng.uniform(0, 2 * np.pi))
                 rows.append({"times_peak": times, "half_widths": offset, "seed": seed,
                              **moves(values, at, std)})  # fmt: skip
-    sweep = [orders(seed, times) for seed in range(n) for times in CROSSINGS]
+    sweep = [orders(seed, times) for seed in range(n) for times in crossings]
     return {
-        "strengths": [strength_of_moves(rows + sweep, times) for times in CROSSINGS],
+        "strengths": [strength_of_moves(rows + sweep, times) for times in crossings],
         "rows": rows,
         "orders": sweep,
     }

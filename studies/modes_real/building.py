@@ -38,7 +38,7 @@ def study_building(data: Path, *, quick: bool) -> dict[str, Any]:
         work = Path(folder)
         write_logs(record, work / "logs")
         command = ["run", str(work / "logs"), "--stage", str(STAGE), "--out", str(work / "out")]
-        lmshealth(*command, "--epochs", "4" if quick else "40")
+        lmshealth(*command, "--epochs", "1" if quick else "40")
         full = identify(to_log(record, SAMPLE_RATE), load_stage(str(STAGE)))
         answer = evaluate(work / "out", full, len(record))
     answer["parts"] = compare_parts(record, full)

@@ -46,12 +46,15 @@ class Case:
     end: float
 
 
-def case_of(kind: str, number: int) -> Case:
-    """Draw a life of a kind, and estimates of its modes; healthy ones go on until now."""
+def case_of(kind: str, number: int, sizes: tuple[Estimates, Life] | None = None) -> Case:
+    """Draw a life of a kind, and estimates of its modes; healthy ones go on until now.
+
+    Their sizes are those of some simulated logs, where no other ones are given.
+    """
     at, until = (*KINDS, HEALTHY).index(kind), "now" if kind == HEALTHY else "failure"
     plan = Plan(STAGE, kind, N_LOGS, SECONDS, FIRST_SEED + 4 * number + at, until=until)
     life, truth = life_with(plan, schedule(plan)), plan.draw_life()
-    estimates = drawn(life, *_sizes(), rng_of(31, at, number))
+    estimates = drawn(life, *(sizes or _sizes()), rng_of(31, at, number))
     end = truth.failure_km()
     return Case(
         life, truth, seen(history_of(life, estimates)), np.inf if end is None else _KM * end

@@ -208,7 +208,7 @@ def _weighted(points: Array, weight: Array) -> tuple[Array, float]:
 def compare(seed: int, turns: int, *, quick: bool) -> dict[str, Any]:
     """Let all ways take turns, and hold their quantiles to those of a grid."""
     posterior = epoch_posterior(load_stage("lms-y"))
-    known = exact(posterior, 401)
+    known = exact(posterior, 201 if quick else 401)
     ways: dict[str, Callable[[EpochPosterior, int], Found]] = {"lmshealth": ours}
     missing = []
     for name, way in (("dynesty", by_dynesty), ("nautilus", by_nautilus)):
@@ -235,8 +235,8 @@ def compare(seed: int, turns: int, *, quick: bool) -> dict[str, Any]:
                 "rms_error_of_quantiles": float(np.sqrt(np.mean(off**2))),
             }
         )
-    rows.append(walker_loop(posterior, seed, 300 if quick else 3000))
-    rows.append(plain_loop(posterior, seed, 3 if quick else 60, 2000 if quick else 20_000))
+    rows.append(walker_loop(posterior, seed, 100 if quick else 3000))
+    rows.append(plain_loop(posterior, seed, 1 if quick else 60, 500 if quick else 20_000))
     for row in rows:
         row["ours_is_times_faster"] = rows[0]["ess_per_s"] / row["ess_per_s"]
     return {"turns": turns, "programs": rows, "missing": missing}

@@ -67,7 +67,9 @@ DRIFTS, HALVED, EXACT = (
 LIVES = {
     ONE: 4000, SHARED: 1000, X: 1000, CHAINS: 200, DRIFTS: 1000, HALVED: 1000, EXACT: 1000,
 }  # fmt: skip
-QUICK = {ONE: 100, SHARED: 20, X: 20, CHAINS: 3, HALVED: 250, EXACT: 50}
+QUICK = {ONE: 8, SHARED: 2, X: 2, EXACT: 8}
+# Lives that tell a control from what it controls.
+ENOUGH = 250
 # Points of the prior to begin from, and weighted ones of the posterior.
 N_PRIOR, N_POINTS = 500, 2000
 # Share of the map's true error that is believed.
@@ -77,7 +79,7 @@ MODEL, SAMPLER = ("epoch", "importance", "modalmap", "priors", "stage"), ("lapla
 
 
 def main() -> None:
-    """Run the study; ``--quick`` does a small part and records nothing."""
+    """Run the study; ``--quick`` does a few lives without chains and records nothing."""
     study = Study(__file__, __doc__)
     plan = QUICK if study.quick else LIVES
     tasks = [(kind, life) for kind, n in plan.items() for life in range(n)]
@@ -162,12 +164,15 @@ def judged(rows: list[Row]) -> dict[str, Any]:
 
 def verdicts(found: dict[str, dict[str, Row]]) -> dict[str, bool]:
     """Say what was asked and whether it is so."""
+    first = machine(ONE).parameters[0].name
     checks = {f"ranks are uniform: {kind}": uniform(found[kind]) for kind in (ONE, SHARED, X)}
-    checks[f"ranks are uniform: {CHAINS}"] = uniform(found[CHAINS])
+    if CHAINS in found:
+        checks[f"ranks are uniform: {CHAINS}"] = uniform(found[CHAINS])
     for kind in (HALVED, EXACT):
-        checks[f"they are not: {kind}"] = not any(
-            row["inside_band"] for row in found[kind].values()
-        )
+        if kind in found and found[kind][first]["n"] >= ENOUGH:  # fewer tell little
+            checks[f"they are not: {kind}"] = not any(
+                row["inside_band"] for row in found[kind].values()
+            )
     return checks
 
 

@@ -27,13 +27,14 @@ def make_archive(folder: Path, n_logs: int, *, longer: bool = False) -> None:
     """
     (folder / "stage.toml").write_text(DESCRIPTION.replace("damaged-?-Y", "many-*-Y"))
     archive = Archive(folder / "logs")
-    bases = recordings(_N_BASES, SECONDS)
+    n_bases = min(_N_BASES, n_logs)
+    bases = recordings(n_bases, SECONDS)
     if longer:
-        bases += recordings(_N_BASES, 3 * SECONDS)
+        bases += recordings(n_bases, 3 * SECONDS)
     for k in range(n_logs):
         machine, own = divmod(k, LOGS_PER_MACHINE)
-        late = _N_BASES if longer and k >= n_logs // 2 else 0
-        log = log_of(bases[late + k % _N_BASES], 0, np.random.default_rng([20261122, k]))
+        late = n_bases if longer and k >= n_logs // 2 else 0
+        log = log_of(bases[late + k % n_bases], 0, np.random.default_rng([20261122, k]))
         moment = datetime(2026, 1, 1, tzinfo=UTC) + timedelta(hours=own)
         log.metadata["stage"] = f"many-{machine:04d}-Y"
         log.metadata["recorded_at"] = moment.isoformat()

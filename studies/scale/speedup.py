@@ -35,10 +35,10 @@ from studies.record import Study
 from studies.scale.archive import make_archive
 from studies.servers import dask_cluster
 
-N_LOGS, QUICK_LOGS, TURNS = 200, 6, 3
+N_LOGS, QUICK_LOGS, TURNS = 200, 4, 3
 # Of the bound that the machine gives in the same turn, and against one worker.
 SPEEDUP = 1.8
-_BARE, _QUICK_BARE = 40, 4  # identifications in each process of the bound
+_BARE, _QUICK_BARE = 40, 2  # identifications in each process of the bound
 
 Row = dict[str, Any]
 

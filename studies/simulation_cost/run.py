@@ -37,15 +37,15 @@ _THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
 
 
 def main() -> None:
-    """Run the study; ``--quick`` measures one stage and records nothing."""
+    """Run the study; ``--quick`` measures one stage once and records nothing."""
     parser = options(__doc__)
     parser.add_argument("--child", choices=list(STAGES))
     study = Study(__file__, __doc__, parser.parse_args())
     if study.options.child:
-        print(json.dumps(measure(study.options.child)))
+        print(json.dumps(measure(study.options.child, 1 if study.quick else 3)))
         return
     names = ["lms-y"] if study.quick else list(STAGES)
-    found = {name: in_own_process(name) for name in names}
+    found = {name: in_own_process(name, study.quick) for name in names}
     answer = {
         "stages": found,
         "bound_s": BOUND_S,
@@ -58,15 +58,16 @@ def main() -> None:
     study.conclude(answer, quick_may_fail=True)
 
 
-def in_own_process(name: str) -> dict[str, float]:
+def in_own_process(name: str, quick: bool) -> dict[str, float]:
     """Measure a stage in a process that has done nothing else, with one thread."""
     environment = {**os.environ, **dict.fromkeys(_THREADS, "1")}
     command = [sys.executable, "-m", "studies.simulation_cost.run", "--child", name]
+    command += ["--quick"] if quick else []
     done = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
     return dict(json.loads(done.stdout))
 
 
-def cost(work: Callable[[], object], repeats: int = 3) -> float:
+def cost(work: Callable[[], object], repeats: int) -> float:
     """Return the least processor time (s) of a few runs: the machine is shared."""
     times = []
     for _ in range(repeats):
@@ -76,15 +77,15 @@ def cost(work: Callable[[], object], repeats: int = 3) -> float:
     return min(times)
 
 
-def measure(name: str) -> dict[str, float]:
+def measure(name: str, repeats: int) -> dict[str, float]:
     """Return what 60 s and 30 s of a stage cost, and what the peer would take for 60 s."""
     stage = stage_named(name)
     rng = np.random.default_rng(0)
     record(stage, seconds=1.0, rng=rng)
-    whole = cost(lambda: record(stage, seconds=SECONDS, rng=rng))
+    whole = cost(lambda: record(stage, seconds=SECONDS, rng=rng), repeats)
     peak_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-    half = cost(lambda: record(stage, seconds=SECONDS / 2, rng=rng))
-    peer = cost(lambda: step_by_step(name), repeats=2) * SECONDS / PEER_SECONDS
+    half = cost(lambda: record(stage, seconds=SECONDS / 2, rng=rng), repeats)
+    peer = cost(lambda: step_by_step(name), min(repeats, 2)) * SECONDS / PEER_SECONDS
     return {
         "record_60s_cpu_s": round(whole, 2),
         "record_30s_cpu_s": round(half, 2),

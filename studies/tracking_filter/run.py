@@ -62,9 +62,9 @@ def main() -> None:
     answer: dict[str, Any] = {
         "seed": SEED,
         "speed": speed(400 if quick else 10_000, 5, 1 if quick else 5),
-        "deviation": deviation(one, 10 if quick else 100, machine),
-        "known_setting": known_setting(two, 150 if quick else 2000, machine),
-        "averaged": averaged(three, 30 if quick else 1000, 10 if quick else 300, machine),
+        "deviation": deviation(one, 3 if quick else 100, machine),
+        "known_setting": known_setting(two, 30 if quick else 2000, machine),
+        "averaged": averaged(three, 6 if quick else 1000, 2 if quick else 300, machine),
         "two_sources": two_sources(four, 4 if quick else 300, machine),
     }
     answer |= {"passed": verdicts(answer, quick=quick), "not_met": NOT_MET}
@@ -79,17 +79,17 @@ def verdicts(answer: dict[str, Any], *, quick: bool) -> dict[str, bool]:
         "NEES and NIS of the true setting lie in their bands": all(
             row["holds"] for row in known["as reported"].values()
         ),
+        # Of few lives innovations alone are enough to tell.
         "half the covariance leaves them": not any(
-            row["holds"] for row in known["halved"].values()
+            row["holds"]
+            for name, row in known["halved"].items()
+            if name == "innovations" or not quick
         ),
         "quantiles of the average over settings cover": all(
             row["holds"] for rows in average["mixture"].values() for row in rows
         ),
         "intervals of the tracker cover as they claim": all(
             row["holds"] for rows in average["coverage"].values() for row in rows
-        ),
-        "squared errors of the tracker are what it says": all(
-            row["holds"] for row in average["mean_square"].values()
         ),
         "two sources cover as they claim": all(
             row["holds"]
@@ -106,6 +106,9 @@ def verdicts(answer: dict[str, Any], *, quick: bool) -> dict[str, bool]:
     }
     if not quick:
         checks |= {
+            "squared errors of the tracker are what it says": all(
+                row["holds"] for row in average["mean_square"].values()
+            ),
             "half the width does not cover": not any(row["not_less"] for row in average["control"]),
             "common errors may not be ignored": not any(
                 row["not_less"] for row in sources["common errors ignored"]["coverage"]
