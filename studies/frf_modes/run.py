@@ -99,7 +99,7 @@ SWEEPS = {
 
 
 def main() -> None:
-    """Run the study; ``--quick`` does two seeds, leaves sweeps and jackknife out, records nothing."""
+    """Run the study; ``--quick`` does two seeds, no sweeps, no jackknife, records nothing."""
     parser = options(__doc__)
     parser.add_argument("--seeds", type=int, default=400)
     study = Study(__file__, __doc__, parser.parse_args())
