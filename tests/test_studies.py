@@ -160,7 +160,7 @@ def test_identification_speed(root: Path) -> None:
 
 
 def test_decays(root: Path) -> None:
-    """Intervals of f and ζ from some decays cover, those of white noise less; modes are not mixed."""
+    """Intervals of f and ζ from some decays cover, those of white noise less."""
     answer = json.loads(run_study(root, "decays"))
     assert all(answer["passed"].values())
     assert answer["machines"]["n_modes"] > sum(answer["machines"]["refused"].values())
