@@ -59,6 +59,7 @@ NOMINAL = 0.95
 # Factors on the intervals: the second and third are negative controls.
 WIDTHS = {"coverage": 1.0, "wide": 1.5, "narrow": 1 / 1.5}
 SEEDS, QUIET_SEEDS, MACHINES = 400, 100, 10
+STAGES = ("lms-x", "lms-y")
 QUICK_SEEDS = 10
 # What does not hold, and why.
 NOT_MET = {
@@ -80,7 +81,7 @@ def main() -> None:
         "quiet": {
             case.name: run_case(case, QUIET_SEEDS, trials) for case in (() if quick else QUIET)
         },
-        "machines": judge_machines(*((1, ("lms-x",)) if quick else (MACHINES, ("lms-x", "lms-y")))),
+        "machines": judge_machines(1, STAGES[:1]) if quick else judge_machines(MACHINES, STAGES),
         "beam": [
             row
             for repeat in range(REPEATS if data and not quick else 0)
