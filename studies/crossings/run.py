@@ -48,9 +48,9 @@ EXAMPLES = ("crossing, named by order", "veering, with shapes", "merging")
 
 
 def main() -> None:
-    """Run the study; ``--quick`` follows three lives of each kind and records nothing."""
+    """Run the study; ``--quick`` follows two lives of each kind and records nothing."""
     study = Study(__file__, __doc__)
-    n = 3 if study.quick else N_LIVES
+    n = 2 if study.quick else N_LIVES
     found = study.trials.collect(of_kind, [(name, n) for name in KINDS])
     answer: dict[str, Any] = {
         "lives": n,

@@ -65,7 +65,7 @@ Row = dict[str, Any]
 def main() -> None:
     """Run the study; ``--quick`` checks less and records nothing."""
     study = Study(__file__, __doc__)
-    asked = (40, (10.0,), 4) if study.quick else (300, RAW_DURATIONS, RAW_LOGS)
+    asked = (2, (10.0,), 2) if study.quick else (300, RAW_DURATIONS, RAW_LOGS)
     study.conclude(answered(study.trials, *asked), quick_may_fail=True)
 
 

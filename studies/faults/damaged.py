@@ -37,13 +37,22 @@ import numpy as np
 import pandas as pd
 
 from studies.faults.damage import KINDS
-from studies.faults.logfiles import DESCRIPTION, SUFFIXES, Archive, log_of, recordings, write
+from studies.faults.logfiles import (
+    DESCRIPTION,
+    MACHINES,
+    SUFFIXES,
+    Archive,
+    log_of,
+    recordings,
+    write,
+)
 from studies.record import Study
 
-N_GOOD, N_GOOD_QUICK, N_BASES = 1000, 60, 4
+N_GOOD, N_GOOD_QUICK, N_BASES = 1000, 8, 4
 _SEED = 20261122
-# Of the quick form: every so many of the kinds, each in one format, without those that swell.
-_EVERY = 3
+# Of the quick form: every so many of the kinds, each in one format, without those that swell, and
+# so many machines.
+_EVERY, _FEW = 4, 2
 _GOOD = "good"
 
 
@@ -109,7 +118,8 @@ def make_archive(folder: Path, quick: bool) -> list[Expected]:
     expected = []
     for k in range(n):
         rng = np.random.default_rng([_SEED, k])
-        log = log_of(bases[k % len(bases)], k, rng)
+        number = len(MACHINES) * (k // _FEW) + k % _FEW if quick else k
+        log = log_of(bases[k % len(bases)], number, rng)
         kind, suffix = damaged.get(k, (None, SUFFIXES[k % len(SUFFIXES)]))
         path = archive.folder / f"log-{k:04d}{suffix}"
         if kind is None:

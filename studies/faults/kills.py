@@ -163,7 +163,7 @@ def run_killed(
 ) -> bool:
     """Start a run and kill it when the time comes; say whether it came to its end all the same."""
     how = ""
-    with running(reference.batch.command(out, store, "--workers", "2")) as run:
+    with running(reference.batch.command(out, store)) as run:
         while len(kills.done) < kills.n:
             wait_s, wish = kills.next(reference.seconds)
             if run.status(wait_s) is not None:

@@ -56,7 +56,7 @@ def main() -> None:
         folder = Path(name)
         batch = make_batch(folder, *((QUICK_MACHINES, 1) if quick else (MACHINES, 2)))
         reference = reference_of(batch, folder / "reference")
-        with dask_cluster() as cluster:
+        with dask_cluster(1 if quick else 2) as cluster:
             pace = (QUICK_KILLS, QUICK_PER_RUN) if quick else (N_KILLS, KILLS_PER_RUN)
             killed = once(partial(workers_killed, reference, cluster), *pace, also=PROGRAM)
         answer: Row = {

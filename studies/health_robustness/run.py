@@ -125,31 +125,38 @@ def main() -> None:
 
 
 # How many lives: of each kind, of these by laws in Y and in X; on paths, by laws, by laws in X, by
-# laws with maps of so many wrong plants, and compared with chains; logs that sizes are from.
+# laws with maps of so many wrong plants, and compared with chains; logs that sizes are from and
+# their length in s; of how many stages, and every how many-th kind.
 FULL = {"kind": 20, "kind_law": 5, "kind_other": 1, "path": 100, "law": 60, "other": 10,
-        "plants": 10, "maps": 4, "chains": 2, "sized": 12}  # fmt: skip
-QUICK = {"kind": 1, "kind_law": 1, "kind_other": 0, "path": 12, "law": 1, "other": 1,
-         "plants": 1, "maps": 1, "chains": 1, "sized": 8}  # fmt: skip
+        "demo": 50, "plant_path": 100, "plants": 10, "maps": 4, "chains": 2, "sized": 12,
+        "seconds": 20, "stages": 2, "every_kind": 1}  # fmt: skip
+QUICK = {"kind": 1, "kind_law": 1, "kind_other": 0, "path": 8, "law": 1, "other": 0,
+         "demo": 1, "plant_path": 1, "plants": 0, "maps": 1, "chains": 1, "sized": 6,
+         "seconds": 10, "stages": 1, "every_kind": 5}  # fmt: skip
 
 
 def drawn_lives(trials: Trials, n: dict[str, int], kept: Path | None) -> Row:
     """Draw all fleets and judge them."""
-    sizes = {stage: measured(stage, n["sized"], kept) for stage in STAGES}
+    stages = STAGES[: n["stages"]]
+    sizes = {
+        stage: measured(stage, n["sized"], kept, seconds=float(n["seconds"])) for stage in stages
+    }
     n_law = dict(zip(STAGES, (n["kind_law"], n["kind_other"]), strict=True))
     laws = dict(zip(STAGES, (n["law"], n["other"]), strict=True))
     once, each = partial(trials.once, also=SIZES), partial(trials.collect, also=SIZES)
-    kinds = [(stage, kind, n["kind"], n_law[stage]) for stage in STAGES for kind in KINDS]
-    worlds = [(stage, world, n["path"], laws[stage]) for stage in STAGES for world in ARMS]
+    kinds = [(stage, kind, n["kind"], n_law[stage]) for stage in stages
+             for kind in KINDS[:: -n["every_kind"]][::-1]]  # fmt: skip
+    worlds = [(stage, world, n["path"], laws[stage]) for stage in stages for world in ARMS]
     parts = {
         "lives": each(partial(lives_of, sizes), kinds),
         "fleets": each(partial(fleet_of, sizes), worlds),
-        "plants": [once(partial(plants_of, sizes), n["path"], n["plants"], n["maps"])],
+        "plants": [once(partial(plants_of, sizes), n["plant_path"], n["plants"], n["maps"])],
     }
     answer: Row = {
         name: [row for part in found for row in part["rows"]] for name, found in parts.items()
     }
     answer |= {
-        "demo": once(partial(demo, sizes=sizes), n["path"] // 2),
+        "demo": once(partial(demo, sizes=sizes), n["demo"]),
         "chains": once(partial(chains, sizes=sizes), n["chains"]),
         "not_drawn": [line for found in parts.values() for part in found for line in part["lost"]],
     }
