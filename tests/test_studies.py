@@ -358,8 +358,7 @@ def test_rul_metrics(root: Path) -> None:
 def test_fleet_prior(root: Path) -> None:
     """What a fleet teaches is nearer to what can be known; what another fleet teaches is not."""
     answer = json.loads(run_study(root, "fleet_prior"))
-    # One life is too few for coverages.
-    assert {found["lives"] for found in answer["ways"].values()} == {1}
+    assert all(answer["passed"].values())
     lost = {way: found["lost_km"][0] for way, found in answer["ways"].items()}
     assert lost["known"] == 0
     assert lost["learned"] < lost["description"]

@@ -56,11 +56,11 @@ from studies.record import LEVEL, Study, as_row
 
 Array = NDArray[np.float64]
 SEED = 20261122
-FLEETS, QUICK = 40, 1
+FLEETS, QUICK = 40, 2
 # How many machines of a fleet teach, by its kind, and how many learn.
 FLEET, SMALL = "fleet", "small fleet"
-N_TEACHERS = {FLEET: 16, SMALL: 6}
-N_YOUNG, MOST_DRAWN = {FLEET: 4, SMALL: 1}, 12
+N_TEACHERS = {FLEET: 16, SMALL: 8}
+N_YOUNG, MOST_DRAWN = 4, 12
 # Fleets that are taught by another one too.
 FOREIGN_FLEETS, TIMES = 20, 5.0
 ENOUGH = 5  # fleets, of which a mean has a standard error
@@ -74,7 +74,7 @@ _MODEL = ("courses", "density", "fleet", "importance", "laws", "life", "lifefit"
 
 
 def main() -> None:
-    """Run the study; ``--quick`` does one small fleet and records nothing."""
+    """Run the study; ``--quick`` does a small part and records nothing."""
     study = Study(__file__, __doc__)
     kind, n = (SMALL, QUICK) if study.quick else (FLEET, FLEETS)
     rows = study.trials.collect(one, [(kind, number) for number in range(n)])
@@ -122,7 +122,7 @@ def one(kind: str, number: int) -> Row:
         lesson = lesson_of(described(), own)
         if is_young(lesson):
             row["young"].append(pupil(drawn, own, lesson, fleet, schools, number))
-        if len(row["young"]) == N_YOUNG[kind]:
+        if len(row["young"]) == N_YOUNG:
             break
     return row
 
