@@ -1,10 +1,10 @@
 """Mutants of a module: its source with one small change, by the operators of mutmut.
 
 Not made is what changes nothing that a module computes: in type annotations, decorators, imports,
-docstrings and ``__all__``; in errors, assertions, warnings, logging, and strings that are text (they
-have a space, are formatted, or stand in triple quotes); aliases of types; the first argument of
-``cast``; ``strict`` of ``zip``, which asks for what holds. Nor is a change that leaves the syntax
-tree as it was. Whether another mutant computes the same cannot be told by rule: it is made.
+docstrings and ``__all__``; in errors, assertions, warnings, logging, and strings that are text
+(they have a space, are formatted, or have triple quotes); in aliases of types and ``cast``; in
+``strict`` of ``zip``, which asks for what holds. Nor is a change that leaves the syntax tree as it
+was. Whether another mutant computes the same cannot be told by rule: it is made.
 """
 
 from __future__ import annotations

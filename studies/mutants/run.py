@@ -134,7 +134,9 @@ def tried(
         seconds = sum(tests[name]["seconds"] for name in names)
         plan = json.dumps({"tests": names, "limit_s": 20 + 2 * round(seconds)})
         files = sorted({name.partition("::")[0] for name in names})
-        digest = digest_of(shared, "\n".join(names), *((ROOT / file).read_bytes() for file in files))
+        digest = digest_of(
+            shared, "\n".join(names), *((ROOT / file).read_bytes() for file in files)
+        )
         (plans / f"{digest}.json").write_text(plan, encoding="utf-8")
         changes = [str(index)]
         if names and module not in controlled:

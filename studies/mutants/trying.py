@@ -12,7 +12,7 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -143,20 +143,22 @@ def _run(tree: Path, words: Iterable[str], limit_s: float) -> Outcome:
     """Run pytest in a tree."""
     watch = tree / "watch.jsonl"
     watch.touch()
-    alone = {"PYTHONPATH": str(tree), "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
+    alone = {"PYTHONPATH": str(tree), "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1",
+             WATCH: str(watch)}  # fmt: skip
+    # A coverage that is measured of this study is another one.
+    around = {name: value for name, value in os.environ.items() if not name.startswith("COV")}
     command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "-p",
                "studies.mutants.watching", *words]  # fmt: skip
     before = _spent()
     with subprocess.Popen(
-        command, cwd=tree, env=os.environ | alone | {WATCH: str(watch)}, start_new_session=True,
+        command, cwd=tree, env=around | alone, start_new_session=True,
         stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
         preexec_fn=partial(_limit, limit_s),
     ) as program:  # fmt: skip
         try:
             # Who waits for ever uses no processor.
-            program.wait(60 + 10 * limit_s)
-        except subprocess.TimeoutExpired:
-            pass
+            with suppress(subprocess.TimeoutExpired):
+                program.wait(60 + 10 * limit_s)
         finally:
             _end(program.pid)
     rows = [json.loads(line) for line in watch.read_text(encoding="utf-8").splitlines()]
@@ -172,10 +174,8 @@ def _limit(seconds: float) -> None:
 
 def _end(group: int) -> None:
     """End all that a run of tests has started and left."""
-    try:
+    with suppress(ProcessLookupError):
         os.killpg(group, signal.SIGKILL)
-    except ProcessLookupError:
-        pass
 
 
 def _spent() -> float:
