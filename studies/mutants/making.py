@@ -24,7 +24,6 @@ _TOLD = (cst.Annotation, cst.Decorator, cst.Import, cst.ImportFrom, cst.Raise, c
 _TELLS = re.compile(r"\w*(Error|Warning|TypeVar|NewType|cast)")
 _LOGGERS = re.compile(r"_?(log|logger|logging|warnings)", re.IGNORECASE)
 _ASKS = ("strict", "stacklevel")
-_FUNCTIONS = (ast.FunctionDef, ast.AsyncFunctionDef, ast.Lambda)
 
 
 @dataclass(frozen=True, slots=True)
@@ -149,8 +148,10 @@ def planted(source: str, line: int) -> str:
     future = [k for k, node in enumerate(body) if isinstance(node, ast.ImportFrom)
               and node.module == "__future__"]  # fmt: skip
     after = body[future[0] + 1 if future else min(int(documented), len(body) - 1)]
+    decorators = getattr(after, "decorator_list", [])
+    first = min(node.lineno for node in (after, *decorators))
     lines = source.splitlines()
-    lines.insert(after.lineno - 1, " " * after.col_offset + 'raise RuntimeError("planted")')
+    lines.insert(first - 1, " " * after.col_offset + 'raise RuntimeError("planted")')
     return "\n".join(lines) + "\n"
 
 

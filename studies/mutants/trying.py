@@ -68,7 +68,8 @@ def collect(file: str, digest: str, *, modules: tuple[str, ...]) -> dict[str, An
     del digest
     with _copy() as tree:
         (tree / "coverage.ini").write_text(
-            "[run]\ninclude =\n" + "".join(f"    lmshealth/{name}.py\n" for name in modules)
+            "[run]\ndisable_warnings = no-data-collected\ninclude =\n"
+            + "".join(f"    lmshealth/{name}.py\n" for name in modules)
         )
         words = (file, "-m", "not statistical", "--cov", "--cov-config=coverage.ini",
                  "--cov-context=test", "--cov-report=")  # fmt: skip
