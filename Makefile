@@ -4,7 +4,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 DEMO := demo
 
-.PHONY: demo picture test slow statistics bench check clean
+.PHONY: demo picture test slow coverage statistics bench check clean
 
 demo: .venv/installed
 	@rm -rf $(DEMO)
@@ -19,14 +19,19 @@ picture: .venv/installed
 	$(BIN)/python -m studies.demo_life.picture $(DEMO)/result
 
 # Tests run side by side: threads inside linear algebra would only get in their way.
-test slow statistics bench: export OPENBLAS_NUM_THREADS = 1
-test slow statistics bench: export OMP_NUM_THREADS = 1
+test slow coverage statistics bench: export OPENBLAS_NUM_THREADS = 1
+test slow coverage statistics bench: export OMP_NUM_THREADS = 1
 test: .venv/installed check
 	$(BIN)/pytest -n 2 -m "not slow and not statistical"
 
 # Tests that take seconds each: whole files, servers, browsers, chains.
 slow: .venv/installed
 	$(BIN)/pytest -n 2 --dist worksteal -m "slow and not statistical"
+
+# Which lines of the package does no test run? Fails below 95 %. What studies run does not count.
+coverage: .venv/installed
+	$(BIN)/pytest -n 2 -m "not statistical" --ignore=tests/test_studies.py \
+		--cov=lmshealth --cov-fail-under=95
 
 # Is what is said of errors and intervals true? LMSHEALTH_SEED=7 draws all anew.
 statistics: .venv/installed
@@ -48,4 +53,4 @@ check: .venv/installed
 	@touch $@
 
 clean:
-	rm -rf .venv $(DEMO) build *.egg-info .pytest_cache .mypy_cache .ruff_cache
+	rm -rf .venv $(DEMO) build .coverage .coverage.* *.egg-info .pytest_cache .mypy_cache .ruff_cache

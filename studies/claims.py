@@ -29,6 +29,7 @@ STEPS = (
     "plan",
     "batch",
     "simulated plants",
+    "the tests themselves",
 )
 
 

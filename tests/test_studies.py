@@ -455,3 +455,11 @@ def test_install(root: Path) -> None:
     answer = json.loads(run_study(root, "install"))
     assert all(answer["passed"].values())
     assert answer["start"]["times_bare"]["all names"] > 1
+
+
+def test_mutants(root: Path) -> None:
+    """Two small changes of a module are tried, which passes as it is and fails where it must."""
+    answer = json.loads(run_study(root, "mutants"))
+    assert answer["mutants"]["n"] == 2
+    assert answer["controls"] == {"as it is": {"survived": 1}, "planted": {"killed": 1}}
+    assert answer["that no test runs"] == 0

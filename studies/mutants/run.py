@@ -1,0 +1,234 @@
+"""Would the tests notice if the science were wrong?
+
+Question
+    Which share of small changes of the modules that identify, track, infer and prognose make a
+    test fail, and which do not?
+Method
+    Mutants are made by the operators of mutmut; what changes no result by rule is left out, as
+    `making.py` tells. A sample is drawn by a seed, in proportion to what each module has. Which
+    tests concern a mutant is found out: each file of tests is run once with coverage by test, in
+    a copy of the project and without those that are statistical or run studies. Of a mutant those
+    tests are tried that run its statement: first those of the module's own file of tests, then
+    file by file, the cheapest first; after them the other tests of these files, since a fixture or
+    a kept result may have run it for them; until they had taken 60 s of the processor in the
+    unchanged project. The first that fails ends it. Twice that time and 20 s more is the limit: a
+    mutant that reaches it is one that would be seen, and is told apart. Tests that start programs
+    count as running what they run themselves, so that more mutants may be found than are told.
+    Controls: for every module the unchanged project passes the tests chosen for one of its mutants,
+    in their order, and an error planted in the function of that mutant is found.
+Answer
+    Not recorded yet.
+Run time
+    Some hours on two processors, two thirds of it for mutants that survive.
+"""
+
+from __future__ import annotations
+
+import json
+import tempfile
+from collections import Counter
+from collections.abc import Iterable
+from concurrent.futures import Executor, ProcessPoolExecutor
+from functools import partial
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lmshealth.metrics import clopper_pearson
+from studies.mutants.making import Mutant, Mutants, reach
+from studies.mutants.trying import ROOT, attempt, collect, digest_of
+from studies.record import Study
+
+LINKS = {
+    "identification": (
+        "band", "bandfit", "blocks", "components", "kernel", "layout", "lines", "linetest", "modal",
+        "peaks", "posterior", "segments", "separation", "spectra", "starts", "targets", "tones",
+        "whittle",
+    ),
+    "tracking": (
+        "association", "bank", "events", "filterbank", "hypotheses", "identities", "smoothing",
+        "statespace", "tracking", "tracks",
+    ),
+    "inference": (
+        "bounds", "condense", "density", "epoch", "importance", "inference", "laplace", "life",
+        "lifefit", "modalmap", "priors", "sampling", "sight",
+    ),
+    "prognosis": (
+        "courses", "decision", "laws", "maintenance", "passage", "prognosis", "verdict",
+    ),
+}  # fmt: skip
+SEED, N = 10, 320
+BUDGET_S = 60.0
+ASKED = 0.85
+LEFT_OUT = ("test_studies.py",)
+# The quick form: two mutants of a small module, by its own file of tests.
+QUICK = ("kernel", 2)
+Tests = dict[str, dict[str, Any]]
+
+
+def main() -> None:
+    """Run the study; ``--quick`` tries two mutants of one module."""
+    study = Study(__file__, __doc__)
+    if study.quick:
+        links = {"identification": (QUICK[0],)}
+        files = [f"tests/test_{QUICK[0]}.py"]
+    else:
+        links = LINKS
+        files = test_files()
+    modules = tuple(name for names in links.values() for name in names)
+    drawn = sample(modules, QUICK[1] if study.quick else N)
+    with (
+        tempfile.TemporaryDirectory() as plans,
+        ProcessPoolExecutor(1 if study.quick else 2, mp_context=get_context("spawn")) as pool,
+    ):
+        rows = tried(study, pool, Path(plans), drawn, gathered(study, pool, files, modules))
+    answer = told(rows, links)
+    study.conclude(answer, quick_may_fail=True)
+
+
+def test_files() -> list[str]:
+    """Name the files of tests that may concern a module."""
+    found = (path.relative_to(ROOT) for path in sorted((ROOT / "tests").rglob("test_*.py")))
+    return [path.as_posix() for path in found
+            if path.name not in LEFT_OUT and path.parent.name != "statistical"]  # fmt: skip
+
+
+def sample(modules: Iterable[str], n: int) -> list[tuple[str, int, Mutant]]:
+    """Draw mutants, in proportion to what each module has."""
+    rng = np.random.default_rng(SEED)
+    made = {name: Mutants(_source(name)) for name in modules}
+    sizes = np.array([len(mutants) for mutants in made.values()])
+    exact = n * sizes / sizes.sum()
+    counts = np.floor(exact).astype(int)
+    counts[np.argsort(counts - exact, kind="stable")[: n - counts.sum()]] += 1
+    drawn = []
+    for (name, mutants), count in zip(made.items(), counts, strict=True):
+        candidates = ((k, mutants.make(k)) for k in map(int, rng.permutation(len(mutants))))
+        changes = ((name, k, mutant) for k, mutant in candidates if mutant is not None)
+        drawn += sorted(
+            (next(changes) for _ in range(count)), key=lambda one: (one[2].line, one[1])
+        )
+    return drawn
+
+
+def gathered(study: Study, pool: Executor, files: list[str], modules: tuple[str, ...]) -> Tests:
+    """Run all files of tests on the unchanged project; give what each test runs of the modules."""
+    shared = _project()
+    tasks = [(file, digest_of(shared, (ROOT / file).read_bytes(), *modules)) for file in files]
+    done = study.trials.collect(partial(collect, modules=modules), tasks, pool=pool)
+    for file, found in zip(files, done, strict=True):
+        if found["failed"] or found["code"] not in (0, 5):
+            raise SystemExit(f"{file} fails as it is ({found['code']}): {found['failed']}")
+    return {name: test for found in done for name, test in found["tests"].items()}
+
+
+def tried(
+    study: Study, pool: Executor, plans: Path, drawn: list[tuple[str, int, Mutant]], tests: Tests
+) -> list[dict[str, Any]]:
+    """Try mutants and controls; give a row for each."""
+    shared, tasks, rows, controlled = _project(), [], [], set()
+    for module, index, mutant in drawn:
+        names = chosen(tests, module, reach(_source(module), mutant.line), BUDGET_S)
+        seconds = sum(tests[name]["seconds"] for name in names)
+        plan = json.dumps({"tests": names, "limit_s": 20 + 2 * round(seconds)})
+        files = sorted({name.partition("::")[0] for name in names})
+        digest = digest_of(
+            shared, "\n".join(names), *((ROOT / file).read_bytes() for file in files)
+        )
+        (plans / f"{digest}.json").write_text(plan, encoding="utf-8")
+        changes = [str(index)]
+        if names and module not in controlled:
+            controlled.add(module)
+            changes += ["as it is", f"planted {mutant.line}"]
+        tasks += [(module, change, digest) for change in changes]
+        rows += [{"module": module, "change": change, "line": mutant.line, "kind": mutant.kind,
+                  "old": mutant.old, "new": mutant.new} for change in changes]  # fmt: skip
+    found = study.trials.collect(partial(attempt, plans=plans), tasks, pool=pool)
+    return [row | more for row, more in zip(rows, found, strict=True)]
+
+
+def chosen(tests: Tests, module: str, lines: int, budget_s: float) -> list[str]:
+    """Choose the tests that concern lines of a module, in the order in which they are tried."""
+    own = f"tests/test_{module}.py"
+    files: dict[str, list[str]] = {}
+    for name in tests:
+        files.setdefault(name.partition("::")[0], []).append(name)
+    direct = {
+        file: [name for name in names if lines & int(tests[name]["lines"].get(module, "0"), 16)]
+        for file, names in files.items()
+    }
+    cost = {file: sum(tests[name]["seconds"] for name in names) for file, names in direct.items()}
+    order = sorted(
+        (file for file in files if direct[file]), key=lambda file: (file != own, cost[file], file)
+    )
+    first = [name for file in order for name in direct[file]]
+    rest = [name for file in order for name in files[file] if name not in direct[file]]
+    seconds = np.cumsum([tests[name]["seconds"] for name in (*first, *rest)])
+    return [*first, *rest][: max(int(np.searchsorted(seconds, budget_s, "right")), 1)]
+
+
+def told(rows: list[dict[str, Any]], links: dict[str, tuple[str, ...]]) -> dict[str, Any]:
+    """Count what became of mutants and controls."""
+    mutants = [row for row in rows if row["change"].isdecimal()]
+    controls = {kind: [row for row in rows if row["change"].startswith(kind)]
+                for kind in ("as it is", "planted")}  # fmt: skip
+    link_of = {module: link for link, modules in links.items() for module in modules}
+    found = counts(mutants)
+    kept = ("module", "line", "kind", "old", "new", "tests")
+    return {
+        "seed": SEED,
+        "mutants": found,
+        "of_the_killed": {
+            "before a test began": sum(r["fate"] == "killed" and not r["by"] for r in mutants),
+            "by the module's own file of tests": sum(
+                r["by"].startswith(f"tests/test_{r['module']}.py") for r in mutants
+            ),
+        },
+        "that no test runs": sum(row["tests"] == 0 for row in mutants),
+        "links": {link: counts(r for r in mutants if link_of[r["module"]] == link)
+                  for link in links},
+        "modules": {name: counts(r for r in mutants if r["module"] == name)
+                    for name in link_of if any(r["module"] == name for r in mutants)},
+        "kinds": {kind: counts(r for r in mutants if r["kind"] == kind)
+                  for kind in sorted({row["kind"] for row in mutants})},
+        "survivors": [{key: r[key] for key in kept} for r in mutants if r["fate"] == "survived"],
+        "timed_out": [{key: r[key] for key in kept} for r in mutants if r["fate"] == "timed out"],
+        "controls": {kind: dict(Counter(r["fate"] for r in those))
+                     for kind, those in controls.items()},
+        "cpu_s": round(sum(row["cpu_s"] for row in rows)),
+        "passed": {
+            f"{ASKED:.0%} of {N} mutants are killed": found["n"] >= N and found["share"] >= ASKED,
+            "every module as it is passes": all(
+                r["fate"] == "survived" for r in controls["as it is"]
+            ),
+            "every planted error is found": all(r["fate"] == "killed" for r in controls["planted"]),
+        },
+    }  # fmt: skip
+
+
+def counts(rows: Iterable[dict[str, Any]]) -> dict[str, Any]:
+    """Count fates, with the share of what is noticed and its 95 % interval."""
+    fates = Counter(row["fate"] for row in rows)
+    n, survived = fates.total(), fates["survived"]
+    low, high = clopper_pearson(n - survived, n)
+    return {"n": n, "killed": fates["killed"], "timed_out": fates["timed out"],
+            "survived": survived, "share": round((n - survived) / n, 4) if n else None,
+            "low": round(low, 4), "high": round(high, 4)}  # fmt: skip
+
+
+def _source(module: str) -> str:
+    return (ROOT / "lmshealth" / f"{module}.py").read_text(encoding="utf-8")
+
+
+def _project() -> str:
+    """Digest what all trials depend on: the packages, and what tests share."""
+    files = [path for folder in ("lmshealth", "models") for path in (ROOT / folder).rglob("*.*")]
+    files += [path for path in (ROOT / "tests").rglob("*.py") if not path.name.startswith("test_")]
+    plain = (path for path in sorted(files) if path.is_file() and path.suffix != ".pyc")
+    return digest_of(*(path.read_bytes() for path in plain))
+
+
+if __name__ == "__main__":
+    main()
