@@ -41,7 +41,7 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=10)
     study = Study(__file__, __doc__, parser.parse_args())
     seeds = [1] if study.quick else list(range(1, study.options.seeds + 1))
-    size = (6, 10, 2) if study.quick else (40, 20, 40)
+    size = (12, 10, 4) if study.quick else (40, 20, 40)
     tasks = [(seed, *size) for seed in seeds]
     lives = study.trials.collect(one_life, tasks, also=PROGRAMS)
     answer = {"seeds": seeds} | summarise(lives)
