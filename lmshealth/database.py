@@ -7,10 +7,11 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
-from sqlalchemy import MetaData, create_engine, event
+from sqlalchemy import MetaData, create_engine, event, inspect
 from sqlalchemy.dialects import postgresql, sqlite
 from sqlalchemy.engine import URL, Engine, make_url
 from sqlalchemy.exc import SQLAlchemyError
+from sqlalchemy.schema import CreateIndex, CreateTable
 
 from lmshealth.addresses import shown_address, without_secrets
 from lmshealth.errors import LmshealthError
@@ -97,9 +98,15 @@ def _engine(url: URL, *, shared: bool = True) -> Engine:
 
 def _make_tables(engine: Engine, metadata: MetaData) -> None:
     """Make the tables that are not there; another run may be about the same."""
-    for attempt in range(3):
+    for attempt in range(3):  # PostgreSQL may fail where two make the same table at once
         try:
-            metadata.create_all(engine)
+            with engine.begin() as connection:
+                known = set(inspect(connection).get_table_names())
+                for table in metadata.sorted_tables:
+                    if table.name not in known:
+                        connection.execute(CreateTable(table, if_not_exists=True))
+                        for index in table.indexes:
+                            connection.execute(CreateIndex(index, if_not_exists=True))
             return
         except SQLAlchemyError:
             if attempt == 2:

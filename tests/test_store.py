@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from sqlalchemy import Engine, event
 
 from lmshealth.assessing import packed
 from lmshealth.history import Reading
@@ -330,6 +331,25 @@ def test_a_row_that_cannot_be_read_counts_as_absent(file_url: str, tmp_path: Pat
         assert store.earlier("B", "k2") is None
         put_in(store, "k", reading())
         assert isinstance(got_from(store, "k", "a.h5"), Reading)
+
+
+def test_a_store_that_another_run_makes_at_the_same_moment_is_opened(tmp_path: Path) -> None:
+    """Of every table the other may be a moment quicker: both have it."""
+    path = tmp_path / "store.sqlite"
+    made = []
+
+    def be_quicker(_: object, __: object, statement: str, *___: object) -> None:
+        if statement.strip().startswith("CREATE TABLE"):
+            with closing(sqlite3.connect(path)) as other:
+                other.execute(statement)
+            made.append(statement)
+
+    event.listen(Engine, "before_cursor_execute", be_quicker)
+    try:
+        Store(f"sqlite:///{path}").close()
+    finally:
+        event.remove(Engine, "before_cursor_execute", be_quicker)
+    assert len(made) == 5
 
 
 def test_two_that_write_the_same_at_once_leave_one_row(url: str, tmp_path: Path) -> None:
