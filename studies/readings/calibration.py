@@ -32,7 +32,7 @@ def calibrate(quick: bool) -> tuple[dict[str, Check], dict[str, Any]]:
     """Check gain and distribution of spectra."""
     rng = np.random.default_rng(1)
     checks, curves = sines()
-    for part in (expected_noise(1700 if quick else 4000), displacements(quick),
+    for part in (expected_noise(2000 if quick else 4000), displacements(quick),
                  sampled(rng, (1 << 16 if quick else 1 << 20) - 1),
                  freedom(rng, 1000 if quick else 4000)):  # fmt: skip
         checks |= part[0]
@@ -140,7 +140,7 @@ def expected_noise(n: int) -> tuple[dict[str, Check], dict[str, Any]]:
 
 def displacements(quick: bool) -> tuple[dict[str, Check], dict[str, Any]]:
     """Read displacements as acceleration: sines, noise of white acceleration, encoder noise."""
-    rate, n = DISPLACEMENT_RATE, 1600 if quick else 12_800
+    rate, n = DISPLACEMENT_RATE, 3200 if quick else 12_800
     # Samples that the second difference takes.
     lost = n - round(spectrum(np.zeros(n), "displacement", rate, TOP).duration * rate)
     size = n + lost

@@ -34,11 +34,9 @@ NEAR, AROUND = 0.15, 1.15
 _SHOWN_HZ = 0.5
 
 
-def read_real(data: Path, quick: bool) -> tuple[dict[str, Check], dict[str, Any]]:
-    """Read the samples of a folder of real measurements, or only the one that is there twice."""
+def read_real(data: Path) -> tuple[dict[str, Check], dict[str, Any]]:
+    """Read the samples of a folder of real measurements."""
     checks, details = twins(data / FOLDER)
-    if quick:
-        return checks, details
     more, mains = measured(data / FOLDER / MEASURED)
     return checks | more, details | mains
 

@@ -26,7 +26,7 @@ def read_sums(quick: bool, folder: Path) -> tuple[dict[str, Check], dict[str, An
     rng = np.random.default_rng(3)
     errors: list[dict[str, float]] = []
     truths = []
-    for i in range(2 if quick else 20):
+    for i in range(4 if quick else 20):
         # Odd and even records, a second or so each.
         truths.append(draw(rng, 20_000 + i % 2))
         write(folder / f"sum-{i:02d}.h5", truths[-1]["samples_um"])
