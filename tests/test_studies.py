@@ -77,7 +77,7 @@ def test_tracking_filter(root: Path) -> None:
 
 def test_demo_life(root: Path) -> None:
     """A short degrading life is recognised, and its truth lies where the posterior does."""
-    life = json.loads(run_study(root, "demo_life").splitlines()[0])
+    (life,) = json.loads(run_study(root, "demo_life"))["lives"]
     assert life["verdict"] == "both"
     for name in ("guide_preload", "mount_stiffness"):
         row = life[name]

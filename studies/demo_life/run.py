@@ -47,6 +47,8 @@ def main() -> None:
     answer = {"seeds": seeds} | summarise(lives)
     if not study.quick:
         answer["make_demo"] = time_demo()
+    if study.quick:
+        answer["lives"] = lives
     study.conclude(answer, beside={"lives": lives})
 
 

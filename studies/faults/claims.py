@@ -4,9 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from studies.claims import Claim, Row, counted
+from studies.claims import Claim, Older, Row, counted
 
 STEP = "batch"
+OLDER = {
+    "together": Older("77fa6686942f", "runs that make a store at the same moment open it both")
+}
 
 
 def kills(answer: Row) -> Iterator[Claim]:
@@ -66,15 +69,12 @@ def losses(answer: Row) -> Iterator[Claim]:
 def together(answer: Row) -> Iterator[Claim]:
     """Claim that two runs at once leave what they leave alone."""
     for kind, ways in answer["pairs"].items():
-        n, wrong = (
-            sum(f(row) for row in ways.values())
-            for f in (lambda row: row["n"], lambda row: len(row["wrong"]))
-        )
+        wrong = sum(bool(row["wrong"]) for row in ways.values())
         yield Claim(
-            f"what is not as alone, of two runs at once ({kind})",
-            f"{wrong} in {n} pairs",
-            "",
-            f"{len(ways)} ways",
+            f"ways of running two at once that leave what each leaves alone ({kind})",
+            f"{len(ways) - wrong} of {len(ways)}",
+            f"{min(row['n'] for row in ways.values())} pairs each",
+            "half of them with one killed",
             wrong == 0,
         )
 

@@ -11,6 +11,12 @@ Method
     on. Each has to give the tables and pages that it gives alone. Only where one knows of more logs
     pages are left out: what they say of the report before depends on which run comes first.
     Negative control: see `kills`.
+Answer
+    Nearly: of 36 pairs 35 end as each run alone, and in none is a row lost or twice. In one a run
+    refused to begin, in one line, because the other made the same table of a new SQLite file at
+    that moment. That is mended since, and held by a test of the store.
+Run time
+    Forty minutes.
 """
 
 from __future__ import annotations
