@@ -77,8 +77,10 @@ def _child(
     return subprocess.Popen(
         ["setpriv", *as_user, "--pdeathsig", end, *command],
         start_new_session=True, cwd="/", stdout=output, stderr=output,
-        # Workers import what this process can, and so does a scheduler.
-        env=os.environ | {"PYTHONPATH": os.pathsep.join(path for path in sys.path if path)},
+        # Workers import what this process can, and so does a scheduler. Where setproctitle is
+        # installed they write their titles over their environment, and with it over the mark.
+        env=os.environ
+        | {"PYTHONPATH": os.pathsep.join(path for path in sys.path if path), "SPT_NOENV": "1"},
     )  # fmt: skip
 
 
