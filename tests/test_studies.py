@@ -285,6 +285,15 @@ def test_lifetimes_raw(root: Path) -> None:
     assert all(answer["passed"].values())
 
 
+def test_blind_lives(root: Path) -> None:
+    """Machines that nobody names as sound, worn or too young are told as such on their pages."""
+    answer = json.loads(run_study(root, "blind_lives"))
+    assert all(answer["passed"].values())
+    told = answer["verdicts"]["all"]
+    assert told["right"]["hits"] == told["right"]["n"] == 3
+    assert [told["told_of_true"][word][word] for word in ("healthy", "preload")] == [1, 1]
+
+
 def test_one_guide(root: Path) -> None:
     """The preload of a shared guide is known better, and the mount of X is never claimed."""
     answer = json.loads(run_study(root, "one_guide"))
