@@ -25,7 +25,7 @@ Method
     truth of such a life is that of a machine to which none happens. Controls that must fail: every
     answer with the truth of another life of its stage, and intervals shrunk to a third.
 Run time
-    RUN_TIME
+    An archive of ten machines at a time; archives done before are not done again.
 """
 
 from __future__ import annotations
