@@ -28,6 +28,7 @@ STEPS = (
     "health, on machines that it does not know",
     "plan",
     "batch",
+    "all of it, from raw logs to the report",
     "simulated plants",
     "the tests themselves",
 )

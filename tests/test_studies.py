@@ -75,6 +75,7 @@ def test_tracking_filter(root: Path) -> None:
     assert len(programs) == 5 - len(answer["speed"]["missing"])
 
 
+@pytest.mark.slow
 def test_demo_life(root: Path) -> None:
     """A short degrading life is recognised, and its truth lies where the posterior does."""
     (life,) = json.loads(run_study(root, "demo_life"))["lives"]
@@ -335,6 +336,16 @@ def test_lifetimes_raw(root: Path) -> None:
     # Both healths together do not lie far out among their draws.
     assert sum(sum(ranks[f"{name} now"]["histogram"][1:-1]) for name in PARTS) >= 1
     assert all(answer["passed"].values())
+
+
+@pytest.mark.slow
+def test_blind_lives(root: Path) -> None:
+    """Machines that nobody names as sound, worn or too young are told as such on their pages."""
+    answer = json.loads(run_study(root, "blind_lives"))
+    assert all(answer["passed"].values())
+    told = answer["verdicts"]["all"]
+    assert told["right"]["hits"] == told["right"]["n"] == 3
+    assert [told["told_of_true"][word][word] for word in ("healthy", "preload")] == [1, 1]
 
 
 def test_one_guide(root: Path) -> None:

@@ -1,0 +1,202 @@
+"""Raw logs of lives drawn blind: is the report right, and as sure as it may be?
+
+Question
+    Of an archive of raw logs, whose machines live any of ten kinds of lives that the analysis does
+    not know, is the verdict of every machine right, and as often as its probability says? Do the
+    intervals of preload, mount and remaining life hold the truth?
+Method
+    A generator draws the kind of every life (all of `models.lives`), its stage, its seed, how many
+    logs it has and how long they are, and where it is cut; a tenth have fewer logs than make a
+    baseline. They are written at 20 kHz, in archives of ten machines whose names tell nothing; the
+    truth is moved to another folder. Then `lmshealth run` is called as a user calls it, with both
+    shipped descriptions and their priors, and health at three epochs. What it says is read from its
+    tables and its front page.
+
+    What verdict is right at the last log follows from the truth alone, by the words of the README:
+    a part counts as degraded once a quarter of what it may lose is gone, in X the mount moves no
+    mode, a step of what the modes tell has no other verdict, nor has a machine of fewer than five
+    logs. Lives near a border (a part within 0.02 of where it counts as degraded, or a step that
+    only one log has seen) are told beside the others; of all, as many verdicts must be right as
+    their probabilities promise (99.9 %).
+
+    Intervals of 50 and 90 % of what is claimed must hold the truth at least as often as they say
+    (99.9 % Clopper-Pearson): the map's error of 5 % is in them, and this map has none. Travel that
+    is left is censored at the horizon; a crash or a loosened bolt to come is in no law, and the
+    truth of such a life is that of a machine to which none happens. Controls that must fail: every
+    answer with the truth of another life of its stage, and intervals shrunk to a third.
+Run time
+    An archive of ten machines at a time; archives done before are not done again.
+"""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+
+from lmshealth.metrics import clopper_pearson
+from models.lives import simulate_life
+from studies.blind_lives import judging
+from studies.blind_lives.answers import SHOWN, analyse
+from studies.blind_lives.lives import SEED, BlindPlan, plan_of, truth_of
+from studies.lives import HEALTHY
+from studies.record import LEVEL, Study
+
+Row = dict[str, Any]
+
+N_LIVES, IN_ARCHIVE = 100, 10
+# A sound one, a worn one, and one with too few logs.
+QUICK = (
+    BlindPlan("lms-x", "temperature-only", 5, 3.0, 61),
+    BlindPlan("lms-x", "preload-wear", 5, 3.0, 62, until="failure"),
+    BlindPlan("lms-x", "preload-wear", 2, 3.0, 63, until="failure"),
+)
+PROGRAMS = ("lmshealth.__main__",)
+PARTS = ("guide_preload", "mount_stiffness")
+LIMITS = (*PARTS, "any")
+# Of a machine that the report does not name.
+SILENT = {"verdict": "not-enough-data", "probability": None, "shown": None, "health": {},
+          "left": {}, "events": {}, "refused": {}}  # fmt: skip
+OTHERS = "truth of another life"
+
+
+def main() -> None:
+    """Run the study; ``--quick`` does one small archive and records nothing."""
+    study = Study(__file__, __doc__)
+    if study.quick:
+        rows = archive_of(QUICK)
+    else:
+        tasks = [(first, IN_ARCHIVE) for first in range(1, N_LIVES, IN_ARCHIVE)]
+        done = study.trials.collect(one_archive, tasks, also=PROGRAMS)
+        rows = [row for archive in done for row in archive]
+    answer = judged(rows)
+    answer["passed"] = verdicts(answer)
+    study.conclude(answer, beside={"rows": rows})
+
+
+def one_archive(first: int, n: int) -> list[Row]:
+    """Draw some lives, and take them from raw logs to the report."""
+    return archive_of([plan_of(number) for number in range(first, first + n)])
+
+
+def archive_of(plans: Sequence[BlindPlan], keep: Path | None = None) -> list[Row]:
+    """Simulate an archive, have it analysed without its truth, and put both side by side.
+
+    Parameters
+    ----------
+    plans : sequence of BlindPlan
+        The lives.
+    keep : Path, optional
+        Folder that gets pages and tables.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        logs, truths, out = (Path(folder) / name for name in ("logs", "truth", "out"))
+        truths.mkdir()
+        for plan in plans:
+            simulate_life(plan, logs / plan.identity)
+            shutil.move(logs / plan.identity / "truth.csv", truths / f"{plan.identity}.csv")
+        told = analyse(logs, keep or out)
+        return [
+            {
+                "stage": plan.stage,
+                "kind": plan.life,
+                "logs": plan.logs,
+                "truth": truth_of(plan, pd.read_csv(truths / f"{plan.identity}.csv")),
+                "told": told.get(plan.identity, SILENT),
+            }
+            for plan in plans
+        ]
+
+
+def judged(rows: Sequence[Row]) -> dict[str, Any]:
+    """Judge what was said of all machines, and the same beside the truth of others."""
+    clear = [row for row in rows if row["truth"]["clear"]]
+    others = judging.of_others(rows)
+    sound = [row for row in rows if row["kind"] in HEALTHY]
+    return {
+        "seed": SEED,
+        "lives": len(rows),
+        "verdicts": {
+            name: {"right": judging.share(_right(row) for row in own),
+                   "told_of_true": judging.confusion(own)}
+            for name, own in (("all", rows), ("clear of borders", clear), (OTHERS, others))
+        },
+        "sureness": {"all": judging.sureness(rows), OTHERS: judging.sureness(others)},
+        "health": judging.coverages(rows, "health", PARTS),
+        "left": judging.coverages(rows, "left", LIMITS),
+        OTHERS: {
+            "health": judging.coverages(others, "health", PARTS),
+            "left": judging.coverages(others, "left", LIMITS),
+        },
+        "sound_kinds": {
+            "called worn or stepped": judging.share(
+                row["told"]["verdict"] not in ("healthy", "not-enough-data") for row in sound
+            ),
+            "alarms": judging.share("alarm" in row["told"]["events"] for row in sound),
+        },
+        "steps_to_come": sum(row["truth"]["to_come"] for row in rows),
+        "ends_beyond_horizon": _beyond(rows),
+        "refused": _refused(rows),
+        "front_page": judging.share(
+            row["told"]["shown"] == SHOWN[row["told"]["verdict"]] for row in rows
+        ),
+    }  # fmt: skip
+
+
+def _right(row: Row) -> bool:
+    return bool(row["told"]["verdict"] == row["truth"]["verdict"])
+
+
+def _beyond(rows: Iterable[Row]) -> dict[str, Row]:
+    """Count machines that reach no limit, and those that do, of which no end is told to be near.
+
+    The median of what is left until any limit lies past the horizon.
+    """
+    pairs = [(row["truth"]["left"]["any"], row["told"]["left"]["any"]) for row in rows
+             if "any" in row["told"]["left"]]  # fmt: skip
+    return {
+        name: judging.share(told["q50"] is None for true, told in pairs if (true is None) is never)
+        for name, never in (("reach no limit", True), ("reach a limit", False))
+    }
+
+
+def _refused(rows: Iterable[Row]) -> dict[str, int]:
+    """Count what was refused by reason, and logs that exist."""
+    found: Counter[str] = Counter()
+    for row in rows:
+        found.update(row["told"]["refused"])
+    return {"logs": sum(row["logs"] for row in rows), **dict(sorted(found.items()))}
+
+
+def verdicts(answer: dict[str, Any]) -> dict[str, bool]:
+    """Say what was asked and whether it is so; controls only where there are lives enough."""
+    page, sure = answer["front_page"], answer["sureness"]
+    checks = {
+        "the front page shows every machine with its verdict": page["hits"] == page["n"],
+        "verdicts are right as often as they say": sure["all"].get("holds", True),
+    }
+    for what in ("health", "left"):
+        checks[f"intervals hold the truth: {what}"] = all(_held(answer[what], ""))
+    for name, row in answer["sound_kinds"].items():
+        low = clopper_pearson(row["hits"], row["n"], LEVEL)[0]
+        checks[f"at most 1 in 100 of sound kinds: {name}"] = low <= 0.01
+    if answer["lives"] == N_LIVES:
+        checks[f"verdicts are not right: {OTHERS}"] = not sure[OTHERS]["holds"]
+        for what in ("health", "left"):
+            checks[f"intervals do not: {what}, {OTHERS}"] = not all(_held(answer[OTHERS][what], ""))
+            checks[f"intervals do not: {what}, shrunk"] = not all(_held(answer[what], " shrunk"))
+    return checks
+
+
+def _held(names: dict[str, dict[str, Row]], way: str) -> list[bool]:
+    return [row["holds"] for levels in names.values() for key, row in levels.items()
+            if key.endswith(way) and key.endswith("shrunk") == bool(way)]  # fmt: skip
+
+
+if __name__ == "__main__":
+    main()
