@@ -24,6 +24,8 @@ from sqlalchemy import create_engine, inspect, make_url, text
 from studies.faults.batch import write_machine, write_stages
 from studies.servers import MARK, Popen, marked, missing_postgres, postgres
 
+# 200 logs; enough machines that three teach a fleet's prior to a fourth, which is young.
+MACHINES = {"WORN-A": 50, "WORN-B": 46, "WORN-C": 46, "WORN-D": 8, "WATCHED-A": 50}
 LONG_S = 1200.0  # no run takes as long
 ENDED_S = 60.0  # by then every process of a killed run has to be gone, on a busy machine too
 # What is started, and what its result depends on.

@@ -36,6 +36,7 @@ from typing import Any
 
 from studies.faults.driving import (
     ENDED_S,
+    MACHINES,
     PROGRAM,
     SOME_REFUSED,
     Reference,
@@ -52,8 +53,6 @@ from studies.record import Study
 from studies.resume import Trials
 
 SEED = 20261122
-# Enough that three teach a fleet's prior to a fourth, which is young.
-MACHINES = {"WORN-A": 50, "WORN-B": 46, "WORN-C": 46, "WORN-D": 8, "WATCHED-A": 50}
 QUICK_MACHINES = {"WATCHED-A": 8}
 N_KILLS, QUICK_KILLS = 100, 1
 HOWS = {"main": 0.5, "worker": 0.2, "SIGINT": 0.15, "SIGTERM": 0.15}

@@ -29,6 +29,7 @@ from pathlib import Path
 from typing import Any
 
 from studies.faults.driving import (
+    MACHINES,
     PROGRAM,
     SOME_REFUSED,
     Reference,
@@ -44,7 +45,6 @@ from studies.record import Study
 from studies.servers import Cluster, dask_cluster, missing_distributed
 
 SEED = 20261122
-MACHINES = {"WORN-A": 50, "WORN-B": 46, "WORN-C": 46, "WORN-D": 8, "WATCHED-A": 50}
 QUICK_MACHINES = {"WATCHED-A": 20}
 N_KILLS, QUICK_KILLS = 10, 1
 KILLS_PER_RUN, QUICK_PER_RUN = 3.0, 20.0  # in the mean, over the time that a run takes
