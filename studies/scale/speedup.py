@@ -135,11 +135,12 @@ def main() -> None:
         kind: int(2e3 / answer[f"{kind}_rate"][1] / answer[f"{kind}_serial_ms"][1])
         for kind in ("local", "dask")
     }
-    least = 0.5 if quick else SPEEDUP / 2  # a small archive only shows that it works
     answer["passed"] = {
-        f"{kind}: 1.8 of 2": answer["of the bound"][kind] >= least for kind in ("local", "dask")
+        f"{kind}: 1.8 of 2": answer["of the bound"][kind] >= SPEEDUP / 2
+        for kind in ("local", "dask")
     }
-    study.conclude(answer)
+    # Of a small archive the start of the second worker is most of the time.
+    study.conclude(answer, quick_may_fail=True)
 
 
 if __name__ == "__main__":
