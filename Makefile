@@ -1,10 +1,10 @@
-# `make demo`, `make test` and `make statistics` do everything. Each first makes a virtual environment.
+# Every target first makes a virtual environment, so that a clean checkout is enough.
 
 PYTHON ?= python3
 BIN := .venv/bin
 DEMO := demo
 
-.PHONY: demo picture test slow coverage statistics bench check clean
+.PHONY: demo picture check test slow coverage statistics bench clean
 
 demo: .venv/installed
 	@rm -rf $(DEMO)
@@ -18,10 +18,16 @@ picture: .venv/installed
 	@test -d $(DEMO)/result || $(MAKE) demo
 	$(BIN)/python -m studies.demo_life.picture $(DEMO)/result
 
+# Linters and types.
+check: .venv/installed
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+
 # Tests run side by side: threads inside linear algebra would only get in their way.
 test slow coverage statistics bench: export OPENBLAS_NUM_THREADS = 1
 test slow coverage statistics bench: export OMP_NUM_THREADS = 1
-test: .venv/installed check
+test: .venv/installed
 	$(BIN)/pytest -n 2 -m "not slow and not statistical"
 
 # Tests that take seconds each: whole files, servers, browsers, chains.
@@ -40,11 +46,6 @@ statistics: .venv/installed
 # Every figure of speed beside its peer, into studies/bench/result.json.
 bench: .venv/installed
 	$(BIN)/python -m studies.bench.run
-
-check: .venv/installed
-	$(BIN)/ruff check .
-	$(BIN)/ruff format --check .
-	$(BIN)/mypy
 
 # The stamp is newer than what it was made from, or the installation is done again.
 .venv/installed: pyproject.toml
