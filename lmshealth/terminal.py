@@ -169,7 +169,8 @@ def _consistent(track: Track) -> str:
         f"autocorrelation {found.autocorrelation:+.2f} (p = {found.autocorrelation_p_value:.2g})"
     )
     if found.holds:
-        return f"The filter agrees with its logs: {told}."
+        how = ", which vary rather less than it expects" if found.cautious else ""
+        return f"The filter agrees with its logs{how}: {told}."
     if track.widening[-1] > 1:
         meant = (
             f"its standard deviations are widened {track.widening[-1]:.2f} times. A cause may be "

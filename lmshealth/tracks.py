@@ -277,6 +277,11 @@ class Consistency:
         least_of_all = _TOO_SURE if self.autocorrelation > 0 else _TOO_CAUTIOUS
         return self.p_value >= least and self.autocorrelation_p_value >= least_of_all
 
+    @property
+    def cautious(self) -> bool:
+        """Whether it holds, with innovations that are improbably small or turn back too often."""
+        return self.holds and min(self.p_value, self.autocorrelation_p_value) < _TOO_SURE
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Track:

@@ -168,6 +168,17 @@ def test_consistency_is_what_it_says() -> None:
     assert found.autocorrelation_p_value == pytest.approx(1.0)
 
 
+@pytest.mark.parametrize(("mean_square", "holds", "cautious"),
+                         [(1.0, True, False), (0.57, True, True), (0.4, False, False)])  # fmt: skip
+def test_too_small_innovations_are_told_before_they_are_wrong(
+    mean_square: float, holds: bool, cautious: bool
+) -> None:
+    """What is improbably small agrees and is called cautious; what is far too small does not."""
+    n = 100
+    found = consistency(np.full(n, mean_square), np.ones(n), np.full((n, 1), np.nan))
+    assert (found.holds, found.cautious) == (holds, cautious)
+
+
 def test_nothing_to_judge_is_consistent() -> None:
     """A filter that has seen one log only is neither right nor wrong."""
     found = consistency(np.zeros(1), np.zeros(1), np.full((1, 2), np.nan))
