@@ -6,8 +6,9 @@ Question
 Method
     Mutants are made by the operators of mutmut; what changes no result by rule is left out, as
     `making.py` tells. A sample is drawn by a seed, in proportion to what each module has. Which
-    tests concern a mutant is found out: each file of tests is run once with coverage by test, in
-    a copy of the project and without those that are statistical or run studies. Of a mutant those
+    tests concern a mutant is found out: the files of tests of these modules are run once with
+    coverage by test, in a copy of the project; statistical tests, studies, and tests of commands,
+    pages and archives are left out, so that more may be found than is told here. Of a mutant those
     tests are tried that run its statement: first those of the module's own file of tests, then
     file by file, the cheapest first; after them the other tests of these files, since a fixture or
     a kept result may have run it for them; until they had taken 30 s of the processor in the
@@ -64,7 +65,6 @@ LINKS = {
 SEED, N = 10, 320
 BUDGET_S = 30.0
 ASKED = 0.85
-LEFT_OUT = ("test_studies.py",)
 # The quick form: two mutants of a small module, by its own file of tests.
 QUICK = ("kernel", 2)
 Tests = dict[str, dict[str, Any]]
@@ -73,13 +73,9 @@ Tests = dict[str, dict[str, Any]]
 def main() -> None:
     """Run the study; ``--quick`` tries two mutants of one module."""
     study = Study(__file__, __doc__)
-    if study.quick:
-        links = {"identification": (QUICK[0],)}
-        files = [f"tests/test_{QUICK[0]}.py"]
-    else:
-        links = LINKS
-        files = test_files()
+    links = {"identification": (QUICK[0],)} if study.quick else LINKS
     modules = tuple(name for names in links.values() for name in names)
+    files = [f"tests/test_{name}.py" for name in modules]
     drawn = sample(modules, QUICK[1] if study.quick else N)
     with (
         tempfile.TemporaryDirectory() as plans,
@@ -88,13 +84,6 @@ def main() -> None:
         rows = tried(study, pool, Path(plans), drawn, gathered(study, pool, files, modules))
     answer = told(rows, links)
     study.conclude(answer, quick_may_fail=True)
-
-
-def test_files() -> list[str]:
-    """Name the files of tests that may concern a module."""
-    found = (path.relative_to(ROOT) for path in sorted((ROOT / "tests").rglob("test_*.py")))
-    return [path.as_posix() for path in found
-            if path.name not in LEFT_OUT and path.parent.name != "statistical"]  # fmt: skip
 
 
 def sample(modules: Iterable[str], n: int) -> list[tuple[str, int, Mutant]]:
