@@ -62,7 +62,7 @@ def main() -> None:
 
 
 def one_repeat(folder: Path, repeat: int, some: slice = slice(None)) -> dict[str, Any]:
-    """Follow the beam through one ramp and return, blind and told, or through some of its dwells."""
+    """Follow the beam through one ramp and return, or some dwells of it, blind and told."""
     rows = [row for row in one_beam(folder, repeat, some) if row["f_hz"] is not None]
     history, refused = build_history([to_reading(row) for row in rows])
     start = rows[0]["roller_v"]

@@ -56,7 +56,7 @@ from studies.record import LEVEL, Study, as_row
 
 Array = NDArray[np.float64]
 SEED = 20261122
-FLEETS, QUICK = 40, 2
+FLEETS, QUICK = 40, 1
 # How many machines of a fleet teach, by its kind, and how many learn.
 FLEET, SMALL = "fleet", "small fleet"
 N_TEACHERS = {FLEET: 16, SMALL: 8}
@@ -74,7 +74,7 @@ _MODEL = ("courses", "density", "fleet", "importance", "laws", "life", "lifefit"
 
 
 def main() -> None:
-    """Run the study; ``--quick`` does a small part and records nothing."""
+    """Run the study; ``--quick`` does one small fleet and records nothing."""
     study = Study(__file__, __doc__)
     kind, n = (SMALL, QUICK) if study.quick else (FLEET, FLEETS)
     rows = study.trials.collect(one, [(kind, number) for number in range(n)])
