@@ -59,8 +59,8 @@ SEED = 20261122
 FLEETS, QUICK = 40, 1
 # How many machines of a fleet teach, by its kind, and how many learn.
 FLEET, SMALL = "fleet", "small fleet"
-N_TEACHERS = {FLEET: 16, SMALL: 8}
-N_YOUNG, MOST_DRAWN = 4, 12
+N_TEACHERS = {FLEET: 16, SMALL: 6}
+N_YOUNG, MOST_DRAWN = {FLEET: 4, SMALL: 2}, 12
 # Fleets that are taught by another one too.
 FOREIGN_FLEETS, TIMES = 20, 5.0
 ENOUGH = 5  # fleets, of which a mean has a standard error
@@ -83,7 +83,8 @@ def main() -> None:
         "fleets": n,
         "teachers": N_TEACHERS[kind],
         "young": sum(len(row["young"]) for row in rows),
-        "ways": {way: judged(rows, way) for way in WAYS},
+        # Of a small fleet too few may be worn to teach.
+        "ways": {way: judged(rows, way) for way in WAYS if was_told(rows, way)},
         "priors": [
             {"true": row["true"]} | young["priors"] for row in rows for young in row["young"][:1]
         ],
@@ -122,7 +123,7 @@ def one(kind: str, number: int) -> Row:
         lesson = lesson_of(described(), own)
         if is_young(lesson):
             row["young"].append(pupil(drawn, own, lesson, fleet, schools, number))
-        if len(row["young"]) == N_YOUNG:
+        if len(row["young"]) == N_YOUNG[kind]:
             break
     return row
 
@@ -223,6 +224,11 @@ def scored(draws: Array, truth: float, known: Array, rng: np.random.Generator) -
 def below(draws: Array, travel: Array) -> Array:
     """Give the distribution of draws at some travels."""
     return np.asarray(np.searchsorted(np.sort(draws), travel, side="right") / draws.size)
+
+
+def was_told(rows: list[Row], way: str) -> bool:
+    """Tell whether any machine was told anything in one way."""
+    return any(way in young for row in rows for young in row["young"])
 
 
 def judged(rows: list[Row], way: str) -> dict[str, Any]:
