@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import tempfile
-from dataclasses import astuple, replace
+from dataclasses import astuple
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -17,7 +17,7 @@ from lmshealth.readers import find_logs, read_manifest
 from lmshealth.stage import load_stage
 from models.lives import Plan, simulate_life
 from models.plant import GUIDE_MODES
-from studies.lives import SECONDS, Estimates, Life, life_of, plan_of
+from studies.lives import Estimates, Life, life_of, plan_of
 from studies.resume import Trials
 
 RAW = "raw_lives"  # name of the file that keeps them
@@ -27,11 +27,9 @@ _RECORD = Path(__file__).parent / "tracking_lives" / "result.json"
 _LOOP_ERROR = 1e-8  # in m; of it the jump and the scatter count alone
 
 
-def measured(
-    stage: str, logs: int, kept: Path | None = None, *, seconds: float = SECONDS
-) -> tuple[Estimates, Life]:
+def measured(stage: str, logs: int, kept: Path | None = None) -> tuple[Estimates, Life]:
     """Simulate and identify a few logs of both tunings, for `studies.lives.drawn`."""
-    plan = replace(plan_of(stage, "servo-retuning", _SIZES_SEED, logs), seconds=seconds)
+    plan = plan_of(stage, "servo-retuning", _SIZES_SEED, logs)
     return identified(plan, kept), life_of(plan)
 
 

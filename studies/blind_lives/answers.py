@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import re
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -13,14 +11,13 @@ import pandas as pd
 
 from lmshealth.results import INFORMED
 from studies.blind_lives.lives import STAGES
+from studies.commands import call
 
 Row = dict[str, Any]
 
 EPOCHS = 3
 LEVELS = ("q05", "q25", "q50", "q75", "q95")
-_DONE, _SOME_REFUSED = 0, 3
 _UNEXPLAINED = 1e-4  # of `fit`, as the README tells it
-_ROOT = Path(__file__).parents[2]
 # What the front page writes for each word of verdict.csv.
 SHOWN = {
     "healthy": "Healthy",
@@ -37,13 +34,15 @@ _INDEX_ROW = re.compile(
 )
 
 
-def analyse(logs: Path, out: Path) -> dict[str, Row]:
+def analyse(logs: Path, out: Path, *, quick: bool = False) -> dict[str, Row]:
     """Run the command line over an archive of both stages, and read what it says of each machine.
 
     Parameters
     ----------
     logs, out : Path
         Folders of the archive, and of the answers.
+    quick : bool
+        As in `call`, and with health at the last log alone.
 
     Returns
     -------
@@ -53,13 +52,9 @@ def analyse(logs: Path, out: Path) -> dict[str, Row]:
         horizon), counts of ``events`` that are no declared work, and of ``refused`` by reason.
     """
     stages = [word for name in STAGES for word in ("--stage", name)]
-    done = subprocess.run(
-        [sys.executable, "-m", "lmshealth", "run", str(logs), *stages, "--out", str(out),
-         "--epochs", str(EPOCHS), "--workers", "1"],
-        capture_output=True, text=True, check=False, cwd=_ROOT,
-    )  # fmt: skip
-    if done.returncode not in (_DONE, _SOME_REFUSED):
-        raise SystemExit(f"lmshealth run ended with {done.returncode}: {done.stderr}")
+    call("lmshealth", "run", logs, *stages, "--out", out,
+         "--epochs", 1 if quick else EPOCHS, "--workers", 1,
+         quick=quick, some_refused=True)  # fmt: skip
     shown = front_page(out / "index.html")
     verdicts = pd.read_csv(out / "verdict.csv")
     health, left = _health(out / "health.csv"), _left(out / "prognosis.csv")

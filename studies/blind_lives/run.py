@@ -66,10 +66,10 @@ OTHERS = "truth of another life"
 
 
 def main() -> None:
-    """Run the study; ``--quick`` does one small archive and records nothing."""
+    """Run the study; ``--quick`` does one small archive without chains, and records nothing."""
     study = Study(__file__, __doc__)
     if study.quick:
-        rows = archive_of(QUICK)
+        rows = archive_of(QUICK, quick=True)
     else:
         tasks = [(first, IN_ARCHIVE) for first in range(1, N_LIVES, IN_ARCHIVE)]
         done = study.trials.collect(one_archive, tasks, also=PROGRAMS)
@@ -84,7 +84,9 @@ def one_archive(first: int, n: int) -> list[Row]:
     return archive_of([plan_of(number) for number in range(first, first + n)])
 
 
-def archive_of(plans: Sequence[BlindPlan], keep: Path | None = None) -> list[Row]:
+def archive_of(
+    plans: Sequence[BlindPlan], keep: Path | None = None, *, quick: bool = False
+) -> list[Row]:
     """Simulate an archive, have it analysed without its truth, and put both side by side.
 
     Parameters
@@ -93,6 +95,8 @@ def archive_of(plans: Sequence[BlindPlan], keep: Path | None = None) -> list[Row
         The lives.
     keep : Path, optional
         Folder that gets pages and tables.
+    quick : bool
+        As in `analyse`.
     """
     with tempfile.TemporaryDirectory() as folder:
         logs, truths, out = (Path(folder) / name for name in ("logs", "truth", "out"))
@@ -100,7 +104,7 @@ def archive_of(plans: Sequence[BlindPlan], keep: Path | None = None) -> list[Row
         for plan in plans:
             simulate_life(plan, logs / plan.identity)
             shutil.move(logs / plan.identity / "truth.csv", truths / f"{plan.identity}.csv")
-        told = analyse(logs, keep or out)
+        told = analyse(logs, keep or out, quick=quick)
         return [
             {
                 "stage": plan.stage,

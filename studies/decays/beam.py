@@ -72,12 +72,12 @@ def find_dwells(log: Log) -> list[tuple[Segment, float]]:
     return found
 
 
-def one_beam(folder: Path, repeat: int) -> list[dict[str, Any]]:
-    """Identify the beam in every dwell of one repeat."""
+def one_beam(folder: Path, repeat: int, some: slice = slice(None)) -> list[dict[str, Any]]:
+    """Identify the beam in every dwell of one repeat, or in some."""
     log = read_beam(folder, repeat)
     stage = Stage(Description(name="beam", mode=(BEAM,)), None, "0" * 64)
     rows = []
-    for k, (dwell, volts) in enumerate(find_dwells(log)):
+    for k, (dwell, volts) in list(enumerate(find_dwells(log)))[some]:
         found = identify_decays(log, stage, segments=[dwell], channels=("acc_low", "acc_high"))
         reference = TABLE[min(TABLE, key=lambda v: abs(v - volts))]
         row: dict[str, Any] = {

@@ -17,7 +17,6 @@ from __future__ import annotations
 
 import os
 import subprocess
-import sys
 import tempfile
 import time
 from pathlib import Path
@@ -27,6 +26,7 @@ import numpy as np
 import pandas as pd
 
 from lmshealth.metrics import clopper_pearson
+from studies.commands import call
 from studies.record import Study, options
 
 HERE = Path(__file__).parent
@@ -36,14 +36,16 @@ PRIOR_WIDTH = float(np.diff(np.exp(0.3 * np.array([-1.6449, 1.6449])))[0])
 
 
 def main() -> None:
-    """Run the study; ``--quick`` does one short life and records nothing."""
+    """Run the study; ``--quick`` does one life of short logs, without chains, records nothing."""
     parser = options(__doc__)
     parser.add_argument("--seeds", type=int, default=10)
     study = Study(__file__, __doc__, parser.parse_args())
     seeds = [1] if study.quick else list(range(1, study.options.seeds + 1))
-    size = (12, 10, 4) if study.quick else (40, 20, 40)
-    tasks = [(seed, *size) for seed in seeds]
-    lives = study.trials.collect(one_life, tasks, also=PROGRAMS)
+    if study.quick:
+        lives = [one_life(seed, 12, 5, 1, quick=True) for seed in seeds]
+    else:
+        tasks = [(seed, 40, 20, 40) for seed in seeds]
+        lives = study.trials.collect(one_life, tasks, also=PROGRAMS)
     answer = {"seeds": seeds} | summarise(lives)
     if not study.quick:
         answer["make_demo"] = time_demo()
@@ -52,16 +54,20 @@ def main() -> None:
     study.conclude(answer, beside={"lives": lives})
 
 
-def one_life(seed: int, n_logs: int = 40, seconds: int = 20, epochs: int = 40) -> dict[str, Any]:
+def one_life(
+    seed: int, n_logs: int = 40, seconds: int = 20, epochs: int = 40, *, quick: bool = False
+) -> dict[str, Any]:
     """Simulate and analyse one life; compare with its truth."""
     with tempfile.TemporaryDirectory() as folder:
         logs, out = Path(folder) / "logs", Path(folder) / "out"
+        workers = ("--workers", 1) if quick else ()
         begin = time.perf_counter()
-        call("models", "simulate", "lms-y", "--life", "both", "--logs", str(n_logs),
-             "--seconds", str(seconds), "--seed", str(seed), "--out", str(logs))  # fmt: skip
+        call("models", "simulate", "lms-y", "--life", "both", "--logs", n_logs,
+             "--seconds", seconds, "--seed", seed, "--out", logs, *workers,
+             quick=quick)  # fmt: skip
         simulated = time.perf_counter()
-        call("lmshealth", "run", str(logs), "--stage", "lms-y", "--out", str(out),
-             "--epochs", str(epochs))  # fmt: skip
+        call("lmshealth", "run", logs, "--stage", "lms-y", "--out", out,
+             "--epochs", epochs, *workers, quick=quick)  # fmt: skip
         done = time.perf_counter()
         truth = pd.read_csv(logs / "truth.csv").iloc[-1]
         health = pd.read_csv(out / "health.csv")
@@ -97,16 +103,6 @@ def time_demo() -> dict[str, float]:
         "wall_s": round(time.perf_counter() - begin, 1),
         "processors": len(os.sched_getaffinity(0)),
     }
-
-
-def call(module: str, *arguments: str) -> None:
-    """Call a command line as a user does."""
-    done = subprocess.run(
-        [sys.executable, "-m", module, *arguments],
-        capture_output=True, text=True, check=False, cwd=HERE.parents[1],
-    )  # fmt: skip
-    if done.returncode:
-        raise SystemExit(f"{module} ended with {done.returncode}: {done.stderr}")
 
 
 def summarise(lives: list[dict[str, Any]]) -> dict[str, Any]:

@@ -45,7 +45,7 @@ from studies.record import Study
 from studies.servers import missing_postgres, postgres
 
 SEED = 20261122
-MACHINES, QUICK_MACHINES = {"WORN-A": 40, "WATCHED-A": 40}, {"WATCHED-A": 6}
+MACHINES, QUICK_MACHINES = {"WORN-A": 40, "WATCHED-A": 40}, {"WATCHED-A": 4}
 N_LOST = 5
 SIZES, QUICK_SIZES = (0.05, 0.2, 0.4, 0.6, 0.75, 0.9, 4.0), (0.4, 4.0)
 

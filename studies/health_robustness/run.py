@@ -79,7 +79,7 @@ from studies.health_robustness.worlds import (
     told,
 )
 from studies.lives import DAMAGED, HEALTHY, Array, Estimates, Life, drawn, plan_of, rng_of
-from studies.raw_lives import RAW, identified, measured
+from studies.raw_lives import RAW, identified, measured, recorded
 from studies.record import Study, options
 from studies.resume import Trials
 
@@ -125,28 +125,32 @@ def main() -> None:
 
 
 # How many lives: of each kind, of these by laws in Y and in X; on paths, by laws, by laws in X, by
-# laws with maps of so many wrong plants, and compared with chains; logs that sizes are from and
-# their length in s; of how many stages, and every how many-th kind.
+# laws with maps of so many wrong plants, and compared with chains; logs that sizes are from (none:
+# those on record are taken); of how many stages, every how many-th kind, and in how many worlds,
+# from the last, there are lives by laws.
 FULL = {"kind": 20, "kind_law": 5, "kind_other": 1, "path": 100, "law": 60, "other": 10,
         "demo": 50, "plant_path": 100, "plants": 10, "maps": 4, "chains": 2, "sized": 12,
-        "seconds": 20, "stages": 2, "every_kind": 1}  # fmt: skip
-QUICK = {"kind": 1, "kind_law": 1, "kind_other": 0, "path": 8, "law": 1, "other": 0,
-         "demo": 1, "plant_path": 1, "plants": 0, "maps": 1, "chains": 1, "sized": 6,
-         "seconds": 10, "stages": 1, "every_kind": 5}  # fmt: skip
+        "stages": 2, "every_kind": 1, "law_worlds": 2}  # fmt: skip
+QUICK = {"kind": 1, "kind_law": 0, "kind_other": 0, "path": 8, "law": 1, "other": 0,
+         "demo": 1, "plant_path": 1, "plants": 0, "maps": 1, "chains": 1, "sized": 0,
+         "stages": 1, "every_kind": 5, "law_worlds": 1}  # fmt: skip
 
 
 def drawn_lives(trials: Trials, n: dict[str, int], kept: Path | None) -> Row:
     """Draw all fleets and judge them."""
     stages = STAGES[: n["stages"]]
     sizes = {
-        stage: measured(stage, n["sized"], kept, seconds=float(n["seconds"])) for stage in stages
+        stage: measured(stage, n["sized"], kept) if n["sized"] else recorded(stage)
+        for stage in stages
     }
     n_law = dict(zip(STAGES, (n["kind_law"], n["kind_other"]), strict=True))
     laws = dict(zip(STAGES, (n["law"], n["other"]), strict=True))
     once, each = partial(trials.once, also=SIZES), partial(trials.collect, also=SIZES)
     kinds = [(stage, kind, n["kind"], n_law[stage]) for stage in stages
              for kind in KINDS[:: -n["every_kind"]][::-1]]  # fmt: skip
-    worlds = [(stage, world, n["path"], laws[stage]) for stage in stages for world in ARMS]
+    living = list(ARMS)[-n["law_worlds"] :]
+    worlds = [(stage, world, n["path"], laws[stage] if world in living else 0)
+              for stage in stages for world in ARMS]  # fmt: skip
     parts = {
         "lives": each(partial(lives_of, sizes), kinds),
         "fleets": each(partial(fleet_of, sizes), worlds),

@@ -32,9 +32,9 @@ class PriorPlan(Plan):
                 return life
 
 
-def plan_of(seed: int, logs: int = N_LOGS) -> PriorPlan:
+def plan_of(seed: int, logs: int = N_LOGS, seconds: float = SECONDS) -> PriorPlan:
     """Plan the life of a seed."""
-    return PriorPlan(STAGE, "by-prior", logs, SECONDS, seed)
+    return PriorPlan(STAGE, "by-prior", logs, seconds, seed)
 
 
 def _law(rng: np.random.Generator, parameter: ParameterSpec) -> Law:

@@ -46,7 +46,7 @@ from lmshealth.prognosis import prognose
 from lmshealth.results import Prognosis
 from lmshealth.stage import Stage, load_stage
 from lmshealth.tracking import track
-from studies.lifetimes_raw.lives import N_LOGS, STAGE, PriorPlan, plan_of
+from studies.lifetimes_raw.lives import N_LOGS, SECONDS, STAGE, PriorPlan, plan_of
 from studies.lives import history_of, life_of
 from studies.ranks import N_DRAWS, Array, Row, bands, judge, rank, uniform
 from studies.raw_lives import RAW, identified
@@ -56,7 +56,7 @@ from studies.sbc_epoch.lives import believing
 SEED = 20261122
 BELIEVED, STATED = "map believed", "map error of 5 %"
 HALVED = "draws pulled to half their distance"
-N_LIVES, QUICK_LIVES, QUICK_LOGS = 100, 1, 4
+N_LIVES, QUICK_LIVES, QUICK_LOGS, QUICK_SECONDS = 100, 1, 4, 8.0
 KM_PER_DAY = 12.0
 QUANTITIES = (
     "preload now",
@@ -70,12 +70,13 @@ CODE = ("courses", "density", "importance", "laws", "life", "lifefit", "passage"
 
 
 def main() -> None:
-    """Run the study; ``--quick`` does one life of four logs, and records nothing."""
+    """Run the study; ``--quick`` does one life of four short logs, and records nothing."""
     study = Study(__file__, __doc__)
     n, logs = (QUICK_LIVES, QUICK_LOGS) if study.quick else (N_LIVES, N_LOGS)
     kinds = (BELIEVED,) if study.quick else (BELIEVED, STATED)
     tasks = [(kind, seed) for kind in kinds for seed in range(1, n + 1)]
-    found = study.trials.collect(partial(one, logs=logs, cache=study.kept(RAW)), tasks)
+    length = {"seconds": QUICK_SECONDS} if study.quick else {}
+    found = study.trials.collect(partial(one, logs=logs, cache=study.kept(RAW), **length), tasks)
     rows = [{"kind": kind} | row for (kind, _), row in zip(tasks, found, strict=True)]
     answer = {"seed": SEED, "lives": n, "logs": logs} | judged(rows)
     answer["passed"] = verdicts(answer)
@@ -83,9 +84,9 @@ def main() -> None:
     study.conclude(answer)
 
 
-def one(kind: str, seed: int, *, logs: int, cache: Path | None) -> Row:
+def one(kind: str, seed: int, *, logs: int, cache: Path | None, seconds: float = SECONDS) -> Row:
     """Take a life from raw logs to its prognosis, and rank the truth."""
-    plan = plan_of(seed, logs)
+    plan = plan_of(seed, logs, seconds)
     life = life_of(plan)
     stage = believing(load_stage(STAGE), 0.0) if kind == BELIEVED else load_stage(STAGE)
     history = history_of(life, identified(plan, cache))

@@ -32,8 +32,6 @@ from __future__ import annotations
 
 import json
 import os
-import subprocess
-import sys
 import tempfile
 from pathlib import Path
 from typing import Any
@@ -41,6 +39,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from studies.commands import call
 from studies.decays.beam import REPEATS
 from studies.movable_roller.calibration import (
     PARAMETER,
@@ -56,13 +55,16 @@ from studies.record import Study
 NEW = 2  # the repeat that map and description do not know
 LEAST_INSIDE = 8
 ALL_EPOCHS, QUICK_EPOCHS = 40, 3  # more than there are, and few
-_DONE, _SOME_REFUSED = 0, 3
+QUICK_DWELLS = (0, 1, 3, 5, 7, 9)  # the first is not excited
 _SIGMAS_90 = 1.645  # half a 90 % interval of a normal distribution
 _TOO_SURE = 0.25  # factor on standard deviations of the control
 
 
 def main() -> None:
-    """Run the study; ``--quick`` infers three dwells, with one control, and records nothing."""
+    """Run the study; ``--quick`` infers three dwells, with one control, and records nothing.
+
+    What was read of the repeats that make the map it takes from the record.
+    """
     study = Study(__file__, __doc__)
     with tempfile.TemporaryDirectory() as scratch:
         answer = answered(Path(os.environ["LMSHEALTH_DATA"]), Path(scratch), quick=study.quick)
@@ -82,17 +84,18 @@ def answered(folder: Path, scratch: Path, *, quick: bool) -> dict[str, Any]:
         Whether few dwells are inferred.
     """
     epochs = QUICK_EPOCHS if quick else ALL_EPOCHS
-    dwells = [write_dwells(folder, k, scratch / f"repeat{k}") for k in range(REPEATS)]
-    look = write_look(scratch)
-    known = pd.concat([read_modes(dwells[k], look) for k in range(NEW)], ignore_index=True)
+    known = recorded() if quick else read_known(folder, scratch)
     used = known.dropna(subset="frequency_hz")
     found = calibrate(used)
     stage = write_stage(found, scratch / "map")
-    new = read_modes(dwells[NEW], stage)
-    track = follow(scratch / f"repeat{NEW}", stage)
-    rows = compare(new, track, infer(track, stage, epochs))
+    dwells = write_dwells(folder, NEW, scratch / f"repeat{NEW}")
+    if quick:
+        dwells = dwells[dwells["dwell"].isin(QUICK_DWELLS)]
+    new = read_modes(dwells, stage, quick=quick)
+    track = follow(scratch / f"repeat{NEW}", stage, quick=quick)
+    rows = compare(new, track, infer(track, stage, epochs, quick=quick))
     sure = {} if quick else {"exact map, quarter of the std": too_sure(new, track, found)}
-    line = straight_line(new, track, used, found.model_std, epochs)
+    line = straight_line(new, track, used, found.model_std, epochs, quick=quick)
     answer = {
         "calibration": describe(found, used),
         "dwells": rows,
@@ -112,7 +115,23 @@ def answered(folder: Path, scratch: Path, *, quick: bool) -> dict[str, Any]:
     return answer | {"passed": judge(answer)}
 
 
-def read_modes(dwells: pd.DataFrame, stage: Path) -> pd.DataFrame:
+def read_known(folder: Path, scratch: Path) -> pd.DataFrame:
+    """Read the dwells of all repeats but the new one, without a map."""
+    look = write_look(scratch)
+    dwells = [write_dwells(folder, k, scratch / f"repeat{k}") for k in range(NEW)]
+    return pd.concat([read_modes(own, look, quick=False) for own in dwells], ignore_index=True)
+
+
+def recorded() -> pd.DataFrame:
+    """Take from the record what `read_known` gave; for the quick form, which has no time for it."""
+    record = json.loads(Path(__file__).with_name("result.json").read_text(encoding="utf-8"))
+    refused = [row for row in record["refused"] if row["repeat"] < NEW]
+    rows = [{**row, "refused": ""} for row in record["calibration"]["dwells"]]
+    rows += [{"repeat": r["repeat"], "dwell": r["dwell"], "refused": r["reason"]} for r in refused]
+    return pd.DataFrame(rows).sort_values(["repeat", "dwell"], ignore_index=True)
+
+
+def read_modes(dwells: pd.DataFrame, stage: Path, *, quick: bool) -> pd.DataFrame:
     """Identify the beam in dwells by the command line; NaN and a reason where it is refused.
 
     Parameters
@@ -121,9 +140,11 @@ def read_modes(dwells: pd.DataFrame, stage: Path) -> pd.DataFrame:
         As `write_dwells` returns it; ``modes.csv`` is written beside its logs.
     stage : Path
         Description that says what to look for.
+    quick : bool
+        As in `call`.
     """
     command = ("modes", *dwells["log"], "--stage", stage, "--part", "settling", "--format", "json")
-    told = json.loads(lmshealth(*command))
+    told = json.loads(call("lmshealth", *command, quick=quick, some_refused=True))
     modes = pd.DataFrame(told["modes"])
     modes.to_csv(Path(dwells["log"].iloc[0]).with_name("modes.csv"), index=False)
     reasons = {row["log"]: row["reason"] for row in told["refused"]}
@@ -131,32 +152,27 @@ def read_modes(dwells: pd.DataFrame, stage: Path) -> pd.DataFrame:
     return read.assign(refused=[reasons.get(log, "") for log in read["log"]])
 
 
-def follow(folder: Path, stage: Path) -> Path:
+def follow(folder: Path, stage: Path, *, quick: bool) -> Path:
     """Track ``modes.csv`` of a folder by the command line, and return the track's path."""
     out = {name: folder / f"{name}.csv" for name in ("track", "track_cov", "events", "refused")}
-    lmshealth(
+    call(
+        "lmshealth",
         "track",
         folder / "modes.csv",
         *("--stage", stage, "--out", out["track"], "--track-cov", out["track_cov"]),
         *("--events", out["events"], "--refused", out["refused"]),
+        quick=quick,
+        some_refused=True,
     )
     return out["track"]
 
 
-def infer(track: Path, stage: Path, epochs: int = ALL_EPOCHS) -> pd.DataFrame:
+def infer(track: Path, stage: Path, epochs: int, *, quick: bool) -> pd.DataFrame:
     """Infer the roller's position by the command line, one row per epoch after the baseline."""
     out = track.with_name("health.csv")
-    lmshealth("infer", track, "--stage", stage, "--out", out, "--epochs", epochs)
+    how = ("--stage", stage, "--out", out, "--epochs", epochs)
+    call("lmshealth", "infer", track, *how, quick=quick, some_refused=True)
     return pd.read_csv(out)
-
-
-def lmshealth(*arguments: object) -> str:
-    """Run a command of lmshealth and return what it prints."""
-    command = [sys.executable, "-m", "lmshealth", *map(str, arguments)]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    if done.returncode not in (_DONE, _SOME_REFUSED):
-        raise RuntimeError(f"lmshealth {arguments[0]}: {done.stderr.strip()}")
-    return done.stdout
 
 
 def compare(read: pd.DataFrame, track: Path, health: pd.DataFrame) -> list[dict[str, Any]]:
@@ -232,16 +248,22 @@ def too_sure(read: pd.DataFrame, track: Path, found: Calibration) -> dict[str, A
     table = pd.read_csv(track)
     table["drift_std"] *= _TOO_SURE
     table.to_csv(sure, index=False)
-    return count(compare(read, sure, infer(sure, stage)))
+    return count(compare(read, sure, infer(sure, stage, ALL_EPOCHS, quick=False)))
 
 
 def straight_line(
-    read: pd.DataFrame, track: Path, known: pd.DataFrame, model_std: float, epochs: int
+    read: pd.DataFrame,
+    track: Path,
+    known: pd.DataFrame,
+    model_std: float,
+    epochs: int,
+    *,
+    quick: bool,
 ) -> dict[str, Any]:
     """Infer with a map that is a straight line through the same dwells, believed as much."""
     line = calibrate(known, degree=1)
     stage = write_stage(line, track.parent / "line", model_std=model_std)
-    return count(compare(read, track, infer(track, stage, epochs)))
+    return count(compare(read, track, infer(track, stage, epochs, quick=quick)))
 
 
 def describe(found: Calibration, known: pd.DataFrame) -> dict[str, Any]:

@@ -24,14 +24,13 @@ Run time
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from datetime import UTC, datetime
 from typing import Any
-from unittest.mock import patch
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lmshealth import sampling
 from lmshealth.inference import infer, infer_together
 from lmshealth.metrics import coverage
 from lmshealth.results import Health
@@ -39,6 +38,7 @@ from lmshealth.stage import Stage, load_stage
 from lmshealth.tracktable import Drifts
 from models.mapping import guide_frequencies
 from models.stages import stage_named
+from studies.commands import short_chains
 from studies.record import LEVEL, Study, as_row
 
 Array = NDArray[np.float64]
@@ -132,9 +132,7 @@ def main() -> None:
     """Run the study; ``--quick`` does one pair by short chains, no control, and records nothing."""
     study = Study(__file__, __doc__)
     n = 1 if study.quick else N_PAIRS
-    # Chains of the quick form are a fifth as long.
-    length = 10 if study.quick else sampling._AUTOCORRELATION_TIMES
-    with patch.object(sampling, "_AUTOCORRELATION_TIMES", length):
+    with short_chains() if study.quick else nullcontext():
         trials = study.trials.collect(one_pair, [(k, False) for k in range(n)])
     ways = {
         way: {name: summary([t[way][name] for t in trials]) for name in trials[0][way]}

@@ -25,6 +25,7 @@ from typing import Any
 import numpy as np
 from scipy.stats import spearmanr
 
+from models.strokes import WINDOW_S
 from studies.paper_tables.tables import (
     FILES,
     PRINTED_GROWING,
@@ -57,7 +58,7 @@ REASONS = {
 
 
 def main() -> None:
-    """Run the study; ``--quick`` takes one seed, leaves out Table 2 and records nothing."""
+    """Run the study; ``--quick`` takes one seed, short controls, no Table 2, records nothing."""
     parser = options(__doc__)
     parser.add_argument("--seeds", type=int, default=20)
     study = Study(__file__, __doc__, parser.parse_args())
@@ -65,7 +66,8 @@ def main() -> None:
     rows = loop_rows() + ([] if quick else resonance_rows()) + modal_rows()
     moved = [row for axis in FILES for row in velocity_rows(axis, seeds)]
     few = min(seeds, 2)
-    control = [row for axis in FILES for row in velocity_rows(axis, few, transients=False)]
+    length = 1.0 if quick else WINDOW_S
+    control = [row for axis in FILES for row in velocity_rows(axis, few, length)]
     answer = {
         "seeds": seeds,
         "summary": summarise(moved),

@@ -123,27 +123,27 @@ def bands_of(axis: str) -> list[Array]:
     return [np.array(row) for row in bands]
 
 
-def moves(axis: str, seed: int, *, transients: bool) -> list[Recording]:
-    """Return the record of every velocity; without transients only its constant part, 4 s."""
+def moves(axis: str, seed: int, constant: float | None = None) -> list[Recording]:
+    """Return the record of every velocity, or of so many s of its constant part alone."""
     stage = STAGES[FILES[axis]]
     records = []
     for velocity in VELOCITIES:
         rng = np.random.default_rng([seed, round(velocity * 1e6)])
         move = full_stroke(stage, velocity)
-        if transients:
+        if constant is None:
             records.append(record_strokes(stage, profile=move, rng=rng))
         else:
-            seconds = min(4.0, move.constant_s)
+            seconds = min(constant, move.constant_s)
             records.append(record(stage, seconds=seconds, velocity=velocity, rng=rng))
     return records
 
 
-def velocity_rows(axis: str, seeds: int, *, transients: bool = True) -> list[Row]:
-    """Return the rows of Tables 3, 4 and 6 or 7 of one configuration."""
+def velocity_rows(axis: str, seeds: int, constant: float | None = None) -> list[Row]:
+    """Return the rows of Tables 3, 4 and 6 or 7 of one configuration; see `moves`."""
     bands = bands_of(axis)
     errors, accelerations = [], []
     for seed in range(seeds):
-        records = moves(axis, seed, transients=transients)
+        records = moves(axis, seed, constant)
         errors.append([list(error_reading(record).values()) for record in records])
         accelerations.append([acceleration_reading(record, bands) for record in records])
     keys = list(error_reading(records[0]))

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
 from typing import Any
 
 from lmshealth.metrics import clopper_pearson
+from studies.commands import call
 
 Check = dict[str, Any]
 
@@ -68,13 +67,8 @@ def control(check: Check) -> Check:
     }
 
 
-def command(*arguments: str) -> dict[str, Any]:
-    """Call the command line and return the JSON that it prints."""
-    done = subprocess.run(
-        [sys.executable, "-m", "lmshealth", *arguments, "--format", "json"],
-        capture_output=True, text=True, check=False,
-    )  # fmt: skip
-    if done.returncode:
-        raise SystemExit(f"lmshealth {arguments[0]} ended with {done.returncode}: {done.stderr}")
-    content: dict[str, Any] = json.loads(done.stdout)
+def command(*arguments: object, quick: bool) -> dict[str, Any]:
+    """Call the command line, see `call`, and return the JSON that it prints."""
+    told = call("lmshealth", *arguments, "--format", "json", quick=quick)
+    content: dict[str, Any] = json.loads(told)
     return content

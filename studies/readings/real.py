@@ -34,10 +34,10 @@ NEAR, AROUND = 0.15, 1.15
 _SHOWN_HZ = 0.5
 
 
-def read_real(data: Path) -> tuple[dict[str, Check], dict[str, Any]]:
+def read_real(data: Path, quick: bool) -> tuple[dict[str, Check], dict[str, Any]]:
     """Read the samples of a folder of real measurements."""
     checks, details = twins(data / FOLDER)
-    more, mains = measured(data / FOLDER / MEASURED)
+    more, mains = measured(data / FOLDER / MEASURED, quick)
     return checks | more, details | mains
 
 
@@ -66,10 +66,10 @@ def twins(folder: Path) -> tuple[dict[str, Check], dict[str, Any]]:
     return checks, {"ascii_and_binary": {"samples": one.size, "largest_sample_pa": top}}
 
 
-def measured(path: Path) -> tuple[dict[str, Check], dict[str, Any]]:
+def measured(path: Path, quick: bool) -> tuple[dict[str, Check], dict[str, Any]]:
     """Ask for the lines of a measured vibration, at its true sample rate and at a wrong one."""
     log = read_log(path)
-    lines = lines_of(path)
+    lines = lines_of(path, quick)
     mains = [line for line in lines if line["kind"] == "mains"]
     for line in mains:
         line |= beside_plain(log, line)
@@ -80,7 +80,7 @@ def measured(path: Path) -> tuple[dict[str, Check], dict[str, Any]]:
             file.attrs["sample_rate_hz"] = WRONG_RATE
             for k, channel in enumerate(log.channels):
                 file[f"acc_{k}_m_s2"] = np.asarray(channel.values[:])
-        moved = [line for line in lines_of(other) if line["kind"] == "mains"]
+        moved = [line for line in lines_of(other, quick) if line["kind"] == "mains"]
     known = [n * MAINS for n in range(1, 9)]
     checks = {
         "MPSTD: channels whose line at 50 Hz is called mains": at_least(len(first), 1),
@@ -110,9 +110,9 @@ def measured(path: Path) -> tuple[dict[str, Check], dict[str, Any]]:
     return checks, {"mpstd": details}
 
 
-def lines_of(path: Path) -> list[dict[str, Any]]:
+def lines_of(path: Path, quick: bool) -> list[dict[str, Any]]:
     """Return the lines that the command line tells of."""
-    told = command("spectrum", str(path), "--band", *(f"{f:g}" for f in BAND))
+    told = command("spectrum", path, "--band", *BAND, quick=quick)
     return [
         {key: line[key] for key in ("channel", "kind", "frequency_hz", "amplitude")}
         for line in told["lines"]

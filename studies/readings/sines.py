@@ -32,8 +32,8 @@ def read_sums(quick: bool, folder: Path) -> tuple[dict[str, Check], dict[str, An
         write(folder / f"sum-{i:02d}.h5", truths[-1]["samples_um"])
     for i, offset in enumerate(OFFSETS):
         write(folder / f"between-{i}.h5", between(offset))
-    told = command("error", *(str(path) for path in sorted(folder.glob("*.h5"))),
-                   "--count", str(COUNT), "--floor-nm", "30")  # fmt: skip
+    told = command("error", *sorted(folder.glob("*.h5")), "--count", COUNT, "--floor-nm", 30,
+                   quick=quick)  # fmt: skip
     rows = {Path(row["log"]).stem: row for row in told["error"]}
     for i, truth in enumerate(truths):
         row = rows[f"sum-{i:02d}"]

@@ -58,7 +58,7 @@ def read_stages(quick: bool) -> tuple[dict[str, Check], dict[str, Any]]:
                 if seed == 0:
                     departures += [beside_numpy(*pair) for pair in zip(paths, logs, strict=True)]
                 if seed == 0 and (axis == "y" or not quick):
-                    told.append(spectrum_beside_numpy(paths))
+                    told.append(spectrum_beside_numpy(paths, quick))
                 series.append([m for log in logs for m in larger(read_magnitudes(log, bands))])
         details[name] = beside_paper(axis, series)
         shares.append(shuffled(series[0], {f"{hertz} Hz" for hertz in table(axis)}))
@@ -95,13 +95,13 @@ def beside_numpy(path: Path, log: Log) -> dict[str, float]:
     return {"all figures, relative": max(off.values()), "harmonics above the floor, count": wrong}
 
 
-def spectrum_beside_numpy(paths: list[Path]) -> dict[str, float]:
+def spectrum_beside_numpy(paths: list[Path], quick: bool) -> dict[str, float]:
     """Return the largest departures of what the command line tells of a series of moves.
 
     Magnitudes of every 10 Hz of each accelerometer, and the slopes of a straight line through
     their logarithms.
     """
-    content = command("spectrum", *map(str, paths), "--band", "10", "400")
+    content = command("spectrum", *paths, "--band", 10, 400, quick=quick)
     plain: dict[tuple[str, str], list[tuple[float, float]]] = {}
     off = []
     levels = {(m["log"], m["channel"], m["band"]): m for m in content["magnitudes"]}

@@ -1,0 +1,69 @@
+"""Command lines as studies call them: as a user does, or quickly."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from contextlib import AbstractContextManager
+from importlib import import_module
+from math import inf
+from pathlib import Path
+from unittest.mock import patch
+
+from click.testing import CliRunner
+
+from lmshealth import lifefit, plots, sampling
+
+ROOT = Path(__file__).parents[1]
+_SOME_REFUSED = 3
+# Where the commands of a program are.
+_GROUPS = {"lmshealth": ("lmshealth.cli", "main"), "models": ("models.__main__", "cli")}
+
+
+def call(program: str, *arguments: object, quick: bool, some_refused: bool = False) -> str:
+    """Call a command line, and give what it prints.
+
+    Parameters
+    ----------
+    program : str
+        ``lmshealth`` or ``models``.
+    arguments : object
+        Told as text.
+    quick : bool
+        In this process, which has imported everything already, with short chains of health, lives
+        by importance sampling alone, and no pictures on pages: most of the time goes into these.
+        Not as a user calls it.
+    some_refused : bool
+        Whether logs may be refused.
+
+    Raises
+    ------
+    SystemExit
+        If it fails.
+    """
+    done = (_here if quick else _as_a_user)(program, [str(word) for word in arguments])
+    if done.returncode not in ((0, _SOME_REFUSED) if some_refused else (0,)):
+        raise SystemExit(f"{program} {arguments[0]} ended with {done.returncode}: {done.stderr}")
+    return done.stdout
+
+
+def short_chains() -> AbstractContextManager[object]:
+    """Let chains be a fifth as long; they have to converge all the same."""
+    return patch.multiple(sampling, _AUTOCORRELATION_TIMES=10, _FIRST_STEPS=100)
+
+
+def _as_a_user(program: str, words: list[str]) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", program, *words]
+    return subprocess.run(command, capture_output=True, text=True, check=False, cwd=ROOT)
+
+
+def _here(program: str, words: list[str]) -> subprocess.CompletedProcess[str]:
+    module, name = _GROUPS[program]
+    group = getattr(import_module(module), name)
+    importance_sampling = patch.object(lifefit, "_WORTH_CHAINS", inf)
+    no_pictures = patch.object(plots, "svg", lambda *_, **__: "")
+    with short_chains(), importance_sampling, no_pictures:
+        done = CliRunner().invoke(group, words, prog_name=program)
+    if done.exception is not None and not isinstance(done.exception, SystemExit):
+        raise done.exception
+    return subprocess.CompletedProcess(words, done.exit_code, done.stdout, done.stderr)
