@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from datetime import datetime
+from datetime import date, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -12,7 +12,7 @@ from numpy.linalg import LinAlgError
 
 from lmshealth.errors import NotConverged, NotEnoughData
 from lmshealth.files import write_draws, write_text
-from lmshealth.options import COV, MAINTENANCE, OUT, SEED, SHARE, TABLE, Finite, examples
+from lmshealth.options import COV, MAINTENANCE, OUT, SEED, SHARE, TABLE, Day, Finite, examples
 from lmshealth.progress import progress_bars
 
 if TYPE_CHECKING:
@@ -40,8 +40,8 @@ if TYPE_CHECKING:
 )
 @click.option(
     "--by",
-    type=click.DateTime(["%Y-%m-%d"]),
-    metavar="DATE",
+    type=Day(),
+    metavar="YYYY-MM-DD",
     help="How probable is it that a limit is reached before this day?",
 )
 @click.option("--max-risk", type=SHARE, help="Service by the last day within this risk.")
@@ -82,14 +82,8 @@ def prognose(ctx: click.Context, /, table: Path, **options: Any) -> None:
         found, lost = _foretold(histories, stage, options, progress)
     rows = []
     for life, _ in found:
-        by: datetime | None = options["by"]
-        if by is not None and by.date() <= life.recorded_at.date():
-            click.echo(
-                f"note: {life.stage}: its last log is of {life.recorded_at.date()}; --by "
-                f"{by.date()} is not after it, so that nothing is foretold for that day",
-                err=True,
-            )
-        before = None if by is None else (by.date(), reached_before(life, by.date()))
+        day = _ahead(options["by"], life)
+        before = None if day is None else (day, reached_before(life, day))
         service = decide(life, decision)
         own = prognosis_rows(life, service, before)
         print_life(life_brief(life, service, own))
@@ -103,6 +97,18 @@ def prognose(ctx: click.Context, /, table: Path, **options: Any) -> None:
         trees = [posterior.to_arviz() for _, posterior in found if posterior is not None]
         write_draws(options["posterior"], [life.stage for life, _ in found], trees)
     ctx.exit(3 if lost else 0)
+
+
+def _ahead(by: datetime | None, life: Prognosis) -> date | None:
+    """Give the day that is asked for, if it lies ahead; of one that does not nothing is foretold."""
+    if by is None or by.date() > life.recorded_at.date():
+        return None if by is None else by.date()
+    click.echo(
+        f"note: {life.stage}: its last log is of {life.recorded_at.date()}; --by {by.date()} is "
+        "not after it, so that nothing is foretold for that day",
+        err=True,
+    )
+    return None
 
 
 def _decision(described: Decision, options: dict[str, Any]) -> Decision:

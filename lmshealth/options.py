@@ -67,6 +67,20 @@ class Finite(click.FloatRange):
         return number
 
 
+class Day(click.DateTime):
+    """A day of the calendar."""
+
+    def __init__(self) -> None:
+        super().__init__(["%Y-%m-%d"])
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """Say how a day is written, not which format does not match."""
+        try:
+            return super().convert(value, param, ctx)
+        except click.BadParameter:
+            self.fail(f"{value!r} is no day; needed YYYY-MM-DD, such as 2027-03-01.", param, ctx)
+
+
 SHARE = Finite(0, 1, min_open=True, max_open=True)
 
 

@@ -16,7 +16,15 @@ from lmshealth.results import Prognosis
 from lmshealth.stage import Stage
 from lmshealth.tables import COLUMNS
 from lmshealth.tracks import History
-from tests.lives import FADING, FREQUENCY, TEMPERATURE, make_prognosis, make_stage, true_drift
+from tests.lives import (
+    FADING,
+    FREQUENCY,
+    START,
+    TEMPERATURE,
+    make_prognosis,
+    make_stage,
+    true_drift,
+)
 
 TAIL = TEMPERATURE + "[usage]\nhorizon_km = 5000\n[decision]\nnext_service = 2026-06-01\n"
 LIMIT_KM = 0.4 / 1.5e-4 + 100 - 1200  # where AX-1 is at its limit, from its last log
@@ -166,3 +174,28 @@ def test_what_is_no_finite_number_is_wrong_usage(
     result = call(table, "--stage", toml, "--out", out, option, value)
     assert result.exit_code == 2
     assert option in result.stderr and not out.exists()
+
+
+@pytest.mark.usefixtures("quick")
+def test_nothing_is_foretold_for_a_day_that_is_past(
+    table: Path, toml: Path, tmp_path: Path
+) -> None:
+    """The day of the last log, or one before it, has a note and no probability anywhere."""
+    out = tmp_path / "p.csv"
+    for day in ("2026-01-01", START.date().isoformat()):
+        result = call(table, "--stage", toml, "--out", out, "--by", day)
+        assert result.exit_code == 0, result.output
+        assert f"--by {day} is not after it" in result.stderr
+        assert f"before {day}" not in result.stdout
+        assert "before" not in pd.read_csv(out).columns
+
+
+@pytest.mark.parametrize("day", ["soon", "01.03.2027", "2027-13-01"])
+def test_what_is_no_day_is_told_how_a_day_is_written(
+    table: Path, toml: Path, tmp_path: Path, day: str
+) -> None:
+    """Status 2, with the form and an example instead of the signs of a format."""
+    result = call(table, "--stage", toml, "--out", tmp_path / "p.csv", "--by", day)
+    assert result.exit_code == 2
+    assert f"{day!r} is no day; needed YYYY-MM-DD, such as 2027-03-01" in result.stderr
+    assert "%" not in result.stderr
