@@ -300,13 +300,23 @@ def _identified(log: Log, stages: tuple[Stage, ...]) -> Reading:
     """Identify a log by the description that takes it."""
     stage = next((stage for stage in stages if stage.takes(log.metadata)), None)
     if stage is None:
-        raise BadLog(
-            log.name,
-            "no-stage",
-            f"stage {log.metadata.stage!r} matches none of the descriptions "
-            f"{[s.description.match.stage for s in stages]}; give its description by --stage",
-        )
+        raise BadLog(log.name, "no-stage", _untaken(log.metadata, stages))
     modes = identify(log, stage)
     return Reading(
         log.name, log.digest, log.metadata, modes, loop_error(log), read_levels(log, stage)
+    )
+
+
+def _untaken(metadata: Metadata, stages: Sequence[Stage]) -> str:
+    """Say why no description takes a log, and the two places where that can be mended."""
+    if metadata.description is not None:
+        return (
+            f"its description is to be {metadata.description!r}, and --stage gives "
+            f"{', '.join(stage.name for stage in stages)}; give that one, or mend column "
+            "description of manifest.csv"
+        )
+    asked = ", ".join(f"{stage.description.match.stage!r} in {stage.name}" for stage in stages)
+    return (
+        f"no description takes stage {metadata.stage!r}: [match] stage is {asked}; mend it there, "
+        "or give by --stage the description of this machine"
     )

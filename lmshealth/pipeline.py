@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Container, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, closing
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
@@ -157,8 +157,8 @@ def run(
     lost = ({refusal.log for refusal in refused} - copies | contradicted) & taken.logs
     if not machines:
         raise NothingUsable(
-            f"{folder}: no usable log: {len(taken.logs)} found, {len(lost)} refused; "
-            f"{out / 'refused.csv'} says why"
+            f"{folder}: no usable log: {len(taken.logs)} found, {len(lost)} refused"
+            f"{_commonest(refused, lost)}; {out / 'refused.csv'} lists all"
         )
     return RunResult(
         index=write_index(out, rows, refused),
@@ -242,6 +242,19 @@ def _prepare(out: Path) -> None:
         TemporaryFile(dir=out).close()
     except OSError as error:
         raise LmshealthError(f"{out}: cannot be written to: {error.strerror}") from error
+
+
+def _commonest(refused: Iterable[Refusal], lost: Container[str]) -> str:
+    """Say why most of the lost logs were refused, in the words of the first of them."""
+    why: dict[str, dict[str, str]] = {}
+    for refusal in refused:
+        if refusal.log in lost:
+            why.setdefault(refusal.reason, {}).setdefault(refusal.log, refusal.detail)
+    if not why:
+        return ""
+    reason, details = max(why.items(), key=lambda item: len(item[1]))
+    log, detail = min(details.items())
+    return f": {len(details)} as {reason}, such as {log}: {detail}"
 
 
 def _machines(

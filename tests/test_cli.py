@@ -610,10 +610,27 @@ def test_a_log_that_no_description_takes_is_refused(stage: Path, tmp_path: Path)
     """A machine without a description is ``no-stage``, and says which there are."""
     logs = tmp_path / "logs"
     write_log(logs / "foreign.h5", 1.0, 1, stage="other-Z")
-    assert run(logs, stage, tmp_path / "out").exit_code == 1
+    result = run(logs, stage, tmp_path / "out")
+    assert result.exit_code == 1
     (row,) = csv.DictReader((tmp_path / "out" / "refused.csv").read_text().splitlines())
     assert row["reason"] == "no-stage"
-    assert "*-A" in row["detail"]
+    assert "no description takes stage 'other-Z': [match] stage is '*-A' in small" in row["detail"]
+    assert "mend it there, or give by --stage" in row["detail"]
+    assert len(result.stderr.splitlines()) == 1
+    assert f"1 refused: 1 as no-stage, such as foreign.h5: {row['detail']}; " in result.stderr
+
+
+def test_a_description_that_a_manifest_asks_for_and_nobody_gave_is_named(
+    stage: Path, tmp_path: Path
+) -> None:
+    """It is not the stage of the log that matches nothing then."""
+    logs = tmp_path / "logs"
+    write_log(logs / "a.h5", 1.0, 1)
+    (logs / "manifest.csv").write_text("file,description\na.h5,lms-q\n")
+    result = run(logs, stage, tmp_path / "out")
+    assert result.exit_code == 1
+    assert "its description is to be 'lms-q', and --stage gives small" in result.stderr
+    assert "column description of manifest.csv" in result.stderr
 
 
 @pytest.mark.parametrize("reference", ["lms-q", "nowhere/stage.toml"])

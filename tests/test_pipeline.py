@@ -540,15 +540,17 @@ def test_each_log_goes_to_the_first_description_that_takes_it(tmp_path: Path) ->
 def test_an_archive_of_bad_logs_only_is_an_error_with_its_reasons_written(
     tmp_path: Path, modes_only: Stage
 ) -> None:
-    """When every log is refused the job fails, says how many, and refused.csv says why."""
+    """When every log is refused the job fails, says how many and mostly why; refused.csv has all."""
     logs = tmp_path / "logs"
     logs.mkdir()
     (logs / "broken.h5").write_bytes(b"nothing")
     (logs / "empty.csv").write_bytes(b"")
-    with pytest.raises(NothingUsable, match="2 found, 2 refused"):
+    (logs / "hollow.csv").write_bytes(b"")
+    with pytest.raises(NothingUsable, match="3 found, 3 refused: 2 as empty") as refusal:
         run(logs, [modes_only], tmp_path / "out")
+    assert "such as empty.csv: 0 bytes; copy the file again; " in str(refusal.value)
     refused = {row["log"]: row["reason"] for row in rows(tmp_path / "out" / "refused.csv")}
-    assert set(refused) == {"broken.h5", "empty.csv"}
+    assert set(refused) == {"broken.h5", "empty.csv", "hollow.csv"}
     assert refused["empty.csv"] == "empty"
 
 
