@@ -20,7 +20,9 @@ Kind = TypeVar("Kind")
 Keys = tuple[str | int, ...]
 
 _PLACE = re.compile(r" - at `\$(?P<path>.*)`$")
-_STEP = re.compile(r"\.([^.\[]+)|\[(\d+)\]")
+_STEP = re.compile(r"\.([^.\[\]]+)|\[(\d+)\]")
+# Which value of a table with free keys is wrong, msgspec does not say.
+_ANY_VALUE = "[...]"
 _FIELD = re.compile(r"Object (?P<what>contains unknown|missing required) field `(?P<field>.*)`$")
 
 
@@ -78,7 +80,7 @@ def place(content: bytes, *keys: str | int) -> str:
 
 def _text(content: bytes) -> str:
     if len(content) > _LONGEST:
-        raise ValueError(f"{len(content)} bytes are no description; needed at most {_LONGEST}")
+        raise ValueError(f"{len(content)} bytes are too many; needed at most {_LONGEST}")
     try:
         return content.decode("utf-8-sig").replace("\r\n", "\n")
     except UnicodeDecodeError as error:
@@ -142,6 +144,8 @@ def _told(error: str, table: Any, schema: Type) -> tuple[Keys, str]:
     keys: Keys = ()
     if path:
         error = error[: path.start()]
+        if path["path"].endswith(_ANY_VALUE):
+            error = f"one of its values: {error}"
         keys = tuple(name or int(index) for name, index in _STEP.findall(path["path"]))
     if field := _FIELD.match(error):
         name = field["field"]

@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-import tomllib
 from datetime import date, datetime
 from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any
 
-import msgspec
 from msgspec import Meta, Struct
 
 from lmshealth.errors import BadTable
 from lmshealth.readers.metadata import KEYS
 from lmshealth.readers.trouble import Unusable, listed
 from lmshealth.readers.units import Signal, parse_column, role_of
+from lmshealth.toml import decode
 
 
 class CsvLayout(Struct, frozen=True, forbid_unknown_fields=True):
@@ -124,11 +123,9 @@ def load_columns(path: str | Path) -> ColumnMap:
         are not in the log contract.
     """
     try:
-        table = tomllib.loads(Path(path).read_text(encoding="utf-8"))
-        columns = msgspec.convert(table, ColumnMap)
+        columns = decode(Path(path).read_bytes(), ColumnMap)
         _check(columns)
-    except (OSError, ValueError, RecursionError) as error:
-        # msgspec's and tomllib's errors, and text that is not UTF-8, are all ValueErrors.
+    except (OSError, ValueError) as error:
         raise BadTable(f"column map {path}: {error}") from error
     except Unusable as error:
         raise BadTable(f"column map {path}: {error.detail}") from error

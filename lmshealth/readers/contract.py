@@ -101,9 +101,10 @@ def _said(overrides: Mapping[str, str]) -> dict[str, str]:
 def _series(raw: Raw, columns: ColumnMap) -> list[_Series]:
     """Name the columns, convert them to SI and compare their lengths."""
     there = f"there: {listed(raw.present)}"
+    hint = f"; {raw.hint}" if raw.hint else ""
     left_out = {refusal.channel for refusal in raw.refused}
     if absent := sorted(set(columns.columns.values()) - set(raw.columns) - left_out):
-        raise Unusable("columns", f"the column map needs {listed(absent)}; {there}")
+        raise Unusable("columns", f"the column map needs {listed(absent)}; {there}{hint}")
     series = []
     for source, values in raw.columns.items():
         target = columns.target(source)
@@ -122,7 +123,7 @@ def _series(raw: Raw, columns: ColumnMap) -> list[_Series]:
     if twice := sorted({item for item in names if names.count(item) > 1}):
         raise Unusable("columns", f"{listed(twice)} comes in more than one unit; {there}")
     if not any(item.signal.role in _DYNAMIC for item in series):
-        hint = "" if columns.columns else "; a column map (--columns) translates other names"
+        hint += "" if columns.columns else "; a column map (--columns) translates other names"
         raise Unusable("columns", f"no signal: {_NEEDED}; {there}{hint}")
     _check_lengths(series)
     return series

@@ -25,6 +25,8 @@ from lmshealth.samples import MINUTE, Samples
 # What becomes of warnings is a setting of the process, which threads share.
 _WARNINGS = threading.Lock()
 _GZIP_MAGIC = b"\x1f\x8b"
+# What separates columns in exports, and in how many first lines their names are looked for.
+_DELIMITERS, _HEAD = ",;\t| ", 100
 _BOM = b"\xef\xbb\xbf"
 # Rows are read so many at a time, and fewer of wide tables: what they take stays in the cache.
 _ROWS = 1 << 16
@@ -69,7 +71,7 @@ def parse_text(stream: BufferedIOBase, stored: int, columns: ColumnMap) -> Raw:
     if twice := sorted({name for name in chosen if names.count(name) > 1}):
         raise Unusable("columns", f"the header names {listed(twice)} more than once")
     if not chosen:
-        return Raw({}, metadata, tuple(names))
+        return Raw({}, metadata, tuple(names), hint=_hint(text, columns))
     places = {name: names.index(name) for name in chosen}
     return Raw(_numbers(text, len(names), places, layout.delimiter), metadata, tuple(names))
 
@@ -135,6 +137,37 @@ def _header(text: Text, layout: CsvLayout) -> list[str]:
             f"[csv] header names {len(layout.header)} columns, the first row has {len(fields)}",
         )
     return list(layout.header)
+
+
+def _hint(text: Text, columns: ColumnMap) -> str:
+    """Say what under ``[csv]`` may not fit a file whose header names nothing that is wanted."""
+    layout = columns.csv
+    if layout.header is not True:
+        return ""
+    text.seek(0)
+    head = b"".join(text.line() for _ in range(_HEAD)).removeprefix(_BOM).decode(errors="replace")
+    # Leading "# key: value" lines stand before the header; only what else does is to be skipped.
+    n_skip = 0
+    for n_before, line in enumerate(head.splitlines()):
+        fitting = [d for d in (layout.delimiter, *_DELIMITERS) if _names(line, d, columns)]
+        if fitting:
+            wrong = [] if fitting[0] == layout.delimiter else [f'delimiter = "{fitting[0]}"']
+            if not n_skip <= layout.skip_rows <= n_before:
+                wrong.append(f"skip_rows = {n_skip}")
+            what = " and ".join(wrong).replace("\t", "\\t")
+            return f"line {n_before + 1} names them: set {what} under [csv] of the column map"
+        if line.strip() and not line.startswith("#"):
+            n_skip = n_before + 1
+    fits = "do skip_rows and delimiter under [csv] of the column map fit the file?"
+    return fits if columns.columns else ""
+
+
+def _names(line: str, delimiter: str, columns: ColumnMap) -> bool:
+    """Tell whether a line names the wanted columns; without a column map, any of the contract."""
+    fields = {field.strip().strip('"') for field in line.split(delimiter)}
+    if columns.columns:
+        return set(columns.columns.values()) <= fields
+    return any(columns.target(field) is not None for field in fields)
 
 
 def _numbers(

@@ -30,12 +30,15 @@ class Raw:
         All column names of the file, for messages.
     refused : tuple of Refusal
         Channels that are wanted and cannot go with the others; their log is not named yet.
+    hint : str
+        What in the column map may not fit the file, where wanted columns are not found.
     """
 
     columns: dict[str, Samples]
     metadata: dict[str, str]
     present: tuple[str, ...]
     refused: tuple[Refusal, ...] = ()
+    hint: str = ""
 
 
 @dataclass(frozen=True, slots=True)

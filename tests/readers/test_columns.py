@@ -84,3 +84,24 @@ def test_absent_map(tmp_path):
     """A map that is not there is an error that names it."""
     with pytest.raises(BadTable, match="nowhere"):
         load_columns(tmp_path / "nowhere.toml")
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        (
+            "[columns]\nacc_x_g = 'a'\n\n[csv]\ndelimeter = ';'",
+            r"line 5: csv\.delimeter: unknown key; known are skip_rows, delimiter, header",
+        ),
+        ("colums = 1", r"line 1: colums: unknown key; known are columns, units, metadata, "),
+        ("[csv]\nskip_rows = 'two'", r"line 2: csv\.skip_rows: Expected `int`, got `str`"),
+        ("[columns]\nacc_x_g = 1", "line 1: columns: one of its values: Expected `str`, got"),
+        ("[csv]\nheader = false\n[", "line 3: no TOML"),
+    ],
+)
+def test_a_slip_in_a_map_is_told_by_line_and_key(tmp_path, text, said):
+    """As in a stage description, and never in the words of a library."""
+    (tmp_path / "map.toml").write_text(text)
+    with pytest.raises(BadTable, match=said) as error:
+        load_columns(tmp_path / "map.toml")
+    assert "$" not in str(error.value)

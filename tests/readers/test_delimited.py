@@ -7,7 +7,8 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from lmshealth.readers import delimited, read_log, text
+from lmshealth.errors import BadLog
+from lmshealth.readers import delimited, load_columns, read_log, text
 from lmshealth.readers.columns import ColumnMap, CsvLayout
 from lmshealth.readers.delimited import parse_text
 from lmshealth.readers.trouble import Unusable
@@ -176,3 +177,54 @@ def test_names_of_text(make, name):
     path = make("log.csv").with_name(name)
     path.write_bytes(gzip.compress(data) if name.endswith(".gz") else data)
     assert len(read_log(path).channels) == 2
+
+
+TABLE = "time;PE(0);AI 3\n0;1;2\n1;3;5\n2;4;1\n"
+MAP = "[columns]\ndelta_e_um = 'PE(0)'\nacc_x_g = 'AI 3'\n[csv]\n"
+
+
+@pytest.mark.parametrize(
+    ("before", "layout", "said"),
+    [
+        ("", "", 'line 1 names them: set delimiter = ";" under [csv] of the column map'),
+        ("Rate 20 kHz\n\n", "delimiter = ';'", "line 3 names them: set skip_rows = 1 under"),
+        ("Rate 20 kHz\n# stage: A\n", "delimiter = ';'", "line 3 names them: set skip_rows = 1 u"),
+        ("Rate 20 kHz\n", "skip_rows = 1", 'line 2 names them: set delimiter = ";" under'),
+        ("Rate\n", "", 'line 2 names them: set delimiter = ";" and skip_rows = 1 under [csv]'),
+        ("", "delimiter = ';'\nskip_rows = 1", "line 1 names them: set skip_rows = 0 under [csv]"),
+    ],
+)
+def test_a_layout_that_does_not_fit_is_told_by_its_key(tmp_path, before, layout, said):
+    """The line that has the wanted names, and what to set; with that the file is read."""
+    (tmp_path / "log.csv").write_text(before + TABLE)
+    (tmp_path / "map.toml").write_text(MAP + layout)
+    with pytest.raises(BadLog) as refused:
+        read_log(tmp_path / "log.csv", columns=load_columns(tmp_path / "map.toml"))
+    assert refused.value.reason == "columns"
+    assert "the column map needs AI 3, PE(0); there: " in refused.value.detail
+    assert said in refused.value.detail
+
+
+def test_names_that_no_line_has_are_asked_for(tmp_path):
+    """Where no layout finds the names the keys are named; where some are found no key is blamed."""
+    (tmp_path / "log.csv").write_text(TABLE)
+    for names, said in ((("PE(1)", "AI 5"), True), (("PE(0)", "AI 5"), False)):
+        columns = ColumnMap(
+            columns=dict(zip(("delta_e_um", "acc_x_g"), names, strict=True)),
+            csv=CsvLayout(delimiter=";"),
+        )
+        with pytest.raises(BadLog, match="needs AI 5") as refused:
+            read_log(tmp_path / "log.csv", columns=columns)
+        assert ("do skip_rows and delimiter" in refused.value.detail) is said
+
+
+def test_a_contract_file_behind_a_preamble_is_told_where_it_begins(tmp_path):
+    """Without a column map the line that names a signal is told, and nothing where none does."""
+    (tmp_path / "log.csv").write_text("Rate 20 kHz\ntime_s,delta_e_um\n0,1\n1,2\n")
+    with pytest.raises(BadLog, match="line 2 names them: set skip_rows = 1 under") as refused:
+        read_log(tmp_path / "log.csv")
+    assert "no signal" in refused.value.detail
+    (tmp_path / "log.csv").write_text("a,b\n0,1\n1,2\n")
+    with pytest.raises(BadLog, match="no signal") as refused:
+        read_log(tmp_path / "log.csv")
+    assert "[csv]" not in refused.value.detail
