@@ -28,9 +28,10 @@ class LifeBrief:
     title : str
         What stands above the table.
     cells : tuple of tuple of str
-        One row per limit and level: until, %, km, hours, days, date.
+        One row per limit and level: until, probability, km, hours, days, date; below them rows
+        with only the first of these, for what else is known of the limit.
     sentences : tuple of str
-        What stands below it: laws, what no mode tells, when to service.
+        What stands below it: whether one limit is all, laws, what no mode tells, when to service.
     """
 
     title: str
@@ -94,16 +95,34 @@ def life_brief(prognosis: Prognosis, service: Service, rows: Sequence[Row]) -> L
     rows : sequence of dict
         As `prognosis_rows` gives them.
     """
-    shown = rows if len(rows) > 2 else rows[:1]  # of one limit "any" is the same
     title = (
         f"{prognosis.stage}: what is left after {prognosis.recorded_at:%Y-%m-%d}, "
         f"at {prognosis.travel / _KM:,.0f} km"
     )
+    blocks = [tuple(_life_cells(prognosis, row)) for row in rows]
+    same = _same_as_any(blocks)
     return LifeBrief(
         title=title,
-        cells=tuple(cell for row in shown for cell in _life_cells(prognosis, row)),
-        sentences=(*_laws(prognosis), *_untold(prognosis), _advice(prognosis, service)),
+        cells=tuple(cell for block in (blocks if same is None else blocks[:-1]) for cell in block),
+        sentences=(
+            *([] if same is None else [f"Any limit: the same as {same}."]),
+            *_laws(prognosis),
+            *_untold(prognosis),
+            *_advice(prognosis, service),
+        ),
     )
+
+
+def _same_as_any(blocks: Sequence[tuple[tuple[str, ...], ...]]) -> str | None:
+    """Name the limit after which the last block, of any limit, would say the same again."""
+    *each, last = blocks
+    alike = [
+        block[0][0]
+        for block in each
+        if [b[1:] for b in block] == [b[1:] for b in last]
+        and [b[0] for b in block[1:]] == [b[0] for b in last[1:]]
+    ]
+    return alike[0] if alike else None
 
 
 def due(service: Service) -> str:
@@ -114,26 +133,29 @@ def due(service: Service) -> str:
 
 
 def _life_cells(prognosis: Prognosis, row: Row) -> Iterator[tuple[str, ...]]:
-    """One line per level; beside the first ones stands what else is known of the limit."""
+    """One line per level, then what else is known of the limit, each on a line of its own."""
     end = f"{prognosis.horizon / _KM:,.0f}"
     name = spell(row["parameter"])
-    beside = [
-        "any limit" if np.isnan(row["limit"]) else f"{name} below {row['limit']:g}",
-        f"  already: {_plain(percent(row['probability_already_past']))}",
-        f"  beyond {end} km: {_plain(percent(row['probability_beyond_horizon']))}",
-    ]
+    text = "any limit" if np.isnan(row["limit"]) else f"{name} below {row['limit']:g}"
+    levels = [f"{100 * level:02.0f}" for level in RUL_LEVELS]
+    for level in levels:
+        share, days = f"{int(level)}", row[f"rul_days_q{level}"]
+        if days is None:
+            share = share if level == levels[-1] else f"{share} to {int(levels[-1])}"
+            yield text, share, f"beyond {end}", "–", "–", "–"
+            break
+        travel, hours = (f"{row[f'rul_{unit}_q{level}']:,.0f}" for unit in ("km", "hours"))
+        yield text, share, travel, hours, f"{days:,.1f}", _day(day_after(prognosis, days))
+        text = ""
+    notes = {
+        "already": percent(row["probability_already_past"]),
+        f"beyond {end} km": percent(row["probability_beyond_horizon"]),
+    }
     if "before" in row:
         bounds = chance(row["probability_at_least"], row["probability_at_most"])
-        beside.append(f"  before {row['before']}: {_plain(bounds)}")
-    beside += [""] * (len(RUL_LEVELS) - len(beside))
-    for level, text in zip(RUL_LEVELS, beside, strict=True):
-        key = f"q{100 * level:02.0f}"
-        share, days = f"{100 * level:.0f}", row[f"rul_days_{key}"]
-        if days is None:
-            yield text, share, f"beyond {end}", "–", "–", "–"
-            continue
-        travel, hours = (f"{row[f'rul_{unit}_{key}']:,.0f}" for unit in ("km", "hours"))
-        yield text, share, travel, hours, f"{days:,.1f}", _day(day_after(prognosis, days))
+        notes[f"before {row['before']}"] = bounds
+    for what, probability in notes.items():
+        yield f"  {what}: {_plain(probability)}", "", "", "", "", ""
 
 
 def _laws(prognosis: Prognosis) -> Iterator[str]:
@@ -162,26 +184,26 @@ def _day(day: date | None) -> str:
     return "past any" if day is None else day.isoformat()
 
 
-def _advice(prognosis: Prognosis, service: Service) -> str:
+def _advice(prognosis: Prognosis, service: Service) -> Iterator[str]:
     """Say when to service, why then, and what the planned service risks."""
     chosen = (
         f"accepted risk {100 * service.max_risk:.3g} %"
         if service.max_risk
         else f"least costs, where a failure costs {service.cost_ratio:.3g} times a service"
     )
-    text = f"Service: {due(service)} ({chosen}).\n"
+    yield f"Service: {due(service)} ({chosen})."
+    risk = _plain(percent(service.risk))
     if service.kind == "later":
-        text += f"Nothing asks for one within {prognosis.horizon / _KM:,.0f} km."
+        yield f"Nothing asks for one within {prognosis.horizon / _KM:,.0f} km."
     elif service.by is None:
-        text += "The machine hardly moves: no calendar has the day."
-    else:
-        when = "already" if service.kind == "now" else "before that day"
-        risk = _plain(percent(service.risk))
-        text += f"Probability that a limit is reached {when}, at most: {risk}."
+        yield "The machine hardly moves: no calendar has the day."
+    elif service.kind == "now":
+        yield f"Probability that a limit is reached already, at most: {risk}."
+    elif not service.max_risk or risk != f"{100 * service.max_risk:.3g} %":
+        yield f"Probability that a limit is reached before that day, at most: {risk}."
     if service.planned is not None:
         planned = _plain(chance(*service.planned_risk))
-        text += f"\nBefore the service planned for {service.planned}: {planned}."
-    return text
+        yield f"Before the service planned for {service.planned}: {planned}."
 
 
 def _verdict(assessment: Assessment) -> str:

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
-from lmshealth import terminal
+from lmshealth import logview, planview, terminal
 from lmshealth.batchcommands import report, run
 from lmshealth.commands import COMMANDS
 from lmshealth.errors import BadLog, LmshealthError
@@ -38,6 +38,12 @@ if TYPE_CHECKING:
 Result = TypeVar("Result")
 
 _DONE, _FAILED, _SOME_REFUSED = 0, 1, 3
+
+
+_NO_BAND = (
+    "Without a band or a description close modes may be merged or missed; look closer with --band "
+    "LOW HIGH. Names hold for this call only."
+)
 
 
 class _Group(click.Group):
@@ -117,14 +123,17 @@ def modes(ctx: click.Context, /, logs: tuple[Path, ...], style: str, **options: 
         ),
     )
     rows = [row for reading in found for row in modes_rows(reading)]
-    refused = refused_rows([*lost, *(r for reading in found for r in reading.modes.refused)])
+    doubted = [r for reading in found for r in reading.modes.refused]
+    refused = refused_rows([*lost, *doubted])
     if style == "csv":
         click.echo(frame(COLUMNS["modes"], rows).to_csv(index=False), nl=False)
     elif style == "json":
         lines = [{"log": r.log, **row} for r in found for row in lines_rows(r.modes.lines)]
         terminal.print_json({"modes": rows, "lines": lines, "refused": refused})
-    else:
-        terminal.print_modes(rows, refused)
+    elif found:
+        logview.print_modes(rows, refused_rows(doubted))
+        if rows and stage is None and band is None:
+            terminal.print_text(_NO_BAND)
     _exit(ctx, found, lost)
 
 
@@ -175,14 +184,15 @@ def error(ctx: click.Context, /, logs: tuple[Path, ...], style: str, **options: 
         ),
     )
     rows = [error_row(log, item) for log, _, own in found for item in own]
-    refused = refused_rows([*lost, *(refusal for _, its, _ in found for refusal in its)])
+    kept = [row for log, _, own in found for item in own for row in harmonics_rows(log, item)]
+    doubted = [refusal for _, its, _ in found for refusal in its]
+    refused = refused_rows([*lost, *doubted])
     if style == "csv":
         click.echo(frame(LOOKS["error"], rows).to_csv(index=False), nl=False)
     elif style == "json":
-        kept = [row for log, _, own in found for item in own for row in harmonics_rows(log, item)]
         terminal.print_json({"error": rows, "harmonics": kept, "refused": refused})
     else:
-        terminal.print_error(rows, refused)
+        logview.print_error(rows, kept, refused_rows(doubted))
     _exit(ctx, found, lost)
 
 
@@ -225,14 +235,15 @@ def spectrum(ctx: click.Context, /, logs: tuple[Path, ...], style: str, **option
     known = [(own.log, line) for own in found for line in own.lines]
     rows = magnitudes_rows(magnitudes, growth, known)
     lines = [{"log": own.log, **row} for own in found for row in lines_rows(own.lines)]
-    refused = refused_rows([*lost, *(refusal for own in found for refusal in own.refused)])
+    doubted = [refusal for own in found for refusal in own.refused]
+    refused = refused_rows([*lost, *doubted])
     if style == "csv":
         click.echo(frame(LOOKS["magnitudes"], rows).to_csv(index=False), nl=False)
     elif style == "json":
         content = {"magnitudes": rows, "growth": growth_rows(growth), "lines": lines}
         terminal.print_json({**content, "refused": refused})
     else:
-        terminal.print_magnitudes(rows, lines, refused)
+        logview.print_magnitudes(rows, lines, refused_rows(doubted))
     _exit(ctx, found, lost)
 
 
@@ -271,7 +282,7 @@ def frf(ctx: click.Context, /, logs: tuple[Path, ...], style: str, **options: An
     modes; json has the response with H1, H2, Hv and coherence too. With a stage modes are named as
     it names them, wherever one alone lies where it is looked for.
     """
-    from lmshealth.frf import name_modes, read_frf
+    from lmshealth.frf import name_modes, read_frf, why_unnamed
     from lmshealth.history import Reading
     from lmshealth.looks import fit_row, frf_rows, lines_rows
     from lmshealth.tables import COLUMNS, frame, modes_rows, refused_rows
@@ -291,7 +302,8 @@ def frf(ctx: click.Context, /, logs: tuple[Path, ...], style: str, **options: An
     rows = [row for reading in readings for row in modes_rows(reading)]
     fits = [fit_row(it.name, own) for it, own in found]
     response = [row for it, own in found for row in frf_rows(it.name, own)]
-    refused = refused_rows([*lost, *(r for _, own in found for r in own.modes.refused)])
+    doubted = [r for _, own in found for r in own.modes.refused]
+    refused = refused_rows([*lost, *doubted])
     if style == "csv":
         click.echo(frame(COLUMNS["modes"], rows).to_csv(index=False), nl=False)
     elif style == "json":
@@ -299,7 +311,11 @@ def frf(ctx: click.Context, /, logs: tuple[Path, ...], style: str, **options: An
         content = {"modes": rows, "fit": fits, "frf": response, "lines": lines}
         terminal.print_json({**content, "refused": refused})
     elif found:
-        terminal.print_frf(fits, response, rows, refused)
+        logview.print_frf(fits, response, rows, refused_rows(doubted))
+    if stage and style != "json":
+        for reading in readings:
+            for why in why_unnamed(reading.modes, stage):
+                click.echo(f"note: {reading.log}: {why}", err=True)
     _exit(ctx, found, lost)
 
 
@@ -354,7 +370,7 @@ def plan(stage: str, detections: list[tuple[str, float]], style: str, **options:
     if style == "json":
         terminal.print_json(content)
     else:
-        terminal.print_plans(**content)
+        planview.print_plans(**content)
 
 
 def _loaded(stage: str | None, columns: Path | None) -> tuple[Stage | None, ColumnMap | None]:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from lmshealth import terminal
+from lmshealth import machineview, terminal
 from lmshealth.errors import BadTable, NotEnoughData
 from lmshealth.files import write_draws, write_text
 from lmshealth.lifecommands import prognose
@@ -79,7 +79,7 @@ def track(table: Path, out: Path, **options: Any) -> None:
         for name, found in _rows(followed, later, lost).items():
             rows[name] += found
         notes += _notes(history, lost)
-        terminal.print_track(followed)
+        machineview.print_track(followed)
     for note in notes:
         click.echo(f"note: {note}", err=True)
     _write(rows, {"track": out} | {name: options[name] for name in _TABLES[1:]})
@@ -164,7 +164,7 @@ def infer(ctx: click.Context, /, table: Path, **options: Any) -> None:
     with progress_bars() as progress:
         found, lost = _inferred(table, options, progress)
     for health in found:
-        terminal.print_health(health)
+        machineview.print_health(health)
     for why in lost:
         click.echo(f"lmshealth: {why}", err=True)
     if not found:

@@ -139,19 +139,19 @@ def _surrogate(examined: Examination) -> Finding:
     checks = [check for check in examined.modes if check.informs]
     worst = max(checks, key=lambda check: check.surrogate_error)
     share = max(check.surrogate_error / check.reached for check in checks)
-    good = worst.surrogate_error <= SURROGATE_TARGET
+    meets = worst.surrogate_error <= SURROGATE_TARGET
     text = (
         f"The surrogate meets points left out of the map within {worst.surrogate_error:.1e} of "
-        f"ln f ({worst.mode.name}), {'at most' if good else 'more than'} the "
+        f"ln f ({worst.mode.name}), {'at most' if meets else 'more than'} the "
         f"{SURROGATE_TARGET:g} wanted; {_share(share)} of what usual logs reach."
     )
     if share > 1:
         text += (
             " It limits what can be told: make the map's grid denser, above all where modes cross."
         )
-    elif not good and share < _SLIGHT:
+    elif not meets and share < _SLIGHT:
         text += " It does not limit what can be told."
-    return Finding("map", good, text)
+    return Finding("map", meets or share < _SLIGHT, text)
 
 
 def _covered(coverage: Coverage) -> Iterator[Finding]:

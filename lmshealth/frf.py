@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import fft
 
-from lmshealth.arrays import FloatArray
+from lmshealth.arrays import BoolArray, FloatArray
 from lmshealth.errors import BadLog
 from lmshealth.lines import name_lines
 from lmshealth.logs import Channel, Log, Refusal
@@ -222,15 +223,39 @@ def name_modes(modes: Modes, stage: Stage) -> Modes:
         A mode has a name if it alone lies where the description looks for that name, and for no
         other; all others have none, and `track` finds out whose they are.
     """
-    described = [(spec.name, spec.frequency_hz, spec.search) for spec in stage.modes]
-    near = np.array(
-        [np.abs(modes.frequency / hz - 1) <= search for _, hz, search in described]
-    ).reshape(len(described), -1)
+    near = _near(modes, stage)
     names = [""] * len(modes.names)
-    for mode, (name, _, _) in zip(near, described, strict=True):
+    for mode, spec in zip(near, stage.modes, strict=True):
         if mode.sum() == 1 and near[:, mode].sum() == 1:
-            names[int(mode.argmax())] = name
+            names[int(mode.argmax())] = spec.name
     return replace(modes, names=tuple(names))
+
+
+def why_unnamed(modes: Modes, stage: Stage) -> Iterator[str]:
+    """Say why modes have no name after `name_modes`, where a description looks for any there.
+
+    Parameters
+    ----------
+    modes : Modes
+        Named.
+    stage : Stage
+        By which they are named.
+    """
+    near = _near(modes, stage)
+    for place in np.flatnonzero([not name for name in modes.names]):
+        sought = [spec.name for spec, own in zip(stage.modes, near, strict=True) if own[place]]
+        told = f"the mode at {modes.frequency[place]:.5g} Hz has no name: "
+        if len(sought) > 1:
+            several = f"{', '.join(sought[:-1])} and {sought[-1]}"
+            yield f"{told}{several} are {'both' if len(sought) == 2 else 'all'} looked for there"
+        elif sought:
+            yield f"{told}it is not alone where {sought[0]} is looked for"
+
+
+def _near(modes: Modes, stage: Stage) -> BoolArray:
+    """Tell which modes lie where which are looked for, ``(n_described, n_modes)``."""
+    off = [np.abs(modes.frequency / spec.frequency_hz - 1) <= spec.search for spec in stage.modes]
+    return np.array(off, dtype=bool).reshape(len(stage.modes), -1)
 
 
 def _differenced(

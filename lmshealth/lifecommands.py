@@ -100,7 +100,7 @@ def prognose(ctx: click.Context, /, table: Path, **options: Any) -> None:
 
 
 def _ahead(by: datetime | None, life: Prognosis) -> date | None:
-    """Give the day that is asked for, if it lies ahead; of one that does not nothing is foretold."""
+    """Give the day that is asked for; for one that does not lie ahead nothing is foretold."""
     if by is None or by.date() > life.recorded_at.date():
         return None if by is None else by.date()
     click.echo(

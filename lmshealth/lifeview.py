@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import click
 
 from lmshealth.brief import Brief, LifeBrief
-from lmshealth.terminal import print_table
+from lmshealth.terminal import print_table, print_text
 
 # So many machines are told one by one, and so many have a row in a table.
 _FEW, _MOST_ROWS = 3, 20
@@ -25,7 +25,7 @@ def print_briefs(briefs: Sequence[Brief]) -> None:
         _print_fleet(briefs)
         return
     for one in briefs:
-        click.echo(f"{one.stage}: {one.verdict}. {one.why}")
+        print_text(f"{one.stage}: {one.verdict}. {one.why}")
         for gauge in one.gauges:
             click.echo(f"  {gauge}")
         if one.life is not None:
@@ -48,7 +48,8 @@ def _print_fleet(briefs: Sequence[Brief]) -> None:
 
 def print_life(life: LifeBrief) -> None:
     """Print the quantiles of a remaining life for each limit and any, then when to service."""
-    print_table(life.title, ("until",), ("%", "km", "hours", "days", "date"), life.cells)
+    heads = ("chance %", "km", "hours", "days", "date")
+    print_table(life.title, ("until",), heads, life.cells)
     for text in life.sentences:
-        click.echo(text)
+        print_text(text)
     click.echo()

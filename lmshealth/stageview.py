@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from textwrap import wrap
 
 import click
 
 from lmshealth.tables import Row
-from lmshealth.terminal import or_dash, print_table
+from lmshealth.terminal import or_dash, percent, print_table, print_text
 
 _VERDICTS = {
     "told": "told",
@@ -16,7 +15,6 @@ _VERDICTS = {
     "together": "together",
     "not-told": "not told",
 }
-_WIDTH = 78
 
 
 def print_stage(content: dict[str, list[Row]]) -> None:
@@ -28,7 +26,7 @@ def print_stage(content: dict[str, list[Row]]) -> None:
         _print_tellings(stage, parameters)
         _print_sensitivities(content)
     for row in content["findings"]:
-        _print_text(row["text"], "+ " if row["good"] else "! ")
+        print_text(row["text"], "+ " if row["good"] else "! ")
 
 
 def _print_modes(stage: Row, rows: Sequence[Row]) -> None:
@@ -55,7 +53,7 @@ def _print_coverage(parameters: Sequence[Row]) -> None:
             "–" if row["limit"] is None else f"{row['limit']:g}",
             f"{row['prior_q05']:.3g}-{row['prior_q95']:.3g}",
             f"{row['map_low']:.3g}-{row['map_high']:.3g}",
-            _percent(row["prior_below_map"] + row["prior_above_map"]),
+            percent(row["prior_below_map"] + row["prior_above_map"]),
         )
         for row in parameters
     ]
@@ -67,8 +65,8 @@ def _print_tellings(stage: Row, parameters: Sequence[Row]) -> None:
     cells = [
         (
             row["parameter"],
-            *(_percent(row[f"{key}_std_ln"]) for key in ("prior", "logs", "endless_logs")),
-            _percent(row["informed"]),
+            *(percent(row[f"{key}_std_ln"]) for key in ("prior", "logs", "endless_logs")),
+            percent(row["informed"]),
             _VERDICTS[row["verdict"]],
         )
         for row in parameters
@@ -76,7 +74,7 @@ def _print_tellings(stage: Row, parameters: Sequence[Row]) -> None:
     heads = ("prior", "logs", "endless logs", "informed", "")
     title = "What is known of them (one standard deviation)"
     print_table(title, ("parameter",), heads, cells)
-    _print_text(
+    print_text(
         f"logs: {stage['n_logs']} of {stage['seconds_per_log']:g} s and as many at the baseline, "
         "on average over the priors, at best. logs reach, map error: of ln f. informed: share of "
         "the prior's variance that the logs take away; told from a half on."
@@ -96,11 +94,3 @@ def _print_sensitivities(content: dict[str, list[Row]]) -> None:
         pair = f"{row['parameter_a']} and {row['parameter_b']}"
         click.echo(f"Correlation of {pair} after such logs: {row['correlation']:+.2f}")
     click.echo()
-
-
-def _print_text(text: str, mark: str = "") -> None:
-    click.echo("\n".join(wrap(mark + text, _WIDTH, subsequent_indent=" " * len(mark))))
-
-
-def _percent(share: float) -> str:
-    return f"{100 * share:.1f} %"

@@ -84,7 +84,7 @@ FLOORS = [
     {"telling"},
     {"batch"},
     {"pipeline", "terminal", "options", "looks"},
-    {"stageview", "lifeview"},
+    {"stageview", "lifeview", "logview", "machineview", "planview"},
     {"lifecommands", "batchcommands"},
     {"commands"},
     {"cli"},

@@ -540,7 +540,7 @@ def test_each_log_goes_to_the_first_description_that_takes_it(tmp_path: Path) ->
 def test_an_archive_of_bad_logs_only_is_an_error_with_its_reasons_written(
     tmp_path: Path, modes_only: Stage
 ) -> None:
-    """When every log is refused the job fails, says how many and mostly why; refused.csv has all."""
+    """When every log is refused the job fails, says how many and why; refused.csv has all."""
     logs = tmp_path / "logs"
     logs.mkdir()
     (logs / "broken.h5").write_bytes(b"nothing")
