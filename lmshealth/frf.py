@@ -245,11 +245,13 @@ def why_unnamed(modes: Modes, stage: Stage) -> Iterator[str]:
     for place in np.flatnonzero([not name for name in modes.names]):
         sought = [spec.name for spec, own in zip(stage.modes, near, strict=True) if own[place]]
         told = f"the mode at {modes.frequency[place]:.5g} Hz has no name: "
+        then = "; track finds out whose it is, or write its name into column mode"
         if len(sought) > 1:
             several = f"{', '.join(sought[:-1])} and {sought[-1]}"
-            yield f"{told}{several} are {'both' if len(sought) == 2 else 'all'} looked for there"
+            both = "both" if len(sought) == 2 else "all"
+            yield f"{told}{several} are {both} looked for there{then}"
         elif sought:
-            yield f"{told}it is not alone where {sought[0]} is looked for"
+            yield f"{told}it is not alone where {sought[0]} is looked for{then}"
 
 
 def _near(modes: Modes, stage: Stage) -> BoolArray:

@@ -198,6 +198,28 @@ def test_modes_as_a_table_name_frequency_and_damping(folder: Path, stage: Path) 
     assert "±" in result.stdout
 
 
+def test_a_refused_log_is_told_once_and_without_an_empty_table(folder: Path, stage: Path) -> None:
+    """On standard error alone; json has it too, for programs."""
+    broken = folder / "bad" / "broken.h5"
+    result = call("modes", broken, "--stage", stage)
+    assert (result.exit_code, result.stdout) == (1, "")
+    assert len(result.stderr.splitlines()) == 1 and "broken.h5" in result.stderr
+    result = call("modes", broken, folder / "good" / "log-00.h5", "--stage", stage)
+    assert result.exit_code == 3
+    assert "roll" in result.stdout and "broken.h5" not in result.stdout
+    assert result.stderr.count("broken.h5") == 1
+    found = strict(call("modes", broken, "--stage", stage, "--format", "json").stdout)["refused"]
+    assert [Path(row["log"]).name for row in found] == ["broken.h5"]
+
+
+def test_modes_without_a_band_say_what_may_be_missed(folder: Path, stage: Path) -> None:
+    """Only people are told, and only where neither a band nor a description is given."""
+    log, said = folder / "bare.csv", "look closer with --band LOW HIGH."
+    assert said in " ".join(call("modes", log).stdout.split())
+    for more in (("--band", 30, 200), ("--format", "csv"), ("--stage", stage)):
+        assert "--band" not in call("modes", log, *more).stdout
+
+
 def test_a_refused_mode_alone_is_still_status_0(folder: Path, stage: Path) -> None:
     """A mode that this log does not show is listed with its reason, and nothing failed."""
     result = call("modes", folder / "bare.csv", "--stage", stage, "--format", "json")
@@ -431,6 +453,22 @@ def test_frf_as_csv_lists_modes_and_as_a_table_both(bench: Path) -> None:
     assert "periods of 4 s" in shown
     assert "mode_1" in shown
     assert max(len(line) for line in shown.splitlines()) <= 80
+
+
+def test_frf_says_why_a_mode_has_no_name(bench: Path, tmp_path: Path) -> None:
+    """Where two are looked for at one place both are named, in the form that goes on to track."""
+    frequency = MODES[0][0]
+    (tmp_path / "two.toml").write_text(
+        'name = "two"\n'
+        + "".join(
+            f'[[mode]]\nname = "{name}"\nfrequency_hz = {frequency}\ndamping_ratio = 0.01\n'
+            for name in ("roll", "pitch")
+        )
+    )
+    result = frf(bench, "--stage", tmp_path / "two.toml", "--format", "csv")
+    assert result.exit_code == 0
+    assert next(csv.DictReader(io.StringIO(result.stdout)))["mode"] == ""
+    assert "has no name: roll and pitch are both looked for there; track finds" in result.stderr
 
 
 def test_frf_of_several_logs_is_a_table_for_track(bench: Path, tmp_path: Path) -> None:

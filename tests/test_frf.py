@@ -13,7 +13,7 @@ import pytest
 from scipy.signal import chirp
 
 from lmshealth.errors import BadLog
-from lmshealth.frf import FrfReading, name_modes, read_frf
+from lmshealth.frf import FrfReading, name_modes, read_frf, why_unnamed
 from lmshealth.logs import Channel, Log, Refusal
 from lmshealth.readers import load_columns, read_log
 from lmshealth.stage import load_stage
@@ -220,19 +220,30 @@ def test_a_name_is_given_where_there_is_no_doubt(tmp_path: Path) -> None:
     """One mode where a name is looked for has it; two there, or one for two names, have none."""
     modes = replace(read_frf(driven(), "current", "acc_x", band=BAND).modes, names=("a", "b"))
 
+    why: list[str] = []
+
     def named(*looked_for: tuple[str, float, float]) -> tuple[str, ...]:
         text = 'name = "m"\n[match]\nstage = "M"\n' + "".join(
             f'[[mode]]\nname = "{name}"\nfrequency_hz = {f}\ndamping_ratio = 0.01\nsearch = {s}\n'
             for name, f, s in looked_for
         )
         (tmp_path / "stage.toml").write_text(text)
-        return name_modes(modes, load_stage(str(tmp_path / "stage.toml"))).names
+        stage = load_stage(str(tmp_path / "stage.toml"))
+        result = name_modes(modes, stage)
+        why[:] = why_unnamed(result, stage)
+        return result.names
 
     low, high = (f for f, _, _ in MODES[:2])
     assert named(("low", low, 0.1), ("high", high, 0.1)) == ("low", "high")
+    assert why == []
     assert named(("high", high, 0.1), ("none", 200.0, 0.1)) == ("", "high")
+    assert why == []
     assert named(("both", (low + high) / 2, 0.5)) == ("", "")
+    assert len(why) == 2 and all("it is not alone where both is looked for; " in w for w in why)
     assert named(("one", low, 0.05), ("two", low + 1, 0.05), ("high", high, 0.1)) == ("", "high")
+    (told,) = why
+    assert told.startswith(f"the mode at {modes.frequency[0]:.5g} Hz has no name: one and two are ")
+    assert "both looked for there; track finds out whose it is" in told
 
 
 def test_channels_that_are_not_there_are_named_with_those_that_are() -> None:
