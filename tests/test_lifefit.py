@@ -9,8 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import xarray
+from threadpoolctl import threadpool_limits
 
-from lmshealth import life
+from lmshealth import life, lifefit
 from lmshealth.arrays import FloatArray
 from lmshealth.density import LifeDensity
 from lmshealth.errors import NotConverged
@@ -28,6 +29,7 @@ from tests.lives import (
     PRELOAD,
     make_history,
     make_stage,
+    threads,
     true_drift,
 )
 
@@ -148,6 +150,24 @@ def test_importance_sampling_alone_gives_the_same(
     ess = both_ess(found.ess, both_ess(float(way.ess_bulk.min()), 2000))
     assert agree(one, two, ess)
     assert not agree(one, 1.01 * two, ess)  # negative control
+
+
+def test_linear_algebra_keeps_to_one_thread(
+    history: History, stage: Stage, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """On small arrays more would only wait for one another, whatever is usual around it."""
+    seen: set[int] = set()
+    ways = lifefit._ways
+
+    def counting(*arguments):
+        seen.update(threads())
+        return ways(*arguments)
+
+    monkeypatch.setattr(lifefit, "_ways", counting)
+    with threadpool_limits(2, user_api="blas"):
+        fit_life(history, stage, 11, chains=False, n_draws=400)
+        assert seen == {1}
+        assert threads() == {2}
 
 
 def test_a_life_says_what_it_rests_on(found: LifePosterior) -> None:
