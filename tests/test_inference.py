@@ -91,6 +91,7 @@ def test_posterior_quantiles_are_those_of_a_grid(stage: Stage, health: Health) -
             assert abs(share - level) < 5 * np.sqrt(level * (1 - level) / n) + 1e-3
 
 
+@pytest.mark.slow
 def test_health_is_sharp_where_modes_tell_it(health: Health) -> None:
     """The truth lies inside, both epochs converge, and the data and not the prior speak."""
     low, high = health.quantile(np.array([0.005, 0.995]))
