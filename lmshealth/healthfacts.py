@@ -56,14 +56,20 @@ class Life:
 
 
 def tone(assessment: Assessment) -> Tone:
-    """Sort a verdict into good, bad and open."""
+    """Sort a verdict into good, bad and open; an alarm is bad where there is no verdict."""
+    if assessment.alarmed:
+        return "bad"
     tones: dict[str, Tone] = {"healthy": "good", "not-enough-data": "open"}
     return tones.get(assessment.judgement.verdict, "bad")
 
 
 def verdict_words(assessment: Assessment) -> str:
-    """Say the verdict."""
+    """Say the verdict, or the alarm where there is none."""
     verdict = assessment.judgement.verdict
+    if assessment.alarmed:
+        return f"Alarm: {' and '.join(map(spell, assessment.alarmed))} moved"
+    if not assessment.stage.parameters and verdict == "not-enough-data":
+        return "Modes followed, no verdict asked for"
     words = {
         "healthy": "Healthy",
         "not-enough-data": "Not enough data for a verdict",
@@ -157,6 +163,22 @@ def _life(prognosis: Prognosis, column: int) -> Life:
         beyond=percent(float(prognosis.beyond_horizon()[column])),
         now="" if name == "any" else f"{middle:.0f}{GAP}% ({low:.0f} to {high:.0f}{GAP}%)",
     )
+
+
+def first_limit(prognosis: Prognosis | None) -> tuple[str, str] | None:
+    """Name the part whose limit is most probably the first, and how probably.
+
+    None where one limit is all there is, or no draw ends before the horizon.
+    """
+    if prognosis is None or len(prognosis.limits) < 3:
+        return None
+    parts = prognosis.claimed()[:, :-1]
+    ending = np.isfinite(parts).any(axis=1)
+    if not ending.any():
+        return None
+    shares = np.bincount(parts[ending].argmin(axis=1), minlength=parts.shape[1]) / ending.sum()
+    k = int(shares.argmax())
+    return spell(prognosis.parameters[k]), percent(float(shares[k]))
 
 
 def service_words(service: Service) -> dict[str, Any]:

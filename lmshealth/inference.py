@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from threadpoolctl import threadpool_limits
 
 from lmshealth.arrays import BoolArray, FloatArray
 from lmshealth.epoch import EpochPosterior, View
@@ -376,7 +377,9 @@ def _infer_all(
     seed: int | Sequence[int],
     mapper: Callable[..., object],
 ) -> Health:
-    found: list[_Epoch] = list(mapper(_infer_epoch, tasks, [seed] * len(tasks), chosen))  # type: ignore[call-overload]
+    # Arrays are small: threads inside linear algebra would only wait for one another.
+    with threadpool_limits(1, user_api="blas"):
+        found: list[_Epoch] = list(mapper(_infer_epoch, tasks, [seed] * len(tasks), chosen))  # type: ignore[call-overload]
     prior = tasks[0].prior
     variance = prior.variance
     low, high = prior.quantile(np.array([[0.05], [0.95]]))

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pandas as pd
 from scipy.special import softmax
+from threadpoolctl import threadpool_limits
 
 from lmshealth.arrays import FloatArray, expect_shape, freeze
 from lmshealth.courses import Course
@@ -291,9 +292,11 @@ def fit_life(
     """
     likelihood = LifeLikelihood(history, stage)
     explore_seed, chain_seed, off_seed = stream(seed, _STEP).spawn(3)
-    found = _explored(likelihood, explore_seed)
     n_kept = n_draws // _N_ENSEMBLES
-    ways = _ways(found, chain_seed, n_kept, _WORTH_CHAINS if chains else np.inf)
+    # Arrays are small: threads inside linear algebra would only wait for one another.
+    with threadpool_limits(1, user_api="blas"):
+        found = _explored(likelihood, explore_seed)
+        ways = _ways(found, chain_seed, n_kept, _WORTH_CHAINS if chains else np.inf)
     rng = np.random.default_rng(off_seed)
     now = np.array([likelihood.now])
     health, off, rate, settings = [], [], [], []

@@ -63,7 +63,8 @@ def _consistent(track: Track) -> str:
         f"autocorrelation {found.autocorrelation:+.2f} (p = {found.autocorrelation_p_value:.2g})"
     )
     if found.holds:
-        how = ", which vary rather less than it expects" if found.cautious else ""
+        how = {"inside": "", "below": ", which vary rather less than it expects",
+               "above": ", which vary rather more than it expects"}[found.side]  # fmt: skip
         return f"The filter agrees with its logs{how}: {told}."
     if track.widening[-1] > 1:
         meant = (

@@ -23,6 +23,7 @@ from lmshealth.decision import Service
 from lmshealth.files import write_text
 from lmshealth.fleetfacts import taught
 from lmshealth.healthfacts import (
+    first_limit,
     gauges,
     health_now,
     how_sure,
@@ -166,6 +167,7 @@ def _first(assessment: Assessment, service: Service) -> dict[str, Any]:
         "gauges": gauges(assessment),
         "lives": lives(assessment.prognosis),
         "service": service_words(service),
+        "first_limit": first_limit(assessment.prognosis),
     }
 
 

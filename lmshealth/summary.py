@@ -12,7 +12,7 @@ from lmshealth.logs import Refusal
 from lmshealth.results import Health, Prognosis
 from lmshealth.stage import Stage
 from lmshealth.tracks import History, Track
-from lmshealth.verdict import Judgement
+from lmshealth.verdict import Judgement, unexplained
 from lmshealth.waterfall import Waterfall
 
 
@@ -68,11 +68,19 @@ class Assessment:
         """Choose the day of the service as the description asks."""
         return decide(self.prognosis, self.stage.description.decision)
 
+    @property
+    def alarmed(self) -> tuple[str, ...]:
+        """The modes that raised an alarm since the baseline, where no verdict says why."""
+        if self.judgement.verdict != "not-enough-data":
+            return ()
+        alarms = unexplained(self.track, self.history.baseline, "alarm")
+        return tuple(dict.fromkeys(event.mode for event in alarms))
+
     def urgency(self, service: Service) -> tuple[int, float, float, str]:
         """Give a key that sorts by risk: days until the service; unknown before safe."""
         identity, verdict = self.judgement.stage, self.judgement.verdict
         if verdict == "not-enough-data":
-            return 1, 0.0, 0.0, identity
+            return (0 if self.alarmed else 1), 0.0, 0.0, identity
         if self.prognosis is None:
             return (1 if verdict == "healthy" else 0), 0.0, 0.0, identity
         days = service.wait

@@ -19,7 +19,7 @@ EventKind = Literal["step", "regreasing", "servo", "sensor", "alarm"]
 
 # Below this probability of their innovations a filter is not consistent with its data: where it
 # makes results too sure of themselves, and where it only makes them too cautious.
-_TOO_SURE, _TOO_CAUTIOUS = 1e-3, 1e-6
+_TOO_SURE, _TOO_CAUTIOUS, _UNUSUAL = 1e-3, 1e-6, 0.05
 
 
 @dataclass(frozen=True, slots=True)
@@ -278,9 +278,11 @@ class Consistency:
         return self.p_value >= least and self.autocorrelation_p_value >= least_of_all
 
     @property
-    def cautious(self) -> bool:
-        """Whether it holds, with innovations that are improbably small or turn back too often."""
-        return self.holds and min(self.p_value, self.autocorrelation_p_value) < _TOO_SURE
+    def side(self) -> Literal["below", "inside", "above"]:
+        """Where the sum lies beside the band that holds 95 % of those of a filter that is right."""
+        if self.p_value >= _UNUSUAL:
+            return "inside"
+        return "above" if self.nis > 1 else "below"
 
 
 @dataclass(frozen=True, slots=True, eq=False)

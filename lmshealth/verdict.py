@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from datetime import datetime
 from typing import Literal
@@ -13,6 +14,7 @@ from lmshealth.arrays import BoolArray
 from lmshealth.results import Health
 from lmshealth.stage import ParameterSpec, Stage
 from lmshealth.tracks import Event, History, Track
+from lmshealth.wording import spell
 
 Verdict = Literal["healthy", "preload", "mount", "both", "step", "not-enough-data"]
 
@@ -77,9 +79,9 @@ def judge(
     -------
     Judgement
         ``not-enough-data`` when there are fewer logs than make a baseline, when the sampler did
-        not converge, when no state of the parameters explains the drifts, or when the data say
-        nothing about any parameter; ``step`` when the modes
-        jumped since the baseline and nobody said why.
+        not converge, when no state of the parameters explains the drifts, when the data say nothing
+        about any parameter, or when there is none; alarms are then told in ``why``. ``step`` when
+        the modes jumped since the baseline and nobody said why.
 
     Examples
     --------
@@ -96,21 +98,21 @@ def judge(
     >>> lmshealth.judge(stage, history, None).why
     'The logs do not carry the health parameters.'
     """
-    jumps = [] if track is None else unexplained_steps(track, history.baseline)
+    jumps = unexplained(track, history.baseline, "step")
     if jumps:
         return _judge_step(stage, history, health, jumps)
     needed = stage.description.baseline.logs
     reason = ""
     since = len(history.logs) - history.baseline
-    if since < needed:
+    if not stage.parameters:
+        reason = (
+            "The stage description has no [[parameter]]: its modes are followed, and nothing is "
+            "said of the parts."
+        )
+    elif since < needed:
         reason = f"{since} usable logs since the baseline began; it needs {needed}."
     elif health is None:
-        reason = (
-            "The logs do not carry the health parameters."
-            if stage.parameters
-            else "The stage description has no [[parameter]]: its modes are followed, and nothing "
-            "is said of the parts."
-        )
+        reason = "The logs do not carry the health parameters."
     elif not health.converged[-1]:
         reason = "The sampler did not converge, so nothing is claimed."
     elif not health.explained:
@@ -121,19 +123,35 @@ def judge(
     elif not health.told().any():
         reason = "These logs move the prior of no parameter: the stage looks the same either way."
     if reason or health is None:
+        why = " ".join((*_alarmed(track, history.baseline), reason))
         return Judgement(
-            history.stage, history.recorded_at[-1], "not-enough-data", float("nan"), reason
+            history.stage, history.recorded_at[-1], "not-enough-data", float("nan"), why
         )
     return _judge_posterior(stage, history, health)
 
 
-def unexplained_steps(track: Track, baseline: int) -> list[Event]:
-    """Give the steps of the modes since a log that no maintenance declares, one per mode."""
+def unexplained(track: Track | None, baseline: int, kind: Literal["step", "alarm"]) -> list[Event]:
+    """Give the events of a kind since a log that no maintenance declares, one per mode."""
     return [
         event
-        for event in track.events
-        if event.kind == "step" and not event.declared and event.epoch > baseline
+        for event in (() if track is None else track.events)
+        if event.kind == kind and not event.declared and event.epoch > baseline
     ]
+
+
+def _alarmed(track: Track | None, baseline: int) -> Iterator[str]:
+    """Say of every mode with an alarm how far it has moved by now."""
+    if track is None:
+        return
+    alarms = {event.mode: event for event in unexplained(track, baseline, "alarm")}
+    for mode, event in alarms.items():
+        k = track.modes.index(mode)
+        moved, std = track.drift[-1, k], np.sqrt(track.drift_cov[-1, k, k])
+        size = f"{100 * np.expm1(moved):+.2f} ± {100 * np.exp(moved) * std:.2f} %"
+        yield (
+            f"Alarm since {track.recorded_at[event.epoch].date().isoformat()}: {spell(mode)} has "
+            f"moved by {size.replace('-', '−')} since the baseline."
+        )
 
 
 def _judge_step(

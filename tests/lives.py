@@ -14,6 +14,7 @@ from itertools import product
 from pathlib import Path
 
 import numpy as np
+from threadpoolctl import threadpool_info
 
 from lmshealth.arrays import BoolArray, FloatArray
 from lmshealth.history import Reading
@@ -453,3 +454,8 @@ def make_reading(
             refused=(),
         ),
     )
+
+
+def threads() -> set[int]:
+    """Count the threads that each library of linear algebra may use now."""
+    return {one["num_threads"] for one in threadpool_info() if one["user_api"] == "blas"}

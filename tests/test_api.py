@@ -63,6 +63,7 @@ def _run(*words: str) -> str:
     return done.stdout
 
 
+@pytest.mark.slow
 def test_names_are_few_and_at_home() -> None:
     """There are at most twenty names; each is what its home calls so, and all can be listed."""
     assert len(lmshealth.__all__) <= MOST_NAMES

@@ -167,6 +167,7 @@ def test_sensors_that_are_moved_cost_no_label(rng: np.random.Generator) -> None:
     assert run(rows).assigned == (("a", "b"),) * 30
 
 
+@pytest.mark.slow
 def test_labels_use_no_later_log(rng: np.random.Generator) -> None:
     """A life cut short has the labels that the whole life has there."""
     rows = crossing(rng)
@@ -282,6 +283,7 @@ def test_unknown_dampings_do_no_harm(rng: np.random.Generator) -> None:
     assert run(rows).assigned == (("a", "b"),) * 20
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(5))
 def test_the_screen_agrees_with_the_filters(monkeypatch: pytest.MonkeyPatch, seed: int) -> None:
     """With and without the screen of the whole table the labels are the same."""
@@ -393,6 +395,7 @@ def enumerated(ln_f: Array, ln_zeta: Array) -> list[Array]:
     return chances
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(4))
 def test_chances_are_those_of_all_sequences_of_assignments(
     monkeypatch: pytest.MonkeyPatch, seed: int

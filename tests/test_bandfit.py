@@ -33,6 +33,7 @@ def test_both_modes_are_fitted_with_their_truth_inside_four_sigma() -> None:
     assert result.view.channels == ("acc_0", "acc_1")
 
 
+@pytest.mark.slow
 def test_forces_that_modes_share_leave_the_truth_inside_four_sigma() -> None:
     """One force through both modes in two channels: they interfere, in size and in phase."""
     deviations = []
@@ -51,6 +52,7 @@ def test_forces_that_modes_share_leave_the_truth_inside_four_sigma() -> None:
     assert np.mean(np.square(deviations)) < 2.1
 
 
+@pytest.mark.slow
 def test_a_floor_that_shares_the_force_of_the_mode_leaves_the_truth_inside_four_sigma() -> None:
     """A rigid body on the force of the mode interferes with it: f and ζ stay within 4σ."""
     deviations = []
@@ -168,6 +170,7 @@ def test_too_few_ordinates_are_named_with_their_number() -> None:
     assert "needed 16" in detail
 
 
+@pytest.mark.slow
 def test_what_a_fit_leaves_over_is_scattered_about_one() -> None:
     """Residuals over two channels have the mean one and the variance of four real normals."""
     residual = found(both()).residual

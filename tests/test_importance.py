@@ -75,6 +75,7 @@ def test_evidences_are_right_within_their_error(density: Density, n_dim: int, kn
     assert found.weight.sum() == pytest.approx(1, abs=1e-12)
 
 
+@pytest.mark.slow
 def test_the_stated_error_is_that_of_many_evidences() -> None:
     """Evidences of 40 seeds scatter by no more than their effective sample sizes say."""
     scores = []

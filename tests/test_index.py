@@ -263,6 +263,7 @@ HOSTILE = (
 )
 
 
+@pytest.mark.slow
 def test_no_name_is_ever_run(browser: Any, tmp_path: Path) -> None:
     """Names, verdicts, parameters and reasons that are markup or script stay text."""
     rows = make_rows(len(HOSTILE))

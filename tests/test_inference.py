@@ -12,6 +12,7 @@ import pytest
 import xarray
 from arviz_stats.base.array import array_stats
 from scipy import stats
+from threadpoolctl import threadpool_limits
 
 from lmshealth import inference
 from lmshealth.arrays import FloatArray
@@ -37,6 +38,7 @@ from tests.lives import (
     make_history,
     make_stage,
     make_track,
+    threads,
     true_drift,
 )
 from tests.test_epoch import book
@@ -89,6 +91,7 @@ def test_posterior_quantiles_are_those_of_a_grid(stage: Stage, health: Health) -
             assert abs(share - level) < 5 * np.sqrt(level * (1 - level) / n) + 1e-3
 
 
+@pytest.mark.slow
 def test_health_is_sharp_where_modes_tell_it(health: Health) -> None:
     """The truth lies inside, both epochs converge, and the data and not the prior speak."""
     low, high = health.quantile(np.array([0.005, 0.995]))
@@ -146,6 +149,21 @@ def test_any_mapper_gives_the_same(stage: Stage, worn: Track) -> None:
     found, plain = infer(worn, stage, 5, mapper=backwards), infer(worn, stage, 5)
     np.testing.assert_array_equal(found.samples, plain.samples)
     assert found.recorded_at == plain.recorded_at == worn.recorded_at[1:]
+
+
+@pytest.mark.usefixtures("quick")
+def test_linear_algebra_keeps_to_one_thread(stage: Stage, worn: Track) -> None:
+    """On small arrays more would only wait for one another, whatever is usual around it."""
+
+    def counting(function, *columns):
+        seen.update(threads())
+        return map(function, *columns)
+
+    seen: set[int] = set()
+    with threadpool_limits(2, user_api="blas"):
+        infer(worn, stage, 5, epochs=[1], mapper=counting)
+        assert seen == {1}
+        assert threads() == {2}
 
 
 @pytest.mark.slow

@@ -102,6 +102,7 @@ def test_a_link_is_no_store(tmp_path: Path) -> None:
     assert not (tmp_path / "elsewhere").exists()
 
 
+@pytest.mark.slow
 def test_sql_in_names_is_text(tmp_path: Path, store_url: str) -> None:
     """Names that hold statements are kept and found as they are, in either kind of store."""
     store = Store(store_url)

@@ -83,6 +83,7 @@ def call(*words: object) -> Result:
     return CliRunner().invoke(main, ["prognose", *map(str, words)])
 
 
+@pytest.mark.slow
 def test_estimates_become_remaining_lives(table: Path, toml: Path, tmp_path: Path) -> None:
     """The truth lies in the 90 % interval, who does not wear has no end; draws are kept."""
     out, draws = tmp_path / "new" / "prognosis.csv", tmp_path / "life.nc"

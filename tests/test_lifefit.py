@@ -9,8 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import xarray
+from threadpoolctl import threadpool_limits
 
-from lmshealth import life
+from lmshealth import life, lifefit
 from lmshealth.arrays import FloatArray
 from lmshealth.density import LifeDensity
 from lmshealth.errors import NotConverged
@@ -28,6 +29,7 @@ from tests.lives import (
     PRELOAD,
     make_history,
     make_stage,
+    threads,
     true_drift,
 )
 
@@ -107,6 +109,7 @@ def both_ess(one: float, two: float) -> float:
     return 1 / (1 / one + 1 / two)
 
 
+@pytest.mark.slow
 def test_laws_and_health_are_those_of_importance_sampling(
     found: LifePosterior, history: History, stage: Stage
 ) -> None:
@@ -150,6 +153,24 @@ def test_importance_sampling_alone_gives_the_same(
     assert not agree(one, 1.01 * two, ess)  # negative control
 
 
+def test_linear_algebra_keeps_to_one_thread(
+    history: History, stage: Stage, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """On small arrays more would only wait for one another, whatever is usual around it."""
+    seen: set[int] = set()
+    ways = lifefit._ways
+
+    def counting(*arguments):
+        seen.update(threads())
+        return ways(*arguments)
+
+    monkeypatch.setattr(lifefit, "_ways", counting)
+    with threadpool_limits(2, user_api="blas"):
+        fit_life(history, stage, 11, chains=False, n_draws=400)
+        assert seen == {1}
+        assert threads() == {2}
+
+
 def test_a_life_says_what_it_rests_on(found: LifePosterior) -> None:
     """Names, convergence, what is informed, and the trade-off of preload and mount."""
     (way,) = found.ways
@@ -182,6 +203,7 @@ def test_health_is_its_law_times_how_far_it_is_off(found: LifePosterior) -> None
     assert (off[~moving] == 0).all()
 
 
+@pytest.mark.slow
 def test_a_prognosis_is_of_the_same_draws(
     found: LifePosterior, history: History, stage: Stage
 ) -> None:
@@ -191,6 +213,7 @@ def test_a_prognosis_is_of_the_same_draws(
     assert told.ess == found.ess
 
 
+@pytest.mark.slow
 def test_the_seed_alone_decides(found: LifePosterior, history: History, stage: Stage) -> None:
     """The same seed gives the same chains, another one others."""
     same, other = (fit_life(history, stage, seed) for seed in ((3, 4), (3, 5)))
@@ -199,6 +222,7 @@ def test_the_seed_alone_decides(found: LifePosterior, history: History, stage: S
     assert not np.array_equal(other.ways[0].coordinates, found.ways[0].coordinates)
 
 
+@pytest.mark.slow
 def test_laws_without_parameters_have_no_draws_of_them(history: History, tmp_path: Path) -> None:
     """An unchanging foot adds health of one, and nothing to what is fitted."""
     only = fit_life(history, make_stage(tmp_path / "one", (FADING, FOOT)), 1)
@@ -212,6 +236,7 @@ def test_laws_without_parameters_have_no_draws_of_them(history: History, tmp_pat
     assert np.isnan(nothing.correlation).all()
 
 
+@pytest.mark.slow
 def test_a_value_that_is_kept_is_read_as_kept(tmp_path: Path) -> None:
     """Rough logs of a mount that keeps its value: read as 1, unless it is told that it settles."""
     noise = 8e-3 * np.random.default_rng(1).standard_normal((12, 2))
@@ -228,6 +253,7 @@ def test_a_value_that_is_kept_is_read_as_kept(tmp_path: Path) -> None:
     assert np.median(must.health) < 0.992
 
 
+@pytest.mark.slow
 def test_the_law_that_the_logs_ask_for_wins(faded: LifePosterior, wavering: Stage) -> None:
     """A clear loss is the law's, a still life is none's; probabilities add up to one."""
     still = fit_life(lived(TRAVEL, np.ones(12), np.ones(12)), wavering, 7)
@@ -258,6 +284,7 @@ def test_draws_of_several_courses_stand_one_after_the_other(faded: LifePosterior
     assert first == faded.health.shape[1]
 
 
+@pytest.mark.slow
 def test_a_course_of_little_probability_has_no_chains(
     wavering: Stage, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -271,6 +298,7 @@ def test_a_course_of_little_probability_has_no_chains(
         assert 0 < way.evidence_std <= 1 / np.sqrt(400)
 
 
+@pytest.mark.slow
 def test_probabilities_are_those_of_the_evidence(tmp_path: Path) -> None:
     """One law of one coordinate against none: the integral on a grid says how probable it is."""
     weighty = FADING_OR_NOT.replace(NONE, '{ kind = "none", weight = 3 }')
@@ -295,6 +323,7 @@ def test_probabilities_are_those_of_the_evidence(tmp_path: Path) -> None:
     assert abs(np.log(told / (1 - told)) - np.log(even / (1 - even))) > 4 * std + 0.01
 
 
+@pytest.mark.slow
 def test_a_step_is_followed_by_a_jump(tmp_path: Path) -> None:
     """Preload that loses an eighth between two logs is followed; unless that is told, it is not."""
     stage = make_stage(tmp_path, (FADING,))

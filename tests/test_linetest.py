@@ -76,6 +76,7 @@ def test_a_resonance_wider_than_all_is_white() -> None:
     assert np.all(np.diff(evidence, axis=0) > 0)
 
 
+@pytest.mark.slow
 def test_narrow_resonances_in_a_long_record_are_no_lines(monkeypatch: pytest.MonkeyPatch) -> None:
     """Of 20 records of 30 s with four resonances of 0.2 % none alarms; taken for noise, most do."""
     # At the bottom of octaves they are narrowest: two ordinates of a stretch.

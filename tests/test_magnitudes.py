@@ -90,6 +90,7 @@ def test_bands_above_half_the_sample_rate_are_passed_over() -> None:
     assert {m.band for m in read_magnitudes(known(), [TEN, high])} == {TEN}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["lms-x", "lms-y"])
 def test_the_papers_moves_read_as_its_tables_do(name: str, tmp_path: Path) -> None:
     """The larger of both accelerometers agrees with an independent reading, row by row."""

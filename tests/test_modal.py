@@ -204,6 +204,7 @@ def test_a_channel_that_shows_nothing_has_no_part_in_a_shape() -> None:
     np.testing.assert_allclose(found.shapes, [[-0.6, np.nan, 0.8]], atol=0.03)
 
 
+@pytest.mark.slow
 def test_more_channels_make_no_interval_wider_and_none_counts_for_itself() -> None:
     """Three channels are at least as sure as each, and the mode is not counted three times."""
     ratios = []
@@ -253,6 +254,7 @@ def short_moves(seed: int, n_moves: int = 7, seconds: float = 3.0) -> Log:
     return make_log({"acc_a": np.concatenate(parts)}, RATE, pieces=pieces)
 
 
+@pytest.mark.slow
 def test_short_moves_do_not_bias_the_damping() -> None:
     """Over 40 logs of 7 moves of 3 s the mean ln ζ is the truth within 4 standard errors."""
     stage = make_stage(ROLL)
@@ -320,6 +322,7 @@ def test_modes_of_a_record_in_parts_are_found_without_a_description(
         assert np.abs(deviations(found, name, mode.frequency, mode.damping)).max() < 4
 
 
+@pytest.mark.slow
 def test_a_long_record_does_not_fill_the_memory() -> None:
     """Ten minutes at 20 kHz on disk are identified in less than four times one minute of them."""
     rate, n, f, zeta = 20_000.0, 10 * MINUTE, 120.0, 0.02
@@ -595,6 +598,7 @@ def test_longer_records_are_surer() -> None:
 # Real measurements
 
 
+@pytest.mark.slow
 def test_a_building_in_the_wind_shows_its_three_modes(needs: Callable[[str], None]) -> None:
     """Without a description the first half hour gives the three published frequencies."""
     needs("data")
@@ -607,6 +611,7 @@ def test_a_building_in_the_wind_shows_its_three_modes(needs: Callable[[str], Non
     assert ((found.damping_ratio > 0.008) & (found.damping_ratio < 0.025)).all()
 
 
+@pytest.mark.slow
 def test_a_vibrating_machine_shows_its_modes_and_not_its_mains(
     needs: Callable[[str], None],
 ) -> None:
@@ -682,6 +687,7 @@ def test_a_narrow_peak_is_not_fitted_with_a_broad_one() -> None:
     assert [len(group) for group in modal._clusters((alike, broad))] == [2]
 
 
+@pytest.mark.slow
 def test_a_record_in_parts_is_as_sure_as_the_whole(monkeypatch: pytest.MonkeyPatch) -> None:
     """Over 20 records σ is that of the whole record to 2 %, and estimates differ by less than σ/4.
 

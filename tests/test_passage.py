@@ -153,6 +153,7 @@ def test_without_bridges_crossings_are_missed() -> None:
     assert np.quantile(wrong, 0.2) > 1.1 * np.quantile(right, 0.2)
 
 
+@pytest.mark.slow
 def test_a_bent_law_is_that_of_brute_force() -> None:
     """Wear by Hertz, which ends at nothing, against a walk of 3,000 steps."""
     life, exponent, rate, limit = 6e6, 1.3, 3e-8, 0.55

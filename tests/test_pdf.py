@@ -51,6 +51,7 @@ def colours(content: bytes) -> set[tuple[float, ...]]:
     return found
 
 
+@pytest.mark.slow
 def test_a_pdf_stands_beside_its_page_with_its_pictures_in_colour(page: Path) -> None:
     """Red and green of the pictures are there: names of colours are not looked up inside them."""
     before = page.read_bytes()
@@ -64,6 +65,7 @@ def test_a_pdf_stands_beside_its_page_with_its_pictures_in_colour(page: Path) ->
         assert rgb in drawn, colour
 
 
+@pytest.mark.slow
 def test_the_same_page_gives_the_same_bytes(small: Path) -> None:
     """Made again, by another process too, a PDF is the same."""
     (target,) = write_pdfs([small])

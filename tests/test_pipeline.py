@@ -94,6 +94,7 @@ def modes_only(tmp_path: Path) -> Stage:
     return load_stage(str(write_archive_stage(tmp_path / "stage", health=False)))
 
 
+@pytest.mark.slow
 def test_all_tables_and_pages_are_written(done: Done) -> None:
     """Every table of the contract, the index and a page per stage are there, no half files."""
     assert set(done.written) == {f"{name}.csv" for name in COLUMNS}
@@ -122,6 +123,7 @@ def test_the_only_epoch_asked_for_is_the_last(done: Done) -> None:
         assert epochs_to_infer(assessment.track, done.stage, most)[-1] == N_LOGS - 1
 
 
+@pytest.mark.slow
 def test_prognose_goes_on_from_the_table_to_the_same_numbers(done: Done, tmp_path: Path) -> None:
     """The command on the run's table of modes, with its seed, gives the run's remaining life."""
     toml, out = done.logs.parent / "stage" / "small.toml", tmp_path / "prognosis.csv"
@@ -165,6 +167,7 @@ def test_every_bad_log_is_listed_with_its_reason(done: Done) -> None:
     assert len({row["log"] for row in rows(done.out / "modes.csv")}) == N_LOGS
 
 
+@pytest.mark.slow
 def test_a_second_run_takes_all_from_the_store_and_the_truth_does_not_matter(
     done: Done, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -178,6 +181,7 @@ def test_a_second_run_takes_all_from_the_store_and_the_truth_does_not_matter(
     assert pages(done.out) == done.pages
 
 
+@pytest.mark.slow
 def test_pages_come_from_the_store_alone(done: Done, tmp_path: Path) -> None:
     """Without logs and descriptions the pages of the machine and of the fleet are the same."""
     shutil.copy(done.out / "lmshealth.sqlite", tmp_path)
@@ -187,12 +191,14 @@ def test_pages_come_from_the_store_alone(done: Done, tmp_path: Path) -> None:
     assert again.rows == done.result.rows
 
 
+@pytest.mark.slow
 def test_results_do_not_depend_on_the_number_of_workers(done: Done, tmp_path: Path) -> None:
     """Two processes with a fresh store write the same bytes as one."""
     run(done.logs, [done.stage], tmp_path / "out", Settings(workers=2, epochs=2))
     assert tables(tmp_path / "out") == done.written
 
 
+@pytest.mark.slow
 def test_results_on_a_cluster_are_those_of_this_machine(
     done: Done, tmp_path: Path, cluster: servers.Cluster
 ) -> None:
@@ -202,6 +208,7 @@ def test_results_on_a_cluster_are_those_of_this_machine(
     assert pages(tmp_path / "out") == done.pages
 
 
+@pytest.mark.slow
 def test_another_seed_gives_other_draws(done: Done) -> None:
     """Negative control for the comparisons of bytes: a new seed changes the draws of health."""
     (assessment,) = assessments(done.out)
@@ -210,6 +217,7 @@ def test_another_seed_gives_other_draws(done: Done) -> None:
     assert one.samples.tobytes() != other.samples.tobytes()
 
 
+@pytest.mark.slow
 def test_output_inside_the_folder_of_logs_is_no_log(tmp_path: Path, modes_only: Stage) -> None:
     """Tables and store inside the archive are not read back by the next run."""
     logs = write_archive(tmp_path / "logs", 2)
@@ -219,6 +227,7 @@ def test_output_inside_the_folder_of_logs_is_no_log(tmp_path: Path, modes_only: 
     assert again.n_remembered == 2
 
 
+@pytest.mark.slow
 def test_descriptions_make_stale_what_is_theirs(tmp_path: Path) -> None:
     """A change of one, or another one before it, leaves what came by others as it is."""
     logs = write_archive(tmp_path / "logs", 2)
@@ -246,6 +255,7 @@ def test_descriptions_make_stale_what_is_theirs(tmp_path: Path) -> None:
     assert remembered(one, two) == 3
 
 
+@pytest.mark.slow
 def test_a_log_that_changes_while_it_is_read_is_done_again(
     tmp_path: Path, modes_only: Stage, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -260,6 +270,7 @@ def test_a_log_that_changes_while_it_is_read_is_done_again(
     assert (again.n_remembered, again.n_refused) == (0, 0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("error", [OSError(28, "No space left on device"), MemoryError()])
 def test_what_the_computer_failed_at_is_tried_again(
     tmp_path: Path, modes_only: Stage, monkeypatch: pytest.MonkeyPatch, error: Exception
@@ -283,6 +294,7 @@ def test_what_the_computer_failed_at_is_tried_again(
     assert (again.n_refused, again.n_remembered) == (0, 2)
 
 
+@pytest.mark.slow
 def test_one_machine_has_one_description(tmp_path: Path) -> None:
     """Logs that a manifest gives to another description than most are refused by name."""
     logs = write_archive(tmp_path / "logs", 3)
@@ -296,6 +308,7 @@ def test_one_machine_has_one_description(tmp_path: Path) -> None:
     assert "2 logs of test-A" in row["detail"]
 
 
+@pytest.mark.slow
 def test_an_assessment_that_cannot_be_read_is_made_again(
     tmp_path: Path, modes_only: Stage, assessed: list[str]
 ) -> None:
@@ -322,6 +335,7 @@ def test_an_assessment_that_never_can_be_read_does_not_end_the_batch(
     assert len(assessed) <= 3
 
 
+@pytest.mark.slow
 def test_what_is_taught_is_taught_anew_where_it_cannot_be_read(
     tmp_path: Path, modes_only: Stage, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -383,6 +397,7 @@ def test_a_machine_that_cannot_be_assessed_does_not_end_the_batch(
     assert "a mistake of ours" in result.failed["other-A"]
 
 
+@pytest.mark.slow
 def test_a_changed_description_is_done_again(tmp_path: Path, modes_only: Stage) -> None:
     """Results of another description are stale: nothing is remembered."""
     logs = write_archive(tmp_path / "logs", 2)
@@ -407,6 +422,7 @@ def assessed(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     return machines
 
 
+@pytest.mark.slow
 def test_only_what_is_stale_is_assessed_again(
     tmp_path: Path, modes_only: Stage, assessed: list[str]
 ) -> None:
@@ -432,6 +448,7 @@ def test_only_what_is_stale_is_assessed_again(
     assert again(seed=1, epochs=3) == []
 
 
+@pytest.mark.slow
 def test_a_page_says_what_is_new_since_the_last_report(tmp_path: Path, modes_only: Stage) -> None:
     """The first page has no earlier one; the next compares, and repeats while nothing changes."""
     logs, out = write_archive(tmp_path / "logs", 2), tmp_path / "out"
@@ -446,6 +463,7 @@ def test_a_page_says_what_is_new_since_the_last_report(tmp_path: Path, modes_onl
     assert (out / "test-A.html").read_text() == second
 
 
+@pytest.mark.slow
 def test_a_renamed_log_is_remembered(tmp_path: Path, modes_only: Stage) -> None:
     """A log is known by its content; the tables carry its new name."""
     logs = write_archive(tmp_path / "logs", 2)
@@ -456,6 +474,7 @@ def test_a_renamed_log_is_remembered(tmp_path: Path, modes_only: Stage) -> None:
     assert {row["log"] for row in rows(tmp_path / "out" / "modes.csv")} == {"log-00.h5", "zero.h5"}
 
 
+@pytest.mark.slow
 def test_a_manifest_overrides_and_is_part_of_the_key(tmp_path: Path, modes_only: Stage) -> None:
     """A new odometer in the manifest is used, not the remembered one; its log is done again."""
     logs = write_archive(tmp_path / "logs", 2)
@@ -466,6 +485,7 @@ def test_a_manifest_overrides_and_is_part_of_the_key(tmp_path: Path, modes_only:
     assert {row["travel_km"] for row in rows(tmp_path / "out" / "modes.csv")} == {"0.0", "777.0"}
 
 
+@pytest.mark.slow
 def test_foreign_columns_are_read_by_a_map_that_is_part_of_the_key(
     tmp_path: Path, modes_only: Stage
 ) -> None:
@@ -484,6 +504,7 @@ def test_foreign_columns_are_read_by_a_map_that_is_part_of_the_key(
     assert run(logs, [modes_only], out, Settings(columns=other)).n_remembered == 0
 
 
+@pytest.mark.slow
 def test_bad_rows_beside_the_logs_are_told_and_stop_nothing(
     tmp_path: Path, modes_only: Stage
 ) -> None:
@@ -504,6 +525,7 @@ def test_bad_rows_beside_the_logs_are_told_and_stop_nothing(
     assert "action &#39;repainted&#39; is unknown" in (out / "test-A.html").read_text()
 
 
+@pytest.mark.slow
 def test_what_tracking_needs_of_each_log_is_in_the_table(tmp_path: Path, modes_only: Stage) -> None:
     """Loop error, tuning and shapes are there, also when the store remembers the log."""
     logs = tmp_path / "logs"
@@ -524,6 +546,7 @@ def test_what_tracking_needs_of_each_log_is_in_the_table(tmp_path: Path, modes_o
         assert without["delta_e_below_40hz_um"] == without["servo_id"] == ""
 
 
+@pytest.mark.slow
 def test_each_log_goes_to_the_first_description_that_takes_it(tmp_path: Path) -> None:
     """Two machines with two descriptions get one page each."""
     logs = write_archive(tmp_path / "logs", 2)
@@ -574,6 +597,7 @@ def test_progress_is_told_to_its_end(tmp_path: Path, modes_only: Stage) -> None:
     assert heard == steps
 
 
+@pytest.mark.slow
 def test_an_interrupted_run_loses_nothing_that_was_done(tmp_path: Path, modes_only: Stage) -> None:
     """Stopped after two logs, the next run remembers two and the tables are as ever."""
     logs = write_archive(tmp_path / "logs", 4)

@@ -221,6 +221,7 @@ def labels(ax: Axes) -> list[str]:
     return ax.get_legend_handles_labels()[1]
 
 
+@pytest.mark.slow
 def test_import_leaves_matplotlib_alone() -> None:
     """Importing the module is light: matplotlib and Jinja2 come when something is written."""
     code = "import sys, lmshealth.report; print({'matplotlib', 'jinja2'} & set(sys.modules))"

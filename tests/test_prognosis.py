@@ -75,6 +75,7 @@ def fading(stage: Stage) -> Prognosis:
     return prognose(fading_life(1.5e-4), stage, 3)
 
 
+@pytest.mark.slow
 def test_ten_thousand_draws_and_the_first_limit(fading: Prognosis) -> None:
     """10,000 draws of each limit; "any" is the smaller of them, draw by draw."""
     assert fading.parameters == ("guide_preload", "mount_stiffness", "any")
@@ -114,6 +115,7 @@ def test_limits_never_reached_stay_infinite(fading: Prognosis) -> None:
     assert (fading.health[:, 1] == 1).all()
 
 
+@pytest.mark.slow
 def test_a_machine_that_does_not_wear_keeps_its_censored_draws(stage: Stage) -> None:
     """With rates around 0 about half of the draws gain, and are kept as infinite."""
     found = prognose(fading_life(0.0), stage, 4)
@@ -124,6 +126,7 @@ def test_a_machine_that_does_not_wear_keeps_its_censored_draws(stage: Stage) -> 
     assert np.isfinite(found.curve_quantiles).all()
 
 
+@pytest.mark.slow
 def test_a_limit_that_is_past_has_negative_life(stage: Stage) -> None:
     """Preload at 0.5, limit 0.6: past with certainty, by the travel since."""
     found = prognose(fading_life(0.5 / 1400), stage, 5)
@@ -131,6 +134,7 @@ def test_a_limit_that_is_past_has_negative_life(stage: Stage) -> None:
     assert np.median(found.remaining[:, 0]) == pytest.approx(1.12e6 - 1.4e6, abs=8e4)
 
 
+@pytest.mark.slow
 def test_the_same_seed_gives_the_same_prognosis(stage: Stage, fading: Prognosis) -> None:
     """Two prognoses with one seed agree to the bit."""
     again = prognose(fading_life(1.5e-4), stage, 3)
@@ -157,6 +161,7 @@ def test_draws_now_and_left_tell_one_story(fading: Prognosis) -> None:
     assert (fading.remaining[~losing, 0] == np.inf).all()
 
 
+@pytest.mark.slow
 def test_the_travel_counts_from_the_baseline(stage: Stage) -> None:
     """With a later baseline the clock starts there: 1,000 km worn of the 2,667 km to the limit."""
     found = prognose(fading_life(1.5e-4, 15, baseline=4), stage, 6)
@@ -258,6 +263,7 @@ def test_what_no_mode_tells_is_named_and_left_out(stage: Stage, fading: Prognosi
     assert [(j, p.name) for j, p in told] == [(0, "guide_preload"), (1, "mount_stiffness")]
 
 
+@pytest.mark.slow
 def test_a_life_of_which_nothing_is_told_is_refused(tmp_path: Path) -> None:
     """Where modes tell no parameter that has a limit there is no prognosis, and this is why."""
     stage = make_stage(tmp_path, (PRELOAD.replace("limit = { below = 0.6 }", ""), LIMITED_FOOT))
@@ -265,6 +271,7 @@ def test_a_life_of_which_nothing_is_told_is_refused(tmp_path: Path) -> None:
         prognose(fading_life(0.0), stage, 1)
 
 
+@pytest.mark.slow
 def test_laws_are_told_with_their_probability(tmp_path: Path) -> None:
     """Of a small loss the law and none are told by their weight in the posterior and the draws."""
     stage = make_stage(tmp_path, (FADING_OR_NOT, STILL_MOUNT), tail=KNOWN_USAGE)
@@ -282,6 +289,7 @@ def test_laws_are_told_with_their_probability(tmp_path: Path) -> None:
     assert still.mean() == pytest.approx(none.probability, abs=1e-3)
 
 
+@pytest.mark.slow
 def test_a_law_that_begins_anew_is_told_with_its_travel(tmp_path: Path) -> None:
     """A preload that fades since a step only is told to do so from there."""
     stage = make_stage(tmp_path, (FADING,), tail=KNOWN_USAGE)
@@ -299,6 +307,7 @@ def test_a_law_that_begins_anew_is_told_with_its_travel(tmp_path: Path) -> None:
     assert prognose(history, stage, 3).laws == (LawWeight("guide_preload", "linear", 0.0, 1.0),)
 
 
+@pytest.mark.slow
 def test_health_off_its_law_makes_life_less_certain(
     stage: Stage, fading: Prognosis, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -332,6 +341,7 @@ def test_curves_pass_through_the_health_now(fading: Prognosis) -> None:
         assert low - margin < now < high + margin
 
 
+@pytest.mark.slow
 def test_a_floor_above_the_limit_never_fails_and_one_below_does(tmp_path: Path) -> None:
     """Draws of a mount whose floor lies above the limit are infinite, the others finite."""
     stage = make_stage(tmp_path, (MOUNT,), tail=KNOWN_USAGE)

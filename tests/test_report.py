@@ -328,6 +328,7 @@ def endless(assessment: Assessment) -> Prognosis:
     return replace(assessment.prognosis, remaining=never)
 
 
+@pytest.mark.slow
 def test_one_parameter_without_limit(make: Maker, tmp_path: Path) -> None:
     """A stage with one parameter and no limit has a density, and says why it has no life."""
     (tmp_path / "one").mkdir()
@@ -389,6 +390,7 @@ def test_files_never_collide(make: Maker, tmp_path: Path) -> None:
     assert [path.name for path in again] == [path.name for path in paths]
 
 
+@pytest.mark.slow
 def test_same_input_same_bytes(make: Maker, tmp_path: Path) -> None:
     """Pages repeat to the byte in any order of the stages, and tell a time only if given."""
     stages = [make(), nothing(make("M8-Y"))]
@@ -431,6 +433,7 @@ def test_a_page_needs_no_other_one(make: Maker, tmp_path: Path) -> None:
     assert again.read_bytes() == index.read_bytes()
 
 
+@pytest.mark.slow
 def test_the_service_is_decided_once_per_page(make: Maker, monkeypatch: pytest.MonkeyPatch) -> None:
     """The first screen, what is new, the pictures and the row of the index share one decision."""
     assessment, asked = make(), []
@@ -463,6 +466,7 @@ def test_empty_fleet(tmp_path: Path) -> None:
     assert "No log belongs to a stage" in Page(paths[0]).text
 
 
+@pytest.mark.slow
 def test_page_stands_alone_and_is_well_formed(make: Maker, tmp_path: Path) -> None:
     """Nothing is loaded from outside, identifiers are unique, headings descend by one."""
     for path in write_report(tmp_path / "out", [make()], ()):
@@ -554,6 +558,7 @@ def hostile(assessment: Assessment, evil: str) -> Assessment:
     )
 
 
+@pytest.mark.slow
 def test_numbers_of_a_page_agree_and_are_grounded(make: Maker, tmp_path: Path) -> None:
     """The odometer is whole, the largest drift is that of the table, and no chains are no ESS."""
     worn = make()
@@ -604,6 +609,7 @@ def watch(browser: Any, path: Path, scheme: str = "light", width: int = 1280) ->
     return page, seen
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("evil", ["", "<script>alert(1)</script>"])
 def test_browser_opens_it_offline(
     make: Maker, tmp_path: Path, needs: Callable[[str], None], evil: str
@@ -626,6 +632,7 @@ def test_browser_opens_it_offline(
                 page.context.close()
 
 
+@pytest.mark.slow
 def test_browser_shows_every_picture_and_prints(
     make: Maker, tmp_path: Path, needs: Callable[[str], None]
 ) -> None:

@@ -70,6 +70,7 @@ def test_the_order_of_the_modes_changes_nothing() -> None:
     assert np.linalg.eigvalsh(result.cov).min() > 0
 
 
+@pytest.mark.slow
 def test_stationary_noise_beside_a_decay_passes_as_such() -> None:
     """The p-values of thirty fits to decays in stationary noise spread over the unit interval."""
     p = [stationarity(ringing(stops(s, [Ring(60.0, 0.01, ambient=0.02)], 2))) for s in range(30)]

@@ -51,6 +51,7 @@ def agree(values: FloatArray, known: float, ess: float) -> None:
     assert abs(values.mean() - known) < 5 * values.std() / np.sqrt(ess)
 
 
+@pytest.mark.slow
 def test_moments_of_a_gaussian(drawn: Sample) -> None:
     """Mean and covariance are right within the Monte-Carlo error of the stated sample size."""
     off = drawn.flat - MEAN
@@ -76,11 +77,13 @@ def test_a_wrong_mean_is_noticed(drawn: Sample) -> None:
         agree(drawn.flat[:, 0], MEAN[0] + 0.2 * np.sqrt(COV[0, 0]), drawn.ess_bulk.min())
 
 
+@pytest.mark.slow
 def test_the_same_seed_gives_the_same_draws(drawn: Sample) -> None:
     """Two calls with one seed agree to the bit."""
     np.testing.assert_array_equal(sample(gaussian, begin, stream(7, 1)).draws, drawn.draws)
 
 
+@pytest.mark.slow
 def test_another_seed_gives_other_draws(drawn: Sample) -> None:
     """Another user's seed, or another step of the computation, gives other draws."""
     for seed in (stream(8, 1), stream(7, 2)):
@@ -89,6 +92,7 @@ def test_another_seed_gives_other_draws(drawn: Sample) -> None:
         assert not np.any(np.all(other[:, :n] == drawn.draws[:, :n], axis=2))
 
 
+@pytest.mark.slow
 def test_the_global_random_state_plays_no_part(drawn: Sample) -> None:
     """Draws do not depend on numpy's global state, and leave it alone."""
     np.random.seed(3)  # noqa: NPY002 - the legacy state is the point
@@ -106,6 +110,7 @@ def test_ensembles_of_one_process_differ(drawn: Sample) -> None:
             assert not one & two
 
 
+@pytest.mark.slow
 def test_sample_sizes_are_honest() -> None:
     """Means of independent samples scatter by as much as their effective sample size says."""
     found = [sample(gaussian, begin, stream(7, 20 + k)) for k in range(24)]
@@ -123,6 +128,7 @@ def test_streams_are_named_by_seed_and_step() -> None:
     assert stream(1, 2).generate_state(4).tolist() != stream(2, 1).generate_state(4).tolist()
 
 
+@pytest.mark.slow
 def test_moments_of_a_banana() -> None:
     """A curved posterior, y = x² + noise, has the right means of x, y and x²."""
 
@@ -138,6 +144,7 @@ def test_moments_of_a_banana() -> None:
     agree((y - x**2) ** 2, 1.0, ess)
 
 
+@pytest.mark.slow
 def test_more_dimensions_keep_their_width() -> None:
     """In six dimensions the mean square distance is right: moves must not shrink a posterior."""
 
@@ -148,6 +155,7 @@ def test_more_dimensions_keep_their_width() -> None:
     agree(np.mean(found.flat**2, axis=1), 1.0, found.ess_bulk.min())
 
 
+@pytest.mark.slow
 def test_one_dimension_with_an_edge() -> None:
     """A half normal keeps to its support and has the right mean."""
 
@@ -159,6 +167,7 @@ def test_one_dimension_with_an_edge() -> None:
     agree(found.flat[:, 0], np.sqrt(2 / np.pi), found.ess_bulk.min())
 
 
+@pytest.mark.slow
 def test_modes_far_apart_are_refused_with_their_chains(monkeypatch: pytest.MonkeyPatch) -> None:
     """Ensembles that keep to their own mixture of two far modes are told from a posterior."""
     monkeypatch.setattr(sampling, "_MOST_STEPS", 1200)

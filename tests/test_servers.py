@@ -77,6 +77,7 @@ def test_servers_end_with_who_started_them(
         wait_until(lambda: not marked(mark), f"the end of {kind}")
 
 
+@pytest.mark.slow
 def test_tasks_of_a_killed_worker_are_done_by_another(cluster: Cluster) -> None:
     """A worker that is killed is replaced, and every task is answered."""
     from distributed import Client

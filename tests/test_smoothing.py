@@ -48,6 +48,7 @@ def test_one_setting_is_the_joint_gaussian_given_all_logs(
     assert np.abs((drift - book.mean[:, 2]) / std[:, 2])[judged].max() < 1e-6
 
 
+@pytest.mark.slow
 def test_settings_are_averaged_by_their_evidence(stage: Stage) -> None:
     """Mean and variance are those of the mixture over settings, given all logs."""
     history = replace(rough_history(np.random.default_rng(2)), covariates={})

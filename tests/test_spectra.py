@@ -361,6 +361,7 @@ def test_only_what_is_alike_is_averaged(segments: list[Segment], counts: list[in
     )
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("short_minute")
 def test_means_have_the_degrees_of_freedom_they_state() -> None:
     """The density of a band of five parts scatters over seeds as χ² of its degrees says."""

@@ -423,12 +423,10 @@ def test_faults_injection(root: Path) -> None:
     assert answer["stores"]["sqlite"]["pages"] == answer["stores"]["sqlite"]["machines"] + 1
 
 
-def test_faults_together(root: Path, needs: Callable[[str], None]) -> None:
+def test_faults_together(root: Path) -> None:
     """Of two runs that share a store one may be killed; both end as they do alone."""
-    needs("postgres")
     answer = json.loads(run_study(root, "faults", "together"))
-    assert all(answer["passed"].values())
-    assert set(answer["pairs"]) == {"sqlite", "postgres"}
+    assert answer["pairs"]["sqlite"] == {"same logs, one killed": {"n": 1, "wrong": []}}
 
 
 def test_scale_index(root: Path, needs: Callable[[str], None]) -> None:
@@ -448,15 +446,13 @@ def test_scale_cost(root: Path) -> None:
     assert all(min(row["yardstick_ms"]) > 0 for row in answer["sizes"])
 
 
-def test_scale_speedup(root: Path, needs: Callable[[str], None]) -> None:
-    """One and two workers, of this machine and of Dask, are timed beside bare processes."""
-    needs("distributed")
+def test_scale_speedup(root: Path) -> None:
+    """One and two workers of this machine are timed beside bare processes."""
     answer = json.loads(run_study(root, "scale", "speedup"))
-    for kind in ("local", "dask"):
-        # A log takes the main process some milliseconds, and workers find many in a second.
-        assert 0 < answer[f"{kind}_serial_ms"][1] < 1e3
-        assert answer[f"{kind}_rate"][1] > 0
-        assert answer["workers kept busy"][kind] >= 1
+    # A log takes the main process some milliseconds, and workers find many in a second.
+    assert 0 < answer["local_serial_ms"][1] < 1e3
+    assert answer["local_rate"][1] > 0
+    assert answer["workers kept busy"]["local"] >= 1
 
 
 def test_scale_plan(root: Path) -> None:
@@ -475,8 +471,8 @@ def test_install(root: Path) -> None:
 
 
 def test_mutants(root: Path) -> None:
-    """Two small changes of a module are tried, which passes as it is and fails where it must."""
+    """A small change of a module is tried, which passes as it is and fails where it must."""
     answer = json.loads(run_study(root, "mutants"))
-    assert answer["mutants"]["n"] == 2
+    assert answer["mutants"]["n"] == 1
     assert answer["controls"] == {"as it is": {"survived": 1}, "planted": {"killed": 1}}
     assert answer["that no test runs"] == 0

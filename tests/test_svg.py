@@ -101,6 +101,7 @@ def test_letters_go_back_into_each_picture(pictures: dict[str, str]) -> None:
     assert give_letters("<body>no picture</body>") == "<body>no picture</body>"
 
 
+@pytest.mark.slow
 def test_a_picture_looks_as_before(
     tmp_path_factory: pytest.TempPathFactory, needs: Callable[[str], None]
 ) -> None:

@@ -88,6 +88,7 @@ def test_tables_that_are_not_finished_leave_those_of_before(tmp_path: Path) -> N
     assert (tmp_path / "effects.csv").read_text() == "as it was"
 
 
+@pytest.mark.slow
 def test_a_page_is_told_without_tables_where_there_are_no_logs(tmp_path: Path) -> None:
     """What the store has of a machine is enough for its page; what is unreadable is nothing."""
     made = packed(worn(tmp_path))

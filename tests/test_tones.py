@@ -195,6 +195,7 @@ def test_what_is_spared_is_left_and_the_rest_is_not() -> None:
     assert len(remove_tones(raw, SECONDS, SPARED)[2]) == 2
 
 
+@pytest.mark.slow
 def test_a_comb_too_close_to_be_told_apart_does_not_grow() -> None:
     """Of an excitation that repeats, every third ordinate towers: nothing is put in there."""
     raw = transform(np.tile(noise(9)[: N // 3], 3)[: N - 2] + 0.01 * noise(10)[: N - 2])[:600]

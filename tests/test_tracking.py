@@ -280,6 +280,7 @@ def eventful(seed: int) -> History:
     )
 
 
+@pytest.mark.slow
 def test_no_epoch_knows_of_later_logs(stage: Stage) -> None:
     """Appending logs changes nothing that was published: events, outliers and doubts included."""
     history = eventful(13)

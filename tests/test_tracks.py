@@ -168,15 +168,18 @@ def test_consistency_is_what_it_says() -> None:
     assert found.autocorrelation_p_value == pytest.approx(1.0)
 
 
-@pytest.mark.parametrize(("mean_square", "holds", "cautious"),
-                         [(1.0, True, False), (0.57, True, True), (0.4, False, False)])  # fmt: skip
-def test_too_small_innovations_are_told_before_they_are_wrong(
-    mean_square: float, holds: bool, cautious: bool
+@pytest.mark.parametrize(
+    ("mean_square", "holds", "side"),
+    [(1.0, True, "inside"), (0.57, True, "below"), (0.4, False, "below"), (1.4, True, "above"),
+     (1.7, False, "above")],
+)  # fmt: skip
+def test_unusual_innovations_are_told_before_they_are_wrong(
+    mean_square: float, holds: bool, side: str
 ) -> None:
-    """What is improbably small agrees and is called cautious; what is far too small does not."""
+    """Beside the band of 95 % a filter may hold and leans; far outside it does not hold."""
     n = 100
     found = consistency(np.full(n, mean_square), np.ones(n), np.full((n, 1), np.nan))
-    assert (found.holds, found.cautious) == (holds, cautious)
+    assert (found.holds, found.side) == (holds, side)
 
 
 def test_nothing_to_judge_is_consistent() -> None:

@@ -146,9 +146,27 @@ def test_without_parameters_the_description_is_the_reason(tmp_path: Path) -> Non
         'name = "m"\n[match]\nstage = "M"\n'
         '[[mode]]\nname = "roll"\nfrequency_hz = 120.0\ndamping_ratio = 0.01\n'
     )
-    found = judge(load_stage(str(path)), logs(8), None)
+    for n in (1, 8):
+        found = judge(load_stage(str(path)), logs(n), None)
+        assert found.verdict == "not-enough-data"
+        assert "no [[parameter]]" in found.why
+
+
+def test_an_alarm_without_a_verdict_is_told(stage: Stage) -> None:
+    """Which mode moved, by how much and since when stands first; past alarms do not."""
+    drift = np.zeros((8, 2))
+    drift[5:, 0] = np.log(0.96)
+    bare = make_track(drift, np.tile(1e-6 * np.eye(2), (8, 1, 1)))
+    alarm = Event("alarm", 5, "roll", "", -0.02, 0.001, 9.0, False, 6)
+    alarmed = replace(bare, events=(alarm,))
+    found = judge(stage, logs(8), None, alarmed)
     assert found.verdict == "not-enough-data"
-    assert "no [[parameter]]" in found.why
+    day = bare.recorded_at[5].date().isoformat()
+    assert found.why.startswith(f"Alarm since {day}: roll has moved by −4.00 ± 0.10 % since")
+    serviced = replace(logs(8), baselines=(0, 6))
+    for track in (bare, replace(bare, events=(replace(alarm, declared=True),))):
+        assert "Alarm" not in judge(stage, logs(8), None, track).why
+    assert "Alarm" not in judge(stage, serviced, None, alarmed).why
 
 
 def test_a_parameter_with_a_unit_is_told_in_it(tmp_path: Path) -> None:

@@ -129,6 +129,7 @@ def test_signal_to_noise_is_that_of_the_modes_in_each_channel() -> None:
 # Derivatives
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("duration", [1.0, 20.0])
 @pytest.mark.parametrize(("m", "n"), LAYOUTS)
 def test_derivatives_are_those_of_the_value(m: int, n: int, duration: float) -> None:
@@ -256,6 +257,7 @@ def test_priors_are_too_weak_to_matter() -> None:
 # The maximum
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("duration", [1.5, 7.0])
 @pytest.mark.parametrize(("m", "n"), [(1, 1), (2, 1), (1, 3), (2, 3), (3, 3), (3, 4)])
 def test_the_maximum_on_scatter_free_data_is_the_truth(m: int, n: int, duration: float) -> None:

@@ -75,6 +75,7 @@ def test_few_items_are_taken_ahead_of_results(size: int) -> None:
                 break
 
 
+@pytest.mark.slow
 def test_an_item_that_kills_its_process_is_lost_alone() -> None:
     """The others are done, those that were under way too, and the pool works on."""
     with processes(2) as pool:
@@ -83,6 +84,7 @@ def test_an_item_that_kills_its_process_is_lost_alone() -> None:
         assert dict(pool.spread(double, range(5), lost)) == {k: 2 * k for k in range(5)}
 
 
+@pytest.mark.slow
 def test_a_killed_process_loses_nothing() -> None:
     """What it was about is done again elsewhere."""
     with processes(2) as pool:
@@ -159,6 +161,7 @@ def _is_there(process: int) -> bool:
 # Dask
 
 
+@pytest.mark.slow
 def test_a_cluster_does_everything_once(cluster: servers.Cluster) -> None:
     """Results are those of this process; an item that kills its workers is lost alone."""
     with workers.cluster(cluster.address) as pool:
@@ -171,6 +174,7 @@ def test_a_cluster_does_everything_once(cluster: servers.Cluster) -> None:
         assert found == {2: 4, 3: -3, 4: 8}
 
 
+@pytest.mark.slow
 def test_a_worker_of_a_cluster_may_be_killed(cluster: servers.Cluster) -> None:
     """What it was about is done by another, and a worker that comes later works as all do."""
     with workers.cluster(cluster.address) as pool:
@@ -191,6 +195,7 @@ def slowly(number: int) -> tuple[int, int]:
     return 2 * number, max(library["num_threads"] for library in threadpool_info())
 
 
+@pytest.mark.slow
 def test_a_lost_scheduler_is_told(
     cluster: servers.Cluster, capfd: pytest.CaptureFixture[str]
 ) -> None:
@@ -204,6 +209,7 @@ def test_a_lost_scheduler_is_told(
     assert capfd.readouterr().err == ""
 
 
+@pytest.mark.slow
 def test_a_worker_of_another_version_is_refused(
     cluster: servers.Cluster, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -238,6 +244,7 @@ def test_an_address_that_is_none_is_told(
     assert "hunter2" not in str(caught.value)
 
 
+@pytest.mark.slow
 def test_a_cluster_without_workers_is_told(
     cluster: servers.Cluster, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -256,6 +263,7 @@ def test_a_cluster_without_workers_is_told(
         pass
 
 
+@pytest.mark.slow
 def test_a_pool_of_one_is_this_process() -> None:
     """Nothing is started for it."""
     with processes(1) as pool:

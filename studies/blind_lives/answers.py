@@ -27,6 +27,8 @@ SHOWN = {
     "step": "A sudden change that nothing explains",
     "not-enough-data": "Not enough data for a verdict",
 }
+# Instead of the last where modes have moved.
+ALARM = "Alarm: "
 _INDEX_ROW = re.compile(
     r'<tr role="row" data-tone.*?<a href="([^"]+)">([^<]+)</a>.*?'
     r'<span class="mark \w+"><span[^>]*>.</span>([^<]*)</span>',
@@ -75,6 +77,12 @@ def analyse(logs: Path, out: Path, *, quick: bool = False) -> dict[str, Row]:
             "refused": _counts(refused[refused["stage"] == name]["reason"]),
         }
     return answers
+
+
+def agrees(told: Row) -> bool:
+    """Whether the front page says what the table of verdicts does."""
+    alarm = told["verdict"] == "not-enough-data" and (told["shown"] or "").startswith(ALARM)
+    return alarm or told["shown"] == SHOWN[told["verdict"]]
 
 
 def front_page(path: Path) -> dict[str, str]:

@@ -42,7 +42,7 @@ import pandas as pd
 from lmshealth.metrics import clopper_pearson
 from models.lives import simulate_life
 from studies.blind_lives import judging
-from studies.blind_lives.answers import SHOWN, analyse
+from studies.blind_lives.answers import agrees, analyse
 from studies.blind_lives.lives import SEED, BlindPlan, plan_of, truth_of
 from studies.lives import HEALTHY
 from studies.record import LEVEL, Study
@@ -146,9 +146,7 @@ def judged(rows: Sequence[Row]) -> dict[str, Any]:
         "steps_to_come": sum(row["truth"]["to_come"] for row in rows),
         "ends_beyond_horizon": _beyond(rows),
         "refused": _refused(rows),
-        "front_page": judging.share(
-            row["told"]["shown"] == SHOWN[row["told"]["verdict"]] for row in rows
-        ),
+        "front_page": judging.share(agrees(row["told"]) for row in rows),
     }  # fmt: skip
 
 

@@ -4,12 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from studies.claims import Claim, Older, Row, counted
+from studies.claims import Claim, Row, counted
 
 STEP = "batch"
-OLDER = {
-    "together": Older("77fa6686942f", "runs that make a store at the same moment open it both")
-}
 
 
 def kills(answer: Row) -> Iterator[Claim]:

@@ -45,7 +45,7 @@ from studies.record import Study
 from studies.servers import Cluster, dask_cluster, missing_distributed
 
 SEED = 20261122
-QUICK_MACHINES = {"WATCHED-A": 20}
+QUICK_MACHINES = {"WATCHED-A": 10}
 N_KILLS, QUICK_KILLS = 10, 1
 KILLS_PER_RUN, QUICK_PER_RUN = 3.0, 20.0  # in the mean, over the time that a run takes
 

@@ -71,7 +71,7 @@ def collect(file: str, digest: str, *, modules: tuple[str, ...]) -> dict[str, An
             "[run]\ndisable_warnings = no-data-collected\ninclude =\n"
             + "".join(f"    lmshealth/{name}.py\n" for name in modules)
         )
-        words = (file, "-m", "not statistical", "--cov", "--cov-config=coverage.ini",
+        words = (file, "-m", "not statistical and not slow", "--cov", "--cov-config=coverage.ini",
                  "--cov-context=test", "--cov-report=")  # fmt: skip
         outcome = _run(tree, words, CUT_OFF_S)
         data = CoverageData(str(tree / ".coverage"))

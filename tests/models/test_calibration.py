@@ -10,6 +10,7 @@ from models.plant import closed_loop_modes
 from models.stages import STAGES
 
 
+@pytest.mark.slow
 def test_tables_are_met():
     """Roll and pitch are within 0.1 Hz, the rest of Table 5 within 3 %, of Table 2 within 5 %."""
     misfits = dict(zip(TARGETS, target_misfits(dict(STAGES)), strict=True))

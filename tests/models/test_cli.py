@@ -69,6 +69,7 @@ def test_help_has_an_example(command):
     assert "Example: python -m models" in CliRunner().invoke(cli, [command, "--help"]).output
 
 
+@pytest.mark.slow
 def test_errors_are_one_line_and_status_1():
     """A named error is one line on standard error."""
     done = run("modes", "lms-z")

@@ -218,6 +218,7 @@ def test_jobs_take_turns():
     assert [jobs.at(s) for s in (0.0, 299.0, 300.0, 650.0, 901.0)] == [0.0, 0.0, 2.0, -1.0, 0.0]
 
 
+@pytest.mark.slow
 def test_regreasing_hardly_moves_frequencies():
     """Over the seeds guide dampings step by a fifth at least, frequencies by 2e-3 at most."""
     for stage in STAGES.values():

@@ -111,6 +111,7 @@ def agrees(found, mode):
     return abs(f / mode.frequency_hz - 1) < 1e-3 and abs(zeta / mode.damping_ratio - 1) < 0.02
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", BOTH)
 def test_every_mode_decays_with_its_eigenvalue(name):
     """Free decays of all modes up to 1 kHz give f to 0.1 % and ζ to 2 %."""
@@ -145,6 +146,7 @@ def lines(system, force, band, period=5.0):
     return index / period, (np.fft.rfft(outputs, axis=1)[:, index] / spectrum[index]).T
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", BOTH)
 @pytest.mark.parametrize("source", ["motor_force", "block2_z", "ground_y"])
 def test_steady_response_is_the_frequency_response(name, source):
@@ -334,6 +336,7 @@ def test_held_inputs_need_no_finer_step(name):
         np.testing.assert_allclose(fine / scale, coarse / scale, atol=1e-8)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("shift", "order"), [(0.0, 1), (0.5, 2)])
 @pytest.mark.parametrize("name", BOTH)
 def test_smooth_inputs_converge_with_the_step(name, shift, order):

@@ -21,6 +21,7 @@ def struck(clean, name, seed=1):
     return fault_named(name)(clean, np.random.default_rng(seed)).columns
 
 
+@pytest.mark.slow
 def test_dropped_samples_leave_holes_in_the_time(clean):
     """Rows are gone, the time column jumps there, and what is left is unchanged."""
     columns = struck(clean, "dropped-samples")

@@ -51,6 +51,7 @@ def life(tmp_path_factory):
     return folder
 
 
+@pytest.mark.slow
 def test_folder_is_complete(life):
     """Logs, manifest, maintenance and truth are there and nothing else."""
     names = sorted(p.name for p in life.iterdir())
@@ -172,6 +173,7 @@ def test_impossible_plan_is_refused(error, arguments):
 STEPS = {"regreasing": "regrease", "servo-retuning": "servo"}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", sorted(LIVES))
 def test_every_life_is_written_with_its_truth(tmp_path, name):
     """Truth is the modes of its condition; logs, manifest and maintenance say the same of it."""
@@ -266,6 +268,7 @@ def test_work_still_to_come_is_not_in_maintenance(tmp_path):
     assert (tmp_path / "maintenance.csv").read_text() == "stage,recorded_at,travel_km,action\n"
 
 
+@pytest.mark.slow
 def test_faults_strike_a_tenth_of_the_logs_and_stand_in_the_truth(tmp_path):
     """Struck logs differ from their clean twins, the others do not, and the truth says which."""
     clean = Plan("lms-y", "healthy", 12, 0.5, 3)

@@ -60,6 +60,7 @@ def test_erratum_rigid_margins(name, crossover, phase, gain, low):
         assert abs(got / printed - 1) > 0.15
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
 def test_flexible_modes_do_not_explain_table_1(name):
     """The flexible structure moves bandwidth by less than 10 % and the phase margin by 2°."""
@@ -126,6 +127,7 @@ def test_gain_margin_is_where_stability_ends(name, make, kind):
         assert margins(10 ** (part * margin / 20) * loop).stable is stable
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
 def test_phase_margin_is_where_stability_ends(name):
     """A delay of 1 % less than the phase margin is borne, of 1 % more is not."""
@@ -164,6 +166,7 @@ def test_simulated_loop_closes_to_the_simulated_poles(name, condition):
     assert len(poles) == len(expected)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
 def test_simulated_loop_is_the_corrected_reading(name):
     """The factored servo of the simulation has the margins of the corrected coefficients."""

@@ -20,6 +20,7 @@ from models.stages import STAGES
 RATE = 20000.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", sorted(STAGES))
 def test_recursion_equals_the_matrix_exponential(name):
     """Modal recursion and the plainly written state recursion agree."""

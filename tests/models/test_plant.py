@@ -35,6 +35,7 @@ def frequencies(stage, *condition):
     return {mode.name: mode.frequency_hz for mode in modes}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", BOTH)
 def test_response_equals_the_loop_solved_by_hand(name):
     """Motor force to Δe is P / (1 + C P) with the receptance from the second-order matrices."""
@@ -103,6 +104,7 @@ def test_identities_survive_a_crossing():
     assert np.abs(np.diff(gaps, 2)).max() < 2e-3
 
 
+@pytest.mark.slow
 def test_identity_does_not_depend_on_the_way():
     """Shapes followed from the nominal agree with the neighbour's at a step of 1 %."""
     stage = STAGES["lms-y"]
@@ -134,6 +136,7 @@ def test_retuning_moves_pitch_more_than_a_tracker_wanders(name):
     assert abs(np.log(new["roll"] / old["roll"])) < 0.1 * TRACKER_STD[name]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", BOTH)
 @pytest.mark.parametrize("rigid", [True, False])
 def test_retuned_loop_keeps_its_margins(name, rigid):

@@ -27,6 +27,7 @@ def log_y():
     return record(STAGES["lms-y"], seconds=20.0, rng=np.random.default_rng(3))
 
 
+@pytest.mark.slow
 def test_columns_are_complete_and_single_precision(log_y):
     """All contract columns are there, as float32 of one length."""
     assert tuple(log_y.columns) == COLUMNS
@@ -98,6 +99,7 @@ def test_sensors_see_the_modes():
         assert min(ratio["pitch"]["acc_feed"], ratio["yaw"]["acc_feed"]) > 30, name
 
 
+@pytest.mark.slow
 def test_simulation_costs_no_more_than_its_filters():
     """Twenty seconds cost a bounded multiple of one first-order filter over as many samples."""
     noise = np.random.default_rng(0).standard_normal(400000)

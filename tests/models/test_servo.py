@@ -27,6 +27,7 @@ def factored(tuning, s):
     return value * numerator / (tuning.inductance * s**2 + total * s + tuning.current_i)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", sorted(TUNINGS))
 def test_state_space_equals_the_factors(name):
     """The series connection has the frequency response of the factors' product."""

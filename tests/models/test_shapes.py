@@ -16,6 +16,7 @@ def modes(name, condition=NOMINAL):
     return STAGES[name], {m.name: m for m in closed_loop_modes(STAGES[name], condition)}
 
 
+@pytest.mark.slow
 def test_participation_shows_which_sensor_sees_what():
     """Vertical corner sees roll and pitch, the feed signals see pitch and yaw, Δe hardly roll."""
     stage, found = modes("lms-y")

@@ -22,6 +22,7 @@ def strokes(velocity, seed=0, **options):
     return record_strokes(STAGE, profile=full_stroke(STAGE, velocity), rng=rng, **options)
 
 
+@pytest.mark.slow
 def test_columns_are_those_of_any_log():
     """A stroke is written like a move at constant velocity."""
     recording = strokes(0.1, seconds=1.0)

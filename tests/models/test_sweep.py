@@ -54,6 +54,7 @@ def test_periods_join_without_a_jump():
     assert abs(wave[0] - wave[-1]) <= np.abs(np.diff(wave)).max()
 
 
+@pytest.mark.slow
 def test_columns_are_those_of_a_log_and_the_excitation(log_y):
     """The columns of every log, and the injected current beside the whole."""
     assert tuple(log_y.columns) == (*COLUMNS, EXCITATION)
@@ -112,6 +113,7 @@ def coherence(recording, periods=4):
     return at * SAMPLE_RATE_HZ / values.size, 1 - noise / power[at]
 
 
+@pytest.mark.slow
 def test_coherence_is_near_one_and_the_following_error_small(log_y):
     """From 100 to 140 Hz coherence is above 0.9, mostly 0.99, while Δe stays within 10 µm."""
     hertz, found = coherence(log_y)
@@ -123,6 +125,7 @@ def test_coherence_is_near_one_and_the_following_error_small(log_y):
     assert np.median(weak[band]) < 0.5
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mode", GUIDE_MODES)
 @pytest.mark.parametrize("name", BOTH)
 def test_excitation_shows_the_closed_loop_and_the_whole_current_the_structure(name, mode):

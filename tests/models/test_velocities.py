@@ -13,6 +13,7 @@ from models.velocities import Experiment, drive_velocities
 EXPERIMENT = Experiment(STAGES["lms-x"], seconds=0.5, seed=5)
 
 
+@pytest.mark.slow
 def test_every_velocity_of_the_paper_gets_a_log(tmp_path):
     """Seven logs, their velocities in the manifest, in the metadata and in the set point."""
     drive_velocities(EXPERIMENT, tmp_path, "hdf5")
@@ -68,6 +69,7 @@ def test_velocities_that_would_share_a_file_are_refused(tmp_path, second):
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.slow
 def test_logs_of_other_velocities_are_not_left_behind(tmp_path):
     """Fewer velocities in the same folder are refused, the same ones are driven again."""
     drive_velocities(EXPERIMENT, tmp_path, "hdf5", velocities=(0.01, 0.1))

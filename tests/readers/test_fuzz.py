@@ -85,6 +85,7 @@ def valid(request, tmp_path_factory):
     return path, data
 
 
+@pytest.mark.slow
 @settings(
     max_examples=EXAMPLES,
     deadline=None,
