@@ -26,6 +26,14 @@ def result(answer: Row) -> Iterator[Claim]:
     for what, of in (("health", ""), ("left", "what is left until ")):
         for name, found in answer[what].items():
             yield from _covered(of + NAMES.get(name, name), found, answer[OTHERS][what][name])
+    found = answer["left, ending"]["any"]["90"], answer["left, ending"]["any"]["90 shrunk"]
+    yield counted(
+        "intervals of 90 % that hold the truth: what is left of those that reach a limit",
+        found[0]["hits"],
+        found[0]["n"],
+        f"{found[1]['hits']} shrunk to a third",
+        met=found[0]["holds"],
+    )
     page = answer["front_page"]
     yield counted(
         "rows of the front page that say what the table of verdicts says",

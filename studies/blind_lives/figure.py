@@ -16,7 +16,7 @@ INTERVAL, TRUTH = "#0072b2", "#d55e00"
 PANELS = (
     ("health", "guide_preload", "guide preload, fraction of the first log"),
     ("health", "mount_stiffness", "mount stiffness, fraction of the first log"),
-    ("left", "any", "travel left to the first limit in 1,000 km"),
+    ("left", "any", "travel left to the first limit in 1,000 km (20: beyond)"),
 )
 _HORIZON_KM = 20_000.0
 
@@ -74,7 +74,7 @@ def _intervals(ax: Axes, rows: list[dict[str, Any]], what: str, name: str, label
 def main() -> None:
     """Write the figure."""
     record = json.loads((HERE / "result.json").read_text())
-    draw(record).savefig(HERE / "figure.svg", metadata={"Date": None})
+    draw(record).savefig(HERE / "figure.svg", metadata={"Date": None}, bbox_inches="tight")
 
 
 if __name__ == "__main__":

@@ -21,15 +21,27 @@ Method
 
     Intervals of 50 and 90 % of what is claimed must hold the truth at least as often as they say
     (99.9 % Clopper-Pearson): the map's error of 5 % is in them, and this map has none. Travel that
-    is left is censored at the horizon; a crash or a loosened bolt to come is in no law, and the
-    truth of such a life is that of a machine to which none happens. Controls that must fail: every
-    answer with the truth of another life of its stage, and intervals shrunk to a third.
+    is left is censored at the horizon, and told once more of those that reach a limit; a crash or a
+    loosened bolt to come is in no law, and the truth of such a life is that of a machine to which
+    none happens. Controls that must fail: every answer with the truth of another life of its stage,
+    and intervals shrunk to a third.
+Answer
+    Yes. 99 of 100 verdicts are right, 87.3 of the 88 that have a probability were promised to be
+    and 87 are; the one that is wrong is told with 58 %, of a machine whose mount stands 0.009 above
+    where it counts as degraded. All steps that a log has seen, all young machines and all losses
+    are told as such, and none of 56 machines of sound kinds is called worn or raises an alarm. The
+    intervals hold more than they promise, those of 90 % in 99 of 100 (preload), 52 of 52 (mount)
+    and 96 of 96 (remaining life), since the error of the map that they allow for is not there. Of
+    59 machines that reach no limit none is told an end within the horizon in the median, and of 37
+    that do all are.
 Run time
-    An archive of ten machines at a time; archives done before are not done again.
+    An hour and twenty minutes of one processor; archives done before are not done again, and
+    ``--again`` judges the recorded lives anew.
 """
 
 from __future__ import annotations
 
+import json
 import shutil
 import tempfile
 from collections import Counter
@@ -45,11 +57,12 @@ from studies.blind_lives import judging
 from studies.blind_lives.answers import agrees, analyse
 from studies.blind_lives.lives import SEED, BlindPlan, plan_of, truth_of
 from studies.lives import HEALTHY
-from studies.record import LEVEL, Study
+from studies.record import LEVEL, Study, options
 
 Row = dict[str, Any]
 
 N_LIVES, IN_ARCHIVE = 100, 10
+RECORD = Path(__file__).with_name("result.json")
 # A sound one, a worn one, and one with too few logs.
 QUICK = (
     BlindPlan("lms-x", "temperature-only", 5, 3.0, 61),
@@ -67,9 +80,15 @@ OTHERS = "truth of another life"
 
 def main() -> None:
     """Run the study; ``--quick`` does one small archive without chains, and records nothing."""
-    study = Study(__file__, __doc__)
+    parser = options(__doc__)
+    parser.add_argument("--again", action="store_true", help="judge the recorded lives anew")
+    study = Study(__file__, __doc__, parser.parse_args())
     if study.quick:
         rows = archive_of(QUICK, quick=True)
+    elif study.options.again:
+        record = json.loads(RECORD.read_text(encoding="utf-8"))
+        rows, took = record["rows"], record["recorded"]
+        study.trials.kept_s = took["wall_s"] + took["kept_s"]
     else:
         tasks = [(first, IN_ARCHIVE) for first in range(1, N_LIVES, IN_ARCHIVE)]
         done = study.trials.collect(one_archive, tasks, also=PROGRAMS)
@@ -122,6 +141,7 @@ def judged(rows: Sequence[Row]) -> dict[str, Any]:
     clear = [row for row in rows if row["truth"]["clear"]]
     others = judging.of_others(rows)
     sound = [row for row in rows if row["kind"] in HEALTHY]
+    ending = [row for row in rows if row["truth"]["left"]["any"] is not None]
     return {
         "seed": SEED,
         "lives": len(rows),
@@ -133,6 +153,7 @@ def judged(rows: Sequence[Row]) -> dict[str, Any]:
         "sureness": {"all": judging.sureness(rows), OTHERS: judging.sureness(others)},
         "health": judging.coverages(rows, "health", PARTS),
         "left": judging.coverages(rows, "left", LIMITS),
+        "left, ending": judging.coverages(ending, "left", LIMITS),
         OTHERS: {
             "health": judging.coverages(others, "health", PARTS),
             "left": judging.coverages(others, "left", LIMITS),
@@ -182,7 +203,7 @@ def verdicts(answer: dict[str, Any]) -> dict[str, bool]:
         "the front page shows every machine with its verdict": page["hits"] == page["n"],
         "verdicts are right as often as they say": sure["all"].get("holds", True),
     }
-    for what in ("health", "left"):
+    for what in ("health", "left", "left, ending"):
         checks[f"intervals hold the truth: {what}"] = all(_held(answer[what], ""))
     for name, row in answer["sound_kinds"].items():
         low = clopper_pearson(row["hits"], row["n"], LEVEL)[0]
@@ -191,6 +212,8 @@ def verdicts(answer: dict[str, Any]) -> dict[str, bool]:
         checks[f"verdicts are not right: {OTHERS}"] = not sure[OTHERS]["holds"]
         for what in ("health", "left"):
             checks[f"intervals do not: {what}, {OTHERS}"] = not all(_held(answer[OTHERS][what], ""))
+        # What lies past the horizon is held by any interval that does.
+        for what in ("health", "left, ending"):
             checks[f"intervals do not: {what}, shrunk"] = not all(_held(answer[what], " shrunk"))
     return checks
 
