@@ -28,7 +28,7 @@ check: .venv/installed
 test slow coverage statistics bench: export OPENBLAS_NUM_THREADS = 1
 test slow coverage statistics bench: export OMP_NUM_THREADS = 1
 test: .venv/installed
-	$(BIN)/pytest -n 2 -m "not slow and not statistical"
+	$(BIN)/pytest -n 2 --dist worksteal -m "not slow and not statistical"
 
 # Tests that take seconds each: whole files, servers, browsers, chains.
 slow: .venv/installed

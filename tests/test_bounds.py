@@ -203,6 +203,7 @@ def test_a_simple_estimator_of_an_ambient_mode_reaches_its_bound_and_not_a_bette
     assert not (np.abs(scatter / 0.5 - 1) < 0.15).any()
 
 
+@pytest.mark.slow
 def test_a_simple_estimator_of_decays_reaches_its_bound() -> None:
     """Least squares on decays in white noise, where they are efficient, scatter by the bound."""
     rng = np.random.default_rng(8)

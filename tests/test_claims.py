@@ -49,6 +49,7 @@ def test_the_family_fails_as_seldom_as_stated(common: float) -> None:
         assert np.mean((p[:, false:] < 0.05).any(axis=1)) > 0.8
 
 
+@pytest.mark.slow
 def test_p_values_are_those_of_chance() -> None:
     """Of 300 true claims of each kind as many as 5 %, and no more, have a p value below 5 %.
 

@@ -621,6 +621,7 @@ def test_a_clean_run_is_status_0_and_says_where_its_report_is(
     assert "2 of them known from before" in again.stdout
 
 
+@pytest.mark.slow
 def test_a_run_with_a_bad_log_is_status_3(folder: Path, stage: Path, tmp_path: Path) -> None:
     """Others are analysed, and refused.csv has the reason."""
     logs = write_archive(tmp_path / "logs", 1)
@@ -807,6 +808,7 @@ def test_pdfs_stand_beside_the_pages_of_run_and_report(
     assert again == (out / "test-A.pdf").read_bytes()
 
 
+@pytest.mark.slow
 def test_without_the_library_pages_are_written_and_the_lack_is_told(
     folder: Path, stage: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -89,6 +89,7 @@ def lives(tmp_path_factory: pytest.TempPathFactory) -> tuple:
     return stage, make_history(np.log(FREQUENCY[:2]) + drift + noise, travel=travel, std=2e-3)
 
 
+@pytest.mark.slow
 def test_a_life_reads_the_same(lives: tuple) -> None:
     """Of 240 logs and of some 40 made of them, medians and widths of health agree."""
     stage, history = lives

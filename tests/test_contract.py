@@ -260,6 +260,7 @@ def _append(path: Path, text: str) -> None:
         stream.write(text)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("complaint", list(BREAKS))
 def test_the_check_notices_a_broken_contract(output: Path, tmp_path: Path, complaint: str) -> None:
     """Negative control: each change that breaks the contract is complained about by name."""

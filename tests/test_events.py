@@ -69,6 +69,7 @@ HAPPENINGS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", HAPPENINGS)
 def test_what_happened_is_found_with_its_kind_place_and_size(stage: Stage, kind: str) -> None:
     """In 8 lives of each kind nothing else is found, and sizes lie within 4 of their std.
@@ -131,6 +132,7 @@ def test_nothing_is_found_in_quiet_lives(stage: Stage) -> None:
         assert found.outliers == ()
 
 
+@pytest.mark.slow
 def test_two_steps_in_a_row_are_two_steps(stage: Stage) -> None:
     """What follows soon after an event is weighed from that event on, not against what was before.
 

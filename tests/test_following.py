@@ -151,6 +151,7 @@ def test_a_log_that_does_not_show_the_loops_band_has_no_loop_error() -> None:
     assert loop_error(make_log({"delta_e": x}, 80.0)) is None
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["lms-x", "lms-y"])
 def test_the_papers_moves_read_as_its_tables_do(name: str, tmp_path: Path) -> None:
     """Tables 3 and 4 of simulated strokes agree with an independent reading to rounding."""

@@ -62,6 +62,7 @@ def off(reading: FrfReading) -> np.ndarray:
 # Simulated machines
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("displacement", [False, True])
 @pytest.mark.parametrize("random", [False, True])
 def test_modes_are_found_with_their_uncertainty(random: bool, displacement: bool) -> None:
@@ -110,6 +111,7 @@ def test_the_default_band_is_where_the_input_is_excited() -> None:
     assert frf.frequency[[0, -1]] == pytest.approx([40, 120], abs=0.3)
 
 
+@pytest.mark.slow
 def test_a_part_of_a_period_does_not_move_the_default_band() -> None:
     """A sweep downwards, louder below, ends at the same line from 5 periods and from 4.4."""
     t = np.arange(SIZE) / RATE

@@ -143,6 +143,7 @@ def seen_rows(page: Any) -> list[str]:
     return list(page.locator("tbody tr:visible th a").all_text_contents())
 
 
+@pytest.mark.slow
 def test_a_stage_is_found_by_its_name(browser: Any, fleet: Path) -> None:
     """Parts of name and verdict in any order find it, accents or not; the count is told aloud."""
     page, seen = watch(browser, fleet)
@@ -160,6 +161,7 @@ def test_a_stage_is_found_by_its_name(browser: Any, fleet: Path) -> None:
     assert seen == []
 
 
+@pytest.mark.slow
 def test_states_and_dates_filter(browser: Any, fleet: Path) -> None:
     """States are chosen by keyboard alone; a month of the calendar gives what is due by it."""
     page, seen = watch(browser, fleet)
@@ -178,6 +180,7 @@ def test_states_and_dates_filter(browser: Any, fleet: Path) -> None:
     assert seen == []
 
 
+@pytest.mark.slow
 def test_columns_sort(browser: Any, fleet: Path) -> None:
     """Numbers sort as numbers, names as people count, what is missing goes last both ways."""
     page, _ = watch(browser, fleet)
@@ -212,6 +215,7 @@ def test_columns_sort(browser: Any, fleet: Path) -> None:
     assert found == sorted(found)
 
 
+@pytest.mark.slow
 def test_what_was_asked_for_is_there_on_the_way_back(browser: Any, fleet: Path) -> None:
     """After a look at a page of a stage the list is as it was left."""
     page, _ = watch(browser, fleet)
@@ -222,6 +226,7 @@ def test_what_was_asked_for_is_there_on_the_way_back(browser: Any, fleet: Path) 
     assert seen_rows(page) == ["Führung 12"]
 
 
+@pytest.mark.slow
 def test_the_list_is_complete_without_script(browser: Any, fleet: Path) -> None:
     """No row and no count is missing, and nothing shows that would not work."""
     context = browser.new_context(java_script_enabled=False)
@@ -232,6 +237,7 @@ def test_the_list_is_complete_without_script(browser: Any, fleet: Path) -> None:
     assert page.locator("[role=status]").inner_text() == f"{N} stages, worst first"
 
 
+@pytest.mark.slow
 def test_the_header_stays_in_sight_and_a_phone_is_wide_enough(browser: Any, fleet: Path) -> None:
     """Far down the columns have names; on a phone nothing goes sideways, order is chosen."""
     page, _ = watch(browser, fleet)

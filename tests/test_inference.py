@@ -348,6 +348,7 @@ def test_reweighting_and_sampling_agree(stage: Stage, monkeypatch: pytest.Monkey
     np.testing.assert_allclose(weighted.prior_shift, sampled.prior_shift, atol=0.08)
 
 
+@pytest.mark.slow
 def test_correlation_is_that_of_the_draws(health: Health) -> None:
     """Preload and mount trade off, and by how much is told."""
     for k in range(2):
@@ -431,6 +432,7 @@ def test_what_is_not_there_cannot_be_shared(stage: Stage) -> None:
         infer_together(two_machines(stage, timedelta(0)), ["belt"], 4)
 
 
+@pytest.mark.slow
 def test_health_is_a_table(health: Health) -> None:
     """One row per epoch and parameter, with quantiles, checks and correlations."""
     table = health.to_frame()
@@ -444,6 +446,7 @@ def test_health_is_a_table(health: Health) -> None:
     assert table["converged"].all()
 
 
+@pytest.mark.slow
 def test_health_goes_to_arviz_and_back(health: Health, tmp_path: Path) -> None:
     """NetCDF keeps draws by ensemble and epoch, and arviz finds its R-hat in them."""
     health.to_arviz().to_netcdf(tmp_path / "health.nc", engine="h5netcdf")

@@ -76,6 +76,7 @@ def test_a_bad_description_is_refused_without_a_word_of_other_files(
     assert acting(said.output) == []
 
 
+@pytest.mark.slow
 def test_links_in_the_output_are_replaced(tmp_path: Path) -> None:
     """Pages and tables take the place of links; what these point to stays as it is."""
     stage = load_stage(str(write_archive_stage(tmp_path / "stage", health=False)))

@@ -133,6 +133,7 @@ def test_laws_and_health_are_those_of_importance_sampling(
     assert not agree(known, 1.01 * draws, ess)  # negative control
 
 
+@pytest.mark.slow
 def test_importance_sampling_alone_gives_the_same(
     found: LifePosterior, history: History, stage: Stage
 ) -> None:
@@ -171,6 +172,7 @@ def test_linear_algebra_keeps_to_one_thread(
         assert threads() == {2}
 
 
+@pytest.mark.slow
 def test_a_life_says_what_it_rests_on(found: LifePosterior) -> None:
     """Names, convergence, what is informed, and the trade-off of preload and mount."""
     (way,) = found.ways
@@ -190,6 +192,7 @@ def test_a_life_says_what_it_rests_on(found: LifePosterior) -> None:
     assert found.laws("mount_stiffness") == {("loosening", 0.0): 1.0}
 
 
+@pytest.mark.slow
 def test_health_is_its_law_times_how_far_it_is_off(found: LifePosterior) -> None:
     """Draws of laws, of what is off them and of health belong together, one by one."""
     ((way, off, rate),) = found.each()
@@ -271,6 +274,7 @@ def test_the_law_that_the_logs_ask_for_wins(faded: LifePosterior, wavering: Stag
         np.testing.assert_allclose(share, probability, atol=1 / 2500)
 
 
+@pytest.mark.slow
 def test_draws_of_several_courses_stand_one_after_the_other(faded: LifePosterior) -> None:
     """Each course has its own part of the draws, and health in it is that of its laws."""
     assert len(faded.ways) > 1
@@ -348,6 +352,7 @@ def test_a_step_is_followed_by_a_jump(tmp_path: Path) -> None:
     assert blind.walk + blind.deviation > 1.5 * (fit.walk + fit.deviation)
 
 
+@pytest.mark.slow
 def test_a_life_goes_to_arviz_and_back(found: LifePosterior, tmp_path: Path) -> None:
     """NetCDF keeps laws and health by ensemble."""
     found.to_arviz().to_netcdf(tmp_path / "life.nc", engine="h5netcdf")
@@ -363,6 +368,7 @@ def test_a_life_goes_to_arviz_and_back(found: LifePosterior, tmp_path: Path) -> 
     assert float(checks[f"informed_1_{name}"]) == found.ways[0].informed[2]
 
 
+@pytest.mark.slow
 def test_a_course_without_parameters_has_no_group_in_arviz(faded: LifePosterior) -> None:
     """Groups are of courses that have draws; the probability of every one is told."""
     tree = faded.to_arviz()
@@ -371,6 +377,7 @@ def test_a_course_without_parameters_has_no_group_in_arviz(faded: LifePosterior)
         assert float(tree["checks_data"][f"probability_{k + 1}"]) == way.probability
 
 
+@pytest.mark.slow
 def test_a_life_is_a_table(found: LifePosterior) -> None:
     """Health now, then laws with their checks, one row each."""
     table = found.to_frame().set_index("parameter")

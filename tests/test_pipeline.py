@@ -105,6 +105,7 @@ def test_all_tables_and_pages_are_written(done: Done) -> None:
     assert not list(done.out.glob("*.part"))
 
 
+@pytest.mark.slow
 def test_the_truth_is_found_in_the_tables(done: Done) -> None:
     """Health at the last epoch is 0.90 within its 5 to 95 % interval widened by its own width."""
     last = rows(done.out / "health.csv")[-1]
@@ -115,6 +116,7 @@ def test_the_truth_is_found_in_the_tables(done: Done) -> None:
     assert {row["mode"] for row in rows(done.out / "modes.csv")} == {"roll", "pitch"}
 
 
+@pytest.mark.slow
 def test_the_only_epoch_asked_for_is_the_last(done: Done) -> None:
     """However few epochs are inferred, the last one, which the verdict is about, is among them."""
     (assessment,) = assessments(done.out)
@@ -138,6 +140,7 @@ def test_prognose_goes_on_from_the_table_to_the_same_numbers(done: Done, tmp_pat
             assert float(own[key]) == pytest.approx(float(other[key]), rel=1e-6)
 
 
+@pytest.mark.slow
 def test_spectra_of_all_logs_reach_the_page(done: Done) -> None:
     """The spectra hold every used log in order, strongest where its modes are."""
     (assessment,) = assessments(done.out)
@@ -153,6 +156,7 @@ def test_spectra_of_all_logs_reach_the_page(done: Done) -> None:
     assert "Spectra over life" in done.result.pages[0].read_text(encoding="utf-8")
 
 
+@pytest.mark.slow
 def test_every_bad_log_is_listed_with_its_reason(done: Done) -> None:
     """The copy, the broken file and the foreign machine are refused by name; the rest is used."""
     refused = {row["log"]: row for row in rows(done.out / "refused.csv")}

@@ -84,6 +84,7 @@ def test_ten_thousand_draws_and_the_first_limit(fading: Prognosis) -> None:
     np.testing.assert_array_equal(fading.limits, [0.6, 0.7, np.nan])
 
 
+@pytest.mark.slow
 def test_remaining_life_is_that_of_a_grid(stage: Stage, fading: Prognosis) -> None:
     """Quantiles of the remaining travel have the right probability on a 1-D grid."""
     likelihood = LifeLikelihood(fading_life(1.5e-4), stage)
@@ -98,6 +99,7 @@ def test_remaining_life_is_that_of_a_grid(stage: Stage, fading: Prognosis) -> No
         assert abs(share - level) < 5 * np.sqrt(level * (1 - level) / fading.ess) + 0.02
 
 
+@pytest.mark.slow
 def test_the_truth_is_where_it_should_be(fading: Prognosis) -> None:
     """Truth of health and remaining life lie within the central 99 % of this life's draws."""
     left = 0.4 / 1.5e-7 - 1.4e6
@@ -107,6 +109,7 @@ def test_the_truth_is_where_it_should_be(fading: Prognosis) -> None:
     assert low < 0.79 < high
 
 
+@pytest.mark.slow
 def test_limits_never_reached_stay_infinite(fading: Prognosis) -> None:
     """An unchanging parameter never fails: infinite in every draw, and past every horizon."""
     assert np.isinf(fading.remaining[:, 1]).all()
@@ -142,6 +145,7 @@ def test_the_same_seed_gives_the_same_prognosis(stage: Stage, fading: Prognosis)
     np.testing.assert_array_equal(again.curve_quantiles, fading.curve_quantiles)
 
 
+@pytest.mark.slow
 def test_curves_start_whole_and_fall(fading: Prognosis) -> None:
     """Quantile curves start at the baseline with 1, are ordered, and their median falls."""
     assert fading.curve_travel[0] == 1e5
@@ -152,6 +156,7 @@ def test_curves_start_whole_and_fall(fading: Prognosis) -> None:
     assert fading.curve_travel[-1] <= 1.5e6 + fading.horizon
 
 
+@pytest.mark.slow
 def test_draws_now_and_left_tell_one_story(fading: Prognosis) -> None:
     """Draw by draw, health now and remaining travel come from the same life."""
     rate = (1 - fading.health[:, 0]) / 1.4e6
@@ -171,6 +176,7 @@ def test_the_travel_counts_from_the_baseline(stage: Stage) -> None:
     assert found.curve_travel[0] == pytest.approx(1.5e6 - since)
 
 
+@pytest.mark.slow
 def test_usage_that_is_stated_is_taken(fading: Prognosis) -> None:
     """Stated kilometres per day come out as metres per day without spread."""
     assert (fading.usage == 20_000).all()
@@ -252,6 +258,7 @@ def test_a_stage_without_any_law_never_fails(tmp_path: Path) -> None:
     assert found.laws == (LawWeight("mount_stiffness", "none", 0.0, 1.0),)
 
 
+@pytest.mark.slow
 def test_what_no_mode_tells_is_named_and_left_out(stage: Stage, fading: Prognosis) -> None:
     """The foot has a limit, but no mode moves with it: nothing is said of it, nor in "any"."""
     assert fading.untold == ("foot",)
@@ -328,6 +335,7 @@ def test_health_off_its_law_makes_life_less_certain(
             assert wide > 1.1 * narrow
 
 
+@pytest.mark.slow
 def test_curves_pass_through_the_health_now(fading: Prognosis) -> None:
     """The band of a parameter at the last log is that of its draws there."""
     order = np.abs(fading.curve_travel - fading.travel).argsort()[:2]

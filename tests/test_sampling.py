@@ -62,6 +62,7 @@ def test_moments_of_a_gaussian(drawn: Sample) -> None:
             agree(off[:, i] * off[:, j], COV[i, j], ess)
 
 
+@pytest.mark.slow
 def test_a_sample_carries_its_evidence(drawn: Sample) -> None:
     """Sample sizes lie between 1,000 and the number of draws; R-hat is below 1.01."""
     assert drawn.draws.shape[::2] == (sampling._N_ENSEMBLES, 2)

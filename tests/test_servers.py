@@ -51,6 +51,7 @@ def test_a_server_that_broke_down_keeps_what_was_written(postgres: Postgres) -> 
         assert tell(url, "SELECT n FROM t") == [(7,)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["postgres", "dask_cluster"])
 def test_servers_end_with_who_started_them(
     root: Path, needs: Callable[[str], None], kind: str

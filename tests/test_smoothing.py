@@ -25,6 +25,7 @@ def stage(tmp_path_factory: pytest.TempPathFactory) -> Stage:
     return make_stage(tmp_path_factory.mktemp("stage"), (PRELOAD,), tail=TWO)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("reopened", [(), (9,)])
 @pytest.mark.parametrize("wander", SETTINGS)
 def test_one_setting_is_the_joint_gaussian_given_all_logs(

@@ -294,6 +294,7 @@ def test_refused_logs_are_those_of_the_last_run_of_each_machine(url: str, tmp_pa
         assert tell("AB", three) == (*three, *two)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "evil", ["'; DROP TABLE assessed_4; --", '" OR 1=1', "%", "..\n\t<b>", "", "x" * 100_000]
 )
@@ -352,6 +353,7 @@ def test_a_store_that_another_run_makes_at_the_same_moment_is_opened(tmp_path: P
     assert len(made) == 5
 
 
+@pytest.mark.slow
 def test_two_that_write_the_same_at_once_leave_one_row(url: str, tmp_path: Path) -> None:
     """Of many threads that put, keep and tell the same, none fails and nothing is doubled."""
     made = packed(worn(tmp_path))

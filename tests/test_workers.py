@@ -222,6 +222,7 @@ def test_a_worker_of_another_version_is_refused(
         pass
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("address", "said"),
     [

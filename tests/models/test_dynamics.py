@@ -202,6 +202,7 @@ def resonance(stage, mode):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", BOTH)
 @pytest.mark.parametrize("mode_name", GUIDE_MODES)
 def test_driven_record_has_the_mode_s_frequency_and_damping(name, mode_name):
