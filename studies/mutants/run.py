@@ -21,7 +21,7 @@ Method
 Answer
     Not recorded yet.
 Run time
-    Some hours on two processors, two thirds of it for mutants that survive.
+    An hour and a half of one processor, a third of it for mutants that survive.
 """
 
 from __future__ import annotations
