@@ -21,7 +21,7 @@ Method
 Answer
     Not recorded yet.
 Run time
-    An hour and a half of one processor, a third of it for mutants that survive.
+    Some hour and a half of one processor, by the first 43 mutants.
 """
 
 from __future__ import annotations
