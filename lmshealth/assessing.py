@@ -195,14 +195,13 @@ def _results(
             return followed, None, None, None
         # The life needs the longest of all: it is begun before the epochs and fetched after them.
         has_limit = any(parameter.limit for parameter in stage.parameters)
-        life = executor.submit(_foretold, history, stage, seed) if executor and has_limit else None
-        epochs = epochs_to_infer(followed, stage, most_epochs)
         mapper = executor.map if executor else map
+        life = mapper(_foretold, [history], [stage], [seed]) if has_limit else None
+        epochs = epochs_to_infer(followed, stage, most_epochs)
         health = infer(followed, stage, seed, epochs=epochs, mapper=mapper)
-        if not has_limit:
+        if life is None:
             return followed, health, None, None
-        found = life.result() if life else _foretold(history, stage, seed)
-        return followed, health, *found
+        return followed, health, *next(iter(life))
     except LmshealthError as error:
         notes.append(str(error))
     except LinAlgError as error:  # one machine must not end the run

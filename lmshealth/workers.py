@@ -140,6 +140,7 @@ class _Cluster(Pool):
         from distributed import KilledWorker
 
         self.losses = (BrokenExecutor, KilledWorker)
+        self.client = client
         self.executor: Executor = client.get_executor(pure=False)
         self.size = max(1, sum(client.nthreads().values()))
 
@@ -149,13 +150,32 @@ class _Cluster(Pool):
         items: Iterable[Item],
         lost: Callable[[Item, str], Result],
     ) -> Iterator[tuple[Item, Result]]:
+        # Not `submit` of the executor: a result that arrives as the worker dies that made it is
+        # neither finished nor cancelled, which distributed/cfexecutor.py takes for an error.
+        from distributed import as_completed
+
         checked = partial(_by_version, version("lmshealth"), function)
-        for item, future in _done(self.executor, checked, iter(items), self.size):
-            try:
-                result = future.result()
-            except self.losses:
-                result = lost(item, "it ended every worker that took it")
-            yield item, result
+        left = iter(items)
+        waiting: dict[Any, Item] = {}
+        finished: Any = as_completed
+        done = finished(loop=self.client.loop)
+        try:
+            while True:
+                for item in islice(left, _AHEAD * self.size - len(waiting)):
+                    future = self.client.submit(checked, item, pure=False)
+                    waiting[future] = item
+                    done.add(future)
+                if not waiting:
+                    return
+                future = next(done)
+                item = waiting.pop(future)
+                try:
+                    result = future.result()
+                except self.losses:
+                    result = lost(item, "it ended every worker that took it")
+                yield item, result
+        finally:
+            self.client.cancel(list(waiting))
 
 
 def _done(

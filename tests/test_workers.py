@@ -187,6 +187,21 @@ def test_a_worker_of_a_cluster_may_be_killed(cluster: servers.Cluster) -> None:
         assert {threads for _, threads in found.values()} == {1}
 
 
+@pytest.mark.slow
+def test_a_result_may_arrive_as_its_worker_dies(
+    cluster: servers.Cluster, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What was fetched counts, though the scheduler holds it for lost by now."""
+    from distributed import Future
+
+    status = Future.status.fget
+    monkeypatch.setattr(
+        Future, "status", property(lambda self: status(self).replace("finished", "lost"))
+    )
+    with workers.cluster(cluster.address) as pool:
+        assert dict(pool.spread(double, range(9), lost)) == {k: 2 * k for k in range(9)}
+
+
 def slowly(number: int) -> tuple[int, int]:
     """Give twice a number after a while, and on how many threads linear algebra works."""
     from threadpoolctl import threadpool_info
