@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from collections.abc import Sequence
 from contextlib import AbstractContextManager
 from importlib import import_module
 from math import inf
@@ -41,29 +42,38 @@ def call(program: str, *arguments: object, quick: bool, some_refused: bool = Fal
     SystemExit
         If it fails.
     """
-    done = (_here if quick else _as_a_user)(program, [str(word) for word in arguments])
-    if done.returncode not in ((0, _SOME_REFUSED) if some_refused else (0,)):
-        raise SystemExit(f"{program} {arguments[0]} ended with {done.returncode}: {done.stderr}")
+    words = [str(word) for word in arguments]
+    if quick:
+        importance_sampling = patch.object(lifefit, "_WORTH_CHAINS", inf)
+        with short_chains(), importance_sampling, no_pictures():
+            return call_here(program, words, some_refused=some_refused)
+    command = [sys.executable, "-m", program, *words]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=ROOT)
+    _insist(done.returncode, some_refused, f"{program} {words[0]}", done.stderr)
     return done.stdout
+
+
+def no_pictures() -> AbstractContextManager[object]:
+    """Let pages have no pictures: drawing them is most of making them."""
+    return patch.object(plots, "svg", lambda *_, **__: "")
+
+
+def call_here(program: str, words: Sequence[str], *, some_refused: bool = False) -> str:
+    """Call a command line in this process, and give what it prints; otherwise as `call`."""
+    module, name = _GROUPS[program]
+    group = getattr(import_module(module), name)
+    done = CliRunner().invoke(group, list(words), prog_name=program)
+    if done.exception is not None and not isinstance(done.exception, SystemExit):
+        raise done.exception
+    _insist(done.exit_code, some_refused, f"{program} {words[0]}", done.stderr)
+    return done.stdout
+
+
+def _insist(status: int, some_refused: bool, command: str, said: str) -> None:
+    if status not in ((0, _SOME_REFUSED) if some_refused else (0,)):
+        raise SystemExit(f"{command} ended with {status}: {said}")
 
 
 def short_chains() -> AbstractContextManager[object]:
     """Let chains be a fifth as long; they have to converge all the same."""
     return patch.multiple(sampling, _AUTOCORRELATION_TIMES=10, _FIRST_STEPS=100)
-
-
-def _as_a_user(program: str, words: list[str]) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", program, *words]
-    return subprocess.run(command, capture_output=True, text=True, check=False, cwd=ROOT)
-
-
-def _here(program: str, words: list[str]) -> subprocess.CompletedProcess[str]:
-    module, name = _GROUPS[program]
-    group = getattr(import_module(module), name)
-    importance_sampling = patch.object(lifefit, "_WORTH_CHAINS", inf)
-    no_pictures = patch.object(plots, "svg", lambda *_, **__: "")
-    with short_chains(), importance_sampling, no_pictures:
-        done = CliRunner().invoke(group, words, prog_name=program)
-    if done.exception is not None and not isinstance(done.exception, SystemExit):
-        raise done.exception
-    return subprocess.CompletedProcess(words, done.exit_code, done.stdout, done.stderr)

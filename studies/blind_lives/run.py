@@ -63,10 +63,9 @@ Row = dict[str, Any]
 
 N_LIVES, IN_ARCHIVE = 100, 10
 RECORD = Path(__file__).with_name("result.json")
-# A sound one, a worn one, and one with too few logs.
+# A sound one, and one with too few logs.
 QUICK = (
     BlindPlan("lms-x", "temperature-only", 5, 3.0, 61),
-    BlindPlan("lms-x", "preload-wear", 5, 3.0, 62, until="failure"),
     BlindPlan("lms-x", "preload-wear", 2, 3.0, 63, until="failure"),
 )
 PROGRAMS = ("lmshealth.__main__",)

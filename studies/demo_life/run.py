@@ -42,7 +42,7 @@ def main() -> None:
     study = Study(__file__, __doc__, parser.parse_args())
     seeds = [1] if study.quick else list(range(1, study.options.seeds + 1))
     if study.quick:
-        lives = [one_life(seed, 12, 5, 1, quick=True) for seed in seeds]
+        lives = [one_life(seed, 8, 5, 1, quick=True) for seed in seeds]
     else:
         tasks = [(seed, 40, 20, 40) for seed in seeds]
         lives = study.trials.collect(one_life, tasks, also=PROGRAMS)

@@ -16,11 +16,13 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import IO
 
 from sqlalchemy import create_engine, inspect, make_url, text
 
+from studies.commands import call_here
 from studies.faults.batch import write_machine, write_stages
 from studies.servers import MARK, Popen, marked, missing_postgres, postgres
 
@@ -30,6 +32,7 @@ LONG_S = 1200.0  # no run takes as long
 ENDED_S = 60.0  # by then every process of a killed run has to be gone, on a busy machine too
 # What is started, and what its result depends on.
 PROGRAM = ("lmshealth.__main__",)
+_PROGRAM = (sys.executable, "-m", "lmshealth")
 SOME_REFUSED = 3  # exit status of a run over the batch, which has damaged logs
 
 
@@ -61,7 +64,7 @@ class Batch:
     def command(self, out: Path, store: str, *more: str) -> list[str]:
         """Give the command that analyses the batch, health at one epoch: that is slow."""
         stages = [word for stage in self.stages for word in ("--stage", str(stage))]
-        return [sys.executable, "-m", "lmshealth", "run", str(self.logs), *stages,
+        return [*_PROGRAM, "run", str(self.logs), *stages,
                 "--out", str(out), "--store", store, "--epochs", "1",
                 *(more or ("--workers", str(self.workers)))]  # fmt: skip
 
@@ -157,12 +160,18 @@ def running(command: Sequence[str]) -> Iterator[Run]:
             run.end()
 
 
-def completed(command: Sequence[str], expected: int = SOME_REFUSED) -> float:
-    """Carry out a run to its end; give how long it took, in seconds."""
+def completed(command: Sequence[str], *, quick: bool = False) -> float:
+    """Carry out a run to its end; give how long it took, in seconds.
+
+    When quick in this process, which has imported everything already.
+    """
     begin = time.monotonic()
+    if quick:
+        call_here("lmshealth", command[len(_PROGRAM) :], some_refused=True)
+        return time.monotonic() - begin
     with running(command) as run:
         status = run.status()
-        if status != expected:
+        if status != SOME_REFUSED:
             raise RuntimeError(f"{command} ended with {status}: {run.said()}")
     return time.monotonic() - begin
 
@@ -226,12 +235,12 @@ class Reference:
         return found
 
 
-def reference_of(batch: Batch, folder: Path) -> Reference:
-    """Analyse a batch without interruption."""
+def reference_of(batch: Batch, folder: Path, *, quick: bool) -> Reference:
+    """Analyse a batch without interruption; ``quick`` as in `completed`."""
     out = folder / "out"
     store = f"sqlite:///{folder / 'reference.sqlite'}"
     folder.mkdir(parents=True)
-    seconds = completed(batch.command(out, store))
+    seconds = completed(batch.command(out, store), quick=quick)
     return Reference(batch, out, rows(store), seconds)
 
 
@@ -241,17 +250,18 @@ Stores = Callable[[], AbstractContextManager[str]]
 
 @contextmanager
 def backends(folder: Path) -> Iterator[dict[str, Stores]]:
-    """Offer new stores of both kinds; PostgreSQL only where it can be started."""
+    """Offer new stores of both kinds; PostgreSQL only where it can be started, when first asked."""
 
     @contextmanager
     def file() -> Iterator[str]:
         with tempfile.TemporaryDirectory(dir=folder) as own:
             yield f"sqlite:///{own}/store.sqlite"
 
-    found: dict[str, Stores] = {"sqlite": file}
     with ExitStack() as stack:
+        server = cache(lambda: stack.enter_context(postgres()))
+        found: dict[str, Stores] = {"sqlite": file}
         if missing_postgres() is None:
-            found["postgres"] = stack.enter_context(postgres()).database
+            found["postgres"] = lambda: server().database()
         yield found
 
 

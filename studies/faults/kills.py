@@ -73,7 +73,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         batch = make_batch(folder, *((QUICK_MACHINES, 1) if quick else (MACHINES, 2)))
-        reference = reference_of(batch, folder / "reference")
+        reference = reference_of(batch, folder / "reference", quick=quick)
         answer: Row = {
             "seed": SEED,
             "logs": len(list(batch.logs.rglob("*.h5"))),

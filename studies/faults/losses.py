@@ -59,7 +59,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         batch = make_batch(folder, *((QUICK_MACHINES, 1) if quick else (MACHINES, 2)))
-        reference = reference_of(batch, folder / "reference")
+        reference = reference_of(batch, folder / "reference", quick=quick)
         sizes, lost = (QUICK_SIZES, (1, 0.0)) if quick else (SIZES, (N_LOST, 0.5))
         both = partial(full_disk, reference, folder / "both", with_store=True)
         output = partial(full_disk, reference, folder / "output", with_store=False)
@@ -67,7 +67,9 @@ def main() -> None:
             "seed": SEED,
             "full disk": once(both, sizes, also=PROGRAM),
             "full disk, output alone": None if quick else once(output, sizes, also=PROGRAM),
-            "lost database": once(partial(lost_database, reference), *lost, also=PROGRAM),
+            "lost database": once(
+                partial(lost_database, reference, quick=quick), *lost, also=PROGRAM
+            ),
         }
     answer["passed"] = verdicts(answer)
     study.conclude(answer)
@@ -121,7 +123,9 @@ def full_disk(
     }
 
 
-def lost_database(reference: Reference, n: int, latest: float) -> Row | None:
+def lost_database(
+    reference: Reference, n: int, latest: float, *, quick: bool = False
+) -> Row | None:
     """End the database server in the middle of runs, start it, and run again.
 
     It ends at a random moment between the first log and a part of a run's time later. A run that
@@ -144,7 +148,7 @@ def lost_database(reference: Reference, n: int, latest: float) -> Row | None:
                 server.start()
                 if any(server.password in line for line in ends[-1][1]):
                     differences.append("the password was shown")
-                completed(command)
+                completed(command, quick=quick)
                 differences += reference.judge(Path(name) / "out", store)
     return {"runs": len(ends), **_failures(ends), "differences": differences}
 

@@ -71,12 +71,12 @@ def main() -> None:
             make_batch(folder / str(k), machines, 1 if quick else 2)
             for k, machines in enumerate(kinds_of_logs)
         ]
-        alone = [reference_of(batch, batch.logs.parent / "alone") for batch in batches]
+        alone = [reference_of(batch, batch.logs.parent / "alone", quick=quick) for batch in batches]
         answer: Row = {"seed": SEED, "pairs": {}}
         with backends(folder) as kinds:
             for kind, new_store in kinds.items():
                 ways = QUICK_WAYS.get(kind, ()) if quick else WAYS
-                n, of_kind = 1 if quick else N_PAIRS, partial(pairs, alone, new_store)
+                n, of_kind = 1 if quick else N_PAIRS, partial(pairs, alone, new_store, quick)
                 answer["pairs"][kind] = {
                     way: once(of_kind, kind, way, n, also=PROGRAM) for way in ways
                 }
@@ -118,7 +118,9 @@ class Pair:
         return found
 
 
-def pairs(alone: list[Reference], new_store: Stores, kind: str, way: str, n: int) -> Row:
+def pairs(
+    alone: list[Reference], new_store: Stores, quick: bool, kind: str, way: str, n: int
+) -> Row:
     """Run two at once, n times in a way."""
     rng = random.Random(f"{SEED} {kind} {way}")
     logs = way.split()[0]
@@ -126,12 +128,14 @@ def pairs(alone: list[Reference], new_store: Stores, kind: str, way: str, n: int
     # Every second pair is started together, the others one after the other.
     gaps = [rng.uniform(0, pair.first.seconds) if k % 2 else 0.0 for k in range(n)]
     kill = way.endswith(KILLED)
-    wrong = [line for gap in gaps for line in one_pair(pair, new_store, gap, kill, rng)]
+    wrong = [
+        line for gap in gaps for line in one_pair(pair, new_store, gap, kill, rng, quick=quick)
+    ]
     return {"n": n, "wrong": wrong}
 
 
 def one_pair(
-    pair: Pair, new_store: Stores, gap: float, kill: bool, rng: random.Random
+    pair: Pair, new_store: Stores, gap: float, kill: bool, rng: random.Random, *, quick: bool
 ) -> list[str]:
     """Run two at once, the second a gap (s) later; list what is not as in a run alone."""
     found: list[str] = []
@@ -151,7 +155,7 @@ def one_pair(
         if ends[0] != SOME_REFUSED or (ends[1] != SOME_REFUSED and not kill):
             found.append(f"ended with {ends}: {first.said()[-3:]}, {second.said()[-3:]}")
         if kill:
-            completed(commands[1])
+            completed(commands[1], quick=quick)
         return found + pair.wrong(store, outs)
 
 

@@ -61,7 +61,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         batch = make_batch(folder, *((QUICK_MACHINES, 1) if quick else (MACHINES, 2)))
-        reference = reference_of(batch, folder / "reference")
+        reference = reference_of(batch, folder / "reference", quick=quick)
         with dask_cluster(1 if quick else 2) as cluster:
             pace = (QUICK_KILLS, QUICK_PER_RUN) if quick else (N_KILLS, KILLS_PER_RUN)
             killed = once(partial(workers_killed, reference, cluster), *pace, also=PROGRAM)

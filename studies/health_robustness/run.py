@@ -126,14 +126,14 @@ def main() -> None:
 
 # How many lives: of each kind, of these by laws in Y and in X; on paths, by laws, by laws in X, by
 # laws with maps of so many wrong plants, and compared with chains; logs that sizes are from (none:
-# those on record are taken); of how many stages, every how many-th kind, and in how many worlds,
-# from the last, there are lives by laws.
+# those on record are taken); of how many stages, every how many-th kind, and in how many worlds
+# from the last.
 FULL = {"kind": 20, "kind_law": 5, "kind_other": 1, "path": 100, "law": 60, "other": 10,
         "demo": 50, "plant_path": 100, "plants": 10, "maps": 4, "chains": 2, "sized": 12,
-        "stages": 2, "every_kind": 1, "law_worlds": 2}  # fmt: skip
+        "stages": 2, "every_kind": 1, "worlds": 2}  # fmt: skip
 QUICK = {"kind": 1, "kind_law": 0, "kind_other": 0, "path": 8, "law": 1, "other": 0,
-         "demo": 1, "plant_path": 1, "plants": 0, "maps": 1, "chains": 1, "sized": 0,
-         "stages": 1, "every_kind": 5, "law_worlds": 1}  # fmt: skip
+         "demo": 1, "plant_path": 0, "plants": 0, "maps": 0, "chains": 1, "sized": 0,
+         "stages": 1, "every_kind": 5, "worlds": 1}  # fmt: skip
 
 
 def drawn_lives(trials: Trials, n: dict[str, int], kept: Path | None) -> Row:
@@ -148,9 +148,8 @@ def drawn_lives(trials: Trials, n: dict[str, int], kept: Path | None) -> Row:
     once, each = partial(trials.once, also=SIZES), partial(trials.collect, also=SIZES)
     kinds = [(stage, kind, n["kind"], n_law[stage]) for stage in stages
              for kind in KINDS[:: -n["every_kind"]][::-1]]  # fmt: skip
-    living = list(ARMS)[-n["law_worlds"] :]
-    worlds = [(stage, world, n["path"], laws[stage] if world in living else 0)
-              for stage in stages for world in ARMS]  # fmt: skip
+    worlds = [(stage, world, n["path"], laws[stage])
+              for stage in stages for world in list(ARMS)[-n["worlds"] :]]  # fmt: skip
     parts = {
         "lives": each(partial(lives_of, sizes), kinds),
         "fleets": each(partial(fleet_of, sizes), worlds),
@@ -299,7 +298,7 @@ def wrong_plants(stage: str, n: dict[str, int], sizes: Sizes, lost: list[str]) -
     paths = followed(on_paths(stage, n["path"], sizes), believing)
     laws = followed(by_laws_drawn(stage, n["plants"], sizes), believing)
     result = []
-    for plant in list(WRONG_PLANTS)[-n["maps"] :]:
+    for plant in list(WRONG_PLANTS)[len(WRONG_PLANTS) - n["maps"] :]:
         for arm in (Arm("no error term", 0.0), Arm("coherent", MAP_STD)):
             found: dict[str, list[list[Answer]]] = {
                 "last": [last_of(one, arm, plant) for one in paths], "now": [], "left": []

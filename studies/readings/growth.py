@@ -45,7 +45,7 @@ def known_growth(quick: bool) -> tuple[dict[str, Check], dict[str, Any]]:
     """Read logs whose level is a power of velocity: is slope ± σ what it says?"""
     rng = np.random.default_rng(4)
     bands = (*choose_bands(None, None, GRID), *wide_bands("lms-y"))
-    repetitions = 40 if quick else 400
+    repetitions = 20 if quick else 400
     kinds = {band.name: "magnitude" if band.kind == "grid" else "rms" for band in bands}
     checks: dict[str, Check] = {}
     slopes: list[dict[str, Any]] = []
@@ -134,7 +134,7 @@ def known_rms(quick: bool) -> tuple[dict[str, Check], dict[str, Any]]:
     """
     rng = np.random.default_rng(5)
     bands = {(name, b.name): b for name in ("lms-x", "lms-y") for b in wide_bands(name)}
-    repetitions = 60 if quick else 600
+    repetitions = 30 if quick else 600
     square = np.empty((repetitions, len(bands)))
     for i in range(repetitions):
         readings = read_magnitudes(noise_log(coloured(rng), 0.01), bands.values())

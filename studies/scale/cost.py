@@ -41,10 +41,11 @@ from lmshealth import Settings, identify, load_stage, read_log, run
 from lmshealth.following import loop_error
 from lmshealth.stage import Stage
 from lmshealth.waterfall import read_levels
+from studies.commands import no_pictures
 from studies.record import Study, options
 from studies.scale.archive import make_archive
 
-SIZES, QUICK_SIZES = (100, 1_000, 10_000), (2, 4, 10)
+SIZES, QUICK_SIZES = (100, 1_000, 10_000), (2, 4, 8)
 LONGER = "longer and longer"
 EVERY = 21  # so that every recording that the logs are made of is among them
 # Of the cost of one more log, of what is added to the identification, and of memory.
@@ -122,12 +123,13 @@ def sized(what: str, n_logs: int) -> tuple[Row, Row]:
 
 
 def here(n_logs: int) -> tuple[Row, Row]:
-    """Do as `sized` in this process, but for one run of the smallest archive."""
+    """Do as `sized` in this process and without pictures, but for one run of the smallest."""
     again = alone if n_logs == QUICK_SIZES[0] else one_run
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         make_archive(folder, n_logs)
-        return one_run(folder), again(folder)
+        with no_pictures():
+            return one_run(folder), again(folder)
 
 
 def marginal(less: Row, more: Row, *, by: Row | None = None) -> float:
