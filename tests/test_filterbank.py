@@ -31,6 +31,7 @@ def test_filters_are_textbook_filters() -> None:
     plain.P = np.diag([1e-6 + (x[0] * 1e-3) ** 2, (0.3 / scale) ** 2, 1e-6])
     plain.P[0, 2] = plain.P[2, 0] = -x[0] * 1e-6
     plain.R = np.array([[1e-6]])
+    np.testing.assert_allclose(bank.cov[0, 1], plain.P)
     for k in range(1, 30):
         t = steps[k]
         bank.predict(t, scale)

@@ -6,9 +6,10 @@ from itertools import product
 
 import numpy as np
 import pytest
+from scipy.integrate import trapezoid
 from scipy.special import logsumexp
 
-from lmshealth.filterbank import Bank, Readings
+from lmshealth.filterbank import Bank, Innovations, Readings
 from lmshealth.hypotheses import (
     Hypotheses,
     Scan,
@@ -17,6 +18,7 @@ from lmshealth.hypotheses import (
     order_gains,
     reduce_hypotheses,
     shape_gains,
+    stranger_gains,
 )
 
 ROW = np.array([1.0, 0.0])
@@ -95,6 +97,36 @@ def test_names_by_order_follow_the_estimates() -> None:
     by_mode = name_gains(scan.names, labels, order)
     np.testing.assert_allclose(by_mode[0], np.log(2 * 0.98))
     np.testing.assert_allclose(by_mode[1], np.log(2 * 0.02))
+
+
+def test_estimates_without_a_name_are_of_any_mode() -> None:
+    """No name, and no mode, makes no hypothesis more likely than another."""
+    labels = np.array([[0, 1], [1, -1]])
+    gains = name_gains(np.array([-1, 1]), labels, np.array([0, 1]))
+    assert (gains[:, 0] == 0).all()
+    assert gains[0, 1] > 0 == gains[1, 1]
+
+
+def test_a_damping_that_is_not_told_is_averaged_over() -> None:
+    """Strangers have any damping: odds without it are the mean of odds with it over strangers."""
+    damping = np.linspace(-30.0, 30.0, 6001)
+    n = damping.size
+    f, var = np.full((1, n, 1), 1e-3), np.full((1, n, 1), 1e-6)
+    told = stranger_gains(Innovations(f, var, damping[None, :, None], np.full((1, n, 1), 0.01)))
+    blind = stranger_gains(Innovations(f, var, 0 * f, np.full((1, n, 1), np.inf)))
+    density = 0.3  # of a stranger's ln ζ
+    mean = trapezoid(density * np.exp(told[0, :, 0]), damping)
+    assert mean == pytest.approx(np.exp(blind[0, 0, 0]), rel=1e-6)
+
+
+def test_what_differs_in_damping_is_not_joined() -> None:
+    """Hypotheses of one frequency and far dampings stay two."""
+    kept = hypotheses([[4.6, 4.8], [4.6, 4.8]], [0.6, 0.4])
+    kept.bank.var_zeta[:] = 0.01
+    kept.bank.ln_zeta[:] = [[-4.0, -4.0], [-4.0, -3.0]]
+    assert len(reduce_hypotheses(kept).log_weights) == 2
+    kept.bank.ln_zeta[:] = -4.0
+    assert len(reduce_hypotheses(kept).log_weights) == 1
 
 
 def test_equal_hypotheses_become_one_and_keep_their_weight() -> None:

@@ -13,7 +13,15 @@ from lmshealth.smoothing import smooth, smooth_one
 from lmshealth.stage import Stage
 from lmshealth.statespace import state_space
 from lmshealth.tracking import track
-from tests.lives import PRELOAD, TWO, awkward_history, make_history, make_stage, rough_history
+from tests.lives import (
+    PRELOAD,
+    TWO,
+    awkward_history,
+    make_history,
+    make_stage,
+    rough_history,
+    since,
+)
 from tests.oracles import Wander, batch
 from tests.test_bank import ALONE, KNOWN, SETTINGS, one
 from tests.test_tracking import quiet, std_of, still
@@ -130,6 +138,23 @@ def test_a_step_that_was_found_stays_sharp(stage: Stage) -> None:
     nothing = replace(track(history, stage), steps=())
     smeared = smooth(history, nothing, stage)
     assert np.abs(smeared.drift[20] - smeared.drift[19] + 0.03).max() > 1e-3
+
+
+@pytest.mark.parametrize("declared", [True, False])
+def test_only_what_nobody_declared_opens_rates_anew(stage: Stage, declared: bool) -> None:
+    """The last epoch is the track's, whether a step was said or found."""
+    ln_f, ln_zeta = still(np.random.default_rng(8), 24)
+    ln_f -= 1e-3 * np.arange(24)[:, None] + 0.03 * (np.arange(24) >= 12)[:, None]
+    history = make_history(ln_f, ln_damping=ln_zeta, std=5e-4)
+    if declared:
+        history = replace(history, steps=(since("step", 12, 24),))
+    followed = track(history, stage)
+    assert [step.declared for step in followed.steps] == [declared]
+    found = smooth(history, followed, stage)
+    np.testing.assert_allclose(
+        found.drift[-1], followed.drift[-1], atol=0.4 * std_of(followed)[-1].min()
+    )
+    np.testing.assert_allclose(found.drift_std[-1], std_of(followed)[-1], rtol=0.1)
 
 
 def test_nothing_is_said_before_the_baseline(stage: Stage) -> None:

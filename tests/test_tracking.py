@@ -382,7 +382,7 @@ def test_a_step_is_followed_and_its_size_told(stage: Stage) -> None:
     assert (np.abs(found.drift[-1] + 0.05) < 4 * std_of(found)[-1]).all()
     assert [(e.kind, e.epoch) for e in found.events if e.kind != "alarm"] == [("step", 15)] * 2
     for event in found.events:
-        assert abs(event.size + 0.05) < 4 * event.std
+        assert abs(event.size + 0.05) < 4 * event.std < 0.02
     assert found.steps[0].declared is False
 
 
