@@ -154,7 +154,9 @@ def attack(
     before = guards.snapshot(folder, [out])
     words = ["--stage", folder / "stage.toml", "--store", url, "--workers", "1", "--epochs", "1"]
     done = lmshealth("run", logs, *words, "--out", out, cwd=folder)
-    again = lmshealth("report", "--store", url, "--out", out / "again", cwd=folder)
+    again = lmshealth(
+        "report", "--store", url, "--out", out / "again", "--workers", "1", cwd=folder
+    )
     # Who names a link means what it points to.
     named = [path for path in sorted(logs.glob("*.csv")) if not path.is_symlink()]
     styles = ("table", "csv", "json") if every == 1 else ()

@@ -7,15 +7,15 @@ Method
     Mutants are made by the operators of mutmut; what changes no result by rule is left out, as
     `making.py` tells. A sample is drawn by a seed, in proportion to what each module has. Which
     tests concern a mutant is found out: the files of tests of these modules are run once with
-    coverage by test, in a copy of the project; slow and statistical tests, studies, and tests of
-    commands, pages and archives are left out, so that more may be found than is told here. Of a
-    mutant those tests are tried that run its statement: first those of the module's own file of
-    tests, then file by file, the cheapest first; after them the other tests of these files, since a
-    fixture or a kept result may have run it for them; until they had taken 30 s of the processor in
-    the unchanged project, so that what survives is told no better than it is. The first that fails
-    ends it. Twice that time and 20 s more is the limit: a mutant that reaches it is one that would
-    be seen, and is told apart. Tests that start programs count as running what they run themselves,
-    so that more mutants may be found than are told.
+    coverage by test, in a copy of the project; statistical tests, studies, and tests of commands,
+    pages and archives are left out, so that more may be found than is told here. Of a mutant those
+    tests are tried that run its statement: first those of the module's own file of tests, then file
+    by file, the cheapest first; after them the other tests of these files, since a fixture or a
+    kept result may have run it for them; until they had taken 30 s of the processor in the
+    unchanged project, so that what survives is told no better than it is. The first that fails ends
+    it. Twice that time and 20 s more is the limit: a mutant that reaches it is one that would be
+    seen, and is told apart. Tests that start programs count as running what they run themselves, so
+    that more mutants may be found than are told.
     Controls: for every module the unchanged project passes the tests chosen for one of its mutants,
     in their order, and an error planted in the function of that mutant is found.
 Answer
@@ -61,7 +61,7 @@ LINKS = {
         "courses", "decision", "laws", "maintenance", "passage", "prognosis", "verdict",
     ),
 }  # fmt: skip
-SEED, N = 10, 320
+SEED, N = 11, 320
 BUDGET_S = 30.0
 ASKED = 0.85
 # The quick form: a mutant of a small module, by its own file of tests.
@@ -144,7 +144,11 @@ def chosen(tests: Tests, module: str, lines: int, budget_s: float) -> list[str]:
     for name in tests:
         files.setdefault(name.partition("::")[0], []).append(name)
     direct = {
-        file: [name for name in names if lines & int(tests[name]["lines"].get(module, "0"), 16)]
+        file: [
+            name
+            for name in sorted(names, key=lambda name: float(tests[name]["seconds"]))
+            if lines & int(tests[name]["lines"].get(module, "0"), 16)
+        ]
         for file, names in files.items()
     }
     cost = {file: sum(tests[name]["seconds"] for name in names) for file, names in direct.items()}
