@@ -59,7 +59,7 @@ SEED = 20261122
 FLEETS, QUICK = 40, 1
 # How many machines of a fleet teach, by its kind, and how many learn.
 FLEET, SMALL, LEAST = "fleet", "small fleet", "fleet of the quick form"
-N_TEACHERS = {FLEET: 16, SMALL: 8, LEAST: 6}
+N_TEACHERS = {FLEET: 16, SMALL: 8, LEAST: 4}
 N_YOUNG, MOST_DRAWN = {FLEET: 4, SMALL: 4, LEAST: 2}, 12
 # Fleets that are taught by another one too.
 FOREIGN_FLEETS, TIMES = 20, 5.0
