@@ -197,6 +197,16 @@ def test_draws_past_the_horizon_only_count_as_alive_up_to_it() -> None:
     assert cheapest_travel(aged(np.full(100, np.inf), 0.0), 30.0) == np.inf
 
 
+@pytest.mark.parametrize("factor", [1e-9, 1e9])
+def test_the_unit_of_length_does_not_matter(factor: float) -> None:
+    """Lives and horizon that are so much longer ask for service after so much more travel."""
+    lives = weibull(2.0)[::100]
+    found = cheapest_travel(aged(lives, 0.0), 5.0)
+    assert 0 < found < SCALE
+    longer = aged(factor * lives, 0.0, horizon=factor * 1e8)
+    assert cheapest_travel(longer, 5.0) == pytest.approx(factor * found)
+
+
 def test_costs_choose_a_day_at_the_median_usage() -> None:
     """Travel over usage are days, and the risk told is that of the chosen day."""
     prognosis = aged(weibull(3.0), 1e5)

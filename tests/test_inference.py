@@ -348,6 +348,26 @@ def test_reweighting_and_sampling_agree(stage: Stage, monkeypatch: pytest.Monkey
     np.testing.assert_allclose(weighted.prior_shift, sampled.prior_shift, atol=0.08)
 
 
+def test_the_wider_posterior_may_have_draws_of_its_own(
+    stage: Stage, worn: Track, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Where weights are too uneven, what wider priors do is read off chains under these."""
+    first = 0.02 * np.random.default_rng(3).standard_normal((4, 500, 2))
+    own = iter([first, first * [1.5, 3.0] + [0.01, -0.02]])
+
+    def fake(*_: object) -> Sample:
+        full = np.full(2, 2000.0)
+        return Sample(next(own), full, full, r_hat=np.ones(2), autocorrelation_time=np.ones(2))
+
+    monkeypatch.setattr(inference, "sample", fake)
+    monkeypatch.setattr(inference, "_LEAST_SHARE", 1.1)
+    found = infer(worn, stage, 5, epochs=[2])
+    middle, std = np.median(first, axis=(0, 1)), np.std(first, axis=(0, 1))
+    shift = (middle * [0.5, 2.0] + [0.01, -0.02]) / std
+    np.testing.assert_allclose(found.prior_ratio[0], [1.5, 3.0])
+    np.testing.assert_allclose(found.prior_shift[0], shift)
+
+
 @pytest.mark.slow
 def test_correlation_is_that_of_the_draws(health: Health) -> None:
     """Preload and mount trade off, and by how much is told."""

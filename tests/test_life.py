@@ -14,7 +14,7 @@ from lmshealth.arrays import FloatArray
 from lmshealth.courses import Course
 from lmshealth.density import LifeDensity
 from lmshealth.errors import NotEnoughData
-from lmshealth.life import LifeLikelihood
+from lmshealth.life import LifeLikelihood, scatter_of
 from lmshealth.stage import Stage
 from lmshealth.tracks import History
 from tests.lives import (
@@ -182,6 +182,15 @@ def test_lives_that_leave_the_map_or_the_prior_are_impossible(stage: Stage) -> N
     found = density.log_probability(np.array([inside, worn, below, low]))
     assert np.isfinite(found).tolist() == [True, False, False, False]
     assert np.isneginf(found[1:]).all()
+
+
+def test_reported_errors_and_laws_are_believed_first(stage: Stage) -> None:
+    """Beforehand larger errors and larger deviations are the less probable the larger they are."""
+    believed = scatter_of(stage)
+    for prior in (believed.noise_scale, believed.deviation):
+        assert sum(prior) == pytest.approx(1)
+        assert prior[0] > 0.5
+        assert (np.diff(prior) < 0).all()
 
 
 def test_the_intercept_is_free(stage: Stage) -> None:

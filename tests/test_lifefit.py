@@ -95,6 +95,33 @@ def faded(wavering: Stage) -> LifePosterior:
     return fit_life(lived(TRAVEL, 1 - 0.08e-6 * TRAVEL, np.ones(12)), wavering, 7)
 
 
+@pytest.fixture(scope="module")
+def unchained(history: History, stage: Stage) -> LifePosterior:
+    """Posterior by few draws of importance sampling alone."""
+    return fit_life(history, stage, 11, chains=False, n_draws=400)
+
+
+@pytest.fixture
+def forked(unchained: LifePosterior) -> LifePosterior:
+    """Make two ways of it, the second with the same draws backwards, with checks of their own."""
+    (way,) = unchained.ways
+    steps = np.arange(way.course.n_dim)
+    ways = tuple(
+        replace(
+            way,
+            probability=probability,
+            coordinates=way.coordinates[:, :: 1 - 2 * k],
+            ess_bulk=900.0 - 100 * k - steps,
+            ess_tail=800.0 - 100 * k - steps,
+            r_hat=1.001 + 0.004 * k + 1e-4 * steps,
+            informed=0.9 - 0.4 * k - 0.01 * steps,
+            share=int(100 * probability),
+        )
+        for k, probability in enumerate((0.75, 0.25))
+    )
+    return replace(unchained, ways=ways)
+
+
 def agree(one: FloatArray, two: FloatArray, ess: float) -> bool:
     """Whether draws ``(n, k)`` have the same quantiles within the error of so many draws."""
     for level in (0.1, 0.5, 0.9):
@@ -170,6 +197,19 @@ def test_linear_algebra_keeps_to_one_thread(
         fit_life(history, stage, 11, chains=False, n_draws=400)
         assert seen == {1}
         assert threads() == {2}
+
+
+def test_importance_sampling_alone_has_no_chains(unchained: LifePosterior) -> None:
+    """Without chains there is no R-hat to be worse than 1, and no chain with few draws."""
+    assert np.isnan(unchained.ways[0].r_hat).all()
+    assert unchained.ess == np.inf
+    assert unchained.worst_r_hat == 1
+
+
+def test_the_worst_of_all_chains_is_told(forked: LifePosterior) -> None:
+    """Of the checks of all ways the worst speaks for the whole."""
+    assert forked.ess == 697
+    assert forked.worst_r_hat == pytest.approx(1.0053)
 
 
 @pytest.mark.slow
@@ -393,6 +433,25 @@ def test_a_life_is_a_table(found: LifePosterior) -> None:
     informed = found.ways[0].informed
     assert table.loc["guide_preload.hertz-wear.life_m", "informed"] == informed[0]
     assert (table["q05"] < table["q95"]).all()
+
+
+def test_a_table_and_arviz_are_told_every_way(forked: LifePosterior) -> None:
+    """Draws, checks and probability of each way stand under its number in both."""
+    table, tree = forked.to_frame(), forked.to_arviz()
+    checks = tree["checks_data"]
+    np.testing.assert_array_equal(tree["posterior/guide_preload"], forked.health[..., 0])
+    for k, way in enumerate(forked.ways, 1):
+        rows = table[table["way"] == k].set_index("parameter")
+        assert len(rows) == way.course.n_dim
+        assert set(tree[f"way_{k}"].data_vars) == set(rows.index)
+        assert (rows["probability"] == way.probability).all()
+        assert float(checks[f"probability_{k}"]) == way.probability
+        for i, name in enumerate(rows.index):
+            np.testing.assert_array_equal(tree[f"way_{k}"][name], way.chains[..., i])
+            assert rows.loc[name, "median"] == np.median(way.chains[..., i])
+            for what in ("ess_bulk", "ess_tail", "r_hat", "informed"):
+                value = getattr(way, what)[i]
+                assert rows.loc[name, what] == float(checks[f"{what}_{k}_{name}"]) == value
 
 
 def test_no_life_without_convergence(

@@ -40,6 +40,15 @@ def test_all_files_below_a_folder_are_read_in_the_order_of_time(tmp_path: Path) 
     assert [(a.stage, a.action) for a in found.actions] == [("A", "regrease"), ("B", "servo")]
 
 
+def test_rows_of_a_table_are_put_in_the_order_of_time(tmp_path: Path) -> None:
+    """A table that was not filled in by the day reads as one that was, zones respected."""
+    path = tmp_path / "maintenance.csv"
+    rows = ["A,2026-05-02T09:00:00Z,servo", "B,2026-05-01T09:00:00Z,regrease"]
+    path.write_text(HEAD + "\n".join([*rows, "A,2026-05-01T10:00:00+02:00,servo\n"]))
+    found = [(action.stage, action.recorded_at.day) for action in read_actions(path)]
+    assert found == [("A", 1), ("B", 1), ("A", 2)]
+
+
 def test_no_file_is_no_maintenance(tmp_path: Path) -> None:
     """A folder without records gives nothing."""
     assert read_maintenance(tmp_path) == Maintenance()

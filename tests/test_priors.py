@@ -110,6 +110,14 @@ def test_a_joint_prior_is_cut_to_its_box(joint: JointPrior) -> None:
     np.testing.assert_allclose(np.exp(high), [3.0, 4.0, 2.5])
 
 
+def test_the_ends_of_the_box_belong_to_it(joint: JointPrior) -> None:
+    """A posterior may be highest where the map ends; beyond that, however little, is nothing."""
+    ends = np.array([joint.low, joint.high])
+    outwards = np.array([[-1e-9], [1e-9]])
+    assert joint.inside(ends).all()
+    assert not joint.inside(ends + outwards).any()
+
+
 def test_a_joint_density_is_that_of_the_logarithms(joint: JointPrior) -> None:
     """Differences are those of the textbook densities with the Jacobian; outside it is zero."""
     x = np.log([[1.5, 1.0, 0.6], [2.5, 3.9, 2.4], [0.9, 1.0, 0.6], [1.5, 1.0, 2.6]])

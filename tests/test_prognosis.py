@@ -28,6 +28,7 @@ from tests.lives import (
     PRELOAD,
     START,
     TEMPERATURE,
+    cut,
     make_history,
     make_stage,
     true_drift,
@@ -181,6 +182,13 @@ def test_usage_that_is_stated_is_taken(fading: Prognosis) -> None:
     """Stated kilometres per day come out as metres per day without spread."""
     assert (fading.usage == 20_000).all()
     assert fading.horizon == 5e6
+
+
+def test_usage_that_is_stated_asks_no_odometer(stage: Stage) -> None:
+    """A machine of one log, which no usage could be learned from, has the stated one as numbers."""
+    rng, left = np.random.default_rng(9), np.array([-1e5, 1e6, np.inf])
+    usage = _usage(cut(fading_life(1e-4), 1), stage, rng, left, 2e7)
+    np.testing.assert_array_equal(usage, np.full(3, 2e4), strict=True)
 
 
 @pytest.fixture(scope="module")

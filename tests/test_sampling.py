@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from emcee import autocorr
+from emcee.autocorr import integrated_time
 from scipy import stats
 
 from lmshealth import sampling
@@ -195,6 +197,37 @@ def test_too_few_steps_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
         sample(gaussian, begin, stream(14))
 
 
+def test_chains_grow_by_half_at_least(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A run that does not converge is looked at few times, and the last time at its full length."""
+    first, most, lengths = 16, 50, list[int]()
+
+    def arrived(rng: np.random.Generator) -> FloatArray:
+        return rng.multivariate_normal(MEAN, COV, size=WALKERS)
+
+    def doubtful(_: str, chains: FloatArray, **__: object) -> FloatArray:
+        return np.full(chains.shape[-1], 2.0)
+
+    def counted(chain: FloatArray, **options: object) -> FloatArray:
+        lengths.append(chain.shape[0])
+        return integrated_time(chain, **options)
+
+    for name, value in {
+        "_FIRST_STEPS": first,
+        "_MOST_STEPS": most,
+        "_AUTOCORRELATION_TIMES": 0,
+        "_diagnose": doubtful,
+    }.items():
+        monkeypatch.setattr(sampling, name, value)
+    monkeypatch.setattr(autocorr, "integrated_time", counted)
+    with pytest.raises(NotConverged, match=r"after 50 steps .* R-hat 2\.000"):
+        sample(gaussian, arrived, stream(15))
+    looks = np.unique(lengths)
+    assert looks[0] == first
+    assert looks[-1] == most
+    assert looks.size > 2
+    assert (looks[1:] >= np.minimum(1.5 * looks[:-1], most)).all()
+
+
 @pytest.mark.parametrize("width", [1e-4, 1e-2, 1.0])
 def test_starts_are_inside_the_support_and_distinct(width: float) -> None:
     """However narrow the support within the prior, every walker starts inside, alone."""
@@ -270,9 +303,10 @@ def test_starts_find_a_posterior_far_narrower_than_the_prior() -> None:
     def narrow(x: FloatArray) -> FloatArray:
         return -0.5 * np.sum(((x - 1.0) / 3e-3) ** 2, axis=1)
 
-    points = start_from_prior(narrow, wide)(np.random.default_rng(2))
+    start, rng = start_from_prior(narrow, wide), np.random.default_rng(2)
+    points = np.concatenate([start(rng) for _ in range(5)])
     assert np.abs(points - 1.0).max() < 10 * 3e-3
-    assert points.std() > 3e-4
+    assert 0.7 * 3e-3 < points.std() < 2 * 3e-3
 
 
 def test_starts_go_on_until_they_have_arrived() -> None:
