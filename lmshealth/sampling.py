@@ -145,7 +145,10 @@ def _run(samplers: list[tuple[emcee.EnsembleSampler, emcee.State]]) -> Sample:
         ]
         n_steps = target
         chains = np.stack([sampler.get_chain() for sampler, _ in samplers])
-        tau = np.max([integrated_time(chain, tol=0, quiet=True) for chain in chains], axis=0)
+        with np.errstate(invalid="ignore"):
+            tau = np.max([integrated_time(chain, tol=0, quiet=True) for chain in chains], axis=0)
+        # Of a walker that never moved it is NaN: no shorter than the run.
+        tau = np.where(np.isnan(tau), n_steps, tau)
         burn = int(min(10 * tau.max(), n_steps / 2))
         kept = chains[:, burn:]
         enough = kept.shape[1] >= _AUTOCORRELATION_TIMES * tau.max()

@@ -228,6 +228,24 @@ def test_chains_grow_by_half_at_least(monkeypatch: pytest.MonkeyPatch) -> None:
     assert (looks[1:] >= np.minimum(1.5 * looks[:-1], most)).all()
 
 
+def test_a_walker_that_never_moves_is_no_convergence(monkeypatch: pytest.MonkeyPatch) -> None:
+    """One that begins on a needle stays there: refused with the chains, not with a broken sum."""
+    monkeypatch.setattr(sampling, "_FIRST_STEPS", 30)
+    monkeypatch.setattr(sampling, "_MOST_STEPS", 40)
+
+    def needle(x: FloatArray) -> FloatArray:
+        return gaussian(x) + 30 * np.exp(-0.5 * np.sum(((x - MEAN) / 1e-5) ** 2, axis=1))
+
+    def one_on_it(rng: np.random.Generator) -> FloatArray:
+        return np.vstack([MEAN, begin(rng)[1:]])
+
+    with pytest.raises(
+        NotConverged, match="after 40 steps the autocorrelation time is 40"
+    ) as caught:
+        sample(needle, one_on_it, stream(16))
+    assert (np.asarray(caught.value.chains)[:, :, 0] == MEAN).all()
+
+
 @pytest.mark.parametrize("width", [1e-4, 1e-2, 1.0])
 def test_starts_are_inside_the_support_and_distinct(width: float) -> None:
     """However narrow the support within the prior, every walker starts inside, alone."""
