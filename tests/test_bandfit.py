@@ -8,8 +8,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lmshealth.band import View
-from lmshealth.bandfit import BandFit, _dispersion, _flags, fit_band
+from lmshealth import bandfit
+from lmshealth.band import Band, View, make_blocks
+from lmshealth.bandfit import BandFit, _dispersion, _flags, _incredible, fit_band
+from lmshealth.blocks import Block
 from lmshealth.segments import Segment
 from lmshealth.spectra import CrossSpectrum, Spectrum, cross_spectra
 from lmshealth.starts import Target, coarsen
@@ -341,6 +343,36 @@ def test_a_peak_as_narrow_as_mains_is_no_mode_unless_sought(
     assert result is not None
     assert [t.name for t in result.targets] == ([] if reason else ["roll"])
     assert reason is None or missing["roll"][0] == reason
+
+
+def test_a_mode_narrower_than_a_record_resolves_is_a_line() -> None:
+    """A half-power bandwidth of 0.95 Fourier frequencies is not believed, one of 1.05 is."""
+    result = found(both())
+    width = 2 * np.exp(result.estimate[0] + result.estimate[2])
+    why = _incredible(result, 0, 0.95 / width)
+    assert why is not None
+    assert why[0] == "line-not-mode"
+    assert "is narrower" in why[1]
+    assert _incredible(result, 0, 1.05 / width) is None
+
+
+@pytest.mark.parametrize(("damping", "again"), [(0.015, False), (0.004, True)])
+def test_bins_are_as_fine_as_the_resonance_that_is_found(
+    monkeypatch: pytest.MonkeyPatch, damping: float, again: bool
+) -> None:
+    """One much narrower than sought is binned anew, by its own width; one as sought is not."""
+    widths: list[float] = []
+
+    def spy(band: Band, width: float, near: Sequence[float] | None = None) -> tuple[Block, ...]:
+        if near is not None:
+            widths.append(width)
+        return make_blocks(band, width, near)
+
+    monkeypatch.setattr(bandfit, "make_blocks", spy)
+    values = accelerations(np.random.default_rng(1), [Mode(105.0, damping)], 60_000, RATE, 0.5)
+    found(values, (ROLL,))
+    assert len(widths) == 1 + again
+    assert widths[-1] == pytest.approx(2 * damping * 105.0, rel=0.3)
 
 
 # How well the model fits, and what to bear in mind

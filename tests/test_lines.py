@@ -5,11 +5,13 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from lmshealth.lines import find_lines, name_lines, survey_lines
+from lmshealth.linetest import find_sines
 from lmshealth.logs import Channel, Log
 from lmshealth.readers import read_log
 from lmshealth.results import Line
@@ -195,6 +197,23 @@ def test_pieces_of_a_log_without_set_point_are_searched_together() -> None:
     assert line.frequency == pytest.approx(141.0, abs=0.4)
     whole = make_log({"acc_a": values}, RATE, pieces=pieces[:1])
     assert survey_lines(whole, whole.channels, None, BAND) == ()
+
+
+def test_every_sample_of_a_displacement_is_searched(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The lengths that are announced are those of the second differences, of each segment."""
+    pairs: list[tuple[int, int]] = []
+
+    def spy(lengths: Sequence[int], read: Callable[[int], np.ndarray], *rest: Any) -> np.ndarray:
+        pairs.extend((length, read(number).size) for number, length in enumerate(lengths))
+        return find_sines(lengths, read, *rest)
+
+    monkeypatch.setattr("lmshealth.lines.find_sines", spy)
+    values = displacements(np.random.default_rng(13), [Mode(60.0, 0.02)], 5000, RATE, 1e-18)[0]
+    log = make_log({"delta_e": values}, RATE, pieces=[(0, 3000), (3100, 5000)])
+    survey_lines(log, log.channels, None, (5.0, 30.0))
+    assert [length for length, _ in pairs] == [size for _, size in pairs]
+    # The difference reaches over four samples to either side.
+    assert [length for length, _ in pairs] == [2992, 1892]
 
 
 def test_a_line_that_stands_still_is_no_order() -> None:

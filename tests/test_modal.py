@@ -244,6 +244,17 @@ def test_the_floor_of_the_following_error_is_its_noise_also_in_short_moves() -> 
     assert mode.snr(1.0) / 3 < np.median(snr) < mode.snr(1.0) * 3
 
 
+def test_noise_of_the_encoder_beyond_the_band_hides_no_mode() -> None:
+    """In 4 s of Δe at 20 kHz a mode is found in a band to 250 Hz, though noise rises to 10 kHz."""
+    rate, mode = 20_000.0, Mode(130.0, 0.02, 0.1)
+    level = 1 / (2 * np.pi * 130.0) ** 4
+    for seed in range(3):
+        values = displacements(rng(seed), [mode], 80_000, rate, level)[0]
+        found = identify(make_log({"delta_e": values}, rate), band=(60.0, 250.0))
+        assert found.names == ("mode_1",)
+        assert np.abs(deviations(found, "mode_1", mode.frequency, mode.damping)).max() < 4
+
+
 def short_moves(seed: int, n_moves: int = 7, seconds: float = 3.0) -> Log:
     """Make a log of separate short moves of one mode."""
     generator, n = rng(seed), round(seconds * RATE)
@@ -458,6 +469,15 @@ def test_modes_are_found_in_a_band_and_named_in_order() -> None:
         assert np.abs(deviations(found, name, mode.frequency, mode.damping)).max() < 4
 
 
+def test_a_mode_on_the_flank_of_another_is_found_in_what_that_one_leaves_over() -> None:
+    """One peak stands out of the noise, and both modes under it are read within 4σ."""
+    modes = [Mode(30.0, 0.03), Mode(31.5, 0.01, 0.1)]
+    found = identify(acceleration_log(rng(27), modes, 600, 250.0, 0.2), band=(20.0, 50.0))
+    assert found.names == ("mode_1", "mode_2")
+    for name, mode in zip(found.names, modes, strict=True):
+        assert np.abs(deviations(found, name, mode.frequency, mode.damping)).max() < 4
+
+
 @pytest.fixture
 def fitted(monkeypatch: pytest.MonkeyPatch) -> list[tuple[spectra.View, tuple[Target, ...]]]:
     """List the views and targets that are fitted."""
@@ -657,15 +677,16 @@ def test_a_lonely_resonance_is_not_named_by_guessing(lonely: str) -> None:
         assert "ambiguous" in {r.reason for r in found.refused}
 
 
-def test_two_of_three_modes_keep_their_names() -> None:
+@pytest.mark.parametrize("pair", [("roll", "yaw"), ("roll", "pitch"), ("pitch", "yaw")])
+def test_two_of_three_modes_keep_their_names(pair: tuple[str, str]) -> None:
     """The distance between two resonances tells which of three they are."""
     nominal = {"roll": 126.4, "pitch": 136.6, "yaw": 155.0}
     stage = make_stage([(name, f, 0.017) for name, f in nominal.items()])
     for seed in range(4):
-        modes = [Mode(nominal[name], 0.017) for name in ("roll", "yaw")]
+        modes = [Mode(nominal[name], 0.017) for name in pair]
         signal = accelerations(rng(seed), modes, round(20 * RATE), RATE, 0.01)[0]
         found = identify(make_log({"acc_a": signal}, RATE), stage)
-        assert found.names == ("roll", "yaw")
+        assert found.names == pair
 
 
 def test_a_silent_channel_has_no_mode_and_does_no_harm() -> None:

@@ -95,6 +95,19 @@ def test_means_show_peaks_that_single_records_hide() -> None:
         assert sum(near(targets, 126.4, 0.02) for targets in found) == seen
 
 
+@pytest.mark.parametrize("wide", [1, 2])
+def test_no_peak_is_narrower_than_four_ordinates(wide: int) -> None:
+    """What rises in one ordinate or two of a mean is a candidate at least four ordinates wide."""
+    density = np.ones(5600)
+    density[200 : 200 + wide] = 12.0
+    spectrum = means(np.random.default_rng(14), density, 30)
+    peaks = find_peaks(((spectrum,),), 20.5, 280.0)
+    assert near(peaks, float(spectrum.frequency[200]), 0.005)
+    # A scale, half the width of a peak, is 1.5 damping ratios.
+    widths = [2 * 1.5 * t.damping_ratio * t.frequency * spectrum.duration for t in peaks]
+    assert min(widths) >= 4
+
+
 def test_means_leave_over_what_single_records_hide() -> None:
     """A fit that lacks 20 % over 3 Hz is found out by the mean of 30 records, and not by one."""
     frequency = np.arange(400, 6000) / 20.0

@@ -132,6 +132,18 @@ def test_a_tone_seen_by_two_channels_leaves_both() -> None:
     np.testing.assert_allclose(mean, 1.0, atol=0.1 + 4.5 / np.sqrt(near.sum()))
 
 
+@pytest.mark.parametrize("factor", [1e-3, 1e3])
+def test_the_unit_of_a_channel_makes_no_tones(factor: float) -> None:
+    """A tone of two channels stays one, and takes the same ordinates, in whatever unit one is."""
+    tone = sine(N, RATE, 150.02, 100.0)
+    for seed in range(3):
+        one, other = noise(seed) + tone, noise(10 + seed) + 0.3 * tone
+        _, free, tones = remove_tones(transform(one, other), SECONDS, SPARED)
+        _, same, scaled = remove_tones(transform(one, factor * other), SECONDS, SPARED)
+        assert [t.channel for t in scaled] == [t.channel for t in tones] == [0]
+        np.testing.assert_array_equal(same, free)
+
+
 @pytest.mark.parametrize("apart", [0.6, 1.0, 3.0, 10.0])
 @pytest.mark.parametrize("amplitude", [20.0, 60.0])
 def test_neighbouring_tones_are_both_taken_out(apart: float, amplitude: float) -> None:
