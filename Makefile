@@ -27,6 +27,8 @@ check: .venv/installed
 # Tests run side by side: threads inside linear algebra would only get in their way.
 test slow coverage statistics bench: export OPENBLAS_NUM_THREADS = 1
 test slow coverage statistics bench: export OMP_NUM_THREADS = 1
+# They start many programs: these find compiled what one of them has compiled.
+unexport PYTHONDONTWRITEBYTECODE
 test: .venv/installed
 	$(BIN)/pytest -n 2 --dist worksteal -m "not slow and not statistical"
 
