@@ -69,7 +69,7 @@ NOT_MET = {
 
 
 def main() -> None:
-    """Run the study; ``--quick`` takes a third of the building and records nothing."""
+    """Run the study; ``--quick`` takes a part of the building, records nothing."""
     study = Study(__file__, __doc__)
     if "LMSHEALTH_DATA" not in os.environ:
         raise SystemExit("LMSHEALTH_DATA is not set: it names the folder of real measurements")
