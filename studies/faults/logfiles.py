@@ -8,6 +8,7 @@ import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from datetime import UTC, datetime, timedelta
+from functools import cache
 from pathlib import Path
 
 import h5py
@@ -76,14 +77,16 @@ class Archive:
 
 def recordings(n: int, seconds: float = SECONDS) -> list[Columns]:
     """Simulate some recordings of one stage, at a tenth of the servo's rate."""
-    found = []
-    for k in range(n):
-        rng = np.random.default_rng([20261122, k])
-        columns = record(STAGES["lms-y"], seconds=seconds, velocity=VELOCITY, rng=rng).columns
-        slow = {name: decimate(columns[name], _EVERY_TENTH, ftype="fir") for name in _SIGNALS}
-        slow["reference_velocity_mm_s"] = np.full(slow["delta_e_um"].size, 1e3 * VELOCITY)
-        found.append({name: values.astype(np.float32) for name, values in slow.items()})
-    return found
+    return [dict(_recording(k, seconds)) for k in range(n)]
+
+
+@cache
+def _recording(k: int, seconds: float) -> Columns:
+    rng = np.random.default_rng([20261122, k])
+    columns = record(STAGES["lms-y"], seconds=seconds, velocity=VELOCITY, rng=rng).columns
+    slow = {name: decimate(columns[name], _EVERY_TENTH, ftype="fir") for name in _SIGNALS}
+    slow["reference_velocity_mm_s"] = np.full(slow["delta_e_um"].size, 1e3 * VELOCITY)
+    return {name: values.astype(np.float32) for name, values in slow.items()}
 
 
 def log_of(base: Columns, number: int, rng: np.random.Generator) -> LogFile:
