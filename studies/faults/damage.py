@@ -4,28 +4,40 @@ from __future__ import annotations
 
 import gzip
 import os
-import struct
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import h5py
 import numpy as np
 
+from studies.faults.containers import (
+    ACC,
+    BOMB,
+    Maker,
+    Rng,
+    external_link,
+    external_storage,
+    gzip_bomb,
+    hdf5,
+    hdf5_bomb,
+    mat,
+    name_of,
+    never_written,
+    parquet,
+    strings,
+    two_rates,
+    unfinished,
+    virtual,
+)
 from studies.faults.logfiles import RATE, SUFFIXES, Archive, Columns, LogFile, text_of, write
 
-Rng = np.random.Generator
-# Makes a damaged log in the place of a good one, and names what refused.csv must list.
-Maker = Callable[[Archive, Path, LogFile, Rng], str]
 _BINARY = (".parquet", ".h5", ".tdms", ".mat", ".uff")
 _TEXT = (".csv", ".csv.gz")
 _TYPED = (".csv", ".csv.gz", ".parquet", ".h5", ".tdms", ".mat")  # hold metadata of their own
-_ACC, _ERROR = "acc_feed_m_s2", "delta_e_um"
-_ALL = (_ERROR, _ACC, "acc_pitch_m_s2")
+_ERROR = "delta_e_um"
+_ALL = (_ERROR, ACC, "acc_pitch_m_s2")
 # The longest beginning that a format is known by: that of MAT.
 _HEAD = 128
-# Zeros that a bomb unpacks to: more than any file may.
-_BOMB = 40_000_000
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,17 +65,13 @@ class Kind:
     lost: bool = True
 
 
-def _name(archive: Archive, path: Path) -> str:
-    return path.relative_to(archive.folder).as_posix()
-
-
 def _of_bytes(change: Callable[[bytes, Rng], bytes]) -> Maker:
     """Damage what a file holds."""
 
     def make(archive: Archive, path: Path, log: LogFile, rng: Rng) -> str:
         write(archive, path, log)
         path.write_bytes(change(path.read_bytes(), rng))
-        return _name(archive, path)
+        return name_of(archive, path)
 
     return make
 
@@ -73,7 +81,7 @@ def _of_columns(change: Callable[[Columns, Rng], Columns]) -> Maker:
 
     def make(archive: Archive, path: Path, log: LogFile, rng: Rng) -> str:
         write(archive, path, replace(log, columns=change(dict(log.columns), rng)))
-        return _name(archive, path)
+        return name_of(archive, path)
 
     return make
 
@@ -84,7 +92,7 @@ def _of_metadata(**said: str | None) -> Maker:
     def make(archive: Archive, path: Path, log: LogFile, rng: Rng) -> str:
         told = {key: v for key, v in {**log.metadata, **said}.items() if v is not None}
         write(archive, path, replace(log, metadata=told))
-        return _name(archive, path)
+        return name_of(archive, path)
 
     return make
 
@@ -95,7 +103,7 @@ def _of_text(change: Callable[[list[bytes], Rng], list[bytes]]) -> Maker:
     def make(archive: Archive, path: Path, log: LogFile, rng: Rng) -> str:
         text = b"\n".join(change(text_of(log).split(b"\n"), rng))
         path.write_bytes(gzip.compress(text, 1) if path.suffix == ".gz" else text)
-        return _name(archive, path)
+        return name_of(archive, path)
 
     return make
 
@@ -170,7 +178,7 @@ def _only(count: int) -> Callable[[Columns, Rng], Columns]:
 
 
 def _unlike(columns: Columns, rng: Rng) -> Columns:
-    return columns | {_ACC: columns[_ACC][:-7]}
+    return columns | {ACC: columns[ACC][:-7]}
 
 
 def _set(value: float, *names: str) -> Callable[[Columns, Rng], Columns]:
@@ -180,17 +188,17 @@ def _set(value: float, *names: str) -> Callable[[Columns, Rng], Columns]:
 
 
 def _clipped(columns: Columns, rng: Rng) -> Columns:
-    values = columns[_ACC]
+    values = columns[ACC]
     reach = values.std() * rng.uniform(0.5, 1.5)
-    return columns | {_ACC: np.clip(values, -reach, reach)}
+    return columns | {ACC: np.clip(values, -reach, reach)}
 
 
 def _missing(share: float) -> Callable[[Columns, Rng], Columns]:
     def change(columns: Columns, rng: Rng) -> Columns:
-        values = columns[_ACC].copy()
+        values = columns[ACC].copy()
         start = int(rng.integers(1, int(values.size * (0.95 - share))))
         values[start : start + int(share * values.size)] = np.nan
-        return columns | {_ACC: values}
+        return columns | {ACC: values}
 
     return change
 
@@ -247,24 +255,24 @@ def _another_format(archive: Archive, path: Path, log: LogFile, rng: Rng) -> str
     real = path.with_name(f".{path.name}{other}")
     write(Archive(archive.folder), real, log)
     real.rename(path)
-    return _name(archive, path)
+    return name_of(archive, path)
 
 
 def _link_out(archive: Archive, path: Path, log: LogFile, rng: Rng) -> str:
     outside = archive.folder.parent / f"outside-{path.name}"
     write(Archive(archive.folder.parent), outside, log)
     path.symlink_to(outside)
-    return _name(archive, path)
+    return name_of(archive, path)
 
 
 def _dangling(archive: Archive, path: Path, log: LogFile, rng: Rng) -> str:
     path.symlink_to(archive.folder / "gone")
-    return _name(archive, path)
+    return name_of(archive, path)
 
 
 def _pipe(archive: Archive, path: Path, log: LogFile, rng: Rng) -> str:
     os.mkfifo(path)
-    return _name(archive, path)
+    return name_of(archive, path)
 
 
 def _copy(archive: Archive, path: Path, log: LogFile, rng: Rng) -> str:
@@ -272,7 +280,7 @@ def _copy(archive: Archive, path: Path, log: LogFile, rng: Rng) -> str:
     write(archive, path, log)
     copy = path.with_name(f"{path.name.split('.')[0]}z{''.join(path.suffixes)}")
     copy.write_bytes(path.read_bytes())
-    return _name(archive, copy)
+    return name_of(archive, copy)
 
 
 # Tables beside the logs
@@ -280,8 +288,8 @@ def _copy(archive: Archive, path: Path, log: LogFile, rng: Rng) -> str:
 
 def _bad_row(archive: Archive, path: Path, log: LogFile, rng: Rng) -> str:
     write(archive, path, log)
-    archive.manifest.append([_name(archive, path), "", "", "", "one cell too many"])
-    return _name(archive, path)
+    archive.manifest.append([name_of(archive, path), "", "", "", "one cell too many"])
+    return name_of(archive, path)
 
 
 def _row(cells: Callable[[str], list[str]]) -> Maker:
@@ -289,16 +297,16 @@ def _row(cells: Callable[[str], list[str]]) -> Maker:
 
     def make(archive: Archive, path: Path, log: LogFile, rng: Rng) -> str:
         write(archive, path, log)
-        archive.manifest.append([_name(archive, path), *cells(log.metadata["recorded_at"])])
-        return _name(archive, path)
+        archive.manifest.append([name_of(archive, path), *cells(log.metadata["recorded_at"])])
+        return name_of(archive, path)
 
     return make
 
 
 def _two_rows(archive: Archive, path: Path, log: LogFile, rng: Rng) -> str:
     write(archive, path, log)
-    archive.manifest += [[_name(archive, path), "", "", km] for km in ("1", "2")]
-    return _name(archive, path)
+    archive.manifest += [[name_of(archive, path), "", "", km] for km in ("1", "2")]
+    return name_of(archive, path)
 
 
 def _named(template: str) -> Maker:
@@ -322,127 +330,12 @@ def _work(*cells: str) -> Maker:
     return make
 
 
-# HDF5, MAT, Parquet and TDMS from inside
-
-
-def _hdf5(change: Callable[[h5py.File, Path, np.ndarray], None]) -> Maker:
-    """Put something else in the place of a column of an HDF5 file."""
-
-    def make(archive: Archive, path: Path, log: LogFile, rng: Rng) -> str:
-        write(archive, path, log)
-        with h5py.File(path, "a") as file:
-            values = file[_ACC][()]
-            del file[_ACC]
-            change(file, archive.folder.parent, values)
-        return _name(archive, path)
-
-    return make
-
-
-def _external_link(file: h5py.File, outside: Path, values: np.ndarray) -> None:
-    with h5py.File(outside / "secret.h5", "w") as other:
-        other["x"] = values
-    file[_ACC] = h5py.ExternalLink(str(outside / "secret.h5"), "x")
-
-
-def _external_storage(file: h5py.File, outside: Path, values: np.ndarray) -> None:
-    (outside / "secret.raw").write_bytes(values.tobytes())
-    place = [(str(outside / "secret.raw"), 0, values.nbytes)]
-    file.create_dataset(_ACC, values.shape, values.dtype, external=place)
-
-
-def _virtual(file: h5py.File, outside: Path, values: np.ndarray) -> None:
-    with h5py.File(outside / "virtual.h5", "w") as other:
-        other["x"] = values
-    layout = h5py.VirtualLayout(values.shape, values.dtype)
-    layout[:] = h5py.VirtualSource(str(outside / "virtual.h5"), "x", values.shape)
-    file.create_virtual_dataset(_ACC, layout)
-
-
-def _never_written(file: h5py.File, outside: Path, values: np.ndarray) -> None:
-    dataset = file.create_dataset(_ACC, values.shape, values.dtype, chunks=(1000,))
-    dataset[:1000] = values[:1000]
-
-
-def _strings(file: h5py.File, outside: Path, values: np.ndarray) -> None:
-    file.create_dataset(_ACC, data=["1.0"] * values.size, dtype=h5py.string_dtype())
-
-
-def _hdf5_bomb(file: h5py.File, outside: Path, values: np.ndarray) -> None:
-    file.create_dataset(
-        _ACC, data=np.zeros(_BOMB, dtype=np.int8), chunks=(1 << 20,), compression="gzip"
-    )
-
-
-def _mat(value: Callable[[np.ndarray], object]) -> Maker:
-    """Put something else in the place of a variable of a MAT file."""
-
-    def make(archive: Archive, path: Path, log: LogFile, rng: Rng) -> str:
-        import scipy.io
-
-        columns = {**log.columns, _ACC: value(log.columns[_ACC])}
-        scipy.io.savemat(path, {**columns, **log.metadata}, do_compression=True)
-        return _name(archive, path)
-
-    return make
-
-
-def _parquet(kind: str) -> Maker:
-    """Give a column of a Parquet file a type that is no number."""
-
-    def make(archive: Archive, path: Path, log: LogFile, rng: Rng) -> str:
-        import pyarrow as pa
-        import pyarrow.parquet as pq
-
-        n = log.columns[_ACC].size
-        odd = {
-            "text": lambda: pa.array(["1.0"] * n),
-            "lists": lambda: pa.array([[1.0]] * n),
-            "extension": lambda: pa.ExtensionArray.from_storage(
-                pa.uuid(), pa.array([b"0123456789abcdef"] * n, pa.binary(16))
-            ),
-            "bomb": lambda: pa.array(np.zeros(_BOMB)),
-        }[kind]()
-        columns = {**log.columns, _ACC: odd} if kind != "bomb" else {_ACC: odd}
-        table = pa.table(columns).replace_schema_metadata(dict(log.metadata))
-        pq.write_table(table, path)
-        return _name(archive, path)
-
-    return make
-
-
-def _gzip_bomb(archive: Archive, path: Path, log: LogFile, rng: Rng) -> str:
-    """Pack rows of zeros, some 300 MB of them."""
-    with gzip.open(path, "wb", 9) as stream:
-        stream.write(b"# sample_rate_hz: 2000\ndelta_e_um,acc_pitch_m_s2\n")
-        for _ in range(300):
-            stream.write(b"0.00000,0\n" * 100_000)
-    return _name(archive, path)
-
-
-def _unfinished(content: bytes, rng: Rng) -> bytes:
-    """Claim of a TDMS segment that its end was never written."""
-    return content[:12] + struct.pack("<Q", (1 << 64) - 1) + content[20:]
-
-
-def _two_rates(archive: Archive, path: Path, log: LogFile, rng: Rng) -> str:
-    from nptdms import ChannelObject, RootObject, TdmsWriter
-
-    channels = [
-        ChannelObject("log", name, v, {"wf_increment": (2 if name == _ACC else 1) / RATE})
-        for name, v in log.columns.items()
-    ]
-    with TdmsWriter(str(path)) as writer:
-        writer.write_segment([RootObject(dict(log.metadata)), *channels])
-    return _name(archive, path)
-
-
 _BOMBS = (
-    Kind("rows that swell a thousandfold", "too-large", (".csv.gz",), _gzip_bomb),
-    Kind("a column that swells a thousandfold", "too-large", (".h5",), _hdf5(_hdf5_bomb)),
-    Kind("a column that swells a thousandfold", "too-large", (".parquet",), _parquet("bomb")),
+    Kind("rows that swell a thousandfold", "too-large", (".csv.gz",), gzip_bomb),
+    Kind("a column that swells a thousandfold", "too-large", (".h5",), hdf5(hdf5_bomb)),
+    Kind("a column that swells a thousandfold", "too-large", (".parquet",), parquet("bomb")),
     Kind("a variable that swells a thousandfold", "too-large", (".mat",),
-         _mat(lambda values: np.zeros(_BOMB))),
+         mat(lambda values: np.zeros(BOMB))),
 )  # fmt: skip
 _OF_BYTES = (
     Kind("no byte", "empty", SUFFIXES, _of_bytes(lambda content, rng: b"")),
@@ -453,8 +346,8 @@ _OF_BYTES = (
          _of_bytes(_struck)),
     Kind("content of another format", "format", SUFFIXES, _another_format),
     Kind("text", "format", _BINARY, _of_bytes(lambda content, rng: b"no signal at all\n" * 100)),
-    Kind("never finished", "corrupt", (".tdms",), _of_bytes(_unfinished)),
-    Kind("blocks never written", "corrupt", (".h5",), _hdf5(_never_written)),
+    Kind("never finished", "corrupt", (".tdms",), _of_bytes(unfinished)),
+    Kind("blocks never written", "corrupt", (".h5",), hdf5(never_written)),
     Kind("NUL bytes in a row", "corrupt", _TEXT, _line(None, b"\0\0\0,1,1,1")),
     Kind("a row too long", "corrupt", _TEXT, _line(None, b"1,1,1,1,1,1")),
     Kind("another encoding", "corrupt", _TEXT, _line(1, b"# machine: M\xfcller")),
@@ -468,15 +361,15 @@ _OF_COLUMNS = (
     Kind("columns of unlike length", "columns", (".h5", ".mat", ".tdms", ".uff"),
          _of_columns(_unlike)),
     Kind("words among numbers", "columns", _TEXT, _line(None, b"1,high,1,1")),
-    Kind("a column of words", "columns", (".h5",), _hdf5(_strings)),
-    Kind("a column of words", "columns", (".parquet",), _parquet("text")),
-    Kind("a column of lists", "columns", (".parquet",), _parquet("lists")),
-    Kind("a column of an extension type", "columns", (".parquet",), _parquet("extension")),
-    Kind("cells", "columns", (".mat",), _mat(lambda v: np.array([v, "x"], dtype=object))),
+    Kind("a column of words", "columns", (".h5",), hdf5(strings)),
+    Kind("a column of words", "columns", (".parquet",), parquet("text")),
+    Kind("a column of lists", "columns", (".parquet",), parquet("lists")),
+    Kind("a column of an extension type", "columns", (".parquet",), parquet("extension")),
+    Kind("cells", "columns", (".mat",), mat(lambda v: np.array([v, "x"], dtype=object))),
     Kind("control characters in a name", "columns", _TYPED,
-         _of_columns(_renamed(_ACC, "acc_\x1b[31m_m_s2"))),
-    Kind("no unit", "unit", _TYPED, _of_columns(_renamed(_ACC, "acc_feed"))),
-    Kind("a unit of another quantity", "unit", SUFFIXES, _of_columns(_renamed(_ACC, "acc_p_mm"))),
+         _of_columns(_renamed(ACC, "acc_\x1b[31m_m_s2"))),
+    Kind("no unit", "unit", _TYPED, _of_columns(_renamed(ACC, "acc_feed"))),
+    Kind("a unit of another quantity", "unit", SUFFIXES, _of_columns(_renamed(ACC, "acc_p_mm"))),
     Kind("an unknown unit", "unit", SUFFIXES, _of_columns(_renamed(_ERROR, "delta_e_furlong"))),
 )  # fmt: skip
 _OF_METADATA = (
@@ -503,22 +396,22 @@ _OF_METADATA = (
 _OF_SIGNALS = (
     Kind("all channels flat", "no-signal", SUFFIXES, _of_columns(_set(0.25, *_ALL))),
     Kind("nothing but NaN", "no-signal", _TYPED, _of_columns(_set(np.nan, *_ALL))),
-    Kind("a flat channel", "flat", SUFFIXES, _of_columns(_set(0.0, _ACC)), lost=False),
+    Kind("a flat channel", "flat", SUFFIXES, _of_columns(_set(0.0, ACC)), lost=False),
     Kind("a clipped channel", "clipped", SUFFIXES, _of_columns(_clipped), lost=False),
     Kind("a channel with a fifth missing", "missing-samples", _TYPED,
          _of_columns(_missing(0.2)), lost=False),
     Kind("a channel with a short gap", "gaps", _TYPED, _of_columns(_missing(0.005)), lost=False),
     Kind("samples dropped", "gaps", SUFFIXES, _of_columns(_dropped), lost=False),
-    Kind("a channel of another rate", "time", (".tdms",), _two_rates, lost=False),
+    Kind("a channel of another rate", "time", (".tdms",), two_rates, lost=False),
 )  # fmt: skip
 _OF_FILES = (
     Kind("a link out of the folder", "escapes", SUFFIXES, _link_out),
     Kind("a link to nothing", "missing-file", SUFFIXES, _dangling),
     Kind("a named pipe", "missing-file", SUFFIXES, _pipe),
     Kind("the same content twice", "duplicate", SUFFIXES, _copy),
-    Kind("a column in another file", "escapes", (".h5",), _hdf5(_external_link)),
-    Kind("samples in another file", "escapes", (".h5",), _hdf5(_external_storage)),
-    Kind("a column put together elsewhere", "escapes", (".h5",), _hdf5(_virtual)),
+    Kind("a column in another file", "escapes", (".h5",), hdf5(external_link)),
+    Kind("samples in another file", "escapes", (".h5",), hdf5(external_storage)),
+    Kind("a column put together elsewhere", "escapes", (".h5",), hdf5(virtual)),
 )
 _OF_TABLES = (
     Kind("a row too long in the manifest", "bad-row", SUFFIXES, _bad_row),
