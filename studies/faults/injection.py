@@ -166,50 +166,61 @@ def attack(
     written = {
         path: path.read_text() for path in out.rglob("*") if path.suffix in (".html", ".csv")
     }
-    pages = {path: text for path, text in written.items() if path.suffix == ".html"}
-    kept = guards.everything_in(url)
-    texts = [printed, *written.values(), kept.decode("utf-8", "replace")]
+    pages = [text for path, text in written.items() if path.suffix == ".html"]
+    kept = guards.everything_in(url).decode("utf-8", "replace")
     told = pd.read_csv(out / "verdict.csv", dtype=str, keep_default_na=False)["stage"].tolist()
     lost = set(pd.read_csv(out / "refused.csv", dtype=str, keep_default_na=False)["log"])
     names = [path.name for path in out.iterdir() if path.suffix == ".html"]
-    shown = [html.unescape(text) for text in pages.values()]
-    own = {script for text in pages.values() for script in guards.scripts(text)}
+    wrong = {
+        "nothing outside the output is changed": changed,
+        "no SQL is executed": guards.touched(url),
+        "every machine is told as it is named": sorted({*machines} ^ {*told}),
+        "every reaching log is refused": sorted({*refused} - lost),
+        "pages have names of their own": guards.bad_names(names)
+        + ([] if len(names) == len(machines) + 1 else [f"{len(names)} pages"]),
+        "no command is run": [str(p) for p in folder.rglob(hostile.MARK)],
+        "links are replaced and not followed": [str(link) for link in links if link.is_symlink()],
+        "the exit status is that of refused logs": []
+        if (done.returncode, again.returncode) == (3, 0)
+        else [str(done.returncode), str(again.returncode), done.stderr[-500:]],
+    }
     return {
         "machines": len(machines),
         "logs_refused": len(refused),
         "pages": len(names),
         "exit_status": [done.returncode, again.returncode, *(one.returncode for one in single)],
-        "wrong": {
-            "nothing outside the output is changed": changed,
-            "no SQL is executed": guards.touched(url),
-            "every machine is told as it is named": sorted({*machines} ^ {*told}),
-            "every reaching log is refused": sorted({*refused} - lost),
-            "pages have names of their own": guards.bad_names(names)
-            + ([] if len(names) == len(machines) + 1 else [f"{len(names)} pages"]),
-            "no command is run": [str(p) for p in folder.rglob(hostile.MARK)],
-            "nothing printed or written acts": sorted(
-                {sign for text in (printed, *written.values()) for sign in guards.acting(text)}
-            ),
-            "pages load and run nothing": sorted(
-                {found for text in pages.values() for found in guards.loaded(text)}
-                | {script[:200] for script in own if "alert" in script}
-            ),
-            "no template is filled in": [
-                name for name in machines if not any(name in text for text in shown)
-            ],
-            "no file outside is read": [f"text {k}" for k, t in enumerate(texts) if _leaked(t)],
-            "no password is shown or kept": [
-                f"text {k}" for k, text in enumerate(texts) if password in text
-            ],
-            "links are replaced and not followed": [
-                str(link) for link in links if link.is_symlink()
-            ],
-            "no traceback": ["there is one"] if "Traceback" in printed else [],
-            "the exit status is that of refused logs": []
-            if (done.returncode, again.returncode) == (3, 0)
-            else [str(done.returncode), str(again.returncode), done.stderr[-500:]],
-        },
-    }  # fmt: skip
+        "wrong": wrong
+        | in_words([printed, *written.values()], kept, password)
+        | on_pages(pages, machines),
+    }
+
+
+def in_words(texts: Sequence[str], kept: str, password: str) -> dict[str, list[str]]:
+    """Search what was printed first and written then, and what is kept, for what acts or leaks."""
+    every = list(enumerate([*texts, kept]))
+    return {
+        "nothing printed or written acts": sorted(
+            {sign for text in texts for sign in guards.acting(text)}
+        ),
+        "no file outside is read": [f"text {k}" for k, text in every if _leaked(text)],
+        "no password is shown or kept": [f"text {k}" for k, text in every if password in text],
+        "no traceback": ["there is one"] if "Traceback" in texts[0] else [],
+    }
+
+
+def on_pages(pages: Sequence[str], machines: Sequence[str]) -> dict[str, list[str]]:
+    """Search pages for what they load and run, and for machines by their names."""
+    shown = [html.unescape(text) for text in pages]
+    own = {script for text in pages for script in guards.scripts(text)}
+    return {
+        "pages load and run nothing": sorted(
+            {found for text in pages for found in guards.loaded(text)}
+            | {script[:200] for script in own if "alert" in script}
+        ),
+        "no template is filled in": [
+            name for name in machines if not any(name in text for text in shown)
+        ],
+    }
 
 
 def _links(folder: Path, out: Path) -> list[Path]:
