@@ -19,9 +19,14 @@ Method
     Controls: for every module the unchanged project passes the tests chosen for one of its mutants,
     in their order, and an error planted in the function of that mutant is found.
 Answer
-    Not recorded yet.
+    283 of 320 are noticed, 88 % (84 to 92): 90 % of identification and of inference, 87 % of
+    tracking, 81 % of the 32 of prognosis. Every unchanged module passes, every planted error is
+    found. Of the 37 survivors, listed in the record, five run in no test of these files, and about
+    half change nothing that a user could notice. A first sample, of another seed and tried by fast
+    tests alone, had 268 of 320; what it showed to be missing was written then, so that this one was
+    drawn anew.
 Run time
-    Some hour and a half of one processor, by the first 43 mutants.
+    Some 40 minutes of two processors.
 """
 
 from __future__ import annotations
