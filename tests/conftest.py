@@ -16,6 +16,11 @@ ROOT = Path(__file__).parent.parent
 pytest_plugins = ["pytester", "tests.claims"]
 
 
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Begin with studies, which take longest: then no worker ends long after the other."""
+    items.sort(key=lambda item: item.path.name != "test_studies.py")
+
+
 def _missing(name: str) -> str | None:
     """Say why something a test needs is not there; None when it is."""
     if name == "chromium":

@@ -295,6 +295,7 @@ def test_the_mean_of_parts_is_as_sure_as_the_whole_record() -> None:
     assert (np.sqrt(np.diag(once.cov)) > 2 * std).all()
 
 
+@pytest.mark.slow
 def test_the_mean_of_parts_shows_lines_that_none_of_them_shows() -> None:
     """A line six times above the noise of a part is masked in the mean of ten, noise never is."""
     clean = both(seed=8, n=200_000)

@@ -247,6 +247,7 @@ def test_a_log_without_estimates_brings_nothing(stage: Stage) -> None:
     np.testing.assert_array_equal(at.log_weight, before.log_weight)
 
 
+@pytest.mark.slow
 def test_covariances_stay_positive_and_symmetric(stage: Stage) -> None:
     """Covariances of all settings are symmetric with no eigenvalue that is notably negative."""
     at, _ = run(awkward_history(np.random.default_rng(10), n=40), stage)[-1]

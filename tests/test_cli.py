@@ -308,6 +308,7 @@ def test_modes_of_what_settles(strokes: list[Path]) -> None:
                         ("mode_2", pytest.approx(136.6, rel=2e-3))]  # fmt: skip
 
 
+@pytest.mark.slow
 def test_error_as_json_lists_every_harmonic(strokes: list[Path]) -> None:
     """Rows have the columns of the table; the harmonics' cosines rebuild what they claim."""
     result = call("error", *strokes, "--count", 20, "--format", "json")

@@ -105,6 +105,7 @@ def test_a_life_reads_the_same(lives: tuple) -> None:
         assert 0.8 < (other[2] - other[0]) / width < 1.25
 
 
+@pytest.mark.slow
 def test_ten_thousand_logs_are_no_more_work_than_some_hundreds(lives: tuple) -> None:
     """The likelihood of a life holds no more rows than that of its condensed history."""
     stage, history = lives

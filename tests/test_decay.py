@@ -102,6 +102,7 @@ def test_decays_of_different_lengths_share_their_modes() -> None:
     assert everything.frequency_std[0] < first.frequency_std[0]
 
 
+@pytest.mark.slow
 def test_a_following_error_rings_too() -> None:
     """A displacement gives the mode by itself, and is not asked what accelerometers tell."""
     rng = np.random.default_rng(7)
@@ -169,6 +170,7 @@ def test_noise_is_refused_and_never_an_empty_success() -> None:
     }
 
 
+@pytest.mark.slow
 def test_a_sine_is_a_line_and_not_a_mode() -> None:
     """Mains does not fade: it is refused as a line, and the mode beside it is found."""
     rng = np.random.default_rng(11)

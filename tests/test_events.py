@@ -106,6 +106,7 @@ def test_a_step_is_damage_and_a_retuning_is_not(stage: Stage) -> None:
     assert set(alarms.values()) == {0}
 
 
+@pytest.mark.slow
 def test_the_same_jumps_without_the_loop_are_damage(stage: Stage) -> None:
     """Negative control: with a following error as ever they are no retuning, and raise alarms."""
     given = HAPPENINGS["servo"] | {"loop": 1.0}

@@ -163,6 +163,7 @@ def test_few_teachers_leave_the_description(stage: Stage) -> None:
     assert set(learn(stage, teachers | {"young": silent()})) == {"young"}
 
 
+@pytest.mark.slow
 def test_machines_that_say_nothing_teach_the_description(stage: Stage) -> None:
     """However many there are, the learned prior is the description's."""
     learned = learn(stage, {str(k): silent() for k in range(30)})

@@ -196,6 +196,7 @@ def test_the_whole_current_shows_the_machine_without_its_servo(sweep: Log) -> No
     assert abs(modes.frequency[i] - closed.frequency_hz) > 4 * modes.frequency_std[i]
 
 
+@pytest.mark.slow
 def test_a_resonance_beyond_the_band_leaves_no_lines_at_its_end(tmp_path: Path) -> None:
     """Pitch of X at 271.6 Hz bends what is below 250 Hz; those lines are answers all the same."""
     sweep = Sweep(20.0, 1000.0, amplitude=0.3, period=4.1)
@@ -388,6 +389,7 @@ def bench(needs: Callable[[str], None], tmp_path: Path) -> Callable[[str], Log]:
     return read
 
 
+@pytest.mark.slow
 def test_two_encoders_and_experiments_of_a_linear_guide_agree(
     bench: Callable[[str], Log],
 ) -> None:

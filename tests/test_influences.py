@@ -40,6 +40,7 @@ def warm(slope: np.ndarray = SLOPE, n: int = 60) -> History:
     return make_history(ln_f, temperature=temperature, std=5e-4)
 
 
+@pytest.mark.slow
 def test_what_is_left_is_what_the_state_space_leaves(bent: Stage) -> None:
     """Two sources, steps of every kind and two covariates: what is left is ln f - H x, exactly."""
     history = awkward_history(np.random.default_rng(3))

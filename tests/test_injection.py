@@ -39,6 +39,7 @@ def unsafe(source: str) -> list[str]:
     return [str(name) for name in found]
 
 
+@pytest.mark.slow
 def test_no_module_runs_what_files_say(root: Path) -> None:
     """There is no pickle, no evaluation of text and no shell in the package."""
     for path in sorted((root / "lmshealth").rglob("*.py")):
@@ -58,6 +59,7 @@ def test_pages_have_names_of_their_own_on_every_system() -> None:
     assert bad_names([*names, "index.html"]) == []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", sorted(BAD_STAGES))
 def test_a_bad_description_is_refused_without_a_word_of_other_files(
     tmp_path: Path, kind: str

@@ -104,6 +104,7 @@ def test_estimates_become_remaining_lives(table: Path, toml: Path, tmp_path: Pat
     assert tree["AX-1/posterior/guide_preload"].to_numpy().mean() == pytest.approx(0.835, abs=0.03)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("quick")
 def test_the_command_line_chooses_the_day(table: Path, toml: Path, tmp_path: Path) -> None:
     """A risk or a ratio of costs stands in for that of the description; the plan stays."""

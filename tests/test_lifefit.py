@@ -454,6 +454,7 @@ def test_a_table_and_arviz_are_told_every_way(forked: LifePosterior) -> None:
                 assert rows.loc[name, what] == float(checks[f"{what}_{k}_{name}"]) == value
 
 
+@pytest.mark.slow
 def test_no_life_without_convergence(
     history: History, stage: Stage, monkeypatch: pytest.MonkeyPatch
 ) -> None:

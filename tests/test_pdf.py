@@ -75,6 +75,7 @@ def test_the_same_page_gives_the_same_bytes(small: Path) -> None:
     assert target.read_bytes() == content
 
 
+@pytest.mark.slow
 def test_nothing_is_loaded_from_outside(tmp_path: Path) -> None:
     """A page that names a file or an address gets nothing of it."""
     secret = tmp_path / "secret.css"

@@ -381,6 +381,7 @@ def test_settings_show_no_password() -> None:
     assert "hunter2" not in repr(Settings(store="postgresql://me:hunter2@host/db"))
 
 
+@pytest.mark.slow
 def test_a_machine_that_cannot_be_assessed_does_not_end_the_batch(
     tmp_path: Path, modes_only: Stage, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -588,6 +589,7 @@ def test_an_empty_folder_is_an_error(tmp_path: Path, modes_only: Stage) -> None:
         run(tmp_path / "logs", [modes_only], tmp_path / "out")
 
 
+@pytest.mark.slow
 def test_progress_is_told_to_its_end(tmp_path: Path, modes_only: Stage) -> None:
     """The callback hears of every step of the work, each up to its total."""
     heard: dict[str, tuple[int, int]] = {}
@@ -618,6 +620,7 @@ def test_an_interrupted_run_loses_nothing_that_was_done(tmp_path: Path, modes_on
     assert tables(tmp_path / "out") == tables(tmp_path / "other")
 
 
+@pytest.mark.slow
 def test_assess_without_parameters_tracks_and_claims_nothing(
     tmp_path: Path, modes_only: Stage
 ) -> None:

@@ -511,6 +511,7 @@ def test_hints_of_dense_pictures_are_thinned() -> None:
     assert told[:2] == ["point 0", "point 4"] and len(told) == 250
 
 
+@pytest.mark.slow
 def test_hints_of_other_pictures(
     history: History, track: Track, health: Health, prognosis: Prognosis
 ) -> None:

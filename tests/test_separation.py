@@ -62,6 +62,7 @@ def test_what_was_not_sought_by_name_is_left_as_one() -> None:
     assert kept.cov.shape == (2, 2)
 
 
+@pytest.mark.slow
 def test_modes_at_one_place_in_one_channel_are_refused_and_not_guessed() -> None:
     """Of 8 records of two modes half a bandwidth apart none gives both by name."""
     modes = [Mode(120.0, 0.02), Mode(122.4, 0.02)]
