@@ -156,6 +156,13 @@ def closed_loop(
     UnstableLoop
         If a pole of the loop does not decay.
     """
+    system = _loop(stage, condition, tuning)
+    _refuse_unstable(stage.name, np.linalg.eigvals(system.a).astype(complex))
+    return system
+
+
+def _loop(stage: Stage, condition: Condition, tuning: Tuning | None = None) -> LinearSystem:
+    """Close the loop, stable or not."""
     tuning = tuning_named(stage.name, condition.servo_id) if tuning is None else tuning
     structure = build_structure(stage, condition)
     servo = servo_matrices(tuning)
@@ -193,7 +200,6 @@ def closed_loop(
         # Back from the ground's frame to absolute acceleration.
         d[row, 12:15] += sensors[name] @ translation
         d[row, 17] += sensors[name] @ carried
-    _refuse_unstable(stage.name, np.linalg.eigvals(a).astype(complex))
     return LinearSystem(a, b, c, d)
 
 
@@ -206,8 +212,8 @@ def _refuse_unstable(stage: str, poles: ComplexArray) -> None:
 
 def _oscillations(stage: Stage, condition: Condition) -> tuple[ComplexArray, ComplexArray]:
     """Return eigenvalues (pair,) with positive frequency and displacement shapes (dof, pair)."""
-    system = closed_loop(stage, condition)
-    values, vectors = np.linalg.eig(system.a)
+    values, vectors = np.linalg.eig(_loop(stage, condition).a)
+    _refuse_unstable(stage.name, values)
     keep = values.imag > 1e-6 * np.abs(values)
     size = build_structure(stage, condition).size
     order = np.argsort(np.abs(values[keep]))

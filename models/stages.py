@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, fields, replace
+from functools import lru_cache
 
 import numpy as np
 
@@ -346,6 +347,8 @@ def corners(spacing: Point) -> list[tuple[float, float, float]]:
     return [(sx * x, sy * y, z) for sx in (1, -1) for sy in (1, -1)]
 
 
+# One look at a plant asks for its structure four times: nothing writes to what is kept.
+@lru_cache(maxsize=64)
 def build_structure(stage: Stage, condition: Condition = NOMINAL) -> Structure:
     """Assemble the structure of a stage in a condition.
 

@@ -114,6 +114,7 @@ def test_damping_tells_where_frequency_does_not(rng: np.random.Generator) -> Non
     assert set(run(rows).assigned[-15:]) == {("b", "a")}
 
 
+@pytest.mark.slow
 def test_what_nothing_tells_is_said_to_be_ambiguous(rng: np.random.Generator) -> None:
     """Equal modes that merge and part get no labels any more, and the sentence names both."""
     gap = np.concatenate([np.linspace(0.02, 0, 20), np.zeros(15), np.linspace(0, 0.02, 25)])

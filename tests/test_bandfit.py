@@ -283,6 +283,7 @@ def fit_mean(
     return result
 
 
+@pytest.mark.slow
 def test_the_mean_of_parts_is_as_sure_as_the_whole_record() -> None:
     """Ten parts of 20 s averaged have their truth within 4σ, and the σ of 200 s within a tenth."""
     values = both(seed=7, n=200_000)
@@ -309,6 +310,7 @@ def test_the_mean_of_parts_shows_lines_that_none_of_them_shows() -> None:
     assert fit_mean(replace(mean_of(dirty, 10), count=1)).lines == ()
 
 
+@pytest.mark.slow
 def test_what_a_fit_of_a_sure_mean_lacks_is_no_line() -> None:
     """A mode that nobody looks for is left over for the search, and not masked as lines."""
     modes = [Mode(105.0, 0.015), Mode(112.0, 0.01, 0.05)]

@@ -118,6 +118,7 @@ def every() -> list[Wander]:
     ]
 
 
+@pytest.mark.slow
 def test_averaging_keeps_the_law_of_total_variance(stage: Stage) -> None:
     """Mean and covariance over the grid are those of the mixture weighted by evidence so far."""
     history = rough_history(np.random.default_rng(4))
@@ -143,6 +144,7 @@ def test_averaging_keeps_the_law_of_total_variance(stage: Stage) -> None:
     assert between > 0.01  # the settings do differ
 
 
+@pytest.mark.slow
 def test_evidence_of_a_drift_is_that_of_one_group_over_the_other(stage: Stage) -> None:
     """The Bayes factor is the mean evidence with a rate over the mean evidence without one."""
     history = rough_history(np.random.default_rng(5))

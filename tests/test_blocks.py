@@ -23,6 +23,7 @@ from tests.bands import (
 )
 
 
+@pytest.mark.slow
 def test_a_mean_over_segments_says_what_they_say_apart() -> None:
     """One block of means has the value and derivatives of the sum over single segments."""
     for duration in (1.0, 40.0):

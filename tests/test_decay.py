@@ -56,6 +56,7 @@ def test_without_a_description_all_that_rings_is_numbered() -> None:
     np.testing.assert_allclose(modes.frequency, [60.0, 85.0], rtol=2e-3)
 
 
+@pytest.mark.slow
 def test_the_unit_of_the_signal_does_not_matter() -> None:
     """A signal a million times smaller gives the same estimates and covariance."""
     log = log_of(3)
@@ -87,6 +88,7 @@ def test_given_segments_are_the_decays() -> None:
     np.testing.assert_allclose(modes.frequency, [60.0], rtol=1e-3)
 
 
+@pytest.mark.slow
 def test_decays_of_different_lengths_share_their_modes() -> None:
     """Long and short decays are used together, each on its own Fourier frequencies."""
     rng = np.random.default_rng(6)
@@ -253,6 +255,7 @@ def test_simulated_stages_tell_their_modes_after_a_stop(name: str) -> None:
         assert max(abs(row["z_f"]), abs(row["z_zeta"])) < 4, row
 
 
+@pytest.mark.slow
 def test_a_mode_that_creeps_ends_in_no_runaway_pole() -> None:
     """A frequency that settles after the stop sends no pole to infinity, and is found."""
     rng = np.random.default_rng(3)

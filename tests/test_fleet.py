@@ -174,6 +174,7 @@ def test_machines_that_say_nothing_teach_the_description(stage: Stage) -> None:
     assert learned["7"].scatter == Scatter(WALKS, SCALES, DEVIATIONS)
 
 
+@pytest.mark.slow
 def test_scatter_of_a_fleet_is_learned(stage: Stage) -> None:
     """Where all logs ask for one walk it is expected of a young machine, and no other of it."""
     walks = (0.01, 0.02, 0.9, 0.05, 0.02)

@@ -81,6 +81,7 @@ def driven_name(machine: Machine) -> str:
     return "delta_e" if machine.displacement else "acc_x"
 
 
+@pytest.mark.slow
 def test_a_random_input_needs_no_whole_number_of_anything() -> None:
     """A stretch of a longer record, with a transient at both ends."""
     log = driven(random=True, periods=5)
@@ -95,6 +96,7 @@ def test_without_noise_the_modes_are_exact() -> None:
     assert modes.damping_ratio == pytest.approx([0.015, 0.02], rel=1e-4)
 
 
+@pytest.mark.slow
 def test_units_do_not_matter_to_modes() -> None:
     """Volts for amperes, angles for lengths: the same modes with the same uncertainty."""
     log = driven()
@@ -133,6 +135,7 @@ def test_a_period_off_by_half_a_percent_is_put_right() -> None:
     assert np.abs(off(stated)).max() < 4
 
 
+@pytest.mark.slow
 def test_a_period_that_is_no_whole_number_of_samples_is_cut_right() -> None:
     """Sampled by a clock that is 0.02 % slow, the modes are 0.02 % high and as certain."""
     rng = np.random.default_rng(3)

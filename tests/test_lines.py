@@ -241,6 +241,7 @@ def _channels(values: np.ndarray) -> tuple[Channel, ...]:
     return make_log({"acc_a": values}, RATE).channels
 
 
+@pytest.mark.slow
 def test_a_measured_machine_shows_its_mains(needs: Callable[[str], None]) -> None:
     """Harmonics of wandering mains in 70 s of a vibrating machine are found and named."""
     needs("data")

@@ -580,6 +580,7 @@ def test_modes_outside_the_band_are_left_alone() -> None:
 # Invariances
 
 
+@pytest.mark.slow
 def test_the_order_of_channels_does_not_matter() -> None:
     """Permuted channels give the same modes to the last bit."""
     log = acceleration_log(rng(20), lms_y_modes(), 20, RATE, 0.5)

@@ -124,6 +124,7 @@ def test_a_distorted_resonance_is_one_mode() -> None:
     assert abs(frequencies(fit)[i] - 61.7) < 0.3 + 2 * std
 
 
+@pytest.mark.slow
 def test_a_line_that_is_no_answer_is_left_out() -> None:
     """Mains on one harmonic: no mode, no bias, and reported as it stands."""
     ordinates = measured(respond(TWO), 0.3)

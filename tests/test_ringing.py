@@ -31,6 +31,7 @@ def test_as_many_modes_are_found_as_there_are() -> None:
     np.testing.assert_allclose(np.sort(found.damping_ratio), [0.005, 0.01], rtol=0.2)
 
 
+@pytest.mark.slow
 def test_noise_does_not_ring() -> None:
     """White noise in two channels has no mode, in any of thirty logs."""
     rng = np.random.default_rng(2)
@@ -55,6 +56,7 @@ def test_excitation_compares_a_stop_with_the_ambient_response() -> None:
     assert result.excitation[0] == pytest.approx(50, rel=0.5)
 
 
+@pytest.mark.slow
 def test_two_channels_know_more_than_one() -> None:
     """A second channel with the same noise shrinks the standard deviation by about √2."""
     x = stops(5, [Ring(60.0, 0.01, (1.0, 1.0))], n_stops=8)

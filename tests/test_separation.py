@@ -74,6 +74,7 @@ def test_modes_at_one_place_in_one_channel_are_refused_and_not_guessed() -> None
         assert {r.reason for r in result.refused} <= {"too-close", "ambiguous", "not-identified"}
 
 
+@pytest.mark.slow
 def test_modes_that_channels_see_differently_are_told_apart_at_one_place() -> None:
     """A third of a bandwidth apart both are found, in order, within 4σ."""
     modes = [Mode(120.0, 0.02, 1.0, (1.0, 0.6, -0.4)), Mode(121.5, 0.02, 1.0, (0.5, -1.0, 0.7))]

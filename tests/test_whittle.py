@@ -184,6 +184,7 @@ def assert_same(one: Likelihood, other: Likelihood) -> None:
     np.testing.assert_allclose(cov / np.outer(std, std), other_cov / np.outer(std, std), atol=1e-2)
 
 
+@pytest.mark.slow
 def test_the_unit_of_a_channel_and_the_phase_of_all_do_not_matter() -> None:
     """A channel a thousand times louder and phases turned at random leave modes as they are."""
     one = noisy(2, 3, 7.0)
@@ -204,6 +205,7 @@ def test_the_unit_of_a_channel_and_the_phase_of_all_do_not_matter() -> None:
     assert_same(one, replace(other, start=start))
 
 
+@pytest.mark.slow
 def test_the_order_of_channels_does_not_matter() -> None:
     """Permuted channels give the same f, ζ and covariance."""
     one = noisy(2, 3, 7.0)

@@ -36,6 +36,7 @@ import tempfile
 from collections import Counter
 from collections.abc import Iterable
 from concurrent.futures import Executor, ProcessPoolExecutor
+from contextlib import nullcontext
 from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
@@ -81,9 +82,10 @@ def main() -> None:
     modules = tuple(name for names in links.values() for name in names)
     files = [f"tests/test_{name}.py" for name in modules]
     drawn = sample(modules, QUICK[1] if study.quick else N)
+    two = ProcessPoolExecutor(2, mp_context=get_context("spawn")) if not study.quick else None
     with (
         tempfile.TemporaryDirectory() as plans,
-        ProcessPoolExecutor(1 if study.quick else 2, mp_context=get_context("spawn")) as pool,
+        two or nullcontext() as pool,
     ):
         rows = tried(study, pool, Path(plans), drawn, gathered(study, pool, files, modules))
     answer = told(rows, links)
@@ -108,7 +110,9 @@ def sample(modules: Iterable[str], n: int) -> list[tuple[str, int, Mutant]]:
     return drawn
 
 
-def gathered(study: Study, pool: Executor, files: list[str], modules: tuple[str, ...]) -> Tests:
+def gathered(
+    study: Study, pool: Executor | None, files: list[str], modules: tuple[str, ...]
+) -> Tests:
     """Run all files of tests on the unchanged project; give what each test runs of the modules."""
     shared = _project()
     tasks = [(file, digest_of(shared, _tests_of(file), *modules)) for file in files]
@@ -120,7 +124,11 @@ def gathered(study: Study, pool: Executor, files: list[str], modules: tuple[str,
 
 
 def tried(
-    study: Study, pool: Executor, plans: Path, drawn: list[tuple[str, int, Mutant]], tests: Tests
+    study: Study,
+    pool: Executor | None,
+    plans: Path,
+    drawn: list[tuple[str, int, Mutant]],
+    tests: Tests,
 ) -> list[dict[str, Any]]:
     """Try mutants and controls; give a row for each."""
     shared, tasks, rows, controlled = _project(), [], [], set()

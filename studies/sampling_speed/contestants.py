@@ -236,7 +236,7 @@ def compare(seed: int, turns: int, *, quick: bool) -> dict[str, Any]:
             }
         )
     rows.append(walker_loop(posterior, seed, 100 if quick else 3000))
-    rows.append(plain_loop(posterior, seed, 1 if quick else 60, 500 if quick else 20_000))
+    rows.append(plain_loop(posterior, seed, 1 if quick else 60, 200 if quick else 20_000))
     for row in rows:
         row["ours_is_times_faster"] = rows[0]["ess_per_s"] / row["ess_per_s"]
     return {"turns": turns, "programs": rows, "missing": missing}

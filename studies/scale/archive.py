@@ -27,7 +27,7 @@ def make_archive(folder: Path, n_logs: int, *, longer: bool = False) -> None:
     """
     (folder / "stage.toml").write_text(DESCRIPTION.replace("damaged-?-Y", "many-*-Y"))
     archive = Archive(folder / "logs")
-    n_bases = min(_N_BASES, n_logs)
+    n_bases = min(_N_BASES, -(-n_logs // 2))
     bases = recordings(n_bases, SECONDS)
     if longer:
         bases += recordings(n_bases, 3 * SECONDS)

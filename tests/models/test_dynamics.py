@@ -213,6 +213,7 @@ def test_driven_record_has_the_mode_s_frequency_and_damping(name, mode_name):
         assert agrees(found, mode), found
 
 
+@pytest.mark.slow
 def test_half_power_notices_five_percent_of_damping():
     """The same check fails on a stage whose joints are 5 % more damped."""
     stage = STAGES["lms-y"]

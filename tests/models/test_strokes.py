@@ -39,6 +39,7 @@ def test_fast_strokes_fit_into_the_window_slow_ones_fill_it():
     assert fast.max() == 100.0
 
 
+@pytest.mark.slow
 def test_transients_make_the_error_of_fast_moves():
     """The error of a stroke at 100 mm/s peaks while it accelerates, not at constant velocity."""
     columns = strokes(0.100).columns

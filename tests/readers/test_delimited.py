@@ -158,6 +158,7 @@ def test_header_without_end():
         parse("delta_e_um," * 200_000)
 
 
+@pytest.mark.slow
 def test_values_are_those_of_pandas():
     """Blocks change no digit of what pandas reads at once, quick or carefully."""
     values = np.random.default_rng(0).normal(size=(150_000, 2)) * [1e-9, 1e5]

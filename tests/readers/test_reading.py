@@ -120,6 +120,7 @@ def test_hdf5_bomb(tmp_path):
     refused(tmp_path / "bomb.h5", "corrupt", "0 of 1048576")
 
 
+@pytest.mark.slow
 def test_parquet_bomb(make):
     """A Parquet file of a few bytes that declares a billion samples is refused."""
     import pyarrow as pa
