@@ -122,11 +122,18 @@ def identify(
     if stage is not None:
         return _collect(fits, view.channels, lines, (*log.refused, *refused))
     modes = _renumber(_collect(_distinct(fits), view.channels, lines, log.refused))
-    return modes if modes.names else replace(modes, refused=(*log.refused, _nothing(log, lines)))
+    if modes.names:
+        return modes
+    return replace(modes, refused=(*log.refused, _nothing(log, lines, refused)))
 
 
-def _nothing(log: Log, lines: tuple[Line, ...]) -> Refusal:
+def _nothing(log: Log, lines: tuple[Line, ...], refused: list[Refusal]) -> Refusal:
     """Say that nothing was found where nothing was sought by name."""
+    if refused:
+        first = refused[0]
+        places = "1 place" if len(refused) == 1 else f"{len(refused)} places"
+        told = f"what stands out of the noise at {places} makes no mode"
+        return Refusal(log.name, first.reason, f"{told}: {first.detail}")
     told = f"{len(lines)} lines, which are no modes" if lines else "no line either"
     return Refusal(
         log.name,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Container, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, closing
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath
 from tempfile import TemporaryFile
 
@@ -200,7 +200,9 @@ def report(
     files = file_names([one.machine for one in told])
     rows, failed = dict[str, IndexRow](), dict[str, str]()
     progress("reporting", 0, len(told))
-    with settings.pool() as pool:
+    # A process takes longer to start than a page to write.
+    few = replace(settings, workers=min(settings.workers, len(told)))
+    with few.pool() as pool:
         contents = (
             Content(
                 machine=one.machine,

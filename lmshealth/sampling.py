@@ -271,7 +271,14 @@ def start_from_prior(
             unit = rng.standard_normal((n_draws, n_dim))
             points = mean + unit @ factor.T
             proposal = -0.5 * np.sum(unit**2, axis=1)
-        weight, _ = _tempered(log_probability(points) - proposal, 2 * n)
+        log_weight = log_probability(points) - proposal
+        if (possible := np.isfinite(log_weight).sum()) < n:
+            raise NotConverged(
+                f"{possible} of {n_draws} draws lie inside the modal map, {n} are needed to begin "
+                "from: widen the map or the prior",
+                points,
+            )
+        weight, _ = _tempered(log_weight, 2 * n)
         chosen = rng.choice(points.shape[0], size=n, replace=False, p=weight)
         return np.asarray(points[chosen])
 

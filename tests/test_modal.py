@@ -380,6 +380,17 @@ def test_white_noise_has_no_mode() -> None:
         assert [refusal.reason for refusal in sought.refused] == ["not-excited"]
 
 
+def test_what_is_too_weak_for_a_mode_is_said_to_stand_out() -> None:
+    """Without a description a peak that no fit bears out is named with what it lacks."""
+    log = acceleration_log(rng(1), [Mode(120.0, 0.01)], 30.0, 1000.0, 400.0)
+    found = identify(log, band=(60.0, 200.0))
+    assert found.names == ()
+    (refusal,) = found.refused
+    assert refusal.reason == "not-excited"
+    assert refusal.detail.startswith("what stands out of the noise at 1 place makes no mode")
+    assert "near 119.5 Hz" in refusal.detail
+
+
 def test_mains_are_a_line_and_no_mode() -> None:
     """A sine of 50 Hz in noise is no mode at 50 Hz, sought or not."""
     values = white(rng(12), 1.0, 60_000, RATE) + sine(60_000, RATE, 50.0, 3.0)

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from lmshealth import assessing, batch, intake, telling
+from lmshealth import assessing, batch, intake, telling, workers
 from lmshealth.assessing import packed
 from lmshealth.cli import main
 from lmshealth.errors import LmshealthError, NothingUsable
@@ -186,11 +186,14 @@ def test_a_second_run_takes_all_from_the_store_and_the_truth_does_not_matter(
 
 
 @pytest.mark.slow
-def test_pages_come_from_the_store_alone(done: Done, tmp_path: Path) -> None:
-    """Without logs and descriptions the pages of the machine and of the fleet are the same."""
+def test_pages_come_from_the_store_alone(
+    done: Done, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Without logs and descriptions the same pages of machine and fleet; one needs no process."""
     shutil.copy(done.out / "lmshealth.sqlite", tmp_path)
+    monkeypatch.setattr(workers, "_Processes", None)
     with closing(Store(beside(tmp_path), create=False)) as store:
-        again = report(store, tmp_path)
+        again = report(store, tmp_path, Settings(workers=8))
     assert pages(tmp_path) == done.pages
     assert again.rows == done.result.rows
 

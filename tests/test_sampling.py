@@ -347,3 +347,14 @@ def test_a_prior_outside_the_support_is_refused() -> None:
     with pytest.raises(NotConverged, match="widen the map or the prior") as caught:
         start_from_prior(lambda x: np.full(x.shape[0], -np.inf), wide)(np.random.default_rng(3))
     assert np.asarray(caught.value.chains).shape[-1] == 2
+
+
+def test_a_prior_with_too_few_possible_draws_is_refused() -> None:
+    """Where fewer draws are possible than an ensemble has walkers the error says so."""
+
+    def seldom(x: FloatArray) -> FloatArray:
+        possible = np.arange(x.shape[0]) < 7
+        return np.where(possible, 0.0, -np.inf)
+
+    with pytest.raises(NotConverged, match=r"7 of 1000 draws .* 32 are needed"):
+        start_from_prior(seldom, wide)(np.random.default_rng(3))
