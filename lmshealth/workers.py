@@ -104,8 +104,12 @@ class _Processes(Pool):
         """End all processes at once, whatever they are about."""
         # In this order: the executor's thread fails on a process that dies when a task was
         # cancelled of which it does not know yet, and would leave this process waiting for ever.
+        caretaker: Any = getattr(self.executor, "_executor_manager_thread", None)
         self.executor.shutdown(wait=False, cancel_futures=True)
         self._ours.close()
+        # Python wakes this thread as it ends itself, by a pipe that may be closed in that moment.
+        if caretaker is not None:
+            caretaker.join()
 
     def spread(
         self,
@@ -254,12 +258,15 @@ def cluster(address: str) -> Iterator[Pool]:
         why = getattr(error, "strerror", None)
         detail = f"{why}; is it running?" if why else without_secrets(str(error), address)
         raise SchedulerError(f"cannot work on the Dask scheduler {shown}: {detail}") from None
+    from distributed.comm.core import CommClosedError
+
+    comm_closed: Any = CommClosedError  # the library has no types
     try:
         _await_worker(client, shown)
         client.register_plugin(_one_thread(), name="lmshealth")  # of workers that come later, too
         client.run(_insist, version("lmshealth"))
         yield _Cluster(client)
-    except CancelledError as error:
+    except (CancelledError, comm_closed) as error:
         raise SchedulerError(
             f"lost the Dask scheduler {shown}; what was done is kept: run again to go on"
         ) from error

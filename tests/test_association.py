@@ -101,6 +101,7 @@ def test_names_that_follow_the_mode_are_believed(rng: np.random.Generator) -> No
     assert set(found.assigned[-10:]) == {("b", "a")}
 
 
+@pytest.mark.slow
 def test_damping_tells_where_frequency_does_not(rng: np.random.Generator) -> None:
     """Two modes merge and part; the one of three times the damping is known again at once."""
     gap = np.concatenate([np.linspace(0.02, 0, 20), np.zeros(15), np.linspace(0, 0.02, 25)])
@@ -132,6 +133,7 @@ def test_what_nothing_tells_is_said_to_be_ambiguous(rng: np.random.Generator) ->
     assert len(told) >= 2 and told == sorted(told, reverse=True)
 
 
+@pytest.mark.slow
 def test_shapes_tell_where_frequencies_merge(rng: np.random.Generator) -> None:
     """With shapes at right angles the same modes keep their labels throughout."""
     gap = np.concatenate([np.linspace(0.02, 0, 20), np.zeros(15), np.linspace(0, 0.02, 25)])

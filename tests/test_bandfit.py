@@ -476,6 +476,7 @@ def test_flags_say_what_a_reading_lacks() -> None:
     assert flags(replace(result, targets=tuple(moved))) == [[], []]
 
 
+@pytest.mark.slow
 def test_a_mode_under_a_line_that_is_too_unsteady_to_be_told_is_refused() -> None:
     """A line that wanders by 0.3 Hz about roll is no noise: roll is refused, pitch is not."""
     t = np.arange(60_000) / RATE

@@ -43,6 +43,7 @@ def test_a_mean_over_segments_says_what_they_say_apart() -> None:
                 np.testing.assert_allclose(a, b, rtol=1e-8, atol=1e-9 * np.abs(b).max())
 
 
+@pytest.mark.slow
 def test_averaged_neighbours_say_what_they_say_apart_where_nothing_changes() -> None:
     """Of channels that show white floors alone the mean of neighbours loses nothing."""
     one, merged = (
@@ -92,6 +93,7 @@ def _shift(exact: Likelihood, block: Block) -> float:
     return float(np.abs((p - target.start) / std)[:2].max())
 
 
+@pytest.mark.slow
 def test_a_block_forgets_what_is_masked_in_all_segments() -> None:
     """Ordinates count as often as they are kept; a short record still expects them smeared."""
     for duration in (2.0, 40.0):

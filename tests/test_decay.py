@@ -150,6 +150,7 @@ def test_a_softening_machine_gets_wide_intervals_or_none() -> None:
     assert std > 5e-3
 
 
+@pytest.mark.slow
 def test_a_mode_on_the_flank_of_a_louder_one_is_found() -> None:
     """Where short decays leave no peak of its own, the fit of the louder mode's band finds it."""
     rings = [Ring(136.0, 0.015), Ring(155.0, 0.0175, (0.07,))]

@@ -126,6 +126,7 @@ def test_an_unknown_fleet_has_the_prior_of_the_description(z: float) -> None:
     assert np.sum(weight * ratio) == pytest.approx(1.0, abs=0.01)
 
 
+@pytest.mark.slow
 def test_learned_prior_is_that_of_dense_integration(stage: Stage) -> None:
     """Median, sigma and share are those of the hierarchical model integrated independently."""
     z = np.array([0.9, 1.4, 1.1, 0.4, 1.8, 1.2])
@@ -192,6 +193,7 @@ def test_scatter_of_a_fleet_is_learned(stage: Stage) -> None:
     np.testing.assert_allclose(after.log_weight - before.log_weight, expected, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_nobody_teaches_itself(stage: Stage) -> None:
     """What a young machine says changes what others learn, and nothing of its own prior."""
     teachers = {str(k): told(0.2 * k, 0.2, 0.9) for k in range(6)}

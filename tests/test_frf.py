@@ -89,6 +89,7 @@ def test_a_random_input_needs_no_whole_number_of_anything() -> None:
     assert np.abs(off(read_frf(cut, "current", "acc_x", band=BAND))).max() < 4
 
 
+@pytest.mark.slow
 def test_without_noise_the_modes_are_exact() -> None:
     """Modes beside the band are all that keeps a simulation from being fitted to rounding."""
     modes = read_frf(driven(Machine(white=0.0, process=0.0)), "current", "acc_x", band=BAND).modes
@@ -190,6 +191,7 @@ def test_a_sweep_shows_the_modes_of_the_closed_loop(sweep: Log, output: str) -> 
     assert modes.frequency_std[i] < 0.02
 
 
+@pytest.mark.slow
 def test_the_whole_current_shows_the_machine_without_its_servo(sweep: Log) -> None:
     """Fed back, a current that sensors cause is no input: poles are those of the open loop."""
     closed, alone = without_loop(stage_named("lms-y"))["pitch"]
@@ -423,6 +425,7 @@ def test_two_encoders_and_experiments_of_a_linear_guide_agree(
 
 
 @pytest.mark.parametrize("band", [None, (40.0, 120.0)])
+@pytest.mark.slow
 def test_motor_and_load_of_a_bench_agree(
     bench: Callable[[str], Log], band: tuple[float, float] | None
 ) -> None:

@@ -54,6 +54,7 @@ def test_the_kernel_gives_the_expected_periodogram_of_a_short_record() -> None:
     assert np.abs(bias).max() > 0.1
 
 
+@pytest.mark.slow
 def test_short_records_average_to_the_expected_periodogram() -> None:
     """The mean periodogram of 400 short records is the kernel's within 4.5 standard errors."""
     mode, noise, n, n_records = Mode(100.0, 0.01), 0.5, 4000, 400

@@ -58,6 +58,7 @@ def test_all_tapers_are_in_one_transform() -> None:
 
 
 @pytest.mark.parametrize("width", [0.5, 2.0, 8.0])
+@pytest.mark.slow
 def test_the_tail_in_a_resonance_is_that_of_a_simulated_one(width: float) -> None:
     """At three limits the share of 20,000 draws is as computed within 4σ, and not as in noise."""
     limits = np.array([0.5, 1.5, 4.0])

@@ -48,6 +48,7 @@ def test_a_sine_reads_its_amplitude() -> None:
     assert second.magnitude == pytest.approx(6e-3, rel=1e-9)
 
 
+@pytest.mark.slow
 def test_noise_reads_its_density_and_its_degrees_of_freedom() -> None:
     """The mean square of a band of white noise is S times its width, scattered as χ² of its dof."""
     rng, level = np.random.default_rng(1), 2e-6

@@ -156,6 +156,7 @@ def joint_log(seed: int, n: int = 20_000) -> Log:
     return make_log({"delta_e": x + white(noise, quiet, n, RATE), **signals}, RATE)
 
 
+@pytest.mark.slow
 def test_following_error_and_accelerometers_are_one_source() -> None:
     """Where both show a mode, it is reported once, from all together, with its truth."""
     off = []

@@ -64,6 +64,7 @@ def test_two_channels_know_more_than_one() -> None:
     assert 1.2 < std[1] / std[0] < 1.65
 
 
+@pytest.mark.slow
 def test_the_order_of_the_modes_changes_nothing() -> None:
     """Estimates have a joint covariance that is positive definite, with each mode's own block."""
     rings = [Ring(60.0, 0.01, ambient=0.05), Ring(63.0, 0.01, ambient=0.05)]

@@ -167,6 +167,7 @@ def test_nothing_is_said_before_the_baseline(stage: Stage) -> None:
     assert found.drift_std[3].max() < 1e-6
 
 
+@pytest.mark.slow
 def test_an_inconsistent_filter_widens_the_smoother_as_well(stage: Stage) -> None:
     """The factor of each epoch is on every standard deviation."""
     ln_f, ln_zeta = still(np.random.default_rng(7))

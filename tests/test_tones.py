@@ -221,6 +221,7 @@ def test_a_comb_too_close_to_be_told_apart_does_not_grow() -> None:
 
 @pytest.mark.parametrize("frequency", [150.0, 150.02])
 @pytest.mark.parametrize("amplitude", [300.0, 1000.0])
+@pytest.mark.slow
 def test_a_strong_line_beside_a_mode_moves_it_less_than_its_uncertainty(
     monkeypatch: pytest.MonkeyPatch, amplitude: float, frequency: float
 ) -> None:

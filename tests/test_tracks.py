@@ -134,6 +134,7 @@ def judged(innovations: np.ndarray) -> tuple[float, float]:
     return found.p_value, found.autocorrelation_p_value
 
 
+@pytest.mark.slow
 def test_p_values_of_a_filter_that_is_right_are_uniform() -> None:
     """A tenth of them lies under a tenth, of the sum of squares and of the autocorrelation."""
     rng = np.random.default_rng(2)

@@ -151,6 +151,36 @@ def test_an_interrupt_as_work_begins_leaves_nothing_that_waits(root: Path, begun
     assert said.count("Traceback") == 1, said
 
 
+def test_an_interrupt_is_over_when_it_is_told(root: Path) -> None:
+    """No thread is left that Python could stumble over as it ends.
+
+    It wakes the one that looks after processes by a pipe that this one closes as it ends: here
+    both take so long that the pipe is closed in between.
+    """
+    code = (
+        "import signal, time\nfrom concurrent.futures import process\n"
+        "from lmshealth.workers import processes\nfrom tests.test_workers import dawdle, lost\n"
+        "class Slow(process._ThreadWakeup):\n"
+        "    def wakeup(self):\n"
+        "        if not self._closed:\n"
+        "            time.sleep(1.0 if process._global_shutdown else 0.0)\n"
+        "            self._writer.send_bytes(b'')\n"
+        "    def close(self):\n"
+        "        time.sleep(0.5)\n"
+        "        super().close()\n"
+        "if __name__ == '__main__':\n"
+        "    process._ThreadWakeup = Slow\n"
+        "    signal.signal(signal.SIGALRM, signal.default_int_handler)\n"
+        "    with processes(2) as pool:\n"
+        "        signal.setitimer(signal.ITIMER_REAL, 0.1)\n"
+        "        list(pool.spread(dawdle, (bytes(9) for _ in range(400)), lost))\n"
+    )
+    words = [sys.executable, "-c", code]
+    done = subprocess.run(words, capture_output=True, text=True, cwd=root, timeout=60, check=False)
+    assert done.returncode == -signal.SIGINT
+    assert done.stderr.count("Traceback") == 1, done.stderr
+
+
 def _is_there(process: int) -> bool:
     try:
         return "Z" not in Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0]
@@ -222,6 +252,18 @@ def test_a_lost_scheduler_is_told(
         for _ in pool.spread(slowly, range(50), lost):
             cluster.scheduler.kill()
     assert capfd.readouterr().err == ""
+
+
+@pytest.mark.slow
+def test_a_connection_that_breaks_is_that_of_a_lost_scheduler(cluster: servers.Cluster) -> None:
+    """Who fetches a result in that moment hears of the connection alone."""
+    from distributed.comm.core import CommClosedError
+
+    with (
+        pytest.raises(SchedulerError, match=f"lost the Dask scheduler {cluster.address}"),
+        workers.cluster(cluster.address),
+    ):
+        raise CommClosedError("in <TCP (closed)>: ConnectionResetError")
 
 
 @pytest.mark.slow

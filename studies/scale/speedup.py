@@ -23,6 +23,7 @@ from __future__ import annotations
 import tempfile
 import time
 from concurrent.futures import ProcessPoolExecutor
+from contextlib import nullcontext
 from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
@@ -31,6 +32,7 @@ from typing import Any
 import numpy as np
 
 from lmshealth import Settings, identify, load_stage, read_log, run
+from studies.commands import no_pictures
 from studies.record import Study
 from studies.scale.archive import make_archive
 from studies.servers import dask_cluster
@@ -130,7 +132,8 @@ def main() -> None:
         make_archive(folder, QUICK_LOGS if quick else N_LOGS)
         each = _QUICK_BARE if quick else _BARE
         tasks = [(each, k) for k in range(1 if quick else TURNS)]
-        turns = study.trials.collect(partial(one_turn, folder, kinds), tasks)
+        with no_pictures() if quick else nullcontext():
+            turns = study.trials.collect(partial(one_turn, folder, kinds), tasks)
     answer: Row = {
         name: [round(float(v), 3) for v in np.quantile([t[name] for t in turns], (0, 0.5, 1))]
         for name in turns[0]

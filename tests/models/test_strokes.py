@@ -30,6 +30,7 @@ def test_columns_are_those_of_any_log():
     assert {values.size for values in recording.columns.values()} == {20000}
 
 
+@pytest.mark.slow
 def test_fast_strokes_fit_into_the_window_slow_ones_fill_it():
     """At 20 mm/s four seconds are constant velocity, at 100 mm/s a whole stroke."""
     slow = strokes(0.020).columns["reference_velocity_mm_s"]
