@@ -254,10 +254,14 @@ def cluster(address: str) -> Iterator[Pool]:
         raise SchedulerError(
             "--scheduler needs Dask: pip install 'lmshealth[distributed]'"
         ) from error
-    except (OSError, ValueError) as error:
+    except (OSError, TypeError, ValueError) as error:  # TypeError: certificates are missing
         why = getattr(error, "strerror", None)
         detail = f"{why}; is it running?" if why else without_secrets(str(error), address)
         raise SchedulerError(f"cannot work on the Dask scheduler {shown}: {detail}") from None
+    except Exception as error:  # whatever the library makes of words that it does not know
+        raise SchedulerError(
+            f"what answers at {shown} does not talk like a Dask scheduler: is it the right port?"
+        ) from error
     from distributed.comm.core import CommClosedError
 
     comm_closed: Any = CommClosedError  # the library has no types
@@ -288,7 +292,16 @@ def _knock(address: str) -> None:
         raise ValueError("its address has no user and no password; certificates go by tls://")
     if not parts.hostname or not parts.port:
         raise ValueError("needed is an address like tcp://host:8786")
-    socket.create_connection((parts.hostname, parts.port), timeout=_TIMEOUT).close()
+    with socket.create_connection((parts.hostname, parts.port), timeout=_TIMEOUT) as door:
+        if parts.scheme != "tcp":
+            return
+        # Both ends begin with a greeting, for which the library would wait for ever.
+        try:
+            door.recv(1)
+        except TimeoutError:
+            raise ValueError(
+                f"it said nothing for {_TIMEOUT} s: is it one, and the right port?"
+            ) from None
 
 
 def _connected(address: str) -> Any:
@@ -303,8 +316,8 @@ def _connected(address: str) -> Any:
     try:
         start: Any = Client.__init__
         start(client, address, timeout=_TIMEOUT, set_as_default=False)
-    except OSError:
-        client.status = "closed"  # else it tries to close what it never opened when it is deleted
+    except BaseException:
+        _close(client)
         raise
     return client
 
@@ -331,6 +344,9 @@ def _close(client: Any) -> None:
         client.close(timeout=_TIMEOUT)
     except (OSError, CancelledError) as error:
         logging.getLogger(__name__).debug("%s", error)
+    # One that is not closed is closed as Python deletes it, in whichever thread that happens: in
+    # that of a client being opened, it would wait for the lock that the opening holds.
+    client.status = "closed"
 
 
 def _open(size: int, end: Connection) -> ProcessPoolExecutor:

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import signal
 import socket
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from importlib.metadata import version
 from pathlib import Path
 
@@ -288,18 +291,51 @@ def test_a_worker_of_another_version_is_refused(
         ("tcp://me:hunter2@127.0.0.1:8786", "no user and no password"),
         ("tcp://127.0.0.1:{port}", "refused"),
         ("nosuch://127.0.0.1:{listening}", "unknown address scheme"),
+        ("tcp://127.0.0.1:{listening}", "it said nothing for 2 s.*right port"),
+        ("tls://127.0.0.1:{listening}", "TLS"),
     ],
 )
 def test_an_address_that_is_none_is_told(
-    address: str, said: str, needs: Callable[[str], None]
+    address: str, said: str, needs: Callable[[str], None], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Each is an error at once, without what is secret in it."""
+    """Each is an error soon, without what is secret in it."""
     needs("distributed")
+    monkeypatch.setattr(workers, "_TIMEOUT", 2)
     with socket.create_server(("127.0.0.1", 0)) as listener:
         full = address.format(port=servers.free_port(), listening=listener.getsockname()[1])
         with pytest.raises(SchedulerError, match=said) as caught, workers.cluster(full):
             pass
     assert "hunter2" not in str(caught.value)
+    _assert_no_client_is_open()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("words", [b"SSH-2.0-OpenSSH_9.2\r\n", b"220 ready\r\n", bytes(64), b""])
+def test_another_service_is_no_scheduler(words: bytes, needs: Callable[[str], None]) -> None:
+    """Whatever it says of itself: a wrong port is told as that."""
+    needs("distributed")
+
+    def serve(listener: socket.socket) -> None:
+        with suppress(OSError):
+            while True:
+                with listener.accept()[0] as guest:
+                    guest.sendall(words)
+
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        threading.Thread(target=serve, args=(listener,), daemon=True).start()
+        address = f"tcp://127.0.0.1:{listener.getsockname()[1]}"
+        with pytest.raises(SchedulerError, match=address), workers.cluster(address):
+            pass
+        listener.shutdown(socket.SHUT_RDWR)
+    _assert_no_client_is_open()
+
+
+def _assert_no_client_is_open() -> None:
+    """Python would close it when it deletes it, in the middle of whatever is done then."""
+    from distributed import Client
+
+    clients = [thing for thing in gc.get_objects() if isinstance(thing, Client)]
+    assert all(client.status == "closed" for client in clients)
 
 
 @pytest.mark.slow
