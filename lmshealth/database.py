@@ -21,6 +21,8 @@ INSERT: dict[str, Any] = {"sqlite": sqlite.insert, "postgresql": postgresql.inse
 
 # Seconds that a writer waits while others write to the same file.
 _PATIENCE = 120
+# Seconds that a server has to answer; its URL may say another number.
+_ANSWER = 20
 
 
 class StoreError(LmshealthError):
@@ -78,7 +80,8 @@ def _understood(url: str | URL) -> URL:
 
 def _engine(url: URL, *, shared: bool = True) -> Engine:
     if url.get_backend_name() != "sqlite":
-        return create_engine(url, pool_pre_ping=True)
+        wait = {} if "connect_timeout" in url.query else {"connect_timeout": _ANSWER}
+        return create_engine(url, pool_pre_ping=True, connect_args=wait)
     folder = Path(url.database or "").parent
     if not (url.database or "").startswith("file:") and not folder.is_dir():
         raise ValueError(f"there is no folder {folder}")

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import socket
 import sqlite3
+import time
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 from dataclasses import replace
@@ -13,6 +16,7 @@ import numpy as np
 import pytest
 from sqlalchemy import Engine, event
 
+from lmshealth import database
 from lmshealth.assessing import packed
 from lmshealth.history import Reading
 from lmshealth.logs import Metadata, Refusal
@@ -174,6 +178,22 @@ def test_a_url_that_cannot_be_opened_is_named_without_its_password(bad: str) -> 
         Store(bad)
     assert "hunter2" not in str(caught.value)
     assert "cannot open the store" in str(caught.value)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("query", ["", "?connect_timeout=2"])
+def test_a_server_that_says_nothing_is_not_waited_for(
+    query: str, needs: Callable[[str], None], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its port may be that of something else. Two seconds are the shortest that libpq knows."""
+    needs("postgres")
+    monkeypatch.setattr(database, "_ANSWER", 60 if query else 2)
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        port = listener.getsockname()[1]
+        begun = time.monotonic()
+        with pytest.raises(StoreError, match="timeout"):
+            Store(f"postgresql://me@127.0.0.1:{port}/fleet{query}")
+    assert time.monotonic() - begun < 30
 
 
 def test_a_file_that_is_no_store_is_named(tmp_path: Path) -> None:
