@@ -28,6 +28,7 @@ import random
 import signal
 import sys
 import tempfile
+import time
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -59,6 +60,7 @@ N_KILLS, QUICK_KILLS = 100, 1
 HOWS = {"main": 0.5, "worker": 0.2, "SIGINT": 0.15, "SIGTERM": 0.15}
 QUICK_HOWS = {"main": 1.0}
 ENDS = {"main": -signal.SIGKILL, "SIGTERM": -signal.SIGTERM}
+IMPORTED_S = 2.0  # by then Python has imported what a run needs; before, it interrupts its own way
 MOST_OTHER = 20  # runs that end otherwise, before it is of no use to go on
 PER_RUN, QUICK_PER_RUN = 5.0, 10.0  # kills in the mean, over the time that a run takes
 
@@ -98,6 +100,9 @@ def verdicts(answer: Row) -> dict[str, bool]:
         passed[f"as uninterrupted, {kind}"] = not found["differences"]
         passed[f"no process left, {kind}"] = found["slowest_end_s"] <= ENDED_S
         passed[f"no other end, {kind}"] = not found["other_ends"]
+        passed[f"interrupts told in one line, {kind}"] = all(
+            other["after_s"] <= IMPORTED_S for other in found["interrupts"]["others"]
+        )
     return passed
 
 
@@ -117,8 +122,14 @@ def until_enough(trials: Trials, work: Callable[..., Row], kind: str, n: int) ->
         "n": n,
         "how": dict(Counter(kill["how"] for kill in kills)),
         "when": dict(Counter(kill["when"] for kill in kills)),
-        # An interpreter that is only starting tells an interrupt in its own way.
-        "interrupts_told_in_one_line": [kill["told"] for kill in kills if "told" in kill],
+        "interrupts": {
+            "told_in_one_line": sum(kill["told"] for kill in kills if "told" in kill),
+            "others": [
+                {name: kill[name] for name in ("after_s", "lines", "last")}
+                for kill in kills
+                if not kill.get("told", True)
+            ],
+        },
         "slowest_end_s": max(kill["gone_s"] for kill in kills),
     }
 
@@ -164,6 +175,7 @@ def run_killed(
 ) -> bool:
     """Start a run and kill it when the time comes; say whether it came to its end all the same."""
     how = ""
+    begun = time.monotonic()
     with running(reference.batch.command(out, store)) as run:
         while len(kills.done) < kills.n:
             wait_s, wish = kills.next(reference.seconds)
@@ -172,6 +184,7 @@ def run_killed(
             if not run.kill(wish, kills.rng):
                 continue
             how = wish
+            after_s = round(time.monotonic() - begun, 2)
             kill = {"how": how, "when": when(reference, store, out), "gone_s": 0.0}
             kills.done.append(kill)
             if how != "worker":  # who loses a worker may go on
@@ -179,7 +192,12 @@ def run_killed(
                 break
         status, said = run.status(), run.said()
     if how == "SIGINT":
-        kills.done[-1]["told"] = one_line(said)
+        kills.done[-1] |= {
+            "told": one_line(said),
+            "after_s": after_s,
+            "lines": len(said),
+            "last": said[-1] if said else "",
+        }
     elif status != SOME_REFUSED and status != ENDS.get(how) and not (how and one_line(said)):
         other_ends.append(f"{how or 'not killed'}: {status}: {said[-3:]}")
         if len(other_ends) > MOST_OTHER:
