@@ -248,13 +248,16 @@ def cluster(address: str) -> Iterator[Pool]:
     """
     shown = shown_address(address)
     try:
-        _knock(address)
-        client = _connected(address)
+        from distributed.comm.core import CommClosedError
     except ImportError as error:
         raise SchedulerError(
             "--scheduler needs Dask: pip install 'lmshealth[distributed]'"
         ) from error
-    except (OSError, TypeError, ValueError) as error:  # TypeError: certificates are missing
+    try:
+        _knock(address)
+        client = _connected(address)
+    # Settings may name modules that are not there, or no certificates, which is a TypeError.
+    except (ImportError, OSError, TypeError, ValueError) as error:
         why = getattr(error, "strerror", None)
         detail = f"{why}; is it running?" if why else without_secrets(str(error), address)
         raise SchedulerError(f"cannot work on the Dask scheduler {shown}: {detail}") from None
@@ -262,8 +265,6 @@ def cluster(address: str) -> Iterator[Pool]:
         raise SchedulerError(
             f"what answers at {shown} does not talk like a Dask scheduler: is it the right port?"
         ) from error
-    from distributed.comm.core import CommClosedError
-
     comm_closed: Any = CommClosedError  # the library has no types
     try:
         _await_worker(client, shown)
@@ -341,7 +342,8 @@ def _one_thread() -> Any:
 def _close(client: Any) -> None:
     """Let go of a client, also of one whose scheduler is gone."""
     try:
-        client.close(timeout=_TIMEOUT)
+        if client.status != "newly-created":  # that has nothing to close
+            client.close(timeout=_TIMEOUT)
     except (OSError, CancelledError) as error:
         logging.getLogger(__name__).debug("%s", error)
     # One that is not closed is closed as Python deletes it, in whichever thread that happens: in

@@ -310,6 +310,25 @@ def test_an_address_that_is_none_is_told(
 
 
 @pytest.mark.slow
+def test_settings_that_cannot_be_followed_are_told(
+    needs: Callable[[str], None], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Dask is there: what it misses is named, not Dask."""
+    needs("distributed")
+    import dask
+
+    monkeypatch.setattr(workers, "_knock", lambda address: None)
+    loader = {"distributed.client.security-loader": "nosuchmodule.loader"}
+    address = f"tcp://127.0.0.1:{servers.free_port()}"
+    with (
+        dask.config.set(loader),
+        pytest.raises(SchedulerError, match=f"{address}: .*nosuchmodule"),
+        workers.cluster(address),
+    ):
+        pass
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("words", [b"SSH-2.0-OpenSSH_9.2\r\n", b"220 ready\r\n", bytes(64), b""])
 def test_another_service_is_no_scheduler(words: bytes, needs: Callable[[str], None]) -> None:
     """Whatever it says of itself: a wrong port is told as that."""
