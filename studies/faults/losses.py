@@ -15,7 +15,7 @@ Answer
     database went away tell it in one line, without the password; what is left in the end is in all
     three cases that of a run without trouble.
 Run time
-    A quarter of an hour.
+    Four minutes to a quarter of an hour.
 """
 
 from __future__ import annotations

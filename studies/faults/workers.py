@@ -15,7 +15,7 @@ Answer
     or page and no row of a store differs from those of a run in one process. A lost scheduler is
     told in one line, with status 1, and the next run ends as if nothing had been.
 Run time
-    Ten minutes to a quarter of an hour.
+    Four minutes to a quarter of an hour.
 """
 
 from __future__ import annotations
