@@ -105,7 +105,11 @@ class _Processes(Pool):
         # In this order: the executor's thread fails on a process that dies when a task was
         # cancelled of which it does not know yet, and would leave this process waiting for ever.
         caretaker: Any = getattr(self.executor, "_executor_manager_thread", None)
+        queue: Any = getattr(self.executor, "_call_queue", None)
         self.executor.shutdown(wait=False, cancel_futures=True)
+        if queue is not None:
+            # Up to Python 3.11.4, a thread that writes a task would wait for a reader for ever.
+            queue._reader.close()
         self._ours.close()
         # Python wakes this thread as it ends itself, by a pipe that may be closed in that moment.
         if caretaker is not None:
