@@ -106,10 +106,11 @@ class _Processes(Pool):
         # cancelled of which it does not know yet, and would leave this process waiting for ever.
         caretaker: Any = getattr(self.executor, "_executor_manager_thread", None)
         queue: Any = getattr(self.executor, "_call_queue", None)
-        self.executor.shutdown(wait=False, cancel_futures=True)
-        if queue is not None:
-            # Up to Python 3.11.4, a thread that writes a task would wait for a reader for ever.
+        if queue is not None and not getattr(self.executor, "_broken", False):
+            # Else a thread that writes a task waits for a reader for ever, as Python 3.11.2 does. A
+            # broken executor sees to it itself, and two must not close it at once.
             queue._reader.close()
+        self.executor.shutdown(wait=False, cancel_futures=True)
         self._ours.close()
         # Python wakes this thread as it ends itself, by a pipe that may be closed in that moment.
         if caretaker is not None:
