@@ -23,6 +23,7 @@ check: .venv/installed
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
+	$(BIN)/lint-imports
 
 # Tests run side by side: threads inside linear algebra would only get in their way.
 test slow coverage statistics bench: export OPENBLAS_NUM_THREADS = 1

@@ -9,25 +9,25 @@ from importlib.metadata import version
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from lmshealth.assessing import assess as assess
-    from lmshealth.decay import identify_decays as identify_decays
-    from lmshealth.decision import decide as decide
+    from lmshealth.batch.assess import assess as assess
+    from lmshealth.batch.run import Settings as Settings
+    from lmshealth.batch.run import run as run
     from lmshealth.errors import LmshealthError as LmshealthError
-    from lmshealth.frf import read_frf as read_frf
-    from lmshealth.history import Reading as Reading
-    from lmshealth.history import build_history as build_history
-    from lmshealth.inference import infer as infer
-    from lmshealth.inference import infer_together as infer_together
-    from lmshealth.lifefit import fit_life as fit_life
-    from lmshealth.modal import identify as identify
-    from lmshealth.pipeline import Settings as Settings
-    from lmshealth.pipeline import run as run
-    from lmshealth.planning import plan as plan
-    from lmshealth.prognosis import prognose as prognose
-    from lmshealth.readers import read_log as read_log
-    from lmshealth.stage import load_stage as load_stage
-    from lmshealth.tracking import track as track
-    from lmshealth.verdict import judge as judge
+    from lmshealth.health.inference import infer as infer
+    from lmshealth.health.inference import infer_together as infer_together
+    from lmshealth.health.verdict import judge as judge
+    from lmshealth.io.reading import read_log as read_log
+    from lmshealth.modal.free_decay.identification import identify_decays as identify_decays
+    from lmshealth.modal.frf.identification import read_frf as read_frf
+    from lmshealth.modal.identification import identify as identify
+    from lmshealth.prognosis.life_posterior import fit_life as fit_life
+    from lmshealth.prognosis.maintenance_decision import decide as decide
+    from lmshealth.prognosis.remaining_life import prognose as prognose
+    from lmshealth.stage.description import load_stage as load_stage
+    from lmshealth.stage.planning import plan as plan
+    from lmshealth.tracking.history import Reading as Reading
+    from lmshealth.tracking.history import build_history as build_history
+    from lmshealth.tracking.tracker import track as track
 
 __version__ = version("lmshealth")
 
@@ -35,24 +35,24 @@ __version__ = version("lmshealth")
 # pays for no database, and the command line sets its threads before numpy is there.
 _HOMES = {
     "LmshealthError": "errors",
-    "Reading": "history",
-    "Settings": "pipeline",
-    "assess": "assessing",
-    "build_history": "history",
-    "decide": "decision",
-    "fit_life": "lifefit",
-    "identify": "modal",
-    "identify_decays": "decay",
-    "infer": "inference",
-    "infer_together": "inference",
-    "judge": "verdict",
-    "load_stage": "stage",
-    "plan": "planning",
-    "prognose": "prognosis",
-    "read_frf": "frf",
-    "read_log": "readers",
-    "run": "pipeline",
-    "track": "tracking",
+    "Reading": "tracking.history",
+    "Settings": "batch.run",
+    "assess": "batch.assess",
+    "build_history": "tracking.history",
+    "decide": "prognosis.maintenance_decision",
+    "fit_life": "prognosis.life_posterior",
+    "identify": "modal.identification",
+    "identify_decays": "modal.free_decay.identification",
+    "infer": "health.inference",
+    "infer_together": "health.inference",
+    "judge": "health.verdict",
+    "load_stage": "stage.description",
+    "plan": "stage.planning",
+    "prognose": "prognosis.remaining_life",
+    "read_frf": "modal.frf.identification",
+    "read_log": "io.reading",
+    "run": "batch.run",
+    "track": "tracking.tracker",
 }
 
 __all__ = [*_HOMES]

@@ -1,6 +1,6 @@
 """``python -m lmshealth`` is the command line."""
 
-from lmshealth.cli import main
+from lmshealth.cli.main import main
 
 if __name__ == "__main__":
     main(prog_name="lmshealth")

@@ -10,12 +10,12 @@ from __future__ import annotations
 from importlib import resources
 from pathlib import Path
 
-from lmshealth.history import Reading, build_history
-from lmshealth.modetable import read_estimates
-from lmshealth.stage import load_stage
-from lmshealth.tracks import History
+from lmshealth.stage.description import load_stage
+from lmshealth.tracking.history import Reading, build_history
+from lmshealth.tracking.read_tables import read_estimates
+from lmshealth.tracking.results import History
 
-TABLE = Path(str(resources.files("lmshealth") / "stages" / "example-y.csv"))
+TABLE = Path(str(resources.files("lmshealth") / "stage" / "descriptions" / "example-y.csv"))
 """The estimates, in the columns of ``modes.csv``."""
 
 

@@ -10,7 +10,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from lmshealth.metrics import clopper_pearson
+from studies.metrics import clopper_pearson
 
 Row = Mapping[str, Any]
 STEPS = (

@@ -13,12 +13,14 @@ from unittest.mock import patch
 
 from click.testing import CliRunner
 
-from lmshealth import lifefit, plots, sampling
+from lmshealth.health import ensemble_sampling as sampling
+from lmshealth.prognosis import life_posterior as lifefit
+from lmshealth.report import figures as plots
 
 ROOT = Path(__file__).parents[1]
 _SOME_REFUSED = 3
 # Where the commands of a program are.
-_GROUPS = {"lmshealth": ("lmshealth.cli", "main"), "models": ("models.__main__", "cli")}
+_GROUPS = {"lmshealth": ("lmshealth.cli.main", "main"), "models": ("models.__main__", "cli")}
 
 
 def call(program: str, *arguments: object, quick: bool, some_refused: bool = False) -> str:

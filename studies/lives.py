@@ -13,7 +13,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from lmshealth.tracks import History, Series, Step
+from lmshealth.tracking.results import History, Series, Step
 from models.degradation import draw_laws
 from models.lives import Plan, Visit, schedule
 from models.plant import GUIDE_MODES, closed_loop_modes

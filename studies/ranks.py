@@ -26,7 +26,7 @@ from matplotlib.axes import Axes
 from numpy.typing import NDArray
 from scipy import stats
 
-from lmshealth.metrics import coverage, place
+from studies.metrics import coverage, place
 from studies.record import LEVEL, as_row
 
 Array = NDArray[np.float64]

@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 
 from lmshealth import identify, read_log
-from lmshealth.following import loop_error
-from lmshealth.readers import find_logs, read_manifest
-from lmshealth.stage import load_stage
+from lmshealth.io.manifest import find_logs, read_manifest
+from lmshealth.signal.following_error import loop_error
+from lmshealth.stage.description import load_stage
 from models.lives import Plan, simulate_life
 from models.plant import GUIDE_MODES
 from studies.lives import Estimates, Life, life_of, plan_of

@@ -12,7 +12,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from lmshealth.metrics import Coverage, clopper_pearson
+from studies.metrics import Coverage, clopper_pearson
 from studies.resume import KEPT, Trials
 
 # How often intervals claim to hold the truth, and how sure the judgement of that is.

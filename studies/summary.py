@@ -27,7 +27,7 @@ claim stands with how sure it is, and with what stands beside it in the same run
 what was asked, or a control that must be found out. A study is run by its script, `--quick` for
 its short form. What a long one has done is kept in `studies/.kept`, by the code that it depends on:
 interrupted, it goes on, and with other code it begins anew. What the tests hold at every run, as
-`tests/test_sight.py` does for `stage`, has no record.
+`tests/stage/test_identifiability.py` does for `stage`, has no record.
 """
 
 

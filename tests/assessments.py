@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 from msgspec.structs import asdict
 
-from lmshealth.logs import Refusal
-from lmshealth.summary import Assessment
-from lmshealth.tracks import Event, Step
-from lmshealth.verdict import Judgement
-from tests.test_plots import (
+from lmshealth.health.verdict import Judgement
+from lmshealth.io.log import Refusal
+from lmshealth.report.assessment import Assessment
+from lmshealth.tracking.results import Event, Step
+from tests.report.test_figures import (
     life,
     make_health,
     make_history,
@@ -22,7 +22,7 @@ from tests.test_plots import (
     make_track,
     make_waterfall,
 )
-from tests.test_report import write_stage
+from tests.report.test_machine_page import write_stage
 
 
 def worn(folder: Path, identity: str = "M7-Y") -> Assessment:

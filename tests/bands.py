@@ -12,14 +12,16 @@ from itertools import product
 
 import numpy as np
 
-from lmshealth.band import View
-from lmshealth.bandfit import BandFit, fit_band
-from lmshealth.blocks import Block, make_block
-from lmshealth.layout import lay_out
-from lmshealth.segments import Segment
-from lmshealth.spectra import CrossSpectrum, cross_spectra
-from lmshealth.starts import Coarse, Target, coarsen
-from lmshealth.whittle import Likelihood
+from lmshealth.modal.ambient.cluster_fit import BandFit, View, fit_band
+from lmshealth.modal.ambient.expected_periodogram import Block, make_block
+from lmshealth.modal.ambient.initial_values import (
+    Coarse,
+    coarsen,
+)
+from lmshealth.modal.ambient.whittle import Likelihood, lay_out
+from lmshealth.modal.targets import Target
+from lmshealth.signal.segments import Segment
+from lmshealth.signal.spectra import CrossSpectrum, cross_spectra
 from tests.oracles import channel_covariance
 from tests.signals import Mode, accelerations, make_log
 

@@ -16,12 +16,14 @@ from pathlib import Path
 import numpy as np
 from threadpoolctl import threadpool_info
 
-from lmshealth.arrays import BoolArray, FloatArray
-from lmshealth.history import Reading
-from lmshealth.logs import Metadata
-from lmshealth.results import Health, Modes, Prognosis
-from lmshealth.stage import Stage, load_stage
-from lmshealth.tracks import History, Series, Step, StepKind, Track
+from lmshealth._arrays import BoolArray, FloatArray
+from lmshealth.health.results import Health
+from lmshealth.io.log import Metadata
+from lmshealth.modal.modes import Modes
+from lmshealth.prognosis.results import Prognosis
+from lmshealth.stage.description import Stage, load_stage
+from lmshealth.tracking.history import Reading
+from lmshealth.tracking.results import History, Series, Step, StepKind, Track
 
 MODES = ("roll", "pitch", "yaw")
 FREQUENCY = np.array([126.4, 136.6, 155.0])

@@ -10,8 +10,8 @@ from filterpy.kalman import KalmanFilter
 from scipy import stats
 from scipy.linalg import cho_factor, cho_solve
 
-from lmshealth.arrays import FloatArray
-from lmshealth.tracks import History, Series
+from lmshealth._arrays import FloatArray
+from lmshealth.tracking.results import History, Series
 
 # The model of a mode: prior standard deviations, and the walk of ln damping in a life.
 LEVEL_STD, DAMPING_STD, DAMPING_WALK = 0.1, 1.0, 0.5

@@ -15,10 +15,10 @@ from pathlib import Path
 import h5py
 import numpy as np
 
-from lmshealth.logs import Channel, ChannelKind, Log, Metadata
-from lmshealth.results import Modes
-from lmshealth.spectra import Spectrum
-from lmshealth.stage import Description, ModeSpec, Order, Stage
+from lmshealth.io.log import Channel, ChannelKind, Log, Metadata
+from lmshealth.modal.modes import Modes
+from lmshealth.signal.spectra import Spectrum
+from lmshealth.stage.description import Description, ModeSpec, Order, Stage
 
 _KINDS: dict[str, ChannelKind] = {"delta": "displacement", "current": "current"}
 _CIRCLE = 3  # lengths of the record on the circle it is cut from

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lmshealth.logs import Log
-from lmshealth.segments import Segment
+from lmshealth.io.log import Log
+from lmshealth.signal.segments import Segment
 from tests.signals import Mode, accelerations, make_log
 
 

@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 from click.testing import CliRunner
 
-from lmshealth.cli import main
+from lmshealth.cli.main import main
 from tests.signals import write_archive, write_archive_stage
 
 QUANTILES = ("q05", "q10", "q25", "q50", "q75", "q90", "q95")

@@ -19,7 +19,7 @@ import pytest
 
 import lmshealth
 from lmshealth import examples
-from lmshealth.stage import load_stage
+from lmshealth.stage.description import load_stage
 
 # What the module of the example says of its machine: preload and mount left, and km to the limit.
 LEFT, KM_LEFT = (0.72, 0.87), 2457 - 1632

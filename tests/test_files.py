@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
+from lmshealth._files import write_bytes, write_text
 from lmshealth.errors import BadTable
-from lmshealth.files import write_bytes, write_text
 
 
 def test_folders_are_made_and_nothing_else_is_left(tmp_path: Path) -> None:

@@ -9,12 +9,12 @@ from pathlib import Path
 import pytest
 from click.testing import CliRunner
 
-from lmshealth.cli import main
+from lmshealth.batch.run import run
+from lmshealth.batch.store import Store, StoreError, beside
+from lmshealth.cli.main import main
 from lmshealth.errors import BadStage
-from lmshealth.index import file_names
-from lmshealth.pipeline import run
-from lmshealth.stage import load_stage
-from lmshealth.store import Store, StoreError, beside
+from lmshealth.report.fleet_page import file_names
+from lmshealth.stage.description import load_stage
 from studies.faults.guards import acting, bad_names
 from studies.faults.hostile import BAD_STAGES, MACHINES, SECRET
 from tests.signals import write_archive, write_archive_stage

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from lmshealth.metrics import (
+from studies.metrics import (
     alpha_lambda,
     clopper_pearson,
     coverage,

@@ -5,8 +5,8 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-from lmshealth.readers import load_columns
-from lmshealth.stage import load_stage
+from lmshealth.io.column_map import load_columns
+from lmshealth.stage.description import load_stage
 
 
 def test_files_of_the_first_five_minutes_are_understood(root: Path, tmp_path: Path) -> None:

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from lmshealth.errors import BadLog
-from lmshealth.logs import Channel, Log, Metadata
-from lmshealth.results import Modes
-from lmshealth.tracks import History, Series
+from lmshealth.io.log import Channel, Log, Metadata
+from lmshealth.modal.modes import Modes
+from lmshealth.tracking.results import History, Series
 from tests.signals import make_log
 
 

@@ -17,7 +17,7 @@ from studies import provenance
 from studies.resume import Trials
 
 SCRIPT = '''
-from lmshealth.metrics import place
+from studies.metrics import place
 
 SCALE = 2.0
 done = []
@@ -92,7 +92,7 @@ def test_line_cut_off(written: Any, tmp_path: Path) -> None:
     [
         ("SCALE = 2.0", "SCALE = 3.0", False),
         ("number / 3", "number / 4", False),
-        ("from lmshealth.metrics import place\n", "", True),
+        ("from studies.metrics import place\n", "", True),
         ("return len(rows)", "return 2 * len(rows)", True),
         ('"""Draw one."""', '"""Draw another."""', True),
         ("# no round number", "", True),
@@ -114,7 +114,7 @@ def test_changed_module(written: Any, tmp_path: Path, monkeypatch: pytest.Monkey
     text = SCRIPT.replace("SCALE *", "place.__name__ and SCALE *")
     before = provenance.code_of(written(text).draw)
     assert provenance.code_of(written(text).draw) == before
-    modules = provenance._closure({provenance.PROJECT / "lmshealth" / "metrics.py"})
+    modules = provenance._closure({provenance.PROJECT / "studies" / "metrics.py"})
     assert len(modules) > 1
     for module in sorted(modules):
         plain = provenance._tree(module)
@@ -137,9 +137,9 @@ def test_gathered_names(written: Any) -> None:
     tree = provenance._tree(Path(written(text).__file__ or ""))
     needed = provenance._closure(provenance._imports(tree.body))
     names = {path.relative_to(provenance.PROJECT).as_posix() for path in needed}
-    assert {"lmshealth/readers/__init__.py", "lmshealth/errors.py"} <= names
-    assert any(name.startswith("lmshealth/readers/") and "hdf5" in name for name in names)
-    assert not {"lmshealth/report.py", "lmshealth/__init__.py"} & names
+    assert {"lmshealth/io/reading.py", "lmshealth/errors.py"} <= names
+    assert any(name.startswith("lmshealth/io/formats/") and "hdf5" in name for name in names)
+    assert not {"lmshealth/report/machine_page.py", "lmshealth/__init__.py"} & names
 
 
 def test_options_and_names_part_trials(written: Any, tmp_path: Path) -> None:

@@ -7,7 +7,7 @@ from typing import Annotated
 import pytest
 from msgspec import Meta, Struct
 
-from lmshealth.toml import decode, place
+from lmshealth._toml import decode, place
 
 TEXT = """# a comment
 

@@ -33,12 +33,12 @@ from typing import Any
 
 import numpy as np
 
-from lmshealth.history import Reading, build_history
-from lmshealth.logs import Metadata
-from lmshealth.results import Modes
-from lmshealth.stage import Covariate, Description, Stage
-from lmshealth.tracking import track
-from lmshealth.tracks import History
+from lmshealth.io.log import Metadata
+from lmshealth.modal.modes import Modes
+from lmshealth.stage.description import Covariate, Description, Stage
+from lmshealth.tracking.history import Reading, build_history
+from lmshealth.tracking.results import History
+from lmshealth.tracking.tracker import track
 from studies.decays.beam import BEAM, REPEATS, one_beam
 from studies.record import Study
 

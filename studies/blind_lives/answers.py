@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from lmshealth.results import INFORMED
+from lmshealth.stage.constants import INFORMED
 from studies.blind_lives.lives import STAGES
 from studies.commands import call
 

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from lmshealth.metrics import clopper_pearson
 from studies.blind_lives.lives import SEED, WORDS
+from studies.metrics import clopper_pearson
 from studies.record import LEVEL
 
 Row = dict[str, Any]

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from lmshealth.stage import Stage, load_stage
-from lmshealth.verdict import degraded_below
+from lmshealth.health.verdict import degraded_below
+from lmshealth.stage.description import Stage, load_stage
 from models.degradation import LIVES, Delayed, Law, Steady, Stepped
 from models.lives import Plan, schedule
 from models.machines import machine_identity

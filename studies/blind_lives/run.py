@@ -51,12 +51,12 @@ from typing import Any
 
 import pandas as pd
 
-from lmshealth.metrics import clopper_pearson
 from models.lives import simulate_life
 from studies.blind_lives import judging
 from studies.blind_lives.answers import agrees, analyse
 from studies.blind_lives.lives import SEED, BlindPlan, plan_of, truth_of
 from studies.lives import HEALTHY
+from studies.metrics import clopper_pearson
 from studies.record import LEVEL, Study, options
 
 Row = dict[str, Any]

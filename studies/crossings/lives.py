@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from lmshealth.association import Estimates
+from lmshealth.tracking.association.associate import Estimates
 
 Array = NDArray[np.float64]
 

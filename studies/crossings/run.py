@@ -35,11 +35,11 @@ from unittest.mock import patch
 import numpy as np
 from numpy.typing import NDArray
 
-from lmshealth import identities
-from lmshealth.association import Association, associate
-from lmshealth.metrics import clopper_pearson
+from lmshealth.tracking.association import identities
+from lmshealth.tracking.association.associate import Association, associate
 from studies.crossings.judging import judge, nearest, recovered
 from studies.crossings.lives import KINDS, Kind, Life, make_life
+from studies.metrics import clopper_pearson
 from studies.record import Study
 
 SEED = 20261124

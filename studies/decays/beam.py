@@ -11,10 +11,10 @@ import numpy as np
 from scipy import ndimage
 
 from lmshealth import identify_decays, read_log
-from lmshealth.logs import Log
-from lmshealth.readers import load_columns
-from lmshealth.segments import Segment
-from lmshealth.stage import Description, ModeSpec, Stage
+from lmshealth.io.column_map import load_columns
+from lmshealth.io.log import Log
+from lmshealth.signal.segments import Segment
+from lmshealth.stage.description import Description, ModeSpec, Stage
 
 REPEATS = 3
 # Volts of the roller and Hz of the beam, and how far an estimate may be off.

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lmshealth.bounds import Recording, Vibration, decay_bound
-from lmshealth.logs import Channel, Log, Metadata
+from lmshealth.io.log import Channel, Log, Metadata
+from studies.cramer_rao import Recording, Vibration, decay_bound
 
 RATE = 400.0
 

@@ -45,12 +45,12 @@ import numpy as np
 from scipy import optimize
 
 from lmshealth import identify_decays
-from lmshealth.metrics import clopper_pearson
-from lmshealth.segments import Segment
-from lmshealth.stage import Description, ModeSpec, Stage
+from lmshealth.signal.segments import Segment
+from lmshealth.stage.description import Description, ModeSpec, Stage
 from studies.decays.beam import REPEATS, judge_beam, one_beam
 from studies.decays.cases import CASES, QUIET, RATE, Case, simulate, to_log
 from studies.decays.stops import one_machine
+from studies.metrics import clopper_pearson
 from studies.record import Study
 from studies.resume import Trials
 

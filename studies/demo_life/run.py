@@ -25,8 +25,8 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from lmshealth.metrics import clopper_pearson
 from studies.commands import call
+from studies.metrics import clopper_pearson
 from studies.record import Study, options
 
 HERE = Path(__file__).parent

@@ -35,17 +35,17 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from lmshealth.bounds import long_record_law
-from lmshealth.epoch import EpochPosterior
 from lmshealth.errors import BadQuestion
-from lmshealth.importance import explore_well
-from lmshealth.metrics import clopper_pearson
-from lmshealth.planning import plan
-from lmshealth.sight import sight_of
-from lmshealth.stage import Stage, load_stage
+from lmshealth.health.epoch_posterior import EpochPosterior
+from lmshealth.health.importance_sampling import explore_well
+from lmshealth.stage.description import Stage, load_stage
+from lmshealth.stage.identifiability import sight_of
+from lmshealth.stage.planning import plan
 from models.lives import Plan
 from models.plant import GUIDE_MODES
+from studies.cramer_rao import long_record_law
 from studies.lives import Array, life_of, rng_of
+from studies.metrics import clopper_pearson
 from studies.raw_lives import identified
 from studies.record import LEVEL, Study, judge_coverage
 from studies.resume import Trials

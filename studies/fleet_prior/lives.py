@@ -9,11 +9,11 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from lmshealth import life as model
-from lmshealth.laws import HertzWear, Unchanging
-from lmshealth.stage import Scatter, Stage, load_stage
-from lmshealth.statespace import regressors
-from lmshealth.tracks import History, Series
+from lmshealth.prognosis import life_likelihood as model
+from lmshealth.stage.degradation_laws import HertzWear, Unchanging
+from lmshealth.stage.description import Scatter, Stage, load_stage
+from lmshealth.tracking.results import History, Series
+from lmshealth.tracking.state_space import regressors
 from studies.sbc_life.lives import Part
 
 Array = NDArray[np.float64]

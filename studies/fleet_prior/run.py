@@ -43,14 +43,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lmshealth.fleet import Learned, Lesson, is_young, learn, lesson_of
-from lmshealth.laws import HertzWear
-from lmshealth.lifefit import LifePosterior, fit_life
-from lmshealth.metrics import coverage, crps, place
-from lmshealth.priors import Lognormal, Prior
-from lmshealth.prognosis import remaining_travel
-from lmshealth.stage import Stage
+from lmshealth.prognosis.fleet_prior import Learned, Lesson, is_young, learn, lesson_of
+from lmshealth.prognosis.life_posterior import LifePosterior, fit_life
+from lmshealth.prognosis.remaining_life import remaining_travel
+from lmshealth.stage.degradation_laws import HertzWear
+from lmshealth.stage.description import Stage
+from lmshealth.stage.priors import Lognormal, Prior
 from studies.fleet_prior.lives import MATURE, YOUNG, Life, draw, draw_fleet, longer_lived, machine
+from studies.metrics import coverage, crps, place
 from studies.ranks import Row
 from studies.record import LEVEL, Study, as_row
 

@@ -39,9 +39,9 @@ import numpy as np
 from scipy.stats import chi2
 
 from lmshealth import read_frf, read_log
-from lmshealth.frf import FrfReading
-from lmshealth.logs import Channel, ChannelKind, Log, Metadata
-from lmshealth.readers import load_columns
+from lmshealth.io.column_map import load_columns
+from lmshealth.io.log import Channel, ChannelKind, Log, Metadata
+from lmshealth.modal.frf.identification import FrfReading
 from models.formats import write_log
 from models.stages import stage_named
 from models.sweep import Sweep, record_sweep, without_loop

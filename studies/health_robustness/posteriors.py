@@ -11,13 +11,13 @@ from unittest.mock import patch
 
 import numpy as np
 
-from lmshealth import life as life_module
-from lmshealth.epoch import EpochPosterior
-from lmshealth.importance import explore_well
-from lmshealth.lifefit import fit_life
-from lmshealth.prognosis import limited, remaining_travel
-from lmshealth.stage import Stage
-from lmshealth.tracks import History, Track
+from lmshealth.health.epoch_posterior import EpochPosterior
+from lmshealth.health.importance_sampling import explore_well
+from lmshealth.prognosis import life_likelihood as life_module
+from lmshealth.prognosis.life_posterior import fit_life
+from lmshealth.prognosis.remaining_life import limited, remaining_travel
+from lmshealth.stage.description import Stage
+from lmshealth.tracking.results import History, Track
 from studies.lives import Array
 
 _N_PRIOR, _N_POINTS, _N_DRAWS = 1000, 2000, 4000

@@ -55,7 +55,7 @@ from typing import Any
 import numpy as np
 
 from lmshealth.errors import NotConverged, NotEnoughData
-from lmshealth.inference import infer
+from lmshealth.health.inference import infer
 from studies.health_robustness.posteriors import epoch_draws, life_draws
 from studies.health_robustness.trials import (
     ENDS,

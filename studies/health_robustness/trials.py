@@ -8,14 +8,14 @@ from typing import Any
 
 import numpy as np
 
-from lmshealth.history import believed
-from lmshealth.metrics import place
-from lmshealth.stage import Stage
-from lmshealth.tracking import track
-from lmshealth.tracks import History, Track
+from lmshealth.stage.description import Stage
+from lmshealth.tracking.history import believed
+from lmshealth.tracking.results import History, Track
+from lmshealth.tracking.tracker import track
 from studies.health_robustness.posteriors import claimed, epoch_draws, life_draws
 from studies.health_robustness.worlds import PARAMETERS, Case, alone
 from studies.lives import Array, history_of
+from studies.metrics import place
 from studies.record import judge_coverage
 
 NOMINALS = (0.9, 0.5)

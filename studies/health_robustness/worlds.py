@@ -11,10 +11,10 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
-from lmshealth.courses import courses_of
-from lmshealth.modalmap import ModalMap, read_map
-from lmshealth.sight import identifiable, sight_of
-from lmshealth.stage import Stage, load_stage
+from lmshealth.prognosis.scenarios import courses_of
+from lmshealth.stage.description import Stage, load_stage
+from lmshealth.stage.identifiability import identifiable, sight_of
+from lmshealth.stage.modal_map import ModalMap, read_map
 from models.lives import Visit, schedule
 from models.mapping import modal_map
 from models.plant import GUIDE_MODES

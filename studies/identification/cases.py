@@ -8,8 +8,8 @@ from functools import partial
 
 import numpy as np
 
-from lmshealth.bounds import Recording, Vibration, joint_bound
-from lmshealth.logs import Log
+from lmshealth.io.log import Log
+from studies.cramer_rao import Recording, Vibration, joint_bound
 from studies.identification.records import (
     Array,
     Truth,

@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
 
-from lmshealth.logs import Channel, Log, Metadata
-from lmshealth.stage import Description, ModeSpec, Order, Stage
+from lmshealth.io.log import Channel, Log, Metadata
+from lmshealth.stage.description import Description, ModeSpec, Order, Stage
 
 Array = NDArray[np.float64]
 

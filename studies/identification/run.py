@@ -36,9 +36,9 @@ from scipy.stats import norm
 
 from lmshealth import identify
 from lmshealth.errors import BadLog
-from lmshealth.logs import Log
-from lmshealth.results import Modes
-from lmshealth.stage import Stage
+from lmshealth.io.log import Log
+from lmshealth.modal.modes import Modes
+from lmshealth.stage.description import Stage
 from studies.identification.cases import CASES, HEADLINE, Case
 from studies.identification.records import Array, describe
 from studies.record import NOMINAL, Study, judge_coverage

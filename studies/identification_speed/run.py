@@ -28,7 +28,7 @@ import numpy as np
 from scipy import fft
 
 from lmshealth import identify, load_stage, read_log
-from lmshealth.logs import Log
+from lmshealth.io.log import Log
 from models.formats import write_log
 from models.recording import Recording, record
 from models.stages import stage_named

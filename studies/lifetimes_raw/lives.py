@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lmshealth.laws import HertzWear as WearLaw
-from lmshealth.laws import Loosening as LooseningLaw
-from lmshealth.stage import ParameterSpec, load_stage
+from lmshealth.stage.degradation_laws import HertzWear as WearLaw
+from lmshealth.stage.degradation_laws import Loosening as LooseningLaw
+from lmshealth.stage.description import ParameterSpec, load_stage
 from models.degradation import HertzWear, Law, Life, Loosening, Steady
 from models.lives import Plan
 

@@ -39,13 +39,13 @@ from typing import Any
 
 import numpy as np
 
-from lmshealth.decision import decide
 from lmshealth.errors import LmshealthError
-from lmshealth.history import believed
-from lmshealth.prognosis import prognose
-from lmshealth.results import Prognosis
-from lmshealth.stage import Stage, load_stage
-from lmshealth.tracking import track
+from lmshealth.prognosis.maintenance_decision import decide
+from lmshealth.prognosis.remaining_life import prognose
+from lmshealth.prognosis.results import Prognosis
+from lmshealth.stage.description import Stage, load_stage
+from lmshealth.tracking.history import believed
+from lmshealth.tracking.tracker import track
 from studies.lifetimes_raw.lives import N_LOGS, SECONDS, STAGE, PriorPlan, plan_of
 from studies.lives import history_of, life_of
 from studies.ranks import N_DRAWS, Array, Row, bands, judge, rank, uniform

@@ -7,8 +7,10 @@ from unittest.mock import patch
 
 import numpy as np
 
-from lmshealth import band, identify, tones
-from lmshealth.stage import Description, ModeSpec, Order, Stage
+from lmshealth import identify
+from lmshealth.modal.ambient import cluster_fit as band
+from lmshealth.signal import tone_removal as tones
+from lmshealth.stage.description import Description, ModeSpec, Order, Stage
 from studies.line_test.signals import (
     FLOOR,
     RATE,

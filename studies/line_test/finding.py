@@ -11,9 +11,9 @@ import numpy as np
 from scipy.stats import ncx2
 
 from lmshealth import load_stage, read_log
-from lmshealth.lines import find_lines, survey_lines
-from lmshealth.logs import Log
-from lmshealth.segments import find_segments
+from lmshealth.io.log import Log
+from lmshealth.signal.segments import find_segments
+from lmshealth.signal.spectral_lines import find_lines, survey_lines
 from models.formats import write_log
 from models.stages import STAGES, stage_named
 from models.strokes import full_stroke, record_strokes

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import median_filter
 
-from lmshealth.logs import Channel, Log, Metadata
+from lmshealth.io.log import Channel, Log, Metadata
 
 Array = NDArray[np.float64]
 Density = Callable[[Array], Array]

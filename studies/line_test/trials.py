@@ -6,11 +6,11 @@ from typing import Any
 
 import numpy as np
 
-from lmshealth.lines import find_lines
-from lmshealth.logs import Channel
-from lmshealth.metrics import clopper_pearson
-from lmshealth.segments import Segment
+from lmshealth.io.log import Channel
+from lmshealth.signal.segments import Segment
+from lmshealth.signal.spectral_lines import find_lines
 from studies.line_test.signals import BAND, RATE, Array
+from studies.metrics import clopper_pearson
 
 SHORT, LONG = 3.0, 30.0
 USUAL = 0.01

@@ -22,7 +22,7 @@ import numpy as np
 
 from lmshealth import identify
 from lmshealth.errors import BadLog
-from lmshealth.logs import Log
+from lmshealth.io.log import Log
 from studies.identification.cases import Case
 from studies.identification.records import RATE, Array, describe
 

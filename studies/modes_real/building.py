@@ -14,9 +14,9 @@ import pandas as pd
 from scipy.stats import norm
 
 from lmshealth import identify, load_stage
-from lmshealth.metrics import clopper_pearson
-from lmshealth.results import Modes
+from lmshealth.modal.modes import Modes
 from studies.commands import call
+from studies.metrics import clopper_pearson
 from studies.modes_real.make_map import PUBLISHED, PUBLISHED_DAMPING
 from studies.modes_real.sets import identify_known, to_log
 

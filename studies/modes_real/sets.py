@@ -11,10 +11,10 @@ import numpy as np
 from scipy.stats import norm
 
 from lmshealth import identify, read_log
-from lmshealth.logs import Channel, Log, Metadata
-from lmshealth.readers import load_columns
-from lmshealth.results import Modes
-from lmshealth.stage import Description, ModeSpec, Stage
+from lmshealth.io.column_map import load_columns
+from lmshealth.io.log import Channel, Log, Metadata
+from lmshealth.modal.modes import Modes
+from lmshealth.stage.description import Description, ModeSpec, Stage
 from studies.read_throughput.samples import MAPS
 
 _Z = float(norm.isf(0.025))

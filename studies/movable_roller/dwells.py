@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 from scipy import ndimage
 
-from lmshealth.segments import Segment
+from lmshealth.signal.segments import Segment
 from studies.decays.beam import find_dwells, read_beam
 
 BEGIN = datetime(2022, 7, 19, 22, 55, tzinfo=UTC)

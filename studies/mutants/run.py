@@ -44,7 +44,7 @@ from typing import Any
 
 import numpy as np
 
-from lmshealth.metrics import clopper_pearson
+from studies.metrics import clopper_pearson
 from studies.mutants.making import Mutant, Mutants, reach
 from studies.mutants.trying import ROOT, attempt, collect, digest_of
 from studies.record import Study

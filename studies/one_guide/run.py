@@ -31,14 +31,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lmshealth.inference import infer, infer_together
-from lmshealth.metrics import coverage
-from lmshealth.results import Health
-from lmshealth.stage import Stage, load_stage
-from lmshealth.tracktable import Drifts
+from lmshealth.health.inference import infer, infer_together
+from lmshealth.health.results import Health
+from lmshealth.stage.description import Stage, load_stage
+from lmshealth.tracking.read_tables import Drifts
 from models.mapping import guide_frequencies
 from models.stages import stage_named
 from studies.commands import short_chains
+from studies.metrics import coverage
 from studies.record import LEVEL, Study, as_row
 
 Array = NDArray[np.float64]

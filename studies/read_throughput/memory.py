@@ -11,8 +11,8 @@ import warnings
 from functools import partial
 from pathlib import Path
 
-from lmshealth.readers import ColumnMap
-from lmshealth.readers.formats import load
+from lmshealth.io.column_map import ColumnMap
+from lmshealth.io.formats.registry import load
 from studies.read_throughput.files import BARE
 
 

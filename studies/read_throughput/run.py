@@ -34,8 +34,9 @@ from typing import Any
 import msgspec
 
 from lmshealth.errors import BadLog
-from lmshealth.readers import ColumnMap, read_log
-from lmshealth.readers.formats import load
+from lmshealth.io.column_map import ColumnMap
+from lmshealth.io.formats.registry import load
+from lmshealth.io.reading import read_log
 from studies.read_throughput.files import BARE, RATE, Call, signals, write
 from studies.read_throughput.memory import needs
 from studies.read_throughput.samples import MAPS

@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 from scipy.stats import chi2, expon, kstest
 
-from lmshealth.harmonics import decompose
-from lmshealth.logs import Channel
-from lmshealth.segments import Segment
-from lmshealth.spectra import Spectrum, periodogram
+from lmshealth.io.log import Channel
+from lmshealth.signal.harmonics import decompose
+from lmshealth.signal.segments import Segment
+from lmshealth.signal.spectra import Spectrum, periodogram
 from studies.readings.checks import Check, below, control, likely, unbiased
 
 Array = np.ndarray[Any, Any]

@@ -5,8 +5,8 @@ from __future__ import annotations
 import json
 from typing import Any
 
-from lmshealth.metrics import clopper_pearson
 from studies.commands import call
+from studies.metrics import clopper_pearson
 
 Check = dict[str, Any]
 

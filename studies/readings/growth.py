@@ -8,9 +8,15 @@ import numpy as np
 from scipy.special import erf
 from scipy.stats import t as student
 
-from lmshealth.logs import Channel, Log, Metadata
-from lmshealth.magnitudes import Band, Growth, choose_bands, find_growth, read_magnitudes
-from lmshealth.stage import load_stage
+from lmshealth.io.log import Channel, Log, Metadata
+from lmshealth.signal.acceleration_levels import (
+    Band,
+    Growth,
+    choose_bands,
+    find_growth,
+    read_magnitudes,
+)
+from lmshealth.stage.description import load_stage
 from models.strokes import VELOCITIES
 from studies.readings.checks import Check, control, rate, unbiased
 

@@ -9,8 +9,9 @@ from typing import Any
 import h5py
 import numpy as np
 
-from lmshealth.logs import Log
-from lmshealth.readers import load_columns, read_log
+from lmshealth.io.column_map import load_columns
+from lmshealth.io.log import Log
+from lmshealth.io.reading import read_log
 from studies.read_throughput.samples import MAPS
 from studies.readings.checks import STANDARD_ERRORS, Check, at_least, below, command, control
 

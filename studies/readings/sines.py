@@ -8,8 +8,8 @@ from typing import Any
 import h5py
 import numpy as np
 
-from lmshealth.following import read_error
-from lmshealth.readers import read_log
+from lmshealth.io.reading import read_log
+from lmshealth.signal.following_error import read_error
 from studies.readings.checks import Check, below, command, control
 
 Array = np.ndarray[Any, Any]

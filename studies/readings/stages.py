@@ -12,10 +12,10 @@ import h5py
 import numpy as np
 from scipy.stats import mannwhitneyu, spearmanr
 
-from lmshealth.following import read_error
-from lmshealth.logs import Log
-from lmshealth.looks import error_row
-from lmshealth.magnitudes import (
+from lmshealth.io.log import Log
+from lmshealth.io.reading import read_log
+from lmshealth.report.tables import error_row
+from lmshealth.signal.acceleration_levels import (
     Band,
     Growth,
     Magnitude,
@@ -23,8 +23,8 @@ from lmshealth.magnitudes import (
     find_growth,
     read_magnitudes,
 )
-from lmshealth.readers import read_log
-from lmshealth.stage import load_stage
+from lmshealth.signal.following_error import read_error
+from lmshealth.stage.description import load_stage
 from models.stages import STAGES
 from models.velocities import Experiment, drive_velocities
 from studies.paper_tables.tables import FILES, PRINTED_GROWING, printed

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import erf
 
-from lmshealth.epoch import one_at_a_time
-from lmshealth.stage import Stage
-from lmshealth.tracks import History
+from lmshealth.health.epoch_posterior import one_at_a_time
+from lmshealth.stage.description import Stage
+from lmshealth.tracking.results import History
 from models.degradation import (
     GUIDE_PRELOAD_LIMIT,
     MOUNT_STIFFNESS_LIMIT,

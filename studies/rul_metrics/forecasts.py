@@ -7,13 +7,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lmshealth.epoch import EpochPosterior
-from lmshealth.laplace import approximate
-from lmshealth.lifefit import LifePosterior, fit_life
-from lmshealth.prognosis import limited, remaining_travel, told_limits
-from lmshealth.stage import Stage
-from lmshealth.tracking import track
-from lmshealth.tracks import History
+from lmshealth.health.epoch_posterior import EpochPosterior
+from lmshealth.health.laplace import approximate
+from lmshealth.prognosis.life_posterior import LifePosterior, fit_life
+from lmshealth.prognosis.remaining_life import limited, remaining_travel, told_limits
+from lmshealth.stage.description import Stage
+from lmshealth.tracking.results import History
+from lmshealth.tracking.tracker import track
 from studies.lives import Array
 
 N_DRAWS = 10_000

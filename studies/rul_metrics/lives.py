@@ -7,7 +7,7 @@ from functools import cache
 
 import numpy as np
 
-from lmshealth.tracks import History
+from lmshealth.tracking.results import History
 from models.degradation import Life as Truth
 from models.lives import Plan, schedule
 from studies.lives import SECONDS, Estimates, Life, drawn, history_of, life_with, rng_of

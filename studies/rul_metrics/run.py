@@ -56,7 +56,9 @@ from typing import Any
 
 import numpy as np
 
-from lmshealth.metrics import (
+from lmshealth.stage.description import Stage, load_stage
+from studies.lives import Array, rng_of
+from studies.metrics import (
     alpha_lambda,
     clopper_pearson,
     coverage,
@@ -71,8 +73,6 @@ from lmshealth.metrics import (
     unexploited_life,
     within,
 )
-from lmshealth.stage import Stage, load_stage
-from studies.lives import Array, rng_of
 from studies.raw_lives import recorded
 from studies.record import LEVEL, Study, as_row
 from studies.rul_metrics.bound import bound, share_within

@@ -7,8 +7,8 @@ from importlib.util import find_spec
 import numpy as np
 
 from lmshealth.errors import NotConverged
-from lmshealth.stage import Stage
-from lmshealth.tracks import History
+from lmshealth.stage.description import Stage
+from lmshealth.tracking.results import History
 from studies.lives import Array
 from studies.rul_metrics.forecasts import linear, ours
 

@@ -13,11 +13,11 @@ from emcee.autocorr import integrated_time
 from numpy.random import MT19937, RandomState
 from numpy.typing import NDArray
 
-from lmshealth.epoch import EpochPosterior
-from lmshealth.inference import draw
-from lmshealth.priors import JointPrior
-from lmshealth.sampling import start_from_prior, stream
-from lmshealth.stage import Stage, load_stage
+from lmshealth.health.ensemble_sampling import start_from_prior, stream
+from lmshealth.health.epoch_posterior import EpochPosterior
+from lmshealth.health.inference import draw
+from lmshealth.stage.description import Stage, load_stage
+from lmshealth.stage.priors import JointPrior
 from models.mapping import guide_frequencies
 from models.stages import stage_named
 

@@ -12,13 +12,13 @@ import numpy as np
 from filterpy.kalman import KalmanFilter
 from numpy.typing import NDArray
 
-from lmshealth.density import LifeDensity
-from lmshealth.epoch import one_at_a_time
-from lmshealth.life import LifeLikelihood
-from lmshealth.prognosis import prognose
-from lmshealth.sampling import start_from_prior
-from lmshealth.stage import Stage, load_stage
-from lmshealth.tracks import History, Series
+from lmshealth.health.ensemble_sampling import start_from_prior
+from lmshealth.health.epoch_posterior import one_at_a_time
+from lmshealth.prognosis.life_likelihood import LifeLikelihood
+from lmshealth.prognosis.life_posterior import LifeDensity
+from lmshealth.prognosis.remaining_life import prognose
+from lmshealth.stage.description import Stage, load_stage
+from lmshealth.tracking.results import History, Series
 
 Array = NDArray[np.float64]
 MODES = ("roll", "pitch")

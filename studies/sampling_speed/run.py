@@ -40,9 +40,9 @@ from typing import Any
 
 import numpy as np
 
-from lmshealth.inference import infer
-from lmshealth.stage import load_stage
-from lmshealth.tracktable import Drifts
+from lmshealth.health.inference import infer
+from lmshealth.stage.description import load_stage
+from lmshealth.tracking.read_tables import Drifts
 from studies.record import Study
 from studies.sampling_speed.contestants import compare, epoch_posterior
 from studies.sampling_speed.life import START, life_posterior

@@ -9,9 +9,9 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from lmshealth.stage import Stage
-from lmshealth.tracking import track
-from lmshealth.tracks import History, Series, Track
+from lmshealth.stage.description import Stage
+from lmshealth.tracking.results import History, Series, Track
+from lmshealth.tracking.tracker import track
 
 Array = NDArray[np.float64]
 START = datetime(2026, 3, 1, tzinfo=UTC)

@@ -38,13 +38,13 @@ from typing import Any
 
 import numpy as np
 
-from lmshealth.epoch import EpochPosterior
 from lmshealth.errors import NotConverged
-from lmshealth.importance import explore_well
-from lmshealth.inference import draw as draw_chains
-from lmshealth.inference import infer
-from lmshealth.sampling import stream
-from lmshealth.stage import Stage, load_stage
+from lmshealth.health.ensemble_sampling import stream
+from lmshealth.health.epoch_posterior import EpochPosterior
+from lmshealth.health.importance_sampling import explore_well
+from lmshealth.health.inference import draw as draw_chains
+from lmshealth.health.inference import infer
+from lmshealth.stage.description import Stage, load_stage
 from studies.ranks import (
     N_DRAWS,
     Array,

@@ -8,12 +8,12 @@ from datetime import UTC, datetime, timedelta
 import numpy as np
 from numpy.typing import NDArray
 
-from lmshealth import courses
-from lmshealth import life as model
-from lmshealth.laws import HertzWear, Law, Loosening
-from lmshealth.stage import ParameterSpec, Stage
-from lmshealth.statespace import BIAS_STD, JUMP_STD, regressors
-from lmshealth.tracks import History, Series, Step
+from lmshealth.prognosis import life_likelihood as model
+from lmshealth.prognosis import scenarios as courses
+from lmshealth.stage.degradation_laws import HertzWear, Law, Loosening
+from lmshealth.stage.description import ParameterSpec, Stage
+from lmshealth.tracking.results import History, Series, Step
+from lmshealth.tracking.state_space import BIAS_STD, JUMP_STD, regressors
 
 Array = NDArray[np.float64]
 START = datetime(2026, 3, 1, tzinfo=UTC)

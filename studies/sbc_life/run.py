@@ -47,9 +47,9 @@ import msgspec
 import numpy as np
 
 from lmshealth.errors import NotConverged
-from lmshealth.lifefit import LifePosterior, fit_life
-from lmshealth.prognosis import remaining_travel
-from lmshealth.stage import Stage, load_stage
+from lmshealth.prognosis.life_posterior import LifePosterior, fit_life
+from lmshealth.prognosis.remaining_life import remaining_travel
+from lmshealth.stage.description import Stage, load_stage
 from studies.ranks import (
     N_DRAWS,
     Array,

@@ -38,9 +38,9 @@ from typing import Any
 import numpy as np
 
 from lmshealth import Settings, identify, load_stage, read_log, run
-from lmshealth.following import loop_error
-from lmshealth.stage import Stage
-from lmshealth.waterfall import read_levels
+from lmshealth.signal.following_error import loop_error
+from lmshealth.signal.waterfall import read_levels
+from lmshealth.stage.description import Stage
 from studies.commands import no_pictures
 from studies.record import Study, options
 from studies.scale.archive import make_archive

@@ -29,7 +29,7 @@ from typing import Any
 
 import numpy as np
 
-from lmshealth.index import IndexRow, write_index
+from lmshealth.report.fleet_page import IndexRow, write_index
 from studies.record import Study
 from studies.scale.rows import make_refused, make_rows
 

@@ -33,7 +33,7 @@ from typing import Any
 import msgspec
 
 from lmshealth import Settings, load_stage, run
-from lmshealth.stage import Stage
+from lmshealth.stage.description import Stage
 from models.lives import Plan, simulate_life
 from studies.record import Study
 

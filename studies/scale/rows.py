@@ -7,12 +7,12 @@ from typing import Any
 
 import numpy as np
 
-from lmshealth.brief import Brief
-from lmshealth.decision import Service
-from lmshealth.healthfacts import Gauge, Life, Tone
-from lmshealth.index import IndexRow
-from lmshealth.logs import Refusal
-from lmshealth.wording import GAP, day_count, km, percent
+from lmshealth.io.log import Refusal
+from lmshealth.prognosis.maintenance_decision import Service
+from lmshealth.report.brief import Brief
+from lmshealth.report.fleet_page import IndexRow
+from lmshealth.report.healthfacts import Gauge, Life, Tone
+from lmshealth.report.text import GAP, day_count, km, percent
 
 TODAY = date(2026, 11, 20)
 HORIZON = 20e6

@@ -40,9 +40,9 @@ import numpy as np
 from scipy.stats import chi2
 
 from lmshealth import identify, load_stage, read_frf, read_log
-from lmshealth.frf import FrfReading
-from lmshealth.logs import Log
-from lmshealth.stage import ModeSpec
+from lmshealth.io.log import Log
+from lmshealth.modal.frf.identification import FrfReading
+from lmshealth.stage.description import ModeSpec
 from models.formats import write_log
 from models.plant import GUIDE_MODES, SENSORS
 from models.recording import record

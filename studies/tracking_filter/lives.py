@@ -11,10 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-from lmshealth.bank import Filter, Settings, settings
-from lmshealth.stage import Stage, load_stage
-from lmshealth.statespace import BIAS_STD, DAMPING_WALK, state_space
-from lmshealth.tracks import History, Series
+from lmshealth.stage.description import Stage, load_stage
+from lmshealth.tracking.filter_bank import Filter, Settings, settings
+from lmshealth.tracking.results import History, Series
+from lmshealth.tracking.state_space import BIAS_STD, DAMPING_WALK, state_space
 
 Array = NDArray[np.float64]
 HORIZON = 2e7  # m of travel in a life

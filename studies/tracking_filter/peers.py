@@ -13,9 +13,10 @@ from typing import Any
 import numpy as np
 from filterpy.kalman import KalmanFilter
 
-from lmshealth.bank import Filter, Settings
-from lmshealth.stage import Stage
-from lmshealth.statespace import (
+from lmshealth.stage.description import Stage
+from lmshealth.tracking.filter_bank import Filter, Settings
+from lmshealth.tracking.results import History, Series
+from lmshealth.tracking.state_space import (
     DAMPING_WALK,
     LN_F_STD,
     LN_ZETA_STD,
@@ -23,8 +24,7 @@ from lmshealth.statespace import (
     StateSpace,
     state_space,
 )
-from lmshealth.tracking import track
-from lmshealth.tracks import History, Series
+from lmshealth.tracking.tracker import track
 from studies.tracking_filter.lives import START, Array, Life, draw, filtered
 
 PEERS = ("simdkalman", "statsmodels")

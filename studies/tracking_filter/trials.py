@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 from scipy import stats
 
-from lmshealth.metrics import clopper_pearson
-from lmshealth.stage import Stage
-from lmshealth.tracking import track
-from lmshealth.tracks import History
+from lmshealth.stage.description import Stage
+from lmshealth.tracking.results import History
+from lmshealth.tracking.tracker import track
+from studies.metrics import clopper_pearson
 from studies.record import LEVEL
 from studies.tracking_filter.lives import (
     Array,

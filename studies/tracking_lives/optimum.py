@@ -12,8 +12,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lmshealth.events import FALSE_ALARMS
-from lmshealth.statespace import LN_F_STD
+from lmshealth.tracking.change_detection import FALSE_ALARMS
+from lmshealth.tracking.state_space import LN_F_STD
 from studies.lives import Array, Estimates, Life
 
 _TEMPERATURE_STD = 0.001  # per K, as in the descriptions of the stages

@@ -45,8 +45,7 @@ from unittest.mock import patch
 
 import numpy as np
 
-from lmshealth import bank
-from lmshealth.metrics import clopper_pearson
+from lmshealth.tracking import filter_bank as bank
 from studies.lives import (
     DAMAGED,
     HEALTHY,
@@ -58,6 +57,7 @@ from studies.lives import (
     plan_of,
     rng_of,
 )
+from studies.metrics import clopper_pearson
 from studies.raw_lives import RAW, identified, measured, recorded
 from studies.record import LEVEL, Study, options
 from studies.resume import Trials

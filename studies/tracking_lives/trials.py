@@ -11,11 +11,11 @@ from typing import Any
 import numpy as np
 from scipy import stats
 
-from lmshealth.metrics import clopper_pearson
-from lmshealth.stage import Stage, load_stage
-from lmshealth.tracking import track
-from lmshealth.tracks import History, Track
+from lmshealth.stage.description import Stage, load_stage
+from lmshealth.tracking.results import History, Track
+from lmshealth.tracking.tracker import track
 from studies.lives import HEALTHY, Array, Estimates, Life, history_of, rng_of
+from studies.metrics import clopper_pearson
 from studies.record import LEVEL, judge_coverage
 
 STAGES = ("lms-y", "lms-x")

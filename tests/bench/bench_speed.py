@@ -18,13 +18,13 @@ from numpy.typing import NDArray
 from scipy import fft
 
 from lmshealth import fit_life, identify, infer, load_stage, prognose, run
+from lmshealth.batch.run import Settings
 from lmshealth.examples import history
-from lmshealth.pipeline import Settings
-from lmshealth.readers import ColumnMap
-from lmshealth.readers.formats import load
-from lmshealth.stage import Stage
-from lmshealth.tracking import track
-from lmshealth.tracktable import Drifts
+from lmshealth.io.column_map import ColumnMap
+from lmshealth.io.formats.registry import load
+from lmshealth.stage.description import Stage
+from lmshealth.tracking.read_tables import Drifts
+from lmshealth.tracking.tracker import track
 from models.recording import record
 from models.stages import stage_named
 from studies.bench.ratios import recorded

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from lmshealth.decay import identify_decays
+from lmshealth.modal.free_decay.identification import identify_decays
 from tests.claims import Claims
 from tests.signals import deviations, make_stage
 from tests.statistical.evidence import covered

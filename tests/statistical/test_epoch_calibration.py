@@ -12,12 +12,12 @@ from pathlib import Path
 import numpy as np
 from scipy import stats
 
-from lmshealth.arrays import FloatArray
-from lmshealth.epoch import EpochPosterior
-from lmshealth.inference import draw, infer_together
-from lmshealth.metrics import place
-from lmshealth.sampling import stream
-from lmshealth.stage import load_stage
+from lmshealth._arrays import FloatArray
+from lmshealth.health.ensemble_sampling import stream
+from lmshealth.health.epoch_posterior import EpochPosterior
+from lmshealth.health.inference import draw, infer_together
+from lmshealth.stage.description import load_stage
+from studies.metrics import place
 from studies.one_guide.run import SHARED, drifts_of
 from studies.sbc_epoch.lives import believing
 from studies.sbc_epoch.lives import draw as draw_track

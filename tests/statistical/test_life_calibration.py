@@ -12,16 +12,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lmshealth import life
-from lmshealth.arrays import FloatArray
-from lmshealth.density import LifeDensity
-from lmshealth.fleet import is_young, lesson_of
-from lmshealth.life import LifeLikelihood
-from lmshealth.lifefit import fit_life
-from lmshealth.metrics import place
-from lmshealth.prognosis import _usage, remaining_travel
-from lmshealth.stage import Stage
-from lmshealth.tracks import History
+from lmshealth._arrays import FloatArray
+from lmshealth.prognosis import life_likelihood as life
+from lmshealth.prognosis.fleet_prior import is_young, lesson_of
+from lmshealth.prognosis.life_likelihood import LifeLikelihood
+from lmshealth.prognosis.life_posterior import LifeDensity, fit_life
+from lmshealth.prognosis.remaining_life import _usage, remaining_travel
+from lmshealth.stage.description import Stage
+from lmshealth.tracking.results import History
 from studies.fleet_prior.lives import YOUNG, draw_fleet
 from studies.fleet_prior.lives import draw as draw_machine
 from studies.fleet_prior.run import (
@@ -33,6 +31,7 @@ from studies.fleet_prior.run import (
     posterior,
     taught,
 )
+from studies.metrics import place
 from studies.ranks import N_DRAWS
 from studies.sbc_life.lives import draw
 from studies.sbc_life.run import N_POSTERIOR, machine, quantities, true_quantities

@@ -7,9 +7,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from lmshealth.lines import find_lines
-from lmshealth.logs import Channel
-from lmshealth.segments import Segment
+from lmshealth.io.log import Channel
+from lmshealth.signal.segments import Segment
+from lmshealth.signal.spectral_lines import find_lines
 from tests.claims import Claims
 from tests.signals import Mode, accelerations
 from tests.statistical.evidence import at_most

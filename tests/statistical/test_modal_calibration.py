@@ -12,10 +12,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lmshealth import segments, spectra
-from lmshealth.logs import Log
-from lmshealth.modal import identify
-from lmshealth.results import Modes
+from lmshealth.io.log import Log
+from lmshealth.modal.identification import identify
+from lmshealth.modal.modes import Modes
+from lmshealth.signal import segments, spectra
 from tests.claims import Claims
 from tests.signals import (
     Mode,

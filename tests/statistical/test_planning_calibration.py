@@ -11,10 +11,10 @@ from pathlib import Path
 import numpy as np
 from scipy import stats
 
-from lmshealth.bounds import ambient_bound
-from lmshealth.planning import plan
-from lmshealth.sight import sight_of
-from lmshealth.stage import Stage
+from lmshealth.stage.cramer_rao import ambient_bound
+from lmshealth.stage.description import Stage
+from lmshealth.stage.identifiability import sight_of
+from lmshealth.stage.planning import plan
 from studies.detectability.run import FALSE_ALARM, POWER, called, stage_with
 from tests.claims import Claims
 from tests.lives import DAMPING, FREQUENCY, MOUNT, PRELOAD, SENSITIVITY, make_stage

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from lmshealth.stage import Stage
+from lmshealth.stage.description import Stage
 from studies.crossings.judging import judge, nearest
 from studies.crossings.lives import KINDS, make_life
 from studies.crossings.run import labels_of

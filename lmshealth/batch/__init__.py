@@ -1,0 +1,1 @@
+"""Batch analysis of archives of logs: ingest, assessment, store of results, worker processes."""

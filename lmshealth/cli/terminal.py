@@ -1,0 +1,109 @@
+"""What a terminal shows: tables for people, JSON for programs, prose that fits."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
+from textwrap import wrap
+from typing import TYPE_CHECKING, Any
+
+import click
+from rich import box
+from rich.console import Console
+from rich.table import Table
+
+if TYPE_CHECKING:  # so that help comes without pandas and scipy
+    from lmshealth.report.tables import Row
+
+_WIDTH = 78
+# Names up to this length are not torn in a table that is too wide.
+_NAME = 16
+
+
+def print_json(content: dict[str, list[Row]]) -> None:
+    """Print JSON with null where a number is missing."""
+    click.echo(json.dumps(_without_nan(content), indent=1, allow_nan=False))
+
+
+def _without_nan(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _without_nan(item) for key, item in value.items()}
+    if isinstance(value, list):
+        return [_without_nan(item) for item in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def print_failed(failed: dict[str, str]) -> None:
+    """Say on standard error of which machines nothing can be told, and why."""
+    for machine, why in failed.items():
+        click.echo(f"lmshealth: {machine}: {why}", err=True)
+
+
+def print_text(text: str, mark: str = "") -> None:
+    """Print prose in lines that fit; those after the first stand below the first, not its mark."""
+    for paragraph in (mark + text).split("\n"):
+        lines = wrap(
+            paragraph,
+            _WIDTH,
+            subsequent_indent=" " * len(mark),
+            break_long_words=False,
+            break_on_hyphens=False,
+        )
+        click.echo("\n".join(lines))
+
+
+def print_refused(rows: Sequence[Row]) -> None:
+    """Print what was refused, and why."""
+    names = ("log", "channel", "mode", "reason", "detail")
+    logs = short_names([row["log"] for row in rows])
+    if rows:
+        cells = [(logs[row["log"]], *(row[name] for name in names[1:])) for row in rows]
+        print_table("Refused", names, (), cells)
+
+
+def print_table(
+    title: str, texts: Sequence[str], numbers: Sequence[str], cells: Sequence[Sequence[str]]
+) -> None:
+    """Print a table: columns of text to the left, columns of numbers to the right."""
+    table = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False)
+    for place, name in enumerate(texts):
+        # What says most stands last, and gives way first: names before it are not torn.
+        words = " ".join([name, *(row[place] for row in cells)]).split()
+        least = min(max(map(len, words), default=0), _NAME) if place < len(texts) - 1 else None
+        table.add_column(name, overflow="fold", min_width=least)
+    for name in numbers:
+        table.add_column(name, justify="right", no_wrap=True)
+    for row in cells:
+        table.add_row(*row)
+    click.echo(title)
+    # What stands in the cells is text: brackets in it are no markup.
+    Console(markup=False, emoji=False, highlight=False).print(table)
+
+
+def short_names(logs: Sequence[str]) -> dict[str, str]:
+    """Name each log without its folder, where that says which."""
+    names = {log: Path(log).name for log in logs}
+    shared = Counter(names.values())
+    return {log: name if shared[name] == 1 else log for log, name in names.items()}
+
+
+def or_dash(value: float, form: str) -> str:
+    """Write a number in a form, and a dash where there is none."""
+    return "–" if math.isnan(value) else f"{value:{form}}"
+
+
+def number(value: float) -> str:
+    """Write three significant digits without an exponent where that is short."""
+    if math.isnan(value):
+        return "–"
+    if 100 <= abs(value) < 1e5:
+        return f"{value:.0f}"
+    return f"{value:.3g}" if abs(value) >= 0.1 else f"{value:.2g}"
+
+
+def percent(share: float) -> str:
+    """Write a share in percent."""
+    return f"{100 * share:.1f} %"

@@ -1,0 +1,1 @@
+"""Posterior of the health parameters at single epochs, and the verdict."""

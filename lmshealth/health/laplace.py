@@ -1,0 +1,116 @@
+"""Laplace's approximation: the normal distribution about the mode of a posterior.
+
+It starts the sampler, and stands beside its answer as a check by other means.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import Bounds, minimize
+
+from lmshealth._arrays import FloatArray, freeze
+
+LogProbability = Callable[[FloatArray], FloatArray]
+"""Log density of many points at once: ``(n_points, n_dim)`` to ``(n_points,)``."""
+
+# Steps of differences: first in units of the box, then of the standard deviation found with them,
+# where rounding (1e-15 over its square) and the fourth derivative both are negligible.
+_FIRST_STEP, _STEP = 1e-4, 0.01
+_SEARCHES = 3
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Laplace:
+    """A normal approximation.
+
+    Attributes
+    ----------
+    mode : ndarray
+        Where the density is highest, shape ``(n_dim,)``.
+    cov : ndarray
+        Inverse of the negative second derivative there, shape ``(n_dim, n_dim)``.
+    """
+
+    mode: FloatArray
+    cov: FloatArray
+
+    def __post_init__(self) -> None:
+        freeze(self)
+
+    @property
+    def std(self) -> FloatArray:
+        """Standard deviations, shape ``(n_dim,)``."""
+        return np.sqrt(np.diag(self.cov))
+
+
+def approximate(
+    log_probability: LogProbability, points: FloatArray, low: FloatArray, high: FloatArray
+) -> Laplace | None:
+    """Approximate a density by a normal one at its highest point.
+
+    Parameters
+    ----------
+    log_probability : callable
+        Vectorised log density.
+    points : ndarray
+        Where to begin the search, such as draws of the prior; the best few are used,
+        shape ``(n_points, n_dim)``.
+    low, high : ndarray
+        Box outside of which the density is zero, shape ``(n_dim,)``.
+
+    Returns
+    -------
+    Laplace or None
+        None where the highest point lies at the edge of the box, or is no maximum: no normal
+        distribution is like such a density.
+    """
+    margin = 1e-9 * (high - low)
+    bounds = Bounds(low + margin, high - margin)
+
+    def cost(x: FloatArray) -> float:
+        return -float(log_probability(x[None])[0])
+
+    value = log_probability(points)
+    begins = points[np.argsort(-value, kind="stable")[:_SEARCHES]]
+    ends = [minimize(cost, begin, method="L-BFGS-B", bounds=bounds) for begin in begins]
+    mode = min(ends, key=lambda end: float(end.fun)).x
+    cov = _inverse_curvature(log_probability, mode, _FIRST_STEP * (high - low), low, high)
+    for _ in range(2):  # a step of Newton's, then the curvature where it ends
+        if cov is None:
+            return None
+        step = _STEP * np.sqrt(np.diag(cov))
+        mode = mode + cov @ _slope(log_probability, mode, step)
+        cov = _inverse_curvature(log_probability, mode, step, low, high)
+    return None if cov is None else Laplace(mode=mode, cov=cov)
+
+
+def _slope(log_probability: LogProbability, x: FloatArray, step: FloatArray) -> FloatArray:
+    shifts = np.diag(step)
+    value = log_probability(np.concatenate([x + shifts, x - shifts])).reshape(2, -1)
+    return np.asarray((value[0] - value[1]) / (2 * step))
+
+
+def _inverse_curvature(
+    log_probability: LogProbability,
+    x: FloatArray,
+    step: FloatArray,
+    low: FloatArray,
+    high: FloatArray,
+) -> FloatArray | None:
+    """Invert the negative matrix of second differences; None where that is no covariance."""
+    n = x.size
+    if (x - 2 * step <= low).any() or (x + 2 * step >= high).any():
+        return None
+    shifts = np.diag(step)
+    one, other = np.repeat(shifts, n, axis=0), np.tile(shifts, (n, 1))
+    corners = [x + one + other, x + one - other, x - one + other, x - one - other]
+    value = log_probability(np.concatenate(corners)).reshape(4, n, n)
+    curvature = -(value[0] - value[1] - value[2] + value[3]) / (4 * np.outer(step, step))
+    try:
+        np.linalg.cholesky(curvature)
+    except np.linalg.LinAlgError:
+        return None
+    return np.asarray(np.linalg.inv(curvature))

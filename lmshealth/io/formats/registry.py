@@ -1,0 +1,93 @@
+"""The registry of file formats: adding one is a module with a `Format` and a line here."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from lmshealth.io.column_map import ColumnMap
+from lmshealth.io.formats.csv import CSV, CSV_GZ
+from lmshealth.io.formats.hdf5 import HDF5
+from lmshealth.io.formats.mat import MAT
+from lmshealth.io.formats.parquet import PARQUET
+from lmshealth.io.formats.tdms import TDMS
+from lmshealth.io.formats.uff import UFF
+from lmshealth.io.raw import Format, Raw
+from lmshealth.io.refusal import Unusable, listed
+
+# Binary formats first: text is what is left when no signature is found.
+FORMATS: tuple[Format, ...] = (HDF5, PARQUET, TDMS, MAT, CSV_GZ, UFF, CSV)
+SUFFIXES: tuple[str, ...] = tuple(sorted(s for form in FORMATS for s in form.suffixes))
+
+# Exporters call delimited text so, and people their notes: read where a file is named, and not
+# looked for in folders.
+TEXT_SUFFIXES = (".txt", ".tsv", ".dat")
+
+_HEAD = 4096
+
+
+def is_log(path: Path) -> bool:
+    """Tell by its name whether a file of a folder is a log."""
+    return path.name.lower().endswith(SUFFIXES)
+
+
+def format_of(path: Path) -> Format | None:
+    """Find the format that a file's name promises; None for an unregistered suffix."""
+    name = path.name.lower()
+    if name.removesuffix(".gz").endswith(TEXT_SUFFIXES):
+        return CSV_GZ if name.endswith(".gz") else CSV
+    return next((form for form in FORMATS if name.endswith(form.suffixes)), None)
+
+
+def format_name(path: Path) -> str:
+    """Name the format that a file's name promises: the same bytes are another log in another."""
+    form = format_of(path)
+    return "" if form is None else form.name
+
+
+def load(path: Path, columns: ColumnMap) -> Raw:
+    """Read a file by the format its name promises and its first bytes confirm.
+
+    Parameters
+    ----------
+    path : Path
+        A regular file.
+    columns : ColumnMap
+        Which columns are wanted, and the layout of exports.
+
+    Raises
+    ------
+    Unusable
+        With reason ``format`` for an unknown suffix or another format's content, ``empty`` for
+        0 bytes, ``corrupt`` for content that cannot be read, and the reasons of the formats.
+    """
+    form = format_of(path)
+    if form is None:
+        known = (*SUFFIXES, *TEXT_SUFFIXES)
+        raise Unusable("format", f"unknown suffix; needed one of {listed(known)}")
+    with path.open("rb") as stream:
+        head = stream.read(_HEAD)
+    if not head:
+        raise Unusable("empty", "0 bytes; copy the file again")
+    if not form.sniff(head):
+        raise _mismatch(form, head)
+    try:
+        return form.load(path, columns)
+    except Unusable:
+        raise
+    except Exception as error:
+        # Libraries raise whatever they like on damaged files; one bad file must not end a batch.
+        text = " ".join(str(error).split())[:200]
+        raise Unusable(
+            "corrupt", f"cannot be read as {form.name} ({type(error).__name__}: {text})"
+        ) from error
+
+
+def _mismatch(form: Format, head: bytes) -> Unusable:
+    actual = next((other for other in FORMATS if other.sniff(head)), None)
+    if actual is None:
+        return Unusable("corrupt", f"does not start as {form.name} does; copy the file again")
+    return Unusable(
+        "format",
+        f"the name says {form.name}, the content is {actual.name}; "
+        f"rename the file to {actual.suffixes[0]}",
+    )

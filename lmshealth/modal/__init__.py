@@ -1,0 +1,1 @@
+"""Identification of natural frequencies, damping ratios and mode shapes with covariance."""

@@ -1,0 +1,87 @@
+"""Survey of a log's accelerometers: where its modes are, how strong they are, and which lines."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from lmshealth.errors import BadLog
+from lmshealth.io.log import Log, Refusal
+from lmshealth.modal.identification import identify
+from lmshealth.modal.modes import Modes
+from lmshealth.signal.acceleration_levels import (
+    GRID_BAND,
+    Magnitude,
+    choose_bands,
+    read_magnitudes,
+)
+from lmshealth.signal.segments import Part
+from lmshealth.signal.spectral_lines import Line, survey_lines
+from lmshealth.stage.description import Stage
+
+
+@dataclass(frozen=True, slots=True)
+class Survey:
+    """What the accelerometers of one log say.
+
+    Attributes
+    ----------
+    log : str
+        The file, as the user knows it.
+    magnitudes : tuple of Magnitude
+        Channel by channel.
+    lines : tuple of Line
+        Spectral lines in the bands and between them.
+    refused : tuple of Refusal
+        Channels that could not be used.
+    """
+
+    log: str
+    magnitudes: tuple[Magnitude, ...]
+    lines: tuple[Line, ...]
+    refused: tuple[Refusal, ...]
+
+
+def survey(
+    log: Log, stage: Stage | None, band: tuple[float, float] | None, *, part: Part = "record"
+) -> Survey:
+    """Read the accelerometers of a log.
+
+    Parameters
+    ----------
+    log : Log
+        With at least one acceleration channel.
+    stage : Stage or None
+        Says which modes and bands to read; without it a grid.
+    band : (float, float) or None
+        Only modes, grid and lines between these, in Hz.
+    part : str
+        Which stretches of the log; see `select_segments`.
+
+    Returns
+    -------
+    Survey
+
+    Raises
+    ------
+    BadLog
+        As `read_magnitudes` does.
+    """
+    accelerometers = [c for c in log.channels if c.kind == "acceleration"]
+    found: Modes | None = None
+    if stage is not None and accelerometers:
+        try:
+            found = identify(log, stage, channels=[c.name for c in accelerometers])
+        except BadLog:
+            found = None  # its modes are read where the description has them
+    identified = (
+        None if found is None else dict(zip(found.names, found.frequency.tolist(), strict=True))
+    )
+    bands = choose_bands(stage, identified, band)
+    magnitudes = read_magnitudes(log, bands, part=part)
+    widest = band or (
+        min([GRID_BAND[0], *(b.low for b in bands)]),
+        max([GRID_BAND[1], *(b.high for b in bands)]),
+    )
+    return Survey(
+        log.name, magnitudes, survey_lines(log, accelerometers, stage, widest), log.refused
+    )

@@ -1,0 +1,1 @@
+"""Modal identification from ambient or operational vibration (Bayesian FFT, Whittle likelihood)."""

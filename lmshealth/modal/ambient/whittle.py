@@ -1,0 +1,574 @@
+"""Whittle likelihood of all channels that see one or several modes, with exact derivatives.
+
+The acceleration of mode i under a white modal force is h_i(f) = 1 / (1 - β² - 2iζβ), β = f_i/f.
+What a channel shows beside the modes, its floor, is h_c(f) = exp((e_c + d_c u + b_c u²) / 2) with
+u = -1 … 1 over the band. Modes and floors are driven by partly common forces: the floor of a
+channel is the tail of other modes and the motion of rigid bodies as well as noise, and it
+interferes with the modes. Each channel sees each mode by its shape φ. The ordinates of all
+channels at one frequency are then complex normal with the matrix
+
+    E(f) = Φ D(f) Φᵀ,   D_ij = S_ij h_i h_j*,   S = L Lᵀ,   Φ = [shapes, 1],
+
+over modes and floors. Averages W of n ordinates keep all there is to know where E hardly changes
+between them:
+
+    -ln p = Σ n (ln det E + tr E⁻¹ W).
+
+Unknowns, in this order: ln f (m), ln ζ (m), e_c, d_c and b_c of each channel, L row by row up to
+its diagonal, which is one for the floors, and the shapes but for the channel of each mode where it
+is one. L is real, for one force moves all modes in phase; it is signed, in units of a start value:
+neither independent modes nor a single common force is a boundary.
+
+Every slope of E has the form E_a = b ω* + ω bᵀ, where b is a column of Φ or a unit vector: a change
+of one component or of one channel. That makes the Hessian a few matrix products.
+
+Which unknown of the likelihood is which.
+
+Responses of modes and of floors, with their derivatives.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Generic, TypeVar
+
+import numpy as np
+from scipy.linalg import cho_factor, cho_solve
+from scipy.optimize import OptimizeResult, minimize
+
+from lmshealth._arrays import ComplexArray, FloatArray
+from lmshealth.modal.ambient.expected_periodogram import Block
+
+
+@dataclass(frozen=True, slots=True)
+class Layout:
+    """Which unknown is which.
+
+    Attributes
+    ----------
+    n_modes, n_channels : int
+        Numbers of modes and of channels, whose floors are the components after the modes.
+    force : tuple of (int, int)
+        Row and column of each unknown of L.
+    shape : tuple of (int, int)
+        Channel and mode of each unknown of the shapes.
+    """
+
+    n_modes: int
+    n_channels: int
+    force: tuple[tuple[int, int], ...]
+    shape: tuple[tuple[int, int], ...]
+
+    @property
+    def n_components(self) -> int:
+        """Number of modes and floors."""
+        return self.n_modes + self.n_channels
+
+    @property
+    def n_poles(self) -> int:
+        """Number of the first unknowns, those of h: two per mode, three per floor."""
+        return 2 * self.n_modes + 3 * self.n_channels
+
+    @property
+    def pole(self) -> list[tuple[int, int]]:
+        """Component of each of the first unknowns, and which derivative of h belongs to it."""
+        modes = [(i, q) for q in (1, 2) for i in range(self.n_modes)]
+        floors = [(i, q) for i in range(self.n_modes, self.n_components) for q in (1, 2, 3)]
+        return modes + floors
+
+    @property
+    def forces(self) -> slice:
+        """Unknowns of L."""
+        return slice(self.n_poles, self.n_poles + len(self.force))
+
+    @property
+    def shared(self) -> list[int]:
+        """Unknowns of L by which floors share the forces of modes."""
+        m, first = self.n_modes, self.forces.start
+        return [first + a for a, (i, j) in enumerate(self.force) if i >= m > j]
+
+    @property
+    def common(self) -> list[int]:
+        """Unknowns of L by which floors share the forces of other floors."""
+        m, first = self.n_modes, self.forces.start
+        return [first + a for a, (_, j) in enumerate(self.force) if j >= m]
+
+    @property
+    def bends(self) -> list[int]:
+        """Unknowns b of the floors."""
+        return list(range(2 * self.n_modes + 2, self.n_poles, 3))
+
+    @property
+    def shapes(self) -> slice:
+        """Unknowns of the shapes."""
+        return slice(self.forces.stop, self.size)
+
+    @property
+    def size(self) -> int:
+        """Number of unknowns."""
+        return self.n_poles + len(self.force) + len(self.shape)
+
+
+def lay_out(reference: Sequence[int], n_channels: int) -> Layout:
+    """Lay the unknowns out.
+
+    Parameters
+    ----------
+    reference : sequence of int
+        Of each mode the channel in which its shape is one.
+    n_channels : int
+        Number of channels.
+    """
+    m = len(reference)
+    # A single channel tells no more than which forces neighbours share.
+    modes = [(i, j) for i in range(m) for j in range(i + 1) if n_channels > 1 or i - j < 2]
+    floors = [(m + c, j) for c in range(n_channels) for j in range(m + c)]
+    shape = [(c, i) for i in range(m) for c in range(n_channels) if c != reference[i]]
+    return Layout(m, n_channels, (*modes, *floors), tuple(shape))
+
+
+# Where the second derivatives of h stand, by which first ones they are of.
+SECOND = np.array([[4, 5, 6], [5, 7, 8], [6, 8, 9]])
+
+
+def response(f: FloatArray, zeta: FloatArray, frequency: FloatArray) -> ComplexArray:
+    """Acceleration response h of modes to a white force, frequencies in the last axis."""
+    beta = f / frequency
+    return np.asarray(1 / (1 - beta**2 - 2j * zeta * beta))
+
+
+def floor_response(p: FloatArray, u: FloatArray) -> FloatArray:
+    """Response exp((e + d u + b u²) / 2) of floors, shape ``(n_floors, n)``."""
+    return np.asarray(np.exp(p @ np.stack([np.ones_like(u), u, u * u]) / 2))
+
+
+def floors(p: FloatArray, u: FloatArray) -> ComplexArray:
+    """`floor_response` with its derivatives, as `receptance` has them.
+
+    Parameters
+    ----------
+    p : ndarray
+        e, d and b of each floor, shape ``(n_floors, 3)``.
+    u : ndarray
+        Place in the band, shape ``(n,)``.
+    """
+    basis = np.stack([np.ones_like(u), u, u * u]) / 2
+    h = np.exp(p @ basis)
+    pairs = [basis[a] * basis[b] for a in range(3) for b in range(a, 3)]
+    return np.stack([h, *(h * slope for slope in [*basis, *pairs])]).astype(complex)
+
+
+def receptance(f: FloatArray, zeta: FloatArray, frequency: FloatArray) -> ComplexArray:
+    """Acceleration response h of modes and its derivatives by x = ln f and z = ln ζ.
+
+    Returns an array of shape ``(10, …, n)``: h, its first derivatives by three unknowns and its
+    second ones (11, 12, 13, 22, 23, 33), of which the third does not exist here. With d = 1/h,
+    h_a = -d_a h² and h_ab = (2 d_a d_b h - d_ab) h².
+    """
+    beta = f / frequency
+    damping = -2j * zeta * beta
+    h = 1 / (1 - beta**2 + damping)
+    d_x, d_xx = damping - 2 * beta**2, damping - 4 * beta**2
+    square = h * h
+    none = np.zeros_like(h)
+    return np.stack(
+        [
+            h,
+            -d_x * square,
+            -damping * square,
+            none,
+            (2 * d_x * d_x * h - d_xx) * square,
+            (2 * d_x * damping * h - damping) * square,
+            none,
+            (2 * damping * damping * h - damping) * square,
+            none,
+            none,
+        ]
+    )
+
+
+T = TypeVar("T")
+
+# Newton decrement, a square in standard deviations, from which on no further step is worth it;
+# along a valley as flat as that of two modes at one place, after so many steps, a larger one.
+_ARRIVED, _NEARLY, _MANY_STEPS = 1e-4, 0.1, 25
+# Standard deviations of the weak normal priors about the start, which only keep directions that
+# the data do not see from running away: of ln f, ln ζ, forces, shapes, floors.
+WEAK = (0.2, 2.0)
+_PRIOR_FORCE = 30.0
+_PRIOR_SHARED = 1.0
+_PRIOR_COMMON = 3.0
+_PRIOR_SHAPE = 30.0
+_PRIOR_FLOOR = (5.0, 2.0, 1.0)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Likelihood:
+    """Negative log posterior of a band with priors about a start.
+
+    Attributes
+    ----------
+    blocks : tuple of Block
+        One per length of segments.
+    layout : Layout
+        Which unknown is which.
+    start : ndarray
+        Start value and centre of the priors, shape ``(n_unknowns,)``.
+    scale : ndarray
+        Unit of the rows of L, shape ``(n_components,)``; one for the floors.
+    centre : float
+        Geometric centre of the band in Hz.
+    spread : float
+        Half width of the band in ln f.
+    """
+
+    blocks: tuple[Block, ...]
+    layout: Layout
+    start: FloatArray
+    scale: FloatArray
+    centre: float
+    spread: float
+
+    @property
+    def prior_std(self) -> FloatArray:
+        """Standard deviations of the weak priors, shape ``(n_unknowns,)``."""
+        lay = self.layout
+        forces = np.full(len(lay.force), _PRIOR_FORCE)
+        forces[np.array(lay.shared, dtype=int) - lay.forces.start] = _PRIOR_SHARED
+        forces[np.array(lay.common, dtype=int) - lay.forces.start] = _PRIOR_COMMON
+        return np.concatenate(
+            [
+                np.repeat(WEAK, lay.n_modes),
+                np.tile(_PRIOR_FLOOR, lay.n_channels),
+                forces,
+                np.full(len(lay.shape), _PRIOR_SHAPE),
+            ]
+        )
+
+    def value(self, p: FloatArray) -> float:
+        """Negative log posterior up to a constant."""
+        return self._value(p, self._at(p))
+
+    def data_value(self, p: FloatArray) -> float:
+        """Negative log likelihood without the priors."""
+        return sum(point.misfit() for point in self._at(p))
+
+    def expected(self, p: FloatArray) -> list[ComplexArray]:
+        """Compute E of each block, shape ``(n, n_channels, n_channels)``."""
+        return [point.expected for point in self._at(p)]
+
+    def _at(self, p: FloatArray) -> list[_Point]:
+        with np.errstate(over="ignore", invalid="ignore"):
+            return [_Point(self, p, block) for block in self.blocks]
+
+    def _value(self, p: FloatArray, points: list[_Point]) -> float:
+        total = 0.5 * float(np.sum(((p - self.start) / self.prior_std) ** 2))
+        with np.errstate(over="ignore", invalid="ignore"):
+            try:
+                total += sum(point.misfit() for point in points)
+            except np.linalg.LinAlgError:
+                return np.inf
+        return total if np.isfinite(total) else np.inf
+
+    def _derivatives(self, p: FloatArray, points: list[_Point]) -> tuple[FloatArray, FloatArray]:
+        gradient = (p - self.start) / self.prior_std**2
+        hessian = np.diag(1 / self.prior_std**2)
+        for point in points:
+            first, second = point.derivatives()
+            gradient = gradient + first
+            hessian = hessian + second
+        return gradient, hessian
+
+    def shapes(self, p: FloatArray) -> FloatArray:
+        """Shapes of the modes, shape ``(n_channels, n_modes)``."""
+        phi = np.ones((self.layout.n_channels, self.layout.n_modes))
+        if self.layout.shape:
+            phi[tuple(_columns(self.layout.shape))] = p[self.layout.shapes]
+        return phi
+
+    def signal_to_noise(self, p: FloatArray) -> FloatArray:
+        """Modal signal-to-noise ratios S φ² / (4 ζ² N), shape ``(n_channels, n_modes)``."""
+        m = self.layout.n_modes
+        at = Block(np.exp(p[:m]), np.empty((m, 0, 0), dtype=complex), np.ones(m), None)
+        point = _Point(self, p, at)
+        return point.strength / (4 * np.exp(2 * p[m : 2 * m]) * point.floor)
+
+    def derivatives(self, p: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Exact gradient and Hessian of `value`, shapes ``(n_unknowns,)`` and square."""
+        return self._derivatives(p, self._at(p))
+
+    def minimise(self, start: FloatArray) -> FloatArray:
+        """Find the posterior mode by Newton's method in a trust region.
+
+        Parameters
+        ----------
+        start : ndarray
+            Shape ``(n_unknowns,)``.
+
+        Returns
+        -------
+        ndarray
+            Where the search ended; the caller judges it by its Newton decrement.
+        """
+        # The optimiser asks for value, gradient and Hessian of a point in an order of its own, and
+        # comes back to the point before where a step was too long.
+        points = _Last(self._at)
+        both = _Last(lambda p: self._derivatives(p, points(p)))
+
+        def value(p: FloatArray) -> float:
+            return self._value(p, points(p))
+
+        def gradient(p: FloatArray) -> FloatArray:
+            return both(p)[0]
+
+        def hessian(p: FloatArray) -> FloatArray:
+            return both(p)[1]
+
+        def decrement(p: FloatArray) -> float:
+            """Give the Newton decrement; infinite where there is no minimum near."""
+            slope, curvature = both(p)
+            try:
+                return float(slope @ cho_solve(cho_factor(curvature), slope))
+            except np.linalg.LinAlgError:
+                return np.inf
+
+        steps = iter(range(1, 1000))
+
+        def arrived(intermediate_result: OptimizeResult) -> None:
+            near = _ARRIVED if next(steps) < _MANY_STEPS else _NEARLY
+            if decrement(np.asarray(intermediate_result.x)) < near:
+                raise StopIteration
+
+        found = minimize(
+            value,
+            start,
+            jac=gradient,
+            hess=hessian,
+            method="trust-exact",
+            callback=arrived,
+            options={"gtol": 1e-9, "maxiter": 100, "initial_trust_radius": 0.3},
+        )
+        return np.asarray(found.x)
+
+
+class _Last(Generic[T]):
+    """A function that remembers its last value.
+
+    Parameters
+    ----------
+    function : callable
+        Of an array.
+    """
+
+    def __init__(self, function: Callable[[FloatArray], T]) -> None:
+        self._function = function
+        self._last: tuple[FloatArray, T] | None = None
+
+    def __call__(self, p: FloatArray) -> T:
+        """Give the value at p."""
+        if self._last is None or not np.array_equal(p, self._last[0]):
+            self._last = p.copy(), self._function(p)
+        return self._last[1]
+
+
+class _Point:
+    """The model of a block at one point; frequency is the last axis unless said otherwise."""
+
+    def __init__(self, likelihood: Likelihood, p: FloatArray, block: Block) -> None:
+        self._block, self._scale = block, likelihood.scale
+        self._layout = lay = likelihood.layout
+        m, n = lay.n_modes, lay.n_components
+        self._root = np.zeros((n, n))
+        self._root[range(m, n), range(m, n)] = 1.0
+        for value, (i, j) in zip(p[lay.forces], lay.force, strict=True):
+            self._root[i, j] = self._scale[i] * value
+        self._phi = np.concatenate([likelihood.shapes(p), np.eye(lay.n_channels)], axis=1)
+        self._poles = p[:m, None], p[m : 2 * m, None]
+        self._tilts = p[2 * m : lay.n_poles].reshape(-1, 3)
+        self._u = np.log(block.grid / likelihood.centre) / likelihood.spread
+
+    @cached_property
+    def _response(self) -> ComplexArray:
+        """Responses h of all components, shape ``(components, grid)``."""
+        ln_f, ln_zeta = self._poles
+        modes = response(np.exp(ln_f), np.exp(ln_zeta), self._block.grid)
+        return np.concatenate([modes, floor_response(self._tilts, self._u)])
+
+    @cached_property
+    def _h(self) -> ComplexArray:
+        """The same with its derivatives, shape ``(10, components, grid)``."""
+        ln_f, ln_zeta = self._poles
+        modes = receptance(np.exp(ln_f), np.exp(ln_zeta), self._block.grid)
+        return np.concatenate([modes, floors(self._tilts, self._u)], axis=1)
+
+    @cached_property
+    def _s(self) -> FloatArray:
+        return np.asarray(self._root @ self._root.T)
+
+    @property
+    def strength(self) -> FloatArray:
+        """PSD of each modal force as each channel sees it, shape ``(channels, modes)``."""
+        m = self._layout.n_modes
+        return np.asarray(self._phi[:, :m] ** 2 * np.diag(self._s)[:m])
+
+    @property
+    def floor(self) -> FloatArray:
+        """PSD of what each floor does not share with a mode, shape ``(channels, grid)``."""
+        m = self._layout.n_modes
+        own = np.sum(self._root[m:, m:] ** 2, axis=1)
+        return np.asarray(np.abs(self._response[m:]) ** 2 * own[:, None])
+
+    @cached_property
+    def _modal(self) -> ComplexArray:
+        """D, shape ``(components, components, n)``."""
+        h = self._response
+        return self._block.smear(self._s[..., None] * h[:, None] * h[None].conj())
+
+    @cached_property
+    def expected(self) -> ComplexArray:
+        """E, shape ``(n, channels, channels)``."""
+        return np.moveaxis(_congruent(self._phi.T, self._modal), -1, 0).copy()
+
+    def misfit(self) -> float:
+        """Σ n (ln det E + tr E⁻¹ W)."""
+        root = np.linalg.cholesky(self.expected)
+        white = np.linalg.solve(self.expected, self._block.matrix)
+        log_det = 2 * np.log(np.diagonal(root, axis1=-2, axis2=-1).real).sum(axis=-1)
+        return float(self._block.count @ (log_det + np.trace(white, axis1=-2, axis2=-1).real))
+
+    def derivatives(self) -> tuple[FloatArray, FloatArray]:
+        """Gradient and Hessian of the misfit.
+
+        With E = C Cᴴ, T_a = C⁻¹ E_a C⁻ᴴ and V = C⁻¹ W C⁻ᴴ the gradient is Σ n tr (1 - V) T_a and
+        the Hessian Σ n (tr T_a T_b (2V - 1) + tr G E_ab), G = C⁻ᴴ (1 - V) C⁻¹.
+        """
+        count, eye = self._block.count, np.eye(self._layout.n_channels)
+        whiten = np.linalg.inv(np.linalg.cholesky(self.expected))
+        adjoint = whiten.conj().swapaxes(1, 2)
+        excess = eye - whiten @ self._block.matrix @ adjoint
+        row, w = self._slopes()
+        # The columns of Φ for the floors are the unit vectors of the channels.
+        basis = _frequency_last(whiten @ self._phi)
+        half = basis[:, row][:, None] * _combined(basis, w.conj().swapaxes(0, 1))[None].conj()
+        slopes = half + half.conj().swapaxes(0, 1)  # (channels, channels, unknowns, n)
+        gradient = _inner(slopes, (_frequency_last(excess) * count)[:, :, None])
+        hessian = _inner(slopes, _combined(_frequency_last(eye - 2 * excess) * count, slopes))
+        g = _frequency_last(adjoint @ (count[:, None, None] * excess) @ whiten)
+        return gradient[:, 0], hessian + self._curvature(w, g)
+
+    def _slopes(self) -> tuple[np.ndarray, ComplexArray]:
+        """Rows of the slopes of E in the basis of Φ's columns and the channels.
+
+        Of each unknown the index of b in the basis and its row w, E_a = b (Φ w)ᵀ and its adjoint,
+        shapes ``(unknowns,)`` and ``(unknowns, components, n)``.
+        """
+        lay, h, s = self._layout, self._h, self._s
+        pole, slope = _columns(lay.pole)
+        driven, _ = _columns(lay.force)
+        by_pole = s[pole, :, None] * h[slope, pole][:, None] * h[0].conj()
+        pairs = self._block.smear(h[0][:, None] * h[0].conj())
+        w = [self._block.smear(by_pole), self._change[..., None] * pairs[driven]]
+        row = [pole, driven]
+        if lay.shape:
+            channel, mode = _columns(lay.shape)
+            row.append(lay.n_modes + channel)
+            w.append(self._modal[mode])
+        return np.concatenate(row), np.concatenate(w)
+
+    @cached_property
+    def _change(self) -> FloatArray:
+        """Change of the row and column of S that belong to each force, ``(forces, components)``."""
+        driven, force = _columns(self._layout.force)
+        return np.asarray(self._scale[driven, None] * self._root.T[force])
+
+    def _curvature(self, w: ComplexArray, g: ComplexArray) -> FloatArray:
+        """Σ tr G E_ab over all pairs of unknowns, the counts in G."""
+        lay = self._layout
+        curvature = np.zeros((lay.size, lay.size))
+        pull = np.tensordot(self._phi.T, g, axes=(1, 0))  # Φᵀ G, (components, channels, n)
+        b = _congruent(self._phi, g)  # (components, components, n)
+        if self._block.kernel is not None:
+            b = self._block.kernel.spread(b)
+        turned = b.swapaxes(0, 1)
+        self._by_poles(curvature, turned)
+        self._by_forces(curvature, turned)
+        if lay.shape:
+            self._by_shapes(curvature, w, g, pull)
+        return curvature
+
+    def _by_poles(self, curvature: FloatArray, turned: ComplexArray) -> None:
+        """By two unknowns of h: Q = Σ_ij S_ij B_ji h_i h_j*."""
+        h, n = self._h, self._layout.n_poles
+        component, slope = _columns(self._layout.pole)
+        weight = self._s[..., None] * turned
+        first = h[slope, component]
+        pairs = weight[component[:, None], component]
+        term = np.einsum("abk,ak,bk->ab", pairs, first, first.conj())
+        pull = np.sum(weight * h[0].conj()[None], axis=1)
+        # Of the second derivatives of h those of one component are not zero.
+        one, other = np.nonzero(component[:, None] == component)
+        second = h[SECOND[slope[one] - 1, slope[other] - 1], component[one]]
+        term[one, other] += np.sum(pull[component[one]] * second, axis=1)
+        curvature[:n, :n] += 2 * term.real
+
+    def _by_forces(self, curvature: FloatArray, turned: ComplexArray) -> None:
+        """By two forces, and by a force and an unknown of h."""
+        lay, h = self._layout, self._h
+        driven, force = _columns(lay.force)
+        overlap = np.einsum("ijk,ik,jk->ij", turned, h[0], h[0].conj()).real
+        overlap *= np.outer(self._scale, self._scale)
+        same = force[:, None] == force
+        curvature[lay.forces, lay.forces] += 2 * same * overlap[driven[:, None], driven]
+        component, slope = _columns(lay.pole)
+        mixed = np.einsum("ajk,ak,jk->aj", turned[component], h[slope, component], h[0].conj()).real
+        # S changes in row and column.
+        term = (driven[:, None] == component) * (self._change @ mixed.T)
+        term += self._change[:, component] * mixed[:, driven].T
+        curvature[lay.forces, : lay.n_poles] += 2 * term
+        curvature[: lay.n_poles, lay.forces] += 2 * term.T
+
+    def _by_shapes(
+        self, curvature: FloatArray, w: ComplexArray, g: ComplexArray, pull: ComplexArray
+    ) -> None:
+        """By two shapes, and by a shape and what D depends on."""
+        lay = self._layout
+        channel, mode = _columns(lay.shape)
+        own = np.tensordot(self._modal, g, axes=(2, 2))  # (i, j, d, c)
+        own = own[mode[:, None], mode, channel, channel[:, None]]
+        curvature[lay.shapes, lay.shapes] += 2 * own.real
+        inner = w[: lay.shapes.start]
+        along = np.einsum("ajk,jck->ac", inner, pull)
+        row = np.array([i for i, *_ in (*lay.pole, *lay.force)], dtype=int)
+        across = inner.conj() @ pull[row].swapaxes(1, 2)  # (a, i, c)
+        term = across[:, mode, channel] + np.where(row[:, None] == mode, along[:, channel], 0)
+        curvature[: lay.shapes.start, lay.shapes] += 2 * term.real
+        curvature[lay.shapes, : lay.shapes.start] += 2 * term.real.T
+
+
+def _columns(pairs: Sequence[tuple[int, int]]) -> np.ndarray[tuple[int, int], np.dtype[np.intp]]:
+    return np.array(pairs, dtype=np.intp).reshape(-1, 2).T
+
+
+def _congruent(basis: FloatArray, matrix: ComplexArray) -> ComplexArray:
+    """Bᵀ M B at each frequency, which is the last axis."""
+    half = np.tensordot(basis.T, matrix, axes=(1, 0))
+    return np.asarray(np.tensordot(half, basis, axes=(1, 0)).swapaxes(1, 2))
+
+
+def _combined(matrix: ComplexArray, vectors: ComplexArray) -> ComplexArray:
+    """Σ_d M_cd v_d at each frequency, the last axis; axes between are carried along."""
+    # One product per pair: their axes are too short for a loop inside.
+    return np.array([sum(m * v for m, v in zip(row, vectors, strict=True)) for row in matrix])
+
+
+def _inner(a: ComplexArray, b: ComplexArray) -> FloatArray:
+    """Σ tr A_i B_j of Hermitian matrices ``(channels, channels, i or j, n)``, shape ``(i, j)``."""
+    pairs = zip(a.reshape(-1, *a.shape[2:]), b.reshape(-1, *b.shape[2:]), strict=True)
+    parts = (np.ascontiguousarray(x).view(float) @ y.view(float).T for x, y in pairs)
+    return np.asarray(sum(parts))
+
+
+def _frequency_last(matrices: ComplexArray | FloatArray) -> ComplexArray:
+    return np.ascontiguousarray(np.moveaxis(matrices, 0, -1), dtype=np.complex128)

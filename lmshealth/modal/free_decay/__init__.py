@@ -1,0 +1,1 @@
+"""Modal identification from free decays after stops."""

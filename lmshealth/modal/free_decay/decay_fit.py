@@ -1,0 +1,557 @@
+"""Fit neighbouring modes to the decays of some channels, and say what they are known to.
+
+Maximum of the likelihood of decays, and its average over what few ordinates tell.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy import linalg, stats
+from scipy.special import softmax
+
+from lmshealth._arrays import BoolArray, ComplexArray, FloatArray
+from lmshealth.modal.free_decay.transient_likelihood import (
+    Block,
+    BlockFit,
+    Evaluation,
+    IntArray,
+    TransientLikelihood,
+    stack,
+    transient,
+    unit_level,
+)
+
+_MOST_STEPS, _STEP_TOLERANCE = 60, 1e-5
+# The Hessian is differenced over this share of a standard deviation.
+_DIFFERENCE = 0.02
+# Levels of the ambient response that are averaged over: where to begin if it is not seen, the
+# least that shows, and how much less likely than the best they may be.
+_FIRST_AVERAGE_LEVEL, _LEAST_LEVEL, _UNLIKELY = 0.5, 0.1, 6.0
+# Largest step of their logarithm, and the step in standard deviations of a level that is known: a
+# sum over a normal density in such steps is exact to 1e-5.
+_COARSE, _SPREADS = 0.6, 1.3
+# Longest steps, of half a Fourier frequency, that a mode may move by when its ambient response is
+# raised.
+_STAYS = 2.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Optimum:
+    """Where the likelihood is largest.
+
+    Attributes
+    ----------
+    p : ndarray
+        Shape ``(n_parameters,)``.
+    at : Evaluation
+        The likelihood there.
+    decrement : float
+        How much larger it might be, by the last step.
+    """
+
+    p: FloatArray
+    at: Evaluation
+    decrement: float
+
+
+def maximise(
+    likelihood: TransientLikelihood,
+    p: FloatArray,
+    free: IntArray,
+    *,
+    tolerance: float = _STEP_TOLERANCE,
+) -> Optimum:
+    """Find the maximum along some parameters by quasi-Newton steps from the Fisher information.
+
+    Parameters
+    ----------
+    likelihood : TransientLikelihood
+        Of which.
+    p : ndarray
+        Start, shape ``(n_parameters,)``.
+    free : ndarray of int
+        Which parameters may move, shape ``(n_free,)``.
+    tolerance : float
+        Gain in log likelihood below which no further step is worth it.
+    """
+    at = likelihood.evaluate(p)
+    metric, fresh, decrement = likelihood.metric(at), True, np.inf
+    for _ in range(_MOST_STEPS):
+        step = _step(metric, at.gradient, likelihood.movable(p, at.gradient, free))
+        decrement = float(-at.gradient @ step) / 2
+        if decrement < tolerance:
+            break
+        reach = likelihood.reach(p)
+        moved = _shorten(likelihood, p, np.clip(step, -reach, reach), at)
+        if moved is None and fresh:
+            break
+        if moved is None:
+            metric, fresh = likelihood.metric(at), True
+            continue
+        metric, fresh = _updated(metric, moved[0] - p, moved[1].gradient - at.gradient), False
+        p, at = moved
+    return Optimum(p, at, decrement)
+
+
+def _step(metric: FloatArray, gradient: FloatArray, free: IntArray) -> FloatArray:
+    """Solve for the step along the free parameters, scaled because they differ by 10⁵."""
+    scale = np.sqrt(np.diag(metric)[free])
+    system = metric[np.ix_(free, free)] / np.outer(scale, scale) + 1e-9 * np.eye(free.size)
+    step = np.zeros(gradient.size)
+    step[free] = -np.linalg.solve(system, gradient[free] / scale) / scale
+    return step
+
+
+def _updated(metric: FloatArray, step: FloatArray, change: FloatArray) -> FloatArray:
+    """Update the metric by what a step did to the gradient, as Broyden and others do."""
+    along = metric @ step
+    expected, seen = float(step @ along), float(step @ change)
+    if seen < 1e-2 * expected:
+        return metric
+    return np.asarray(metric - np.outer(along, along) / expected + np.outer(change, change) / seen)
+
+
+def _shorten(
+    likelihood: TransientLikelihood, p: FloatArray, step: FloatArray, at: Evaluation
+) -> tuple[FloatArray, Evaluation] | None:
+    """Shorten a step until it gains; None where none does."""
+    for share in (1.0, 0.3, 0.1, 0.03, 0.01, 1e-3):
+        tried = likelihood.clip(p + share * step)
+        there = likelihood.evaluate(tried)
+        if there.value < at.value:
+            return tried, there
+    return None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Average:
+    """The posterior with one mode's ambient response averaged over.
+
+    Attributes
+    ----------
+    mean : ndarray
+        Of all parameters, shape ``(n_parameters,)``.
+    cov : ndarray
+        Their covariance, shape ``(n_parameters, n_parameters)``; zero where held.
+    """
+
+    mean: FloatArray
+    cov: FloatArray
+
+
+def average_ambient(
+    likelihood: TransientLikelihood, p: FloatArray, mode: int, free: IntArray
+) -> Average:
+    """Average over the ambient response of a mode, which few ordinates tell.
+
+    A stop shows it at two or three Fourier frequencies beside the resonance, and the most
+    probable level is often far below the true one. Intervals at that level cover two times out of
+    three; averaged over all levels under Jeffreys' prior they cover as they say.
+
+    Parameters
+    ----------
+    likelihood : TransientLikelihood
+        Of which.
+    p : ndarray
+        Its maximum, shape ``(n_parameters,)``.
+    mode : int
+        Which mode's.
+    free : ndarray of int
+        The other parameters that are not held, shape ``(n_free,)``.
+    """
+    place = 2 * likelihood.n_modes + mode
+    start = p.copy()
+    start[place] = max(abs(p[place]), _FIRST_AVERAGE_LEVEL)
+    weight, levels = _average_levels(likelihood, start, place, free, _COARSE)
+    best = levels[int(np.argmax(weight))]
+    if abs(best.p[mode] - p[mode]) > _STAYS * likelihood.reach(p)[mode]:
+        # An ambient response far above a clean decay's noise drives the mode out of its place, and
+        # another pole takes it: the response is raised from the least one on.
+        start[place] = max(abs(p[place]), _LEAST_LEVEL * (1 + _STEP_TOLERANCE))
+        weight, levels = _average_levels(likelihood, start, place, free, _COARSE)
+        best = levels[int(np.argmax(weight))]
+    metric = likelihood.metric(best.at)
+    spread = float(np.sqrt(np.linalg.inv(metric)[place, place])) / best.p[place]
+    if _SPREADS * spread < _COARSE:
+        weight, levels = _average_levels(likelihood, best.p, place, free, _SPREADS * spread)
+    weights, most = softmax(weight), int(np.argmax(weight))
+    inverses = np.array([np.linalg.inv(level.at.fisher[np.ix_(free, free)]) for level in levels])
+    # The Hessian is costly: what it is over the Fisher information is taken from the best level.
+    wide = np.linalg.cholesky(invert(likelihood, levels[most], free))
+    stretch = wide @ np.linalg.inv(np.linalg.cholesky(inverses[most]))
+    where = np.array([level.p for level in levels])
+    mean = weights @ where
+    cov = (where - mean).T @ (weights[:, None] * (where - mean))
+    cov[np.ix_(free, free)] += stretch @ np.tensordot(weights, inverses, 1) @ stretch.T
+    return Average(mean, cov)
+
+
+def _average_levels(
+    likelihood: TransientLikelihood, p: FloatArray, place: int, free: IntArray, step: float
+) -> tuple[FloatArray, list[Optimum]]:
+    """Maximise at levels in both directions from a first one, until they are too unlikely.
+
+    Returns
+    -------
+    weights : ndarray
+        Log posterior of each level, the others integrated, under Jeffreys' prior on a log grid.
+    levels : list of Optimum
+        The levels.
+    """
+    found: list[tuple[float, Optimum]] = []
+    for way in (1, -1):
+        at = p.copy()
+        if way < 0:
+            at[place] *= np.exp(-step)
+        while at[place] > _LEAST_LEVEL:
+            level = maximise(likelihood, at, free)
+            fisher = level.at.fisher
+            log_det = np.linalg.slogdet(fisher[np.ix_(free, free)])[1]
+            prior = 0.5 * np.log(fisher[place, place]) + np.log(at[place])
+            found.append((float(prior - level.at.value - log_det / 2), level))
+            if found[-1][0] < max(weight for weight, _ in found) - _UNLIKELY:
+                break
+            at = level.p.copy()
+            at[place] *= np.exp(way * step)
+    best = max(weight for weight, _ in found)
+    kept = [item for item in found if item[0] > best - _UNLIKELY]
+    return np.array([weight for weight, _ in kept]), [level for _, level in kept]
+
+
+def invert(likelihood: TransientLikelihood, optimum: Optimum, free: IntArray) -> FloatArray:
+    """Invert the Hessian, or the Fisher information where that has no inverse.
+
+    Parameters
+    ----------
+    likelihood : TransientLikelihood
+        Of which.
+    optimum : Optimum
+        Its maximum.
+    free : ndarray of int
+        Along which parameters, shape ``(n_free,)``.
+
+    Returns
+    -------
+    ndarray
+        Covariance of the free parameters, shape ``(n_free, n_free)``.
+    """
+    try:
+        factor = np.linalg.cholesky(_hessian(likelihood, optimum, free))
+    except np.linalg.LinAlgError:
+        factor = np.linalg.cholesky(optimum.at.fisher[np.ix_(free, free)])
+    return np.asarray(linalg.cho_solve((factor, True), np.eye(free.size)))
+
+
+def _hessian(likelihood: TransientLikelihood, optimum: Optimum, free: IntArray) -> FloatArray:
+    """Differentiate the gradient along some parameters, shape ``(n_free, n_free)``."""
+    p = optimum.p
+    scale = 1 / np.sqrt(np.diag(likelihood.metric(optimum.at)))
+    reach = likelihood.reach(p)
+    rows = []
+    for j in free:
+        step = np.zeros(p.size)
+        step[j] = _DIFFERENCE * min(scale[j], reach[j])
+        up, down = likelihood.evaluate(p + step), likelihood.evaluate(p - step)
+        rows.append((up.gradient - down.gradient)[free] / (2 * step[j]))
+    return np.asarray(np.add(rows, np.transpose(rows)) / 2)
+
+
+MOST_POLES = 6
+# Log likelihood beyond the Bayesian information criterion that a further pole must bring.
+_EVIDENCE_MARGIN = 5.0
+# Poles tried per Fourier frequency, and their dampings.
+_TRIALS, _DAMPINGS = 4.0, np.geomspace(2e-4, 0.1, 10)
+_FIRST_LEVEL = 0.3  # of the ambient response
+# A line's damping is within this share of the least that can be told from none.
+_AT_BOUND = 0.01
+# Log likelihood that is not worth a step while poles are counted.
+_ROUGH = 0.02
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Ringing:
+    """Poles that decays in a band show, at their most probable place.
+
+    Attributes
+    ----------
+    likelihood : TransientLikelihood
+        Of the band.
+    optimum : Optimum
+        Its maximum.
+    """
+
+    likelihood: TransientLikelihood
+    optimum: Optimum
+
+    @property
+    def frequency(self) -> FloatArray:
+        """Natural frequencies in Hz, shape ``(n_modes,)``."""
+        return np.exp(self.optimum.p[: self.likelihood.n_modes])
+
+    @property
+    def damping_ratio(self) -> FloatArray:
+        """Damping ratios, shape ``(n_modes,)``."""
+        m = self.likelihood.n_modes
+        return np.exp(self.optimum.p[m : 2 * m])
+
+    def is_line(self) -> BoolArray:
+        """Tell which modes do not fade at all over the record, shape ``(n_modes,)``."""
+        m, p = self.likelihood.n_modes, self.optimum.p
+        return np.asarray(p[m : 2 * m] < self.likelihood.least_damping(p) + _AT_BOUND)
+
+    def sizes(self, mode: int) -> list[ComplexArray]:
+        """Complex size of a mode's transient, per block of ``(n_channels, n_segments)``."""
+        pairs = [
+            fit.sizes[:, 2 * mode - 2 * self.likelihood.n_modes :][:, :2]
+            for fit in self.optimum.at.fits
+        ]
+        return [pair[:, 0] + 1j * pair[:, 1] for pair in pairs]
+
+    def white_level(self) -> FloatArray:
+        """Power spectral density of the white noise in mid-band, shape ``(n_channels,)``."""
+        m, n = self.likelihood.n_modes, self.likelihood.n_channels
+        return np.exp(self.optimum.p[3 * m : 3 * m + n])
+
+    def snr(self, mode: int) -> FloatArray:
+        """Largest mean ordinate of a mode's decays over the noise, shape ``(n_channels,)``.
+
+        As S / (4 ζ² S_e) is of an ambient response.
+        """
+        block, size = self.likelihood.blocks[0], self.sizes(mode)[0]
+        own = slice(mode, mode + 1)
+        top = np.abs(transient(block, self.frequency[own], self.damping_ratio[own])).max()
+        n_samples = block.sample_rate * block.duration
+        mean = np.mean(np.abs(size) ** 2, axis=1) * (top / n_samples) ** 2
+        return np.asarray(mean / self.white_level())
+
+    def excitation(self, mode: int, level: float) -> float:
+        """Mean square of a mode's vibration at the stops over that of its ambient response.
+
+        Parameters
+        ----------
+        mode : int
+            Which.
+        level : float
+            Its ambient response, h of the likelihood.
+        """
+        f, zeta = float(self.frequency[mode]), float(self.damping_ratio[mode])
+        exponent = 2 * np.pi * f * (-zeta + 1j * np.sqrt(1 - zeta**2))
+        shape = self.likelihood.shapes[mode]
+        squares = []
+        for block, size in zip(self.likelihood.blocks, self.sizes(mode), strict=True):
+            start = size * np.sqrt(2 / block.duration) / (1 - np.exp(exponent * block.duration))
+            # Seen along the mode's shape, every channel in units of its noise.
+            along = (shape / self.white_level()) @ start / (shape**2 / self.white_level()).sum()
+            squares.append(np.abs(along) ** 2)
+        # Twice the variance π f S / (4 ζ) of the response to a force of density S.
+        ambient = np.pi * f / (2 * zeta) * level**2 / self.likelihood.units[mode]
+        return float(np.mean(np.concatenate(squares)) / ambient)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Estimate:
+    """Modes of a band with their joint covariance.
+
+    Attributes
+    ----------
+    mean : ndarray
+        ``[ln f, ln ζ]`` of n modes, shape ``(2 n,)``.
+    cov : ndarray
+        Shape ``(2 n, 2 n)``.
+    excitation : ndarray
+        Mean square of each mode's vibration at the stops over that of its ambient response,
+        shape ``(n,)``.
+    """
+
+    mean: FloatArray
+    cov: FloatArray
+    excitation: FloatArray
+
+
+def find_ringing(blocks: tuple[Block, ...], *, displacement: bool = False) -> Ringing:
+    """Add poles as long as the Bayesian information criterion asks for them.
+
+    Parameters
+    ----------
+    blocks : tuple of Block
+        Decays in a band.
+    displacement : bool
+        The channels are displacements.
+
+    Returns
+    -------
+    Ringing
+        Without modes where the band holds noise only.
+    """
+    n = blocks[0].ordinates.shape[2]
+    levels = np.log(_levels(blocks))
+    likelihood = TransientLikelihood(blocks, np.empty((0, n)), np.empty(0), levels, displacement)
+    start = np.concatenate([levels, np.zeros(n)])
+    found = Ringing(likelihood, maximise(likelihood, start, np.arange(2 * n)))
+    sizes = [block.ordinates.shape for block in blocks]
+    # A pole and its ambient response are told by all ordinates, the sizes of a segment by its own.
+    total = sum(2 * s * k * n for s, k, _ in sizes)
+    own = sum(2 * s * n * np.log(2 * k) for s, k, _ in sizes)
+    needed = 1.5 * np.log(total) + own / 2 + _EVIDENCE_MARGIN
+    while found.likelihood.n_modes < MOST_POLES:
+        more = _add_pole(found, *_best_pole(found))
+        gain = found.optimum.at.profile - more.optimum.at.profile
+        if gain < needed:
+            break
+        found = more
+    return found
+
+
+def _levels(blocks: tuple[Block, ...]) -> FloatArray:
+    """Level of the noise between the peaks of each channel."""
+    medians = [np.median(np.abs(block.ordinates) ** 2, axis=(0, 1)) for block in blocks]
+    return np.asarray(np.mean(medians, axis=0) / np.log(2))
+
+
+def _best_pole(found: Ringing) -> tuple[float, float]:
+    """Try poles all over the band on what the fit leaves, and choose the one that gains most."""
+    longest = max(found.likelihood.blocks, key=lambda block: block.duration)
+    step = 1 / (_TRIALS * longest.duration)
+    grid = np.arange(longest.frequency[0] + 2 * step, longest.frequency[-1] - step, step)
+    f, zeta = (values.ravel() for values in np.meshgrid(grid, _DAMPINGS))
+    gain = np.zeros(f.size)
+    for block in found.likelihood.blocks:
+        density = found.likelihood.density(block, found.optimum.p)
+        known = [block.base, transient(block, found.frequency, found.damping_ratio)]
+        tried = transient(block, f, zeta)
+        for c in range(density.shape[1]):
+            scale = 1 / np.sqrt(density[:, c, c, None])
+            q, _ = np.linalg.qr(scale * np.concatenate(known, axis=1))
+            data, columns = (
+                x - q @ (q.conj().T @ x)
+                for x in (scale * block.ordinates[:, :, c].T, scale * tried)
+            )
+            shown = np.sum(np.abs(columns.conj().T @ data) ** 2, axis=1)
+            gain += shown / np.sum(np.abs(columns) ** 2, axis=0)
+    best = int(np.argmax(gain))
+    return float(f[best]), float(zeta[best])
+
+
+def _add_pole(found: Ringing, f: float, zeta: float) -> Ringing:
+    """Fit one pole more: first without its ambient response, then with it in the decay's shape."""
+    before, m = found.likelihood, found.likelihood.n_modes
+    p = found.optimum.p
+    start = np.concatenate(
+        [p[:m], [np.log(f)], p[m : 2 * m], [np.log(zeta)], p[2 * m : 3 * m], [0.0], p[3 * m :]]
+    )
+    size = max(block.duration for block in before.blocks)
+    unit = unit_level(f, zeta, size, displacement=before.displacement)
+    likelihood = replace(
+        before,
+        shapes=np.concatenate([before.shapes, np.ones((1, before.n_channels))]),
+        units=np.append(before.units, unit),
+    )
+    without = np.delete(np.arange(start.size), 3 * m + 2)
+    first = Ringing(
+        likelihood, maximise(likelihood, likelihood.clip(start), without, tolerance=_ROUGH)
+    )
+    shape = _shape(np.concatenate(first.sizes(m), axis=1), first.white_level())
+    shapes = np.concatenate([before.shapes, shape[None]])
+    likelihood = replace(likelihood, shapes=shapes)
+    start = first.optimum.p + 0.0
+    start[3 * m + 2] = _FIRST_LEVEL
+    return Ringing(likelihood, maximise(likelihood, start, np.arange(start.size), tolerance=_ROUGH))
+
+
+def _shape(sizes: ComplexArray, noise: FloatArray) -> FloatArray:
+    """Find the real shape that a mode's decays have in common, in units of the noise."""
+    scale = np.sqrt(noise)
+    seen = np.concatenate([sizes.real, sizes.imag], axis=1) / scale[:, None]
+    return np.asarray(np.linalg.svd(seen, full_matrices=False)[0][:, 0] * scale)
+
+
+def estimate(found: Ringing, modes: Sequence[int] | None = None) -> Estimate:
+    """Average modes of a band over their ambient responses.
+
+    Parameters
+    ----------
+    found : Ringing
+        With at least one mode.
+    modes : sequence of int, optional
+        Which, at least one; by default all.
+    """
+    likelihood, m = found.likelihood, found.likelihood.n_modes
+    modes = range(m) if modes is None else modes
+    p = found.optimum.p.copy()
+    at_bound = m + np.flatnonzero(found.is_line())
+    free = np.setdiff1d(np.arange(p.size), [*range(2 * m, 3 * m), *at_bound])
+    averages = []
+    # The ambient response of one mode hardly tells on another: each is averaged over in turn.
+    for i in modes:
+        averages.append(average_ambient(likelihood, p, i, free))
+        p[2 * m + i] = averages[-1].mean[2 * m + i]
+    own = np.array([*modes, *(m + i for i in modes)])
+    n = len(modes)
+    inverse = np.zeros((p.size, p.size))
+    inverse[np.ix_(free, free)] = invert(likelihood, maximise(likelihood, p, free), free)
+    joint = inverse[np.ix_(own, own)]
+    mean, scales = np.empty(2 * n), np.zeros((2 * n, 2 * n))
+    for k, average in enumerate(averages):
+        pair = np.array([k, n + k])
+        mean[pair] = average.mean[own[pair]]
+        # The joint covariance is stretched until each mode has that of its average.
+        wide = np.linalg.cholesky(average.cov[np.ix_(own[pair], own[pair])])
+        narrow = np.linalg.cholesky(joint[np.ix_(pair, pair)])
+        scales[np.ix_(pair, pair)] = wide @ np.linalg.inv(narrow)
+    excitation = [found.excitation(i, float(p[2 * m + i])) for i in modes]
+    return Estimate(mean, scales @ joint @ scales.T, np.array(excitation))
+
+
+def stationarity(found: Ringing) -> float:
+    """Test whether what the fit leaves is the same all through the record.
+
+    What fades with the decay or grows towards the end of a record ties ordinates to their
+    neighbours. The lag-one products of the whitened residual are compared with what white noise
+    would leave of itself after the same fit.
+
+    Parameters
+    ----------
+    found : Ringing
+        Any fit.
+
+    Returns
+    -------
+    float
+        Probability of at least that much correlation in stationary noise.
+    """
+    total = np.zeros((3, 2))
+    for fit in found.optimum.at.fits:
+        total += _lag_one(fit, found.likelihood.n_channels)
+    return float(stats.chi2.sf(np.sum((total[0] - total[1]) ** 2 / total[2]), 2))
+
+
+def _lag_one(fit: BlockFit, n: int) -> FloatArray:
+    """Lag-one products, real and imaginary: found, expected and variance, shape ``(3, 2)``."""
+    found = np.empty((3, 2))
+    for k, turn in enumerate((1.0, -1j)):
+        moved_residual = _neighbours(fit.residual, n, turn)
+        moved_base = _neighbours(fit.removed, n, turn)
+        n_segments = fit.residual.shape[1]
+        n_rows = fit.residual.shape[0]
+        inner = fit.removed.T @ moved_base
+        # tr(A²) of the symmetric shift: half of the ordinates that have a neighbour, twice.
+        whole = n_rows / 2 - n
+        found[0, k] = np.sum(fit.residual * moved_residual)
+        found[1, k] = -0.5 * n_segments * np.trace(inner)
+        found[2, k] = (
+            0.5 * n_segments * (whole - 2 * np.sum(moved_base**2) + np.sum(inner * inner.T))
+        )
+    return found
+
+
+def _neighbours(rows: FloatArray, n: int, turn: complex) -> FloatArray:
+    """Apply the quadratic form's matrix of Re(turn Σ z_k z*_{k+1}) to stacked ordinates."""
+    halves = rows.reshape(2, -1, n, rows.shape[1])
+    z = halves[0] + 1j * halves[1]
+    moved = np.zeros_like(z)
+    moved[:-1] += turn * z[1:] / 2
+    moved[1:] += np.conj(turn) * z[:-1] / 2
+    return stack(moved).reshape(rows.shape)

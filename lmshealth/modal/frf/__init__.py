@@ -1,0 +1,1 @@
+"""Modal identification from frequency response functions."""

@@ -1,0 +1,294 @@
+"""Rational transfer function with modes: its likelihood at the lines of a band, and the best poles.
+
+The model is H(s) = Σ R/(s - p) + R*/(s - p*) + Σ a_k s^k with real a_k: powers of s stand for the
+modes outside the band, the lower ones for those below. A record that does not repeat answers
+Y = H U + T, with a transient T of the same poles. Errors are circular normal. Residues and powers
+are linear and solved for; only ln f and ln ζ are searched (variable projection), and the Fisher
+information of these is that with everything linear marginalised.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.optimize import least_squares
+
+from lmshealth._arrays import BoolArray, ComplexArray, FloatArray, freeze
+
+# A transient of a band is smooth: powers of s in it.
+_TRANSIENT_POWERS = (-1, 0, 1)
+# Damping ratios at which modes are searched for, and bounds of the fit.
+_TRIED_DAMPING = (0.003, 0.01, 0.03, 0.1)
+_LEAST_DAMPING, _MOST_DAMPING = 1e-5, 0.7
+# What is damped more heavily is a background and no mode.
+HEAVY = 0.2
+_OUTSIDE = 0.5  # of the band's ends: so far beyond them a pole may go
+_BLOCK = 128
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Ordinates:
+    """Spectra of an input and an output at the lines of a band.
+
+    Attributes
+    ----------
+    frequency : ndarray
+        In Hz, ascending, shape ``(n_lines,)``.
+    given, answer : ndarray of complex
+        Amplitudes of input and output, shape ``(n_lines,)``.
+    noise : ndarray
+        Variance of ``answer - H given`` by noise, shape ``(n_lines,)``; where the excitation is
+        not periodic a first guess.
+    freedom : float
+        Complex degrees of freedom of each variance.
+    periodic : bool
+        Whether they are means over whole periods: there is no transient in them then, and the
+        noise is known from the scatter over periods.
+    """
+
+    frequency: FloatArray
+    given: ComplexArray
+    answer: ComplexArray
+    noise: FloatArray
+    freedom: float
+    periodic: bool
+
+    def __post_init__(self) -> None:
+        freeze(self)
+
+    @property
+    def spacing(self) -> float:
+        """Distance of neighbouring lines in Hz."""
+        return float(np.median(np.diff(self.frequency)))
+
+    def only(self, keep: BoolArray) -> Ordinates:
+        """Keep some of the lines."""
+        return replace(
+            self,
+            frequency=self.frequency[keep],
+            given=self.given[keep],
+            answer=self.answer[keep],
+            noise=self.noise[keep],
+        )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Order:
+    """What a model is made of.
+
+    Attributes
+    ----------
+    theta : ndarray
+        ``[ln f, ln ζ]`` of the modes, shape ``(2 n_modes,)``.
+    low, high : int
+        Lowest and highest power of s beside them.
+    """
+
+    theta: FloatArray
+    low: int
+    high: int
+
+    @property
+    def n_modes(self) -> int:
+        """Number of modes."""
+        return self.theta.size // 2
+
+    @property
+    def modes(self) -> tuple[FloatArray, FloatArray]:
+        """Natural frequency in Hz and damping ratio, shape ``(n_modes,)`` each."""
+        f, zeta = np.exp(np.split(self.theta, 2))
+        return f, zeta
+
+    def unknowns(self, periodic: bool) -> int:
+        """Count real unknowns."""
+        each, beside = (4, 0) if periodic else (6, len(_TRANSIENT_POWERS))
+        return each * self.n_modes + self.high - self.low + 1 + beside
+
+    def with_mode(self, f: float, zeta: float) -> Order:
+        """Add a mode at a frequency in Hz."""
+        ln_f, ln_zeta = np.split(self.theta, 2)
+        theta = np.concatenate([ln_f, [np.log(f)], ln_zeta, [np.log(zeta)]])
+        return replace(self, theta=theta)
+
+    def without_mode(self, i: int) -> Order:
+        """Leave a mode out."""
+        return replace(self, theta=np.delete(self.theta, [i, i + self.n_modes]))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Solution:
+    """A model with what is linear in it solved for.
+
+    Attributes
+    ----------
+    basis : ndarray
+        Orthonormal, spans the whitened columns of what is linear, shape ``(2 n_lines, n)``.
+    residues : ndarray of complex
+        Over the centre of the band in rad/s, shape ``(n_modes,)``.
+    swing : ndarray of complex
+        The same of the transient.
+    error : ndarray of complex
+        Answer less fit, shape ``(n_lines,)``.
+    response : ndarray of complex
+        The fitted H, shape ``(n_lines,)``.
+    parts : ndarray
+        Power of the parts of H, each mode and the background of powers of s and heavily damped
+        poles, whether or not they cancel, shape ``(n_lines,)``.
+    """
+
+    basis: FloatArray
+    residues: ComplexArray
+    swing: ComplexArray
+    error: ComplexArray
+    response: ComplexArray
+    parts: FloatArray
+
+
+def stack(values: ComplexArray) -> FloatArray:
+    """Stack real over imaginary parts."""
+    return np.concatenate([values.real, values.imag])
+
+
+def _poles(ordinates: Ordinates, order: Order) -> tuple[ComplexArray, ComplexArray]:
+    """Give jω, shape ``(n_lines,)``, and the poles, ``(n_modes,)``, over the band's centre."""
+    centre = np.sqrt(ordinates.frequency[0] * ordinates.frequency[-1])
+    f, zeta = order.modes
+    return (
+        1j * ordinates.frequency / centre,
+        f / centre * (-zeta + 1j * np.sqrt(1 - zeta**2)),
+    )
+
+
+def _modal(s: ComplexArray, pole: ComplexArray) -> ComplexArray:
+    """Columns that real and imaginary parts of the residues multiply, ``(n_lines, 2 n_modes)``."""
+    upper, lower = 1 / (s[:, None] - pole), 1 / (s[:, None] - pole.conj())
+    return np.hstack([upper + lower, 1j * (upper - lower)])
+
+
+def solve(ordinates: Ordinates, order: Order, variance: FloatArray) -> Solution:
+    """Solve for what is linear at given poles and variances of the lines, shape ``(n_lines,)``."""
+    m = order.n_modes
+    s, pole = _poles(ordinates, order)
+    modal = _modal(s, pole)
+    response = np.hstack([modal, s[:, None] ** np.arange(order.low, order.high + 1)])
+    n = response.shape[1]
+    columns = response * ordinates.given[:, None]
+    if not ordinates.periodic:
+        columns = np.hstack([columns, modal, s[:, None] ** np.array(_TRANSIENT_POWERS)])
+    whiten = np.sqrt(2 / variance)
+    stacked = stack(columns * whiten[:, None])
+    scale = np.linalg.norm(stacked, axis=0)
+    basis, triangle = np.linalg.qr(stacked / scale)
+    seen = basis.T @ stack(ordinates.answer * whiten)
+    weights = np.linalg.lstsq(triangle, seen, rcond=None)[0] / scale
+    fitted = response @ weights[:n]
+    parts = modal[:, :m] * weights[:m] + modal[:, m:] * weights[m : 2 * m]
+    # Poles of a background and powers may cancel each other, as no modes do.
+    parts = parts[:, order.modes[1] <= HEAVY]
+    rest = fitted - parts.sum(axis=1)
+    swing = np.zeros(m, dtype=complex)
+    if not ordinates.periodic:
+        swing = _residues(weights[n:], m)
+    return Solution(
+        basis=basis,
+        residues=_residues(weights, m),
+        swing=swing,
+        error=ordinates.answer - columns @ weights,
+        response=fitted,
+        parts=np.sum(np.abs(parts) ** 2, axis=1) + np.abs(rest) ** 2,
+    )
+
+
+def _residues(weights: FloatArray, n_modes: int) -> ComplexArray:
+    return np.asarray(weights[:n_modes] + 1j * weights[n_modes : 2 * n_modes])
+
+
+def slopes(
+    ordinates: Ordinates, order: Order, variance: FloatArray, solution: Solution
+) -> FloatArray:
+    """Differentiate the whitened error by ``[ln f, ln ζ]``, shape ``(2 n_lines, 2 n_modes)``.
+
+    What is linear is projected out (Kaufman's form of variable projection): the product with its
+    transpose is the Fisher information of ln f and ln ζ with all else marginalised.
+
+    References
+    ----------
+    Golub2003
+    """
+    s, pole = _poles(ordinates, order)
+    _, zeta = order.modes
+    by_zeta = np.abs(pole) * (-zeta - 1j * zeta**2 / np.sqrt(1 - zeta**2))
+    given = ordinates.given[:, None]
+    upper = (given * solution.residues + solution.swing) / (s[:, None] - pole) ** 2
+    lower = (given * solution.residues.conj() + solution.swing.conj()) / (
+        s[:, None] - pole.conj()
+    ) ** 2
+    moved = np.hstack([upper * move + lower * move.conj() for move in (pole, by_zeta)])
+    slope = -stack(moved * np.sqrt(2 / variance)[:, None])
+    return np.asarray(slope - solution.basis @ (solution.basis.T @ slope))
+
+
+def refine(ordinates: Ordinates, order: Order, variance: FloatArray) -> Order:
+    """Find the poles of greatest likelihood near given ones by a trust-region method."""
+    m = order.n_modes
+    if m == 0:
+        return order
+    whiten = np.sqrt(2 / variance)
+    latest: list[tuple[FloatArray, Solution]] = []
+
+    def error(theta: FloatArray) -> FloatArray:
+        solution = solve(ordinates, replace(order, theta=theta), variance)
+        latest[:] = [(theta.copy(), solution)]
+        return stack(solution.error * whiten)
+
+    def derivative(theta: FloatArray) -> FloatArray:
+        if not np.array_equal(latest[0][0], theta):
+            error(theta)
+        return slopes(ordinates, replace(order, theta=theta), variance, latest[0][1])
+
+    low, high = ordinates.frequency[[0, -1]]
+    least = np.repeat(np.log([low * (1 - _OUTSIDE), _LEAST_DAMPING]), m)
+    most = np.repeat(np.log([high * (1 + _OUTSIDE), _MOST_DAMPING]), m)
+    start = np.clip(order.theta, least + 1e-9, most - 1e-9)
+    scale = np.concatenate([np.exp(start[m:]), np.ones(m)])
+    solved = least_squares(
+        error, start, derivative, bounds=(least, most), x_scale=scale, ftol=1e-6, max_nfev=40
+    )
+    return replace(order, theta=solved.x)
+
+
+def best_place(
+    ordinates: Ordinates, variance: FloatArray, solution: Solution
+) -> tuple[float, float, float]:
+    """Find frequency in Hz and damping ratio of the mode that explains most of the error left.
+
+    The third is what it gains in -2 ln L.
+    """
+    low, high = ordinates.frequency[[0, -1]].tolist()
+    whiten = np.sqrt(2 / variance)
+    error = stack(solution.error * whiten)
+    best = (-np.inf, low, _TRIED_DAMPING[-1])
+    for zeta in _TRIED_DAMPING:
+        grid = np.geomspace(low, high, 2 + int(np.log(high / low) / zeta))
+        for first in range(0, grid.size, _BLOCK):
+            f = grid[first : first + _BLOCK]
+            damping = np.clip(ordinates.spacing / f, zeta, _MOST_DAMPING)
+            at = Order(np.log(np.concatenate([f, damping])), 1, 0)
+            columns = _modal(*_poles(ordinates, at)) * (ordinates.given * whiten)[:, None]
+            gain = _explained(stack(columns), error, solution.basis)
+            k = int(np.argmax(gain))
+            best = max(best, (float(gain[k]), float(f[k]), float(damping[k])))
+    return best[1], best[2], best[0]
+
+
+def _explained(columns: FloatArray, error: FloatArray, basis: FloatArray) -> FloatArray:
+    """Gain in -2 ln L by each pair of columns beside those of a basis, shape ``(n_pairs,)``."""
+    first, second = np.split(columns, 2, axis=1)
+    known_first, known_second = np.split(basis.T @ columns, 2, axis=1)
+    a = np.sum(first**2, axis=0) - np.sum(known_first**2, axis=0)
+    b = np.sum(first * second, axis=0) - np.sum(known_first * known_second, axis=0)
+    c = np.sum(second**2, axis=0) - np.sum(known_second**2, axis=0)
+    u, v = error @ first, error @ second
+    gain = (c * u**2 - 2 * b * u * v + a * v**2) / np.maximum(a * c - b**2, 1e-9 * a * c)
+    return np.asarray(gain)

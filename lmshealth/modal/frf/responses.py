@@ -1,0 +1,340 @@
+"""Frequency response of an output to an input: over periods, or over stretches of a record.
+
+Noise of the lines of a response: of the sensor, and of forces that the modes answer.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import combinations_with_replacement
+
+import numpy as np
+from scipy import fft, signal
+from scipy.ndimage import uniform_filter1d
+from scipy.optimize import minimize_scalar
+from scipy.stats import f as fisher
+
+from lmshealth._arrays import BoolArray, ComplexArray, FloatArray, expect_shape, freeze
+from lmshealth.errors import BadLog
+from lmshealth.io.log import Log
+from lmshealth.modal.frf.periods import cut_periods
+from lmshealth.modal.frf.rational import Ordinates
+
+_LEAST_RATIO, _LARGEST_RATIO = 1e-6, 1e6
+
+
+def smooth_noise(power: FloatArray, response: FloatArray, width: int) -> FloatArray:
+    """Average the power of noise over neighbouring lines, without flattening its resonances.
+
+    A disturbance that the machine answers has the modes' resonances, narrower than what is
+    averaged over. The power is divided by the shape a + b |H|² that suits it best by the likelihood
+    of exponential variables, averaged, and multiplied again.
+
+    Parameters
+    ----------
+    power : ndarray
+        Shape ``(n_lines,)``.
+    response : ndarray
+        |H|² up to a factor, shape ``(n_lines,)``.
+    width : int
+        Lines to average over.
+
+    Returns
+    -------
+    ndarray
+        Shape ``(n_lines,)``.
+    """
+    relative = response / response.max()
+    power = np.maximum(power, np.finfo(float).tiny)
+
+    def cost(ln_ratio: float) -> float:
+        shape = 1 + np.exp(ln_ratio) * relative
+        return float(power.size * np.log(np.mean(power / shape)) + np.sum(np.log(shape)))
+
+    bounds = (np.log(_LEAST_RATIO), np.log(_LARGEST_RATIO))
+    found = minimize_scalar(cost, bounds=bounds, method="bounded")
+    shape = 1 + np.exp(found.x) * relative
+    width = min(width, power.size)
+    return np.asarray(shape * uniform_filter1d(power / shape, width, mode="nearest"))
+
+
+# A line is excited from this share of the strongest amplitude of the input on, and from so many
+# times its noise in power: with less, noise of the input where that is weak at a resonance would
+# bias the damping by more than half its standard deviation.
+EXCITED = 0.2
+_CLEAR = 30.0
+# Complex degrees of freedom that a variance needs; of few periods neighbouring lines help out.
+_FREEDOM = 16
+# Probability that the first of equal periods is taken for a transient.
+_TRANSIENT = 1e-3
+# Stretches of a record, half overlapping, that a coherence is averaged over.
+_STRETCHES = 8
+# Lines that a fit needs, more where they must tell the noise too, and can take.
+_FEWEST_LINES, _FEWEST_OF_RECORD, _MOST_LINES = 16, 64, 20_000
+_ROUNDING = 1e-9  # of what is largest
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Frf:
+    """Frequency response function with its coherence.
+
+    With a periodic excitation ``response`` is the mean output over the mean input: noise of
+    neither biases it. Otherwise it is H1, from spectra of half overlapping stretches.
+
+    Noise of the input draws H1 towards zero, by the share of noise in the input's power, most
+    where the input is weak (at resonances of a driven structure); noise of the output raises H2,
+    most at antiresonances; Hv lies between them, and is right where both have the same share of
+    noise as the units weigh it: channels are weighed by their mean power. In a closed loop, where
+    the input answers the output's noise, all three are drawn towards the inverse of what feeds
+    back. Stretches too short for a resonance flatten it in all three.
+
+    Attributes
+    ----------
+    input, output : str
+        Channel names.
+    frequency : ndarray
+        In Hz, shape ``(n_lines,)``; with a periodic excitation only excited harmonics.
+    response : ndarray of complex
+        SI unit of the output per that of the input, shape ``(n_lines,)``.
+    std : ndarray
+        Standard deviation of the response by noise, sqrt(E|ΔH|²), shape ``(n_lines,)``.
+    h1, h2, hv : ndarray of complex
+        Estimates from the spectra of all periods or stretches, shape ``(n_lines,)``.
+    coherence : ndarray
+        Between input and output over periods or stretches, 0 to 1, shape ``(n_lines,)``.
+    period : float
+        Of the excitation in s; NaN where it does not repeat.
+    n_averages : float
+        Periods that were used, or stretches counted as if independent.
+    """
+
+    input: str
+    output: str
+    frequency: FloatArray
+    response: ComplexArray
+    std: FloatArray
+    h1: ComplexArray
+    h2: ComplexArray
+    hv: ComplexArray
+    coherence: FloatArray
+    period: float
+    n_averages: float
+
+    def __post_init__(self) -> None:
+        for name in ("response", "std", "h1", "h2", "hv", "coherence"):
+            expect_shape(name, getattr(self, name), self.frequency.shape)
+        freeze(self)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Pair:
+    """Signals of an input and an output.
+
+    Attributes
+    ----------
+    log : Log
+        Where they come from.
+    names : (str, str)
+        Of input and output.
+    signals : (ndarray, ndarray)
+        Shape ``(n_samples,)`` each.
+    lag : int
+        Samples that a second difference taken of both reaches over; 0 for none.
+    """
+
+    log: Log
+    names: tuple[str, str]
+    signals: tuple[FloatArray, FloatArray]
+    lag: int
+
+    def gain(self, frequency: FloatArray) -> FloatArray:
+        """Gain of the difference at frequencies in Hz."""
+        if self.lag == 0:
+            return np.ones(frequency.size)
+        return np.asarray(4 * np.sin(np.pi * frequency * self.lag / self.log.sample_rate) ** 2)
+
+
+def from_periods(pair: Pair, band: tuple[float, float], period: float) -> tuple[Frf, Ordinates]:
+    """Average whole periods; the noise is their scatter.
+
+    Parameters
+    ----------
+    pair : Pair
+        Of an input that repeats itself.
+    band : (float, float)
+        In Hz.
+    period : float
+        In samples.
+
+    Raises
+    ------
+    BadLog
+        If the record holds less than two periods, too few lines of the band are excited, or the
+        input is not the same in every period.
+    """
+    rate = pair.log.sample_rate
+    spectra, period = cut_periods(pair.signals, period)
+    if spectra.shape[1] < 2:
+        raise BadLog(
+            pair.log.name,
+            "period",
+            f"{pair.signals[0].size / rate:.4g} s hold less than two whole periods of "
+            f"{period / rate:.4g} s; record longer",
+        )
+    frequency: FloatArray = np.arange(spectra.shape[2], dtype=np.float64) * (rate / period)
+    inside = (frequency >= band[0]) & (frequency <= band[1]) & (frequency > 0)
+    strongest = np.abs(spectra[0]).max()
+    frequency = frequency[inside]
+    spectra = spectra[:, :, inside] / pair.gain(frequency)
+    if _is_transient(spectra[1]):
+        spectra = spectra[:, 1:]
+    n = spectra.shape[1]
+    excited = _excited(pair, spectra[0], strongest, period / rate, band)
+    frequency, spectra = frequency[excited], spectra[:, :, excited]
+    given, answer = spectra.mean(axis=1)
+    response = answer / given
+    # The scatter of Y - H U has the noise of both and what they have in common.
+    noise = np.var(spectra[1] - response * spectra[0], axis=0, ddof=1) / n
+    width = max(1, 2 * int(np.ceil((_FREEDOM / (n - 1) - 1) / 2)) + 1)
+    freedom = float(width * (n - 1))
+    # One over a variance of ν degrees of freedom is too large by ν/(ν - 1) on average.
+    noise = smooth_noise(noise, np.abs(response) ** 2, width) * (freedom / (freedom - 1))
+    # Simulated records may lack all noise; rounding is what is left.
+    noise = np.maximum(noise, (_ROUNDING * np.abs(answer).max()) ** 2)
+    power = np.mean(np.abs(spectra) ** 2, axis=1)
+    h1, h2, hv, coherence = _estimates(
+        power[0], power[1], np.mean(spectra[1] * spectra[0].conj(), axis=0)
+    )
+    frf = Frf(
+        *pair.names,
+        frequency=frequency,
+        response=response,
+        std=np.sqrt(noise) / np.abs(given),
+        h1=h1,
+        h2=h2,
+        hv=hv,
+        coherence=coherence,
+        period=period / rate,
+        n_averages=n,
+    )
+    return frf, Ordinates(frequency, given, answer, noise, freedom, periodic=True)
+
+
+def _excited(
+    pair: Pair, given: ComplexArray, strongest: float, period: float, band: tuple[float, float]
+) -> BoolArray:
+    """Tell which lines stand out of the others and of the noise, from ``(n_periods, n_lines)``."""
+    power = np.abs(given.mean(axis=0)) ** 2
+    noise = np.var(given, axis=0, ddof=1) / given.shape[0]
+    strong = power >= EXCITED**2 * power.max(initial=0.0)
+    strong &= np.abs(given).max(axis=0) > _ROUNDING * strongest
+    _check_lines(pair, int(strong.sum()), band, _FEWEST_LINES)
+    excited = np.asarray(strong & (power > _CLEAR * noise))
+    if excited.sum() < _FEWEST_LINES:
+        raise BadLog(
+            pair.log.name,
+            "period",
+            f"{pair.names[0]} does not repeat itself after {period:.4g} s: of its {strong.sum()} "
+            f"lines {excited.sum()} stand out of what differs between periods; state another "
+            "period or none, or excite more",
+        )
+    return excited
+
+
+def _is_transient(answer: ComplexArray) -> bool:
+    """Tell whether the first of several periods is unlike the others, ``(n_periods, n_lines)``."""
+    n, n_lines = answer.shape
+    if n < 4 or n_lines == 0:
+        return False
+    rest = answer[1:]
+    scatter = np.var(rest, axis=0, ddof=1)
+    apart = np.abs(answer[0] - rest.mean(axis=0)) ** 2 / (1 + 1 / (n - 1))
+    # Weighed alike: at a resonance that a disturbance shakes few lines would be all that counts.
+    level = uniform_filter1d(scatter, min(_FREEDOM, n_lines), mode="nearest")
+    level = np.maximum(level, np.finfo(float).tiny)
+    ratio = np.sum(apart / level) / max(np.sum(scatter / level), np.finfo(float).tiny)
+    return bool(fisher.sf(ratio, 2 * n_lines, 2 * n_lines * (n - 2)) < _TRANSIENT)
+
+
+def from_record(pair: Pair, band: tuple[float, float]) -> tuple[Frf, Ordinates]:
+    """Average half overlapping stretches for the response; for its modes transform all at once.
+
+    Parameters
+    ----------
+    pair : Pair
+        Of any input.
+    band : (float, float)
+        In Hz.
+
+    Raises
+    ------
+    BadLog
+        If the band holds too few lines, or too many.
+    """
+    size, rate = pair.signals[0].size, pair.log.sample_rate
+    step = rate / size
+    first, last = max(1, int(np.ceil(band[0] / step))), int(band[1] / step)
+    _check_lines(pair, last - first + 1, band, _FEWEST_OF_RECORD)
+    lines: FloatArray = np.arange(first, last + 1, dtype=np.float64) * step
+    given, answer = (
+        np.asarray(fft.rfft(x - x.mean())[first : last + 1], dtype=np.complex128)
+        / (size / 2 * pair.gain(lines))
+        for x in pair.signals
+    )
+    length = size // _STRETCHES
+    # Of two half overlapping Hann windows the spectra correlate by 1/6.
+    n = (2 * size / length - 1) / (1 + 2 / 6**2)
+    (frequency, auto_in), (_, cross), (_, auto_out) = (
+        signal.csd(x, y, rate, nperseg=length)
+        for x, y in combinations_with_replacement(pair.signals, 2)
+    )
+    inside = (frequency >= band[0]) & (frequency <= band[1]) & (frequency > 0)
+    frequency = frequency[inside]
+    weight = pair.gain(frequency) ** -2
+    power_in, power_out = auto_in.real[inside] * weight, auto_out.real[inside] * weight
+    h1, h2, hv, coherence = _estimates(power_in, power_out, cross[inside] * weight)
+    unexplained = np.maximum(1 - coherence, _ROUNDING) * power_out * n / (n - 1)
+    frf = Frf(
+        *pair.names,
+        frequency=frequency,
+        response=h1,
+        std=np.sqrt(unexplained / (n * power_in)),
+        h1=h1,
+        h2=h2,
+        hv=hv,
+        coherence=coherence,
+        period=float("nan"),
+        n_averages=n,
+    )
+    noise = np.interp(lines, frequency, unexplained) * (2 * step)
+    return frf, Ordinates(lines, given, answer, noise, n - 1, periodic=False)
+
+
+def _estimates(
+    power_in: FloatArray, power_out: FloatArray, cross: ComplexArray
+) -> tuple[ComplexArray, ComplexArray, ComplexArray, FloatArray]:
+    """Give H1, H2, Hv and the coherence from powers and E[Y U*]."""
+    h1 = cross / power_in
+    h2 = power_out / cross.conj()
+    weight = power_out.mean() / power_in.mean()
+    apart = power_out / weight - power_in
+    hv = (apart + np.sqrt(apart**2 + 4 * np.abs(cross) ** 2 / weight)) / (2 * cross.conj()) * weight
+    coherence = np.abs(cross) ** 2 / (power_in * power_out)
+    return h1, h2, hv, np.minimum(coherence, 1.0)
+
+
+def _check_lines(pair: Pair, n: int, band: tuple[float, float], fewest: int) -> None:
+    where = f"between {band[0]:.4g} and {band[1]:.4g} Hz"
+    if n < fewest:
+        raise BadLog(
+            pair.log.name,
+            "not-excited" if n <= 0 else "band-too-narrow",
+            f"{pair.names[0]} excites {max(n, 0)} lines {where}; needed are at least {fewest}: "
+            "choose a wider band, or record longer (a longer period has more lines)",
+        )
+    if n > _MOST_LINES:
+        raise BadLog(
+            pair.log.name,
+            "band-too-wide",
+            f"{n} lines {where}, at most {_MOST_LINES} are fitted together; choose a band",
+        )

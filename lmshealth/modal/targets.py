@@ -1,0 +1,99 @@
+"""What is asked of a log: which channels and modes, how far up, and how surely."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from lmshealth.errors import BadLog, BadStage
+from lmshealth.io.log import Channel, Log
+from lmshealth.stage.description import Stage
+
+USABLE = 0.45  # of the sample rate: anti-alias filters reach below Nyquist
+# Standard deviations of ln f and ln ζ beyond which an estimate is not reported.
+WORST_STD_LN_F, WORST_STD_LN_ZETA = 0.03, 0.7
+
+
+@dataclass(frozen=True, slots=True)
+class Target:
+    """A mode to look for.
+
+    Attributes
+    ----------
+    name : str
+        Of the mode.
+    frequency : float
+        Where to look, in Hz.
+    damping_ratio : float
+        Start value.
+    search : float
+        Half width of the search, as a fraction of the frequency.
+    nominal : float or None
+        Where it was sought before it was placed, in Hz.
+    """
+
+    name: str
+    frequency: float
+    damping_ratio: float
+    search: float
+    nominal: float | None = None
+
+    def band(self, widths: float) -> tuple[float, float]:
+        """Frequencies within so many damping ratios of the target."""
+        half = widths * self.damping_ratio
+        return self.frequency * (1 - min(half, 0.5)), self.frequency * (1 + half)
+
+
+def choose_channels(log: Log, names: Sequence[str] | None = None) -> tuple[Channel, ...]:
+    """Choose the channels that show modes: displacements and accelerations, by name.
+
+    Parameters
+    ----------
+    log : Log
+        With its channels in any order: it decides nothing, not even a rounding.
+    names : sequence of str, optional
+        Use only these.
+
+    Raises
+    ------
+    BadLog
+        If one of the names is no such channel, or none is left.
+    """
+    usable = tuple(c for c in log.channels if c.kind in ("displacement", "acceleration"))
+    if names is not None:
+        there = sorted(channel.name for channel in usable)
+        unknown = sorted(set(names) - set(there))
+        if unknown:
+            raise BadLog(log.name, "channel", f"no usable channel {unknown}; there are {there}")
+        usable = tuple(channel for channel in usable if channel.name in names)
+    if not usable:
+        raise BadLog(log.name, "no-signal", "no delta_e or acc channel is left to analyse")
+    return tuple(sorted(usable, key=lambda channel: channel.name))
+
+
+def choose_targets(stage: Stage, band: tuple[float, float] | None = None) -> tuple[Target, ...]:
+    """Choose the modes of a description to look for, ascending in frequency.
+
+    Parameters
+    ----------
+    stage : Stage
+        The description.
+    band : (float, float), optional
+        Use only modes between these frequencies in Hz.
+
+    Raises
+    ------
+    BadStage
+        If no mode is left.
+    """
+    low, high = band or (0.0, np.inf)
+    targets = tuple(
+        Target(mode.name, mode.frequency_hz, mode.damping_ratio, mode.search)
+        for mode in sorted(stage.modes, key=lambda mode: mode.frequency_hz)
+        if low <= mode.frequency_hz <= high
+    )
+    if not targets:
+        raise BadStage(f"{stage.name}: no [[mode]] lies between {low:g} and {high:g} Hz")
+    return targets

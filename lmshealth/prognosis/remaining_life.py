@@ -1,0 +1,242 @@
+"""Remaining useful life: when health reaches its limits."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from lmshealth._arrays import FloatArray
+from lmshealth.errors import BadStage, NotEnoughData
+from lmshealth.health.ensemble_sampling import stream
+from lmshealth.prognosis.first_passage import first_passage
+from lmshealth.prognosis.life_posterior import LifePosterior, fit_life
+from lmshealth.prognosis.results import LawWeight, Prognosis
+from lmshealth.stage.description import ParameterSpec, Stage
+from lmshealth.stage.identifiability import identifiable, sight_of
+from lmshealth.tracking.results import History
+
+_STEP = 1 << 21
+_N_CURVE, _N_COARSE, _EVERY = 101, 40, 5
+_SECONDS_PER_DAY = 86_400.0
+_KM = 1000.0
+_LEVELS = (0.05, 0.25, 0.5, 0.75, 0.95)
+
+
+def prognose(
+    history: History, stage: Stage, seed: int | Sequence[int], *, chains: bool = True
+) -> Prognosis:
+    """Infer the degradation laws of a stage and the travel left to each limit.
+
+    Parameters
+    ----------
+    history : History
+        Modal estimates of all logs.
+    stage : Stage
+        Laws, limits, modal map and usage.
+    seed : int or sequence of int
+        Of all randomness.
+    chains : bool
+        As in `fit_life`.
+
+    Returns
+    -------
+    Prognosis
+        10,000 draws. Runs that never reach a limit are kept, as infinite. Parameters that the
+        modes cannot tell are left out, and named.
+
+    Raises
+    ------
+    BadStage
+        If no health parameter has a limit.
+    NotEnoughData
+        If the history is too short, or the modes tell no parameter that has a limit.
+    NotConverged
+        If the sampler did not converge.
+
+    Examples
+    --------
+    A simulated machine, whose preload reaches its limit 824 km after the last log:
+
+    >>> import numpy as np
+    >>> import lmshealth
+    >>> from lmshealth import examples
+    >>> stage = lmshealth.load_stage("lms-y")
+    >>> prognosis = lmshealth.prognose(examples.history(), stage, seed=0, chains=False)
+    >>> prognosis.parameters
+    ('guide_preload', 'mount_stiffness', 'any')
+    >>> low, median, high = np.quantile(prognosis.remaining[:, -1], (0.05, 0.5, 0.95)) / 1000
+    >>> bool(low < 824 < high)
+    True
+    """
+    return prognose_with_posterior(history, stage, seed, chains=chains)[0]
+
+
+def prognose_with_posterior(
+    history: History, stage: Stage, seed: int | Sequence[int], *, chains: bool = True
+) -> tuple[Prognosis, LifePosterior]:
+    """Prognose, and give the posterior that it rests on; see `prognose`."""
+    if not limited(stage):
+        raise BadStage(f"{stage.name}: no [[parameter]] has a limit, so there is no end of life")
+    # Health has its streams by epoch, the life its own; these are of what comes after.
+    seeds = stream(seed, _STEP).spawn(3)
+    life = fit_life(history, stage, seed, chains=chains)
+    told = told_limits(stage, life.modes)
+    if not told:
+        raise NotEnoughData(
+            f"{history.stage}: {', '.join(life.modes)} cannot tell any parameter that has a limit, "
+            "however many logs there are; `lmshealth stage` says what each mode tells"
+        )
+    horizon = stage.description.usage.horizon_km * _KM
+    since = float(history.travel[-1] - history.travel[history.baseline])
+    remaining = remaining_travel(
+        life, told, np.random.default_rng(seeds[0]), now=since, horizon=horizon
+    )
+    usage = _usage(history, stage, np.random.default_rng(seeds[1]), remaining[:, -1], horizon)
+    travel = _curve_grid(remaining, since, horizon)
+    columns = [j for j, _ in told]
+    unit = np.array([parameter.baseline for _, parameter in told])
+    curve = _curve(life, travel, np.random.default_rng(seeds[2]))[..., columns] * unit
+    found = Prognosis(
+        stage=history.stage,
+        recorded_at=history.recorded_at[-1],
+        travel=float(history.travel[-1]),
+        parameters=(*(p.name for _, p in told), "any"),
+        untold=tuple(p.name for j, p in limited(stage) if j not in columns),
+        limits=np.array([p.limit.below for _, p in told if p.limit] + [np.nan]),
+        remaining=remaining,
+        usage=usage,
+        horizon=horizon,
+        health=life.health.reshape(-1, len(life.parameters))[:, columns] * unit,
+        curve_travel=travel + history.travel[history.baseline],
+        curve_quantiles=np.quantile(curve, _LEVELS, axis=0),
+        laws=tuple(
+            LawWeight(p.name, kind, begin, probability)
+            for _, p in told
+            for (kind, begin), probability in life.laws(p.name).items()
+        ),
+        chi_square=life.chi_square,
+        degrees_of_freedom=life.degrees_of_freedom,
+        walk=life.walk,
+        noise_scale=life.noise_scale,
+        deviation=life.deviation,
+        ess=life.ess,
+        r_hat=life.worst_r_hat,
+    )
+    return found, life
+
+
+def remaining_travel(
+    life: LifePosterior,
+    told: Sequence[tuple[int, ParameterSpec]],
+    rng: np.random.Generator,
+    *,
+    now: float,
+    horizon: float,
+) -> FloatArray:
+    """Draw the travel left to each limit, and to the first of them.
+
+    Parameters
+    ----------
+    life : LifePosterior
+        Draws of the laws and of how far health is off them.
+    told : sequence of (int, ParameterSpec)
+        Parameters with a limit, and where they stand among all.
+    rng : Generator
+        Of all randomness.
+    now, horizon : float
+        Travel in m since the baseline, and from now, past which nothing is claimed.
+
+    Returns
+    -------
+    ndarray
+        In m, shape ``(n_draws, n_limits + 1)``, in the order of the draws of `life`.
+    """
+    parts = []
+    for way, off, rate in life.each():
+        theta = way.course.split(way.course.natural(way.own))
+        columns = [
+            first_passage(
+                way.course.branches[j],
+                theta[j],
+                off[:, j],
+                rate[:, j],
+                rng,
+                now=now,
+                limit=parameter.limit.below / parameter.baseline,
+                horizon=horizon,
+            )
+            for j, parameter in told
+            if parameter.limit is not None
+        ]
+        found = np.column_stack([*columns, np.min(columns, axis=0)])
+        parts.append(found.reshape(life.rate.shape[0], way.share, -1))
+    joined = np.concatenate(parts, axis=1)
+    return joined.reshape(-1, joined.shape[-1])
+
+
+def _curve(life: LifePosterior, travel: FloatArray, rng: np.random.Generator) -> FloatArray:
+    """Draw health at travels since the baseline, ``(n, n_travel, n_parameters)``."""
+    curves = []
+    for way, _, _ in life.each():
+        y = way.own[::_EVERY]
+        off, _ = way.density.deviations(y, travel, rng)
+        curves.append(way.course.health(way.course.natural(y), travel) * np.exp(off))
+    return np.concatenate(curves)
+
+
+def _curve_grid(remaining: FloatArray, since: float, horizon: float) -> FloatArray:
+    """Travel since the baseline, far enough ahead to show when each limit may be reached.
+
+    Fine to where the first of them mostly is, coarse from there to where the last one is.
+    """
+    late = np.quantile(np.minimum(remaining, horizon), 0.75, axis=0)
+    near, far = (min(max(1.3 * ahead, 0.5 * since), horizon) for ahead in (late[-1], late.max()))
+    fine = np.linspace(0.0, since + near, _N_CURVE)
+    return np.append(fine, np.linspace(since + near, since + far, _N_COARSE + 1)[1:])
+
+
+def _usage(
+    history: History,
+    stage: Stage,
+    rng: np.random.Generator,
+    remaining: FloatArray,
+    horizon: float,
+) -> FloatArray:
+    """Draw the mean travel per day in m over the remaining life.
+
+    Learned from the odometer: increments between logs are taken as independent, their variance in
+    proportion to the time between. The rate over the time to come is then off the mean one by
+    Student's t: by what is not known of the mean, and by its own scatter, the less the longer that
+    time is.
+    """
+    stated = stage.description.usage.km_per_day
+    if stated is not None:
+        return np.full(remaining.size, stated * _KM)
+    seconds = np.array([moment.timestamp() for moment in history.recorded_at])
+    days, steps = np.diff(seconds) / _SECONDS_PER_DAY, np.diff(history.travel)
+    days, steps = days[days > 0], steps[days > 0]
+    if days.size < 2 or steps.sum() <= 0:
+        raise NotEnoughData(
+            f"{history.stage}: the odometer does not tell the usage; state [usage] km_per_day"
+        )
+    total, rate = days.sum(), steps.sum() / days.sum()
+    per_day = np.sum((steps - rate * days) ** 2 / days) / (days.size - 1)
+    ahead = np.clip(remaining, 0.01 * horizon, horizon) / rate
+    # Both the mean and what scatters about it have the variance that few increments tell.
+    scatter = rng.standard_t(days.size - 1, remaining.size) * np.sqrt(1 / total + 1 / ahead)
+    # A machine that moves at all moves forward: relative errors are those of the logarithm. Few
+    # logs have tails without end, of which a factor of e^5 is enough.
+    return np.asarray(rate * np.exp(np.clip(np.sqrt(per_day) / rate * scatter, -5.0, 5.0)))
+
+
+def limited(stage: Stage) -> list[tuple[int, ParameterSpec]]:
+    """Parameters that have a limit, with their position."""
+    return [(j, p) for j, p in enumerate(stage.parameters) if p.limit is not None]
+
+
+def told_limits(stage: Stage, modes: Sequence[str]) -> list[tuple[int, ParameterSpec]]:
+    """Parameters that have a limit and that endless logs with some modes would tell."""
+    sight = sight_of(stage).through(modes)
+    seen = identifiable([sight], [range(len(stage.parameters))], stage.prior.variance)
+    return [(j, p) for j, p in limited(stage) if seen[j]]

@@ -1,0 +1,803 @@
+"""Pictures of results: every function takes the matplotlib Axes to draw on, then results.
+
+They return the Axes. Names of modes and parameters are those of the results; travel is shown in
+km, health in % of baseline. Colours come from the palette of Okabe and Ito, and nothing is told
+by colour alone. `svg` turns one of them into an inline picture, in which `hints` show values where
+the pointer rests.
+
+Pictures as light SVG: what no eye sees is left out, and letters are drawn once for a page.
+
+Pictures of tracks: frequencies, dampings, what happened, and whether the filter is believed.
+"""
+
+from __future__ import annotations
+
+import re
+import warnings
+from collections.abc import Callable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import numpy as np
+
+from lmshealth._arrays import FloatArray
+from lmshealth.health.results import Health
+from lmshealth.prognosis.maintenance_decision import Service
+from lmshealth.prognosis.results import Prognosis
+from lmshealth.report.text import GAP, km, moment, spell, whole_km
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+from itertools import cycle
+
+from lmshealth.report.text import covariate, signed
+from lmshealth.signal.spectral_lines import Line
+from lmshealth.signal.waterfall import Waterfall
+from lmshealth.tracking.covariate_effects import Influence
+from lmshealth.tracking.results import History, Track
+
+Key = TypeVar("Key")
+
+_GLYPH = re.compile(
+    r'<path id="([\w-]*?)-?(?:DejaVu)(\w+-\w+)" ((?:d="[^"]*" )?transform="[^"]*"/>)\n?'
+)
+
+
+def lean(text: str) -> str:
+    """Leave out what no eye sees: a third of what matplotlib writes.
+
+    Parameters
+    ----------
+    text : str
+        An SVG as matplotlib writes it, with letters as paths.
+    """
+    text = re.sub(r"(?s)<!--.*?-->|<metadata>.*?</metadata>", "", text)
+    text = re.sub(r"\n\s*", "\n", text).strip().replace("xlink:href", "href")
+    # Two decimals of a point are finer than any screen or printer.
+    text = re.sub(
+        r'\s[dxy]="[^"]*"|translate\([^)]*\)', lambda m: re.sub(r"(\.\d\d)\d+", r"\1", m[0]), text
+    )
+    text = re.sub(r'(?<=\sd=")[^"]*', lambda m: re.sub(r"\s*([A-Za-z])\s*", r"\1", m[0]), text)
+    text = re.sub(r'style="[^"]*"', lambda m: re.sub(r"([:;,]) ", r"\1", m[0]), text)
+    # A letter is put in its place by an attribute.
+    text = re.sub(r'" transform="translate\(([\d.-]+) ([\d.-]+)\)"/>', r'" x="\1" y="\2"/>', text)
+    text = text.replace(' y="0"/>', "/>")
+    # Markers in a row say how they look once.
+    text = re.sub(r'(?:<use [^>]*? (style="[^"]*")/>\n)(?:<use [^>]*? \1/>\n)+', _once, text)
+    used = set(re.findall(r'(?:href="|url\()#([^")]+)', text))
+    text = re.sub(r'\sid="([^"]*)"', lambda m: m[0] if m[1] in used else "", text)
+    return re.sub(r"<g>\n(<(?:use|path) [^>]*/>)\n</g>", r"\1", text)
+
+
+def _once(found: re.Match[str]) -> str:
+    return f"<g {found[1]}>\n{found[0].replace(f' {found[1]}', '')}</g>\n"
+
+
+def share_letters(pictures: Mapping[Key, str]) -> tuple[str, dict[Key, str]]:
+    """Take the letters out of the pictures of a page.
+
+    Parameters
+    ----------
+    pictures : mapping of str
+        Lean SVG elements.
+
+    Returns
+    -------
+    letters : str
+        An SVG element for the same page that defines each letter once; empty without any.
+    pictures : dict of str
+        What refers to it.
+    """
+    letters: dict[str, str] = {}
+    shared = {}
+    for key, text in pictures.items():
+        for _, name, outline in _GLYPH.findall(text):
+            letters[name] = f'<path id="{name}" {outline}'
+        text = _GLYPH.sub("", text).replace("<defs>\n</defs>\n", "")
+        shared[key] = re.sub(r'href="#[\w-]*?-?DejaVu(\w+-\w+)"', r'href="#\1"', text)
+    if not letters:
+        return "", shared
+    outlines = "\n".join(letters[name] for name in sorted(letters))
+    return f'<svg class="letters" aria-hidden="true"><defs>\n{outlines}\n</defs></svg>', shared
+
+
+def give_letters(page: str) -> str:
+    """Put the letters of a page back into each of its pictures, for who reads them one by one."""
+    found = re.search(r'(?s)<svg class="letters"[^>]*>(<defs>.*?</defs>)</svg>', page)
+    if found is None:
+        return page
+    return re.sub(r"<figure[^>]*>.*?<svg[^>]*>", lambda m: m[0] + found[1], page, flags=re.S)
+
+
+INK, MUTED, GRID, PAPER = "#1f2933", "#5f6b7a", "#d9dee5", "#fefefe"
+BLUE, RED, GREEN = "#0072b2", "#c44e00", "#007a5a"
+_NAMED = dict(
+    zip(
+        (INK, MUTED, GRID, PAPER, BLUE, RED, GREEN),
+        ("ink", "muted", "line", "card", "blue", "red", "green"),
+        strict=True,
+    )
+)
+_STYLE: dict[str, Any] = {
+    "font.family": "DejaVu Sans",  # comes with matplotlib: the same outlines everywhere
+    "font.size": 9,
+    "text.usetex": False,
+    "axes.edgecolor": MUTED,
+    "axes.facecolor": "none",
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "axes.spines.right": False,
+    "axes.spines.top": False,
+    "grid.color": GRID,
+    "grid.linewidth": 0.6,
+    "hatch.linewidth": 0.6,
+    "legend.fontsize": 8,
+    "legend.frameon": False,
+    "svg.fonttype": "path",
+    **dict.fromkeys(("xtick.color", "ytick.color"), MUTED),
+    **dict.fromkeys(("axes.labelcolor", "legend.labelcolor", "text.color"), INK),
+    **dict.fromkeys(("xtick.labelcolor", "ytick.labelcolor"), INK),
+}
+_KM = 1000.0
+# Of what is drawn as an image; more than screens show, so that a page can be zoomed and printed.
+_DPI = 200
+# A picture carries no more hints than that: what is denser no pointer can tell apart.
+_MOST_HINTS = 300
+_LEVELS = np.array([0.05, 0.25, 0.5, 0.75, 0.95])
+_GRID_POINTS = 72
+SIZE = (4.8, 2.8)  # of a picture in inches
+ROOM = 72  # characters that fit on a line of its legend
+
+
+def svg(draw: Callable[[Axes], object], *, salt: str, size: tuple[float, float] = SIZE) -> str:
+    """Draw one picture as an SVG element for the inside of a page.
+
+    The same input gives the same bytes. Colours follow the style sheet of the page (``--ink``,
+    ``--blue``, ...) where it has one; prolog, comments and metadata are left out, and screen
+    readers skip the picture, because the page carries its text.
+
+    Parameters
+    ----------
+    draw : callable
+        Takes the Axes and draws on it.
+    salt : str
+        Prefix of all identifiers, of letters, digits and dashes; one for each picture of a page.
+    size : (float, float)
+        Width and height in inches.
+    """
+    import io
+
+    import matplotlib
+    from matplotlib.backends.backend_svg import FigureCanvasSVG
+    from matplotlib.figure import Figure
+
+    target = io.StringIO()
+    nothing = dict.fromkeys(("Date", "Creator", "Format", "Type"))
+    style: Any = _STYLE | {"svg.hashsalt": salt}
+    with matplotlib.rc_context(style), warnings.catch_warnings():
+        # A name in a script the font lacks is drawn as boxes; the page itself spells it out.
+        warnings.filterwarnings("ignore", message="Glyph .* missing")
+        figure = Figure(figsize=size, dpi=_DPI, layout="constrained", facecolor="none")
+        draw(figure.add_subplot())
+        # By itself, because `savefig` goes through everything once more before.
+        canvas: Any = FigureCanvasSVG(figure)
+        canvas.print_svg(target, metadata=nothing)
+    text = _LINK.sub(r'<g class="hint" fill-opacity="0.004"><title>\1</title>', target.getvalue())
+    text = text.replace("</a>", "</g>").replace(_CLEAR, "")
+    text = lean(text[text.index("<svg") :])
+    # Glyphs and groups carry the same identifiers in every file: give each picture its own.
+    text = re.sub(r'(\sid="|href="#|url\(#)', rf"\g<1>{salt}-", text)
+    for colour, name in _NAMED.items():
+        text = text.replace(colour, f"var(--{name}, {colour})")
+    return text.replace("<svg ", '<svg aria-hidden="true" focusable="false" ', 1)
+
+
+# Hints travel as the addresses of links, the only text that matplotlib gives each of many artists.
+_CLEAR = f' style="fill: {INK}; fill-opacity: 0.003922"'
+_LINK = re.compile(r'<a xlink:href="([^"]*)"[^>]*>')
+
+
+def hints(ax: Axes, x: FloatArray, y: FloatArray, texts: Sequence[str]) -> None:
+    """Lay invisible discs over points, which `svg` turns into titles shown by browsers.
+
+    Parameters
+    ----------
+    ax : Axes
+        In its data coordinates.
+    x, y : ndarray
+        Shape ``(n,)``.
+    texts : sequence of str
+        What is shown at each point; line breaks are kept.
+    """
+    some = few(len(texts))
+    # Opaque by one part in 255: what is not drawn at all feels no pointer.
+    discs = ax.scatter(x[some], y[some], s=80, color=INK, alpha=1 / 255, lw=0, zorder=9)
+    discs.set_urls(list(texts[some]))
+
+
+def few(n: int) -> slice:
+    """Choose as many of n things, evenly, as may have hints."""
+    return slice(None, None, -(-n // _MOST_HINTS) or 1)
+
+
+def plot_posterior(ax: Axes, health: Health, parameters: tuple[str, ...]) -> Axes:
+    """Plot the joint posterior of the last epoch.
+
+    Two parameters give the highest-density regions that hold 50 and 90 % of the draws, the
+    baseline, the medians and the marginal 90 % intervals (bars along the axes); one parameter
+    gives its density.
+
+    Raises
+    ------
+    ValueError
+        If the number of parameters is neither one nor two.
+    """
+    if len(parameters) not in (1, 2):
+        raise ValueError(
+            f"a posterior of {len(parameters)} parameters cannot be drawn, only 1 or 2"
+        )
+    columns = [health.parameters.index(name) for name in parameters]
+    draws = 100 * health.samples[-1][:, columns]
+    draws = draws[np.isfinite(draws).all(axis=1)]
+    if len(columns) == 1:
+        _density(ax, draws[:, 0])
+    else:
+        _regions(ax, draws)
+        ax.set_ylabel(f"{_spell(parameters[1])} in % of baseline")
+    ax.set_xlabel(f"{_spell(parameters[0])} in % of baseline")
+    return legend(ax)
+
+
+def plot_health(ax: Axes, health: Health, parameter: str, limit: float | None) -> Axes:
+    """Plot median, 50 and 90 % bands of a health parameter against the odometer.
+
+    The limit is a fraction of baseline.
+    """
+    column = health.parameters.index(parameter)
+    bands = 100 * health.quantile(_LEVELS)[:, :, column]
+    told = _tells(health, parameter)
+    name = "each epoch by itself" if told else "mostly assumption, not measured"
+    _bands(ax, health.travel / _KM, bands, name, told=told)
+    if told:  # what is not told has no values to show
+        texts = [
+            f"{moment(when)}, {whole_km(travel)}\n{spell(parameter)} {q[2]:.1f}{GAP}%, "
+            f"90{GAP}%: {q[0]:.1f} to {q[4]:.1f}{GAP}%"
+            for when, travel, q in zip(health.recorded_at, health.travel, bands.T, strict=True)
+        ]
+        hints(ax, health.travel / _KM, bands[2], texts)
+    failed = ~health.converged
+    if failed.any():
+        where = health.travel[failed] / _KM
+        ax.plot(where, bands[2, failed], "x", color=RED, ms=6, label="sampler not converged")
+    _levels(ax, limit)
+    _room(ax, bands, limit)
+    ax.set_ylabel("% of baseline")
+    return odometer(ax)
+
+
+def plot_life(
+    ax: Axes, prognosis: Prognosis, parameter: str, *, health: Health | None = None
+) -> Axes:
+    """Plot the degradation law of a parameter through now and into the future.
+
+    With `health`, its epochs stand beside the law, as 90 % intervals that know nothing of it,
+    unless they are mostly assumption. The bar on the limit holds 90 % of the moments at which it
+    is reached.
+    """
+    column = prognosis.parameters.index(parameter)
+    limit = float(prognosis.limits[column])
+    now, travel = prognosis.travel / _KM, prognosis.curve_travel / _KM
+    bands = 100 * prognosis.curve_quantiles[:, :, column]
+    _bands(ax, travel, bands, "law", told=True)
+    top = 108.0
+    if health is not None and _tells(health, parameter):
+        top = max(top, 1.04 * _epochs(ax, health, parameter))
+    _levels(ax, limit)
+    ax.axvline(now, color=INK, lw=1.2, ls=":", label="now")
+    end = now + prognosis.horizon / _KM
+    low, middle, high = _quantiles(prognosis.remaining[:, column], (0.05, 0.5, 0.95)) / _KM
+    if np.isfinite(low) and low < prognosis.horizon / _KM:
+        _passage(ax, now, np.array([low, middle, high]), 100 * limit)
+    right = min(end, now + max(1.3 * high, 0.25 * now)) if np.isfinite(high) else end
+    shown = right >= 0.55 * end
+    if shown:
+        right = end
+        ax.axvline(end, color=MUTED, lw=1.2, ls="-.", label="horizon")
+    left = min(float(travel.min()), now)
+    if health is not None:
+        left = min(left, float(health.travel.min()) / _KM)
+    ax.set_xlim(left - 0.01 * (right - left), right + 0.02 * (right - left))
+    ax.set_ylim(0, max(top, 1.04 * float(np.max(bands[4][travel <= right], initial=0.0))))
+    ax.set_ylabel("% of baseline")
+    odometer(ax)
+    if not shown:
+        ax.set_xlabel(f"odometer in km (horizon at {end:.0f} km, not shown)")
+    return ax
+
+
+def plot_survival(ax: Axes, prognosis: Prognosis, *, service: Service | None = None) -> Axes:
+    """Plot the probability of not having reached a limit against the travel ahead.
+
+    With a service the risk that its day keeps is drawn: the accepted one, or that of least costs.
+    """
+    horizon = prognosis.horizon / _KM
+    last = _quantiles(prognosis.remaining[:, -1], (0.99,))[0] / _KM
+    end = min(horizon, max(1.2 * last, horizon / 50)) if np.isfinite(last) else horizon
+    ahead = np.linspace(0, end, 400)
+    ordered = np.sort(prognosis.remaining / _KM, axis=0)
+    dashes = ["--", "-.", ":", (0, (7, 2, 1, 2, 1, 2))]
+    several = len(prognosis.parameters) > 2
+    for k, name in enumerate(prognosis.parameters):
+        past = np.searchsorted(ordered[:, k], ahead, side="right") / ordered.shape[0]
+        if name == "any":
+            label = "no limit reached" if several else f"{_spell(prognosis.parameters[0])} limit"
+            ax.plot(ahead, 100 * (1 - past), color=BLUE, lw=2.2, label=label)
+        elif several:
+            line = dashes[k % len(dashes)]
+            ax.plot(ahead, 100 * (1 - past), color=MUTED, lw=1.2, ls=line, label=_spell(name))
+    some = np.linspace(0, end, 25)
+    chance = 100 * (1 - np.searchsorted(ordered[:, -1], some, side="right") / ordered.shape[0])
+    texts = [f"after {x:,.0f}{GAP}km: {y:.0f}{GAP}%" for x, y in zip(some, chance, strict=True)]
+    hints(ax, some, chance, [text.replace(",", GAP) for text in texts])
+    if service is not None and service.kept_risk is not None:
+        what = "accepted risk" if service.max_risk else "risk at least costs"
+        label = f"{what} {100 * service.kept_risk:.3g} %"
+        ax.axhline(100 * (1 - service.kept_risk), color=RED, lw=1.2, ls=(0, (5, 2)), label=label)
+    ax.set_xlim(0, end)
+    ax.set_ylim(0, 103)
+    ax.set_xlabel("travel from now in km" + (" (ends at the horizon)" if end == horizon else ""))
+    ax.set_ylabel("probability in %")
+    return legend(ax)
+
+
+def bars(ax: Axes, travel: FloatArray, bounds: FloatArray, label: str, size: float) -> None:
+    """Draw points with bars from low, middle and high values, shape ``(3, n)``."""
+    style: Any = {"fmt": "o", "color": MUTED, "elinewidth": 0.7, "alpha": 0.85}
+    ax.errorbar(travel / _KM, bounds[1], np.diff(bounds, axis=0), ms=size, label=label, **style)
+
+
+def _bands(ax: Axes, x: FloatArray, bands: FloatArray, name: str, *, told: bool) -> None:
+    """Draw median, 50 and 90 % bands; hatched and grey where the data do not tell."""
+    colour = BLUE if told else MUTED
+    for low, alpha, label in ((0, 0.18, "90 %"), (1, 0.32, "50 %")):
+        shown = label if told else None
+        ax.fill_between(x, bands[low], bands[4 - low], fc=colour, alpha=alpha, lw=0, label=shown)
+    if not told:
+        ax.fill_between(x, bands[0], bands[4], fc="none", ec=colour, hatch="///", lw=0)
+    line = "-" if told else (0, (1, 2))
+    marker = "o" if x.size < 3 else ""
+    ax.plot(x, bands[2], color=colour, lw=1.8, ls=line, marker=marker, ms=4, label=name)
+
+
+def _levels(ax: Axes, limit: float | None) -> None:
+    """Draw baseline and limit."""
+    ax.axhline(100, color=GREEN, lw=1.1, ls=(0, (5, 3)), label="baseline")
+    if limit is not None:
+        name = f"limit {100 * limit:.3g} %"
+        ax.axhline(100 * limit, color=RED, lw=1.6, ls=(0, (8, 2)), label=name)
+
+
+def _room(ax: Axes, bands: FloatArray, limit: float | None) -> None:
+    """Show bands, baseline and limit, but not all of a band without end."""
+    values = [100.0, float(np.nanmin(bands[0])), float(np.nanmax(bands[4]))]
+    if limit is not None:
+        values.append(100 * limit)
+    low, high = min(values), min(max(values), 250.0)
+    ax.set_ylim(max(low - 0.06 * (high - low), 0.0), high + 0.06 * (high - low))
+
+
+def _tells(health: Health, parameter: str) -> bool:
+    """Tell whether the last epoch knows a parameter from the data."""
+    if parameter not in health.parameters:
+        return False
+    return bool(health.told()[health.parameters.index(parameter)])
+
+
+def _epochs(ax: Axes, health: Health, parameter: str) -> float:
+    """Draw epochs that know nothing of the law; return the top of their bars."""
+    bounds = 100 * health.quantile(_LEVELS[::2])[:, :, health.parameters.index(parameter)]
+    # Twenty bars are enough to judge by; the last epoch is always among them.
+    some = np.arange(bounds.shape[1])[:: -max(1, bounds.shape[1] // 20)]
+    bars(ax, health.travel[some], bounds[:, some], "epochs, 90 %", 2.5)
+    return min(float(bounds[2].max()), 160.0)
+
+
+def _passage(ax: Axes, now: float, ahead: FloatArray, level: float) -> None:
+    """Mark where the limit is reached: 5 to 95 % as a bar on the limit, the median as a point."""
+    where = now + ahead
+    right = where[2] if np.isfinite(where[2]) else 1e9  # runs out of the picture
+    ax.plot([where[0], right], [level, level], color=RED, lw=5, alpha=0.55, solid_capstyle="butt")
+    if np.isfinite(where[1]):
+        ax.plot(where[1], level, "D", color=RED, mec=PAPER, ms=6, zorder=5, label="limit reached")
+    for x, far, name in zip(where, ahead, ("Early (5 %)", "Median", "Late (95 %)"), strict=True):
+        if np.isfinite(x):
+            text = f"{name}: in {km(_KM * far)}, at {whole_km(_KM * x)}"
+            hints(ax, np.array([x]), np.array([level]), [text])
+
+
+def _regions(ax: Axes, draws: FloatArray) -> None:
+    """Draw highest-density regions of two columns, smoothed along their principal axes."""
+    from scipy.ndimage import gaussian_filter, map_coordinates
+
+    mean, cov = draws.mean(axis=0), np.cov(draws.T)
+    root = np.linalg.cholesky(cov + 1e-12 * np.trace(cov) * np.eye(2))
+    white = np.linalg.solve(root, (draws - mean).T).T
+    reach = 1.15 * np.abs(white).max()
+    edges = np.linspace(-reach, reach, _GRID_POINTS + 1)
+    density = np.histogram2d(white[:, 0], white[:, 1], bins=(edges, edges))[0]
+    width = 1.2 * draws.shape[0] ** (-1 / 6) / (edges[1] - edges[0])
+    density = gaussian_filter(density, width)
+    at = ((white + reach) / (edges[1] - edges[0]) - 0.5).T
+    level90, level50 = np.quantile(map_coordinates(density, at, order=1), [0.1, 0.5])
+    centre = (edges[:-1] + edges[1:]) / 2
+    grid = np.stack(np.meshgrid(centre, centre, indexing="ij"), axis=-1) @ root.T + mean
+    x, y = grid[..., 0], grid[..., 1]
+    if level90 < level50 < density.max():
+        steps = [level90, level50, density.max()]
+        ax.contourf(x, y, density, steps[:1] + steps[2:], colors=[BLUE], alpha=0.2)
+        ax.contourf(x, y, density, steps[1:], colors=[BLUE], alpha=0.35)
+        ax.contour(x, y, density, steps[:2], colors=[BLUE], linewidths=1.2, linestyles=["--", "-"])
+    ax.fill([], [], color=BLUE, alpha=0.55, label="50 %")
+    ax.fill([], [], color=BLUE, alpha=0.2, label="90 %")
+    middle = np.median(draws, axis=0)
+    ax.plot(*middle, "o", color=INK, ms=5, label="median")
+    ax.plot(100, 100, "*", color=GREEN, mec=PAPER, mew=0.5, ms=12, label="baseline", zorder=5)
+    low, high = np.quantile(draws, [0.05, 0.95], axis=0)
+    span = np.quantile(draws, [0.002, 0.998], axis=0)
+    first, last = np.minimum(span[0], 100.0), np.maximum(span[1], 100.0)
+    first, last = first - 0.16 * (last - first), last + 0.06 * (last - first)
+    ax.set_xlim(first[0], last[0])
+    ax.set_ylim(first[1], last[1])
+    across, up = ax.get_xaxis_transform(), ax.get_yaxis_transform()
+    ax.plot([low[0], high[0]], [0.05] * 2, "|-", color=INK, lw=1.4, ms=8, transform=across)
+    name = "single 90 %"
+    ax.plot([0.04] * 2, [low[1], high[1]], "_-", color=INK, lw=1.4, ms=8, transform=up, label=name)
+
+
+def _density(ax: Axes, draws: FloatArray) -> None:
+    """Draw the density of one column with its 50 and 90 % intervals."""
+    from scipy.ndimage import gaussian_filter1d
+
+    margin = 0.1 * float(np.ptp(draws)) + 1e-9
+    counts, edges = np.histogram(draws, 280, (draws.min() - margin, draws.max() + margin))
+    step = edges[1] - edges[0]
+    width = max(1.06 * draws.std() * draws.size**-0.2 / step, 1.0)
+    density = gaussian_filter1d(counts / (draws.size * step), width, mode="constant")
+    x = (edges[:-1] + edges[1:]) / 2
+    q = np.quantile(draws, _LEVELS)
+    for low, high, alpha, name in ((q[0], q[4], 0.2, "90 %"), (q[1], q[3], 0.4, "50 %")):
+        part = (x >= low) & (x <= high)
+        ax.fill_between(x[part], density[part], color=BLUE, alpha=alpha, lw=0, label=name)
+    ax.plot(x, density, color=BLUE, lw=1.6)
+    ax.axvline(float(q[2]), color=INK, lw=1.4, label="median")
+    ax.axvline(100, color=GREEN, lw=1.3, ls=(0, (5, 3)), label="baseline")
+    ax.set_ylim(0, 1.06 * density.max())
+    ax.set_ylabel("probability density per %")
+
+
+def _quantiles(values: FloatArray, levels: tuple[float, ...]) -> FloatArray:
+    """Quantiles of draws that may be infinite: always one of the draws."""
+    return np.asarray(np.quantile(values, levels, method="inverted_cdf"))
+
+
+def odometer(ax: Axes, *, room: int = ROOM) -> Axes:
+    """Finish a picture over the odometer: axis and legend."""
+    ax.set_xlabel("odometer in km")
+    return legend(ax, room=room)
+
+
+def legend(ax: Axes, *, room: int = ROOM) -> Axes:
+    """Put the legend above the picture, where it covers nothing; ``room`` characters are a line."""
+    handles, labels = ax.get_legend_handles_labels()
+    lengths = np.array([len(label) for label in labels])
+    columns = max(min(4, len(labels)), 1)
+    while columns > 1 and sum(p.max() + 6 for p in np.array_split(lengths, columns)) > room:
+        columns -= 1
+    place: Any = {"loc": "lower left", "bbox_to_anchor": (0, 1), "borderaxespad": 0.2}
+    ax.legend(handles, labels, ncols=columns, columnspacing=1.2, handlelength=1.8, **place)
+    return ax
+
+
+def _spell(name: str) -> str:
+    """Spell a name for people; a dollar sign would open a formula."""
+    return name.replace("_", " ").replace("$", r"\$")
+
+
+# A band is shown on a logarithmic axis if its top is more than so many times its bottom.
+_WIDE = 4.0
+# A column of a waterfall reaches so many usual distances of logs to either side.
+_MOST_ROOM = 0.75
+_LINES = {"unknown": "other"}
+# On an image; not of the palette, which turns where a page is dark.
+_WHITE, _BLACK = "#ffffff", "#000000"
+
+
+def plot_frequencies(ax: Axes, history: History, track: Track | None, mode: str) -> Axes:
+    """Plot the natural frequency of a mode against the odometer.
+
+    Each log's estimate with ± 2 standard deviations as it was measured; the filtered line with
+    its 95 % band has the covariates at their reference. Without a track of this mode the line
+    is left out.
+    """
+    for column in history.columns(mode):
+        _logs(ax, history, column, history.ln_frequency[:, column], (1.0, "Hz"))
+    if track is not None and mode in track.modes:
+        k = track.modes.index(mode)
+        level = track.ln_frequency[:, k]
+        _filtered(ax, track.travel, level, track.ln_frequency_std[:, k], 1.0)
+        _baselines(ax, history, track, k)
+        _happenings(ax, track)
+    # A healthy mode must not look like a drama: at least 1 % of the frequency is shown.
+    low, high = ax.get_ylim()
+    middle = (low + high) / 2
+    if high - low < 0.01 * middle:
+        ax.set_ylim(0.995 * middle, 1.005 * middle)
+    ax.set_ylabel("natural frequency in Hz")
+    return odometer(ax)
+
+
+def plot_damping(ax: Axes, history: History, track: Track | None, mode: str) -> Axes:
+    """Plot the damping ratio of a mode against the odometer, as `plot_frequencies` does."""
+    columns = history.columns(mode)
+    level = history.ln_damping[:, columns]
+    top = max(
+        _logs(
+            ax, history, len(history.series) + column, history.ln_damping[:, column], (100.0, "%")
+        )
+        for column in columns
+    )
+    if track is not None and mode in track.modes:
+        k = track.modes.index(mode)
+        _filtered(ax, track.travel, track.ln_damping[:, k], track.ln_damping_std[:, k], 100.0)
+    # A log that hardly saw the mode has bars without end; they may leave the picture.
+    if top > 0:
+        ax.set_ylim(0, 1.08 * min(top, 300 * float(np.exp(np.nanmax(level)))))
+    ax.set_ylabel("damping ratio in %")
+    return odometer(ax)
+
+
+def plot_nis(ax: Axes, track: Track) -> Axes:
+    """Plot the normalised innovation squared of each epoch and its 95 % chi-square band."""
+    seen = (track.nis_dof > 0) & np.isfinite(track.nis)
+    x, nis = track.travel[seen] / _KM, track.nis[seen]
+    low, high = chi_square_band(track.nis_dof[seen])
+    ax.fill_between(x, low, high, step="mid", color=BLUE, alpha=0.18, lw=0, label="95 % band")
+    inside = (nis >= low) & (nis <= high)
+    ax.plot(x[inside], nis[inside], "o", color=BLUE, ms=4, label="inside")
+    texts = [
+        f"{title(track, k)}\nNIS {value:.1f}; expected {a:.1f} to {b:.1f}"
+        for k, value, a, b in zip(np.flatnonzero(seen).tolist(), nis, low, high, strict=True)
+    ]
+    hints(ax, x, nis, texts)
+    if not inside.all():
+        ax.plot(x[~inside], nis[~inside], "D", color=RED, ms=5, label="outside")
+    if nis.size and nis.max() > 4 * high.max():
+        ax.set_yscale("log")
+        ax.set_ylabel("NIS (log scale)")
+    else:
+        ax.set_ylim(bottom=0)
+        ax.set_ylabel("NIS")
+    return odometer(ax)
+
+
+def plot_waterfall(
+    ax: Axes,
+    waterfall: Waterfall,
+    history: History,
+    track: Track | None = None,
+    *,
+    moved: FloatArray | None = None,
+) -> Axes:
+    """Plot the spectra of all logs side by side: odometer, frequency, level in dB as colour.
+
+    The history has an odometer. The filtered frequencies of the modes stand above with their 95 %
+    bands, and every line of a log at its place. Where no log stands for longer than usual there is
+    a gap. ``moved`` is how far covariates have moved ln f, shape ``(n_logs, n_modes)``: with it the
+    modes stand where the logs saw them, else at the covariates' reference.
+    """
+    sides = _columns(history.travel / _KM)
+    x, level = sides.ravel(), np.full((waterfall.level.shape[1], 2 * len(sides) - 1), np.nan)
+    level[:, ::2] = waterfall.level.T
+    low, high = _shown_levels(waterfall)
+    # As an image: thousands of rectangles would be a hundred times as many bytes.
+    picture = ax.pcolormesh(
+        x, waterfall.edges, level, cmap="cividis", vmin=low, vmax=high, rasterized=True
+    )
+    bar = ax.figure.colorbar(picture, ax=ax, extend="both", pad=0.02, aspect=30)
+    bar.set_label("level in dB")
+    bar.outline.set_visible(False)
+    _column_hints(ax, sides, waterfall, history)
+    _waterfall_lines(ax, waterfall, history)
+    if track is not None:
+        for k in range(len(track.modes)):
+            _on_image(ax, track, k, 0.0 if moved is None else moved[:, k])
+    ax.grid(visible=False)
+    ax.set_ylim(waterfall.edges[0], waterfall.edges[-1])
+    if waterfall.edges[-1] > _WIDE * waterfall.edges[0]:
+        ax.set_yscale("log")
+    ax.set_ylabel("frequency in Hz")
+    return odometer(ax, room=54)  # the bar of colours takes the rest
+
+
+def plot_influence(ax: Axes, influence: Influence, history: History) -> Axes:
+    """Plot what a covariate does to the frequency of a mode, before and after it is taken out.
+
+    Changes are in % of the frequency at the covariate's reference, without wear and whatever else
+    is known to move the mode. Of the line a 95 % band is shown where the effect is a straight one.
+    """
+    x, before, after = influence.values, 100 * influence.measured, 100 * influence.corrected
+    grid = np.linspace(float(x.min()), float(x.max()), 60)
+    line, std = 100 * influence.explained(grid), influence.explained_std(grid)
+    if std is not None:
+        reach = 196 * std
+        ax.fill_between(grid, line - reach, line + reach, color=BLUE, alpha=0.18, lw=0)
+    ax.plot(grid, line, color=BLUE, lw=1.6, label="taken out")
+    ax.plot(x, before, "o", mfc="none", mec=MUTED, ms=4.5, mew=1.0, label="as measured")
+    ax.plot(x, after, "o", color=INK, ms=2.8, label="corrected")
+    name, unit = covariate(influence.covariate)
+    texts = [
+        f"{title(history, k)}\n{name} {value:.4g}{GAP}{unit}\n"
+        f"as measured {signed(a, 2)}{GAP}%, corrected {signed(b, 2)}{GAP}%"
+        for k, value, a, b in zip(influence.epochs.tolist(), x, before, after, strict=True)
+    ]
+    hints(ax, x, before, texts)
+    ax.set_xlabel(f"{name} in {unit}".replace("$", r"\$") if unit else name.replace("$", r"\$"))
+    ax.set_ylabel("change of frequency in %")
+    return legend(ax)
+
+
+def chi_square_band(dof: FloatArray) -> FloatArray:
+    """Bounds that hold a chi-square variable with 95 %, shape ``(2, ...)``."""
+    from scipy.special import gammaincinv
+
+    return np.stack([2 * gammaincinv(dof / 2, level) for level in (0.025, 0.975)])
+
+
+def _logs(
+    ax: Axes, history: History, row: int, level: FloatArray, unit: tuple[float, str]
+) -> float:
+    """Draw logarithmic estimates with ± 2 standard deviations; return the top of the bars.
+
+    ``unit`` holds how many of it are one, and its name.
+    """
+    std = np.sqrt(history.cov[:, row, row])
+    seen = np.flatnonzero(np.isfinite(level) & np.isfinite(std))
+    per, name = unit
+    bounds = per * np.exp(level[seen] + np.array([-2, 0, 2])[:, None] * std[seen])
+    bars(ax, history.travel[seen], bounds, "each log, ±2σ", 3)
+    texts = [
+        f"{title(history, k)}\n{value:.2f} ± {value * std[k]:.2f}{GAP}{name}"
+        for k, value in zip(seen.tolist(), bounds[1], strict=True)
+    ]
+    hints(ax, history.travel[seen] / _KM, bounds[1], texts)
+    return float(np.max(bounds[2], initial=0.0))
+
+
+def title(lives: History | Track, k: int) -> str:
+    """Say which log it is, for hints: its name, moment and odometer."""
+    return f"{lives.logs[k]}\n{moment(lives.recorded_at[k])}, {whole_km(lives.travel[k])}"
+
+
+def _filtered(
+    ax: Axes, travel: FloatArray, level: FloatArray, std: FloatArray, unit: float
+) -> None:
+    """Draw the filtered line with its 95 % band, above the logs."""
+    x, reach = travel / _KM, 1.96 * std
+    low, high = unit * np.exp(level - reach), unit * np.exp(level + reach)
+    ax.fill_between(x, low, high, color=BLUE, alpha=0.25, lw=0, zorder=3)
+    marker = "o" if travel.size < 3 else ""
+    name = "filtered, 95 % band"
+    ax.plot(x, unit * np.exp(level), color=BLUE, lw=1.8, marker=marker, zorder=4, label=name)
+
+
+def _baselines(ax: Axes, history: History, track: Track, column: int) -> None:
+    """Draw what each baseline is now believed to have been, as far as it counts."""
+    base = np.exp(track.ln_frequency[:, column] - track.drift[:, column])
+    ends = [*history.baselines[1:], len(history.logs)]
+    for number, (first, end) in enumerate(zip(history.baselines, ends, strict=True)):
+        own = base[first:end]
+        if np.isfinite(own).any():
+            value = float(own[np.isfinite(own)][-1])
+            x = track.travel[[first, end - 1]] / _KM
+            name = None if number else "baseline"
+            ax.plot(x, [value, value], color=GREEN, lw=1.1, ls=(0, (5, 3)), label=name)
+
+
+def _columns(x: FloatArray) -> FloatArray:
+    """Give each log the room to its neighbours, but not much more than usual, ``(n_logs, 2)``."""
+    gaps = np.diff(x)
+    usual = float(np.median(gaps[gaps > 0])) if (gaps > 0).any() else 1.0
+    # A log beside another at the same place still is a stroke.
+    half = np.clip(gaps / 2, 0.1 * usual, _MOST_ROOM * usual)
+    return np.stack([x - np.append(usual / 2, half), x + np.append(half, usual / 2)], axis=1)
+
+
+def _shown_levels(waterfall: Waterfall) -> tuple[float, float]:
+    """Choose the ends of the colours in dB: what lines do not reach decides, in steps of 5 dB."""
+    free = waterfall.level.copy()
+    for row, lines in zip(free, waterfall.lines, strict=True):
+        for line in lines:
+            at = int(np.searchsorted(waterfall.edges, line.frequency))
+            row[max(at - 3, 0) : at + 2] = np.nan
+    low, high = np.nanquantile(free, [0.02, 0.998])
+    return 5 * float(np.floor(low / 5)), 5 * float(np.ceil(high / 5))
+
+
+def _column_hints(ax: Axes, sides: FloatArray, waterfall: Waterfall, history: History) -> None:
+    """Let each column tell its log, and where it has the modes."""
+    from matplotlib.collections import PolyCollection
+
+    low, high = waterfall.edges[[0, -1]]
+    some = few(len(sides))
+    corners = [[(a, low), (a, high), (b, high), (b, low)] for a, b in sides[some]]
+    columns = PolyCollection(corners, facecolor=INK, alpha=1 / 255, lw=0)
+    texts = [title(history, k) + _found(history, k) for k in range(len(sides))]
+    columns.set_urls(texts[some])
+    ax.add_collection(columns)
+
+
+def _found(history: History, k: int) -> str:
+    """List the frequencies that a log gave, a line each."""
+    return "".join(
+        f"\n{spell(one.mode)} {np.exp(ln_f):.2f}{GAP}Hz"
+        for one, ln_f in zip(history.series, history.ln_frequency[k], strict=True)
+        if np.isfinite(ln_f)
+    )
+
+
+def _waterfall_lines(ax: Axes, waterfall: Waterfall, history: History) -> None:
+    """Mark the lines of every log; each kind has its own marker."""
+    seen: dict[str, list[tuple[float, Line, int]]] = {}
+    for k, (x, lines) in enumerate(zip(history.travel / _KM, waterfall.lines, strict=True)):
+        for line in lines:
+            seen.setdefault(line.kind, []).append((x, line, k))
+    for marker, (kind, own) in zip(cycle("_x+1|"), sorted(seen.items()), strict=False):
+        x = np.array([place for place, _, _ in own])
+        y = np.array([line.frequency for _, line, _ in own])
+        name = f"{_LINES.get(kind, spell(kind))} line".replace("$", r"\$")
+        ax.plot(x, y, marker, color=RED, ms=3.5, mew=1.0, path_effects=_halo(2.0), label=name)
+        texts = [
+            f"{title(history, k)}\n{_LINES.get(kind, spell(kind))} line at "
+            f"{line.frequency:.2f}{GAP}Hz, {line.amplitude:.2g}{GAP}{line.unit} in {line.channel}"
+            for _, line, k in own
+        ]
+        hints(ax, x, y, texts)
+
+
+def _on_image(ax: Axes, track: Track, k: int, moved: FloatArray | float) -> None:
+    """Draw the filtered line of a mode and its 95 % band so that they show on every colour."""
+    level, reach = track.ln_frequency[:, k] + moved, 1.96 * track.ln_frequency_std[:, k]
+    x = track.travel / _KM
+    name = None if k else "tracked modes, 95 % band"
+    ax.fill_between(x, np.exp(level - reach), np.exp(level + reach), fc=_WHITE, alpha=0.4, lw=0)
+    ax.plot(x, np.exp(level), color=_WHITE, lw=0.7, path_effects=_halo(1.5), label=name)
+    if np.isfinite(level).any():
+        first = int(np.argmax(np.isfinite(level)))
+        style: Any = {"color": _WHITE, "size": 8, "clip_on": True, "path_effects": _halo(1.8)}
+        name = spell(track.modes[k]).replace("$", r"\$")
+        place = (x[first], np.exp(level[first]))
+        ax.annotate(name, place, xytext=(2, 3), textcoords="offset points", **style)
+
+
+def _halo(width: float) -> list[Any]:
+    from matplotlib.patheffects import withStroke
+
+    return [withStroke(linewidth=width, foreground=_BLACK)]
+
+
+def _happenings(ax: Axes, track: Track) -> None:
+    """Mark what happened at once."""
+    marked: set[str] = set()
+    for kind, first in dict.fromkeys((step.kind, step.first) for step in track.steps):
+        colour, style = (RED, "-") if kind == "step" else (INK, ":")
+        name = None if kind in marked else _WORDS[kind]
+        marked.add(kind)
+        ax.axvline(track.travel[first] / _KM, color=colour, ls=style, lw=1.0, label=name, zorder=1)
+
+
+_WORDS = {
+    "step": "sudden change",
+    "regreasing": "regreasing",
+    "servo": "servo retuned",
+    "sensor": "sensor changed",
+    "reset": "guide or mount serviced",
+}

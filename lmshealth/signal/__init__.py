@@ -1,0 +1,1 @@
+"""Signal processing: segments, spectra, spectral lines, readings of the paper."""

@@ -1,0 +1,332 @@
+"""Accelerations as the paper reads them: magnitudes of frequencies over velocity, which grow."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Literal, NamedTuple
+
+import numpy as np
+from scipy.special import stdtr
+
+from lmshealth.errors import BadLog
+from lmshealth.io.log import Channel, Log
+from lmshealth.signal.harmonics import Harmonics, decompose
+from lmshealth.signal.segments import Part, Segment, select_segments, set_velocity
+from lmshealth.stage.description import Stage
+
+# Without a description: the rows of the paper's Tables 6 and 7.
+GRID = 10.0
+GRID_BAND = (10.0, 400.0)
+# A row of a mode reaches this many damping ratios to either side.
+_WIDTHS = 2.5
+# One-sided probability below which a slope counts: of twenty bands that do not depend on velocity
+# one will be said to grow.
+SIGNIFICANCE = 0.05
+_LEAST_ORDINATES = 3
+
+BandKind = Literal["mode", "grid", "health", "watch"]
+
+
+@dataclass(frozen=True, slots=True)
+class Band:
+    """A band of frequencies that is read as one number.
+
+    Attributes
+    ----------
+    name : str
+        Of the mode, or the band in words; the same in all logs.
+    kind : str
+        ``mode``, ``grid`` (no description), ``health`` or ``watch``.
+    low, high : float
+        In Hz.
+    placed_by : str
+        Of a mode: ``identified`` where this log shows it, else ``stage``.
+    """
+
+    name: str
+    kind: BandKind
+    low: float
+    high: float
+    placed_by: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Magnitude:
+    """What one accelerometer of one log reads in a band.
+
+    Attributes
+    ----------
+    log, stage : str
+        Name of the log and identity of the machine, empty where unknown.
+    velocity : float
+        Set velocity in m/s, NaN where unknown.
+    channel : str
+        The accelerometer.
+    band : Band
+        Where.
+    magnitude, frequency : float
+        Amplitude in m/s² and frequency in Hz of the strongest harmonic of the longest stretch.
+    resolution : float
+        Distance of its harmonics in Hz.
+    rms : float
+        In m/s², all stretches together.
+    dof : int
+        Degrees of freedom of the mean square: two per harmonic.
+    """
+
+    log: str
+    stage: str
+    velocity: float
+    channel: str
+    band: Band
+    magnitude: float
+    frequency: float
+    resolution: float
+    rms: float
+    dof: int
+
+    @property
+    def level(self) -> float:
+        """What is compared between velocities, in m/s²: magnitude, of wide bands the RMS."""
+        return self.rms if self.band.kind in ("health", "watch") else self.magnitude
+
+
+@dataclass(frozen=True, slots=True)
+class Growth:
+    """How a level depends on velocity: ln level = constant + slope · ln velocity.
+
+    Attributes
+    ----------
+    stage, channel, band : str
+        Machine, accelerometer and name of the band.
+    n_logs, n_velocities : int
+        Points of the straight line, and different velocities among them.
+    slope, slope_std : float
+        Least squares, with the standard deviation that the scatter about the line tells; NaN where
+        fewer than two velocities, or three logs, leave it open.
+    p_value : float
+        Probability of such a slope or a larger one where there is none (Student's t).
+    """
+
+    stage: str
+    channel: str
+    band: str
+    n_logs: int
+    n_velocities: int
+    slope: float
+    slope_std: float
+    p_value: float
+
+    @property
+    def grows(self) -> bool | None:
+        """Whether the slope is positive beyond chance; None where that cannot be told."""
+        return None if np.isnan(self.p_value) else self.p_value < SIGNIFICANCE
+
+
+def choose_bands(
+    stage: Stage | None, found: Mapping[str, float] | None, span: tuple[float, float] | None
+) -> tuple[Band, ...]:
+    """Choose what is read: modes and bands of the description, or the paper's grid without one.
+
+    Parameters
+    ----------
+    stage : Stage or None
+        Its modes, health band and watched bands.
+    found : mapping of str to float, optional
+        Natural frequencies in Hz, by name, of the modes identified in this log; other modes are
+        read at the frequencies of the description.
+    span : (float, float) or None
+        Only modes or grid frequencies between these, in Hz.
+
+    Returns
+    -------
+    tuple of Band
+        Modes or grid ascending in frequency, then health band, then watched bands.
+    """
+    if stage is None:
+        low, high = span or GRID_BAND
+        grid = GRID * np.arange(np.ceil(low / GRID), np.floor(high / GRID) + 1)
+        return tuple(
+            Band(f"{f:g} Hz", "grid", f - GRID / 2, f + GRID / 2) for f in grid.tolist() if f > 0
+        )
+    bands = _mode_bands(stage, found or {}, span)
+    description = stage.description
+    if description.health_band_hz is not None:
+        low, high = description.health_band_hz
+        bands.append(Band(f"{low:g}-{high:g} Hz", "health", low, high))
+    for watch in description.watch:
+        name = f"{watch.low_hz:g}-{watch.high_hz:g} Hz"
+        bands.append(Band(name, "watch", watch.low_hz, watch.high_hz))
+    return tuple(bands)
+
+
+def _mode_bands(
+    stage: Stage, found: Mapping[str, float], span: tuple[float, float] | None
+) -> list[Band]:
+    """Bands about the modes; where two touch, they part in the middle."""
+    low, high = span or (0.0, np.inf)
+    places = sorted(
+        (found.get(mode.name, mode.frequency_hz), mode.damping_ratio, mode.name)
+        for mode in stage.modes
+        if low <= mode.frequency_hz <= high
+    )
+    bands = []
+    for i, (f, damping, name) in enumerate(places):
+        below = f * (1 - _WIDTHS * damping)
+        above = f * (1 + _WIDTHS * damping)
+        if i > 0:
+            below = max(below, (places[i - 1][0] + f) / 2)
+        if i + 1 < len(places):
+            above = min(above, (places[i + 1][0] + f) / 2)
+        bands.append(Band(name, "mode", below, above, "identified" if name in found else "stage"))
+    return bands
+
+
+def read_magnitudes(
+    log: Log, bands: Iterable[Band], *, part: Part = "record"
+) -> tuple[Magnitude, ...]:
+    """Read every accelerometer of a log in every band.
+
+    Parameters
+    ----------
+    log : Log
+        With at least one acceleration channel.
+    bands : iterable of Band
+        Those that reach beyond half the sample rate are passed over.
+    part : str
+        Which stretches of the log; see `select_segments`.
+
+    Returns
+    -------
+    tuple of Magnitude
+        Channel by channel.
+
+    Raises
+    ------
+    BadLog
+        With reason ``no-accelerometer`` without such a channel, ``sample-rate`` where no band is
+        below half of it, ``too-short`` where a band holds fewer than three harmonics, or as
+        `select_segments` does.
+
+    References
+    ----------
+    Piscalov2021
+    """
+    channels = [channel for channel in log.channels if channel.kind == "acceleration"]
+    if not channels:
+        there = ", ".join(channel.name for channel in log.channels)
+        raise BadLog(
+            log.name,
+            "no-accelerometer",
+            f"no usable acc channel; there: {there}; needed acc_<name>_m_s2",
+        )
+    segments = select_segments(log, part)
+    usable = _usable(log, bands, max(s.stop - s.start for s in segments))
+    velocity = set_velocity(log)
+    return tuple(
+        Magnitude(log.name, log.metadata.stage or "", velocity, channel.name, band, *reading)
+        for channel in channels
+        for band, reading in zip(
+            usable, _read(channel, log.sample_rate, segments, usable), strict=True
+        )
+    )
+
+
+def _usable(log: Log, bands: Iterable[Band], longest: int) -> list[Band]:
+    asked = tuple(bands)
+    usable = [band for band in asked if band.high < log.sample_rate / 2]
+    if not usable:
+        lowest = min((band.high for band in asked), default=np.nan)
+        raise BadLog(
+            log.name,
+            "sample-rate",
+            f"{log.sample_rate:g} Hz shows none of the bands asked for; needed is more than "
+            f"{2 * lowest:.4g} Hz",
+        )
+    narrowest = min(band.high - band.low for band in usable)
+    needed, seconds = _LEAST_ORDINATES / narrowest, longest / log.sample_rate
+    if seconds < needed:
+        raise BadLog(
+            log.name,
+            "too-short",
+            f"the longest stretch has {seconds:.3g} s; a band of {narrowest:.3g} Hz needs "
+            f"{needed:.3g} s",
+        )
+    return usable
+
+
+class _Reading(NamedTuple):
+    """What a `Magnitude` says of a band."""
+
+    magnitude: float
+    frequency: float
+    resolution: float
+    rms: float
+    dof: int
+
+
+def _read(
+    channel: Channel, sample_rate: float, segments: Sequence[Segment], bands: Sequence[Band]
+) -> list[_Reading]:
+    """Read all bands of a channel, one stretch at a time, the longest first."""
+    ordered = sorted(segments, key=lambda s: s.start - s.stop)
+    strongest: list[tuple[float, float, float]] = []
+    total, seconds = np.zeros(len(bands)), np.zeros(len(bands))
+    dof = np.zeros(len(bands), dtype=int)
+    for segment in ordered:
+        if segment.stop - segment.start < 2:
+            continue
+        harmonics = decompose(channel.values[segment.start : segment.stop], sample_rate)
+        inside = [harmonics.between(band.low, band.high) for band in bands]
+        strongest = strongest or [_strongest(harmonics, own) for own in inside]
+        for i, own in enumerate(inside):
+            # A stretch too short for the band says nothing about it.
+            if own.stop - own.start >= _LEAST_ORDINATES - 1:
+                total[i] += harmonics.duration * float(harmonics.power[own].sum())
+                seconds[i] += harmonics.duration
+                dof[i] += 2 * (own.stop - own.start)
+    rms = np.sqrt(total / seconds)
+    return [
+        _Reading(*best, r, n)
+        for best, r, n in zip(strongest, rms.tolist(), dof.tolist(), strict=True)
+    ]
+
+
+def _strongest(harmonics: Harmonics, inside: slice) -> tuple[float, float, float]:
+    """Amplitude and frequency of the strongest harmonic of a band, and what is resolved."""
+    amplitude = harmonics.amplitude[inside]
+    at = int(np.argmax(amplitude))
+    return float(amplitude[at]), float(harmonics.frequency[inside][at]), 1 / harmonics.duration
+
+
+def find_growth(magnitudes: Iterable[Magnitude]) -> tuple[Growth, ...]:
+    """Fit the growth of every machine, accelerometer and band over the logs of known velocity.
+
+    Returns
+    -------
+    tuple of Growth
+        In the order in which they are first met.
+    """
+    groups: dict[tuple[str, str, str], list[tuple[float, float]]] = {}
+    for m in magnitudes:
+        points = groups.setdefault((m.stage, m.channel, m.band.name), [])
+        if m.velocity > 0 and m.level > 0:
+            points.append((float(np.log(m.velocity)), float(np.log(m.level))))
+    return tuple(_growth(*key, points) for key, points in groups.items())
+
+
+def _growth(stage: str, channel: str, band: str, points: list[tuple[float, float]]) -> Growth:
+    x, y = np.array(points).reshape(-1, 2).T
+    # Set velocities measured to a percent are the same.
+    n_velocities = np.unique(np.round(x / 0.02)).size
+    slope = std = p_value = float("nan")
+    if n_velocities > 1:
+        off = x - x.mean()
+        slope = float(off @ y / (off @ off))
+        dof = x.size - 2
+        if dof > 0:
+            rest = y - y.mean() - slope * off
+            std = float(np.sqrt(rest @ rest / dof / (off @ off)))
+            p_value = float(stdtr(dof, -slope / std)) if std > 0 else float(slope <= 0)
+    return Growth(stage, channel, band, x.size, n_velocities, slope, std, p_value)

@@ -1,0 +1,101 @@
+"""Harmonics of a record: calibrated amplitudes and phases, and the record rebuilt from some."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import fft
+
+from lmshealth._arrays import FloatArray, freeze
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Harmonics:
+    """A record as its mean and a sum of cosines, A cos(2πft + φ) with t from its first sample.
+
+    Nothing but the mean is taken out and no window is laid over it: a sine with a whole number of
+    periods in the record reads its amplitude and phase to rounding, and white noise of power
+    spectral density S has the expected power S/T in each harmonic, T the duration.
+
+    Attributes
+    ----------
+    mean : float
+        In the record's unit.
+    frequency : ndarray
+        In Hz, ascending from one over the duration, shape ``(n_harmonics,)``.
+    amplitude : ndarray
+        In the record's unit, same shape.
+    phase : ndarray
+        In rad, of the cosine, same shape.
+    duration : float
+        Of the record, in s.
+    size : int
+        Samples of the record.
+    """
+
+    mean: float
+    frequency: FloatArray
+    amplitude: FloatArray
+    phase: FloatArray
+    duration: float
+    size: int
+
+    def __post_init__(self) -> None:
+        if not self.frequency.shape == self.amplitude.shape == self.phase.shape:
+            raise ValueError("frequency, amplitude and phase differ in shape")
+        freeze(self)
+
+    @property
+    def power(self) -> FloatArray:
+        """Mean square of each harmonic; together the variance (Parseval)."""
+        power = self.amplitude**2 / 2
+        if self.size % 2 == 0:
+            # At half the sample rate a cosine of phase 0 or π is ± A at every sample.
+            power[-1] *= 2
+        return power
+
+    def strongest(self, count: int) -> np.ndarray[tuple[int], np.dtype[np.intp]]:
+        """Choose the strongest harmonics: indices, strongest first, shape ``(count,)`` at most."""
+        return np.argsort(-self.amplitude, kind="stable")[:count]
+
+    def between(self, low: float, high: float) -> slice:
+        """Choose the harmonics strictly between two frequencies in Hz."""
+        first = np.searchsorted(self.frequency, low, side="right")
+        return slice(int(first), int(np.searchsorted(self.frequency, high)))
+
+    def rebuild(self, kept: np.ndarray[tuple[int], np.dtype[np.intp]]) -> FloatArray:
+        """Sum the mean and some harmonics, by index; shape ``(size,)``."""
+        transform = np.zeros(self.size // 2 + 1, dtype=complex)
+        transform[0] = self.mean * self.size
+        half = np.full(self.frequency.size, 0.5 * self.size)
+        if self.size % 2 == 0:
+            half[-1] = self.size
+        transform[kept + 1] = (half * self.amplitude * np.exp(1j * self.phase))[kept]
+        return np.asarray(fft.irfft(transform, self.size))
+
+
+def decompose(values: FloatArray, sample_rate: float) -> Harmonics:
+    """Decompose a gap-free record into its harmonics.
+
+    Parameters
+    ----------
+    values : ndarray
+        Samples, shape ``(n_samples,)``, at least two.
+    sample_rate : float
+        In Hz.
+    """
+    n = values.size
+    mean = float(values.mean())
+    transform = fft.rfft(values - mean)[1:]
+    amplitude: FloatArray = np.abs(transform) * (2 / n)
+    if n % 2 == 0:
+        amplitude[-1] /= 2
+    return Harmonics(
+        mean=mean,
+        frequency=np.arange(1, n // 2 + 1, dtype=np.float64) * (sample_rate / n),
+        amplitude=amplitude,
+        phase=np.angle(transform),
+        duration=n / sample_rate,
+        size=n,
+    )

@@ -1,0 +1,179 @@
+"""Spectra over life: the band of the tracked modes as every log shows it, side by side."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Self
+
+import numpy as np
+from scipy import fft
+
+from lmshealth._arrays import FloatArray, expect_shape, freeze
+from lmshealth.io.log import Channel, Log
+from lmshealth.signal.segments import Segment, find_segments
+from lmshealth.signal.spectra import Spectrum, periodogram
+from lmshealth.signal.spectral_lines import Line
+from lmshealth.stage.description import Stage
+
+BINS = 160
+# A stretch counts if it holds so many periods of the lowest frequency.
+_LEAST_PERIODS = 20
+# Power below this share of a channel's median is rounding.
+_LEAST_SHARE = 1e-9
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Levels:
+    """How strongly a log shows each frequency of the band of the tracked modes.
+
+    Attributes
+    ----------
+    low, high : float
+        Ends of the band in Hz.
+    level : ndarray
+        In dB, in bins of equal width in ln f, NaN from half the sample rate on, shape
+        ``(n_bins,)``.
+    """
+
+    low: float
+    high: float
+    level: FloatArray
+
+    def __post_init__(self) -> None:
+        expect_shape("level", self.level, (self.level.size,))
+        freeze(self)
+
+    @property
+    def edges(self) -> FloatArray:
+        """Edges of the bins in Hz, shape ``(n_bins + 1,)``."""
+        return np.geomspace(self.low, self.high, self.level.size + 1)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Waterfall:
+    """The levels of a machine's logs, and the lines that stand among them.
+
+    Attributes
+    ----------
+    edges : ndarray
+        Edges of the bins in Hz, shape ``(n_bins + 1,)``.
+    level : ndarray
+        In dB, NaN where a log has none, shape ``(n_logs, n_bins)``.
+    lines : tuple of tuple of Line
+        Of each log those within the band.
+    """
+
+    edges: FloatArray
+    level: FloatArray
+    lines: tuple[tuple[Line, ...], ...]
+
+    def __post_init__(self) -> None:
+        expect_shape("level", self.level, (len(self.lines), self.edges.size - 1))
+        freeze(self)
+
+    @classmethod
+    def stack(cls, logs: Sequence[tuple[Levels | None, Sequence[Line]]]) -> Self | None:
+        """Put logs that were read with one description side by side; None without any levels."""
+        there = [levels for levels, _ in logs if levels is not None]
+        if not there:
+            return None
+        missing = np.full(there[0].level.size, np.nan)
+        low, high = there[0].low, there[0].high
+        return cls(
+            edges=there[0].edges,
+            level=np.stack([missing if own is None else own.level for own, _ in logs]),
+            lines=tuple(
+                tuple(line for line in lines if low <= line.frequency <= high) for _, lines in logs
+            ),
+        )
+
+
+def shown_band(stage: Stage) -> tuple[float, float]:
+    """Choose the band that is shown, in Hz: wherever a tracked mode of a stage is looked for."""
+    modes = [mode for mode in stage.modes if mode.tracked] or stage.modes
+    return (
+        min(mode.frequency_hz * (1 - mode.search) for mode in modes),
+        max(mode.frequency_hz * (1 + mode.search) for mode in modes),
+    )
+
+
+def read_levels(log: Log, stage: Stage, *, n_bins: int = BINS) -> Levels | None:
+    """Read how strongly a log shows each frequency of the band of the tracked modes.
+
+    Stretches of constant velocity are cut into parts that resolve the bins, and their periodograms
+    are averaged, each by its duration, within every bin. A channel counts in units of its own
+    median over the band, and the level is the mean of all channels: logs of different velocity,
+    load or sensors are then alike but for where they have their resonances, which is what is to be
+    compared. Absolute levels are lost.
+
+    Parameters
+    ----------
+    log : Log
+        Displacements and accelerations are used, both as accelerations.
+    stage : Stage
+        Its modes tell the band.
+    n_bins : int
+        How finely the band is divided.
+
+    Returns
+    -------
+    Levels or None
+        None where nothing can be read: no such channel, no stretch of twenty periods, or a sample
+        rate that does not reach the band.
+    """
+    low, high = shown_band(stage)
+    edges = np.geomspace(low, high, n_bins + 1)
+    channels = [c for c in log.channels if c.kind in ("displacement", "acceleration")]
+    segments = _cut(find_segments(log, _LEAST_PERIODS / low), log.sample_rate / np.diff(edges)[0])
+    below = edges[1:] < log.sample_rate / 2
+    if not channels or not segments or not below.any():
+        return None
+    total = np.zeros(n_bins)
+    for channel in channels:
+        density = _density(channel, segments, log.sample_rate, edges)
+        middle = float(np.median(density[below]))
+        if middle > 0:
+            total += density / middle
+    if not total[below].any():
+        return None
+    decibel = 10 * np.log10((total / len(channels)).clip(_LEAST_SHARE))
+    return Levels(low, high, np.where(below, decibel, np.nan))
+
+
+def _cut(segments: Sequence[Segment], size: float) -> list[Segment]:
+    """Cut segments into parts that resolve the bins and no more: five times cheaper than whole.
+
+    What is left at the end of a segment is given up.
+    """
+    n = fft.next_fast_len(int(np.ceil(size)), real=True)
+    parts = []
+    for segment in segments:
+        starts = range(segment.start, segment.stop - n + 1, n)
+        parts += [replace(segment, start=at, stop=at + n) for at in starts] or [segment]
+    return parts
+
+
+def _density(
+    channel: Channel, segments: Sequence[Segment], sample_rate: float, edges: FloatArray
+) -> FloatArray:
+    """Average the power spectral density of a channel over stretches and within bins."""
+    spectra = [
+        periodogram(channel, segment, sample_rate, float(edges[-1]), ceiling=1.1 * float(edges[-1]))
+        for segment in segments
+    ]
+    duration = np.array([spectrum.duration for spectrum in spectra])
+    binned = np.array([bin_density(spectrum, edges) for spectrum in spectra])
+    return np.asarray(duration @ binned / duration.sum())
+
+
+def bin_density(spectrum: Spectrum, edges: FloatArray) -> FloatArray:
+    """Average a spectrum within bins, shape ``(n_bins,)``.
+
+    Every ordinate is taken for the density from half way below it to half way above, so that bins
+    narrower than what the spectrum resolves have a value as well, and no power is lost.
+    """
+    half = 0.5 / spectrum.duration
+    places = np.append(spectrum.frequency - half, spectrum.frequency[-1] + half)
+    power = np.append(0.0, np.cumsum(spectrum.periodogram)) / spectrum.duration
+    return np.asarray(np.diff(np.interp(edges, places, power)) / np.diff(edges))

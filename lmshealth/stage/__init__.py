@@ -1,0 +1,1 @@
+"""Stage descriptions: modes, health parameters, priors, modal map, degradation laws."""

@@ -1,0 +1,178 @@
+"""Sight: what small changes of the health parameters do to the tracked modes, and what logs show.
+
+Two groups of logs are compared, those of now and those of the baseline, all of one length T. The
+drifts δ of the modes between them have the covariance C = R(T) (1/N + 1/N_baseline), where R is the
+Cramér-Rao bound of ln f of one log: independent from log to log, and from mode to mode. With the
+sensitivities S of the modal map at the baseline, δ = S x + ε for small changes x of the
+ln parameters, whose priors have the variances Λ. The map's error, its sensitivities being wrong by
+a relative standard deviation m, is that of parameters which have moved as far as their priors say:
+E = m² (S ∘ S) Λ and the surrogate's own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from lmshealth._arrays import BoolArray, FloatArray
+from lmshealth.errors import BadStage
+from lmshealth.stage.constants import BAND, INFORMED, LEAST_RESOLUTION
+from lmshealth.stage.cramer_rao import ambient_bound
+from lmshealth.stage.description import ModeSpec, Stage
+
+# What is more than this is no plan: what is left then, no logs take away.
+MOST_LOGS, LONGEST = 10_000, 3600
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Sight:
+    """What the tracked modes show of the health parameters.
+
+    Attributes
+    ----------
+    parameters : tuple of str
+        Their names.
+    modes : tuple of ModeSpec
+        Those that are tracked and on the map.
+    slopes : ndarray
+        d ln f / d ln parameter at the baseline, shape ``(n_modes, n_parameters)``.
+    prior : ndarray
+        Variances of the ln parameters in their priors, shape ``(n_parameters,)``.
+    model_std : float
+        Relative standard deviation of the map's sensitivities.
+    leave_out : ndarray
+        Error of ln f of the map's surrogate, shape ``(n_modes,)``.
+    n_baseline : int
+        Logs of the baseline.
+    """
+
+    parameters: tuple[str, ...]
+    modes: tuple[ModeSpec, ...]
+    slopes: FloatArray
+    prior: FloatArray
+    model_std: float
+    leave_out: FloatArray
+    n_baseline: int
+    # Bounds by length of log: many questions are asked of few lengths.
+    _known: dict[float, FloatArray] = field(default_factory=dict)
+
+    @property
+    def least_duration(self) -> float:
+        """Length in s of a log in which every mode can be identified."""
+        widths = [2 * mode.damping_ratio * mode.frequency_hz for mode in self.modes]
+        return LEAST_RESOLUTION / min(widths)
+
+    def log_variance(self, duration: float) -> FloatArray:
+        """Bound the variance of ln f of each mode in one log, shape ``(n_modes,)``."""
+        if duration not in self._known:
+            self._known[duration] = np.array([_bound(mode, duration) for mode in self.modes])
+        return self._known[duration]
+
+    def drift_variance(
+        self, duration: float, n_logs: int, n_baseline: int | None = None
+    ) -> FloatArray:
+        """Bound the variance of the drift of each mode, shape ``(n_modes,)``."""
+        return self.log_variance(duration) * (1 / n_logs + 1 / (n_baseline or self.n_baseline))
+
+    def through(self, modes: Sequence[str]) -> Sight:
+        """Give the sight through some of the modes."""
+        rows = [k for k, mode in enumerate(self.modes) if mode.name in modes]
+        return replace(
+            self,
+            modes=tuple(self.modes[k] for k in rows),
+            slopes=self.slopes[rows],
+            leave_out=self.leave_out[rows],
+            _known={},
+        )
+
+    def endless_variance(self) -> FloatArray:
+        """Bound the variance of the drifts by logs without end, shape ``(n_modes,)``."""
+        return self.drift_variance(LONGEST, MOST_LOGS, MOST_LOGS)
+
+    def std(self, parameter: int, noise: FloatArray) -> float:
+        """Tell how well drifts of an exact map estimate one ln parameter, the others by priors.
+
+        With δ = s_j x_j + S_o x_o + ε and V = C + S_o Λ_o S_oᵀ this is 1 / √(s_jᵀ V⁻¹ s_j).
+        """
+        own, others = self.slopes[:, parameter], np.delete(self.slopes, parameter, axis=1)
+        cov = np.diag(noise) + (others * np.delete(self.prior, parameter)) @ others.T
+        information = float(own @ np.linalg.solve(cov, own))
+        return float(1 / np.sqrt(information)) if information > 0 else np.inf
+
+    def precision(self, noise: FloatArray) -> FloatArray:
+        """Give the precision of all ln parameters after logs, Λ⁻¹ + Sᵀ (C + E)⁻¹ S.
+
+        Parameters
+        ----------
+        noise : ndarray
+            Variances of the drifts, shape ``(n_modes,)``.
+
+        Returns
+        -------
+        ndarray
+            Shape ``(n_parameters, n_parameters)``.
+        """
+        error = self.model_std**2 * self.slopes**2 @ self.prior + self.leave_out**2
+        weighted = self.slopes / (noise + error)[:, None]
+        return np.asarray(np.diag(1 / self.prior) + self.slopes.T @ weighted)
+
+
+def identifiable(
+    sights: Sequence[Sight], columns: Sequence[Sequence[int]], prior: FloatArray
+) -> BoolArray:
+    """Tell which of all parameters endless logs would tell, of one machine or of several together.
+
+    Parameters
+    ----------
+    sights : sequence of Sight
+        One per machine.
+    columns : sequence of sequence of int
+        Where the parameters of each stand among all.
+    prior : ndarray
+        Variances of all ln parameters in their priors, shape ``(n_parameters,)``.
+
+    Returns
+    -------
+    ndarray of bool
+        Shape ``(n_parameters,)``.
+    """
+    precision = np.diag(1 / prior)
+    for sight, places in zip(sights, columns, strict=True):
+        told = sight.precision(sight.endless_variance()) - np.diag(1 / sight.prior)
+        precision[np.ix_(places, places)] += told
+    left = np.diag(np.linalg.inv(precision))
+    return np.asarray(1 - left / prior >= INFORMED)
+
+
+def sight_of(stage: Stage) -> Sight:
+    """Tell what the tracked modes of a stage show of its health parameters.
+
+    Raises
+    ------
+    BadStage
+        If the description has no map.
+    """
+    if stage.modal_map is None or stage.description.map is None:
+        raise BadStage(
+            f"{stage.name}: no [map], so nothing links health to frequencies; "
+            "describe [[parameter]] and [map]"
+        )
+    rows = [stage.modal_map.modes.index(name) for name in stage.informative]
+    return Sight(
+        parameters=stage.prior.names,
+        modes=tuple(mode for mode in stage.modes if mode.name in stage.informative),
+        slopes=stage.modal_map.gradient(stage.baseline_point[None])[0, rows],
+        prior=stage.prior.variance,
+        model_std=stage.description.map.model_std,
+        leave_out=stage.modal_map.leave_out_error[rows],
+        n_baseline=stage.description.baseline.logs,
+    )
+
+
+def _bound(mode: ModeSpec, duration: float) -> float:
+    """Bound the variance of ln f in the band that identification uses."""
+    f, zeta = mode.frequency_hz, mode.damping_ratio
+    band = (f * (1 - BAND * zeta), f * (1 + BAND * zeta))
+    return float(ambient_bound(f, zeta, mode.snr, duration, band=band)[0, 0])

@@ -1,0 +1,268 @@
+"""The modal map: natural frequencies as a smooth function of the health parameters.
+
+A map is a table made by any solver over a full grid of parameter values. It enters as a
+Chebyshev surrogate of ln frequency over ln parameters, whose error is estimated by leaving
+grid points out.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pandas as pd
+from numpy.polynomial.chebyshev import chebder
+
+from lmshealth._arrays import BoolArray, FloatArray
+from lmshealth.errors import BadStage, OutsideMap
+
+_MAX_DEGREE = 14
+_NEGLIGIBLE = 1e-6  # error of ln frequency that no measurement comes near
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ModalMap:
+    """Chebyshev surrogate of ln frequency over ln health parameters.
+
+    Attributes
+    ----------
+    parameters, modes : tuple of str
+        Names, in the order of the axes below.
+    low, high : ndarray
+        Bounds of ln parameter, shape ``(n_parameters,)``.
+    coefficients : ndarray
+        Tensor Chebyshev coefficients, shape ``(d_1 + 1, ..., d_P + 1, n_modes)``.
+    leave_out_error : ndarray
+        Largest error of ln frequency at inner grid points, each left out of the fit,
+        ``(n_modes,)``.
+    """
+
+    parameters: tuple[str, ...]
+    modes: tuple[str, ...]
+    low: FloatArray
+    high: FloatArray
+    coefficients: FloatArray
+    leave_out_error: FloatArray
+
+    def inside(self, x: FloatArray) -> BoolArray:
+        """Tell which points lie inside the grid.
+
+        Parameters
+        ----------
+        x : ndarray
+            ln parameters, shape ``(n_points, n_parameters)``.
+
+        Returns
+        -------
+        ndarray of bool
+            Shape ``(n_points,)``.
+        """
+        return np.asarray(np.all((x >= self.low) & (x <= self.high), axis=-1))
+
+    def ln_frequency(self, x: FloatArray) -> FloatArray:
+        """Evaluate ln frequency for many points in one call.
+
+        Parameters
+        ----------
+        x : ndarray
+            ln parameters, shape ``(n_points, n_parameters)``.
+
+        Returns
+        -------
+        ndarray
+            ln of frequency in Hz, shape ``(n_points, n_modes)``.
+
+        Raises
+        ------
+        OutsideMap
+            If a point lies outside the grid; maps are never extrapolated.
+        """
+        return _evaluate(self.coefficients, self._unit(x))
+
+    def gradient(self, x: FloatArray) -> FloatArray:
+        """Differentiate ln frequency by the ln parameters, for many points in one call.
+
+        The derivative is that of the polynomial, so that it holds at the ends of the grid too.
+
+        Parameters
+        ----------
+        x : ndarray
+            ln parameters, shape ``(n_points, n_parameters)``.
+
+        Returns
+        -------
+        ndarray
+            d ln frequency / d ln parameter, shape ``(n_points, n_modes, n_parameters)``.
+
+        Raises
+        ------
+        OutsideMap
+            If a point lies outside the grid; maps are never extrapolated.
+        """
+        unit = self._unit(x)
+        slopes = [
+            _evaluate(chebder(self.coefficients, scl=scale, axis=axis), unit)
+            for axis, scale in enumerate(2 / (self.high - self.low))
+        ]
+        return np.stack(slopes, axis=-1)
+
+    def _unit(self, x: FloatArray) -> FloatArray:
+        """Scale points to the range -1 to 1 of the polynomials; refuse those outside."""
+        inside = self.inside(x)
+        if not inside.all():
+            worst = np.exp(x[~inside][0])
+            raise OutsideMap(
+                f"parameters {dict(zip(self.parameters, worst.tolist(), strict=True))} lie outside "
+                f"the modal map ({np.exp(self.low)} to {np.exp(self.high)}); make a wider map"
+            )
+        return np.asarray(2 * (x - self.low) / (self.high - self.low) - 1)
+
+
+def read_map(path: str, parameters: tuple[str, ...]) -> ModalMap:
+    """Read a modal map and fit its surrogate.
+
+    Parameters
+    ----------
+    path : str
+        CSV with one column per parameter, then ``mode`` and ``frequency_hz``; a full grid.
+    parameters : tuple of str
+        Columns to use as health parameters.
+
+    Raises
+    ------
+    BadStage
+        If columns are missing, values are not positive, or the grid is not full.
+    """
+    try:
+        # Blank lines count, so that a row is told by its line.
+        table = pd.read_csv(path, skip_blank_lines=False).dropna(how="all")
+    except (OSError, ValueError) as error:
+        why = getattr(error, "strerror", None) or error
+        raise BadStage(f"{path}: cannot read the modal map: {why}") from error
+    missing = {*parameters, "mode", "frequency_hz"} - set(table.columns)
+    if missing:
+        # A description may name any file, and what is no map at all is nobody's business.
+        is_map = missing != {*parameters, "mode", "frequency_hz"}
+        there = f"there are {list(table.columns)}" if is_map else "it is no modal map"
+        raise BadStage(f"{path}: no column {sorted(missing)}; {there}")
+    extra = set(table.columns) - {*parameters, "mode", "frequency_hz"}
+    if extra:
+        raise BadStage(
+            f"{path}: columns {sorted(extra)} are no parameter of the stage description; "
+            "describe them as [[parameter]] or make the map without them"
+        )
+    numbers = table[[*parameters, "frequency_hz"]].apply(pd.to_numeric, errors="coerce")
+    for name, column in numbers.items():
+        wrong = ~(np.isfinite(column) & (column > 0)).to_numpy()
+        if wrong.any():
+            cell = table[name].iloc[wrong.argmax()]
+            raise BadStage(
+                f"{_line(path, table, wrong)}: {name} is {cell}; needed is a positive number"
+            )
+    unnamed = table["mode"].isna().to_numpy()
+    if unnamed.any():
+        raise BadStage(f"{_line(path, table, unnamed)}: a mode without a name")
+    table = table.assign(**numbers, mode=table["mode"].astype(str))
+    twice = table.duplicated([*parameters, "mode"]).to_numpy()
+    if twice.any():
+        raise BadStage(f"{_line(path, table, twice)}: a mode stands twice at one grid point")
+    return _fit(path, table, parameters)
+
+
+def _line(path: str, table: pd.DataFrame, wrong: BoolArray) -> str:
+    """Name the line of the first row that is meant; the first line has the columns' names."""
+    return f"{path}: line {table.index[wrong][0] + 2}"
+
+
+def _fit(path: str, table: pd.DataFrame, parameters: tuple[str, ...]) -> ModalMap:
+    modes = tuple(table["mode"].unique())
+    wide = table.pivot(index=list(parameters), columns="mode", values="frequency_hz")
+    axes = [np.unique(table[name]) for name in parameters]
+    n_grid = int(np.prod([axis.size for axis in axes]))
+    values = wide[list(modes)].to_numpy(dtype=float)
+    if values.shape[0] != n_grid or np.isnan(values).any():
+        raise BadStage(
+            f"{path}: {np.isfinite(values).sum()} values where a full grid of {n_grid} points "
+            f"with modes {list(modes)} needs {n_grid * len(modes)}"
+        )
+    if min(axis.size for axis in axes) < 3:
+        sizes = {name: axis.size for name, axis in zip(parameters, axes, strict=True)}
+        raise BadStage(f"{path}: every parameter needs at least 3 grid values, there are {sizes}")
+    points = np.log(wide.index.to_frame().to_numpy(dtype=float))
+    low, high = points.min(axis=0), points.max(axis=0)
+    unit = 2 * (points - low) / (high - low) - 1
+    degrees, miss = _choose_degrees(unit, np.log(values), [axis.size for axis in axes])
+    return ModalMap(
+        parameters=parameters,
+        modes=modes,
+        low=low,
+        high=high,
+        coefficients=_least_squares(unit, np.log(values), degrees),
+        leave_out_error=miss,
+    )
+
+
+def _evaluate(coefficients: FloatArray, unit: FloatArray) -> FloatArray:
+    """Sum a tensor Chebyshev series at points ``(n_points, n_parameters)`` from -1 to 1."""
+    shape = coefficients.shape
+    # The last parameter axis is contracted by one matrix product for all points and modes;
+    # what is left is small.
+    basis = _polynomials(unit[:, -1], shape[-2])
+    last = np.moveaxis(coefficients, -2, 0).reshape(shape[-2], -1)
+    value = (basis @ last).reshape(-1, *shape[:-2], shape[-1])
+    for axis in reversed(range(unit.shape[1] - 1)):
+        basis = _polynomials(unit[:, axis], shape[axis])
+        value = np.einsum("n...km,nk->n...m", value, basis)
+    return np.asarray(value)
+
+
+def _polynomials(unit: FloatArray, n: int) -> FloatArray:
+    """Chebyshev polynomials 0 … n-1 at points from -1 to 1, shape ``(n_points, n)``."""
+    # numpy's chebvander spends more on bookkeeping than on the few points of a step of walkers.
+    value = np.ones((n, unit.size))
+    if n > 1:
+        value[1] = unit
+    twice = 2 * unit
+    for k in range(2, n):
+        np.multiply(twice, value[k - 1], out=value[k])
+        value[k] -= value[k - 2]
+    return value.T
+
+
+def _basis(unit: FloatArray, degrees: list[int]) -> FloatArray:
+    basis = np.ones((unit.shape[0], 1))
+    for axis, degree in enumerate(degrees):
+        vander = _polynomials(unit[:, axis], degree + 1)
+        basis = (basis[:, :, None] * vander[:, None, :]).reshape(unit.shape[0], -1)
+    return basis
+
+
+def _least_squares(unit: FloatArray, values: FloatArray, degrees: list[int]) -> FloatArray:
+    solution = np.linalg.lstsq(_basis(unit, degrees), values, rcond=None)[0]
+    return np.asarray(solution.reshape(*[d + 1 for d in degrees], values.shape[1]))
+
+
+def _choose_degrees(
+    unit: FloatArray, values: FloatArray, sizes: list[int]
+) -> tuple[list[int], FloatArray]:
+    """Choose one degree for all axes by the error at points left out, each by itself.
+
+    Corners and edges stay in: without them the fit would extrapolate, which it is never asked to.
+    What a fit without a point misses there is r / (1 - h), with the residual r and the leverage h
+    of the fit with it.
+    """
+    interior = np.all(np.abs(unit) < 1 - 1e-9, axis=1)
+    best: tuple[list[int], FloatArray] | None = None
+    for degree in range(1, min(max(sizes) - 1, _MAX_DEGREE) + 1):
+        # One degree less than the axis can carry, so that leaving points out stays well posed.
+        degrees = [min(degree, size - 2) for size in sizes]
+        span = np.linalg.qr(_basis(unit, degrees))[0]
+        residual = values - span @ (span.T @ values)
+        rest = 1 - np.sum(span**2, axis=1)
+        error = np.abs(residual / rest[:, None])[interior].max(axis=0)
+        if best is None or error.max() < best[1].max():
+            best = degrees, error
+        if error.max() < _NEGLIGIBLE:
+            break
+    assert best is not None  # sizes are at least 3: degree 1 is always tried
+    return best

@@ -1,0 +1,1 @@
+"""Kalman filtering of modal estimates over the life of a machine."""

@@ -1,0 +1,1 @@
+"""Data association of modal estimates (multiple hypotheses)."""

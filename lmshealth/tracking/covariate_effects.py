@@ -1,0 +1,152 @@
+"""What temperature, payload and the like do to the modes: taken out of them, log by log."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from lmshealth._arrays import FloatArray, expect_shape, freeze
+from lmshealth.stage.description import Stage
+from lmshealth.tracking.history import believed
+from lmshealth.tracking.results import Effect, History, Track
+from lmshealth.tracking.smoother import smooth
+from lmshealth.tracking.state_space import MOVES, Regressor, regressors
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Influence:
+    """What a covariate does to a mode: its effects beside the estimates that they were found from.
+
+    Attributes
+    ----------
+    mode, covariate : str
+        Names.
+    reference : float
+        The covariate at which the effect is zero.
+    effects : tuple of Effect
+        Per unit, and where the description has a curvature per unit squared.
+    epochs : ndarray of int
+        Logs of the estimates, shape ``(n,)``.
+    values : ndarray
+        The covariate in these logs, shape ``(n,)``.
+    measured : ndarray
+        ln f less all that moves it but this covariate: wear, steps, biases and other covariates,
+        as all logs together tell them; shape ``(n,)``. Their level follows the logs, so that what
+        is left scatters less than the estimates are uncertain.
+    """
+
+    mode: str
+    covariate: str
+    reference: float
+    effects: tuple[Effect, ...]
+    epochs: np.ndarray
+    values: FloatArray
+    measured: FloatArray
+
+    def __post_init__(self) -> None:
+        for name in ("values", "measured"):
+            expect_shape(name, getattr(self, name), self.epochs.shape)
+        freeze(self)
+
+    def explained(self, values: FloatArray) -> FloatArray:
+        """Change of ln f at some values of the covariate, shape of ``values``."""
+        offset = values - self.reference
+        return np.asarray(sum(e.coefficient * offset**p for p, e in enumerate(self.effects, 1)))
+
+    def explained_std(self, values: FloatArray) -> FloatArray | None:
+        """Its standard deviation; None with a curvature, because only each alone is known."""
+        if len(self.effects) > 1:
+            return None
+        return np.abs(values - self.reference) * self.effects[0].std
+
+    @property
+    def corrected(self) -> FloatArray:
+        """What is left of the measured changes, shape ``(n,)``."""
+        return self.measured - self.explained(self.values)
+
+    @property
+    def seen(self) -> bool:
+        """Whether any of the effects is more than two standard deviations from zero."""
+        return any(abs(effect.coefficient) > 2 * effect.std for effect in self.effects)
+
+
+def find_influences(history: History, track: Track, stage: Stage) -> tuple[Influence, ...]:
+    """Compare what covariates explain with the estimates, mode by mode.
+
+    Parameters
+    ----------
+    history : History
+        Modal estimates; those that the track hardly believed are left out.
+    track : Track
+        Their track.
+    stage : Stage
+        Its description, which names the covariates.
+
+    Returns
+    -------
+    tuple of Influence
+        Covariate by covariate, in the order of the description; none for a covariate that is
+        unknown or never left its reference.
+    """
+    columns = regressors(history.covariates, stage)
+    if not columns:
+        return ()
+    taken, known = believed(history, track), {(e.mode, e.covariate): e for e in track.effects}
+    level = smooth(taken, track, stage).ln_frequency
+    modes = [one.mode for one in taken.series]
+    moved = covariate_shifts(history, track, stage)
+    places = [track.modes.index(mode) for mode in modes]
+    rest = taken.ln_frequency - level[:, places] - moved[:, places] - _offsets(taken, known)
+    found = []
+    for covariate in stage.description.covariate:
+        own = [r for r in columns if r.name.removesuffix("^2") == covariate.name]
+        for mode in track.modes if own else ():
+            effects = tuple(known[mode, r.name] for r in own)
+            at = [i for i, name in enumerate(modes) if name == mode]
+            there = (
+                np.isfinite(rest[:, at]) & np.isfinite(history.covariates[covariate.name])[:, None]
+            )
+            epochs, series = np.nonzero(there)
+            explained = _explained(own, effects)
+            found.append(
+                Influence(
+                    mode=mode,
+                    covariate=covariate.name,
+                    reference=covariate.reference,
+                    effects=effects,
+                    epochs=epochs,
+                    values=history.covariates[covariate.name][epochs],
+                    measured=rest[:, at][epochs, series] + explained[epochs],
+                )
+            )
+    return tuple(found)
+
+
+def covariate_shifts(history: History, track: Track, stage: Stage) -> FloatArray:
+    """Give how far covariates have moved ln f of every mode, shape ``(n_logs, n_modes)``."""
+    columns = regressors(history.covariates, stage)
+    known = {(e.mode, e.covariate): e for e in track.effects}
+    moved = np.zeros((len(history.logs), len(track.modes)))
+    for m, mode in enumerate(track.modes):
+        moved[:, m] += _explained(columns, tuple(known[mode, r.name] for r in columns))
+    return moved
+
+
+def _explained(columns: Sequence[Regressor], effects: Sequence[Effect]) -> FloatArray:
+    return np.asarray(sum(e.coefficient * r.values for r, e in zip(columns, effects, strict=True)))
+
+
+def _offsets(history: History, known: dict[tuple[str, str], Effect]) -> FloatArray:
+    """Give how far sources, tunings and sensors read ln f off, shape ``(n_logs, n_series)``."""
+    offsets = np.zeros_like(history.ln_frequency)
+    for i, one in enumerate(history.series):
+        bias = known.get((one.mode, f"bias:{one.source}"))
+        offsets[:, i] = 0.0 if bias is None else bias.coefficient
+        for step in history.steps:
+            if step.kind in MOVES or step.source not in ("", one.source):
+                continue
+            effect = known[one.mode, f"{step.kind}:{step.name or step.source}"]
+            offsets[step.there, i] += effect.coefficient
+    return offsets

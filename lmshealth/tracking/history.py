@@ -1,0 +1,443 @@
+"""Histories: the modal estimates of one machine put in order, each given to its mode."""
+
+from __future__ import annotations
+
+from bisect import bisect_right
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
+
+import numpy as np
+
+from lmshealth._arrays import FloatArray
+from lmshealth.errors import NotEnoughData
+from lmshealth.io.log import Metadata, Refusal
+from lmshealth.modal.modes import Modes
+from lmshealth.signal.waterfall import Levels
+from lmshealth.stage.description import Stage
+from lmshealth.tracking.association.associate import Association, associate
+from lmshealth.tracking.association.estimates import Estimates
+from lmshealth.tracking.maintenance import RESETS, Action
+from lmshealth.tracking.results import History, Series, Step, StepKind, Track
+from lmshealth.tracking.state_space import Regressor, regressors
+
+# Sources in the order in which they stand where a mode has several.
+_SOURCES = ("joint", "acc", "frf", "delta_e")
+# So many logs in a row without a clear identity are worth a word.
+_LATE = 3
+# From one log to the next ln f stays within that, and so many standard deviations of its error and
+# of what covariates may do.
+_STILL = 0.003
+_JUMP_SIGMAS = 6.0
+_PRIOR_SIGMAS = 2.0
+_KINDS: dict[str, StepKind] = {"regrease": "regreasing", "servo": "servo", "sensor": "sensor"}
+_NO_MOMENT = datetime.max.replace(tzinfo=UTC)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Reading:
+    r"""What one log said.
+
+    Attributes
+    ----------
+    log : str
+        Its name.
+    digest : str
+        SHA-256 of its content.
+    metadata : Metadata
+        With identity, moment and odometer.
+    modes : Modes
+        Its modal estimates.
+    loop_error : float or None
+        RMS of the following error from 1 to 40 Hz in m, see `loop_error` of `following`; None
+        where the log does not tell.
+    levels : Levels or None
+        The band of the tracked modes, for people to look at; None where the log does not show it.
+
+    Examples
+    --------
+    Of a log of noise alone, which shows no mode:
+
+    >>> import numpy as np
+    >>> import lmshealth
+    >>> noise = np.random.default_rng(1).standard_normal(20_000)
+    >>> head = "# sample_rate_hz: 1000\n# stage: AX-3-Y\n# travel_km: 12.5\nacc_pitch_m_s2"
+    >>> np.savetxt("log.csv", noise, header=head, comments="")
+    >>> log = lmshealth.read_log("log.csv")
+    >>> modes = lmshealth.identify(log, lmshealth.load_stage("lms-y"))
+    >>> reading = lmshealth.Reading(log.name, log.digest, log.metadata, modes)
+    >>> reading.metadata.stage, reading.metadata.travel, reading.modes.names
+    ('AX-3-Y', 12500.0, ())
+    >>> [(refusal.mode, refusal.reason) for refusal in reading.modes.refused]
+    [('roll', 'not-excited'), ('pitch', 'not-excited'), ('yaw', 'not-excited')]
+    """
+
+    log: str
+    digest: str
+    metadata: Metadata
+    modes: Modes
+    loop_error: float | None = None
+    levels: Levels | None = None
+
+
+def in_order(readings: Sequence[Reading]) -> tuple[Reading, ...]:
+    """Sort readings by the moment of recording, then by name."""
+    return tuple(sorted(readings, key=lambda r: (r.metadata.recorded_at or _NO_MOMENT, r.log)))
+
+
+def build_history(
+    readings: Sequence[Reading], stage: Stage | None = None, actions: Sequence[Action] = ()
+) -> tuple[History, list[Refusal]]:
+    """Line up the modes of one machine.
+
+    Parameters
+    ----------
+    readings : sequence of Reading
+        Logs of one machine in any order, with identity and moment; the odometer is the clock where
+        every log has it, else the time is.
+    stage : Stage, optional
+        Says which modes are tracked; without it all are, and those without a name are named by
+        their frequency.
+    actions : sequence of Action
+        What was done to the machine. Work on guide or mount opens a new baseline; a regreasing, a
+        retuning and a new sensor are steps, as is every change of ``servo_id``.
+
+    Returns
+    -------
+    history : History
+        In the order of recording. Its first baseline is the first log that the manifest declares
+        one, else the first log.
+    refused : list of Refusal
+        Logs whose odometer contradicts the others, which are left out, and estimates that cannot
+        be given to a mode, which are missing.
+
+    Raises
+    ------
+    NotEnoughData
+        If there is no reading.
+
+    Examples
+    --------
+    >>> import lmshealth
+    >>> from lmshealth import examples
+    >>> stage = lmshealth.load_stage("lms-y")
+    >>> history, refused = lmshealth.build_history(examples.readings(), stage)
+    >>> len(history.logs), len(refused), history.modes
+    (24, 0, ('roll', 'pitch', 'yaw'))
+    >>> print(f"{history.travel[-1] / 1000:.0f} km")
+    1632 km
+    """
+    if not readings:
+        name = "" if stage is None else f"{stage.name}: "
+        raise NotEnoughData(f"{name}no usable log")
+    ordered, refused = _without_contradictions(in_order(readings))
+    travel = np.array(
+        [np.nan if r.metadata.travel is None else r.metadata.travel for r in ordered], dtype=float
+    )
+    moments = tuple(r.metadata.recorded_at or _NO_MOMENT for r in ordered)
+    has_odometer = bool(np.isfinite(travel).all())
+    clock = travel if has_odometer else np.array([moment.timestamp() for moment in moments])
+    covariates = _covariates(ordered)
+    steps = _steps(ordered, actions)
+    resets = [step.first for step in steps if step.kind == "reset"]
+    regressed = regressors(covariates, stage)
+    estimates = _estimates(ordered, stage)
+    found = associate(
+        estimates,
+        clock,
+        offsets=np.array([one.values for one in regressed]).reshape(-1, len(ordered)).T,
+        prior_std=np.array([one.prior_std for one in regressed]),
+        jumps={step.first for step in steps} | _common_jumps(estimates, regressed),
+    )
+    refused += _doubts(ordered, estimates, found)
+    modes, series, columns = _line_up(estimates, found, stage)
+    declared = [k for k, reading in enumerate(ordered) if reading.metadata.baseline]
+    history = History(
+        stage=str(ordered[0].metadata.stage),
+        logs=tuple(reading.log for reading in ordered),
+        recorded_at=moments,
+        travel=travel if has_odometer else np.full_like(travel, np.nan),
+        covariates=covariates,
+        modes=modes,
+        series=series,
+        **columns,
+        loop_error=np.array([r.loop_error or np.nan for r in ordered], dtype=float),
+        baselines=_baselines(declared, resets, len(ordered)),
+        steps=steps,
+    )
+    return history, refused
+
+
+def _without_contradictions(
+    ordered: tuple[Reading, ...],
+) -> tuple[tuple[Reading, ...], list[Refusal]]:
+    """Keep the longest run of logs whose odometer never runs backwards.
+
+    One mistyped odometer contradicts all logs after or before it; it is the odd one out that goes.
+    """
+    if any(reading.metadata.travel is None for reading in ordered):
+        return ordered, []
+    travel = [float(reading.metadata.travel or 0.0) for reading in ordered]
+    # Longest non-decreasing subsequence: the lowest end of a run of each length, and its log.
+    ends: list[float] = []
+    logs: list[int] = []
+    before = [-1] * len(travel)
+    for k, own in enumerate(travel):
+        place = bisect_right(ends, own)
+        before[k] = logs[place - 1] if place else -1
+        ends[place : place + 1], logs[place : place + 1] = [own], [k]
+    kept: set[int] = set()
+    at = logs[-1] if logs else -1
+    while at >= 0:
+        kept.add(at)
+        at = before[at]
+    refused = [
+        Refusal(
+            log=reading.log,
+            reason="odometer",
+            detail=f"travel_km {travel[k] / 1000:g} contradicts the logs recorded before or after "
+            "it: an odometer never runs backwards; correct it in manifest.csv",
+        )
+        for k, reading in enumerate(ordered)
+        if k not in kept
+    ]
+    return tuple(ordered[k] for k in sorted(kept)), refused
+
+
+def _covariates(ordered: Sequence[Reading]) -> dict[str, FloatArray]:
+    names = sorted({name for reading in ordered for name in reading.metadata.covariates})
+    return {
+        name: np.array([r.metadata.covariates.get(name, np.nan) for r in ordered], dtype=float)
+        for name in names
+    }
+
+
+def _steps(ordered: Sequence[Reading], actions: Sequence[Action]) -> tuple[Step, ...]:
+    """Say what is known to have happened between the logs."""
+    moments = [reading.metadata.recorded_at for reading in ordered]
+    steps: list[Step] = []
+    ids = np.array([reading.metadata.servo_id or "" for reading in ordered])
+    known = [name for name in dict.fromkeys(ids.tolist()) if name]
+    for name in known[1:]:
+        there = ids == name
+        steps.append(Step("servo", int(np.argmax(there)), there, name=name))
+    retuned = {step.first for step in steps}
+    for action in sorted(actions, key=lambda action: action.recorded_at):
+        later = np.array([m is not None and m >= action.recorded_at for m in moments])
+        first = int(np.argmax(later))
+        # Before the first log and after the last nothing is seen of it.
+        if not later.any() or first == 0:
+            continue
+        kind: StepKind = "reset" if action.action in RESETS else _KINDS[action.action]
+        # A retuning that comes with a new servo_id is one step, not two.
+        if kind == "servo" and first in retuned:
+            continue
+        name = action.recorded_at.date().isoformat()
+        steps.append(Step(kind, first, np.arange(len(ordered)) >= first, name=name))
+    return tuple(sorted(steps, key=lambda step: step.first))
+
+
+def _baselines(declared: list[int], resets: list[int], n_logs: int) -> tuple[int, ...]:
+    """Give the log at which each baseline begins: the first declared one since the last reset."""
+    begins = [0, *resets]
+    ends = [*resets, n_logs]
+    chosen = [
+        next((k for k in declared if begin <= k < end), begin)
+        for begin, end in zip(begins, ends, strict=True)
+    ]
+    return tuple(dict.fromkeys(chosen))
+
+
+def _estimates(ordered: Sequence[Reading], stage: Stage | None) -> list[Estimates]:
+    """Give what each log says of the modes that are tracked, with shapes over all channels."""
+    tracked = None if stage is None else {mode.name for mode in stage.modes if mode.tracked}
+    channels = list(dict.fromkeys(c for r in ordered for c in r.modes.shape_channels))
+    estimates = []
+    for reading in ordered:
+        modes = reading.modes
+        named = [_named(modes, i, stage) for i in range(len(modes.names))]
+        kept = np.array([i for i, n in enumerate(named) if tracked is None or n in tracked], int)
+        shapes = np.full((kept.size, len(channels)), np.nan)
+        places = [channels.index(channel) for channel in modes.shape_channels]
+        shapes[:, places] = modes.shapes[kept]
+        both = np.concatenate([kept, kept + len(modes.names)])
+        estimates.append(
+            Estimates(
+                names=tuple(named[i] for i in kept),
+                sources=tuple(modes.sources[i] for i in kept),
+                ln_frequency=modes.ln_frequency[kept],
+                ln_damping=modes.ln_damping[kept],
+                cov=modes.cov[np.ix_(both, both)],
+                shapes=shapes,
+            )
+        )
+    return estimates
+
+
+def _common_jumps(estimates: Sequence[Estimates], regressed: Sequence[Regressor]) -> set[int]:
+    """Find logs in which several named modes are off at once, at places where no other mode was.
+
+    A crash moves all modes: their names are then worth more than their places. Where the places
+    are those of other modes, the names may be wrong, and it is no such log.
+    """
+    last: dict[tuple[str, str], tuple[float, float, int]] = {}
+    jumps: set[int] = set()
+    for k, own in enumerate(estimates):
+        keys = list(zip(own.names, own.sources, strict=True))
+        variance = np.diag(own.cov)[: len(keys)]
+        elsewhere = set()
+        for i, key in enumerate(keys):
+            if not key[0] or key not in last:
+                continue
+            change = sum(
+                one.prior_std * abs(float(one.values[k] - one.values[last[key][2]]))
+                for one in regressed
+            )
+            near = [
+                other
+                for other, (place, spread, _) in last.items()
+                if other[1] == key[1]
+                and abs(own.ln_frequency[i] - place)
+                <= _STILL + _PRIOR_SIGMAS * change + _reach(variance[i], spread)
+            ]
+            if not near:
+                elsewhere.add(key[0])
+        if len(elsewhere) > 1:
+            jumps.add(k)
+        last |= {
+            key: (float(own.ln_frequency[i]), float(variance[i]), k)
+            for i, key in enumerate(keys)
+            if key[0]
+        }
+    return jumps
+
+
+def _reach(variance: float, other: float) -> float:
+    return _JUMP_SIGMAS * float(np.sqrt(variance + other))
+
+
+def _named(modes: Modes, i: int, stage: Stage | None) -> str:
+    """Name of an estimate; without one, that of the nearest mode of the stage within its search."""
+    if modes.names[i] or stage is None:
+        return modes.names[i]
+    found = float(modes.frequency[i])
+    away = {m.name: abs(found / m.frequency_hz - 1) for m in stage.modes if m.tracked}
+    near = [m.name for m in stage.modes if m.tracked and away[m.name] <= m.search]
+    return min(near, key=lambda name: away[name], default="")
+
+
+def _doubts(
+    ordered: Sequence[Reading], estimates: Sequence[Estimates], found: Association
+) -> list[Refusal]:
+    """Tell which estimates are given to no mode. Of a jump the tracker decides."""
+    return [
+        Refusal(
+            log=ordered[doubt.epoch].log,
+            mode=estimates[doubt.epoch].names[doubt.estimate],
+            source=estimates[doubt.epoch].sources[doubt.estimate],
+            reason=doubt.reason,
+            detail=doubt.detail,
+        )
+        for doubt in found.doubts
+        if doubt.reason != "jump"
+    ]
+
+
+def _line_up(
+    estimates: Sequence[Estimates], found: Association, stage: Stage | None
+) -> tuple[tuple[str, ...], tuple[Series, ...], dict[str, FloatArray]]:
+    """Give every mode and source its column; what is missing is NaN."""
+    jumps = {
+        (d.epoch, d.estimate): estimates[d.epoch].names[d.estimate]
+        for d in found.doubts
+        if d.reason == "jump"
+    }
+    given = [
+        [jumps.get((k, i), mode) for i, mode in enumerate(own)]
+        for k, own in enumerate(found.assigned)
+    ]
+    seen = {
+        (mode, source)
+        for own, one in zip(given, estimates, strict=True)
+        for mode, source in zip(own, one.sources, strict=True)
+        if mode is not None
+    }
+    order = found.modes
+    if stage is not None:
+        order = tuple(mode.name for mode in stage.modes if mode.tracked)
+    named = {mode for mode, _ in seen}
+    modes = tuple(mode for mode in order if mode in named)
+    sources = sorted({source for _, source in seen}, key=_rank)
+    series = tuple(Series(m, s) for m in modes for s in sources if (m, s) in seen)
+    places = {(one.mode, one.source): i for i, one in enumerate(series)}
+    n, r = len(estimates), len(series)
+    ln_f, ln_zeta = np.full((n, r), np.nan), np.full((n, r), np.nan)
+    cov = np.full((n, 2 * r, 2 * r), np.nan)
+    for k, (own, one) in enumerate(zip(given, estimates, strict=True)):
+        pairs = [
+            (places[mode, source], i)
+            for i, (mode, source) in enumerate(zip(own, one.sources, strict=True))
+            if mode is not None and (mode, source) in places
+        ]
+        if not pairs:
+            continue
+        to, of = (np.array(side) for side in zip(*pairs, strict=True))
+        ln_f[k, to], ln_zeta[k, to] = one.ln_frequency[of], one.ln_damping[of]
+        to, of = np.concatenate([to, to + r]), np.concatenate([of, of + len(own)])
+        cov[k][np.ix_(to, to)] = one.cov[np.ix_(of, of)]
+    return modes, series, {"ln_frequency": ln_f, "ln_damping": ln_zeta, "cov": cov}
+
+
+def _rank(source: str) -> tuple[int, str]:
+    return (_SOURCES.index(source) if source in _SOURCES else len(_SOURCES), source)
+
+
+def lost_notes(history: History, refused: Sequence[Refusal]) -> list[str]:
+    """Say which modes are no longer seen or told apart, so that nothing new is known of them."""
+    last = history.logs[-_LATE:]
+    doubted = {
+        name: {r.log for r in refused if (r.reason, r.mode) == ("ambiguous", name)} & set(last)
+        for name in history.modes
+    }
+    lost = [name for name, logs in doubted.items() if len(last) == _LATE == len(logs)]
+    notes = []
+    if lost:
+        notes.append(
+            f"{' and '.join(lost)}: the last {_LATE} logs do not tell which mode their estimates "
+            "are of, so that nothing new is known; logs with more channels would tell modes by "
+            "their shapes."
+        )
+    for name in history.modes:
+        seen, _ = np.nonzero(np.isfinite(history.ln_frequency[:, history.columns(name)]))
+        missed = len(history.logs) - 1 - int(seen.max(initial=-1))
+        if missed >= _LATE and name not in lost:
+            notes.append(f"{name}: no estimate in the last {missed} logs; nothing new is known.")
+    return notes
+
+
+def believed(history: History, followed: Track) -> History:
+    """Give a history as its track takes it: with all steps, without the outliers."""
+    values = [np.array(part) for part in (history.ln_frequency, history.ln_damping, history.cov)]
+    ln_f, ln_zeta, cov = values
+    r = len(history.series)
+    for k, mode in followed.outliers:
+        own = history.columns(mode)
+        ln_f[k, own] = ln_zeta[k, own] = np.nan
+        both = [*own, *(r + i for i in own)]
+        cov[k, both], cov[k][:, both] = np.nan, np.nan
+    return replace(history, ln_frequency=ln_f, ln_damping=ln_zeta, cov=cov, steps=followed.steps)
+
+
+def doubted(history: History, followed: Track) -> list[Refusal]:
+    """Tell which estimates the track hardly believed."""
+    refused = []
+    for k, mode in followed.outliers:
+        i, own = followed.modes.index(mode), history.columns(mode)
+        found = float(np.exp(np.nanmean(history.ln_frequency[k, own])))
+        before = float(np.exp(followed.ln_frequency[max(k - 1, 0), i]))
+        detail = (
+            f"{found:.5g} Hz, or its damping, lies far from what all logs before it tell "
+            f"({before:.5g} Hz): a jump is believed once the next log confirms it"
+        )
+        refused.append(Refusal(log=history.logs[k], mode=mode, reason="jump", detail=detail))
+    return refused

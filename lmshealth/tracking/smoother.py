@@ -1,0 +1,118 @@
+"""Smoother: what all logs together say of every epoch, later ones included."""
+
+from __future__ import annotations
+
+import numpy as np
+from filterpy.kalman import KalmanFilter
+
+from lmshealth._arrays import FloatArray
+from lmshealth.stage.description import Stage
+from lmshealth.tracking.filter_bank import Bank, Filter, Settings
+from lmshealth.tracking.results import History, Smoothed, Track
+from lmshealth.tracking.state_space import state_space
+
+# Settings that together have less of the posterior are left out.
+_SHARE = 1e-3
+# Eigenvalues of correlations below are rounding.
+_SINGULAR = 1e-10
+
+
+def smooth(history: History, followed: Track, stage: Stage | None = None) -> Smoothed:
+    """Smooth a track by the Rauch-Tung-Striebel recursion under every likely setting.
+
+    Parameters
+    ----------
+    history : History
+        Modal estimates.
+    followed : Track
+        The history's track, whose steps are let happen where they did.
+    stage : Stage, optional
+        As for `track`.
+
+    References
+    ----------
+    Rauch1965.
+    """
+    space = state_space(history, stage, followed.steps)
+    # Where a chapter begins the track lets rates be unknown anew.
+    begun = {step.first for step in followed.steps if step.kind == "reset" or not step.declared}
+    filters = Filter(space, history.baselines, begun - {0})
+    bank = filters.advance(filters.start(), 0, len(history.logs) - 1)
+    order = np.argsort(bank.weight)
+    bank = bank.only(order[np.cumsum(bank.weight[order]) > _SHARE])
+    weight = bank.weight
+    runs = [smooth_one(filters, bank.settings.only(np.array([g]))) for g in range(weight.size)]
+    mean = np.einsum("g,gki->ki", weight, [run[0] for run in runs])
+    cov = np.einsum("g,gkij->kij", weight, [run[1] for run in runs])
+    for share, (own, _) in zip(weight, runs, strict=True):
+        off = own - mean
+        cov += share * off[:, :, None] * off[:, None, :]
+    contrast = space.drift()
+    size = contrast.shape[1]
+    drift = mean[:, :size] @ contrast.T
+    variance = np.einsum("mi,kij,mj->km", contrast, cov[:, :size, :size], contrast)
+    early = np.arange(len(history.logs)) < history.baselines[0]
+    drift[early], variance[early] = np.nan, np.nan
+    std = np.sqrt(np.maximum(np.einsum("kii->ki", cov), 0.0)) * followed.widening[:, None]
+    unseen = space.damping.start + np.flatnonzero(np.isnan(followed.ln_damping).all(axis=0))
+    mean[:, unseen], std[:, unseen] = np.nan, np.nan
+    return Smoothed(
+        ln_frequency=mean[:, space.level],
+        ln_frequency_std=std[:, space.level],
+        ln_damping=mean[:, space.damping],
+        ln_damping_std=std[:, space.damping],
+        drift=drift,
+        drift_std=np.sqrt(np.maximum(variance, 0.0)) * followed.widening[:, None],
+    )
+
+
+def smooth_one(filters: Filter, setting: Settings) -> tuple[FloatArray, FloatArray]:
+    """Filter and smooth under one setting: states ``(n, size)`` and covariances."""
+    space = filters.space
+    n, size = len(space.history.logs), space.size
+    kalman = KalmanFilter(dim_x=size, dim_z=1)
+    kalman.x, kalman.P = space.prior()
+    rate = np.arange(space.rate.start, space.rate.stop)
+    kalman.P[rate, rate] = setting.rate_std[0] ** 2
+    means, covs = np.empty((n, size)), np.empty((n, size, size))
+    moves, noises = np.empty((n, size, size)), np.empty((n, size, size))
+    for k in range(n):
+        moves[k], noises[k] = transition(filters, setting, k)
+        kalman.predict(F=moves[k], Q=noises[k])
+        rows = np.flatnonzero(filters.there[k])
+        if rows.size:
+            scale = setting.scales[0, filters.scale_of[rows]]
+            noise = filters.noise[k][np.ix_(rows, rows)] * np.outer(scale, scale)
+            noise += np.diag(filters.extra[k, rows])
+            kalman.update(filters.values[k, rows], R=noise, H=space.matrix(k)[rows])
+        means[k], covs[k] = kalman.x, kalman.P
+    smoothed = kalman.rts_smoother(means, covs, moves, noises, inv=_inverse)
+    return smoothed[0], smoothed[1]
+
+
+def _inverse(cov: FloatArray) -> FloatArray:
+    """Invert a covariance where it is not singular.
+
+    An exact copy of ℓ, and jumps that have not happened yet, make it singular. Of the correlations,
+    because variances of ln ζ lie ten orders of magnitude above those that ln f wanders by.
+    """
+    std = np.sqrt(np.maximum(np.diag(cov), 0.0))
+    scale = np.outer(np.where(std > 0, std, 1.0), np.where(std > 0, std, 1.0))
+    return np.asarray(np.linalg.pinv(cov / scale, rcond=_SINGULAR, hermitian=True) / scale)
+
+
+def transition(filters: Filter, setting: Settings, k: int) -> tuple[FloatArray, FloatArray]:
+    """Give transition matrix and process noise into log k, ``(size, size)`` each.
+
+    They are what `Filter.move` does to one state at a time: to the units of the state, and to the
+    covariance of an exactly known one.
+    """
+    size = filters.space.size
+    unit = Bank(
+        setting.only(np.zeros(size + 1, dtype=int)),
+        np.zeros(size + 1),
+        np.vstack([np.eye(size), np.zeros(size)]),
+        np.zeros((size + 1, size, size)),
+    )
+    filters.move(unit, k)
+    return unit.mean[:-1].T, unit.cov[-1]

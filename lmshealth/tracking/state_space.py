@@ -1,0 +1,258 @@
+"""State space of a machine's modes: what is in the state, how it moves, and how logs see it.
+
+For M modes the state is
+
+    [ℓ, ℓ̇, ln ζ, ℓ₀ | covariates | biases | steps]
+
+each but the biases in blocks of M: ln frequency at the covariates' reference, its rate, ln damping,
+a copy of ℓ at the baseline; a coefficient per regressor; the bias of ln f and of ln ζ of every
+series but the first seen of its mode; and for every step the jumps of ln f and of ln ζ. The copy ℓ₀
+makes the covariance hold Cov(ℓ, ℓ₀), so that the drift ℓ - ℓ₀ has the right variance and the error
+of the baseline stays common to all epochs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from copy import copy
+from dataclasses import dataclass
+
+import numpy as np
+import pandas as pd
+
+from lmshealth._arrays import FloatArray
+from lmshealth.stage.description import Covariate, Stage
+from lmshealth.tracking.results import History, Step, StepKind
+
+_KM = 1000.0
+# Priors. Rates and walks of a mode are per life.
+LN_F_STD = 0.1
+LN_ZETA_STD = 1.0
+DAMPING_WALK = 0.5
+BIAS_STD = (0.005, 0.2)
+UNKNOWN_COVARIATE_STD = 0.001
+# Standard deviations of the jumps of ln f and ln ζ: of a loosened bolt or a crash; of grease; of
+# the loop's poles; of a sensor that was moved or calibrated anew; of an overhaul.
+JUMP_STD: dict[StepKind, tuple[float, float]] = {
+    "step": (0.03, 0.3),
+    "regreasing": (0.0, 0.3),
+    "servo": (0.01, 0.2),
+    "sensor": (0.005, 0.2),
+    "reset": (0.05, 0.5),
+}
+# Kinds that change the modes; the others change how the modes are seen.
+MOVES = ("step", "regreasing", "reset")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Regressor:
+    """One column that ln f depends on without wear.
+
+    Attributes
+    ----------
+    name : str
+        Of the covariate, with ``^2`` for its square.
+    values : ndarray
+        Offset from the reference, 0 where unknown, shape ``(n_logs,)``.
+    prior_std : float
+        Of d ln f per unit.
+    unknown : ndarray
+        Variance that ln f has where the value is unknown, shape ``(n_logs,)``.
+    """
+
+    name: str
+    values: FloatArray
+    prior_std: float
+    unknown: FloatArray
+
+
+def regressors(covariates: Mapping[str, FloatArray], stage: Stage | None) -> tuple[Regressor, ...]:
+    """Take the covariates that are asked for and known in at least one log.
+
+    Without a stage every covariate present is taken, about its median. Keys are column names,
+    values of shape ``(n_logs,)``.
+    """
+    wanted = (
+        stage.description.covariate
+        if stage is not None
+        else tuple(
+            Covariate(name, float(np.nanmedian(values)), UNKNOWN_COVARIATE_STD)
+            for name, values in covariates.items()
+            if np.isfinite(values).any()
+        )
+    )
+    found: list[Regressor] = []
+    for covariate in wanted:
+        values = covariates.get(covariate.name)
+        if values is None or not np.isfinite(values).any():
+            continue
+        known = np.isfinite(values)
+        offset = np.where(known, values - covariate.reference, 0.0)
+        # What never leaves its reference moves nothing.
+        if not offset.any():
+            continue
+        # Of the values up to each log: no log knows of later ones.
+        spread = pd.Series(values).expanding().std(ddof=0).fillna(0.0).clip(lower=1.0).to_numpy()
+        unknown = np.where(known, 0.0, (covariate.prior_std * spread) ** 2)
+        found.append(Regressor(covariate.name, offset, covariate.prior_std, unknown))
+        if covariate.curvature_std:
+            name, std = f"{covariate.name}^2", covariate.curvature_std
+            found.append(Regressor(name, offset**2, std, np.zeros_like(unknown)))
+    return tuple(found)
+
+
+def state_space(history: History, stage: Stage | None, steps: tuple[Step, ...] = ()) -> StateSpace:
+    """Make the state space of a history.
+
+    Rates and walks are counted per horizon of the stage, or without one per length of the history.
+    """
+    life = float(np.ptp(history.clock()))
+    if stage is not None and history.has_odometer:
+        life = stage.description.usage.horizon_km * _KM
+    return StateSpace(history, regressors(history.covariates, stage), life or 1.0, steps)
+
+
+class StateSpace:
+    """Where everything stands in the state, and the matrices of a history.
+
+    Parameters
+    ----------
+    history : History
+        Says which modes and series there are, and when logs were recorded.
+    regressed : tuple of Regressor
+        Covariates.
+    life : float
+        Ticks of the clock that rates and walks are counted per.
+    steps : tuple of Step
+        What happened.
+
+    Attributes
+    ----------
+    size : int
+        Length of the state.
+    ticks : ndarray
+        Parts of a life between each log and the one before, shape ``(n_logs,)``.
+    """
+
+    def __init__(
+        self,
+        history: History,
+        regressed: tuple[Regressor, ...],
+        life: float,
+        steps: tuple[Step, ...] = (),
+    ) -> None:
+        self.history, self.regressed, self.life, self.steps = history, regressed, life, steps
+        m = self.n_modes = len(history.modes)
+        self.level, self.rate, self.damping, self.base = (
+            slice(part * m, (part + 1) * m) for part in range(4)
+        )
+        self.first_bias = (4 + len(regressed)) * m
+        self.biased = self._biased()
+        self.first_step = self.first_bias + 2 * len(self.biased)
+        self.size = self.first_step + 2 * m * len(steps)
+        self.ticks = np.diff(history.clock(), prepend=history.clock()[:1]) / life
+        self._fixed = self._without_steps()
+        self._read = [(step, self._reading(step)) for step in steps]
+
+    def with_step(self, step: Step) -> StateSpace:
+        """Give the same with one more step at its end: the state only grows."""
+        longer = copy(self)
+        longer.steps = (*self.steps, step)
+        longer.size = self.size + 2 * self.n_modes
+        longer._read = [*self._read, (step, self._reading(step))]
+        return longer
+
+    def matrix(self, k: int) -> FloatArray:
+        """Give the measurement matrix of ``[ln f, ln ζ]`` of log k, ``(2 n_series, size)``."""
+        fixed: FloatArray = self._fixed[k]
+        if not self.steps:
+            return fixed
+        matrix = np.zeros((fixed.shape[0], self.size))
+        matrix[:, : self.first_step] = fixed
+        for j, (step, reading) in enumerate(self._read):
+            if step.there[k]:
+                matrix[:, self.jump(j)] = reading
+        return matrix
+
+    def regressor(self, j: int) -> slice:
+        """Where the coefficients of a regressor stand."""
+        return slice((4 + j) * self.n_modes, (5 + j) * self.n_modes)
+
+    def jump(self, j: int) -> slice:
+        """Where the jumps of a step stand: those of ln f, then those of ln ζ."""
+        first = self.first_step + 2 * self.n_modes * j
+        return slice(first, first + 2 * self.n_modes)
+
+    def _biased(self) -> tuple[int, ...]:
+        """Series that are measured against another: all of a mode but the one seen first."""
+        there = np.isfinite(self.history.ln_frequency)
+        first = np.where(there.any(axis=0), there.argmax(axis=0), len(there))
+        biased: list[int] = []
+        for mode in self.history.modes:
+            own = self.history.columns(mode)
+            reference = min(own, key=lambda i: (first[i], i), default=None)
+            biased += [i for i in self.history.columns(mode) if i != reference]
+        return tuple(biased)
+
+    def _without_steps(self) -> FloatArray:
+        """Give what all logs see of a state without steps, ``(n_logs, 2 n_series, first_step)``."""
+        history, r = self.history, len(self.history.series)
+        mode, series = history.mode_of(), np.arange(r)
+        matrix = np.zeros((len(history.logs), 2 * r, self.first_step))
+        matrix[:, series, mode] = 1
+        matrix[:, r + series, self.damping.start + mode] = 1
+        for j, regressor in enumerate(self.regressed):
+            matrix[:, series, self.regressor(j).start + mode] = regressor.values[:, None]
+        for j, i in enumerate(self.biased):
+            matrix[:, i, self.first_bias + 2 * j] = 1
+            matrix[:, r + i, self.first_bias + 2 * j + 1] = 1
+        return matrix
+
+    def _reading(self, step: Step) -> FloatArray:
+        """Give how a log reads the jumps of a step, ``(2 n_series, 2 n_modes)``.
+
+        What moves the modes themselves is read in them.
+        """
+        series, r, m = self.history.series, len(self.history.series), self.n_modes
+        reading = np.zeros((2 * r, 2 * m))
+        if step.kind not in MOVES:
+            for i, mode in enumerate(self.history.mode_of()):
+                if step.source in ("", series[i].source):
+                    reading[i, mode] = reading[r + i, m + mode] = 1
+        return reading
+
+    def prior(self) -> tuple[FloatArray, FloatArray]:
+        """Mean and covariance before the first log, without rates and steps.
+
+        The centre is each mode's first estimate.
+        """
+        history = self.history
+        mean, std = np.zeros(self.size), np.zeros(self.size)
+        for place, values, width in (
+            (self.level, history.ln_frequency, LN_F_STD),
+            (self.damping, history.ln_damping, LN_ZETA_STD),
+        ):
+            for i, mode in enumerate(history.modes):
+                own = values[:, history.columns(mode)]
+                first = own[np.isfinite(own)][:1]
+                mean[place.start + i] = first[0] if first.size else 0.0
+            std[place] = width
+        for j, regressor in enumerate(self.regressed):
+            std[self.regressor(j)] = regressor.prior_std
+        std[self.first_bias : self.first_step] = np.tile(BIAS_STD, len(self.biased))
+        return mean, np.diag(std**2)
+
+    def unknown(self) -> FloatArray:
+        """Variance that ln f has where a covariate is unknown, shape ``(n_logs,)``."""
+        total = np.zeros(len(self.history.logs))
+        for regressor in self.regressed:
+            total += regressor.unknown
+        return total
+
+    def drift(self) -> FloatArray:
+        """Contrast that makes the drift of a state, shape ``(n_modes, 4 n_modes)``."""
+        m = self.n_modes
+        contrast = np.zeros((m, 4 * m))
+        contrast[:, self.level] = np.eye(m)
+        contrast[:, self.base] = -np.eye(m)
+        return contrast

@@ -1,0 +1,648 @@
+"""The main job: everything is written, nothing is done twice, and nothing but the logs matters."""
+
+from __future__ import annotations
+
+import csv
+import shutil
+import sqlite3
+from collections.abc import Sequence
+from contextlib import closing
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from lmshealth.batch import (
+    assess as assessing,
+)
+from lmshealth.batch import (
+    ingest as intake,
+)
+from lmshealth.batch import (
+    machines as batch,
+)
+from lmshealth.batch import (
+    telling,
+    workers,
+)
+from lmshealth.batch.assess import packed
+from lmshealth.batch.run import RunResult, Settings, report, run
+from lmshealth.batch.store import SCHEMA, Store, beside, read
+from lmshealth.cli.main import main
+from lmshealth.errors import LmshealthError, NothingUsable
+from lmshealth.health.inference import epochs_to_infer, infer
+from lmshealth.io.column_map import ColumnMap
+from lmshealth.io.log import Log
+from lmshealth.modal.modes import Modes
+from lmshealth.prognosis.fleet_prior import Learned
+from lmshealth.prognosis.life_likelihood import scatter_of
+from lmshealth.report.assessment import Assessment
+from lmshealth.report.tables import COLUMNS
+from lmshealth.stage.description import Stage, load_stage
+from lmshealth.tracking.history import Reading
+from studies import servers
+from tests.signals import sine, write_archive, write_archive_stage, write_log
+
+N_LOGS = 6
+
+
+def rows(path: Path) -> list[dict[str, str]]:
+    """Read a table."""
+    with path.open(encoding="utf-8", newline="") as stream:
+        return list(csv.DictReader(stream))
+
+
+def pages(out: Path) -> dict[str, bytes]:
+    """Read all pages of an output folder as bytes."""
+    return {path.name: path.read_bytes() for path in sorted(out.glob("*.html"))}
+
+
+def tables(out: Path) -> dict[str, bytes]:
+    """Read all tables of an output folder as bytes."""
+    return {path.name: path.read_bytes() for path in sorted(out.glob("*.csv"))}
+
+
+def assessments(out: Path) -> list[Assessment]:
+    """Fetch what a run kept of its machines."""
+    with closing(Store(beside(out), create=False)) as store:
+        packed = [store.assessment(told.machine, told.key) for told in store.told()]
+    return [read(content, Assessment) for content in packed if content is not None]
+
+
+@dataclass(frozen=True)
+class Done:
+    """A full run over an archive with three bad logs, what it wrote, and where."""
+
+    logs: Path
+    out: Path
+    stage: Stage
+    result: RunResult
+    written: dict[str, bytes]
+    pages: dict[str, bytes]
+
+
+@pytest.fixture(scope="module")
+def done(tmp_path_factory: pytest.TempPathFactory) -> Done:
+    """Run the main job once on good logs, a copy, a broken file and a foreign machine."""
+    folder = tmp_path_factory.mktemp("archive")
+    stage = load_stage(str(write_archive_stage(folder / "stage")))
+    logs = write_archive(folder / "logs", N_LOGS)
+    (logs / "later").mkdir()
+    shutil.copy(logs / "log-00.h5", logs / "later" / "copy.h5")
+    (logs / "broken.h5").write_bytes(b"no signal at all" * 100)
+    write_log(logs / "foreign.h5", 1.0, 99, stage="other-Z")
+    out = folder / "out"
+    result = run(logs, [stage], out, Settings(epochs=2))
+    return Done(logs, out, stage, result, tables(out), pages(out))
+
+
+@pytest.fixture
+def modes_only(tmp_path: Path) -> Stage:
+    """Load a description without health parameters: quick to run."""
+    return load_stage(str(write_archive_stage(tmp_path / "stage", health=False)))
+
+
+@pytest.mark.slow
+def test_all_tables_and_pages_are_written(done: Done) -> None:
+    """Every table of the contract, the index and a page per stage are there, no half files."""
+    assert set(done.written) == {f"{name}.csv" for name in COLUMNS}
+    assert done.result.index == done.out / "index.html"
+    assert done.result.index.is_file()
+    assert [page.name for page in done.result.pages] == ["test-A.html"]
+    assert all(page.is_file() for page in done.result.pages)
+    assert not list(done.out.glob("*.part"))
+
+
+@pytest.mark.slow
+def test_the_truth_is_found_in_the_tables(done: Done) -> None:
+    """Health at the last epoch is 0.90 within its 5 to 95 % interval widened by its own width."""
+    last = rows(done.out / "health.csv")[-1]
+    low, high = float(last["q05"]), float(last["q95"])
+    assert low - (high - low) < 0.90 < high + (high - low)
+    assert high - low < 0.05
+    assert last["converged"] == "True"
+    assert {row["mode"] for row in rows(done.out / "modes.csv")} == {"roll", "pitch"}
+
+
+@pytest.mark.slow
+def test_the_only_epoch_asked_for_is_the_last(done: Done) -> None:
+    """However few epochs are inferred, the last one, which the verdict is about, is among them."""
+    (assessment,) = assessments(done.out)
+    assert assessment.track is not None
+    for most in (1, 2, 3):
+        assert epochs_to_infer(assessment.track, done.stage, most)[-1] == N_LOGS - 1
+
+
+@pytest.mark.slow
+def test_prognose_goes_on_from_the_table_to_the_same_numbers(done: Done, tmp_path: Path) -> None:
+    """The command on the run's table of modes, with its seed, gives the run's remaining life."""
+    toml, out = done.logs.parent / "stage" / "small.toml", tmp_path / "prognosis.csv"
+    words = ["prognose", done.out / "modes.csv", "--stage", toml, "--out", out]
+    result = CliRunner().invoke(main, [str(word) for word in words])
+    assert result.exit_code == 0, result.output
+    ours, theirs = rows(out), rows(done.out / "prognosis.csv")
+    assert [row.keys() for row in ours] == [row.keys() for row in theirs]
+    for own, other in zip(ours, theirs, strict=True):
+        assert own["service_by"] == other["service_by"]
+        for key in [key for key in own if key.startswith(("rul_", "probability_"))]:
+            assert float(own[key]) == pytest.approx(float(other[key]), rel=1e-6)
+
+
+@pytest.mark.slow
+def test_spectra_of_all_logs_reach_the_page(done: Done) -> None:
+    """The spectra hold every used log in order, strongest where its modes are."""
+    (assessment,) = assessments(done.out)
+    waterfall, history = assessment.waterfall, assessment.history
+    assert waterfall is not None
+    assert waterfall.level.shape[0] == len(history.logs) == N_LOGS
+    # Pitch, at 105 Hz when new, is the only mode in the upper half of the band.
+    edges = waterfall.edges
+    upper = np.sqrt(edges[1:] * edges[:-1])[edges[1:] > 85]
+    strongest = upper[np.argmax(waterfall.level[:, edges[1:] > 85], axis=1)]
+    pitch = np.exp(history.ln_frequency[:, history.columns("pitch")[0]])
+    np.testing.assert_allclose(strongest, pitch, rtol=0.04)
+    assert "Spectra over life" in done.result.pages[0].read_text(encoding="utf-8")
+
+
+@pytest.mark.slow
+def test_every_bad_log_is_listed_with_its_reason(done: Done) -> None:
+    """The copy, the broken file and the foreign machine are refused by name; the rest is used."""
+    refused = {row["log"]: row for row in rows(done.out / "refused.csv")}
+    assert refused["later/copy.h5"]["reason"] == "duplicate"
+    assert "log-00.h5" in refused["later/copy.h5"]["detail"]
+    assert refused["broken.h5"]["reason"] in ("corrupt", "format")
+    assert refused["foreign.h5"]["reason"] == "no-stage"
+    assert "other-Z" in refused["foreign.h5"]["detail"]
+    assert all(row["detail"] for row in refused.values())
+    # The copy is no log of its own, and none is lost by it.
+    assert (done.result.n_logs, done.result.n_refused) == (N_LOGS + 2, 2)
+    assert len({row["log"] for row in rows(done.out / "modes.csv")}) == N_LOGS
+
+
+@pytest.mark.slow
+def test_a_second_run_takes_all_from_the_store_and_the_truth_does_not_matter(
+    done: Done, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With truth.csv deleted a second run remembers every log and result: the same bytes."""
+    (done.logs / "truth.csv").unlink()
+    monkeypatch.setattr(assessing, "assess", None)  # nothing may be inferred again
+    again = run(done.logs, [done.stage], done.out, Settings(epochs=2))
+    # The broken file is told by its content and tried no more than once.
+    assert again.n_remembered == N_LOGS + 2
+    assert tables(done.out) == done.written
+    assert pages(done.out) == done.pages
+
+
+@pytest.mark.slow
+def test_pages_come_from_the_store_alone(
+    done: Done, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Without logs and descriptions the same pages of machine and fleet; one needs no process."""
+    shutil.copy(done.out / "lmshealth.sqlite", tmp_path)
+    monkeypatch.setattr(workers, "_Processes", None)
+    with closing(Store(beside(tmp_path), create=False)) as store:
+        again = report(store, tmp_path, Settings(workers=8))
+    assert pages(tmp_path) == done.pages
+    assert again.rows == done.result.rows
+
+
+@pytest.mark.slow
+def test_results_do_not_depend_on_the_number_of_workers(done: Done, tmp_path: Path) -> None:
+    """Two processes with a fresh store write the same bytes as one."""
+    run(done.logs, [done.stage], tmp_path / "out", Settings(workers=2, epochs=2))
+    assert tables(tmp_path / "out") == done.written
+
+
+@pytest.mark.slow
+def test_results_on_a_cluster_are_those_of_this_machine(
+    done: Done, tmp_path: Path, cluster: servers.Cluster
+) -> None:
+    """Two workers of Dask with a fresh store write the same bytes, pages too."""
+    run(done.logs, [done.stage], tmp_path / "out", Settings(scheduler=cluster.address, epochs=2))
+    assert tables(tmp_path / "out") == done.written
+    assert pages(tmp_path / "out") == done.pages
+
+
+@pytest.mark.slow
+def test_another_seed_gives_other_draws(done: Done) -> None:
+    """Negative control for the comparisons of bytes: a new seed changes the draws of health."""
+    (assessment,) = assessments(done.out)
+    assert assessment.track is not None
+    one, other = (infer(assessment.track, done.stage, seed, epochs=(5,)) for seed in (1, 2))
+    assert one.samples.tobytes() != other.samples.tobytes()
+
+
+@pytest.mark.slow
+def test_output_inside_the_folder_of_logs_is_no_log(tmp_path: Path, modes_only: Stage) -> None:
+    """Tables and store inside the archive are not read back by the next run."""
+    logs = write_archive(tmp_path / "logs", 2)
+    first = run(logs, [modes_only], logs / "result")
+    again = run(logs, [modes_only], logs / "result")
+    assert (first.n_logs, again.n_logs, again.n_refused) == (2, 2, 0)
+    assert again.n_remembered == 2
+
+
+@pytest.mark.slow
+def test_descriptions_make_stale_what_is_theirs(tmp_path: Path) -> None:
+    """A change of one, or another one before it, leaves what came by others as it is."""
+    logs = write_archive(tmp_path / "logs", 2)
+    write_log(logs / "b.h5", 1.0, 7, stage="test-B")
+    paths = [write_archive_stage(tmp_path / name, health=False) for name in ("one", "two", "new")]
+    for path, ending in zip(paths[1:], ("B", "C"), strict=True):
+        path.write_text(path.read_text().replace("*-A", f"*-{ending}"))
+
+    def remembered(*which: Path) -> int:
+        stages = [load_stage(str(path)) for path in which]
+        return run(logs, stages, tmp_path / "out").n_remembered
+
+    one, two, new = paths
+    assert remembered(one, two) == 0
+    assert remembered(new, one, two) == 3
+    two.write_text(two.read_text() + "# a remark\n")
+    assert remembered(one, two) == 2
+    # Who comes first takes all: what the other gave is not of these logs any more.
+    new.write_text(new.read_text().replace("*-C", "*"))
+    assert remembered(new, one, two) == 0
+    assert remembered(one, two) == 3
+    # What no description takes is tried again when there is another one.
+    assert remembered(one) == 2
+    assert remembered(one) == 3
+    assert remembered(one, two) == 3
+
+
+@pytest.mark.slow
+def test_a_log_that_changes_while_it_is_read_is_done_again(
+    tmp_path: Path, modes_only: Stage, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What is still being written is refused for now, and not remembered."""
+    logs = write_archive(tmp_path / "logs", 2)
+    with monkeypatch.context() as patch:
+        patch.setattr(intake, "content_digest", lambda path: f"{path.name:0>64}")
+        with pytest.raises(NothingUsable):
+            run(logs, [modes_only], tmp_path / "out")
+    assert {row["reason"] for row in rows(tmp_path / "out" / "refused.csv")} == {"changed"}
+    again = run(logs, [modes_only], tmp_path / "out")
+    assert (again.n_remembered, again.n_refused) == (0, 0)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("error", [OSError(28, "No space left on device"), MemoryError()])
+def test_what_the_computer_failed_at_is_tried_again(
+    tmp_path: Path, modes_only: Stage, monkeypatch: pytest.MonkeyPatch, error: Exception
+) -> None:
+    """A full disk or memory says nothing of a log: it is refused for now, and not remembered."""
+    logs = write_archive(tmp_path / "logs", 3)
+    whole = intake.identify
+
+    def fail(log: Log, stage: Stage) -> Modes:
+        if log.name == "log-01.h5":
+            raise error
+        return whole(log, stage)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(intake, "identify", fail)
+        first = run(logs, [modes_only], tmp_path / "out")
+    assert (first.n_refused, first.n_remembered) == (1, 0)
+    refused = rows(tmp_path / "out" / "refused.csv")
+    assert [(row["log"], row["reason"]) for row in refused] == [("log-01.h5", "resources")]
+    again = run(logs, [modes_only], tmp_path / "out")
+    assert (again.n_refused, again.n_remembered) == (0, 2)
+
+
+@pytest.mark.slow
+def test_one_machine_has_one_description(tmp_path: Path) -> None:
+    """Logs that a manifest gives to another description than most are refused by name."""
+    logs = write_archive(tmp_path / "logs", 3)
+    one, two = (write_archive_stage(tmp_path / name, health=False) for name in ("one", "two"))
+    two.write_text(two.read_text().replace('name = "small"', 'name = "other"', 1))
+    (logs / "manifest.csv").write_text("file,description\nlog-01.h5,other\n")
+    result = run(logs, [load_stage(str(path)) for path in (one, two)], tmp_path / "out")
+    assert result.n_refused == 1
+    (row,) = rows(tmp_path / "out" / "refused.csv")
+    assert (row["log"], row["reason"]) == ("log-01.h5", "no-stage")
+    assert "2 logs of test-A" in row["detail"]
+
+
+@pytest.mark.slow
+def test_an_assessment_that_cannot_be_read_is_made_again(
+    tmp_path: Path, modes_only: Stage, assessed: list[str]
+) -> None:
+    """Neither damage nor another run that forgets it keeps a machine from being told."""
+    logs, out = write_archive(tmp_path / "logs", 2), tmp_path / "out"
+    run(logs, [modes_only], out)
+    before = tables(out), pages(out)
+    with closing(sqlite3.connect(out / "lmshealth.sqlite")) as file, file:
+        file.execute(f"UPDATE assessed_{SCHEMA} SET content = x'00'")
+    run(logs, [modes_only], out)
+    assert assessed == ["test-A"] * 2
+    assert (tables(out), pages(out)) == before
+
+
+def test_an_assessment_that_never_can_be_read_does_not_end_the_batch(
+    tmp_path: Path, modes_only: Stage, monkeypatch: pytest.MonkeyPatch, assessed: list[str]
+) -> None:
+    """It is made once more, then its machine is named, and the run comes to its end."""
+    logs = write_archive(tmp_path / "logs", 2)
+    monkeypatch.setattr(telling, "read", lambda content, kind: None)
+    result = run(logs, [modes_only], tmp_path / "out")
+    assert result.rows == ()
+    assert result.failed == {"test-A": "its assessment cannot be read back from the store"}
+    assert len(assessed) <= 3
+
+
+@pytest.mark.slow
+def test_what_is_taught_is_taught_anew_where_it_cannot_be_read(
+    tmp_path: Path, modes_only: Stage, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A damaged assessment after the fleet's lesson is made again as well as the one before it."""
+    logs = write_archive(tmp_path / "logs", 2)
+    learned = Learned(3, (), scatter_of(modes_only))
+    monkeypatch.setattr(
+        batch, "_pupils", lambda machines, store: ((machine, learned) for machine in machines)
+    )
+    monkeypatch.setattr(
+        batch,
+        "taught",
+        lambda content, one: packed(replace(read(content, Assessment), fleet=one, notes=("t",))),
+    )
+    run(logs, [modes_only], tmp_path / "out")
+    before = pages(tmp_path / "out")
+    with closing(sqlite3.connect(tmp_path / "out" / "lmshealth.sqlite")) as file, file:
+        (n,) = file.execute(f"SELECT count(*) FROM assessed_{SCHEMA}").fetchone()
+        file.execute(f"UPDATE assessed_{SCHEMA} SET content = x'00'")
+    assert n == 2
+    result = run(logs, [modes_only], tmp_path / "out")
+    assert result.failed == {}
+    assert pages(tmp_path / "out") == before
+    (assessment,) = assessments(tmp_path / "out")
+    assert assessment.fleet == learned
+
+
+def test_a_folder_that_cannot_be_written_to_is_told(tmp_path: Path, modes_only: Stage) -> None:
+    """Before anything is done, and by its name."""
+    logs = write_archive(tmp_path / "logs", 2)
+    (tmp_path / "file").write_text("no folder")
+    for out in (tmp_path / "file", tmp_path / "file" / "below"):
+        with pytest.raises(LmshealthError, match=f"{out}: cannot be written to"):
+            run(logs, [modes_only], out)
+
+
+def test_settings_show_no_password() -> None:
+    """A store's address may hold one, and settings may reach a log of somebody's program."""
+    assert "hunter2" not in repr(Settings(store="postgresql://me:hunter2@host/db"))
+
+
+@pytest.mark.slow
+def test_a_machine_that_cannot_be_assessed_does_not_end_the_batch(
+    tmp_path: Path, modes_only: Stage, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It is named with the reason, and the others are told."""
+    logs = write_archive(tmp_path / "logs", 2)
+    write_log(logs / "b.h5", 1.0, 7, stage="other-A")
+    whole = assessing.assess
+
+    def fail(readings: Sequence[Reading], *given: Any, **options: Any) -> Assessment:
+        if readings[0].metadata.stage == "other-A":
+            raise ZeroDivisionError("a mistake of ours")
+        return whole(readings, *given, **options)
+
+    monkeypatch.setattr(assessing, "assess", fail)
+    result = run(logs, [modes_only], tmp_path / "out")
+    assert [row.identity for row in result.rows] == ["test-A"]
+    assert set(result.failed) == {"other-A"}
+    assert "a mistake of ours" in result.failed["other-A"]
+
+
+@pytest.mark.slow
+def test_a_changed_description_is_done_again(tmp_path: Path, modes_only: Stage) -> None:
+    """Results of another description are stale: nothing is remembered."""
+    logs = write_archive(tmp_path / "logs", 2)
+    run(logs, [modes_only], tmp_path / "out")
+    path = tmp_path / "stage" / "small.toml"
+    path.write_text(path.read_text() + "# a remark\n")
+    again = run(logs, [load_stage(str(path))], tmp_path / "out")
+    assert again.n_remembered == 0
+
+
+@pytest.fixture
+def assessed(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """List the machines that are assessed and not remembered."""
+    machines: list[str] = []
+    whole = assessing.assess
+
+    def listen(readings: Sequence[Reading], *given: Any, **options: Any) -> Assessment:
+        machines.append(str(readings[0].metadata.stage))
+        return whole(readings, *given, **options)
+
+    monkeypatch.setattr(assessing, "assess", listen)
+    return machines
+
+
+@pytest.mark.slow
+def test_only_what_is_stale_is_assessed_again(
+    tmp_path: Path, modes_only: Stage, assessed: list[str]
+) -> None:
+    """A log, maintenance, seed or number of epochs makes stale what depends on it, no more."""
+    logs, out = write_archive(tmp_path / "logs", 2), tmp_path / "out"
+    write_log(logs / "b.h5", 1.0, 7, stage="other-A")
+
+    def again(**options: int) -> list[str]:
+        assessed.clear()
+        run(logs, [modes_only], out, Settings(**options))
+        return list(assessed)
+
+    assert again() == ["other-A", "test-A"]
+    assert again() == []
+    write_log(logs / "c.h5", 1.0, 8, stage="other-A")
+    assert again() == ["other-A"]
+    text = "stage,recorded_at,travel_km,action\n"
+    (logs / "maintenance.csv").write_text(text + "test-A,2026-01-01T00:00:00+00:00,0,regrease\n")
+    assert again() == ["test-A"]
+    assert again(seed=1) == ["other-A", "test-A"]
+    assert again(seed=1, epochs=3) == ["other-A", "test-A"]
+    (logs / "broken.h5").write_bytes(b"nothing")
+    assert again(seed=1, epochs=3) == []
+
+
+@pytest.mark.slow
+def test_a_page_says_what_is_new_since_the_last_report(tmp_path: Path, modes_only: Stage) -> None:
+    """The first page has no earlier one; the next compares, and repeats while nothing changes."""
+    logs, out = write_archive(tmp_path / "logs", 2), tmp_path / "out"
+    run(logs, [modes_only], out)
+    assert "This is the first report on this stage" in (out / "test-A.html").read_text()
+    shutil.copy(write_archive(tmp_path / "more", 3) / "log-02.h5", logs)
+    run(logs, [modes_only], out)
+    second = (out / "test-A.html").read_text()
+    assert "Compared with the report on 2 logs" in second
+    assert "<li>1 log and " in second
+    run(logs, [modes_only], out)
+    assert (out / "test-A.html").read_text() == second
+
+
+@pytest.mark.slow
+def test_a_renamed_log_is_remembered(tmp_path: Path, modes_only: Stage) -> None:
+    """A log is known by its content; the tables carry its new name."""
+    logs = write_archive(tmp_path / "logs", 2)
+    run(logs, [modes_only], tmp_path / "out")
+    (logs / "log-01.h5").rename(logs / "zero.h5")
+    again = run(logs, [modes_only], tmp_path / "out")
+    assert again.n_remembered == 2
+    assert {row["log"] for row in rows(tmp_path / "out" / "modes.csv")} == {"log-00.h5", "zero.h5"}
+
+
+@pytest.mark.slow
+def test_a_manifest_overrides_and_is_part_of_the_key(tmp_path: Path, modes_only: Stage) -> None:
+    """A new odometer in the manifest is used, not the remembered one; its log is done again."""
+    logs = write_archive(tmp_path / "logs", 2)
+    run(logs, [modes_only], tmp_path / "out")
+    (logs / "manifest.csv").write_text("file,travel_km\nlog-01.h5,777\n")
+    again = run(logs, [modes_only], tmp_path / "out")
+    assert again.n_remembered == 1
+    assert {row["travel_km"] for row in rows(tmp_path / "out" / "modes.csv")} == {"0.0", "777.0"}
+
+
+@pytest.mark.slow
+def test_foreign_columns_are_read_by_a_map_that_is_part_of_the_key(
+    tmp_path: Path, modes_only: Stage
+) -> None:
+    """Without its map an export is refused, with it it is a log; another map makes it a new one."""
+    logs, out = write_archive(tmp_path / "logs", 2), tmp_path / "out"
+    for path in logs.glob("*.h5"):
+        with h5py.File(path, "r+") as file:
+            file.move("acc_feed_m_s2", "AI0")
+    with pytest.raises(NothingUsable):
+        run(logs, [modes_only], out, Settings())
+    columns = ColumnMap(columns={"acc_feed_m_s2": "AI0"})
+    result = run(logs, [modes_only], out, Settings(columns=columns))
+    assert (result.n_refused, result.n_remembered) == (0, 0)
+    assert run(logs, [modes_only], out, Settings(columns=columns)).n_remembered == 2
+    other = ColumnMap(columns={"acc_feed_g": "AI0"})
+    assert run(logs, [modes_only], out, Settings(columns=other)).n_remembered == 0
+
+
+@pytest.mark.slow
+def test_bad_rows_beside_the_logs_are_told_and_stop_nothing(
+    tmp_path: Path, modes_only: Stage
+) -> None:
+    """Logs are analysed, each bad row is listed, and the page of its machine tells of the work."""
+    logs, out = write_archive(tmp_path / "logs", 2), tmp_path / "out"
+    done = run(logs, [modes_only], out)
+    assert (done.n_refused, done.n_unread) == (0, 0)
+    (logs / "maintenance.csv").write_text(
+        "stage,recorded_at,action\ntest-A,2026-01-05T00:00:00Z,repainted\n"
+        "test-A,2026-01-01T00:00:00Z,servo\n"
+    )
+    (logs / "manifest.csv").write_text("file,travel_km\nlog-01.h5,1,2,3\n,5\n")
+    again = run(logs, [modes_only], out)
+    assert (again.n_logs, again.n_refused, again.n_unread) == (2, 1, 2)
+    refused = [(row["log"], row["reason"]) for row in rows(out / "refused.csv")]
+    tables = ["maintenance.csv", "manifest.csv"]
+    assert sorted(refused) == [(name, "bad-row") for name in ("log-01.h5", *tables)]
+    assert "action &#39;repainted&#39; is unknown" in (out / "test-A.html").read_text()
+
+
+@pytest.mark.slow
+def test_what_tracking_needs_of_each_log_is_in_the_table(tmp_path: Path, modes_only: Stage) -> None:
+    """Loop error, tuning and shapes are there, also when the store remembers the log."""
+    logs = tmp_path / "logs"
+    with h5py.File(write_log(logs / "a.h5", 1.0, 0), "a") as file:
+        n = file["acc_feed_m_s2"].size
+        file["delta_e_um"] = sine(n, float(file.attrs["sample_rate_hz"]), 10.0, 2.0)
+        file.attrs["servo_id"] = "stiff"
+    write_log(logs / "b.h5", 1.0, 1)
+    for n_remembered in (0, 2):
+        assert run(logs, [modes_only], tmp_path / "out").n_remembered == n_remembered
+        row, *_, without = rows(tmp_path / "out" / "modes.csv")
+        assert float(row["delta_e_below_40hz_um"]) == pytest.approx(np.sqrt(2), rel=1e-3)
+        assert (row["servo_id"], row["shape_acc_feed"], row["shape_delta_e"]) == (
+            "stiff",
+            "1.0",
+            "",
+        )
+        assert without["delta_e_below_40hz_um"] == without["servo_id"] == ""
+
+
+@pytest.mark.slow
+def test_each_log_goes_to_the_first_description_that_takes_it(tmp_path: Path) -> None:
+    """Two machines with two descriptions get one page each."""
+    logs = write_archive(tmp_path / "logs", 2)
+    write_log(logs / "b.h5", 1.0, 7, stage="test-B")
+    one = write_archive_stage(tmp_path / "one", health=False)
+    two = write_archive_stage(tmp_path / "two", health=False)
+    two.write_text(two.read_text().replace("*-A", "*-B"))
+    result = run(logs, [load_stage(str(one)), load_stage(str(two))], tmp_path / "out")
+    assert [page.name for page in result.pages] == ["test-A.html", "test-B.html"]
+    found = assessments(tmp_path / "out")
+    assert {a.judgement.verdict for a in found} == {"not-enough-data"}
+
+
+def test_an_archive_of_bad_logs_only_is_an_error_with_its_reasons_written(
+    tmp_path: Path, modes_only: Stage
+) -> None:
+    """When every log is refused the job fails, says how many and why; refused.csv has all."""
+    logs = tmp_path / "logs"
+    logs.mkdir()
+    (logs / "broken.h5").write_bytes(b"nothing")
+    (logs / "empty.csv").write_bytes(b"")
+    (logs / "hollow.csv").write_bytes(b"")
+    with pytest.raises(NothingUsable, match="3 found, 3 refused: 2 as empty") as refusal:
+        run(logs, [modes_only], tmp_path / "out")
+    assert "such as empty.csv: 0 bytes; copy the file again; " in str(refusal.value)
+    refused = {row["log"]: row["reason"] for row in rows(tmp_path / "out" / "refused.csv")}
+    assert set(refused) == {"broken.h5", "empty.csv", "hollow.csv"}
+    assert refused["empty.csv"] == "empty"
+
+
+def test_an_empty_folder_is_an_error(tmp_path: Path, modes_only: Stage) -> None:
+    """No log at all is said."""
+    (tmp_path / "logs").mkdir()
+    with pytest.raises(NothingUsable, match="0 found"):
+        run(tmp_path / "logs", [modes_only], tmp_path / "out")
+
+
+@pytest.mark.slow
+def test_progress_is_told_to_its_end(tmp_path: Path, modes_only: Stage) -> None:
+    """The callback hears of every step of the work, each up to its total."""
+    heard: dict[str, tuple[int, int]] = {}
+
+    def hear(what: str, finished: int, total: int) -> None:
+        assert 0 <= finished <= total
+        heard[what] = (finished, total)
+
+    run(write_archive(tmp_path / "logs", 2), [modes_only], tmp_path / "out", progress=hear)
+    steps = {"reading": (2, 2), "identifying": (2, 2), "assessing": (1, 1), "reporting": (1, 1)}
+    assert heard == steps
+
+
+@pytest.mark.slow
+def test_an_interrupted_run_loses_nothing_that_was_done(tmp_path: Path, modes_only: Stage) -> None:
+    """Stopped after two logs, the next run remembers two and the tables are as ever."""
+    logs = write_archive(tmp_path / "logs", 4)
+
+    def stop(what: str, finished: int, total: int) -> None:
+        if what == "identifying" and finished == 2:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        run(logs, [modes_only], tmp_path / "out", progress=stop)
+    again = run(logs, [modes_only], tmp_path / "out")
+    run(logs, [modes_only], tmp_path / "other")
+    assert again.n_remembered == 2
+    assert tables(tmp_path / "out") == tables(tmp_path / "other")
+
+
+@pytest.mark.slow
+def test_assess_without_parameters_tracks_and_claims_nothing(
+    tmp_path: Path, modes_only: Stage
+) -> None:
+    """A description of modes alone gives a track, no health, and no verdict."""
+    run(write_archive(tmp_path / "logs", 3), [modes_only], tmp_path / "out")
+    (assessment,) = assessments(tmp_path / "out")
+    assert assessment.track is not None
+    assert assessment.health is None
+    assert assessment.prognosis is None
+    assert assessment.judgement.verdict == "not-enough-data"

@@ -1,0 +1,444 @@
+"""The store: what goes in comes out bit for bit, and what is wrong with it is said."""
+
+from __future__ import annotations
+
+import socket
+import sqlite3
+import time
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing
+from dataclasses import replace
+from datetime import datetime, timedelta, timezone
+from pathlib import Path
+
+import numpy as np
+import pytest
+from sqlalchemy import Engine, event
+
+from lmshealth._serialize import pack
+from lmshealth.batch import database
+from lmshealth.batch.assess import packed
+from lmshealth.batch.store import (
+    SCHEMA,
+    Identified,
+    Outcome,
+    Store,
+    StoreError,
+    beside,
+    read,
+)
+from lmshealth.io.log import Metadata, Refusal
+from lmshealth.modal.modes import Modes
+from lmshealth.report.assessment import Assessment
+from lmshealth.signal.spectral_lines import Line
+from lmshealth.signal.waterfall import Levels
+from lmshealth.tracking.history import Reading
+from tests.assessments import leaves, worn
+
+
+def reading(n: int = 2, log: str = "a.h5") -> Reading:
+    """Give a reading whose numbers use all bits of a float."""
+    rng = np.random.default_rng(n)
+    cov = rng.normal(size=(2 * n, 2 * n)) * 10.0 ** rng.integers(-12, 3, (2 * n, 2 * n))
+    names = tuple(f"mode_{k}" for k in range(n))
+    modes = Modes(
+        names=names,
+        sources=("acc",) * n,
+        channels=("acc_x",) * n,
+        ln_frequency=np.log(rng.uniform(1, 300, n)),
+        ln_damping=np.log(rng.uniform(1e-3, 0.1, n)),
+        cov=cov @ cov.T,
+        snr=np.exp(rng.normal(5, 3, n)),
+        dispersion=np.ones(n),
+        flags=("",) * n,
+        shape_channels=("acc_x", "acc_y", "delta_e"),
+        shapes=rng.choice([np.nan, 1 / 3, -0.1], (n, 3)),
+        lines=(Line(50.0 + 1e-13, 1 / 3, "m/s²", "mains", "acc_x"),),
+        refused=(Refusal(log, "not-excited", "näher 126.4 Hz", mode="yaw"),),
+    )
+    metadata = Metadata(
+        stage="test-A",
+        recorded_at=datetime(2026, 3, 1, 8, 30, 0, 125, tzinfo=timezone(timedelta(hours=1))),
+        travel=123_456.7,
+        covariates={"temperature_c": 21.4},
+        servo_id="new",
+        baseline=True,
+        description="small",
+    )
+    levels = Levels(100 / 3, 200 / 3, rng.choice([np.nan, 1 / 3], 5))
+    return Reading(log, "d" * 64, metadata, modes, 1e-6 / 3, levels)
+
+
+@pytest.fixture
+def url(store_url: str) -> str:
+    """Name a store that does not exist yet, of either kind."""
+    return store_url
+
+
+def put_in(store: Store, key: str, outcome: Outcome) -> None:
+    """Keep what became of a log."""
+    store.put(key, "d" * 64, Identified(outcome, "e" * 64, "test-A"))
+
+
+def got_from(store: Store, key: str, log: str) -> Outcome | None:
+    """Fetch what became of a log, under its present name."""
+    return next((found.named(log).outcome for _, found in store.identified([key])), None)
+
+
+@pytest.fixture
+def file_url(tmp_path: Path) -> str:
+    """Name a store in a file that does not exist yet."""
+    return f"sqlite:///{(tmp_path / 'store.sqlite').as_posix()}"
+
+
+@pytest.mark.parametrize("n", [0, 1, 3])
+def test_a_reading_comes_back_bit_for_bit(url: str, n: int) -> None:
+    """Every float, name, line, refusal and metadatum is the same after a round trip."""
+    put = reading(n)
+    writer = Store(url)
+    put_in(writer, "k", put)
+    writer.close()
+    reader = Store(url)
+    got = got_from(reader, "k", put.log)
+    reader.close()
+    assert isinstance(got, Reading)
+    assert list(leaves(got)) == list(leaves(put))
+
+
+def test_missing_metadata_stay_missing(url: str) -> None:
+    """What a log did not say is None again, not a text or a zero."""
+    put = Reading("a.h5", "d" * 64, Metadata(), reading(0).modes)
+    store = Store(url)
+    put_in(store, "k", put)
+    got = got_from(store, "k", "a.h5")
+    store.close()
+    assert isinstance(got, Reading)
+    assert got.metadata == Metadata()
+    assert got.loop_error is None
+    assert got.levels is None
+
+
+def test_refusals_come_back_under_the_present_name(url: str) -> None:
+    """A refused log is remembered too; renamed, it is refused under its new name."""
+    refused = (Refusal("old.h5", "too-short", "0.3 s", channel="acc_x", source="acc"),)
+    store = Store(url)
+    put_in(store, "k", refused)
+    assert got_from(store, "k", "old.h5") == refused
+    moved = got_from(store, "k", "new.h5")
+    store.close()
+    assert moved == (Refusal("new.h5", "too-short", "0.3 s", channel="acc_x", source="acc"),)
+
+
+def test_a_renamed_log_is_known_under_its_new_name(url: str) -> None:
+    """The reading and the refusals inside it carry the name asked for."""
+    store = Store(url)
+    put_in(store, "k", reading())
+    got = got_from(store, "k", "b.h5")
+    store.close()
+    assert isinstance(got, Reading)
+    assert got.log == "b.h5"
+    assert [refusal.log for refusal in got.modes.refused] == ["b.h5"]
+
+
+def test_what_is_not_there_is_none(url: str) -> None:
+    """An unknown key is no error."""
+    store = Store(url)
+    assert got_from(store, "nothing", "a.h5") is None
+    store.close()
+
+
+def test_what_an_older_version_kept_is_not_read(file_url: str, tmp_path: Path) -> None:
+    """Rows of an older layout stay where they are, and their logs are done again."""
+    with sqlite3.connect(tmp_path / "store.sqlite") as older:
+        older.execute(f"CREATE TABLE identified_{SCHEMA - 1} (key TEXT, log TEXT, outcome TEXT)")
+        older.execute(f"INSERT INTO identified_{SCHEMA - 1} VALUES ('k', 'a.h5', '{{}}')")
+    store = Store(file_url)
+    assert got_from(store, "k", "a.h5") is None
+    put_in(store, "k", reading())
+    assert isinstance(got_from(store, "k", "a.h5"), Reading)
+    store.close()
+
+
+def test_putting_twice_changes_nothing(url: str) -> None:
+    """The same key again keeps one row with the same content."""
+    store = Store(url)
+    for _ in range(2):
+        put_in(store, "k", reading())
+    got = got_from(store, "k", "a.h5")
+    store.close()
+    assert isinstance(got, Reading)
+    assert got.modes.cov.tobytes() == reading().modes.cov.tobytes()
+
+
+@pytest.mark.parametrize(
+    "bad",
+    [
+        "no url at all",
+        "nosuchdatabase://user:hunter2@host/db",
+        "postgresql+nosuchdriver://user:hunter2@host/db",
+        "postgresql://user:hunter2@host:port/db",
+        "sqlite:////no/such/folder/store.sqlite",
+    ],
+)
+def test_a_url_that_cannot_be_opened_is_named_without_its_password(bad: str) -> None:
+    """Each bad URL is a StoreError of one message that does not show the password."""
+    with pytest.raises(StoreError) as caught:
+        Store(bad)
+    assert "hunter2" not in str(caught.value)
+    assert "cannot open the store" in str(caught.value)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("query", ["", "?connect_timeout=2"])
+def test_a_server_that_says_nothing_is_not_waited_for(
+    query: str, needs: Callable[[str], None], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its port may be that of something else. Two seconds are the shortest that libpq knows."""
+    needs("postgres")
+    monkeypatch.setattr(database, "_ANSWER", 60 if query else 2)
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        port = listener.getsockname()[1]
+        begun = time.monotonic()
+        with pytest.raises(StoreError, match="timeout"):
+            Store(f"postgresql://me@127.0.0.1:{port}/fleet{query}")
+    assert time.monotonic() - begun < 30
+
+
+def test_a_file_that_is_no_store_is_named(tmp_path: Path) -> None:
+    """A file of other content is a StoreError that names it, and stays as it was."""
+    path = tmp_path / "notes.sqlite"
+    path.write_text("these are my notes, not a database\n" * 100)
+    before = path.read_bytes()
+    with pytest.raises(StoreError, match=r"notes\.sqlite"):
+        Store(f"sqlite:///{path.as_posix()}")
+    assert path.read_bytes() == before
+
+
+def test_a_damaged_store_is_named(file_url: str, tmp_path: Path) -> None:
+    """A store damaged after its first page fails with a StoreError when it is read."""
+    store = Store(file_url)
+    for number in range(40):
+        put_in(store, f"k{number}", reading(3))
+    store.close()
+    path = tmp_path / "store.sqlite"
+    data = bytearray(path.read_bytes())
+    data[4096:] = b"\xff" * (len(data) - 4096)
+    path.write_bytes(bytes(data))
+    with pytest.raises(StoreError, match=r"store\.sqlite"):
+        damaged = Store(file_url)
+        try:
+            got_from(damaged, "k7", "a.h5")
+        finally:
+            damaged.close()
+
+
+# Assessments
+
+
+def keep(store: Store, machine: str, key: str, assessment: Assessment) -> None:
+    """Keep an assessment as a run does, and tell it."""
+    store.keep(machine, key, packed(assessment))
+    store.tell(machine, key, store.keep_refused(()))
+
+
+def recall(store: Store, machine: str, key: str) -> Assessment | None:
+    """Fetch an assessment, as far as it can be read."""
+    content = store.assessment(machine, key)
+    found: Assessment | None = None if content is None else read(content, Assessment)
+    return found
+
+
+def test_an_assessment_comes_back_bit_for_bit(url: str, tmp_path: Path) -> None:
+    """Description, map, history, track, chains, draws, verdict: every leaf is the same."""
+    put = worn(tmp_path)
+    with closing(Store(url)) as store:
+        keep(store, "M7-Y", "k1", put)
+        got = recall(store, "M7-Y", "k1")
+    assert got is not None
+    expected = list(leaves(put))
+    assert sum(isinstance(leaf, tuple) and len(leaf) == 3 for _, leaf in expected) > 40
+    assert list(leaves(got)) == expected
+    assert got.stage.takes(reading().metadata) == put.stage.takes(reading().metadata)
+    assert got.service() == put.service()
+
+
+def test_what_an_assessment_lacks_it_lacks_again(url: str, tmp_path: Path) -> None:
+    """No track, health and prognosis, and a probability that is NaN, stay so."""
+    put = worn(tmp_path)
+    judgement = replace(put.judgement, verdict="not-enough-data", probability=np.nan)
+    put = replace(put, track=None, health=None, prognosis=None, judgement=judgement)
+    with closing(Store(url)) as store:
+        keep(store, "M7-Y", "k1", put)
+        got = recall(store, "M7-Y", "k1")
+    assert list(leaves(got)) == list(leaves(put))
+
+
+def test_only_what_is_told_and_what_it_comes_from_are_kept_whole(url: str, tmp_path: Path) -> None:
+    """Telling forgets the other assessments of the same machine, not of others."""
+    one = packed(worn(tmp_path))
+    with closing(Store(url)) as store:
+        for machine, key in (("A", "k1"), ("B", "k1"), ("A", "k2"), ("A", "k3")):
+            store.keep(machine, key, one)
+        assert store.has("A", "k1")
+        store.tell("A", "k3", "", beside=["k2"])
+        assert [store.has("A", key) for key in ("k1", "k2", "k3")] == [False, True, True]
+        assert store.assessment("A", "k1") is None
+        assert store.has("B", "k1")
+        assert not store.has("C", "k1")
+        assert [(told.machine, told.key) for told in store.told()] == [("A", "k3")]
+
+
+def test_the_earlier_report_is_the_newest_of_another_key(url: str, tmp_path: Path) -> None:
+    """Telling the same again changes nothing; going back to a former state is news again."""
+    one = worn(tmp_path)
+    words = {"k1": "healthy", "k2": "preload", "k3": "mount"}
+    with closing(Store(url)) as store:
+
+        def tell(key: str) -> str | None:
+            judgement = replace(one.judgement, verdict=words[key])
+            keep(store, "A", key, replace(one, judgement=judgement))
+            before = store.earlier("A", key)
+            return before and before.verdict
+
+        assert [tell(key) for key in ("k1", "k1", "k2", "k2", "k1", "k3")] == [
+            *(None, None, "healthy", "healthy", "preload", "healthy")
+        ]
+        assert store.earlier("B", "k1") is None
+
+
+def test_refused_logs_are_those_of_the_last_run_of_each_machine(url: str, tmp_path: Path) -> None:
+    """A later run replaces what an earlier one refused, where it told the same machines."""
+    one, two, three = ((Refusal(log, "gap", ""),) for log in ("one", "two", "three"))
+    with closing(Store(url)) as store:
+
+        def tell(machines: str, refused: tuple[Refusal, ...]) -> tuple[Refusal, ...]:
+            for machine in machines:
+                store.tell(machine, "k1", store.keep_refused(refused))
+            return store.refused(told.refused for told in store.told())
+
+        assert tell("ABC", ()) == ()
+        assert tell("AB", one) == one
+        assert tell("C", two) == (*one, *two)
+        assert tell("AB", three) == (*three, *two)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "evil", ["'; DROP TABLE assessed_4; --", '" OR 1=1', "%", "..\n\t<b>", "", "x" * 100_000]
+)
+def test_names_of_machines_are_data(url: str, tmp_path: Path, evil: str) -> None:
+    """No name of a machine reaches another's rows, or the database itself, however long it is."""
+    one = worn(tmp_path)
+    with closing(Store(url)) as store:
+        keep(store, "A", "k1", one)
+        keep(store, evil, "k2", replace(one, seed=7))
+        assert recall(store, evil, "k1") is None
+        assert store.earlier(evil, "k2") is None
+        got = recall(store, evil, "k2")
+        assert got is not None and got.seed == 7
+        assert recall(store, "A", "k1") is not None
+        assert {told.machine for told in store.told()} == {"A", evil}
+
+
+def test_a_row_that_cannot_be_read_counts_as_absent(file_url: str, tmp_path: Path) -> None:
+    """Damaged or foreign rows are as if they were not there, and may be written anew."""
+    with closing(Store(file_url)) as store:
+        put_in(store, "k", reading())
+        for machine, key in (("A", "k0"), ("A", "k1"), ("A", "k2"), ("B", "k1")):
+            keep(store, machine, key, worn(tmp_path, machine))
+        with closing(sqlite3.connect(tmp_path / "store.sqlite")) as file, file:
+            file.execute(f"UPDATE identified_{SCHEMA} SET content = ?", (b"nonsense",))
+            file.execute(
+                f"UPDATE assessed_{SCHEMA} SET content = ? WHERE key = 'k1'", (pack({"stage": 3}),)
+            )
+            file.execute(f"UPDATE reported_{SCHEMA} SET content = x'00' WHERE key = 'k1'")
+        assert got_from(store, "k", "a.h5") is None
+        assert recall(store, "B", "k1") is None
+        assert recall(store, "A", "k2") is not None
+        # The newest that can be read, two reports ago: of the three there is no other.
+        assert store.earlier("A", "k2") is not None
+        assert store.earlier("B", "k2") is None
+        put_in(store, "k", reading())
+        assert isinstance(got_from(store, "k", "a.h5"), Reading)
+
+
+def test_a_store_that_another_run_makes_at_the_same_moment_is_opened(tmp_path: Path) -> None:
+    """Of every table the other may be a moment quicker: both have it."""
+    path = tmp_path / "store.sqlite"
+    made = []
+
+    def be_quicker(_: object, __: object, statement: str, *___: object) -> None:
+        if statement.strip().startswith("CREATE TABLE"):
+            with closing(sqlite3.connect(path)) as other:
+                other.execute(statement)
+            made.append(statement)
+
+    event.listen(Engine, "before_cursor_execute", be_quicker)
+    try:
+        Store(f"sqlite:///{path}").close()
+    finally:
+        event.remove(Engine, "before_cursor_execute", be_quicker)
+    assert len(made) == 5
+
+
+@pytest.mark.slow
+def test_two_that_write_the_same_at_once_leave_one_row(url: str, tmp_path: Path) -> None:
+    """Of many threads that put, keep and tell the same, none fails and nothing is doubled."""
+    made = packed(worn(tmp_path))
+
+    def write(_: int) -> None:
+        with closing(Store(url)) as store:
+            for number in range(5):
+                put_in(store, f"k{number}", reading())
+            store.keep("A", "k1", made)
+            store.tell("A", "k1", store.keep_refused(()))
+
+    with ThreadPoolExecutor(6) as threads:
+        list(threads.map(write, range(12)))
+    with closing(Store(url)) as store:
+        assert len(store.told()) == 1
+        assert recall(store, "A", "k1") is not None
+        assert len(dict(store.identified(f"k{number}" for number in range(9)))) == 5
+        assert store.earlier("A", "k1") is None
+
+
+# Stores that are only looked at
+
+
+def test_a_store_that_is_not_there_is_not_made(file_url: str, tmp_path: Path) -> None:
+    """Opened to be read, a missing file stays missing, also in SQLite's own notation."""
+    for missing in (file_url, file_url.replace("///", "///file:") + "?uri=true"):
+        with pytest.raises(StoreError, match=r"store\.sqlite"):
+            Store(missing, create=False)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_store_without_results_is_told_from_an_older_one(file_url: str, tmp_path: Path) -> None:
+    """An empty file, tables of another version, and tables without a row are said each."""
+    path = tmp_path / "store.sqlite"
+    path.touch()
+    with pytest.raises(StoreError, match="holds no results"):
+        Store(file_url, create=False)
+    assert path.read_bytes() == b""
+    with closing(sqlite3.connect(path)) as older, older:
+        older.execute(f"CREATE TABLE identified_{SCHEMA - 1} (key TEXT)")
+    with pytest.raises(StoreError, match="another version"):
+        Store(file_url, create=False)
+    store = Store(file_url)
+    put_in(store, "k", reading())
+    with pytest.raises(StoreError, match="no assessment"):
+        store.told()
+    store.close()
+
+
+def test_a_store_in_a_folder_of_any_name_is_opened_as_it_is(tmp_path: Path) -> None:
+    """Signs that mean something in an address are parts of a name here."""
+    folder = tmp_path / "a b?c#d%20ü"
+    folder.mkdir()
+    store = Store(beside(folder))
+    keep(store, "A", "k1", worn(tmp_path))
+    store.close()
+    again = Store(beside(folder), create=False)
+    assert len(again.told()) == 1
+    again.close()

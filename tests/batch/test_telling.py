@@ -1,0 +1,100 @@
+"""Telling: tables of parts, in the order of the machines, whole or not at all."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from lmshealth.batch.assess import packed
+from lmshealth.batch.telling import Content, Part, Tables, tell
+from lmshealth.io.log import Refusal
+from lmshealth.report.tables import COLUMNS
+from tests.assessments import worn
+
+
+def read(path: Path) -> list[dict[str, str]]:
+    """Read a table."""
+    with path.open(encoding="utf-8", newline="") as stream:
+        return list(csv.DictReader(stream))
+
+
+def effect(mode: str, **more: Any) -> Part:
+    """Give a row of effects.csv."""
+    return Part.of("effects", [{"stage": "A", "mode": mode, "coefficient": 0.1 + 0.2, **more}])
+
+
+def test_rows_stand_in_the_order_of_the_machines(tmp_path: Path) -> None:
+    """In whichever order machines are done; those that never come leave the others their place."""
+    with Tables(tmp_path, ["A", "B", "C", "D"]) as tables:
+        for machine in ("C", "A", "D", "B"):
+            tables.add(machine, {"effects": effect(machine)})
+        tables.write()
+    assert [row["mode"] for row in read(tmp_path / "effects.csv")] == ["A", "B", "C", "D"]
+
+
+def test_a_machine_that_never_comes_keeps_no_other_from_its_place(tmp_path: Path) -> None:
+    """Rows of machines after one that failed are written all the same."""
+    with Tables(tmp_path, ["A", "B", "C"]) as tables:
+        for machine in ("C", "B"):
+            tables.add(machine, {"effects": effect(machine)})
+        tables.write()
+    assert [row["mode"] for row in read(tmp_path / "effects.csv")] == ["B", "C"]
+
+
+def test_parts_may_have_columns_of_their_own(tmp_path: Path) -> None:
+    """A column that only some rows have is empty in the others, and comes last."""
+    with Tables(tmp_path, ["A", "B"]) as tables:
+        tables.add("A", {"effects": effect("roll", note='two\nlines, "quoted"')})
+        tables.add("B", {"effects": effect("pitch", other=1)})
+        tables.write()
+    one, two = read(tmp_path / "effects.csv")
+    assert list(one) == [*COLUMNS["effects"].split(), "note", "other"]
+    assert (one["note"], one["other"]) == ('two\nlines, "quoted"', "")
+    assert (two["mode"], two["note"], two["other"]) == ("pitch", "", "1")
+    assert float(two["coefficient"]) == 0.1 + 0.2
+
+
+def test_a_cell_may_hold_any_sign(tmp_path: Path) -> None:
+    """What ends a line elsewhere does not end the run, nor take another row along."""
+    with Tables(tmp_path, ["A", "B"]) as tables:
+        tables.add("A", {"effects": effect("one\rtwo")})
+        tables.add("B", {"effects": effect("pitch")})
+        tables.write()
+    lines = (tmp_path / "effects.csv").read_bytes().decode().split("\n")
+    assert ["one\rtwo" in lines[1], "pitch" in lines[2]] == [True, True]
+
+
+def test_what_belongs_to_no_machine_comes_first(tmp_path: Path) -> None:
+    """Refused logs are listed, and tables without rows have their headers."""
+    with Tables(tmp_path, []) as tables:
+        tables.add_refused([Refusal("a.h5", "empty", "0 bytes")])
+        tables.write()
+    assert [row["log"] for row in read(tmp_path / "refused.csv")] == ["a.h5"]
+    for name, columns in COLUMNS.items():
+        head = (tmp_path / f"{name}.csv").read_text(encoding="utf-8").splitlines()[0]
+        assert head == ",".join(columns.split())
+
+
+def test_tables_that_are_not_finished_leave_those_of_before(tmp_path: Path) -> None:
+    """Who is interrupted sees the last whole tables, and nothing else is left in the folder."""
+    (tmp_path / "effects.csv").write_text("as it was")
+    with pytest.raises(KeyboardInterrupt), Tables(tmp_path, ["A"]) as tables:
+        tables.add("A", {"effects": effect("roll")})
+        raise KeyboardInterrupt
+    assert [path.name for path in tmp_path.iterdir()] == ["effects.csv"]
+    assert (tmp_path / "effects.csv").read_text() == "as it was"
+
+
+@pytest.mark.slow
+def test_a_page_is_told_without_tables_where_there_are_no_logs(tmp_path: Path) -> None:
+    """What the store has of a machine is enough for its page; what is unreadable is nothing."""
+    made = packed(worn(tmp_path))
+    told = tell(Content("M7-Y", "M7-Y.html", made.content, (), None))
+    assert told is not None
+    assert (told.page.file, told.page.row.identity) == ("M7-Y.html", "M7-Y")
+    assert told.tables == {}
+    assert tell(Content("M7-Y", "M7-Y.html", b"nonsense", (), None)) is None
+    assert tell(Content("M7-Y", "M7-Y.html", None, (), None)) is None

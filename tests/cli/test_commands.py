@@ -1,0 +1,325 @@
+"""Commands on tables and descriptions: what they write, what they say, how they fail."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+import xarray
+from click.testing import CliRunner, Result
+
+from lmshealth.cli.main import main
+from lmshealth.report.tables import COLUMNS
+from tests.lives import FADING, FOOT, MOUNT, make_stage, true_drift
+
+N = 30
+
+
+@pytest.fixture
+def estimates(tmp_path: Path) -> Path:
+    """Write estimates of two modes of a machine whose roll jumps by -3 % at log 20."""
+    rng = np.random.default_rng(4)
+    rows = []
+    for k in range(N):
+        for mode, f in (("roll", 126.4), ("pitch", 136.6)):
+            jump = 0.97 if mode == "roll" and k >= 20 else 1.0
+            rows.append(
+                {
+                    "stage": "AX-1",
+                    "log": f"{k:03d}",
+                    "recorded_at": f"2026-03-{k + 1:02d}T06:00:00+00:00",
+                    "travel_km": 100.0 * k,
+                    "temperature_c": 21 + rng.standard_normal(),
+                    "mode": mode,
+                    "source": "acc",
+                    "frequency_hz": f * jump * (1 + 1e-3 * rng.standard_normal()),
+                    "frequency_std_hz": 1e-3 * f,
+                    "damping_ratio": 0.015 * np.exp(0.05 * rng.standard_normal()),
+                    "damping_ratio_std": 0.015 * 0.05,
+                }
+            )
+    table = pd.DataFrame(rows)
+    table["temperature_c"] = table.groupby("log")["temperature_c"].transform("first")
+    path = tmp_path / "modes.csv"
+    table.to_csv(path, index=False)
+    return path
+
+
+def run(*words: object) -> Result:
+    """Run the command line."""
+    return CliRunner().invoke(main, ["track", *map(str, words)])
+
+
+def test_a_table_becomes_track_effects_and_events(estimates: Path, tmp_path: Path) -> None:
+    """Every file that is asked for is written; the jump is an event and an alarm."""
+    stage = make_stage(tmp_path / "stage", (FADING,))
+    assert stage.modes
+    out = {name: tmp_path / f"{name}.csv" for name in ("track", "effects", "events", "track_cov")}
+    result = run(
+        estimates, "--stage", tmp_path / "stage" / "small.toml", "--out", out["track"],
+        "--effects", out["effects"], "--events", out["events"], "--track-cov", out["track_cov"],
+        "--smooth",
+    )  # fmt: skip
+    assert result.exit_code == 0, result.output
+    track = pd.read_csv(out["track"])
+    assert len(track) == 2 * N
+    last = track[(track["mode"] == "roll")].iloc[-1]
+    assert abs(last["drift"] - np.log(0.97)) < 3 * last["drift_std"]
+    assert abs(last["drift_smoothed"] - last["drift"]) < 0.3 * last["drift_std"]
+    events = pd.read_csv(out["events"])
+    steps = events[events["kind"] == "step"]
+    assert set(steps["recorded_at"]) == {"2026-03-21T06:00:00+00:00"}
+    assert "alarm" in set(events["kind"])
+    assert set(pd.read_csv(out["effects"])["covariate"]) == {"temperature_c", "scale:acc"}
+    assert len(pd.read_csv(out["track_cov"])) == N
+    assert "What happened" in result.output
+
+
+def test_without_stage_and_names_modes_are_born(estimates: Path, tmp_path: Path) -> None:
+    """Unnamed estimates make two modes, named by their frequency."""
+    table = pd.read_csv(estimates).drop(columns=["mode", "source", "stage", "travel_km"])
+    bare = tmp_path / "other.csv"
+    table[table["recorded_at"] < "2026-03-21"].to_csv(bare, index=False)
+    result = run(bare, "--out", tmp_path / "track.csv")
+    assert result.exit_code == 0, result.output
+    names = sorted(set(pd.read_csv(tmp_path / "track.csv")["mode"]))
+    assert [name[:2] + name[-3:] for name in names] == ["12_hz", "13_hz"]
+    assert "all rows are taken for one machine, other" in result.stderr
+    assert "the clock is the time" in result.stderr
+
+
+def test_one_log_is_the_baseline(estimates: Path, tmp_path: Path) -> None:
+    """One epoch is no failure: nothing has drifted, which is said."""
+    single = tmp_path / "single.csv"
+    pd.read_csv(estimates).iloc[:2].to_csv(single, index=False)
+    result = run(single, "--out", tmp_path / "track.csv")
+    assert result.exit_code == 0, result.output
+    track = pd.read_csv(tmp_path / "track.csv")
+    assert (track["drift"] == 0).all()
+    assert "one log is the baseline" in result.stderr
+
+
+def test_bad_tables_are_one_line_and_status_1(estimates: Path, tmp_path: Path) -> None:
+    """The line names the file, the line of it and what is wrong."""
+    table = pd.read_csv(estimates)
+    table.loc[3, "frequency_std_hz"] = -1.0
+    bad = tmp_path / "bad.csv"
+    table.to_csv(bad, index=False)
+    result = run(bad, "--out", tmp_path / "track.csv")
+    assert result.exit_code == 1
+    assert result.stderr.count("\n") == 1
+    assert "line 5: frequency_std_hz is -1" in result.stderr
+    assert not (tmp_path / "track.csv").exists()
+
+
+def test_an_output_that_cannot_be_written_is_told(estimates: Path, tmp_path: Path) -> None:
+    """A file stands where a folder is needed: status 1 and the reason. Folders are made."""
+    result = run(estimates, "--out", estimates / "track.csv")
+    assert result.exit_code == 1
+    assert "cannot be written" in result.stderr
+    assert run(estimates, "--out", tmp_path / "new" / "track.csv").exit_code == 0
+    assert (tmp_path / "new" / "track.csv").exists()
+
+
+def test_maintenance_of_other_machines_is_told(estimates: Path, tmp_path: Path) -> None:
+    """A name that the table does not have may be a slip of the pen."""
+    actions = tmp_path / "maintenance.csv"
+    actions.write_text("stage,recorded_at,action\nAX-9,2026-03-02T00:00:00Z,servo\n")
+    result = run(estimates, "--out", tmp_path / "track.csv", "--maintenance", actions)
+    assert result.exit_code == 0, result.output
+    assert "maintenance of AX-9 is not used" in result.stderr
+
+
+def test_fewer_logs_than_a_birth_takes_are_told(estimates: Path, tmp_path: Path) -> None:
+    """Two logs without names know no mode yet: status 1 and what is needed."""
+    table = pd.read_csv(estimates)
+    two = table[table["recorded_at"].isin(table["recorded_at"].unique()[:2])]
+    two.drop(columns="mode").to_csv(tmp_path / "two.csv", index=False)
+    result = run(tmp_path / "two.csv", "--out", tmp_path / "track.csv")
+    assert result.exit_code == 1
+    assert "known once three logs show it" in result.stderr
+
+
+# infer
+
+
+@pytest.fixture
+def drifts(tmp_path: Path) -> Path:
+    """Write drifts of two machines, the second one's preload lower, with their cross terms."""
+    rows, terms = [], []
+    for stage, preload in (("AX-1", 0.9), ("AX-2", 0.7)):
+        make_stage(tmp_path / "stage")
+        for k, share in enumerate((0.0, 0.5, 1.0)):
+            moment = f"2026-03-{k + 1:02d}T06:00:00+00:00"
+            drift = true_drift(("guide_preload", "mount_stiffness"), share * np.log([preload, 0.9]))
+            for mode, size in zip(("roll", "pitch"), drift, strict=False):
+                rows.append((stage, moment, 100.0 * k, mode, size, 1e-3 * (k > 0)))
+            terms.append((stage, moment, "roll", "pitch", 3e-7 * (k > 0)))
+    columns = ["stage", "recorded_at", "travel_km", "mode", "drift", "drift_std"]
+    path = tmp_path / "track.csv"
+    pd.DataFrame(rows, columns=columns).to_csv(path, index=False)
+    columns = ["stage", "recorded_at", "mode_a", "mode_b", "cov_drift"]
+    pd.DataFrame(terms, columns=columns).to_csv(tmp_path / "track_cov.csv", index=False)
+    return path
+
+
+def infer(*words: object) -> Result:
+    """Run the command on drifts."""
+    return CliRunner().invoke(main, ["infer", *map(str, words)])
+
+
+@pytest.mark.slow
+def test_drifts_become_health(drifts: Path, tmp_path: Path) -> None:
+    """Every machine has its epochs in the table and its draws in the file; the truth is inside."""
+    toml = tmp_path / "stage" / "small.toml"
+    out, draws = tmp_path / "new" / "health.csv", tmp_path / "health.nc"
+    result = infer(drifts, "--stage", toml, "--out", out, "--posterior", draws)
+    assert result.exit_code == 0, result.output
+    table = pd.read_csv(out)
+    assert list(table.columns[:11]) == COLUMNS["health"].split()[:11]
+    last = table[table["recorded_at"].str.startswith("2026-03-03")].set_index(
+        ["stage", "parameter"]
+    )
+    for stage, preload in (("AX-1", 0.9), ("AX-2", 0.7)):
+        row = last.loc[stage, "guide_preload"]
+        assert row["q05"] < preload < row["q95"]
+        assert f"{stage}: health at 2026-03-03" in result.stdout
+    tree = xarray.open_datatree(draws, engine="h5netcdf")
+    median = np.median(tree["AX-2/posterior/guide_preload"][..., -1])
+    assert median == pytest.approx(last.loc["AX-2", "guide_preload"]["median"])
+
+
+@pytest.mark.slow
+def test_the_seed_alone_decides(drifts: Path, tmp_path: Path) -> None:
+    """The same seed gives the same file to the byte, another one another file."""
+    toml = tmp_path / "stage" / "small.toml"
+    outs = [tmp_path / f"{k}.csv" for k in range(3)]
+    for out, seed in zip(outs, (0, 0, 1), strict=True):
+        result = infer(drifts, "--stage", toml, "--out", out, "--seed", seed, "--epochs", 1)
+        assert result.exit_code == 0
+    assert outs[0].read_bytes() == outs[1].read_bytes() != outs[2].read_bytes()
+
+
+@pytest.mark.slow
+def test_machines_that_share_a_guide_are_inferred_together(drifts: Path, tmp_path: Path) -> None:
+    """One table for both; the shared preload once, the mounts under the names of the machines."""
+    toml = tmp_path / "stage" / "small.toml"
+    table = pd.read_csv(drifts)
+    paths = []
+    for stage in ("AX-1", "AX-2"):
+        paths.append(tmp_path / stage / "track.csv")
+        paths[-1].parent.mkdir()
+        table[table["stage"] == stage].to_csv(paths[-1], index=False)
+    out = tmp_path / "health.csv"
+    words = [paths[0], "--stage", toml, "--with", paths[1], toml, "--out", out, "--epochs", 1]
+    result = infer(*words, "--shared", "guide_preload")
+    assert result.exit_code == 0, result.output
+    assert set(pd.read_csv(out)["parameter"]) == {
+        "guide_preload",
+        "AX-1:mount_stiffness",
+        "AX-2:mount_stiffness",
+    }
+    assert infer(*words).exit_code == 2
+    words[0] = drifts
+    result = infer(*words, "--shared", "guide_preload")
+    assert result.exit_code == 1
+    assert "2 machines (AX-1, AX-2); needed is a table of the one" in result.stderr
+
+
+@pytest.mark.slow
+def test_a_machine_without_drifts_is_told_and_the_others_go_on(
+    drifts: Path, tmp_path: Path
+) -> None:
+    """Status 3 where one of two machines has nothing to infer from, 1 where none has."""
+    toml = tmp_path / "stage" / "small.toml"
+    table = pd.read_csv(drifts)
+    table.loc[table["stage"] == "AX-2", "mode"] += "2"
+    table.to_csv(drifts, index=False)
+    out = tmp_path / "health.csv"
+    result = infer(drifts, "--stage", toml, "--out", out)
+    assert result.exit_code == 3
+    assert "AX-2: none of the modes ['roll', 'pitch'] was tracked" in result.stderr
+    assert set(pd.read_csv(out)["stage"]) == {"AX-1"}
+    table[table["stage"] == "AX-2"].to_csv(drifts, index=False)
+    result = infer(drifts, "--stage", toml, "--out", tmp_path / "none.csv")
+    assert result.exit_code == 1
+    assert not (tmp_path / "none.csv").exists()
+
+
+# stage
+
+
+def check(*words: object) -> Result:
+    """Check a stage description on the command line."""
+    return CliRunner().invoke(main, ["stage", *map(str, words)])
+
+
+def test_a_description_in_order_is_told_in_tables_and_sentences(tmp_path: Path) -> None:
+    """Status 0, nothing on standard error; what the X stage cannot see is no failure."""
+    make_stage(tmp_path)
+    for reference in (tmp_path / "small.toml", "lms-x"):
+        result = check(reference)
+        assert (result.exit_code, result.stderr) == (0, "")
+        assert "Sensitivity" in result.stdout
+    assert "mount_stiffness is not identifiable" in result.stdout
+
+
+@pytest.mark.parametrize("parameters", [(), (FADING,), (FADING, FOOT, MOUNT)])
+def test_as_json_it_has_numbers_and_null(tmp_path: Path, parameters: tuple[str, ...]) -> None:
+    """Rows for as many parameters as there are; what is missing is null, never NaN."""
+    make_stage(tmp_path, parameters)
+
+    def refuse(word: str) -> None:
+        raise AssertionError(f"{word} is no JSON")
+
+    result = check(tmp_path / "small.toml", "--format", "json")
+    content = json.loads(result.stdout, parse_constant=refuse)
+    n = len(parameters)
+    assert [len(content[key]) for key in ("stage", "modes", "parameters")] == [1, 2, n]
+    assert [len(content[key]) for key in ("sensitivities", "correlations")] == [
+        2 * n,
+        n * (n - 1) / 2,
+    ]
+    assert {row["verdict"] for row in content["parameters"]} <= {"told", "not-told"}
+    assert (content["stage"][0]["model_std"] is None) == (n == 0)
+    assert content["findings"][0]["topic"] == "parameters"
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ("damping_ratio = 0.018", "damping_ratio = 1.8", "line 5: mode[0].damping_ratio: "),
+        ("limit =", "limits =", "line 13: parameter[0].limits: unknown key; known are name, prior"),
+        ('"map.csv"', '"gone.csv"', "line 27: map.file: there is no file "),
+        ("[map]", "[map", "line 26: no TOML: "),
+    ],
+)
+def test_a_slip_is_one_line_and_status_1(tmp_path: Path, old: str, new: str, said: str) -> None:
+    """The line names file, line, key, and what is needed."""
+    make_stage(tmp_path)
+    path = tmp_path / "small.toml"
+    path.write_text(path.read_text().replace(old, new, 1))
+    result = check(path)
+    assert (result.exit_code, result.stdout) == (1, "")
+    assert result.stderr.startswith(f"lmshealth: {path}: {said}")
+    assert result.stderr.count("\n") == 1
+
+
+def test_a_map_that_is_none_and_names_nobody_knows(tmp_path: Path) -> None:
+    """A cell that is no number has its line; unknown names are told which ones there are."""
+    make_stage(tmp_path)
+    table = tmp_path / "map.csv"
+    table.write_text(table.read_text().replace("\n0.2", "\na", 1))
+    result = check(tmp_path / "small.toml")
+    assert result.exit_code == 1
+    assert "map.csv: line 2: guide_preload is a" in result.stderr
+    assert "needed is a positive number" in result.stderr
+    assert "lms-x, lms-y" in check("lms-z").stderr
+    for path in (tmp_path / "gone.toml", tmp_path / "folder.toml"):
+        (tmp_path / "folder.toml").mkdir(exist_ok=True)
+        result = check(path)
+        assert result.exit_code == 1
+        assert f"{path}: cannot read the stage description: " in result.stderr

@@ -1,0 +1,203 @@
+"""From a table of estimates to remaining life: what is written, said and refused."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+import xarray
+from click.testing import CliRunner, Result
+
+from lmshealth.cli.main import main
+from lmshealth.prognosis import remaining_life as foretelling
+from lmshealth.prognosis.results import Prognosis
+from lmshealth.report.tables import COLUMNS
+from lmshealth.stage.description import Stage
+from lmshealth.tracking.results import History
+from tests.lives import (
+    FADING,
+    FREQUENCY,
+    START,
+    TEMPERATURE,
+    make_prognosis,
+    make_stage,
+    true_drift,
+)
+
+TAIL = TEMPERATURE + "[usage]\nhorizon_km = 5000\n[decision]\nnext_service = 2026-06-01\n"
+LIMIT_KM = 0.4 / 1.5e-4 + 100 - 1200  # where AX-1 is at its limit, from its last log
+
+
+@pytest.fixture
+def toml(tmp_path: Path) -> Path:
+    """Write the description of a preload that fades."""
+    make_stage(tmp_path / "stage", (FADING,), tail=TAIL)
+    return tmp_path / "stage" / "small.toml"
+
+
+@pytest.fixture
+def table(tmp_path: Path) -> Path:
+    """Write estimates of a machine that wears and of one that does not."""
+    rng = np.random.default_rng(4)
+    rows = []
+    for stage, rate in (("AX-1", 1.5e-4), ("AX-2", 0.0)):
+        for k in range(12):
+            left = 1 - rate * 100 * k
+            drift = true_drift(("guide_preload",), np.log([left]))
+            for j, mode in enumerate(("roll", "pitch")):
+                f = FREQUENCY[j] * np.exp(drift[j] + 1e-3 * rng.standard_normal())
+                rows.append(
+                    {
+                        "stage": stage,
+                        "log": f"{stage}-{k:02d}",
+                        "recorded_at": f"2026-03-{2 * k + 1:02d}T06:00:00+00:00",
+                        "travel_km": 100.0 * (k + 1),
+                        "temperature_c": 21.0,
+                        "mode": mode,
+                        "source": "acc",
+                        "frequency_hz": f,
+                        "frequency_std_hz": 1e-3 * f,
+                    }
+                )
+    path = tmp_path / "modes.csv"
+    pd.DataFrame(rows).to_csv(path, index=False)
+    return path
+
+
+@pytest.fixture
+def quick(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Put a life with a known end in the place of the inference."""
+
+    def prognose(history: History, stage: Stage, seed: object) -> tuple[Prognosis, None]:
+        made = make_prognosis(np.linspace(1e5, 1e6, 1000), np.full(1000, 1e4))
+        object.__setattr__(made, "stage", history.stage)
+        return made, None
+
+    monkeypatch.setattr(foretelling, "prognose_with_posterior", prognose)
+
+
+def call(*words: object) -> Result:
+    """Run the command."""
+    return CliRunner().invoke(main, ["prognose", *map(str, words)])
+
+
+@pytest.mark.slow
+def test_estimates_become_remaining_lives(table: Path, toml: Path, tmp_path: Path) -> None:
+    """The truth lies in the 90 % interval, who does not wear has no end; draws are kept."""
+    out, draws = tmp_path / "new" / "prognosis.csv", tmp_path / "life.nc"
+    result = call(table, "--stage", toml, "--out", out, "--posterior", draws, "--by", "2026-05-01")
+    assert result.exit_code == 0, result.output
+    found = pd.read_csv(out)
+    assert list(found.columns[: len(COLUMNS["prognosis"].split())]) == COLUMNS["prognosis"].split()
+    worn, sound = (found[found["stage"] == stage].iloc[1] for stage in ("AX-1", "AX-2"))
+    assert worn["rul_km_q05"] < LIMIT_KM < worn["rul_km_q95"]
+    assert (worn["service"], sound["service"]) == ("by", "later")
+    assert worn["service_risk"] <= 0.05
+    assert sound["censored_from"] == 0.05 and sound["probability_at_most"] < 0.05
+    assert worn["before"] == "2026-05-01"
+    assert f"Service: by {worn['service_by']} (accepted risk 5 %)" in result.stdout
+    assert f"{worn['rul_km_q50']:,.0f}" in result.stdout
+    assert "AX-2: what is left" in result.stdout and "beyond 5,000" in result.stdout
+    tree = xarray.open_datatree(draws, engine="h5netcdf")
+    assert tree["AX-1/posterior/guide_preload"].to_numpy().mean() == pytest.approx(0.835, abs=0.03)
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("quick")
+def test_the_command_line_chooses_the_day(table: Path, toml: Path, tmp_path: Path) -> None:
+    """A risk or a ratio of costs stands in for that of the description; the plan stays."""
+    out, days = tmp_path / "p.csv", []
+    for more in ((), ("--max-risk", 0.3), ("--cost-ratio", 1.5), ("--cost-ratio", 300)):
+        result = call(table, "--stage", toml, "--out", out, *more)
+        assert result.exit_code == 0, result.output
+        assert "Before the service planned for 2026-06-01: 91 %" in result.stdout
+        days.append(pd.read_csv(out)["service_by"].iloc[1])
+    assert days[0] < days[1] and days[3] < days[2]
+    assert "least costs, where a failure costs 300 times" in result.stdout
+    assert call(table, "--stage", toml, "--out", out, "--cost-ratio", 1).exit_code == 2
+
+
+def test_two_choices_of_the_day_are_wrong_usage(table: Path, toml: Path, tmp_path: Path) -> None:
+    """Both options together: status 2, and both are named."""
+    words = ("--max-risk", 0.3, "--cost-ratio", 3)
+    result = call(table, "--stage", toml, "--out", tmp_path / "p.csv", *words)
+    assert result.exit_code == 2
+    assert "--max-risk and --cost-ratio" in result.stderr
+
+
+@pytest.mark.usefixtures("quick")
+def test_a_machine_that_cannot_be_foretold_is_left_out(
+    table: Path, toml: Path, tmp_path: Path
+) -> None:
+    """Status 3 where one of two machines has no odometer, 1 and no file where none has."""
+    rows, out = pd.read_csv(table), tmp_path / "p.csv"
+    rows.loc[rows["stage"] == "AX-2", "travel_km"] = np.nan
+    rows.to_csv(table, index=False)
+    result = call(table, "--stage", toml, "--out", out)
+    assert result.exit_code == 3
+    assert "AX-2: not every log has travel_km" in result.stderr
+    assert set(pd.read_csv(out)["stage"]) == {"AX-1"}
+    rows[rows["stage"] == "AX-2"].to_csv(table, index=False)
+    result = call(table, "--stage", toml, "--out", tmp_path / "none.csv")
+    assert result.exit_code == 1
+    assert not (tmp_path / "none.csv").exists()
+
+
+def test_a_description_without_limits_is_one_line_and_status_1(table: Path, tmp_path: Path) -> None:
+    """Without a limit there is no end of life, whatever the table."""
+    make_stage(tmp_path / "free", (FADING.replace("limit = { below = 0.6 }", ""),), tail=TAIL)
+    stage = tmp_path / "free" / "small.toml"
+    result = call(table, "--stage", stage, "--out", tmp_path / "p.csv")
+    assert result.exit_code == 1
+    assert result.stderr.count("\n") == 1
+    assert "no [[parameter]] has a limit" in result.stderr
+
+
+@pytest.mark.usefixtures("quick")
+def test_maintenance_of_other_machines_is_told(table: Path, toml: Path, tmp_path: Path) -> None:
+    """A name that the table does not have may be a slip of the pen."""
+    actions = tmp_path / "maintenance.csv"
+    actions.write_text("stage,recorded_at,action\nAX-9,2026-03-02T00:00:00Z,servo\n")
+    out = tmp_path / "p.csv"
+    result = call(table, "--stage", toml, "--out", out, "--maintenance", actions)
+    assert result.exit_code == 0, result.output
+    assert "note: maintenance of AX-9 is not used: the table has AX-1, AX-2" in result.stderr
+
+
+@pytest.mark.parametrize("option", ["--max-risk", "--cost-ratio"])
+@pytest.mark.parametrize("value", ["nan", "inf"])
+def test_what_is_no_finite_number_is_wrong_usage(
+    table: Path, toml: Path, tmp_path: Path, option: str, value: str
+) -> None:
+    """Neither NaN nor infinity chooses a day: status 2, the option is named, nothing is written."""
+    out = tmp_path / "p.csv"
+    result = call(table, "--stage", toml, "--out", out, option, value)
+    assert result.exit_code == 2
+    assert option in result.stderr and not out.exists()
+
+
+@pytest.mark.usefixtures("quick")
+def test_nothing_is_foretold_for_a_day_that_is_past(
+    table: Path, toml: Path, tmp_path: Path
+) -> None:
+    """The day of the last log, or one before it, has a note and no probability anywhere."""
+    out = tmp_path / "p.csv"
+    for day in ("2026-01-01", START.date().isoformat()):
+        result = call(table, "--stage", toml, "--out", out, "--by", day)
+        assert result.exit_code == 0, result.output
+        assert f"--by {day} is not after it" in result.stderr
+        assert f"before {day}" not in result.stdout
+        assert "before" not in pd.read_csv(out).columns
+
+
+@pytest.mark.parametrize("day", ["soon", "01.03.2027", "2027-13-01"])
+def test_what_is_no_day_is_told_how_a_day_is_written(
+    table: Path, toml: Path, tmp_path: Path, day: str
+) -> None:
+    """Status 2, with the form and an example instead of the signs of a format."""
+    result = call(table, "--stage", toml, "--out", tmp_path / "p.csv", "--by", day)
+    assert result.exit_code == 2
+    assert f"{day!r} is no day; needed YYYY-MM-DD, such as 2027-03-01" in result.stderr
+    assert "%" not in result.stderr

@@ -1,0 +1,824 @@
+"""The command line: exit statuses, one line of error, and the three formats of the contract."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import shutil
+import sqlite3
+import subprocess
+import sys
+from collections.abc import Callable
+from contextlib import closing
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner, Result
+
+from lmshealth.batch.assess import packed
+from lmshealth.batch.store import SCHEMA, Store, beside
+from lmshealth.cli.main import main
+from lmshealth.report.tables import COLUMNS, LOOKS
+from models.stages import STAGES
+from models.velocities import Experiment, drive_velocities
+from studies.frf_modes.records import BAND, MODES, RATE, Machine, periodic
+from tests.assessments import worn
+from tests.report.test_machine_page import nothing
+from tests.signals import Mode, accelerations, write_archive, write_archive_stage, write_log
+
+MODE_KEYS = set(COLUMNS["modes"].split())
+
+
+def call(*arguments: object) -> Result:
+    """Run the command line in this process."""
+    return CliRunner().invoke(main, [str(argument) for argument in arguments])
+
+
+def strict(text: str) -> dict[str, list[dict[str, object]]]:
+    """Parse JSON and refuse NaN and infinity, which JSON does not have."""
+
+    def refuse(name: str) -> None:
+        raise ValueError(f"{name} is no JSON")
+
+    content = json.loads(text, parse_constant=refuse)
+    assert isinstance(content, dict)
+    return content
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Make two good logs, a broken one, one without metadata, and a description of modes."""
+    root = tmp_path_factory.mktemp("cli")
+    write_archive(root / "good", 2)
+    write_archive_stage(root / "stage", health=False)
+    (root / "bad").mkdir()
+    (root / "bad" / "broken.h5").write_bytes(b"nothing")
+    values = "\n".join(f"{v!r}" for v in _noise())
+    (root / "bare.csv").write_text("# sample_rate_hz: 500\nacc_x_m_s2\n" + values + "\n")
+    return root
+
+
+def _noise() -> list[float]:
+    """Give 16 s of one mode at 62 Hz."""
+    rng = np.random.default_rng(5)
+    return [float(v) for v in accelerations(rng, [Mode(62.0, 0.02)], 8000, 500.0, 0.5)[0]]
+
+
+@pytest.fixture
+def stage(folder: Path) -> Path:
+    """Give the path of the description."""
+    return folder / "stage" / "small.toml"
+
+
+# Help and usage
+
+
+def test_every_command_has_help_with_an_example() -> None:
+    """``--help`` of each command shows how it is called."""
+    assert set(main.commands) >= {
+        "run",
+        "modes",
+        "error",
+        "spectrum",
+        "frf",
+        "plan",
+        "stage",
+        "report",
+    }
+    for name in main.commands:
+        result = call(name, "--help")
+        assert result.exit_code == 0
+        assert "Example" in result.stdout
+        # One line per example, as it is typed.
+        assert f"\n      lmshealth {name} " in result.stdout
+
+
+def test_the_exit_statuses_are_told() -> None:
+    """The help of the program names its exit statuses; -h is help too."""
+    result = call("-h")
+    assert result.exit_code == 0
+    assert "Exit status" in result.stdout
+
+
+def test_the_version_is_told() -> None:
+    """``--version`` prints the version of the package."""
+    from lmshealth import __version__
+
+    assert __version__ in call("--version").stdout
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ("run",),
+        ("run", "."),
+        ("run", ".", "--stage", "lms-y"),
+        ("run", "no-such-folder", "--stage", "lms-y", "--out", "out"),
+        ("run", ".", "--stage", "lms-y", "--out", "out", "--workers", "0"),
+        ("run", ".", "--stage", "lms-y", "--out", "out", "--epochs", "none"),
+        ("modes",),
+        ("modes", "log.h5", "--format", "yaml"),
+        ("modes", "log.h5", "--band", "200", "80"),
+        ("modes", "log.h5", "--band", "-5", "80"),
+        ("modes", "log.h5", "--nonsense"),
+        ("error",),
+        ("error", "log.h5", "--count", "0"),
+        ("error", "log.h5", "--floor-nm", "-1"),
+        ("error", "log.h5", "--part", "ramp"),
+        ("spectrum",),
+        ("spectrum", "log.h5", "--band", "200", "80"),
+        ("frf", "log.h5"),
+        ("frf", "log.h5", "--input", "current"),
+        ("frf", "log.h5", "--input", "current", "--output", "acc_x", "--period", "0"),
+        ("frf", "log.h5", "--input", "current", "--output", "acc_x", "--band", "200", "80"),
+        ("plan", "--stage", "lms-y"),
+        ("plan", "--detect", "guide_preload=0.05"),
+        ("plan", "--stage", "lms-y", "--detect", "guide_preload"),
+        ("plan", "--stage", "lms-y", "--detect", "guide_preload=0.05", "--power", "1"),
+        ("plan", "--stage", "lms-y", "--detect", "guide_preload=0.05", "--format", "csv"),
+        ("report", "--out", "pages"),
+        ("report", "--store", "sqlite:///store.sqlite"),
+        ("nonsense",),
+    ],
+)
+def test_wrong_usage_is_status_2(arguments: tuple[str, ...]) -> None:
+    """What is wrongly asked is said on standard error with status 2."""
+    result = call(*arguments)
+    assert result.exit_code == 2
+    assert "Error" in result.stderr
+    assert result.stdout == ""
+
+
+# modes
+
+
+def test_modes_as_json_have_the_keys_of_the_contract(folder: Path, stage: Path) -> None:
+    """Modes, lines and refused are lists of objects with at least the contract's keys."""
+    log = folder / "good" / "log-00.h5"
+    result = call("modes", log, "--stage", stage, "--format", "json")
+    assert result.exit_code == 0
+    content = strict(result.stdout)
+    assert set(content) == {"modes", "lines", "refused"}
+    assert [mode["mode"] for mode in content["modes"]] == ["roll", "pitch"]
+    assert all(set(mode) >= MODE_KEYS for mode in content["modes"])
+    assert content["modes"][0]["frequency_hz"] == pytest.approx(62.0, rel=0.01)
+
+
+def test_modes_of_a_bare_log_have_nulls_and_need_no_metadata(folder: Path) -> None:
+    """A log of samples and a rate alone is analysed; what it does not say is null."""
+    result = call("modes", folder / "bare.csv", "--band", 30, 200, "--format", "json")
+    assert result.exit_code == 0
+    (mode,) = strict(result.stdout)["modes"]
+    assert mode["mode"] == "mode_1"
+    assert mode["stage"] is None
+    assert mode["travel_km"] is None
+    assert mode["frequency_hz"] == pytest.approx(62.0, rel=0.02)
+
+
+def test_modes_as_csv_have_the_columns_of_the_contract(folder: Path, stage: Path) -> None:
+    """One header and one row per mode and log, parsed by any reader."""
+    logs = sorted((folder / "good").glob("*.h5"))
+    result = call("modes", *logs, "--stage", stage, "--format", "csv")
+    rows = list(csv.DictReader(io.StringIO(result.stdout)))
+    assert result.exit_code == 0
+    assert set(rows[0]) >= MODE_KEYS
+    assert [(Path(row["log"]).name, row["mode"]) for row in rows] == [
+        (name, mode) for name in ("log-00.h5", "log-01.h5") for mode in ("roll", "pitch")
+    ]
+
+
+def test_modes_as_a_table_name_frequency_and_damping(folder: Path, stage: Path) -> None:
+    """People get a table; it is the default."""
+    result = call("modes", folder / "good" / "log-00.h5", "--stage", stage)
+    assert result.exit_code == 0
+    assert "roll" in result.stdout
+    assert "±" in result.stdout
+
+
+def test_a_refused_log_is_told_once_and_without_an_empty_table(folder: Path, stage: Path) -> None:
+    """On standard error alone; json has it too, for programs."""
+    broken = folder / "bad" / "broken.h5"
+    result = call("modes", broken, "--stage", stage)
+    assert (result.exit_code, result.stdout) == (1, "")
+    assert len(result.stderr.splitlines()) == 1 and "broken.h5" in result.stderr
+    result = call("modes", broken, folder / "good" / "log-00.h5", "--stage", stage)
+    assert result.exit_code == 3
+    assert "roll" in result.stdout and "broken.h5" not in result.stdout
+    assert result.stderr.count("broken.h5") == 1
+    found = strict(call("modes", broken, "--stage", stage, "--format", "json").stdout)["refused"]
+    assert [Path(row["log"]).name for row in found] == ["broken.h5"]
+
+
+def test_modes_without_a_band_say_what_may_be_missed(folder: Path, stage: Path) -> None:
+    """Only people are told, and only where neither a band nor a description is given."""
+    log, said = folder / "bare.csv", "look closer with --band LOW HIGH."
+    assert said in " ".join(call("modes", log).stdout.split())
+    for more in (("--band", 30, 200), ("--format", "csv"), ("--stage", stage)):
+        assert "--band" not in call("modes", log, *more).stdout
+
+
+def test_a_refused_mode_alone_is_still_status_0(folder: Path, stage: Path) -> None:
+    """A mode that this log does not show is listed with its reason, and nothing failed."""
+    result = call("modes", folder / "bare.csv", "--stage", stage, "--format", "json")
+    content = strict(result.stdout)
+    assert result.exit_code == 0
+    assert [mode["mode"] for mode in content["modes"]] == ["roll"]
+    (refused,) = content["refused"]
+    assert refused["mode"] == "pitch"
+    assert {"log", "channel", "mode", "reason"} <= set(refused)
+
+
+def test_some_bad_logs_are_status_3_and_all_bad_are_1(folder: Path, stage: Path) -> None:
+    """One line on standard error per bad log; standard output stays what the format says."""
+    good, bad = folder / "good" / "log-00.h5", folder / "bad" / "broken.h5"
+    some = call("modes", good, bad, "--stage", stage, "--format", "json")
+    assert some.exit_code == 3
+    assert len(strict(some.stdout)["modes"]) == 2
+    assert len(some.stderr.splitlines()) == 1
+    assert "broken.h5" in some.stderr
+    none = call("modes", bad, folder / "no-such.h5", "--stage", stage, "--format", "json")
+    assert none.exit_code == 1
+    assert {row["log"] for row in strict(none.stdout)["refused"]} == {
+        str(bad),
+        str(folder / "no-such.h5"),
+    }
+
+
+def test_chosen_channels_and_column_maps_reach_the_analysis(folder: Path, tmp_path: Path) -> None:
+    """A foreign export is read through its map; an unknown channel is a bad log, not a crash."""
+    text = (folder / "bare.csv").read_text().replace("acc_x_m_s2", "CH1")
+    (tmp_path / "export.csv").write_text(text)
+    (tmp_path / "map.toml").write_text('[columns]\nacc_pitch_m_s2 = "CH1"\n')
+    arguments = ("--columns", tmp_path / "map.toml", "--band", 30, 200, "--format", "json")
+    result = call("modes", tmp_path / "export.csv", *arguments)
+    assert result.exit_code == 0
+    assert strict(result.stdout)["modes"][0]["channel"] == "acc_pitch"
+    unknown = call("modes", tmp_path / "export.csv", *arguments, "--channels", "acc_yaw")
+    assert unknown.exit_code == 1
+    assert "acc_pitch" in unknown.stderr
+
+
+@pytest.mark.slow
+def test_the_program_runs_as_a_process(folder: Path, stage: Path) -> None:
+    """From a shell: JSON on standard output, nothing on standard error, status 0."""
+    start = [sys.executable, "-c", "from lmshealth.cli import main; main()"]
+    log = folder / "good" / "log-00.h5"
+    done = subprocess.run(
+        [*start, "modes", str(log), "--stage", str(stage), "--format", "json"],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert (done.returncode, done.stderr) == (0, "")
+    assert len(strict(done.stdout)["modes"]) == 2
+
+
+# Logs of strokes
+
+
+@pytest.fixture(scope="module")
+def strokes(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    """Drive the simulated Y at four velocities, 4 s each with acceleration and braking."""
+    folder = tmp_path_factory.mktemp("strokes")
+    drive_velocities(
+        Experiment(STAGES["lms-y"]), folder, "hdf5", velocities=(0.005, 0.02, 0.1, 0.4)
+    )
+    return sorted(folder.glob("*.h5"))
+
+
+@pytest.mark.slow
+def test_modes_of_what_settles(strokes: list[Path]) -> None:
+    """A stop from 400 mm/s tells the modes, with a stage or without; a log without is refused."""
+    arguments = ("--part", "settling", "--format", "json")
+    result = call("modes", strokes[-1], strokes[0], "--stage", "lms-y", *arguments)
+    assert result.exit_code == 3
+    assert "no-such-part" in result.stderr
+    content = strict(result.stdout)
+    assert [row["mode"] for row in content["modes"]] == ["roll", "pitch", "yaw"]
+    assert all(set(row) == MODE_KEYS for row in content["modes"])
+    found = [row["frequency_hz"] for row in content["modes"]]
+    assert found == pytest.approx([126.4, 136.6, 155.0], rel=2e-3)
+    assert [row["reason"] for row in content["refused"]] == ["no-such-part"]
+    bare = strict(call("modes", strokes[-1], "--band", 110, 145, *arguments).stdout)
+    numbered = [(row["mode"], row["frequency_hz"]) for row in bare["modes"]]
+    assert numbered == [("mode_1", pytest.approx(126.4, rel=2e-3)),
+                        ("mode_2", pytest.approx(136.6, rel=2e-3))]  # fmt: skip
+
+
+@pytest.mark.slow
+def test_error_as_json_lists_every_harmonic(strokes: list[Path]) -> None:
+    """Rows have the columns of the table; the harmonics' cosines rebuild what they claim."""
+    result = call("error", *strokes, "--count", 20, "--format", "json")
+    assert (result.exit_code, result.stderr) == (0, "")
+    content = strict(result.stdout)
+    assert set(content) == {"error", "harmonics", "refused"}
+    assert [row["velocity_mm_s"] for row in content["error"]] == pytest.approx([5, 20, 100, 400])
+    for row in content["error"]:
+        assert set(row) == set(LOOKS["error"].split())
+        own = [h for h in content["harmonics"] if h["log"] == row["log"]]
+        assert len(own) == 20
+        assert own[0]["amplitude_um"] == row["max_magnitude_um"]
+        power = sum(h["amplitude_um"] ** 2 / 2 for h in own)  # type: ignore[operator]
+        assert power / row["std_um"] ** 2 == pytest.approx(row["share_explained"], rel=1e-6)  # type: ignore[operator]
+
+
+def test_error_as_csv_and_table(strokes: list[Path]) -> None:
+    """One row per log; a floor above everything leaves cells empty, the table a dash."""
+    arguments = ("error", *strokes, "--floor-nm", 1e6)
+    rows = list(csv.DictReader(io.StringIO(call(*arguments, "--format", "csv").stdout)))
+    assert len(rows) == 4
+    assert {row["bandwidth_above_floor_hz"] for row in rows} == {""}
+    shown = call(*arguments).stdout
+    assert "velocity-0400.000.h5" in shown
+    assert "–" in shown
+
+
+def test_error_of_a_part_and_its_refusals(strokes: list[Path], folder: Path) -> None:
+    """A stroke settles; a log without Δe, or that never settles, is refused: status 3, then 1."""
+    result = call("error", strokes[-1], folder / "bare.csv", "--part", "settling")
+    assert result.exit_code == 3
+    assert "no-delta-e" in result.stderr
+    result = call("error", strokes[0], "--part", "settling")
+    assert result.exit_code == 1
+    assert "no-such-part" in result.stderr
+    assert len(result.stderr.splitlines()) == 1
+
+
+@pytest.mark.slow
+def test_spectrum_as_json_says_what_grows(strokes: list[Path]) -> None:
+    """Pitch grows with velocity and is read by both accelerometers; 50 Hz is mains."""
+    result = call("spectrum", *strokes, "--stage", "lms-y", "--format", "json")
+    assert (result.exit_code, result.stderr) == (0, "")
+    content = strict(result.stdout)
+    assert set(content) == {"magnitudes", "growth", "lines", "refused"}
+    assert all(set(row) == set(LOOKS["magnitudes"].split()) for row in content["magnitudes"])
+    assert len(content["magnitudes"]) == 4 * 2 * 7  # logs, accelerometers, bands
+    pitch = [row for row in content["growth"] if row["band"] == "pitch"]
+    assert [row["grows"] for row in pitch] == [True, True]
+    assert {line["kind"] for line in content["lines"]} >= {"mains"}
+    mains = [line["frequency_hz"] for line in content["lines"] if line["kind"] == "mains"]
+    assert min(mains) == pytest.approx(50.0, abs=0.05)  # type: ignore[type-var]
+
+
+def test_spectrum_without_a_stage_reads_the_papers_grid(strokes: list[Path]) -> None:
+    """Every 10 Hz of the band, as CSV and as a table."""
+    arguments = ("spectrum", *strokes, "--band", 100, 140)
+    rows = list(csv.DictReader(io.StringIO(call(*arguments, "--format", "csv").stdout)))
+    assert [row["band"] for row in rows[:5]] == [f"{f} Hz" for f in range(100, 141, 10)]
+    assert len(rows) == 4 * 2 * 5
+    assert "grows" in call(*arguments).stdout
+
+
+def test_one_velocity_has_no_slope_and_that_is_no_failure(strokes: list[Path]) -> None:
+    """A single log is read; what grows cannot be told: null, and a dash in the table."""
+    content = strict(call("spectrum", strokes[0], "--format", "json").stdout)
+    assert {row["slope"] for row in content["growth"]} == {None}
+    assert {row["grows"] for row in content["growth"]} == {None}
+    result = call("spectrum", strokes[0])
+    assert result.exit_code == 0
+    assert "–" in result.stdout
+
+
+def test_spectrum_refuses_what_it_cannot_read(folder: Path, tmp_path: Path) -> None:
+    """No accelerometer and a record too short are named; all refused is status 1."""
+    (tmp_path / "slow.csv").write_text("# sample_rate_hz: 500\ndelta_e_um\n1\n2\n3\n1\n2\n")
+    (tmp_path / "short.csv").write_text(
+        "# sample_rate_hz: 500\nacc_x_m_s2\n" + "".join(f"{v}\n" for v in _noise()[:100])
+    )
+    result = call("spectrum", tmp_path / "slow.csv", tmp_path / "short.csv", "--band", 10, 200)
+    assert result.exit_code == 1
+    assert "no-accelerometer" in result.stderr
+    assert "too-short" in result.stderr
+    assert len(result.stderr.splitlines()) == 2
+    assert (
+        call("spectrum", folder / "bare.csv", tmp_path / "short.csv", "--band", 10, 200).exit_code
+        == 3
+    )
+
+
+# frf
+
+
+@pytest.fixture(scope="module")
+def bench(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Drive a machine by a multisine of 4 s for 20 s; the export calls its columns otherwise."""
+    folder = tmp_path_factory.mktemp("bench")
+    signals = periodic(np.random.default_rng(9), Machine(), 1600, 5)
+    np.savetxt(folder / "bench.csv", np.column_stack(signals), header="U,ACC", delimiter=",",
+               comments="")  # fmt: skip
+    (folder / "map.toml").write_text(
+        f'sample_rate_hz = {RATE}\n[columns]\ncurrent_a = "U"\nacc_x_m_s2 = "ACC"\n'
+    )
+    return folder
+
+
+def frf(bench: Path, *more: object) -> Result:
+    """Ask for the response of the bench."""
+    return call(
+        "frf", bench / "bench.csv", "--columns", bench / "map.toml",
+        "--input", "current", "--output", "acc_x", *more,
+    )  # fmt: skip
+
+
+def test_frf_as_json_has_the_response_and_its_modes(bench: Path) -> None:
+    """Modes as everywhere, the response line by line, how it was measured and fitted."""
+    result = frf(bench, "--band", *BAND, "--period", 4, "--format", "json")
+    assert (result.exit_code, result.stderr) == (0, "")
+    content = strict(result.stdout)
+    assert set(content) == {"modes", "fit", "frf", "lines", "refused"}
+    assert all(set(mode) >= MODE_KEYS for mode in content["modes"])
+    assert [mode["source"] for mode in content["modes"]] == ["frf", "frf"]
+    for mode, (f, _, _) in zip(content["modes"], MODES, strict=False):
+        assert mode["frequency_hz"] == pytest.approx(f, rel=2e-3)
+    (fit,) = content["fit"]
+    assert set(fit) == set(LOOKS["fit"].split())
+    assert fit["period_s"] == pytest.approx(4)
+    assert fit["n_lines"] == len(content["frf"]) == 305
+    for row in content["frf"]:
+        assert set(row) == set(LOOKS["frf"].split())
+    keys = ("gain", "fit_gain", "gain_std")
+    gain, fitted, std = np.array([[row[k] for k in keys] for row in content["frf"]], dtype=float).T
+    assert np.abs((gain - fitted) / std).max() < 5
+
+
+def test_frf_as_csv_lists_modes_and_as_a_table_both(bench: Path) -> None:
+    """CSV is a table of modes that `track` reads; people see lines of the response too."""
+    rows = list(csv.DictReader(io.StringIO(frf(bench, "--format", "csv").stdout)))
+    assert set(rows[0]) >= MODE_KEYS
+    shown = frf(bench).stdout
+    assert "Response of acc_x to current" in shown
+    assert "coherence" in shown
+    assert "periods of 4 s" in shown
+    assert "mode_1" in shown
+    assert max(len(line) for line in shown.splitlines()) <= 80
+
+
+def test_frf_says_why_a_mode_has_no_name(bench: Path, tmp_path: Path) -> None:
+    """Where two are looked for at one place both are named, in the form that goes on to track."""
+    frequency = MODES[0][0]
+    (tmp_path / "two.toml").write_text(
+        'name = "two"\n'
+        + "".join(
+            f'[[mode]]\nname = "{name}"\nfrequency_hz = {frequency}\ndamping_ratio = 0.01\n'
+            for name in ("roll", "pitch")
+        )
+    )
+    result = frf(bench, "--stage", tmp_path / "two.toml", "--format", "csv")
+    assert result.exit_code == 0
+    assert next(csv.DictReader(io.StringIO(result.stdout)))["mode"] == ""
+    assert "has no name: roll and pitch are both looked for there; track finds" in result.stderr
+
+
+def test_frf_of_several_logs_is_a_table_for_track(bench: Path, tmp_path: Path) -> None:
+    """Modes are named by the description, dated by the manifest beside the logs, and tracked."""
+    for name in ("a.csv", "b.csv"):
+        shutil.copy(bench / "bench.csv", tmp_path / name)
+    (tmp_path / "manifest.csv").write_text(
+        "file,stage,recorded_at,travel_km\na.csv,M,2026-01-01T00:00Z,1\nb.csv,M,2026-01-02T00:00Z,2\n"
+    )
+    modes = "".join(
+        f'[[mode]]\nname = "{name}"\nfrequency_hz = {f}\ndamping_ratio = {zeta}\nsearch = 0.1\n'
+        for name, (f, zeta, _) in zip(("low", "high"), MODES, strict=False)
+    )
+    (tmp_path / "stage.toml").write_text(f'name = "m"\n[match]\nstage = "M"\n{modes}')
+    result = call(
+        "frf", *sorted(tmp_path.glob("*.csv")), "--columns", bench / "map.toml",
+        "--input", "current", "--output", "acc_x", "--band", *BAND,
+        "--stage", tmp_path / "stage.toml", "--format", "csv",
+    )  # fmt: skip
+    assert (result.exit_code, result.stderr) == (0, "")
+    told = list(csv.DictReader(io.StringIO(result.stdout)))
+    assert [row["mode"] for row in told] == ["low", "high"] * 2
+    assert [row["travel_km"] for row in told] == ["1.0", "1.0", "2.0", "2.0"]
+    (tmp_path / "modes.csv").write_text(result.stdout)
+    track = ("--stage", tmp_path / "stage.toml", "--out", tmp_path / "track.csv")
+    assert call("track", tmp_path / "modes.csv", *track).exit_code == 0
+
+
+def test_a_single_log_heeds_the_manifest_beside_it(folder: Path, tmp_path: Path) -> None:
+    """Its row has the last word, a bad one refuses the log, and other folders' are not read."""
+    log = Path(shutil.copy(folder / "good" / "log-00.h5", tmp_path))
+    manifest = tmp_path / "manifest.csv"
+    (tmp_path / "below").mkdir()
+    (tmp_path / "below" / "manifest.csv").write_text("file,stage\n../log-00.h5,never\n")
+
+    def stages() -> list[str]:
+        result = call("modes", log, "--stage", folder / "stage" / "small.toml", "--format", "csv")
+        return [row["stage"] for row in csv.DictReader(io.StringIO(result.stdout))]
+
+    assert set(stages()) == {"test-A"}
+    manifest.write_text("file,stage\nlog-00.h5,other\n")
+    assert set(stages()) == {"other"}
+    manifest.write_text("file,travel_km\nlog-00.h5,1\nlog-00.h5,2\n")
+    result = call("modes", log)
+    assert result.exit_code == 1
+    assert "bad-row" in result.stderr
+    manifest.write_bytes(b"")
+    result = call("modes", log, "--stage", folder / "stage" / "small.toml")
+    assert result.exit_code == 0
+    assert result.stderr.startswith("note: manifest.csv: ")
+
+
+def test_frf_that_cannot_be_read_is_status_1_with_one_line(bench: Path) -> None:
+    """A missing channel is named with those that are there, in every format."""
+    for style in ("table", "csv", "json"):
+        result = frf(bench, "--output", "acc_y", "--format", style)
+        assert result.exit_code == 1
+        assert "['current', 'acc_x']" in result.stderr
+        assert len(result.stderr.splitlines()) == 1
+    assert "does not fit twice" in frf(bench, "--period", 11).stderr
+
+
+# plan
+
+PLAN = ("plan", "--stage", "lms-y", "--detect")
+
+
+def test_plan_as_json_has_what_was_asked_and_one_row_per_length() -> None:
+    """Two losses, three lengths of which one is too short: nulls there, no NaN."""
+    lengths = ("--seconds", 0.2, "--seconds", 10, "--seconds", 60)
+    detect = ("guide_preload=0.05", "--detect", "mount_stiffness=0.02")
+    result = call(*PLAN, *detect, *lengths, "--format", "json")
+    assert (result.exit_code, result.stderr) == (0, "")
+    content = strict(result.stdout)
+    assert set(content) == {"detect", "plan"}
+    assert all(set(row) == set(LOOKS["detect"].split()) for row in content["detect"])
+    assert all(set(row) == set(LOOKS["plan"].split()) for row in content["plan"])
+    assert [(row["parameter"], row["loss"], row["n_baseline"]) for row in content["detect"]] == [
+        ("guide_preload", 0.05, 5), ("mount_stiffness", 0.02, 5),
+    ]  # fmt: skip
+    assert [row["seconds_per_log"] for row in content["plan"]] == [0.2, 10, 60] * 2
+    short = content["plan"][0]
+    assert (short["n_logs"], short["hindrance"], short["power_of_one_log"]) == (
+        None, "too-short", None,
+    )  # fmt: skip
+    assert isinstance(content["plan"][2]["n_logs"], int)
+
+
+def test_plan_as_a_table_follows_power_and_false_alarms() -> None:
+    """People see the answer in a line; asking for less needs less."""
+    shown = call(*PLAN, "guide_preload=0.05")
+    assert shown.exit_code == 0
+    assert "s per log" in shown.stdout
+    assert "One log is enough from" in shown.stdout
+    asked = (*PLAN, "guide_preload=0.05", "--format", "json")
+    easy = call(*asked, "--power", 0.8, "--false-alarm", 0.05)
+    needed = [
+        strict(text)["detect"][0]["seconds_for_one_log"]
+        for text in (call(*asked).stdout, easy.stdout)
+    ]
+    assert needed[1] < needed[0]  # type: ignore[operator]
+
+
+@pytest.mark.parametrize(
+    ("stage", "detect", "said"),
+    [
+        ("lms-x", "mount_stiffness=0.1", "do not show mount_stiffness"),
+        ("lms-y", "preload=0.1", "there are ['guide_preload', 'mount_stiffness']"),
+        ("lms-y", "guide_preload=5", "between 0 and 1"),
+        ("lms-z", "guide_preload=0.1", "no stage description"),
+    ],
+)
+def test_plan_without_an_answer_is_status_1_with_one_line(
+    stage: str, detect: str, said: str
+) -> None:
+    """What cannot be seen, is unknown, or is no fraction."""
+    result = call("plan", "--stage", stage, "--detect", detect)
+    assert (result.exit_code, result.stdout) == (1, "")
+    assert said in result.stderr
+    assert len(result.stderr.splitlines()) == 1
+
+
+def test_plan_needs_a_map(stage: Path) -> None:
+    """A description of modes alone cannot be planned with."""
+    result = call("plan", "--stage", stage, "--detect", "guide_preload=0.05")
+    assert result.exit_code == 1
+    assert "[map]" in result.stderr
+
+
+# run
+
+
+def run(logs: Path, stage: Path | str, out: Path) -> Result:
+    """Run the main job with one worker."""
+    return call("run", logs, "--stage", stage, "--out", out, "--workers", 1)
+
+
+@pytest.mark.slow
+def test_a_clean_run_is_status_0_and_says_where_its_report_is(
+    folder: Path, stage: Path, tmp_path: Path
+) -> None:
+    """The count of logs, a line per stage and the front page; no bar where no terminal is."""
+    result = run(folder / "good", stage, tmp_path / "out")
+    assert result.exit_code == 0
+    assert "2 of 2 logs analysed" in result.stdout
+    assert "test-A: not-enough-data" in result.stdout
+    assert str(tmp_path / "out" / "index.html") in result.stdout
+    assert result.stderr == ""
+    again = run(folder / "good", stage, tmp_path / "out")
+    assert "2 of them known from before" in again.stdout
+
+
+@pytest.mark.slow
+def test_a_run_with_a_bad_log_is_status_3(folder: Path, stage: Path, tmp_path: Path) -> None:
+    """Others are analysed, and refused.csv has the reason."""
+    logs = write_archive(tmp_path / "logs", 1)
+    (logs / "broken.h5").write_bytes(b"nothing")
+    result = run(logs, stage, tmp_path / "out")
+    assert result.exit_code == 3
+    assert "1 of 2 logs analysed" in result.stdout
+    (row,) = csv.DictReader((tmp_path / "out" / "refused.csv").read_text().splitlines())
+    assert row["log"] == "broken.h5"
+
+
+def test_a_run_of_bad_logs_only_is_status_1_with_one_line(
+    folder: Path, stage: Path, tmp_path: Path
+) -> None:
+    """One line on standard error; refused.csv is written all the same."""
+    result = run(folder / "bad", stage, tmp_path / "out")
+    assert result.exit_code == 1
+    assert result.stdout == ""
+    assert len(result.stderr.splitlines()) == 1
+    assert result.stderr.startswith("lmshealth: ")
+    assert "broken.h5" in (tmp_path / "out" / "refused.csv").read_text()
+
+
+def test_a_log_that_no_description_takes_is_refused(stage: Path, tmp_path: Path) -> None:
+    """A machine without a description is ``no-stage``, and says which there are."""
+    logs = tmp_path / "logs"
+    write_log(logs / "foreign.h5", 1.0, 1, stage="other-Z")
+    result = run(logs, stage, tmp_path / "out")
+    assert result.exit_code == 1
+    (row,) = csv.DictReader((tmp_path / "out" / "refused.csv").read_text().splitlines())
+    assert row["reason"] == "no-stage"
+    assert "no description takes stage 'other-Z': [match] stage is '*-A' in small" in row["detail"]
+    assert "mend it there, or give by --stage" in row["detail"]
+    assert len(result.stderr.splitlines()) == 1
+    assert f"1 refused: 1 as no-stage, such as foreign.h5: {row['detail']}; " in result.stderr
+
+
+def test_a_description_that_a_manifest_asks_for_and_nobody_gave_is_named(
+    stage: Path, tmp_path: Path
+) -> None:
+    """It is not the stage of the log that matches nothing then."""
+    logs = tmp_path / "logs"
+    write_log(logs / "a.h5", 1.0, 1)
+    (logs / "manifest.csv").write_text("file,description\na.h5,lms-q\n")
+    result = run(logs, stage, tmp_path / "out")
+    assert result.exit_code == 1
+    assert "its description is to be 'lms-q', and --stage gives small" in result.stderr
+    assert "column description of manifest.csv" in result.stderr
+
+
+@pytest.mark.parametrize("reference", ["lms-q", "nowhere/stage.toml"])
+def test_an_unknown_stage_is_status_1_with_one_line(
+    folder: Path, tmp_path: Path, reference: str
+) -> None:
+    """The line names the description that is not there."""
+    for arguments in (
+        ("run", folder / "good", "--stage", reference, "--out", tmp_path / "out"),
+        ("modes", folder / "good" / "log-00.h5", "--stage", reference),
+    ):
+        result = call(*arguments)
+        assert result.exit_code == 1
+        assert reference in result.stderr
+        assert len(result.stderr.splitlines()) == 1
+
+
+def test_a_store_that_cannot_be_opened_is_status_1(
+    folder: Path, stage: Path, tmp_path: Path
+) -> None:
+    """One line names the store without its password."""
+    result = call(
+        "run", folder / "good", "--stage", stage, "--out", tmp_path / "out",
+        "--workers", 1, "--store", "nosuch://me:hunter2@host/db",
+    )  # fmt: skip
+    assert result.exit_code == 1
+    assert "hunter2" not in result.stderr
+    assert len(result.stderr.splitlines()) == 1
+
+
+def test_a_bad_description_is_status_1_with_one_line(folder: Path, tmp_path: Path) -> None:
+    """A typing slip in a description is named."""
+    bad = tmp_path / "bad.toml"
+    bad.write_text('name = "x"\n[[mode]]\nname = "roll"\nfrequenzy_hz = 3\ndamping_ratio = 0.1\n')
+    result = call("modes", folder / "good" / "log-00.h5", "--stage", bad)
+    assert result.exit_code == 1
+    assert "frequenzy_hz" in result.stderr
+    assert len(result.stderr.splitlines()) == 1
+
+
+# report
+
+
+@pytest.mark.slow
+def test_report_writes_the_pages_of_run_without_its_logs(stage: Path, tmp_path: Path) -> None:
+    """Logs and description gone, every page is the same to the byte."""
+    logs = write_archive(tmp_path / "logs", 2)
+    (logs / "broken.h5").write_bytes(b"nothing")
+    own = shutil.copy(stage, tmp_path / "own.toml")
+    assert run(logs, own, tmp_path / "out").exit_code == 3
+    shutil.rmtree(logs)
+    Path(own).unlink()
+    url = f"sqlite:///{(tmp_path / 'out' / 'lmshealth.sqlite').as_posix()}"
+    result = call("report", "--store", url, "--out", tmp_path / "pages")
+    assert (result.exit_code, result.stderr) == (0, "")
+    assert str(tmp_path / "pages" / "index.html") in result.stdout
+    names = sorted(page.name for page in (tmp_path / "pages").iterdir())
+    assert names == ["index.html", "test-A.html"]
+    for name in names:
+        assert (tmp_path / "pages" / name).read_bytes() == (tmp_path / "out" / name).read_bytes()
+    assert "broken.h5" in (tmp_path / "pages" / "index.html").read_text()
+
+
+@pytest.mark.parametrize(
+    ("url", "said"),
+    [
+        ("sqlite:///{}/nowhere.sqlite", "nowhere.sqlite"),
+        ("sqlite:///{}/empty.sqlite", "no results"),
+        ("sqlite:///{}/text.sqlite", "not a database"),
+        ("no url at all", "no URL; a file is sqlite:///PATH"),
+        ("nosuch://me:hunter2@host/db?password=hunter2", "nosuch://host/db"),
+        ("postgresql+nosuch://me:hunter2@host/db", "host/db"),
+    ],
+)
+def test_a_store_that_has_no_report_is_status_1_with_one_line(
+    tmp_path: Path, url: str, said: str
+) -> None:
+    """Each kind is named without its password; no file is made and no page written."""
+    (tmp_path / "empty.sqlite").touch()
+    (tmp_path / "text.sqlite").write_text("these are my notes\n" * 100)
+    result = call("report", "--store", url.format(tmp_path.as_posix()), "--out", tmp_path / "pages")
+    assert result.exit_code == 1
+    assert said in result.stderr
+    assert "hunter2" not in result.stderr
+    assert len(result.stderr.splitlines()) == 1
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["empty.sqlite", "text.sqlite"]
+
+
+def test_the_store_may_be_named_by_the_environment(tmp_path: Path) -> None:
+    """An address with a password need not stand on the command line, where all can see it."""
+    store = tmp_path / "none.sqlite"
+    named = CliRunner().invoke(
+        main, ["report", "--out", str(tmp_path)], env={"LMSHEALTH_STORE": f"sqlite:///{store}"}
+    )
+    assert named.exit_code == 1
+    assert store.name in named.output
+    assert call("report", "--out", tmp_path).exit_code == 2
+
+
+@pytest.mark.slow
+def test_a_machine_that_cannot_be_read_is_told_and_the_others_are_written(tmp_path: Path) -> None:
+    """One line names it, with status 3."""
+    store = Store(beside(tmp_path))
+    for name in ("M7-Y", "M8-Y"):
+        store.keep(name, "k1", packed(nothing(worn(tmp_path, name))))
+        store.tell(name, "k1", "")
+    store.close()
+    with closing(sqlite3.connect(tmp_path / "lmshealth.sqlite")) as file, file:
+        file.execute(
+            f"UPDATE assessed_{SCHEMA} SET content = x'00' WHERE machine = "
+            f"(SELECT machine FROM present_{SCHEMA} WHERE name = 'M8-Y')"
+        )
+    url = beside(tmp_path).render_as_string()
+    result = call("report", "--store", url, "--out", tmp_path / "pages")
+    assert result.exit_code == 3
+    assert "M8-Y" in result.stderr and len(result.stderr.splitlines()) == 1
+    names = sorted(page.name for page in (tmp_path / "pages").iterdir())
+    assert names == ["M7-Y.html", "index.html"]
+
+
+@pytest.mark.slow
+def test_pdfs_stand_beside_the_pages_of_run_and_report(
+    folder: Path, stage: Path, tmp_path: Path, needs: Callable[[str], None]
+) -> None:
+    """One per stage, under the name of its page; none without being asked for."""
+    needs("pdf")
+    out = tmp_path / "out"
+    arguments = ("run", folder / "good", "--stage", stage, "--out", out, "--workers", 1)
+    assert call(*arguments).exit_code == 0
+    assert list(out.glob("*.pdf")) == []
+    assert call(*arguments, "--pdf").exit_code == 0
+    assert [path.name for path in out.glob("*.pdf")] == ["test-A.pdf"]
+    url = beside(out).render_as_string()
+    assert call("report", "--store", url, "--out", tmp_path / "pages", "--pdf").exit_code == 0
+    again = (tmp_path / "pages" / "test-A.pdf").read_bytes()
+    assert again == (out / "test-A.pdf").read_bytes()
+
+
+@pytest.mark.slow
+def test_without_the_library_pages_are_written_and_the_lack_is_told(
+    folder: Path, stage: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Status 1 with one line that says what to install; the work is done and kept."""
+    monkeypatch.setitem(sys.modules, "weasyprint", None)
+    out = tmp_path / "out"
+    result = call(
+        "run", folder / "good", "--stage", stage, "--out", out, "--workers", 1, "--pdf"
+    )  # fmt: skip
+    assert result.exit_code == 1
+    assert 'pip install "lmshealth[pdf]"' in result.stderr
+    assert len(result.stderr.splitlines()) == 1
+    assert (out / "test-A.html").is_file() and (out / "lmshealth.sqlite").is_file()

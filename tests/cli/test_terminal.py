@@ -1,0 +1,57 @@
+"""Terminal: JSON without NaN, prose and tables that fit, no bars in a pipe."""
+
+from __future__ import annotations
+
+import json
+import math
+
+import pytest
+
+from lmshealth.cli.progress import progress_bars
+from lmshealth.cli.terminal import print_json, print_refused, print_text
+
+NAN = float("nan")
+
+
+def test_json_has_null_for_what_is_no_number(capsys: pytest.CaptureFixture[str]) -> None:
+    """NaN and infinity at any depth become null."""
+    print_json({"rows": [{"a": NAN, "b": [math.inf, 1.0], "c": "x"}]})
+    assert json.loads(capsys.readouterr().out) == {
+        "rows": [{"a": None, "b": [None, 1.0], "c": "x"}]
+    }
+
+
+def test_there_is_no_bar_where_there_is_no_terminal(capsys: pytest.CaptureFixture[str]) -> None:
+    """Progress is told without a trace in a pipe."""
+    with progress_bars() as tell:
+        tell("logs", 1, 2)
+        tell("logs", 2, 2)
+    captured = capsys.readouterr()
+    assert captured.err == captured.out == ""
+
+
+def test_prose_is_wrapped_between_words(capsys: pytest.CaptureFixture[str]) -> None:
+    """Lines fit a terminal; names, dates and numbers with a sign stay whole; lines are kept."""
+    name = "some/folder-of-logs/" + 8 * "velocity-0001" + ".h5"
+    print_text("so it is " * 20 + name + " since 2026-03-01\nsecond", "! ")
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0].startswith("! so it is") and lines[-1] == "second"
+    assert any(line.strip() == name for line in lines)
+    assert all(len(line) <= 78 for line in lines if name not in line)
+    assert any("2026-03-01" in line for line in lines)
+
+
+def test_names_in_a_wide_table_are_not_torn(capsys: pytest.CaptureFixture[str]) -> None:
+    """The last column gives way; folders are left out unless two logs have one name."""
+    row = {"log": "far/away/on/a/disk/log-0001.h5", "channel": "acc_pitch", "mode": "roll",
+           "reason": "not-excited", "detail": "no " * 40}  # fmt: skip
+    print_refused([row])
+    out = capsys.readouterr().out
+    assert max(len(line) for line in out.splitlines()) <= 80
+    assert any(
+        line.split()[:4] == ["log-0001.h5", "acc_pitch", "roll", "not-excited"]
+        for line in out.splitlines()
+    )
+    print_refused([row | {"log": f"{k}/log.h5"} for k in "ab"])
+    out = capsys.readouterr().out
+    assert "a/log.h5" in out and "b/log.h5" in out

@@ -1,0 +1,176 @@
+"""Verdicts in one word."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from lmshealth._arrays import FloatArray
+from lmshealth.health.verdict import degraded_below, judge
+from lmshealth.stage.description import Stage, load_stage
+from lmshealth.tracking.results import Event, History, Track
+from tests.lives import (
+    FOOT,
+    FREQUENCY,
+    MOUNT,
+    PRELOAD,
+    make_health,
+    make_history,
+    make_stage,
+    make_track,
+)
+
+
+@pytest.fixture(scope="module")
+def stage(tmp_path_factory: pytest.TempPathFactory) -> Stage:
+    """Preload with limit 0.6 and mount with limit 0.7."""
+    return make_stage(tmp_path_factory.mktemp("stage"))
+
+
+def logs(n: int) -> History:
+    """Make a history of so many logs."""
+    return make_history(np.tile(np.log(FREQUENCY[:2]), (n, 1)))
+
+
+def around(preload: float, mount: float, n: int = 1000) -> FloatArray:
+    """Draw health closely around two values."""
+    return np.random.default_rng(1).normal([preload, mount], 0.005, (n, 2))
+
+
+def test_degraded_is_a_quarter_of_what_may_be_lost(stage: Stage, tmp_path: Path) -> None:
+    """Without a limit a loss of 40 % stands for one."""
+    assert [degraded_below(p) for p in stage.parameters] == pytest.approx([0.9, 0.925])
+    foot = make_stage(tmp_path, (PRELOAD, MOUNT, FOOT)).parameters[2]
+    assert degraded_below(foot) == pytest.approx(0.9)
+
+
+@pytest.mark.parametrize(
+    ("preload", "mount", "word"),
+    [
+        (0.99, 1.0, "healthy"),
+        (0.8, 0.99, "preload"),
+        (0.98, 0.8, "mount"),
+        (0.7, 0.75, "both"),
+    ],
+)
+def test_the_word_is_what_the_draws_say(
+    stage: Stage, preload: float, mount: float, word: str
+) -> None:
+    """Clear cases get their word with probability near 1, and numbers in the sentence."""
+    found = judge(stage, logs(8), make_health(around(preload, mount)))
+    assert found.verdict == word
+    assert found.probability > 0.99
+    assert f"Guide preload is at {100 * preload:.0f} %" in found.why
+    assert found.recorded_at == logs(8).recorded_at[-1]
+
+
+def test_the_probability_is_the_share_of_the_draws(stage: Stage) -> None:
+    """Six draws in ten with worn preload: the word is preload, its probability 0.6."""
+    samples = np.ones((10, 2))
+    samples[:6, 0] = 0.8
+    found = judge(stage, logs(8), make_health(samples))
+    assert (found.verdict, found.probability) == ("preload", pytest.approx(0.6))
+
+
+def test_a_parameter_the_logs_do_not_tell_is_left_out(stage: Stage) -> None:
+    """An uninformed mount cannot be blamed, however low its draws lie, and the sentence says so."""
+    found = judge(stage, logs(8), make_health(around(0.99, 0.5), informed=(0.9, 0.1)))
+    assert found.verdict == "healthy"
+    assert "Mount stiffness: these logs do not tell." in found.why
+
+
+def stepped(*, declared: bool = False, epoch: int = 5, evidence: float = 30.0) -> Track:
+    """Make a track with one step of roll and pitch."""
+    events = tuple(
+        Event("step", epoch, mode, "", size, 0.001, evidence, declared, epoch + 1)
+        for mode, size in (("roll", -0.03), ("pitch", 0.002))
+    )
+    bare = make_track(np.zeros((8, 2)), np.tile(1e-6 * np.eye(2), (8, 1, 1)))
+    return replace(bare, events=events)
+
+
+def test_a_jump_that_nobody_explains_is_the_verdict(stage: Stage) -> None:
+    """The word is step, with what jumped and what health is left; its odds are the evidence's."""
+    health = make_health(around(0.99, 0.6))
+    found = judge(stage, logs(8), health, stepped(evidence=3.0))
+    assert found.verdict == "step"
+    assert found.probability == pytest.approx(1 / (1 + np.exp(-3.0)))
+    assert "roll −3.0 %" in found.why
+    assert "pitch +0.2 %" in found.why
+    assert "Mount stiffness is at 60 %" in found.why
+    # Also where the logs do not carry health.
+    assert judge(stage, logs(8), None, stepped()).verdict == "step"
+
+
+def test_a_jump_that_is_explained_or_past_is_not_the_verdict(stage: Stage) -> None:
+    """Declared steps, and those before the last overhaul, leave the word to health."""
+    health = make_health(around(0.99, 0.99))
+    assert judge(stage, logs(8), health, stepped(declared=True)).verdict == "healthy"
+    serviced = replace(logs(8), baselines=(0, 2))
+    assert judge(stage, serviced, health, stepped(epoch=1)).verdict == "healthy"
+
+
+@pytest.mark.parametrize(
+    ("n_logs", "options", "needle"),
+    [
+        (3, {}, "3 usable logs since the baseline began; it needs 5"),
+        (8, {"converged": False}, "did not converge"),
+        (8, {"informed": (0.2, 0.4)}, "move the prior of no parameter"),
+    ],
+)
+def test_too_little_data_gets_no_word(
+    stage: Stage, n_logs: int, options: dict, needle: str
+) -> None:
+    """Few logs, no convergence or no information: not-enough-data, without a probability."""
+    found = judge(stage, logs(n_logs), make_health(around(0.5, 0.5), **options))
+    assert found.verdict == "not-enough-data"
+    assert np.isnan(found.probability)
+    assert needle in found.why
+
+
+def test_without_health_there_is_no_word(stage: Stage) -> None:
+    """Logs that do not carry the parameters are told as such."""
+    found = judge(stage, logs(8), None)
+    assert found.verdict == "not-enough-data"
+    assert "do not carry" in found.why
+
+
+def test_without_parameters_the_description_is_the_reason(tmp_path: Path) -> None:
+    """Where the description asks for no part, it is not the logs that lack something."""
+    path = tmp_path / "modes.toml"
+    path.write_text(
+        'name = "m"\n[match]\nstage = "M"\n'
+        '[[mode]]\nname = "roll"\nfrequency_hz = 120.0\ndamping_ratio = 0.01\n'
+    )
+    for n in (1, 8):
+        found = judge(load_stage(str(path)), logs(n), None)
+        assert found.verdict == "not-enough-data"
+        assert "no [[parameter]]" in found.why
+
+
+def test_an_alarm_without_a_verdict_is_told(stage: Stage) -> None:
+    """Which mode moved, by how much and since when stands first; past alarms do not."""
+    drift = np.zeros((8, 2))
+    drift[5:, 0] = np.log(0.96)
+    bare = make_track(drift, np.tile(1e-6 * np.eye(2), (8, 1, 1)))
+    alarm = Event("alarm", 5, "roll", "", -0.02, 0.001, 9.0, False, 6)
+    alarmed = replace(bare, events=(alarm,))
+    found = judge(stage, logs(8), None, alarmed)
+    assert found.verdict == "not-enough-data"
+    day = bare.recorded_at[5].date().isoformat()
+    assert found.why.startswith(f"Alarm since {day}: roll has moved by −4.00 ± 0.10 % since")
+    serviced = replace(logs(8), baselines=(0, 6))
+    for track in (bare, replace(bare, events=(replace(alarm, declared=True),))):
+        assert "Alarm" not in judge(stage, logs(8), None, track).why
+    assert "Alarm" not in judge(stage, serviced, None, alarmed).why
+
+
+def test_a_parameter_with_a_unit_is_told_in_it(tmp_path: Path) -> None:
+    """A parameter of its own unit is told in that unit, not in percent."""
+    stage = make_stage(tmp_path, (PRELOAD.replace("limit", 'unit = "kN"\nlimit'), MOUNT))
+    found = judge(stage, logs(8), make_health(around(0.8, 0.99)))
+    assert re.search(r"Guide preload is 0\.(79|80)\d* kN \(90 %: 0\.79", found.why)

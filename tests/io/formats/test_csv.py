@@ -1,0 +1,233 @@
+"""Delimited text: layouts, damage, and what must not be guessed."""
+
+import gzip
+import io
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from lmshealth.errors import BadLog
+from lmshealth.io.column_map import ColumnMap, CsvLayout, load_columns
+from lmshealth.io.formats import csv as delimited
+from lmshealth.io.formats import csv as text
+from lmshealth.io.formats.csv import parse_text
+from lmshealth.io.reading import read_log
+from lmshealth.io.refusal import Unusable
+
+
+def parse(text, **layout):
+    """Parse text or bytes with a layout."""
+    return parse_with(text, ColumnMap(csv=CsvLayout(**layout)))
+
+
+def parse_with(text, columns):
+    """Parse text or bytes by a column map."""
+    data = text if isinstance(text, bytes) else text.encode()
+    return parse_text(io.BytesIO(data), len(data), columns)
+
+
+def test_leading_lines():
+    """Leading lines give metadata; values keep their colons, remarks are passed over."""
+    raw = parse("# stage: A\n# remark\n# recorded_at: 2026-01-01T00:00:00Z\ndelta_e_um\n1\n2\n")
+    assert raw.metadata == {"stage": "A", "recorded_at": "2026-01-01T00:00:00Z"}
+    assert raw.columns["delta_e_um"].tolist() == [1.0, 2.0]
+
+
+def test_byte_order_mark_and_windows_lines():
+    """A byte order mark and Windows line ends change nothing."""
+    raw = parse(b"\xef\xbb\xbf# stage: A\r\ndelta_e_um, x\r\n1, a\r\n2, b\r\n")
+    assert raw.metadata == {"stage": "A"} and raw.columns["delta_e_um"].tolist() == [1.0, 2.0]
+
+
+def test_layout():
+    """Skipped lines, delimiter and absent header lines are as the map says."""
+    raw = parse("vendor \n\ndelta_e_um;b\n1;2\n", skip_rows=2, delimiter=";")
+    assert raw.columns["delta_e_um"].tolist() == [1.0]
+    raw = parse("1,2\n3,4\n", header=["delta_e_um", "x"])
+    assert raw.columns["delta_e_um"].tolist() == [1.0, 3.0]
+    numbered = ColumnMap(columns={"delta_e_um": "1"}, csv=CsvLayout(header=False))
+    assert parse_with(b"1,2\n3,4\n", numbered).columns["1"].tolist() == [2.0, 4.0]
+
+
+@pytest.mark.parametrize(
+    ("text", "reason", "word"),
+    [
+        ("", "empty", "header"),
+        ("# stage: A\n", "empty", "header"),
+        ("delta_e_um\n", "empty", "rows"),
+        ("delta_e_um,b\n1,2\n3,4,5\n", "corrupt", "row 2 has 3"),
+        ("delta_e_um,b\n1,2\n3,4,5,6\n", "corrupt", "row 2 has 4 fields, the first line 2"),
+        ("delta_e_um,b\n1,2,9\n3,4,5\n", "corrupt", ""),
+        ("delta_e_um,b\n1,2\n3", "corrupt", "1 of 2"),
+        ("delta_e_um\n1\noops\n", "columns", "'oops' in row 2"),
+        ("delta_e_um,delta_e_um\n1,2\n", "columns", "more than once"),
+        ("# stage: A\n# stage: B\ndelta_e_um\n1\n", "metadata", "'A'"),
+        (b"delta_e_um\n1\0\n", "corrupt", "NUL"),
+        (b"delta_e_\xb5m\n1\n", "corrupt", "0xb5"),
+        ('delta_e_um\n"1\n2\n', "corrupt", ""),
+    ],
+)
+def test_damage(text, reason, word):
+    """Each kind of damage has its reason and says where it is."""
+    with pytest.raises(Unusable) as caught:
+        parse(text)
+    assert caught.value.reason == reason and word in caught.value.detail
+
+
+def test_empty_cells_are_missing():
+    """An empty cell is a missing sample, not an error."""
+    raw = parse("delta_e_um,b\n1,2\n,4\nnan,4\n")
+    assert str(raw.columns["delta_e_um"].tolist()) == "[1.0, nan, nan]"
+
+
+def test_blanks_around_numbers():
+    """Blanks change nothing: rows that the quick way cannot read are read the careful way."""
+    raw = parse("delta_e_um, b, c\n 1 , 2,  \n 3 ,\t4, 5\n")
+    assert raw.columns["delta_e_um"].tolist() == [1.0, 3.0]
+    both = ColumnMap(columns={"delta_e_um": "delta_e_um", "acc_c_g": "c"})
+    raw = parse_with(b"delta_e_um, c\n1,\n2, 5\n", both)
+    assert str(raw.columns["c"].tolist()) == "[nan, 5.0]"
+
+
+def test_text_beside_numbers():
+    """A column that nobody wants may change from numbers to text."""
+    rows = "".join(f"{k},{k if k < 200_000 else 'late'}\n" for k in range(200_100))
+    assert parse("delta_e_um,note\n" + rows).columns["delta_e_um"][-1] == 200_099.0
+
+
+@pytest.fixture
+def small_blocks(monkeypatch):
+    """Read ten rows at a time."""
+    monkeypatch.setattr(delimited, "_ROWS", 10)
+
+
+@pytest.mark.parametrize("version", [pd.__version__, "2.2.3"])
+@pytest.mark.parametrize("place", [0, 9, 10, 11, 20, 34])
+@pytest.mark.parametrize("row", ["7,8,9", "7,8,9,10", "7,8,x", "x,8,9"])
+def test_long_row_anywhere(small_blocks, monkeypatch, version, place, row):
+    """A row with too many fields is found at every place of a block, and its number is said."""
+    monkeypatch.setattr(pd, "__version__", version)
+    rows = ["1,2"] * 35
+    rows[place] = row
+    with pytest.raises(Unusable) as caught:
+        parse("delta_e_um,b\n" + "\n".join(rows) + "\n")
+    assert caught.value.reason == "corrupt"
+    # What is wrong with the very first row is a warning of pandas, without a number.
+    assert place == 0 or f"row {place + 1} has" in caught.value.detail
+
+
+def test_delimiter_behind_the_last_field(small_blocks):
+    """An empty field behind the last, as some exporters write it, is none."""
+    raw = parse("delta_e_um,b\n" + "1,2,\n" * 25)
+    assert raw.columns["delta_e_um"].tolist() == [1.0] * 25
+
+
+def test_row_of_a_late_text(small_blocks):
+    """The row of a text is counted from the first row, not from its block's."""
+    with pytest.raises(Unusable, match="'oops' in row 24"):
+        parse("delta_e_um\n" + "1\n" * 23 + "oops\n" + "1\n" * 5)
+
+
+def test_late_blanks(small_blocks):
+    """When a late block needs the careful way, no row comes twice."""
+    rows = "".join(f"{k},{k}\n" for k in range(25)) + "25 , 25\n"
+    values = parse("delta_e_um,b\n" + rows).columns["delta_e_um"]
+    assert values.tolist() == list(range(26))
+
+
+@pytest.mark.parametrize(
+    ("rows", "word"),
+    [
+        ("1,2\n" * 300_000 + "3", "1 of 2"),
+        ("1,2\n" * 300_000 + "\0", f"NUL byte at offset {13 + 1_200_000}"),
+        ("1,2\n" * 300_000 + '"1,2\n' + "1,2\n" * 600_000, "quote"),
+        ("1,2\n" * 300_000 + "1" * 2_000_000, f"offset {13 + 1_200_000} is longer"),
+    ],
+)
+def test_late_damage(monkeypatch, rows, word):
+    """Damage far behind the head is found as the text streams by."""
+    monkeypatch.setattr(text, "LONGEST_BLOCK", 1 << 21)
+    monkeypatch.setattr(delimited, "_ROWS", 10_000)
+    with pytest.raises(Unusable) as caught:
+        parse("delta_e_um,b\n" + rows)
+    assert caught.value.reason == "corrupt" and word in caught.value.detail
+
+
+def test_header_without_end():
+    """A file that is one long line is not held whole to name its columns."""
+    with pytest.raises(Unusable, match="longer than 1048576 bytes"):
+        parse("delta_e_um," * 200_000)
+
+
+@pytest.mark.slow
+def test_values_are_those_of_pandas():
+    """Blocks change no digit of what pandas reads at once, quick or carefully."""
+    values = np.random.default_rng(0).normal(size=(150_000, 2)) * [1e-9, 1e5]
+    lines = [f"{one!r},{other!r}\n" for one, other in values.tolist()]
+    data = "delta_e_um,acc_x_g\n" + "".join(lines)
+    whole = pd.read_csv(io.StringIO(data))
+    for content in (data, data.replace("\n", " \n", 3)):
+        raw = parse(content)
+        for name in whole.columns:
+            np.testing.assert_array_equal(raw.columns[name], whole[name].to_numpy())
+
+
+@pytest.mark.parametrize("name", ["log.txt", "LOG.TSV", "log.dat", "log.txt.gz", "log.tsv.gz"])
+def test_names_of_text(make, name):
+    """Delimited text is read under the names that exporters give it."""
+    data = make("log.csv").read_bytes()
+    path = make("log.csv").with_name(name)
+    path.write_bytes(gzip.compress(data) if name.endswith(".gz") else data)
+    assert len(read_log(path).channels) == 2
+
+
+TABLE = "time;PE(0);AI 3\n0;1;2\n1;3;5\n2;4;1\n"
+MAP = "[columns]\ndelta_e_um = 'PE(0)'\nacc_x_g = 'AI 3'\n[csv]\n"
+
+
+@pytest.mark.parametrize(
+    ("before", "layout", "said"),
+    [
+        ("", "", 'line 1 names them: set delimiter = ";" under [csv] of the column map'),
+        ("Rate 20 kHz\n\n", "delimiter = ';'", "line 3 names them: set skip_rows = 1 under"),
+        ("Rate 20 kHz\n# stage: A\n", "delimiter = ';'", "line 3 names them: set skip_rows = 1 u"),
+        ("Rate 20 kHz\n", "skip_rows = 1", 'line 2 names them: set delimiter = ";" under'),
+        ("Rate\n", "", 'line 2 names them: set delimiter = ";" and skip_rows = 1 under [csv]'),
+        ("", "delimiter = ';'\nskip_rows = 1", "line 1 names them: set skip_rows = 0 under [csv]"),
+    ],
+)
+def test_a_layout_that_does_not_fit_is_told_by_its_key(tmp_path, before, layout, said):
+    """The line that has the wanted names, and what to set; with that the file is read."""
+    (tmp_path / "log.csv").write_text(before + TABLE)
+    (tmp_path / "map.toml").write_text(MAP + layout)
+    with pytest.raises(BadLog) as refused:
+        read_log(tmp_path / "log.csv", columns=load_columns(tmp_path / "map.toml"))
+    assert refused.value.reason == "columns"
+    assert "the column map needs AI 3, PE(0); there: " in refused.value.detail
+    assert said in refused.value.detail
+
+
+def test_names_that_no_line_has_are_asked_for(tmp_path):
+    """Where no layout finds the names the keys are named; where some are found no key is blamed."""
+    (tmp_path / "log.csv").write_text(TABLE)
+    for names, said in ((("PE(1)", "AI 5"), True), (("PE(0)", "AI 5"), False)):
+        columns = ColumnMap(
+            columns=dict(zip(("delta_e_um", "acc_x_g"), names, strict=True)),
+            csv=CsvLayout(delimiter=";"),
+        )
+        with pytest.raises(BadLog, match="needs AI 5") as refused:
+            read_log(tmp_path / "log.csv", columns=columns)
+        assert ("do skip_rows and delimiter" in refused.value.detail) is said
+
+
+def test_a_contract_file_behind_a_preamble_is_told_where_it_begins(tmp_path):
+    """Without a column map the line that names a signal is told, and nothing where none does."""
+    (tmp_path / "log.csv").write_text("Rate 20 kHz\ntime_s,delta_e_um\n0,1\n1,2\n")
+    with pytest.raises(BadLog, match="line 2 names them: set skip_rows = 1 under") as refused:
+        read_log(tmp_path / "log.csv")
+    assert "no signal" in refused.value.detail
+    (tmp_path / "log.csv").write_text("a,b\n0,1\n1,2\n")
+    with pytest.raises(BadLog, match="no signal") as refused:
+        read_log(tmp_path / "log.csv")
+    assert "[csv]" not in refused.value.detail

@@ -1,0 +1,111 @@
+"""What the HDF5 library must not be given: damaged heaps, claims without end, virtual columns."""
+
+import subprocess
+import sys
+
+import h5py
+import numpy as np
+import pytest
+
+from lmshealth.io.column_map import ColumnMap
+from lmshealth.io.formats.hdf5 import Guarded
+from lmshealth.io.formats.registry import load
+from lmshealth.io.refusal import Unusable
+
+LIBRARIES = ["earliest", "latest"]
+
+
+@pytest.fixture(params=LIBRARIES)
+def log(request, tmp_path):
+    """Write a log with text attributes, by either layout of attributes."""
+    path = tmp_path / "log.h5"
+    with h5py.File(path, "w", libver=request.param) as file:
+        file["delta_e_um"] = np.random.default_rng(0).normal(size=100)
+        file.attrs.update({"stage": "demo", "servo_id": "x" * 9000, "sample_rate_hz": "2000"})
+    return path
+
+
+def test_texts_of_any_honest_length(log):
+    """Short texts and those with a heap of their own are read."""
+    metadata = load(log, ColumnMap()).metadata
+    assert metadata == {"stage": "demo", "servo_id": "x" * 9000, "sample_rate_hz": "2000"}
+
+
+@pytest.mark.parametrize("claim", [0, 8, 1 << 30, (1 << 64) - 1])
+def test_damaged_sizes(log, claim):
+    """Neither a claim of zero nor one beyond the heap reaches the library."""
+    data = log.read_bytes()
+    at = data.index(b"GCOL") + 24
+    # The free space behind the first text: index 0, and the size under test.
+    free = at + 8 + 8
+    damaged = data[:free] + bytes(8) + claim.to_bytes(8, "little") + data[free + 16 :]
+    log.write_bytes(damaged)
+    with pytest.raises(Unusable, match="heap of strings at byte") as caught:
+        load(log, ColumnMap())
+    assert caught.value.reason == "corrupt"
+
+
+def test_heap_that_claims_gigabytes(log):
+    """A heap is no larger than the file."""
+    data = log.read_bytes()
+    at = data.index(b"GCOL") + 8
+    log.write_bytes(data[:at] + (1 << 33).to_bytes(8, "little") + data[at + 8 :])
+    with pytest.raises(Unusable, match="8589934592 bytes"):
+        load(log, ColumnMap())
+
+
+def test_claims_of_texts(log):
+    """The length that a text claims is found wherever its attribute stands."""
+    with Guarded(log) as stream, h5py.File(stream, "r") as file:
+        stream.now = "texts"
+        assert set(file.attrs) == {"stage", "servo_id", "sample_rate_hz"}
+        claims = {key: stream.claimed(key) for key in (*file.attrs, "travel_km")}
+    assert claims == {"stage": 4, "servo_id": 9000, "sample_rate_hz": 4, "travel_km": 0}
+
+
+def test_text_that_claims_gigabytes(log):
+    """For a text that claims gigabytes no room is made; newer files have a sum that tells it."""
+    data = log.read_bytes()
+    heap = data.index(b"GCOL").to_bytes(8, "little")
+    length = data.index(b"\4\0\0\0" + heap, data.index(b"sample_rate_hz\0"))
+    log.write_bytes(data[:length] + b"\0\0\0\x80" + data[length + 4 :])
+    with pytest.raises(Unusable, match=r"of 2147483648 bytes|checksum") as caught:
+        load(log, ColumnMap())
+    assert caught.value.reason == "corrupt"
+
+
+def test_samples_that_look_like_a_heap(log):
+    """What stands among the samples is no heap and refuses nothing."""
+    with h5py.File(log, "a") as file:
+        noise = np.random.default_rng(1).normal(size=99)
+        file["acc_x_g"] = np.append(np.frombuffer(b"GCOL\1\0\0\0"), noise)
+    assert load(log, ColumnMap()).columns["acc_x_g"].size == 100
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("lists_files", [False, True])
+@pytest.mark.parametrize("library", LIBRARIES)
+def test_virtual_columns_end_no_process(tmp_path, library, lists_files):
+    """A virtual column is refused, also one that cannot be opened, and Python ends as it should."""
+    path = tmp_path / "log.h5"
+    layout = h5py.VirtualLayout((10,), "f8")
+    if lists_files:
+        layout[:] = h5py.VirtualSource("other.h5", "x", (10,))
+    with h5py.File(path, "w", libver=library) as file:
+        file.create_virtual_dataset("delta_e_um", layout, fillvalue=1.25)
+    # The version of the message with the fill value: the column cannot be opened.
+    data = path.read_bytes()
+    value = data.index(np.float64(1.25).tobytes())
+    damaged = tmp_path / "damaged.h5"
+    damaged.write_bytes(data[: value - 8] + b"\xff" + data[value - 7 :])
+    code = (
+        "import sys; from pathlib import Path; from lmshealth.readers.columns import ColumnMap; "
+        "from lmshealth.readers.formats import load\n"
+        "for name in sys.argv[1:]:\n"
+        "    try: load(Path(name), ColumnMap())\n"
+        "    except Exception as error: print(error.reason)\n"
+    )
+    command = [sys.executable, "-c", code, str(path), str(damaged)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout in ("escapes\nescapes\n", "escapes\ncorrupt\n")

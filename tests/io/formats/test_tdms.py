@@ -1,0 +1,197 @@
+"""TDMS: units, rates and properties of channels; damage that npTDMS passes over."""
+
+import sys
+import warnings
+
+import numpy as np
+import pytest
+from nptdms import ChannelObject, RootObject, TdmsWriter
+
+from lmshealth.errors import BadLog
+from lmshealth.io.column_map import ColumnMap
+from lmshealth.io.reading import read_log
+
+RATE = {"wf_increment": 1e-3}
+NOISE = np.random.default_rng(0).normal(size=2000)
+
+
+def write(path, *channels, root=None, n_segments=1):
+    """Write channels given as (name, values, properties) or (group, name, values, properties)."""
+    full = [c if len(c) == 4 else ("log", *c) for c in channels]
+    with TdmsWriter(str(path)) as writer:
+        for k in range(n_segments):
+            writer.write_segment(
+                [RootObject(root or {})]
+                + [ChannelObject(g, n, np.array_split(v, n_segments)[k], p) for g, n, v, p in full]
+            )
+    return path
+
+
+def refused(path, reason, *words, **options):
+    """Expect a refusal and look for words in its detail."""
+    with pytest.raises(BadLog) as caught:
+        read_log(path, **options)
+    assert caught.value.reason == reason, caught.value
+    for word in words:
+        assert word in caught.value.detail
+
+
+@pytest.mark.parametrize("unit", ["g", "m/s^2", "m/s²", "mm/s2", "m/sÂ²"])
+def test_reads_accelerations(tmp_path, unit):
+    """Channels in a unit of acceleration are read without a map, over all segments."""
+    factor = {"g": 9.80665, "mm/s2": 1e-3}.get(unit, 1.0)
+    properties = {"unit_string": unit, **RATE}
+    path = write(
+        tmp_path / "log.tdms",
+        ("Head X", NOISE.astype("f4"), properties),
+        ("Strain", NOISE, {"unit_string": "um/m", **RATE}),
+        n_segments=7,
+    )
+    log = read_log(path)
+    assert [c.name for c in log.channels] == ["acc_Head_X"] and log.sample_rate == 1000.0
+    np.testing.assert_allclose(log.channels[0].values, NOISE * factor, rtol=1e-6)
+
+
+def test_unit_beside_a_name_of_the_contract(tmp_path):
+    """A unit property completes a name of the contract and must not contradict it."""
+    path = write(tmp_path / "a.tdms", ("delta_e", NOISE, {"unit_string": "nm", **RATE}))
+    np.testing.assert_allclose(read_log(path).channels[0].values, NOISE * 1e-9)
+    path = write(tmp_path / "b.tdms", ("acc_x_g", NOISE, {"unit_string": "m/s2", **RATE}))
+    refused(path, "unit", "acc_x_g")
+
+
+def test_mixed_rates(tmp_path):
+    """The rate of most channels makes the log; the others are refused by name."""
+    fast = {"unit_string": "g", "wf_increment": 1e-4}
+    slow = {"unit_string": "g", "wf_increment": 1e-3}
+    path = write(
+        tmp_path / "log.tdms",
+        ("a", NOISE, fast),
+        ("b", NOISE, fast),
+        ("c", NOISE[:200], slow),
+        ("temperature", NOISE[:2], {"unit_string": "C", "wf_increment": 1.0}),
+    )
+    log = read_log(path)
+    assert log.sample_rate == 10_000.0 and [c.name for c in log.channels] == ["acc_a", "acc_b"]
+    (refusal,) = log.refused
+    assert (refusal.channel, refusal.reason, refusal.log) == ("acc_c_g", "time", log.name)
+    assert "1000 Hz" in refusal.detail and "10000 Hz" in refusal.detail
+
+
+def test_groups(tmp_path):
+    """Equal names in two groups are told apart by the group, also in a map."""
+    unit = {"unit_string": "g", **RATE}
+    path = write(tmp_path / "log.tdms", ("one", "x", NOISE, unit), ("two", "x", NOISE**2, unit))
+    assert {c.name for c in read_log(path).channels} == {"acc_one_x", "acc_two_x"}
+    log = read_log(path, columns=ColumnMap(columns={"acc_second_g": "two/x"}))
+    assert [c.name for c in log.channels] == ["acc_second"]
+
+
+def test_names_that_collide(tmp_path):
+    """Two channels whose names become one are not guessed at."""
+    unit = {"unit_string": "g", **RATE}
+    path = write(tmp_path / "log.tdms", ("a b", NOISE, unit), ("a-b", NOISE, unit))
+    refused(path, "columns", "a b, a-b")
+
+
+def test_properties_are_metadata(tmp_path):
+    """Properties of the file are metadata; the start of the recording is in UTC."""
+    moment = np.datetime64("2026-03-01T07:30:00", "us")
+    channel = ("x", NOISE, {"unit_string": "g", "wf_start_time": moment, **RATE})
+    root = {"stage": "demo-Y", "travel_km": 12.5, "baseline": True}
+    log = read_log(write(tmp_path / "log.tdms", channel, root=root))
+    assert (log.metadata.stage, log.metadata.travel) == ("demo-Y", 12_500.0)
+    assert log.metadata.baseline and log.metadata.recorded_at.isoformat().endswith("07:30:00+00:00")
+    never = ("x", NOISE, {"unit_string": "g", "wf_start_time": np.datetime64(0, "us"), **RATE})
+    path = write(tmp_path / "b.tdms", never, root={**root, "recorded_at": "2026-01-01T00:00:00Z"})
+    assert read_log(path).metadata.recorded_at.year == 2026
+
+
+def test_velocity_is_metadata(tmp_path):
+    """The velocity at which a log was recorded is read in m/s; what is no number is refused."""
+    channel = ("x", NOISE, {"unit_string": "g", **RATE})
+    for said in (-100.0, "-100", 100):
+        path = write(tmp_path / "log.tdms", channel, root={"velocity_mm_s": said})
+        assert read_log(path).metadata.velocity == pytest.approx(0.001 * float(said), rel=1e-15)
+    assert read_log(write(tmp_path / "log.tdms", channel)).metadata.velocity is None
+    path = write(tmp_path / "log.tdms", channel, root={"velocity_mm_s": "fast"})
+    refused(path, "metadata", "velocity_mm_s", "'fast'")
+
+
+def test_scaled_samples(tmp_path):
+    """Raw counts are scaled as the properties say."""
+    scale = {
+        "NI_Number_Of_Scales": 1,
+        "NI_Scale[0]_Scale_Type": "Linear",
+        "NI_Scale[0]_Linear_Slope": 0.5,
+        "NI_Scale[0]_Linear_Y_Intercept": 1.0,
+        "NI_Scale[0]_Linear_Input_Source": 0xFFFFFFFF,
+    }
+    counts = (NOISE * 1000).astype("i2")
+    path = write(tmp_path / "log.tdms", ("x", counts, {"unit_string": "m/s2", **RATE, **scale}))
+    np.testing.assert_allclose(read_log(path).channels[0].values, counts * 0.5 + 1)
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        {"NI_Number_Of_Scales": 4_000_000_000},
+        {"NI_Scale[4000000000]_Scale_Type": "Linear"},
+        {"NI_Scale[0]_Polynomial_Coefficients_Size": 4_000_000_000},
+    ],
+)
+def test_counts_of_scales(tmp_path, damage):
+    """A damaged count of scales is refused; npTDMS would fill the memory and loop."""
+    path = write(tmp_path / "log.tdms", ("x", NOISE, {"unit_string": "g", **RATE, **damage}))
+    refused(path, "corrupt", "NI_")
+
+
+def test_text_channel(tmp_path):
+    """A channel of text cannot be a signal."""
+    text = np.array(["a", "b"] * 10)
+    path = write(tmp_path / "log.tdms", ("delta_e_um", text, RATE))
+    refused(path, "columns", "delta_e_um")
+
+
+def test_truncated_anywhere(tmp_path):
+    """A file cut anywhere but between segments is refused; npTDMS would read what is left."""
+    channel = ("x", NOISE, {"unit_string": "g", **RATE})
+    path = write(tmp_path / "log.tdms", channel, n_segments=3)
+    data = path.read_bytes()
+    last = data.rindex(b"TDSm")
+    for stop in (20, last - 8, last + 3, last + 20, last + 40, len(data) - 1):
+        path.write_bytes(data[:stop])
+        refused(path, "corrupt")
+
+
+def test_unfinished_segment(tmp_path):
+    """A recorder that stopped before it wrote the length of its segment is named."""
+    path = write(tmp_path / "log.tdms", ("x", NOISE, {"unit_string": "g", **RATE}))
+    data = path.read_bytes()
+    path.write_bytes(data[:12] + b"\xff" * 8 + data[20:])
+    refused(path, "corrupt", "never finished")
+
+
+def test_index_beside_the_file_is_not_believed(tmp_path):
+    """An index file beside the log says nothing about it."""
+    channel = ("x", NOISE, {"unit_string": "g", **RATE})
+    path = write(tmp_path / "log.tdms", channel)
+    path.with_name("log.tdms_index").write_bytes(b"TDSh" + bytes(100))
+    assert read_log(path).channels[0].values.size == 2000
+
+
+def test_nothing_is_printed(tmp_path, capfd):
+    """Guesses of npTDMS end as errors and not as lines on standard error."""
+    path = write(tmp_path / "log.tdms", ("x", NOISE, {"unit_string": "g", **RATE}))
+    data = path.read_bytes()
+    path.write_bytes(data[:-8])
+    with warnings.catch_warnings(record=True) as caught:
+        refused(path, "corrupt")
+    assert capfd.readouterr() == ("", "") and not caught
+
+
+def test_without_nptdms(tmp_path, monkeypatch):
+    """Without npTDMS the error names the extra to install."""
+    path = write(tmp_path / "log.tdms", ("x", NOISE, RATE))
+    monkeypatch.setitem(sys.modules, "nptdms", None)
+    refused(path, "format", "lmshealth[formats]")

@@ -1,0 +1,72 @@
+"""Samples: a file is sliced as an array is, in its unit, and blocks are all of it."""
+
+from __future__ import annotations
+
+import tempfile
+
+import numpy as np
+import pytest
+
+from lmshealth.io.buffers import BLOCK, Stored, blocks, in_unit
+
+
+def stored(values: np.ndarray) -> Stored:
+    """Put samples into a file."""
+    file = tempfile.TemporaryFile()  # noqa: SIM115
+    values.tofile(file)
+    file.flush()
+    return Stored(file, values.size)
+
+
+@pytest.mark.parametrize(
+    "stretch", [slice(0, 10), slice(3, 7), slice(None), slice(-3, None), slice(5, 5), slice(8, 2)]
+)
+def test_slices_are_those_of_an_array(stretch: slice) -> None:
+    """Every stretch of consecutive samples is the array's, in any order of asking."""
+    values = np.random.default_rng(0).normal(size=10)
+    on_disk = stored(values)
+    for _ in range(2):
+        np.testing.assert_array_equal(on_disk[stretch], values[stretch])
+
+
+def test_no_sample_is_passed_over() -> None:
+    """A step is refused rather than ignored."""
+    with pytest.raises(ValueError, match="step is 2"):
+        stored(np.arange(4.0))[::2]
+
+
+def test_a_view_in_another_unit_keeps_the_first() -> None:
+    """Factors multiply, what reaches the limit is NaN, and the file stays open for all views."""
+    on_disk = stored(np.array([1.0, -2.0, 3000.0, np.inf]))
+    scaled = on_disk.scaled(1e-3, 2.0).scaled(2.0, 5.0)
+    del on_disk
+    np.testing.assert_allclose(scaled[:], [2e-3, -4e-3, np.nan, np.nan])
+
+
+def test_what_overflows_is_missing() -> None:
+    """A damaged float becomes NaN without a warning, and the given array stays as it is."""
+    values = np.array([1.0, 1e308, np.nan, -np.inf])
+    np.testing.assert_array_equal(in_unit(values, 1e3, np.inf), [1e3, np.nan, np.nan, np.nan])
+    assert values[1] == 1e308
+
+
+@pytest.mark.parametrize("size", [0, 1, BLOCK, BLOCK + 1, 3 * BLOCK - 7])
+@pytest.mark.parametrize("overlap", [0, 2])
+def test_blocks_are_all_of_it(size: int, overlap: int) -> None:
+    """Blocks without their overlap are the samples, each where it says it is; none is tiny."""
+    values = np.arange(float(size))
+    parts = []
+    for at, block in blocks(values, overlap=overlap):
+        assert block[0] == at
+        parts.append(block[overlap if at else 0 :])
+        assert parts[-1].size >= min(size, BLOCK // 2)
+        assert parts[-1].size <= 1.5 * BLOCK
+    np.testing.assert_array_equal(np.concatenate([np.empty(0), *parts]), values)
+
+
+def test_blocks_of_a_stretch_stay_in_it() -> None:
+    """A range is read from its start to its stop, also with an overlap."""
+    values = np.arange(3.0 * BLOCK)
+    found = [block for _, block in blocks(values, 5, 2 * BLOCK, overlap=1)]
+    assert found[0][0] == 5
+    assert found[-1][-1] == 2 * BLOCK - 1

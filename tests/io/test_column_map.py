@@ -1,0 +1,108 @@
+"""Column maps."""
+
+import numpy as np
+import pytest
+
+from lmshealth.errors import BadLog, BadTable
+from lmshealth.io.column_map import load_columns
+from lmshealth.io.reading import read_log
+
+GOOD = """
+sample_rate_hz = 2000
+[columns]
+delta_e = "PE(0)"
+acc_feed_g = "Ch 1"
+[units]
+delta_e = 4.88e-9
+[metadata]
+stage = "demo-X"
+recorded_at = 2026-03-01T08:30:00Z
+baseline = true
+[csv]
+skip_rows = 1
+delimiter = ";"
+header = true
+[mat]
+variable = "log"
+"""
+
+
+def test_map_reads_an_export(tmp_path):
+    """A vendor's export is read by its map; columns that only look like signals are left."""
+    (tmp_path / "map.toml").write_text(GOOD)
+    rows = "".join(f"{i % 7};{(i % 5) / 10};x\n" for i in range(100))
+    (tmp_path / "log.csv").write_text("Vendor 3.1\nPE(0);Ch 1;current_limit\n" + rows)
+    log = read_log(tmp_path / "log.csv", columns=load_columns(tmp_path / "map.toml"))
+    assert log.sample_rate == 2000 and log.metadata.stage == "demo-X" and log.metadata.baseline
+    values = {c.name: c.values for c in log.channels}
+    assert values["delta_e"].max() == pytest.approx(6 * 4.88e-9)
+    assert values["acc_feed"].max() == pytest.approx(0.4 * 9.80665)
+
+
+def test_map_keeps_columns_of_the_contract(make, tmp_path):
+    """Beside the named columns, those that keep the contract are read too; the map wins."""
+    (tmp_path / "map.toml").write_text('[columns]\ndelta_e_um = "PE"\n')
+    path = make(columns={"PE": np.sin(np.arange(400.0))})
+    log = read_log(path, columns=load_columns(tmp_path / "map.toml"))
+    values = {c.name: c.values for c in log.channels}
+    assert set(values) == {"delta_e", "acc_feed"} and values["delta_e"].max() > 9e-7
+
+
+def test_absent_source(make, tmp_path):
+    """A column that the map names and the file lacks is named, with what is there."""
+    (tmp_path / "map.toml").write_text('[columns]\ndelta_e_um = "PE"\n')
+    with pytest.raises(BadLog, match="needs PE; there: time_s, delta_e_um") as caught:
+        read_log(make(), columns=load_columns(tmp_path / "map.toml"))
+    assert caught.value.reason == "columns"
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "colums = 1",
+        "[columns]\nfoo_um = 'a'",
+        "[columns]\ndelta_e = 'a'",
+        "[columns]\ndelta_e_um = 'a'\ndelta_e_nm = 'b'",
+        "[columns]\ndelta_e_um = 'a'\nacc_x_g = 'a'",
+        "[columns]\ndelta_e = 'a'\n[units]\ndelta_e = 'parsec'",
+        "[metadata]\ntravel = 3",
+        "[metadata]\nstage = ['a']",
+        "sample_rate_hz = -1",
+        "sample_rate_hz = 1\n[metadata]\nsample_rate_hz = 1",
+        "[csv]\ndelimiter = 'ab'",
+        "[csv]\ndelimiter = '\"'",
+        "not toml",
+    ],
+)
+def test_bad_maps(tmp_path, text):
+    """Slips in a map are errors before any log is read."""
+    (tmp_path / "map.toml").write_text(text)
+    with pytest.raises(BadTable, match=r"map\.toml"):
+        load_columns(tmp_path / "map.toml")
+
+
+def test_absent_map(tmp_path):
+    """A map that is not there is an error that names it."""
+    with pytest.raises(BadTable, match="nowhere"):
+        load_columns(tmp_path / "nowhere.toml")
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        (
+            "[columns]\nacc_x_g = 'a'\n\n[csv]\ndelimeter = ';'",
+            r"line 5: csv\.delimeter: unknown key; known are skip_rows, delimiter, header",
+        ),
+        ("colums = 1", r"line 1: colums: unknown key; known are columns, units, metadata, "),
+        ("[csv]\nskip_rows = 'two'", r"line 2: csv\.skip_rows: Expected `int`, got `str`"),
+        ("[columns]\nacc_x_g = 1", "line 1: columns: one of its values: Expected `str`, got"),
+        ("[csv]\nheader = false\n[", "line 3: no TOML"),
+    ],
+)
+def test_a_slip_in_a_map_is_told_by_line_and_key(tmp_path, text, said):
+    """As in a stage description, and never in the words of a library."""
+    (tmp_path / "map.toml").write_text(text)
+    with pytest.raises(BadTable, match=said) as error:
+        load_columns(tmp_path / "map.toml")
+    assert "$" not in str(error.value)

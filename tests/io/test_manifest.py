@@ -1,0 +1,151 @@
+"""Folders of logs and their manifests."""
+
+import os
+
+import pytest
+
+from lmshealth.errors import BadLog, BadTable
+from lmshealth.io.manifest import find_logs, name_of, read_manifest
+from lmshealth.io.reading import read_log
+
+HEADER = "file,stage,travel_km,baseline\n"
+
+
+def test_find_logs(tmp_path):
+    """Logs are found by suffix, sorted; tables and texts beside them and hidden files are none."""
+    (tmp_path / "sub").mkdir()
+    (tmp_path / ".git").mkdir()
+    names = ["b.csv", "a.H5", "sub/c.csv.gz", "sub/manifest.csv", "maintenance.csv", "truth.csv"]
+    for name in [*names, "notes.txt", "notes.txt.gz", "sub/x.dat", ".git/d.csv", "._b.csv"]:
+        (tmp_path / name).write_bytes(b"")
+    found = find_logs(tmp_path)
+    logs, refused = found
+    assert (logs, refused) == (found.logs, found.refused)
+    assert [str(p.relative_to(tmp_path)) for p in found.logs] == ["a.H5", "b.csv", "sub/c.csv.gz"]
+    assert found.refused == ()
+
+
+def test_links(tmp_path):
+    """Links out of the folder, dangling links and pipes are refused; links inside are followed."""
+    outside, root = tmp_path / "outside", tmp_path / "root"
+    outside.mkdir()
+    root.mkdir()
+    (outside / "x.csv").write_bytes(b"")
+    (root / "real.csv").write_bytes(b"")
+    (root / "a.csv").symlink_to(outside / "x.csv")
+    (root / "b.csv").symlink_to(root / "real.csv")
+    (root / "c.csv").symlink_to(root / "gone.csv")
+    (root / "d").symlink_to(outside)
+    (root / "loop").symlink_to(root)
+    os.mkfifo(root / "e.csv")
+    found = find_logs(root)
+    assert [p.name for p in found.logs] == ["b.csv", "real.csv"]
+    refused = {r.log: r.reason for r in found.refused}
+    assert refused == {
+        "a.csv": "escapes",
+        "d": "escapes",
+        "c.csv": "missing-file",
+        "e.csv": "missing-file",
+    }
+
+
+def test_manifest_overrides(make, tmp_path):
+    """A row overrides what the file says; a manifest nearer to the log has the last word."""
+    (tmp_path / "sub").mkdir()
+    path = make("sub/log.csv")
+    (tmp_path / "manifest.csv").write_text(HEADER + "sub/log.csv,up,1,true\n")
+    (tmp_path / "sub/manifest.csv").write_text("file, stage,remark\nlog.csv, near,x\n")
+    manifest = read_manifest(tmp_path)
+    log = read_log(path, overrides=manifest.overrides(path))
+    assert (log.metadata.stage, log.metadata.travel, log.metadata.baseline) == ("near", 1e3, True)
+    assert manifest.refused == () and manifest.overrides(tmp_path / "other.csv") == {}
+
+
+def test_no_manifest(tmp_path):
+    """A folder may have no manifest."""
+    assert read_manifest(tmp_path).rows == {}
+
+
+def test_bad_value_refuses_one_log(make, tmp_path):
+    """A bad cell refuses its log and no other."""
+    path = make("log.csv")
+    (tmp_path / "manifest.csv").write_text(HEADER + "log.csv,A,many,\n")
+    with pytest.raises(BadLog, match="travel_km is 'many'"):
+        read_log(path, overrides=read_manifest(tmp_path).overrides(path))
+
+
+def test_rows_without_log(tmp_path):
+    """Rows that leave the folder or name nothing are refused, the others count."""
+    (tmp_path / "in").mkdir()
+    (tmp_path / "x.csv").write_bytes(b"")
+    (tmp_path / "in/manifest.csv").write_text(
+        HEADER + "../x.csv,A,1,\n/etc/passwd,A,1,\nno.csv,A,,\n"
+    )
+    refused = read_manifest(tmp_path / "in").refused
+    assert [r.reason for r in refused] == ["escapes", "escapes", "missing-file"]
+
+
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [
+        (b"", "empty"),
+        (b"stage\nA\n", "columns"),
+        (b"file,file\na,b\n", "columns"),
+        (b"file;stage\na;b\n", "columns"),
+        ("file,stage\na,b\n".encode("utf-16"), "columns"),
+    ],
+)
+def test_manifests_that_say_nothing(tmp_path, text, reason):
+    """A table that cannot be understood as a whole is one refusal, under its name."""
+    (tmp_path / "manifest.csv").write_bytes(text)
+    manifest = read_manifest(tmp_path)
+    assert [(r.log, r.reason) for r in manifest.refused] == [("manifest.csv", reason)]
+    assert manifest.rows == {}
+
+
+def test_bad_rows_cost_their_log_only(make, tmp_path):
+    """A log whose row cannot be read or is contradicted is refused; the rows around it count."""
+    logs = {name: make(f"{name}.csv") for name in "abcde"}
+    (tmp_path / "manifest.csv").write_bytes(
+        b"file,stage,travel_km,remark\n"
+        b"a.csv,A,1,\xff is not used\n"
+        b"b.csv,B,1,,too,many\n"
+        b'c.csv,"C,1,\n'
+        b"d.csv,D,1,,,\n"
+        b",E,1,\n"
+        b"e.csv,E,1,\n./e.csv,E,2,\n./d.csv,D,1,twice the same\n"
+        b"f\0.csv,F,1,\n"
+    )
+    manifest = read_manifest(tmp_path)
+    assert manifest.overrides(logs["a"]) == {"stage": "A", "travel_km": "1"}
+    assert manifest.overrides(logs["d"]) == {"stage": "D", "travel_km": "1"}
+    for name, needle in {
+        "b": "line 3 of manifest.csv: 6 cells",
+        "c": "line 4",
+        "e": "another row",
+    }.items():
+        with pytest.raises(BadLog, match=needle) as caught:
+            manifest.overrides(logs[name])
+        assert caught.value.reason == "bad-row"
+    assert [(r.log, r.reason, r.detail.split(":")[0]) for r in manifest.refused] == [
+        ("manifest.csv", "bad-row", "line 6"),
+        ("manifest.csv", "bad-row", "line 10"),
+    ]
+
+
+def test_names_are_fit_to_be_printed_and_differ(tmp_path):
+    """Control characters, turned writing and foreign bytes are escaped; no two names become one."""
+    names = [b"a\x1b[31m.csv", b"a\\x1b[31m.csv", b"\xff.csv", b"\xfe.csv", "\u202eb.csv".encode()]
+    for name in names:
+        open(os.path.join(os.fsencode(tmp_path), name), "wb").close()
+    told = [name_of(path, tmp_path) for path in find_logs(tmp_path).logs]
+    assert len(set(told)) == len(names)
+    assert all(name.isprintable() for name in told)
+    assert {r"a\x1b[31m.csv", r"a\\x1b[31m.csv", r"\udcff.csv", r"\u202eb.csv"} <= set(told)
+
+
+def test_no_folder(tmp_path):
+    """What is no folder is an error."""
+    for verb in (find_logs, read_manifest):
+        with pytest.raises(BadTable, match="no folder"):
+            verb(tmp_path / "absent")

@@ -1,0 +1,91 @@
+"""The time axis: rates agree, gaps split, disorder is refused with counts."""
+
+import numpy as np
+import pytest
+
+from lmshealth.io.buffers import BLOCK
+from lmshealth.io.refusal import Unusable
+from lmshealth.io.time_axis import pieces, time_axis
+
+
+def test_rate_from_time():
+    """The rate is found from exact, rounded, float32, offset and integer time stamps."""
+    n = np.arange(100_000)
+    assert time_axis(n / 20e3, None).sample_rate == 20e3
+    for stamps in (
+        np.round(n / 16384, 6),
+        (n / 16384).astype("f4").astype(float),
+        1.7e9 + n / 16384,
+    ):
+        axis = time_axis(stamps, None)
+        assert axis.sample_rate == pytest.approx(16384, rel=1e-5) and axis.breaks.size == 0
+    assert time_axis(n.astype(float), 1.0).sample_rate == 1.0
+
+
+def test_agreement():
+    """Time and metadata must agree within 1e-4; the metadata's rate is kept."""
+    time = np.arange(1000) / 1000
+    assert time_axis(time, 1000.05).sample_rate == 1000.05
+    with pytest.raises(Unusable, match=r"1000\.2"):
+        time_axis(time, 1000.2)
+    with pytest.raises(Unusable, match="neither"):
+        time_axis(None, None)
+
+
+def test_gaps_are_counted_and_split():
+    """Dropped samples split the record in indices of what is stored."""
+    time = np.delete(np.arange(1000) / 1000, [100, 101, 500])
+    axis = time_axis(time, 1000.0)
+    assert "2 gaps with 3 dropped samples" in axis.note
+    assert pieces(997, [], axis.breaks) == ((0, 100), (100, 498), (498, 997))
+
+
+def test_one_hiccup_splits():
+    """A single irregular interval interrupts the record there and nowhere else."""
+    time = np.arange(1000) / 1000
+    time[400:] += 0.0004
+    axis = time_axis(time, None)
+    assert axis.breaks.tolist() == [400] and "1 of 999 intervals" in axis.note
+    assert axis.sample_rate == pytest.approx(1000, rel=1e-9)
+
+
+def test_jitter_is_refused():
+    """Time that is not uniform is refused with the count of odd intervals."""
+    rng = np.random.default_rng(0)
+    with pytest.raises(Unusable, match="of 999 intervals differ"):
+        time_axis(np.cumsum(rng.uniform(0.5, 1.5, 1000)), None)
+
+
+def test_disorder_is_refused():
+    """Time is never sorted: what runs backwards or stands still is counted and refused."""
+    time = np.arange(100.0)
+    time[50], time[80] = 10.0, 79.0
+    with pytest.raises(Unusable, match="backwards 1 times and stands still 1 times"):
+        time_axis(time, None)
+    time[3] = np.nan
+    with pytest.raises(Unusable, match="1 of 100 time stamps"):
+        time_axis(time, None)
+
+
+def test_pieces_around_missing_samples():
+    """Pieces leave missing samples of any channel and single samples out."""
+    one, other = np.array([[0, 1], [5, 6]]), np.array([[3, 4], [9, 10]])
+    assert pieces(10, [one, other], np.array([8])) == ((1, 3), (6, 8))
+    assert pieces(10, [np.array([[2, 9]]), np.array([[3, 5]])], np.array([4])) == ((0, 2),)
+    assert pieces(3, [np.array([[0, 3]])], np.empty(0, int)) == ()
+    assert pieces(8, [], np.array([4])) == ((0, 4), (4, 8))
+
+
+def test_long_time_axes_are_read_in_blocks():
+    """Gaps, odd intervals and disorder are found in every block, also at their edges."""
+    n = 2 * BLOCK + 1000
+    time = np.arange(n) / 20e3
+    time[BLOCK:] += 3 / 20e3
+    time[2 * BLOCK + 10 :] += 0.4 / 20e3
+    axis = time_axis(time, None)
+    assert axis.breaks.tolist() == [BLOCK, 2 * BLOCK + 10]
+    assert "1 gaps with 3 dropped" in axis.note and "1 of" in axis.note
+    assert axis.sample_rate == pytest.approx(20e3, rel=1e-9)
+    time[2 * BLOCK + 20] = 0.0
+    with pytest.raises(Unusable, match=f"backwards 1 times.*at sample {2 * BLOCK + 20};"):
+        time_axis(time, None)

@@ -1,0 +1,68 @@
+"""What is asked of a log: which channels are used, and which modes are looked for."""
+
+from __future__ import annotations
+
+from itertools import permutations
+
+import numpy as np
+import pytest
+
+from lmshealth.errors import BadLog, BadStage
+from lmshealth.modal.targets import choose_channels, choose_targets
+from tests.signals import make_log, make_stage
+
+NAMES = ("acc_b", "current", "delta_e", "acc_a")
+STAGE = make_stage([("pitch", 136.6, 0.015), ("roll", 105.0, 0.02), ("yaw", 155.0, 0.03)])
+
+
+def names(order: tuple[str, ...] = NAMES, chosen: list[str] | None = None) -> list[str]:
+    """Name the channels that are used of a log of some."""
+    log = make_log({name: np.zeros(4) for name in order}, 100.0)
+    return [channel.name for channel in choose_channels(log, chosen)]
+
+
+def test_what_shows_modes_is_used_in_the_order_of_names() -> None:
+    """Currents are left out; the order of the file changes nothing."""
+    assert {tuple(names(order)) for order in permutations(NAMES)} == {("acc_a", "acc_b", "delta_e")}
+
+
+def test_only_named_channels_are_used() -> None:
+    """Of those named, whatever their order, each is used once."""
+    assert names(chosen=["delta_e", "acc_a", "delta_e"]) == ["acc_a", "delta_e"]
+
+
+@pytest.mark.parametrize("unknown", ["acc_c", "current"])
+def test_a_channel_that_is_not_usable_is_named_with_those_that_are(unknown: str) -> None:
+    """Neither what is not there nor what shows no modes is passed over in silence."""
+    with pytest.raises(BadLog, match=f"{unknown}.*acc_a.*acc_b.*delta_e") as caught:
+        names(chosen=["acc_a", unknown])
+    assert caught.value.reason == "channel"
+
+
+@pytest.mark.parametrize(("there", "chosen"), [(("current",), None), (NAMES, [])])
+def test_no_channel_left_is_an_error(there: tuple[str, ...], chosen: list[str] | None) -> None:
+    """A log of currents alone, or none asked for, is refused."""
+    with pytest.raises(BadLog, match="delta_e or acc") as caught:
+        names(there, chosen)
+    assert caught.value.reason == "no-signal"
+
+
+def test_modes_are_looked_for_as_they_are_described_and_in_order() -> None:
+    """Frequency, damping and search are the description's, ascending in frequency."""
+    found = choose_targets(STAGE)
+    assert [target.name for target in found] == ["roll", "pitch", "yaw"]
+    roll = found[0]
+    assert (roll.frequency, roll.damping_ratio, roll.search) == (105.0, 0.02, 0.15)
+    assert roll.nominal is None
+
+
+def test_a_band_takes_the_modes_inside_it_ends_included() -> None:
+    """Modes beyond are not looked for."""
+    assert [t.name for t in choose_targets(STAGE, (105.0, 136.6))] == ["roll", "pitch"]
+    assert [t.name for t in choose_targets(STAGE, (105.1, 154.9))] == ["pitch"]
+
+
+def test_a_band_without_modes_is_an_error() -> None:
+    """Nothing to look for is said, not shown as an empty table."""
+    with pytest.raises(BadStage, match="300 and 400 Hz"):
+        choose_targets(STAGE, (300.0, 400.0))

@@ -1,0 +1,355 @@
+"""The likelihood of a whole life against one dense multivariate normal."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import product
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from lmshealth._arrays import FloatArray
+from lmshealth.errors import NotEnoughData
+from lmshealth.prognosis import life_likelihood as life
+from lmshealth.prognosis.life_likelihood import LifeLikelihood, scatter_of
+from lmshealth.prognosis.life_posterior import LifeDensity
+from lmshealth.prognosis.scenarios import Course
+from lmshealth.stage.description import Stage
+from lmshealth.tracking.results import History
+from tests.lives import (
+    FADING,
+    FOOT,
+    FREQUENCY,
+    MOUNT,
+    PRELOAD,
+    SENSITIVITY,
+    make_history,
+    make_stage,
+    rough_history,
+    since,
+    true_drift,
+)
+from tests.oracles import LifeBelief, LifeSetting, life_log_likelihood
+
+NAMES = ("guide_preload", "mount_stiffness")
+NO_PRELOAD = PRELOAD.replace("law = { kind", "law = [{ kind").replace("} }\n", "} }, NONE]\n")
+NO_PRELOAD = NO_PRELOAD.replace("NONE", '{ kind = "none", weight = 3 }')
+
+
+@pytest.fixture(scope="module")
+def stage(tmp_path_factory: pytest.TempPathFactory) -> Stage:
+    """Wear of preload, loosening of the mount, two modes, temperature."""
+    return make_stage(tmp_path_factory.mktemp("stage"))
+
+
+def density_of(history: History, stage: Stage) -> LifeDensity:
+    """Give the density of the first course."""
+    likelihood = LifeLikelihood(history, stage)
+    return LifeDensity.of(likelihood, likelihood.courses[0])
+
+
+def coordinates(density: LifeDensity, n: int = 6, seed: int = 1) -> FloatArray:
+    """Draw coordinates inside the support."""
+    y = density.draw_prior(np.random.default_rng(seed), 300)
+    return y[np.isfinite(density.log_probability(y))][:n]
+
+
+def healths(course: Course, y: FloatArray, clock: FloatArray) -> FloatArray:
+    """Preload and mount by wear, loosening and jumps written out, shape (n_logs, 2)."""
+    columns = []
+    for branch, part in zip(course.branches, course.split(course.natural(y[None])), strict=True):
+        own, column = part[0], []
+        for s in clock:
+            since = max(s - branch.begin, 0.0)
+            if branch.law.kind == "hertz-wear":
+                health = (1 - (since / own[0]) ** own[1]) ** 1.5
+            elif branch.law.kind == "loosening":
+                health = own[0] + (1 - own[0]) * np.exp(-since / own[1])
+            else:
+                health = 1.0
+            for k, step in enumerate(branch.steps):
+                health *= own[len(branch.law.names) + k] if s > step else 1.0
+            column.append(health)
+        columns.append(column)
+    return np.array(columns).T
+
+
+def book(history: History, density: LifeDensity, y: FloatArray, model_std: float) -> float:
+    """Log likelihood of one set of coordinates by the dense oracle."""
+    x = np.log(healths(density.course, y, history.clock()[history.baseline :]))
+    alone = np.stack([true_drift(NAMES, x * (np.arange(2) == j))[:, :2] for j in range(2)])
+    belief = LifeBelief(
+        slopes=np.array([SENSITIVITY[name][:2] for name in NAMES]),
+        horizon=density.life.stage.description.usage.horizon_km * 1000,
+        model_std=model_std,
+        intercept_std=life._INTERCEPT_STD,
+    )
+    scales = zip(life._NOISE_SCALES, life._NOISE_SCALE_PRIOR, strict=True)
+    deviations = zip(life._DEVIATIONS, life._DEVIATION_PRIOR, strict=True)
+    grid = [
+        LifeSetting(walk, scale, deviation, p * q)
+        for walk, (scale, p), (deviation, q) in product(life._WALKS, scales, deviations)
+    ]
+    found = life_log_likelihood(history, true_drift(NAMES, x)[:, :2], alone, belief, grid)
+    return found + density.life.y.size / 2 * np.log(2 * np.pi)
+
+
+@pytest.fixture
+def short_grid(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Average over two values each, so that a plainly written oracle takes no long time."""
+    monkeypatch.setattr(life, "_WALKS", (5e-4, 5e-3))
+    monkeypatch.setattr(life, "_NOISE_SCALES", (1.0, 1.5))
+    monkeypatch.setattr(life, "_NOISE_SCALE_PRIOR", (0.9, 0.1))
+    monkeypatch.setattr(life, "_DEVIATIONS", (0.0, 0.15))
+    monkeypatch.setattr(life, "_DEVIATION_PRIOR", (0.6, 0.4))
+
+
+@pytest.mark.usefixtures("short_grid")
+@pytest.mark.parametrize("model_std", [0.0, 0.05, 0.3])
+@pytest.mark.parametrize("baseline", [0, 3])
+def test_likelihood_is_the_dense_multivariate_normal(
+    tmp_path: Path, model_std: float, baseline: int
+) -> None:
+    """Missing data, cross terms, unknown temperature, map error, deviation and grid: to 1e-9."""
+    stage = make_stage(tmp_path, model_std=model_std)
+    history = rough_history(np.random.default_rng(2), baseline=baseline)
+    density = density_of(history, stage)
+    y = coordinates(density, 4)
+    found = density.log_probability(y) - density.course.log_prior(y)
+    known = np.array([book(history, density, point, model_std) for point in y])
+    np.testing.assert_allclose(found, known, rtol=1e-9, atol=1e-7)
+
+
+@pytest.mark.usefixtures("short_grid")
+def test_every_course_after_a_step_is_the_dense_normal(tmp_path: Path) -> None:
+    """Laws or none, jumps and laws begun anew: values, not only differences, are comparable."""
+    stage = make_stage(tmp_path, (NO_PRELOAD, MOUNT))
+    history = rough_history(np.random.default_rng(3))
+    history = replace(history, steps=(since("step", 5, 10),))
+    likelihood = LifeLikelihood(history, stage)
+    assert likelihood.steps == (np.mean(history.clock()[4:6]),)
+    assert len(likelihood.courses) == 3 * 2
+    found, known = [], []
+    for course in likelihood.courses:
+        density = LifeDensity.of(likelihood, course)
+        y = coordinates(density, 1)
+        found.append((density.log_probability(y) - course.log_prior(y))[0])
+        known.append(book(history, density, y[0], 0.05))
+    np.testing.assert_allclose(found, known, rtol=1e-9, atol=1e-7)
+    assert np.ptp(found) > 0.1
+
+
+@pytest.mark.usefixtures("short_grid")
+@pytest.mark.parametrize("what", ["map error", "deviation"])
+def test_what_is_wrong_is_noticed(stage: Stage, what: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Negative control: the oracle with another error differs by far more than rounding."""
+    history = rough_history(np.random.default_rng(2))
+    density = density_of(history, stage)
+    y = coordinates(density)
+    found = density.log_probability(y) - density.course.log_prior(y)
+    if what == "deviation":
+        monkeypatch.setattr(life, "_DEVIATIONS", (0.0, 0.151))
+    model_std = 0.0501 if what == "map error" else 0.05
+    known = np.array([book(history, density, point, model_std) for point in y])
+    assert np.abs(found - known).max() > 1e-5
+
+
+def test_walkers_do_not_see_each_other(stage: Stage) -> None:
+    """A batch equals its walkers one at a time, also where some are impossible."""
+    density = density_of(rough_history(np.random.default_rng(3)), stage)
+    y = density.draw_prior(np.random.default_rng(4), 40)
+    y[5, 0] = 50.0  # preload gone long before now
+    together = density.log_probability(y)
+    alone = np.concatenate([density.log_probability(point[None]) for point in y])
+    np.testing.assert_allclose(together, alone, rtol=1e-11)
+    assert np.isneginf(together[5])
+    assert np.isfinite(together).any()
+
+
+def test_lives_that_leave_the_map_or_the_prior_are_impossible(stage: Stage) -> None:
+    """Preload below the map, or a floor below 0 or outside its prior: minus infinity, no error."""
+    density = density_of(rough_history(np.random.default_rng(5)), stage)
+    inside = coordinates(density, 1)[0]
+    now = density.life.now
+    wear, loose = (branch.law for branch in density.course.branches)
+    worn, below, low = inside.copy(), inside.copy(), inside.copy()
+    worn[0] = 0.5  # s_w < now
+    below[2] = 1.0  # floor below 0
+    life_m = loose.natural(inside[None, 2:], now)[0, 1]
+    low[2] = np.log(0.9 * -np.expm1(-now / life_m))  # floor 0.1, prior from 0.3
+    assert wear.natural(worn[None, :2], now)[0, 0] < now
+    found = density.log_probability(np.array([inside, worn, below, low]))
+    assert np.isfinite(found).tolist() == [True, False, False, False]
+    assert np.isneginf(found[1:]).all()
+
+
+def test_reported_errors_and_laws_are_believed_first(stage: Stage) -> None:
+    """Beforehand larger errors and larger deviations are the less probable the larger they are."""
+    believed = scatter_of(stage)
+    for prior in (believed.noise_scale, believed.deviation):
+        assert sum(prior) == pytest.approx(1)
+        assert prior[0] > 0.5
+        assert (np.diff(prior) < 0).all()
+
+
+def test_the_intercept_is_free(stage: Stage) -> None:
+    """Moving every frequency by the same part in a hundred changes no difference of likelihood."""
+    history = rough_history(np.random.default_rng(6))
+    moved = replace(history, ln_frequency=history.ln_frequency + 0.01)
+    one, two = density_of(history, stage), density_of(moved, stage)
+    y = coordinates(one)
+    np.testing.assert_allclose(one.log_probability(y), two.log_probability(y), atol=1e-8)
+
+
+def test_an_empty_log_changes_nothing(stage: Stage) -> None:
+    """A log without any mode, at a known temperature, leaves the likelihood."""
+    history = rough_history(np.random.default_rng(7))
+    temperature = np.nan_to_num(history.covariates["temperature_c"], nan=21.0)
+    history = replace(history, covariates={"temperature_c": temperature})
+    keep = np.arange(len(history.logs)) != 4
+    without = make_history(
+        history.ln_frequency[keep],
+        travel=history.travel[keep],
+        cov=history.cov[keep],
+        temperature=temperature[keep],
+    )
+    one, two = density_of(history, stage), density_of(without, stage)
+    y = coordinates(one)
+    np.testing.assert_allclose(one.log_probability(y), two.log_probability(y), rtol=1e-11)
+
+
+def test_a_mode_that_vanished_before_the_baseline_is_left_out(stage: Stage) -> None:
+    """A mode without any estimate since the baseline adds nothing, and no warning."""
+    ln_f = np.log(FREQUENCY[:2]) + 1e-3 * np.random.default_rng(8).standard_normal((8, 2))
+    ln_f[2:, 1] = np.nan
+    density = density_of(make_history(ln_f, baseline=2), stage)
+    assert density.life.y.size == 6
+    assert np.isfinite(density.log_probability(coordinates(density))).all()
+
+
+def test_a_covariate_that_is_not_recorded_is_ignored(stage: Stage) -> None:
+    """Without any temperature the likelihood is that of a stage without the covariate."""
+    ln_f = np.log(FREQUENCY[:2]) + 1e-3 * np.random.default_rng(9).standard_normal((6, 2))
+    bare = density_of(make_history(ln_f), stage)
+    reference = density_of(make_history(ln_f, temperature=np.full(6, 21.0)), stage)
+    y = coordinates(bare)
+    np.testing.assert_allclose(bare.log_probability(y), reference.log_probability(y), rtol=1e-12)
+
+
+def test_laws_without_parameters_take_no_coordinate(tmp_path: Path) -> None:
+    """An unchanging parameter among others keeps health 1 and needs no coordinate."""
+    stage = make_stage(tmp_path, (PRELOAD, FOOT, MOUNT))
+    density = density_of(rough_history(np.random.default_rng(13)), stage)
+    course = density.course
+    assert course.n_dim == 4
+    y = coordinates(density, 5)
+    assert [part.shape for part in course.split(y)] == [(5, 2), (5, 0), (5, 2)]
+    health = course.health(course.natural(y), np.array([0.0, density.life.now]))
+    assert health.shape == (5, 2, 3)
+    assert (health[:, :, 1] == 1).all()
+    np.testing.assert_allclose(health[:, 0], 1)
+    np.testing.assert_array_equal(density.life.free, [1, 0, 1])
+    assert (density.life.slopes[:, 1] == 0).all()
+
+
+def test_what_has_no_law_does_not_deviate(tmp_path: Path) -> None:
+    """A parameter that only keeps its value adds nothing to the covariance, seen or not."""
+    still = MOUNT[: MOUNT.index("[parameter.law]")]
+    history = rough_history(np.random.default_rng(13))
+    alone = LifeLikelihood(history, make_stage(tmp_path / "one", (PRELOAD,)))
+    beside = LifeLikelihood(history, make_stage(tmp_path / "two", (PRELOAD, still)))
+    free = LifeLikelihood(history, make_stage(tmp_path / "three", (PRELOAD, MOUNT)))
+    deviation = alone.covariance.deviation
+    np.testing.assert_allclose(beside.covariance.deviation, deviation, rtol=1e-9)
+    assert (free.covariance.deviation > 1.1 * deviation)[deviation > 0].all()
+
+
+@pytest.mark.parametrize("n", [3, 4])
+def test_a_life_of_many_steps_is_refused(stage: Stage, n: int) -> None:
+    """Three jumps since the baseline are as many as laws hold over; those before do not count."""
+    history = rough_history(np.random.default_rng(14), baseline=2)
+    steps = [since("step", k, 10) for k in (1, *range(4, 4 + n))]
+    history = replace(history, steps=tuple(steps))
+    if n == 3:
+        likelihood = LifeLikelihood(history, stage)
+        assert len(likelihood.steps) == 3
+        assert likelihood.courses[0].n_dim == 4 + 2 * 3
+        return
+    with pytest.raises(NotEnoughData, match=r"jumped 4 times.*declare a new baseline"):
+        LifeLikelihood(history, stage)
+
+
+@pytest.mark.parametrize(
+    ("ln_f", "travel"),
+    [
+        (np.log(np.tile(FREQUENCY[:2], (2, 1))), None),
+        (np.log(np.tile(FREQUENCY[:2], (5, 1))), np.full(5, 1e5)),
+        (np.where(np.arange(6)[:, None] < 2, np.log(FREQUENCY[:2]), np.nan), None),
+    ],
+    ids=["two-logs", "no-travel", "two-with-modes"],
+)
+def test_a_life_too_short_is_refused(
+    stage: Stage, ln_f: FloatArray, travel: FloatArray | None
+) -> None:
+    """Fewer than three logs with modes, or no travel, are no life; the error says so."""
+    with pytest.raises(NotEnoughData, match="at least 3 logs and some travel"):
+        LifeLikelihood(make_history(ln_f, travel=travel), stage)
+
+
+def test_baseline_units_do_not_matter(tmp_path: Path) -> None:
+    """A parameter in kN with baseline 1 kN is the same as a fraction: paths are relative."""
+    stage = make_stage(tmp_path, (FADING,))
+    density = density_of(rough_history(np.random.default_rng(14)), stage)
+    course, y = density.course, np.array([[0.1], [0.3]])
+    health = course.health(course.natural(y), np.array([density.life.now]))
+    np.testing.assert_allclose(health[:, 0, 0], [0.9, 0.7])
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("short_grid")
+def test_many_logs_are_told_by_few_nodes(stage: Stage) -> None:
+    """Of 80 logs two dozen nodes are enough, and what follows between them is right to 1e-7."""
+    rng = np.random.default_rng(12)
+    n = 80
+    history = make_history(
+        np.log(FREQUENCY[:2]) + 1e-3 * rng.standard_normal((n, 2)),
+        temperature=21 + rng.standard_normal(n),
+    )
+    density = density_of(history, stage)
+    likelihood = density.life
+    assert likelihood.nodes.size < 24
+    y = coordinates(density, 20, seed=5)
+    x = np.log([healths(density.course, point, likelihood.clock) for point in y])
+    drift = np.moveaxis(true_drift(NAMES, x)[..., :2], 1, 2)
+    told = drift[..., likelihood.nodes] @ likelihood.weights.T
+    np.testing.assert_allclose(told, drift, atol=1e-7)
+    # Negative control: a node less than half of them does not tell.
+    few = np.linalg.lstsq(drift[..., likelihood.nodes[:6]].reshape(-1, 6), drift.reshape(-1, n))[0]
+    told = drift[..., likelihood.nodes[:6]] @ few
+    assert np.abs(told - drift).max() > 1e-6
+    found = density.log_probability(y[:2]) - density.course.log_prior(y[:2])
+    known = np.array([book(history, density, point, 0.05) for point in y[:2]])
+    np.testing.assert_allclose(np.diff(found), np.diff(known), atol=1e-5)
+
+
+@pytest.mark.parametrize("last_still", [1, 5, 9], ids=["at the baseline", "between", "at the end"])
+def test_a_step_without_travel_parts_the_logs(tmp_path: Path, last_still: int) -> None:
+    """Logs at one odometer lie on both sides of a step; without one they are of one moment."""
+    stage = make_stage(tmp_path, (FADING,))
+    travel = np.linspace(0.0, 2e6, 10)
+    travel[last_still] = travel[last_still - 1]
+    ln_f = np.log(FREQUENCY[:2]) + 1e-3 * np.random.default_rng(3).standard_normal((10, 2))
+    history = make_history(ln_f, travel=travel)
+    without = LifeLikelihood(history, stage)
+    stepped = LifeLikelihood(replace(history, steps=(since("step", last_still, 10),)), stage)
+    (step,) = stepped.steps
+    np.testing.assert_array_equal(stepped.clock < step, np.arange(10) < last_still)
+    np.testing.assert_allclose(stepped.clock, without.clock, atol=1.0)
+    assert without.clock[last_still] == without.clock[last_still - 1]
+    for course in stepped.courses:
+        density = LifeDensity.of(stepped, course)
+        y = coordinates(density, 20)
+        assert np.isfinite(density.log_probability(y)).all()
+        off, _ = density.deviations(y, np.array([0.0, stepped.now]), np.random.default_rng(4))
+        assert np.isfinite(off).all()

@@ -1,0 +1,466 @@
+"""The posterior of a life: which course it took, what it says of itself, and where it goes."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import xarray
+from threadpoolctl import threadpool_limits
+
+from lmshealth._arrays import FloatArray
+from lmshealth.errors import NotConverged
+from lmshealth.health.importance_sampling import explore_well
+from lmshealth.prognosis import life_likelihood as life
+from lmshealth.prognosis import life_posterior as lifefit
+from lmshealth.prognosis.life_likelihood import LifeLikelihood
+from lmshealth.prognosis.life_posterior import LifeDensity, LifePosterior, fit_life
+from lmshealth.prognosis.remaining_life import prognose
+from lmshealth.stage.description import Stage
+from lmshealth.tracking.results import History, Step
+from tests.lives import (
+    FADING,
+    FOOT,
+    FREQUENCY,
+    MOUNT,
+    PRELOAD,
+    make_history,
+    make_stage,
+    threads,
+    true_drift,
+)
+
+NAMES = ("guide_preload", "mount_stiffness")
+NONE = '{ kind = "none" }'
+FADING_OR_NOT = FADING.replace("law = {", "law = [{").replace("} }\n", "} }, " + NONE + "]\n")
+MOUNT_OR_NOT = MOUNT[: MOUNT.index("[parameter.law]")] + (
+    'law = [{ kind = "loosening", life_km = { kind = "lognormal", median = 4000, sigma = 1.0 }, '
+    'floor = { kind = "uniform", low = 0.3, high = 1.0 } }, ' + NONE + "]\n"
+)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def small_grid() -> Iterator[None]:
+    """Average over two walks, two deviations and one noise scale: checks hold for any of them."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(life, "_WALKS", (1e-5, 1.5e-3))
+        patch.setattr(life, "_NOISE_SCALES", (1.0,))
+        patch.setattr(life, "_NOISE_SCALE_PRIOR", (1.0,))
+        patch.setattr(life, "_DEVIATIONS", (0.0, 0.01))
+        patch.setattr(life, "_DEVIATION_PRIOR", (0.5, 0.5))
+        yield
+
+
+@pytest.fixture(scope="module")
+def stage(small_grid: None, tmp_path_factory: pytest.TempPathFactory) -> Stage:
+    """Wear of the preload and loosening of the mount, seen by two modes."""
+    return make_stage(tmp_path_factory.mktemp("stage"), (PRELOAD, MOUNT))
+
+
+@pytest.fixture(scope="module")
+def wavering(small_grid: None, tmp_path_factory: pytest.TempPathFactory) -> Stage:
+    """Preload that fades and a mount that settles, or either of them not."""
+    return make_stage(tmp_path_factory.mktemp("wavering"), (FADING_OR_NOT, MOUNT_OR_NOT))
+
+
+def lived(travel: FloatArray, preload: FloatArray, mount: FloatArray, seed: int = 1) -> History:
+    """Make the life of a preload and a mount, with errors of 5e-4 in ln f."""
+    drift = true_drift(NAMES, np.log([preload, mount]).T)[:, :2]
+    noise = 5e-4 * np.random.default_rng(seed).standard_normal((travel.size, 2))
+    return make_history(np.log(FREQUENCY[:2]) + drift + noise, travel=travel, std=5e-4)
+
+
+TRAVEL = np.linspace(0.0, 2.5e6, 12)
+
+
+@pytest.fixture(scope="module")
+def history() -> History:
+    """Make a life of 12 logs: preload for 8,000 km, the mount settling to 0.8 within 1,500."""
+    preload = (1 - TRAVEL / 8e6) ** 1.5
+    return lived(TRAVEL, preload, 0.8 + 0.2 * np.exp(-TRAVEL / 1.5e6))
+
+
+@pytest.fixture(scope="module")
+def found(history: History, stage: Stage) -> LifePosterior:
+    """Its posterior."""
+    return fit_life(history, stage, (3, 4))
+
+
+@pytest.fixture(scope="module")
+def faded(wavering: Stage) -> LifePosterior:
+    """Posterior of a preload that loses a fifth, on a mount that keeps its value."""
+    return fit_life(lived(TRAVEL, 1 - 0.08e-6 * TRAVEL, np.ones(12)), wavering, 7)
+
+
+@pytest.fixture(scope="module")
+def unchained(history: History, stage: Stage) -> LifePosterior:
+    """Posterior by few draws of importance sampling alone."""
+    return fit_life(history, stage, 11, chains=False, n_draws=400)
+
+
+@pytest.fixture
+def forked(unchained: LifePosterior) -> LifePosterior:
+    """Make two ways of it, the second with the same draws backwards, with checks of their own."""
+    (way,) = unchained.ways
+    steps = np.arange(way.course.n_dim)
+    ways = tuple(
+        replace(
+            way,
+            probability=probability,
+            coordinates=way.coordinates[:, :: 1 - 2 * k],
+            ess_bulk=900.0 - 100 * k - steps,
+            ess_tail=800.0 - 100 * k - steps,
+            r_hat=1.001 + 0.004 * k + 1e-4 * steps,
+            informed=0.9 - 0.4 * k - 0.01 * steps,
+            share=int(100 * probability),
+        )
+        for k, probability in enumerate((0.75, 0.25))
+    )
+    return replace(unchained, ways=ways)
+
+
+def agree(one: FloatArray, two: FloatArray, ess: float) -> bool:
+    """Whether draws ``(n, k)`` have the same quantiles within the error of so many draws."""
+    for level in (0.1, 0.5, 0.9):
+        share = np.mean(one < np.quantile(two, level, axis=0), axis=0)
+        if (np.abs(share - level) > 4.5 * np.sqrt(level * (1 - level) / ess)).any():
+            return False
+    return True
+
+
+def both_ess(one: float, two: float) -> float:
+    """Draws whose error is that of the difference of two samples."""
+    return 1 / (1 / one + 1 / two)
+
+
+@pytest.mark.slow
+def test_laws_and_health_are_those_of_importance_sampling(
+    found: LifePosterior, history: History, stage: Stage
+) -> None:
+    """Chains and importance sampling give the same quantiles, within the error of both."""
+    likelihood = LifeLikelihood(history, stage)
+    (course,) = likelihood.courses
+    density = LifeDensity.of(likelihood, course)
+    rng = np.random.default_rng(5)
+    drawn = explore_well(density.log_probability, density.draw_prior(rng, 600), rng, 4000)
+    y = drawn.resampled(rng, 4000)
+    now = np.array([likelihood.now])
+    theta = course.natural(y)
+    health = course.health(theta, now) * np.exp(density.deviations(y, now, rng)[0])
+    known = np.column_stack([health[:, 0], theta[:, :2]])
+    (way,) = found.ways
+    draws = np.concatenate([found.health, way.chains[..., :2]], axis=2).reshape(-1, 4)
+    # Drawn twice: with weights, then by these.
+    ess = both_ess(found.ess, both_ess(drawn.ess, 4000))
+    assert ess > 500
+    assert agree(known, draws, ess)
+    assert not agree(known, 1.01 * draws, ess)  # negative control
+
+
+@pytest.mark.slow
+def test_importance_sampling_alone_gives_the_same(
+    found: LifePosterior, history: History, stage: Stage
+) -> None:
+    """Without chains quantiles are the same within their error, and so many draws are given."""
+    quick = fit_life(history, stage, 11, chains=False, n_draws=2000)
+    assert quick.health.shape == (4, 500, 2)
+    (way,) = quick.ways
+    assert np.isnan(way.r_hat).all()
+    assert way.ess_bulk.min() >= 400
+    assert quick.ess == np.inf
+    assert quick.worst_r_hat == 1
+    one, two = (
+        np.concatenate([fit.health, fit.ways[0].chains], axis=2).reshape(-1, 6)
+        for fit in (quick, found)
+    )
+    ess = both_ess(found.ess, both_ess(float(way.ess_bulk.min()), 2000))
+    assert agree(one, two, ess)
+    assert not agree(one, 1.01 * two, ess)  # negative control
+
+
+def test_linear_algebra_keeps_to_one_thread(
+    history: History, stage: Stage, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """On small arrays more would only wait for one another, whatever is usual around it."""
+    seen: set[int] = set()
+    ways = lifefit._ways
+
+    def counting(*arguments):
+        seen.update(threads())
+        return ways(*arguments)
+
+    monkeypatch.setattr(lifefit, "_ways", counting)
+    with threadpool_limits(2, user_api="blas"):
+        fit_life(history, stage, 11, chains=False, n_draws=400)
+        assert seen == {1}
+        assert threads() == {2}
+
+
+def test_importance_sampling_alone_has_no_chains(unchained: LifePosterior) -> None:
+    """Without chains there is no R-hat to be worse than 1, and no chain with few draws."""
+    assert np.isnan(unchained.ways[0].r_hat).all()
+    assert unchained.ess == np.inf
+    assert unchained.worst_r_hat == 1
+
+
+def test_the_worst_of_all_chains_is_told(forked: LifePosterior) -> None:
+    """Of the checks of all ways the worst speaks for the whole."""
+    assert forked.ess == 697
+    assert forked.worst_r_hat == pytest.approx(1.0053)
+
+
+@pytest.mark.slow
+def test_a_life_says_what_it_rests_on(found: LifePosterior) -> None:
+    """Names, convergence, what is informed, and the trade-off of preload and mount."""
+    (way,) = found.ways
+    assert found.parameters == NAMES
+    assert found.modes == ("roll", "pitch")
+    assert found.seed == (3, 4)
+    assert way.probability == 1
+    assert way.share == found.health.shape[1] == 2500
+    assert found.worst_r_hat < 1.01
+    assert found.ess > 1000
+    assert way.informed[0] > 0.9
+    assert way.informed[1] < way.informed[0]
+    assert found.correlation[0, 1] < -0.5
+    ratio = found.chi_square / found.degrees_of_freedom
+    assert 0.2 < ratio < 2.5
+    assert found.degrees_of_freedom == 24 - 4
+    assert found.laws("mount_stiffness") == {("loosening", 0.0): 1.0}
+
+
+@pytest.mark.slow
+def test_health_is_its_law_times_how_far_it_is_off(found: LifePosterior) -> None:
+    """Draws of laws, of what is off them and of health belong together, one by one."""
+    ((way, off, rate),) = found.each()
+    theta = way.course.natural(way.own)
+    by_law = way.course.health(theta, TRAVEL[-1:])[:, 0]
+    np.testing.assert_allclose(by_law * np.exp(off), found.health.reshape(-1, 2), rtol=1e-12)
+    np.testing.assert_array_equal(way.chains.reshape(-1, 4), theta)
+    moving = rate[:, 0] > 0
+    assert 0.02 < moving.mean() < 0.9
+    assert (off[moving] != 0).all()
+    assert (off[~moving] == 0).all()
+
+
+@pytest.mark.slow
+def test_a_prognosis_is_of_the_same_draws(
+    found: LifePosterior, history: History, stage: Stage
+) -> None:
+    """Health now of the prognosis is that of the fitted life, draw by draw."""
+    told = prognose(history, stage, (3, 4))
+    np.testing.assert_allclose(told.health, found.health.reshape(-1, 2), rtol=1e-12)
+    assert told.ess == found.ess
+
+
+@pytest.mark.slow
+def test_the_seed_alone_decides(found: LifePosterior, history: History, stage: Stage) -> None:
+    """The same seed gives the same chains, another one others."""
+    same, other = (fit_life(history, stage, seed) for seed in ((3, 4), (3, 5)))
+    np.testing.assert_array_equal(same.ways[0].coordinates, found.ways[0].coordinates)
+    np.testing.assert_array_equal(same.health, found.health)
+    assert not np.array_equal(other.ways[0].coordinates, found.ways[0].coordinates)
+
+
+@pytest.mark.slow
+def test_laws_without_parameters_have_no_draws_of_them(history: History, tmp_path: Path) -> None:
+    """An unchanging foot adds health of one, and nothing to what is fitted."""
+    only = fit_life(history, make_stage(tmp_path / "one", (FADING, FOOT)), 1)
+    assert only.ways[0].course.sizes == (1, 0)
+    assert (only.health[..., 1] == 1).all()
+    nothing = fit_life(history, make_stage(tmp_path / "none", (FOOT,)), 1)
+    assert nothing.ways[0].chains.shape == (4, 2500, 0)
+    assert nothing.ways[0].evidence_std == 0
+    assert nothing.ess == np.inf
+    assert nothing.worst_r_hat == 1
+    assert np.isnan(nothing.correlation).all()
+
+
+@pytest.mark.slow
+def test_a_value_that_is_kept_is_read_as_kept(tmp_path: Path) -> None:
+    """Rough logs of a mount that keeps its value: read as 1, unless it is told that it settles."""
+    noise = 8e-3 * np.random.default_rng(1).standard_normal((12, 2))
+    history = make_history(np.log(FREQUENCY[:2]) + noise, travel=TRAVEL, std=8e-3)
+    may, must = (
+        fit_life(history, make_stage(tmp_path / str(k), (parameter,)), 7)
+        for k, parameter in enumerate((MOUNT_OR_NOT, MOUNT))
+    )
+    assert may.laws("mount_stiffness")["none", 0.0] > 0.6
+    assert np.median(may.health) == pytest.approx(1, abs=2e-3)
+    assert np.mean(may.health < 0.98) < 0.1
+    # Negative control: what can only settle is read as settled.
+    assert np.mean(must.health < 0.98) > 0.2
+    assert np.median(must.health) < 0.992
+
+
+@pytest.mark.slow
+def test_the_law_that_the_logs_ask_for_wins(faded: LifePosterior, wavering: Stage) -> None:
+    """A clear loss is the law's, a still life is none's; probabilities add up to one."""
+    still = fit_life(lived(TRAVEL, np.ones(12), np.ones(12)), wavering, 7)
+    assert faded.laws("guide_preload")["linear", 0.0] > 0.99
+    assert next(iter(still.laws("guide_preload"))) == ("none", 0.0)
+    assert still.laws("guide_preload")["none", 0.0] > 0.6
+    for fit in (faded, still):
+        probability = [way.probability for way in fit.ways]
+        assert sum(probability) == pytest.approx(1, abs=1e-12)
+        assert probability == sorted(probability, reverse=True)
+        assert min(probability) >= 0.01
+        for name in NAMES:
+            assert sum(fit.laws(name).values()) == pytest.approx(1, abs=1e-12)
+        share = [way.share / fit.health.shape[1] for way in fit.ways]
+        np.testing.assert_allclose(share, probability, atol=1 / 2500)
+
+
+@pytest.mark.slow
+def test_draws_of_several_courses_stand_one_after_the_other(faded: LifePosterior) -> None:
+    """Each course has its own part of the draws, and health in it is that of its laws."""
+    assert len(faded.ways) > 1
+    first = 0
+    for way, off, _ in faded.each():
+        part = faded.health[:, first : first + way.share].reshape(-1, 2)
+        first += way.share
+        theta = way.course.natural(way.own)
+        by_law = way.course.health(theta, TRAVEL[-1:])[:, 0]
+        np.testing.assert_allclose(by_law * np.exp(off), part, rtol=1e-12)
+    assert first == faded.health.shape[1]
+
+
+@pytest.mark.slow
+def test_a_course_of_little_probability_has_no_chains(
+    wavering: Stage, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What is improbable is drawn by importance sampling alone, the rest by chains."""
+    monkeypatch.setattr("lmshealth.prognosis.life_posterior._WORTH_CHAINS", 0.5)
+    fit = fit_life(lived(TRAVEL, 1 - 0.08e-6 * TRAVEL, np.ones(12)), wavering, 7)
+    with_law = [way for way in fit.ways if way.course.n_dim]
+    assert {way.probability >= 0.5 for way in with_law} == {True, False}
+    for way in with_law:
+        assert np.isfinite(way.r_hat).all() == (way.probability >= 0.5)
+        assert 0 < way.evidence_std <= 1 / np.sqrt(400)
+
+
+@pytest.mark.slow
+def test_probabilities_are_those_of_the_evidence(tmp_path: Path) -> None:
+    """One law of one coordinate against none: the integral on a grid says how probable it is."""
+    weighty = FADING_OR_NOT.replace(NONE, '{ kind = "none", weight = 3 }')
+    stage = make_stage(tmp_path, (weighty,))
+    history = lived(TRAVEL, 1 - 0.008e-6 * TRAVEL, np.ones(12))
+    likelihood = LifeLikelihood(history, stage)
+    law, none = (LifeDensity.of(likelihood, course) for course in likelihood.courses)
+    assert (law.course.weight, none.course.weight) == (0.25, 0.75)
+    y = np.linspace(-0.5, 0.6, 20_001)
+    value = law.log_probability(y[:, None])
+    top = none.log_probability(np.empty((1, 0)))[0]
+    evidence = np.sum(np.exp(value - top)) * (y[1] - y[0])
+    known = 0.25 * evidence / (0.25 * evidence + 0.75)
+    fit = fit_life(history, stage, 2)
+    told = fit.laws("guide_preload")["linear", 0.0]
+    assert 0.1 < known < 0.9
+    std = max(way.evidence_std for way in fit.ways)
+    # Narrowing the grid may lose a hundredth of the evidence.
+    off = abs(np.log(told / (1 - told)) - np.log(known / (1 - known)))
+    assert off < 4 * std + 0.01
+    even = evidence / (evidence + 1)  # negative control: weights left out
+    assert abs(np.log(told / (1 - told)) - np.log(even / (1 - even))) > 4 * std + 0.01
+
+
+@pytest.mark.slow
+def test_a_step_is_followed_by_a_jump(tmp_path: Path) -> None:
+    """Preload that loses an eighth between two logs is followed; unless that is told, it is not."""
+    stage = make_stage(tmp_path, (FADING,))
+    travel = np.linspace(0.0, 2.4e6, 13)
+    preload = (1 - 0.04e-6 * travel) * np.where(travel > 1.3e6, 0.875, 1.0)
+    history = lived(travel, preload, np.ones(13))
+    told = replace(history, steps=(Step.found("step", 7, 13),))
+    fit, blind = fit_life(told, stage, 3), fit_life(history, stage, 3)
+    for way in fit.ways:
+        branch = way.course.branches[0]
+        assert branch.steps == (1.3e6,)
+        assert branch.begin in (0.0, 1.3e6)
+        jump = way.chains[..., branch.names.index("jump_1")]
+        low, high = np.quantile(jump, [0.005, 0.995])
+        assert low < 0.875 < high
+        assert high - low < 0.4
+    assert sum(fit.laws("guide_preload").values()) == pytest.approx(1)
+    low, high = np.quantile(fit.health, [0.005, 0.995])
+    assert low < preload[-1] < high
+    assert fit.chi_square / fit.degrees_of_freedom < 2
+    # Negative control: what is not told stays off the law, or is a walk.
+    assert blind.walk + blind.deviation > 1.5 * (fit.walk + fit.deviation)
+
+
+@pytest.mark.slow
+def test_a_life_goes_to_arviz_and_back(found: LifePosterior, tmp_path: Path) -> None:
+    """NetCDF keeps laws and health by ensemble."""
+    found.to_arviz().to_netcdf(tmp_path / "life.nc", engine="h5netcdf")
+    tree = xarray.open_datatree(tmp_path / "life.nc", engine="h5netcdf")
+    draws = tree["way_1/guide_preload.hertz-wear.life_m"]
+    assert draws.dims == ("chain", "draw")
+    np.testing.assert_array_equal(draws.to_numpy(), found.ways[0].chains[..., 0])
+    np.testing.assert_array_equal(tree["posterior/mount_stiffness"], found.health[..., 1])
+    checks = tree["checks_data"]
+    assert float(checks["chi_square"]) == found.chi_square
+    assert float(checks["probability_1"]) == 1
+    name = "mount_stiffness.loosening.floor"
+    assert float(checks[f"informed_1_{name}"]) == found.ways[0].informed[2]
+
+
+@pytest.mark.slow
+def test_a_course_without_parameters_has_no_group_in_arviz(faded: LifePosterior) -> None:
+    """Groups are of courses that have draws; the probability of every one is told."""
+    tree = faded.to_arviz()
+    for k, way in enumerate(faded.ways):
+        assert (f"way_{k + 1}" in tree.children) == (way.course.n_dim > 0)
+        assert float(tree["checks_data"][f"probability_{k + 1}"]) == way.probability
+
+
+@pytest.mark.slow
+def test_a_life_is_a_table(found: LifePosterior) -> None:
+    """Health now, then laws with their checks, one row each."""
+    table = found.to_frame().set_index("parameter")
+    assert list(table.index) == [
+        *NAMES,
+        "guide_preload.hertz-wear.life_m",
+        "guide_preload.hertz-wear.exponent",
+        "mount_stiffness.loosening.floor",
+        "mount_stiffness.loosening.life_m",
+    ]
+    assert list(table["way"]) == [0, 0, 1, 1, 1, 1]
+    assert table.loc["guide_preload", "median"] == np.median(found.health[..., 0])
+    informed = found.ways[0].informed
+    assert table.loc["guide_preload.hertz-wear.life_m", "informed"] == informed[0]
+    assert (table["q05"] < table["q95"]).all()
+
+
+def test_a_table_and_arviz_are_told_every_way(forked: LifePosterior) -> None:
+    """Draws, checks and probability of each way stand under its number in both."""
+    table, tree = forked.to_frame(), forked.to_arviz()
+    checks = tree["checks_data"]
+    np.testing.assert_array_equal(tree["posterior/guide_preload"], forked.health[..., 0])
+    for k, way in enumerate(forked.ways, 1):
+        rows = table[table["way"] == k].set_index("parameter")
+        assert len(rows) == way.course.n_dim
+        assert set(tree[f"way_{k}"].data_vars) == set(rows.index)
+        assert (rows["probability"] == way.probability).all()
+        assert float(checks[f"probability_{k}"]) == way.probability
+        for i, name in enumerate(rows.index):
+            np.testing.assert_array_equal(tree[f"way_{k}"][name], way.chains[..., i])
+            assert rows.loc[name, "median"] == np.median(way.chains[..., i])
+            for what in ("ess_bulk", "ess_tail", "r_hat", "informed"):
+                value = getattr(way, what)[i]
+                assert rows.loc[name, what] == float(checks[f"{what}_{k}_{name}"]) == value
+
+
+@pytest.mark.slow
+def test_no_life_without_convergence(
+    history: History, stage: Stage, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A sampler that stops too soon is refused with its chains."""
+    monkeypatch.setattr("lmshealth.health.ensemble_sampling._FIRST_STEPS", 40)
+    monkeypatch.setattr("lmshealth.health.ensemble_sampling._MOST_STEPS", 40)
+    with pytest.raises(NotConverged, match="after 40 steps") as caught:
+        fit_life(history, stage, 1)
+    assert np.shape(caught.value.chains) == (4, 40, 64, 4)

@@ -1,0 +1,157 @@
+"""What changed since the last report: sentences, and what they must not compare."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from datetime import UTC, date, datetime
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from lmshealth._serialize import pack, unpack
+from lmshealth.report.changes import Reported, changes, reported
+from tests.assessments import worn
+from tests.report.test_machine_page import nothing
+
+THEN = Reported(
+    recorded_at=datetime(2026, 6, 1, tzinfo=UTC),
+    baseline_at=datetime(2026, 1, 1, tzinfo=UTC),
+    description="d1",
+    n_logs=20,
+    travel=1e6,
+    verdict="healthy",
+    probability=0.93,
+    health={"guide_preload": (0.95, 0.97, 0.99)},
+    remaining=(3e6, 5e6, 9e6),
+    horizon=2e7,
+    service_by=date(2027, 3, 3),
+)
+NOW = replace(
+    THEN,
+    recorded_at=datetime(2026, 9, 1, tzinfo=UTC),
+    n_logs=32,
+    travel=1.34e6,
+    verdict="preload",
+    probability=0.88,
+    health={"guide_preload": (0.89, 0.91, 0.93)},
+    remaining=(1e6, 3e6, np.inf),
+    service_by=date(2027, 1, 12),
+)
+
+
+def told(now: Reported, before: Reported = THEN) -> list[str]:
+    """Give the sentences with all spaces alike."""
+    return [sentence.replace("\u202f", " ") for sentence in changes(before, now)]
+
+
+def test_every_number_of_two_reports_is_set_side_by_side() -> None:
+    """Verdict, health, life, date and logs, each in one sentence."""
+    assert told(NOW) == [
+        "Verdict was healthy (93 %), now loss of preload (88 %).",
+        "Guide preload: 97 % → 91 % (90 %: 89 to 93 %).",
+        "Remaining life, median: 5 000 km → 3 000 km (90 %: 1 000 km to beyond 20 000 km).",
+        "Service date: 2027-03-03 → 2027-01-12, 50 days earlier.",
+        "12 logs and 340 km more.",
+    ]
+
+
+def test_nothing_new_is_said_as_such() -> None:
+    """What stays is called so, not repeated as a change."""
+    assert told(THEN) == [
+        "Verdict still healthy (93 %).",
+        "Guide preload: 97 % → 97 % (90 %: 95 to 99 %).",
+        "Remaining life, median: still 5 000 km (90 %: 3 000 km to 9 000 km).",
+        "Service date: still 2027-03-03.",
+        "As many logs as then.",
+    ]
+    assert told(replace(THEN, probability=0.8))[0] == "Verdict still healthy (80 %), then 93 %."
+
+
+@pytest.mark.parametrize(
+    ("now", "said"),
+    [
+        (replace(NOW, health={}), "Guide preload: 97 % then; these logs do not tell it any more."),
+        (
+            replace(NOW, health={"mount_stiffness": (0.5, 0.6, 0.7)}),
+            "Mount stiffness: 60 % (90 %: 50 to 70 %); not told then.",
+        ),
+        (replace(NOW, remaining=None), "Remaining life, median: 5 000 km → not known."),
+        (
+            replace(NOW, remaining=(-2e6, -1e6, 1e5)),
+            "Remaining life, median: 5 000 km → already passed (90 %: already passed to 100 km).",
+        ),
+        (replace(NOW, service_by=None), "Service date: 2027-03-03 → none."),
+        (
+            replace(NOW, service_by=date(2027, 3, 4)),
+            "Service date: 2027-03-03 → 2027-03-04, 1 day later.",
+        ),
+        (replace(NOW, n_logs=19), "1 log fewer, 340 km further."),
+        (replace(NOW, n_logs=21, travel=np.nan), "1 log more."),
+        (replace(NOW, n_logs=18, travel=9e5), "2 logs fewer."),
+        (
+            replace(NOW, verdict="not-enough-data", probability=np.nan),
+            "Verdict was healthy (93 %), now not enough data.",
+        ),
+    ],
+)
+def test_what_is_not_known_on_one_side_is_said(now: Reported, said: str) -> None:
+    """A number that one of the reports lacks is named, never left out or made up."""
+    assert said in told(now)
+    assert "nan" not in " ".join(told(now)) and "inf" not in " ".join(told(now))
+
+
+def test_what_keeps_reports_from_being_compared_comes_first() -> None:
+    """Another description or another baseline is said before any number."""
+    other = replace(NOW, description="d2", baseline_at=datetime(2026, 7, 1, tzinfo=UTC))
+    description, baseline, *rest = told(other)
+    assert "stage description is another one" in description
+    assert "that of 2026-07-01 and no longer that of 2026-01-01" in baseline
+    assert rest == told(NOW)
+
+
+def test_a_report_is_told_by_the_numbers_of_its_page(tmp_path: Path) -> None:
+    """Quantiles, date and counts are those of the assessment, and come back from bytes."""
+    assessment = worn(tmp_path)
+    assert assessment.health is not None and assessment.prognosis is not None
+    said = reported(assessment)
+    expected = assessment.health.quantile(np.array([0.05, 0.5, 0.95]))[:, -1]
+    assert list(said.health) == ["guide_preload", "mount_stiffness"]
+    np.testing.assert_array_equal(np.array(list(said.health.values())).T, expected)
+    assert said.service_by == assessment.service().by
+    assert (said.n_logs, said.travel) == (40, 1.72e6)
+    assert said.remaining is not None
+    share = np.mean(assessment.prognosis.remaining[:, -1] <= said.remaining[1])
+    assert share == pytest.approx(0.5, abs=1e-3)
+    assert unpack(pack(said), Reported) == said
+
+
+def test_a_parameter_that_the_logs_do_not_tell_is_not_kept(tmp_path: Path) -> None:
+    """A value that a page does not show is not compared with later."""
+    assessment = worn(tmp_path)
+    assert assessment.health is not None
+    blind = replace(assessment.health, informed=assessment.health.informed * [1.0, 0.1])
+    assert list(reported(replace(assessment, health=blind)).health) == ["guide_preload"]
+
+
+def test_a_report_without_results_or_logs_has_gaps_not_failures(tmp_path: Path) -> None:
+    """Before anything is known, only the verdict is kept; without logs that too."""
+    bare = nothing(worn(tmp_path))
+    said = reported(bare)
+    assert (said.health, said.remaining, said.service_by) == ({}, None, None)
+    assert told(said, said) == ["Verdict still not enough data.", "As many logs as then."]
+    history = bare.history
+    empty = replace(
+        history,
+        logs=(),
+        recorded_at=(),
+        travel=history.travel[:0],
+        covariates={},
+        ln_frequency=history.ln_frequency[:0],
+        ln_damping=history.ln_damping[:0],
+        cov=history.cov[:0],
+        loop_error=history.loop_error[:0],
+    )
+    said = reported(replace(bare, history=empty))
+    assert said.n_logs == 0 and np.isnan(said.travel)
+    assert said.baseline_at == bare.judgement.recorded_at

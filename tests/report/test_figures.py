@@ -1,0 +1,580 @@
+"""Pictures: what they show, and that they repeat to the byte."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+from dataclasses import replace
+from datetime import UTC, datetime, timedelta
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+from matplotlib.axes import Axes
+from matplotlib.collections import QuadMesh
+from matplotlib.figure import Figure
+
+from lmshealth._arrays import FloatArray
+from lmshealth.health.results import Health
+from lmshealth.prognosis.maintenance_decision import decide
+from lmshealth.prognosis.results import Prognosis
+from lmshealth.report import figures as plots
+from lmshealth.report import figures as trackplots
+from lmshealth.signal.spectral_lines import Line
+from lmshealth.signal.waterfall import Waterfall
+from lmshealth.stage.degradation_laws import HertzWear, Law, Loosening
+from lmshealth.stage.description import Decision
+from lmshealth.stage.priors import Lognormal, Normal
+from lmshealth.tracking.covariate_effects import Influence
+from lmshealth.tracking.results import Effect, History, Series, Track
+from tests.lives import cut, health_of
+
+MODES = ("roll", "pitch", "yaw")
+PARAMETERS = ("guide_preload", "mount_stiffness")
+FREQUENCY = np.array([126.4, 136.6, 155.0])
+SENSITIVITY = np.array([[0.077, 0.26], [0.107, 0.18], [0.12, 0.05]])
+EPOCHS = 40
+START = datetime(2026, 6, 1, 8, 30, tzinfo=UTC)
+
+
+def life(wear_km: float, floor: float) -> tuple[FloatArray, FloatArray]:
+    """Return odometer in m and true health, shape (n_epochs, 2), of a machine."""
+    travel = np.linspace(120.0, 1720.0, EPOCHS) * 1000
+    s = travel - travel[0]
+    preload = (1 - s / (wear_km * 1000)) ** 1.5
+    mount = floor + (1 - floor) * np.exp(-s / 1.5e6)
+    return travel, np.column_stack([preload, mount])
+
+
+def make_history(stage: str, travel: FloatArray, truth: FloatArray, seed: int = 1) -> History:
+    """Make estimates of three modes with temperature and errors; roll is lost in one log."""
+    rng = np.random.default_rng(seed)
+    n, m = travel.size, len(MODES)
+    temperature = 21 + 2.5 * np.sin(np.arange(n) / 4) + rng.normal(0, 0.5, n)
+    level = np.log(FREQUENCY) + np.log(truth) @ SENSITIVITY.T
+    level = level - 1.2e-4 * (temperature[:, None] - 21)
+    std = np.r_[np.full(m, 8e-4), np.full(m, 0.06)] * np.exp(rng.normal(0, 0.25, (n, 1)))
+    cov = std[:, :, None] * std[:, None, :] * np.eye(2 * m)
+    damping = np.log([0.015, 0.018, 0.012]) + 0.1 * np.arange(n)[:, None] / n
+    noise = std * rng.standard_normal((n, 2 * m))
+    ln_f, ln_z = level + noise[:, :m], damping + noise[:, m:]
+    ln_f[7, 0] = ln_z[7, 0] = np.nan
+    cov[7, [0, m]] = cov[7][:, [0, m]] = np.nan
+    cov[7, :, 0] = cov[7, :, m] = np.nan
+    return History(
+        stage=stage,
+        logs=tuple(f"logs/{stage}/{i:04d}.csv" for i in range(n)),
+        recorded_at=tuple(START + timedelta(days=float(s) / 12e3) for s in travel - travel[0]),
+        travel=travel,
+        covariates={"temperature_c": temperature},
+        modes=MODES,
+        ln_frequency=ln_f,
+        ln_damping=ln_z,
+        cov=cov,
+        series=tuple(Series(mode, "acc") for mode in MODES),
+        loop_error=np.full(n, np.nan),
+        baselines=(0,),
+    )
+
+
+def make_track(history: History, truth: FloatArray, seed: int = 2) -> Track:
+    """Make a track whose line follows the truth."""
+    rng = np.random.default_rng(seed)
+    n, m = len(history.logs), len(history.modes)
+    drift = np.log(truth) @ SENSITIVITY.T
+    std = 6e-4 / np.sqrt(1 + np.arange(n))[:, None] + np.full(m, 2.5e-4)
+    wander = np.cumsum(rng.normal(0, 8e-5, (n, m)), axis=0)
+    ln_f = np.log(FREQUENCY) + drift + wander
+    dof = np.where(np.isnan(history.ln_frequency).any(axis=1), m - 1.0, float(m))
+    return Track(
+        stage=history.stage,
+        logs=history.logs,
+        recorded_at=history.recorded_at,
+        travel=history.travel,
+        modes=history.modes,
+        ln_frequency=ln_f,
+        ln_frequency_std=std,
+        ln_damping=np.log([0.015, 0.018, 0.012]) + 0.1 * np.arange(n)[:, None] / n,
+        ln_damping_std=np.full((n, m), 0.02),
+        drift=drift + wander,
+        drift_cov=(std**2)[:, :, None] * np.eye(m),
+        effects=tuple(Effect(mode, "temperature_c", -1.2e-4, 1.5e-5) for mode in history.modes),
+        nis=rng.chisquare(dof),
+        nis_dof=dof,
+        noise_scale=np.ones((n, 1)),
+        sources=("acc",),
+        events=(),
+        steps=(),
+        outliers=(),
+        innovations=rng.standard_normal((n, 2 * m)),
+        widening=np.ones(n),
+    )
+
+
+def make_health(
+    history: History, truth: FloatArray, informed: tuple[float, float] = (0.96, 0.93), seed: int = 3
+) -> Health:
+    """Make a posterior with the strong trade-off between preload and mount."""
+    rng = np.random.default_rng(seed)
+    n = len(history.logs)
+    std = np.where(np.array(informed) > 0.5, [0.055, 0.035], [0.3, 0.3])
+    std = std * (1 + 1.5 / np.sqrt(1 + np.arange(n)))[:, None] * [1.0, 1.0]
+    root = np.linalg.cholesky(np.array([[1, -0.9], [-0.9, 1]]))
+    both = min(informed) > 0.5
+    white = rng.standard_normal((n, 1500, 2))
+    white = white @ root.T if both else white
+    return health_of(
+        np.exp(np.log(truth)[:, None] + std[:, None] * white),
+        stage=history.stage,
+        recorded_at=history.recorded_at,
+        travel=history.travel,
+        parameters=PARAMETERS,
+        converged=np.ones(n, dtype=bool),
+        informed=np.tile(np.array(informed), (n, 1)),
+    )
+
+
+def make_prognosis(
+    history: History, wear_km: float, floor: float, limits: tuple[float, float] = (0.6, 0.7)
+) -> Prognosis:
+    """Make a prognosis from draws of the laws around the truth."""
+    rng = np.random.default_rng(4)
+    n, now = 4000, float(history.clock()[-1])
+    wear = HertzWear(life_km=Lognormal(8000, 0.5))
+    loose = Loosening(life_km=Lognormal(1500, 0.3), floor=Normal(0.7, 0.1))
+    laws: tuple[Law, Law] = (wear, loose)
+    theta: tuple[FloatArray, ...] = (
+        np.column_stack(
+            [wear_km * 1e3 * np.exp(rng.normal(0, 0.12, n)), rng.uniform(0.9, 1.15, n)]
+        ),
+        np.column_stack([rng.normal(floor, 0.03, n), 1.5e6 * np.exp(rng.normal(0, 0.15, n))]),
+    )
+    passed = [law.passage(t, x) for law, t, x in zip(laws, theta, limits, strict=True)]
+    remaining = np.column_stack(passed) - now
+    horizon = 20e6
+    grid = np.linspace(0, now + horizon, 240)
+    curves = [law.health(t, grid) for law, t in zip(laws, theta, strict=True)]
+    present = [law.health(t, np.array([now])) for law, t in zip(laws, theta, strict=True)]
+    return Prognosis(
+        stage=history.stage,
+        recorded_at=history.recorded_at[-1],
+        travel=float(history.travel[-1]),
+        parameters=(*PARAMETERS, "any"),
+        untold=(),
+        limits=np.array([*limits, np.nan]),
+        remaining=np.column_stack([remaining, remaining.min(axis=1)]),
+        usage=12e3 * np.exp(rng.normal(0, 0.08, n)),
+        horizon=horizon,
+        health=np.column_stack(present),
+        curve_travel=grid + history.travel[0],
+        curve_quantiles=np.stack(
+            [np.quantile(c, [0.05, 0.25, 0.5, 0.75, 0.95], axis=0) for c in curves], axis=-1
+        ),
+        laws=(),
+        chi_square=121.4,
+        degrees_of_freedom=115,
+        walk=8e-4,
+        noise_scale=1.02,
+        deviation=0.0,
+        ess=1830.0,
+        r_hat=1.006,
+    )
+
+
+@pytest.fixture(scope="module")
+def history() -> History:
+    """History of a wearing machine."""
+    travel, truth = life(8000, 0.68)
+    return make_history("M7-Y", travel, truth)
+
+
+@pytest.fixture(scope="module")
+def track(history: History) -> Track:
+    """Its track."""
+    return make_track(history, life(8000, 0.68)[1])
+
+
+@pytest.fixture(scope="module")
+def health(history: History) -> Health:
+    """Its health."""
+    return make_health(history, life(8000, 0.68)[1])
+
+
+@pytest.fixture(scope="module")
+def prognosis(history: History) -> Prognosis:
+    """Its remaining life."""
+    return make_prognosis(history, 8000, 0.68)
+
+
+@pytest.fixture
+def ax() -> Axes:
+    """Make an empty Axes that no global state knows."""
+    return Figure().add_subplot()
+
+
+def data(ax: Axes, label: str) -> tuple[FloatArray, FloatArray]:
+    """Return x and y of the line with a label."""
+    line = next(line for line in ax.lines if line.get_label() == label)
+    return np.asarray(line.get_xdata(), dtype=float), np.asarray(line.get_ydata(), dtype=float)
+
+
+def labels(ax: Axes) -> list[str]:
+    """Entries of the legend."""
+    return ax.get_legend_handles_labels()[1]
+
+
+@pytest.mark.slow
+def test_import_leaves_matplotlib_alone() -> None:
+    """Importing the module is light: matplotlib and Jinja2 come when something is written."""
+    code = "import sys, lmshealth.report; print({'matplotlib', 'jinja2'} & set(sys.modules))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "set()"
+
+
+def test_frequencies_in_hz_over_km(ax: Axes, history: History, track: Track) -> None:
+    """Logs, filtered line and baseline stand at the right numbers, missing logs are left out."""
+    assert trackplots.plot_frequencies(ax, history, track, "roll") is ax
+    points = np.asarray(ax.lines[0].get_xydata())
+    assert len(points) == EPOCHS - 1
+    np.testing.assert_allclose(points[-1, 0], history.travel[-1] / 1000)
+    np.testing.assert_allclose(points[-1, 1], np.exp(history.ln_frequency[-1, 0]))
+    np.testing.assert_allclose(data(ax, "baseline")[1], FREQUENCY[0], rtol=1e-12)
+    assert labels(ax) == ["filtered, 95 % band", "baseline", "each log, ±2σ"]
+    assert ax.get_xlabel() == "odometer in km"
+    assert ax.get_ylabel() == "natural frequency in Hz"
+
+
+def test_frequency_without_track(ax: Axes, history: History) -> None:
+    """Without a track the logs alone are shown."""
+    trackplots.plot_frequencies(ax, history, None, "yaw")
+    assert labels(ax) == ["each log, ±2σ"]
+
+
+def test_quiet_mode_is_no_drama(ax: Axes, history: History) -> None:
+    """A mode that hardly moves is shown on a scale of at least 1 %."""
+    flat = np.where(np.isnan(history.ln_frequency), np.nan, np.log(100.0))
+    still = replace(history, ln_frequency=flat)
+    trackplots.plot_frequencies(ax, replace(still, cov=1e-12 * history.cov), None, "yaw")
+    low, high = ax.get_ylim()
+    assert high - low >= 0.99
+
+
+def test_damping_in_percent_from_zero(ax: Axes, history: History, track: Track) -> None:
+    """Damping is in percent and its axis starts at zero."""
+    trackplots.plot_damping(ax, history, track, "pitch")
+    assert ax.get_ylim()[0] == 0
+    assert ax.get_ylim()[1] < 10
+    assert "%" in ax.get_ylabel()
+
+
+def test_posterior_regions_hold_their_share(ax: Axes, health: Health) -> None:
+    """The regions called 50 and 90 % hold 50 and 90 % of the draws, at correlation -0.9."""
+    plots.plot_posterior(ax, health, PARAMETERS)
+    outlines = next(c for c in ax.collections if len(c.get_paths()) == 2).get_paths()
+    shares = [path.contains_points(100 * health.samples[-1]).mean() for path in outlines]
+    np.testing.assert_allclose(shares, [0.9, 0.5], atol=0.03)
+    assert {"baseline", "median", "single 90 %"} <= set(labels(ax))
+
+
+def test_posterior_of_one_parameter_is_a_density(ax: Axes, health: Health) -> None:
+    """One parameter gives a density that integrates to one."""
+    plots.plot_posterior(ax, health, PARAMETERS[:1])
+    x, y = np.asarray(ax.lines[0].get_xydata()).T
+    assert np.trapezoid(y, x) == pytest.approx(1, abs=0.01)
+
+
+def test_posterior_of_three_parameters_is_refused(ax: Axes, health: Health) -> None:
+    """Three parameters cannot be drawn in one picture."""
+    with pytest.raises(ValueError, match="3 parameters"):
+        plots.plot_posterior(ax, health, ("a", "b", "c"))
+
+
+def test_health_marks_limit_and_failures(ax: Axes, health: Health) -> None:
+    """Limit, baseline and epochs without convergence are marked."""
+    converged = health.converged.copy()
+    converged[5] = False
+    plots.plot_health(ax, replace(health, converged=converged), "guide_preload", 0.6)
+    assert {"limit 60 %", "baseline", "sampler not converged"} <= set(labels(ax))
+    low, high = ax.get_ylim()
+    assert low < 60
+    assert high > 100
+
+
+def test_life_hides_epochs_that_are_not_told(
+    ax: Axes, history: History, prognosis: Prognosis
+) -> None:
+    """Epochs that are mostly assumption do not stand beside the law."""
+    health = make_health(history, life(8000, 0.68)[1], (0.9, 0.1))
+    plots.plot_life(ax, prognosis, "mount_stiffness", health=health)
+    assert "epochs, 90 %" not in labels(ax)
+
+
+def test_health_that_is_not_told_does_not_look_measured(ax: Axes, history: History) -> None:
+    """A parameter the data do not tell is hatched and named as an assumption."""
+    plots.plot_health(
+        ax, make_health(history, life(8000, 0.68)[1], (0.9, 0.1)), PARAMETERS[1], None
+    )
+    assert "mostly assumption, not measured" in labels(ax)
+    assert any(collection.get_hatch() for collection in ax.collections)
+
+
+def test_life_shows_now_limit_and_horizon(ax: Axes, prognosis: Prognosis, health: Health) -> None:
+    """A horizon far behind the limit is named instead of squeezing the picture."""
+    plots.plot_life(ax, prognosis, "guide_preload", health=health)
+    assert {"now", "limit 60 %", "law", "epochs, 90 %", "limit reached"} <= set(labels(ax))
+    assert "horizon at 21720 km" in ax.get_xlabel()
+    near = Figure().add_subplot()
+    plots.plot_life(near, replace(prognosis, horizon=3e6), "mount_stiffness")
+    assert "horizon" in labels(near)
+
+
+def test_survival_is_the_share_of_draws(ax: Axes, prognosis: Prognosis) -> None:
+    """The curve is the share of draws that have not reached a limit."""
+    plots.plot_survival(ax, prognosis, service=decide(prognosis, Decision()))
+    x, y = data(ax, "no limit reached")
+    share = [100 * np.mean(prognosis.remaining[:, -1] > km * 1000) for km in x]
+    np.testing.assert_allclose(y, share)
+    assert "accepted risk 5 %" in labels(ax)
+
+
+def test_survival_shows_the_risk_of_least_costs(ax: Axes, prognosis: Prognosis) -> None:
+    """Where costs choose the day the line is at its risk; where they choose none there is none."""
+    service = decide(prognosis, Decision(cost_ratio=20.0))
+    plots.plot_survival(ax, prognosis, service=service)
+    label = f"risk at least costs {100 * service.risk:.3g} %"
+    np.testing.assert_allclose(data(ax, label)[1], 100 * (1 - service.risk))
+    endless = replace(prognosis, remaining=np.full_like(prognosis.remaining, np.inf))
+    bare = Figure().add_subplot()
+    plots.plot_survival(bare, endless, service=decide(endless, Decision(cost_ratio=20.0)))
+    assert len(bare.get_lines()) == len(ax.get_lines()) - 1
+
+
+def test_survival_without_end(ax: Axes, prognosis: Prognosis) -> None:
+    """A life without a visible end is drawn up to the horizon."""
+    endless = np.full_like(prognosis.remaining, np.inf)
+    plots.plot_survival(ax, replace(prognosis, remaining=endless))
+    assert ax.get_xlim()[1] == pytest.approx(20000)
+    assert "horizon" in ax.get_xlabel()
+
+
+def test_nis_band_is_chi_square(ax: Axes, track: Track) -> None:
+    """Epochs outside the 95 % band of their own degrees of freedom have another marker."""
+    from scipy.stats import chi2
+
+    nis = track.nis.copy()
+    nis[3], nis[4] = 60.0, np.nan
+    trackplots.plot_nis(ax, replace(track, nis=nis))
+    seen = np.isfinite(nis)
+    cdf = chi2.cdf(nis[seen], track.nis_dof[seen])
+    assert data(ax, "outside")[0].size == np.sum((cdf < 0.025) | (cdf > 0.975))
+    assert "log scale" in ax.get_ylabel()
+
+
+def make_waterfall(history: History) -> Waterfall:
+    """Make spectra with a peak at roll, a mains line in every log, and a log without levels."""
+    edges = np.geomspace(100.0, 180.0, 81)
+    centre = np.sqrt(edges[1:] * edges[:-1])
+    roll = np.exp(history.ln_frequency[:, 0])[:, None]
+    level = 12 - 3 * np.abs(centre - np.where(np.isnan(roll), FREQUENCY[0], roll)).clip(0, 6)
+    level[:, np.searchsorted(edges, 150.0) - 1] = 40.0
+    level[3] = np.nan
+    line = Line(150.0, 2e-3, "m/s²", "mains", "acc_feed")
+    return Waterfall(edges, level, tuple((line,) for _ in history.logs))
+
+
+def test_waterfall_shows_every_log_in_its_column(ax: Axes, history: History, track: Track) -> None:
+    """Colours are the levels, columns hold their logs, and lines do not decide the colours."""
+    waterfall = make_waterfall(history)
+    assert trackplots.plot_waterfall(ax, waterfall, history, track) is ax
+    mesh = next(c for c in ax.collections if isinstance(c, QuadMesh))
+    shown = np.ma.filled(mesh.get_array(), np.nan)[:, ::2].T
+    np.testing.assert_array_equal(shown, waterfall.level)
+    x = mesh.get_coordinates()[0, :, 0].reshape(-1, 2)
+    km = history.travel / 1000
+    assert (x[:, 0] < km).all() and (km < x[:, 1]).all()
+    assert mesh.get_clim() == (-10.0, 15.0)
+    np.testing.assert_allclose(data(ax, "mains line"), [km, np.full(EPOCHS, 150.0)])
+    np.testing.assert_allclose(
+        data(ax, "tracked modes, 95 % band")[1], np.exp(track.ln_frequency[:, 0])
+    )
+    assert ax.get_ylabel() == "frequency in Hz" and ax.get_yscale() == "linear"
+
+
+def test_waterfall_moves_the_modes_to_where_logs_saw_them(
+    ax: Axes, history: History, track: Track
+) -> None:
+    """What covariates did is added to the tracked frequencies."""
+    moved = np.linspace(0, 0.02, EPOCHS)[:, None] * np.ones(3)
+    trackplots.plot_waterfall(ax, make_waterfall(history), history, track, moved=moved)
+    np.testing.assert_allclose(
+        data(ax, "tracked modes, 95 % band")[1], np.exp(track.ln_frequency[:, 0] + moved[:, 0])
+    )
+
+
+def test_waterfall_leaves_a_gap_where_logs_are_missing(ax: Axes, history: History) -> None:
+    """Columns touch their neighbours, but not across a hole of several usual distances."""
+    travel = history.travel.copy()
+    travel[20:] += 10 * (travel[1] - travel[0])
+    apart = replace(history, travel=travel)
+    trackplots.plot_waterfall(ax, make_waterfall(apart), apart)
+    mesh = next(c for c in ax.collections if isinstance(c, QuadMesh))
+    left, right = mesh.get_coordinates()[0, :, 0].reshape(-1, 2).T
+    gaps = left[1:] - right[:-1]
+    usual = (travel[1] - travel[0]) / 1000
+    assert gaps[19] > 9 * usual
+    np.testing.assert_allclose(np.delete(gaps, 19), 0.0, atol=1e-9 * travel[-1])
+
+
+@pytest.mark.parametrize("still", [False, True])
+def test_waterfall_of_one_log_or_of_a_machine_at_rest(
+    ax: Axes, history: History, still: bool
+) -> None:
+    """One log is a column; several at one odometer are one place with some width."""
+    n = 5 if still else 1
+    few = cut(history, n)
+    few = replace(few, travel=np.full(n, few.travel[0]))
+    waterfall = make_waterfall(history)
+    own = Waterfall(waterfall.edges, waterfall.level[:n], waterfall.lines[:n])
+    trackplots.plot_waterfall(ax, own, few)
+    low, high = ax.get_xlim()
+    assert low < few.travel[0] / 1000 < high
+
+
+def test_waterfall_keeps_its_width_beside_long_names(history: History) -> None:
+    """A line with a long name takes a line of the legend, not the room of the picture."""
+    waterfall = make_waterfall(history)
+    long = replace(waterfall.lines[0][0], kind="a disturbance of unknown origin")
+    waterfall = replace(waterfall, lines=((long,), *waterfall.lines[1:]))
+    figure = Figure(figsize=(4.8, 3.6), layout="constrained")
+    ax = trackplots.plot_waterfall(figure.add_subplot(), waterfall, history)
+    figure.draw_without_rendering()
+    assert ax.get_position().width > 0.6
+
+
+def test_wide_waterfall_is_logarithmic(ax: Axes, history: History) -> None:
+    """A band over more than two octaves has a logarithmic axis."""
+    waterfall = replace(make_waterfall(history), edges=np.geomspace(20.0, 2000.0, 81))
+    trackplots.plot_waterfall(ax, waterfall, history)
+    assert ax.get_yscale() == "log"
+
+
+def test_influence_shows_before_and_after(ax: Axes, history: History) -> None:
+    """Points before and after stand at their numbers in %, the line is the effect with its band."""
+    values = history.covariates["temperature_c"]
+    effect = Effect("roll", "temperature_c", -1.2e-3, 1e-4)
+    rng = np.random.default_rng(5)
+    measured = -1.2e-3 * (values - 21) + 1e-4 * rng.standard_normal(EPOCHS)
+    one = Influence(
+        "roll", "temperature_c", 21.0, (effect,), np.arange(EPOCHS), np.array(values), measured
+    )
+    assert trackplots.plot_influence(ax, one, history) is ax
+    np.testing.assert_allclose(data(ax, "as measured"), [values, 100 * measured])
+    left = 100 * (measured + 1.2e-3 * (values - 21))
+    np.testing.assert_allclose(data(ax, "corrected"), [values, left])
+    x, y = data(ax, "taken out")
+    np.testing.assert_allclose(y, -0.12 * (x - 21))
+    band = next(c for c in ax.collections if c.get_alpha() == 0.18).get_paths()[0].vertices
+    np.testing.assert_allclose(
+        band[:, 1].max(), max(-0.12 * (x - 21) + 1.96e-2 * np.abs(x - 21)), rtol=1e-9
+    )
+    assert ax.get_xlabel() == "temperature in °C"
+    bent = replace(one, effects=(effect, replace(effect, covariate="temperature_c^2")))
+    plain = trackplots.plot_influence(Figure().add_subplot(), bent, history)
+    assert not [c for c in plain.collections if c.get_alpha() == 0.18]
+
+
+def titles(text: str) -> list[str]:
+    """Give what a picture tells where the pointer rests."""
+    tree = ElementTree.fromstring(text)
+    return [element.text or "" for element in tree.iter("{http://www.w3.org/2000/svg}title")]
+
+
+def test_hints_tell_the_values_of_points(history: History, track: Track) -> None:
+    """Every log that shows the mode has a title with its name and value on what feels a pointer."""
+    text = plots.svg(lambda ax: trackplots.plot_frequencies(ax, history, track, "roll"), salt="a")
+    told = titles(text)
+    seen = np.flatnonzero(np.isfinite(history.ln_frequency[:, 0]))
+    assert len(told) == seen.size
+    for one, k in zip(told, seen, strict=True):
+        assert one.startswith(f"{history.logs[k]}\n")
+        assert f"{np.exp(history.ln_frequency[k, 0]):.2f} ± " in one
+    assert "<a " not in text and text.count("</title>\n<use") + text.count("</title>\n<g") == len(
+        told
+    )
+
+
+def test_hints_of_dense_pictures_are_thinned() -> None:
+    """A thousand points have no more hints than a pointer can tell apart."""
+    x = np.arange(1000.0)
+    text = plots.svg(
+        lambda ax: plots.hints(ax, x, x, [f"point {k}" for k in range(1000)]), salt="a"
+    )
+    told = titles(text)
+    assert told[:2] == ["point 0", "point 4"] and len(told) == 250
+
+
+@pytest.mark.slow
+def test_hints_of_other_pictures(
+    history: History, track: Track, health: Health, prognosis: Prognosis
+) -> None:
+    """Health, passage, survival, NIS, columns and lines tell their numbers."""
+    told = titles(
+        plots.svg(lambda ax: plots.plot_health(ax, health, "guide_preload", 0.6), salt="a")
+    )
+    middle = 100 * np.median(health.samples[-1, :, 0])
+    assert len(told) == EPOCHS and f"guide preload {middle:.1f}" in told[-1]
+    told = titles(plots.svg(lambda ax: plots.plot_life(ax, prognosis, "guide_preload"), salt="a"))
+    assert [one.split(":")[0] for one in told] == ["Early (5 %)", "Median", "Late (95 %)"]
+    told = titles(plots.svg(lambda ax: plots.plot_survival(ax, prognosis), salt="a"))
+    assert told[0] == "after 0\u202fkm: 100\u202f%" and len(told) == 25
+    told = titles(plots.svg(lambda ax: trackplots.plot_nis(ax, track), salt="a"))
+    assert len(told) == EPOCHS and f"NIS {track.nis[-1]:.1f}" in told[-1]
+    waterfall = make_waterfall(history)
+    told = titles(plots.svg(lambda ax: trackplots.plot_waterfall(ax, waterfall, history), salt="a"))
+    assert len(told) == 2 * EPOCHS
+    assert f"yaw {np.exp(history.ln_frequency[0, 2]):.2f}" in told[0]
+    assert "mains line at 150.00\u202fHz, 0.002\u202fm/s² in acc_feed" in told[EPOCHS]
+
+
+def test_health_that_is_not_told_gives_no_values(history: History) -> None:
+    """What is mostly assumption shows no number under the pointer either."""
+    health = make_health(history, life(8000, 0.68)[1], (0.9, 0.1))
+    text = plots.svg(lambda ax: plots.plot_health(ax, health, PARAMETERS[1], None), salt="a")
+    assert titles(text) == []
+
+
+def test_svg_repeats_and_stands_alone(history: History, track: Track) -> None:
+    """Same input, same bytes; other salt, no identifier in common; nothing from outside."""
+
+    def draw(ax: Axes) -> Axes:
+        return trackplots.plot_frequencies(ax, history, track, "roll")
+
+    one, two = plots.svg(draw, salt="a"), plots.svg(draw, salt="a")
+    assert one == two
+    other = plots.svg(draw, salt="b")
+    assert not set(re.findall(r'\sid="([^"]+)"', one)) & set(re.findall(r'\sid="([^"]+)"', other))
+    tree = ElementTree.fromstring(one)
+    ids = {element.get("id") for element in tree.iter()} - {None}
+    used = set(re.findall(r'href="#([^"]+)"|url\(#([^)]+)\)', one))
+    assert {first or second for first, second in used} <= ids
+    assert "var(--blue, #0072b2)" in one
+    assert "metadata" not in one and "<!--" not in one
+
+
+def test_svg_survives_hostile_names(prognosis: Prognosis) -> None:
+    """Formula signs, markup and unknown scripts in names neither fail nor reach the file."""
+    names = ("$a_b", "<script>--> 導軌", "any")
+    strange = replace(prognosis, parameters=names)
+    text = plots.svg(lambda ax: plots.plot_survival(ax, strange), salt="x")
+    assert "<script" not in text
+    ElementTree.fromstring(text)
+
+
+def test_hints_survive_hostile_names(history: History) -> None:
+    """Markup, quotes, formula signs and ends of links in a log's name are text in its title."""
+    evil = "'\"></a><script>alert(1)</script>$x_2$ url(#a) &amp;"
+    strange = replace(history, logs=(evil, *history.logs[1:]))
+    text = plots.svg(lambda ax: trackplots.plot_damping(ax, strange, None, "roll"), salt="x")
+    assert "<script" not in text
+    assert titles(text)[0].replace("#x-", "#").startswith(evil)

@@ -1,0 +1,668 @@
+"""Pages: what they say about healthy, worn, unknown and hostile stages, and what they never do."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import weakref
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from datetime import UTC, datetime
+from html.parser import HTMLParser
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from msgspec import structs
+
+from lmshealth._arrays import FloatArray
+from lmshealth.health.verdict import Judgement
+from lmshealth.io.log import Refusal
+from lmshealth.prognosis.results import Prognosis
+from lmshealth.report import figures as plots
+from lmshealth.report.assessment import Assessment
+from lmshealth.report.changes import reported
+from lmshealth.report.fleet_page import write_index
+from lmshealth.report.machine_page import page_of, write_report
+from lmshealth.stage.description import Decision, Stage, load_stage
+from lmshealth.tracking.covariate_effects import find_influences
+from lmshealth.tracking.results import Series
+from tests.report.test_figures import (
+    FREQUENCY,
+    MODES,
+    PARAMETERS,
+    SENSITIVITY,
+    life,
+    make_health,
+    make_history,
+    make_prognosis,
+    make_track,
+    make_waterfall,
+)
+
+Maker = Callable[..., Assessment]
+PER_PARAMETER = (
+    *("ess_bulk", "ess_tail", "r_hat", "informed", "laplace_shift", "laplace_ratio"),
+    *("prior_shift", "prior_ratio", "at_edge", "identifiable"),
+)
+COVARIATE = '[[covariate]]\nname = "temperature_c"\nreference = 21.0\nprior_std = 0.001\n'
+DECISION = "[decision]\nmax_risk = 0.05\nnext_service = 2027-03-01\n"
+
+
+def write_stage(folder: Path, limited: bool = True, parameters: int = 2) -> Stage:
+    """Write a small description with its map, and load it."""
+    names, levels = PARAMETERS[:parameters], np.geomspace(0.3, 1.6, 9)
+    grid = np.stack(np.meshgrid(*[levels] * parameters), -1).reshape(-1, parameters)
+    rows = [",".join([*names, "mode", "frequency_hz"])]
+    for point in grid:
+        for mode, base, slope in zip(MODES, FREQUENCY, SENSITIVITY[:, :parameters], strict=True):
+            values = [*point, mode, base * np.exp(slope @ np.log(point))]
+            rows.append(",".join(str(value) for value in values))
+    (folder / "map.csv").write_text("\n".join(rows))
+    text = 'name = "lms-y"\nsource = "small stage of the tests"\n'
+    for mode, frequency in zip(MODES, FREQUENCY, strict=True):
+        text += f'[[mode]]\nname = "{mode}"\nfrequency_hz = {frequency}\ndamping_ratio = 0.015\n'
+    for name, limit in zip(names, (0.6, 0.7), strict=False):
+        text += f'[[parameter]]\nname = "{name}"\n'
+        text += 'prior = { kind = "lognormal", median = 1.0, sigma = 0.3 }\n'
+        text += f"limit = {{ below = {limit} }}\n" if limited else ""
+    text += f'[map]\nfile = "map.csv"\n{COVARIATE}{DECISION if limited else ""}'
+    path = folder / "stage.toml"
+    path.write_text(text)
+    return load_stage(str(path))
+
+
+@pytest.fixture
+def make(tmp_path: Path) -> Maker:
+    """Return a maker of assessments: worn unless told otherwise."""
+    stage = write_stage(tmp_path)
+
+    def assess(identity: str = "M7-Y", wear_km: float = 8000, floor: float = 0.68) -> Assessment:
+        travel, truth = life(wear_km, floor)
+        history = make_history(identity, travel, truth)
+        healthy = wear_km > 20000
+        return Assessment(
+            stage=stage,
+            history=history,
+            digests=tuple(f"{k:064x}" for k in range(len(history.logs))),
+            track=make_track(history, truth),
+            health=make_health(history, truth),
+            prognosis=make_prognosis(history, wear_km, floor),
+            judgement=Judgement(
+                stage=identity,
+                recorded_at=history.recorded_at[-1],
+                verdict="healthy" if healthy else "both",
+                probability=0.97 if healthy else 0.93,
+                why="No parameter has left its baseline by more than the logs can tell."
+                if healthy
+                else "Roll, pitch and yaw have fallen by 7, 7 and 4 % since the baseline; the "
+                "map explains this by less guide preload and a looser mount together.",
+            ),
+            refused=(
+                Refusal(
+                    "logs/0007.csv",
+                    "not excited",
+                    "modal SNR 1.3 where 3 is needed",
+                    channel="acc_feed",
+                    mode="roll",
+                    source="acc",
+                ),
+                Refusal("logs/x.csv", "gap", "31 % of the samples are missing, 5 % are allowed"),
+            ),
+            notes=("The temperature of 3 logs is missing; their estimates are less certain.",),
+            seed=0,
+            waterfall=make_waterfall(history),
+        )
+
+    return assess
+
+
+@pytest.fixture
+def blank(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Leave pictures out where a test reads words only."""
+    monkeypatch.setattr(plots, "svg", lambda draw, *, salt, size: f'<svg id="{salt}"></svg>')
+
+
+def nothing(assessment: Assessment) -> Assessment:
+    """Return the same stage before its logs carry anything."""
+    judgement = replace(
+        assessment.judgement,
+        verdict="not-enough-data",
+        probability=float("nan"),
+        why="2 logs so far; a baseline needs 5.",
+    )
+    history = assessment.history
+    unseen = replace(history, ln_frequency=np.full_like(history.ln_frequency, np.nan))
+    return replace(
+        assessment, history=unseen, track=None, health=None, prognosis=None, judgement=judgement
+    )
+
+
+def blind(assessment: Assessment) -> Assessment:
+    """Return the same stage with a mount that the logs do not tell, as in LMS-X."""
+    truth = life(8000, 0.68)[1]
+    return replace(assessment, health=make_health(assessment.history, truth, (0.95, 0.08)))
+
+
+class Page(HTMLParser):
+    """What a browser would be asked to load, and the order of headings."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__()
+        self.loads: list[str] = []
+        self.headings: list[int] = []
+        self.ids: list[str] = []
+        self.tags: list[str] = []
+        self.text = ""
+        self.source = path.read_text(encoding="utf-8")
+        self.feed(self.source)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        """Note tags, identifiers and addresses."""
+        self.tags.append(tag)
+        self.text += " " if tag in ("p", "td", "th") else ""
+        if re.fullmatch("h[1-6]", tag):
+            self.headings.append(int(tag[1]))
+        for name, value in attrs:
+            if name == "id":
+                self.ids.append(value or "")
+            if name in ("src", "href", "xlink:href", "action", "data", "srcset"):
+                self.loads.append(value or "")
+
+    def handle_data(self, data: str) -> None:
+        """Collect what is read, outside of style sheets."""
+        if self.tags and self.tags[-1] != "style":
+            self.text += data
+
+
+def one(folder: Path, assessment: Assessment) -> Page:
+    """Write the page of one stage and read it."""
+    return Page(write_report(folder / "out", [assessment], ())[0])
+
+
+def words(page: Page) -> str:
+    """Return the text of a page with all spaces alike."""
+    return re.sub(r"\s+", " ", page.text)
+
+
+@pytest.mark.usefixtures("blank")
+def test_worn_stage_says_it_first(make: Maker, tmp_path: Path) -> None:
+    """Verdict, probability, reason, date and remaining life stand on the first screen."""
+    assessment = make()
+    by = assessment.service().by
+    assert by is not None
+    text = words(one(tmp_path, assessment))
+    first = text[: text.index("Frequencies and damping")]
+    for part in ("Loss of guide preload and mount stiffness", "93 % probability", "Roll, pitch"):
+        assert part in first
+    assert f"By {by.isoformat()}" in first and "accepted risk of 5 %" in first
+    assert re.search(r"Median [\d ]+ km [\d ]+ days", first)
+    assert "service planned for 2027-03-01" in first
+    assert first.index("Loss of") < first.index("Health now") < first.index("Remaining life")
+
+
+@pytest.mark.usefixtures("blank")
+def test_what_is_new_follows_the_first_screen(make: Maker, tmp_path: Path) -> None:
+    """The earlier report of this stage is compared with, another stage's is not."""
+    before = replace(reported(make(wear_km=400000, floor=0.98)), n_logs=28)
+    for identity, said in (
+        ("M7-Y", "Verdict was healthy (97 %), now loss of preload and mount stiffness (93 %)."),
+        ("M8-Y", "This is the first report on this stage"),
+    ):
+        page = Page(write_report(tmp_path, [make()], (), earlier={identity: before})[0])
+        text = words(page)
+        place = text.index(said)
+        assert text.index("Mind this") < place < text.index("Tracked modes")
+        assert ("on 28 logs up to" in text) == (identity == "M7-Y")
+
+
+@pytest.mark.usefixtures("blank")
+def test_numbers_are_those_of_the_results(make: Maker, tmp_path: Path) -> None:
+    """Median and interval of a gauge, and the quantiles of the life, are those of the draws."""
+    assessment = make()
+    assert assessment.health is not None and assessment.prognosis is not None
+    text = words(one(tmp_path, assessment))
+    low, middle, high = 100 * assessment.health.quantile(np.array([0.05, 0.5, 0.95]))[:, -1, 0]
+    assert f"{middle:.0f} % of baseline, 90 % interval {low:.0f} to {high:.0f} %" in text
+    km = np.median(assessment.prognosis.remaining[:, -1]) / 1000
+    shown = float(re.search(r"Median ([\d ]+) km", text)[1].replace(" ", ""))  # type: ignore[index]
+    assert shown == pytest.approx(km, rel=0.01)
+
+
+@pytest.mark.usefixtures("blank")
+def test_parameter_that_is_not_told_shows_no_number(make: Maker, tmp_path: Path) -> None:
+    """A parameter the logs do not tell says so, in the gauge, the table and the index."""
+    page = one(tmp_path, blind(make()))
+    text = words(page)
+    gauge = text[text.index("Mount stiffness") : text.index("Service")]
+    assert "These logs do not tell" in gauge and "of baseline" not in gauge
+    assert "Rests partly on assumption" in text
+    assert 'class="bar untold"' in page.source
+    assert "not told" in words(Page(tmp_path / "out" / "index.html"))
+
+
+@pytest.mark.usefixtures("blank")
+def test_nothing_known_is_said_in_words(make: Maker, tmp_path: Path) -> None:
+    """A page without track, health and prognosis says why for each."""
+    text = words(one(tmp_path, nothing(make())))
+    assert "Not enough data for a verdict" in text
+    assert "No log gave a tracked mode" in text
+    assert "do not carry a statement about health" in text
+    assert "no remaining life without a statement about health" in text
+    assert not re.search(r"\bnan\b", text.lower())
+    untracked = replace(make(), track=None)
+    assert "could not be followed as a track" in words(one(tmp_path, untracked))
+
+
+def test_no_log_at_all(make: Maker, tmp_path: Path) -> None:
+    """A history without logs is a page, not a failure."""
+    bare = nothing(make())
+    history = bare.history
+    empty = replace(
+        history,
+        logs=(),
+        recorded_at=(),
+        travel=history.travel[:0],
+        covariates={},
+        ln_frequency=history.ln_frequency[:0],
+        ln_damping=history.ln_damping[:0],
+        cov=history.cov[:0],
+        loop_error=history.loop_error[:0],
+    )
+    text = words(one(tmp_path, replace(bare, history=empty, digests=(), waterfall=None)))
+    assert "0 logs used" in text
+    assert "No log gave a tracked mode" in text
+
+
+@pytest.mark.usefixtures("blank")
+def test_healthy_stage_without_visible_end(make: Maker, tmp_path: Path) -> None:
+    """A life beyond the horizon is censored: no date, no number."""
+    assessment = make(wear_km=400000, floor=0.98)
+    assert assessment.prognosis is not None
+    endless = np.where(assessment.prognosis.remaining > 2e7, np.inf, 3e7)
+    assessment = replace(assessment, prognosis=replace(assessment.prognosis, remaining=endless))
+    text = words(one(tmp_path, assessment))
+    assert "No service needed yet" in text
+    assert "No end of life visible within 20 000 km" in text
+    seen = assessment.history.travel[-1] - assessment.history.travel[0]
+    assert f"The logs cover {seen / 1000:,.0f}".replace(",", " ") in text
+    assert "beyond 20 000 km" in text
+
+
+@pytest.mark.usefixtures("blank")
+def test_limit_already_passed_means_now(make: Maker, tmp_path: Path) -> None:
+    """Where the accepted risk is used up already, the service is due now."""
+    assessment = make()
+    assert assessment.prognosis is not None
+    late = replace(assessment.prognosis, remaining=assessment.prognosis.remaining - 2e6)
+    text = words(one(tmp_path, replace(assessment, prognosis=late)))
+    assert "Service Now" in text and "already passed" in text
+
+
+@pytest.mark.usefixtures("blank")
+def test_a_day_of_least_costs_says_so(make: Maker, tmp_path: Path) -> None:
+    """With a ratio of costs page, table and picture have the day of least costs and its risk."""
+    assessment = make()
+    by_costs = Decision(cost_ratio=3.0)
+    stage = assessment.stage
+    chosen = replace(stage, description=structs.replace(stage.description, decision=by_costs))
+    assessment = replace(assessment, stage=chosen)
+    service = assessment.service()
+    assert service.by is not None and service.by != make().service().by
+    text = words(one(tmp_path, assessment))
+    assert f"By {service.by.isoformat()} The day of least costs per travel" in text
+    assert "a failure costs 3 times a planned service" in text
+    assert "risk on the day of least costs" in text and "accepted risk" not in text
+    assert assessment.urgency(service)[1] == service.wait
+    healthy = replace(assessment, prognosis=endless(assessment))
+    assert "saves costs, where a failure costs 3 times" in words(one(tmp_path, healthy))
+
+
+def endless(assessment: Assessment) -> Prognosis:
+    """Return the life of a machine that never reaches a limit."""
+    assert assessment.prognosis is not None
+    never = np.full_like(assessment.prognosis.remaining, np.inf)
+    return replace(assessment.prognosis, remaining=never)
+
+
+@pytest.mark.slow
+def test_one_parameter_without_limit(make: Maker, tmp_path: Path) -> None:
+    """A stage with one parameter and no limit has a density, and says why it has no life."""
+    (tmp_path / "one").mkdir()
+    stage = write_stage(tmp_path / "one", limited=False, parameters=1)
+    assessment = make()
+    health = assessment.health
+    assert health is not None
+    single = replace(
+        health,
+        parameters=health.parameters[:1],
+        chains=health.chains[..., :1],
+        prior_width=health.prior_width[:1],
+        correlation=health.correlation[:, :1, :1],
+        **{name: getattr(health, name)[:, :1] for name in PER_PARAMETER},
+    )
+    text = words(one(tmp_path, replace(assessment, stage=stage, health=single, prognosis=None)))
+    assert "sets no limit" in text
+    assert "The last epoch: guide preload" in text
+
+
+@pytest.mark.usefixtures("blank")
+def test_law_that_does_not_fit_is_told(make: Maker, tmp_path: Path) -> None:
+    """A bad fit, a wide walk and a sampler without convergence are said in words."""
+    assessment = make()
+    assert assessment.prognosis is not None and assessment.health is not None
+    bad = replace(assessment.prognosis, chi_square=400.0, walk=0.04)
+    failed = replace(assessment.health, converged=~assessment.health.converged)
+    text = words(one(tmp_path, replace(assessment, prognosis=bad, health=failed)))
+    assert "The laws do not fit the logs" in text
+    assert "random walk of 4.00 %" in text
+    assert "The sampler did not converge" in text
+
+
+@pytest.mark.usefixtures("blank")
+def test_names_are_escaped(make: Maker, tmp_path: Path) -> None:
+    """Markup in names and reasons stays text, and names no file outside the folder."""
+    evil = "../<script>alert(1)</script>"
+    assessment = make(evil)
+    refusal = Refusal(log=evil, reason=f'"{evil}', detail="'><img src=x onerror=alert(1)>")
+    assessment = replace(assessment, refused=(refusal,), notes=(evil,))
+    paths = write_report(tmp_path / "out", [assessment], [refusal])
+    assert {path.parent for path in paths} == {tmp_path / "out"}
+    for path in paths:
+        page = Page(path)
+        assert "script" not in page.tags and "img" not in page.tags
+        assert evil in page.text
+
+
+@pytest.mark.usefixtures("blank")
+def test_files_never_collide(make: Maker, tmp_path: Path) -> None:
+    """Identities that differ only in case or signs get pages of their own; none is the index."""
+    base = nothing(make())
+    names = ["A 1", "A/1", "a-1", "index", "..", "Führung"]
+    stages = [replace(base, judgement=replace(base.judgement, stage=name)) for name in names]
+    paths = write_report(tmp_path / "out", stages, ())
+    assert len({path.name.casefold() for path in paths}) == len(names) + 1
+    assert {"Führung.html", "index-2.html", "stage.html"} <= {path.name for path in paths}
+    again = write_report(tmp_path / "again", stages[::-1], ())
+    assert [path.name for path in again] == [path.name for path in paths]
+
+
+@pytest.mark.slow
+def test_same_input_same_bytes(make: Maker, tmp_path: Path) -> None:
+    """Pages repeat to the byte in any order of the stages, and tell a time only if given."""
+    stages = [make(), nothing(make("M8-Y"))]
+    first = write_report(tmp_path / "a", stages, ())
+    second = write_report(tmp_path / "b", stages[::-1], ())
+    assert [p.name for p in first] == [p.name for p in second]
+    assert [p.read_bytes() for p in first] == [p.read_bytes() for p in second]
+    when = datetime(2027, 1, 2, 3, 4, tzinfo=UTC)
+    index = write_report(tmp_path / "c", stages[1:], (), generated=when)[-1]
+    assert "written 2027-01-02 03:04 UTC" in index.read_text(encoding="utf-8")
+
+
+@pytest.mark.usefixtures("blank")
+def test_only_one_assessment_is_held(make: Maker, tmp_path: Path) -> None:
+    """Each stage may be forgotten as soon as the next one is asked for."""
+    gone: list[weakref.ref[Any]] = []
+
+    def one_by_one() -> Iterator[Assessment]:
+        for identity in ("A", "B", "C"):
+            assessment = replace(make(identity), waterfall=None)
+            gone.append(weakref.ref(assessment.history.travel))
+            yield assessment
+            del assessment
+            assert all(one() is None for one in gone[:-1])
+
+    write_report(tmp_path / "out", one_by_one(), ())
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == [
+        *("A.html", "B.html", "C.html", "index.html")
+    ]
+
+
+@pytest.mark.usefixtures("blank")
+def test_a_page_needs_no_other_one(make: Maker, tmp_path: Path) -> None:
+    """Made alone, the same page and the same rows come out."""
+    stages = [make(), nothing(make("M8-Y"))]
+    *pages, index = write_report(tmp_path / "a", stages, ())
+    alone = [page_of(stage, path.name) for stage, path in zip(stages, pages, strict=True)]
+    assert [page.text for page in alone] == [path.read_text(encoding="utf-8") for path in pages]
+    again = write_index(tmp_path, [page.row for page in alone[::-1]], ())
+    assert again.read_bytes() == index.read_bytes()
+
+
+@pytest.mark.slow
+def test_the_service_is_decided_once_per_page(make: Maker, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The first screen, what is new, the pictures and the row of the index share one decision."""
+    assessment, asked = make(), []
+    decided = assessment.service()
+    monkeypatch.setattr(Assessment, "service", lambda self: asked.append(self) or decided)
+    page_of(assessment, "a.html", before=reported(assessment, decided))
+    assert asked == [assessment]
+
+
+@pytest.mark.usefixtures("blank")
+def test_index_is_sorted_by_risk(make: Maker, tmp_path: Path) -> None:
+    """The worst stage comes first, an unknown one before the healthy one."""
+    safe = make("safe", wear_km=400000, floor=0.98)
+    assert safe.prognosis is not None
+    safe = replace(safe, prognosis=replace(safe.prognosis, remaining=np.full((4000, 3), np.inf)))
+    worn = make("worn")
+    stages = [safe, nothing(make("unknown")), worn]
+    refused = [Refusal("stray.csv", "no stage", "no description takes stage 'Q'")]
+    paths = write_report(tmp_path / "out", stages, refused)
+    assert [path.stem for path in paths] == ["worn", "unknown", "safe", "index"]
+    text = words(Page(paths[-1]))
+    assert text.index("worn") < text.index("unknown") < text.index("safe") < text.index("stray.csv")
+    assert f"By {worn.service().by}" in text
+
+
+def test_empty_fleet(tmp_path: Path) -> None:
+    """No stage at all still gives an index that says so."""
+    paths = write_report(tmp_path / "out", [], ())
+    assert [path.name for path in paths] == ["index.html"]
+    assert "No log belongs to a stage" in Page(paths[0]).text
+
+
+@pytest.mark.slow
+def test_page_stands_alone_and_is_well_formed(make: Maker, tmp_path: Path) -> None:
+    """Nothing is loaded from outside, identifiers are unique, headings descend by one."""
+    for path in write_report(tmp_path / "out", [make()], ()):
+        page = Page(path)
+        assert "http:" not in page.source and "https:" not in page.source
+        allowed = ("#", "data:", "index.html", "M7-Y.html")
+        assert all(address.startswith(allowed) for address in page.loads), page.loads
+        assert len(page.ids) == len(set(page.ids))
+        assert {a[1:] for a in page.loads if a.startswith("#")} <= set(page.ids)
+        assert page.headings[0] == 1 and page.headings.count(1) == 1
+        assert all(b <= a + 1 for a, b in pairwise(page.headings))
+        assert '<html lang="en">' in page.source and "Content-Security-Policy" in page.source
+        assert all("scope=" in tag for tag in re.findall("<th[ >][^>]*", page.source))
+
+
+@pytest.mark.usefixtures("blank")
+def test_what_was_taken_out_is_told(make: Maker, tmp_path: Path) -> None:
+    """Range, reference, coefficient and scatter of a covariate stand there; so does what is not."""
+    assessment = make()
+    found = find_influences(assessment.history, assessment.track, assessment.stage)  # type: ignore[arg-type]
+    text = words(one(tmp_path, assessment))
+    part = text[text.index("What moves the frequencies") : text.index("Health over the odometer")]
+    values = assessment.history.covariates["temperature_c"]
+    low, high = values.min(), values.max()
+    assert f"it lay between {low:.4g} and {high:.4g} °C; frequencies are told for 21 °C" in part
+    assert "−0.012 ± 0.002 % per °C" in part
+    assert f"{100 * found[0].measured.std():.2f} %" in part
+    assert f"{100 * found[0].corrected.std():.2f} %" in part
+
+
+@pytest.mark.usefixtures("blank")
+def test_what_was_not_taken_out_is_told(make: Maker, tmp_path: Path) -> None:
+    """Unknown covariates, such as never left their reference, and such as nobody named are told."""
+    assessment = make()
+    n = len(assessment.history.logs)
+
+    def page(covariates: dict[str, FloatArray]) -> str:
+        history = replace(assessment.history, covariates=covariates)
+        return words(one(tmp_path, replace(assessment, history=history)))
+
+    assert "No log tells temperature" in page({})
+    text = page({"temperature_c": np.full(n, 21.0), "payload_kg": np.linspace(2, 5, n)})
+    assert "Temperature was always 21 °C." in text
+    assert "Payload went from 2 to 5 kg, but the stage description does not name it" in text
+
+
+@pytest.mark.usefixtures("blank")
+def test_use_of_the_logs_is_counted(make: Maker, tmp_path: Path) -> None:
+    """Of each mode the page counts logs, estimates that are not believed, and reasons."""
+    assessment = make()
+    assert assessment.track is not None
+    track = replace(assessment.track, outliers=((5, "pitch"), (9, "pitch")))
+    text = words(one(tmp_path, replace(assessment, track=track)))
+    part = text[text.index("How much of the data was used") : text.index("Fit of the laws")]
+    assert "40 logs of this machine" in part
+    assert "2 parts were refused: 1 × not excited, 1 × gap." in part
+    assert "roll 39 of 40 (98 %) none 1 × not excited" in part
+    assert "pitch 40 of 40 (100 %) 2 –" in part
+    assert "logs/0007.csv mode roll by acc, channel acc_feed not excited" in part
+    assert "logs/x.csv whole log gap" in part
+
+
+@pytest.mark.usefixtures("blank")
+def test_without_spectra_there_is_no_waterfall(make: Maker, tmp_path: Path) -> None:
+    """Logs that do not show the band leave the picture and its text out."""
+    assert "Spectra over life" in words(one(tmp_path, make()))
+    assert "Spectra over life" not in words(one(tmp_path, replace(make(), waterfall=None)))
+
+
+def hostile(assessment: Assessment, evil: str) -> Assessment:
+    """Put markup wherever a name comes from outside: modes, logs, lines, notes, refusals."""
+    history, track, waterfall = assessment.history, assessment.track, assessment.waterfall
+    assert track is not None and waterfall is not None
+    modes = (evil, *history.modes[1:])
+    logs = (f"{evil}.csv", *history.logs[1:])
+    effects = tuple(replace(e, mode=evil) if e.mode == "roll" else e for e in track.effects)
+    line = replace(waterfall.lines[0][0], kind=evil, channel=evil)
+    history = replace(
+        history, modes=modes, logs=logs, series=tuple(Series(mode, "acc") for mode in modes)
+    )
+    return replace(
+        assessment,
+        history=history,
+        track=replace(track, modes=modes, logs=logs, effects=effects),
+        waterfall=replace(waterfall, lines=((line,), *waterfall.lines[1:])),
+        refused=(Refusal(evil, evil, evil, mode=evil, channel=evil, source=evil),),
+        notes=(evil,),
+        judgement=replace(assessment.judgement, stage=evil, why=evil),
+    )
+
+
+@pytest.mark.slow
+def test_numbers_of_a_page_agree_and_are_grounded(make: Maker, tmp_path: Path) -> None:
+    """The odometer is whole, the largest drift is that of the table, and no chains are no ESS."""
+    worn = make()
+    assert worn.prognosis is not None and worn.track is not None
+    drift = 100 * np.abs(np.expm1(worn.track.drift[-1])).max()
+    path = write_report(tmp_path / "a", [worn], ())[0]
+    text = path.read_text()
+    odometer = f"{worn.history.travel[-1] / 1000:,.0f}".replace(",", "\u202f")
+    assert f"odometer {odometer}\u202fkm" in text
+    assert f"the largest drift is {drift:.2f} %" in text
+    assert f"<td>{worn.prognosis.ess:.0f}</td>" in text
+    still = replace(worn, prognosis=replace(worn.prognosis, ess=np.inf, r_hat=1.0))
+    text = write_report(tmp_path / "b", [still], ())[0].read_text()
+    assert "<td>no chains needed</td>" in text and "<td>inf</td>" not in text
+    travel = np.full_like(worn.history.travel, np.nan)
+    lost = replace(worn, history=replace(worn.history, travel=travel), prognosis=None)
+    assert "odometer nan" not in write_report(tmp_path / "c", [lost], ())[0].read_text()
+
+
+@contextmanager
+def chromium() -> Iterator[Any]:
+    """Start a browser without a network."""
+    playwright = pytest.importorskip("playwright.sync_api")
+    with playwright.sync_playwright() as driver:
+        browser = driver.chromium.launch(
+            executable_path=shutil.which("chromium"), args=["--no-sandbox", "--disable-gpu"]
+        )
+        yield browser
+        browser.close()
+
+
+def watch(browser: Any, path: Path, scheme: str = "light", width: int = 1280) -> tuple[Any, Any]:
+    """Open a page; return it, and all messages and requests beside its own."""
+    context = browser.new_context(
+        offline=True, color_scheme=scheme, viewport={"width": width, "height": 800}
+    )
+    page = context.new_page()
+    seen: list[str] = []
+    page.on("console", lambda message: seen.append(message.text))
+    page.on("pageerror", lambda error: seen.append(str(error)))
+    page.on("dialog", lambda dialog: (seen.append(dialog.message), dialog.dismiss()))
+    outside = ("data:", path.as_uri())
+    page.on(
+        "request",
+        lambda request: None if request.url.startswith(outside) else seen.append(request.url),
+    )
+    page.goto(path.as_uri())
+    return page, seen
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("evil", ["", "<script>alert(1)</script>"])
+def test_browser_opens_it_offline(
+    make: Maker, tmp_path: Path, needs: Callable[[str], None], evil: str
+) -> None:
+    """Both pages open in both schemes and on a phone: no error, no request, no sideways scroll.
+
+    So they do where every name is a script, which stays text.
+    """
+    needs("chromium")
+    assessment = hostile(make(), evil) if evil else blind(make())
+    paths = write_report(tmp_path / "out", [assessment], ())
+    with chromium() as browser:
+        for path in paths:
+            for scheme, width in (("light", 1280), ("dark", 1280), ("light", 390), ("dark", 390)):
+                page, seen = watch(browser, path, scheme, width)
+                assert seen == []
+                assert page.evaluate("document.documentElement.scrollWidth") <= width
+                assert page.locator("script").count() == 0
+                assert evil in page.locator("body").inner_text()
+                page.context.close()
+
+
+@pytest.mark.slow
+def test_browser_shows_every_picture_and_prints(
+    make: Maker, tmp_path: Path, needs: Callable[[str], None]
+) -> None:
+    """No picture is empty, the waterfall's image has loaded, titles show, and the page prints."""
+    needs("chromium")
+    path = write_report(tmp_path / "out", [make()], ())[0]
+    with chromium() as browser:
+        page, seen = watch(browser, path)
+        boxes = [picture.bounding_box() for picture in page.locator("figure svg").all()]
+        assert len(boxes) == page.locator("figure").count() == 17
+        assert all(box["width"] > 200 and box["height"] > 100 for box in boxes)
+        assert page.locator("figure svg:not([aria-hidden=true])").count() == 0
+        assert page.locator("figure div[role=img]:not([aria-label])").count() == 0
+        image = page.locator("figure svg image").first
+        loaded = """async (image) => {
+            const copy = new Image();
+            copy.src = image.href.baseVal;
+            await copy.decode();
+            return copy.naturalWidth;
+        }"""
+        assert image.evaluate(loaded) > 400
+        # What the pointer meets in the middle of a column is what carries its title.
+        column = page.locator(".hint", has=page.locator("title", has_text="mains line")).first
+        column.scroll_into_view_if_needed()
+        box = column.bounding_box()
+        met = page.evaluate(
+            "([x, y]) => document.elementFromPoint(x, y).closest('.hint')?.textContent",
+            [box["x"] + box["width"] / 2, box["y"] + box["height"] / 2],
+        )
+        assert "mains line at 150.00" in met
+        paper = page.pdf()
+        assert paper.startswith(b"%PDF") and len(paper) > 100_000
+        assert seen == []

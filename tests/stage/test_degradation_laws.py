@@ -1,0 +1,227 @@
+"""Degradation laws: coordinates, Jacobians, priors and first passages."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from itertools import pairwise
+
+import msgspec
+import numpy as np
+import pytest
+from scipy.optimize import brentq
+
+from lmshealth.stage.degradation_laws import (
+    AnyLaw,
+    HertzWear,
+    Law,
+    Linear,
+    Loosening,
+    Power,
+    Unchanging,
+)
+from lmshealth.stage.priors import Lognormal, Normal, Uniform
+
+NOW = 1.7e6
+WEAR = HertzWear(Lognormal(8000, 1.0), Uniform(0.7, 1.6))
+LOOSE = Loosening(Lognormal(4000, 1.0), Uniform(0.3, 1.0))
+POWER = Power(Lognormal(6000, 0.5), Uniform(0.5, 2.0))
+LINEAR = Linear(Normal(0.0, 2e-4))
+LAWS = [WEAR, LOOSE, POWER, LINEAR]
+NAMES = ["hertz-wear", "loosening", "power", "linear"]
+
+
+def natural_log_prior(law: AnyLaw, theta: np.ndarray) -> float:
+    """Log prior density of natural parameters, lengths in m, written out law by law."""
+    per_km = np.log(1000)
+    if isinstance(law, HertzWear):  # power is one of them
+        value = law.life_km.log_density(theta[:1] / 1000) - per_km
+        value = value + law.exponent.log_density(theta[1:])
+    elif isinstance(law, Loosening):
+        value = law.life_km.log_density(theta[1:] / 1000) - per_km
+        value = value + law.floor.log_density(theta[:1])
+    else:
+        value = law.rate_per_km.log_density(theta[:1] * 1000) + per_km
+    return float(value[0])
+
+
+def numerical_log_jacobian(law: AnyLaw, y: np.ndarray) -> float:
+    """Log |det dθ/dy| by central differences."""
+    columns = []
+    for j in range(y.size):
+        shift = np.zeros_like(y)
+        shift[j] = 1e-5
+        up, down = law.natural((y + shift)[None], NOW)[0], law.natural((y - shift)[None], NOW)[0]
+        columns.append((up - down) / 2e-5)
+    return float(np.linalg.slogdet(np.column_stack(columns))[1])
+
+
+@pytest.mark.parametrize("law", LAWS, ids=NAMES)
+def test_prior_in_coordinates_is_the_natural_one_times_the_jacobian(law: AnyLaw) -> None:
+    """Log prior in coordinates is the natural one plus the log Jacobian: it has the integral 1."""
+    y = law.draw(np.random.default_rng(1), 40, NOW)
+    found = law.log_prior(y, NOW)
+    known = [
+        natural_log_prior(law, theta) + numerical_log_jacobian(law, point)
+        for theta, point in zip(law.natural(y, NOW), y, strict=True)
+    ]
+    np.testing.assert_allclose(found, known, atol=2e-5)
+
+
+@pytest.mark.parametrize(
+    ("law", "column", "unit"),
+    [(WEAR, 0, 1e-3), (POWER, 0, 1e-3), (LOOSE, 1, 1e-3), (LINEAR, 0, 1e3)],
+)
+def test_draws_follow_the_prior(law: AnyLaw, column: int, unit: float) -> None:
+    """Draws, turned to natural parameters, have the quantiles of the stated prior."""
+    theta = law.natural(law.draw(np.random.default_rng(2), 20_000, NOW), NOW)
+    prior = law.rate_per_km if isinstance(law, Linear) else law.life_km
+    for level in (0.1, 0.5, 0.9):
+        share = np.mean(theta[:, column] * unit < prior.quantile(level))
+        assert abs(share - level) < 5 * np.sqrt(level * (1 - level) / 20_000)
+
+
+@pytest.mark.parametrize("law", [*LAWS, Unchanging()], ids=[*NAMES, "none"])
+def test_draws_are_finite_and_inside_the_support(law: AnyLaw) -> None:
+    """Every draw of a prior has a finite density there."""
+    y = law.draw(np.random.default_rng(3), 2000, NOW)
+    assert y.shape == (2000, len(law.names))
+    assert np.isfinite(y).all()
+    assert np.isfinite(law.log_prior(y, NOW)).all()
+
+
+@pytest.mark.parametrize(
+    "law",
+    [HertzWear(Normal(5000, 3000)), Loosening(Normal(5000, 3000), Normal(0.9, 0.1))],
+    ids=["hertz-wear", "loosening"],
+)
+def test_a_prior_that_reaches_below_zero_is_cut_there(law: AnyLaw) -> None:
+    """A normal prior of a length puts no draw at NaN, from where no sampler can start."""
+    y = law.draw(np.random.default_rng(3), 2000, NOW)
+    assert y.shape == (2000, len(law.names))
+    assert np.isfinite(y).all()
+
+
+@pytest.mark.parametrize("law", LAWS, ids=NAMES)
+def test_closed_form_passage_is_the_root_of_health(law: AnyLaw) -> None:
+    """Where a limit is reached, root finding on health gives the same travel."""
+    theta = law.natural(law.draw(np.random.default_rng(4), 60, NOW), NOW)
+    for limit in (0.35, 0.6, 0.95):
+        passage = law.passage(theta, limit)
+        assert passage.shape == (theta.shape[0],)
+        for row, travel in zip(theta[:, None], passage, strict=True):
+
+            def off(s: float, row: np.ndarray = row, limit: float = limit) -> float:
+                return float(law.health(row, np.array([s]))[0, 0] - limit)
+
+            if np.isfinite(travel):
+                root = brentq(off, 0.0, 4 * travel, xtol=1e-9 * travel, rtol=1e-13)
+                assert travel == pytest.approx(root, rel=1e-8)
+            else:
+                assert off(1e13) > -1e-12
+
+
+@pytest.mark.parametrize("law", [*LAWS, Unchanging()], ids=[*NAMES, "none"])
+def test_each_draw_may_have_its_own_limit(law: AnyLaw) -> None:
+    """An array of limits gives what each limit alone gives, up to those at the baseline."""
+    theta = law.natural(law.draw(np.random.default_rng(7), 40, NOW), NOW)
+    limit = np.linspace(0.1, 1.0, 40)
+    together = law.passage(theta, limit)
+    alone = [law.passage(row[None], float(one))[0] for row, one in zip(theta, limit, strict=True)]
+    np.testing.assert_array_equal(together, alone)
+    assert together[-1] == 0
+
+
+@pytest.mark.parametrize("law", [*LAWS, Unchanging()], ids=[*NAMES, "none"])
+def test_each_draw_may_have_its_own_travel(law: AnyLaw) -> None:
+    """Health at travels of each draw is that of each draw alone."""
+    theta = law.natural(law.draw(np.random.default_rng(8), 10, NOW), NOW)
+    travel = np.random.default_rng(9).uniform(-1e5, 4e6, (10, 3))
+    together = law.health(theta, travel)
+    assert together.shape == (10, 3)
+    alone = [law.health(row[None], own)[0] for row, own in zip(theta, travel, strict=True)]
+    np.testing.assert_array_equal(together, alone)
+
+
+@pytest.mark.parametrize("law", [*LAWS, Unchanging()], ids=[*NAMES, "none"])
+def test_before_it_begins_a_law_changes_nothing(law: AnyLaw) -> None:
+    """Travel below 0 is of a time before the law: health is whole."""
+    theta = law.natural(law.draw(np.random.default_rng(10), 20, NOW), NOW)
+    np.testing.assert_allclose(law.health(theta, np.array([-1e6, 0.0])), 1.0, atol=1e-14)
+
+
+@pytest.mark.parametrize(
+    ("law", "kind"), [*zip(LAWS, NAMES, strict=True), (Unchanging(), "none")], ids=[*NAMES, "none"]
+)
+def test_laws_have_a_kind_and_a_weight(law: AnyLaw, kind: str) -> None:
+    """A law is called as in a description, and counts as any other unless it is told."""
+    assert law.kind == kind
+    assert law.weight == 1
+    assert msgspec.structs.replace(law, weight=2.5).weight == 2.5
+    assert msgspec.convert(msgspec.to_builtins(law) | {"weight": 3}, AnyLaw).weight == 3
+    for weight in (0, -1.0, 1e7):
+        with pytest.raises(msgspec.ValidationError, match="weight"):
+            msgspec.convert(msgspec.to_builtins(law) | {"weight": weight}, AnyLaw)
+
+
+def test_health_starts_at_one_and_stays_above_zero() -> None:
+    """Every law is whole at the baseline and never negative."""
+    travel = np.array([0.0, 1e5, 1e7, 1e12])
+    for law in LAWS:
+        y = law.draw(np.random.default_rng(5), 50, NOW)
+        health = law.health(law.natural(y, NOW), travel)
+        np.testing.assert_allclose(health[:, 0], 1.0, atol=1e-14)
+        assert (health >= 0).all()
+
+
+def test_wear_is_hertz_and_power_is_not() -> None:
+    """Wear has the outer exponent 3/2 of a Hertz contact, a power law has 1."""
+    theta, travel = np.array([[4e6, 1.2]]), np.array([1e6])
+    loss = (1e6 / 4e6) ** 1.2
+    np.testing.assert_allclose(WEAR.health(theta, travel), [[(1 - loss) ** 1.5]])
+    np.testing.assert_allclose(POWER.health(theta, travel), [[1 - loss]])
+
+
+def test_a_limit_that_is_never_reached_is_infinite() -> None:
+    """Floors above the limit, gains and unchanging parameters never fail."""
+    assert np.isinf(LOOSE.passage(np.array([[0.8, 1e6]]), 0.7)).all()
+    assert np.isinf(LINEAR.passage(np.array([[-1e-9], [0.0]]), 0.7)).all()
+    assert np.isinf(Unchanging().passage(np.empty((3, 0)), 0.7)).all()
+    assert (Unchanging().health(np.empty((3, 0)), np.zeros(4)) == 1).all()
+
+
+def test_lower_limits_are_reached_later() -> None:
+    """First passage grows as the limit falls."""
+    for law in LAWS:
+        theta = law.natural(law.draw(np.random.default_rng(6), 50, NOW), NOW)
+        passages = [law.passage(theta, limit) for limit in (0.99, 0.8, 0.5, 0.31)]
+        for early, late in pairwise(passages):
+            keep = np.isfinite(early)
+            assert (early[keep] <= late[keep]).all()
+
+
+@pytest.mark.parametrize("y", [[-400.0, 0.0], [400.0, 0.0], [0.0, 50.0], [1e3, -600.0]])
+@pytest.mark.parametrize("law", [WEAR, LOOSE], ids=["hertz-wear", "loosening"])
+def test_far_off_walkers_raise_no_warning(law: AnyLaw, y: list[float]) -> None:
+    """Coordinates far outside the posterior give a number or minus infinity, never an error."""
+    point = np.array([y])
+    assert not np.isposinf(law.log_prior(point, NOW)).any()
+    health = law.health(law.natural(point, NOW), np.array([0.0, NOW]))
+    assert health.shape == (1, 2)
+
+
+@pytest.mark.parametrize(
+    ("law", "told"),
+    [
+        (lambda: HertzWear(life_km=Uniform(-5.0, -1.0)), "life_km must lie between 0 and inf"),
+        (lambda: HertzWear(Lognormal(8000, 1), Uniform(-0.7, 1.6)), "exponent needs a range above"),
+        (
+            lambda: Loosening(Lognormal(4000, 1), Uniform(1.3, 2.0)),
+            "floor must lie between",
+        ),
+        (lambda: Loosening(Normal(-9.0, 1.0), Uniform(0.3, 1.0)), "life_km must lie between"),
+    ],
+)
+def test_laws_that_cannot_be_are_refused(law: Callable[[], Law], told: str) -> None:
+    """Priors outside of what makes sense are refused before anything is drawn from them."""
+    with pytest.raises(ValueError, match=told):
+        law()

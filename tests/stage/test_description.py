@@ -1,0 +1,317 @@
+"""Stage descriptions: schema errors name their key, maps are checked, logs find their stage."""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from lmshealth.errors import BadStage
+from lmshealth.io.log import Metadata
+from lmshealth.stage.degradation_laws import Unchanging
+from lmshealth.stage.description import Stage, load_stage, shipped
+from tests.lives import FADING, FOOT, MOUNT, PRELOAD, make_stage, map_rows, stage_text, true_drift
+
+
+@pytest.fixture
+def stage(tmp_path: Path) -> Stage:
+    """Preload and mount, two modes."""
+    return make_stage(tmp_path)
+
+
+def load(folder: Path, text: str) -> Stage:
+    """Write a description beside a full map and load it."""
+    (folder / "map.csv").write_text("\n".join(map_rows(("guide_preload", "mount_stiffness"))))
+    path = folder / "odd.toml"
+    path.write_text(text)
+    return load_stage(str(path))
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "needle"),
+    [
+        (
+            "damping_ratio = 0.018",
+            "damping_ratio = 1.8",
+            r"line 5: mode\[0\]\.damping_ratio: .* < 1.0, got 1.8",
+        ),
+        ("damping_ratio = 0.015", "damping = 0.015", r"line 9: mode\[1\]\.damping: unknown key"),
+        ("frequency_hz = 136.6\n", "", r"line 6: mode\[1\]\.frequency_hz: missing"),
+        ("= 126.4", "= inf", r"line 4: mode\[0\]\.frequency_hz: .*got inf"),
+        ("sigma = 0.3", 'sigma = "wide"', r"line 12: parameter\[0\]\.prior\.sigma"),
+        (
+            '"hertz-wear"',
+            '"rust"',
+            r"line 14: parameter\[0\]\.law\.kind: there are hertz-wear, loo",
+        ),
+        ("below = 0.6", "below = -1", r"line 13: parameter\[0\]\.limit\.below"),
+        ("floor = {", "flor = {", r"line 24: parameter\[1\]\.law\.flor: .*kind, life_km, floor"),
+        ("model_std = 0.05", "model_std = 1.5", r"line 28: map\.model_std"),
+        ("prior_std = 0.001", "prior_std = 0", r"line 33: covariate\[0\]\.prior_std"),
+        ("reference = 21.0", "referense = 21.0", r"line 32: covariate\[0\]\.referense"),
+        ('name = "small"', 'nam = "small"', "line 1: nam: unknown key"),
+        (
+            "median = 1.0, sigma = 0.3",
+            "median = -1.0, sigma = 0.3",
+            r"line 12: parameter\[0\]\.prior: .*median and sigma above 0",
+        ),
+        (
+            'name = "pitch"',
+            'name = "roll"',
+            r"line 7: mode\[1\]\.name: \[\[mode\]\] names must be unique.*roll",
+        ),
+        (
+            'name = "mount_stiffness"',
+            'name = "guide_preload"',
+            r"line 17: parameter\[1\]\.name: \[\[parameter\]\].*unique",
+        ),
+        (
+            '[map]\nfile = "map.csv"\nmodel_std = 0.05',
+            "",
+            r"line 10: parameter\[0\]: \[\[parameter\]\] needs a \[map\]",
+        ),
+        ('file = "map.csv"', 'file = "gone.csv"', r"line 27: map\.file: .*gone\.csv"),
+        (
+            "below = 0.7",
+            "below = 1.2",
+            r"line 19: parameter\[1\]\.limit\.below: mount_stiffness: limit 1.2 must lie below",
+        ),
+        ('name = "mount_stiffness"', 'name = "mount"', r"map\.csv: no column \['mount'\]"),
+    ],
+)
+def test_a_description_that_breaks_the_schema_is_refused(
+    tmp_path: Path, old: str, new: str, needle: str
+) -> None:
+    """Each slip is refused with its line and key, and what was got or is needed."""
+    text = stage_text()
+    assert old in text
+    with pytest.raises(BadStage, match=needle):
+        load(tmp_path, text.replace(old, new))
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "slip"),
+    [
+        ("sigma = 0.3 }", "sigma = 0.3, medain = 2.0 }", "medain"),
+        ('{ kind = "hertz-wear",', '{ kind = "hertz-wear", exponnt = 1.2,', "exponnt"),
+    ],
+    ids=["prior", "law"],
+)
+def test_unknown_keys_of_priors_and_laws_are_refused(
+    tmp_path: Path, old: str, new: str, slip: str
+) -> None:
+    """A typing slip inside a prior or a law is seen, as everywhere in a description."""
+    text = stage_text()
+    assert old in text
+    with pytest.raises(BadStage, match=slip):
+        load(tmp_path, text.replace(old, new))
+
+
+def test_covariate_names_are_unique(tmp_path: Path) -> None:
+    """Two covariates of one name are refused with the name."""
+    tail = '[[covariate]]\nname = "temperature_c"\nreference = 21.0\nprior_std = 0.001\n' * 2
+    with pytest.raises(BadStage, match=r"\[\[covariate\]\] names must be unique.*temperature_c"):
+        make_stage(tmp_path, tail=tail)
+
+
+def test_one_thing_chooses_the_service_date(tmp_path: Path) -> None:
+    """A risk and a ratio of costs together are refused by line and key; 5 % where neither is."""
+    both = "[decision]\nmax_risk = 0.1\ncost_ratio = 20\n"
+    with pytest.raises(
+        BadStage,
+        match=r"line \d+: decision\.cost_ratio: cost_ratio = 20 and max_risk = 0\.1 would each",
+    ):
+        make_stage(tmp_path, tail=both)
+    with pytest.raises(BadStage, match=r"line \d+: decision\.cost_ratio: Expected `float` > 1"):
+        make_stage(tmp_path, tail="[decision]\ncost_ratio = 1.0\n")
+    for tail, risk, ratio in (
+        ("", 0.05, None),
+        ("[decision]\nmax_risk = 0.1\n", 0.1, None),
+        ("[decision]\ncost_ratio = 20\n", None, 20.0),
+    ):
+        decision = make_stage(tmp_path, tail=tail).description.decision
+        assert (decision.accepted, decision.cost_ratio) == (risk, ratio)
+
+
+def test_a_baseline_outside_the_map_is_refused(tmp_path: Path) -> None:
+    """The state at baseline has to be on the map."""
+    with pytest.raises(
+        BadStage,
+        match=r"line 20: parameter\[1\]\.baseline: the baseline 9 of mount_stiffness lies out",
+    ):
+        make_stage(tmp_path, (PRELOAD + "\n", MOUNT.replace("limit =", "baseline = 9.0\nlimit =")))
+
+
+def test_a_prior_beyond_the_map_is_refused(tmp_path: Path) -> None:
+    """A prior that the map does not reach says nothing about this machine."""
+    inside = 'kind = "lognormal", median = 1.0, sigma = 0.3'
+    far = MOUNT.replace(inside, 'kind = "uniform", low = 5, high = 6')
+    with pytest.raises(BadStage, match=r"line 18: parameter\[1\]\.prior: .*mount_stiffness puts"):
+        make_stage(tmp_path, (PRELOAD, far))
+
+
+def test_a_map_without_any_tracked_mode_is_refused(tmp_path: Path) -> None:
+    """A map whose modes are none of the description's says nothing, and both lists are told."""
+    text = stage_text().replace('name = "roll"', 'name = "bounce"').replace('"pitch"', '"sway"')
+    with pytest.raises(BadStage, match=r"none of them is a tracked.*bounce"):
+        load(tmp_path, text)
+
+
+def test_a_file_that_is_not_there_and_a_name_nobody_knows(tmp_path: Path) -> None:
+    """A missing path is named; an unknown name is told which ones there are."""
+    with pytest.raises(BadStage, match=r"gone\.toml"):
+        load_stage(str(tmp_path / "gone.toml"))
+    with pytest.raises(BadStage, match="lms-x, lms-y"):
+        load_stage("lms-z")
+
+
+def test_a_file_that_is_no_toml_is_refused(tmp_path: Path) -> None:
+    """Broken syntax names the file and the line."""
+    with pytest.raises(BadStage, match=r"odd\.toml: line 2: no TOML: "):
+        load(tmp_path, 'name = "odd"\nmode = }\n')
+
+
+def test_a_description_needs_a_mode(tmp_path: Path) -> None:
+    """An empty list of modes leaves nothing to look for."""
+    with pytest.raises(BadStage, match=r"line 2: mode: Expected `array` of length >= 1"):
+        load(tmp_path, 'name = "odd"\nmode = []\n')
+
+
+def test_drift_is_zero_at_baseline_and_follows_the_map(stage: Stage) -> None:
+    """Predicted drifts are those of the formula behind the map, for the modes asked for."""
+    x = np.log([[1.0, 1.0], [0.7, 0.8], [0.4, 1.2]])
+    known = true_drift(("guide_preload", "mount_stiffness"), x)
+    np.testing.assert_allclose(stage.drift(x, ("pitch", "roll")), known[:, [1, 0]], atol=1e-12)
+    assert (stage.drift(x[:1], ("roll",)) == 0).all()
+
+
+def test_a_stage_without_parameters_needs_no_map(tmp_path: Path) -> None:
+    """Modes can be tracked without health; asking for health then is refused."""
+    stage = make_stage(tmp_path, ())
+    assert stage.modal_map is None
+    assert stage.informative == ()
+    with pytest.raises(BadStage, match=r"no \[map\]"):
+        stage.drift(np.zeros((1, 1)), ("roll",))
+
+
+def test_modes_that_are_not_tracked_do_not_inform(tmp_path: Path) -> None:
+    """Health is read from tracked modes that the map knows."""
+    text = stage_text(n_modes=3).replace(
+        "damping_ratio = 0.015", "damping_ratio = 0.015\ntracked = false"
+    )
+    assert load(tmp_path, text).informative == ("roll",)
+
+
+def test_the_digest_covers_description_and_map(tmp_path: Path, stage: Stage) -> None:
+    """A change of the description or of the map alone changes the digest."""
+    same = make_stage(tmp_path / "same")
+    other = make_stage(tmp_path / "other", model_std=0.04)
+    rows = map_rows(("guide_preload", "mount_stiffness"))
+    (tmp_path / "same" / "map.csv").write_text("\n".join([rows[0], *rows[:0:-1]]) + "\n")
+    moved = load_stage(str(tmp_path / "same" / "small.toml"))
+    assert stage.digest == same.digest
+    assert len({stage.digest, other.digest, moved.digest}) == 3
+
+
+def test_logs_find_their_description(tmp_path: Path) -> None:
+    """A description named in the manifest decides; without one the pattern of the stage does."""
+    stage = make_stage(tmp_path, (FADING,), tail='[match]\nstage = "*-X"')
+    moment = datetime(2026, 1, 1, tzinfo=UTC)
+    assert stage.takes(Metadata(stage="AX-X", recorded_at=moment))
+    assert not stage.takes(Metadata(stage="AX-Y"))
+    assert not stage.takes(Metadata())
+    assert stage.takes(Metadata(stage="AX-Y", description="small"))
+    assert stage.takes(Metadata(stage="AX-Y", description="small.toml"))
+    assert not stage.takes(Metadata(stage="AX-X", description="large"))
+
+
+def test_a_parameter_is_told_by_preload_or_mount(tmp_path: Path) -> None:
+    """The word of a verdict comes from the name unless it is stated; no law means unchanging."""
+    words = FOOT + 'verdict = "preload"\n'
+    stage = make_stage(tmp_path, (PRELOAD, MOUNT, words))
+    assert [p.word for p in stage.parameters] == ["preload", "mount", "preload"]
+    assert stage.parameters[2].laws == (Unchanging(),)
+
+
+WEAR = PRELOAD[PRELOAD.index('{ kind = "hertz-wear"') :].rstrip()
+
+
+def with_laws(*laws: str) -> str:
+    """Write a preload of several laws."""
+    start = PRELOAD[: PRELOAD.index("law = ")]
+    return f"{start}law = [{', '.join(laws)}]\n"
+
+
+def test_a_parameter_has_one_law_or_several(tmp_path: Path) -> None:
+    """One law stands alone, several in an array, in their order and with their weights."""
+    linear = 'rate_per_km = { kind = "normal", mean = 0.0, std = 2e-4 }'
+    parameter = with_laws(
+        WEAR, f'{{ kind = "linear", weight = 2.5, {linear} }}', '{ kind = "none" }'
+    )
+    stage = make_stage(tmp_path, (parameter, MOUNT))
+    preload, mount = (p.laws for p in stage.parameters)
+    assert [law.kind for law in preload] == ["hertz-wear", "linear", "none"]
+    assert [law.weight for law in preload] == [1.0, 2.5, 1.0]
+    assert preload[0] == make_stage(tmp_path / "alone").parameters[0].law
+    assert [law.kind for law in mount] == ["loosening"]
+
+
+@pytest.mark.parametrize(
+    ("laws", "needle"),
+    [
+        (
+            ('{ kind = "none" }', WEAR, WEAR),
+            r"line 14: parameter\[0\]\.law\[2\]: guide_preload: two laws of the kind 'hertz-wear'",
+        ),
+        ((), r"line 14: parameter\[0\]\.law: .*length >= 1"),
+        (
+            (WEAR, '{ kind = "rust" }'),
+            r"line 14: parameter\[0\]\.law\[1\]\.kind: there are hertz-w",
+        ),
+        (('{ kind = "none", weight = 0 }',), r"parameter\[0\]\.law\[0\]\.weight: .*> 0"),
+        (('{ kind = "none", wieght = 2 }',), r"parameter\[0\]\.law\[0\]\.wieght"),
+    ],
+    ids=["twice", "empty", "unknown", "weightless", "slip"],
+)
+def test_laws_that_are_none_are_refused_with_their_place(
+    tmp_path: Path, laws: tuple[str, ...], needle: str
+) -> None:
+    """Of several laws the one that is wrong is named by its place."""
+    with pytest.raises(BadStage, match=needle):
+        load(tmp_path, stage_text((with_laws(*laws), MOUNT)))
+
+
+@pytest.mark.parametrize("name", ["lms-x", "lms-y"])
+def test_shipped_stages_load(name: str) -> None:
+    """Shipped descriptions load, with three modes that inform two limited parameters."""
+    stage = load_stage(name)
+    assert name in shipped()
+    assert len(stage.informative) == 3
+    assert [p.name for p in stage.parameters] == ["guide_preload", "mount_stiffness"]
+    assert all(p.limit for p in stage.parameters)
+
+
+@pytest.mark.parametrize(("name", "band"), [("lms-x", (10, 150)), ("lms-y", (10, 390))])
+def test_shipped_stages_have_the_papers_health_band(name: str, band: tuple[float, float]) -> None:
+    """The health band comes from the description."""
+    assert load_stage(name).description.health_band_hz == band
+
+
+@pytest.mark.parametrize(
+    ("line", "key"),
+    [
+        ("health_band_hz = [150, 10]", "line 2: health_band_hz: reaches from 150 to 10 Hz"),
+        ("health_band_hz = [10]", "line 2: health_band_hz: .*length 2"),
+        ("[[watch]]\nlow_hz = 20\nhigh_hz = 20", r"line 2: watch\[0\]: .*needed low < high"),
+    ],
+)
+def test_a_band_that_is_none_is_named(tmp_path: Path, line: str, key: str) -> None:
+    """Bands whose ends are swapped or missing are errors at the door."""
+    path = tmp_path / "bad.toml"
+    path.write_text(
+        f'name = "bad"\n{line}\n[[mode]]\nname = "roll"\nfrequency_hz = 5\ndamping_ratio = 0.1\n'
+    )
+    with pytest.raises(BadStage, match=key):
+        load_stage(str(path))

@@ -1,0 +1,475 @@
+"""Estimates get the modes they are of, no label uses later logs, and doubt is said."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import replace
+from itertools import product
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.stats import norm
+
+from lmshealth.errors import BadTable, NotEnoughData
+from lmshealth.tracking.association import hypotheses
+from lmshealth.tracking.association.associate import Association, associate
+from lmshealth.tracking.association.estimates import Estimates, Table
+from lmshealth.tracking.association.identities import Identities, Log
+
+Array = NDArray[np.float64]
+STD_F, STD_ZETA = 1e-3, 0.1
+N = 60
+CLOCK = np.arange(N) / (N - 1)
+
+
+@pytest.fixture
+def rng() -> np.random.Generator:
+    """One generator for a test."""
+    return np.random.default_rng(20261121)
+
+
+def say(
+    ln_f: Sequence[float],
+    names: Sequence[str] | None = None,
+    *,
+    ln_zeta: Sequence[float] | None = None,
+    shapes: Array | None = None,
+    sources: Sequence[str] | None = None,
+) -> Estimates:
+    """Make the estimates of a log."""
+    n = len(ln_f)
+    zeta = np.full(n, -4.0) if ln_zeta is None else np.array(ln_zeta, dtype=float)
+    return Estimates(
+        names=tuple(names) if names is not None else ("",) * n,
+        sources=tuple(sources) if sources is not None else ("acc",) * n,
+        ln_frequency=np.array(ln_f, dtype=float),
+        ln_damping=zeta,
+        cov=np.diag(np.where(np.isfinite(np.tile(zeta, 2)), np.repeat([1e-6, 1e-2], n), 1e-6)),
+        shapes=np.empty((n, 0)) if shapes is None else np.array(shapes, dtype=float),
+    )
+
+
+def run(epochs: Sequence[Estimates], **options: Any) -> Association:
+    """Associate logs at even places of the clock, without covariates."""
+    n = len(epochs)
+    options = {"offsets": np.zeros((n, 0)), "prior_std": np.zeros(0)} | options
+    return associate(epochs, np.arange(float(n)), **options)
+
+
+def crossing(rng: np.random.Generator, *, named: bool = True) -> list[Estimates]:
+    """Two modes that cross at mid-life, named by the order of their frequencies."""
+    rows = []
+    for t in CLOCK:
+        centre = np.log(120.0) + np.array([0.08, -0.08]) * (t - 0.51)
+        rows.append(say(sorted(centre + STD_F * rng.standard_normal(2)), "ab" if named else None))
+    return rows
+
+
+def steady(rng: np.random.Generator, n: int, f: Sequence[float] = (100.0, 126.0)) -> Array:
+    """Noisy ln frequencies of modes that stay where they are."""
+    return np.log(f) + STD_F * rng.standard_normal((n, len(f)))
+
+
+def test_identity_survives_a_crossing_though_names_go_by_order(rng: np.random.Generator) -> None:
+    """After the crossing the lower estimate, still named a, is of b."""
+    found = run(crossing(rng))
+    assert found.modes == ("a", "b")
+    assert set(found.assigned[:20]) == {("a", "b")}
+    assert set(found.assigned[-10:]) == {("b", "a")}
+
+
+def test_identity_survives_a_crossing_without_names(rng: np.random.Generator) -> None:
+    """Tracks are born by their third log, named by frequency, and cross."""
+    found = run(crossing(rng, named=False))
+    low, high = found.modes
+    assert low.endswith("_hz")
+    assert set(found.assigned[:2]) == {(None, None)}
+    assert set(found.assigned[3:20]) == {(low, high)}
+    assert set(found.assigned[-10:]) == {(high, low)}
+
+
+def test_names_that_follow_the_mode_are_believed(rng: np.random.Generator) -> None:
+    """Where names stay with straight lines through a crossing, so do the labels."""
+    rows = crossing(rng)
+    swapped = [
+        replace(e, names=("b", "a")) if t > 0.51 else e for t, e in zip(CLOCK, rows, strict=True)
+    ]
+    found = run(swapped)
+    assert set(found.assigned[-10:]) == {("b", "a")}
+
+
+@pytest.mark.slow
+def test_damping_tells_where_frequency_does_not(rng: np.random.Generator) -> None:
+    """Two modes merge and part; the one of three times the damping is known again at once."""
+    gap = np.concatenate([np.linspace(0.02, 0, 20), np.zeros(15), np.linspace(0, 0.02, 25)])
+    rows = []
+    for k, g in enumerate(gap):
+        side = -0.5 if k < 27 else 0.5
+        values = 4.8 + g * np.array([side, -side]) + STD_F * rng.standard_normal(2)
+        dampings = np.array([-4.5, -3.4]) + STD_ZETA * rng.standard_normal(2)
+        order = np.argsort(values)
+        rows.append(say(values[order], "ab", ln_zeta=dampings[order]))
+    assert set(run(rows).assigned[-15:]) == {("b", "a")}
+
+
+@pytest.mark.slow
+def test_what_nothing_tells_is_said_to_be_ambiguous(rng: np.random.Generator) -> None:
+    """Equal modes that merge and part get no labels any more, and the sentence names both."""
+    gap = np.concatenate([np.linspace(0.02, 0, 20), np.zeros(15), np.linspace(0, 0.02, 25)])
+    rows = [
+        say(np.sort(4.8 + g * np.array([-0.5, 0.5]) + STD_F * rng.standard_normal(2)), "ab")
+        for g in gap
+    ]
+    found = run(rows)
+    assert set(found.assigned[:10]) == {("a", "b")}
+    assert set(found.assigned[-20:]) == {(None, None)}
+    last = found.doubts[-1]
+    assert (last.reason, last.epoch, last.estimate) == ("ambiguous", N - 1, 1)
+    assert "a " in last.detail and "b " in last.detail
+    told = [int(share) for share in re.findall(r"(\d+)%", last.detail)]
+    assert len(told) >= 2 and told == sorted(told, reverse=True)
+
+
+@pytest.mark.slow
+def test_shapes_tell_where_frequencies_merge(rng: np.random.Generator) -> None:
+    """With shapes at right angles the same modes keep their labels throughout."""
+    gap = np.concatenate([np.linspace(0.02, 0, 20), np.zeros(15), np.linspace(0, 0.02, 25)])
+    rows = []
+    for k, g in enumerate(gap):
+        side = -0.5 if k < 27 else 0.5
+        shapes = np.eye(3)[:2] + 0.05 * rng.standard_normal((2, 3))
+        values = 4.8 + g * np.array([side, -side]) + STD_F * rng.standard_normal(2)
+        order = np.argsort(values)
+        rows.append((say(values[order], "ab", shapes=shapes[order]), order))
+    found = run([e for e, _ in rows])
+    for label, (_, order) in zip(found.assigned, rows, strict=True):
+        assert label == tuple("ab"[i] for i in order)
+
+
+@pytest.mark.parametrize(("gap", "first", "last"), [(0.003, 20, 20), (0.01, 15, 10)])
+def test_modes_that_veer_are_known_by_their_shapes(gap: float, first: int, last: int) -> None:
+    """Frequencies turn away from each other, shapes go over, at once or in half of the life."""
+    half = np.linspace(-0.03, 0.03, N)
+    reach, angle = np.hypot(half, gap), 0.5 * np.arctan2(gap, half)
+    rows = [
+        say(4.8 + np.array([-r, r]), "ab",
+            shapes=np.array([[-np.sin(t), np.cos(t), 0], [np.cos(t), np.sin(t), 0]]))
+        for r, t in zip(reach, angle, strict=True)
+    ]  # fmt: skip
+    found = run(rows)
+    assert set(found.assigned[:first]) == {("a", "b")}
+    assert set(found.assigned[-last:]) == {("b", "a")}
+
+
+def test_sensors_that_are_moved_cost_no_label(rng: np.random.Generator) -> None:
+    """All shapes change at once: frequencies alone tell from then on."""
+    rows = []
+    for k, row in enumerate(steady(rng, 30)):
+        shapes = np.eye(4)[2 * (k >= 15) :][:2] + 0.05 * rng.standard_normal((2, 4))
+        rows.append(say(row, "ab", shapes=shapes))
+    assert run(rows).assigned == (("a", "b"),) * 30
+
+
+@pytest.mark.slow
+def test_labels_use_no_later_log(rng: np.random.Generator) -> None:
+    """A life cut short has the labels that the whole life has there."""
+    rows = crossing(rng)
+    whole = run(rows)
+    for n in (1, 2, 25, 31, 34, 50):
+        part = run(rows[:n])
+        assert part.assigned == whole.assigned[:n]
+        assert part.doubts == tuple(doubt for doubt in whole.doubts if doubt.epoch < n)
+
+
+def test_a_jump_is_believed_once_the_next_log_confirms_it(rng: np.random.Generator) -> None:
+    """A loosened bolt costs one estimate; the mode goes on at its new level."""
+    ln_f = steady(rng, 30)
+    ln_f[15:, 1] -= 0.08
+    found = run([say(row, "ab") for row in ln_f])
+    assert [(d.epoch, d.estimate, d.reason) for d in found.doubts] == [(15, 1, "jump")]
+    assert found.assigned[16:] == (("a", "b"),) * 14
+    assert "named b" in found.doubts[0].detail
+
+
+@pytest.mark.parametrize("step", [0.01, 0.04, 0.06])
+def test_jumps_of_any_size_cost_at_most_one_estimate(rng: np.random.Generator, step: float) -> None:
+    """One per cent is followed at once, what is more waits for the next log as a jump."""
+    ln_f = steady(rng, 30)
+    ln_f[15:, 1] -= step
+    doubts = run([say(row, "ab") for row in ln_f]).doubts
+    assert [(d.epoch, d.reason) for d in doubts] == ([(15, "jump")] if step > 0.03 else [])
+
+
+def test_a_single_outlier_stays_refused(rng: np.random.Generator) -> None:
+    """A peak under a wrong name moves nothing."""
+    ln_f = steady(rng, 30)
+    ln_f[15, 1] -= 0.08
+    found = run([say(row, "ab") for row in ln_f])
+    assert [(d.epoch, d.reason) for d in found.doubts] == [(15, "jump")]
+    assert found.assigned[16] == ("a", "b")
+
+
+def test_declared_jumps_need_no_confirmation(rng: np.random.Generator) -> None:
+    """Where maintenance is declared the step is followed at once."""
+    ln_f = steady(rng, 30)
+    ln_f[15:] -= 0.08
+    rows = [say(row, "ab") for row in ln_f]
+    assert run(rows, jumps=[15]).assigned == (("a", "b"),) * 30
+    assert any(label is None for label in run(rows).assigned[15])
+
+
+def test_a_name_that_is_wrong_once_is_overruled(rng: np.random.Generator) -> None:
+    """Names that change places for one log do not change the labels."""
+    rows = [say(row, "ba" if k == 20 else "ab") for k, row in enumerate(steady(rng, 30))]
+    assert run(rows).assigned == (("a", "b"),) * 30
+
+
+def test_modes_vanish_and_return(rng: np.random.Generator) -> None:
+    """A track without a name is known again after ten logs without it."""
+    rows = [say(row[:1] if 20 <= k < 30 else row) for k, row in enumerate(steady(rng, 50))]
+    found = run(rows)
+    assert found.modes == ("100_hz", "126_hz")
+    assert set(found.assigned[20:30]) == {("100_hz",)}
+    assert set(found.assigned[30:]) == {("100_hz", "126_hz")}
+
+
+def test_spurious_estimates_found_no_tracks(rng: np.random.Generator) -> None:
+    """Estimates at random places are refused as spurious, with their reason."""
+    rows = []
+    for row in steady(rng, 50):
+        extra = [float(rng.uniform(4.9, 5.5))] if rng.random() < 0.3 else []
+        rows.append(say([*row, *extra], ["a", "b", *("" for _ in extra)]))
+    found = run(rows)
+    assert found.modes == ("a", "b")
+    assert {doubt.reason for doubt in found.doubts} == {"unconfirmed"}
+    assert "three logs" in found.doubts[0].detail
+
+
+def test_births_near_each_other_have_names_of_their_own(rng: np.random.Generator) -> None:
+    """Two modes that round to one frequency are told apart by more digits."""
+    ln_f = np.log([120.2, 119.7]) + 2e-4 * rng.standard_normal((10, 2))
+    rows = []
+    for row in ln_f:
+        one = say(row)
+        rows.append(replace(one, cov=np.diag([4e-8, 4e-8, 1e-2, 1e-2])))
+    names = run(rows).modes
+    assert len(set(names)) == 2
+    assert {"120_hz"} < set(names)
+
+
+def test_sources_share_a_mode(rng: np.random.Generator) -> None:
+    """Each source has one estimate of each mode, and two of one source are never of one."""
+    rows = [
+        say([*row, *(row + STD_F)], ["a", "b", "a", "b"], sources=["acc"] * 2 + ["delta_e"] * 2)
+        for row in steady(rng, 20)
+    ]
+    assert run(rows).assigned == (("a", "b", "a", "b"),) * 20
+
+
+@pytest.mark.slow
+def test_covariates_are_regressed(rng: np.random.Generator) -> None:
+    """Swings of temperature that move modes by 1 % cost no label, and do if not told."""
+    warm = 10 * np.sign(np.sin(np.arange(N))) + rng.standard_normal(N)
+    ln_f = np.log([120.0, 122.0]) + 1e-3 * warm[:, None] + 2e-4 * rng.standard_normal((N, 2))
+    rows = [replace(say(row), cov=np.diag([4e-8, 4e-8, 1e-2, 1e-2])) for row in ln_f]
+    told = run(rows, offsets=warm[:, None], prior_std=np.array([1e-3]))
+    assert set(told.assigned[10:]) == {told.modes}
+    assert {label for row in run(rows).assigned[10:] for label in row} != set(told.modes)
+
+
+def test_unknown_dampings_do_no_harm(rng: np.random.Generator) -> None:
+    """Estimates without damping are known by frequency alone."""
+    rows = [
+        say(row, "ab", ln_zeta=[np.nan, -4.0] if k % 2 else [-4.0, np.nan])
+        for k, row in enumerate(steady(rng, 20))
+    ]
+    assert run(rows).assigned == (("a", "b"),) * 20
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(5))
+def test_the_screen_agrees_with_the_filters(monkeypatch: pytest.MonkeyPatch, seed: int) -> None:
+    """With and without the screen of the whole table the labels are the same."""
+    rng = np.random.default_rng(seed)
+    n = 150
+    warm = rng.uniform(-10, 10, n)
+    walk = np.cumsum(3e-4 * rng.standard_normal((n, 5)), axis=0)
+    f = np.log([45.0, 89.0, 126.0, 136.6, 271.6])
+    ln_f = f + walk - 4e-4 * warm[:, None] + STD_F * rng.standard_normal((n, 5))
+    ln_f[rng.integers(20, n, 4), rng.integers(0, 5, 4)] += 0.07
+    ln_f[100:, 2] -= 0.05
+    rows = [say(row, "abcde", ln_zeta=-4 + STD_ZETA * rng.standard_normal(5)) for row in ln_f]
+    told: dict[str, Any] = {"offsets": warm[:, None], "prior_std": np.array([1e-3])}
+    screened = run(rows, **told)
+    asked: list[Identities] = []
+    never = property(asked.append, lambda identities, value: None)
+    monkeypatch.setattr(Identities, "settled", never, raising=False)
+    filtered = run(rows, **told)
+    assert len(asked) > n / 2
+    assert screened.assigned == filtered.assigned
+    assert [(d.epoch, d.estimate, d.reason) for d in screened.doubts] == [
+        (d.epoch, d.estimate, d.reason) for d in filtered.doubts
+    ]
+
+
+class Plain:
+    """One mode of the oracle: its filter, written as in a textbook."""
+
+    def __init__(self, y: float, z: float) -> None:
+        self.x, self.p = np.array([y, 0.0]), np.diag([STD_F**2, 0.0])
+        self.z, self.q, self.fresh = z, STD_ZETA**2, True
+
+    def predict(self, step: float, scale: float) -> None:
+        """Move on; the prior of the rate is known from the second log on."""
+        rate = 0.3 / scale
+        if self.fresh:
+            self.p[1, 1], self.fresh = rate**2, False
+        elif self.p[1, 1] > rate**2:
+            d = np.diag([1.0, rate / np.sqrt(self.p[1, 1])])
+            self.x, self.p = d @ self.x, d @ self.p @ d
+        f = np.array([[1.0, step], [0.0, 1.0]])
+        share, white = step / scale, 0.1**2 / scale**3
+        noise = white * np.array([[step**3 / 3, step**2 / 2], [step**2 / 2, step]])
+        noise[0, 0] += 3e-3**2 * share
+        self.x, self.p = f @ self.x, f @ self.p @ f.T + noise
+        self.q += 0.3**2 * share
+
+    def absorb(self, y: float, z: float) -> float:
+        """Update with an estimate; return its density."""
+        s, t = self.p[0, 0] + STD_F**2, self.q + STD_ZETA**2
+        dy, dz = y - self.x[0], z - self.z
+        in_f = 0.95 * norm.pdf(dy, 0, s**0.5), 0.05 * norm.pdf(dy, 0, (s + 1e-4) ** 0.5)
+        in_z = 0.95 * norm.pdf(dz, 0, t**0.5), 0.05 * norm.pdf(dz, 0, (t + 0.49) ** 0.5)
+        if in_f[1] > in_f[0]:
+            self.p[0, 0] += 1e-4
+        if in_z[1] > in_z[0]:
+            self.q += 0.49
+        gain = self.p[:, 0] / (self.p[0, 0] + STD_F**2)
+        self.x, self.p = self.x + gain * dy, self.p - np.outer(gain, self.p[0])
+        k = self.q / (self.q + STD_ZETA**2)
+        self.z, self.q = self.z + k * dz, (1 - k) * self.q
+        return float(sum(in_f) * sum(in_z))
+
+
+def told_by_order(labels: Sequence[int], values: Array, modes: Sequence[Plain]) -> float:
+    """Probability of names 0 and 1 of two estimates, if they go by order, over a half each."""
+    total = 1.0
+    for i, mode in enumerate(labels):
+        if mode >= 0:
+            other = 1 - mode
+            if labels[1 - i] == other:
+                below = float(values[1 - i] < values[i])
+            else:
+                s = (modes[other].p[0, 0] + STD_F**2) ** 0.5
+                below = float(norm.cdf((values[i] - modes[other].x[0]) / s))
+            right = below if i else 1 - below
+            total *= 2 * (0.02 + 0.96 * right)
+    return total
+
+
+def enumerated(ln_f: Array, ln_zeta: Array) -> list[Array]:
+    """Chances of the labels in each log from the second on, over all sequences of assignments."""
+    n = len(ln_f)
+    ways = [(a, b) for a in (-1, 0, 1) for b in (-1, 0, 1) if a != b or a < 0]
+    weights: dict[tuple[tuple[int, int], ...], float] = {}
+    for length in range(1, n):
+        for path in product(ways, repeat=length):
+            modes = [Plain(y, z) for y, z in zip(ln_f[0], ln_zeta[0], strict=True)]
+            weight, by_mode, by_order = 1.0, 0.5, 0.5
+            for k, labels in enumerate(path, start=1):
+                for mode in modes:
+                    mode.predict(1.0, 50.0)
+                by_order *= told_by_order(labels, ln_f[k], modes)
+                for i, t in enumerate(labels):
+                    if t >= 0:
+                        # Seen against missed, over the density of a stranger.
+                        density = modes[t].absorb(ln_f[k, i], ln_zeta[k, i])
+                        weight *= density * 0.8 / 0.2 / (0.1 * 0.3)
+                        by_mode *= 2 * (0.98 if i == t else 0.02)
+            weights[path] = weight * (by_mode + by_order)
+    chances = []
+    for length in range(1, n):
+        own = {path: w for path, w in weights.items() if len(path) == length}
+        each = np.zeros((2, 3))
+        for path, w in own.items():
+            for i, t in enumerate(path[-1]):
+                each[i, t] += w
+        chances.append(each / sum(own.values()))
+    return chances
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(4))
+def test_chances_are_those_of_all_sequences_of_assignments(
+    monkeypatch: pytest.MonkeyPatch, seed: int
+) -> None:
+    """Four logs of two near modes, enumerated with filters written plainly, give the same."""
+    monkeypatch.setattr(hypotheses, "_SAME", -1.0)
+    monkeypatch.setattr(hypotheses, "_HOPELESS", -60.0)
+    monkeypatch.setattr(hypotheses, "_MOST", 10_000)
+    rng = np.random.default_rng(seed)
+    ln_f = 4.8 + np.array([-1e-3, 1e-3]) * rng.uniform(0.5, 2) + STD_F * rng.standard_normal((4, 2))
+    ln_zeta = -4 + 2 * STD_ZETA * rng.standard_normal((4, 2))
+    rows = [say(y, "ab", ln_zeta=z) for y, z in zip(ln_f, ln_zeta, strict=True)]
+    table = Table(rows, np.zeros((4, 0)), np.zeros(0))
+    identities = Identities(np.zeros(0), 0)
+    seen = []
+    for k in range(4):
+        log = Log(k, float(k), 50.0 if k else 0.0, np.zeros(0), False, ("a", "b"), ("acc",) * 2)
+        (verdict,) = identities.see(log, table)
+        seen.append(verdict.chances)
+    for found, wanted in zip(seen[1:], enumerated(ln_f, ln_zeta), strict=True):
+        np.testing.assert_allclose(found, wanted, rtol=1e-8, atol=1e-12)
+
+
+def test_one_log_alone() -> None:
+    """A single log gives its names, and nothing without names."""
+    assert run([say([4.6, 4.8], "ab")]).assigned == (("a", "b"),)
+    assert run([say([4.6, 4.8])]).modes == ()
+
+
+def test_logs_without_estimates(rng: np.random.Generator) -> None:
+    """An empty log is no news."""
+    rows = [say(row, "ab") if k % 3 else say([], []) for k, row in enumerate(steady(rng, 20))]
+    assert set(run(rows).assigned) == {(), ("a", "b")}
+
+
+def test_equal_clocks_are_one_moment(rng: np.random.Generator) -> None:
+    """Logs at one place of the odometer are associated like others."""
+    rows = [say(row, "ab") for row in steady(rng, 10)]
+    found = associate(rows, np.zeros(10), offsets=np.zeros((10, 0)), prior_std=np.zeros(0))
+    assert found.assigned == (("a", "b"),) * 10
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"clock": [0.0, 2.0, 1.0]}, "clock descends to 1 at epoch 2"),
+        ({"clock": [0.0, 1.0]}, "clock has shape"),
+        ({"offsets": np.zeros((3, 2))}, "offsets have shape"),
+        ({"prior_std": np.array([-1.0])}, "prior_std"),
+        ({"jumps": [3]}, r"jumps at epochs \[3\]"),
+    ],
+)
+def test_tables_that_do_not_fit_are_refused(change: dict[str, Any], message: str) -> None:
+    """The error names what was got and what is needed."""
+    told = {"clock": [0.0, 1.0, 2.0], "offsets": np.zeros((3, 1)), "prior_std": np.ones(1)}
+    told |= change
+    clock = np.array(told.pop("clock"))
+    with pytest.raises(BadTable, match=message):
+        associate([say([4.6], "a")] * 3, clock, **told)
+
+
+def test_different_channels_are_refused() -> None:
+    """All logs give shapes in the same channels."""
+    with pytest.raises(BadTable, match=r"\[0, 2\] channels"):
+        run([say([4.6], "a"), say([4.6], "a", shapes=np.ones((1, 2)))])
+
+
+def test_no_log_is_refused() -> None:
+    """Without a log there is nothing to do."""
+    with pytest.raises(NotEnoughData, match="no log"):
+        run([])

@@ -1,0 +1,146 @@
+"""Assignments are the best ones, shapes and names count as their distributions say."""
+
+from __future__ import annotations
+
+from itertools import product
+
+import numpy as np
+import pytest
+from scipy.integrate import trapezoid
+from scipy.special import logsumexp
+
+from lmshealth.tracking.association.hypotheses import (
+    Hypotheses,
+    Scan,
+    best_assignments,
+    name_gains,
+    order_gains,
+    reduce_hypotheses,
+    shape_gains,
+    stranger_gains,
+)
+from lmshealth.tracking.association.mode_filters import Bank, Innovations, Readings
+
+ROW = np.array([1.0, 0.0])
+
+
+def readings(ln_f: list[float]) -> Readings:
+    """Make estimates without damping and shape."""
+    n = len(ln_f)
+    return Readings(
+        np.array(ln_f), np.full(n, 1e-6), np.zeros(n), np.full(n, np.inf), np.empty((n, 0))
+    )
+
+
+def hypotheses(levels: list[list[float]], weights: list[float]) -> Hypotheses:
+    """Make hypotheses of two modes that differ in levels."""
+    bank = Bank.empty(0, 0).found(readings([4.6, 4.8]), ROW, np.zeros(0), 50.0)
+    bank = bank.take(np.zeros(len(levels), dtype=int))
+    bank.mean[:, :, 0] = levels
+    log_weights = np.log(np.array(weights))[:, None] + np.log([0.5, 0.5])
+    return Hypotheses(bank, log_weights, np.zeros((len(levels), 1), dtype=int))
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_assignments_are_the_best_in_order(seed: int) -> None:
+    """All assignments of a small table, enumerated, are found in the same order."""
+    rng = np.random.default_rng(seed)
+    n, m = rng.integers(1, 4, 2)
+    score = rng.normal(1.0, 3.0, (n, m))
+    score[rng.random((n, m)) < 0.2] = -np.inf
+    every = []
+    for columns in product(range(-1, m), repeat=n):
+        used = [c for c in columns if c >= 0]
+        total = sum(score[i, c] for i, c in enumerate(columns) if c >= 0)
+        if len(set(used)) == len(used) and total > -np.inf:
+            every.append((total, columns))
+    every.sort(reverse=True)
+    found = best_assignments(score, -1e9, 10_000)
+    assert len(found) == len(every)
+    np.testing.assert_allclose([t for t, _ in found], [t for t, _ in every])
+    assert {columns for _, columns in found} == {columns for _, columns in every}
+    assert best_assignments(score, -1e9, 2) == found[:2]
+    near = best_assignments(score, -3.0, 10_000)
+    assert [t for t, _ in near] == [t for t, _ in found if t >= found[0][0] - 3.0]
+
+
+@pytest.mark.parametrize("n", [2, 3, 5])
+def test_shape_likelihood_is_a_distribution(n: int) -> None:
+    """Against directions at random the likelihood ratio averages to one."""
+    rng = np.random.default_rng(n)
+    draws = rng.standard_normal((400_000, n))
+    gains = shape_gains(draws, np.eye(n)[None, :1])[0, :, 0]
+    values = np.exp(gains)
+    assert values.mean() == pytest.approx(1.0, abs=4 * values.std() / np.sqrt(len(values)))
+    assert gains.max() > 1
+    assert gains.min() == pytest.approx(np.log(0.05), abs=0.01)
+
+
+def test_shapes_without_common_channels_say_nothing() -> None:
+    """One common channel has no direction."""
+    shapes = np.array([[1.0, 1.0, np.nan], [np.nan, 1.0, 1.0]])
+    modes = np.array([[[np.nan, 1.0, 1.0], [np.nan, np.nan, np.nan]]])
+    gains = shape_gains(shapes, modes)
+    assert gains[0, 0].tolist() == [0.0, 0.0]
+    assert gains[0, 1, 0] > 0 == gains[0, 1, 1]
+
+
+def test_names_by_order_follow_the_estimates() -> None:
+    """Two estimates in order bear the first and second name, whichever modes they are of."""
+    scan = Scan(0, np.arange(2), np.array([0, 1]), readings([4.6, 4.8]), ROW)
+    labels, order = np.array([[0, 1], [1, 0], [1, -1]]), np.array([0, 1])
+    seen = (np.tile([4.6, 4.7], (3, 1)), np.full((3, 2), 1e-8))
+    by_order = order_gains(scan, labels, order, seen)
+    np.testing.assert_allclose(by_order[:2], np.log(2 * 0.98), rtol=1e-6)
+    # The mode not shown stands where the estimate does: below it or above, nobody knows.
+    np.testing.assert_allclose(by_order[2], [0.0, 0.0], atol=1e-12)
+    by_mode = name_gains(scan.names, labels, order)
+    np.testing.assert_allclose(by_mode[0], np.log(2 * 0.98))
+    np.testing.assert_allclose(by_mode[1], np.log(2 * 0.02))
+
+
+def test_estimates_without_a_name_are_of_any_mode() -> None:
+    """No name, and no mode, makes no hypothesis more likely than another."""
+    labels = np.array([[0, 1], [1, -1]])
+    gains = name_gains(np.array([-1, 1]), labels, np.array([0, 1]))
+    assert (gains[:, 0] == 0).all()
+    assert gains[0, 1] > 0 == gains[1, 1]
+
+
+def test_a_damping_that_is_not_told_is_averaged_over() -> None:
+    """Strangers have any damping: odds without it are the mean of odds with it over strangers."""
+    damping = np.linspace(-30.0, 30.0, 6001)
+    n = damping.size
+    f, var = np.full((1, n, 1), 1e-3), np.full((1, n, 1), 1e-6)
+    told = stranger_gains(Innovations(f, var, damping[None, :, None], np.full((1, n, 1), 0.01)))
+    blind = stranger_gains(Innovations(f, var, 0 * f, np.full((1, n, 1), np.inf)))
+    density = 0.3  # of a stranger's ln ζ
+    mean = trapezoid(density * np.exp(told[0, :, 0]), damping)
+    assert mean == pytest.approx(np.exp(blind[0, 0, 0]), rel=1e-6)
+
+
+def test_what_differs_in_damping_is_not_joined() -> None:
+    """Hypotheses of one frequency and far dampings stay two."""
+    kept = hypotheses([[4.6, 4.8], [4.6, 4.8]], [0.6, 0.4])
+    kept.bank.var_zeta[:] = 0.01
+    kept.bank.ln_zeta[:] = [[-4.0, -4.0], [-4.0, -3.0]]
+    assert len(reduce_hypotheses(kept).log_weights) == 2
+    kept.bank.ln_zeta[:] = -4.0
+    assert len(reduce_hypotheses(kept).log_weights) == 1
+
+
+def test_equal_hypotheses_become_one_and_keep_their_weight() -> None:
+    """What differs by little is joined with the mean of the mixture, what differs much is not."""
+    near, far = 4.8 + 2e-4, 4.9
+    kept = reduce_hypotheses(hypotheses([[4.6, 4.8], [4.6, near], [4.6, far]], [0.6, 0.3, 0.1]))
+    weights = np.exp(logsumexp(kept.log_weights, axis=1))
+    np.testing.assert_allclose(weights, [0.9, 0.1])
+    assert kept.bank.mean[0, 1, 0] == pytest.approx((2 * 4.8 + near) / 3)
+    assert kept.bank.cov[0, 1, 0, 0] == pytest.approx(1e-6 + 2 / 9 * 2e-4**2)
+
+
+def test_hopeless_hypotheses_are_dropped() -> None:
+    """Less than 1e-7 of the best is nothing."""
+    kept = reduce_hypotheses(hypotheses([[4.6, 4.8], [4.6, 4.9]], [1.0, 1e-8]))
+    assert len(kept.log_weights) == 1
+    assert np.exp(kept.log_weights).sum() == pytest.approx(1.0)

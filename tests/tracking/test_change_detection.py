@@ -1,0 +1,333 @@
+"""What happened at once is found with its kind, place and size; in quiet lives nothing is."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from scipy import integrate, stats
+
+from lmshealth._arrays import FloatArray
+from lmshealth.stage.description import Stage
+from lmshealth.tracking import change_detection as events
+from lmshealth.tracking import filter_bank as bank
+from lmshealth.tracking.change_detection import (
+    Finding,
+    Watch,
+    loop_evidence,
+    reborn,
+    threshold,
+)
+from lmshealth.tracking.filter_bank import Filter, Surprise
+from lmshealth.tracking.results import History, Step, Track
+from lmshealth.tracking.state_space import state_space
+from lmshealth.tracking.tracker import track
+from tests.lives import DAMPING, FREQUENCY, make_stage, rough_history, seen_by, since
+from tests.tracking.test_filter_bank import SETTINGS, one, run
+
+N_LOGS, PLACE = 40, 22
+
+
+@pytest.fixture(scope="module")
+def stage(tmp_path_factory: pytest.TempPathFactory) -> Stage:
+    """Two modes and a horizon of 20,000 km."""
+    return make_stage(tmp_path_factory.mktemp("stage"))
+
+
+def life(
+    seed: int,
+    *,
+    jump: tuple[float, float] = (0.0, 0.0),
+    source: str = "",
+    loop: float = 1.0,
+    sources: tuple[str, ...] = ("acc", "delta_e"),
+) -> History:
+    """Make a life of two modes that jump by ln f and ln ζ at one place, or as one source reads."""
+    rng = np.random.default_rng(seed)
+    level, damping = np.tile(np.log(FREQUENCY[:2]), (N_LOGS, 1)), np.log(DAMPING[:2])
+    damping = np.tile(damping, (N_LOGS, 1))
+    after = (np.arange(N_LOGS) >= PLACE)[:, None]
+    if not source:
+        level, damping = level + jump[0] * after, damping + jump[1] * after
+    history = seen_by(rng, level, damping, sources=sources)
+    own = np.array([one.source == source for one in history.series])
+    error = 1e-6 * np.exp(0.05 * rng.standard_normal(N_LOGS))
+    error[PLACE:] *= loop
+    return replace(
+        history,
+        ln_frequency=history.ln_frequency + jump[0] * (after & own),
+        ln_damping=history.ln_damping + jump[1] * (after & own),
+        loop_error=error,
+    )
+
+
+def told(found: Track) -> set[tuple[str, int, str]]:
+    """Give kind, place and source of what was found, without the alarms that follow from it."""
+    return {(e.kind, e.epoch, e.source) for e in found.events if e.kind != "alarm"}
+
+
+HAPPENINGS = {
+    "step": {"jump": (-0.03, 0.0)},
+    "regreasing": {"jump": (0.0, -0.5)},
+    "servo": {"jump": (-0.012, 0.3), "loop": 1.4},
+    "sensor": {"jump": (0.006, 0.1), "source": "delta_e"},
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", HAPPENINGS)
+def test_what_happened_is_found_with_its_kind_place_and_size(stage: Stage, kind: str) -> None:
+    """In 8 lives of each kind nothing else is found, and sizes lie within 4 of their std.
+
+    Their errors are as large as they say: the sum of squares lies inside its 99.9 % band.
+    """
+    given = HAPPENINGS[kind]
+    z = []
+    for seed in range(8):
+        found = track(life(seed, **given), stage)
+        assert told(found) == {(kind, PLACE, given.get("source", ""))}
+        assert bool(found.alarms) <= (kind == "step")
+        assert found.outliers == ()
+        size = given["jump"][1 if kind == "regreasing" else 0]
+        for event in found.events:
+            if event.kind == kind:
+                assert not event.declared
+                assert PLACE < event.found_at <= PLACE + 3
+                assert event.evidence >= threshold(1)
+                z.append((event.size - size) / event.std)
+    assert np.abs(z).max() < 4
+    # Modes of one life are independent of one another.
+    assert stats.chi2.ppf(5e-4, len(z)) < np.sum(np.square(z)) < stats.chi2.isf(5e-4, len(z))
+
+
+@pytest.mark.slow
+def test_a_step_is_damage_and_a_retuning_is_not(stage: Stage) -> None:
+    """The alarm follows from a loosened bolt; what the loop explains, and grease, raise none."""
+    alarms = {
+        kind: sum(bool(track(life(seed, **given), stage).alarms) for seed in range(8))
+        for kind, given in HAPPENINGS.items()
+    }
+    assert alarms.pop("step") >= 6
+    assert set(alarms.values()) == {0}
+
+
+@pytest.mark.slow
+def test_the_same_jumps_without_the_loop_are_damage(stage: Stage) -> None:
+    """Negative control: with a following error as ever they are no retuning, and raise alarms."""
+    given = HAPPENINGS["servo"] | {"loop": 1.0}
+    tracks = [track(life(seed, **given), stage) for seed in range(8)]
+    assert not any(("servo", PLACE, "") in told(found) for found in tracks)
+    assert sum(bool(found.alarms) for found in tracks) >= 6
+
+
+def test_a_declared_retuning_is_not_found_again(stage: Stage) -> None:
+    """What is declared explains its jumps and its following error."""
+    step = Step("servo", PLACE, np.arange(N_LOGS) >= PLACE, name="second")
+    found = track(replace(life(3, **HAPPENINGS["servo"]), steps=(step,)), stage)
+    assert {(e.kind, e.declared) for e in found.events} == {("servo", True)}
+    std = np.sqrt(np.diag(found.drift_cov[-1]))
+    assert (np.abs(found.drift[-1]) < 4 * std).all()
+
+
+@pytest.mark.slow
+def test_nothing_is_found_in_quiet_lives(stage: Stage) -> None:
+    """In 40 lives of two sources nothing happens, and nothing is found or doubted."""
+    for seed in range(100, 140):
+        found = track(life(seed), stage)
+        assert found.events == ()
+        assert found.outliers == ()
+
+
+@pytest.mark.slow
+def test_two_steps_in_a_row_are_two_steps(stage: Stage) -> None:
+    """What follows soon after an event is weighed from that event on, not against what was before.
+
+    Two bolts that break three logs apart are two steps; a retuning then a sensor raise no alarm.
+    """
+    for seed in range(4):
+        history = life(seed, jump=(-0.03, 0.0))
+        later = (np.arange(N_LOGS) >= PLACE + 3)[:, None]
+        found = track(replace(history, ln_frequency=history.ln_frequency - 0.04 * later), stage)
+        assert told(found) == {("step", PLACE, ""), ("step", PLACE + 3, "")}
+        retuned = life(seed, **HAPPENINGS["servo"])
+        moved = later * np.array([0, 0, 1, 1])
+        found = track(replace(retuned, ln_frequency=retuned.ln_frequency + 0.006 * moved), stage)
+        assert told(found) == {("servo", PLACE, ""), ("sensor", PLACE + 3, "delta_e")}
+        assert found.alarms == ()
+
+
+def test_a_drift_that_begins_is_an_alarm(stage: Stage) -> None:
+    """A mode that was still and then falls by 3 % raises the alarm, with the drift as its size."""
+    rng = np.random.default_rng(30)
+    level = np.tile(np.log(FREQUENCY[:2]), (N_LOGS, 1))
+    level -= 0.03 * np.maximum(np.arange(N_LOGS) - PLACE, 0)[:, None] / (N_LOGS - PLACE)
+    history = seen_by(rng, level, np.tile(np.log(DAMPING[:2]), (N_LOGS, 1)), sources=("acc",))
+    found = track(history, stage)
+    assert len(found.alarms) == 1
+    alarm = found.alarms[0]
+    assert PLACE < alarm.epoch == alarm.found_at < N_LOGS
+    assert alarm.evidence >= threshold()
+    i = found.modes.index(alarm.mode)
+    assert alarm.size == pytest.approx(found.drift[alarm.epoch, i])
+
+
+def test_windows_that_lean_raise_a_suspicion() -> None:
+    """The suspect is the first log of the window that leans most; outliers keep their lean."""
+    watch = Watch(2, np.full(30, np.nan))
+    rows = np.arange(2)
+    for k in range(20):
+        own = Surprise(rows, np.array([0.5, -0.5]) * (-1) ** k, 0.5)
+        watch.add(k, own, own)
+        assert watch.suspect(k) is None
+    nothing = Surprise(rows[:0], np.array([]), 0.0)
+    for k in range(20, 24):
+        watch.add(k, Surprise(rows, np.array([0.0, 2.5]), 6.25), nothing)
+    assert watch.suspect(23) == 20
+    assert np.isnan(watch.innovations[20:24]).all()
+    # What is filtered again replaces what was noted.
+    for k in range(20, 24):
+        calm = Surprise(rows, np.zeros(2), 0.0)
+        watch.add(k, calm, calm)
+    assert watch.suspect(23) is None
+    assert (watch.innovations[20:24] == 0).all()
+
+
+def test_leaps_of_the_loop_are_suspected() -> None:
+    """Two following errors in a row that differ from the dozen before are, with the second log.
+
+    One alone is not, and neither is one that a known step explains.
+    """
+    rng = np.random.default_rng(34)
+    error = 1e-6 * np.exp(0.05 * rng.standard_normal(30))
+    lone = error.copy()
+    lone[15] *= 1.5
+    error[20:] *= 1.5
+    watch = Watch(2, error)
+    assert watch.suspect(20) is None
+    assert watch.suspect(21) == 20
+    assert Watch(2, lone).suspect(16) is None
+    watch.settle((since("servo", 20, 30),))
+    assert watch.suspect(21) is None
+
+
+def test_windows_do_not_reach_before_the_chapter() -> None:
+    """What leaned before an event is explained by it."""
+    watch = Watch(2, np.full(10, np.nan))
+    rows = np.arange(2)
+    for k in range(6):
+        own = Surprise(rows, np.array([4.0, 0.0]), 16.0)
+        watch.add(k, own, own)
+    assert watch.suspect(5) == 2
+    watch.first = 4
+    assert watch.suspect(5) == 4
+    watch.first = 5
+    assert watch.suspect(5) is None
+
+
+def test_what_moves_all_dampings_is_suspected_before_each_of_them() -> None:
+    """Four rows that lean by 2.2 together lean as far as one by 4.4; one alone does not."""
+    for leaning, suspected in (((0, 0, 1, 1), 10), ((0, 0, 1, 0), None)):
+        watch, rows = Watch(4, np.full(20, np.nan)), np.arange(4)
+        for k in range(12):
+            lean = 2.2 * (k >= 10) * np.array(leaning)
+            own = Surprise(rows, lean, float(lean @ lean))
+            watch.add(k, own, own)
+        assert watch.suspect(11) == suspected
+
+
+def student_bayes_factor(before: FloatArray, after: FloatArray) -> float:
+    """Integrate the noncentral t of a difference of means over its prior of reach 10."""
+    n, m = before.size, after.size
+    dof, effective = n + m - 2, n * m / (n + m)
+    pooled = (n * before.var() + m * after.var()) / dof
+    t = (before.mean() - after.mean()) * np.sqrt(effective / pooled)
+
+    def density(size: float) -> float:
+        return float(stats.nct.pdf(t, dof, size * np.sqrt(effective)) * stats.norm.pdf(size, 0, 10))
+
+    peak = t / np.sqrt(effective)
+    edges = [peak - 20, peak - 3, peak, peak + 3, peak + 20]
+    total = sum(integrate.quad(density, a, b, limit=200)[0] for a, b in pairwise(edges))
+    return float(total / stats.t.pdf(t, dof))
+
+
+@pytest.mark.parametrize("change", [0.0, 0.05, 0.2])
+@pytest.mark.parametrize("kind", ["servo", "step"])
+def test_evidence_of_the_loop_is_the_integral(change: float, kind: str) -> None:
+    """The closed form equals a numerical integral over the size of the change, to 1e-6."""
+    rng = np.random.default_rng(31)
+    log_error = np.log(1e-6) + 0.05 * rng.standard_normal(20)
+    log_error[8:] += change
+    chance = 0.99 if kind == "servo" else 0.02
+    changed = student_bayes_factor(log_error[:8], log_error[8:14])
+    expected = np.log(chance * changed + 1 - chance)
+    assert loop_evidence(np.exp(log_error), 8, 13, kind) == pytest.approx(expected, abs=1e-6)
+
+
+def test_evidence_of_the_loop_needs_logs_on_both_sides() -> None:
+    """Unknown errors, and too few before, tell nothing."""
+    error = np.full(20, 1e-6)
+    assert loop_evidence(np.full(20, np.nan), 8, 13, "servo") is None
+    assert loop_evidence(error, 2, 13, "servo") is None
+    error[8:] = np.nan
+    assert loop_evidence(error, 8, 13, "servo") is None
+    # A loop that has not moved speaks against a retuning.
+    still = loop_evidence(np.full(20, 1e-6), 8, 13, "servo")
+    assert still is not None and still < -2
+
+
+def test_a_new_chapter_keeps_the_state_and_forgets_the_settings(stage: Stage) -> None:
+    """Means stay, rates are open again, the noise stays known, and the weights are the prior's."""
+    kept = run(rough_history(np.random.default_rng(32), n=30), stage)
+    old = kept[-1][0].pruned()
+    filters = Filter(state_space(rough_history(np.random.default_rng(32), n=30), stage), (0,))
+    new = reborn(old, filters)
+    space, healthy = filters.space, new.settings.healthy
+    assert new.weight.sum() == pytest.approx(1.0)
+    assert new.weight[healthy].sum() == pytest.approx(bank.HEALTHY_PRIOR)
+    for scale in np.unique(new.settings.scales):
+        share = new.weight[new.settings.scales[:, 0] == scale].sum()
+        before = old.weight[old.settings.scales[:, 0] == scale].sum()
+        assert share == pytest.approx(before, abs=1e-9)
+    for still in (True, False):
+        group = healthy == still
+        mean, cov = old.only(old.settings.healthy == still).collapse()
+        rest = np.setdiff1d(np.arange(space.size), np.arange(space.rate.start, space.rate.stop))
+        np.testing.assert_allclose(new.mean[group][:, rest], np.tile(mean[rest], (group.sum(), 1)))
+        for own in new.cov[group]:
+            np.testing.assert_allclose(own[np.ix_(rest, rest)], cov[np.ix_(rest, rest)], atol=1e-18)
+    rates = np.einsum("gii->gi", new.cov[:, space.rate, space.rate])
+    assert (rates[healthy] == 0).all()
+    assert (rates[~healthy] >= new.settings.rate_std[~healthy, None] ** 2).all()
+    # The bank it came from is untouched.
+    assert old.mean.shape[0] < new.mean.shape[0]
+
+
+def test_one_setting_is_born_again_as_it_was(stage: Stage, monkeypatch: pytest.MonkeyPatch) -> None:
+    """With a grid of one only the rate is open anew."""
+    grid = one(SETTINGS[0], ("acc",))
+    history = rough_history(np.random.default_rng(33))
+    monkeypatch.setattr(bank, "settings", lambda n: grid)
+    filters = Filter(state_space(history, stage), history.baselines)
+    old = run(history, stage, grid)[-1][0]
+    new = reborn(old, filters)
+    np.testing.assert_allclose(new.mean, old.mean, rtol=1e-12)
+    opened = np.zeros_like(old.cov)
+    rate = np.arange(filters.space.rate.start, filters.space.rate.stop)
+    opened[:, rate, rate] = SETTINGS[0].rate ** 2
+    np.testing.assert_allclose(new.cov, old.cov + opened, atol=1e-16)
+    assert new.log_evidence == pytest.approx(0.0, abs=1e-12)
+
+
+def test_findings_are_believed_at_the_declared_rate() -> None:
+    """One in a hundred is the bound for an event; an alarm shares it among three routes."""
+    assert threshold(1) == pytest.approx(np.log(100))
+    assert threshold() == pytest.approx(np.log(300))
+    likely = Finding("step", "", 3, np.log(200), 10.0)
+    assert likely.believed and not likely.damage
+    assert Finding("step", "", 3, 10.0, 10.0).damage
+    assert not Finding("step", "", 3, 10.0, 1.0).damage
+    assert not Finding("servo", "", 3, 10.0, 10.0).damage
+    assert events.FALSE_ALARMS == 0.01

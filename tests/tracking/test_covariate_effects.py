@@ -1,0 +1,148 @@
+"""Influences: what covariates explain agrees with the state space and with known truths."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from lmshealth.stage.description import Stage
+from lmshealth.tracking.covariate_effects import covariate_shifts, find_influences
+from lmshealth.tracking.history import believed
+from lmshealth.tracking.results import History
+from lmshealth.tracking.smoother import smooth
+from lmshealth.tracking.state_space import MOVES, state_space
+from lmshealth.tracking.tracker import track
+from tests.lives import FREQUENCY, PRELOAD, TWO, awkward_history, make_history, make_stage
+
+SLOPE = np.array([-8e-4, 5e-4])
+
+
+@pytest.fixture(scope="module")
+def straight(tmp_path_factory: pytest.TempPathFactory) -> Stage:
+    """Two modes and temperature."""
+    return make_stage(tmp_path_factory.mktemp("straight"), (PRELOAD,))
+
+
+@pytest.fixture(scope="module")
+def bent(tmp_path_factory: pytest.TempPathFactory) -> Stage:
+    """Two modes, temperature with a curvature, and payload."""
+    return make_stage(tmp_path_factory.mktemp("bent"), (PRELOAD,), tail=TWO)
+
+
+def warm(slope: np.ndarray = SLOPE, n: int = 60) -> History:
+    """Make a life of two wearing modes that temperature moves by a slope."""
+    rng = np.random.default_rng(7)
+    temperature = 21 + 4 * rng.standard_normal(n)
+    level = np.log(FREQUENCY[:2]) - 0.02 * np.linspace(0, 1, n)[:, None]
+    ln_f = level + slope * (temperature[:, None] - 21) + 5e-4 * rng.standard_normal((n, 2))
+    return make_history(ln_f, temperature=temperature, std=5e-4)
+
+
+@pytest.mark.slow
+def test_what_is_left_is_what_the_state_space_leaves(bent: Stage) -> None:
+    """Two sources, steps of every kind and two covariates: what is left is ln f - H x, exactly."""
+    history = awkward_history(np.random.default_rng(3))
+    followed = track(history, bent)
+    taken = believed(history, followed)
+    space = state_space(taken, bent, taken.steps)
+    state = np.zeros((len(history.logs), space.size))
+    state[:, space.level] = smooth(taken, followed, bent).ln_frequency
+    effects = {(e.mode, e.covariate): e.coefficient for e in followed.effects}
+    for m, mode in enumerate(history.modes):
+        for j, one in enumerate(space.regressed):
+            state[:, space.regressor(j).start + m] = effects[mode, one.name]
+        for j, step in enumerate(space.steps):
+            if step.kind not in MOVES:
+                name = f"{step.kind}:{step.name or step.source}"
+                state[:, space.jump(j).start + m] = effects[mode, name]
+    for j, i in enumerate(space._biased()):
+        series = history.series[i]
+        state[:, space.first_bias + 2 * j] = effects[series.mode, f"bias:{series.source}"]
+    r = len(history.series)
+    seen = np.array([space.matrix(k)[:r] @ x for k, x in enumerate(state)])
+    left = taken.ln_frequency - seen
+    found = find_influences(history, followed, bent)
+    assert [(one.covariate, one.mode) for one in found] == [
+        (covariate, mode) for covariate in ("temperature_c", "payload_kg") for mode in history.modes
+    ]
+    for one in found:
+        at = history.columns(one.mode)
+        there = np.isfinite(left[:, at]) & np.isfinite(history.covariates[one.covariate])[:, None]
+        np.testing.assert_allclose(one.corrected, left[:, at][there], atol=1e-12)
+        np.testing.assert_array_equal(one.epochs, np.nonzero(there)[0])
+
+
+def test_a_known_slope_is_found_and_taken_out(straight: Stage) -> None:
+    """Effects lie within four standard deviations of the truth; only noise is left of the scatter.
+
+    The slopes scatter the logs by 3.2 and 2.0 per mille, noise by 0.5, of which the level takes
+    its part.
+    """
+    history = warm()
+    for one, slope in zip(
+        find_influences(history, track(history, straight), straight), SLOPE, strict=True
+    ):
+        effect = one.effects[0]
+        assert abs(effect.coefficient - slope) < 4 * effect.std
+        assert one.seen
+        assert one.measured.std() > 3 * one.corrected.std()
+        assert one.corrected.std() < 5e-4
+
+
+def test_a_covariate_that_does_nothing_takes_nothing_out(straight: Stage) -> None:
+    """Without an effect coefficients lie about zero, and nothing that is not there is taken out."""
+    history = warm(np.zeros(2))
+    for one in find_influences(history, track(history, straight), straight):
+        assert abs(one.effects[0].coefficient) < 4 * one.effects[0].std
+        assert one.explained(one.values).std() < 2e-4
+
+
+def test_an_effect_is_seen_beyond_two_standard_deviations(straight: Stage) -> None:
+    """Of linear and square one is enough."""
+    one = find_influences(warm(), track(warm(), straight), straight)[0]
+    faint, clear = (replace(one.effects[0], coefficient=c, std=1.0) for c in (-1.9, -2.1))
+    assert not replace(one, effects=(faint, faint)).seen
+    assert replace(one, effects=(faint, clear)).seen
+
+
+def test_line_and_band_are_those_of_the_effects(straight: Stage, bent: Stage) -> None:
+    """Zero at the reference; straight with a band that grows from there, bent without one."""
+    history = warm()
+    values = np.array([19.0, 21.0, 25.0])
+    one = find_influences(history, track(history, straight), straight)[0]
+    effect = one.effects[0]
+    np.testing.assert_allclose(one.explained(values), effect.coefficient * (values - 21))
+    std = one.explained_std(values)
+    assert std is not None
+    np.testing.assert_allclose(std, effect.std * np.array([2.0, 0.0, 4.0]))
+    one = find_influences(history, track(history, bent), bent)[0]
+    linear, square = (e.coefficient for e in one.effects)
+    np.testing.assert_allclose(
+        one.explained(values), linear * (values - 21) + square * (values - 21) ** 2
+    )
+    assert one.explained_std(values) is None
+
+
+def test_shifts_are_the_sum_of_what_covariates_explain(bent: Stage) -> None:
+    """Where all covariates are known ln f is moved by what each explains, else by those known."""
+    history = awkward_history(np.random.default_rng(4))
+    followed = track(history, bent)
+    moved = covariate_shifts(history, followed, bent)
+    total = np.zeros_like(moved)
+    for one in find_influences(history, followed, bent):
+        values = history.covariates[one.covariate]
+        explained = np.where(np.isfinite(values), one.explained(values), 0.0)
+        total[:, history.modes.index(one.mode)] += explained
+    np.testing.assert_allclose(moved, total, atol=1e-15)
+
+
+def test_without_covariates_there_is_nothing_to_take_out(straight: Stage) -> None:
+    """Neither an unknown temperature nor one that never leaves its reference has an influence."""
+    history = warm()
+    still = replace(history, covariates={"temperature_c": np.full(len(history.logs), 21.0)})
+    for quiet in (replace(history, covariates={}), still):
+        followed = track(quiet, straight)
+        assert find_influences(quiet, followed, straight) == ()
+        assert not covariate_shifts(quiet, followed, straight).any()

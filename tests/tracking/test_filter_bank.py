@@ -1,0 +1,258 @@
+"""The bank of filters against textbook filters, one setting at a time and all together."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.special import softmax
+
+from lmshealth._arrays import FloatArray
+from lmshealth.stage.description import Stage
+from lmshealth.tracking.filter_bank import HEALTHY_PRIOR, Bank, Filter, Settings, settings
+from lmshealth.tracking.results import History
+from lmshealth.tracking.state_space import state_space
+from tests.lives import PRELOAD, TWO, awkward_history, make_stage, rough_history
+from tests.oracles import Followed, Known, Wander, batch, filterpy_loop, kalman
+
+KNOWN = Known(2e7, (("temperature_c", 21.0, 0.001, 0.0001), ("payload_kg", 50.0, 0.0005, 0.0)))
+ALONE = Known(2e7, (("temperature_c", 21.0, 0.001, 0.0001),))
+SETTINGS = [
+    Wander(1e-3, 0.3, 0.1, {"acc": 1.0, "delta_e": 1.5}),
+    Wander(1e-5, 0.0, 0.0, {"acc": 2.25, "delta_e": 0.5}),
+    Wander(1e-2, 1.0, 3.0, {"acc": 0.5, "delta_e": 4.0}),
+]
+ORACLES = {"filterpy": filterpy_loop, "textbook": kalman, "joint Gaussian": batch}
+
+
+@pytest.fixture(scope="module")
+def stage(tmp_path_factory: pytest.TempPathFactory) -> Stage:
+    """Two modes, temperature with a curvature and payload as covariates."""
+    return make_stage(tmp_path_factory.mktemp("stage"), (PRELOAD,), tail=TWO)
+
+
+def one(wander: Wander, sources: tuple[str, ...]) -> Settings:
+    """Put a setting of the oracles as a grid of one."""
+    scales = np.array([[wander.scales[source] for source in sources]])
+    return Settings(
+        np.array([wander.level]),
+        np.array([wander.rate]),
+        np.array([wander.bend]),
+        scales,
+        np.zeros(1),
+    )
+
+
+def run(history: History, stage: Stage, grid: Settings | None = None) -> list[tuple[Bank, float]]:
+    """Filter all logs and keep a copy of the bank, and the NIS, after each."""
+    filters = Filter(state_space(history, stage, history.steps), history.baselines)
+    filters.grid = grid or filters.grid
+    at, kept = filters.start(), []
+    for k in range(len(history.logs)):
+        filters.move(at, k)
+        surprise = filters.see(at, k)
+        kept.append((at.copy(), surprise.nis))
+    return kept
+
+
+def told(history: History, stage: Stage, wander: Wander) -> Followed:
+    """Tell what the bank says under one setting, as the oracles say it."""
+    space = state_space(history, stage, history.steps)
+    sources = Filter(space, ()).sources
+    m = space.n_modes
+    c = np.zeros((3, m, space.size))
+    c[0, :, space.level] = c[1, :, space.damping] = c[2, :, space.level] = np.eye(m)
+    c[2, :, space.base] = -np.eye(m)
+    kept = run(history, stage, one(wander, sources))
+    return Followed(
+        np.array([c @ at.mean[0] for at, _ in kept]),
+        np.array([np.einsum("pia,ab,qjb->piqj", c, at.cov[0], c) for at, _ in kept]),
+        np.array([at.log_evidence for at, _ in kept]),
+        np.array([nis for _, nis in kept]),
+    )
+
+
+def furthest(found: Followed, book: Followed, judged: FloatArray) -> float:
+    """Give the largest deviation of means and covariances in standard deviations of the oracle."""
+    variance = np.einsum("kpipi->kpi", book.cov)
+    # A drift has no variance at its baseline: what differs there differs in units of ln f.
+    std = np.sqrt(np.maximum(variance, 1e-2 * variance[:, :1]))
+    mean = np.abs(found.mean - book.mean) / std
+    cov = np.abs(found.cov - book.cov) / (std[:, :, :, None, None] * std[:, None, None])
+    return float(max(mean[judged].max(), cov[judged].max()))
+
+
+@pytest.mark.parametrize("oracle", ORACLES)
+@pytest.mark.parametrize("wander", SETTINGS)
+def test_one_setting_is_the_textbook_filter(stage: Stage, wander: Wander, oracle: str) -> None:
+    """Means, covariances, evidence and NIS are those of every oracle, to 1e-10 of the std."""
+    history = awkward_history(np.random.default_rng(1))
+    found, book = told(history, stage, wander), ORACLES[oracle](history, wander, KNOWN)
+    # Before the first baseline nobody says what a drift is.
+    judged = np.arange(len(history.logs)) >= history.baselines[0]
+    assert furthest(found, book, judged) < 1e-10
+    np.testing.assert_allclose(found.log_evidence, book.log_evidence, rtol=1e-10, atol=1e-9)
+    if oracle != "joint Gaussian":
+        np.testing.assert_allclose(found.nis, book.nis, rtol=1e-9, atol=1e-10)
+
+
+def test_another_setting_is_told_from_it(stage: Stage) -> None:
+    """Negative control: the bank is nowhere near the filter of another setting or other steps."""
+    history = awkward_history(np.random.default_rng(1))
+    found, judged = told(history, stage, SETTINGS[0]), np.arange(len(history.logs)) >= 1
+    assert furthest(found, kalman(history, SETTINGS[2], KNOWN), judged) > 0.1
+    for j in range(len(history.steps)):
+        fewer = replace(history, steps=history.steps[:j] + history.steps[j + 1 :])
+        assert furthest(found, kalman(fewer, SETTINGS[0], KNOWN), judged) > 0.01
+
+
+def every() -> list[Wander]:
+    """Give all settings of the grid as the oracles know them."""
+    grid = settings(1)
+    return [
+        Wander(walk, rate, bend, {"acc": scale})
+        for walk, rate, bend, scale in zip(
+            grid.level_walk, grid.rate_std, grid.rate_walk, grid.scales[:, 0], strict=True
+        )
+    ]
+
+
+@pytest.mark.slow
+def test_averaging_keeps_the_law_of_total_variance(stage: Stage) -> None:
+    """Mean and covariance over the grid are those of the mixture weighted by evidence so far."""
+    history = rough_history(np.random.default_rng(4))
+    space = state_space(history, stage)
+    books = [kalman(history, wander, ALONE) for wander in every()]
+    log_weight = settings(1).log_prior[:, None] + [book.log_evidence for book in books]
+    kept = run(history, stage)
+    between = 0.0
+    for k, (at, _) in enumerate(kept):
+        mean, cov = at.collapse(4 * space.n_modes)
+        weight = softmax(log_weight[:, k])
+        own = np.array([book.mean[k, 0] for book in books])
+        off = own - weight @ own
+        spread = np.einsum("g,gi,gj->ij", weight, off, off)
+        within = np.einsum("g,gij->ij", weight, [book.cov[k, 0, :, 0, :] for book in books])
+        total = within + spread
+        std = np.sqrt(np.diag(total))
+        assert np.abs((mean[space.level] - weight @ own) / std).max() < 1e-10
+        level = cov[space.level, space.level]
+        assert np.abs((level - total) / np.outer(std, std)).max() < 1e-10
+        np.testing.assert_allclose(at.weight, weight, rtol=1e-8, atol=1e-12)
+        between = max(between, float((np.diag(spread) / np.diag(total)).max()))
+    assert between > 0.01  # the settings do differ
+
+
+@pytest.mark.slow
+def test_evidence_of_a_drift_is_that_of_one_group_over_the_other(stage: Stage) -> None:
+    """The Bayes factor is the mean evidence with a rate over the mean evidence without one."""
+    history = rough_history(np.random.default_rng(5))
+    evidence = np.array([kalman(history, w, ALONE).log_evidence[-1] for w in every()])
+    grid = settings(1)
+    groups = [
+        np.logaddexp.reduce(evidence[own] + grid.log_prior[own])
+        - np.logaddexp.reduce(grid.log_prior[own])
+        for own in (~grid.healthy, grid.healthy)
+    ]
+    at, _ = run(history, stage)[-1]
+    assert at.log_bayes_factor() == pytest.approx(groups[0] - groups[1], abs=1e-8)
+    assert at.only(grid.healthy).log_bayes_factor() == 0.0
+
+
+def test_pruning_changes_next_to_nothing(stage: Stage) -> None:
+    """Dropping what carries under 1e-5 of its group's best moves nothing by a thousandth of a std.
+
+    Negative control: dropping all but the likeliest does.
+    """
+    history = rough_history(np.random.default_rng(6), n=60)
+    filters = Filter(state_space(history, stage), history.baselines)
+    banks = [filters.start() for _ in range(3)]
+    moved, narrowed, poorest, least = np.zeros(60), np.zeros(60), np.zeros(60), 10**6
+    for k in range(60):
+        for at in banks:
+            filters.move(at, k)
+            filters.see(at, k)
+        banks[1] = banks[1].pruned()
+        banks[2] = banks[2].only(banks[2].log_weight == banks[2].log_weight.max())
+        (mean, cov), (pruned, own), (poor, _) = (at.collapse() for at in banks)
+        std = np.sqrt(np.maximum(np.diag(cov), 1e-12))
+        moved[k] = np.abs((pruned - mean) / std).max()
+        narrowed[k] = np.abs(np.sqrt(np.maximum(np.diag(own), 1e-12)) / std - 1).max()
+        poorest[k] = np.abs((poor - mean) / std).max()
+        least = min(least, banks[1].weight.size)
+        healthy = banks[1].settings.healthy
+        assert healthy.any() and not healthy.all()
+    assert max(moved.max(), narrowed.max()) < 1e-3
+    assert poorest.max() > 0.1
+    assert least < settings(1).rate_std.size / 2
+
+
+def test_the_prior_of_the_settings_adds_up() -> None:
+    """Probabilities sum to one, a tenth of them healthy, for any number of sources."""
+    for n_sources in (1, 2, 3, 5):
+        grid = settings(n_sources)
+        share = np.exp(grid.log_prior)
+        assert share.sum() == pytest.approx(1.0)
+        assert share[grid.healthy].sum() == pytest.approx(HEALTHY_PRIOR)
+        assert (grid.rate_walk[grid.healthy] == 0).all()
+        assert grid.scales.shape == (share.size, n_sources)
+        # Sources past the third have no factor of their own.
+        assert (grid.scales[:, 3:] == grid.scales[:, 2:3]).all() or n_sources <= 3
+
+
+def test_copies_of_a_bank_are_its_own(stage: Stage) -> None:
+    """Advancing a copy, or a longer one, leaves the bank as it was."""
+    history = rough_history(np.random.default_rng(7))
+    filters = Filter(state_space(history, stage), history.baselines)
+    at = filters.start()
+    before = at.mean.copy(), at.cov.copy(), at.log_weight.copy()
+    for other in (at.copy(), at.padded(at.mean.shape[1])):
+        filters.move(other, 0)
+        filters.see(other, 0)
+    for was, now in zip(before, (at.mean, at.cov, at.log_weight), strict=True):
+        np.testing.assert_array_equal(was, now)
+    longer = at.padded(at.mean.shape[1] + 2)
+    assert (longer.mean[:, -2:] == 0).all()
+    assert (longer.cov[:, -2:] == 0).all() and (longer.cov[:, :, -2:] == 0).all()
+
+
+def test_what_is_doubted_is_hardly_believed(stage: Stage) -> None:
+    """A doubted log moves the state by a fiftieth of what it did at most, at a cost."""
+    history = rough_history(np.random.default_rng(8))
+    filters = Filter(state_space(history, stage), history.baselines)
+    filters.grid = one(SETTINGS[0], ("acc",))
+    plain, doubted = filters.start(), filters.start()
+    for at in (plain, doubted):
+        filters.move(at, 0)
+        filters.see(at, 0)
+        filters.move(at, 1)
+    before = plain.mean[0].copy()
+    surprise = filters.see(plain, 1)
+    filters.see(doubted, 1, np.full(4, True))
+    level = filters.space.level.start
+    moved = np.abs(plain.mean[0] - before)[level], np.abs(doubted.mean[0] - before)[level]
+    assert moved[1] < 0.02 * moved[0]
+    assert surprise.rows.tolist() == [0, 1, 2, 3]
+    assert doubted.log_weight[0] < plain.log_weight[0]
+
+
+def test_a_log_without_estimates_brings_nothing(stage: Stage) -> None:
+    """An empty log leaves states, covariances and weights, and surprises nobody."""
+    history = rough_history(np.random.default_rng(9))
+    filters = Filter(state_space(history, stage), history.baselines)
+    at = filters.start()
+    before = at.copy()
+    surprise = filters.see(at, 4)
+    assert surprise.rows.size == 0 and surprise.nis == 0
+    np.testing.assert_array_equal(at.mean, before.mean)
+    np.testing.assert_array_equal(at.log_weight, before.log_weight)
+
+
+@pytest.mark.slow
+def test_covariances_stay_positive_and_symmetric(stage: Stage) -> None:
+    """Covariances of all settings are symmetric with no eigenvalue that is notably negative."""
+    at, _ = run(awkward_history(np.random.default_rng(10), n=40), stage)[-1]
+    assert settings(2).rate_std.size == at.weight.size
+    np.testing.assert_allclose(at.cov, np.swapaxes(at.cov, 1, 2), rtol=0, atol=1e-15)
+    assert np.linalg.eigvalsh(at.cov).min() > -1e-13

@@ -1,0 +1,237 @@
+"""Histories: readings put in order, modes lined up, odometers that run backwards."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from datetime import timedelta
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from lmshealth.errors import NotEnoughData
+from lmshealth.io.log import Refusal
+from lmshealth.stage.description import Stage
+from lmshealth.tracking.history import (
+    believed,
+    build_history,
+    doubted,
+    in_order,
+    lost_notes,
+)
+from lmshealth.tracking.maintenance import Action
+from lmshealth.tracking.results import Series
+from lmshealth.tracking.tracker import track
+from tests.lives import FADING, START, make_reading, make_stage
+
+
+@pytest.fixture
+def stage(tmp_path: Path) -> Stage:
+    """Two tracked modes, roll and pitch."""
+    return make_stage(tmp_path, (FADING,))
+
+
+def test_readings_are_sorted_by_moment_then_name(stage: Stage) -> None:
+    """The order given does not matter; equal moments are told apart by name."""
+    late = make_reading("a", 5, 3e5, {"roll": 4.8})
+    early = make_reading("z", 1, 1e5, {"roll": 4.81})
+    twin = make_reading("b", 1, 1e5, {"roll": 4.81})
+    assert [r.log for r in in_order([late, early, twin])] == ["b", "z", "a"]
+    history, refused = build_history([late, early, twin], stage)
+    assert history.logs == ("b", "z", "a")
+    assert list(history.recorded_at) == sorted(history.recorded_at)
+    assert refused == []
+
+
+def test_modes_are_lined_up_with_their_covariances(stage: Stage) -> None:
+    """Whatever the order within a log, each mode has its column, rows and cross terms."""
+    readings = [
+        make_reading("0", 0, 0.0, {"pitch": 4.9, "roll": 4.8}),
+        make_reading("1", 1, 1e5, {"roll": 4.79}),
+    ]
+    history, _ = build_history(readings, stage)
+    assert history.modes == ("roll", "pitch")
+    np.testing.assert_array_equal(history.ln_frequency, [[4.8, 4.9], [4.79, np.nan]])
+    own = readings[0].modes.cov
+    order = [1, 0, 3, 2]  # roll before pitch, for frequency and for damping
+    np.testing.assert_array_equal(history.cov[0], own[np.ix_(order, order)])
+    alone = readings[1].modes.cov
+    np.testing.assert_array_equal(history.cov[1][np.ix_([0, 2], [0, 2])], alone)
+    assert np.isnan(history.cov[1][1]).all()
+    assert np.isnan(history.cov[1][:, 3]).all()
+
+
+def test_modes_that_are_not_tracked_or_never_found_are_left_out(stage: Stage) -> None:
+    """Only tracked modes that some log found make a column; empty logs stay as epochs."""
+    readings = [
+        make_reading("0", 0, 0.0, {"pitch": 4.9, "shaker": 3.0}),
+        make_reading("1", 1, 1e5, {"shaker": 3.0}),
+    ]
+    history, _ = build_history(readings, stage)
+    assert history.modes == ("pitch",)
+    assert np.isnan(history.ln_frequency[1]).all()
+
+
+def test_one_mistyped_odometer_does_not_rewrite_the_life(stage: Stage) -> None:
+    """The log that contradicts most others goes, whether its odometer is too high or too low."""
+    for wrong, at in ((1.8e7, 1), (1e3, 4)):
+        travels = [1e5, 2e5, 3e5, 4e5, 5e5, 6e5]
+        travels[at] = wrong
+        readings = [make_reading(str(k), k, s, {"roll": 4.8}) for k, s in enumerate(travels)]
+        history, refused = build_history(readings, stage)
+        np.testing.assert_array_equal(history.travel, np.delete(travels, at))
+        assert history.logs == tuple(str(k) for k in range(6) if k != at)
+        assert [(r.log, r.reason) for r in refused] == [(str(at), "odometer")]
+        assert f"{wrong / 1000:g}" in refused[0].detail
+
+
+def jumping(values: list[float], stage: Stage) -> tuple[list[bool], list[str]]:
+    """Tell which logs kept their roll of these ln frequencies, and which were refused."""
+    readings = [
+        make_reading(str(k), k, 1e5 * k, {"roll": value, "pitch": 4.9})
+        for k, value in enumerate(values)
+    ]
+    history, refused = build_history(readings, stage)
+    followed = track(history, stage)
+    refused += doubted(history, followed)
+    history = believed(history, followed)
+    assert all(r.reason == "jump" and r.mode == "roll" for r in refused)
+    roll, pitch = history.modes.index("roll"), history.modes.index("pitch")
+    assert np.isfinite(history.ln_frequency[:, pitch]).all()
+    kept = np.isfinite(history.ln_frequency[:, roll])
+    np.testing.assert_array_equal(np.isfinite(history.cov[:, roll, roll]), kept)
+    return kept.tolist(), [r.log for r in refused]
+
+
+def test_a_jump_in_one_log_only_is_not_believed(stage: Stage) -> None:
+    """A frequency that is off in one log, also in the last, is refused and named."""
+    kept, refused = jumping([4.84, 4.84, 4.92, 4.84, 4.839, 4.70], stage)
+    assert kept == [True, True, False, True, True, False]
+    assert refused == ["2", "5"]
+
+
+def test_a_jump_that_the_next_log_confirms_is_a_step(stage: Stage) -> None:
+    """A loosened bolt costs no log once the next one shows it too."""
+    kept, refused = jumping([4.84, 4.84, 4.84, 4.79, 4.79, 4.789, 4.79], stage)
+    assert all(kept)
+    assert not refused
+
+
+def test_drift_within_reach_is_no_jump(stage: Stage) -> None:
+    """A steady loss of half a per cent a log, as fast wear may bring, is believed."""
+    kept, refused = jumping([4.84 - 0.005 * k for k in range(6)], stage)
+    assert all(kept)
+    assert not refused
+
+
+def test_every_source_of_a_mode_has_its_column(stage: Stage) -> None:
+    """Logs with and without accelerometers make one mode of two series."""
+    readings = [make_reading(str(k), k, 1e5 * k, {"roll": 4.8, "pitch": 4.9}) for k in range(4)]
+    readings[2] = replace(
+        readings[2], modes=replace(readings[2].modes, sources=("delta_e", "delta_e"))
+    )
+    history, _ = build_history(readings, stage)
+    assert history.modes == ("roll", "pitch")
+    assert history.series == (
+        Series("roll", "acc"),
+        Series("roll", "delta_e"),
+        Series("pitch", "acc"),
+        Series("pitch", "delta_e"),
+    )
+    there = np.isfinite(history.ln_frequency)
+    np.testing.assert_array_equal(there[:, 0], [True, True, False, True])
+    np.testing.assert_array_equal(there[:, 1], [False, False, True, False])
+
+
+def test_a_new_tuning_is_a_step_of_the_servo(stage: Stage) -> None:
+    """A change of servo_id, declared by maintenance as well, is one step; its logs see it."""
+    readings = [
+        replace(r, metadata=replace(r.metadata, servo_id="b" if k in (2, 3) else "a"))
+        for k, r in enumerate(make_reading(str(k), k, 1e5 * k, {"roll": 4.8}) for k in range(5))
+    ]
+    told = [Action("AX-1", START + timedelta(days=1.5), "servo")]
+    history, _ = build_history(readings, stage, told)
+    assert [(s.kind, s.first, s.name) for s in history.steps] == [("servo", 2, "b")]
+    np.testing.assert_array_equal(history.steps[0].there, [False, False, True, True, False])
+
+
+def test_work_is_a_step_or_a_baseline(stage: Stage) -> None:
+    """Work on guide or mount opens a baseline; what is done before the first log is not seen."""
+    readings = [make_reading(str(k), k, 1e5 * k, {"roll": 4.8}) for k in range(6)]
+    days = {"regrease": 0.5, "sensor": 1.5, "mount-tightened": 3.5, "servo": -2.0}
+    told = [Action("AX-1", START + timedelta(days=d), action) for action, d in days.items()]
+    history, _ = build_history(readings, stage, told)
+    found = [(step.kind, step.first) for step in history.steps]
+    assert found == [("regreasing", 1), ("sensor", 2), ("reset", 4)]
+    assert history.baselines == (0, 4)
+    assert history.baseline == 4
+
+
+def test_without_every_odometer_the_clock_is_time(stage: Stage) -> None:
+    """One log without travel makes the moments of recording the clock."""
+    readings = [make_reading(str(k), k, 1e5 * k, {"roll": 4.8}) for k in range(3)]
+    readings[1] = replace(readings[1], metadata=replace(readings[1].metadata, travel=None))
+    history, _ = build_history(readings, stage)
+    assert not history.has_odometer
+    np.testing.assert_allclose(history.clock(), 86400.0 * np.arange(3))
+
+
+def test_modes_without_a_name_are_given_one(stage: Stage) -> None:
+    """With a stage an unnamed estimate has the name of the mode it is near to, if it is near."""
+    reading = make_reading("0", 0, 0.0, {"": float(np.log(126.0))})
+    far = make_reading("1", 1, 1e5, {"": float(np.log(300.0))})
+    history, _ = build_history([reading, far], stage)
+    assert history.modes == ("roll",)
+    assert np.isnan(history.ln_frequency[1]).all()
+
+
+def test_the_first_declared_baseline_counts(stage: Stage) -> None:
+    """The first log declared a baseline is it; without a declaration the first log is."""
+    flags = [None, False, True, True]
+    readings = [
+        make_reading(str(k), k, 1e5 * k, {"roll": 4.8}, baseline=flag)
+        for k, flag in enumerate(flags)
+    ]
+    history, _ = build_history(readings, stage)
+    assert history.baseline == 2
+    np.testing.assert_allclose(history.clock(), [-2e5, -1e5, 0, 1e5])
+    assert build_history(readings[:2], stage)[0].baseline == 0
+
+
+def test_covariates_are_nan_where_a_log_has_none(stage: Stage) -> None:
+    """Covariates of any log make a column, NaN in logs without."""
+    readings = [
+        make_reading("0", 0, 0.0, {"roll": 4.8}, covariates={"temperature_c": 20.0}),
+        make_reading("1", 1, 1e5, {"roll": 4.8}, covariates={"payload_kg": 3.0}),
+    ]
+    history, _ = build_history(readings, stage)
+    np.testing.assert_array_equal(history.covariates["temperature_c"], [20.0, np.nan])
+    np.testing.assert_array_equal(history.covariates["payload_kg"], [np.nan, 3.0])
+
+
+def test_no_reading_is_refused(stage: Stage) -> None:
+    """A history of nothing names the stage."""
+    with pytest.raises(NotEnoughData, match="small: no usable log"):
+        build_history([], stage)
+
+
+def test_modes_that_can_no_longer_be_told_apart_are_told(stage: Stage) -> None:
+    """Three logs in a row without a clear identity make a note, two do not."""
+    readings = [make_reading(str(k), k, 1e5 * k, {"roll": 4.8}) for k in range(5)]
+    history, _ = build_history(readings, stage)
+    doubts = [Refusal(str(k), "ambiguous", "", mode="roll") for k in range(5)]
+    assert "roll: the last 3 logs do not tell" in lost_notes(history, doubts[2:])[0]
+    assert lost_notes(history, doubts[:4]) == []
+
+
+def test_a_mode_that_is_no_longer_seen_is_told(stage: Stage) -> None:
+    """Three logs without it are worth a word, two are not."""
+    logs = [
+        make_reading(f"{day}", day, 1e5 * day, {"roll": 4.8} | ({"pitch": 4.9} if day < 4 else {}))
+        for day in range(1, 7)
+    ]
+    history, refused = build_history(logs, stage)
+    told = lost_notes(history, refused)
+    assert told == ["pitch: no estimate in the last 3 logs; nothing new is known."]
+    history, refused = build_history(logs[:5], stage)
+    assert lost_notes(history, refused) == []

@@ -1,0 +1,149 @@
+"""Tables of estimates: what is read, what is assumed and said, what is refused."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from lmshealth.errors import BadTable
+from lmshealth.stage.description import Stage
+from lmshealth.tracking.history import Reading
+from lmshealth.tracking.read_tables import read_estimates
+from tests.lives import FADING, make_stage
+
+HEAD = "stage,log,recorded_at,travel_km,temperature_c,mode,source,frequency_hz,frequency_std_hz,"
+HEAD += "damping_ratio,damping_ratio_std,correlation_f_zeta\n"
+ROW = "AX-1,{log},2026-03-{day:02d}T06:00:00+00:00,{km},21.5,{mode},{source},{f},{std},0.02,0.001,"
+ROW += "{rho}\n"
+
+
+def row(**changes: object) -> str:
+    """Write one row of a table."""
+    parts: dict[str, object] = {
+        "log": "a", "day": 1, "km": 10, "mode": "roll", "source": "acc", "f": 126.4, "std": 0.1,
+        "rho": 0.5,
+    }  # fmt: skip
+    return ROW.format(**(parts | changes))
+
+
+@pytest.fixture
+def stage(tmp_path: Path) -> Stage:
+    """Two tracked modes, roll and pitch."""
+    return make_stage(tmp_path / "stage", (FADING,))
+
+
+def _write(tmp_path: Path, text: str, terms: str) -> tuple[Path, Path | None]:
+    path, cross = tmp_path / "modes.csv", tmp_path / "modes_cov.csv"
+    path.write_text(text)
+    cross.write_text("log,source_a,mode_a,source_b,mode_b,cov_ln_f\n" + terms)
+    return path, cross if terms else None
+
+
+def read(tmp_path: Path, text: str, terms: str = "", stage: Stage | None = None) -> list[Reading]:
+    """Write tables and read them."""
+    path, cross = _write(tmp_path, text, terms)
+    return list(read_estimates(path, cross_terms=cross, stage=stage).readings)
+
+
+def notes(tmp_path: Path, text: str, terms: str = "") -> str:
+    """Read tables and give what is said about them."""
+    path, cross = _write(tmp_path, text, terms)
+    return "\n".join(read_estimates(path, cross_terms=cross).notes)
+
+
+def test_a_row_becomes_an_estimate_in_si_units(tmp_path: Path) -> None:
+    """Hz become ln f with its relative standard deviation; km become m."""
+    (reading,) = read(tmp_path, HEAD + row() + row(mode="pitch", f=136.6, std=0.2, rho=0))
+    assert reading.metadata.travel == 10_000
+    assert reading.metadata.covariates == {"temperature_c": 21.5}
+    assert reading.modes.names == ("roll", "pitch")
+    np.testing.assert_allclose(reading.modes.frequency, [126.4, 136.6])
+    np.testing.assert_allclose(reading.modes.frequency_std, [0.1, 0.2])
+    np.testing.assert_allclose(reading.modes.damping_ratio_std, [0.001, 0.001])
+    np.testing.assert_allclose(reading.modes.correlation, [0.5, 0.0])
+
+
+def test_cross_terms_enter_the_covariance_of_their_log(tmp_path: Path) -> None:
+    """Terms of other logs, and of estimates that are not there, are left alone."""
+    text = HEAD + row() + row(mode="pitch") + row(log="b", day=2)
+    terms = "a,acc,roll,acc,pitch,3e-7\nb,acc,roll,acc,pitch,4e-7\n"
+    first, second = read(tmp_path, text, terms)
+    assert first.modes.cov[0, 1] == first.modes.cov[1, 0] == 3e-7
+    assert second.modes.cov.shape == (2, 2)
+
+
+def test_another_program_needs_three_columns(tmp_path: Path) -> None:
+    """Without names, sources, odometer and damping everything that is assumed is said."""
+    text = "recorded_at,frequency_hz,frequency_std_hz\n2026-03-01T06:00:00Z,126.4,0.1\n"
+    (reading,) = read(tmp_path, text)
+    assert reading.modes.names == ("",)
+    assert reading.modes.sources == ("unknown",)
+    assert reading.metadata.travel is None
+    assert np.isnan(reading.modes.ln_damping).all()
+    assert np.isnan(reading.modes.cov[1]).all()
+    assert "no column stage" in notes(tmp_path, text)
+
+
+def test_what_is_assumed_is_said(tmp_path: Path) -> None:
+    """Order of time, dampings without a standard deviation, sources without cross terms."""
+    text = HEAD + row(day=2) + row(log="b", day=1)
+    assert "not in the order of time" in notes(tmp_path, text)
+    text = HEAD + row().replace("0.02,0.001", "0.02,")
+    assert "1 damping ratios" in notes(tmp_path, text)
+    assert "line 2" in notes(tmp_path, text)
+    text = HEAD + row() + row(source="delta_e")
+    assert "give modes_cov.csv" in notes(tmp_path, text)
+    terms = "a,acc,roll,delta_e,roll,1e-8\n"
+    assert notes(tmp_path, text, terms) == ""
+    told = notes(tmp_path, text, terms.replace("delta_e,roll", "delta_e,heave"))
+    assert "1 of 1 cross terms are of estimates that the table does not have (line 2)" in told
+    assert "give modes_cov.csv" in told
+    text = HEAD + row(day=2) + row(log="b", day=1).replace("AX-1", "AX-2")
+    assert notes(tmp_path, text) == ""
+    assert notes(tmp_path, HEAD + row()) == ""
+
+
+@pytest.mark.parametrize(
+    ("text", "needle"),
+    [
+        (HEAD, "no row"),
+        ("recorded_at,frequency_hz\n2026-03-01T06:00:00Z,1\n", "no column ['frequency_std_hz']"),
+        (HEAD + row(std=""), "line 2: frequency_std_hz is missing"),
+        (HEAD + row(std=-0.1), "line 2: frequency_std_hz is -0.1"),
+        (HEAD + row(std=1e-9), "line 2: frequency_std_hz is 1e-09, below 1e-07 of the frequency"),
+        ("recorded_at;frequency_hz\n1;2\n", "columns are parted by commas"),
+        (HEAD + row(f=0), "line 2: frequency_hz is 0"),
+        (HEAD + row(f="fast"), "line 2: frequency_hz is no finite number"),
+        (HEAD + row(f="inf"), "line 2: frequency_hz is no finite number"),
+        (HEAD + row() + row(), "line 2, 3: roll by acc stands there twice"),
+        (HEAD + row() + row(mode="pitch", km=11), "log a has travel_km 10 and 11"),
+        (HEAD + row(rho=1.0), "correlation_f_zeta reaches 1"),
+        (HEAD + row().replace("+00:00", ""), "needs a time zone"),
+        (HEAD + row().replace("2026-03-01T", "1.3.2026 "), "is no ISO date"),
+    ],
+)
+def test_what_makes_no_sense_is_refused_with_its_line(
+    tmp_path: Path, text: str, needle: str
+) -> None:
+    """The error names the file, the line, what was got and what is needed."""
+    with pytest.raises(BadTable, match=r"modes\.csv") as caught:
+        read(tmp_path, text)
+    assert needle in str(caught.value)
+
+
+def test_cross_terms_that_are_no_covariance_are_refused(tmp_path: Path) -> None:
+    """A correlation above one, a text and a missing column are named."""
+    text = HEAD + row() + row(mode="pitch")
+    with pytest.raises(BadTable, match="log a: variances and cross terms are no covariance"):
+        read(tmp_path, text, "a,acc,roll,acc,pitch,1e-3\n")
+    with pytest.raises(BadTable, match="cov_ln_f is no finite number"):
+        read(tmp_path, text, "a,acc,roll,acc,pitch,x\n")
+
+
+def test_names_that_the_stage_does_not_know_are_refused(tmp_path: Path, stage: Stage) -> None:
+    """The error lists the stage's modes and says how to go on."""
+    with pytest.raises(BadTable, match=r"modes \['shaker'\] are none of small") as caught:
+        read(tmp_path, HEAD + row(mode="shaker"), stage=stage)
+    assert "leave the column mode empty" in str(caught.value)

@@ -1,0 +1,554 @@
+"""The tracker against textbook filters, and the lives that mislead others."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from math import inf
+
+import numpy as np
+import pytest
+
+from lmshealth._arrays import FloatArray
+from lmshealth.errors import NotEnoughData
+from lmshealth.stage.description import Stage
+from lmshealth.tracking import (
+    change_detection as events,
+)
+from lmshealth.tracking import (
+    filter_bank as bank,
+)
+from lmshealth.tracking import (
+    tracker as tracking,
+)
+from lmshealth.tracking.change_detection import loop_evidence
+from lmshealth.tracking.results import History, Track
+from lmshealth.tracking.state_space import JUMP_STD
+from lmshealth.tracking.tracker import track
+from tests.lives import (
+    DAMPING,
+    FREQUENCY,
+    TWO,
+    awkward_history,
+    cut,
+    make_history,
+    make_stage,
+    rough_history,
+    seen_by,
+    since,
+)
+from tests.oracles import JUMPS, Known, Wander, filterpy_loop
+from tests.tracking.test_filter_bank import KNOWN, SETTINGS, one
+
+PUBLISHED = (
+    "ln_frequency",
+    "ln_frequency_std",
+    "ln_damping",
+    "ln_damping_std",
+    "drift",
+    "drift_cov",
+    "noise_scale",
+    "widening",
+)
+
+
+@pytest.fixture(scope="module")
+def stage(tmp_path_factory: pytest.TempPathFactory) -> Stage:
+    """Two modes and temperature as covariate, a horizon of 20,000 km."""
+    return make_stage(tmp_path_factory.mktemp("stage"))
+
+
+@pytest.fixture
+def plain(monkeypatch: pytest.MonkeyPatch) -> Callable[[Wander], None]:
+    """Shrink the grid to one setting, and let nothing be an outlier or an event."""
+
+    def choose(wander: Wander) -> None:
+        sources = tuple(wander.scales)
+        monkeypatch.setattr(bank, "settings", lambda n: one(wander, sources[:n]))
+        monkeypatch.setattr(tracking, "_FAR", inf)
+        monkeypatch.setattr(events, "_SUSPICIOUS", inf)
+
+    return choose
+
+
+def still(rng: np.random.Generator, n: int = 40) -> tuple[FloatArray, FloatArray]:
+    """Ln f and ln ζ of two modes that do not change, with errors of 5e-4 and 0.05."""
+    ln_f = np.log(FREQUENCY[:2]) + 5e-4 * rng.standard_normal((n, 2))
+    return ln_f, np.log(DAMPING[:2]) + 0.05 * rng.standard_normal((n, 2))
+
+
+def quiet(rng: np.random.Generator, n: int = 40) -> History:
+    """Make a life in which nothing happens."""
+    ln_f, ln_zeta = still(rng, n)
+    return make_history(ln_f, ln_damping=ln_zeta, std=5e-4)
+
+
+def std_of(found: Track) -> FloatArray:
+    """Give the standard deviations of the drifts, ``(n_epochs, n_modes)``."""
+    return np.sqrt(np.einsum("kii->ki", found.drift_cov))
+
+
+@pytest.mark.parametrize("wander", SETTINGS)
+def test_one_setting_is_a_filterpy_loop(
+    tmp_path_factory: pytest.TempPathFactory,
+    plain: Callable[[Wander], None],
+    wander: Wander,
+) -> None:
+    """For one setting a track is what filterpy filters, to 1e-10 of the std, work and all."""
+    stage = make_stage(tmp_path_factory.mktemp("two"), tail=TWO)
+    history = awkward_history(np.random.default_rng(1))
+    plain(wander)
+    found = track(history, stage)
+    # After work on the machine its rates are unknown anew.
+    book = filterpy_loop(history, wander, replace(KNOWN, reopened=(9,)))
+    std = np.sqrt(np.einsum("kpipi->kpi", book.cov))
+    widening = found.widening[:, None]
+    for part, name in enumerate(("ln_frequency", "ln_damping")):
+        own = getattr(found, name)
+        assert np.abs((own - book.mean[:, part]) / std[:, part]).max() < 1e-10
+        own_std = getattr(found, f"{name}_std")
+        np.testing.assert_allclose(own_std, std[:, part] * widening, rtol=1e-10)
+    judged = np.setdiff1d(np.arange(1, 16), history.baselines)
+    # A machine that hardly wanders has drifts of next to no std, but of numbers of ln f.
+    drift_std = np.maximum(std[judged, 2], 0.1 * std[judged, 0])
+    assert np.abs((found.drift[judged] - book.mean[judged, 2]) / drift_std).max() < 1e-10
+    cov = found.drift_cov[judged] / widening[judged, :, None] ** 2
+    scale = drift_std[:, :, None] * drift_std[:, None]
+    assert np.abs((cov - book.cov[judged, 2, :, 2]) / scale).max() < 1e-10
+    np.testing.assert_allclose(found.nis, book.nis, rtol=1e-9, atol=1e-10)
+
+
+@pytest.mark.parametrize("baseline", [0, 4])
+def test_drift_and_its_variance_vanish_at_the_baseline(stage: Stage, baseline: int) -> None:
+    """The copy is exact: at the baseline drift and covariance are 0, not nearly so."""
+    found = track(rough_history(np.random.default_rng(5), baseline=baseline), stage)
+    assert (found.drift[baseline] == 0).all()
+    assert (found.drift_cov[baseline] == 0).all()
+    assert (std_of(found)[baseline + 1 :] > 0).any()
+
+
+def test_logs_on_the_spot_of_the_baseline_have_no_drift(stage: Stage) -> None:
+    """Where the odometer has not moved since the baseline there is nothing to infer."""
+    history = rough_history(np.random.default_rng(6))
+    travel = np.r_[np.full(4, 1e5), np.linspace(2e5, 1e6, 6)]
+    found = track(replace(history, travel=travel), stage)
+    assert (found.drift[:4] == 0).all()
+    assert (found.drift_cov[:4] == 0).all()
+
+
+def test_a_step_where_the_machine_stands_is_a_drift(stage: Stage) -> None:
+    """A bolt may loosen where the odometer stands still: events and drift agree."""
+    ln_f, ln_zeta = still(np.random.default_rng(7), 12)
+    ln_f[6:] -= 0.02
+    parked = replace(make_history(ln_f, ln_damping=ln_zeta, std=5e-4), travel=np.full(12, 1e5))
+    found = track(parked, stage)
+    assert {(event.kind, event.epoch) for event in found.events} >= {("step", 6)}
+    assert (found.drift[:6] == 0).all()
+    assert (np.abs(found.drift[7:] + 0.02) < 5 * std_of(found)[7:]).all()
+    assert (std_of(found)[6:] > 0).all()
+
+
+def test_damping_that_no_log_tells_is_unknown(stage: Stage) -> None:
+    """A mode of which only frequencies are given has no damping, and the others keep theirs."""
+    ln_f, ln_zeta = still(np.random.default_rng(8), 6)
+    ln_zeta[:, 0] = np.nan
+    found = track(make_history(ln_f, ln_damping=ln_zeta), stage)
+    assert np.isnan(found.ln_damping[:, 0]).all()
+    assert np.isnan(found.ln_damping_std[:, 0]).all()
+    assert np.isfinite(found.ln_damping[:, 1]).all()
+    assert np.isfinite(found.ln_frequency).all()
+
+
+def test_nothing_is_said_before_the_baseline(stage: Stage) -> None:
+    """With the baseline in the middle earlier drifts are NaN, and later ones are not."""
+    found = track(rough_history(np.random.default_rng(7), baseline=3), stage)
+    assert np.isnan(found.drift[:3]).all()
+    assert np.isnan(found.drift_cov[:3]).all()
+    assert np.isfinite(found.drift[3:]).all()
+    assert np.isfinite(found.ln_frequency).all()
+
+
+def test_work_on_the_machine_opens_a_new_baseline(stage: Stage) -> None:
+    """Drift is counted from the last work, however far that moved the modes."""
+    ln_f, ln_zeta = still(np.random.default_rng(8))
+    ln_f += 0.05 * (np.arange(40) >= 20)[:, None]
+    history = make_history(ln_f, ln_damping=ln_zeta, std=5e-4)
+    history = replace(history, baselines=(0, 20), steps=(since("reset", 20, 40),))
+    found = track(history, stage)
+    assert (found.drift[20] == 0).all()
+    assert np.abs(found.drift).max() < 5e-3
+    assert found.events == ()
+    assert np.abs(found.ln_frequency[-1] - found.ln_frequency[19] - 0.05).max() < 2e-3
+
+
+def test_variance_of_the_drift_keeps_the_error_of_the_baseline(stage: Stage) -> None:
+    """However many logs follow, one poor baseline log leaves its own error in every drift."""
+    ln_f, _ = still(np.random.default_rng(8))
+    cov = np.tile(np.diag([1e-8, 1e-8, 1e-3, 1e-3]), (40, 1, 1))
+    sharp = track(make_history(ln_f, cov=cov), stage)
+    cov[0] *= 1e4  # a baseline of standard deviation 0.01
+    wide = track(make_history(ln_f, cov=cov), stage)
+    assert (std_of(wide)[1:] > 0).all()
+    assert wide.drift_cov[1, 0, 0] > 2 * sharp.drift_cov[1, 0, 0]
+
+
+def test_a_wholly_missing_log_changes_nothing(stage: Stage) -> None:
+    """A log without any mode leaves all other epochs as if it did not exist."""
+    rough = rough_history(np.random.default_rng(9))
+    temperature = np.nan_to_num(rough.covariates["temperature_c"], nan=21.0)
+    history = replace(rough, covariates={"temperature_c": temperature})
+    keep = np.arange(len(history.logs)) != 4  # the builder's empty log
+    without = make_history(
+        history.ln_frequency[keep],
+        travel=history.travel[keep],
+        cov=history.cov[keep],
+        ln_damping=history.ln_damping[keep],
+        temperature=temperature[keep],
+    )
+    with_all, alone = track(history, stage), track(without, stage)
+    np.testing.assert_allclose(with_all.drift[keep], alone.drift, atol=1e-12)
+    np.testing.assert_allclose(with_all.drift_cov[keep], alone.drift_cov, rtol=1e-9, atol=1e-15)
+    assert with_all.nis[4] == 0
+    assert with_all.nis_dof[4] == 0
+
+
+def test_a_missing_mode_never_poisons_the_others(
+    stage: Stage, plain: Callable[[Wander], None]
+) -> None:
+    """With independent errors a mode is followed as if the half-missing one did not exist."""
+    rng = np.random.default_rng(10)
+    ln_f, _ = still(rng, 12)
+    temperature = 21 + rng.standard_normal(12)
+    holes = ln_f.copy()
+    holes[[0, 3, 4, 11], 1] = np.nan
+    plain(SETTINGS[0])
+    both = track(make_history(holes, temperature=temperature), stage)
+    alone = track(make_history(ln_f[:, :1], temperature=temperature), stage)
+    for name in ("ln_frequency", "ln_damping", "drift"):
+        np.testing.assert_allclose(getattr(both, name)[:, :1], getattr(alone, name), atol=1e-12)
+    assert np.isfinite(both.drift).all()
+    assert np.isfinite(both.drift_cov).all()
+
+
+def test_a_mode_that_is_not_seen_yet_has_no_frequency(stage: Stage) -> None:
+    """Before its first estimate a mode has neither frequency nor damping, and a wide drift."""
+    ln_f, ln_zeta = still(np.random.default_rng(11), 10)
+    ln_f[:3, 1] = np.nan
+    found = track(make_history(ln_f, ln_damping=ln_zeta), stage)
+    for name in ("ln_frequency", "ln_frequency_std", "ln_damping", "ln_damping_std"):
+        assert np.isnan(getattr(found, name)[:3, 1]).all()
+        assert np.isfinite(getattr(found, name)[3:]).all()
+        assert np.isfinite(getattr(found, name)[:, 0]).all()
+    assert np.isfinite(found.drift).all()
+    assert (std_of(found)[1:] > 0).all()
+    assert found.nis_dof.tolist() == [0, 2, 2, 2, 4, 4, 4, 4, 4, 4]
+
+
+def test_a_missing_baseline_log_is_bridged(stage: Stage) -> None:
+    """A baseline log without any mode leaves finite, wide drifts."""
+    ln_f, _ = still(np.random.default_rng(11), 10)
+    ln_f[0] = np.nan
+    found = track(make_history(ln_f), stage)
+    assert np.isfinite(found.drift).all()
+    assert (std_of(found)[1:] > 0).all()
+
+
+def test_covariances_stay_positive_and_symmetric(stage: Stage) -> None:
+    """Drift covariances are symmetric with no negative eigenvalue over a long awkward life."""
+    found = track(rough_history(np.random.default_rng(12), n=40), stage)
+    np.testing.assert_allclose(found.drift_cov, np.swapaxes(found.drift_cov, 1, 2), atol=1e-18)
+    assert np.linalg.eigvalsh(found.drift_cov).min() > -1e-16
+
+
+def eventful(seed: int) -> History:
+    """Make a life with everything that could look ahead: a late mode, an outlier, two events."""
+    rng = np.random.default_rng(seed)
+    n = 36
+    level, damping = np.tile(np.log(FREQUENCY[:2]), (n, 1)), np.tile(np.log(DAMPING[:2]), (n, 1))
+    level[14:] -= 0.03
+    level[24:] += 0.01
+    damping[24:] += 0.3
+    history = seen_by(rng, level, damping)
+    ln_f = np.array(history.ln_frequency)
+    ln_f[7, [0, 2]] += 0.04
+    gone = np.zeros((n, 8), dtype=bool)
+    gone[:3, [1, 3, 5, 7]] = gone[::3, [2, 3, 6, 7]] = True
+    temperature = 21 + rng.standard_normal(n)
+    temperature[[5, 11]] = np.nan
+    loop = 1e-6 * np.exp(0.05 * rng.standard_normal(n))
+    loop[24:] *= 1.5
+    cov = np.where(gone[:, :, None] | gone[:, None, :], np.nan, history.cov)
+    return replace(
+        history,
+        ln_frequency=np.where(gone[:, :4], np.nan, ln_f),
+        ln_damping=np.where(gone[:, 4:], np.nan, history.ln_damping),
+        cov=cov,
+        covariates={"temperature_c": temperature},
+        loop_error=loop,
+    )
+
+
+@pytest.mark.slow
+def test_no_epoch_knows_of_later_logs(stage: Stage) -> None:
+    """Appending logs changes nothing that was published: events, outliers and doubts included."""
+    history = eventful(13)
+    whole = track(history, stage)
+    assert {(e.kind, e.epoch) for e in whole.events if not e.declared} >= {("step", 14)}
+    assert whole.outliers[0] == (7, "roll")
+    for n in (5, 8, 9, 12, 15, 16, 17, 25, 26, 27, 35):
+        part = track(cut(history, n), stage)
+        for name in PUBLISHED:
+            np.testing.assert_allclose(
+                getattr(part, name),
+                getattr(whole, name)[:n],
+                rtol=1e-9,
+                atol=1e-12,
+                err_msg=f"{name} of {n} logs",
+            )
+        # Sizes are of the last log; that something happened, and when it was known, is not.
+        for kept, all_found in ((part.events, whole.events),):
+            known = [(e.kind, e.epoch, e.mode, e.source, e.found_at) for e in kept]
+            later = [
+                (e.kind, e.epoch, e.mode, e.source, e.found_at) for e in all_found if e.found_at < n
+            ]
+            assert known == later
+
+
+def test_without_a_stage_the_length_of_the_history_counts() -> None:
+    """Negative control: without a horizon rates are per length of the history, known at its end."""
+    history = rough_history(np.random.default_rng(14), n=20)
+    history = replace(history, covariates={})
+    whole, part = track(history), track(cut(history, 10))
+    assert np.abs(std_of(whole)[9] / std_of(part)[9] - 1).max() > 1e-3
+
+
+def temperature_life(seed: int) -> History:
+    """Make a life in which only the temperature moves the modes, by 2 % between its ends."""
+    rng = np.random.default_rng(seed)
+    temperature = 21 + 12 * np.sin(np.arange(40) / 5) + rng.standard_normal(40)
+    ln_f, _ = still(rng)
+    return make_history(
+        ln_f - 8e-4 * (temperature[:, None] - 21), std=5e-4, temperature=temperature
+    )
+
+
+def worst_drift(found: Track) -> float:
+    """Largest drift in units of its own standard deviation."""
+    return float(np.abs(found.drift[1:] / std_of(found)[1:]).max())
+
+
+def test_temperature_alone_raises_no_drift(stage: Stage) -> None:
+    """A life of temperature alone keeps its drifts within their standard deviations."""
+    found = track(temperature_life(14), stage)
+    assert worst_drift(found) < 3
+    assert found.events == ()
+    effects = [effect for effect in found.effects if effect.covariate == "temperature_c"]
+    assert [effect.mode for effect in effects] == ["roll", "pitch"]
+    for effect in effects:
+        assert abs(effect.coefficient + 8e-4) < 4 * effect.std
+        assert effect.std < 1e-4
+
+
+def test_temperature_that_is_not_recorded_reads_as_drift(stage: Stage) -> None:
+    """Negative control: the same life without its temperatures drifts far beyond its std."""
+    assert worst_drift(track(replace(temperature_life(14), covariates={}), stage)) > 6
+
+
+def test_a_log_without_temperature_counts_less(stage: Stage) -> None:
+    """A log whose temperature is unknown moves the track less than one whose is known."""
+    rng = np.random.default_rng(15)
+    temperature = 21 + 5 * rng.standard_normal(12)
+    ln_f, _ = still(rng, 12)
+    unknown = temperature.copy()
+    unknown[-1] = np.nan
+    known = track(make_history(ln_f, temperature=temperature), stage)
+    less = track(make_history(ln_f, temperature=unknown), stage)
+    assert (less.ln_frequency_std[-1] > known.ln_frequency_std[-1]).all()
+    assert np.isfinite(less.drift).all()
+
+
+def test_without_a_stage_covariates_are_taken_about_their_median(
+    plain: Callable[[Wander], None],
+) -> None:
+    """Without a description every covariate is regressed out about its median."""
+    history = temperature_life(16)
+    median = float(np.median(history.covariates["temperature_c"]))
+    plain(SETTINGS[0])
+    found = track(history)
+    known = Known(float(np.ptp(history.travel)), (("temperature_c", median, 1e-3, 0.0),))
+    book = filterpy_loop(history, SETTINGS[0], known)
+    std = np.sqrt(np.einsum("kpipi->kpi", book.cov))
+    assert np.abs((found.drift - book.mean[:, 2])[1:] / std[1:, 2]).max() < 1e-10
+
+
+def test_a_step_is_followed_and_its_size_told(stage: Stage) -> None:
+    """A 5 % step is taken up within its own uncertainty, and is an event of that size."""
+    history = quiet(np.random.default_rng(17))
+    ln_f = np.array(history.ln_frequency)
+    ln_f[15:] -= 0.05
+    found = track(replace(history, ln_frequency=ln_f), stage)
+    assert (np.abs(found.drift[-1] + 0.05) < 4 * std_of(found)[-1]).all()
+    assert [(e.kind, e.epoch) for e in found.events if e.kind != "alarm"] == [("step", 15)] * 2
+    for event in found.events:
+        assert abs(event.size + 0.05) < 4 * event.std < 0.02
+    assert found.steps[0].declared is False
+
+
+@pytest.mark.parametrize("rows", [(0,), (0, 1), (2,)])
+def test_one_log_that_is_far_off_is_an_outlier(stage: Stage, rows: tuple[int, ...]) -> None:
+    """It is named, it leaves the track where it was, and its log says that nobody can tell yet."""
+    history = quiet(np.random.default_rng(18))
+    values = np.hstack([history.ln_frequency, history.ln_damping])
+    far = 0.05 if rows[0] < 2 else 1.5
+    values[20, list(rows)] += far
+    history = replace(history, ln_frequency=values[:, :2], ln_damping=values[:, 2:])
+    modes = sorted({row % 2 for row in rows})
+    missing = np.array(history.ln_frequency)
+    missing[20, modes] = np.nan
+    believed = make_history(missing, ln_damping=history.ln_damping, std=5e-4)
+    found, without = track(history, stage), track(believed, stage)
+    assert found.outliers == tuple((20, history.modes[i]) for i in modes)
+    assert found.events == ()
+    assert np.abs((found.drift - without.drift)[21:] / std_of(without)[21:]).max() < 0.3
+    assert np.abs(found.widening - 1).max() == 0
+    # At its log the interval holds both explanations: nothing, and a step.
+    for i in modes:
+        name = "ln_frequency" if rows[0] < 2 else "ln_damping"
+        mean, std = (getattr(found, name + end)[20, i] for end in ("", "_std"))
+        before = getattr(found, name)[19, i]
+        assert mean - 2 * std < before < mean + 2 * std
+        assert mean - 2 * std < before + far < mean + 2 * std
+        assert getattr(found, f"{name}_std")[22, i] < std / 3
+
+
+def test_outliers_two_logs_in_a_row_are_no_step(stage: Stage) -> None:
+    """Negative control for the control: what goes back at once is not believed for good."""
+    history = quiet(np.random.default_rng(19))
+    ln_f = np.array(history.ln_frequency)
+    ln_f[20, 0] += 0.05
+    ln_f[23, 0] -= 0.05
+    found = track(replace(history, ln_frequency=ln_f), stage)
+    assert found.outliers == ((20, "roll"), (23, "roll"))
+    assert found.events == ()
+
+
+def test_estimates_that_scatter_more_than_they_say_raise_the_noise_scale(stage: Stage) -> None:
+    """Reported errors that are half the true ones are found out; honest ones are left alone."""
+    history = quiet(np.random.default_rng(18), 60)
+    honest = track(history, stage)
+    boastful = track(replace(history, cov=history.cov / 4), stage)
+    assert honest.noise_scale.shape == (60, 1)
+    assert honest.noise_scale[-1, 0] < 1.1
+    assert boastful.noise_scale[-1, 0] > 1.5
+    assert np.abs(honest.widening - 1).max() == 0
+
+
+def test_a_filter_that_is_inconsistent_widens(stage: Stage) -> None:
+    """Errors eight times as large as they say are beyond the grid: the intervals are widened."""
+    history = quiet(np.random.default_rng(20), 60)
+    found = track(replace(history, cov=history.cov / 64), stage)
+    assert found.widening[-1] > 1.2
+    assert found.widening[0] == 1
+    assert not found.consistency().holds
+    assert track(history, stage).consistency().holds
+
+
+def test_two_sources_are_told_apart_by_their_bias(stage: Stage) -> None:
+    """The bias of the second source is an effect of each mode, within its standard deviation."""
+    rng = np.random.default_rng(21)
+    n = 40
+    history = seen_by(
+        rng, np.tile(np.log(FREQUENCY[:2]), (n, 1)), np.tile(np.log(DAMPING[:2]), (n, 1))
+    )
+    found = track(history, stage)
+    biases = [effect for effect in found.effects if effect.covariate == "bias:delta_e"]
+    assert [effect.mode for effect in biases] == ["roll", "pitch"]
+    for effect in biases:
+        # Errors that are nine tenths common tell a difference better than a level.
+        assert effect.std < 5e-4 / np.sqrt(n)
+        assert abs(effect.coefficient - 2e-3) < 4 * effect.std
+    assert found.sources == ("acc", "delta_e")
+    assert [e.covariate for e in found.effects if not e.mode] == ["scale:acc", "scale:delta_e"]
+
+
+@pytest.mark.parametrize("kind", ["step", "servo", "regreasing"])
+def test_evidence_of_a_declared_step_is_that_of_two_filters(
+    stage: Stage,
+    plain: Callable[[Wander], None],
+    monkeypatch: pytest.MonkeyPatch,
+    kind: str,
+) -> None:
+    """The density ratio at no jump is the evidence with the jump over that without, to 1e-8."""
+    n = 20
+    rng = np.random.default_rng(22)
+    ln_f, ln_zeta = still(rng, n)
+    ln_f[8:] -= 0.001
+    ln_zeta[8:] -= 0.1
+    history = make_history(ln_f, ln_damping=ln_zeta, std=5e-4)
+    history = replace(history, steps=(since(kind, 8, n),))
+    wander = Wander(1e-3, 0.3, 0.1, {"acc": 1.0})
+    plain(wander)
+    events_found = track(history, stage).events
+    part = 1 if kind == "regreasing" else 0
+    known = Known(2e7)
+    with_it = filterpy_loop(history, wander, known).log_evidence[-1]
+    jump = list(JUMP_STD[kind])
+    jump[part] = 0.0
+    monkeypatch.setitem(JUMPS, kind, tuple(jump))
+    without = filterpy_loop(history, wander, known).log_evidence[-1]
+    assert len(events_found) == 2
+    for event in events_found:
+        assert event.declared
+        assert event.found_at == event.epoch == 8
+        assert event.evidence == pytest.approx(with_it - without, abs=1e-6)
+
+
+def test_a_declared_retuning_is_no_drift(stage: Stage) -> None:
+    """What a servo does to the estimates is an effect; undeclared it is found as the loop moved."""
+    n = 40
+    ln_f, ln_zeta = still(np.random.default_rng(23), n)
+    ln_f[20:] -= 0.015
+    ln_zeta[20:] += 0.3
+    history = make_history(ln_f, ln_damping=ln_zeta, std=5e-4)
+    declared = replace(history, steps=(since("servo", 20, n, name="v2"),))
+    found = track(declared, stage)
+    assert np.abs(found.drift).max() < 4e-3
+    assert {e.kind for e in found.events} == {"servo"}
+    effect = next(effect for effect in found.effects if effect.covariate == "servo:v2")
+    assert abs(effect.coefficient + 0.015) < 4 * effect.std
+    # Nothing declared: the following error below 40 Hz tells.
+    loop = 1e-6 * np.exp(0.05 * np.random.default_rng(24).standard_normal(n))
+    loop[20:] *= 1.4
+    by_itself = track(replace(history, loop_error=loop), stage)
+    assert {(e.kind, e.epoch, e.declared) for e in by_itself.events} == {("servo", 20, False)}
+    assert np.abs(by_itself.drift[22:]).max() < 4e-3
+    assert loop_evidence(loop, 20, 30, "servo") > 3
+
+
+def test_a_machine_that_never_moved_is_tracked_without_drift(stage: Stage) -> None:
+    """Logs at one odometer reading are averaged, not divided by their span of 0."""
+    ln_f, ln_zeta = still(np.random.default_rng(20), 6)
+    found = track(make_history(ln_f, ln_damping=ln_zeta, travel=np.full(6, 1e5)), stage)
+    np.testing.assert_allclose(found.drift, 0, atol=1e-12)
+    np.testing.assert_allclose(found.ln_frequency[-1], ln_f.mean(axis=0), atol=1e-5)
+
+
+def test_one_log_only_is_tracked(stage: Stage) -> None:
+    """One epoch gives its own estimates, with next to their own std, and no drift."""
+    history = cut(quiet(np.random.default_rng(25)), 1)
+    for given in (stage, None):
+        found = track(history, given)
+        np.testing.assert_allclose(found.ln_frequency, history.ln_frequency, atol=1e-12)
+        # By what factor the estimates' own std is wrong is not known after one log.
+        grid = bank.settings(1)
+        factor = np.sqrt(np.exp(grid.log_prior) @ grid.scales[:, 0] ** 2)
+        np.testing.assert_allclose(found.ln_frequency_std, factor * 5e-4, rtol=0.01)
+        assert (found.drift == 0).all()
+        assert found.events == ()
+        assert found.consistency().holds
+
+
+def test_a_history_without_estimates_is_refused(stage: Stage) -> None:
+    """No estimate in any log: the error counts the logs."""
+    with pytest.raises(NotEnoughData, match="no modal estimate in 5 logs"):
+        track(make_history(np.full((5, 2), np.nan)), stage)
