@@ -133,7 +133,7 @@ def test_changed_module(written: Any, tmp_path: Path, monkeypatch: pytest.Monkey
 def test_gathered_names(written: Any) -> None:
     """Of the package a trial needs the homes of the names it uses, and what these register."""
     text = SCRIPT.replace("metrics import place", "import read_log as place", 1)
-    text = text.replace("from lmshealth.import", "from lmshealth import")
+    text = text.replace("from studies.import", "from lmshealth import")
     tree = provenance._tree(Path(written(text).__file__ or ""))
     needed = provenance._closure(provenance._imports(tree.body))
     names = {path.relative_to(provenance.PROJECT).as_posix() for path in needed}

@@ -14,8 +14,8 @@ from __future__ import annotations
 
 import re
 import warnings
-from collections.abc import Callable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, TypeVar
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -23,6 +23,7 @@ from lmshealth._arrays import FloatArray
 from lmshealth.health.results import Health
 from lmshealth.prognosis.maintenance_decision import Service
 from lmshealth.prognosis.results import Prognosis
+from lmshealth.report.svg import lean
 from lmshealth.report.text import GAP, km, moment, spell, whole_km
 
 if TYPE_CHECKING:
@@ -34,79 +35,6 @@ from lmshealth.signal.spectral_lines import Line
 from lmshealth.signal.waterfall import Waterfall
 from lmshealth.tracking.covariate_effects import Influence
 from lmshealth.tracking.results import History, Track
-
-Key = TypeVar("Key")
-
-_GLYPH = re.compile(
-    r'<path id="([\w-]*?)-?(?:DejaVu)(\w+-\w+)" ((?:d="[^"]*" )?transform="[^"]*"/>)\n?'
-)
-
-
-def lean(text: str) -> str:
-    """Leave out what no eye sees: a third of what matplotlib writes.
-
-    Parameters
-    ----------
-    text : str
-        An SVG as matplotlib writes it, with letters as paths.
-    """
-    text = re.sub(r"(?s)<!--.*?-->|<metadata>.*?</metadata>", "", text)
-    text = re.sub(r"\n\s*", "\n", text).strip().replace("xlink:href", "href")
-    # Two decimals of a point are finer than any screen or printer.
-    text = re.sub(
-        r'\s[dxy]="[^"]*"|translate\([^)]*\)', lambda m: re.sub(r"(\.\d\d)\d+", r"\1", m[0]), text
-    )
-    text = re.sub(r'(?<=\sd=")[^"]*', lambda m: re.sub(r"\s*([A-Za-z])\s*", r"\1", m[0]), text)
-    text = re.sub(r'style="[^"]*"', lambda m: re.sub(r"([:;,]) ", r"\1", m[0]), text)
-    # A letter is put in its place by an attribute.
-    text = re.sub(r'" transform="translate\(([\d.-]+) ([\d.-]+)\)"/>', r'" x="\1" y="\2"/>', text)
-    text = text.replace(' y="0"/>', "/>")
-    # Markers in a row say how they look once.
-    text = re.sub(r'(?:<use [^>]*? (style="[^"]*")/>\n)(?:<use [^>]*? \1/>\n)+', _once, text)
-    used = set(re.findall(r'(?:href="|url\()#([^")]+)', text))
-    text = re.sub(r'\sid="([^"]*)"', lambda m: m[0] if m[1] in used else "", text)
-    return re.sub(r"<g>\n(<(?:use|path) [^>]*/>)\n</g>", r"\1", text)
-
-
-def _once(found: re.Match[str]) -> str:
-    return f"<g {found[1]}>\n{found[0].replace(f' {found[1]}', '')}</g>\n"
-
-
-def share_letters(pictures: Mapping[Key, str]) -> tuple[str, dict[Key, str]]:
-    """Take the letters out of the pictures of a page.
-
-    Parameters
-    ----------
-    pictures : mapping of str
-        Lean SVG elements.
-
-    Returns
-    -------
-    letters : str
-        An SVG element for the same page that defines each letter once; empty without any.
-    pictures : dict of str
-        What refers to it.
-    """
-    letters: dict[str, str] = {}
-    shared = {}
-    for key, text in pictures.items():
-        for _, name, outline in _GLYPH.findall(text):
-            letters[name] = f'<path id="{name}" {outline}'
-        text = _GLYPH.sub("", text).replace("<defs>\n</defs>\n", "")
-        shared[key] = re.sub(r'href="#[\w-]*?-?DejaVu(\w+-\w+)"', r'href="#\1"', text)
-    if not letters:
-        return "", shared
-    outlines = "\n".join(letters[name] for name in sorted(letters))
-    return f'<svg class="letters" aria-hidden="true"><defs>\n{outlines}\n</defs></svg>', shared
-
-
-def give_letters(page: str) -> str:
-    """Put the letters of a page back into each of its pictures, for who reads them one by one."""
-    found = re.search(r'(?s)<svg class="letters"[^>]*>(<defs>.*?</defs>)</svg>', page)
-    if found is None:
-        return page
-    return re.sub(r"<figure[^>]*>.*?<svg[^>]*>", lambda m: m[0] + found[1], page, flags=re.S)
-
 
 INK, MUTED, GRID, PAPER = "#1f2933", "#5f6b7a", "#d9dee5", "#fefefe"
 BLUE, RED, GREEN = "#0072b2", "#c44e00", "#007a5a"

@@ -31,7 +31,6 @@ from lmshealth.report.figures import (
     plot_influence,
     plot_nis,
     plot_waterfall,
-    share_letters,
 )
 from lmshealth.report.fleet_page import (
     IndexRow,
@@ -53,6 +52,7 @@ from lmshealth.report.healthfacts import (
     verdict_words,
 )
 from lmshealth.report.html import render
+from lmshealth.report.svg import share_letters
 from lmshealth.report.text import covariate, km, law_words, percent, spell
 from lmshealth.report.trackfacts import (
     effect_row,

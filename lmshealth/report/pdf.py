@@ -10,7 +10,7 @@ from typing import Any
 
 from lmshealth._files import write_bytes
 from lmshealth.errors import LmshealthError
-from lmshealth.report.figures import give_letters
+from lmshealth.report.svg import give_letters
 
 
 class PdfError(LmshealthError):

@@ -10,7 +10,9 @@ from typing import Any
 import numpy as np
 
 from lmshealth.io.log import Refusal
-from lmshealth.report.figures import chi_square_band
+from lmshealth.report.figures import (
+    chi_square_band,
+)
 from lmshealth.report.text import GAP, change, covariate, km, signed, spell
 from lmshealth.stage.description import Stage
 from lmshealth.tracking.covariate_effects import Influence

@@ -240,7 +240,7 @@ def test_import_is_light():
     code = (
         "import sys, types; package = types.ModuleType('lmshealth'); "
         f"package.__path__ = [{folder!r}]; sys.modules['lmshealth'] = package; "
-        "import lmshealth.readers; "
+        "import lmshealth.io.reading; "
         "late = ('pandas', 'pyarrow', 'h5py', 'scipy', 'nptdms', 'pyuff'); "
         "sys.exit(any(m in sys.modules for m in late))"
     )

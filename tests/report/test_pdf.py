@@ -11,7 +11,10 @@ from pathlib import Path
 
 import pytest
 
-from lmshealth.report.figures import GREEN, RED
+from lmshealth.report.figures import (
+    GREEN,
+    RED,
+)
 from lmshealth.report.machine_page import write_report
 from lmshealth.report.pdf import PdfError, write_pdfs
 from tests.assessments import worn
@@ -70,7 +73,7 @@ def test_the_same_page_gives_the_same_bytes(small: Path) -> None:
     """Made again, by another process too, a PDF is the same."""
     (target,) = write_pdfs([small])
     content = target.read_bytes()
-    code = "import sys, pathlib, lmshealth.pdf as p; p.write_pdfs([pathlib.Path(sys.argv[1])])"
+    code = "import sys, pathlib, lmshealth.report.pdf as p; p.write_pdfs([pathlib.Path(sys.argv[1])])"
     subprocess.run([sys.executable, "-c", code, str(small)], check=True)
     assert target.read_bytes() == content
 
@@ -128,5 +131,5 @@ def test_a_page_that_cannot_be_laid_out_is_named(
 
 def test_the_library_is_loaded_only_when_it_is_needed() -> None:
     """The command line starts without it."""
-    code = "import sys, lmshealth.cli; sys.exit('weasyprint' in sys.modules)"
+    code = "import sys, lmshealth.cli.main; sys.exit('weasyprint' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

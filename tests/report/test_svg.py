@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 from matplotlib.image import imread
 
 from lmshealth.report import figures as plots
-from lmshealth.report.figures import give_letters, lean, share_letters
+from lmshealth.report.svg import give_letters, lean, share_letters
 from tests.report.test_machine_page import chromium
 
 
