@@ -54,7 +54,7 @@ class Format:
     sniff : callable
         Tells by the leading bytes of a file whether it is of this format.
     load : callable
-        Reads a file; may raise anything, `lmshealth.readers.formats.load` names it.
+        Reads a file; may raise anything, `lmshealth.io.formats.registry.load` names it.
     """
 
     name: str

@@ -43,7 +43,7 @@ def read_log(
     Raises
     ------
     BadLog
-        Whatever is wrong with the file; see `lmshealth.readers` for the reasons.
+        Whatever is wrong with the file; see `lmshealth.io` for the reasons.
 
     Examples
     --------

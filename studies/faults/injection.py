@@ -73,7 +73,7 @@ _MOST_MEMORY = 400 << 20
 _EVERY = 19
 _TALKATIVE = (
     "import logging, sys; logging.basicConfig(level=logging.DEBUG);"
-    "from lmshealth.cli import main; main(sys.argv[1:])"
+    "from lmshealth.cli.main import main; main(sys.argv[1:])"
 )
 Done = subprocess.CompletedProcess[str]
 
@@ -321,7 +321,7 @@ def bombs(folder: Path, base: Columns) -> list[dict[str, Any]]:
 def _weigh(path: Path, folder: Path) -> dict[str, Any]:
     """Read a log in a process of its own, and give its peak of memory in MB."""
     script = (
-        "import json, resource, sys\nfrom lmshealth.readers import read_log\n"
+        "import json, resource, sys\nfrom lmshealth.io.reading import read_log\n"
         "from lmshealth.errors import BadLog\n"
         "try:\n    read_log(sys.argv[1]); reason = ''\n"
         "except BadLog as error:\n    reason = error.reason\n"

@@ -263,7 +263,7 @@ def test_chosen_channels_and_column_maps_reach_the_analysis(folder: Path, tmp_pa
 @pytest.mark.slow
 def test_the_program_runs_as_a_process(folder: Path, stage: Path) -> None:
     """From a shell: JSON on standard output, nothing on standard error, status 0."""
-    start = [sys.executable, "-c", "from lmshealth.cli import main; main()"]
+    start = [sys.executable, "-c", "from lmshealth.cli.main import main; main()"]
     log = folder / "good" / "log-00.h5"
     done = subprocess.run(
         [*start, "modes", str(log), "--stage", str(stage), "--format", "json"],

@@ -73,7 +73,9 @@ def test_the_same_page_gives_the_same_bytes(small: Path) -> None:
     """Made again, by another process too, a PDF is the same."""
     (target,) = write_pdfs([small])
     content = target.read_bytes()
-    code = "import sys, pathlib, lmshealth.report.pdf as p; p.write_pdfs([pathlib.Path(sys.argv[1])])"
+    code = (
+        "import sys, pathlib, lmshealth.report.pdf as p; p.write_pdfs([pathlib.Path(sys.argv[1])])"
+    )
     subprocess.run([sys.executable, "-c", code, str(small)], check=True)
     assert target.read_bytes() == content
 

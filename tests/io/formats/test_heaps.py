@@ -99,8 +99,8 @@ def test_virtual_columns_end_no_process(tmp_path, library, lists_files):
     damaged = tmp_path / "damaged.h5"
     damaged.write_bytes(data[: value - 8] + b"\xff" + data[value - 7 :])
     code = (
-        "import sys; from pathlib import Path; from lmshealth.readers.columns import ColumnMap; "
-        "from lmshealth.readers.formats import load\n"
+        "import sys; from pathlib import Path; from lmshealth.io.column_map import ColumnMap; "
+        "from lmshealth.io.formats.registry import load\n"
         "for name in sys.argv[1:]:\n"
         "    try: load(Path(name), ColumnMap())\n"
         "    except Exception as error: print(error.reason)\n"
