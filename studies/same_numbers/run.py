@@ -41,7 +41,7 @@ def main() -> None:
     """Run both revisions and compare their answers."""
     parser = options(__doc__)
     parser.add_argument("--before", default="before-house", help="revision to compare with")
-    parser.add_argument("--keep", type=Path, help="folder for all answers, kept and used again")
+    parser.add_argument("--keep", type=Path, help="folder for what does not change from call to call")
     chosen = parser.parse_args()
     study = Study(__file__, __doc__, chosen)
     with tempfile.TemporaryDirectory() as temporary:
@@ -50,8 +50,8 @@ def main() -> None:
             if not (folder / "before").exists():
                 make_inputs(folder / "inputs", old, quick=study.quick)
                 answer_all(folder / "before", folder / "inputs", old)
-        answer_all(folder / "after", folder / "inputs", ROOT)
-        found = compare(folder / "before", folder / "after")
+        answer_all(Path(temporary) / "after", folder / "inputs", ROOT)
+        found = compare(folder / "before", Path(temporary) / "after")
     study.conclude(
         {
             "before": chosen.before,
