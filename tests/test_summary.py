@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
 from pathlib import Path
 from typing import Any
 
@@ -12,8 +11,6 @@ import pytest
 from studies import summary
 from studies.claims import STEPS, Claim, counted, covered
 from studies.record import Study
-
-_LINK = re.compile(r"\[[^]]*\]\(([^)#:]+)\)")
 
 
 @pytest.fixture
@@ -57,22 +54,6 @@ def test_every_study_has_claims() -> None:
         if "study.conclude(" in path.read_text(encoding="utf-8")
     }
     assert programs == told
-
-
-@pytest.mark.parametrize("page", ["README.md", "studies/README.md"])
-def test_links_lead_somewhere(root: Path, page: str) -> None:
-    """Every link of both pages to a file leads to one."""
-    text = (root / page).read_text(encoding="utf-8")
-    links = set(_LINK.findall(re.sub(r"```.*?```", "", text, flags=re.S)))
-    assert len(links) > 20
-    assert not [link for link in links if not ((root / page).parent / link).exists()]
-
-
-def test_readme_names_every_study(root: Path) -> None:
-    """The project's page names no study that is not there, and leaves none out."""
-    text = (root / "README.md").read_text(encoding="utf-8")
-    named = set(re.findall(r"\(studies/(\w+)/", text))
-    assert named == {record.study for record in summary.records()}
 
 
 def test_figures_follow_the_record(copied: Path) -> None:
