@@ -19,7 +19,7 @@ from lmshealth.errors import LmshealthError, NothingUsable
 from lmshealth.io.column_map import ColumnMap
 from lmshealth.io.log import Refusal
 from lmshealth.io.manifest import NOT_LOGS
-from lmshealth.report.fleet_page import IndexRow, file_names, worst_first, write_index
+from lmshealth.report.fleet_page import Summary, by_urgency, file_names, write_index
 from lmshealth.stage.description import Stage
 from lmshealth.tracking.maintenance import Maintenance, read_maintenance
 
@@ -72,7 +72,7 @@ class RunResult:
     ----------
     index : Path
         The front page of the report.
-    rows : tuple of IndexRow
+    rows : tuple of Summary
         One per machine, worst first.
     n_logs, n_refused, n_remembered : int
         Different logs found, refused as a whole, and taken from the store.
@@ -83,7 +83,7 @@ class RunResult:
     """
 
     index: Path
-    rows: tuple[IndexRow, ...]
+    rows: tuple[Summary, ...]
     n_logs: int
     n_refused: int
     n_remembered: int
@@ -199,7 +199,7 @@ def report(
     _prepare(out)
     told = store.told()
     files = file_names([one.machine for one in told])
-    rows, failed = dict[str, IndexRow](), dict[str, str]()
+    rows, failed = dict[str, Summary](), dict[str, str]()
     progress("reporting", 0, len(told))
     # A process takes longer to start than a page to write.
     few = replace(settings, workers=min(settings.workers, len(told)))
@@ -218,14 +218,14 @@ def report(
             if isinstance(telling, str):
                 failed[name] = telling
             else:
-                rows[name] = telling.page.row
+                rows[name] = telling.page.summary
             progress("reporting", len(rows) + len(failed), len(told))
     if not rows and not failed:
         raise StoreError(
             "the store holds only what another version of lmshealth kept; `lmshealth run LOGS "
             "--store URL` fills it anew"
         )
-    ranked = tuple(worst_first(rows.values()))
+    ranked = tuple(by_urgency(rows.values()))
     unread = "not readable for this version of lmshealth; run its logs again"
     return RunResult(
         index=write_index(out, ranked, store.refused(one.refused for one in told)),
@@ -284,10 +284,10 @@ def _report(
     site: Site,
     out: Path,
     failed: dict[str, str],
-) -> tuple[tuple[IndexRow, ...], set[str]]:
+) -> tuple[tuple[Summary, ...], set[str]]:
     """Write pages and tables; give the rows of the index, and logs left out of a life."""
     key = site.store.keep_refused(tuple(refused))
-    rows, contradicted = dict[str, IndexRow](), set[str]()
+    rows, contradicted = dict[str, Summary](), set[str]()
     site.progress("reporting", 0, len(machines))
     with Tables(out, [machine.name for machine in machines]) as tables:
         tables.add_refused(refused)
@@ -298,10 +298,10 @@ def _report(
             site.store.tell(name, keys[0], key, beside=keys)
             tables.add(name, telling.tables)
             contradicted |= set(telling.contradicted)
-            rows[name] = telling.page.row
+            rows[name] = telling.page.summary
             site.progress("reporting", len(rows), len(machines))
         tables.write()
-    return tuple(worst_first(rows.values())), contradicted
+    return tuple(by_urgency(rows.values())), contradicted
 
 
 def _told(

@@ -23,8 +23,8 @@ from lmshealth.batch.store import read
 from lmshealth.io.log import Refusal
 from lmshealth.report.assessment import Assessment
 from lmshealth.report.changes import Reported
-from lmshealth.report.machine_page import Page, page_of
-from lmshealth.report.tables import COLUMNS, Row, frame, refused_rows, tables_of
+from lmshealth.report.machine_page import Page, make_page
+from lmshealth.report.tables import COLUMNS, Row, frame, machine_tables, refused_rows
 from lmshealth.tracking.history import in_order
 
 # Threads of one worker share the settings of the library that draws.
@@ -73,9 +73,9 @@ def tell(content: Content) -> Telling | None:
     if assessment is None:
         return None
     with _DRAWING:
-        page = page_of(assessment, content.file, before=content.before)
+        page = make_page(assessment, content.file, before=content.before)
     readings = in_order(unpacked(content.logs))
-    rows = tables_of(readings, assessment) if readings else {}
+    rows = machine_tables(readings, assessment) if readings else {}
     return Telling(
         page=page,
         tables={name: Part.of(name, own) for name, own in rows.items() if own},

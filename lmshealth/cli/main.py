@@ -168,7 +168,7 @@ def error(ctx: click.Context, /, logs: tuple[Path, ...], style: str, **options: 
     Statistics are those of all samples, harmonics those of the longest stretch without gaps; json
     lists each of them. Their cosines, added up, rebuild the following error.
     """
-    from lmshealth.report.tables import LOOKS, error_row, frame, harmonics_rows, refused_rows
+    from lmshealth.report.tables import LOG_COLUMNS, error_row, frame, harmonics_rows, refused_rows
     from lmshealth.signal.following_error import read_error
 
     _, columns = _loaded(None, options["columns"])
@@ -187,7 +187,7 @@ def error(ctx: click.Context, /, logs: tuple[Path, ...], style: str, **options: 
     doubted = [refusal for _, its, _ in found for refusal in its]
     refused = refused_rows([*lost, *doubted])
     if style == "csv":
-        click.echo(frame(LOOKS["error"], rows).to_csv(index=False), nl=False)
+        click.echo(frame(LOG_COLUMNS["error"], rows).to_csv(index=False), nl=False)
     elif style == "json":
         terminal.print_json({"error": rows, "harmonics": kept, "refused": refused})
     else:
@@ -223,7 +223,7 @@ def spectrum(ctx: click.Context, /, logs: tuple[Path, ...], style: str, **option
     """
     from lmshealth.modal.acceleration_survey import survey
     from lmshealth.report.tables import (
-        LOOKS,
+        LOG_COLUMNS,
         frame,
         growth_rows,
         lines_rows,
@@ -243,7 +243,7 @@ def spectrum(ctx: click.Context, /, logs: tuple[Path, ...], style: str, **option
     doubted = [refusal for own in found for refusal in own.refused]
     refused = refused_rows([*lost, *doubted])
     if style == "csv":
-        click.echo(frame(LOOKS["magnitudes"], rows).to_csv(index=False), nl=False)
+        click.echo(frame(LOG_COLUMNS["magnitudes"], rows).to_csv(index=False), nl=False)
     elif style == "json":
         content = {"magnitudes": rows, "growth": growth_rows(growth), "lines": lines}
         terminal.print_json({**content, "refused": refused})

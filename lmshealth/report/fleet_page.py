@@ -44,7 +44,7 @@ _MONTHS = 12
 
 
 @dataclass(frozen=True, slots=True)
-class IndexRow:
+class Summary:
     """A stage on the front page: texts and a few numbers, so that all of a fleet can be kept.
 
     Attributes
@@ -97,7 +97,7 @@ class Month:
     count: int
 
 
-def index_row(assessment: Assessment, service: Service, file: str) -> IndexRow:
+def summarise(assessment: Assessment, service: Service, file: str) -> Summary:
     """Keep of an assessment what the front page says of it.
 
     Parameters
@@ -110,7 +110,7 @@ def index_row(assessment: Assessment, service: Service, file: str) -> IndexRow:
         Name of its page.
     """
     judgement, prognosis = assessment.judgement, assessment.prognosis
-    return IndexRow(
+    return Summary(
         file=file,
         identity=judgement.stage,
         urgency=assessment.urgency(service),
@@ -149,14 +149,14 @@ def file_names(identities: Iterable[str]) -> dict[str, str]:
     return names
 
 
-def worst_first(rows: Iterable[IndexRow]) -> list[IndexRow]:
+def by_urgency(rows: Iterable[Summary]) -> list[Summary]:
     """Sort rows by risk."""
     return sorted(rows, key=lambda row: row.urgency)
 
 
 def write_index(
     folder: Path,
-    rows: Iterable[IndexRow],
+    rows: Iterable[Summary],
     refused: Sequence[Refusal],
     *,
     generated: datetime | None = None,
@@ -167,14 +167,14 @@ def write_index(
     ----------
     folder : Path
         Where the pages of the stages are.
-    rows : iterable of IndexRow
+    rows : iterable of Summary
         One per stage.
     refused : sequence of Refusal
         Logs that belong to no stage.
     generated : datetime or None
         Moment to print on the page; nothing is printed for None.
     """
-    ranked = worst_first(rows)
+    ranked = by_urgency(rows)
     script = _script() if len(ranked) > _MANY else ""
     newest = max((row.last_log for row in ranked), default=date.min)
     text = render(
@@ -203,7 +203,7 @@ def _script() -> str:
     return path.read_text(encoding="utf-8")
 
 
-def _months(rows: Sequence[IndexRow], newest: date) -> list[Month]:
+def _months(rows: Sequence[Summary], newest: date) -> list[Month]:
     """Count the services that are due now, and in each month of a year; none where none is."""
     due = [row.service.by for row in rows if row.service.by is not None]
     newest = min(newest, date.max - timedelta(days=31 * (_MONTHS + 1)))

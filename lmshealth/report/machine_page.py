@@ -33,10 +33,10 @@ from lmshealth.report.figures import (
     plot_waterfall,
 )
 from lmshealth.report.fleet_page import (
-    IndexRow,
+    Summary,
+    by_urgency,
     file_names,
-    index_row,
-    worst_first,
+    summarise,
     write_index,
 )
 from lmshealth.report.fleetfacts import taught
@@ -86,16 +86,16 @@ class Page:
         Its name.
     text : str
         HTML.
-    row : IndexRow
+    summary : Summary
         What the front page says of the stage.
     """
 
     file: str
     text: str
-    row: IndexRow
+    summary: Summary
 
 
-def page_of(
+def make_page(
     assessment: Assessment,
     file: str,
     *,
@@ -119,7 +119,7 @@ def page_of(
     content = _first(assessment, service) | _evidence(assessment, service)
     content |= _changes(assessment, service, before)
     text = render("stage.html.j2", generated, **content)
-    return Page(file, text, index_row(assessment, service, file))
+    return Page(file, text, summarise(assessment, service, file))
 
 
 def write_report(
@@ -156,15 +156,15 @@ def write_report(
     rows = []
     for k, assessment in enumerate(assessments):
         before = (earlier or {}).get(assessment.judgement.stage)
-        page = page_of(assessment, f"{k}.part", before=before, generated=generated)
+        page = make_page(assessment, f"{k}.part", before=before, generated=generated)
         write_text(folder / page.file, page.text)
-        rows.append(page.row)
+        rows.append(page.summary)
     names = file_names(row.identity for row in rows)  # known only when all have been seen
     named = [replace(row, file=names[row.identity]) for row in rows]
     for row, final in zip(rows, named, strict=True):
         (folder / row.file).replace(folder / final.file)
     index = write_index(folder, named, refused, generated=generated)
-    return [*(folder / row.file for row in worst_first(named)), index]
+    return [*(folder / row.file for row in by_urgency(named)), index]
 
 
 def _first(assessment: Assessment, service: Service) -> dict[str, Any]:

@@ -124,7 +124,7 @@ def frame(columns: str, rows: Sequence[Row]) -> pd.DataFrame:
     return pd.DataFrame(list(rows), columns=list(order))
 
 
-def tables_of(readings: Sequence[Reading], assessment: Assessment) -> dict[str, list[Row]]:
+def machine_tables(readings: Sequence[Reading], assessment: Assessment) -> dict[str, list[Row]]:
     """List everything about one machine, by the name of the table, which is a file without ending.
 
     Parameters
@@ -326,7 +326,7 @@ def _rul(prognosis: Prognosis, column: int, days: FloatArray) -> Row:
 
 _MICRO, _MILLI, _NANO = 1e-6, 1e-3, 1e-9
 
-LOOKS = {
+LOG_COLUMNS = {
     "error": "log channel velocity_mm_s duration_s min_um max_um std_um mean_um n_harmonics "
     "bandwidth_hz lowest_hz highest_hz max_magnitude_um strongest_hz share_explained floor_nm "
     "n_above_floor bandwidth_above_floor_hz lowest_above_floor_hz highest_above_floor_hz "
@@ -404,7 +404,7 @@ def frf_rows(log: str, reading: FrfReading) -> list[Row]:
     ):
         columns |= {f"{name}gain": np.abs(response), f"{name}phase_rad": np.angle(response)}
     columns |= {"gain_std": frf.std, "coherence": frf.coherence}
-    names = LOOKS["frf"].split()[1:]
+    names = LOG_COLUMNS["frf"].split()[1:]
     rows = zip(*(columns[name].tolist() for name in names), strict=True)
     return [{"log": log, **dict(zip(names, row, strict=True))} for row in rows]
 
@@ -498,7 +498,7 @@ def plan_rows(plans: Sequence[Plan]) -> dict[str, list[Row]]:
     ]
     efforts = [(p.parameter, p.loss, *astuple(effort)) for p in plans for effort in p.efforts]
     return {
-        name: [dict(zip(LOOKS[name].split(), row, strict=True)) for row in rows]
+        name: [dict(zip(LOG_COLUMNS[name].split(), row, strict=True)) for row in rows]
         for name, rows in (("detect", asked), ("plan", efforts))
     }
 

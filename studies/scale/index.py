@@ -29,7 +29,7 @@ from typing import Any
 
 import numpy as np
 
-from lmshealth.report.fleet_page import IndexRow, write_index
+from lmshealth.report.fleet_page import Summary, write_index
 from studies.record import Study
 from studies.scale.rows import make_refused, make_rows
 
@@ -56,7 +56,7 @@ _TYPE = """(sought) => {
 }"""
 
 
-def bare(rows: Sequence[IndexRow]) -> str:
+def bare(rows: Sequence[Summary]) -> str:
     """Write the words of the rows as the plainest table."""
     lines = []
     for row in rows:

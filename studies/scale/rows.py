@@ -10,7 +10,7 @@ import numpy as np
 from lmshealth.io.log import Refusal
 from lmshealth.prognosis.maintenance_decision import Service
 from lmshealth.report.brief import Brief
-from lmshealth.report.fleet_page import IndexRow
+from lmshealth.report.fleet_page import Summary
 from lmshealth.report.healthfacts import Gauge, Life, Tone
 from lmshealth.report.text import GAP, day_count, km, percent
 
@@ -23,7 +23,7 @@ WORN, YOUNG = 25, 40
 REASONS = ("no stage", "unreadable", "time axis", "no channel")
 
 
-def make_rows(n: int, seed: int = 0) -> list[IndexRow]:
+def make_rows(n: int, seed: int = 0) -> list[Summary]:
     """Invent so many stages: most are healthy, a few worn, a few too young for a verdict."""
     rng = np.random.default_rng(seed)
     return [_row(k, rng) for k in range(n)]
@@ -37,7 +37,7 @@ def make_refused(n: int) -> list[Refusal]:
     ]
 
 
-def _row(k: int, rng: np.random.Generator) -> IndexRow:
+def _row(k: int, rng: np.random.Generator) -> Summary:
     identity = f"LINE{k // 100:02d}-M{k:04d}-{'XY'[k % 2]}"
     worn, young = k % WORN == 3, k % YOUNG == 7
     level = rng.uniform(0.66, 0.9, 2) if worn else rng.uniform(0.94, 1.03, 2)
@@ -50,7 +50,7 @@ def _row(k: int, rng: np.random.Generator) -> IndexRow:
     service = _service(None if young else days)
     likely = "" if young else percent(rng.uniform(0.8, 1))
     gauges = () if young else tuple(map(_gauge, LIMITS, level, rng.uniform(0.01, 0.04, 2)))
-    return IndexRow(
+    return Summary(
         file=f"{identity}.html",
         identity=identity,
         urgency=(1 if young else 2 if service.kind == "later" else 0, days, 0.0, identity),

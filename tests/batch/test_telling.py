@@ -94,7 +94,7 @@ def test_a_page_is_told_without_tables_where_there_are_no_logs(tmp_path: Path) -
     made = packed(worn(tmp_path))
     told = tell(Content("M7-Y", "M7-Y.html", made.content, (), None))
     assert told is not None
-    assert (told.page.file, told.page.row.identity) == ("M7-Y.html", "M7-Y")
+    assert (told.page.file, told.page.summary.identity) == ("M7-Y.html", "M7-Y")
     assert told.tables == {}
     assert tell(Content("M7-Y", "M7-Y.html", b"nonsense", (), None)) is None
     assert tell(Content("M7-Y", "M7-Y.html", None, (), None)) is None

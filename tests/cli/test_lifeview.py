@@ -14,7 +14,7 @@ from lmshealth.prognosis.maintenance_decision import decide, reached_before
 from lmshealth.prognosis.results import LawWeight, Prognosis
 from lmshealth.report.assessment import Assessment
 from lmshealth.report.brief import due, life_brief
-from lmshealth.report.fleet_page import index_row, worst_first
+from lmshealth.report.fleet_page import by_urgency, summarise
 from lmshealth.report.tables import prognosis_rows
 from lmshealth.stage.description import Decision
 from tests.lives import START, make_prognosis
@@ -40,7 +40,7 @@ def shown(life: Prognosis, decision: Decision, said: Said, by: date | None = Non
 
 def print_fleet(assessments: Sequence[Assessment]) -> None:
     """Print what a run says of machines."""
-    rows = worst_first(index_row(one, one.service(), "") for one in assessments)
+    rows = by_urgency(summarise(one, one.service(), "") for one in assessments)
     print_briefs([row.brief for row in rows])
 
 

@@ -15,10 +15,10 @@ import pytest
 from lmshealth._serialize import pack, unpack
 from lmshealth.report.assessment import Assessment
 from lmshealth.report.fleet_page import (
-    IndexRow,
+    Summary,
+    by_urgency,
     file_names,
-    index_row,
-    worst_first,
+    summarise,
     write_index,
 )
 from studies.scale.rows import TODAY, make_refused, make_rows
@@ -29,16 +29,16 @@ __all__ = ["make"]
 N = 60
 
 
-def row_of(assessment: Assessment) -> IndexRow:
+def row_of(assessment: Assessment) -> Summary:
     """Return the row of a stage."""
-    return index_row(assessment, assessment.service(), "stage.html")
+    return summarise(assessment, assessment.service(), "stage.html")
 
 
 def test_rows_go_to_other_processes_and_into_a_store(make: Callable[..., Assessment]) -> None:
     """Packed or pickled a row comes back as it was, infinite lives and missing ones too."""
     for assessment in (make(), blind(make()), nothing(make()), make(wear_km=400000, floor=0.98)):
         row = row_of(assessment)
-        for again in (unpack(pack(row), IndexRow), pickle.loads(pickle.dumps(row))):
+        for again in (unpack(pack(row), Summary), pickle.loads(pickle.dumps(row))):
             assert list(leaves(again)) == list(leaves(row))
 
 
@@ -190,7 +190,7 @@ def test_states_and_dates_filter(browser: Any, fleet: Path) -> None:
 def test_columns_sort(browser: Any, fleet: Path) -> None:
     """Numbers sort as numbers, names as people count, what is missing goes last both ways."""
     page, _ = watch(browser, fleet)
-    worst = [row.identity for row in worst_first(make_rows(N))]
+    worst = [row.identity for row in by_urgency(make_rows(N))]
     assert seen_rows(page)[:3] == worst[:3]
     head = page.get_by_role("columnheader", name="Guide preload")
 

@@ -26,7 +26,7 @@ from lmshealth.report import figures as plots
 from lmshealth.report.assessment import Assessment
 from lmshealth.report.changes import reported
 from lmshealth.report.fleet_page import write_index
-from lmshealth.report.machine_page import page_of, write_report
+from lmshealth.report.machine_page import make_page, write_report
 from lmshealth.stage.description import Decision, Stage, load_stage
 from lmshealth.tracking.covariate_effects import find_influences
 from lmshealth.tracking.results import Series
@@ -427,9 +427,9 @@ def test_a_page_needs_no_other_one(make: Maker, tmp_path: Path) -> None:
     """Made alone, the same page and the same rows come out."""
     stages = [make(), nothing(make("M8-Y"))]
     *pages, index = write_report(tmp_path / "a", stages, ())
-    alone = [page_of(stage, path.name) for stage, path in zip(stages, pages, strict=True)]
+    alone = [make_page(stage, path.name) for stage, path in zip(stages, pages, strict=True)]
     assert [page.text for page in alone] == [path.read_text(encoding="utf-8") for path in pages]
-    again = write_index(tmp_path, [page.row for page in alone[::-1]], ())
+    again = write_index(tmp_path, [page.summary for page in alone[::-1]], ())
     assert again.read_bytes() == index.read_bytes()
 
 
@@ -439,7 +439,7 @@ def test_the_service_is_decided_once_per_page(make: Maker, monkeypatch: pytest.M
     assessment, asked = make(), []
     decided = assessment.service()
     monkeypatch.setattr(Assessment, "service", lambda self: asked.append(self) or decided)
-    page_of(assessment, "a.html", before=reported(assessment, decided))
+    make_page(assessment, "a.html", before=reported(assessment, decided))
     assert asked == [assessment]
 
 

@@ -19,10 +19,10 @@ from lmshealth.report.assessment import Assessment
 from lmshealth.report.tables import (
     COLUMNS,
     frame,
+    machine_tables,
     modes_rows,
     prognosis_rows,
     refused_rows,
-    tables_of,
     track_rows,
 )
 from lmshealth.signal.spectral_lines import Line
@@ -124,7 +124,7 @@ def tables(stage: Stage, remaining: np.ndarray) -> dict[str, pd.DataFrame]:
 
 def frames(readings: Sequence[Reading], made: Assessment) -> dict[str, pd.DataFrame]:
     """Make the tables of one machine."""
-    rows = tables_of(readings, made)
+    rows = machine_tables(readings, made)
     return {name: frame(COLUMNS[name], own) for name, own in rows.items()}
 
 
