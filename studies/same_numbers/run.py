@@ -41,9 +41,7 @@ def main() -> None:
     """Run both revisions and compare their answers."""
     parser = options(__doc__)
     parser.add_argument("--before", default="before-house", help="revision to compare with")
-    parser.add_argument(
-        "--keep", type=Path, help="folder for inputs and earlier answers"
-    )
+    parser.add_argument("--keep", type=Path, help="folder for inputs and earlier answers")
     chosen = parser.parse_args()
     study = Study(__file__, __doc__, chosen)
     with tempfile.TemporaryDirectory() as temporary:
