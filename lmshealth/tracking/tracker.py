@@ -281,7 +281,8 @@ class _Follower:
         self.found.alarmed = True
         mean, cov = bank.collapse(self.record.mean.shape[1])
         contrast = self.filters.space.drift()
-        drift, std = contrast @ mean, np.sqrt(np.diag(contrast @ cov @ contrast.T))
+        drift = contrast @ mean
+        std = np.sqrt(np.maximum(np.diag(contrast @ cov @ contrast.T), 0.0))
         i = int(np.argmax(np.abs(drift) / np.maximum(std, 1e-12)))
         self.found.events.append(
             Event(
@@ -310,9 +311,13 @@ class _Follower:
             still = (clock == clock[first]) & (np.arange(clock.size) > first) & (spread < _ROUNDING)
             still[first] = True
             drift[still], drift_cov[still] = 0.0, 0.0
+        # A variance of nearly zero may become negative by rounding, and then has no covariances.
+        negative = np.einsum("kmm->km", drift_cov) < 0
+        drift_cov[negative[:, :, None] | negative[:, None, :]] = 0.0
         self._settle(len(history.logs))
         widening = record.widening
-        std = np.sqrt(np.einsum("kii->ki", record.cov)) * widening[:, None]
+        variance = np.maximum(np.einsum("kii->ki", record.cov), 0.0)
+        std = np.sqrt(variance) * widening[:, None]
         unseen = self._unseen()
         record.mean[unseen], std[unseen] = np.nan, np.nan
         return Track(
