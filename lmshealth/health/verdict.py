@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
 from datetime import datetime
+from itertools import compress
 from typing import Literal
 
 import numpy as np
@@ -15,7 +17,24 @@ from lmshealth.health.results import Health
 from lmshealth.stage.description import ParameterSpec, Stage
 from lmshealth.tracking.results import Event, History, Track
 
-Verdict = Literal["healthy", "preload", "mount", "both", "step", "not-enough-data"]
+_WITHOUT_LOSS = ("healthy", "step", "not-enough-data")
+
+
+def verdict_of(words: tuple[str, ...]) -> str:
+    """Return the verdict for the words of the degraded parameters.
+
+    ``healthy`` without any, ``both`` for preload and mount, else the words joined by ``+``.
+    """
+    if set(words) == {"preload", "mount"}:
+        return "both"
+    return "+".join(words) or "healthy"
+
+
+def degraded_words(verdict: str) -> tuple[str, ...]:
+    """Return the words of the parameters that a verdict reports as degraded."""
+    if verdict == "both":
+        return "preload", "mount"
+    return () if verdict in _WITHOUT_LOSS else tuple(verdict.split("+"))
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,7 +48,8 @@ class Judgement:
     recorded_at : datetime
         The last log.
     verdict : str
-        One of the words of ``verdict.csv``.
+        ``healthy``, ``step``, ``not-enough-data``, or what `verdict_of` returns for the degraded
+        parameters.
     probability : float
         Posterior probability of that word; NaN for ``not-enough-data``.
     why : str
@@ -38,7 +58,7 @@ class Judgement:
 
     stage: str
     recorded_at: datetime
-    verdict: Verdict
+    verdict: str
     probability: float
     why: str
 
@@ -174,25 +194,19 @@ def _judge_step(
 
 def _judge_posterior(stage: Stage, history: History, health: Health) -> Judgement:
     told = np.flatnonzero(health.told()).tolist()
-    lost: dict[str, BoolArray] = {
-        word: np.zeros(health.samples.shape[1], dtype=bool) for word in ("preload", "mount")
-    }
+    lost: dict[str, BoolArray] = {}
     for j in told:
         parameter = stage.parameters[j]
-        lost[parameter.word] |= health.samples[-1, :, j] < degraded_below(parameter)
-    preload, mount = lost["preload"], lost["mount"]
-    probabilities: dict[Verdict, float] = {
-        "healthy": float(np.mean(~preload & ~mount)),
-        "preload": float(np.mean(preload & ~mount)),
-        "mount": float(np.mean(mount & ~preload)),
-        "both": float(np.mean(preload & mount)),
-    }
-    verdict = max(probabilities, key=lambda word: probabilities[word])
+        below = health.samples[-1, :, j] < degraded_below(parameter)
+        lost[parameter.word] = lost.get(parameter.word, False) | below
+    draws = Counter(map(tuple, np.column_stack(list(lost.values())).tolist()))
+    # Of equally probable verdicts the one with fewer degraded parameters.
+    degraded, count = max(draws.items(), key=lambda one: (one[1], -sum(one[0]), one[0]))
     return Judgement(
         stage=history.stage,
         recorded_at=history.recorded_at[-1],
-        verdict=verdict,
-        probability=probabilities[verdict],
+        verdict=verdict_of(tuple(compress(lost, degraded))),
+        probability=count / health.samples.shape[1],
         why=_why(stage, health, told),
     )
 

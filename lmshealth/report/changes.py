@@ -7,19 +7,12 @@ from datetime import date, datetime
 
 import numpy as np
 
-from lmshealth.health.verdict import Verdict
+from lmshealth.health.verdict import degraded_words
 from lmshealth.prognosis.maintenance_decision import Service
 from lmshealth.report.assessment import Assessment
 from lmshealth.report.text import GAP, LEVELS, km, left, percent, quantiles, spell
 
-_WORDS: dict[Verdict, str] = {
-    "healthy": "healthy",
-    "preload": "loss of preload",
-    "mount": "loss of mount stiffness",
-    "both": "loss of preload and mount stiffness",
-    "step": "a sudden change",
-    "not-enough-data": "not enough data",
-}
+_WORDS = {"step": "a sudden change", "not-enough-data": "not enough data"}
 
 Interval = tuple[float, float, float]
 """The 5, 50 and 95 % quantiles of something."""
@@ -42,7 +35,7 @@ class Reported:
     travel : float
         Odometer at the last log in m, NaN without one.
     verdict : str
-        One of the words of ``verdict.csv``.
+        As in ``verdict.csv``.
     probability : float
         Of that word; NaN for ``not-enough-data``.
     health : dict of str to tuple of float
@@ -60,7 +53,7 @@ class Reported:
     description: str
     n_logs: int
     travel: float
-    verdict: Verdict
+    verdict: str
     probability: float
     health: dict[str, Interval]
     remaining: Interval | None
@@ -150,7 +143,12 @@ def _verdict(before: Reported, now: Reported) -> str:
 
 def _sure(report: Reported) -> str:
     sure = f" ({percent(report.probability)})" if report.probability >= 0 else ""
-    return _WORDS[report.verdict] + sure
+    # A report keeps the words of its parameters, not their names.
+    names = [
+        "mount stiffness" if w == "mount" else spell(w) for w in degraded_words(report.verdict)
+    ]
+    lost = f"loss of {' and '.join(names)}" if names else report.verdict
+    return _WORDS.get(report.verdict, lost) + sure
 
 
 def _health(before: Reported, now: Reported) -> list[str]:

@@ -8,6 +8,7 @@ from typing import Any, Literal
 import numpy as np
 
 from lmshealth.health.results import Health
+from lmshealth.health.verdict import degraded_words
 from lmshealth.prognosis.maintenance_decision import Service, remaining_days
 from lmshealth.prognosis.results import Prognosis
 from lmshealth.report.assessment import Assessment
@@ -78,7 +79,7 @@ def verdict_words(assessment: Assessment) -> str:
     }
     if verdict in words:
         return words[verdict]
-    lost = ("preload", "mount") if verdict == "both" else (verdict,)
+    lost = degraded_words(verdict)
     names = [spell(spec.name) for spec in assessment.stage.parameters if spec.word in lost]
     return f"Loss of {' and '.join(names) or verdict}"
 

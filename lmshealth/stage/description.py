@@ -14,7 +14,7 @@ from fnmatch import fnmatchcase
 from functools import cached_property
 from importlib import resources
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 import numpy as np
 from msgspec import Meta, Struct
@@ -40,6 +40,9 @@ Name = Annotated[
 CostRatio = Annotated[float, Meta(gt=1, le=sys.float_info.max)]
 
 _MAX_RISK = 0.05
+# Words of verdict.csv for the parameters of lms-x and lms-y, and those that name no parameter.
+_WORDS = {"guide_preload": "preload", "mount_stiffness": "mount"}
+_RESERVED = ("healthy", "both", "step", "not-enough-data")
 
 
 class _Part(Struct, frozen=True, forbid_unknown_fields=True):
@@ -80,9 +83,8 @@ class Limit(_Part, frozen=True):
 class ParameterSpec(_Part, frozen=True):
     """A health parameter to infer.
 
-    ``law`` may be several, of which it follows one. ``verdict`` is the word of verdict.csv that its
-    loss is told by; by default ``preload`` for a parameter with preload in its name and ``mount``
-    for any other.
+    ``law`` may list several laws, of which the parameter follows one. ``verdict`` overrides the
+    word by which verdict.csv names its loss.
     """
 
     name: Name
@@ -91,7 +93,7 @@ class ParameterSpec(_Part, frozen=True):
     unit: Name = ""
     limit: Limit | None = None
     law: AnyLaw | Annotated[tuple[AnyLaw, ...], Meta(min_length=1)] = Unchanging()
-    verdict: Literal["preload", "mount", ""] = ""
+    verdict: Name = ""
 
     @property
     def laws(self) -> tuple[AnyLaw, ...]:
@@ -99,9 +101,9 @@ class ParameterSpec(_Part, frozen=True):
         return self.law if isinstance(self.law, tuple) else (self.law,)
 
     @property
-    def word(self) -> Literal["preload", "mount"]:
-        """The word of verdict.csv that stands for a loss of this parameter."""
-        return self.verdict or ("preload" if "preload" in self.name else "mount")
+    def word(self) -> str:
+        """Word of verdict.csv for a loss of this parameter: by default its name."""
+        return self.verdict or _WORDS.get(self.name, self.name)
 
 
 class MapSpec(_Part, frozen=True):
@@ -390,6 +392,12 @@ def _troubles(description: Description) -> Iterator[tuple[Keys, str]]:
 
 def _parameter_troubles(k: int, parameter: ParameterSpec) -> Iterator[tuple[Keys, str]]:
     """Say what is wrong within a parameter, the k-th."""
+    if parameter.word in _RESERVED or "+" in parameter.word:
+        yield (
+            ("parameter", k, "verdict" if parameter.verdict else "name"),
+            f"{parameter.word!r} cannot name a lost parameter in verdict.csv: no "
+            f"{', '.join(_RESERVED)} and no '+'; choose another name, or set verdict",
+        )
     kinds = [law.kind for law in parameter.laws]
     for j, kind in enumerate(kinds):
         if kind in kinds[:j]:

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from lmshealth._arrays import FloatArray
-from lmshealth.health.verdict import degraded_below, judge
+from lmshealth.health.verdict import degraded_below, degraded_words, judge, verdict_of
 from lmshealth.stage.description import Stage, load_stage
 from lmshealth.tracking.results import Event, History, Track
 from tests.lives import (
@@ -74,6 +74,31 @@ def test_the_probability_is_the_share_of_the_draws(stage: Stage) -> None:
     samples[:6, 0] = 0.8
     found = judge(stage, logs(8), make_health(samples))
     assert (found.verdict, found.probability) == ("preload", pytest.approx(0.6))
+
+
+NAMES = ("guide_preload", "mount_stiffness", "foot")
+
+
+@pytest.mark.parametrize(
+    ("health", "verdict"),
+    [
+        ((0.99, 1.0, 1.0), "healthy"),
+        ((0.99, 1.0, 0.7), "foot"),
+        ((0.7, 1.0, 0.7), "preload+foot"),
+        ((0.7, 0.7, 1.0), "both"),
+        ((0.7, 0.7, 0.7), "preload+mount+foot"),
+    ],
+)
+def test_a_verdict_names_every_degraded_parameter(
+    tmp_path: Path, health: tuple[float, ...], verdict: str
+) -> None:
+    """A parameter that is neither preload nor mount is named as the description names it."""
+    three = make_stage(tmp_path, (PRELOAD, MOUNT, FOOT))
+    draws = np.random.default_rng(1).normal(health, 0.005, (1000, 3))
+    found = judge(three, logs(8), make_health(draws, parameters=NAMES, informed=(0.9,) * 3))
+    assert found.verdict == verdict
+    assert verdict_of(degraded_words(verdict)) == verdict
+    assert found.probability > 0.99
 
 
 def test_a_parameter_the_logs_do_not_tell_is_left_out(stage: Stage) -> None:

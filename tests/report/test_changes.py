@@ -65,6 +65,9 @@ def test_nothing_new_is_said_as_such() -> None:
         "Service date: still 2027-03-03.",
         "As many logs as then.",
     ]
+    coupling = replace(THEN, verdict="mount+coupling_stiffness")
+    loss = "Verdict was healthy (93 %), now loss of mount stiffness and coupling stiffness (93 %)."
+    assert told(coupling)[0] == loss
     assert told(replace(THEN, probability=0.8))[0] == "Verdict still healthy (80 %), then 93 %."
 
 

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from msgspec import structs
 
-from lmshealth.health.verdict import Verdict
 from lmshealth.report.assessment import Assessment
 from lmshealth.report.healthfacts import (
     first_limit,
@@ -36,11 +35,12 @@ Maker = Callable[..., Assessment]
         ("preload", "Loss of guide preload", "bad"),
         ("mount", "Loss of mount stiffness", "bad"),
         ("both", "Loss of guide preload and mount stiffness", "bad"),
+        ("mount+foot", "Loss of mount stiffness", "bad"),
         ("step", "A sudden change that nothing explains", "bad"),
         ("not-enough-data", "Not enough data for a verdict", "open"),
     ],
 )
-def test_every_verdict_has_words(make: Maker, verdict: Verdict, words: str, colour: str) -> None:
+def test_every_verdict_has_words(make: Maker, verdict: str, words: str, colour: str) -> None:
     """A loss names the parameters of the description that its word stands for."""
     assessment = make()
     judgement = replace(assessment.judgement, verdict=verdict)

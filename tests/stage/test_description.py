@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -227,12 +228,20 @@ def test_logs_find_their_description(tmp_path: Path) -> None:
     assert not stage.takes(Metadata(stage="AX-X", description="large"))
 
 
-def test_a_parameter_is_told_by_preload_or_mount(tmp_path: Path) -> None:
-    """The word of a verdict comes from the name unless it is stated; no law means unchanging."""
-    words = FOOT + 'verdict = "preload"\n'
-    stage = make_stage(tmp_path, (PRELOAD, MOUNT, words))
-    assert [p.word for p in stage.parameters] == ["preload", "mount", "preload"]
+def test_a_verdict_names_a_parameter_by_its_name(tmp_path: Path) -> None:
+    """Two names are shortened, and any word may be stated; no law means unchanging."""
+    stage = make_stage(tmp_path, (PRELOAD, MOUNT, FOOT))
+    assert [p.word for p in stage.parameters] == ["preload", "mount", "foot"]
+    stage = make_stage(tmp_path, (PRELOAD, MOUNT, FOOT + 'verdict = "preload"\n'))
+    assert stage.parameters[2].word == "preload"
     assert stage.parameters[2].laws == (Unchanging(),)
+
+
+@pytest.mark.parametrize("word", ["healthy", "both", "a+b"])
+def test_a_word_with_another_meaning_in_verdicts_is_refused(tmp_path: Path, word: str) -> None:
+    """The message names line and key."""
+    with pytest.raises(BadStage, match=rf"line \d+: parameter\[0\]\.verdict: '{re.escape(word)}'"):
+        make_stage(tmp_path, (PRELOAD + f'verdict = "{word}"\n',))
 
 
 WEAR = PRELOAD[PRELOAD.index('{ kind = "hertz-wear"') :].rstrip()
