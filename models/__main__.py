@@ -15,21 +15,21 @@ from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 
-from models.degradation import LIVES
+from models.dynamics.margins import GAIN_MARGIN_DB, PHASE_MARGIN_DEG, TABLE_1, cases, margin_record
+from models.dynamics.modal_map import modal_map
+from models.dynamics.mode_shapes import body_motions, participation, strain_energy
+from models.dynamics.plant import SENSORS, closed_loop_modes
+from models.dynamics.stages import NOMINAL, Condition, stage_named
 from models.errors import ModelError
-from models.faults import FAULTS
-from models.formats import WRITERS, format_of, write_log
-from models.lives import UNTIL, Plan, simulate_life
-from models.machines import machine_identity, stream
-from models.mapping import modal_map
-from models.margins import GAIN_MARGIN_DB, PHASE_MARGIN_DEG, TABLE_1, cases, margin_record
-from models.plant import SENSORS, closed_loop_modes
-from models.recording import signal_to_noise
-from models.shapes import body_motions, participation, strain_energy
-from models.stages import NOMINAL, Condition, stage_named
-from models.strokes import VELOCITIES, WINDOW_S
-from models.sweep import Sweep, record_sweep
-from models.velocities import Experiment, drive_velocities
+from models.lives.degradation import LIVES
+from models.lives.faults import FAULTS
+from models.lives.simulation import UNTIL, Plan, simulate_life
+from models.recordings.formats import WRITERS, format_of, write_log
+from models.recordings.machines import machine_identity, stream
+from models.recordings.recording import signal_to_noise
+from models.recordings.strokes import VELOCITIES, WINDOW_S
+from models.recordings.sweep import Sweep, record_sweep
+from models.recordings.velocities import Experiment, drive_velocities
 
 _TABLE_WIDTH = 100
 _EXAMPLES = {

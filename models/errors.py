@@ -65,6 +65,16 @@ class BadParameter(ModelError):
         super().__init__(f"{name} is {got}; needed: {needed}")
 
 
+class MissingLibrary(ModelError):
+    """A library of an extra that is not installed."""
+
+    def __init__(self, library: str, extra: str) -> None:
+        self.library = library
+        super().__init__(
+            f"the simulated stages need the library {library}: pip install 'lmshealth[{extra}]'"
+        )
+
+
 class OccupiedFolder(ModelError):
     """A folder that holds logs which a run would leave beside its own."""
 

@@ -14,11 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lmshealth.tracking.results import History, Series, Step
-from models.degradation import draw_laws
-from models.lives import Plan, Visit, schedule
-from models.plant import GUIDE_MODES, closed_loop_modes
-from models.recording import payload_kg
-from models.stages import NOMINAL, Condition, stage_named
+from models.dynamics.plant import GUIDE_MODES, closed_loop_modes
+from models.dynamics.stages import NOMINAL, Condition, stage_named
+from models.lives.degradation import draw_laws
+from models.lives.simulation import Plan, Visit, schedule
+from models.recordings.recording import payload_kg
 
 Array = NDArray[np.float64]
 

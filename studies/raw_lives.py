@@ -15,8 +15,8 @@ from lmshealth import identify, read_log
 from lmshealth.io.manifest import find_logs, read_manifest
 from lmshealth.signal.following_error import loop_error
 from lmshealth.stage.description import load_stage
-from models.lives import Plan, simulate_life
-from models.plant import GUIDE_MODES
+from models.dynamics.plant import GUIDE_MODES
+from models.lives.simulation import Plan, simulate_life
 from studies.lives import Estimates, Life, life_of, plan_of
 from studies.resume import Trials
 

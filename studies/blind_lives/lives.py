@@ -11,10 +11,10 @@ import pandas as pd
 
 from lmshealth.health.verdict import degraded_below
 from lmshealth.stage.description import Stage, load_stage
-from models.degradation import LIVES, Delayed, Law, Steady, Stepped
-from models.lives import Plan, schedule
-from models.machines import machine_identity
-from models.stages import stage_named
+from models.dynamics.stages import stage_named
+from models.lives.degradation import LIVES, Delayed, Law, Steady, Stepped
+from models.lives.simulation import Plan, schedule
+from models.recordings.machines import machine_identity
 
 Row = dict[str, Any]
 

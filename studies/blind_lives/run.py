@@ -51,7 +51,7 @@ from typing import Any
 
 import pandas as pd
 
-from models.lives import simulate_life
+from models.lives.simulation import simulate_life
 from studies.blind_lives import judging
 from studies.blind_lives.answers import agrees, analyse
 from studies.blind_lives.lives import SEED, BlindPlan, plan_of, truth_of

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 
 from lmshealth import identify_decays, load_stage, read_log
-from models.plant import Mode, closed_loop_modes
-from models.stages import STAGES
-from models.velocities import Experiment, drive_velocities
+from models.dynamics.plant import Mode, closed_loop_modes
+from models.dynamics.stages import STAGES
+from models.recordings.velocities import Experiment, drive_velocities
 
 VELOCITIES = (0.1, 0.4)
 

@@ -41,8 +41,8 @@ from lmshealth.health.importance_sampling import explore_well
 from lmshealth.stage.description import Stage, load_stage
 from lmshealth.stage.identifiability import sight_of
 from lmshealth.stage.planning import plan
-from models.lives import Plan
-from models.plant import GUIDE_MODES
+from models.dynamics.plant import GUIDE_MODES
+from models.lives.simulation import Plan
 from studies.cramer_rao import long_record_law
 from studies.lives import Array, life_of, rng_of
 from studies.metrics import clopper_pearson

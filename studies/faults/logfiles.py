@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import decimate
 
-from models.recording import SAMPLE_RATE_HZ, record
-from models.stages import STAGES
+from models.dynamics.stages import STAGES
+from models.recordings.recording import SAMPLE_RATE_HZ, record
 
 Columns = dict[str, NDArray[np.float32]]
 MACHINES = tuple(f"damaged-{letter}-Y" for letter in "ABCDEF")

@@ -42,9 +42,9 @@ from lmshealth import read_frf, read_log
 from lmshealth.io.column_map import load_columns
 from lmshealth.io.log import Channel, ChannelKind, Log, Metadata
 from lmshealth.modal.frf.identification import FrfReading
-from models.formats import write_log
-from models.stages import stage_named
-from models.sweep import Sweep, record_sweep, without_loop
+from models.dynamics.stages import stage_named
+from models.recordings.formats import write_log
+from models.recordings.sweep import Sweep, record_sweep, without_loop
 from studies.frf_modes.records import (
     BAND,
     BENCH,

@@ -15,10 +15,10 @@ from lmshealth.prognosis.scenarios import courses_of
 from lmshealth.stage.description import Stage, load_stage
 from lmshealth.stage.identifiability import identifiable, sight_of
 from lmshealth.stage.modal_map import ModalMap, read_map
-from models.lives import Visit, schedule
-from models.mapping import modal_map
-from models.plant import GUIDE_MODES
-from models.stages import stage_named
+from models.dynamics.modal_map import modal_map
+from models.dynamics.plant import GUIDE_MODES
+from models.dynamics.stages import stage_named
+from models.lives.simulation import Visit, schedule
 from studies.lives import HEALTHY, Array, Estimates, Life, life_of, life_with, plan_of
 from studies.sbc_life.run import always_losing
 

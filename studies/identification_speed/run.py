@@ -29,9 +29,9 @@ from scipy import fft
 
 from lmshealth import identify, load_stage, read_log
 from lmshealth.io.log import Log
-from models.formats import write_log
-from models.recording import Recording, record
-from models.stages import stage_named
+from models.dynamics.stages import stage_named
+from models.recordings.formats import write_log
+from models.recordings.recording import Recording, record
 from studies.identification.cases import CASES
 from studies.identification.records import describe
 from studies.record import Study

@@ -9,8 +9,8 @@ import numpy as np
 from lmshealth.stage.degradation_laws import HertzWear as WearLaw
 from lmshealth.stage.degradation_laws import Loosening as LooseningLaw
 from lmshealth.stage.description import ParameterSpec, load_stage
-from models.degradation import HertzWear, Law, Life, Loosening, Steady
-from models.lives import Plan
+from models.lives.degradation import HertzWear, Law, Life, Loosening, Steady
+from models.lives.simulation import Plan
 
 STAGE, N_LOGS, SECONDS = "lms-y", 30, 20.0
 # Beyond the map, which nobody can be asked about: the last odometer of any life in km, and how

@@ -14,9 +14,9 @@ from lmshealth import load_stage, read_log
 from lmshealth.io.log import Log
 from lmshealth.signal.segments import find_segments
 from lmshealth.signal.spectral_lines import find_lines, survey_lines
-from models.formats import write_log
-from models.stages import STAGES, stage_named
-from models.strokes import full_stroke, record_strokes
+from models.dynamics.stages import STAGES, stage_named
+from models.recordings.formats import write_log
+from models.recordings.strokes import full_stroke, record_strokes
 from studies.line_test.signals import (
     BAND,
     FLOOR,

@@ -35,8 +35,8 @@ from lmshealth.health.inference import infer, infer_together
 from lmshealth.health.results import Health
 from lmshealth.stage.description import Stage, load_stage
 from lmshealth.tracking.read_tables import Drifts
-from models.mapping import guide_frequencies
-from models.stages import stage_named
+from models.dynamics.modal_map import guide_frequencies
+from models.dynamics.stages import stage_named
 from studies.commands import short_chains
 from studies.metrics import coverage
 from studies.record import LEVEL, Study, as_row

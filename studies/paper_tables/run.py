@@ -25,7 +25,7 @@ from typing import Any
 import numpy as np
 from scipy.stats import spearmanr
 
-from models.strokes import WINDOW_S
+from models.recordings.strokes import WINDOW_S
 from studies.paper_tables.tables import (
     FILES,
     PRINTED_GROWING,

@@ -11,13 +11,13 @@ import pandas as pd
 from numpy.typing import NDArray
 from scipy.signal import find_peaks
 
-from models.equations import controller
-from models.margins import cases, margin_record
-from models.plant import closed_loop_modes
-from models.recording import Recording, record
-from models.stages import STAGES
-from models.strokes import VELOCITIES, full_stroke, record_strokes
-from models.sweep import Sweep, record_sweep
+from models.dynamics.equations import controller
+from models.dynamics.margins import cases, margin_record
+from models.dynamics.plant import closed_loop_modes
+from models.dynamics.stages import STAGES
+from models.recordings.recording import Recording, record
+from models.recordings.strokes import VELOCITIES, full_stroke, record_strokes
+from models.recordings.sweep import Sweep, record_sweep
 
 Array = NDArray[np.float64]
 

@@ -17,7 +17,7 @@ from lmshealth.signal.acceleration_levels import (
     read_magnitudes,
 )
 from lmshealth.stage.description import load_stage
-from models.strokes import VELOCITIES
+from models.recordings.strokes import VELOCITIES
 from studies.readings.checks import Check, control, rate, unbiased
 
 Array = np.ndarray[Any, Any]

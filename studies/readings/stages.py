@@ -25,8 +25,8 @@ from lmshealth.signal.acceleration_levels import (
 )
 from lmshealth.signal.following_error import read_error
 from lmshealth.stage.description import load_stage
-from models.stages import STAGES
-from models.velocities import Experiment, drive_velocities
+from models.dynamics.stages import STAGES
+from models.recordings.velocities import Experiment, drive_velocities
 from studies.paper_tables.tables import FILES, PRINTED_GROWING, printed
 from studies.readings.checks import Check, below, command
 from studies.readings.sines import plain_reading

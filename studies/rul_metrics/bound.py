@@ -11,7 +11,7 @@ from scipy.special import erf
 from lmshealth.health.epoch_posterior import one_at_a_time
 from lmshealth.stage.description import Stage
 from lmshealth.tracking.results import History
-from models.degradation import (
+from models.lives.degradation import (
     GUIDE_PRELOAD_LIMIT,
     MOUNT_STIFFNESS_LIMIT,
     HertzWear,

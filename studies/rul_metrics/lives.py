@@ -8,8 +8,8 @@ from functools import cache
 import numpy as np
 
 from lmshealth.tracking.results import History
-from models.degradation import Life as Truth
-from models.lives import Plan, schedule
+from models.lives.degradation import Life as Truth
+from models.lives.simulation import Plan, schedule
 from studies.lives import SECONDS, Estimates, Life, drawn, history_of, life_with, rng_of
 from studies.raw_lives import measured
 
@@ -32,7 +32,7 @@ class Case:
     ----------
     life : Life
         What is so at every log.
-    truth : models.degradation.Life
+    truth : models.lives.degradation.Life
         Its laws.
     history : History
         Estimates of roll and pitch at all logs.

@@ -18,8 +18,8 @@ from lmshealth.health.epoch_posterior import EpochPosterior
 from lmshealth.health.inference import draw
 from lmshealth.stage.description import Stage, load_stage
 from lmshealth.stage.priors import JointPrior
-from models.mapping import guide_frequencies
-from models.stages import stage_named
+from models.dynamics.modal_map import guide_frequencies
+from models.dynamics.stages import stage_named
 
 Array = NDArray[np.float64]
 TRUTH = np.log([[0.8, 0.9]])

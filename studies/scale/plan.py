@@ -34,7 +34,7 @@ import msgspec
 
 from lmshealth import Settings, load_stage, run
 from lmshealth.stage.description import Stage
-from models.lives import Plan, simulate_life
+from models.lives.simulation import Plan, simulate_life
 from studies.record import Study
 
 HERE = Path(__file__).parent

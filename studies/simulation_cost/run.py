@@ -25,10 +25,10 @@ from collections.abc import Callable
 
 import numpy as np
 
-from models.disturbance import noise_levels
-from models.plant import NOISE_INPUTS, closed_loop
-from models.recording import SAMPLE_RATE_HZ, record
-from models.stages import STAGES, stage_named
+from models.dynamics.plant import NOISE_INPUTS, closed_loop
+from models.dynamics.stages import STAGES, stage_named
+from models.recordings.disturbances import noise_levels
+from models.recordings.recording import SAMPLE_RATE_HZ, record
 from studies.record import Study, options
 
 SECONDS, PEER_SECONDS = 60.0, 2.0

@@ -43,11 +43,11 @@ from lmshealth import identify, load_stage, read_frf, read_log
 from lmshealth.io.log import Log
 from lmshealth.modal.frf.identification import FrfReading
 from lmshealth.stage.description import ModeSpec
-from models.formats import write_log
-from models.plant import GUIDE_MODES, SENSORS
-from models.recording import record
-from models.stages import NOMINAL, Condition, stage_named
-from models.sweep import Sweep, record_sweep, without_loop
+from models.dynamics.plant import GUIDE_MODES, SENSORS
+from models.dynamics.stages import NOMINAL, Condition, stage_named
+from models.recordings.formats import write_log
+from models.recordings.recording import record
+from models.recordings.sweep import Sweep, record_sweep, without_loop
 from studies.record import Study, options
 
 SECONDS = 20.0

@@ -25,8 +25,8 @@ from lmshealth.io.formats.registry import load
 from lmshealth.stage.description import Stage
 from lmshealth.tracking.read_tables import Drifts
 from lmshealth.tracking.tracker import track
-from models.recording import record
-from models.stages import stage_named
+from models.dynamics.stages import stage_named
+from models.recordings.recording import record
 from studies.bench.ratios import recorded
 from studies.identification.records import describe
 from studies.identification_speed.run import CASE, headline_log, parquet_log

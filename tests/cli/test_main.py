@@ -21,8 +21,8 @@ from lmshealth.batch.assess import packed
 from lmshealth.batch.store import SCHEMA, Store, beside
 from lmshealth.cli.main import main
 from lmshealth.report.tables import COLUMNS, LOG_COLUMNS
-from models.stages import STAGES
-from models.velocities import Experiment, drive_velocities
+from models.dynamics.stages import STAGES
+from models.recordings.velocities import Experiment, drive_velocities
 from studies.frf_modes.records import BAND, MODES, RATE, Machine, periodic
 from tests.assessments import worn
 from tests.report.test_machine_page import nothing

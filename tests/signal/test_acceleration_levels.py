@@ -21,9 +21,9 @@ from lmshealth.signal.acceleration_levels import (
     read_magnitudes,
 )
 from lmshealth.stage.description import load_stage
-from models.stages import STAGES
-from models.strokes import record_strokes
-from models.velocities import Experiment, drive_velocities
+from models.dynamics.stages import STAGES
+from models.recordings.strokes import record_strokes
+from models.recordings.velocities import Experiment, drive_velocities
 from studies.paper_tables.tables import PRINTED, acceleration_reading
 from tests.signals import Mode, acceleration_log, make_log, make_stage, sine, white
 

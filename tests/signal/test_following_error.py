@@ -11,9 +11,9 @@ import pytest
 from lmshealth.errors import BadLog
 from lmshealth.io.reading import read_log
 from lmshealth.signal.following_error import loop_error, read_error
-from models.stages import STAGES
-from models.strokes import record_strokes
-from models.velocities import Experiment, drive_velocities
+from models.dynamics.stages import STAGES
+from models.recordings.strokes import record_strokes
+from models.recordings.velocities import Experiment, drive_velocities
 from studies.paper_tables.tables import error_reading
 from tests.signals import make_log, sine
 

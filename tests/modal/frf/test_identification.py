@@ -23,9 +23,9 @@ from lmshealth.modal.frf.identification import (
     why_unnamed,
 )
 from lmshealth.stage.description import load_stage
-from models.formats import write_log
-from models.stages import stage_named
-from models.sweep import Sweep, record_sweep, without_loop
+from models.dynamics.stages import stage_named
+from models.recordings.formats import write_log
+from models.recordings.sweep import Sweep, record_sweep, without_loop
 from studies.frf_modes.records import (
     BAND,
     BENCH,

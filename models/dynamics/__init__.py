@@ -1,0 +1,1 @@
+"""Equations of motion of the simulated stages and of their position loop."""

@@ -1,0 +1,1 @@
+"""Lives of simulated machines: degradation, schedules of logs, faults of recordings."""

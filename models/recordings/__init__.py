@@ -1,0 +1,1 @@
+"""Simulated logs: motion, disturbances, sensors, file formats."""
