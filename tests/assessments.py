@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from msgspec.structs import asdict
 
-from lmshealth.health.verdict import Judgement
+from lmshealth.health.verdict import Verdict
 from lmshealth.io.log import Refusal
 from lmshealth.report.assessment import Assessment
 from lmshealth.tracking.results import Event, Step
@@ -40,7 +40,7 @@ def worn(folder: Path, identity: str = "M7-Y") -> Assessment:
         ),
         health=make_health(history, truth),
         prognosis=make_prognosis(history, 8000, 0.68),
-        judgement=Judgement(identity, history.recorded_at[-1], "both", 0.93, "It is so."),
+        judgement=Verdict(identity, history.recorded_at[-1], "both", 0.93, "It is so."),
         refused=(Refusal("a.csv", "gap", "31 % are missing", channel="acc_feed"),),
         notes=("The temperature of 3 logs is missing.",),
         seed=0,

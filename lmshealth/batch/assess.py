@@ -16,7 +16,7 @@ from lmshealth.health.ensemble_sampling import seed_of
 from lmshealth.health.inference import epochs_to_infer, infer
 from lmshealth.health.results import Health
 from lmshealth.health.verdict import judge
-from lmshealth.prognosis.fleet_prior import Learned, Lesson, lesson_of
+from lmshealth.prognosis.fleet_prior import FleetPrior, MachineEvidence, machine_evidence
 from lmshealth.prognosis.remaining_life import prognose, prognose_with_posterior
 from lmshealth.prognosis.results import Prognosis
 from lmshealth.report.assessment import Assessment
@@ -89,10 +89,10 @@ def make(
 
 def packed(assessment: Assessment) -> Made:
     """Pack an assessment for the store."""
-    return Made(pack(assessment), pack(assessment.lesson), pack(reported(assessment)))
+    return Made(pack(assessment), pack(assessment.evidence), pack(reported(assessment)))
 
 
-def taught(content: bytes, learned: Learned) -> Made | None:
+def with_fleet_prior(content: bytes, learned: FleetPrior) -> Made | None:
     """Foretell a machine anew, from its packed assessment, with what its fleet has taught it.
 
     Returns
@@ -108,7 +108,7 @@ def taught(content: bytes, learned: Learned) -> Made | None:
     found: Assessment | None = read(content, Assessment)
     if found is None or found.track is None:
         return None
-    history, stage = believed(found.history, found.track), learned.onto(found.stage)
+    history, stage = believed(found.history, found.track), learned.apply_to(found.stage)
     prognosis = prognose(history, stage, seed_of(found.seed, history.stage, stage.digest))
     return packed(replace(found, prognosis=prognosis, fleet=learned))
 
@@ -163,7 +163,7 @@ def assess(
     partial = [refusal for reading in readings for refusal in reading.modes.refused]
     own_seed = seed_of(seed, history.stage, stage.digest)
     found = _results(history, stage, epochs, own_seed, executor, notes)
-    followed, health, prognosis, lesson = found
+    followed, health, prognosis, evidence = found
     if followed is not None:
         refused += doubted(history, followed)
     by_log = {reading.log: reading for reading in readings}
@@ -180,7 +180,7 @@ def assess(
         notes=tuple(notes),
         seed=seed,
         waterfall=Waterfall.stack([(reading.levels, reading.modes.lines) for reading in used]),
-        lesson=lesson,
+        evidence=evidence,
     )
 
 
@@ -191,7 +191,7 @@ def _results(
     seed: tuple[int, int],
     executor: Executor | None,
     notes: list[str],
-) -> tuple[Track | None, Health | None, Prognosis | None, Lesson | None]:
+) -> tuple[Track | None, Health | None, Prognosis | None, MachineEvidence | None]:
     """Go as far as the data carry; what stops it becomes a note."""
     followed: Track | None = None
     health: Health | None = None
@@ -219,7 +219,9 @@ def _results(
     return followed, health, None, None
 
 
-def _foretold(history: History, stage: Stage, seed: tuple[int, int]) -> tuple[Prognosis, Lesson]:
+def _foretold(
+    history: History, stage: Stage, seed: tuple[int, int]
+) -> tuple[Prognosis, MachineEvidence]:
     """Prognose, and say what the life teaches of others: less to send than the life itself."""
     prognosis, life = prognose_with_posterior(history, stage, seed)
-    return prognosis, lesson_of(stage, life)
+    return prognosis, machine_evidence(stage, life)

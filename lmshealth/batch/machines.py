@@ -12,18 +12,18 @@ from pathlib import Path
 
 from lmshealth._files import write_text
 from lmshealth._serialize import fingerprint
-from lmshealth.batch.assess import Machine, make, taught
+from lmshealth.batch.assess import Machine, make, with_fleet_prior
 from lmshealth.batch.ingest import Site
 from lmshealth.batch.store import Made, Store, read
 from lmshealth.batch.telling import Content, Telling, tell
 from lmshealth.batch.workers import Pool
 from lmshealth.errors import LmshealthError
 from lmshealth.io.refusal import visible
-from lmshealth.prognosis.fleet_prior import Learned, Lesson, learn
+from lmshealth.prognosis.fleet_prior import FleetPrior, MachineEvidence, fleet_priors
 
 _Job = tuple[Machine, tuple[tuple[str, bytes], ...]]
 
-_Lecture = tuple[Machine, str, bytes | None, Learned]
+_PriorUpdate = tuple[Machine, str, bytes | None, FleetPrior]
 
 _logger = logging.getLogger(__name__)
 
@@ -96,7 +96,7 @@ def _make(
         return _mistake(error)
 
 
-def teach_all(
+def update_priors(
     machines: Sequence[Machine], site: Site, *, anew: Container[str] = ()
 ) -> tuple[dict[str, str], dict[str, str]]:
     """Let the machines of each description teach the young ones among them.
@@ -106,7 +106,7 @@ def teach_all(
     machines : sequence of Machine
         All of them, assessed.
     site : Site
-        Its store has their lessons and assessments.
+        Its store has their evidence and assessments.
     anew : container of str
         Which are to be taught whatever the store remembers.
 
@@ -115,25 +115,25 @@ def teach_all(
     keys : dict of str to str
         Under which the store has the assessment of each machine that is to be told.
     failed : dict of str to str
-        Machines whose life could not be foretold with what they were taught, and why: they are
-        told as they were before.
+        Machines whose prognosis could not be recomputed with the fleet prior, and why: they keep
+        the prognosis from before.
     """
     store = site.store
     keys, failed = {machine.name: machine.key for machine in machines}, dict[str, str]()
     left = []
-    for pupil, learned in _pupils(machines, store):
-        key = fingerprint(pupil.key, learned)
-        if pupil.name not in anew and store.has(pupil.name, key):
-            keys[pupil.name] = key
+    for machine, learned in _machines_to_update(machines, store):
+        key = fingerprint(machine.key, learned)
+        if machine.name not in anew and store.has(machine.name, key):
+            keys[machine.name] = key
         else:
-            left.append((pupil, learned, key))
+            left.append((machine, learned, key))
     if left:
         site.progress("teaching", 0, len(left))
     jobs = (
-        (pupil, key, store.assessment(pupil.name, pupil.key), learned)
-        for pupil, learned, key in left
+        (machine, key, store.assessment(machine.name, machine.key), learned)
+        for machine, learned, key in left
     )
-    for k, (job, made) in enumerate(site.pool.spread(_teach, jobs, _why), start=1):
+    for k, (job, made) in enumerate(site.pool.spread(_update, jobs, _why), start=1):
         name, key = job[0].name, job[1]
         if isinstance(made, Made):
             store.keep(name, key, made)
@@ -144,28 +144,30 @@ def teach_all(
     return keys, failed
 
 
-def _pupils(machines: Sequence[Machine], store: Store) -> Iterator[tuple[Machine, Learned]]:
+def _machines_to_update(
+    machines: Sequence[Machine], store: Store
+) -> Iterator[tuple[Machine, FleetPrior]]:
     """Find the young machines of each description, and what the others teach them."""
     classes: dict[str, dict[str, Machine]] = {}
     for machine in machines:
         classes.setdefault(machine.stage.digest, {})[machine.name] = machine
     for own in classes.values():
-        lessons = {}
+        evidence = {}
         for name, machine in own.items():
-            content = store.lesson(name, machine.key)
-            lesson = None if content is None else read(content, Lesson | None)
-            if lesson is not None:
-                lessons[name] = lesson
-        if lessons:
+            content = store.evidence(name, machine.key)
+            own_evidence = None if content is None else read(content, MachineEvidence | None)
+            if own_evidence is not None:
+                evidence[name] = own_evidence
+        if evidence:
             stage = next(iter(own.values())).stage
-            yield from ((own[name], one) for name, one in learn(stage, lessons).items())
+            yield from ((own[name], one) for name, one in fleet_priors(stage, evidence).items())
 
 
-def _teach(job: _Lecture) -> Made | str | None:
+def _update(job: _PriorUpdate) -> Made | str | None:
     """Teach a machine; whatever goes wrong with it is told, never an exception."""
     _, _, content, learned = job
     try:
-        return None if content is None else taught(content, learned)
+        return None if content is None else with_fleet_prior(content, learned)
     except LmshealthError as error:
         return str(error)
     except Exception as error:

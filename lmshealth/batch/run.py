@@ -11,7 +11,7 @@ from tempfile import TemporaryFile
 from lmshealth.batch.assess import Machine
 from lmshealth.batch.database import StoreError
 from lmshealth.batch.ingest import Intake, Progress, Site, take_in
-from lmshealth.batch.machines import assess_all, logs_of, teach_all, tell_all
+from lmshealth.batch.machines import assess_all, logs_of, tell_all, update_priors
 from lmshealth.batch.store import Store, beside
 from lmshealth.batch.telling import Content, Tables, Telling
 from lmshealth.batch.workers import Pool, cluster, processes
@@ -314,7 +314,7 @@ def _told(
     files = file_names([machine.name for machine in machines])
     left, anew = {machine.name: machine for machine in machines}, frozenset[str]()
     for _ in range(2):
-        keys, untaught = teach_all(machines, site, anew=anew)
+        keys, untaught = update_priors(machines, site, anew=anew)
         failed |= untaught
         contents = (_content(m, keys[m.name], files, site.store) for m in list(left.values()))
         for name, telling in tell_all(contents, site.pool, out):

@@ -38,7 +38,7 @@ from lmshealth.io.log import Refusal
 from lmshealth.report.changes import Reported
 from lmshealth.tracking.history import Reading
 
-SCHEMA = 4  # part of the names of the tables: what an older one holds is not read
+SCHEMA = 5  # part of the names of the tables: what an older one holds is not read
 
 Outcome = Reading | tuple[Refusal, ...]
 """What became of a log: its reading, or why it was refused."""
@@ -77,7 +77,7 @@ class _Assessed(_Base):
     machine: Mapped[str] = mapped_column(String(64), primary_key=True)
     key: Mapped[str] = mapped_column(String(64), primary_key=True)
     content: Mapped[bytes] = mapped_column(LargeBinary)
-    lesson: Mapped[bytes] = mapped_column(LargeBinary)
+    evidence: Mapped[bytes] = mapped_column(LargeBinary)
     said: Mapped[bytes] = mapped_column(LargeBinary)
 
 
@@ -147,7 +147,7 @@ class Made:
     """An assessment as bytes: whole, what it teaches of others, and what it says in short."""
 
     content: bytes
-    lesson: bytes
+    evidence: bytes
     said: bytes
 
 
@@ -251,14 +251,14 @@ class Store:
         """Fetch a packed assessment; None where it is not there."""
         return self._column(_Assessed.content, machine, key)
 
-    def lesson(self, machine: str, key: str) -> bytes | None:
+    def evidence(self, machine: str, key: str) -> bytes | None:
         """Fetch what an assessment teaches, packed; None where it is not there."""
-        return self._column(_Assessed.lesson, machine, key)
+        return self._column(_Assessed.evidence, machine, key)
 
     def keep(self, machine: str, key: str, made: Made) -> None:
         """Keep an assessment of a machine."""
         row = {"machine": _id(machine), "key": key, "content": made.content}
-        row |= {"lesson": made.lesson, "said": made.said}
+        row |= {"evidence": made.evidence, "said": made.said}
         with self._session() as session:
             session.execute(self._upsert(_Assessed, row))
 

@@ -70,7 +70,7 @@ def prognose(ctx: click.Context, /, table: Path, **options: Any) -> None:
     of the stage description.
     """
     from lmshealth.cli.lifeview import print_life
-    from lmshealth.prognosis.maintenance_decision import decide, reached_before
+    from lmshealth.prognosis.maintenance_decision import decide, probability_before
     from lmshealth.report.brief import life_brief
     from lmshealth.report.tables import COLUMNS, frame, prognosis_rows
     from lmshealth.stage.description import load_stage
@@ -93,7 +93,7 @@ def prognose(ctx: click.Context, /, table: Path, **options: Any) -> None:
     rows = []
     for life, _ in found:
         day = _ahead(options["by"], life)
-        before = None if day is None else (day, reached_before(life, day))
+        before = None if day is None else (day, probability_before(life, day))
         service = decide(life, decision)
         own = prognosis_rows(life, service, before)
         print_life(life_brief(life, service, own))

@@ -123,7 +123,7 @@ def print_health(health: Health) -> None:
             )
         if not health.identifiable[-1, j]:
             print_text(f"{name}: not identifiable by the tracked modes; see lmshealth stage.")
-        elif health.explained and not health.told()[j]:
+        elif health.explained and not health.informed_parameters()[j]:
             print_text(f"{name}: these drifts tell too little of it for a claim.")
     for when in np.flatnonzero(~health.converged):
         print_text(f"The sampler did not converge at {health.recorded_at[when]:%Y-%m-%d}.")

@@ -27,7 +27,7 @@ _WIDER, _EDGE, _ENDS = 2.0, 0.01, (0.05, 0.95)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class View:
+class MachineDrifts:
     """What one machine shows at one epoch.
 
     Attributes
@@ -77,26 +77,26 @@ class EpochPosterior:
     ----------
     prior : JointPrior
         Of all parameters.
-    views : tuple of View
+    machines : tuple of MachineDrifts
         One per machine.
     """
 
     prior: JointPrior
-    views: tuple[View, ...]
+    machines: tuple[MachineDrifts, ...]
 
     @classmethod
     def of(
         cls, stage: Stage, modes: tuple[str, ...], drift: FloatArray, cov: FloatArray
     ) -> EpochPosterior:
-        """Make that of a single machine; see `View`."""
+        """Make that of a single machine; see `MachineDrifts`."""
         columns = tuple(range(len(stage.parameters)))
-        return cls(stage.prior, (View(stage, modes, drift, cov, columns),))
+        return cls(stage.prior, (MachineDrifts(stage, modes, drift, cov, columns),))
 
     def log_probability(self, x: FloatArray) -> FloatArray:
         """Log posterior of ln parameters up to a constant, shape ``(n_points,)``."""
         total = self.prior.log_density(x)
         inside = np.isfinite(total)
-        for view in self.views:
+        for view in self.machines:
             if inside.any():
                 total[inside] += view.log_likelihood(x[inside])
         return total
@@ -111,8 +111,8 @@ class EpochPosterior:
         As many degrees of freedom as drifts: the parameters are not taken off, as priors may hold
         them, so that what is called improbable is.
         """
-        least = np.min(np.sum([view.misfit(x)[0] for view in self.views], axis=0))
-        return float(chdtrc(sum(len(view.modes) for view in self.views), least))
+        least = np.min(np.sum([view.misfit(x)[0] for view in self.machines], axis=0))
+        return float(chdtrc(sum(len(view.modes) for view in self.machines), least))
 
     def at_edge(self, x: FloatArray) -> BoolArray:
         """Tell which parameters have draws piled up at an end of the map, ``(n_parameters,)``."""
@@ -122,7 +122,7 @@ class EpochPosterior:
 
     def widened(self) -> EpochPosterior:
         """Give the posterior with priors twice as wide."""
-        return EpochPosterior(self.prior.widened(_WIDER), self.views)
+        return EpochPosterior(self.prior.widened(_WIDER), self.machines)
 
 
 def one_at_a_time(stage: Stage, x: FloatArray) -> FloatArray:

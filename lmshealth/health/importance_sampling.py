@@ -24,8 +24,8 @@ _TRIES = 3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Weighted:
-    """Weighted draws of a density.
+class WeightedDraws:
+    """WeightedDraws draws of a density.
 
     Attributes
     ----------
@@ -54,9 +54,9 @@ class Weighted:
         return np.asarray(self.points[rng.choice(self.weight.size, n, p=self.weight)])
 
 
-def explore(
+def importance_sample(
     log_probability: LogProbability, start: FloatArray, rng: np.random.Generator, n: int
-) -> Weighted:
+) -> WeightedDraws:
     """Draw from a density by importance sampling, from a mixture that learns it in rounds.
 
     Parameters
@@ -87,10 +87,10 @@ def explore(
     return _weighted(points, log_probability(points) - proposal)
 
 
-def explore_well(
+def importance_sample_to_ess(
     log_probability: LogProbability, start: FloatArray, rng: np.random.Generator, n: int
-) -> Weighted:
-    """Draw as `explore` until the draws are worth 400 independent ones, each time more.
+) -> WeightedDraws:
+    """Draw as `importance_sample` until the draws are worth 400 independent ones, each time more.
 
     Raises
     ------
@@ -98,7 +98,7 @@ def explore_well(
         If three times are not enough; carries the points.
     """
     for _ in range(_TRIES):
-        found = explore(log_probability, start, rng, n)
+        found = importance_sample(log_probability, start, rng, n)
         if found.ess >= _LEAST:
             return found
         start, n = found.resampled(rng, 500), 3 * n
@@ -109,7 +109,7 @@ def explore_well(
     )
 
 
-def _weighted(points: FloatArray, log_weight: FloatArray) -> Weighted:
+def _weighted(points: FloatArray, log_weight: FloatArray) -> WeightedDraws:
     inside = np.isfinite(log_weight)
     if not inside.any():
         raise NotConverged(
@@ -117,10 +117,10 @@ def _weighted(points: FloatArray, log_weight: FloatArray) -> Weighted:
         )
     kept = log_weight[inside]
     total = float(logsumexp(kept))
-    return Weighted(points[inside], np.exp(kept - total), total - np.log(log_weight.size))
+    return WeightedDraws(points[inside], np.exp(kept - total), total - np.log(log_weight.size))
 
 
-def _flattened(points: FloatArray, log_weight: FloatArray) -> Weighted:
+def _flattened(points: FloatArray, log_weight: FloatArray) -> WeightedDraws:
     """Weight draws by a power of their weights that leaves enough of them."""
     draws = _weighted(points, log_weight)
     least = min(20.0 * points.shape[1], 0.3 * draws.weight.size)
@@ -132,7 +132,9 @@ def _flattened(points: FloatArray, log_weight: FloatArray) -> Weighted:
     return draws
 
 
-def _propose(draws: Weighted, rng: np.random.Generator, n: int) -> tuple[FloatArray, FloatArray]:
+def _propose(
+    draws: WeightedDraws, rng: np.random.Generator, n: int
+) -> tuple[FloatArray, FloatArray]:
     """Draw from a mixture of Student's t about draws, and give its log density."""
     d = draws.points.shape[1]
     off = draws.points - draws.weight @ draws.points

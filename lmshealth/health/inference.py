@@ -19,7 +19,7 @@ from lmshealth.health.ensemble_sampling import (
     stream,
     thin,
 )
-from lmshealth.health.epoch_posterior import EpochPosterior, View
+from lmshealth.health.epoch_posterior import EpochPosterior, MachineDrifts
 from lmshealth.health.laplace import approximate
 from lmshealth.health.results import Health
 from lmshealth.stage.description import Stage
@@ -152,10 +152,11 @@ def infer_together(
     ...     seen = Drifts(name, when, np.array([1e6]), modes, drift, cov)
     ...     machines.append((seen, stage))
     >>> both = lmshealth.infer_together(machines, ["guide_preload"], seed=0)
-    >>> for name, median, told in zip(both.parameters, both.latest(0.5), both.told()):
-    ...     print(f"{name}: {median:.2f}" if told else f"{name}: not told")
+    >>> rows = zip(both.parameters, both.latest(0.5), both.informed_parameters())
+    >>> for name, median, informed in rows:
+    ...     print(f"{name}: {median:.2f}" if informed else f"{name}: not informed")
     guide_preload: 0.80
-    lms-x:mount_stiffness: not told
+    lms-x:mount_stiffness: not informed
     lms-y:mount_stiffness: 0.90
     """
     names, columns = _places(machines, shared)
@@ -168,7 +169,7 @@ def infer_together(
         for (track, own), used, places in zip(machines, modes, columns, strict=True):
             row = k if track is first else _last_before(track, usable[track.stage], first, k)
             if row is not None:
-                views.append(View(own, *_seen(track, used, row), places))
+                views.append(MachineDrifts(own, *_seen(track, used, row), places))
                 priors.append(own.prior)
         if len(views) == len(machines):
             prior = joined(priors, columns)
@@ -424,10 +425,10 @@ def _infer_all(
 def _identifiable(tasks: Sequence[EpochPosterior], prior: FloatArray) -> BoolArray:
     """Tell what the modes that an epoch has could tell, ``(n_epochs, n_parameters)``."""
     known: dict[tuple[tuple[str, ...], ...], BoolArray] = {}
-    sights = [sight_of(view.stage) for view in tasks[0].views]
+    sights = [sight_of(view.stage) for view in tasks[0].machines]
     for task in tasks:
-        modes = tuple(view.modes for view in task.views)
+        modes = tuple(view.modes for view in task.machines)
         if modes not in known:
             cut = [sight.through(own) for sight, own in zip(sights, modes, strict=True)]
-            known[modes] = identifiable(cut, [view.columns for view in task.views], prior)
-    return np.stack([known[tuple(view.modes for view in task.views)] for task in tasks])
+            known[modes] = identifiable(cut, [view.columns for view in task.machines], prior)
+    return np.stack([known[tuple(view.modes for view in task.machines)] for task in tasks])

@@ -127,7 +127,7 @@ class Health:
         """The smaller effective sample size, ``(n_epochs, n_parameters)``."""
         return np.minimum(self.ess_bulk, self.ess_tail)
 
-    def told(self) -> BoolArray:
+    def informed_parameters(self) -> BoolArray:
         """Tell which parameters the last epoch's data tell, not the prior, ``(n_parameters,)``."""
         claimed = bool(self.converged[-1]) and self.explained
         return np.asarray(claimed & self.identifiable[-1] & (self.informed[-1] >= INFORMED))

@@ -38,7 +38,7 @@ def degraded_words(verdict: str) -> tuple[str, ...]:
 
 
 @dataclass(frozen=True, slots=True)
-class Judgement:
+class Verdict:
     """What is said about a stage in one word, with its probability.
 
     Attributes
@@ -80,7 +80,7 @@ def degraded_below(parameter: ParameterSpec) -> float:
 
 def judge(
     stage: Stage, history: History, health: Health | None, track: Track | None = None
-) -> Judgement:
+) -> Verdict:
     """Say in one word what the last epoch shows, with its posterior probability.
 
     Parameters
@@ -96,7 +96,7 @@ def judge(
 
     Returns
     -------
-    Judgement
+    Verdict
         ``not-enough-data`` when there are fewer logs than make a baseline, when the sampler did
         not converge, when no state of the parameters explains the drifts, when the data say nothing
         about any parameter, or when there is none; alarms are then told in ``why``. ``step`` when
@@ -117,7 +117,7 @@ def judge(
     >>> lmshealth.judge(stage, history, None).why
     'The logs do not carry the health parameters.'
     """
-    jumps = unexplained(track, history.baseline, "step")
+    jumps = undeclared_events(track, history.baseline, "step")
     if jumps:
         return _judge_step(stage, history, health, jumps)
     needed = stage.description.baseline.logs
@@ -139,17 +139,17 @@ def judge(
             "No state of the parameters on the map explains the drifts "
             f"(p = {health.fit[-1]:.1g}): something else moved the modes, or the map is wrong."
         )
-    elif not health.told().any():
+    elif not health.informed_parameters().any():
         reason = "These logs move the prior of no parameter: the stage looks the same either way."
     if reason or health is None:
         why = " ".join((*_alarmed(track, history.baseline), reason))
-        return Judgement(
-            history.stage, history.recorded_at[-1], "not-enough-data", float("nan"), why
-        )
+        return Verdict(history.stage, history.recorded_at[-1], "not-enough-data", float("nan"), why)
     return _judge_posterior(stage, history, health)
 
 
-def unexplained(track: Track | None, baseline: int, kind: Literal["step", "alarm"]) -> list[Event]:
+def undeclared_events(
+    track: Track | None, baseline: int, kind: Literal["step", "alarm"]
+) -> list[Event]:
     """Give the events of a kind since a log that no maintenance declares, one per mode."""
     return [
         event
@@ -162,7 +162,7 @@ def _alarmed(track: Track | None, baseline: int) -> Iterator[str]:
     """Say of every mode with an alarm how far it has moved by now."""
     if track is None:
         return
-    alarms = {event.mode: event for event in unexplained(track, baseline, "alarm")}
+    alarms = {event.mode: event for event in undeclared_events(track, baseline, "alarm")}
     for mode, event in alarms.items():
         k = track.modes.index(mode)
         moved, std = track.drift[-1, k], np.sqrt(track.drift_cov[-1, k, k])
@@ -175,7 +175,7 @@ def _alarmed(track: Track | None, baseline: int) -> Iterator[str]:
 
 def _judge_step(
     stage: Stage, history: History, health: Health | None, jumps: list[Event]
-) -> Judgement:
+) -> Verdict:
     last = max(event.epoch for event in jumps)
     sizes = ", ".join(
         f"{event.mode} {100 * np.expm1(event.size):+.1f} %".replace("-", "−")
@@ -186,14 +186,14 @@ def _judge_step(
     why = (
         f"The frequencies jumped before the log of {when} ({sizes}), and no maintenance tells why."
     )
-    if health is not None and health.converged[-1] and health.told().any():
-        why += " " + _why(stage, health, np.flatnonzero(health.told()).tolist())
+    if health is not None and health.converged[-1] and health.informed_parameters().any():
+        why += " " + _why(stage, health, np.flatnonzero(health.informed_parameters()).tolist())
     evidence = max(event.evidence for event in jumps)
-    return Judgement(history.stage, history.recorded_at[-1], "step", float(expit(evidence)), why)
+    return Verdict(history.stage, history.recorded_at[-1], "step", float(expit(evidence)), why)
 
 
-def _judge_posterior(stage: Stage, history: History, health: Health) -> Judgement:
-    told = np.flatnonzero(health.told()).tolist()
+def _judge_posterior(stage: Stage, history: History, health: Health) -> Verdict:
+    told = np.flatnonzero(health.informed_parameters()).tolist()
     lost: dict[str, BoolArray] = {}
     for j in told:
         parameter = stage.parameters[j]
@@ -202,7 +202,7 @@ def _judge_posterior(stage: Stage, history: History, health: Health) -> Judgemen
     draws = Counter(map(tuple, np.column_stack(list(lost.values())).tolist()))
     # Of equally probable verdicts the one with fewer degraded parameters.
     degraded, count = max(draws.items(), key=lambda one: (one[1], -sum(one[0]), one[0]))
-    return Judgement(
+    return Verdict(
         stage=history.stage,
         recorded_at=history.recorded_at[-1],
         verdict=verdict_of(tuple(compress(lost, degraded))),

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from lmshealth._arrays import FloatArray
-from lmshealth.prognosis.scenarios import Branch
+from lmshealth.prognosis.scenarios import DegradationPath
 
 # Points up to where the law alone would be well past the limit, and from there to the horizon.
 _NEAR, _FAR = 24, 12
@@ -14,7 +14,7 @@ _RARE = 1e-9
 
 
 def first_passage(
-    branch: Branch,
+    path: DegradationPath,
     theta: FloatArray,
     off: FloatArray,
     rate: FloatArray,
@@ -35,7 +35,7 @@ def first_passage(
 
     Parameters
     ----------
-    branch : Branch
+    path : DegradationPath
         What the parameter does.
     theta : ndarray
         Its natural parameters, shape ``(n, k)``.
@@ -62,14 +62,14 @@ def first_passage(
     ----------
     Borodin2002 for the bridge.
     """
-    left = branch.passage(theta, limit * np.exp(-off)) - now
+    left = path.passage(theta, limit * np.exp(-off)) - now
     # What gains may have been under its limit before, after a jump: that is over.
-    above = branch.health(theta, np.array([now]))[:, 0] * np.exp(off) > limit
+    above = path.health(theta, np.array([now]))[:, 0] * np.exp(off) > limit
     left[above & (left <= 0)] = np.inf
     moving = (rate > 0) & (left > 0)
     if moving.any():
         left[moving] = _wandering(
-            branch,
+            path,
             theta[moving],
             off[moving] - np.log(limit),
             rate[moving],
@@ -82,7 +82,7 @@ def first_passage(
 
 
 def _wandering(
-    branch: Branch,
+    path: DegradationPath,
     theta: FloatArray,
     above: FloatArray,
     rate: FloatArray,
@@ -99,7 +99,7 @@ def _wandering(
     variance = rate[:, None] * step
     walk = np.cumsum(np.sqrt(variance) * rng.standard_normal(step.shape), axis=1)
     with np.errstate(divide="ignore"):  # nothing is left past the end of a law
-        distance = np.log(branch.health(theta, now + ahead)) + above[:, None]
+        distance = np.log(path.health(theta, now + ahead)) + above[:, None]
     distance[:, 1:] += walk
     a, b = distance[:, :-1], distance[:, 1:]
     # Past the limit at the end, or touching it in between.

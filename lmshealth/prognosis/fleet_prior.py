@@ -34,12 +34,12 @@ from scipy.special import betainc, logsumexp, softmax
 
 from lmshealth._arrays import FloatArray
 from lmshealth._serialize import fingerprint
-from lmshealth.prognosis.life_likelihood import scatter_of
+from lmshealth.prognosis.life_likelihood import scatter_prior
 from lmshealth.prognosis.life_posterior import LifePosterior
-from lmshealth.prognosis.remaining_life import told_limits
+from lmshealth.prognosis.remaining_life import identifiable_limits
 from lmshealth.stage.constants import INFORMED
 from lmshealth.stage.degradation_laws import AnyLaw, Law
-from lmshealth.stage.description import Scatter, Stage
+from lmshealth.stage.description import ScatterPrior, Stage
 from lmshealth.stage.priors import Lognormal, Normal
 
 LEAST_TEACHERS = 3
@@ -56,31 +56,31 @@ _DIGITS = 2
 # By the field of a law that is the prior of its pace: the natural parameter it is of, and its unit.
 _PACES = {"life_km": ("life_m", 1e3), "rate_per_km": ("rate_per_m", 1e-3)}
 _N_SCATTER = 500
-_SCATTERS = tuple(field.name for field in fields(Scatter))
+_SCATTERS = tuple(field.name for field in fields(ScatterPrior))
 
 Pace = Lognormal | Normal
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Heard:
+class LawEvidence:
     """What a machine says of one of several laws, or values, of which every machine has one.
 
     Attributes
     ----------
-    before, after : float
+    prior, posterior : float
         Probability that the machine has it, by the description and by its logs.
     pace : ndarray
         Ln likelihood of mean and variance of the fleet if it has, relative to the description's
         prior, shape ``(n_means, n_variances)``, or ``(1, 1)`` where there is no pace to learn.
     """
 
-    before: float
-    after: float
+    prior: float
+    posterior: float
     pace: FloatArray
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Lesson:
+class MachineEvidence:
     """What one machine teaches the others.
 
     Attributes
@@ -88,19 +88,19 @@ class Lesson:
     laws : dict
         By health parameter, then by kind of law.
     scatter : dict
-        By field of `Scatter`, of each value.
+        By field of `ScatterPrior`, of each value.
     informed : float
         Part of the prior's variance of a law's pace that the logs have removed: the least of all
         laws by which the machine may come to a limit.
     """
 
-    laws: dict[str, dict[str, Heard]]
-    scatter: dict[str, tuple[Heard, ...]]
+    laws: dict[str, dict[str, LawEvidence]]
+    scatter: dict[str, tuple[LawEvidence, ...]]
     informed: float
 
 
 @dataclass(frozen=True, slots=True)
-class LearnedLaw:
+class LawPrior:
     """What is believed of a law beforehand: by the description, then by the fleet.
 
     Attributes
@@ -123,24 +123,24 @@ class LearnedLaw:
 
 
 @dataclass(frozen=True, slots=True)
-class Learned:
+class FleetPrior:
     """The prior that other machines of a fleet have taught a young one.
 
     Attributes
     ----------
-    n_teachers : int
+    n_machines : int
         Number of the others.
-    laws : tuple of LearnedLaw
+    laws : tuple of LawPrior
         Of all health parameters.
-    scatter : Scatter
+    scatter : ScatterPrior
         What is believed of the scatter of logs about a life.
     """
 
-    n_teachers: int
-    laws: tuple[LearnedLaw, ...]
-    scatter: Scatter
+    n_machines: int
+    laws: tuple[LawPrior, ...]
+    scatter: ScatterPrior
 
-    def onto(self, stage: Stage) -> Stage:
+    def apply_to(self, stage: Stage) -> Stage:
         """Put the prior into the description; the digest follows from both."""
         known = {(law.parameter, law.kind): law for law in self.laws}
         parameters = tuple(
@@ -158,7 +158,7 @@ class Learned:
         )
 
 
-def lesson_of(stage: Stage, life: LifePosterior) -> Lesson:
+def machine_evidence(stage: Stage, life: LifePosterior) -> MachineEvidence:
     """Say what the logs of a machine teach of its fleet.
 
     A law that begins anew at a step has the prior of one from the baseline on, and teaches as much.
@@ -170,8 +170,8 @@ def lesson_of(stage: Stage, life: LifePosterior) -> Lesson:
     life : LifePosterior
         Posterior of the machine under it.
     """
-    told = {j for j, _ in told_limits(stage, life.modes)}
-    laws: dict[str, dict[str, Heard]] = {}
+    told = {j for j, _ in identifiable_limits(stage, life.modes)}
+    laws: dict[str, dict[str, LawEvidence]] = {}
     informed = 1.0
     for j, parameter in enumerate(stage.parameters):
         total = sum(law.weight for law in parameter.laws)
@@ -185,8 +185,8 @@ def lesson_of(stage: Stage, life: LifePosterior) -> Lesson:
                 pace = pace_likelihood(z, weight / after)
                 if j in told and after >= _WORTH:
                     informed = min(informed, 1 - float(np.cov(z, aweights=weight)))
-            laws[parameter.name][law.kind] = Heard(law.weight / total, after, pace)
-    return Lesson(laws, _scatter_heard(stage, life), informed)
+            laws[parameter.name][law.kind] = LawEvidence(law.weight / total, after, pace)
+    return MachineEvidence(laws, _scatter_heard(stage, life), informed)
 
 
 def pace_likelihood(z: FloatArray, weight: FloatArray) -> FloatArray:
@@ -211,7 +211,7 @@ def pace_likelihood(z: FloatArray, weight: FloatArray) -> FloatArray:
     return np.column_stack(columns)
 
 
-def is_young(lesson: Lesson) -> bool:
+def needs_fleet_prior(lesson: MachineEvidence) -> bool:
     """Tell whether a machine's own logs say too little of how its life ends.
 
     So it is while they have removed less than half of the prior's variance of the pace of a law
@@ -222,7 +222,7 @@ def is_young(lesson: Lesson) -> bool:
     return lesson.informed < INFORMED
 
 
-def learn(stage: Stage, lessons: Mapping[str, Lesson]) -> dict[str, Learned]:
+def fleet_priors(stage: Stage, lessons: Mapping[str, MachineEvidence]) -> dict[str, FleetPrior]:
     """Learn a prior for each young machine from all the others.
 
     All others teach, those too that show no wear: without them all machines would seem to wear, and
@@ -232,25 +232,25 @@ def learn(stage: Stage, lessons: Mapping[str, Lesson]) -> dict[str, Learned]:
     ----------
     stage : Stage
         The description of all of them.
-    lessons : mapping of str to Lesson
+    lessons : mapping of str to MachineEvidence
         By machine, in any order.
 
     Returns
     -------
-    dict of str to Learned
+    dict of str to FleetPrior
         By young machine; empty where fewer than three others teach.
     """
-    machines, n_teachers = sorted(lessons), len(lessons) - 1
-    young = [machine for machine in machines if is_young(lessons[machine])]
-    if n_teachers < LEAST_TEACHERS or not young:
+    machines, n_machines = sorted(lessons), len(lessons) - 1
+    young = [machine for machine in machines if needs_fleet_prior(lessons[machine])]
+    if n_machines < LEAST_TEACHERS or not young:
         return {}
-    laws: dict[str, list[LearnedLaw]] = {name: [] for name in young}
+    laws: dict[str, list[LawPrior]] = {name: [] for name in young}
     for parameter in stage.parameters:
-        found: dict[str, list[LearnedLaw]] = {name: [] for name in young}
+        found: dict[str, list[LawPrior]] = {name: [] for name in young}
         for law in parameter.laws:
             heard = {name: lessons[name].laws[parameter.name][law.kind] for name in machines}
             for name, belief in _beliefs(heard, young, len(parameter.laws)).items():
-                found[name].append(_learned(parameter.name, law, heard[name].before, belief))
+                found[name].append(_learned(parameter.name, law, heard[name].prior, belief))
         for name, own in found.items():
             laws[name] += _of_one(own)
     scatters: dict[str, list[tuple[float, ...]]] = {name: [] for name in young}
@@ -261,7 +261,8 @@ def learn(stage: Stage, lessons: Mapping[str, Lesson]) -> dict[str, Learned]:
         for name in young:
             scatters[name].append(tuple(_rounded(belief[name].share) for belief in learned))
     return {
-        name: Learned(n_teachers, tuple(laws[name]), Scatter(*scatters[name])) for name in young
+        name: FleetPrior(n_machines, tuple(laws[name]), ScatterPrior(*scatters[name]))
+        for name in young
     }
 
 
@@ -274,7 +275,7 @@ class _Belief:
     std: float
 
 
-def _beliefs(heard: Mapping[str, Heard], young: Sequence[str], n: int) -> dict[str, _Belief]:
+def _beliefs(heard: Mapping[str, LawEvidence], young: Sequence[str], n: int) -> dict[str, _Belief]:
     """Give what all others teach each young machine of one of n laws or values."""
     share, log_prior = _hyperprior(heard[young[0]], n)
     total = log_prior
@@ -283,7 +284,7 @@ def _beliefs(heard: Mapping[str, Heard], young: Sequence[str], n: int) -> dict[s
     return {name: _predicted(share, total - _log_lesson(heard[name], share)) for name in young}
 
 
-def _hyperprior(heard: Heard, n: int) -> tuple[FloatArray, FloatArray]:
+def _hyperprior(heard: LawEvidence, n: int) -> tuple[FloatArray, FloatArray]:
     """Give nodes of the share, and the log prior of share, mean and variance at the nodes.
 
     Shapes ``(n_shares,)`` and ``(n_shares, n_means, n_variances)``.
@@ -291,23 +292,23 @@ def _hyperprior(heard: Heard, n: int) -> tuple[FloatArray, FloatArray]:
     own = _LOG_PRIOR if heard.pace.size > 1 else np.zeros((1, 1))
     if n == 1:
         return np.ones(1), own[None]
-    a, b = n * heard.before, n * (1 - heard.before)
+    a, b = n * heard.prior, n * (1 - heard.prior)
     mass = np.diff(betainc(a, b, _SHARE_EDGES))
     # The mean of each cell is its node, so that the mean of all is that of the description.
     with np.errstate(invalid="ignore", divide="ignore"):
-        node = heard.before * np.diff(betainc(a + 1, b, _SHARE_EDGES)) / mass
+        node = heard.prior * np.diff(betainc(a + 1, b, _SHARE_EDGES)) / mass
         log_mass = np.log(mass)
     node = np.where(mass > 0, node, (_SHARE_EDGES[1:] + _SHARE_EDGES[:-1]) / 2)
     return np.clip(node, _SHARE_EDGES[:-1], _SHARE_EDGES[1:]), log_mass[:, None, None] + own
 
 
-def _log_lesson(heard: Heard, share: FloatArray) -> FloatArray:
+def _log_lesson(heard: LawEvidence, share: FloatArray) -> FloatArray:
     """Give ln p(D | m, v, s) / p(D), ``(n_shares, n_means, n_variances)``."""
     with np.errstate(divide="ignore"):
-        has = np.log(share * heard.after / heard.before)
+        has = np.log(share * heard.posterior / heard.prior)
         if share.size == 1:
             return has[:, None, None] + heard.pace
-        lacks = np.log((1 - share) * (1 - heard.after) / (1 - heard.before))
+        lacks = np.log((1 - share) * (1 - heard.posterior) / (1 - heard.prior))
     return np.logaddexp(has[:, None, None] + heard.pace, lacks[:, None, None])
 
 
@@ -323,22 +324,22 @@ def _predicted(share: FloatArray, log_posterior: FloatArray) -> _Belief:
     return _Belief(mean_share, float(mean), float(np.sqrt(variance)))
 
 
-def _of_one(laws: Sequence[LearnedLaw]) -> list[LearnedLaw]:
+def _of_one(laws: Sequence[LawPrior]) -> list[LawPrior]:
     """Let the laws of a parameter, each learned by itself, share one probability."""
     total = sum(law.share[1] for law in laws)
     return [replace(law, share=(law.share[0], _rounded(law.share[1] / total))) for law in laws]
 
 
-def _learned(parameter: str, law: AnyLaw, before: float, belief: _Belief) -> LearnedLaw:
+def _learned(parameter: str, law: AnyLaw, before: float, belief: _Belief) -> LawPrior:
     pace, field = None, _pace_field(law)
     if field:
         prior = getattr(law, field)
         placed = prior.placed(belief.mean, belief.std)
         pace = (prior, type(prior)(*(_rounded(value) for value in msgspec.structs.astuple(placed))))
-    return LearnedLaw(parameter, law.kind, (before, _rounded(belief.share)), field, pace)
+    return LawPrior(parameter, law.kind, (before, _rounded(belief.share)), field, pace)
 
 
-def _changed(law: AnyLaw, learned: LearnedLaw) -> AnyLaw:
+def _changed(law: AnyLaw, learned: LawPrior) -> AnyLaw:
     changes: dict[str, object] = {"weight": learned.share[1]}
     if learned.pace is not None:
         changes[learned.field] = learned.pace[1]
@@ -361,14 +362,14 @@ def _pace_draws(life: LifePosterior, j: int, law: AnyLaw) -> tuple[FloatArray, F
     """Give draws of z under a law of a parameter, and weights that add up to its probability."""
     values, weights = [np.empty(0)], [np.empty(0)]
     field = _pace_field(law)
-    for way in life.ways:
-        if way.course.branches[j].law.kind != law.kind:
+    for way in life.scenarios:
+        if way.scenario.paths[j].law.kind != law.kind:
             continue
         chains = way.chains
         z = np.zeros(chains.shape[0] * chains.shape[1])
         if field:
             name, unit = _PACES[field]
-            own = way.course.split(chains.reshape(z.size, -1))[j]
+            own = way.scenario.split(chains.reshape(z.size, -1))[j]
             pace = own[:, law.names.index(name)] / unit
             z = getattr(law, field).standard(pace)
         values.append(z)
@@ -376,20 +377,21 @@ def _pace_draws(life: LifePosterior, j: int, law: AnyLaw) -> tuple[FloatArray, F
     return np.concatenate(values), np.concatenate(weights)
 
 
-def _scatter_heard(stage: Stage, life: LifePosterior) -> dict[str, tuple[Heard, ...]]:
-    """Say how probable each value of the grid of scatter is, averaged over courses."""
+def _scatter_heard(stage: Stage, life: LifePosterior) -> dict[str, tuple[LawEvidence, ...]]:
+    """Say how probable each value of the grid of scatter is, averaged over scenarios."""
     weights = [
-        way.density.weights(way.own[:: max(1, len(way.own) // _N_SCATTER)]) for way in life.ways
+        way.density.weights(way.mixture_draws[:: max(1, len(way.mixture_draws) // _N_SCATTER)])
+        for way in life.scenarios
     ]
     heard = {}
     for field in _SCATTERS:
-        before = np.array(getattr(scatter_of(stage), field))
+        before = np.array(getattr(scatter_prior(stage), field))
         after = np.zeros(before.size)
-        for way, weight in zip(life.ways, weights, strict=True):
+        for way, weight in zip(life.scenarios, weights, strict=True):
             values = np.unique(getattr(way.density.life.grid, field))
             has = np.equal.outer(values, getattr(way.density.grid, field))
             after += way.probability * (has @ weight)
         none = np.zeros((1, 1))
         pairs = zip((before / before.sum()).tolist(), after.tolist(), strict=True)
-        heard[field] = tuple(Heard(b, min(a, 1.0), none) for b, a in pairs)
+        heard[field] = tuple(LawEvidence(b, min(a, 1.0), none) for b, a in pairs)
     return heard

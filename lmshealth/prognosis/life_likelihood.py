@@ -1,4 +1,4 @@
-"""The likelihood of a whole life: courses of health against the ln frequencies of all logs.
+"""The likelihood of a whole life: scenarios of health against the ln frequencies of all logs.
 
 For the informative modes of all logs since the baseline, y = H(θ) + S g + a + b (T - T_ref) + walk
 + ε. The intercept a, the covariate coefficients b and the random walk are Gaussian, as are the
@@ -40,13 +40,13 @@ from scipy.linalg import qr, solve_triangular
 from lmshealth._arrays import BoolArray, FloatArray
 from lmshealth.errors import NotEnoughData
 from lmshealth.health.epoch_posterior import one_at_a_time
-from lmshealth.prognosis.scenarios import Course, courses_of
-from lmshealth.stage.description import Scatter, Stage
+from lmshealth.prognosis.scenarios import Scenario, list_scenarios
+from lmshealth.stage.description import ScatterPrior, Stage
 from lmshealth.tracking.results import History
 from lmshealth.tracking.state_space import BIAS_STD, JUMP_STD, MOVES, regressors
 
 
-def condensed(history: History, most: int) -> History:
+def condense(history: History, most: int) -> History:
     """Take neighbouring logs together until there are about so many.
 
     Estimates are averaged by generalised least squares over the logs, series and their cross terms
@@ -193,7 +193,7 @@ class _Covariance:
 
 
 class LifeLikelihood:
-    """What all logs of a life say, whichever course it took; vectorised over walkers.
+    """What all logs of a life say, whichever scenario it took; vectorised over walkers.
 
     Parameters
     ----------
@@ -211,7 +211,7 @@ class LifeLikelihood:
 
     def __init__(self, history: History, stage: Stage) -> None:
         self.stage = stage
-        history = condensed(history, MOST_LOGS)
+        history = condense(history, MOST_LOGS)
         if not history.has_odometer:
             raise NotEnoughData(
                 f"{history.stage}: not every log has travel_km, and laws of a life count by the "
@@ -248,7 +248,7 @@ class LifeLikelihood:
         )
         self.y = flat[self.rows] - centre[self.mode_of]
         self.steps = _steps(history, clock)
-        self.courses = courses_of(stage.parameters, self.steps, self.now)
+        self.scenarios = list_scenarios(stage.parameters, self.steps, self.now)
         # What only ever keeps its value does not deviate from that either.
         free = [any(law.names for law in parameter.laws) for parameter in stage.parameters]
         self.free = np.array(free, dtype=float)
@@ -262,11 +262,11 @@ class LifeLikelihood:
         self.grid = self._whiten()
 
     def ln_health(
-        self, course: Course, y: FloatArray, clock: FloatArray
+        self, scenario: Scenario, y: FloatArray, clock: FloatArray
     ) -> tuple[FloatArray, BoolArray]:
         """Ln parameters at moments of lives, and which lives are inside the map at all of them."""
         assert self.stage.modal_map is not None  # prognose() has checked
-        health = course.health(course.natural(y), clock)
+        health = scenario.health(scenario.natural(y), clock)
         with np.errstate(divide="ignore", invalid="ignore"):
             x = np.log(health * [p.baseline for p in self.stage.parameters])
         return x, np.asarray(self.stage.modal_map.inside(x).all(axis=1))
@@ -361,9 +361,9 @@ class LifeLikelihood:
             Shape ``(n_logs, n_nodes)``.
         """
         rng, examples = np.random.default_rng(0), []
-        for course in self.courses:
-            y = course.draw(rng, _N_EXAMPLES if course.n_dim else 1)
-            x, inside = self.ln_health(course, y, self.clock)
+        for scenario in self.scenarios:
+            y = scenario.draw(rng, _N_EXAMPLES if scenario.n_dim else 1)
+            x, inside = self.ln_health(scenario, y, self.clock)
             if inside.any():
                 examples.append(self._drifts(x[inside]).reshape(-1, self.clock.size))
         if not examples:
@@ -410,7 +410,7 @@ class LifeLikelihood:
         return both[:, -1], q, r
 
     def _whiten(self) -> Grid:
-        points, believed = [], scatter_of(self.stage)
+        points, believed = [], scatter_prior(self.stage)
         for (walk, walk_prior), (scale, scale_prior), (deviation, deviation_prior) in product(
             zip(_WALKS, believed.walk, strict=True),
             zip(_NOISE_SCALES, believed.noise_scale, strict=True),
@@ -443,14 +443,14 @@ class LifeLikelihood:
         return total
 
 
-def scatter_of(stage: Stage) -> Scatter:
+def scatter_prior(stage: Stage) -> ScatterPrior:
     """Give what is believed of the scatter of a stage beforehand."""
     if stage.scatter is not None:
         return stage.scatter
-    return Scatter((1.0,) * len(_WALKS), _NOISE_SCALE_PRIOR, _DEVIATION_PRIOR)
+    return ScatterPrior((1.0,) * len(_WALKS), _NOISE_SCALE_PRIOR, _DEVIATION_PRIOR)
 
 
-def expected_scatter(scatter: Scatter) -> tuple[float, float, float]:
+def expected_scatter(scatter: ScatterPrior) -> tuple[float, float, float]:
     """Give the means of walk, noise scale and deviation that are believed in beforehand."""
     values = (_WALKS, _NOISE_SCALES, _DEVIATIONS)
     priors = (scatter.walk, scatter.noise_scale, scatter.deviation)

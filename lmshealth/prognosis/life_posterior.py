@@ -1,6 +1,6 @@
-"""The posterior of a whole life: which course it took, and by which parameters of its laws.
+"""The posterior of a whole life: which scenario it took, and by which parameters of its laws.
 
-The posterior density of one course of a life, in its coordinates.
+The posterior density of one scenario of a life, in its coordinates.
 """
 
 from __future__ import annotations
@@ -17,10 +17,14 @@ from threadpoolctl import threadpool_limits
 from lmshealth._arrays import BoolArray, FloatArray, expect_shape, freeze
 from lmshealth.errors import NotEnoughData
 from lmshealth.health.ensemble_sampling import Sample, sample, start_among, stream, thin
-from lmshealth.health.importance_sampling import Weighted, explore, explore_well
+from lmshealth.health.importance_sampling import (
+    WeightedDraws,
+    importance_sample,
+    importance_sample_to_ess,
+)
 from lmshealth.health.results import QUANTILES
 from lmshealth.prognosis.life_likelihood import Grid, LifeLikelihood
-from lmshealth.prognosis.scenarios import Course
+from lmshealth.prognosis.scenarios import Scenario
 from lmshealth.stage.description import Stage
 from lmshealth.tracking.results import History
 
@@ -32,37 +36,37 @@ _NEGLIGIBLE = 0.01  # share of the posterior
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LifeDensity:
-    """Log posterior of the coordinates of one course.
+    """Log posterior of the coordinates of one scenario.
 
     Attributes
     ----------
     life : LifeLikelihood
         The data.
-    course : Course
+    scenario : Scenario
         Laws, and their priors.
     grid : Grid
         Points of walk, noise scale and deviation to average over.
     """
 
     life: LifeLikelihood
-    course: Course
+    scenario: Scenario
     grid: Grid
 
     @classmethod
-    def of(cls, life: LifeLikelihood, course: Course) -> LifeDensity:
-        """Give the density of a course over the whole grid."""
-        return cls(life, course, life.grid)
+    def of(cls, life: LifeLikelihood, scenario: Scenario) -> LifeDensity:
+        """Give the density of a scenario over the whole grid."""
+        return cls(life, scenario, life.grid)
 
     def draw_prior(self, rng: np.random.Generator, n: int) -> FloatArray:
         """Draw coordinates from the prior, shape ``(n, n_dim)``."""
-        return self.course.draw(rng, n)
+        return self.scenario.draw(rng, n)
 
     def log_probability(self, y: FloatArray) -> FloatArray:
         """Log posterior, not normalised; -inf where a life leaves the map, shape ``(n,)``.
 
-        Its integral is the evidence of the course, up to a factor that all courses share.
+        Its integral is the evidence of the scenario, up to a factor that all scenarios share.
         """
-        total = self.course.log_prior(y)
+        total = self.scenario.log_prior(y)
         x, inside = self._path(y, np.isfinite(total))
         total = np.where(inside, total, -np.inf)
         if inside.any():
@@ -88,7 +92,7 @@ class LifeDensity:
         """
         weight, grid = self.weights(y), self.grid
         centre = y.mean(axis=0, keepdims=True)
-        x, inside = self._path(centre, np.isfinite(self.course.log_prior(centre)))
+        x, inside = self._path(centre, np.isfinite(self.scenario.log_prior(centre)))
         if not inside.all():
             x, _ = self._path(y[:1], np.array([True]))
         chi_square = self.life.quadratic(grid, x)[0][:, 0]
@@ -117,14 +121,14 @@ class LifeDensity:
             Variance that is added per m of travel to come, shape ``(n, n_parameters)``.
         """
         # Without coordinates all draws are of one life.
-        one = y[:1] if not self.course.n_dim else y
+        one = y[:1] if not self.scenario.n_dim else y
         x, _ = self._path(one, np.full(one.shape[0], True))
         upto = np.cumsum(softmax(self.life.terms(self.grid, x), axis=0), axis=0)
         point = (upto < rng.uniform(size=y.shape[0])).sum(axis=0).clip(max=upto.shape[0] - 1)
-        off = np.zeros((y.shape[0], moments.size, len(self.course.branches)))
+        off = np.zeros((y.shape[0], moments.size, len(self.scenario.paths)))
         for k in np.unique(point[self.grid.deviation[point] > 0]):
             own = point == k
-            of = own if self.course.n_dim else slice(None)
+            of = own if self.scenario.n_dim else slice(None)
             mean, cov = self.life.deviation(self.grid, int(k), x[of], moments)
             # What the data or the baseline leave nothing of is rounding.
             least = 1e-15 * np.eye(cov.shape[-1])
@@ -135,7 +139,7 @@ class LifeDensity:
 
     def weights(self, y: FloatArray) -> FloatArray:
         """Probability of each point of the grid, averaged over coordinates, ``(n_grid,)``."""
-        x, inside = self._path(y, np.isfinite(self.course.log_prior(y)))
+        x, inside = self._path(y, np.isfinite(self.scenario.log_prior(y)))
         if not inside.any():
             name = self.life.stage.name
             raise NotEnoughData(f"{name}: no life of the prior stays inside the map")
@@ -144,7 +148,7 @@ class LifeDensity:
     def _path(self, y: FloatArray, possible: BoolArray) -> tuple[FloatArray, BoolArray]:
         """Ln parameters at the nodes of the lives that stay inside the map, and which these are."""
         inside = possible.copy()
-        x, within = self.life.ln_health(self.course, y[possible], self.life.checked)
+        x, within = self.life.ln_health(self.scenario, y[possible], self.life.checked)
         inside[possible] = within
         return x[within, : self.life.nodes.size], inside
 
@@ -152,7 +156,7 @@ class LifeDensity:
 _STEP = 1 << 20  # far from the epochs that health counts its streams by
 _N_ENSEMBLES, _N_PRIOR, _N_SETTINGS = 4, 10_000, 500
 _N_ROUGH, _N_FINE = 600, 2000
-# A course less probable than the first is told of no more, and one less probable than the second
+# A scenario less probable than the first is told of no more, and one less probable than the second
 # is drawn by importance sampling alone: chains of it would not change what all draws say.
 _LEAST_PROBABILITY, _WORTH_CHAINS = 0.01, 0.1
 # In ln: what a first look finds so much less probable than the best is looked at no closer.
@@ -161,15 +165,15 @@ _ENDS = (0.05, 0.95)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Way:
-    """Posterior under one course.
+class ScenarioPosterior:
+    """Posterior under one scenario.
 
     Attributes
     ----------
     density : LifeDensity
         Of its coordinates.
     probability : float
-        That the life took this course.
+        That the life took this scenario.
     evidence_std : float
         Relative standard deviation of its evidence, from which the probability is.
     coordinates : ndarray
@@ -180,8 +184,8 @@ class Way:
     informed : ndarray
         One minus the squared ratio of posterior to prior width of the 90 % interval of each natural
         parameter, floored at 0, shape ``(n_dim,)``.
-    share : int
-        So many draws of each ensemble stand for this course among those of all.
+    n_mixture : int
+        So many draws of each ensemble stand for this scenario among those of all.
     """
 
     density: LifeDensity
@@ -192,37 +196,37 @@ class Way:
     ess_tail: FloatArray
     r_hat: FloatArray
     informed: FloatArray
-    share: int
+    n_mixture: int
 
     def __post_init__(self) -> None:
-        n = self.course.n_dim
+        n = self.scenario.n_dim
         expect_shape("coordinates", self.coordinates, (*self.coordinates.shape[:2], n))
         for name in ("ess_bulk", "ess_tail", "r_hat", "informed"):
             expect_shape(name, getattr(self, name), (n,))
         freeze(self)
 
     @property
-    def course(self) -> Course:
+    def scenario(self) -> Scenario:
         """What each health parameter does."""
-        return self.density.course
+        return self.density.scenario
 
     @property
     def chains(self) -> FloatArray:
         """Draws of the natural parameters, ``(n_ensembles, n_draws, n_dim)``; lengths are in m."""
-        n, own = self.coordinates.shape[:2], self.course.n_dim
+        n, own = self.coordinates.shape[:2], self.scenario.n_dim
         flat = self.coordinates.reshape(n[0] * n[1], own)
-        return self.course.natural(flat).reshape(self.coordinates.shape)
+        return self.scenario.natural(flat).reshape(self.coordinates.shape)
 
     @property
-    def own(self) -> FloatArray:
-        """Coordinates that stand among those of all courses, ``(n_ensembles share, n_dim)``."""
-        kept = thin(self.coordinates, self.share)
-        return kept.reshape(kept.shape[0] * kept.shape[1], self.course.n_dim)
+    def mixture_draws(self) -> FloatArray:
+        """Coordinates that stand among those of all scenarios, ``(n_ensembles share, n_dim)``."""
+        kept = thin(self.coordinates, self.n_mixture)
+        return kept.reshape(kept.shape[0] * kept.shape[1], self.scenario.n_dim)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LifePosterior:
-    """Posterior of a life, averaged over its courses.
+    """Posterior of a life, averaged over its scenarios.
 
     Attributes
     ----------
@@ -232,7 +236,7 @@ class LifePosterior:
         Health parameters.
     modes : tuple of str
         Modes that it rests on.
-    ways : tuple of Way
+    scenarios : tuple of ScenarioPosterior
         Courses worth telling, the most probable first.
     health : ndarray
         Health parameters now, as fractions of the baseline value: those of the first way, then of
@@ -245,9 +249,9 @@ class LifePosterior:
         Of the logarithms of health now, shape ``(n_parameters, n_parameters)``; NaN where a
         parameter never changes.
     chi_square : float
-        Of the residuals at the posterior mean of each course, averaged.
+        Of the residuals at the posterior mean of each scenario, averaged.
     degrees_of_freedom : int
-        Data minus parameters of the most probable course.
+        Data minus parameters of the most probable scenario.
     walk, noise_scale, deviation : float
         As in `Prognosis`.
     seed : tuple of int
@@ -257,7 +261,7 @@ class LifePosterior:
     stage: str
     parameters: tuple[str, ...]
     modes: tuple[str, ...]
-    ways: tuple[Way, ...]
+    scenarios: tuple[ScenarioPosterior, ...]
     health: FloatArray
     off: FloatArray
     rate: FloatArray
@@ -275,15 +279,15 @@ class LifePosterior:
         expect_shape("off", self.off, shape)
         expect_shape("rate", self.rate, shape)
         expect_shape("correlation", self.correlation, (p, p))
-        if sum(way.share for way in self.ways) != shape[1]:
+        if sum(way.n_mixture for way in self.scenarios) != shape[1]:
             raise ValueError("the ways do not share the draws among them")
         freeze(self)
 
-    def each(self) -> Iterator[tuple[Way, FloatArray, FloatArray]]:
+    def by_scenario(self) -> Iterator[tuple[ScenarioPosterior, FloatArray, FloatArray]]:
         """Yield each way with what `off` and `rate` its own draws have."""
         first = 0
-        for way in self.ways:
-            part = slice(first, first + way.share)
+        for way in self.scenarios:
+            part = slice(first, first + way.n_mixture)
             first = part.stop
             off, rate = (x[:, part].reshape(-1, x.shape[-1]) for x in (self.off, self.rate))
             yield way, off, rate
@@ -291,23 +295,23 @@ class LifePosterior:
     def laws(self, parameter: str) -> dict[tuple[str, float], float]:
         """Probability of each law of a parameter, by its kind and the travel it begins at."""
         j, found = self.parameters.index(parameter), dict[tuple[str, float], float]()
-        for way in self.ways:
-            branch = way.course.branches[j]
-            key = (branch.law.kind, branch.begin)
+        for way in self.scenarios:
+            path = way.scenario.paths[j]
+            key = (path.law.kind, path.begin)
             found[key] = found.get(key, 0.0) + way.probability
         return dict(sorted(found.items(), key=lambda item: -item[1]))
 
     @property
     def ess(self) -> float:
         """The smallest effective sample size of chains; infinite where there are none."""
-        chains = [way for way in self.ways if np.isfinite(way.r_hat).all()]
+        chains = [way for way in self.scenarios if np.isfinite(way.r_hat).all()]
         found = [value for way in chains for value in (*way.ess_bulk, *way.ess_tail)]
         return float(np.min(found, initial=np.inf))
 
     @property
     def worst_r_hat(self) -> float:
         """The largest R-hat of any way."""
-        found = [value for way in self.ways for value in way.r_hat if np.isfinite(value)]
+        found = [value for way in self.scenarios for value in way.r_hat if np.isfinite(value)]
         return float(np.max(found, initial=1.0))
 
     def to_frame(self) -> pd.DataFrame:
@@ -316,7 +320,7 @@ class LifePosterior:
             {"way": 0, "probability": 1.0, "parameter": name} | _quantiles(self.health[..., j])
             for j, name in enumerate(self.parameters)
         ]
-        for k, way in enumerate(self.ways):
+        for k, way in enumerate(self.scenarios):
             chains = way.chains
             for i, name in enumerate(self._names(way)):
                 checks = ("ess_bulk", "ess_tail", "r_hat", "informed")
@@ -338,7 +342,7 @@ class LifePosterior:
             name: np.array(getattr(self, name))
             for name in ("chi_square", "degrees_of_freedom", "walk", "noise_scale", "deviation")
         }
-        for k, way in enumerate(self.ways):
+        for k, way in enumerate(self.scenarios):
             names, chains = self._names(way), way.chains
             groups[f"way_{k + 1}"] = {name: chains[..., i] for i, name in enumerate(names)}
             checks[f"probability_{k + 1}"] = np.array(way.probability)
@@ -351,12 +355,12 @@ class LifePosterior:
             attrs={"/": {"stage": self.stage, "seed": " ".join(map(str, self.seed))}},
         )
 
-    def _names(self, way: Way) -> list[str]:
+    def _names(self, way: ScenarioPosterior) -> list[str]:
         """Name natural parameters by health parameter, law, and where it begins if not at first."""
         names = []
-        for parameter, branch in zip(self.parameters, way.course.branches, strict=True):
-            since = f"@{branch.begin / 1000:.0f}km" if branch.begin else ""
-            names += [f"{parameter}.{branch.law.kind}{since}.{own}" for own in branch.names]
+        for parameter, path in zip(self.parameters, way.scenario.paths, strict=True):
+            since = f"@{path.begin / 1000:.0f}km" if path.begin else ""
+            names += [f"{parameter}.{path.law.kind}{since}.{own}" for own in path.names]
         return names
 
 
@@ -374,7 +378,7 @@ def fit_life(
 ) -> LifePosterior:
     """Fit the degradation laws of a stage to all logs since its baseline.
 
-    Every course that the laws and the steps allow is weighed by its evidence; those that are
+    Every scenario that the laws and the steps allow is weighed by its evidence; those that are
     probable are sampled, and their draws stand together by their probabilities.
 
     Parameters
@@ -386,8 +390,8 @@ def fit_life(
     seed : int or sequence of int
         Of all randomness.
     chains : bool
-        Whether emcee samples the probable courses; else they too are drawn by importance sampling,
-        which is worth at least 400 draws, in a fraction of the time.
+        Whether emcee samples the probable scenarios; otherwise importance sampling draws them (at
+        least 400 effective draws), in a fraction of the time.
     n_draws : int
         Of all ensembles, a multiple of 4.
 
@@ -408,7 +412,7 @@ def fit_life(
     >>> from lmshealth import examples
     >>> stage = lmshealth.load_stage("lms-y")
     >>> life = lmshealth.fit_life(examples.history(), stage, seed=0, chains=False)
-    >>> [branch.law.kind for branch in life.ways[0].course.branches]
+    >>> [path.law.kind for path in life.scenarios[0].scenario.paths]
     ['hertz-wear', 'loosening']
     >>> for name, median in zip(life.parameters, np.median(life.health, axis=(0, 1))):
     ...     print(f"{name}: {median:.0%}")
@@ -426,10 +430,10 @@ def fit_life(
     now = np.array([likelihood.now])
     health, off, rate, settings = [], [], [], []
     for way in ways:
-        y = way.own
+        y = way.mixture_draws
         own_off, own_rate = way.density.deviations(y, now, rng)
-        by_law = way.course.health(way.course.natural(y), now)
-        shape = (_N_ENSEMBLES, way.share, own_off.shape[-1])
+        by_law = way.scenario.health(way.scenario.natural(y), now)
+        shape = (_N_ENSEMBLES, way.n_mixture, own_off.shape[-1])
         health.append((by_law * np.exp(own_off)).reshape(shape))
         off.append(own_off.reshape(shape))
         rate.append(own_rate.reshape(shape))
@@ -438,19 +442,19 @@ def fit_life(
     with np.errstate(invalid="ignore"):  # health that never changes has no correlation
         flat = np.log(both.reshape(-1, both.shape[-1]))
         correlation = np.atleast_2d(np.corrcoef(flat, rowvar=False))
-    share = np.array([way.share for way in ways]) / n_kept
+    share = np.array([way.n_mixture for way in ways]) / n_kept
     walk, noise_scale, deviation, chi_square = (float(v) for v in share @ np.array(settings))
     return LifePosterior(
         stage=history.stage,
         parameters=tuple(parameter.name for parameter in stage.parameters),
         modes=likelihood.modes,
-        ways=ways,
+        scenarios=ways,
         health=both,
         off=np.concatenate(off, axis=1),
         rate=np.concatenate(rate, axis=1),
         correlation=correlation,
         chi_square=chi_square,
-        degrees_of_freedom=likelihood.y.size - ways[0].course.n_dim,
+        degrees_of_freedom=likelihood.y.size - ways[0].scenario.n_dim,
         walk=walk,
         noise_scale=noise_scale,
         deviation=deviation,
@@ -460,51 +464,51 @@ def fit_life(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Look:
-    """What importance sampling finds under one course."""
+    """What importance sampling finds under one scenario."""
 
     density: LifeDensity
-    draws: Weighted
+    draws: WeightedDraws
 
     @property
     def value(self) -> float:
-        """Log of the probability of the course, up to a constant."""
-        return float(np.log(self.density.course.weight) + self.draws.log_evidence)
+        """Log of the probability of the scenario, up to a constant."""
+        return float(np.log(self.density.scenario.weight) + self.draws.log_evidence)
 
 
 def _explored(likelihood: LifeLikelihood, seed: np.random.SeedSequence) -> list[_Look]:
-    """Find the posteriors and evidences of all courses that may be worth it."""
-    densities = [LifeDensity.of(likelihood, course) for course in likelihood.courses]
+    """Find the posteriors and evidences of all scenarios that may be worth it."""
+    densities = [LifeDensity.of(likelihood, scenario) for scenario in likelihood.scenarios]
     generators = [np.random.default_rng(own) for own in seed.spawn(len(densities))]
     looks = [_rough(one, rng) for one, rng in zip(densities, generators, strict=True)]
     best = max(look.value for look in looks)
     return [
-        _fine(look, rng) if look.density.course.n_dim else look
+        _fine(look, rng) if look.density.scenario.n_dim else look
         for look, rng in zip(looks, generators, strict=True)
         if look.value > best - _HOPELESS
     ]
 
 
 def _rough(density: LifeDensity, rng: np.random.Generator) -> _Look:
-    """Look at a course; where it has no coordinates this is exact."""
-    if density.course.n_dim == 0:
+    """Look at a scenario; where it has no coordinates this is exact."""
+    if density.scenario.n_dim == 0:
         point = np.empty((1, 0))
         value = float(density.log_probability(point)[0])
-        return _Look(density.narrowed(point), Weighted(point, np.ones(1), value))
+        return _Look(density.narrowed(point), WeightedDraws(point, np.ones(1), value))
     start = density.draw_prior(rng, _N_ROUGH)
-    return _Look(density, explore(density.log_probability, start, rng, _N_ROUGH))
+    return _Look(density, importance_sample(density.log_probability, start, rng, _N_ROUGH))
 
 
 def _fine(look: _Look, rng: np.random.Generator) -> _Look:
     """Look closely, with what walk, noise and deviation the data leave."""
     start = look.draws.resampled(rng, _N_ROUGH)
     density = look.density.narrowed(start[: _N_ROUGH // 3])
-    return _Look(density, explore_well(density.log_probability, start, rng, _N_FINE))
+    return _Look(density, importance_sample_to_ess(density.log_probability, start, rng, _N_FINE))
 
 
 def _ways(
     found: Sequence[_Look], seed: np.random.SeedSequence, n_kept: int, worth_chains: float
-) -> tuple[Way, ...]:
-    """Sample the courses that are probable, and share the draws among them."""
+) -> tuple[ScenarioPosterior, ...]:
+    """Sample the scenarios that are probable, and share the draws among them."""
     probability = softmax([look.value for look in found])
     order = [k for k in np.argsort(-probability) if probability[k] >= _LEAST_PROBABILITY]
     kept = probability[order] / probability[order].sum()
@@ -516,16 +520,16 @@ def _ways(
         density, weighted = found[k].density, found[k].draws
         draws = _drawn(density, weighted, seeds[k], n_kept, chains=own >= worth_chains)
         ways.append(
-            Way(
+            ScenarioPosterior(
                 density=density,
                 probability=float(own),
-                evidence_std=float(np.sqrt(1 / weighted.ess)) if density.course.n_dim else 0.0,
+                evidence_std=float(np.sqrt(1 / weighted.ess)) if density.scenario.n_dim else 0.0,
                 coordinates=draws.thinned(n_kept),
                 ess_bulk=draws.ess_bulk,
                 ess_tail=draws.ess_tail,
                 r_hat=draws.r_hat,
-                informed=_informed(density.course, draws.thinned(n_kept)),
-                share=int(share),
+                informed=_informed(density.scenario, draws.thinned(n_kept)),
+                n_mixture=int(share),
             )
         )
     return tuple(ways)
@@ -533,14 +537,14 @@ def _ways(
 
 def _drawn(
     density: LifeDensity,
-    weighted: Weighted,
+    weighted: WeightedDraws,
     seed: np.random.SeedSequence,
     n_kept: int,
     *,
     chains: bool,
 ) -> Sample:
-    """Draw coordinates from the posterior of a course."""
-    n_dim = density.course.n_dim
+    """Draw coordinates from the posterior of a scenario."""
+    n_dim = density.scenario.n_dim
     if n_dim and chains:
         start = start_among(weighted.points, weighted.weight)
         return sample(density.log_probability, start, seed)
@@ -549,10 +553,10 @@ def _drawn(
     return Sample(draws.reshape(_N_ENSEMBLES, n_kept, n_dim), worth, worth, unknown, unknown)
 
 
-def _informed(course: Course, y: FloatArray) -> FloatArray:
-    if not course.n_dim:
+def _informed(scenario: Scenario, y: FloatArray) -> FloatArray:
+    if not scenario.n_dim:
         return np.empty(0)
-    prior = course.natural(course.draw(np.random.default_rng(0), _N_PRIOR))
-    theta = course.natural(y.reshape(-1, course.n_dim))
+    prior = scenario.natural(scenario.draw(np.random.default_rng(0), _N_PRIOR))
+    theta = scenario.natural(y.reshape(-1, scenario.n_dim))
     before, after = (np.ptp(np.quantile(x, _ENDS, axis=0), axis=0) for x in (prior, theta))
     return np.asarray(np.clip(1 - (after / before) ** 2, 0, 1))

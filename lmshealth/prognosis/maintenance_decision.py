@@ -18,7 +18,7 @@ _WORTH = 0.01
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Reached:
+class ProbabilityBounds:
     """Probability of having reached each limit before a day, shapes ``(n_parameters + 1,)``.
 
     The two differ where a draw gets past the horizon before that day: nothing is claimed about it
@@ -105,12 +105,12 @@ def decide(prognosis: Prognosis | None, decision: Decision) -> Service:
         by = day_after(prognosis, wait)
         if by is not None:
             kind = "now" if by <= prognosis.recorded_at.date() else "by"
-            risk = float(reached_before(prognosis, by).at_most[-1])
+            risk = float(probability_before(prognosis, by).at_most[-1])
         elif np.isinf(wait):
             kind = "later"
         planned = decision.next_service
         if planned is not None:
-            reached = reached_before(prognosis, planned)
+            reached = probability_before(prognosis, planned)
             planned_risk = float(reached.at_least[-1]), float(reached.at_most[-1])
     return Service(
         kind, by, wait, risk, planned, planned_risk, decision.accepted, decision.cost_ratio
@@ -186,7 +186,7 @@ def cheapest_travel(prognosis: Prognosis, cost_ratio: float) -> float:
     return float(planned[best]) if cost[best] < (1 - _WORTH) * cost[-1] else np.inf
 
 
-def reached_before(prognosis: Prognosis, day: date) -> Reached:
+def probability_before(prognosis: Prognosis, day: date) -> ProbabilityBounds:
     """Give the probability that each limit, and any, is reached before a day begins.
 
     Parameters
@@ -202,13 +202,13 @@ def reached_before(prognosis: Prognosis, day: date) -> Reached:
     within = np.minimum(prognosis.remaining, prognosis.horizon)
     maybe = within <= days * prognosis.usage[:, None]
     surely = maybe & (prognosis.remaining <= prognosis.horizon)
-    return Reached(at_least=np.mean(surely, axis=0), at_most=np.mean(maybe, axis=0))
+    return ProbabilityBounds(at_least=np.mean(surely, axis=0), at_most=np.mean(maybe, axis=0))
 
 
 def remaining_days(prognosis: Prognosis) -> FloatArray:
     """Give the draws of the remaining days, infinite past the horizon, as `remaining` is shaped."""
     with np.errstate(divide="ignore", invalid="ignore"):
-        return np.asarray(prognosis.claimed() / prognosis.usage[:, None])
+        return np.asarray(prognosis.censored() / prognosis.usage[:, None])
 
 
 def day_after(prognosis: Prognosis, wait: float) -> date | None:

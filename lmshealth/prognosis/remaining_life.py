@@ -76,12 +76,12 @@ def prognose_with_posterior(
     history: History, stage: Stage, seed: int | Sequence[int], *, chains: bool = True
 ) -> tuple[Prognosis, LifePosterior]:
     """Prognose, and give the posterior that it rests on; see `prognose`."""
-    if not limited(stage):
+    if not parameters_with_limit(stage):
         raise BadStage(f"{stage.name}: no [[parameter]] has a limit, so there is no end of life")
     # Health has its streams by epoch, the life its own; these are of what comes after.
     seeds = stream(seed, _STEP).spawn(3)
     life = fit_life(history, stage, seed, chains=chains)
-    told = told_limits(stage, life.modes)
+    told = identifiable_limits(stage, life.modes)
     if not told:
         raise NotEnoughData(
             f"{history.stage}: {', '.join(life.modes)} cannot tell any parameter that has a limit, "
@@ -102,7 +102,7 @@ def prognose_with_posterior(
         recorded_at=history.recorded_at[-1],
         travel=float(history.travel[-1]),
         parameters=(*(p.name for _, p in told), "any"),
-        untold=tuple(p.name for j, p in limited(stage) if j not in columns),
+        unidentifiable=tuple(p.name for j, p in parameters_with_limit(stage) if j not in columns),
         limits=np.array([p.limit.below for _, p in told if p.limit] + [np.nan]),
         remaining=remaining,
         usage=usage,
@@ -153,11 +153,11 @@ def remaining_travel(
         In m, shape ``(n_draws, n_limits + 1)``, in the order of the draws of `life`.
     """
     parts = []
-    for way, off, rate in life.each():
-        theta = way.course.split(way.course.natural(way.own))
+    for way, off, rate in life.by_scenario():
+        theta = way.scenario.split(way.scenario.natural(way.mixture_draws))
         columns = [
             first_passage(
-                way.course.branches[j],
+                way.scenario.paths[j],
                 theta[j],
                 off[:, j],
                 rate[:, j],
@@ -170,7 +170,7 @@ def remaining_travel(
             if parameter.limit is not None
         ]
         found = np.column_stack([*columns, np.min(columns, axis=0)])
-        parts.append(found.reshape(life.rate.shape[0], way.share, -1))
+        parts.append(found.reshape(life.rate.shape[0], way.n_mixture, -1))
     joined = np.concatenate(parts, axis=1)
     return joined.reshape(-1, joined.shape[-1])
 
@@ -178,10 +178,10 @@ def remaining_travel(
 def _curve(life: LifePosterior, travel: FloatArray, rng: np.random.Generator) -> FloatArray:
     """Draw health at travels since the baseline, ``(n, n_travel, n_parameters)``."""
     curves = []
-    for way, _, _ in life.each():
-        y = way.own[::_EVERY]
+    for way, _, _ in life.by_scenario():
+        y = way.mixture_draws[::_EVERY]
         off, _ = way.density.deviations(y, travel, rng)
-        curves.append(way.course.health(way.course.natural(y), travel) * np.exp(off))
+        curves.append(way.scenario.health(way.scenario.natural(y), travel) * np.exp(off))
     return np.concatenate(curves)
 
 
@@ -230,13 +230,13 @@ def _usage(
     return np.asarray(rate * np.exp(np.clip(np.sqrt(per_day) / rate * scatter, -5.0, 5.0)))
 
 
-def limited(stage: Stage) -> list[tuple[int, ParameterSpec]]:
+def parameters_with_limit(stage: Stage) -> list[tuple[int, ParameterSpec]]:
     """Parameters that have a limit, with their position."""
     return [(j, p) for j, p in enumerate(stage.parameters) if p.limit is not None]
 
 
-def told_limits(stage: Stage, modes: Sequence[str]) -> list[tuple[int, ParameterSpec]]:
+def identifiable_limits(stage: Stage, modes: Sequence[str]) -> list[tuple[int, ParameterSpec]]:
     """Parameters that have a limit and that endless logs with some modes would tell."""
     sight = sight_of(stage).through(modes)
     seen = identifiable([sight], [range(len(stage.parameters))], stage.prior.variance)
-    return [(j, p) for j, p in limited(stage) if seen[j]]
+    return [(j, p) for j, p in parameters_with_limit(stage) if seen[j]]

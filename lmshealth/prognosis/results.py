@@ -46,7 +46,7 @@ class Prognosis:
         Odometer at that moment, in m.
     parameters : tuple of str
         Names of the health parameters with a limit, then ``any`` (the first limit reached).
-    untold : tuple of str
+    unidentifiable : tuple of str
         Parameters with a limit of which the modes cannot tell how far off it is: nothing is said of
         them, and they are no part of ``any``.
     limits : ndarray
@@ -87,7 +87,7 @@ class Prognosis:
     recorded_at: datetime
     travel: float
     parameters: tuple[str, ...]
-    untold: tuple[str, ...]
+    unidentifiable: tuple[str, ...]
     limits: FloatArray
     remaining: FloatArray
     usage: FloatArray
@@ -113,7 +113,7 @@ class Prognosis:
         expect_shape("curve_quantiles", self.curve_quantiles, (5, self.curve_travel.size, n - 1))
         freeze(self)
 
-    def claimed(self) -> FloatArray:
+    def censored(self) -> FloatArray:
         """Draws of the remaining travel, infinite past the horizon, as `remaining` is shaped."""
         return np.where(self.remaining > self.horizon, np.inf, self.remaining)
 

@@ -25,7 +25,7 @@ _JUMP = Normal(0.0, 0.3)
 
 
 @dataclass(frozen=True, slots=True)
-class Branch:
+class DegradationPath:
     """What one health parameter does.
 
     Coordinates are those of the law, then ln of the jump at each step.
@@ -96,12 +96,12 @@ class Branch:
 
 
 @dataclass(frozen=True)
-class Course:
+class Scenario:
     """One way in which all health parameters may go.
 
     Attributes
     ----------
-    branches : tuple of Branch
+    paths : tuple of DegradationPath
         One per health parameter.
     now : float
         Travel in m since the baseline at the last log.
@@ -109,14 +109,14 @@ class Course:
         Probability beforehand.
     """
 
-    branches: tuple[Branch, ...]
+    paths: tuple[DegradationPath, ...]
     now: float
     weight: float
 
     @cached_property
     def sizes(self) -> tuple[int, ...]:
         """Number of coordinates of each parameter."""
-        return tuple(len(branch.names) for branch in self.branches)
+        return tuple(len(path.names) for path in self.paths)
 
     @property
     def n_dim(self) -> int:
@@ -129,19 +129,19 @@ class Course:
 
     def natural(self, y: FloatArray) -> FloatArray:
         """Turn coordinates into natural parameters, ``(n, n_dim)`` both."""
-        parts = zip(self.branches, self.split(y), strict=True)
-        return np.hstack([branch.natural(part, self.now) for branch, part in parts])
+        parts = zip(self.paths, self.split(y), strict=True)
+        return np.hstack([path.natural(part, self.now) for path, part in parts])
 
     def log_prior(self, y: FloatArray) -> FloatArray:
         """Log prior density of the coordinates, shape ``(n,)``."""
         total = np.zeros(y.shape[0])
-        for branch, part in zip(self.branches, self.split(y), strict=True):
-            total = total + branch.log_prior(part, self.now)
+        for path, part in zip(self.paths, self.split(y), strict=True):
+            total = total + path.log_prior(part, self.now)
         return np.where(np.isnan(total), -np.inf, total)
 
     def draw(self, rng: np.random.Generator, n: int) -> FloatArray:
         """Draw coordinates from the prior, shape ``(n, n_dim)``."""
-        return np.hstack([branch.draw(rng, n, self.now) for branch in self.branches])
+        return np.hstack([path.draw(rng, n, self.now) for path in self.paths])
 
     def health(self, theta: FloatArray, travel: FloatArray) -> FloatArray:
         """Health as fractions of baseline by natural parameters, ``(n, n_travel, n_parameters)``.
@@ -153,14 +153,14 @@ class Course:
         travel : ndarray
             Since the baseline in m, shape ``(n_travel,)``.
         """
-        parts = zip(self.branches, self.split(theta), strict=True)
-        return np.stack([branch.health(own, travel) for branch, own in parts], axis=-1)
+        parts = zip(self.paths, self.split(theta), strict=True)
+        return np.stack([path.health(own, travel) for path, own in parts], axis=-1)
 
 
-def courses_of(
+def list_scenarios(
     parameters: Sequence[ParameterSpec], steps: Sequence[float], now: float
-) -> tuple[Course, ...]:
-    """List every course that a life may have taken, with its probability beforehand.
+) -> tuple[Scenario, ...]:
+    """List every scenario that a life may have taken, with its probability beforehand.
 
     Parameters
     ----------
@@ -174,17 +174,17 @@ def courses_of(
     choices = []
     for parameter in parameters:
         total = sum(law.weight for law in parameter.laws)
-        own: list[tuple[Branch, float]] = []
+        own: list[tuple[DegradationPath, float]] = []
         for law in parameter.laws:
             # What has no parameters, or no travel after the step, cannot begin anew.
             anew = law.names and steps and 0 < steps[-1] < now
             begins = (0.0, steps[-1]) if anew else (0.0,)
             share = law.weight / total / len(begins)
-            own += [(Branch(law, begin, tuple(steps)), share) for begin in begins]
+            own += [(DegradationPath(law, begin, tuple(steps)), share) for begin in begins]
         choices.append(own)
     return tuple(
-        Course(
-            branches=tuple(branch for branch, _ in chosen),
+        Scenario(
+            paths=tuple(path for path, _ in chosen),
             now=now,
             weight=float(np.prod([share for _, share in chosen])),
         )

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from lmshealth.health.results import Health
-from lmshealth.health.verdict import Judgement, unexplained
+from lmshealth.health.verdict import Verdict, undeclared_events
 from lmshealth.io.log import Refusal
-from lmshealth.prognosis.fleet_prior import Learned, Lesson
+from lmshealth.prognosis.fleet_prior import FleetPrior, MachineEvidence
 from lmshealth.prognosis.maintenance_decision import Service, decide
 from lmshealth.prognosis.results import Prognosis
 from lmshealth.signal.waterfall import Waterfall
@@ -35,7 +35,7 @@ class Assessment:
         None when there is no health parameter, or too few logs.
     prognosis : Prognosis or None
         None when there is no health, or no limit.
-    judgement : Judgement
+    judgement : Verdict
         The verdict.
     refused : tuple of Refusal
         Everything of this stage that was not analysed.
@@ -45,9 +45,9 @@ class Assessment:
         Of all random streams.
     waterfall : Waterfall or None
         Spectra of the logs of the history; None where no log shows the band of its modes.
-    lesson : Lesson or None
+    evidence : MachineEvidence or None
         What the machine teaches others of its description; None without a posterior of its life.
-    fleet : Learned or None
+    fleet : FleetPrior or None
         The prior that others have taught it; None where the prognosis rests on the description's.
     """
 
@@ -57,13 +57,13 @@ class Assessment:
     track: Track | None
     health: Health | None
     prognosis: Prognosis | None
-    judgement: Judgement
+    judgement: Verdict
     refused: tuple[Refusal, ...]
     notes: tuple[str, ...]
     seed: int
     waterfall: Waterfall | None = None
-    lesson: Lesson | None = None
-    fleet: Learned | None = None
+    evidence: MachineEvidence | None = None
+    fleet: FleetPrior | None = None
 
     def service(self) -> Service:
         """Choose the day of the service as the description asks."""
@@ -74,7 +74,7 @@ class Assessment:
         """The modes that raised an alarm since the baseline, where no verdict says why."""
         if self.judgement.verdict != "not-enough-data":
             return ()
-        alarms = unexplained(self.track, self.history.baseline, "alarm")
+        alarms = undeclared_events(self.track, self.history.baseline, "alarm")
         return tuple(dict.fromkeys(event.mode for event in alarms))
 
     def urgency(self, service: Service) -> tuple[int, float, float, str]:

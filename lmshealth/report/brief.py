@@ -176,7 +176,7 @@ def _begin(travel: float) -> str:
 
 
 def _untold(prognosis: Prognosis) -> Iterator[str]:
-    names = ", ".join(spell(name) for name in prognosis.untold)
+    names = ", ".join(spell(name) for name in prognosis.unidentifiable)
     if names:
         yield f"The modes cannot tell {names}: its limit is no part of this."
 
@@ -218,7 +218,7 @@ def _gauges(health: Health | None) -> Iterator[str]:
     """Median and 90 % interval of each parameter that the logs tell."""
     if health is None or not health.recorded_at:
         return
-    told, values = health.told(), 100 * health.latest(LEVELS)
+    told, values = health.informed_parameters(), 100 * health.latest(LEVELS)
     for j, name in enumerate(health.parameters):
         low, middle, high = values[:, j]
         found = f"{middle:.0f} % ({low:.0f} to {high:.0f})" if told[j] else "not told"
@@ -231,7 +231,7 @@ def _left(prognosis: Prognosis | None) -> str:
     end = f"beyond {prognosis.horizon / _KM:,.0f}"
     low, middle, high = (
         f"{max(value, 0.0) / _KM:,.0f}" if np.isfinite(value) else end
-        for value in quantiles(prognosis.claimed()[:, -1])
+        for value in quantiles(prognosis.censored()[:, -1])
     )
     return middle if low == high else f"{middle} ({low} to {high})"
 

@@ -76,7 +76,7 @@ def reported(assessment: Assessment, service: Service | None = None) -> Reported
     told: dict[str, Interval] = {}
     if health is not None and health.recorded_at:
         low, middle, high = health.latest(LEVELS)
-        for k in np.flatnonzero(health.told()).tolist():
+        for k in np.flatnonzero(health.informed_parameters()).tolist():
             told[health.parameters[k]] = float(low[k]), float(middle[k]), float(high[k])
     remaining: Interval | None = None
     if prognosis is not None:

@@ -317,7 +317,7 @@ def _tells(health: Health, parameter: str) -> bool:
     """Tell whether the last epoch knows a parameter from the data."""
     if parameter not in health.parameters:
         return False
-    return bool(health.told()[health.parameters.index(parameter)])
+    return bool(health.informed_parameters()[health.parameters.index(parameter)])
 
 
 def _epochs(ax: Axes, health: Health, parameter: str) -> float:

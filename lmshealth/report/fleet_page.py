@@ -120,7 +120,7 @@ def summarise(assessment: Assessment, service: Service, file: str) -> Summary:
         probability=how_sure(assessment),
         gauges=gauges(assessment, _TOP),
         life=next(reversed(lives(prognosis)), None),
-        remaining=np.nan if prognosis is None else quantiles(prognosis.claimed()[:, -1])[1],
+        remaining=np.nan if prognosis is None else quantiles(prognosis.censored()[:, -1])[1],
         service=service,
         brief=brief(assessment, service),
     )

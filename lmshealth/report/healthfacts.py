@@ -130,7 +130,7 @@ def _gauge(spec: ParameterSpec | None, health: Health, column: int, top: float) 
     below = "" if limit is None else percent(np.mean(health.samples[-1, :, column] < limit))
     return Gauge(
         name=spell(health.parameters[column]),
-        told=bool(health.told()[column]),
+        told=bool(health.informed_parameters()[column]),
         converged=bool(health.converged[-1]),
         share=percent(float(health.informed[-1, column])),
         value=f"{100 * middle:.0f}{GAP}%",
@@ -151,7 +151,7 @@ def lives(prognosis: Prognosis | None) -> tuple[Life, ...]:
 
 def _life(prognosis: Prognosis, column: int) -> Life:
     name, limit = prognosis.parameters[column], float(prognosis.limits[column])
-    distance = quantiles(prognosis.claimed()[:, column])
+    distance = quantiles(prognosis.censored()[:, column])
     days = quantiles(remaining_days(prognosis)[:, column])
     low, middle, high = quantiles(
         100 * prognosis.health[:, min(column, prognosis.health.shape[1] - 1)]
@@ -174,7 +174,7 @@ def first_limit(prognosis: Prognosis | None) -> tuple[str, str] | None:
     """
     if prognosis is None or len(prognosis.limits) < 3:
         return None
-    parts = prognosis.claimed()[:, :-1]
+    parts = prognosis.censored()[:, :-1]
     ending = np.isfinite(parts).any(axis=1)
     if not ending.any():
         return None

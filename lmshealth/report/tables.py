@@ -19,7 +19,7 @@ from lmshealth.health.results import Health
 from lmshealth.io.log import Refusal
 from lmshealth.io.metadata import COVARIATES
 from lmshealth.modal.frf.identification import FrfReading
-from lmshealth.prognosis.maintenance_decision import Reached, Service, remaining_days
+from lmshealth.prognosis.maintenance_decision import ProbabilityBounds, Service, remaining_days
 from lmshealth.prognosis.results import Prognosis
 from lmshealth.report.assessment import Assessment
 from lmshealth.signal.acceleration_levels import Growth, Magnitude
@@ -272,7 +272,7 @@ def _smoothed_columns(smoothed: Smoothed, k: int, i: int) -> Row:
 
 
 def prognosis_rows(
-    prognosis: Prognosis, service: Service, before: tuple[date, Reached] | None = None
+    prognosis: Prognosis, service: Service, before: tuple[date, ProbabilityBounds] | None = None
 ) -> list[Row]:
     """List a remaining life, one row per limit and one for any of them.
 
@@ -282,7 +282,7 @@ def prognosis_rows(
         The draws.
     service : Service
         What they lead to; told in the row of any limit.
-    before : tuple of date and Reached, optional
+    before : tuple of date and ProbabilityBounds, optional
         A day, and the probabilities to have reached a limit before it: in columns of their own.
     """
     beyond, past = prognosis.beyond_horizon(), prognosis.already_past()
@@ -313,7 +313,7 @@ def prognosis_rows(
 
 def _rul(prognosis: Prognosis, column: int, days: FloatArray) -> Row:
     """Quantiles of the remaining life; past the horizon they are empty, not numbers."""
-    travel = prognosis.claimed()[:, column]
+    travel = prognosis.censored()[:, column]
     row: Row = {}
     for unit, values in (("km", travel / _KM), ("hours", days * 24), ("days", days)):
         found = np.quantile(np.maximum(values, 0), RUL_LEVELS, method="inverted_cdf")

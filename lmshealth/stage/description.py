@@ -192,7 +192,7 @@ class Description(_Part, frozen=True):
 
 
 @dataclass(frozen=True, slots=True)
-class Scatter:
+class ScatterPrior:
     """How probable each value is that the scatter of logs about a life may have, in proportion.
 
     Weights of the values of the life's grid, in its order: of the random walk of ln
@@ -217,14 +217,14 @@ class Stage:
         Surrogate of the map; None when there is no health parameter.
     digest : str
         SHA-256 over description and map: results carry it.
-    scatter : Scatter or None
+    scatter : ScatterPrior or None
         What is believed of scatter beforehand; None for what every stage is believed to have.
     """
 
     description: Description
     modal_map: ModalMap | None
     digest: str
-    scatter: Scatter | None = None
+    scatter: ScatterPrior | None = None
 
     @property
     def name(self) -> str:

@@ -37,7 +37,7 @@ import numpy as np
 
 from lmshealth.errors import BadQuestion
 from lmshealth.health.epoch_posterior import EpochPosterior
-from lmshealth.health.importance_sampling import explore_well
+from lmshealth.health.importance_sampling import importance_sample_to_ess
 from lmshealth.stage.description import Stage, load_stage
 from lmshealth.stage.identifiability import sight_of
 from lmshealth.stage.planning import plan
@@ -167,7 +167,9 @@ def called(
     modes = stage.informative
     drift = stage.drift(x[None], modes)[0] + np.sqrt(variance) * rng.standard_normal(variance.size)
     posterior = EpochPosterior.of(stage, modes, drift, np.diag(variance))
-    draws = explore_well(posterior.log_probability, _about(stage, x, variance, rng), rng, 1200)
+    draws = importance_sample_to_ess(
+        posterior.log_probability, _about(stage, x, variance, rng), rng, 1200
+    )
     lost = draws.weight @ (draws.points[:, j] < stage.baseline_point[j])
     return bool(lost > 1 - FALSE_ALARM)
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from lmshealth.prognosis import life_likelihood as model
 from lmshealth.stage.degradation_laws import HertzWear, Unchanging
-from lmshealth.stage.description import Scatter, Stage, load_stage
+from lmshealth.stage.description import ScatterPrior, Stage, load_stage
 from lmshealth.tracking.results import History, Series
 from lmshealth.tracking.state_space import regressors
 from studies.sbc_life.lives import Part
@@ -68,8 +68,8 @@ def draw_fleet(rng: np.random.Generator, stage: Stage) -> Stage:
         msgspec.structs.replace(wear, life_km=life_km, weight=share),
         msgspec.structs.replace(none, weight=1 - share),
     )
-    believed = model.scatter_of(stage)
-    scatter = Scatter(*(_of_values(rng, getattr(believed, f)) for f in Scatter.__slots__))
+    believed = model.scatter_prior(stage)
+    scatter = ScatterPrior(*(_of_values(rng, getattr(believed, f)) for f in ScatterPrior.__slots__))
     own = _with(stage, (msgspec.structs.replace(preload, law=laws), mount))
     return replace(own, scatter=scatter)
 
@@ -161,7 +161,7 @@ def _modes(
 
 
 def _shares(fleet: Stage, field: str) -> Array:
-    weight = np.array(getattr(model.scatter_of(fleet), field))
+    weight = np.array(getattr(model.scatter_prior(fleet), field))
     return np.asarray(weight / weight.sum())
 
 

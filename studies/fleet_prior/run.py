@@ -9,8 +9,8 @@ Method
     of a fleet, the share of its machines that wear, and how its logs scatter, of a stage in Y whose
     mount keeps its stiffness. Each has 16 machines of 24 logs that teach, their odometers lognormal
     about 2,000 km; a machine that leaves the modal map is taken out at the log before. Young ones
-    have 8 logs about 200 km; they are drawn until four of a fleet are young by `is_young`. Logs
-    have errors of 0.03 to 0.2 %, unknown intercepts, effects of temperature and payload, a random
+    have 8 logs about 200 km; they are drawn until four of a fleet are young (`needs_fleet_prior`).
+    Logs have errors of 0.03 to 0.2 %, unknown intercepts, effects of temperature and payload, a random
     walk, a factor on the errors, a deviation of health from its law, and a map whose sensitivities
     are wrong. All posteriors are drawn by importance sampling (``chains=False``). The remaining
     life of every young machine, cut at the horizon, is told with the prior of the description, with
@@ -43,7 +43,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lmshealth.prognosis.fleet_prior import Learned, Lesson, is_young, learn, lesson_of
+from lmshealth.prognosis.fleet_prior import (
+    FleetPrior,
+    MachineEvidence,
+    fleet_priors,
+    machine_evidence,
+    needs_fleet_prior,
+)
 from lmshealth.prognosis.life_posterior import LifePosterior, fit_life
 from lmshealth.prognosis.remaining_life import remaining_travel
 from lmshealth.stage.degradation_laws import HertzWear
@@ -120,26 +126,28 @@ def one(kind: str, number: int) -> Row:
     for _ in range(MOST_DRAWN):
         drawn = draw(rng, fleet, YOUNG)
         own = posterior(drawn, described(), number)
-        lesson = lesson_of(described(), own)
-        if is_young(lesson):
+        lesson = machine_evidence(described(), own)
+        if needs_fleet_prior(lesson):
             row["young"].append(pupil(drawn, own, lesson, fleet, schools, number))
         if len(row["young"]) == N_YOUNG[kind]:
             break
     return row
 
 
-def lessons(rng: np.random.Generator, fleet: Stage, kind: str, number: int) -> dict[str, Lesson]:
+def lessons(
+    rng: np.random.Generator, fleet: Stage, kind: str, number: int
+) -> dict[str, MachineEvidence]:
     """Draw the grown machines of a fleet, and what each teaches."""
     found = {}
     for k in range(N_TEACHERS[kind]):
         life = posterior(draw(rng, fleet, MATURE), described(), number)
-        found[f"grown-{k:02d}"] = lesson_of(described(), life)
+        found[f"grown-{k:02d}"] = machine_evidence(described(), life)
     return found
 
 
-def wears(lesson: Lesson) -> bool:
+def wears(lesson: MachineEvidence) -> bool:
     """Tell whether a machine is seen to wear."""
-    return lesson.laws["guide_preload"]["hertz-wear"].after >= SEEN_TO_WEAR
+    return lesson.laws["guide_preload"]["hertz-wear"].posterior >= SEEN_TO_WEAR
 
 
 def posterior(drawn: Life, stage: Stage, number: int) -> LifePosterior:
@@ -147,17 +155,17 @@ def posterior(drawn: Life, stage: Stage, number: int) -> LifePosterior:
     return fit_life(drawn.history, stage, [SEED, number], chains=False, n_draws=N_POSTERIOR)
 
 
-def taught(lesson: Lesson, teachers: Mapping[str, Lesson]) -> Learned | None:
+def taught(lesson: MachineEvidence, teachers: Mapping[str, MachineEvidence]) -> FleetPrior | None:
     """Give what teachers teach a young machine; None if they are too few."""
-    return learn(described(), dict(teachers) | {"young": lesson}).get("young")
+    return fleet_priors(described(), dict(teachers) | {"young": lesson}).get("young")
 
 
 def pupil(
     drawn: Life,
     own: LifePosterior,
-    lesson: Lesson,
+    lesson: MachineEvidence,
     fleet: Stage,
-    schools: Mapping[str, Mapping[str, Lesson]],
+    schools: Mapping[str, Mapping[str, MachineEvidence]],
     number: int,
 ) -> Row:
     """Score what is told of a young machine with every prior."""
@@ -173,7 +181,7 @@ def pupil(
     for way, teachers in schools.items():
         if (prior := taught(lesson, teachers)) is None:
             continue
-        stage = prior.onto(described())
+        stage = prior.apply_to(described())
         told[way] = left(posterior(drawn, stage, number), drawn.now)
         priors[way] = learned_numbers(prior)
         if way == LEARNED:
@@ -187,7 +195,7 @@ def pupil(
     }
 
 
-def learned_numbers(prior: Learned) -> list[float]:
+def learned_numbers(prior: FleetPrior) -> list[float]:
     """Give median and sigma of wear lives in km, and the share that wears, as they were learned."""
     law = prior.laws[0]
     assert law.pace is not None

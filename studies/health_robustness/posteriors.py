@@ -12,10 +12,10 @@ from unittest.mock import patch
 import numpy as np
 
 from lmshealth.health.epoch_posterior import EpochPosterior
-from lmshealth.health.importance_sampling import explore_well
+from lmshealth.health.importance_sampling import importance_sample_to_ess
 from lmshealth.prognosis import life_likelihood as life_module
 from lmshealth.prognosis.life_posterior import fit_life
-from lmshealth.prognosis.remaining_life import limited, remaining_travel
+from lmshealth.prognosis.remaining_life import parameters_with_limit, remaining_travel
 from lmshealth.stage.description import Stage
 from lmshealth.tracking.results import History, Track
 from studies.lives import Array
@@ -32,7 +32,7 @@ def epoch_draws(
     cov = shrink * track.drift_cov[epoch][np.ix_(columns, columns)]
     posterior = EpochPosterior.of(stage, modes, track.drift[epoch][columns], cov)
     start = posterior.draw_prior(rng, _N_PRIOR)
-    found = explore_well(posterior.log_probability, start, rng, _N_POINTS)
+    found = importance_sample_to_ess(posterior.log_probability, start, rng, _N_POINTS)
     return np.asarray(np.exp(found.resampled(rng, _N_DRAWS)))
 
 
@@ -66,7 +66,7 @@ def life_draws(
     with _noise_as_stated() if noise_known else nullcontext():
         found = fit_life(history, stage, int(rng.integers(2**32)), chains=chains, n_draws=_N_DRAWS)
     now, horizon = history.clock()[-1], 1000 * stage.description.usage.horizon_km
-    left = remaining_travel(found, limited(stage), rng, now=now, horizon=horizon)
+    left = remaining_travel(found, parameters_with_limit(stage), rng, now=now, horizon=horizon)
     return found.health.reshape(-1, found.health.shape[-1]), claimed(left, stage)
 
 

@@ -337,7 +337,7 @@ def chains(n: int, sizes: Sizes) -> Row:
         chain = infer(one.track, stage, 1, epochs=[last]).samples[0]
         epoch.append(_apart(epoch_draws(one.track, stage, last, rng_of(19, i)), chain))
         if n > 1:
-            # Which course a life took is weighed by importance sampling in both.
+            # Which scenario a life took is weighed by importance sampling in both.
             (by_points, _), (by_chains, _) = (
                 life_draws(one.history, stage, rng_of(19, i), chains=way) for way in (False, True)
             )

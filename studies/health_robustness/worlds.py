@@ -11,7 +11,7 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
-from lmshealth.prognosis.scenarios import courses_of
+from lmshealth.prognosis.scenarios import list_scenarios
 from lmshealth.stage.description import Stage, load_stage
 from lmshealth.stage.identifiability import identifiable, sight_of
 from lmshealth.stage.modal_map import ModalMap, read_map
@@ -126,7 +126,7 @@ def on_path(stage: str, seed: int, rng: np.random.Generator) -> Life:
 
 
 def by_law(stage: str, seed: int, rng: np.random.Generator) -> tuple[Life, Array]:
-    """Take a life whose course is drawn from its prior: the life, and where its limits are, in m.
+    """Take a life whose scenario is drawn from its prior: the life, and where its limits are, in m.
 
     Each parameter follows one of the laws by which it loses, and does not deviate from it. Only
     lives that stay inside the map until now are possible for who believes in the map.
@@ -135,19 +135,19 @@ def by_law(stage: str, seed: int, rng: np.random.Generator) -> tuple[Life, Array
     assert description.modal_map is not None
     kind, visits = _healthy(stage, seed, rng)
     s = _KM * np.array([visit.travel_km - visits[0].travel_km for visit in visits])
-    courses = courses_of(description.parameters, (), s[-1])
+    scenarios = list_scenarios(description.parameters, (), s[-1])
     for _ in range(_REDRAWS):
-        course = courses[rng.choice(len(courses), p=[one.weight for one in courses])]
-        theta = course.natural(course.draw(rng, 1))
-        health = course.health(theta, s)[0]
+        scenario = scenarios[rng.choice(len(scenarios), p=[one.weight for one in scenarios])]
+        theta = scenario.natural(scenario.draw(rng, 1))
+        health = scenario.health(theta, s)[0]
         if health.min() > 0 and description.modal_map.inside(np.log(health)).all():
             break
     else:
         raise RuntimeError(f"{stage}: no life of {_REDRAWS} stays inside the map")
     ends = [
-        branch.passage(own, p.limit.below)[0] if p.limit else np.inf
-        for branch, own, p in zip(
-            course.branches, course.split(theta), description.parameters, strict=True
+        path.passage(own, p.limit.below)[0] if p.limit else np.inf
+        for path, own, p in zip(
+            scenario.paths, scenario.split(theta), description.parameters, strict=True
         )
     ]
     life = life_with(plan_of(stage, kind, seed), _with_health(visits, health))

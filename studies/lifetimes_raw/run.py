@@ -124,7 +124,7 @@ def true_quantities(plan: PriorPlan, health: Array) -> Array:
 
 def quantities(found: Prognosis, stage: Stage) -> Array:
     """Give draws of the same; what lies past the horizon is not claimed."""
-    left = found.claimed()
+    left = found.censored()
     baseline = [p.baseline for p in stage.parameters]
     days = left[:, -1:] / found.usage[:, None]
     return np.hstack([found.health / baseline, left, days])

@@ -98,7 +98,7 @@ def told(health: Health, truth: tuple[float, ...]) -> dict[str, Any]:
             "half_level": level_of_half(np.log(draws[:, j]), float(np.log(truth[j]))),
             "width": float(np.ptp(np.log(np.quantile(draws[:, j], [0.05, 0.95])))),
             "informed": float(health.informed[0, j]),
-            "told": bool(health.told()[j]),
+            "told": bool(health.informed_parameters()[j]),
         }
         for j, name in enumerate(health.parameters)
     }

@@ -10,7 +10,11 @@ import numpy as np
 from lmshealth.health.epoch_posterior import EpochPosterior
 from lmshealth.health.laplace import approximate
 from lmshealth.prognosis.life_posterior import LifePosterior, fit_life
-from lmshealth.prognosis.remaining_life import limited, remaining_travel, told_limits
+from lmshealth.prognosis.remaining_life import (
+    identifiable_limits,
+    parameters_with_limit,
+    remaining_travel,
+)
 from lmshealth.stage.description import Stage
 from lmshealth.tracking.results import History
 from lmshealth.tracking.tracker import track
@@ -58,7 +62,7 @@ def futures(life: LifePosterior, history: History, stage: Stage, seed: list[int]
     """Draw the travel to the first limit from a posterior."""
     return remaining_travel(
         life,
-        told_limits(stage, life.modes),
+        identifiable_limits(stage, life.modes),
         np.random.default_rng(seed),
         now=_since_baseline(history),
         horizon=stage.description.usage.horizon_km * _KM,
@@ -72,12 +76,12 @@ def _since_baseline(history: History) -> float:
 def states_of(life: LifePosterior, history: History) -> dict[str, Array]:
     """Write every draw as wear and loosening; of what never changes nothing is ever lost."""
     now, parts = _since_baseline(history), []
-    for way, off, rate in life.each():
+    for way, off, rate in life.by_scenario():
         n = rate.shape[0]
         never = np.full(n, np.inf), np.ones(n)
-        theta = way.course.split(way.course.natural(way.own))
-        pairs = zip(way.course.branches, theta, strict=True)
-        by_law = {branch.law.kind: own for branch, own in pairs}
+        theta = way.scenario.split(way.scenario.natural(way.mixture_draws))
+        pairs = zip(way.scenario.paths, theta, strict=True)
+        by_law = {path.law.kind: own for path, own in pairs}
         wear = by_law["hertz-wear"].T if "hertz-wear" in by_law else never
         floor, length = by_law["loosening"].T if "loosening" in by_law else never[::-1]
         parts.append(
@@ -144,7 +148,9 @@ def linear(history: History, stage: Stage, rng: np.random.Generator) -> Array:
     normal = rng.standard_normal((N_DRAWS, 3, health.shape[1])) @ scatter.T * scale
     lines = best + root @ normal[:, :2]
     level, slope = lines[:, 0] + normal[:, 2], lines[:, 1]
-    limits = np.array([p.limit.below for _, p in limited(stage) if p.limit is not None])
+    limits = np.array(
+        [p.limit.below for _, p in parameters_with_limit(stage) if p.limit is not None]
+    )
     falling = slope < 0
     passed = (limits - level) / np.where(falling, slope, 1.0)
     ends = np.where(falling, passed, np.where(level <= limits, 0.0, np.inf))

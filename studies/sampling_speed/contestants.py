@@ -91,7 +91,7 @@ def plain_loop(posterior: EpochPosterior, seed: int, steps: int, long: int) -> d
     So few steps tell no autocorrelation time. It is that of the same moves on the same density,
     evaluated by the surrogate over many more steps.
     """
-    machine, view = stage_named("lms-y"), posterior.views[0]
+    machine, view = stage_named("lms-y"), posterior.machines[0]
     model_std = view.stage.description.map.model_std  # type: ignore[union-attr]
     base = guide_frequencies(machine, 1.0, 1.0)
 
@@ -194,7 +194,7 @@ def by_nautilus(posterior: EpochPosterior, seed: int) -> Found:
 
 
 def _log_likelihood(posterior: EpochPosterior, x: Array) -> Array:
-    return posterior.views[0].log_likelihood(x)
+    return posterior.machines[0].log_likelihood(x)
 
 
 def _weighted(points: Array, weight: Array) -> tuple[Array, float]:

@@ -111,9 +111,9 @@ class Walkers:
 def two_ways(history: History, stage: Stage, walkers: int, looped: int) -> Walkers:
     """Find points that the posterior holds probable, and both ways to their likelihood."""
     likelihood = LifeLikelihood(history, stage)
-    # Both parts lose: of all courses the one with the most to draw.
-    course = max(likelihood.courses, key=lambda one: one.n_dim)
-    density = LifeDensity.of(likelihood, course)
+    # Both parts lose: of all scenarios the one with the most to draw.
+    scenario = max(likelihood.scenarios, key=lambda one: one.n_dim)
+    density = LifeDensity.of(likelihood, scenario)
     begin = start_from_prior(density.log_probability, density.draw_prior, 300)
     y = np.concatenate([begin(np.random.default_rng(k)) for k in range(8)])[:walkers]
     density = density.narrowed(y)
@@ -122,12 +122,12 @@ def two_ways(history: History, stage: Stage, walkers: int, looped: int) -> Walke
     value = np.where(grid.deviation == 0, grid.log_weight - 0.5 * grid.rest, -np.inf)
     density = replace(density, grid=grid.chosen(np.arange(n_kept) == np.argmax(value)))
     walk, scale = float(density.grid.walk[0]), float(density.grid.noise_scale[0])
-    prior = course.log_prior(y)
+    prior = scenario.log_prior(y)
     assert stage.description.map is not None
     model_std = stage.description.map.model_std
 
     def loop() -> Array:
-        x, _ = likelihood.ln_health(course, y[:looped], history.clock())
+        x, _ = likelihood.ln_health(scenario, y[:looped], history.clock())
         flats = [stage.drift(one_at_a_time(stage, path), MODES).reshape(3, -1, 2) for path in x]
         setting = {"walk": walk, "scale": scale, "model_std": model_std}
         return np.array([by_filterpy(history, flat[0], flat[1:], **setting) for flat in flats])
@@ -170,7 +170,7 @@ def likelihoods(history: History, stage: Stage, walkers: int, looped: int) -> di
 
 def life_posterior(seed: int, turns: int, *, quick: bool) -> dict[str, Any]:
     """Time the whole posterior with its convergence; the quick form has no chains."""
-    # The fewer laws, the fewer courses.
+    # The fewer laws, the fewer scenarios.
     stage = load_stage("lms-x" if quick else "lms-y")
     rng = np.random.default_rng(seed)
     history = degrading_life(stage, 20 if quick else 100, rng)

@@ -56,7 +56,7 @@ SAME_QUANTILES, SAME_LIKELIHOOD = 0.1, 1e-4
 def converged_epochs(seed: int, turns: int) -> dict[str, Any]:
     """Time all that `infer` does of one epoch."""
     stage = load_stage("lms-y")
-    (view,) = epoch_posterior(stage).views
+    (view,) = epoch_posterior(stage).machines
     drifts = Drifts("AX-Y", (START,), np.array([1e6]), view.modes, view.drift[None], view.cov[None])
     seconds, r_hat = [], []
     for turn in range(turns):

@@ -41,7 +41,7 @@ import numpy as np
 from lmshealth.errors import NotConverged
 from lmshealth.health.ensemble_sampling import stream
 from lmshealth.health.epoch_posterior import EpochPosterior
-from lmshealth.health.importance_sampling import explore_well
+from lmshealth.health.importance_sampling import importance_sample_to_ess
 from lmshealth.health.inference import draw as draw_chains
 from lmshealth.health.inference import infer
 from lmshealth.stage.description import Stage, load_stage
@@ -130,7 +130,7 @@ def ranks_of(
         posterior = EpochPosterior.of(believed, names, told.drift[k][columns], cov)
         start = posterior.draw_prior(rng, N_PRIOR)
         try:
-            found = explore_well(posterior.log_probability, start, rng, N_POINTS)
+            found = importance_sample_to_ess(posterior.log_probability, start, rng, N_POINTS)
             draws.append(found.resampled(rng, N_DRAWS))
         except NotConverged:
             draws.append(thinned(draw_chains(posterior, stream(key, k)).flat))

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lmshealth.prognosis import life_likelihood as model
-from lmshealth.prognosis import scenarios as courses
+from lmshealth.prognosis import scenarios
 from lmshealth.stage.degradation_laws import HertzWear, Law, Loosening
 from lmshealth.stage.description import ParameterSpec, Stage
 from lmshealth.tracking.results import History, Series, Step
@@ -33,7 +33,7 @@ class Part:
     Attributes
     ----------
     law : Law
-        Of the course it takes.
+        Of the scenario it takes.
     theta : ndarray
         Natural parameters of the law, lengths in m.
     begin, step : float
@@ -125,7 +125,7 @@ def _travel(rng: np.random.Generator) -> Array:
 def _parts(
     rng: np.random.Generator, machine: Stage, clock: Array, first: int | None
 ) -> tuple[Part, ...]:
-    """Draw courses and deviations from their priors, until a life stays inside the map."""
+    """Draw scenarios and deviations from their priors, until a life stays inside the map."""
     assert machine.modal_map is not None
     step = np.inf if first is None else float(clock[first - 1 : first + 1].mean())
     while True:
@@ -150,7 +150,7 @@ def _part(
         theta=_of_law(rng, law),
         begin=step if anew else 0.0,
         step=step,
-        jump=float(np.exp(courses._JUMP.std * rng.standard_normal())),
+        jump=float(np.exp(scenarios._JUMP.std * rng.standard_normal())),
         off=np.cumsum(steps),
         rate=float(rate),
     )

@@ -6,7 +6,7 @@ Question
     posterior uniform, do 50 and 90 % intervals cover as often, and does a part wear as often as its
     posterior says?
 Method
-    Simulation-based calibration of `fit_life` and `remaining_travel`. The course of a life (which
+    Simulation-based calibration of `fit_life` and `remaining_travel`. The scenario of a life (which
     law each parameter follows, or none), the parameters of the laws, the standard deviation of the
     deviation and its path are drawn from the priors of the description, the odometer of now by its
     own distribution (lognormal about 2,000 km); lives that leave the map are drawn again, as the
@@ -19,7 +19,7 @@ Method
     and the factor on the reported errors by the estimator's grid and its weights, the second
     source's bias, the size of declared steps, and a relative error of the map's sensitivities per
     parameter and mode, one for the life. A twentieth of estimates and temperatures is missing.
-    Posteriors are drawn by importance sampling, course by course (``chains=False``); those of some
+    Posteriors are drawn by importance sampling, one scenario at a time (``chains=False``); some
     of the same lives by chains too. Ranks among 127 draws, ties (a limit that is never reached, a
     part that keeps its health, censored lives) at random, are held to the simultaneous band of
     their distribution at 99.9 %, and coverages to their 99.9 % Clopper-Pearson interval.
@@ -73,7 +73,7 @@ N_POSTERIOR = 1024
 # What a posterior is made of, and what chains are made of.
 MODEL, SAMPLER = (
     (
-        *("courses", "density", "epoch", "importance", "laws", "life", "lifefit", "modalmap"),
+        *("scenarios", "density", "epoch", "importance", "laws", "life", "lifefit", "modalmap"),
         *("passage", "priors", "stage", "statespace"),
     ),
     ("sampling",),
@@ -155,8 +155,8 @@ def quantities(found: LifePosterior, now: float, rng: np.random.Generator) -> Ar
     n = found.rate.shape[0]
     loses = np.concatenate(
         [
-            np.tile([bool(b.law.names) for b in way.course.branches], (n, way.share, 1))
-            for way in found.ways
+            np.tile([bool(b.law.names) for b in way.scenario.paths], (n, way.n_mixture, 1))
+            for way in found.scenarios
         ],
         axis=1,
     )

@@ -38,8 +38,8 @@ from lmshealth.health.inference import epochs_to_infer, infer
 from lmshealth.io.column_map import ColumnMap
 from lmshealth.io.log import Log
 from lmshealth.modal.modes import Modes
-from lmshealth.prognosis.fleet_prior import Learned
-from lmshealth.prognosis.life_likelihood import scatter_of
+from lmshealth.prognosis.fleet_prior import FleetPrior
+from lmshealth.prognosis.life_likelihood import scatter_prior
 from lmshealth.report.assessment import Assessment
 from lmshealth.report.tables import COLUMNS
 from lmshealth.stage.description import Stage, load_stage
@@ -358,11 +358,13 @@ def test_an_assessment_that_never_can_be_read_does_not_end_the_batch(
 def test_what_is_taught_is_taught_anew_where_it_cannot_be_read(
     tmp_path: Path, modes_only: Stage, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A damaged assessment after the fleet's lesson is made again as well as the one before it."""
+    """A damaged assessment after the fleet's evidence is recomputed like the one before."""
     logs = write_archive(tmp_path / "logs", 2)
-    learned = Learned(3, (), scatter_of(modes_only))
+    learned = FleetPrior(3, (), scatter_prior(modes_only))
     monkeypatch.setattr(
-        batch, "_pupils", lambda machines, store: ((machine, learned) for machine in machines)
+        batch,
+        "_machines_to_update",
+        lambda machines, store: ((machine, learned) for machine in machines),
     )
     monkeypatch.setattr(
         batch,

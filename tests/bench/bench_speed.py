@@ -90,7 +90,7 @@ def test_epoch(race: Race, stage: Stage) -> None:
     Both are told in effective draws of emcee in a plain loop over the same posterior.
     """
     posterior = epoch_posterior(stage)
-    (view,) = posterior.views
+    (view,) = posterior.machines
     drifts = Drifts("AX-Y", (START,), np.array([1e6]), view.modes, view.drift[None], view.cov[None])
     rows = recorded(SAMPLING, "epoch", "programs")
     rate = next(row["ess_per_s"] for row in rows if row["program"] == LOOP)

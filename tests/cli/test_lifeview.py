@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from lmshealth.cli.lifeview import print_briefs, print_life
-from lmshealth.prognosis.maintenance_decision import decide, reached_before
+from lmshealth.prognosis.maintenance_decision import decide, probability_before
 from lmshealth.prognosis.results import LawWeight, Prognosis
 from lmshealth.report.assessment import Assessment
 from lmshealth.report.brief import due, life_brief
@@ -32,7 +32,7 @@ def said(capsys: pytest.CaptureFixture[str]) -> Said:
 
 def shown(life: Prognosis, decision: Decision, said: Said, by: date | None = None) -> str:
     """Print a life and return the text."""
-    before = None if by is None else (by, reached_before(life, by))
+    before = None if by is None else (by, probability_before(life, by))
     service = decide(life, decision)
     print_life(life_brief(life, service, prognosis_rows(life, service, before)))
     return said()
@@ -125,7 +125,7 @@ def test_laws_and_what_no_mode_tells_are_named(said: Said) -> None:
     assert "Law of" not in shown(life, Decision(), said)
     weights = (("linear", 0.0, 0.7), ("none", 3e5, 0.295), ("power", 0.0, 0.005))
     laws = tuple(LawWeight("guide_preload", *weight) for weight in weights)
-    text = shown(replace(life, laws=laws, untold=("mount_stiffness",)), Decision(), said)
+    text = shown(replace(life, laws=laws, unidentifiable=("mount_stiffness",)), Decision(), said)
     told = "Law of guide preload: linear 70 %, none from 300 km after the baseline 30 %."
     assert told in " ".join(text.split()) and "power" not in text
     assert "The modes cannot tell mount stiffness" in text

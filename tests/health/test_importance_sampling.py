@@ -11,7 +11,11 @@ from scipy import stats
 from lmshealth._arrays import FloatArray
 from lmshealth.errors import NotConverged
 from lmshealth.health import importance_sampling as importance
-from lmshealth.health.importance_sampling import Weighted, explore, explore_well
+from lmshealth.health.importance_sampling import (
+    WeightedDraws,
+    importance_sample,
+    importance_sample_to_ess,
+)
 
 Density = Callable[[FloatArray], FloatArray]
 LN_SCALE = 12.3  # of densities that are not normalised
@@ -50,7 +54,7 @@ def banana(x: FloatArray) -> FloatArray:
     return LN_SCALE + stats.norm.logpdf(x[:, 0]) + y.logpdf(x[:, 1])
 
 
-def agrees(found: Weighted, known: float) -> bool:
+def agrees(found: WeightedDraws, known: float) -> bool:
     """Whether an evidence is the known one within 4.5 of its stated standard deviations."""
     return bool(abs(found.log_evidence - known) < 4.5 / np.sqrt(found.ess))
 
@@ -67,7 +71,7 @@ IDS = ["1", "2", "4", "6", "two-peaks", "half", "banana"]
 @pytest.mark.parametrize(("density", "n_dim", "known"), CASES, ids=IDS)
 def test_evidences_are_right_within_their_error(density: Density, n_dim: int, known: float) -> None:
     """Integrals of known densities are found, and a fifth more or less would be noticed."""
-    found = explore_well(density, start(n_dim), np.random.default_rng(2), 4000)
+    found = importance_sample_to_ess(density, start(n_dim), np.random.default_rng(2), 4000)
     assert found.ess > 900
     assert agrees(found, known)
     assert not agrees(found, known + np.log(1.2))
@@ -80,7 +84,9 @@ def test_the_stated_error_is_that_of_many_evidences() -> None:
     """Evidences of 40 seeds scatter by no more than their effective sample sizes say."""
     scores = []
     for seed in range(40):
-        found = explore(two_peaks, start(2, seed), np.random.default_rng(100 + seed), 1500)
+        found = importance_sample(
+            two_peaks, start(2, seed), np.random.default_rng(100 + seed), 1500
+        )
         scores.append((found.log_evidence - LN_SCALE) * np.sqrt(found.ess))
     total = np.sum(np.square(scores))
     assert total < stats.chi2(40).ppf(0.9995)
@@ -93,7 +99,7 @@ def test_the_stated_error_is_that_of_many_evidences() -> None:
 def test_peaks_far_apart_have_their_share() -> None:
     """Draws stand on both peaks as their integrals do, weighted and resampled."""
     rng = np.random.default_rng(3)
-    found = explore_well(two_peaks, start(2), rng, 4000)
+    found = importance_sample_to_ess(two_peaks, start(2), rng, 4000)
     right = found.points[:, 0] > 0
     error = np.sqrt(0.3 * 0.7 / found.ess)
     assert abs(found.weight[right].sum() - 0.7) < 4.5 * error
@@ -108,7 +114,7 @@ def test_peaks_far_apart_have_their_share() -> None:
 def test_draws_of_equal_weight_have_the_moments() -> None:
     """Of a banana: means of x, y and x² are 0, 0.3 and 1, within the error of the draws."""
     rng = np.random.default_rng(4)
-    found = explore_well(banana, start(2), rng, 4000)
+    found = importance_sample_to_ess(banana, start(2), rng, 4000)
     drawn = found.resampled(rng, 4000)
     ess = 1 / (1 / found.ess + 1 / 4000)
     for values, known in ((drawn[:, 0], 0.0), (drawn[:, 1], 0.3), (drawn[:, 0] ** 2, 1.0)):
@@ -118,7 +124,7 @@ def test_draws_of_equal_weight_have_the_moments() -> None:
 def test_points_are_resampled_by_their_weight() -> None:
     """Counts of resampled points follow the weights; one without weight never comes."""
     weight = np.array([0.5, 0.3, 0.2, 0.0])
-    draws = Weighted(np.arange(4.0)[:, None], weight, 0.0)
+    draws = WeightedDraws(np.arange(4.0)[:, None], weight, 0.0)
     found = draws.resampled(np.random.default_rng(5), 10_000)
     count = np.bincount(found[:, 0].astype(int), minlength=4)
     assert count[3] == 0
@@ -129,7 +135,8 @@ def test_points_are_resampled_by_their_weight() -> None:
 def test_the_generator_alone_decides() -> None:
     """One seed gives the same draws, another one others."""
     one, two, other = (
-        explore(two_peaks, start(2), np.random.default_rng(seed), 500) for seed in (6, 6, 7)
+        importance_sample(two_peaks, start(2), np.random.default_rng(seed), 500)
+        for seed in (6, 6, 7)
     )
     np.testing.assert_array_equal(one.points, two.points)
     assert one.log_evidence == two.log_evidence
@@ -138,7 +145,7 @@ def test_the_generator_alone_decides() -> None:
 
 def test_points_outside_of_the_support_are_left_out_but_count() -> None:
     """Draws without a density are none, yet the evidence is of all that were drawn."""
-    found = explore(half, np.abs(start(1)), np.random.default_rng(8), 20_000)
+    found = importance_sample(half, np.abs(start(1)), np.random.default_rng(8), 20_000)
     assert (found.points > 0).all()
     assert found.weight.size < 20_000
     assert agrees(found, LN_SCALE + np.log(0.5))
@@ -149,7 +156,7 @@ def test_points_outside_of_the_support_are_left_out_but_count() -> None:
 
 def test_too_few_draws_are_drawn_anew() -> None:
     """Draws worth less than 400 are drawn again, three times as many."""
-    found = explore_well(gaussian(2), start(2), np.random.default_rng(9), 300)
+    found = importance_sample_to_ess(gaussian(2), start(2), np.random.default_rng(9), 300)
     assert found.points.shape[0] == 900
     assert found.ess >= importance._LEAST
 
@@ -157,12 +164,12 @@ def test_too_few_draws_are_drawn_anew() -> None:
 def test_what_stays_too_little_is_refused_with_its_points() -> None:
     """After three times less than 400 effective draws are an error that says so."""
     with pytest.raises(NotConverged, match=r"of 270 by importance.*needed are 400") as caught:
-        explore_well(gaussian(2), start(2), np.random.default_rng(10), 30)
+        importance_sample_to_ess(gaussian(2), start(2), np.random.default_rng(10), 30)
     assert np.shape(caught.value.chains) == (270, 2)
 
 
 def test_a_start_outside_of_the_support_is_refused() -> None:
     """Where no point has a density the error says what to widen, with the points."""
     with pytest.raises(NotConverged, match="widen the map or the prior") as caught:
-        explore(half, -np.abs(start(2)), np.random.default_rng(11), 500)
+        importance_sample(half, -np.abs(start(2)), np.random.default_rng(11), 500)
     assert np.shape(caught.value.chains) == (600, 2)

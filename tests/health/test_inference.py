@@ -421,7 +421,7 @@ def test_a_shared_guide_is_known_better(stage: Stage) -> None:
     marginal = np.zeros(axis.size)
     for shown, own in machines:
         view = EpochPosterior.of(own, ("roll", "pitch"), shown.drift[2], shown.drift_cov[2])
-        value = view.views[0].log_likelihood(grid).reshape(120, 120) - 0.5 * (axis / 0.3) ** 2
+        value = view.machines[0].log_likelihood(grid).reshape(120, 120) - 0.5 * (axis / 0.3) ** 2
         marginal += np.logaddexp.reduce(value, axis=1)
     marginal += -0.5 * (axis / 0.3) ** 2
     density = np.exp(marginal - marginal.max())
@@ -488,11 +488,11 @@ def test_drifts_that_no_state_explains_claim_nothing(tmp_path: Path) -> None:
     fine = infer(epochs([right], cov), stage, 1)
     assert fine.fit[-1] > 0.01
     assert fine.explained
-    assert fine.told().all()
+    assert fine.informed_parameters().all()
     wrong = infer(epochs([right * [1, -1, 1]], cov), stage, 1)
     assert wrong.fit[-1] < 1e-6
     assert not wrong.explained
-    assert not wrong.told().any()
+    assert not wrong.informed_parameters().any()
 
 
 @pytest.mark.slow
@@ -526,7 +526,7 @@ def test_nothing_is_told_by_what_did_not_converge(
     monkeypatch.setattr(inference, "sample", fail)
     found = infer(worn, stage, 1)
     assert (found.informed > 0.9).all()
-    assert not found.told().any()
+    assert not found.informed_parameters().any()
     assert found.at_edge[-1].tolist() == [True, False]
     assert found.fit[-1] < 1e-6
 

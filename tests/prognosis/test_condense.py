@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lmshealth.prognosis.life_likelihood import MOST_LOGS, LifeLikelihood, condensed
+from lmshealth.prognosis.life_likelihood import MOST_LOGS, LifeLikelihood
 from lmshealth.prognosis.life_posterior import fit_life
 from lmshealth.tracking.results import Step
 from tests.lives import FREQUENCY, SENSITIVITY, awkward_history, make_history, make_stage, since
@@ -16,14 +16,14 @@ from tests.lives import FREQUENCY, SENSITIVITY, awkward_history, make_history, m
 def test_few_logs_are_left_as_they_are() -> None:
     """A history that is short enough is the same one."""
     history = awkward_history(np.random.default_rng(1))
-    assert condensed(history, len(history.logs)) is history
+    assert condense(history, len(history.logs)) is history
 
 
 def test_neighbours_are_averaged_by_all_that_is_known_of_them() -> None:
     """Means and covariances are those of generalised least squares written out as one system."""
     history = awkward_history(np.random.default_rng(2), n=24)
     history = replace(history, steps=())
-    short = condensed(history, 8)
+    short = condense(history, 8)
     assert len(short.logs) < 14
     r, start = len(history.series), 0
     for k, log in enumerate(short.logs):
@@ -63,7 +63,7 @@ def test_baseline_last_log_and_steps_are_not_mixed() -> None:
     there = np.zeros(50, dtype=bool)
     there[30:41] = True
     steps = (since("regreasing", 20, 50), Step("servo", 30, there, name="soft"))
-    short = condensed(replace(history, steps=steps), 6)
+    short = condense(replace(history, steps=steps), 6)
     assert len(short.logs) < 18
     assert short.logs[short.baseline] == history.logs[7]
     assert short.travel[-1] == history.travel[-1]
@@ -93,7 +93,7 @@ def test_a_life_reads_the_same(lives: tuple) -> None:
     """Of 240 logs and of some 40 made of them, medians and widths of health agree."""
     stage, history = lives
     whole, short = (
-        fit_life(own, stage, 0, chains=False) for own in (history, condensed(history, 40))
+        fit_life(own, stage, 0, chains=False) for own in (history, condense(history, 40))
     )
     for j in range(2):
         one, other = (

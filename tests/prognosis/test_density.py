@@ -1,4 +1,4 @@
-"""The posterior density of a course: its grid, its settings, and how far health is off its laws."""
+"""The posterior density of a scenario: its grid, its settings, and deviations of health."""
 
 from __future__ import annotations
 
@@ -39,9 +39,9 @@ def stage(tmp_path_factory: pytest.TempPathFactory) -> Stage:
 
 
 def density_of(history: History, stage: Stage) -> LifeDensity:
-    """Give the density of the first course."""
+    """Give the density of the first scenario."""
     likelihood = LifeLikelihood(history, stage)
-    return LifeDensity.of(likelihood, likelihood.courses[0])
+    return LifeDensity.of(likelihood, likelihood.scenarios[0])
 
 
 def coordinates(density: LifeDensity, n: int, seed: int = 1) -> FloatArray:
@@ -127,7 +127,7 @@ def off_by_hand(
 ) -> tuple[FloatArray, FloatArray]:
     """Condition the dense Gaussian of health about wear and loosening on one life."""
     clock = history.clock()[history.baseline :]
-    health = density.course.health(density.course.natural(y[None]), clock)
+    health = density.scenario.health(density.scenario.natural(y[None]), clock)
     x = np.log(health[0])
     alone = np.stack([true_drift(NAMES, x * (np.arange(2) == j))[:, :2] for j in range(2)])
     belief = LifeBelief(
@@ -236,8 +236,8 @@ def test_a_course_without_coordinates_has_draws_of_one_life(
     several = FADING.replace("law = ", "law = [").replace("} }\n", '} }, { kind = "none" }]\n')
     stage = make_stage(tmp_path, (several,))
     likelihood = LifeLikelihood(rough_history(np.random.default_rng(17)), stage)
-    density = LifeDensity.of(likelihood, likelihood.courses[1])
-    assert density.course.n_dim == 0
+    density = LifeDensity.of(likelihood, likelihood.scenarios[1])
+    assert density.scenario.n_dim == 0
     y = np.empty((2000, 0))
     assert np.isfinite(density.log_probability(y[:1])).all()
     off, rate = density.deviations(y, np.array([likelihood.now]), np.random.default_rng(4))

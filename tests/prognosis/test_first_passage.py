@@ -8,7 +8,7 @@ from scipy import stats
 
 from lmshealth._arrays import FloatArray
 from lmshealth.prognosis.first_passage import first_passage
-from lmshealth.prognosis.scenarios import Branch
+from lmshealth.prognosis.scenarios import DegradationPath
 from lmshealth.stage.degradation_laws import (
     AnyLaw,
     HertzWear,
@@ -29,7 +29,7 @@ LINEAR = Linear(rate_per_km=Normal(0.0, 2e-4))
 
 
 def draw(
-    branch: Branch,
+    path: DegradationPath,
     natural: tuple[float, ...],
     *,
     off: float,
@@ -39,7 +39,7 @@ def draw(
 ) -> FloatArray:
     """Draw many passages of one life."""
     return first_passage(
-        branch,
+        path,
         np.tile(natural, (N, 1)),
         np.full(N, off),
         np.full(N, rate),
@@ -88,16 +88,14 @@ class NoBridge:
 )
 def test_without_wandering_it_is_the_law(law: AnyLaw) -> None:
     """The closed form of each law, at the limit that is left where health is off it."""
-    branch = Branch(law, 0.0, ())
+    path = DegradationPath(law, 0.0, ())
     rng = np.random.default_rng(2)
-    theta = branch.natural(branch.draw(rng, 400, NOW), NOW)
+    theta = path.natural(path.draw(rng, 400, NOW), NOW)
     off = 0.1 * rng.standard_normal(400)
-    found = first_passage(
-        branch, theta, off, np.zeros(400), rng, now=NOW, limit=0.8, horizon=HORIZON
-    )
-    closed = branch.passage(theta, 0.8 * np.exp(-off)) - NOW
+    found = first_passage(path, theta, off, np.zeros(400), rng, now=NOW, limit=0.8, horizon=HORIZON)
+    closed = path.passage(theta, 0.8 * np.exp(-off)) - NOW
     # Only what gains can be above a limit now that it was below before.
-    back = (closed <= 0) & (branch.health(theta, np.array([NOW]))[:, 0] * np.exp(off) > 0.8)
+    back = (closed <= 0) & (path.health(theta, np.array([NOW]))[:, 0] * np.exp(off) > 0.8)
     assert isinstance(law, Linear) or not back.any()
     np.testing.assert_array_equal(found, np.where(back, np.inf, closed))
     finite = np.isfinite(found)
@@ -107,7 +105,7 @@ def test_without_wandering_it_is_the_law(law: AnyLaw) -> None:
         assert (found[finite] < 0).any()
         assert (found[finite] > 0).any()
         ahead = (found[finite] + NOW)[:, None]
-        health = branch.health(theta[finite], ahead)[:, 0] * np.exp(off[finite])
+        health = path.health(theta[finite], ahead)[:, 0] * np.exp(off[finite])
         inside = ahead[:, 0] > 0
         np.testing.assert_allclose(health[inside], 0.8, rtol=1e-9)
 
@@ -116,7 +114,7 @@ def test_without_wandering_it_is_the_law(law: AnyLaw) -> None:
 @pytest.mark.parametrize(("limit", "off"), [(0.75, 0.0), (0.5, 0.05), (0.2, -0.1)])
 def test_a_steady_fall_is_inverse_gaussian(limit: float, off: float, rate: float) -> None:
     """Ln health that falls in proportion to travel has a passage in closed form."""
-    found = draw(Branch(FALLING, 0.0, ()), (0.0, LIFE), off=off, rate=rate, limit=limit)
+    found = draw(DegradationPath(FALLING, 0.0, ()), (0.0, LIFE), off=off, rate=rate, limit=limit)
     above = off - NOW / LIFE - np.log(limit)
     assert (found > 0).all()
     assert follows(found, inverse_gaussian(above, rate))
@@ -128,7 +126,9 @@ def test_a_steady_fall_is_inverse_gaussian(limit: float, off: float, rate: float
 @pytest.mark.parametrize("begin", [0.0, 0.4e6])
 def test_a_step_in_the_past_is_what_it_left(begin: float) -> None:
     """From a jump by a fifth on, and a law that begins there or before, it falls as steadily."""
-    found = draw(Branch(FALLING, begin, (0.4e6,)), (0.0, LIFE, 0.8), off=0.02, rate=2e-8, limit=0.4)
+    found = draw(
+        DegradationPath(FALLING, begin, (0.4e6,)), (0.0, LIFE, 0.8), off=0.02, rate=2e-8, limit=0.4
+    )
     above = 0.02 - (NOW - begin) / LIFE + np.log(0.8 / 0.4)
     assert follows(found, inverse_gaussian(above, 2e-8))
     assert not follows(found, inverse_gaussian(above - np.log(0.8), 2e-8))  # negative control
@@ -137,7 +137,7 @@ def test_a_step_in_the_past_is_what_it_left(begin: float) -> None:
 @pytest.mark.parametrize(("limit", "rate"), [(0.9, 1e-9), (0.6, 1e-8), (0.3, 4e-7)])
 def test_without_a_law_it_is_the_reflection_principle(limit: float, rate: float) -> None:
     """Health that only wanders is past its limit by s with probability 2 Φ(-a / σ√s)."""
-    found = draw(Branch(Unchanging(), 0.0, ()), (), off=0.03, rate=rate, limit=limit)
+    found = draw(DegradationPath(Unchanging(), 0.0, ()), (), off=0.03, rate=rate, limit=limit)
     above = 0.03 - np.log(limit)
     for travel in (0.2 * HORIZON, 0.5 * HORIZON, HORIZON):
         low, high = binomial_band(int(np.sum(found <= travel)), N)
@@ -148,11 +148,11 @@ def test_without_a_law_it_is_the_reflection_principle(limit: float, rate: float)
 
 def test_without_bridges_crossings_are_missed() -> None:
     """Negative control: at few moments alone fewer lives, and later ones, are seen to end."""
-    branch = Branch(FALLING, 0.0, ())
+    path = DegradationPath(FALLING, 0.0, ())
     above = -NOW / LIFE - np.log(0.6)
     rng: np.random.Generator = NoBridge()  # type: ignore[assignment]
-    wrong = draw(branch, (0.0, LIFE), off=0.0, rate=2e-7, limit=0.6, rng=rng)
-    right = draw(branch, (0.0, LIFE), off=0.0, rate=2e-7, limit=0.6)
+    wrong = draw(path, (0.0, LIFE), off=0.0, rate=2e-7, limit=0.6, rng=rng)
+    right = draw(path, (0.0, LIFE), off=0.0, rate=2e-7, limit=0.6)
     book = inverse_gaussian(above, 2e-7)
     assert follows(right, book)
     assert not follows(wrong, book)
@@ -163,7 +163,7 @@ def test_without_bridges_crossings_are_missed() -> None:
 def test_a_bent_law_is_that_of_brute_force() -> None:
     """Wear by Hertz, which ends at nothing, against a walk of 3,000 steps."""
     life, exponent, rate, limit = 6e6, 1.3, 3e-8, 0.55
-    found = draw(Branch(WEAR, 0.0, ()), (life, exponent), off=0.04, rate=rate, limit=limit)
+    found = draw(DegradationPath(WEAR, 0.0, ()), (life, exponent), off=0.04, rate=rate, limit=limit)
     rng, n, step = np.random.default_rng(3), 6000, HORIZON / 3000
     ahead = step * np.arange(1, 3001)
     with np.errstate(divide="ignore"):
@@ -181,8 +181,8 @@ def test_a_bent_law_is_that_of_brute_force() -> None:
 
 def test_a_limit_that_is_past_needs_no_wandering() -> None:
     """Health below its limit now has been there since the law, so lowered, was."""
-    branch = Branch(FALLING, 0.0, ())
-    found = draw(branch, (0.0, LIFE), off=-0.2, rate=1e-7, limit=0.7)
+    path = DegradationPath(FALLING, 0.0, ())
+    found = draw(path, (0.0, LIFE), off=-0.2, rate=1e-7, limit=0.7)
     left = LIFE * (-0.2 - np.log(0.7)) - NOW
     assert left < 0
     np.testing.assert_allclose(found, left)
@@ -190,11 +190,11 @@ def test_a_limit_that_is_past_needs_no_wandering() -> None:
 
 def test_draws_that_wander_stand_among_those_that_do_not() -> None:
     """Each draw has its own rate: what does not move is at the closed form, what does about it."""
-    branch = Branch(FALLING, 0.0, ())
+    path = DegradationPath(FALLING, 0.0, ())
     rate = np.where(np.arange(1000) % 2, 1e-9, 0.0)
     theta, off = np.tile((0.0, LIFE), (1000, 1)), np.zeros(1000)
     rng = np.random.default_rng(4)
-    found = first_passage(branch, theta, off, rate, rng, now=NOW, limit=0.6, horizon=HORIZON)
+    found = first_passage(path, theta, off, rate, rng, now=NOW, limit=0.6, horizon=HORIZON)
     left = -LIFE * np.log(0.6) - NOW
     np.testing.assert_allclose(found[::2], left)
     assert np.unique(found[1::2]).size == 500
@@ -203,7 +203,7 @@ def test_draws_that_wander_stand_among_those_that_do_not() -> None:
 
 def test_nothing_is_claimed_past_the_horizon() -> None:
     """Lives that wander end before the horizon, or are not said to end."""
-    found = draw(Branch(FALLING, 0.0, ()), (0.0, 4 * LIFE), off=0.0, rate=1e-8, limit=0.5)
+    found = draw(DegradationPath(FALLING, 0.0, ()), (0.0, 4 * LIFE), off=0.0, rate=1e-8, limit=0.5)
     finite = np.isfinite(found)
     assert 0.05 < finite.mean() < 0.95
     assert found[finite].max() <= HORIZON
@@ -211,11 +211,11 @@ def test_nothing_is_claimed_past_the_horizon() -> None:
 
 def test_what_gains_is_not_past_a_limit_that_it_has_left_behind() -> None:
     """After a jump below the limit a parameter that gains is above it again: nothing is ahead."""
-    branch = Branch(LINEAR, 0.0, (0.1 * NOW,))
+    path = DegradationPath(LINEAR, 0.0, (0.1 * NOW,))
     natural = (-1e-6, 0.45)  # gains 100 % by now, of which the jump left 45 %
-    assert (branch.health(np.array([natural]), np.array([0.1 * NOW, NOW])) > 0.7).tolist() == [
+    assert (path.health(np.array([natural]), np.array([0.1 * NOW, NOW])) > 0.7).tolist() == [
         [False, True]
     ]
-    assert np.isinf(draw(branch, natural, off=0.0, rate=0.0, limit=0.7)).all()
+    assert np.isinf(draw(path, natural, off=0.0, rate=0.0, limit=0.7)).all()
     # Negative control: one that has not come back is past it.
-    assert (draw(branch, (-1e-7, 0.45), off=0.0, rate=0.0, limit=0.7) <= 0).all()
+    assert (draw(path, (-1e-7, 0.45), off=0.0, rate=0.0, limit=0.7) <= 0).all()

@@ -16,17 +16,17 @@ from lmshealth._serialize import pack, unpack
 from lmshealth.prognosis import fleet_prior as fleet
 from lmshealth.prognosis import life_likelihood as life
 from lmshealth.prognosis.fleet_prior import (
-    Heard,
-    Learned,
-    Lesson,
-    is_young,
-    learn,
-    lesson_of,
+    FleetPrior,
+    LawEvidence,
+    MachineEvidence,
+    fleet_priors,
+    machine_evidence,
+    needs_fleet_prior,
     pace_likelihood,
 )
-from lmshealth.prognosis.life_likelihood import LifeLikelihood, scatter_of
+from lmshealth.prognosis.life_likelihood import LifeLikelihood, scatter_prior
 from lmshealth.prognosis.life_posterior import LifePosterior, fit_life
-from lmshealth.prognosis.scenarios import courses_of
+from lmshealth.prognosis.scenarios import list_scenarios
 from lmshealth.stage.degradation_laws import (
     AnyLaw,
     HertzWear,
@@ -35,7 +35,7 @@ from lmshealth.stage.degradation_laws import (
     Power,
     Unchanging,
 )
-from lmshealth.stage.description import ParameterSpec, Scatter, Stage
+from lmshealth.stage.description import ParameterSpec, ScatterPrior, Stage
 from lmshealth.stage.priors import Lognormal, Normal, Uniform
 from lmshealth.tracking.results import History
 from tests.lives import FOOT, FREQUENCY, MOUNT, PRELOAD, make_history, make_stage, true_drift
@@ -66,38 +66,38 @@ def gaussian(z: float, error: float) -> FloatArray:
     return np.asarray(stats.norm(z * width**2 / error**2, width).ppf(levels))
 
 
-def scattering(walk: tuple[float, ...] = WALKS) -> dict[str, tuple[Heard, ...]]:
+def scattering(walk: tuple[float, ...] = WALKS) -> dict[str, tuple[LawEvidence, ...]]:
     """Make what a machine says of scatter: something of the walk alone."""
     after = {"walk": walk, "noise_scale": SCALES, "deviation": DEVIATIONS}
     before = {"walk": WALKS, "noise_scale": SCALES, "deviation": DEVIATIONS}
     return {
-        name: tuple(Heard(b, a, FLAT) for b, a in zip(before[name], after[name], strict=True))
+        name: tuple(LawEvidence(b, a, FLAT) for b, a in zip(before[name], after[name], strict=True))
         for name in before
     }
 
 
-def told(z: float, error: float, wears: float = 0.5, *, informed: float = 0.9) -> Lesson:
+def told(z: float, error: float, wears: float = 0.5, *, informed: float = 0.9) -> MachineEvidence:
     """Make the lesson of a machine whose pace was measured, if it wears."""
     pace = pace_likelihood(gaussian(z, error), np.full(N, 1 / N))
     laws = {
         "guide_preload": {
-            "hertz-wear": Heard(0.5, wears, pace),
-            "none": Heard(0.5, 1 - wears, FLAT),
+            "hertz-wear": LawEvidence(0.5, wears, pace),
+            "none": LawEvidence(0.5, 1 - wears, FLAT),
         },
-        "mount_stiffness": {"none": Heard(1.0, 1.0, FLAT)},
+        "mount_stiffness": {"none": LawEvidence(1.0, 1.0, FLAT)},
     }
-    return Lesson(laws, scattering(), informed)
+    return MachineEvidence(laws, scattering(), informed)
 
 
-def silent() -> Lesson:
+def silent() -> MachineEvidence:
     """Make the lesson of a young machine that says nothing at all."""
     pace = np.zeros_like(told(0.0, 1.0).laws["guide_preload"]["hertz-wear"].pace)
-    heard = {"hertz-wear": Heard(0.5, 0.5, pace), "none": Heard(0.5, 0.5, FLAT)}
-    still = {"none": Heard(1.0, 1.0, FLAT)}
-    return Lesson({"guide_preload": heard, "mount_stiffness": still}, scattering(), 0.0)
+    heard = {"hertz-wear": LawEvidence(0.5, 0.5, pace), "none": LawEvidence(0.5, 0.5, FLAT)}
+    still = {"none": LawEvidence(1.0, 1.0, FLAT)}
+    return MachineEvidence({"guide_preload": heard, "mount_stiffness": still}, scattering(), 0.0)
 
 
-def wear_of(learned: Learned) -> tuple[float, Lognormal]:
+def wear_of(learned: FleetPrior) -> tuple[float, Lognormal]:
     """Give the learned share of machines that wear, and the prior of their lives."""
     law = learned.laws[0]
     assert law.kind == "hertz-wear"
@@ -106,9 +106,9 @@ def wear_of(learned: Learned) -> tuple[float, Lognormal]:
     return law.share[1], law.pace[1]
 
 
-def taught_by(teachers: Mapping[str, Lesson], stage: Stage) -> tuple[float, Lognormal]:
+def taught_by(teachers: Mapping[str, MachineEvidence], stage: Stage) -> tuple[float, Lognormal]:
     """Give what teachers teach a machine that says nothing itself."""
-    return wear_of(learn(stage, dict(teachers) | {"young": silent()})["young"])
+    return wear_of(fleet_priors(stage, dict(teachers) | {"young": silent()})["young"])
 
 
 @pytest.mark.parametrize(("z", "error"), [(0.3, 0.2), (-1.5, 0.4), (1.0, 2.0)])
@@ -166,21 +166,21 @@ def test_learned_prior_is_that_of_dense_integration(stage: Stage) -> None:
 def test_few_teachers_leave_the_description(stage: Stage) -> None:
     """Two other machines teach nothing; three do."""
     teachers = {str(k): told(1.0, 0.1) for k in range(3)}
-    assert learn(stage, {"young": silent()}) == {}
+    assert fleet_priors(stage, {"young": silent()}) == {}
     two = {name: teachers[name] for name in ("0", "1")}
-    assert learn(stage, two | {"young": silent()}) == {}
-    assert set(learn(stage, teachers | {"young": silent()})) == {"young"}
+    assert fleet_priors(stage, two | {"young": silent()}) == {}
+    assert set(fleet_priors(stage, teachers | {"young": silent()})) == {"young"}
 
 
 @pytest.mark.slow
 def test_machines_that_say_nothing_teach_the_description(stage: Stage) -> None:
     """However many there are, the learned prior is the description's."""
-    learned = learn(stage, {str(k): silent() for k in range(30)})
+    learned = fleet_priors(stage, {str(k): silent() for k in range(30)})
     assert len(learned) == 30
     share, prior = wear_of(learned["7"])
     assert share == 0.5
     assert prior == Lognormal(8000, 1.0)
-    assert learned["7"].scatter == Scatter(WALKS, SCALES, DEVIATIONS)
+    assert learned["7"].scatter == ScatterPrior(WALKS, SCALES, DEVIATIONS)
 
 
 @pytest.mark.slow
@@ -188,8 +188,8 @@ def test_scatter_of_a_fleet_is_learned(stage: Stage) -> None:
     """Where all logs ask for one walk it is expected of a young machine, and no other of it."""
     walks = (0.01, 0.02, 0.9, 0.05, 0.02)
     teachers = {str(k): replace(silent(), scatter=scattering(walks)) for k in range(20)}
-    learned = learn(stage, teachers | {"young": silent()})["young"]
-    taught = learned.onto(stage)
+    learned = fleet_priors(stage, teachers | {"young": silent()})["young"]
+    taught = learned.apply_to(stage)
     assert taught.scatter == learned.scatter
     assert learned.scatter.walk[2] > 0.7
     assert max(learned.scatter.walk[k] for k in (0, 1, 3, 4)) < 0.15
@@ -197,7 +197,7 @@ def test_scatter_of_a_fleet_is_learned(stage: Stage) -> None:
     history = lived(np.linspace(0.0, 2e6, 8), 4000.0)
     before, after = (LifeLikelihood(history, one).grid for one in (stage, taught))
     k = np.searchsorted(np.unique(before.walk), before.walk)
-    expected = np.log(np.array(learned.scatter.walk) / scatter_of(stage).walk)[k]
+    expected = np.log(np.array(learned.scatter.walk) / scatter_prior(stage).walk)[k]
     np.testing.assert_allclose(after.log_weight - before.log_weight, expected, atol=1e-9)
 
 
@@ -207,9 +207,9 @@ def test_nobody_teaches_itself(stage: Stage) -> None:
     teachers = {str(k): told(0.2 * k, 0.2, 0.9) for k in range(6)}
     slow = teachers | {"a": told(2.0, 0.5, 0.9, informed=0.1), "b": silent()}
     fast = teachers | {"a": told(-2.0, 0.5, 0.1, informed=0.1), "b": silent()}
-    of_slow, of_fast = learn(stage, slow), learn(stage, fast)
+    of_slow, of_fast = fleet_priors(stage, slow), fleet_priors(stage, fast)
     assert of_slow["a"] == of_fast["a"]
-    assert of_slow["a"].n_teachers == 7
+    assert of_slow["a"].n_machines == 7
     assert wear_of(of_slow["b"])[1].median > wear_of(of_fast["b"])[1].median
     assert wear_of(of_slow["b"])[0] > wear_of(of_fast["b"])[0]
 
@@ -219,7 +219,7 @@ def test_order_of_machines_does_not_matter(stage: Stage) -> None:
     lessons = {str(k): told(0.3 * k - 1, 0.3, 0.1 + 0.08 * k) for k in range(8)}
     lessons |= {"young": silent(), "other": silent()}
     backward = dict(reversed(lessons.items()))
-    assert learn(stage, lessons) == learn(stage, backward)
+    assert fleet_priors(stage, lessons) == fleet_priors(stage, backward)
 
 
 def test_machines_without_wear_make_lives_longer(stage: Stage) -> None:
@@ -231,7 +231,7 @@ def test_machines_without_wear_make_lives_longer(stage: Stage) -> None:
     slow = slow[slow > 0.5]
     pace = pace_likelihood(slow, np.full(slow.size, 1 / slow.size))
     sound = told(0.0, 1.0)
-    heard = {"hertz-wear": Heard(0.5, 0.3, pace), "none": Heard(0.5, 0.7, FLAT)}
+    heard = {"hertz-wear": LawEvidence(0.5, 0.3, pace), "none": LawEvidence(0.5, 0.7, FLAT)}
     sound = replace(sound, laws=sound.laws | {"guide_preload": heard})
     more, longer = taught_by(worn | {f"sound-{k}": sound for k in range(6)}, stage)
     assert more < share - 0.1
@@ -242,13 +242,13 @@ def test_lessons_and_what_was_learned_survive_packing(stage: Stage) -> None:
     """Both come back as they were, and a lesson is small."""
     lesson = told(0.5, 0.3)
     content = pack(lesson)
-    back = unpack(content, Lesson)
+    back = unpack(content, MachineEvidence)
     assert pack(back) == content
     heard = back.laws["guide_preload"]["hertz-wear"]
     np.testing.assert_array_equal(heard.pace, lesson.laws["guide_preload"]["hertz-wear"].pace)
     assert len(content) < 30_000
-    learned = learn(stage, {str(k): told(1.0, 0.2) for k in range(4)} | {"young": silent()})
-    assert unpack(pack(learned["young"]), Learned) == learned["young"]
+    learned = fleet_priors(stage, {str(k): told(1.0, 0.2) for k in range(4)} | {"young": silent()})
+    assert unpack(pack(learned["young"]), FleetPrior) == learned["young"]
 
 
 KINDS: list[tuple[AnyLaw, str]] = [
@@ -271,12 +271,14 @@ def test_learned_laws_are_laws_of_a_description(stage: Stage, law: AnyLaw, field
     own = replace(stage, description=msgspec.structs.replace(stage.description, parameter=(spec,)))
     pace = told(0.8, 0.2).laws["guide_preload"]["hertz-wear"].pace
 
-    def heard(one: AnyLaw, after: float) -> Heard:
-        return Heard(0.5, after, pace if fleet._pace_field(one) else FLAT)
+    def heard(one: AnyLaw, after: float) -> LawEvidence:
+        return LawEvidence(0.5, after, pace if fleet._pace_field(one) else FLAT)
 
     laws = {"guide_preload": {law.kind: heard(law, 0.8), other.kind: heard(other, 0.2)}}
-    learned = learn(own, {str(k): Lesson(laws, scattering(), 0.1) for k in range(5)})["3"]
-    taught = learned.onto(own)
+    learned = fleet_priors(
+        own, {str(k): MachineEvidence(laws, scattering(), 0.1) for k in range(5)}
+    )["3"]
+    taught = learned.apply_to(own)
     found = taught.parameters[0].laws[0]
     assert learned.laws[0].field == field
     assert found.weight > 0.6
@@ -284,7 +286,7 @@ def test_learned_laws_are_laws_of_a_description(stage: Stage, law: AnyLaw, field
     assert changed == {"weight", *([field] if field else [])}
     written = msgspec.json.encode(taught.parameters[0])
     assert msgspec.json.decode(written, type=ParameterSpec).laws[0] == found
-    weights = [course.weight for course in courses_of(taught.parameters, (), 1e6)]
+    weights = [scenario.weight for scenario in list_scenarios(taught.parameters, (), 1e6)]
     assert sum(weights) == pytest.approx(1.0)
     if field:
         before, after = getattr(law, field), getattr(found, field)
@@ -295,11 +297,11 @@ def test_learned_laws_are_laws_of_a_description(stage: Stage, law: AnyLaw, field
 def test_a_taught_stage_has_its_own_digest(stage: Stage) -> None:
     """Other teaching is another digest, the same teaching the same one."""
     lessons = {str(k): told(1.0, 0.2) for k in range(4)} | {"young": silent()}
-    learned = learn(stage, lessons)["young"]
-    taught = learned.onto(stage)
+    learned = fleet_priors(stage, lessons)["young"]
+    taught = learned.apply_to(stage)
     assert taught.digest != stage.digest
-    assert learned.onto(stage).digest == taught.digest
-    other = learn(stage, lessons | {"0": told(-2.0, 0.1)})["young"].onto(stage)
+    assert learned.apply_to(stage).digest == taught.digest
+    other = fleet_priors(stage, lessons | {"0": told(-2.0, 0.1)})["young"].apply_to(stage)
     assert other.digest not in (stage.digest, taught.digest)
     assert taught.modal_map is stage.modal_map
 
@@ -308,7 +310,7 @@ def test_what_is_learned_is_told_in_two_digits(stage: Stage) -> None:
     """A teacher that says a little more changes no prior, so that no young machine is stale."""
     lessons = {str(k): told(1.0, 0.2) for k in range(9)} | {"young": silent()}
     moved = lessons | {"0": told(1.0005, 0.2)}
-    assert learn(stage, moved)["young"] == learn(stage, lessons)["young"]
+    assert fleet_priors(stage, moved)["young"] == fleet_priors(stage, lessons)["young"]
 
 
 @pytest.fixture(scope="module")
@@ -338,11 +340,11 @@ def fitted(history: History, stage: Stage) -> LifePosterior:
 
 def test_a_machine_is_young_until_its_logs_tell_its_life(small_grid: None, stage: Stage) -> None:
     """A life of 4,000 km is told after 2,000 of them, and not after 40."""
-    old = lesson_of(stage, fitted(lived(np.linspace(0.0, 2e6, 12), 4000.0), stage))
-    new = lesson_of(stage, fitted(lived(np.linspace(0.0, 4e4, 6), 4000.0), stage))
-    assert not is_young(old)
+    old = machine_evidence(stage, fitted(lived(np.linspace(0.0, 2e6, 12), 4000.0), stage))
+    new = machine_evidence(stage, fitted(lived(np.linspace(0.0, 4e4, 6), 4000.0), stage))
+    assert not needs_fleet_prior(old)
     assert old.informed > 0.95
-    assert is_young(new)
+    assert needs_fleet_prior(new)
     assert new.informed < 0.3
     assert len(pack(old)) < 30_000
 
@@ -350,12 +352,12 @@ def test_a_machine_is_young_until_its_logs_tell_its_life(small_grid: None, stage
 def test_a_lesson_says_what_the_posterior_says(small_grid: None, stage: Stage) -> None:
     """Probabilities of laws are those of the posterior, and the likeliest fleet has its life."""
     posterior = fitted(lived(np.linspace(0.0, 2e6, 12), 4000.0), stage)
-    heard = lesson_of(stage, posterior).laws
+    heard = machine_evidence(stage, posterior).laws
     laws = posterior.laws("guide_preload")
     for kind, one in heard["guide_preload"].items():
-        assert one.before == 0.5
-        assert one.after == pytest.approx(laws.get((kind, 0.0), 0.0))
-    assert heard["mount_stiffness"]["none"].after == pytest.approx(1.0)
+        assert one.prior == 0.5
+        assert one.posterior == pytest.approx(laws.get((kind, 0.0), 0.0))
+    assert heard["mount_stiffness"]["none"].posterior == pytest.approx(1.0)
     pace = heard["guide_preload"]["hertz-wear"].pace
     best = float(fleet._MEAN[np.argmax(pace[:, 0]), 0])
     assert 8000 * np.exp(best) == pytest.approx(4000, rel=0.25)
@@ -363,13 +365,13 @@ def test_a_lesson_says_what_the_posterior_says(small_grid: None, stage: Stage) -
 
 def test_a_law_that_is_ruled_out_teaches_its_share_alone(small_grid: None, stage: Stage) -> None:
     """A part that keeps its health says that few wear, and nothing of how fast others do."""
-    still = lesson_of(stage, fitted(lived(np.linspace(0.0, 4e6, 12), 1e9), stage))
+    still = machine_evidence(stage, fitted(lived(np.linspace(0.0, 4e6, 12), 1e9), stage))
     heard = still.laws["guide_preload"]["hertz-wear"]
-    assert heard.after < 0.05
-    ruled_out = replace(heard, after=0.0, pace=np.zeros_like(heard.pace))
-    laws = {"hertz-wear": ruled_out, "none": Heard(0.5, 1.0, FLAT)}
+    assert heard.posterior < 0.05
+    ruled_out = replace(heard, posterior=0.0, pace=np.zeros_like(heard.pace))
+    laws = {"hertz-wear": ruled_out, "none": LawEvidence(0.5, 1.0, FLAT)}
     sound = replace(still, laws=still.laws | {"guide_preload": laws}, informed=0.0)
-    share, prior = wear_of(learn(stage, {str(k): sound for k in range(5)})["0"])
+    share, prior = wear_of(fleet_priors(stage, {str(k): sound for k in range(5)})["0"])
     assert share < 0.2
     assert prior == Lognormal(8000, 1.0)
 
@@ -378,7 +380,7 @@ def test_what_no_mode_tells_makes_nobody_young(small_grid: None, tmp_path: Path)
     """A part that the modes cannot see stays unknown for ever: that is no question of age."""
     blind = make_stage(tmp_path, (PRELOAD, STILL_MOUNT, LIMITED_FOOT))
     posterior = fitted(lived(np.linspace(0.0, 2e6, 12), 4000.0), blind)
-    lesson = lesson_of(blind, posterior)
-    assert not is_young(lesson)
+    lesson = machine_evidence(blind, posterior)
+    assert not needs_fleet_prior(lesson)
     # Nor does such a machine teach anything of it.
     assert np.abs(lesson.laws["foot"]["hertz-wear"].pace[15:26, 4:]).max() < 0.5

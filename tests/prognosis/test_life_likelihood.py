@@ -12,9 +12,9 @@ import pytest
 from lmshealth._arrays import FloatArray
 from lmshealth.errors import NotEnoughData
 from lmshealth.prognosis import life_likelihood as life
-from lmshealth.prognosis.life_likelihood import LifeLikelihood, scatter_of
+from lmshealth.prognosis.life_likelihood import LifeLikelihood, scatter_prior
 from lmshealth.prognosis.life_posterior import LifeDensity
-from lmshealth.prognosis.scenarios import Course
+from lmshealth.prognosis.scenarios import Scenario
 from lmshealth.stage.description import Stage
 from lmshealth.tracking.results import History
 from tests.lives import (
@@ -44,9 +44,9 @@ def stage(tmp_path_factory: pytest.TempPathFactory) -> Stage:
 
 
 def density_of(history: History, stage: Stage) -> LifeDensity:
-    """Give the density of the first course."""
+    """Give the density of the first scenario."""
     likelihood = LifeLikelihood(history, stage)
-    return LifeDensity.of(likelihood, likelihood.courses[0])
+    return LifeDensity.of(likelihood, likelihood.scenarios[0])
 
 
 def coordinates(density: LifeDensity, n: int = 6, seed: int = 1) -> FloatArray:
@@ -55,21 +55,21 @@ def coordinates(density: LifeDensity, n: int = 6, seed: int = 1) -> FloatArray:
     return y[np.isfinite(density.log_probability(y))][:n]
 
 
-def healths(course: Course, y: FloatArray, clock: FloatArray) -> FloatArray:
+def healths(scenario: Scenario, y: FloatArray, clock: FloatArray) -> FloatArray:
     """Preload and mount by wear, loosening and jumps written out, shape (n_logs, 2)."""
     columns = []
-    for branch, part in zip(course.branches, course.split(course.natural(y[None])), strict=True):
+    for path, part in zip(scenario.paths, scenario.split(scenario.natural(y[None])), strict=True):
         own, column = part[0], []
         for s in clock:
-            since = max(s - branch.begin, 0.0)
-            if branch.law.kind == "hertz-wear":
+            since = max(s - path.begin, 0.0)
+            if path.law.kind == "hertz-wear":
                 health = (1 - (since / own[0]) ** own[1]) ** 1.5
-            elif branch.law.kind == "loosening":
+            elif path.law.kind == "loosening":
                 health = own[0] + (1 - own[0]) * np.exp(-since / own[1])
             else:
                 health = 1.0
-            for k, step in enumerate(branch.steps):
-                health *= own[len(branch.law.names) + k] if s > step else 1.0
+            for k, step in enumerate(path.steps):
+                health *= own[len(path.law.names) + k] if s > step else 1.0
             column.append(health)
         columns.append(column)
     return np.array(columns).T
@@ -77,7 +77,7 @@ def healths(course: Course, y: FloatArray, clock: FloatArray) -> FloatArray:
 
 def book(history: History, density: LifeDensity, y: FloatArray, model_std: float) -> float:
     """Log likelihood of one set of coordinates by the dense oracle."""
-    x = np.log(healths(density.course, y, history.clock()[history.baseline :]))
+    x = np.log(healths(density.scenario, y, history.clock()[history.baseline :]))
     alone = np.stack([true_drift(NAMES, x * (np.arange(2) == j))[:, :2] for j in range(2)])
     belief = LifeBelief(
         slopes=np.array([SENSITIVITY[name][:2] for name in NAMES]),
@@ -116,7 +116,7 @@ def test_likelihood_is_the_dense_multivariate_normal(
     history = rough_history(np.random.default_rng(2), baseline=baseline)
     density = density_of(history, stage)
     y = coordinates(density, 4)
-    found = density.log_probability(y) - density.course.log_prior(y)
+    found = density.log_probability(y) - density.scenario.log_prior(y)
     known = np.array([book(history, density, point, model_std) for point in y])
     np.testing.assert_allclose(found, known, rtol=1e-9, atol=1e-7)
 
@@ -129,12 +129,12 @@ def test_every_course_after_a_step_is_the_dense_normal(tmp_path: Path) -> None:
     history = replace(history, steps=(since("step", 5, 10),))
     likelihood = LifeLikelihood(history, stage)
     assert likelihood.steps == (np.mean(history.clock()[4:6]),)
-    assert len(likelihood.courses) == 3 * 2
+    assert len(likelihood.scenarios) == 3 * 2
     found, known = [], []
-    for course in likelihood.courses:
-        density = LifeDensity.of(likelihood, course)
+    for scenario in likelihood.scenarios:
+        density = LifeDensity.of(likelihood, scenario)
         y = coordinates(density, 1)
-        found.append((density.log_probability(y) - course.log_prior(y))[0])
+        found.append((density.log_probability(y) - scenario.log_prior(y))[0])
         known.append(book(history, density, y[0], 0.05))
     np.testing.assert_allclose(found, known, rtol=1e-9, atol=1e-7)
     assert np.ptp(found) > 0.1
@@ -147,7 +147,7 @@ def test_what_is_wrong_is_noticed(stage: Stage, what: str, monkeypatch: pytest.M
     history = rough_history(np.random.default_rng(2))
     density = density_of(history, stage)
     y = coordinates(density)
-    found = density.log_probability(y) - density.course.log_prior(y)
+    found = density.log_probability(y) - density.scenario.log_prior(y)
     if what == "deviation":
         monkeypatch.setattr(life, "_DEVIATIONS", (0.0, 0.151))
     model_std = 0.0501 if what == "map error" else 0.05
@@ -172,7 +172,7 @@ def test_lives_that_leave_the_map_or_the_prior_are_impossible(stage: Stage) -> N
     density = density_of(rough_history(np.random.default_rng(5)), stage)
     inside = coordinates(density, 1)[0]
     now = density.life.now
-    wear, loose = (branch.law for branch in density.course.branches)
+    wear, loose = (path.law for path in density.scenario.paths)
     worn, below, low = inside.copy(), inside.copy(), inside.copy()
     worn[0] = 0.5  # s_w < now
     below[2] = 1.0  # floor below 0
@@ -186,7 +186,7 @@ def test_lives_that_leave_the_map_or_the_prior_are_impossible(stage: Stage) -> N
 
 def test_reported_errors_and_laws_are_believed_first(stage: Stage) -> None:
     """Beforehand larger errors and larger deviations are the less probable the larger they are."""
-    believed = scatter_of(stage)
+    believed = scatter_prior(stage)
     for prior in (believed.noise_scale, believed.deviation):
         assert sum(prior) == pytest.approx(1)
         assert prior[0] > 0.5
@@ -241,11 +241,11 @@ def test_laws_without_parameters_take_no_coordinate(tmp_path: Path) -> None:
     """An unchanging parameter among others keeps health 1 and needs no coordinate."""
     stage = make_stage(tmp_path, (PRELOAD, FOOT, MOUNT))
     density = density_of(rough_history(np.random.default_rng(13)), stage)
-    course = density.course
-    assert course.n_dim == 4
+    scenario = density.scenario
+    assert scenario.n_dim == 4
     y = coordinates(density, 5)
-    assert [part.shape for part in course.split(y)] == [(5, 2), (5, 0), (5, 2)]
-    health = course.health(course.natural(y), np.array([0.0, density.life.now]))
+    assert [part.shape for part in scenario.split(y)] == [(5, 2), (5, 0), (5, 2)]
+    health = scenario.health(scenario.natural(y), np.array([0.0, density.life.now]))
     assert health.shape == (5, 2, 3)
     assert (health[:, :, 1] == 1).all()
     np.testing.assert_allclose(health[:, 0], 1)
@@ -274,7 +274,7 @@ def test_a_life_of_many_steps_is_refused(stage: Stage, n: int) -> None:
     if n == 3:
         likelihood = LifeLikelihood(history, stage)
         assert len(likelihood.steps) == 3
-        assert likelihood.courses[0].n_dim == 4 + 2 * 3
+        assert likelihood.scenarios[0].n_dim == 4 + 2 * 3
         return
     with pytest.raises(NotEnoughData, match=r"jumped 4 times.*declare a new baseline"):
         LifeLikelihood(history, stage)
@@ -301,8 +301,8 @@ def test_baseline_units_do_not_matter(tmp_path: Path) -> None:
     """A parameter in kN with baseline 1 kN is the same as a fraction: paths are relative."""
     stage = make_stage(tmp_path, (FADING,))
     density = density_of(rough_history(np.random.default_rng(14)), stage)
-    course, y = density.course, np.array([[0.1], [0.3]])
-    health = course.health(course.natural(y), np.array([density.life.now]))
+    scenario, y = density.scenario, np.array([[0.1], [0.3]])
+    health = scenario.health(scenario.natural(y), np.array([density.life.now]))
     np.testing.assert_allclose(health[:, 0, 0], [0.9, 0.7])
 
 
@@ -320,7 +320,7 @@ def test_many_logs_are_told_by_few_nodes(stage: Stage) -> None:
     likelihood = density.life
     assert likelihood.nodes.size < 24
     y = coordinates(density, 20, seed=5)
-    x = np.log([healths(density.course, point, likelihood.clock) for point in y])
+    x = np.log([healths(density.scenario, point, likelihood.clock) for point in y])
     drift = np.moveaxis(true_drift(NAMES, x)[..., :2], 1, 2)
     told = drift[..., likelihood.nodes] @ likelihood.weights.T
     np.testing.assert_allclose(told, drift, atol=1e-7)
@@ -328,7 +328,7 @@ def test_many_logs_are_told_by_few_nodes(stage: Stage) -> None:
     few = np.linalg.lstsq(drift[..., likelihood.nodes[:6]].reshape(-1, 6), drift.reshape(-1, n))[0]
     told = drift[..., likelihood.nodes[:6]] @ few
     assert np.abs(told - drift).max() > 1e-6
-    found = density.log_probability(y[:2]) - density.course.log_prior(y[:2])
+    found = density.log_probability(y[:2]) - density.scenario.log_prior(y[:2])
     known = np.array([book(history, density, point, 0.05) for point in y[:2]])
     np.testing.assert_allclose(np.diff(found), np.diff(known), atol=1e-5)
 
@@ -347,8 +347,8 @@ def test_a_step_without_travel_parts_the_logs(tmp_path: Path, last_still: int) -
     np.testing.assert_array_equal(stepped.clock < step, np.arange(10) < last_still)
     np.testing.assert_allclose(stepped.clock, without.clock, atol=1.0)
     assert without.clock[last_still] == without.clock[last_still - 1]
-    for course in stepped.courses:
-        density = LifeDensity.of(stepped, course)
+    for scenario in stepped.scenarios:
+        density = LifeDensity.of(stepped, scenario)
         y = coordinates(density, 20)
         assert np.isfinite(density.log_probability(y)).all()
         off, _ = density.deviations(y, np.array([0.0, stepped.now]), np.random.default_rng(4))

@@ -1,4 +1,4 @@
-"""The posterior of a life: which course it took, what it says of itself, and where it goes."""
+"""The posterior of a life: which scenario it took, what it says of itself, and where it goes."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from threadpoolctl import threadpool_limits
 
 from lmshealth._arrays import FloatArray
 from lmshealth.errors import NotConverged
-from lmshealth.health.importance_sampling import explore_well
+from lmshealth.health.importance_sampling import importance_sample_to_ess
 from lmshealth.prognosis import life_likelihood as life
 from lmshealth.prognosis import life_posterior as lifefit
 from lmshealth.prognosis.life_likelihood import LifeLikelihood
@@ -104,8 +104,8 @@ def unchained(history: History, stage: Stage) -> LifePosterior:
 @pytest.fixture
 def forked(unchained: LifePosterior) -> LifePosterior:
     """Make two ways of it, the second with the same draws backwards, with checks of their own."""
-    (way,) = unchained.ways
-    steps = np.arange(way.course.n_dim)
+    (way,) = unchained.scenarios
+    steps = np.arange(way.scenario.n_dim)
     ways = tuple(
         replace(
             way,
@@ -119,7 +119,7 @@ def forked(unchained: LifePosterior) -> LifePosterior:
         )
         for k, probability in enumerate((0.75, 0.25))
     )
-    return replace(unchained, ways=ways)
+    return replace(unchained, scenarios=ways)
 
 
 def agree(one: FloatArray, two: FloatArray, ess: float) -> bool:
@@ -142,16 +142,18 @@ def test_laws_and_health_are_those_of_importance_sampling(
 ) -> None:
     """Chains and importance sampling give the same quantiles, within the error of both."""
     likelihood = LifeLikelihood(history, stage)
-    (course,) = likelihood.courses
-    density = LifeDensity.of(likelihood, course)
+    (scenario,) = likelihood.scenarios
+    density = LifeDensity.of(likelihood, scenario)
     rng = np.random.default_rng(5)
-    drawn = explore_well(density.log_probability, density.draw_prior(rng, 600), rng, 4000)
+    drawn = importance_sample_to_ess(
+        density.log_probability, density.draw_prior(rng, 600), rng, 4000
+    )
     y = drawn.resampled(rng, 4000)
     now = np.array([likelihood.now])
-    theta = course.natural(y)
-    health = course.health(theta, now) * np.exp(density.deviations(y, now, rng)[0])
+    theta = scenario.natural(y)
+    health = scenario.health(theta, now) * np.exp(density.deviations(y, now, rng)[0])
     known = np.column_stack([health[:, 0], theta[:, :2]])
-    (way,) = found.ways
+    (way,) = found.scenarios
     draws = np.concatenate([found.health, way.chains[..., :2]], axis=2).reshape(-1, 4)
     # Drawn twice: with weights, then by these.
     ess = both_ess(found.ess, both_ess(drawn.ess, 4000))
@@ -167,13 +169,13 @@ def test_importance_sampling_alone_gives_the_same(
     """Without chains quantiles are the same within their error, and so many draws are given."""
     quick = fit_life(history, stage, 11, chains=False, n_draws=2000)
     assert quick.health.shape == (4, 500, 2)
-    (way,) = quick.ways
+    (way,) = quick.scenarios
     assert np.isnan(way.r_hat).all()
     assert way.ess_bulk.min() >= 400
     assert quick.ess == np.inf
     assert quick.worst_r_hat == 1
     one, two = (
-        np.concatenate([fit.health, fit.ways[0].chains], axis=2).reshape(-1, 6)
+        np.concatenate([fit.health, fit.scenarios[0].chains], axis=2).reshape(-1, 6)
         for fit in (quick, found)
     )
     ess = both_ess(found.ess, both_ess(float(way.ess_bulk.min()), 2000))
@@ -201,7 +203,7 @@ def test_linear_algebra_keeps_to_one_thread(
 
 def test_importance_sampling_alone_has_no_chains(unchained: LifePosterior) -> None:
     """Without chains there is no R-hat to be worse than 1, and no chain with few draws."""
-    assert np.isnan(unchained.ways[0].r_hat).all()
+    assert np.isnan(unchained.scenarios[0].r_hat).all()
     assert unchained.ess == np.inf
     assert unchained.worst_r_hat == 1
 
@@ -215,12 +217,12 @@ def test_the_worst_of_all_chains_is_told(forked: LifePosterior) -> None:
 @pytest.mark.slow
 def test_a_life_says_what_it_rests_on(found: LifePosterior) -> None:
     """Names, convergence, what is informed, and the trade-off of preload and mount."""
-    (way,) = found.ways
+    (way,) = found.scenarios
     assert found.parameters == NAMES
     assert found.modes == ("roll", "pitch")
     assert found.seed == (3, 4)
     assert way.probability == 1
-    assert way.share == found.health.shape[1] == 2500
+    assert way.n_mixture == found.health.shape[1] == 2500
     assert found.worst_r_hat < 1.01
     assert found.ess > 1000
     assert way.informed[0] > 0.9
@@ -235,9 +237,9 @@ def test_a_life_says_what_it_rests_on(found: LifePosterior) -> None:
 @pytest.mark.slow
 def test_health_is_its_law_times_how_far_it_is_off(found: LifePosterior) -> None:
     """Draws of laws, of what is off them and of health belong together, one by one."""
-    ((way, off, rate),) = found.each()
-    theta = way.course.natural(way.own)
-    by_law = way.course.health(theta, TRAVEL[-1:])[:, 0]
+    ((way, off, rate),) = found.by_scenario()
+    theta = way.scenario.natural(way.mixture_draws)
+    by_law = way.scenario.health(theta, TRAVEL[-1:])[:, 0]
     np.testing.assert_allclose(by_law * np.exp(off), found.health.reshape(-1, 2), rtol=1e-12)
     np.testing.assert_array_equal(way.chains.reshape(-1, 4), theta)
     moving = rate[:, 0] > 0
@@ -260,20 +262,20 @@ def test_a_prognosis_is_of_the_same_draws(
 def test_the_seed_alone_decides(found: LifePosterior, history: History, stage: Stage) -> None:
     """The same seed gives the same chains, another one others."""
     same, other = (fit_life(history, stage, seed) for seed in ((3, 4), (3, 5)))
-    np.testing.assert_array_equal(same.ways[0].coordinates, found.ways[0].coordinates)
+    np.testing.assert_array_equal(same.scenarios[0].coordinates, found.scenarios[0].coordinates)
     np.testing.assert_array_equal(same.health, found.health)
-    assert not np.array_equal(other.ways[0].coordinates, found.ways[0].coordinates)
+    assert not np.array_equal(other.scenarios[0].coordinates, found.scenarios[0].coordinates)
 
 
 @pytest.mark.slow
 def test_laws_without_parameters_have_no_draws_of_them(history: History, tmp_path: Path) -> None:
     """An unchanging foot adds health of one, and nothing to what is fitted."""
     only = fit_life(history, make_stage(tmp_path / "one", (FADING, FOOT)), 1)
-    assert only.ways[0].course.sizes == (1, 0)
+    assert only.scenarios[0].scenario.sizes == (1, 0)
     assert (only.health[..., 1] == 1).all()
     nothing = fit_life(history, make_stage(tmp_path / "none", (FOOT,)), 1)
-    assert nothing.ways[0].chains.shape == (4, 2500, 0)
-    assert nothing.ways[0].evidence_std == 0
+    assert nothing.scenarios[0].chains.shape == (4, 2500, 0)
+    assert nothing.scenarios[0].evidence_std == 0
     assert nothing.ess == np.inf
     assert nothing.worst_r_hat == 1
     assert np.isnan(nothing.correlation).all()
@@ -304,26 +306,26 @@ def test_the_law_that_the_logs_ask_for_wins(faded: LifePosterior, wavering: Stag
     assert next(iter(still.laws("guide_preload"))) == ("none", 0.0)
     assert still.laws("guide_preload")["none", 0.0] > 0.6
     for fit in (faded, still):
-        probability = [way.probability for way in fit.ways]
+        probability = [way.probability for way in fit.scenarios]
         assert sum(probability) == pytest.approx(1, abs=1e-12)
         assert probability == sorted(probability, reverse=True)
         assert min(probability) >= 0.01
         for name in NAMES:
             assert sum(fit.laws(name).values()) == pytest.approx(1, abs=1e-12)
-        share = [way.share / fit.health.shape[1] for way in fit.ways]
+        share = [way.n_mixture / fit.health.shape[1] for way in fit.scenarios]
         np.testing.assert_allclose(share, probability, atol=1 / 2500)
 
 
 @pytest.mark.slow
 def test_draws_of_several_courses_stand_one_after_the_other(faded: LifePosterior) -> None:
-    """Each course has its own part of the draws, and health in it is that of its laws."""
-    assert len(faded.ways) > 1
+    """Each scenario has its own part of the draws, and health in it is that of its laws."""
+    assert len(faded.scenarios) > 1
     first = 0
-    for way, off, _ in faded.each():
-        part = faded.health[:, first : first + way.share].reshape(-1, 2)
-        first += way.share
-        theta = way.course.natural(way.own)
-        by_law = way.course.health(theta, TRAVEL[-1:])[:, 0]
+    for way, off, _ in faded.by_scenario():
+        part = faded.health[:, first : first + way.n_mixture].reshape(-1, 2)
+        first += way.n_mixture
+        theta = way.scenario.natural(way.mixture_draws)
+        by_law = way.scenario.health(theta, TRAVEL[-1:])[:, 0]
         np.testing.assert_allclose(by_law * np.exp(off), part, rtol=1e-12)
     assert first == faded.health.shape[1]
 
@@ -335,7 +337,7 @@ def test_a_course_of_little_probability_has_no_chains(
     """What is improbable is drawn by importance sampling alone, the rest by chains."""
     monkeypatch.setattr("lmshealth.prognosis.life_posterior._WORTH_CHAINS", 0.5)
     fit = fit_life(lived(TRAVEL, 1 - 0.08e-6 * TRAVEL, np.ones(12)), wavering, 7)
-    with_law = [way for way in fit.ways if way.course.n_dim]
+    with_law = [way for way in fit.scenarios if way.scenario.n_dim]
     assert {way.probability >= 0.5 for way in with_law} == {True, False}
     for way in with_law:
         assert np.isfinite(way.r_hat).all() == (way.probability >= 0.5)
@@ -349,8 +351,8 @@ def test_probabilities_are_those_of_the_evidence(tmp_path: Path) -> None:
     stage = make_stage(tmp_path, (weighty,))
     history = lived(TRAVEL, 1 - 0.008e-6 * TRAVEL, np.ones(12))
     likelihood = LifeLikelihood(history, stage)
-    law, none = (LifeDensity.of(likelihood, course) for course in likelihood.courses)
-    assert (law.course.weight, none.course.weight) == (0.25, 0.75)
+    law, none = (LifeDensity.of(likelihood, scenario) for scenario in likelihood.scenarios)
+    assert (law.scenario.weight, none.scenario.weight) == (0.25, 0.75)
     y = np.linspace(-0.5, 0.6, 20_001)
     value = law.log_probability(y[:, None])
     top = none.log_probability(np.empty((1, 0)))[0]
@@ -359,7 +361,7 @@ def test_probabilities_are_those_of_the_evidence(tmp_path: Path) -> None:
     fit = fit_life(history, stage, 2)
     told = fit.laws("guide_preload")["linear", 0.0]
     assert 0.1 < known < 0.9
-    std = max(way.evidence_std for way in fit.ways)
+    std = max(way.evidence_std for way in fit.scenarios)
     # Narrowing the grid may lose a hundredth of the evidence.
     off = abs(np.log(told / (1 - told)) - np.log(known / (1 - known)))
     assert off < 4 * std + 0.01
@@ -376,11 +378,11 @@ def test_a_step_is_followed_by_a_jump(tmp_path: Path) -> None:
     history = lived(travel, preload, np.ones(13))
     told = replace(history, steps=(Step.found("step", 7, 13),))
     fit, blind = fit_life(told, stage, 3), fit_life(history, stage, 3)
-    for way in fit.ways:
-        branch = way.course.branches[0]
-        assert branch.steps == (1.3e6,)
-        assert branch.begin in (0.0, 1.3e6)
-        jump = way.chains[..., branch.names.index("jump_1")]
+    for way in fit.scenarios:
+        path = way.scenario.paths[0]
+        assert path.steps == (1.3e6,)
+        assert path.begin in (0.0, 1.3e6)
+        jump = way.chains[..., path.names.index("jump_1")]
         low, high = np.quantile(jump, [0.005, 0.995])
         assert low < 0.875 < high
         assert high - low < 0.4
@@ -399,21 +401,21 @@ def test_a_life_goes_to_arviz_and_back(found: LifePosterior, tmp_path: Path) -> 
     tree = xarray.open_datatree(tmp_path / "life.nc", engine="h5netcdf")
     draws = tree["way_1/guide_preload.hertz-wear.life_m"]
     assert draws.dims == ("chain", "draw")
-    np.testing.assert_array_equal(draws.to_numpy(), found.ways[0].chains[..., 0])
+    np.testing.assert_array_equal(draws.to_numpy(), found.scenarios[0].chains[..., 0])
     np.testing.assert_array_equal(tree["posterior/mount_stiffness"], found.health[..., 1])
     checks = tree["checks_data"]
     assert float(checks["chi_square"]) == found.chi_square
     assert float(checks["probability_1"]) == 1
     name = "mount_stiffness.loosening.floor"
-    assert float(checks[f"informed_1_{name}"]) == found.ways[0].informed[2]
+    assert float(checks[f"informed_1_{name}"]) == found.scenarios[0].informed[2]
 
 
 @pytest.mark.slow
 def test_a_course_without_parameters_has_no_group_in_arviz(faded: LifePosterior) -> None:
-    """Groups are of courses that have draws; the probability of every one is told."""
+    """Groups are of scenarios that have draws; the probability of every one is told."""
     tree = faded.to_arviz()
-    for k, way in enumerate(faded.ways):
-        assert (f"way_{k + 1}" in tree.children) == (way.course.n_dim > 0)
+    for k, way in enumerate(faded.scenarios):
+        assert (f"way_{k + 1}" in tree.children) == (way.scenario.n_dim > 0)
         assert float(tree["checks_data"][f"probability_{k + 1}"]) == way.probability
 
 
@@ -430,7 +432,7 @@ def test_a_life_is_a_table(found: LifePosterior) -> None:
     ]
     assert list(table["way"]) == [0, 0, 1, 1, 1, 1]
     assert table.loc["guide_preload", "median"] == np.median(found.health[..., 0])
-    informed = found.ways[0].informed
+    informed = found.scenarios[0].informed
     assert table.loc["guide_preload.hertz-wear.life_m", "informed"] == informed[0]
     assert (table["q05"] < table["q95"]).all()
 
@@ -440,9 +442,9 @@ def test_a_table_and_arviz_are_told_every_way(forked: LifePosterior) -> None:
     table, tree = forked.to_frame(), forked.to_arviz()
     checks = tree["checks_data"]
     np.testing.assert_array_equal(tree["posterior/guide_preload"], forked.health[..., 0])
-    for k, way in enumerate(forked.ways, 1):
+    for k, way in enumerate(forked.scenarios, 1):
         rows = table[table["way"] == k].set_index("parameter")
-        assert len(rows) == way.course.n_dim
+        assert len(rows) == way.scenario.n_dim
         assert set(tree[f"way_{k}"].data_vars) == set(rows.index)
         assert (rows["probability"] == way.probability).all()
         assert float(checks[f"probability_{k}"]) == way.probability

@@ -17,7 +17,7 @@ from lmshealth.prognosis.maintenance_decision import (
     cheapest_travel,
     day_after,
     decide,
-    reached_before,
+    probability_before,
     remaining_days,
     service_date,
 )
@@ -101,9 +101,9 @@ def test_a_draw_past_the_horizon_may_fail_there(rng: np.random.Generator) -> Non
     for risk in (0.05, 0.2, 0.45):
         day = service_date(prognosis, risk)
         assert day is not None
-        reached = reached_before(prognosis, day)
+        reached = probability_before(prognosis, day)
         assert reached.at_least[-1] <= reached.at_most[-1] <= risk
-        assert reached_before(prognosis, day + timedelta(days=30)).at_most[-1] > risk
+        assert probability_before(prognosis, day + timedelta(days=30)).at_most[-1] > risk
 
 
 # a ratio of costs
@@ -220,7 +220,7 @@ def test_costs_choose_a_day_at_the_median_usage() -> None:
     assert service.risk == pytest.approx(expected, abs=2e-4)
     assert (service.max_risk, service.cost_ratio, service.kept_risk) == (None, 10.0, service.risk)
     low, high = service.planned_risk
-    assert low == high == reached_before(prognosis, date(2026, 3, 21)).at_most[-1]
+    assert low == high == probability_before(prognosis, date(2026, 3, 21)).at_most[-1]
 
 
 # a given day
@@ -238,7 +238,7 @@ def test_the_probability_before_a_day_is_the_share_of_draws() -> None:
         health=np.ones((10, 2)),
         curve_quantiles=np.ones((5, 3, 2)),
     )
-    reached = reached_before(both, (START + timedelta(days=5)).date())  # 4.75 days
+    reached = probability_before(both, (START + timedelta(days=5)).date())  # 4.75 days
     np.testing.assert_allclose(reached.at_least, [0.4, 0.2, 0.6])
     np.testing.assert_array_equal(reached.at_least, reached.at_most)
 
@@ -248,7 +248,7 @@ def test_a_day_behind_the_horizon_has_bounds() -> None:
     remaining = np.r_[np.full(30, 5e6), np.full(50, 2e7), np.full(20, np.inf)]
     prognosis = make_prognosis(remaining, np.full(100, 1e4), horizon=1e7)
     for days, low, high in ((400, 0.0, 0.0), (900, 0.3, 0.3), (1200, 0.3, 1.0)):
-        reached = reached_before(prognosis, (START + timedelta(days=days)).date())
+        reached = probability_before(prognosis, (START + timedelta(days=days)).date())
         assert (reached.at_least[-1], reached.at_most[-1]) == (low, high)
     assert np.isinf(remaining_days(prognosis)[30:]).all()
 
@@ -257,7 +257,9 @@ def test_a_day_that_is_past_has_what_is_reached_already() -> None:
     """No day asks for less than what the last log says."""
     prognosis = make_prognosis(np.r_[-1e5, -1.0, 1e6, 2e6], np.full(4, 1e4))
     for day in (START.date(), date(2020, 1, 1)):
-        assert reached_before(prognosis, day).at_least[-1] == prognosis.already_past()[-1] == 0.5
+        assert (
+            probability_before(prognosis, day).at_least[-1] == prognosis.already_past()[-1] == 0.5
+        )
 
 
 def test_without_a_prognosis_nothing_is_known() -> None:

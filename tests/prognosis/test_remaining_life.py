@@ -16,7 +16,12 @@ from lmshealth.health import ensemble_sampling as sampling
 from lmshealth.prognosis import life_likelihood as life
 from lmshealth.prognosis.life_likelihood import LifeLikelihood
 from lmshealth.prognosis.life_posterior import LifeDensity, fit_life
-from lmshealth.prognosis.remaining_life import _usage, limited, prognose, told_limits
+from lmshealth.prognosis.remaining_life import (
+    _usage,
+    identifiable_limits,
+    parameters_with_limit,
+    prognose,
+)
 from lmshealth.prognosis.results import LawWeight, Prognosis
 from lmshealth.stage.description import Stage
 from lmshealth.tracking.results import History, Step
@@ -90,7 +95,7 @@ def test_remaining_life_is_that_of_a_grid(stage: Stage, fading: Prognosis) -> No
     """Quantiles of the remaining travel have the right probability on a 1-D grid."""
     likelihood = LifeLikelihood(fading_life(1.5e-4), stage)
     y = np.linspace(-0.3, 0.6, 4001)[:, None]
-    value = LifeDensity.of(likelihood, likelihood.courses[0]).log_probability(y)
+    value = LifeDensity.of(likelihood, likelihood.scenarios[0]).log_probability(y)
     density = np.exp(value - value.max())
     cdf = (np.cumsum(density) - 0.5 * density) / density.sum()
     for level in (0.05, 0.25, 0.5, 0.75, 0.95):
@@ -269,12 +274,16 @@ def test_a_stage_without_any_law_never_fails(tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_what_no_mode_tells_is_named_and_left_out(stage: Stage, fading: Prognosis) -> None:
     """The foot has a limit, but no mode moves with it: nothing is said of it, nor in "any"."""
-    assert fading.untold == ("foot",)
+    assert fading.unidentifiable == ("foot",)
     assert fading.health.shape == (10_000, 2)
     assert fading.curve_quantiles.shape[2] == 2
     assert {weight.parameter for weight in fading.laws} == {"guide_preload", "mount_stiffness"}
-    assert [p.name for _, p in limited(stage)] == ["guide_preload", "mount_stiffness", "foot"]
-    told = told_limits(stage, ("roll", "pitch"))
+    assert [p.name for _, p in parameters_with_limit(stage)] == [
+        "guide_preload",
+        "mount_stiffness",
+        "foot",
+    ]
+    told = identifiable_limits(stage, ("roll", "pitch"))
     assert [(j, p.name) for j, p in told] == [(0, "guide_preload"), (1, "mount_stiffness")]
 
 
@@ -375,4 +384,4 @@ def test_a_floor_above_the_limit_never_fails_and_one_below_does(tmp_path: Path) 
 def test_limited_parameters_keep_their_position(tmp_path: Path) -> None:
     """Parameters with a limit are found with their place among all."""
     stage = make_stage(tmp_path, (FOOT, PRELOAD))
-    assert [(j, p.name) for j, p in limited(stage)] == [(1, "guide_preload")]
+    assert [(j, p.name) for j, p in parameters_with_limit(stage)] == [(1, "guide_preload")]

@@ -8,7 +8,7 @@ from scipy import stats
 from scipy.optimize import brentq
 
 from lmshealth._arrays import FloatArray
-from lmshealth.prognosis.scenarios import _JUMP, Branch, Course, courses_of
+from lmshealth.prognosis.scenarios import _JUMP, DegradationPath, Scenario, list_scenarios
 from lmshealth.stage.degradation_laws import (
     AnyLaw,
     HertzWear,
@@ -33,10 +33,10 @@ def parameter(name: str, *laws: AnyLaw) -> ParameterSpec:
     return ParameterSpec(name=name, prior=Lognormal(1.0, 0.3), law=laws)
 
 
-def natural(branch: Branch, n: int, seed: int = 1) -> FloatArray:
-    """Draw natural parameters of a branch."""
-    y = branch.draw(np.random.default_rng(seed), n, NOW)
-    return branch.natural(y, NOW)
+def natural(path: DegradationPath, n: int, seed: int = 1) -> FloatArray:
+    """Draw natural parameters of a path."""
+    y = path.draw(np.random.default_rng(seed), n, NOW)
+    return path.natural(y, NOW)
 
 
 PRELOAD = parameter("preload", WEAR, LINEAR, NONE)
@@ -48,22 +48,22 @@ MOUNT = parameter("mount", LOOSE, NONE)
 )
 def test_courses_have_all_the_probability(steps: tuple[float, ...], n: int) -> None:
     """Every choice of laws and beginnings stands once, and weights add up to one."""
-    courses = courses_of((PRELOAD, MOUNT), steps, NOW)
-    assert len(courses) == n
-    assert sum(course.weight for course in courses) == pytest.approx(1, abs=1e-14)
-    keys = {tuple((b.law.kind, b.begin) for b in course.branches) for course in courses}
+    scenarios = list_scenarios((PRELOAD, MOUNT), steps, NOW)
+    assert len(scenarios) == n
+    assert sum(scenario.weight for scenario in scenarios) == pytest.approx(1, abs=1e-14)
+    keys = {tuple((b.law.kind, b.begin) for b in scenario.paths) for scenario in scenarios}
     assert len(keys) == n
-    assert all(branch.steps == steps for course in courses for branch in course.branches)
+    assert all(path.steps == steps for scenario in scenarios for path in scenario.paths)
 
 
 def test_a_law_has_its_weight_whether_it_begins_anew_or_not() -> None:
     """Beginnings share what a law has; weights count against those of the same parameter."""
-    courses = courses_of((PRELOAD, MOUNT), STEPS, NOW)
+    scenarios = list_scenarios((PRELOAD, MOUNT), STEPS, NOW)
     weights: dict[tuple[str, float], float] = {}
-    for course in courses:
-        for branch in course.branches:
-            key = (branch.law.kind, branch.begin)
-            weights[key] = weights.get(key, 0.0) + course.weight
+    for scenario in scenarios:
+        for path in scenario.paths:
+            key = (path.law.kind, path.begin)
+            weights[key] = weights.get(key, 0.0) + scenario.weight
     known = {
         ("hertz-wear", 0.0): 1 / 12,
         ("hertz-wear", 1.2e6): 1 / 12,
@@ -77,11 +77,11 @@ def test_a_law_has_its_weight_whether_it_begins_anew_or_not() -> None:
 
 
 def test_a_course_without_parameters_is_one_certain_life() -> None:
-    """One law of each parameter, and no step, is one course."""
-    (course,) = courses_of((parameter("foot", NONE), MOUNT_ONLY), (), NOW)
-    assert course.weight == 1
-    assert course.sizes == (0, 2)
-    assert course.n_dim == 2
+    """One law of each parameter, and no step, is one scenario."""
+    (scenario,) = list_scenarios((parameter("foot", NONE), MOUNT_ONLY), (), NOW)
+    assert scenario.weight == 1
+    assert scenario.sizes == (0, 2)
+    assert scenario.n_dim == 2
 
 
 MOUNT_ONLY = parameter("mount", LOOSE)
@@ -90,13 +90,13 @@ MOUNT_ONLY = parameter("mount", LOOSE)
 @pytest.mark.parametrize("law", LAWS, ids=[law.kind for law in LAWS])
 def test_jumps_act_from_their_step_on(law: AnyLaw) -> None:
     """Before a step health is that of the law; from it on, times all jumps so far."""
-    branch, k = Branch(law, 0.0, STEPS), len(law.names)
-    assert branch.names == (*law.names, "jump_1", "jump_2")
-    theta = natural(branch, 30)
+    path, k = DegradationPath(law, 0.0, STEPS), len(law.names)
+    assert path.names == (*law.names, "jump_1", "jump_2")
+    theta = natural(path, 30)
     travel = np.array(
         [0.0, np.nextafter(0.5e6, 0), 0.5e6, 1.1e6, np.nextafter(1.2e6, 0), 1.2e6, 9e6]
     )
-    ratio = branch.health(theta, travel)
+    ratio = path.health(theta, travel)
     own = law.health(theta[:, :k], travel)
     first, second = theta[:, k], theta[:, k + 1]
     known = own * np.stack(
@@ -109,17 +109,17 @@ def test_jumps_act_from_their_step_on(law: AnyLaw) -> None:
 @pytest.mark.parametrize("law", LAWS[:3], ids=[law.kind for law in LAWS[:3]])
 def test_a_law_begun_anew_is_whole_until_then(law: AnyLaw) -> None:
     """Up to where it begins only jumps act; from there it is the law of the travel since."""
-    branch, k = Branch(law, 1.2e6, STEPS), len(law.names)
-    theta = natural(branch, 30)
+    path, k = DegradationPath(law, 1.2e6, STEPS), len(law.names)
+    theta = natural(path, 30)
     first, second = theta[:, k : k + 1], theta[:, k + 1 :]
     early, late = np.array([0.0, 0.4e6]), np.array([1.2e6, 1.5e6, 4e6])
-    np.testing.assert_array_equal(branch.health(theta, early), 1)
-    np.testing.assert_array_equal(branch.health(theta, np.array([0.9e6])), first)
+    np.testing.assert_array_equal(path.health(theta, early), 1)
+    np.testing.assert_array_equal(path.health(theta, np.array([0.9e6])), first)
     known = law.health(theta[:, :k], late - 1.2e6) * first * second
-    np.testing.assert_allclose(branch.health(theta, late), known, rtol=1e-14)
+    np.testing.assert_allclose(path.health(theta, late), known, rtol=1e-14)
     # Coordinates are of the travel that the law itself has had.
-    y = branch.draw(np.random.default_rng(2), 5, NOW)
-    np.testing.assert_array_equal(branch.natural(y, NOW)[:, :k], law.natural(y[:, :k], NOW - 1.2e6))
+    y = path.draw(np.random.default_rng(2), 5, NOW)
+    np.testing.assert_array_equal(path.natural(y, NOW)[:, :k], law.natural(y[:, :k], NOW - 1.2e6))
 
 
 FALLING = [WEAR, LOOSE, Linear(rate_per_km=Lognormal(2e-4, 0.5)), NONE]
@@ -129,16 +129,16 @@ FALLING = [WEAR, LOOSE, Linear(rate_per_km=Lognormal(2e-4, 0.5)), NONE]
 @pytest.mark.parametrize("law", FALLING, ids=[law.kind for law in LAWS])
 def test_passage_after_the_last_step_is_the_root_of_health(law: AnyLaw, begin: float) -> None:
     """Where a limit is reached after all steps, root finding on health finds the same travel."""
-    branch = Branch(law, begin, STEPS)
-    theta = natural(branch, 120)
+    path = DegradationPath(law, begin, STEPS)
+    theta = natural(path, 120)
     found = 0
     for limit in (0.5, 0.8, 0.95):
-        passage = branch.passage(theta, limit)
+        passage = path.passage(theta, limit)
         assert passage.shape == (120,)
         for row, travel in zip(theta[:, None], passage, strict=True):
 
             def off(s: float, row: FloatArray = row, limit: float = limit) -> float:
-                return float(branch.health(row, np.array([s]))[0, 0] - limit)
+                return float(path.health(row, np.array([s]))[0, 0] - limit)
 
             last = STEPS[-1]
             if np.isinf(travel):
@@ -154,36 +154,34 @@ def test_passage_after_the_last_step_is_the_root_of_health(law: AnyLaw, begin: f
 
 def test_a_gain_never_reaches_what_no_step_has_jumped_over() -> None:
     """Where all is gained after the jumps a limit below them is never reached."""
-    branch = Branch(LINEAR, 0.0, STEPS)
+    path = DegradationPath(LINEAR, 0.0, STEPS)
     theta = np.array([[-1e-8, 0.9, 0.9], [-1e-8, 0.9, 1.2]])
-    assert np.isinf(branch.passage(theta, 0.7)).all()
+    assert np.isinf(path.passage(theta, 0.7)).all()
 
 
 def test_each_draw_may_have_its_own_limit() -> None:
     """An array of limits gives what each limit alone gives."""
-    branch = Branch(LOOSE, 0.0, STEPS)
-    theta, limit = natural(branch, 40), np.linspace(0.4, 1.2, 40)
-    alone = [
-        branch.passage(row[None], float(one))[0] for row, one in zip(theta, limit, strict=True)
-    ]
-    np.testing.assert_array_equal(branch.passage(theta, limit), alone)
+    path = DegradationPath(LOOSE, 0.0, STEPS)
+    theta, limit = natural(path, 40), np.linspace(0.4, 1.2, 40)
+    alone = [path.passage(row[None], float(one))[0] for row, one in zip(theta, limit, strict=True)]
+    np.testing.assert_array_equal(path.passage(theta, limit), alone)
 
 
-def one_course(*branches: Branch) -> Course:
-    """Make a course of some branches."""
-    return Course(branches, NOW, 1.0)
+def one_course(*paths: DegradationPath) -> Scenario:
+    """Make a scenario of some paths."""
+    return Scenario(paths, NOW, 1.0)
 
 
 @pytest.mark.parametrize("begin", [0.0, 0.5e6])
 def test_the_prior_of_a_line_with_a_jump_integrates_to_one(begin: float) -> None:
     """A rate and a jump, by quadrature on a grid of coordinates."""
-    course = one_course(Branch(LINEAR, begin, (0.5e6,)))
+    scenario = one_course(DegradationPath(LINEAR, begin, (0.5e6,)))
     loss, jump = np.linspace(-4, 4, 801), np.linspace(-2.5, 2.5, 501)
     y = np.stack(np.meshgrid(loss, jump, indexing="ij"), axis=-1).reshape(-1, 2)
     cell = (loss[1] - loss[0]) * (jump[1] - jump[0])
-    assert np.exp(course.log_prior(y)).sum() * cell == pytest.approx(1, abs=1e-9)
+    assert np.exp(scenario.log_prior(y)).sum() * cell == pytest.approx(1, abs=1e-9)
     # Negative control: a density of the rate itself, without the Jacobian, does not.
-    bare = LINEAR.rate_per_km.log_density(course.natural(y)[:, 0] * 1000)
+    bare = LINEAR.rate_per_km.log_density(scenario.natural(y)[:, 0] * 1000)
     bare = np.exp(bare + _JUMP.log_density(y[:, 1])).sum() * cell
     assert abs(bare - 1) > 0.1
 
@@ -192,29 +190,29 @@ def test_the_prior_of_a_line_with_a_jump_integrates_to_one(begin: float) -> None
 @pytest.mark.parametrize("law", [WEAR, LOOSE], ids=["hertz-wear", "loosening"])
 def test_priors_of_two_coordinates_integrate_to_one(law: AnyLaw, begin: float) -> None:
     """Wear and loosening, begun anew or not, by quadrature on a grid of coordinates."""
-    course = one_course(Branch(law, begin, ()))
-    y = course.draw(np.random.default_rng(3), 20_000)
+    scenario = one_course(DegradationPath(law, begin, ()))
+    y = scenario.draw(np.random.default_rng(3), 20_000)
     low, high = y.min(axis=0) - 2, y.max(axis=0) + 2
     axes = [np.linspace(a, b, 1201) for a, b in zip(low, high, strict=True)]
     grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
-    density = np.exp(course.log_prior(grid))
+    density = np.exp(scenario.log_prior(grid))
     cell = float(np.prod((high - low) / 1200))
     # The floor's prior has edges, at which a grid is rough.
     assert density.sum() * cell == pytest.approx(1, abs=3e-3)
     mean = density @ grid * cell
     assert (np.abs(y.mean(axis=0) - mean) < 5 * y.std(axis=0) / np.sqrt(20_000) + 5e-3).all()
     # Negative control: draws as if the law had another travel behind it.
-    other = one_course(Branch(law, 1.2e6, ())).draw(np.random.default_rng(3), 20_000)
+    other = one_course(DegradationPath(law, 1.2e6, ())).draw(np.random.default_rng(3), 20_000)
     assert (np.abs(other.mean(axis=0) - mean) > 0.05).any()
 
 
 def test_draws_follow_the_prior() -> None:
     """Rates and jumps of draws have the stated distributions, one independent of the other."""
-    course = one_course(Branch(LINEAR, 0.5e6, STEPS), Branch(NONE, 0.0, STEPS))
-    y = course.draw(np.random.default_rng(4), 5000)
+    scenario = one_course(DegradationPath(LINEAR, 0.5e6, STEPS), DegradationPath(NONE, 0.0, STEPS))
+    y = scenario.draw(np.random.default_rng(4), 5000)
     assert y.shape == (5000, 5)
-    assert np.isfinite(course.log_prior(y)).all()
-    theta = course.natural(y)
+    assert np.isfinite(scenario.log_prior(y)).all()
+    theta = scenario.natural(y)
     books = [stats.norm(0.0, 2e-7), *[stats.lognorm(_JUMP.std)] * 4]
     for column, book in zip(theta.T, books, strict=True):
         assert stats.kstest(column, book.cdf).pvalue > 1e-4
@@ -224,31 +222,35 @@ def test_draws_follow_the_prior() -> None:
 
 
 def test_a_course_joins_its_branches() -> None:
-    """Coordinates, densities and health of a course are those of its branches, side by side."""
-    branches = (Branch(WEAR, 0.0, STEPS), Branch(NONE, 0.0, STEPS), Branch(LOOSE, 1.2e6, STEPS))
-    course = one_course(*branches)
-    assert course.sizes == (4, 2, 4)
-    y = course.draw(np.random.default_rng(5), 20)
-    parts = course.split(y)
+    """Coordinates, densities and health of a scenario are those of its paths, side by side."""
+    paths = (
+        DegradationPath(WEAR, 0.0, STEPS),
+        DegradationPath(NONE, 0.0, STEPS),
+        DegradationPath(LOOSE, 1.2e6, STEPS),
+    )
+    scenario = one_course(*paths)
+    assert scenario.sizes == (4, 2, 4)
+    y = scenario.draw(np.random.default_rng(5), 20)
+    parts = scenario.split(y)
     assert [part.shape for part in parts] == [(20, 4), (20, 2), (20, 4)]
     travel = np.array([0.0, 1e6, NOW])
     alone = [
-        branch.health(branch.natural(part, NOW), travel)
-        for branch, part in zip(branches, parts, strict=True)
+        path.health(path.natural(part, NOW), travel)
+        for path, part in zip(paths, parts, strict=True)
     ]
-    theta = course.natural(y)
-    np.testing.assert_array_equal(course.health(theta, travel), np.stack(alone, axis=-1))
-    total = sum(b.log_prior(part, NOW) for b, part in zip(branches, parts, strict=True))
-    np.testing.assert_allclose(course.log_prior(y), total, rtol=1e-14)
+    theta = scenario.natural(y)
+    np.testing.assert_array_equal(scenario.health(theta, travel), np.stack(alone, axis=-1))
+    total = sum(b.log_prior(part, NOW) for b, part in zip(paths, parts, strict=True))
+    np.testing.assert_allclose(scenario.log_prior(y), total, rtol=1e-14)
 
 
 def test_far_off_walkers_are_impossible_and_raise_no_warning() -> None:
     """Coordinates beyond the range of floats have a prior of next to nothing, never NaN."""
-    course = one_course(Branch(LOOSE, 0.0, STEPS), Branch(WEAR, 0.0, STEPS))
-    y = course.draw(np.random.default_rng(6), 1)
+    scenario = one_course(DegradationPath(LOOSE, 0.0, STEPS), DegradationPath(WEAR, 0.0, STEPS))
+    y = scenario.draw(np.random.default_rng(6), 1)
     for shift in (-1e3, 1e3):
-        far = y + shift * np.eye(course.n_dim)
-        value = course.log_prior(far)
+        far = y + shift * np.eye(scenario.n_dim)
+        value = scenario.log_prior(far)
         assert not np.isnan(value).any()
-        assert (value < course.log_prior(y) - 100).all()
-        assert not np.isnan(course.natural(far)).any()
+        assert (value < scenario.log_prior(y) - 100).all()
+        assert not np.isnan(scenario.natural(far)).any()

@@ -161,7 +161,7 @@ def make_prognosis(
         recorded_at=history.recorded_at[-1],
         travel=float(history.travel[-1]),
         parameters=(*PARAMETERS, "any"),
-        untold=(),
+        unidentifiable=(),
         limits=np.array([*limits, np.nan]),
         remaining=np.column_stack([remaining, remaining.min(axis=1)]),
         usage=12e3 * np.exp(rng.normal(0, 0.08, n)),

@@ -8,28 +8,28 @@ from pathlib import Path
 
 import pytest
 
-from lmshealth.prognosis.fleet_prior import Learned, LearnedLaw
-from lmshealth.prognosis.life_likelihood import expected_scatter, scatter_of
+from lmshealth.prognosis.fleet_prior import FleetPrior, LawPrior
+from lmshealth.prognosis.life_likelihood import expected_scatter, scatter_prior
 from lmshealth.report.fleetfacts import taught
 from lmshealth.report.machine_page import write_report
 from lmshealth.report.text import GAP
-from lmshealth.stage.description import Scatter, load_stage
+from lmshealth.stage.description import ScatterPrior, load_stage
 from lmshealth.stage.priors import Lognormal, Normal
 from tests.assessments import worn
 
-SCATTER = Scatter((0.0, 1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0), (1.0, 0.0, 0.0))
-LEARNED = Learned(
-    n_teachers=25,
+SCATTER = ScatterPrior((0.0, 1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0), (1.0, 0.0, 0.0))
+LEARNED = FleetPrior(
+    n_machines=25,
     laws=(
-        LearnedLaw(
+        LawPrior(
             "guide_preload",
             "hertz-wear",
             (0.5, 0.82),
             "life_km",
             (Lognormal(8000, 1.0), Lognormal(4100, 0.5)),
         ),
-        LearnedLaw("guide_preload", "none", (0.5, 0.18), "", None),
-        LearnedLaw(
+        LawPrior("guide_preload", "none", (0.5, 0.18), "", None),
+        LawPrior(
             "belt", "linear", (1.0, 1.0), "rate_per_km", (Normal(0, 1e-4), Normal(2e-5, 5e-5))
         ),
     ),
@@ -46,7 +46,7 @@ def test_priors_are_told_before_and_after() -> None:
     """Shares, medians and 90 % ranges are those of the priors; scatter is told by its means."""
     told = taught(LEARNED, load_stage("lms-y"))
     assert told is not None
-    assert told.n_teachers == 25
+    assert told.n_machines == 25
     wear, none, belt = [[plain(cell) for cell in row] for row in told.laws]
     assert wear == [
         "guide preload, wear of the contacts (Hertz)",
@@ -64,8 +64,8 @@ def test_priors_are_told_before_and_after() -> None:
 def test_expected_scatter_is_what_is_believed() -> None:
     """A stage is believed to scatter as every stage, until it is told otherwise."""
     stage = load_stage("lms-y")
-    assert expected_scatter(scatter_of(replace(stage, scatter=SCATTER))) == (5e-4, 1.5, 0.0)
-    assert scatter_of(stage) == scatter_of(replace(stage, digest="another"))
+    assert expected_scatter(scatter_prior(replace(stage, scatter=SCATTER))) == (5e-4, 1.5, 0.0)
+    assert scatter_prior(stage) == scatter_prior(replace(stage, digest="another"))
 
 
 @pytest.mark.slow

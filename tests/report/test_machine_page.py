@@ -19,7 +19,7 @@ import pytest
 from msgspec import structs
 
 from lmshealth._arrays import FloatArray
-from lmshealth.health.verdict import Judgement
+from lmshealth.health.verdict import Verdict
 from lmshealth.io.log import Refusal
 from lmshealth.prognosis.results import Prognosis
 from lmshealth.report import figures as plots
@@ -91,7 +91,7 @@ def make(tmp_path: Path) -> Maker:
             track=make_track(history, truth),
             health=make_health(history, truth),
             prognosis=make_prognosis(history, wear_km, floor),
-            judgement=Judgement(
+            judgement=Verdict(
                 stage=identity,
                 recorded_at=history.recorded_at[-1],
                 verdict="healthy" if healthy else "both",

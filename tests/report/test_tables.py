@@ -10,10 +10,10 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from lmshealth.health.verdict import Judgement
+from lmshealth.health.verdict import Verdict
 from lmshealth.io.log import Metadata, Refusal
 from lmshealth.modal.modes import Modes
-from lmshealth.prognosis.maintenance_decision import decide, reached_before
+from lmshealth.prognosis.maintenance_decision import decide, probability_before
 from lmshealth.prognosis.results import Prognosis
 from lmshealth.report.assessment import Assessment
 from lmshealth.report.tables import (
@@ -66,7 +66,7 @@ def prognosis(remaining: np.ndarray, usage: float = 10_000.0) -> Prognosis:
         recorded_at=WHEN,
         travel=5e5,
         parameters=("guide_preload", "any"),
-        untold=(),
+        unidentifiable=(),
         limits=np.array([0.6, np.nan]),
         remaining=np.column_stack([remaining, remaining]),
         usage=np.full(n, usage),
@@ -107,7 +107,7 @@ def assessment(stage: Stage, foretold: Prognosis | None) -> Assessment:
         draws, recorded_at=two, travel=travel, parameters=("guide_preload",),
         converged=np.array([True, False]), informed=np.full((2, 1), 0.9), stage="test-A",
     )  # fmt: skip
-    verdict = Judgement("test-A", two[-1], "healthy", 0.8, "")
+    verdict = Verdict("test-A", two[-1], "healthy", 0.8, "")
     return Assessment(stage, history, ("d", "e"), track, health, foretold, verdict, (), (), 0)
 
 
@@ -261,7 +261,7 @@ def test_a_day_that_is_asked_for_has_columns_of_its_own() -> None:
     """The day and the two bounds of its probability stand after all other columns."""
     life = prognosis(np.r_[np.full(50, 1e5), np.full(50, np.inf)])
     day = date(2046, 1, 1)
-    before = day, reached_before(life, day)
+    before = day, probability_before(life, day)
     table = frame(COLUMNS["prognosis"], prognosis_rows(life, decide(life, Decision()), before))
     assert list(table.columns[-3:]) == ["before", "probability_at_least", "probability_at_most"]
     assert table[table.columns[-3:]].to_numpy().tolist() == 2 * [[day, 0.5, 1.0]]

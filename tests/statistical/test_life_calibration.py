@@ -14,7 +14,7 @@ import pytest
 
 from lmshealth._arrays import FloatArray
 from lmshealth.prognosis import life_likelihood as life
-from lmshealth.prognosis.fleet_prior import is_young, lesson_of
+from lmshealth.prognosis.fleet_prior import machine_evidence, needs_fleet_prior
 from lmshealth.prognosis.life_likelihood import LifeLikelihood
 from lmshealth.prognosis.life_posterior import LifeDensity, fit_life
 from lmshealth.prognosis.remaining_life import _usage, remaining_travel
@@ -93,9 +93,9 @@ def integrated(density: LifeDensity) -> tuple[FloatArray, FloatArray]:
 
 
 def density_of(history: History, stage: Stage) -> LifeDensity:
-    """Give the density of the only course."""
+    """Give the density of the only scenario."""
     likelihood = LifeLikelihood(history, stage)
-    return LifeDensity.of(likelihood, likelihood.courses[0])
+    return LifeDensity.of(likelihood, likelihood.scenarios[0])
 
 
 def level_of_health(
@@ -195,12 +195,12 @@ def test_young_machines_are_told_right_by_their_fleet(
         teachers = lessons(rng, fleet, SMALL, number)
         for _ in range(MOST_DRAWN):
             young = draw_machine(rng, fleet, YOUNG)
-            lesson = lesson_of(described(), posterior(young, described(), number))
-            if is_young(lesson) and (prior := taught(lesson, teachers)) is not None:
+            lesson = machine_evidence(described(), posterior(young, described(), number))
+            if needs_fleet_prior(lesson) and (prior := taught(lesson, teachers)) is not None:
                 break
         else:
             continue
-        told = posterior(young, prior.onto(described()), number)
+        told = posterior(young, prior.apply_to(described()), number)
         left = remaining_travel(
             told, [(0, described().parameters[0])], rng, now=young.now, horizon=horizon()
         )
