@@ -10,9 +10,9 @@ Method
     mount keeps its stiffness. Each has 16 machines of 24 logs that teach, their odometers lognormal
     about 2,000 km; a machine that leaves the modal map is taken out at the log before. Young ones
     have 8 logs about 200 km; they are drawn until four of a fleet are young (`needs_fleet_prior`).
-    Logs have errors of 0.03 to 0.2 %, unknown intercepts, effects of temperature and payload, a random
-    walk, a factor on the errors, a deviation of health from its law, and a map whose sensitivities
-    are wrong. All posteriors are drawn by importance sampling (``chains=False``). The remaining
+    Logs have errors of 0.03 to 0.2 %, unknown intercepts, effects of temperature and payload, a
+    random walk, a factor on the errors, a deviation of health from its law, and a wrong map of
+    sensitivities. All posteriors are drawn by importance sampling (``chains=False``). The remaining
     life of every young machine, cut at the horizon, is told with the prior of the description, with
     the one learned from its own fleet (also with the laws of that alone, its scatter left as
     described), and with what is true of the fleet: nothing that is learned can be better. Compared

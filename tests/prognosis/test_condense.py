@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lmshealth.prognosis.life_likelihood import MOST_LOGS, LifeLikelihood
+from lmshealth.prognosis.life_likelihood import MOST_LOGS, LifeLikelihood, condense
 from lmshealth.prognosis.life_posterior import fit_life
 from lmshealth.tracking.results import Step
 from tests.lives import FREQUENCY, SENSITIVITY, awkward_history, make_history, make_stage, since
