@@ -80,7 +80,7 @@ def reported(assessment: Assessment, service: Service | None = None) -> Reported
             told[health.parameters[k]] = float(low[k]), float(middle[k]), float(high[k])
     remaining: Interval | None = None
     if prognosis is not None:
-        low, middle, high = quantiles(prognosis.claimed()[:, -1])
+        low, middle, high = quantiles(prognosis.censored()[:, -1])
         remaining = low, middle, high
     return Reported(
         recorded_at=judgement.recorded_at,

@@ -115,7 +115,7 @@ def forked(unchained: LifePosterior) -> LifePosterior:
             ess_tail=800.0 - 100 * k - steps,
             r_hat=1.001 + 0.004 * k + 1e-4 * steps,
             informed=0.9 - 0.4 * k - 0.01 * steps,
-            share=int(100 * probability),
+            n_mixture=int(100 * probability),
         )
         for k, probability in enumerate((0.75, 0.25))
     )
