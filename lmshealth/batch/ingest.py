@@ -13,6 +13,7 @@ from lmshealth.batch.store import Identified, Store
 from lmshealth.batch.workers import Pool
 from lmshealth.errors import BadLog
 from lmshealth.io.column_map import ColumnMap
+from lmshealth.io.constants import MAX_MEMORY
 from lmshealth.io.formats.registry import format_name
 from lmshealth.io.log import Log, Metadata, Refusal
 from lmshealth.io.manifest import find_logs, name_of, read_manifest
@@ -29,8 +30,8 @@ Progress = Callable[[str, int, int], None]
 
 # Files hashed by one task.
 _BATCH = 16
-# Their refusal says something of the computer, not of the log: it may be otherwise next time.
-_PASSING = ("missing-file", "changed")
+# Their refusal depends on the computer and on --max-memory, not only on the log: it is not cached.
+_PASSING = ("missing-file", "changed", "too-large")
 
 _logger = logging.getLogger(__name__)
 
@@ -98,6 +99,7 @@ def take_in(
     *,
     out: Path,
     columns: ColumnMap | None = None,
+    max_memory: float = MAX_MEMORY,
 ) -> Intake:
     """Identify every log of a folder that the store does not know yet.
 
@@ -114,6 +116,8 @@ def take_in(
         Folder of the output: nothing inside it is a log.
     columns : ColumnMap, optional
         How all of them are read; by default their columns are those of the log contract.
+    max_memory : float
+        Most memory in bytes that reading a log may take.
     """
     folder = folder.absolute()  # workers may stand elsewhere
     archive = find_logs(folder)
@@ -127,7 +131,7 @@ def take_in(
         known.add(task.name)
     site.progress("identifying", len(known), len(tasks))
     left = [task for task in tasks if task.name not in known]
-    work = partial(identify_log, stages=tuple(stages))
+    work = partial(identify_log, stages=tuple(stages), max_memory=max_memory)
     for k, (task, outcome) in enumerate(site.pool.spread(work, left, _lost), start=1):
         if outcome.lasting:
             site.store.put(task.key(outcome.description), task.digest, outcome)
@@ -265,11 +269,19 @@ def _lost(task: _Task, why: str) -> Identified:
     return Identified((refusal,), lasting=False)
 
 
-def identify_log(task: _Task, stages: tuple[Stage, ...]) -> Identified:
+def identify_log(
+    task: _Task, stages: tuple[Stage, ...], max_memory: float = MAX_MEMORY
+) -> Identified:
     """Read and identify one log; what goes wrong with it is its refusal, never an exception."""
     by, stage, asked = "", None, None
     try:
-        log = read_log(task.path, columns=task.columns, overrides=task.overrides, name=task.name)
+        log = read_log(
+            task.path,
+            columns=task.columns,
+            overrides=task.overrides,
+            name=task.name,
+            max_memory=max_memory,
+        )
         if log.digest != task.digest:
             raise BadLog(task.name, "changed", "it is being written to; run again")
         require_identity(log)

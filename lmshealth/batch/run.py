@@ -17,6 +17,7 @@ from lmshealth.batch.telling import Content, Tables, Telling
 from lmshealth.batch.workers import Pool, cluster, processes
 from lmshealth.errors import LmshealthError, NothingUsable
 from lmshealth.io.column_map import ColumnMap
+from lmshealth.io.constants import MAX_MEMORY
 from lmshealth.io.log import Refusal
 from lmshealth.io.manifest import NOT_LOGS
 from lmshealth.report.fleet_page import Summary, by_urgency, file_names, write_index
@@ -42,6 +43,8 @@ class Settings:
         Of all randomness.
     columns : ColumnMap or None
         How logs are read; None where their columns are those of the log contract.
+    max_memory : float
+        Most memory in bytes that reading a log may take.
 
     Examples
     --------
@@ -49,7 +52,7 @@ class Settings:
 
     >>> import lmshealth
     >>> lmshealth.Settings(workers=2, store="postgresql://me:secret@host/fleet")
-    Settings(workers=2, scheduler=None, epochs=40, seed=0, columns=None)
+    Settings(workers=2, scheduler=None, epochs=40, seed=0, columns=None, max_memory=2000000000.0)
     """
 
     store: str | None = field(default=None, repr=False)  # it may hold a password
@@ -58,6 +61,7 @@ class Settings:
     epochs: int = 40
     seed: int = 0
     columns: ColumnMap | None = None
+    max_memory: float = MAX_MEMORY
 
     def pool(self) -> AbstractContextManager[Pool]:
         """Open what does the work."""
@@ -148,7 +152,14 @@ def run(
     work = read_maintenance(folder)
     with settings.pool() as pool, closing(Store(settings.store or beside(out))) as store:
         site = Site(store, pool, progress)
-        taken = take_in(folder, stages, site, out=out, columns=settings.columns)
+        taken = take_in(
+            folder,
+            stages,
+            site,
+            out=out,
+            columns=settings.columns,
+            max_memory=settings.max_memory,
+        )
         refused = (*taken.refused, *work.refused)
         machines = _machines(taken, stages, work, settings)
         failed = assess_all(machines, site)

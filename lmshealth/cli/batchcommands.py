@@ -10,7 +10,15 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from lmshealth.cli import terminal
-from lmshealth.cli.options import COLUMNS, EPOCHS, PDF, SCHEDULER, SEED, WORKERS, examples
+from lmshealth.cli.options import (
+    EPOCHS,
+    PDF,
+    SCHEDULER,
+    SEED,
+    WORKERS,
+    examples,
+    reading_options,
+)
 from lmshealth.cli.progress import progress_bars
 from lmshealth.report.pdf import write_pdfs
 
@@ -51,7 +59,7 @@ STORE_VARIABLE = "LMSHEALTH_STORE"
     help="Where results are kept: sqlite:///PATH, or a PostgreSQL database; default a file in "
     "--out.",
 )
-@COLUMNS
+@reading_options
 @WORKERS
 @SCHEDULER
 @EPOCHS
@@ -74,6 +82,7 @@ def run(
         epochs=options["epochs"],
         seed=options["seed"],
         columns=load_columns(options["columns"]) if options["columns"] else None,
+        max_memory=options["max_memory"],
     )
     loaded = [load_stage(reference) for reference in stages]
     with progress_bars() as progress:

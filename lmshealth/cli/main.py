@@ -18,7 +18,6 @@ from lmshealth.cli import logview, planview, terminal
 from lmshealth.cli.batchcommands import report, run
 from lmshealth.cli.commands import COMMANDS
 from lmshealth.cli.options import (
-    COLUMNS,
     DETECT,
     FORMAT,
     LOGS,
@@ -27,6 +26,7 @@ from lmshealth.cli.options import (
     STAGE,
     checked_band,
     examples,
+    reading_options,
 )
 from lmshealth.errors import BadLog, LmshealthError
 from lmshealth.io.log import Log, Refusal
@@ -92,7 +92,7 @@ def main() -> None:
     help="Use what vibrates at constant velocity, or all of a log that never moves; or what "
     "decays after the moves.",
 )
-@COLUMNS
+@reading_options
 @click.option("--channels", help="Use only these channels, separated by commas.")
 @click.option("--band", nargs=2, type=float, metavar="LOW HIGH", help="Use only this band, in Hz.")
 @FORMAT
@@ -159,7 +159,7 @@ def modes(ctx: click.Context, /, logs: tuple[Path, ...], style: str, **options: 
     help="Then count those above this amplitude.",
 )
 @PART
-@COLUMNS
+@reading_options
 @FORMAT
 @click.pass_context
 def error(ctx: click.Context, /, logs: tuple[Path, ...], style: str, **options: Any) -> None:
@@ -211,7 +211,7 @@ def error(ctx: click.Context, /, logs: tuple[Path, ...], style: str, **options: 
     help="Only modes, grid and lines of this band, in Hz; default 10 to 400 without a stage.",
 )
 @PART
-@COLUMNS
+@reading_options
 @FORMAT
 @click.pass_context
 def spectrum(ctx: click.Context, /, logs: tuple[Path, ...], style: str, **options: Any) -> None:
@@ -277,7 +277,7 @@ def spectrum(ctx: click.Context, /, logs: tuple[Path, ...], style: str, **option
     metavar="S",
     help="Period of the excitation in s, to 1 %; default found from the input, if it repeats.",
 )
-@COLUMNS
+@reading_options
 @FORMAT
 @click.pass_context
 def frf(ctx: click.Context, /, logs: tuple[Path, ...], style: str, **options: Any) -> None:
@@ -405,6 +405,7 @@ def _each(
     found: list[Result] = []
     lost: list[Refusal] = []
     manifests: dict[Path, Manifest] = {}
+    max_memory = click.get_current_context().params["max_memory"]
     named = tuple(logs)
     # Who says *.csv does not mean the manifest beside the logs.
     for path in [path for path in named if path.name not in NOT_LOGS] or named:
@@ -412,7 +413,8 @@ def _each(
             if path.parent not in manifests:
                 manifests[path.parent] = _noted(read_manifest_beside(path))
             overrides = manifests[path.parent].overrides(path)
-            found.append(look(read_log(path, columns=columns, overrides=overrides)))
+            log = read_log(path, columns=columns, overrides=overrides, max_memory=max_memory)
+            found.append(look(log))
         except BadLog as why:
             lost.append(Refusal(why.log, why.reason, why.detail))
     return found, lost

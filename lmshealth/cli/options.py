@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import click
 
+from lmshealth.io.constants import MAX_MEMORY
 from lmshealth.signal.segments import PARTS
 
 TABLE = click.Path(exists=True, dir_okay=False, path_type=Path)
@@ -15,7 +17,7 @@ OUT = click.Path(dir_okay=False, path_type=Path)
 
 LOGS = click.argument("logs", nargs=-1, required=True, type=click.Path(path_type=Path))
 STAGE = click.option("--stage", help="Stage description: a .toml file or a shipped name.")
-COLUMNS = click.option(
+_COLUMNS = click.option(
     "--columns", type=click.Path(path_type=Path), help="Column map of the export."
 )
 FORMAT = click.option(
@@ -82,6 +84,23 @@ class Day(click.DateTime):
 
 
 SHARE = Finite(0, 1, min_open=True, max_open=True)
+
+_MAX_MEMORY = click.option(
+    "--max-memory",
+    type=Finite(0, min_open=True),
+    default=MAX_MEMORY / 1e9,
+    show_default=True,
+    envvar="LMSHEALTH_MAX_MEMORY",
+    show_envvar=True,
+    metavar="GB",
+    callback=lambda ctx, option, gigabytes: 1e9 * gigabytes,
+    help="Refuse a log that needs more memory than this to be read (MAT, UFF58, TDMS).",
+)
+
+
+def reading_options(command: Callable[..., Any]) -> Callable[..., Any]:
+    """Add the options by which logs are read: --columns and --max-memory (bytes)."""
+    return _COLUMNS(_MAX_MEMORY(command))
 
 
 def examples(*lines: str) -> str:

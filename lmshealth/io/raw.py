@@ -54,13 +54,14 @@ class Format:
     sniff : callable
         Tells by the leading bytes of a file whether it is of this format.
     load : callable
-        Reads a file; may raise anything, `lmshealth.io.formats.registry.load` names it.
+        Read a file: path, column map, most memory in bytes. It may raise anything:
+        `lmshealth.io.formats.registry.load` turns it into a refusal.
     """
 
     name: str
     suffixes: tuple[str, ...]
     sniff: Callable[[bytes], bool]
-    load: Callable[[Path, ColumnMap], Raw]
+    load: Callable[[Path, ColumnMap, float], Raw]
 
 
 def size_limit(stored: int) -> int:

@@ -9,6 +9,7 @@ from pathlib import Path
 
 from lmshealth.errors import BadLog
 from lmshealth.io.column_map import ColumnMap
+from lmshealth.io.constants import MAX_MEMORY
 from lmshealth.io.formats.registry import load
 from lmshealth.io.log import Log
 from lmshealth.io.log_contract import to_log
@@ -21,6 +22,7 @@ def read_log(
     columns: ColumnMap | None = None,
     overrides: Mapping[str, str] | None = None,
     name: str | None = None,
+    max_memory: float = MAX_MEMORY,
 ) -> Log:
     """Read a log.
 
@@ -34,6 +36,9 @@ def read_log(
         Metadata that override what the file and the column map say, as a manifest gives them.
     name : str, optional
         The log as the user knows it; by default the path.
+    max_memory : float, optional
+        Most memory in bytes that one variable (MAT), data set (UFF58) or segment (TDMS) may take;
+        what needs more is refused with reason ``too-large``.
 
     Returns
     -------
@@ -67,7 +72,9 @@ def read_log(
     try:
         digest = _digest(file)
         used = ColumnMap() if columns is None else columns
-        return to_log(load(file, used), used, overrides or {}, name=label, digest=digest)
+        return to_log(
+            load(file, used, max_memory), used, overrides or {}, name=label, digest=digest
+        )
     except Unusable as error:
         raise BadLog(label, error.reason, error.detail) from error
 

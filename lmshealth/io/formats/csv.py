@@ -142,12 +142,12 @@ _FIELDS = 1 << 18
 _LONG_ROW = re.compile(r"in line (\d+), saw (\d+)")
 
 
-def _load_plain(path: Path, columns: ColumnMap) -> Raw:
+def _load_plain(path: Path, columns: ColumnMap, max_memory: float) -> Raw:
     with path.open("rb") as stream:
         return parse_text(stream, path.stat().st_size, columns)
 
 
-def _load_gzip(path: Path, columns: ColumnMap) -> Raw:
+def _load_gzip(path: Path, columns: ColumnMap, max_memory: float) -> Raw:
     with gzip.open(path, "rb") as stream:
         return parse_text(stream, path.stat().st_size, columns)
 

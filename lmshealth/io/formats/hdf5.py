@@ -134,7 +134,7 @@ _MAGIC = b"\x89HDF\r\n\x1a\n"
 _LONGEST_TEXT = 1 << 16
 
 
-def _load(path: Path, columns: ColumnMap) -> Raw:
+def _load(path: Path, columns: ColumnMap, max_memory: float) -> Raw:
     import h5py
 
     with Guarded(path) as stream:

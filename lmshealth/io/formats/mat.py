@@ -45,7 +45,7 @@ class _Variable(NamedTuple):
     size: int
 
 
-def _load(path: Path, columns: ColumnMap) -> Raw:
+def _load(path: Path, columns: ColumnMap, max_memory: float) -> Raw:
     with path.open("rb") as stream:
         order = _order(stream)
         variables = list(_variables(stream, order))

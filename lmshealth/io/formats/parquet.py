@@ -17,7 +17,7 @@ _BUFFER = 1 << 20
 _LIBRARY_KEYS = frozenset({b"pandas", b"ARROW:schema"})
 
 
-def _load(path: Path, columns: ColumnMap) -> Raw:
+def _load(path: Path, columns: ColumnMap, max_memory: float) -> Raw:
     try:
         import pyarrow.parquet as pq
     except ImportError as error:

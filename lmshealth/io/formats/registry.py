@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from lmshealth.io.column_map import ColumnMap
+from lmshealth.io.constants import MAX_MEMORY
 from lmshealth.io.formats.csv import CSV, CSV_GZ
 from lmshealth.io.formats.hdf5 import HDF5
 from lmshealth.io.formats.mat import MAT
@@ -44,7 +45,7 @@ def format_name(path: Path) -> str:
     return "" if form is None else form.name
 
 
-def load(path: Path, columns: ColumnMap) -> Raw:
+def load(path: Path, columns: ColumnMap, max_memory: float = MAX_MEMORY) -> Raw:
     """Read a file by the format its name promises and its first bytes confirm.
 
     Parameters
@@ -53,6 +54,8 @@ def load(path: Path, columns: ColumnMap) -> Raw:
         A regular file.
     columns : ColumnMap
         Which columns are wanted, and the layout of exports.
+    max_memory : float
+        In bytes, for formats that are not read in blocks.
 
     Raises
     ------
@@ -71,7 +74,7 @@ def load(path: Path, columns: ColumnMap) -> Raw:
     if not form.sniff(head):
         raise _mismatch(form, head)
     try:
-        return form.load(path, columns)
+        return form.load(path, columns, max_memory)
     except Unusable:
         raise
     except Exception as error:

@@ -33,7 +33,7 @@ _MOST_SCALES = 10_000
 _EPOCH = np.datetime64("1904-01-01", "us")
 
 
-def _load(path: Path, columns: ColumnMap) -> Raw:
+def _load(path: Path, columns: ColumnMap, max_memory: float) -> Raw:
     try:
         from nptdms import TdmsFile
         from nptdms.log import log_manager

@@ -31,7 +31,7 @@ _LITTLE = 1
 Header = dict[str, Any]
 
 
-def _load(path: Path, columns: ColumnMap) -> Raw:
+def _load(path: Path, columns: ColumnMap, max_memory: float) -> Raw:
     with path.open("rb") as stream:
         sets = list(functions(stream))
         headers = _headers(sets)
