@@ -4,6 +4,7 @@ Guide preload, mount stiffness and remaining life, with every uncertainty carrie
 samples to the date. Inside the package all quantities are in SI units.
 """
 
+import warnings
 from importlib import import_module
 from importlib.metadata import version
 from typing import TYPE_CHECKING
@@ -25,9 +26,9 @@ if TYPE_CHECKING:
     from lmshealth.prognosis.remaining_life import prognose as prognose
     from lmshealth.stage.description import load_stage as load_stage
     from lmshealth.stage.planning import plan as plan
-    from lmshealth.tracking.history import Reading as Reading
+    from lmshealth.tracking.history import LogEstimates as LogEstimates
     from lmshealth.tracking.history import build_history as build_history
-    from lmshealth.tracking.tracker import track as track
+    from lmshealth.tracking.track import track as track
 
 __version__ = version("lmshealth")
 
@@ -35,7 +36,7 @@ __version__ = version("lmshealth")
 # pays for no database, and the command line sets its threads before numpy is there.
 _HOMES = {
     "LmshealthError": "errors",
-    "Reading": "tracking.history",
+    "LogEstimates": "tracking.history",
     "Settings": "batch.run",
     "assess": "batch.assess",
     "build_history": "tracking.history",
@@ -52,8 +53,11 @@ _HOMES = {
     "read_frf": "modal.frf.identification",
     "read_log": "io.reading",
     "run": "batch.run",
-    "track": "tracking.tracker",
+    "track": "tracking.track",
 }
+
+# Former names of public names, for one release.
+_FORMER = {"Reading": "LogEstimates"}
 
 __all__ = [*_HOMES]
 
@@ -61,6 +65,13 @@ if not TYPE_CHECKING:  # else a type checker would take any name for one of thes
 
     def __getattr__(name: str) -> object:
         """Fetch a public name from its home."""
+        if name in _FORMER:
+            warnings.warn(
+                f"lmshealth.{name} is deprecated: use lmshealth.{_FORMER[name]}",
+                DeprecationWarning,
+                stacklevel=2,
+            )
+            return getattr(import_module(__name__), _FORMER[name])
         if name not in _HOMES:
             raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
         found = getattr(import_module(f"{__name__}.{_HOMES[name]}"), name)

@@ -11,15 +11,14 @@ from importlib import resources
 from pathlib import Path
 
 from lmshealth.stage.description import load_stage
-from lmshealth.tracking.history import Reading, build_history
+from lmshealth.tracking.history import History, LogEstimates, build_history
 from lmshealth.tracking.read_tables import read_estimates
-from lmshealth.tracking.results import History
 
 TABLE = Path(str(resources.files("lmshealth") / "stage" / "descriptions" / "example-y.csv"))
 """The estimates, in the columns of ``modes.csv``."""
 
 
-def readings() -> tuple[Reading, ...]:
+def readings() -> tuple[LogEstimates, ...]:
     """Give what each log of the example said."""
     return read_estimates(TABLE, stage=load_stage("lms-y")).readings
 

@@ -13,7 +13,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from lmshealth.tracking.results import History, Series, Step
+from lmshealth.tracking.history import History, Series, Step
 from models.dynamics.plant import GUIDE_MODES, closed_loop_modes
 from models.dynamics.stages import NOMINAL, Condition, stage_named
 from models.lives.degradation import draw_laws

@@ -13,7 +13,8 @@ from msgspec.structs import asdict
 from lmshealth.health.verdict import Verdict
 from lmshealth.io.log import Refusal
 from lmshealth.report.assessment import Assessment
-from lmshealth.tracking.results import Event, Step
+from lmshealth.tracking.history import Step
+from lmshealth.tracking.track import Event
 from tests.report.test_figures import (
     life,
     make_health,

@@ -22,8 +22,8 @@ from lmshealth.io.log import Metadata
 from lmshealth.modal.modes import Modes
 from lmshealth.prognosis.results import Prognosis
 from lmshealth.stage.description import Stage, load_stage
-from lmshealth.tracking.history import Reading
-from lmshealth.tracking.results import History, Series, Step, StepKind, Track
+from lmshealth.tracking.history import History, LogEstimates, Series, Step, StepKind
+from lmshealth.tracking.track import Track
 
 MODES = ("roll", "pitch", "yaw")
 FREQUENCY = np.array([126.4, 136.6, 155.0])
@@ -426,11 +426,11 @@ def make_reading(
     *,
     baseline: bool | None = None,
     covariates: dict[str, float] | None = None,
-) -> Reading:
+) -> LogEstimates:
     """Make the reading of one log from ln frequencies by mode name."""
     m = len(modes)
     root = np.arange(1.0, 4 * m * m + 1).reshape(2 * m, 2 * m) * 1e-4
-    return Reading(
+    return LogEstimates(
         log=log,
         digest=f"digest of {log}",
         metadata=Metadata(

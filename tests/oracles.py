@@ -11,7 +11,7 @@ from scipy import stats
 from scipy.linalg import cho_factor, cho_solve
 
 from lmshealth._arrays import FloatArray
-from lmshealth.tracking.results import History, Series
+from lmshealth.tracking.history import History, Series
 
 # The model of a mode: prior standard deviations, and the walk of ln damping in a life.
 LEVEL_STD, DAMPING_STD, DAMPING_WALK = 0.1, 1.0, 0.5

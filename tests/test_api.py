@@ -38,7 +38,7 @@ def assessed(folder: Path) -> str:
         rung = lmshealth.identify_decays(log, stage)
         response = lmshealth.read_frf(log, "current_excitation", "acc_pitch", band=(95.0, 175.0))
         for one in (modes, rung, response.modes):
-            readings.append(lmshealth.Reading(log.name, log.digest, log.metadata, one))
+            readings.append(lmshealth.LogEstimates(log.name, log.digest, log.metadata, one))
     history, refused = lmshealth.build_history(readings, stage)
     track = lmshealth.track(history, stage)
     health = lmshealth.infer(track, stage, seed=0)
@@ -73,6 +73,12 @@ def test_names_are_few_and_at_home() -> None:
         assert found.__name__ == name
         home = importlib.import_module(found.__module__)
         assert getattr(home, name) is found
+
+
+def test_a_former_name_is_deprecated() -> None:
+    """A former name is the new one, with a warning that names it."""
+    with pytest.warns(DeprecationWarning, match="use lmshealth.LogEstimates"):
+        assert lmshealth.LogEstimates is lmshealth.LogEstimates  # type: ignore[attr-defined]
 
 
 def test_no_other_name_is_found() -> None:

@@ -12,7 +12,7 @@ import pytest
 from lmshealth.errors import BadLog
 from lmshealth.io.log import Channel, Log, Metadata
 from lmshealth.modal.modes import Modes
-from lmshealth.tracking.results import History, Series
+from lmshealth.tracking.history import History, Series
 from tests.signals import make_log
 
 

@@ -23,16 +23,9 @@ from lmshealth.report.assessment import Assessment
 from lmshealth.report.changes import reported
 from lmshealth.signal.waterfall import Waterfall
 from lmshealth.stage.description import Stage
-from lmshealth.tracking.history import (
-    Reading,
-    believed,
-    build_history,
-    doubted,
-    lost_notes,
-)
-from lmshealth.tracking.maintenance import NOTHING_KNOWN, Maintenance, maintenance_notes
-from lmshealth.tracking.results import History, Track
-from lmshealth.tracking.tracker import track
+from lmshealth.tracking.history import History, LogEstimates, build_history, missing_mode_notes
+from lmshealth.tracking.maintenance import NO_MAINTENANCE, Maintenance, maintenance_notes
+from lmshealth.tracking.track import Track, accepted_estimates, outlier_refusals, track
 
 _logger = logging.getLogger(__name__)
 
@@ -71,11 +64,11 @@ class Machine:
         return fingerprint(VERSION, *given)
 
 
-def unpacked(logs: Sequence[tuple[str, bytes]]) -> list[Reading]:
+def unpacked(logs: Sequence[tuple[str, bytes]]) -> list[LogEstimates]:
     """Rebuild readings from what a store has of them, under the present names of their logs."""
     found = [(log, read(content, Identified)) for log, content in logs]
     named = [own.named(log).outcome for log, own in found if own is not None]
-    return [reading for reading in named if isinstance(reading, Reading)]
+    return [reading for reading in named if isinstance(reading, LogEstimates)]
 
 
 def make(
@@ -108,15 +101,15 @@ def with_fleet_prior(content: bytes, learned: FleetPrior) -> Made | None:
     found: Assessment | None = read(content, Assessment)
     if found is None or found.track is None:
         return None
-    history, stage = believed(found.history, found.track), learned.apply_to(found.stage)
+    history, stage = accepted_estimates(found.history, found.track), learned.apply_to(found.stage)
     prognosis = prognose(history, stage, seed_of(found.seed, history.stage, stage.digest))
     return packed(replace(found, prognosis=prognosis, fleet=learned))
 
 
 def assess(
-    readings: Sequence[Reading],
+    readings: Sequence[LogEstimates],
     stage: Stage,
-    work: Maintenance = NOTHING_KNOWN,
+    work: Maintenance = NO_MAINTENANCE,
     *,
     epochs: int = 40,
     seed: int = 0,
@@ -126,7 +119,7 @@ def assess(
 
     Parameters
     ----------
-    readings : sequence of Reading
+    readings : sequence of LogEstimates
         Logs of one machine, at least one.
     stage : Stage
         Its description.
@@ -159,13 +152,13 @@ def assess(
     """
     history, refused = build_history(readings, stage, work.actions)
     notes = maintenance_notes(work, [reading.metadata.recorded_at for reading in readings])
-    notes += lost_notes(history, refused)
+    notes += missing_mode_notes(history, refused)
     partial = [refusal for reading in readings for refusal in reading.modes.refused]
     own_seed = seed_of(seed, history.stage, stage.digest)
     found = _results(history, stage, epochs, own_seed, executor, notes)
     followed, health, prognosis, evidence = found
     if followed is not None:
-        refused += doubted(history, followed)
+        refused += outlier_refusals(history, followed)
     by_log = {reading.log: reading for reading in readings}
     used = [by_log[log] for log in history.logs]
     return Assessment(
@@ -197,7 +190,7 @@ def _results(
     health: Health | None = None
     try:
         followed = track(history, stage)
-        history = believed(history, followed)
+        history = accepted_estimates(history, followed)
         if not stage.parameters:
             return followed, None, None, None
         # The life needs the longest of all: it is begun before the epochs and fetched after them.

@@ -23,7 +23,7 @@ from lmshealth.modal.identification import identify
 from lmshealth.signal.following_error import loop_error
 from lmshealth.signal.waterfall import read_levels
 from lmshealth.stage.description import Stage
-from lmshealth.tracking.history import Reading
+from lmshealth.tracking.history import LogEstimates
 
 Progress = Callable[[str, int, int], None]
 """Called with what is being done, how much is done, and how much there is."""
@@ -157,7 +157,7 @@ class _Sorter:
         self._lost: list[Refusal] = []
 
     def add(self, task: _Task, found: Identified) -> None:
-        if isinstance(found.outcome, Reading):
+        if isinstance(found.outcome, LogEstimates):
             own = self._found.setdefault(str(found.stage), {})
             entry = Entry(task.name, task.key(found.description))
             own.setdefault(found.description, []).append(entry)
@@ -302,13 +302,13 @@ def identify_log(
         return Identified((Refusal(task.name, "internal", detail),), lasting=False)
 
 
-def _identified(log: Log, stages: tuple[Stage, ...]) -> Reading:
+def _identified(log: Log, stages: tuple[Stage, ...]) -> LogEstimates:
     """Identify a log by the description that takes it."""
     stage = next((stage for stage in stages if stage.takes(log.metadata)), None)
     if stage is None:
         raise BadLog(log.name, "no-stage", _untaken(log.metadata, stages))
     modes = identify(log, stage)
-    return Reading(
+    return LogEstimates(
         log.name, log.digest, log.metadata, modes, loop_error(log), read_levels(log, stage)
     )
 

@@ -36,11 +36,11 @@ from lmshealth.batch.addresses import shown_address
 from lmshealth.batch.database import INSERT, StoreError, connect, why
 from lmshealth.io.log import Refusal
 from lmshealth.report.changes import Reported
-from lmshealth.tracking.history import Reading
+from lmshealth.tracking.history import LogEstimates
 
 SCHEMA = 5  # part of the names of the tables: what an older one holds is not read
 
-Outcome = Reading | tuple[Refusal, ...]
+Outcome = LogEstimates | tuple[Refusal, ...]
 """What became of a log: its reading, or why it was refused."""
 
 # Rows asked for at a time.
@@ -118,7 +118,7 @@ class Identified:
 
     Attributes
     ----------
-    outcome : Reading or tuple of Refusal
+    outcome : LogEstimates or tuple of Refusal
         What it gave.
     description : str
         Digest of the stage description that had a part in it; empty where none had.
@@ -136,7 +136,7 @@ class Identified:
 
     def named(self, log: str) -> Identified:
         """Give it under the present name of the log."""
-        if not isinstance(self.outcome, Reading):
+        if not isinstance(self.outcome, LogEstimates):
             return replace(self, outcome=_renamed(self.outcome, log))
         modes = replace(self.outcome.modes, refused=_renamed(self.outcome.modes.refused, log))
         return replace(self, outcome=replace(self.outcome, log=log, modes=modes))
@@ -227,7 +227,7 @@ class Store:
 
     def put(self, key: str, digest: str, found: Identified) -> None:
         """Keep what became of a log of that content."""
-        reading = found.outcome if isinstance(found.outcome, Reading) else None
+        reading = found.outcome if isinstance(found.outcome, LogEstimates) else None
         row = {
             "key": key,
             "digest": digest,

@@ -25,7 +25,7 @@ from lmshealth.report.assessment import Assessment
 from lmshealth.report.changes import Reported
 from lmshealth.report.machine_page import Page, make_page
 from lmshealth.report.tables import COLUMNS, Row, frame, machine_tables, refused_rows
-from lmshealth.tracking.history import in_order
+from lmshealth.tracking.history import sort_by_time
 
 # Threads of one worker share the settings of the library that draws.
 _DRAWING = threading.Lock()
@@ -74,7 +74,7 @@ def tell(content: Content) -> Telling | None:
         return None
     with _DRAWING:
         page = make_page(assessment, content.file, before=content.before)
-    readings = in_order(unpacked(content.logs))
+    readings = sort_by_time(unpacked(content.logs))
     rows = machine_tables(readings, assessment) if readings else {}
     return Telling(
         page=page,

@@ -29,8 +29,10 @@ if TYPE_CHECKING:
     from lmshealth.health.results import Health
     from lmshealth.io.log import Refusal
     from lmshealth.report.tables import Row
+    from lmshealth.tracking.history import History
     from lmshealth.tracking.read_tables import Drifts
-    from lmshealth.tracking.results import History, Smoothed, Track
+    from lmshealth.tracking.smoother import Smoothed
+    from lmshealth.tracking.track import Track
 
 _TABLES = ("track", "track_cov", "effects", "events", "refused")
 
@@ -59,10 +61,10 @@ def track(table: Path, out: Path, **options: Any) -> None:
     without --stage every covariate column is regressed, about its median.
     """
     from lmshealth.stage.description import load_stage
-    from lmshealth.tracking.history import believed, doubted
     from lmshealth.tracking.read_tables import read_machines
     from lmshealth.tracking.smoother import smooth
-    from lmshealth.tracking.tracker import track as follow
+    from lmshealth.tracking.track import accepted_estimates, outlier_refusals
+    from lmshealth.tracking.track import track as follow
 
     stage = load_stage(options["stage"]) if options["stage"] else None
     read = read_machines(
@@ -72,10 +74,10 @@ def track(table: Path, out: Path, **options: Any) -> None:
     notes = list(read.notes)
     for history, lost in read.machines:
         followed = follow(history, stage)
-        lost += doubted(history, followed)
+        lost += outlier_refusals(history, followed)
         later = None
         if options["smoothed"]:
-            later = smooth(believed(history, followed), followed, stage)
+            later = smooth(accepted_estimates(history, followed), followed, stage)
         for name, found in _rows(followed, later, lost).items():
             rows[name] += found
         notes += _notes(history, lost)
@@ -100,9 +102,9 @@ def _rows(track: Track, smoothed: Smoothed | None, refused: list[Refusal]) -> di
 
 def _notes(history: History, refused: list[Refusal]) -> list[str]:
     """Say what the reader of a track must know of its machine."""
-    from lmshealth.tracking.history import lost_notes
+    from lmshealth.tracking.history import missing_mode_notes
 
-    notes = [f"{history.stage}: {note}" for note in lost_notes(history, refused)]
+    notes = [f"{history.stage}: {note}" for note in missing_mode_notes(history, refused)]
     if not history.has_odometer:
         notes.append(f"{history.stage}: not every log has travel_km, so the clock is the time")
     if len(history.logs) == 1:

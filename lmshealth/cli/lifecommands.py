@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from lmshealth.prognosis.life_posterior import LifePosterior
     from lmshealth.prognosis.results import Prognosis
     from lmshealth.stage.description import Decision, Stage
-    from lmshealth.tracking.results import History
+    from lmshealth.tracking.history import History
 
     Life = tuple[Prognosis, LifePosterior | None]
 
@@ -74,7 +74,7 @@ def prognose(ctx: click.Context, /, table: Path, **options: Any) -> None:
     from lmshealth.report.brief import life_brief
     from lmshealth.report.tables import COLUMNS, frame, prognosis_rows
     from lmshealth.stage.description import load_stage
-    from lmshealth.tracking.history import lost_notes
+    from lmshealth.tracking.history import missing_mode_notes
     from lmshealth.tracking.read_tables import read_machines
 
     stage = load_stage(options["stage"])
@@ -83,7 +83,9 @@ def prognose(ctx: click.Context, /, table: Path, **options: Any) -> None:
         table, stage, cross_terms=options["cov"], maintenance=options["maintenance"]
     )
     notes = [
-        f"{own.stage}: {note}" for own, gone in read.machines for note in lost_notes(own, gone)
+        f"{own.stage}: {note}"
+        for own, gone in read.machines
+        for note in missing_mode_notes(own, gone)
     ]
     for note in (*read.notes, *notes):
         click.echo(f"note: {note}", err=True)
@@ -156,8 +158,7 @@ def _life(history: History, stage: Stage, seed: int, keep_posterior: bool) -> Li
     """Track one machine and foretell it from what its track believes, as a run does."""
     from lmshealth.health.ensemble_sampling import seed_of
     from lmshealth.prognosis.remaining_life import prognose_with_posterior
-    from lmshealth.tracking.history import believed
-    from lmshealth.tracking.tracker import track
+    from lmshealth.tracking.track import accepted_estimates, track
 
     if not history.has_odometer:
         raise NotEnoughData(
@@ -165,6 +166,6 @@ def _life(history: History, stage: Stage, seed: int, keep_posterior: bool) -> Li
             "row needs the odometer"
         )
     seeds = seed_of(seed, history.stage, stage.digest)
-    trusted = believed(history, track(history, stage))
+    trusted = accepted_estimates(history, track(history, stage))
     prognosis, posterior = prognose_with_posterior(trusted, stage, seeds)
     return prognosis, posterior if keep_posterior else None

@@ -13,7 +13,7 @@ from lmshealth.report.text import LEVELS, change
 
 if TYPE_CHECKING:  # so that help comes without pandas and scipy
     from lmshealth.health.results import Health
-    from lmshealth.tracking.results import Track
+    from lmshealth.tracking.track import Track
 
 # A posterior this far from its Laplace approximation, in mean and ln width, is worth a word.
 _ODD_SHIFT, _ODD_RATIO = 0.5, 0.3

@@ -103,7 +103,7 @@ def modes(ctx: click.Context, /, logs: tuple[Path, ...], style: str, **options: 
     from lmshealth.modal.identification import identify
     from lmshealth.report.tables import COLUMNS, frame, lines_rows, modes_rows, refused_rows
     from lmshealth.signal.following_error import loop_error
-    from lmshealth.tracking.history import Reading
+    from lmshealth.tracking.history import LogEstimates
 
     look = identify_decays if options["part"] == "settling" else identify
     stage, columns = _loaded(options["stage"], options["columns"])
@@ -114,7 +114,7 @@ def modes(ctx: click.Context, /, logs: tuple[Path, ...], style: str, **options: 
     found, lost = _each(
         logs,
         columns,
-        lambda log: Reading(
+        lambda log: LogEstimates(
             log.name,
             log.digest,
             log.metadata,
@@ -297,7 +297,7 @@ def frf(ctx: click.Context, /, logs: tuple[Path, ...], style: str, **options: An
         modes_rows,
         refused_rows,
     )
-    from lmshealth.tracking.history import Reading
+    from lmshealth.tracking.history import LogEstimates
 
     stage, columns = _loaded(options["stage"], options["columns"])
     band, period = checked_band(options["band"]), options["period"]
@@ -306,7 +306,7 @@ def frf(ctx: click.Context, /, logs: tuple[Path, ...], style: str, **options: An
         logs, columns, lambda it: (it, read_frf(it, *names, band=band, period=period))
     )
     readings = [
-        Reading(
+        LogEstimates(
             it.name, it.digest, it.metadata, name_modes(own.modes, stage) if stage else own.modes
         )
         for it, own in found

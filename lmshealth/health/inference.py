@@ -26,7 +26,7 @@ from lmshealth.stage.description import Stage
 from lmshealth.stage.identifiability import identifiable, sight_of
 from lmshealth.stage.priors import JointPrior, joined
 from lmshealth.tracking.read_tables import Drifts
-from lmshealth.tracking.results import Track
+from lmshealth.tracking.track import Track
 
 _N_KEPT = 1000  # draws of each ensemble
 _N_SEARCHED = 200

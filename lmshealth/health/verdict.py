@@ -15,7 +15,8 @@ from scipy.special import expit
 from lmshealth._arrays import BoolArray
 from lmshealth.health.results import Health
 from lmshealth.stage.description import ParameterSpec, Stage
-from lmshealth.tracking.results import Event, History, Track
+from lmshealth.tracking.history import History
+from lmshealth.tracking.track import Event, Track
 
 _WITHOUT_LOSS = ("healthy", "step", "not-enough-data")
 

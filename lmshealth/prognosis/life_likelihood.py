@@ -42,8 +42,9 @@ from lmshealth.errors import NotEnoughData
 from lmshealth.health.epoch_posterior import one_at_a_time
 from lmshealth.prognosis.scenarios import Scenario, list_scenarios
 from lmshealth.stage.description import ScatterPrior, Stage
-from lmshealth.tracking.results import History
-from lmshealth.tracking.state_space import BIAS_STD, JUMP_STD, MOVES, regressors
+from lmshealth.tracking.constants import BIAS_STD, JUMP_STD
+from lmshealth.tracking.covariates import regressors
+from lmshealth.tracking.history import History
 
 
 def condense(history: History, most: int) -> History:
@@ -433,7 +434,7 @@ class LifeLikelihood:
         further = np.tril(same, -1).any(axis=1).astype(float)
         total = np.kron(np.diag(further), np.full((self.clock.size,) * 2, BIAS_STD[0] ** 2))
         for step in history.steps:
-            if step.kind in MOVES:
+            if step.changes_modes:
                 continue
             there = step.there[history.baseline :].astype(float)
             seen = [step.source in ("", one.source) for one in self.series]

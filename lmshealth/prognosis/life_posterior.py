@@ -26,7 +26,7 @@ from lmshealth.health.results import QUANTILES
 from lmshealth.prognosis.life_likelihood import Grid, LifeLikelihood
 from lmshealth.prognosis.scenarios import Scenario
 from lmshealth.stage.description import Stage
-from lmshealth.tracking.results import History
+from lmshealth.tracking.history import History
 
 if TYPE_CHECKING:
     from xarray import DataTree

@@ -14,7 +14,7 @@ from lmshealth.prognosis.life_posterior import LifePosterior, fit_life
 from lmshealth.prognosis.results import LawWeight, Prognosis
 from lmshealth.stage.description import ParameterSpec, Stage
 from lmshealth.stage.identifiability import identifiable, sight_of
-from lmshealth.tracking.results import History
+from lmshealth.tracking.history import History
 
 _STEP = 1 << 21
 _N_CURVE, _N_COARSE, _EVERY = 101, 40, 5

@@ -14,7 +14,8 @@ from lmshealth.prognosis.maintenance_decision import Service, decide
 from lmshealth.prognosis.results import Prognosis
 from lmshealth.signal.waterfall import Waterfall
 from lmshealth.stage.description import Stage
-from lmshealth.tracking.results import History, Track
+from lmshealth.tracking.history import History
+from lmshealth.tracking.track import Track
 
 
 @dataclass(frozen=True, slots=True, eq=False)

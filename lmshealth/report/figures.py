@@ -33,8 +33,9 @@ from itertools import cycle
 from lmshealth.report.text import covariate, signed
 from lmshealth.signal.spectral_lines import Line
 from lmshealth.signal.waterfall import Waterfall
-from lmshealth.tracking.covariate_effects import Influence
-from lmshealth.tracking.results import History, Track
+from lmshealth.tracking.covariate_effects import CovariateEffect
+from lmshealth.tracking.history import History
+from lmshealth.tracking.track import Track
 
 INK, MUTED, GRID, PAPER = "#1f2933", "#5f6b7a", "#d9dee5", "#fefefe"
 BLUE, RED, GREEN = "#0072b2", "#c44e00", "#007a5a"
@@ -546,7 +547,7 @@ def plot_waterfall(
     return odometer(ax, room=54)  # the bar of colours takes the rest
 
 
-def plot_influence(ax: Axes, influence: Influence, history: History) -> Axes:
+def plot_influence(ax: Axes, influence: CovariateEffect, history: History) -> Axes:
     """Plot what a covariate does to the frequency of a mode, before and after it is taken out.
 
     Changes are in % of the frequency at the covariate's reference, without wear and whatever else

@@ -67,11 +67,11 @@ from lmshealth.report.trackfacts import (
     untouched,
 )
 from lmshealth.tracking.covariate_effects import (
-    Influence,
+    CovariateEffect,
     covariate_shifts,
-    find_influences,
+    find_covariate_effects,
 )
-from lmshealth.tracking.results import History
+from lmshealth.tracking.history import History
 
 _SIZES = {"waterfall": (4.8, 3.6), "influence": (3.8, 2.6)}  # in inches, unlike others
 
@@ -192,7 +192,7 @@ def _evidence(assessment: Assessment, service: Service) -> dict[str, Any]:
     """Collect what the rest of a stage's page shows."""
     track, prognosis, history = assessment.track, assessment.prognosis, assessment.history
     health, stage = health_now(assessment), assessment.stage
-    influences = () if track is None else find_influences(history, track, stage)
+    influences = () if track is None else find_covariate_effects(history, track, stage)
     letters, pictures = share_letters(_pictures(assessment, service, influences))
     drift = np.zeros(1) if track is None else np.abs(np.expm1(track.drift[-1]))
     return {
@@ -229,7 +229,7 @@ def _laws(prognosis: Prognosis) -> Iterator[tuple[str, str, str, str]]:
 
 
 def _pictures(
-    assessment: Assessment, service: Service, influences: Sequence[Influence]
+    assessment: Assessment, service: Service, influences: Sequence[CovariateEffect]
 ) -> dict[tuple[str, ...], str]:
     """Draw every picture of a page, by kind and by what it shows."""
     draw = _track_pictures(assessment, influences) | _health_pictures(assessment, service)
@@ -237,7 +237,7 @@ def _pictures(
 
 
 def _track_pictures(
-    assessment: Assessment, influences: Sequence[Influence]
+    assessment: Assessment, influences: Sequence[CovariateEffect]
 ) -> dict[tuple[str, ...], Any]:
     history, track, waterfall = assessment.history, assessment.track, assessment.waterfall
     draw: dict[tuple[str, ...], Any] = {}

@@ -34,8 +34,9 @@ from lmshealth.stage.check import (
     Telling,
 )
 from lmshealth.stage.planning import Plan
-from lmshealth.tracking.history import Reading
-from lmshealth.tracking.results import Smoothed, Track
+from lmshealth.tracking.history import LogEstimates
+from lmshealth.tracking.smoother import Smoothed
+from lmshealth.tracking.track import Track
 
 _KM, _MICRO = 1000.0, 1e-6
 RUL_LEVELS = (0.05, 0.10, 0.25, 0.50, 0.75, 0.90, 0.95)
@@ -68,7 +69,7 @@ COLUMNS = {
 Row = dict[str, Any]
 
 
-def modes_rows(reading: Reading) -> list[Row]:
+def modes_rows(reading: LogEstimates) -> list[Row]:
     """List the estimates of one log, one row per mode, with a column per channel of a shape."""
     metadata, modes, error = reading.metadata, reading.modes, reading.loop_error
     circumstances = {
@@ -124,12 +125,14 @@ def frame(columns: str, rows: Sequence[Row]) -> pd.DataFrame:
     return pd.DataFrame(list(rows), columns=list(order))
 
 
-def machine_tables(readings: Sequence[Reading], assessment: Assessment) -> dict[str, list[Row]]:
+def machine_tables(
+    readings: Sequence[LogEstimates], assessment: Assessment
+) -> dict[str, list[Row]]:
     """List everything about one machine, by the name of the table, which is a file without ending.
 
     Parameters
     ----------
-    readings : sequence of Reading
+    readings : sequence of LogEstimates
         Its logs.
     assessment : Assessment
         What they say together.
@@ -159,7 +162,7 @@ def _moment(moment: datetime | None) -> str | None:
     return None if moment is None else moment.isoformat()
 
 
-def _modes_cov_rows(reading: Reading) -> list[Row]:
+def _modes_cov_rows(reading: LogEstimates) -> list[Row]:
     modes = reading.modes
     return [
         {

@@ -15,8 +15,9 @@ from lmshealth.report.figures import (
 )
 from lmshealth.report.text import GAP, change, covariate, km, signed, spell
 from lmshealth.stage.description import Stage
-from lmshealth.tracking.covariate_effects import Influence
-from lmshealth.tracking.results import Effect, Event, History, Track
+from lmshealth.tracking.covariate_effects import CovariateEffect
+from lmshealth.tracking.history import History
+from lmshealth.tracking.track import Effect, Event, Track
 
 # A factor on standard deviations that is nearer to one is not worth a word.
 _SCALED = 0.05
@@ -137,7 +138,7 @@ class TakenOut:
     modes: tuple[str, ...]
 
 
-def taken_out(influences: Sequence[Influence]) -> Iterator[TakenOut]:
+def taken_out(influences: Sequence[CovariateEffect]) -> Iterator[TakenOut]:
     """Tell what each covariate was in the logs, and what was taken out of every mode."""
     for column in dict.fromkeys(one.covariate for one in influences):
         own = [one for one in influences if one.covariate == column and one.values.size]
@@ -157,7 +158,7 @@ def taken_out(influences: Sequence[Influence]) -> Iterator[TakenOut]:
         )
 
 
-def _taken_row(one: Influence, unit: str) -> tuple[str, ...]:
+def _taken_row(one: CovariateEffect, unit: str) -> tuple[str, ...]:
     """Mode, effect, change over the range seen, scatter before and after, whether it is seen."""
     per = f" per {unit.strip(GAP)}" if unit else " per unit"
     effect = "; ".join(

@@ -20,12 +20,12 @@ from numpy.lib.stride_tricks import sliding_window_view
 from scipy import stats
 
 from lmshealth._arrays import BoolArray, FloatArray
+from lmshealth.tracking import constants
 from lmshealth.tracking.filter_bank import Bank, Filter, Settings, Surprise
-from lmshealth.tracking.results import Step, StepKind
+from lmshealth.tracking.history import Step, StepKind
 
 FindingKind = StepKind | Literal["drift"]
 
-FALSE_ALARMS = 0.01
 # An alarm may come from a drift since the baseline, from a drift that begins later, or from a step.
 _ROUTES = 3
 _WINDOWS = np.array([2, 4, 8, 16, 32, 64])
@@ -155,7 +155,7 @@ class Finding:
 
 def threshold(routes: int = _ROUTES) -> float:
     """Log Bayes factor from which an alarm is raised that may come by so many routes."""
-    return float(np.log(routes / FALSE_ALARMS))
+    return float(np.log(routes / constants.FALSE_ALARM_PROBABILITY))
 
 
 def explain(filters: Filter, memory: dict[int, Bank], now: int, suspect: int) -> Finding | None:

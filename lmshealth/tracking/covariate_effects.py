@@ -9,14 +9,14 @@ import numpy as np
 
 from lmshealth._arrays import FloatArray, expect_shape, freeze
 from lmshealth.stage.description import Stage
-from lmshealth.tracking.history import believed
-from lmshealth.tracking.results import Effect, History, Track
+from lmshealth.tracking.covariates import Regressor, regressors
+from lmshealth.tracking.history import History
 from lmshealth.tracking.smoother import smooth
-from lmshealth.tracking.state_space import MOVES, Regressor, regressors
+from lmshealth.tracking.track import Effect, Track, accepted_estimates
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Influence:
+class CovariateEffect:
     """What a covariate does to a mode: its effects beside the estimates that they were found from.
 
     Attributes
@@ -72,7 +72,9 @@ class Influence:
         return any(abs(effect.coefficient) > 2 * effect.std for effect in self.effects)
 
 
-def find_influences(history: History, track: Track, stage: Stage) -> tuple[Influence, ...]:
+def find_covariate_effects(
+    history: History, track: Track, stage: Stage
+) -> tuple[CovariateEffect, ...]:
     """Compare what covariates explain with the estimates, mode by mode.
 
     Parameters
@@ -86,14 +88,17 @@ def find_influences(history: History, track: Track, stage: Stage) -> tuple[Influ
 
     Returns
     -------
-    tuple of Influence
+    tuple of CovariateEffect
         Covariate by covariate, in the order of the description; none for a covariate that is
         unknown or never left its reference.
     """
     columns = regressors(history.covariates, stage)
     if not columns:
         return ()
-    taken, known = believed(history, track), {(e.mode, e.covariate): e for e in track.effects}
+    taken, known = (
+        accepted_estimates(history, track),
+        {(e.mode, e.covariate): e for e in track.effects},
+    )
     level = smooth(taken, track, stage).ln_frequency
     modes = [one.mode for one in taken.series]
     moved = covariate_shifts(history, track, stage)
@@ -111,7 +116,7 @@ def find_influences(history: History, track: Track, stage: Stage) -> tuple[Influ
             epochs, series = np.nonzero(there)
             explained = _explained(own, effects)
             found.append(
-                Influence(
+                CovariateEffect(
                     mode=mode,
                     covariate=covariate.name,
                     reference=covariate.reference,
@@ -145,7 +150,7 @@ def _offsets(history: History, known: dict[tuple[str, str], Effect]) -> FloatArr
         bias = known.get((one.mode, f"bias:{one.source}"))
         offsets[:, i] = 0.0 if bias is None else bias.coefficient
         for step in history.steps:
-            if step.kind in MOVES or step.source not in ("", one.source):
+            if step.changes_modes or step.source not in ("", one.source):
                 continue
             effect = known[one.mode, f"{step.kind}:{step.name or step.source}"]
             offsets[step.there, i] += effect.coefficient

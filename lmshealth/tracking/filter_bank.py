@@ -21,15 +21,9 @@ from math import prod
 import numpy as np
 
 from lmshealth._arrays import BoolArray, FloatArray
-from lmshealth.tracking.results import Step
-from lmshealth.tracking.state_space import (
-    DAMPING_WALK,
-    JUMP_STD,
-    LN_F_STD,
-    LN_ZETA_STD,
-    MOVES,
-    StateSpace,
-)
+from lmshealth.tracking.constants import DAMPING_WALK, JUMP_STD, LN_F_STD, LN_ZETA_STD
+from lmshealth.tracking.history import Step
+from lmshealth.tracking.state_space import StateSpace
 
 # Random walk of ln f per life of a healthy machine, and of one that changes with its rate per life
 # and with how far the rate wanders in a life.
@@ -247,7 +241,7 @@ class Filter:
         variance = np.repeat(np.square(JUMP_STD[step.kind]), m)
         own = np.arange(jump.start, jump.stop)
         bank.cov[:, own, own] += variance
-        if step.kind in MOVES:
+        if step.changes_modes:
             level, damping = space.level, space.damping
             moved = np.r_[level.start : level.stop, damping.start : damping.stop]
             bank.cov[:, own, moved] += variance

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from bisect import bisect_right
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from datetime import UTC, datetime
+from typing import Literal
 
 import numpy as np
 
-from lmshealth._arrays import FloatArray
+from lmshealth._arrays import BoolArray, FloatArray, expect_shape, freeze
 from lmshealth.errors import NotEnoughData
 from lmshealth.io.log import Metadata, Refusal
 from lmshealth.modal.modes import Modes
@@ -17,9 +18,10 @@ from lmshealth.signal.waterfall import Levels
 from lmshealth.stage.description import Stage
 from lmshealth.tracking.association.associate import Association, associate
 from lmshealth.tracking.association.estimates import Estimates
+from lmshealth.tracking.covariates import Regressor, regressors
 from lmshealth.tracking.maintenance import RESETS, Action
-from lmshealth.tracking.results import History, Series, Step, StepKind, Track
-from lmshealth.tracking.state_space import Regressor, regressors
+
+StepKind = Literal["step", "regreasing", "servo", "sensor", "reset"]
 
 # Sources in the order in which they stand where a mode has several.
 _SOURCES = ("joint", "acc", "frf", "delta_e")
@@ -34,8 +36,188 @@ _KINDS: dict[str, StepKind] = {"regrease": "regreasing", "servo": "servo", "sens
 _NO_MOMENT = datetime.max.replace(tzinfo=UTC)
 
 
+@dataclass(frozen=True, slots=True)
+class Series:
+    """Estimates of one mode by one source."""
+
+    mode: str
+    source: str
+
+
 @dataclass(frozen=True, slots=True, eq=False)
-class Reading:
+class Step:
+    """Something that happens between two logs and moves the estimates at once.
+
+    Attributes
+    ----------
+    kind : str
+        ``step``: the modes themselves jump, without a declared cause. ``regreasing``: their
+        dampings do. ``servo``: the closed loop reads otherwise, in all sources, and ``sensor``:
+        one source does; neither counts as drift. ``reset``: work on guide or mount, which opens a
+        new baseline.
+    first : int
+        Index of the first log that sees it.
+    there : ndarray of bool
+        The logs that see it, shape ``(n_logs,)``.
+    source : str
+        Of a sensor; empty where all sources are meant.
+    name : str
+        What tells it from others of its kind: a ``servo_id``, or a date.
+    declared : bool
+        Whether somebody said so, or the estimates did.
+    """
+
+    kind: StepKind
+    first: int
+    there: BoolArray
+    source: str = ""
+    name: str = ""
+    declared: bool = True
+
+    def __post_init__(self) -> None:
+        freeze(self)
+
+    @property
+    def changes_modes(self) -> bool:
+        """Whether the modes themselves change, and not only their estimates."""
+        return self.kind in ("step", "regreasing", "reset")
+
+    @classmethod
+    def found(cls, kind: StepKind, first: int, n_logs: int, source: str = "") -> Step:
+        """Make a step that nobody declared, and that all logs from one on see."""
+        return cls(kind, first, np.arange(n_logs) >= first, source, declared=False)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class History:
+    """All modal estimates of one stage, in the order of recording.
+
+    Attributes
+    ----------
+    stage : str
+        Identity of the machine.
+    logs : tuple of str
+        Log names.
+    recorded_at : tuple of datetime
+        Ascending.
+    travel : ndarray
+        Odometer in m, shape ``(n_logs,)``; NaN throughout where there is none.
+    covariates : dict of str to ndarray
+        Column name to values, each of shape ``(n_logs,)``, NaN where unknown.
+    modes : tuple of str
+        Mode names.
+    series : tuple of Series
+        What the columns of the estimates are: a mode as one source sees it.
+    ln_frequency, ln_damping : ndarray
+        Shape ``(n_logs, n_series)``, NaN where the mode was not found.
+    cov : ndarray
+        Covariance of ``[ln_frequency, ln_damping]`` per log, shape
+        ``(n_logs, 2 n_series, 2 n_series)``, NaN in rows and columns of what is missing.
+    loop_error : ndarray
+        RMS of the following error below 40 Hz in m, shape ``(n_logs,)``, NaN where unknown.
+    baselines : tuple of int
+        Indices of the logs at which health is one by definition: the first, and one after every
+        reset, ascending.
+    steps : tuple of Step
+        What is known to have happened, in order.
+    """
+
+    stage: str
+    logs: tuple[str, ...]
+    recorded_at: tuple[datetime, ...]
+    travel: FloatArray
+    covariates: dict[str, FloatArray]
+    modes: tuple[str, ...]
+    series: tuple[Series, ...]
+    ln_frequency: FloatArray
+    ln_damping: FloatArray
+    cov: FloatArray
+    loop_error: FloatArray
+    baselines: tuple[int, ...]
+    steps: tuple[Step, ...] = ()
+
+    def __post_init__(self) -> None:
+        n, r = len(self.logs), len(self.series)
+        for name in ("travel", "loop_error"):
+            expect_shape(name, getattr(self, name), (n,))
+        for name in ("ln_frequency", "ln_damping"):
+            expect_shape(name, getattr(self, name), (n, r))
+        expect_shape("cov", self.cov, (n, 2 * r, 2 * r))
+        if not self.baselines or not all(0 <= first < max(n, 1) for first in self.baselines):
+            raise ValueError(f"baselines are logs {self.baselines} of {n}")
+        if {one.mode for one in self.series} - set(self.modes):
+            raise ValueError(f"series {self.series} of modes that are not among {self.modes}")
+        self._expect_order()
+        self._expect_errors()
+        freeze(self)
+
+    def _expect_order(self) -> None:
+        """Insist on logs in the order of recording, and on an odometer that never runs backwards.
+
+        Raises
+        ------
+        ValueError
+            Naming the log that comes too late.
+        """
+        for name, ticks in (
+            ("recorded_at", [moment.timestamp() for moment in self.recorded_at]),
+            ("travel", self.travel if self.has_odometer else []),
+        ):
+            back = np.flatnonzero(np.diff(ticks) < 0)
+            if back.size:
+                raise ValueError(
+                    f"{name} runs backwards at {self.logs[back[0] + 1]}: sort the logs"
+                )
+
+    def _expect_errors(self) -> None:
+        """Insist on a covariance of every estimate.
+
+        Raises
+        ------
+        ValueError
+            Naming a log and a series whose estimate has none, or a variance that is not positive.
+        """
+        there = np.isfinite(np.hstack([self.ln_frequency, self.ln_damping]))
+        variance = np.einsum("kii->ki", self.cov)
+        both = there[:, :, None] & there[:, None, :]
+        wrong = (there & ~(variance > 0)) | (both & ~np.isfinite(self.cov)).any(axis=2)
+        if wrong.any():
+            k, row = np.argwhere(wrong)[0]
+            one = self.series[row % len(self.series)]
+            raise ValueError(
+                f"{self.logs[k]}: {one.mode} by {one.source} has an estimate of variance "
+                f"{variance[k, row]:g}, or without covariances; needed are positive ones"
+            )
+
+    @property
+    def baseline(self) -> int:
+        """Index of the log at which the present baseline begins."""
+        return self.baselines[-1]
+
+    @property
+    def has_odometer(self) -> bool:
+        """Whether the odometer is the clock; else it is the time."""
+        return bool(np.isfinite(self.travel).all())
+
+    def clock(self) -> FloatArray:
+        """Odometer (m), or time (s) without one, since the baseline log, shape ``(n_logs,)``."""
+        if self.has_odometer:
+            ticks = self.travel
+        else:
+            ticks = np.array([moment.timestamp() for moment in self.recorded_at])
+        return np.asarray(ticks - ticks[self.baseline])
+
+    def mode_of(self) -> np.ndarray:
+        """Column of `modes` that each series belongs to, shape ``(n_series,)``."""
+        return np.array([self.modes.index(one.mode) for one in self.series], dtype=int)
+
+    def columns(self, mode: str) -> list[int]:
+        """Give the series of a mode, in their order."""
+        return [i for i, one in enumerate(self.series) if one.mode == mode]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LogEstimates:
     r"""What one log said.
 
     Attributes
@@ -65,7 +247,7 @@ class Reading:
     >>> np.savetxt("log.csv", noise, header=head, comments="")
     >>> log = lmshealth.read_log("log.csv")
     >>> modes = lmshealth.identify(log, lmshealth.load_stage("lms-y"))
-    >>> reading = lmshealth.Reading(log.name, log.digest, log.metadata, modes)
+    >>> reading = lmshealth.LogEstimates(log.name, log.digest, log.metadata, modes)
     >>> reading.metadata.stage, reading.metadata.travel, reading.modes.names
     ('AX-3-Y', 12500.0, ())
     >>> [(refusal.mode, refusal.reason) for refusal in reading.modes.refused]
@@ -80,19 +262,19 @@ class Reading:
     levels: Levels | None = None
 
 
-def in_order(readings: Sequence[Reading]) -> tuple[Reading, ...]:
+def sort_by_time(readings: Sequence[LogEstimates]) -> tuple[LogEstimates, ...]:
     """Sort readings by the moment of recording, then by name."""
     return tuple(sorted(readings, key=lambda r: (r.metadata.recorded_at or _NO_MOMENT, r.log)))
 
 
 def build_history(
-    readings: Sequence[Reading], stage: Stage | None = None, actions: Sequence[Action] = ()
+    readings: Sequence[LogEstimates], stage: Stage | None = None, actions: Sequence[Action] = ()
 ) -> tuple[History, list[Refusal]]:
     """Line up the modes of one machine.
 
     Parameters
     ----------
-    readings : sequence of Reading
+    readings : sequence of LogEstimates
         Logs of one machine in any order, with identity and moment; the odometer is the clock where
         every log has it, else the time is.
     stage : Stage, optional
@@ -130,7 +312,7 @@ def build_history(
     if not readings:
         name = "" if stage is None else f"{stage.name}: "
         raise NotEnoughData(f"{name}no usable log")
-    ordered, refused = _without_contradictions(in_order(readings))
+    ordered, refused = _without_contradictions(sort_by_time(readings))
     travel = np.array(
         [np.nan if r.metadata.travel is None else r.metadata.travel for r in ordered], dtype=float
     )
@@ -169,8 +351,8 @@ def build_history(
 
 
 def _without_contradictions(
-    ordered: tuple[Reading, ...],
-) -> tuple[tuple[Reading, ...], list[Refusal]]:
+    ordered: tuple[LogEstimates, ...],
+) -> tuple[tuple[LogEstimates, ...], list[Refusal]]:
     """Keep the longest run of logs whose odometer never runs backwards.
 
     One mistyped odometer contradicts all logs after or before it; it is the odd one out that goes.
@@ -204,7 +386,7 @@ def _without_contradictions(
     return tuple(ordered[k] for k in sorted(kept)), refused
 
 
-def _covariates(ordered: Sequence[Reading]) -> dict[str, FloatArray]:
+def _covariates(ordered: Sequence[LogEstimates]) -> dict[str, FloatArray]:
     names = sorted({name for reading in ordered for name in reading.metadata.covariates})
     return {
         name: np.array([r.metadata.covariates.get(name, np.nan) for r in ordered], dtype=float)
@@ -212,7 +394,7 @@ def _covariates(ordered: Sequence[Reading]) -> dict[str, FloatArray]:
     }
 
 
-def _steps(ordered: Sequence[Reading], actions: Sequence[Action]) -> tuple[Step, ...]:
+def _steps(ordered: Sequence[LogEstimates], actions: Sequence[Action]) -> tuple[Step, ...]:
     """Say what is known to have happened between the logs."""
     moments = [reading.metadata.recorded_at for reading in ordered]
     steps: list[Step] = []
@@ -248,7 +430,7 @@ def _baselines(declared: list[int], resets: list[int], n_logs: int) -> tuple[int
     return tuple(dict.fromkeys(chosen))
 
 
-def _estimates(ordered: Sequence[Reading], stage: Stage | None) -> list[Estimates]:
+def _estimates(ordered: Sequence[LogEstimates], stage: Stage | None) -> list[Estimates]:
     """Give what each log says of the modes that are tracked, with shapes over all channels."""
     tracked = None if stage is None else {mode.name for mode in stage.modes if mode.tracked}
     channels = list(dict.fromkeys(c for r in ordered for c in r.modes.shape_channels))
@@ -327,7 +509,7 @@ def _named(modes: Modes, i: int, stage: Stage | None) -> str:
 
 
 def _doubts(
-    ordered: Sequence[Reading], estimates: Sequence[Estimates], found: Association
+    ordered: Sequence[LogEstimates], estimates: Sequence[Estimates], found: Association
 ) -> list[Refusal]:
     """Tell which estimates are given to no mode. Of a jump the tracker decides."""
     return [
@@ -392,7 +574,7 @@ def _rank(source: str) -> tuple[int, str]:
     return (_SOURCES.index(source) if source in _SOURCES else len(_SOURCES), source)
 
 
-def lost_notes(history: History, refused: Sequence[Refusal]) -> list[str]:
+def missing_mode_notes(history: History, refused: Sequence[Refusal]) -> list[str]:
     """Say which modes are no longer seen or told apart, so that nothing new is known of them."""
     last = history.logs[-_LATE:]
     doubted = {
@@ -413,31 +595,3 @@ def lost_notes(history: History, refused: Sequence[Refusal]) -> list[str]:
         if missed >= _LATE and name not in lost:
             notes.append(f"{name}: no estimate in the last {missed} logs; nothing new is known.")
     return notes
-
-
-def believed(history: History, followed: Track) -> History:
-    """Give a history as its track takes it: with all steps, without the outliers."""
-    values = [np.array(part) for part in (history.ln_frequency, history.ln_damping, history.cov)]
-    ln_f, ln_zeta, cov = values
-    r = len(history.series)
-    for k, mode in followed.outliers:
-        own = history.columns(mode)
-        ln_f[k, own] = ln_zeta[k, own] = np.nan
-        both = [*own, *(r + i for i in own)]
-        cov[k, both], cov[k][:, both] = np.nan, np.nan
-    return replace(history, ln_frequency=ln_f, ln_damping=ln_zeta, cov=cov, steps=followed.steps)
-
-
-def doubted(history: History, followed: Track) -> list[Refusal]:
-    """Tell which estimates the track hardly believed."""
-    refused = []
-    for k, mode in followed.outliers:
-        i, own = followed.modes.index(mode), history.columns(mode)
-        found = float(np.exp(np.nanmean(history.ln_frequency[k, own])))
-        before = float(np.exp(followed.ln_frequency[max(k - 1, 0), i]))
-        detail = (
-            f"{found:.5g} Hz, or its damping, lies far from what all logs before it tell "
-            f"({before:.5g} Hz): a jump is believed once the next log confirms it"
-        )
-        refused.append(Refusal(log=history.logs[k], mode=mode, reason="jump", detail=detail))
-    return refused

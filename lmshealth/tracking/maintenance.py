@@ -75,7 +75,7 @@ class Maintenance:
         )
 
 
-NOTHING_KNOWN = Maintenance()
+NO_MAINTENANCE = Maintenance()
 """What is known where there is no table."""
 
 

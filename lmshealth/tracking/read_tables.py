@@ -21,9 +21,8 @@ from lmshealth.io.metadata import COVARIATES
 from lmshealth.io.tables import lines, name_machine, read_rows, to_moments, to_numbers
 from lmshealth.modal.modes import Modes
 from lmshealth.stage.description import Stage
-from lmshealth.tracking.history import Reading, build_history
+from lmshealth.tracking.history import History, LogEstimates, build_history
 from lmshealth.tracking.maintenance import read_actions
-from lmshealth.tracking.results import History
 
 _KM, _MICRO = 1000.0, 1e-6
 _NEEDED = ("recorded_at", "frequency_hz", "frequency_std_hz")
@@ -50,13 +49,13 @@ class EstimateTable:
 
     Attributes
     ----------
-    readings : tuple of Reading
+    readings : tuple of LogEstimates
         One per log, in the order of the table.
     notes : tuple of str
         What its reader must know: what was missing, and what is assumed instead.
     """
 
-    readings: tuple[Reading, ...]
+    readings: tuple[LogEstimates, ...]
     notes: tuple[str, ...]
 
 
@@ -103,7 +102,7 @@ def read_estimates(
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Machines:
+class MachineHistories:
     """What a table says, machine by machine.
 
     Attributes
@@ -124,7 +123,7 @@ def read_machines(
     *,
     cross_terms: Path | None = None,
     maintenance: Path | None = None,
-) -> Machines:
+) -> MachineHistories:
     """Read a table in the columns of ``modes.csv`` into a history per machine.
 
     Parameters
@@ -147,7 +146,7 @@ def read_machines(
     terms = cross_terms or (beside if beside.exists() else None)
     read = read_estimates(path, cross_terms=terms, stage=stage)
     actions = read_actions(maintenance) if maintenance else ()
-    own: dict[str, list[Reading]] = {}
+    own: dict[str, list[LogEstimates]] = {}
     for reading in read.readings:
         own.setdefault(str(reading.metadata.stage), []).append(reading)
     notes = [
@@ -158,10 +157,10 @@ def read_machines(
         build_history(readings, stage, [action for action in actions if action.stage == name])
         for name, readings in own.items()
     )
-    return Machines(machines, (*read.notes, *notes))
+    return MachineHistories(machines, (*read.notes, *notes))
 
 
-def _order_notes(readings: Sequence[Reading]) -> list[str]:
+def _order_notes(readings: Sequence[LogEstimates]) -> list[str]:
     """Say which machines' logs are sorted."""
     machines: dict[str, list[datetime]] = {}
     for reading in readings:
@@ -289,7 +288,7 @@ def _reading(
     covariates: Sequence[str],
     shapes: Sequence[str],
     terms: pd.DataFrame | None,
-) -> Reading:
+) -> LogEstimates:
     """Make the reading of one log from its rows."""
     for name in (*_OF_LOG, *covariates):
         if name in rows.columns and rows[name].nunique(dropna=False) > 1:
@@ -326,7 +325,7 @@ def _reading(
         refused=(),
     )
     loop_error = float(loop) * _MICRO if np.isfinite(loop) and loop > 0 else None
-    return Reading(log, "", metadata, modes, loop_error)
+    return LogEstimates(log, "", metadata, modes, loop_error)
 
 
 def _covariance(path: Path, log: str, rows: pd.DataFrame, terms: pd.DataFrame | None) -> FloatArray:

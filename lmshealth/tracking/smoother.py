@@ -2,19 +2,43 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from filterpy.kalman import KalmanFilter
 
-from lmshealth._arrays import FloatArray
+from lmshealth._arrays import FloatArray, freeze
 from lmshealth.stage.description import Stage
 from lmshealth.tracking.filter_bank import Bank, Filter, Settings
-from lmshealth.tracking.results import History, Smoothed, Track
+from lmshealth.tracking.history import History
 from lmshealth.tracking.state_space import state_space
+from lmshealth.tracking.track import Track
 
 # Settings that together have less of the posterior are left out.
 _SHARE = 1e-3
 # Eigenvalues of correlations below are rounding.
 _SINGULAR = 1e-10
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Smoothed:
+    """What all logs together say of every epoch, later ones included.
+
+    Attributes
+    ----------
+    ln_frequency, ln_frequency_std, ln_damping, ln_damping_std, drift, drift_std : ndarray
+        As in `Track`, shape ``(n_epochs, n_modes)``.
+    """
+
+    ln_frequency: FloatArray
+    ln_frequency_std: FloatArray
+    ln_damping: FloatArray
+    ln_damping_std: FloatArray
+    drift: FloatArray
+    drift_std: FloatArray
+
+    def __post_init__(self) -> None:
+        freeze(self)
 
 
 def smooth(history: History, followed: Track, stage: Stage | None = None) -> Smoothed:

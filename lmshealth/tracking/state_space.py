@@ -13,92 +13,17 @@ of the baseline stays common to all epochs.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from copy import copy
-from dataclasses import dataclass
 
 import numpy as np
-import pandas as pd
 
 from lmshealth._arrays import FloatArray
-from lmshealth.stage.description import Covariate, Stage
-from lmshealth.tracking.results import History, Step, StepKind
+from lmshealth.stage.description import Stage
+from lmshealth.tracking import constants
+from lmshealth.tracking.covariates import Regressor, regressors
+from lmshealth.tracking.history import History, Step
 
 _KM = 1000.0
-# Priors. Rates and walks of a mode are per life.
-LN_F_STD = 0.1
-LN_ZETA_STD = 1.0
-DAMPING_WALK = 0.5
-BIAS_STD = (0.005, 0.2)
-UNKNOWN_COVARIATE_STD = 0.001
-# Standard deviations of the jumps of ln f and ln ζ: of a loosened bolt or a crash; of grease; of
-# the loop's poles; of a sensor that was moved or calibrated anew; of an overhaul.
-JUMP_STD: dict[StepKind, tuple[float, float]] = {
-    "step": (0.03, 0.3),
-    "regreasing": (0.0, 0.3),
-    "servo": (0.01, 0.2),
-    "sensor": (0.005, 0.2),
-    "reset": (0.05, 0.5),
-}
-# Kinds that change the modes; the others change how the modes are seen.
-MOVES = ("step", "regreasing", "reset")
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Regressor:
-    """One column that ln f depends on without wear.
-
-    Attributes
-    ----------
-    name : str
-        Of the covariate, with ``^2`` for its square.
-    values : ndarray
-        Offset from the reference, 0 where unknown, shape ``(n_logs,)``.
-    prior_std : float
-        Of d ln f per unit.
-    unknown : ndarray
-        Variance that ln f has where the value is unknown, shape ``(n_logs,)``.
-    """
-
-    name: str
-    values: FloatArray
-    prior_std: float
-    unknown: FloatArray
-
-
-def regressors(covariates: Mapping[str, FloatArray], stage: Stage | None) -> tuple[Regressor, ...]:
-    """Take the covariates that are asked for and known in at least one log.
-
-    Without a stage every covariate present is taken, about its median. Keys are column names,
-    values of shape ``(n_logs,)``.
-    """
-    wanted = (
-        stage.description.covariate
-        if stage is not None
-        else tuple(
-            Covariate(name, float(np.nanmedian(values)), UNKNOWN_COVARIATE_STD)
-            for name, values in covariates.items()
-            if np.isfinite(values).any()
-        )
-    )
-    found: list[Regressor] = []
-    for covariate in wanted:
-        values = covariates.get(covariate.name)
-        if values is None or not np.isfinite(values).any():
-            continue
-        known = np.isfinite(values)
-        offset = np.where(known, values - covariate.reference, 0.0)
-        # What never leaves its reference moves nothing.
-        if not offset.any():
-            continue
-        # Of the values up to each log: no log knows of later ones.
-        spread = pd.Series(values).expanding().std(ddof=0).fillna(0.0).clip(lower=1.0).to_numpy()
-        unknown = np.where(known, 0.0, (covariate.prior_std * spread) ** 2)
-        found.append(Regressor(covariate.name, offset, covariate.prior_std, unknown))
-        if covariate.curvature_std:
-            name, std = f"{covariate.name}^2", covariate.curvature_std
-            found.append(Regressor(name, offset**2, std, np.zeros_like(unknown)))
-    return tuple(found)
 
 
 def state_space(history: History, stage: Stage | None, steps: tuple[Step, ...] = ()) -> StateSpace:
@@ -215,7 +140,7 @@ class StateSpace:
         """
         series, r, m = self.history.series, len(self.history.series), self.n_modes
         reading = np.zeros((2 * r, 2 * m))
-        if step.kind not in MOVES:
+        if not step.changes_modes:
             for i, mode in enumerate(self.history.mode_of()):
                 if step.source in ("", series[i].source):
                     reading[i, mode] = reading[r + i, m + mode] = 1
@@ -229,8 +154,8 @@ class StateSpace:
         history = self.history
         mean, std = np.zeros(self.size), np.zeros(self.size)
         for place, values, width in (
-            (self.level, history.ln_frequency, LN_F_STD),
-            (self.damping, history.ln_damping, LN_ZETA_STD),
+            (self.level, history.ln_frequency, constants.LN_F_STD),
+            (self.damping, history.ln_damping, constants.LN_ZETA_STD),
         ):
             for i, mode in enumerate(history.modes):
                 own = values[:, history.columns(mode)]
@@ -239,7 +164,7 @@ class StateSpace:
             std[place] = width
         for j, regressor in enumerate(self.regressed):
             std[self.regressor(j)] = regressor.prior_std
-        std[self.first_bias : self.first_step] = np.tile(BIAS_STD, len(self.biased))
+        std[self.first_bias : self.first_step] = np.tile(constants.BIAS_STD, len(self.biased))
         return mean, np.diag(std**2)
 
     def unknown(self) -> FloatArray:

@@ -36,9 +36,8 @@ import numpy as np
 from lmshealth.io.log import Metadata
 from lmshealth.modal.modes import Modes
 from lmshealth.stage.description import Covariate, Description, Stage
-from lmshealth.tracking.history import Reading, build_history
-from lmshealth.tracking.results import History
-from lmshealth.tracking.tracker import track
+from lmshealth.tracking.history import History, LogEstimates, build_history
+from lmshealth.tracking.track import track
 from studies.decays.beam import BEAM, REPEATS, one_beam
 from studies.record import Study
 
@@ -80,11 +79,11 @@ def one_repeat(folder: Path, repeat: int, some: slice = slice(None)) -> dict[str
     }
 
 
-def to_reading(row: dict[str, Any]) -> Reading:
+def to_reading(row: dict[str, Any]) -> LogEstimates:
     """Take a dwell for a log."""
     std = np.array([row["f_std_hz"] / row["f_hz"], row["zeta_std"] / row["zeta"]])
     when = BEGIN + timedelta(seconds=SECONDS_A_DWELL * row["dwell"])
-    return Reading(
+    return LogEstimates(
         log=f"dwell-{row['dwell']:02d}",
         digest="",
         metadata=Metadata("beam", when, None, {"roller_v": row["roller_v"]}),

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from lmshealth.prognosis import life_likelihood as model
 from lmshealth.stage.degradation_laws import HertzWear, Unchanging
 from lmshealth.stage.description import ScatterPrior, Stage, load_stage
-from lmshealth.tracking.results import History, Series
-from lmshealth.tracking.state_space import regressors
+from lmshealth.tracking.covariates import regressors
+from lmshealth.tracking.history import History, Series
 from studies.sbc_life.lives import Part
 
 Array = NDArray[np.float64]

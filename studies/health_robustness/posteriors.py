@@ -17,7 +17,8 @@ from lmshealth.prognosis import life_likelihood as life_module
 from lmshealth.prognosis.life_posterior import fit_life
 from lmshealth.prognosis.remaining_life import parameters_with_limit, remaining_travel
 from lmshealth.stage.description import Stage
-from lmshealth.tracking.results import History, Track
+from lmshealth.tracking.history import History
+from lmshealth.tracking.track import Track
 from studies.lives import Array
 
 _N_PRIOR, _N_POINTS, _N_DRAWS = 1000, 2000, 4000

@@ -9,9 +9,8 @@ from typing import Any
 import numpy as np
 
 from lmshealth.stage.description import Stage
-from lmshealth.tracking.history import believed
-from lmshealth.tracking.results import History, Track
-from lmshealth.tracking.tracker import track
+from lmshealth.tracking.history import History
+from lmshealth.tracking.track import Track, accepted_estimates, track
 from studies.health_robustness.posteriors import claimed, epoch_draws, life_draws
 from studies.health_robustness.worlds import PARAMETERS, Case, alone
 from studies.lives import Array, history_of
@@ -88,7 +87,7 @@ def followed(cases: Iterable[Case], stage: Stage) -> list[Followed]:
     for case in cases:
         history = history_of(case.life, case.estimates)
         own = track(history, stage)
-        found.append(Followed(case, own, believed(history, own)))
+        found.append(Followed(case, own, accepted_estimates(history, own)))
     return found
 
 

@@ -44,8 +44,7 @@ from lmshealth.prognosis.maintenance_decision import decide
 from lmshealth.prognosis.remaining_life import prognose
 from lmshealth.prognosis.results import Prognosis
 from lmshealth.stage.description import Stage, load_stage
-from lmshealth.tracking.history import believed
-from lmshealth.tracking.tracker import track
+from lmshealth.tracking.track import accepted_estimates, track
 from studies.lifetimes_raw.lives import N_LOGS, SECONDS, STAGE, PriorPlan, plan_of
 from studies.lives import history_of, life_of
 from studies.ranks import N_DRAWS, Array, Row, bands, judge, rank, uniform
@@ -91,7 +90,7 @@ def one(kind: str, seed: int, *, logs: int, cache: Path | None, seconds: float =
     stage = believing(load_stage(STAGE), 0.0) if kind == BELIEVED else load_stage(STAGE)
     history = history_of(life, identified(plan, cache))
     try:
-        history = believed(history, track(history, stage))
+        history = accepted_estimates(history, track(history, stage))
         found = prognose(history, stage, [SEED, seed], chains=False)
     except LmshealthError as why:
         return {"rank": None, "why": str(why)}

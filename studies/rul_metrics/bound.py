@@ -10,7 +10,7 @@ from scipy.special import erf
 
 from lmshealth.health.epoch_posterior import one_at_a_time
 from lmshealth.stage.description import Stage
-from lmshealth.tracking.results import History
+from lmshealth.tracking.history import History
 from models.lives.degradation import (
     GUIDE_PRELOAD_LIMIT,
     MOUNT_STIFFNESS_LIMIT,

@@ -16,8 +16,8 @@ from lmshealth.prognosis.remaining_life import (
     remaining_travel,
 )
 from lmshealth.stage.description import Stage
-from lmshealth.tracking.results import History
-from lmshealth.tracking.tracker import track
+from lmshealth.tracking.history import History
+from lmshealth.tracking.track import track
 from studies.lives import Array
 
 N_DRAWS = 10_000

@@ -7,7 +7,7 @@ from functools import cache
 
 import numpy as np
 
-from lmshealth.tracking.results import History
+from lmshealth.tracking.history import History
 from models.lives.degradation import Life as Truth
 from models.lives.simulation import Plan, schedule
 from studies.lives import SECONDS, Estimates, Life, drawn, history_of, life_with, rng_of

@@ -8,7 +8,7 @@ import numpy as np
 
 from lmshealth.errors import NotConverged
 from lmshealth.stage.description import Stage
-from lmshealth.tracking.results import History
+from lmshealth.tracking.history import History
 from studies.lives import Array
 from studies.rul_metrics.forecasts import linear, ours
 

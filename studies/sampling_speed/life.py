@@ -18,7 +18,7 @@ from lmshealth.prognosis.life_likelihood import LifeLikelihood
 from lmshealth.prognosis.life_posterior import LifeDensity
 from lmshealth.prognosis.remaining_life import prognose
 from lmshealth.stage.description import Stage, load_stage
-from lmshealth.tracking.results import History, Series
+from lmshealth.tracking.history import History, Series
 
 Array = NDArray[np.float64]
 MODES = ("roll", "pitch")

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lmshealth.stage.description import Stage
-from lmshealth.tracking.results import History, Series, Track
-from lmshealth.tracking.tracker import track
+from lmshealth.tracking.history import History, Series
+from lmshealth.tracking.track import Track, track
 
 Array = NDArray[np.float64]
 START = datetime(2026, 3, 1, tzinfo=UTC)

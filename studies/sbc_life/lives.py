@@ -12,8 +12,9 @@ from lmshealth.prognosis import life_likelihood as model
 from lmshealth.prognosis import scenarios
 from lmshealth.stage.degradation_laws import HertzWear, Law, Loosening
 from lmshealth.stage.description import ParameterSpec, Stage
-from lmshealth.tracking.results import History, Series, Step
-from lmshealth.tracking.state_space import BIAS_STD, JUMP_STD, regressors
+from lmshealth.tracking.constants import BIAS_STD, JUMP_STD
+from lmshealth.tracking.covariates import regressors
+from lmshealth.tracking.history import History, Series, Step
 
 Array = NDArray[np.float64]
 START = datetime(2026, 3, 1, tzinfo=UTC)

@@ -12,9 +12,10 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from lmshealth.stage.description import Stage, load_stage
+from lmshealth.tracking.constants import BIAS_STD, DAMPING_WALK
 from lmshealth.tracking.filter_bank import Filter, Settings, settings
-from lmshealth.tracking.results import History, Series
-from lmshealth.tracking.state_space import BIAS_STD, DAMPING_WALK, state_space
+from lmshealth.tracking.history import History, Series
+from lmshealth.tracking.state_space import state_space
 
 Array = NDArray[np.float64]
 HORIZON = 2e7  # m of travel in a life

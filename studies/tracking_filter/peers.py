@@ -14,17 +14,12 @@ import numpy as np
 from filterpy.kalman import KalmanFilter
 
 from lmshealth.stage.description import Stage
+from lmshealth.tracking.constants import DAMPING_WALK, LN_F_STD, LN_ZETA_STD
+from lmshealth.tracking.covariates import Regressor
 from lmshealth.tracking.filter_bank import Filter, Settings
-from lmshealth.tracking.results import History, Series
-from lmshealth.tracking.state_space import (
-    DAMPING_WALK,
-    LN_F_STD,
-    LN_ZETA_STD,
-    Regressor,
-    StateSpace,
-    state_space,
-)
-from lmshealth.tracking.tracker import track
+from lmshealth.tracking.history import History, Series
+from lmshealth.tracking.state_space import StateSpace, state_space
+from lmshealth.tracking.track import track
 from studies.tracking_filter.lives import START, Array, Life, draw, filtered
 
 PEERS = ("simdkalman", "statsmodels")

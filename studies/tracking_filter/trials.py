@@ -9,8 +9,8 @@ import numpy as np
 from scipy import stats
 
 from lmshealth.stage.description import Stage
-from lmshealth.tracking.results import History
-from lmshealth.tracking.tracker import track
+from lmshealth.tracking.history import History
+from lmshealth.tracking.track import track
 from studies.metrics import clopper_pearson
 from studies.record import LEVEL
 from studies.tracking_filter.lives import (

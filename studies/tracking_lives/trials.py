@@ -12,8 +12,8 @@ import numpy as np
 from scipy import stats
 
 from lmshealth.stage.description import Stage, load_stage
-from lmshealth.tracking.results import History, Track
-from lmshealth.tracking.tracker import track
+from lmshealth.tracking.history import History
+from lmshealth.tracking.track import Track, track
 from studies.lives import HEALTHY, Array, Estimates, Life, history_of, rng_of
 from studies.metrics import clopper_pearson
 from studies.record import LEVEL, judge_coverage

@@ -43,7 +43,7 @@ from lmshealth.prognosis.life_likelihood import scatter_prior
 from lmshealth.report.assessment import Assessment
 from lmshealth.report.tables import COLUMNS
 from lmshealth.stage.description import Stage, load_stage
-from lmshealth.tracking.history import Reading
+from lmshealth.tracking.history import LogEstimates
 from studies import servers
 from tests.signals import sine, write_archive, write_archive_stage, write_log
 
@@ -407,7 +407,7 @@ def test_a_machine_that_cannot_be_assessed_does_not_end_the_batch(
     write_log(logs / "b.h5", 1.0, 7, stage="other-A")
     whole = assessing.assess
 
-    def fail(readings: Sequence[Reading], *given: Any, **options: Any) -> Assessment:
+    def fail(readings: Sequence[LogEstimates], *given: Any, **options: Any) -> Assessment:
         if readings[0].metadata.stage == "other-A":
             raise ZeroDivisionError("a mistake of ours")
         return whole(readings, *given, **options)
@@ -436,7 +436,7 @@ def assessed(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     machines: list[str] = []
     whole = assessing.assess
 
-    def listen(readings: Sequence[Reading], *given: Any, **options: Any) -> Assessment:
+    def listen(readings: Sequence[LogEstimates], *given: Any, **options: Any) -> Assessment:
         machines.append(str(readings[0].metadata.stage))
         return whole(readings, *given, **options)
 

@@ -33,11 +33,11 @@ from lmshealth.modal.modes import Modes
 from lmshealth.report.assessment import Assessment
 from lmshealth.signal.spectral_lines import Line
 from lmshealth.signal.waterfall import Levels
-from lmshealth.tracking.history import Reading
+from lmshealth.tracking.history import LogEstimates
 from tests.assessments import leaves, worn
 
 
-def reading(n: int = 2, log: str = "a.h5") -> Reading:
+def reading(n: int = 2, log: str = "a.h5") -> LogEstimates:
     """Give a reading whose numbers use all bits of a float."""
     rng = np.random.default_rng(n)
     cov = rng.normal(size=(2 * n, 2 * n)) * 10.0 ** rng.integers(-12, 3, (2 * n, 2 * n))
@@ -67,7 +67,7 @@ def reading(n: int = 2, log: str = "a.h5") -> Reading:
         description="small",
     )
     levels = Levels(100 / 3, 200 / 3, rng.choice([np.nan, 1 / 3], 5))
-    return Reading(log, "d" * 64, metadata, modes, 1e-6 / 3, levels)
+    return LogEstimates(log, "d" * 64, metadata, modes, 1e-6 / 3, levels)
 
 
 @pytest.fixture
@@ -102,18 +102,18 @@ def test_a_reading_comes_back_bit_for_bit(url: str, n: int) -> None:
     reader = Store(url)
     got = got_from(reader, "k", put.log)
     reader.close()
-    assert isinstance(got, Reading)
+    assert isinstance(got, LogEstimates)
     assert list(leaves(got)) == list(leaves(put))
 
 
 def test_missing_metadata_stay_missing(url: str) -> None:
     """What a log did not say is None again, not a text or a zero."""
-    put = Reading("a.h5", "d" * 64, Metadata(), reading(0).modes)
+    put = LogEstimates("a.h5", "d" * 64, Metadata(), reading(0).modes)
     store = Store(url)
     put_in(store, "k", put)
     got = got_from(store, "k", "a.h5")
     store.close()
-    assert isinstance(got, Reading)
+    assert isinstance(got, LogEstimates)
     assert got.metadata == Metadata()
     assert got.loop_error is None
     assert got.levels is None
@@ -136,7 +136,7 @@ def test_a_renamed_log_is_known_under_its_new_name(url: str) -> None:
     put_in(store, "k", reading())
     got = got_from(store, "k", "b.h5")
     store.close()
-    assert isinstance(got, Reading)
+    assert isinstance(got, LogEstimates)
     assert got.log == "b.h5"
     assert [refusal.log for refusal in got.modes.refused] == ["b.h5"]
 
@@ -156,7 +156,7 @@ def test_what_an_older_version_kept_is_not_read(file_url: str, tmp_path: Path) -
     store = Store(file_url)
     assert got_from(store, "k", "a.h5") is None
     put_in(store, "k", reading())
-    assert isinstance(got_from(store, "k", "a.h5"), Reading)
+    assert isinstance(got_from(store, "k", "a.h5"), LogEstimates)
     store.close()
 
 
@@ -167,7 +167,7 @@ def test_putting_twice_changes_nothing(url: str) -> None:
         put_in(store, "k", reading())
     got = got_from(store, "k", "a.h5")
     store.close()
-    assert isinstance(got, Reading)
+    assert isinstance(got, LogEstimates)
     assert got.modes.cov.tobytes() == reading().modes.cov.tobytes()
 
 
@@ -360,7 +360,7 @@ def test_a_row_that_cannot_be_read_counts_as_absent(file_url: str, tmp_path: Pat
         assert store.earlier("A", "k2") is not None
         assert store.earlier("B", "k2") is None
         put_in(store, "k", reading())
-        assert isinstance(got_from(store, "k", "a.h5"), Reading)
+        assert isinstance(got_from(store, "k", "a.h5"), LogEstimates)
 
 
 def test_a_store_that_another_run_makes_at_the_same_moment_is_opened(tmp_path: Path) -> None:

@@ -24,7 +24,7 @@ from lmshealth.io.column_map import ColumnMap
 from lmshealth.io.formats.registry import load
 from lmshealth.stage.description import Stage
 from lmshealth.tracking.read_tables import Drifts
-from lmshealth.tracking.tracker import track
+from lmshealth.tracking.track import track
 from models.dynamics.stages import stage_named
 from models.recordings.recording import record
 from studies.bench.ratios import recorded

@@ -15,7 +15,7 @@ from lmshealth.prognosis import remaining_life as foretelling
 from lmshealth.prognosis.results import Prognosis
 from lmshealth.report.tables import COLUMNS
 from lmshealth.stage.description import Stage
-from lmshealth.tracking.results import History
+from lmshealth.tracking.history import History
 from tests.lives import (
     FADING,
     FREQUENCY,

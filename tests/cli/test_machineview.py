@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from lmshealth.cli.machineview import print_health, print_track
-from lmshealth.tracking.tracker import track
+from lmshealth.tracking.track import track
 from tests.lives import DAMPING, FREQUENCY, make_health, make_history
 
 

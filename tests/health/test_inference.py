@@ -27,8 +27,7 @@ from lmshealth.health.inference import (
 from lmshealth.health.results import Health
 from lmshealth.stage.description import Stage
 from lmshealth.stage.priors import Uniform
-from lmshealth.tracking.results import Track
-from lmshealth.tracking.tracker import track
+from lmshealth.tracking.track import Track, track
 from tests.health.test_epoch_posterior import book
 from tests.lives import (
     AXES,

@@ -12,7 +12,8 @@ import pytest
 from lmshealth._arrays import FloatArray
 from lmshealth.health.verdict import degraded_below, degraded_words, judge, verdict_of
 from lmshealth.stage.description import Stage, load_stage
-from lmshealth.tracking.results import Event, History, Track
+from lmshealth.tracking.history import History
+from lmshealth.tracking.track import Event, Track
 from tests.lives import (
     FOOT,
     FREQUENCY,

@@ -9,7 +9,7 @@ import pytest
 
 from lmshealth.prognosis.life_likelihood import MOST_LOGS, LifeLikelihood, condense
 from lmshealth.prognosis.life_posterior import fit_life
-from lmshealth.tracking.results import Step
+from lmshealth.tracking.history import Step
 from tests.lives import FREQUENCY, SENSITIVITY, awkward_history, make_history, make_stage, since
 
 

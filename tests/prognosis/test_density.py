@@ -14,7 +14,7 @@ from lmshealth.prognosis import life_likelihood as life
 from lmshealth.prognosis.life_likelihood import LifeLikelihood
 from lmshealth.prognosis.life_posterior import LifeDensity
 from lmshealth.stage.description import Stage
-from lmshealth.tracking.results import History
+from lmshealth.tracking.history import History
 from tests.lives import (
     FADING,
     FOOT,

@@ -37,7 +37,7 @@ from lmshealth.stage.degradation_laws import (
 )
 from lmshealth.stage.description import ParameterSpec, ScatterPrior, Stage
 from lmshealth.stage.priors import Lognormal, Normal, Uniform
-from lmshealth.tracking.results import History
+from lmshealth.tracking.history import History
 from tests.lives import FOOT, FREQUENCY, MOUNT, PRELOAD, make_history, make_stage, true_drift
 
 NONE = '{ kind = "none" }'

@@ -16,7 +16,7 @@ from lmshealth.prognosis.life_likelihood import LifeLikelihood, scatter_prior
 from lmshealth.prognosis.life_posterior import LifeDensity
 from lmshealth.prognosis.scenarios import Scenario
 from lmshealth.stage.description import Stage
-from lmshealth.tracking.results import History
+from lmshealth.tracking.history import History
 from tests.lives import (
     FADING,
     FOOT,

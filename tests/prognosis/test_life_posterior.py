@@ -20,7 +20,7 @@ from lmshealth.prognosis.life_likelihood import LifeLikelihood
 from lmshealth.prognosis.life_posterior import LifeDensity, LifePosterior, fit_life
 from lmshealth.prognosis.remaining_life import prognose
 from lmshealth.stage.description import Stage
-from lmshealth.tracking.results import History, Step
+from lmshealth.tracking.history import History, Step
 from tests.lives import (
     FADING,
     FOOT,

@@ -24,7 +24,7 @@ from lmshealth.prognosis.remaining_life import (
 )
 from lmshealth.prognosis.results import LawWeight, Prognosis
 from lmshealth.stage.description import Stage
-from lmshealth.tracking.results import History, Step
+from lmshealth.tracking.history import History, Step
 from tests.lives import (
     FADING,
     FOOT,

@@ -26,8 +26,9 @@ from lmshealth.signal.waterfall import Waterfall
 from lmshealth.stage.degradation_laws import HertzWear, Law, Loosening
 from lmshealth.stage.description import Decision
 from lmshealth.stage.priors import Lognormal, Normal
-from lmshealth.tracking.covariate_effects import Influence
-from lmshealth.tracking.results import Effect, History, Series, Track
+from lmshealth.tracking.covariate_effects import CovariateEffect
+from lmshealth.tracking.history import History, Series
+from lmshealth.tracking.track import Effect, Track
 from tests.lives import cut, health_of
 
 MODES = ("roll", "pitch", "yaw")
@@ -468,7 +469,7 @@ def test_influence_shows_before_and_after(ax: Axes, history: History) -> None:
     effect = Effect("roll", "temperature_c", -1.2e-3, 1e-4)
     rng = np.random.default_rng(5)
     measured = -1.2e-3 * (values - 21) + 1e-4 * rng.standard_normal(EPOCHS)
-    one = Influence(
+    one = CovariateEffect(
         "roll", "temperature_c", 21.0, (effect,), np.arange(EPOCHS), np.array(values), measured
     )
     assert trackplots.plot_influence(ax, one, history) is ax

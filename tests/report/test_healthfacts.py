@@ -21,7 +21,7 @@ from lmshealth.report.healthfacts import (
     verdict_words,
 )
 from lmshealth.report.text import percent
-from lmshealth.tracking.results import Event
+from lmshealth.tracking.track import Event
 from tests.report.test_machine_page import blind, make, nothing
 
 __all__ = ["make"]

@@ -28,8 +28,8 @@ from lmshealth.report.changes import reported
 from lmshealth.report.fleet_page import write_index
 from lmshealth.report.machine_page import make_page, write_report
 from lmshealth.stage.description import Decision, Stage, load_stage
-from lmshealth.tracking.covariate_effects import find_influences
-from lmshealth.tracking.results import Series
+from lmshealth.tracking.covariate_effects import find_covariate_effects
+from lmshealth.tracking.history import Series
 from tests.report.test_figures import (
     FREQUENCY,
     MODES,
@@ -486,7 +486,7 @@ def test_page_stands_alone_and_is_well_formed(make: Maker, tmp_path: Path) -> No
 def test_what_was_taken_out_is_told(make: Maker, tmp_path: Path) -> None:
     """Range, reference, coefficient and scatter of a covariate stand there; so does what is not."""
     assessment = make()
-    found = find_influences(assessment.history, assessment.track, assessment.stage)  # type: ignore[arg-type]
+    found = find_covariate_effects(assessment.history, assessment.track, assessment.stage)  # type: ignore[arg-type]
     text = words(one(tmp_path, assessment))
     part = text[text.index("What moves the frequencies") : text.index("Health over the odometer")]
     values = assessment.history.covariates["temperature_c"]

@@ -27,8 +27,9 @@ from lmshealth.report.tables import (
 )
 from lmshealth.signal.spectral_lines import Line
 from lmshealth.stage.description import Decision, Stage, load_stage
-from lmshealth.tracking.history import Reading
-from lmshealth.tracking.results import Effect, Event, History, Series, Smoothed, Track
+from lmshealth.tracking.history import History, LogEstimates, Series
+from lmshealth.tracking.smoother import Smoothed
+from lmshealth.tracking.track import Effect, Event, Track
 from tests.lives import health_of
 from tests.signals import write_archive_stage
 
@@ -122,7 +123,7 @@ def tables(stage: Stage, remaining: np.ndarray) -> dict[str, pd.DataFrame]:
     return frames([], assessment(stage, prognosis(remaining)))
 
 
-def frames(readings: Sequence[Reading], made: Assessment) -> dict[str, pd.DataFrame]:
+def frames(readings: Sequence[LogEstimates], made: Assessment) -> dict[str, pd.DataFrame]:
     """Make the tables of one machine."""
     rows = machine_tables(readings, made)
     return {name: frame(COLUMNS[name], own) for name, own in rows.items()}
@@ -141,7 +142,7 @@ def test_modes_leave_with_units_in_their_names() -> None:
     """Hz, km and °C stand in the table; the std of f is f times the std of ln f."""
     covariates = {"temperature_c": 21.5, "payload_kg": 4.0, "position_mm": -20.0}
     metadata = Metadata("test-A", WHEN, 123_400.0, covariates, servo_id="stiff")
-    reading = Reading("a.h5", "d", metadata, two_modes(), 1.5e-6)
+    reading = LogEstimates("a.h5", "d", metadata, two_modes(), 1.5e-6)
     table = frame(COLUMNS["modes"], modes_rows(reading))
     row = table.iloc[0]
     assert (row["mode"], row["source"], row["channel"]) == ("roll", "acc", "acc_x")
@@ -156,7 +157,7 @@ def test_modes_leave_with_units_in_their_names() -> None:
 
 def test_unknown_metadata_are_empty_cells() -> None:
     """A log that says nothing about itself leaves empty cells, never a text like nan."""
-    reading = Reading("a.h5", "d", Metadata(), two_modes())
+    reading = LogEstimates("a.h5", "d", Metadata(), two_modes())
     text = frame(COLUMNS["modes"], modes_rows(reading)).to_csv(index=False)
     assert text.splitlines()[1].startswith("a.h5,,,,,,,,,roll,acc,")
     assert "nan" not in text.lower()
@@ -166,7 +167,7 @@ def test_shapes_have_a_column_per_channel_after_all_others(stage: Stage) -> None
     """Channels of any log of the table; an empty cell where a log or a mode has no such part."""
     alone = replace(two_modes(), shape_channels=("delta_e",), shapes=np.ones((2, 1)))
     both = {"a": two_modes(), "b": alone}
-    readings = [Reading(log, "d", Metadata(), modes) for log, modes in both.items()]
+    readings = [LogEstimates(log, "d", Metadata(), modes) for log, modes in both.items()]
     table = frames(readings, assessment(stage, None))["modes"]
     own = ["shape_acc_x", "shape_acc_y", "shape_delta_e"]
     assert list(table.columns) == [*COLUMNS["modes"].split(), *own]
@@ -177,12 +178,12 @@ def test_shapes_have_a_column_per_channel_after_all_others(stage: Stage) -> None
 
 def test_covariances_between_modes_are_listed_once_and_zeros_left_out(stage: Stage) -> None:
     """A cross term of ln f is one row; modes of separate fits have none."""
-    readings = [Reading("a.h5", "d", Metadata(), two_modes())]
+    readings = [LogEstimates("a.h5", "d", Metadata(), two_modes())]
     table = frames(readings, assessment(stage, None))["modes_cov"]
     (row,) = table.to_dict("records")
     assert (row["log"], row["mode_a"], row["mode_b"]) == ("a.h5", "roll", "pitch")
     assert row["cov_ln_f"] == 2e-7
-    apart = [Reading("a.h5", "d", Metadata(), two_modes(0.0))]
+    apart = [LogEstimates("a.h5", "d", Metadata(), two_modes(0.0))]
     assert frames(apart, assessment(stage, None))["modes_cov"].empty
 
 

@@ -19,7 +19,7 @@ from lmshealth.prognosis.life_likelihood import LifeLikelihood
 from lmshealth.prognosis.life_posterior import LifeDensity, fit_life
 from lmshealth.prognosis.remaining_life import _usage, remaining_travel
 from lmshealth.stage.description import Stage
-from lmshealth.tracking.results import History
+from lmshealth.tracking.history import History
 from studies.fleet_prior.lives import YOUNG, draw_fleet
 from studies.fleet_prior.lives import draw as draw_machine
 from studies.fleet_prior.run import (

@@ -13,17 +13,11 @@ from lmshealth._arrays import FloatArray
 from lmshealth.stage.description import Stage
 from lmshealth.tracking import change_detection as events
 from lmshealth.tracking import filter_bank as bank
-from lmshealth.tracking.change_detection import (
-    Finding,
-    Watch,
-    loop_evidence,
-    reborn,
-    threshold,
-)
+from lmshealth.tracking.change_detection import Finding, Watch, loop_evidence, reborn, threshold
 from lmshealth.tracking.filter_bank import Filter, Surprise
-from lmshealth.tracking.results import History, Step, Track
+from lmshealth.tracking.history import History, Step
 from lmshealth.tracking.state_space import state_space
-from lmshealth.tracking.tracker import track
+from lmshealth.tracking.track import Track, track
 from tests.lives import DAMPING, FREQUENCY, make_stage, rough_history, seen_by, since
 from tests.tracking.test_filter_bank import SETTINGS, one, run
 
@@ -330,4 +324,4 @@ def test_findings_are_believed_at_the_declared_rate() -> None:
     assert Finding("step", "", 3, 10.0, 10.0).damage
     assert not Finding("step", "", 3, 10.0, 1.0).damage
     assert not Finding("servo", "", 3, 10.0, 10.0).damage
-    assert events.FALSE_ALARMS == 0.01
+    assert events.constants.FALSE_ALARM_PROBABILITY == 0.01

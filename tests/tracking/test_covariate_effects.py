@@ -8,12 +8,11 @@ import numpy as np
 import pytest
 
 from lmshealth.stage.description import Stage
-from lmshealth.tracking.covariate_effects import covariate_shifts, find_influences
-from lmshealth.tracking.history import believed
-from lmshealth.tracking.results import History
+from lmshealth.tracking.covariate_effects import covariate_shifts, find_covariate_effects
+from lmshealth.tracking.history import History
 from lmshealth.tracking.smoother import smooth
-from lmshealth.tracking.state_space import MOVES, state_space
-from lmshealth.tracking.tracker import track
+from lmshealth.tracking.state_space import state_space
+from lmshealth.tracking.track import accepted_estimates, track
 from tests.lives import FREQUENCY, PRELOAD, TWO, awkward_history, make_history, make_stage
 
 SLOPE = np.array([-8e-4, 5e-4])
@@ -45,7 +44,7 @@ def test_what_is_left_is_what_the_state_space_leaves(bent: Stage) -> None:
     """Two sources, steps of every kind and two covariates: what is left is ln f - H x, exactly."""
     history = awkward_history(np.random.default_rng(3))
     followed = track(history, bent)
-    taken = believed(history, followed)
+    taken = accepted_estimates(history, followed)
     space = state_space(taken, bent, taken.steps)
     state = np.zeros((len(history.logs), space.size))
     state[:, space.level] = smooth(taken, followed, bent).ln_frequency
@@ -54,7 +53,7 @@ def test_what_is_left_is_what_the_state_space_leaves(bent: Stage) -> None:
         for j, one in enumerate(space.regressed):
             state[:, space.regressor(j).start + m] = effects[mode, one.name]
         for j, step in enumerate(space.steps):
-            if step.kind not in MOVES:
+            if not step.changes_modes:
                 name = f"{step.kind}:{step.name or step.source}"
                 state[:, space.jump(j).start + m] = effects[mode, name]
     for j, i in enumerate(space._biased()):
@@ -63,7 +62,7 @@ def test_what_is_left_is_what_the_state_space_leaves(bent: Stage) -> None:
     r = len(history.series)
     seen = np.array([space.matrix(k)[:r] @ x for k, x in enumerate(state)])
     left = taken.ln_frequency - seen
-    found = find_influences(history, followed, bent)
+    found = find_covariate_effects(history, followed, bent)
     assert [(one.covariate, one.mode) for one in found] == [
         (covariate, mode) for covariate in ("temperature_c", "payload_kg") for mode in history.modes
     ]
@@ -82,7 +81,7 @@ def test_a_known_slope_is_found_and_taken_out(straight: Stage) -> None:
     """
     history = warm()
     for one, slope in zip(
-        find_influences(history, track(history, straight), straight), SLOPE, strict=True
+        find_covariate_effects(history, track(history, straight), straight), SLOPE, strict=True
     ):
         effect = one.effects[0]
         assert abs(effect.coefficient - slope) < 4 * effect.std
@@ -94,14 +93,14 @@ def test_a_known_slope_is_found_and_taken_out(straight: Stage) -> None:
 def test_a_covariate_that_does_nothing_takes_nothing_out(straight: Stage) -> None:
     """Without an effect coefficients lie about zero, and nothing that is not there is taken out."""
     history = warm(np.zeros(2))
-    for one in find_influences(history, track(history, straight), straight):
+    for one in find_covariate_effects(history, track(history, straight), straight):
         assert abs(one.effects[0].coefficient) < 4 * one.effects[0].std
         assert one.explained(one.values).std() < 2e-4
 
 
 def test_an_effect_is_seen_beyond_two_standard_deviations(straight: Stage) -> None:
     """Of linear and square one is enough."""
-    one = find_influences(warm(), track(warm(), straight), straight)[0]
+    one = find_covariate_effects(warm(), track(warm(), straight), straight)[0]
     faint, clear = (replace(one.effects[0], coefficient=c, std=1.0) for c in (-1.9, -2.1))
     assert not replace(one, effects=(faint, faint)).seen
     assert replace(one, effects=(faint, clear)).seen
@@ -111,13 +110,13 @@ def test_line_and_band_are_those_of_the_effects(straight: Stage, bent: Stage) ->
     """Zero at the reference; straight with a band that grows from there, bent without one."""
     history = warm()
     values = np.array([19.0, 21.0, 25.0])
-    one = find_influences(history, track(history, straight), straight)[0]
+    one = find_covariate_effects(history, track(history, straight), straight)[0]
     effect = one.effects[0]
     np.testing.assert_allclose(one.explained(values), effect.coefficient * (values - 21))
     std = one.explained_std(values)
     assert std is not None
     np.testing.assert_allclose(std, effect.std * np.array([2.0, 0.0, 4.0]))
-    one = find_influences(history, track(history, bent), bent)[0]
+    one = find_covariate_effects(history, track(history, bent), bent)[0]
     linear, square = (e.coefficient for e in one.effects)
     np.testing.assert_allclose(
         one.explained(values), linear * (values - 21) + square * (values - 21) ** 2
@@ -131,7 +130,7 @@ def test_shifts_are_the_sum_of_what_covariates_explain(bent: Stage) -> None:
     followed = track(history, bent)
     moved = covariate_shifts(history, followed, bent)
     total = np.zeros_like(moved)
-    for one in find_influences(history, followed, bent):
+    for one in find_covariate_effects(history, followed, bent):
         values = history.covariates[one.covariate]
         explained = np.where(np.isfinite(values), one.explained(values), 0.0)
         total[:, history.modes.index(one.mode)] += explained
@@ -144,5 +143,5 @@ def test_without_covariates_there_is_nothing_to_take_out(straight: Stage) -> Non
     still = replace(history, covariates={"temperature_c": np.full(len(history.logs), 21.0)})
     for quiet in (replace(history, covariates={}), still):
         followed = track(quiet, straight)
-        assert find_influences(quiet, followed, straight) == ()
+        assert find_covariate_effects(quiet, followed, straight) == ()
         assert not covariate_shifts(quiet, followed, straight).any()

@@ -11,7 +11,7 @@ from scipy.special import softmax
 from lmshealth._arrays import FloatArray
 from lmshealth.stage.description import Stage
 from lmshealth.tracking.filter_bank import HEALTHY_PRIOR, Bank, Filter, Settings, settings
-from lmshealth.tracking.results import History
+from lmshealth.tracking.history import History
 from lmshealth.tracking.state_space import state_space
 from tests.lives import PRELOAD, TWO, awkward_history, make_stage, rough_history
 from tests.oracles import Followed, Known, Wander, batch, filterpy_loop, kalman

@@ -12,16 +12,9 @@ import pytest
 from lmshealth.errors import NotEnoughData
 from lmshealth.io.log import Refusal
 from lmshealth.stage.description import Stage
-from lmshealth.tracking.history import (
-    believed,
-    build_history,
-    doubted,
-    in_order,
-    lost_notes,
-)
+from lmshealth.tracking.history import Series, build_history, missing_mode_notes, sort_by_time
 from lmshealth.tracking.maintenance import Action
-from lmshealth.tracking.results import Series
-from lmshealth.tracking.tracker import track
+from lmshealth.tracking.track import accepted_estimates, outlier_refusals, track
 from tests.lives import FADING, START, make_reading, make_stage
 
 
@@ -36,7 +29,7 @@ def test_readings_are_sorted_by_moment_then_name(stage: Stage) -> None:
     late = make_reading("a", 5, 3e5, {"roll": 4.8})
     early = make_reading("z", 1, 1e5, {"roll": 4.81})
     twin = make_reading("b", 1, 1e5, {"roll": 4.81})
-    assert [r.log for r in in_order([late, early, twin])] == ["b", "z", "a"]
+    assert [r.log for r in sort_by_time([late, early, twin])] == ["b", "z", "a"]
     history, refused = build_history([late, early, twin], stage)
     assert history.logs == ("b", "z", "a")
     assert list(history.recorded_at) == sorted(history.recorded_at)
@@ -93,8 +86,8 @@ def jumping(values: list[float], stage: Stage) -> tuple[list[bool], list[str]]:
     ]
     history, refused = build_history(readings, stage)
     followed = track(history, stage)
-    refused += doubted(history, followed)
-    history = believed(history, followed)
+    refused += outlier_refusals(history, followed)
+    history = accepted_estimates(history, followed)
     assert all(r.reason == "jump" and r.mode == "roll" for r in refused)
     roll, pitch = history.modes.index("roll"), history.modes.index("pitch")
     assert np.isfinite(history.ln_frequency[:, pitch]).all()
@@ -220,8 +213,8 @@ def test_modes_that_can_no_longer_be_told_apart_are_told(stage: Stage) -> None:
     readings = [make_reading(str(k), k, 1e5 * k, {"roll": 4.8}) for k in range(5)]
     history, _ = build_history(readings, stage)
     doubts = [Refusal(str(k), "ambiguous", "", mode="roll") for k in range(5)]
-    assert "roll: the last 3 logs do not tell" in lost_notes(history, doubts[2:])[0]
-    assert lost_notes(history, doubts[:4]) == []
+    assert "roll: the last 3 logs do not tell" in missing_mode_notes(history, doubts[2:])[0]
+    assert missing_mode_notes(history, doubts[:4]) == []
 
 
 def test_a_mode_that_is_no_longer_seen_is_told(stage: Stage) -> None:
@@ -231,7 +224,7 @@ def test_a_mode_that_is_no_longer_seen_is_told(stage: Stage) -> None:
         for day in range(1, 7)
     ]
     history, refused = build_history(logs, stage)
-    told = lost_notes(history, refused)
+    told = missing_mode_notes(history, refused)
     assert told == ["pitch: no estimate in the last 3 logs; nothing new is known."]
     history, refused = build_history(logs[:5], stage)
-    assert lost_notes(history, refused) == []
+    assert missing_mode_notes(history, refused) == []

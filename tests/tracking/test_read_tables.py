@@ -9,7 +9,7 @@ import pytest
 
 from lmshealth.errors import BadTable
 from lmshealth.stage.description import Stage
-from lmshealth.tracking.history import Reading
+from lmshealth.tracking.history import LogEstimates
 from lmshealth.tracking.read_tables import read_estimates
 from tests.lives import FADING, make_stage
 
@@ -41,7 +41,9 @@ def _write(tmp_path: Path, text: str, terms: str) -> tuple[Path, Path | None]:
     return path, cross if terms else None
 
 
-def read(tmp_path: Path, text: str, terms: str = "", stage: Stage | None = None) -> list[Reading]:
+def read(
+    tmp_path: Path, text: str, terms: str = "", stage: Stage | None = None
+) -> list[LogEstimates]:
     """Write tables and read them."""
     path, cross = _write(tmp_path, text, terms)
     return list(read_estimates(path, cross_terms=cross, stage=stage).readings)

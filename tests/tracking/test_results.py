@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from lmshealth.tracking.results import Event, History, Series, consistency
+from lmshealth.tracking.history import History, Series
+from lmshealth.tracking.track import Event, consistency
 from tests.lives import START, awkward_history, make_track
 from tests.oracles import binomial_band
 

@@ -12,7 +12,7 @@ from lmshealth.tracking import filter_bank as bank
 from lmshealth.tracking.filter_bank import Filter
 from lmshealth.tracking.smoother import smooth, smooth_one
 from lmshealth.tracking.state_space import state_space
-from lmshealth.tracking.tracker import track
+from lmshealth.tracking.track import track
 from tests.lives import (
     PRELOAD,
     TWO,
@@ -24,7 +24,7 @@ from tests.lives import (
 )
 from tests.oracles import Wander, batch
 from tests.tracking.test_filter_bank import ALONE, KNOWN, SETTINGS, one
-from tests.tracking.test_tracker import quiet, std_of, still
+from tests.tracking.test_track import quiet, std_of, still
 
 
 @pytest.fixture(scope="module")

@@ -8,13 +8,9 @@ import numpy as np
 import pytest
 
 from lmshealth.stage.description import Stage
-from lmshealth.tracking.results import History
-from lmshealth.tracking.state_space import (
-    LN_F_STD,
-    LN_ZETA_STD,
-    UNKNOWN_COVARIATE_STD,
-    state_space,
-)
+from lmshealth.tracking.constants import COVARIATE_STD, LN_F_STD, LN_ZETA_STD
+from lmshealth.tracking.history import History
+from lmshealth.tracking.state_space import state_space
 from tests.lives import (
     PRELOAD,
     TWO,
@@ -122,7 +118,7 @@ def test_without_a_stage_covariates_are_about_their_median(history: History) -> 
         values = history.covariates[one.name]
         known = np.isfinite(values)
         np.testing.assert_allclose(one.values[known], values[known] - np.nanmedian(values))
-        assert one.prior_std == UNKNOWN_COVARIATE_STD
+        assert one.prior_std == COVARIATE_STD
 
 
 def test_a_covariate_that_is_never_known_is_left_out(history: History) -> None:

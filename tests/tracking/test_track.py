@@ -19,12 +19,12 @@ from lmshealth.tracking import (
     filter_bank as bank,
 )
 from lmshealth.tracking import (
-    tracker as tracking,
+    track as tracking,
 )
 from lmshealth.tracking.change_detection import loop_evidence
-from lmshealth.tracking.results import History, Track
-from lmshealth.tracking.state_space import JUMP_STD
-from lmshealth.tracking.tracker import track
+from lmshealth.tracking.constants import JUMP_STD
+from lmshealth.tracking.history import History
+from lmshealth.tracking.track import Track, track
 from tests.lives import (
     DAMPING,
     FREQUENCY,

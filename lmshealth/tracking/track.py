@@ -8,31 +8,255 @@ happen from then on. No epoch knows of later logs; `smooth` does.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from datetime import datetime
+from typing import Literal
 
 import numpy as np
 from scipy import stats
 
-from lmshealth._arrays import BoolArray, FloatArray
+from lmshealth._arrays import BoolArray, FloatArray, expect_shape, freeze
 from lmshealth.errors import NotEnoughData
+from lmshealth.io.log import Refusal
 from lmshealth.stage.description import Stage
-from lmshealth.tracking.change_detection import (
-    MEMORY,
-    Finding,
-    Watch,
-    explain,
-    reborn,
-    threshold,
-)
+from lmshealth.tracking.change_detection import MEMORY, Finding, Watch, explain, reborn, threshold
+from lmshealth.tracking.constants import JUMP_STD
 from lmshealth.tracking.filter_bank import Bank, Filter
-from lmshealth.tracking.results import Effect, Event, History, Step, Track, neighbours
-from lmshealth.tracking.state_space import JUMP_STD, MOVES, StateSpace, state_space
+from lmshealth.tracking.history import History, Step
+from lmshealth.tracking.state_space import StateSpace, state_space
 
+EventKind = Literal["step", "regreasing", "servo", "sensor", "alarm"]
+
+# Below this probability of their innovations a filter is not consistent with its data: where it
+# makes results too sure of themselves, and where it only makes them too cautious.
+_TOO_SURE, _TOO_CAUTIOUS, _UNUSUAL = 1e-3, 1e-6, 0.05
 # Innovations further out are hardly believed before the next log is there.
 _FAR = 6.0
 # A filter is widened once its innovations are less probable than that.
 _WIDEN = 5e-4
 _ROUNDING = 1e-15  # of the variance of a drift
+
+
+@dataclass(frozen=True, slots=True)
+class Effect:
+    """What moves a mode without wear: one row of ``effects.csv``.
+
+    ``covariate`` is the name of a covariate, ``bias:<source>``, ``servo:<id>``, ``sensor:<date>``,
+    or ``scale:<source>`` for the factor on the standard deviations of a source (then `mode` is
+    empty).
+    """
+
+    mode: str
+    covariate: str
+    coefficient: float
+    std: float
+
+
+@dataclass(frozen=True, slots=True)
+class Event:
+    """Something that happened to a machine, as one mode shows it: one row of ``events.csv``.
+
+    Attributes
+    ----------
+    kind : str
+        ``step``, ``regreasing``, ``servo``, ``sensor``, or ``alarm``: unexplained change of the
+        modes since the baseline, at the declared rate of false alarms.
+    epoch : int
+        First log that shows it; of an alarm, the log at which it is raised.
+    mode : str
+        The mode.
+    source : str
+        The sensor's; else empty.
+    size, std : float
+        Change of ln f, of a regreasing change of ln ζ, of an alarm the drift.
+    evidence : float
+        Log Bayes factor against nothing having happened; of what was found by itself, the place
+        of the step is not known beforehand and counted in.
+    declared : bool
+        Whether maintenance or the log's ``servo_id`` told of it.
+    found_at : int
+        The log after which it was known.
+    """
+
+    kind: EventKind
+    epoch: int
+    mode: str
+    source: str
+    size: float
+    std: float
+    evidence: float
+    declared: bool
+    found_at: int
+
+
+@dataclass(frozen=True, slots=True)
+class Consistency:
+    """Whether a filter's innovations are what it expects.
+
+    Attributes
+    ----------
+    nis : float
+        Sum of the normalised innovations squared over their degrees of freedom.
+    p_value : float
+        Two-sided, of that sum under χ².
+    autocorrelation : float
+        Of standardised innovations of one series from one log to the next, all series together.
+    autocorrelation_p_value : float
+        Two-sided, if they were independent.
+    """
+
+    nis: float
+    p_value: float
+    autocorrelation: float
+    autocorrelation_p_value: float
+
+    @property
+    def holds(self) -> bool:
+        """Whether neither is improbable; an average is somewhat cautious with quiet machines."""
+        least = _TOO_SURE if self.nis > 1 else _TOO_CAUTIOUS
+        least_of_all = _TOO_SURE if self.autocorrelation > 0 else _TOO_CAUTIOUS
+        return self.p_value >= least and self.autocorrelation_p_value >= least_of_all
+
+    @property
+    def side(self) -> Literal["below", "inside", "above"]:
+        """Where the sum lies beside the band that holds 95 % of those of a filter that is right."""
+        if self.p_value >= _UNUSUAL:
+            return "inside"
+        return "above" if self.nis > 1 else "below"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Track:
+    """Modes followed over a machine's life by a Kalman filter.
+
+    Attributes
+    ----------
+    stage : str
+        Identity of the machine.
+    logs : tuple of str
+        Names of the logs, one epoch each.
+    recorded_at : tuple of datetime
+        Ascending.
+    travel : ndarray
+        Odometer in m, shape ``(n_epochs,)``; NaN throughout where there is none.
+    modes : tuple of str
+        Mode names.
+    sources : tuple of str
+        Sources of estimates.
+    ln_frequency, ln_frequency_std, ln_damping, ln_damping_std : ndarray
+        Filtered (no future data), covariates at their reference, shape ``(n_epochs, n_modes)``;
+        NaN before the first estimate of a mode.
+    drift : ndarray
+        ln frequency minus its value at the baseline before it, shape ``(n_epochs, n_modes)``.
+    drift_cov : ndarray
+        Covariance of the drifts of one epoch, shape ``(n_epochs, n_modes, n_modes)``.
+    effects : tuple of Effect
+        Coefficients after the last epoch.
+    events : tuple of Event
+        What happened, in order.
+    steps : tuple of Step
+        The steps among it, declared and found.
+    outliers : tuple of (int, str)
+        Epochs and modes whose estimates lie so far off that they were hardly believed, and that no
+        later log confirmed.
+    nis : ndarray
+        Normalised innovation squared, shape ``(n_epochs,)``. Logs that were filtered again with an
+        event have that of the last time.
+    nis_dof : ndarray
+        Its degrees of freedom, shape ``(n_epochs,)``; the first estimate of a mode has none,
+        because the filter starts from it, and outliers have none.
+    innovations : ndarray
+        Standardised innovations of ``[ln f, ln ζ]`` of all series, ``(n_epochs, 2 n_series)``.
+    noise_scale : ndarray
+        Factor on the reported standard deviations of each source that the innovations ask for,
+        shape ``(n_epochs, n_sources)``; 1 when they are consistent.
+    widening : ndarray
+        Factor on all standard deviations, as the filter's innovations were not consistent up to
+        there, shape ``(n_epochs,)``; 1 when they are.
+    """
+
+    stage: str
+    logs: tuple[str, ...]
+    recorded_at: tuple[datetime, ...]
+    travel: FloatArray
+    modes: tuple[str, ...]
+    sources: tuple[str, ...]
+    ln_frequency: FloatArray
+    ln_frequency_std: FloatArray
+    ln_damping: FloatArray
+    ln_damping_std: FloatArray
+    drift: FloatArray
+    drift_cov: FloatArray
+    effects: tuple[Effect, ...]
+    events: tuple[Event, ...]
+    steps: tuple[Step, ...]
+    outliers: tuple[tuple[int, str], ...]
+    nis: FloatArray
+    nis_dof: FloatArray
+    innovations: FloatArray
+    noise_scale: FloatArray
+    widening: FloatArray
+
+    def __post_init__(self) -> None:
+        n, m = len(self.logs), len(self.modes)
+        for name in ("ln_frequency", "ln_frequency_std", "ln_damping", "ln_damping_std", "drift"):
+            expect_shape(name, getattr(self, name), (n, m))
+        expect_shape("drift_cov", self.drift_cov, (n, m, m))
+        expect_shape("noise_scale", self.noise_scale, (n, len(self.sources)))
+        expect_shape("innovations", self.innovations, (n, self.innovations.shape[1]))
+        for name in ("travel", "nis", "nis_dof", "widening"):
+            expect_shape(name, getattr(self, name), (n,))
+        freeze(self)
+
+    @property
+    def alarms(self) -> tuple[Event, ...]:
+        """The damage alarms."""
+        return tuple(event for event in self.events if event.kind == "alarm")
+
+    def consistency(self) -> Consistency:
+        """Judge the filter by its innovations."""
+        return consistency(self.nis, self.nis_dof, self.innovations)
+
+
+def neighbours(innovations: FloatArray) -> tuple[FloatArray, np.ndarray]:
+    """Multiply innovations by those of the log before: sums over each log, and how many they are.
+
+    Series of one log may have errors in common: the sums over a log are what is independent.
+    """
+    products = np.full_like(innovations, np.nan)
+    products[1:] = innovations[1:] * innovations[:-1]
+    there = np.isfinite(products)
+    return np.where(there, products, 0.0).sum(axis=1), there.sum(axis=1)
+
+
+def consistency(nis: FloatArray, dof: FloatArray, innovations: FloatArray) -> Consistency:
+    """Judge innovations: their sum of squares by χ², their independence by the autocorrelation.
+
+    Parameters
+    ----------
+    nis, dof : ndarray
+        Normalised innovation squared and its degrees of freedom, shape ``(n_epochs,)``.
+    innovations : ndarray
+        Standardised, NaN where there is none, shape ``(n_epochs, n)``.
+
+    References
+    ----------
+    BarShalom2001, section 5.4.
+    """
+    judged = dof > 0
+    total, degrees = float(nis[judged].sum()), float(dof[judged].sum())
+    tail = stats.chi2.sf(total, degrees) if degrees else 0.5
+    sums, counts = neighbours(innovations)
+    n = int(counts.sum())
+    scale = float(np.sqrt(np.sum(sums**2)))
+    size = float(np.mean(innovations[np.isfinite(innovations)] ** 2)) if n else 1.0
+    correlation = float(sums.sum()) / n / max(size, 1e-12) if n else 0.0
+    return Consistency(
+        nis=total / degrees if degrees else 1.0,
+        p_value=float(2 * min(tail, 1 - tail)),
+        autocorrelation=correlation,
+        autocorrelation_p_value=float(2 * stats.norm.sf(abs(sums.sum()) / scale)) if scale else 1.0,
+    )
 
 
 def track(history: History, stage: Stage | None = None) -> Track:
@@ -420,7 +644,7 @@ def _effects(space: StateSpace, bank: Bank, sources: tuple[str, ...]) -> tuple[E
     places += [
         (f"{step.kind}:{step.name or step.source}", space.jump(j).start)
         for j, step in enumerate(space.steps)
-        if step.kind not in MOVES
+        if not step.changes_modes
     ]
     effects = [
         Effect(mode, name, float(mean[first + i]), float(std[first + i]))
@@ -436,3 +660,31 @@ def _effects(space: StateSpace, bank: Bank, sources: tuple[str, ...]) -> tuple[E
         spread = float(np.sqrt(bank.weight @ (values - scale) ** 2))
         effects.append(Effect("", f"scale:{source}", scale, spread))
     return tuple(effects)
+
+
+def accepted_estimates(history: History, followed: Track) -> History:
+    """Give a history as its track takes it: with all steps, without the outliers."""
+    values = [np.array(part) for part in (history.ln_frequency, history.ln_damping, history.cov)]
+    ln_f, ln_zeta, cov = values
+    r = len(history.series)
+    for k, mode in followed.outliers:
+        own = history.columns(mode)
+        ln_f[k, own] = ln_zeta[k, own] = np.nan
+        both = [*own, *(r + i for i in own)]
+        cov[k, both], cov[k][:, both] = np.nan, np.nan
+    return replace(history, ln_frequency=ln_f, ln_damping=ln_zeta, cov=cov, steps=followed.steps)
+
+
+def outlier_refusals(history: History, followed: Track) -> list[Refusal]:
+    """Tell which estimates the track hardly believed."""
+    refused = []
+    for k, mode in followed.outliers:
+        i, own = followed.modes.index(mode), history.columns(mode)
+        found = float(np.exp(np.nanmean(history.ln_frequency[k, own])))
+        before = float(np.exp(followed.ln_frequency[max(k - 1, 0), i]))
+        detail = (
+            f"{found:.5g} Hz, or its damping, lies far from what all logs before it tell "
+            f"({before:.5g} Hz): a jump is believed once the next log confirms it"
+        )
+        refused.append(Refusal(log=history.logs[k], mode=mode, reason="jump", detail=detail))
+    return refused

@@ -1,0 +1,70 @@
+"""Covariates of ln f (temperature, payload, position) as regressors of the state space."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import pandas as pd
+
+from lmshealth._arrays import FloatArray
+from lmshealth.stage.description import Covariate, Stage
+from lmshealth.tracking import constants
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Regressor:
+    """One column that ln f depends on without wear.
+
+    Attributes
+    ----------
+    name : str
+        Of the covariate, with ``^2`` for its square.
+    values : ndarray
+        Offset from the reference, 0 where unknown, shape ``(n_logs,)``.
+    prior_std : float
+        Of d ln f per unit.
+    unknown : ndarray
+        Variance that ln f has where the value is unknown, shape ``(n_logs,)``.
+    """
+
+    name: str
+    values: FloatArray
+    prior_std: float
+    unknown: FloatArray
+
+
+def regressors(covariates: Mapping[str, FloatArray], stage: Stage | None) -> tuple[Regressor, ...]:
+    """Take the covariates that are asked for and known in at least one log.
+
+    Without a stage every covariate present is taken, about its median. Keys are column names,
+    values of shape ``(n_logs,)``.
+    """
+    wanted = (
+        stage.description.covariate
+        if stage is not None
+        else tuple(
+            Covariate(name, float(np.nanmedian(values)), constants.COVARIATE_STD)
+            for name, values in covariates.items()
+            if np.isfinite(values).any()
+        )
+    )
+    found: list[Regressor] = []
+    for covariate in wanted:
+        values = covariates.get(covariate.name)
+        if values is None or not np.isfinite(values).any():
+            continue
+        known = np.isfinite(values)
+        offset = np.where(known, values - covariate.reference, 0.0)
+        # What never leaves its reference moves nothing.
+        if not offset.any():
+            continue
+        # Of the values up to each log: no log knows of later ones.
+        spread = pd.Series(values).expanding().std(ddof=0).fillna(0.0).clip(lower=1.0).to_numpy()
+        unknown = np.where(known, 0.0, (covariate.prior_std * spread) ** 2)
+        found.append(Regressor(covariate.name, offset, covariate.prior_std, unknown))
+        if covariate.curvature_std:
+            name, std = f"{covariate.name}^2", covariate.curvature_std
+            found.append(Regressor(name, offset**2, std, np.zeros_like(unknown)))
+    return tuple(found)
