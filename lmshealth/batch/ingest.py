@@ -21,7 +21,7 @@ from lmshealth.io.reading import content_digest, read_log, require_identity
 from lmshealth.io.refusal import visible
 from lmshealth.modal.identification import identify
 from lmshealth.signal.following_error import loop_error
-from lmshealth.signal.waterfall import read_levels
+from lmshealth.signal.waterfall import relative_spectrum
 from lmshealth.stage.description import Stage
 from lmshealth.tracking.history import LogEstimates
 
@@ -256,7 +256,7 @@ def _remembered(
 
 def _taker(stages: Sequence[Stage], metadata: Metadata) -> str | None:
     """Digest of the description that a log belongs to."""
-    return next((stage.digest for stage in stages if stage.takes(metadata)), None)
+    return next((stage.digest for stage in stages if stage.matches(metadata)), None)
 
 
 def _none_of(stages: Sequence[Stage]) -> str:
@@ -304,12 +304,12 @@ def identify_log(
 
 def _identified(log: Log, stages: tuple[Stage, ...]) -> LogEstimates:
     """Identify a log by the description that takes it."""
-    stage = next((stage for stage in stages if stage.takes(log.metadata)), None)
+    stage = next((stage for stage in stages if stage.matches(log.metadata)), None)
     if stage is None:
         raise BadLog(log.name, "no-stage", _untaken(log.metadata, stages))
     modes = identify(log, stage)
     return LogEstimates(
-        log.name, log.digest, log.metadata, modes, loop_error(log), read_levels(log, stage)
+        log.name, log.digest, log.metadata, modes, loop_error(log), relative_spectrum(log, stage)
     )
 
 

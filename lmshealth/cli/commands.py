@@ -257,11 +257,11 @@ def stage(reference: str, style: str) -> None:
     """
     from lmshealth.cli.stageview import print_stage
     from lmshealth.report.tables import stage_rows
-    from lmshealth.stage.check import examine, findings
+    from lmshealth.stage.check import check_stage, diagnose
     from lmshealth.stage.description import load_stage
 
-    examined = examine(load_stage(reference))
-    content = stage_rows(examined, findings(examined))
+    examined = check_stage(load_stage(reference))
+    content = stage_rows(examined, diagnose(examined))
     if style == "json":
         terminal.print_json(content)
     else:

@@ -23,8 +23,8 @@ from lmshealth.health.epoch_posterior import EpochPosterior, MachineDrifts
 from lmshealth.health.laplace import approximate
 from lmshealth.health.results import Health
 from lmshealth.stage.description import Stage
-from lmshealth.stage.identifiability import identifiable, sight_of
-from lmshealth.stage.priors import JointPrior, joined
+from lmshealth.stage.identifiability import identifiability_of, identifiable_parameters
+from lmshealth.stage.priors import JointPrior, combine_priors
 from lmshealth.tracking.read_tables import Drifts
 from lmshealth.tracking.track import Track
 
@@ -172,7 +172,7 @@ def infer_together(
                 views.append(MachineDrifts(own, *_seen(track, used, row), places))
                 priors.append(own.prior)
         if len(views) == len(machines):
-            prior = joined(priors, columns)
+            prior = combine_priors(priors, columns)
             prior = JointPrior(names, prior.priors, prior.low, prior.high)
             tasks.append(EpochPosterior(prior, tuple(views)))
             kept.append(k)
@@ -425,10 +425,12 @@ def _infer_all(
 def _identifiable(tasks: Sequence[EpochPosterior], prior: FloatArray) -> BoolArray:
     """Tell what the modes that an epoch has could tell, ``(n_epochs, n_parameters)``."""
     known: dict[tuple[tuple[str, ...], ...], BoolArray] = {}
-    sights = [sight_of(view.stage) for view in tasks[0].machines]
+    machines = [identifiability_of(view.stage) for view in tasks[0].machines]
     for task in tasks:
         modes = tuple(view.modes for view in task.machines)
         if modes not in known:
-            cut = [sight.through(own) for sight, own in zip(sights, modes, strict=True)]
-            known[modes] = identifiable(cut, [view.columns for view in task.machines], prior)
+            cut = [seen.restricted_to(own) for seen, own in zip(machines, modes, strict=True)]
+            known[modes] = identifiable_parameters(
+                cut, [view.columns for view in task.machines], prior
+            )
     return np.stack([known[tuple(view.modes for view in task.machines)] for task in tasks])

@@ -15,7 +15,7 @@ from lmshealth.signal.acceleration_levels import (
     read_magnitudes,
 )
 from lmshealth.signal.segments import Part
-from lmshealth.signal.spectral_lines import Line, survey_lines
+from lmshealth.signal.spectral_lines import Line, find_lines_by_velocity
 from lmshealth.stage.description import Stage
 
 
@@ -83,5 +83,8 @@ def survey(
         max([GRID_BAND[1], *(b.high for b in bands)]),
     )
     return Survey(
-        log.name, magnitudes, survey_lines(log, accelerometers, stage, widest), log.refused
+        log.name,
+        magnitudes,
+        find_lines_by_velocity(log, accelerometers, stage, widest),
+        log.refused,
     )

@@ -27,7 +27,7 @@ from lmshealth.modal.ambient.peak_picking import find_excess, find_peaks
 from lmshealth.modal.modes import Modes
 from lmshealth.modal.targets import USABLE, Target, choose_channels, choose_targets
 from lmshealth.signal.segments import find_segments
-from lmshealth.signal.spectra import ANY_RESONANCE, Resonances, cross_spectra
+from lmshealth.signal.spectra import ANY_RESONANCE, ResonanceRange, cross_spectra
 from lmshealth.signal.spectral_lines import Line, find_lines, name_lines
 from lmshealth.stage.constants import BAND, LEAST_RESOLUTION
 from lmshealth.stage.description import Stage
@@ -192,11 +192,11 @@ def _transform(
     )
 
 
-def _expected(target: Target) -> Resonances:
+def _expected(target: Target) -> ResonanceRange:
     """Say where a mode may stand; its damping may be half of what is known of it."""
     low, high = target.band(1.0)
     low, high = low * (1 - target.search), high * (1 + target.search)
-    return Resonances(low, high, target.damping_ratio / 2)
+    return ResonanceRange(low, high, target.damping_ratio / 2)
 
 
 def _search(

@@ -13,7 +13,7 @@ from lmshealth.prognosis.first_passage import first_passage
 from lmshealth.prognosis.life_posterior import LifePosterior, fit_life
 from lmshealth.prognosis.results import LawWeight, Prognosis
 from lmshealth.stage.description import ParameterSpec, Stage
-from lmshealth.stage.identifiability import identifiable, sight_of
+from lmshealth.stage.identifiability import identifiability_of
 from lmshealth.tracking.history import History
 
 _STEP = 1 << 21
@@ -237,6 +237,7 @@ def parameters_with_limit(stage: Stage) -> list[tuple[int, ParameterSpec]]:
 
 def identifiable_limits(stage: Stage, modes: Sequence[str]) -> list[tuple[int, ParameterSpec]]:
     """Parameters that have a limit and that endless logs with some modes would tell."""
-    sight = sight_of(stage).through(modes)
-    seen = identifiable([sight], [range(len(stage.parameters))], stage.prior.variance)
+    information = identifiability_of(stage).restricted_to(modes)
+    columns = [range(len(stage.parameters))]
+    seen = identifiable_parameters([information], columns, information.prior)
     return [(j, p) for j, p in parameters_with_limit(stage) if seen[j]]

@@ -27,11 +27,11 @@ from lmshealth.signal.following_error import FollowingError
 from lmshealth.signal.spectral_lines import Line
 from lmshealth.stage.check import (
     USUAL_DURATION,
-    Coverage,
-    Examination,
-    Finding,
+    Diagnostic,
+    MapRange,
     ModeCheck,
-    Telling,
+    ParameterCheck,
+    StageCheck,
 )
 from lmshealth.stage.planning import Plan
 from lmshealth.tracking.history import LogEstimates
@@ -506,9 +506,9 @@ def plan_rows(plans: Sequence[Plan]) -> dict[str, list[Row]]:
     }
 
 
-def stage_rows(examined: Examination, found: Sequence[Finding]) -> dict[str, list[Row]]:
+def stage_rows(examined: StageCheck, found: Sequence[Diagnostic]) -> dict[str, list[Row]]:
     """List what an examination of a stage description measured, and what it comes to."""
-    names = [telling.parameter for telling in examined.tellings]
+    names = [check.parameter for check in examined.parameters]
     return {
         "stage": [
             {
@@ -520,8 +520,8 @@ def stage_rows(examined: Examination, found: Sequence[Finding]) -> dict[str, lis
         ],
         "modes": [_mode_row(check) for check in examined.modes],
         "parameters": [
-            _parameter_row(coverage, telling)
-            for coverage, telling in zip(examined.coverage, examined.tellings, strict=True)
+            _parameter_row(ranges, check)
+            for ranges, check in zip(examined.ranges, examined.parameters, strict=True)
         ],
         "sensitivities": [
             {
@@ -558,26 +558,26 @@ def _mode_row(check: ModeCheck) -> Row:
     }
 
 
-def _parameter_row(coverage: Coverage, telling: Telling) -> Row:
-    spec = coverage.parameter
+def _parameter_row(ranges: MapRange, check: ParameterCheck) -> Row:
+    spec = ranges.parameter
     levels = ("q005", "q05", "q95", "q995")
     return {
         "parameter": spec.name,
         "baseline": spec.baseline,
         "limit": spec.limit.below if spec.limit else None,
-        "limit_on_map": coverage.holds_limit if spec.limit else None,
-        "map_low": coverage.low,
-        "map_high": coverage.high,
-        **{f"prior_{key}": value for key, value in zip(levels, coverage.prior, strict=True)},
-        "prior_below_map": coverage.below,
-        "prior_above_map": coverage.above,
-        "prior_std_ln": telling.prior_std,
-        "logs_std_ln": telling.usual_std,
-        "endless_logs_std_ln": telling.endless_std,
-        "exact_map_std_ln": telling.exact_map_std,
-        "others_known_std_ln": telling.known_std,
-        "informed": telling.informed(telling.usual_std),
-        "verdict": telling.verdict,
+        "limit_on_map": ranges.holds_limit if spec.limit else None,
+        "map_low": ranges.low,
+        "map_high": ranges.high,
+        **{f"prior_{key}": value for key, value in zip(levels, ranges.prior, strict=True)},
+        "prior_below_map": ranges.below,
+        "prior_above_map": ranges.above,
+        "prior_std_ln": check.prior_std,
+        "logs_std_ln": check.usual_std,
+        "endless_logs_std_ln": check.endless_std,
+        "exact_map_std_ln": check.exact_map_std,
+        "others_known_std_ln": check.known_std,
+        "informed": check.informed(check.usual_std),
+        "verdict": check.verdict,
     }
 
 

@@ -12,7 +12,7 @@ from scipy.special import stdtr
 from lmshealth.errors import BadLog
 from lmshealth.io.log import Channel, Log
 from lmshealth.signal.harmonics import Harmonics, decompose
-from lmshealth.signal.segments import Part, Segment, select_segments, set_velocity
+from lmshealth.signal.segments import Part, Segment, nominal_velocity, select_segments
 from lmshealth.stage.description import Stage
 
 # Without a description: the rows of the paper's Tables 6 and 7.
@@ -29,7 +29,7 @@ BandKind = Literal["mode", "grid", "health", "watch"]
 
 
 @dataclass(frozen=True, slots=True)
-class Band:
+class FrequencyBand:
     """A band of frequencies that is read as one number.
 
     Attributes
@@ -63,7 +63,7 @@ class Magnitude:
         Set velocity in m/s, NaN where unknown.
     channel : str
         The accelerometer.
-    band : Band
+    band : FrequencyBand
         Where.
     magnitude, frequency : float
         Amplitude in m/s² and frequency in Hz of the strongest harmonic of the longest stretch.
@@ -79,7 +79,7 @@ class Magnitude:
     stage: str
     velocity: float
     channel: str
-    band: Band
+    band: FrequencyBand
     magnitude: float
     frequency: float
     resolution: float
@@ -126,7 +126,7 @@ class Growth:
 
 def choose_bands(
     stage: Stage | None, found: Mapping[str, float] | None, span: tuple[float, float] | None
-) -> tuple[Band, ...]:
+) -> tuple[FrequencyBand, ...]:
     """Choose what is read: modes and bands of the description, or the paper's grid without one.
 
     Parameters
@@ -141,29 +141,31 @@ def choose_bands(
 
     Returns
     -------
-    tuple of Band
+    tuple of FrequencyBand
         Modes or grid ascending in frequency, then health band, then watched bands.
     """
     if stage is None:
         low, high = span or GRID_BAND
         grid = GRID * np.arange(np.ceil(low / GRID), np.floor(high / GRID) + 1)
         return tuple(
-            Band(f"{f:g} Hz", "grid", f - GRID / 2, f + GRID / 2) for f in grid.tolist() if f > 0
+            FrequencyBand(f"{f:g} Hz", "grid", f - GRID / 2, f + GRID / 2)
+            for f in grid.tolist()
+            if f > 0
         )
     bands = _mode_bands(stage, found or {}, span)
     description = stage.description
     if description.health_band_hz is not None:
         low, high = description.health_band_hz
-        bands.append(Band(f"{low:g}-{high:g} Hz", "health", low, high))
+        bands.append(FrequencyBand(f"{low:g}-{high:g} Hz", "health", low, high))
     for watch in description.watch:
         name = f"{watch.low_hz:g}-{watch.high_hz:g} Hz"
-        bands.append(Band(name, "watch", watch.low_hz, watch.high_hz))
+        bands.append(FrequencyBand(name, "watch", watch.low_hz, watch.high_hz))
     return tuple(bands)
 
 
 def _mode_bands(
     stage: Stage, found: Mapping[str, float], span: tuple[float, float] | None
-) -> list[Band]:
+) -> list[FrequencyBand]:
     """Bands about the modes; where two touch, they part in the middle."""
     low, high = span or (0.0, np.inf)
     places = sorted(
@@ -179,12 +181,14 @@ def _mode_bands(
             below = max(below, (places[i - 1][0] + f) / 2)
         if i + 1 < len(places):
             above = min(above, (places[i + 1][0] + f) / 2)
-        bands.append(Band(name, "mode", below, above, "identified" if name in found else "stage"))
+        bands.append(
+            FrequencyBand(name, "mode", below, above, "identified" if name in found else "stage")
+        )
     return bands
 
 
 def read_magnitudes(
-    log: Log, bands: Iterable[Band], *, part: Part = "record"
+    log: Log, bands: Iterable[FrequencyBand], *, part: Part = "record"
 ) -> tuple[Magnitude, ...]:
     """Read every accelerometer of a log in every band.
 
@@ -192,7 +196,7 @@ def read_magnitudes(
     ----------
     log : Log
         With at least one acceleration channel.
-    bands : iterable of Band
+    bands : iterable of FrequencyBand
         Those that reach beyond half the sample rate are passed over.
     part : str
         Which stretches of the log; see `select_segments`.
@@ -223,7 +227,7 @@ def read_magnitudes(
         )
     segments = select_segments(log, part)
     usable = _usable(log, bands, max(s.stop - s.start for s in segments))
-    velocity = set_velocity(log)
+    velocity = nominal_velocity(log)
     return tuple(
         Magnitude(log.name, log.metadata.stage or "", velocity, channel.name, band, *reading)
         for channel in channels
@@ -233,7 +237,7 @@ def read_magnitudes(
     )
 
 
-def _usable(log: Log, bands: Iterable[Band], longest: int) -> list[Band]:
+def _usable(log: Log, bands: Iterable[FrequencyBand], longest: int) -> list[FrequencyBand]:
     asked = tuple(bands)
     usable = [band for band in asked if band.high < log.sample_rate / 2]
     if not usable:
@@ -267,7 +271,10 @@ class _Reading(NamedTuple):
 
 
 def _read(
-    channel: Channel, sample_rate: float, segments: Sequence[Segment], bands: Sequence[Band]
+    channel: Channel,
+    sample_rate: float,
+    segments: Sequence[Segment],
+    bands: Sequence[FrequencyBand],
 ) -> list[_Reading]:
     """Read all bands of a channel, one stretch at a time, the longest first."""
     ordered = sorted(segments, key=lambda s: s.start - s.stop)

@@ -16,8 +16,8 @@ from lmshealth.signal.segments import (
     Part,
     Segment,
     find_segments,
+    nominal_velocity,
     select_segments,
-    set_velocity,
 )
 
 COUNT = 100
@@ -159,7 +159,7 @@ def read_error(
             f"{needed / log.sample_rate:.3g} s: record longer or lower --count",
         )
 
-    velocity = set_velocity(log)
+    velocity = nominal_velocity(log)
     readings = []
     for channel in channels:
         lowest, highest, mean, std = _statistics(channel, segments)

@@ -42,7 +42,7 @@ _EDGE = 45.0
 _MOST_OCTAVES = 40
 
 
-def find_sines(
+def detect_sinusoids(
     lengths: Sequence[int],
     read: Callable[[int], FloatArray],
     sample_rate: float,

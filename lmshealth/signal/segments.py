@@ -205,7 +205,7 @@ def select_segments(log: Log, part: Part) -> tuple[Segment, ...]:
     return chosen
 
 
-def set_velocity(log: Log) -> float:
+def nominal_velocity(log: Log) -> float:
     """Tell the one velocity a log was set to, in m/s, whatever its direction.
 
     By the set point; without it by the metadata. NaN where neither tells, or where the set point

@@ -14,7 +14,7 @@ from lmshealth._arrays import BoolArray, ComplexArray, FloatArray, freeze
 from lmshealth.io.buffers import MINUTE
 from lmshealth.io.log import Channel
 from lmshealth.signal.segments import Segment
-from lmshealth.signal.tone_removal import remove_tones
+from lmshealth.signal.tone_removal import remove_sinusoids
 
 # The second difference of a displacement reaches over this part of the shortest period.
 _LAG_PERIODS = 8.0
@@ -173,7 +173,7 @@ def median_ordinate(count: int) -> float:
     return float(gamma.ppf(0.5, count)) / count
 
 
-class Resonances(NamedTuple):
+class ResonanceRange(NamedTuple):
     """Where resonances may stand, in Hz, and the least damping ratio that they may have."""
 
     low: float
@@ -187,7 +187,7 @@ class Resonances(NamedTuple):
         return np.asarray(within & (width < _TOLD_APART))
 
 
-ANY_RESONANCE = (Resonances(0.0, np.inf, 0.005),)
+ANY_RESONANCE = (ResonanceRange(0.0, np.inf, 0.005),)
 
 
 def cross_spectra(
@@ -197,7 +197,7 @@ def cross_spectra(
     top: float,
     *,
     ceiling: float = np.inf,
-    resonances: Sequence[Resonances] = ANY_RESONANCE,
+    resonances: Sequence[ResonanceRange] = ANY_RESONANCE,
 ) -> tuple[CrossSpectrum, ...]:
     """Transform all channels segment by segment, and average the parts of long stretches.
 
@@ -238,7 +238,7 @@ def _cross_spectrum(
     segment: Segment,
     sample_rate: float,
     reach: tuple[float, float],
-    resonances: Sequence[Resonances],
+    resonances: Sequence[ResonanceRange],
 ) -> CrossSpectrum:
     top, ceiling = reach
     parts = [as_acceleration(channel, segment, sample_rate, top) for channel in channels]
@@ -256,7 +256,7 @@ def _cross_spectrum(
         x = x[short - lag : n + short - lag]
         transforms[:, c] = _transform(x, lag, frequency, sample_rate)
     spared = np.any([r.like_lines(frequency, n / sample_rate) for r in resonances], axis=0)
-    transforms, free, tones = remove_tones(transforms, n / sample_rate, spared)
+    transforms, free, tones = remove_sinusoids(transforms, n / sample_rate, spared)
     step = sample_rate / n
     lines = tuple(
         # Σ I = A² T / 2 over the ordinates of a sine.

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 from lmshealth._arrays import FloatArray
 from lmshealth.io.log import Channel, Log
-from lmshealth.signal.multitaper_test import find_sines
+from lmshealth.signal.multitaper_test import detect_sinusoids
 from lmshealth.signal.segments import Segment, find_segments
 from lmshealth.signal.spectra import WANDER, as_acceleration, lag_gain
 from lmshealth.stage.description import Stage
@@ -66,8 +66,8 @@ def find_lines(
     band : (float, float)
         Where to look, in Hz; the first and last four ordinates cannot be tested.
     false_alarm : float
-        Probability that a segment without lines shows any in the band; see `find_sines` for the
-        resonances that this holds for.
+        Probability that a segment without lines shows any in the band; see
+        `detect_sinusoids` for the resonances that this holds for.
 
     Returns
     -------
@@ -95,7 +95,7 @@ def _find_together(
 
     _, lag = read(0)
     lengths = [max(segment.stop - segment.start - 2 * lag, 0) for segment in segments]
-    found = find_sines(lengths, lambda k: read(k)[0], sample_rate, band, false_alarm)
+    found = detect_sinusoids(lengths, lambda k: read(k)[0], sample_rate, band, false_alarm)
     if lag:
         found[:, 1] *= lag_gain(found[:, 0], lag, sample_rate)
     return found
@@ -142,7 +142,7 @@ class _Sighting:
     resolution: float
 
 
-def survey_lines(
+def find_lines_by_velocity(
     log: Log,
     channels: Sequence[Channel],
     stage: Stage | None,

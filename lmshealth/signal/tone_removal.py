@@ -39,7 +39,7 @@ _TOGETHER, _FOOT = 6, 4
 _SKIRT = 0.05
 
 
-class Tone(NamedTuple):
+class Sinusoid(NamedTuple):
     """A tone: index of its channel, its ordinate (a fraction between two) and its mean power.
 
     The power is the one-sided periodogram that it has in its ordinates together.
@@ -50,9 +50,9 @@ class Tone(NamedTuple):
     power: float
 
 
-def remove_tones(
+def remove_sinusoids(
     transforms: ComplexArray, duration: float, spared: BoolArray
-) -> tuple[ComplexArray, BoolArray, tuple[Tone, ...]]:
+) -> tuple[ComplexArray, BoolArray, tuple[Sinusoid, ...]]:
     """Take out the tones of a segment.
 
     Parameters
@@ -71,7 +71,7 @@ def remove_tones(
         Without the tones, same shape; where they stood too little is left.
     free : ndarray of bool
         Ordinates at which no tone stands, shape ``(n_ordinates,)``.
-    tones : tuple of Tone
+    tones : tuple of Sinusoid
         Each in the channel that shows it most clearly.
     """
     free = np.ones(len(transforms), dtype=bool)
@@ -81,7 +81,7 @@ def remove_tones(
     turn = np.where(np.arange(len(transforms)) % 2, -1.0, 1.0)[:, None]
     rest = transforms * turn
     choice = tuple(k for k in _TERMS if k <= max(_TERMS[0], _TERMS_PER_SECOND * duration))
-    tones: list[Tone] = []
+    tones: list[Sinusoid] = []
     for _ in range(_MOST_ROUNDS):
         peaks = [k for k in _towering(_filled(rest, free)) if free[k] and not spared[k]]
         found = _take_out(rest, free, peaks, choice)
@@ -93,7 +93,7 @@ def remove_tones(
 
 def _take_out(
     rest: ComplexArray, free: BoolArray, peaks: list[int], choice: tuple[int, ...]
-) -> list[Tone]:
+) -> list[Sinusoid]:
     """Take out of ``rest`` and of ``free`` what is a tone of some peaks."""
     tones = []
     for at in peaks:
@@ -114,7 +114,7 @@ def _take_out(
         channel = int(np.argmax(power / level))
         # What the noise adds by itself is not the tone's.
         own = max(0.0, float(power[channel] - terms * level[channel]))
-        tones.append(Tone(channel, float(places[0]), own))
+        tones.append(Sinusoid(channel, float(places[0]), own))
         # Its skirt falls with the square of the distance.
         reach = max(_REACH, int(np.sqrt(np.max(power / level) / _SKIRT) / np.pi))
         reached = slice(max(0, at - reach), min(at + reach + 1, len(rest)))

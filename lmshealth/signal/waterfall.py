@@ -24,7 +24,7 @@ _LEAST_SHARE = 1e-9
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Levels:
+class RelativeSpectrum:
     """How strongly a log shows each frequency of the band of the tracked modes.
 
     Attributes
@@ -73,7 +73,7 @@ class Waterfall:
         freeze(self)
 
     @classmethod
-    def stack(cls, logs: Sequence[tuple[Levels | None, Sequence[Line]]]) -> Self | None:
+    def stack(cls, logs: Sequence[tuple[RelativeSpectrum | None, Sequence[Line]]]) -> Self | None:
         """Put logs that were read with one description side by side; None without any levels."""
         there = [levels for levels, _ in logs if levels is not None]
         if not there:
@@ -98,7 +98,7 @@ def shown_band(stage: Stage) -> tuple[float, float]:
     )
 
 
-def read_levels(log: Log, stage: Stage, *, n_bins: int = BINS) -> Levels | None:
+def relative_spectrum(log: Log, stage: Stage, *, n_bins: int = BINS) -> RelativeSpectrum | None:
     """Read how strongly a log shows each frequency of the band of the tracked modes.
 
     Stretches of constant velocity are cut into parts that resolve the bins, and their periodograms
@@ -118,7 +118,7 @@ def read_levels(log: Log, stage: Stage, *, n_bins: int = BINS) -> Levels | None:
 
     Returns
     -------
-    Levels or None
+    RelativeSpectrum or None
         None where nothing can be read: no such channel, no stretch of twenty periods, or a sample
         rate that does not reach the band.
     """
@@ -138,7 +138,7 @@ def read_levels(log: Log, stage: Stage, *, n_bins: int = BINS) -> Levels | None:
     if not total[below].any():
         return None
     decibel = 10 * np.log10((total / len(channels)).clip(_LEAST_SHARE))
-    return Levels(low, high, np.where(below, decibel, np.nan))
+    return RelativeSpectrum(low, high, np.where(below, decibel, np.nan))
 
 
 def _cut(segments: Sequence[Segment], size: float) -> list[Segment]:

@@ -1,13 +1,4 @@
-"""Examination of a stage description: what its map covers, and what its modes can tell.
-
-After N logs now and at the baseline the ln parameters x have the covariance P, for small changes,
-as `sight` has it. The data inform about parameter j by 1 - P_jj / Λ_j, one minus the share of its
-prior's variance that is left. Were the other parameters known, 1 / Q_jj would be left, Q being the
-inverse of P. That is also the variance of the combination Σ_k (Q_jk / Q_jj) x_k, of all with x_j in
-them the one known best.
-
-Findings: what an examination of a stage description comes to, in sentences.
-"""
+"""Check of a stage description: range of its map, and the parameters that its modes identify."""
 
 from __future__ import annotations
 
@@ -21,7 +12,7 @@ import numpy as np
 from lmshealth._arrays import FloatArray, freeze
 from lmshealth.stage.constants import INFORMED
 from lmshealth.stage.description import ModeSpec, ParameterSpec, Stage
-from lmshealth.stage.identifiability import Sight, sight_of
+from lmshealth.stage.identifiability import Identifiability, identifiability_of
 
 # Surrogates are to be this good: an error of ln f that no measurement comes near.
 SURROGATE_TARGET = 1e-5
@@ -70,7 +61,7 @@ class ModeCheck:
 
 
 @dataclass(frozen=True, slots=True)
-class Coverage:
+class MapRange:
     """How far the map reaches for one parameter.
 
     Attributes
@@ -100,7 +91,7 @@ class Coverage:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Telling:
+class ParameterCheck:
     """What the modes can tell of one parameter; standard deviations are of its logarithm.
 
     Attributes
@@ -138,7 +129,7 @@ class Telling:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Examination:
+class StageCheck:
     """What a stage description can do.
 
     Attributes
@@ -147,9 +138,9 @@ class Examination:
         Of the description.
     modes : tuple of ModeCheck
         All that are described.
-    coverage : tuple of Coverage
+    ranges : tuple of MapRange
         One per parameter; empty without a map.
-    tellings : tuple of Telling
+    parameters : tuple of ParameterCheck
         One per parameter.
     informative : tuple of str
         Modes in whose order the sensitivities stand.
@@ -168,8 +159,8 @@ class Examination:
 
     name: str
     modes: tuple[ModeCheck, ...]
-    coverage: tuple[Coverage, ...]
-    tellings: tuple[Telling, ...]
+    ranges: tuple[MapRange, ...]
+    parameters: tuple[ParameterCheck, ...]
     informative: tuple[str, ...]
     slopes: FloatArray
     limit_slopes: FloatArray
@@ -182,7 +173,7 @@ class Examination:
         freeze(self)
 
 
-def examine(stage: Stage) -> Examination:
+def check_stage(stage: Stage) -> StageCheck:
     """Examine what the map of a stage description covers, and what its modes can tell.
 
     Parameters
@@ -192,15 +183,15 @@ def examine(stage: Stage) -> Examination:
 
     Returns
     -------
-    Examination
+    StageCheck
     """
     if stage.modal_map is None:
         none = np.empty((0, 0))
-        return Examination(
+        return StageCheck(
             name=stage.name,
             modes=tuple(ModeCheck(mode, informs=False) for mode in stage.modes),
-            coverage=(),
-            tellings=(),
+            ranges=(),
+            parameters=(),
             informative=(),
             slopes=none,
             limit_slopes=none,
@@ -209,26 +200,26 @@ def examine(stage: Stage) -> Examination:
             model_std=np.nan,
             unused=(),
         )
-    sight = sight_of(stage)
-    rows = [stage.modal_map.modes.index(mode.name) for mode in sight.modes]
+    information = identifiability_of(stage)
+    rows = [stage.modal_map.modes.index(mode.name) for mode in information.modes]
     limits = _limits(stage)
-    usual = sight.drift_variance(USUAL_DURATION, sight.n_baseline)
-    cov = np.linalg.inv(sight.precision(usual))
+    usual = information.drift_variance(USUAL_DURATION, information.n_baseline)
+    cov = np.linalg.inv(information.precision(usual))
     std = np.sqrt(np.diag(cov))
     described = {mode.name for mode in stage.modes}
-    return Examination(
+    return StageCheck(
         name=stage.name,
-        modes=tuple(_check(stage, mode, sight, limits) for mode in stage.modes),
-        coverage=tuple(_cover(stage, k) for k in range(len(stage.parameters))),
-        tellings=tuple(_tell(sight, j, usual) for j in range(len(stage.parameters))),
-        informative=tuple(mode.name for mode in sight.modes),
-        slopes=sight.slopes,
-        limit_slopes=np.full(sight.slopes.shape, np.nan)
+        modes=tuple(_check(stage, mode, information, limits) for mode in stage.modes),
+        ranges=tuple(_cover(stage, k) for k in range(len(stage.parameters))),
+        parameters=tuple(_tell(information, j, usual) for j in range(len(stage.parameters))),
+        informative=tuple(mode.name for mode in information.modes),
+        slopes=information.slopes,
+        limit_slopes=np.full(information.slopes.shape, np.nan)
         if limits is None
         else stage.modal_map.gradient(limits[None])[0, rows],
         correlation=cov / np.outer(std, std),
-        n_logs=sight.n_baseline,
-        model_std=sight.model_std,
+        n_logs=information.n_baseline,
+        model_std=information.model_std,
         unused=tuple(name for name in stage.modal_map.modes if name not in described),
     )
 
@@ -243,7 +234,9 @@ def _limits(stage: Stage) -> FloatArray | None:
     return point if stage.modal_map.inside(point[None]).all() else None
 
 
-def _check(stage: Stage, mode: ModeSpec, sight: Sight, limits: FloatArray | None) -> ModeCheck:
+def _check(
+    stage: Stage, mode: ModeSpec, information: Identifiability, limits: FloatArray | None
+) -> ModeCheck:
     known = stage.modal_map
     if known is None or mode.name not in known.modes:
         return ModeCheck(mode, informs=False)
@@ -252,8 +245,8 @@ def _check(stage: Stage, mode: ModeSpec, sight: Sight, limits: FloatArray | None
     def frequency(point: FloatArray) -> float:
         return float(np.exp(known.ln_frequency(point[None])[0, column]))
 
-    reached = replace(sight, modes=(mode,), _known={}).drift_variance(
-        USUAL_DURATION, sight.n_baseline
+    reached = replace(information, modes=(mode,), _known={}).drift_variance(
+        USUAL_DURATION, information.n_baseline
     )
     return ModeCheck(
         mode,
@@ -265,13 +258,13 @@ def _check(stage: Stage, mode: ModeSpec, sight: Sight, limits: FloatArray | None
     )
 
 
-def _cover(stage: Stage, column: int) -> Coverage:
+def _cover(stage: Stage, column: int) -> MapRange:
     assert stage.modal_map is not None
     parameter = stage.parameters[column]
     ends = np.exp([stage.modal_map.low[column], stage.modal_map.high[column]])
     below, upto = parameter.prior.probability(ends)
     lowest, low, high, highest = parameter.prior.quantile(np.array([0.005, 0.05, 0.95, 0.995]))
-    return Coverage(
+    return MapRange(
         parameter=parameter,
         low=float(ends[0]),
         high=float(ends[1]),
@@ -281,18 +274,18 @@ def _cover(stage: Stage, column: int) -> Coverage:
     )
 
 
-def _tell(sight: Sight, j: int, usual: FloatArray) -> Telling:
-    def left(view: Sight, noise: FloatArray) -> float:
+def _tell(information: Identifiability, j: int, usual: FloatArray) -> ParameterCheck:
+    def left(view: Identifiability, noise: FloatArray) -> float:
         return float(np.sqrt(np.linalg.inv(view.precision(noise))[j, j]))
 
-    precision = sight.precision(sight.endless_variance())
-    found = Telling(
-        parameter=sight.parameters[j],
+    precision = information.precision(information.limiting_variance())
+    found = ParameterCheck(
+        parameter=information.parameters[j],
         verdict="not-told",
-        prior_std=float(np.sqrt(sight.prior[j])),
-        usual_std=left(sight, usual),
-        endless_std=left(sight, sight.endless_variance()),
-        exact_map_std=left(replace(sight, model_std=0.0), usual),
+        prior_std=float(np.sqrt(information.prior[j])),
+        usual_std=left(information, usual),
+        endless_std=left(information, information.limiting_variance()),
+        exact_map_std=left(replace(information, model_std=0.0), usual),
         known_std=float(1 / np.sqrt(precision[j, j])),
         exponents=precision[j] / precision[j, j],
     )
@@ -312,7 +305,7 @@ _CUT, _CORRELATED, _SLIGHT = 0.01, 0.5, 0.05
 
 
 @dataclass(frozen=True, slots=True)
-class Finding:
+class Diagnostic:
     """One sentence or two about a stage description.
 
     Attributes
@@ -330,78 +323,78 @@ class Finding:
     text: str
 
 
-def findings(examined: Examination) -> tuple[Finding, ...]:
+def diagnose(examined: StageCheck) -> tuple[Diagnostic, ...]:
     """Say what an examination comes to.
 
     Parameters
     ----------
-    examined : Examination
+    examined : StageCheck
         What was measured.
 
     Returns
     -------
-    tuple of Finding
+    tuple of Diagnostic
         Of the parameters first, then of the map and the modes.
     """
-    if not examined.tellings:
+    if not examined.parameters:
         text = (
             "No [[parameter]], so modes are followed and no health is inferred. For health "
             "describe [[parameter]] and a [map] that says what it does to the modes."
         )
-        return (Finding("parameters", True, text),)
+        return (Diagnostic("parameters", True, text),)
     return (
-        *(_told(examined, telling) for telling in examined.tellings),
+        *(_told(examined, check) for check in examined.parameters),
         *_correlated(examined),
         _surrogate(examined),
-        *(found for coverage in examined.coverage for found in _covered(coverage)),
+        *(found for ranges in examined.ranges for found in _covered(ranges)),
         *(found for check in examined.modes for found in _placed(check)),
         *_strangers(examined),
     )
 
 
-def _told(examined: Examination, telling: Telling) -> Finding:
-    name, before = telling.parameter, _share(telling.prior_std)
+def _told(examined: StageCheck, check: ParameterCheck) -> Diagnostic:
+    name, before = check.parameter, _share(check.prior_std)
     logs = f"{examined.n_logs} logs of {USUAL_DURATION:g} s"
-    after = _share(telling.usual_std)
-    if telling.verdict == "told":
+    after = _share(check.usual_std)
+    if check.verdict == "told":
         text = f"{name} can be told: {logs} know it to {after}, the prior alone to {before}."
-    elif telling.verdict == "longer-logs":
+    elif check.verdict == "longer-logs":
         text = (
             f"{name} can be told by more or longer logs only: {logs} know it to {after}, endless "
-            f"ones to {_share(telling.endless_std)}, the prior alone to {before}."
+            f"ones to {_share(check.endless_std)}, the prior alone to {before}."
         )
-    elif telling.verdict == "together":
+    elif check.verdict == "together":
         text = (
-            f"{name} can be told only together with others: {_combination(examined, telling)} is "
-            f"known to {_share(telling.known_std)}, {name} by itself to "
-            f"{_share(telling.endless_std)} even from endless logs, and to {before} by the prior "
+            f"{name} can be told only together with others: {_combination(examined, check)} is "
+            f"known to {_share(check.known_std)}, {name} by itself to "
+            f"{_share(check.endless_std)} even from endless logs, and to {before} by the prior "
             "alone. Track a mode that feels the parameters in another proportion."
         )
     else:
         text = (
             f"{name} is not identifiable: {logs} leave it known to {after}, endless ones to "
-            f"{_share(telling.endless_std)}, where the prior alone knows {before}. "
-            f"{_hindrance(telling)}"
+            f"{_share(check.endless_std)}, where the prior alone knows {before}. "
+            f"{_hindrance(check)}"
         )
-    return Finding("parameters", telling.verdict == "told", text)
+    return Diagnostic("parameters", check.verdict == "told", text)
 
 
-def _hindrance(telling: Telling) -> str:
-    if telling.informed(telling.exact_map_std) >= INFORMED:
+def _hindrance(check: ParameterCheck) -> str:
+    if check.informed(check.exact_map_std) >= INFORMED:
         return (
             "What it does to the modes is less than the map's error (model_std) in what the others "
-            f"do; with an exact map it would be {_share(telling.exact_map_std)}. Track a mode that "
+            f"do; with an exact map it would be {_share(check.exact_map_std)}. Track a mode that "
             "depends on it more, or make a better map."
         )
     return "The modes hardly feel it: track a mode that depends on it more."
 
 
-def _combination(examined: Examination, telling: Telling) -> str:
+def _combination(examined: StageCheck, check: ParameterCheck) -> str:
     """Write the product of powers that is known best."""
-    widths = [other.prior_std / telling.prior_std for other in examined.tellings]
+    widths = [other.prior_std / check.prior_std for other in examined.parameters]
     shown = [
         (other.parameter, exponent)
-        for other, exponent, width in zip(examined.tellings, telling.exponents, widths, strict=True)
+        for other, exponent, width in zip(examined.parameters, check.exponents, widths, strict=True)
         if abs(exponent) * width >= _SLIGHT
     ]
     return " · ".join(
@@ -409,19 +402,19 @@ def _combination(examined: Examination, telling: Telling) -> str:
     )
 
 
-def _correlated(examined: Examination) -> Iterator[Finding]:
-    told = [k for k, telling in enumerate(examined.tellings) if telling.verdict == "told"]
+def _correlated(examined: StageCheck) -> Iterator[Diagnostic]:
+    told = [k for k, check in enumerate(examined.parameters) if check.verdict == "told"]
     for i, j in combinations(told, 2):
-        first, second = (examined.tellings[k].parameter for k in (i, j))
+        first, second = (examined.parameters[k].parameter for k in (i, j))
         value = examined.correlation[i, j]
         text = f"{first} and {second} can be told apart, their errors correlate by {value:+.2f}"
         if abs(value) >= _CORRELATED:
             how = "down" if value < 0 else "up too"
             text += f": where one is estimated too high, the other tends {how}"
-        yield Finding("parameters", True, f"{text}.")
+        yield Diagnostic("parameters", True, f"{text}.")
 
 
-def _surrogate(examined: Examination) -> Finding:
+def _surrogate(examined: StageCheck) -> Diagnostic:
     """Judge the surrogate against its target and against what logs reach."""
     checks = [check for check in examined.modes if check.informs]
     worst = max(checks, key=lambda check: check.surrogate_error)
@@ -438,21 +431,21 @@ def _surrogate(examined: Examination) -> Finding:
         )
     elif not meets and share < _SLIGHT:
         text += " It does not limit what can be told."
-    return Finding("map", meets or share < _SLIGHT, text)
+    return Diagnostic("map", meets or share < _SLIGHT, text)
 
 
-def _covered(coverage: Coverage) -> Iterator[Finding]:
-    spec, ends = coverage.parameter, f"{coverage.low:.3g} to {coverage.high:.3g}"
-    outside = coverage.below + coverage.above
+def _covered(ranges: MapRange) -> Iterator[Diagnostic]:
+    spec, ends = ranges.parameter, f"{ranges.low:.3g} to {ranges.high:.3g}"
+    outside = ranges.below + ranges.above
     if outside > _CUT:
-        yield Finding(
+        yield Diagnostic(
             "map",
             False,
             f"The map of {spec.name} reaches from {ends}, and {_share(outside)} of its prior lies "
             "beyond: it is cut there. Make a wider map, or a narrower prior.",
         )
-    if not coverage.holds_limit and spec.limit is not None:
-        yield Finding(
+    if not ranges.holds_limit and spec.limit is not None:
+        yield Diagnostic(
             "map",
             False,
             f"The limit {spec.limit.below:g} of {spec.name} does not lie inside the map ({ends}), "
@@ -460,11 +453,11 @@ def _covered(coverage: Coverage) -> Iterator[Finding]:
         )
 
 
-def _placed(check: ModeCheck) -> Iterator[Finding]:
+def _placed(check: ModeCheck) -> Iterator[Diagnostic]:
     mode, (low, high) = check.mode, check.searched
     if mode.tracked and not check.informs:
         text = f"{mode.name} is followed but not on the map: it tells nothing of health."
-        yield Finding("modes", True, text)
+        yield Diagnostic("modes", True, text)
     if not check.informs:
         return
     for when, frequency in (
@@ -472,7 +465,7 @@ def _placed(check: ModeCheck) -> Iterator[Finding]:
         ("with every parameter at its limit", check.limit_frequency),
     ):
         if np.isfinite(frequency) and not check.is_searched(frequency):
-            yield Finding(
+            yield Diagnostic(
                 "modes",
                 False,
                 f"{mode.name} is looked for from {low:.4g} to {high:.4g} Hz, and the map has it at "
@@ -480,10 +473,10 @@ def _placed(check: ModeCheck) -> Iterator[Finding]:
             )
 
 
-def _strangers(examined: Examination) -> Iterator[Finding]:
+def _strangers(examined: StageCheck) -> Iterator[Diagnostic]:
     if examined.unused:
         text = f"The map also has {', '.join(examined.unused)}, which no [[mode]] describes."
-        yield Finding("modes", True, text)
+        yield Diagnostic("modes", True, text)
 
 
 def _share(value: float) -> str:

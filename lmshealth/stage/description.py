@@ -261,7 +261,7 @@ class Stage:
         priors = tuple(parameter.prior for parameter in self.parameters)
         return JointPrior(names, priors, self.modal_map.low, self.modal_map.high)
 
-    def takes(self, metadata: Metadata) -> bool:
+    def matches(self, metadata: Metadata) -> bool:
         """Tell whether a log belongs to this description."""
         if metadata.description is not None:
             return metadata.description in (self.name, f"{self.name}.toml")

@@ -1,13 +1,4 @@
-"""Sight: what small changes of the health parameters do to the tracked modes, and what logs show.
-
-Two groups of logs are compared, those of now and those of the baseline, all of one length T. The
-drifts δ of the modes between them have the covariance C = R(T) (1/N + 1/N_baseline), where R is the
-Cramér-Rao bound of ln f of one log: independent from log to log, and from mode to mode. With the
-sensitivities S of the modal map at the baseline, δ = S x + ε for small changes x of the
-ln parameters, whose priors have the variances Λ. The map's error, its sensitivities being wrong by
-a relative standard deviation m, is that of parameters which have moved as far as their priors say:
-E = m² (S ∘ S) Λ and the surrogate's own.
-"""
+"""Identifiability of the health parameters by the tracked modes (README.md: Identifiability)."""
 
 from __future__ import annotations
 
@@ -27,7 +18,7 @@ MOST_LOGS, LONGEST = 10_000, 3600
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Sight:
+class Identifiability:
     """What the tracked modes show of the health parameters.
 
     Attributes
@@ -76,7 +67,7 @@ class Sight:
         """Bound the variance of the drift of each mode, shape ``(n_modes,)``."""
         return self.log_variance(duration) * (1 / n_logs + 1 / (n_baseline or self.n_baseline))
 
-    def through(self, modes: Sequence[str]) -> Sight:
+    def restricted_to(self, modes: Sequence[str]) -> Identifiability:
         """Give the sight through some of the modes."""
         rows = [k for k, mode in enumerate(self.modes) if mode.name in modes]
         return replace(
@@ -87,7 +78,7 @@ class Sight:
             _known={},
         )
 
-    def endless_variance(self) -> FloatArray:
+    def limiting_variance(self) -> FloatArray:
         """Bound the variance of the drifts by logs without end, shape ``(n_modes,)``."""
         return self.drift_variance(LONGEST, MOST_LOGS, MOST_LOGS)
 
@@ -119,14 +110,14 @@ class Sight:
         return np.asarray(np.diag(1 / self.prior) + self.slopes.T @ weighted)
 
 
-def identifiable(
-    sights: Sequence[Sight], columns: Sequence[Sequence[int]], prior: FloatArray
+def identifiable_parameters(
+    machines: Sequence[Identifiability], columns: Sequence[Sequence[int]], prior: FloatArray
 ) -> BoolArray:
     """Tell which of all parameters endless logs would tell, of one machine or of several together.
 
     Parameters
     ----------
-    sights : sequence of Sight
+    machines : sequence of Identifiability
         One per machine.
     columns : sequence of sequence of int
         Where the parameters of each stand among all.
@@ -139,14 +130,14 @@ def identifiable(
         Shape ``(n_parameters,)``.
     """
     precision = np.diag(1 / prior)
-    for sight, places in zip(sights, columns, strict=True):
-        told = sight.precision(sight.endless_variance()) - np.diag(1 / sight.prior)
-        precision[np.ix_(places, places)] += told
+    for machine, places in zip(machines, columns, strict=True):
+        gained = machine.precision(machine.limiting_variance()) - np.diag(1 / machine.prior)
+        precision[np.ix_(places, places)] += gained
     left = np.diag(np.linalg.inv(precision))
     return np.asarray(1 - left / prior >= INFORMED)
 
 
-def sight_of(stage: Stage) -> Sight:
+def identifiability_of(stage: Stage) -> Identifiability:
     """Tell what the tracked modes of a stage show of its health parameters.
 
     Raises
@@ -160,7 +151,7 @@ def sight_of(stage: Stage) -> Sight:
             "describe [[parameter]] and [map]"
         )
     rows = [stage.modal_map.modes.index(name) for name in stage.informative]
-    return Sight(
+    return Identifiability(
         parameters=stage.prior.names,
         modes=tuple(mode for mode in stage.modes if mode.name in stage.informative),
         slopes=stage.modal_map.gradient(stage.baseline_point[None])[0, rows],

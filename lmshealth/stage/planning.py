@@ -1,28 +1,4 @@
-"""Planning: how long and how many logs must be, for a loss of health to be seen.
-
-Logs of now are compared with those of the baseline, as `sight` has it: drifts δ = S x + ε of the
-modes with the covariance C. All parameters but the one asked for, j, are unknown, with the
-variances Λ of their priors, and that one is estimated by generalised least squares:
-
-    V = C + S_o Λ_o S_oᵀ,    x̂ = s_jᵀ V⁻¹ δ / (s_jᵀ V⁻¹ s_j),    σ² = 1 / (s_jᵀ V⁻¹ s_j).
-
-A loss is called where x̂ < -z σ, z being the normal quantile that leaves the false-alarm
-probability. Its power to see the loss l is then Φ(-ln(1 - l)/σ - z), on average over the priors of
-the other parameters.
-
-Neglected, so that a plan is the best that can be had:
-
-- temperature and other covariates, and the random walk of frequencies between logs: both groups of
-  logs are to be taken in the same state, and what wanders common to a group is not averaged away;
-- that modes whose bands overlap are estimated together: the more alike the channels see them the
-  more this costs;
-- what identification loses against the bound;
-- the bend of the map: S is that of small changes;
-- the error of the map (`model_std`). Of the parameter asked for it changes the size that a drift
-  is taken for, and with it the smallest loss in proportion, but makes no drift where nothing has
-  changed. Of the others it counts once they have moved far themselves; it decides here only whether
-  a parameter is shown at all.
-"""
+"""Length and number of logs that detect a loss of health (README.md: Planning)."""
 
 from __future__ import annotations
 
@@ -36,7 +12,7 @@ from scipy.special import ndtr, ndtri
 
 from lmshealth.errors import BadQuestion
 from lmshealth.stage.description import Stage
-from lmshealth.stage.identifiability import LONGEST, MOST_LOGS, Sight, sight_of
+from lmshealth.stage.identifiability import LONGEST, MOST_LOGS, Identifiability, identifiability_of
 
 DURATIONS = (10.0, 20.0, 60.0, 120.0, 300.0, 600.0)
 
@@ -158,23 +134,23 @@ def plan(
     20 s: 1 of them, 100% for one
     """
     test = _Test(power, false_alarm)
-    sight = sight_of(stage)
+    information = identifiability_of(stage)
     j = _asked(stage, parameter, loss)
-    _expect_shown(stage, sight, j)
+    _expect_shown(stage, information, j)
     size = -np.log1p(-loss)
 
     def power_of(duration: float, n_logs: int) -> float:
-        return test.power(size, sight.std(j, sight.drift_variance(duration, n_logs)))
+        return test.power(size, information.std(j, information.drift_variance(duration, n_logs)))
 
-    seconds = range(max(1, int(np.ceil(sight.least_duration))), LONGEST + 1)
+    seconds = range(max(1, int(np.ceil(information.least_duration))), LONGEST + 1)
     place = bisect_left(seconds, power, key=lambda duration: power_of(duration, 1))
     return Plan(
         parameter=parameter,
         loss=loss,
         power=power,
         false_alarm=false_alarm,
-        n_baseline=sight.n_baseline,
-        efforts=tuple(_effort(sight, j, test, size, duration) for duration in durations),
+        n_baseline=information.n_baseline,
+        efforts=tuple(_effort(information, j, test, size, duration) for duration in durations),
         duration_of_one=seconds[place] if place < len(seconds) else None,
     )
 
@@ -218,36 +194,38 @@ def _asked(stage: Stage, parameter: str, loss: float) -> int:
     return j
 
 
-def _expect_shown(stage: Stage, sight: Sight, j: int) -> None:
+def _expect_shown(stage: Stage, information: Identifiability, j: int) -> None:
     """Refuse a parameter of which even endless logs would tell less than its prior does.
 
     Then only the map's own error is left, in what the other parameters do to the modes.
     """
-    cov = np.linalg.inv(sight.precision(sight.endless_variance()))
+    cov = np.linalg.inv(information.precision(information.limiting_variance()))
     # Half of the prior's variance would be left: results call that not told by the data.
-    if cov[j, j] < sight.prior[j] / 2:
+    if cov[j, j] < information.prior[j] / 2:
         return
-    name = sight.parameters[j]
+    name = information.parameters[j]
     moved = ", ".join(
         f"{mode.name} {slope:.2g}"
-        for mode, slope in zip(sight.modes, sight.slopes[:, j], strict=True)
+        for mode, slope in zip(information.modes, information.slopes[:, j], strict=True)
     )
-    rest = [other for other in sight.parameters if other != name]
+    rest = [other for other in information.parameters if other != name]
     raise BadQuestion(
         f"{stage.name}: the modes do not show {name}: ln f moves by so much per ln of it: {moved}. "
         f"Besides what {', '.join(rest) or 'nothing else'} does to them it would be known to "
         f"{100 * np.sqrt(cov[j, j]):.0f} % even from endless logs, the prior alone knows it to "
-        f"{100 * np.sqrt(sight.prior[j]):.0f} %. Track a mode that depends on it more, or improve "
-        "the map"
+        f"{100 * np.sqrt(information.prior[j]):.0f} %. Track a mode that depends on it more, or "
+        "improve the map"
     )
 
 
-def _effort(sight: Sight, j: int, test: _Test, size: float, duration: float) -> Effort:
-    if duration < sight.least_duration:
+def _effort(
+    information: Identifiability, j: int, test: _Test, size: float, duration: float
+) -> Effort:
+    if duration < information.least_duration:
         return Effort(duration, None, "too-short")
 
     def std(n_logs: int, n_baseline: int | None = None) -> float:
-        return sight.std(j, sight.drift_variance(duration, n_logs, n_baseline))
+        return information.std(j, information.drift_variance(duration, n_logs, n_baseline))
 
     counts = range(1, MOST_LOGS + 1)
     place = bisect_left(counts, test.wanted, key=lambda n: test.power(size, std(n)))
@@ -261,5 +239,5 @@ def _effort(sight: Sight, j: int, test: _Test, size: float, duration: float) -> 
         hindrance=hindrance,
         power=test.power(size, std(1)),
         smallest_loss=test.smallest_loss(std(1)),
-        smallest_loss_many=test.smallest_loss(std(sight.n_baseline)),
+        smallest_loss_many=test.smallest_loss(std(information.n_baseline)),
     )

@@ -211,7 +211,7 @@ class JointPrior:
         return JointPrior(self.names, priors, self.low, self.high)
 
 
-def joined(parts: Sequence[JointPrior], columns: Sequence[Sequence[int]]) -> JointPrior:
+def combine_priors(parts: Sequence[JointPrior], columns: Sequence[Sequence[int]]) -> JointPrior:
     """Make one prior of several whose parameters are partly the same.
 
     Parameters

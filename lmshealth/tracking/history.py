@@ -14,7 +14,7 @@ from lmshealth._arrays import BoolArray, FloatArray, expect_shape, freeze
 from lmshealth.errors import NotEnoughData
 from lmshealth.io.log import Metadata, Refusal
 from lmshealth.modal.modes import Modes
-from lmshealth.signal.waterfall import Levels
+from lmshealth.signal.waterfall import RelativeSpectrum
 from lmshealth.stage.description import Stage
 from lmshealth.tracking.association.associate import Association, associate
 from lmshealth.tracking.association.estimates import Estimates
@@ -233,7 +233,7 @@ class LogEstimates:
     loop_error : float or None
         RMS of the following error from 1 to 40 Hz in m, see `loop_error` of `following`; None
         where the log does not tell.
-    levels : Levels or None
+    levels : RelativeSpectrum or None
         The band of the tracked modes, for people to look at; None where the log does not show it.
 
     Examples
@@ -259,7 +259,7 @@ class LogEstimates:
     metadata: Metadata
     modes: Modes
     loop_error: float | None = None
-    levels: Levels | None = None
+    levels: RelativeSpectrum | None = None
 
 
 def sort_by_time(readings: Sequence[LogEstimates]) -> tuple[LogEstimates, ...]:

@@ -39,7 +39,7 @@ from lmshealth.errors import BadQuestion
 from lmshealth.health.epoch_posterior import EpochPosterior
 from lmshealth.health.importance_sampling import importance_sample_to_ess
 from lmshealth.stage.description import Stage, load_stage
-from lmshealth.stage.identifiability import sight_of
+from lmshealth.stage.identifiability import identifiability_of
 from lmshealth.stage.planning import plan
 from models.dynamics.plant import GUIDE_MODES
 from models.lives.simulation import Plan
@@ -140,7 +140,7 @@ def checks(name: str, parameter: str, trials: int) -> list[Row]:
         loss = found.efforts[0].smallest_loss_many
         for arm, (model_std, free) in arms.items():
             stage = stage_with(name, model_std=model_std)
-            variance = sight_of(stage).drift_variance(duration, n, n)
+            variance = identifiability_of(stage).drift_variance(duration, n, n)
             rng = rng_of(SEED, ASKED.index((name, parameter)), point, len(arm))
             hits, false = (
                 sum(called(stage, parameter, size, variance, free, rng) for _ in range(trials))
@@ -177,23 +177,23 @@ def called(
 def _about(stage: Stage, x: Array, variance: Array, rng: np.random.Generator) -> Array:
     """Draw points about the truth, wider than the posterior: where sampling begins."""
     assert stage.modal_map is not None
-    cov = np.linalg.inv(sight_of(stage).precision(variance))
+    cov = np.linalg.inv(identifiability_of(stage).precision(variance))
     points = x + 3 * rng.standard_normal((400, x.size)) @ np.linalg.cholesky(cov).T
     return np.clip(points, stage.modal_map.low, stage.modal_map.high)
 
 
 def law(name: str) -> Row:
     """Tell the standard deviation of ln f of one log against its length: bound and law."""
-    sight = sight_of(load_stage(name))
-    bound = np.sqrt([sight.log_variance(duration) for duration in DURATIONS])
+    seen = identifiability_of(load_stage(name))
+    bound = np.sqrt([seen.log_variance(duration) for duration in DURATIONS])
     return {
         "stage": name,
         "durations_s": list(DURATIONS),
-        "bound": {mode.name: bound[:, i].tolist() for i, mode in enumerate(sight.modes)},
+        "bound": {mode.name: bound[:, i].tolist() for i, mode in enumerate(seen.modes)},
         "long_record": {
             mode.name: long_record_law(mode.frequency_hz, mode.damping_ratio,
                                        np.array(DURATIONS))[0].tolist()
-            for mode in sight.modes
+            for mode in seen.modes
         },
     }  # fmt: skip
 
@@ -202,11 +202,11 @@ def measured(name: str, duration: float, logs: int) -> Row:
     """Simulate logs of a machine that does not change, identify them, compare with the truth."""
     simulated = Plan(name, "healthy", logs, duration, SEED)
     life, found = life_of(simulated), identified(simulated)
-    sight = sight_of(load_stage(name))
+    seen = identifiability_of(load_stage(name))
     off = found.ln_frequency - life.ln_frequency
     std = np.sqrt(np.einsum("kii->ki", found.cov)[:, : len(GUIDE_MODES)])
-    names = [mode.name for mode in sight.modes]
-    bound = dict(zip(names, np.sqrt(sight.log_variance(duration)), strict=True))
+    names = [mode.name for mode in seen.modes]
+    bound = dict(zip(names, np.sqrt(seen.log_variance(duration)), strict=True))
     rows = {}
     for i, mode in enumerate(GUIDE_MODES):
         there = np.isfinite(off[:, i])

@@ -13,7 +13,7 @@ import numpy as np
 
 from lmshealth.prognosis.scenarios import list_scenarios
 from lmshealth.stage.description import Stage, load_stage
-from lmshealth.stage.identifiability import identifiable, sight_of
+from lmshealth.stage.identifiability import identifiability_of, identifiable_parameters
 from lmshealth.stage.modal_map import ModalMap, read_map
 from models.dynamics.modal_map import modal_map
 from models.dynamics.plant import GUIDE_MODES
@@ -81,9 +81,14 @@ def stage_with(name: str, model_std: float, plant: str = "", *, losing: bool = F
 @cache
 def told(name: str) -> dict[str, bool]:
     """Say which parameters the modes of a stage tell at all; ``any`` stands for all of them."""
-    sight = sight_of(load_stage(name))
-    shown = identifiable([sight], [range(len(sight.parameters))], sight.prior)
-    return {**dict(zip(sight.parameters, shown.tolist(), strict=True)), "any": bool(shown.all())}
+    seen = identifiability_of(load_stage(name))
+    shown = identifiable_parameters(
+        [seen], [range(len(seen.parameters))], seen.prior
+    )
+    return {
+        **dict(zip(seen.parameters, shown.tolist(), strict=True)),
+        "any": bool(shown.all()),
+    }
 
 
 @cache

@@ -13,7 +13,7 @@ from scipy.stats import ncx2
 from lmshealth import load_stage, read_log
 from lmshealth.io.log import Log
 from lmshealth.signal.segments import find_segments
-from lmshealth.signal.spectral_lines import find_lines, survey_lines
+from lmshealth.signal.spectral_lines import find_lines, find_lines_by_velocity
 from models.dynamics.stages import STAGES, stage_named
 from models.recordings.formats import write_log
 from models.recordings.strokes import full_stroke, record_strokes
@@ -143,7 +143,7 @@ def strokes(n: int) -> list[dict[str, Any]]:
         for _ in range(n):
             log, f = stroke_log(rng, count)
             (channel,), segments = log.channels, find_segments(log, 0.2)
-            found = survey_lines(log, log.channels, None, BAND, USUAL)
+            found = find_lines_by_velocity(log, log.channels, None, BAND, USUAL)
             together += any(abs(line.frequency - f) < 0.5 / STROKE for line in found)
             for segment in segments:
                 own = find_lines(channel, segment, RATE, BAND, USUAL / len(segments))
@@ -192,7 +192,7 @@ def simulated_strokes() -> list[dict[str, Any]]:
                     share = USUAL / len(segments)
                     found = find_lines(channel, segment, log.sample_rate, (10.0, 400.0), share)
                     alone += [(channel.name, round(f, 2)) for f, _ in found.tolist()]
-            together = survey_lines(log, channels, load_stage(name), (10.0, 400.0), USUAL)
+            together = find_lines_by_velocity(log, channels, load_stage(name), (10.0, 400.0), USUAL)
             rows.append(
                 {
                     "stage": name,

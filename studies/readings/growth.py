@@ -10,7 +10,7 @@ from scipy.stats import t as student
 
 from lmshealth.io.log import Channel, Log, Metadata
 from lmshealth.signal.acceleration_levels import (
-    Band,
+    FrequencyBand,
     Growth,
     choose_bands,
     find_growth,
@@ -42,7 +42,7 @@ def noise_log(values: Array, velocity: float) -> Log:
                ((0, values.size),), ())  # fmt: skip
 
 
-def wide_bands(name: str) -> tuple[Band, ...]:
+def wide_bands(name: str) -> tuple[FrequencyBand, ...]:
     """Return the health band and the watched bands of a shipped description."""
     return tuple(b for b in choose_bands(load_stage(name), None, None) if b.kind != "mode")
 
@@ -67,7 +67,9 @@ def known_growth(quick: bool) -> tuple[dict[str, Check], dict[str, Any]]:
     return checks, {"known_growth": details}
 
 
-def fit(rng: np.random.Generator, exponent: float, bands: tuple[Band, ...]) -> tuple[Growth, ...]:
+def fit(
+    rng: np.random.Generator, exponent: float, bands: tuple[FrequencyBand, ...]
+) -> tuple[Growth, ...]:
     """Read the growth of one series of logs at the paper's velocities."""
     readings = []
     for velocity in VELOCITIES:

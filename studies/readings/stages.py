@@ -16,7 +16,7 @@ from lmshealth.io.log import Log
 from lmshealth.io.reading import read_log
 from lmshealth.report.tables import error_row
 from lmshealth.signal.acceleration_levels import (
-    Band,
+    FrequencyBand,
     Growth,
     Magnitude,
     choose_bands,
@@ -132,7 +132,7 @@ def plain_amplitudes(path: Path) -> dict[str, tuple[Array, Array]]:
 
 def larger(readings: Iterable[Magnitude]) -> list[Magnitude]:
     """Keep per band the accelerometer that reads more: the paper does not say which it shows."""
-    best: dict[Band, Magnitude] = {}
+    best: dict[FrequencyBand, Magnitude] = {}
     for m in readings:
         if m.band not in best or m.level > best[m.band].level:
             best[m.band] = replace(m, channel=EITHER)
@@ -153,7 +153,7 @@ def printed_growth(axis: str, moves: list[Magnitude]) -> dict[str, Growth]:
     some = moves[0]
     readings = [
         replace(some, velocity=v, magnitude=1e-3 * level,
-                band=Band(f"{hertz} Hz", "grid", 0.0, 1.0))
+                band=FrequencyBand(f"{hertz} Hz", "grid", 0.0, 1.0))
         for hertz, levels in table(axis).items()
         for v, level in zip(velocities, levels, strict=True)
     ]  # fmt: skip

@@ -39,7 +39,7 @@ import numpy as np
 
 from lmshealth import Settings, identify, load_stage, read_log, run
 from lmshealth.signal.following_error import loop_error
-from lmshealth.signal.waterfall import read_levels
+from lmshealth.signal.waterfall import relative_spectrum
 from lmshealth.stage.description import Stage
 from studies.commands import no_pictures
 from studies.record import Study, options
@@ -82,7 +82,7 @@ class Meter:
         identify(log, self._stage)
         moments.append(time.process_time())
         loop_error(log)
-        read_levels(log, self._stage)
+        relative_spectrum(log, self._stage)
         moments.append(time.process_time())
         read, identified, other = np.diff(moments)
         return float(read), float(identified), float(other)

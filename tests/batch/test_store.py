@@ -32,7 +32,7 @@ from lmshealth.io.log import Metadata, Refusal
 from lmshealth.modal.modes import Modes
 from lmshealth.report.assessment import Assessment
 from lmshealth.signal.spectral_lines import Line
-from lmshealth.signal.waterfall import Levels
+from lmshealth.signal.waterfall import RelativeSpectrum
 from lmshealth.tracking.history import LogEstimates
 from tests.assessments import leaves, worn
 
@@ -66,7 +66,7 @@ def reading(n: int = 2, log: str = "a.h5") -> LogEstimates:
         baseline=True,
         description="small",
     )
-    levels = Levels(100 / 3, 200 / 3, rng.choice([np.nan, 1 / 3], 5))
+    levels = RelativeSpectrum(100 / 3, 200 / 3, rng.choice([np.nan, 1 / 3], 5))
     return LogEstimates(log, "d" * 64, metadata, modes, 1e-6 / 3, levels)
 
 
@@ -259,7 +259,7 @@ def test_an_assessment_comes_back_bit_for_bit(url: str, tmp_path: Path) -> None:
     expected = list(leaves(put))
     assert sum(isinstance(leaf, tuple) and len(leaf) == 3 for _, leaf in expected) > 40
     assert list(leaves(got)) == expected
-    assert got.stage.takes(reading().metadata) == put.stage.takes(reading().metadata)
+    assert got.stage.matches(reading().metadata) == put.stage.matches(reading().metadata)
     assert got.service() == put.service()
 
 

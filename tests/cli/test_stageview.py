@@ -8,15 +8,15 @@ import pytest
 
 from lmshealth.cli.stageview import print_stage
 from lmshealth.report.tables import stage_rows
-from lmshealth.stage.check import examine, findings
+from lmshealth.stage.check import check_stage, diagnose
 from lmshealth.stage.description import Stage, load_stage
 from tests.lives import FOOT, MOUNT, PRELOAD, make_stage
 
 
 def shown(stage: Stage, capsys: pytest.CaptureFixture[str]) -> str:
     """Examine and print."""
-    examined = examine(stage)
-    print_stage(stage_rows(examined, findings(examined)))
+    examined = check_stage(stage)
+    print_stage(stage_rows(examined, diagnose(examined)))
     return capsys.readouterr().out
 
 
@@ -24,7 +24,7 @@ def shown(stage: Stage, capsys: pytest.CaptureFixture[str]) -> str:
 def test_the_shipped_descriptions_fit_eighty_columns(
     name: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Modes, parameters, what is known, sensitivities, correlation, findings: no line breaks."""
+    """Modes, parameters, what is known, sensitivities, correlation, diagnose: no line breaks."""
     out = shown(load_stage(name), capsys)
     assert max(len(line) for line in out.splitlines()) <= 80
     assert all(out.count(word) >= 4 for word in ("guide_preload", "mount_stiffness"))

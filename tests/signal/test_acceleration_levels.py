@@ -14,7 +14,7 @@ from lmshealth.io.log import Log, Metadata
 from lmshealth.io.reading import read_log
 from lmshealth.modal.identification import identify
 from lmshealth.signal.acceleration_levels import (
-    Band,
+    FrequencyBand,
     Magnitude,
     choose_bands,
     find_growth,
@@ -29,7 +29,7 @@ from tests.signals import Mode, acceleration_log, make_log, make_stage, sine, wh
 
 RATE = 8000.0
 N = 32_000
-TEN = Band("100 Hz", "grid", 95.0, 105.0)
+TEN = FrequencyBand("100 Hz", "grid", 95.0, 105.0)
 
 
 def known() -> Log:
@@ -87,7 +87,7 @@ def test_what_a_log_cannot_show_is_refused() -> None:
 
 def test_bands_above_half_the_sample_rate_are_passed_over() -> None:
     """A watched band that the sampling cannot show leaves the others readable."""
-    high = Band("watch", "watch", 3900.0, 4100.0)
+    high = FrequencyBand("watch", "watch", 3900.0, 4100.0)
     assert {m.band for m in read_magnitudes(known(), [TEN, high])} == {TEN}
 
 
@@ -213,7 +213,7 @@ def test_the_papers_own_numbers_grow_where_it_says() -> None:
     table = pd.read_csv(PRINTED / "table7.csv")
     speeds = [float(name.split("_")[1]) * 1e-3 for name in table.columns[2:]]
     readings = [
-        replace(at(v, float(m)), band=Band(f"{row.iloc[1]:g}", "grid", 1.0, 2.0))
+        replace(at(v, float(m)), band=FrequencyBand(f"{row.iloc[1]:g}", "grid", 1.0, 2.0))
         for _, row in table.iterrows()
         for v, m in zip(speeds, row.iloc[2:], strict=True)
     ]

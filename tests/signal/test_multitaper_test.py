@@ -7,7 +7,7 @@ import pytest
 from scipy import fft
 
 from lmshealth.signal import multitaper_test as linetest
-from lmshealth.signal.multitaper_test import find_sines
+from lmshealth.signal.multitaper_test import detect_sinusoids
 from tests.signals import Mode, accelerations, sine, white
 
 RATE = 1000.0
@@ -17,7 +17,7 @@ BAND = (20.0, 450.0)
 def found_in(*segments: np.ndarray, alarm: float = 0.01) -> np.ndarray:
     """Test segments together."""
     lengths = [segment.size for segment in segments]
-    return find_sines(lengths, lambda number: segments[number], RATE, BAND, alarm)
+    return detect_sinusoids(lengths, lambda number: segments[number], RATE, BAND, alarm)
 
 
 def shares(
@@ -140,14 +140,14 @@ def test_segments_much_shorter_than_the_longest_are_left_out() -> None:
         read.append(number)
         return noise[: (4000, 1999, 2000)[number]]
 
-    find_sines([4000, 1999, 2000], samples, RATE, BAND, 0.01)
+    detect_sinusoids([4000, 1999, 2000], samples, RATE, BAND, 0.01)
     assert set(read) == {0, 2}
 
 
 def test_what_is_found_does_not_depend_on_the_band() -> None:
     """Cut at other frequencies, the band shows the same line to the last digit."""
     values = sine(4000, RATE, 100.3, 1.0) + white(np.random.default_rng(8), 1e-3, 4000, RATE)
-    rows = [find_sines([4000], lambda _: values, RATE, band, 1e-4) for band in
+    rows = [detect_sinusoids([4000], lambda _: values, RATE, band, 1e-4) for band in
             ((20.0, 450.0), (93.0, 130.0))]  # fmt: skip
     np.testing.assert_array_equal(*rows)
-    assert len(find_sines([4000], lambda _: values, RATE, (101.5, 130.0), 1e-4)) == 0
+    assert len(detect_sinusoids([4000], lambda _: values, RATE, (101.5, 130.0), 1e-4)) == 0

@@ -17,8 +17,8 @@ from lmshealth.signal.segments import (
     Segment,
     find_phases,
     find_segments,
+    nominal_velocity,
     select_segments,
-    set_velocity,
 )
 from tests.signals import make_log
 
@@ -86,14 +86,14 @@ def test_gaps_split_every_part() -> None:
 
 def test_the_set_velocity_is_a_speed() -> None:
     """There and back are one velocity; the set point has the last word over metadata."""
-    assert set_velocity(log_of(strokes(0.1, -0.1), 0.3)) == pytest.approx(0.1)
-    assert set_velocity(log_of(None, -0.3)) == pytest.approx(0.3)
+    assert nominal_velocity(log_of(strokes(0.1, -0.1), 0.3)) == pytest.approx(0.1)
+    assert nominal_velocity(log_of(None, -0.3)) == pytest.approx(0.3)
 
 
 def test_a_log_of_several_velocities_has_none() -> None:
     """Two speeds, no move at all, or nothing known: not a number."""
     for log in (log_of(strokes(0.1, 0.2)), log_of(np.zeros(4000)), log_of(None)):
-        assert np.isnan(set_velocity(log))
+        assert np.isnan(nominal_velocity(log))
 
 
 def moves(rate: float = 20_000.0) -> tuple[np.ndarray, list[tuple[int, int, float]]]:

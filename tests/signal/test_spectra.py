@@ -13,7 +13,7 @@ from lmshealth.signal import spectra
 from lmshealth.signal.segments import Segment
 from lmshealth.signal.spectra import (
     CrossSpectrum,
-    Resonances,
+    ResonanceRange,
     Spectrum,
     cross_spectra,
     periodogram,
@@ -410,7 +410,7 @@ def test_without_gives_up_what_lines_reach_and_nothing_else() -> None:
 def test_resonances_look_like_lines_where_a_segment_does_not_resolve_them() -> None:
     """Within their band, and below eight ordinates in the half-power bandwidth 2ζf."""
     frequency = np.array([89.0, 90.0, 99.0, 101.0, 110.0, 111.0])
-    expected = Resonances(90.0, 110.0, 0.02)
+    expected = ResonanceRange(90.0, 110.0, 0.02)
     # 2 · 0.02 · 100 Hz · 2 s is eight.
     assert expected.like_lines(frequency, 2.0).tolist() == [False, True, True, False, False, False]
     assert not expected.like_lines(frequency, 3.0).any()
@@ -422,8 +422,8 @@ def test_a_resonance_of_a_short_move_is_not_taken_for_a_tone() -> None:
     n, mode = 1340, Mode(130.0, 0.006, 4 * 0.006**2 * 300)
     kept = {}
     for name, expected in (
-        ("there", Resonances(110.0, 150.0, 0.005)),
-        ("elsewhere", Resonances(300.0, 350.0, 0.005)),
+        ("there", ResonanceRange(110.0, 150.0, 0.005)),
+        ("elsewhere", ResonanceRange(300.0, 350.0, 0.005)),
     ):
         free = []
         for seed in range(60):

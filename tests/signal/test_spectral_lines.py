@@ -12,9 +12,9 @@ import pytest
 
 from lmshealth.io.log import Channel, Log
 from lmshealth.io.reading import read_log
-from lmshealth.signal.multitaper_test import find_sines
+from lmshealth.signal.multitaper_test import detect_sinusoids
 from lmshealth.signal.segments import Segment, find_segments
-from lmshealth.signal.spectral_lines import Line, find_lines, name_lines, survey_lines
+from lmshealth.signal.spectral_lines import Line, find_lines, find_lines_by_velocity, name_lines
 from tests.signals import (
     Mode,
     accelerations,
@@ -143,8 +143,10 @@ def sweeping(rng: np.random.Generator, wavelength: float, velocities: tuple[floa
 def test_lines_that_follow_the_velocity_are_orders() -> None:
     """At three velocities an order is found three times and named, known or not; others stay."""
     log = sweeping(np.random.default_rng(7), 0.004, (0.30, 0.36, 0.43))
-    known = survey_lines(log, log.channels, make_stage([("r", 105.0, 0.02)], order_mm=4.0), BAND)
-    unknown = survey_lines(log, log.channels, None, BAND)
+    known = find_lines_by_velocity(
+        log, log.channels, make_stage([("r", 105.0, 0.02)], order_mm=4.0), BAND
+    )
+    unknown = find_lines_by_velocity(log, log.channels, None, BAND)
     for found, kind in ((known, "ball pass"), (unknown, "order of 4 mm")):
         assert [line.kind for line in found] == [kind] * 3 + ["unknown"]
         np.testing.assert_allclose([f.frequency for f in found], [75, 90, 107.5, 333], atol=0.05)
@@ -165,7 +167,9 @@ def stroking(rng: np.random.Generator, velocities: Sequence[float], amplitude: f
 def test_short_strokes_show_their_order_together() -> None:
     """Of twelve strokes to and fro none shows the order; together they do within 0.2 ordinates."""
     log = stroking(np.random.default_rng(10), [0.41] * 12, 0.6)
-    (line,) = survey_lines(log, log.channels, make_stage([("r", 105.0, 0.02)], order_mm=4.0), BAND)
+    (line,) = find_lines_by_velocity(
+        log, log.channels, make_stage([("r", 105.0, 0.02)], order_mm=4.0), BAND
+    )
     assert line.kind == "ball pass"
     assert line.frequency == pytest.approx(102.5, abs=0.4)
     assert line.amplitude == pytest.approx(0.6, rel=0.25)
@@ -179,9 +183,9 @@ def test_strokes_of_different_velocities_stay_apart() -> None:
     """Twelve strokes at twelve velocities have no line in common, two times twelve have two."""
     rng = np.random.default_rng(11)
     log = stroking(rng, np.linspace(0.2, 0.6, 12).tolist(), 0.6)
-    assert survey_lines(log, log.channels, None, BAND) == ()
+    assert find_lines_by_velocity(log, log.channels, None, BAND) == ()
     log = stroking(rng, [0.41, 0.41, 0.55, 0.55] * 6, 0.6)
-    found = survey_lines(log, log.channels, None, BAND)
+    found = find_lines_by_velocity(log, log.channels, None, BAND)
     assert [line.kind for line in found] == ["order of 4 mm"] * 2
     np.testing.assert_allclose([line.frequency for line in found], [102.5, 137.5], atol=0.4)
 
@@ -192,10 +196,10 @@ def test_pieces_of_a_log_without_set_point_are_searched_together() -> None:
     values = white(rng, 1e-2, 6000, RATE) + sine(6000, RATE, 141.0, 0.6)
     pieces = [(k, k + 500) for k in range(0, 6000, 600)]
     log = make_log({"acc_a": values}, RATE, pieces=pieces)
-    (line,) = survey_lines(log, log.channels, None, BAND)
+    (line,) = find_lines_by_velocity(log, log.channels, None, BAND)
     assert line.frequency == pytest.approx(141.0, abs=0.4)
     whole = make_log({"acc_a": values}, RATE, pieces=pieces[:1])
-    assert survey_lines(whole, whole.channels, None, BAND) == ()
+    assert find_lines_by_velocity(whole, whole.channels, None, BAND) == ()
 
 
 def test_every_sample_of_a_displacement_is_searched(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -204,12 +208,12 @@ def test_every_sample_of_a_displacement_is_searched(monkeypatch: pytest.MonkeyPa
 
     def spy(lengths: Sequence[int], read: Callable[[int], np.ndarray], *rest: Any) -> np.ndarray:
         pairs.extend((length, read(number).size) for number, length in enumerate(lengths))
-        return find_sines(lengths, read, *rest)
+        return detect_sinusoids(lengths, read, *rest)
 
-    monkeypatch.setattr("lmshealth.signal.spectral_lines.find_sines", spy)
+    monkeypatch.setattr("lmshealth.signal.spectral_lines.detect_sinusoids", spy)
     values = displacements(np.random.default_rng(13), [Mode(60.0, 0.02)], 5000, RATE, 1e-18)[0]
     log = make_log({"delta_e": values}, RATE, pieces=[(0, 3000), (3100, 5000)])
-    survey_lines(log, log.channels, None, (5.0, 30.0))
+    find_lines_by_velocity(log, log.channels, None, (5.0, 30.0))
     assert [length for length, _ in pairs] == [size for _, size in pairs]
     # The difference reaches over four samples to either side.
     assert [length for length, _ in pairs] == [2992, 1892]
@@ -218,7 +222,7 @@ def test_every_sample_of_a_displacement_is_searched(monkeypatch: pytest.MonkeyPa
 def test_a_line_that_stands_still_is_no_order() -> None:
     """One frequency at all velocities is one line, listed once."""
     log = sweeping(np.random.default_rng(8), 1e9, (0.30, 0.36, 0.43))
-    (line,) = survey_lines(log, log.channels, None, BAND)
+    (line,) = find_lines_by_velocity(log, log.channels, None, BAND)
     assert isinstance(line, Line)
     assert (line.kind, line.channel) == ("unknown", "acc_a")
     assert line.frequency == pytest.approx(333.0, abs=0.02)
@@ -230,7 +234,9 @@ def test_mains_that_wander_are_found_and_named() -> None:
     n = 60_000
     wander = 0.02 * np.sin(2 * np.pi * np.arange(n) / RATE / 25) + 100
     values = np.sin(2 * np.pi * np.cumsum(wander) / RATE) + white(rng, 0.05, n, RATE)
-    (line,) = survey_lines(make_log({"acc_a": values}, RATE), _channels(values), None, BAND)
+    (line,) = find_lines_by_velocity(
+        make_log({"acc_a": values}, RATE), _channels(values), None, BAND
+    )
     assert line.kind == "mains"
     assert line.frequency == pytest.approx(100.0, abs=0.05)
     assert line.amplitude == pytest.approx(1.0, rel=0.1)
@@ -246,7 +252,7 @@ def test_a_measured_machine_shows_its_mains(needs: Callable[[str], None]) -> Non
     needs("data")
     (path,) = (Path(os.environ["LMSHEALTH_DATA"]) / "uff58_samples").glob("MPSTD*.uff")
     log = read_log(path)
-    found = survey_lines(log, log.channels, None, (20.0, 350.0))
+    found = find_lines_by_velocity(log, log.channels, None, (20.0, 350.0))
     mains = {round(line.frequency) for line in found if line.kind == "mains"}
     assert mains == {50, 100, 200, 300}
     # The motor's own line is none.

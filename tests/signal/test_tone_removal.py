@@ -8,7 +8,7 @@ import pytest
 from lmshealth.modal.identification import identify
 from lmshealth.modal.modes import Modes
 from lmshealth.signal import spectra
-from lmshealth.signal.tone_removal import Tone, remove_tones
+from lmshealth.signal.tone_removal import Sinusoid, remove_sinusoids
 from tests.signals import (
     Mode,
     acceleration_log,
@@ -62,7 +62,7 @@ def around(frequency: float, reach: int = 100) -> np.ndarray:
     return mask
 
 
-def read(tone: Tone) -> tuple[float, float]:
+def read(tone: Sinusoid) -> tuple[float, float]:
     """Frequency in Hz and amplitude of a tone."""
     return (tone.ordinate + 1) / SECONDS, float(np.sqrt(2 * tone.power / SECONDS))
 
@@ -82,7 +82,7 @@ def test_a_tone_is_taken_out_down_to_the_noise(amplitude: float, by: float) -> N
     for seed in range(10):
         frequency = 150 + 0.005 * seed
         x = noise(seed) + wandering(frequency, amplitude, by, seed)
-        rest, free, tones = remove_tones(transform(x), SECONDS, SPARED)
+        rest, free, tones = remove_sinusoids(transform(x), SECONDS, SPARED)
         near = around(frequency) & free
         assert near.sum() >= 201 - 27
         left.append(np.abs(rest[near, 0]) ** 2)
@@ -102,7 +102,7 @@ def test_masking_the_peak_alone_leaves_the_skirt() -> None:
     raw = transform(noise(1) + wandering(150.02, 100.0, 0.0))
     near = around(150.02) & ~around(150.02, 2)
     assert np.mean(np.abs(raw[near, 0]) ** 2) > 30
-    rest, free, _ = remove_tones(raw, SECONDS, SPARED)
+    rest, free, _ = remove_sinusoids(raw, SECONDS, SPARED)
     assert np.mean(np.abs(rest[near & free, 0]) ** 2) < 1.5
 
 
@@ -110,7 +110,7 @@ def test_other_ordinates_and_channels_keep_what_they_have() -> None:
     """A tone in one channel takes less than 1 % of the noise of another, and none far away."""
     quiet, loud = noise(2), noise(3) + sine(N, RATE, 150.02, 100.0)
     raw = transform(quiet, loud)
-    rest, free, tones = remove_tones(raw, SECONDS, SPARED)
+    rest, free, tones = remove_sinusoids(raw, SECONDS, SPARED)
     assert [tone.channel for tone in tones] == [1]
     near = around(150.02, 300) & free
     lost = np.abs(rest - raw)[:, 0] ** 2
@@ -123,7 +123,7 @@ def test_other_ordinates_and_channels_keep_what_they_have() -> None:
 def test_a_tone_seen_by_two_channels_leaves_both() -> None:
     """Taken out of all channels, and reported once, in the one that shows it most clearly."""
     tone = sine(N, RATE, 150.02, 100.0)
-    rest, free, tones = remove_tones(
+    rest, free, tones = remove_sinusoids(
         transform(noise(4) + 0.3 * tone, noise(5) + tone), SECONDS, SPARED
     )
     assert [t.channel for t in tones] == [1]
@@ -138,8 +138,8 @@ def test_the_unit_of_a_channel_makes_no_tones(factor: float) -> None:
     tone = sine(N, RATE, 150.02, 100.0)
     for seed in range(3):
         one, other = noise(seed) + tone, noise(10 + seed) + 0.3 * tone
-        _, free, tones = remove_tones(transform(one, other), SECONDS, SPARED)
-        _, same, scaled = remove_tones(transform(one, factor * other), SECONDS, SPARED)
+        _, free, tones = remove_sinusoids(transform(one, other), SECONDS, SPARED)
+        _, same, scaled = remove_sinusoids(transform(one, factor * other), SECONDS, SPARED)
         assert [t.channel for t in scaled] == [t.channel for t in tones] == [0]
         np.testing.assert_array_equal(same, free)
 
@@ -149,7 +149,7 @@ def test_the_unit_of_a_channel_makes_no_tones(factor: float) -> None:
 def test_neighbouring_tones_are_both_taken_out(apart: float, amplitude: float) -> None:
     """Two tones of different strength, twelve ordinates apart and more, leave the noise."""
     values = noise(6) + sine(N, RATE, 150.02, 100.0) + sine(N, RATE, 150.02 + apart, amplitude)
-    rest, free, tones = remove_tones(transform(values), SECONDS, SPARED)
+    rest, free, tones = remove_sinusoids(transform(values), SECONDS, SPARED)
     found = sorted(read(tone) for tone in tones)
     np.testing.assert_allclose([f for f, _ in found], [150.02, 150.02 + apart], atol=0.03)
     np.testing.assert_allclose([a for _, a in found], [100.0, amplitude], rtol=0.05)
@@ -166,7 +166,7 @@ def test_noise_has_no_tones() -> None:
     for seed in range(20):
         white_noise = transform(noise(seed))
         for raw in (white_noise, white_noise * f[:, None] ** 2):
-            rest, free, tones = remove_tones(raw, SECONDS, SPARED)
+            rest, free, tones = remove_sinusoids(raw, SECONDS, SPARED)
             assert not tones
             assert free.all()
             np.testing.assert_array_equal(rest, raw)
@@ -180,7 +180,7 @@ def test_narrow_modes_are_seldom_taken_for_tones(width: float, most: int) -> Non
     taken = 0
     for seed in range(40):
         values = accelerations(rng(seed), [mode], N, RATE, 1.0)[0]
-        _, free, _ = remove_tones(transform(values), SECONDS, SPARED)
+        _, free, _ = remove_sinusoids(transform(values), SECONDS, SPARED)
         taken += not free[around(120.0, round(width))].all()
     assert taken <= most
 
@@ -189,7 +189,7 @@ def test_narrow_modes_are_seldom_taken_for_tones(width: float, most: int) -> Non
 def test_too_few_ordinates_are_left_as_they_are(n: int) -> None:
     """Transforms too short to tell a tone from its surroundings come back untouched."""
     raw = transform(sine(N, RATE, 2.5, 100.0) + noise(1))[:n]
-    rest, free, tones = remove_tones(raw, SECONDS, SPARED)
+    rest, free, tones = remove_sinusoids(raw, SECONDS, SPARED)
     assert (free.all(), tones) == (True, ())
     np.testing.assert_array_equal(rest, raw)
 
@@ -199,19 +199,19 @@ def test_what_is_spared_is_left_and_the_rest_is_not() -> None:
     raw = transform(noise(8) + sine(N, RATE, 150.02, 100.0) + sine(N, RATE, 300.02, 100.0))
     spared = SPARED.copy()
     spared[at(140.0) : at(160.0)] = True
-    rest, free, tones = remove_tones(raw, SECONDS, spared)
+    rest, free, tones = remove_sinusoids(raw, SECONDS, spared)
     assert [read(tone)[0] for tone in tones] == [pytest.approx(300.02, abs=0.02)]
     assert free[around(150.0)].all()
     peak = around(150.02, 2)
     np.testing.assert_allclose(rest[peak], raw[peak], rtol=0.01)
-    assert len(remove_tones(raw, SECONDS, SPARED)[2]) == 2
+    assert len(remove_sinusoids(raw, SECONDS, SPARED)[2]) == 2
 
 
 @pytest.mark.slow
 def test_a_comb_too_close_to_be_told_apart_does_not_grow() -> None:
     """Of an excitation that repeats, every third ordinate towers: nothing is put in there."""
     raw = transform(np.tile(noise(9)[: N // 3], 3)[: N - 2] + 0.01 * noise(10)[: N - 2])[:600]
-    rest, _, _ = remove_tones(raw, SECONDS, SPARED[:600])
+    rest, _, _ = remove_sinusoids(raw, SECONDS, SPARED[:600])
     assert np.isfinite(rest).all()
     assert np.sum(np.abs(rest) ** 2) < np.sum(np.abs(raw) ** 2)
 
@@ -248,7 +248,9 @@ def test_a_strong_line_beside_a_mode_moves_it_less_than_its_uncertainty(
         with monkeypatch.context() as patch:
             # Negative control: with the tone left in, the mode moves or is lost.
             patch.setattr(
-                spectra, "remove_tones", lambda raw, *_: (raw, np.ones(len(raw), dtype=bool), ())
+                spectra,
+                "remove_sinusoids",
+                lambda raw, *_: (raw, np.ones(len(raw), dtype=bool), ()),
             )
             left_in = find(values + line)
         assert not left_in.names or moved(left_in, clean) > 1

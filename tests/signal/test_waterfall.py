@@ -9,10 +9,10 @@ from lmshealth.io.log import Log
 from lmshealth.signal.spectra import Spectrum
 from lmshealth.signal.spectral_lines import Line
 from lmshealth.signal.waterfall import (
-    Levels,
+    RelativeSpectrum,
     Waterfall,
     bin_density,
-    read_levels,
+    relative_spectrum,
     shown_band,
 )
 from tests.signals import Mode, accelerations, make_log, make_stage, sine, white
@@ -28,7 +28,7 @@ def resonant(factor: float = 1.0, rate: float = RATE) -> Log:
     return make_log({"acc_a": factor * values[0], "acc_b": values[1]}, rate)
 
 
-def level_at(levels: Levels, frequency: float) -> float:
+def level_at(levels: RelativeSpectrum, frequency: float) -> float:
     """Give the level of the bin that holds a frequency."""
     return float(levels.level[np.searchsorted(levels.edges, frequency) - 1])
 
@@ -52,14 +52,14 @@ def test_binning_keeps_the_power() -> None:
 
 def test_resonances_and_lines_stand_out_where_they_are() -> None:
     """The highest bins are those of the modes; a line makes its own bin the highest of all."""
-    levels = read_levels(resonant(), STAGE)
+    levels = relative_spectrum(resonant(), STAGE)
     assert levels is not None
     for low, high, truth in ((85, 130, 104.0), (130, 184, 155.0)):
         centre = np.sqrt(levels.edges[1:] * levels.edges[:-1])
         own = (centre > low) & (centre < high)
         peak = centre[own][np.argmax(levels.level[own])]
         assert peak == pytest.approx(truth, rel=0.02)
-    loud = read_levels(make_log({"acc_a": sine(N, RATE, 120.0, 5.0)}, RATE), STAGE)
+    loud = relative_spectrum(make_log({"acc_a": sine(N, RATE, 120.0, 5.0)}, RATE), STAGE)
     assert loud is not None
     assert int(np.argmax(loud.level)) == np.searchsorted(loud.edges, 120.0) - 1
 
@@ -67,7 +67,7 @@ def test_resonances_and_lines_stand_out_where_they_are() -> None:
 def test_level_is_that_of_white_noise_about_its_median() -> None:
     """White noise stands at 0 dB, as far as the number of ordinates in a bin allows."""
     noise = white(np.random.default_rng(3), NOISE, 8 * N, RATE)
-    levels = read_levels(make_log({"acc_a": noise}, RATE), STAGE, n_bins=40)
+    levels = relative_spectrum(make_log({"acc_a": noise}, RATE), STAGE, n_bins=40)
     assert levels is not None
     # The narrowest bin holds 530 ordinates: 4.5 of its standard deviations are 0.85 dB.
     assert np.abs(levels.level).max() < 0.85
@@ -75,7 +75,7 @@ def test_level_is_that_of_white_noise_about_its_median() -> None:
 
 def test_loudness_and_unit_of_a_channel_do_not_matter() -> None:
     """A channel a thousand times as loud gives the same picture; absolute levels are lost."""
-    one, other = read_levels(resonant(), STAGE), read_levels(resonant(1e3), STAGE)
+    one, other = relative_spectrum(resonant(), STAGE), relative_spectrum(resonant(1e3), STAGE)
     assert one is not None and other is not None
     np.testing.assert_allclose(one.level, other.level, atol=1e-9)
 
@@ -87,8 +87,10 @@ def test_following_error_counts_as_acceleration() -> None:
     turned = np.fft.rfft(acceleration)
     turned[1:] /= -((2 * np.pi * frequency[1:]) ** 2)
     turned[0] = 0.0
-    one = read_levels(make_log({"acc_a": acceleration}, RATE), STAGE, n_bins=40)
-    other = read_levels(make_log({"delta_e": np.fft.irfft(turned, N)}, RATE), STAGE, n_bins=40)
+    one = relative_spectrum(make_log({"acc_a": acceleration}, RATE), STAGE, n_bins=40)
+    other = relative_spectrum(
+        make_log({"delta_e": np.fft.irfft(turned, N)}, RATE), STAGE, n_bins=40
+    )
     assert one is not None and other is not None
     # Read as it is, a displacement would be tilted by 13 dB over the band.
     assert np.abs(one.level - other.level).max() < 1.0
@@ -97,18 +99,18 @@ def test_following_error_counts_as_acceleration() -> None:
 def test_what_cannot_be_read_is_missing() -> None:
     """No fitting channel, no stretch, no signal or too low a rate give None; half a band NaN."""
     noise = white(np.random.default_rng(5), NOISE, N, RATE)
-    assert read_levels(make_log({"current": noise}, RATE), STAGE) is None
-    assert read_levels(make_log({"acc_a": noise}, RATE, pieces=[(0, 50)]), STAGE) is None
-    assert read_levels(make_log({"acc_a": np.zeros(N)}, RATE), STAGE) is None
-    assert read_levels(make_log({"acc_a": noise}, 160.0), STAGE) is None
-    half = read_levels(make_log({"acc_a": noise}, 250.0), STAGE)
+    assert relative_spectrum(make_log({"current": noise}, RATE), STAGE) is None
+    assert relative_spectrum(make_log({"acc_a": noise}, RATE, pieces=[(0, 50)]), STAGE) is None
+    assert relative_spectrum(make_log({"acc_a": np.zeros(N)}, RATE), STAGE) is None
+    assert relative_spectrum(make_log({"acc_a": noise}, 160.0), STAGE) is None
+    half = relative_spectrum(make_log({"acc_a": noise}, 250.0), STAGE)
     assert half is not None
     np.testing.assert_array_equal(np.isnan(half.level), half.edges[1:] >= 125.0)
 
 
 def test_logs_stand_side_by_side_with_their_lines() -> None:
     """A log without levels is a row of NaN; only lines within the band are kept."""
-    levels = read_levels(resonant(), STAGE)
+    levels = relative_spectrum(resonant(), STAGE)
     lines = [Line(f, 1e-3, "m/s²", "mains", "acc_a") for f in (50.0, 100.0, 150.0, 200.0)]
     waterfall = Waterfall.stack([(levels, lines), (None, ())])
     assert waterfall is not None and levels is not None

@@ -220,12 +220,12 @@ def test_logs_find_their_description(tmp_path: Path) -> None:
     """A description named in the manifest decides; without one the pattern of the stage does."""
     stage = make_stage(tmp_path, (FADING,), tail='[match]\nstage = "*-X"')
     moment = datetime(2026, 1, 1, tzinfo=UTC)
-    assert stage.takes(Metadata(stage="AX-X", recorded_at=moment))
-    assert not stage.takes(Metadata(stage="AX-Y"))
-    assert not stage.takes(Metadata())
-    assert stage.takes(Metadata(stage="AX-Y", description="small"))
-    assert stage.takes(Metadata(stage="AX-Y", description="small.toml"))
-    assert not stage.takes(Metadata(stage="AX-X", description="large"))
+    assert stage.matches(Metadata(stage="AX-X", recorded_at=moment))
+    assert not stage.matches(Metadata(stage="AX-Y"))
+    assert not stage.matches(Metadata())
+    assert stage.matches(Metadata(stage="AX-Y", description="small"))
+    assert stage.matches(Metadata(stage="AX-Y", description="small.toml"))
+    assert not stage.matches(Metadata(stage="AX-X", description="large"))
 
 
 def test_a_verdict_names_a_parameter_by_its_name(tmp_path: Path) -> None:

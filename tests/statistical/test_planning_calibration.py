@@ -13,7 +13,7 @@ from scipy import stats
 
 from lmshealth.stage.cramer_rao import ambient_bound
 from lmshealth.stage.description import Stage
-from lmshealth.stage.identifiability import sight_of
+from lmshealth.stage.identifiability import identifiability_of
 from lmshealth.stage.planning import plan
 from studies.detectability.run import FALSE_ALARM, POWER, called, stage_with
 from tests.claims import Claims
@@ -94,7 +94,7 @@ def test_the_posterior_has_the_power_that_was_planned(
     half as much as is planned, taken for a sound one.
     """
     stage = stage_with("lms-y", model_std=0.0)
-    variance = sight_of(stage).drift_variance(_SECONDS, 1, 1)
+    variance = identifiability_of(stage).drift_variance(_SECONDS, 1, 1)
     planned, promised = (
         plan(stage_with("lms-y", baseline=n), _PARAMETER, 0.05, power=POWER,
              false_alarm=FALSE_ALARM, durations=(_SECONDS,)).efforts[0].smallest_loss
