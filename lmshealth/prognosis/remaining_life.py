@@ -13,7 +13,7 @@ from lmshealth.prognosis.first_passage import first_passage
 from lmshealth.prognosis.life_posterior import LifePosterior, fit_life
 from lmshealth.prognosis.results import LawWeight, Prognosis
 from lmshealth.stage.description import ParameterSpec, Stage
-from lmshealth.stage.identifiability import identifiability_of
+from lmshealth.stage.identifiability import identifiability_of, identifiable_parameters
 from lmshealth.tracking.history import History
 
 _STEP = 1 << 21
