@@ -82,9 +82,7 @@ def stage_with(name: str, model_std: float, plant: str = "", *, losing: bool = F
 def told(name: str) -> dict[str, bool]:
     """Say which parameters the modes of a stage tell at all; ``any`` stands for all of them."""
     seen = identifiability_of(load_stage(name))
-    shown = identifiable_parameters(
-        [seen], [range(len(seen.parameters))], seen.prior
-    )
+    shown = identifiable_parameters([seen], [range(len(seen.parameters))], seen.prior)
     return {
         **dict(zip(seen.parameters, shown.tolist(), strict=True)),
         "any": bool(shown.all()),
