@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any, TypeVar
 
 from numpy.linalg import LinAlgError
 
@@ -26,6 +28,8 @@ from lmshealth.stage.description import Stage
 from lmshealth.tracking.history import History, LogEstimates, build_history, missing_mode_notes
 from lmshealth.tracking.maintenance import NO_MAINTENANCE, Maintenance, maintenance_notes
 from lmshealth.tracking.track import Track, accepted_estimates, outlier_refusals, track
+
+Part = TypeVar("Part")
 
 _logger = logging.getLogger(__name__)
 
@@ -195,7 +199,7 @@ def _results(
             return followed, None, None, None
         # The life needs the longest of all: it is begun before the epochs and fetched after them.
         has_limit = any(parameter.limit for parameter in stage.parameters)
-        mapper = executor.map if executor else map
+        mapper = map if executor is None else partial(map_parts, executor)
         life = mapper(_foretold, [history], [stage], [seed]) if has_limit else None
         epochs = epochs_to_infer(followed, stage, most_epochs)
         health = infer(followed, stage, seed, epochs=epochs, mapper=mapper)
@@ -210,6 +214,17 @@ def _results(
             "report this with modes.csv"
         )
     return followed, health, None, None
+
+
+def map_parts(
+    executor: Executor, function: Callable[..., Part], *columns: Iterable[Any]
+) -> Iterator[Part]:
+    """Apply a function to columns of arguments side by side; yield the results in their order.
+
+    Other than ``Executor.map`` it cancels nothing, which loky does not expect of one that ends.
+    """
+    futures = [executor.submit(function, *row) for row in zip(*columns, strict=True)]
+    return (future.result() for future in futures)
 
 
 def _foretold(

@@ -132,7 +132,7 @@ def take_in(
     site.progress("identifying", len(known), len(tasks))
     left = [task for task in tasks if task.name not in known]
     work = partial(identify_log, stages=tuple(stages), max_memory=max_memory)
-    for k, (task, outcome) in enumerate(site.pool.spread(work, left, _lost), start=1):
+    for k, (task, outcome) in enumerate(site.pool.map_unordered(work, left, _lost), start=1):
         if outcome.lasting:
             site.store.put(task.key(outcome.description), task.digest, outcome)
         sorter.add(task, outcome)
@@ -188,7 +188,7 @@ def _tasks(
     refused: list[Refusal] = list(manifest.refused)
     digests: dict[Path, str] = {}
     site.progress("reading", 0, len(found))
-    for _, part in site.pool.spread(_digests, _batches(found), _no_digests):
+    for _, part in site.pool.map_unordered(_digests, _batches(found), _no_digests):
         for path, (digest, refusal) in part.items():
             digests[path] = digest
             if refusal is not None:

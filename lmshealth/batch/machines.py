@@ -63,13 +63,13 @@ def _assessed(machines: Sequence[Machine], site: Site) -> Iterator[tuple[Machine
     pool = site.pool
     jobs = ((machine, logs_of(machine, site.store)) for machine in machines)
     if pool.executor is None or len(machines) >= pool.size:
-        for (machine, _), made in pool.spread(_make, jobs, _why):
+        for (machine, _), made in pool.map_unordered(_make, jobs, _why):
             yield machine, made
         return
     for machine, logs in jobs:
         try:
-            yield machine, _make((machine, logs), pool.executor, pool.losses)
-        except pool.losses:  # a worker was killed: without them it only takes longer
+            yield machine, _make((machine, logs), pool.executor, pool.crashes)
+        except pool.crashes:  # a worker was killed: without them it only takes longer
             yield machine, _make((machine, logs))
 
 
@@ -133,7 +133,7 @@ def update_priors(
         (machine, key, store.assessment(machine.name, machine.key), learned)
         for machine, learned, key in left
     )
-    for k, (job, made) in enumerate(site.pool.spread(_update, jobs, _why), start=1):
+    for k, (job, made) in enumerate(site.pool.map_unordered(_update, jobs, _why), start=1):
         name, key = job[0].name, job[1]
         if isinstance(made, Made):
             store.keep(name, key, made)
@@ -186,7 +186,7 @@ def tell_all(
 
     Those of which there is nothing, or nothing that this version can read, are passed over.
     """
-    for content, telling in pool.spread(_tell, contents, _why):
+    for content, telling in pool.map_unordered(_tell, contents, _why):
         if isinstance(telling, Telling):
             write_text(out / content.file, telling.page.text)
         if telling is not None:

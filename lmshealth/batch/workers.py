@@ -1,6 +1,6 @@
-"""Where work is done: in this process, in several on this machine, or on a Dask cluster.
+"""Workers: this process, processes of this machine (loky), or a Dask cluster.
 
-A worker that dies takes its task along, not the batch: see `Pool.spread`.
+A worker that dies loses its task, not the batch: see `Pool.map_unordered`.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ import os
 import signal
 import socket
 import threading
+import warnings
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import (
     FIRST_COMPLETED,
@@ -18,372 +19,218 @@ from concurrent.futures import (
     CancelledError,
     Executor,
     Future,
-    ProcessPoolExecutor,
     wait,
 )
 from contextlib import contextmanager
 from functools import cache, partial
 from importlib.metadata import version
 from itertools import islice
-from multiprocessing import connection
+from multiprocessing import connection, resource_tracker
 from multiprocessing.connection import Connection
 from typing import Any, TypeVar
 from urllib.parse import urlsplit
 
+from loky import ProcessPoolExecutor
 from threadpoolctl import threadpool_limits
 
+from lmshealth.batch import constants
 from lmshealth.batch.addresses import shown_address, without_secrets
 from lmshealth.errors import LmshealthError
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
+OnCrash = Callable[[Item, str], Result]
 
-# So many tasks per worker are under way: enough that none waits, few enough to be held in memory.
-_AHEAD = 3
-# Seconds that a scheduler has to answer, and its first worker to be there.
-_TIMEOUT = 20
+# Of worker processes: loky restarts a process that has grown by 300 MB, which logs of unequal
+# length do without any leak, and prints a traceback of native code for every crash.
+_ENVIRONMENT = {"LOKY_MAX_MEMORY_LEAK_SIZE": "1e18", "PYTHONFAULTHANDLER": ""}
 
 
 class SchedulerError(LmshealthError):
-    """A Dask scheduler that cannot be used, or is lost."""
+    """A Dask scheduler that cannot be used, or whose connection is lost."""
 
 
 class Pool:
-    """Does work in this process, one task after the other.
+    """Execute tasks in this process, one after the other.
 
     Attributes
     ----------
     executor : Executor or None
-        For parts of one task; None where there is nothing to be gained.
+        For the parts of one task; None where parts cannot run side by side.
     size : int
-        How many tasks are done at a time.
-    losses : tuple of type
-        What the executor raises where a worker died.
+        Number of tasks that run at a time.
+    crashes : tuple of type
+        What futures of the executor raise where a worker died.
     """
 
     executor: Executor | None = None
     size: int = 1
-    losses: tuple[type[Exception], ...] = (BrokenExecutor,)
+    crashes: tuple[type[Exception], ...] = (BrokenExecutor,)
 
-    def spread(
+    def map_unordered(
         self,
         function: Callable[[Item], Result],
         items: Iterable[Item],
-        lost: Callable[[Item, str], Result],
+        on_crash: OnCrash[Item, Result],
     ) -> Iterator[tuple[Item, Result]]:
-        """Apply a function to items, and yield them with the results, in the order of doing.
+        """Apply a function to items; yield each item with its result, in the order of completion.
 
-        Few items are taken ahead of the results, so that neither pile up in memory.
+        No more than `constants.TASKS_AHEAD` items per worker are taken before their results are
+        fetched, so that memory does not grow with the number of items.
 
         Parameters
         ----------
         function : callable
-            Of a module, or a `partial` of one; what it raises ends the batch.
+            Of a module, or a `partial` of one. Its exceptions end the batch.
         items : iterable
-            Whatever the function takes.
-        lost : callable
-            Makes the result of an item whose worker died of it, from the item and the reason.
-            Items that were under way elsewhere when a worker died are done again.
+            Arguments of the function.
+        on_crash : callable
+            Makes the result of an item that ends its worker, from the item and the reason. Other
+            items that were running when a worker died are run again.
         """
         for item in items:
             yield item, function(item)
 
 
-class _Processes(Pool):
-    """Processes on this machine, started again when one of them dies."""
+class _ProcessPool(Pool):
+    """Processes on this machine, restarted when one of them dies.
+
+    Raises
+    ------
+    LmshealthError
+        If the processes cannot be started.
+    """
 
     def __init__(self, size: int) -> None:
         self.size = size
-        self._start()
+        self.start()
+
+    def start(self) -> None:
+        """Start processes; where one is killed meanwhile, try again."""
+        for _ in range(constants.START_ATTEMPTS):
+            try:
+                self._start()
+                return
+            except BrokenExecutor:
+                self.kill()
+            except BaseException:
+                self.kill()
+                raise
+        raise LmshealthError(
+            f"worker processes end as they start ({constants.START_ATTEMPTS} attempts): is there "
+            "enough memory? Use fewer --workers"
+        )
 
     def _start(self) -> None:
-        self._ours, theirs = multiprocessing.get_context("spawn").Pipe()
-        self.executor: Executor = _open(self.size, theirs)
+        # The processes exit when the other end of this pipe is closed, by us or by our own end.
+        parent_exit, self._open_end = multiprocessing.Pipe(duplex=False)
+        executor = ProcessPoolExecutor(
+            self.size, initializer=_initialise, initargs=(parent_exit,), env=_ENVIRONMENT
+        )
+        self.executor: Executor = executor
+        resource_tracker.ensure_running()  # its start unblocks SIGINT: not amid what follows
+        with _interrupts_blocked():  # the processes start here, and inherit the mask
+            first = executor.submit(os.getpid)
+        first.result()
 
-    def end(self) -> None:
-        """End all processes at once, whatever they are about."""
-        # In this order: the executor's thread fails on a process that dies when a task was
-        # cancelled of which it does not know yet, and would leave this process waiting for ever.
-        caretaker: Any = getattr(self.executor, "_executor_manager_thread", None)
-        queue: Any = getattr(self.executor, "_call_queue", None)
-        if queue is not None and not getattr(self.executor, "_broken", False):
-            # Else a thread that writes a task waits for a reader for ever, as Python 3.11.2 does. A
-            # broken executor sees to it itself, and two must not close it at once.
-            queue._reader.close()
-        self.executor.shutdown(wait=False, cancel_futures=True)
-        self._ours.close()
-        # Python wakes this thread as it ends itself, by a pipe that may be closed in that moment.
-        if caretaker is not None:
-            caretaker.join()
+    def kill(self) -> None:
+        """End all processes at once, whatever they are doing."""
+        if isinstance(self.executor, ProcessPoolExecutor):
+            self.executor.shutdown(kill_workers=True)
+        self._open_end.close()
 
-    def spread(
+    def close(self) -> None:
+        """Wait for the tasks that are running, and end the processes."""
+        self.executor.shutdown()
+        self._open_end.close()
+
+    def map_unordered(
         self,
         function: Callable[[Item], Result],
         items: Iterable[Item],
-        lost: Callable[[Item, str], Result],
+        on_crash: OnCrash[Item, Result],
     ) -> Iterator[tuple[Item, Result]]:
         left = iter(items)
         while True:
-            suspects: list[Item] = []
-            for item, future in _done(self.executor, function, left, self.size):
+            interrupted: list[Item] = []
+            for item, future in _completed(self.executor, function, left, self.size):
                 try:
                     result = future.result()
                 except BrokenExecutor:
-                    suspects.append(item)
+                    interrupted.append(item)
                     continue
                 yield item, result
-            if not suspects:
+            if not interrupted:
                 return
-            # One of them ended a process, and that its pool. Each is done again in a process of
-            # its own, so that only the one is lost.
-            self.end()
-            self._start()
-            for item in suspects:
-                yield item, _alone(function, item, lost)
+            # One of these items ended its process, and with it the pool. Each is run again alone,
+            # so that only that one is lost.
+            self.kill()
+            self.start()
+            with _process_pool(1) as single:
+                for item in interrupted:
+                    try:
+                        result = single.executor.submit(function, item).result()
+                    except BrokenExecutor:
+                        single.kill()
+                        single.start()
+                        result = on_crash(item, "it ended the process that worked on it")
+                    yield item, result
 
 
-class _Cluster(Pool):
-    """Workers of a Dask cluster; its scheduler does again what was on a worker that died."""
-
-    def __init__(self, client: Any) -> None:
-        from distributed import KilledWorker
-
-        self.losses = (BrokenExecutor, KilledWorker)
-        self.client = client
-        self.executor: Executor = client.get_executor(pure=False)
-        self.size = max(1, sum(client.nthreads().values()))
-
-    def spread(
-        self,
-        function: Callable[[Item], Result],
-        items: Iterable[Item],
-        lost: Callable[[Item, str], Result],
-    ) -> Iterator[tuple[Item, Result]]:
-        # Not `submit` of the executor: a result that arrives as the worker dies that made it is
-        # neither finished nor cancelled, which distributed/cfexecutor.py takes for an error.
-        from distributed import as_completed
-
-        checked = partial(_by_version, version("lmshealth"), function)
-        left = iter(items)
-        waiting: dict[Any, Item] = {}
-        finished: Any = as_completed
-        done = finished(loop=self.client.loop)
-        try:
-            while True:
-                for item in islice(left, _AHEAD * self.size - len(waiting)):
-                    future = self.client.submit(checked, item, pure=False)
-                    waiting[future] = item
-                    done.add(future)
-                if not waiting:
-                    return
-                future = next(done)
-                item = waiting.pop(future)
-                try:
-                    result = future.result()
-                except self.losses:
-                    result = lost(item, "it ended every worker that took it")
-                yield item, result
-        finally:
-            self.client.cancel(list(waiting))
-
-
-def _done(
+def _completed(
     executor: Executor, function: Callable[[Item], Result], items: Iterator[Item], size: int
 ) -> Iterator[tuple[Item, Future[Result]]]:
-    """Yield items with their futures when these are done, in whichever way."""
-    waiting: dict[Future[Result], Item] = {}
-    try:
-        while True:
-            for item in islice(items, _AHEAD * size - len(waiting)):
-                try:
-                    future = executor.submit(function, item)
-                except BrokenExecutor as error:
-                    future = Future()
-                    future.set_exception(error)
-                waiting[future] = item
-                if future.done():
-                    break  # it may be broken: look before more is taken
-            if not waiting:
-                return
-            for future in wait(waiting, return_when=FIRST_COMPLETED).done:
-                yield waiting.pop(future), future
-                broken = not future.cancelled() and isinstance(future.exception(), BrokenExecutor)
-                if broken:
-                    items = iter(())
-    finally:
-        for future in waiting:
-            future.cancel()
+    """Yield items with their futures when these are done; after a crash take no more items."""
+    running: dict[Future[Result], Item] = {}
+    while True:
+        for item in islice(items, constants.TASKS_AHEAD * size - len(running)):
+            try:
+                future = executor.submit(function, item)
+            except BrokenExecutor as error:
+                future = Future()
+                future.set_exception(error)
+            running[future] = item
+            if future.done():
+                break  # perhaps by a crash: see below before more items are taken
+        if not running:
+            return
+        for future in wait(running, return_when=FIRST_COMPLETED).done:
+            if isinstance(future.exception(), BrokenExecutor):
+                items = iter(())
+            yield running.pop(future), future
+
+
+@contextmanager
+def _process_pool(size: int) -> Iterator[_ProcessPool]:
+    with warnings.catch_warnings():
+        # Where neither psutil nor pgrep is installed, loky warns that it kills only its own.
+        warnings.filterwarnings("ignore", module=r"loky\.")
+        pool = _ProcessPool(size)
+        try:
+            yield pool
+        except BaseException:
+            pool.kill()
+            raise
+        pool.close()
 
 
 @contextmanager
 def processes(size: int) -> Iterator[Pool]:
-    """Work in so many processes of this machine; for one, in this process.
+    """Open a pool of processes of this machine; of one, work in this process.
 
-    They end with the pool, with an interrupt, and with this process, whatever ends it.
+    The processes end with the pool, with an interrupt, and with this process, whatever ends it.
     """
     if size <= 1:
         with threadpool_limits(1):
             yield Pool()
         return
-    pool = _Processes(size)
-    try:
+    with _process_pool(size) as pool:
         yield pool
-    except BaseException:
-        pool.end()
-        raise
-    pool.executor.shutdown()
 
 
 @contextmanager
-def cluster(address: str) -> Iterator[Pool]:
-    """Work on a Dask cluster.
-
-    Scheduler and workers need this version of lmshealth, and workers see the logs under the same
-    paths.
-
-    Parameters
-    ----------
-    address : str
-        Of its scheduler, such as ``tcp://host:8786``.
-
-    Raises
-    ------
-    SchedulerError
-        If it does not answer, has no worker, or one that is of another version.
-    """
-    shown = shown_address(address)
-    try:
-        from distributed.comm.core import CommClosedError
-    except ImportError as error:
-        raise SchedulerError(
-            "--scheduler needs Dask: pip install 'lmshealth[distributed]'"
-        ) from error
-    try:
-        _knock(address)
-        client = _connected(address)
-    # Settings may name modules that are not there, or no certificates, which is a TypeError.
-    except (ImportError, OSError, TypeError, ValueError) as error:
-        why = getattr(error, "strerror", None)
-        detail = f"{why}; is it running?" if why else without_secrets(str(error), address)
-        raise SchedulerError(f"cannot work on the Dask scheduler {shown}: {detail}") from None
-    except Exception as error:  # whatever the library makes of words that it does not know
-        raise SchedulerError(
-            f"what answers at {shown} does not talk like a Dask scheduler: is it the right port?"
-        ) from error
-    comm_closed: Any = CommClosedError  # the library has no types
-    try:
-        _await_worker(client, shown)
-        client.register_plugin(_one_thread(), name="lmshealth")  # of workers that come later, too
-        client.run(_insist, version("lmshealth"))
-        yield _Cluster(client)
-    except (CancelledError, comm_closed) as error:
-        raise SchedulerError(
-            f"lost the Dask scheduler {shown}; what was done is kept: run again to go on"
-        ) from error
-    finally:
-        _close(client)
-
-
-def _await_worker(client: Any, shown: str) -> None:
-    try:
-        client.wait_for_workers(1, timeout=_TIMEOUT)
-    except TimeoutError as error:
-        raise SchedulerError(f"the Dask scheduler {shown} has no workers: start some") from error
-
-
-def _knock(address: str) -> None:
-    """See whether somebody answers at an address, before a client waits long for it."""
-    parts = urlsplit(address)
-    if parts.username or parts.password:
-        raise ValueError("its address has no user and no password; certificates go by tls://")
-    if not parts.hostname or not parts.port:
-        raise ValueError("needed is an address like tcp://host:8786")
-    with socket.create_connection((parts.hostname, parts.port), timeout=_TIMEOUT) as door:
-        if parts.scheme != "tcp":
-            return
-        # Both ends begin with a greeting, for which the library would wait for ever.
-        try:
-            door.recv(1)
-        except TimeoutError:
-            raise ValueError(
-                f"it said nothing for {_TIMEOUT} s: is it one, and the right port?"
-            ) from None
-
-
-def _connected(address: str) -> Any:
-    """Open a client of a scheduler."""
-    from distributed import Client
-
-    # What becomes of its connections is told by our own errors. Each part has a level of its own.
-    for name in logging.root.manager.loggerDict:
-        if name.split(".")[0] == "distributed":
-            logging.getLogger(name).setLevel(logging.CRITICAL)
-    client = Client.__new__(Client)
-    try:
-        start: Any = Client.__init__
-        start(client, address, timeout=_TIMEOUT, set_as_default=False)
-    except BaseException:
-        _close(client)
-        raise
-    return client
-
-
-def _one_thread() -> Any:
-    """Make a plugin that keeps linear algebra to one thread, as it is in processes of our own.
-
-    More would be no faster, and sums in another order differ in their last digits.
-    """
-    from distributed import WorkerPlugin
-
-    class OneThread(WorkerPlugin):
-        def setup(self, worker: Any) -> None:
-            import scipy.linalg  # noqa: F401  # it brings a library of its own
-
-            self.limits = threadpool_limits(1)
-
-    return OneThread()
-
-
-def _close(client: Any) -> None:
-    """Let go of a client, also of one whose scheduler is gone."""
-    try:
-        if client.status != "newly-created":  # that has nothing to close
-            client.close(timeout=_TIMEOUT)
-    except (OSError, CancelledError) as error:
-        logging.getLogger(__name__).debug("%s", error)
-    # One that is not closed is closed as Python deletes it, in whichever thread that happens: in
-    # that of a client being opened, it would wait for the lock that the opening holds.
-    client.status = "closed"
-
-
-def _open(size: int, end: Connection) -> ProcessPoolExecutor:
-    """Start processes; they end when the other end of a pipe is closed.
-
-    Raises
-    ------
-    LmshealthError
-        If they cannot be started.
-    """
-    # Spawned, not forked: a fork would share locks of threads that do not come along.
-    context = multiprocessing.get_context("spawn")
-    executor = ProcessPoolExecutor(size, mp_context=context, initializer=_begin, initargs=(end,))
-    try:
-        with _uninterrupted():  # until they know that an interrupt is not meant for them
-            started = [executor.submit(os.getpid) for _ in range(size)]  # each starts one
-        wait(started)
-        for future in started:
-            future.result()
-    except BrokenExecutor as error:
-        raise LmshealthError(
-            "worker processes end as they start: a script that asks for several workers has to do "
-            'so under `if __name__ == "__main__":`'
-        ) from error
-    return executor
-
-
-@contextmanager
-def _uninterrupted() -> Iterator[None]:
-    """Hold back interrupts; processes that start meanwhile inherit that."""
+def _interrupts_blocked() -> Iterator[None]:
+    """Block SIGINT in this thread; processes and threads that start meanwhile inherit that."""
     if not hasattr(signal, "pthread_sigmask"):
         yield
         return
@@ -394,37 +241,191 @@ def _uninterrupted() -> Iterator[None]:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
-def _begin(end: Connection) -> None:
-    """Let Ctrl-C be the parent's alone, end with the parent, and do sums in one order."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+def _initialise(parent_exit: Connection) -> None:
+    """Set up a worker process: no interrupts, one thread for linear algebra, exit with parent."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent handles interrupts
     if hasattr(signal, "pthread_sigmask"):
         signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
-    threadpool_limits(1)
-    threading.Thread(target=_end_with_parent, args=(end,), daemon=True).start()
+    threadpool_limits(1)  # as in `processes`: sums in another order differ in their last digits
+    threading.Thread(target=_exit_with_parent, args=(parent_exit,), daemon=True).start()
 
 
-def _end_with_parent(end: Connection) -> None:
-    parent = multiprocessing.parent_process()
-    assert parent is not None
-    connection.wait([parent.sentinel, end])
+def _exit_with_parent(parent_exit: Connection) -> None:
+    connection.wait([parent_exit])  # ready when the other end is closed
     os._exit(1)
 
 
-def _alone(
-    function: Callable[[Item], Result], item: Item, lost: Callable[[Item, str], Result]
-) -> Result:
-    """Work in a process of its own, and survive that process."""
-    ours, theirs = multiprocessing.get_context("spawn").Pipe()
-    with ours, _open(1, theirs) as executor:
+# Dask
+
+
+class _Cluster(Pool):
+    """Workers of a Dask cluster; its scheduler reruns what was on a worker that died."""
+
+    def __init__(self, client: Any) -> None:
+        from distributed import KilledWorker
+
+        self.crashes = (BrokenExecutor, KilledWorker)
+        self.client = client
+        self.executor: Executor = client.get_executor(pure=False)
+        self.size = max(1, sum(client.nthreads().values()))
+
+    def map_unordered(
+        self,
+        function: Callable[[Item], Result],
+        items: Iterable[Item],
+        on_crash: OnCrash[Item, Result],
+    ) -> Iterator[tuple[Item, Result]]:
+        # Not `submit` of the executor: a result that arrives as its worker dies is neither
+        # finished nor cancelled, which distributed/cfexecutor.py takes for an error.
+        from distributed import as_completed
+
+        checked = partial(_run_checked, version("lmshealth"), function)
+        left = iter(items)
+        running: dict[Any, Item] = {}
+        finished: Any = as_completed
+        done = finished(loop=self.client.loop)
         try:
-            return executor.submit(function, item).result()
-        except BrokenExecutor:
-            return lost(item, "it ended the process that worked on it")
+            while True:
+                for item in islice(left, constants.TASKS_AHEAD * self.size - len(running)):
+                    future = self.client.submit(checked, item, pure=False)
+                    running[future] = item
+                    done.add(future)
+                if not running:
+                    return
+                future = next(done)
+                item = running.pop(future)
+                try:
+                    result = future.result()
+                except self.crashes:
+                    result = on_crash(item, "it ended every worker that took it")
+                yield item, result
+        finally:
+            self.client.cancel(list(running))
 
 
-def _by_version(needed: str, function: Callable[[Item], Result], item: Item) -> Result:
-    """Work only where results are those that the batch takes them for."""
-    _insist(needed)
+@contextmanager
+def cluster(address: str) -> Iterator[Pool]:
+    """Open a pool of the workers of a Dask cluster.
+
+    Scheduler and workers need this version of lmshealth, and the workers need the logs under the
+    same paths.
+
+    Parameters
+    ----------
+    address : str
+        Of its scheduler, such as ``tcp://host:8786``.
+
+    Raises
+    ------
+    SchedulerError
+        If the scheduler does not answer, has no worker, or has a worker of another version.
+    """
+    shown = shown_address(address)
+    try:
+        from distributed.comm.core import CommClosedError
+    except ImportError as error:
+        raise SchedulerError(
+            "--scheduler needs Dask: pip install 'lmshealth[distributed]'"
+        ) from error
+    try:
+        _check_address(address)
+        client = _connected(address)
+    # Dask's settings may name modules that are missing, or lack certificates (a TypeError).
+    except (ImportError, OSError, TypeError, ValueError) as error:
+        why = getattr(error, "strerror", None)
+        detail = f"{why}; is it running?" if why else without_secrets(str(error), address)
+        raise SchedulerError(f"cannot work on the Dask scheduler {shown}: {detail}") from None
+    except Exception as error:  # whatever the library makes of an answer that it cannot parse
+        raise SchedulerError(
+            f"the service at {shown} does not answer like a Dask scheduler: is it the right port?"
+        ) from error
+    comm_closed: Any = CommClosedError  # the library has no types
+    try:
+        _await_worker(client, shown)
+        client.register_plugin(_one_thread(), name="lmshealth")  # also of workers that join later
+        client.run(_require_version, version("lmshealth"))
+        yield _Cluster(client)
+    except (CancelledError, comm_closed) as error:
+        raise SchedulerError(
+            f"lost the Dask scheduler {shown}; finished results are stored: run again to continue"
+        ) from error
+    finally:
+        _close(client)
+
+
+def _await_worker(client: Any, shown: str) -> None:
+    try:
+        client.wait_for_workers(1, timeout=constants.SCHEDULER_TIMEOUT_S)
+    except TimeoutError as error:
+        raise SchedulerError(f"the Dask scheduler {shown} has no workers: start some") from error
+
+
+def _check_address(address: str) -> None:
+    """Check that a service answers at an address, before a client waits long for it."""
+    parts = urlsplit(address)
+    if parts.username or parts.password:
+        raise ValueError("its address has no user and no password; certificates go by tls://")
+    if not parts.hostname or not parts.port:
+        raise ValueError("needed is an address like tcp://host:8786")
+    timeout = constants.SCHEDULER_TIMEOUT_S
+    with socket.create_connection((parts.hostname, parts.port), timeout=timeout) as service:
+        if parts.scheme != "tcp":
+            return
+        # Both ends begin with a greeting, for which the library would wait for ever.
+        try:
+            service.recv(1)
+        except TimeoutError:
+            raise ValueError(
+                f"no greeting within {timeout} s: is it a scheduler, and the right port?"
+            ) from None
+
+
+def _connected(address: str) -> Any:
+    """Open a client of a scheduler."""
+    from distributed import Client
+
+    # Our own errors report what becomes of its connections. Each logger has a level of its own.
+    for name in logging.root.manager.loggerDict:
+        if name.split(".")[0] == "distributed":
+            logging.getLogger(name).setLevel(logging.CRITICAL)
+    client = Client.__new__(Client)
+    try:
+        start: Any = Client.__init__
+        start(client, address, timeout=constants.SCHEDULER_TIMEOUT_S, set_as_default=False)
+    except BaseException:
+        _close(client)
+        raise
+    return client
+
+
+def _one_thread() -> Any:
+    """Make a plugin that keeps linear algebra to one thread, as in processes of our own."""
+    from distributed import WorkerPlugin
+
+    class OneThread(WorkerPlugin):
+        def setup(self, worker: Any) -> None:
+            import scipy.linalg  # noqa: F401  # it loads a library of its own
+
+            self.limits = threadpool_limits(1)
+
+    return OneThread()
+
+
+def _close(client: Any) -> None:
+    """Close a client, also one whose scheduler is gone."""
+    try:
+        if client.status != "newly-created":  # such a client has nothing to close
+            client.close(timeout=constants.SCHEDULER_TIMEOUT_S)
+    except (OSError, CancelledError) as error:
+        logging.getLogger(__name__).debug("%s", error)
+    # Python closes an open client when it deletes it, in whichever thread that happens: in the
+    # thread of a client being opened it would wait for the lock that the opening holds.
+    client.status = "closed"
+
+
+def _run_checked(needed: str, function: Callable[[Item], Result], item: Item) -> Result:
+    """Run a task on a worker of the needed version only: the store names results by version."""
+    _require_version(needed)
     return function(item)
 
 
@@ -433,9 +434,9 @@ def _own_version() -> str:
     return version("lmshealth")
 
 
-def _insist(needed: str) -> None:
+def _require_version(needed: str) -> None:
     found = _own_version()
     if found != needed:
         raise SchedulerError(
-            f"a worker has lmshealth {found}, this run is of {needed}: install one version"
+            f"a worker has lmshealth {found}, this run has {needed}: install one version"
         )

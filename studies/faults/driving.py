@@ -120,7 +120,7 @@ class Run:
         if how == "main":
             self._process.kill()
         elif how == "worker":
-            workers = [pid for pid, words in marked(self.mark).items() if "spawn_main" in words]
+            workers = [pid for pid, words in marked(self.mark).items() if "popen_loky" in words]
             if not workers:
                 return False
             os.kill(rng.choice(workers), signal.SIGKILL)

@@ -203,7 +203,7 @@ def test_pages_come_from_the_store_alone(
 ) -> None:
     """Without logs and descriptions the same pages of machine and fleet; one needs no process."""
     shutil.copy(done.out / "lmshealth.sqlite", tmp_path)
-    monkeypatch.setattr(workers, "_Processes", None)
+    monkeypatch.setattr(workers, "_ProcessPool", None)
     with closing(Store(beside(tmp_path), create=False)) as store:
         again = report(store, tmp_path, Settings(workers=8))
     assert pages(tmp_path) == done.pages

@@ -17,8 +17,9 @@ from pathlib import Path
 
 import pytest
 
-from lmshealth.batch import workers
+from lmshealth.batch import constants, workers
 from lmshealth.batch.workers import Pool, SchedulerError, processes
+from lmshealth.errors import LmshealthError
 from studies import servers
 
 
@@ -55,8 +56,10 @@ def lost(number: int, why: str) -> int:
 def test_everything_is_done_once(size: int) -> None:
     """Each item comes back with its own result, also when there are more than fit in a window."""
     with processes(size) as pool:
-        assert sorted(pool.spread(double, range(40), lost)) == [(k, 2 * k) for k in range(40)]
-        assert list(pool.spread(double, [], lost)) == []
+        assert sorted(pool.map_unordered(double, range(40), lost)) == [
+            (k, 2 * k) for k in range(40)
+        ]
+        assert list(pool.map_unordered(double, [], lost)) == []
         assert pool.size == size
 
 
@@ -72,7 +75,7 @@ def test_few_items_are_taken_ahead_of_results(size: int) -> None:
             yield taken
 
     with processes(size) as pool:
-        for done, _ in enumerate(pool.spread(double, items(), lost)):
+        for done, _ in enumerate(pool.map_unordered(double, items(), lost)):
             assert taken <= done + 1 + 3 * size
             if done == 50:
                 break
@@ -82,24 +85,24 @@ def test_few_items_are_taken_ahead_of_results(size: int) -> None:
 def test_an_item_that_kills_its_process_is_lost_alone() -> None:
     """The others are done, those that were under way too, and the pool works on."""
     with processes(2) as pool:
-        found = dict(pool.spread(die_of_three, range(12), lost))
+        found = dict(pool.map_unordered(die_of_three, range(12), lost))
         assert found == {k: 2 * k for k in range(12)} | {3: -3}
-        assert dict(pool.spread(double, range(5), lost)) == {k: 2 * k for k in range(5)}
+        assert dict(pool.map_unordered(double, range(5), lost)) == {k: 2 * k for k in range(5)}
 
 
 @pytest.mark.slow
 def test_a_killed_process_loses_nothing() -> None:
     """What it was about is done again elsewhere."""
     with processes(2) as pool:
-        (_, victim), *_ = pool.spread(process_of, [0], lost)
+        (_, victim), *_ = pool.map_unordered(process_of, [0], lost)
         os.kill(victim, signal.SIGKILL)
-        assert dict(pool.spread(double, range(20), lost)) == {k: 2 * k for k in range(20)}
+        assert dict(pool.map_unordered(double, range(20), lost)) == {k: 2 * k for k in range(20)}
 
 
 def test_a_mistake_is_raised_here() -> None:
     """What a function raises ends the batch with its own error."""
     with processes(2) as pool, pytest.raises(TypeError):
-        list(pool.spread(double, [None], lost))  # type: ignore[list-item]
+        list(pool.map_unordered(double, [None], lost))  # type: ignore[list-item]
 
 
 def test_processes_end_with_a_parent_that_is_killed(root: Path) -> None:
@@ -110,7 +113,8 @@ def test_processes_end_with_a_parent_that_is_killed(root: Path) -> None:
         "import time\n"
         "if __name__ == '__main__':\n"
         "    with processes(2) as pool:\n"
-        "        print(*{p for _, p in pool.spread(process_of, range(20), lost)}, flush=True)\n"
+        "        found = pool.map_unordered(process_of, range(20), lost)\n"
+        "        print(*{process for _, process in found}, flush=True)\n"
         "        time.sleep(60)\n"
     )
     script = ["-c", code]
@@ -125,12 +129,13 @@ def test_processes_end_with_a_parent_that_is_killed(root: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "begun", ["pool.spread(dawdle, items, lost)", "pool.executor.map(len, items)"]
+    "begun", ["pool.map_unordered(dawdle, items, lost)", "map_parts(pool.executor, len, items)"]
 )
 def test_an_interrupt_as_work_begins_leaves_nothing_that_waits(root: Path, begun: str) -> None:
     """Processes that only start hear no interrupt, and what they were to do is let go."""
     code = (
-        "import signal\nfrom lmshealth.batch.workers import processes\n"
+        "import signal\nfrom lmshealth.batch.assess import map_parts\n"
+        "from lmshealth.batch.workers import processes\n"
         "from tests.batch.test_workers import dawdle, lost\n"
         "if __name__ == '__main__':\n"
         "    signal.signal(signal.SIGINT, signal.default_int_handler)\n"
@@ -155,35 +160,30 @@ def test_an_interrupt_as_work_begins_leaves_nothing_that_waits(root: Path, begun
     assert said.count("Traceback") == 1, said
 
 
-def test_an_interrupt_is_over_when_it_is_told(root: Path) -> None:
-    """No thread is left that Python could stumble over as it ends.
+def test_processes_that_cannot_start_end_the_batch(monkeypatch: pytest.MonkeyPatch) -> None:
+    """After some attempts one error states it, with what can be done."""
+    monkeypatch.setattr(workers, "_initialise", os._exit)
+    monkeypatch.setattr(constants, "START_ATTEMPTS", 2)
+    with pytest.raises(LmshealthError, match=r"as they start \(2 attempts\).*fewer --workers"):
+        _run_in_processes(1)
 
-    It wakes the one that looks after processes by a pipe that this one closes as it ends: here
-    both take so long that the pipe is closed in between.
-    """
-    code = (
-        "import signal, time\nfrom concurrent.futures import process\n"
-        "from lmshealth.batch.workers import processes\n"
-        "from tests.batch.test_workers import dawdle, lost\n"
-        "class Slow(process._ThreadWakeup):\n"
-        "    def wakeup(self):\n"
-        "        if not self._closed:\n"
-        "            time.sleep(1.0 if process._global_shutdown else 0.0)\n"
-        "            self._writer.send_bytes(b'')\n"
-        "    def close(self):\n"
-        "        time.sleep(0.5)\n"
-        "        super().close()\n"
-        "if __name__ == '__main__':\n"
-        "    process._ThreadWakeup = Slow\n"
-        "    signal.signal(signal.SIGALRM, signal.default_int_handler)\n"
-        "    with processes(2) as pool:\n"
-        "        signal.setitimer(signal.ITIMER_REAL, 0.1)\n"
-        "        list(pool.spread(dawdle, (bytes(9) for _ in range(400)), lost))\n"
+
+def _run_in_processes(number: int) -> int:
+    with processes(2) as pool:
+        ((_, result),) = pool.map_unordered(double, [number], lost)
+        return result
+
+
+def test_a_script_needs_no_guard(root: Path, tmp_path: Path) -> None:
+    """Workers do not import the script that starts them."""
+    script = tmp_path / "script.py"
+    script.write_text(
+        "from tests.batch.test_workers import _run_in_processes\nprint(_run_in_processes(4))\n"
     )
-    words = [sys.executable, "-c", code]
-    done = subprocess.run(words, capture_output=True, text=True, cwd=root, timeout=60, check=False)
-    assert done.returncode == -signal.SIGINT
-    assert done.stderr.count("Traceback") == 1, done.stderr
+    words = [sys.executable, str(script)]
+    environment = {**os.environ, "PYTHONPATH": str(root)}
+    done = subprocess.run(words, capture_output=True, text=True, env=environment, check=True)
+    assert (done.stdout, done.stderr) == ("8\n", "")
 
 
 def _is_there(process: int) -> bool:
@@ -201,11 +201,11 @@ def test_a_cluster_does_everything_once(cluster: servers.Cluster) -> None:
     """Results are those of this process; an item that kills its workers is lost alone."""
     with workers.cluster(cluster.address) as pool:
         assert pool.size == 2
-        assert dict(pool.spread(double, range(40), lost)) == {k: 2 * k for k in range(40)}
+        assert dict(pool.map_unordered(double, range(40), lost)) == {k: 2 * k for k in range(40)}
         # Dask gives up what four workers died of.
         for _ in range(4):
             cluster.add_worker()
-        found = dict(pool.spread(die_of_three, range(2, 5), lost))
+        found = dict(pool.map_unordered(die_of_three, range(2, 5), lost))
         assert found == {2: 4, 3: -3, 4: 8}
 
 
@@ -213,7 +213,7 @@ def test_a_cluster_does_everything_once(cluster: servers.Cluster) -> None:
 def test_a_worker_of_a_cluster_may_be_killed(cluster: servers.Cluster) -> None:
     """What it was about is done by another, and a worker that comes later works as all do."""
     with workers.cluster(cluster.address) as pool:
-        tasks = pool.spread(slowly, range(12), lost)
+        tasks = pool.map_unordered(slowly, range(12), lost)
         found = dict([next(tasks)])
         cluster.workers[0].kill()
         cluster.add_worker()
@@ -234,7 +234,7 @@ def test_a_result_may_arrive_as_its_worker_dies(
         Future, "status", property(lambda self: status(self).replace("finished", "lost"))
     )
     with workers.cluster(cluster.address) as pool:
-        assert dict(pool.spread(double, range(9), lost)) == {k: 2 * k for k in range(9)}
+        assert dict(pool.map_unordered(double, range(9), lost)) == {k: 2 * k for k in range(9)}
 
 
 def slowly(number: int) -> tuple[int, int]:
@@ -254,7 +254,7 @@ def test_a_lost_scheduler_is_told(
         pytest.raises(SchedulerError, match=f"lost the Dask scheduler {cluster.address}"),
         workers.cluster(cluster.address) as pool,
     ):
-        for _ in pool.spread(slowly, range(50), lost):
+        for _ in pool.map_unordered(slowly, range(50), lost):
             cluster.scheduler.kill()
     assert capfd.readouterr().err == ""
 
@@ -278,7 +278,7 @@ def test_a_worker_of_another_version_is_refused(
     """Its results would be kept under the name of this version."""
     monkeypatch.setattr(workers, "version", lambda name: "0.0.1")
     with (
-        pytest.raises(SchedulerError, match=f"lmshealth {version('lmshealth')}.*of 0.0.1"),
+        pytest.raises(SchedulerError, match=f"lmshealth {version('lmshealth')}.*has 0.0.1"),
         workers.cluster(cluster.address),
     ):
         pass
@@ -293,7 +293,7 @@ def test_a_worker_of_another_version_is_refused(
         ("tcp://me:hunter2@127.0.0.1:8786", "no user and no password"),
         ("tcp://127.0.0.1:{port}", "refused"),
         ("nosuch://127.0.0.1:{listening}", "unknown address scheme"),
-        ("tcp://127.0.0.1:{listening}", "it said nothing for 2 s.*right port"),
+        ("tcp://127.0.0.1:{listening}", "no greeting within 2 s.*right port"),
         ("tls://127.0.0.1:{listening}", "TLS"),
     ],
 )
@@ -302,7 +302,7 @@ def test_an_address_that_is_none_is_told(
 ) -> None:
     """Each is an error soon, without what is secret in it."""
     needs("distributed")
-    monkeypatch.setattr(workers, "_TIMEOUT", 2)
+    monkeypatch.setattr(constants, "SCHEDULER_TIMEOUT_S", 2)
     with socket.create_server(("127.0.0.1", 0)) as listener:
         full = address.format(port=servers.free_port(), listening=listener.getsockname()[1])
         with pytest.raises(SchedulerError, match=said) as caught, workers.cluster(full):
@@ -319,7 +319,7 @@ def test_settings_that_cannot_be_followed_are_told(
     needs("distributed")
     import dask
 
-    monkeypatch.setattr(workers, "_knock", lambda address: None)
+    monkeypatch.setattr(workers, "_check_address", lambda address: None)
     loader = {"distributed.client.security-loader": "nosuchmodule.loader"}
     address = f"tcp://127.0.0.1:{servers.free_port()}"
     with (
@@ -370,7 +370,7 @@ def test_a_cluster_without_workers_is_told(
         worker.kill()
     with Client(cluster.address, timeout=servers.WAIT_S, set_as_default=False) as client:
         servers.wait_until(lambda: not client.nthreads(), "losing the workers")
-    monkeypatch.setattr(workers, "_TIMEOUT", 2)
+    monkeypatch.setattr(constants, "SCHEDULER_TIMEOUT_S", 2)
     with (
         pytest.raises(SchedulerError, match="has no workers"),
         workers.cluster(cluster.address),
@@ -384,4 +384,4 @@ def test_a_pool_of_one_is_this_process() -> None:
     with processes(1) as pool:
         assert type(pool) is Pool
         assert pool.executor is None
-        assert dict(pool.spread(process_of, [1], lost)) == {1: os.getpid()}
+        assert dict(pool.map_unordered(process_of, [1], lost)) == {1: os.getpid()}

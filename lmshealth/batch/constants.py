@@ -1,0 +1,39 @@
+"""Limits, time-outs and retries of batch analysis."""
+
+TASKS_AHEAD = 3
+"""Tasks per worker that are submitted before their results are fetched. Two keep a worker busy
+while its result travels; the third covers tasks of unequal length. Each is held in memory."""
+
+START_ATTEMPTS = 3
+"""How often worker processes are started when one of them is killed as it starts."""
+
+SCHEDULER_TIMEOUT_S = 20
+"""Seconds (s) within which a Dask scheduler has to answer, and to have a first worker."""
+
+FILES_PER_HASH_TASK = 16
+"""Files that one task hashes: a short file is hashed faster than a task is sent."""
+
+ROWS_PER_QUERY = 400
+"""Rows fetched by one query: far below the 999 variables that old builds of SQLite accept."""
+
+SQLITE_BUSY_TIMEOUT_S = 120
+"""Seconds (s) that a writer waits while other processes write to the same SQLite file."""
+
+SERVER_TIMEOUT_S = 20
+"""Seconds (s) that a database server has to answer, unless its URL has ``connect_timeout``."""
+
+SCHEMA = 5
+"""Version of the tables of a store, part of their names: older tables are not read."""
+
+RETRIED_REASONS = ("missing-file", "changed")
+"""Reasons of refusal that depend on the moment and not on the content of the log: they are not
+stored, and the next run tries the log again. The same holds for logs that fail for lack of
+resources, by an error of this program, or by a crash of their process."""
+
+ASSESSMENT_ATTEMPTS = 2
+"""How often a machine is assessed in one run when its assessment is missing from the store, for
+instance because a run at the same time removed it."""
+
+SHORTEST_SECRET = 4
+"""Least length of a value of a URL's options that is masked in messages. Shorter values are
+numbers and switches, which occur everywhere in a message."""
