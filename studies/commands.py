@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import subprocess
 import sys
-from collections.abc import Sequence
-from contextlib import AbstractContextManager
+from collections.abc import Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager
 from importlib import import_module
 from math import inf
 from pathlib import Path
@@ -13,6 +13,7 @@ from unittest.mock import patch
 
 from click.testing import CliRunner
 
+from lmshealth.health import constants
 from lmshealth.health import ensemble_sampling as sampling
 from lmshealth.prognosis import life_posterior as lifefit
 from lmshealth.report import figures as plots
@@ -76,6 +77,11 @@ def _insist(status: int, some_refused: bool, command: str, said: str) -> None:
         raise SystemExit(f"{command} ended with {status}: {said}")
 
 
-def short_chains() -> AbstractContextManager[object]:
-    """Let chains be a fifth as long; they have to converge all the same."""
-    return patch.multiple(sampling, _AUTOCORRELATION_TIMES=10, _FIRST_STEPS=100)
+@contextmanager
+def short_chains() -> Iterator[None]:
+    """Require a fifth of the length of chains; they have to converge all the same."""
+    with (
+        patch.object(constants, "MIN_AUTOCORRELATION_TIMES", 10),
+        patch.object(sampling, "_FIRST_STEPS", 100),
+    ):
+        yield

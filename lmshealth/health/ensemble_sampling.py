@@ -1,4 +1,4 @@
-"""Run emcee so that its answer can be trusted: independent ensembles, seeds, convergence."""
+"""Markov chain Monte Carlo: independent emcee ensembles, seeds, starts, convergence."""
 
 from __future__ import annotations
 
@@ -12,40 +12,39 @@ from numpy.random import MT19937, RandomState
 
 from lmshealth._arrays import FloatArray, freeze
 from lmshealth.errors import NotConverged
+from lmshealth.health import constants
+from lmshealth.health.importance_sampling import importance_sample, tempered
 from lmshealth.health.laplace import LogProbability
 
 if TYPE_CHECKING:
     import emcee
 
 Start = Callable[[np.random.Generator], FloatArray]
-"""Draws the points inside the support that an ensemble begins from: ``(n_walkers, n_dim)``."""
+"""Draw the start of an ensemble inside the support: ``(n_walkers, n_dim)``."""
 
-_N_ENSEMBLES = 4
-_AUTOCORRELATION_TIMES = 50
-_R_HAT = 1.01
 _FIRST_STEPS = 250
-_MOST_STEPS = 20_000
-_LEAST_WALKERS = 32
-_MOST_ROUNDS = 60
+_MIN_WALKERS = 32
 _START_ATTEMPTS = 100
+# Draws of the prior, and of the importance sampler, that starts are chosen from.
+_N_PRIOR, _N_START = 1000, 1000
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Sample:
-    """Draws from a posterior with the evidence that they are.
+    """Draws from a posterior with their convergence diagnostics.
 
     Attributes
     ----------
     draws : ndarray
-        Of every ensemble, after burn-in, step by step and walker by walker, shape
+        Of every ensemble after burn-in, step after step and in a step walker after walker, shape
         ``(n_ensembles, n_draws, n_dim)``.
     ess_bulk, ess_tail : ndarray
-        Effective sample size of all ensembles together for the middle of the posterior and for
-        its 5 and 95 % quantiles, shape ``(n_dim,)``.
+        Effective sample size of all ensembles, for the middle of the posterior and for its 5 and
+        95 % quantiles, shape ``(n_dim,)``.
     r_hat : ndarray
-        Rank-normalised split R-hat over the independent ensembles, shape ``(n_dim,)``.
+        Rank-normalised split R-hat over the ensembles, shape ``(n_dim,)``.
     autocorrelation_time : ndarray
-        In steps, the longest of the ensembles, shape ``(n_dim,)``.
+        Steps, the longest of the ensembles, shape ``(n_dim,)``.
     """
 
     draws: FloatArray
@@ -58,28 +57,28 @@ class Sample:
         freeze(self)
 
     def thinned(self, n: int) -> FloatArray:
-        """Take so many draws of each ensemble, evenly: ``(n_ensembles, n, n_dim)``."""
+        """Thin each ensemble to n draws: ``(n_ensembles, n, n_dim)``."""
         return thin(self.draws, n)
 
     @property
     def flat(self) -> FloatArray:
-        """Draws of all ensembles by turns, shape ``(n_ensembles n_draws, n_dim)``."""
+        """Draws of the ensembles in turn, shape ``(n_ensembles n_draws, n_dim)``."""
         return np.swapaxes(self.draws, 0, 1).reshape(-1, self.draws.shape[-1])
 
 
 def thin(draws: FloatArray, n: int) -> FloatArray:
-    """Take so many draws along the second axis, evenly."""
+    """Take n evenly spaced draws along the second axis."""
     index = np.linspace(0, draws.shape[1] - 1, n).round().astype(int)
     return np.asarray(draws[:, index])
 
 
 def stream(seed: int | Sequence[int], *steps: int) -> np.random.SeedSequence:
-    """Name a random stream by the user's seed, the input, and the step of the computation."""
+    """Return the random stream of a step of the computation."""
     return np.random.SeedSequence([*np.atleast_1d(seed).tolist(), *steps])
 
 
 def seed_of(seed: int, *inputs: str) -> tuple[int, int]:
-    """Make the seed of a computation from the user's and from what goes in, by its hash."""
+    """Derive the seed of a computation from the user's seed and a hash of its inputs."""
     digest = hashlib.sha256("\n".join(inputs).encode()).hexdigest()
     return seed, int(digest[:12], 16)
 
@@ -87,26 +86,30 @@ def seed_of(seed: int, *inputs: str) -> tuple[int, int]:
 def sample(log_probability: LogProbability, start: Start, seed: np.random.SeedSequence) -> Sample:
     """Sample a posterior with several independent emcee ensembles.
 
-    Every ensemble has its own start and its own random stream: walkers of one ensemble depend on
-    each other, so that R-hat over them would say nothing.
+    Every ensemble has its own start and random stream: walkers of one ensemble depend on each
+    other, so that R-hat over them is no diagnostic.
 
     Parameters
     ----------
     log_probability : callable
         Vectorised log density; -inf outside its support.
     start : callable
-        Where an ensemble begins.
+        Draws the start of an ensemble.
     seed : SeedSequence
-        Of all randomness.
+        Seed of all random numbers.
 
     Raises
     ------
     NotConverged
         If 50 autocorrelation times or R-hat below 1.01 are not reached; carries the chains.
-    """
-    import emcee  # late: it brings scipy.stats along
 
-    streams = seed.spawn(2 * _N_ENSEMBLES)
+    References
+    ----------
+    [ForemanMackey2013], [Vehtari2021]
+    """
+    import emcee  # late: it imports scipy.stats
+
+    streams = seed.spawn(2 * constants.N_ENSEMBLES)
     samplers = []
     for start_seed, chain_seed in zip(streams[::2], streams[1::2], strict=True):
         points = start(np.random.default_rng(start_seed))
@@ -114,18 +117,17 @@ def sample(log_probability: LogProbability, start: Start, seed: np.random.SeedSe
             *points.shape,
             log_probability,
             vectorize=True,
-            # Proposals from a kernel density of the other walkers need a quarter of the steps that
-            # differences of walkers do, but keep away from tails that no walker is in; differences
-            # do not. Taken whole (gamma0 = 1) they jump between modes of the posterior.
-            # Not DESnookerMove: that of emcee 3.1.6 does not keep the target (its step is not along
-            # a unit vector), and narrows a Gaussian of six dimensions by 9 %.
+            # Proposals from a kernel density of the other walkers need a quarter of the steps of
+            # differential evolution, but rarely reach tails without a walker; differences do, and
+            # with gamma0 = 1 they jump between modes of the posterior. DESnookerMove of emcee
+            # 3.1.6 does not keep the target: it narrows a Gaussian of six dimensions by 9 %.
             moves=[
                 (emcee.moves.KDEMove(), 0.7),
                 (emcee.moves.DEMove(), 0.2),
                 (emcee.moves.DEMove(gamma0=1.0), 0.1),
             ],
         )
-        # emcee ignores a Generator, and without a seed two samplers of one process are alike.
+        # emcee ignores a Generator; without a state all samplers of a process draw the same.
         state = emcee.State(
             points, random_state=RandomState(MT19937(chain_seed)).get_state(legacy=False)
         )
@@ -147,24 +149,25 @@ def _run(samplers: list[tuple[emcee.EnsembleSampler, emcee.State]]) -> Sample:
         chains = np.stack([sampler.get_chain() for sampler, _ in samplers])
         with np.errstate(invalid="ignore"):
             tau = np.max([integrated_time(chain, tol=0, quiet=True) for chain in chains], axis=0)
-        # Of a walker that never moved it is NaN: no shorter than the run.
+        # NaN for a walker that never moved: at least as long as the run.
         tau = np.where(np.isnan(tau), n_steps, tau)
         burn = int(min(10 * tau.max(), n_steps / 2))
         kept = chains[:, burn:]
-        enough = kept.shape[1] >= _AUTOCORRELATION_TIMES * tau.max()
+        enough = kept.shape[1] >= constants.MIN_AUTOCORRELATION_TIMES * tau.max()
         r_hat = _diagnose("rhat", kept)
-        if enough and (r_hat < _R_HAT).all():
+        if enough and (r_hat < constants.MAX_R_HAT).all():
             break
-        if n_steps >= _MOST_STEPS:
+        if n_steps >= constants.MAX_STEPS:
             raise NotConverged(
                 f"after {n_steps} steps the autocorrelation time is {tau.max():.0f} and R-hat "
-                f"{r_hat.max():.3f}; needed are {_AUTOCORRELATION_TIMES} autocorrelation times "
-                f"and R-hat below {_R_HAT}; the posterior may have several modes",
+                f"{r_hat.max():.3f}; needed are {constants.MIN_AUTOCORRELATION_TIMES} "
+                f"autocorrelation times and R-hat below {constants.MAX_R_HAT}; the posterior may "
+                "have several modes",
                 chains,
             )
-        wanted = int(1.1 * (_AUTOCORRELATION_TIMES + 10) * tau.max())
-        target = min(max(wanted, n_steps + n_steps // 2), _MOST_STEPS)
-    # What has a time scale along a chain must see the walkers one after the other.
+        wanted = int(1.1 * (constants.MIN_AUTOCORRELATION_TIMES + 10) * tau.max())
+        target = min(max(wanted, n_steps + n_steps // 2), constants.MAX_STEPS)
+    # Effective sample sizes need each walker as a chain in time.
     walkers = np.swapaxes(kept, 1, 2)
     return Sample(
         draws=flattened(kept),
@@ -181,22 +184,23 @@ def flattened(chains: FloatArray) -> FloatArray:
 
 
 def _diagnose(what: str, chains: FloatArray, **options: Any) -> FloatArray:
-    """Ask arviz about each dimension, an ensemble being a chain, shape ``(n_dim,)``."""
+    """Return a diagnostic of arviz with the ensembles as chains, shape ``(n_dim,)``."""
     from arviz_stats.base.array import array_stats  # late: it costs more than numpy to import
 
-    ask: Any = getattr(array_stats, what)  # the library has no types
+    diagnostic: Any = getattr(array_stats, what)  # the library has no types
     flat = flattened(chains)
     axes = {"chain_axis": 0, "draw_axis": 1}
-    return np.array([float(ask(flat[..., d], **axes, **options)) for d in range(flat.shape[-1])])
+    columns = np.moveaxis(flat, -1, 0)
+    return np.array([float(diagnostic(column, **axes, **options)) for column in columns])
 
 
 def _n_walkers(n_dim: int) -> int:
-    """Choose the walkers of an ensemble: a step of many costs hardly more than one of few."""
-    return max(_LEAST_WALKERS, 16 * n_dim)
+    """Return the number of walkers; vectorised, many cost little more than few."""
+    return max(_MIN_WALKERS, 16 * n_dim)
 
 
 def start_near(centre: FloatArray, cov: FloatArray, log_probability: LogProbability) -> Start:
-    """Begin about a point, twice as wide as a normal distribution, inside the support."""
+    """Start from a normal distribution of twice the standard deviations, inside the support."""
     factor = 2 * np.linalg.cholesky(cov)
 
     def start(rng: np.random.Generator) -> FloatArray:
@@ -217,91 +221,41 @@ def start_near(centre: FloatArray, cov: FloatArray, log_probability: LogProbabil
 
 
 def start_among(points: FloatArray, weight: FloatArray) -> Start:
-    """Begin at some of many weighted draws of the posterior itself, none twice."""
+    """Start from distinct draws of the posterior, shape ``(n, n_dim)``, by weight ``(n,)``.
+
+    Weights are tempered where few draws have all the weight.
+    """
 
     def start(rng: np.random.Generator) -> FloatArray:
         n = _n_walkers(points.shape[1])
-        # Flattened where few draws have all the weight.
-        flat, _ = _tempered(np.log(np.maximum(weight, 1e-300)), 2 * n)
+        if points.shape[0] < n:
+            raise NotConverged(
+                f"{points.shape[0]} draws lie inside the modal map, {n} are needed to start from: "
+                "widen the map or the prior",
+                points,
+            )
+        log_weight = np.log(np.maximum(weight, 1e-300))
+        flat = tempered(points, log_weight, min(2 * n, 0.5 * points.shape[0])).weight
         return np.asarray(points[rng.choice(points.shape[0], size=n, replace=False, p=flat)])
 
     return start
 
 
 def start_from_prior(
-    log_probability: LogProbability,
-    draw_prior: Callable[[np.random.Generator, int], FloatArray],
-    n_draws: int = 1000,
+    log_probability: LogProbability, draw_prior: Callable[[np.random.Generator, int], FloatArray]
 ) -> Start:
-    """Begin where rounds of importance sampling narrow the prior down to the posterior.
-
-    They end when the weights of a round need no flattening any more: earlier than that the points
-    may lie tens of log units below the posterior.
+    """Start from draws of the posterior by adaptive importance sampling from the prior.
 
     Parameters
     ----------
     log_probability : callable
         As in `sample`.
     draw_prior : callable
-        Draws points of the right order of magnitude: ``(rng, n)`` to ``(n, n_dim)``.
-    n_draws : int
-        Points per round.
+        Draws from the prior: ``(rng, n)`` to ``(n, n_dim)``.
     """
 
     def start(rng: np.random.Generator) -> FloatArray:
-        points = draw_prior(rng, n_draws)
-        n_dim = points.shape[1]
-        n = _n_walkers(n_dim)
-        proposal = np.zeros(points.shape[0])
-        for k in range(_MOST_ROUNDS):
-            log_weight = log_probability(points) - proposal
-            if not np.isfinite(log_weight).any():
-                raise NotConverged(
-                    "no draw of the prior lies inside the modal map: widen the map or the prior",
-                    points,
-                )
-            weight, power = _tempered(log_weight, 10 * n_dim)
-            if k and power == 1 and np.isfinite(log_weight).sum() >= 2 * n:
-                break
-            mean = weight @ points
-            off = points - mean
-            # A proposal must be wider than what it is to find; flattened weights see to that too.
-            cov = 1.3 * (weight[:, None] * off).T @ off + 1e-16 * np.eye(n_dim)
-            factor = np.linalg.cholesky(cov)
-            unit = rng.standard_normal((n_draws, n_dim))
-            points = mean + unit @ factor.T
-            proposal = -0.5 * np.sum(unit**2, axis=1)
-        log_weight = log_probability(points) - proposal
-        if (possible := np.isfinite(log_weight).sum()) < n:
-            raise NotConverged(
-                f"{possible} of {n_draws} draws lie inside the modal map, {n} are needed to begin "
-                "from: widen the map or the prior",
-                points,
-            )
-        weight, _ = _tempered(log_weight, 2 * n)
-        chosen = rng.choice(points.shape[0], size=n, replace=False, p=weight)
-        return np.asarray(points[chosen])
+        found = importance_sample(log_probability, draw_prior(rng, _N_PRIOR), rng, _N_START)
+        return start_among(found.points, found.weight)(rng)
 
     return start
-
-
-def _tempered(log_weight: FloatArray, least: float) -> tuple[FloatArray, float]:
-    """Weights, flattened by a power until they hold so many effective draws, and that power."""
-    low, high = 0.0, 1.0
-    top = np.where(np.isfinite(log_weight), log_weight - np.max(log_weight), -np.inf)
-    support = np.isfinite(top)
-    least = min(least, 0.5 * support.sum())
-
-    def weights(power: float) -> FloatArray:
-        value = np.where(support, np.exp(power * np.where(support, top, 0.0)), 0.0)
-        return np.asarray(value / value.sum())
-
-    if 1 / np.sum(weights(1.0) ** 2) >= least:
-        return weights(1.0), 1.0
-    for _ in range(30):
-        middle = (low + high) / 2
-        if 1 / np.sum(weights(middle) ** 2) >= least:
-            low = middle
-        else:
-            high = middle
-    return weights(low), low

@@ -1,13 +1,6 @@
-"""The posterior of the health parameters at one epoch: its density, and whether it fits.
+"""Posterior density of the ln health parameters at one epoch, and its goodness of fit.
 
-The drifts δ of the tracked modes have covariance C from the filter. The modal map predicts h(x);
-its sensitivities are believed to a relative standard deviation m, so that the error of mode i has
-the variance E_i(x) = Σ_j (m h_i^j)², h^j being the drift that parameter j causes alone. Then
-δ ~ N(h(x), C + E(x)), with x the ln parameters. The errors of a map are the same at all epochs of a
-life: every epoch by itself is judged rightly, but not the difference of two.
-
-Machines that share a part, such as one guide that serves two configurations, have one posterior of
-all their parameters, the shared ones once: their likelihoods multiply.
+README.md has the model. Machines that share a part have one posterior of all parameters.
 """
 
 from __future__ import annotations
@@ -18,30 +11,27 @@ import numpy as np
 from scipy.special import chdtrc
 
 from lmshealth._arrays import BoolArray, FloatArray
+from lmshealth.health import constants
 from lmshealth.stage.description import Stage
 from lmshealth.stage.priors import JointPrior
-
-# How much wider priors are made to see what hangs on them; what of the map, as a share of its
-# reach in ln parameter, counts as its edge, and the quantiles that may not lie there.
-_WIDER, _EDGE, _ENDS = 2.0, 0.01, (0.05, 0.95)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MachineDrifts:
-    """What one machine shows at one epoch.
+    """Drifts of one machine at one epoch.
 
     Attributes
     ----------
     stage : Stage
-        Its modal map.
+        Description with the modal map.
     modes : tuple of str
         Modes used.
     drift : ndarray
-        Shape ``(n_modes,)``.
+        Drift of ln f since the baseline, shape ``(n_modes,)``.
     cov : ndarray
-        Its covariance, shape ``(n_modes, n_modes)``.
+        Covariance of the drifts, shape ``(n_modes, n_modes)``.
     columns : tuple of int
-        Where its parameters stand among all.
+        Index of each parameter of the machine among all parameters.
     """
 
     stage: Stage
@@ -51,12 +41,12 @@ class MachineDrifts:
     columns: tuple[int, ...]
 
     def log_likelihood(self, x: FloatArray) -> FloatArray:
-        """Log likelihood of all ln parameters, inside the map, shape ``(n_points,)``."""
+        """Return the log likelihood of all ln parameters inside the map, shape ``(n_points,)``."""
         chi_square, log_det = self.misfit(x)
         return -0.5 * (chi_square + log_det)
 
     def misfit(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """χ² of the drifts and the log determinant of their covariance, both ``(n_points,)``."""
+        """Return χ² of the drifts and the log determinant of their covariance, ``(n_points,)``."""
         own = x[:, self.columns]
         n, n_parameters = own.shape
         drift = self.stage.drift(one_at_a_time(self.stage, own), self.modes)
@@ -76,7 +66,7 @@ class EpochPosterior:
     Attributes
     ----------
     prior : JointPrior
-        Of all parameters.
+        Prior of all parameters.
     machines : tuple of MachineDrifts
         One per machine.
     """
@@ -88,17 +78,17 @@ class EpochPosterior:
     def of(
         cls, stage: Stage, modes: tuple[str, ...], drift: FloatArray, cov: FloatArray
     ) -> EpochPosterior:
-        """Make that of a single machine; see `MachineDrifts`."""
+        """Make the posterior of a single machine; see `MachineDrifts`."""
         columns = tuple(range(len(stage.parameters)))
         return cls(stage.prior, (MachineDrifts(stage, modes, drift, cov, columns),))
 
     def log_probability(self, x: FloatArray) -> FloatArray:
-        """Log posterior of ln parameters up to a constant, shape ``(n_points,)``."""
+        """Return the log posterior of ln parameters up to a constant, shape ``(n_points,)``."""
         total = self.prior.log_density(x)
         inside = np.isfinite(total)
-        for view in self.machines:
+        for machine in self.machines:
             if inside.any():
-                total[inside] += view.log_likelihood(x[inside])
+                total[inside] += machine.log_likelihood(x[inside])
         return total
 
     def draw_prior(self, rng: np.random.Generator, n: int) -> FloatArray:
@@ -106,34 +96,34 @@ class EpochPosterior:
         return self.prior.draw(rng, n)
 
     def fit(self, x: FloatArray) -> float:
-        """Probability of a χ² as large as the least that some of these points leave.
+        """Return the probability of a χ² above the smallest of these points ``(n, n_parameters)``.
 
-        As many degrees of freedom as drifts: the parameters are not taken off, as priors may hold
-        them, so that what is called improbable is.
+        The degrees of freedom are the number of drifts, without the parameters, which priors may
+        hold: an upper bound of the p value.
         """
-        least = np.min(np.sum([view.misfit(x)[0] for view in self.machines], axis=0))
-        return float(chdtrc(sum(len(view.modes) for view in self.machines), least))
+        smallest = np.min(np.sum([machine.misfit(x)[0] for machine in self.machines], axis=0))
+        return float(chdtrc(sum(len(machine.modes) for machine in self.machines), smallest))
 
     def at_edge(self, x: FloatArray) -> BoolArray:
-        """Tell which parameters have draws piled up at an end of the map, ``(n_parameters,)``."""
-        low, high = np.quantile(x, _ENDS, axis=0)
-        margin = _EDGE * (self.prior.high - self.prior.low)
+        """Return which parameters' draws end at an end of the map, shape ``(n_parameters,)``."""
+        low, high = np.quantile(x, (0.05, 0.95), axis=0)
+        margin = constants.EDGE_SHARE * (self.prior.high - self.prior.low)
         return np.asarray((low < self.prior.low + margin) | (high > self.prior.high - margin))
 
     def widened(self) -> EpochPosterior:
-        """Give the posterior with priors twice as wide."""
-        return EpochPosterior(self.prior.widened(_WIDER), self.machines)
+        """Return the posterior under priors twice as wide."""
+        return EpochPosterior(self.prior.widened(constants.PRIOR_FACTOR), self.machines)
 
 
 def one_at_a_time(stage: Stage, x: FloatArray) -> FloatArray:
-    """Stack points with copies in which one parameter at a time leaves its baseline.
+    """Stack points with copies in which all parameters but one are at baseline.
 
     Parameters
     ----------
     stage : Stage
-        Says where the baseline is.
+        Description with the baseline.
     x : ndarray
-        ln parameters, shape ``(n_points, n_parameters)``.
+        Ln parameters, shape ``(n_points, n_parameters)``.
 
     Returns
     -------

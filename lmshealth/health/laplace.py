@@ -1,7 +1,4 @@
-"""Laplace's approximation: the normal distribution about the mode of a posterior.
-
-It starts the sampler, and stands beside its answer as a check by other means.
-"""
+"""Laplace's approximation of a posterior: the sampler's start and an independent check."""
 
 from __future__ import annotations
 
@@ -16,8 +13,8 @@ from lmshealth._arrays import FloatArray, freeze
 LogProbability = Callable[[FloatArray], FloatArray]
 """Log density of many points at once: ``(n_points, n_dim)`` to ``(n_points,)``."""
 
-# Steps of differences: first in units of the box, then of the standard deviation found with them,
-# where rounding (1e-15 over its square) and the fourth derivative both are negligible.
+# Steps of the differences: first as a share of the box, then of the standard deviation, where
+# rounding (1e-15 over its square) and the fourth derivative are both negligible.
 _FIRST_STEP, _STEP = 1e-4, 0.01
 _SEARCHES = 3
 
@@ -29,9 +26,9 @@ class Laplace:
     Attributes
     ----------
     mode : ndarray
-        Where the density is highest, shape ``(n_dim,)``.
+        Maximum of the density, shape ``(n_dim,)``.
     cov : ndarray
-        Inverse of the negative second derivative there, shape ``(n_dim, n_dim)``.
+        Inverse of the negative Hessian of the log density there, shape ``(n_dim, n_dim)``.
     """
 
     mode: FloatArray
@@ -49,14 +46,14 @@ class Laplace:
 def approximate(
     log_probability: LogProbability, points: FloatArray, low: FloatArray, high: FloatArray
 ) -> Laplace | None:
-    """Approximate a density by a normal one at its highest point.
+    """Approximate a density by a normal distribution at its maximum.
 
     Parameters
     ----------
     log_probability : callable
         Vectorised log density.
     points : ndarray
-        Where to begin the search, such as draws of the prior; the best few are used,
+        Candidate starts of the search, of which the best three are used,
         shape ``(n_points, n_dim)``.
     low, high : ndarray
         Box outside of which the density is zero, shape ``(n_dim,)``.
@@ -64,8 +61,8 @@ def approximate(
     Returns
     -------
     Laplace or None
-        None where the highest point lies at the edge of the box, or is no maximum: no normal
-        distribution is like such a density.
+        None if the maximum lies at the edge of the box or the Hessian there is not negative
+        definite.
     """
     margin = 1e-9 * (high - low)
     bounds = Bounds(low + margin, high - margin)
@@ -78,7 +75,7 @@ def approximate(
     ends = [minimize(cost, begin, method="L-BFGS-B", bounds=bounds) for begin in begins]
     mode = min(ends, key=lambda end: float(end.fun)).x
     cov = _inverse_curvature(log_probability, mode, _FIRST_STEP * (high - low), low, high)
-    for _ in range(2):  # a step of Newton's, then the curvature where it ends
+    for _ in range(2):  # a Newton step, then the curvature at its end
         if cov is None:
             return None
         step = _STEP * np.sqrt(np.diag(cov))
@@ -100,7 +97,7 @@ def _inverse_curvature(
     low: FloatArray,
     high: FloatArray,
 ) -> FloatArray | None:
-    """Invert the negative matrix of second differences; None where that is no covariance."""
+    """Invert the negative matrix of second differences; None if it is not positive definite."""
     n = x.size
     if (x - 2 * step <= low).any() or (x + 2 * step >= high).any():
         return None

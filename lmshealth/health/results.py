@@ -1,9 +1,4 @@
-"""Result of the inference: posterior of the health parameters per epoch.
-
-Arrays are read-only, time (or log) axis first, mode axis last, NaN where a value is missing.
-SI units throughout: s, m, m/s, Hz, m/s²; temperatures are in °C because only their differences
-are used.
-"""
+"""Result of the inference: posterior of the health parameters per epoch."""
 
 from __future__ import annotations
 
@@ -16,17 +11,19 @@ import numpy as np
 import pandas as pd
 
 from lmshealth._arrays import BoolArray, FloatArray, expect_shape, freeze
+from lmshealth.health import constants
 from lmshealth.stage.constants import INFORMED
 
 if TYPE_CHECKING:
     from xarray import DataTree
 
-# What tables say of a posterior.
+# Quantiles in the tables of a posterior.
 QUANTILES = {"median": 0.5, "q05": 0.05, "q25": 0.25, "q75": 0.75, "q95": 0.95}
-# Drifts this improbable are of something that is not on the map.
-_UNEXPLAINED = 1e-4
-# What else is known about a posterior of health, one number per epoch and parameter.
-_CHECKS = ("ess_bulk", "ess_tail", "laplace_shift", "laplace_ratio", "prior_shift", "prior_ratio")
+# Diagnostics with one number per epoch and parameter.
+CHECKS = (
+    *("r_hat", "ess_bulk", "ess_tail"),
+    *("laplace_shift", "laplace_ratio", "prior_shift", "prior_ratio"),
+)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -38,49 +35,47 @@ class Health:
     stage : str
         Identity of the machine.
     recorded_at : tuple of datetime
-        Epochs that were inferred, ascending.
+        Epochs, ascending.
     travel : ndarray
         Odometer in m, shape ``(n_epochs,)``.
     parameters : tuple of str
         Parameter names.
     chains : ndarray
-        Posterior draws of independent ensembles,
-        shape ``(n_epochs, n_ensembles, n_draws, n_parameters)``.
+        Draws of the ensembles, shape ``(n_epochs, n_ensembles, n_draws, n_parameters)``.
     ess_bulk, ess_tail : ndarray
         Effective sample size over all ensembles, for the middle and for the 5 and 95 % quantiles,
-        shape ``(n_epochs, n_parameters)``; NaN where the sampler did not converge, as are all that
-        follow but `informed` and `correlation`.
+        shape ``(n_epochs, n_parameters)``; NaN where the sampler did not converge, as are `r_hat`
+        and the shifts and ratios.
     r_hat : ndarray
         Rank-normalised split R-hat over the ensembles, shape ``(n_epochs, n_parameters)``.
     converged : ndarray of bool
         Shape ``(n_epochs,)``.
     informed : ndarray
-        One minus the ratio of posterior to prior variance of the logarithm, floored at 0:
-        how much the data, and not the prior, say; shape ``(n_epochs, n_parameters)``.
+        Share of the prior variance of ln parameter that the data removed, at least 0,
+        shape ``(n_epochs, n_parameters)``.
     prior_width : ndarray
         Width of the prior's 90 % interval, shape ``(n_parameters,)``.
     identifiable : ndarray of bool
-        Whether endless logs with the modes of an epoch would tell a parameter, on average over the
-        priors. One that they would not may still be informed by chance: while nothing has drifted,
-        the map's error does not count. Shape ``(n_epochs, n_parameters)``.
+        Whether unlimited logs with the modes of the epoch inform the parameter on average over the
+        priors, shape ``(n_epochs, n_parameters)``. An unidentifiable one may be `informed` by
+        chance: at drifts near 0 the map's error is negligible.
     correlation : ndarray
-        Of the logarithms in the posterior, shape ``(n_epochs, n_parameters, n_parameters)``.
+        Posterior correlation of ln parameters, shape ``(n_epochs, n_parameters, n_parameters)``.
     laplace_shift, laplace_ratio : ndarray
-        By another method, Laplace's approximation, the posterior of the logarithm is lower by so
-        many of its standard deviations, and the posterior's standard deviation is so many times
-        its; NaN also where no normal distribution approximates. Shape ``(n_epochs, n_parameters)``.
+        Difference of the posterior mean of ln parameter from the mode of Laplace's approximation in
+        its standard deviations, and ratio of the standard deviations, shape
+        ``(n_epochs, n_parameters)``; NaN also where the approximation does not exist.
     prior_shift, prior_ratio : ndarray
-        With priors twice as wide the median of the logarithm moves by so many posterior standard
-        deviations, and its 90 % interval is so many times as wide; the map cuts these priors too,
-        NaN where it hardly lets them be wider. Shape ``(n_epochs, n_parameters)``.
+        Change of the median of ln parameter under priors twice as wide, in posterior standard
+        deviations, and ratio of the 90 % intervals, shape ``(n_epochs, n_parameters)``; NaN also
+        where the map hardly lets the prior widen.
     fit : ndarray
-        Probability, at most, that drifts lie as far from the map as these do at best, shape
-        ``(n_epochs,)``.
+        Upper bound of the p value of the drifts under the best draw, shape ``(n_epochs,)``.
     at_edge : ndarray of bool
-        Whether the posterior is piled up at an end of the map, which is then a bound of it and not
-        of the parameter, shape ``(n_epochs, n_parameters)``.
+        Whether the posterior ends at an end of the map, which then bounds the value,
+        shape ``(n_epochs, n_parameters)``.
     seed : tuple of int
-        Of all random streams; the same one gives the same chains.
+        Seed of all random streams.
     """
 
     stage: str
@@ -107,14 +102,12 @@ class Health:
     def __post_init__(self) -> None:
         n, p = len(self.recorded_at), len(self.parameters)
         expect_shape("chains", self.chains, (n, *self.chains.shape[1:3], p))
-        for name in ("r_hat", "informed", *_CHECKS):
+        for name in ("informed", "at_edge", "identifiable", *CHECKS):
             expect_shape(name, getattr(self, name), (n, p))
         expect_shape("correlation", self.correlation, (n, p, p))
         expect_shape("prior_width", self.prior_width, (p,))
         for name in ("travel", "converged", "fit"):
             expect_shape(name, getattr(self, name), (n,))
-        for name in ("at_edge", "identifiable"):
-            expect_shape(name, getattr(self, name), (n, p))
         freeze(self)
 
     @property
@@ -124,39 +117,46 @@ class Health:
 
     @property
     def ess(self) -> FloatArray:
-        """The smaller effective sample size, ``(n_epochs, n_parameters)``."""
+        """Smaller effective sample size, shape ``(n_epochs, n_parameters)``."""
         return np.minimum(self.ess_bulk, self.ess_tail)
 
     def informed_parameters(self) -> BoolArray:
-        """Tell which parameters the last epoch's data tell, not the prior, ``(n_parameters,)``."""
-        claimed = bool(self.converged[-1]) and self.explained
-        return np.asarray(claimed & self.identifiable[-1] & (self.informed[-1] >= INFORMED))
+        """Return which values of the last epoch may be published, shape ``(n_parameters,)``.
+
+        The sampler converged, the drifts are explained, and the parameter is identifiable and
+        informed.
+        """
+        valid = bool(self.converged[-1]) and self.explained
+        return np.asarray(valid & self.identifiable[-1] & (self.informed[-1] >= INFORMED))
 
     @property
     def explained(self) -> bool:
         """Whether some state of the parameters explains the drifts of the last epoch."""
-        return not self.fit[-1] < _UNEXPLAINED
+        return not self.fit[-1] < constants.MIN_FIT
 
     def quantile(self, level: float | FloatArray) -> FloatArray:
-        """Quantiles of every parameter at every epoch, shape ``(..., n_epochs, n_parameters)``."""
+        """Return quantiles at every epoch, shape ``(..., n_epochs, n_parameters)``."""
         return np.asarray(np.quantile(self.samples, level, axis=1))
 
     def latest(self, level: float | FloatArray) -> FloatArray:
-        """Quantiles of every parameter at the last epoch, shape ``(..., n_parameters)``."""
+        """Return quantiles at the last epoch, shape ``(..., n_parameters)``."""
         return np.asarray(np.quantile(self.samples[-1], level, axis=0))
 
     def to_frame(self) -> pd.DataFrame:
-        """Make the table of ``health.csv``: one row per epoch and parameter, odometer in km."""
-        quantiles = self.quantile(np.array(list(QUANTILES.values())))
-        columns: dict[str, FloatArray | BoolArray] = dict(zip(QUANTILES, quantiles, strict=True))
-        columns |= {name: getattr(self, name) for name in ("ess", "r_hat")}
+        """Return the table of ``health.csv``: one row per epoch and parameter."""
         n, p = len(self.recorded_at), len(self.parameters)
-        columns["converged"] = np.repeat(self.converged[:, None], p, axis=1)
-        columns["identifiable"] = self.identifiable
-        columns["at_edge"] = self.at_edge
-        columns["fit"] = np.repeat(self.fit[:, None], p, axis=1)
-        columns["prior_width"] = np.tile(self.prior_width, (n, 1))
-        columns |= {name: getattr(self, name) for name in ("informed", *_CHECKS)}
+        quantiles = self.quantile(np.array(list(QUANTILES.values())))
+        columns: dict[str, FloatArray | BoolArray] = {
+            **dict(zip(QUANTILES, quantiles, strict=True)),
+            "ess": self.ess,
+            "r_hat": self.r_hat,
+            "converged": np.repeat(self.converged[:, None], p, axis=1),
+            "identifiable": self.identifiable,
+            "at_edge": self.at_edge,
+            "fit": np.repeat(self.fit[:, None], p, axis=1),
+            "prior_width": np.tile(self.prior_width, (n, 1)),
+        }
+        columns |= {name: getattr(self, name) for name in ("informed", *CHECKS)}
         columns |= {
             f"correlation_{name}": self.correlation[:, :, j]
             for j, name in enumerate(self.parameters)
@@ -172,20 +172,20 @@ class Health:
         )
 
     def to_arviz(self) -> DataTree:
-        """Give the draws to ArviZ: groups posterior, with the ensembles as chains, and checks.
+        """Return the draws, with the ensembles as chains, and the diagnostics for ArviZ.
 
-        ``to_arviz().to_netcdf(file, engine="h5netcdf")`` writes what ``xarray.open_datatree``
-        reads.
+        ``to_arviz().to_netcdf(file, engine="h5netcdf")`` writes a file for
+        ``xarray.open_datatree``.
         """
-        import arviz_base  # late: it takes a second to import
+        import arviz_base  # late: its import takes a second
 
-        # xarray keeps no time zones: moments are those of UTC.
+        # xarray has no time zones: moments in UTC.
         moments = [moment.astimezone(UTC).replace(tzinfo=None) for moment in self.recorded_at]
         coords = {"epoch": np.array(moments, dtype="datetime64[us]")}
         draws = np.moveaxis(self.chains, 0, 2)  # chain, draw, epoch
         checks = {
             f"{what}_{name}": getattr(self, what)[:, j]
-            for what in ("informed", "identifiable", "at_edge", "r_hat", *_CHECKS)
+            for what in ("informed", "identifiable", "at_edge", *CHECKS)
             for j, name in enumerate(self.parameters)
         }
         checks |= {

@@ -1,4 +1,4 @@
-"""The verdict: what the last epoch of a stage shows, in one word."""
+"""Verdict on a stage: its most probable state at the last epoch."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ import numpy as np
 from scipy.special import expit
 
 from lmshealth._arrays import BoolArray
+from lmshealth.health import constants
 from lmshealth.health.results import Health
 from lmshealth.stage.description import ParameterSpec, Stage
 from lmshealth.tracking.history import History
@@ -40,7 +41,7 @@ def degraded_words(verdict: str) -> tuple[str, ...]:
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """What is said about a stage in one word, with its probability.
+    """State of a stage with its probability.
 
     Attributes
     ----------
@@ -52,9 +53,9 @@ class Verdict:
         ``healthy``, ``step``, ``not-enough-data``, or what `verdict_of` returns for the degraded
         parameters.
     probability : float
-        Posterior probability of that word; NaN for ``not-enough-data``.
+        Posterior probability of that state; NaN for ``not-enough-data``.
     why : str
-        One sentence for the reader of the report.
+        Sentences for the reader of the report.
     """
 
     stage: str
@@ -64,44 +65,37 @@ class Verdict:
     why: str
 
 
-# A parameter counts as degraded once this share of what it may lose is gone.
-DEGRADED_SHARE = 0.25
-_LOSS_WITHOUT_LIMIT = 0.4
-
-
 def degraded_below(parameter: ParameterSpec) -> float:
-    """Value of a parameter below which it counts as degraded."""
-    limit = (
-        parameter.limit.below
-        if parameter.limit
-        else (parameter.baseline * (1 - _LOSS_WITHOUT_LIMIT))
-    )
-    return parameter.baseline - DEGRADED_SHARE * (parameter.baseline - limit)
+    """Return the value below which a parameter is degraded."""
+    limit = parameter.baseline * (1 - constants.LOSS_WITHOUT_LIMIT)
+    if parameter.limit:
+        limit = parameter.limit.below
+    return parameter.baseline - constants.DEGRADED_SHARE * (parameter.baseline - limit)
 
 
 def judge(
     stage: Stage, history: History, health: Health | None, track: Track | None = None
 ) -> Verdict:
-    """Say in one word what the last epoch shows, with its posterior probability.
+    """Return the most probable state of the stage at the last epoch, with its probability.
 
     Parameters
     ----------
     stage : Stage
-        Says what counts as degraded and which word tells it.
+        Parameters with their limits and words.
     history : History
         All logs.
     health : Health or None
-        Posterior of the parameters; None when they could not be inferred.
+        Posterior of the parameters; None if they could not be inferred.
     track : Track, optional
-        Says whether something happened at once since the baseline.
+        Steps and alarms.
 
     Returns
     -------
     Verdict
-        ``not-enough-data`` when there are fewer logs than make a baseline, when the sampler did
-        not converge, when no state of the parameters explains the drifts, when the data say nothing
-        about any parameter, or when there is none; alarms are then told in ``why``. ``step`` when
-        the modes jumped since the baseline and nobody said why.
+        ``step`` after an undeclared step of the modes since the baseline. ``not-enough-data``
+        if there are fewer logs than a baseline needs, if the sampler did not converge, if no state
+        of the parameters explains the drifts, or if no parameter is informed; ``why`` then reports
+        alarms. Otherwise the most probable set of degraded parameters.
 
     Examples
     --------
@@ -116,42 +110,45 @@ def judge(
     >>> judgement.why.split(".")[0]
     'Guide preload is at 72 % of its baseline value (90 %: 70 to 75 %)'
     >>> lmshealth.judge(stage, history, None).why
-    'The logs do not carry the health parameters.'
+    'The logs do not contain enough information for the health parameters.'
     """
     jumps = undeclared_events(track, history.baseline, "step")
     if jumps:
         return _judge_step(stage, history, health, jumps)
-    needed = stage.description.baseline.logs
-    reason = ""
-    since = len(history.logs) - history.baseline
+    reason = _reason_for_no_verdict(stage, history, health)
+    if reason or health is None:
+        why = " ".join((*_alarm_sentences(track, history.baseline), reason))
+        return Verdict(history.stage, history.recorded_at[-1], "not-enough-data", float("nan"), why)
+    return _judge_posterior(stage, history, health)
+
+
+def _reason_for_no_verdict(stage: Stage, history: History, health: Health | None) -> str:
+    n_logs, needed = len(history.logs) - history.baseline, stage.description.baseline.logs
     if not stage.parameters:
-        reason = (
-            "The stage description has no [[parameter]]: its modes are followed, and nothing is "
-            "said of the parts."
+        return (
+            "The stage description has no [[parameter]]: the modes are tracked, and no health "
+            "parameter is inferred."
         )
-    elif since < needed:
-        reason = f"{since} usable logs since the baseline began; it needs {needed}."
-    elif health is None:
-        reason = "The logs do not carry the health parameters."
-    elif not health.converged[-1]:
-        reason = "The sampler did not converge, so nothing is claimed."
-    elif not health.explained:
-        reason = (
+    if n_logs < needed:
+        return f"{n_logs} usable logs since the baseline began; it needs {needed}."
+    if health is None:
+        return "The logs do not contain enough information for the health parameters."
+    if not health.converged[-1]:
+        return "The sampler did not converge, so no value is published."
+    if not health.explained:
+        return (
             "No state of the parameters on the map explains the drifts "
             f"(p = {health.fit[-1]:.1g}): something else moved the modes, or the map is wrong."
         )
-    elif not health.informed_parameters().any():
-        reason = "These logs move the prior of no parameter: the stage looks the same either way."
-    if reason or health is None:
-        why = " ".join((*_alarmed(track, history.baseline), reason))
-        return Verdict(history.stage, history.recorded_at[-1], "not-enough-data", float("nan"), why)
-    return _judge_posterior(stage, history, health)
+    if not health.informed_parameters().any():
+        return "The data do not constrain any health parameter."
+    return ""
 
 
 def undeclared_events(
     track: Track | None, baseline: int, kind: Literal["step", "alarm"]
 ) -> list[Event]:
-    """Give the events of a kind since a log that no maintenance declares, one per mode."""
+    """Return the events of a kind after a log that no maintenance declares, one per mode."""
     return [
         event
         for event in (() if track is None else track.events)
@@ -159,8 +156,8 @@ def undeclared_events(
     ]
 
 
-def _alarmed(track: Track | None, baseline: int) -> Iterator[str]:
-    """Say of every mode with an alarm how far it has moved by now."""
+def _alarm_sentences(track: Track | None, baseline: int) -> Iterator[str]:
+    """Yield a sentence per mode with an alarm: its drift by now."""
     if track is None:
         return
     alarms = {event.mode: event for event in undeclared_events(track, baseline, "alarm")}
@@ -185,18 +182,18 @@ def _judge_step(
     )
     when = history.recorded_at[last].date().isoformat()
     why = (
-        f"The frequencies jumped before the log of {when} ({sizes}), and no maintenance tells why."
+        f"The frequencies jumped before the log of {when} ({sizes}), and no declared maintenance "
+        "explains it."
     )
-    if health is not None and health.converged[-1] and health.informed_parameters().any():
-        why += " " + _why(stage, health, np.flatnonzero(health.informed_parameters()).tolist())
+    if health is not None and health.informed_parameters().any():
+        why += " " + _parameter_sentences(stage, health)
     evidence = max(event.evidence for event in jumps)
     return Verdict(history.stage, history.recorded_at[-1], "step", float(expit(evidence)), why)
 
 
 def _judge_posterior(stage: Stage, history: History, health: Health) -> Verdict:
-    told = np.flatnonzero(health.informed_parameters()).tolist()
     lost: dict[str, BoolArray] = {}
-    for j in told:
+    for j in np.flatnonzero(health.informed_parameters()).tolist():
         parameter = stage.parameters[j]
         below = health.samples[-1, :, j] < degraded_below(parameter)
         lost[parameter.word] = lost.get(parameter.word, False) | below
@@ -208,19 +205,20 @@ def _judge_posterior(stage: Stage, history: History, health: Health) -> Verdict:
         recorded_at=history.recorded_at[-1],
         verdict=verdict_of(tuple(compress(lost, degraded))),
         probability=count / health.samples.shape[1],
-        why=_why(stage, health, told),
+        why=_parameter_sentences(stage, health),
     )
 
 
-def _why(stage: Stage, health: Health, told: list[int]) -> str:
+def _parameter_sentences(stage: Stage, health: Health) -> str:
     low, middle, high = health.latest(np.array([0.05, 0.5, 0.95]))
+    informed = health.informed_parameters()
     sentences = []
     for j, parameter in enumerate(stage.parameters):
         name = parameter.name.replace("_", " ").capitalize()
         if not health.identifiable[-1, j]:
-            sentences.append(f"{name}: the tracked modes cannot tell.")
-        elif j not in told:
-            sentences.append(f"{name}: these logs do not tell.")
+            sentences.append(f"{name}: not identifiable from the tracked modes.")
+        elif not informed[j]:
+            sentences.append(f"{name}: not constrained by these logs.")
         elif parameter.unit:
             sentences.append(
                 f"{name} is {middle[j]:.4g} {parameter.unit} (90 %: {low[j]:.4g} to {high[j]:.4g})."

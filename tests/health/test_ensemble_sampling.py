@@ -10,6 +10,7 @@ from scipy import stats
 
 from lmshealth._arrays import FloatArray
 from lmshealth.errors import NotConverged
+from lmshealth.health import constants
 from lmshealth.health import ensemble_sampling as sampling
 from lmshealth.health.ensemble_sampling import (
     Sample,
@@ -67,7 +68,7 @@ def test_moments_of_a_gaussian(drawn: Sample) -> None:
 @pytest.mark.slow
 def test_a_sample_carries_its_evidence(drawn: Sample) -> None:
     """Sample sizes lie between 1,000 and the number of draws; R-hat is below 1.01."""
-    assert drawn.draws.shape[::2] == (sampling._N_ENSEMBLES, 2)
+    assert drawn.draws.shape[::2] == (constants.N_ENSEMBLES, 2)
     for ess in (drawn.ess_bulk, drawn.ess_tail):
         assert (ess < drawn.flat.shape[0]).all()
         assert (ess > 1000).all()
@@ -106,7 +107,7 @@ def test_the_global_random_state_plays_no_part(drawn: Sample) -> None:
 
 def test_ensembles_of_one_process_differ(drawn: Sample) -> None:
     """No two of the independent ensembles hold a draw in common."""
-    for a in range(sampling._N_ENSEMBLES):
+    for a in range(constants.N_ENSEMBLES):
         for b in range(a):
             one = {tuple(point) for point in drawn.draws[a, -800:]}
             two = {tuple(point) for point in drawn.draws[b, -800:]}
@@ -173,7 +174,7 @@ def test_one_dimension_with_an_edge() -> None:
 @pytest.mark.slow
 def test_modes_far_apart_are_refused_with_their_chains(monkeypatch: pytest.MonkeyPatch) -> None:
     """Ensembles that keep to their own mixture of two far modes are told from a posterior."""
-    monkeypatch.setattr(sampling, "_MOST_STEPS", 1200)
+    monkeypatch.setattr(constants, "MAX_STEPS", 1200)
 
     def two(x: FloatArray) -> FloatArray:
         return np.logaddexp(*(-0.5 * np.sum(((x - c) / 0.05) ** 2, axis=1) for c in (-40.0, 40.0)))
@@ -185,14 +186,14 @@ def test_modes_far_apart_are_refused_with_their_chains(monkeypatch: pytest.Monke
     with pytest.raises(NotConverged, match=r"after 1200 steps.*several modes") as caught:
         sample(two, sides, stream(13))
     chains = np.asarray(caught.value.chains)
-    assert chains.shape == (sampling._N_ENSEMBLES, 1200, 18, 3)
+    assert chains.shape == (constants.N_ENSEMBLES, 1200, 18, 3)
     assert not np.array_equal(chains[0], chains[1])
 
 
 def test_too_few_steps_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     """Fewer steps than 50 autocorrelation times are not enough, however good they look."""
     monkeypatch.setattr(sampling, "_FIRST_STEPS", 60)
-    monkeypatch.setattr(sampling, "_MOST_STEPS", 60)
+    monkeypatch.setattr(constants, "MAX_STEPS", 60)
     with pytest.raises(NotConverged, match="needed are 50"):
         sample(gaussian, begin, stream(14))
 
@@ -211,13 +212,10 @@ def test_chains_grow_by_half_at_least(monkeypatch: pytest.MonkeyPatch) -> None:
         lengths.append(chain.shape[0])
         return integrated_time(chain, **options)
 
-    for name, value in {
-        "_FIRST_STEPS": first,
-        "_MOST_STEPS": most,
-        "_AUTOCORRELATION_TIMES": 0,
-        "_diagnose": doubtful,
-    }.items():
-        monkeypatch.setattr(sampling, name, value)
+    monkeypatch.setattr(sampling, "_FIRST_STEPS", first)
+    monkeypatch.setattr(sampling, "_diagnose", doubtful)
+    monkeypatch.setattr(constants, "MAX_STEPS", most)
+    monkeypatch.setattr(constants, "MIN_AUTOCORRELATION_TIMES", 0)
     monkeypatch.setattr(autocorr, "integrated_time", counted)
     with pytest.raises(NotConverged, match=r"after 50 steps .* R-hat 2\.000"):
         sample(gaussian, arrived, stream(15))
@@ -231,7 +229,7 @@ def test_chains_grow_by_half_at_least(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_a_walker_that_never_moves_is_no_convergence(monkeypatch: pytest.MonkeyPatch) -> None:
     """One that begins on a needle stays there: refused with the chains, not with a broken sum."""
     monkeypatch.setattr(sampling, "_FIRST_STEPS", 30)
-    monkeypatch.setattr(sampling, "_MOST_STEPS", 40)
+    monkeypatch.setattr(constants, "MAX_STEPS", 40)
 
     def needle(x: FloatArray) -> FloatArray:
         return gaussian(x) + 30 * np.exp(-0.5 * np.sum(((x - MEAN) / 1e-5) ** 2, axis=1))
@@ -328,7 +326,7 @@ def test_starts_find_a_posterior_far_narrower_than_the_prior() -> None:
 
 
 def test_starts_go_on_until_they_have_arrived() -> None:
-    """A ridge that is a ten thousandth of the prior wide is reached, by few draws a round."""
+    """A ridge that is a ten thousandth of the prior wide is reached."""
     slope = np.array([1.0, 0.99, -0.98, 1.01])
 
     def ridge(x: FloatArray) -> FloatArray:
@@ -338,7 +336,7 @@ def test_starts_go_on_until_they_have_arrived() -> None:
     def prior(rng: np.random.Generator, n: int) -> FloatArray:
         return 3 * rng.standard_normal((n, 4))
 
-    points = start_from_prior(ridge, prior, 300)(np.random.default_rng(4))
+    points = start_from_prior(ridge, prior)(np.random.default_rng(4))
     assert ridge(points).min() > -30
 
 
@@ -356,5 +354,5 @@ def test_a_prior_with_too_few_possible_draws_is_refused() -> None:
         possible = np.arange(x.shape[0]) < 7
         return np.where(possible, 0.0, -np.inf)
 
-    with pytest.raises(NotConverged, match=r"7 of 1000 draws .* 32 are needed"):
+    with pytest.raises(NotConverged, match=r"7 draws lie inside .* 32 are needed"):
         start_from_prior(seldom, wide)(np.random.default_rng(3))

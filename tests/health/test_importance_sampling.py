@@ -10,7 +10,7 @@ from scipy import stats
 
 from lmshealth._arrays import FloatArray
 from lmshealth.errors import NotConverged
-from lmshealth.health import importance_sampling as importance
+from lmshealth.health import constants
 from lmshealth.health.importance_sampling import (
     WeightedDraws,
     importance_sample,
@@ -158,7 +158,7 @@ def test_too_few_draws_are_drawn_anew() -> None:
     """Draws worth less than 400 are drawn again, three times as many."""
     found = importance_sample_to_ess(gaussian(2), start(2), np.random.default_rng(9), 300)
     assert found.points.shape[0] == 900
-    assert found.ess >= importance._LEAST
+    assert found.ess >= constants.MIN_ESS
 
 
 def test_what_stays_too_little_is_refused_with_its_points() -> None:

@@ -337,9 +337,9 @@ def test_reweighting_and_sampling_agree(stage: Stage, monkeypatch: pytest.Monkey
     """
     cov = 60 * COV
     track = epochs([true_drift(NAMES, TRUTH)[:2]], cov)
-    monkeypatch.setattr(inference, "_LEAST_SHARE", 0.0)
+    monkeypatch.setattr(inference, "_MIN_SHARE", 0.0)
     weighted = infer(track, stage, 9)
-    monkeypatch.setattr(inference, "_LEAST_SHARE", 1.1)
+    monkeypatch.setattr(inference, "_MIN_SHARE", 1.1)
     sampled = infer(track, stage, 9)
     assert (weighted.prior_ratio > 1.05).any()
     np.testing.assert_array_equal(weighted.samples, sampled.samples)
@@ -359,7 +359,7 @@ def test_the_wider_posterior_may_have_draws_of_its_own(
         return Sample(next(own), full, full, r_hat=np.ones(2), autocorrelation_time=np.ones(2))
 
     monkeypatch.setattr(inference, "sample", fake)
-    monkeypatch.setattr(inference, "_LEAST_SHARE", 1.1)
+    monkeypatch.setattr(inference, "_MIN_SHARE", 1.1)
     found = infer(worn, stage, 5, epochs=[2])
     middle, std = np.median(first, axis=(0, 1)), np.std(first, axis=(0, 1))
     shift = (middle * [0.5, 2.0] + [0.01, -0.02]) / std

@@ -106,7 +106,7 @@ def test_a_parameter_the_logs_do_not_tell_is_left_out(stage: Stage) -> None:
     """An uninformed mount cannot be blamed, however low its draws lie, and the sentence says so."""
     found = judge(stage, logs(8), make_health(around(0.99, 0.5), informed=(0.9, 0.1)))
     assert found.verdict == "healthy"
-    assert "Mount stiffness: these logs do not tell." in found.why
+    assert "Mount stiffness: not constrained by these logs." in found.why
 
 
 def stepped(*, declared: bool = False, epoch: int = 5, evidence: float = 30.0) -> Track:
@@ -145,7 +145,7 @@ def test_a_jump_that_is_explained_or_past_is_not_the_verdict(stage: Stage) -> No
     [
         (3, {}, "3 usable logs since the baseline began; it needs 5"),
         (8, {"converged": False}, "did not converge"),
-        (8, {"informed": (0.2, 0.4)}, "move the prior of no parameter"),
+        (8, {"informed": (0.2, 0.4)}, "do not constrain any health parameter"),
     ],
 )
 def test_too_little_data_gets_no_word(
@@ -162,7 +162,7 @@ def test_without_health_there_is_no_word(stage: Stage) -> None:
     """Logs that do not carry the parameters are told as such."""
     found = judge(stage, logs(8), None)
     assert found.verdict == "not-enough-data"
-    assert "do not carry" in found.why
+    assert "do not contain enough information" in found.why
 
 
 def test_without_parameters_the_description_is_the_reason(tmp_path: Path) -> None:

@@ -462,7 +462,7 @@ def test_no_life_without_convergence(
 ) -> None:
     """A sampler that stops too soon is refused with its chains."""
     monkeypatch.setattr("lmshealth.health.ensemble_sampling._FIRST_STEPS", 40)
-    monkeypatch.setattr("lmshealth.health.ensemble_sampling._MOST_STEPS", 40)
+    monkeypatch.setattr("lmshealth.health.constants.MAX_STEPS", 40)
     with pytest.raises(NotConverged, match="after 40 steps") as caught:
         fit_life(history, stage, 1)
     assert np.shape(caught.value.chains) == (4, 40, 64, 4)

@@ -1,0 +1,39 @@
+"""Constants that decide which health and which verdict are published.
+
+A parameter is informed above `lmshealth.stage.constants.INFORMED`, which planning shares.
+"""
+
+from __future__ import annotations
+
+MAX_EPOCHS = 40
+"""Epochs that `infer` takes by default, some two seconds each; a trend shows no more detail."""
+
+# Convergence. Four independent ensembles are the least for which R-hat is calibrated, and 1.01 is
+# its recommended limit [Vehtari2021]; 50 autocorrelation times is what emcee's authors require for
+# an estimate of that time [ForemanMackey2013]. An epoch that needs more steps is not published.
+N_ENSEMBLES = 4
+MIN_AUTOCORRELATION_TIMES = 50
+MAX_R_HAT = 1.01
+MAX_STEPS = 20_000
+MIN_ESS = 400
+"""Effective draws of a posterior by importance sampling: as many as [Vehtari2021] asks of chains.
+The relative standard deviation of the evidence is then at most 5 %."""
+
+MIN_FIT = 1e-4
+"""Drifts whose probability under the best state of the parameters is lower are unexplained.
+One healthy machine in 10,000 is refused by chance; a wrong map or mode is refused at 4 sigma."""
+
+DEGRADED_SHARE = 0.25
+"""A parameter is degraded once it has lost this share of the distance from baseline to limit: time
+is left to plan a service, and intervals of the shipped stages are some 3 % wide."""
+LOSS_WITHOUT_LIMIT = 0.4
+"""Share of the baseline that a parameter without limit may lose: as the limits of the paper's
+stages, 0.6 of the preload [Piscalov2021]."""
+
+PRIOR_FACTOR = 2.0
+"""Factor on the width of the priors by which the sensitivity of a posterior is checked."""
+MIN_WIDENING = 1.2
+"""Priors that the map cuts to less than this factor on their 90 % interval are not checked."""
+EDGE_SHARE = 0.01
+"""A posterior is at the edge if its 5 or 95 % quantile is closer to an end of the map than this
+share of the map's range in ln parameter."""
