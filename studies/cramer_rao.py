@@ -13,7 +13,7 @@ from lmshealth.modal.free_decay.transient_likelihood import (
     pole_columns,
     unit_level,
 )
-from lmshealth.stage.cramer_rao import _NOISE_STD, _fourier, _marginal
+from lmshealth.stage.cramer_rao import NOISE_STD, fourier_frequencies, marginal_covariance
 
 # Steps of the differences by which several modes' densities are differentiated, in ln.
 _STEP = 1e-5
@@ -149,7 +149,7 @@ def joint_bound(modes: Vibration, force: FloatArray, recording: Recording) -> Fl
         Covariance of ``[ln f, ln ζ]``, shape ``(2 n_modes, 2 n_modes)``.
     """
     n, m = modes.shapes.shape
-    f = _fourier(recording.duration, recording.band)
+    f = fourier_frequencies(recording.duration, recording.band)
     pairs = [(i, j) for i in range(m) for j in range(i) if force[i, j] != 0]
     levels = slice(2 * m + n * m, 2 * m + n * m + n)
 
@@ -179,8 +179,8 @@ def joint_bound(modes: Vibration, force: FloatArray, recording: Recording) -> Fl
     )
     fisher = np.einsum("qkab,rkba->qr", slopes, slopes, optimize=True).real
     place = np.arange(levels.start, levels.stop)
-    fisher[place, place] += _NOISE_STD**-2
-    return _marginal(fisher, 2 * m)
+    fisher[place, place] += NOISE_STD**-2
+    return marginal_covariance(fisher, 2 * m)
 
 
 def decay_bound(
@@ -213,7 +213,7 @@ def decay_bound(
     f, zeta, duration = modes.frequency, modes.damping_ratio, recording.duration
     # So fast that nothing aliases; the band alone counts.
     n_samples = int(np.ceil(20 * recording.band[1] * duration))
-    fourier = _fourier(duration, recording.band)
+    fourier = fourier_frequencies(duration, recording.band)
     nothing = np.empty((fourier.size, 0))
     block = Block(fourier, nothing, duration, n_samples / duration, nothing)
     columns, _ = pole_columns(block, f, zeta)
@@ -226,4 +226,4 @@ def decay_bound(
     likelihood = TransientLikelihood((block,), modes.shapes.T, units, levels)
     p = np.concatenate([np.log(f), np.log(zeta), np.sqrt(ambient * units), levels, np.zeros(n)])
     unknown = np.delete(np.arange(3 * m + n), 2 * m + np.flatnonzero(ambient == 0))
-    return _marginal(likelihood.evaluate(p).fisher[np.ix_(unknown, unknown)], 2 * m)
+    return marginal_covariance(likelihood.evaluate(p).fisher[np.ix_(unknown, unknown)], 2 * m)

@@ -363,8 +363,8 @@ def plan(stage: str, detections: list[tuple[str, float]], style: str, **options:
     now are compared with those of the baseline, as long, at the same temperature.
     """
     from lmshealth.report.tables import plan_rows
+    from lmshealth.stage.constants import DURATIONS
     from lmshealth.stage.description import load_stage
-    from lmshealth.stage.planning import DURATIONS
     from lmshealth.stage.planning import plan as make_plan
 
     loaded = load_stage(stage)

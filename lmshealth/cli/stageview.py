@@ -10,10 +10,10 @@ from lmshealth.cli.terminal import or_dash, percent, print_table, print_text
 from lmshealth.report.tables import Row
 
 _VERDICTS = {
-    "told": "told",
+    "told": "identifiable",
     "longer-logs": "longer logs",
     "together": "together",
-    "not-told": "not told",
+    "not-told": "not identifiable",
 }
 
 

@@ -26,13 +26,12 @@ from lmshealth.signal.acceleration_levels import Growth, Magnitude
 from lmshealth.signal.following_error import FollowingError
 from lmshealth.signal.spectral_lines import Line
 from lmshealth.stage.check import (
-    USUAL_DURATION,
     Diagnostic,
-    MapRange,
     ModeCheck,
     ParameterCheck,
     StageCheck,
 )
+from lmshealth.stage.constants import TYPICAL_DURATION
 from lmshealth.stage.planning import Plan
 from lmshealth.tracking.history import LogEstimates
 from lmshealth.tracking.smoother import Smoothed
@@ -508,21 +507,18 @@ def plan_rows(plans: Sequence[Plan]) -> dict[str, list[Row]]:
 
 def stage_rows(examined: StageCheck, found: Sequence[Diagnostic]) -> dict[str, list[Row]]:
     """List what an examination of a stage description measured, and what it comes to."""
-    names = [check.parameter for check in examined.parameters]
+    names = [check.name for check in examined.parameters]
     return {
         "stage": [
             {
                 "name": examined.name,
                 "model_std": examined.model_std,
                 "n_logs": examined.n_logs,
-                "seconds_per_log": USUAL_DURATION,
+                "seconds_per_log": TYPICAL_DURATION,
             }
         ],
         "modes": [_mode_row(check) for check in examined.modes],
-        "parameters": [
-            _parameter_row(ranges, check)
-            for ranges, check in zip(examined.ranges, examined.parameters, strict=True)
-        ],
+        "parameters": [_parameter_row(check) for check in examined.parameters],
         "sensitivities": [
             {
                 "mode": mode,
@@ -558,19 +554,19 @@ def _mode_row(check: ModeCheck) -> Row:
     }
 
 
-def _parameter_row(ranges: MapRange, check: ParameterCheck) -> Row:
-    spec = ranges.parameter
+def _parameter_row(check: ParameterCheck) -> Row:
+    spec = check.spec
     levels = ("q005", "q05", "q95", "q995")
     return {
         "parameter": spec.name,
         "baseline": spec.baseline,
         "limit": spec.limit.below if spec.limit else None,
-        "limit_on_map": ranges.holds_limit if spec.limit else None,
-        "map_low": ranges.low,
-        "map_high": ranges.high,
-        **{f"prior_{key}": value for key, value in zip(levels, ranges.prior, strict=True)},
-        "prior_below_map": ranges.below,
-        "prior_above_map": ranges.above,
+        "limit_on_map": check.has_limit_on_map if spec.limit else None,
+        "map_low": check.low,
+        "map_high": check.high,
+        **{f"prior_{key}": value for key, value in zip(levels, check.quantiles, strict=True)},
+        "prior_below_map": check.below,
+        "prior_above_map": check.above,
         "prior_std_ln": check.prior_std,
         "logs_std_ln": check.usual_std,
         "endless_logs_std_ln": check.endless_std,

@@ -1,4 +1,7 @@
-"""Check of a stage description: range of its map, and the parameters that its modes identify."""
+"""Check of a stage description: range of its map, and the parameters that its modes identify.
+
+`check_stage` computes the numbers, `diagnose` states what they mean (README.md, "Check").
+"""
 
 from __future__ import annotations
 
@@ -10,35 +13,31 @@ from typing import Literal
 import numpy as np
 
 from lmshealth._arrays import FloatArray, freeze
-from lmshealth.stage.constants import INFORMED
+from lmshealth.stage import constants
 from lmshealth.stage.description import ModeSpec, ParameterSpec, Stage
 from lmshealth.stage.identifiability import Identifiability, identifiability_of
 
-# Surrogates are to be this good: an error of ln f that no measurement comes near.
-SURROGATE_TARGET = 1e-5
-# Logs as they are usual; so many now as the baseline has.
-USUAL_DURATION = 60.0
-
+# Values of the column `verdict` of `lmshealth stage`.
 Verdict = Literal["told", "longer-logs", "together", "not-told"]
 
 
 @dataclass(frozen=True, slots=True)
 class ModeCheck:
-    """A mode of the description, and what the map has for it.
+    """A mode of the description and its place on the map.
 
     Attributes
     ----------
     mode : ModeSpec
         As described.
     informs : bool
-        Whether health is read from it: it is tracked and on the map.
+        Whether health is inferred from it: it is tracked and on the map.
     map_frequency, limit_frequency : float
         On the map, in Hz: at the baseline, and with every parameter at its limit. NaN without a
-        map; the second also without limits, or where they lie beyond the map.
+        map; the second also without limits, or where they lie outside the map.
     surrogate_error : float
         Largest error of ln f at grid points left out of the fit.
     reached : float
-        Standard deviation that usual logs reach of the drift of ln f.
+        Standard deviation that typical logs reach of the drift of ln f.
     """
 
     mode: ModeSpec
@@ -50,68 +49,44 @@ class ModeCheck:
 
     @property
     def searched(self) -> tuple[float, float]:
-        """Band in Hz in which the mode is looked for."""
+        """Band in Hz in which the mode is searched."""
         f, share = self.mode.frequency_hz, self.mode.search
         return f * (1 - share), f * (1 + share)
-
-    def is_searched(self, frequency: float) -> bool:
-        """Tell whether a frequency in Hz is looked for."""
-        low, high = self.searched
-        return low <= frequency <= high
-
-
-@dataclass(frozen=True, slots=True)
-class MapRange:
-    """How far the map reaches for one parameter.
-
-    Attributes
-    ----------
-    parameter : ParameterSpec
-        As described.
-    low, high : float
-        Where the map ends.
-    prior : tuple of float
-        Quantiles of the prior at 0.5, 5, 95 and 99.5 %.
-    below, above : float
-        Probability of the prior beyond either end.
-    """
-
-    parameter: ParameterSpec
-    low: float
-    high: float
-    prior: tuple[float, float, float, float]
-    below: float
-    above: float
-
-    @property
-    def holds_limit(self) -> bool:
-        """Whether the limit, if there is one, lies inside the map."""
-        limit = self.parameter.limit
-        return limit is None or limit.below > self.low
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ParameterCheck:
-    """What the modes can tell of one parameter; standard deviations are of its logarithm.
+    """Range of the map and identifiability of one parameter; ``std`` is of its logarithm.
 
     Attributes
     ----------
-    parameter : str
-        Its name.
+    spec : ParameterSpec
+        As described.
+    low, high : float
+        Range of the map.
+    quantiles : tuple of float
+        Of the prior at 0.5, 5, 95 and 99.5 %.
+    below, above : float
+        Prior probability outside either end of the map.
     verdict : str
-        ``told`` by usual logs; by ``longer-logs`` only; ``together`` with other parameters, as one
-        combination; ``not-told``.
+        Identified by typical logs (``told``), by ``longer-logs`` only, ``together`` with other
+        parameters as one combination, or ``not-told``.
     prior_std, usual_std, endless_std : float
-        In the prior, after usual logs, and after endless ones.
+        In the prior, after typical logs, and after unlimited ones.
     exact_map_std : float
-        After usual logs, were the map exact.
+        After typical logs, were the map exact.
     known_std : float
-        After endless logs, were the other parameters known; also that of the combination.
+        After unlimited logs, were the other parameters known; also that of the combination.
     exponents : ndarray
         Of the parameters in the combination, its own being 1, shape ``(n_parameters,)``.
     """
 
-    parameter: str
+    spec: ParameterSpec
+    low: float
+    high: float
+    quantiles: tuple[float, float, float, float]
+    below: float
+    above: float
     verdict: Verdict
     prior_std: float
     usual_std: float
@@ -123,14 +98,24 @@ class ParameterCheck:
     def __post_init__(self) -> None:
         freeze(self)
 
+    @property
+    def name(self) -> str:
+        """Name of the parameter."""
+        return self.spec.name
+
+    @property
+    def has_limit_on_map(self) -> bool:
+        """Whether the limit, if there is one, lies inside the map."""
+        return self.spec.limit is None or self.spec.limit.below > self.low
+
     def informed(self, std: float) -> float:
-        """Share of the prior's variance that data take away which leave this deviation."""
+        """Return the share of the prior variance removed by data that leave this deviation."""
         return 1 - (std / self.prior_std) ** 2
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StageCheck:
-    """What a stage description can do.
+    """Capabilities of a stage description.
 
     Attributes
     ----------
@@ -138,28 +123,25 @@ class StageCheck:
         Of the description.
     modes : tuple of ModeCheck
         All that are described.
-    ranges : tuple of MapRange
-        One per parameter; empty without a map.
     parameters : tuple of ParameterCheck
-        One per parameter.
+        One per parameter; empty without a map.
     informative : tuple of str
-        Modes in whose order the sensitivities stand.
+        Modes in the order of the sensitivities.
     slopes, limit_slopes : ndarray
         d ln f / d ln parameter at the baseline and with every parameter at its limit, NaN where
         there is none, shape ``(n_modes, n_parameters)``.
     correlation : ndarray
-        Of the ln parameters after usual logs, shape ``(n_parameters, n_parameters)``.
+        Of the ln parameters after typical logs, shape ``(n_parameters, n_parameters)``.
     n_logs : int
-        Usual number of logs.
+        Number of typical logs.
     model_std : float
         Relative standard deviation of the map's sensitivities; NaN without a map.
     unused : tuple of str
-        Modes that only the map has.
+        Modes of the map that are not described.
     """
 
     name: str
     modes: tuple[ModeCheck, ...]
-    ranges: tuple[MapRange, ...]
     parameters: tuple[ParameterCheck, ...]
     informative: tuple[str, ...]
     slopes: FloatArray
@@ -174,7 +156,7 @@ class StageCheck:
 
 
 def check_stage(stage: Stage) -> StageCheck:
-    """Examine what the map of a stage description covers, and what its modes can tell.
+    """Check the range of the map of a stage description, and the parameters that it identifies.
 
     Parameters
     ----------
@@ -190,7 +172,6 @@ def check_stage(stage: Stage) -> StageCheck:
         return StageCheck(
             name=stage.name,
             modes=tuple(ModeCheck(mode, informs=False) for mode in stage.modes),
-            ranges=(),
             parameters=(),
             informative=(),
             slopes=none,
@@ -203,15 +184,16 @@ def check_stage(stage: Stage) -> StageCheck:
     information = identifiability_of(stage)
     rows = [stage.modal_map.modes.index(mode.name) for mode in information.modes]
     limits = _limits(stage)
-    usual = information.drift_variance(USUAL_DURATION, information.n_baseline)
-    cov = np.linalg.inv(information.precision(usual))
+    noise = information.drift_variance(constants.TYPICAL_DURATION, information.n_baseline)
+    cov = np.linalg.inv(information.precision(noise))
     std = np.sqrt(np.diag(cov))
     described = {mode.name for mode in stage.modes}
     return StageCheck(
         name=stage.name,
-        modes=tuple(_check(stage, mode, information, limits) for mode in stage.modes),
-        ranges=tuple(_cover(stage, k) for k in range(len(stage.parameters))),
-        parameters=tuple(_tell(information, j, usual) for j in range(len(stage.parameters))),
+        modes=tuple(_check_mode(stage, mode, information, limits) for mode in stage.modes),
+        parameters=tuple(
+            _check_parameter(stage, information, j, noise) for j in range(len(stage.parameters))
+        ),
         informative=tuple(mode.name for mode in information.modes),
         slopes=information.slopes,
         limit_slopes=np.full(information.slopes.shape, np.nan)
@@ -225,67 +207,66 @@ def check_stage(stage: Stage) -> StageCheck:
 
 
 def _limits(stage: Stage) -> FloatArray | None:
-    """Ln parameters with each at its limit, or at the baseline; None off the map or without any."""
+    """Return the ln parameters at their limits, or baselines; None off the map or without any."""
     assert stage.modal_map is not None
     if not any(parameter.limit for parameter in stage.parameters):
         return None
-    ends = [p.limit.below if p.limit else p.baseline for p in stage.parameters]
-    point = np.log(ends)
+    point = np.log([p.limit.below if p.limit else p.baseline for p in stage.parameters])
     return point if stage.modal_map.inside(point[None]).all() else None
 
 
-def _check(
+def _check_mode(
     stage: Stage, mode: ModeSpec, information: Identifiability, limits: FloatArray | None
 ) -> ModeCheck:
-    known = stage.modal_map
-    if known is None or mode.name not in known.modes:
+    modal_map = stage.modal_map
+    if modal_map is None or mode.name not in modal_map.modes:
         return ModeCheck(mode, informs=False)
-    column = known.modes.index(mode.name)
+    column = modal_map.modes.index(mode.name)
 
     def frequency(point: FloatArray) -> float:
-        return float(np.exp(known.ln_frequency(point[None])[0, column]))
+        return float(np.exp(modal_map.ln_frequency(point[None])[0, column]))
 
-    reached = replace(information, modes=(mode,), _known={}).drift_variance(
-        USUAL_DURATION, information.n_baseline
+    reached = replace(information, modes=(mode,)).drift_variance(
+        constants.TYPICAL_DURATION, information.n_baseline
     )
     return ModeCheck(
         mode,
         informs=mode.tracked,
         map_frequency=frequency(stage.baseline_point),
         limit_frequency=np.nan if limits is None else frequency(limits),
-        surrogate_error=float(known.leave_out_error[column]),
+        surrogate_error=float(modal_map.leave_out_error[column]),
         reached=float(np.sqrt(reached[0])),
     )
 
 
-def _cover(stage: Stage, column: int) -> MapRange:
+def _check_parameter(
+    stage: Stage, information: Identifiability, j: int, noise: FloatArray
+) -> ParameterCheck:
     assert stage.modal_map is not None
-    parameter = stage.parameters[column]
-    ends = np.exp([stage.modal_map.low[column], stage.modal_map.high[column]])
-    below, upto = parameter.prior.probability(ends)
-    lowest, low, high, highest = parameter.prior.quantile(np.array([0.005, 0.05, 0.95, 0.995]))
-    return MapRange(
-        parameter=parameter,
-        low=float(ends[0]),
-        high=float(ends[1]),
-        prior=(float(lowest), float(low), float(high), float(highest)),
-        below=float(below),
-        above=float(1 - upto),
-    )
+    spec = stage.parameters[j]
+    low, high = np.exp([stage.modal_map.low[j], stage.modal_map.high[j]]).tolist()
+    below, upto = spec.prior.probability(np.array([low, high])).tolist()
+    lowest, lower, upper, highest = spec.prior.quantile(
+        np.array([0.005, 0.05, 0.95, 0.995])
+    ).tolist()
 
+    def left(model: Identifiability, variance: FloatArray) -> float:
+        return float(np.sqrt(np.linalg.inv(model.precision(variance))[j, j]))
 
-def _tell(information: Identifiability, j: int, usual: FloatArray) -> ParameterCheck:
-    def left(view: Identifiability, noise: FloatArray) -> float:
-        return float(np.sqrt(np.linalg.inv(view.precision(noise))[j, j]))
-
-    precision = information.precision(information.limiting_variance())
+    unlimited = information.limiting_variance()
+    precision = information.precision(unlimited)
     found = ParameterCheck(
-        parameter=information.parameters[j],
+        spec=spec,
+        low=low,
+        high=high,
+        quantiles=(lowest, lower, upper, highest),
+        below=below,
+        above=1 - upto,
         verdict="not-told",
         prior_std=float(np.sqrt(information.prior[j])),
-        usual_std=left(information, usual),
-        endless_std=left(information, information.limiting_variance()),
-        exact_map_std=left(replace(information, model_std=0.0), usual),
+        usual_std=left(information, noise),
+        endless_std=left(information, unlimited),
+        exact_map_std=left(replace(information, model_std=0.0), noise),
         known_std=float(1 / np.sqrt(precision[j, j])),
         exponents=precision[j] / precision[j, j],
     )
@@ -294,26 +275,20 @@ def _tell(information: Identifiability, j: int, usual: FloatArray) -> ParameterC
         ("longer-logs", found.endless_std),
         ("together", found.known_std),
     )
-    told = (verdict for verdict, std in cases if found.informed(std) >= INFORMED)
-    return replace(found, verdict=next(told, "not-told"))
-
-
-# A prior cut by more than this is not the one that was described; a correlation of more than this
-# is worth knowing; an exponent below this, times the priors' widths, is left out, and so small a
-# share of what logs reach is no limit.
-_CUT, _CORRELATED, _SLIGHT = 0.01, 0.5, 0.05
+    passed = (verdict for verdict, std in cases if found.informed(std) >= constants.INFORMED)
+    return replace(found, verdict=next(passed, "not-told"))
 
 
 @dataclass(frozen=True, slots=True)
 class Diagnostic:
-    """One sentence or two about a stage description.
+    """One or two sentences about a stage description.
 
     Attributes
     ----------
     topic : str
         ``modes``, ``map`` or ``parameters``.
     good : bool
-        False for what may have to be mended.
+        False for a possible fault.
     text : str
         What was found, and what to do.
     """
@@ -323,140 +298,127 @@ class Diagnostic:
     text: str
 
 
-def diagnose(examined: StageCheck) -> tuple[Diagnostic, ...]:
-    """Say what an examination comes to.
-
-    Parameters
-    ----------
-    examined : StageCheck
-        What was measured.
-
-    Returns
-    -------
-    tuple of Diagnostic
-        Of the parameters first, then of the map and the modes.
-    """
-    if not examined.parameters:
+def diagnose(checked: StageCheck) -> tuple[Diagnostic, ...]:
+    """State the results of a check in sentences: of parameters, of the map, then of modes."""
+    if not checked.parameters:
         text = (
-            "No [[parameter]], so modes are followed and no health is inferred. For health "
-            "describe [[parameter]] and a [map] that says what it does to the modes."
+            "No [[parameter]]: modes are tracked and no health is inferred. For health, describe "
+            "[[parameter]] and a [map] of its effect on the modes."
         )
         return (Diagnostic("parameters", True, text),)
     return (
-        *(_told(examined, check) for check in examined.parameters),
-        *_correlated(examined),
-        _surrogate(examined),
-        *(found for ranges in examined.ranges for found in _covered(ranges)),
-        *(found for check in examined.modes for found in _placed(check)),
-        *_strangers(examined),
+        *(_identified(checked, parameter) for parameter in checked.parameters),
+        *_correlated(checked),
+        _surrogate(checked),
+        *(found for parameter in checked.parameters for found in _map_range(parameter)),
+        *(found for mode in checked.modes for found in _searched(mode)),
+        *_unused(checked),
     )
 
 
-def _told(examined: StageCheck, check: ParameterCheck) -> Diagnostic:
-    name, before = check.parameter, _share(check.prior_std)
-    logs = f"{examined.n_logs} logs of {USUAL_DURATION:g} s"
-    after = _share(check.usual_std)
-    if check.verdict == "told":
-        text = f"{name} can be told: {logs} know it to {after}, the prior alone to {before}."
-    elif check.verdict == "longer-logs":
+def _identified(checked: StageCheck, parameter: ParameterCheck) -> Diagnostic:
+    name, prior = parameter.name, _share(parameter.prior_std)
+    after, unlimited = _share(parameter.usual_std), _share(parameter.endless_std)
+    logs = f"{checked.n_logs} logs of {constants.TYPICAL_DURATION:g} s"
+    if parameter.verdict == "told":
         text = (
-            f"{name} can be told by more or longer logs only: {logs} know it to {after}, endless "
-            f"ones to {_share(check.endless_std)}, the prior alone to {before}."
+            f"{name} is identifiable: {logs} reduce its standard deviation to {after}, from "
+            f"{prior} in the prior."
         )
-    elif check.verdict == "together":
+    elif parameter.verdict == "longer-logs":
         text = (
-            f"{name} can be told only together with others: {_combination(examined, check)} is "
-            f"known to {_share(check.known_std)}, {name} by itself to "
-            f"{_share(check.endless_std)} even from endless logs, and to {before} by the prior "
-            "alone. Track a mode that feels the parameters in another proportion."
+            f"{name} is identifiable by more or longer logs only: {logs} reduce its standard "
+            f"deviation to {after}, unlimited logs to {unlimited}, from {prior} in the prior."
+        )
+    elif parameter.verdict == "together":
+        text = (
+            f"{name} is identifiable only together with others: {_combination(checked, parameter)} "
+            f"has a standard deviation of {_share(parameter.known_std)}, {name} by itself "
+            f"{unlimited} even after unlimited logs and {prior} in the prior. Track a mode that "
+            "depends on the parameters in another proportion."
         )
     else:
         text = (
-            f"{name} is not identifiable: {logs} leave it known to {after}, endless ones to "
-            f"{_share(check.endless_std)}, where the prior alone knows {before}. "
-            f"{_hindrance(check)}"
+            f"{name} is not identifiable: its standard deviation is {after} after {logs}, "
+            f"{unlimited} after unlimited logs and {prior} in the prior. {_hindrance(parameter)}"
         )
-    return Diagnostic("parameters", check.verdict == "told", text)
+    return Diagnostic("parameters", parameter.verdict == "told", text)
 
 
-def _hindrance(check: ParameterCheck) -> str:
-    if check.informed(check.exact_map_std) >= INFORMED:
+def _hindrance(parameter: ParameterCheck) -> str:
+    if parameter.informed(parameter.exact_map_std) >= constants.INFORMED:
         return (
-            "What it does to the modes is less than the map's error (model_std) in what the others "
-            f"do; with an exact map it would be {_share(check.exact_map_std)}. Track a mode that "
-            "depends on it more, or make a better map."
+            "Its effect on the modes is less than the map's error (model_std) in the effects of "
+            f"the others; with an exact map it would be {_share(parameter.exact_map_std)}. Track a "
+            "mode that depends on it more, or make a better map."
         )
-    return "The modes hardly feel it: track a mode that depends on it more."
+    return "The modes hardly depend on it: track a mode that depends on it more."
 
 
-def _combination(examined: StageCheck, check: ParameterCheck) -> str:
-    """Write the product of powers that is known best."""
-    widths = [other.prior_std / check.prior_std for other in examined.parameters]
-    shown = [
-        (other.parameter, exponent)
-        for other, exponent, width in zip(examined.parameters, check.exponents, widths, strict=True)
-        if abs(exponent) * width >= _SLIGHT
-    ]
+def _combination(checked: StageCheck, parameter: ParameterCheck) -> str:
+    """Write the product of powers with the least standard deviation."""
     return " · ".join(
-        name if exponent == 1 else f"{name}^{exponent:.2g}" for name, exponent in shown
+        other.name if exponent == 1 else f"{other.name}^{exponent:.2g}"
+        for other, exponent in zip(checked.parameters, parameter.exponents, strict=True)
+        if abs(exponent) * other.prior_std / parameter.prior_std >= constants.NEGLIGIBLE_SHARE
     )
 
 
-def _correlated(examined: StageCheck) -> Iterator[Diagnostic]:
-    told = [k for k, check in enumerate(examined.parameters) if check.verdict == "told"]
-    for i, j in combinations(told, 2):
-        first, second = (examined.parameters[k].parameter for k in (i, j))
-        value = examined.correlation[i, j]
-        text = f"{first} and {second} can be told apart, their errors correlate by {value:+.2f}"
-        if abs(value) >= _CORRELATED:
-            how = "down" if value < 0 else "up too"
-            text += f": where one is estimated too high, the other tends {how}"
+def _correlated(checked: StageCheck) -> Iterator[Diagnostic]:
+    identified = [k for k, p in enumerate(checked.parameters) if p.verdict == "told"]
+    for i, j in combinations(identified, 2):
+        first, second = (checked.parameters[k].name for k in (i, j))
+        value = checked.correlation[i, j]
+        text = f"{first} and {second} are identifiable separately; their errors have a correlation"
+        text += f" of {value:+.2f}"
+        if abs(value) >= constants.NOTABLE_CORRELATION:
+            text += ": if the estimate of one is too high, that of the other tends to be too "
+            text += "low" if value < 0 else "high"
         yield Diagnostic("parameters", True, f"{text}.")
 
 
-def _surrogate(examined: StageCheck) -> Diagnostic:
-    """Judge the surrogate against its target and against what logs reach."""
-    checks = [check for check in examined.modes if check.informs]
-    worst = max(checks, key=lambda check: check.surrogate_error)
-    share = max(check.surrogate_error / check.reached for check in checks)
-    meets = worst.surrogate_error <= SURROGATE_TARGET
+def _surrogate(checked: StageCheck) -> Diagnostic:
+    """Compare the error of the surrogate with its target and with the scatter of typical logs."""
+    checks = [mode for mode in checked.modes if mode.informs]
+    worst = max(checks, key=lambda mode: mode.surrogate_error)
+    share = max(mode.surrogate_error / mode.reached for mode in checks)
+    meets = worst.surrogate_error <= constants.SURROGATE_TARGET
     text = (
-        f"The surrogate meets points left out of the map within {worst.surrogate_error:.1e} of "
-        f"ln f ({worst.mode.name}), {'at most' if meets else 'more than'} the "
-        f"{SURROGATE_TARGET:g} wanted; {_share(share)} of what usual logs reach."
+        f"The surrogate reproduces grid points left out of its fit within "
+        f"{worst.surrogate_error:.1e} of ln f ({worst.mode.name}), "
+        f"{'at most' if meets else 'more than'} the target of {constants.SURROGATE_TARGET:g}; "
+        f"{_share(share)} of the standard deviation of typical logs."
     )
     if share > 1:
-        text += (
-            " It limits what can be told: make the map's grid denser, above all where modes cross."
-        )
-    elif not meets and share < _SLIGHT:
-        text += " It does not limit what can be told."
-    return Diagnostic("map", meets or share < _SLIGHT, text)
+        text += " It limits the result: make the map's grid denser, above all where modes cross."
+    elif not meets and share < constants.NEGLIGIBLE_SHARE:
+        text += " It does not limit the result."
+    return Diagnostic("map", meets or share < constants.NEGLIGIBLE_SHARE, text)
 
 
-def _covered(ranges: MapRange) -> Iterator[Diagnostic]:
-    spec, ends = ranges.parameter, f"{ranges.low:.3g} to {ranges.high:.3g}"
-    outside = ranges.below + ranges.above
-    if outside > _CUT:
+def _map_range(parameter: ParameterCheck) -> Iterator[Diagnostic]:
+    name, ends = parameter.name, f"{parameter.low:.3g} to {parameter.high:.3g}"
+    outside = parameter.below + parameter.above
+    if outside > constants.PRIOR_OUTSIDE:
         yield Diagnostic(
             "map",
             False,
-            f"The map of {spec.name} reaches from {ends}, and {_share(outside)} of its prior lies "
-            "beyond: it is cut there. Make a wider map, or a narrower prior.",
+            f"The map of {name} covers {ends}; {_share(outside)} of its prior lies outside and is "
+            "cut off. Make a wider map, or a narrower prior.",
         )
-    if not ranges.holds_limit and spec.limit is not None:
+    if not parameter.has_limit_on_map and parameter.spec.limit is not None:
         yield Diagnostic(
             "map",
             False,
-            f"The limit {spec.limit.below:g} of {spec.name} does not lie inside the map ({ends}), "
-            "so logs cannot show that it is passed. Make a wider map.",
+            f"The limit {parameter.spec.limit.below:g} of {name} does not lie inside the map "
+            f"({ends}), so logs cannot show that it is passed. Make a wider map.",
         )
 
 
-def _placed(check: ModeCheck) -> Iterator[Diagnostic]:
+def _searched(check: ModeCheck) -> Iterator[Diagnostic]:
     mode, (low, high) = check.mode, check.searched
     if mode.tracked and not check.informs:
-        text = f"{mode.name} is followed but not on the map: it tells nothing of health."
+        text = f"{mode.name} is tracked but not on the map: it contributes nothing to health."
         yield Diagnostic("modes", True, text)
     if not check.informs:
         return
@@ -464,18 +426,18 @@ def _placed(check: ModeCheck) -> Iterator[Diagnostic]:
         ("at the baseline", check.map_frequency),
         ("with every parameter at its limit", check.limit_frequency),
     ):
-        if np.isfinite(frequency) and not check.is_searched(frequency):
+        if np.isfinite(frequency) and not low <= frequency <= high:
             yield Diagnostic(
                 "modes",
                 False,
-                f"{mode.name} is looked for from {low:.4g} to {high:.4g} Hz, and the map has it at "
-                f"{frequency:.4g} Hz {when}. Widen its search, or mend map or frequency.",
+                f"{mode.name} is searched from {low:.4g} to {high:.4g} Hz, but the map has it at "
+                f"{frequency:.4g} Hz {when}. Widen its search, or correct the map or frequency.",
             )
 
 
-def _strangers(examined: StageCheck) -> Iterator[Diagnostic]:
-    if examined.unused:
-        text = f"The map also has {', '.join(examined.unused)}, which no [[mode]] describes."
+def _unused(checked: StageCheck) -> Iterator[Diagnostic]:
+    if checked.unused:
+        text = f"The map also has {', '.join(checked.unused)}, which no [[mode]] describes."
         yield Diagnostic("modes", True, text)
 
 

@@ -1,11 +1,45 @@
-"""Constants that decide what a description, a record or a posterior is accepted for."""
+"""Constants that decide what is accepted and published of a stage description."""
 
 from __future__ import annotations
 
-# Share of the prior variance that data must remove before a value of a parameter is published.
+# --- Health parameters -------------------------------------------------------------------------
+# Least share of the prior variance of a ln parameter that the data must remove before its value is
+# published: from a half on the data contribute more than the prior.
 INFORMED = 0.5
+# Numbers and durations (s) of logs beyond which a plan is impractical. What such logs leave
+# uncertain at both the baseline and now is the error of the map.
+MOST_LOGS, LONGEST_LOG = 10_000, 3600
+# Least prior probability inside the modal map; below it, map and prior describe two machines.
+LEAST_PRIOR_MASS = 1e-6
+# Least prior probability of a law's parameter in its admissible range.
+LEAST_LAW_MASS = 0.01
+# Accepted risk of reaching a limit before the service, where [decision] states nothing.
+MAX_RISK = 0.05
+# Words of verdict.csv for the parameters of lms-x and lms-y (every other parameter has its own
+# name), and those that name no parameter.
+VERDICT_WORDS = {"guide_preload": "preload", "mount_stiffness": "mount"}
+RESERVED_WORDS = ("healthy", "both", "step", "not-enough-data")
+
+# --- Identification, as the Cramér-Rao bound assumes it -----------------------------------------
 # Half-width of the band that a mode is fitted in, in damping ratios times its frequency. Beyond it
 # a resonance adds little information, and the noise need not be as simple as the model.
 BAND = 8.0
 # Least duration of a segment times the half-power bandwidth of a mode identified in it.
 LEAST_RESOLUTION = 2.0
+
+# --- Check of a description ---------------------------------------------------------------------
+# Duration in s of the typical logs of the check; there are as many now as in the baseline.
+TYPICAL_DURATION = 60.0
+# Largest error of ln f of a good surrogate: a hundredth of the best that logs reach.
+SURROGATE_TARGET = 1e-5
+# Share of the uncertainty of typical logs below which an error of the surrogate is no fault, and
+# exponent times relative prior width below which a combination omits a parameter.
+NEGLIGIBLE_SHARE = 0.05
+# Prior probability outside the map from which the check recommends a wider map.
+PRIOR_OUTSIDE = 0.01
+# Correlation from which the check explains its sign.
+NOTABLE_CORRELATION = 0.5
+
+# --- Planning -----------------------------------------------------------------------------------
+# Durations in s that a plan compares by default.
+DURATIONS = (10.0, 20.0, 60.0, 120.0, 300.0, 600.0)

@@ -1,4 +1,4 @@
-"""Cramér-Rao bound of one mode identified from ambient accelerations with noise."""
+"""Cramér-Rao bound of one mode identified from ambient accelerations in noise."""
 
 from __future__ import annotations
 
@@ -6,9 +6,9 @@ import numpy as np
 
 from lmshealth._arrays import FloatArray
 
-# Of the logarithm of the noise's level beforehand: without it an ever smaller noise would still
-# cost what an unknown part of its shape does.
-_NOISE_STD = 3.0
+# Prior standard deviation of the logarithm of the noise level. Without it an ever smaller noise
+# would still cost what an unknown part of its spectrum does.
+NOISE_STD = 3.0
 
 
 def ambient_bound(
@@ -20,10 +20,10 @@ def ambient_bound(
     band: tuple[float, float],
     n_channels: int = 1,
 ) -> FloatArray:
-    """Bound the covariance of one mode's estimate from ambient accelerations with noise.
+    """Bound the covariance of the estimate of one mode from ambient accelerations in white noise.
 
-    Of the channels' covariance S D φφᵀ + S_e I one eigenvalue is S D + S_e and all others are
-    S_e: further channels tell the noise, and the mode only through the sum of their SNR.
+    Of the channels' covariance S D φφᵀ + S_e I one eigenvalue is S D + S_e and all others are S_e:
+    further channels inform about the noise, and about the mode only by the sum of their SNR.
 
     Parameters
     ----------
@@ -32,7 +32,7 @@ def ambient_bound(
     snr : float
         Modal signal-to-noise ratio S / (4 ζ² S_e), summed over the channels.
     duration : float
-        Of the record in s. Several records of one length: multiply the result by 1/their number.
+        Of the record in s. For n records of one length divide the result by n.
     band : (float, float)
         Band in Hz in which the noise is white with an unknown level.
     n_channels : int
@@ -42,13 +42,18 @@ def ambient_bound(
     -------
     ndarray
         Covariance of ``[ln f, ln ζ]``, shape ``(2, 2)``.
+
+    References
+    ----------
+    Au2014
     """
-    f = _fourier(duration, band)
+    f = fourier_frequencies(duration, band)
     beta2 = (frequency / f) ** 2
     damped = 4 * damping_ratio**2 * beta2
     under = (1 - beta2) ** 2 + damped
     modal = 4 * damping_ratio**2 * snr / under
     share = modal / (modal + 1)
+    # Derivatives of ln(S D + S_e) by ln f, ln ζ, ln S and ln S_e.
     slopes = np.stack(
         [
             share * (4 * beta2 * (1 - beta2) - 2 * damped) / under,
@@ -58,16 +63,17 @@ def ambient_bound(
         ]
     )
     fisher = slopes @ slopes.T
-    fisher[3, 3] += (n_channels - 1) * f.size + _NOISE_STD**-2
-    return _marginal(fisher, 2)
+    fisher[3, 3] += (n_channels - 1) * f.size + NOISE_STD**-2
+    return marginal_covariance(fisher, 2)
 
 
-def _fourier(duration: float, band: tuple[float, float]) -> FloatArray:
+def fourier_frequencies(duration: float, band: tuple[float, float]) -> FloatArray:
+    """List the Fourier frequencies in Hz within a band, zero excluded."""
     low, high = band
     return np.arange(max(1.0, np.ceil(low * duration)), np.floor(high * duration) + 1) / duration
 
 
-def _marginal(fisher: FloatArray, n: int) -> FloatArray:
+def marginal_covariance(fisher: FloatArray, n: int) -> FloatArray:
     """Invert an information matrix for its first ``n`` parameters, the others unknown."""
     scale = np.sqrt(np.diag(fisher))
     inverse = np.linalg.inv(fisher / np.outer(scale, scale))

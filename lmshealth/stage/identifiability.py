@@ -1,36 +1,34 @@
-"""Identifiability of the health parameters by the tracked modes (README.md: Identifiability)."""
+"""Identifiability of health parameters by the tracked modes (README.md, "Identifiability")."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 
 from lmshealth._arrays import BoolArray, FloatArray
 from lmshealth.errors import BadStage
-from lmshealth.stage.constants import BAND, INFORMED, LEAST_RESOLUTION
+from lmshealth.stage import constants
 from lmshealth.stage.cramer_rao import ambient_bound
 from lmshealth.stage.description import ModeSpec, Stage
-
-# What is more than this is no plan: what is left then, no logs take away.
-MOST_LOGS, LONGEST = 10_000, 3600
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Identifiability:
-    """What the tracked modes show of the health parameters.
+    """Information of the tracked modes about small changes of the ln health parameters.
 
     Attributes
     ----------
     parameters : tuple of str
-        Their names.
+        Names of the parameters.
     modes : tuple of ModeSpec
-        Those that are tracked and on the map.
+        Tracked modes on the map.
     slopes : ndarray
         d ln f / d ln parameter at the baseline, shape ``(n_modes, n_parameters)``.
     prior : ndarray
-        Variances of the ln parameters in their priors, shape ``(n_parameters,)``.
+        Prior variances of the ln parameters, shape ``(n_parameters,)``.
     model_std : float
         Relative standard deviation of the map's sensitivities.
     leave_out : ndarray
@@ -46,20 +44,16 @@ class Identifiability:
     model_std: float
     leave_out: FloatArray
     n_baseline: int
-    # Bounds by length of log: many questions are asked of few lengths.
-    _known: dict[float, FloatArray] = field(default_factory=dict)
 
     @property
     def least_duration(self) -> float:
-        """Length in s of a log in which every mode can be identified."""
+        """Duration in s of a log from which every mode can be identified."""
         widths = [2 * mode.damping_ratio * mode.frequency_hz for mode in self.modes]
-        return LEAST_RESOLUTION / min(widths)
+        return constants.LEAST_RESOLUTION / min(widths)
 
     def log_variance(self, duration: float) -> FloatArray:
         """Bound the variance of ln f of each mode in one log, shape ``(n_modes,)``."""
-        if duration not in self._known:
-            self._known[duration] = np.array([_bound(mode, duration) for mode in self.modes])
-        return self._known[duration]
+        return np.array([_bound(mode, duration) for mode in self.modes])
 
     def drift_variance(
         self, duration: float, n_logs: int, n_baseline: int | None = None
@@ -67,25 +61,25 @@ class Identifiability:
         """Bound the variance of the drift of each mode, shape ``(n_modes,)``."""
         return self.log_variance(duration) * (1 / n_logs + 1 / (n_baseline or self.n_baseline))
 
+    def limiting_variance(self) -> FloatArray:
+        """Bound the variance of the drifts by unlimited logs, shape ``(n_modes,)``."""
+        return self.drift_variance(constants.LONGEST_LOG, constants.MOST_LOGS, constants.MOST_LOGS)
+
     def restricted_to(self, modes: Sequence[str]) -> Identifiability:
-        """Give the sight through some of the modes."""
+        """Return the identifiability by some of the modes only."""
         rows = [k for k, mode in enumerate(self.modes) if mode.name in modes]
         return replace(
             self,
             modes=tuple(self.modes[k] for k in rows),
             slopes=self.slopes[rows],
             leave_out=self.leave_out[rows],
-            _known={},
         )
 
-    def limiting_variance(self) -> FloatArray:
-        """Bound the variance of the drifts by logs without end, shape ``(n_modes,)``."""
-        return self.drift_variance(LONGEST, MOST_LOGS, MOST_LOGS)
-
     def std(self, parameter: int, noise: FloatArray) -> float:
-        """Tell how well drifts of an exact map estimate one ln parameter, the others by priors.
+        """Return the standard deviation of one ln parameter by an exact map.
 
-        With δ = s_j x_j + S_o x_o + ε and V = C + S_o Λ_o S_oᵀ this is 1 / √(s_jᵀ V⁻¹ s_j).
+        With V = C + S_o Λ_o S_oᵀ, the other parameters known by their priors, this is
+        1 / √(s_jᵀ V⁻¹ s_j); ``noise`` is the diagonal of C, shape ``(n_modes,)``.
         """
         own, others = self.slopes[:, parameter], np.delete(self.slopes, parameter, axis=1)
         cov = np.diag(noise) + (others * np.delete(self.prior, parameter)) @ others.T
@@ -93,7 +87,7 @@ class Identifiability:
         return float(1 / np.sqrt(information)) if information > 0 else np.inf
 
     def precision(self, noise: FloatArray) -> FloatArray:
-        """Give the precision of all ln parameters after logs, Λ⁻¹ + Sᵀ (C + E)⁻¹ S.
+        """Return the posterior precision of all ln parameters, Λ⁻¹ + Sᵀ (C + E)⁻¹ S.
 
         Parameters
         ----------
@@ -113,16 +107,16 @@ class Identifiability:
 def identifiable_parameters(
     machines: Sequence[Identifiability], columns: Sequence[Sequence[int]], prior: FloatArray
 ) -> BoolArray:
-    """Tell which of all parameters endless logs would tell, of one machine or of several together.
+    """Decide which parameters unlimited logs would inform, of one or several machines together.
 
     Parameters
     ----------
     machines : sequence of Identifiability
         One per machine.
     columns : sequence of sequence of int
-        Where the parameters of each stand among all.
+        Indices of the parameters of each machine among all.
     prior : ndarray
-        Variances of all ln parameters in their priors, shape ``(n_parameters,)``.
+        Prior variances of all ln parameters, shape ``(n_parameters,)``.
 
     Returns
     -------
@@ -134,11 +128,11 @@ def identifiable_parameters(
         gained = machine.precision(machine.limiting_variance()) - np.diag(1 / machine.prior)
         precision[np.ix_(places, places)] += gained
     left = np.diag(np.linalg.inv(precision))
-    return np.asarray(1 - left / prior >= INFORMED)
+    return np.asarray(1 - left / prior >= constants.INFORMED)
 
 
 def identifiability_of(stage: Stage) -> Identifiability:
-    """Tell what the tracked modes of a stage show of its health parameters.
+    """Linearise the modal map of a stage at the baseline.
 
     Raises
     ------
@@ -162,8 +156,9 @@ def identifiability_of(stage: Stage) -> Identifiability:
     )
 
 
+@lru_cache(maxsize=1 << 14)
 def _bound(mode: ModeSpec, duration: float) -> float:
     """Bound the variance of ln f in the band that identification uses."""
     f, zeta = mode.frequency_hz, mode.damping_ratio
-    band = (f * (1 - BAND * zeta), f * (1 + BAND * zeta))
+    band = (f * (1 - constants.BAND * zeta), f * (1 + constants.BAND * zeta))
     return float(ambient_bound(f, zeta, mode.snr, duration, band=band)[0, 0])

@@ -575,7 +575,7 @@ def test_plan_as_a_table_follows_power_and_false_alarms() -> None:
 @pytest.mark.parametrize(
     ("stage", "detect", "said"),
     [
-        ("lms-x", "mount_stiffness=0.1", "do not show mount_stiffness"),
+        ("lms-x", "mount_stiffness=0.1", "do not identify mount_stiffness"),
         ("lms-y", "preload=0.1", "there are ['guide_preload', 'mount_stiffness']"),
         ("lms-y", "guide_preload=5", "between 0 and 1"),
         ("lms-z", "guide_preload=0.1", "no stage description"),

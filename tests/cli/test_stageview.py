@@ -30,7 +30,7 @@ def test_the_shipped_descriptions_fit_eighty_columns(
     assert all(out.count(word) >= 4 for word in ("guide_preload", "mount_stiffness"))
     heads = ("map error", "prior beyond", "endless logs", "Sensitivity", "Correlation")
     assert all(head in out for head in heads)
-    assert "+ guide_preload can be told" in out
+    assert "+ guide_preload is identifiable" in out
     assert ("! mount_stiffness is not identifiable" in out) == (name == "lms-x")
 
 

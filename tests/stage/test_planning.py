@@ -137,7 +137,7 @@ def test_what_other_parameters_hide_no_log_shows(tmp_path: Path) -> None:
     found = plan(stage, "mount_stiffness", 0.1, durations=(60.0, 600.0))
     assert [effort.hindrance for effort in found.efforts] == ["parameters"] * 2
     assert found.duration_of_one is None
-    with pytest.raises(BadQuestion, match="do not show guide_preload"):
+    with pytest.raises(BadQuestion, match="do not identify guide_preload"):
         plan(stage, "guide_preload", 0.1)
 
 
@@ -153,7 +153,7 @@ def test_logs_too_short_to_be_identified_are_told(one: Stage) -> None:
 def test_a_parameter_that_no_mode_feels_is_refused(tmp_path: Path, model_std: float) -> None:
     """Sensitivities, what the prior knows and the next step are named."""
     stage = make_stage(tmp_path, (PRELOAD, FOOT), model_std=model_std)
-    with pytest.raises(BadQuestion, match=r"do not show foot.*roll .*Track a mode"):
+    with pytest.raises(BadQuestion, match=r"do not identify foot.*roll .*Track a mode"):
         plan(stage, "foot", 0.2)
     assert plan(stage, "guide_preload", 0.2).efforts[-1].n_logs == 1
 
@@ -161,7 +161,7 @@ def test_a_parameter_that_no_mode_feels_is_refused(tmp_path: Path, model_std: fl
 def test_the_x_stage_does_not_show_its_mount_and_the_y_stage_does() -> None:
     """The shipped descriptions: preload can be planned on both, the mount on Y alone."""
     x, y = load_stage("lms-x"), load_stage("lms-y")
-    with pytest.raises(BadQuestion, match="do not show mount_stiffness"):
+    with pytest.raises(BadQuestion, match="do not identify mount_stiffness"):
         plan(x, "mount_stiffness", 0.3)
     for stage, name in ((x, "guide_preload"), (y, "guide_preload"), (y, "mount_stiffness")):
         assert plan(stage, name, 0.05).duration_of_one is not None
