@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from studies import servers
+from studies.harness import servers
 
 ROOT = Path(__file__).parent.parent
 pytest_plugins = ["pytester", "tests.claims"]

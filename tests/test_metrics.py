@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from studies.metrics import (
+from studies.common.metrics import (
     alpha_lambda,
     clopper_pearson,
     coverage,

@@ -13,11 +13,11 @@ from typing import Any
 
 import pytest
 
-from studies import provenance
-from studies.resume import Trials
+from studies.harness import provenance
+from studies.harness.study import Trials
 
 SCRIPT = '''
-from studies.metrics import place
+from studies.common.metrics import place
 
 SCALE = 2.0
 done = []
@@ -92,7 +92,7 @@ def test_line_cut_off(written: Any, tmp_path: Path) -> None:
     [
         ("SCALE = 2.0", "SCALE = 3.0", False),
         ("number / 3", "number / 4", False),
-        ("from studies.metrics import place\n", "", True),
+        ("from studies.common.metrics import place\n", "", True),
         ("return len(rows)", "return 2 * len(rows)", True),
         ('"""Draw one."""', '"""Draw another."""', True),
         ("# no round number", "", True),

@@ -14,7 +14,7 @@ import pytest
 from sqlalchemy import create_engine, text
 from sqlalchemy.exc import OperationalError
 
-from studies.servers import MARK, Cluster, Postgres, marked, wait_until
+from studies.harness.servers import MARK, Cluster, Postgres, marked, wait_until
 
 
 def tell(url: str, statement: str) -> list[tuple[object, ...]]:
@@ -59,7 +59,7 @@ def test_servers_end_with_who_started_them(
     """Of a starter that is killed no server process is left."""
     needs({"postgres": "postgres", "dask_cluster": "distributed"}[kind])
     script = (
-        f"from studies.servers import {kind}\nwith {kind}():\n    print('up', flush=True)\n"
+        f"from studies.harness.servers import {kind}\nwith {kind}():\n    print('up', flush=True)\n"
         "    input()\n"
     )
     # Children carry the mark in their environment, whatever sessions they make.

@@ -8,9 +8,9 @@ from typing import Any
 
 import pytest
 
-from studies import summary
-from studies.claims import STEPS, Claim, counted, covered
-from studies.record import Study
+from studies.harness import summary
+from studies.harness.claims import STEPS, Claim, counted, covered
+from studies.harness.study import Study
 
 
 @pytest.fixture
@@ -26,7 +26,7 @@ def copied(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def test_page_is_up_to_date() -> None:
-    """The page beside the studies is what `python -m studies.summary` writes."""
+    """The page beside the studies is what `python -m studies.harness.summary` writes."""
     assert summary.PAGE.read_text(encoding="utf-8") == summary.page()
 
 

@@ -2,21 +2,21 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
-from typing import Any
 
 import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from studies.harness.study import Row, read_record
+
 HERE = Path(__file__).parent
 COLOURS = ("#0072b2", "#d55e00", "#009e73")
 MARKERS = ("o", "s", "^")
 
 
-def draw(ax: Axes, repeats: list[dict[str, Any]], kind: str) -> None:
+def draw(ax: Axes, repeats: list[Row], kind: str) -> None:
     """Draw the drift of every dwell with two standard deviations."""
     ax.axhline(0, color="black", lw=0.8)
     for r, colour, marker in zip(repeats, COLOURS, MARKERS, strict=False):
@@ -33,7 +33,7 @@ def draw(ax: Axes, repeats: list[dict[str, Any]], kind: str) -> None:
 
 def main() -> None:
     """Draw the study."""
-    result = json.loads((HERE / "result.json").read_text())
+    result = read_record(__file__)
     style = {"svg.hashsalt": "beam_track", "font.size": 9}
     with matplotlib.rc_context(style):
         figure = Figure(figsize=(9, 4), layout="constrained")

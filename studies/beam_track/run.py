@@ -27,9 +27,9 @@ Data
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -39,7 +39,10 @@ from lmshealth.stage.description import Covariate, Description, Stage
 from lmshealth.tracking.history import History, LogEstimates, build_history
 from lmshealth.tracking.track import track
 from studies.decays.beam import BEAM, REPEATS, one_beam
-from studies.record import Study
+from studies.harness.claims import Claim, span
+from studies.harness.study import Row, Study
+
+STEP = "track"
 
 BEGIN = datetime(2026, 1, 1, tzinfo=UTC)
 SECONDS_A_DWELL = 1.2
@@ -60,7 +63,7 @@ def main() -> None:
     study.conclude({"repeats": repeats, "passed": judge(repeats)})
 
 
-def one_repeat(folder: Path, repeat: int, some: slice = slice(None)) -> dict[str, Any]:
+def one_repeat(folder: Path, repeat: int, some: slice = slice(None)) -> Row:
     """Follow the beam through one ramp and return, or some dwells of it, blind and told."""
     rows = [row for row in one_beam(folder, repeat, some) if row["f_hz"] is not None]
     history, refused = build_history([to_reading(row) for row in rows])
@@ -79,7 +82,7 @@ def one_repeat(folder: Path, repeat: int, some: slice = slice(None)) -> dict[str
     }
 
 
-def to_reading(row: dict[str, Any]) -> LogEstimates:
+def to_reading(row: Row) -> LogEstimates:
     """Take a dwell for a log."""
     std = np.array([row["f_std_hz"] / row["f_hz"], row["zeta_std"] / row["zeta"]])
     when = BEGIN + timedelta(seconds=SECONDS_A_DWELL * row["dwell"])
@@ -105,7 +108,7 @@ def to_reading(row: dict[str, Any]) -> LogEstimates:
     )
 
 
-def follow(history: History, stage: Stage, rows: list[dict[str, Any]]) -> dict[str, Any]:
+def follow(history: History, stage: Stage, rows: list[Row]) -> Row:
     """Track, and compare the way back with the way up."""
     found = track(history, stage)
     level, drift = found.ln_frequency[:, 0], found.drift[:, 0]
@@ -128,7 +131,7 @@ def follow(history: History, stage: Stage, rows: list[dict[str, Any]]) -> dict[s
     }
 
 
-def judge(repeats: list[dict[str, Any]]) -> dict[str, bool]:
+def judge(repeats: list[Row]) -> dict[str, bool]:
     """Say whether the state returns, and whether the tracker says what it does not know."""
     return {
         "the state returns within two standard deviations, blind": all(
@@ -144,6 +147,21 @@ def judge(repeats: list[dict[str, Any]]) -> dict[str, bool]:
             not r["blind"]["consistent"] for r in repeats
         ),
     }
+
+
+def claims(answer: Row) -> Iterator[Claim]:
+    """Claim how far a beam goes, and that it is said to return."""
+    repeats, passed = answer["repeats"], answer["passed"]
+    ways = [(row, way) for row in repeats for way in ("blind", "told")]
+    off = [abs(row[way]["off_in_std"]) for row, way in ways]
+    far = [max(row["blind"]["drift"]) for row in repeats]
+    yield Claim(
+        "a real beam, stiffened and released, returns to its start within, standard deviations",
+        span(off),
+        f"{len(repeats)} repeats, told and not told of the roller",
+        f"2 asked; it went {span(far)} in ln f away",
+        all(passed.values()),
+    )
 
 
 if __name__ == "__main__":

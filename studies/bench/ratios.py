@@ -11,6 +11,8 @@ from typing import Any
 import numpy as np
 from scipy.stats import binom
 
+from studies.harness.study import Row
+
 # Probability at most that a figure which is just held is said to be missed.
 FALSE_ALARM = 0.01
 
@@ -49,7 +51,7 @@ class Figure:
         above = sum(ratio > self.at_most for ratio in self.ratios)
         return bool(binom.sf(above - 1, len(self.ratios), 0.5) < FALSE_ALARM)
 
-    def row(self) -> dict[str, Any]:
+    def row(self) -> Row:
         """Write it down."""
         return {
             "peer": self.peer,

@@ -20,10 +20,13 @@ import os
 import subprocess
 import sys
 import tempfile
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
-from studies.record import Study
+from studies.harness.claims import Claim, number
+from studies.harness.study import Row, Study
+
+STEP = "batch"
 
 ROOT = Path(__file__).parents[2]
 QUICK = "simulation"
@@ -41,8 +44,8 @@ def main() -> None:
             *(("-k", QUICK) if study.quick else ()),
         ]
         done = subprocess.run(command, cwd=ROOT, stdout=sys.stderr, check=False)
-        found: dict[str, Any] = json.loads(figures.read_text(encoding="utf-8"))
-    answer: dict[str, Any] = {
+        found: Row = json.loads(figures.read_text(encoding="utf-8"))
+    answer: Row = {
         "figures": found,
         # Whether the machine had other work.
         "processors": os.cpu_count(),
@@ -51,6 +54,18 @@ def main() -> None:
     }
     answer["passed"]["no bench failed"] = done.returncode == 0
     study.conclude(answer)
+
+
+def claims(answer: Row) -> Iterator[Claim]:
+    """Claim the cost of every step in times of a peer."""
+    for name, row in answer["figures"].items():
+        yield Claim(
+            name,
+            f"{number(row['ratio'])} times",
+            f"{number(row['least'])} to {number(row['largest'])} in {row['turns']} turns",
+            f"{row['peer']}; at most {number(row['at_most'])}",
+            not row["missed"],
+        )
 
 
 if __name__ == "__main__":

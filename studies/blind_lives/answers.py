@@ -4,16 +4,14 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pandas as pd
 
 from lmshealth.stage.constants import INFORMED
 from studies.blind_lives.lives import STAGES
-from studies.commands import call
-
-Row = dict[str, Any]
+from studies.harness.command_line import call
+from studies.harness.study import Row
 
 EPOCHS = 3
 LEVELS = ("q05", "q25", "q50", "q75", "q95")

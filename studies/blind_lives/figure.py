@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
-from typing import Any
 
 import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+
+from studies.harness.study import Row, read_record
 
 HERE = Path(__file__).parent
 INTERVAL, TRUTH = "#0072b2", "#d55e00"
@@ -21,7 +21,7 @@ PANELS = (
 _HORIZON_KM = 20_000.0
 
 
-def draw(record: dict[str, Any]) -> Figure:
+def draw(record: Row) -> Figure:
     """Draw the table of verdicts, and a panel per quantity with a row per machine."""
     matplotlib.rcParams["svg.hashsalt"] = "blind_lives"
     figure = Figure(figsize=(13.0, 4.6), layout="constrained")
@@ -49,7 +49,7 @@ def _confusion(ax: Axes, table: dict[str, dict[str, int]]) -> None:
     ax.set_ylabel("true", fontsize=8)
 
 
-def _intervals(ax: Axes, rows: list[dict[str, Any]], what: str, name: str, label: str) -> None:
+def _intervals(ax: Axes, rows: list[Row], what: str, name: str, label: str) -> None:
     """Draw medians and 90 % intervals, in the order of the truth; past the horizon at its end."""
     scale, top = (1e-3, _HORIZON_KM) if what == "left" else (1.0, np.inf)
     found = []
@@ -73,7 +73,7 @@ def _intervals(ax: Axes, rows: list[dict[str, Any]], what: str, name: str, label
 
 def main() -> None:
     """Write the figure."""
-    record = json.loads((HERE / "result.json").read_text())
+    record = read_record(__file__)
     draw(record).savefig(HERE / "figure.svg", metadata={"Date": None}, bbox_inches="tight")
 
 

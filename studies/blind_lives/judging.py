@@ -4,15 +4,12 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
-from typing import Any
 
 import numpy as np
 
 from studies.blind_lives.lives import SEED, WORDS
-from studies.metrics import clopper_pearson
-from studies.record import LEVEL
-
-Row = dict[str, Any]
+from studies.common.metrics import clopper_pearson
+from studies.harness.study import LEVEL, Row
 
 LEVELS = {0.5: ("q25", "q75"), 0.9: ("q05", "q95")}
 _BINS = (0.0, 0.5, 0.8, 0.95, 0.99, 1.0)

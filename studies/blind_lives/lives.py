@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cache
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -15,8 +14,7 @@ from models.dynamics.stages import stage_named
 from models.lives.degradation import LIVES, Delayed, Law, Steady, Stepped
 from models.lives.simulation import Plan, schedule
 from models.recordings.machines import machine_identity
-
-Row = dict[str, Any]
+from studies.harness.study import Row
 
 SEED = 20261123
 STAGES = ("lms-x", "lms-y")

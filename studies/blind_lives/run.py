@@ -45,9 +45,8 @@ import json
 import shutil
 import tempfile
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import Any
 
 import pandas as pd
 
@@ -55,11 +54,18 @@ from models.lives.simulation import simulate_life
 from studies.blind_lives import judging
 from studies.blind_lives.answers import agrees, analyse
 from studies.blind_lives.lives import SEED, BlindPlan, plan_of, truth_of
-from studies.lives import HEALTHY
-from studies.metrics import clopper_pearson
-from studies.record import LEVEL, Study, options
+from studies.common.lives import HEALTHY
+from studies.common.metrics import clopper_pearson
+from studies.harness.claims import Claim, counted, number
+from studies.harness.study import LEVEL, Row, Study
 
-Row = dict[str, Any]
+STEP = "all of it, from raw logs to the report"
+NAMES = {
+    "guide_preload": "preload",
+    "mount_stiffness": "mount stiffness",
+    "any": "the first of all limits",
+}
+
 
 N_LIVES, IN_ARCHIVE = 100, 10
 RECORD = Path(__file__).with_name("result.json")
@@ -79,9 +85,7 @@ OTHERS = "truth of another life"
 
 def main() -> None:
     """Run the study; ``--quick`` does one small archive without chains, and records nothing."""
-    parser = options(__doc__)
-    parser.add_argument("--again", action="store_true", help="judge the recorded lives anew")
-    study = Study(__file__, __doc__, parser.parse_args())
+    study = Study(__file__, __doc__, again=False)
     if study.quick:
         rows = archive_of(QUICK, quick=True)
     elif study.options.again:
@@ -94,7 +98,7 @@ def main() -> None:
         rows = [row for archive in done for row in archive]
     answer = judged(rows)
     answer["passed"] = verdicts(answer)
-    study.conclude(answer, beside={"rows": rows})
+    study.conclude(answer, details={"rows": rows})
 
 
 def one_archive(first: int, n: int) -> list[Row]:
@@ -135,7 +139,7 @@ def archive_of(
         ]
 
 
-def judged(rows: Sequence[Row]) -> dict[str, Any]:
+def judged(rows: Sequence[Row]) -> Row:
     """Judge what was said of all machines, and the same beside the truth of others."""
     clear = [row for row in rows if row["truth"]["clear"]]
     others = judging.of_others(rows)
@@ -195,7 +199,7 @@ def _refused(rows: Iterable[Row]) -> dict[str, int]:
     return {"logs": sum(row["logs"] for row in rows), **dict(sorted(found.items()))}
 
 
-def verdicts(answer: dict[str, Any]) -> dict[str, bool]:
+def verdicts(answer: Row) -> dict[str, bool]:
     """Say what was asked and whether it is so; controls only where there are lives enough."""
     page, sure = answer["front_page"], answer["sureness"]
     checks = {
@@ -220,6 +224,75 @@ def verdicts(answer: dict[str, Any]) -> dict[str, bool]:
 def _held(names: dict[str, dict[str, Row]], way: str) -> list[bool]:
     return [row["holds"] for levels in names.values() for key, row in levels.items()
             if key.endswith(way) and key.endswith("shrunk") == bool(way)]  # fmt: skip
+
+
+def claims(answer: Row) -> Iterator[Claim]:
+    """Claim verdicts, how sure they are, what sound machines are called, and coverages."""
+    yield from _verdicts(answer)
+    for name, row in answer["sound_kinds"].items():
+        fine = answer["passed"][f"at most 1 in 100 of sound kinds: {name}"]
+        yield counted(
+            f"machines of sound kinds: {name}", row["hits"], row["n"], "1 in 100 asked", met=fine
+        )
+    for what, of in (("health", ""), ("left", "what is left until ")):
+        for name, found in answer[what].items():
+            yield from _covered(of + NAMES.get(name, name), found, answer[OTHERS][what][name])
+    found = answer["left, ending"]["any"]["90"], answer["left, ending"]["any"]["90 shrunk"]
+    yield counted(
+        "intervals of 90 % that hold the truth: what is left of those that reach a limit",
+        found[0]["hits"],
+        found[0]["n"],
+        f"{found[1]['hits']} shrunk to a third",
+        met=found[0]["holds"],
+    )
+    page = answer["front_page"]
+    yield counted(
+        "rows of the front page that say what the table of verdicts says",
+        page["hits"],
+        page["n"],
+        met=page["hits"] == page["n"],
+    )
+
+
+def _verdicts(answer: Row) -> Iterator[Claim]:
+    found, sure = answer["verdicts"], answer["sureness"]["all"]
+    wrong = found[OTHERS]["right"]
+    for name in ("all", "clear of borders"):
+        row = found[name]["right"]
+        yield counted(
+            f"verdicts of blind lives that are right, {name}",
+            row["hits"],
+            row["n"],
+            f"{wrong['hits']} of {wrong['n']} with the {OTHERS}" if name == "all" else "",
+        )
+    yield Claim(
+        "verdicts with a probability that are right, beside what the probabilities promise",
+        f"{sure['right']} of {sure['n']}",
+        f"{number(sure['z'])} standard deviations from it",
+        f"{number(sure['promised'])} promised",
+        met=sure["holds"],
+    )
+    own, base = sure["brier"]
+    yield Claim(
+        "Brier score of the verdicts' probabilities",
+        number(own),
+        "",
+        f"{number(base)} of who tells the share of rights of all",
+        met=own <= base,
+    )
+
+
+def _covered(name: str, found: Row, others: Row) -> Iterator[Claim]:
+    for level in ("90", "50"):
+        row, narrow, mixed = found[level], found[f"{level} shrunk"], others[level]
+        if row["n"]:
+            yield counted(
+                f"intervals of {level} % that hold the truth: {name}",
+                row["hits"],
+                row["n"],
+                f"{narrow['hits']} shrunk to a third, {mixed['hits']} with the {OTHERS}",
+                met=row["holds"],
+            )
 
 
 if __name__ == "__main__":

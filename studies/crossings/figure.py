@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
-from typing import Any
 
 import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+
+from studies.harness.study import Row, read_record
 
 HERE = Path(__file__).parent
 BLUE, ORANGE, GREEN, PINK, GREY = "#0072b2", "#d55e00", "#009e73", "#cc79a7", "#888888"
@@ -17,7 +17,7 @@ COLOURS = (BLUE, ORANGE, GREEN, PINK, "#e69f00", "#56b4e9", "#000000")
 MARKERS = "osD^vPX"
 
 
-def draw_life(ax: Axes, name: str, life: dict[str, Any]) -> None:
+def draw_life(ax: Axes, name: str, life: Row) -> None:
     """Draw the estimates of a life, coloured by their labels."""
     clock = life["clock"]
     for column in np.array(life["true_ln_f"]).T:
@@ -38,7 +38,7 @@ def draw_life(ax: Axes, name: str, life: dict[str, Any]) -> None:
     ax.legend(fontsize=7)
 
 
-def draw_swaps(ax: Axes, result: dict[str, Any]) -> None:
+def draw_swaps(ax: Axes, result: Row) -> None:
     """Draw the share of lives swapped silently, with its interval."""
     kinds = result["kinds"]
     for key, colour, marker, shift, label in (
@@ -63,7 +63,7 @@ def draw_swaps(ax: Axes, result: dict[str, Any]) -> None:
     ax.grid(alpha=0.25, axis="x")
 
 
-def draw_recovery(ax: Axes, kinds: dict[str, dict[str, Any]]) -> None:
+def draw_recovery(ax: Axes, kinds: dict[str, Row]) -> None:
     """Draw the share labelled over logs since the modes are clear of each other."""
     for (name, row), colour, marker in zip(kinds.items(), COLOURS, MARKERS, strict=True):
         if name != "well apart":
@@ -76,7 +76,7 @@ def draw_recovery(ax: Axes, kinds: dict[str, dict[str, Any]]) -> None:
     ax.grid(alpha=0.25)
 
 
-def draw_shares(ax: Axes, kinds: dict[str, dict[str, Any]]) -> None:
+def draw_shares(ax: Axes, kinds: dict[str, Row]) -> None:
     """Draw the shares labelled before and after."""
     for key, colour, shift, label in (
         ("labelled_before", GREEN, -0.18, "before"),
@@ -99,7 +99,7 @@ def draw_shares(ax: Axes, kinds: dict[str, dict[str, Any]]) -> None:
 def main() -> None:
     """Draw six panels."""
     matplotlib.rcParams["svg.hashsalt"] = "crossings"
-    result = json.loads((HERE / "result.json").read_text())
+    result = read_record(__file__)
     figure = Figure(figsize=(13.0, 7.5), layout="constrained")
     axes = figure.subplots(2, 3)
     for ax, (name, life) in zip(axes[0], result["examples"].items(), strict=True):

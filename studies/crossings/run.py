@@ -29,7 +29,7 @@ Run time
 from __future__ import annotations
 
 from collections import Counter
-from typing import Any
+from collections.abc import Iterator
 from unittest.mock import patch
 
 import numpy as np
@@ -37,10 +37,13 @@ from numpy.typing import NDArray
 
 from lmshealth.tracking.association import identities
 from lmshealth.tracking.association.associate import Association, associate
+from studies.common.metrics import clopper_pearson
 from studies.crossings.judging import judge, nearest, recovered
 from studies.crossings.lives import KINDS, Kind, Life, make_life
-from studies.metrics import clopper_pearson
-from studies.record import Study
+from studies.harness.claims import Claim, counted, percents
+from studies.harness.study import Row, Study
+
+STEP = "track"
 
 SEED = 20261124
 N_LIVES = 200
@@ -52,14 +55,14 @@ def main() -> None:
     study = Study(__file__, __doc__)
     n = 2 if study.quick else N_LIVES
     found = study.trials.collect(of_kind, [(name, n) for name in KINDS])
-    answer: dict[str, Any] = {
+    answer: Row = {
         "lives": n,
         "kinds": dict(zip(KINDS, found, strict=True)),
         "best_guess_where_nothing_tells": study.trials.once(guessed, n),
     }
     answer["passed"] = verdicts(answer)
     examples = {} if study.quick else {name: example(name) for name in EXAMPLES}
-    study.conclude(answer, beside={"examples": examples}, quick_may_fail=True)
+    study.conclude(answer, details={"examples": examples}, quick_may_fail=True)
 
 
 def life_of(name: str, seed: int) -> Life:
@@ -74,12 +77,12 @@ def labels_of(life: Life) -> Association:
     return associate(life.epochs, life.clock, offsets=np.zeros((n, 0)), prior_std=np.zeros(0))
 
 
-def of_kind(name: str, n: int) -> dict[str, Any]:
+def of_kind(name: str, n: int) -> Row:
     """Count what becomes of lives of the kind of a name."""
     return followed(name, KINDS[name], n)
 
 
-def followed(name: str, kind: Kind, n: int) -> dict[str, Any]:
+def followed(name: str, kind: Kind, n: int) -> Row:
     """Count what becomes of lives of one kind."""
     count: Counter[str] = Counter()
     control: Counter[str] = Counter()
@@ -115,13 +118,13 @@ def average(share: NDArray[np.float64]) -> list[float | None]:
     ]
 
 
-def swaps(count: Counter[str]) -> dict[str, Any]:
+def swaps(count: Counter[str]) -> Row:
     """Put the share of swapped lives beside its 95 % interval."""
     low, high = clopper_pearson(count["lives_swapped"], count["lives"])
     return {"hits": count["lives_swapped"], "n": count["lives"], "low": low, "high": high}
 
 
-def guessed(n: int) -> dict[str, Any]:
+def guessed(n: int) -> Row:
     """Count silent swaps where nothing tells and the best guess is given."""
     count: Counter[str] = Counter()
     with patch.object(identities, "SURE", 0.5):
@@ -131,7 +134,7 @@ def guessed(n: int) -> dict[str, Any]:
     return swaps(count)
 
 
-def verdicts(answer: dict[str, Any]) -> dict[str, bool]:
+def verdicts(answer: Row) -> dict[str, bool]:
     """Say what was asked and whether it is so."""
     kinds = answer["kinds"]
     turning = [row for name, row in kinds.items() if name not in ("merging", "well apart")]
@@ -154,7 +157,7 @@ def verdicts(answer: dict[str, Any]) -> dict[str, bool]:
     return {name: bool(passed) for name, passed in checks.items()}
 
 
-def example(name: str) -> dict[str, Any]:
+def example(name: str) -> Row:
     """Return estimates and labels of the first life."""
     life = life_of(name, 0)
     found = labels_of(life)
@@ -165,6 +168,39 @@ def example(name: str) -> dict[str, Any]:
         "true_ln_f": life.ln_f.round(5).tolist(),
         "labels": [list(labels) for labels in found.assigned],
     }
+
+
+def claims(answer: Row) -> Iterator[Claim]:
+    """Claim that nothing is swapped silently, and what is said to be ambiguous."""
+    kinds, passed = answer["kinds"], answer["passed"]
+    swapped = [row["lives_swapped"] for row in kinds.values()]
+    nearest = [
+        row["nearest_lives_swapped"]
+        for name, row in kinds.items()
+        if name not in ("merging", "well apart")
+    ]
+    yield counted(
+        f"lives swapped silently, {len(kinds)} kinds",
+        sum(row["hits"] for row in swapped),
+        sum(row["n"] for row in swapped),
+        f"the nearest frequency swaps {sum(row['hits'] for row in nearest)} of "
+        f"{sum(row['n'] for row in nearest)} where modes cross or turn",
+        met=passed["no life is swapped silently"],
+    )
+    turning = [row for name, row in kinds.items() if name not in ("merging", "well apart")]
+    yield Claim(
+        "estimates labelled after modes have crossed or turned",
+        percents(row["labelled_after"] for row in turning),
+        met=passed["most labels are recovered"],
+    )
+    merging, guess = kinds["merging"], answer["best_guess_where_nothing_tells"]
+    yield Claim(
+        "the same where nothing tells modes apart",
+        percents([merging["labelled_after"]]),
+        "",
+        f"a best guess swaps {guess['hits']} of {guess['n']} lives",
+        passed["what nothing tells is ambiguous"],
+    )
 
 
 if __name__ == "__main__":

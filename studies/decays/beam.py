@@ -5,7 +5,6 @@ from __future__ import annotations
 import shutil
 import tempfile
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from scipy import ndimage
@@ -15,6 +14,7 @@ from lmshealth.io.column_map import load_columns
 from lmshealth.io.log import Log
 from lmshealth.signal.segments import Segment
 from lmshealth.stage.description import Description, ModeSpec, Stage
+from studies.harness.study import Row
 
 REPEATS = 3
 # Volts of the roller and Hz of the beam, and how far an estimate may be off.
@@ -72,7 +72,7 @@ def find_dwells(log: Log) -> list[tuple[Segment, float]]:
     return found
 
 
-def one_beam(folder: Path, repeat: int, some: slice = slice(None)) -> list[dict[str, Any]]:
+def one_beam(folder: Path, repeat: int, some: slice = slice(None)) -> list[Row]:
     """Identify the beam in every dwell of one repeat, or in some."""
     log = read_beam(folder, repeat)
     stage = Stage(Description(name="beam", mode=(BEAM,)), None, "0" * 64)
@@ -80,7 +80,7 @@ def one_beam(folder: Path, repeat: int, some: slice = slice(None)) -> list[dict[
     for k, (dwell, volts) in list(enumerate(find_dwells(log)))[some]:
         found = identify_decays(log, stage, segments=[dwell], channels=("acc_low", "acc_high"))
         reference = TABLE[min(TABLE, key=lambda v: abs(v - volts))]
-        row: dict[str, Any] = {
+        row: Row = {
             "repeat": repeat,
             "dwell": k,
             "roller_v": round(volts, 4),
@@ -103,7 +103,7 @@ def one_beam(folder: Path, repeat: int, some: slice = slice(None)) -> list[dict[
     return rows
 
 
-def judge_beam(beam: list[dict[str, Any]]) -> dict[str, bool]:
+def judge_beam(beam: list[Row]) -> dict[str, bool]:
     """Say whether every dwell is right or refused, and the first one refused."""
     seen = [row for row in beam if row["f_hz"] is not None]
     places: dict[tuple[int, float], list[float]] = {}

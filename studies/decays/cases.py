@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from lmshealth.io.log import Channel, Log, Metadata
-from studies.cramer_rao import Recording, Vibration, decay_bound
+from studies.common.cramer_rao import Recording, Vibration, decay_bound
 
 RATE = 400.0
 

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
-from typing import Any
 
 import matplotlib
 import numpy as np
@@ -12,13 +10,15 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from scipy.stats import norm
 
+from studies.harness.study import Row, read_record
+
 HERE = Path(__file__).parent
 BLUE, ORANGE, GREEN, PINK, BLACK = "#0072b2", "#d55e00", "#009e73", "#cc79a7", "#000000"
 QUANTITIES = (("f", BLUE, "o", -0.15), ("zeta", ORANGE, "s", 0.15))
 SYMBOLS = {"f": "frequency", "zeta": "damping"}
 
 
-def rows_of(cases: dict[str, Any]) -> list[tuple[str, dict[str, Any]]]:
+def rows_of(cases: Row) -> list[tuple[str, Row]]:
     """List every mode of every case with a name."""
     rows = []
     for name, case in cases.items():
@@ -28,7 +28,7 @@ def rows_of(cases: dict[str, Any]) -> list[tuple[str, dict[str, Any]]]:
     return rows
 
 
-def draw_coverage(ax: Axes, rows: list[tuple[str, dict[str, Any]]]) -> None:
+def draw_coverage(ax: Axes, rows: list[tuple[str, Row]]) -> None:
     """Draw coverages with their intervals, and those of the controls."""
     ax.axvline(95, color=BLACK, lw=1)
     for y, (_, mode) in enumerate(rows):
@@ -57,7 +57,7 @@ def draw_coverage(ax: Axes, rows: list[tuple[str, dict[str, Any]]]) -> None:
     ax.grid(alpha=0.25, axis="x")
 
 
-def draw_scatter(ax: Axes, rows: list[tuple[str, dict[str, Any]]]) -> None:
+def draw_scatter(ax: Axes, rows: list[tuple[str, Row]]) -> None:
     """Draw scatter over the bound."""
     ax.axvline(1, color=BLACK, lw=1)
     for y, (_, mode) in enumerate(rows):
@@ -73,7 +73,7 @@ def draw_scatter(ax: Axes, rows: list[tuple[str, dict[str, Any]]]) -> None:
     ax.grid(alpha=0.25, axis="x")
 
 
-def draw_machines(ax: Axes, machines: dict[str, Any]) -> None:
+def draw_machines(ax: Axes, machines: Row) -> None:
     """Draw deviations over standard deviations against those of a normal distribution."""
     seen = [row for row in machines["rows"] if row["f_hz"] is not None]
     place = norm.ppf((np.arange(len(seen)) + 0.5) / len(seen))
@@ -91,7 +91,7 @@ def draw_machines(ax: Axes, machines: dict[str, Any]) -> None:
     ax.grid(alpha=0.25)
 
 
-def draw_beam(ax: Axes, beam: list[dict[str, Any]]) -> None:
+def draw_beam(ax: Axes, beam: list[Row]) -> None:
     """Draw each dwell's deviation from the table."""
     ax.axhspan(-0.15, 0.15, color=GREEN, alpha=0.12, label="allowed")
     ax.axhline(0, color=BLACK, lw=1)
@@ -119,7 +119,7 @@ def draw_beam(ax: Axes, beam: list[dict[str, Any]]) -> None:
 def main() -> None:
     """Draw four panels."""
     matplotlib.rcParams["svg.hashsalt"] = "decays"
-    result = json.loads((HERE / "result.json").read_text())
+    result = read_record(__file__)
     rows = rows_of(result["cases"])
     figure = Figure(figsize=(12.0, 9.0), layout="constrained")
     axes = figure.subplots(2, 2, width_ratios=[1.15, 1], height_ratios=[1.25, 1])

@@ -38,8 +38,8 @@ from __future__ import annotations
 
 import os
 import zlib
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from scipy import optimize
@@ -47,12 +47,14 @@ from scipy import optimize
 from lmshealth import identify_decays
 from lmshealth.signal.segments import Segment
 from lmshealth.stage.description import Description, ModeSpec, Stage
+from studies.common.metrics import clopper_pearson
 from studies.decays.beam import REPEATS, judge_beam, one_beam
 from studies.decays.cases import CASES, QUIET, RATE, Case, simulate, to_log
 from studies.decays.stops import one_machine
-from studies.metrics import clopper_pearson
-from studies.record import Study
-from studies.resume import Trials
+from studies.harness.claims import Claim, percents, span
+from studies.harness.study import Row, Study, Trials
+
+STEP = "identify, after stops"
 
 LEVEL, Z = 0.999, 1.959963984540054
 NOMINAL = 0.95
@@ -75,7 +77,7 @@ def main() -> None:
     n_seeds = QUICK_SEEDS if quick else SEEDS
     cases = CASES[1:2] if quick else CASES
     data = os.environ.get("LMSHEALTH_DATA")
-    answer: dict[str, Any] = {
+    answer: Row = {
         "n_seeds": n_seeds,
         "cases": {case.name: run_case(case, n_seeds, trials) for case in cases},
         "quiet": {
@@ -95,7 +97,7 @@ def main() -> None:
         raise SystemExit(f"met after all: {met}")
 
 
-def judge(answer: dict[str, Any], *, quick: bool) -> dict[str, Any]:
+def judge(answer: Row, *, quick: bool) -> Row:
     """Say what holds of the intervals, of their negative controls, of machines and beam."""
     modes = [mode for case in answer["cases"].values() for mode in case["modes"]]
     parts = [mode[quantity] for mode in modes for quantity in ("f", "zeta")]
@@ -124,14 +126,14 @@ def judge(answer: dict[str, Any], *, quick: bool) -> dict[str, Any]:
     }
 
 
-def run_case(case: Case, n_seeds: int, trials: Trials) -> dict[str, Any]:
+def run_case(case: Case, n_seeds: int, trials: Trials) -> Row:
     """Identify logs of a case; count what intervals cover, set scatter against the bound."""
     rows = trials.collect(one_named, [(case.name, seed) for seed in range(n_seeds)])
     bound, modes = case.bound(), []
     for i, (f, zeta) in enumerate(case.modes):
         kept = [row[f"mode {f}"] for row in rows if not isinstance(row[f"mode {f}"], str)]
         reasons = [row[f"mode {f}"] for row in rows if isinstance(row[f"mode {f}"], str)]
-        mode: dict[str, Any] = {
+        mode: Row = {
             "f_hz": f,
             "zeta": zeta,
             "refused": {reason: reasons.count(reason) for reason in sorted(set(reasons))},
@@ -157,13 +159,13 @@ def run_case(case: Case, n_seeds: int, trials: Trials) -> dict[str, Any]:
     }
 
 
-def one_named(name: str, seed: int) -> dict[str, Any]:
+def one_named(name: str, seed: int) -> Row:
     """Identify one log of the case of a name."""
     (case,) = (case for case in (*CASES, *QUIET) if case.name == name)
     return one_log(case, seed)
 
 
-def one_log(case: Case, seed: int) -> dict[str, Any]:
+def one_log(case: Case, seed: int) -> Row:
     """Identify one log; return estimates, standard deviations or the reason of each mode."""
     rng = np.random.default_rng([seed, zlib.crc32(case.name.encode())])
     x = simulate(case, rng)
@@ -178,7 +180,7 @@ def one_log(case: Case, seed: int) -> dict[str, Any]:
     found = identify_decays(log, Stage(description, None, "0" * 64), segments=decays)
     n = len(found.names)
     std = np.sqrt(np.diag(found.cov))
-    row: dict[str, Any] = {refusal.mode: refusal.reason for refusal in found.refused}
+    row: Row = {refusal.mode: refusal.reason for refusal in found.refused}
     for i, name in enumerate(found.names):
         row[name] = [found.ln_frequency[i], found.ln_damping[i], std[i], std[n + i]]
     if len(case.modes) == 1:
@@ -203,7 +205,7 @@ def least_squares(x: np.ndarray, f: float, zeta: float) -> list[float]:
     return [*fit.x.tolist(), *std.tolist()]
 
 
-def judge_machines(n_seeds: int, names: tuple[str, ...]) -> dict[str, Any]:
+def judge_machines(n_seeds: int, names: tuple[str, ...]) -> Row:
     """Stop simulated stages; count what the intervals of all their modes cover."""
     rows = [row for name in names for k in range(n_seeds)
             for row in one_machine(name, k)]  # fmt: skip
@@ -220,7 +222,7 @@ def judge_machines(n_seeds: int, names: tuple[str, ...]) -> dict[str, Any]:
     }
 
 
-def coverage(off: np.ndarray, width: float = 1.0) -> dict[str, Any]:
+def coverage(off: np.ndarray, width: float = 1.0) -> Row:
     """Count how many intervals hold the truth, from deviations and standard deviations."""
     hits, n = int(np.sum(np.abs(off[:, 0]) < Z * width * off[:, 1])), len(off)
     low, high = clopper_pearson(hits, n, LEVEL)
@@ -230,6 +232,53 @@ def coverage(off: np.ndarray, width: float = 1.0) -> dict[str, Any]:
         "interval": [low, high],
         "holds": bool(low <= NOMINAL <= high),
     }
+
+
+def claims(answer: Row) -> Iterator[Claim]:
+    """Claim coverages, scatter beside the bound, machines, and a real beam."""
+    parts = [
+        mode[quantity]
+        for case in answer["cases"].values()
+        for mode in case["modes"]
+        for quantity in ("f", "zeta")
+    ]
+    held = sum(part["coverage"]["holds"] for part in parts)
+    squares = [part["least_squares"]["share"] for part in parts if "least_squares" in part]
+    shares = [part["coverage"]["share"] for part in parts]
+    yield Claim(
+        "cases whose 95 % intervals of f and ζ cover",
+        f"{held} of {len(parts)} ({percents(shares)})",
+        f"99.9 %, {answer['n_seeds']} logs each",
+        f"least squares cover {percents(squares)}",
+        held == len(parts),
+    )
+    yield Claim(
+        "root mean square error over the Cramér-Rao bound",
+        span(part["rmse_over_bound"] for part in parts),
+    )
+    for width, told in (("narrow", "1.5 times as narrow"), ("wide", "1.5 times as wide")):
+        found = answer["controls_found_out"][width]
+        caught, of = found.split(" of ")
+        yield Claim(
+            f"cases in which intervals {told} are found out (control)", found, met=caught == of
+        )
+    machines = answer["machines"]
+    yield Claim(
+        "95 % intervals of f and ζ of stopped machines hold the truth",
+        percents(machines[q]["share"] for q in ("f", "zeta")),
+        f"{percents(machines['f']['interval'])} (f, 99.9 %)",
+        f"{machines['n_taken_for_another']} of {machines['n_modes']} modes taken for another",
+        all(machines[q]["holds"] for q in ("f", "zeta")),
+    )
+    seen = [row for row in answer["beam"] if row["f_hz"] is not None]
+    off = max(abs(row["f_hz"] - row["reference_hz"]) for row in seen)
+    yield Claim(
+        "a real beam: dwells told, and how far they are off at most",
+        f"{len(seen)} of {len(answer['beam'])}, {off:.2f} Hz",
+        "",
+        "0.15 Hz asked",
+        off < 0.15,
+    )
 
 
 if __name__ == "__main__":

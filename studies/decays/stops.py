@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import tempfile
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -12,11 +11,12 @@ from lmshealth import identify_decays, load_stage, read_log
 from models.dynamics.plant import Mode, closed_loop_modes
 from models.dynamics.stages import STAGES
 from models.recordings.velocities import Experiment, drive_velocities
+from studies.harness.study import Row
 
 VELOCITIES = (0.1, 0.4)
 
 
-def one_machine(name: str, seed: int) -> list[dict[str, Any]]:
+def one_machine(name: str, seed: int) -> list[Row]:
     """Identify the modes after strokes at two velocities; one row per tracked mode and log."""
     truth = {mode.name: mode for mode in closed_loop_modes(STAGES[name])}
     stage = load_stage(name)
@@ -28,7 +28,7 @@ def one_machine(name: str, seed: int) -> list[dict[str, Any]]:
             found = identify_decays(read_log(path), stage)
             std = np.sqrt(np.diag(found.cov)).reshape(2, -1)
             for mode in stage.modes:
-                row: dict[str, Any] = {"stage": name, "seed": seed, "log": path.stem}
+                row: Row = {"stage": name, "seed": seed, "log": path.stem}
                 row |= {"mode": mode.name, "f_hz": None, "refused": ""}
                 if mode.name not in found.names:
                     row["refused"] = next(r.reason for r in found.refused if r.mode == mode.name)

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import matplotlib
 import numpy as np
 from matplotlib.figure import Figure
+
+from studies.harness.study import read_record
 
 HERE = Path(__file__).parent
 INTERVAL, TRUTH = "#0072b2", "#d55e00"
@@ -21,7 +22,7 @@ PANELS = (
 def main() -> None:
     """Draw one panel per quantity, one row per life, in the order of the truth."""
     matplotlib.rcParams["svg.hashsalt"] = "demo_life"
-    lives = json.loads((HERE / "result.json").read_text())["lives"]
+    lives = read_record(__file__)["lives"]
     figure = Figure(figsize=(10.5, 1.6 + 0.22 * len(lives)), layout="constrained")
     for ax, (name, middle, label) in zip(figure.subplots(1, 3), PANELS, strict=True):
         rows = sorted((life[name] for life in lives), key=lambda row: row["truth"])

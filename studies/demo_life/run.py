@@ -19,15 +19,19 @@ import os
 import subprocess
 import tempfile
 import time
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pandas as pd
 
-from studies.commands import call
-from studies.metrics import clopper_pearson
-from studies.record import Study, options
+from studies.common.metrics import clopper_pearson
+from studies.harness.claims import Claim, Older, counted, percents
+from studies.harness.command_line import call
+from studies.harness.study import Row, Study
+
+STEP = "infer"
+OLDER = {"result": Older("b609ecec2899", "laws were weighed")}
 
 HERE = Path(__file__).parent
 PARAMETERS = ("guide_preload", "mount_stiffness")
@@ -37,9 +41,7 @@ PRIOR_WIDTH = float(np.diff(np.exp(0.3 * np.array([-1.6449, 1.6449])))[0])
 
 def main() -> None:
     """Run the study; ``--quick`` does one life of short logs, without chains, records nothing."""
-    parser = options(__doc__)
-    parser.add_argument("--seeds", type=int, default=10)
-    study = Study(__file__, __doc__, parser.parse_args())
+    study = Study(__file__, __doc__, seeds=10)
     seeds = [1] if study.quick else list(range(1, study.options.seeds + 1))
     if study.quick:
         lives = [one_life(seed, 8, 5, 1, quick=True) for seed in seeds]
@@ -51,12 +53,12 @@ def main() -> None:
         answer["make_demo"] = time_demo()
     if study.quick:
         answer["lives"] = lives
-    study.conclude(answer, beside={"lives": lives})
+    study.conclude(answer, details={"lives": lives})
 
 
 def one_life(
     seed: int, n_logs: int = 40, seconds: int = 20, epochs: int = 40, *, quick: bool = False
-) -> dict[str, Any]:
+) -> Row:
     """Simulate and analyse one life; compare with its truth."""
     with tempfile.TemporaryDirectory() as folder:
         logs, out = Path(folder) / "logs", Path(folder) / "out"
@@ -73,7 +75,7 @@ def one_life(
         health = pd.read_csv(out / "health.csv")
         prognosis = pd.read_csv(out / "prognosis.csv").set_index("parameter")
         verdict = pd.read_csv(out / "verdict.csv").iloc[0]
-    row: dict[str, Any] = {
+    row: Row = {
         "seed": seed,
         "verdict": str(verdict["verdict"]),
         "simulate_s": round(simulated - begin, 1),
@@ -105,9 +107,9 @@ def time_demo() -> dict[str, float]:
     }
 
 
-def summarise(lives: list[dict[str, Any]]) -> dict[str, Any]:
+def summarise(lives: list[Row]) -> Row:
     """Count how often the intervals hold the truth."""
-    answer: dict[str, Any] = {"n_lives": len(lives)}
+    answer: Row = {"n_lives": len(lives)}
     for name in PARAMETERS:
         answer[name] = coverage([life[name] for life in lives], "median")
         widths = [life[name]["q95"] - life[name]["q05"] for life in lives]
@@ -124,7 +126,7 @@ def summarise(lives: list[dict[str, Any]]) -> dict[str, Any]:
     return answer
 
 
-def coverage(rows: list[dict[str, float]], middle: str) -> dict[str, Any]:
+def coverage(rows: list[dict[str, float]], middle: str) -> Row:
     """Count intervals that hold the truth, and those shrunk to a third that do."""
     inside = sum(row["q05"] <= row["truth"] <= row["q95"] for row in rows)
     shrunk = sum(
@@ -139,6 +141,22 @@ def coverage(rows: list[dict[str, float]], middle: str) -> dict[str, Any]:
         "inside_50": sum(row["q25"] <= row["truth"] <= row["q75"] for row in rows),
         "control_inside_when_shrunk_to_a_third": shrunk,
     }
+
+
+def claims(answer: Row) -> Iterator[Claim]:
+    """Claim that intervals hold the truth of the demo's kind of life."""
+    for name in ("guide_preload", "mount_stiffness", "remaining_km"):
+        row = answer[name]
+        yield counted(
+            f"lives whose true {name} lies inside its 90 % interval",
+            row["inside_90"],
+            answer["n_lives"],
+            f"{row['control_inside_when_shrunk_to_a_third']} inside a third of it",
+        )
+    widest = [
+        answer[name]["widest_interval_over_prior"] for name in ("guide_preload", "mount_stiffness")
+    ]
+    yield Claim("widest interval of preload and mount, over the prior's", percents(widest))
 
 
 if __name__ == "__main__":

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from textwrap import wrap
 from typing import Any
@@ -15,6 +14,8 @@ from matplotlib.figure import Figure
 from matplotlib.patheffects import withStroke
 from matplotlib.ticker import ScalarFormatter
 
+from studies.harness.study import Row, read_record
+
 HERE = Path(__file__).parent
 COLOURS = {"roll": "#0072b2", "pitch": "#d55e00", "yaw": "#009e73"}
 _LINES = (0.2, 0.3, 0.5, 1, 2, 3, 5)  # per cent
@@ -26,7 +27,7 @@ _ARMS = {
 }
 
 
-def draw_map(ax: Axes, result: dict[str, Any], one: dict[str, Any]) -> Any:
+def draw_map(ax: Axes, result: Row, one: Row) -> Any:
     """Draw one map with labelled lines, and the shares of calls at the points that were checked."""
     loss = 100 * np.array(one["smallest_loss"], dtype=float)
     x, y = np.array(result["durations_s"]), np.array(result["logs"])
@@ -53,7 +54,7 @@ def draw_map(ax: Axes, result: dict[str, Any], one: dict[str, Any]) -> Any:
     return mesh
 
 
-def draw_checks(ax: Axes, result: dict[str, Any]) -> None:
+def draw_checks(ax: Axes, result: Row) -> None:
     """Draw how often the planned losses are called, and none."""
     rows = result["checks"]
     arms = list(_ARMS)
@@ -84,7 +85,7 @@ def draw_checks(ax: Axes, result: dict[str, Any]) -> None:
     ax.grid(axis="x", alpha=0.25)
 
 
-def draw_law(ax: Axes, result: dict[str, Any]) -> None:
+def draw_law(ax: Axes, result: Row) -> None:
     """Draw the standard deviation of ln f of one log: bound, law, and what was identified."""
     law = result["law"]
     for mode, colour in COLOURS.items():
@@ -112,7 +113,7 @@ def draw_law(ax: Axes, result: dict[str, Any]) -> None:
 def main() -> None:
     """Draw."""
     matplotlib.rcParams |= {"svg.hashsalt": "lmshealth", "font.size": 8}
-    result = json.loads((HERE / "result.json").read_text(encoding="utf-8"))
+    result = read_record(__file__)
     figure = Figure(figsize=(12, 9), layout="constrained")
     top, bottom = figure.subfigures(2, 1, height_ratios=(1, 1.15))
     axes = top.subplots(1, 3)

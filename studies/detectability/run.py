@@ -29,8 +29,8 @@ Run time
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
-from typing import Any
 
 import msgspec
 import numpy as np
@@ -43,12 +43,14 @@ from lmshealth.stage.identifiability import identifiability_of
 from lmshealth.stage.planning import plan
 from models.dynamics.plant import GUIDE_MODES
 from models.lives.simulation import Plan
-from studies.cramer_rao import long_record_law
-from studies.lives import Array, life_of, rng_of
-from studies.metrics import clopper_pearson
-from studies.raw_lives import identified
-from studies.record import LEVEL, Study, judge_coverage
-from studies.resume import Trials
+from studies.common.cramer_rao import long_record_law
+from studies.common.lives import Array, identified, life_of, rng_of
+from studies.common.metrics import clopper_pearson
+from studies.harness.claims import Claim, covered, percents, span
+from studies.harness.study import LEVEL, Row, Study, Trials, judge_coverage
+
+STEP = "plan"
+SHORT, LONG = (1, 20.0), (20, 300.0)  # logs, and seconds of each
 
 POWER, FALSE_ALARM = 0.95, 0.01
 ASKED = (("lms-y", "guide_preload"), ("lms-y", "mount_stiffness"), ("lms-x", "guide_preload"))
@@ -59,7 +61,6 @@ COUNTS = (1, 2, 3, 5, 8, 12, 20, 30, 50, 100)
 CHECKED = ((20.0, 1), (60.0, 5), (300.0, 20))
 RAW_DURATIONS, RAW_LOGS = (10.0, 20.0, 60.0, 120.0), 16
 SEED = 31
-Row = dict[str, Any]
 
 
 def main() -> None:
@@ -244,6 +245,46 @@ def verdicts(answer: Row) -> dict[str, bool]:
             if row["arm"] != "as planned"
         ),
     }
+
+
+def claims(answer: Row) -> Iterator[Claim]:
+    """Claim smallest losses, and that the posterior has the planned power and false alarms."""
+    for asked in answer["maps"]:
+        losses = [
+            asked["smallest_loss"][answer["logs"].index(n)][answer["durations_s"].index(seconds)]
+            for n, seconds in (SHORT, LONG)
+        ]
+        yield Claim(
+            f"smallest loss of {asked['parameter']} of {asked['stage']} that one log of 20 s shows",
+            f"{100 * losses[0]:.1f} %",
+            f"power {100 * answer['power']:.0f} %, "
+            f"false alarms {100 * answer['false_alarm']:.0f} %",
+            f"twenty of 300 s show {100 * losses[1]:.1f} %",
+        )
+    planned = [row for row in answer["checks"] if row["arm"] == "as planned"]
+    yield covered(
+        f"power of the posterior, {len(planned)} points",
+        [row["power"] for row in planned],
+        f"{100 * answer['power']:.0f} % planned",
+    )
+    yield covered(
+        "its false alarms",
+        [row["false_alarms"] for row in planned],
+        f"{100 * answer['false_alarm']:.0f} % planned",
+    )
+    free = [
+        row["power"]["share"]
+        for row in answer["checks"]
+        if row["arm"] == "as shipped, the other from its prior" and row["stage"] == "lms-y"
+    ]
+    yield Claim(
+        "power in Y where the other parameter has moved and the map has its error",
+        percents(free),
+        "",
+        "no part of the plan",
+    )
+    over = [m["stated_over_bound"] for row in answer["identified"] for m in row["modes"].values()]
+    yield Claim("standard deviations of identification over the bound of the plan", span(over))
 
 
 if __name__ == "__main__":

@@ -46,7 +46,10 @@ from studies.faults.logfiles import (
     recordings,
     write,
 )
-from studies.record import Study
+from studies.harness.claims import Claim, counted
+from studies.harness.study import Row, Study
+
+STEP = "batch"
 
 N_GOOD, N_GOOD_QUICK, N_BASES = 1000, 8, 4
 _SEED = 20261122
@@ -177,7 +180,7 @@ def wrong(expected: Sequence[Expected], found: Found) -> list[str]:
 
 def judge(
     expected: Sequence[Expected], found: Found, done: subprocess.CompletedProcess[str]
-) -> dict[str, Any]:
+) -> Row:
     """Compare what was found with what is right."""
     other = wrong(expected, found)
     counts = Counter((one.kind, found.reason(one)) for one in expected)
@@ -215,6 +218,28 @@ def judge(
             "controls are caught": all(caught.values()),
         },
     }
+
+
+def claims(answer: Row) -> Iterator[Claim]:
+    """Claim that damaged logs are told, and good ones analysed."""
+    yield counted(
+        f"damaged logs of {answer['kinds']} kinds told with the right reason",
+        answer["damaged_told_right"],
+        answer["damaged"],
+        _control(answer, "controls"),
+        met=answer["damaged_told_right"] == answer["damaged"],
+    )
+    yield counted(
+        "good logs among them analysed",
+        answer["good_analysed"],
+        answer["good"],
+        met=answer["good_analysed"] == answer["good"],
+    )
+
+
+def _control(answer: Row, name: str = "control") -> str:
+    found = answer[name].values()
+    return f"{sum(map(bool, found))} of {len(found)} controls are seen"
 
 
 if __name__ == "__main__":

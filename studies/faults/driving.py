@@ -22,9 +22,9 @@ from typing import IO
 
 from sqlalchemy import create_engine, inspect, make_url, text
 
-from studies.commands import call_here
 from studies.faults.batch import write_machine, write_stages
-from studies.servers import MARK, Popen, marked, missing_postgres, postgres
+from studies.harness.command_line import call_here
+from studies.harness.servers import MARK, Popen, marked, missing_postgres, postgres
 
 # 200 logs; enough machines that three teach a fleet's prior to a fourth, which is young.
 MACHINES = {"WORN-A": 50, "WORN-B": 46, "WORN-C": 46, "WORN-D": 8, "WATCHED-A": 50}

@@ -32,22 +32,24 @@ import socket
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pandas as pd
 from sqlalchemy import create_engine
 
-from studies import servers
 from studies.faults import guards, hostile
 from studies.faults.damage import KINDS
 from studies.faults.driving import PROGRAM
 from studies.faults.logfiles import DESCRIPTION, Archive, Columns, log_of, recordings
-from studies.record import Study
+from studies.harness import servers
+from studies.harness.claims import Claim
+from studies.harness.study import Row, Study
+
+STEP = "batch"
 
 PASSWORD = "s3cr3t-pa55w0rd"
 # Ways to write a password into an address; some of them are no addresses at all.
@@ -83,7 +85,7 @@ def main() -> None:
     study = Study(__file__, __doc__)
     quick, once = study.quick, partial(study.trials.once, also=PROGRAM)
     (base,) = recordings(1)
-    answer: dict[str, Any] = {"stores": {}, "controls": controls()}
+    answer: Row = {"stores": {}, "controls": controls()}
     with ExitStack() as stack:
         kinds = ["sqlite"]
         if not quick and servers.missing_postgres() is None:
@@ -106,7 +108,7 @@ def main() -> None:
     study.conclude(answer)
 
 
-def verdicts(answer: dict[str, Any]) -> dict[str, bool]:
+def verdicts(answer: Row) -> dict[str, bool]:
     """Say what was asked and whether it is so."""
     stores = answer["stores"].values()
     wrong = {name for store in stores for name, found in store["wrong"].items() if found}
@@ -142,9 +144,7 @@ def lmshealth(*words: str | Path, cwd: Path, limit: Callable[[], None] | None = 
     )  # fmt: skip
 
 
-def attack(
-    folder: Path, base: Columns, url: str, password: str, _kind: str, *, every: int
-) -> dict[str, Any]:
+def attack(folder: Path, base: Columns, url: str, password: str, _kind: str, *, every: int) -> Row:
     """Run and report a hostile archive, and look at everything that came of it."""
     logs, out = folder / "logs", folder / "out"
     machines, refused = hostile.make_hostile(folder, base, every=every)
@@ -241,7 +241,7 @@ def _leaked(text: str) -> bool:
     return hostile.SECRET in text or "root:x:0" in text
 
 
-def addresses(folder: Path, forms: Sequence[str]) -> dict[str, Any]:
+def addresses(folder: Path, forms: Sequence[str]) -> Row:
     """Try addresses that hold a password, as stores and as schedulers."""
     (folder / "logs").mkdir(exist_ok=True)
     (folder / "stage.toml").write_text(DESCRIPTION)
@@ -302,7 +302,7 @@ def network(folder: Path) -> list[str]:
     return wrong
 
 
-def bombs(folder: Path, base: Columns) -> list[dict[str, Any]]:
+def bombs(folder: Path, base: Columns) -> list[Row]:
     """Read files that swell, and measure the memory that each takes."""
     rows = []
     archive = Archive(folder / "bombs")
@@ -318,7 +318,7 @@ def bombs(folder: Path, base: Columns) -> list[dict[str, Any]]:
     return rows
 
 
-def _weigh(path: Path, folder: Path) -> dict[str, Any]:
+def _weigh(path: Path, folder: Path) -> Row:
     """Read a log in a process of its own, and give its peak of memory in MB."""
     script = (
         "import json, resource, sys\nfrom lmshealth.io.reading import read_log\n"
@@ -333,7 +333,7 @@ def _weigh(path: Path, folder: Path) -> dict[str, Any]:
         command, capture_output=True, text=True, check=True,
         preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_AS, (8 << 30, 8 << 30)),
     )  # fmt: skip
-    found: dict[str, Any] = json.loads(done.stdout)
+    found: Row = json.loads(done.stdout)
     return found
 
 
@@ -371,6 +371,39 @@ def controls() -> dict[str, bool]:
             "names of devices and twins": guards.bad_names(["CON.html", "a.html", "A.html"])
             == ["CON.html", "a.html", "A.html"],
         }
+
+
+def claims(answer: Row) -> Iterator[Claim]:
+    """Claim that what names, tables and addresses say never acts."""
+    for kind, row in answer["stores"].items():
+        wrong = [line for found in row["wrong"].values() for line in found]
+        yield Claim(
+            f"what hostile names and metadata do ({kind})",
+            f"{len(wrong)} of {len(row['wrong'])} things that must not be",
+            f"{row['machines']} machines",
+            _control(answer, "controls"),
+            not wrong,
+        )
+    peaks = [row["peak_mb"] for row in answer["bombs"]]
+    if peaks:
+        yield Claim(
+            "memory that a file which swells takes, with all libraries",
+            f"{max(peaks)} MB at most",
+            f"{len(peaks)} kinds",
+            "",
+            answer["passed"]["bombs stay small"],
+        )
+    tried = answer["addresses"]
+    yield Claim(
+        "addresses that show or keep their password",
+        f"{len(tried['shown'])} of {tried['tried']}",
+        met=not tried["shown"],
+    )
+
+
+def _control(answer: Row, name: str = "control") -> str:
+    found = answer[name].values()
+    return f"{sum(map(bool, found))} of {len(found)} controls are seen"
 
 
 if __name__ == "__main__":

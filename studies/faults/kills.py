@@ -30,11 +30,10 @@ import sys
 import tempfile
 import time
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 from studies.faults.driving import (
     ENDED_S,
@@ -51,8 +50,10 @@ from studies.faults.driving import (
     rows,
     running,
 )
-from studies.record import Study
-from studies.resume import Trials
+from studies.harness.claims import Claim
+from studies.harness.study import Row, Study, Trials
+
+STEP = "batch"
 
 SEED = 20261122
 QUICK_MACHINES = {"WATCHED-A": 4}
@@ -63,8 +64,6 @@ ENDS = {"main": -signal.SIGKILL, "SIGTERM": -signal.SIGTERM}
 IMPORTED_S = 2.0  # by then Python has imported what a run needs; before, it interrupts its own way
 MOST_OTHER = 20  # runs that end otherwise, before it is of no use to go on
 PER_RUN, QUICK_PER_RUN = 5.0, 10.0  # kills in the mean, over the time that a run takes
-
-Row = dict[str, Any]
 
 
 def main() -> None:
@@ -208,6 +207,24 @@ def when(reference: Reference, store: str, out: Path) -> str:
     if now["assessed"] < full["assessed"]:
         return "among the machines"
     return "among the tables" if not (out / "index.html").exists() else "at the end"
+
+
+def claims(answer: Row) -> Iterator[Claim]:
+    """Claim that batches whose runs are killed end as if nothing had happened."""
+    for kind, row in answer["kills"].items():
+        wrong = len(row["differences"]) + len(row["other_ends"])
+        yield Claim(
+            f"what is not as uninterrupted after kills at random moments ({kind})",
+            f"{wrong} in {row['n']} kills, {row['batches']} batches",
+            f"slowest end {row['slowest_end_s']:.0f} s",
+            _control(answer),
+            wrong == 0,
+        )
+
+
+def _control(answer: Row, name: str = "control") -> str:
+    found = answer[name].values()
+    return f"{sum(map(bool, found))} of {len(found)} controls are seen"
 
 
 if __name__ == "__main__":

@@ -26,10 +26,9 @@ import re
 import signal
 import subprocess
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 from studies.faults.driving import (
     PROGRAM,
@@ -41,15 +40,16 @@ from studies.faults.driving import (
     reference_of,
     running,
 )
-from studies.record import Study
-from studies.servers import missing_postgres, postgres
+from studies.harness.claims import Claim
+from studies.harness.servers import missing_postgres, postgres
+from studies.harness.study import Row, Study
+
+STEP = "batch"
 
 SEED = 20261122
 MACHINES, QUICK_MACHINES = {"WORN-A": 40, "WATCHED-A": 40}, {"WATCHED-A": 4}
 N_LOST = 5
 SIZES, QUICK_SIZES = (0.05, 0.2, 0.4, 0.6, 0.75, 0.9, 4.0), (0.4, 4.0)
-
-Row = dict[str, Any]
 
 
 def main() -> None:
@@ -160,6 +160,23 @@ def _failures(ends: list[tuple[int | None, list[str]]]) -> Row:
     other += [f"1: {said[-3:]}" for end, said in ends if end == 1 and not one_line(said)]
     told = {re.sub(r"\w+:/\S+|'?/\S+", "…", line) for line in failed}
     return {"failed": len(failed), "said": sorted(told), "other_ends": other}
+
+
+def claims(answer: Row) -> Iterator[Claim]:
+    """Claim that a full disk and a lost database are told, and cost nothing."""
+    for name in ("full disk", "full disk, output alone", "lost database"):
+        row = answer[name]
+        if row is None:
+            yield Claim(name, "not tried: this machine does not allow it", met=False)
+            continue
+        fine = all(held for what, held in answer["passed"].items() if what.endswith(f", {name}"))
+        yield Claim(
+            f"{name}: what is not as without it",
+            str(len(row["differences"])),
+            f"{row['failed']} runs failed",
+            "each in one line",
+            fine,
+        )
 
 
 if __name__ == "__main__":

@@ -23,12 +23,11 @@ from __future__ import annotations
 import random
 import sys
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 from studies.faults.driving import (
     PROGRAM,
@@ -43,7 +42,10 @@ from studies.faults.driving import (
     rows,
     running,
 )
-from studies.record import Study
+from studies.harness.claims import Claim
+from studies.harness.study import Row, Study
+
+STEP = "batch"
 
 SEED = 20261122
 ONE = {"WORN-A": 12, "WATCHED-A": 28}
@@ -56,8 +58,6 @@ N_PAIRS = 3
 OTHERS, KILLED = ("same", "other", "more"), ", one killed"
 WAYS = tuple(f"{logs} logs{kill}" for logs in OTHERS for kill in ("", KILLED))
 QUICK_WAYS = {"sqlite": (f"same logs{KILLED}",)}  # the other kind is in that of `kills`
-
-Row = dict[str, Any]
 
 
 def main() -> None:
@@ -157,6 +157,19 @@ def one_pair(
         if kill:
             completed(commands[1], quick=quick)
         return found + pair.wrong(store, outs)
+
+
+def claims(answer: Row) -> Iterator[Claim]:
+    """Claim that two runs at once leave what they leave alone."""
+    for kind, ways in answer["pairs"].items():
+        wrong = sum(bool(row["wrong"]) for row in ways.values())
+        yield Claim(
+            f"ways of running two at once that leave what each leaves alone ({kind})",
+            f"{len(ways) - wrong} of {len(ways)}",
+            f"{min(row['n'] for row in ways.values())} pairs each",
+            "half of them with one killed",
+            wrong == 0,
+        )
 
 
 if __name__ == "__main__":

@@ -24,9 +24,9 @@ import random
 import signal
 import sys
 import tempfile
+from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 from studies.faults.driving import (
     MACHINES,
@@ -41,15 +41,16 @@ from studies.faults.driving import (
     rows,
     running,
 )
-from studies.record import Study
-from studies.servers import Cluster, dask_cluster, missing_distributed
+from studies.harness.claims import Claim
+from studies.harness.servers import Cluster, dask_cluster, missing_distributed
+from studies.harness.study import Row, Study
+
+STEP = "batch"
 
 SEED = 20261122
 QUICK_MACHINES = {"WATCHED-A": 10}
 N_KILLS, QUICK_KILLS = 10, 1
 KILLS_PER_RUN, QUICK_PER_RUN = 3.0, 20.0  # in the mean, over the time that a run takes
-
-Row = dict[str, Any]
 
 
 def main() -> None:
@@ -130,6 +131,35 @@ def scheduler_lost(reference: Reference) -> Row:
         with dask_cluster() as cluster:
             completed(reference.batch.command(out, store, "--scheduler", cluster.address))
         return {"status": status, "said": said, "differences": reference.judge(out, store)}
+
+
+def claims(answer: Row) -> Iterator[Claim]:
+    """Claim the same of workers of a cluster, and of its scheduler."""
+    row, passed = answer["workers killed"], answer["passed"]
+    wrong = len(row["differences"]) + len(row["other_ends"])
+    yield Claim(
+        "what is not as uninterrupted after workers were killed",
+        f"{wrong} in {row['n']} kills, {row['batches']} batches",
+        "",
+        _control(answer),
+        wrong == 0,
+    )
+    if lost := answer["scheduler lost"]:
+        fine = all(
+            passed[f"{what}, scheduler lost"] for what in ("as uninterrupted", "told in one line")
+        )
+        yield Claim(
+            "what is not so after the scheduler was lost",
+            str(len(lost["differences"])),
+            "",
+            "told in one line" if fine else "not told in one line",
+            fine,
+        )
+
+
+def _control(answer: Row, name: str = "control") -> str:
+    found = answer[name].values()
+    return f"{sum(map(bool, found))} of {len(found)} controls are seen"
 
 
 if __name__ == "__main__":

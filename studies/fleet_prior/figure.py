@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
-from typing import Any
 
 import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from studies.ranks import BLACK, BLUE, ORANGE
+from studies.common.ranks import BLACK, BLUE, ORANGE
+from studies.harness.study import Row, read_record
 
 HERE = Path(__file__).parent
 GREY = "#999999"
@@ -31,7 +30,7 @@ def colour(way: str) -> str:
     return COLOURS.get(way, ORANGE)
 
 
-def draw_lost(ax: Axes, ways: dict[str, Any]) -> None:
+def draw_lost(ax: Axes, ways: Row) -> None:
     """Draw what the score loses on average, with its standard error."""
     for k, (way, found) in enumerate(ways.items()):
         value, error = found["lost_km"]
@@ -45,7 +44,7 @@ def draw_lost(ax: Axes, ways: dict[str, Any]) -> None:
     ax.grid(axis="x", lw=0.3)
 
 
-def draw_coverage(ax: Axes, ways: dict[str, Any]) -> None:
+def draw_coverage(ax: Axes, ways: Row) -> None:
     """Draw coverages of 50 and 90 % intervals with their Clopper-Pearson intervals."""
     for nominal, marker in ((0, "s"), (1, "o")):
         for k, (way, found) in enumerate(ways.items()):
@@ -90,7 +89,7 @@ def draw_priors(ax: Axes, priors: list[dict[str, list[float]]]) -> None:
 def main() -> None:
     """Draw the three side by side."""
     matplotlib.rcParams["svg.hashsalt"] = "fleet_prior"
-    result = json.loads((HERE / "result.json").read_text())
+    result = read_record(__file__)
     figure = Figure(figsize=(13.0, 4.2), layout="constrained")
     axes = figure.subplots(1, 3, width_ratios=[1.0, 1.0, 1.25])
     draw_lost(axes[0], result["ways"])

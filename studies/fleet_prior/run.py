@@ -35,10 +35,9 @@ Run time
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from functools import cache
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -55,10 +54,12 @@ from lmshealth.prognosis.remaining_life import remaining_travel
 from lmshealth.stage.degradation_laws import HertzWear
 from lmshealth.stage.description import Stage
 from lmshealth.stage.priors import Lognormal, Prior
+from studies.common.metrics import coverage, crps, place
 from studies.fleet_prior.lives import MATURE, YOUNG, Life, draw, draw_fleet, longer_lived, machine
-from studies.metrics import coverage, crps, place
-from studies.ranks import Row
-from studies.record import LEVEL, Study, as_row
+from studies.harness.claims import Claim, covered, measured, percents
+from studies.harness.study import LEVEL, Row, Study, as_row
+
+STEP = "prognose, young machines"
 
 Array = NDArray[np.float64]
 SEED = 20261122
@@ -84,7 +85,7 @@ def main() -> None:
     study = Study(__file__, __doc__)
     kind, n = (LEAST, QUICK) if study.quick else (FLEET, FLEETS)
     rows = study.trials.collect(one, [(kind, number) for number in range(n)])
-    answer: dict[str, Any] = {
+    answer: Row = {
         "seed": SEED,
         "fleets": n,
         "teachers": N_TEACHERS[kind],
@@ -239,12 +240,12 @@ def was_told(rows: list[Row], way: str) -> bool:
     return any(way in young for row in rows for young in row["young"])
 
 
-def judged(rows: list[Row], way: str) -> dict[str, Any]:
+def judged(rows: list[Row], way: str) -> Row:
     """Judge what is told in one way, where it is told, with errors by fleet."""
     fleets = [[one for one in row["young"] if way in one] for row in rows]
     fleets = [young for young in fleets if young]
     places = np.array([one[way]["place"] for young in fleets for one in young])
-    answer: dict[str, Any] = {
+    answer: Row = {
         "lives": len(places),
         "mean_place": round(float(places.mean()), 3),
         "coverage": [
@@ -270,7 +271,7 @@ def mean(values: Array) -> list[float]:
     return [round(float(values.mean()), 4), round(float(error), 4)]
 
 
-def verdicts(ways: Mapping[str, dict[str, Any]], n: int) -> dict[str, bool]:
+def verdicts(ways: Mapping[str, Row], n: int) -> dict[str, bool]:
     """Say what was asked and whether it is so."""
 
     def surely(value: list[float], sign: int) -> bool:
@@ -289,6 +290,40 @@ def verdicts(ways: Mapping[str, dict[str, Any]], n: int) -> dict[str, bool]:
         for way in (WORN, FOREIGN)
     }
     return found
+
+
+def claims(answer: Row) -> Iterator[Claim]:
+    """Claim what a fleet teaches its young machines."""
+    ways = answer["ways"]
+    own, learned = ways["description"], ways["learned"]
+    gain = own["crps_km_over_learned"]
+    score = measured(learned["crps_km"], "km")
+    yield Claim(
+        f"score (CRPS) of the remaining life of {answer['young']} young machines",
+        *score,
+        f"{measured(own['crps_km'], 'km')[0]} by the description, "
+        f"{' '.join(measured(gain, 'km'))} more",
+        gain[0] > 0,
+    )
+    yield Claim(
+        "of it lost to who knows the fleet",
+        *measured(learned["lost_km"], "km"),
+        f"{' '.join(measured(own['lost_km'], 'km'))} by the description",
+        learned["lost_km"][0] < own["lost_km"][0],
+    )
+    yield covered(
+        "intervals of 90 % cover, by the learned prior",
+        learned["coverage"][1:],
+        f"50 %: {percents([learned['coverage'][0]['share']])}",
+    )
+    for way in ("only the worn teach", "another fleet teaches"):
+        wrong = ways[way]
+        yield Claim(
+            f"lost if {way} (control)",
+            *measured(wrong["lost_km"], "km"),
+            f"90 % intervals cover {percents([wrong['coverage'][1]['share']])}",
+            wrong["lost_km"][0] > learned["lost_km"][0],
+        )
 
 
 if __name__ == "__main__":

@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
-from typing import Any
 
 import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from studies.harness.study import Row, read_record
+
 HERE = Path(__file__).parent
 COLOURS = ("#0072b2", "#d55e00")
 
 
-def draw_responses(ax: Axes, pictures: dict[str, Any], bench: str) -> None:
+def draw_responses(ax: Axes, pictures: Row, bench: str) -> None:
     """Draw measured gain, its noise and the fit of two responses of a bench."""
     shown = {name: part for name, part in pictures.items() if name.startswith(bench)}
     for (name, part), colour in zip(shown.items(), COLOURS, strict=True):
@@ -30,7 +30,7 @@ def draw_responses(ax: Axes, pictures: dict[str, Any], bench: str) -> None:
     ax.grid(alpha=0.25)
 
 
-def draw_coverage(ax: Axes, cases: dict[str, Any]) -> None:
+def draw_coverage(ax: Axes, cases: Row) -> None:
     """Draw every coverage with its exact interval, and the controls that must fail."""
     labels = []
     for name, case in cases.items():
@@ -53,7 +53,7 @@ def draw_coverage(ax: Axes, cases: dict[str, Any]) -> None:
     ax.grid(alpha=0.25, axis="x")
 
 
-def draw_modes(ax: Axes, rows: dict[str, Any], title: str) -> None:
+def draw_modes(ax: Axes, rows: Row, title: str) -> None:
     """Draw frequency and damping of real modes with two standard deviations."""
     for k, (name, row) in enumerate(rows.items()):
         ax.errorbar(row["frequency_hz"], 100 * row["damping_ratio"],
@@ -67,7 +67,7 @@ def draw_modes(ax: Axes, rows: dict[str, Any], title: str) -> None:
     ax.grid(alpha=0.25)
 
 
-def draw_sweeps(ax: Axes, sweeps: dict[str, list[dict[str, Any]]]) -> None:
+def draw_sweeps(ax: Axes, sweeps: dict[str, list[Row]]) -> None:
     """Draw how far pitch is off by each sensor, in stated standard deviations."""
     labels = []
     for name, rows in sweeps.items():
@@ -92,7 +92,7 @@ def draw_sweeps(ax: Axes, sweeps: dict[str, list[dict[str, Any]]]) -> None:
 def main() -> None:
     """Draw benches above, simulated machines below."""
     matplotlib.rcParams["svg.hashsalt"] = "frf_modes"
-    result = json.loads((HERE / "result.json").read_text())
+    result = read_record(__file__)
     figure = Figure(figsize=(14.0, 8.5), layout="constrained")
     axes = figure.subplots(2, 3)
     draw_responses(axes[0, 0], result["pictures"], "linear guide")

@@ -31,9 +31,9 @@ from __future__ import annotations
 
 import os
 import tempfile
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from scipy.stats import chi2
@@ -58,7 +58,10 @@ from studies.frf_modes.records import (
     at_random,
     periodic,
 )
-from studies.record import Study, judge_coverage, options
+from studies.harness.claims import Claim, covered, number, percents, span
+from studies.harness.study import Row, Study, judge_coverage
+
+STEP = "identify FRF logs"
 
 NOT_MET = {
     "both modes always": "one of 400 records of the distorting motor gives another number of them",
@@ -100,17 +103,15 @@ SWEEPS = {
 
 def main() -> None:
     """Run the study; ``--quick`` does two seeds, no sweeps, no jackknife, records nothing."""
-    parser = options(__doc__)
-    parser.add_argument("--seeds", type=int, default=400)
-    study = Study(__file__, __doc__, parser.parse_args())
+    study = Study(__file__, __doc__, seeds=400)
     quick, trials = study.quick, study.trials
     seeds = 2 if quick else study.options.seeds
     cases = {
         name: summarise(name, trials.collect(one_seed, [(name, k) for k in range(seeds)]))
         for name in CASES
     }
-    answer: dict[str, Any] = {"n_seeds": seeds, "cases": cases}
-    swept: dict[str, Any] = {}
+    answer: Row = {"n_seeds": seeds, "cases": cases}
+    swept: Row = {}
     if not quick:
         swept = {
             name: trials.collect(one_sweep, [(name, seed) for seed in range(8)]) for name in SWEEPS
@@ -119,7 +120,7 @@ def main() -> None:
     benches, pictures = read_benches(Path(os.environ["LMSHEALTH_DATA"]), quick=quick)
     answer |= benches
     answer |= {"passed": judge(answer, quick=quick), "not_met": NOT_MET}
-    study.conclude(answer, beside={"pictures": pictures, "sweep_rows": swept}, not_met=NOT_MET)
+    study.conclude(answer, details={"pictures": pictures, "sweep_rows": swept}, not_met=NOT_MET)
 
 
 def make_log(given: Array, answer: Array, displacement: bool) -> Log:
@@ -129,7 +130,7 @@ def make_log(given: Array, answer: Array, displacement: bool) -> Log:
     return Log("simulated", "0" * 64, Metadata(), RATE, channels, None, ((0, given.size),), ())
 
 
-def one_seed(name: str, seed: int) -> dict[str, Any]:
+def one_seed(name: str, seed: int) -> Row:
     """Return estimates and standard deviations of ln f and ln ζ of both modes, (2, 2) each."""
     rng = np.random.default_rng([seed, list(CASES).index(name)])
     case = CASES[name]
@@ -140,7 +141,7 @@ def one_seed(name: str, seed: int) -> dict[str, Any]:
     )
     log = make_log(*signals, case.machine.displacement)
     modes = read_frf(log, "current", "sensor", band=BAND).modes
-    found: dict[str, Any] = {"seed": seed, "n_modes": len(modes.names)}
+    found: Row = {"seed": seed, "n_modes": len(modes.names)}
     if len(modes.names) == 2:
         std = np.sqrt(np.diag(modes.cov)).reshape(2, 2)
         found |= {"value": [modes.ln_frequency.tolist(), modes.ln_damping.tolist()],
@@ -214,7 +215,7 @@ def _true_unknowns(machine: Machine, s: Array) -> Array:
     return np.concatenate([poles, powers])
 
 
-def summarise(name: str, rows: list[dict[str, Any]]) -> dict[str, Any]:
+def summarise(name: str, rows: list[Row]) -> Row:
     """Return coverage, its negative controls and efficiency of f and ζ."""
     case = CASES[name]
     kept = [row for row in rows if row["n_modes"] == 2]
@@ -222,13 +223,13 @@ def summarise(name: str, rows: list[dict[str, Any]]) -> dict[str, Any]:
     error = np.array([row["value"] for row in kept]) - truth
     std = np.array([row["std"] for row in kept])
     z = error / std
-    summary: dict[str, Any] = {"n_with_both_modes": len(kept)}
+    summary: Row = {"n_with_both_modes": len(kept)}
     summary["n_with_others"] = len(rows) - len(kept)
     for k, what in enumerate(("frequency", "damping")):
         summary[what] = {
-            "coverage": covered(z[:, k], Z),
-            "control_narrower": covered(z[:, k], Z / CONTROL),
-            "control_wider": covered(z[:, k], Z * CONTROL),
+            "coverage": coverage_of(z[:, k], Z),
+            "control_narrower": coverage_of(z[:, k], Z / CONTROL),
+            "control_wider": coverage_of(z[:, k], Z * CONTROL),
             "z_mean": float(z[:, k].mean()),
             "z_std": float(z[:, k].std()),
         }
@@ -242,12 +243,12 @@ def summarise(name: str, rows: list[dict[str, Any]]) -> dict[str, Any]:
     return summary
 
 
-def covered(z: Array, reach: float) -> dict[str, Any]:
+def coverage_of(z: Array, reach: float) -> Row:
     """Return a coverage, its exact interval, and whether that holds 95 %."""
     return judge_coverage(int(np.count_nonzero(np.abs(z) < reach)), z.size)
 
 
-def one_sweep(name: str, seed: int) -> dict[str, Any]:
+def one_sweep(name: str, seed: int) -> Row:
     """Return pitch of a stage by each sensor: its error in Hz, and of f and ζ in σ."""
     sweep, band = SWEEPS[name]
     stage = stage_named(name.split(",")[0])
@@ -257,7 +258,7 @@ def one_sweep(name: str, seed: int) -> dict[str, Any]:
         path = Path(scratch) / "log.h5"
         write_log(record_sweep(stage, sweep, seconds=SECONDS, rng=rng), path, "hdf5")
         log = read_log(path)
-    row: dict[str, Any] = {"seed": seed}
+    row: Row = {"seed": seed}
     for sensor in SENSORS:
         modes = read_frf(log, "current_excitation", sensor, band=band).modes
         i = int(np.argmin(np.abs(modes.frequency - mode.frequency_hz)))
@@ -272,7 +273,7 @@ def one_sweep(name: str, seed: int) -> dict[str, Any]:
     return row
 
 
-def summarise_sweeps(rows: list[dict[str, Any]]) -> dict[str, Any]:
+def summarise_sweeps(rows: list[Row]) -> Row:
     """Test the deviations of each sensor over the seeds."""
     found = {}
     for sensor in SENSORS:
@@ -287,7 +288,7 @@ def summarise_sweeps(rows: list[dict[str, Any]]) -> dict[str, Any]:
     return found
 
 
-def read_benches(data: Path, *, quick: bool) -> tuple[dict[str, Any], dict[str, Any]]:
+def read_benches(data: Path, *, quick: bool) -> tuple[Row, Row]:
     """Return what the benches say, and pictures of two of their responses."""
     guide = {}
     pictures = {}
@@ -299,7 +300,7 @@ def read_benches(data: Path, *, quick: bool) -> tuple[dict[str, Any], dict[str, 
             if output == "delta_e_load":
                 pictures[f"linear guide, {Path(name).stem}"] = pictured(reading)
     log = mapped(data, BENCH)
-    bench: dict[str, dict[str, Any]] = {}
+    bench: dict[str, Row] = {}
     for output in ("delta_e_motor", "delta_e_load"):
         reading = read_frf(log, "current", output)
         bench[output] = told(reading)
@@ -323,7 +324,7 @@ def mapped(data: Path, name: str) -> Log:
         return read_log(data / name, columns=load_columns(path))
 
 
-def told(reading: FrfReading) -> dict[str, Any]:
+def told(reading: FrfReading) -> Row:
     """Return the one mode of a reading."""
     modes, fit = reading.modes, reading.fit
     if len(modes.names) != 1:
@@ -383,7 +384,7 @@ def scatter_over_periods(
     }
 
 
-def judge(answer: dict[str, Any], *, quick: bool) -> dict[str, bool]:
+def judge(answer: Row, *, quick: bool) -> dict[str, bool]:
     """Tell what was asked for and what came out; few seeds cannot make the controls fail."""
     both = ("frequency", "damping")
     parts = [(CASES[name].exact, part[what]) for name, part in answer["cases"].items()
@@ -435,6 +436,61 @@ def agree(one: dict[str, float], other: dict[str, float]) -> bool:
             ("damping_ratio", "damping_ratio_std"),
         )
     )
+
+
+def claims(answer: Row) -> Iterator[Claim]:
+    """Claim coverages, errors beside the bound, benches, and sweeps."""
+    parts = [case[q] for case in answer["cases"].values() for q in ("frequency", "damping")]
+    exact = [part for part in parts if "rmse_over_cramer_rao" in part]
+    narrow = percents(part["control_narrower"]["share"] for part in exact)
+    yield covered(
+        "95 % intervals of f and ζ, four kinds of driven records",
+        [part["coverage"] for part in exact],
+        f"1.5 times as narrow: {narrow}",
+    )
+    yield Claim(
+        "root mean square errors over the Cramér-Rao bound",
+        span(value for part in exact for value in part["rmse_over_cramer_rao"]),
+    )
+    bent = [part["coverage"]["share"] for part in parts if part not in exact]
+    lost = answer["cases"]["distorting motor"]["n_with_others"]
+    yield Claim(
+        "coverage with a motor that distorts",
+        percents(bent),
+        "",
+        f"95 % at least asked; {lost} of {answer['n_seeds']} records show another number of modes",
+        lost == 0,
+    )
+    sides = answer["two_inertias"]
+    yield Claim(
+        "a real bench of two inertias: motor and load side",
+        " and ".join(f"{row['frequency_hz']:.3f}" for row in sides.values()) + " Hz",
+        f"± {number(max(row['frequency_std_hz'] for row in sides.values()))} Hz",
+        "",
+        answer["passed"]["bench: sides agree"],
+    )
+    rows = {name: answer["sweep_rows"][name] for name in answer["sweeps"]}
+    for what, wide in (("a band around it", False), ("all that is excited", True)):
+        own = [
+            sensor
+            for name, found in rows.items()
+            if name.endswith("wide") == wide
+            for row in found
+            for sensor in row.values()
+            if isinstance(sensor, dict)
+        ]
+        name = (
+            "wide sweeps: z below 2 on average"
+            if wide
+            else ("sweeps around pitch: z is standard normal")
+        )
+        yield Claim(
+            f"pitch of a sweep of the simulated stages, in {what}: largest error",
+            f"{max(abs(s['error_hz']) for s in own):.3f} Hz",
+            f"{max(abs(s['z'][0]) for s in own):.1f} σ",
+            "",
+            answer["passed"][name],
+        )
 
 
 if __name__ == "__main__":

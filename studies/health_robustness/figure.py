@@ -5,17 +5,17 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import matplotlib
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from studies.harness.study import Row, read_record
+
 HERE = Path(__file__).parent
 BLUE, ORANGE, BLACK = "#0072b2", "#d55e00", "#000000"
 PARAMETERS = {"guide_preload": (BLUE, "o", "preload"), "mount_stiffness": (ORANGE, "s", "mount")}
 WHAT = {"last": "last log, no law", "now": "now, by laws", "left": "remaining life"}
-Row = dict[str, Any]
 
 
 def coverage(
@@ -114,7 +114,7 @@ def of(rows: list[Row], what: str) -> list[Row]:
 def main() -> None:
     """Draw."""
     matplotlib.rcParams |= {"svg.hashsalt": "lmshealth", "font.size": 8}
-    result = json.loads((HERE / "result.json").read_text(encoding="utf-8"))
+    result = read_record(__file__)
     kept = HERE / "raw.json"
     raw = json.loads(kept.read_text(encoding="utf-8"))["lives"] if kept.exists() else []
     more = HERE / "control.json"

@@ -19,7 +19,7 @@ from lmshealth.prognosis.remaining_life import parameters_with_limit, remaining_
 from lmshealth.stage.description import Stage
 from lmshealth.tracking.history import History
 from lmshealth.tracking.track import Track
-from studies.lives import Array
+from studies.common.lives import Array
 
 _N_PRIOR, _N_POINTS, _N_DRAWS = 1000, 2000, 4000
 

@@ -4,18 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
 from lmshealth.stage.description import Stage
 from lmshealth.tracking.history import History
 from lmshealth.tracking.track import Track, accepted_estimates, track
+from studies.common.lives import Array, history_of
+from studies.common.metrics import place
+from studies.harness.study import Row, judge_coverage
 from studies.health_robustness.posteriors import claimed, epoch_draws, life_draws
 from studies.health_robustness.worlds import PARAMETERS, Case, alone
-from studies.lives import Array, history_of
-from studies.metrics import place
-from studies.record import judge_coverage
 
 NOMINALS = (0.9, 0.5)
 _LEVELS = (0.05, 0.5, 0.95)
@@ -133,10 +132,10 @@ def _answers(draws: Array, truth: Array, rng: np.random.Generator) -> list[Answe
     return answers
 
 
-def summed(answers: list[Answer]) -> dict[str, Any]:
+def summed(answers: list[Answer]) -> Row:
     """Sum up the answers of many lives: coverage and bias, each with its Monte-Carlo error."""
     places = np.array([one.place for one in answers])
-    row: dict[str, Any] = {"n": len(answers)}
+    row: Row = {"n": len(answers)}
     for nominal in NOMINALS:
         hits = int(np.sum(np.abs(places - 0.5) <= nominal / 2))
         row[f"{100 * nominal:g}"] = judge_coverage(hits, places.size, nominal)

@@ -19,7 +19,7 @@ from models.dynamics.modal_map import modal_map
 from models.dynamics.plant import GUIDE_MODES
 from models.dynamics.stages import stage_named
 from models.lives.simulation import Visit, schedule
-from studies.lives import HEALTHY, Array, Estimates, Life, life_of, life_with, plan_of
+from studies.common.lives import HEALTHY, Array, Estimates, Life, life_of, life_with, plan_of
 from studies.sbc_life.run import always_losing
 
 PARAMETERS = ("guide_preload", "mount_stiffness")

@@ -9,7 +9,7 @@ from functools import partial
 import numpy as np
 
 from lmshealth.io.log import Log
-from studies.cramer_rao import Recording, Vibration, joint_bound
+from studies.common.cramer_rao import Recording, Vibration, joint_bound
 from studies.identification.records import (
     Array,
     Truth,

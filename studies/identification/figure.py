@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
-from typing import Any
 
 import matplotlib
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+
+from studies.harness.study import Row, read_record
 
 HERE = Path(__file__).parent
 QUANTITIES = {"ln f": ("#0072b2", "o", -0.18), "ln zeta": ("#d55e00", "s", 0.18)}
@@ -18,7 +18,7 @@ NAMES = {"ln f": "frequency", "ln zeta": "damping"}
 def main() -> None:
     """Draw."""
     matplotlib.rcParams |= {"svg.hashsalt": "lmshealth", "font.size": 8}
-    rows = json.loads((HERE / "result.json").read_text(encoding="utf-8"))["cases"]
+    rows = read_record(__file__)["cases"]
     cases = list(dict.fromkeys(row["case"] for row in rows))
     figure = Figure(figsize=(10, 0.42 * len(cases) + 1.4), layout="constrained")
     left, right = figure.subplots(1, 2, sharey=True)
@@ -29,7 +29,7 @@ def main() -> None:
     figure.savefig(HERE / "figure.svg", metadata={"Date": None})
 
 
-def places(cases: list[str], rows: list[dict[str, Any]]) -> list[tuple[float, dict[str, Any]]]:
+def places(cases: list[str], rows: list[Row]) -> list[tuple[float, Row]]:
     """Put the modes of a case beside each other, in the order of their frequencies."""
     found = []
     for row in rows:
@@ -40,7 +40,7 @@ def places(cases: list[str], rows: list[dict[str, Any]]) -> list[tuple[float, di
     return found
 
 
-def draw_coverage(ax: Axes, cases: list[str], rows: list[dict[str, Any]]) -> None:
+def draw_coverage(ax: Axes, cases: list[str], rows: list[Row]) -> None:
     """Draw the share of intervals that hold the truth, with its 99.9 % interval."""
     for quantity, (colour, marker, _) in QUANTITIES.items():
         own = [(y, row) for y, row in places(cases, rows) if row["quantity"] == quantity]
@@ -64,7 +64,7 @@ def draw_coverage(ax: Axes, cases: list[str], rows: list[dict[str, Any]]) -> Non
     ax.grid(axis="x", alpha=0.25)
 
 
-def draw_efficiency(ax: Axes, cases: list[str], rows: list[dict[str, Any]]) -> None:
+def draw_efficiency(ax: Axes, cases: list[str], rows: list[Row]) -> None:
     """Draw root mean square errors over the Cramér-Rao bound, with one standard error."""
     for y, row in places(cases, rows):
         if "rmse_over_bound" not in row:

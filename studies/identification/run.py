@@ -25,6 +25,7 @@ Run time
 from __future__ import annotations
 
 import os
+from collections import Counter
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import nullcontext
@@ -39,9 +40,12 @@ from lmshealth.errors import BadLog
 from lmshealth.io.log import Log
 from lmshealth.modal.modes import Modes
 from lmshealth.stage.description import Stage
+from studies.harness.claims import Claim, covered, number, percents, span
+from studies.harness.study import NOMINAL, Row, Study, judge_coverage
 from studies.identification.cases import CASES, HEADLINE, Case
 from studies.identification.records import Array, describe
-from studies.record import NOMINAL, Study, judge_coverage
+
+STEP = "identify"
 
 FACTOR = 1.5
 CHUNK = 50
@@ -71,7 +75,7 @@ def main() -> None:
         for k in cases
     }
     rows = [row for k in cases for row in summarise(CASES[k], found[k])]
-    answer: dict[str, Any] = {
+    answer: Row = {
         "cases": rows,
         "passed": verdicts(rows, quick=study.quick),
         "not_met": shortfalls(rows),
@@ -123,7 +127,7 @@ def _estimate(log: Log, stage: Stage, case: Case, channels: list[str] | None = N
     return result
 
 
-def summarise(case: Case, found: Array) -> Iterator[dict[str, Any]]:
+def summarise(case: Case, found: Array) -> Iterator[Row]:
     """Compare the errors of a case with what is said of them, mode by mode."""
     m = len(case.modes)
     bound = case.bound() if case.bounded else np.full(2 * m, np.nan)
@@ -132,7 +136,7 @@ def summarise(case: Case, found: Array) -> Iterator[dict[str, Any]]:
         error, std = found[kept, 0, j], found[kept, 1, j]
         n = int(kept.sum())
         rmse = float(np.sqrt(np.mean(error**2)))
-        row: dict[str, Any] = {
+        row: Row = {
             "case": case.name,
             "frequency_hz": case.modes[j % m].frequency,
             "quantity": "ln f" if j < m else "ln zeta",
@@ -156,17 +160,17 @@ def summarise(case: Case, found: Array) -> Iterator[dict[str, Any]]:
         yield row
 
 
-def _coverage(off: Array) -> dict[str, Any]:
+def _coverage(off: Array) -> Row:
     """How often intervals hold the truth, and whether that may be 95 %."""
     return judge_coverage(int(np.sum(np.abs(off) < norm.isf((1 - NOMINAL) / 2))), off.size)
 
 
-def _pooled(coverages: list[dict[str, Any]]) -> dict[str, Any]:
+def _pooled(coverages: list[Row]) -> Row:
     """Judge coverages of modes and quantities together."""
     return judge_coverage(sum(c["hits"] for c in coverages), sum(c["n"] for c in coverages))
 
 
-def verdicts(rows: list[dict[str, Any]], *, quick: bool) -> dict[str, bool]:
+def verdicts(rows: list[Row], *, quick: bool) -> dict[str, bool]:
     """Say what was asked and whether it is so."""
     sure = [row for row in rows if row["n"] >= 300]
     headline = [row for row in rows if row["case"] in HEADLINES]
@@ -187,7 +191,7 @@ def verdicts(rows: list[dict[str, Any]], *, quick: bool) -> dict[str, bool]:
     return {name: bool(held) for name, held in passed.items()}
 
 
-def shortfalls(rows: list[dict[str, Any]]) -> list[str]:
+def shortfalls(rows: list[Row]) -> list[str]:
     """List what is short of what was asked, case by case."""
     short = []
     for row in rows:
@@ -208,10 +212,56 @@ def shortfalls(rows: list[dict[str, Any]]) -> list[str]:
     return short
 
 
-def _too_far(row: dict[str, Any]) -> bool:
+def _too_far(row: Row) -> bool:
     """Tell whether an error is beyond what was asked, its own scatter allowed for."""
     asked = row.get("asked")
     return asked is not None and row["rmse_over_bound"] - 2 * row["its_error"] > asked
+
+
+def claims(answer: Row) -> Iterator[Claim]:
+    """Claim coverages, and errors beside the Cramér-Rao bound."""
+    rows = answer["cases"]
+    kinds = dict.fromkeys(row["case"] for row in rows)
+    short = {row["case"] for row in rows if not row["coverage"]["holds"]}
+    yield Claim(
+        "kinds of records whose 95 % intervals of f and ζ cover",
+        f"{len(kinds) - len(short)} of {len(kinds)}",
+        "99.9 %",
+        met=not short,
+    )
+    head = [row for row in rows if row["n"] + row["refused"] == HEADLINE]
+    yield covered(
+        "coverage of 95 % intervals in the headline kinds",
+        [row["coverage"] for row in head],
+        f"half as wide again {percents(row['too_wide']['share'] for row in head)}, "
+        f"a third less wide {percents(row['too_narrow']['share'] for row in head)}",
+    )
+    fused = [row["as_if_independent"] for row in rows if "as_if_independent" in row]
+    yield Claim(
+        "the same where sources are averaged as if independent (control)",
+        percents(row["share"] for row in fused),
+    )
+    bounded = [row for row in rows if "rmse_over_bound" in row]
+    single = [row for row in bounded if "one channel" in row["case"]]
+    sizes = Counter(row["case"] for row in rows)  # f and ζ of each mode
+    several = [row for row in bounded if sizes[row["case"]] > 2]
+    others = [row for row in bounded if row not in single and row not in several]
+    for what, own in (
+        ("one mode in three channels", others),
+        ("several modes", several),
+        ("one mode in a single channel", single),
+    ):
+        asked = [row["asked"] for row in own if row["asked"] is not None]
+        yield Claim(
+            f"root mean square errors over the Cramér-Rao bound, {what}",
+            span(row["rmse_over_bound"] for row in own),
+            f"± {number(max(row['its_error'] for row in own))} at most",
+            f"{span(asked)} asked" if asked else "",
+            not any(
+                row["asked"] and row["rmse_over_bound"] - 2 * row["its_error"] > row["asked"]
+                for row in own
+            ),
+        )
 
 
 if __name__ == "__main__":

@@ -22,7 +22,6 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from scipy import fft
@@ -32,9 +31,12 @@ from lmshealth.io.log import Log
 from models.dynamics.stages import stage_named
 from models.recordings.formats import write_log
 from models.recordings.recording import Recording, record
+from studies.harness.claims import Claim, number
+from studies.harness.study import Row, Study
 from studies.identification.cases import CASES
 from studies.identification.records import describe
-from studies.record import Study
+
+STEP = "identify"
 
 CASE = next(case for case in CASES if case.name == "three modes, three channels, 60 s")
 SECONDS = 60.0
@@ -44,7 +46,7 @@ SIGNALS = ("delta_e", "acc_feed", "acc_pitch", "acc_between")
 def main() -> None:
     """Run the study; ``--quick`` repeats less, with a shorter log, and records nothing."""
     study = Study(__file__, __doc__)
-    answer: dict[str, Any] = {
+    answer: Row = {
         "record": headline(5 if study.quick else 40),
         "log": long_log(4, 15.0) if study.quick else long_log(15),
     }
@@ -68,7 +70,7 @@ def headline_log(seed: int) -> Log:
     return CASE.make(np.random.default_rng(seed), CASE.modes, CASE.noise)
 
 
-def headline(n: int) -> dict[str, Any]:
+def headline(n: int) -> Row:
     """Identify the headline record, beside one product of matrices that every machine knows."""
     stage = describe(CASE.modes)
     square = np.random.default_rng(0).standard_normal((500, 500))
@@ -87,7 +89,7 @@ def headline(n: int) -> dict[str, Any]:
     }
 
 
-def long_log(n: int, seconds: float = SECONDS) -> dict[str, Any]:
+def long_log(n: int, seconds: float = SECONDS) -> Row:
     """Take a log of the simulated stage from Parquet to its modes."""
     with parquet_log(seconds) as (yardstick, all_of_it, n_samples):
         yardstick(), all_of_it()
@@ -139,6 +141,32 @@ def four_channels(seconds: float) -> Recording:
     # A third accelerometer halfway between the other two, with the noise of one.
     between = (feed + pitch) / 2 + 0.1 * feed.std() * rng.standard_normal(feed.size)
     return replace(made, columns={**made.columns, "acc_between_m_s2": between})
+
+
+def claims(answer: Row) -> Iterator[Claim]:
+    """Claim time and memory."""
+    record, log = answer["record"], answer["log"]
+    yield Claim(
+        "three modes in three channels of 60 s at 1 kHz, least time",
+        f"{number(record['least_s'])} s",
+        f"of {record['n']} turns",
+        "0.05 s asked",
+        record["least_s"] < 0.05,
+    )
+    yield Claim(
+        "a minute of four channels at 20 kHz, over reading and transforming it",
+        number(log["median_ratio"]),
+        f"median of {log['n']} turns",
+        "3 asked",
+        log["median_ratio"] <= 3,
+    )
+    yield Claim(
+        "its memory over that of the record",
+        number(log["memory_over_record"]),
+        "",
+        "3 asked",
+        log["memory_over_record"] <= 3,
+    )
 
 
 if __name__ == "__main__":

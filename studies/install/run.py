@@ -29,12 +29,15 @@ import subprocess
 import sys
 import tempfile
 import venv
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from studies.record import Study
+from studies.harness.claims import Claim, number
+from studies.harness.study import Row, Study
+
+STEP = "batch"
 
 ROOT = Path(__file__).parents[2]
 SOURCES = ("pyproject.toml", "README.md", "LICENSE", "lmshealth")
@@ -63,7 +66,7 @@ print(json.dumps(sizes))
 def main() -> None:
     """Run the study; ``--quick`` measures once what is installed already, and records nothing."""
     study = Study(__file__, __doc__)
-    answer: dict[str, Any] = {}
+    answer: Row = {}
     if study.quick:
         answer["start"] = started(Path(sys.executable), ROOT, turns=1, warm=False)
     else:
@@ -98,7 +101,7 @@ def installed(folder: Path) -> Path:
     return python
 
 
-def sizes(python: Path, environment: Path) -> dict[str, Any]:
+def sizes(python: Path, environment: Path) -> Row:
     """Give the megabytes of an environment, and of its largest distributions."""
     done = subprocess.run([python, "-c", _SIZES], check=True, capture_output=True, text=True)
     found = {name: size / 1e6 for name, size in json.loads(done.stdout).items()}
@@ -115,7 +118,7 @@ def sizes(python: Path, environment: Path) -> dict[str, Any]:
     }
 
 
-def started(python: Path, folder: Path, turns: int, *, warm: bool = True) -> dict[str, Any]:
+def started(python: Path, folder: Path, turns: int, *, warm: bool = True) -> Row:
     """Measure what fresh interpreters take, in turns, the first of which may count for nothing."""
     rounds = [
         {name: spent(python, words, folder) for name, words in PROGRAMS.items()}
@@ -141,6 +144,32 @@ def spent(python: Path, words: tuple[str, ...], folder: Path) -> float:
     subprocess.run([python, *words], check=True, capture_output=True, cwd=folder)
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
     return after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+
+
+def claims(answer: Row) -> Iterator[Claim]:
+    """Claim what the package costs before it does anything."""
+    start, size, passed = answer["start"], answer["size"], answer["passed"]
+    own, bare = start["cpu_s"]["import lmshealth"], start["cpu_s"]["import numpy, scipy, pandas"]
+    yield Claim(
+        "import lmshealth, processor time",
+        f"{number(own)} s",
+        f"least of {start['turns']} turns",
+        f"1.5 s asked; numpy, scipy and pandas {number(bare)} s",
+        passed["import in 1.5 s"],
+    )
+    yield Claim(
+        "lmshealth --help, over the import of numpy, scipy and pandas",
+        f"{number(start['times_bare']['--help'])} times",
+        f"median of {start['turns']} turns",
+        "less than once asked",
+        passed["so does help"],
+    )
+    yield Claim(
+        "megabytes installed, of all distributions",
+        number(size["distributions_mb"]),
+        "",
+        f"lmshealth itself {number(size['lmshealth_mb'])}",
+    )
 
 
 if __name__ == "__main__":

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import matplotlib
 from matplotlib.figure import Figure
 
-from studies.ranks import COLOURS, draw_ecdf
+from studies.common.ranks import COLOURS, draw_ecdf
+from studies.harness.study import read_record
 
 HERE = Path(__file__).parent
 
@@ -16,7 +16,7 @@ HERE = Path(__file__).parent
 def main() -> None:
     """Draw a panel for the map believed, one for its error, one for the control."""
     matplotlib.rcParams["svg.hashsalt"] = "lifetimes_raw"
-    result = json.loads((HERE / "result.json").read_text())
+    result = read_record(__file__)
     figure = Figure(figsize=(11.5, 4.4), layout="constrained")
     axes = figure.subplots(1, 3, sharey=True)
     for ax, (name, rows) in zip(axes, result["ranks"].items(), strict=True):

@@ -33,9 +33,9 @@ Run time
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -45,12 +45,15 @@ from lmshealth.prognosis.remaining_life import prognose
 from lmshealth.prognosis.results import Prognosis
 from lmshealth.stage.description import Stage, load_stage
 from lmshealth.tracking.track import accepted_estimates, track
+from studies.common.lives import RAW, history_of, identified, life_of
+from studies.common.ranks import N_DRAWS, Array, bands, judge, rank, uniform
+from studies.harness.claims import Claim, counted, ranked
+from studies.harness.study import Row, Study
 from studies.lifetimes_raw.lives import N_LOGS, SECONDS, STAGE, PriorPlan, plan_of
-from studies.lives import history_of, life_of
-from studies.ranks import N_DRAWS, Array, Row, bands, judge, rank, uniform
-from studies.raw_lives import RAW, identified
-from studies.record import Study
 from studies.sbc_epoch.lives import believing
+
+STEP = "prognose"
+CONTROL = "draws pulled to half their distance"
 
 SEED = 20261122
 BELIEVED, STATED = "map believed", "map error of 5 %"
@@ -129,7 +132,7 @@ def quantities(found: Prognosis, stage: Stage) -> Array:
     return np.hstack([found.health / baseline, left, days])
 
 
-def judged(rows: list[Row]) -> dict[str, Any]:
+def judged(rows: list[Row]) -> Row:
     """Judge the ranks of every quantity, and what is said of machines that keep their health."""
     done = [row for row in rows if row["rank"] is not None]
     ranks: dict[str, dict[str, Row]] = {}
@@ -162,13 +165,32 @@ def judged(rows: list[Row]) -> dict[str, Any]:
     }
 
 
-def verdicts(answer: dict[str, Any]) -> dict[str, bool]:
+def verdicts(answer: Row) -> dict[str, bool]:
     """Say what was asked and whether it is so."""
     found = answer["ranks"]
     checks = {f"ranks are uniform: {BELIEVED}": uniform(found[BELIEVED])}
     if found[HALVED][QUANTITIES[0]]["n"] >= 0.9 * N_LIVES:  # fewer tell little
         checks[f"they are not: {HALVED}"] = not uniform(found[HALVED])
     return checks
+
+
+def claims(answer: Row) -> Iterator[Claim]:
+    """Claim the remaining life from raw samples on, and of machines that keep their health."""
+    for kind, rows in answer["ranks"].items():
+        if kind != STATED:
+            yield from ranked(f"from raw logs, {kind}", rows.values(), control=kind == CONTROL)
+    kept, lost = answer["no_limit_within_horizon"], answer["limit_within_horizon"]
+    yield counted(
+        "lives that reach no limit within the horizon are told that no end is visible",
+        kept["no_end_visible"],
+        kept["n"],
+    )
+    yield counted(
+        "lives that do reach one are told the same",
+        lost["no_end_visible"],
+        lost["n"],
+        met=lost["no_end_visible"] == 0,
+    )
 
 
 if __name__ == "__main__":

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
 from unittest.mock import patch
 
 import numpy as np
@@ -11,6 +10,7 @@ from lmshealth import identify
 from lmshealth.modal.ambient import cluster_fit as band
 from lmshealth.signal import tone_removal as tones
 from lmshealth.stage.description import Description, ModeSpec, Order, Stage
+from studies.harness.study import Row
 from studies.line_test.signals import (
     FLOOR,
     RATE,
@@ -55,7 +55,7 @@ def modes(
     n: int,
     crossings: tuple[float, ...] = CROSSINGS,
     places: tuple[float, ...] = PLACES_ON_MODE,
-) -> dict[str, Any]:
+) -> Row:
     """Tell by how many σ lines on a mode move it, with lines kept out and without."""
     rows = []
     for seed in range(n):
@@ -78,10 +78,10 @@ def modes(
     }
 
 
-def strength_of_moves(rows: list[dict[str, Any]], times: float) -> dict[str, Any]:
+def strength_of_moves(rows: list[Row], times: float) -> Row:
     """Sum up the moves by lines of one strength; a mode that is refused is not in its place."""
     own = [row for row in rows if row["times_peak"] == times]
-    answer: dict[str, Any] = {"times_peak": times, "n": len(own)}
+    answer: Row = {"times_peak": times, "n": len(own)}
     for suffix in ("", "_with_lines_left_in"):
         moved = [row["moved" + suffix] for row in own]
         kept = np.abs([move for move in moved if move is not None])
@@ -92,7 +92,7 @@ def strength_of_moves(rows: list[dict[str, Any]], times: float) -> dict[str, Any
     return answer
 
 
-def moves(values: Array, at: float, std: float, velocity: Array | None = None) -> dict[str, Any]:
+def moves(values: Array, at: float, std: float, velocity: Array | None = None) -> Row:
     """Return how many σ a mode has moved, with lines kept out and without."""
     moved = (estimate(values, velocity)[0] - at) / std
     # Strong lines are taken out of the transforms, and weak ones masked.
@@ -107,7 +107,7 @@ def moves(values: Array, at: float, std: float, velocity: Array | None = None) -
     }
 
 
-def orders(seed: int, times: float) -> dict[str, Any]:
+def orders(seed: int, times: float) -> Row:
     """Let an order of the velocity cross the mode: six moves, each a little faster."""
     rng = rng_of(8, seed, round(10 * times))
     speeds = 0.004 * MODE * np.linspace(0.96, 1.04, 6)

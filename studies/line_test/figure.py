@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
-from typing import Any
 
 import matplotlib
 import numpy as np
@@ -12,13 +10,15 @@ from matplotlib.axes import Axes
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 
+from studies.harness.study import Row, read_record
+
 HERE = Path(__file__).parent
 BLUE, ORANGE, GREEN, PINK, BLACK = "#0072b2", "#d55e00", "#009e73", "#cc79a7", "#000000"
 MARKERS = "osD"
 _LEAST_RATE = 1e-4
 
 
-def draw_alarms(ax: Axes, rows: list[dict[str, Any]], controls: list[dict[str, Any]]) -> None:
+def draw_alarms(ax: Axes, rows: list[Row], controls: list[Row]) -> None:
     """Draw measured rates over declared ones, every background in a row of its own."""
     names = [row["background"] for row in rows] + ["control: rate not shared",
                                                   "control: highest ordinate"]  # fmt: skip
@@ -44,7 +44,7 @@ def draw_alarms(ax: Axes, rows: list[dict[str, Any]], controls: list[dict[str, A
     ax.legend(fontsize=7, loc="lower center", frameon=True)
 
 
-def draw_border(ax: Axes, rows: list[dict[str, Any]]) -> None:
+def draw_border(ax: Axes, rows: list[Row]) -> None:
     """Draw alarms of one resonance over its width and height."""
     widths = sorted({row["width_ordinates"] for row in rows})
     heights = sorted({row["height_db"] for row in rows})
@@ -63,7 +63,7 @@ def draw_border(ax: Axes, rows: list[dict[str, Any]]) -> None:
     ax.figure.colorbar(image, ax=ax, label="share of spectra")
 
 
-def draw_detection(ax: Axes, kinds: dict[str, list[dict[str, Any]]]) -> None:
+def draw_detection(ax: Axes, kinds: dict[str, list[Row]]) -> None:
     """Draw the share found over the strength, against the best detectors."""
     for (name, rows), colour, marker in zip(
         kinds.items(), (BLUE, GREEN, ORANGE), MARKERS, strict=True
@@ -85,7 +85,7 @@ def draw_detection(ax: Axes, kinds: dict[str, list[dict[str, Any]]]) -> None:
     ax.grid(alpha=0.25)
 
 
-def draw_errors(ax: Axes, rows: list[dict[str, Any]]) -> None:
+def draw_errors(ax: Axes, rows: list[Row]) -> None:
     """Draw errors of frequency and amplitude against their bounds."""
     kept = [row for row in rows if row["share_found"] > 0.3]
     ratio = [row["ratio_db"] for row in kept]
@@ -104,7 +104,7 @@ def draw_errors(ax: Axes, rows: list[dict[str, Any]]) -> None:
     ax.grid(alpha=0.25, which="both")
 
 
-def draw_company(ax: Axes, beside: list[dict[str, Any]], strokes: list[dict[str, Any]]) -> None:
+def draw_company(ax: Axes, beside: list[Row], strokes: list[Row]) -> None:
     """Draw what is found beside a strong line, and in strokes together."""
     for contrast, colour, marker in zip((20, 30), (BLUE, ORANGE), "os", strict=True):
         rows = [row for row in beside if row["contrast_db"] == contrast]
@@ -126,7 +126,7 @@ def draw_company(ax: Axes, beside: list[dict[str, Any]], strokes: list[dict[str,
     ax.grid(alpha=0.25)
 
 
-def draw_moves(ax: Axes, modes: dict[str, Any]) -> None:
+def draw_moves(ax: Axes, modes: Row) -> None:
     """Draw how far each line moves the mode, and how often it is refused."""
     rows = modes["rows"] + modes["orders"]
     for key, colour, marker, shift, label in (
@@ -157,7 +157,7 @@ def draw_moves(ax: Axes, modes: dict[str, Any]) -> None:
 def main() -> None:
     """Draw six panels."""
     matplotlib.rcParams["svg.hashsalt"] = "line_test"
-    result = json.loads((HERE / "result.json").read_text())
+    result = read_record(__file__)
     figure = Figure(figsize=(13.0, 8.0), layout="constrained")
     axes = figure.subplots(2, 3)
     draw_alarms(axes[0, 0], result["false_alarms"], result["controls"])

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
 
 import numpy as np
 from scipy.stats import ncx2
@@ -17,6 +16,7 @@ from lmshealth.signal.spectral_lines import find_lines, find_lines_by_velocity
 from models.dynamics.stages import STAGES, stage_named
 from models.recordings.formats import write_log
 from models.recordings.strokes import full_stroke, record_strokes
+from studies.harness.study import Row
 from studies.line_test.signals import (
     BAND,
     FLOOR,
@@ -37,7 +37,7 @@ CONTRASTS, GAPS = (20, 30), (4.5, 6.0, 8.0, 10.0, 14.0, 20.0)
 STROKES, STROKE, STROKE_DB = (1, 2, 4, 8, 16, 32), 0.5, 8.0
 
 
-def detection(n: int, long: float) -> dict[str, list[dict[str, Any]]]:
+def detection(n: int, long: float) -> dict[str, list[Row]]:
     """Find a line of every strength in three kinds of noise, and tell its errors."""
     on_peak = resonances(0.002, 40, (166.7,))
     kinds = {
@@ -53,7 +53,7 @@ def detection(n: int, long: float) -> dict[str, list[dict[str, Any]]]:
 
 def strength(
     n: int, k: int, ratio_db: float, seconds: float, density: Density, place: float | None
-) -> dict[str, Any]:
+) -> Row:
     """Find lines of one strength, somewhere in the band or within an ordinate of a place."""
     rng = rng_of(3, k, round(ratio_db))
     off: list[tuple[float, float]] = []
@@ -83,7 +83,7 @@ def strength(
     }
 
 
-def beside(n: int) -> list[dict[str, Any]]:
+def beside(n: int) -> list[Row]:
     """Find a line of 25 dB so many ordinates beside a stronger one."""
     rows = []
     for i, contrast in enumerate(CONTRASTS):
@@ -120,7 +120,7 @@ def unsteady(rng: np.random.Generator, kind: str, ratio_db: float) -> Array:
     return np.asarray(amplitude(ratio_db, FLOOR, SHORT) * line)
 
 
-def satellites(n: int) -> list[dict[str, Any]]:
+def satellites(n: int) -> list[Row]:
     """Count how often a strong line alone shows a second one."""
     rows = []
     for i, kind in enumerate(("steady", "wanders", "drifts", "fades", "halves")):
@@ -135,7 +135,7 @@ def satellites(n: int) -> list[dict[str, Any]]:
     return rows
 
 
-def strokes(n: int) -> list[dict[str, Any]]:
+def strokes(n: int) -> list[Row]:
     """Find an order of the velocity in strokes of half a second, together and each alone."""
     rows = []
     for count in STROKES:
@@ -171,7 +171,7 @@ def stroke_log(rng: np.random.Generator, count: int) -> tuple[Log, float]:
     return make_log(values, sweep), f
 
 
-def simulated_strokes() -> list[dict[str, Any]]:
+def simulated_strokes() -> list[Row]:
     """Tell what the strokes of the simulated stages show together, and each on its own."""
     rows = []
     for name in STAGES:

@@ -28,10 +28,11 @@ Run time
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import partial
-from typing import Any
 
+from studies.harness.claims import Claim, counted, percents
+from studies.harness.study import Row, Study
 from studies.line_test.crossing import modes
 from studies.line_test.finding import beside, detection, satellites, simulated_strokes, strokes
 from studies.line_test.signals import (
@@ -45,7 +46,8 @@ from studies.line_test.signals import (
     resonances,
 )
 from studies.line_test.trials import LONG, SHORT, USUAL, rated, rng_of, tested
-from studies.record import Study
+
+STEP = "lines"
 
 DECLARED = (0.05, 0.01, 0.001)
 BACKGROUNDS: dict[str, tuple[float, Density]] = {
@@ -74,7 +76,7 @@ def main() -> None:
     quick, once = study.quick, study.trials.once
     names = ["white, 3 s", "resonances of 0.5 %, 3 s"] if quick else list(BACKGROUNDS)
     share = 0.01 if quick else 1.0
-    answer: dict[str, Any] = {
+    answer: Row = {
         "false_alarms": study.trials.collect(alarms, [(name, share) for name in names]),
         "controls": once(controls, 10 if quick else 400),
         "border": once(border, 0 if quick else 400),
@@ -89,7 +91,7 @@ def main() -> None:
     study.conclude(answer, not_met=NOT_MET)
 
 
-def verdicts(answer: dict[str, Any]) -> dict[str, bool]:
+def verdicts(answer: Row) -> dict[str, bool]:
     """Say what was asked and whether it is so."""
     rates = [rate for row in answer["false_alarms"] for rate in row["rates"]]
     found = {row["ratio_db"]: row["share_found"] for row in answer["detection"]["white, 3 s"]}
@@ -114,7 +116,7 @@ def verdicts(answer: dict[str, Any]) -> dict[str, bool]:
     return {name: bool(passed) for name, passed in checks.items()}
 
 
-def alarms(name: str, share: float) -> dict[str, Any]:
+def alarms(name: str, share: float) -> Row:
     """Count the alarms in noise of one kind at every declared rate."""
     seconds, density = BACKGROUNDS[name]
     n = round(share * (3000 if seconds == SHORT else 400))
@@ -130,7 +132,7 @@ def alarms(name: str, share: float) -> dict[str, Any]:
     return {"background": name, "rates": [rated(hits[d], n, d) for d in DECLARED]}
 
 
-def controls(n: int) -> list[dict[str, Any]]:
+def controls(n: int) -> list[Row]:
     """Count alarms of two tests that must raise theirs."""
     n_tests = 4 * (BAND[1] - BAND[0]) * SHORT
     ways: dict[str, tuple[Density, Callable[[Array], bool]]] = {
@@ -149,7 +151,7 @@ def controls(n: int) -> list[dict[str, Any]]:
     return rows
 
 
-def border(n: int) -> list[dict[str, Any]]:
+def border(n: int) -> list[Row]:
     """Count alarms of single resonances of damping 0.2 %: how narrow and low may they be."""
     rows = []
     for i, place in enumerate(BORDER_PLACES):
@@ -161,6 +163,45 @@ def border(n: int) -> list[dict[str, Any]]:
                 rows.append({"width_ordinates": width, "height_db": height,
                              **rated(hits, n, USUAL)})  # fmt: skip
     return rows
+
+
+def claims(answer: Row) -> Iterator[Claim]:
+    """Claim false alarms, what is found, and what lines do to a mode."""
+    rates = [rate for row in answer["false_alarms"] for rate in row["rates"]]
+    controls = answer["controls"]
+    yield Claim(
+        "declared rates of false alarms that are raised",
+        f"{sum(rate['raised'] for rate in rates)} of {len(rates)}",
+        "99 % intervals",
+        "two tests that must raise theirs do"
+        if all(row["raised"] for row in controls)
+        else "controls are not found out",
+        not any(rate["raised"] for rate in rates),
+    )
+    found = answer["detection"]["white, 3 s"]
+    for row in found:
+        if row["ratio_db"] in (16, 18, 20, 24):
+            yield counted(
+                f"lines of {row['ratio_db']} dB found in white noise of 3 s",
+                round(row["share_found"] * row["n"]),
+                row["n"],
+                f"{percents([row['best_any_frequency']])} by who knows the density",
+            )
+    moved = answer["modes"]["strengths"]
+    hits = [round(row["share_in_place"] * row["n"]) for row in moved]
+    yield counted(
+        "a mode stays within σ under lines of 0.3 to 1000 times its peak",
+        sum(hits),
+        sum(row["n"] for row in moved),
+    )
+    worst = min(moved, key=lambda row: row["share_in_place"])
+    yield counted(
+        f"the same at {worst['times_peak']:g} times the peak, where it is worst",
+        round(worst["share_in_place"] * worst["n"]),
+        worst["n"],
+        "95 % asked; with lines left in " + percents([worst["share_in_place_with_lines_left_in"]]),
+        met=worst["share_in_place"] >= 0.95,
+    )
 
 
 if __name__ == "__main__":

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
 from lmshealth.io.log import Channel
 from lmshealth.signal.segments import Segment
 from lmshealth.signal.spectral_lines import find_lines
+from studies.common.metrics import clopper_pearson
+from studies.harness.study import Row
 from studies.line_test.signals import BAND, RATE, Array
-from studies.metrics import clopper_pearson
 
 SHORT, LONG = 3.0, 30.0
 USUAL = 0.01
@@ -28,7 +27,7 @@ def tested(values: Array, declared: float) -> Array:
     return find_lines(channel, Segment(0, values.size, np.nan), RATE, BAND, declared)
 
 
-def rated(hits: int, n: int, declared: float) -> dict[str, Any]:
+def rated(hits: int, n: int, declared: float) -> Row:
     """Put a rate beside the declared one."""
     low, high = clopper_pearson(hits, n, LEVEL)
     return {"declared": declared, "hits": hits, "n": n, "low": low, "high": high,

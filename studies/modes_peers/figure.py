@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
-from typing import Any
 
 import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+
+from studies.harness.study import Row, read_record
 
 HERE = Path(__file__).parent
 COLOURS, MARKERS = ("#0072b2", "#d55e00", "#009e73"), "osD"
@@ -17,7 +17,7 @@ SHIFT = 0.24
 QUANTITIES = {"ln f": "natural frequency", "ln zeta": "damping ratio"}
 
 
-def draw_errors(ax: Axes, cases: list[dict[str, Any]], quantity: str) -> None:
+def draw_errors(ax: Axes, cases: list[Row], quantity: str) -> None:
     """Draw root mean square errors over the bound, a mark for each mode."""
     for k, case in enumerate(cases):
         for y, row in enumerate(case["tools"].values()):
@@ -33,7 +33,7 @@ def draw_errors(ax: Axes, cases: list[dict[str, Any]], quantity: str) -> None:
     ax.set_title(f"Error of the {QUANTITIES[quantity]}", fontsize=10)
 
 
-def draw_coverage(ax: Axes, cases: list[dict[str, Any]]) -> None:
+def draw_coverage(ax: Axes, cases: list[Row]) -> None:
     """Draw how often 95 % intervals hold the truth, full marks for f and open ones for ζ."""
     for k, case in enumerate(cases):
         for y, row in enumerate(case["tools"].values()):
@@ -51,7 +51,7 @@ def draw_coverage(ax: Axes, cases: list[dict[str, Any]]) -> None:
     ax.set_title("Coverage of 95 % intervals\n(full: frequency, open: damping)", fontsize=10)
 
 
-def draw_costs(ax: Axes, cases: list[dict[str, Any]], key: str, label: str, title: str) -> None:
+def draw_costs(ax: Axes, cases: list[Row], key: str, label: str, title: str) -> None:
     """Draw time or memory."""
     for k, case in enumerate(cases):
         for y, row in enumerate(case["tools"].values()):
@@ -69,7 +69,7 @@ def draw_costs(ax: Axes, cases: list[dict[str, Any]], key: str, label: str, titl
 def main() -> None:
     """Draw five panels that share the list of programs."""
     matplotlib.rcParams["svg.hashsalt"] = "modes_peers"
-    result = json.loads((HERE / "result.json").read_text())
+    result = read_record(__file__)
     cases = result["cases"]
     figure = Figure(figsize=(14.0, 5.2), layout="constrained")
     axes = figure.subplots(1, 5, sharey=True)

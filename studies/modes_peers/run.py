@@ -34,19 +34,23 @@ from __future__ import annotations
 
 import os
 import time
+from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
 from importlib.metadata import version
 from importlib.util import find_spec
 from multiprocessing import get_context
-from typing import Any
 
 import numpy as np
 from scipy.stats import norm
 
+from studies.harness.claims import Claim, span
+from studies.harness.study import NOMINAL, Row, Study, judge_coverage
 from studies.identification.cases import CASES, Case
 from studies.identification.records import Array
 from studies.modes_peers.memory import peak_of
-from studies.record import NOMINAL, Study, judge_coverage
+
+STEP = "identify"
+OURS = "lmshealth"
 
 PACKAGES = {"pyoma2": "pyOMA-2", "pyOMA": "pyoma-toolbox"}
 NAMES = (
@@ -83,7 +87,7 @@ def main() -> None:
     ]
     with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
         cases = study.trials.collect(compare, tasks, pool=pool)
-    answer: dict[str, Any] = {
+    answer: Row = {
         "versions": {name: version(name) for name in PACKAGES.values()},
         "cases": cases,
         "not_ahead_of": {case["case"]: not_ahead(case) for case in cases},
@@ -94,7 +98,7 @@ def main() -> None:
     study.conclude(answer, not_met=NOT_MET)
 
 
-def compare(name: str, seeds: int, quick: bool) -> dict[str, Any]:
+def compare(name: str, seeds: int, quick: bool) -> Row:
     """Let all tools identify the records of a kind."""
     # Needs the extra: the study says so before it comes here.
     from studies.modes_peers.peers import TOOLS, nearest
@@ -162,13 +166,13 @@ def scores(poles: Array, case: Case, *, ours: bool) -> Array:
     return (value - np.exp(case.truth)) / std
 
 
-def summarise(poles: Array, case: Case) -> list[dict[str, Any]]:
+def summarise(poles: Array, case: Case) -> list[Row]:
     """Errors over the bound, mode by mode."""
     off, m = errors(poles, case), len(case.modes)
     rows = []
     for j, bound in enumerate(case.bound()):
         kept = off[np.isfinite(off[:, j]), j]
-        row: dict[str, Any] = {
+        row: Row = {
             "frequency_hz": case.modes[j % m].frequency,
             "quantity": QUANTITIES[j // m],
             "missed": len(off) - kept.size,
@@ -182,7 +186,7 @@ def summarise(poles: Array, case: Case) -> list[dict[str, Any]]:
     return rows
 
 
-def against(theirs: Array, ours: Array, case: Case) -> dict[str, dict[str, Any]]:
+def against(theirs: Array, ours: Array, case: Case) -> dict[str, Row]:
     """Compare squared errors over the bound record by record, of f and of ζ."""
     excess = (theirs**2 - ours**2) / case.bound() ** 2
     told = {}
@@ -196,9 +200,9 @@ def against(theirs: Array, ours: Array, case: Case) -> dict[str, dict[str, Any]]
     return told
 
 
-def coverage(off: Array) -> dict[str, Any]:
+def coverage(off: Array) -> Row:
     """How often intervals hold the truth, of f and of ζ, and whether that may be 95 %."""
-    told: dict[str, Any] = {}
+    told: Row = {}
     for quantity, part in zip(QUANTITIES, np.hsplit(off, 2), strict=True):
         part = part[np.isfinite(part)]
         if part.size == 0:
@@ -208,7 +212,7 @@ def coverage(off: Array) -> dict[str, Any]:
     return told
 
 
-def verdicts(cases: list[dict[str, Any]], *, quick: bool) -> dict[str, bool]:
+def verdicts(cases: list[Row], *, quick: bool) -> dict[str, bool]:
     """Say what was asked and whether it is so."""
     ours = [next(iter(case["tools"].values())) for case in cases]
     peers = [row for case in cases for row in list(case["tools"].values())[1:]]
@@ -228,7 +232,7 @@ def verdicts(cases: list[dict[str, Any]], *, quick: bool) -> dict[str, bool]:
     return {name: bool(held) for name, held in passed.items()}
 
 
-def not_ahead(case: dict[str, Any]) -> dict[str, list[str]]:
+def not_ahead(case: Row) -> dict[str, list[str]]:
     """Say in which columns each peer is as good as we are, or better."""
     ours, *_ = case["tools"].values()
     told = {}
@@ -239,6 +243,65 @@ def not_ahead(case: dict[str, Any]) -> dict[str, list[str]]:
         columns += ["memory"] * (row["peak_mb"] <= ours["peak_mb"])
         told[name] = columns
     return told
+
+
+def claims(answer: Row) -> Iterator[Claim]:
+    """Claim errors, coverage and time beside other programs on the same records."""
+    cases = answer["cases"]
+    ours = _errors(cases, OURS)
+    yield Claim(
+        "root mean square errors over the Cramér-Rao bound",
+        span(ours),
+        f"± {max(_errors(cases, OURS, 'its_error')):.2f} at most",
+    )
+    for name in dict.fromkeys(tool for case in cases for tool in case["tools"]):
+        if name == OURS or "no intervals" in name:
+            continue
+        own = [case["tools"][name] for case in cases if name in case["tools"]]
+        told = [x["it_is"] for tool in own for x in tool["against_ours"].values()]
+        covers = [bool(tool["coverage"]) for tool in own]
+        yield Claim(
+            f"the same of {name}, and how often it is ahead of us, even, or behind",
+            f"{span(found)}" if (found := _errors(cases, name)) else "no mode",
+            "",
+            f"{told.count('ahead')}, {told.count('even')}, {told.count('behind')} of {len(told)}; "
+            f"{span(tool['time_over_ours'] for tool in own)} times our time"
+            + ("" if any(covers) else ", without intervals"),
+            "ahead" not in told,
+        )
+    bare = [
+        c["tools"][name]["time_over_ours"]
+        for c in cases
+        for name in c["tools"]
+        if "no intervals" in name
+    ]
+    yield Claim("time of SSI-cov without intervals, over ours", span(bare))
+    held = {
+        name: [
+            c["holds"]
+            for case in cases
+            for c in case["tools"].get(name, {}).get("coverage", {}).values()
+        ]
+        for name in dict.fromkeys(tool for case in cases for tool in case["tools"])
+    }
+    yield Claim(
+        "cases in which 95 % intervals cover",
+        f"{sum(held[OURS])} of {len(held[OURS])}",
+        "99.9 %",
+        ", ".join(
+            f"{name} {sum(own)} of {len(own)}" for name, own in held.items() if own and name != OURS
+        ),
+        all(held[OURS]),
+    )
+
+
+def _errors(cases: list[Row], name: str, what: str = "rmse_over_bound") -> list[float]:
+    return [
+        mode[what]
+        for case in cases
+        for mode in case["tools"].get(name, {}).get("modes", [])
+        if mode.get(what) is not None
+    ]
 
 
 if __name__ == "__main__":

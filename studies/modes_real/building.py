@@ -15,8 +15,9 @@ from scipy.stats import norm
 
 from lmshealth import identify, load_stage
 from lmshealth.modal.modes import Modes
-from studies.commands import call
-from studies.metrics import clopper_pearson
+from studies.common.metrics import clopper_pearson
+from studies.harness.command_line import call
+from studies.harness.study import Row
 from studies.modes_real.make_map import PUBLISHED, PUBLISHED_DAMPING
 from studies.modes_real.sets import identify_known, to_log
 
@@ -29,7 +30,7 @@ BEGIN = datetime(2024, 1, 1, tzinfo=UTC)  # the data do not say when; only diffe
 _Z = float(norm.isf(0.025))
 
 
-def study_building(data: Path, *, quick: bool) -> dict[str, Any]:
+def study_building(data: Path, *, quick: bool) -> Row:
     """Analyse the building as a user does; when quick four sensors, one third."""
     record = np.load(data / "palisaden_building" / "Palisaden_dataset.npy", allow_pickle=False)
     if quick:
@@ -47,9 +48,7 @@ def study_building(data: Path, *, quick: bool) -> dict[str, Any]:
     return answer
 
 
-def vary_description(
-    record: np.ndarray[Any, Any], dampings: Sequence[float]
-) -> list[dict[str, Any]]:
+def vary_description(record: np.ndarray[Any, Any], dampings: Sequence[float]) -> list[Row]:
     """Identify the record with other dampings in the description, from which the band follows."""
     rows = []
     for damping in dampings:
@@ -63,14 +62,14 @@ def vary_description(
     return rows
 
 
-def compare_parts(record: np.ndarray[Any, Any], full: Modes) -> list[dict[str, Any]]:
+def compare_parts(record: np.ndarray[Any, Any], full: Modes) -> list[Row]:
     """Identify each third of the record and compare it with the whole."""
     n, rows = record.shape[0] // PARTS, []
     for k in range(PARTS):
         part = identify(to_log(record[k * n : (k + 1) * n], SAMPLE_RATE), load_stage(str(STAGE)))
         std = np.sqrt(np.diag(part.cov)).reshape(2, -1)
         for name in full.names:
-            row: dict[str, Any] = {"part": k, "mode": name}
+            row: Row = {"part": k, "mode": name}
             rows.append(row)
             if name not in part.names:
                 continue
@@ -105,7 +104,7 @@ def write_logs(record: np.ndarray[Any, Any], folder: Path) -> None:
         write_log(folder / f"{k:03d}.h5", record[k * n : (k + 1) * n], k * WINDOW_S / 3600)
 
 
-def evaluate(out: Path, full: Modes, n_samples: int) -> dict[str, Any]:
+def evaluate(out: Path, full: Modes, n_samples: int) -> Row:
     """Compare windows with the published values and with the full record."""
     modes = pd.read_csv(out / "modes.csv")
     health = pd.read_csv(out / "health.csv").iloc[-1]
@@ -129,7 +128,7 @@ def evaluate(out: Path, full: Modes, n_samples: int) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def compare(name: str, windows: pd.DataFrame, full: Modes) -> dict[str, Any]:
+def compare(name: str, windows: pd.DataFrame, full: Modes) -> Row:
     """Compare one mode's windows with the full record."""
     i = full.names.index(name)
     whole = {"frequency_hz": full.frequency[i], "damping_ratio": full.damping_ratio[i]}

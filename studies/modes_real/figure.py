@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
-from typing import Any
 
 import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from studies.harness.study import Row, read_record
+
 HERE = Path(__file__).parent
 DATA, FULL, KNOWN, STEPPED = "#56606b", "#0072b2", "#d55e00", "#009e73"
 
 
-def draw_building(top: Axes, bottom: Axes, name: str, building: dict[str, Any]) -> None:
+def draw_building(top: Axes, bottom: Axes, name: str, building: Row) -> None:
     """Draw frequency and damping of one mode in every window, the thirds and the whole."""
     mode = building["modes"][name]
     windows = [row for row in building["windows"] if row["mode"] == name]
@@ -45,7 +45,7 @@ def draw_building(top: Axes, bottom: Axes, name: str, building: dict[str, Any]) 
     bottom.set_xlabel("time in min")
 
 
-def draw_shear(ax: Axes, rows: list[dict[str, Any]]) -> None:
+def draw_shear(ax: Axes, rows: list[Row]) -> None:
     """Draw relative errors of the shear frame's frequencies, and what its integration does."""
     at = np.arange(1, len(rows) + 1)
     documented, stepped = (
@@ -65,7 +65,7 @@ def draw_shear(ax: Axes, rows: list[dict[str, Any]]) -> None:
     ax.grid(alpha=0.25)
 
 
-def draw_light(ax: Axes, rows: list[dict[str, Any]]) -> None:
+def draw_light(ax: Axes, rows: list[Row]) -> None:
     """Draw the light frame's dampings beside the known one and the resolution."""
     at = np.arange(1, len(rows) + 1)
     zeta, std = (np.array([row.get(k, np.nan) for row in rows]) for k in ("zeta", "zeta_std"))
@@ -84,7 +84,7 @@ def draw_light(ax: Axes, rows: list[dict[str, Any]]) -> None:
     ax.grid(alpha=0.25)
 
 
-def draw_shake(ax: Axes, rows: list[dict[str, Any]]) -> None:
+def draw_shake(ax: Axes, rows: list[Row]) -> None:
     """Draw the table frame's frequencies from each floor against their known ranges."""
     modes = sorted({(row["frame"], row["mode"]) for row in rows})
     floors = sorted({row["floor"] for row in rows})
@@ -118,7 +118,7 @@ def draw_shake(ax: Axes, rows: list[dict[str, Any]]) -> None:
 def main() -> None:
     """Draw the building above, the other sets below."""
     matplotlib.rcParams["svg.hashsalt"] = "modes_real"
-    result = json.loads((HERE / "result.json").read_text())
+    result = read_record(__file__)
     figure = Figure(figsize=(11.0, 9.0), layout="constrained")
     axes = figure.subplots(3, 3, height_ratios=(1, 1, 1.25))
     for column, name in enumerate(result["building"]["modes"]):

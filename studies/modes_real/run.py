@@ -40,12 +40,15 @@ Data
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
+from studies.harness.claims import Claim, number, percents
+from studies.harness.study import Row, Study
 from studies.modes_real.building import study_building
 from studies.modes_real.sets import study_koma, study_mpstd, study_shake, study_weimar
-from studies.record import Study
+
+STEP = "identify"
 
 OUTSIDE = 1.959963984540054
 NOT_MET = {
@@ -74,7 +77,7 @@ def main() -> None:
     if "LMSHEALTH_DATA" not in os.environ:
         raise SystemExit("LMSHEALTH_DATA is not set: it names the folder of real measurements")
     data = Path(os.environ["LMSHEALTH_DATA"])
-    answer: dict[str, Any] = {
+    answer: Row = {
         "seed": 0,
         "building": study_building(data, quick=study.quick),
         "shake": study_shake(data),
@@ -88,12 +91,12 @@ def main() -> None:
     study.conclude(answer, not_met=NOT_MET)
 
 
-def verdicts(answer: dict[str, Any]) -> dict[str, bool]:
+def verdicts(answer: Row) -> dict[str, bool]:
     """Say what was asked and whether it is so."""
     return judge_building(answer["building"]) | judge_others(answer)
 
 
-def judge_building(building: dict[str, Any]) -> dict[str, bool]:
+def judge_building(building: Row) -> dict[str, bool]:
     """Say whether the building is what it is known to be."""
     modes = building["modes"].values()
     low, _, high = building["stiffness"].values()
@@ -133,7 +136,7 @@ def judge_building(building: dict[str, Any]) -> dict[str, bool]:
     }
 
 
-def judge_others(answer: dict[str, Any]) -> dict[str, bool]:
+def judge_others(answer: Row) -> dict[str, bool]:
     """Say whether all others are what they are known to be."""
     shear, light, weak = answer["shear_frame"], answer["light_frame"], answer["weak_mode"]
     shake = answer["shake"]["rows"]
@@ -154,6 +157,62 @@ def judge_others(answer: dict[str, Any]) -> dict[str, bool]:
         "weak mode: 50 Hz is mains and no mode": weak["modes_at_mains"] == 0
         and [line["kind"] for line in weak["lines"]] == ["mains"],
     }
+
+
+def claims(answer: Row) -> Iterator[Claim]:
+    """Claim what is known of a building, frames and a weak mode."""
+    building = answer["building"]
+    modes = building["modes"].values()
+    off = [abs(row["median_frequency_hz"] / row["published_hz"] - 1) for row in modes]
+    n = building["n_windows"]
+    yield Claim(
+        f"a timber building: logs of five minutes in which each of {len(off)} modes is told",
+        f"{min(row['n_windows'] for row in modes)} of {n}",
+        met=all(row["n_windows"] == n for row in modes),
+    )
+    yield Claim(
+        "its median frequencies off the published ones, at most",
+        f"{100 * max(off):.2f} %",
+        "",
+        "0.5 % asked",
+        max(off) < 0.005,
+    )
+    low = min(row["frequency_hz_coverage_95_interval"][0] for row in modes)
+    high = max(row["frequency_hz_coverage_95_interval"][1] for row in modes)
+    half = [row["frequency_hz_coverage_95_control_half_std"] for row in modes]
+    yield Claim(
+        "95 % intervals of its windows hold the frequency of the whole record",
+        percents(row["frequency_hz_coverage_95"] for row in modes),
+        f"{percents([low, high])} (95 %)",
+        f"95 % asked; half the standard deviations {percents(half)}",
+        all(row["frequency_hz_coverage_95_interval"][1] >= 0.95 for row in modes)
+        and answer["passed"]["building: intervals of each third hold the whole"],
+    )
+    light = answer["light_frame"]
+    off = [abs(row["f_hz"] / row["known_f_hz"] - 1) for row in light]
+    yield Claim(
+        f"a light frame: {len(light)} frequencies off the known ones, at most",
+        f"{100 * max(off):.3f} %",
+        "",
+        "0.1 % asked",
+        max(off) < 1e-3,
+    )
+    frame, weak = answer["shear_frame"], answer["weak_mode"]
+    for what in ("documented", "stepped"):
+        held = sum(row[f"holds_{what}_f"] for row in frame)
+        more = "" if what == "documented" else ", as its integration in steps has them"
+        yield Claim(
+            f"a shear frame: frequencies inside their 95 % intervals, {what}{more}",
+            f"{held} of {len(frame)}",
+            met=held == len(frame),
+        )
+    yield Claim(
+        "a mode beside the mains lies where it is known to be, which are no mode",
+        f"{number(weak['f_hz'])} Hz",
+        f"± {number(weak['f_std_hz'])} Hz",
+        "40.5 Hz known",
+        weak["holds_f"] and not weak["modes_at_mains"],
+    )
 
 
 if __name__ == "__main__":

@@ -15,6 +15,7 @@ from lmshealth.io.column_map import load_columns
 from lmshealth.io.log import Channel, Log, Metadata
 from lmshealth.modal.modes import Modes
 from lmshealth.stage.description import Description, ModeSpec, Stage
+from studies.harness.study import Row
 from studies.read_throughput.samples import MAPS
 
 _Z = float(norm.isf(0.025))
@@ -46,7 +47,7 @@ def to_log(values: np.ndarray[Any, Any], rate: float) -> Log:
 
 def identify_known(
     log: Log, frequency: Sequence[float], damping: Sequence[float], channels: Sequence[str] | None
-) -> list[dict[str, Any]]:
+) -> list[Row]:
     """Identify modes that a description names; those refused have their reason instead."""
     specs = tuple(
         ModeSpec(str(k), f, z) for k, (f, z) in enumerate(zip(frequency, damping, strict=True))
@@ -62,7 +63,7 @@ def identify_known(
     ]
 
 
-def tell(modes: Modes, i: int) -> dict[str, Any]:
+def tell(modes: Modes, i: int) -> Row:
     """Give what was identified of one mode."""
     return {
         "f_hz": float(modes.frequency[i]),
@@ -73,7 +74,7 @@ def tell(modes: Modes, i: int) -> dict[str, Any]:
     }
 
 
-def holds(row: dict[str, Any], what: str, truth: float) -> bool:
+def holds(row: Row, what: str, truth: float) -> bool:
     """Whether the 95 % interval of f or ζ, which is one of its logarithm, holds a value."""
     if "refused" in row:
         return False
@@ -81,7 +82,7 @@ def holds(row: dict[str, Any], what: str, truth: float) -> bool:
     return bool(abs(np.log(value / truth)) < _Z * std / value)
 
 
-def study_koma(data: Path) -> list[dict[str, Any]]:
+def study_koma(data: Path) -> list[Row]:
     """Identify the simulated shear frame; beside its parameters those of what was integrated.
 
     Steps of the trapezoidal rule of length h turn the pole λ into ln((1 + λh/2) / (1 - λh/2)) / h.
@@ -104,7 +105,7 @@ def study_koma(data: Path) -> list[dict[str, Any]]:
     return rows
 
 
-def study_weimar(data: Path) -> list[dict[str, Any]]:
+def study_weimar(data: Path) -> list[Row]:
     """Identify the simulated frame of the lowest damping."""
     record = np.load(data / "SIMULATED_weimar_frame/measurement_2.npy")
     log = to_log(record[:, WEIMAR_CHANNELS], WEIMAR_RATE)
@@ -116,7 +117,7 @@ def study_weimar(data: Path) -> list[dict[str, Any]]:
     return rows
 
 
-def study_mpstd(data: Path) -> dict[str, Any]:
+def study_mpstd(data: Path) -> Row:
     """Search for a weak mode beside the mains, without a description."""
     modes = identify(read_log(data / MPSTD), band=MPSTD_BAND)
     f, damping = MPSTD_MODE
@@ -133,9 +134,9 @@ def study_mpstd(data: Path) -> dict[str, Any]:
     }
 
 
-def study_shake(data: Path) -> dict[str, Any]:
+def study_shake(data: Path) -> Row:
     """Identify the frame on a shaking table, floor by floor: the loggers' clocks do not agree."""
-    rows: list[dict[str, Any]] = []
+    rows: list[Row] = []
     for frame, known in SHAKE.items():
         middle = [(low + high) / 2 for low, high, _ in known]
         for floor in FLOORS:

@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
-from typing import Any
 
 import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from studies.harness.study import Row, read_record
+
 HERE = Path(__file__).parent
 UP, DOWN, OTHER = "#0072b2", "#d55e00", "#777777"
 
 
-def draw_map(ax: Axes, calibration: dict[str, Any], dwells: list[dict[str, Any]]) -> None:
+def draw_map(ax: Axes, calibration: Row, dwells: list[Row]) -> None:
     """Draw the map with the dwells that it is made from, and the new ones."""
     ax.plot(calibration["curve_v"], calibration["curve_hz"], color="black", lw=1, label="map")
     known = calibration["dwells"]
@@ -32,7 +32,7 @@ def draw_map(ax: Axes, calibration: dict[str, Any], dwells: list[dict[str, Any]]
     ax.grid(alpha=0.3)
 
 
-def draw_positions(top: Axes, below: Axes, dwells: list[dict[str, Any]]) -> None:
+def draw_positions(top: Axes, below: Axes, dwells: list[Row]) -> None:
     """Draw inferred over measured positions with 90 % intervals, and their difference."""
     turn = max(dwells, key=lambda row: row["roller_v"])["dwell"]
     top.axline((2.0, 2.0), slope=1, color="black", lw=0.8)
@@ -64,7 +64,7 @@ def draw_positions(top: Axes, below: Axes, dwells: list[dict[str, Any]]) -> None
 
 def main() -> None:
     """Draw the study."""
-    result = json.loads((HERE / "result.json").read_text())
+    result = read_record(__file__)
     with matplotlib.rc_context({"svg.hashsalt": "movable_roller", "font.size": 9}):
         figure = Figure(figsize=(9, 4.8), layout="constrained")
         axes = figure.subplot_mosaic([["map", "top"], ["map", "below"]], height_ratios=[3, 2])

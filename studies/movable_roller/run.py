@@ -33,14 +33,16 @@ from __future__ import annotations
 import json
 import os
 import tempfile
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pandas as pd
 
-from studies.commands import call
 from studies.decays.beam import REPEATS
+from studies.harness.claims import Claim, counted, number
+from studies.harness.command_line import call
+from studies.harness.study import Row, Study
 from studies.movable_roller.calibration import (
     PARAMETER,
     Calibration,
@@ -50,7 +52,8 @@ from studies.movable_roller.calibration import (
     write_stage,
 )
 from studies.movable_roller.dwells import write_dwells
-from studies.record import Study
+
+STEP = "infer"
 
 NEW = 2  # the repeat that map and description do not know
 LEAST_INSIDE = 8
@@ -71,7 +74,7 @@ def main() -> None:
     study.conclude(answer)
 
 
-def answered(folder: Path, scratch: Path, *, quick: bool) -> dict[str, Any]:
+def answered(folder: Path, scratch: Path, *, quick: bool) -> Row:
     """Calibrate with two repeats and infer the third.
 
     Parameters
@@ -175,7 +178,7 @@ def infer(track: Path, stage: Path, epochs: int, *, quick: bool) -> pd.DataFrame
     return pd.read_csv(out)
 
 
-def compare(read: pd.DataFrame, track: Path, health: pd.DataFrame) -> list[dict[str, Any]]:
+def compare(read: pd.DataFrame, track: Path, health: pd.DataFrame) -> list[Row]:
     """Line up what was measured in each dwell with what was inferred.
 
     Parameters
@@ -202,7 +205,7 @@ def compare(read: pd.DataFrame, track: Path, health: pd.DataFrame) -> list[dict[
     ]
 
 
-def count(rows: list[dict[str, Any]]) -> dict[str, Any]:
+def count(rows: list[Row]) -> Row:
     """Count the dwells whose measured position lies inside the interval, and size their errors."""
     inferred = [row for row in rows if row["median"] is not None]
     errors = [
@@ -216,7 +219,7 @@ def count(rows: list[dict[str, Any]]) -> dict[str, Any]:
     }
 
 
-def up_and_down(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+def up_and_down(rows: list[Row]) -> list[Row]:
     """Compare positions inferred on the way up with those inferred on the way back.
 
     The interval of a difference is that of two independent ones; where the baseline is one of the
@@ -241,7 +244,7 @@ def up_and_down(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
     return found
 
 
-def too_sure(read: pd.DataFrame, track: Path, found: Calibration) -> dict[str, Any]:
+def too_sure(read: pd.DataFrame, track: Path, found: Calibration) -> Row:
     """Infer with the map taken for exact and the drifts for much better known than they are."""
     stage = write_stage(found, track.parent / "exact", model_std=0.0)
     sure = stage.with_name("track.csv")
@@ -259,14 +262,14 @@ def straight_line(
     epochs: int,
     *,
     quick: bool,
-) -> dict[str, Any]:
+) -> Row:
     """Infer with a map that is a straight line through the same dwells, believed as much."""
     line = calibrate(known, degree=1)
     stage = write_stage(line, track.parent / "line", model_std=model_std)
     return count(compare(read, track, infer(track, stage, epochs, quick=quick)))
 
 
-def describe(found: Calibration, known: pd.DataFrame) -> dict[str, Any]:
+def describe(found: Calibration, known: pd.DataFrame) -> Row:
     """Tell what the map is and how good it is."""
     columns = ["repeat", "dwell", "roller_v", "frequency_hz", "frequency_std_hz"]
     volts = np.linspace(found.low, found.high, 60)
@@ -282,7 +285,7 @@ def describe(found: Calibration, known: pd.DataFrame) -> dict[str, Any]:
     }
 
 
-def judge(answer: dict[str, Any]) -> dict[str, bool]:
+def judge(answer: Row) -> dict[str, bool]:
     """Say whether the positions are found, and whether the controls lose them."""
     rows = answer["dwells"]
     inferred = [row for row in rows if row["median"] is not None]
@@ -308,6 +311,37 @@ def judge(answer: dict[str, Any]) -> dict[str, bool]:
             for control in answer["controls"].values()
         ),
     }
+
+
+def claims(answer: Row) -> Iterator[Claim]:
+    """Claim where a roller under a real beam stands."""
+    inside, passed = answer["inside"], answer["passed"]
+    controls = "; ".join(
+        f"{name}: {row['inside']} of {row['inferred']}" for name, row in answer["controls"].items()
+    )
+    yield counted(
+        "positions inside their 90 % intervals",
+        inside["inside"],
+        inside["inferred"],
+        controls,
+        met=all(passed.values()),
+    )
+    ends = [row["roller_v"] for row in answer["dwells"]]
+    width = [row["q95"] - row["q05"] for row in answer["dwells"] if row["q95"] is not None]
+    share = [100 * value / (max(ends) - min(ends)) for value in width]
+    yield Claim(
+        "width of the intervals, of the travel",
+        f"{number(min(share))} to {number(max(share))} %",
+        "",
+        "3 % asked",
+        passed["no interval is wider than 3 % of the travel"],
+    )
+    apart = max(abs(row["difference_v"]) / row["half_interval_v"] for row in answer["up_and_down"])
+    yield Claim(
+        "up and down differ, over half their interval, at most",
+        number(apart),
+        met=passed["up and down agree within their intervals"],
+    )
 
 
 if __name__ == "__main__":

@@ -34,20 +34,22 @@ from __future__ import annotations
 import json
 import tempfile
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from concurrent.futures import Executor, ProcessPoolExecutor
 from contextlib import nullcontext
 from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from studies.metrics import clopper_pearson
+from studies.common.metrics import clopper_pearson
+from studies.harness.claims import Claim, counted
+from studies.harness.study import Row, Study
 from studies.mutants.making import Mutant, Mutants, reach
 from studies.mutants.trying import ROOT, attempt, collect, digest_of
-from studies.record import Study
+
+STEP = "the tests themselves"
 
 LINKS = {
     "identification": (
@@ -72,7 +74,7 @@ BUDGET_S = 30.0
 ASKED = 0.85
 # The quick form: a mutant of a small module, by its own file of tests.
 QUICK = ("kernel", 1)
-Tests = dict[str, dict[str, Any]]
+Tests = dict[str, Row]
 
 
 def main() -> None:
@@ -129,7 +131,7 @@ def tried(
     plans: Path,
     drawn: list[tuple[str, int, Mutant]],
     tests: Tests,
-) -> list[dict[str, Any]]:
+) -> list[Row]:
     """Try mutants and controls; give a row for each."""
     shared, tasks, rows, controlled = _project(), [], [], set()
     for module, index, mutant in drawn:
@@ -174,7 +176,7 @@ def chosen(tests: Tests, module: str, lines: int, budget_s: float) -> list[str]:
     return [*first, *rest][: max(int(np.searchsorted(seconds, budget_s, "right")), 1)]
 
 
-def told(rows: list[dict[str, Any]], links: dict[str, tuple[str, ...]]) -> dict[str, Any]:
+def told(rows: list[Row], links: dict[str, tuple[str, ...]]) -> Row:
     """Count what became of mutants and controls."""
     mutants = [row for row in rows if row["change"].isdecimal()]
     controls = {kind: [row for row in rows if row["change"].startswith(kind)]
@@ -213,7 +215,7 @@ def told(rows: list[dict[str, Any]], links: dict[str, tuple[str, ...]]) -> dict[
     }  # fmt: skip
 
 
-def counts(rows: Iterable[dict[str, Any]]) -> dict[str, Any]:
+def counts(rows: Iterable[Row]) -> Row:
     """Count fates, with the share of what is noticed and its 95 % interval."""
     fates = Counter(row["fate"] for row in rows)
     n, survived = fates.total(), fates["survived"]
@@ -237,6 +239,29 @@ def _project() -> str:
     files += [path for path in (ROOT / "tests").rglob("*.py") if not path.name.startswith("test_")]
     plain = (path for path in sorted(files) if path.is_file() and path.suffix != ".pyc")
     return digest_of(*(path.read_bytes() for path in plain))
+
+
+def claims(answer: Row) -> Iterator[Claim]:
+    """Claim which small changes of the science make a test fail."""
+    controls, passed = answer["controls"], answer["passed"]
+    found = answer["mutants"]
+    planted = controls["planted"]
+    yield counted(
+        "small changes of the science that make a test fail, or never end",
+        found["killed"] + found["timed_out"],
+        found["n"],
+        f"85 % asked; errors planted in one function of each module: "
+        f"{planted.get('killed', 0)} of {sum(planted.values())} found",
+        met=all(passed.values()),
+    )
+    for link, row in answer["links"].items():
+        yield counted(f"the same in {link}", row["killed"] + row["timed_out"], row["n"])
+    numbers = [answer["kinds"][kind] for kind in ("number", "swap op") if kind in answer["kinds"]]
+    yield counted(
+        "the same where a number, an operation or a comparison is another",
+        sum(row["killed"] + row["timed_out"] for row in numbers),
+        sum(row["n"] for row in numbers),
+    )
 
 
 if __name__ == "__main__":

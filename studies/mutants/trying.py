@@ -16,10 +16,10 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 from coverage import CoverageData
 
+from studies.harness.study import Row
 from studies.mutants.making import Mutants, bits, planted
 from studies.mutants.watching import WATCH
 
@@ -44,7 +44,7 @@ class Outcome:
     """
 
     code: int
-    rows: list[dict[str, Any]]
+    rows: list[Row]
     seconds: float
 
     @property
@@ -60,7 +60,7 @@ class Outcome:
         return next((row["test"] for row in self.rows if row["failed"]), "")
 
 
-def collect(file: str, digest: str, *, modules: tuple[str, ...]) -> dict[str, Any]:
+def collect(file: str, digest: str, *, modules: tuple[str, ...]) -> Row:
     """Run a file of tests on the project as it is; give what each test runs of the modules.
 
     ``digest`` is that of all that this depends on, and tells trials from each other.
@@ -101,9 +101,7 @@ def _lines(data: CoverageData, tree: Path) -> dict[str, dict[str, str]]:
     }
 
 
-def attempt(
-    module: str, change: str, digest: str, *, plans: Path, root: Path = ROOT
-) -> dict[str, Any]:
+def attempt(module: str, change: str, digest: str, *, plans: Path, root: Path = ROOT) -> Row:
     """Run the tests of a plan on a changed module, until one fails.
 
     ``change`` is the number of a mutant, ``as it is``, or ``planted`` and a line.

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
-from typing import Any
 
 import matplotlib
 import numpy as np
 from matplotlib.figure import Figure
+
+from studies.harness.study import Row, read_record
 
 HERE = Path(__file__).parent
 STYLES = {
@@ -18,7 +18,7 @@ STYLES = {
 HOURS_PER_WEEK = 168
 
 
-def draw(result: dict[str, Any]) -> Figure:
+def draw(result: Row) -> Figure:
     """Draw medians with 90 % intervals over the weeks, the truth, and when B reaches its limit."""
     figure = Figure(figsize=(8, 3.6), layout="constrained")
     ax = figure.subplots()
@@ -60,7 +60,7 @@ def draw(result: dict[str, Any]) -> Figure:
 
 def main() -> None:
     """Draw the study."""
-    result = json.loads((HERE / "result.json").read_text())
+    result = read_record(__file__)
     with matplotlib.rc_context({"svg.hashsalt": "new_machine", "font.size": 9}):
         draw(result).savefig(HERE / "figure.svg", metadata={"Date": None})
 

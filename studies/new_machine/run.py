@@ -34,14 +34,18 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
 
+from studies.harness.claims import Claim, counted, number
+from studies.harness.study import Row, Study
 from studies.new_machine.cut import APART_H, SLOWER, stiffness_of
-from studies.record import Study
+
+STEP = "infer"
 
 HERE = Path(__file__).parent
 ROOT = HERE.parent.parent
@@ -79,14 +83,14 @@ def steps() -> list[Step]:
     return found
 
 
-def begun(scratch: Path) -> dict[str, Any]:
+def begun(scratch: Path) -> Row:
     """Follow the steps that take little, and compare what they show and make."""
     told = followed(steps()[:QUICK_STEPS], scratch)
     made = files_as_shown(scratch / "bench")
     return {"steps": told, "files_as_shown": made, "passed": as_shown(told, made)}
 
 
-def followed(some: list[Step], scratch: Path) -> list[dict[str, Any]]:
+def followed(some: list[Step], scratch: Path) -> list[Row]:
     """Follow steps in an empty folder that sees the project."""
     (scratch / "studies").symlink_to(HERE.parent)
     return [follow(step, scratch) for step in some]
@@ -101,7 +105,7 @@ def files_as_shown(bench: Path) -> dict[str, bool]:
     }  # fmt: skip
 
 
-def answered(scratch: Path) -> dict[str, Any]:
+def answered(scratch: Path) -> Row:
     """Follow the tutorial to its end, and compare what it concludes with what is true."""
     told = followed(steps(), scratch)
     bench = scratch / "bench"
@@ -120,7 +124,7 @@ def answered(scratch: Path) -> dict[str, Any]:
     return answer | {"passed": judge(answer)}
 
 
-def follow(step: Step, scratch: Path) -> dict[str, Any]:
+def follow(step: Step, scratch: Path) -> Row:
     """Give a step to a shell, and see whether what comes out is what the tutorial shows."""
     words = {"lmshealth": "-m lmshealth", "python": ""}
     tools = "".join(
@@ -149,7 +153,7 @@ def plain(line: str) -> str:
     return " ".join(_DIGITS.sub("0", line).split())
 
 
-def tell_modes(bench: Path) -> dict[str, Any]:
+def tell_modes(bench: Path) -> Row:
     """Tell how far the estimates of the machine that does not change scatter and say they do."""
     modes = pd.read_csv(bench / "modes.csv")
     own = modes[modes["stage"] == "bench-A"]
@@ -161,7 +165,7 @@ def tell_modes(bench: Path) -> dict[str, Any]:
     }
 
 
-def tell_stiffness(bench: Path) -> list[dict[str, Any]]:
+def tell_stiffness(bench: Path) -> list[Row]:
     """Line up the stiffness inferred with the one that the manifest amounts to."""
     health = pd.read_csv(bench / "health.csv")
     rows = []
@@ -177,7 +181,7 @@ def tell_stiffness(bench: Path) -> list[dict[str, Any]]:
     return rows
 
 
-def tell_remaining(bench: Path) -> dict[str, Any]:
+def tell_remaining(bench: Path) -> Row:
     """Tell what is left, and what is left if bench-B goes on as it was made to."""
     table = pd.read_csv(bench / "prognosis.csv")
     own = table[table["parameter"] == "coupling_stiffness"].set_index("stage")
@@ -190,7 +194,7 @@ def tell_remaining(bench: Path) -> dict[str, Any]:
     return told | {"true_of_bench-B_h": (1 - float(np.sqrt(LIMIT))) / SLOWER * APART_H - last}
 
 
-def as_shown(told: list[dict[str, Any]], made: dict[str, bool]) -> dict[str, bool]:
+def as_shown(told: list[Row], made: dict[str, bool]) -> dict[str, bool]:
     """Say whether what is shown comes out."""
     return {
         "what is shown comes out": not any(step["shown_and_not_come_out"] for step in told),
@@ -198,7 +202,7 @@ def as_shown(told: list[dict[str, Any]], made: dict[str, bool]) -> dict[str, boo
     }
 
 
-def judge(answer: dict[str, Any]) -> dict[str, bool]:
+def judge(answer: Row) -> dict[str, bool]:
     """Say whether the tutorial does what it says, and whether it ends where the truth is."""
     sound, worn = (
         [row for row in answer["stiffness"] if row["stage"] == name]
@@ -221,6 +225,33 @@ def judge(answer: dict[str, Any]) -> dict[str, bool]:
             <= left["bench-B"]["rul_km_q95"]
         ),
     }
+
+
+def claims(answer: Row) -> Iterator[Claim]:
+    """Claim that a described machine is told right, and that its tutorial does what it says."""
+    rows, left, passed = answer["stiffness"], answer["remaining"], answer["passed"]
+    lines = [line for step in answer["steps"] for line in step["commands"]]
+    yield Claim(
+        "commands of the tutorial that do what it says",
+        f"{len(lines)} of {len(lines)}" if passed["what is shown comes out"] else "not all",
+        met=passed["what is shown comes out"],
+    )
+    yield counted(
+        "stiffness of a real coupling inside its 90 % intervals, sound and made to lose 7 %",
+        sum(row["inside"] for row in rows),
+        len(rows),
+        "half the loss: outside at the end",
+        met=all(row["inside"] for row in rows)
+        and passed["control: half of B's fall is outside at the end"],
+    )
+    worn = left["bench-B"]
+    yield Claim(
+        "hours until the one made to lose reaches its limit",
+        number(worn["rul_km_q50"]),
+        f"{number(worn['rul_km_q05'])} to {number(worn['rul_km_q95'])} (90 %)",
+        f"{number(left['true_of_bench-B_h'])} if it goes on",
+        passed["B's end is inside its interval"],
+    )
 
 
 if __name__ == "__main__":

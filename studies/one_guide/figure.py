@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
-from typing import Any
 
 import matplotlib
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from studies.harness.study import Row, read_record
+
 HERE = Path(__file__).parent
 BLUE, ORANGE, GREEN, BLACK = "#0072b2", "#d55e00", "#009e73", "#000000"
 
 
-def rows_of(answer: dict[str, Any]) -> list[tuple[str, dict[str, Any]]]:
+def rows_of(answer: Row) -> list[tuple[str, Row]]:
     """Name every parameter of every way."""
     return [
         (f"{way}: {name.split(':')[-1].replace('_', ' ')}" + machine(name), own)
@@ -28,7 +28,7 @@ def machine(name: str) -> str:
     return f" of {name.split(':')[0][-1].upper()}" if ":" in name else ""
 
 
-def draw_widths(ax: Axes, rows: list[tuple[str, dict[str, Any]]]) -> None:
+def draw_widths(ax: Axes, rows: list[tuple[str, Row]]) -> None:
     """Draw the median width of the 90 % interval of ln parameter, hatched where it is no claim."""
     for y, (_, own) in enumerate(rows):
         claimed = own["told"] > 0.5
@@ -45,7 +45,7 @@ def draw_widths(ax: Axes, rows: list[tuple[str, dict[str, Any]]]) -> None:
     ax.set_title("What is known", fontsize=10)
 
 
-def draw_coverage(ax: Axes, rows: list[tuple[str, list[dict[str, Any]], bool]]) -> None:
+def draw_coverage(ax: Axes, rows: list[tuple[str, list[Row], bool]]) -> None:
     """Draw coverages of 50 and 90 % intervals with their Clopper-Pearson intervals."""
     for y, (_, levels, control) in enumerate(rows):
         for row in levels:
@@ -63,7 +63,7 @@ def draw_coverage(ax: Axes, rows: list[tuple[str, list[dict[str, Any]], bool]]) 
 
 def main() -> None:
     """Draw the figure."""
-    answer = json.loads((HERE / "result.json").read_text(encoding="utf-8"))
+    answer = read_record(__file__)
     matplotlib.rcParams["svg.hashsalt"] = "one_guide"
     fig = Figure(figsize=(11.5, 4.2), layout="constrained")
     left, right = fig.subplots(1, 2)

@@ -24,9 +24,9 @@ Run time
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from contextlib import nullcontext
 from datetime import UTC, datetime
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,9 +37,12 @@ from lmshealth.stage.description import Stage, load_stage
 from lmshealth.tracking.read_tables import Drifts
 from models.dynamics.modal_map import guide_frequencies
 from models.dynamics.stages import stage_named
-from studies.commands import short_chains
-from studies.metrics import coverage
-from studies.record import LEVEL, Study, as_row
+from studies.common.metrics import coverage
+from studies.harness.claims import Claim, at_level, covered, percents
+from studies.harness.command_line import short_chains
+from studies.harness.study import LEVEL, Row, Study, as_row
+
+STEP = "infer"
 
 Array = NDArray[np.float64]
 SEED = 20261123
@@ -67,12 +70,12 @@ def drifts_of(stage: Stage, preload: float, mount: float, rng: np.random.Generat
     return Drifts(stage.name, (WHEN,), np.array([1e6]), modes, drift[None], cov[None])
 
 
-def one_pair(seed: int, apart: bool) -> dict[str, Any]:
+def one_pair(seed: int, apart: bool) -> Row:
     """Infer one pair of the shipped machines."""
     return one_trial((load_stage("lms-x"), load_stage("lms-y")), seed, apart=apart)
 
 
-def one_trial(stages: tuple[Stage, Stage], seed: int, *, apart: bool) -> dict[str, Any]:
+def one_trial(stages: tuple[Stage, Stage], seed: int, *, apart: bool) -> Row:
     """Infer one pair of machines alone and together; ``apart`` if their preloads differ."""
     rng = np.random.default_rng([SEED, seed])
     x_stage, y_stage = stages
@@ -89,7 +92,7 @@ def one_trial(stages: tuple[Stage, Stage], seed: int, *, apart: bool) -> dict[st
     return row
 
 
-def told(health: Health, truth: tuple[float, ...]) -> dict[str, Any]:
+def told(health: Health, truth: tuple[float, ...]) -> Row:
     """Say of each parameter what its posterior says: level of the truth, ln width, claims."""
     draws = health.samples[0]
     return {
@@ -110,7 +113,7 @@ def level_of_half(draws: Array, truth: float) -> float:
     return float(np.mean(middle + 0.5 * (draws - middle) < truth))
 
 
-def judged(rows: list[dict[str, Any]], level_name: str = "level") -> list[dict[str, Any]]:
+def judged(rows: list[Row], level_name: str = "level") -> list[Row]:
     """Judge the coverage of central intervals."""
     levels = np.array([row[level_name] for row in rows])
     return [
@@ -118,7 +121,7 @@ def judged(rows: list[dict[str, Any]], level_name: str = "level") -> list[dict[s
     ]
 
 
-def summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
+def summary(rows: list[Row]) -> Row:
     """Summarise one parameter over all trials."""
     return {
         "coverage": judged(rows),
@@ -139,7 +142,7 @@ def main() -> None:
         for way in ("X alone", "Y alone", "together")
     }
     gain = [t["Y alone"][SHARED]["width"] / t["together"][SHARED]["width"] for t in trials]
-    answer: dict[str, Any] = {
+    answer: Row = {
         "seed": SEED,
         "pairs": n,
         "ways": ways,
@@ -155,7 +158,7 @@ def main() -> None:
     study.conclude(answer)
 
 
-def verdicts(answer: dict[str, Any], *, quick: bool) -> dict[str, bool]:
+def verdicts(answer: Row, *, quick: bool) -> dict[str, bool]:
     """Say what was asked and whether it is so; one pair has no control."""
     ways = answer["ways"]
     checks = {
@@ -175,6 +178,36 @@ def verdicts(answer: dict[str, Any], *, quick: bool) -> dict[str, bool]:
             for name, rows in answer["controls"].items()
         }
     return {name: bool(passed) for name, passed in checks.items()}
+
+
+def claims(answer: Row) -> Iterator[Claim]:
+    """Claim what is gained where one guide serves X and Y, and what is never claimed."""
+    ways = answer["ways"]
+    width = {way: percents([own["guide_preload"]["median_width"]]) for way, own in ways.items()}
+    yield Claim(
+        "preload is known from both to (median width of the 90 % interval)",
+        width["together"],
+        f"{answer['pairs']} pairs",
+        f"{width['Y alone']} from Y, {width['X alone']} from X",
+        answer["preload_narrower_than_y_alone"] > 1,
+    )
+    rows = [row for way in ways.values() for own in way.values() for row in own["coverage"]]
+    for nominal in (0.5, 0.9):
+        controls = [row for own in answer["controls"].values() for row in at_level(own, nominal)]
+        yield covered(
+            f"intervals of {100 * nominal:.0f} % cover",
+            at_level(rows, nominal),
+            "two guides taken for one, and half the width: "
+            + percents(row["share"] for row in controls),
+        )
+    told = [
+        own["told"]
+        for way in ways.values()
+        for name, own in way.items()
+        if name in ("lms-x:mount_stiffness",)
+        or (way is ways["X alone"] and name == "mount_stiffness")
+    ]
+    yield Claim("how often the mount of X is claimed", percents(told), "", "", not any(told))
 
 
 if __name__ == "__main__":

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
-from typing import Any
 
 import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+
+from studies.harness.study import Row, read_record
 
 HERE = Path(__file__).parent
 COLOURS = {"x": "#0072b2", "y": "#d55e00"}
@@ -20,7 +20,7 @@ SLOW, FAST = "#009e73", "#cc79a7"
 def main() -> None:
     """Draw errors over velocity above, accelerations over frequency below."""
     matplotlib.rcParams["svg.hashsalt"] = "paper_tables"
-    rows = json.loads((HERE / "result.json").read_text())["rows"]
+    rows = read_record(__file__)["rows"]
     figure = Figure(figsize=(10, 7.6), layout="constrained")
     axes = figure.subplots(2, 2)
     over_velocity(axes[0, 0], rows, "std_um", "standard deviation of Δe in µm (Table 3)")
@@ -30,7 +30,7 @@ def main() -> None:
     figure.savefig(HERE / "figure.svg", metadata={"Date": None})
 
 
-def over_velocity(ax: Axes, rows: list[dict[str, Any]], key: str, label: str) -> None:
+def over_velocity(ax: Axes, rows: list[Row], key: str, label: str) -> None:
     """Draw a row of X and of Y, printed as points and simulated as a line with its scatter."""
     for axis, colour in COLOURS.items():
         row = next(row for row in rows if row["row"] == f"{axis} {key}")
@@ -54,7 +54,7 @@ def over_velocity(ax: Axes, rows: list[dict[str, Any]], key: str, label: str) ->
     ax.legend(frameon=False, fontsize=8)
 
 
-def over_frequency(ax: Axes, rows: list[dict[str, Any]], axis: str, table: str) -> None:
+def over_frequency(ax: Axes, rows: list[Row], axis: str, table: str) -> None:
     """Draw magnitudes over frequency at 10 and 400 mm/s."""
     mine = [row for row in rows if row["table"] == table]
     hertz = [int(row["row"].split()[1]) for row in mine]

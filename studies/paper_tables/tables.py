@@ -47,7 +47,7 @@ PRINTED_GROWING = {
 
 
 @dataclass(frozen=True, slots=True)
-class Row:
+class TableRow:
     """A row of a table: printed and simulated cells (NaN = none), scatter over seeds."""
 
     table: str
@@ -138,7 +138,7 @@ def moves(axis: str, seed: int, constant: float | None = None) -> list[Recording
     return records
 
 
-def velocity_rows(axis: str, seeds: int, constant: float | None = None) -> list[Row]:
+def velocity_rows(axis: str, seeds: int, constant: float | None = None) -> list[TableRow]:
     """Return the rows of Tables 3, 4 and 6 or 7 of one configuration; see `moves`."""
     bands = bands_of(axis)
     errors, accelerations = [], []
@@ -164,10 +164,12 @@ def velocity_rows(axis: str, seeds: int, constant: float | None = None) -> list[
     return rows
 
 
-def _row(table: str, name: str, cells: list[float], found: Array, mode: str | None = None) -> Row:
+def _row(
+    table: str, name: str, cells: list[float], found: Array, mode: str | None = None
+) -> TableRow:
     """Make a row of the mean over seeds (seed, velocity) and its scatter."""
     spread = found.std(axis=0, ddof=1) if len(found) > 1 else np.full(found.shape[1], np.nan)
-    return Row(
+    return TableRow(
         table,
         name,
         tuple(float(c) for c in cells),
@@ -177,7 +179,7 @@ def _row(table: str, name: str, cells: list[float], found: Array, mode: str | No
     )
 
 
-def loop_rows() -> list[Row]:
+def loop_rows() -> list[TableRow]:
     """Return Table 1: margins with the flexible modes inside, filters from equations 8 and 9.
 
     The velocity loop's P stands in the equations only as a product with a scale, so that they tell
@@ -202,7 +204,7 @@ def loop_rows() -> list[Row]:
         for key, value in _controller_numbers(name).items():
             found[key].append(value)
     return [
-        Row("Table 1", key, tuple(map(float, table.loc[key])), tuple(values))
+        TableRow("Table 1", key, tuple(map(float, table.loc[key])), tuple(values))
         for key, values in found.items()
     ]
 
@@ -260,7 +262,7 @@ def feed_resonances(axis: str, logs: int = 4) -> Array:
     return np.asarray(grid[inner][peaks])
 
 
-def resonance_rows() -> list[Row]:
+def resonance_rows() -> list[TableRow]:
     """Return Table 2: each printed resonance beside a simulated one within 10 % (our tolerance).
 
     A resonance that the simulated sweep shows comes first; else a mode of the structure that has
@@ -277,7 +279,7 @@ def resonance_rows() -> list[Row]:
         for hertz in wanted.tolist():
             value, owner = seen.get(hertz) or hidden.get(hertz) or (np.nan, None)
             label = f"{axis} {hertz:g} Hz"
-            rows.append(Row("Table 2", label, (hertz,), (float(value),), mode=owner))
+            rows.append(TableRow("Table 2", label, (hertz,), (float(value),), mode=owner))
     return rows
 
 
@@ -295,7 +297,7 @@ def _nearest(
     return pairs
 
 
-def modal_rows() -> list[Row]:
+def modal_rows() -> list[TableRow]:
     """Return Table 5; labels 1 and 3 are swapped between X and Y, so modes go by frequency."""
     table = printed(5)
     order = ("granite_feed", "granite_yaw", "granite_vertical", "roll", "pitch")
@@ -305,5 +307,5 @@ def modal_rows() -> list[Row]:
         for line, mode in zip(table.itertuples(), order, strict=True):
             value = float(getattr(line, f"{axis}_hz"))
             label = f"{axis} {getattr(line, f'{axis}_direction')}"
-            rows.append(Row("Table 5", label, (value,), (modes[mode],), mode=mode))
+            rows.append(TableRow("Table 5", label, (value,), (modes[mode],), mode=mode))
     return rows

@@ -26,10 +26,9 @@ import os
 import tempfile
 import time
 import tomllib
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import msgspec
 
@@ -37,10 +36,13 @@ from lmshealth.errors import BadLog
 from lmshealth.io.column_map import ColumnMap
 from lmshealth.io.formats.registry import load
 from lmshealth.io.reading import read_log
+from studies.harness.claims import Claim, span
+from studies.harness.study import Row, Study
 from studies.read_throughput.files import BARE, RATE, Call, signals, write
 from studies.read_throughput.memory import needs
 from studies.read_throughput.samples import MAPS
-from studies.record import Study
+
+STEP = "read"
 
 # Noise and fixed costs do not shrink with the file: the quick form is judged more mildly. An HDF5
 # reader that searched for damage as slowly as it might took 3.0 times the library.
@@ -86,7 +88,7 @@ def main() -> None:
     study.conclude(answer, quick_may_fail=True)
 
 
-def timed(name: str, seconds: int, rounds: int = ROUNDS) -> dict[str, Any]:
+def timed(name: str, seconds: int, rounds: int = ROUNDS) -> Row:
     """Compare reader and libraries on a file of a format."""
     with tempfile.TemporaryDirectory() as folder:
         return compare(write(Path(folder) / name, signals(RATE * seconds)), BARE[name], rounds)
@@ -99,7 +101,7 @@ def cost(work: Callable[[], object]) -> float:
     return time.process_time() - start
 
 
-def compare(path: Path, calls: tuple[Call, ...], rounds: int) -> dict[str, Any]:
+def compare(path: Path, calls: tuple[Call, ...], rounds: int) -> Row:
     """Let libraries and reader take turns on one file."""
     rounds = 2 if path.suffix == ".uff" else rounds
     libraries: dict[str, list[float]] = {call.__name__: [] for call in calls}
@@ -168,6 +170,38 @@ def outcome(path: Path, columns: ColumnMap, name: str) -> str:
     n_samples = log.channels[0].values.size
     refused = "".join(f"; {r.channel} refused, {r.reason}" for r in log.refused)
     return f"read: {len(log.channels)} x {n_samples} at {log.sample_rate:.7g} Hz{refused}"
+
+
+def claims(answer: Row) -> Iterator[Claim]:
+    """Claim times and memory beside the bare libraries, and what becomes of real files."""
+    times, memory = answer["times"], answer["memory"]
+    bounded = [times[name]["ratio"] for name in answer["passed"]]
+    yield Claim(
+        "processor time of a reader over that of the bare library, six formats",
+        span(bounded),
+        "least of nine turns",
+        f"{answer['bound']} asked",
+        max(bounded) <= answer["bound"],
+    )
+    yield Claim(
+        "the same of compressed CSV and UFF58",
+        span(row["ratio"] for name, row in times.items() if name not in answer["passed"]),
+    )
+    yield Claim(
+        f"memory for a log of {answer['memory_minutes']} minutes, in minutes of the log",
+        span(row["minutes_of_reader"] for row in memory.values()),
+        "",
+        f"the libraries take {span(row['minutes_of_library'] for row in memory.values())}",
+        all(answer["memory_passed"].values()),
+    )
+    samples = answer["samples"].values()
+    told = sum(any(text.startswith("read") for text in sample.values()) for sample in samples)
+    yield Claim(
+        "real files that are read, as they are or by a column map",
+        f"{told} of {len(samples)}",
+        "",
+        "the others are refused with a reason",
+    )
 
 
 if __name__ == "__main__":

@@ -12,6 +12,7 @@ from lmshealth.io.log import Channel
 from lmshealth.signal.harmonics import decompose
 from lmshealth.signal.segments import Segment
 from lmshealth.signal.spectra import Spectrum, periodogram
+from studies.harness.study import Row
 from studies.readings.checks import Check, below, control, likely, unbiased
 
 Array = np.ndarray[Any, Any]
@@ -28,7 +29,7 @@ DISPLACEMENT_RATE = 4000.0
 BAND = (100.0, 150.0)
 
 
-def calibrate(quick: bool) -> tuple[dict[str, Check], dict[str, Any]]:
+def calibrate(quick: bool) -> tuple[dict[str, Check], Row]:
     """Check gain and distribution of spectra."""
     rng = np.random.default_rng(1)
     checks, curves = sines()
@@ -59,7 +60,7 @@ def read_sine(k: int, n: int, phase: float) -> tuple[float, float]:
     return spectrum(x).sine(k - 1, k)[1], float(decompose(x, RATE).amplitude[k - 1])
 
 
-def sines() -> tuple[dict[str, Check], dict[str, Any]]:
+def sines() -> tuple[dict[str, Check], Row]:
     """Read sines of whole numbers of periods: odd and even records, eight phases."""
     off = np.array(
         [
@@ -99,7 +100,7 @@ def hann(n: int) -> Array:
     return np.hanning(n + 1)[:-1]
 
 
-def expected_noise(n: int) -> tuple[dict[str, Check], dict[str, Any]]:
+def expected_noise(n: int) -> tuple[dict[str, Check], Row]:
     """Read the expectation for white noise exactly, without sampling any.
 
     An ordinate is a quadratic form of the samples. For independent samples of variance σ² its
@@ -138,7 +139,7 @@ def expected_noise(n: int) -> tuple[dict[str, Check], dict[str, Any]]:
     }
 
 
-def displacements(quick: bool) -> tuple[dict[str, Check], dict[str, Any]]:
+def displacements(quick: bool) -> tuple[dict[str, Check], Row]:
     """Read displacements as acceleration: sines, noise of white acceleration, encoder noise."""
     rate, n = DISPLACEMENT_RATE, 3200 if quick else 12_800
     # Samples that the second difference takes.
@@ -186,7 +187,7 @@ def displacements(quick: bool) -> tuple[dict[str, Check], dict[str, Any]]:
     }
 
 
-def sampled(rng: np.random.Generator, n: int) -> tuple[dict[str, Check], dict[str, Any]]:
+def sampled(rng: np.random.Generator, n: int) -> tuple[dict[str, Check], Row]:
     """Read one long record of noise: Parseval's identity, mean, variance and distribution."""
     x = rng.standard_normal(n) * np.sqrt(LEVEL * RATE / 2)
     whole = spectrum(x)
@@ -232,7 +233,7 @@ def sampled(rng: np.random.Generator, n: int) -> tuple[dict[str, Check], dict[st
     }
 
 
-def freedom(rng: np.random.Generator, records: int) -> tuple[dict[str, Check], dict[str, Any]]:
+def freedom(rng: np.random.Generator, records: int) -> tuple[dict[str, Check], Row]:
     """Read the mean ordinate of a band over many records: its degrees of freedom."""
     n = 8000
     window = hann(n) / np.sqrt(np.mean(hann(n) ** 2))

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import json
-from typing import Any
 
-from studies.commands import call
-from studies.metrics import clopper_pearson
+from studies.common.metrics import clopper_pearson
+from studies.harness.command_line import call
+from studies.harness.study import Row
 
-Check = dict[str, Any]
+Check = Row
 
 # A mean is unbiased within so many of its standard errors, and a distribution is the one said to
 # be if its test has such a p-value or a larger one: a right reading fails once in 10,000 studies.
@@ -67,8 +67,8 @@ def control(check: Check) -> Check:
     }
 
 
-def command(*arguments: object, quick: bool) -> dict[str, Any]:
+def command(*arguments: object, quick: bool) -> Row:
     """Call the command line, see `call`, and return the JSON that it prints."""
     told = call("lmshealth", *arguments, "--format", "json", quick=quick)
-    content: dict[str, Any] = json.loads(told)
+    content: Row = json.loads(told)
     return content

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-import json
 from itertools import groupby
 from pathlib import Path
-from typing import Any
 
 import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+
+from studies.harness.study import Row, read_record
 
 HERE = Path(__file__).parent
 BLUE, RED, GREEN, GREY = "#0072b2", "#d55e00", "#009e73", "#56606b"
@@ -18,7 +18,7 @@ BLUE, RED, GREEN, GREY = "#0072b2", "#d55e00", "#009e73", "#56606b"
 _TOGETHER_HZ = 10.0
 
 
-def draw_gain(ax: Axes, details: dict[str, Any]) -> None:
+def draw_gain(ax: Axes, details: Row) -> None:
     """Draw how far sines and expected noise are read from the truth, by ordinate."""
     sine, noise = details["sine_error"], details["noise_error"]
     at = np.geomspace(1, 8000, 50)
@@ -37,7 +37,7 @@ def draw_gain(ax: Axes, details: dict[str, Any]) -> None:
     ax.legend(frameon=False, fontsize=7.5, loc="lower left")
 
 
-def draw_ratios(ax: Axes, details: dict[str, Any]) -> None:
+def draw_ratios(ax: Axes, details: Row) -> None:
     """Draw noise of known density as read in bands, with standard errors."""
     bands = details["noise_bands"]
     middle = np.sqrt(np.array(bands["low_hz"]) * np.array(bands["high_hz"]))
@@ -59,7 +59,7 @@ def draw_ratios(ax: Axes, details: dict[str, Any]) -> None:
     ax.legend(frameon=False, fontsize=7.5, loc="upper right")
 
 
-def draw_distribution(ax: Axes, ordinates: dict[str, Any]) -> None:
+def draw_distribution(ax: Axes, ordinates: Row) -> None:
     """Draw the share of ordinates above a level beside the exponential distribution."""
     x = np.linspace(0, 15, 50)
     share = ordinates["probability_above"]
@@ -74,7 +74,7 @@ def draw_distribution(ax: Axes, ordinates: dict[str, Any]) -> None:
     ax.legend(frameon=False, fontsize=7.5, loc="upper right")
 
 
-def draw_slopes(ax: Axes, shown: list[dict[str, Any]], checks: dict[str, Any]) -> None:
+def draw_slopes(ax: Axes, shown: list[Row], checks: Row) -> None:
     """Draw slopes with their intervals, less the truth."""
     start, ticks, labels = 0, [], []
     for part in shown:
@@ -99,7 +99,7 @@ def draw_slopes(ax: Axes, shown: list[dict[str, Any]], checks: dict[str, Any]) -
     ax.set_title("Growth over velocity (×: interval misses)", fontsize=10)
 
 
-def draw_lines(ax: Axes, mpstd: dict[str, Any]) -> None:
+def draw_lines(ax: Axes, mpstd: Row) -> None:
     """Draw the spectrum of a real record with its lines named."""
     spectrum = mpstd["spectrum"]
     ax.semilogy(spectrum["frequency_hz"], 1e3 * np.array(spectrum["amplitude"]), lw=0.7,
@@ -135,7 +135,7 @@ def draw_lines(ax: Axes, mpstd: dict[str, Any]) -> None:
 def main() -> None:
     """Draw what is calibrated above; growth and a real record below."""
     matplotlib.rcParams["svg.hashsalt"] = "readings"
-    result = json.loads((HERE / "result.json").read_text())
+    result = read_record(__file__)
     details = result["details"]
     figure = Figure(figsize=(13.0, 7.6), layout="constrained")
     grid = figure.add_gridspec(2, 6)

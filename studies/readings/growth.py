@@ -18,6 +18,7 @@ from lmshealth.signal.acceleration_levels import (
 )
 from lmshealth.stage.description import load_stage
 from models.recordings.strokes import VELOCITIES
+from studies.harness.study import Row
 from studies.readings.checks import Check, control, rate, unbiased
 
 Array = np.ndarray[Any, Any]
@@ -47,14 +48,14 @@ def wide_bands(name: str) -> tuple[FrequencyBand, ...]:
     return tuple(b for b in choose_bands(load_stage(name), None, None) if b.kind != "mode")
 
 
-def known_growth(quick: bool) -> tuple[dict[str, Check], dict[str, Any]]:
+def known_growth(quick: bool) -> tuple[dict[str, Check], Row]:
     """Read logs whose level is a power of velocity: is slope ± σ what it says?"""
     rng = np.random.default_rng(4)
     bands = (*choose_bands(None, None, GRID), *wide_bands("lms-y"))
     repetitions = 20 if quick else 400
     kinds = {band.name: "magnitude" if band.kind == "grid" else "rms" for band in bands}
     checks: dict[str, Check] = {}
-    slopes: list[dict[str, Any]] = []
+    slopes: list[Row] = []
     for exponent in EXPONENTS:
         found = [fit(rng, exponent, bands) for _ in range(repetitions)]
         for kind in ("magnitude", "rms"):
@@ -134,7 +135,7 @@ def coloured(rng: np.random.Generator) -> Array:
     return np.fft.irfft(transform[0] + 1j * transform[1], size)[:N]
 
 
-def known_rms(quick: bool) -> tuple[dict[str, Check], dict[str, Any]]:
+def known_rms(quick: bool) -> tuple[dict[str, Check], Row]:
     """Read the RMS of health and watched bands of noise of known density.
 
     The harmonics inside a band reach to half their distance from its ends: the integral is asked

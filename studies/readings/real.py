@@ -12,6 +12,7 @@ import numpy as np
 from lmshealth.io.column_map import load_columns
 from lmshealth.io.log import Log
 from lmshealth.io.reading import read_log
+from studies.harness.study import Row
 from studies.read_throughput.samples import MAPS
 from studies.readings.checks import STANDARD_ERRORS, Check, at_least, below, command, control
 
@@ -35,14 +36,14 @@ NEAR, AROUND = 0.15, 1.15
 _SHOWN_HZ = 0.5
 
 
-def read_real(data: Path, quick: bool) -> tuple[dict[str, Check], dict[str, Any]]:
+def read_real(data: Path, quick: bool) -> tuple[dict[str, Check], Row]:
     """Read the samples of a folder of real measurements."""
     checks, details = twins(data / FOLDER)
     more, mains = measured(data / FOLDER / MEASURED, quick)
     return checks | more, details | mains
 
 
-def twins(folder: Path) -> tuple[dict[str, Check], dict[str, Any]]:
+def twins(folder: Path) -> tuple[dict[str, Check], Row]:
     """Compare one recording in ASCII and in binary."""
     found = []
     with tempfile.TemporaryDirectory() as scratch:
@@ -67,7 +68,7 @@ def twins(folder: Path) -> tuple[dict[str, Check], dict[str, Any]]:
     return checks, {"ascii_and_binary": {"samples": one.size, "largest_sample_pa": top}}
 
 
-def measured(path: Path, quick: bool) -> tuple[dict[str, Check], dict[str, Any]]:
+def measured(path: Path, quick: bool) -> tuple[dict[str, Check], Row]:
     """Ask for the lines of a measured vibration, at its true sample rate and at a wrong one."""
     log = read_log(path)
     lines = lines_of(path, quick)
@@ -111,7 +112,7 @@ def measured(path: Path, quick: bool) -> tuple[dict[str, Check], dict[str, Any]]
     return checks, {"mpstd": details}
 
 
-def lines_of(path: Path, quick: bool) -> list[dict[str, Any]]:
+def lines_of(path: Path, quick: bool) -> list[Row]:
     """Return the lines that the command line tells of."""
     told = command("spectrum", path, "--band", *BAND, quick=quick)
     return [
@@ -127,7 +128,7 @@ def power_spectrum(log: Log, name: str) -> tuple[Array, Array]:
     return np.fft.rfftfreq(x.size, 1 / log.sample_rate), power
 
 
-def beside_plain(log: Log, line: dict[str, Any]) -> dict[str, float]:
+def beside_plain(log: Log, line: Row) -> dict[str, float]:
     """Measure a line's amplitude by its power above its surroundings, over the whole record.
 
     The standard error is that of a sum of ordinates of noise and of their product with the line.
@@ -145,7 +146,7 @@ def beside_plain(log: Log, line: dict[str, Any]) -> dict[str, float]:
     }
 
 
-def picture(log: Log, name: str) -> dict[str, Any]:
+def picture(log: Log, name: str) -> Row:
     """Return the largest harmonic of every half a hertz, for the figure."""
     frequency, power = power_spectrum(log, name)
     edges = np.arange(BAND[0], BAND[1] + _SHOWN_HZ, _SHOWN_HZ)

@@ -32,16 +32,19 @@ from __future__ import annotations
 
 import os
 import tempfile
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
+from studies.harness.claims import Claim, number, percents, span
+from studies.harness.study import Row, Study
 from studies.readings.calibration import calibrate
 from studies.readings.checks import Check
 from studies.readings.growth import known_growth, known_rms
 from studies.readings.real import NOT_MET, read_real
 from studies.readings.sines import read_sums
 from studies.readings.stages import read_stages
-from studies.record import Study
+
+STEP = "spectra, following error, accelerations"
 
 
 def main() -> None:
@@ -53,13 +56,13 @@ def main() -> None:
     left_out = [] if data else ["LMSHEALTH_DATA is not set: real files were not read"]
     checks, details = read(study.quick, data)
     answer = {"left_out": left_out, **judge(checks)}
-    study.conclude(answer, beside={"details": details}, not_met=answer["not_met"])
+    study.conclude(answer, details={"details": details}, not_met=answer["not_met"])
     # What is said not to be met and is met after all is to be told, too.
     if met := [name for name in answer["not_met"] if answer["passed"][name]]:
         raise SystemExit(f"met after all: {met}")
 
 
-def read(quick: bool, data: str | None) -> tuple[dict[str, dict[str, Check]], dict[str, Any]]:
+def read(quick: bool, data: str | None) -> tuple[dict[str, dict[str, Check]], Row]:
     """Return the checks and details of all parts."""
     parts = {"spectra": calibrate(quick)}
     with tempfile.TemporaryDirectory() as folder:
@@ -72,13 +75,68 @@ def read(quick: bool, data: str | None) -> tuple[dict[str, dict[str, Check]], di
     return checks, {name: value for _, own in parts.values() for name, value in own.items()}
 
 
-def judge(checks: dict[str, dict[str, Check]]) -> dict[str, Any]:
+def judge(checks: dict[str, dict[str, Check]]) -> Row:
     """Return the answer: what passed, and what is known not to be met and why."""
     passed = {f"{part}: {name}": check["passed"] for part, own in checks.items()
               for name, check in own.items()}  # fmt: skip
     why = {f"real files: {name}": reason for name, reason in NOT_MET.items()}
     known = {name: reason for name, reason in why.items() if name in passed}
     return {"passed": passed, "not_met": known, "checks": checks}
+
+
+def claims(answer: Row) -> Iterator[Claim]:
+    """Claim what is read of known signals, slopes of growth, and real files."""
+    checks = answer["checks"]
+    sines = [
+        c["measured"]
+        for name, c in checks["spectra"].items()
+        if "sine of amplitude A" in name and c["asked"] == "below 1e-06"
+    ]
+    yield Claim(
+        "spectra: error of the amplitude of a sine, relative, at most",
+        number(max(sines)),
+        "",
+        "10⁻⁶ asked",
+        max(sines) < 1e-6,
+    )
+    sums = [c["measured"] for c in checks["error"].values() if c["asked"] == "below 1e-09"]
+    yield Claim(
+        "following error: largest error of a sum of sines",
+        number(max(sums)),
+        "",
+        "10⁻⁹ asked",
+        max(sums) < 1e-9,
+    )
+    growth = checks["growth"]
+    for what, ending, control in (
+        (
+            "95 % intervals of slopes of growth cover",
+            "coverage of the 95 % interval",
+            "coverage with σ halved",
+        ),
+        (
+            "what does not depend on velocity is said to grow",
+            "said to grow",
+            "said to grow with σ halved",
+        ),
+    ):
+        own, others = (
+            [c for name, c in growth.items() if name.endswith(text)] for text in (ending, control)
+        )
+        margin = max((c["interval"][1] - c["interval"][0]) / 2 for c in own)
+        yield Claim(
+            what,
+            f"{percents(c['measured'] for c in own)} ({span(c['trials'] for c in own)} each)",
+            f"± {100 * margin:.1f} % at most (99.9 %)",
+            f"σ halved: {percents(c['measured'] for c in others)}",
+            all(c["passed"] for c in own),
+        )
+    passed = answer["passed"]
+    yield Claim(
+        "checks of readings that hold, with their controls",
+        f"{sum(passed.values())} of {len(passed)}",
+        met=all(passed.values()),
+    )
 
 
 if __name__ == "__main__":

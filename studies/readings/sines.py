@@ -10,6 +10,7 @@ import numpy as np
 
 from lmshealth.io.reading import read_log
 from lmshealth.signal.following_error import read_error
+from studies.harness.study import Row
 from studies.readings.checks import Check, below, command, control
 
 Array = np.ndarray[Any, Any]
@@ -21,7 +22,7 @@ MEAN_UM = 0.1
 OFFSETS = (0.001, 0.01, 0.1, 0.25, 0.5)
 
 
-def read_sums(quick: bool, folder: Path) -> tuple[dict[str, Check], dict[str, Any]]:
+def read_sums(quick: bool, folder: Path) -> tuple[dict[str, Check], Row]:
     """Read sums of sines from files by the command line, and sines between the harmonics."""
     rng = np.random.default_rng(3)
     errors: list[dict[str, float]] = []
@@ -50,7 +51,7 @@ def read_sums(quick: bool, folder: Path) -> tuple[dict[str, Check], dict[str, An
     return checks, {"sums_of_sines": details}
 
 
-def draw(rng: np.random.Generator, n: int) -> dict[str, Any]:
+def draw(rng: np.random.Generator, n: int) -> Row:
     """Draw sines of whole periods, strongest first, from 3 nm to 3 µm, and their sum in µm."""
     k = rng.choice(np.arange(1, n // 2), N_SINES, replace=False)
     amplitude = np.sort(10 ** rng.uniform(-2.5, 0.5, N_SINES))[::-1]
@@ -76,9 +77,7 @@ def write(path: Path, delta_e_um: Array) -> None:
         file.attrs["sample_rate_hz"] = RATE
 
 
-def compare(
-    row: dict[str, Any], harmonics: list[dict[str, Any]], truth: dict[str, Any]
-) -> dict[str, float]:
+def compare(row: Row, harmonics: list[Row], truth: Row) -> dict[str, float]:
     """Return the largest errors of what the command tells of one sum."""
     found = {
         key: np.array([h[key] for h in harmonics])
@@ -125,7 +124,7 @@ def compare(
     }
 
 
-def rebuilt(path: Path, harmonics: list[dict[str, Any]], truth: dict[str, Any]) -> dict[str, float]:
+def rebuilt(path: Path, harmonics: list[Row], truth: Row) -> dict[str, float]:
     """Compare the rebuilt error with the sines kept, and with the cosines that the command lists.
 
     Also the share of variance: explained by the rebuilt error, one minus what it leaves.
@@ -159,7 +158,7 @@ def between(offset: float) -> Array:
     return np.cos(2 * np.pi * (500 + offset) * np.arange(n) / n)
 
 
-def leak(row: dict[str, Any], offset: float) -> dict[str, float]:
+def leak(row: Row, offset: float) -> dict[str, float]:
     """Tell how far the reading of such a sine is off, and where its power went."""
     (reading,) = read_error(read_log(Path(row["log"])))
     amplitude = 1e6 * reading.harmonics.amplitude

@@ -27,6 +27,7 @@ from lmshealth.signal.following_error import read_error
 from lmshealth.stage.description import load_stage
 from models.dynamics.stages import STAGES
 from models.recordings.velocities import Experiment, drive_velocities
+from studies.harness.study import Row
 from studies.paper_tables.tables import FILES, PRINTED_GROWING, printed
 from studies.readings.checks import Check, below, command
 from studies.readings.sines import plain_reading
@@ -41,11 +42,11 @@ SHUFFLES = 200
 RASH = 0.1
 
 
-def read_stages(quick: bool) -> tuple[dict[str, Check], dict[str, Any]]:
+def read_stages(quick: bool) -> tuple[dict[str, Check], Row]:
     """Drive both stages, read their logs, compare with numpy and with the paper."""
     seeds = 1 if quick else 5
     departures: list[dict[str, float]] = []
-    details: dict[str, Any] = {"seeds": seeds, "accelerometer": EITHER}
+    details: Row = {"seeds": seeds, "accelerometer": EITHER}
     shares, told = [], []
     for axis, name in [("y", FILES["y"])] if quick else FILES.items():
         bands = (*choose_bands(None, None, None), *choose_bands(load_stage(name), None, None))
@@ -160,7 +161,7 @@ def printed_growth(axis: str, moves: list[Magnitude]) -> dict[str, Growth]:
     return {g.band: g for g in find_growth(readings)}
 
 
-def beside_paper(axis: str, series: list[list[Magnitude]]) -> dict[str, Any]:
+def beside_paper(axis: str, series: list[list[Magnitude]]) -> Row:
     """Compare which frequencies grow: named by the paper, printed, simulated."""
     growth = [{g.band: g for g in find_growth(readings)} for readings in series]
     of_paper = printed_growth(axis, series[0])
@@ -183,12 +184,12 @@ def beside_paper(axis: str, series: list[list[Magnitude]]) -> dict[str, Any]:
     return {**agreement(rows), "modes_and_wide_bands": others, "rows": rows}
 
 
-def told(growth: Growth) -> dict[str, Any]:
+def told(growth: Growth) -> Row:
     """Return a slope as JSON."""
     return {"slope": growth.slope, "slope_std": growth.slope_std, "grows": bool(growth.grows)}
 
 
-def average(growth: list[Growth]) -> dict[str, Any]:
+def average(growth: list[Growth]) -> Row:
     """Return the mean slope over seeds, its mean σ, and whether most seeds say that it grows."""
     grown = sum(g.grows is True for g in growth)
     return {
@@ -199,14 +200,14 @@ def average(growth: list[Growth]) -> dict[str, Any]:
     }
 
 
-def agreement(rows: list[dict[str, Any]]) -> dict[str, Any]:
+def agreement(rows: list[Row]) -> Row:
     """Count where names, printed numbers and simulation agree and where they do not."""
 
     def count(hits: Iterable[bool]) -> str:
         answers = list(hits)
         return f"{sum(answers)} of {len(answers)}"
 
-    def hertz(some: Iterable[dict[str, Any]]) -> list[int]:
+    def hertz(some: Iterable[Row]) -> list[int]:
         return [row["frequency_hz"] for row in some]
 
     named = [row for row in rows if row["named_by_the_paper"]]

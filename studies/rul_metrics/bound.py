@@ -18,7 +18,7 @@ from models.lives.degradation import (
     Loosening,
     Steady,
 )
-from studies.lives import Array
+from studies.common.lives import Array
 from studies.rul_metrics.lives import Case
 
 _INTERCEPT_STD = 0.1

@@ -12,7 +12,8 @@ from progpy import PrognosticsModel
 from progpy.predictors import MonteCarlo
 from progpy.uncertain_data import UnweightedSamples
 
-from studies.lives import Array
+from studies.common.lives import Array
+from studies.harness.study import Row
 
 N_SAMPLES = 1000
 _STEP_KM = 10.0
@@ -37,7 +38,7 @@ class Wearing(PrognosticsModel):
     ]
     outputs: ClassVar[list[str]] = ["preload", "mount"]
     events: ClassVar[list[str]] = ["end"]
-    default_parameters: ClassVar[dict[str, Any]] = {
+    default_parameters: ClassVar[Row] = {
         "preload_limit": 0.6,
         "mount_limit": 0.7,
         "process_noise": 0,

@@ -5,12 +5,13 @@ from __future__ import annotations
 import json
 import sys
 from pathlib import Path
-from typing import Any
 
 import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+
+from studies.harness.study import Row
 
 HERE = Path(__file__).parent
 BLACK, GREY = "#000000", "#777777"
@@ -23,7 +24,6 @@ WAYS = {
 CONTROL = ("#cc79a7", ":", "control: a tenth of the spread")
 KEPT = "progpy, all runs kept"
 MAIN_CUT = 0.7
-Row = dict[str, Any]
 
 
 def places_of(cuts: list[Row], name: str) -> np.ndarray:

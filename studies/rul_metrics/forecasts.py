@@ -18,7 +18,7 @@ from lmshealth.prognosis.remaining_life import (
 from lmshealth.stage.description import Stage
 from lmshealth.tracking.history import History
 from lmshealth.tracking.track import track
-from studies.lives import Array
+from studies.common.lives import Array
 
 N_DRAWS = 10_000
 _N_BEGIN = 64

@@ -10,8 +10,16 @@ import numpy as np
 from lmshealth.tracking.history import History
 from models.lives.degradation import Life as Truth
 from models.lives.simulation import Plan, schedule
-from studies.lives import SECONDS, Estimates, Life, drawn, history_of, life_with, rng_of
-from studies.raw_lives import measured
+from studies.common.lives import (
+    SECONDS,
+    Estimates,
+    Life,
+    drawn,
+    history_of,
+    life_with,
+    measured,
+    rng_of,
+)
 
 STAGE = "lms-y"
 KINDS = ("preload-wear", "mount-loosening", "both")

@@ -50,15 +50,15 @@ Run time
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from functools import cache
 from importlib.util import find_spec
-from typing import Any
 
 import numpy as np
 
 from lmshealth.stage.description import Stage, load_stage
-from studies.lives import Array, rng_of
-from studies.metrics import (
+from studies.common.lives import Array, recorded, rng_of
+from studies.common.metrics import (
     alpha_lambda,
     clopper_pearson,
     coverage,
@@ -73,11 +73,13 @@ from studies.metrics import (
     unexploited_life,
     within,
 )
-from studies.raw_lives import recorded
-from studies.record import LEVEL, Study, as_row
+from studies.harness.claims import Claim, counted, measured, number
+from studies.harness.study import LEVEL, Row, Study, as_row
 from studies.rul_metrics.bound import bound, share_within
 from studies.rul_metrics.lives import CUTS, HEALTHY, KINDS, STAGE, Case, case_of, cut
 from studies.rul_metrics.ways import CONTROL, LINE, MISSING, OURS, PROGPY, WAYS, all_ways
+
+STEP = "prognose, beside others"
 
 SEED = 20261124
 LIVES, UNENDING = 16, 6  # of each kind, and healthy ones
@@ -97,7 +99,6 @@ CODE = (
     ),
 )
 _KM = 1000.0
-Row = dict[str, Any]
 
 
 def main() -> None:
@@ -345,6 +346,62 @@ def verdicts(answer: Row, *, quick: bool) -> dict[str, bool]:
         peer = main[PROGPY]["crps_more_than_ours_km"]
         checks["no worse a score than progpy's at 70 % of life"] = peer["mean"] > -2 * peer["se"]
     return {name: bool(fine) for name, fine in checks.items()}
+
+
+def claims(answer: Row) -> Iterator[Claim]:
+    """Claim accuracy and score beside a line, progpy and the Cramér-Rao bound."""
+    for moment in answer["cuts"]:
+        ways, share = moment["ways"], f"{100 * moment['share']:.0f} % of life"
+        ours, line = ways["lmshealth"], ways["line"]
+        bound = ours["over_bound"]["map right"]
+        yield counted(
+            f"median within a fifth of the truth at {share}",
+            ours["accurate"]["hits"],
+            ours["accurate"]["n"],
+            f"{bound[0]:.2f} times ({bound[1]:.2f} to {bound[2]:.2f}) as often as at the "
+            f"Cramér-Rao bound; a line {line['accurate']['hits']}",
+        )
+        others, better = [], False
+        for name in ("line", "progpy"):
+            if name in ways:
+                apart = ways[name]["crps_more_than_ours_km"]
+                better |= apart["mean"] < -2 * apart["se"]
+                more = " ".join(measured(apart.values(), "km"))
+                others.append(f"{name} {number(ways[name]['crps_km'])} km ({more} more)")
+        yield Claim(
+            f"score (CRPS) at {share}",
+            f"{number(ours['crps_km'])} km",
+            "",
+            "; ".join(others),
+            ours["crps_km"] <= line["crps_km"] and not better,
+        )
+        for level, (inside, wrong) in zip(
+            (50, 90), zip(ours["coverage"], line["coverage"], strict=True), strict=True
+        ):
+            yield counted(
+                f"{level} % intervals hold the truth at {share}",
+                inside["hits"],
+                inside["n"],
+                f"a line's {wrong['hits']}" + ("" if inside["holds"] else "; ours are too wide"),
+                met=inside["holds"],
+            )
+    seconds = answer["seconds"]
+    yield Claim(
+        "10,000 draws after the posterior",
+        f"{1e3 * seconds['lmshealth']['median']:.0f} ms",
+        f"{1e3 * seconds['lmshealth']['largest']:.0f} ms at most",
+        f"1,000 of progpy: {number(seconds['progpy']['median'])} s" if "progpy" in seconds else "",
+        answer["passed"]["10,000 draws in 0.1 s after the posterior"],
+    )
+    healthy = answer["healthy"]
+    yield Claim(
+        "remaining life of healthy lives: probability past the horizon",
+        number(healthy["lmshealth"]["beyond"]),
+        f"{healthy['lmshealth']['n']} lives",
+        f"progpy: median {number(healthy['progpy']['median_km'])} km in {healthy['progpy']['n']}"
+        if "progpy" in healthy
+        else "",
+    )
 
 
 if __name__ == "__main__":

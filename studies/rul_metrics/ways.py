@@ -9,7 +9,7 @@ import numpy as np
 from lmshealth.errors import NotConverged
 from lmshealth.stage.description import Stage
 from lmshealth.tracking.history import History
-from studies.lives import Array
+from studies.common.lives import Array
 from studies.rul_metrics.forecasts import linear, ours
 
 OURS, LINE, PROGPY = "lmshealth", "line", "progpy"

@@ -27,7 +27,10 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from studies.record import Study, options
+from studies.harness.claims import Claim, number
+from studies.harness.study import Row, Study
+
+STEP = "the tests themselves"
 
 ROOT = Path(__file__).parents[2]
 TOLERANCE = 1e-9
@@ -39,13 +42,10 @@ SKIPPED = ("lmshealth.sqlite",)
 
 def main() -> None:
     """Run both revisions and compare their answers."""
-    parser = options(__doc__)
-    parser.add_argument("--before", default="before-house", help="revision to compare with")
-    parser.add_argument("--keep", type=Path, help="folder for inputs and earlier answers")
-    chosen = parser.parse_args()
-    study = Study(__file__, __doc__, chosen)
+    study = Study(__file__, __doc__, before="before-house", keep="")
+    chosen = study.options
     with tempfile.TemporaryDirectory() as temporary:
-        folder = (chosen.keep or Path(temporary)).resolve()
+        folder = Path(chosen.keep or temporary).resolve()
         with _checkout(chosen.before, folder / "code") as old:
             if not (folder / "before").exists():
                 make_inputs(folder / "inputs", old, quick=study.quick)
@@ -159,7 +159,7 @@ def answer_all(out: Path, inputs: Path, code: Path) -> None:
          "--seed", "5", "--format", "csv", "--out", out / "simulated")  # fmt: skip
 
 
-def compare(before: Path, after: Path) -> dict[str, Any]:
+def compare(before: Path, after: Path) -> Row:
     """Compare all tables and answers of two folders."""
     names = {p.relative_to(before).as_posix() for p in before.rglob("*.*")}
     names = {n for n in names if n.endswith((".csv", ".json")) and Path(n).name not in SKIPPED}
@@ -221,6 +221,19 @@ def _leaves(place: str, value: Any) -> Iterator[tuple[str, Any]]:
             yield from _leaves(f"{place}[{k}]", inner)
     else:
         yield place, value
+
+
+def claims(record: Row) -> list[Claim]:
+    """Claim equality of all numbers."""
+    return [
+        Claim(
+            f"cells of {record['files']} tables and answers equal to those of the code before",
+            f"{record['cells'] - record['n_different']:,} of {record['cells']:,}",
+            f"worst relative difference {number(record['worst_relative_difference'])}",
+            "1e-9 relative",
+            not record["different"],
+        )
+    ]
 
 
 if __name__ == "__main__":

@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import emcee
 import numpy as np
@@ -20,6 +19,7 @@ from lmshealth.stage.description import Stage, load_stage
 from lmshealth.stage.priors import JointPrior
 from models.dynamics.modal_map import guide_frequencies
 from models.dynamics.stages import stage_named
+from studies.harness.study import Row
 
 Array = NDArray[np.float64]
 TRUTH = np.log([[0.8, 0.9]])
@@ -85,7 +85,7 @@ def ours(posterior: EpochPosterior, seed: int) -> Found:
     return timed(work)
 
 
-def plain_loop(posterior: EpochPosterior, seed: int, steps: int, long: int) -> dict[str, Any]:
+def plain_loop(posterior: EpochPosterior, seed: int, steps: int, long: int) -> Row:
     """Time emcee's default with one walker at a time and the plant solved for each.
 
     So few steps tell no autocorrelation time. It is that of the same moves on the same density,
@@ -131,7 +131,7 @@ def plain_loop(posterior: EpochPosterior, seed: int, steps: int, long: int) -> d
     }
 
 
-def walker_loop(posterior: EpochPosterior, seed: int, steps: int) -> dict[str, Any]:
+def walker_loop(posterior: EpochPosterior, seed: int, steps: int) -> Row:
     """Time emcee's default with the surrogate, but one walker at a time."""
     rng = np.random.default_rng(seed)
     begin = start_from_prior(posterior.log_probability, posterior.draw_prior)(rng)[:N_WALKERS]
@@ -205,7 +205,7 @@ def _weighted(points: Array, weight: Array) -> tuple[Array, float]:
     return np.column_stack(quantiles), ess
 
 
-def compare(seed: int, turns: int, *, quick: bool) -> dict[str, Any]:
+def compare(seed: int, turns: int, *, quick: bool) -> Row:
     """Let all ways take turns, and hold their quantiles to those of a grid."""
     posterior = epoch_posterior(load_stage("lms-y"))
     known = exact(posterior, 201 if quick else 401)
@@ -223,7 +223,7 @@ def compare(seed: int, turns: int, *, quick: bool) -> dict[str, Any]:
         for name, way in ways.items():
             found[name].append(way(posterior, seed + turn))
     width = (known[2] - known[0]) / (2 * 1.645)
-    rows: list[dict[str, Any]] = []
+    rows: list[Row] = []
     for name, runs in found.items():
         off = np.array([np.abs(run.quantiles - known) / width for run in runs])
         rows.append(

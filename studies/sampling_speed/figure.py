@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
-from typing import Any
 
 import matplotlib
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from studies.harness.study import Row, read_record
+
 HERE = Path(__file__).parent
 BLUE, ORANGE, GREEN, BLACK = "#0072b2", "#d55e00", "#009e73", "#000000"
 
 
-def draw_rates(ax: Axes, rows: list[dict[str, Any]]) -> None:
+def draw_rates(ax: Axes, rows: list[Row]) -> None:
     """Draw effective draws per second of processor time, each with its multiple of ours."""
     for y, row in enumerate(rows):
         ax.barh(y, row["ess_per_s"], color=BLUE if y == 0 else GREEN, height=0.6)
@@ -34,7 +34,7 @@ def draw_rates(ax: Axes, rows: list[dict[str, Any]]) -> None:
     ax.set_title("Posterior of one epoch, LMS-Y", fontsize=10)
 
 
-def draw_ratios(ax: Axes, answer: dict[str, Any]) -> None:
+def draw_ratios(ax: Axes, answer: Row) -> None:
     """Draw what was measured as a share of what was asked for at most."""
     life = answer["life"]
     rows = [
@@ -57,7 +57,7 @@ def draw_ratios(ax: Axes, answer: dict[str, Any]) -> None:
 
 def main() -> None:
     """Draw the figure."""
-    answer = json.loads((HERE / "result.json").read_text(encoding="utf-8"))
+    answer = read_record(__file__)
     matplotlib.rcParams["svg.hashsalt"] = "sampling_speed"
     fig = Figure(figsize=(10.5, 4.0), layout="constrained")
     left, right = fig.subplots(1, 2, width_ratios=[1.25, 1])

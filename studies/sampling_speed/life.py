@@ -6,7 +6,6 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime, timedelta
-from typing import Any
 
 import numpy as np
 from filterpy.kalman import KalmanFilter
@@ -19,6 +18,7 @@ from lmshealth.prognosis.life_posterior import LifeDensity
 from lmshealth.prognosis.remaining_life import prognose
 from lmshealth.stage.description import Stage, load_stage
 from lmshealth.tracking.history import History, Series
+from studies.harness.study import Row
 
 Array = NDArray[np.float64]
 MODES = ("roll", "pitch")
@@ -142,7 +142,7 @@ def two_ways(history: History, stage: Stage, walkers: int, looped: int) -> Walke
     )
 
 
-def likelihoods(history: History, stage: Stage, walkers: int, looped: int) -> dict[str, Any]:
+def likelihoods(history: History, stage: Stage, walkers: int, looped: int) -> Row:
     """Compare the time of a walker and the values, at one point of the grid of settings."""
     ways = two_ways(history, stage, walkers, looped)
     found = ways.ours()
@@ -168,7 +168,7 @@ def likelihoods(history: History, stage: Stage, walkers: int, looped: int) -> di
     }
 
 
-def life_posterior(seed: int, turns: int, *, quick: bool) -> dict[str, Any]:
+def life_posterior(seed: int, turns: int, *, quick: bool) -> Row:
     """Time the whole posterior with its convergence; the quick form has no chains."""
     # The fewer laws, the fewer scenarios.
     stage = load_stage("lms-x" if quick else "lms-y")

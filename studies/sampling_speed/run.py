@@ -35,17 +35,23 @@ Run time
 from __future__ import annotations
 
 import time
+from collections.abc import Iterator
 from functools import partial
-from typing import Any
 
 import numpy as np
 
 from lmshealth.health.inference import infer
 from lmshealth.stage.description import load_stage
 from lmshealth.tracking.read_tables import Drifts
-from studies.record import Study
+from studies.harness.claims import Claim, Older, number
+from studies.harness.study import Row, Study
 from studies.sampling_speed.contestants import compare, epoch_posterior
 from studies.sampling_speed.life import START, life_posterior
+
+STEP = "infer"
+OLDER = {
+    "result": Older("38ea0d4464b9", "the courses of a life were weighed, which its times are of")
+}
 
 SEED = 20261122
 ESS_PER_S, EPOCH_S, LIFE_S, TIMES, R_HAT = 2000.0, 3.0, 10.0, 20.0, 1.01
@@ -53,7 +59,7 @@ ESS_PER_S, EPOCH_S, LIFE_S, TIMES, R_HAT = 2000.0, 3.0, 10.0, 20.0, 1.01
 SAME_QUANTILES, SAME_LIKELIHOOD = 0.1, 1e-4
 
 
-def converged_epochs(seed: int, turns: int) -> dict[str, Any]:
+def converged_epochs(seed: int, turns: int) -> Row:
     """Time all that `infer` does of one epoch."""
     stage = load_stage("lms-y")
     (view,) = epoch_posterior(stage).machines
@@ -74,7 +80,7 @@ def main() -> None:
     turns = 1 if quick else 7
     if not quick:  # the first call imports what the libraries put off until then
         converged_epochs(SEED, 1)
-    answer: dict[str, Any] = {
+    answer: Row = {
         "seed": SEED,
         "epoch": once(partial(compare, quick=quick), SEED, turns),
         "converged_epoch": once(converged_epochs, SEED, turns),
@@ -84,7 +90,7 @@ def main() -> None:
     study.conclude(answer)
 
 
-def verdicts(answer: dict[str, Any], *, quick: bool) -> dict[str, bool]:
+def verdicts(answer: Row, *, quick: bool) -> dict[str, bool]:
     """Say what was asked and whether it is so; times are judged in the recorded run alone."""
     rows = {row["program"]: row for row in answer["epoch"]["programs"]}
     life, likelihood = answer["life"], answer["life"]["likelihood"]
@@ -110,6 +116,49 @@ def verdicts(answer: dict[str, Any], *, quick: bool) -> dict[str, bool]:
             "a life of 100 logs in 10 s": life["cpu_s"] < LIFE_S,
         }
     return {name: bool(passed) for name, passed in checks.items()}
+
+
+def claims(answer: Row) -> Iterator[Claim]:
+    """Claim draws a second beside other programs, and times of epochs and lives."""
+    epoch, life = answer["epoch"], answer["life"]
+    rows = {row["program"]: row for row in epoch["programs"]}
+    beside = ", ".join(
+        f"{number(row['ours_is_times_faster'])} times {name}"
+        for name, row in rows.items()
+        if name != "lmshealth"
+    )
+    ours = rows["lmshealth"]
+    yield Claim(
+        "effective draws of an epoch a second",
+        number(ours["ess_per_s"]),
+        f"median of {epoch['turns']} turns",
+        f"2,000 asked; {beside}",
+        ours["ess_per_s"] >= 2000
+        and all(row["ours_is_times_faster"] >= 1 for row in rows.values()),
+    )
+    one = answer["converged_epoch"]
+    yield Claim(
+        "a converged epoch",
+        f"{number(one['cpu_s'])} s",
+        f"median of {one['turns']} turns",
+        "3 s asked",
+        one["cpu_s"] < 3,
+    )
+    walker = life["likelihood"]
+    yield Claim(
+        "a walker of a life, with the likelihood of a loop over filterpy",
+        f"{number(walker['us_per_walker'])} µs, {number(walker['times_faster'])} times faster",
+        "",
+        f"20 times asked; likelihoods differ by {number(walker['largest_difference'])}",
+        walker["times_faster"] >= 20,
+    )
+    yield Claim(
+        f"the posterior of a life of {walker['logs']} logs",
+        f"{number(life['cpu_s'])} s",
+        f"median of {len(life['runs'])} turns" if "runs" in life else "",
+        "10 s asked",
+        life["cpu_s"] < 10,
+    )
 
 
 if __name__ == "__main__":

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
-from typing import Any
 
 import matplotlib
 from matplotlib.figure import Figure
 
-from studies.ranks import BLUE, COLOURS, ORANGE, draw_ecdf, draw_histogram
+from studies.common.ranks import BLUE, COLOURS, ORANGE, draw_ecdf, draw_histogram
+from studies.harness.study import Row, read_record
 
 HERE = Path(__file__).parent
 WORDS = {"guide_preload": "preload", "mount_stiffness": "mount"}
@@ -25,8 +24,8 @@ def short(name: str) -> str:
 def main() -> None:
     """Draw histograms above, distributions below."""
     matplotlib.rcParams["svg.hashsalt"] = "sbc_epoch"
-    result = json.loads((HERE / "result.json").read_text())
-    ranks: dict[str, dict[str, Any]] = result["ranks"]
+    result = read_record(__file__)
+    ranks: dict[str, Row] = result["ranks"]
     figure = Figure(figsize=(11.0, 6.5), layout="constrained")
     upper, lower = figure.subfigures(2, 1, height_ratios=[1.0, 1.35])
     axes = iter(upper.subplots(1, 6, sharey=True))
@@ -51,7 +50,7 @@ def main() -> None:
     figure.savefig(HERE / "figure.svg", metadata={"Date": None})
 
 
-def joined(ranks: dict[str, dict[str, Any]], kinds: tuple[str, ...]) -> dict[str, Any]:
+def joined(ranks: dict[str, Row], kinds: tuple[str, ...]) -> Row:
     """Put parameters of several kinds of lives into one table."""
     return {
         f"{kind}, {short(name)}, {row['n']:,}": row

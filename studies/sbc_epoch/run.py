@@ -32,9 +32,9 @@ Run time
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
 from functools import cache
-from typing import Any
 
 import numpy as np
 
@@ -45,18 +45,22 @@ from lmshealth.health.importance_sampling import importance_sample_to_ess
 from lmshealth.health.inference import draw as draw_chains
 from lmshealth.health.inference import infer
 from lmshealth.stage.description import Stage, load_stage
-from studies.ranks import (
+from studies.common.ranks import (
     N_DRAWS,
     Array,
-    Row,
     bands,
     judge,
     rank,
     thinned,
     uniform,
 )
-from studies.record import Study
+from studies.harness.claims import Claim, ranked
+from studies.harness.study import Row, Study
 from studies.sbc_epoch.lives import Life, believing, draw
+
+STEP = "infer"
+CONTROLS = ("all covariances halved", "map taken as exact")
+UNSEEN = "covariance of the drifts halved"
 
 SEED = 20261122
 EPOCHS = ("first third", "second third", "last")
@@ -85,7 +89,7 @@ def main() -> None:
     tasks = [(kind, life) for kind, n in plan.items() for life in range(n)]
     found = study.trials.collect(one, tasks)
     rows = [{"kind": kind} | row for (kind, _), row in zip(tasks, found, strict=True)]
-    answer: dict[str, Any] = {"seed": SEED, "lives": plan} | judged(rows)
+    answer: Row = {"seed": SEED, "lives": plan} | judged(rows)
     answer["passed"] = verdicts(answer["ranks"])
     answer["bands"] = bands(row for part in answer["ranks"].values() for row in part.values())
     study.conclude(answer)
@@ -143,7 +147,7 @@ def ranks(truth: Array, draws: list[Array], rng: np.random.Generator) -> list[li
     return [rank(x, own, rng) for x, own in zip(truth, draws, strict=True)]
 
 
-def judged(rows: list[Row]) -> dict[str, Any]:
+def judged(rows: list[Row]) -> Row:
     """Judge the ranks of every parameter, kind by kind and epoch by epoch."""
     names = [parameter.name for parameter in machine(ONE).parameters]
     found: dict[str, dict[str, Row]] = {}
@@ -174,6 +178,15 @@ def verdicts(found: dict[str, dict[str, Row]]) -> dict[str, bool]:
                 row["inside_band"] for row in found[kind].values()
             )
     return checks
+
+
+def claims(answer: Row) -> Iterator[Claim]:
+    """Claim uniform ranks of the truth, and controls that are found out."""
+    for kind, rows in answer["ranks"].items():
+        if kind == UNSEEN:
+            yield from ranked(f"{kind}, which is not seen", rows.values())
+        else:
+            yield from ranked(kind, rows.values(), control=kind in CONTROLS)
 
 
 if __name__ == "__main__":

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
-from typing import Any
 
 import matplotlib
 from matplotlib.figure import Figure
 
-from studies.ranks import COLOURS, draw_ecdf, draw_histogram
+from studies.common.ranks import COLOURS, draw_ecdf, draw_histogram
+from studies.harness.study import Row, read_record
 
 HERE = Path(__file__).parent
 SHOWN = ("preload now", "mount now", "remaining, first of both")
@@ -18,8 +17,8 @@ SHOWN = ("preload now", "mount now", "remaining, first of both")
 def main() -> None:
     """Draw histograms on the left, distributions on the right."""
     matplotlib.rcParams["svg.hashsalt"] = "sbc_life"
-    result = json.loads((HERE / "result.json").read_text())
-    ranks: dict[str, dict[str, Any]] = result["ranks"]
+    result = read_record(__file__)
+    ranks: dict[str, Row] = result["ranks"]
     figure = Figure(figsize=(11.0, 8.0), layout="constrained")
     left, right = figure.subfigures(1, 2, width_ratios=[1.0, 1.25])
     axes = left.subplots(3, 3, sharex=True, sharey=True)

@@ -39,9 +39,9 @@ Run time
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
 from functools import cache
-from typing import Any
 
 import msgspec
 import numpy as np
@@ -50,18 +50,29 @@ from lmshealth.errors import NotConverged
 from lmshealth.prognosis.life_posterior import LifePosterior, fit_life
 from lmshealth.prognosis.remaining_life import remaining_travel
 from lmshealth.stage.description import Stage, load_stage
-from studies.ranks import (
+from studies.common.ranks import (
     N_DRAWS,
     Array,
-    Row,
     bands,
     judge,
     rank,
     uniform,
 )
-from studies.record import Study
+from studies.harness.claims import Claim, Older, ranked
+from studies.harness.study import Row, Study
 from studies.sbc_epoch.lives import believing
 from studies.sbc_life.lives import Life, draw
+
+STEP = "prognose"
+OLDER = {
+    "result": Older(
+        "f293e059ff09",
+        "jumps were parted from logs at the same odometer, which its lives have not, and a linear "
+        "law could gain",
+    )
+}
+CONTROLS = ("map taken as exact", "every part taken to lose")
+NOW = ("preload now", "mount now")
 
 SEED = 20261123
 ONE, CHAINS = "posterior", "by chains"
@@ -91,7 +102,7 @@ def main() -> None:
     tasks = [(kind, first + k) for kind, n in plan.items() for k in range(n)]
     found = study.trials.collect(one, tasks)
     rows = [{"kind": kind} | row for (kind, _), row in zip(tasks, found, strict=True)]
-    answer: dict[str, Any] = {"seed": SEED, "lives": plan} | judged(rows)
+    answer: Row = {"seed": SEED, "lives": plan} | judged(rows)
     answer["passed"] = verdicts(answer["ranks"])
     answer["bands"] = bands(row for part in answer["ranks"].values() for row in part.values())
     study.conclude(answer)
@@ -164,7 +175,7 @@ def quantities(found: LifePosterior, now: float, rng: np.random.Generator) -> Ar
     return np.hstack([*(part.reshape(left.shape[0], -1) for part in now_parts), left])
 
 
-def judged(rows: list[Row]) -> dict[str, Any]:
+def judged(rows: list[Row]) -> Row:
     """Judge the ranks of every quantity, kind by kind."""
     found: dict[str, dict[str, Row]] = {}
     for kind in dict.fromkeys(row["kind"] for row in rows):
@@ -182,6 +193,15 @@ def verdicts(found: dict[str, dict[str, Row]]) -> dict[str, bool]:
         if kind in found and found[kind][HEALTH[0]]["n"] >= 0.9 * LIVES[kind]:  # fewer tell little
             checks[f"they are not: {kind}"] = not uniform({n: found[kind][n] for n in names})
     return checks
+
+
+def claims(answer: Row) -> Iterator[Claim]:
+    """Claim uniform ranks of health now and of the remaining life."""
+    for kind, rows in answer["ranks"].items():
+        if kind in CONTROLS:
+            yield from ranked(f"health now, {kind}", [rows[name] for name in NOW], control=True)
+        else:
+            yield from ranked(f"health now and remaining life, {kind}", rows.values())
 
 
 if __name__ == "__main__":

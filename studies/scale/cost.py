@@ -31,9 +31,9 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Iterator
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -41,9 +41,12 @@ from lmshealth import Settings, identify, load_stage, read_log, run
 from lmshealth.signal.following_error import loop_error
 from lmshealth.signal.waterfall import relative_spectrum
 from lmshealth.stage.description import Stage
-from studies.commands import no_pictures
-from studies.record import Study, options
+from studies.harness.claims import Claim
+from studies.harness.command_line import no_pictures
+from studies.harness.study import Row, Study
 from studies.scale.archive import make_archive
+
+STEP = "batch"
 
 SIZES, QUICK_SIZES = (100, 1_000, 10_000), (2, 4, 8)
 LONGER = "longer and longer"
@@ -52,8 +55,6 @@ EVERY = 21  # so that every recording that the logs are made of is among them
 FLAT, OVERHEAD, MEMORY = 0.10, 0.15, 1.10
 # A few logs of the quick form are not enough for more than that it works.
 QUICK = 10.0
-
-Row = dict[str, Any]
 
 
 class Meter:
@@ -148,11 +149,9 @@ def overhead_of(row: Row) -> float:
 
 def main() -> None:
     """Run the study; ``--quick`` does small archives and records nothing."""
-    parser = options(__doc__)
-    parser.add_argument("--one", type=Path, help="only analyse this archive, and say what it cost")
-    study = Study(__file__, __doc__, parser.parse_args())
+    study = Study(__file__, __doc__, one="")
     if study.options.one:
-        print(json.dumps(one_run(study.options.one)))
+        print(json.dumps(one_run(Path(study.options.one))))
         return
     quick, once = study.quick, study.trials.once
     sizes = QUICK_SIZES if quick else SIZES
@@ -183,6 +182,28 @@ def main() -> None:
     answer["passed"] = {name: bool(fine) for name, fine in answer["passed"].items()}
     # What is imported late makes the first of a few logs dear.
     study.conclude(answer, quick_may_fail=True)
+
+
+def claims(answer: Row) -> Iterator[Claim]:
+    """Claim that a log costs the same in archives of any size."""
+    passed = answer["passed"]
+    sizes = [row["logs"] for row in answer["sizes"]]
+    yield Claim(
+        f"cost of one more log between {sizes[1]:,} and {sizes[2]:,}, over that from {sizes[0]:,}",
+        f"{answer['marginal_ratio']:.3f}",
+        "",
+        f"0.9 to 1.1 asked; where logs get longer {answer['control_ratio']:.2f} of a log",
+        passed["flat"] and passed["control is seen"],
+    )
+    memory = [f"{row['memory_mb']:.0f}" for row in answer["sizes"]]
+    yield Claim("largest memory", f"{memory[0]} to {memory[-1]} MB", "", "", passed["memory stays"])
+    yield Claim(
+        "reading, store and bookkeeping over the identification",
+        f"{100 * answer['overhead']:.1f} %",
+        "",
+        "15 % asked",
+        passed["little beside identification"],
+    )
 
 
 if __name__ == "__main__":

@@ -23,15 +23,18 @@ from __future__ import annotations
 import html
 import shutil
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from lmshealth.report.fleet_page import Summary, write_index
-from studies.record import Study
+from studies.harness.claims import Claim
+from studies.harness.study import Row, Study
 from studies.scale.rows import make_refused, make_rows
+
+STEP = "batch"
 
 SOUGHT = "line04-m0417"
 # Of the page against the bare table, and of bytes per stage.
@@ -82,7 +85,7 @@ def write_pages(folder: Path, n: int) -> dict[str, Path]:
     return paths
 
 
-def watch(browser: Any, path: Path) -> dict[str, Any]:
+def watch(browser: Any, path: Path) -> Row:
     """Load a page once; type into its search field, where it has one."""
     context = browser.new_context(offline=True, viewport={"width": 1280, "height": 800})
     page = context.new_page()
@@ -100,7 +103,7 @@ def measure(paths: Mapping[str, Path], repeats: int) -> dict[str, dict[str, floa
     """Load all pages in turns; give medians, and the slowest key stroke."""
     from playwright.sync_api import sync_playwright
 
-    seen: dict[str, list[dict[str, Any]]] = {name: [] for name in paths}
+    seen: dict[str, list[Row]] = {name: [] for name in paths}
     with sync_playwright() as driver:
         browser = driver.chromium.launch(
             executable_path=shutil.which("chromium"), args=["--no-sandbox", "--disable-gpu"]
@@ -146,6 +149,25 @@ def main() -> None:
         "control: slower with every row laid out": answer["control_to_bare"] > answer["to_bare"],
     }
     study.conclude(answer)
+
+
+def claims(answer: Row) -> Iterator[Claim]:
+    """Claim that the front page of many machines is light."""
+    passed = answer["passed"]
+    yield Claim(
+        f"{answer['stages']:,} stages on one page load, over a bare table of the same text",
+        f"{answer['to_bare']:.2f} times",
+        f"median of {answer['loads']} loads",
+        f"4 asked; with every row laid out {answer['control_to_bare']:.1f}",
+        all(passed.values()),
+    )
+    yield Claim(
+        "a stage on it",
+        f"{answer['bytes_per_stage']:,} bytes",
+        "",
+        "1,500 asked",
+        answer["bytes_per_stage"] <= 1500,
+    )
 
 
 if __name__ == "__main__":

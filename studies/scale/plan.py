@@ -25,24 +25,25 @@ from __future__ import annotations
 import json
 import tempfile
 import time
+from collections.abc import Iterator
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import msgspec
 
 from lmshealth import Settings, load_stage, run
 from lmshealth.stage.description import Stage
 from models.lives.simulation import Plan, simulate_life
-from studies.record import Study
+from studies.harness.claims import Claim, number
+from studies.harness.study import Row, Study
+
+STEP = "batch"
 
 HERE = Path(__file__).parent
 N_LOGS, N_STAGES = 1_000_000, 10_000
 WORKERS = (1, 8, 32, 128, 512)
 FULL, QUICK = Plan("lms-y", "both", 40, 20.0, 3), Plan("lms-x", "preload-wear", 5, 5.0, 3)
-
-Row = dict[str, Any]
 
 
 class Steps:
@@ -138,6 +139,17 @@ def main() -> None:
         "passed": {"more workers take less": plans[0]["hours"] > plans[-1]["hours"]},
     }
     study.conclude(answer)
+
+
+def claims(answer: Row) -> Iterator[Claim]:
+    """Claim, by what one stage costs, how long a million logs take."""
+    for row in answer["plans"]:
+        yield Claim(
+            f"a million logs of ten thousand stages, {row['workers']:,} workers, reckoned",
+            f"{number(row['hours'])} h",
+            "",
+            f"waits for {row['waits_for']}",
+        )
 
 
 if __name__ == "__main__":

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from datetime import date, timedelta
-from typing import Any
 
 import numpy as np
 
@@ -13,6 +12,7 @@ from lmshealth.report.brief import Brief
 from lmshealth.report.fleet_page import Summary
 from lmshealth.report.healthfacts import Gauge, Life, Tone
 from lmshealth.report.text import GAP, day_count, km, percent
+from studies.harness.study import Row
 
 TODAY = date(2026, 11, 20)
 HORIZON = 20e6
@@ -97,7 +97,7 @@ def _life(days: float) -> Life:
 
 
 def _service(days: float | None) -> Service:
-    kinds: dict[str, Any] = {"kind": "unknown", "by": None, "wait": np.nan, "risk": np.nan}
+    kinds: Row = {"kind": "unknown", "by": None, "wait": np.nan, "risk": np.nan}
     if days is not None and days * USAGE > HORIZON:
         kinds |= {"kind": "later", "wait": np.inf}
     elif days is not None:

@@ -22,27 +22,28 @@ from __future__ import annotations
 
 import tempfile
 import time
+from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import nullcontext
 from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from lmshealth import Settings, identify, load_stage, read_log, run
-from studies.commands import no_pictures
-from studies.record import Study
+from studies.harness.claims import Claim
+from studies.harness.command_line import no_pictures
+from studies.harness.servers import dask_cluster
+from studies.harness.study import Row, Study
 from studies.scale.archive import make_archive
-from studies.servers import dask_cluster
+
+STEP = "batch"
 
 N_LOGS, QUICK_LOGS, TURNS = 200, 4, 3
 # Of the bound that the machine gives in the same turn, and against one worker.
 SPEEDUP = 1.8
 _BARE, _QUICK_BARE = 40, 1  # identifications in each process of the bound
-
-Row = dict[str, Any]
 
 
 class Clock:
@@ -151,6 +152,21 @@ def main() -> None:
     }
     # Of a small archive the start of the second worker is most of the time.
     study.conclude(answer, quick_may_fail=True)
+
+
+def claims(answer: Row) -> Iterator[Claim]:
+    """Claim how much faster two workers are than one."""
+    low, middle, high = answer["bound"]
+    for kind, what in (("local", "two processes"), ("dask", "two workers of Dask")):
+        least, median, most = answer[kind]
+        yield Claim(
+            f"{what} identify an archive, over one",
+            f"{median:.2f} times",
+            f"{least:.2f} to {most:.2f} in {answer['turns']} turns",
+            f"the machine gives two bare processes {middle:.2f} ({low:.2f} to {high:.2f}); "
+            f"{answer['of the bound'][kind]:.2f} of it, 0.9 asked",
+            answer["passed"][f"{kind}: 1.8 of 2"],
+        )
 
 
 if __name__ == "__main__":

@@ -21,7 +21,7 @@ import subprocess
 import sys
 import time
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 import numpy as np
 
@@ -29,7 +29,10 @@ from models.dynamics.plant import NOISE_INPUTS, closed_loop
 from models.dynamics.stages import STAGES, stage_named
 from models.recordings.disturbances import noise_levels
 from models.recordings.recording import SAMPLE_RATE_HZ, record
-from studies.record import Study, options
+from studies.harness.claims import Claim, span
+from studies.harness.study import Row, Study
+
+STEP = "simulated plants"
 
 SECONDS, PEER_SECONDS = 60.0, 2.0
 BOUND_S, BOUND_MB = 2.0, 500.0
@@ -38,9 +41,7 @@ _THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
 
 def main() -> None:
     """Run the study; ``--quick`` measures one stage once and records nothing."""
-    parser = options(__doc__)
-    parser.add_argument("--child", choices=list(STAGES))
-    study = Study(__file__, __doc__, parser.parse_args())
+    study = Study(__file__, __doc__, child="")
     if study.options.child:
         print(json.dumps(measure(study.options.child, 1 if study.quick else 3)))
         return
@@ -109,6 +110,27 @@ def step_by_step(name: str) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         control.forced_response(sampled, np.arange(samples) / SAMPLE_RATE_HZ, white)
+
+
+def claims(answer: Row) -> Iterator[Claim]:
+    """Claim time and memory of a simulated minute."""
+    rows = answer["stages"].values()
+    passed = answer["passed"]
+    peers = span(row["peer_over_ours"] for row in rows)
+    yield Claim(
+        "60 s of four signals, processor time",
+        span((row["record_60s_cpu_s"] for row in rows), "s"),
+        "least of three turns",
+        f"{answer['bound_s']} s asked; stepping by python-control takes {peers} times",
+        passed["time"],
+    )
+    yield Claim(
+        "its memory",
+        span((row["peak_mb"] for row in rows), "MB"),
+        "",
+        f"{answer['bound_mb']:.0f} MB asked",
+        passed["memory"],
+    )
 
 
 if __name__ == "__main__":

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
-from typing import Any
 
 import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter, StrMethodFormatter
+
+from studies.harness.study import Row, read_record
 
 HERE = Path(__file__).parent
 SENSORS = {
@@ -28,7 +28,7 @@ STAGE, MODES = "lms-y", ("roll", "pitch", "yaw")
 _REACH = 5.0
 
 
-def draw_response(gain: list[Axes], coherence: Axes, example: dict[str, Any]) -> None:
+def draw_response(gain: list[Axes], coherence: Axes, example: Row) -> None:
     """Draw measured gain, its fit, and coherence of both sensors."""
     for ax, (name, (label, scale, unit, colour)) in zip(gain, SENSORS.items(), strict=True):
         part = example[name]
@@ -52,7 +52,7 @@ def draw_response(gain: list[Axes], coherence: Axes, example: dict[str, Any]) ->
         ax.grid(alpha=0.25)
 
 
-def draw_mode(ax: Axes, name: str, mode: dict[str, Any], rows: list[dict[str, Any]]) -> None:
+def draw_mode(ax: Axes, name: str, mode: Row, rows: list[Row]) -> None:
     """Draw what every method found in every log, less the truth."""
     reach = _REACH * max(m.get("median_std_hz", 0.0) for m in mode["methods"].values())
     for k, (method, (label, colour, marker)) in enumerate(METHODS.items()):
@@ -81,7 +81,7 @@ def draw_mode(ax: Axes, name: str, mode: dict[str, Any], rows: list[dict[str, An
 def main() -> None:
     """Draw responses above, one panel per mode below."""
     matplotlib.rcParams["svg.hashsalt"] = "three_methods"
-    result = json.loads((HERE / "result.json").read_text())
+    result = read_record(__file__)
     figure = Figure(figsize=(11.0, 6.6), layout="constrained")
     axes = figure.subplots(2, 3)
     draw_response([axes[0, 0], axes[0, 1]], axes[0, 2], result["example"])

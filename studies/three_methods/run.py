@@ -28,7 +28,7 @@ from __future__ import annotations
 import os
 import tempfile
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import nullcontext
 from itertools import combinations, product
@@ -48,7 +48,10 @@ from models.dynamics.stages import NOMINAL, Condition, stage_named
 from models.recordings.formats import write_log
 from models.recordings.recording import record
 from models.recordings.sweep import Sweep, record_sweep, without_loop
-from studies.record import Study, options
+from studies.harness.claims import Claim, number
+from studies.harness.study import Row, Study
+
+STEP = "simulated plants"
 
 SECONDS = 20.0
 # All of the travel at 10 mm/s, four periods long, around the guide modes; the amplitude is near
@@ -81,9 +84,7 @@ Estimates = dict[str, tuple[float, float] | str]
 
 def main() -> None:
     """Run the study; ``--quick`` does one seed of stage Y in this process, and records nothing."""
-    parser = options(__doc__)
-    parser.add_argument("--seeds", type=int, default=20)
-    study = Study(__file__, __doc__, parser.parse_args())
+    study = Study(__file__, __doc__, seeds=20)
     seeds = [QUICK_SEED] if study.quick else range(study.options.seeds)
     names = ["lms-y"] if study.quick else list(SWEEPS)
     # Two workers fill two cores: threads inside linear algebra would get in their way.
@@ -105,7 +106,7 @@ def main() -> None:
         },
     }
     example = None if study.quick else example_response("lms-y")
-    study.conclude(answer, beside={"example": example, "rows": rows})
+    study.conclude(answer, details={"example": example, "rows": rows})
 
 
 def generator(name: str, seed: int, step: str) -> np.random.Generator:
@@ -168,13 +169,13 @@ def by_channels(name: str, log: Log, channels: tuple[str, ...]) -> Estimates:
     return {mode: found.get(mode, "not reported") for mode in GUIDE_MODES}
 
 
-def one_seed(name: str, seed: int) -> dict[str, Any]:
+def one_seed(name: str, seed: int) -> Row:
     """Return the estimates of all methods and controls for one seed."""
     with tempfile.TemporaryDirectory() as scratch:
         folder = Path(scratch)
         log = swept(name, seed, folder)
         error = next(c.values for c in log.channels if c.name == "delta_e")
-        row: dict[str, Any] = {
+        row: Row = {
             "stage": name,
             "seed": seed,
             "sweep_delta_e_max_um": float(1e6 * np.abs(error - error.mean()).max()),
@@ -187,9 +188,7 @@ def one_seed(name: str, seed: int) -> dict[str, Any]:
     return row
 
 
-def scores(
-    rows: list[dict[str, Any]], first: str, second: Callable[[dict[str, Any]], Any], mode: str
-) -> dict[str, Any]:
+def scores(rows: list[Row], first: str, second: Callable[[Row], Any], mode: str) -> Row:
     """Test differences of two estimates of a mode over the seeds in which both have it."""
     pairs = [(row[first][mode], second(row)) for row in rows]
     both = [(a, b) for a, b in pairs if not isinstance(a, str) and not isinstance(b, str)]
@@ -210,7 +209,7 @@ def scores(
     }
 
 
-def summarise(name: str, rows: list[dict[str, Any]]) -> dict[str, Any]:
+def summarise(name: str, rows: list[Row]) -> Row:
     """Compare the methods with each other and with the eigenvalues."""
     loop = without_loop(stage_named(name))
     truth = {mode: loop[mode][0].frequency_hz for mode in GUIDE_MODES}
@@ -228,9 +227,9 @@ def summarise(name: str, rows: list[dict[str, Any]]) -> dict[str, Any]:
     }
 
 
-def compare(rows: list[dict[str, Any]], mode: str, truth: float) -> dict[str, Any]:
+def compare(rows: list[Row], mode: str, truth: float) -> Row:
     """Compare the methods in one mode, and say what follows."""
-    methods: dict[str, Any] = {}
+    methods: Row = {}
     for method in METHODS:
         kept = [row[method][mode] for row in rows if not isinstance(row[method][mode], str)]
         refused = sorted({row[method][mode] for row in rows if isinstance(row[method][mode], str)})
@@ -249,7 +248,7 @@ def compare(rows: list[dict[str, Any]], mode: str, truth: float) -> dict[str, An
             "pairs": pairs}  # fmt: skip
 
 
-def controls(rows: list[dict[str, Any]], pitch: dict[str, Any]) -> dict[str, Any]:
+def controls(rows: list[Row], pitch: Row) -> Row:
     """Return the comparisons that must fail, on pitch: it is seen by all and moved by the loop."""
     closed = pitch["truth_hz"]
     worn = scores(rows, "frf_worn", lambda row: row["delta_e"]["pitch"], "pitch")
@@ -264,12 +263,12 @@ def controls(rows: list[dict[str, Any]], pitch: dict[str, Any]) -> dict[str, Any
     return found
 
 
-def example_response(name: str) -> dict[str, Any]:
+def example_response(name: str) -> Row:
     """Return the responses of one log with their fits, for the figure."""
     with tempfile.TemporaryDirectory() as scratch:
         log = swept(name, 0, Path(scratch))
     (names,) = BANDS[name]
-    example: dict[str, Any] = {"stage": name}
+    example: Row = {"stage": name}
     for sensor in ("delta_e", "acc_pitch"):
         reading = read(name, log, "current_excitation", sensor, names)
         frf, fit = reading.frf, reading.fit
@@ -284,6 +283,22 @@ def example_response(name: str) -> dict[str, Any]:
             key: [float(f"{x:.5g}") for x in values] for key, values in columns.items()
         }
     return example
+
+
+def claims(answer: Row) -> Iterator[Claim]:
+    """Claim that three methods agree, and which mode which of them shows."""
+    for name, stage in answer["stages"].items():
+        controls = all(row["disagrees"] for row in stage["controls"].values())
+        for mode, row in stage["modes"].items():
+            seen = ", ".join(f"{method} {own['n_seen']}" for method, own in row["methods"].items())
+            least = [min(pair["p"], pair["p_of_mean"]) for pair in row["pairs"].values()]
+            yield Claim(
+                f"{name}: methods that show {mode} agree, of {answer['n_seeds']} logs each",
+                f"{row['verdict']} ({seen})",
+                f"smallest p {number(min(least))}, refused below 0.001" if least else "",
+                "both controls disagree" if controls else "controls are not found out",
+                row["verdict"] != "disagree" and controls,
+            )
 
 
 if __name__ == "__main__":

@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
-from typing import Any
 
 import matplotlib
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from studies.harness.study import Row, read_record
+
 HERE = Path(__file__).parent
 BLUE, ORANGE, GREEN, BLACK = "#0072b2", "#d55e00", "#009e73", "#000000"
 
 
-def draw_sums(ax: Axes, known: dict[str, Any]) -> None:
+def draw_sums(ax: Axes, known: Row) -> None:
     """Draw mean squares of errors and innovations with their bands, and those of the control."""
     names = list(known["as reported"])
     for y, name in enumerate(names):
@@ -33,7 +33,7 @@ def draw_sums(ax: Axes, known: dict[str, Any]) -> None:
     ax.legend(fontsize=7, loc="lower right")
 
 
-def draw_coverage(ax: Axes, rows: dict[str, list[dict[str, Any]]], title: str) -> None:
+def draw_coverage(ax: Axes, rows: dict[str, list[Row]], title: str) -> None:
     """Draw measured coverages of 50 and 90 % intervals with their Clopper-Pearson intervals."""
     for y, (name, levels) in enumerate(rows.items()):
         colour = ORANGE if "control" in name else BLUE
@@ -49,7 +49,7 @@ def draw_coverage(ax: Axes, rows: dict[str, list[dict[str, Any]]], title: str) -
     ax.set_title(title, fontsize=10)
 
 
-def draw_times(ax: Axes, speed: dict[str, Any]) -> None:
+def draw_times(ax: Axes, speed: Row) -> None:
     """Draw processor time in units of the filterpy loop, with the seconds and the differences."""
     rows = speed["programs"]
     for y, row in enumerate(rows):
@@ -69,7 +69,7 @@ def draw_times(ax: Axes, speed: dict[str, Any]) -> None:
 def main() -> None:
     """Draw four panels."""
     matplotlib.rcParams["svg.hashsalt"] = "tracking_filter"
-    result = json.loads((HERE / "result.json").read_text())
+    result = read_record(__file__)
     average, sources = result["averaged"], result["two_sources"]
     figure = Figure(figsize=(11.0, 6.5), layout="constrained")
     axes = figure.subplots(2, 2)

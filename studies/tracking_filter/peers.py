@@ -20,6 +20,7 @@ from lmshealth.tracking.filter_bank import Filter, Settings
 from lmshealth.tracking.history import History, Series
 from lmshealth.tracking.state_space import StateSpace, state_space
 from lmshealth.tracking.track import track
+from studies.harness.study import Row
 from studies.tracking_filter.lives import START, Array, Life, draw, filtered
 
 PEERS = ("simdkalman", "statsmodels")
@@ -203,7 +204,7 @@ def seconds(work: Callable[[], Any]) -> float:
     return time.process_time() - begin
 
 
-def speed(n: int, m: int, repeats: int) -> dict[str, Any]:
+def speed(n: int, m: int, repeats: int) -> Row:
     """Compare numbers and processor time on one long life; programs take turns."""
     history = long_life(n, m)
     missing = [name for name in PEERS if find_spec(name) is None]
@@ -230,7 +231,7 @@ def speed(n: int, m: int, repeats: int) -> dict[str, Any]:
     rows = []
     for name, taken in times.items():
         ratios = np.array(taken) / times["filterpy, one setting"]
-        row: dict[str, Any] = {"program": name, "cpu_s": min(taken),
+        row: Row = {"program": name, "cpu_s": min(taken),
                                "times_filterpy": float(np.median(ratios))}  # fmt: skip
         if name in numbers:
             other, other_std = numbers[name]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 from scipy import stats
@@ -11,8 +10,8 @@ from scipy import stats
 from lmshealth.stage.description import Stage
 from lmshealth.tracking.history import History
 from lmshealth.tracking.track import track
-from studies.metrics import clopper_pearson
-from studies.record import LEVEL
+from studies.common.metrics import clopper_pearson
+from studies.harness.study import LEVEL, Row
 from studies.tracking_filter.lives import (
     Array,
     Life,
@@ -27,7 +26,7 @@ QUANTITIES = ("ln f", "ln ζ", "drift")
 NOMINAL = (0.5, 0.9)
 
 
-def band(total: float, dof: float) -> dict[str, Any]:
+def band(total: float, dof: float) -> Row:
     """Judge a sum of squares by its 99.9 % band; numbers are per degree of freedom."""
     low, high = stats.chi2.interval(LEVEL, dof)
     return {
@@ -44,7 +43,7 @@ def halved(history: History) -> History:
     return replace(history, cov=history.cov / 2)
 
 
-def known_setting(rng: np.random.Generator, n: int, machine: Stage) -> dict[str, Any]:
+def known_setting(rng: np.random.Generator, n: int, machine: Stage) -> Row:
     """Sum the squares of errors and innovations of the filter of the right setting.
 
     The errors of a life are those at one of its logs; the control has half the covariance.
@@ -82,7 +81,7 @@ def errors(life: Life, history: History, k: int, machine: Stage) -> dict[str, Ar
     return off | {"width": std["drift"]}
 
 
-def coverage(z: Array) -> list[dict[str, Any]]:
+def coverage(z: Array) -> list[Row]:
     """Tell how often intervals of both levels hold the truth."""
     rows = []
     for level in NOMINAL:
@@ -94,7 +93,7 @@ def coverage(z: Array) -> list[dict[str, Any]]:
     return rows
 
 
-def moment(z: Array) -> dict[str, Any]:
+def moment(z: Array) -> Row:
     """Judge the mean square of errors by its own scatter, because their tails are heavy."""
     square = np.square(z)
     error = float(stats.norm.isf((1 - LEVEL) / 2) * square.std(ddof=1) / np.sqrt(z.size))
@@ -102,7 +101,7 @@ def moment(z: Array) -> dict[str, Any]:
             "holds": bool(abs(square.mean() - 1) <= error)}  # fmt: skip
 
 
-def averaged(rng: np.random.Generator, n: int, n_halved: int, machine: Stage) -> dict[str, Any]:
+def averaged(rng: np.random.Generator, n: int, n_halved: int, machine: Stage) -> Row:
     """Cover the truth by the tracker, which knows nothing of the setting.
 
     What is published is a mean and a standard deviation. The average over settings they belong to
@@ -136,7 +135,7 @@ def averaged(rng: np.random.Generator, n: int, n_halved: int, machine: Stage) ->
     }
 
 
-def two_sources(rng: np.random.Generator, n: int, machine: Stage) -> dict[str, Any]:
+def two_sources(rng: np.random.Generator, n: int, machine: Stage) -> Row:
     """Cover the drifts of lives that two sources see, by both and by one alone.
 
     The control takes errors that are common to both sources for independent ones.

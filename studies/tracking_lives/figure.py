@@ -10,6 +10,8 @@ import matplotlib
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from studies.harness.study import Row, read_record
+
 HERE = Path(__file__).parent
 BLUE, ORANGE, GREEN, BLACK = "#0072b2", "#d55e00", "#009e73", "#000000"
 _LEAST_RATE = 1e-3
@@ -22,19 +24,19 @@ _WHO = {
 }
 
 
-def label(row: dict[str, Any]) -> str:
+def label(row: Row) -> str:
     """Name a row."""
     return f"{row['stage'][-1].upper()} {row['name']}"
 
 
-def interval(ax: Axes, y: float, rate: dict[str, Any], colour: str, marker: str, least: float = 0,
+def interval(ax: Axes, y: float, rate: Row, colour: str, marker: str, least: float = 0,
              **style: Any) -> None:  # fmt: skip
     """Draw a share and its interval."""
     ax.plot([max(rate["low"], least), rate["high"]], [y, y], lw=1.5, color=colour, alpha=0.6)
     ax.plot(max(rate["share"], least), y, marker, ms=4.5, color=colour, **style)
 
 
-def draw_coverage(ax: Axes, result: dict[str, Any], raw: dict[str, Any]) -> None:
+def draw_coverage(ax: Axes, result: Row, raw: Row) -> None:
     """Draw how often intervals of the drift hold the truth."""
     rows = result["lives"]
     names = [label(row) for row in rows]
@@ -57,7 +59,7 @@ def draw_coverage(ax: Axes, result: dict[str, Any], raw: dict[str, Any]) -> None
     ax.grid(axis="x", alpha=0.25)
 
 
-def draw_alarms(ax: Axes, result: dict[str, Any], raw: dict[str, Any]) -> None:
+def draw_alarms(ax: Axes, result: Row, raw: Row) -> None:
     """Draw how many lives alarm."""
     rows = result["lives"] + result["controls"]
     names = [label(row) for row in rows]
@@ -87,7 +89,7 @@ def draw_alarms(ax: Axes, result: dict[str, Any], raw: dict[str, Any]) -> None:
     ax.grid(axis="x", alpha=0.25)
 
 
-def draw_delays(ax: Axes, delays: dict[str, Any]) -> None:
+def draw_delays(ax: Axes, delays: Row) -> None:
     """Draw when a loss of 5 % in 60 logs is told."""
     for y, (key, (_, colour)) in enumerate(_WHO.items()):
         own = delays[key]
@@ -103,7 +105,7 @@ def draw_delays(ax: Axes, delays: dict[str, Any]) -> None:
     ax.grid(axis="x", alpha=0.25)
 
 
-def draw_events(ax: Axes, rows: list[dict[str, Any]]) -> None:
+def draw_events(ax: Axes, rows: list[Row]) -> None:
     """Draw the share of undeclared events that are told for what they are."""
     rows = [
         row
@@ -127,7 +129,7 @@ def draw_events(ax: Axes, rows: list[dict[str, Any]]) -> None:
 def main() -> None:
     """Draw."""
     matplotlib.rcParams |= {"svg.hashsalt": "lmshealth", "font.size": 8}
-    result = json.loads((HERE / "result.json").read_text(encoding="utf-8"))
+    result = read_record(__file__)
     kept = HERE / "raw.json"
     raw = json.loads(kept.read_text(encoding="utf-8")) if kept.exists() else {"lives": []}
     figure = Figure(figsize=(11, 9), layout="constrained")

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from lmshealth.tracking.constants import FALSE_ALARM_PROBABILITY, LN_F_STD
-from studies.lives import Array, Estimates, Life
+from studies.common.lives import Array, Estimates, Life
 
 _TEMPERATURE_STD = 0.001  # per K, as in the descriptions of the stages
 _BOUND = float(np.log(1 / FALSE_ALARM_PROBABILITY))

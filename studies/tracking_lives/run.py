@@ -40,27 +40,29 @@ from collections.abc import Iterator
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any
 from unittest.mock import patch
 
 import numpy as np
 
 from lmshealth.tracking import filter_bank as bank
-from studies.lives import (
+from studies.common.lives import (
     DAMAGED,
     HEALTHY,
+    RAW,
     Estimates,
     Life,
     drawn,
+    identified,
     life_of,
     losing_life,
+    measured,
     plan_of,
+    recorded,
     rng_of,
 )
-from studies.metrics import clopper_pearson
-from studies.raw_lives import RAW, identified, measured, recorded
-from studies.record import LEVEL, Study, options
-from studies.resume import Trials
+from studies.common.metrics import clopper_pearson
+from studies.harness.claims import Claim, counted, covered, number
+from studies.harness.study import LEVEL, Row, Study, Trials
 from studies.tracking_lives.optimum import optimum
 from studies.tracking_lives.trials import (
     DECLARED_RATE,
@@ -71,6 +73,14 @@ from studies.tracking_lives.trials import (
     coverage,
     follow,
     summed,
+)
+
+STEP = "track"
+EVENTS = (
+    "crash",
+    "sudden-loosening",
+    "servo-retuning, undeclared",
+    "regreasing, undeclared",
 )
 
 CASES = [("lms-y", kind) for kind in HEALTHY + DAMAGED] + [("lms-x", kind) for kind in HEALTHY]
@@ -85,22 +95,20 @@ CONTROLS = 100  # lives at most of each negative control
 # Alarms of damage, and events found, of all.
 ENOUGH = 0.95
 SIZED = 12  # logs of each stage that the sizes of estimates are taken from
-SIZES = ("studies.raw_lives",)  # where the sizes of estimates come from
+SIZES = ("studies.common.lives",)  # where the sizes of estimates come from
 Pairs = list[tuple[Life, Estimates]]
 Sizes = dict[str, tuple[Estimates, Life]]
 
 
 def main() -> None:
     """Run the study; ``--quick`` does one life of some kinds and records nothing."""
-    parser = options(__doc__)
-    parser.add_argument("--raw", type=int, default=0, metavar="SEEDS")
-    study = Study(__file__, __doc__, parser.parse_args())
+    study = Study(__file__, __doc__, raw=0)
     kept, seeds = study.kept(RAW), study.options.raw
     answer = raw(seeds, kept) if seeds else drawn_lives(study.trials, study.quick, kept)
     study.conclude(answer, name="raw" if seeds else "", quick_may_fail=True)
 
 
-def drawn_lives(trials: Trials, quick: bool, kept: Path | None) -> dict[str, Any]:
+def drawn_lives(trials: Trials, quick: bool, kept: Path | None) -> Row:
     """Draw, track and judge lives of each kind: 300, or one with the sizes on record."""
     n = 1 if quick else 300
     sizes = {s: recorded(s) if quick else measured(s, SIZED, kept) for s in STAGES}
@@ -116,7 +124,7 @@ def drawn_lives(trials: Trials, quick: bool, kept: Path | None) -> dict[str, Any
     return answer | {"passed": verdicts(answer, quick=quick)}
 
 
-def of_kind(sizes: Sizes, i: int, n: int) -> dict[str, Any]:
+def of_kind(sizes: Sizes, i: int, n: int) -> Row:
     """Draw, track and judge so many lives of one kind."""
     pairs = pairs_of(sizes, i, n)
     return {"lives": judged(pairs), "controls": controls(pairs[:CONTROLS])}
@@ -131,7 +139,7 @@ def pairs_of(sizes: Sizes, i: int, n: int) -> Pairs:
     ]
 
 
-def described(sizes: Estimates, life: Life) -> dict[str, Any]:
+def described(sizes: Estimates, life: Life) -> Row:
     """Tell the sizes that lives are drawn with."""
     std = np.sqrt(np.einsum("kii->ki", sizes.cov))
     loop, m = np.log(sizes.loop_error), life.drift.shape[1]
@@ -151,7 +159,7 @@ def lives(stage: str, kind: str, n: int) -> Iterator[Life]:
     return (life_of(plan_of(stage, kind, FIRST_SEED + i)) for i in range(n))
 
 
-def judged(pairs: Pairs) -> list[dict[str, Any]]:
+def judged(pairs: Pairs) -> list[Row]:
     """Track lives of one kind, with their cause declared and, where it can be, not."""
     kind = pairs[0][0].kind
     rows = [summed(follow(pairs), kind)]
@@ -160,9 +168,9 @@ def judged(pairs: Pairs) -> list[dict[str, Any]]:
     return rows
 
 
-def controls(pairs: Pairs) -> list[dict[str, Any]]:
+def controls(pairs: Pairs) -> list[Row]:
     """Track lives of which the tracker does not know what it must."""
-    unknown: dict[str, tuple[str, dict[str, Any]]] = {
+    unknown: dict[str, tuple[str, Row]] = {
         "servo-retuning": ("retuning unseen", {"declared": False, "loop_error": False}),
         "temperature-only": ("temperature unknown", {"covariates": ("payload_kg",)}),
         "payload-change": ("payload unknown", {"covariates": ("temperature_c",)}),
@@ -174,7 +182,7 @@ def controls(pairs: Pairs) -> list[dict[str, Any]]:
     return [{"name": name, "stage": life.stage, "alarms": alarmed(follow(pairs, **known))}]
 
 
-def halved(sizes: Sizes, n: int) -> dict[str, Any]:
+def halved(sizes: Sizes, n: int) -> Row:
     """Judge lives whose covariances are stated half as large, by a filter that cannot learn it."""
     found: list[Followed] = []
     for i, (_, kind) in enumerate(CASES):
@@ -186,7 +194,7 @@ def halved(sizes: Sizes, n: int) -> dict[str, Any]:
     return coverage(found)
 
 
-def power(sizes: tuple[Estimates, Life], n: int) -> dict[str, Any]:
+def power(sizes: tuple[Estimates, Life], n: int) -> Row:
     """Tell how soon a loss of preload is found, beside the best that is possible."""
     rows: list[dict[str, float]] = []
     false = {"knows": 0, "learns": 0}
@@ -198,7 +206,7 @@ def power(sizes: tuple[Estimates, Life], n: int) -> dict[str, Any]:
         (followed,) = follow([(life, estimates)])
         found.append(followed)
         alarms = followed.track.alarms
-        row: dict[str, Any] = {"tracker": alarms[0].epoch if alarms else None}
+        row: Row = {"tracker": alarms[0].epoch if alarms else None}
         for name in false:
             best = optimum(life, estimates, life.drift, learns=name == "learns")
             row |= {name: best.told, f"bound_{name}": best.bound}
@@ -220,7 +228,7 @@ def power(sizes: tuple[Estimates, Life], n: int) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def raw(seeds: int, cache: Path | None) -> dict[str, Any]:
+def raw(seeds: int, cache: Path | None) -> Row:
     """Track and judge lives that were simulated and identified."""
     rows = []
     for stage, kind in CASES:
@@ -230,7 +238,7 @@ def raw(seeds: int, cache: Path | None) -> dict[str, Any]:
     return {"lives": rows, "passed": verdicts_of_lives(rows)}
 
 
-def verdicts(answer: dict[str, Any], *, quick: bool) -> dict[str, bool]:
+def verdicts(answer: Row, *, quick: bool) -> dict[str, bool]:
     """Say what was asked and whether it is so; one life of a kind tells no rate of alarms."""
     checks = verdicts_of_lives(answer["lives"])
     if not quick:
@@ -243,7 +251,7 @@ def verdicts(answer: dict[str, Any], *, quick: bool) -> dict[str, bool]:
     }
 
 
-def verdicts_of_lives(rows: list[dict[str, Any]]) -> dict[str, bool]:
+def verdicts_of_lives(rows: list[Row]) -> dict[str, bool]:
     """Say what was asked of alarms, intervals and events."""
     healthy = [row for row in rows if row["kind"] in HEALTHY]
     damaged = [row for row in rows if row["kind"] in DAMAGED]
@@ -269,6 +277,78 @@ def verdicts_of_lives(rows: list[dict[str, Any]]) -> dict[str, bool]:
             if "found_right" in row["events"]
         ),
     }
+
+
+def claims(answer: Row) -> Iterator[Claim]:
+    """Claim coverage, alarms, delays and events of drawn lives."""
+    yield from _lives(answer)
+    yield covered(
+        "the same, 90 %, where covariances are halved (control)",
+        [answer["halved"]["90"]],
+        met=not answer["halved"]["90"]["holds"],
+    )
+    power = answer["power"]
+    alarms, learns = power["alarms"], number(power["over_best_that_learns"])
+    yield counted(
+        "5 % of preload lost over 60 logs is told",
+        alarms["hits"],
+        alarms["n"],
+        "95 % asked",
+        met=alarms["share"] >= 0.95,
+    )
+    delays = power["delays"]
+    spread = [delays["tracker"][q] for q in ("q5", "q95")]
+    yield Claim(
+        "logs until it is told, over those of the best that must learn as much",
+        learns,
+        f"{number(delays['tracker']['mean'])} logs in the mean, 90 % of lives "
+        f"{number(spread[0])} to {number(spread[1])}",
+        f"{number(power['over_best_that_knows'])} times those of who knows all",
+    )
+    hits = [row["alarms"] for row in answer["controls"]]
+    yield counted(
+        "lives alarm of which temperature, payload or a retuning is hidden (control)",
+        sum(row["hits"] for row in hits),
+        sum(row["n"] for row in hits),
+    )
+
+
+def claims_raw(answer: Row) -> Iterator[Claim]:
+    """Claim the same of lives that were simulated and identified."""
+    yield from _lives(answer)
+
+
+def _lives(answer: Row) -> Iterator[Claim]:
+    rows, passed = answer["lives"], answer["passed"]
+    damaged = [row for row in rows if row["kind"] in DAMAGED]
+    healthy = [row for row in rows if row not in damaged]
+    for nominal in ("90", "50"):
+        yield covered(
+            f"intervals of {nominal} % hold the drift of damaged lives",
+            [row["coverage"][nominal] for row in damaged],
+        )
+    yield covered(
+        "intervals of 90 % hold the drift of healthy lives",
+        [row["coverage"]["90"] for row in healthy],
+        "wider than asked" if any(not r["coverage"]["90"]["holds"] for r in healthy) else "",
+        met=passed["intervals of healthy lives cover at least"],
+    )
+    for what, own, asked in (
+        ("healthy lives that alarm", healthy, "healthy lives alarm as declared"),
+        ("damaged lives that alarm", damaged, "damage alarms"),
+    ):
+        hits = sum(row["alarms"]["hits"] for row in own)
+        n = sum(row["n"] for row in own)
+        yield counted(what, hits, n, "1 % declared" if own is healthy else "", met=passed[asked])
+    for name in EVENTS:
+        own = [row["events"]["found_right"] for row in rows if row["name"] == name]
+        each = " (" + ", ".join(f"{row['hits']} of {row['n']}" for row in own) + ")"
+        yield counted(
+            f"told for what it is: {name}",
+            sum(row["hits"] for row in own),
+            sum(row["n"] for row in own),
+            each.strip(" ()") if len(own) > 1 else "",
+        )
 
 
 if __name__ == "__main__":

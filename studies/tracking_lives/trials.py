@@ -14,9 +14,9 @@ from scipy import stats
 from lmshealth.stage.description import Stage, load_stage
 from lmshealth.tracking.history import History
 from lmshealth.tracking.track import Track, track
-from studies.lives import HEALTHY, Array, Estimates, Life, history_of, rng_of
-from studies.metrics import clopper_pearson
-from studies.record import LEVEL, judge_coverage
+from studies.common.lives import HEALTHY, Array, Estimates, Life, history_of, rng_of
+from studies.common.metrics import clopper_pearson
+from studies.harness.study import LEVEL, Row, judge_coverage
 
 STAGES = ("lms-y", "lms-x")
 NOMINALS = (0.9, 0.5)
@@ -57,7 +57,7 @@ def tracked(life: Life, history: History) -> Track:
     return track(history, stage_of(life.stage))
 
 
-def summed(followed: list[Followed], name: str) -> dict[str, Any]:
+def summed(followed: list[Followed], name: str) -> Row:
     """Sum up lives of one kind."""
     life = followed[0].life
     return {
@@ -71,7 +71,7 @@ def summed(followed: list[Followed], name: str) -> dict[str, Any]:
     }
 
 
-def alarmed(followed: list[Followed]) -> dict[str, Any]:
+def alarmed(followed: list[Followed]) -> Row:
     """Count the lives with an alarm."""
     hits, n = sum(bool(one.track.alarms) for one in followed), len(followed)
     low, high = clopper_pearson(hits, n, LEVEL)
@@ -88,7 +88,7 @@ def scores(one: Followed) -> Array:
     return np.asarray(off / np.where(std > 0, std, np.inf))
 
 
-def coverage(followed: list[Followed]) -> dict[str, Any]:
+def coverage(followed: list[Followed]) -> Row:
     """Count the intervals of the drift that hold the truth.
 
     Judged is one interval a life, of one mode after one log, because those of one life depend on
@@ -98,7 +98,7 @@ def coverage(followed: list[Followed]) -> dict[str, Any]:
     every = [scores(one) for one in followed]
     judged = np.array([_one(one, z) for one, z in zip(followed, every, strict=True)])
     together = np.concatenate([z.ravel() for z in every])
-    rows: dict[str, Any] = {"rms": float(np.sqrt(np.mean(together**2)))}
+    rows: Row = {"rms": float(np.sqrt(np.mean(together**2)))}
     for nominal in NOMINALS:
         reach = float(stats.norm.isf((1 - nominal) / 2))
         hits = int(np.sum(np.abs(judged) <= reach))
@@ -119,7 +119,7 @@ def _one(one: Followed, z: Array) -> float:
     return float(z[rng.choice(moved), mode])
 
 
-def told(followed: list[Followed]) -> dict[str, Any]:
+def told(followed: list[Followed]) -> Row:
     """Say what was found that nobody had declared, and how soon."""
     kinds: Counter[str] = Counter()
     delays, right, wrong = [], 0, 0
@@ -135,7 +135,7 @@ def told(followed: list[Followed]) -> dict[str, Any]:
         wrong += bool(near) and not own
         delays += [min(e.found_at for e in own) - one.life.event] if own else []
     n = len(followed)
-    events: dict[str, Any] = {"lives_with": {kind: kinds[kind] for kind in sorted(kinds)}}
+    events: Row = {"lives_with": {kind: kinds[kind] for kind in sorted(kinds)}}
     if any(one.life.event is not None for one in followed):
         low, high = clopper_pearson(right, n, LEVEL)
         events |= {"found_right": {"hits": right, "n": n, "share": right / n,

@@ -44,7 +44,7 @@ from lmshealth.report.assessment import Assessment
 from lmshealth.report.tables import COLUMNS
 from lmshealth.stage.description import Stage, load_stage
 from lmshealth.tracking.history import LogEstimates
-from studies import servers
+from studies.harness import servers
 from tests.signals import sine, write_archive, write_archive_stage, write_log
 
 N_LOGS = 6

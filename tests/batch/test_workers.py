@@ -20,7 +20,7 @@ import pytest
 from lmshealth.batch import constants, workers
 from lmshealth.batch.workers import Pool, SchedulerError, processes
 from lmshealth.errors import LmshealthError
-from studies import servers
+from studies.harness import servers
 
 
 def double(number: int) -> int:

@@ -14,7 +14,7 @@ from lmshealth.errors import BadQuestion, BadStage, OutsideMap
 from lmshealth.stage.cramer_rao import ambient_bound
 from lmshealth.stage.description import Stage, load_stage
 from lmshealth.stage.planning import Plan, plan
-from studies.cramer_rao import long_record_law
+from studies.common.cramer_rao import long_record_law
 from tests.lives import DAMPING, FOOT, FREQUENCY, PRELOAD, SENSITIVITY, make_stage
 from tests.oracles import planned_std
 from tests.signals import write_archive_stage

@@ -17,7 +17,7 @@ from lmshealth.health.ensemble_sampling import stream
 from lmshealth.health.epoch_posterior import EpochPosterior
 from lmshealth.health.inference import draw, infer_together
 from lmshealth.stage.description import load_stage
-from studies.metrics import place
+from studies.common.metrics import place
 from studies.one_guide.run import SHARED, drifts_of
 from studies.sbc_epoch.lives import believing
 from studies.sbc_epoch.lives import draw as draw_track

@@ -20,6 +20,8 @@ from lmshealth.prognosis.life_posterior import LifeDensity, fit_life
 from lmshealth.prognosis.remaining_life import _usage, remaining_travel
 from lmshealth.stage.description import Stage
 from lmshealth.tracking.history import History
+from studies.common.metrics import place
+from studies.common.ranks import N_DRAWS
 from studies.fleet_prior.lives import YOUNG, draw_fleet
 from studies.fleet_prior.lives import draw as draw_machine
 from studies.fleet_prior.run import (
@@ -31,8 +33,6 @@ from studies.fleet_prior.run import (
     posterior,
     taught,
 )
-from studies.metrics import place
-from studies.ranks import N_DRAWS
 from studies.sbc_life.lives import draw
 from studies.sbc_life.run import N_POSTERIOR, machine, quantities, true_quantities
 from tests.claims import Claims

@@ -10,11 +10,19 @@ import pytest
 from scipy import stats
 
 from lmshealth.stage.description import Stage
+from studies.common.lives import (
+    DAMAGED,
+    HEALTHY,
+    Estimates,
+    Life,
+    drawn,
+    life_of,
+    measured,
+    plan_of,
+)
 from studies.crossings.judging import judge, nearest
 from studies.crossings.lives import KINDS, make_life
 from studies.crossings.run import labels_of
-from studies.lives import DAMAGED, HEALTHY, Estimates, Life, drawn, life_of, plan_of
-from studies.raw_lives import measured
 from studies.tracking_filter.lives import alone, draw, mixture, stage
 from studies.tracking_filter.trials import QUANTITIES, errors, known_setting
 from studies.tracking_lives.trials import DECLARED_RATE, alarmed, follow, scores

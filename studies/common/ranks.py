@@ -26,8 +26,8 @@ from matplotlib.axes import Axes
 from numpy.typing import NDArray
 from scipy import stats
 
-from studies.metrics import coverage, place
-from studies.record import LEVEL, as_row
+from studies.common.metrics import coverage, place
+from studies.harness.study import LEVEL, as_row
 
 Array = NDArray[np.float64]
 Row = dict[str, Any]

@@ -1,6 +1,6 @@
-"""Write `README.md` beside this file: all claims of the studies, as they were recorded.
+"""Write `README.md` of the studies: all claims, as they were recorded.
 
-``python -m studies.summary`` does it, and nothing else writes that page.
+``python -m studies.harness.summary`` writes the part of that page below the mark `MARK`.
 """
 
 from __future__ import annotations
@@ -14,92 +14,78 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from studies.claims import STEPS, Claim, Older
+from studies.harness.claims import STEPS, Claim, Older
+from studies.harness.study import STUDIES
 
-HERE = Path(__file__).parent
+HERE = STUDIES
 PAGE = HERE / "README.md"
-_DIGITS = 12  # of the digest of a record that is older than a mend
-_HEAD = """\
-# What the studies claim
-
-Written by `python -m studies.summary` from the records beside the scripts; no figure is typed. Each
-claim stands with how sure it is, and with what stands beside it in the same run: a peer, a bound,
-what was asked, or a control that must be found out. A study is run by its script, `--quick` for
-its short form. What a long one has done is kept in `studies/.kept`, by the code that it depends on:
-interrupted, it goes on, and with other code it begins anew. What the tests hold at every run, as
-`tests/stage/test_identifiability.py` does for `stage`, has no record.
-"""
+MARK = "<!-- claims -->\n"
+_DIGITS = 12  # of the digest of a record that is older than a correction
 
 
 @dataclass(frozen=True, slots=True)
 class Record:
-    """A record of a study, or the place of one that is not recorded.
+    """A record of a study, or the place of a record that does not exist yet.
 
     Attributes
     ----------
-    study, name : str
-        Folder, and the record in it without its suffix.
+    study, script, name : str
+        Folder, script in it, and record without its suffix.
     step : str
-        Of the chain.
+        Step of the method that it examines.
     older : Older or None
-        What was mended since it was recorded.
+        Correction since it was recorded.
     content : dict or None
-        The record; None if there is none.
+        Contents; None if there is no record.
     claims : tuple of Claim
-        What it claims.
+        Claims computed from the contents.
     """
 
     study: str
+    script: str
     name: str
     step: str
     older: Older | None
     content: dict[str, Any] | None
     claims: tuple[Claim, ...]
 
-    @property
-    def script(self) -> str:
-        """Name the script that records it."""
-        own = f"{self.name}.py"
-        return own if (HERE / self.study / own).exists() else "run.py"
-
 
 def records() -> Iterator[Record]:
-    """Find all records that studies claim something of, whether they are there or not."""
-    for path in sorted(HERE.glob("*/claims.py")):
-        study = path.parent.name
-        module = import_module(f"studies.{study}.claims")
-        names = [name for name, own in vars(module).items() if _is_of(own, module.__name__)]
-        for name in names:
-            yield _record(module, study, name)
+    """Find the records of all scripts that define claims, whether they exist or not."""
+    for path in sorted(HERE.glob("*/*.py")):
+        if "\nSTEP = " not in path.read_text(encoding="utf-8"):
+            continue
+        module = import_module(f"studies.{path.parent.name}.{path.stem}")
+        own = "result" if path.stem == "run" else path.stem
+        for function in (name for name in vars(module) if name.split("_")[0] == "claims"):
+            yield _record(
+                module, path, function, function.removeprefix("claims").lstrip("_") or own
+            )
 
 
-def _is_of(own: Any, module: str) -> bool:
-    return callable(own) and own.__module__ == module and not own.__name__.startswith("_")
-
-
-def _record(module: Any, study: str, name: str) -> Record:
-    path = HERE / study / f"{name}.json"
+def _record(module: Any, script: Path, function: str, name: str) -> Record:
+    path, study = script.with_name(f"{name}.json"), script.parent.name
     if not path.exists():
-        return Record(study, name, module.STEP, None, None, ())
+        return Record(study, script.name, name, module.STEP, None, None, ())
     text = path.read_bytes()
     older = getattr(module, "OLDER", {}).get(name)
-    # The note ends with the record that it is of.
+    # A new record ends the note.
     if older and hashlib.sha256(text).hexdigest()[:_DIGITS] != older.digest:
         older = None
     content = json.loads(text)
-    claims = tuple(getattr(module, name)(content))
-    return Record(study, name, module.STEP, older, content, claims)
+    claims = tuple(getattr(module, function)(content))
+    return Record(study, script.name, name, module.STEP, older, content, claims)
 
 
 def page() -> str:
-    """Give the page."""
+    """Return the page: its introduction as it is, and all claims."""
     found = list(records())
     there = [record for record in found if record.content is not None]
     claims = [claim for record in there for claim in record.claims]
     short = sum(not claim.met for claim in claims)
     lines = [
-        _HEAD,
-        f"{len(claims)} claims of {len(there)} records; **{short} are not met** and say so.",
+        PAGE.read_text(encoding="utf-8").split(MARK)[0] + MARK,
+        f"{len(claims)} claims of {len(there)} records; **{short} are not met**.",
     ]
     if missing := [f"{r.study}/{r.name}" for r in found if r.content is None]:
         lines.append(f"Not recorded: {', '.join(missing)}.")
@@ -112,7 +98,7 @@ def page() -> str:
 
 
 def section(record: Record) -> Iterator[str]:
-    """Give the lines of one record."""
+    """Return the lines of one record."""
     title = record.study if record.name == "result" else f"{record.study}, {record.name}"
     script = f"[{record.script}]({record.study}/{record.script})"
     yield f"### {title}"
@@ -121,11 +107,8 @@ def section(record: Record) -> Iterator[str]:
         yield f"{question(record)} **Not recorded**: {script} has not been run in full."
         return
     made = record.content["recorded"]
-    told = f"[{record.name}.json]({record.study}/{record.name}.json)"
-    yield (
-        f"{record.content['question']} Recorded {made['date']} in {_duration(made)} by {script}: "
-        f"{told}."
-    )
+    link = f"[{record.name}.json]({record.study}/{record.name}.json)"
+    yield f"{question(record)} Recorded {made['date']} in {_duration(made)} by {script}: {link}."
     if record.older:
         yield f"**Recorded before {record.older.why}.**"
     yield ""
@@ -143,13 +126,13 @@ def section(record: Record) -> Iterator[str]:
 
 
 def question(record: Record) -> str:
-    """Give the question of a script."""
+    """Return the question of a script."""
     tree = ast.parse((HERE / record.study / record.script).read_text(encoding="utf-8"))
     return (ast.get_docstring(tree) or "").split("\n")[0]
 
 
 def _duration(made: dict[str, Any]) -> str:
-    """Tell the run time; after an interruption with that of what was done before."""
+    """Format the run time, after an interruption with that of the kept trials."""
     kept = made.get("kept_s", 0.0)
     more = f", after {_time(kept)} before an interruption" if kept else ""
     return _time(made["wall_s"]) + more

@@ -1,16 +1,17 @@
-"""What a study claims: a figure with how sure it is, and what stands beside it in the same run.
+"""Claims of a study: a figure, its interval, and its comparison in the same run.
 
-Beside its script a study has ``claims.py``: the step of the chain that it is of, and for each of
-its records a function of the same name that reads nothing but the record.
+A script that writes a record names the step of the method that it examines in ``STEP``. Its
+function ``claims`` computes the claims from the record alone; if it writes further records,
+``claims_NAME`` does so for ``NAME.json``.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from studies.metrics import clopper_pearson
+from studies.common.metrics import clopper_pearson
 
 Row = Mapping[str, Any]
 STEPS = (
@@ -41,15 +42,15 @@ class Claim:
     Attributes
     ----------
     what : str
-        Is claimed.
+        Quantity that is claimed.
     figure : str
-        That was measured.
+        Measured value.
     interval : str
-        How sure that is: an interval or a Monte-Carlo error.
+        Uncertainty: an interval or a Monte-Carlo error.
     beside : str
-        A peer, a bound, what was asked, or a control, in the same run.
+        Comparison in the same run: a peer, a bound, a requirement or a control.
     met : bool
-        Whether what was asked is so.
+        Whether the requirement is met.
     """
 
     what: str
@@ -61,14 +62,14 @@ class Claim:
 
 @dataclass(frozen=True, slots=True)
 class Older:
-    """A record that is older than a mend of what it measures.
+    """A record that is older than a correction of the code that it measures.
 
     Attributes
     ----------
     digest : str
-        Beginning of the SHA-256 of the record, so that the note ends with it.
+        First digits of the SHA-256 of the record: a new record ends the note.
     why : str
-        What was mended since.
+        Correction since then.
     """
 
     digest: str
@@ -76,34 +77,34 @@ class Older:
 
 
 def number(value: float) -> str:
-    """Write a number with three digits."""
+    """Format a number with three digits."""
     if value and (abs(value) < 1e-3 or abs(value) >= 1e6):
         return f"{value:.1e}"
     return f"{value:,.0f}" if abs(value) >= 100 else f"{value:.3g}"
 
 
 def span(values: Iterable[float], unit: str = "") -> str:
-    """Write from which to which value numbers reach."""
+    """Format the range of numbers."""
     found = [float(value) for value in values]
     low, high = number(min(found)), number(max(found))
     return (low if low == high else f"{low} to {high}") + (f" {unit}" if unit else "")
 
 
 def percents(shares: Iterable[float]) -> str:
-    """Write shares in percent, from the lowest to the highest."""
+    """Format the range of shares in percent."""
     found = [100 * float(share) for share in shares]
     low, high = f"{min(found):.1f}", f"{max(found):.1f}"
     return (low if low == high else f"{low} to {high}") + " %"
 
 
 def counted(what: str, hits: int, n: int, beside: str = "", *, met: bool = True) -> Claim:
-    """Claim how many of how many, with the 95 % Clopper-Pearson interval of the share."""
+    """Claim a count, with the 95 % Clopper-Pearson interval of the share."""
     interval = f"{percents(clopper_pearson(hits, n))} (95 %)"
     return Claim(what, f"{hits:,} of {n:,}", interval, beside, met)
 
 
 def covered(what: str, rows: Iterable[Row], beside: str = "", *, met: bool | None = None) -> Claim:
-    """Claim the coverage of intervals, each row judged at 99.9 %."""
+    """Claim the coverage of intervals; each row is judged at 99.9 %."""
     found = list(rows)
     margin = max((row["high"] - row["low"]) / 2 for row in found)
     sizes = [row["n"] for row in found if "n" in row]
@@ -117,11 +118,28 @@ def covered(what: str, rows: Iterable[Row], beside: str = "", *, met: bool | Non
 
 
 def at_level(rows: Iterable[Row], nominal: float) -> list[Row]:
-    """Pick the coverages of one level."""
+    """Return the coverages of one level."""
     return [row for row in rows if row["nominal"] == nominal]
 
 
 def measured(mean_and_error: Iterable[float], unit: str) -> tuple[str, str]:
-    """Write a mean, and its standard error as an interval."""
+    """Format a mean and its standard error."""
     mean, error = mean_and_error
     return f"{number(mean)} {unit}", f"± {number(error)} {unit}"
+
+
+def ranked(kind: str, rows: Iterable[Row], *, control: bool = False) -> Iterator[Claim]:
+    """Claim that ranks are uniform, or of a control that some are not, with the coverages."""
+    found = list(rows)
+    levels = [row for own in found for row in own["coverage"]]
+    inside = sum(row["inside_band"] for row in found)
+    name = f"{kind} (control)" if control else kind
+    half, most = at_level(levels, 0.5), at_level(levels, 0.9)
+    fine = all(row["holds"] for row in levels) and inside == len(found)
+    yield covered(
+        f"90 % intervals hold the truth: {name}",
+        most,
+        f"50 %: {percents(row['share'] for row in half)}; ranks inside their 99.9 % band in "
+        f"{inside} of {len(found)}",
+        met=inside < len(found) if control else fine,
+    )

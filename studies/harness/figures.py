@@ -1,0 +1,52 @@
+"""Figures of studies: colours, and one way to write ``figure.svg`` from a record."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from studies.harness.study import Row, read_record
+
+# Colours that colour-blind readers can distinguish (Okabe and Ito).
+BLUE, ORANGE, GREEN, PINK = "#0072b2", "#d55e00", "#009e73", "#cc79a7"
+SKY, YELLOW, BLACK, GREY = "#56b4e9", "#e69f00", "#000000", "#999999"
+COLOURS = (BLUE, SKY, ORANGE, YELLOW, GREEN, PINK, BLACK, GREY, "#b8a000")
+
+
+def write(
+    script: str,
+    draw: Callable[[Figure, Row], None],
+    size: tuple[float, float] | Callable[[Row], tuple[float, float]],
+    font: float = 10,
+) -> None:
+    """Draw ``figure.svg`` beside ``figure.py`` from ``result.json``.
+
+    Parameters
+    ----------
+    script : str
+        ``__file__`` of figure.py.
+    draw : callable
+        Fills the figure from the record.
+    size : tuple of float or callable
+        Width and height in inches, or a function of the record that returns them.
+    font : float
+        Font size in points.
+    """
+    record = read_record(script)
+    folder = Path(script).parent
+    with matplotlib.rc_context({"svg.hashsalt": folder.name, "font.size": font}):
+        width_and_height = size(record) if callable(size) else size
+        figure = Figure(figsize=width_and_height, layout="constrained")
+        draw(figure, record)
+        figure.savefig(folder / "figure.svg", metadata={"Date": None})
+
+
+def legend_above(figure: Figure, ax: Axes, **options: Any) -> None:
+    """Draw the legend of one panel above all panels."""
+    handles, labels = ax.get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside upper center", frameon=False, **options)

@@ -1,0 +1,257 @@
+"""Run a study: options, trials that are computed once, and the record of its results.
+
+A trial is a function of the arguments that distinguish it from other trials. Its value is appended
+as one line of JSON to a file under ``studies/.kept``, with the digest of all code that it depends
+on: values of other code are discarded and computed again. All values pass through JSON, so that an
+interrupted study has the same result as one that ran without interruption.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import platform
+import time
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from concurrent.futures import Executor, ProcessPoolExecutor
+from contextlib import AbstractContextManager, nullcontext
+from datetime import UTC, datetime
+from functools import partial
+from importlib.metadata import version
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+from studies.common.metrics import Coverage, clopper_pearson
+from studies.harness.provenance import code_of, name_of
+
+Row = dict[str, Any]
+Work = Callable[..., Any]
+
+STUDIES = Path(__file__).parents[1]
+KEPT = STUDIES / ".kept"
+# Coverage that intervals state, and level of the interval by which a coverage is judged.
+NOMINAL, LEVEL = 0.95, 0.999
+_PACKAGES = ("lmshealth", "numpy", "scipy", "emcee", "filterpy")
+
+
+class Study:
+    """A run of a study: its options, its trials, its run time, its record.
+
+    Parameters
+    ----------
+    script : str
+        ``__file__`` of the script. ``run.py`` writes ``result.json``, any other script a record of
+        its own name.
+    doc : str
+        Docstring of the script; its first line is the question.
+    options : bool, int or str
+        Options of the command line beyond ``--quick``, by name, with their defaults.
+
+    Attributes
+    ----------
+    options : Namespace
+        Options as given.
+    quick : bool
+        Whether this is the quick form: a small part, nothing is recorded or kept.
+    trials : Trials
+        Trials that are computed once.
+    """
+
+    def __init__(self, script: str, doc: str | None, **options: Any) -> None:
+        self._wall, self._cpu = time.perf_counter(), time.process_time()
+        parser = argparse.ArgumentParser(
+            description=doc, formatter_class=argparse.RawDescriptionHelpFormatter
+        )
+        for name, default in ({"quick": False} | options).items():
+            kind = {"action": "store_true"} if default is False else {"type": type(default)}
+            parser.add_argument(f"--{name}", default=default, **kind)
+        self.options = parser.parse_args()
+        self.quick: bool = self.options.quick
+        self._folder, self._stem = Path(script).parent, Path(script).stem
+        self._question = str(doc).split("\n", 1)[0]
+        self.trials = Trials(self.kept(self._folder.name))
+
+    def kept(self, name: str) -> Path | None:
+        """Return the file in which trials are kept; None for the quick form."""
+        return None if self.quick else KEPT / f"{name}.jsonl"
+
+    def pool(self, n: int = 2) -> AbstractContextManager[Executor | None]:
+        """Return a pool of ``n`` processes; the quick form stays in this process."""
+        return nullcontext() if self.quick else spawn_pool(n)
+
+    def conclude(
+        self,
+        answer: Mapping[str, Any],
+        *,
+        details: Mapping[str, Any] | None = None,
+        name: str = "",
+        not_met: Iterable[str] = (),
+        quick_may_fail: bool = False,
+    ) -> None:
+        """Print the answer, record it unless this is the quick form, and exit on a failed check.
+
+        Parameters
+        ----------
+        answer : mapping
+            Results; ``passed`` has a bool for each check.
+        details : mapping, optional
+            Results that are recorded and not printed.
+        name : str, optional
+            Name of the record, if it is not that of the script.
+        not_met : iterable of str
+            Checks that are documented as not passed.
+        quick_may_fail : bool
+            Whether the quick form is too small to be judged.
+
+        Raises
+        ------
+        SystemExit
+            If another check has not passed.
+        """
+        print(json.dumps(answer, indent=1))
+        if not self.quick:
+            name = name or {"run": "result"}.get(self._stem, self._stem)
+            self._write(self._folder / f"{name}.json", {**answer, **(details or {})})
+        failed = [check for check, fine in answer.get("passed", {}).items() if not fine]
+        if not set(failed) <= set(not_met) and not (self.quick and quick_may_fail):
+            raise SystemExit(f"not as asked: {failed}")
+
+    def _write(self, path: Path, answer: Mapping[str, Any]) -> None:
+        """Write a record: results, versions, and run time with that of kept trials."""
+        content = {
+            "question": self._question,
+            **answer,
+            "recorded": {
+                "date": datetime.now(UTC).date().isoformat(),
+                "python": platform.python_version(),
+                **{name: version(name) for name in _PACKAGES},
+                "wall_s": round(time.perf_counter() - self._wall, 1),
+                "cpu_s": round(time.process_time() - self._cpu, 1),
+                "kept_s": round(self.trials.kept_s, 1),
+            },
+        }
+        path.write_text(json.dumps(content, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+
+
+class Trials:
+    """Trials of a study, each computed once.
+
+    Parameters
+    ----------
+    path : Path or None
+        File that keeps their values; None keeps nothing.
+
+    Attributes
+    ----------
+    kept_s : float
+        Run time in s of the trials whose values were kept before.
+    """
+
+    def __init__(self, path: Path | None) -> None:
+        self._path, self.kept_s = path, 0.0
+
+    def once(self, work: Work, *task: Any, also: Iterable[str] = ()) -> Any:
+        """Compute one trial, or read its kept value."""
+        return self.collect(work, [task], also=also)[0]
+
+    def collect(
+        self,
+        work: Work,
+        tasks: Iterable[tuple[Any, ...]],
+        *,
+        also: Iterable[str] = (),
+        pool: Executor | None = None,
+    ) -> list[Any]:
+        """Compute trials, except those whose values are kept.
+
+        Parameters
+        ----------
+        work : callable
+            Function of a module, or a partial of one; JSON can express its value.
+        tasks : iterable of tuples
+            Arguments of each trial: strings, numbers and the like.
+        also : iterable of str
+            Modules of the project that the work needs and does not import, as programs it starts.
+        pool : Executor, optional
+            Where trials are computed; one after the other without it.
+
+        Returns
+        -------
+        list
+            Values in the order of the tasks.
+        """
+        tasks = [tuple(task) for task in tasks]
+        if self._path is None:
+            return [json.loads(json.dumps(value)) for value, _ in _compute(work, tasks, pool)]
+        name, code = name_of(work), code_of(work, tuple(also))
+        kept = _read(self._path, name, code)
+        self.kept_s += sum(kept[key]["seconds"] for key in map(json.dumps, tasks) if key in kept)
+        missing = [task for task in dict.fromkeys(tasks) if json.dumps(task) not in kept]
+        for task, (value, seconds) in zip(missing, _compute(work, missing, pool), strict=True):
+            row = {"work": name, "task": task, "code": code, "seconds": seconds, "value": value}
+            line = json.dumps(row)
+            self._path.parent.mkdir(parents=True, exist_ok=True)
+            with self._path.open("a", encoding="utf-8") as file:
+                file.write(line + "\n")
+            kept[json.dumps(task)] = json.loads(line)
+        return [kept[json.dumps(task)]["value"] for task in tasks]
+
+
+def spawn_pool(n: int) -> ProcessPoolExecutor:
+    """Return a pool of ``n`` processes that import everything themselves."""
+    return ProcessPoolExecutor(n, mp_context=get_context("spawn"))
+
+
+def _compute(
+    work: Work, tasks: list[tuple[Any, ...]], pool: Executor | None
+) -> Iterator[tuple[Any, float]]:
+    """Compute trials in order, in a pool if there is one; yield value and run time in s."""
+    timed = partial(_timed, work)
+    return pool.map(timed, tasks) if pool else map(timed, tasks)
+
+
+def _timed(work: Work, task: tuple[Any, ...]) -> tuple[Any, float]:
+    start = time.perf_counter()
+    value = work(*task)
+    return value, round(time.perf_counter() - start, 2)
+
+
+def _read(path: Path, name: str, code: str) -> dict[str, Row]:
+    """Read the kept trials of a work; remove those of other code from the file."""
+    if not path.exists():
+        return {}
+    rows = []
+    text = path.read_text(encoding="utf-8")
+    for line in text.splitlines():
+        try:
+            rows.append(json.loads(line))
+        except json.JSONDecodeError:
+            continue  # the run ended while this line was written
+    rows = [row for row in rows if row["work"] != name or row["code"] == code]
+    valid = "".join(json.dumps(row) + "\n" for row in rows)
+    if valid != text:
+        part = path.with_suffix(".part")
+        part.write_text(valid, encoding="utf-8")
+        part.replace(path)
+    return {json.dumps(row["task"]): row for row in rows if row["work"] == name}
+
+
+def judge_coverage(hits: int, n: int, nominal: float = NOMINAL) -> Row:
+    """Return the coverage of n intervals of which ``hits`` contain the truth, and whether it holds.
+
+    It holds if the Clopper-Pearson interval of the share at level `LEVEL` contains the nominal.
+    """
+    return as_row(Coverage(nominal, hits, n, *clopper_pearson(hits, n, LEVEL)))
+
+
+def as_row(found: Coverage) -> Row:
+    """Return a coverage as it is recorded."""
+    return {"hits": found.hits, "n": found.n, "share": found.share, "low": found.low,
+            "high": found.high, "holds": found.holds}  # fmt: skip
+
+
+def read_record(script: str, name: str = "result") -> Row:
+    """Read a record from the folder of a script."""
+    found: Row = json.loads((Path(script).parent / f"{name}.json").read_text(encoding="utf-8"))
+    return found
