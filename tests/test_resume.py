@@ -114,7 +114,7 @@ def test_changed_module(written: Any, tmp_path: Path, monkeypatch: pytest.Monkey
     text = SCRIPT.replace("SCALE *", "place.__name__ and SCALE *")
     before = provenance.code_of(written(text).draw)
     assert provenance.code_of(written(text).draw) == before
-    modules = provenance._closure({provenance.PROJECT / "studies" / "metrics.py"})
+    modules = provenance._closure({provenance.PROJECT / "studies" / "common" / "metrics.py"})
     assert len(modules) > 1
     for module in sorted(modules):
         plain = provenance._tree(module)
@@ -132,8 +132,9 @@ def test_changed_module(written: Any, tmp_path: Path, monkeypatch: pytest.Monkey
 
 def test_gathered_names(written: Any) -> None:
     """Of the package a trial needs the homes of the names it uses, and what these register."""
-    text = SCRIPT.replace("metrics import place", "import read_log as place", 1)
-    text = text.replace("from studies.import", "from lmshealth import")
+    text = SCRIPT.replace(
+        "studies.common.metrics import place", "lmshealth import read_log as place"
+    )
     tree = provenance._tree(Path(written(text).__file__ or ""))
     needed = provenance._closure(provenance._imports(tree.body))
     names = {path.relative_to(provenance.PROJECT).as_posix() for path in needed}

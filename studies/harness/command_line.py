@@ -18,7 +18,7 @@ from lmshealth.health import ensemble_sampling as sampling
 from lmshealth.prognosis import life_posterior as lifefit
 from lmshealth.report import figures as plots
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 _SOME_REFUSED = 3
 # Where the commands of a program are.
 _GROUPS = {"lmshealth": ("lmshealth.cli.main", "main"), "models": ("models.__main__", "cli")}

@@ -12,7 +12,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-PROJECT = Path(__file__).parents[1]
+PROJECT = Path(__file__).parents[2]
 _PACKAGES = ("lmshealth", "models", "studies")
 _LIBRARIES = ("numpy", "scipy", "emcee")
 _DOCUMENTED = (ast.Module, ast.ClassDef, ast.FunctionDef)
