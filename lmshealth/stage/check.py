@@ -156,17 +156,7 @@ class StageCheck:
 
 
 def check_stage(stage: Stage) -> StageCheck:
-    """Check the range of the map of a stage description, and the parameters that it identifies.
-
-    Parameters
-    ----------
-    stage : Stage
-        Description and map; both may be without health.
-
-    Returns
-    -------
-    StageCheck
-    """
+    """Check a stage description, with or without health parameters."""
     if stage.modal_map is None:
         none = np.empty((0, 0))
         return StageCheck(

@@ -1,62 +1,70 @@
-"""Laws by which a health parameter degrades with travel.
-
-A law is a small object: its free parameters with their priors, the health it predicts, the
-travel at which it crosses a limit, and sampling coordinates in which the posterior of a partly
-worn machine is close to a Gaussian. Travel is in m from where the law begins, health is a fraction
-of its value there. Where a parameter has several laws, ``weight`` says how probable each is
-beforehand, in proportion.
-"""
+"""Laws by which a health parameter degrades with travel (README.md, "Degradation laws")."""
 
 from __future__ import annotations
 
-from typing import Annotated, ClassVar, Protocol
+from typing import Annotated, ClassVar
 
 import msgspec
 import numpy as np
 from scipy.special import expit, log_expit
 
 from lmshealth._arrays import FloatArray
+from lmshealth.stage import constants
 from lmshealth.stage.priors import Prior, Uniform
 
 _KM = 1000.0
-_LEAST_MASS = 0.01
+# ln of ratios of lengths is cut here: a distant walker may ask for a length outside the range of
+# floats, where its prior is 0 anyway.
+_LARGEST_LN = 300
 
 
-class Law(Protocol):
-    """What prognosis needs of a degradation law; ``y`` are sampling coordinates."""
+class Law(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """A degradation law: health as a fraction of its initial value over travel in m.
 
-    @property
-    def weight(self) -> float:
-        """How probable it is beforehand, in proportion to the other laws of the parameter."""
+    ``theta`` are its natural parameters, ``y`` the sampling coordinates, in which the posterior of
+    a partly worn machine is close to a Gaussian; ``now`` is the travel of that machine in m.
+
+    Attributes
+    ----------
+    weight : float
+        Prior probability in proportion to the other laws of the parameter.
+    names : tuple of str
+        Names of the natural parameters, one per coordinate.
+    """
+
+    weight: Annotated[float, msgspec.Meta(gt=0, le=1e6)] = 1.0
+    names: ClassVar[tuple[str, ...]] = ()
 
     @property
     def kind(self) -> str:
-        """What the stage description calls it."""
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Names of the natural parameters; their number is the number of coordinates."""
+        """Name of the law in a stage description."""
+        return str(self.__struct_config__.tag)
 
     def natural(self, y: FloatArray, now: float) -> FloatArray:
-        """Turn coordinates, shape ``(n, k)``, into natural parameters (lengths in m)."""
+        """Convert coordinates, shape ``(n, k)``, to natural parameters (lengths in m)."""
+        raise NotImplementedError
 
     def log_prior(self, y: FloatArray, now: float) -> FloatArray:
-        """Log prior density in the coordinates, with the Jacobian, shape ``(n,)``."""
+        """Return the log prior density in the coordinates, with the Jacobian, shape ``(n,)``."""
+        raise NotImplementedError
 
     def draw(self, rng: np.random.Generator, n: int, now: float) -> FloatArray:
         """Draw coordinates from the prior, shape ``(n, k)``."""
+        raise NotImplementedError
 
     def health(self, theta: FloatArray, travel: FloatArray) -> FloatArray:
-        """Health at each travel, the same for all or each one's own: ``(n, n_travel)``."""
+        """Return the health at travels common to all or of each row, ``(n, n_travel)``."""
+        raise NotImplementedError
 
     def passage(self, theta: FloatArray, limit: FloatArray) -> FloatArray:
-        """Travel in m at which health falls to each one's limit, inf if never, shape ``(n,)``."""
+        """Return the travel in m at which health falls to the limit, inf if never, ``(n,)``."""
+        raise NotImplementedError
 
 
 def _expect_mass(name: str, prior: Prior, low: float, high: float) -> None:
-    """Insist on a prior that is not all but surely outside of what makes sense."""
+    """Refuse a prior with almost no probability in the admissible range."""
     below, upto = prior.probability(np.array([low, high]))
-    if upto - below < _LEAST_MASS:
+    if upto - below < constants.LEAST_LAW_MASS:
         raise ValueError(f"{name} must lie between {low:g} and {high:g}, got {prior}")
 
 
@@ -65,53 +73,34 @@ def _draw(prior: Prior, rng: np.random.Generator, n: int) -> FloatArray:
 
 
 def _draw_length(prior: Prior, rng: np.random.Generator, n: int) -> FloatArray:
-    """Draw lengths in m from a prior in km; a prior that reaches below 0 is cut there."""
+    """Draw lengths in m from a prior in km, truncated at 0."""
     km = _draw(prior, rng, n)
     while (negative := km <= 0).any():
         km[negative] = _draw(prior, rng, int(negative.sum()))
     return _KM * km
 
 
-class _Law(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """What all laws have."""
-
-    weight: Annotated[float, msgspec.Meta(gt=0, le=1e6)] = 1.0
-
-    @property
-    def kind(self) -> str:
-        """What the stage description calls it."""
-        return str(self.__struct_config__.tag)
-
-
-class HertzWear(_Law, frozen=True, tag="hertz-wear", tag_field="kind"):
-    """Preload lost by wear of the rolling contacts: P(s) = (1 - (s / s_w)^n)^1.5.
-
-    The elastic approach shrinks with travel as (s / s_w)^n, and the contact force goes with its
-    power 3/2 (Hertz). Nothing is left at s_w.
-    """
+class HertzWear(Law, frozen=True, tag="hertz-wear", tag_field="kind"):
+    """Preload lost by wear of the rolling contacts: P(s) = (1 - (s / s_w)^n)^1.5."""
 
     life_km: Prior
     exponent: Uniform = Uniform(0.7, 1.6)
     outer: ClassVar[float] = 1.5
+    names: ClassVar[tuple[str, ...]] = ("life_m", "exponent")
 
     def __post_init__(self) -> None:
         _expect_mass("life_km", self.life_km, 0.0, np.inf)
         if not self.exponent.low > 0:
             raise ValueError(f"exponent needs a range above 0, got {self.exponent}")
 
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Names of the natural parameters."""
-        return "life_m", "exponent"
-
     def natural(self, y: FloatArray, now: float) -> FloatArray:
-        """From y1 = n ln(now / s_w), y2 = logit of n in its range."""
+        """Convert y1 = n ln(now / s_w) and y2 = logit of n in its range."""
         n = self.exponent.low + (self.exponent.high - self.exponent.low) * expit(y[:, 1])
-        # A far-off walker may ask for a life beyond the range of floats; its prior is 0 anyway.
-        return np.column_stack([now * np.exp(np.clip(-y[:, 0] / n, -300, 300)), n])
+        ratio = np.exp(np.clip(-y[:, 0] / n, -_LARGEST_LN, _LARGEST_LN))
+        return np.column_stack([now * ratio, n])
 
     def log_prior(self, y: FloatArray, now: float) -> FloatArray:
-        """Log prior density with |d(s_w, n)/d(y1, y2)| = (s_w / n) (dn/dy2)."""
+        """Return the log prior with |d(s_w, n)/d(y1, y2)| = (s_w / n) (dn/dy2)."""
         life, n = self.natural(y, now).T
         slope = log_expit(y[:, 1]) + log_expit(-y[:, 1])
         return np.asarray(self.life_km.log_density(life / _KM) + np.log(life / _KM / n) + slope)
@@ -124,40 +113,43 @@ class HertzWear(_Law, frozen=True, tag="hertz-wear", tag_field="kind"):
         return np.column_stack([exponent * np.log(now / life), np.log(share / (1 - share))])
 
     def health(self, theta: FloatArray, travel: FloatArray) -> FloatArray:
-        """Preload as a fraction of its baseline; 0 past the end of the law."""
+        """Return the health, 0 from s_w on."""
         life, n = theta[:, :1], theta[:, 1:]
         left = 1 - (np.maximum(travel, 0) / life) ** n
         return np.asarray(np.maximum(left, 0) ** self.outer)
 
     def passage(self, theta: FloatArray, limit: FloatArray) -> FloatArray:
-        """Travel at the limit, in closed form."""
+        """Return the travel at the limit, in closed form."""
         loss = 1 - np.minimum(limit, 1.0) ** (1 / self.outer)
         return np.asarray(theta[:, 0] * loss ** (1 / theta[:, 1]))
 
 
-class Loosening(_Law, frozen=True, tag="loosening", tag_field="kind"):
+class Power(HertzWear, frozen=True, tag="power", tag_field="kind"):
+    """Loss as a power of travel: h(s) = 1 - (s / s_p)^n, without a physical model."""
+
+    outer: ClassVar[float] = 1.0
+
+
+class Loosening(Law, frozen=True, tag="loosening", tag_field="kind"):
     """Joint that settles towards a floor: k(s) = k_f + (1 - k_f) exp(-s / s_m)."""
 
     life_km: Prior
     floor: Prior
+    names: ClassVar[tuple[str, ...]] = ("floor", "life_m")
 
     def __post_init__(self) -> None:
         _expect_mass("life_km", self.life_km, 0.0, np.inf)
         _expect_mass("floor", self.floor, 0.0, 1.0)
 
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Names of the natural parameters."""
-        return "floor", "life_m"
-
     def natural(self, y: FloatArray, now: float) -> FloatArray:
-        """From y1 = ln[(1 - k_f)(1 - exp(-now / s_m))], the loss so far, and y2 = ln s_m."""
-        life = np.exp(np.clip(y[:, 1], -300, 300))
-        floor = 1 - np.exp(np.minimum(y[:, 0] - np.log(-np.expm1(-now / life)), 300))
+        """Convert y1 = ln[(1 - k_f)(1 - exp(-now / s_m))], the loss so far, and y2 = ln s_m."""
+        life = np.exp(np.clip(y[:, 1], -_LARGEST_LN, _LARGEST_LN))
+        share = np.log(-np.expm1(-now / life))
+        floor = 1 - np.exp(np.minimum(y[:, 0] - share, _LARGEST_LN))
         return np.column_stack([floor, life])
 
     def log_prior(self, y: FloatArray, now: float) -> FloatArray:
-        """Log prior density with |d(k_f, s_m)/d(y1, y2)| = (1 - k_f) s_m."""
+        """Return the log prior with |d(k_f, s_m)/d(y1, y2)| = (1 - k_f) s_m."""
         floor, life = self.natural(y, now).T
         inside = (floor >= 0) & (floor < 1)
         rest = np.where(inside, 1 - floor, 1.0)
@@ -171,40 +163,30 @@ class Loosening(_Law, frozen=True, tag="loosening", tag_field="kind"):
         return np.column_stack([np.log((1 - floor) * -np.expm1(-now / life)), np.log(life)])
 
     def health(self, theta: FloatArray, travel: FloatArray) -> FloatArray:
-        """Stiffness as a fraction of its baseline."""
+        """Return the stiffness."""
         floor, life = theta[:, :1], theta[:, 1:]
         return np.asarray(floor + (1 - floor) * np.exp(-np.maximum(travel, 0) / life))
 
     def passage(self, theta: FloatArray, limit: FloatArray) -> FloatArray:
-        """Travel at the limit, in closed form; inf where the floor lies above it."""
+        """Return the travel at the limit, inf where the floor lies above it."""
         floor, life = theta.T
         reached = floor < limit
         ratio = (1 - floor) / np.where(reached, limit - floor, 1.0)
         return np.where(reached, life * np.log(np.maximum(ratio, 1.0)), np.inf)
 
 
-class Power(HertzWear, frozen=True, tag="power", tag_field="kind"):
-    """Loss as a power of travel: h(s) = 1 - (s / s_p)^n, for parameters without a physics."""
-
-    outer: ClassVar[float] = 1.0
-
-
-class Linear(_Law, frozen=True, tag="linear", tag_field="kind"):
-    """Loss in proportion to travel: h(s) = 1 - r s. A rate below 0 is a gain."""
+class Linear(Law, frozen=True, tag="linear", tag_field="kind"):
+    """Loss proportional to travel: h(s) = 1 - r s; a negative rate is a gain."""
 
     rate_per_km: Prior
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Names of the natural parameters."""
-        return ("rate_per_m",)
+    names: ClassVar[tuple[str, ...]] = ("rate_per_m",)
 
     def natural(self, y: FloatArray, now: float) -> FloatArray:
-        """From y1 = r now, the loss so far."""
+        """Convert y1 = r now, the loss so far."""
         return y / now
 
     def log_prior(self, y: FloatArray, now: float) -> FloatArray:
-        """Log prior density with dr/dy1 = 1 / now."""
+        """Return the log prior with dr/dy1 = 1 / now."""
         value = self.rate_per_km.log_density(y[:, 0] / now * _KM)
         return np.asarray(value + np.log(_KM / now))
 
@@ -213,27 +195,22 @@ class Linear(_Law, frozen=True, tag="linear", tag_field="kind"):
         return (_draw(self.rate_per_km, rng, n) / _KM * now)[:, None]
 
     def health(self, theta: FloatArray, travel: FloatArray) -> FloatArray:
-        """Health, never below 0."""
+        """Return the health, not below 0."""
         return np.asarray(np.maximum(1 - theta * np.maximum(travel, 0), 0))
 
     def passage(self, theta: FloatArray, limit: FloatArray) -> FloatArray:
-        """Travel at the limit; inf where nothing is lost."""
+        """Return the travel at the limit, inf without a loss."""
         rate = theta[:, 0]
         losing = rate > 0
         passed = np.maximum(1 - limit, 0.0) / np.where(losing, rate, 1.0)
         return np.where(losing | (limit >= 1), passed, np.inf)
 
 
-class Unchanging(_Law, frozen=True, tag="none", tag_field="kind"):
+class Unchanging(Law, frozen=True, tag="none", tag_field="kind"):
     """No degradation: h(s) = 1."""
 
-    @property
-    def names(self) -> tuple[str, ...]:
-        """No free parameter."""
-        return ()
-
     def natural(self, y: FloatArray, now: float) -> FloatArray:
-        """Return the empty coordinates."""
+        """Return the empty coordinates as they are."""
         return y
 
     def log_prior(self, y: FloatArray, now: float) -> FloatArray:
@@ -241,7 +218,7 @@ class Unchanging(_Law, frozen=True, tag="none", tag_field="kind"):
         return np.zeros(y.shape[0])
 
     def draw(self, rng: np.random.Generator, n: int, now: float) -> FloatArray:
-        """Draw nothing."""
+        """Return empty coordinates."""
         return np.empty((n, 0))
 
     def health(self, theta: FloatArray, travel: FloatArray) -> FloatArray:
@@ -249,7 +226,7 @@ class Unchanging(_Law, frozen=True, tag="none", tag_field="kind"):
         return np.ones((theta.shape[0], travel.shape[-1]))
 
     def passage(self, theta: FloatArray, limit: FloatArray) -> FloatArray:
-        """Never, unless it begins at the limit."""
+        """Return inf, or 0 for a limit at the initial value."""
         return np.where(np.broadcast_to(limit, theta.shape[:1]) >= 1, 0.0, np.inf)
 
 

@@ -1,7 +1,4 @@
-"""Stage descriptions: what to look for in a machine's logs and what it means.
-
-The TOML file carries units in its keys; this module is the door where it is checked.
-"""
+"""Stage descriptions: schema, loading and checks of the TOML file (README.md is its reference)."""
 
 from __future__ import annotations
 
@@ -23,13 +20,14 @@ from lmshealth._arrays import FloatArray
 from lmshealth._toml import Keys, decode, place
 from lmshealth.errors import BadStage
 from lmshealth.io.log import Metadata
+from lmshealth.stage import constants
 from lmshealth.stage.degradation_laws import AnyLaw, Unchanging
 from lmshealth.stage.modal_map import ModalMap, read_map
 from lmshealth.stage.priors import JointPrior, Prior
 
 Positive = Annotated[float, Meta(gt=0, le=sys.float_info.max)]
 Share = Annotated[float, Meta(gt=0, lt=1)]
-# Names reach terminals, tables and pages: no control characters, nothing that turns the writing.
+# Names appear on terminals, in tables and pages: no control or bidirectional characters.
 Name = Annotated[
     str,
     Meta(
@@ -39,24 +37,19 @@ Name = Annotated[
 ]
 CostRatio = Annotated[float, Meta(gt=1, le=sys.float_info.max)]
 
-_MAX_RISK = 0.05
-# Words of verdict.csv for the parameters of lms-x and lms-y, and those that name no parameter.
-_WORDS = {"guide_preload": "preload", "mount_stiffness": "mount"}
-_RESERVED = ("healthy", "both", "step", "not-enough-data")
-
 
 class _Part(Struct, frozen=True, forbid_unknown_fields=True):
-    """Part of a stage description: unknown keys are errors, so that typing slips are seen."""
+    """A table of a stage description; unknown keys are errors."""
 
 
 class Match(_Part, frozen=True):
-    """Which logs belong to this description."""
+    """Pattern of the machines that the description applies to."""
 
     stage: str = "*"
 
 
 class ModeSpec(_Part, frozen=True):
-    """A mode to look for."""
+    """A mode to identify; ``direction`` is accepted, not used."""
 
     name: Name
     frequency_hz: Positive
@@ -67,15 +60,15 @@ class ModeSpec(_Part, frozen=True):
     tracked: bool = True
 
 
-class Watch(_Part, frozen=True):
-    """A narrow band followed without physics."""
+class WatchedBand(_Part, frozen=True):
+    """A narrow band of which only the acceleration level is reported."""
 
     low_hz: Positive
     high_hz: Positive
 
 
 class Limit(_Part, frozen=True):
-    """Where a health parameter ends its life."""
+    """Value below which a health parameter is worn out."""
 
     below: Positive
 
@@ -97,33 +90,34 @@ class ParameterSpec(_Part, frozen=True):
 
     @property
     def laws(self) -> tuple[AnyLaw, ...]:
-        """Laws that it may follow, at least one."""
+        """Candidate laws, at least one."""
         return self.law if isinstance(self.law, tuple) else (self.law,)
 
     @property
     def word(self) -> str:
         """Word of verdict.csv for a loss of this parameter: by default its name."""
-        return self.verdict or _WORDS.get(self.name, self.name)
+        return self.verdict or constants.VERDICT_WORDS.get(self.name, self.name)
 
 
 class MapSpec(_Part, frozen=True):
-    """Where the modal map is, and how far its sensitivities are believed."""
+    """File of the modal map and relative standard deviation of its sensitivities."""
 
     file: str
     model_std: Annotated[float, Meta(ge=0, lt=1)] = 0.05
 
 
 class Order(_Part, frozen=True):
-    """A line whose frequency is velocity over wavelength."""
+    """A spectral line at velocity / wavelength."""
 
     name: Name
     wavelength_mm: Positive
 
 
 class Covariate(_Part, frozen=True):
-    """A measured number that moves frequencies without wear.
+    """A measured quantity that shifts ln f without wear.
 
-    ``curvature_std`` is the prior standard deviation of what its square does, per unit squared.
+    ``prior_std`` is the prior standard deviation of its linear coefficient per unit,
+    ``curvature_std`` that of its quadratic coefficient per unit squared.
     """
 
     name: Name
@@ -132,25 +126,16 @@ class Covariate(_Part, frozen=True):
     curvature_std: Annotated[float, Meta(ge=0)] = 0.0
 
 
-class Loop(_Part, frozen=True):
-    """Rigid open loop of one tuning, descending powers of s in rad/s."""
-
-    id: Name
-    numerator: tuple[float, ...]
-    denominator: tuple[float, ...]
-
-
 class Baseline(_Part, frozen=True):
-    """How many logs make the baseline where the manifest does not say."""
+    """Number of logs of the baseline where the manifest does not flag them."""
 
     logs: Annotated[int, Meta(ge=1)] = 5
 
 
 class Decision(_Part, frozen=True):
-    """What the service date is chosen for.
+    """Criterion of the service date: accepted risk of reaching a limit, or least costs.
 
-    Either for a risk, of having reached a limit, or for least costs: ``cost_ratio`` is the cost of
-    a failure over that of a planned service.
+    ``cost_ratio`` is the cost of a failure over that of a planned service.
     """
 
     max_risk: Share | None = None
@@ -159,33 +144,33 @@ class Decision(_Part, frozen=True):
 
     @property
     def accepted(self) -> float | None:
-        """The accepted risk, 5 % where nothing is said; None where costs decide."""
+        """Accepted risk, `constants.MAX_RISK` by default; None where costs decide."""
         if self.cost_ratio is not None:
             return None
-        return _MAX_RISK if self.max_risk is None else self.max_risk
+        return constants.MAX_RISK if self.max_risk is None else self.max_risk
 
 
 class Usage(_Part, frozen=True):
-    """Travel per day, and how far ahead is looked."""
+    """Travel per day and horizon of the prognosis."""
 
     km_per_day: Positive | None = None
     horizon_km: Positive = 20000.0
 
 
 class Description(_Part, frozen=True):
-    """The stage description as written."""
+    """The stage description as written; ``source`` and ``loop`` are accepted, not used."""
 
     name: Name
     mode: Annotated[tuple[ModeSpec, ...], Meta(min_length=1)]
     source: str = ""
     match: Match = Match()
     health_band_hz: tuple[Positive, Positive] | None = None
-    watch: tuple[Watch, ...] = ()
+    watch: tuple[WatchedBand, ...] = ()
     parameter: tuple[ParameterSpec, ...] = ()
     map: MapSpec | None = None
     order: tuple[Order, ...] = ()
     covariate: tuple[Covariate, ...] = ()
-    loop: tuple[Loop, ...] = ()
+    loop: tuple[dict[str, object], ...] = ()
     baseline: Baseline = Baseline()
     decision: Decision = Decision()
     usage: Usage = Usage()
@@ -193,11 +178,10 @@ class Description(_Part, frozen=True):
 
 @dataclass(frozen=True, slots=True)
 class ScatterPrior:
-    """How probable each value is that the scatter of logs about a life may have, in proportion.
+    """Prior weights of the grid of scatter parameters of a life, in its order.
 
-    Weights of the values of the life's grid, in its order: of the random walk of ln
-    frequency, of the factor on reported standard deviations, and of the deviation of ln health
-    from its law.
+    ``walk`` is the random walk of ln f, ``noise_scale`` the factor on reported standard deviations,
+    ``deviation`` that of ln health from its law.
     """
 
     walk: tuple[float, ...]
@@ -216,9 +200,9 @@ class Stage:
     modal_map : ModalMap or None
         Surrogate of the map; None when there is no health parameter.
     digest : str
-        SHA-256 over description and map: results carry it.
+        SHA-256 over description and map.
     scatter : ScatterPrior or None
-        What is believed of scatter beforehand; None for what every stage is believed to have.
+        Prior of the scatter of logs; None for the common one.
     """
 
     description: Description
@@ -233,7 +217,7 @@ class Stage:
 
     @property
     def modes(self) -> tuple[ModeSpec, ...]:
-        """Modes to look for."""
+        """Described modes."""
         return self.description.mode
 
     @property
@@ -243,18 +227,18 @@ class Stage:
 
     @cached_property
     def informative(self) -> tuple[str, ...]:
-        """Tracked modes that the map knows: the ones health is inferred from."""
+        """Tracked modes on the map, from which health is inferred."""
         known = () if self.modal_map is None else self.modal_map.modes
         return tuple(mode.name for mode in self.modes if mode.tracked and mode.name in known)
 
     @cached_property
     def baseline_point(self) -> FloatArray:
-        """Ln of the parameters at baseline, shape ``(n_parameters,)``."""
+        """Ln parameters at the baseline, shape ``(n_parameters,)``."""
         return np.log([parameter.baseline for parameter in self.parameters])
 
     @cached_property
     def prior(self) -> JointPrior:
-        """Priors of the health parameters, cut where the map ends."""
+        """Priors of the health parameters, truncated at the ends of the map."""
         if self.modal_map is None:
             raise BadStage(f"{self.name}: no [[parameter]] with a [map]")
         names = tuple(parameter.name for parameter in self.parameters)
@@ -262,7 +246,7 @@ class Stage:
         return JointPrior(names, priors, self.modal_map.low, self.modal_map.high)
 
     def matches(self, metadata: Metadata) -> bool:
-        """Tell whether a log belongs to this description."""
+        """Return whether the description applies to a log."""
         if metadata.description is not None:
             return metadata.description in (self.name, f"{self.name}.toml")
         return metadata.stage is not None and fnmatchcase(
@@ -277,7 +261,7 @@ class Stage:
         x : ndarray
             ln parameters inside the map, shape ``(n_points, n_parameters)``.
         modes : tuple of str
-            Which modes.
+            Names of modes on the map.
 
         Returns
         -------
@@ -296,7 +280,7 @@ class Stage:
 
 
 def shipped() -> tuple[str, ...]:
-    """Names of the descriptions that come with the package."""
+    """List the names of the shipped descriptions."""
     folder = resources.files("lmshealth") / "stage" / "descriptions"
     names = (item.name for item in folder.iterdir())
     return tuple(sorted(name[:-5] for name in names if name.endswith(".toml")))
@@ -313,7 +297,7 @@ def load_stage(reference: str) -> Stage:
     Raises
     ------
     BadStage
-        If it cannot be found or read, breaks the schema, or its map does not fit.
+        If it cannot be found or read, violates the schema, or does not match its map.
 
     Examples
     --------
@@ -324,7 +308,7 @@ def load_stage(reference: str) -> Stage:
     >>> [(parameter.name, parameter.limit.below) for parameter in stage.parameters]
     [('guide_preload', 0.6), ('mount_stiffness', 0.7)]
 
-    By how much a fifth of the preload lost lowers roll and pitch, by its modal map:
+    Frequencies of roll and pitch after the loss of a fifth of the preload, by the modal map:
 
     >>> import numpy as np
     >>> np.exp(stage.drift(np.log([[0.8, 1.0]]), ("roll", "pitch"))).round(3)
@@ -338,7 +322,7 @@ def load_stage(reference: str) -> Stage:
         )
     else:
         raise BadStage(
-            f"no stage description {reference!r}: give a path ending in .toml, "
+            f"no stage description {reference!r}: needed is a path ending in .toml, "
             f"or one of {', '.join(shipped())}"
         )
     try:
@@ -348,7 +332,7 @@ def load_stage(reference: str) -> Stage:
         raise BadStage(f"{path}: cannot read the stage description: {error.strerror}") from error
     except ValueError as error:
         raise BadStage(f"{path}: {error}") from error
-    _refuse(path, content, _troubles(description))
+    _refuse(path, content, _faults(description))
     digest = hashlib.sha256(content)
     modal_map = None
     if description.map is not None and description.parameter:
@@ -358,18 +342,18 @@ def load_stage(reference: str) -> Stage:
             _refuse(path, content, [(("map", "file"), f"there is no file {map_path}")])
         modal_map = read_map(str(map_path), names)
         digest.update(map_path.read_bytes())
-        _refuse(path, content, _map_troubles(description, modal_map))
+        _refuse(path, content, _map_faults(description, modal_map))
     return Stage(description=description, modal_map=modal_map, digest=digest.hexdigest())
 
 
-def _refuse(path: Path, content: bytes, troubles: Iterable[tuple[Keys, str]]) -> None:
-    """Refuse a description for the first of its troubles, if it has any."""
-    for keys, trouble in troubles:
-        raise BadStage(f"{path}: {place(content, *keys)}: {trouble}")
+def _refuse(path: Path, content: bytes, faults: Iterable[tuple[Keys, str]]) -> None:
+    """Raise the first of the faults, if there is any."""
+    for keys, fault in faults:
+        raise BadStage(f"{path}: {place(content, *keys)}: {fault}")
 
 
-def _troubles(description: Description) -> Iterator[tuple[Keys, str]]:
-    """Say what is wrong between the parts of a description, and by which key."""
+def _faults(description: Description) -> Iterator[tuple[Keys, str]]:
+    """Find contradictions between the parts of a description; yield key and message."""
     bands: list[tuple[Keys, tuple[float, float]]] = [
         (("watch", k), (band.low_hz, band.high_hz)) for k, band in enumerate(description.watch)
     ]
@@ -384,19 +368,19 @@ def _troubles(description: Description) -> Iterator[tuple[Keys, str]]:
             if name in names[:k]:
                 yield (kind, k, "name"), f"[[{kind}]] names must be unique, twice: {name!r}"
     if description.parameter and description.map is None:
-        yield ("parameter", 0), "[[parameter]] needs a [map] that says what it does to the modes"
-    yield from _decision_troubles(description.decision)
+        yield ("parameter", 0), "[[parameter]] needs a [map] of its effect on the modes"
+    yield from _decision_faults(description.decision)
     for k, parameter in enumerate(description.parameter):
-        yield from _parameter_troubles(k, parameter)
+        yield from _parameter_faults(k, parameter)
 
 
-def _parameter_troubles(k: int, parameter: ParameterSpec) -> Iterator[tuple[Keys, str]]:
-    """Say what is wrong within a parameter, the k-th."""
-    if parameter.word in _RESERVED or "+" in parameter.word:
+def _parameter_faults(k: int, parameter: ParameterSpec) -> Iterator[tuple[Keys, str]]:
+    """Find faults of the k-th parameter."""
+    if parameter.word in constants.RESERVED_WORDS or "+" in parameter.word:
         yield (
             ("parameter", k, "verdict" if parameter.verdict else "name"),
-            f"{parameter.word!r} cannot name a lost parameter in verdict.csv: no "
-            f"{', '.join(_RESERVED)} and no '+'; choose another name, or set verdict",
+            f"{parameter.word!r} cannot name a parameter in verdict.csv, nor can anything with '+' "
+            f"or {', '.join(constants.RESERVED_WORDS)}: choose another name, or set verdict",
         )
     kinds = [law.kind for law in parameter.laws]
     for j, kind in enumerate(kinds):
@@ -410,18 +394,18 @@ def _parameter_troubles(k: int, parameter: ParameterSpec) -> Iterator[tuple[Keys
         )
 
 
-def _decision_troubles(decision: Decision) -> Iterator[tuple[Keys, str]]:
-    """Say whether two things would choose the service date."""
+def _decision_faults(decision: Decision) -> Iterator[tuple[Keys, str]]:
+    """Find two criteria of the service date."""
     if decision.max_risk is not None and decision.cost_ratio is not None:
         yield (
             ("decision", "cost_ratio"),
-            f"cost_ratio = {decision.cost_ratio:g} and max_risk = {decision.max_risk:g} would each "
-            "choose a service date: give one of them",
+            f"cost_ratio = {decision.cost_ratio:g} and max_risk = {decision.max_risk:g} each "
+            "choose a service date: state one of them",
         )
 
 
-def _map_troubles(description: Description, modal_map: ModalMap) -> Iterator[tuple[Keys, str]]:
-    """Say in what a description does not fit its map, and by which key."""
+def _map_faults(description: Description, modal_map: ModalMap) -> Iterator[tuple[Keys, str]]:
+    """Find contradictions between a description and its map."""
     ends = np.array([modal_map.low, modal_map.high])
     for k, parameter in enumerate(description.parameter):
         low, high = ends[:, k]
@@ -429,7 +413,7 @@ def _map_troubles(description: Description, modal_map: ModalMap) -> Iterator[tup
             yield (
                 ("parameter", k, "baseline"),
                 f"the baseline {parameter.baseline:g} of {parameter.name} lies outside the modal "
-                f"map, which reaches from {np.exp(low):.4g} to {np.exp(high):.4g}",
+                f"map, which covers {np.exp(low):.4g} to {np.exp(high):.4g}",
             )
         try:
             JointPrior((parameter.name,), (parameter.prior,), *ends[:, [k]])

@@ -1,9 +1,4 @@
-"""The modal map: natural frequencies as a smooth function of the health parameters.
-
-A map is a table made by any solver over a full grid of parameter values. It enters as a
-Chebyshev surrogate of ln frequency over ln parameters, whose error is estimated by leaving
-grid points out.
-"""
+"""Modal map: Chebyshev surrogate of ln frequency over ln health parameters (README.md, "Map")."""
 
 from __future__ import annotations
 
@@ -16,8 +11,8 @@ from numpy.polynomial.chebyshev import chebder
 from lmshealth._arrays import BoolArray, FloatArray
 from lmshealth.errors import BadStage, OutsideMap
 
-_MAX_DEGREE = 14
-_NEGLIGIBLE = 1e-6  # error of ln frequency that no measurement comes near
+# The degree is raised until the error of ln f is far below that of any measurement.
+_MAX_DEGREE, _NEGLIGIBLE = 14, 1e-6
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -45,22 +40,11 @@ class ModalMap:
     leave_out_error: FloatArray
 
     def inside(self, x: FloatArray) -> BoolArray:
-        """Tell which points lie inside the grid.
-
-        Parameters
-        ----------
-        x : ndarray
-            ln parameters, shape ``(n_points, n_parameters)``.
-
-        Returns
-        -------
-        ndarray of bool
-            Shape ``(n_points,)``.
-        """
+        """Return which points, shape ``(n_points, n_parameters)``, lie inside the grid."""
         return np.asarray(np.all((x >= self.low) & (x <= self.high), axis=-1))
 
     def ln_frequency(self, x: FloatArray) -> FloatArray:
-        """Evaluate ln frequency for many points in one call.
+        """Evaluate ln frequency at many points.
 
         Parameters
         ----------
@@ -75,14 +59,12 @@ class ModalMap:
         Raises
         ------
         OutsideMap
-            If a point lies outside the grid; maps are never extrapolated.
+            If a point lies outside the grid; there is no extrapolation.
         """
         return _evaluate(self.coefficients, self._unit(x))
 
     def gradient(self, x: FloatArray) -> FloatArray:
-        """Differentiate ln frequency by the ln parameters, for many points in one call.
-
-        The derivative is that of the polynomial, so that it holds at the ends of the grid too.
+        """Differentiate the polynomial of ln frequency by the ln parameters at many points.
 
         Parameters
         ----------
@@ -97,7 +79,7 @@ class ModalMap:
         Raises
         ------
         OutsideMap
-            If a point lies outside the grid; maps are never extrapolated.
+            If a point lies outside the grid; there is no extrapolation.
         """
         unit = self._unit(x)
         slopes = [
@@ -107,7 +89,7 @@ class ModalMap:
         return np.stack(slopes, axis=-1)
 
     def _unit(self, x: FloatArray) -> FloatArray:
-        """Scale points to the range -1 to 1 of the polynomials; refuse those outside."""
+        """Scale points to the range -1 to 1; refuse those outside."""
         inside = self.inside(x)
         if not inside.all():
             worst = np.exp(x[~inside][0])
@@ -131,24 +113,24 @@ def read_map(path: str, parameters: tuple[str, ...]) -> ModalMap:
     Raises
     ------
     BadStage
-        If columns are missing, values are not positive, or the grid is not full.
+        If columns are missing or unknown, values are not positive, or the grid is not full.
     """
     try:
-        # Blank lines count, so that a row is told by its line.
+        # Blank lines are kept, so that the index of a row gives its line.
         table = pd.read_csv(path, skip_blank_lines=False).dropna(how="all")
     except (OSError, ValueError) as error:
         why = getattr(error, "strerror", None) or error
         raise BadStage(f"{path}: cannot read the modal map: {why}") from error
     missing = {*parameters, "mode", "frequency_hz"} - set(table.columns)
     if missing:
-        # A description may name any file, and what is no map at all is nobody's business.
+        # A description may name any file: the columns of one that is no map are not disclosed.
         is_map = missing != {*parameters, "mode", "frequency_hz"}
-        there = f"there are {list(table.columns)}" if is_map else "it is no modal map"
+        there = f"there are {list(table.columns)}" if is_map else "it is not a modal map"
         raise BadStage(f"{path}: no column {sorted(missing)}; {there}")
     extra = set(table.columns) - {*parameters, "mode", "frequency_hz"}
     if extra:
         raise BadStage(
-            f"{path}: columns {sorted(extra)} are no parameter of the stage description; "
+            f"{path}: columns {sorted(extra)} are not parameters of the stage description; "
             "describe them as [[parameter]] or make the map without them"
         )
     numbers = table[[*parameters, "frequency_hz"]].apply(pd.to_numeric, errors="coerce")
@@ -165,12 +147,12 @@ def read_map(path: str, parameters: tuple[str, ...]) -> ModalMap:
     table = table.assign(**numbers, mode=table["mode"].astype(str))
     twice = table.duplicated([*parameters, "mode"]).to_numpy()
     if twice.any():
-        raise BadStage(f"{_line(path, table, twice)}: a mode stands twice at one grid point")
+        raise BadStage(f"{_line(path, table, twice)}: a mode occurs twice at one grid point")
     return _fit(path, table, parameters)
 
 
 def _line(path: str, table: pd.DataFrame, wrong: BoolArray) -> str:
-    """Name the line of the first row that is meant; the first line has the columns' names."""
+    """Name the line of the first wrong row; line 1 holds the column names."""
     return f"{path}: line {table.index[wrong][0] + 2}"
 
 
@@ -205,8 +187,7 @@ def _fit(path: str, table: pd.DataFrame, parameters: tuple[str, ...]) -> ModalMa
 def _evaluate(coefficients: FloatArray, unit: FloatArray) -> FloatArray:
     """Sum a tensor Chebyshev series at points ``(n_points, n_parameters)`` from -1 to 1."""
     shape = coefficients.shape
-    # The last parameter axis is contracted by one matrix product for all points and modes;
-    # what is left is small.
+    # One matrix product contracts the last parameter axis for all points and modes.
     basis = _polynomials(unit[:, -1], shape[-2])
     last = np.moveaxis(coefficients, -2, 0).reshape(shape[-2], -1)
     value = (basis @ last).reshape(-1, *shape[:-2], shape[-1])
@@ -217,8 +198,8 @@ def _evaluate(coefficients: FloatArray, unit: FloatArray) -> FloatArray:
 
 
 def _polynomials(unit: FloatArray, n: int) -> FloatArray:
-    """Chebyshev polynomials 0 … n-1 at points from -1 to 1, shape ``(n_points, n)``."""
-    # numpy's chebvander spends more on bookkeeping than on the few points of a step of walkers.
+    """Evaluate Chebyshev polynomials 0 … n-1 at points from -1 to 1, shape ``(n_points, n)``."""
+    # Faster than numpy's chebvander for the few points of a step of an ensemble.
     value = np.ones((n, unit.size))
     if n > 1:
         value[1] = unit
@@ -245,16 +226,22 @@ def _least_squares(unit: FloatArray, values: FloatArray, degrees: list[int]) -> 
 def _choose_degrees(
     unit: FloatArray, values: FloatArray, sizes: list[int]
 ) -> tuple[list[int], FloatArray]:
-    """Choose one degree for all axes by the error at points left out, each by itself.
+    """Choose the degree with the least error at inner grid points, each left out.
 
-    Corners and edges stay in: without them the fit would extrapolate, which it is never asked to.
-    What a fit without a point misses there is r / (1 - h), with the residual r and the leverage h
-    of the fit with it.
+    The error of a fit without a point is r / (1 - h) there, r the residual and h the leverage of
+    the fit with it.
+
+    Returns
+    -------
+    degrees : list of int
+        One per axis.
+    error : ndarray
+        Largest error of ln frequency of each mode, shape ``(n_modes,)``.
     """
     interior = np.all(np.abs(unit) < 1 - 1e-9, axis=1)
     best: tuple[list[int], FloatArray] | None = None
     for degree in range(1, min(max(sizes) - 1, _MAX_DEGREE) + 1):
-        # One degree less than the axis can carry, so that leaving points out stays well posed.
+        # One degree less than the axis permits keeps fits without a point well posed.
         degrees = [min(degree, size - 2) for size in sizes]
         span = np.linalg.qr(_basis(unit, degrees))[0]
         residual = values - span @ (span.T @ values)
@@ -264,5 +251,5 @@ def _choose_degrees(
             best = degrees, error
         if error.max() < _NEGLIGIBLE:
             break
-    assert best is not None  # sizes are at least 3: degree 1 is always tried
+    assert best is not None  # at least 3 grid values: degree 1 is always tried
     return best

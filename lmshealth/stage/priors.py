@@ -1,4 +1,4 @@
-"""Prior distributions of a stage description, alone and together over a modal map."""
+"""Prior distributions of a stage description, single and joint (README.md, "Priors")."""
 
 from __future__ import annotations
 
@@ -11,16 +11,18 @@ from scipy.special import ndtr, ndtri
 
 from lmshealth._arrays import BoolArray, FloatArray, freeze
 from lmshealth.errors import BadStage
+from lmshealth.stage import constants
 
-# A prior with less than this inside the map is about another machine than the map is.
-_LEAST_INSIDE = 1e-6
+# Levels of the quantiles that approximate a variance.
 _N_LEVELS = 4096
 _HALF_LN_2PI = 0.5 * np.log(2 * np.pi)
 
 
-class Lognormal(
-    msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="lognormal", tag_field="kind"
-):
+class _Distribution(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A distribution; unknown keys are errors."""
+
+
+class Lognormal(_Distribution, frozen=True, tag="lognormal", tag_field="kind"):
     """Lognormal distribution by its median and the standard deviation of the logarithm."""
 
     median: float
@@ -31,38 +33,36 @@ class Lognormal(
             raise ValueError(f"lognormal needs finite median and sigma above 0, got {self}")
 
     def log_density(self, x: FloatArray) -> FloatArray:
-        """Log density at x > 0; -inf elsewhere."""
+        """Return the log density, -inf for x <= 0."""
         with np.errstate(invalid="ignore", divide="ignore"):
             log_x = np.log(x)
             value = -0.5 * ((log_x - np.log(self.median)) / self.sigma) ** 2 - log_x
         return np.where(x > 0, value - np.log(self.sigma) - _HALF_LN_2PI, -np.inf)
 
     def quantile(self, level: FloatArray) -> FloatArray:
-        """Quantile function, elementwise."""
+        """Return quantiles, elementwise."""
         return self.median * np.exp(self.sigma * ndtri(level))
 
     def probability(self, x: FloatArray) -> FloatArray:
-        """Distribution function, elementwise."""
+        """Return probabilities below x, elementwise."""
         with np.errstate(invalid="ignore", divide="ignore"):
             value = ndtr(np.log(np.divide(x, self.median)) / self.sigma)
         return np.where(np.asarray(x) > 0, value, 0.0)
 
     def standard(self, x: FloatArray) -> FloatArray:
-        """Give what has a standard normal distribution: ln x off the median, in sigmas."""
+        """Standardise: return (ln x - ln median) / sigma."""
         return np.asarray(np.log(x / self.median) / self.sigma)
 
     def placed(self, mean: float, std: float) -> Lognormal:
-        """Give the distribution whose `standard` has this mean and standard deviation here."""
+        """Return the distribution of which `standard` has this mean and standard deviation."""
         return Lognormal(self.median * float(np.exp(self.sigma * mean)), self.sigma * std)
 
     def widened(self, factor: float) -> Lognormal:
-        """Give one with the same median, wider by a factor in the logarithm."""
+        """Return one with the same median and ``factor`` times the sigma."""
         return Lognormal(self.median, factor * self.sigma)
 
 
-class Normal(
-    msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="normal", tag_field="kind"
-):
+class Normal(_Distribution, frozen=True, tag="normal", tag_field="kind"):
     """Normal distribution."""
 
     mean: float
@@ -73,34 +73,32 @@ class Normal(
             raise ValueError(f"normal needs a finite mean and a finite std above 0, got {self}")
 
     def log_density(self, x: FloatArray) -> FloatArray:
-        """Log density."""
+        """Return the log density."""
         value = -0.5 * ((x - self.mean) / self.std) ** 2
         return np.asarray(value - np.log(self.std) - _HALF_LN_2PI)
 
     def quantile(self, level: FloatArray) -> FloatArray:
-        """Quantile function, elementwise."""
+        """Return quantiles, elementwise."""
         return self.mean + self.std * ndtri(level)
 
     def probability(self, x: FloatArray) -> FloatArray:
-        """Distribution function, elementwise."""
+        """Return probabilities below x, elementwise."""
         return np.asarray(ndtr((np.asarray(x) - self.mean) / self.std))
 
     def standard(self, x: FloatArray) -> FloatArray:
-        """Give what has a standard normal distribution: x off the mean, in standard deviations."""
+        """Standardise: return (x - mean) / std."""
         return np.asarray((x - self.mean) / self.std)
 
     def placed(self, mean: float, std: float) -> Normal:
-        """Give the distribution whose `standard` has this mean and standard deviation here."""
+        """Return the distribution of which `standard` has this mean and standard deviation."""
         return Normal(self.mean + self.std * mean, self.std * std)
 
     def widened(self, factor: float) -> Normal:
-        """Give one with the same mean, wider by a factor."""
+        """Return one with the same mean and ``factor`` times the std."""
         return Normal(self.mean, factor * self.std)
 
 
-class Uniform(
-    msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="uniform", tag_field="kind"
-):
+class Uniform(_Distribution, frozen=True, tag="uniform", tag_field="kind"):
     """Uniform distribution between low and high."""
 
     low: float
@@ -108,23 +106,23 @@ class Uniform(
 
     def __post_init__(self) -> None:
         if not -np.inf < self.low < self.high < np.inf:
-            raise ValueError(f"uniform needs finite ends, high above low, got {self}")
+            raise ValueError(f"uniform needs finite ends with high above low, got {self}")
 
     def log_density(self, x: FloatArray) -> FloatArray:
-        """Log density inside, -inf outside."""
+        """Return the log density, -inf outside."""
         inside = (x > self.low) & (x < self.high)
         return np.where(inside, -np.log(self.high - self.low), -np.inf)
 
     def quantile(self, level: FloatArray) -> FloatArray:
-        """Quantile function, elementwise."""
+        """Return quantiles, elementwise."""
         return self.low + (self.high - self.low) * np.asarray(level)
 
     def probability(self, x: FloatArray) -> FloatArray:
-        """Distribution function, elementwise."""
+        """Return probabilities below x, elementwise."""
         return np.clip((np.asarray(x) - self.low) / (self.high - self.low), 0.0, 1.0)
 
     def widened(self, factor: float) -> Uniform:
-        """Give one about the same middle, wider by a factor."""
+        """Return one with the same centre and ``factor`` times the width."""
         middle, half = (self.low + self.high) / 2, (self.high - self.low) / 2
         return Uniform(middle - factor * half, middle + factor * half)
 
@@ -134,16 +132,16 @@ Prior = Lognormal | Normal | Uniform
 
 @dataclass(frozen=True, slots=True, eq=False)
 class JointPrior:
-    """Independent priors of several parameters, in their logarithms, cut to a box.
+    """Independent priors of several parameters, in their logarithms, truncated to a box.
 
     Attributes
     ----------
     names : tuple of str
-        Of the parameters.
+        Names of the parameters.
     priors : tuple of Prior
-        Of the parameters themselves, not of their logarithms.
+        Of the parameters, not of their logarithms.
     low, high : ndarray
-        Bounds of the ln parameters: where the modal map ends, shape ``(n_parameters,)``.
+        Bounds of the ln parameters, the range of the modal map, shape ``(n_parameters,)``.
     """
 
     names: tuple[str, ...]
@@ -154,25 +152,25 @@ class JointPrior:
     def __post_init__(self) -> None:
         ends = zip(self.names, self.priors, self.low, self.high, strict=True)
         for name, prior, low, high in ends:
-            if self._mass(prior, low, high)[1] < _LEAST_INSIDE:
+            if self._mass(prior, low, high)[1] < constants.LEAST_PRIOR_MASS:
                 raise BadStage(
-                    f"the prior of {name} puts almost nothing inside the modal map, which reaches "
-                    f"from {np.exp(low):.4g} to {np.exp(high):.4g}; widen the map or move the prior"
+                    f"the prior of {name} has almost no probability inside the modal map, "
+                    f"{np.exp(low):.4g} to {np.exp(high):.4g}; widen the map or move the prior"
                 )
         freeze(self)
 
     @staticmethod
     def _mass(prior: Prior, low: float, high: float) -> tuple[float, float]:
-        """Probability below the box and inside it."""
+        """Return the probability below the box and inside it."""
         below, upto = prior.probability(np.exp([low, high]))
         return float(below), float(upto - below)
 
     def inside(self, x: FloatArray) -> BoolArray:
-        """Tell which ln parameters, ``(n_points, n_parameters)``, lie in the box."""
+        """Return which ln parameters, ``(n_points, n_parameters)``, lie in the box."""
         return np.asarray(np.all((x >= self.low) & (x <= self.high), axis=-1))
 
     def log_density(self, x: FloatArray) -> FloatArray:
-        """Log density of ln parameters up to a constant, shape ``(n_points,)``."""
+        """Return the log density of ln parameters up to a constant, shape ``(n_points,)``."""
         total = np.where(self.inside(x), 0.0, -np.inf)
         for j, prior in enumerate(self.priors):
             # The density of a logarithm has the parameter itself as its Jacobian.
@@ -180,7 +178,7 @@ class JointPrior:
         return np.asarray(total)
 
     def quantile(self, level: FloatArray) -> FloatArray:
-        """Quantiles of every ln parameter at ``(n, n_parameters)`` or ``(n, 1)`` levels."""
+        """Return quantiles of the ln parameters at ``(n, n_parameters)`` or ``(n, 1)`` levels."""
         level = np.broadcast_to(level, (np.shape(level)[0], len(self.priors)))
         columns = []
         for j, prior in enumerate(self.priors):
@@ -191,7 +189,7 @@ class JointPrior:
 
     @property
     def support(self) -> tuple[FloatArray, FloatArray]:
-        """Ends of the ln parameters that are possible, in the box; each ``(n_parameters,)``."""
+        """Bounds of the ln parameters of non-zero density, each ``(n_parameters,)``."""
         low, high = self.quantile(np.array([[0.0], [1.0]]))
         return low, high
 
@@ -206,25 +204,25 @@ class JointPrior:
         return self.quantile(rng.uniform(1e-12, 1 - 1e-12, (n, len(self.priors))))
 
     def widened(self, factor: float) -> JointPrior:
-        """Give one whose priors are wider by a factor, in the same box."""
+        """Return one whose priors are wider by a factor, in the same box."""
         priors = tuple(prior.widened(factor) for prior in self.priors)
         return JointPrior(self.names, priors, self.low, self.high)
 
 
 def combine_priors(parts: Sequence[JointPrior], columns: Sequence[Sequence[int]]) -> JointPrior:
-    """Make one prior of several whose parameters are partly the same.
+    """Combine priors of several machines that share parameters.
 
     Parameters
     ----------
     parts : sequence of JointPrior
         One per machine.
     columns : sequence of sequence of int
-        Where the parameters of each stand among all; the same place twice is one parameter.
+        Indices of the parameters of each among all; a shared index is a shared parameter.
 
     Raises
     ------
     BadStage
-        If one parameter has different priors.
+        If a shared parameter has different priors.
     """
     n = 1 + max(place for places in columns for place in places)
     names, priors = [""] * n, [parts[0].priors[0]] * n
@@ -233,8 +231,8 @@ def combine_priors(parts: Sequence[JointPrior], columns: Sequence[Sequence[int]]
         for j, place in enumerate(places):
             if names[place] and priors[place] != part.priors[j]:
                 raise BadStage(
-                    f"{part.names[j]} is to be one parameter, but has the priors {priors[place]} "
-                    f"and {part.priors[j]}; state the same in both descriptions"
+                    f"{part.names[j]} is shared, but has the priors {priors[place]} and "
+                    f"{part.priors[j]}; state the same prior in both descriptions"
                 )
             names[place], priors[place] = part.names[j], part.priors[j]
             low[place], high[place] = max(low[place], part.low[j]), min(high[place], part.high[j])

@@ -122,7 +122,7 @@ def test_one_thing_chooses_the_service_date(tmp_path: Path) -> None:
     both = "[decision]\nmax_risk = 0.1\ncost_ratio = 20\n"
     with pytest.raises(
         BadStage,
-        match=r"line \d+: decision\.cost_ratio: cost_ratio = 20 and max_risk = 0\.1 would each",
+        match=r"line \d+: decision\.cost_ratio: cost_ratio = 20 and max_risk = 0\.1 each",
     ):
         make_stage(tmp_path, tail=both)
     with pytest.raises(BadStage, match=r"line \d+: decision\.cost_ratio: Expected `float` > 1"):
@@ -149,7 +149,7 @@ def test_a_prior_beyond_the_map_is_refused(tmp_path: Path) -> None:
     """A prior that the map does not reach says nothing about this machine."""
     inside = 'kind = "lognormal", median = 1.0, sigma = 0.3'
     far = MOUNT.replace(inside, 'kind = "uniform", low = 5, high = 6')
-    with pytest.raises(BadStage, match=r"line 18: parameter\[1\]\.prior: .*mount_stiffness puts"):
+    with pytest.raises(BadStage, match=r"line 18: parameter\[1\]\.prior: .*mount_stiffness has"):
         make_stage(tmp_path, (PRELOAD, far))
 
 

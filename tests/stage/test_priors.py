@@ -140,7 +140,7 @@ def test_shared_parameters_stand_once(joint: JointPrior) -> None:
 def test_shared_parameters_need_one_prior(joint: JointPrior) -> None:
     """One parameter with two priors is refused with both."""
     other = JointPrior(("b",), (Lognormal(1.0, 0.2),), *np.log([[0.5], [2.0]]))
-    with pytest.raises(BadStage, match=r"b is to be one parameter.*std=3.*sigma=0\.2"):
+    with pytest.raises(BadStage, match=r"b is shared, but has.*std=3.*sigma=0\.2"):
         combine_priors([joint, other], [(0, 1, 2), (1,)])
 
 
