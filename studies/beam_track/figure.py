@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
-import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from studies.harness.study import Row, read_record
+from studies.harness.figures import BLUE, GREEN, ORANGE, write
+from studies.harness.study import Row
 
-HERE = Path(__file__).parent
-COLOURS = ("#0072b2", "#d55e00", "#009e73")
+COLOURS = (BLUE, ORANGE, GREEN)
 MARKERS = ("o", "s", "^")
 
 
@@ -31,23 +28,18 @@ def draw(ax: Axes, repeats: list[Row], kind: str) -> None:
     ax.grid(alpha=0.3)
 
 
-def main() -> None:
+def draw_figure(figure: Figure, result: Row) -> None:
     """Draw the study."""
-    result = read_record(__file__)
-    style = {"svg.hashsalt": "beam_track", "font.size": 9}
-    with matplotlib.rc_context(style):
-        figure = Figure(figsize=(9, 4), layout="constrained")
-        left, right = figure.subplots(1, 2)
-        draw(left, result["repeats"], "blind")
-        left.set_ylim(-30, 60)
-        left.set_title("nothing known but the estimates")
-        left.set_ylabel("drift of ln f since the first dwell in %, ± 2σ")
-        draw(right, result["repeats"], "told")
-        right.set_title("roller position told, taken out")
-        right.legend(loc="upper right")
-        figure.suptitle("Tracked beam through ramp and return; circles: back at the first position")
-        figure.savefig(HERE / "figure.svg", metadata={"Date": None})
+    left, right = figure.subplots(1, 2)
+    draw(left, result["repeats"], "blind")
+    left.set_ylim(-30, 60)
+    left.set_title("nothing known but the estimates")
+    left.set_ylabel("drift of ln f since the first dwell in %, ± 2σ")
+    draw(right, result["repeats"], "told")
+    right.set_title("roller position told, taken out")
+    right.legend(loc="upper right")
+    figure.suptitle("Tracked beam through ramp and return; circles: back at the first position")
 
 
 if __name__ == "__main__":
-    main()
+    write(__file__, draw_figure, (9, 4), font=9)

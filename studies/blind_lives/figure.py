@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
-import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from studies.harness.study import Row, read_record
+from studies.harness.figures import BLUE, ORANGE, write
+from studies.harness.study import Row
 
-HERE = Path(__file__).parent
-INTERVAL, TRUTH = "#0072b2", "#d55e00"
+INTERVAL = BLUE
+TRUTH = ORANGE
 PANELS = (
     ("health", "guide_preload", "guide preload, fraction of the first log"),
     ("health", "mount_stiffness", "mount stiffness, fraction of the first log"),
@@ -21,17 +19,14 @@ PANELS = (
 _HORIZON_KM = 20_000.0
 
 
-def draw(record: Row) -> Figure:
+def draw_figure(figure: Figure, record: Row) -> None:
     """Draw the table of verdicts, and a panel per quantity with a row per machine."""
-    matplotlib.rcParams["svg.hashsalt"] = "blind_lives"
-    figure = Figure(figsize=(13.0, 4.6), layout="constrained")
     axes = figure.subplots(1, 4, width_ratios=(1.25, 1, 1, 1))
     _confusion(axes[0], record["verdicts"]["all"]["told_of_true"])
     for ax, panel in zip(axes[1:], PANELS, strict=True):
         _intervals(ax, record["rows"], *panel)
     handles, labels = axes[1].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside upper right", ncols=2, frameon=False, fontsize=8)
-    return figure
 
 
 def _confusion(ax: Axes, table: dict[str, dict[str, int]]) -> None:
@@ -71,11 +66,5 @@ def _intervals(ax: Axes, rows: list[Row], what: str, name: str, label: str) -> N
     ax.grid(axis="x", alpha=0.3)
 
 
-def main() -> None:
-    """Write the figure."""
-    record = read_record(__file__)
-    draw(record).savefig(HERE / "figure.svg", metadata={"Date": None}, bbox_inches="tight")
-
-
 if __name__ == "__main__":
-    main()
+    write(__file__, draw_figure, (13.0, 4.6), bbox_inches="tight")

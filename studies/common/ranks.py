@@ -27,6 +27,7 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from studies.common.metrics import coverage, place
+from studies.harness.figures import BLACK, BLUE
 from studies.harness.study import LEVEL, as_row
 
 Array = NDArray[np.float64]
@@ -39,9 +40,6 @@ _POINTS = np.arange(1, 64) / 64
 _SIMULATIONS = 20_000
 # Of fewer ranks, as quick forms have them, hardly anything is outside.
 _FEW, _FEW_SIMULATIONS = 20, 2_000
-BLUE, ORANGE, BLACK = "#0072b2", "#d55e00", "#000000"
-# Told apart by colour-blind eyes, and in pairs by the dash.
-COLOURS = (BLUE, "#56b4e9", ORANGE, "#e69f00", "#009e73", "#cc79a7", BLACK, "#999999", "#b8a000")
 _DASHES = ("-", "--")
 
 

@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
-import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from studies.harness.study import Row, read_record
+from studies.harness.figures import BLUE, GREEN, ORANGE, PINK, SKY, YELLOW, write
+from studies.harness.study import Row
 
-HERE = Path(__file__).parent
-BLUE, ORANGE, GREEN, PINK, GREY = "#0072b2", "#d55e00", "#009e73", "#cc79a7", "#888888"
-COLOURS = (BLUE, ORANGE, GREEN, PINK, "#e69f00", "#56b4e9", "#000000")
+GREY = "#888888"
+COLOURS = (BLUE, ORANGE, GREEN, PINK, YELLOW, SKY, "#000000")
 MARKERS = "osD^vPX"
 
 
@@ -96,19 +93,15 @@ def draw_shares(ax: Axes, kinds: dict[str, Row]) -> None:
     ax.legend(fontsize=7, loc="center right")
 
 
-def main() -> None:
+def draw_figure(figure: Figure, result: Row) -> None:
     """Draw six panels."""
-    matplotlib.rcParams["svg.hashsalt"] = "crossings"
-    result = read_record(__file__)
-    figure = Figure(figsize=(13.0, 7.5), layout="constrained")
     axes = figure.subplots(2, 3)
     for ax, (name, life) in zip(axes[0], result["examples"].items(), strict=True):
         draw_life(ax, name, life)
     draw_swaps(axes[1, 0], result)
     draw_recovery(axes[1, 1], result["kinds"])
     draw_shares(axes[1, 2], result["kinds"])
-    figure.savefig(HERE / "figure.svg", metadata={"Date": None})
 
 
 if __name__ == "__main__":
-    main()
+    write(__file__, draw_figure, (13.0, 7.5))

@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
-import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from scipy.stats import norm
 
-from studies.harness.study import Row, read_record
+from studies.harness.figures import BLACK, BLUE, GREEN, ORANGE, PINK, write
+from studies.harness.study import Row
 
-HERE = Path(__file__).parent
-BLUE, ORANGE, GREEN, PINK, BLACK = "#0072b2", "#d55e00", "#009e73", "#cc79a7", "#000000"
 QUANTITIES = (("f", BLUE, "o", -0.15), ("zeta", ORANGE, "s", 0.15))
 SYMBOLS = {"f": "frequency", "zeta": "damping"}
 
@@ -116,19 +112,15 @@ def draw_beam(ax: Axes, beam: list[Row]) -> None:
     ax.legend(fontsize=7, loc="upper left", ncols=2)
 
 
-def main() -> None:
+def draw_figure(figure: Figure, result: Row) -> None:
     """Draw four panels."""
-    matplotlib.rcParams["svg.hashsalt"] = "decays"
-    result = read_record(__file__)
     rows = rows_of(result["cases"])
-    figure = Figure(figsize=(12.0, 9.0), layout="constrained")
     axes = figure.subplots(2, 2, width_ratios=[1.15, 1], height_ratios=[1.25, 1])
     draw_coverage(axes[0, 0], rows)
     draw_scatter(axes[0, 1], rows)
     draw_machines(axes[1, 0], result["machines"])
     draw_beam(axes[1, 1], result["beam"])
-    figure.savefig(HERE / "figure.svg", metadata={"Date": None})
 
 
 if __name__ == "__main__":
-    main()
+    write(__file__, draw_figure, (12.0, 9.0))

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
-import matplotlib
 import numpy as np
 from matplotlib.figure import Figure
 
-from studies.harness.study import read_record
+from studies.harness.figures import BLUE, ORANGE, write
+from studies.harness.study import Row
 
-HERE = Path(__file__).parent
-INTERVAL, TRUTH = "#0072b2", "#d55e00"
+INTERVAL = BLUE
+TRUTH = ORANGE
 PANELS = (
     ("guide_preload", "median", "guide preload, fraction of commissioning"),
     ("mount_stiffness", "median", "mount stiffness, fraction of commissioning"),
@@ -19,11 +17,9 @@ PANELS = (
 )
 
 
-def main() -> None:
+def draw_figure(figure: Figure, record: Row) -> None:
     """Draw one panel per quantity, one row per life, in the order of the truth."""
-    matplotlib.rcParams["svg.hashsalt"] = "demo_life"
-    lives = read_record(__file__)["lives"]
-    figure = Figure(figsize=(10.5, 1.6 + 0.22 * len(lives)), layout="constrained")
+    lives = record["lives"]
     for ax, (name, middle, label) in zip(figure.subplots(1, 3), PANELS, strict=True):
         rows = sorted((life[name] for life in lives), key=lambda row: row["truth"])
         y = np.arange(len(rows))
@@ -41,8 +37,7 @@ def main() -> None:
     figure.axes[0].set_ylabel("lives, sorted by truth")
     handles, labels = figure.axes[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside upper center", ncols=2, frameon=False)
-    figure.savefig(HERE / "figure.svg", metadata={"Date": None})
 
 
 if __name__ == "__main__":
-    main()
+    write(__file__, draw_figure, lambda record: (10.5, 1.6 + 0.22 * len(record["lives"])))

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from textwrap import wrap
 from typing import Any
 
-import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import LogNorm
@@ -14,10 +12,10 @@ from matplotlib.figure import Figure
 from matplotlib.patheffects import withStroke
 from matplotlib.ticker import ScalarFormatter
 
-from studies.harness.study import Row, read_record
+from studies.harness.figures import BLUE, GREEN, ORANGE, write
+from studies.harness.study import Row
 
-HERE = Path(__file__).parent
-COLOURS = {"roll": "#0072b2", "pitch": "#d55e00", "yaw": "#009e73"}
+COLOURS = {"roll": BLUE, "pitch": ORANGE, "yaw": GREEN}
 _LINES = (0.2, 0.3, 0.5, 1, 2, 3, 5)  # per cent
 _NAMES = {"guide_preload": "guide preload", "mount_stiffness": "mount stiffness"}
 _ARMS = {
@@ -58,7 +56,7 @@ def draw_checks(ax: Axes, result: Row) -> None:
     """Draw how often the planned losses are called, and none."""
     rows = result["checks"]
     arms = list(_ARMS)
-    colours = ("#0072b2", "#009e73", "#d55e00")
+    colours = (BLUE, GREEN, ORANGE)
     keys = list(
         dict.fromkeys((r["stage"], r["parameter"], r["duration_s"], r["logs"]) for r in rows)
     )
@@ -110,11 +108,8 @@ def draw_law(ax: Axes, result: Row) -> None:
     ax.grid(alpha=0.25)
 
 
-def main() -> None:
+def draw_figure(figure: Figure, result: Row) -> None:
     """Draw."""
-    matplotlib.rcParams |= {"svg.hashsalt": "lmshealth", "font.size": 8}
-    result = read_record(__file__)
-    figure = Figure(figsize=(12, 9), layout="constrained")
     top, bottom = figure.subfigures(2, 1, height_ratios=(1, 1.15))
     axes = top.subplots(1, 3)
     for ax, one in zip(axes, result["maps"], strict=True):
@@ -125,8 +120,7 @@ def main() -> None:
     draw_law(left, result)
     draw_checks(right, result)
     figure.supxlabel("\n".join(wrap(f"Not drawn, {result['unseen']['said']}", 170)), fontsize=7)
-    figure.savefig(HERE / "figure.svg", metadata={"Date": None})
 
 
 if __name__ == "__main__":
-    main()
+    write(__file__, draw_figure, (12, 9), font=8)

@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
-import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from studies.common.ranks import BLACK, BLUE, ORANGE
-from studies.harness.study import Row, read_record
+from studies.harness.figures import BLACK, BLUE, ORANGE, write
+from studies.harness.study import Row
 
-HERE = Path(__file__).parent
 GREY = "#999999"
 NAMES = {
     "description": "prior of the description",
@@ -86,19 +82,15 @@ def draw_priors(ax: Axes, priors: list[dict[str, list[float]]]) -> None:
     bar.set_label("machines of the fleet that wear, %")
 
 
-def main() -> None:
+def draw_figure(figure: Figure, result: Row) -> None:
     """Draw the three side by side."""
-    matplotlib.rcParams["svg.hashsalt"] = "fleet_prior"
-    result = read_record(__file__)
-    figure = Figure(figsize=(13.0, 4.2), layout="constrained")
     axes = figure.subplots(1, 3, width_ratios=[1.0, 1.0, 1.25])
     draw_lost(axes[0], result["ways"])
     draw_coverage(axes[1], result["ways"])
     draw_priors(axes[2], result["priors"])
     title = f"{result['young']} young machines of {result['fleets']} fleets"
     figure.suptitle(f"{title}, {result['teachers']} teachers each", fontsize=10)
-    figure.savefig(HERE / "figure.svg", metadata={"Date": None})
 
 
 if __name__ == "__main__":
-    main()
+    write(__file__, draw_figure, (13.0, 4.2))

@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
-import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from studies.harness.study import Row, read_record
+from studies.harness.figures import BLUE, GREEN, ORANGE, write
+from studies.harness.study import Row
 
-HERE = Path(__file__).parent
-COLOURS = ("#0072b2", "#d55e00")
+COLOURS = (BLUE, ORANGE)
 
 
 def draw_responses(ax: Axes, pictures: Row, bench: str) -> None:
@@ -45,7 +42,7 @@ def draw_coverage(ax: Axes, cases: Row) -> None:
                 ax.plot([row["low"], row["high"]], [k, k], lw=2.5, color=colour)
                 ax.plot(row["share"], k, marker, ms=5, color=colour)
             labels.append(f"{name}: {'f' if what == 'frequency' else 'ζ'}")
-    ax.axvline(0.95, color="#009e73", lw=1)
+    ax.axvline(0.95, color=GREEN, lw=1)
     ax.set_yticks(range(len(labels)), labels, fontsize=8)
     ax.invert_yaxis()
     ax.set_title("simulated; grey: 1.5 × as narrow ◂, wide ▸", fontsize=10)
@@ -81,7 +78,7 @@ def draw_sweeps(ax: Axes, sweeps: dict[str, list[Row]]) -> None:
                     label="ζ" if first else None)  # fmt: skip
             labels.append(f"{name}: {sensor}")
     for level in (-1.96, 1.96):
-        ax.axhline(level, color="#009e73", lw=1)
+        ax.axhline(level, color=GREEN, lw=1)
     ax.set_xticks(range(len(labels)), labels, rotation=60, ha="right", fontsize=8)
     ax.set_title("sweeps of simulated stages: pitch, 8 seeds", fontsize=10)
     ax.set_ylabel("error over stated σ")
@@ -89,11 +86,8 @@ def draw_sweeps(ax: Axes, sweeps: dict[str, list[Row]]) -> None:
     ax.grid(alpha=0.25, axis="y")
 
 
-def main() -> None:
+def draw_figure(figure: Figure, result: Row) -> None:
     """Draw benches above, simulated machines below."""
-    matplotlib.rcParams["svg.hashsalt"] = "frf_modes"
-    result = read_record(__file__)
-    figure = Figure(figsize=(14.0, 8.5), layout="constrained")
     axes = figure.subplots(2, 3)
     draw_responses(axes[0, 0], result["pictures"], "linear guide")
     draw_modes(axes[0, 1], result["linear_guide"], "linear guide: friction moves it")
@@ -102,8 +96,7 @@ def main() -> None:
     draw_modes(axes[1, 0], sides, "two inertias: both sides")
     draw_coverage(axes[1, 1], result["cases"])
     draw_sweeps(axes[1, 2], result["sweep_rows"])
-    figure.savefig(HERE / "figure.svg", metadata={"Date": None})
 
 
 if __name__ == "__main__":
-    main()
+    write(__file__, draw_figure, (14.0, 8.5))

@@ -23,6 +23,7 @@ def write(
     draw: Callable[[Figure, Row], None],
     size: tuple[float, float] | Callable[[Row], tuple[float, float]],
     font: float = 10,
+    **options: Any,
 ) -> None:
     """Draw ``figure.svg`` beside ``figure.py`` from ``result.json``.
 
@@ -36,6 +37,8 @@ def write(
         Width and height in inches, or a function of the record that returns them.
     font : float
         Font size in points.
+    options : object
+        Further arguments of `Figure.savefig`.
     """
     record = read_record(script)
     folder = Path(script).parent
@@ -43,7 +46,7 @@ def write(
         width_and_height = size(record) if callable(size) else size
         figure = Figure(figsize=width_and_height, layout="constrained")
         draw(figure, record)
-        figure.savefig(folder / "figure.svg", metadata={"Date": None})
+        figure.savefig(folder / "figure.svg", metadata={"Date": None}, **options)
 
 
 def legend_above(figure: Figure, ax: Axes, **options: Any) -> None:

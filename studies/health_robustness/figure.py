@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
-from pathlib import Path
 
-import matplotlib
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from studies.harness.figures import BLACK, BLUE, ORANGE, write
 from studies.harness.study import Row, read_record
 
-HERE = Path(__file__).parent
-BLUE, ORANGE, BLACK = "#0072b2", "#d55e00", "#000000"
 PARAMETERS = {"guide_preload": (BLUE, "o", "preload"), "mount_stiffness": (ORANGE, "s", "mount")}
 WHAT = {"last": "last log, no law", "now": "now, by laws", "left": "remaining life"}
 
@@ -111,20 +107,14 @@ def of(rows: list[Row], what: str) -> list[Row]:
     return [row for row in rows if row["what"] == what]
 
 
-def main() -> None:
+def draw_figure(figure: Figure, result: Row) -> None:
     """Draw."""
-    matplotlib.rcParams |= {"svg.hashsalt": "lmshealth", "font.size": 8}
-    result = read_record(__file__)
-    kept = HERE / "raw.json"
-    raw = json.loads(kept.read_text(encoding="utf-8"))["lives"] if kept.exists() else []
-    more = HERE / "control.json"
-    if more.exists():
-        control = json.loads(more.read_text(encoding="utf-8"))["fleets"]
-        arms = {(row["stage"], row["arm"]) for row in control}
-        result["fleets"] = control + [
-            row for row in result["fleets"] if (row["stage"], row["arm"]) not in arms
-        ]
-    figure = Figure(figsize=(13, 15), layout="constrained")
+    raw = read_record(__file__, "raw")["lives"]
+    control = read_record(__file__, "control")["fleets"]
+    arms = {(row["stage"], row["arm"]) for row in control}
+    result["fleets"] = control + [
+        row for row in result["fleets"] if (row["stage"], row["arm"]) not in arms
+    ]
     top, middle, bottom = figure.subfigures(3, 1, height_ratios=(2.1, 1.3, 1.5))
     lives, fleets, plants = result["lives"], result["fleets"], result["plants"]
     axes = top.subplots(1, 3, sharey=True)
@@ -149,8 +139,7 @@ def main() -> None:
                                  (BLACK, "x", "raw lives")):  # fmt: skip
         axes[2].plot([], [], marker, color=colour, label=what)
     axes[2].legend(fontsize=7, loc="lower left")
-    figure.savefig(HERE / "figure.svg", metadata={"Date": None})
 
 
 if __name__ == "__main__":
-    main()
+    write(__file__, draw_figure, (13, 15), font=8)

@@ -2,31 +2,30 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
-import matplotlib
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from studies.harness.study import Row, read_record
+from studies.harness.figures import BLUE, GREEN, ORANGE, write
+from studies.harness.study import Row
 
-HERE = Path(__file__).parent
-QUANTITIES = {"ln f": ("#0072b2", "o", -0.18), "ln zeta": ("#d55e00", "s", 0.18)}
+QUANTITIES = {"ln f": (BLUE, "o", -0.18), "ln zeta": (ORANGE, "s", 0.18)}
 NAMES = {"ln f": "frequency", "ln zeta": "damping"}
 
 
-def main() -> None:
-    """Draw."""
-    matplotlib.rcParams |= {"svg.hashsalt": "lmshealth", "font.size": 8}
-    rows = read_record(__file__)["cases"]
-    cases = list(dict.fromkeys(row["case"] for row in rows))
-    figure = Figure(figsize=(10, 0.42 * len(cases) + 1.4), layout="constrained")
+def draw_figure(figure: Figure, record: Row) -> None:
+    """Draw a line per case, its coverage on the left and its errors on the right."""
+    rows = record["cases"]
+    cases = cases_of(rows)
     left, right = figure.subplots(1, 2, sharey=True)
     draw_coverage(left, cases, rows)
     draw_efficiency(right, cases, rows)
     left.set_yticks(range(len(cases)), cases)
     left.set_ylim(len(cases) - 0.4, -0.6)
-    figure.savefig(HERE / "figure.svg", metadata={"Date": None})
+
+
+def cases_of(rows: list[Row]) -> list[str]:
+    """Return the names of cases in their order."""
+    return list(dict.fromkeys(row["case"] for row in rows))
 
 
 def places(cases: list[str], rows: list[Row]) -> list[tuple[float, Row]]:
@@ -73,16 +72,21 @@ def draw_efficiency(ax: Axes, cases: list[str], rows: list[Row]) -> None:
         ax.errorbar(row["rmse_over_bound"], y, xerr=row["its_error"], fmt=marker, ms=3, lw=1,
                     color=colour)  # fmt: skip
         if row["asked"] is not None:
-            ax.plot(row["asked"], y, "|", ms=7, color="#009e73")
+            ax.plot(row["asked"], y, "|", ms=7, color=GREEN)
     for k, case in enumerate(cases):
         if all("rmse_over_bound" not in row for row in rows if row["case"] == case):
             ax.text(1.0, k, " no bound computed", va="center", color="#777777")
     ax.axvline(1, color="black", lw=0.8)
-    ax.plot([], [], "|", ms=7, color="#009e73", label="asked: no more than this")
+    ax.plot([], [], "|", ms=7, color=GREEN, label="asked: no more than this")
     ax.set_xlabel("root mean square error over the Cramér-Rao bound;\nbars: one standard error")
     ax.legend(loc="upper right", frameon=True, framealpha=0.9)
     ax.grid(axis="x", alpha=0.25)
 
 
 if __name__ == "__main__":
-    main()
+    write(
+        __file__,
+        draw_figure,
+        lambda record: (10, 0.42 * len(cases_of(record["cases"])) + 1.4),
+        font=8,
+    )

@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
-import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 
-from studies.harness.study import Row, read_record
+from studies.harness.figures import BLACK, BLUE, GREEN, ORANGE, PINK, write
+from studies.harness.study import Row
 
-HERE = Path(__file__).parent
-BLUE, ORANGE, GREEN, PINK, BLACK = "#0072b2", "#d55e00", "#009e73", "#cc79a7", "#000000"
 MARKERS = "osD"
 _LEAST_RATE = 1e-4
 
@@ -154,11 +150,8 @@ def draw_moves(ax: Axes, modes: Row) -> None:
     ax.grid(alpha=0.25)
 
 
-def main() -> None:
+def draw_figure(figure: Figure, result: Row) -> None:
     """Draw six panels."""
-    matplotlib.rcParams["svg.hashsalt"] = "line_test"
-    result = read_record(__file__)
-    figure = Figure(figsize=(13.0, 8.0), layout="constrained")
     axes = figure.subplots(2, 3)
     draw_alarms(axes[0, 0], result["false_alarms"], result["controls"])
     draw_border(axes[0, 1], result["border"])
@@ -166,8 +159,7 @@ def main() -> None:
     draw_errors(axes[1, 0], result["detection"]["white, 3 s"])
     draw_company(axes[1, 1], result["beside"], result["strokes"])
     draw_moves(axes[1, 2], result["modes"])
-    figure.savefig(HERE / "figure.svg", metadata={"Date": None})
 
 
 if __name__ == "__main__":
-    main()
+    write(__file__, draw_figure, (13.0, 8.0))

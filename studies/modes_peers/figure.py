@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
-import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from studies.harness.study import Row, read_record
+from studies.harness.figures import BLUE, GREEN, ORANGE, write
+from studies.harness.study import Row
 
-HERE = Path(__file__).parent
-COLOURS, MARKERS = ("#0072b2", "#d55e00", "#009e73"), "osD"
+COLOURS, MARKERS = (BLUE, ORANGE, GREEN), "osD"
 SHIFT = 0.24
 QUANTITIES = {"ln f": "natural frequency", "ln zeta": "damping ratio"}
 
@@ -66,12 +63,9 @@ def draw_costs(ax: Axes, cases: list[Row], key: str, label: str, title: str) -> 
     ax.set_title(title, fontsize=10)
 
 
-def main() -> None:
+def draw_figure(figure: Figure, result: Row) -> None:
     """Draw five panels that share the list of programs."""
-    matplotlib.rcParams["svg.hashsalt"] = "modes_peers"
-    result = read_record(__file__)
     cases = result["cases"]
-    figure = Figure(figsize=(14.0, 5.2), layout="constrained")
     axes = figure.subplots(1, 5, sharey=True)
     draw_errors(axes[0], cases, "ln f")
     draw_errors(axes[1], cases, "ln zeta")
@@ -87,8 +81,7 @@ def main() -> None:
     for k, case in enumerate(cases):
         axes[0].plot([], [], MARKERS[k], color=COLOURS[k], label=case["case"])
     figure.legend(loc="outside lower center", ncols=3, frameon=False)
-    figure.savefig(HERE / "figure.svg", metadata={"Date": None})
 
 
 if __name__ == "__main__":
-    main()
+    write(__file__, draw_figure, (14.0, 5.2))

@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
-import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from studies.harness.study import Row, read_record
+from studies.harness.figures import BLUE, GREEN, ORANGE, write
+from studies.harness.study import Row
 
-HERE = Path(__file__).parent
-DATA, FULL, KNOWN, STEPPED = "#56606b", "#0072b2", "#d55e00", "#009e73"
+DATA = "#56606b"
+FULL = BLUE
+KNOWN = ORANGE
+STEPPED = GREEN
 
 
 def draw_building(top: Axes, bottom: Axes, name: str, building: Row) -> None:
@@ -115,11 +115,8 @@ def draw_shake(ax: Axes, rows: list[Row]) -> None:
     ax.grid(alpha=0.25, axis="x")
 
 
-def main() -> None:
+def draw_figure(figure: Figure, result: Row) -> None:
     """Draw the building above, the other sets below."""
-    matplotlib.rcParams["svg.hashsalt"] = "modes_real"
-    result = read_record(__file__)
-    figure = Figure(figsize=(11.0, 9.0), layout="constrained")
     axes = figure.subplots(3, 3, height_ratios=(1, 1, 1.25))
     for column, name in enumerate(result["building"]["modes"]):
         draw_building(axes[0, column], axes[1, column], name, result["building"])
@@ -130,8 +127,7 @@ def main() -> None:
     draw_light(axes[2, 2], result["light_frame"])
     handles, labels = axes[0, 0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside upper center", ncols=4, frameon=False)
-    figure.savefig(HERE / "figure.svg", metadata={"Date": None})
 
 
 if __name__ == "__main__":
-    main()
+    write(__file__, draw_figure, (11.0, 9.0))

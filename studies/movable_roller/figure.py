@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
-import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from studies.harness.study import Row, read_record
+from studies.harness.figures import BLUE, ORANGE, write
+from studies.harness.study import Row
 
-HERE = Path(__file__).parent
-UP, DOWN, OTHER = "#0072b2", "#d55e00", "#777777"
+UP = BLUE
+DOWN = ORANGE
+OTHER = "#777777"
 
 
 def draw_map(ax: Axes, calibration: Row, dwells: list[Row]) -> None:
@@ -62,17 +61,13 @@ def draw_positions(top: Axes, below: Axes, dwells: list[Row]) -> None:
     below.set_xlabel("roller position measured in V")
 
 
-def main() -> None:
+def draw_figure(figure: Figure, result: Row) -> None:
     """Draw the study."""
-    result = read_record(__file__)
-    with matplotlib.rc_context({"svg.hashsalt": "movable_roller", "font.size": 9}):
-        figure = Figure(figsize=(9, 4.8), layout="constrained")
-        axes = figure.subplot_mosaic([["map", "top"], ["map", "below"]], height_ratios=[3, 2])
-        draw_map(axes["map"], result["calibration"], result["dwells"])
-        draw_positions(axes["top"], axes["below"], result["dwells"])
-        axes["below"].set_xlim(axes["top"].get_xlim())
-        figure.savefig(HERE / "figure.svg", metadata={"Date": None})
+    axes = figure.subplot_mosaic([["map", "top"], ["map", "below"]], height_ratios=[3, 2])
+    draw_map(axes["map"], result["calibration"], result["dwells"])
+    draw_positions(axes["top"], axes["below"], result["dwells"])
+    axes["below"].set_xlim(axes["top"].get_xlim())
 
 
 if __name__ == "__main__":
-    main()
+    write(__file__, draw_figure, (9, 4.8), font=9)

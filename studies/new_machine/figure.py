@@ -2,25 +2,21 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
-import matplotlib
 import numpy as np
 from matplotlib.figure import Figure
 
-from studies.harness.study import Row, read_record
+from studies.harness.figures import BLUE, ORANGE, write
+from studies.harness.study import Row
 
-HERE = Path(__file__).parent
 STYLES = {
-    "bench-A": ("#0072b2", "o", "bench-A, as measured"),
-    "bench-B": ("#d55e00", "s", "bench-B, read as sampled slower and slower"),
+    "bench-A": (BLUE, "o", "bench-A, as measured"),
+    "bench-B": (ORANGE, "s", "bench-B, read as sampled slower and slower"),
 }
 HOURS_PER_WEEK = 168
 
 
-def draw(result: Row) -> Figure:
+def draw_figure(figure: Figure, result: Row) -> None:
     """Draw medians with 90 % intervals over the weeks, the truth, and when B reaches its limit."""
-    figure = Figure(figsize=(8, 3.6), layout="constrained")
     ax = figure.subplots()
     for name, (colour, marker, label) in STYLES.items():
         own = [row for row in result["stiffness"] if row["stage"] == name]
@@ -55,15 +51,7 @@ def draw(result: Row) -> Figure:
     ax.set_ylabel("coupling stiffness / baseline")
     ax.legend(fontsize=8)
     ax.grid(alpha=0.3)
-    return figure
-
-
-def main() -> None:
-    """Draw the study."""
-    result = read_record(__file__)
-    with matplotlib.rc_context({"svg.hashsalt": "new_machine", "font.size": 9}):
-        draw(result).savefig(HERE / "figure.svg", metadata={"Date": None})
 
 
 if __name__ == "__main__":
-    main()
+    write(__file__, draw_figure, (8, 3.6), font=9)

@@ -2,16 +2,11 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
-import matplotlib
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from studies.harness.study import Row, read_record
-
-HERE = Path(__file__).parent
-BLUE, ORANGE, GREEN, BLACK = "#0072b2", "#d55e00", "#009e73", "#000000"
+from studies.harness.figures import BLACK, BLUE, ORANGE, write
+from studies.harness.study import Row
 
 
 def rows_of(answer: Row) -> list[tuple[str, Row]]:
@@ -61,18 +56,14 @@ def draw_coverage(ax: Axes, rows: list[tuple[str, list[Row], bool]]) -> None:
     ax.set_title("Whether intervals cover (×: controls that must not)", fontsize=10)
 
 
-def main() -> None:
+def draw_figure(figure: Figure, answer: Row) -> None:
     """Draw the figure."""
-    answer = read_record(__file__)
-    matplotlib.rcParams["svg.hashsalt"] = "one_guide"
-    fig = Figure(figsize=(11.5, 4.2), layout="constrained")
-    left, right = fig.subplots(1, 2)
+    left, right = figure.subplots(1, 2)
     rows = rows_of(answer)
     draw_widths(left, rows)
     controls = [(f"control: {name}", own, True) for name, own in answer["controls"].items()]
     draw_coverage(right, [(name, own["coverage"], False) for name, own in rows] + controls)
-    fig.savefig(HERE / "figure.svg", metadata={"Date": None})
 
 
 if __name__ == "__main__":
-    main()
+    write(__file__, draw_figure, (11.5, 4.2))

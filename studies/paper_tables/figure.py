@@ -2,32 +2,26 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
-import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from studies.harness.study import Row, read_record
+from studies.harness.figures import BLUE, GREEN, ORANGE, PINK, write
+from studies.harness.study import Row
 
-HERE = Path(__file__).parent
-COLOURS = {"x": "#0072b2", "y": "#d55e00"}
+COLOURS = {"x": BLUE, "y": ORANGE}
 VELOCITIES = np.array([1, 5, 10, 20, 100, 200, 400])
-SLOW, FAST = "#009e73", "#cc79a7"
+SLOW, FAST = GREEN, PINK
 
 
-def main() -> None:
+def draw_figure(figure: Figure, record: Row) -> None:
     """Draw errors over velocity above, accelerations over frequency below."""
-    matplotlib.rcParams["svg.hashsalt"] = "paper_tables"
-    rows = read_record(__file__)["rows"]
-    figure = Figure(figsize=(10, 7.6), layout="constrained")
+    rows = record["rows"]
     axes = figure.subplots(2, 2)
     over_velocity(axes[0, 0], rows, "std_um", "standard deviation of Δe in µm (Table 3)")
     over_velocity(axes[0, 1], rows, "max_magnitude_um", "largest harmonic of Δe in µm (Table 4)")
     over_frequency(axes[1, 0], rows, "x", "Table 6")
     over_frequency(axes[1, 1], rows, "y", "Table 7")
-    figure.savefig(HERE / "figure.svg", metadata={"Date": None})
 
 
 def over_velocity(ax: Axes, rows: list[Row], key: str, label: str) -> None:
@@ -71,4 +65,4 @@ def over_frequency(ax: Axes, rows: list[Row], axis: str, table: str) -> None:
 
 
 if __name__ == "__main__":
-    main()
+    write(__file__, draw_figure, (10, 7.6))

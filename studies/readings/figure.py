@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 from itertools import groupby
-from pathlib import Path
 
-import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from studies.harness.study import Row, read_record
+from studies.harness.figures import BLUE, ORANGE, write
+from studies.harness.study import Row
 
-HERE = Path(__file__).parent
-BLUE, RED, GREEN, GREY = "#0072b2", "#d55e00", "#009e73", "#56606b"
+RED = ORANGE
+GREY = "#56606b"
 # Lines of one kind that are closer than this share a label.
 _TOGETHER_HZ = 10.0
 
@@ -132,12 +131,9 @@ def draw_lines(ax: Axes, mpstd: Row) -> None:
     ax.legend(frameon=False, fontsize=8, ncols=3, loc="upper right")
 
 
-def main() -> None:
+def draw_figure(figure: Figure, result: Row) -> None:
     """Draw what is calibrated above; growth and a real record below."""
-    matplotlib.rcParams["svg.hashsalt"] = "readings"
-    result = read_record(__file__)
     details = result["details"]
-    figure = Figure(figsize=(13.0, 7.6), layout="constrained")
     grid = figure.add_gridspec(2, 6)
     above = [figure.add_subplot(grid[0, 2 * i : 2 * i + 2]) for i in range(3)]
     below = [figure.add_subplot(grid[1, :2]), figure.add_subplot(grid[1, 2:])]
@@ -148,8 +144,7 @@ def main() -> None:
     draw_lines(below[1], details["mpstd"])
     for ax in (*above, *below):
         ax.grid(alpha=0.25)
-    figure.savefig(HERE / "figure.svg", metadata={"Date": None})
 
 
 if __name__ == "__main__":
-    main()
+    write(__file__, draw_figure, (13.0, 7.6))

@@ -2,26 +2,21 @@
 
 from __future__ import annotations
 
-import json
-import sys
-from pathlib import Path
-
-import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from studies.harness.figures import BLACK, BLUE, GREEN, ORANGE, PINK, write
 from studies.harness.study import Row
 
-HERE = Path(__file__).parent
-BLACK, GREY = "#000000", "#777777"
+GREY = "#777777"
 # Colour, marker, dash, name, and by how much it stands aside.
 WAYS = {
-    "lmshealth": ("#0072b2", "o", "-", "lmshealth", -1.5),
-    "progpy": ("#009e73", "^", "--", "progpy, same draws", 0.0),
-    "line": ("#d55e00", "s", "-.", "line through health", 1.5),
+    "lmshealth": (BLUE, "o", "-", "lmshealth", -1.5),
+    "progpy": (GREEN, "^", "--", "progpy, same draws", 0.0),
+    "line": (ORANGE, "s", "-.", "line through health", 1.5),
 }
-CONTROL = ("#cc79a7", ":", "control: a tenth of the spread")
+CONTROL = (PINK, ":", "control: a tenth of the spread")
 KEPT = "progpy, all runs kept"
 MAIN_CUT = 0.7
 
@@ -119,22 +114,15 @@ def draw_services(ax: Axes, cuts: list[Row], risk: float) -> None:
     ax.legend(fontsize=7, loc="lower left")
 
 
-def main() -> None:
+def draw_figure(figure: Figure, result: Row) -> None:
     """Draw four panels."""
-    folder = Path(sys.argv[1]) if len(sys.argv) > 1 else HERE
-    matplotlib.rcParams["svg.hashsalt"] = "rul_metrics"
-    result = json.loads((folder / "result.json").read_text())
     cuts = result["cuts"]
-    figure = Figure(figsize=(10.5, 8.0), layout="constrained")
     axes = figure.subplots(2, 2)
     draw_accuracy(axes[0, 0], cuts)
     draw_score(axes[0, 1], cuts)
     draw_places(axes[1, 0], next(row for row in cuts if row["share"] == MAIN_CUT))
     draw_services(axes[1, 1], cuts, result["risk"])
-    figure.savefig(folder / "figure.svg", metadata={"Date": None})
-    if folder != HERE:
-        figure.savefig(folder / "figure.png", dpi=80)
 
 
 if __name__ == "__main__":
-    main()
+    write(__file__, draw_figure, (10.5, 8.0))

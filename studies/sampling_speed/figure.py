@@ -2,16 +2,11 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
-import matplotlib
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from studies.harness.study import Row, read_record
-
-HERE = Path(__file__).parent
-BLUE, ORANGE, GREEN, BLACK = "#0072b2", "#d55e00", "#009e73", "#000000"
+from studies.harness.figures import BLACK, BLUE, GREEN, ORANGE, write
+from studies.harness.study import Row
 
 
 def draw_rates(ax: Axes, rows: list[Row]) -> None:
@@ -55,16 +50,12 @@ def draw_ratios(ax: Axes, answer: Row) -> None:
     ax.set_title("What results take", fontsize=10)
 
 
-def main() -> None:
+def draw_figure(figure: Figure, answer: Row) -> None:
     """Draw the figure."""
-    answer = read_record(__file__)
-    matplotlib.rcParams["svg.hashsalt"] = "sampling_speed"
-    fig = Figure(figsize=(10.5, 4.0), layout="constrained")
-    left, right = fig.subplots(1, 2, width_ratios=[1.25, 1])
+    left, right = figure.subplots(1, 2, width_ratios=[1.25, 1])
     draw_rates(left, answer["epoch"]["programs"])
     draw_ratios(right, answer)
-    fig.savefig(HERE / "figure.svg", metadata={"Date": None})
 
 
 if __name__ == "__main__":
-    main()
+    write(__file__, draw_figure, (10.5, 4.0))

@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
-import matplotlib
 from matplotlib.figure import Figure
 
-from studies.common.ranks import BLUE, COLOURS, ORANGE, draw_ecdf, draw_histogram
-from studies.harness.study import Row, read_record
+from studies.common.ranks import draw_ecdf, draw_histogram
+from studies.harness.figures import BLUE, COLOURS, ORANGE, write
+from studies.harness.study import Row
 
-HERE = Path(__file__).parent
 WORDS = {"guide_preload": "preload", "mount_stiffness": "mount"}
 
 
@@ -21,12 +18,9 @@ def short(name: str) -> str:
     return name
 
 
-def main() -> None:
+def draw_figure(figure: Figure, result: Row) -> None:
     """Draw histograms above, distributions below."""
-    matplotlib.rcParams["svg.hashsalt"] = "sbc_epoch"
-    result = read_record(__file__)
     ranks: dict[str, Row] = result["ranks"]
-    figure = Figure(figsize=(11.0, 6.5), layout="constrained")
     upper, lower = figure.subfigures(2, 1, height_ratios=[1.0, 1.35])
     axes = iter(upper.subplots(1, 6, sharey=True))
     for kind, colour in (
@@ -47,7 +41,6 @@ def main() -> None:
     )
     kinds = ("covariance of the drifts halved", "all covariances halved", "map taken as exact")
     draw_ecdf(controls, joined(ranks, kinds), result["bands"], "Controls", COLOURS)
-    figure.savefig(HERE / "figure.svg", metadata={"Date": None})
 
 
 def joined(ranks: dict[str, Row], kinds: tuple[str, ...]) -> Row:
@@ -60,4 +53,4 @@ def joined(ranks: dict[str, Row], kinds: tuple[str, ...]) -> Row:
 
 
 if __name__ == "__main__":
-    main()
+    write(__file__, draw_figure, (11.0, 6.5))

@@ -2,24 +2,18 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
-import matplotlib
 from matplotlib.figure import Figure
 
-from studies.common.ranks import COLOURS, draw_ecdf, draw_histogram
-from studies.harness.study import Row, read_record
+from studies.common.ranks import draw_ecdf, draw_histogram
+from studies.harness.figures import COLOURS, write
+from studies.harness.study import Row
 
-HERE = Path(__file__).parent
 SHOWN = ("preload now", "mount now", "remaining, first of both")
 
 
-def main() -> None:
+def draw_figure(figure: Figure, result: Row) -> None:
     """Draw histograms on the left, distributions on the right."""
-    matplotlib.rcParams["svg.hashsalt"] = "sbc_life"
-    result = read_record(__file__)
     ranks: dict[str, Row] = result["ranks"]
-    figure = Figure(figsize=(11.0, 8.0), layout="constrained")
     left, right = figure.subfigures(1, 2, width_ratios=[1.0, 1.25])
     axes = left.subplots(3, 3, sharex=True, sharey=True)
     axes[2, 2].set_visible(False)
@@ -37,8 +31,7 @@ def main() -> None:
     ):
         rows = {name: ranks[kind][name] for name in SHOWN}
         draw_ecdf(ax, rows, result["bands"], f"{kind}, {rows[SHOWN[0]]['n']:,} lives", COLOURS)
-    figure.savefig(HERE / "figure.svg", metadata={"Date": None})
 
 
 if __name__ == "__main__":
-    main()
+    write(__file__, draw_figure, (11.0, 8.0))

@@ -2,25 +2,22 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
-import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter, StrMethodFormatter
 
-from studies.harness.study import Row, read_record
+from studies.harness.figures import BLUE, GREEN, ORANGE, write
+from studies.harness.study import Row
 
-HERE = Path(__file__).parent
 SENSORS = {
-    "delta_e": ("following error", 1e6, "µm/A", "#0072b2"),
-    "acc_pitch": ("vertical acceleration", 1.0, "m/s²/A", "#d55e00"),
+    "delta_e": ("following error", 1e6, "µm/A", BLUE),
+    "acc_pitch": ("vertical acceleration", 1.0, "m/s²/A", ORANGE),
 }
 METHODS = {
     "frf": ("FRF", "#000000", "o"),
-    "delta_e": ("following error", "#0072b2", "s"),
-    "accelerometers": ("accelerometers", "#d55e00", "^"),
+    "delta_e": ("following error", BLUE, "s"),
+    "accelerometers": ("accelerometers", ORANGE, "^"),
     "frf_worn": ("FRF at 95 % preload (control)", "#999999", "x"),
 }
 STAGE, MODES = "lms-y", ("roll", "pitch", "yaw")
@@ -70,7 +67,7 @@ def draw_mode(ax: Axes, name: str, mode: Row, rows: list[Row]) -> None:
             edge = np.sign(by) * 0.97 * reach
             ax.annotate(f"{by:+.1f}", (at, edge), ha="center", va="top" if by > 0 else "bottom",
                         fontsize=6, color=colour, rotation=90)  # fmt: skip
-    ax.axhline(0.0, lw=1, color="#009e73")
+    ax.axhline(0.0, lw=1, color=GREEN)
     ax.set_ylim(-reach, reach)
     ax.set_title(f"{name}, {mode['truth_hz']:.2f} Hz: {mode['verdict']}", fontsize=10)
     ax.set_xlabel("seed")
@@ -78,11 +75,8 @@ def draw_mode(ax: Axes, name: str, mode: Row, rows: list[Row]) -> None:
     ax.grid(alpha=0.25)
 
 
-def main() -> None:
+def draw_figure(figure: Figure, result: Row) -> None:
     """Draw responses above, one panel per mode below."""
-    matplotlib.rcParams["svg.hashsalt"] = "three_methods"
-    result = read_record(__file__)
-    figure = Figure(figsize=(11.0, 6.6), layout="constrained")
     axes = figure.subplots(2, 3)
     draw_response([axes[0, 0], axes[0, 1]], axes[0, 2], result["example"])
     rows = [row for row in result["rows"] if row["stage"] == STAGE]
@@ -91,8 +85,7 @@ def main() -> None:
     axes[1, 0].set_ylabel("frequency less eigenvalue in Hz")
     handles, labels = axes[1, 1].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=4, frameon=False)
-    figure.savefig(HERE / "figure.svg", metadata={"Date": None})
 
 
 if __name__ == "__main__":
-    main()
+    write(__file__, draw_figure, (11.0, 6.6))

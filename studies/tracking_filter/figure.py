@@ -2,16 +2,11 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
-import matplotlib
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from studies.harness.study import Row, read_record
-
-HERE = Path(__file__).parent
-BLUE, ORANGE, GREEN, BLACK = "#0072b2", "#d55e00", "#009e73", "#000000"
+from studies.harness.figures import BLACK, BLUE, GREEN, ORANGE, write
+from studies.harness.study import Row
 
 
 def draw_sums(ax: Axes, known: Row) -> None:
@@ -66,12 +61,9 @@ def draw_times(ax: Axes, speed: Row) -> None:
     ax.set_title(f"{speed['epochs']:,} epochs of {speed['modes']} modes", fontsize=10)
 
 
-def main() -> None:
+def draw_figure(figure: Figure, result: Row) -> None:
     """Draw four panels."""
-    matplotlib.rcParams["svg.hashsalt"] = "tracking_filter"
-    result = read_record(__file__)
     average, sources = result["averaged"], result["two_sources"]
-    figure = Figure(figsize=(11.0, 6.5), layout="constrained")
     axes = figure.subplots(2, 2)
     draw_sums(axes[0, 0], result["known_setting"])
     rows = {f"{name}, quantiles": levels for name, levels in average["mixture"].items()}
@@ -86,8 +78,7 @@ def main() -> None:
     rows = {label: sources[name]["coverage"] for name, label in names.items()}
     draw_coverage(axes[1, 0], rows, f"Drift by two sources, {sources['lives']:,} lives")
     draw_times(axes[1, 1], result["speed"])
-    figure.savefig(HERE / "figure.svg", metadata={"Date": None})
 
 
 if __name__ == "__main__":
-    main()
+    write(__file__, draw_figure, (11.0, 6.5))

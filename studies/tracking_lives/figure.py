@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-import json
-from pathlib import Path
 from typing import Any
 
-import matplotlib
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from studies.harness.figures import BLACK, BLUE, GREEN, ORANGE, write
 from studies.harness.study import Row, read_record
 
-HERE = Path(__file__).parent
-BLUE, ORANGE, GREEN, BLACK = "#0072b2", "#d55e00", "#009e73", "#000000"
 _LEAST_RATE = 1e-3
 _WHO = {
     "bound_knows": ("bound, all known", BLACK),
@@ -126,20 +122,15 @@ def draw_events(ax: Axes, rows: list[Row]) -> None:
     ax.grid(axis="x", alpha=0.25)
 
 
-def main() -> None:
+def draw_figure(figure: Figure, result: Row) -> None:
     """Draw."""
-    matplotlib.rcParams |= {"svg.hashsalt": "lmshealth", "font.size": 8}
-    result = read_record(__file__)
-    kept = HERE / "raw.json"
-    raw = json.loads(kept.read_text(encoding="utf-8")) if kept.exists() else {"lives": []}
-    figure = Figure(figsize=(11, 9), layout="constrained")
+    raw = read_record(__file__, "raw")
     axes = figure.subplots(2, 2, height_ratios=(2.2, 1))
     draw_coverage(axes[0, 0], result, raw)
     draw_alarms(axes[0, 1], result, raw)
     draw_delays(axes[1, 0], result["power"]["delays"])
     draw_events(axes[1, 1], result["lives"])
-    figure.savefig(HERE / "figure.svg", metadata={"Date": None})
 
 
 if __name__ == "__main__":
-    main()
+    write(__file__, draw_figure, (11, 9), font=8)
