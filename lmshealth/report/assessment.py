@@ -1,55 +1,61 @@
-"""Everything that is said about a stage, in one noun."""
+"""Results of one machine (`Assessment`), and their summary in a few numbers (`Summary`)."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from datetime import date, datetime
+from typing import Literal
 
 import numpy as np
 
 from lmshealth.health.results import Health
-from lmshealth.health.verdict import Verdict, undeclared_events
+from lmshealth.health.verdict import Verdict, degraded_words, undeclared_events
 from lmshealth.io.log import Refusal
 from lmshealth.prognosis.fleet_prior import FleetPrior, MachineEvidence
-from lmshealth.prognosis.maintenance_decision import Service, decide
-from lmshealth.prognosis.results import Prognosis
+from lmshealth.prognosis.maintenance_decision import Service, day_after, decide, remaining_days
+from lmshealth.prognosis.results import LawWeight, Prognosis
+from lmshealth.report import constants
+from lmshealth.report.text import quantiles, spell
 from lmshealth.signal.waterfall import Waterfall
-from lmshealth.stage.description import Stage
+from lmshealth.stage.description import ParameterSpec, Stage
 from lmshealth.tracking.history import History
 from lmshealth.tracking.track import Track
+
+State = Literal["good", "bad", "open"]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Assessment:
-    """All results of one stage, as far as the data carried them.
+    """All results of one machine, as far as its data carry them.
 
     Attributes
     ----------
     stage : Stage
-        The description the logs were read with.
+        Description that the logs were analysed with.
     history : History
         Modal estimates of all logs.
     digests : tuple of str
         SHA-256 of each log of the history.
     track : Track or None
-        None when no log gave a tracked mode.
+        None without an estimate of a tracked mode.
     health : Health or None
-        None when there is no health parameter, or too few logs.
+        None without a health parameter, or with too few logs.
     prognosis : Prognosis or None
-        None when there is no health, or no limit.
+        None without health, or without a limit.
     judgement : Verdict
         The verdict.
     refused : tuple of Refusal
-        Everything of this stage that was not analysed.
+        Everything of this machine that was not analysed.
     notes : tuple of str
-        What the reader must know beside the numbers, one sentence each.
+        What the reader must take into account, one sentence each.
     seed : int
-        Of all random streams.
+        Seed of all random streams.
     waterfall : Waterfall or None
-        Spectra of the logs of the history; None where no log shows the band of its modes.
+        Spectra of the logs of the history; None when no log covers the band of the modes.
     evidence : MachineEvidence or None
-        What the machine teaches others of its description; None without a posterior of its life.
+        Evidence for the fleet prior; None without a posterior of the life.
     fleet : FleetPrior or None
-        The prior that others have taught it; None where the prognosis rests on the description's.
+        Fleet prior of the prognosis; None when it rests on the prior of the description.
     """
 
     stage: Stage
@@ -67,19 +73,27 @@ class Assessment:
     fleet: FleetPrior | None = None
 
     def service(self) -> Service:
-        """Choose the day of the service as the description asks."""
+        """Choose the day of the service by the rule of the description."""
         return decide(self.prognosis, self.stage.description.decision)
 
     @property
     def alarmed(self) -> tuple[str, ...]:
-        """The modes that raised an alarm since the baseline, where no verdict says why."""
+        """Modes with an alarm since the baseline, when no verdict explains it."""
         if self.judgement.verdict != "not-enough-data":
             return ()
         alarms = undeclared_events(self.track, self.history.baseline, "alarm")
         return tuple(dict.fromkeys(event.mode for event in alarms))
 
+    @property
+    def latest_health(self) -> Health | None:
+        """The health, if it has an epoch and a parameter."""
+        health = self.health
+        return health if health is not None and health.recorded_at and health.parameters else None
+
     def urgency(self, service: Service) -> tuple[int, float, float, str]:
-        """Give a key that sorts by risk: days until the service; unknown before safe."""
+        """Return a key that sorts by days until the service; machines without verdict come before
+        safe ones.
+        """
         identity, verdict = self.judgement.stage, self.judgement.verdict
         if verdict == "not-enough-data":
             return (0 if self.alarmed else 1), 0.0, 0.0, identity
@@ -88,3 +102,278 @@ class Assessment:
         days = service.wait
         group = 2 if verdict == "healthy" and np.isinf(days) else 0
         return group, days, float(self.prognosis.beyond_horizon()[-1]), identity
+
+
+@dataclass(frozen=True, slots=True)
+class ParameterHealth:
+    """A health parameter at the last epoch.
+
+    Attributes
+    ----------
+    name : str
+        Of the parameter.
+    determined : bool
+        Whether the data determine it; else its interval is mostly the prior.
+    converged : bool
+        Whether the sampler converged.
+    informed : float
+        Share of the prior variance that the data remove.
+    low, median, high : float
+        5, 50 and 95 % quantiles, as fractions of the baseline.
+    limit : float or None
+        As a fraction of the baseline.
+    below_limit : float
+        Probability of being below the limit; NaN without one.
+    baseline, unit : float, str
+        Baseline value with its unit; "" for a pure fraction.
+    """
+
+    name: str
+    determined: bool
+    converged: bool
+    informed: float
+    low: float
+    median: float
+    high: float
+    limit: float | None = None
+    below_limit: float = np.nan
+    baseline: float = 1.0
+    unit: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class LimitLife:
+    """Remaining life until one limit, quantiles at `constants.RUL_LEVELS`.
+
+    Attributes
+    ----------
+    parameter : str
+        Of the limit; ``any`` for the first limit reached.
+    limit : float
+        NaN for ``any``.
+    travel : tuple of float
+        In m, at least 0, infinite beyond the horizon.
+    days : tuple of float
+        Likewise in days.
+    dates : tuple of (date or None)
+        Days of the calendar; None beyond the horizon or the calendar.
+    already_past, beyond_horizon : float
+        Probabilities.
+    health : tuple of float
+        5, 50 and 95 % quantiles of the parameter now, by its laws; empty for ``any``.
+    """
+
+    parameter: str
+    limit: float
+    travel: tuple[float, ...]
+    days: tuple[float, ...]
+    dates: tuple[date | None, ...]
+    already_past: float
+    beyond_horizon: float
+    health: tuple[float, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Life:
+    """Remaining life of a machine in a few numbers.
+
+    Attributes
+    ----------
+    stage : str
+        Identity of the machine.
+    recorded_at : datetime
+        The last log.
+    travel, horizon : float
+        Odometer at the last log, and travel from there beyond which nothing is claimed, in m.
+    limits : tuple of LimitLife
+        One per limit, then any.
+    laws : tuple of LawWeight
+        Laws of each parameter with their posterior probability.
+    undetermined : tuple of str
+        Parameters with a limit that the modes do not determine: excluded.
+    """
+
+    stage: str
+    recorded_at: datetime
+    travel: float
+    horizon: float
+    limits: tuple[LimitLife, ...]
+    laws: tuple[LawWeight, ...]
+    undetermined: tuple[str, ...]
+
+    @property
+    def any(self) -> LimitLife:
+        """The life until any limit."""
+        return self.limits[-1]
+
+
+@dataclass(frozen=True, slots=True)
+class Summary:
+    """A machine as the fleet page and a terminal show it; small enough to keep for a whole fleet.
+
+    Attributes
+    ----------
+    file : str
+        Its page, in the folder of the fleet page.
+    identity : str
+        Of the machine.
+    urgency : tuple
+        Sort key, most urgent first.
+    last_log : date
+        Day of the last log.
+    state : str
+        ``good``, ``bad`` or ``open`` (no verdict).
+    headline : str
+        The verdict in words.
+    verdict, probability, why : str, float, str
+        As in `Verdict`.
+    health : tuple of ParameterHealth
+        One per health parameter; empty without any.
+    life : Life or None
+        The remaining life.
+    service : Service
+        When to service, and by which rule.
+    """
+
+    file: str
+    identity: str
+    urgency: tuple[int, float, float, str]
+    last_log: date
+    state: State
+    headline: str
+    verdict: str
+    probability: float
+    why: str
+    health: tuple[ParameterHealth, ...]
+    life: Life | None
+    service: Service
+
+
+def summarise(assessment: Assessment, service: Service, file: str = "") -> Summary:
+    """Summarise an assessment.
+
+    Parameters
+    ----------
+    assessment : Assessment
+        Of the machine.
+    service : Service
+        Result of `Assessment.service`, which takes time to compute.
+    file : str
+        Name of its page.
+    """
+    judgement = assessment.judgement
+    return Summary(
+        file=file,
+        identity=judgement.stage,
+        urgency=assessment.urgency(service),
+        last_log=judgement.recorded_at.date(),
+        state=_state(assessment),
+        headline=_headline(assessment),
+        verdict=judgement.verdict,
+        probability=judgement.probability,
+        why=judgement.why,
+        health=_parameters(assessment),
+        life=None if assessment.prognosis is None else summarise_life(assessment.prognosis),
+        service=service,
+    )
+
+
+def summarise_life(prognosis: Prognosis) -> Life:
+    """Summarise a prognosis: quantiles and probabilities of every limit, and of any."""
+    return Life(
+        stage=prognosis.stage,
+        recorded_at=prognosis.recorded_at,
+        travel=prognosis.travel,
+        horizon=prognosis.horizon,
+        limits=_limits(prognosis),
+        laws=prognosis.laws,
+        undetermined=prognosis.unidentifiable,
+    )
+
+
+def limit_of(spec: ParameterSpec | None) -> float | None:
+    """Return the limit of a parameter as a fraction of its baseline; None without one."""
+    return None if spec is None or spec.limit is None else spec.limit.below / spec.baseline
+
+
+def verdict_text(verdict: str, parameters: tuple[ParameterSpec, ...]) -> str:
+    """Return a verdict in words, with the parameters as the description names them."""
+    texts = {
+        "healthy": "healthy",
+        "not-enough-data": "not enough data for a verdict",
+        "step": "sudden change without a known cause",
+    }
+    lost = degraded_words(verdict)
+    names = [spell(spec.name) for spec in parameters if spec.word in lost]
+    return texts.get(verdict, f"loss of {' and '.join(names or map(spell, lost))}")
+
+
+def _state(assessment: Assessment) -> State:
+    if assessment.alarmed:
+        return "bad"
+    states: dict[str, State] = {"healthy": "good", "not-enough-data": "open"}
+    return states.get(assessment.judgement.verdict, "bad")
+
+
+def _headline(assessment: Assessment) -> str:
+    """Return the verdict in words, or the alarm when there is no verdict."""
+    verdict, parameters = assessment.judgement.verdict, assessment.stage.parameters
+    if assessment.alarmed:
+        return f"Alarm: unexplained change of {' and '.join(map(spell, assessment.alarmed))}"
+    if not parameters and verdict == "not-enough-data":
+        return "Modes tracked; no health parameter described"
+    text = verdict_text(verdict, parameters)
+    return text[0].upper() + text[1:]
+
+
+def _parameters(assessment: Assessment) -> tuple[ParameterHealth, ...]:
+    health = assessment.latest_health
+    if health is None:
+        return ()
+    specs = {spec.name: spec for spec in assessment.stage.parameters}
+    levels = health.latest(np.array(constants.LEVELS)).T.tolist()
+    return tuple(
+        _parameter(specs.get(name), health, k, *levels[k])
+        for k, name in enumerate(health.parameters)
+    )
+
+
+def _parameter(
+    spec: ParameterSpec | None, health: Health, column: int, low: float, median: float, high: float
+) -> ParameterHealth:
+    limit = limit_of(spec)
+    draws = health.samples[-1, :, column]
+    return ParameterHealth(
+        name=health.parameters[column],
+        determined=bool(health.informed_parameters()[column]),
+        converged=bool(health.converged[-1]),
+        informed=float(health.informed[-1, column]),
+        low=low,
+        median=median,
+        high=high,
+        limit=limit,
+        below_limit=np.nan if limit is None else float(np.mean(draws < limit)),
+        baseline=spec.baseline if spec else 1.0,
+        unit=spec.unit if spec else "",
+    )
+
+
+def _limits(prognosis: Prognosis) -> tuple[LimitLife, ...]:
+    past, beyond = prognosis.already_past(), prognosis.beyond_horizon()
+    travel, days = np.maximum(prognosis.censored(), 0), np.maximum(remaining_days(prognosis), 0)
+    found = []
+    for k, name in enumerate(prognosis.parameters):
+        wait = quantiles(days[:, k], constants.RUL_LEVELS)
+        found.append(
+            LimitLife(
+                parameter=name,
+                limit=float(prognosis.limits[k]),
+                travel=quantiles(travel[:, k], constants.RUL_LEVELS),
+                days=wait,
+                dates=tuple(day_after(prognosis, one) for one in wait),
+                already_past=float(past[k]),
+                beyond_horizon=float(beyond[k]),
+                health=() if name == "any" else quantiles(prognosis.health[:, k]),
+            )
+        )
+    return tuple(found)

@@ -1,4 +1,4 @@
-"""What changed on a machine from one report to the next."""
+"""Changes of a machine from one report to the next."""
 
 from __future__ import annotations
 
@@ -7,27 +7,35 @@ from datetime import date, datetime
 
 import numpy as np
 
-from lmshealth.health.verdict import degraded_words
 from lmshealth.prognosis.maintenance_decision import Service
-from lmshealth.report.assessment import Assessment
-from lmshealth.report.text import GAP, LEVELS, km, left, percent, quantiles, spell
-
-_WORDS = {"step": "a sudden change", "not-enough-data": "not enough data"}
+from lmshealth.report.assessment import Assessment, verdict_text
+from lmshealth.report.constants import LEVELS
+from lmshealth.report.text import (
+    GAP,
+    interval,
+    km,
+    percent,
+    probability,
+    quantiles,
+    spell,
+    travel_left,
+)
+from lmshealth.stage.description import ParameterSpec
 
 Interval = tuple[float, float, float]
-"""The 5, 50 and 95 % quantiles of something."""
+"""The 5, 50 and 95 % quantiles."""
 
 
 @dataclass(frozen=True, slots=True)
 class Reported:
-    """What a report said of a machine, in few numbers.
+    """State of a machine in a report, in a few numbers.
 
     Attributes
     ----------
     recorded_at : datetime
         The last log.
     baseline_at : datetime
-        The log that the fractions are of.
+        The log at the baseline.
     description : str
         Digest of the stage description.
     n_logs : int
@@ -37,15 +45,15 @@ class Reported:
     verdict : str
         As in ``verdict.csv``.
     probability : float
-        Of that word; NaN for ``not-enough-data``.
+        Of the verdict; NaN for ``not-enough-data``.
     health : dict of str to tuple of float
-        Quantiles of each parameter that the logs tell, as fractions of the baseline.
+        Quantiles of each parameter that the data determine, as fractions of the baseline.
     remaining : tuple of float or None
-        Quantiles of the remaining travel until any limit in m, infinite past the horizon.
+        Quantiles of the remaining travel until any limit in m, infinite beyond the horizon.
     horizon : float
-        Travel in m past which nothing is claimed.
+        Travel in m beyond which nothing is claimed.
     service_by : date or None
-        Last day for the service; None where none is asked for.
+        Last day for the service; None without a due service.
     """
 
     recorded_at: datetime
@@ -62,22 +70,22 @@ class Reported:
 
 
 def reported(assessment: Assessment, service: Service | None = None) -> Reported:
-    """Keep of an assessment what a later report compares itself with.
+    """Return what a later report compares itself with.
 
     Parameters
     ----------
     assessment : Assessment
-        Of the stage.
+        Of the machine.
     service : Service or None
-        What `Assessment.service` gives, where it is known: to decide it takes time.
+        Result of `Assessment.service` where it is known; it takes time to compute.
     """
     history, judgement = assessment.history, assessment.judgement
-    health, prognosis = assessment.health, assessment.prognosis
-    told: dict[str, Interval] = {}
-    if health is not None and health.recorded_at:
-        low, middle, high = health.latest(LEVELS)
+    health, prognosis = assessment.latest_health, assessment.prognosis
+    determined: dict[str, Interval] = {}
+    if health is not None:
+        low, middle, high = health.latest(np.array(LEVELS))
         for k in np.flatnonzero(health.informed_parameters()).tolist():
-            told[health.parameters[k]] = float(low[k]), float(middle[k]), float(high[k])
+            determined[health.parameters[k]] = float(low[k]), float(middle[k]), float(high[k])
     remaining: Interval | None = None
     if prognosis is not None:
         low, middle, high = quantiles(prognosis.censored()[:, -1])
@@ -90,29 +98,33 @@ def reported(assessment: Assessment, service: Service | None = None) -> Reported
         travel=float(history.travel[-1]) if history.logs else np.nan,
         verdict=judgement.verdict,
         probability=judgement.probability,
-        health=told,
+        health=determined,
         remaining=remaining,
         horizon=np.inf if prognosis is None else prognosis.horizon,
         service_by=(service or assessment.service()).by,
     )
 
 
-def changes(before: Reported, now: Reported) -> tuple[str, ...]:
-    """Say in sentences what changed since an earlier report.
+def changes(
+    before: Reported, now: Reported, parameters: tuple[ParameterSpec, ...]
+) -> tuple[str, ...]:
+    """Describe in sentences what changed since an earlier report.
 
     Parameters
     ----------
     before, now : Reported
-        The earlier report on a machine and the present one.
+        The earlier and the present report on a machine.
+    parameters : tuple of ParameterSpec
+        Of its description.
 
     Returns
     -------
     tuple of str
-        What keeps the two from being compared comes first.
+        Reasons why the reports cannot be compared come first.
     """
     return (
         *_caveats(before, now),
-        _verdict(before, now),
+        _verdict(before, now, parameters),
         *_health(before, now),
         *_life(before, now),
         *_service(before, now),
@@ -121,65 +133,55 @@ def changes(before: Reported, now: Reported) -> tuple[str, ...]:
 
 
 def _caveats(before: Reported, now: Reported) -> list[str]:
-    told = []
+    found = []
     if before.description != now.description:
-        told.append("The stage description is another one now: not all that differs is wear.")
+        found.append("The stage description has changed: not all differences are wear.")
     if before.baseline_at != now.baseline_at:
-        told.append(
-            f"The baseline is another one now, that of {_day(now.baseline_at)} and no longer that "
-            f"of {_day(before.baseline_at)}: percentages of then and now do not compare."
+        found.append(
+            f"The baseline has changed from {_day(before.baseline_at)} to "
+            f"{_day(now.baseline_at)}: percentages of the two reports cannot be compared."
         )
-    return told
+    return found
 
 
-def _verdict(before: Reported, now: Reported) -> str:
-    one, other = (_sure(report) for report in (before, now))
+def _verdict(before: Reported, now: Reported, parameters: tuple[ParameterSpec, ...]) -> str:
+    def text(report: Reported) -> str:
+        sure = f" ({probability(report.probability)})" if report.probability >= 0 else ""
+        return verdict_text(report.verdict, parameters) + sure
+
     if before.verdict != now.verdict:
-        return f"Verdict was {one}, now {other}."
-    return (
-        f"Verdict still {other}{'' if one == other else f', then {percent(before.probability)}'}."
+        return f"Verdict: {text(before)} → {text(now)}."
+    same = text(before) == text(now)
+    return f"Verdict: still {text(now)}" + (
+        "." if same else f", before {probability(before.probability)}."
     )
 
 
-def _sure(report: Reported) -> str:
-    sure = f" ({percent(report.probability)})" if report.probability >= 0 else ""
-    # A report keeps the words of its parameters, not their names.
-    names = [
-        "mount stiffness" if w == "mount" else spell(w) for w in degraded_words(report.verdict)
-    ]
-    lost = f"loss of {' and '.join(names)}" if names else report.verdict
-    return _WORDS.get(report.verdict, lost) + sure
-
-
 def _health(before: Reported, now: Reported) -> list[str]:
-    told = []
+    found = []
     for name in dict.fromkeys((*now.health, *before.health)):
-        then, own = before.health.get(name), now.health.get(name)
-        what = spell(name).capitalize()
-        if own is None and then is not None:
-            told.append(f"{what}: {_share(then)} then; these logs do not tell it any more.")
-        elif own is not None and then is None:
-            told.append(f"{what}: {_share(own)} ({_range(own)}); not told then.")
-        elif own is not None and then is not None:
-            told.append(f"{what}: {_share(then)} → {_share(own)} ({_range(own)}).")
-    return told
+        texts = [
+            percent(report.health[name][1], 0) if name in report.health else "not determined"
+            for report in (before, now)
+        ]
+        own = now.health.get(name)
+        spread = f" (90{GAP}%: {interval(own[0], own[2])})" if own else ""
+        found.append(f"{spell(name).capitalize()}: {' → '.join(texts)}{spread}.")
+    return found
 
 
 def _life(before: Reported, now: Reported) -> list[str]:
     if before.remaining is None and now.remaining is None:
         return []
     low, middle, high = (
-        [_distance(report, k) if report.remaining else "not known" for report in (before, now)]
+        [
+            travel_left(report.remaining[k], report.horizon) if report.remaining else "not known"
+            for report in (before, now)
+        ]
         for k in range(3)
     )
-    reach = f" (90 %: {low[1]} to {high[1]})" if now.remaining else ""
-    return [f"Remaining life, median: {_from_to(*middle)}{reach}."]
-
-
-def _distance(report: Reported, k: int) -> str:
-    assert report.remaining is not None
-    value = report.remaining[k]
-    return left(value, f"beyond {km(report.horizon)}", km(value))
+    spread = f" (90{GAP}%: {low[1]} to {high[1]})" if now.remaining else ""
+    return [f"Remaining life, median: {_from_to(*middle)}{spread}."]
 
 
 def _service(before: Reported, now: Reported) -> list[str]:
@@ -194,24 +196,13 @@ def _service(before: Reported, now: Reported) -> list[str]:
 
 
 def _logs(before: Reported, now: Reported) -> str:
-    more = now.n_logs - before.n_logs
+    more, travel = now.n_logs - before.n_logs, now.travel - before.travel
     logs = f"{abs(more)} log{_s(more)} {'more' if more > 0 else 'fewer'}" if more else ""
-    further = now.travel - before.travel
-    if more > 0 and further > 0:
-        return f"{more} log{_s(more)} and {km(further)} more."
-    return f"{logs or 'As many logs as then'}{f', {km(further)} further' if further > 0 else ''}."
+    return (logs or "Same number of logs") + (f", {km(travel)} further." if travel > 0 else ".")
 
 
-def _from_to(one: str, other: str) -> str:
-    return f"still {other}" if one == other else f"{one} → {other}"
-
-
-def _share(interval: Interval) -> str:
-    return f"{100 * interval[1]:.0f}{GAP}%"
-
-
-def _range(interval: Interval) -> str:
-    return f"90{GAP}%: {100 * interval[0]:.0f} to {100 * interval[2]:.0f}{GAP}%"
+def _from_to(before: str, now: str) -> str:
+    return f"still {now}" if before == now else f"{before} → {now}"
 
 
 def _day(moment: datetime) -> str:

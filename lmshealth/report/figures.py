@@ -1,13 +1,9 @@
-"""Pictures of results: every function takes the matplotlib Axes to draw on, then results.
+"""Figures of tracks, health and remaining life.
 
-They return the Axes. Names of modes and parameters are those of the results; travel is shown in
-km, health in % of baseline. Colours come from the palette of Okabe and Ito, and nothing is told
-by colour alone. `svg` turns one of them into an inline picture, in which `hints` show values where
-the pointer rests.
-
-Pictures as light SVG: what no eye sees is left out, and letters are drawn once for a page.
-
-Pictures of tracks: frequencies, dampings, what happened, and whether the filter is believed.
+Every function takes matplotlib Axes, then results, and returns the Axes. Travel is shown in km,
+health in % of baseline. Colours are from the palette of Okabe and Ito; no information is in the
+colour alone. `svg` converts a figure to an inline SVG, in which `hints` show values under the
+pointer.
 """
 
 from __future__ import annotations
@@ -15,27 +11,27 @@ from __future__ import annotations
 import re
 import warnings
 from collections.abc import Callable, Sequence
+from itertools import cycle
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from scipy.special import gammaincinv
 
 from lmshealth._arrays import FloatArray
 from lmshealth.health.results import Health
 from lmshealth.prognosis.maintenance_decision import Service
 from lmshealth.prognosis.results import Prognosis
-from lmshealth.report.svg import lean
-from lmshealth.report.text import GAP, km, moment, spell, whole_km
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-from itertools import cycle
-
-from lmshealth.report.text import covariate, signed
+from lmshealth.report import constants
+from lmshealth.report.svg import compact
+from lmshealth.report.text import GAP, covariate, km, moment, quantiles, signed, spell, whole_km
 from lmshealth.signal.spectral_lines import Line
 from lmshealth.signal.waterfall import Waterfall
 from lmshealth.tracking.covariate_effects import CovariateEffect
 from lmshealth.tracking.history import History
 from lmshealth.tracking.track import Track
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 INK, MUTED, GRID, PAPER = "#1f2933", "#5f6b7a", "#d9dee5", "#fefefe"
 BLUE, RED, GREEN = "#0072b2", "#c44e00", "#007a5a"
@@ -69,9 +65,7 @@ _STYLE: dict[str, Any] = {
 _KM = 1000.0
 # Of what is drawn as an image; more than screens show, so that a page can be zoomed and printed.
 _DPI = 200
-# A picture carries no more hints than that: what is denser no pointer can tell apart.
-_MOST_HINTS = 300
-_LEVELS = np.array([0.05, 0.25, 0.5, 0.75, 0.95])
+_LEVELS = np.array(constants.BAND_LEVELS)
 _GRID_POINTS = 72
 SIZE = (4.8, 2.8)  # of a picture in inches
 ROOM = 72  # characters that fit on a line of its legend
@@ -112,7 +106,7 @@ def svg(draw: Callable[[Axes], object], *, salt: str, size: tuple[float, float] 
         canvas.print_svg(target, metadata=nothing)
     text = _LINK.sub(r'<g class="hint" fill-opacity="0.004"><title>\1</title>', target.getvalue())
     text = text.replace("</a>", "</g>").replace(_CLEAR, "")
-    text = lean(text[text.index("<svg") :])
+    text = compact(text[text.index("<svg") :])
     # Glyphs and groups carry the same identifiers in every file: give each picture its own.
     text = re.sub(r'(\sid="|href="#|url\(#)', rf"\g<1>{salt}-", text)
     for colour, name in _NAMED.items():
@@ -137,15 +131,15 @@ def hints(ax: Axes, x: FloatArray, y: FloatArray, texts: Sequence[str]) -> None:
     texts : sequence of str
         What is shown at each point; line breaks are kept.
     """
-    some = few(len(texts))
+    some = _thinned(len(texts))
     # Opaque by one part in 255: what is not drawn at all feels no pointer.
     discs = ax.scatter(x[some], y[some], s=80, color=INK, alpha=1 / 255, lw=0, zorder=9)
     discs.set_urls(list(texts[some]))
 
 
-def few(n: int) -> slice:
+def _thinned(n: int) -> slice:
     """Choose as many of n things, evenly, as may have hints."""
-    return slice(None, None, -(-n // _MOST_HINTS) or 1)
+    return slice(None, None, -(-n // constants.HINTS) or 1)
 
 
 def plot_posterior(ax: Axes, health: Health, parameters: tuple[str, ...]) -> Axes:
@@ -223,7 +217,7 @@ def plot_life(
     _levels(ax, limit)
     ax.axvline(now, color=INK, lw=1.2, ls=":", label="now")
     end = now + prognosis.horizon / _KM
-    low, middle, high = _quantiles(prognosis.remaining[:, column], (0.05, 0.5, 0.95)) / _KM
+    low, middle, high = np.array(quantiles(prognosis.remaining[:, column])) / _KM
     if np.isfinite(low) and low < prognosis.horizon / _KM:
         _passage(ax, now, np.array([low, middle, high]), 100 * limit)
     right = min(end, now + max(1.3 * high, 0.25 * now)) if np.isfinite(high) else end
@@ -249,7 +243,7 @@ def plot_survival(ax: Axes, prognosis: Prognosis, *, service: Service | None = N
     With a service the risk that its day keeps is drawn: the accepted one, or that of least costs.
     """
     horizon = prognosis.horizon / _KM
-    last = _quantiles(prognosis.remaining[:, -1], (0.99,))[0] / _KM
+    last = quantiles(prognosis.remaining[:, -1], (0.99,))[0] / _KM
     end = min(horizon, max(1.2 * last, horizon / 50)) if np.isfinite(last) else horizon
     ahead = np.linspace(0, end, 400)
     ordered = np.sort(prognosis.remaining / _KM, axis=0)
@@ -401,11 +395,6 @@ def _density(ax: Axes, draws: FloatArray) -> None:
     ax.axvline(100, color=GREEN, lw=1.3, ls=(0, (5, 3)), label="baseline")
     ax.set_ylim(0, 1.06 * density.max())
     ax.set_ylabel("probability density per %")
-
-
-def _quantiles(values: FloatArray, levels: tuple[float, ...]) -> FloatArray:
-    """Quantiles of draws that may be infinite: always one of the draws."""
-    return np.asarray(np.quantile(values, levels, method="inverted_cdf"))
 
 
 def odometer(ax: Axes, *, room: int = ROOM) -> Axes:
@@ -576,8 +565,6 @@ def plot_influence(ax: Axes, influence: CovariateEffect, history: History) -> Ax
 
 def chi_square_band(dof: FloatArray) -> FloatArray:
     """Bounds that hold a chi-square variable with 95 %, shape ``(2, ...)``."""
-    from scipy.special import gammaincinv
-
     return np.stack([2 * gammaincinv(dof / 2, level) for level in (0.025, 0.975)])
 
 
@@ -656,7 +643,7 @@ def _column_hints(ax: Axes, sides: FloatArray, waterfall: Waterfall, history: Hi
     from matplotlib.collections import PolyCollection
 
     low, high = waterfall.edges[[0, -1]]
-    some = few(len(sides))
+    some = _thinned(len(sides))
     corners = [[(a, low), (a, high), (b, high), (b, low)] for a, b in sides[some]]
     columns = PolyCollection(corners, facecolor=INK, alpha=1 / 255, lw=0)
     texts = [title(history, k) + _found(history, k) for k in range(len(sides))]

@@ -1,4 +1,4 @@
-"""The front page: all stages of a fleet, worst first, from rows that are light enough to keep."""
+"""Fleet page ``index.html``: all machines, most urgent first, from their summaries."""
 
 from __future__ import annotations
 
@@ -13,83 +13,20 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from lmshealth._files import write_text
 from lmshealth.io.log import Refusal
-from lmshealth.prognosis.maintenance_decision import Service
-from lmshealth.report.assessment import Assessment
-from lmshealth.report.brief import Brief, brief
-from lmshealth.report.healthfacts import (
-    Gauge,
-    Life,
-    Tone,
-    gauges,
-    how_sure,
-    lives,
-    tone,
-    verdict_words,
-)
+from lmshealth.report import constants
+from lmshealth.report.assessment import Summary
 from lmshealth.report.html import render
-from lmshealth.report.text import quantiles
 
-# What Windows takes for a device, whatever its ending.
+# Names of devices on Windows, with any file name extension.
 _DEVICES = re.compile(r"con|prn|aux|nul|(com|lpt)[0-9\u00b9\u00b2\u00b3]", re.IGNORECASE)
-_TOP = 1.5  # length of all gauges, as a fraction of baseline
-# More stages than that can be searched, filtered and sorted, and have a calendar.
-_MANY = 10
-# Of logs without a stage, so many are shown of each reason; so few of all are not folded away.
-_MOST_REFUSED, _MOST_OPEN = 50, 12
-_MONTHS = 12
-
-
-@dataclass(frozen=True, slots=True)
-class Summary:
-    """A stage on the front page: texts and a few numbers, so that all of a fleet can be kept.
-
-    Attributes
-    ----------
-    file : str
-        Its page, beside the front page.
-    identity : str
-        Of the machine.
-    urgency : tuple
-        Sorts rows, worst first.
-    last_log : date
-        Day of it.
-    tone : str
-        ``good``, ``bad`` or ``open``.
-    verdict, probability : str
-        In words; the probability is empty without one.
-    gauges : tuple of Gauge
-        Health now, all drawn in one length.
-    life : Life or None
-        What is left until any limit.
-    remaining : float
-        Its median in m, infinite past the horizon, NaN where nothing is known.
-    service : Service
-        When, and by what that was chosen.
-    brief : Brief
-        What a terminal says of it.
-    """
-
-    file: str
-    identity: str
-    urgency: tuple[int, float, float, str]
-    last_log: date
-    tone: Tone
-    verdict: str
-    probability: str
-    gauges: tuple[Gauge, ...]
-    life: Life | None
-    remaining: float
-    service: Service
-    brief: Brief
+_NAME_LENGTH = 60
 
 
 @dataclass(frozen=True, slots=True)
 class Month:
-    """How many services are due in a month; ``before`` is the day after it."""
+    """Number of services due in a month; ``before`` is the day after its last."""
 
     label: str
     year: str
@@ -97,47 +34,18 @@ class Month:
     count: int
 
 
-def summarise(assessment: Assessment, service: Service, file: str) -> Summary:
-    """Keep of an assessment what the front page says of it.
-
-    Parameters
-    ----------
-    assessment : Assessment
-        Of the stage.
-    service : Service
-        What `Assessment.service` gives: to decide it takes time.
-    file : str
-        Name of its page.
-    """
-    judgement, prognosis = assessment.judgement, assessment.prognosis
-    return Summary(
-        file=file,
-        identity=judgement.stage,
-        urgency=assessment.urgency(service),
-        last_log=judgement.recorded_at.date(),
-        tone=tone(assessment),
-        verdict=verdict_words(assessment),
-        probability=how_sure(assessment),
-        gauges=gauges(assessment, _TOP),
-        life=next(reversed(lives(prognosis)), None),
-        remaining=np.nan if prognosis is None else quantiles(prognosis.censored()[:, -1])[1],
-        service=service,
-        brief=brief(assessment, service),
-    )
-
-
 def file_names(identities: Iterable[str]) -> dict[str, str]:
-    """Name the pages of stages after them: safe on every file system, never twice the same.
+    """Name the pages of machines: valid on every file system and unique regardless of case.
 
     Returns
     -------
     dict of str to str
-        The file of each identity; the same whatever their order.
+        File name by identity, independent of their order.
     """
     taken = {"index"}
     names = {}
     for identity in sorted(set(identities)):
-        stem = re.sub(r"[^\w.-]+", "-", identity).strip("-._")[:60] or "stage"
+        stem = re.sub(r"[^\w.-]+", "-", identity).strip("-._")[:_NAME_LENGTH] or "stage"
         if _DEVICES.fullmatch(stem.split(".")[0]):
             stem = f"stage-{stem}"
         name, count = stem, 1
@@ -149,46 +57,46 @@ def file_names(identities: Iterable[str]) -> dict[str, str]:
     return names
 
 
-def by_urgency(rows: Iterable[Summary]) -> list[Summary]:
-    """Sort rows by risk."""
-    return sorted(rows, key=lambda row: row.urgency)
+def by_urgency(summaries: Iterable[Summary]) -> list[Summary]:
+    """Sort machines, most urgent first."""
+    return sorted(summaries, key=lambda one: one.urgency)
 
 
 def write_index(
     folder: Path,
-    rows: Iterable[Summary],
+    summaries: Iterable[Summary],
     refused: Sequence[Refusal],
     *,
     generated: datetime | None = None,
 ) -> Path:
-    """Write ``index.html``; the same rows give the same bytes, in any order.
+    """Write ``index.html``; its bytes do not depend on the order of the summaries.
 
     Parameters
     ----------
     folder : Path
-        Where the pages of the stages are.
-    rows : iterable of Summary
-        One per stage.
+        Folder of the machines' pages.
+    summaries : iterable of Summary
+        One per machine.
     refused : sequence of Refusal
-        Logs that belong to no stage.
+        Logs that belong to no machine.
     generated : datetime or None
-        Moment to print on the page; nothing is printed for None.
+        Time to print on the page; none is printed for None.
     """
-    ranked = by_urgency(rows)
-    script = _script() if len(ranked) > _MANY else ""
-    newest = max((row.last_log for row in ranked), default=date.min)
+    ranked = by_urgency(summaries)
+    script = _script() if len(ranked) > constants.MANY_MACHINES else ""
+    newest = max((one.last_log for one in ranked), default=date.min)
     text = render(
         "index.html.j2",
         generated,
         rows=ranked,
-        parameters=list(dict.fromkeys(gauge.name for row in ranked for gauge in row.gauges)),
-        tones=Counter(row.tone for row in ranked),
-        kinds=Counter(row.service.kind for row in ranked),
-        base=round(100 / _TOP, 2),
+        parameters=list(dict.fromkeys(own.name for one in ranked for own in one.health)),
+        states=Counter(one.state for one in ranked),
+        kinds=Counter(one.service.kind for one in ranked),
+        bar=constants.FLEET_BAR,
         months=_months(ranked, newest) if script else [],
         newest=newest,
         refused=list(_by_reason(refused)),
-        fold=len(refused) > _MOST_OPEN,
+        fold=len(refused) > constants.REFUSED_UNFOLDED,
         script=script,
         script_hash=b64encode(hashlib.sha256(script.encode()).digest()).decode() if script else "",
     )
@@ -198,20 +106,20 @@ def write_index(
 
 
 def _script() -> str:
-    """Read what makes a long table handy; the page names its digest, and nothing else may run."""
+    """Return the script that filters and sorts; the page allows no other, by its digest."""
     path = resources.files("lmshealth") / "report" / "templates" / "index.js"
     return path.read_text(encoding="utf-8")
 
 
-def _months(rows: Sequence[Summary], newest: date) -> list[Month]:
-    """Count the services that are due now, and in each month of a year; none where none is."""
-    due = [row.service.by for row in rows if row.service.by is not None]
-    newest = min(newest, date.max - timedelta(days=31 * (_MONTHS + 1)))
-    # What is due on the day of the newest log, or was before it, is due now.
+def _months(summaries: Sequence[Summary], newest: date) -> list[Month]:
+    """Count the services due now and in each month of a year; empty without any."""
+    due = [one.service.by for one in summaries if one.service.by is not None]
+    newest = min(newest, date.max - timedelta(days=31 * (constants.CALENDAR_MONTHS + 1)))
+    # Due now: everything due on or before the day of the newest log.
     counts = Counter(day.replace(day=1) for day in due if day > newest)
     months = [Month("now", "", newest + timedelta(days=1), sum(day <= newest for day in due))]
     begin = newest.replace(day=1)
-    for k in range(_MONTHS):
+    for k in range(constants.CALENDAR_MONTHS):
         year = f"{begin:%Y}" if k == 0 or begin.month == 1 else ""
         after = (begin + timedelta(days=31)).replace(day=1)
         months.append(Month(f"{begin:%b}", year, after, counts[begin]))
@@ -220,7 +128,7 @@ def _months(rows: Sequence[Summary], newest: date) -> list[Month]:
 
 
 def _by_reason(refused: Sequence[Refusal]) -> Iterator[dict[str, Any]]:
-    """Put logs together that were refused for one reason, the most common reason first."""
+    """Group refused logs by reason, the most frequent reason first."""
     for reason, count in Counter(item.reason for item in refused).most_common():
-        shown = [item for item in refused if item.reason == reason][:_MOST_REFUSED]
+        shown = [item for item in refused if item.reason == reason][: constants.REFUSED_SHOWN]
         yield {"reason": reason, "count": count, "shown": shown}

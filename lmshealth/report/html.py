@@ -1,4 +1,4 @@
-"""Markup of the pages: templates, filled in with everything escaped."""
+"""Rendering of the page templates (Jinja2, everything escaped)."""
 
 from __future__ import annotations
 
@@ -7,29 +7,40 @@ from functools import cache
 from importlib import metadata
 from typing import Any
 
-from lmshealth.report.text import km, moment, spell, whole_km
+from lmshealth.report import text
+
+_FILTERS = (
+    *(text.change, text.fixed, text.interval, text.km, text.law, text.moment, text.number),
+    *(text.percent, text.probability, text.probability_range, text.signed, text.spell),
+    *(text.time_left, text.travel_left, text.whole_km),
+)
 
 
 def render(template: str, generated: datetime | None = None, /, **content: Any) -> str:
-    """Fill in a template of a page.
+    """Render a page.
 
     Parameters
     ----------
     template : str
-        Its file in ``templates/``.
+        File name in ``templates/``.
     generated : datetime or None
-        Moment to print on the page; nothing is printed for None.
+        Time to print on the page; none is printed for None.
     content : Any
-        What the template names; a name that it lacks is an error.
+        Values of the template's names; a missing name is an error.
     """
     version = metadata.version("lmshealth")
     page = _environment().get_template(template)
     return str(page.render(content, generated=generated, version=version))
 
 
+def place(value: float, length: float) -> float:
+    """Return the position of a value on a bar, in % of the bar's length."""
+    return round(100 * min(max(value, 0.0) / length, 1.0), 2)
+
+
 @cache
 def _environment() -> Any:
-    """Set up the templates, once per process: to read them costs more than to fill them in."""
+    """Load the templates once per process: parsing takes longer than rendering."""
     import jinja2
 
     pages = jinja2.Environment(
@@ -39,5 +50,6 @@ def _environment() -> Any:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    pages.filters |= {"spell": spell, "moment": moment, "km": km, "whole_km": whole_km}
+    pages.filters |= {function.__name__: function for function in (*_FILTERS, place)}
+    pages.globals["covariate"] = text.covariate
     return pages

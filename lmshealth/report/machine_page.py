@@ -1,93 +1,54 @@
-"""Pages for people who decide: one self-contained HTML file per stage, each made alone.
+"""Page of one machine: a self-contained HTML file.
 
-This module prepares numbers, names and pictures; words and markup are in ``templates/``.
+This module collects results and figures; wording and markup are in ``templates/``.
 """
 
 from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from datetime import datetime
 from functools import partial
 from itertools import combinations
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from lmshealth._files import write_text
 from lmshealth.health.results import Health
 from lmshealth.io.log import Refusal
+from lmshealth.prognosis.fleet_prior import FleetPrior, LawPrior, Pace
+from lmshealth.prognosis.life_likelihood import expected_scatter, scatter_prior
 from lmshealth.prognosis.maintenance_decision import Service
 from lmshealth.prognosis.results import Prognosis
-from lmshealth.report import figures as plots
-from lmshealth.report.assessment import Assessment
+from lmshealth.report import constants, figures
+from lmshealth.report.assessment import Assessment, Summary, limit_of, summarise
 from lmshealth.report.changes import Reported, changes, reported
-from lmshealth.report.figures import (
-    plot_damping,
-    plot_frequencies,
-    plot_influence,
-    plot_nis,
-    plot_waterfall,
-)
-from lmshealth.report.fleet_page import (
-    Summary,
-    by_urgency,
-    file_names,
-    summarise,
-    write_index,
-)
-from lmshealth.report.fleetfacts import taught
-from lmshealth.report.healthfacts import (
-    first_limit,
-    gauges,
-    health_now,
-    how_sure,
-    limit_of,
-    lives,
-    service_words,
-    tone,
-    verdict_words,
-)
 from lmshealth.report.html import render
 from lmshealth.report.svg import share_letters
-from lmshealth.report.text import covariate, km, law_words, percent, spell
-from lmshealth.report.trackfacts import (
-    effect_row,
-    filter_health,
-    fit,
-    happened,
-    mode_rows,
-    mode_use,
-    other_effects,
-    surprise,
-    taken_out,
-    untouched,
-)
-from lmshealth.tracking.covariate_effects import (
-    CovariateEffect,
-    covariate_shifts,
-    find_covariate_effects,
-)
+from lmshealth.report.tables import track_rows
+from lmshealth.report.text import GAP, coarse, km, spell
+from lmshealth.stage.description import Stage
+from lmshealth.tracking.covariate_effects import CovariateEffect, covariate_shifts, find_covariate_effects
 from lmshealth.tracking.history import History
+from lmshealth.tracking.track import Effect, Event, Track
 
-_SIZES = {"waterfall": (4.8, 3.6), "influence": (3.8, 2.6)}  # in inches, unlike others
+_SIZES = {"waterfall": (4.8, 3.6), "influence": (3.8, 2.6)}  # in inches; others: figures.SIZE
 
 
 @dataclass(frozen=True, slots=True)
 class Page:
-    """The page of one stage.
+    """The page of a machine.
 
     Attributes
     ----------
     file : str
-        Its name.
+        Its file name.
     text : str
         HTML.
     summary : Summary
-        What the front page says of the stage.
+        The machine on the fleet page.
     """
 
     file: str
@@ -102,136 +63,223 @@ def make_page(
     before: Reported | None = None,
     generated: datetime | None = None,
 ) -> Page:
-    """Make the page of one stage; it needs no other one.
+    """Make the page of one machine.
 
     Parameters
     ----------
     assessment : Assessment
-        Of the stage.
+        Of the machine.
     file : str
         Name of the page, from `file_names`.
     before : Reported or None
-        What the last report on this stage said.
+        State of the machine in its previous report.
     generated : datetime or None
-        Moment to print on the page; nothing is printed for None.
+        Time to print on the page; none is printed for None.
     """
     service = assessment.service()
-    content = _first(assessment, service) | _evidence(assessment, service)
-    content |= _changes(assessment, service, before)
-    text = render("stage.html.j2", generated, **content)
-    return Page(file, text, summarise(assessment, service, file))
-
-
-def write_report(
-    folder: Path,
-    assessments: Iterable[Assessment],
-    refused: Sequence[Refusal],
-    *,
-    earlier: Mapping[str, Reported] | None = None,
-    generated: datetime | None = None,
-) -> list[Path]:
-    """Write one page per stage, and ``index.html``.
-
-    The same input gives the same bytes, in any order of the assessments.
-
-    Parameters
-    ----------
-    folder : Path
-        Where to write; made if it is not there.
-    assessments : iterable of Assessment
-        One per stage; only one at a time is held.
-    refused : sequence of Refusal
-        Logs that belong to no stage.
-    earlier : mapping of str to Reported, optional
-        By stage, what its last report said.
-    generated : datetime or None
-        Moment to print on the pages; nothing is printed for None.
-
-    Returns
-    -------
-    list of Path
-        The pages of the stages, worst first, then the index.
-    """
-    folder.mkdir(parents=True, exist_ok=True)
-    rows = []
-    for k, assessment in enumerate(assessments):
-        before = (earlier or {}).get(assessment.judgement.stage)
-        page = make_page(assessment, f"{k}.part", before=before, generated=generated)
-        write_text(folder / page.file, page.text)
-        rows.append(page.summary)
-    names = file_names(row.identity for row in rows)  # known only when all have been seen
-    named = [replace(row, file=names[row.identity]) for row in rows]
-    for row, final in zip(rows, named, strict=True):
-        (folder / row.file).replace(folder / final.file)
-    index = write_index(folder, named, refused, generated=generated)
-    return [*(folder / row.file for row in by_urgency(named)), index]
-
-
-def _first(assessment: Assessment, service: Service) -> dict[str, Any]:
-    """Collect what the first screen of a page says."""
-    return {
+    summary = summarise(assessment, service, file)
+    parameters = assessment.stage.parameters
+    content = {
         "assessment": assessment,
-        "identity": assessment.judgement.stage,
-        "verdict": verdict_words(assessment),
-        "tone": tone(assessment),
-        "probability": how_sure(assessment),
-        "gauges": gauges(assessment),
-        "lives": lives(assessment.prognosis),
-        "service": service_words(service),
-        "first_limit": first_limit(assessment.prognosis),
+        "summary": summary,
+        "bar": _bar_length(summary),
+        "first_limit": _first_limit(assessment.prognosis),
+        "before": before,
+        "news": () if before is None else changes(before, reported(assessment, service), parameters),
+        **_track_content(assessment),
+        **_health_content(assessment),
     }
+    influences = content["influences"]
+    content["letters"], content["picture"] = share_letters(
+        _pictures(assessment, service, influences)
+    )
+    return Page(file, render("stage.html.j2", generated, **content), summary)
 
 
-def _changes(assessment: Assessment, service: Service, before: Reported | None) -> dict[str, Any]:
-    """Say what is new since the last report."""
-    news = () if before is None else changes(before, reported(assessment, service))
-    return {"before": before, "news": news}
+def latest_modes(track: Track) -> list[dict[str, Any]]:
+    """Return rows of ``track.csv`` of the last epoch, with ``baseline_hz``; untracked modes last.
+
+    A mode without an estimate yet is left out.
+    """
+    return [
+        row | {"baseline_hz": row["frequency_hz"] * np.exp(-row["drift"])}
+        for row in track_rows(track, epochs=[len(track.logs) - 1])
+        if np.isfinite([row["frequency_hz"], row["drift"]]).all()
+    ]
 
 
-def _evidence(assessment: Assessment, service: Service) -> dict[str, Any]:
-    """Collect what the rest of a stage's page shows."""
-    track, prognosis, history = assessment.track, assessment.prognosis, assessment.history
-    health, stage = health_now(assessment), assessment.stage
-    influences = () if track is None else find_covariate_effects(history, track, stage)
-    letters, pictures = share_letters(_pictures(assessment, service, influences))
-    drift = np.zeros(1) if track is None else np.abs(np.expm1(track.drift[-1]))
-    return {
-        "health": health,
-        "modes": [] if track is None else list(mode_rows(track)),
+def chi_square_side(value: float, dof: float) -> dict[str, Any] | None:
+    """Compare χ² with its 95 % interval; None without degrees of freedom."""
+    if dof <= 0:
+        return None
+    low, high = figures.chi_square_band(np.array(dof, dtype=float)).tolist()
+    side = "above" if value > high else "below" if value < low else "inside"
+    return {"value": value, "dof": dof, "low": low, "high": high, "side": side}
+
+
+def _bar_length(summary: Summary) -> float:
+    """Return one length for all bars of a page, as a fraction of the baseline."""
+    highest = max((one.high for one in summary.health), default=1.0)
+    return float(np.clip(np.ceil(10 * highest + 0.5) / 10, 1.2, 2.0))
+
+
+def _first_limit(prognosis: Prognosis | None) -> tuple[str, float] | None:
+    """Return the parameter whose limit is most probably reached first, and its probability.
+
+    None with a single limit, or when no draw reaches one before the horizon.
+    """
+    if prognosis is None or len(prognosis.limits) < 3:
+        return None
+    parts = prognosis.censored()[:, :-1]
+    ending = np.isfinite(parts).any(axis=1)
+    if not ending.any():
+        return None
+    shares = np.bincount(parts[ending].argmin(axis=1), minlength=parts.shape[1]) / ending.sum()
+    k = int(shares.argmax())
+    return prognosis.parameters[k], float(shares[k])
+
+
+def _track_content(assessment: Assessment) -> dict[str, Any]:
+    """Collect what the page shows of modes, events, covariates and data quality."""
+    track, history, stage = assessment.track, assessment.history, assessment.stage
+    influences: tuple[CovariateEffect, ...] = ()
+    content: dict[str, Any] = dict.fromkeys(("consistency", "nis", "noise_scale", "widening"))
+    content |= {"modes": [], "events": [], "effects": [], "largest_drift": 0.0}
+    if track is not None:
+        influences = find_covariate_effects(history, track, stage)
+        content |= {
+            "modes": latest_modes(track),
+            "events": list(_events(track)),
+            "effects": list(_other_effects(track)),
+            "consistency": track.consistency(),
+            "nis": _nis(track),
+            "noise_scale": float(track.noise_scale[-1].max()),
+            "widening": float(track.widening[-1]),
+            "largest_drift": float(np.nanmax(np.abs(np.expm1(track.drift[-1])), initial=0.0)),
+        }
+    return content | {
         "seen": _seen(history),
-        "pairs": [] if health is None else _pairs(health),
-        "picture": pictures,
-        "letters": letters,
-        "taken_out": list(taken_out(influences)),
-        "untouched": untouched(history, stage),
-        "mode_use": list(mode_use(history, track, stage, assessment.refused)),
-        "surprise": None if track is None else surprise(track),
-        "happened": [] if track is None else list(happened(track)),
-        "filter": None if track is None else filter_health(track),
-        "noise_scale": None if track is None else float(track.noise_scale[-1].max()),
-        "largest_drift": float(np.nanmax(drift, initial=0.0)),
-        "taught": taught(assessment.fleet, stage),
-        "laws": [] if prognosis is None else list(_laws(prognosis)),
-        "law": prognosis and fit(prognosis.chi_square, prognosis.degrees_of_freedom),
-        # Laws that leave nothing to sample, and improbable ones, have no chains to be judged.
-        "chained": prognosis is not None and bool(np.isfinite(prognosis.ess)),
-        "effects": [] if track is None else [effect_row(effect) for effect in other_effects(track)],
+        "influences": influences,
+        "corrected": _by_covariate(influences),
+        "uncorrected": list(_uncorrected(history, stage)),
+        "mode_use": list(_mode_use(history, track, stage, assessment.refused)),
         "reasons": Counter(item.reason for item in assessment.refused).most_common(),
         "hashes": list(zip(history.logs, assessment.digests, strict=False)),
     }
 
 
-def _laws(prognosis: Prognosis) -> Iterator[tuple[str, str, str, str]]:
-    """Say what each parameter may do: its name, the law, since when, and how probably."""
-    for law in prognosis.laws:
-        since = km(law.begin) if law.begin else ""
-        yield spell(law.parameter), law_words(law.kind), since, percent(law.probability)
+def _health_content(assessment: Assessment) -> dict[str, Any]:
+    """Collect what the page shows of health, laws and samplers."""
+    prognosis, health = assessment.prognosis, assessment.latest_health
+    return {
+        "health": health,
+        "pairs": [] if health is None else list(_pairs(health)),
+        "fleet": assessment.fleet,
+        "scatter": list(_scatter(assessment.fleet, assessment.stage)),
+        "pace": _pace,
+        "fit": prognosis and chi_square_side(prognosis.chi_square, prognosis.degrees_of_freedom),
+        "walk_share": constants.WALK_SHARE,
+        "correlation_shown": constants.CORRELATION_SHOWN,
+        "scale_shown": constants.SCALE_SHOWN,
+        "unfolded": constants.REFUSED_UNFOLDED,
+    }
+
+
+def _events(track: Track) -> Iterator[list[Event]]:
+    """Group the events of all modes that are one event of the machine."""
+    groups: dict[tuple[str, int, str], list[Event]] = {}
+    for event in track.events:
+        groups.setdefault((event.kind, event.epoch, event.source), []).append(event)
+    yield from groups.values()
+
+
+def _other_effects(track: Track) -> Iterator[Effect]:
+    """Yield effects of sources, tunings and sensors, and scales that differ from one."""
+    for effect in track.effects:
+        kind, colon, _ = effect.covariate.partition(":")
+        if colon and (kind != "scale" or abs(effect.coefficient - 1) > constants.SCALE_SHOWN):
+            yield effect
+
+
+def _nis(track: Track) -> dict[str, Any] | None:
+    """Count the epochs whose NIS lies in its 95 % interval, and compare their sum with χ²."""
+    seen = (track.nis_dof > 0) & np.isfinite(track.nis)
+    nis, dof = track.nis[seen], track.nis_dof[seen]
+    total = chi_square_side(float(nis.sum()), float(dof.sum()))
+    low, high = figures.chi_square_band(dof)
+    inside = int(np.sum((nis >= low) & (nis <= high)))
+    return total and {"inside": inside, "epochs": nis.size, "side": total["side"]}
+
+
+def _by_covariate(influences: Sequence[CovariateEffect]) -> dict[str, list[CovariateEffect]]:
+    """Group influences by covariate; without those that have no estimate."""
+    groups: dict[str, list[CovariateEffect]] = {}
+    for one in influences:
+        if one.values.size:
+            groups.setdefault(one.covariate, []).append(one)
+    return groups
+
+
+def _uncorrected(history: History, stage: Stage) -> Iterator[dict[str, Any]]:
+    """Yield covariates without correction: missing, constant, or not described."""
+    described = {one.name: one.reference for one in stage.description.covariate}
+    for column in dict.fromkeys([*described, *history.covariates]):
+        values = history.covariates.get(column, np.empty(0))
+        values = values[np.isfinite(values)]
+        reference = described.get(column)
+        if reference is not None and not values.size:
+            yield {"column": column, "why": "missing"}
+        elif reference is not None and (values == reference).all():
+            yield {"column": column, "why": "constant", "low": reference}
+        elif reference is None and values.size and np.ptp(values) > 0:
+            ends = {"low": values.min(), "high": values.max()}
+            yield {"column": column, "why": "not described", **ends}
+
+
+def _mode_use(
+    history: History, track: Track | None, stage: Stage, refused: Sequence[Refusal]
+) -> Iterator[dict[str, Any]]:
+    """Yield, per mode, the logs with an estimate, rejected estimates and reasons of refusal."""
+    outliers = Counter(mode for _, mode in (() if track is None else track.outliers))
+    tracked = [mode.name for mode in stage.modes if mode.tracked]
+    for mode in dict.fromkeys([*history.modes, *tracked]):
+        found = np.isfinite(history.ln_frequency[:, history.columns(mode)]).any(axis=1)
+        reasons = Counter(r.reason for r in refused if r.mode == mode and r.reason != "jump")
+        yield {
+            "mode": mode,
+            "found": int(found.sum()),
+            "rejected": outliers[mode],
+            "reasons": reasons.most_common(),
+        }
+
+
+def _scatter(fleet: FleetPrior | None, stage: Stage) -> Iterator[tuple[str, str, float, float]]:
+    """Yield the expected scatter by the description and by the fleet: key, name and both values."""
+    if fleet is None:
+        return
+    names = {
+        "walk": "random walk of ln frequency",
+        "factor": "factor on reported errors",
+        "deviation": "deviation of health from its law",
+    }
+    pairs = zip(expected_scatter(scatter_prior(stage)), expected_scatter(fleet.scatter), strict=True)
+    for (key, name), pair in zip(names.items(), pairs, strict=True):
+        yield key, name, *pair
+
+
+def _pace(law: LawPrior, pace: Pace) -> str:
+    """Format the prior of the life of a law, or of its rate: median and 90 % interval."""
+    low, middle, high = (float(q) for q in pace.quantile(np.array(constants.LEVELS)))
+    if law.field == "life_km":
+        return f"life {km(1e3 * middle)} ({coarse(low)} to {coarse(high)})"
+    low, middle, high = (1e5 * rate for rate in (low, middle, high))  # % per 1,000 km
+    return f"{coarse(middle)}{GAP}% per {km(1e6)} ({coarse(low)} to {coarse(high)}{GAP}%)"
 
 
 def _pictures(
     assessment: Assessment, service: Service, influences: Sequence[CovariateEffect]
 ) -> dict[tuple[str, ...], str]:
-    """Draw every picture of a page, by kind and by what it shows."""
+    """Draw all figures of a page, by kind and subject."""
     draw = _track_pictures(assessment, influences) | _health_pictures(assessment, service)
     return {key: _inline(one, key[0], f"p{k}") for k, (key, one) in enumerate(draw.items())}
 
@@ -241,65 +289,66 @@ def _track_pictures(
 ) -> dict[tuple[str, ...], Any]:
     history, track, waterfall = assessment.history, assessment.track, assessment.waterfall
     draw: dict[tuple[str, ...], Any] = {}
-    pair = {"frequency": plot_frequencies, "damping": plot_damping}
+    pair = {"frequency": figures.plot_frequencies, "damping": figures.plot_damping}
     for mode in _seen(history):
         for kind, plot in pair.items():
             draw[kind, mode] = partial(plot, history=history, track=track, mode=mode)
     if waterfall is not None and history.has_odometer:
         moved = None if track is None else covariate_shifts(history, track, assessment.stage)
         draw["waterfall", "all"] = partial(
-            plot_waterfall, waterfall=waterfall, history=history, track=track, moved=moved
+            figures.plot_waterfall, waterfall=waterfall, history=history, track=track, moved=moved
         )
     for one in influences:
         if one.values.size:
-            name = covariate(one.covariate)[0]
-            draw["influence", name, one.mode] = partial(
-                plot_influence, influence=one, history=history
+            draw["influence", one.covariate, one.mode] = partial(
+                figures.plot_influence, influence=one, history=history
             )
-    if track is not None and surprise(track) is not None:
-        draw["nis", "all"] = partial(plot_nis, track=track)
+    if track is not None and _nis(track) is not None:
+        draw["nis", "all"] = partial(figures.plot_nis, track=track)
     return draw
 
 
 def _health_pictures(assessment: Assessment, service: Service) -> dict[tuple[str, ...], Any]:
-    prognosis, health = assessment.prognosis, health_now(assessment)
+    prognosis, health = assessment.prognosis, assessment.latest_health
     draw: dict[tuple[str, ...], Any] = {}
     if health is not None:
         for names, key, _ in _pairs(health):
-            draw["posterior", key] = partial(plots.plot_posterior, health=health, parameters=names)
+            draw["posterior", key] = partial(
+                figures.plot_posterior, health=health, parameters=names
+            )
         limits = {spec.name: limit_of(spec) for spec in assessment.stage.parameters}
         for name in health.parameters:
-            draw["health", spell(name)] = partial(
-                plots.plot_health, health=health, parameter=name, limit=limits.get(name)
+            draw["health", name] = partial(
+                figures.plot_health, health=health, parameter=name, limit=limits.get(name)
             )
     if prognosis is not None:
         for name in prognosis.parameters[:-1]:
-            draw["life", spell(name)] = partial(
-                plots.plot_life, prognosis=prognosis, parameter=name, health=health
+            draw["life", name] = partial(
+                figures.plot_life, prognosis=prognosis, parameter=name, health=health
             )
-        draw["survival", "any"] = partial(plots.plot_survival, prognosis=prognosis, service=service)
+        draw["survival", "any"] = partial(
+            figures.plot_survival, prognosis=prognosis, service=service
+        )
     return draw
 
 
 def _inline(draw: Any, kind: str, salt: str) -> str:
-    size = _SIZES.get(kind, plots.SIZE)
-    # The HTML parser knows these namespaces; without them the page names no address at all.
-    return re.sub(r'\sxmlns(:xlink)?="[^"]*"', "", plots.svg(draw, salt=salt, size=size))
+    size = _SIZES.get(kind, figures.SIZE)
+    # An HTML parser does not need these namespaces; without them the page names no address at all.
+    return re.sub(r'\sxmlns(:xlink)?="[^"]*"', "", figures.svg(draw, salt=salt, size=size))
 
 
-def _pairs(health: Health) -> list[tuple[tuple[str, ...], str, float]]:
-    """Parameters to draw against each other, their title, and their correlation."""
+def _pairs(health: Health) -> Iterator[tuple[tuple[str, ...], str, float]]:
+    """Yield parameters to draw against each other, the title and their correlation."""
     names = health.parameters
     if len(names) == 1:
-        return [(names, spell(names[0]), 0.0)]
-    rho = health.correlation[-1]
-    return [
-        ((names[i], names[j]), f"{spell(names[i])} against {spell(names[j])}", float(rho[i, j]))
-        for i, j in combinations(range(len(names)), 2)
-    ]
+        yield names, spell(names[0]), 0.0
+    for i, j in combinations(range(len(names)), 2):
+        title = f"{spell(names[i])} against {spell(names[j])}"
+        yield (names[i], names[j]), title, float(health.correlation[-1, i, j])
 
 
 def _seen(history: History) -> list[str]:
-    """Modes that at least one log gave."""
+    """Return the modes with at least one estimate."""
     found = np.isfinite(history.ln_frequency)
     return [mode for mode in history.modes if found[:, history.columns(mode)].any()]

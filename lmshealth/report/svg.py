@@ -13,7 +13,7 @@ _GLYPH = re.compile(
 )
 
 
-def lean(text: str) -> str:
+def compact(text: str) -> str:
     """Leave out what no eye sees: a third of what matplotlib writes.
 
     Parameters

@@ -19,9 +19,9 @@ from lmshealth.health.results import Health
 from lmshealth.io.log import Refusal
 from lmshealth.io.metadata import COVARIATES
 from lmshealth.modal.frf.identification import FrfReading
-from lmshealth.prognosis.maintenance_decision import ProbabilityBounds, Service, remaining_days
-from lmshealth.prognosis.results import Prognosis
-from lmshealth.report.assessment import Assessment
+from lmshealth.prognosis.maintenance_decision import ProbabilityBounds, Service
+from lmshealth.report.assessment import Assessment, Life, LimitLife, summarise_life
+from lmshealth.report.constants import RUL_LEVELS
 from lmshealth.signal.acceleration_levels import Growth, Magnitude
 from lmshealth.signal.following_error import FollowingError
 from lmshealth.signal.spectral_lines import Line
@@ -38,7 +38,6 @@ from lmshealth.tracking.smoother import Smoothed
 from lmshealth.tracking.track import Track
 
 _KM, _MICRO = 1000.0, 1e-6
-RUL_LEVELS = (0.05, 0.10, 0.25, 0.50, 0.75, 0.90, 0.95)
 
 COLUMNS = {
     "modes": "log stage recorded_at travel_km temperature_c payload_kg position_mm servo_id "
@@ -124,9 +123,7 @@ def frame(columns: str, rows: Sequence[Row]) -> pd.DataFrame:
     return pd.DataFrame(list(rows), columns=list(order))
 
 
-def machine_tables(
-    readings: Sequence[LogEstimates], assessment: Assessment
-) -> dict[str, list[Row]]:
+def machine_tables(readings: Sequence[LogEstimates], assessment: Assessment) -> dict[str, list[Row]]:
     """List everything about one machine, by the name of the table, which is a file without ending.
 
     Parameters
@@ -148,7 +145,8 @@ def machine_tables(
     if assessment.health is not None:
         rows["health"] = health_rows(assessment.health)
     if assessment.prognosis is not None:
-        rows["prognosis"] = prognosis_rows(assessment.prognosis, assessment.service())
+        life = summarise_life(assessment.prognosis)
+        rows["prognosis"] = prognosis_rows(life, assessment.service())
     judgement = assessment.judgement
     verdict = judgement.verdict, judgement.probability
     values = judgement.stage, _moment(judgement.recorded_at), *verdict
@@ -177,8 +175,13 @@ def _modes_cov_rows(reading: LogEstimates) -> list[Row]:
     ]
 
 
-def track_rows(track: Track, smoothed: Smoothed | None = None) -> list[Row]:
-    """List a track, one row per epoch and mode; what is smoothed has columns of its own."""
+def track_rows(
+    track: Track, smoothed: Smoothed | None = None, *, epochs: Iterable[int] | None = None
+) -> list[Row]:
+    """Return a track, one row per epoch and mode; smoothed values have columns of their own.
+
+    With `epochs` only these.
+    """
     drift_std = np.sqrt(np.einsum("kii->ki", track.drift_cov))
     frequency, damping = np.exp(track.ln_frequency), np.exp(track.ln_damping)
     return [
@@ -199,7 +202,7 @@ def track_rows(track: Track, smoothed: Smoothed | None = None) -> list[Row]:
             "widening": track.widening[k],
             **({} if smoothed is None else _smoothed_columns(smoothed, k, i)),
         }
-        for k in range(len(track.logs))
+        for k in (range(len(track.logs)) if epochs is None else epochs)
         for i, mode in enumerate(track.modes)
     ]
 
@@ -274,33 +277,32 @@ def _smoothed_columns(smoothed: Smoothed, k: int, i: int) -> Row:
 
 
 def prognosis_rows(
-    prognosis: Prognosis, service: Service, before: tuple[date, ProbabilityBounds] | None = None
+    life: Life, service: Service, before: tuple[date, ProbabilityBounds] | None = None
 ) -> list[Row]:
-    """List a remaining life, one row per limit and one for any of them.
+    """Return a remaining life, one row per limit and one for any of them.
 
     Parameters
     ----------
-    prognosis : Prognosis
-        The draws.
+    life : Life
+        Its quantiles and probabilities.
     service : Service
-        What they lead to; told in the row of any limit.
+        When to service; in the row of any limit.
     before : tuple of date and ProbabilityBounds, optional
-        A day, and the probabilities to have reached a limit before it: in columns of their own.
+        A day, and the probabilities that a limit is reached before it: in extra columns.
     """
-    beyond, past = prognosis.beyond_horizon(), prognosis.already_past()
-    days = remaining_days(prognosis)
     rows = []
-    for j, name in enumerate(prognosis.parameters):
+    for j, one in enumerate(life.limits):
+        last = one.parameter == "any"
         row = {
-            "stage": prognosis.stage,
-            "parameter": name,
-            "limit": prognosis.limits[j],
-            **_rul(prognosis, j, days[:, j]),
-            "probability_beyond_horizon": beyond[j],
-            "probability_already_past": past[j],
-            "service": service.kind if name == "any" else None,
-            "service_by": service.by if name == "any" else None,
-            "service_risk": service.risk if name == "any" else None,
+            "stage": life.stage,
+            "parameter": one.parameter,
+            "limit": one.limit,
+            **_rul_columns(one),
+            "probability_beyond_horizon": one.beyond_horizon,
+            "probability_already_past": one.already_past,
+            "service": service.kind if last else None,
+            "service_by": service.by if last else None,
+            "service_risk": service.risk if last else None,
         }
         if before is not None:
             day, reached = before
@@ -313,15 +315,16 @@ def prognosis_rows(
     return rows
 
 
-def _rul(prognosis: Prognosis, column: int, days: FloatArray) -> Row:
-    """Quantiles of the remaining life; past the horizon they are empty, not numbers."""
-    travel = prognosis.censored()[:, column]
+def _rul_columns(one: LimitLife) -> Row:
+    """Return the quantiles of a remaining life; empty beyond the horizon."""
+    hours = [24 * days for days in one.days]
     row: Row = {}
-    for unit, values in (("km", travel / _KM), ("hours", days * 24), ("days", days)):
-        found = np.quantile(np.maximum(values, 0), RUL_LEVELS, method="inverted_cdf")
-        for level, value in zip(RUL_LEVELS, found, strict=True):
-            row[f"rul_{unit}_q{100 * level:02.0f}"] = None if np.isinf(value) else float(value)
-    censored = [level for level, value in zip(RUL_LEVELS, found, strict=True) if np.isinf(value)]
+    for unit, values in (
+        ("km", [metres / _KM for metres in one.travel]), ("hours", hours), ("days", one.days)
+    ):
+        for level, value in zip(RUL_LEVELS, values, strict=True):
+            row[f"rul_{unit}_q{100 * level:02.0f}"] = None if np.isinf(value) else value
+    censored = [level for level, days in zip(RUL_LEVELS, one.days, strict=True) if np.isinf(days)]
     row["censored_from"] = censored[0] if censored else None
     return row
 

@@ -1,4 +1,4 @@
-"""Numbers in words, as pages for people write them."""
+"""Formats of numbers and names; pages, terminals and figures share them."""
 
 from __future__ import annotations
 
@@ -8,98 +8,150 @@ from typing import Any
 import numpy as np
 
 from lmshealth._arrays import FloatArray
+from lmshealth.report import constants
 
 _KM = 1000.0
-GAP = "\u202f"  # narrow space that does not break: between a number and its unit
+GAP = "\u202f"  # narrow no-break space between a number and its unit, and between thousands
 _UNITS = {"c": "°C", "kg": "kg", "mm": "mm"}
-LEVELS = np.array([0.05, 0.5, 0.95])
+_LAWS = {
+    "hertz-wear": "wear of the contacts (Hertz)",
+    "loosening": "loosening towards a floor",
+    "power": "loss as a power of travel",
+    "linear": "loss in proportion to travel",
+    "none": "no change",
+}
+
+Number = float | np.floating[Any]
 
 
 def spell(name: str) -> str:
-    """Write a name in words."""
+    """Return a name with blanks instead of underscores."""
     return name.replace("_", " ")
 
 
+def plain(text: str) -> str:
+    """Return a text with ordinary blanks, for terminals."""
+    return text.replace(GAP, " ")
+
+
 def covariate(column: str) -> tuple[str, str]:
-    """Split the name of a covariate's column into words and its unit, empty where unknown."""
+    """Split the column of a covariate into its name in words and its unit ("" if unknown)."""
     name, _, unit = column.rpartition("_")
     return (spell(name), _UNITS[unit]) if name and unit in _UNITS else (spell(column), "")
 
 
-def law_words(kind: str) -> str:
-    """Say what a law of a stage description does."""
-    words = {
-        "hertz-wear": "wear of the contacts (Hertz)",
-        "loosening": "loosening towards a floor",
-        "power": "loss as a power of travel",
-        "linear": "loss in proportion to travel",
-        "none": "no change",
-    }
-    return words.get(kind, kind)
+def law(kind: str) -> str:
+    """Return the description of a degradation law."""
+    return _LAWS.get(kind, kind)
 
 
 def moment(when: datetime) -> str:
-    """Write a moment for people."""
+    """Format date, time and zone."""
     return when.strftime("%Y-%m-%d %H:%M %Z").strip()
 
 
-def percent(probability: float | np.floating[Any]) -> str:
-    """Write a probability; draws cannot prove 0 or 1."""
-    if probability < 0.01:
-        return f"below 1{GAP}%"
-    if probability > 0.99:
-        return f"above 99{GAP}%"
-    return f"{100 * probability:.0f}{GAP}%"
+def number(value: Number, digits: int = 3) -> str:
+    """Format a number with significant digits and grouped thousands; NaN is a dash."""
+    if np.isnan(value):
+        return "–"
+    rounded = float(f"{value:.{digits}g}")
+    if abs(rounded) < 10 ** (digits - 1):
+        return f"{rounded:.{digits}g}".replace("-", "−")
+    return f"{rounded:,.0f}".replace(",", GAP).replace("-", "−")
 
 
-def chance(at_least: float, at_most: float) -> str:
-    """Write a probability that is known between two values."""
-    low, high = percent(at_least), percent(at_most)
-    if low == high:
-        return low
-    if at_least < 0.01:
-        return f"at most {high}"
-    return f"at least {low}" if at_most > 0.99 else f"{low} to {high}"
+def fixed(value: Number, digits: int) -> str:
+    """Format a number with fixed decimals; NaN is a dash."""
+    return "–" if np.isnan(value) else f"{value:.{digits}f}".replace("-", "−")
 
 
-def signed(value: float, digits: int) -> str:
-    """Write a number with its sign."""
+def signed(value: Number, digits: int) -> str:
+    """Format a number with its sign and fixed decimals."""
     return f"{value:+.{digits}f}".replace("-", "−")
 
 
-def change(ln: float, std: float) -> tuple[float, float]:
-    """Turn the change of a logarithm and its standard deviation into percent of what was before."""
-    return 100 * float(np.expm1(ln)), 100 * float(np.exp(ln)) * std
+def percent(share: Number, digits: int | None = None) -> str:
+    """Format a share in percent: fixed decimals, or three significant digits; NaN is a dash."""
+    if np.isnan(share):
+        return "–"
+    value = 100 * share
+    return f"{number(value) if digits is None else fixed(value, digits)}{GAP}%"
 
 
-def number(value: float) -> str:
-    """Write three significant digits, thousands apart."""
-    rounded = float(f"{value:.3g}")
-    digits = 0 if not abs(rounded) < 10 or rounded.is_integer() else 1
-    return f"{rounded:,.{digits}f}".replace(",", GAP).replace("-", "−")
+def interval(low: Number, high: Number) -> str:
+    """Format an interval of shares in whole percent."""
+    return f"{fixed(100 * low, 0)} to {percent(high, 0)}"
 
 
-def km(metres: float) -> str:
-    """Write a distance given in m."""
-    return f"{number(metres / _KM)}{GAP}km"
+def probability(value: Number) -> str:
+    """Format a probability in percent; draws cannot prove 0 or 1."""
+    if value < constants.LEAST_PROBABILITY:
+        return f"below {percent(constants.LEAST_PROBABILITY)}"
+    if value > constants.LARGEST_PROBABILITY:
+        return f"above {percent(constants.LARGEST_PROBABILITY)}"
+    return percent(value, 0)
 
 
-def whole_km(metres: float) -> str:
-    """Write a distance given in m to the kilometre."""
-    return f"{metres / _KM:,.0f}{GAP}km".replace(",", GAP)
+def probability_range(bounds: tuple[Number, Number]) -> str:
+    """Format a probability that lies between two bounds."""
+    at_least, at_most = bounds
+    low, high = probability(at_least), probability(at_most)
+    if low == high:
+        return low
+    if at_least < constants.LEAST_PROBABILITY:
+        return f"at most {high}"
+    return f"at least {low}" if at_most > constants.LARGEST_PROBABILITY else f"{low} to {high}"
 
 
-def day_count(days: float) -> str:
-    """Write a number of days, with years where there are many."""
+def change(ln: Number, std: Number, digits: int = 2) -> str:
+    """Format a change of a logarithm and its standard deviation as a relative change in percent."""
+    value, spread = 100 * float(np.expm1(ln)), 100 * float(np.exp(ln)) * float(std)
+    return f"{signed(value, digits)} ± {spread:.{digits}f}{GAP}%"
+
+
+def coarse(value: Number) -> str:
+    """Format a number with three significant digits, two below 10."""
+    return number(value, 3 if abs(value) >= 10 else 2)
+
+
+def km(metres: Number) -> str:
+    """Format a distance given in m."""
+    return f"{coarse(metres / _KM)}{GAP}km"
+
+
+def whole_km(metres: Number) -> str:
+    """Format a distance given in m to the kilometre."""
+    return f"{metres / _KM:,.0f}{GAP}km".replace(",", GAP).replace("-", "−")
+
+
+def day_count(days: Number) -> str:
+    """Format a number of days, with years from 1,000 days on."""
     years = f" ({days / 365.25:.1f} years)" if days >= 1000 else ""
-    return f"{number(days)}{GAP}days{years}"
+    return f"{coarse(days)}{GAP}days{years}"
 
 
-def quantiles(values: FloatArray) -> list[float]:
-    """Give 5, 50 and 95 % of draws that may be infinite: always one of the draws."""
-    return [float(q) for q in np.quantile(values, LEVELS, method="inverted_cdf")]
+def travel_left(metres: Number, horizon: Number) -> str:
+    """Format a remaining travel in m; infinite stands for beyond the horizon (m)."""
+    if np.isinf(metres):
+        return f"beyond {km(horizon)}"
+    return "already passed" if metres <= 0 else km(metres)
 
 
-def left(value: float, beyond: str, text: str) -> str:
-    """Write what is left of a life."""
-    return "already passed" if value <= 0 else beyond if np.isinf(value) else text
+def time_left(days: Number) -> str:
+    """Format remaining days; infinite stands for beyond the horizon."""
+    if np.isinf(days):
+        return "beyond"
+    return "already passed" if days <= 0 else day_count(days)
+
+
+def quantiles(values: FloatArray, levels: tuple[float, ...] = constants.LEVELS) -> tuple[float, ...]:
+    """Return quantiles of draws that may be infinite: each is one of the draws.
+
+    Parameters
+    ----------
+    values : ndarray
+        Draws, shape ``(n_draws,)``.
+    levels : tuple of float
+        Probabilities.
+    """
+    return tuple(float(q) for q in np.quantile(values, levels, method="inverted_cdf"))

@@ -1,10 +1,10 @@
 "use strict";
-// Find, filter and sort the rows of a table that is complete without this.
+// Find, filter and sort the rows of a table that is complete without it.
 (() => {
   const by = (id) => document.getElementById(id);
   const table = document.querySelector(".fleet");
   const [find, before, order, all, count] = ["find", "before", "order", "all", "count"].map(by);
-  const states = [...document.querySelectorAll("[name=tone]")];
+  const states = [...document.querySelectorAll("[name=state]")];
   const heads = [...table.tHead.rows[0].cells];
   const names = heads.map((head) => head.textContent.trim());
   const alphabet = new Intl.Collator("en", { numeric: true });
@@ -23,14 +23,14 @@
     const state = states.find((one) => one.checked).value;
     let shown = 0;
     for (const { line, text } of rows) {
-      const { tone, due } = line.dataset;
-      const fits = (!state || tone === state) && (!before.value || (due && due < before.value))
+      const { due } = line.dataset;
+      const fits = (!state || line.dataset.state === state) && (!before.value || (due && due < before.value))
         && words.every((word) => text.includes(word));
       line.hidden = !fits;
       shown += fits;
     }
     const sorted = table.querySelector("[aria-sort]");
-    const way = sorted ? `by ${names[heads.indexOf(sorted)].toLowerCase()}, ${sorted.ariaSort}` : "worst first";
+    const way = sorted ? `by ${names[heads.indexOf(sorted)].toLowerCase()}, ${sorted.ariaSort}` : "most urgent first";
     count.textContent = `${shown} of ${rows.length} stages, ${way}`;
     all.hidden = shown === rows.length && !sorted;
   };
@@ -60,8 +60,8 @@
     cell.append(button);
   };
 
-  order.append(new Option("Worst first", "-1"), ...names.map((name, k) => new Option(name, String(k))));
-  // A third press brings back the order of risk.
+  order.append(new Option("Most urgent first", "-1"), ...names.map((name, k) => new Option(name, String(k))));
+  // A third press restores the order of urgency.
   heads.forEach((head, k) => wrap(head, () => {
     if (head.ariaSort === "descending") sort(-1);
     else sort(k, head.ariaSort === "ascending");
@@ -78,7 +78,7 @@
     find.focus();
   });
   document.querySelector(".tools").hidden = false;
-  // Coming back from the page of a stage, the browser has filled in what was asked for.
+  // Coming back from the page of a stage, the browser has filled in the fields.
   addEventListener("pageshow", () => sort(Number(order.value)));
   sort(-1);
 })();
