@@ -30,7 +30,11 @@ from lmshealth.report.svg import share_letters
 from lmshealth.report.tables import track_rows
 from lmshealth.report.text import GAP, coarse, km, spell
 from lmshealth.stage.description import Stage
-from lmshealth.tracking.covariate_effects import CovariateEffect, covariate_shifts, find_covariate_effects
+from lmshealth.tracking.covariate_effects import (
+    CovariateEffect,
+    covariate_shifts,
+    find_covariate_effects,
+)
 from lmshealth.tracking.history import History
 from lmshealth.tracking.track import Effect, Event, Track
 

@@ -65,6 +65,11 @@ def fixed(value: Number, digits: int) -> str:
     return "–" if np.isnan(value) else f"{value:.{digits}f}".replace("-", "−")
 
 
+def quantity(value: Number, digits: int) -> str:
+    """Format a number with fixed decimals and grouped thousands."""
+    return f"{value:,.{digits}f}".replace(",", GAP).replace("-", "−")
+
+
 def signed(value: Number, digits: int) -> str:
     """Format a number with its sign and fixed decimals."""
     return f"{value:+.{digits}f}".replace("-", "−")
@@ -74,7 +79,7 @@ def percent(share: Number, digits: int | None = None) -> str:
     """Format a share in percent: fixed decimals, or three significant digits; NaN is a dash."""
     if np.isnan(share):
         return "–"
-    value = 100 * share
+    value = 100 * float(share)
     return f"{number(value) if digits is None else fixed(value, digits)}{GAP}%"
 
 
@@ -121,7 +126,7 @@ def km(metres: Number) -> str:
 
 def whole_km(metres: Number) -> str:
     """Format a distance given in m to the kilometre."""
-    return f"{metres / _KM:,.0f}{GAP}km".replace(",", GAP).replace("-", "−")
+    return f"{quantity(metres / _KM, 0)}{GAP}km"
 
 
 def day_count(days: Number) -> str:
@@ -130,21 +135,23 @@ def day_count(days: Number) -> str:
     return f"{coarse(days)}{GAP}days{years}"
 
 
-def travel_left(metres: Number, horizon: Number) -> str:
+def travel_left(metres: float, horizon: float) -> str:
     """Format a remaining travel in m; infinite stands for beyond the horizon (m)."""
     if np.isinf(metres):
         return f"beyond {km(horizon)}"
     return "already passed" if metres <= 0 else km(metres)
 
 
-def time_left(days: Number) -> str:
+def time_left(days: float) -> str:
     """Format remaining days; infinite stands for beyond the horizon."""
     if np.isinf(days):
         return "beyond"
     return "already passed" if days <= 0 else day_count(days)
 
 
-def quantiles(values: FloatArray, levels: tuple[float, ...] = constants.LEVELS) -> tuple[float, ...]:
+def quantiles(
+    values: FloatArray, levels: tuple[float, ...] = constants.LEVELS
+) -> tuple[float, ...]:
     """Return quantiles of draws that may be infinite: each is one of the draws.
 
     Parameters
