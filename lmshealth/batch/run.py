@@ -20,7 +20,8 @@ from lmshealth.io.column_map import ColumnMap
 from lmshealth.io.constants import MAX_MEMORY
 from lmshealth.io.log import Refusal
 from lmshealth.io.manifest import NOT_LOGS
-from lmshealth.report.fleet_page import Summary, by_urgency, file_names, write_index
+from lmshealth.report.assessment import Summary
+from lmshealth.report.fleet_page import by_urgency, file_names, write_index
 from lmshealth.stage.description import Stage
 from lmshealth.tracking.maintenance import Maintenance, read_maintenance
 

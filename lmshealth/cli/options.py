@@ -1,22 +1,33 @@
-"""Options of the command line that several commands share, and how their values are read."""
+"""Options that several commands share, and the types of their values."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from lmshealth.io.constants import MAX_MEMORY
 from lmshealth.signal.segments import PARTS
 
+if TYPE_CHECKING:
+    from lmshealth.io.column_map import ColumnMap
+    from lmshealth.stage.description import Stage
+
+# Exit status: done, but some logs or machines were refused.
+SOME_REFUSED = 3
+# An address on the command line is visible to all users of the machine, with its password.
+_STORE_VARIABLE = "LMSHEALTH_STORE"
+
 TABLE = click.Path(exists=True, dir_okay=False, path_type=Path)
 OUT = click.Path(dir_okay=False, path_type=Path)
 
 LOGS = click.argument("logs", nargs=-1, required=True, type=click.Path(path_type=Path))
-STAGE = click.option("--stage", help="Stage description: a .toml file or a shipped name.")
+_STAGE_HELP = "Stage description: a .toml file or a shipped name."
+STAGE = click.option("--stage", help=_STAGE_HELP)
+REQUIRED_STAGE = click.option("--stage", required=True, help=_STAGE_HELP)
 _COLUMNS = click.option(
     "--columns", type=click.Path(path_type=Path), help="Column map of the export."
 )
@@ -32,10 +43,17 @@ PART = click.option(
     type=click.Choice(PARTS),
     default="record",
     show_default=True,
-    help="Read all of the log, or what its set point says is this.",
+    help="Use the whole log, or the part that its set point marks as such.",
 )
-COV = click.option("--cov", type=TABLE, help="Cross terms; default modes_cov.csv beside MODES.csv.")
-MAINTENANCE = click.option("--maintenance", type=TABLE, help="What was done, as maintenance.csv.")
+TABLE_OR_JSON = click.option(
+    "--format", "style", type=click.Choice(["table", "json"]), default="table", show_default=True
+)
+COV = click.option(
+    "--cov", type=TABLE, help="Covariances of estimates; default modes_cov.csv in the same folder."
+)
+MAINTENANCE = click.option(
+    "--maintenance", type=TABLE, help="Table of maintenance, like maintenance.csv."
+)
 EPOCHS = click.option(
     "--epochs",
     type=click.IntRange(1),
@@ -45,42 +63,44 @@ EPOCHS = click.option(
 )
 SEED = click.option("--seed", type=click.IntRange(0), default=0, show_default=True)
 WORKERS = click.option(
-    "--workers", type=click.IntRange(1), help="Processes; default one per processor."
+    "--workers", type=click.IntRange(1), help="Number of processes; default one per processor."
 )
 SCHEDULER = click.option(
     "--scheduler",
     metavar="ADDRESS",
-    help="Work on a Dask cluster instead, by the address of its scheduler: it has this version of "
-    "lmshealth, and its workers see the logs under the same paths.",
+    help="Run on the Dask cluster with this scheduler. It needs the same version of lmshealth, and "
+    "its workers access to the logs under the same paths.",
 )
-PDF = click.option("--pdf", is_flag=True, help="Also write a PDF beside the page of each stage.")
+PDF = click.option("--pdf", is_flag=True, help="Also write the page of each stage as PDF.")
 
 
 class Finite(click.FloatRange):
-    """A number in a range: NaN is in none of them, and infinity is no number to count with."""
+    """Finite number in a range."""
 
     def convert(
         self, value: Any, param: click.Parameter | None, ctx: click.Context | None
     ) -> float:
-        """Refuse what compares with nothing, or is without end."""
+        """Reject NaN and infinity."""
         number = float(super().convert(value, param, ctx))
         if not math.isfinite(number):
-            self.fail(f"{value} is no finite number.", param, ctx)
+            self.fail(f"{value} is not a finite number.", param, ctx)
         return number
 
 
 class Day(click.DateTime):
-    """A day of the calendar."""
+    """Day of the calendar."""
 
     def __init__(self) -> None:
         super().__init__(["%Y-%m-%d"])
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        """Say how a day is written, not which format does not match."""
+        """Reject other formats, with an example of the right one."""
         try:
             return super().convert(value, param, ctx)
         except click.BadParameter:
-            self.fail(f"{value!r} is no day; needed YYYY-MM-DD, such as 2027-03-01.", param, ctx)
+            self.fail(
+                f"{value!r} is not a day; needed is YYYY-MM-DD, such as 2027-03-01.", param, ctx
+            )
 
 
 SHARE = Finite(0, 1, min_open=True, max_open=True)
@@ -103,14 +123,41 @@ def reading_options(command: Callable[..., Any]) -> Callable[..., Any]:
     return _COLUMNS(_MAX_MEMORY(command))
 
 
+def out_option(text: str) -> Callable[[Any], Any]:
+    """Return the required option of the output table."""
+    return click.option("--out", required=True, type=OUT, help=text)
+
+
+def store_option(**more: Any) -> Callable[[Any], Any]:
+    """Return the option of the store."""
+    return click.option("--store", envvar=_STORE_VARIABLE, show_envvar=True, metavar="URL", **more)
+
+
+def band_help(text: str) -> Callable[[Any], Any]:
+    """Return the option of a frequency band."""
+    return click.option("--band", nargs=2, type=float, metavar="LOW HIGH", help=text)
+
+
+BAND = band_help("Use only this band, in Hz.")
+
+
+def load_columns_and_stage(options: dict[str, Any]) -> tuple[ColumnMap | None, Stage | None]:
+    """Load the files of --columns and --stage."""
+    from lmshealth.io.column_map import load_columns
+    from lmshealth.stage.description import load_stage
+
+    columns, stage = options["columns"], options.get("stage")
+    return load_columns(columns) if columns else None, load_stage(stage) if stage else None
+
+
 def examples(*lines: str) -> str:
-    """Write examples that stand unwrapped at the end of a command's help."""
-    # click leaves a paragraph alone that begins with a backspace.
+    """Return the examples at the end of a command's help."""
+    # click does not wrap a paragraph that begins with a backspace.
     return "\n".join(["\b", "Examples:", *(f"    lmshealth {line}" for line in lines)])
 
 
 def checked_band(band: tuple[float, float] | None) -> tuple[float, float] | None:
-    """Refuse a band whose ends are not in order."""
+    """Reject a band whose ends are not in ascending order."""
     if band and not 0 <= band[0] < band[1]:
         raise click.BadParameter(
             f"needs 0 <= LOW < HIGH, got {band[0]:g} {band[1]:g}", param_hint="--band"
@@ -121,7 +168,7 @@ def checked_band(band: tuple[float, float] | None) -> tuple[float, float] | None
 def _detections(
     ctx: click.Context, option: click.Parameter, values: tuple[str, ...]
 ) -> list[tuple[str, float]]:
-    """Read each NAME=LOSS once."""
+    """Parse NAME=LOSS, without duplicates."""
     pairs = [value.split("=") for value in dict.fromkeys(values)]
     try:
         return [(name, float(loss)) for name, loss in pairs]
@@ -136,5 +183,5 @@ DETECT = click.option(
     required=True,
     metavar="NAME=LOSS",
     callback=_detections,
-    help="Parameter, and which fraction of it is lost; may be given several times.",
+    help="Parameter and the fraction of it that is lost; may be given several times.",
 )

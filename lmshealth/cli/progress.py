@@ -1,4 +1,4 @@
-"""Bars that say how far a long job is, how fast it goes, and when it will be done."""
+"""Progress bars of long jobs, with rate and remaining time."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ from rich.text import Text
 
 
 class _Rate(ProgressColumn):
-    """How many are done in a second, or in a minute where they are slow."""
+    """Rate per second, or per minute below one per second."""
 
     def render(self, task: Task) -> Text:
-        """Give the rate, once it is known."""
+        """Return the rate; empty until it is measured."""
         speed = task.finished_speed or task.speed
         if not speed:
             return Text("")
@@ -33,7 +33,7 @@ class _Rate(ProgressColumn):
 
 @contextmanager
 def progress_bars() -> Iterator[Any]:
-    """Show bars with rate and time left on a terminal's standard error, and nothing elsewhere."""
+    """Show progress bars on standard error if it is a terminal; yield their callback."""
     with Progress(
         TextColumn("{task.description:<12}"),
         BarColumn(),
@@ -43,12 +43,12 @@ def progress_bars() -> Iterator[Any]:
         console=Console(stderr=True),
         disable=not sys.stderr.isatty(),
     ) as bars:
-        known: dict[str, Any] = {}
+        tasks: dict[str, Any] = {}
 
-        def tell(what: str, done: int, total: int) -> None:
-            if what not in known:
-                # What is done at the beginning was done before: it is no measure of the rate.
-                known[what] = bars.add_task(what, total=total, completed=done)
-            bars.update(known[what], completed=done, total=total)
+        def report(what: str, done: int, total: int) -> None:
+            if what not in tasks:
+                # Work that is done at the start was cached and does not count for the rate.
+                tasks[what] = bars.add_task(what, total=total, completed=done)
+            bars.update(tasks[what], completed=done, total=total)
 
-        yield tell
+        yield report

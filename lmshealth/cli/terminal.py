@@ -1,4 +1,4 @@
-"""What a terminal shows: tables for people, JSON for programs, prose that fits."""
+"""Output to a terminal: tables, JSON, wrapped text."""
 
 from __future__ import annotations
 
@@ -15,11 +15,13 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
-if TYPE_CHECKING:  # so that help comes without pandas and scipy
+from lmshealth.report.text import plain
+
+if TYPE_CHECKING:  # so that --help does not import pandas and scipy
     from lmshealth.report.tables import Row
 
 _WIDTH = 78
-# Names up to this length are not torn in a table that is too wide.
+# Names up to this length are not split in a table that is too wide.
 _NAME = 16
 
 
@@ -37,13 +39,13 @@ def _without_nan(value: Any) -> Any:
 
 
 def print_failed(failed: dict[str, str]) -> None:
-    """Say on standard error of which machines nothing can be told, and why."""
+    """Print machines without a result and the reasons, on standard error."""
     for machine, why in failed.items():
         click.echo(f"lmshealth: {machine}: {why}", err=True)
 
 
 def print_text(text: str, mark: str = "") -> None:
-    """Print prose in lines that fit; those after the first stand below the first, not its mark."""
+    """Print text in lines that fit, indented below the mark."""
     for paragraph in (mark + text).split("\n"):
         lines = wrap(
             paragraph,
@@ -52,11 +54,11 @@ def print_text(text: str, mark: str = "") -> None:
             break_long_words=False,
             break_on_hyphens=False,
         )
-        click.echo("\n".join(lines))
+        click.echo(plain("\n".join(lines)))
 
 
 def print_refused(rows: Sequence[Row]) -> None:
-    """Print what was refused, and why."""
+    """Print refusals and their reasons."""
     names = ("log", "channel", "mode", "reason", "detail")
     logs = short_names([row["log"] for row in rows])
     if rows:
@@ -67,43 +69,24 @@ def print_refused(rows: Sequence[Row]) -> None:
 def print_table(
     title: str, texts: Sequence[str], numbers: Sequence[str], cells: Sequence[Sequence[str]]
 ) -> None:
-    """Print a table: columns of text to the left, columns of numbers to the right."""
+    """Print a table: text columns left-aligned, then number columns right-aligned."""
     table = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False)
     for place, name in enumerate(texts):
-        # What says most stands last, and gives way first: names before it are not torn.
+        # The last text column is the longest and is wrapped first; names before it are not split.
         words = " ".join([name, *(row[place] for row in cells)]).split()
         least = min(max(map(len, words), default=0), _NAME) if place < len(texts) - 1 else None
         table.add_column(name, overflow="fold", min_width=least)
     for name in numbers:
         table.add_column(name, justify="right", no_wrap=True)
     for row in cells:
-        table.add_row(*row)
-    click.echo(title)
-    # What stands in the cells is text: brackets in it are no markup.
+        table.add_row(*map(plain, row))
+    click.echo(plain(title))
+    # Brackets in the cells are not markup.
     Console(markup=False, emoji=False, highlight=False).print(table)
 
 
 def short_names(logs: Sequence[str]) -> dict[str, str]:
-    """Name each log without its folder, where that says which."""
+    """Return the name of each log without its folder where that is unique."""
     names = {log: Path(log).name for log in logs}
     shared = Counter(names.values())
     return {log: name if shared[name] == 1 else log for log, name in names.items()}
-
-
-def or_dash(value: float, form: str) -> str:
-    """Write a number in a form, and a dash where there is none."""
-    return "–" if math.isnan(value) else f"{value:{form}}"
-
-
-def number(value: float) -> str:
-    """Write three significant digits without an exponent where that is short."""
-    if math.isnan(value):
-        return "–"
-    if 100 <= abs(value) < 1e5:
-        return f"{value:.0f}"
-    return f"{value:.3g}" if abs(value) >= 0.1 else f"{value:.2g}"
-
-
-def percent(share: float) -> str:
-    """Write a share in percent."""
-    return f"{100 * share:.1f} %"

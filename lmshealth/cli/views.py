@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
+from datetime import date
 from itertools import combinations
 from typing import TYPE_CHECKING
 
@@ -26,8 +27,8 @@ from lmshealth.report.text import (
 
 if TYPE_CHECKING:  # so that --help does not import pandas and scipy
     from lmshealth.health.results import Health
-    from lmshealth.prognosis.maintenance_decision import Service
-    from lmshealth.report.assessment import Life, LimitLife, ParameterHealth, Summary
+    from lmshealth.prognosis.maintenance_decision import ProbabilityBounds, Service
+    from lmshealth.report.assessment import Life, ParameterHealth, Summary
     from lmshealth.report.tables import Row
     from lmshealth.tracking.track import Track
 
@@ -38,10 +39,10 @@ _HINDRANCES = {
     "parameters": ("hidden", "other parameters change the modes alike; track further modes."),
 }
 _VERDICTS = {
-    "told": "determined",
+    "told": "identifiable",
     "longer-logs": "longer logs",
     "together": "together",
-    "not-told": "not determined",
+    "not-told": "not identifiable",
 }
 
 
@@ -351,7 +352,7 @@ def _print_identifiability(stage: Row, parameters: Sequence[Row]) -> None:
     print_text(
         f"logs: {stage['n_logs']} logs of {stage['seconds_per_log']:g} s now and at the baseline, "
         "averaged over the priors (Cramér-Rao bound). map error, log std: of ln f. informed: share "
-        "of the prior variance that the logs remove; determined from 50 % on."
+        "of the prior variance that the logs remove; identifiable from 50 % on."
     )
     click.echo()
 
@@ -454,8 +455,8 @@ def _consistency(track: Track) -> str:
     if track.widening[-1] > 1:
         return (
             f"The filter is NOT consistent with its logs: {values}. Its standard deviations are "
-            f"multiplied by {track.widening[-1]:.2f}. A cause may be missing: a covariate, a change "
-            "of servo tuning, or wrong standard deviations in the table."
+            f"multiplied by {track.widening[-1]:.2f}. A cause may be missing: a covariate, a "
+            "change of servo tuning, or wrong standard deviations in the table."
         )
     return (
         f"The filter is NOT consistent with its logs: {values}. The logs vary less than expected: "
@@ -594,7 +595,7 @@ def service_text(service: Service) -> str:
 
 
 def print_life(
-    life: Life, service: Service, before: dict[str, tuple[str, float, float]] | None = None
+    life: Life, service: Service, before: tuple[date, ProbabilityBounds] | None = None
 ) -> None:
     """Print the quantiles of the remaining life for each limit and any, then the service.
 
@@ -604,14 +605,13 @@ def print_life(
         The remaining life.
     service : Service
         When to service.
-    before : dict, optional
-        By parameter: a day, and bounds of the probability that its limit is reached before it.
+    before : tuple of date and ProbabilityBounds, optional
+        A day, and the probabilities that a limit is reached before it.
     """
-    blocks = [tuple(_limit_cells(life, one, (before or {}).get(one.parameter))) for one in life.limits]
+    blocks = [tuple(_limit_cells(life, k, before)) for k in range(len(life.limits))]
     same = _same_as_any(blocks)
     title = (
-        f"{life.stage}: remaining life after {life.recorded_at:%Y-%m-%d}, "
-        f"at {_km(life.travel)} km"
+        f"{life.stage}: remaining life after {life.recorded_at:%Y-%m-%d}, at {_km(life.travel)} km"
     )
     heads = ("chance %", "km", "hours", "days", "date")
     cells = [cell for block in (blocks if same is None else blocks[:-1]) for cell in block]
@@ -635,9 +635,10 @@ def print_life(
 
 
 def _limit_cells(
-    life: Life, one: LimitLife, before: tuple[str, float, float] | None
+    life: Life, index: int, before: tuple[date, ProbabilityBounds] | None
 ) -> Iterator[tuple[str, ...]]:
     """Yield one row per quantile, then the probabilities of the limit, one row each."""
+    one = life.limits[index]
     any_limit = one.parameter == "any"
     text = "any limit" if any_limit else f"{spell(one.parameter)} below {one.limit:g}"
     last = constants.RUL_LEVELS[-1]
@@ -648,17 +649,19 @@ def _limit_cells(
             yield text, share, f"beyond {_km(life.horizon)}", "–", "–", "–"
             break
         day = one.dates[k]
-        date = "out of range" if day is None else day.isoformat()
+        calendar = "out of range" if day is None else day.isoformat()
         hours = quantity(24 * days, 0)
-        yield text, share, _km(one.travel[k]), hours, quantity(days, 1), date
+        yield text, share, _km(one.travel[k]), hours, quantity(days, 1), calendar
         text = ""
     notes = {
         "already": probability(one.already_past),
         f"beyond {_km(life.horizon)} km": probability(one.beyond_horizon),
     }
     if before is not None:
-        day_text, at_least, at_most = before
-        notes[f"before {day_text}"] = probability_range((at_least, at_most))
+        asked, bounds = before
+        notes[f"before {asked}"] = probability_range(
+            (bounds.at_least[index], bounds.at_most[index])
+        )
     for what, chance in notes.items():
         yield f"  {what}: {chance}", "", "", "", "", ""
 

@@ -91,9 +91,7 @@ class Assessment:
         return health if health is not None and health.recorded_at and health.parameters else None
 
     def urgency(self, service: Service) -> tuple[int, float, float, str]:
-        """Return a key that sorts by days until the service; machines without verdict come before
-        safe ones.
-        """
+        """Return a sort key: days until the service; without a verdict before safe machines."""
         identity, verdict = self.judgement.stage, self.judgement.verdict
         if verdict == "not-enough-data":
             return (0 if self.alarmed else 1), 0.0, 0.0, identity
@@ -149,8 +147,8 @@ class LimitLife:
     ----------
     parameter : str
         Of the limit; ``any`` for the first limit reached.
-    limit : float
-        NaN for ``any``.
+    limit, baseline : float
+        In the unit of the parameter; the limit of ``any`` is NaN.
     travel : tuple of float
         In m, at least 0, infinite beyond the horizon.
     days : tuple of float
@@ -160,11 +158,13 @@ class LimitLife:
     already_past, beyond_horizon : float
         Probabilities.
     health : tuple of float
-        5, 50 and 95 % quantiles of the parameter now, by its laws; empty for ``any``.
+        5, 50 and 95 % quantiles of the parameter now by its laws, as fractions of the baseline;
+        empty for ``any``.
     """
 
     parameter: str
     limit: float
+    baseline: float
     travel: tuple[float, ...]
     days: tuple[float, ...]
     dates: tuple[date | None, ...]
@@ -273,19 +273,21 @@ def summarise(assessment: Assessment, service: Service, file: str = "") -> Summa
         probability=judgement.probability,
         why=judgement.why,
         health=_parameters(assessment),
-        life=None if assessment.prognosis is None else summarise_life(assessment.prognosis),
+        life=None
+        if assessment.prognosis is None
+        else summarise_life(assessment.prognosis, assessment.stage),
         service=service,
     )
 
 
-def summarise_life(prognosis: Prognosis) -> Life:
+def summarise_life(prognosis: Prognosis, stage: Stage) -> Life:
     """Summarise a prognosis: quantiles and probabilities of every limit, and of any."""
     return Life(
         stage=prognosis.stage,
         recorded_at=prognosis.recorded_at,
         travel=prognosis.travel,
         horizon=prognosis.horizon,
-        limits=_limits(prognosis),
+        limits=_limits(prognosis, stage),
         laws=prognosis.laws,
         undetermined=prognosis.unidentifiable,
     )
@@ -358,11 +360,13 @@ def _parameter(
     )
 
 
-def _limits(prognosis: Prognosis) -> tuple[LimitLife, ...]:
+def _limits(prognosis: Prognosis, stage: Stage) -> tuple[LimitLife, ...]:
+    baselines = {spec.name: spec.baseline for spec in stage.parameters}
     past, beyond = prognosis.already_past(), prognosis.beyond_horizon()
     travel, days = np.maximum(prognosis.censored(), 0), np.maximum(remaining_days(prognosis), 0)
     found = []
     for k, name in enumerate(prognosis.parameters):
+        baseline = baselines.get(name, 1.0)
         wait = quantiles(days[:, k], constants.RUL_LEVELS)
         found.append(
             LimitLife(
@@ -373,7 +377,8 @@ def _limits(prognosis: Prognosis) -> tuple[LimitLife, ...]:
                 dates=tuple(day_after(prognosis, one) for one in wait),
                 already_past=float(past[k]),
                 beyond_horizon=float(beyond[k]),
-                health=() if name == "any" else quantiles(prognosis.health[:, k]),
+                baseline=baseline,
+                health=() if name == "any" else quantiles(prognosis.health[:, k] / baseline),
             )
         )
     return tuple(found)

@@ -198,18 +198,23 @@ def plot_health(ax: Axes, health: Health, parameter: str, limit: float | None) -
 
 
 def plot_life(
-    ax: Axes, prognosis: Prognosis, parameter: str, *, health: Health | None = None
+    ax: Axes,
+    prognosis: Prognosis,
+    parameter: str,
+    *,
+    health: Health | None = None,
+    baseline: float = 1.0,
 ) -> Axes:
-    """Plot the degradation law of a parameter through now and into the future.
+    """Plot the degradation of a parameter up to the horizon, by its laws.
 
-    With `health`, its epochs stand beside the law, as 90 % intervals that know nothing of it,
-    unless they are mostly assumption. The bar on the limit holds 90 % of the moments at which it
-    is reached.
+    With `health`, 90 % intervals of epochs without a law are drawn too, if the data determine the
+    parameter. The bar on the limit is the 90 % interval of its first passage. `baseline` is the
+    value of the parameter at 100 %.
     """
     column = prognosis.parameters.index(parameter)
-    limit = float(prognosis.limits[column])
+    limit = float(prognosis.limits[column]) / baseline
     now, travel = prognosis.travel / _KM, prognosis.curve_travel / _KM
-    bands = 100 * prognosis.curve_quantiles[:, :, column]
+    bands = 100 * prognosis.curve_quantiles[:, :, column] / baseline
     _bands(ax, travel, bands, "law", told=True)
     top = 108.0
     if health is not None and _tells(health, parameter):

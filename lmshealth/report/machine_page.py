@@ -80,16 +80,18 @@ def make_page(
     generated : datetime or None
         Time to print on the page; none is printed for None.
     """
-    service = assessment.service()
+    service, parameters = assessment.service(), assessment.stage.parameters
     summary = summarise(assessment, service, file)
-    parameters = assessment.stage.parameters
+    news: tuple[str, ...] = ()
+    if before is not None:
+        news = changes(before, reported(assessment, service), parameters)
     content = {
         "assessment": assessment,
         "summary": summary,
         "bar": _bar_length(summary),
         "first_limit": _first_limit(assessment.prognosis),
         "before": before,
-        "news": () if before is None else changes(before, reported(assessment, service), parameters),
+        "news": news,
         **_track_content(assessment),
         **_health_content(assessment),
     }
@@ -266,7 +268,8 @@ def _scatter(fleet: FleetPrior | None, stage: Stage) -> Iterator[tuple[str, str,
         "factor": "factor on reported errors",
         "deviation": "deviation of health from its law",
     }
-    pairs = zip(expected_scatter(scatter_prior(stage)), expected_scatter(fleet.scatter), strict=True)
+    described, learned = expected_scatter(scatter_prior(stage)), expected_scatter(fleet.scatter)
+    pairs = zip(described, learned, strict=True)
     for (key, name), pair in zip(names.items(), pairs, strict=True):
         yield key, name, *pair
 
@@ -326,9 +329,14 @@ def _health_pictures(assessment: Assessment, service: Service) -> dict[tuple[str
                 figures.plot_health, health=health, parameter=name, limit=limits.get(name)
             )
     if prognosis is not None:
+        baselines = {spec.name: spec.baseline for spec in assessment.stage.parameters}
         for name in prognosis.parameters[:-1]:
             draw["life", name] = partial(
-                figures.plot_life, prognosis=prognosis, parameter=name, health=health
+                figures.plot_life,
+                prognosis=prognosis,
+                parameter=name,
+                health=health,
+                baseline=baselines[name],
             )
         draw["survival", "any"] = partial(
             figures.plot_survival, prognosis=prognosis, service=service

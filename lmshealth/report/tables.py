@@ -123,7 +123,9 @@ def frame(columns: str, rows: Sequence[Row]) -> pd.DataFrame:
     return pd.DataFrame(list(rows), columns=list(order))
 
 
-def machine_tables(readings: Sequence[LogEstimates], assessment: Assessment) -> dict[str, list[Row]]:
+def machine_tables(
+    readings: Sequence[LogEstimates], assessment: Assessment
+) -> dict[str, list[Row]]:
     """List everything about one machine, by the name of the table, which is a file without ending.
 
     Parameters
@@ -145,7 +147,7 @@ def machine_tables(readings: Sequence[LogEstimates], assessment: Assessment) -> 
     if assessment.health is not None:
         rows["health"] = health_rows(assessment.health)
     if assessment.prognosis is not None:
-        life = summarise_life(assessment.prognosis)
+        life = summarise_life(assessment.prognosis, assessment.stage)
         rows["prognosis"] = prognosis_rows(life, assessment.service())
     judgement = assessment.judgement
     verdict = judgement.verdict, judgement.probability
@@ -320,7 +322,9 @@ def _rul_columns(one: LimitLife) -> Row:
     hours = [24 * days for days in one.days]
     row: Row = {}
     for unit, values in (
-        ("km", [metres / _KM for metres in one.travel]), ("hours", hours), ("days", one.days)
+        ("km", [metres / _KM for metres in one.travel]),
+        ("hours", hours),
+        ("days", one.days),
     ):
         for level, value in zip(RUL_LEVELS, values, strict=True):
             row[f"rul_{unit}_q{100 * level:02.0f}"] = None if np.isinf(value) else value

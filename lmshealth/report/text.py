@@ -88,7 +88,7 @@ def interval(low: Number, high: Number) -> str:
     return f"{fixed(100 * low, 0)} to {percent(high, 0)}"
 
 
-def probability(value: Number) -> str:
+def probability(value: float) -> str:
     """Format a probability in percent; draws cannot prove 0 or 1."""
     if value < constants.LEAST_PROBABILITY:
         return f"below {percent(constants.LEAST_PROBABILITY)}"
@@ -97,7 +97,7 @@ def probability(value: Number) -> str:
     return percent(value, 0)
 
 
-def probability_range(bounds: tuple[Number, Number]) -> str:
+def probability_range(bounds: tuple[float, float]) -> str:
     """Format a probability that lies between two bounds."""
     at_least, at_most = bounds
     low, high = probability(at_least), probability(at_most)
@@ -116,7 +116,7 @@ def change(ln: Number, std: Number, digits: int = 2) -> str:
 
 def coarse(value: Number) -> str:
     """Format a number with three significant digits, two below 10."""
-    return number(value, 3 if abs(value) >= 10 else 2)
+    return number(value, 3 if abs(float(value)) >= 10 else 2)
 
 
 def km(metres: Number) -> str:

@@ -1,4 +1,4 @@
-"""Commands that do a whole archive, or tell a whole store."""
+"""Commands on archives and stores: run, report."""
 
 from __future__ import annotations
 
@@ -9,24 +9,23 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from lmshealth.cli import terminal
+from lmshealth.cli import terminal, views
 from lmshealth.cli.options import (
     EPOCHS,
     PDF,
     SCHEDULER,
     SEED,
+    SOME_REFUSED,
     WORKERS,
     examples,
     reading_options,
+    store_option,
 )
 from lmshealth.cli.progress import progress_bars
 from lmshealth.report.pdf import write_pdfs
 
 if TYPE_CHECKING:
     from lmshealth.batch.run import RunResult
-
-# An address on the command line is seen by everybody on the machine, with its password.
-STORE_VARIABLE = "LMSHEALTH_STORE"
 
 
 @click.command(
@@ -51,13 +50,8 @@ STORE_VARIABLE = "LMSHEALTH_STORE"
     required=True,
     help="Folder for tables and report.",
 )
-@click.option(
-    "--store",
-    envvar=STORE_VARIABLE,
-    show_envvar=True,
-    metavar="URL",
-    help="Where results are kept: sqlite:///PATH, or a PostgreSQL database; default a file in "
-    "--out.",
+@store_option(
+    help="Store of results: sqlite:///PATH or a PostgreSQL database; default a file in --out."
 )
 @reading_options
 @WORKERS
@@ -69,7 +63,7 @@ STORE_VARIABLE = "LMSHEALTH_STORE"
 def run(
     ctx: click.Context, /, logs: Path, stages: tuple[str, ...], out: Path, **options: Any
 ) -> None:
-    """Analyse a folder of logs: tables, verdict and report. Run again to go on."""
+    """Analyse a folder of logs: tables, verdicts and report. Run again to continue."""
     from lmshealth.batch.run import Settings
     from lmshealth.batch.run import run as run_pipeline
     from lmshealth.io.column_map import load_columns
@@ -87,21 +81,19 @@ def run(
     loaded = [load_stage(reference) for reference in stages]
     with progress_bars() as progress:
         result = run_pipeline(logs, loaded, out, settings, progress)
-    _tell(result)
+    _print_result(result)
     if options["pdf"]:
         write_pdfs(result.pages)
-    ctx.exit(3 if result.n_refused or result.n_unread or result.failed else 0)
+    ctx.exit(SOME_REFUSED if result.n_refused or result.n_unread or result.failed else 0)
 
 
-def _tell(result: RunResult) -> None:
-    from lmshealth.cli.lifeview import print_briefs
-
+def _print_result(result: RunResult) -> None:
     used = result.n_logs - result.n_refused
-    again = f", {result.n_remembered} of them known from before" if result.n_remembered else ""
+    again = f", {result.n_remembered} of them in an earlier run" if result.n_remembered else ""
     click.echo(f"{used} of {result.n_logs} logs analysed{again}.")
     if result.n_unread:
-        click.echo(f"{result.n_unread} rows or tables beside them not understood: see refused.csv.")
-    print_briefs([row.brief for row in result.rows])
+        click.echo(f"{result.n_unread} invalid tables or table rows: see refused.csv.")
+    views.print_summaries(result.rows)
     terminal.print_failed(result.failed)
     click.echo(f"Report: {result.index}")
 
@@ -112,14 +104,7 @@ def _tell(result: RunResult) -> None:
         "report --store postgresql://me@host/fleet --out pages/ --pdf",
     )
 )
-@click.option(
-    "--store",
-    envvar=STORE_VARIABLE,
-    show_envvar=True,
-    required=True,
-    metavar="URL",
-    help="What `run` has filled, by its URL.",
-)
+@store_option(required=True, help="Store that `run` has filled.")
 @click.option(
     "--out",
     type=click.Path(file_okay=False, path_type=Path),
@@ -132,7 +117,7 @@ def _tell(result: RunResult) -> None:
 def report(ctx: click.Context, /, store: str, out: Path, workers: int | None, pdf: bool) -> None:
     """Write the pages of all machines in a store, without their logs.
 
-    They are those that `run` wrote last for each machine, byte for byte.
+    The pages are those that `run` wrote last for each machine, byte for byte.
     """
     from lmshealth.batch.run import Settings
     from lmshealth.batch.run import report as write_pages
@@ -145,11 +130,11 @@ def report(ctx: click.Context, /, store: str, out: Path, workers: int | None, pd
     terminal.print_failed(result.failed)
     if pdf:
         write_pdfs(result.pages)
-    ctx.exit(3 if result.failed else 0)
+    ctx.exit(SOME_REFUSED if result.failed else 0)
 
 
 def _processors() -> int:
-    """Count the processors that this process may use."""
+    """Return the number of processors that this process may use."""
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1  # where no system call tells
+    return os.cpu_count() or 1
