@@ -21,7 +21,6 @@ from lmshealth.report.text import (
     percent,
     probability,
     probability_range,
-    quantity,
     spell,
 )
 
@@ -269,7 +268,8 @@ def _slope(row: Row) -> str:
 
 
 def _mean(values: Sequence[float]) -> str:
-    return number(sum(values) / len(values)) if values else ""
+    mean = sum(values) / len(values) if values else 0.0
+    return number(mean, 3 if mean >= 0.1 else 2) if values else ""
 
 
 def _print_lines(lines: Sequence[Row]) -> None:
@@ -650,8 +650,7 @@ def _limit_cells(
             break
         day = one.dates[k]
         calendar = "out of range" if day is None else day.isoformat()
-        hours = quantity(24 * days, 0)
-        yield text, share, _km(one.travel[k]), hours, quantity(days, 1), calendar
+        yield text, share, _km(one.travel[k]), f"{24 * days:,.0f}", f"{days:,.1f}", calendar
         text = ""
     notes = {
         "already": probability(one.already_past),
@@ -700,4 +699,4 @@ def _advice(life: Life, service: Service) -> Iterator[str]:
 
 
 def _km(metres: float) -> str:
-    return quantity(metres / _KM, 0)
+    return f"{metres / _KM:,.0f}"

@@ -65,11 +65,6 @@ def fixed(value: Number, digits: int) -> str:
     return "–" if np.isnan(value) else f"{value:.{digits}f}".replace("-", "−")
 
 
-def quantity(value: Number, digits: int) -> str:
-    """Format a number with fixed decimals and grouped thousands."""
-    return f"{value:,.{digits}f}".replace(",", GAP).replace("-", "−")
-
-
 def signed(value: Number, digits: int) -> str:
     """Format a number with its sign and fixed decimals."""
     return f"{value:+.{digits}f}".replace("-", "−")
@@ -115,8 +110,8 @@ def change(ln: Number, std: Number, digits: int = 2) -> str:
 
 
 def coarse(value: Number) -> str:
-    """Format a number with three significant digits, two below 10."""
-    return number(value, 3 if abs(float(value)) >= 10 else 2)
+    """Format a number with three significant digits, two below 100."""
+    return number(value, 3 if abs(float(value)) >= 100 else 2)
 
 
 def km(metres: Number) -> str:
@@ -126,7 +121,7 @@ def km(metres: Number) -> str:
 
 def whole_km(metres: Number) -> str:
     """Format a distance given in m to the kilometre."""
-    return f"{quantity(metres / _KM, 0)}{GAP}km"
+    return f"{metres / _KM:,.0f}{GAP}km".replace(",", GAP).replace("-", "−")
 
 
 def day_count(days: Number) -> str:

@@ -22,13 +22,13 @@ SHOWN = {
     "preload": "Loss of guide preload",
     "mount": "Loss of mount stiffness",
     "both": "Loss of guide preload and mount stiffness",
-    "step": "A sudden change that nothing explains",
+    "step": "Sudden change without a known cause",
     "not-enough-data": "Not enough data for a verdict",
 }
 # Instead of the last where modes have moved.
 ALARM = "Alarm: "
 _INDEX_ROW = re.compile(
-    r'<tr role="row" data-tone.*?<a href="([^"]+)">([^<]+)</a>.*?'
+    r'<tr role="row" data-state.*?<a href="([^"]+)">([^<]+)</a>.*?'
     r'<span class="mark \w+"><span[^>]*>.</span>([^<]*)</span>',
     re.S,
 )

@@ -29,7 +29,9 @@ from typing import Any
 
 import numpy as np
 
-from lmshealth.report.fleet_page import Summary, write_index
+from lmshealth.report.assessment import Summary
+from lmshealth.report.fleet_page import write_index
+from lmshealth.report.text import interval, percent, probability, time_left, travel_left
 from studies.harness.claims import Claim
 from studies.harness.study import Row, Study
 from studies.scale.rows import make_refused, make_rows
@@ -63,9 +65,12 @@ def bare(rows: Sequence[Summary]) -> str:
     """Write the words of the rows as the plainest table."""
     lines = []
     for row in rows:
-        cells = [row.identity, row.last_log.isoformat(), row.verdict, row.probability]
-        cells += [text for gauge in row.gauges for text in (gauge.value, gauge.interval)]
-        cells += [] if row.life is None else [row.life.km[1], row.life.days[1]]
+        cells = [row.identity, row.last_log.isoformat(), row.headline, probability(row.probability)]
+        for one in row.health:
+            cells += [percent(one.median, 0), interval(one.low, one.high)]
+        if row.life is not None:
+            left = row.life.any
+            cells += [travel_left(left.travel[3], row.life.horizon), time_left(left.days[3])]
         cells.append(f"{row.service.kind} {row.service.by or ''}")
         lines.append("".join(f"<td>{html.escape(cell)}" for cell in cells))
     return f"<!DOCTYPE html><title>bare</title><table><tr>{'<tr>'.join(lines)}</table>"

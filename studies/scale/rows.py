@@ -2,22 +2,19 @@
 
 from __future__ import annotations
 
-from datetime import date, timedelta
+from datetime import UTC, date, datetime, timedelta
 
 import numpy as np
 
 from lmshealth.io.log import Refusal
 from lmshealth.prognosis.maintenance_decision import Service
-from lmshealth.report.brief import Brief
-from lmshealth.report.fleet_page import Summary
-from lmshealth.report.healthfacts import Gauge, Life, Tone
-from lmshealth.report.text import GAP, day_count, km, percent
+from lmshealth.report.assessment import Life, LimitLife, ParameterHealth, State, Summary
 from studies.harness.study import Row
 
 TODAY = date(2026, 11, 20)
 HORIZON = 20e6
 # In m a day; and what the parameters may fall to.
-USAGE, LIMITS = 12e3, {"guide preload": 0.6, "mount stiffness": 0.7}
+USAGE, LIMITS = 12e3, {"guide_preload": 0.6, "mount_stiffness": 0.7}
 # Of so many stages one each is worn, and young.
 WORN, YOUNG = 25, 40
 REASONS = ("no stage", "unreadable", "time axis", "no channel")
@@ -43,56 +40,63 @@ def _row(k: int, rng: np.random.Generator) -> Summary:
     level = rng.uniform(0.66, 0.9, 2) if worn else rng.uniform(0.94, 1.03, 2)
     lost = [name for name, value in zip(LIMITS, level, strict=True) if value < 0.88]
     days = float(rng.uniform(-60, 400) if worn else rng.uniform(200, 6000))
-    verdict = "Not enough data for a verdict" if young else "Healthy"
+    headline = "Not enough data for a verdict" if young else "Healthy"
     if worn:
-        verdict = f"Loss of {' and '.join(lost or LIMITS)}"
-    tone: Tone = "open" if young else "bad" if worn else "good"
+        headline = f"Loss of {' and '.join(lost or LIMITS)}".replace("_", " ")
+    state: State = "open" if young else "bad" if worn else "good"
     service = _service(None if young else days)
-    likely = "" if young else percent(rng.uniform(0.8, 1))
-    gauges = () if young else tuple(map(_gauge, LIMITS, level, rng.uniform(0.01, 0.04, 2)))
+    probability = rng.uniform(0.8, 1)
+    health = () if young else tuple(map(_parameter, LIMITS, level, rng.uniform(0.01, 0.04, 2)))
     return Summary(
         file=f"{identity}.html",
         identity=identity,
         urgency=(1 if young else 2 if service.kind == "later" else 0, days, 0.0, identity),
         last_log=TODAY - timedelta(days=int(rng.integers(0, 30))),
-        tone=tone,
-        verdict=verdict,
-        probability=likely,
-        gauges=gauges,
-        life=None if young else _life(1.6 * days),
-        remaining=np.nan if young else 1.6 * days * USAGE,
+        state=state,
+        headline=headline,
+        verdict=state,
+        probability=np.nan if young else probability,
+        why="as drawn",
+        health=health,
+        life=None if young else _life(identity, 1.6 * days),
         service=service,
-        brief=Brief(identity, tone, "as drawn", (), "", service.kind, None),
     )
 
 
-def _gauge(name: str, level: float, std: float) -> Gauge:
-    values = {"low": level - 1.6 * std, "median": level, "high": level + 1.6 * std}
-    values |= {"baseline": 1.0, "limit": LIMITS[name]}
-    return Gauge(
+def _parameter(name: str, level: float, std: float) -> ParameterHealth:
+    return ParameterHealth(
         name=name,
-        told=True,
+        determined=True,
         converged=True,
-        share=f"96{GAP}%",
-        value=f"{100 * level:.0f}{GAP}%",
-        interval=f"{100 * values['low']:.0f} to {100 * values['high']:.0f}{GAP}%",
-        below=percent(0.0),
-        limit=f"{100 * LIMITS[name]:.3g}{GAP}%",
-        unit="",
-        places={key: round(100 * value / 1.5, 2) for key, value in values.items()},
+        informed=0.96,
+        low=level - 1.6 * std,
+        median=level,
+        high=level + 1.6 * std,
+        limit=LIMITS[name],
+        below_limit=0.0,
     )
 
 
-def _life(days: float) -> Life:
-    spread = [0.8 * days, days, 1.4 * days]
+def _life(identity: str, days: float) -> Life:
+    spread = tuple(max(factor * days, 0.0) for factor in (0.8, 0.85, 0.9, 1.0, 1.15, 1.3, 1.4))
+    any_limit = LimitLife(
+        parameter="any",
+        limit=np.nan,
+        baseline=1.0,
+        travel=tuple(day * USAGE for day in spread),
+        days=spread,
+        dates=(None,) * len(spread),
+        already_past=0.01,
+        beyond_horizon=0.01,
+    )
     return Life(
-        name="any limit",
-        limit="",
-        km=tuple("already passed" if day <= 0 else km(day * USAGE) for day in spread),
-        days=tuple("already passed" if day <= 0 else day_count(day) for day in spread),
-        past=percent(0.01),
-        beyond=percent(0.01),
-        now="",
+        stage=identity,
+        recorded_at=datetime(TODAY.year, TODAY.month, TODAY.day, tzinfo=UTC),
+        travel=1e6,
+        horizon=HORIZON,
+        limits=(any_limit,),
+        laws=(),
+        undetermined=(),
     )
 
 

@@ -75,7 +75,7 @@ def test_a_table_becomes_track_effects_and_events(estimates: Path, tmp_path: Pat
     assert "alarm" in set(events["kind"])
     assert set(pd.read_csv(out["effects"])["covariate"]) == {"temperature_c", "scale:acc"}
     assert len(pd.read_csv(out["track_cov"])) == N
-    assert "What happened" in result.output
+    assert "Events" in result.output
 
 
 def test_without_stage_and_names_modes_are_born(estimates: Path, tmp_path: Path) -> None:
@@ -99,7 +99,7 @@ def test_one_log_is_the_baseline(estimates: Path, tmp_path: Path) -> None:
     assert result.exit_code == 0, result.output
     track = pd.read_csv(tmp_path / "track.csv")
     assert (track["drift"] == 0).all()
-    assert "one log is the baseline" in result.stderr
+    assert "a single log is the baseline" in result.stderr
 
 
 def test_bad_tables_are_one_line_and_status_1(estimates: Path, tmp_path: Path) -> None:

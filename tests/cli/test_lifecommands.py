@@ -99,7 +99,7 @@ def test_estimates_become_remaining_lives(table: Path, toml: Path, tmp_path: Pat
     assert worn["before"] == "2026-05-01"
     assert f"Service: by {worn['service_by']} (accepted risk 5 %)" in result.stdout
     assert f"{worn['rul_km_q50']:,.0f}" in result.stdout
-    assert "AX-2: what is left" in result.stdout and "beyond 5,000" in result.stdout
+    assert "AX-2: remaining life" in result.stdout and "beyond 5,000" in result.stdout
     tree = xarray.open_datatree(draws, engine="h5netcdf")
     assert tree["AX-1/posterior/guide_preload"].to_numpy().mean() == pytest.approx(0.835, abs=0.03)
 
@@ -115,7 +115,7 @@ def test_the_command_line_chooses_the_day(table: Path, toml: Path, tmp_path: Pat
         assert "Before the service planned for 2026-06-01: 91 %" in result.stdout
         days.append(pd.read_csv(out)["service_by"].iloc[1])
     assert days[0] < days[1] and days[3] < days[2]
-    assert "least costs, where a failure costs 300 times" in result.stdout
+    assert "least cost, where a failure costs 300 times" in result.stdout
     assert call(table, "--stage", toml, "--out", out, "--cost-ratio", 1).exit_code == 2
 
 
@@ -187,7 +187,7 @@ def test_nothing_is_foretold_for_a_day_that_is_past(
     for day in ("2026-01-01", START.date().isoformat()):
         result = call(table, "--stage", toml, "--out", out, "--by", day)
         assert result.exit_code == 0, result.output
-        assert f"--by {day} is not after it" in result.stderr
+        assert f"--by {day} is not after the last log" in result.stderr
         assert f"before {day}" not in result.stdout
         assert "before" not in pd.read_csv(out).columns
 
@@ -199,5 +199,5 @@ def test_what_is_no_day_is_told_how_a_day_is_written(
     """Status 2, with the form and an example instead of the signs of a format."""
     result = call(table, "--stage", toml, "--out", tmp_path / "p.csv", "--by", day)
     assert result.exit_code == 2
-    assert f"{day!r} is no day; needed YYYY-MM-DD, such as 2027-03-01" in result.stderr
+    assert f"{day!r} is not a day; needed is YYYY-MM-DD, such as 2027-03-01" in result.stderr
     assert "%" not in result.stderr

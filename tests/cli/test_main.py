@@ -24,8 +24,7 @@ from lmshealth.report.tables import COLUMNS, LOG_COLUMNS
 from models.dynamics.stages import STAGES
 from models.recordings.velocities import Experiment, drive_velocities
 from studies.frf_modes.records import BAND, MODES, RATE, Machine, periodic
-from tests.assessments import worn
-from tests.report.test_machine_page import nothing
+from tests.assessments import nothing, worn
 from tests.signals import Mode, accelerations, write_archive, write_archive_stage, write_log
 
 MODE_KEYS = set(COLUMNS["modes"].split())
@@ -213,7 +212,7 @@ def test_a_refused_log_is_told_once_and_without_an_empty_table(folder: Path, sta
 
 def test_modes_without_a_band_say_what_may_be_missed(folder: Path, stage: Path) -> None:
     """Only people are told, and only where neither a band nor a description is given."""
-    log, said = folder / "bare.csv", "look closer with --band LOW HIGH."
+    log, said = folder / "bare.csv", "select them with --band LOW HIGH."
     assert said in " ".join(call("modes", log).stdout.split())
     for more in (("--band", 30, 200), ("--format", "csv"), ("--stage", stage)):
         assert "--band" not in call("modes", log, *more).stdout
@@ -618,7 +617,7 @@ def test_a_clean_run_is_status_0_and_says_where_its_report_is(
     assert str(tmp_path / "out" / "index.html") in result.stdout
     assert result.stderr == ""
     again = run(folder / "good", stage, tmp_path / "out")
-    assert "2 of them known from before" in again.stdout
+    assert "2 of them in an earlier run" in again.stdout
 
 
 @pytest.mark.slow

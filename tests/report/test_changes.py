@@ -11,9 +11,14 @@ import pytest
 
 from lmshealth._serialize import pack, unpack
 from lmshealth.report.changes import Reported, changes, reported
-from tests.assessments import worn
-from tests.report.test_machine_page import nothing
+from lmshealth.stage.description import ParameterSpec, load_stage
+from lmshealth.stage.priors import Lognormal
+from tests.assessments import nothing, worn
 
+PARAMETERS = (
+    *load_stage("lms-y").parameters,
+    ParameterSpec("coupling_stiffness", Lognormal(1.0, 0.3)),
+)
 THEN = Reported(
     recorded_at=datetime(2026, 6, 1, tzinfo=UTC),
     baseline_at=datetime(2026, 1, 1, tzinfo=UTC),
@@ -42,42 +47,42 @@ NOW = replace(
 
 def told(now: Reported, before: Reported = THEN) -> list[str]:
     """Give the sentences with all spaces alike."""
-    return [sentence.replace("\u202f", " ") for sentence in changes(before, now)]
+    return [sentence.replace("\u202f", " ") for sentence in changes(before, now, PARAMETERS)]
 
 
 def test_every_number_of_two_reports_is_set_side_by_side() -> None:
     """Verdict, health, life, date and logs, each in one sentence."""
     assert told(NOW) == [
-        "Verdict was healthy (93 %), now loss of preload (88 %).",
+        "Verdict: healthy (93 %) → loss of guide preload (88 %).",
         "Guide preload: 97 % → 91 % (90 %: 89 to 93 %).",
         "Remaining life, median: 5 000 km → 3 000 km (90 %: 1 000 km to beyond 20 000 km).",
         "Service date: 2027-03-03 → 2027-01-12, 50 days earlier.",
-        "12 logs and 340 km more.",
+        "12 logs more, 340 km further.",
     ]
 
 
 def test_nothing_new_is_said_as_such() -> None:
     """What stays is called so, not repeated as a change."""
     assert told(THEN) == [
-        "Verdict still healthy (93 %).",
+        "Verdict: still healthy (93 %).",
         "Guide preload: 97 % → 97 % (90 %: 95 to 99 %).",
         "Remaining life, median: still 5 000 km (90 %: 3 000 km to 9 000 km).",
         "Service date: still 2027-03-03.",
-        "As many logs as then.",
+        "Same number of logs.",
     ]
     coupling = replace(THEN, verdict="mount+coupling_stiffness")
-    loss = "Verdict was healthy (93 %), now loss of mount stiffness and coupling stiffness (93 %)."
+    loss = "Verdict: healthy (93 %) → loss of mount stiffness and coupling stiffness (93 %)."
     assert told(coupling)[0] == loss
-    assert told(replace(THEN, probability=0.8))[0] == "Verdict still healthy (80 %), then 93 %."
+    assert told(replace(THEN, probability=0.8))[0] == "Verdict: still healthy (80 %), before 93 %."
 
 
 @pytest.mark.parametrize(
     ("now", "said"),
     [
-        (replace(NOW, health={}), "Guide preload: 97 % then; these logs do not tell it any more."),
+        (replace(NOW, health={}), "Guide preload: 97 % → not determined."),
         (
             replace(NOW, health={"mount_stiffness": (0.5, 0.6, 0.7)}),
-            "Mount stiffness: 60 % (90 %: 50 to 70 %); not told then.",
+            "Mount stiffness: not determined → 60 % (90 %: 50 to 70 %).",
         ),
         (replace(NOW, remaining=None), "Remaining life, median: 5 000 km → not known."),
         (
@@ -94,7 +99,7 @@ def test_nothing_new_is_said_as_such() -> None:
         (replace(NOW, n_logs=18, travel=9e5), "2 logs fewer."),
         (
             replace(NOW, verdict="not-enough-data", probability=np.nan),
-            "Verdict was healthy (93 %), now not enough data.",
+            "Verdict: healthy (93 %) → not enough data for a verdict.",
         ),
     ],
 )
@@ -108,8 +113,8 @@ def test_what_keeps_reports_from_being_compared_comes_first() -> None:
     """Another description or another baseline is said before any number."""
     other = replace(NOW, description="d2", baseline_at=datetime(2026, 7, 1, tzinfo=UTC))
     description, baseline, *rest = told(other)
-    assert "stage description is another one" in description
-    assert "that of 2026-07-01 and no longer that of 2026-01-01" in baseline
+    assert "stage description has changed" in description
+    assert "from 2026-01-01 to 2026-07-01" in baseline
     assert rest == told(NOW)
 
 
@@ -142,7 +147,10 @@ def test_a_report_without_results_or_logs_has_gaps_not_failures(tmp_path: Path) 
     bare = nothing(worn(tmp_path))
     said = reported(bare)
     assert (said.health, said.remaining, said.service_by) == ({}, None, None)
-    assert told(said, said) == ["Verdict still not enough data.", "As many logs as then."]
+    assert told(said, said) == [
+        "Verdict: still not enough data for a verdict.",
+        "Same number of logs.",
+    ]
     history = bare.history
     empty = replace(
         history,

@@ -6,7 +6,6 @@ import re
 import subprocess
 import sys
 from dataclasses import replace
-from datetime import UTC, datetime, timedelta
 from xml.etree import ElementTree
 
 import numpy as np
@@ -21,166 +20,23 @@ from lmshealth.prognosis.maintenance_decision import decide
 from lmshealth.prognosis.results import Prognosis
 from lmshealth.report import figures as plots
 from lmshealth.report import figures as trackplots
-from lmshealth.signal.spectral_lines import Line
 from lmshealth.signal.waterfall import Waterfall
-from lmshealth.stage.degradation_laws import HertzWear, Law, Loosening
 from lmshealth.stage.description import Decision
-from lmshealth.stage.priors import Lognormal, Normal
 from lmshealth.tracking.covariate_effects import CovariateEffect
-from lmshealth.tracking.history import History, Series
+from lmshealth.tracking.history import History
 from lmshealth.tracking.track import Effect, Track
-from tests.lives import cut, health_of
-
-MODES = ("roll", "pitch", "yaw")
-PARAMETERS = ("guide_preload", "mount_stiffness")
-FREQUENCY = np.array([126.4, 136.6, 155.0])
-SENSITIVITY = np.array([[0.077, 0.26], [0.107, 0.18], [0.12, 0.05]])
-EPOCHS = 40
-START = datetime(2026, 6, 1, 8, 30, tzinfo=UTC)
-
-
-def life(wear_km: float, floor: float) -> tuple[FloatArray, FloatArray]:
-    """Return odometer in m and true health, shape (n_epochs, 2), of a machine."""
-    travel = np.linspace(120.0, 1720.0, EPOCHS) * 1000
-    s = travel - travel[0]
-    preload = (1 - s / (wear_km * 1000)) ** 1.5
-    mount = floor + (1 - floor) * np.exp(-s / 1.5e6)
-    return travel, np.column_stack([preload, mount])
-
-
-def make_history(stage: str, travel: FloatArray, truth: FloatArray, seed: int = 1) -> History:
-    """Make estimates of three modes with temperature and errors; roll is lost in one log."""
-    rng = np.random.default_rng(seed)
-    n, m = travel.size, len(MODES)
-    temperature = 21 + 2.5 * np.sin(np.arange(n) / 4) + rng.normal(0, 0.5, n)
-    level = np.log(FREQUENCY) + np.log(truth) @ SENSITIVITY.T
-    level = level - 1.2e-4 * (temperature[:, None] - 21)
-    std = np.r_[np.full(m, 8e-4), np.full(m, 0.06)] * np.exp(rng.normal(0, 0.25, (n, 1)))
-    cov = std[:, :, None] * std[:, None, :] * np.eye(2 * m)
-    damping = np.log([0.015, 0.018, 0.012]) + 0.1 * np.arange(n)[:, None] / n
-    noise = std * rng.standard_normal((n, 2 * m))
-    ln_f, ln_z = level + noise[:, :m], damping + noise[:, m:]
-    ln_f[7, 0] = ln_z[7, 0] = np.nan
-    cov[7, [0, m]] = cov[7][:, [0, m]] = np.nan
-    cov[7, :, 0] = cov[7, :, m] = np.nan
-    return History(
-        stage=stage,
-        logs=tuple(f"logs/{stage}/{i:04d}.csv" for i in range(n)),
-        recorded_at=tuple(START + timedelta(days=float(s) / 12e3) for s in travel - travel[0]),
-        travel=travel,
-        covariates={"temperature_c": temperature},
-        modes=MODES,
-        ln_frequency=ln_f,
-        ln_damping=ln_z,
-        cov=cov,
-        series=tuple(Series(mode, "acc") for mode in MODES),
-        loop_error=np.full(n, np.nan),
-        baselines=(0,),
-    )
-
-
-def make_track(history: History, truth: FloatArray, seed: int = 2) -> Track:
-    """Make a track whose line follows the truth."""
-    rng = np.random.default_rng(seed)
-    n, m = len(history.logs), len(history.modes)
-    drift = np.log(truth) @ SENSITIVITY.T
-    std = 6e-4 / np.sqrt(1 + np.arange(n))[:, None] + np.full(m, 2.5e-4)
-    wander = np.cumsum(rng.normal(0, 8e-5, (n, m)), axis=0)
-    ln_f = np.log(FREQUENCY) + drift + wander
-    dof = np.where(np.isnan(history.ln_frequency).any(axis=1), m - 1.0, float(m))
-    return Track(
-        stage=history.stage,
-        logs=history.logs,
-        recorded_at=history.recorded_at,
-        travel=history.travel,
-        modes=history.modes,
-        ln_frequency=ln_f,
-        ln_frequency_std=std,
-        ln_damping=np.log([0.015, 0.018, 0.012]) + 0.1 * np.arange(n)[:, None] / n,
-        ln_damping_std=np.full((n, m), 0.02),
-        drift=drift + wander,
-        drift_cov=(std**2)[:, :, None] * np.eye(m),
-        effects=tuple(Effect(mode, "temperature_c", -1.2e-4, 1.5e-5) for mode in history.modes),
-        nis=rng.chisquare(dof),
-        nis_dof=dof,
-        noise_scale=np.ones((n, 1)),
-        sources=("acc",),
-        events=(),
-        steps=(),
-        outliers=(),
-        innovations=rng.standard_normal((n, 2 * m)),
-        widening=np.ones(n),
-    )
-
-
-def make_health(
-    history: History, truth: FloatArray, informed: tuple[float, float] = (0.96, 0.93), seed: int = 3
-) -> Health:
-    """Make a posterior with the strong trade-off between preload and mount."""
-    rng = np.random.default_rng(seed)
-    n = len(history.logs)
-    std = np.where(np.array(informed) > 0.5, [0.055, 0.035], [0.3, 0.3])
-    std = std * (1 + 1.5 / np.sqrt(1 + np.arange(n)))[:, None] * [1.0, 1.0]
-    root = np.linalg.cholesky(np.array([[1, -0.9], [-0.9, 1]]))
-    both = min(informed) > 0.5
-    white = rng.standard_normal((n, 1500, 2))
-    white = white @ root.T if both else white
-    return health_of(
-        np.exp(np.log(truth)[:, None] + std[:, None] * white),
-        stage=history.stage,
-        recorded_at=history.recorded_at,
-        travel=history.travel,
-        parameters=PARAMETERS,
-        converged=np.ones(n, dtype=bool),
-        informed=np.tile(np.array(informed), (n, 1)),
-    )
-
-
-def make_prognosis(
-    history: History, wear_km: float, floor: float, limits: tuple[float, float] = (0.6, 0.7)
-) -> Prognosis:
-    """Make a prognosis from draws of the laws around the truth."""
-    rng = np.random.default_rng(4)
-    n, now = 4000, float(history.clock()[-1])
-    wear = HertzWear(life_km=Lognormal(8000, 0.5))
-    loose = Loosening(life_km=Lognormal(1500, 0.3), floor=Normal(0.7, 0.1))
-    laws: tuple[Law, Law] = (wear, loose)
-    theta: tuple[FloatArray, ...] = (
-        np.column_stack(
-            [wear_km * 1e3 * np.exp(rng.normal(0, 0.12, n)), rng.uniform(0.9, 1.15, n)]
-        ),
-        np.column_stack([rng.normal(floor, 0.03, n), 1.5e6 * np.exp(rng.normal(0, 0.15, n))]),
-    )
-    passed = [law.passage(t, x) for law, t, x in zip(laws, theta, limits, strict=True)]
-    remaining = np.column_stack(passed) - now
-    horizon = 20e6
-    grid = np.linspace(0, now + horizon, 240)
-    curves = [law.health(t, grid) for law, t in zip(laws, theta, strict=True)]
-    present = [law.health(t, np.array([now])) for law, t in zip(laws, theta, strict=True)]
-    return Prognosis(
-        stage=history.stage,
-        recorded_at=history.recorded_at[-1],
-        travel=float(history.travel[-1]),
-        parameters=(*PARAMETERS, "any"),
-        unidentifiable=(),
-        limits=np.array([*limits, np.nan]),
-        remaining=np.column_stack([remaining, remaining.min(axis=1)]),
-        usage=12e3 * np.exp(rng.normal(0, 0.08, n)),
-        horizon=horizon,
-        health=np.column_stack(present),
-        curve_travel=grid + history.travel[0],
-        curve_quantiles=np.stack(
-            [np.quantile(c, [0.05, 0.25, 0.5, 0.75, 0.95], axis=0) for c in curves], axis=-1
-        ),
-        laws=(),
-        chi_square=121.4,
-        degrees_of_freedom=115,
-        walk=8e-4,
-        noise_scale=1.02,
-        deviation=0.0,
-        ess=1830.0,
-        r_hat=1.006,
-    )
+from tests.assessments import (
+    EPOCHS,
+    FREQUENCY,
+    PARAMETERS,
+    life,
+    make_health,
+    make_history,
+    make_prognosis,
+    make_track,
+    make_waterfall,
+)
+from tests.lives import cut
 
 
 @pytest.fixture(scope="module")
@@ -373,18 +229,6 @@ def test_nis_band_is_chi_square(ax: Axes, track: Track) -> None:
     cdf = chi2.cdf(nis[seen], track.nis_dof[seen])
     assert data(ax, "outside")[0].size == np.sum((cdf < 0.025) | (cdf > 0.975))
     assert "log scale" in ax.get_ylabel()
-
-
-def make_waterfall(history: History) -> Waterfall:
-    """Make spectra with a peak at roll, a mains line in every log, and a log without levels."""
-    edges = np.geomspace(100.0, 180.0, 81)
-    centre = np.sqrt(edges[1:] * edges[:-1])
-    roll = np.exp(history.ln_frequency[:, 0])[:, None]
-    level = 12 - 3 * np.abs(centre - np.where(np.isnan(roll), FREQUENCY[0], roll)).clip(0, 6)
-    level[:, np.searchsorted(edges, 150.0) - 1] = 40.0
-    level[3] = np.nan
-    line = Line(150.0, 2e-3, "m/s²", "mains", "acc_feed")
-    return Waterfall(edges, level, tuple((line,) for _ in history.logs))
 
 
 def test_waterfall_shows_every_log_in_its_column(ax: Axes, history: History, track: Track) -> None:

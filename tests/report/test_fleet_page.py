@@ -10,20 +10,18 @@ from datetime import date
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from lmshealth._serialize import pack, unpack
-from lmshealth.report.assessment import Assessment
+from lmshealth.report.assessment import Assessment, Summary, summarise
 from lmshealth.report.fleet_page import (
-    Summary,
     by_urgency,
     file_names,
-    summarise,
     write_index,
 )
 from studies.scale.rows import TODAY, make_refused, make_rows
-from tests.assessments import leaves
-from tests.report.test_machine_page import Page, blind, chromium, make, nothing, watch, words
+from tests.assessments import Page, blind, chromium, leaves, make, nothing, watch, words
 
 __all__ = ["make"]
 N = 60
@@ -91,8 +89,8 @@ def test_services_are_counted_by_month(tmp_path: Path) -> None:
     assert counts["Feb"] == sum(date(2027, 2, 1) <= day < date(2027, 3, 1) for day in dates) > 0
     kinds = [row.service.kind for row in rows]
     assert (
-        f"{len(dates) - sum(counts.values())} are due later than that, {kinds.count('later')} need "
-        f"none as far as can be told, {kinds.count('unknown')} have no date"
+        f"{len(dates) - sum(counts.values())} are due after these months, {kinds.count('later')} "
+        f"need no service within the horizon, {kinds.count('unknown')} have no date"
     ) in words(page)
 
 
@@ -154,10 +152,10 @@ def test_a_stage_is_found_by_its_name(browser: Any, fleet: Path) -> None:
     """Parts of name and verdict in any order find it, accents or not; the count is told aloud."""
     page, seen = watch(browser, fleet)
     status = page.locator("[role=status]")
-    assert status.inner_text() == f"{N} of {N} stages, worst first"
+    assert status.inner_text() == f"{N} of {N} stages, most urgent first"
     page.get_by_label("Find").press_sequentially("m0028 x")
     assert seen_rows(page) == ["LINE00-M0028-X"]
-    assert status.inner_text() == f"1 of {N} stages, worst first"
+    assert status.inner_text() == f"1 of {N} stages, most urgent first"
     page.get_by_label("Find").fill("HEALTHY fuhr")
     assert seen_rows(page) == ["Führung 12"]
     page.get_by_label("Find").fill("nothing like it")
@@ -175,9 +173,9 @@ def test_states_and_dates_filter(browser: Any, fleet: Path) -> None:
     page.get_by_label("Find").focus()
     page.keyboard.press("Tab")
     page.keyboard.press("ArrowRight")
-    assert len(seen_rows(page)) == sum(row.tone == "bad" for row in rows) > 0
+    assert len(seen_rows(page)) == sum(row.state == "bad" for row in rows) > 0
     page.keyboard.press("ArrowRight")
-    assert len(seen_rows(page)) == sum(row.tone == "open" for row in rows) > 0
+    assert len(seen_rows(page)) == sum(row.state == "open" for row in rows) > 0
     page.get_by_label("All").check(force=True)
     page.get_by_role("button", name=re.compile("Mar")).click()
     assert page.get_by_label("Service before").input_value() == "2027-04-01"
@@ -214,7 +212,7 @@ def test_columns_sort(browser: Any, fleet: Path) -> None:
     assert head.get_attribute("aria-sort") is None and seen_rows(page)[1:3] == worst[1:3]
     life = page.get_by_role("columnheader", name="Remaining life, median")
     life.get_by_role("button").click()
-    lives = {row.identity: row.remaining for row in make_rows(N)}
+    lives = {row.identity: row.life.any.travel[3] if row.life else np.nan for row in make_rows(N)}
     found = [
         lives[name] for name in seen_rows(page) if name in lives and lives[name] == lives[name]
     ]
@@ -240,7 +238,7 @@ def test_the_list_is_complete_without_script(browser: Any, fleet: Path) -> None:
     page.goto(fleet.as_uri())
     assert len(seen_rows(page)) == N
     assert page.locator("input:visible, button:visible, select:visible").count() == 0
-    assert page.locator("[role=status]").inner_text() == f"{N} stages, worst first"
+    assert page.locator("[role=status]").inner_text() == f"{N} stages, most urgent first"
 
 
 @pytest.mark.slow
@@ -285,11 +283,8 @@ def test_no_name_is_ever_run(browser: Any, tmp_path: Path) -> None:
             row,
             identity=evil,
             file=files[evil],
-            verdict=evil,
-            probability=evil,
-            gauges=tuple(
-                replace(gauge, name=evil, value=evil, interval=evil) for gauge in row.gauges
-            ),
+            headline=evil,
+            health=tuple(replace(one, name=evil) for one in row.health),
         )
         for row, evil in zip(rows, HOSTILE, strict=True)
     ]

@@ -15,9 +15,8 @@ from lmshealth.report.figures import (
     GREEN,
     RED,
 )
-from lmshealth.report.machine_page import write_report
 from lmshealth.report.pdf import PdfError, write_pdfs
-from tests.assessments import worn
+from tests.assessments import worn, write_report
 
 
 @pytest.fixture(autouse=True, scope="module")

@@ -15,8 +15,8 @@ from matplotlib.figure import Figure
 from matplotlib.image import imread
 
 from lmshealth.report import figures as plots
-from lmshealth.report.svg import give_letters, lean, share_letters
-from tests.report.test_machine_page import chromium
+from lmshealth.report.svg import compact, give_letters, share_letters
+from tests.assessments import chromium
 
 
 def curve(ax: Axes) -> None:
@@ -46,7 +46,7 @@ def targets(text: str) -> tuple[set[str], list[str]]:
 
 def test_lean_keeps_what_is_seen() -> None:
     """Numbers keep two decimals, scales all; what is referred to keeps its name, nothing else."""
-    text = lean(
+    text = compact(
         '<svg>\n <!-- made by -->\n <metadata>x</metadata>\n <g id="axes">\n'
         '  <path id="m1" d="M 0.123456 1 \nL 2 3.999 \nz" style="fill: none; stroke: #000"/>\n'
         '  <use xlink:href="#m1" transform="translate(1.23456 0)"/>\n'
@@ -63,7 +63,7 @@ def test_markers_in_a_row_say_once_how_they_look() -> None:
     """A run of equal markers shares its style, one that looks otherwise has its own."""
     red, blue = 'style="fill:red"', 'style="fill:blue"'
     rows = [f'<use href="#m" x="{k}" {red if k < 3 else blue}/>\n' for k in range(4)]
-    text = lean(f'<svg>\n<path id="m"/>\n{"".join(rows)}</svg>')
+    text = compact(f'<svg>\n<path id="m"/>\n{"".join(rows)}</svg>')
     assert text.count(red) == text.count(blue) == 1 and text.count("<use") == 4
     assert text.index("<g ") < text.index('x="0"') < text.index('x="2"') < text.index("</g>")
 

@@ -15,10 +15,11 @@ from lmshealth.io.log import Metadata, Refusal
 from lmshealth.modal.modes import Modes
 from lmshealth.prognosis.maintenance_decision import decide, probability_before
 from lmshealth.prognosis.results import Prognosis
-from lmshealth.report.assessment import Assessment
+from lmshealth.report.assessment import Assessment, summarise_life
 from lmshealth.report.tables import (
     COLUMNS,
     frame,
+    lines_rows,
     machine_tables,
     modes_rows,
     prognosis_rows,
@@ -263,7 +264,10 @@ def test_a_day_that_is_asked_for_has_columns_of_its_own() -> None:
     life = prognosis(np.r_[np.full(50, 1e5), np.full(50, np.inf)])
     day = date(2046, 1, 1)
     before = day, probability_before(life, day)
-    table = frame(COLUMNS["prognosis"], prognosis_rows(life, decide(life, Decision()), before))
+    table = frame(
+        COLUMNS["prognosis"],
+        prognosis_rows(summarise_life(life, load_stage("lms-y")), decide(life, Decision()), before),
+    )
     assert list(table.columns[-3:]) == ["before", "probability_at_least", "probability_at_most"]
     assert table[table.columns[-3:]].to_numpy().tolist() == 2 * [[day, 0.5, 1.0]]
 
@@ -307,3 +311,15 @@ def test_events_and_smoothed_columns_leave_with_their_units(stage: Stage) -> Non
     assert rows[0]["frequency_std_hz_smoothed"] == pytest.approx(np.log(100.0))
     assert rows[3]["drift_std_smoothed"] == 1e-3
     assert "frequency_hz_smoothed" not in track_rows(made.track)[0]
+
+
+def test_lines_have_the_keys_of_the_contract() -> None:
+    """A line is told by frequency, amplitude with unit, kind and channel."""
+    (row,) = lines_rows([Line(50.0, 0.1, "m/s²", "mains", "acc_x")])
+    assert row == {
+        "frequency_hz": 50.0,
+        "amplitude": 0.1,
+        "unit": "m/s²",
+        "kind": "mains",
+        "channel": "acc_x",
+    }

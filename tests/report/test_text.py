@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from lmshealth.report.text import GAP, chance
+from lmshealth.report.text import GAP, probability_range
 
 
 @pytest.mark.parametrize(
@@ -21,4 +21,4 @@ from lmshealth.report.text import GAP, chance
 )
 def test_a_probability_between_bounds(at_least: float, at_most: float, text: str) -> None:
     """Bounds that read alike are one number; trivial ones are not named."""
-    assert chance(at_least, at_most).replace(GAP, " ") == text
+    assert probability_range((at_least, at_most)).replace(GAP, " ") == text
