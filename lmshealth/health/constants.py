@@ -21,14 +21,13 @@ The relative standard deviation of the evidence is then at most 5 %."""
 
 MIN_FIT = 1e-4
 """Drifts whose probability under the best state of the parameters is lower are unexplained.
-One healthy machine in 10,000 is refused by chance; a wrong map or mode is refused at 4 sigma."""
+At most one machine in 10,000 is refused by chance."""
 
 DEGRADED_SHARE = 0.25
-"""A parameter is degraded once it has lost this share of the distance from baseline to limit: time
-is left to plan a service, and intervals of the shipped stages are some 3 % wide."""
+"""A parameter is degraded once it has lost this share of the distance from baseline to limit. At a
+limit of 0.6 this is a loss of 10 %, four half-widths of a 90 % interval of the shipped stages."""
 LOSS_WITHOUT_LIMIT = 0.4
-"""Share of the baseline that a parameter without limit may lose: as the limits of the paper's
-stages, 0.6 of the preload [Piscalov2021]."""
+"""Share of the baseline that a parameter without limit may lose: as the preload of lms-y."""
 
 PRIOR_FACTOR = 2.0
 """Factor on the width of the priors by which the sensitivity of a posterior is checked."""

@@ -1,4 +1,4 @@
-"""First passage: when health, its law times a deviation that wanders, falls to a limit."""
+"""First passage of health, a law times the exponential of a Wiener process, to its limit."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ import numpy as np
 from lmshealth._arrays import FloatArray
 from lmshealth.prognosis.scenarios import DegradationPath
 
-# Points up to where the law alone would be well past the limit, and from there to the horizon.
+# Grid points up to 1.5 times the passage of the law alone, and from there to the horizon.
 _NEAR, _FAR = 24, 12
 _BEYOND = 1.5
-_RARE = 1e-9
+_RARE = 1e-9  # bounds of the mean and shape of the inverse Gaussian
 
 
 def first_passage(
@@ -24,51 +24,47 @@ def first_passage(
     limit: float,
     horizon: float,
 ) -> FloatArray:
-    """Draw the travel from now to the first moment at which health is at its limit.
+    """Draw the travel from now to the first passage of a limit.
 
-    Ln health is that of the law plus a Wiener process, which is ``off`` now. Without the process
-    the passage is that of the law, in closed form. With it, the process is drawn at few moments,
-    and what it does between two of them is a Brownian bridge over the variance v, which touches a
-    straight limit with probability exp(-2 a b / v), a and b its distances from the limit at both
-    ends; the odds of the part of the way at which it first does are inverse Gaussian, of mean
-    a / abs(b) and shape a² / v.
+    Without deviation the passage is that of the law, in closed form. With deviation, ln health is
+    drawn at grid points and a Brownian bridge is between them; README.md has the equations.
 
     Parameters
     ----------
     path : DegradationPath
-        What the parameter does.
+        Degradation of the parameter.
     theta : ndarray
-        Its natural parameters, shape ``(n, k)``.
+        Natural parameters, shape ``(n, k)``.
     off : ndarray
-        Ln of health over its law now, shape ``(n,)``.
+        Deviation of ln health from its law now, shape ``(n,)``.
     rate : ndarray
-        Variance of the process per m, shape ``(n,)``.
+        Variance of the deviation per m, shape ``(n,)``.
     rng : Generator
-        Of all randomness.
+        Random numbers.
     now : float
         Travel in m since the baseline.
     limit : float
-        As a fraction of baseline.
+        Limit as a fraction of baseline.
     horizon : float
-        Travel in m from now, past which nothing is claimed.
+        Travel in m from now beyond which nothing is published.
 
     Returns
     -------
     ndarray
-        In m, shape ``(n,)``: negative where it has been passed, by so much by the law; infinite
-        where it is never reached or, if the process moves, not before the horizon.
+        In m, shape ``(n,)``: negative, by the law, if the limit has been passed; infinite if it is
+        never reached or, with deviation, not before the horizon.
 
     References
     ----------
-    Borodin2002 for the bridge.
+    [Borodin2002]
     """
     left = path.passage(theta, limit * np.exp(-off)) - now
-    # What gains may have been under its limit before, after a jump: that is over.
+    # A law that gains may have been below the limit before, and is above it now.
     above = path.health(theta, np.array([now]))[:, 0] * np.exp(off) > limit
     left[above & (left <= 0)] = np.inf
     moving = (rate > 0) & (left > 0)
     if moving.any():
-        left[moving] = _wandering(
+        left[moving] = _with_deviation(
             path,
             theta[moving],
             off[moving] - np.log(limit),
@@ -81,7 +77,7 @@ def first_passage(
     return left
 
 
-def _wandering(
+def _with_deviation(
     path: DegradationPath,
     theta: FloatArray,
     above: FloatArray,
@@ -98,11 +94,11 @@ def _wandering(
     step = np.diff(ahead, axis=1)
     variance = rate[:, None] * step
     walk = np.cumsum(np.sqrt(variance) * rng.standard_normal(step.shape), axis=1)
-    with np.errstate(divide="ignore"):  # nothing is left past the end of a law
+    with np.errstate(divide="ignore"):  # health is 0 past the end of a law
         distance = np.log(path.health(theta, now + ahead)) + above[:, None]
     distance[:, 1:] += walk
     a, b = distance[:, :-1], distance[:, 1:]
-    # Past the limit at the end, or touching it in between.
+    # Below the limit at the end of the interval, or the bridge touches it in between.
     with np.errstate(invalid="ignore", over="ignore"):
         touched = np.exp(-2 * a * b / variance) > rng.uniform(size=step.shape)
     crossed = (b <= 0) | touched
@@ -110,7 +106,7 @@ def _wandering(
     a, b, begin, length = (
         np.take_along_axis(part, first, axis=1)[:, 0] for part in (a, b, ahead[:, :-1], step)
     )
-    # When a bridge of length T that touches 0 does so first: t / (T - t) is inverse Gaussian.
+    # First passage t of a bridge of length T that touches 0: t / (T - t) is inverse Gaussian.
     spread = rate * length
     with np.errstate(divide="ignore", invalid="ignore"):
         odds = rng.wald(np.clip(a / np.abs(b), _RARE, 1 / _RARE), np.maximum(a * a / spread, _RARE))

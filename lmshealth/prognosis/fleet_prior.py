@@ -1,26 +1,6 @@
-"""What machines of one description teach about a young one: a prior learned from the fleet.
+"""Prior of a degradation law from the other machines of the description (empirical Bayes).
 
-The prior of a stage description is about one machine of a fleet that nobody has seen. A part of its
-variance is between fleets, the rest v between the machines of one: in the coordinate z in which the
-prior of a law's pace (its life, or its rate) is a standard normal distribution,
-
-    z of a machine ~ N(m, v),   mean m of the fleet ~ N(0, 1 - v),   v ~ U(0, 1),
-
-so that a machine of an unknown fleet has the description's prior, whatever v is. Likewise the
-machines of a fleet follow a law with a probability s ~ Beta(k w, k (1 - w)), w being that of the
-description and k the number of laws to choose from; and so with the values of the grid of scatter.
-
-The data D of a machine, of which the posterior under the description has draws of z, say of this
-
-    p(D | m, v, s) / p(D) = s P / w E[p(z | m, v) / p(z)] + (1 - s) (1 - P) / (1 - w)
-
-with P the posterior probability of the law and E the mean over its draws. Machines multiply. m, v
-and s are integrated over a grid, not maximised, so that few teachers leave the description's prior
-nearly as it is. Each law is learned by itself, with all else as the description has it.
-
-References
-----------
-Gelman2013, chapter 5, for hierarchical models.
+README.md has the model.
 """
 
 from __future__ import annotations
@@ -34,6 +14,7 @@ from scipy.special import betainc, logsumexp, softmax
 
 from lmshealth._arrays import FloatArray
 from lmshealth._serialize import fingerprint
+from lmshealth.prognosis import constants
 from lmshealth.prognosis.life_likelihood import scatter_prior
 from lmshealth.prognosis.life_posterior import LifePosterior
 from lmshealth.prognosis.remaining_life import identifiable_limits
@@ -42,36 +23,31 @@ from lmshealth.stage.degradation_laws import AnyLaw, Law
 from lmshealth.stage.description import ScatterPrior, Stage
 from lmshealth.stage.priors import Lognormal, Normal
 
-LEAST_TEACHERS = 3
-# A law less probable than this is not what a remaining life rests on.
-_WORTH = 0.05
-# Grid of the mean and of the variance between the machines of a fleet, with its log prior. A fleet
-# whose machines are more alike than by a fifth of the prior's width is of no further use.
-_MEAN = np.linspace(-3.0, 3.0, 41)[:, None]
-_VARIANCE = (np.arange(12) + 0.5) / 12
+_MEAN, _VARIANCE = constants.FLEET_MEAN, constants.FLEET_VARIANCE
+# Log prior of mean and variance at their grid: N(0, 1 - v) and U(0, 1).
 _LOG_PRIOR = -0.5 * (_MEAN**2 / (1 - _VARIANCE) + np.log(1 - _VARIANCE))
 _SHARE_EDGES = np.sin(np.linspace(0, np.pi / 2, 33)) ** 2
-# What is learned is told no finer, so that one log more does not change all priors of a fleet.
-_DIGITS = 2
-# By the field of a law that is the prior of its pace: the natural parameter it is of, and its unit.
+# By the field that is the prior of a law's pace: the natural parameter, and its unit.
 _PACES = {"life_km": ("life_m", 1e3), "rate_per_km": ("rate_per_m", 1e-3)}
 _N_SCATTER = 500
 _SCATTERS = tuple(field.name for field in fields(ScatterPrior))
+_NO_PACE = np.zeros((1, 1))
 
 Pace = Lognormal | Normal
+"""Prior of the pace of a law: of its life, or of its rate."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LawEvidence:
-    """What a machine says of one of several laws, or values, of which every machine has one.
+    """Evidence of a machine on one of several laws, or values of the scatter.
 
     Attributes
     ----------
     prior, posterior : float
-        Probability that the machine has it, by the description and by its logs.
+        Probability of the law by the description and by the machine's logs.
     pace : ndarray
-        Ln likelihood of mean and variance of the fleet if it has, relative to the description's
-        prior, shape ``(n_means, n_variances)``, or ``(1, 1)`` where there is no pace to learn.
+        Log likelihood of mean and variance of the fleet under the law, relative to that of the
+        description's prior, shape ``(n_means, n_variances)``, or ``(1, 1)`` without a pace.
     """
 
     prior: float
@@ -81,7 +57,7 @@ class LawEvidence:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MachineEvidence:
-    """What one machine teaches the others.
+    """Evidence of one machine for the prior of the others.
 
     Attributes
     ----------
@@ -90,8 +66,8 @@ class MachineEvidence:
     scatter : dict
         By field of `ScatterPrior`, of each value.
     informed : float
-        Part of the prior's variance of a law's pace that the logs have removed: the least of all
-        laws by which the machine may come to a limit.
+        Share of the prior variance of a law's pace that the logs removed, the least of all probable
+        laws of identifiable parameters with a limit.
     """
 
     laws: dict[str, dict[str, LawEvidence]]
@@ -101,18 +77,18 @@ class MachineEvidence:
 
 @dataclass(frozen=True, slots=True)
 class LawPrior:
-    """What is believed of a law beforehand: by the description, then by the fleet.
+    """Prior of a law by the description, then by the fleet.
 
     Attributes
     ----------
     parameter, kind : str
-        Which.
+        Health parameter and kind of law.
     share : tuple of float
-        Probability that a machine follows it.
+        Probability that a machine follows the law.
     field : str
-        Which prior of the law is learned: ``life_km`` or ``rate_per_km``; empty for none.
+        Field of the law with the prior of its pace, ``life_km`` or ``rate_per_km``; empty without.
     pace : tuple of prior, or None
-        That prior.
+        Prior of the pace.
     """
 
     parameter: str
@@ -124,16 +100,16 @@ class LawPrior:
 
 @dataclass(frozen=True, slots=True)
 class FleetPrior:
-    """The prior that other machines of a fleet have taught a young one.
+    """Prior of a machine from the other machines of its fleet.
 
     Attributes
     ----------
     n_machines : int
         Number of the others.
     laws : tuple of LawPrior
-        Of all health parameters.
+        Laws of all health parameters.
     scatter : ScatterPrior
-        What is believed of the scatter of logs about a life.
+        Prior of the scatter of logs about a life.
     """
 
     n_machines: int
@@ -141,12 +117,14 @@ class FleetPrior:
     scatter: ScatterPrior
 
     def apply_to(self, stage: Stage) -> Stage:
-        """Put the prior into the description; the digest follows from both."""
+        """Return the stage with this prior, and a digest of both."""
         known = {(law.parameter, law.kind): law for law in self.laws}
         parameters = tuple(
             msgspec.structs.replace(
                 parameter,
-                law=tuple(_changed(law, known[parameter.name, law.kind]) for law in parameter.laws),
+                law=tuple(
+                    _with_prior(law, known[parameter.name, law.kind]) for law in parameter.laws
+                ),
             )
             for parameter in stage.parameters
         )
@@ -159,18 +137,18 @@ class FleetPrior:
 
 
 def machine_evidence(stage: Stage, life: LifePosterior) -> MachineEvidence:
-    """Say what the logs of a machine teach of its fleet.
+    """Return the evidence of a machine for the prior of its fleet.
 
-    A law that begins anew at a step has the prior of one from the baseline on, and teaches as much.
+    A law that restarts at a step has the prior of one from the baseline on, and counts alike.
 
     Parameters
     ----------
     stage : Stage
-        The description itself: by a prior that others have taught their lessons would count twice.
+        The description itself: with a fleet prior the others' evidence would count twice.
     life : LifePosterior
         Posterior of the machine under it.
     """
-    told = {j for j, _ in identifiable_limits(stage, life.modes)}
+    limited = {j for j, _ in identifiable_limits(stage, life.modes)}
     laws: dict[str, dict[str, LawEvidence]] = {}
     informed = 1.0
     for j, parameter in enumerate(stage.parameters):
@@ -179,25 +157,25 @@ def machine_evidence(stage: Stage, life: LifePosterior) -> MachineEvidence:
         for law in parameter.laws:
             z, weight = _pace_draws(life, j, law)
             after = min(float(weight.sum()), 1.0)
-            # What the machine does not follow it says nothing of.
-            pace = np.zeros(_LOG_PRIOR.shape if _pace_field(law) else (1, 1))
+            # A law that the machine does not follow has no evidence on its pace.
+            pace = np.zeros(_LOG_PRIOR.shape) if _pace_field(law) else _NO_PACE
             if _pace_field(law) and after:
                 pace = pace_likelihood(z, weight / after)
-                if j in told and after >= _WORTH:
+                if j in limited and after >= constants.MIN_LAW_PROBABILITY:
                     informed = min(informed, 1 - float(np.cov(z, aweights=weight)))
             laws[parameter.name][law.kind] = LawEvidence(law.weight / total, after, pace)
-    return MachineEvidence(laws, _scatter_heard(stage, life), informed)
+    return MachineEvidence(laws, _scatter_evidence(stage, life), informed)
 
 
 def pace_likelihood(z: FloatArray, weight: FloatArray) -> FloatArray:
-    """Say how likely the data of a machine are in a fleet, over how likely by the description.
+    """Return the log likelihood ratio of fleets with mean m and variance v to the description.
 
     Parameters
     ----------
     z : ndarray
-        Draws of the pace under the description, as its prior makes standard, shape ``(n,)``.
+        Draws of the standardised pace under the description, shape ``(n,)``.
     weight : ndarray
-        They sum to one, shape ``(n,)``.
+        Normalised weights, shape ``(n,)``.
 
     Returns
     -------
@@ -211,187 +189,185 @@ def pace_likelihood(z: FloatArray, weight: FloatArray) -> FloatArray:
     return np.column_stack(columns)
 
 
-def needs_fleet_prior(lesson: MachineEvidence) -> bool:
-    """Tell whether a machine's own logs say too little of how its life ends.
+def needs_fleet_prior(evidence: MachineEvidence) -> bool:
+    """Return whether a machine's own logs inform the pace of a probable law too little.
 
-    So it is while they have removed less than half of the prior's variance of the pace of a law
-    that leads to a limit and that it follows with a probability of 5 % or more: its remaining life
-    is then mostly what was believed beforehand. A machine without wear is young in this sense
-    however far it has travelled, until hardly anything speaks for a law by which it would wear.
+    A machine without wear needs the fleet prior, however far it has travelled, until a law by which
+    it would wear is improbable.
     """
-    return lesson.informed < INFORMED
+    return evidence.informed < INFORMED
 
 
-def fleet_priors(stage: Stage, lessons: Mapping[str, MachineEvidence]) -> dict[str, FleetPrior]:
-    """Learn a prior for each young machine from all the others.
+def fleet_priors(stage: Stage, evidence: Mapping[str, MachineEvidence]) -> dict[str, FleetPrior]:
+    """Estimate a prior for each machine that needs one from all others.
 
-    All others teach, those too that show no wear: without them all machines would seem to wear, and
-    to wear fast.
+    Machines without wear count too: without them all machines would seem to wear, and fast.
 
     Parameters
     ----------
     stage : Stage
-        The description of all of them.
-    lessons : mapping of str to MachineEvidence
+        Their common description.
+    evidence : mapping of str to MachineEvidence
         By machine, in any order.
 
     Returns
     -------
     dict of str to FleetPrior
-        By young machine; empty where fewer than three others teach.
+        By machine; empty with fewer than three others.
     """
-    machines, n_machines = sorted(lessons), len(lessons) - 1
-    young = [machine for machine in machines if needs_fleet_prior(lessons[machine])]
-    if n_machines < LEAST_TEACHERS or not young:
+    machines, n_others = sorted(evidence), len(evidence) - 1
+    needy = [machine for machine in machines if needs_fleet_prior(evidence[machine])]
+    if n_others < constants.MIN_MACHINES or not needy:
         return {}
-    laws: dict[str, list[LawPrior]] = {name: [] for name in young}
+    laws: dict[str, list[LawPrior]] = {name: [] for name in needy}
     for parameter in stage.parameters:
-        found: dict[str, list[LawPrior]] = {name: [] for name in young}
+        found: dict[str, list[LawPrior]] = {name: [] for name in needy}
         for law in parameter.laws:
-            heard = {name: lessons[name].laws[parameter.name][law.kind] for name in machines}
-            for name, belief in _beliefs(heard, young, len(parameter.laws)).items():
-                found[name].append(_learned(parameter.name, law, heard[name].prior, belief))
-        for name, own in found.items():
-            laws[name] += _of_one(own)
-    scatters: dict[str, list[tuple[float, ...]]] = {name: [] for name in young}
+            own = {name: evidence[name].laws[parameter.name][law.kind] for name in machines}
+            for name, predictive in _predictives(own, needy, len(parameter.laws)).items():
+                found[name].append(_law_prior(parameter.name, law, own[name].prior, predictive))
+        for name, priors in found.items():
+            # Estimated one by one: their probabilities are normalised.
+            total = sum(one.share[1] for one in priors)
+            laws[name] += [
+                replace(one, share=(one.share[0], _rounded(one.share[1] / total))) for one in priors
+            ]
+    scatters: dict[str, list[tuple[float, ...]]] = {name: [] for name in needy}
     for field in _SCATTERS:
-        columns = zip(*(lessons[name].scatter[field] for name in machines), strict=True)
+        columns = zip(*(evidence[name].scatter[field] for name in machines), strict=True)
         values = [dict(zip(machines, column, strict=True)) for column in columns]
-        learned = [_beliefs(heard, young, len(values)) for heard in values]
-        for name in young:
-            scatters[name].append(tuple(_rounded(belief[name].share) for belief in learned))
+        predictives = [_predictives(own, needy, len(values)) for own in values]
+        for name in needy:
+            scatters[name].append(tuple(_rounded(one[name].share) for one in predictives))
     return {
-        name: FleetPrior(n_machines, tuple(laws[name]), ScatterPrior(*scatters[name]))
-        for name in young
+        name: FleetPrior(n_others, tuple(laws[name]), ScatterPrior(*scatters[name]))
+        for name in needy
     }
 
 
 @dataclass(frozen=True, slots=True)
-class _Belief:
-    """Probability that a machine follows a law; mean and standard deviation of z if it does."""
+class _Predictive:
+    """Probability of a law for a machine; mean and standard deviation of z under the law."""
 
     share: float
     mean: float
     std: float
 
 
-def _beliefs(heard: Mapping[str, LawEvidence], young: Sequence[str], n: int) -> dict[str, _Belief]:
-    """Give what all others teach each young machine of one of n laws or values."""
-    share, log_prior = _hyperprior(heard[young[0]], n)
+def _predictives(
+    evidence: Mapping[str, LawEvidence], needy: Sequence[str], n: int
+) -> dict[str, _Predictive]:
+    """Return the predictive of one of n laws for each machine from the evidence of all others."""
+    share, log_prior = _hyperprior(evidence[needy[0]], n)
     total = log_prior
-    for one in heard.values():
-        total = total + _log_lesson(one, share)
-    return {name: _predicted(share, total - _log_lesson(heard[name], share)) for name in young}
+    for one in evidence.values():
+        total = total + _log_evidence(one, share)
+    return {
+        name: _predictive(share, total - _log_evidence(evidence[name], share)) for name in needy
+    }
 
 
-def _hyperprior(heard: LawEvidence, n: int) -> tuple[FloatArray, FloatArray]:
-    """Give nodes of the share, and the log prior of share, mean and variance at the nodes.
+def _hyperprior(evidence: LawEvidence, n: int) -> tuple[FloatArray, FloatArray]:
+    """Return nodes of the share, and the log prior of share, mean and variance at the nodes.
 
     Shapes ``(n_shares,)`` and ``(n_shares, n_means, n_variances)``.
     """
-    own = _LOG_PRIOR if heard.pace.size > 1 else np.zeros((1, 1))
+    own = _LOG_PRIOR if evidence.pace.size > 1 else np.zeros((1, 1))
     if n == 1:
         return np.ones(1), own[None]
-    a, b = n * heard.prior, n * (1 - heard.prior)
+    a, b = n * evidence.prior, n * (1 - evidence.prior)
     mass = np.diff(betainc(a, b, _SHARE_EDGES))
-    # The mean of each cell is its node, so that the mean of all is that of the description.
+    # Each node is the mean of its cell, so that the mean share is the description's.
     with np.errstate(invalid="ignore", divide="ignore"):
-        node = heard.prior * np.diff(betainc(a + 1, b, _SHARE_EDGES)) / mass
+        node = evidence.prior * np.diff(betainc(a + 1, b, _SHARE_EDGES)) / mass
         log_mass = np.log(mass)
     node = np.where(mass > 0, node, (_SHARE_EDGES[1:] + _SHARE_EDGES[:-1]) / 2)
     return np.clip(node, _SHARE_EDGES[:-1], _SHARE_EDGES[1:]), log_mass[:, None, None] + own
 
 
-def _log_lesson(heard: LawEvidence, share: FloatArray) -> FloatArray:
-    """Give ln p(D | m, v, s) / p(D), ``(n_shares, n_means, n_variances)``."""
+def _log_evidence(evidence: LawEvidence, share: FloatArray) -> FloatArray:
+    """Return ln p(D | m, v, s) / p(D), shape ``(n_shares, n_means, n_variances)``."""
     with np.errstate(divide="ignore"):
-        has = np.log(share * heard.posterior / heard.prior)
+        has = np.log(share * evidence.posterior / evidence.prior)
         if share.size == 1:
-            return has[:, None, None] + heard.pace
-        lacks = np.log((1 - share) * (1 - heard.posterior) / (1 - heard.prior))
-    return np.logaddexp(has[:, None, None] + heard.pace, lacks[:, None, None])
+            return has[:, None, None] + evidence.pace
+        lacks = np.log((1 - share) * (1 - evidence.posterior) / (1 - evidence.prior))
+    return np.logaddexp(has[:, None, None] + evidence.pace, lacks[:, None, None])
 
 
-def _predicted(share: FloatArray, log_posterior: FloatArray) -> _Belief:
-    """Average over the hyperparameters; z by the moments of the mixture that it then has."""
+def _predictive(share: FloatArray, log_posterior: FloatArray) -> _Predictive:
+    """Average over the hyperparameters; z by the moments of its mixture."""
     weight = softmax(log_posterior) * share[:, None, None]
     mean_share = float(weight.sum())
     of_pace = weight.sum(axis=0) / mean_share
     if of_pace.size == 1:
-        return _Belief(mean_share, 0.0, 1.0)
+        return _Predictive(mean_share, 0.0, 1.0)
     mean = np.sum(of_pace * _MEAN)
     variance = np.sum(of_pace * (_VARIANCE + _MEAN**2)) - mean**2
-    return _Belief(mean_share, float(mean), float(np.sqrt(variance)))
+    return _Predictive(mean_share, float(mean), float(np.sqrt(variance)))
 
 
-def _of_one(laws: Sequence[LawPrior]) -> list[LawPrior]:
-    """Let the laws of a parameter, each learned by itself, share one probability."""
-    total = sum(law.share[1] for law in laws)
-    return [replace(law, share=(law.share[0], _rounded(law.share[1] / total))) for law in laws]
-
-
-def _learned(parameter: str, law: AnyLaw, before: float, belief: _Belief) -> LawPrior:
+def _law_prior(parameter: str, law: AnyLaw, before: float, predictive: _Predictive) -> LawPrior:
     pace, field = None, _pace_field(law)
     if field:
         prior = getattr(law, field)
-        placed = prior.placed(belief.mean, belief.std)
+        placed = prior.placed(predictive.mean, predictive.std)
         pace = (prior, type(prior)(*(_rounded(value) for value in msgspec.structs.astuple(placed))))
-    return LawPrior(parameter, law.kind, (before, _rounded(belief.share)), field, pace)
+    return LawPrior(parameter, law.kind, (before, _rounded(predictive.share)), field, pace)
 
 
-def _changed(law: AnyLaw, learned: LawPrior) -> AnyLaw:
-    changes: dict[str, object] = {"weight": learned.share[1]}
-    if learned.pace is not None:
-        changes[learned.field] = learned.pace[1]
+def _with_prior(law: AnyLaw, fleet: LawPrior) -> AnyLaw:
+    changes: dict[str, object] = {"weight": fleet.share[1]}
+    if fleet.pace is not None:
+        changes[fleet.field] = fleet.pace[1]
     return msgspec.structs.replace(law, **changes)
 
 
 def _rounded(value: float) -> float:
-    return float(f"{value:.{_DIGITS}g}")
+    return float(f"{value:.{constants.FLEET_DIGITS}g}")
 
 
 def _pace_field(law: Law) -> str:
-    """Name the field of a law that is the prior of its pace; empty where that is not learned."""
+    """Return the field of a law with the prior of its pace; empty without one."""
     if isinstance(getattr(law, "life_km", None), Lognormal):
         return "life_km"
-    # A normal prior of a length would be cut at 0, and be normal no more; that of a rate is not.
+    # A normal prior of a life would be cut at 0 and not stay normal; that of a rate is not cut.
     return "rate_per_km" if isinstance(getattr(law, "rate_per_km", None), Pace) else ""
 
 
 def _pace_draws(life: LifePosterior, j: int, law: AnyLaw) -> tuple[FloatArray, FloatArray]:
-    """Give draws of z under a law of a parameter, and weights that add up to its probability."""
+    """Return draws of z under a law of a parameter, and weights that sum to its probability."""
     values, weights = [np.empty(0)], [np.empty(0)]
     field = _pace_field(law)
-    for way in life.scenarios:
-        if way.scenario.paths[j].law.kind != law.kind:
+    for one in life.scenarios:
+        if one.scenario.paths[j].law.kind != law.kind:
             continue
-        chains = way.chains
+        chains = one.chains
         z = np.zeros(chains.shape[0] * chains.shape[1])
         if field:
             name, unit = _PACES[field]
-            own = way.scenario.split(chains.reshape(z.size, -1))[j]
+            own = one.scenario.split(chains.reshape(z.size, -1))[j]
             pace = own[:, law.names.index(name)] / unit
             z = getattr(law, field).standard(pace)
         values.append(z)
-        weights.append(np.full(z.size, way.probability / z.size))
+        weights.append(np.full(z.size, one.probability / z.size))
     return np.concatenate(values), np.concatenate(weights)
 
 
-def _scatter_heard(stage: Stage, life: LifePosterior) -> dict[str, tuple[LawEvidence, ...]]:
-    """Say how probable each value of the grid of scatter is, averaged over scenarios."""
+def _scatter_evidence(stage: Stage, life: LifePosterior) -> dict[str, tuple[LawEvidence, ...]]:
+    """Return the evidence on each value of the grid of scatter, averaged over scenarios."""
     weights = [
-        way.density.weights(way.mixture_draws[:: max(1, len(way.mixture_draws) // _N_SCATTER)])
-        for way in life.scenarios
+        one.density.weights(one.mixture_draws[:: max(1, len(one.mixture_draws) // _N_SCATTER)])
+        for one in life.scenarios
     ]
-    heard = {}
+    found = {}
     for field in _SCATTERS:
         before = np.array(getattr(scatter_prior(stage), field))
         after = np.zeros(before.size)
-        for way, weight in zip(life.scenarios, weights, strict=True):
-            values = np.unique(getattr(way.density.life.grid, field))
-            has = np.equal.outer(values, getattr(way.density.grid, field))
-            after += way.probability * (has @ weight)
-        none = np.zeros((1, 1))
+        for one, weight in zip(life.scenarios, weights, strict=True):
+            values = np.unique(getattr(one.density.likelihood.grid, field))
+            has = np.equal.outer(values, getattr(one.density.grid, field))
+            after += one.probability * (has @ weight)
         pairs = zip((before / before.sum()).tolist(), after.tolist(), strict=True)
-        heard[field] = tuple(LawEvidence(b, min(a, 1.0), none) for b, a in pairs)
-    return heard
+        found[field] = tuple(LawEvidence(b, min(a, 1.0), _NO_PACE) for b, a in pairs)
+    return found

@@ -1,4 +1,4 @@
-"""When to service: what the draws of a remaining life say about days."""
+"""Service date: last day of an accepted risk, or the day of least long-run costs."""
 
 from __future__ import annotations
 
@@ -9,25 +9,24 @@ from typing import Literal
 import numpy as np
 
 from lmshealth._arrays import FloatArray, freeze
+from lmshealth.prognosis import constants
 from lmshealth.prognosis.results import Prognosis
 from lmshealth.stage.description import Decision
 
 _SECONDS_PER_DAY = 86_400.0
-# A service that saves a smaller share of the costs is not worth a date: draws cannot tell it.
-_WORTH = 0.01
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ProbabilityBounds:
-    """Probability of having reached each limit before a day, shapes ``(n_parameters + 1,)``.
+    """Bounds of the probability to reach each limit before a day.
 
-    The two differ where a draw gets past the horizon before that day: nothing is claimed about it
-    there, so that it counts as a limit not reached in one and as a limit reached in the other.
+    They differ if draws pass the horizon before that day, beyond which nothing is published: such
+    a draw counts as no failure in the lower bound and as a failure in the upper one.
 
     Attributes
     ----------
     at_least, at_most : ndarray
-        In the order of the prognosis's parameters, ``any`` last.
+        In the order of the prognosis's parameters, ``any`` last, shape ``(n_parameters + 1,)``.
     """
 
     at_least: FloatArray
@@ -39,25 +38,25 @@ class ProbabilityBounds:
 
 @dataclass(frozen=True, slots=True)
 class Service:
-    """When to service a machine, and by what that was chosen.
+    """Service date of a machine, and the criterion that chose it.
 
     Attributes
     ----------
     kind : str
-        ``now``, ``by`` a day, ``later`` than the horizon or without end, or ``unknown``.
+        ``now``, ``by`` a day, ``later`` than the horizon or never, or ``unknown``.
     by : date or None
-        The last day; of the last log where it is now.
+        Last day; that of the last log for ``now``.
     wait : float
-        Days from the last log, negative where a stated risk was used up before it, infinite where
-        no service is asked for, NaN where nothing is known.
+        Days from the last log, negative if the accepted risk was reached before it, infinite for
+        ``later``, NaN for ``unknown``.
     risk : float
-        Probability, at most, that a limit is reached before that day; NaN without one.
+        Upper bound of the probability to reach a limit before that day; NaN without one.
     planned : date or None
-        The service that the description plans.
+        Next service by the description.
     planned_risk : tuple of float
-        Probability that a limit is reached before it, at least and at most; NaN without one.
+        Bounds of the probability to reach a limit before it; NaN without one.
     max_risk, cost_ratio : float or None
-        What chose the day: one of them is None.
+        Criterion: one of them is None.
     """
 
     kind: Literal["now", "by", "later", "unknown"]
@@ -71,19 +70,19 @@ class Service:
 
     @property
     def kept_risk(self) -> float | None:
-        """The risk that the day keeps: the stated one, else that of the day of least costs."""
+        """Accepted risk, or else the risk before the day of least costs."""
         return self.max_risk or (None if np.isnan(self.risk) else self.risk)
 
 
 def decide(prognosis: Prognosis | None, decision: Decision) -> Service:
-    """Choose the day of the service.
+    """Choose the service date.
 
     Parameters
     ----------
     prognosis : Prognosis or None
-        The remaining life; without one the kind is ``unknown``.
+        Remaining life; without it the kind is ``unknown``.
     decision : Decision
-        The accepted risk or the ratio of costs, and the service that is planned.
+        Accepted risk or cost ratio, and the planned service.
 
     Examples
     --------
@@ -117,57 +116,25 @@ def decide(prognosis: Prognosis | None, decision: Decision) -> Service:
     )
 
 
-def service_date(prognosis: Prognosis, max_risk: float) -> date | None:
-    """Find the last day on which the risk of having reached any limit is at most ``max_risk``.
-
-    Returns
-    -------
-    date or None
-        None when that day lies past the horizon: no service is asked for. A limit that is reached
-        already with more than that risk gives the day of the last log.
-    """
-    return day_after(prognosis, _wait_for_risk(prognosis, max_risk))
-
-
-def cheapest_date(prognosis: Prognosis, cost_ratio: float) -> date | None:
-    """Find the day on which a service costs least per travel, at the median usage.
-
-    Returns
-    -------
-    date or None
-        None when no service is asked for, see `cheapest_travel`.
-    """
-    travel = cheapest_travel(prognosis, cost_ratio)
-    return day_after(prognosis, travel / float(np.median(prognosis.usage)))
-
-
 def cheapest_travel(prognosis: Prognosis, cost_ratio: float) -> float:
-    """Find the travel from now at which a service costs least per travel: age replacement.
+    """Return the travel from now of the service of least long-run costs (age replacement).
 
-    A life ends by a service planned at age a + t, which costs 1, or by a failure before it, which
-    costs r, and the next one begins. In the long run that costs, per travel,
-    (S(t) + r F(t)) / (a + E[min(T, t)]). T, the remaining life to any limit, has the distribution
-    of the draws, and a is the travel since the baseline.
-
-    This assumes that every service makes the machine as it was at the baseline; that each life is
-    like one of the draws, which all reach the age a; that reaching a limit ends a life as a
-    failure does, at once; and that a service takes no time. What is uncertain about this machine
-    counts as if it differed from life to life. A draw that is past its limit fails as soon as the
-    machine goes on, and a service now still prevents that. A draw past the horizon, infinite or
-    not, only counts as alive up to there.
+    The cost per travel of a service at t from now is (S(t) + r F(t)) / (a + E[min(T, t)]), with T
+    the remaining life to any limit, a the travel since the baseline and r the cost ratio. README.md
+    has the assumptions.
 
     Parameters
     ----------
     prognosis : Prognosis
-        Its draws for any limit.
+        Draws for any limit.
     cost_ratio : float
         Cost of a failure over that of a planned service, above 1.
 
     Returns
     -------
     float
-        In m; 0 for now, infinite where no service within the horizon saves 1 % of the costs of
-        going on to it.
+        In m; 0 for now, infinite if no service within the horizon saves 1 % of the costs of
+        operation up to it.
 
     References
     ----------
@@ -176,25 +143,20 @@ def cheapest_travel(prognosis: Prognosis, cost_ratio: float) -> float:
     age = prognosis.travel - float(prognosis.curve_travel[0])
     left = np.sort(np.maximum(prognosis.remaining[:, -1], 0))
     n, left = left.size, left[left <= prognosis.horizon]
-    # Between two draws costs fall, so that they are least just before one fails.
+    # Costs fall between two draws: they are least just before one fails.
     planned = np.concatenate([[0.0], left, [prognosis.horizon]])
     failed = np.searchsorted(left, planned, side="left")
     mean_travel = np.append(0.0, np.cumsum(left))[failed] / n + planned * (1 - failed / n)
-    with np.errstate(divide="ignore"):  # a service at age 0 has no travel to be paid by
+    with np.errstate(divide="ignore"):  # a service at age 0 has infinite costs
         cost = (1 + (cost_ratio - 1) * failed / n) / (age + mean_travel)
     best = int(np.argmin(cost))
-    return float(planned[best]) if cost[best] < (1 - _WORTH) * cost[-1] else np.inf
+    return float(planned[best]) if cost[best] < (1 - constants.MIN_SAVING) * cost[-1] else np.inf
 
 
 def probability_before(prognosis: Prognosis, day: date) -> ProbabilityBounds:
-    """Give the probability that each limit, and any, is reached before a day begins.
+    """Return the probability to reach each limit, and any, before a day begins.
 
-    Parameters
-    ----------
-    prognosis : Prognosis
-        With draws of travel and usage.
-    day : date
-        In the time zone of the last log; one before that log counts as its moment.
+    The day is in the time zone of the last log; a day before that log counts as its moment.
     """
     moment = prognosis.recorded_at
     ahead = datetime.combine(day, time(), moment.tzinfo) - moment
@@ -206,19 +168,15 @@ def probability_before(prognosis: Prognosis, day: date) -> ProbabilityBounds:
 
 
 def remaining_days(prognosis: Prognosis) -> FloatArray:
-    """Give the draws of the remaining days, infinite past the horizon, as `remaining` is shaped."""
+    """Return the remaining life in days, infinite beyond the horizon, shaped as `remaining`."""
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.asarray(prognosis.censored() / prognosis.usage[:, None])
 
 
 def day_after(prognosis: Prognosis, wait: float) -> date | None:
-    """Give the day so many days after the last log, that of the log itself where they are past.
+    """Return the day so many days after the last log, at least that of the log.
 
-    Returns
-    -------
-    date or None
-        None where there is none: past the horizon, or past the calendar where a machine hardly
-        moves.
+    None if the wait is infinite or beyond the calendar.
     """
     try:
         return (prognosis.recorded_at + timedelta(days=max(wait, 0.0))).date()
@@ -227,19 +185,15 @@ def day_after(prognosis: Prognosis, wait: float) -> date | None:
 
 
 def _wait(prognosis: Prognosis, decision: Decision) -> float:
-    """Days from the last log to the service; infinite where none is asked for."""
+    """Return the days from the last log to the service, infinite without one."""
     if decision.cost_ratio is not None:
         usage = float(np.median(prognosis.usage))
         return cheapest_travel(prognosis, decision.cost_ratio) / usage
     assert decision.accepted is not None  # one of the two is
-    return _wait_for_risk(prognosis, decision.accepted)
-
-
-def _wait_for_risk(prognosis: Prognosis, max_risk: float) -> float:
+    max_risk = decision.accepted
     remaining = prognosis.remaining[:, -1]
     if np.quantile(remaining, max_risk, method="inverted_cdf") > prognosis.horizon:
         return np.inf
-    # Usage differs between draws: one that gets past the horizon sooner than others reach a limit
-    # may have reached one there.
+    # A draw past the horizon may have reached a limit there, sooner than slower draws do.
     days = np.minimum(remaining, prognosis.horizon) / prognosis.usage
     return float(np.quantile(days, max_risk, method="inverted_cdf"))

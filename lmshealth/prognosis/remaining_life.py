@@ -1,4 +1,4 @@
-"""Remaining useful life: when health reaches its limits."""
+"""Remaining useful life: first passage of the limits, usage, and life curves."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from lmshealth.stage.description import ParameterSpec, Stage
 from lmshealth.stage.identifiability import identifiability_of, identifiable_parameters
 from lmshealth.tracking.history import History
 
-_STEP = 1 << 21
+_STEP = 1 << 21  # of the random stream: beyond the epochs of health and the life
 _N_CURVE, _N_COARSE, _EVERY = 101, 40, 5
 _SECONDS_PER_DAY = 86_400.0
 _KM = 1000.0
@@ -26,7 +26,7 @@ _LEVELS = (0.05, 0.25, 0.5, 0.75, 0.95)
 def prognose(
     history: History, stage: Stage, seed: int | Sequence[int], *, chains: bool = True
 ) -> Prognosis:
-    """Infer the degradation laws of a stage and the travel left to each limit.
+    """Fit the degradation laws of a stage and draw the travel left to each limit.
 
     Parameters
     ----------
@@ -35,22 +35,22 @@ def prognose(
     stage : Stage
         Laws, limits, modal map and usage.
     seed : int or sequence of int
-        Of all randomness.
+        Seed of all random numbers.
     chains : bool
         As in `fit_life`.
 
     Returns
     -------
     Prognosis
-        10,000 draws. Runs that never reach a limit are kept, as infinite. Parameters that the
-        modes cannot tell are left out, and named.
+        10,000 draws, infinite where a limit is never reached. Parameters that the modes do not
+        identify are left out and named.
 
     Raises
     ------
     BadStage
         If no health parameter has a limit.
     NotEnoughData
-        If the history is too short, or the modes tell no parameter that has a limit.
+        If the history is too short, or no parameter with a limit is identifiable.
     NotConverged
         If the sampler did not converge.
 
@@ -75,35 +75,34 @@ def prognose(
 def prognose_with_posterior(
     history: History, stage: Stage, seed: int | Sequence[int], *, chains: bool = True
 ) -> tuple[Prognosis, LifePosterior]:
-    """Prognose, and give the posterior that it rests on; see `prognose`."""
+    """Return the prognosis and the posterior of the life; see `prognose`."""
     if not parameters_with_limit(stage):
         raise BadStage(f"{stage.name}: no [[parameter]] has a limit, so there is no end of life")
-    # Health has its streams by epoch, the life its own; these are of what comes after.
     seeds = stream(seed, _STEP).spawn(3)
     life = fit_life(history, stage, seed, chains=chains)
-    told = identifiable_limits(stage, life.modes)
-    if not told:
+    limited = identifiable_limits(stage, life.modes)
+    if not limited:
         raise NotEnoughData(
-            f"{history.stage}: {', '.join(life.modes)} cannot tell any parameter that has a limit, "
-            "however many logs there are; `lmshealth stage` says what each mode tells"
+            f"{history.stage}: the modes {', '.join(life.modes)} identify no parameter that has a "
+            "limit, however many logs there are; `lmshealth stage` lists what they identify"
         )
     horizon = stage.description.usage.horizon_km * _KM
     since = float(history.travel[-1] - history.travel[history.baseline])
     remaining = remaining_travel(
-        life, told, np.random.default_rng(seeds[0]), now=since, horizon=horizon
+        life, limited, np.random.default_rng(seeds[0]), now=since, horizon=horizon
     )
     usage = _usage(history, stage, np.random.default_rng(seeds[1]), remaining[:, -1], horizon)
     travel = _curve_grid(remaining, since, horizon)
-    columns = [j for j, _ in told]
-    unit = np.array([parameter.baseline for _, parameter in told])
+    columns = [j for j, _ in limited]
+    unit = np.array([parameter.baseline for _, parameter in limited])
     curve = _curve(life, travel, np.random.default_rng(seeds[2]))[..., columns] * unit
     found = Prognosis(
         stage=history.stage,
         recorded_at=history.recorded_at[-1],
         travel=float(history.travel[-1]),
-        parameters=(*(p.name for _, p in told), "any"),
+        parameters=(*(p.name for _, p in limited), "any"),
         unidentifiable=tuple(p.name for j, p in parameters_with_limit(stage) if j not in columns),
-        limits=np.array([p.limit.below for _, p in told if p.limit] + [np.nan]),
+        limits=np.array([p.limit.below for _, p in limited if p.limit] + [np.nan]),
         remaining=remaining,
         usage=usage,
         horizon=horizon,
@@ -112,7 +111,7 @@ def prognose_with_posterior(
         curve_quantiles=np.quantile(curve, _LEVELS, axis=0),
         laws=tuple(
             LawWeight(p.name, kind, begin, probability)
-            for _, p in told
+            for _, p in limited
             for (kind, begin), probability in life.laws(p.name).items()
         ),
         chi_square=life.chi_square,
@@ -128,7 +127,7 @@ def prognose_with_posterior(
 
 def remaining_travel(
     life: LifePosterior,
-    told: Sequence[tuple[int, ParameterSpec]],
+    limited: Sequence[tuple[int, ParameterSpec]],
     rng: np.random.Generator,
     *,
     now: float,
@@ -139,13 +138,13 @@ def remaining_travel(
     Parameters
     ----------
     life : LifePosterior
-        Draws of the laws and of how far health is off them.
-    told : sequence of (int, ParameterSpec)
-        Parameters with a limit, and where they stand among all.
+        Draws of the laws and of the deviations of health.
+    limited : sequence of (int, ParameterSpec)
+        Parameters with a limit, and their index among all.
     rng : Generator
-        Of all randomness.
+        Random numbers.
     now, horizon : float
-        Travel in m since the baseline, and from now, past which nothing is claimed.
+        Travel in m since the baseline, and from now to the horizon.
 
     Returns
     -------
@@ -153,11 +152,11 @@ def remaining_travel(
         In m, shape ``(n_draws, n_limits + 1)``, in the order of the draws of `life`.
     """
     parts = []
-    for way, off, rate in life.by_scenario():
-        theta = way.scenario.split(way.scenario.natural(way.mixture_draws))
+    for one, off, rate in life.by_scenario():
+        theta = one.scenario.split(one.scenario.natural(one.mixture_draws))
         columns = [
             first_passage(
-                way.scenario.paths[j],
+                one.scenario.paths[j],
                 theta[j],
                 off[:, j],
                 rate[:, j],
@@ -166,30 +165,27 @@ def remaining_travel(
                 limit=parameter.limit.below / parameter.baseline,
                 horizon=horizon,
             )
-            for j, parameter in told
+            for j, parameter in limited
             if parameter.limit is not None
         ]
         found = np.column_stack([*columns, np.min(columns, axis=0)])
-        parts.append(found.reshape(life.rate.shape[0], way.n_mixture, -1))
+        parts.append(found.reshape(life.rate.shape[0], one.n_mixture, -1))
     joined = np.concatenate(parts, axis=1)
     return joined.reshape(-1, joined.shape[-1])
 
 
 def _curve(life: LifePosterior, travel: FloatArray, rng: np.random.Generator) -> FloatArray:
-    """Draw health at travels since the baseline, ``(n, n_travel, n_parameters)``."""
+    """Draw health at travels in m since the baseline, ``(n, n_travel, n_parameters)``."""
     curves = []
-    for way, _, _ in life.by_scenario():
-        y = way.mixture_draws[::_EVERY]
-        off, _ = way.density.deviations(y, travel, rng)
-        curves.append(way.scenario.health(way.scenario.natural(y), travel) * np.exp(off))
+    for one in life.scenarios:
+        y = one.mixture_draws[::_EVERY]
+        off, _ = one.density.deviations(y, travel, rng)
+        curves.append(one.scenario.health(one.scenario.natural(y), travel) * np.exp(off))
     return np.concatenate(curves)
 
 
 def _curve_grid(remaining: FloatArray, since: float, horizon: float) -> FloatArray:
-    """Travel since the baseline, far enough ahead to show when each limit may be reached.
-
-    Fine to where the first of them mostly is, coarse from there to where the last one is.
-    """
+    """Return travels in m since the baseline, fine up to the first limit, coarse to the last."""
     late = np.quantile(np.minimum(remaining, horizon), 0.75, axis=0)
     near, far = (min(max(1.3 * ahead, 0.5 * since), horizon) for ahead in (late[-1], late.max()))
     fine = np.linspace(0.0, since + near, _N_CURVE)
@@ -203,12 +199,10 @@ def _usage(
     remaining: FloatArray,
     horizon: float,
 ) -> FloatArray:
-    """Draw the mean travel per day in m over the remaining life.
+    """Draw the mean travel in m per day over the remaining life, shape ``(n_draws,)``.
 
-    Learned from the odometer: increments between logs are taken as independent, their variance in
-    proportion to the time between. The rate over the time to come is then off the mean one by
-    Student's t: by what is not known of the mean, and by its own scatter, the less the longer that
-    time is.
+    Stated by the description, or estimated from independent increments of the odometer: the future
+    rate differs from the past mean by Student's t; README.md has the equation.
     """
     stated = stage.description.usage.km_per_day
     if stated is not None:
@@ -218,25 +212,23 @@ def _usage(
     days, steps = days[days > 0], steps[days > 0]
     if days.size < 2 or steps.sum() <= 0:
         raise NotEnoughData(
-            f"{history.stage}: the odometer does not tell the usage; state [usage] km_per_day"
+            f"{history.stage}: the odometer gives no usage; state [usage] km_per_day"
         )
     total, rate = days.sum(), steps.sum() / days.sum()
     per_day = np.sum((steps - rate * days) ** 2 / days) / (days.size - 1)
     ahead = np.clip(remaining, 0.01 * horizon, horizon) / rate
-    # Both the mean and what scatters about it have the variance that few increments tell.
     scatter = rng.standard_t(days.size - 1, remaining.size) * np.sqrt(1 / total + 1 / ahead)
-    # A machine that moves at all moves forward: relative errors are those of the logarithm. Few
-    # logs have tails without end, of which a factor of e^5 is enough.
+    # Usage is positive: errors are those of its logarithm, with the tails of few logs cut at e^5.
     return np.asarray(rate * np.exp(np.clip(np.sqrt(per_day) / rate * scatter, -5.0, 5.0)))
 
 
 def parameters_with_limit(stage: Stage) -> list[tuple[int, ParameterSpec]]:
-    """Parameters that have a limit, with their position."""
+    """Return the parameters that have a limit, with their index."""
     return [(j, p) for j, p in enumerate(stage.parameters) if p.limit is not None]
 
 
 def identifiable_limits(stage: Stage, modes: Sequence[str]) -> list[tuple[int, ParameterSpec]]:
-    """Parameters that have a limit and that endless logs with some modes would tell."""
+    """Return the parameters with a limit that unlimited logs with some modes identify."""
     information = identifiability_of(stage).restricted_to(modes)
     columns = [range(len(stage.parameters))]
     seen = identifiable_parameters([information], columns, information.prior)

@@ -1,4 +1,4 @@
-"""Result of the prognosis: remaining useful life."""
+"""Result of the prognosis: remaining useful life with its uncertainty."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ from lmshealth._arrays import FloatArray, expect_shape, freeze
 
 @dataclass(frozen=True, slots=True)
 class LawWeight:
-    """How probable it is that a parameter follows a law.
+    """Posterior probability of a law of a parameter.
 
     Attributes
     ----------
     parameter : str
         Name of the health parameter.
     kind : str
-        The law, as in the stage description.
+        Kind of the law, as in the stage description.
     begin : float
-        Travel in m since the baseline at which it begins: 0, or that of a step.
+        Travel in m since the baseline at which the law begins: 0, or that of a step.
     probability : float
-        In the posterior.
+        Posterior probability.
     """
 
     parameter: str
@@ -34,53 +34,50 @@ class LawWeight:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Prognosis:
-    """Remaining useful life with everything that is not known about it.
+    """Remaining useful life of one machine.
 
     Attributes
     ----------
     stage : str
         Identity of the machine.
     recorded_at : datetime
-        The moment the prognosis is made at: the last log.
+        The last log, at which the prognosis is made.
     travel : float
-        Odometer at that moment, in m.
+        Odometer then in m.
     parameters : tuple of str
-        Names of the health parameters with a limit, then ``any`` (the first limit reached).
+        Health parameters with a limit, then ``any`` (the first limit reached).
     unidentifiable : tuple of str
-        Parameters with a limit of which the modes cannot tell how far off it is: nothing is said of
-        them, and they are no part of ``any``.
+        Parameters with a limit that the modes do not identify; not in `parameters` nor ``any``.
     limits : ndarray
         Limit of each parameter, NaN for ``any``, shape ``(n_parameters + 1,)``.
     remaining : ndarray
-        Draws of the remaining travel in m, negative when the limit is already passed and infinite
-        when it is never reached, shape ``(n_draws, n_parameters + 1)``.
+        Draws of the remaining travel in m, negative if the limit has been passed and infinite if it
+        is never reached, shape ``(n_draws, n_parameters + 1)``.
     usage : ndarray
-        Draws of the mean travel per day in m until the end, shape ``(n_draws,)``.
+        Draws of the mean travel in m per day until the end, shape ``(n_draws,)``.
     horizon : float
-        Travel in m past which nothing is claimed.
+        Travel in m beyond which nothing is published.
     health : ndarray
-        Draws of the same parameters now, by their laws and how far health is off these,
-        shape ``(n_draws, n_parameters)``.
+        Draws of the parameters now in their units, shape ``(n_draws, n_parameters)``.
     curve_travel : ndarray
         Odometer grid in m of the life curves, shape ``(n_grid,)``.
     curve_quantiles : ndarray
-        5, 25, 50, 75, 95 % quantiles of the same on that grid,
+        5, 25, 50, 75, 95 % quantiles of the parameters on that grid,
         shape ``(5, n_grid, n_parameters)``.
     laws : tuple of LawWeight
-        Of each parameter, the most probable law first.
+        Laws of each parameter, the most probable first.
     chi_square : float
         Of the residuals at the posterior mean.
     degrees_of_freedom : int
-        Data minus law parameters.
+        Number of data minus law parameters.
     walk : float
-        Standard deviation over the history of the random walk of ln frequency that the data ask
-        for beside the laws, averaged over its evidence.
+        Posterior mean of the standard deviation over the history of the random walk of ln f.
     noise_scale : float
-        Factor on the reported standard deviations that the data ask for, averaged likewise.
+        Posterior mean of the factor on the reported standard deviations.
     deviation : float
-        Standard deviation at the horizon of ln health about its laws, averaged likewise.
+        Posterior mean of the standard deviation at the horizon of ln health about its laws.
     ess, r_hat : float
-        Worst over the law parameters.
+        Worst of all law parameters.
     """
 
     stage: str
@@ -114,13 +111,13 @@ class Prognosis:
         freeze(self)
 
     def censored(self) -> FloatArray:
-        """Draws of the remaining travel, infinite past the horizon, as `remaining` is shaped."""
+        """Return `remaining` with infinity beyond the horizon."""
         return np.where(self.remaining > self.horizon, np.inf, self.remaining)
 
     def beyond_horizon(self) -> FloatArray:
-        """Probability that each limit stays unreached to the horizon, ``(n_parameters + 1,)``."""
+        """Return the probability to reach the horizon, shape ``(n_parameters + 1,)``."""
         return np.asarray(np.mean(self.remaining > self.horizon, axis=0))
 
     def already_past(self) -> FloatArray:
-        """Probability that each limit has been passed already, shape ``(n_parameters + 1,)``."""
+        """Return the probability that a limit has been passed, shape ``(n_parameters + 1,)``."""
         return np.asarray(np.mean(self.remaining <= 0, axis=0))

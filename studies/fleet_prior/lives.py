@@ -9,6 +9,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from lmshealth.prognosis import constants
 from lmshealth.prognosis import life_likelihood as model
 from lmshealth.stage.degradation_laws import HertzWear, Unchanging
 from lmshealth.stage.description import ScatterPrior, Stage, load_stage
@@ -112,7 +113,7 @@ def draw(rng: np.random.Generator, fleet: Stage, age: Age) -> Life:
     }
     names = fleet.informative[:2]
     std = rng.uniform(3e-4, 2e-3) * np.exp(0.3 * rng.standard_normal((n, 2)))
-    scale = rng.choice(model._NOISE_SCALES, p=_shares(fleet, "noise_scale"))
+    scale = rng.choice(constants.NOISE_SCALES, p=_shares(fleet, "noise_scale"))
     values = _modes(rng, fleet, names, clock, path)
     for one in regressors(covariates, fleet):
         values += np.outer(one.values, one.prior_std * rng.standard_normal(2))
@@ -129,7 +130,7 @@ def _part(rng: np.random.Generator, fleet: Stage, clock: Array) -> tuple[Part, A
     if isinstance(law, HertzWear):
         first, second = rng.uniform(size=(2, 1))
         theta = np.r_[1000 * law.life_km.quantile(first), law.exponent.quantile(second)]
-    deviation = rng.choice(model._DEVIATIONS, p=_shares(fleet, "deviation"))
+    deviation = rng.choice(constants.DEVIATIONS, p=_shares(fleet, "deviation"))
     rate = float(deviation**2 / (1000 * fleet.description.usage.horizon_km))
     steps = np.sqrt(rate * np.diff(clock, prepend=0.0)) * rng.standard_normal(clock.size)
     part = Part(law, theta, 0.0, np.inf, 1.0, np.cumsum(steps), rate)
@@ -153,11 +154,11 @@ def _modes(
     # The mount keeps its stiffness: the error of the map is that of the preload alone.
     error = fleet.description.map.model_std * rng.standard_normal(len(names))
     level = (1 + error) * fleet.drift(path, names)
-    walk = rng.choice(model._WALKS, p=_shares(fleet, "walk"))
+    walk = rng.choice(constants.WALKS, p=_shares(fleet, "walk"))
     steps = walk * np.sqrt(np.diff(clock, prepend=0.0) / clock[-1])
     level = level + np.cumsum(steps[:, None] * rng.standard_normal(level.shape), axis=0)
     known = np.log([mode.frequency_hz for mode in fleet.modes if mode.name in names])
-    return np.asarray(level + known + model._INTERCEPT_STD * rng.standard_normal(len(names)))
+    return np.asarray(level + known + constants.INTERCEPT_STD * rng.standard_normal(len(names)))
 
 
 def _shares(fleet: Stage, field: str) -> Array:

@@ -15,7 +15,7 @@ from click.testing import CliRunner
 
 from lmshealth.health import constants
 from lmshealth.health import ensemble_sampling as sampling
-from lmshealth.prognosis import life_posterior as lifefit
+from lmshealth.prognosis import constants as prognosis_constants
 from lmshealth.report import figures as plots
 
 ROOT = Path(__file__).parents[2]
@@ -47,7 +47,7 @@ def call(program: str, *arguments: object, quick: bool, some_refused: bool = Fal
     """
     words = [str(word) for word in arguments]
     if quick:
-        importance_sampling = patch.object(lifefit, "_WORTH_CHAINS", inf)
+        importance_sampling = patch.object(prognosis_constants, "MIN_CHAIN_PROBABILITY", inf)
         with short_chains(), importance_sampling, no_pictures():
             return call_here(program, words, some_refused=some_refused)
     command = [sys.executable, "-m", program, *words]

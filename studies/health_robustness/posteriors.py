@@ -13,6 +13,7 @@ import numpy as np
 
 from lmshealth.health.epoch_posterior import EpochPosterior
 from lmshealth.health.importance_sampling import importance_sample_to_ess
+from lmshealth.prognosis import constants
 from lmshealth.prognosis import life_likelihood as life_module
 from lmshealth.prognosis.life_posterior import fit_life
 from lmshealth.prognosis.remaining_life import parameters_with_limit, remaining_travel
@@ -81,7 +82,7 @@ def _noise_as_stated() -> patch.multiple:
     """Leave of the grid of `lmshealth.life` the point at which estimates are all that errs."""
     return patch.multiple(
         life_module,
-        _WALKS=life_module._WALKS[:1],
+        _WALKS=constants.WALKS[:1],
         _NOISE_SCALES=(1.0,),
         _NOISE_SCALE_PRIOR=(1.0,),
         _DEVIATIONS=(0.0,),

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from lmshealth.health.ensemble_sampling import start_from_prior
 from lmshealth.health.epoch_posterior import one_at_a_time
-from lmshealth.prognosis.life_likelihood import LifeLikelihood
+from lmshealth.prognosis.life_likelihood import LifeLikelihood, ln_health
 from lmshealth.prognosis.life_posterior import LifeDensity
 from lmshealth.prognosis.remaining_life import prognose
 from lmshealth.stage.description import Stage, load_stage
@@ -110,9 +110,9 @@ class Walkers:
 
 def two_ways(history: History, stage: Stage, walkers: int, looped: int) -> Walkers:
     """Find points that the posterior holds probable, and both ways to their likelihood."""
-    likelihood = LifeLikelihood(history, stage)
+    likelihood = LifeLikelihood.of(history, stage)
     # Both parts lose: of all scenarios the one with the most to draw.
-    scenario = max(likelihood.scenarios, key=lambda one: one.n_dim)
+    scenario = max(likelihood.data.scenarios, key=lambda one: one.n_dim)
     density = LifeDensity.of(likelihood, scenario)
     begin = start_from_prior(density.log_probability, density.draw_prior)
     y = np.concatenate([begin(np.random.default_rng(k)) for k in range(8)])[:walkers]
@@ -127,7 +127,7 @@ def two_ways(history: History, stage: Stage, walkers: int, looped: int) -> Walke
     model_std = stage.description.map.model_std
 
     def loop() -> Array:
-        x, _ = likelihood.ln_health(scenario, y[:looped], history.clock())
+        x, _ = ln_health(stage, scenario, y[:looped], history.clock())
         flats = [stage.drift(one_at_a_time(stage, path), MODES).reshape(3, -1, 2) for path in x]
         setting = {"walk": walk, "scale": scale, "model_std": model_std}
         return np.array([by_filterpy(history, flat[0], flat[1:], **setting) for flat in flats])

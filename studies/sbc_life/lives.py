@@ -8,8 +8,7 @@ from datetime import UTC, datetime, timedelta
 import numpy as np
 from numpy.typing import NDArray
 
-from lmshealth.prognosis import life_likelihood as model
-from lmshealth.prognosis import scenarios
+from lmshealth.prognosis import constants
 from lmshealth.stage.degradation_laws import HertzWear, Law, Loosening
 from lmshealth.stage.description import ParameterSpec, Stage
 from lmshealth.tracking.constants import BIAS_STD, JUMP_STD
@@ -110,7 +109,7 @@ def draw(rng: np.random.Generator, machine: Stage) -> Life:
     mode = np.array([names.index(one.mode) for one in series])
     values = level[:, mode] + _offsets(rng, series, mode, steps)
     cov = _covariance(rng, mode)
-    scale = rng.choice(model._NOISE_SCALES, p=model._NOISE_SCALE_PRIOR)
+    scale = rng.choice(constants.NOISE_SCALES, p=constants.NOISE_SCALE_PRIOR)
     values += (
         scale * (np.linalg.cholesky(cov) @ rng.standard_normal((N_LOGS, mode.size, 1)))[..., 0]
     )
@@ -130,7 +129,7 @@ def _parts(
     assert machine.modal_map is not None
     step = np.inf if first is None else float(clock[first - 1 : first + 1].mean())
     while True:
-        deviation = rng.choice(model._DEVIATIONS, p=model._DEVIATION_PRIOR)
+        deviation = rng.choice(constants.DEVIATIONS, p=constants.DEVIATION_PRIOR)
         rate = deviation**2 / (1000 * machine.description.usage.horizon_km)
         parts = tuple(_part(rng, one, clock, step, rate) for one in machine.parameters)
         with np.errstate(divide="ignore"):
@@ -151,7 +150,7 @@ def _part(
         theta=_of_law(rng, law),
         begin=step if anew else 0.0,
         step=step,
-        jump=float(np.exp(scenarios._JUMP.std * rng.standard_normal())),
+        jump=float(np.exp(constants.JUMP.std * rng.standard_normal())),
         off=np.cumsum(steps),
         rate=float(rate),
     )
@@ -190,10 +189,10 @@ def _modes(
         alone[:, j] = x[:, j]
         error = machine.description.map.model_std * rng.standard_normal(len(names))
         level = level + error * machine.drift(alone, names)
-    walk = rng.choice(model._WALKS) * np.sqrt(np.diff(clock, prepend=0.0) / clock[-1])
+    walk = rng.choice(constants.WALKS) * np.sqrt(np.diff(clock, prepend=0.0) / clock[-1])
     level = level + np.cumsum(walk[:, None] * rng.standard_normal(level.shape), axis=0)
     known = np.log([mode.frequency_hz for mode in machine.modes if mode.name in names])
-    return np.asarray(level + known + model._INTERCEPT_STD * rng.standard_normal(len(names)))
+    return np.asarray(level + known + constants.INTERCEPT_STD * rng.standard_normal(len(names)))
 
 
 def _covariates(rng: np.random.Generator) -> dict[str, Array]:

@@ -10,7 +10,7 @@ import pytest
 
 from lmshealth._arrays import FloatArray
 from lmshealth.errors import NotEnoughData
-from lmshealth.prognosis import life_likelihood as life
+from lmshealth.prognosis import constants
 from lmshealth.prognosis.life_likelihood import LifeLikelihood
 from lmshealth.prognosis.life_posterior import LifeDensity
 from lmshealth.stage.description import Stage
@@ -40,8 +40,8 @@ def stage(tmp_path_factory: pytest.TempPathFactory) -> Stage:
 
 def density_of(history: History, stage: Stage) -> LifeDensity:
     """Give the density of the first scenario."""
-    likelihood = LifeLikelihood(history, stage)
-    return LifeDensity.of(likelihood, likelihood.scenarios[0])
+    likelihood = LifeLikelihood.of(history, stage)
+    return LifeDensity.of(likelihood, likelihood.data.scenarios[0])
 
 
 def coordinates(density: LifeDensity, n: int, seed: int = 1) -> FloatArray:
@@ -80,9 +80,9 @@ def test_settings_lie_inside_their_grids(stage: Stage) -> None:
     """Averages of walk, noise scale and deviation lie inside their grids; χ² is no less than 0."""
     density = density_of(rough_history(np.random.default_rng(11)), stage)
     walk, scale, deviation, chi_square = density.settings(coordinates(density, 30))
-    assert life._WALKS[0] <= walk <= life._WALKS[-1]
-    assert 1 <= scale <= life._NOISE_SCALES[-1]
-    assert life._DEVIATIONS[0] <= deviation <= life._DEVIATIONS[-1]
+    assert constants.WALKS[0] <= walk <= constants.WALKS[-1]
+    assert 1 <= scale <= constants.NOISE_SCALES[-1]
+    assert constants.DEVIATIONS[0] <= deviation <= constants.DEVIATIONS[-1]
     assert chi_square > 0
 
 
@@ -114,11 +114,11 @@ def test_chi_square_of_a_life_as_stated_is_near_its_degrees_of_freedom(tmp_path:
 @pytest.fixture
 def wandering(monkeypatch: pytest.MonkeyPatch) -> LifeSetting:
     """One point of the grid, at which health is far off its laws."""
-    monkeypatch.setattr(life, "_WALKS", (1.5e-3,))
-    monkeypatch.setattr(life, "_NOISE_SCALES", (1.0,))
-    monkeypatch.setattr(life, "_NOISE_SCALE_PRIOR", (1.0,))
-    monkeypatch.setattr(life, "_DEVIATIONS", (0.4,))
-    monkeypatch.setattr(life, "_DEVIATION_PRIOR", (1.0,))
+    monkeypatch.setattr(constants, "WALKS", (1.5e-3,))
+    monkeypatch.setattr(constants, "NOISE_SCALES", (1.0,))
+    monkeypatch.setattr(constants, "NOISE_SCALE_PRIOR", (1.0,))
+    monkeypatch.setattr(constants, "DEVIATIONS", (0.4,))
+    monkeypatch.setattr(constants, "DEVIATION_PRIOR", (1.0,))
     return LifeSetting(1.5e-3, 1.0, 0.4)
 
 
@@ -132,9 +132,9 @@ def off_by_hand(
     alone = np.stack([true_drift(NAMES, x * (np.arange(2) == j))[:, :2] for j in range(2)])
     belief = LifeBelief(
         slopes=np.array([SENSITIVITY[name][:2] for name in NAMES]),
-        horizon=density.life.horizon,
+        horizon=density.likelihood.data.horizon,
         model_std=MODEL_STD,
-        intercept_std=life._INTERCEPT_STD,
+        intercept_std=constants.INTERCEPT_STD,
     )
     drift = true_drift(NAMES, x)[:, :2]
     return life_deviation(history, drift, alone, belief, setting, moment)
@@ -145,10 +145,10 @@ def test_deviations_are_those_of_a_dense_gaussian(stage: Stage, wandering: LifeS
     history = rough_history(np.random.default_rng(13), baseline=2)
     density = density_of(history, stage)
     y = coordinates(density, 3)
-    now = density.life.now
+    now = density.likelihood.data.now
     moments = np.array([0.0, 0.37 * now, now, 2.5 * now])
-    x, _ = density._path(y, np.full(3, True))
-    mean, cov = density.life.deviation(density.grid, 0, x, moments)
+    x, _ = density.likelihood.path(density.scenario, y)
+    mean, cov = density.likelihood.deviation(density.grid, 0, x, moments)
     assert mean.shape == (3, 4, 2)
     for i, point in enumerate(y):
         for m, moment in enumerate(moments):
@@ -156,7 +156,7 @@ def test_deviations_are_those_of_a_dense_gaussian(stage: Stage, wandering: LifeS
             np.testing.assert_allclose(mean[i, m], known[0], rtol=1e-7, atol=1e-10)
             np.testing.assert_allclose(cov[i, m], known[1], rtol=1e-7, atol=1e-10)
     # What the data say lies behind; from now on variance grows as of a Wiener process.
-    rate = wandering.deviation**2 / density.life.horizon
+    rate = wandering.deviation**2 / density.likelihood.data.horizon
     np.testing.assert_allclose(mean[:, 3], mean[:, 2], rtol=1e-9)
     np.testing.assert_allclose(
         cov[:, 3] - cov[:, 2], np.tile(1.5 * now * rate * np.eye(2), (3, 1, 1))
@@ -169,11 +169,11 @@ def test_a_wrong_deviation_is_noticed(stage: Stage, wandering: LifeSetting) -> N
     history = rough_history(np.random.default_rng(13))
     density = density_of(history, stage)
     y = coordinates(density, 1)
-    moments = np.array([density.life.now])
-    x, _ = density._path(y, np.array([True]))
-    mean, cov = density.life.deviation(density.grid, 0, x, moments)
+    moments = np.array([density.likelihood.data.now])
+    x, _ = density.likelihood.path(density.scenario, y)
+    mean, cov = density.likelihood.deviation(density.grid, 0, x, moments)
     wrong = replace(wandering, deviation=0.41)
-    known = off_by_hand(density, history, y[0], wrong, density.life.now)
+    known = off_by_hand(density, history, y[0], wrong, density.likelihood.data.now)
     assert np.abs(mean[0, 0] / known[0] - 1).min() > 1e-3
     assert np.abs(np.diag(cov[0, 0]) / np.diag(known[1]) - 1).min() > 1e-3
 
@@ -186,26 +186,26 @@ def test_draws_of_deviations_have_their_mean_and_covariance(
     density = density_of(history, stage)
     n = 4000
     one = coordinates(density, 1)
-    moments = np.array([0.0, density.life.now])
+    moments = np.array([0.0, density.likelihood.data.now])
     off, rate = density.deviations(np.tile(one, (n, 1)), moments, np.random.default_rng(1))
-    mean, cov = off_by_hand(density, history, one[0], wandering, density.life.now)
+    mean, cov = off_by_hand(density, history, one[0], wandering, density.likelihood.data.now)
     assert np.abs(off[:, 0]).max() < 1e-6  # the baseline is what health is measured against
     std = np.sqrt(np.diag(cov))
     assert (np.abs(off[:, 1].mean(axis=0) - mean) < 5 * std / np.sqrt(n)).all()
     assert (np.abs(np.cov(off[:, 1].T) - cov) < 8 / np.sqrt(n) * np.outer(std, std)).all()
     assert (np.abs(off[:, 1].mean(axis=0) - 1.2 * mean) > 5 * std / np.sqrt(n)).any()
-    np.testing.assert_allclose(rate, wandering.deviation**2 / density.life.horizon)
+    np.testing.assert_allclose(rate, wandering.deviation**2 / density.likelihood.data.horizon)
 
 
 def test_points_of_the_grid_are_drawn_by_their_weight(
     stage: Stage, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Draws without a deviation are as many as their weight says, and are not off at all."""
-    monkeypatch.setattr(life, "_WALKS", (1.5e-3,))
+    monkeypatch.setattr(constants, "WALKS", (1.5e-3,))
     density = density_of(rough_history(np.random.default_rng(15)), stage)
     y = coordinates(density, 1)
     n = 4000
-    now = np.array([density.life.now])
+    now = np.array([density.likelihood.data.now])
     off, rate = density.deviations(np.tile(y, (n, 1)), now, np.random.default_rng(2))
     still = (rate == 0).all(axis=1)
     assert (off[still] == 0).all()
@@ -221,7 +221,7 @@ def test_only_what_has_a_law_deviates(tmp_path: Path, wandering: LifeSetting) ->
     still = MOUNT[: MOUNT.index("[parameter.law]")]
     stage = make_stage(tmp_path, (FADING, still, FOOT))
     density = density_of(rough_history(np.random.default_rng(16)), stage)
-    now = np.array([density.life.now])
+    now = np.array([density.likelihood.data.now])
     off, rate = density.deviations(coordinates(density, 50), now, np.random.default_rng(3))
     assert (off[:, 0, 0] != 0).all()
     assert (off[:, 0, 1:] == 0).all()
@@ -235,12 +235,12 @@ def test_a_course_without_coordinates_has_draws_of_one_life(
     """Where no law is followed but one was possible, health still wanders."""
     several = FADING.replace("law = ", "law = [").replace("} }\n", '} }, { kind = "none" }]\n')
     stage = make_stage(tmp_path, (several,))
-    likelihood = LifeLikelihood(rough_history(np.random.default_rng(17)), stage)
-    density = LifeDensity.of(likelihood, likelihood.scenarios[1])
+    likelihood = LifeLikelihood.of(rough_history(np.random.default_rng(17)), stage)
+    density = LifeDensity.of(likelihood, likelihood.data.scenarios[1])
     assert density.scenario.n_dim == 0
     y = np.empty((2000, 0))
     assert np.isfinite(density.log_probability(y[:1])).all()
-    off, rate = density.deviations(y, np.array([likelihood.now]), np.random.default_rng(4))
+    off, rate = density.deviations(y, np.array([likelihood.data.now]), np.random.default_rng(4))
     assert off.shape == (2000, 1, 1)
     assert np.unique(off).size == 2000
     assert (rate > 0).all()

@@ -13,8 +13,8 @@ from scipy import stats
 
 from lmshealth._arrays import FloatArray
 from lmshealth._serialize import pack, unpack
+from lmshealth.prognosis import constants
 from lmshealth.prognosis import fleet_prior as fleet
-from lmshealth.prognosis import life_likelihood as life
 from lmshealth.prognosis.fleet_prior import (
     FleetPrior,
     LawEvidence,
@@ -115,7 +115,7 @@ def taught_by(teachers: Mapping[str, MachineEvidence], stage: Stage) -> tuple[fl
 def test_likelihood_of_a_fleet_is_that_of_the_textbook(z: float, error: float) -> None:
     """With Gaussian measurements data have the density N(z; m, v + e²) over N(z; 0, 1 + e²)."""
     found = pace_likelihood(gaussian(z, error), np.full(N, 1 / N))
-    mean, variance = fleet._MEAN, fleet._VARIANCE
+    mean, variance = constants.FLEET_MEAN, constants.FLEET_VARIANCE
     expected = stats.norm(mean, np.sqrt(variance + error**2)).logpdf(z)
     expected -= stats.norm(0, np.sqrt(1 + error**2)).logpdf(z)
     # Where the fleet is where the draws are; beyond them it is improbable, and only has to be so.
@@ -128,7 +128,8 @@ def test_likelihood_of_a_fleet_is_that_of_the_textbook(z: float, error: float) -
 @pytest.mark.parametrize("z", [-2.0, 0.0, 1.3])
 def test_an_unknown_fleet_has_the_prior_of_the_description(z: float) -> None:
     """Averaged over all fleets a machine is as probable as by the description, whatever its z."""
-    log_prior = np.broadcast_to(fleet._LOG_PRIOR, (fleet._MEAN.size, fleet._VARIANCE.size))
+    shape = constants.FLEET_MEAN.size, constants.FLEET_VARIANCE.size
+    log_prior = np.broadcast_to(fleet._LOG_PRIOR, shape)
     weight = np.exp(log_prior) / np.exp(log_prior).sum()
     ratio = np.exp(pace_likelihood(np.array([z]), np.ones(1)))
     assert np.sum(weight * ratio) == pytest.approx(1.0, abs=0.01)
@@ -195,7 +196,7 @@ def test_scatter_of_a_fleet_is_learned(stage: Stage) -> None:
     assert max(learned.scatter.walk[k] for k in (0, 1, 3, 4)) < 0.15
     assert learned.scatter.noise_scale == SCALES
     history = lived(np.linspace(0.0, 2e6, 8), 4000.0)
-    before, after = (LifeLikelihood(history, one).grid for one in (stage, taught))
+    before, after = (LifeLikelihood.of(history, one).grid for one in (stage, taught))
     k = np.searchsorted(np.unique(before.walk), before.walk)
     expected = np.log(np.array(learned.scatter.walk) / scatter_prior(stage).walk)[k]
     np.testing.assert_allclose(after.log_weight - before.log_weight, expected, atol=1e-9)
@@ -317,11 +318,11 @@ def test_what_is_learned_is_told_in_two_digits(stage: Stage) -> None:
 def small_grid() -> Iterator[None]:
     """Average over one walk and no deviation: lessons of a posterior are made alike by any."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(life, "_WALKS", (1e-5,))
-        patch.setattr(life, "_NOISE_SCALES", (1.0,))
-        patch.setattr(life, "_NOISE_SCALE_PRIOR", (1.0,))
-        patch.setattr(life, "_DEVIATIONS", (0.0,))
-        patch.setattr(life, "_DEVIATION_PRIOR", (1.0,))
+        patch.setattr(constants, "WALKS", (1e-5,))
+        patch.setattr(constants, "NOISE_SCALES", (1.0,))
+        patch.setattr(constants, "NOISE_SCALE_PRIOR", (1.0,))
+        patch.setattr(constants, "DEVIATIONS", (0.0,))
+        patch.setattr(constants, "DEVIATION_PRIOR", (1.0,))
         yield
 
 
@@ -359,7 +360,7 @@ def test_a_lesson_says_what_the_posterior_says(small_grid: None, stage: Stage) -
         assert one.posterior == pytest.approx(laws.get((kind, 0.0), 0.0))
     assert heard["mount_stiffness"]["none"].posterior == pytest.approx(1.0)
     pace = heard["guide_preload"]["hertz-wear"].pace
-    best = float(fleet._MEAN[np.argmax(pace[:, 0]), 0])
+    best = float(constants.FLEET_MEAN[np.argmax(pace[:, 0]), 0])
     assert 8000 * np.exp(best) == pytest.approx(4000, rel=0.25)
 
 

@@ -11,7 +11,7 @@ import pytest
 
 from lmshealth._arrays import FloatArray
 from lmshealth.errors import NotEnoughData
-from lmshealth.prognosis import life_likelihood as life
+from lmshealth.prognosis import constants
 from lmshealth.prognosis.life_likelihood import LifeLikelihood, scatter_prior
 from lmshealth.prognosis.life_posterior import LifeDensity
 from lmshealth.prognosis.scenarios import Scenario
@@ -45,8 +45,8 @@ def stage(tmp_path_factory: pytest.TempPathFactory) -> Stage:
 
 def density_of(history: History, stage: Stage) -> LifeDensity:
     """Give the density of the first scenario."""
-    likelihood = LifeLikelihood(history, stage)
-    return LifeDensity.of(likelihood, likelihood.scenarios[0])
+    likelihood = LifeLikelihood.of(history, stage)
+    return LifeDensity.of(likelihood, likelihood.data.scenarios[0])
 
 
 def coordinates(density: LifeDensity, n: int = 6, seed: int = 1) -> FloatArray:
@@ -81,28 +81,28 @@ def book(history: History, density: LifeDensity, y: FloatArray, model_std: float
     alone = np.stack([true_drift(NAMES, x * (np.arange(2) == j))[:, :2] for j in range(2)])
     belief = LifeBelief(
         slopes=np.array([SENSITIVITY[name][:2] for name in NAMES]),
-        horizon=density.life.stage.description.usage.horizon_km * 1000,
+        horizon=density.likelihood.data.stage.description.usage.horizon_km * 1000,
         model_std=model_std,
-        intercept_std=life._INTERCEPT_STD,
+        intercept_std=constants.INTERCEPT_STD,
     )
-    scales = zip(life._NOISE_SCALES, life._NOISE_SCALE_PRIOR, strict=True)
-    deviations = zip(life._DEVIATIONS, life._DEVIATION_PRIOR, strict=True)
+    scales = zip(constants.NOISE_SCALES, constants.NOISE_SCALE_PRIOR, strict=True)
+    deviations = zip(constants.DEVIATIONS, constants.DEVIATION_PRIOR, strict=True)
     grid = [
         LifeSetting(walk, scale, deviation, p * q)
-        for walk, (scale, p), (deviation, q) in product(life._WALKS, scales, deviations)
+        for walk, (scale, p), (deviation, q) in product(constants.WALKS, scales, deviations)
     ]
     found = life_log_likelihood(history, true_drift(NAMES, x)[:, :2], alone, belief, grid)
-    return found + density.life.y.size / 2 * np.log(2 * np.pi)
+    return found + density.likelihood.data.y.size / 2 * np.log(2 * np.pi)
 
 
 @pytest.fixture
 def short_grid(monkeypatch: pytest.MonkeyPatch) -> None:
     """Average over two values each, so that a plainly written oracle takes no long time."""
-    monkeypatch.setattr(life, "_WALKS", (5e-4, 5e-3))
-    monkeypatch.setattr(life, "_NOISE_SCALES", (1.0, 1.5))
-    monkeypatch.setattr(life, "_NOISE_SCALE_PRIOR", (0.9, 0.1))
-    monkeypatch.setattr(life, "_DEVIATIONS", (0.0, 0.15))
-    monkeypatch.setattr(life, "_DEVIATION_PRIOR", (0.6, 0.4))
+    monkeypatch.setattr(constants, "WALKS", (5e-4, 5e-3))
+    monkeypatch.setattr(constants, "NOISE_SCALES", (1.0, 1.5))
+    monkeypatch.setattr(constants, "NOISE_SCALE_PRIOR", (0.9, 0.1))
+    monkeypatch.setattr(constants, "DEVIATIONS", (0.0, 0.15))
+    monkeypatch.setattr(constants, "DEVIATION_PRIOR", (0.6, 0.4))
 
 
 @pytest.mark.usefixtures("short_grid")
@@ -127,11 +127,11 @@ def test_every_course_after_a_step_is_the_dense_normal(tmp_path: Path) -> None:
     stage = make_stage(tmp_path, (NO_PRELOAD, MOUNT))
     history = rough_history(np.random.default_rng(3))
     history = replace(history, steps=(since("step", 5, 10),))
-    likelihood = LifeLikelihood(history, stage)
-    assert likelihood.steps == (np.mean(history.clock()[4:6]),)
-    assert len(likelihood.scenarios) == 3 * 2
+    likelihood = LifeLikelihood.of(history, stage)
+    assert likelihood.data.steps == (np.mean(history.clock()[4:6]),)
+    assert len(likelihood.data.scenarios) == 3 * 2
     found, known = [], []
-    for scenario in likelihood.scenarios:
+    for scenario in likelihood.data.scenarios:
         density = LifeDensity.of(likelihood, scenario)
         y = coordinates(density, 1)
         found.append((density.log_probability(y) - scenario.log_prior(y))[0])
@@ -149,7 +149,7 @@ def test_what_is_wrong_is_noticed(stage: Stage, what: str, monkeypatch: pytest.M
     y = coordinates(density)
     found = density.log_probability(y) - density.scenario.log_prior(y)
     if what == "deviation":
-        monkeypatch.setattr(life, "_DEVIATIONS", (0.0, 0.151))
+        monkeypatch.setattr(constants, "DEVIATIONS", (0.0, 0.151))
     model_std = 0.0501 if what == "map error" else 0.05
     known = np.array([book(history, density, point, model_std) for point in y])
     assert np.abs(found - known).max() > 1e-5
@@ -171,7 +171,7 @@ def test_lives_that_leave_the_map_or_the_prior_are_impossible(stage: Stage) -> N
     """Preload below the map, or a floor below 0 or outside its prior: minus infinity, no error."""
     density = density_of(rough_history(np.random.default_rng(5)), stage)
     inside = coordinates(density, 1)[0]
-    now = density.life.now
+    now = density.likelihood.data.now
     wear, loose = (path.law for path in density.scenario.paths)
     worn, below, low = inside.copy(), inside.copy(), inside.copy()
     worn[0] = 0.5  # s_w < now
@@ -224,7 +224,7 @@ def test_a_mode_that_vanished_before_the_baseline_is_left_out(stage: Stage) -> N
     ln_f = np.log(FREQUENCY[:2]) + 1e-3 * np.random.default_rng(8).standard_normal((8, 2))
     ln_f[2:, 1] = np.nan
     density = density_of(make_history(ln_f, baseline=2), stage)
-    assert density.life.y.size == 6
+    assert density.likelihood.data.y.size == 6
     assert np.isfinite(density.log_probability(coordinates(density))).all()
 
 
@@ -245,21 +245,21 @@ def test_laws_without_parameters_take_no_coordinate(tmp_path: Path) -> None:
     assert scenario.n_dim == 4
     y = coordinates(density, 5)
     assert [part.shape for part in scenario.split(y)] == [(5, 2), (5, 0), (5, 2)]
-    health = scenario.health(scenario.natural(y), np.array([0.0, density.life.now]))
+    health = scenario.health(scenario.natural(y), np.array([0.0, density.likelihood.data.now]))
     assert health.shape == (5, 2, 3)
     assert (health[:, :, 1] == 1).all()
     np.testing.assert_allclose(health[:, 0], 1)
-    np.testing.assert_array_equal(density.life.free, [1, 0, 1])
-    assert (density.life.slopes[:, 1] == 0).all()
+    np.testing.assert_array_equal(density.likelihood.data.free, [1, 0, 1])
+    assert (density.likelihood.data.sensitivity[:, 1] == 0).all()
 
 
 def test_what_has_no_law_does_not_deviate(tmp_path: Path) -> None:
     """A parameter that only keeps its value adds nothing to the covariance, seen or not."""
     still = MOUNT[: MOUNT.index("[parameter.law]")]
     history = rough_history(np.random.default_rng(13))
-    alone = LifeLikelihood(history, make_stage(tmp_path / "one", (PRELOAD,)))
-    beside = LifeLikelihood(history, make_stage(tmp_path / "two", (PRELOAD, still)))
-    free = LifeLikelihood(history, make_stage(tmp_path / "three", (PRELOAD, MOUNT)))
+    alone = LifeLikelihood.of(history, make_stage(tmp_path / "one", (PRELOAD,)))
+    beside = LifeLikelihood.of(history, make_stage(tmp_path / "two", (PRELOAD, still)))
+    free = LifeLikelihood.of(history, make_stage(tmp_path / "three", (PRELOAD, MOUNT)))
     deviation = alone.covariance.deviation
     np.testing.assert_allclose(beside.covariance.deviation, deviation, rtol=1e-9)
     assert (free.covariance.deviation > 1.1 * deviation)[deviation > 0].all()
@@ -272,12 +272,12 @@ def test_a_life_of_many_steps_is_refused(stage: Stage, n: int) -> None:
     steps = [since("step", k, 10) for k in (1, *range(4, 4 + n))]
     history = replace(history, steps=tuple(steps))
     if n == 3:
-        likelihood = LifeLikelihood(history, stage)
-        assert len(likelihood.steps) == 3
-        assert likelihood.scenarios[0].n_dim == 4 + 2 * 3
+        likelihood = LifeLikelihood.of(history, stage)
+        assert len(likelihood.data.steps) == 3
+        assert likelihood.data.scenarios[0].n_dim == 4 + 2 * 3
         return
     with pytest.raises(NotEnoughData, match=r"jumped 4 times.*declare a new baseline"):
-        LifeLikelihood(history, stage)
+        LifeLikelihood.of(history, stage)
 
 
 @pytest.mark.parametrize(
@@ -294,7 +294,7 @@ def test_a_life_too_short_is_refused(
 ) -> None:
     """Fewer than three logs with modes, or no travel, are no life; the error says so."""
     with pytest.raises(NotEnoughData, match="at least 3 logs and some travel"):
-        LifeLikelihood(make_history(ln_f, travel=travel), stage)
+        LifeLikelihood.of(make_history(ln_f, travel=travel), stage)
 
 
 def test_baseline_units_do_not_matter(tmp_path: Path) -> None:
@@ -302,7 +302,7 @@ def test_baseline_units_do_not_matter(tmp_path: Path) -> None:
     stage = make_stage(tmp_path, (FADING,))
     density = density_of(rough_history(np.random.default_rng(14)), stage)
     scenario, y = density.scenario, np.array([[0.1], [0.3]])
-    health = scenario.health(scenario.natural(y), np.array([density.life.now]))
+    health = scenario.health(scenario.natural(y), np.array([density.likelihood.data.now]))
     np.testing.assert_allclose(health[:, 0, 0], [0.9, 0.7])
 
 
@@ -317,16 +317,16 @@ def test_many_logs_are_told_by_few_nodes(stage: Stage) -> None:
         temperature=21 + rng.standard_normal(n),
     )
     density = density_of(history, stage)
-    likelihood = density.life
-    assert likelihood.nodes.size < 24
+    likelihood = density.likelihood
+    assert likelihood.basis.nodes.size < 24
     y = coordinates(density, 20, seed=5)
-    x = np.log([healths(density.scenario, point, likelihood.clock) for point in y])
+    x = np.log([healths(density.scenario, point, likelihood.data.clock) for point in y])
     drift = np.moveaxis(true_drift(NAMES, x)[..., :2], 1, 2)
-    told = drift[..., likelihood.nodes] @ likelihood.weights.T
+    told = drift[..., likelihood.basis.nodes] @ likelihood.basis.weights.T
     np.testing.assert_allclose(told, drift, atol=1e-7)
     # Negative control: a node less than half of them does not tell.
-    few = np.linalg.lstsq(drift[..., likelihood.nodes[:6]].reshape(-1, 6), drift.reshape(-1, n))[0]
-    told = drift[..., likelihood.nodes[:6]] @ few
+    six = drift[..., likelihood.basis.nodes[:6]]
+    told = six @ np.linalg.lstsq(six.reshape(-1, 6), drift.reshape(-1, n))[0]
     assert np.abs(told - drift).max() > 1e-6
     found = density.log_probability(y[:2]) - density.scenario.log_prior(y[:2])
     known = np.array([book(history, density, point, 0.05) for point in y[:2]])
@@ -341,15 +341,15 @@ def test_a_step_without_travel_parts_the_logs(tmp_path: Path, last_still: int) -
     travel[last_still] = travel[last_still - 1]
     ln_f = np.log(FREQUENCY[:2]) + 1e-3 * np.random.default_rng(3).standard_normal((10, 2))
     history = make_history(ln_f, travel=travel)
-    without = LifeLikelihood(history, stage)
-    stepped = LifeLikelihood(replace(history, steps=(since("step", last_still, 10),)), stage)
-    (step,) = stepped.steps
-    np.testing.assert_array_equal(stepped.clock < step, np.arange(10) < last_still)
-    np.testing.assert_allclose(stepped.clock, without.clock, atol=1.0)
-    assert without.clock[last_still] == without.clock[last_still - 1]
-    for scenario in stepped.scenarios:
+    without = LifeLikelihood.of(history, stage)
+    stepped = LifeLikelihood.of(replace(history, steps=(since("step", last_still, 10),)), stage)
+    (step,) = stepped.data.steps
+    np.testing.assert_array_equal(stepped.data.clock < step, np.arange(10) < last_still)
+    np.testing.assert_allclose(stepped.data.clock, without.data.clock, atol=1.0)
+    assert without.data.clock[last_still] == without.data.clock[last_still - 1]
+    for scenario in stepped.data.scenarios:
         density = LifeDensity.of(stepped, scenario)
         y = coordinates(density, 20)
         assert np.isfinite(density.log_probability(y)).all()
-        off, _ = density.deviations(y, np.array([0.0, stepped.now]), np.random.default_rng(4))
+        off, _ = density.deviations(y, np.array([0.0, stepped.data.now]), np.random.default_rng(4))
         assert np.isfinite(off).all()

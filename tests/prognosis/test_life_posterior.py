@@ -14,7 +14,7 @@ from threadpoolctl import threadpool_limits
 from lmshealth._arrays import FloatArray
 from lmshealth.errors import NotConverged
 from lmshealth.health.importance_sampling import importance_sample_to_ess
-from lmshealth.prognosis import life_likelihood as life
+from lmshealth.prognosis import constants
 from lmshealth.prognosis import life_posterior as lifefit
 from lmshealth.prognosis.life_likelihood import LifeLikelihood
 from lmshealth.prognosis.life_posterior import LifeDensity, LifePosterior, fit_life
@@ -46,11 +46,11 @@ MOUNT_OR_NOT = MOUNT[: MOUNT.index("[parameter.law]")] + (
 def small_grid() -> Iterator[None]:
     """Average over two walks, two deviations and one noise scale: checks hold for any of them."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(life, "_WALKS", (1e-5, 1.5e-3))
-        patch.setattr(life, "_NOISE_SCALES", (1.0,))
-        patch.setattr(life, "_NOISE_SCALE_PRIOR", (1.0,))
-        patch.setattr(life, "_DEVIATIONS", (0.0, 0.01))
-        patch.setattr(life, "_DEVIATION_PRIOR", (0.5, 0.5))
+        patch.setattr(constants, "WALKS", (1e-5, 1.5e-3))
+        patch.setattr(constants, "NOISE_SCALES", (1.0,))
+        patch.setattr(constants, "NOISE_SCALE_PRIOR", (1.0,))
+        patch.setattr(constants, "DEVIATIONS", (0.0, 0.01))
+        patch.setattr(constants, "DEVIATION_PRIOR", (0.5, 0.5))
         yield
 
 
@@ -141,15 +141,15 @@ def test_laws_and_health_are_those_of_importance_sampling(
     found: LifePosterior, history: History, stage: Stage
 ) -> None:
     """Chains and importance sampling give the same quantiles, within the error of both."""
-    likelihood = LifeLikelihood(history, stage)
-    (scenario,) = likelihood.scenarios
+    likelihood = LifeLikelihood.of(history, stage)
+    (scenario,) = likelihood.data.scenarios
     density = LifeDensity.of(likelihood, scenario)
     rng = np.random.default_rng(5)
     drawn = importance_sample_to_ess(
         density.log_probability, density.draw_prior(rng, 600), rng, 4000
     )
     y = drawn.resampled(rng, 4000)
-    now = np.array([likelihood.now])
+    now = np.array([likelihood.data.now])
     theta = scenario.natural(y)
     health = scenario.health(theta, now) * np.exp(density.deviations(y, now, rng)[0])
     known = np.column_stack([health[:, 0], theta[:, :2]])
@@ -188,13 +188,13 @@ def test_linear_algebra_keeps_to_one_thread(
 ) -> None:
     """On small arrays more would only wait for one another, whatever is usual around it."""
     seen: set[int] = set()
-    ways = lifefit._ways
+    sampled = lifefit._sampled_scenarios
 
     def counting(*arguments):
         seen.update(threads())
-        return ways(*arguments)
+        return sampled(*arguments)
 
-    monkeypatch.setattr(lifefit, "_ways", counting)
+    monkeypatch.setattr(lifefit, "_sampled_scenarios", counting)
     with threadpool_limits(2, user_api="blas"):
         fit_life(history, stage, 11, chains=False, n_draws=400)
         assert seen == {1}
@@ -335,7 +335,7 @@ def test_a_course_of_little_probability_has_no_chains(
     wavering: Stage, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """What is improbable is drawn by importance sampling alone, the rest by chains."""
-    monkeypatch.setattr("lmshealth.prognosis.life_posterior._WORTH_CHAINS", 0.5)
+    monkeypatch.setattr("lmshealth.prognosis.constants.MIN_CHAIN_PROBABILITY", 0.5)
     fit = fit_life(lived(TRAVEL, 1 - 0.08e-6 * TRAVEL, np.ones(12)), wavering, 7)
     with_law = [way for way in fit.scenarios if way.scenario.n_dim]
     assert {way.probability >= 0.5 for way in with_law} == {True, False}
@@ -350,8 +350,8 @@ def test_probabilities_are_those_of_the_evidence(tmp_path: Path) -> None:
     weighty = FADING_OR_NOT.replace(NONE, '{ kind = "none", weight = 3 }')
     stage = make_stage(tmp_path, (weighty,))
     history = lived(TRAVEL, 1 - 0.008e-6 * TRAVEL, np.ones(12))
-    likelihood = LifeLikelihood(history, stage)
-    law, none = (LifeDensity.of(likelihood, scenario) for scenario in likelihood.scenarios)
+    likelihood = LifeLikelihood.of(history, stage)
+    law, none = (LifeDensity.of(likelihood, scenario) for scenario in likelihood.data.scenarios)
     assert (law.scenario.weight, none.scenario.weight) == (0.25, 0.75)
     y = np.linspace(-0.5, 0.6, 20_001)
     value = law.log_probability(y[:, None])

@@ -13,13 +13,11 @@ from scipy.stats import weibull_min
 
 from lmshealth._arrays import FloatArray
 from lmshealth.prognosis.maintenance_decision import (
-    cheapest_date,
     cheapest_travel,
     day_after,
     decide,
     probability_before,
     remaining_days,
-    service_date,
 )
 from lmshealth.prognosis.results import Prognosis
 from lmshealth.stage.description import Decision
@@ -59,7 +57,7 @@ def test_the_service_day_is_the_last_with_the_risk_allowed() -> None:
     remaining = np.arange(1, 11) * 1e4
     prognosis = make_prognosis(remaining, np.full(10, 1e4))
     for risk, days in ((0.05, 1), (0.35, 4), (0.95, 10)):
-        day = service_date(prognosis, risk)
+        day = decide(prognosis, Decision(max_risk=risk)).by
         assert day == (START + timedelta(days=days)).date()
         assert np.mean(remaining / 1e4 <= midnight(day)) <= risk
         assert np.mean(remaining / 1e4 <= midnight(day) + 1) > risk
@@ -68,7 +66,7 @@ def test_the_service_day_is_the_last_with_the_risk_allowed() -> None:
 def test_a_limit_that_is_passed_asks_for_service_today() -> None:
     """More risk than allowed already: the day of the last log, not one before it."""
     prognosis = make_prognosis(np.full(100, -5e5), np.full(100, 1e4))
-    assert service_date(prognosis, 0.05) == START.date()
+    assert decide(prognosis, Decision(max_risk=0.05)).by == START.date()
     service = decide(prognosis, Decision())
     assert (service.kind, service.by, service.risk) == ("now", START.date(), 1.0)
     assert service.wait == -50
@@ -79,7 +77,7 @@ def test_no_service_is_asked_for_past_the_horizon() -> None:
     few = np.r_[np.full(4, 1e5), np.full(96, np.inf)]
     for remaining in (np.full(100, 2e7), np.full(100, np.inf), few):
         prognosis = make_prognosis(remaining, np.full(100, 1e4))
-        assert service_date(prognosis, 0.05) is None
+        assert decide(prognosis, Decision(max_risk=0.05)).by is None
         service = decide(prognosis, Decision())
         assert (service.kind, service.by, service.wait) == ("later", None, np.inf)
         assert np.isnan(service.risk)
@@ -88,7 +86,7 @@ def test_no_service_is_asked_for_past_the_horizon() -> None:
 def test_an_idle_machine_needs_no_service_within_any_calendar() -> None:
     """A day past the last one of the calendar is no date, and no error."""
     prognosis = make_prognosis(np.full(100, 9e6), np.full(100, 1.0))
-    assert service_date(prognosis, 0.05) is None
+    assert decide(prognosis, Decision(max_risk=0.05)).by is None
     assert decide(prognosis, Decision()).kind == "unknown"
     assert day_after(prognosis, np.inf) is None
 
@@ -99,7 +97,7 @@ def test_a_draw_past_the_horizon_may_fail_there(rng: np.random.Generator) -> Non
     remaining = rng.uniform(0, 2e7, 1000)
     prognosis = make_prognosis(remaining, usage)
     for risk in (0.05, 0.2, 0.45):
-        day = service_date(prognosis, risk)
+        day = decide(prognosis, Decision(max_risk=risk)).by
         assert day is not None
         reached = probability_before(prognosis, day)
         assert reached.at_least[-1] <= reached.at_most[-1] <= risk
@@ -213,7 +211,6 @@ def test_costs_choose_a_day_at_the_median_usage() -> None:
     travel = cheapest_travel(prognosis, 10.0)
     service = decide(prognosis, Decision(cost_ratio=10.0, next_service=date(2026, 3, 21)))
     assert service.kind == "by"
-    assert service.by == cheapest_date(prognosis, 10.0)
     assert service.by == (START + timedelta(days=travel / 1e4)).date()
     assert service.wait == pytest.approx(travel / 1e4)
     expected = weibull_min.cdf(1e4 * midnight(service.by), 3.0, scale=SCALE)

@@ -13,7 +13,7 @@ from scipy import stats
 
 from lmshealth.errors import BadStage, NotEnoughData
 from lmshealth.health import ensemble_sampling as sampling
-from lmshealth.prognosis import life_likelihood as life
+from lmshealth.prognosis import constants
 from lmshealth.prognosis.life_likelihood import LifeLikelihood
 from lmshealth.prognosis.life_posterior import LifeDensity, fit_life
 from lmshealth.prognosis.remaining_life import (
@@ -49,12 +49,12 @@ LIMITED_FOOT = FOOT + "limit = { below = 0.8 }\n"
 def small_grid() -> Iterator[None]:
     """Average over two walks, in short chains, about exact laws: checks hold for any of them."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(life, "_WALKS", (1e-5, 1.5e-3))
+        patch.setattr(constants, "WALKS", (1e-5, 1.5e-3))
         patch.setattr(sampling, "_FIRST_STEPS", 300)
-        patch.setattr(life, "_NOISE_SCALES", (1.0,))
-        patch.setattr(life, "_NOISE_SCALE_PRIOR", (1.0,))
-        patch.setattr(life, "_DEVIATIONS", (0.0,))
-        patch.setattr(life, "_DEVIATION_PRIOR", (1.0,))
+        patch.setattr(constants, "NOISE_SCALES", (1.0,))
+        patch.setattr(constants, "NOISE_SCALE_PRIOR", (1.0,))
+        patch.setattr(constants, "DEVIATIONS", (0.0,))
+        patch.setattr(constants, "DEVIATION_PRIOR", (1.0,))
         yield
 
 
@@ -93,9 +93,9 @@ def test_ten_thousand_draws_and_the_first_limit(fading: Prognosis) -> None:
 @pytest.mark.slow
 def test_remaining_life_is_that_of_a_grid(stage: Stage, fading: Prognosis) -> None:
     """Quantiles of the remaining travel have the right probability on a 1-D grid."""
-    likelihood = LifeLikelihood(fading_life(1.5e-4), stage)
+    likelihood = LifeLikelihood.of(fading_life(1.5e-4), stage)
     y = np.linspace(-0.3, 0.6, 4001)[:, None]
-    value = LifeDensity.of(likelihood, likelihood.scenarios[0]).log_probability(y)
+    value = LifeDensity.of(likelihood, likelihood.data.scenarios[0]).log_probability(y)
     density = np.exp(value - value.max())
     cdf = (np.cumsum(density) - 0.5 * density) / density.sum()
     for level in (0.05, 0.25, 0.5, 0.75, 0.95):
@@ -336,7 +336,7 @@ def test_health_off_its_law_makes_life_less_certain(
     stage: Stage, fading: Prognosis, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A deviation widens what is left, and what is past is so of the health that is now."""
-    monkeypatch.setattr(life, "_DEVIATIONS", (0.15,))
+    monkeypatch.setattr(constants, "DEVIATIONS", (0.15,))
     for rate, past_share in ((1.5e-4, 0.0), (0.4 / 1400, 0.5)):
         found = prognose(fading_life(rate), stage, 3)
         assert found.deviation == pytest.approx(0.15)

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from lmshealth._arrays import FloatArray
-from lmshealth.prognosis import life_likelihood as life
+from lmshealth.prognosis import constants
 from lmshealth.prognosis.fleet_prior import machine_evidence, needs_fleet_prior
 from lmshealth.prognosis.life_likelihood import LifeLikelihood
 from lmshealth.prognosis.life_posterior import LifeDensity, fit_life
@@ -66,12 +66,12 @@ def draw_history(rng: np.random.Generator, model_std: float) -> tuple[History, f
     temperature = 21 + 4 * rng.standard_normal(N_LOGS)
     drift += np.outer(temperature - 21, rng.normal(0, 1e-3, 2))
     steps = np.sqrt(np.diff(clock) / now)[:, None] * rng.standard_normal((N_LOGS - 1, 2))
-    drift[1:] += rng.choice(life._WALKS) * np.cumsum(steps, axis=0)
-    deviation = rng.choice(life._DEVIATIONS, p=life._DEVIATION_PRIOR)
+    drift[1:] += rng.choice(constants.WALKS) * np.cumsum(steps, axis=0)
+    deviation = rng.choice(constants.DEVIATIONS, p=constants.DEVIATION_PRIOR)
     steps = np.sqrt(np.diff(clock) / HORIZON) * rng.standard_normal(N_LOGS - 1)
     off = deviation * np.r_[0, np.cumsum(steps)]
     drift += np.outer(off, SENSITIVITY["guide_preload"][:2])
-    scale = rng.choice(life._NOISE_SCALES, p=life._NOISE_SCALE_PRIOR)
+    scale = rng.choice(constants.NOISE_SCALES, p=constants.NOISE_SCALE_PRIOR)
     noise = scale * 1e-3 * rng.standard_normal((N_LOGS, 2))
     history = make_history(
         np.log(FREQUENCY[:2]) + drift + noise, travel=travel, temperature=temperature
@@ -94,8 +94,8 @@ def integrated(density: LifeDensity) -> tuple[FloatArray, FloatArray]:
 
 def density_of(history: History, stage: Stage) -> LifeDensity:
     """Give the density of the only scenario."""
-    likelihood = LifeLikelihood(history, stage)
-    return LifeDensity.of(likelihood, likelihood.scenarios[0])
+    likelihood = LifeLikelihood.of(history, stage)
+    return LifeDensity.of(likelihood, likelihood.data.scenarios[0])
 
 
 def level_of_health(
@@ -104,7 +104,7 @@ def level_of_health(
     """Posterior probability of less health now than the truth: the law times how far it is off."""
     y, weight = integrated(density)
     drawn = rng.choice(y, n, p=weight / weight.sum())[:, None]
-    off, _ = density.deviations(drawn, np.array([density.life.now]), rng)
+    off, _ = density.deviations(drawn, np.array([density.likelihood.data.now]), rng)
     return float(np.mean((1 - drawn) * np.exp(off[:, 0]) < truth))
 
 
@@ -121,7 +121,7 @@ def test_losses_by_laws_are_calibrated(
     for _ in range(claims.trials):
         history, loss, left = draw_history(rng, 0.2)
         density = density_of(history, honest)
-        assert density.life.horizon == HORIZON
+        assert density.likelihood.data.horizon == HORIZON
         found.append(cdf_at(*integrated(density), loss))
         health.append(level_of_health(density, rng, left))
         rash = density_of(history, proud)
@@ -139,9 +139,9 @@ def test_health_off_its_law_is_calibrated(
 
     Control: taken never to leave its law, it is not.
     """
-    monkeypatch.setattr(life, "_WALKS", (1e-5, 5e-4, 1.5e-3))
-    monkeypatch.setattr(life, "_DEVIATIONS", (0.0, 0.4))
-    monkeypatch.setattr(life, "_DEVIATION_PRIOR", (0.1, 0.9))
+    monkeypatch.setattr(constants, "WALKS", (1e-5, 5e-4, 1.5e-3))
+    monkeypatch.setattr(constants, "DEVIATIONS", (0.0, 0.4))
+    monkeypatch.setattr(constants, "DEVIATION_PRIOR", (0.1, 0.9))
     stage = make_stage(tmp_path, (FADING,), model_std=0.2, tail=TEMPERATURE)
     found, wrong = [], []
     for _ in range(claims.trials):

@@ -7,7 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lmshealth.prognosis.life_likelihood import MOST_LOGS, LifeLikelihood, condense
+from lmshealth.prognosis import constants
+from lmshealth.prognosis.life_data import condense
+from lmshealth.prognosis.life_likelihood import LifeLikelihood
 from lmshealth.prognosis.life_posterior import fit_life
 from lmshealth.tracking.history import Step
 from tests.lives import FREQUENCY, SENSITIVITY, awkward_history, make_history, make_stage, since
@@ -113,6 +115,6 @@ def test_ten_thousand_logs_are_no_more_work_than_some_hundreds(lives: tuple) -> 
         history.ln_frequency[many], travel=np.linspace(0.0, 3.0e6, many.size), std=2e-3
     )
     times = tuple(sorted(history.recorded_at[0].replace(microsecond=0) for _ in many))
-    likelihood = LifeLikelihood(replace(longer, recorded_at=times), stage)
-    assert likelihood.rows.size <= 2 * (MOST_LOGS + 3)
-    assert likelihood.now == longer.travel[-1] - longer.travel[0]
+    likelihood = LifeLikelihood.of(replace(longer, recorded_at=times), stage)
+    assert likelihood.data.rows.size <= 2 * (constants.MAX_LOGS + 3)
+    assert likelihood.data.now == longer.travel[-1] - longer.travel[0]

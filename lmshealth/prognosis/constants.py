@@ -1,0 +1,60 @@
+"""Constants that decide which remaining life and which service date are published."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from lmshealth.stage.priors import Normal
+
+# What a life needs.
+MIN_LOGS = 3
+"""Logs with an informative mode: with fewer, a slope is not separated from the intercept."""
+MAX_STEPS = 3
+"""Steps since the baseline; with more, every piece of the life is too short for a law."""
+MAX_LOGS = 400
+"""Longer histories are condensed: the cost of Σ grows with the third power of the logs. Medians and
+widths of health change by less than a quarter of a 90 % interval when 240 logs become 40 (test)."""
+
+# Priors of nuisance parameters; studies/sbc_life has the ranks of the truth under them.
+INTERCEPT_STD = 0.1
+"""Standard deviation of ln f of a mode at the baseline: so wide that only the data decide."""
+JUMP = Normal(0.0, 0.3)
+"""Ln factor on a health parameter at a step: one standard deviation is a loss of a quarter."""
+WALKS = (1e-5, 5e-4, 1.5e-3, 5e-3, 1.5e-2)
+"""Standard deviations over the history of the random walk of ln f, equally probable: from none to
+several times the 0.4 % that frequencies of a real building move by (studies/modes_real)."""
+NOISE_SCALES = (1.0, 1.5, 2.25)
+"""Factors on the reported standard deviations of ln f; 1 is probable, as 95 % intervals of the
+identification cover 95 % (studies/identification)."""
+NOISE_SCALE_PRIOR = (0.9, 0.07, 0.03)
+DEVIATIONS = (0.0, 0.04, 0.15)
+"""Standard deviations at the horizon of ln health about its law: exact laws, and deviations of a
+tenth and of a third of the loss at a limit of 0.6."""
+DEVIATION_PRIOR = (0.6, 0.3, 0.1)
+
+# Posterior over scenarios, see README.md.
+MIN_PROBABILITY = 0.01
+"""Scenarios with a lower probability are not published."""
+MIN_CHAIN_PROBABILITY = 0.1
+"""Scenarios with a lower probability are drawn by importance sampling only: their share of all
+draws is too small for chains to change a quantile."""
+MAX_LOG_ODDS = 9.0
+"""Scenarios so much less probable than the best by a rough evidence are dropped (1 : 8100)."""
+
+# Fleet prior, see README.md.
+MIN_MACHINES = 3
+"""Other machines that a fleet prior needs: with fewer, the variance between machines is mixed with
+the variance between fleets."""
+MIN_LAW_PROBABILITY = 0.05
+"""A law with a lower probability does not decide the remaining life, nor whether it is informed."""
+FLEET_MEAN = np.linspace(-3.0, 3.0, 41)[:, None]
+"""Grid of the mean m of a fleet in standard deviations of the description's prior."""
+FLEET_VARIANCE = (np.arange(12) + 0.5) / 12
+"""Grid of the variance v between the machines of a fleet, uniform on (0, 1). Its lowest value is a
+fifth of the prior's standard deviation: machines that are more alike change no date."""
+FLEET_DIGITS = 2
+"""Significant digits of a fleet prior: with more, one new log would recompute a whole fleet."""
+
+MIN_SAVING = 0.01
+"""A service that saves a smaller share of the long-run costs gets no date: 10,000 draws do not
+resolve it."""

@@ -1,0 +1,258 @@
+"""Data of a life: ln frequencies of the informative modes since the baseline, condensed."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
+
+import numpy as np
+
+from lmshealth._arrays import FloatArray, freeze
+from lmshealth.errors import NotEnoughData
+from lmshealth.prognosis import constants
+from lmshealth.prognosis.scenarios import Scenario, list_scenarios
+from lmshealth.stage.description import Stage
+from lmshealth.tracking.history import History
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LifeData:
+    """Data of a life.
+
+    The data are ordered by series, and those of a series by log.
+
+    Attributes
+    ----------
+    stage : Stage
+        Description.
+    history : History
+        All logs, condensed.
+    columns : list of int
+        Series of the history that are used.
+    modes : tuple of str
+        Modes of these series.
+    mode_of_series : ndarray of int
+        Index of the mode of each series used, shape ``(n_series,)``.
+    clock : ndarray
+        Travel since the baseline of each log since then in m, shape ``(n_logs,)``.
+    steps : tuple of float
+        Travel since the baseline of each step of the modes in m.
+    rows : ndarray of int
+        Index of each datum among all series and logs, shape ``(n_data,)``.
+    y : ndarray
+        Ln f minus the mean of its mode, shape ``(n_data,)``.
+    """
+
+    stage: Stage
+    history: History
+    columns: list[int]
+    modes: tuple[str, ...]
+    mode_of_series: np.ndarray
+    clock: FloatArray
+    steps: tuple[float, ...]
+    rows: np.ndarray
+    y: FloatArray
+
+    def __post_init__(self) -> None:
+        freeze(self)
+
+    @classmethod
+    def select(cls, history: History, stage: Stage) -> LifeData:
+        """Select the data of a life.
+
+        Raises
+        ------
+        NotEnoughData
+            If the odometer is missing or has not moved, fewer than three logs since the baseline
+            have an informative mode, or the modes stepped more than three times.
+        """
+        history = condense(history, constants.MAX_LOGS)
+        if not history.has_odometer:
+            raise NotEnoughData(
+                f"{history.stage}: not every log has travel_km, and degradation laws count by the "
+                "odometer; add it to manifest.csv"
+            )
+        observed = np.any(np.isfinite(history.ln_frequency[history.baseline :]), axis=0)
+        names = [name for name in stage.informative if name in history.modes]
+        columns = [i for name in names for i in history.columns(name) if observed[i]]
+        of_series = [history.series[i].mode for i in columns]
+        modes = tuple(dict.fromkeys(of_series))
+        ln_f = history.ln_frequency[history.baseline :, columns]
+        all_clock = _clock_before_steps(history)
+        clock = all_clock[history.baseline :]
+        now, n_logs = float(clock.max(initial=0.0)), np.isfinite(ln_f).any(axis=1).sum()
+        if n_logs < constants.MIN_LOGS or now <= 0:
+            raise NotEnoughData(
+                f"{history.stage}: {n_logs} logs with a mode of the map over {now / 1000:.4g} km; "
+                f"a life needs at least {constants.MIN_LOGS} logs and some travel"
+            )
+        flat = ln_f.T.ravel()
+        rows = np.flatnonzero(np.isfinite(flat))
+        mode_of_series = np.array([modes.index(name) for name in of_series])
+        means = np.array([np.nanmean(ln_f[:, mode_of_series == i]) for i in range(len(modes))])
+        return cls(
+            stage=stage,
+            history=history,
+            columns=columns,
+            modes=modes,
+            mode_of_series=mode_of_series,
+            clock=clock,
+            steps=_steps(history, all_clock),
+            rows=rows,
+            y=flat[rows] - means[mode_of_series[rows // clock.size]],
+        )
+
+    @property
+    def now(self) -> float:
+        """Travel since the baseline at the last log in m."""
+        return float(self.clock.max())
+
+    @property
+    def horizon(self) -> float:
+        """Travel in m beyond which no remaining life is published."""
+        return self.stage.description.usage.horizon_km * 1000.0
+
+    @property
+    def log_of(self) -> np.ndarray:
+        """Index of the log of each datum, shape ``(n_data,)``."""
+        return np.asarray(self.rows % self.clock.size)
+
+    @property
+    def mode_of(self) -> np.ndarray:
+        """Index of the mode of each datum, shape ``(n_data,)``."""
+        return np.asarray(self.mode_of_series[self.rows // self.clock.size])
+
+    @property
+    def scenarios(self) -> tuple[Scenario, ...]:
+        """Scenarios that the laws and the steps allow."""
+        return list_scenarios(self.stage.parameters, self.steps, self.now)
+
+    @property
+    def free(self) -> FloatArray:
+        """1 for a parameter that may change and 0 for one that keeps its value, by parameter."""
+        parameters = self.stage.parameters
+        return np.array([float(any(law.names for law in one.laws)) for one in parameters])
+
+    @property
+    def sensitivity(self) -> FloatArray:
+        """D ln f / d ln parameter at the baseline, 0 if not free, ``(n_modes, n_parameters)``."""
+        assert self.stage.modal_map is not None  # prognose() has checked
+        rows = [self.stage.modal_map.modes.index(name) for name in self.modes]
+        gradient = self.stage.modal_map.gradient(self.stage.baseline_point[None])
+        return np.asarray(gradient[0, rows] * self.free)
+
+
+def condense(history: History, most: int) -> History:
+    """Average neighbouring logs until there are about so many.
+
+    Estimates are averaged by generalised least squares over the logs, series and cross terms of a
+    group; moments, odometer and covariates are plain means. The first log of a baseline and the
+    last log stay alone, and no group reaches across a step.
+
+    Parameters
+    ----------
+    history : History
+        Any number of logs; no more than `most` are returned as they are.
+    most : int
+        Number of logs.
+
+    Returns
+    -------
+    History
+        Each log named by the last log of its group.
+    """
+    n = len(history.logs)
+    if n <= most:
+        return history
+    begins = _group_begins(history, -(-n // most))
+    ends = np.append(begins[1:], n)
+    group_of = np.repeat(np.arange(begins.size), ends - begins)
+    parts = [slice(begin, end) for begin, end in zip(begins, ends, strict=True)]
+    found = [_average(history, part) for part in parts]
+    seconds = np.array([moment.timestamp() for moment in history.recorded_at])
+    r = len(history.series)
+    return replace(
+        history,
+        logs=tuple(history.logs[end - 1] for end in ends),
+        recorded_at=tuple(datetime.fromtimestamp(seconds[part].mean(), UTC) for part in parts),
+        travel=_means(history.travel, parts),
+        covariates={name: _means(own, parts) for name, own in history.covariates.items()},
+        ln_frequency=np.array([mean[:r] for mean, _ in found]),
+        ln_damping=np.array([mean[r:] for mean, _ in found]),
+        cov=np.array([cov for _, cov in found]),
+        loop_error=_means(history.loop_error, parts),
+        baselines=tuple(int(group_of[k]) for k in history.baselines),
+        steps=tuple(
+            replace(step, first=int(group_of[step.first]), there=step.there[begins])
+            for step in history.steps
+        ),
+    )
+
+
+def _group_begins(history: History, size: int) -> np.ndarray:
+    """Return the index of the first log of each group of at most so many."""
+    n = len(history.logs)
+    begins = np.zeros(n, dtype=bool)
+    begins[[0, n - 1]] = True
+    for k in history.baselines:
+        begins[[k, min(k + 1, n - 1)]] = True
+    for step in history.steps:
+        begins[step.first] = True
+        begins[1:] |= np.diff(step.there.astype(int)) != 0
+    lengths = np.diff(np.flatnonzero(begins), append=n)
+    within = np.concatenate([np.arange(length) for length in lengths])
+    return np.flatnonzero(within % size == 0)
+
+
+def _means(values: FloatArray, parts: list[slice]) -> FloatArray:
+    """Return the mean of each group without missing values, NaN if all are missing."""
+    known = np.isfinite(values)
+    filled = np.where(known, values, 0.0)
+    counts = np.array([known[part].sum() for part in parts])
+    sums = np.array([filled[part].sum() for part in parts])
+    return np.where(counts > 0, sums / np.maximum(counts, 1), np.nan)
+
+
+def _average(history: History, part: slice) -> tuple[FloatArray, FloatArray]:
+    """Average ln f and ln ζ of a group: mean ``(2 n_series,)`` and covariance, NaN if missing."""
+    values = np.hstack([history.ln_frequency[part], history.ln_damping[part]])
+    precision, weighted = np.zeros((values.shape[1],) * 2), np.zeros(values.shape[1])
+    for own, cov in zip(values, history.cov[part], strict=True):
+        present = np.flatnonzero(np.isfinite(own))
+        if present.size:
+            block = np.linalg.inv(cov[np.ix_(present, present)])
+            precision[np.ix_(present, present)] += block
+            weighted[present] += block @ own[present]
+    observed = np.flatnonzero(np.isfinite(values).any(axis=0))
+    mean, total = np.full(values.shape[1], np.nan), np.full_like(precision, np.nan)
+    if observed.size:
+        cov = np.linalg.inv(precision[np.ix_(observed, observed)])
+        mean[observed] = cov @ weighted[observed]
+        total[np.ix_(observed, observed)] = (cov + cov.T) / 2
+    return mean, total
+
+
+def _first_logs(history: History) -> list[int]:
+    """Return the first log after each step of the modes since the baseline."""
+    first = {s.first for s in history.steps if s.kind == "step" and s.first > history.baseline}
+    return sorted(first)
+
+
+def _clock_before_steps(history: History) -> FloatArray:
+    """Return the travel since the baseline in m, at least 1 m between a step and the log before."""
+    clock = history.clock()
+    for k in reversed(_first_logs(history)):
+        before = clock[:k]
+        before[before >= clock[k]] = clock[k] - 1.0
+    return clock
+
+
+def _steps(history: History, clock: FloatArray) -> tuple[float, ...]:
+    """Return the travel since the baseline of each step, halfway between two logs."""
+    first = _first_logs(history)
+    if len(first) > constants.MAX_STEPS:
+        raise NotEnoughData(
+            f"{history.stage}: the modes jumped {len(first)} times since the baseline; no law of "
+            "a life holds over so many; maintenance.csv can declare a new baseline"
+        )
+    return tuple(float((clock[k - 1] + clock[k]) / 2) for k in first)
