@@ -1,13 +1,60 @@
-"""Constants that decide what a track publishes."""
+"""Constants that decide what a track publishes.
 
-# Priors. Rates and walks of a mode are per life.
+Frequencies enter as ln f and damping ratios as ln ζ; a "life" is the horizon of the stage
+description, or the length of the history without one. Rates and random walks are per life.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+# --- Alarms and change detection ----------------------------------------------------------------
+# Probability that a machine without damage ever raises an alarm, however many logs are judged. A
+# log Bayes factor of ln(routes / probability) is required (Ville's inequality [Ville1939]).
+FALSE_ALARM_PROBABILITY = 0.01
+# An alarm has three routes: drift since the baseline, drift that begins later, and a step.
+ALARM_ROUTES = 3
+# Mean standardised innovation over a window, times the root of its length, that opens the weighing
+# of change hypotheses. Lower costs time only: what is published depends on the Bayes factor.
+SUSPICION_GATE = 4.0
+# The kind of a change is settled at these odds over all other kinds, or after so many logs.
+KIND_LOG_ODDS = float(np.log(10.0))
+KIND_PATIENCE = 8
+# RMS of the following error below 40 Hz. Probability that a retuning of the servo changes it, and
+# that any other event does: a new loop gain nearly always shows, wear hardly ever.
+LOOP_CHANGE_PROBABILITY = {"servo": 0.99, "other": 0.02}
+# Prior variance of such a change, in variances between logs [Gonen2005].
+LOOP_CHANGE_VARIANCE = 100.0
+# Logs before and after that are compared, the fewest before, and the p-value of two following
+# errors in a row that mark a possible retuning.
+LOOP_LOGS, LOOP_FEWEST, LOOP_P_VALUE = 12, 3, 0.01
+
+# --- Outliers and consistency -------------------------------------------------------------------
+# An estimate with a standardised innovation beyond the gate is an outlier until the next log
+# confirms it. False alarms of the gate: 2e-9 per estimate.
+OUTLIER_GATE = 6.0
+# Prior probability that a log holds an outlier.
+OUTLIER_PROBABILITY = 0.01
+# Published standard deviations are widened once the innovations are less probable than this.
+WIDENING_P_VALUE = 5e-4
+# Below these p-values a filter is not consistent: overconfident, or too cautious. The second is
+# lower, because averaging over process noise is somewhat cautious for quiet machines.
+OVERCONFIDENT_P_VALUE, CAUTIOUS_P_VALUE = 1e-3, 1e-6
+# Two-sided p-value outside of which NIS counts as "above" or "below" its 95 % band.
+NIS_P_VALUE = 0.05
+
+# --- Priors of the state ------------------------------------------------------------------------
+# Standard deviations of ln f and ln ζ about a mode's first estimate.
 LN_F_STD = 0.1
 LN_ZETA_STD = 1.0
+# Random walk of ln ζ per life.
 DAMPING_WALK = 0.5
+# Bias of ln f and ln ζ between two sources of one mode.
 BIAS_STD = (0.005, 0.2)
+# d ln f per unit of a covariate that no stage description describes.
 COVARIATE_STD = 0.001
-# Standard deviations of the jumps of ln f and ln ζ: of a loosened bolt or a crash; of grease; of
-# the loop's poles; of a sensor that was moved or calibrated anew; of an overhaul.
+# Jumps of ln f and ln ζ: a loosened bolt or a crash; grease; the loop's poles after a retuning; a
+# sensor that was moved or recalibrated; an overhaul.
 JUMP_STD: dict[str, tuple[float, float]] = {
     "step": (0.03, 0.3),
     "regreasing": (0.0, 0.3),
@@ -15,4 +62,77 @@ JUMP_STD: dict[str, tuple[float, float]] = {
     "sensor": (0.005, 0.2),
     "reset": (0.05, 0.5),
 }
-FALSE_ALARM_PROBABILITY = 0.01
+
+# --- Process noise, averaged over its evidence (INFERENCE: maximum likelihood collapses to none) --
+# Random walk of ln f of a healthy machine, which has no rate.
+HEALTHY_WALKS = (1e-5, 3e-4, 1e-3)
+# Random walk of ln f of a changing machine, its initial rates, and the random walks of the rate.
+CHANGING_WALKS = (1e-5, 1e-3, 3e-3, 1e-2)
+CHANGING_RATES = ((0.03, 0.01), (0.03, 0.1), (0.3, 0.1), (0.3, 1.0), (1.0, 3.0))
+# Prior probability of the healthy group. It cancels in the Bayes factor of an alarm.
+HEALTHY_PROBABILITY = 0.1
+# Factors on the reported standard deviations of one source, with prior probabilities. Sources past
+# the third share the factor of the third, to bound the size of the grid.
+NOISE_SCALES = ((0.5, 0.02), (0.7, 0.05), (1.0, 0.8), (1.5, 0.08), (2.25, 0.03), (4.0, 0.02))
+MOST_SCALED_SOURCES = 3
+
+# --- Association: gates --------------------------------------------------------------------------
+# Posterior probability from which an estimate is assigned to a mode.
+LABEL_PROBABILITY = 0.95
+# An assignment is unique if every estimate is within the inner gate of its mode and outside the
+# outer gate of all others (standard deviations), with at least this MAC.
+INNER_GATE, OUTER_GATE = 4.0, 12.0
+LEAST_MAC = 0.8
+# A log repeats the one before if ln f changes by at most this, plus covariates and REPEAT_GATE
+# standard deviations, and modes are farther apart than that by REPEAT_SEPARATION.
+REPEAT_LN_F, REPEAT_SEPARATION, REPEAT_GATE = 0.005, 0.03, 4.0
+# A crash moves all modes: two named modes or more that are all outside this gate about every mode
+# seen before, while their names agree, open the log for steps.
+JUMP_LN_F, JUMP_GATE, JUMP_COVARIATE_GATE = 0.003, 6.0, 2.0
+
+# --- Association: hypotheses ---------------------------------------------------------------------
+# Probability that a source shows a mode in a log.
+DETECTION_PROBABILITY = 0.8
+# Clutter: false estimates per log and unit of ln f, and their density in ln ζ (any value within an
+# order of magnitude).
+CLUTTER_DENSITY, CLUTTER_LN_ZETA_DENSITY = 0.1, 0.3
+# Probability that a name is right, given the rule by which names are assigned.
+NAME_PROBABILITY = 0.98
+# Concentration of a Watson distribution of shapes: a direction known to 0.13 rad.
+SHAPE_CONCENTRATION = 30.0
+# Explanations and hypotheses with less than this share of the best are pruned; so many assignments
+# per hypothesis, and so many hypotheses, are kept.
+PRUNING_LOG_ODDS = float(np.log(1e-7))
+MOST_ASSIGNMENTS, MOST_HYPOTHESES = 12, 24
+# Hypotheses nearer than this (squared standard deviations) are merged.
+MERGING_DISTANCE = 1.0
+# Probability that a declared intervention changes the order of frequencies: modes step together.
+REORDERING_PROBABILITY = 0.05
+# Modes nearer than this in ln f may veer, with this probability per log.
+VEERING_LN_F, VEERING_PROBABILITY = 0.03, 0.02
+
+# --- Association: filters of single modes (those of a stage that wears quickly: labels must not
+# depend on a precise prediction) -----------------------------------------------------------------
+RATE_STD, LEVEL_WALK, RATE_WALK, LN_ZETA_WALK = 0.3, 3e-3, 0.1, 0.3
+DECLARED_STEP_STD = 0.05
+# Probability of a stray innovation, and its standard deviations.
+STRAY_PROBABILITY, STRAY_LN_F_STD, STRAY_LN_ZETA_STD = 0.05, 0.01, 0.7
+# No life is assumed shorter than so many logs: early logs do not show its length.
+LEAST_LIFE_LOGS = 50
+# A mode's shape is the mean of its first ones. Later shapes do not move it, so that a mode that
+# takes another's shape is detected.
+N_MEAN_SHAPES = 10
+
+# --- Association: track initiation ---------------------------------------------------------------
+# Prior odds that an unassigned estimate is a mode's first, the probability that confirms it, and
+# the odds at which it is deleted.
+INITIATION_ODDS, CONFIRMATION_PROBABILITY, DELETION_ODDS = 1e-3, 0.95, 1e-5
+# Logs that confirm a new mode, and a new level of a mode that is named.
+LEAST_LOGS_NEW, LEAST_LOGS_NAMED = 3, 2
+
+# --- Notes and tables ----------------------------------------------------------------------------
+# So many logs in a row without an assigned estimate of a mode are reported.
+MISSING_LOGS = 3
+# Smallest relative standard deviation of a frequency in a foreign table, and smallest and largest
+# standard deviation of a drift: smaller ones are lost in rounding, a factor of 20 is no drift.
+LEAST_RELATIVE_STD, LEAST_DRIFT_STD, MOST_DRIFT = 1e-7, 1e-9, 3.0

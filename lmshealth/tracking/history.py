@@ -16,22 +16,15 @@ from lmshealth.io.log import Metadata, Refusal
 from lmshealth.modal.modes import Modes
 from lmshealth.signal.waterfall import RelativeSpectrum
 from lmshealth.stage.description import Stage
-from lmshealth.tracking.association.associate import Association, associate
-from lmshealth.tracking.association.estimates import Estimates
-from lmshealth.tracking.covariates import Regressor, regressors
+from lmshealth.tracking import constants
+from lmshealth.tracking.association.associate import Association, Estimates, associate
+from lmshealth.tracking.covariates import regressors
 from lmshealth.tracking.maintenance import RESETS, Action
 
 StepKind = Literal["step", "regreasing", "servo", "sensor", "reset"]
 
 # Sources in the order in which they stand where a mode has several.
 _SOURCES = ("joint", "acc", "frf", "delta_e")
-# So many logs in a row without a clear identity are worth a word.
-_LATE = 3
-# From one log to the next ln f stays within that, and so many standard deviations of its error and
-# of what covariates may do.
-_STILL = 0.003
-_JUMP_SIGMAS = 6.0
-_PRIOR_SIGMAS = 2.0
 _KINDS: dict[str, StepKind] = {"regrease": "regreasing", "servo": "servo", "sensor": "sensor"}
 _NO_MOMENT = datetime.max.replace(tzinfo=UTC)
 
@@ -329,9 +322,9 @@ def build_history(
         clock,
         offsets=np.array([one.values for one in regressed]).reshape(-1, len(ordered)).T,
         prior_std=np.array([one.prior_std for one in regressed]),
-        jumps={step.first for step in steps} | _common_jumps(estimates, regressed),
+        jumps={step.first for step in steps},
     )
-    refused += _doubts(ordered, estimates, found)
+    refused += _unassigned(ordered, estimates, found)
     modes, series, columns = _line_up(estimates, found, stage)
     declared = [k for k, reading in enumerate(ordered) if reading.metadata.baseline]
     history = History(
@@ -456,48 +449,6 @@ def _estimates(ordered: Sequence[LogEstimates], stage: Stage | None) -> list[Est
     return estimates
 
 
-def _common_jumps(estimates: Sequence[Estimates], regressed: Sequence[Regressor]) -> set[int]:
-    """Find logs in which several named modes are off at once, at places where no other mode was.
-
-    A crash moves all modes: their names are then worth more than their places. Where the places
-    are those of other modes, the names may be wrong, and it is no such log.
-    """
-    last: dict[tuple[str, str], tuple[float, float, int]] = {}
-    jumps: set[int] = set()
-    for k, own in enumerate(estimates):
-        keys = list(zip(own.names, own.sources, strict=True))
-        variance = np.diag(own.cov)[: len(keys)]
-        elsewhere = set()
-        for i, key in enumerate(keys):
-            if not key[0] or key not in last:
-                continue
-            change = sum(
-                one.prior_std * abs(float(one.values[k] - one.values[last[key][2]]))
-                for one in regressed
-            )
-            near = [
-                other
-                for other, (place, spread, _) in last.items()
-                if other[1] == key[1]
-                and abs(own.ln_frequency[i] - place)
-                <= _STILL + _PRIOR_SIGMAS * change + _reach(variance[i], spread)
-            ]
-            if not near:
-                elsewhere.add(key[0])
-        if len(elsewhere) > 1:
-            jumps.add(k)
-        last |= {
-            key: (float(own.ln_frequency[i]), float(variance[i]), k)
-            for i, key in enumerate(keys)
-            if key[0]
-        }
-    return jumps
-
-
-def _reach(variance: float, other: float) -> float:
-    return _JUMP_SIGMAS * float(np.sqrt(variance + other))
-
-
 def _named(modes: Modes, i: int, stage: Stage | None) -> str:
     """Name of an estimate; without one, that of the nearest mode of the stage within its search."""
     if modes.names[i] or stage is None:
@@ -508,35 +459,34 @@ def _named(modes: Modes, i: int, stage: Stage | None) -> str:
     return min(near, key=lambda name: away[name], default="")
 
 
-def _doubts(
+def _unassigned(
     ordered: Sequence[LogEstimates], estimates: Sequence[Estimates], found: Association
 ) -> list[Refusal]:
-    """Tell which estimates are given to no mode. Of a jump the tracker decides."""
+    """List the estimates that are assigned to no mode. Jumps are left to the tracker."""
     return [
         Refusal(
-            log=ordered[doubt.epoch].log,
-            mode=estimates[doubt.epoch].names[doubt.estimate],
-            source=estimates[doubt.epoch].sources[doubt.estimate],
-            reason=doubt.reason,
-            detail=doubt.detail,
+            log=ordered[k].log,
+            mode=estimates[k].names[i],
+            source=estimates[k].sources[i],
+            reason=label.reason,
+            detail=label.detail,
         )
-        for doubt in found.doubts
-        if doubt.reason != "jump"
+        for k, i, label in found.unassigned
+        if label.reason != "jump"
     ]
 
 
 def _line_up(
     estimates: Sequence[Estimates], found: Association, stage: Stage | None
 ) -> tuple[tuple[str, ...], tuple[Series, ...], dict[str, FloatArray]]:
-    """Give every mode and source its column; what is missing is NaN."""
-    jumps = {
-        (d.epoch, d.estimate): estimates[d.epoch].names[d.estimate]
-        for d in found.doubts
-        if d.reason == "jump"
-    }
+    """Put the estimates of every mode and source in a column; missing ones are NaN."""
+    # A jump keeps its name: the tracker decides whether it is an outlier or a step.
     given = [
-        [jumps.get((k, i), mode) for i, mode in enumerate(own)]
-        for k, own in enumerate(found.assigned)
+        [
+            name if label.reason == "jump" else label.mode
+            for name, label in zip(e.names, own, strict=True)
+        ]
+        for e, own in zip(estimates, found.labels, strict=True)
     ]
     seen = {
         (mode, source)
@@ -575,23 +525,25 @@ def _rank(source: str) -> tuple[int, str]:
 
 
 def missing_mode_notes(history: History, refused: Sequence[Refusal]) -> list[str]:
-    """Say which modes are no longer seen or told apart, so that nothing new is known of them."""
-    last = history.logs[-_LATE:]
-    doubted = {
-        name: {r.log for r in refused if (r.reason, r.mode) == ("ambiguous", name)} & set(last)
+    """List modes that the last logs do not detect, or whose estimates are ambiguous there."""
+    least = constants.MISSING_LOGS
+    last = history.logs[-least:]
+    ambiguous = [
+        name
         for name in history.modes
-    }
-    lost = [name for name, logs in doubted.items() if len(last) == _LATE == len(logs)]
+        if len({r.log for r in refused if (r.reason, r.mode) == ("ambiguous", name)} & set(last))
+        == least
+    ]
     notes = []
-    if lost:
+    if ambiguous:
         notes.append(
-            f"{' and '.join(lost)}: the last {_LATE} logs do not tell which mode their estimates "
-            "are of, so that nothing new is known; logs with more channels would tell modes by "
-            "their shapes."
+            f"{' and '.join(ambiguous)}: the estimates of the last {least} logs are ambiguous, so "
+            "that nothing new is known; logs with more channels would distinguish modes by their "
+            "shapes."
         )
     for name in history.modes:
-        seen, _ = np.nonzero(np.isfinite(history.ln_frequency[:, history.columns(name)]))
-        missed = len(history.logs) - 1 - int(seen.max(initial=-1))
-        if missed >= _LATE and name not in lost:
+        found = np.flatnonzero(np.isfinite(history.ln_frequency[:, history.columns(name)]).any(1))
+        missed = len(history.logs) - 1 - int(found.max(initial=-1))
+        if missed >= least and name not in ambiguous:
             notes.append(f"{name}: no estimate in the last {missed} logs; nothing new is known.")
     return notes

@@ -35,7 +35,7 @@ from unittest.mock import patch
 import numpy as np
 from numpy.typing import NDArray
 
-from lmshealth.tracking.association import identities
+from lmshealth.tracking import constants
 from lmshealth.tracking.association.associate import Association, associate
 from studies.common.metrics import clopper_pearson
 from studies.crossings.judging import judge, nearest, recovered
@@ -91,7 +91,7 @@ def followed(name: str, kind: Kind, n: int) -> Row:
         life = life_of(name, seed)
         found = labels_of(life)
         count += judge(life, found.assigned)
-        count += Counter(f"refused_{doubt.reason}" for doubt in found.doubts)
+        count += Counter(f"refused_{label.reason}" for _, _, label in found.unassigned)
         control += judge(life, nearest(life))
         again.append(recovered(life, found.assigned))
     return {
@@ -127,7 +127,7 @@ def swaps(count: Counter[str]) -> Row:
 def guessed(n: int) -> Row:
     """Count silent swaps where nothing tells and the best guess is given."""
     count: Counter[str] = Counter()
-    with patch.object(identities, "SURE", 0.5):
+    with patch.object(constants, "LABEL_PROBABILITY", 0.5):
         for seed in range(n):
             life = life_of("merging", seed)
             count += judge(life, labels_of(life).assigned)

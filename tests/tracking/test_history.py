@@ -208,12 +208,15 @@ def test_no_reading_is_refused(stage: Stage) -> None:
         build_history([], stage)
 
 
-def test_modes_that_can_no_longer_be_told_apart_are_told(stage: Stage) -> None:
+def test_modes_that_stay_ambiguous_make_a_note(stage: Stage) -> None:
     """Three logs in a row without a clear identity make a note, two do not."""
     readings = [make_reading(str(k), k, 1e5 * k, {"roll": 4.8}) for k in range(5)]
     history, _ = build_history(readings, stage)
     doubts = [Refusal(str(k), "ambiguous", "", mode="roll") for k in range(5)]
-    assert "roll: the last 3 logs do not tell" in missing_mode_notes(history, doubts[2:])[0]
+    assert (
+        "roll: the estimates of the last 3 logs are ambiguous"
+        in missing_mode_notes(history, doubts[2:])[0]
+    )
     assert missing_mode_notes(history, doubts[:4]) == []
 
 

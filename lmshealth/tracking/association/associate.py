@@ -1,68 +1,216 @@
-"""Who is who: estimates of many logs given to the modes of one machine.
+"""Data association: assign the modal estimates of all logs to the modes of one machine.
 
-Names are strong evidence and not infallible: a finder that names its peaks by frequency gives wrong
-names once two modes have crossed. What frequencies, dampings and shapes did before then decides,
-and where it does not, the estimate is given to nobody.
-
-Where one explanation of a log is possible, it is taken. Where modes come near each other, all
-explanations that are not hopeless are followed [Reid1979]_, and an estimate gets a label once that
-label has nearly all of their weight. No label uses later logs.
+`associate_log` is one step of a tracker with multiple hypotheses [Reid1979]_: it takes a state and
+the estimates of a log, and returns the next state and a label per estimate. No label uses later
+logs, and an estimate gets a mode only if that mode has nearly all of the posterior probability.
 """
 
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from itertools import pairwise
 from typing import Literal
 
 import numpy as np
 
-from lmshealth._arrays import FloatArray
+from lmshealth._arrays import BoolArray, FloatArray, expect_shape, freeze
 from lmshealth.errors import BadTable, NotEnoughData
-from lmshealth.tracking.association.estimates import Estimates, Table
-from lmshealth.tracking.association.identities import SURE, Identities, Log, Verdict
-from lmshealth.tracking.association.mode_filters import LEAST_LOGS
+from lmshealth.tracking import constants
+from lmshealth.tracking.association.hypotheses import (
+    Hypotheses,
+    Scan,
+    extend,
+    reduce_hypotheses,
+)
+from lmshealth.tracking.association.mode_filters import IntArray, Measurements, predict, update
+from lmshealth.tracking.association.track_initiation import Candidates, follow, prune
 
 Reason = Literal["ambiguous", "jump", "unconfirmed"]
 
+# Filters that catch up with repeated logs need no more than these: older ones have no influence.
+_MOST_PENDING = 64
 
-@dataclass(frozen=True, slots=True)
-class Doubt:
-    """An estimate that is given to no mode.
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Estimates:
+    """The modal estimates of one log.
 
     Attributes
     ----------
-    epoch, estimate : int
-        Which it is.
-    reason : str
-        ``ambiguous``, ``jump`` or ``unconfirmed``.
-    detail : str
-        What is known, in a sentence.
+    names : tuple of str
+        Names that the identification assigned, empty where it assigned none.
+    sources : tuple of str
+        Source of each. Two estimates of one source are never of one mode.
+    ln_frequency, ln_damping : ndarray
+        ln of frequency (Hz) and of damping ratio, shape ``(n,)``; ln ζ is NaN where unknown.
+    cov : ndarray
+        Covariance of ``[ln f, ln ζ]``, ``(2 n, 2 n)``; NaN where ln ζ is unknown.
+    shapes : ndarray
+        Real mode shapes, ``(n, n_channels)``, of any length; NaN where a channel is absent.
+
+    Raises
+    ------
+    ValueError
+        If shapes of arrays do not match.
     """
 
-    epoch: int
-    estimate: int
-    reason: Reason
-    detail: str
+    names: tuple[str, ...]
+    sources: tuple[str, ...]
+    ln_frequency: FloatArray
+    ln_damping: FloatArray
+    cov: FloatArray
+    shapes: FloatArray
+
+    def __post_init__(self) -> None:
+        n = len(self.names)
+        if len(self.sources) != n:
+            raise ValueError(f"sources has {len(self.sources)} entries, needed {n}")
+        expect_shape("ln_frequency", self.ln_frequency, (n,))
+        expect_shape("ln_damping", self.ln_damping, (n,))
+        expect_shape("cov", self.cov, (2 * n, 2 * n))
+        if self.shapes.ndim != 2:
+            raise ValueError(f"shapes has {self.shapes.ndim} dimensions, needed 2")
+        expect_shape("shapes", self.shapes, (n, self.shapes.shape[1]))
+        freeze(self)
+
+
+@dataclass(frozen=True, slots=True)
+class Label:
+    """The mode of one estimate, or why it has none.
+
+    Attributes
+    ----------
+    mode : str or None
+        Name of the mode.
+    reason : str
+        ``ambiguous``, ``jump`` or ``unconfirmed``; empty with a mode.
+    detail : str
+        The reason in a sentence.
+    """
+
+    mode: str | None
+    reason: Reason | Literal[""] = ""
+    detail: str = ""
 
 
 @dataclass(frozen=True, slots=True)
 class Association:
-    """Which mode each estimate is of.
+    """Labels of all estimates.
 
     Attributes
     ----------
     modes : tuple of str
-        Ascending in first frequency; those without a name are named by frequency.
-    assigned : tuple
-        For each log and each of its estimates the mode, or None.
-    doubts : tuple of Doubt
-        One for each None, in order.
+        Ascending in first frequency; modes without a name are named by their frequency.
+    labels : tuple of tuple of Label
+        For each log and each of its estimates.
     """
 
     modes: tuple[str, ...]
-    assigned: tuple[tuple[str | None, ...], ...]
-    doubts: tuple[Doubt, ...]
+    labels: tuple[tuple[Label, ...], ...]
+
+    @property
+    def assigned(self) -> tuple[tuple[str | None, ...], ...]:
+        """Mode of each estimate of each log, or None."""
+        return tuple(tuple(label.mode for label in own) for own in self.labels)
+
+    @property
+    def unassigned(self) -> list[tuple[int, int, Label]]:
+        """Log, estimate and label of each estimate without a mode, in order."""
+        return [
+            (k, i, label)
+            for k, own in enumerate(self.labels)
+            for i, label in enumerate(own)
+            if label.mode is None
+        ]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Log:
+    """One log, as `associate_log` takes it.
+
+    Attributes
+    ----------
+    epoch : int
+        Index of the log.
+    clock, life : float
+        Its place on the clock, and the length of a life as known then.
+    offsets : ndarray
+        Covariates about their references, shape ``(n_covariates,)``.
+    opened : bool
+        Whether frequencies may step before it, as after declared maintenance.
+    names, sources : tuple of str
+        Of its n estimates.
+    measurements : Measurements
+        The estimates.
+    """
+
+    epoch: int
+    clock: float
+    life: float
+    offsets: FloatArray
+    opened: bool
+    names: tuple[str, ...]
+    sources: tuple[str, ...]
+    measurements: Measurements
+
+
+Place = tuple[float, float, FloatArray]
+"""ln f of a named estimate, its variance, and the covariates of its log."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class State:
+    """All that later labels depend on.
+
+    Attributes
+    ----------
+    prior_std : ndarray
+        Prior standard deviations of the covariates' coefficients, ``(n_covariates,)``.
+    hypotheses : Hypotheses
+        Over the m modes found so far.
+    candidates : Candidates
+        Tentative tracks.
+    order : ndarray of int
+        Modes that have names from the identification, ascending in first frequency.
+    names : tuple of str
+        Of the modes, in the order in which they were found.
+    first : tuple of float
+        Their first ln f.
+    places : dict
+        Last place of each named mode and source, before the last log.
+    last : Log or None
+        The last log.
+    labels : tuple of Label
+        Its labels.
+    repeatable : bool
+        Whether one hypothesis is left without candidates, and all names of the last log are right.
+    pending : tuple of Log
+        Logs that repeat the one before and that the filters have not processed yet.
+    clock : float or None
+        Place on the clock to which the filters are predicted.
+    """
+
+    prior_std: FloatArray
+    hypotheses: Hypotheses
+    candidates: Candidates
+    order: IntArray
+    names: tuple[str, ...] = ()
+    first: tuple[float, ...] = ()
+    places: dict[tuple[str, str], Place] | None = None
+    last: Log | None = None
+    labels: tuple[Label, ...] = ()
+    repeatable: bool = False
+    pending: tuple[Log, ...] = ()
+    clock: float | None = None
+
+    @classmethod
+    def start(cls, prior_std: FloatArray, n_channels: int) -> State:
+        """Return the state before the first log."""
+        sizes = (prior_std.size, n_channels)
+        none = np.empty(0, dtype=int)
+        return cls(prior_std, Hypotheses.empty(*sizes), Candidates.empty(*sizes), none)
 
 
 def associate(
@@ -73,12 +221,12 @@ def associate(
     prior_std: FloatArray,
     jumps: Collection[int] = (),
 ) -> Association:
-    """Give the estimates of all logs to modes.
+    """Assign the estimates of all logs to modes.
 
     Parameters
     ----------
     epochs : sequence of Estimates
-        One for each log, with equally many channels of shapes.
+        One per log, all with equally many channels of shapes.
     clock : ndarray
         Ascending odometer or time in any unit, shape ``(n_epochs,)``.
     offsets : ndarray
@@ -91,7 +239,7 @@ def associate(
     Returns
     -------
     Association
-        The labels of a log rest on it and on earlier logs.
+        The labels of a log use it and earlier logs.
 
     Raises
     ------
@@ -107,55 +255,371 @@ def associate(
     """
     clock, offsets, prior_std = (np.asarray(a, float) for a in (clock, offsets, prior_std))
     _check(epochs, clock, offsets, prior_std, jumps)
-    table = Table(epochs, offsets, prior_std)
-    identities = Identities(prior_std, epochs[0].shapes.shape[1])
-    scales, declared = _scales(clock), frozenset(jumps)
-    assigned: list[tuple[str | None, ...]] = []
-    doubts: list[Doubt] = []
-    for k, estimates in enumerate(epochs):
-        names, opened = estimates.names, k in declared
-        log = Log(k, float(clock[k]), scales[k], offsets[k], opened, names, estimates.sources)
-        if table.plain[k] and not opened and identities.settled and assigned[-1] == names:
-            identities.defer(log, table)
-            assigned.append(names)
+    state = State.start(prior_std, epochs[0].shapes.shape[1])
+    declared, lives, places = frozenset(jumps), _lives(clock), clock.tolist()
+    labels = []
+    for k, (own, new) in enumerate(zip(epochs, measurements_of(epochs), strict=True)):
+        log = Log(k, places[k], lives[k], offsets[k], k in declared, own.names, own.sources, new)
+        state, found = associate_log(state, log)
+        labels.append(found)
+    order = np.argsort(state.first, kind="stable")
+    return Association(tuple(state.names[i] for i in order), tuple(labels))
+
+
+def associate_log(state: State, log: Log) -> tuple[State, tuple[Label, ...]]:
+    """Associate the estimates of one log: the next state, and a label per estimate.
+
+    A log that repeats the one before has its labels; the filters catch up with it later. Otherwise
+    all filters are predicted to the log and the sources are associated one after the other: by the
+    gates where only one assignment is possible, else by hypotheses.
+    """
+    if _repeats(state, log):
+        pending = (*state.pending, log)[-_MOST_PENDING:]
+        return replace(state, last=log, pending=pending), state.labels
+    places = dict(state.places or {}) | ({} if state.last is None else _places(state.last))
+    if not log.opened and _is_common_jump(places, log, state.prior_std):
+        log = replace(log, opened=True)
+    for late in state.pending:
+        state = _catch_up(state, late)
+    state = _predict(state, log)
+    found: list[Label] = [Label(None)] * len(log.names)
+    confirmed: set[int] = set()
+    detected: set[int] = set()
+    for source in range(len(set(log.sources))):
+        # Modes that one source starts are known to the next.
+        rows, meant = _groups(state.names, log.names, log.sources)[source]
+        own = log.measurements if rows.size == len(log.names) else log.measurements.pick(rows)
+        scan = Scan(log.epoch, rows, meant, own, _row(log))
+        unique = None if log.opened else _unique_assignment(state, scan)
+        if unique is not None:
+            state, modes = _update(state, unique, scan), unique.tolist()
+            labels = [Label(state.names[mode]) for mode in modes]
+        else:
+            state, modes, labels = _resolve(state, scan, log, confirmed)
+        detected.update(mode for mode in modes if mode >= 0)
+        for row, label in zip(rows, labels, strict=True):
+            found[row] = label
+    candidates = prune(state.candidates, log.epoch, confirmed, detected)
+    state = replace(state, candidates=candidates, places=places, last=log, labels=tuple(found))
+    certain = len(state.hypotheses.filters.mean) == 1 and not len(candidates)
+    right = all(label.mode == name for label, name in zip(found, log.names, strict=True))
+    return replace(state, repeatable=certain and right and _in_order(state, log)), state.labels
+
+
+def _repeats(state: State, log: Log) -> bool:
+    """Return whether a log repeats the one before: names, places, dampings and shapes.
+
+    The labels are then the names, without any filter: a test holds them equal to those of the full
+    step on random lives.
+    """
+    last = state.last
+    if last is None or not state.repeatable or log.opened or not log.names:
+        return False
+    if log.names != last.names or log.sources != last.sources:
+        return False
+    new, old = log.measurements, last.measurements
+    step, std = np.abs(new.ln_f - old.ln_f), np.sqrt(new.var_f + old.var_f)
+    moved = float(np.abs(log.offsets - last.offsets) @ state.prior_std)
+    reach = constants.REPEAT_LN_F + moved + constants.REPEAT_GATE * std
+    # Where a damping is unknown its variance is infinite.
+    far = constants.REPEAT_GATE * np.sqrt(new.var_zeta + old.var_zeta)
+    if ((step / reach) ** 2 + ((new.ln_zeta - old.ln_zeta) / far) ** 2 > 1).any():
+        return False
+    covariates = constants.JUMP_COVARIATE_GATE * moved
+    jumped = step > constants.JUMP_LN_F + covariates + constants.JUMP_GATE * std
+    if np.count_nonzero(jumped) > 1:
+        return False
+    if new.shapes.shape[1] > 1:
+        mac = np.nansum(new.shapes * old.shapes, axis=1) ** 2
+        if (mac < constants.LEAST_MAC).any():
+            return False
+    gap = np.abs(new.ln_f[:, None] - new.ln_f)
+    near = gap < constants.REPEAT_SEPARATION + reach.max()
+    return not (near & _different(log.names)).any()
+
+
+@lru_cache(maxsize=64)
+def _different(names: tuple[str, ...]) -> BoolArray:
+    """Mark pairs of different names, shape ``(n, n)``."""
+    return np.array([[a != b for b in names] for a in names])
+
+
+@lru_cache(maxsize=256)
+def _groups(
+    modes: tuple[str, ...], names: tuple[str, ...], sources: tuple[str, ...]
+) -> list[tuple[IntArray, IntArray]]:
+    """Return the rows of each source, and the indices of the modes that their names mean."""
+    index = {name: i for i, name in enumerate(modes)}
+    meant = np.array([index.get(n, len(modes)) if n else -1 for n in names], dtype=int)
+    each = [np.flatnonzero(np.array(sources) == s) for s in dict.fromkeys(sources)]
+    return [(rows, meant[rows]) for rows in each]
+
+
+def _row(log: Log) -> FloatArray:
+    """Return the observation row ``[1, 0, covariates]`` of a log."""
+    return np.concatenate([(1.0, 0.0), log.offsets])
+
+
+def _places(log: Log) -> dict[tuple[str, str], Place]:
+    """Return the place of every named mode and source of a log."""
+    new = log.measurements
+    return {
+        (name, source): (ln_f, var, log.offsets)
+        for name, source, ln_f, var in zip(
+            log.names, log.sources, new.ln_f.tolist(), new.var_f.tolist(), strict=True
+        )
+        if name
+    }
+
+
+def _is_common_jump(places: dict[tuple[str, str], Place], log: Log, prior_std: FloatArray) -> bool:
+    """Return whether several named modes are off at once, at places where no mode was before.
+
+    A crash moves all modes: names are then more reliable than places. At places of other modes the
+    names may be wrong.
+    """
+    moved = set()
+    for (name, source), (ln_f, var, _) in _places(log).items():
+        if (name, source) not in places:
             continue
-        labels: list[str | None] = [None] * len(names)
-        for verdict in identities.see(log, table):
-            for i, (row, mode) in enumerate(zip(verdict.scan.rows, verdict.modes, strict=True)):
-                if mode >= 0:
-                    labels[row] = identities.names[mode]
-                else:
-                    doubts.append(_doubt(verdict, i, names[row], identities.names))
-        assigned.append(tuple(labels))
-    order = np.argsort(identities.first, kind="stable")
-    doubts.sort(key=lambda doubt: (doubt.epoch, doubt.estimate))
-    return Association(tuple(identities.names[i] for i in order), tuple(assigned), tuple(doubts))
+        change = float(np.abs(log.offsets - places[name, source][2]) @ prior_std)
+        reach = constants.JUMP_LN_F + constants.JUMP_COVARIATE_GATE * change
+        if not any(
+            other[1] == source
+            and abs(ln_f - place) <= reach + constants.JUMP_GATE * float(np.sqrt(var + spread))
+            for other, (place, spread, _) in places.items()
+        ):
+            moved.add(name)
+    return len(moved) > 1
 
 
-def _doubt(verdict: Verdict, i: int, name: str, modes: list[str]) -> Doubt:
-    """Say why an estimate is given to no mode."""
-    scan, chances = verdict.scan, verdict.chances[i]
-    frequency = float(np.exp(scan.readings.ln_f[i]))
-    reason: Reason
-    if i in verdict.jumps:
-        reason = "jump"
-        expected = float(np.exp(verdict.expected[scan.names[i]]))
-        detail = (
-            f"{frequency:.5g} Hz named {name}, expected at {expected:.5g} Hz: a jump that the log "
-            "before does not show; it is believed once the next log confirms it"
+def _predict(state: State, log: Log) -> State:
+    """Predict all filters to a log."""
+    step = 0.0 if state.clock is None else log.clock - state.clock
+    hypotheses, candidates = state.hypotheses, state.candidates
+    filters = predict(hypotheses.filters, step, log.life, opened=log.opened)
+    hypotheses = replace(hypotheses, filters=filters)
+    if len(candidates):
+        filters = predict(candidates.filters, step, log.life, opened=log.opened)
+        candidates = replace(candidates, filters=filters)
+    return replace(state, hypotheses=hypotheses, candidates=candidates, clock=log.clock, pending=())
+
+
+def _update(state: State, modes: IntArray, scan: Scan) -> State:
+    """Update the filters of a single hypothesis with estimates of known modes."""
+    hypotheses = state.hypotheses
+    at = (np.zeros_like(modes), modes)
+    filters = update(hypotheses.filters, at, scan.measurements, scan.row)
+    return replace(state, hypotheses=replace(hypotheses, filters=filters))
+
+
+def _catch_up(state: State, log: Log) -> State:
+    """Process a log that repeats the one before it: its names are right."""
+    state = _predict(state, log)
+    for rows, meant in _groups(state.names, log.names, log.sources):
+        own = log.measurements.pick(rows)
+        state = _update(state, meant, Scan(log.epoch, rows, meant, own, _row(log)))
+    return state
+
+
+def _in_order(state: State, log: Log) -> bool:
+    """Return whether names by order and by mode are the same."""
+    at = state.hypotheses.filters.predicted(_row(log))[0][0, state.order]
+    return bool((np.diff(at) > 0).all())
+
+
+def _unique_assignment(state: State, scan: Scan) -> IntArray | None:
+    """Return the modes of a scan that has only one assignment inside the gates, else None.
+
+    Each estimate is inside the inner gate of one mode, outside the outer gates of all others, and
+    agrees with its mode in name, damping and shape.
+    """
+    filters, new = state.hypotheses.filters, scan.measurements
+    if len(filters.mean) > 1 or not filters.n_modes:
+        return None
+    at, var = (side[0] for side in filters.predicted(scan.row))
+    squared = (new.ln_f[:, None] - at) ** 2 / (new.var_f[:, None] + var)
+    rows, modes = np.nonzero(squared < constants.OUTER_GATE**2)
+    if rows.size != scan.rows.size or np.unique(modes).size < rows.size:
+        return None
+    inner = constants.INNER_GATE**2
+    if (rows != np.arange(rows.size)).any() or (squared[rows, modes] > inner).any():
+        return None
+    named = scan.names >= 0
+    # Names by order and by mode must be the same.
+    if named.any() and not (
+        np.array_equal(scan.names[named], modes[named]) and (np.diff(at[state.order]) > 0).all()
+    ):
+        return None
+    off = (new.ln_zeta - filters.ln_zeta[0, modes]) ** 2
+    if (off > inner * (new.var_zeta + filters.var_zeta[0, modes])).any():
+        return None
+    if new.shapes.shape[1] > 1:
+        mac = np.nansum(new.shapes * filters.shapes[0, modes], axis=-1) ** 2
+        if not (mac > constants.LEAST_MAC).all():
+            return None
+    return np.asarray(modes)
+
+
+def _resolve(
+    state: State, scan: Scan, log: Log, confirmed: set[int]
+) -> tuple[State, list[int], list[Label]]:
+    """Associate a scan by hypotheses; mark the candidates that it makes modes as confirmed.
+
+    Returns
+    -------
+    state : State
+        After the scan.
+    modes : list of int
+        Mode of each estimate, -1 for none.
+    labels : list of Label
+        Of each estimate.
+    """
+    expected = state.hypotheses.filters.predicted(scan.row)[0][0]
+    extended = extend(state.hypotheses, scan, state.order, opened=log.opened)
+    state = replace(state, hypotheses=reduce_hypotheses(extended))
+    known = state.names
+    m = len(known)
+    chances = extended.probabilities(m)
+    best = np.where(chances.argmax(1) < m, chances.argmax(1), -1)
+    modes = np.where(chances.max(1) >= constants.LABEL_PROBABILITY, best, -1).tolist()
+    jumps = [i for i in range(len(modes)) if modes[i] < 0 and _is_jump(i, scan, chances, best)]
+    for i in np.flatnonzero(chances[:, -1] > 0.5).tolist():
+        name = log.names[scan.rows[i]]
+        if name and name not in state.names:
+            state = _start_named(state, scan.pick(np.array([i])), name, log.life)
+            modes[i] = len(state.names) - 1
+    lone = [i for i, mode in enumerate(modes) if mode < 0 and chances[i, -1] > 0.5]
+    left = np.array(sorted({*lone, *jumps}), dtype=int)
+    rest = scan.pick(left)
+    rest = replace(rest, names=np.where(np.isin(left, jumps), rest.names, -1))
+    candidates, new = follow(state.candidates, rest, state.prior_std, log.life)
+    state = replace(state, candidates=candidates)
+    for i, j in zip(left.tolist(), new, strict=True):
+        if j is not None:
+            state, modes[i] = _confirm(state, j, scan.row)
+            confirmed.add(j)
+    labels = []
+    for i, mode in enumerate(modes):
+        if mode >= 0:
+            labels.append(Label(state.names[mode]))
+            continue
+        frequency = float(np.exp(scan.measurements.ln_f[i]))
+        if i in jumps:
+            detail = _jump_detail(frequency, log.names[scan.rows[i]], expected[scan.names[i]])
+            labels.append(Label(None, "jump", detail))
+        else:
+            labels.append(_doubtful(frequency, chances[i], known))
+    return state, modes, labels
+
+
+def _is_jump(i: int, scan: Scan, chances: FloatArray, best: IntArray) -> bool:
+    """Return whether an estimate is of the mode that its name means or of none.
+
+    The name of a mode that is detected elsewhere in the scan has no weight.
+    """
+    own = int(scan.names[i])
+    if not 0 <= own < chances.shape[1] - 1 or own in np.delete(best, i):
+        return False
+    return bool(chances[i, own] + chances[i, -1] >= constants.LABEL_PROBABILITY)
+
+
+def _start_named(state: State, scan: Scan, name: str, life: float) -> State:
+    """Start a mode at the first estimate that has its name."""
+    hypotheses = state.hypotheses
+    filters = hypotheses.filters.start(scan.measurements, scan.row, state.prior_std, life)
+    state = _add_mode(
+        replace(state, hypotheses=replace(hypotheses, filters=filters)),
+        name,
+        float(scan.measurements.ln_f[0]),
+    )
+    named = (*state.order.tolist(), len(state.names) - 1)
+    by_first = np.argsort([state.first[i] for i in named], kind="stable")
+    return replace(state, order=np.array(named)[by_first])
+
+
+def _confirm(state: State, j: int, row: FloatArray) -> tuple[State, int]:
+    """Make a candidate a mode, or the new level of the mode that it is named after."""
+    new = state.candidates.filters.keep(np.array([j]))
+    mode = int(state.candidates.modes[j])
+    hypotheses = state.hypotheses
+    filters = hypotheses.filters
+    if mode < 0:
+        ln_f = float(new.predicted(row)[0][0, 0])
+        state = replace(state, hypotheses=replace(hypotheses, filters=filters.join(new)))
+        state = _add_mode(state, _unique_name(state.names, float(np.exp(ln_f))), ln_f)
+        return state, len(state.names) - 1
+    filters = filters.take(np.arange(len(filters.mean)))
+    for name in ("mean", "cov", "ln_zeta", "var_zeta"):
+        getattr(filters, name)[:, mode] = getattr(new, name)[0, 0]
+    return replace(state, hypotheses=replace(hypotheses, filters=filters)), mode
+
+
+def _add_mode(state: State, name: str, ln_f: float) -> State:
+    return replace(state, names=(*state.names, name), first=(*state.first, ln_f))
+
+
+def _unique_name(names: tuple[str, ...], frequency: float) -> str:
+    """Name a mode by its frequency, with as many digits as distinguish it from others."""
+    for digits in range(6):
+        name = f"{frequency:.{digits}f}_hz"
+        if name not in names:
+            return name
+    return f"{name[:-3]}_{len(names)}_hz"
+
+
+def _jump_detail(frequency: float, name: str, expected: float) -> str:
+    return (
+        f"{frequency:.5g} Hz named {name}, expected at {float(np.exp(expected)):.5g} Hz: a jump "
+        "that the log before does not show; it is accepted once the next log confirms it"
+    )
+
+
+def _doubtful(frequency: float, chances: FloatArray, modes: tuple[str, ...]) -> Label:
+    """Return the label of an estimate without a mode."""
+    if chances[-1] >= constants.LABEL_PROBABILITY:
+        detail = f"{frequency:.5g} Hz is of no known mode; it becomes one once three logs show it"
+        return Label(None, "unconfirmed", detail)
+    each = [*modes, "no known mode"]
+    parts = [f"{each[j]} {chances[j]:.0%}" for j in np.argsort(-chances) if chances[j] > 0.005]
+    detail = f"{frequency:.5g} Hz may be of {' or '.join(parts)}: the logs so far do not decide"
+    return Label(None, "ambiguous", detail)
+
+
+def measurements_of(epochs: Sequence[Estimates]) -> list[Measurements]:
+    """Return the measurements of each log, with shapes of unit length.
+
+    Raises
+    ------
+    BadTable
+        If an estimate is not finite or has no positive variance.
+    """
+    start = np.cumsum([0, *(len(e.names) for e in epochs)]).tolist()
+    every = [(e.cov.diagonal(), len(e.names)) for e in epochs]
+    ln_f = np.concatenate([e.ln_frequency for e in epochs])
+    ln_zeta = np.concatenate([e.ln_damping for e in epochs])
+    var_f = np.concatenate([var[:n] for var, n in every])
+    var_zeta = np.concatenate([var[n:] for var, n in every])
+    shapes = np.concatenate([e.shapes for e in epochs])
+    good = np.isfinite(ln_f) & np.isfinite(var_f) & (var_f > 0)
+    good &= (np.isfinite(var_zeta) & (var_zeta > 0)) | ~np.isfinite(ln_zeta)
+    if not good.all():
+        at = int(np.flatnonzero(~good)[0])
+        k = int(np.searchsorted(start, at, side="right")) - 1
+        i = at - start[k]
+        raise BadTable(
+            f"epoch {k}, estimate {i} ({epochs[k].names[i] or 'without a name'}): ln f "
+            f"{ln_f[at]:g} with variance {var_f[at]:g}, ln ζ {ln_zeta[at]:g} with variance "
+            f"{var_zeta[at]:g}: needed are finite values with positive variances; leave out "
+            "estimates that have none, and give ln ζ as NaN where it is unknown"
         )
-    elif chances[-1] < SURE:
-        reason = "ambiguous"
-        told = [*modes[: chances.size - 1], "no known mode"]
-        parts = [f"{told[j]} {chances[j]:.0%}" for j in np.argsort(-chances) if chances[j] > 0.005]
-        detail = f"{frequency:.5g} Hz may be of {' or '.join(parts)}: the logs so far do not tell"
-    else:
-        reason = "unconfirmed"
-        detail = (
-            f"{frequency:.5g} Hz is of no known mode; it is believed to be one once three logs "
-            "show it"
-        )
-    return Doubt(scan.epoch, int(scan.rows[i]), reason, detail)
+    unknown = ~np.isfinite(ln_zeta)
+    ln_zeta[unknown], var_zeta[unknown] = 0.0, np.inf
+    if shapes.shape[1]:
+        norm = np.sqrt(np.nansum(shapes**2, axis=1, keepdims=True))
+        shapes /= np.where(norm > 0, norm, np.nan)
+    columns = (ln_f, var_f, ln_zeta, var_zeta, shapes)
+    return [Measurements(*(column[a:b] for column in columns)) for a, b in pairwise(start)]
 
 
 def _check(
@@ -192,8 +656,9 @@ def _check(
         raise BadTable(f"jumps at epochs {wrong}: there are epochs 0 to {n - 1}")
 
 
-def _scales(clock: FloatArray) -> list[float]:
-    """Length of a life at each log as it is known then: what has passed, or a number of logs."""
+def _lives(clock: FloatArray) -> list[float]:
+    """Return the length of a life as known at each log."""
     passed = clock - clock[0]
     count = np.maximum(np.arange(clock.size), 1)
-    return [float(s) for s in passed * np.maximum(1.0, LEAST_LOGS / count)]
+    lives: list[float] = (passed * np.maximum(1.0, constants.LEAST_LIFE_LOGS / count)).tolist()
+    return lives

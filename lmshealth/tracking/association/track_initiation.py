@@ -1,131 +1,159 @@
-"""Estimates that belong to no mode, watched until they are one: births and jumps.
+"""Track initiation: estimates of no mode that become modes, or new levels of modes, or are deleted.
 
-A single estimate apart from all modes is most often nothing. It is followed by a filter of its own,
-and its odds of being a mode grow with every log that shows it where the filter expects it.
+A candidate has a filter of its own. Its odds of being a mode grow with every log that detects it
+where the filter predicts it, and shrink with every log that does not.
 """
 
 from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from lmshealth._arrays import FloatArray
-from lmshealth.tracking.association.hypotheses import SHOWN, Scan, stranger_gains
-from lmshealth.tracking.association.mode_filters import Bank
-
-# Odds that an estimate apart from all modes is a mode's first; when it is one, when it is dropped.
-_NEW_ODDS, _CONFIRMED, _DROPPED = 1e-3, 0.95, 1e-5
-_LEAST_LOGS = 3
-_LEAST_LOGS_NAMED = 2
+from lmshealth.tracking import constants
+from lmshealth.tracking.association.hypotheses import Scan, clutter_gains
+from lmshealth.tracking.association.mode_filters import IntArray, ModeFilters, update
 
 
-class Newcomers:
-    """What may become a mode, or a mode's new level.
+@dataclass(frozen=True, slots=True, eq=False)
+class Candidates:
+    """Tentative tracks, all arrays of shape ``(n,)``.
+
+    Attributes
+    ----------
+    filters : ModeFilters
+        One hypothesis, a mode per candidate.
+    modes : ndarray of int
+        Mode of which this may be the new level; -1 for a new mode.
+    log_odds : ndarray
+        Log odds of being a mode.
+    n_logs, last : ndarray of int
+        Number of logs that detect it, and the last of them.
+    """
+
+    filters: ModeFilters
+    modes: IntArray
+    log_odds: FloatArray
+    n_logs: IntArray
+    last: IntArray
+
+    @classmethod
+    def empty(cls, n_covariates: int, n_channels: int) -> Candidates:
+        """Return no candidates."""
+        none = np.empty(0, dtype=int)
+        return cls(ModeFilters.empty(n_covariates, n_channels), none, np.empty(0), none, none)
+
+    def __len__(self) -> int:
+        return self.modes.size
+
+    def confirmed(self, j: int) -> bool:
+        """Return whether a candidate is a mode."""
+        if self.modes[j] >= 0:
+            return bool(self.n_logs[j] >= constants.LEAST_LOGS_NAMED)
+        chance = constants.CONFIRMATION_PROBABILITY
+        sure = self.log_odds[j] > np.log(chance / (1 - chance))
+        return bool(sure and self.n_logs[j] >= constants.LEAST_LOGS_NEW)
+
+
+def follow(
+    candidates: Candidates, scan: Scan, prior_std: FloatArray, life: float
+) -> tuple[Candidates, list[int | None]]:
+    """Update candidates with a scan and start new ones.
 
     Parameters
     ----------
-    n_covariates, n_channels : int
-        Sizes of its filters.
+    candidates : Candidates
+        With filters predicted to the log.
+    scan : Scan
+        Estimates of no mode; `names` holds the mode of which each may be the new level, else -1.
+    prior_std : ndarray
+        Prior standard deviations of the covariates' coefficients, ``(n_covariates,)``.
+    life : float
+        Length of a life on the clock.
+
+    Returns
+    -------
+    candidates : Candidates
+        Those before, and new ones at the end.
+    confirmed : list of int or None
+        For each estimate the candidate that it confirms.
     """
+    candidates, mine = _assign(candidates, scan)
+    known = [j for j in mine if j is not None]
+    n_logs, last = candidates.n_logs.copy(), candidates.last.copy()
+    n_logs[known] += last[known] != scan.epoch
+    last[known] = scan.epoch
+    lone = np.array([i for i, j in enumerate(mine) if j is None], dtype=int)
+    filters = candidates.filters
+    if lone.size:
+        filters = filters.start(scan.measurements.pick(lone), scan.row, prior_std, life)
+    grown = Candidates(
+        filters,
+        np.append(candidates.modes, scan.names[lone]),
+        np.append(candidates.log_odds, np.full(lone.size, np.log(constants.INITIATION_ODDS))),
+        np.append(n_logs, np.ones(lone.size, dtype=int)),
+        np.append(last, np.full(lone.size, scan.epoch)),
+    )
+    return grown, [j if j is not None and grown.confirmed(j) else None for j in mine]
 
-    def __init__(self, n_covariates: int, n_channels: int) -> None:
-        self.bank = Bank.empty(n_covariates, n_channels)
-        self._names: list[int] = []
-        self._log_odds: list[float] = []
-        self._logs: list[int] = []
-        self._last: list[int] = []
 
-    def __len__(self) -> int:
-        return len(self._names)
+def _assign(candidates: Candidates, scan: Scan) -> tuple[Candidates, list[int | None]]:
+    """Assign estimates to candidates, one to one, and update these."""
+    mine: list[int | None] = [None] * scan.rows.size
+    if not len(candidates):
+        return candidates, mine
+    # The alternative of a detection is clutter, not a missed detection.
+    gains = clutter_gains(candidates.filters, scan)[0]
+    gains += np.log(1 - constants.DETECTION_PROBABILITY)
+    gains[scan.names[:, None] != candidates.modes] = -np.inf
+    best = np.maximum(gains, 0.0)
+    pairs = [(i, j) for i, j in zip(*linear_sum_assignment(-best), strict=True) if best[i, j]]
+    if not pairs:
+        return candidates, mine
+    for i, j in pairs:
+        mine[i] = int(j)
+    rows, own = (np.array(side) for side in zip(*pairs, strict=True))
+    log_odds = candidates.log_odds.copy()
+    log_odds[own] += gains[rows, own]
+    at = (np.zeros_like(own), own)
+    filters = update(candidates.filters, at, scan.measurements.pick(rows), scan.row)
+    return replace(candidates, filters=filters, log_odds=log_odds), mine
 
-    def watch(self, scan: Scan, prior_std: FloatArray, scale: float) -> list[int | None]:
-        """Follow strangers and say which newcomer each is, with all that are confirmed.
 
-        Parameters
-        ----------
-        scan : Scan
-            Estimates that are of no mode; a name is that of a mode which the log does not show
-            elsewhere, else -1.
-        prior_std : ndarray
-            Of the covariates' coefficients.
-        scale : float
-            Length of a life on the clock.
+def prune(
+    candidates: Candidates, epoch: int, confirmed: Collection[int], detected: Collection[int]
+) -> Candidates:
+    """Delete candidates after a log.
 
-        Returns
-        -------
-        list of int or None
-            For each estimate the newcomer that it confirms.
-        """
-        mine = self._match(scan)
-        for j in mine:
-            if j is not None and self._last[j] != scan.epoch:
-                self._logs[j] += 1
-                self._last[j] = scan.epoch
-        lone = np.array([i for i, j in enumerate(mine) if j is None], dtype=int)
-        if lone.size:
-            self.bank = self.bank.found(scan.readings.pick(lone), scan.row, prior_std, scale)
-            self._names += scan.names[lone].tolist()
-            self._log_odds += [float(np.log(_NEW_ODDS))] * lone.size
-            self._logs += [1] * lone.size
-            self._last += [scan.epoch] * lone.size
-        return [j if j is not None and self._confirmed(j) else None for j in mine]
-
-    def _match(self, scan: Scan) -> list[int | None]:
-        """Assign estimates to newcomers, one to one, and update these."""
-        mine: list[int | None] = [None] * scan.rows.size
-        if not self._names:
-            return mine
-        gains = stranger_gains(self.bank.compare(scan.readings, scan.row))[0]
-        # Being seen counts against being no mode, not against being missed.
-        gains += np.log(1 - SHOWN)
-        theirs = np.array(self._names)
-        gains[scan.names[:, None] != theirs] = -np.inf
-        best = np.maximum(gains, 0.0)
-        pairs = [(i, j) for i, j in zip(*linear_sum_assignment(-best), strict=True) if best[i, j]]
-        for i, j in pairs:
-            mine[i] = int(j)
-            self._log_odds[j] += float(gains[i, j])
-        if pairs:
-            rows, own = (np.array(side) for side in zip(*pairs, strict=True))
-            at = (np.zeros_like(own), own)
-            self.bank.absorb(at, scan.readings.pick(rows), scan.row)
-        return mine
-
-    def _confirmed(self, j: int) -> bool:
-        if self._names[j] >= 0:
-            return self._logs[j] >= _LEAST_LOGS_NAMED
-        sure = self._log_odds[j] > np.log(_CONFIRMED / (1 - _CONFIRMED))
-        return sure and self._logs[j] >= _LEAST_LOGS
-
-    def name(self, j: int) -> int:
-        """Return the mode whose new level a newcomer is, -1 for a new mode."""
-        return self._names[j]
-
-    def forget(self, epoch: int, gone: set[int], back: set[int]) -> None:
-        """Close a log: drop what it makes unlikely.
-
-        Parameters
-        ----------
-        epoch : int
-            The log.
-        gone : set of int
-            Newcomers that are modes now.
-        back : set of int
-            Modes that were seen where they were expected: what had jumped with their name had not.
-        """
-        if not self._names:
-            return
-        for j, last in enumerate(self._last):
-            if last != epoch:
-                self._log_odds[j] += float(np.log(1 - SHOWN))
-        kept = [
-            j
-            for j, odds in enumerate(self._log_odds)
-            if j not in gone and self._names[j] not in back and odds > np.log(_DROPPED)
-        ]
-        if len(kept) < len(self._names):
-            self.bank = self.bank.keep(np.array(kept, dtype=int))
-            self._names = [self._names[j] for j in kept]
-            self._log_odds = [self._log_odds[j] for j in kept]
-            self._logs = [self._logs[j] for j in kept]
-            self._last = [self._last[j] for j in kept]
+    Parameters
+    ----------
+    candidates : Candidates
+        After all scans of the log.
+    epoch : int
+        The log.
+    confirmed : collection of int
+        Candidates that have become modes.
+    detected : collection of int
+        Modes that were detected at their old level: they have no new one.
+    """
+    if not len(candidates):
+        return candidates
+    missed = np.log(1 - constants.DETECTION_PROBABILITY)
+    odds = candidates.log_odds + np.where(candidates.last != epoch, missed, 0.0)
+    keep = odds > np.log(constants.DELETION_ODDS)
+    keep[list(confirmed)] = False
+    keep &= ~np.isin(candidates.modes, list(detected))
+    kept = np.flatnonzero(keep)
+    filters = candidates.filters
+    if kept.size < len(candidates):
+        filters = filters.keep(kept)
+    return Candidates(
+        filters,
+        candidates.modes[kept],
+        odds[kept],
+        candidates.n_logs[kept],
+        candidates.last[kept],
+    )

@@ -1,7 +1,8 @@
-"""Assignments are the best ones, shapes and names count as their distributions say."""
+"""Assignments are the best ones; shapes and names have the likelihoods of their distributions."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import product
 
 import numpy as np
@@ -9,36 +10,37 @@ import pytest
 from scipy.integrate import trapezoid
 from scipy.special import logsumexp
 
+from lmshealth.tracking import constants
 from lmshealth.tracking.association.hypotheses import (
     Hypotheses,
     Scan,
     best_assignments,
+    clutter_gains,
     name_gains,
     order_gains,
     reduce_hypotheses,
     shape_gains,
-    stranger_gains,
 )
-from lmshealth.tracking.association.mode_filters import Bank, Innovations, Readings
+from lmshealth.tracking.association.mode_filters import Measurements, ModeFilters
 
 ROW = np.array([1.0, 0.0])
 
 
-def readings(ln_f: list[float]) -> Readings:
+def measured(ln_f: list[float]) -> Measurements:
     """Make estimates without damping and shape."""
     n = len(ln_f)
-    return Readings(
+    return Measurements(
         np.array(ln_f), np.full(n, 1e-6), np.zeros(n), np.full(n, np.inf), np.empty((n, 0))
     )
 
 
 def hypotheses(levels: list[list[float]], weights: list[float]) -> Hypotheses:
     """Make hypotheses of two modes that differ in levels."""
-    bank = Bank.empty(0, 0).found(readings([4.6, 4.8]), ROW, np.zeros(0), 50.0)
-    bank = bank.take(np.zeros(len(levels), dtype=int))
-    bank.mean[:, :, 0] = levels
+    filters = ModeFilters.empty(0, 0).start(measured([4.6, 4.8]), ROW, np.zeros(0), 50.0)
+    filters = filters.take(np.zeros(len(levels), dtype=int))
+    filters.mean[:, :, 0] = levels
     log_weights = np.log(np.array(weights))[:, None] + np.log([0.5, 0.5])
-    return Hypotheses(bank, log_weights, np.zeros((len(levels), 1), dtype=int))
+    return Hypotheses(filters, log_weights, np.zeros((len(levels), 1), dtype=int))
 
 
 @pytest.mark.parametrize("seed", range(10))
@@ -76,7 +78,7 @@ def test_shape_likelihood_is_a_distribution(n: int) -> None:
     assert gains.min() == pytest.approx(np.log(0.05), abs=0.01)
 
 
-def test_shapes_without_common_channels_say_nothing() -> None:
+def test_shapes_without_common_channels_have_no_weight() -> None:
     """One common channel has no direction."""
     shapes = np.array([[1.0, 1.0, np.nan], [np.nan, 1.0, 1.0]])
     modes = np.array([[[np.nan, 1.0, 1.0], [np.nan, np.nan, np.nan]]])
@@ -86,13 +88,13 @@ def test_shapes_without_common_channels_say_nothing() -> None:
 
 
 def test_names_by_order_follow_the_estimates() -> None:
-    """Two estimates in order bear the first and second name, whichever modes they are of."""
-    scan = Scan(0, np.arange(2), np.array([0, 1]), readings([4.6, 4.8]), ROW)
+    """Two estimates in order have the first and second name, whichever modes they are of."""
+    scan = Scan(0, np.arange(2), np.array([0, 1]), measured([4.6, 4.8]), ROW)
     labels, order = np.array([[0, 1], [1, 0], [1, -1]]), np.array([0, 1])
     seen = (np.tile([4.6, 4.7], (3, 1)), np.full((3, 2), 1e-8))
     by_order = order_gains(scan, labels, order, seen)
     np.testing.assert_allclose(by_order[:2], np.log(2 * 0.98), rtol=1e-6)
-    # The mode not shown stands where the estimate does: below it or above, nobody knows.
+    # The missed mode is predicted at the estimate: below or above with equal probability.
     np.testing.assert_allclose(by_order[2], [0.0, 0.0], atol=1e-12)
     by_mode = name_gains(scan.names, labels, order)
     np.testing.assert_allclose(by_mode[0], np.log(2 * 0.98))
@@ -107,39 +109,41 @@ def test_estimates_without_a_name_are_of_any_mode() -> None:
     assert gains[0, 1] > 0 == gains[1, 1]
 
 
-def test_a_damping_that_is_not_told_is_averaged_over() -> None:
-    """Strangers have any damping: odds without it are the mean of odds with it over strangers."""
+def test_an_unknown_damping_is_averaged_over() -> None:
+    """Odds without ln ζ are the mean of odds with it over the ln ζ of clutter."""
     damping = np.linspace(-30.0, 30.0, 6001)
     n = damping.size
-    f, var = np.full((1, n, 1), 1e-3), np.full((1, n, 1), 1e-6)
-    told = stranger_gains(Innovations(f, var, damping[None, :, None], np.full((1, n, 1), 0.01)))
-    blind = stranger_gains(Innovations(f, var, 0 * f, np.full((1, n, 1), np.inf)))
-    density = 0.3  # of a stranger's ln ζ
-    mean = trapezoid(density * np.exp(told[0, :, 0]), damping)
-    assert mean == pytest.approx(np.exp(blind[0, 0, 0]), rel=1e-6)
+    first = Measurements(*(np.array([x]) for x in (4.6, 1e-6, 0.0, 0.005)), np.empty((1, 0)))
+    filters = ModeFilters.empty(0, 0).start(first, ROW, np.zeros(0), 50.0)
+    many = Scan(0, np.arange(n), np.full(n, -1), measured([4.601] * n), ROW)
+    known = replace(many.measurements, ln_zeta=damping, var_zeta=np.full(n, 0.005))
+    with_damping = clutter_gains(filters, replace(many, measurements=known))[0, :, 0]
+    without = clutter_gains(filters, many)[0, 0, 0]
+    mean = trapezoid(constants.CLUTTER_LN_ZETA_DENSITY * np.exp(with_damping), damping)
+    assert mean == pytest.approx(np.exp(without), rel=1e-6)
 
 
-def test_what_differs_in_damping_is_not_joined() -> None:
+def test_far_dampings_are_not_merged() -> None:
     """Hypotheses of one frequency and far dampings stay two."""
     kept = hypotheses([[4.6, 4.8], [4.6, 4.8]], [0.6, 0.4])
-    kept.bank.var_zeta[:] = 0.01
-    kept.bank.ln_zeta[:] = [[-4.0, -4.0], [-4.0, -3.0]]
+    kept.filters.var_zeta[:] = 0.01
+    kept.filters.ln_zeta[:] = [[-4.0, -4.0], [-4.0, -3.0]]
     assert len(reduce_hypotheses(kept).log_weights) == 2
-    kept.bank.ln_zeta[:] = -4.0
+    kept.filters.ln_zeta[:] = -4.0
     assert len(reduce_hypotheses(kept).log_weights) == 1
 
 
 def test_equal_hypotheses_become_one_and_keep_their_weight() -> None:
-    """What differs by little is joined with the mean of the mixture, what differs much is not."""
+    """Near hypotheses are merged with the mean of the mixture, far ones are not."""
     near, far = 4.8 + 2e-4, 4.9
     kept = reduce_hypotheses(hypotheses([[4.6, 4.8], [4.6, near], [4.6, far]], [0.6, 0.3, 0.1]))
     weights = np.exp(logsumexp(kept.log_weights, axis=1))
     np.testing.assert_allclose(weights, [0.9, 0.1])
-    assert kept.bank.mean[0, 1, 0] == pytest.approx((2 * 4.8 + near) / 3)
-    assert kept.bank.cov[0, 1, 0, 0] == pytest.approx(1e-6 + 2 / 9 * 2e-4**2)
+    assert kept.filters.mean[0, 1, 0] == pytest.approx((2 * 4.8 + near) / 3)
+    assert kept.filters.cov[0, 1, 0, 0] == pytest.approx(1e-6 + 2 / 9 * 2e-4**2)
 
 
-def test_hopeless_hypotheses_are_dropped() -> None:
+def test_hypotheses_without_weight_are_pruned() -> None:
     """Less than 1e-7 of the best is nothing."""
     kept = reduce_hypotheses(hypotheses([[4.6, 4.8], [4.6, 4.9]], [1.0, 1e-8]))
     assert len(kept.log_weights) == 1

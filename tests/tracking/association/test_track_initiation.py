@@ -1,57 +1,72 @@
-"""Strangers become modes by their odds, jumps by a second log, and are forgotten else."""
+"""Candidates become modes by their odds and jumps by a second log, or are deleted."""
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import numpy as np
 
 from lmshealth.tracking.association.hypotheses import Scan
-from lmshealth.tracking.association.mode_filters import Readings
-from lmshealth.tracking.association.track_initiation import Newcomers
+from lmshealth.tracking.association.mode_filters import Measurements, predict
+from lmshealth.tracking.association.track_initiation import Candidates, follow, prune
+
+NONE = Candidates.empty(0, 0)
 
 
 def scan(epoch: int, ln_f: float, name: int = -1) -> Scan:
-    """Make a log with one stranger."""
-    own = Readings(
+    """Make a log with one estimate of no mode."""
+    own = Measurements(
         np.array([ln_f]), np.array([1e-6]), np.array([-4.0]), np.array([0.01]), np.empty((1, 0))
     )
     return Scan(epoch, np.arange(1), np.array([name]), own, np.array([1.0, 0.0]))
 
 
-def follow(new: Newcomers, seen: list[tuple[float, int] | None]) -> list[int | None]:
-    """Show one stranger or none in each log; return what each log confirms."""
-    told: list[int | None] = []
-    for epoch, one in enumerate(seen):
-        new.bank.predict(1.0, 50.0)
-        told += new.watch(scan(epoch, *one), np.zeros(0), 50.0) if one else [None]
-        new.forget(epoch, set(), set())
-    return told
+def followed(estimates: list[tuple[float, int] | None]) -> tuple[Candidates, list[int | None]]:
+    """Process one estimate or none per log; return the candidates and what each log confirms."""
+    candidates, confirmed = NONE, []
+    for epoch, one in enumerate(estimates):
+        candidates = replace(candidates, filters=predict(candidates.filters, 1.0, 50.0))
+        own: list[int | None] = [None]
+        if one:
+            candidates, own = follow(candidates, scan(epoch, *one), np.zeros(0), 50.0)
+        confirmed += own
+        candidates = prune(candidates, epoch, set(), set())
+    return candidates, confirmed
 
 
 def test_three_logs_make_a_mode() -> None:
     """The third consistent estimate confirms, also after a log that misses it."""
-    assert follow(Newcomers(0, 0), [(4.8, -1)] * 3) == [None, None, 0]
-    assert follow(Newcomers(0, 0), [(4.8, -1), None, (4.8, -1), (4.8, -1)])[-1] == 0
+    assert followed([(4.8, -1)] * 3)[1] == [None, None, 0]
+    assert followed([(4.8, -1), None, (4.8, -1), (4.8, -1)])[1][-1] == 0
 
 
 def test_two_logs_make_a_jump() -> None:
     """With the name of a mode the second estimate confirms; another name does not."""
-    assert follow(Newcomers(0, 0), [(4.8, 1), (4.8, 1)]) == [None, 0]
-    assert follow(Newcomers(0, 0), [(4.8, 1), (4.8, 0)]) == [None, None]
+    assert followed([(4.8, 1), (4.8, 1)])[1] == [None, 0]
+    assert followed([(4.8, 1), (4.8, 0)])[1] == [None, None]
 
 
-def test_scattered_strangers_make_none() -> None:
-    """Estimates all over the band confirm nothing, and what is not seen again is dropped."""
-    new = Newcomers(0, 0)
-    assert follow(new, [(4.0 + 0.3 * k, -1) for k in range(6)]) == [None] * 6
-    before = len(new)
+def test_scattered_estimates_make_no_mode() -> None:
+    """Estimates all over the band confirm nothing, and candidates without detections go."""
+    candidates, confirmed = followed([(4.0 + 0.3 * k, -1) for k in range(6)])
+    assert confirmed == [None] * 6
+    before = len(candidates)
     for epoch in range(6, 12):
-        new.forget(epoch, set(), set())
-    assert len(new) < before
+        candidates = prune(candidates, epoch, set(), set())
+    assert len(candidates) < before
 
 
-def test_a_mode_seen_again_where_it_was_has_not_jumped() -> None:
-    """The watched jump of a mode is forgotten once the mode is back."""
-    new = Newcomers(0, 0)
-    follow(new, [(4.8, 1)])
-    new.forget(1, set(), {1})
-    assert len(new) == 0
+def test_a_mode_detected_at_its_old_level_has_not_jumped() -> None:
+    """The candidate for a new level is deleted once the mode is detected at the old one."""
+    candidates, _ = followed([(4.8, 1)])
+    assert len(candidates) == 1
+    assert len(prune(candidates, 1, set(), {1})) == 0
+
+
+def test_following_changes_no_candidates_given() -> None:
+    """The step is pure: the candidates before it stay as they were."""
+    before, _ = followed([(4.8, -1)])
+    odds, mean = before.log_odds.copy(), before.filters.mean.copy()
+    follow(before, scan(1, 4.8), np.zeros(0), 50.0)
+    assert np.array_equal(before.log_odds, odds)
+    assert np.array_equal(before.filters.mean, mean)
