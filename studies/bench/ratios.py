@@ -19,22 +19,12 @@ FALSE_ALARM = 0.01
 
 @dataclass(frozen=True)
 class Figure:
-    """A figure that is held, and what was measured of it.
+    """A figure that is held, and what was measured of it."""
 
-    Attributes
-    ----------
-    name, peer : str
-        What is timed, and beside what.
-    at_most : float
-        The largest ratio of both times with which the figure is met.
-    ratios : tuple of float
-        One per turn.
-    """
-
-    name: str
+    name: str  # What is timed, and beside what
     peer: str
-    at_most: float
-    ratios: tuple[float, ...]
+    at_most: float  # The largest ratio of both times with which the figure is met
+    ratios: tuple[float, ...]  # One per turn
 
     def __post_init__(self) -> None:
         if binom.sf(len(self.ratios) - 1, len(self.ratios), 0.5) > FALSE_ALARM:

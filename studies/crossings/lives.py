@@ -26,46 +26,27 @@ Paths = tuple[Array, Array, NDArray[np.bool_]]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Life:
-    """Estimates and the truth about them.
+    """Estimates and the truth about them."""
 
-    Attributes
-    ----------
-    clock : ndarray
-        Odometer of each log, shape ``(n_logs,)``, from 0 to 1.
-    epochs : tuple of Estimates
-        One for each log.
-    truth : tuple of tuple of int
-        For each estimate its mode; -1 for a spurious one.
-    ln_f : ndarray
-        True ln frequencies, ``(n_logs, n_modes)``.
-    before, after : int
-        Logs before the one are before modes come near each other, from the other on they are
-        clear of each other again.
-    """
-
-    clock: Array
-    epochs: tuple[Estimates, ...]
-    truth: tuple[tuple[int, ...], ...]
-    ln_f: Array
+    clock: Array  # Odometer of each log, shape ``(n_logs,)``, from 0 to 1
+    epochs: tuple[Estimates, ...]  # One for each log
+    truth: tuple[tuple[int, ...], ...]  # For each estimate its mode; -1 for a spurious one
+    ln_f: Array  # True ln frequencies, ``(n_logs, n_modes)``
+    # Logs before the one are before modes come near each other, from the other on they are clear of
+    # each other again
     before: int
     after: int
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Kind:
-    """What a life is like.
+    """What a life is like."""
 
-    Attributes
-    ----------
-    paths : callable
-        Makes true ln frequencies ``(n_logs, n_modes)``, shapes ``(n_logs, n_modes, n)`` and
-        the logs in which modes are not clear, ``(n_logs,)``.
-    named, shaped, gaps : bool
-        Whether names are given by the order of frequencies, there are shapes, and logs miss modes
-        and show what is none.
-    """
-
+    # Makes true ln frequencies ``(n_logs, n_modes)``, shapes ``(n_logs, n_modes, n)`` and the logs
+    # in which modes are not clear, ``(n_logs,)``
     paths: Callable[[Array, np.random.Generator], Paths]
+    # Whether names are given by the order of frequencies, there are shapes, and logs miss modes and
+    # show what is none
     named: bool = True
     shaped: bool = False
     gaps: bool = False

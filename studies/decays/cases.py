@@ -14,32 +14,17 @@ RATE = 400.0
 
 @dataclass(frozen=True)
 class Case:
-    """Stops of a machine.
+    """Stops of a machine."""
 
-    Attributes
-    ----------
-    name : str
-        What it is about.
-    modes : tuple of (float, float)
-        Natural frequency in Hz and damping ratio.
-    n_stops : int
-        Decays in a log.
-    seconds : float
-        Length of each.
-    ambient, noise : float
-        Standard deviations of the ambient response and of the noise of a sample over the
-        amplitude right after a stop.
-    n_channels : int
-        Channels with independent noise; shapes alternate in sign.
-    """
-
-    name: str
-    modes: tuple[tuple[float, float], ...]
-    n_stops: int = 1
-    seconds: float = 1.0
+    name: str  # What it is about
+    modes: tuple[tuple[float, float], ...]  # Natural frequency in Hz and damping ratio
+    n_stops: int = 1  # Decays in a log
+    seconds: float = 1.0  # Length of each
+    # Standard deviations of the ambient response and of the noise of a sample over the amplitude
+    # right after a stop
     ambient: float = 0.03
     noise: float = 0.02
-    n_channels: int = 1
+    n_channels: int = 1  # Channels with independent noise; shapes alternate in sign
 
     def vibration(self) -> Vibration:
         """Give the true modes."""

@@ -42,27 +42,13 @@ _HEAD = 128
 
 @dataclass(frozen=True, slots=True)
 class Kind:
-    """A kind of damage.
+    """A kind of damage."""
 
-    Attributes
-    ----------
-    name : str
-        In words.
-    reason : str
-        What refused.csv must say.
-    suffixes : tuple of str
-        Formats that it can happen to.
-    make : callable
-        Does it.
-    lost : bool
-        Whether the whole log is lost by it; else the rest of it is analysed.
-    """
-
-    name: str
-    reason: str
-    suffixes: tuple[str, ...]
-    make: Maker
-    lost: bool = True
+    name: str  # In words
+    reason: str  # What refused.csv must say
+    suffixes: tuple[str, ...]  # Formats that it can happen to
+    make: Maker  # Does it
+    lost: bool = True  # Whether the whole log is lost by it; else the rest of it is analysed
 
 
 def _of_bytes(change: Callable[[bytes, Rng], bytes]) -> Maker:

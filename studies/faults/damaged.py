@@ -71,19 +71,12 @@ class Expected:
 
 @dataclass(frozen=True, slots=True)
 class Found:
-    """What became of all logs.
+    """What became of all logs."""
 
-    Attributes
-    ----------
-    whole, partly : dict of str to set of str
-        By log, the reasons for which all of it and a channel of it is refused.
-    analysed : set of str
-        Logs with a mode in ``modes.csv``.
-    """
-
+    # By log, the reasons for which all of it and a channel of it is refused
     whole: dict[str, set[str]]
     partly: dict[str, set[str]]
-    analysed: set[str]
+    analysed: set[str]  # Logs with a mode in ``modes.csv``
 
     def reason(self, expected: Expected) -> str:
         """Tell in one word what became of a log."""

@@ -50,17 +50,10 @@ class LogFile:
 
 @dataclass(slots=True)
 class Archive:
-    """A folder of logs with the tables beside them.
+    """A folder of logs with the tables beside them."""
 
-    Attributes
-    ----------
-    folder : Path
-        Of the logs.
-    manifest, maintenance : list of str
-        Rows of the tables without their header, in the order in which they are added.
-    """
-
-    folder: Path
+    folder: Path  # Of the logs
+    # Rows of the tables without their header, in the order in which they are added
     manifest: list[list[str]] = field(default_factory=list)
     maintenance: list[list[str]] = field(default_factory=list)
 

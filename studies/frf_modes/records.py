@@ -24,28 +24,17 @@ EXCITED = (40.0, 120.0)  # by a multisine
 
 @dataclass(frozen=True)
 class Machine:
-    """Linear machine between a current and a sensor.
+    """Linear machine between a current and a sensor."""
 
-    Attributes
-    ----------
-    modes : tuple of (float, float, float)
-        Natural frequency in Hz, damping ratio, participation.
-    displacement : bool
-        What the sensor reads; else acceleration.
-    white, process : float
-        Noise of the sensor as a share of its answer's standard deviation, and a disturbance that
-        the machine answers like the current, as a share of the current's.
-    input_noise : float
-        Of the measured current, as a share of its standard deviation.
-    cubic : float
-        Of the motor: what the cube adds to the force at one standard deviation. Poles stay.
-    """
-
+    # Natural frequency in Hz, damping ratio, participation
     modes: tuple[tuple[float, float, float], ...] = MODES
-    displacement: bool = False
+    displacement: bool = False  # What the sensor reads; else acceleration
+    # Noise of the sensor as a share of its answer's standard deviation, and a disturbance that the
+    # machine answers like the current, as a share of the current's
     white: float = 0.1
     process: float = 0.1
-    input_noise: float = 0.0
+    input_noise: float = 0.0  # Of the measured current, as a share of its standard deviation
+    # Of the motor: what the cube adds to the force at one standard deviation. Poles stay.
     cubic: float = 0.0
 
     def response(self, hertz: Array) -> Array:

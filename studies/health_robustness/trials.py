@@ -23,48 +23,24 @@ ENDS = (*PARAMETERS, "any")
 
 @dataclass(frozen=True, slots=True)
 class Answer:
-    """One posterior against its truth: one parameter of one life.
+    """One posterior against its truth: one parameter of one life."""
 
-    Attributes
-    ----------
-    place : float
-        Posterior probability below the truth.
-    error : float
-        Posterior median minus truth, of ln health, or of the travel left in km.
-    z : float
-        The same over the posterior standard deviation.
-    width : float
-        Of the 90 % interval, in the same unit.
-    third : bool
-        Whether the truth lies inside that interval shrunk to a third about the median.
-    """
-
-    place: float
-    error: float
-    z: float
-    width: float
-    third: bool
+    place: float  # Posterior probability below the truth
+    error: float  # Posterior median minus truth, of ln health, or of the travel left in km
+    z: float  # The same over the posterior standard deviation
+    width: float  # Of the 90 % interval, in the same unit
+    third: bool  # Whether the truth lies inside that interval shrunk to a third about the median
 
 
 @dataclass(frozen=True, slots=True)
 class Arm:
-    """What the estimator believes.
+    """What the estimator believes."""
 
-    Attributes
-    ----------
-    name : str
-        Of the arm.
-    model_std : float
-        Relative error of the map's sensitivities that it believes in.
-    shrink : float
-        Factor on the covariance of what it is given, which it is not allowed to find out.
-    independent : float
-        Relative error of the map that it believes in as if it were new at every log.
-    """
-
-    name: str
-    model_std: float
+    name: str  # Of the arm
+    model_std: float  # Relative error of the map's sensitivities that it believes in
+    # Factor on the covariance of what it is given, which it is not allowed to find out
     shrink: float = 1.0
+    # Relative error of the map that it believes in as if it were new at every log
     independent: float = 0.0
 
 

@@ -37,28 +37,15 @@ _REDRAWS = 200
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Case:
-    """One life, its estimates, and the truth that is asked for.
+    """One life, its estimates, and the truth that is asked for."""
 
-    Attributes
-    ----------
-    life : Life
-        What is so at every log.
-    estimates : Estimates
-        What identification gives.
-    health : ndarray
-        Fractions of their value at the first log, shape ``(n_logs, 2)``.
-    passage : ndarray
-        Travel in m since the first log at which each limit is reached, infinite if never,
-        shape ``(2,)``.
-    losing : bool
-        Whether it is known that every parameter loses.
-    """
-
-    life: Life
-    estimates: Estimates
-    health: Array
+    life: Life  # What is so at every log
+    estimates: Estimates  # What identification gives
+    health: Array  # Fractions of their value at the first log, shape ``(n_logs, 2)``
+    # Travel in m since the first log at which each limit is reached, infinite if never, shape
+    # ``(2,)``
     passage: Array
-    losing: bool = False
+    losing: bool = False  # Whether it is known that every parameter loses
 
 
 @cache

@@ -27,30 +27,17 @@ SHAPES = ((1.0, 0.6, -0.4), (0.5, -1.0, 0.7), (-0.3, 0.8, 1.0))
 
 @dataclass(frozen=True)
 class Case:
-    """A kind of record.
+    """A kind of record."""
 
-    Attributes
-    ----------
-    name : str
-    modes : tuple of Truth
-    noise : float
-        PSD of the noise of each accelerometer, (m/s²)²/Hz.
-    make : callable
-        Makes a log of a generator, modes and noise.
-    seconds, moves : float, int
-        Length and number of the records.
-    seeds : int
-    worst : float or None
-        Largest root mean square error over the Cramér-Rao bound that is asked for.
-    """
-
-    name: str
-    modes: tuple[Truth, ...]
-    noise: float
+    name: str  #
+    modes: tuple[Truth, ...]  #
+    noise: float  # PSD of the noise of each accelerometer, (m/s²)²/Hz
+    # Makes a log of a generator, modes and noise
     make: Callable[[np.random.Generator, tuple[Truth, ...], float], Log]
-    seconds: float
+    seconds: float  # Length and number of the records
     moves: int = 1
-    seeds: int = OTHERS
+    seeds: int = OTHERS  #
+    # Largest root mean square error over the Cramér-Rao bound that is asked for
     worst: float | None = None
     bounded: bool = True
 

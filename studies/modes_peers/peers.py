@@ -44,21 +44,13 @@ _PERCENT = 100
 
 @dataclass(frozen=True)
 class Tool:
-    """A program, and what of it is compared.
+    """A program, and what of it is compared."""
 
-    Attributes
-    ----------
-    name : str
-    poles : callable
-        Of a log and its case: ``[f, ζ, std f, std ζ]`` of all poles of all orders, in Hz, shape
-        ``(n_orders, n_poles, 4)``; NaN where it does not say.
-    slow : bool
-        Whether the quick form leaves it out.
-    """
-
-    name: str
+    name: str  #
+    # Of a log and its case: ``[f, ζ, std f, std ζ]`` of all poles of all orders, in Hz, shape
+    # ``(n_orders, n_poles, 4)``; NaN where it does not say
     poles: Callable[[Log, Case], Array]
-    slow: bool = False
+    slow: bool = False  # Whether the quick form leaves it out
 
     def __call__(self, log: Log, case: Case) -> Array:
         """Call the program without its messages; nothing found where it raises."""

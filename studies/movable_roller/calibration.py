@@ -45,31 +45,16 @@ model_std = {model_std:.6f}
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Calibration:
-    """ln frequency as a polynomial of ln position.
+    """ln frequency as a polynomial of ln position."""
 
-    Attributes
-    ----------
-    curve : Polynomial
-        ln f (f in Hz) over ln of the roller's volts.
-    low, high : float
-        Where the map ends, in V.
-    baseline : float
-        Position of the first dwell that is read, in V.
-    model_std : float
-        Relative error of a drift that one repeat's curve predicts for the other.
-    left_out : dict of int to float
-        By degree, rms error of ln f at inner positions that the curve has not seen.
-    scatter : float
-        Rms of ln f about the curve.
-    """
-
-    curve: Polynomial
-    low: float
+    curve: Polynomial  # ln f (f in Hz) over ln of the roller's volts
+    low: float  # Where the map ends, in V
     high: float
-    baseline: float
-    model_std: float
+    baseline: float  # Position of the first dwell that is read, in V
+    model_std: float  # Relative error of a drift that one repeat's curve predicts for the other
+    # By degree, rms error of ln f at inner positions that the curve has not seen
     left_out: dict[int, float]
-    scatter: float
+    scatter: float  # Rms of ln f about the curve
 
 
 def calibrate(read: pd.DataFrame, *, degree: int | None = None) -> Calibration:

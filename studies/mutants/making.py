@@ -28,25 +28,13 @@ _ASKS = ("strict", "stacklevel")
 
 @dataclass(frozen=True, slots=True)
 class Mutant:
-    """One small change of a module.
+    """One small change of a module."""
 
-    Attributes
-    ----------
-    kind : str
-        What the operator changes.
-    line : int
-        Where.
-    old, new : str
-        The lines that differ, before and after.
-    code : str
-        The module with the change.
-    """
-
-    kind: str
-    line: int
-    old: str
+    kind: str  # What the operator changes
+    line: int  # Where
+    old: str  # The lines that differ, before and after
     new: str
-    code: str
+    code: str  # The module with the change
 
 
 class Mutants:

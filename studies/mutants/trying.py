@@ -31,21 +31,11 @@ _FINE, _NO_TESTS = 0, 5  # what pytest returns
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """What a run of tests came to.
+    """What a run of tests came to."""
 
-    Attributes
-    ----------
-    code : int
-        Returned by pytest, or minus the signal that ended it.
-    rows : list of dict
-        One for each test.
-    seconds : float
-        Of the processor.
-    """
-
-    code: int
-    rows: list[Row]
-    seconds: float
+    code: int  # Returned by pytest, or minus the signal that ended it
+    rows: list[Row]  # One for each test
+    seconds: float  # Of the processor
 
     @property
     def fate(self) -> str:

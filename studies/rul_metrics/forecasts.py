@@ -27,23 +27,14 @@ _KM = 1000.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Futures:
-    """What a posterior says of the time to come.
+    """What a posterior says of the time to come."""
 
-    Attributes
-    ----------
-    remaining : ndarray
-        Draws of the travel in m to the first limit, shape ``(n_draws,)``.
-    states : dict of str to ndarray
-        The draws that they are from, each of shape ``(n_draws,)``: travel now, life and exponent
-        of the wear, floor and length of the loosening, of either parameter ln of health over its
-        law, and the variance that every unit of travel adds to these; lengths in km.
-    posterior_s, futures_s : float
-        Processor times of both steps.
-    """
-
-    remaining: Array
+    remaining: Array  # Draws of the travel in m to the first limit, shape ``(n_draws,)``
+    # The draws that they are from, each of shape ``(n_draws,)``: travel now, life and exponent of
+    # the wear, floor and length of the loosening, of either parameter ln of health over its law,
+    # and the variance that every unit of travel adds to these; lengths in km
     states: dict[str, Array]
-    posterior_s: float
+    posterior_s: float  # Processor times of both steps
     futures_s: float
 
 

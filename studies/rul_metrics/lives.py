@@ -34,24 +34,12 @@ _KM = 1000.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Case:
-    """One life, followed past its end.
+    """One life, followed past its end."""
 
-    Attributes
-    ----------
-    life : Life
-        What is so at every log.
-    truth : models.lives.degradation.Life
-        Its laws.
-    history : History
-        Estimates of roll and pitch at all logs.
-    end : float
-        Odometer in m at which the first limit is reached; infinite if none ever is.
-    """
-
-    life: Life
-    truth: Truth
-    history: History
-    end: float
+    life: Life  # What is so at every log
+    truth: Truth  # Its laws
+    history: History  # Estimates of roll and pitch at all logs
+    end: float  # Odometer in m at which the first limit is reached; infinite if none ever is
 
 
 def case_of(kind: str, number: int, sizes: tuple[Estimates, Life] | None = None) -> Case:

@@ -88,23 +88,13 @@ def by_filterpy(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Walkers:
-    """Points of a life's posterior, at one point of the grid of settings, and both ways to it.
+    """Points of a life's posterior, at one point of the grid of settings, and both ways to it."""
 
-    Attributes
-    ----------
-    ours, by_filterpy : callable
-        Give log likelihoods up to a constant, of so many walkers.
-    walkers, looped : int
-        How many ours has at once, and how many filterpy one after the other.
-    n_settings, n_kept : int
-        Of the grid, before and after it is cut to what is probable.
-    """
-
-    ours: Callable[[], Array]
+    ours: Callable[[], Array]  # Give log likelihoods up to a constant, of so many walkers
     by_filterpy: Callable[[], Array]
-    walkers: int
+    walkers: int  # How many ours has at once, and how many filterpy one after the other
     looped: int
-    n_settings: int
+    n_settings: int  # Of the grid, before and after it is cut to what is probable
     n_kept: int
 
 

@@ -28,31 +28,15 @@ STEPS, FINE = 0.15, 2000.0
 
 @dataclass(frozen=True)
 class Part:
-    """What really becomes of a health parameter.
+    """What really becomes of a health parameter."""
 
-    Attributes
-    ----------
-    law : Law
-        Of the scenario it takes.
-    theta : ndarray
-        Natural parameters of the law, lengths in m.
-    begin, step : float
-        Travel in m at which the law begins, and at which health jumps (inf: never).
-    jump : float
-        Factor of the jump.
-    off : ndarray
-        Ln of health over its law at each log, shape ``(n_logs,)``.
-    rate : float
-        Variance of it per m.
-    """
-
-    law: Law
-    theta: Array
-    begin: float
+    law: Law  # Of the scenario it takes
+    theta: Array  # Natural parameters of the law, lengths in m
+    begin: float  # Travel in m at which the law begins, and at which health jumps (inf: never)
     step: float
-    jump: float
-    off: Array
-    rate: float
+    jump: float  # Factor of the jump
+    off: Array  # Ln of health over its law at each log, shape ``(n_logs,)``
+    rate: float  # Variance of it per m
 
     def by_law(self, travel: Array) -> Array:
         """Health by the law and the jump alone, at travels since the baseline."""

@@ -21,18 +21,10 @@ _BOUND = float(np.log(1 / FALSE_ALARM_PROBABILITY))
 
 @dataclass(frozen=True, slots=True)
 class Optimum:
-    """Logs after which a known loss is told; None where it is not.
+    """Logs after which a known loss is told; None where it is not."""
 
-    Attributes
-    ----------
-    bound : int or None
-        Where the information gathered reaches ln(1/α).
-    told : int or None
-        Where the likelihood ratio does.
-    """
-
-    bound: int | None
-    told: int | None
+    bound: int | None  # Where the information gathered reaches ln(1/α)
+    told: int | None  # Where the likelihood ratio does
 
 
 def optimum(life: Life, estimates: Estimates, loss: Array, *, learns: bool) -> Optimum:
