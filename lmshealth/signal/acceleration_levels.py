@@ -1,4 +1,4 @@
-"""Accelerations as the paper reads them: magnitudes of frequencies over velocity, which grow."""
+"""Acceleration levels of bands, and their growth with velocity (README.md, "Levels")."""
 
 from __future__ import annotations
 
@@ -11,37 +11,28 @@ from scipy.special import stdtr
 
 from lmshealth.errors import BadLog
 from lmshealth.io.log import Channel, Log
+from lmshealth.signal import constants
 from lmshealth.signal.harmonics import Harmonics, decompose
 from lmshealth.signal.segments import Part, Segment, nominal_velocity, select_segments
 from lmshealth.stage.description import Stage
-
-# Without a description: the rows of the paper's Tables 6 and 7.
-GRID = 10.0
-GRID_BAND = (10.0, 400.0)
-# A row of a mode reaches this many damping ratios to either side.
-_WIDTHS = 2.5
-# One-sided probability below which a slope counts: of twenty bands that do not depend on velocity
-# one will be said to grow.
-SIGNIFICANCE = 0.05
-_LEAST_ORDINATES = 3
 
 BandKind = Literal["mode", "grid", "health", "watch"]
 
 
 @dataclass(frozen=True, slots=True)
 class FrequencyBand:
-    """A band of frequencies that is read as one number.
+    """A frequency band with one level.
 
     Attributes
     ----------
     name : str
-        Of the mode, or the band in words; the same in all logs.
+        Of the mode, or the band in Hz; the same in all logs.
     kind : str
         ``mode``, ``grid`` (no description), ``health`` or ``watch``.
     low, high : float
         In Hz.
     placed_by : str
-        Of a mode: ``identified`` where this log shows it, else ``stage``.
+        Source of the frequency of a mode: ``identified`` in this log, or ``stage``.
     """
 
     name: str
@@ -53,7 +44,7 @@ class FrequencyBand:
 
 @dataclass(frozen=True, slots=True)
 class Magnitude:
-    """What one accelerometer of one log reads in a band.
+    """Levels of one accelerometer of one log in a band.
 
     Attributes
     ----------
@@ -62,15 +53,14 @@ class Magnitude:
     velocity : float
         Set velocity in m/s, NaN where unknown.
     channel : str
-        The accelerometer.
+        Name of the accelerometer.
     band : FrequencyBand
-        Where.
     magnitude, frequency : float
         Amplitude in m/s² and frequency in Hz of the strongest harmonic of the longest stretch.
     resolution : float
-        Distance of its harmonics in Hz.
+        Spacing of its harmonics in Hz.
     rms : float
-        In m/s², all stretches together.
+        Of all stretches, in m/s².
     dof : int
         Degrees of freedom of the mean square: two per harmonic.
     """
@@ -88,25 +78,25 @@ class Magnitude:
 
     @property
     def level(self) -> float:
-        """What is compared between velocities, in m/s²: magnitude, of wide bands the RMS."""
+        """Level in m/s² compared between velocities: magnitude, for wide bands the RMS."""
         return self.rms if self.band.kind in ("health", "watch") else self.magnitude
 
 
 @dataclass(frozen=True, slots=True)
 class Growth:
-    """How a level depends on velocity: ln level = constant + slope · ln velocity.
+    """Regression of a level on velocity: ln level = constant + slope · ln velocity.
 
     Attributes
     ----------
     stage, channel, band : str
         Machine, accelerometer and name of the band.
     n_logs, n_velocities : int
-        Points of the straight line, and different velocities among them.
+        Number of points, and of different velocities.
     slope, slope_std : float
-        Least squares, with the standard deviation that the scatter about the line tells; NaN where
-        fewer than two velocities, or three logs, leave it open.
+        Least squares, with its standard deviation from the residuals; NaN with fewer than two
+        velocities or three logs.
     p_value : float
-        Probability of such a slope or a larger one where there is none (Student's t).
+        One-sided, of no growth (Student's t).
     """
 
     stage: str
@@ -120,24 +110,24 @@ class Growth:
 
     @property
     def grows(self) -> bool | None:
-        """Whether the slope is positive beyond chance; None where that cannot be told."""
-        return None if np.isnan(self.p_value) else self.p_value < SIGNIFICANCE
+        """Whether the slope is significantly positive; None where it is unknown."""
+        return None if np.isnan(self.p_value) else self.p_value < constants.SIGNIFICANCE
 
 
 def choose_bands(
     stage: Stage | None, found: Mapping[str, float] | None, span: tuple[float, float] | None
 ) -> tuple[FrequencyBand, ...]:
-    """Choose what is read: modes and bands of the description, or the paper's grid without one.
+    """Choose the bands: modes and bands of the description, or a grid without one.
 
     Parameters
     ----------
     stage : Stage or None
         Its modes, health band and watched bands.
     found : mapping of str to float, optional
-        Natural frequencies in Hz, by name, of the modes identified in this log; other modes are
-        read at the frequencies of the description.
+        Natural frequencies in Hz, by name, of the modes identified in this log; other modes have
+        the frequencies of the description.
     span : (float, float) or None
-        Only modes or grid frequencies between these, in Hz.
+        Range in Hz of the modes or grid frequencies.
 
     Returns
     -------
@@ -145,10 +135,11 @@ def choose_bands(
         Modes or grid ascending in frequency, then health band, then watched bands.
     """
     if stage is None:
-        low, high = span or GRID_BAND
-        grid = GRID * np.arange(np.ceil(low / GRID), np.floor(high / GRID) + 1)
+        step = constants.GRID
+        low, high = span or constants.GRID_BAND
+        grid = step * np.arange(np.ceil(low / step), np.floor(high / step) + 1)
         return tuple(
-            FrequencyBand(f"{f:g} Hz", "grid", f - GRID / 2, f + GRID / 2)
+            FrequencyBand(f"{f:g} Hz", "grid", f - step / 2, f + step / 2)
             for f in grid.tolist()
             if f > 0
         )
@@ -166,7 +157,7 @@ def choose_bands(
 def _mode_bands(
     stage: Stage, found: Mapping[str, float], span: tuple[float, float] | None
 ) -> list[FrequencyBand]:
-    """Bands about the modes; where two touch, they part in the middle."""
+    """Return the bands of the modes; overlapping ones are split in the middle."""
     low, high = span or (0.0, np.inf)
     places = sorted(
         (found.get(mode.name, mode.frequency_hz), mode.damping_ratio, mode.name)
@@ -175,8 +166,8 @@ def _mode_bands(
     )
     bands = []
     for i, (f, damping, name) in enumerate(places):
-        below = f * (1 - _WIDTHS * damping)
-        above = f * (1 + _WIDTHS * damping)
+        below = f * (1 - constants.BAND_WIDTHS * damping)
+        above = f * (1 + constants.BAND_WIDTHS * damping)
         if i > 0:
             below = max(below, (places[i - 1][0] + f) / 2)
         if i + 1 < len(places):
@@ -190,16 +181,16 @@ def _mode_bands(
 def read_magnitudes(
     log: Log, bands: Iterable[FrequencyBand], *, part: Part = "record"
 ) -> tuple[Magnitude, ...]:
-    """Read every accelerometer of a log in every band.
+    """Measure the levels of every accelerometer of a log in every band.
 
     Parameters
     ----------
     log : Log
         With at least one acceleration channel.
     bands : iterable of FrequencyBand
-        Those that reach beyond half the sample rate are passed over.
+        Those above half the sample rate are omitted.
     part : str
-        Which stretches of the log; see `select_segments`.
+        Motion phase; see `select_segments`.
 
     Returns
     -------
@@ -223,7 +214,7 @@ def read_magnitudes(
         raise BadLog(
             log.name,
             "no-accelerometer",
-            f"no usable acc channel; there: {there}; needed acc_<name>_m_s2",
+            f"no usable acc channel; there are: {there}; needed acc_<name>_m_s2",
         )
     segments = select_segments(log, part)
     usable = _usable(log, bands, max(s.stop - s.start for s in segments))
@@ -245,11 +236,11 @@ def _usable(log: Log, bands: Iterable[FrequencyBand], longest: int) -> list[Freq
         raise BadLog(
             log.name,
             "sample-rate",
-            f"{log.sample_rate:g} Hz shows none of the bands asked for; needed is more than "
-            f"{2 * lowest:.4g} Hz",
+            f"a sample rate of {log.sample_rate:g} Hz covers none of the bands; needed is more "
+            f"than {2 * lowest:.4g} Hz",
         )
     narrowest = min(band.high - band.low for band in usable)
-    needed, seconds = _LEAST_ORDINATES / narrowest, longest / log.sample_rate
+    needed, seconds = constants.LEAST_ORDINATES / narrowest, longest / log.sample_rate
     if seconds < needed:
         raise BadLog(
             log.name,
@@ -261,7 +252,7 @@ def _usable(log: Log, bands: Iterable[FrequencyBand], longest: int) -> list[Freq
 
 
 class _Reading(NamedTuple):
-    """What a `Magnitude` says of a band."""
+    """Levels of a `Magnitude`."""
 
     magnitude: float
     frequency: float
@@ -276,7 +267,7 @@ def _read(
     segments: Sequence[Segment],
     bands: Sequence[FrequencyBand],
 ) -> list[_Reading]:
-    """Read all bands of a channel, one stretch at a time, the longest first."""
+    """Measure all bands of a channel, one stretch at a time, the longest first."""
     ordered = sorted(segments, key=lambda s: s.start - s.stop)
     strongest: list[tuple[float, float, float]] = []
     total, seconds = np.zeros(len(bands)), np.zeros(len(bands))
@@ -288,8 +279,8 @@ def _read(
         inside = [harmonics.between(band.low, band.high) for band in bands]
         strongest = strongest or [_strongest(harmonics, own) for own in inside]
         for i, own in enumerate(inside):
-            # A stretch too short for the band says nothing about it.
-            if own.stop - own.start >= _LEAST_ORDINATES - 1:
+            # Stretches too short for the band are omitted.
+            if own.stop - own.start >= constants.LEAST_ORDINATES - 1:
                 total[i] += harmonics.duration * float(harmonics.power[own].sum())
                 seconds[i] += harmonics.duration
                 dof[i] += 2 * (own.stop - own.start)
@@ -301,20 +292,14 @@ def _read(
 
 
 def _strongest(harmonics: Harmonics, inside: slice) -> tuple[float, float, float]:
-    """Amplitude and frequency of the strongest harmonic of a band, and what is resolved."""
+    """Return amplitude and frequency of the strongest harmonic of a band, and the resolution."""
     amplitude = harmonics.amplitude[inside]
     at = int(np.argmax(amplitude))
     return float(amplitude[at]), float(harmonics.frequency[inside][at]), 1 / harmonics.duration
 
 
 def find_growth(magnitudes: Iterable[Magnitude]) -> tuple[Growth, ...]:
-    """Fit the growth of every machine, accelerometer and band over the logs of known velocity.
-
-    Returns
-    -------
-    tuple of Growth
-        In the order in which they are first met.
-    """
+    """Fit the growth of every machine, accelerometer and band over logs of known velocity."""
     groups: dict[tuple[str, str, str], list[tuple[float, float]]] = {}
     for m in magnitudes:
         points = groups.setdefault((m.stage, m.channel, m.band.name), [])
@@ -325,7 +310,7 @@ def find_growth(magnitudes: Iterable[Magnitude]) -> tuple[Growth, ...]:
 
 def _growth(stage: str, channel: str, band: str, points: list[tuple[float, float]]) -> Growth:
     x, y = np.array(points).reshape(-1, 2).T
-    # Set velocities measured to a percent are the same.
+    # Set velocities that differ by a percent are equal.
     n_velocities = np.unique(np.round(x / 0.02)).size
     slope = std = p_value = float("nan")
     if n_velocities > 1:

@@ -1,4 +1,4 @@
-"""The following error: what the paper reads of it, and what the control loop leaves of it."""
+"""Following error: statistics and harmonics, and its RMS in the band of the control loop."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from scipy import signal
 from lmshealth._arrays import FloatArray, freeze
 from lmshealth.errors import BadLog
 from lmshealth.io.log import Channel, Log
+from lmshealth.signal import constants
 from lmshealth.signal.harmonics import Harmonics, decompose
 from lmshealth.signal.segments import (
     Part,
@@ -20,18 +21,10 @@ from lmshealth.signal.segments import (
     select_segments,
 )
 
-COUNT = 100
-# Six counts of the paper's encoder, in m.
-FLOOR = 30e-9
-# Hz: a servo works below its crossover, and modes of guide and mounts stand above.
-_LOOP_BAND = (1.0, 40.0)
-# Periods of its lower end that a stretch must hold: a line takes the slower ones away.
-_LOOP_PERIODS = 2.0
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FollowingError:
-    """Reading of one following-error channel of a log.
+    """Statistics and harmonics of one following-error channel of a log.
 
     Attributes
     ----------
@@ -40,16 +33,15 @@ class FollowingError:
     velocity : float
         Set velocity in m/s; NaN where unknown or where the log has several.
     duration : float
-        Seconds that the statistics are taken from.
+        Total duration of the statistics in s.
     lowest, highest, std, mean : float
         Of all samples, in m.
     harmonics : Harmonics
-        Of the longest stretch without gaps, of a longer one than a minute at 20 kHz of its first
-        part.
+        Of the longest gap-free stretch, at most of a minute at 20 kHz.
     kept : ndarray
         Indices of the strongest harmonics, strongest first, shape ``(n_kept,)``.
     floor : float
-        Harmonics up to this amplitude in m are left out of what counts as above it.
+        Amplitude in m above which a harmonic is no noise.
     """
 
     channel: str
@@ -83,21 +75,21 @@ class FollowingError:
 
     @property
     def band_above(self) -> tuple[float, float]:
-        """The same of those above the floor; NaN where there are none."""
+        """Band in Hz of those above the floor; NaN where there are none."""
         return self._span(self.above)
 
     @property
     def share_explained(self) -> float:
-        """Share of the variance of the transformed stretch that the kept harmonics rebuild."""
+        """Share of the variance in the kept harmonics."""
         return self._share(self.kept)
 
     @property
     def share_explained_above(self) -> float:
-        """The same of those above the floor."""
+        """Share of the variance in those above the floor."""
         return self._share(self.above)
 
     def rebuilt(self) -> FloatArray:
-        """Rebuild Δe in m from the kept harmonics above the floor, shape ``(n_samples,)``."""
+        """Return Δe in m from the kept harmonics above the floor, shape ``(n_samples,)``."""
         return self.harmonics.rebuild(self.above)
 
     def _span(self, index: np.ndarray[tuple[int], np.dtype[np.intp]]) -> tuple[float, float]:
@@ -112,20 +104,24 @@ class FollowingError:
 
 
 def read_error(
-    log: Log, *, count: int = COUNT, floor: float = FLOOR, part: Part = "record"
+    log: Log,
+    *,
+    count: int = constants.N_HARMONICS,
+    floor: float = constants.ENCODER_FLOOR,
+    part: Part = "record",
 ) -> tuple[FollowingError, ...]:
-    """Read the following error of a log.
+    """Analyse the following error of a log.
 
     Parameters
     ----------
     log : Log
         With at least one displacement channel.
     count : int
-        How many of the strongest harmonics are kept.
+        Number of the strongest harmonics to keep.
     floor : float
-        In m.
+        Amplitude of noise in m.
     part : str
-        Which stretches of the log; see `select_segments`.
+        Motion phase; see `select_segments`.
 
     Returns
     -------
@@ -136,7 +132,7 @@ def read_error(
     ------
     BadLog
         With reason ``no-delta-e`` without such a channel, ``too-short`` where the longest stretch
-        has fewer harmonics than are to be kept, or as `select_segments` does.
+        has fewer than ``count`` harmonics, or as `select_segments` does.
 
     References
     ----------
@@ -146,7 +142,9 @@ def read_error(
     if not channels:
         there = ", ".join(channel.name for channel in log.channels)
         raise BadLog(
-            log.name, "no-delta-e", f"no usable delta_e channel; there: {there}; needed delta_e_um"
+            log.name,
+            "no-delta-e",
+            f"no usable delta_e channel; there are: {there}; needed delta_e_um",
         )
     segments = select_segments(log, part)
     longest = max(segments, key=lambda segment: segment.stop - segment.start)
@@ -182,28 +180,24 @@ def read_error(
 
 
 def loop_error(log: Log) -> float | None:
-    """Measure the following error from 1 to 40 Hz: what the control loop leaves.
+    """Measure the RMS following error from 1 to 40 Hz, which depends on the servo tuning.
 
-    It tells a retuned servo from wear. In this band the loop gain alone decides how much of a
-    disturbance is left: a retuning moves it by tens of per cent or more, while wear shifts modes
-    that stand above. Disturbances change with velocity, so that only logs of one velocity compare.
+    Disturbances depend on velocity: only logs of one velocity are comparable.
 
     Parameters
     ----------
     log : Log
-        Stretches of constant velocity of two seconds or more are used, as for modes, each less
-        its line.
+        Its stretches of constant velocity of two seconds or more, detrended.
 
     Returns
     -------
     float or None
-        Root of the mean square in m, stretches weighted by their durations, several channels
-        alike. None where no channel tells the following error, no stretch resolves 1 Hz, or the
-        sample rate does not show 40 Hz.
+        In m, stretches weighted by duration, channels equally. None without a displacement
+        channel, a stretch that resolves 1 Hz, or a sample rate above 80 Hz.
     """
-    low, high = _LOOP_BAND
+    low, high = constants.LOOP_BAND
     channels = [channel for channel in log.channels if channel.kind == "displacement"]
-    segments = find_segments(log, _LOOP_PERIODS / low)
+    segments = find_segments(log, constants.LOOP_PERIODS / low)
     if not channels or not segments or log.sample_rate <= 2 * high:
         return None
     weights = [s.stop - s.start for s in segments]
@@ -218,19 +212,19 @@ def loop_error(log: Log) -> float | None:
 
 
 def _mean_square(values: FloatArray, sample_rate: float) -> float:
-    """Mean square of what a stretch holds in the loop's band.
+    """Return the mean square of a stretch in the band of the loop.
 
-    The window keeps drift below the band and lines above it from leaking in.
+    The window prevents leakage of drift below the band and of lines above it.
     """
     frequency, density = signal.periodogram(
         values, sample_rate, window="hann", detrend=signal.detrend, scaling="density"
     )
-    inside = (frequency >= _LOOP_BAND[0]) & (frequency <= _LOOP_BAND[1])
+    inside = (frequency >= constants.LOOP_BAND[0]) & (frequency <= constants.LOOP_BAND[1])
     return float(density[inside].sum() * sample_rate / values.size)
 
 
 def _statistics(channel: Channel, segments: Sequence[Segment]) -> tuple[float, float, float, float]:
-    """Minimum, maximum, mean and standard deviation of all samples, one stretch at a time."""
+    """Return minimum, maximum, mean and standard deviation of all samples."""
     size, low, high, mean, var = np.array(
         [
             (x.size, x.min(), x.max(), x.mean(), x.var())

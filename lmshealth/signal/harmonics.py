@@ -1,4 +1,4 @@
-"""Harmonics of a record: calibrated amplitudes and phases, and the record rebuilt from some."""
+"""Harmonics of a record: calibrated amplitudes and phases (README.md, "Harmonics")."""
 
 from __future__ import annotations
 
@@ -14,16 +14,12 @@ from lmshealth._arrays import FloatArray, freeze
 class Harmonics:
     """A record as its mean and a sum of cosines, A cos(2πft + φ) with t from its first sample.
 
-    Nothing but the mean is taken out and no window is laid over it: a sine with a whole number of
-    periods in the record reads its amplitude and phase to rounding, and white noise of power
-    spectral density S has the expected power S/T in each harmonic, T the duration.
-
     Attributes
     ----------
     mean : float
         In the record's unit.
     frequency : ndarray
-        In Hz, ascending from one over the duration, shape ``(n_harmonics,)``.
+        In Hz, ascending from 1 / duration, shape ``(n_harmonics,)``.
     amplitude : ndarray
         In the record's unit, same shape.
     phase : ndarray
@@ -48,7 +44,7 @@ class Harmonics:
 
     @property
     def power(self) -> FloatArray:
-        """Mean square of each harmonic; together the variance (Parseval)."""
+        """Mean square of each harmonic; their sum is the variance (Parseval)."""
         power = self.amplitude**2 / 2
         if self.size % 2 == 0:
             # At half the sample rate a cosine of phase 0 or π is ± A at every sample.
@@ -56,16 +52,16 @@ class Harmonics:
         return power
 
     def strongest(self, count: int) -> np.ndarray[tuple[int], np.dtype[np.intp]]:
-        """Choose the strongest harmonics: indices, strongest first, shape ``(count,)`` at most."""
+        """Return the indices of the strongest harmonics, at most ``count``, strongest first."""
         return np.argsort(-self.amplitude, kind="stable")[:count]
 
     def between(self, low: float, high: float) -> slice:
-        """Choose the harmonics strictly between two frequencies in Hz."""
+        """Return the harmonics strictly between two frequencies in Hz."""
         first = np.searchsorted(self.frequency, low, side="right")
         return slice(int(first), int(np.searchsorted(self.frequency, high)))
 
     def rebuild(self, kept: np.ndarray[tuple[int], np.dtype[np.intp]]) -> FloatArray:
-        """Sum the mean and some harmonics, by index; shape ``(size,)``."""
+        """Return the sum of the mean and some harmonics, by index; shape ``(size,)``."""
         transform = np.zeros(self.size // 2 + 1, dtype=complex)
         transform[0] = self.mean * self.size
         half = np.full(self.frequency.size, 0.5 * self.size)

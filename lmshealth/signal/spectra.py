@@ -1,4 +1,4 @@
-"""From samples to FFT ordinates: periodograms and their expectation."""
+"""Periodograms and cross spectra of segments, as acceleration (README.md, "Spectra")."""
 
 from __future__ import annotations
 
@@ -13,21 +13,16 @@ from scipy.stats import gamma
 from lmshealth._arrays import BoolArray, ComplexArray, FloatArray, freeze
 from lmshealth.io.buffers import MINUTE
 from lmshealth.io.log import Channel
+from lmshealth.signal import constants
 from lmshealth.signal.segments import Segment
 from lmshealth.signal.tone_removal import remove_sinusoids
 
-# The second difference of a displacement reaches over this part of the shortest period.
+# Shortest period over the lag of the second difference of a displacement.
 _LAG_PERIODS = 8.0
-# Set velocities closer than this are one.
-_SAME_VELOCITY = 0.01
-# From so many samples on a few at the end are given up for the sake of a fast transform.
+# Segments of more samples than this lose a few at their end for a fast transform.
 _LONG = 1 << 14
-# A resonance is no line if it is so many ordinates wide.
-_TOLD_APART = 8.0
-# Parts of a stretch that is cut have at least so many samples: only they are averaged.
+# Only segments of at least this many samples are averaged: the parts of a long stretch.
 _LEAST_PART = MINUTE // 2
-# A line keeps its phase for about a thousand periods: so wide it is, as a share of its frequency.
-WANDER = 1e-3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -39,14 +34,14 @@ class Spectrum:
     frequency : ndarray
         Fourier frequencies in Hz, shape ``(n_ordinates,)``.
     periodogram : ndarray
-        One-sided periodogram in (m/s²)²/Hz: for a stationary signal each ordinate over the power
-        spectral density is the mean of ``count`` exponential variables, shape ``(n_ordinates,)``.
+        One-sided periodogram in (m/s²)²/Hz: the power spectral density times the mean of
+        ``count`` exponential variables, shape ``(n_ordinates,)``.
     duration : float
-        Length of a segment in s.
+        Of a segment in s.
     velocity : float
         Set velocity in m/s, NaN where unknown.
     count : int
-        Number of segments of this length whose mean it is.
+        Number of averaged segments.
     """
 
     frequency: FloatArray
@@ -63,33 +58,33 @@ class Spectrum:
 
     @property
     def observed(self) -> float:
-        """Time in s that all its segments last together."""
+        """Total duration of its segments in s."""
         return self.count * self.duration
 
     def band(self, low: float, high: float) -> Spectrum:
-        """Cut out the ordinates from low to high Hz."""
+        """Return the ordinates from low to high Hz."""
         first, last = np.searchsorted(self.frequency, [low, high])
         cut = slice(int(first), int(last))
         return replace(self, frequency=self.frequency[cut], periodogram=self.periodogram[cut])
 
     def near(self, line: float) -> slice:
-        """Ordinates that a line may reach: it wanders, and its foot is two ordinates wide."""
+        """Return the ordinates of a line: its relative width, at least two to either side."""
         return _near(self.frequency, self.duration, line)
 
     def clear_of(self, lines: Sequence[float]) -> BoolArray:
-        """Tell which ordinates no line at one of these frequencies reaches."""
+        """Return which ordinates lie outside lines at these frequencies in Hz."""
         clear = np.ones(self.frequency.size, dtype=bool)
         for line in lines:
             clear[self.near(line)] = False
         return clear
 
     def density(self, low: float, high: float) -> tuple[float, int]:
-        """Mean ordinate from low to high Hz and its degrees of freedom, 2 count per ordinate."""
+        """Return the mean ordinate from low to high Hz and its degrees of freedom."""
         cut = self.band(low, high).periodogram
         return float(cut.mean()) if cut.size else float("nan"), 2 * self.count * cut.size
 
     def sine(self, first: int, last: int) -> tuple[float, float]:
-        """Frequency in Hz and amplitude of a sine within some ordinates: Σ I = A² T / 2."""
+        """Return frequency in Hz and amplitude of a sine in some ordinates: Σ I = A² T / 2."""
         ordinates = self.periodogram[first:last]
         amplitude = np.sqrt(2 * ordinates.sum() / self.duration)
         return float(self.frequency[first + int(np.argmax(ordinates))]), float(amplitude)
@@ -104,19 +99,18 @@ class CrossSpectrum:
     frequency : ndarray
         Fourier frequencies in Hz, shape ``(n_ordinates,)``.
     matrix : ndarray
-        F F*, F the transforms of all channels scaled so that its diagonal holds their one-sided
-        periodograms in (m/s²)²/Hz, shape ``(n_ordinates, n_channels, n_channels)``.
+        F F*, F the transforms of all channels; its diagonal holds their one-sided periodograms in
+        (m/s²)²/Hz, shape ``(n_ordinates, n_channels, n_channels)``.
     duration : float
-        Length of a segment in s.
+        Of a segment in s.
     velocity : float
         Set velocity in m/s, NaN where unknown.
     free : ndarray of bool
-        Ordinates at which no strong line stood, shape ``(n_ordinates,)``.
+        Ordinates without a removed or masked line, shape ``(n_ordinates,)``.
     lines : tuple of (int, float, float)
-        Of each line that was taken out the index of its channel, frequency in Hz and amplitude in
-        m/s².
+        Index of the channel, frequency in Hz and amplitude in m/s² of each removed sinusoid.
     count : int
-        Number of segments of this length whose mean it is.
+        Number of averaged segments.
     """
 
     frequency: FloatArray
@@ -134,11 +128,11 @@ class CrossSpectrum:
 
     @property
     def observed(self) -> float:
-        """Time in s that all its segments last together."""
+        """Total duration of its segments in s."""
         return self.count * self.duration
 
     def band(self, low: float, high: float) -> CrossSpectrum:
-        """Cut out the ordinates from low to high Hz."""
+        """Return the ordinates from low to high Hz."""
         first, last = np.searchsorted(self.frequency, [low, high])
         cut = slice(int(first), int(last))
         return replace(
@@ -150,44 +144,44 @@ class CrossSpectrum:
         )
 
     def without(self, lines: Sequence[float]) -> CrossSpectrum:
-        """Give up the ordinates that lines at these frequencies in Hz may reach."""
+        """Mask the ordinates of lines at these frequencies in Hz."""
         free = self.free.copy()
         for line in lines:
             free[_near(self.frequency, self.duration, line)] = False
         return replace(self, free=free)
 
     def channel(self, index: int) -> Spectrum:
-        """Give the spectrum of one channel."""
+        """Return the spectrum of one channel."""
         own = self.matrix[:, index, index].real.copy()
         return Spectrum(self.frequency, own, self.duration, self.velocity, self.count)
 
 
 def _near(frequency: FloatArray, duration: float, line: float) -> slice:
-    half = max(WANDER * line, 2 / duration)
+    half = max(constants.LINE_WIDTH * line, 2 / duration)
     first, last = np.searchsorted(frequency, [line - half, line + half])
     return slice(int(first), int(last))
 
 
 def median_ordinate(count: int) -> float:
-    """Median of the mean of so many exponential variables."""
+    """Return the median of the mean of ``count`` exponential variables of mean 1."""
     return float(gamma.ppf(0.5, count)) / count
 
 
 class ResonanceRange(NamedTuple):
-    """Where resonances may stand, in Hz, and the least damping ratio that they may have."""
+    """Range of possible resonances in Hz, and their least damping ratio."""
 
     low: float
     high: float
     damping_ratio: float
 
-    def like_lines(self, frequency: FloatArray, duration: float) -> BoolArray:
-        """Tell at which frequencies a segment does not tell them from lines."""
+    def unresolved(self, frequency: FloatArray, duration: float) -> BoolArray:
+        """Return the frequencies at which a segment cannot distinguish them from sinusoids."""
         width = 2 * self.damping_ratio * frequency * duration
         within = (frequency >= self.low) & (frequency <= self.high)
-        return np.asarray(within & (width < _TOLD_APART))
+        return np.asarray(within & (width < constants.DISTINCT_WIDTH))
 
 
-ANY_RESONANCE = (ResonanceRange(0.0, np.inf, 0.005),)
+ANY_RESONANCE = (ResonanceRange(0.0, np.inf, constants.LEAST_EXPECTED_DAMPING),)
 
 
 def cross_spectra(
@@ -201,9 +195,8 @@ def cross_spectra(
 ) -> tuple[CrossSpectrum, ...]:
     """Transform all channels segment by segment, and average the parts of long stretches.
 
-    Parts of one length and one set velocity have the same expectation, and the likelihood needs
-    no more of them than their mean. Short moves stay apart: a line that differs between them is
-    then masked in each where it stands.
+    Parts of one length and set velocity have the same expectation: their mean is a sufficient
+    statistic. Short moves stay separate, so that a line is masked in each at its own frequency.
 
     Parameters
     ----------
@@ -215,14 +208,13 @@ def cross_spectra(
         In Hz.
     top, ceiling : float
         In Hz, as in `periodogram`.
-    resonances : sequence of Resonances
-        Where resonances may stand: in a segment too short to tell them from lines nothing is
-        taken out there.
+    resonances : sequence of ResonanceRange
+        Possible resonances: where a segment does not resolve them no sinusoid is removed.
 
     Returns
     -------
     tuple of CrossSpectrum
-        Each at the place of its first segment.
+        In the order of their first segments.
     """
     return tuple(
         _mean(
@@ -242,11 +234,11 @@ def _cross_spectrum(
 ) -> CrossSpectrum:
     top, ceiling = reach
     parts = [as_acceleration(channel, segment, sample_rate, top) for channel in channels]
-    # A second difference has no values at the ends: there the others are cut, too.
+    # A second difference has no values at the ends; the other channels are cut there, too.
     short = max(lag for _, lag in parts)
     n = segment.stop - segment.start - 2 * short
     if n > _LONG:
-        # A length with a large prime factor costs ten times as much; that less is never 1 %.
+        # A length with a large prime factor takes ten times as long; the loss is below 1 %.
         n = fft.prev_fast_len(n)
     if short:
         ceiling = min(ceiling, 4 * top)
@@ -255,27 +247,27 @@ def _cross_spectrum(
     for c, (x, lag) in enumerate(parts):
         x = x[short - lag : n + short - lag]
         transforms[:, c] = _transform(x, lag, frequency, sample_rate)
-    spared = np.any([r.like_lines(frequency, n / sample_rate) for r in resonances], axis=0)
-    transforms, free, tones = remove_sinusoids(transforms, n / sample_rate, spared)
+    protected = np.any([r.unresolved(frequency, n / sample_rate) for r in resonances], axis=0)
+    transforms, free, sinusoids = remove_sinusoids(transforms, n / sample_rate, protected)
     step = sample_rate / n
     lines = tuple(
         # Σ I = A² T / 2 over the ordinates of a sine.
-        (tone.channel, (tone.ordinate + 1) * step, float(np.sqrt(2 * tone.power * step)))
-        for tone in tones
+        (one.channel, (one.ordinate + 1) * step, float(np.sqrt(2 * one.power * step)))
+        for one in sinusoids
     )
     matrix = transforms[:, :, None] * transforms[:, None].conj()
     return CrossSpectrum(frequency, matrix, n / sample_rate, segment.velocity, free, lines)
 
 
 def _frequencies(n: int, sample_rate: float, ceiling: float) -> FloatArray:
-    """Fourier frequencies in Hz from the first to just below Nyquist or the ceiling."""
+    """Return the Fourier frequencies in Hz from the first to below Nyquist or the ceiling."""
     frequency = np.arange(1, (n - 1) // 2 + 1, dtype=np.float64) * (sample_rate / n)
-    # A copy: a view would keep what it is cut from.
+    # A copy: a view would keep the whole array in memory.
     return frequency[: np.searchsorted(frequency, ceiling)].copy()
 
 
 def _exchangeable(segments: Sequence[Segment]) -> list[list[Segment]]:
-    """Group long segments of one length and one set velocity, whatever its direction."""
+    """Group long segments of one length and one set speed."""
     groups: list[list[Segment]] = []
     long: list[list[Segment]] = []
     for segment in segments:
@@ -293,7 +285,7 @@ def _exchangeable(segments: Sequence[Segment]) -> list[list[Segment]]:
 
 def _same(one: Segment, other: Segment) -> bool:
     speed, another = abs(one.velocity), abs(other.velocity)
-    alike = np.isclose(speed, another, rtol=_SAME_VELOCITY, atol=0.0, equal_nan=True)
+    alike = np.isclose(speed, another, rtol=constants.SAME_VELOCITY, atol=0.0, equal_nan=True)
     return one.stop - one.start == other.stop - other.start and bool(alike)
 
 
@@ -316,14 +308,9 @@ def periodogram(
 ) -> Spectrum:
     """Compute the one-sided periodogram of a channel as acceleration.
 
-    Mean and straight trend are taken out first, so that they do not leak into the band. With them
-    goes the share 3/(πk)² of white noise, and up to 6/(πk)² of the amplitude of a sine, at the
-    k-th ordinate: below 10⁻⁶ from the 780th on.
-
-    A displacement is differenced twice before the transform rather than multiplied by ω² after
-    it: differencing first keeps its large slow part from leaking into the band of the modes. The
-    difference reaches over as many samples as the top of the band allows, because between
-    neighbouring samples it would raise the fast noise so far that this leaks instead.
+    Mean and linear trend are removed. Of a displacement the second difference is transformed,
+    over a lag that the top of the band permits, so that neither its large slow part nor its
+    amplified fast noise leaks into the band.
 
     Parameters
     ----------
@@ -334,16 +321,16 @@ def periodogram(
     sample_rate : float
         In Hz.
     top : float
-        Highest frequency of interest in Hz; of a displacement nothing is given far above it.
-        By default all are, at the price of that leakage.
+        Highest frequency of interest in Hz, which sets the lag; by default Nyquist, at the price
+        of leakage.
     ceiling : float
-        Ordinates from here on are left out, in Hz.
+        Upper end of the ordinates in Hz.
 
     Returns
     -------
     Spectrum
-        From the first Fourier frequency up to just below Nyquist or the ceiling, for a
-        displacement up to four times ``top`` if that is lower.
+        From the first Fourier frequency to below Nyquist, the ceiling, and for a displacement
+        four times ``top``.
     """
     x, lag = as_acceleration(channel, segment, sample_rate, top)
     if lag:
@@ -355,7 +342,7 @@ def periodogram(
 
 
 def _transform(x: FloatArray, lag: int, frequency: FloatArray, sample_rate: float) -> ComplexArray:
-    """Transform what `as_acceleration` gives; the squared magnitude is the periodogram."""
+    """Transform the result of `as_acceleration`; the squared magnitude is the periodogram."""
     transform: ComplexArray = fft.rfft(_without_trend(x))[1 : frequency.size + 1]
     transform *= np.sqrt(2 / (x.size * sample_rate))
     if lag:
@@ -376,20 +363,20 @@ def _without_trend(x: FloatArray) -> FloatArray:
 def as_acceleration(
     channel: Channel, segment: Segment, sample_rate: float, top: float
 ) -> tuple[FloatArray, int]:
-    """Cut out a segment; of a displacement take the second difference.
+    """Return a segment of a channel; of a displacement its second difference.
 
     Returns
     -------
     values : ndarray
-        In m/s² but for `lag_gain`, shape ``(n,)``.
+        In m/s² up to `lag_gain`, shape ``(n,)``.
     lag : int
-        Samples that the difference reaches over; 0 for an acceleration.
+        Lag of the difference in samples; 0 for an acceleration.
     """
     x = channel.values[segment.start : segment.stop]
     if channel.kind != "displacement":
         return x, 0
     lag = max(1, int(sample_rate / (_LAG_PERIODS * top)))
-    # In place: of a long segment each intermediate array would be as large as a minute of samples.
+    # In place: each intermediate array would be as large as the segment.
     difference: FloatArray = x[2 * lag :] + x[: -2 * lag]
     difference -= x[lag:-lag]
     difference -= x[lag:-lag]
@@ -398,10 +385,10 @@ def as_acceleration(
 
 
 def lag_gain(frequency: FloatArray, lag: int, sample_rate: float) -> FloatArray:
-    """Amplitude of the second derivative over that of the second difference over L samples.
+    """Return the gain of the second derivative, ω², over that of the second difference.
 
-    The latter has gain (2 fs sin(ωL/2fs))², the former ω²; the difference vanishes at fs/L, eight
-    times the top of its band.
+    The latter is (2 fs sin(ωL/2fs))² for a lag of L samples; it vanishes at fs/L, eight times the
+    top of the band.
     """
     half = np.pi * frequency / sample_rate
     return np.asarray((half / np.abs(np.sin(lag * half)).clip(1e-6)) ** 2)

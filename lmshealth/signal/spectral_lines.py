@@ -1,4 +1,4 @@
-"""Spectral lines: where they stand, and what the narrow peaks that are no modes come from."""
+"""Spectral lines: detection, and naming by their sources (README.md, "Lines")."""
 
 from __future__ import annotations
 
@@ -7,28 +7,29 @@ from dataclasses import dataclass, replace
 
 from lmshealth._arrays import FloatArray
 from lmshealth.io.log import Channel, Log
+from lmshealth.signal import constants
 from lmshealth.signal.multitaper_test import detect_sinusoids
 from lmshealth.signal.segments import Segment, find_segments
-from lmshealth.signal.spectra import WANDER, as_acceleration, lag_gain
+from lmshealth.signal.spectra import as_acceleration, lag_gain
 from lmshealth.stage.description import Stage
 
 
 @dataclass(frozen=True, slots=True)
 class Line:
-    """A narrow spectral line that is no mode.
+    """A narrow spectral line that is not a mode.
 
     Attributes
     ----------
     frequency : float
         In Hz.
     amplitude : float
-        Of the sine, in the channel's unit.
+        Of the sine, in ``unit``.
     unit : str
         SI unit of the amplitude.
     kind : str
-        What it was recognised as: a name of the stage's orders, ``mains`` or ``unknown``.
+        Name of an order of the stage, ``order of … mm``, ``mains`` or ``unknown``.
     channel : str
-        The channel it was seen in.
+        Name of the channel.
     """
 
     frequency: float
@@ -38,22 +39,14 @@ class Line:
     channel: str
 
 
-# Probability that noise and resonances alone show a line somewhere in the band of one channel.
-FALSE_ALARM = 0.01
-_MAINS = (50.0, 60.0)
-_MOST_HARMONICS = 10
-# Two velocities are told apart from this ratio on.
-_OTHER_VELOCITY = 1.02
-
-
 def find_lines(
     channel: Channel,
     segment: Segment,
     sample_rate: float,
     band: tuple[float, float],
-    false_alarm: float = FALSE_ALARM,
+    false_alarm: float = constants.FALSE_ALARM,
 ) -> FloatArray:
-    """Find narrow lines in a segment by Thomson's test.
+    """Find narrow lines in a segment by Thomson's multitaper test.
 
     Parameters
     ----------
@@ -64,10 +57,10 @@ def find_lines(
     sample_rate : float
         In Hz.
     band : (float, float)
-        Where to look, in Hz; the first and last four ordinates cannot be tested.
+        In Hz; the first and last four ordinates cannot be tested.
     false_alarm : float
-        Probability that a segment without lines shows any in the band; see
-        `detect_sinusoids` for the resonances that this holds for.
+        Probability that a segment without lines shows any in the band, as `detect_sinusoids`
+        defines it.
 
     Returns
     -------
@@ -88,7 +81,7 @@ def _find_together(
     band: tuple[float, float],
     false_alarm: float,
 ) -> FloatArray:
-    """Find the lines that segments show together."""
+    """Find the lines that segments have in common."""
 
     def read(number: int) -> tuple[FloatArray, int]:
         return as_acceleration(channel, segments[number], sample_rate, band[1])
@@ -104,16 +97,16 @@ def _find_together(
 def name_lines(
     seen: Sequence[tuple[str, float, float]], log: Log, stage: Stage | None, resolution: float
 ) -> tuple[Line, ...]:
-    """Tell what each line is: an order of the velocity, mains, or unknown.
+    """Name the source of each line: an order of the velocity, mains, or unknown.
 
     Parameters
     ----------
     seen : sequence of (str, float, float)
-        Channel, frequency in Hz and amplitude in m/s² of each; one line may stand there twice.
+        Channel, frequency in Hz and amplitude in m/s² of each; a line may occur twice.
     log : Log
-        Says how fast the stage moved.
+        For the velocity of the stage.
     stage : Stage or None
-        Knows the orders.
+        For its orders.
     resolution : float
         Of the spectrum, in Hz.
 
@@ -130,12 +123,12 @@ def name_lines(
         Line(frequency, amplitude, "m/s²", _kind(frequency, bases, resolution), channel)
         for channel, frequency, amplitude in seen
     ]
-    return _once(named, resolution)
+    return _without_duplicates(named, resolution)
 
 
 @dataclass(frozen=True, slots=True)
-class _Sighting:
-    """A line at one velocity."""
+class _Detection:
+    """A line at one velocity, with the resolution of its frequency in Hz."""
 
     line: Line
     velocity: float
@@ -147,36 +140,35 @@ def find_lines_by_velocity(
     channels: Sequence[Channel],
     stage: Stage | None,
     band: tuple[float, float],
-    false_alarm: float = FALSE_ALARM,
+    false_alarm: float = constants.FALSE_ALARM,
 ) -> tuple[Line, ...]:
-    """Find the lines of every velocity and tell them by how they follow it.
+    """Find the lines at every velocity of a log, and name those that are proportional to it.
 
     Parameters
     ----------
     log : Log
-        Its segments of one velocity, whatever their direction, are searched together: short
-        strokes show together what none shows alone. Those not half as long as the longest are
-        left out.
+        Its segments of one speed are searched together; those less than half as long as the
+        longest are omitted.
     channels : sequence of Channel
-        Which channels.
+        Displacements or accelerations.
     stage : Stage or None
-        Knows the orders. A line that it does not know, but that stands at one wavelength of
-        several velocities, is called ``order of … mm``.
+        For its orders. Any other line at one wavelength of several velocities is named
+        ``order of … mm``.
     band : (float, float)
         In Hz.
     false_alarm : float
-        Probability that a channel without lines shows any, at all its velocities together.
+        Probability that a channel without lines shows any, at all velocities together.
 
     Returns
     -------
     tuple of Line
-        Ascending in frequency, each line once per channel, where it is strongest.
+        Ascending in frequency, each line once per channel, at its strongest.
     """
     segments = find_segments(log, 0.0)
     groups = _by_velocity(segments)
     lines: list[Line] = []
     for channel in channels:
-        sightings = []
+        detections = []
         for group in groups:
             velocity = abs(group[0].velocity)
             resolution = 0.5 * _ordinate(log, group)
@@ -186,19 +178,20 @@ def find_lines_by_velocity(
             for frequency, amplitude in found.tolist():
                 kind = _kind(frequency, bases, resolution)
                 line = Line(frequency, amplitude, "m/s²", kind, channel.name)
-                sightings.append(_Sighting(line, velocity, resolution))
-        known = [s.line for s in sightings if s.line.kind != "unknown"]
-        unknown = [s for s in sightings if s.line.kind == "unknown"]
-        lines += _once([*known, *_orders(unknown)], 1.5 * _ordinate(log, segments))
+                detections.append(_Detection(line, velocity, resolution))
+        known = [s.line for s in detections if s.line.kind != "unknown"]
+        unknown = [s for s in detections if s.line.kind == "unknown"]
+        lines += _without_duplicates([*known, *_orders(unknown)], 1.5 * _ordinate(log, segments))
     return tuple(sorted(lines, key=lambda line: (line.frequency, line.channel)))
 
 
 def _by_velocity(segments: Sequence[Segment]) -> list[list[Segment]]:
-    """Group segments of one velocity."""
+    """Group segments of one speed."""
     groups: list[list[Segment]] = []
     for segment in sorted(segments, key=lambda s: abs(s.velocity)):
-        # Without a set point, NaN, all are one group.
-        if groups and not abs(segment.velocity) > _OTHER_VELOCITY * abs(groups[-1][0].velocity):
+        # Without a set point velocities are NaN: one group.
+        slowest = abs(groups[-1][0].velocity) if groups else 0.0
+        if groups and not abs(segment.velocity) > constants.OTHER_VELOCITY * slowest:
             groups[-1].append(segment)
         else:
             groups.append([segment])
@@ -206,13 +199,13 @@ def _by_velocity(segments: Sequence[Segment]) -> list[list[Segment]]:
 
 
 def _ordinate(log: Log, segments: Sequence[Segment]) -> float:
-    """Distance in Hz of the ordinates of the longest segment."""
+    """Return the spacing in Hz of the ordinates of the longest segment."""
     return log.sample_rate / max((s.stop - s.start for s in segments), default=1)
 
 
 def _bases(stage: Stage | None, velocities: Iterable[float]) -> list[tuple[float, str]]:
     orders = () if stage is None else stage.description.order
-    return [(mains, "mains") for mains in _MAINS] + [
+    return [(mains, "mains") for mains in constants.MAINS] + [
         (abs(velocity) / (order.wavelength_mm * 1e-3), order.name)
         for order in orders
         for velocity in velocities
@@ -220,30 +213,30 @@ def _bases(stage: Stage | None, velocities: Iterable[float]) -> list[tuple[float
 
 
 def _kind(frequency: float, bases: list[tuple[float, str]], resolution: float) -> str:
-    """Name a line by the base of which it is the lowest harmonic; mains before orders."""
-    kind, lowest = "unknown", _MOST_HARMONICS + 1
-    resolution = max(resolution, WANDER * frequency)
+    """Name a line by the base with the lowest matching harmonic; mains before orders."""
+    kind, lowest = "unknown", constants.MOST_HARMONICS + 1
+    resolution = max(resolution, constants.LINE_WIDTH * frequency)
     for base, name in bases:
-        # High harmonics of a slow order lie so close together that any line would be one.
+        # The harmonics of a base below three resolutions would match any line.
         n = round(frequency / base) if base > 3 * resolution else 0
         if 1 <= n < lowest and abs(frequency - n * base) < resolution:
             kind, lowest = name, n
     return kind
 
 
-def _orders(unknown: Sequence[_Sighting]) -> list[Line]:
-    """Name the lines that other velocities show at the same wavelength and not where they were."""
+def _orders(unknown: Sequence[_Detection]) -> list[Line]:
+    """Name the lines that have the same wavelength at another velocity."""
     named = []
     for one in unknown:
         kind = "unknown"
         for other in unknown:
-            apart = max(one.velocity, other.velocity) > _OTHER_VELOCITY * min(
+            apart = max(one.velocity, other.velocity) > constants.OTHER_VELOCITY * min(
                 one.velocity, other.velocity
             )
             if not (apart and one.velocity > 0 and other.velocity > 0):
                 continue
             expected = one.line.frequency * other.velocity / one.velocity
-            # What the first does not resolve grows with the ratio of velocities.
+            # The resolution of the first scales with the ratio of velocities.
             blur = other.resolution + one.resolution * other.velocity / one.velocity
             if abs(other.line.frequency - expected) < blur:
                 kind = f"order of {1e3 * one.velocity / one.line.frequency:.3g} mm"
@@ -251,8 +244,8 @@ def _orders(unknown: Sequence[_Sighting]) -> list[Line]:
     return named
 
 
-def _once(lines: Iterable[Line], resolution: float) -> tuple[Line, ...]:
-    """Keep each line once per channel, the strongest, ascending in frequency."""
+def _without_duplicates(lines: Iterable[Line], resolution: float) -> tuple[Line, ...]:
+    """Keep the strongest of equal lines of a channel, ascending in frequency."""
     kept: list[Line] = []
     for line in sorted(lines, key=lambda s: (s.channel, -s.amplitude)):
         if all(

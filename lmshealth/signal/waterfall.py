@@ -1,4 +1,4 @@
-"""Spectra over life: the band of the tracked modes as every log shows it, side by side."""
+"""Waterfall of a life: relative spectra of all logs in the band of the tracked modes."""
 
 from __future__ import annotations
 
@@ -11,29 +11,26 @@ from scipy import fft
 
 from lmshealth._arrays import FloatArray, expect_shape, freeze
 from lmshealth.io.log import Channel, Log
+from lmshealth.signal import constants
 from lmshealth.signal.segments import Segment, find_segments
 from lmshealth.signal.spectra import Spectrum, periodogram
 from lmshealth.signal.spectral_lines import Line
 from lmshealth.stage.description import Stage
 
-BINS = 160
-# A stretch counts if it holds so many periods of the lowest frequency.
-_LEAST_PERIODS = 20
 # Power below this share of a channel's median is rounding.
 _LEAST_SHARE = 1e-9
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RelativeSpectrum:
-    """How strongly a log shows each frequency of the band of the tracked modes.
+    """Spectrum of a log relative to its median in the band of the tracked modes.
 
     Attributes
     ----------
     low, high : float
         Ends of the band in Hz.
     level : ndarray
-        In dB, in bins of equal width in ln f, NaN from half the sample rate on, shape
-        ``(n_bins,)``.
+        In dB, in bins of equal width in ln f, NaN above half the sample rate, shape ``(n_bins,)``.
     """
 
     low: float
@@ -52,7 +49,7 @@ class RelativeSpectrum:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Waterfall:
-    """The levels of a machine's logs, and the lines that stand among them.
+    """Relative spectra and lines of the logs of a machine.
 
     Attributes
     ----------
@@ -61,7 +58,7 @@ class Waterfall:
     level : ndarray
         In dB, NaN where a log has none, shape ``(n_logs, n_bins)``.
     lines : tuple of tuple of Line
-        Of each log those within the band.
+        Of each log, within the band.
     """
 
     edges: FloatArray
@@ -74,7 +71,7 @@ class Waterfall:
 
     @classmethod
     def stack(cls, logs: Sequence[tuple[RelativeSpectrum | None, Sequence[Line]]]) -> Self | None:
-        """Put logs that were read with one description side by side; None without any levels."""
+        """Stack logs of one description; None without any spectrum."""
         there = [levels for levels, _ in logs if levels is not None]
         if not there:
             return None
@@ -90,7 +87,7 @@ class Waterfall:
 
 
 def shown_band(stage: Stage) -> tuple[float, float]:
-    """Choose the band that is shown, in Hz: wherever a tracked mode of a stage is looked for."""
+    """Return the band in Hz in which the tracked modes of a stage are searched."""
     modes = [mode for mode in stage.modes if mode.tracked] or stage.modes
     return (
         min(mode.frequency_hz * (1 - mode.search) for mode in modes),
@@ -98,34 +95,34 @@ def shown_band(stage: Stage) -> tuple[float, float]:
     )
 
 
-def relative_spectrum(log: Log, stage: Stage, *, n_bins: int = BINS) -> RelativeSpectrum | None:
-    """Read how strongly a log shows each frequency of the band of the tracked modes.
+def relative_spectrum(
+    log: Log, stage: Stage, *, n_bins: int = constants.N_BINS
+) -> RelativeSpectrum | None:
+    """Compute the spectrum of a log relative to its median in the band of the tracked modes.
 
-    Stretches of constant velocity are cut into parts that resolve the bins, and their periodograms
-    are averaged, each by its duration, within every bin. A channel counts in units of its own
-    median over the band, and the level is the mean of all channels: logs of different velocity,
-    load or sensors are then alike but for where they have their resonances, which is what is to be
-    compared. Absolute levels are lost.
+    Periodograms of parts of the constant-velocity stretches are averaged within bins. Each channel
+    is divided by its median over the band, and the mean of all channels is returned: logs of
+    different velocity, load or sensors then differ in their resonances only.
 
     Parameters
     ----------
     log : Log
         Displacements and accelerations are used, both as accelerations.
     stage : Stage
-        Its modes tell the band.
+        Its modes define the band.
     n_bins : int
-        How finely the band is divided.
+        Number of bins.
 
     Returns
     -------
     RelativeSpectrum or None
-        None where nothing can be read: no such channel, no stretch of twenty periods, or a sample
-        rate that does not reach the band.
+        None without such a channel, a stretch of twenty periods, or a sufficient sample rate.
     """
     low, high = shown_band(stage)
     edges = np.geomspace(low, high, n_bins + 1)
     channels = [c for c in log.channels if c.kind in ("displacement", "acceleration")]
-    segments = _cut(find_segments(log, _LEAST_PERIODS / low), log.sample_rate / np.diff(edges)[0])
+    stretches = find_segments(log, constants.LEAST_PERIODS / low)
+    segments = _cut(stretches, log.sample_rate / np.diff(edges)[0])
     below = edges[1:] < log.sample_rate / 2
     if not channels or not segments or not below.any():
         return None
@@ -142,10 +139,7 @@ def relative_spectrum(log: Log, stage: Stage, *, n_bins: int = BINS) -> Relative
 
 
 def _cut(segments: Sequence[Segment], size: float) -> list[Segment]:
-    """Cut segments into parts that resolve the bins and no more: five times cheaper than whole.
-
-    What is left at the end of a segment is given up.
-    """
+    """Cut segments into parts that just resolve the bins; the rest of a segment is omitted."""
     n = fft.next_fast_len(int(np.ceil(size)), real=True)
     parts = []
     for segment in segments:
@@ -170,8 +164,7 @@ def _density(
 def bin_density(spectrum: Spectrum, edges: FloatArray) -> FloatArray:
     """Average a spectrum within bins, shape ``(n_bins,)``.
 
-    Every ordinate is taken for the density from half way below it to half way above, so that bins
-    narrower than what the spectrum resolves have a value as well, and no power is lost.
+    An ordinate is the density within half a spacing: narrow bins have a value, and power is kept.
     """
     half = 0.5 / spectrum.duration
     places = np.append(spectrum.frequency - half, spectrum.frequency[-1] + half)

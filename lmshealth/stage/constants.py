@@ -30,7 +30,7 @@ LEAST_RESOLUTION = 2.0
 # --- Check of a description ---------------------------------------------------------------------
 # Duration in s of the typical logs of the check; there are as many now as in the baseline.
 TYPICAL_DURATION = 60.0
-# Largest error of ln f of a good surrogate: a hundredth of the best that logs reach.
+# Largest error of ln f of a good surrogate: below the standard deviation of any measurement.
 SURROGATE_TARGET = 1e-5
 # Share of the uncertainty of typical logs below which an error of the surrogate is no fault, and
 # exponent times relative prior width below which a combination omits a parameter.

@@ -70,7 +70,7 @@ def test_without_a_set_point_there_is_the_whole_record_only() -> None:
 
 def test_a_part_that_is_not_there_is_an_error_with_those_that_are() -> None:
     """A log that never moves has nothing to settle from."""
-    with pytest.raises(BadLog, match="there: idle") as caught:
+    with pytest.raises(BadLog, match="there are: idle") as caught:
         select_segments(log_of(np.zeros(4000)), "settling")
     assert caught.value.reason == "no-such-part"
 

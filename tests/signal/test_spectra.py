@@ -407,14 +407,14 @@ def test_without_gives_up_what_lines_reach_and_nothing_else() -> None:
     np.testing.assert_array_equal(twice.matrix, found.matrix)
 
 
-def test_resonances_look_like_lines_where_a_segment_does_not_resolve_them() -> None:
+def test_resonances_look_unresolved_where_a_segment_does_not_resolve_them() -> None:
     """Within their band, and below eight ordinates in the half-power bandwidth 2ζf."""
     frequency = np.array([89.0, 90.0, 99.0, 101.0, 110.0, 111.0])
     expected = ResonanceRange(90.0, 110.0, 0.02)
     # 2 · 0.02 · 100 Hz · 2 s is eight.
-    assert expected.like_lines(frequency, 2.0).tolist() == [False, True, True, False, False, False]
-    assert not expected.like_lines(frequency, 3.0).any()
-    assert expected.like_lines(frequency, 1.0).sum() == 4
+    assert expected.unresolved(frequency, 2.0).tolist() == [False, True, True, False, False, False]
+    assert not expected.unresolved(frequency, 3.0).any()
+    assert expected.unresolved(frequency, 1.0).sum() == 4
 
 
 def test_a_resonance_of_a_short_move_is_not_taken_for_a_tone() -> None:

@@ -22,7 +22,8 @@ from lmshealth.modal.ambient.initial_values import (
 from lmshealth.modal.ambient.marginalisation import marginalise
 from lmshealth.modal.ambient.whittle import Likelihood, lay_out
 from lmshealth.modal.targets import WORST_STD_LN_F, WORST_STD_LN_ZETA, Target
-from lmshealth.signal.spectra import WANDER, CrossSpectrum, Spectrum, median_ordinate
+from lmshealth.signal.constants import LINE_WIDTH
+from lmshealth.signal.spectra import CrossSpectrum, Spectrum, median_ordinate
 from lmshealth.stage.constants import BAND
 
 # Probability that noise alone makes a line somewhere in the band.
@@ -623,7 +624,7 @@ def _incredible(fit: BandFit, i: int, duration: float) -> tuple[str, str] | None
             f"{f:.5g} Hz in {channel} is narrower ({2 * zeta * f:.2g} Hz) than a record of "
             f"{duration:.3g} s resolves",
         )
-    if target.nominal is None and 2 * zeta < WANDER:
+    if target.nominal is None and 2 * zeta < LINE_WIDTH:
         return "line-not-mode", f"{f:.5g} Hz in {channel} is as narrow as a line that wanders"
     if fit.dispersion[i] > _WORST_DISPERSION:
         return (
