@@ -1,7 +1,4 @@
-"""Samples of a signal: in memory, or of long records in a file, and read stretch by stretch.
-
-Where decoded blocks of a column go: to memory up to a minute of a log, beyond it to disk.
-"""
+"""Samples of a column: in memory up to a minute of a log, beyond it in a temporary file."""
 
 from __future__ import annotations
 
@@ -17,9 +14,9 @@ import numpy as np
 from lmshealth._arrays import FloatArray
 from lmshealth.io.refusal import Unusable
 
-# A minute at 20 kHz: columns that are longer stay on disk.
+# A minute at 20 kHz: longer columns stay on disk.
 MINUTE = 1_200_000
-# What is looked at in one go: small enough that its temporaries stay in the processor's cache.
+# Samples per block: small enough that temporary arrays stay in the processor's cache.
 BLOCK = 1 << 18
 
 
@@ -51,7 +48,7 @@ class Stored:
         return in_unit(values, self._factor, self._limit)
 
     def scaled(self, factor: float, limit: float) -> Stored:
-        """View the samples times a factor; from a limit on they are no measurements but NaN."""
+        """View the samples times a factor, as NaN from the limit on."""
         view = copy(self)
         view._factor, view._limit, view._viewed = self._factor * factor, limit, self
         return view
@@ -61,18 +58,18 @@ Samples = FloatArray | Stored
 
 
 def in_unit(values: FloatArray, factor: float, limit: float) -> FloatArray:
-    """Multiply samples, and make NaN of what reaches the limit or is no number.
+    """Multiply samples by a factor, and set those from the limit on to NaN.
 
     Parameters
     ----------
     values : ndarray
-        Shape ``(n,)``; left as it is.
+        Shape ``(n,)``; left unchanged.
     factor : float
         SI value of one.
     limit : float
         In SI units.
     """
-    # A damaged float can be so large that its SI value is infinite: missing, not a warning.
+    # A damaged float may be so large that its SI value is infinite: missing, without a warning.
     with np.errstate(over="ignore", invalid="ignore"):
         scaled = values * factor
         missing = ~(np.abs(scaled) < limit)
@@ -84,7 +81,7 @@ def in_unit(values: FloatArray, factor: float, limit: float) -> FloatArray:
 def blocks(
     samples: Samples, start: int = 0, stop: int | None = None, *, overlap: int = 0
 ) -> Iterator[tuple[int, FloatArray]]:
-    """Read samples block by block, each with the place of its first sample.
+    """Read samples block by block, each with the index of its first sample.
 
     Parameters
     ----------
@@ -93,12 +90,12 @@ def blocks(
     start, stop : int, optional
         Half-open range; by default all.
     overlap : int
-        So many samples of the block before are repeated at the beginning of each but the first.
+        Samples of the block before that are repeated at the beginning of each but the first.
     """
     end = samples.size if stop is None else stop
     at = start
     while at < end:
-        # Never a remainder so short that a difference over it has no samples.
+        # No remainder so short that a difference over it has no samples.
         following = at + BLOCK if end - at > 1.5 * BLOCK else end
         begin = max(start, at - overlap)
         yield begin, samples[begin:following]
@@ -106,61 +103,55 @@ def blocks(
 
 
 class Spool:
-    """Takes the samples of one column in blocks.
+    """Collects the samples of one column in blocks.
 
-    The temporary file of a long column has no name and is gone with the last `Stored` of it.
+    The temporary file of a long column has no name and is deleted with the last `Stored` of it.
 
     Parameters
     ----------
     expected : int
-        Number of samples, where it is known: up to a minute of them need not be joined then.
+        Number of samples, where it is known: up to a minute of them need no concatenation then.
     """
 
     def __init__(self, expected: int = 0) -> None:
         self._memory = np.empty(expected if 0 < expected <= MINUTE else 0)
         self._parts: list[FloatArray] = []
-        self._size = 0
         self._file: IO[bytes] | None = None
-
-    @property
-    def size(self) -> int:
-        """Samples taken so far."""
-        return self._size
+        self.size = 0
 
     def append(self, block: np.ndarray) -> None:
-        """Take the next samples, shape ``(n,)``, of any type of numbers.
+        """Add the next samples, shape ``(n,)``, of any numeric type.
 
         Raises
         ------
         Unusable
             With reason ``too-large`` where the disk is full.
         """
-        start, self._size = self._size, self._size + block.size
-        if self._size <= self._memory.size:
-            # Damaged bytes may be a NaN that complains when it is widened.
-            with np.errstate(invalid="ignore"):
-                self._memory[start : self._size] = block
-            return
-        if self._memory.size:
-            self._parts, self._memory = [self._memory[:start]], np.empty(0)
+        start, self.size = self.size, self.size + block.size
+        # Damaged bytes may be a signalling NaN, which warns when it is widened.
         with np.errstate(invalid="ignore"):
+            if self.size <= self._memory.size:
+                self._memory[start : self.size] = block
+                return
+            if self._memory.size:
+                self._parts, self._memory = [self._memory[:start]], np.empty(0)
             self._parts.append(np.asarray(block, dtype=np.float64))
-        if self._file is not None or self._size > MINUTE:
+        if self._file is not None or self.size > MINUTE:
             self._write()
 
     def samples(self) -> Samples:
-        """Give everything that was taken."""
+        """Return all samples."""
         if self._file is not None:
             self._file.flush()
-            return Stored(self._file, self._size)
+            return Stored(self._file, self.size)
         if self._memory.size:
-            return self._memory[: self._size]
+            return self._memory[: self.size]
         if len(self._parts) != 1:
             self._parts = [np.concatenate(self._parts) if self._parts else np.empty(0)]
         return self._parts[0]
 
     def close(self) -> None:
-        """Give up the file of what was taken and will not be asked for."""
+        """Discard the samples."""
         if self._file is not None:
             self._file.close()
 
@@ -173,7 +164,7 @@ class Spool:
         except OSError as error:
             raise Unusable(
                 "too-large",
-                f"{8 * self._size} bytes of a column do not fit into {tempfile.gettempdir()} "
+                f"{8 * self.size} bytes of a column do not fit into {tempfile.gettempdir()} "
                 f"({error.strerror}); set TMPDIR to a folder on a larger disk",
             ) from error
         self._parts.clear()

@@ -1,4 +1,4 @@
-"""What makes a single channel unusable: too many missing samples, a flat line, clipping."""
+"""Checks of a channel: missing samples, constant value, clipping."""
 
 from __future__ import annotations
 
@@ -7,24 +7,14 @@ from collections.abc import Iterator
 import numpy as np
 
 from lmshealth._arrays import FloatArray
+from lmshealth.io import constants
 from lmshealth.io.buffers import Samples, blocks
 from lmshealth.io.refusal import Unusable
 from lmshealth.io.time_axis import IntArray, too_many
 
-LARGEST_MISSING = 0.10
-# No acceleration, position or current reaches this in SI units; its square is still a number.
-ABSURD = 1e12
-
-CLIPPED_SHARE = 1e-3
-_PILE_UP = 2.0
-_LEVELS_BELOW = 4
-_FEWEST_LEVELS = 16
-_FEWEST_STUCK = 5
-_ADJACENT = 0.1
-
 
 def missing_stretches(values: Samples) -> tuple[IntArray, str]:
-    """Find the samples of a channel that are no measurements.
+    """Find the missing samples of a channel.
 
     Parameters
     ----------
@@ -42,37 +32,36 @@ def missing_stretches(values: Samples) -> tuple[IntArray, str]:
     Raises
     ------
     Unusable
-        With reason ``missing-samples`` when they are too many to work around: other channels
-        would be cut to pieces by this one.
+        With reason ``missing-samples`` when they are so many that they would cut the other
+        channels to pieces.
     """
     found = [np.empty(0, dtype=np.int64)]
     for at, block in blocks(values):
-        missing = ~(np.abs(block) < ABSURD)
+        missing = ~(np.abs(block) < constants.ABSURD)
         if missing.any():
             edges = np.diff(missing.view(np.int8), prepend=0, append=0)
             found.append(np.flatnonzero(edges) + at)
     bounds = np.concatenate(found)
-    # Where a stretch ends at the edge of a block and another begins there, they are one.
+    # A stretch that ends at the edge of a block continues in the next.
     twice = np.flatnonzero(np.diff(bounds) == 0)
     bounds = np.delete(bounds, np.concatenate([twice, twice + 1]))
     stretches: IntArray = bounds.reshape(-1, 2)
     if not stretches.size:
         return stretches, ""
-    n_missing = int(np.sum(stretches[:, 1] - stretches[:, 0]))
-    n_stretches = len(stretches)
+    n_missing, n_stretches = int(np.sum(stretches[:, 1] - stretches[:, 0])), len(stretches)
     note = f"{n_missing} of {values.size} samples are missing (NaN) in {n_stretches} stretches"
-    if n_missing > LARGEST_MISSING * values.size or too_many(n_stretches, values.size):
+    if n_missing > constants.LARGEST_MISSING * values.size or too_many(n_stretches, values.size):
         raise Unusable("missing-samples", note)
     return stretches, note
 
 
 def check_signal(values: Samples) -> None:
-    """Refuse a flat or clipped channel.
+    """Refuse a constant or clipped channel.
 
     Parameters
     ----------
     values : ndarray or Stored
-        Samples in SI units, shape ``(n_samples,)``; those that are missing are passed over.
+        Samples in SI units, shape ``(n_samples,)``; missing ones are ignored.
 
     Raises
     ------
@@ -85,18 +74,18 @@ def check_signal(values: Samples) -> None:
         raise Unusable("flat", f"all {values.size} samples are {low:.6g} (SI); check the sensor")
     at_high = _stuck(values, low, high, 1.0)
     at_low = _stuck(values, -high, -low, -1.0)
-    if at_high + at_low >= CLIPPED_SHARE * values.size:
+    if at_high + at_low >= constants.CLIPPED_SHARE * values.size:
         raise Unusable(
             "clipped",
-            f"{at_low} samples stand at the minimum {low:.6g} and {at_high} at the maximum "
+            f"{at_low} samples are at the minimum {low:.6g} and {at_high} at the maximum "
             f"{high:.6g} (SI) of {values.size}; widen the range of the sensor",
         )
 
 
 def _measured(values: Samples) -> Iterator[FloatArray]:
-    """Give the samples block by block, without those that are missing."""
+    """Yield the samples block by block, without the missing ones."""
     for _, block in blocks(values):
-        there = np.abs(block) < ABSURD
+        there = np.abs(block) < constants.ABSURD
         if there.all():
             yield block
         elif there.any():
@@ -104,14 +93,12 @@ def _measured(values: Samples) -> Iterator[FloatArray]:
 
 
 def _stuck(values: Samples, low: float, high: float, sign: float) -> int:
-    """Count the samples that a limited range holds at the maximum; 0 where nothing says so.
+    """Count the samples at the maximum that a limited range explains; 0 where it does not.
 
-    Many samples at the maximum alone prove nothing: a sine in steps of an encoder spends
-    ``(d / 2A)^½ 2/π`` of its time in its outermost step of width d. Over the four steps below it
-    spends ``5^½ - 1 = 1.24`` times that, whereas a clipped signal crosses those steps quickly.
-    So clipping is a pile-up at the end, of at least twice what the steps below hold together. A
-    signal of few steps has no such shape and is given the benefit of the doubt. With ``sign`` -1
-    the minimum is looked at, as the maximum of the signal turned upside down.
+    Many samples at the maximum alone are no clipping: a sine of amplitude A in steps of an encoder
+    spends ``(d / 2A)^½ 2/π`` of its time in its outermost step of width d, and over the four steps
+    below it ``5^½ - 1 = 1.24`` times that, whereas a clipped signal crosses those steps quickly.
+    A signal of few steps has no such shape and is accepted. ``sign`` -1 examines the minimum.
     """
     n_at = n_adjacent = 0
     below = low
@@ -121,11 +108,11 @@ def _stuck(values: Samples, low: float, high: float, sign: float) -> int:
         n_at += n_block
         n_adjacent += int(np.count_nonzero(at[1:] & at[:-1])) if n_block else 0
         below = max(below, float(np.max(sign * block, where=~at, initial=low)))
-    if n_at < max(_FEWEST_STUCK, CLIPPED_SHARE / 2 * values.size):
+    if n_at < max(constants.FEWEST_STUCK, constants.CLIPPED_SHARE / 2 * values.size):
         return 0
     step = high - below
-    if n_adjacent < _ADJACENT * n_at or high - low < _FEWEST_LEVELS * step:
+    if n_adjacent < constants.ADJACENT * n_at or high - low < constants.FEWEST_LEVELS * step:
         return 0
-    floor = high - (_LEVELS_BELOW + 0.5) * step
+    floor = high - (constants.LEVELS_BELOW + 0.5) * step
     n_below = sum(int(np.count_nonzero(sign * b > floor)) for b in _measured(values)) - n_at
-    return n_at if n_at > _PILE_UP * n_below else 0
+    return n_at if n_at > constants.PILE_UP * n_below else 0

@@ -1,23 +1,175 @@
-"""Column maps: how a controller's or analyser's export is read as the log contract."""
+"""Column names, their units, and column maps that translate the names of an export.
+
+A column name of the log contract gives the quantity by its prefix and the unit by its suffix.
+"""
 
 from __future__ import annotations
 
+import math
+from dataclasses import dataclass
 from datetime import date, datetime
 from functools import cached_property
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from msgspec import Meta, Struct
 
 from lmshealth._toml import decode
 from lmshealth.errors import BadTable
+from lmshealth.io import constants
 from lmshealth.io.metadata import KEYS
 from lmshealth.io.refusal import Unusable, listed
-from lmshealth.io.units import Signal, parse_column, role_of
+
+Role = Literal[
+    "displacement", "acceleration", "current", "reference_velocity", "reference_position", "time"
+]
+
+STANDARD_GRAVITY = 9.80665
+
+_UNITS: dict[str, tuple[str, float]] = {
+    "m": ("length", 1.0),
+    "mm": ("length", 1e-3),
+    "um": ("length", 1e-6),
+    "nm": ("length", 1e-9),
+    "m_s": ("velocity", 1.0),
+    "mm_s": ("velocity", 1e-3),
+    "m_s2": ("acceleration", 1.0),
+    "mm_s2": ("acceleration", 1e-3),
+    "g": ("acceleration", STANDARD_GRAVITY),
+    "a": ("current", 1.0),
+    "ma": ("current", 1e-3),
+    "s": ("time", 1.0),
+}
+# `_m_s2` must be tried before `_s`, or an acceleration would be read as a time.
+_LONGEST_FIRST = sorted(_UNITS, key=len, reverse=True)
+# "Â" is left of a superscript or a micro sign that some exporter encoded twice.
+_SPELLINGS = str.maketrans(
+    {"/": "_", "^": None, "*": None, "µ": "u", "μ": "u", "²": "2", " ": None, "Â": None}
+)
+_ALIASES = {"A": "a", "mA": "ma", "gn": "g", "m_s_s": "m_s2", "m_sec2": "m_s2"}
+
+_DIMENSIONS: dict[Role, str] = {
+    "displacement": "length",
+    "acceleration": "acceleration",
+    "current": "current",
+    "reference_velocity": "velocity",
+    "reference_position": "length",
+    "time": "time",
+}
+_PREFIXES: dict[str, Role] = {
+    "delta_e": "displacement",
+    "acc": "acceleration",
+    "current": "current",
+    "reference_velocity": "reference_velocity",
+    "reference_position": "reference_position",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Signal:
+    """Content of a column.
+
+    Attributes
+    ----------
+    name : str
+        Column name without its unit.
+    role : str
+        Physical quantity, and whether it is measured or a set point.
+    factor : float
+        SI value of one in the column's unit.
+    """
+
+    name: str
+    role: Role
+    factor: float
+
+
+def role_of(column: str) -> Role | None:
+    """Return the quantity of a column by its prefix; None for a column outside the contract.
+
+    ``time`` alone is no prefix: a column such as ``time_of_day`` is no time axis.
+    """
+    if column in ("time", "time_s"):
+        return "time"
+    for prefix, role in _PREFIXES.items():
+        if column == prefix or column.startswith(prefix + "_"):
+            return role
+    return None
+
+
+def unit_key(text: str) -> str | None:
+    """Return a unit as the contract writes it (``m/s²`` is ``m_s2``); None for an unknown unit."""
+    word = text.strip().translate(_SPELLINGS)
+    word = _ALIASES.get(word, word)
+    return word if word in _UNITS else None
+
+
+def acceleration_unit(text: str) -> str | None:
+    """Return a unit of acceleration as the contract writes it; None for any other unit."""
+    word = unit_key(text)
+    return word if word is not None and _UNITS[word][0] == "acceleration" else None
+
+
+def parse_column(column: str, unit: str | float | None = None) -> Signal:
+    """Read quantity, name and unit from a column name.
+
+    Parameters
+    ----------
+    column : str
+        A name that `role_of` recognises.
+    unit : str or float, optional
+        For a column whose name carries no unit: its unit, or the SI value of one count.
+
+    Raises
+    ------
+    Unusable
+        With reason ``unit`` when the unit is missing, unknown or of another quantity; with reason
+        ``columns`` for a column outside the contract or an unprintable or very long name.
+    """
+    role = role_of(column)
+    if role is None:
+        raise Unusable("columns", f"{column!r} is no column of the log contract")
+    if not column.isprintable() or len(column) > constants.LONGEST_NAME:
+        needed = f"printable text of at most {constants.LONGEST_NAME} characters"
+        raise Unusable("columns", f"a column is called {column[:80]!r}, needed {needed}")
+    suffix = next((word for word in _LONGEST_FIRST if column.endswith("_" + word)), None)
+    fits = suffix is not None and _UNITS[suffix][0] == _DIMENSIONS[role]
+    if unit is None and suffix is not None and fits:
+        return Signal(column.removesuffix("_" + suffix), role, _UNITS[suffix][1])
+    if unit is None:
+        found = "no known unit" if suffix is None else f"the unit {suffix}"
+        raise Unusable(
+            "unit", f"column {column!r} carries {found}; needed one of {_choices(role)} as suffix"
+        )
+    if fits:
+        raise Unusable(
+            "unit",
+            f"column {column!r} carries the unit {suffix} and is given {unit!r} as well; name it "
+            f"{column.removesuffix(f'_{suffix}')!r} to read it by the latter",
+        )
+    return Signal(column, role, _factor(column, role, unit))
+
+
+def _factor(column: str, role: Role, unit: str | float) -> float:
+    """Return the SI value of one in the unit that a column map gives."""
+    if isinstance(unit, str):
+        key = unit_key(unit)
+        if key is None or _UNITS[key][0] != _DIMENSIONS[role]:
+            raise Unusable(
+                "unit", f"column {column!r} is given the unit {unit!r}; needed {_choices(role)}"
+            )
+        return _UNITS[key][1]
+    if not math.isfinite(unit) or unit == 0:
+        raise Unusable("unit", f"column {column!r} is given the scale {unit}; needed a number")
+    return float(unit)
+
+
+def _choices(role: Role) -> str:
+    return ", ".join(f"_{unit}" for unit, (what, _) in _UNITS.items() if what == _DIMENSIONS[role])
 
 
 class CsvLayout(Struct, frozen=True, forbid_unknown_fields=True):
-    """How a delimited text file is laid out.
+    """Layout of a delimited text file.
 
     Attributes
     ----------
@@ -36,13 +188,13 @@ class CsvLayout(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class MatLayout(Struct, frozen=True, forbid_unknown_fields=True):
-    """Which variable of a MAT file holds the log."""
+    """Variable of a MAT file that holds the log; None for all variables."""
 
     variable: str | None = None
 
 
 class ColumnMap(Struct, frozen=True, forbid_unknown_fields=True, dict=True):
-    """How an export is read as the log contract; the default reads the contract itself.
+    """Translation of an export into the log contract; by default its columns are the contract's.
 
     Attributes
     ----------
@@ -51,13 +203,11 @@ class ColumnMap(Struct, frozen=True, forbid_unknown_fields=True, dict=True):
     units : dict of str to str or float
         Contract name without unit suffix to its unit, or to the SI value of one count.
     metadata : dict of str to object
-        Constants that override what the file says.
+        Constants that override the metadata of the file.
     sample_rate_hz : float or None
         In Hz.
     csv : CsvLayout
-        Layout of delimited text.
     mat : MatLayout
-        Where a MAT file holds the log.
     """
 
     columns: dict[str, str] = {}
@@ -72,11 +222,11 @@ class ColumnMap(Struct, frozen=True, forbid_unknown_fields=True, dict=True):
         return {source: target for target, source in self.columns.items()}
 
     def target(self, source: str) -> str | None:
-        """Find the contract name of a column of the file; None if the column is not to be read.
+        """Return the contract name of a column of the file; None if it is not to be read.
 
-        Without ``[columns]`` everything that looks like a signal is read, so that a missing unit
-        is an error and not a lost channel. An export described by ``[columns]`` may hold columns
-        that only look like signals: beside the named ones it gives those that keep the contract.
+        Without ``[columns]`` every column with a prefix of the contract is read, so that a missing
+        unit is an error and not a lost channel. An export with ``[columns]`` may have other columns
+        with such a prefix: only those with a unit of the contract are read as well.
         """
         if source in self._targets:
             return self._targets[source]
@@ -85,7 +235,7 @@ class ColumnMap(Struct, frozen=True, forbid_unknown_fields=True, dict=True):
         if not self.columns:
             return source
         try:
-            parse_column(source, self.units.get(source))
+            self.signal(source)
         except Unusable:
             return None
         return source
@@ -101,7 +251,7 @@ class ColumnMap(Struct, frozen=True, forbid_unknown_fields=True, dict=True):
         return parse_column(target, self.units.get(target))
 
     def constants(self) -> dict[str, str]:
-        """Give the metadata of the map as text, with the keys of the contract."""
+        """Return the metadata of the map as text, with the keys of the contract."""
         text = {key: _as_text(value) for key, value in self.metadata.items()}
         if self.sample_rate_hz is not None:
             text["sample_rate_hz"] = repr(self.sample_rate_hz)
@@ -133,14 +283,12 @@ def load_columns(path: str | Path) -> ColumnMap:
 
 
 def _check(columns: ColumnMap) -> None:
-    """Check names, units and metadata keys, so that slips are seen before any log is read."""
-    signals = [columns.signal(target) for target in columns.columns]
-    names = [signal.name for signal in signals]
-    if twice := {name for name in names if names.count(name) > 1}:
-        raise ValueError(f"[columns] names one signal twice: {listed(sorted(twice))}")
-    sources = list(columns.columns.values())
-    if twice := {source for source in sources if sources.count(source) > 1}:
-        raise ValueError(f"[columns] reads one column twice: {listed(sorted(twice))}")
+    """Check names, units and metadata keys before any log is read."""
+    signals = [columns.signal(target).name for target in columns.columns]
+    if twice := _repeated(signals):
+        raise ValueError(f"[columns] names one signal twice: {listed(twice)}")
+    if twice := _repeated([*columns.columns.values()]):
+        raise ValueError(f"[columns] reads one column twice: {listed(twice)}")
     for target in columns.units:
         columns.signal(target)
     if unknown := sorted(set(columns.metadata) - set(KEYS)):
@@ -153,6 +301,10 @@ def _check(columns: ColumnMap) -> None:
     delimiter = columns.csv.delimiter
     if not delimiter.isascii() or delimiter in '\r\n"#':
         raise ValueError(f"[csv] delimiter is {delimiter!r}, needed one ASCII separator")
+
+
+def _repeated(names: list[str]) -> list[str]:
+    return sorted({name for name in names if names.count(name) > 1})
 
 
 def _as_text(value: object) -> str:

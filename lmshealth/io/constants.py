@@ -1,7 +1,90 @@
-"""Limits that decide which logs, channels and samples are refused."""
+"""Limits that decide which logs, channels and samples are refused.
+
+They are read as ``constants.NAME``. Lengths of text and counts that only bound what damaged or
+hostile files may claim were chosen far above every honest export.
+"""
 
 from __future__ import annotations
 
 MAX_MEMORY = 2e9
 """Most memory in bytes that decoding one variable (MAT), data set (UFF58) or segment (TDMS) may
 take: ten minutes of 20 kHz take 0.1 GB per channel. The option ``--max-memory``."""
+
+LARGEST_RATIO = 200
+"""Most bytes of decoded samples per byte of the file. Noise compresses by single digits; constant
+channels are refused anyway."""
+SMALL_ENOUGH = 256 << 20
+"""Decoded bytes that are accepted whatever the ratio; also the largest table beside logs."""
+
+# Channels
+
+LARGEST_MISSING = 0.10
+"""Largest share of missing samples of a channel: one that misses more is left out, because the
+other channels would be cut at each of its gaps."""
+ABSURD = 1e12
+"""Magnitude in SI units from which a sample counts as missing: no acceleration, position or current
+reaches it, and its square is still finite."""
+CLIPPED_SHARE = 1e-3
+"""Share of samples at both ends of the range from which a channel is clipped."""
+PILE_UP = 2.0
+"""Clipping needs this ratio of samples at an end to those in the `LEVELS_BELOW` levels next to it.
+A sine in steps of an encoder reaches 1 / 1.24."""
+LEVELS_BELOW = 4
+"""Levels of quantisation that `PILE_UP` compares with."""
+FEWEST_LEVELS = 16
+"""Range in levels below which a signal is too coarse to judge clipping."""
+FEWEST_STUCK = 5
+"""Fewest samples at an end that may be clipping."""
+ADJACENT = 0.1
+"""Least share of samples at an end whose successor is there too."""
+
+# Time
+
+AGREEMENT = 1e-4
+"""Largest relative difference between sample rates of one log (time stamps, metadata, channels)."""
+GAP = 1.5
+"""Interval, in median intervals, from which samples are missing."""
+JITTER = 0.25
+"""Largest relative deviation of an interval. Time stamps are rounded (to 1e-6 s in many exports, to
+2e-6 s by float32 after 20 s); no sampling clock deviates so far."""
+BROKEN = 0.01
+"""Interruptions per sample above which a record is refused instead of cut, beyond
+`ALWAYS_ALLOWED`."""
+ALWAYS_ALLOWED = 10
+"""Interruptions that are accepted in a record of any length."""
+SHORTEST_PIECE = 2
+"""Fewest consecutive samples that are kept, and fewest samples of a log."""
+STEP_SHARE = 2e-4
+"""A set velocity is differentiated over so many samples that one step of the position (1 um in
+print, 30 nm of a float32 at 300 mm) is worth this share of the largest velocity."""
+LONGEST_REACH = 0.02
+"""Longest distance in s to either side of that difference: the set point of a stroke changes in
+it."""
+
+# Metadata
+
+LONGEST_NAME = 200
+"""Most characters of a machine, servo, description or column name."""
+SLOWEST_HZ, FASTEST_HZ = 1e-9, 1e12
+"""Sample rates between which its reciprocal and its multiples stay finite."""
+
+# What damaged or hostile files may claim
+
+LONGEST_LINE = 1 << 20
+"""Bytes of a line of text: a file without line ends is one line."""
+LONGEST_BLOCK = 64 << 20
+"""Bytes of text without the end of a row: an open quote makes one field of all rows after it."""
+LONGEST_CELL = 50
+"""Lines of a cell of a table beside logs: an open quote again."""
+LONGEST_ATTRIBUTE = 1 << 16
+"""Bytes of a text attribute of HDF5, which stores no larger one in an object header."""
+LARGEST_HEAP = 1 << 20
+"""Bytes of an HDF5 heap of strings: the library writes 64 KiB, more only for a longer text."""
+MOST_COLUMNS = 1000
+"""Columns of a MAT matrix that are signals."""
+MOST_ARRAYS = 20_000
+"""Arrays of a MAT variable."""
+DEEPEST = 32
+"""Nesting of structs in a MAT variable, and its dimensions."""
+MOST_SCALES = 10_000
+"""Scales and coefficients of a TDMS channel: npTDMS iterates over as many as are claimed."""

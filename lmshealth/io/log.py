@@ -1,4 +1,4 @@
-"""What goes in: one recording of one stage, in SI units, and what was refused of it."""
+"""A log: the samples of one recording of one stage in SI units, its metadata, its refusals."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ ChannelKind = Literal["displacement", "acceleration", "current"]
 
 @dataclass(frozen=True, slots=True)
 class Refusal:
-    """Something that was not analysed, and why: one row of ``refused.csv``."""
+    """A log, channel, stretch or mode that was not analysed: one row of ``refused.csv``."""
 
     log: str
     reason: str
@@ -28,25 +28,25 @@ class Refusal:
 
 @dataclass(frozen=True, slots=True)
 class Metadata:
-    """What is known about a log beside its samples.
+    """Metadata of a log.
 
     Attributes
     ----------
     stage : str or None
         Identity of the physical machine.
     recorded_at : datetime or None
-        Moment of the recording, with time zone.
+        Time of the recording, with time zone.
     travel : float or None
         Odometer in m.
     covariates : dict of str to float
-        Numbers that move frequencies without wear, keyed by their column name
-        (``temperature_c``, ``payload_kg``, ``position_mm``).
+        Values of ``temperature_c``, ``payload_kg`` and ``position_mm``: they move frequencies
+        without wear.
     servo_id : str or None
         Tuning of the control loop.
     baseline : bool or None
-        Whether the manifest declares this log part of the baseline.
+        Whether the log belongs to the baseline; None where nothing is declared.
     description : str or None
-        Stage description the manifest names for this log.
+        Stage description that the manifest names for this log.
     velocity : float or None
         Set velocity in m/s, for logs without a set point.
     """
@@ -73,7 +73,7 @@ class Channel:
         Physical quantity: ``displacement`` (m), ``acceleration`` (m/s²) or ``current`` (A).
     values : ndarray or Stored
         Samples in SI units, shape ``(n_samples,)``; NaN where a sample is missing. Those of a long
-        record are on disk: take a stretch of them, ``values[start:stop]``.
+        record are on disk: read a stretch of them by ``values[start:stop]``.
     """
 
     name: str
@@ -93,11 +93,10 @@ class Log:
     Attributes
     ----------
     name : str
-        Path as the user knows it.
+        Path as the user gave it.
     digest : str
         SHA-256 of the file's content.
     metadata : Metadata
-        What is known beside the samples.
     sample_rate : float
         In Hz.
     channels : tuple of Channel
@@ -105,9 +104,9 @@ class Log:
     reference_velocity : ndarray, Stored or None
         Set point in m/s, shape ``(n_samples,)``; NaN where it is missing.
     pieces : tuple of (int, int)
-        Half-open sample ranges without gaps; one range covering everything when nothing is missing.
+        Half-open sample ranges without gaps; the whole range when nothing is missing.
     refused : tuple of Refusal
-        Channels that were refused at the door.
+        Channels that were left out, and stretches of those that were not.
     """
 
     name: str

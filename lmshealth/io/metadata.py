@@ -1,4 +1,4 @@
-"""Metadata of a log: typed once, at the door, with the key and the value named in every error."""
+"""Metadata of a log: text of the file, the column map and the manifest, converted and checked."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import unicodedata
 from collections.abc import Mapping
 from datetime import UTC, datetime
 
+from lmshealth.io import constants
 from lmshealth.io.log import Metadata
 from lmshealth.io.refusal import Unusable
 
@@ -24,23 +25,20 @@ KEYS = (
 )
 
 _BOOLEANS = {"true": True, "1": True, "false": False, "0": False}
-_LONGEST_NAME = 200
-_METRES_PER_KM = 1e3
-_METRES_PER_MM = 1e-3
 
 
 def parse_metadata(text: Mapping[str, str]) -> tuple[Metadata, float | None]:
-    """Type the metadata of a log; unknown keys and empty values are passed over.
+    """Convert the metadata of a log; unknown keys and empty values are ignored.
 
     Parameters
     ----------
     text : mapping of str to str
-        Keys of the log contract to what the file, the column map or the manifest say.
+        Values by keys of the log contract.
 
     Returns
     -------
     Metadata
-        What is known beside the samples.
+        Everything but the sample rate.
     float or None
         Sample rate in Hz.
 
@@ -50,17 +48,21 @@ def parse_metadata(text: Mapping[str, str]) -> tuple[Metadata, float | None]:
         With reason ``metadata``, naming key and value.
     """
     given = {key: text[key].strip() for key in KEYS if text.get(key, "").strip()}
+    travel = _number(given, "travel_km", "an odometer of 0 or more", low=0.0, scale=1e3)
     metadata = Metadata(
         stage=parse_name(given, "stage"),
         recorded_at=parse_moment(given),
-        travel=_travel(given),
-        covariates={key: _number(given, key) for key in COVARIATES if key in given},
+        travel=travel,
+        covariates={key: value for key in COVARIATES if (value := _number(given, key)) is not None},
         servo_id=parse_name(given, "servo_id"),
         baseline=_boolean(given),
         description=parse_name(given, "description"),
-        velocity=_velocity(given),
+        velocity=_number(given, "velocity_mm_s", scale=1e-3),
     )
-    return metadata, _sample_rate(given)
+    rate = _number(given, "sample_rate_hz")
+    if rate is not None and not constants.SLOWEST_HZ < rate < constants.FASTEST_HZ:
+        raise _bad(given, "sample_rate_hz", "a positive number")
+    return metadata, rate
 
 
 def _bad(given: Mapping[str, str], key: str, needed: str) -> Unusable:
@@ -70,30 +72,19 @@ def _bad(given: Mapping[str, str], key: str, needed: str) -> Unusable:
 def parse_name(given: Mapping[str, str], key: str) -> str | None:
     """Read a name; None where there is none.
 
-    The two ways to write an accented letter, by one sign or by two, are one name: systems differ
-    in which of them they write, and a machine must not become two.
+    Names are normalised (NFC): systems differ in how they write an accented letter, and one
+    machine must not become two.
 
     Raises
     ------
     Unusable
-        With reason ``metadata`` for a name with signs that cannot be seen, or a very long one.
+        With reason ``metadata`` for an unprintable or very long name.
     """
     if not given.get(key):
         return None
-    if not given[key].isprintable() or len(given[key]) > _LONGEST_NAME:
-        raise _bad(given, key, f"printable text of at most {_LONGEST_NAME} characters")
+    if not given[key].isprintable() or len(given[key]) > constants.LONGEST_NAME:
+        raise _bad(given, key, f"printable text of at most {constants.LONGEST_NAME} characters")
     return unicodedata.normalize("NFC", given[key])
-
-
-def _number(given: Mapping[str, str], key: str) -> float:
-    try:
-        # Python reads 1_000 as a number; no exporter means that.
-        value = math.nan if "_" in given[key] else float(given[key])
-    except ValueError:
-        value = math.nan
-    if not math.isfinite(value):
-        raise _bad(given, key, "a finite number")
-    return value
 
 
 def parse_moment(given: Mapping[str, str]) -> datetime | None:
@@ -102,7 +93,7 @@ def parse_moment(given: Mapping[str, str]) -> datetime | None:
     Raises
     ------
     Unusable
-        With reason ``metadata`` if it is no moment with a time zone.
+        With reason ``metadata`` if it is no date and time with a time zone.
     """
     if not given.get("recorded_at"):
         return None
@@ -117,29 +108,28 @@ def parse_moment(given: Mapping[str, str]) -> datetime | None:
     return moment
 
 
-def _travel(given: Mapping[str, str]) -> float | None:
-    if "travel_km" not in given:
+def _number(
+    given: Mapping[str, str],
+    key: str,
+    needed: str = "a finite number",
+    *,
+    low: float = -math.inf,
+    scale: float = 1.0,
+) -> float | None:
+    """Read a number times a scale; None where it is not given."""
+    if key not in given:
         return None
-    travel = _number(given, "travel_km") * _METRES_PER_KM
-    if not 0 <= travel < math.inf:
-        raise _bad(given, "travel_km", "an odometer of 0 or more")
-    return travel
-
-
-def _velocity(given: Mapping[str, str]) -> float | None:
-    if "velocity_mm_s" not in given:
-        return None
-    return _number(given, "velocity_mm_s") * _METRES_PER_MM
-
-
-def _sample_rate(given: Mapping[str, str]) -> float | None:
-    if "sample_rate_hz" not in given:
-        return None
-    rate = _number(given, "sample_rate_hz")
-    # Outside this range 1 / rate or rate * samples leave the numbers that floats can hold.
-    if not 1e-9 < rate < 1e12:
-        raise _bad(given, "sample_rate_hz", "a positive number")
-    return rate
+    try:
+        # Python reads 1_000 as a number; no exporter means that.
+        value = math.nan if "_" in given[key] else float(given[key])
+    except ValueError:
+        value = math.nan
+    if not math.isfinite(value):
+        raise _bad(given, key, "a finite number")
+    value *= scale
+    if not (low <= value and math.isfinite(value)):
+        raise _bad(given, key, needed)
+    return value
 
 
 def _boolean(given: Mapping[str, str]) -> bool | None:

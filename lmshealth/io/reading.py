@@ -1,19 +1,31 @@
-"""Reading one log, whatever its format: the only place where a file becomes a `Log`."""
+"""Read one log: from a file of any format to a `Log` in SI units that keeps the log contract."""
 
 from __future__ import annotations
 
 import hashlib
 import stat
 from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import cast
+
+import numpy as np
 
 from lmshealth.errors import BadLog
-from lmshealth.io.column_map import ColumnMap
-from lmshealth.io.constants import MAX_MEMORY
+from lmshealth.io import constants
+from lmshealth.io.buffers import Samples, Stored, in_unit
+from lmshealth.io.channel_checks import check_signal, missing_stretches
+from lmshealth.io.column_map import ColumnMap, Role, Signal
+from lmshealth.io.formats.content import Content
 from lmshealth.io.formats.registry import load
-from lmshealth.io.log import Log
-from lmshealth.io.log_contract import to_log
-from lmshealth.io.refusal import Unusable, shown
+from lmshealth.io.log import Channel, ChannelKind, Log, Refusal
+from lmshealth.io.metadata import parse_metadata
+from lmshealth.io.refusal import Unusable, listed, shown
+from lmshealth.io.time_axis import IntArray, pieces, set_velocity, time_axis
+
+_NEEDED = "needed delta_e_um or acc_<name>_m_s2 (or another unit of the contract)"
+_MEASURED: tuple[Role, ...] = ("displacement", "acceleration", "current")
+_DYNAMIC = ("displacement", "acceleration")
 
 
 def read_log(
@@ -22,7 +34,7 @@ def read_log(
     columns: ColumnMap | None = None,
     overrides: Mapping[str, str] | None = None,
     name: str | None = None,
-    max_memory: float = MAX_MEMORY,
+    max_memory: float = constants.MAX_MEMORY,
 ) -> Log:
     """Read a log.
 
@@ -33,22 +45,23 @@ def read_log(
     columns : ColumnMap, optional
         How an export is read; by default the columns are those of the log contract.
     overrides : mapping of str to str, optional
-        Metadata that override what the file and the column map say, as a manifest gives them.
+        Metadata of a manifest, which override those of the file and the column map.
     name : str, optional
-        The log as the user knows it; by default the path.
+        Name of the log in results; by default the path.
     max_memory : float, optional
-        Most memory in bytes that one variable (MAT), data set (UFF58) or segment (TDMS) may take;
-        what needs more is refused with reason ``too-large``.
+        Most memory in bytes that decoding one variable (MAT), data set (UFF58) or segment (TDMS)
+        may take; a log that needs more is refused with reason ``too-large``.
 
     Returns
     -------
     Log
-        In SI units, with the channels that were refused.
+        In SI units. Its ``refused`` lists the channels that cannot be used, and the stretches that
+        were left out (reason ``gaps``).
 
     Raises
     ------
     BadLog
-        Whatever is wrong with the file; see `lmshealth.io` for the reasons.
+        For every fault of the file; the reasons are listed in the README of this folder.
 
     Examples
     --------
@@ -72,21 +85,20 @@ def read_log(
     try:
         digest = _digest(file)
         used = ColumnMap() if columns is None else columns
-        return to_log(
-            load(file, used, max_memory), used, overrides or {}, name=label, digest=digest
-        )
+        content = load(file, used, max_memory)
+        return _to_log(content, used, overrides or {}, name=label, digest=digest)
     except Unusable as error:
         raise BadLog(label, error.reason, error.detail) from error
 
 
 def content_digest(path: str | Path) -> str:
-    """Hash a file's content with SHA-256, block by block.
+    """Return the SHA-256 of a file's content.
 
     Raises
     ------
     BadLog
-        With reason ``missing-file`` when there is nothing that can be read, ``empty`` for 0 bytes:
-        empty files are no copies of each other.
+        With reason ``missing-file`` where no file can be read, ``empty`` for 0 bytes: empty files
+        are no copies of each other.
     """
     try:
         return _digest(Path(path))
@@ -95,19 +107,19 @@ def content_digest(path: str | Path) -> str:
 
 
 def require_identity(log: Log) -> None:
-    """Insist on the metadata that following a stage over its life needs.
+    """Require the metadata that tracking a machine over its life needs.
 
     Raises
     ------
     BadLog
         With reason ``metadata``, naming the missing keys.
     """
-    known = {
+    given = {
         "stage": log.metadata.stage,
         "recorded_at": log.metadata.recorded_at,
         "travel_km": log.metadata.travel,
     }
-    if absent := [key for key, value in known.items() if value is None]:
+    if absent := [key for key, value in given.items() if value is None]:
         raise BadLog(
             log.name,
             "metadata",
@@ -116,16 +128,9 @@ def require_identity(log: Log) -> None:
 
 
 def _digest(file: Path) -> str:
-    """Hash a regular file block by block.
-
-    Raises
-    ------
-    Unusable
-        With the reasons ``missing-file`` and ``empty``.
-    """
     try:
         found = file.stat()
-        # A named pipe would be waited for until somebody writes to it.
+        # Opening a named pipe would wait until somebody writes to it.
         if not stat.S_ISREG(found.st_mode):
             raise Unusable("missing-file", "is no regular file")
         if not found.st_size:
@@ -135,3 +140,116 @@ def _digest(file: Path) -> str:
     except (OSError, ValueError) as error:
         why = getattr(error, "strerror", None) or str(error)
         raise Unusable("missing-file", f"cannot be opened: {why}") from error
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Series:
+    """A column in SI units, shape ``(n_samples,)``; NaN where a sample is missing."""
+
+    signal: Signal
+    values: Samples
+
+
+def _to_log(
+    content: Content, columns: ColumnMap, overrides: Mapping[str, str], *, name: str, digest: str
+) -> Log:
+    """Apply the log contract to the content of a file."""
+    filled = {key: value for key, value in overrides.items() if value.strip()}
+    metadata, rate = parse_metadata(content.metadata | columns.constants() | filled)
+    series = _series(content, columns)
+    time = _first(series, "time")
+    axis = time_axis(None if time is None else time.values, rate)
+    refused = [replace(refusal, log=name) for refusal in content.refused]
+    if axis.note:
+        refused.append(Refusal(name, "gaps", axis.note, channel="time_s"))
+    missing: list[IntArray] = []
+    channels = []
+    for item in series:
+        if item.signal.role in _MEASURED:
+            gone = _missing(item, name, refused)
+            if gone is not None:
+                missing.append(gone)
+                kind = cast(ChannelKind, item.signal.role)
+                channels.append(Channel(item.signal.name, kind, item.values))
+    if not any(channel.kind in _DYNAMIC for channel in channels):
+        raise Unusable("no-signal", f"no usable channel is left: {_why(refused)}")
+    reference = _first(series, "reference_velocity") or _first(series, "reference_position")
+    gone = None if reference is None else _missing(reference, name, refused)
+    if gone is not None:
+        missing.append(gone)
+    ranges = pieces(series[0].values.size, missing, axis.breaks)
+    if not ranges:
+        raise Unusable("no-signal", f"no two samples in a row are complete; {_why(refused)}")
+    velocity = None
+    if reference is not None and gone is not None:
+        velocity = reference.values
+        if reference.signal.role == "reference_position":
+            velocity = set_velocity(velocity, ranges, axis.sample_rate)
+    return Log(
+        name=name,
+        digest=digest,
+        metadata=metadata,
+        sample_rate=axis.sample_rate,
+        channels=tuple(channels),
+        reference_velocity=velocity,
+        pieces=ranges,
+        refused=tuple(refused),
+    )
+
+
+def _series(content: Content, columns: ColumnMap) -> list[_Series]:
+    """Name the columns, convert them to SI and compare their lengths."""
+    there = f"there: {listed(content.present)}"
+    hint = f"; {content.hint}" if content.hint else ""
+    left_out = {refusal.channel for refusal in content.refused}
+    if absent := sorted(set(columns.columns.values()) - set(content.columns) - left_out):
+        raise Unusable("columns", f"the column map needs {listed(absent)}; {there}{hint}")
+    series = []
+    for source, values in content.columns.items():
+        target = columns.target(source)
+        if target is None:
+            continue
+        try:
+            signal = columns.signal(target)
+        except Unusable as error:
+            raise Unusable(error.reason, f"{error.detail}; {there}") from error
+        limit = np.inf if signal.role == "time" else constants.ABSURD
+        if isinstance(values, Stored):
+            series.append(_Series(signal, values.scaled(signal.factor, limit)))
+        else:
+            series.append(_Series(signal, in_unit(values, signal.factor, limit)))
+    names = [item.signal.name for item in series]
+    if twice := sorted({item for item in names if names.count(item) > 1}):
+        raise Unusable("columns", f"{listed(twice)} comes in more than one unit; {there}")
+    if not any(item.signal.role in _DYNAMIC for item in series):
+        hint += "" if columns.columns else "; a column map (--columns) translates other names"
+        raise Unusable("columns", f"no signal: {_NEEDED}; {there}{hint}")
+    lengths = {item.signal.name: item.values.size for item in series}
+    if len(set(lengths.values())) > 1:
+        found = listed(f"{name} {size}" for name, size in lengths.items())
+        raise Unusable("columns", f"columns differ in length ({found}); needed one length")
+    if (shortest := min(lengths.values())) < constants.SHORTEST_PIECE:
+        raise Unusable("empty", f"{shortest} samples; needed at least {constants.SHORTEST_PIECE}")
+    return series
+
+
+def _first(series: list[_Series], role: Role) -> _Series | None:
+    return next((item for item in series if item.signal.role == role), None)
+
+
+def _missing(item: _Series, name: str, refused: list[Refusal]) -> IntArray | None:
+    """Find the missing samples of a channel; None if it cannot be used, which is refused."""
+    try:
+        gone, note = missing_stretches(item.values)
+        if item.signal.role in _MEASURED:
+            check_signal(item.values)
+    except Unusable as error:
+        refused.append(Refusal(name, error.reason, error.detail, channel=item.signal.name))
+        return None
+    if note:
+        refused.append(Refusal(name, "gaps", note, channel=item.signal.name))
+    return gone
+
+
+def _why(refused: list[Refusal]) -> str:
+    return "; ".join(f"{item.channel}: {item.reason}, {item.detail}" for item in refused)

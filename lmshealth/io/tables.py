@@ -16,7 +16,7 @@ import numpy as np
 import pandas as pd
 
 from lmshealth.errors import BadTable
-from lmshealth.io.raw import SMALL_ENOUGH
+from lmshealth.io import constants
 from lmshealth.io.refusal import Unusable, listed
 
 # A cell of more lines than these is a quote that was never closed.
@@ -78,8 +78,10 @@ def read_sheet(path: Path, needed: Sequence[str]) -> Iterator[Row]:
 
 def _lines(path: Path) -> list[str]:
     try:
-        if (size := path.stat().st_size) > SMALL_ENOUGH:
-            raise Unusable("too-large", f"{size} bytes, allowed are {SMALL_ENOUGH}; split it")
+        if (size := path.stat().st_size) > constants.SMALL_ENOUGH:
+            raise Unusable(
+                "too-large", f"{size} bytes, allowed are {constants.SMALL_ENOUGH}; split it"
+            )
         text = path.read_bytes().decode("utf-8-sig", "surrogateescape")
     except OSError as error:
         raise Unusable("missing-file", f"cannot be opened: {error.strerror}") from error

@@ -1,4 +1,7 @@
-"""The time axis: sample rate, and where samples are missing. Never sorted, never interpolated."""
+"""The time axis: sample rate, interruptions, and the set velocity of a set position.
+
+Samples are never sorted and never interpolated.
+"""
 
 from __future__ import annotations
 
@@ -8,20 +11,15 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from lmshealth.io.buffers import Samples, blocks
+from lmshealth._arrays import FloatArray
+from lmshealth.io import constants
+from lmshealth.io.buffers import Samples, Spool, blocks
 from lmshealth.io.refusal import Unusable
 
 IntArray = NDArray[np.int64]
 
-AGREEMENT = 1e-4
-GAP = 1.5
-# Time stamps are rounded (to 1e-6 s in many exports, to 2e-6 s by float32 after 20 s): a quarter
-# of an interval leaves room for that, and is too much for any sampling clock.
-JITTER = 0.25
-# More interruptions than this share are no gaps but a broken recording.
-BROKEN = 0.01
-ALWAYS_ALLOWED = 10
-SHORTEST_PIECE = 2
+# Quantile of the second differences of a position that is at most a step and an acceleration.
+_QUANTILE = 0.9
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -35,7 +33,7 @@ class TimeAxis:
     breaks : ndarray of int
         Samples before which the record is interrupted, shape ``(n_breaks,)``.
     note : str
-        Counts of what interrupts the record; empty if nothing does.
+        Counts of the interruptions; empty if there are none.
     """
 
     sample_rate: float
@@ -44,8 +42,8 @@ class TimeAxis:
 
 
 def too_many(n_interruptions: int, n_samples: int) -> bool:
-    """Tell whether a record is interrupted too often to be cut into pieces."""
-    return n_interruptions > max(ALWAYS_ALLOWED, BROKEN * n_samples)
+    """Return whether a record is interrupted too often to be cut into pieces."""
+    return n_interruptions > max(constants.ALWAYS_ALLOWED, constants.BROKEN * n_samples)
 
 
 def time_axis(time: Samples | None, rate: float | None) -> TimeAxis:
@@ -56,13 +54,13 @@ def time_axis(time: Samples | None, rate: float | None) -> TimeAxis:
     time : ndarray, Stored or None
         Time stamps in s as recorded, shape ``(n_samples,)``.
     rate : float or None
-        Sample rate in Hz that the metadata give.
+        Sample rate in Hz from the metadata.
 
     Raises
     ------
     Unusable
-        With reason ``time`` where both are absent or disagree, where time stands still, runs
-        backwards or is unknown, and where the intervals are not uniform.
+        With reason ``time`` where both are absent or disagree, where time stamps are missing,
+        repeated or descending, and where the intervals are not uniform.
     """
     if time is None:
         if rate is None:
@@ -75,10 +73,10 @@ def time_axis(time: Samples | None, rate: float | None) -> TimeAxis:
     breaks = [np.empty(0, dtype=np.int64)]
     for at, stamps in blocks(time, overlap=1):
         steps = np.diff(stamps)
-        # The first block tells what an interval is.
+        # The first block determines the nominal interval.
         interval = interval or float(np.median(steps))
-        gap = steps > GAP * interval
-        irregular = gap | (np.abs(steps / interval - 1) > JITTER)
+        gap = steps > constants.GAP * interval
+        irregular = gap | (np.abs(steps / interval - 1) > constants.JITTER)
         n_gaps += int(gap.sum())
         missing += float(np.round(steps[gap] / interval - 1).sum())
         total += float(steps[~irregular].sum())
@@ -103,7 +101,7 @@ def pieces(
     n_samples : int
         Length of the record.
     missing : sequence of ndarray
-        Of each channel the half-open ranges in which it has no samples, shape ``(n, 2)``.
+        For each channel the half-open ranges in which it has no samples, shape ``(n, 2)``.
     breaks : ndarray of int
         Samples before which time is interrupted, ascending, shape ``(n_breaks,)``.
 
@@ -114,21 +112,21 @@ def pieces(
     """
     gone = np.concatenate([*missing, np.empty((0, 2), dtype=np.int64)])
     gone = gone[np.argsort(gone[:, 0], kind="stable")]
-    # What is there begins where all that is missing so far has ended.
+    # A piece begins where all missing ranges so far have ended.
     start = np.concatenate([[0], np.maximum.accumulate(gone[:, 1])])
     stop = np.concatenate([gone[:, 0], [n_samples]])
     there = start < stop
     start, stop = start[there], stop[there]
     inside = breaks[np.searchsorted(start, breaks) > np.searchsorted(stop, breaks, side="right")]
     start, stop = np.sort(np.append(start, inside)), np.sort(np.append(stop, inside))
-    keep = stop - start >= SHORTEST_PIECE
+    keep = stop - start >= constants.SHORTEST_PIECE
     return tuple(zip(start[keep].tolist(), stop[keep].tolist(), strict=True))
 
 
 def _check_order(time: Samples) -> None:
-    """Insist that time stamps are numbers and increase."""
-    if time.size < SHORTEST_PIECE:
-        raise Unusable("empty", f"{time.size} samples; needed at least {SHORTEST_PIECE}")
+    """Require that time stamps are numbers and increase."""
+    if time.size < constants.SHORTEST_PIECE:
+        raise Unusable("empty", f"{time.size} samples; needed at least {constants.SHORTEST_PIECE}")
     unknown = backwards = repeated = 0
     first = None
     for at, stamps in blocks(time, overlap=1):
@@ -136,7 +134,7 @@ def _check_order(time: Samples) -> None:
         wrong = ~(steps > 0)
         if wrong.any() and first is None:
             first = at + int(np.argmax(wrong)) + 1
-        unknown += int(np.count_nonzero(~(np.abs(stamps[at > 0 :]) < 1e12)))
+        unknown += int(np.count_nonzero(~(np.abs(stamps[at > 0 :]) < constants.ABSURD)))
         backwards += int(np.count_nonzero(steps < 0))
         repeated += int(np.count_nonzero(steps == 0))
     if unknown:
@@ -144,7 +142,7 @@ def _check_order(time: Samples) -> None:
     if backwards or repeated:
         raise Unusable(
             "time",
-            f"time_s runs backwards {backwards} times and stands still {repeated} times in "
+            f"time_s runs backwards {backwards} times and repeats {repeated} times in "
             f"{time.size} samples, first at sample {first}; needed increasing time stamps",
         )
 
@@ -155,21 +153,89 @@ def _note(n_gaps: int, missing: float, n_odd: int, n_steps: int, interval: float
         parts.append(f"{n_gaps} gaps with {missing:.0f} dropped samples")
     if n_odd:
         parts.append(
-            f"{n_odd} of {n_steps} intervals differ by more than {JITTER:.0%} "
+            f"{n_odd} of {n_steps} intervals differ by more than {constants.JITTER:.0%} "
             f"from the median {interval:.6g} s"
         )
     return " and ".join(parts)
 
 
 def _agreed(interval: float, rate: float | None) -> float:
-    """Choose the sample rate in Hz: the metadata's, if the time stamps confirm it."""
+    """Choose the sample rate in Hz: that of the metadata, if the time stamps confirm it."""
     if rate is None:
         # 20000.000000000004 Hz is an artefact of the division.
         return float(f"{1 / interval:.10g}")
-    if abs(interval * rate - 1) > AGREEMENT:
+    if abs(interval * rate - 1) > constants.AGREEMENT:
         raise Unusable(
             "time",
-            f"time_s says {1 / interval:.8g} Hz, sample_rate_hz says {rate:.8g}; "
-            f"needed agreement within {AGREEMENT:g}",
+            f"time_s gives {1 / interval:.8g} Hz, sample_rate_hz is {rate:.8g}; "
+            f"needed agreement within {constants.AGREEMENT:g}",
         )
     return rate
+
+
+def set_velocity(
+    position: Samples, pieces: Sequence[tuple[int, int]], sample_rate: float
+) -> Samples:
+    """Differentiate a set position piece by piece, never across a gap.
+
+    The difference spans so many samples that the steps in which positions are stored do not show.
+
+    Parameters
+    ----------
+    position : ndarray or Stored
+        In m, shape ``(n_samples,)``.
+    pieces : sequence of (int, int)
+        Half-open ranges without gaps, ascending.
+    sample_rate : float
+        In Hz.
+
+    Returns
+    -------
+    ndarray or Stored
+        In m/s, shape ``(n_samples,)``; NaN outside the pieces.
+    """
+    reach = _reach(position, pieces, sample_rate)
+    velocity = Spool()
+    for start, stop in pieces:
+        _fill(velocity, start)
+        for at, block in blocks(position, start, stop):
+            low, high = max(start, at - reach), min(stop, at + block.size + reach)
+            around = position[low:high]
+            index = np.arange(at - low, at - low + block.size)
+            # Towards the ends of a piece the difference is one-sided.
+            after = np.minimum(index + reach, high - low - 1)
+            before = np.maximum(index - reach, 0)
+            velocity.append((around[after] - around[before]) * sample_rate / (after - before))
+    _fill(velocity, position.size)
+    return velocity.samples()
+
+
+def _fill(velocity: Spool, stop: int) -> None:
+    """Append NaN up to a sample."""
+    for _, block in blocks(np.broadcast_to(np.nan, (stop,)), velocity.size):
+        velocity.append(block)
+
+
+def _reach(position: Samples, pieces: Sequence[tuple[int, int]], sample_rate: float) -> int:
+    """Compute how many samples to either side the difference must span to hide the steps."""
+    most = max(1, int(constants.LONGEST_REACH * sample_rate))
+    step = fastest = 0.0
+    for start, stop in pieces:
+        for _, block in blocks(position, start, stop):
+            if block.size > 2 * most:
+                step = max(step, _step(block))
+                average = (block[most:] - block[:-most]) * sample_rate / most
+                fastest = max(fastest, float(np.abs(average).max()))
+    if fastest == 0:
+        return 1
+    return int(np.clip(np.ceil(step * sample_rate / (2 * constants.STEP_SHARE * fastest)), 1, most))
+
+
+def _step(block: FloatArray) -> float:
+    """Estimate the step of stored positions in m from the second differences."""
+    uneven = np.abs(np.diff(block, 2))
+    # At a velocity of a whole number of steps per sample only few differences are uneven.
+    apart = np.diff(np.unique(block))
+    smallest = float(apart.min()) if apart.size else 0.0
+    visible = smallest if float(uneven.max()) > 0.5 * smallest else 0.0
+    return max(visible, float(np.quantile(uneven, _QUANTILE)))

@@ -1,4 +1,4 @@
-"""Reading whole files: formats agree, bad files end as ``BadLog`` with a reason."""
+"""Reading files: formats agree, the contract is kept, every fault is a ``BadLog``."""
 
 import gzip
 import hashlib
@@ -13,7 +13,7 @@ import pytest
 
 from lmshealth import io as readers
 from lmshealth.errors import BadLog
-from lmshealth.io import raw
+from lmshealth.io import constants
 from lmshealth.io.reading import content_digest, read_log, require_identity
 
 ALL = ["log.csv", "log.csv.gz", "log.parquet", "log.h5", "log.hdf5", "log.tdms", "log.mat"]
@@ -107,7 +107,7 @@ def test_unknown_suffix(tmp_path):
 
 def test_gzip_bomb(tmp_path, monkeypatch):
     """A gzip bomb is stopped while it is unpacked."""
-    monkeypatch.setattr(raw, "SMALL_ENOUGH", 1 << 20)
+    monkeypatch.setattr(constants, "SMALL_ENOUGH", 1 << 20)
     member = gzip.compress(b"0\n" * (1 << 24), 9)
     (tmp_path / "bomb.csv.gz").write_bytes(gzip.compress(b"delta_e_um\n") + member)
     refused(tmp_path / "bomb.csv.gz", "too-large")
@@ -133,77 +133,6 @@ def test_parquet_bomb(make):
         for _ in range(3):
             writer.write_table(block)
     refused(path, "too-large")
-
-
-def test_hdf5_links_are_not_followed(make, tmp_path):
-    """External links, external storage and virtual datasets are refused as escapes."""
-    source = make("source.h5")
-    with h5py.File(tmp_path / "link.h5", "w") as file:
-        file["delta_e_um"] = h5py.ExternalLink(str(source), "delta_e_um")
-    refused(tmp_path / "link.h5", "escapes")
-    (tmp_path / "raw.bin").write_bytes(bytes(800))
-    with h5py.File(tmp_path / "storage.h5", "w") as file:
-        external = [(str(tmp_path / "raw.bin"), 0, 800)]
-        file.create_dataset("delta_e_um", (100,), "f8", external=external)
-    refused(tmp_path / "storage.h5", "escapes")
-    layout = h5py.VirtualLayout((400,), "f8")
-    layout[:] = h5py.VirtualSource(source, "delta_e_um", (400,))
-    with h5py.File(tmp_path / "virtual.h5", "w") as file:
-        file.create_virtual_dataset("delta_e_um", layout)
-    refused(tmp_path / "virtual.h5", "escapes")
-
-
-def test_hdf5_unwritten_blocks(tmp_path):
-    """Blocks that a crashed recorder never wrote are not read as zeros."""
-    with h5py.File(tmp_path / "log.h5", "w") as file:
-        data = file.create_dataset("delta_e_um", (1000,), "f8", chunks=(100,))
-        data[:500] = np.random.default_rng(0).normal(size=500)
-        file.attrs["sample_rate_hz"] = 1000
-    refused(tmp_path / "log.h5", "corrupt", "5 of 10")
-
-
-def test_hdf5_damaged_heap(make):
-    """A heap of strings on which the HDF5 library would never return is refused."""
-    path = make("log.h5")
-    data = bytearray(path.read_bytes())
-    first = data.index(b"GCOL") + 16
-    data[first : first + 2] = bytes(2)
-    data[first + 8 : first + 16] = bytes(8)
-    path.write_bytes(data)
-    refused(path, "corrupt", "heap")
-
-
-def test_hdf5_attributes(make):
-    """Attributes may be text, bytes, numbers or booleans; anything else is refused unread."""
-    path = make("log.h5")
-    with h5py.File(path, "a") as file:
-        file.attrs["travel_km"] = np.float32(1.5)
-        file.attrs["stage"] = np.bytes_(b"demo")
-        file.attrs["servo_id"] = [3]
-        file.attrs["baseline"] = True
-    metadata = read_log(path).metadata
-    assert (metadata.travel, metadata.stage) == (1500.0, "demo")
-    assert (metadata.servo_id, metadata.baseline) == ("3", True)
-    for value in ([1, 2], np.array([[1, 2]], dtype=object)[0, :0]):
-        with h5py.File(path, "a") as file:
-            file.attrs.create("servo_id", value, dtype="i8")
-        refused(path, "metadata", "servo_id")
-    with h5py.File(path, "a") as file:
-        data = np.empty((), dtype=object)
-        data[()] = np.arange(3)
-        file.attrs.create("servo_id", data, dtype=h5py.vlen_dtype("i8"))
-    refused(path, "metadata", "servo_id")
-
-
-@pytest.mark.parametrize("kind", ["text", "group", "matrix"])
-def test_hdf5_column_that_is_no_series(tmp_path, kind):
-    """Strings, groups and matrices under a signal's name are named."""
-    with h5py.File(tmp_path / "log.h5", "w") as file:
-        if kind == "group":
-            file.create_group("delta_e_um")
-        else:
-            file["delta_e_um"] = ["a", "b"] if kind == "text" else np.zeros((3, 3))
-    refused(tmp_path / "log.h5", "columns", "delta_e_um")
 
 
 def test_parquet_text_column(make):
@@ -245,3 +174,111 @@ def test_import_is_light():
         "sys.exit(any(m in sys.modules for m in late))"
     )
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+def fails(path, reason, words):
+    """Expect a refusal of the whole log."""
+    with pytest.raises(BadLog, match=words) as caught:
+        read_log(path)
+    assert caught.value.reason == reason
+
+
+def test_missing_signal(make):
+    """A log without Δe and acceleration says what is there and what is needed."""
+    path = make(columns={"delta_e_um": None, "acc_feed_m_s2": None, "current_a": np.arange(400.0)})
+    fails(path, "columns", "no signal: needed delta_e_um.*there: time_s")
+
+
+def test_missing_rate(make):
+    """A log without time and sample rate says that one of them is needed."""
+    fails(make(columns={"time_s": None}, meta={"sample_rate_hz": None}), "time", "needed one")
+    assert read_log(make(columns={"time_s": None})).sample_rate == 2000.0
+
+
+def test_unknown_unit(make):
+    """An unknown unit is an error for a signal and of no interest elsewhere."""
+    fails(make(columns={"acc_x_furlong": np.zeros(400)}), "unit", "acc_x_furlong.*there: time_s")
+    read_log(make(columns={"weather_furlong": np.zeros(400)}))
+
+
+def test_one_signal_in_two_units(make):
+    """The same signal in two units is ambiguous."""
+    fails(make(columns={"delta_e_nm": np.arange(400.0)}), "columns", "more than one unit")
+
+
+def test_lengths(make):
+    """Columns of different lengths are named with their lengths."""
+    fails(make("log.h5", {"delta_e_um": np.arange(300.0)}), "columns", "delta_e 300")
+
+
+@pytest.mark.parametrize(
+    ("values", "reason"),
+    [
+        (np.zeros(400), "flat"),
+        (np.clip(np.random.default_rng(0).normal(size=400), -1, 1).repeat(1), "clipped"),
+        (np.where(np.arange(400) < 50, np.nan, np.arange(400.0)), "missing-samples"),
+    ],
+)
+def test_bad_channel_is_refused_alone(make, values, reason):
+    """A bad channel is refused with its reason, the others go on over the whole record."""
+    log = read_log(make(columns={"acc_bad_m_s2": values}))
+    assert [(r.channel, r.reason) for r in log.refused] == [("acc_bad", reason)]
+    assert {c.name for c in log.channels} == {"delta_e", "acc_feed"} and log.pieces == ((0, 400),)
+
+
+def test_no_channel_left(make):
+    """A log whose channels are all refused is refused with all reasons."""
+    path = make(columns={"delta_e_um": np.zeros(400), "acc_feed_m_s2": np.ones(400)})
+    fails(path, "no-signal", "delta_e: flat.*acc_feed: flat")
+
+
+@pytest.mark.parametrize("file", ["log.csv", "log.parquet", "log.h5"])
+def test_short_gaps_split(make, file):
+    """Missing samples of any channel split the record, with counts, and stay NaN."""
+    values = np.random.default_rng(1).normal(size=400)
+    values[[100, 101]] = np.nan
+    log = read_log(make(file, {"acc_feed_m_s2": values}))
+    assert log.pieces == ((0, 100), (102, 400))
+    assert [(r.channel, r.reason) for r in log.refused] == [("acc_feed", "gaps")]
+    assert "2 of 400" in log.refused[0].detail
+    channel = next(c for c in log.channels if c.name == "acc_feed")
+    assert np.isnan(channel.values).sum() == 2
+
+
+def test_dropped_samples(make):
+    """Gaps in time are named with counts and split the record."""
+    time = np.arange(400) / 2000
+    time[250:] += 5 / 2000
+    log = read_log(make(columns={"time_s": time}))
+    assert log.pieces == ((0, 250), (250, 400)) and "5 dropped" in log.refused[0].detail
+
+
+def test_velocity_from_position(make):
+    """A set point given as position is differentiated, never across a gap."""
+    time = np.arange(400) / 2000
+    time[250:] += 5 / 2000
+    columns = {
+        "reference_velocity_mm_s": None,
+        "reference_position_mm": 50 * time,
+        "time_s": time,
+    }
+    np.testing.assert_allclose(read_log(make(columns=columns)).reference_velocity, 0.05)
+
+
+def test_useless_set_point(make):
+    """A set point that is mostly missing is refused, and cuts nothing."""
+    log = read_log(make(columns={"reference_velocity_mm_s": np.full(400, np.nan)}))
+    assert log.reference_velocity is None and log.pieces == ((0, 400),)
+    assert log.refused[0].channel == "reference_velocity"
+
+
+@pytest.mark.parametrize("n", [0, 1])
+def test_too_few_samples(make, n):
+    """Fewer than two samples are no recording."""
+    fails(make("log.h5", n=n), "empty", "at least 2")
+
+
+def test_arrays_are_read_only(make):
+    """A log cannot be changed by who reads it."""
+    with pytest.raises(ValueError, match="read-only"):
+        read_log(make()).channels[0].values[0] = 1.0

@@ -1,1 +1,1 @@
-"""File formats."""
+"""File formats: one module for each, and their registry."""

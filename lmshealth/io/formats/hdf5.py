@@ -1,8 +1,9 @@
 """HDF5: one dataset per column at the root, root attributes as metadata.
 
-Nothing outside the file is touched: links, external storage and virtual datasets are refused.
-
-Heaps of strings in HDF5 files, looked at before the HDF5 library trusts the sizes they claim.
+Nothing outside the file is opened: links, external storage and virtual datasets are refused. The
+HDF5 library loops without end on a damaged heap of strings (HDFGroup/hdf5 issue 1707; still so in
+2.0.0), allocates as many bytes as a damaged attribute claims, and crashes Python at its end after a
+virtual dataset that cannot be opened. `Guarded` checks what the library reads before it gets it.
 """
 
 from __future__ import annotations
@@ -15,33 +16,30 @@ from typing import Any, Literal
 
 import numpy as np
 
+from lmshealth.io import constants
 from lmshealth.io.buffers import BLOCK, MINUTE, Spool, spools
 from lmshealth.io.column_map import ColumnMap
+from lmshealth.io.formats.content import Content, Format, check_size, not_numeric, wanted
 from lmshealth.io.metadata import KEYS
-from lmshealth.io.raw import Format, Raw, check_size, not_numeric, wanted
 from lmshealth.io.refusal import Unusable
 
-# Global heap of the HDF5 file format: signature, version 1, three zeros, size of the collection
-# (8 bytes); then objects with index (2), references (2), reserved (4), size (8).
-_SIGNATURE = b"GCOL\x01\x00\x00\x00"
+_MAGIC = b"\x89HDF\r\n\x1a\n"
+# Version 1 of a heap of strings, and the bytes of its header and of each object's.
+_HEAP = b"GCOL\1\0\0\0"
 _HEADER = 16
-# The library makes heaps of 64 KiB, and larger ones only for a longer text.
-_LARGEST = 1 << 20
 # Layout of a virtual dataset that lists no files; one that lists some does it in a heap.
 _NO_FILES = b"\x04\x03" + 8 * b"\xff" + bytes(4)
 # Attribute messages: version, bytes before the name, and what the sizes of name, type and space
-# are rounded up to. The sizes stand at byte 2; a text begins with its length (4), heap and object.
+# are rounded up to. The sizes are at byte 2; a text begins with its length (4), heap and object.
 _LONGEST_MESSAGE = 512
 _MESSAGES = ((1, 8, 8), (2, 8, 1), (3, 9, 1))
 
 
 class Guarded(FileIO):
-    """A file that keeps damaged heaps from the HDF5 library, for h5py's driver of Python files.
+    """A file for h5py's driver of Python files that checks heaps and text attributes.
 
-    The library walks a heap by the sizes its objects claim, and stands still at a claim of zero
-    (HDFGroup/hdf5 issue 1707; still so in 2.0.0); it makes room for as many bytes as an attribute
-    claims before it finds that they are not there. Each heap is looked at when the library reads
-    it: to search a file for heaps takes half as long as to read it.
+    Each heap is checked when the library reads it: to search the file for heaps takes half as long
+    as to read it.
 
     Parameters
     ----------
@@ -51,9 +49,9 @@ class Guarded(FileIO):
     Attributes
     ----------
     now : str
-        What is read: ``columns`` are opened, ``texts`` are read, or ``samples``.
+        Content that is read: ``columns`` are opened, ``texts`` are read, or ``samples``.
     trouble : Unusable or None
-        Why something was kept from the library, which then fails with an error of its own.
+        Why bytes were withheld from the library, which then fails with an error of its own.
     """
 
     def __init__(self, path: Path) -> None:
@@ -61,29 +59,29 @@ class Guarded(FileIO):
         self.size = path.stat().st_size
         self.now: Literal["columns", "texts", "samples"] = "columns"
         self.trouble: Unusable | None = None
-        self._seen: list[tuple[int, int]] = []
+        self._read: list[tuple[int, int]] = []
 
     def readinto(self, buffer: Any) -> int:
-        """Read for the library; what it must not have is handed over as zeros."""
+        """Read for the library; zeros in the place of damaged bytes."""
         if self.now == "samples":
             return super().readinto(buffer)
         start = self.tell()
         n_read = super().readinto(buffer)
         content = bytes(buffer)
-        self._seen.append((start, start + n_read))
+        self._read.append((start, start + n_read))
         self.trouble = self.trouble or self._trouble(start, content)
         if self.trouble is not None:
             buffer[:] = bytes(len(buffer))
         return n_read
 
     def claimed(self, attribute: str) -> int:
-        """Give the bytes for which the library makes room when it reads a text attribute."""
+        """Return the bytes that the library allocates when it reads a text attribute."""
         most = 0
         name = attribute.encode() + b"\0"
-        for start, stop in self._seen:
-            # A message may go on where another read began.
-            seen = self._bytes(start, stop + _LONGEST_MESSAGE)
-            for found in re.finditer(re.escape(name), seen):
+        for start, stop in self._read:
+            # A message may continue where another read began.
+            content = self._bytes(start, stop + _LONGEST_MESSAGE)
+            for found in re.finditer(re.escape(name), content):
                 at = start + found.start()
                 most = max(most, *(self._length(at, len(name), *kind) for kind in _MESSAGES))
         return most
@@ -102,16 +100,14 @@ class Guarded(FileIO):
         return self.read(stop - max(start, 0))
 
     def _trouble(self, start: int, content: bytes) -> Unusable | None:
-        """Say why the library must not have what it asked for."""
-        is_heap = content.startswith(_SIGNATURE)
+        is_heap = content.startswith(_HEAP)
         if self.now == "columns" and (is_heap or _NO_FILES in content):
-            # Never opened: a virtual column that fails to open crashes Python at its end.
             return Unusable("escapes", "a column keeps its samples in other files")
         return self._damage(start) if is_heap else None
 
     def _damage(self, start: int) -> Unusable | None:
-        """Walk a heap as the library does."""
-        heap = self._bytes(start, start + _LARGEST)
+        """Follow the objects of a heap as the library does."""
+        heap = self._bytes(start, start + constants.LARGEST_HEAP)
         size = int.from_bytes(heap[8:_HEADER], "little")
         if size > len(heap):
             return Unusable("corrupt", f"heap of strings of {size} bytes at byte {start}")
@@ -129,25 +125,20 @@ class Guarded(FileIO):
         return None
 
 
-_MAGIC = b"\x89HDF\r\n\x1a\n"
-# A damaged length may claim gigabytes; HDF5 itself keeps no attribute above 64 KiB in its header.
-_LONGEST_TEXT = 1 << 16
-
-
-def _load(path: Path, columns: ColumnMap, max_memory: float) -> Raw:
+def _load(path: Path, columns: ColumnMap, max_memory: float) -> Content:
     import h5py
 
     with Guarded(path) as stream:
         try:
             with h5py.File(stream, "r") as file:
-                return _read(file, stream, columns)
+                return _content(file, stream, columns)
         except Exception:
             if stream.trouble is None:
                 raise
         raise stream.trouble
 
 
-def _read(file: Any, stream: Guarded, columns: ColumnMap) -> Raw:
+def _content(file: Any, stream: Guarded, columns: ColumnMap) -> Content:
     names = list(file)
     chosen = {name: _dataset(file, name) for name in wanted(names, columns)}
     stream.now = "texts"
@@ -156,20 +147,13 @@ def _read(file: Any, stream: Guarded, columns: ColumnMap) -> Raw:
     stream.now = "samples"
     with spools(chosen) as taken:
         for name, dataset in chosen.items():
-            _take(dataset, taken[name])
+            _read(dataset, taken[name])
     read = {name: spool.samples() for name, spool in taken.items()}
-    return Raw(read, metadata, tuple(names))
+    return Content(read, metadata, tuple(names))
 
 
 def _dataset(file: Any, name: str) -> Any:
-    """Open a column after looking at it from outside.
-
-    Raises
-    ------
-    Unusable
-        With reason ``escapes`` if its samples are elsewhere, ``columns`` if it is no series of
-        numbers, ``corrupt`` if it was never written completely.
-    """
+    """Open a column, and check that it is complete and in this file."""
     import h5py
 
     if not isinstance(file.get(name, getlink=True), h5py.HardLink):
@@ -182,21 +166,17 @@ def _dataset(file: Any, name: str) -> Any:
         raise not_numeric(name, f"{item.dtype} of shape {item.shape}")
     if item.is_virtual or item.external:
         raise Unusable("escapes", f"column {name!r} keeps its samples in another file")
-    _check_written(item, name)
+    # HDF5 reads blocks that a crashed recorder never wrote as zeros.
+    if item.size == 0 or item.chunks is None:
+        needed, found = int(item.size > 0), int(item.id.get_storage_size() > 0)
+    else:
+        needed, found = -(-item.size // item.chunks[0]), item.id.get_num_chunks()
+    if found < needed:
+        raise Unusable("corrupt", f"column {name!r}: {found} of {needed} blocks were ever written")
     return item
 
 
-def _check_written(dataset: Any, name: str) -> None:
-    """Refuse what a crashed recorder never wrote; HDF5 would read it as zeros."""
-    if dataset.size == 0 or dataset.chunks is None:
-        needed, found = int(dataset.size > 0), int(dataset.id.get_storage_size() > 0)
-    else:
-        needed, found = -(-dataset.size // dataset.chunks[0]), dataset.id.get_num_chunks()
-    if found < needed:
-        raise Unusable("corrupt", f"column {name!r}: {found} of {needed} blocks were ever written")
-
-
-def _take(dataset: Any, spool: Spool) -> None:
+def _read(dataset: Any, spool: Spool) -> None:
     """Read a column, beyond a minute in stretches of whole chunks: each is unpacked only once."""
     chunk = 1 if dataset.chunks is None else dataset.chunks[0]
     step = max(1, dataset.size) if dataset.size <= MINUTE else -(-BLOCK // chunk) * chunk
@@ -205,19 +185,19 @@ def _take(dataset: Any, spool: Spool) -> None:
 
 
 def _attribute(file: Any, stream: Guarded, key: str) -> str:
-    """Read an attribute as text, whatever plain type the exporter gave it."""
+    """Read an attribute of any plain type as text."""
     import h5py
 
     attribute = file.attrs.get_id(key)
-    # Looked at before it is read: the library crashes on damaged types of other classes.
+    # Its type is checked before it is read: the library crashes on damaged types of other classes.
     plain = h5py.h5t.TypeStringID, h5py.h5t.TypeIntegerID, h5py.h5t.TypeFloatID, h5py.h5t.TypeEnumID
     kind = attribute.get_type()
-    is_plain = isinstance(kind, plain) and kind.get_size() <= _LONGEST_TEXT
+    is_plain = isinstance(kind, plain) and kind.get_size() <= constants.LONGEST_ATTRIBUTE
     if not is_plain or attribute.shape not in ((), (1,)):
         raise Unusable("metadata", f"{key} is no single text or number; write it as text")
     if isinstance(kind, h5py.h5t.TypeStringID) and kind.is_variable_str():
         claimed = stream.claimed(key)
-        if claimed > _LONGEST_TEXT:
+        if claimed > constants.LONGEST_ATTRIBUTE:
             raise Unusable("corrupt", f"{key} claims a text of {claimed} bytes")
     value = np.asarray(file.attrs[key]).reshape(-1)[0]
     if isinstance(value, bytes):

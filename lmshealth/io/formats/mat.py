@@ -1,43 +1,59 @@
-"""MAT: variables, fields of structs and columns of matrices, each by the name MATLAB calls it."""
+"""MAT-files of version 5: variables, fields of structs, columns of matrices, as MATLAB names them.
+
+The elements are parsed here, and every size is checked against the element around it, because
+`scipy.io.loadmat` ends the Python process with a segmentation fault on damaged headers (3 % of
+single flipped bits in the first 64 bytes of an uncompressed variable; scipy 1.17), and allocates
+what text and cells claim before it finds that they are not there. One variable is held in memory.
+"""
 
 from __future__ import annotations
 
-import os
 import re
 import struct
-from collections.abc import Iterable, Iterator
-from dataclasses import replace
+import zlib
+from collections.abc import Iterator
+from dataclasses import dataclass
 from math import prod
 from pathlib import Path
 from typing import IO, NamedTuple
 
-from lmshealth.io.buffers import Samples, spools
+import numpy as np
+
+from lmshealth.io import constants
+from lmshealth.io.buffers import Spool
 from lmshealth.io.column_map import ColumnMap
-from lmshealth.io.formats.matbytes import PackedBytes, PlainBytes, cut_off
-from lmshealth.io.formats.matwalk import (
-    COMPRESSED,
-    MATRIX,
-    NUMBERS,
-    TAG,
-    TEXT,
-    Array,
-    Walker,
+from lmshealth.io.formats.content import (
+    Content,
+    Format,
+    check_memory,
+    check_size,
+    not_numeric,
 )
 from lmshealth.io.metadata import KEYS
-from lmshealth.io.raw import Format, Raw, check_size, not_numeric
 from lmshealth.io.refusal import Unusable, listed
 
-_HEADER = 128
+_HEADER, _TAG = 128, 8
 _ORDERS = {b"\x00\x01IM": "<", b"\x01\x00MI": ">"}
 _HDF5_INSIDE = (b"\x00\x02IM", b"\x02\x00MI")
-# A matrix with more columns than this is no table of signals.
-_MOST_COLUMNS = 1000
-# What has more arrays is no log, and would fill the memory with their names.
-_MOST_ARRAYS = 20_000
+# Bytes of a variable that hold its name.
+_PEEK = 1 << 10
+
+# Types of data elements. Whatever the class of an array, MATLAB stores its numbers in the smallest
+# type that holds them.
+_INT8, _INT32, _UINT32, _MATRIX, _COMPRESSED = 1, 5, 6, 14, 15
+_TYPES = dict(zip((1, 2, 3, 4, 5, 6, 7, 9, 12, 13), "bBhHiIfdqQ", strict=True))
+_ENCODINGS = {1: "latin-1", 2: "latin-1", 4: "utf-16", 16: "utf-8", 17: "utf-16", 18: "utf-32"}
+# Classes of arrays.
+_STRUCT, _CHAR, _OPAQUE = 2, 4, 17
+_NUMERIC = range(6, 16)
+_OBJECT = "an object or a function (save plain arrays or structs)"
+_OTHERS = {1: "cells", 3: _OBJECT, 5: "a sparse matrix", 16: _OBJECT, 17: _OBJECT}
+_COMPLEX = 1 << 11
+_NUMBERS, _TEXT = "numbers", "text"
 
 
 class _Variable(NamedTuple):
-    """A variable where it stands in the file, with its tag."""
+    """A variable in the file: name, whether compressed, start and size of its bytes."""
 
     name: str
     packed: bool
@@ -45,146 +61,313 @@ class _Variable(NamedTuple):
     size: int
 
 
-def _load(path: Path, columns: ColumnMap, max_memory: float) -> Raw:
+@dataclass(frozen=True, slots=True, eq=False)
+class _Array:
+    """An array that is no struct.
+
+    Attributes
+    ----------
+    name : str
+        As MATLAB calls it.
+    shape : tuple of int
+        As in MATLAB, whose arrays are stored column after column.
+    what : str
+        `_NUMBERS`, `_TEXT`, or words for a message.
+    values : ndarray
+        Numbers as stored, shape ``(prod(shape),)``.
+    text : str
+    """
+
+    name: str
+    shape: tuple[int, ...]
+    what: str
+    values: np.ndarray | None = None
+    text: str = ""
+
+
+def _load(path: Path, columns: ColumnMap, max_memory: float) -> Content:
+    stored = path.stat().st_size
     with path.open("rb") as stream:
-        order = _order(stream)
-        variables = list(_variables(stream, order))
+        version = stream.read(_HEADER)[-4:]
+        if version in _HDF5_INSIDE:
+            raise Unusable(
+                "format", "MAT-file of version 7.3; save it in MATLAB with the option -v7"
+            )
+        order = _ORDERS[version]
+        variables = list(_variables(stream, order, stored))
         names = [variable.name for variable in variables]
         chosen = _chosen(names, columns)
-        if twice := sorted({name for name in chosen if names.count(name) > 1}):
-            raise Unusable("columns", f"the file holds {listed(twice)} more than once")
-        wanted = [variable for variable in variables if variable.name in chosen]
-        arrays = _arrays(stream, order, wanted, columns.mat.variable)
-        raw = _raw(arrays, columns, os.fstat(stream.fileno()).st_size)
+        content = Content({}, {}, ())
+        unpacked = 0
+        for variable in variables:
+            if variable.name in chosen:
+                view = _unpacked(stream, order, variable, unpacked, stored, max_memory)
+                unpacked += len(view)
+                inside = columns.mat.variable is not None
+                arrays = _arrays(view[_TAG:], order, variable.name, inside=inside)
+                content = _added(content, arrays, columns, stored)
     others = tuple(name for name in names if name and name not in chosen)
-    return replace(raw, present=raw.present + others)
+    return Content(content.columns, content.metadata, content.present + others)
 
 
-def _order(stream: IO[bytes]) -> str:
-    """Tell the order of bytes; refuse the version that is something else inside."""
-    version = stream.read(_HEADER)[-4:]
-    if version in _HDF5_INSIDE:
-        raise Unusable("format", "MAT-file of version 7.3; save it in MATLAB with the option -v7")
-    return _ORDERS[version]
-
-
-def _variables(stream: IO[bytes], order: str) -> Iterator[_Variable]:
-    """Find the variables by their tags, and read their names.
-
-    Raises
-    ------
-    Unusable
-        With reason ``corrupt`` where the file ends before its variables do.
-    """
-    end = os.fstat(stream.fileno()).st_size
+def _variables(stream: IO[bytes], order: str, end: int) -> Iterator[_Variable]:
+    """Find the variables by their tags, and read their names."""
     at = _HEADER
     while at < end:
-        if at + TAG > end:
-            raise cut_off(at)
         stream.seek(at)
-        kind, size = struct.unpack(order + "II", stream.read(TAG))
-        if kind not in (COMPRESSED, MATRIX):
+        tag = stream.read(_TAG)
+        if len(tag) < _TAG:
+            raise _cut_off(at)
+        kind, size = struct.unpack(order + "II", tag)
+        if kind not in (_COMPRESSED, _MATRIX):
             raise Unusable("corrupt", f"no variable begins at byte {at}; copy the file again")
-        if at + TAG + size > end:
-            raise cut_off(at)
-        found = _Variable("", kind == COMPRESSED, at, TAG + size)
-        yield found._replace(name=_walker(stream, order, found).name())
-        at += TAG + size
+        if at + _TAG + size > end:
+            raise _cut_off(at)
+        packed = kind == _COMPRESSED
+        head = stream.read(min(size, _PEEK))
+        if packed:
+            head = _inflate(zlib.decompressobj(), head, _PEEK)[_TAG:]
+        # Objects of newer classes have no name, and neither have empty variables.
+        name = _head(_elements(memoryview(head), order), order)[2] if head else ""
+        yield _Variable(name, packed, at, _TAG + size)
+        at += _TAG + size
 
 
-def _walker(stream: IO[bytes], order: str, variable: _Variable) -> Walker:
+def _inflate(inflater: zlib._Decompress, packed: bytes, size: int) -> bytes:
+    try:
+        return inflater.decompress(packed, size)
+    except zlib.error as error:
+        raise _damaged() from error
+
+
+def _unpacked(
+    stream: IO[bytes],
+    order: str,
+    variable: _Variable,
+    unpacked: int,
+    stored: int,
+    max_memory: float,
+) -> memoryview:
+    """Read a variable with its tag, unless it takes too much memory."""
+    stream.seek(variable.start)
     if not variable.packed:
-        stream.seek(variable.start)
-        return Walker(PlainBytes(stream), order)
-    stream.seek(variable.start + TAG)
-    return Walker(PackedBytes(stream, variable.size - TAG), order)
+        check_memory(f"variable {variable.name[:80]!r}", variable.size, max_memory)
+        return memoryview(stream.read(variable.size))
+    packed = stream.read(variable.size)[_TAG:]
+    tag = _inflate(zlib.decompressobj(), packed[:_PEEK], _TAG)
+    if len(tag) < _TAG:
+        raise _cut_off(variable.start)
+    kind, size = struct.unpack(order + "II", tag)
+    if kind != _MATRIX:
+        raise Unusable("corrupt", "a compressed element is no variable; copy the file again")
+    size += _TAG
+    check_size(unpacked + size, stored)
+    check_memory(f"variable {variable.name[:80]!r}", size, max_memory)
+    inflater = zlib.decompressobj()
+    content = _inflate(inflater, packed, size + 1)
+    if len(content) < size:
+        raise _cut_off(variable.start)
+    # The checksum is that of the whole variable.
+    if len(content) > size or not inflater.eof:
+        raise _damaged()
+    return memoryview(content)
+
+
+def _cut_off(at: int) -> Unusable:
+    return Unusable("corrupt", f"the variable at byte {at} is cut off; copy the file again")
+
+
+def _damaged(what: str = "a compressed variable is damaged") -> Unusable:
+    return Unusable("corrupt", f"{what}; copy the file again")
 
 
 def _chosen(names: list[str], columns: ColumnMap) -> set[str]:
     """Choose the variables that hold the log."""
     if columns.mat.variable is not None:
+        chosen = {columns.mat.variable}
         if columns.mat.variable not in names:
+            detail = f"the column map needs the variable {columns.mat.variable}; there: "
+            raise Unusable("columns", detail + listed(names))
+    else:
+        roots = {re.split(r"[.({]", source)[0] for source in columns.columns.values()}
+        known = roots | set(KEYS)
+        chosen = {name for name in names if name and (name in known or columns.target(name))}
+    if twice := sorted({name for name in chosen if names.count(name) > 1}):
+        raise Unusable("columns", f"the file holds {listed(twice)} more than once")
+    return chosen
+
+
+def _added(content: Content, arrays: Iterator[_Array], columns: ColumnMap, stored: int) -> Content:
+    """Add the arrays of a variable to the columns and metadata of a file."""
+    read, metadata, present = dict(content.columns), dict(content.metadata), [*content.present]
+    n_samples = sum(samples.size for samples in read.values())
+    for k, whole in enumerate(arrays):
+        for array in _columns(whole):
+            present.append(array.name)
+            if columns.target(array.name) is not None:
+                values = _vector(array)
+                n_samples += values.size
+                # MATLAB stores whole numbers in fewer bytes than they take here.
+                check_size(8 * n_samples, stored)
+                spool = Spool(values.size)
+                spool.append(values)
+                read[array.name] = spool.samples()
+            elif array.name in KEYS:
+                metadata[array.name] = _text(array)
+        if k + len(present) > constants.MOST_ARRAYS:
             raise Unusable(
-                "columns",
-                f"the column map needs the variable {columns.mat.variable}; there: {listed(names)}",
+                "columns", f"more than {constants.MOST_ARRAYS} arrays; save the log by itself"
             )
-        return {columns.mat.variable}
-    roots = {re.split(r"[.({]", source)[0] for source in columns.columns.values()}
-    known = roots | set(KEYS)
-    return {name for name in names if name and (name in known or columns.target(name))}
+    return Content(read, metadata, tuple(present))
+
+
+def _columns(array: _Array) -> Iterator[_Array]:
+    """Split a matrix of signals into its columns; any other array stays whole."""
+    values, shape = array.values, array.shape
+    is_matrix = len(shape) == 2 and 1 not in shape and shape[1] <= constants.MOST_COLUMNS
+    if values is None or not is_matrix:
+        yield array
+        return
+    for k, column in enumerate(values.reshape(shape[::-1])):
+        yield _Array(f"{array.name}(:,{k + 1})", (shape[0], 1), _NUMBERS, column)
+
+
+def _vector(array: _Array) -> np.ndarray:
+    """Return the numbers of a vector, shape ``(n,)``."""
+    if array.values is None:
+        raise not_numeric(array.name, array.what)
+    if array.values.size not in array.shape:
+        raise not_numeric(array.name, f"numbers of shape {array.shape}")
+    return array.values
+
+
+def _text(array: _Array) -> str:
+    """Read a single number or line of text."""
+    if array.values is not None and array.values.size == 1:
+        value = array.values[0].item()
+        # An integer may be stored as one or not.
+        return str(int(value) if float(value).is_integer() else value)
+    if array.what == _TEXT and (not prod(array.shape) or array.shape[0] == 1):
+        return array.text
+    raise Unusable("metadata", f"{array.name} is no single text or number; write it as text")
+
+
+Elements = Iterator[tuple[int, memoryview]]
+
+
+def _elements(view: memoryview, order: str) -> Elements:
+    """Split the content of a variable into its data elements: type and content of each."""
+    at, stop = 0, len(view)
+    while at < stop:
+        if at + _TAG > stop:
+            raise _damaged("a variable is cut off")
+        kind, size = struct.unpack_from(order + "II", view, at)
+        if kind >> 16:  # up to four bytes are inside the tag itself
+            start, after, kind, size = at + 4, at + _TAG, kind & 0xFFFF, kind >> 16
+        else:
+            start = at + _TAG
+            after = start + size + (0 if kind == _MATRIX else -size % 8)
+        # The last element need not be padded.
+        at = min(after, stop)
+        if start + size > at:
+            raise _damaged("an element of a variable is cut off")
+        yield kind, view[start : start + size]
+
+
+def _next(elements: Elements, *kinds: int) -> tuple[int, memoryview]:
+    """Return the next element, which must be of one of some types."""
+    kind, content = next(elements, (0, memoryview(b"")))
+    if kind not in kinds:
+        raise _damaged("a variable is cut off or damaged")
+    return kind, content
+
+
+def _integers(elements: Elements, order: str) -> tuple[int, ...]:
+    _, content = _next(elements, _INT32)
+    return struct.unpack_from(f"{order}{len(content) // 4}i", content)
+
+
+def _head(elements: Elements, order: str) -> tuple[int, tuple[int, ...], str, bool]:
+    """Read class, shape, name, and whether complex; objects of newer classes have but a class."""
+    _, flags = _next(elements, _UINT32)
+    if len(flags) != 8:
+        raise _damaged("a variable has no class")
+    (word,) = struct.unpack_from(order + "I", flags)
+    kind = word & 0xFF
+    if kind == _OPAQUE:
+        return kind, (), "", False
+    shape = _integers(elements, order)
+    if not 1 <= len(shape) <= constants.DEEPEST or min(shape) < 0:
+        raise _damaged("a variable has impossible dimensions")
+    name = str(_next(elements, _INT8)[1], "latin-1")
+    return kind, shape, name, bool(word & _COMPLEX)
 
 
 def _arrays(
-    stream: IO[bytes], order: str, variables: Iterable[_Variable], inside: str | None
-) -> Iterator[Array]:
-    """Give the arrays of variables; inside one variable without its name."""
-    end = os.fstat(stream.fileno()).st_size
-    unpacked = 0
-    for variable in variables:
-        walker = _walker(stream, order, variable)
-        unpacked += walker.size
-        check_size(unpacked, end)
-        yield from walker.arrays(variable.name, inside=variable.name == inside)
+    view: memoryview, order: str, name: str, depth: int = 0, *, inside: bool = False
+) -> Iterator[_Array]:
+    """Yield all arrays of a matrix that are no structs.
 
-
-def _raw(arrays: Iterable[Array], columns: ColumnMap, size: int) -> Raw:
-    """Read what is wanted of the arrays of a file of ``size`` bytes."""
-    n_samples = 0
-    read: dict[str, Samples] = {}
-    metadata: dict[str, str] = {}
-    present: list[str] = []
-    for k, array in enumerate(arrays):
-        for name, n in _columns(array):
-            present.append(name)
-            if columns.target(name) is not None:
-                _check_series(array, name, n)
-                n_samples += n
-                # MATLAB stores whole numbers in fewer bytes than they take here.
-                check_size(8 * n_samples, size)
-                read[name] = _samples(array, n)
-            elif name in KEYS:
-                metadata[name] = _text(array, name)
-            elif array.what == NUMBERS:
-                array.skip(n)
-        if k + len(present) > _MOST_ARRAYS:
-            raise Unusable("columns", f"more than {_MOST_ARRAYS} arrays; save the log by itself")
-    return Raw(read, metadata, tuple(present))
-
-
-def _columns(array: Array) -> Iterator[tuple[str, int]]:
-    """Give the columns of a matrix, or an array itself, with their numbers of entries."""
-    n_columns = array.shape[1] if len(array.shape) == 2 and 1 not in array.shape else None
-    if array.what != NUMBERS or n_columns is None or n_columns > _MOST_COLUMNS:
-        yield array.name, prod(array.shape)
+    Parameters
+    ----------
+    view : memoryview
+        Content of the matrix.
+    order : str
+        Byte order as `struct` writes it.
+    name : str
+        As MATLAB calls it.
+    depth : int
+        Number of structs around it.
+    inside : bool
+        Whether the fields of a struct are called without the name of the variable.
+    """
+    if not len(view):
+        yield _Array(name, (0, 0), _NUMBERS, np.empty(0))
         return
-    for k in range(n_columns):
-        yield f"{array.name}(:,{k + 1})", array.shape[0]
+    if depth > constants.DEEPEST:
+        raise _damaged(f"{name[:80]!r} is nested deeper than {constants.DEEPEST}")
+    elements = _elements(view, order)
+    kind, shape, _, is_complex = _head(elements, order)
+    if kind == _STRUCT:
+        for label, field in _fields(elements, order, "" if inside else name, shape, len(view)):
+            yield from _arrays(field, order, label, depth + 1)
+    elif kind in _OTHERS:
+        yield _Array(name, shape, _OTHERS[kind])
+    elif kind == _CHAR:
+        stored, content = _next(elements, *_ENCODINGS)
+        encoding = _ENCODINGS[stored]
+        if encoding in ("utf-16", "utf-32"):
+            encoding += "-le" if order == "<" else "-be"
+        yield _Array(name, shape, _TEXT, text=str(content, encoding))
+    elif kind in _NUMERIC:
+        stored, content = _next(elements, *_TYPES)
+        dtype = np.dtype(order + _TYPES[stored])
+        if len(content) != prod(shape) * dtype.itemsize:
+            raise _damaged(f"{name[:80]!r} is cut off")
+        what = "complex numbers" if is_complex else _NUMBERS
+        values = None if is_complex else np.frombuffer(content, dtype=dtype)
+        yield _Array(name, shape, what, values)
+    else:
+        raise _damaged(f"{name[:80]!r} is of the unknown class {kind}")
 
 
-def _check_series(array: Array, name: str, n: int) -> None:
-    if array.what != NUMBERS:
-        raise not_numeric(name, array.what)
-    if n not in array.shape:
-        raise not_numeric(name, f"numbers of shape {array.shape}")
-
-
-def _samples(array: Array, n: int) -> Samples:
-    with spools([array.name], expected=n) as taken:
-        for block in array.numbers(n):
-            taken[array.name].append(block)
-        return taken[array.name].samples()
-
-
-def _text(array: Array, key: str) -> str:
-    """Read a single number or line of text."""
-    n = prod(array.shape)
-    if array.what == NUMBERS and n == 1:
-        value = next(array.numbers(1)).item()
-        # An integer may be stored as one or not.
-        return str(int(value) if float(value).is_integer() else value)
-    if array.what == TEXT and (n == 0 or array.shape[0] == 1):
-        return array.text()
-    raise Unusable("metadata", f"{key} is no single text or number; write it as text")
+def _fields(
+    elements: Elements, order: str, name: str, shape: tuple[int, ...], size: int
+) -> Iterator[tuple[str, memoryview]]:
+    """Yield name and content of the fields of a struct, entry after entry."""
+    length, (_, names) = sum(_integers(elements, order)), _next(elements, _INT8)
+    if not 1 <= length <= _PEEK or len(names) % length:
+        raise _damaged("a struct has impossible fields")
+    fields = [
+        str(names[k : k + length], "latin-1").split("\0")[0] for k in range(0, len(names), length)
+    ]
+    n_items = prod(shape)
+    if n_items * len(fields) * _TAG > size:
+        raise _damaged(f"{name[:80]!r} is cut off")
+    for k in range(n_items if fields else 0):
+        whole = name if n_items == 1 else f"{name}({k + 1})"
+        for field in fields:
+            yield f"{whole}.{field}" if whole else field, _next(elements, _MATRIX)[1]
 
 
 def _sniff(head: bytes) -> bool:

@@ -1,38 +1,37 @@
-"""The registry of file formats: adding one is a module with a `Format` and a line here."""
+"""The registry of file formats: a new one is a module with a `Format`, and its name here."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
+from lmshealth.io import constants
 from lmshealth.io.column_map import ColumnMap
-from lmshealth.io.constants import MAX_MEMORY
+from lmshealth.io.formats.content import Content, Format
 from lmshealth.io.formats.csv import CSV, CSV_GZ
 from lmshealth.io.formats.hdf5 import HDF5
 from lmshealth.io.formats.mat import MAT
 from lmshealth.io.formats.parquet import PARQUET
 from lmshealth.io.formats.tdms import TDMS
 from lmshealth.io.formats.uff import UFF
-from lmshealth.io.raw import Format, Raw
 from lmshealth.io.refusal import Unusable, listed
 
-# Binary formats first: text is what is left when no signature is found.
+# Binary formats first: text is recognised by the absence of other signatures.
 FORMATS: tuple[Format, ...] = (HDF5, PARQUET, TDMS, MAT, CSV_GZ, UFF, CSV)
 SUFFIXES: tuple[str, ...] = tuple(sorted(s for form in FORMATS for s in form.suffixes))
-
-# Exporters call delimited text so, and people their notes: read where a file is named, and not
-# looked for in folders.
+# Exporters use them for delimited text, and people for notes: such files are read where they are
+# named, and not collected from folders.
 TEXT_SUFFIXES = (".txt", ".tsv", ".dat")
 
 _HEAD = 4096
 
 
 def is_log(path: Path) -> bool:
-    """Tell by its name whether a file of a folder is a log."""
+    """Return whether a file of a folder has the suffix of a log."""
     return path.name.lower().endswith(SUFFIXES)
 
 
 def format_of(path: Path) -> Format | None:
-    """Find the format that a file's name promises; None for an unregistered suffix."""
+    """Return the format of a file's suffix; None for an unregistered one."""
     name = path.name.lower()
     if name.removesuffix(".gz").endswith(TEXT_SUFFIXES):
         return CSV_GZ if name.endswith(".gz") else CSV
@@ -40,13 +39,13 @@ def format_of(path: Path) -> Format | None:
 
 
 def format_name(path: Path) -> str:
-    """Name the format that a file's name promises: the same bytes are another log in another."""
+    """Return the name of that format: the same bytes are another log in another format."""
     form = format_of(path)
     return "" if form is None else form.name
 
 
-def load(path: Path, columns: ColumnMap, max_memory: float = MAX_MEMORY) -> Raw:
-    """Read a file by the format its name promises and its first bytes confirm.
+def load(path: Path, columns: ColumnMap, max_memory: float = constants.MAX_MEMORY) -> Content:
+    """Read a file by the format of its suffix, which its first bytes must confirm.
 
     Parameters
     ----------
@@ -78,7 +77,7 @@ def load(path: Path, columns: ColumnMap, max_memory: float = MAX_MEMORY) -> Raw:
     except Unusable:
         raise
     except Exception as error:
-        # Libraries raise whatever they like on damaged files; one bad file must not end a batch.
+        # Libraries raise any exception on damaged files; one file must not end a batch.
         text = " ".join(str(error).split())[:200]
         raise Unusable(
             "corrupt", f"cannot be read as {form.name} ({type(error).__name__}: {text})"
@@ -91,6 +90,6 @@ def _mismatch(form: Format, head: bytes) -> Unusable:
         return Unusable("corrupt", f"does not start as {form.name} does; copy the file again")
     return Unusable(
         "format",
-        f"the name says {form.name}, the content is {actual.name}; "
+        f"the suffix is that of {form.name}, the content is {actual.name}; "
         f"rename the file to {actual.suffixes[0]}",
     )

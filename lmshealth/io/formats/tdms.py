@@ -1,24 +1,34 @@
-"""TDMS: channels with properties, as LabVIEW and many loggers write them."""
+"""TDMS: channels with properties, as LabVIEW and many loggers write them.
+
+npTDMS reads the samples chunk by chunk. It accepts files that are cut off, follows an index file
+instead of the log, and loops over damaged counts of scales: these are checked here before.
+"""
 
 from __future__ import annotations
 
 import logging
-import os
 import re
 import struct
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 import numpy as np
 
+from lmshealth.io import constants
 from lmshealth.io.buffers import Samples, spools
 from lmshealth.io.column_map import ColumnMap
-from lmshealth.io.described_channels import Chosen, Described, choose, present
-from lmshealth.io.formats.tdmsdata import raw_samples
+from lmshealth.io.formats.content import (
+    Content,
+    Format,
+    check_memory,
+    check_size,
+    missing_library,
+    not_numeric,
+)
+from lmshealth.io.formats.unit_channels import Chosen, Described, choose, present, rate_of
 from lmshealth.io.metadata import KEYS
-from lmshealth.io.raw import Format, Raw, check_size, missing_library, not_numeric
 from lmshealth.io.refusal import Unusable, listed
 
 _MAGIC = b"TDSm"
@@ -28,12 +38,11 @@ _BIG_ENDIAN = 1 << 6
 _NEVER_FINISHED = (1 << 64) - 1
 _N_SCALES = "NI_Number_Of_Scales"
 _SCALE = re.compile(r"NI_Scale\[(\d{1,18})\d*\]")
-_MOST_SCALES = 10_000
-# What a start time says that was never set.
+# Start time of a channel whose start was never set.
 _EPOCH = np.datetime64("1904-01-01", "us")
 
 
-def _load(path: Path, columns: ColumnMap, max_memory: float) -> Raw:
+def _load(path: Path, columns: ColumnMap, max_memory: float) -> Content:
     try:
         from nptdms import TdmsFile
         from nptdms.log import log_manager
@@ -41,34 +50,38 @@ def _load(path: Path, columns: ColumnMap, max_memory: float) -> Raw:
         raise missing_library("TDMS", "npTDMS") from error
     # npTDMS prints on standard error where it guesses; here a guess is an error of the file.
     log_manager.set_level(logging.ERROR)
-    n_bytes = _check_segments(path)
-    # Opened here: given a path, npTDMS would believe a *.tdms_index beside it instead of the file.
+    segments = _segments(path)
+    # A chunk of interleaved samples is read and split, and may be the whole segment.
+    check_memory("a segment of samples", 2 * max(segments, default=0), max_memory)
+    # Given a path, npTDMS would read the index of a *.tdms_index in its folder.
     with path.open("rb") as stream, TdmsFile.open(stream) as file:
         channels = [channel for group in file.groups() for channel in group.channels()]
-        _check_sizes(channels, n_bytes)
+        _check_sizes(channels, sum(segments))
         _check_scales([file.properties, *(group.properties for group in file.groups())])
         _check_scales([channel.properties for channel in channels])
         described = _described(channels)
         chosen = choose(described, columns)
-        read = _read(file, {name: channels[k] for name, k in chosen.columns.items()}, stream)
-        metadata = _metadata(file.properties, channels, chosen)
-    return Raw(read, metadata, present(described), chosen.refused)
+        wanted = {name: channels[k] for name, k in chosen.columns.items()}
+        read = _read(file, wanted, path.stat().st_size)
+        metadata = _metadata(file.properties, wanted.values(), chosen)
+    return Content(read, metadata, present(described), chosen.refused)
 
 
-def _check_segments(path: Path) -> int:
-    """Follow the segments to the end of the file, and count the bytes of their samples.
+def _segments(path: Path) -> list[int]:
+    """Follow the segments to the end of the file, and list the bytes of their samples.
 
     Raises
     ------
     Unusable
-        With reason ``corrupt`` where npTDMS would stop reading, and pass over what is missing.
+        With reason ``corrupt`` where npTDMS would stop reading, and ignore the rest.
     """
-    size, at, n_segments, n_bytes = path.stat().st_size, 0, 0, 0
+    size, at = path.stat().st_size, 0
+    found: list[int] = []
     with path.open("rb") as stream:
         while at < size:
             stream.seek(at)
             lead_in = stream.read(_LEAD_IN)
-            where = f"at byte {at} of {size}, after {n_segments} whole segments,"
+            where = f"at byte {at} of {size}, after {len(found)} whole segments,"
             if not lead_in.startswith(_MAGIC):
                 raise Unusable("corrupt", f"{where} no segment begins; copy the file again")
             if len(lead_in) < _LEAD_IN:
@@ -80,9 +93,8 @@ def _check_segments(path: Path) -> int:
             if samples > rest or at + _LEAD_IN + rest > size:
                 raise Unusable("corrupt", f"{where} a segment of {rest} bytes is cut off")
             at += _LEAD_IN + rest
-            n_segments += 1
-            n_bytes += rest - samples
-    return n_bytes
+            found.append(rest - samples)
+    return found
 
 
 def _check_sizes(channels: Sequence[Any], n_bytes: int) -> None:
@@ -105,8 +117,8 @@ def _check_scales(objects: Iterable[Mapping[str, object]]) -> None:
         for key, value in properties.items():
             scale = _SCALE.match(key)
             is_count = key == _N_SCALES or (scale is not None and key.endswith("_Size"))
-            too_many = is_count and not (isinstance(value, int) and value <= _MOST_SCALES)
-            if too_many or (scale is not None and int(scale[1]) > _MOST_SCALES):
+            many = is_count and not (isinstance(value, int) and value <= constants.MOST_SCALES)
+            if many or (scale is not None and int(scale[1]) > constants.MOST_SCALES):
                 raise Unusable(
                     "corrupt", f"{listed([key])} is {str(value)[:20]!r}; export it again"
                 )
@@ -119,38 +131,26 @@ def _described(channels: Sequence[Any]) -> list[Described]:
         Described(
             channel.name if names[channel.name] == 1 else f"{channel.group_name}/{channel.name}",
             str(channel.properties.get("unit_string", "")),
-            _rate(channel.properties.get("wf_increment")),
+            rate_of(channel.properties.get("wf_increment")),
         )
         for channel in channels
     ]
 
 
-def _rate(increment: object) -> float | None:
-    """Turn the interval in s into a rate in Hz."""
-    if not isinstance(increment, int | float) or not 1e-12 < increment < 1e9:
-        return None
-    return 1 / float(increment)
-
-
-def _read(file: Any, chosen: dict[str, Any], stream: IO[bytes]) -> dict[str, Samples]:
+def _read(file: Any, wanted: dict[str, Any], stored: int) -> dict[str, Samples]:
     """Read the wanted channels in one pass, each of shape ``(n_samples,)``."""
-    from nptdms.tdms import ChannelDataChunk
-
-    for name, channel in chosen.items():
+    for name, channel in wanted.items():
         if channel.dtype.kind not in "fiu":
             raise not_numeric(name, f"values of type {channel.dtype}")
-    n_samples = sum(len(channel) for channel in chosen.values())
-    check_size(8 * n_samples, os.fstat(stream.fileno()).st_size)
-    names = {channel.path: name for name, channel in chosen.items()}
-    longest = max(map(len, chosen.values()), default=0)
-    with spools(chosen, expected=longest) as taken:
-        # npTDMS keeps to itself where the samples are.
-        for segment in file._reader._segments:
-            for path, raw in raw_samples(stream, segment, names):
-                name = names[path]
-                # Only asking for its samples scales a chunk.
-                taken[name].append(ChannelDataChunk(chosen[name], raw, taken[name].size)[:])
-        for name, channel in chosen.items():
+    lengths = [len(channel) for channel in wanted.values()]
+    check_size(8 * sum(lengths), stored)
+    with spools(wanted, expected=max(lengths, default=0)) as taken:
+        for chunk in file.data_chunks() if wanted else ():
+            for name, channel in wanted.items():
+                samples = chunk[channel.group_name][channel.name]
+                if len(samples):
+                    taken[name].append(samples[:])
+        for name, channel in wanted.items():
             if taken[name].size != len(channel):
                 raise Unusable(
                     "corrupt", f"{name}: {taken[name].size} of {len(channel)} samples are there"
@@ -158,16 +158,12 @@ def _read(file: Any, chosen: dict[str, Any], stream: IO[bytes]) -> dict[str, Sam
         return {name: spool.samples() for name, spool in taken.items()}
 
 
-def _metadata(
-    properties: dict[str, Any], channels: Sequence[Any], chosen: Chosen
-) -> dict[str, str]:
-    """Take properties of the file under the keys of the contract; what it lacks, the channels'."""
-    starts = [channels[k].properties.get("wf_start_time") for k in chosen.columns.values()]
+def _metadata(properties: dict[str, Any], wanted: Iterable[Any], chosen: Chosen) -> dict[str, str]:
+    """Read properties of the file under the keys of the contract, and the start of its channels."""
+    starts = [channel.properties.get("wf_start_time") for channel in wanted]
     start = next((s for s in starts if isinstance(s, np.datetime64) and s > _EPOCH), None)
-    said = {} if start is None else {"recorded_at": _text(start)}
-    return (
-        said | chosen.metadata | {key: _text(properties[key]) for key in KEYS if key in properties}
-    )
+    own = {key: _text(properties[key]) for key in KEYS if key in properties}
+    return ({} if start is None else {"recorded_at": _text(start)}) | chosen.metadata | own
 
 
 def _text(value: object) -> str:

@@ -1,39 +1,93 @@
-"""UFF58: functions at nodal degrees of freedom in ASCII or binary, of which time records count."""
+"""UFF58: functions at nodal degrees of freedom in ASCII or binary, of which time records are read.
+
+pyuff reads the headers. It drops a data set that is cut off, pairs tags wrongly where a line of
+another data set ends like one, and needs 11 times the processor time and 10 times the memory for
+binary samples (2 and 6 times for ASCII): data sets are found and samples decoded here.
+"""
 
 from __future__ import annotations
 
 import re
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from itertools import accumulate
 from pathlib import Path
 from typing import IO, Any
 
 import numpy as np
 
+from lmshealth._arrays import FloatArray
 from lmshealth.io.buffers import Samples, blocks, spools
 from lmshealth.io.column_map import ColumnMap
-from lmshealth.io.described_channels import Described, choose, present
-from lmshealth.io.formats.uffsets import DataSet, functions, not_kept, numbers
-from lmshealth.io.raw import Format, Raw, missing_library, not_numeric
+from lmshealth.io.formats.content import (
+    Content,
+    Format,
+    check_memory,
+    missing_library,
+    not_numeric,
+)
+from lmshealth.io.formats.unit_channels import Described, choose, present, rate_of
 from lmshealth.io.refusal import Unusable
 
 _START = re.compile(rb"\s*-1[ \t]*\r?\n[ \t]*\d+")
-_END = b"    -1\n"
+_TAG = b"    -1"
+_BLANK = b" \t\r\n\x1a"
+# Lines have 80 characters; binary data may have no line end for long.
+_LONGEST_LINE = 1 << 16
+_FUNCTION, _N_RECORDS = 58, 11
+# Some exporters begin a new line after binary data.
+_AFTER_BINARY = re.compile(rb"\r?\n?    -1[ \t]*(\r|\n|\Z)")
+_N_BYTES = slice(31, 43)
 
-_TIME_RESPONSE = 1
-_UNKNOWN = 0
+# Codes of the headers.
+_TIME_RESPONSE, _UNKNOWN = 1, 0
 _TIME, _ACCELERATION = 17, 12
 _REAL = (2, 4)
 _SECONDS = ("", "none", "s", "sec", "second", "seconds")
 _UNEVEN, _EVEN = 0, 1
 _LITTLE = 1
 
+# Widths of the numbers in a line, by type of the ordinate and spacing of the abscissa.
+_WIDTHS = {
+    (2, _EVEN): (13,) * 6,
+    (2, _UNEVEN): (13,) * 6,
+    (4, _EVEN): (20,) * 4,
+    (4, _UNEVEN): (13, 20, 13, 20),
+}
+_BINARY = {2: "f4", 4: "f8"}
+# Bytes of memory for a byte of ASCII: the text, its lines, the fields of a column, the numbers.
+_ASCII_MEMORY = 4
+
 Header = dict[str, Any]
 
 
-def _load(path: Path, columns: ColumnMap, max_memory: float) -> Raw:
+@dataclass(frozen=True, slots=True)
+class _DataSet:
+    """A function at nodal degrees of freedom.
+
+    Attributes
+    ----------
+    place : int
+        Among all data sets of the file, from 1.
+    header : bytes
+        Tag, number and eleven records, as they are in the file.
+    binary : bool
+        Whether the numbers are binary.
+    start, stop : int
+        Bytes of the file that the numbers take.
+    """
+
+    place: int
+    header: bytes
+    binary: bool
+    start: int
+    stop: int
+
+
+def _load(path: Path, columns: ColumnMap, max_memory: float) -> Content:
     with path.open("rb") as stream:
-        sets = list(functions(stream))
+        sets = list(_data_sets(stream))
         headers = _headers(sets)
         names = _names(headers, sets)
         described = [_describe(header, name) for header, name in zip(headers, names, strict=True)]
@@ -41,23 +95,102 @@ def _load(path: Path, columns: ColumnMap, max_memory: float) -> Raw:
         read: dict[str, Samples] = {}
         stamps: dict[str, Samples] = {}
         for name, k in chosen.columns.items():
+            _check_record(headers[k], sets[k], name, max_memory)
             x, read[name] = _record(stream, sets[k], headers[k], name)
-            if headers[k]["abscissa_spacing"] == _UNEVEN:
+            if x is not None:
                 stamps[name] = x
     if stamps:
-        read["time_s"] = _common(stamps, read)
-    return Raw(read, chosen.metadata, present(described), chosen.refused)
+        first = next(iter(stamps.values()))
+        if len(stamps) < len(read) or not all(_equal(x, first) for x in stamps.values()):
+            raise Unusable(
+                "time", "the records have different time stamps; needed the same for all"
+            )
+        read["time_s"] = first
+    return Content(read, chosen.metadata, present(described), chosen.refused)
 
 
-def _headers(sets: Sequence[DataSet]) -> list[Header]:
-    """Read headers with pyuff, which gets them without the samples: it reads whole files."""
+def _data_sets(stream: IO[bytes]) -> Iterator[_DataSet]:
+    """Find the data sets 58, and check that all data sets are whole.
+
+    Raises
+    ------
+    Unusable
+        With reason ``corrupt`` where tags or numbers of data sets are damaged or cut off.
+    """
+    place = 0
+    while tag := stream.readline(_LONGEST_LINE):
+        if not tag.strip(_BLANK):
+            continue
+        if not _is_tag(tag):
+            at = stream.tell() - len(tag)
+            raise Unusable("corrupt", f"no data set begins at byte {at}; copy the file again")
+        place += 1
+        number = stream.readline(_LONGEST_LINE)
+        if not number.strip(_BLANK):
+            raise _cut_off()
+        if not number[:6].strip().isdigit() or not int(number[:6]):
+            raise Unusable("corrupt", f"data set {place} has no number; copy the file again")
+        if int(number[:6]) != _FUNCTION:
+            _end(stream)
+            continue
+        records = [stream.readline(_LONGEST_LINE) for _ in range(_N_RECORDS)]
+        if any(_is_tag(record) for record in records):
+            raise _malformed(place)
+        start = stream.tell()
+        binary = number[6:7].lower() == b"b"
+        stop = _claimed_end(stream, number) if binary else None
+        if stop is None:
+            stream.seek(start)
+            stop = _end(stream, binary=binary)
+        yield _DataSet(place, b"".join([tag, number, *records]), binary, start, stop)
+
+
+def _malformed(place: int) -> Unusable:
+    return Unusable("corrupt", f"data set {place} does not keep the format 58; export it again")
+
+
+def _is_tag(line: bytes) -> bool:
+    return line.rstrip(_BLANK) == _TAG
+
+
+def _cut_off() -> Unusable:
+    return Unusable("corrupt", "the last data set is cut off; copy the file again")
+
+
+def _claimed_end(stream: IO[bytes], number: bytes) -> int | None:
+    """Find the end of binary data by the number of bytes in the header; None if it is wrong.
+
+    Binary data may contain a tag by chance; but not every program writes their number of bytes.
+    """
+    claim = number[_N_BYTES].strip()
+    if not claim.isdigit():
+        return None
+    stop = stream.tell() + int(claim)
+    stream.seek(stop)
+    found = _AFTER_BINARY.match(stream.read(100))
+    if found is None:
+        return None
+    stream.seek(stop + found.end())
+    return stop
+
+
+def _end(stream: IO[bytes], *, binary: bool = False) -> int:
+    """Find the end of a data set by its tag, and go behind it."""
+    while line := stream.readline(_LONGEST_LINE):
+        if _is_tag(line) or (binary and line.rstrip(_BLANK).endswith(_TAG)):
+            return stream.tell() - len(line) + line.rindex(_TAG)
+    raise _cut_off()
+
+
+def _headers(sets: Sequence[_DataSet]) -> list[Header]:
+    """Read the headers with pyuff, which gets a file without the samples."""
     try:
         import pyuff
     except ImportError as error:
         raise missing_library("UFF58", "pyuff") from error
     with tempfile.TemporaryDirectory(prefix="lmshealth-") as folder:
         path = Path(folder) / "headers.uff"
-        path.write_bytes(b"".join(found.header + _END for found in sets))
+        path.write_bytes(b"".join(found.header + _TAG + b"\n" for found in sets))
         file = pyuff.UFF(str(path))
         if file.get_n_sets() != len(sets):
             raise Unusable("corrupt", "a header looks like the end of a data set; export it again")
@@ -68,11 +201,11 @@ def _header(file: Any, k: int, place: int) -> Header:
     try:
         return dict(file.read_sets(k, header_only=True))
     except Exception as error:  # pyuff raises nothing more specific
-        raise not_kept(place) from error
+        raise _malformed(place) from error
 
 
-def _names(headers: Sequence[Header], sets: Sequence[DataSet]) -> list[str]:
-    """Call the data sets by the first entry of their headers that tells all of them apart."""
+def _names(headers: Sequence[Header], sets: Sequence[_DataSet]) -> list[str]:
+    """Name the data sets by the first entry of their headers that distinguishes all of them."""
     for entry in (
         lambda header: header["id1"],
         lambda header: header["rsp_ent_name"],
@@ -95,7 +228,9 @@ def _describe(header: Header, name: str) -> Described:
     if acceleration:
         # pyuff cannot read a superscript two in the Windows encoding.
         unit = unit.replace("\ufffd", "2")
-    return Described(name, unit, _rate(header), acceleration)
+    uneven = header["abscissa_spacing"] == _UNEVEN
+    rate = None if uneven else rate_of(header["abscissa_inc"])
+    return Described(name, unit, rate, acceleration)
 
 
 def _is_time_record(header: Header) -> bool:
@@ -106,50 +241,61 @@ def _is_time_record(header: Header) -> bool:
     return over_time and header["ord_data_type"] in _REAL
 
 
-def _rate(header: Header) -> float | None:
-    """Turn the interval in s into a rate in Hz; None where the record has time stamps instead."""
-    interval = header["abscissa_inc"]
-    if header["abscissa_spacing"] == _UNEVEN or not 1e-12 < interval < 1e9:
-        return None
-    return 1 / float(interval)
-
-
-def _record(
-    stream: IO[bytes], found: DataSet, header: Header, name: str
-) -> tuple[Samples, Samples]:
-    """Read the abscissa, where it is stored, and the ordinate of one time record.
-
-    Raises
-    ------
-    Unusable
-        With the reasons ``columns``, ``unit`` and ``corrupt``.
-    """
+def _check_record(header: Header, found: _DataSet, name: str, max_memory: float) -> None:
+    """Check that a data set is a time record in s, before it is read."""
     if not _is_time_record(header):
         raise not_numeric(name, f"no time record but the function type {header['func_type']}")
     unit = header["abscissa_axis_units_lab"].strip()
     if unit.lower() not in _SECONDS:
         raise Unusable("unit", f"the abscissa of {name!r} is in {unit!r}; needed s")
     if header["abscissa_spacing"] not in (_UNEVEN, _EVEN):
-        raise not_kept(found.place)
-    uneven = header["abscissa_spacing"] == _UNEVEN
-    little = header.get("byte_ordering") == _LITTLE
-    n, ordinate = header["num_pts"], header["ord_data_type"]
+        raise _malformed(found.place)
+    needed = (found.stop - found.start) * (1 if found.binary else _ASCII_MEMORY)
+    check_memory(f"data set {name[:80]!r}", needed, max_memory)
+
+
+def _record(
+    stream: IO[bytes], found: _DataSet, header: Header, name: str
+) -> tuple[Samples | None, Samples]:
+    """Read the abscissa, where it is stored, and the ordinate of a time record, ``(n,)`` each."""
+    ordinate, spacing, n = header["ord_data_type"], header["abscissa_spacing"], header["num_pts"]
+    stream.seek(found.start)
+    body = stream.read(found.stop - found.start)
+    if found.binary:
+        order = "<" if header.get("byte_ordering") == _LITTLE else ">"
+        dtype = np.dtype(order + _BINARY[ordinate])
+        # A line end behind the numbers makes no number.
+        values: np.ndarray = np.frombuffer(body, dtype, count=len(body) // dtype.itemsize)
+    else:
+        try:
+            values = _fields(body, _WIDTHS[ordinate, spacing])
+        except ValueError as error:
+            raise _malformed(found.place) from error
+    uneven = spacing == _UNEVEN
+    n_found = values.size // 2 if uneven else values.size
+    if n_found != n:
+        raise Unusable("corrupt", f"{name!r}: {n_found} of {n} samples are there")
     with spools("xy", expected=n) as taken:
-        for values in numbers(stream, found, ordinate=ordinate, uneven=uneven, little=little):
-            if uneven:
-                taken["x"].append(values[::2])
-            taken["y"].append(values[1::2] if uneven else values)
-        if taken["y"].size != n:
-            raise Unusable("corrupt", f"{name!r}: {taken['y'].size} of {n} samples are there")
-        return taken["x"].samples(), taken["y"].samples()
+        if uneven:
+            taken["x"].append(values[: 2 * n : 2])
+        taken["y"].append(values[1::2] if uneven else values)
+        return taken["x"].samples() if uneven else None, taken["y"].samples()
 
 
-def _common(stamps: dict[str, Samples], read: dict[str, Samples]) -> Samples:
-    """Find the time stamps that all records share."""
-    first = next(iter(stamps.values()))
-    if len(stamps) < len(read) or not all(_equal(x, first) for x in stamps.values()):
-        raise Unusable("time", "the records have different time stamps; needed the same for all")
-    return first
+def _fields(body: bytes, widths: Sequence[int]) -> FloatArray:
+    """Read numbers in columns, with or without blanks between them, shape ``(n,)``."""
+    length = sum(widths)
+    lines = body.splitlines()
+    text = b"".join([line.ljust(length)[:length] for line in lines])
+    table = np.frombuffer(text, dtype=np.uint8).reshape(len(lines), length)
+    values = np.empty((len(lines), len(widths)))
+    given = np.empty(values.shape, dtype=bool)
+    for k, (width, stop) in enumerate(zip(widths, accumulate(widths), strict=True)):
+        field = table[:, stop - width : stop]
+        # The last line need not be full.
+        given[:, k] = (field != ord(" ")).any(axis=1)
+        values[given[:, k], k] = field[given[:, k]].view(f"S{width}").ravel().astype(np.float64)
+    return values[given]
 
 
 def _equal(one: Samples, other: Samples) -> bool:

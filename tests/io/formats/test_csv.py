@@ -8,9 +8,9 @@ import pandas as pd
 import pytest
 
 from lmshealth.errors import BadLog
+from lmshealth.io import constants
 from lmshealth.io.column_map import ColumnMap, CsvLayout, load_columns
 from lmshealth.io.formats import csv as delimited
-from lmshealth.io.formats import csv as text
 from lmshealth.io.formats.csv import parse_text
 from lmshealth.io.reading import read_log
 from lmshealth.io.refusal import Unusable
@@ -147,7 +147,7 @@ def test_late_blanks(small_blocks):
 )
 def test_late_damage(monkeypatch, rows, word):
     """Damage far behind the head is found as the text streams by."""
-    monkeypatch.setattr(text, "LONGEST_BLOCK", 1 << 21)
+    monkeypatch.setattr(constants, "LONGEST_BLOCK", 1 << 21)
     monkeypatch.setattr(delimited, "_ROWS", 10_000)
     with pytest.raises(Unusable) as caught:
         parse("delta_e_um,b\n" + rows)

@@ -1,15 +1,20 @@
 """TDMS: units, rates and properties of channels; damage that npTDMS passes over."""
 
+import os
 import sys
 import warnings
+from pathlib import Path
 
 import numpy as np
 import pytest
-from nptdms import ChannelObject, RootObject, TdmsWriter
+from nptdms import ChannelObject, RootObject, TdmsFile, TdmsWriter
 
 from lmshealth.errors import BadLog
 from lmshealth.io.column_map import ColumnMap
+from lmshealth.io.formats.registry import load
 from lmshealth.io.reading import read_log
+from lmshealth.io.refusal import Unusable
+from tests.io.handmade import tdms_segment
 
 RATE = {"wf_increment": 1e-3}
 NOISE = np.random.default_rng(0).normal(size=2000)
@@ -195,3 +200,95 @@ def test_without_nptdms(tmp_path, monkeypatch):
     path = write(tmp_path / "log.tdms", ("x", NOISE, RATE))
     monkeypatch.setitem(sys.modules, "nptdms", None)
     refused(path, "format", "lmshealth[formats]")
+
+
+SHORT = NOISE[:240]
+CHANNELS = {
+    "delta_e_um": SHORT,
+    "other": np.arange(240, dtype="i2"),
+    "acc_x_g": SHORT.astype("f4"),
+}
+
+
+def agree(path):
+    """Compare the wanted channels with what npTDMS reads."""
+    columns = load(path, ColumnMap()).columns
+    group = TdmsFile.read(path)["log"]
+    for name in ("delta_e_um", "acc_x_g"):
+        np.testing.assert_array_equal(columns[name], group[name][:])
+    assert set(columns) == {"delta_e_um", "acc_x_g"}
+    return columns
+
+
+@pytest.mark.parametrize("n_chunks", [1, 3, 240])
+@pytest.mark.parametrize("interleaved", [False, True])
+@pytest.mark.parametrize("order", ["<", ">"])
+def test_layouts(tmp_path, order, interleaved, n_chunks):
+    """Chunks one after the other and samples in turns, in either order of bytes."""
+    made = tdms_segment(CHANNELS, order=order, interleaved=interleaved, n_chunks=n_chunks)
+    (tmp_path / "log.tdms").write_bytes(made + made)
+    columns = agree(tmp_path / "log.tdms")
+    np.testing.assert_array_equal(columns["delta_e_um"], np.tile(SHORT, 2))
+
+
+def test_shorter_last_chunk(tmp_path):
+    """A last chunk with half the samples of each channel is read in proportion."""
+    half = b"".join(values[:60].tobytes() for values in CHANNELS.values())
+    made = tdms_segment(CHANNELS, n_chunks=2, extra=half)
+    (tmp_path / "log.tdms").write_bytes(made + tdms_segment(CHANNELS))
+    columns = agree(tmp_path / "log.tdms")
+    np.testing.assert_array_equal(columns["delta_e_um"], np.concatenate([SHORT, SHORT[:60], SHORT]))
+
+
+def test_channels_that_come_and_go(tmp_path):
+    """Text, channels of some segments only, and scaled counts stand between the samples."""
+    scale = {
+        "NI_Number_Of_Scales": 1,
+        "NI_Scale[0]_Scale_Type": "Polynomial",
+        "NI_Scale[0]_Polynomial_Coefficients_Size": 3,
+        "NI_Scale[0]_Polynomial_Coefficients[0]": 1.0,
+        "NI_Scale[0]_Polynomial_Coefficients[1]": 2.0,
+        "NI_Scale[0]_Polynomial_Coefficients[2]": 0.25,
+        "NI_Scale[0]_Polynomial_Input_Source": 0xFFFFFFFF,
+    }
+    path = tmp_path / "log.tdms"
+    counts = np.arange(240, dtype="i2")
+    with TdmsWriter(str(path)) as writer:
+        writer.write_segment(
+            [
+                ChannelObject("log", "said", np.array(["a", "bcd"] * 20)),
+                ChannelObject("log", "delta_e_um", SHORT),
+                ChannelObject("log", "acc_x_g", counts, scale),
+            ]
+        )
+        writer.write_segment([ChannelObject("log", "acc_x_g", counts[:7])])
+        writer.write_segment([ChannelObject("log", "said", np.array(["only text"]))])
+        writer.write_segment([ChannelObject("log", "delta_e_um", SHORT[:9])])
+    columns = agree(path)
+    assert {name: values.size for name, values in columns.items()} == {
+        "delta_e_um": 249,
+        "acc_x_g": 247,
+    }
+    np.testing.assert_array_equal(columns["acc_x_g"][-7:], 1 + 2 * counts[:7] + counts[:7] ** 2 / 4)
+
+
+def test_counts_of_acquisition_cards(needs):
+    """Raw counts of DAQmx are scaled by npTDMS."""
+    needs("data")
+    path = Path(os.environ["LMSHEALTH_DATA"]) / "tdms_reader_samples/raw1.tdms"
+    with TdmsFile.open(path) as file:
+        channel = file.groups()[0].channels()[0]
+        name = channel.name
+        whole = channel[:]
+    columns = ColumnMap(columns={"acc_x_m_s2": name})
+    np.testing.assert_array_equal(load(path, columns).columns[name], whole)
+
+
+def test_limit_of_memory(tmp_path):
+    """A segment that takes more memory than allowed is refused with the next step."""
+    (tmp_path / "log.tdms").write_bytes(tdms_segment(CHANNELS))
+    n_bytes = sum(values.nbytes for values in CHANNELS.values())
+    assert load(tmp_path / "log.tdms", ColumnMap(), 2 * n_bytes).columns
+    with pytest.raises(Unusable, match="convert the file to HDF5 or Parquet, or raise") as caught:
+        load(tmp_path / "log.tdms", ColumnMap(), 2 * n_bytes - 1)
+    assert caught.value.reason == "too-large"

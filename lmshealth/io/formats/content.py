@@ -1,4 +1,4 @@
-"""What every format hands over: columns as they stand in the file, and metadata as text."""
+"""What every format returns: columns as they are in the file, and metadata as text."""
 
 from __future__ import annotations
 
@@ -6,19 +6,16 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
+from lmshealth.io import constants
 from lmshealth.io.buffers import Samples
 from lmshealth.io.column_map import ColumnMap
 from lmshealth.io.log import Refusal
-from lmshealth.io.refusal import Unusable
-
-# Honest recordings are noise and compress by single digits; constant ones are refused anyway.
-LARGEST_RATIO = 200
-SMALL_ENOUGH = 256 << 20
+from lmshealth.io.refusal import Unusable, listed
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Raw:
-    """A file's content before the contract is applied.
+class Content:
+    """Content of a file before the log contract is applied.
 
     Attributes
     ----------
@@ -29,7 +26,7 @@ class Raw:
     present : tuple of str
         All column names of the file, for messages.
     refused : tuple of Refusal
-        Channels that are wanted and cannot go with the others; their log is not named yet.
+        Wanted channels that cannot go with the others; the name of the log is added later.
     hint : str
         What in the column map may not fit the file, where wanted columns are not found.
     """
@@ -48,11 +45,11 @@ class Format:
     Attributes
     ----------
     name : str
-        As users call it.
+        For messages.
     suffixes : tuple of str
         In lower case, with the leading dot.
     sniff : callable
-        Tells by the leading bytes of a file whether it is of this format.
+        Return from the leading bytes of a file whether it has this format.
     load : callable
         Read a file: path, column map, most memory in bytes. It may raise anything:
         `lmshealth.io.formats.registry.load` turns it into a refusal.
@@ -61,40 +58,62 @@ class Format:
     name: str
     suffixes: tuple[str, ...]
     sniff: Callable[[bytes], bool]
-    load: Callable[[Path, ColumnMap, float], Raw]
-
-
-def size_limit(stored: int) -> int:
-    """Bound in bytes for the decoded content of a file of ``stored`` bytes."""
-    return max(SMALL_ENOUGH, LARGEST_RATIO * stored)
+    load: Callable[[Path, ColumnMap, float], Content]
 
 
 def check_size(decoded: int, stored: int) -> None:
-    """Refuse content that would swell to an unreasonable size, before it does.
+    """Refuse content that would decode to an unreasonable size, before it does.
 
     Raises
     ------
     Unusable
         With reason ``too-large``.
     """
-    if decoded > size_limit(stored):
+    limit = max(constants.SMALL_ENOUGH, constants.LARGEST_RATIO * stored)
+    if decoded > limit:
         raise Unusable(
             "too-large",
-            f"{stored} bytes would swell to {decoded} or more, allowed are {size_limit(stored)}; "
+            f"{stored} bytes would swell to {decoded} or more, allowed are {limit}; "
             "split the recording, or check where the file comes from",
         )
 
 
+def check_memory(what: str, needed: float, allowed: float) -> None:
+    """Refuse a part of a file that takes too much memory, before it is read.
+
+    Raises
+    ------
+    Unusable
+        With reason ``too-large``.
+    """
+    if needed > allowed:
+        raise Unusable(
+            "too-large",
+            f"{what} needs {needed / 1e9:.2g} GB of memory, allowed are {allowed / 1e9:.2g} GB; "
+            "convert the file to HDF5 or Parquet, or raise --max-memory",
+        )
+
+
 def wanted(names: Iterable[str], columns: ColumnMap) -> list[str]:
-    """Choose the columns of a file that the contract or the column map ask for."""
-    return [name for name in names if columns.target(name) is not None]
+    """Choose the columns of a file that the contract or the column map ask for.
+
+    Raises
+    ------
+    Unusable
+        With reason ``columns`` where two of them have one name.
+    """
+    every = list(names)
+    chosen = [name for name in every if columns.target(name) is not None]
+    if twice := sorted({name for name in chosen if every.count(name) > 1}):
+        raise Unusable("columns", f"the file names {listed(twice)} more than once")
+    return chosen
 
 
 def missing_library(form: str, library: str) -> Unusable:
-    """Say that the library which reads a format is not installed."""
+    """Return the refusal of a file whose library is not installed."""
     return Unusable("format", f"reading {form} needs {library}: pip install 'lmshealth[formats]'")
 
 
 def not_numeric(column: str, found: str) -> Unusable:
-    """Say that a column that is needed holds something else than numbers."""
+    """Return the refusal of a wanted column that holds no series of numbers."""
     return Unusable("columns", f"column {column!r} holds {found}, needed one number per sample")

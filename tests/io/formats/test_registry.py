@@ -1,6 +1,7 @@
-"""Tables of many minutes take no more memory than a few minutes, and lose nothing."""
+"""Long files of every format: streamed where the format allows it, and without loss."""
 
 import gzip
+import os
 
 import h5py
 import numpy as np
@@ -8,14 +9,17 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
+from lmshealth.io import buffers
 from lmshealth.io.buffers import MINUTE, Stored, blocks
 from lmshealth.io.column_map import ColumnMap
 from lmshealth.io.formats.registry import load
+from lmshealth.io.refusal import Unusable
+from tests.io.handmade import array, element, mat_file, pack, tdms_segment, uff_set
 
 # Values repeat after so many rows, and no block ends where they do.
 PERIOD = 10_007
 # What h5py needs for a sample is a part of what the others need.
-MINUTES = {".h5": 5, ".parquet": 3, ".csv": 2, ".gz": 3}
+MINUTES = {".h5": 5, ".parquet": 3, ".csv": 2, ".gz": 3, ".tdms": 5}
 NAMES = ("delta_e_um", "acc_feed_m_s2")
 
 
@@ -33,6 +37,8 @@ def write(path, n_periods, **options):
                 file.create_dataset(name, data=values, **options)
     elif path.suffix == ".parquet":
         pq.write_table(pa.table(columns), path, **options)
+    elif path.suffix == ".tdms":
+        path.write_bytes(tdms_segment({name: pattern(name) for name in NAMES}) * n_periods)
     else:
         rows = zip(*(pattern(name).tolist() for name in NAMES), strict=True)
         text = "".join(f"{one!r},{other!r},remark\n" for one, other in rows).encode()
@@ -47,6 +53,7 @@ CASES = {
     "chunks.h5": {"chunks": (4096,), "compression": "lzf"},
     "one_group.parquet": {"row_group_size": 10 * MINUTE},
     "groups.parquet": {"row_group_size": MINUTE, "use_dictionary": False},
+    "segments.tdms": {},
     "log.csv": {},
     "log.csv.gz": {},
 }
@@ -70,3 +77,44 @@ def test_long_table(tmp_path, peaks, name):
     own, bare = peaks(short, path)
     allowed = 4 * 8 * MINUTE * len(columns)
     assert own < allowed < bare, (own, bare)
+
+
+def whole(path, values):
+    """Write one column in a format that is decoded as a whole."""
+    body = values.tobytes()
+    if path.suffix == ".uff":
+        path.write_bytes(uff_set(body, values.size, binary=str(len(body))))
+    elif path.suffix == ".tdms":
+        path.write_bytes(tdms_segment({"delta_e_um": values}, interleaved=True))
+    else:
+        mat_file(path, pack(array(6, (values.size, 1), content=element(9, body))))
+    return path
+
+
+@pytest.mark.parametrize("name", ["log.uff", "log.mat", "log.tdms"])
+def test_long_columns_go_to_disk(tmp_path, monkeypatch, name):
+    """What is decoded as a whole does not stay in memory when it is long."""
+    values = np.random.default_rng(0).normal(size=2500)
+    path = whole(tmp_path / name, values)
+    np.testing.assert_array_equal(load(path, ColumnMap()).columns["delta_e_um"], values)
+    monkeypatch.setattr(buffers, "MINUTE", 1000)
+    stored = load(path, ColumnMap()).columns["delta_e_um"]
+    assert isinstance(stored, Stored)
+    np.testing.assert_array_equal(stored[:], values)
+
+
+@pytest.mark.parametrize("name", ["log.uff", "log.mat", "log.tdms"])
+def test_no_file_is_left_open(tmp_path, monkeypatch, name):
+    """A long file that turns out to be damaged leaves no file open."""
+    monkeypatch.setattr(buffers, "MINUTE", 1000)
+    path = whole(tmp_path / name, np.random.default_rng(0).normal(size=2500))
+    content = bytearray(path.read_bytes())
+    if name == "log.mat":
+        content[-100] ^= 1
+    else:
+        content = content[: len(content) // 2]
+    path.write_bytes(content)
+    before = os.listdir("/proc/self/fd")
+    with pytest.raises(Unusable, match=r"cut off|damaged"):
+        load(path, ColumnMap())
+    assert os.listdir("/proc/self/fd") == before

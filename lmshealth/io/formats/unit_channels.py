@@ -1,4 +1,4 @@
-"""Channels that carry their unit beside their name (TDMS, UFF58): which are read, and as what."""
+"""Channels with their unit in a field of the file (TDMS, UFF58): which are read, and as what."""
 
 from __future__ import annotations
 
@@ -7,25 +7,24 @@ from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
-from lmshealth.io.column_map import ColumnMap
+from lmshealth.io import constants
+from lmshealth.io.column_map import ColumnMap, acceleration_unit, parse_column, role_of, unit_key
 from lmshealth.io.log import Refusal
 from lmshealth.io.refusal import Unusable, listed
-from lmshealth.io.time_axis import AGREEMENT
-from lmshealth.io.units import acceleration_unit, parse_column, role_of, unit_key
 
 
 @dataclass(frozen=True, slots=True)
 class Described:
-    """What a file says about one of its channels.
+    """Description of a channel in a file.
 
     Attributes
     ----------
     name : str
-        As in the file; what a column map calls it by.
+        As in the file and in a column map.
     unit : str
-        As in the file; empty where it says none.
+        As in the file; empty where it gives none.
     rate : float or None
-        Sample rate in Hz; None where the channel says none.
+        Sample rate in Hz; None where the channel gives none.
     acceleration : bool
         Whether the file calls it an acceleration, whatever its unit.
     """
@@ -38,27 +37,21 @@ class Described:
 
 @dataclass(frozen=True, slots=True)
 class Chosen:
-    """Which channels make the log.
+    """Channels that make the log.
 
     Attributes
     ----------
     columns : dict of str to int
-        Name as a column of the log to the place among the channels of the file.
-    rate : float or None
-        Their sample rate in Hz.
+        Name as a column of the log to the index among the channels of the file.
+    metadata : dict of str to str
+        Their sample rate, where they give one.
     refused : tuple of Refusal
         Wanted channels of another sample rate.
     """
 
     columns: dict[str, int]
-    rate: float | None
+    metadata: dict[str, str]
     refused: tuple[Refusal, ...]
-
-    @property
-    def metadata(self) -> dict[str, str]:
-        """Give the sample rate as metadata of the log."""
-        # 999.9999999999999 Hz is an artefact of the division.
-        return {} if self.rate is None else {"sample_rate_hz": f"{self.rate:.10g}"}
 
 
 def choose(channels: Sequence[Described], columns: ColumnMap) -> Chosen:
@@ -67,49 +60,48 @@ def choose(channels: Sequence[Described], columns: ColumnMap) -> Chosen:
     Without ``[columns]`` every channel whose unit is an acceleration is read as ``acc_<name>``;
     with it, the named ones and those that keep the contract.
 
-    Parameters
-    ----------
-    channels : sequence of Described
-        All channels of a file.
-    columns : ColumnMap
-        What the user said about them.
-
     Raises
     ------
     Unusable
         With reason ``columns`` where two channels would be one column, ``unit`` where a name
-        contradicts the unit beside it.
+        contradicts the unit of its channel.
     """
     found: dict[str, int] = {}
-    for place, channel in enumerate(channels):
+    for k, channel in enumerate(channels):
         column = _column(channel, columns)
-        if column is None:
-            continue
         if column in found:
             both = listed([channels[found[column]].name, channel.name])
             raise Unusable(
                 "columns", f"{both} would both be read as {column}; rename them or map one of them"
             )
-        found[column] = place
-    rate = _most_common(channels[place].rate for place in found.values())
-    kept = {name: k for name, k in found.items() if _agree(channels[k].rate, rate)}
-    refused = tuple(
-        Refusal(
-            "",
-            "time",
-            f"sampled at {channels[k].rate:.6g} Hz, the log at {rate:.6g} Hz; "
-            "keep channels of one rate in one log",
-            channel=name,
-        )
-        for name, k in found.items()
-        if name not in kept
-    )
-    return Chosen(kept, rate, refused)
+        if column is not None:
+            found[column] = k
+    rate = _most_common(channels[k].rate for k in found.values())
+    if rate is None:
+        return Chosen(found, {}, ())
+    kept, refused = {}, []
+    for name, k in found.items():
+        own = channels[k].rate
+        if own is None or abs(own / rate - 1) <= constants.AGREEMENT:
+            kept[name] = k
+            continue
+        detail = f"sampled at {own:.6g} Hz, the log at {rate:.6g} Hz; "
+        detail += "keep channels of one rate in one log"
+        refused.append(Refusal("", "time", detail, channel=name))
+    # 999.9999999999999 Hz is an artefact of the division.
+    return Chosen(kept, {"sample_rate_hz": f"{rate:.10g}"}, tuple(refused))
 
 
 def present(channels: Iterable[Described]) -> tuple[str, ...]:
-    """Name all channels with their units, for messages."""
+    """List all channels with their units, for messages."""
     return tuple(f"{c.name} [{c.unit}]" if c.unit else c.name for c in channels)
+
+
+def rate_of(interval: object) -> float | None:
+    """Convert an interval in s to a sample rate in Hz; None for an impossible one."""
+    if not isinstance(interval, int | float) or not 1e-12 < interval < 1e9:
+        return None
+    return 1 / float(interval)
 
 
 def _column(channel: Described, columns: ColumnMap) -> str | None:
@@ -129,7 +121,7 @@ def _column(channel: Described, columns: ColumnMap) -> str | None:
 
 
 def _with_unit(channel: Described, columns: ColumnMap) -> str:
-    """Complete a name of the contract by the unit beside it; the two must not contradict."""
+    """Complete a name of the contract by the unit of its channel; the two must agree."""
     unit = unit_key(channel.unit)
     if unit is None or channel.name in columns.units:
         return channel.name
@@ -139,16 +131,12 @@ def _with_unit(channel: Described, columns: ColumnMap) -> str:
         return f"{channel.name}_{unit}"
     if parse_column(own.name, unit).factor != own.factor:
         raise Unusable(
-            "unit", f"channel {channel.name!r} has the unit {channel.unit!r} beside its name"
+            "unit", f"channel {channel.name!r} has the unit {channel.unit!r}; they must agree"
         )
     return channel.name
 
 
 def _most_common(rates: Iterable[float | None]) -> float | None:
-    """Find the rate of most channels, of several the highest; None where no channel says one."""
+    """Return the rate of most channels, of several the highest; None where no channel has one."""
     counts = Counter(rate for rate in rates if rate is not None)
     return max(counts, key=lambda rate: (counts[rate], rate)) if counts else None
-
-
-def _agree(rate: float | None, other: float | None) -> bool:
-    return rate is None or other is None or abs(rate / other - 1) <= AGREEMENT

@@ -1,4 +1,4 @@
-"""What the HDF5 library must not be given: damaged heaps, claims without end, virtual columns."""
+"""HDF5: links and virtual columns, damage that the HDF5 library does not survive, attributes."""
 
 import subprocess
 import sys
@@ -7,9 +7,11 @@ import h5py
 import numpy as np
 import pytest
 
+from lmshealth.errors import BadLog
 from lmshealth.io.column_map import ColumnMap
 from lmshealth.io.formats.hdf5 import Guarded
 from lmshealth.io.formats.registry import load
+from lmshealth.io.reading import read_log
 from lmshealth.io.refusal import Unusable
 
 LIBRARIES = ["earliest", "latest"]
@@ -109,3 +111,83 @@ def test_virtual_columns_end_no_process(tmp_path, library, lists_files):
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     assert done.stdout in ("escapes\nescapes\n", "escapes\ncorrupt\n")
+
+
+def refused(path, reason, *words):
+    """Expect a refusal and look for words in its detail."""
+    with pytest.raises(BadLog) as caught:
+        read_log(path)
+    assert caught.value.reason == reason, caught.value
+    for word in words:
+        assert word in caught.value.detail
+
+
+def test_hdf5_links_are_not_followed(make, tmp_path):
+    """External links, external storage and virtual datasets are refused as escapes."""
+    source = make("source.h5")
+    with h5py.File(tmp_path / "link.h5", "w") as file:
+        file["delta_e_um"] = h5py.ExternalLink(str(source), "delta_e_um")
+    refused(tmp_path / "link.h5", "escapes")
+    (tmp_path / "raw.bin").write_bytes(bytes(800))
+    with h5py.File(tmp_path / "storage.h5", "w") as file:
+        external = [(str(tmp_path / "raw.bin"), 0, 800)]
+        file.create_dataset("delta_e_um", (100,), "f8", external=external)
+    refused(tmp_path / "storage.h5", "escapes")
+    layout = h5py.VirtualLayout((400,), "f8")
+    layout[:] = h5py.VirtualSource(source, "delta_e_um", (400,))
+    with h5py.File(tmp_path / "virtual.h5", "w") as file:
+        file.create_virtual_dataset("delta_e_um", layout)
+    refused(tmp_path / "virtual.h5", "escapes")
+
+
+def test_hdf5_unwritten_blocks(tmp_path):
+    """Blocks that a crashed recorder never wrote are not read as zeros."""
+    with h5py.File(tmp_path / "log.h5", "w") as file:
+        data = file.create_dataset("delta_e_um", (1000,), "f8", chunks=(100,))
+        data[:500] = np.random.default_rng(0).normal(size=500)
+        file.attrs["sample_rate_hz"] = 1000
+    refused(tmp_path / "log.h5", "corrupt", "5 of 10")
+
+
+def test_hdf5_damaged_heap(make):
+    """A heap of strings on which the HDF5 library would never return is refused."""
+    path = make("log.h5")
+    data = bytearray(path.read_bytes())
+    first = data.index(b"GCOL") + 16
+    data[first : first + 2] = bytes(2)
+    data[first + 8 : first + 16] = bytes(8)
+    path.write_bytes(data)
+    refused(path, "corrupt", "heap")
+
+
+def test_hdf5_attributes(make):
+    """Attributes may be text, bytes, numbers or booleans; anything else is refused unread."""
+    path = make("log.h5")
+    with h5py.File(path, "a") as file:
+        file.attrs["travel_km"] = np.float32(1.5)
+        file.attrs["stage"] = np.bytes_(b"demo")
+        file.attrs["servo_id"] = [3]
+        file.attrs["baseline"] = True
+    metadata = read_log(path).metadata
+    assert (metadata.travel, metadata.stage) == (1500.0, "demo")
+    assert (metadata.servo_id, metadata.baseline) == ("3", True)
+    for value in ([1, 2], np.array([[1, 2]], dtype=object)[0, :0]):
+        with h5py.File(path, "a") as file:
+            file.attrs.create("servo_id", value, dtype="i8")
+        refused(path, "metadata", "servo_id")
+    with h5py.File(path, "a") as file:
+        data = np.empty((), dtype=object)
+        data[()] = np.arange(3)
+        file.attrs.create("servo_id", data, dtype=h5py.vlen_dtype("i8"))
+    refused(path, "metadata", "servo_id")
+
+
+@pytest.mark.parametrize("kind", ["text", "group", "matrix"])
+def test_hdf5_column_that_is_no_series(tmp_path, kind):
+    """Strings, groups and matrices under a signal's name are named."""
+    with h5py.File(tmp_path / "log.h5", "w") as file:
+        if kind == "group":
+            file.create_group("delta_e_um")
+        else:
+            file["delta_e_um"] = ["a", "b"] if kind == "text" else np.zeros((3, 3))
+    refused(tmp_path / "log.h5", "columns", "delta_e_um")
