@@ -10,7 +10,7 @@ import pytest
 from click.testing import CliRunner
 
 from lmshealth.batch.run import run
-from lmshealth.batch.store import Store, StoreError, beside
+from lmshealth.batch.store import Store, StoreError, default_url
 from lmshealth.cli.main import main
 from lmshealth.errors import BadStage
 from lmshealth.report.fleet_page import file_names
@@ -101,7 +101,7 @@ def test_a_link_is_no_store(tmp_path: Path) -> None:
     """The store in the output is never somewhere else, whether the link's end is there or not."""
     (tmp_path / "lmshealth.sqlite").symlink_to(tmp_path / "elsewhere")
     with pytest.raises(StoreError, match="is a link"):
-        beside(tmp_path)
+        default_url(tmp_path)
     assert not (tmp_path / "elsewhere").exists()
 
 
@@ -109,8 +109,8 @@ def test_a_link_is_no_store(tmp_path: Path) -> None:
 def test_sql_in_names_is_text(tmp_path: Path, store_url: str) -> None:
     """Names that hold statements are kept and found as they are, in either kind of store."""
     store = Store(store_url)
-    refused = store.keep_refused(())
+    refused = store.put_refused(())
     for name in MACHINES:
-        store.tell(name, "0" * 64, refused)
-    assert sorted(one.machine for one in store.told()) == sorted(MACHINES)
+        store.publish(name, ["0" * 64], refused)
+    assert sorted(one.machine for one in store.published()) == sorted(MACHINES)
     store.close()

@@ -1,10 +1,10 @@
-"""Assessing one machine: from its readings to its verdict, wherever the work is done."""
+"""Assessment of machines: track, health, prognosis, verdict, and the update by the fleet prior."""
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import Executor
+from collections.abc import Callable, Container, Iterable, Iterator, Sequence
+from concurrent.futures import CancelledError, Executor
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, TypeVar
@@ -12,13 +12,19 @@ from typing import Any, TypeVar
 from numpy.linalg import LinAlgError
 
 from lmshealth._serialize import VERSION, fingerprint, pack
-from lmshealth.batch.store import Identified, Made, read
+from lmshealth.batch.ingest import LogKey, Resources, unexpected
+from lmshealth.batch.store import Identified, PackedAssessment, Store, unpack_or_none
 from lmshealth.errors import LmshealthError
 from lmshealth.health.ensemble_sampling import seed_of
 from lmshealth.health.inference import epochs_to_infer, infer
 from lmshealth.health.results import Health
 from lmshealth.health.verdict import judge
-from lmshealth.prognosis.fleet_prior import FleetPrior, MachineEvidence, machine_evidence
+from lmshealth.prognosis.fleet_prior import (
+    FleetPrior,
+    MachineEvidence,
+    fleet_priors,
+    machine_evidence,
+)
 from lmshealth.prognosis.remaining_life import prognose, prognose_with_posterior
 from lmshealth.prognosis.results import Prognosis
 from lmshealth.report.assessment import Assessment
@@ -29,85 +35,16 @@ from lmshealth.tracking.history import History, LogEstimates, build_history, mis
 from lmshealth.tracking.maintenance import NO_MAINTENANCE, Maintenance, maintenance_notes
 from lmshealth.tracking.track import Track, accepted_estimates, outlier_refusals, track
 
+PackedLogs = tuple[tuple[str, bytes], ...]
+"""Names of logs, and their packed estimates."""
+
 Part = TypeVar("Part")
+Work = TypeVar("Work")
 
 _logger = logging.getLogger(__name__)
 
 
-@dataclass(frozen=True, slots=True)
-class Machine:
-    """One machine of a run, and all that its assessment depends on.
-
-    Attributes
-    ----------
-    name : str
-        Its identity.
-    logs : tuple of (str, str)
-        Names of its logs, and the keys of their readings.
-    stage : Stage
-        Its description.
-    work : Maintenance
-        What was done to it.
-    epochs : int
-        Health is inferred at no more than this many.
-    seed : int
-        Of all randomness.
-    """
-
-    name: str
-    logs: tuple[tuple[str, str], ...]
-    stage: Stage
-    work: Maintenance
-    epochs: int
-    seed: int
-
-    @property
-    def key(self) -> str:
-        """Name of its assessment."""
-        given = self.logs, self.stage.digest, self.work, self.epochs, self.seed
-        return fingerprint(VERSION, *given)
-
-
-def unpacked(logs: Sequence[tuple[str, bytes]]) -> list[LogEstimates]:
-    """Rebuild readings from what a store has of them, under the present names of their logs."""
-    found = [(log, read(content, Identified)) for log, content in logs]
-    named = [own.named(log).outcome for log, own in found if own is not None]
-    return [reading for reading in named if isinstance(reading, LogEstimates)]
-
-
-def make(
-    machine: Machine, logs: Sequence[tuple[str, bytes]], executor: Executor | None = None
-) -> Made:
-    """Assess a machine from its packed readings, and pack what comes of it."""
-    options = {"epochs": machine.epochs, "seed": machine.seed}
-    readings = unpacked(logs)
-    return packed(assess(readings, machine.stage, machine.work, **options, executor=executor))
-
-
-def packed(assessment: Assessment) -> Made:
-    """Pack an assessment for the store."""
-    return Made(pack(assessment), pack(assessment.evidence), pack(reported(assessment)))
-
-
-def with_fleet_prior(content: bytes, learned: FleetPrior) -> Made | None:
-    """Foretell a machine anew, from its packed assessment, with what its fleet has taught it.
-
-    Returns
-    -------
-    Made or None
-        None where this version cannot read the assessment.
-
-    Raises
-    ------
-    LmshealthError
-        If its life cannot be fitted with that prior.
-    """
-    found: Assessment | None = read(content, Assessment)
-    if found is None or found.track is None:
-        return None
-    history, stage = accepted_estimates(found.history, found.track), learned.apply_to(found.stage)
-    prognosis = prognose(history, stage, seed_of(found.seed, history.stage, stage.digest))
-    return packed(replace(found, prognosis=prognosis, fleet=learned))
+# One machine
 
 
 def assess(
@@ -119,31 +56,31 @@ def assess(
     seed: int = 0,
     executor: Executor | None = None,
 ) -> Assessment:
-    """Take the readings of one machine through tracking, health, prognosis and verdict.
+    """Compute track, health, prognosis and verdict of one machine.
 
     Parameters
     ----------
     readings : sequence of LogEstimates
-        Logs of one machine, at least one.
+        Modal estimates of the logs of one machine, at least one.
     stage : Stage
         Its description.
     work : Maintenance
-        What was done to it.
+        Maintenance done to it.
     epochs : int
-        Health is inferred at no more than this many.
+        Most epochs at which health is inferred.
     seed : int
-        Of all randomness.
+        Of all random numbers.
     executor : Executor, optional
-        Epochs are spread over it.
+        Runs epochs side by side.
 
     Returns
     -------
     Assessment
-        What the data do not carry is None, with the reason among the notes.
+        Results that the data do not support are None, with the reason among the notes.
 
     Examples
     --------
-    Two logs are not enough for a baseline, and that is what is said:
+    Two logs are not enough for a baseline, and the verdict states that:
 
     >>> import lmshealth
     >>> from lmshealth import examples
@@ -157,28 +94,38 @@ def assess(
     history, refused = build_history(readings, stage, work.actions)
     notes = maintenance_notes(work, [reading.metadata.recorded_at for reading in readings])
     notes += missing_mode_notes(history, refused)
-    partial = [refusal for reading in readings for refusal in reading.modes.refused]
+    not_excited = [refusal for reading in readings for refusal in reading.modes.refused]
     own_seed = seed_of(seed, history.stage, stage.digest)
-    found = _results(history, stage, epochs, own_seed, executor, notes)
-    followed, health, prognosis, evidence = found
-    if followed is not None:
-        refused += outlier_refusals(history, followed)
+    found = _results(history, stage, epochs, own_seed, executor)
+    if found.track is not None:
+        refused += outlier_refusals(history, found.track)
     by_log = {reading.log: reading for reading in readings}
     used = [by_log[log] for log in history.logs]
     return Assessment(
         stage=stage,
         history=history,
         digests=tuple(reading.digest for reading in used),
-        track=followed,
-        health=health,
-        prognosis=prognosis,
-        judgement=judge(stage, history, health, followed),
-        refused=tuple([*partial, *refused]),
-        notes=tuple(notes),
+        track=found.track,
+        health=found.health,
+        prognosis=found.prognosis,
+        judgement=judge(stage, history, found.health, found.track),
+        refused=tuple([*not_excited, *refused]),
+        notes=(*notes, *found.notes),
         seed=seed,
         waterfall=Waterfall.stack([(reading.levels, reading.modes.lines) for reading in used]),
-        evidence=evidence,
+        evidence=found.evidence,
     )
+
+
+@dataclass(frozen=True, slots=True)
+class _Results:
+    """Results of one machine up to the first that fails; the notes state why it does."""
+
+    track: Track | None = None
+    health: Health | None = None
+    prognosis: Prognosis | None = None
+    evidence: MachineEvidence | None = None
+    notes: tuple[str, ...] = ()
 
 
 def _results(
@@ -187,49 +134,298 @@ def _results(
     most_epochs: int,
     seed: tuple[int, int],
     executor: Executor | None,
-    notes: list[str],
-) -> tuple[Track | None, Health | None, Prognosis | None, MachineEvidence | None]:
-    """Go as far as the data carry; what stops it becomes a note."""
-    followed: Track | None = None
-    health: Health | None = None
+) -> _Results:
+    found = _Results()
     try:
-        followed = track(history, stage)
-        history = accepted_estimates(history, followed)
+        tracked = track(history, stage)
+        found = replace(found, track=tracked)
+        history = accepted_estimates(history, tracked)
         if not stage.parameters:
-            return followed, None, None, None
-        # The life needs the longest of all: it is begun before the epochs and fetched after them.
+            return found
+        # The prognosis takes longest: it is begun before the epochs and fetched after them.
         has_limit = any(parameter.limit for parameter in stage.parameters)
-        mapper = map if executor is None else partial(map_parts, executor)
-        life = mapper(_foretold, [history], [stage], [seed]) if has_limit else None
-        epochs = epochs_to_infer(followed, stage, most_epochs)
-        health = infer(followed, stage, seed, epochs=epochs, mapper=mapper)
+        mapper = map if executor is None else partial(map_in_order, executor)
+        life = mapper(_prognose, [history], [stage], [seed]) if has_limit else None
+        epochs = epochs_to_infer(tracked, stage, most_epochs)
+        found = replace(found, health=infer(tracked, stage, seed, epochs=epochs, mapper=mapper))
         if life is None:
-            return followed, health, None, None
-        return followed, health, *next(iter(life))
+            return found
+        prognosis, evidence = next(iter(life))
+        return replace(found, prognosis=prognosis, evidence=evidence)
     except LmshealthError as error:
-        notes.append(str(error))
+        return replace(found, notes=(str(error),))
     except LinAlgError as error:  # one machine must not end the run
-        notes.append(
-            f"{history.stage}: its logs lead to a matrix without an inverse ({error}); please "
-            "report this with modes.csv"
+        why = (
+            f"{history.stage}: its logs lead to a singular matrix ({error}); please report this "
+            "with modes.csv"
         )
-    return followed, health, None, None
+        return replace(found, notes=(why,))
 
 
-def map_parts(
+def map_in_order(
     executor: Executor, function: Callable[..., Part], *columns: Iterable[Any]
 ) -> Iterator[Part]:
-    """Apply a function to columns of arguments side by side; yield the results in their order.
+    """Apply a function to columns of arguments in parallel; yield the results in order.
 
-    Other than ``Executor.map`` it cancels nothing, which loky does not expect of one that ends.
+    Other than ``Executor.map`` it cancels no future when it is interrupted: an executor of loky
+    that is shut down afterwards would log that as an error of its own.
     """
     futures = [executor.submit(function, *row) for row in zip(*columns, strict=True)]
     return (future.result() for future in futures)
 
 
-def _foretold(
+def _prognose(
     history: History, stage: Stage, seed: tuple[int, int]
 ) -> tuple[Prognosis, MachineEvidence]:
-    """Prognose, and say what the life teaches of others: less to send than the life itself."""
-    prognosis, life = prognose_with_posterior(history, stage, seed)
-    return prognosis, machine_evidence(stage, life)
+    """Return the prognosis and the evidence for a fleet prior: smaller than the posterior."""
+    prognosis, posterior = prognose_with_posterior(history, stage, seed)
+    return prognosis, machine_evidence(stage, posterior)
+
+
+# All machines of a run
+
+
+@dataclass(frozen=True, slots=True)
+class Machine:
+    """One machine of a run, and all that its assessment depends on.
+
+    Attributes
+    ----------
+    name : str
+        Its identity.
+    logs : tuple of LogKey
+        Names of its logs, and the keys of their estimates.
+    stage : Stage
+        Its description.
+    work : Maintenance
+        Maintenance done to it.
+    epochs : int
+        Most epochs at which health is inferred.
+    seed : int
+        Of all random numbers.
+    """
+
+    name: str
+    logs: tuple[LogKey, ...]
+    stage: Stage
+    work: Maintenance
+    epochs: int
+    seed: int
+
+    @property
+    def key(self) -> str:
+        """Key of its assessment in a store."""
+        inputs = self.logs, self.stage.digest, self.work, self.epochs, self.seed
+        return fingerprint(VERSION, *inputs)
+
+
+@dataclass(frozen=True, slots=True)
+class FleetUpdate:
+    """Outcome of `apply_fleet_priors`.
+
+    Attributes
+    ----------
+    keys : dict of str to str
+        Key of the assessment of each machine that is to be published.
+    failed : dict of str to str
+        Machines whose prognosis could not be recomputed, and why: they keep the one from before.
+    """
+
+    keys: dict[str, str]
+    failed: dict[str, str]
+
+
+def assess_all(
+    machines: Sequence[Machine], resources: Resources, *, force: bool = False
+) -> dict[str, str]:
+    """Assess every machine whose assessment is not in the store.
+
+    Parameters
+    ----------
+    machines : sequence of Machine
+        With all that their assessments depend on.
+    resources : Resources
+        Its store has the estimates of their logs, and receives the assessments.
+    force : bool
+        Assess machines whose assessment is in the store, too.
+
+    Returns
+    -------
+    dict of str to str
+        Machines that could not be assessed, and why: one must not end the batch.
+    """
+    store, failed = resources.store, dict[str, str]()
+    left = [m for m in machines if force or not store.has_assessment(m.name, m.key)]
+    n_cached = len(machines) - len(left)
+    resources.progress("assessing", n_cached, len(machines))
+    for k, (machine, made) in enumerate(_assessed(left, resources), start=1):
+        if isinstance(made, PackedAssessment):
+            store.put_assessment(machine.name, machine.key, made)
+        else:
+            failed[machine.name] = made
+        resources.progress("assessing", n_cached + k, len(machines))
+    return failed
+
+
+def _assessed(
+    machines: Sequence[Machine], resources: Resources
+) -> Iterator[tuple[Machine, PackedAssessment | str]]:
+    """Assess machines in parallel; where they are fewer than workers, the parts of each."""
+    pool = resources.pool
+    jobs = ((machine, packed_logs(machine, resources.store)) for machine in machines)
+    if pool.executor is None or len(machines) >= pool.size:
+        for (machine, _), made in pool.map_unordered(_assess_packed, jobs, _reason):
+            yield machine, made
+        return
+    for machine, logs in jobs:
+        try:
+            yield machine, _assess_packed((machine, logs), pool.executor, pool.crashes)
+        except pool.crashes:  # a worker was killed: without workers it only takes longer
+            yield machine, _assess_packed((machine, logs))
+
+
+def packed_logs(machine: Machine, store: Store) -> PackedLogs:
+    """Fetch the names and the packed estimates of the logs of a machine."""
+    contents = dict(store.packed_identified(key for _, key in machine.logs))
+    return tuple((log, contents[key]) for log, key in machine.logs if key in contents)
+
+
+def unpack_logs(logs: PackedLogs) -> list[LogEstimates]:
+    """Decode estimates, under the present names of their logs."""
+    found = [(log, unpack_or_none(content, Identified)) for log, content in logs]
+    outcomes = [own.renamed(log).outcome for log, own in found if own is not None]
+    return [outcome for outcome in outcomes if isinstance(outcome, LogEstimates)]
+
+
+def pack_assessment(assessment: Assessment) -> PackedAssessment:
+    """Encode an assessment for the store."""
+    evidence, summary = pack(assessment.evidence), pack(reported(assessment))
+    return PackedAssessment(pack(assessment), evidence, summary)
+
+
+def _assess_packed(
+    job: tuple[Machine, PackedLogs],
+    executor: Executor | None = None,
+    crashes: tuple[type[Exception], ...] = (),
+) -> PackedAssessment | str:
+    """Assess a machine; return why it fails, but raise what workers fail of."""
+    machine, logs = job
+    options = {"epochs": machine.epochs, "seed": machine.seed}
+    return _reason_if_failed(
+        lambda: pack_assessment(
+            assess(unpack_logs(logs), machine.stage, machine.work, **options, executor=executor)
+        ),
+        machine.name,
+        (CancelledError, *crashes),
+    )
+
+
+def apply_fleet_priors(
+    machines: Sequence[Machine], resources: Resources, *, force: Container[str] = ()
+) -> FleetUpdate:
+    """Recompute the prognosis of young machines with the prior of their fleet.
+
+    A fleet is all machines of one description.
+
+    Parameters
+    ----------
+    machines : sequence of Machine
+        All machines of the run that are assessed.
+    resources : Resources
+        Its store has their evidence and assessments.
+    force : container of str
+        Names of machines that are updated although the result is in the store.
+    """
+    store, failed = resources.store, dict[str, str]()
+    keys = {machine.name: machine.key for machine in machines}
+    left = []
+    for machine, prior in _machines_to_update(machines, store):
+        key = fingerprint(machine.key, prior)
+        if machine.name not in force and store.has_assessment(machine.name, key):
+            keys[machine.name] = key
+        else:
+            left.append((machine, prior, key))
+    if left:
+        resources.progress("fleet priors", 0, len(left))
+    updates = (
+        (machine.name, key, store.assessment(machine.name, machine.key), prior)
+        for machine, prior, key in left
+    )
+    done = resources.pool.map_unordered(_update, updates, _reason)
+    for k, ((name, key, _, _), made) in enumerate(done, start=1):
+        if isinstance(made, PackedAssessment):
+            store.put_assessment(name, key, made)
+            keys[name] = key
+        elif made is not None:
+            failed[name] = made
+        resources.progress("fleet priors", k, len(left))
+    return FleetUpdate(keys, failed)
+
+
+def _machines_to_update(
+    machines: Sequence[Machine], store: Store
+) -> Iterator[tuple[Machine, FleetPrior]]:
+    """Find the machines of each description that need a fleet prior, and their priors."""
+    fleets: dict[str, dict[str, Machine]] = {}
+    for machine in machines:
+        fleets.setdefault(machine.stage.digest, {})[machine.name] = machine
+    for fleet in fleets.values():
+        evidence = {}
+        for name, machine in fleet.items():
+            content = store.evidence(name, machine.key)
+            own = None if content is None else unpack_or_none(content, MachineEvidence | None)
+            if own is not None:
+                evidence[name] = own
+        if evidence:
+            stage = next(iter(fleet.values())).stage
+            yield from (
+                (fleet[name], prior) for name, prior in fleet_priors(stage, evidence).items()
+            )
+
+
+def _update(job: tuple[str, str, bytes | None, FleetPrior]) -> PackedAssessment | str | None:
+    """Recompute the prognosis of a machine; return why it fails."""
+    name, _, content, prior = job
+    if content is None:
+        return None
+    return _reason_if_failed(lambda: with_fleet_prior(content, prior), name)
+
+
+def with_fleet_prior(content: bytes, prior: FleetPrior) -> PackedAssessment | None:
+    """Recompute the prognosis of a packed assessment with a fleet prior.
+
+    Returns
+    -------
+    PackedAssessment or None
+        None where this version cannot decode the assessment.
+
+    Raises
+    ------
+    LmshealthError
+        If its life cannot be fitted with that prior.
+    """
+    found: Assessment | None = unpack_or_none(content, Assessment)
+    if found is None or found.track is None:
+        return None
+    history, stage = accepted_estimates(found.history, found.track), prior.apply_to(found.stage)
+    prognosis = prognose(history, stage, seed_of(found.seed, history.stage, stage.digest))
+    return pack_assessment(replace(found, prognosis=prognosis, fleet=prior))
+
+
+def _reason(job: object, why: str) -> str:
+    return why
+
+
+def _reason_if_failed(
+    work: Callable[[], Work], name: str, raised: tuple[type[BaseException], ...] = ()
+) -> Work | str:
+    """Return the result of a work, or why it fails; raise only certain exceptions."""
+    try:
+        return work()
+    except raised:
+        raise
+    except LmshealthError as error:
+        return str(error)
+    except Exception as error:
+        _logger.exception("%s", name)
+        return unexpected(error, "its logs")

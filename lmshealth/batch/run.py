@@ -1,19 +1,18 @@
-"""The main job: a folder of logs to tables and a report."""
+"""Run over an archive: from a folder of logs to tables and a report."""
 
 from __future__ import annotations
 
-from collections.abc import Container, Iterable, Iterator, Sequence
+from collections.abc import Container, Iterable, Sequence
 from contextlib import AbstractContextManager, closing
 from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath
 from tempfile import TemporaryFile
 
-from lmshealth.batch.assess import Machine
-from lmshealth.batch.database import StoreError
-from lmshealth.batch.ingest import Intake, Progress, Site, take_in
-from lmshealth.batch.machines import assess_all, logs_of, tell_all, update_priors
-from lmshealth.batch.store import Store, beside
-from lmshealth.batch.telling import Content, Tables, Telling
+from lmshealth.batch import constants
+from lmshealth.batch.assess import Machine, apply_fleet_priors, assess_all, packed_logs
+from lmshealth.batch.ingest import Ingested, Progress, Resources, ingest
+from lmshealth.batch.outputs import MachineRecord, Tables, write_pages
+from lmshealth.batch.store import Store, StoreError, default_url
 from lmshealth.batch.workers import Pool, cluster, processes
 from lmshealth.errors import LmshealthError, NothingUsable
 from lmshealth.io.column_map import ColumnMap
@@ -28,20 +27,20 @@ from lmshealth.tracking.maintenance import Maintenance, read_maintenance
 
 @dataclass(frozen=True, slots=True)
 class Settings:
-    """How a run is carried out.
+    """Settings of a run.
 
     Attributes
     ----------
     store : str or None
-        SQLAlchemy URL; None for a SQLite file beside the output.
+        SQLAlchemy URL; None for a SQLite file in the folder of the output.
     workers : int
         Processes of this machine; results do not depend on it.
     scheduler : str or None
-        Address of a Dask scheduler, whose workers then take the place of processes.
+        Address of a Dask scheduler, whose workers replace the processes.
     epochs : int
-        Health is inferred at no more than this many epochs per stage.
+        Most epochs per machine at which health is inferred.
     seed : int
-        Of all randomness.
+        Of all random numbers.
     columns : ColumnMap or None
         How logs are read; None where their columns are those of the log contract.
     max_memory : float
@@ -56,7 +55,7 @@ class Settings:
     Settings(workers=2, scheduler=None, epochs=40, seed=0, columns=None, max_memory=2000000000.0)
     """
 
-    store: str | None = field(default=None, repr=False)  # it may hold a password
+    store: str | None = field(default=None, repr=False)  # it may contain a password
     workers: int = 1
     scheduler: str | None = None
     epochs: int = 40
@@ -65,26 +64,26 @@ class Settings:
     max_memory: float = MAX_MEMORY
 
     def pool(self) -> AbstractContextManager[Pool]:
-        """Open what does the work."""
+        """Open the workers."""
         return cluster(self.scheduler) if self.scheduler else processes(self.workers)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RunResult:
-    """What a run did.
+    """Result of a run.
 
     Attributes
     ----------
     index : Path
-        The front page of the report.
+        Front page of the report.
     rows : tuple of Summary
-        One per machine, worst first.
+        One per machine, most urgent first.
     n_logs, n_refused, n_remembered : int
-        Different logs found, refused as a whole, and taken from the store.
+        Distinct logs found, refused as a whole, and taken from the store.
     n_unread : int
-        Rows of manifests and of maintenance that are not understood, or whole such tables.
+        Rows of ``manifest.csv`` and ``maintenance.csv`` that cannot be read, or whole such tables.
     failed : dict of str to str
-        Machines that could not be assessed, or told, and why.
+        Machines that could not be assessed or reported, and why.
     """
 
     index: Path
@@ -97,7 +96,7 @@ class RunResult:
 
     @property
     def pages(self) -> tuple[Path, ...]:
-        """Pages of the machines, which lie beside the index."""
+        """Pages of the machines, in the folder of the index."""
         return tuple(self.index.with_name(row.file) for row in self.rows)
 
 
@@ -106,31 +105,31 @@ def run(
     stages: Sequence[Stage],
     out: Path,
     settings: Settings = Settings(),
-    progress: Progress = lambda what, done, total: None,
+    progress: Progress = lambda step, done, total: None,
 ) -> RunResult:
     """Analyse a folder of logs and write tables and report.
 
     Parameters
     ----------
     folder : Path
-        Read recursively; ``manifest.csv`` and ``maintenance.csv`` are understood.
+        Read recursively, with its ``manifest.csv`` and ``maintenance.csv``.
     stages : sequence of Stage
-        Each log goes to the first description that takes it.
+        Each log is read with the first description that matches it.
     out : Path
-        Folder of the output, made if needed.
+        Folder of the output, created if needed.
     settings : Settings
-        How to do it.
+        Store, workers, seed and how logs are read.
     progress : callable
-        Told what is going on.
+        Called as the run proceeds.
 
     Raises
     ------
     NothingUsable
-        If there is no log, or every log was refused; ``refused.csv`` is written all the same.
+        If there is no log, or every log was refused; ``refused.csv`` is written nevertheless.
 
     Examples
     --------
-    A folder of one log, of noise alone: no mode is made up, and the pages say so.
+    A folder of one log that contains only noise: no mode is excited.
 
     >>> from pathlib import Path
     >>> import numpy as np
@@ -151,36 +150,31 @@ def run(
     """
     _prepare(out)
     work = read_maintenance(folder)
-    with settings.pool() as pool, closing(Store(settings.store or beside(out))) as store:
-        site = Site(store, pool, progress)
-        taken = take_in(
-            folder,
-            stages,
-            site,
-            out=out,
-            columns=settings.columns,
-            max_memory=settings.max_memory,
-        )
-        refused = (*taken.refused, *work.refused)
-        machines = _machines(taken, stages, work, settings)
-        failed = assess_all(machines, site)
+    with settings.pool() as pool, closing(Store(settings.store or default_url(out))) as store:
+        resources = Resources(store, pool, progress)
+        columns, limit = settings.columns, settings.max_memory
+        ingested = ingest(folder, stages, resources, out=out, columns=columns, max_memory=limit)
+        refused = (*ingested.refused, *work.refused)
+        machines = _machines(ingested, stages, work, settings)
+        failed = assess_all(machines, resources)
         usable = [machine for machine in machines if machine.name not in failed]
-        rows, contradicted = _report(usable, refused, site, out, failed)
+        published = _report(usable, refused, resources, out)
     copies = {refusal.log for refusal in refused if refusal.reason == "duplicate"}
-    lost = ({refusal.log for refusal in refused} - copies | contradicted) & taken.logs
+    lost = ({refusal.log for refusal in refused} - copies | published.excluded) & ingested.logs
     if not machines:
         raise NothingUsable(
-            f"{folder}: no usable log: {len(taken.logs)} found, {len(lost)} refused"
+            f"{folder}: no usable log: {len(ingested.logs)} found, {len(lost)} refused"
             f"{_commonest(refused, lost)}; {out / 'refused.csv'} lists all"
         )
+    rows = tuple(by_urgency(published.rows.values()))
     return RunResult(
         index=write_index(out, rows, refused),
         rows=rows,
-        n_logs=len(taken.logs - copies),
+        n_logs=len(ingested.logs - copies),
         n_refused=len(lost),
-        n_remembered=taken.n_remembered,
+        n_remembered=ingested.n_cached,
         n_unread=sum(PurePosixPath(refusal.log).name in NOT_LOGS for refusal in refused),
-        failed=failed,
+        failed=failed | published.failed,
     )
 
 
@@ -188,7 +182,7 @@ def report(
     store: Store,
     out: Path,
     settings: Settings = Settings(),
-    progress: Progress = lambda what, done, total: None,
+    progress: Progress = lambda step, done, total: None,
 ) -> RunResult:
     """Write the pages of all machines in a store, without their logs.
 
@@ -197,61 +191,61 @@ def report(
     store : Store
         Filled by `run`.
     out : Path
-        Folder of the pages, made if needed.
+        Folder of the pages, created if needed.
     settings : Settings
-        Who does the work.
+        Its workers write the pages.
     progress : callable
-        Told what is going on.
+        Called as the report proceeds.
 
     Raises
     ------
     StoreError
-        If there is no assessment that this version can read.
+        If there is no assessment that this version can decode.
     """
     _prepare(out)
-    told = store.told()
-    files = file_names([one.machine for one in told])
+    present = store.published()
+    files = file_names([one.machine for one in present])
     rows, failed = dict[str, Summary](), dict[str, str]()
-    progress("reporting", 0, len(told))
+    progress("reporting", 0, len(present))
     # A process takes longer to start than a page to write.
-    few = replace(settings, workers=min(settings.workers, len(told)))
+    few = replace(settings, workers=min(settings.workers, len(present)))
     with few.pool() as pool:
-        contents = (
-            Content(
+        records = (
+            MachineRecord(
                 machine=one.machine,
                 file=files[one.machine],
                 assessment=store.assessment(one.machine, one.key),
                 logs=(),
-                before=store.earlier(one.machine, one.key),
+                before=store.previous_summary(one.machine, one.key),
             )
-            for one in told
+            for one in present
         )
-        for name, telling in tell_all(contents, pool, out):
-            if isinstance(telling, str):
-                failed[name] = telling
+        for name, output in write_pages(records, pool, out):
+            if isinstance(output, str):
+                failed[name] = output
             else:
-                rows[name] = telling.page.summary
-            progress("reporting", len(rows) + len(failed), len(told))
+                rows[name] = output.page.summary
+            progress("reporting", len(rows) + len(failed), len(present))
     if not rows and not failed:
         raise StoreError(
-            "the store holds only what another version of lmshealth kept; `lmshealth run LOGS "
-            "--store URL` fills it anew"
+            "the store holds only results of another version of lmshealth; `lmshealth run LOGS "
+            "--store URL` fills it"
         )
     ranked = tuple(by_urgency(rows.values()))
     unread = "not readable for this version of lmshealth; run its logs again"
     return RunResult(
-        index=write_index(out, ranked, store.refused(one.refused for one in told)),
+        index=write_index(out, ranked, store.refused(one.refused for one in present)),
         rows=ranked,
         n_logs=0,
         n_refused=0,
         n_remembered=0,
         n_unread=0,
-        failed={one.machine: unread for one in told if one.machine not in rows} | failed,
+        failed={one.machine: unread for one in present if one.machine not in rows} | failed,
     )
 
 
 def _prepare(out: Path) -> None:
-    """Make the folder of the output, and see whether it can be written to."""
+    """Create the folder of the output, and check that it is writable."""
     try:
         out.mkdir(parents=True, exist_ok=True)
         TemporaryFile(dir=out).close()
@@ -260,7 +254,7 @@ def _prepare(out: Path) -> None:
 
 
 def _commonest(refused: Iterable[Refusal], lost: Container[str]) -> str:
-    """Say why most of the lost logs were refused, in the words of the first of them."""
+    """Return the most frequent reason of refused logs, and the detail of the first of them."""
     why: dict[str, dict[str, str]] = {}
     for refusal in refused:
         if refusal.log in lost:
@@ -273,83 +267,79 @@ def _commonest(refused: Iterable[Refusal], lost: Container[str]) -> str:
 
 
 def _machines(
-    taken: Intake, stages: Sequence[Stage], work: Maintenance, settings: Settings
+    ingested: Ingested, stages: Sequence[Stage], work: Maintenance, settings: Settings
 ) -> list[Machine]:
-    """Put together what the assessment of each machine depends on."""
+    """Collect what the assessment of each machine depends on."""
     by_digest = {stage.digest: stage for stage in stages}
     return [
         Machine(
             name=name,
-            logs=tuple((entry.log, entry.key) for entry in entries),
-            stage=by_digest[taken.descriptions[name]],
+            logs=logs,
+            stage=by_digest[ingested.descriptions[name]],
             work=work.of(name),
             epochs=settings.epochs,
             seed=settings.seed,
         )
-        for name, entries in taken.machines.items()
+        for name, logs in ingested.machines.items()
     ]
 
 
+@dataclass(frozen=True, slots=True)
+class _Published:
+    """Rows of the index by machine, logs excluded from a life, and machines that failed."""
+
+    rows: dict[str, Summary]
+    excluded: frozenset[str]
+    failed: dict[str, str]
+
+
 def _report(
-    machines: Sequence[Machine],
-    refused: Sequence[Refusal],
-    site: Site,
-    out: Path,
-    failed: dict[str, str],
-) -> tuple[tuple[Summary, ...], set[str]]:
-    """Write pages and tables; give the rows of the index, and logs left out of a life."""
-    key = site.store.keep_refused(tuple(refused))
-    rows, contradicted = dict[str, Summary](), set[str]()
-    site.progress("reporting", 0, len(machines))
-    with Tables(out, [machine.name for machine in machines]) as tables:
-        tables.add_refused(refused)
-        for name, keys, telling in _told(machines, site, out, failed):
-            if telling is None:
-                tables.add(name, {})
-                continue
-            site.store.tell(name, keys[0], key, beside=keys)
-            tables.add(name, telling.tables)
-            contradicted |= set(telling.contradicted)
-            rows[name] = telling.page.summary
-            site.progress("reporting", len(rows), len(machines))
-        tables.write()
-    return tuple(by_urgency(rows.values())), contradicted
+    machines: Sequence[Machine], refused: Sequence[Refusal], resources: Resources, out: Path
+) -> _Published:
+    """Write pages and tables of machines.
 
-
-def _told(
-    machines: Sequence[Machine], site: Site, out: Path, failed: dict[str, str]
-) -> Iterator[tuple[str, tuple[str, str], Telling | None]]:
-    """Tell machines, and yield the keys of what is told and of what that comes from.
-
-    One whose assessment has gone, or cannot be read, is assessed once more.
+    Machines whose assessment is missing, or cannot be decoded, are assessed once more.
     """
-    files = file_names([machine.name for machine in machines])
-    left, anew = {machine.name: machine for machine in machines}, frozenset[str]()
-    for _ in range(2):
-        keys, untaught = update_priors(machines, site, anew=anew)
-        failed |= untaught
-        contents = (_content(m, keys[m.name], files, site.store) for m in list(left.values()))
-        for name, telling in tell_all(contents, site.pool, out):
-            both = keys[name], left.pop(name).key
-            if isinstance(telling, str):
-                failed[name] = telling
-                yield name, both, None
-            else:
-                yield name, both, telling
-        if not left:
-            return
-        failed |= assess_all(list(left.values()), site, anew=True)
-        anew = frozenset(left)
-    for name in left:
-        failed.setdefault(name, "its assessment cannot be read back from the store")
+    store, names = resources.store, [machine.name for machine in machines]
+    files, own_keys = file_names(names), {machine.name: machine.key for machine in machines}
+    refused_key = store.put_refused(tuple(refused))
+    rows, excluded = dict[str, Summary](), set[str]()
+    failed, not_updated = dict[str, str](), dict[str, str]()
+    resources.progress("reporting", 0, len(machines))
+    with Tables(out, names) as tables:
+        tables.add_refused(refused)
+        left = list(machines)
+        for attempt in range(constants.ASSESSMENT_ATTEMPTS):
+            if attempt:
+                failed |= assess_all(left, resources, force=True)
+            force = {machine.name for machine in left} if attempt else ()
+            update = apply_fleet_priors(machines, resources, force=force)
+            not_updated |= update.failed
+            records = (_record(m, update.keys[m.name], files[m.name], store) for m in left)
+            for name, output in write_pages(records, resources.pool, out):
+                if isinstance(output, str):
+                    failed[name] = output
+                    tables.add(name, {})
+                    continue
+                store.publish(name, (update.keys[name], own_keys[name]), refused_key)
+                tables.add(name, output.tables)
+                excluded.update(output.excluded)
+                rows[name] = output.page.summary
+                resources.progress("reporting", len(rows), len(machines))
+            left = [m for m in left if m.name not in rows and m.name not in failed]
+            if not left:
+                break
+        tables.write()
+    unread = {machine.name: "its assessment cannot be read back from the store" for machine in left}
+    return _Published(rows, frozenset(excluded), not_updated | unread | failed)
 
 
-def _content(machine: Machine, key: str, files: dict[str, str], store: Store) -> Content:
-    """Fetch what is to be told of a machine."""
-    return Content(
+def _record(machine: Machine, key: str, file: str, store: Store) -> MachineRecord:
+    """Fetch the results of a machine from the store."""
+    return MachineRecord(
         machine=machine.name,
-        file=files[machine.name],
+        file=file,
         assessment=store.assessment(machine.name, key),
-        logs=logs_of(machine, store),
-        before=store.earlier(machine.name, key),
+        logs=packed_logs(machine, store),
+        before=store.previous_summary(machine.name, key),
     )

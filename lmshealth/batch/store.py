@@ -1,9 +1,9 @@
-"""What has been done already, so that a run can go on and a report needs no logs.
+"""Store of results: a content-addressed cache and the published assessments (SQLite, PostgreSQL).
 
-Results are named by fingerprints of everything they depend on: a change of anything is another
-name, so that what is stale is done again and nothing else is. A row that this version cannot read
-counts as absent. Every write may be done twice and by two at once, so that runs may be killed, and
-may share a store.
+The key of a result is a fingerprint of everything that the result depends on. A change of any of it
+gives another key, so that only stale results are computed again. A row that this version cannot
+decode counts as absent. Every write may be repeated, and may be made by two runs at once: runs may
+be killed, and may share a store.
 """
 
 from __future__ import annotations
@@ -12,120 +12,102 @@ import hashlib
 import logging
 import re
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
+from urllib.parse import parse_qsl, quote, unquote
 
 from sqlalchemy import (
+    Column,
+    Integer,
     LargeBinary,
+    MetaData,
     String,
+    Table,
     Text,
+    create_engine,
     delete,
+    event,
     func,
     inspect,
     literal,
     select,
 )
-from sqlalchemy.engine import URL
+from sqlalchemy.dialects import postgresql, sqlite
+from sqlalchemy.engine import URL, Connection, Engine, make_url
 from sqlalchemy.exc import SQLAlchemyError
-from sqlalchemy.orm import DeclarativeBase, Mapped, Session, mapped_column
+from sqlalchemy.schema import CreateTable
 
 from lmshealth._serialize import VERSION, fingerprint, pack, unpack
-from lmshealth.batch.addresses import shown_address
-from lmshealth.batch.database import INSERT, StoreError, connect, why
+from lmshealth.batch import constants
+from lmshealth.errors import LmshealthError
 from lmshealth.io.log import Refusal
 from lmshealth.report.changes import Reported
 from lmshealth.tracking.history import LogEstimates
 
-SCHEMA = 5  # part of the names of the tables: what an older one holds is not read
-
 Outcome = LogEstimates | tuple[Refusal, ...]
-"""What became of a log: its reading, or why it was refused."""
+"""Result of a log: its modal estimates, or why it was refused."""
 
-# Rows asked for at a time.
-_BATCH = 400
+_INSERT: dict[str, Any] = {"sqlite": sqlite.insert, "postgresql": postgresql.insert}
 
 _logger = logging.getLogger(__name__)
 
 
-class _Base(DeclarativeBase):
-    pass
+class StoreError(LmshealthError):
+    """A store that cannot be opened, read or written."""
 
 
-class _Identified(_Base):
-    """What became of each log; the columns between key and content are for people."""
+# Tables: the key of a machine is a digest, because its name may be longer than an index allows
 
-    __tablename__ = f"identified_{SCHEMA}"
-
-    key: Mapped[str] = mapped_column(String(64), primary_key=True)
-    digest: Mapped[str] = mapped_column(String(64))
-    description: Mapped[str] = mapped_column(String(64))
-    version: Mapped[str] = mapped_column(Text)
-    machine: Mapped[str | None] = mapped_column(Text)
-    content: Mapped[bytes] = mapped_column(LargeBinary)
+_METADATA = MetaData()
 
 
-class _Assessed(_Base):
-    """The present assessment of each machine, and what it was before the fleet's prior.
-
-    Machines are named by a digest: their own names may be longer than an index takes.
-    """
-
-    __tablename__ = f"assessed_{SCHEMA}"
-
-    machine: Mapped[str] = mapped_column(String(64), primary_key=True)
-    key: Mapped[str] = mapped_column(String(64), primary_key=True)
-    content: Mapped[bytes] = mapped_column(LargeBinary)
-    evidence: Mapped[bytes] = mapped_column(LargeBinary)
-    said: Mapped[bytes] = mapped_column(LargeBinary)
+def _table(table: str, keys: str, /, **columns: Any) -> Table:
+    primary = [Column(key, String(64), primary_key=True) for key in keys.split()]
+    others = [Column(key, kind, nullable=key == "machine") for key, kind in columns.items()]
+    return Table(f"{table}_{constants.SCHEMA}", _METADATA, *primary, *others)
 
 
-class _Present(_Base):
-    """Which assessment of each machine was told last, and by a run that refused which logs."""
+# Outcome of each log; the columns between key and content are for people.
+_IDENTIFIED = _table(
+    "identified",
+    "key",
+    digest=String(64),
+    description=String(64),
+    version=Text,
+    machine=Text,
+    content=LargeBinary,
+)
+# The present assessment of each machine, and the one before the fleet prior was applied.
+_ASSESSED = _table(
+    "assessed", "machine key", content=LargeBinary, evidence=LargeBinary, summary=LargeBinary
+)
+# Which assessment of each machine was published last, and the key of its list of refused logs.
+_PRESENT = _table("present", "machine", name=Text, key=String(64), refused=String(64))
+# Summaries of all published assessments, numbered in the order of publication.
+_REPORTED = _table("reported", "machine key", number=Integer, content=LargeBinary)
+# Lists of logs that belong to no machine, by the fingerprint of the list.
+_REFUSED = _table("refused", "key", content=LargeBinary)
 
-    __tablename__ = f"present_{SCHEMA}"
 
-    machine: Mapped[str] = mapped_column(String(64), primary_key=True)
-    name: Mapped[str] = mapped_column(Text)
-    key: Mapped[str] = mapped_column(String(64))
-    refused: Mapped[str] = mapped_column(String(64))
-
-
-class _Reported(_Base):
-    """What all assessments that were told said, in the order in which they were."""
-
-    __tablename__ = f"reported_{SCHEMA}"
-
-    machine: Mapped[str] = mapped_column(String(64), primary_key=True)
-    key: Mapped[str] = mapped_column(String(64), primary_key=True)
-    number: Mapped[int]
-    content: Mapped[bytes] = mapped_column(LargeBinary)
-
-
-class _Refused(_Base):
-    """Logs that belong to no machine, by the fingerprint of their list."""
-
-    __tablename__ = f"refused_{SCHEMA}"
-
-    key: Mapped[str] = mapped_column(String(64), primary_key=True)
-    content: Mapped[bytes] = mapped_column(LargeBinary)
+# Records
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Identified:
-    """What became of a log, and of what that is true.
+    """Outcome of a log, and what it depends on.
 
     Attributes
     ----------
     outcome : LogEstimates or tuple of Refusal
-        What it gave.
+        Result of the log.
     description : str
-        Digest of the stage description that had a part in it; empty where none had.
+        Digest of the stage description that was used; empty if none was.
     stage, asked : str or None
-        Identity of the machine and name of the description as the log's metadata have them.
+        Identity of the machine and name of the description in the metadata of the log.
     lasting : bool
-        Whether trying again would give the same; False where something beside the log failed.
+        Whether another attempt would give the same; False if the failure was not of the log.
     """
 
     outcome: Outcome
@@ -134,43 +116,56 @@ class Identified:
     asked: str | None = None
     lasting: bool = True
 
-    def named(self, log: str) -> Identified:
-        """Give it under the present name of the log."""
+    def renamed(self, log: str) -> Identified:
+        """Replace the name of the log, which may have been moved since."""
         if not isinstance(self.outcome, LogEstimates):
             return replace(self, outcome=_renamed(self.outcome, log))
         modes = replace(self.outcome.modes, refused=_renamed(self.outcome.modes.refused, log))
         return replace(self, outcome=replace(self.outcome, log=log, modes=modes))
 
 
+def _renamed(refused: tuple[Refusal, ...], log: str) -> tuple[Refusal, ...]:
+    return tuple(replace(refusal, log=log) for refusal in refused)
+
+
 @dataclass(frozen=True, slots=True)
-class Made:
-    """An assessment as bytes: whole, what it teaches of others, and what it says in short."""
+class PackedAssessment:
+    """An assessment as bytes: as a whole, its evidence for a fleet prior, and its summary."""
 
     content: bytes
     evidence: bytes
-    said: bytes
+    summary: bytes
 
 
 @dataclass(frozen=True, slots=True)
-class Told:
-    """What a store was told last of a machine: under which key, by which list of refused logs."""
+class Published:
+    """Key of the assessment of a machine that was published last, and of its refused logs."""
 
     machine: str
     key: str
     refused: str
 
 
-def beside(folder: Path) -> URL:
-    """URL of the default store: a SQLite file in the folder of the output, whatever its name.
+def unpack_or_none(content: bytes, kind: Any) -> Any:
+    """Decode a packed record of a store; None where this version cannot."""
+    try:
+        return unpack(content, kind)
+    except ValueError as error:
+        _logger.debug("%s", error)
+        return None
+
+
+def default_url(folder: Path) -> URL:
+    """Return the URL of the default store: a SQLite file in the folder of the output.
 
     Raises
     ------
     StoreError
-        If a link stands there: what it points to is not in the folder.
+        If the file is a symbolic link: its target is not in the folder.
     """
     path = folder / "lmshealth.sqlite"
     if path.is_symlink():
-        raise StoreError(f"the store {path} is a link; remove it, or name what is meant by --store")
+        raise StoreError(f"the store {path} is a link; remove it, or name its target by --store")
     return URL.create("sqlite", database=str(path))
 
 
@@ -180,202 +175,339 @@ class Store:
     Parameters
     ----------
     url : str or URL
-        Such as ``sqlite:///results.sqlite``.
+        Such as ``sqlite:///results.sqlite`` or ``postgresql://me@host/fleet``.
     create : bool
-        Whether to make the store, or its tables, where they are not there.
+        Whether to create the database file and tables that are missing.
 
     Raises
     ------
     StoreError
-        If it cannot be opened, or is not there and not to be made.
+        If it cannot be opened, or does not exist and may not be created.
     """
 
     def __init__(self, url: str | URL, *, create: bool = True) -> None:
-        self._engine, self._address = connect(url, _Base.metadata, create=create)
+        self._engine, self._address = _connect(url, create=create)
         self._shown = shown_address(self._address)
         tables = inspect(self._engine).get_table_names()
-        if missing := {table for table in _Base.metadata.tables if table not in tables}:
+        if missing := set(_METADATA.tables) - set(tables):
             older = any(re.fullmatch(r"(identified|assessed)_\d+", table) for table in tables)
-            found = "only what another version of lmshealth kept" if older else "no results"
+            found = "only results of another version of lmshealth" if older else "no results"
             self.close()
-            raise StoreError(
-                f"the store {self._shown} holds {found} (no table {min(missing)}); "
-                "`lmshealth run LOGS --store URL` fills it"
-            )
+            raise self._unfilled(f"{found} (no table {min(missing)})")
+
+    def _unfilled(self, found: str) -> StoreError:
+        return StoreError(
+            f"the store {self._shown} holds {found}; `lmshealth run LOGS --store URL` fills it"
+        )
 
     def close(self) -> None:
-        """Let go of all connections."""
+        """Close all connections."""
         self._engine.dispose()
 
     # Logs
 
     def identified(self, keys: Iterable[str]) -> Iterator[tuple[str, Identified]]:
-        """Fetch what became of those logs that the store knows, under the names of then."""
-        for key, content in self.contents(keys):
-            if (found := read(content, Identified)) is not None:
+        """Fetch the outcomes of those logs that are stored, under their names of that time."""
+        for key, content in self.packed_identified(keys):
+            if (found := unpack_or_none(content, Identified)) is not None:
                 yield key, found
 
-    def contents(self, keys: Iterable[str]) -> Iterator[tuple[str, bytes]]:
-        """Fetch the same packed, for `read` elsewhere."""
+    def packed_identified(self, keys: Iterable[str]) -> Iterator[tuple[str, bytes]]:
+        """Fetch the same as bytes, for `unpack_or_none` in a worker."""
         asked = list(dict.fromkeys(keys))
-        for first in range(0, len(asked), _BATCH):
-            part = asked[first : first + _BATCH]
-            query = select(_Identified.key, _Identified.content).where(_Identified.key.in_(part))
-            with self._session() as session:
-                rows = session.execute(query).all()
+        for first in range(0, len(asked), constants.ROWS_PER_QUERY):
+            part = asked[first : first + constants.ROWS_PER_QUERY]
+            query = select(_IDENTIFIED.c.key, _IDENTIFIED.c.content)
+            with self._begin() as connection:
+                rows = connection.execute(query.where(_IDENTIFIED.c.key.in_(part))).all()
             yield from ((row.key, row.content) for row in rows)
 
-    def put(self, key: str, digest: str, found: Identified) -> None:
-        """Keep what became of a log of that content."""
-        reading = found.outcome if isinstance(found.outcome, LogEstimates) else None
-        row = {
-            "key": key,
-            "digest": digest,
-            "description": found.description,
-            "version": VERSION,
-            "machine": None if reading is None else found.stage,
-            "content": pack(found),
-        }
-        with self._session() as session:
-            session.execute(self._upsert(_Identified, row))
+    def put_identified(self, key: str, digest: str, found: Identified) -> None:
+        """Store the outcome of a log whose content has a digest."""
+        row = {"key": key, "digest": digest, "description": found.description, "version": VERSION}
+        machine = found.stage if isinstance(found.outcome, LogEstimates) else None
+        self._upsert(_IDENTIFIED, row | {"machine": machine, "content": pack(found)})
 
     # Machines
 
-    def has(self, machine: str, key: str) -> bool:
-        """Tell whether there is an assessment of a machine under a key."""
-        query = select(literal(1)).where(_Assessed.machine == _id(machine), _Assessed.key == key)
-        with self._session() as session:
-            return session.execute(query).first() is not None
+    def has_assessment(self, machine: str, key: str) -> bool:
+        """Return whether a machine has an assessment under a key."""
+        return self._of_assessment(literal(True), machine, key) is not None
 
     def assessment(self, machine: str, key: str) -> bytes | None:
-        """Fetch a packed assessment; None where it is not there."""
-        return self._column(_Assessed.content, machine, key)
+        """Fetch a packed assessment; None where it is not stored."""
+        content: bytes | None = self._of_assessment(_ASSESSED.c.content, machine, key)
+        return content
 
     def evidence(self, machine: str, key: str) -> bytes | None:
-        """Fetch what an assessment teaches, packed; None where it is not there."""
-        return self._column(_Assessed.evidence, machine, key)
+        """Fetch the packed evidence of an assessment for a fleet prior; None as before."""
+        content: bytes | None = self._of_assessment(_ASSESSED.c.evidence, machine, key)
+        return content
 
-    def keep(self, machine: str, key: str, made: Made) -> None:
-        """Keep an assessment of a machine."""
+    def put_assessment(self, machine: str, key: str, made: PackedAssessment) -> None:
+        """Store an assessment of a machine."""
         row = {"machine": _id(machine), "key": key, "content": made.content}
-        row |= {"evidence": made.evidence, "said": made.said}
-        with self._session() as session:
-            session.execute(self._upsert(_Assessed, row))
+        self._upsert(_ASSESSED, row | {"evidence": made.evidence, "summary": made.summary})
 
-    def keep_refused(self, refused: tuple[Refusal, ...]) -> str:
-        """Keep a list of logs that belong to no machine, and give its key."""
+    def put_refused(self, refused: tuple[Refusal, ...]) -> str:
+        """Store a list of logs that belong to no machine, and return its key."""
         key = fingerprint(refused)
-        with self._session() as session:
-            session.execute(self._upsert(_Refused, {"key": key, "content": pack(refused)}))
+        self._upsert(_REFUSED, {"key": key, "content": pack(refused)})
         return key
 
-    def tell(self, machine: str, key: str, refused: str, *, beside: Sequence[str] = ()) -> None:
-        """Make an assessment the present one of a machine, and forget others.
+    def publish(self, machine: str, keys: Sequence[str], refused: str) -> None:
+        """Make an assessment the present one of a machine, and delete its other assessments.
 
         Parameters
         ----------
-        machine, key : str
-            Which assessment.
+        machine : str
+            Its name.
+        keys : sequence of str
+            Of the assessment, and of others of the machine that stay.
         refused : str
             Key of the list of logs that belong to no machine.
-        beside : sequence of str
-            Keys of assessments of the machine that stay.
         """
-        own = _id(machine)
-        number = select(func.coalesce(func.max(_Reported.number), 0) + 1).scalar_subquery()
-        said = select(literal(own), literal(key), number, _Assessed.said).where(
-            _Assessed.machine == own, _Assessed.key == key
+        own, key, stored = _id(machine), keys[0], _ASSESSED.c
+        number = select(func.coalesce(func.max(_REPORTED.c.number), 0) + 1).scalar_subquery()
+        summary = select(literal(own), literal(key), number, stored.summary).where(
+            stored.machine == own, stored.key == key
         )
         columns = ["machine", "key", "number", "content"]
-        add = INSERT[self._engine.dialect.name](_Reported).from_select(columns, said)
-        add = add.on_conflict_do_update(
-            index_elements=["machine", "key"],
-            set_={"number": add.excluded.number, "content": add.excluded.content},
-        )
         row = {"machine": own, "name": machine, "key": key, "refused": refused}
-        others = _Assessed.machine == own, _Assessed.key.not_in([key, *beside])
-        with self._session() as session:
-            session.execute(self._upsert(_Present, row))
-            session.execute(add)
-            session.execute(delete(_Assessed).where(*others))
+        with self._begin() as connection:
+            self._upsert_in(connection, _PRESENT, row)
+            add = self._insert(_REPORTED).from_select(columns, summary)
+            connection.execute(_or_update(add, _REPORTED, columns))
+            others = delete(_ASSESSED).where(stored.machine == own, stored.key.not_in(keys))
+            connection.execute(others)
 
-    def earlier(self, machine: str, key: str) -> Reported | None:
-        """Give what the newest assessment of a machine with another key said; None for none."""
+    def previous_summary(self, machine: str, key: str) -> Reported | None:
+        """Fetch the summary of the newest published assessment under another key; None if none."""
         query = (
-            select(_Reported.content)
-            .where(_Reported.machine == _id(machine), _Reported.key != key)
-            .order_by(_Reported.number.desc())
+            select(_REPORTED.c.content)
+            .where(_REPORTED.c.machine == _id(machine), _REPORTED.c.key != key)
+            .order_by(_REPORTED.c.number.desc())
         )
-        with self._session() as session:
-            rows = session.scalars(query)
-            said = (read(row, Reported) for row in rows)
-            return next((one for one in said if one is not None), None)
+        with self._begin() as connection:
+            summaries = (unpack_or_none(row, Reported) for row in connection.scalars(query))
+            return next((summary for summary in summaries if summary is not None), None)
 
-    def told(self) -> tuple[Told, ...]:
-        """List all machines with what was told of them last, in the order of their names.
+    def published(self) -> tuple[Published, ...]:
+        """List the published assessments of all machines, in the order of their names.
 
         Raises
         ------
         StoreError
             If there is none.
         """
-        with self._session() as session:
-            rows = session.execute(select(_Present.name, _Present.key, _Present.refused)).all()
+        query = select(_PRESENT.c.name, _PRESENT.c.key, _PRESENT.c.refused)
+        with self._begin() as connection:
+            rows = connection.execute(query).all()
         if not rows:
-            raise StoreError(
-                f"the store {self._shown} holds no assessment; `lmshealth run LOGS --store URL` "
-                "fills it"
-            )
-        return tuple(sorted((Told(*row) for row in rows), key=lambda told: told.machine))
+            raise self._unfilled("no assessment")
+        return tuple(sorted((Published(*row) for row in rows), key=lambda one: one.machine))
 
     def refused(self, keys: Iterable[str]) -> tuple[Refusal, ...]:
-        """Fetch lists of logs that belong to no machine; what two lists share is told once."""
+        """Fetch lists of logs that belong to no machine, each refusal once."""
         found: dict[Refusal, None] = {}
         for key in dict.fromkeys(keys):
-            query = select(_Refused.content).where(_Refused.key == key)
-            with self._session() as session:
-                content = session.scalars(query).first()
-            own = None if content is None else read(content, tuple[Refusal, ...])
+            content = self._first(select(_REFUSED.c.content).where(_REFUSED.c.key == key))
+            own = None if content is None else unpack_or_none(content, tuple[Refusal, ...])
             found |= dict.fromkeys(own or ())
         return tuple(found)
 
-    def _column(self, column: Any, machine: str, key: str) -> bytes | None:
-        query = select(column).where(_Assessed.machine == _id(machine), _Assessed.key == key)
-        with self._session() as session:
-            content: bytes | None = session.scalars(query).first()
-        return content
+    # Statements
 
-    def _upsert(self, table: type[_Base], row: dict[str, Any]) -> Any:
-        """Write a row, or write it anew: of two that do so at once the later one stays."""
-        keys = [column.name for column in inspect(table).primary_key]
-        insert = INSERT[self._engine.dialect.name](table).values(row)
-        rest = {name: insert.excluded[name] for name in row if name not in keys}
-        return insert.on_conflict_do_update(index_elements=keys, set_=rest)
+    def _of_assessment(self, column: Any, machine: str, key: str) -> Any:
+        stored = _ASSESSED.c
+        return self._first(select(column).where(stored.machine == _id(machine), stored.key == key))
+
+    def _first(self, query: Any) -> Any:
+        """Fetch the first value of a query; None if there is none."""
+        with self._begin() as connection:
+            return connection.scalars(query).first()
+
+    def _insert(self, table: Table) -> Any:
+        return _INSERT[self._engine.dialect.name](table)
+
+    def _upsert(self, table: Table, row: dict[str, Any]) -> None:
+        with self._begin() as connection:
+            self._upsert_in(connection, table, row)
+
+    def _upsert_in(self, connection: Connection, table: Table, row: dict[str, Any]) -> None:
+        connection.execute(_or_update(self._insert(table).values(row), table, row))
 
     @contextmanager
-    def _session(self) -> Iterator[Session]:
+    def _begin(self) -> Iterator[Connection]:
+        """Open a transaction."""
         try:
-            with Session(self._engine) as session, session.begin():
-                yield session
+            with self._engine.begin() as connection:
+                yield connection
         except SQLAlchemyError as error:
             raise StoreError(
-                f"the store {self._shown} failed: {why(error, self._address)}; what it has is "
-                "kept, run again to go on"
-            ) from None  # what led to it would show the row
+                f"the store {self._shown} failed: {_reason(error, self._address)}; its results "
+                "are kept, run again to continue"
+            ) from None  # the cause would quote the row
 
 
-def read(content: bytes, kind: Any) -> Any:
-    """Rebuild what a store gave packed; None where this version cannot."""
-    try:
-        return unpack(content, kind)
-    except ValueError as error:
-        _logger.debug("%s", error)
-        return None
+def _or_update(insert: Any, table: Table, columns: Iterable[str]) -> Any:
+    """Update a row that exists: of two that are written at once the later one stays."""
+    keys = [column.name for column in table.primary_key]
+    rest = {name: insert.excluded[name] for name in columns if name not in keys}
+    return insert.on_conflict_do_update(index_elements=keys, set_=rest)
 
 
 def _id(machine: str) -> str:
     return hashlib.sha256(machine.encode("utf-8", "surrogatepass")).hexdigest()
 
 
-def _renamed(refused: tuple[Refusal, ...], log: str) -> tuple[Refusal, ...]:
-    return tuple(replace(refusal, log=log) for refusal in refused)
+# Databases
+
+
+def _connect(url: str | URL, *, create: bool) -> tuple[Engine, str]:
+    """Open a database; return its engine and its URL as text."""
+    address = url if isinstance(url, str) else url.render_as_string(False)
+    if "://" not in address:
+        raise StoreError(
+            "cannot open the store: the given address is no URL; a file is sqlite:///PATH, a "
+            "database postgresql://user@host/name"
+        )
+    engine: Engine | None = None
+    try:
+        parsed = _parsed(url)
+        engine = _engine(parsed) if create else _engine(_existing(parsed), shared=False)
+        if create:
+            _create_tables(engine)
+        with engine.connect():
+            return engine, address
+    except (SQLAlchemyError, ImportError, TypeError, ValueError) as error:
+        if engine is not None:
+            engine.dispose()
+        reason = _reason(error, address)
+        # The cause would be printed with it, and quotes passwords.
+        raise StoreError(f"cannot open the store {shown_address(address)}: {reason}") from None
+
+
+def _parsed(url: str | URL) -> URL:
+    """Parse a URL; PostgreSQL uses the driver that the extra installs."""
+    parsed = make_url(url)
+    kind = parsed.get_backend_name()
+    if kind not in _INSERT:
+        raise ValueError(f"{kind} is not supported: use {' or '.join(_INSERT)}")
+    plain = parsed.drivername == "postgresql"
+    return parsed.set(drivername="postgresql+psycopg") if plain else parsed
+
+
+def _engine(url: URL, *, shared: bool = True) -> Engine:
+    if url.get_backend_name() != "sqlite":
+        timeout = constants.SERVER_TIMEOUT_S
+        wait = {} if "connect_timeout" in url.query else {"connect_timeout": timeout}
+        return create_engine(url, pool_pre_ping=True, connect_args=wait)
+    folder = Path(url.database or "").parent
+    if not (url.database or "").startswith("file:") and not folder.is_dir():
+        raise ValueError(f"there is no folder {folder}")
+    engine = create_engine(url, connect_args={"timeout": constants.SQLITE_BUSY_TIMEOUT_S})
+
+    @event.listens_for(engine, "connect")
+    def _set_up(connection: Any, _: Any) -> None:
+        # Readers beside one writer, and no wait for the disk at every log: results that a crash
+        # of the computer loses are computed again.
+        with suppress(Exception):  # another run may do so now, or the file may be no database
+            if shared:
+                connection.execute("PRAGMA journal_mode = WAL")
+        connection.execute("PRAGMA synchronous = NORMAL")
+
+    return engine
+
+
+def _create_tables(engine: Engine) -> None:
+    """Create the tables that are missing; another run may do so at the same time."""
+    attempts = 3  # PostgreSQL may fail where two runs create the same table
+    for attempt in range(attempts):
+        try:
+            with engine.begin() as connection:
+                existing = set(inspect(connection).get_table_names())
+                for table in _METADATA.sorted_tables:
+                    if table.name not in existing:
+                        connection.execute(CreateTable(table, if_not_exists=True))
+            return
+        except SQLAlchemyError:
+            if attempt == attempts - 1:
+                raise
+
+
+def _existing(url: URL) -> URL:
+    """Add to a URL that SQLite must not create the file."""
+    name = url.database or ":memory:"
+    if url.get_backend_name() != "sqlite" or name == ":memory:":
+        return url
+    if not name.startswith("file:") and not Path(name).exists():
+        raise ValueError("there is no such file; `lmshealth run LOGS --store URL` makes it")
+    path = name if name.startswith("file:") else f"file:{quote(name)}"
+    return url.set(database=path).update_query_dict({"mode": "rw", "uri": "true"})
+
+
+def _reason(error: Exception, address: str) -> str:
+    """Return an error in one line, without statements of SQL and without secrets."""
+    text = str(getattr(error, "orig", None) or error).strip()
+    first = text.splitlines()[0] if text else type(error).__name__
+    return without_secrets(first, address)
+
+
+# Addresses of stores and schedulers in messages
+
+# A password that contains characters with a meaning in URLs could be read as a host or a port: such
+# an address does not match.
+_URL = re.compile(
+    r"(?P<kind>[\w+.-]+)://"
+    r"(?:[^:@/?#]*(?::(?P<password>[^:@/?#]*))?@)?"
+    # Only the path of a file, after no host, may contain an @: elsewhere it ends a password.
+    r"(?P<place>(?:\[[\da-fA-F:]*\]|[\w.-]*)(?::\d+)?(?:(?<=://)/[^?]*|/[^?@]*)?)"
+    r"(?:\?(?P<options>.*))?",
+    re.DOTALL,
+)
+# Without any character of an address or option there is no password.
+_NO_URL = re.compile(r"[\w .-]*")
+
+
+def shown_address(address: str) -> str:
+    """Return an address without user, password and options."""
+    found = _URL.fullmatch(address)
+    if found is None:
+        return address if _NO_URL.fullmatch(address) else "that was given"
+    return f"{found['kind']}://{found['place']}"
+
+
+def without_secrets(text: str, address: str) -> str:
+    """Mask the secrets of an address in the message of an error about it.
+
+    Parameters
+    ----------
+    text : str
+        Message of the error, which may quote the address.
+    address : str
+        URL of a store or a scheduler.
+
+    Returns
+    -------
+    str
+        With ``***`` for password and values of options; where the password cannot be separated
+        from the rest of the address, only what to do.
+    """
+    found = _URL.fullmatch(address)
+    if found is None:
+        if _NO_URL.fullmatch(address):
+            return text
+        return (
+            "needed is an address such as postgresql://user:password@host/database, with special "
+            "characters of a password percent-encoded, @ as %40; the reason may contain the "
+            "password and is not shown"
+        )
+    options = found["options"] or ""
+    values = [value for _, value in parse_qsl(options)]
+    values += [part.partition("=")[2] for part in options.split("&")]
+    secrets = [value for value in values if len(value) >= constants.SHORTEST_SECRET]
+    secrets += [found["password"] or "", unquote(found["password"] or "")]
+    for secret in sorted(set(secrets) - {""}, key=len, reverse=True):
+        text = text.replace(secret, "***")
+    return text

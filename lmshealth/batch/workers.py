@@ -34,7 +34,7 @@ from loky import ProcessPoolExecutor
 from threadpoolctl import threadpool_limits
 
 from lmshealth.batch import constants
-from lmshealth.batch.addresses import shown_address, without_secrets
+from lmshealth.batch.store import shown_address, without_secrets
 from lmshealth.errors import LmshealthError
 
 Item = TypeVar("Item")

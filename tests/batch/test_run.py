@@ -16,22 +16,12 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from lmshealth.batch import (
-    assess as assessing,
-)
-from lmshealth.batch import (
-    ingest as intake,
-)
-from lmshealth.batch import (
-    machines as batch,
-)
-from lmshealth.batch import (
-    telling,
-    workers,
-)
-from lmshealth.batch.assess import packed
+from lmshealth.batch import assess as assessing
+from lmshealth.batch import constants, outputs, workers
+from lmshealth.batch import ingest as ingesting
+from lmshealth.batch.assess import pack_assessment
 from lmshealth.batch.run import RunResult, Settings, report, run
-from lmshealth.batch.store import SCHEMA, Store, beside, read
+from lmshealth.batch.store import Store, default_url, unpack_or_none
 from lmshealth.cli.main import main
 from lmshealth.errors import LmshealthError, NothingUsable
 from lmshealth.health.inference import epochs_to_infer, infer
@@ -68,9 +58,9 @@ def tables(out: Path) -> dict[str, bytes]:
 
 def assessments(out: Path) -> list[Assessment]:
     """Fetch what a run kept of its machines."""
-    with closing(Store(beside(out), create=False)) as store:
-        packed = [store.assessment(told.machine, told.key) for told in store.told()]
-    return [read(content, Assessment) for content in packed if content is not None]
+    with closing(Store(default_url(out), create=False)) as store:
+        packed = [store.assessment(one.machine, one.key) for one in store.published()]
+    return [unpack_or_none(content, Assessment) for content in packed if content is not None]
 
 
 @dataclass(frozen=True)
@@ -204,7 +194,7 @@ def test_pages_come_from_the_store_alone(
     """Without logs and descriptions the same pages of machine and fleet; one needs no process."""
     shutil.copy(done.out / "lmshealth.sqlite", tmp_path)
     monkeypatch.setattr(workers, "_ProcessPool", None)
-    with closing(Store(beside(tmp_path), create=False)) as store:
+    with closing(Store(default_url(tmp_path), create=False)) as store:
         again = report(store, tmp_path, Settings(workers=8))
     assert pages(tmp_path) == done.pages
     assert again.rows == done.result.rows
@@ -281,7 +271,7 @@ def test_a_log_that_changes_while_it_is_read_is_done_again(
     """What is still being written is refused for now, and not remembered."""
     logs = write_archive(tmp_path / "logs", 2)
     with monkeypatch.context() as patch:
-        patch.setattr(intake, "content_digest", lambda path: f"{path.name:0>64}")
+        patch.setattr(ingesting, "content_digest", lambda path: f"{path.name:0>64}")
         with pytest.raises(NothingUsable):
             run(logs, [modes_only], tmp_path / "out")
     assert {row["reason"] for row in rows(tmp_path / "out" / "refused.csv")} == {"changed"}
@@ -296,7 +286,7 @@ def test_what_the_computer_failed_at_is_tried_again(
 ) -> None:
     """A full disk or memory says nothing of a log: it is refused for now, and not remembered."""
     logs = write_archive(tmp_path / "logs", 3)
-    whole = intake.identify
+    whole = ingesting.identify
 
     def fail(log: Log, stage: Stage) -> Modes:
         if log.name == "log-01.h5":
@@ -304,7 +294,7 @@ def test_what_the_computer_failed_at_is_tried_again(
         return whole(log, stage)
 
     with monkeypatch.context() as patch:
-        patch.setattr(intake, "identify", fail)
+        patch.setattr(ingesting, "identify", fail)
         first = run(logs, [modes_only], tmp_path / "out")
     assert (first.n_refused, first.n_remembered) == (1, 0)
     refused = rows(tmp_path / "out" / "refused.csv")
@@ -336,7 +326,7 @@ def test_an_assessment_that_cannot_be_read_is_made_again(
     run(logs, [modes_only], out)
     before = tables(out), pages(out)
     with closing(sqlite3.connect(out / "lmshealth.sqlite")) as file, file:
-        file.execute(f"UPDATE assessed_{SCHEMA} SET content = x'00'")
+        file.execute(f"UPDATE assessed_{constants.SCHEMA} SET content = x'00'")
     run(logs, [modes_only], out)
     assert assessed == ["test-A"] * 2
     assert (tables(out), pages(out)) == before
@@ -347,7 +337,7 @@ def test_an_assessment_that_never_can_be_read_does_not_end_the_batch(
 ) -> None:
     """It is made once more, then its machine is named, and the run comes to its end."""
     logs = write_archive(tmp_path / "logs", 2)
-    monkeypatch.setattr(telling, "read", lambda content, kind: None)
+    monkeypatch.setattr(outputs, "unpack_or_none", lambda content, kind: None)
     result = run(logs, [modes_only], tmp_path / "out")
     assert result.rows == ()
     assert result.failed == {"test-A": "its assessment cannot be read back from the store"}
@@ -362,20 +352,22 @@ def test_what_is_taught_is_taught_anew_where_it_cannot_be_read(
     logs = write_archive(tmp_path / "logs", 2)
     learned = FleetPrior(3, (), scatter_prior(modes_only))
     monkeypatch.setattr(
-        batch,
+        assessing,
         "_machines_to_update",
         lambda machines, store: ((machine, learned) for machine in machines),
     )
     monkeypatch.setattr(
-        batch,
-        "taught",
-        lambda content, one: packed(replace(read(content, Assessment), fleet=one, notes=("t",))),
+        assessing,
+        "with_fleet_prior",
+        lambda content, one: pack_assessment(
+            replace(unpack_or_none(content, Assessment), fleet=one, notes=("t",))
+        ),
     )
     run(logs, [modes_only], tmp_path / "out")
     before = pages(tmp_path / "out")
     with closing(sqlite3.connect(tmp_path / "out" / "lmshealth.sqlite")) as file, file:
-        (n,) = file.execute(f"SELECT count(*) FROM assessed_{SCHEMA}").fetchone()
-        file.execute(f"UPDATE assessed_{SCHEMA} SET content = x'00'")
+        (n,) = file.execute(f"SELECT count(*) FROM assessed_{constants.SCHEMA}").fetchone()
+        file.execute(f"UPDATE assessed_{constants.SCHEMA} SET content = x'00'")
     assert n == 2
     result = run(logs, [modes_only], tmp_path / "out")
     assert result.failed == {}

@@ -17,16 +17,17 @@ import pytest
 from sqlalchemy import Engine, event
 
 from lmshealth._serialize import pack
-from lmshealth.batch import database
-from lmshealth.batch.assess import packed
+from lmshealth.batch import constants
+from lmshealth.batch.assess import pack_assessment
 from lmshealth.batch.store import (
-    SCHEMA,
     Identified,
     Outcome,
     Store,
     StoreError,
-    beside,
-    read,
+    default_url,
+    shown_address,
+    unpack_or_none,
+    without_secrets,
 )
 from lmshealth.io.log import Metadata, Refusal
 from lmshealth.modal.modes import Modes
@@ -34,7 +35,10 @@ from lmshealth.report.assessment import Assessment
 from lmshealth.signal.spectral_lines import Line
 from lmshealth.signal.waterfall import RelativeSpectrum
 from lmshealth.tracking.history import LogEstimates
+from studies.faults.injection import ADDRESSES
 from tests.assessments import leaves, worn
+
+SCHEMA = constants.SCHEMA
 
 
 def reading(n: int = 2, log: str = "a.h5") -> LogEstimates:
@@ -78,12 +82,12 @@ def url(store_url: str) -> str:
 
 def put_in(store: Store, key: str, outcome: Outcome) -> None:
     """Keep what became of a log."""
-    store.put(key, "d" * 64, Identified(outcome, "e" * 64, "test-A"))
+    store.put_identified(key, "d" * 64, Identified(outcome, "e" * 64, "test-A"))
 
 
 def got_from(store: Store, key: str, log: str) -> Outcome | None:
     """Fetch what became of a log, under its present name."""
-    return next((found.named(log).outcome for _, found in store.identified([key])), None)
+    return next((found.renamed(log).outcome for _, found in store.identified([key])), None)
 
 
 @pytest.fixture
@@ -196,7 +200,7 @@ def test_a_server_that_says_nothing_is_not_waited_for(
 ) -> None:
     """Its port may be that of something else. Two seconds are the shortest that libpq knows."""
     needs("postgres")
-    monkeypatch.setattr(database, "_ANSWER", 60 if query else 2)
+    monkeypatch.setattr(constants, "SERVER_TIMEOUT_S", 60 if query else 2)
     with socket.create_server(("127.0.0.1", 0)) as listener:
         port = listener.getsockname()[1]
         begun = time.monotonic()
@@ -238,14 +242,14 @@ def test_a_damaged_store_is_named(file_url: str, tmp_path: Path) -> None:
 
 def keep(store: Store, machine: str, key: str, assessment: Assessment) -> None:
     """Keep an assessment as a run does, and tell it."""
-    store.keep(machine, key, packed(assessment))
-    store.tell(machine, key, store.keep_refused(()))
+    store.put_assessment(machine, key, pack_assessment(assessment))
+    store.publish(machine, [key], store.put_refused(()))
 
 
 def recall(store: Store, machine: str, key: str) -> Assessment | None:
     """Fetch an assessment, as far as it can be read."""
     content = store.assessment(machine, key)
-    found: Assessment | None = None if content is None else read(content, Assessment)
+    found: Assessment | None = None if content is None else unpack_or_none(content, Assessment)
     return found
 
 
@@ -276,17 +280,17 @@ def test_what_an_assessment_lacks_it_lacks_again(url: str, tmp_path: Path) -> No
 
 def test_only_what_is_told_and_what_it_comes_from_are_kept_whole(url: str, tmp_path: Path) -> None:
     """Telling forgets the other assessments of the same machine, not of others."""
-    one = packed(worn(tmp_path))
+    one = pack_assessment(worn(tmp_path))
     with closing(Store(url)) as store:
         for machine, key in (("A", "k1"), ("B", "k1"), ("A", "k2"), ("A", "k3")):
-            store.keep(machine, key, one)
-        assert store.has("A", "k1")
-        store.tell("A", "k3", "", beside=["k2"])
-        assert [store.has("A", key) for key in ("k1", "k2", "k3")] == [False, True, True]
+            store.put_assessment(machine, key, one)
+        assert store.has_assessment("A", "k1")
+        store.publish("A", ["k3", "k2"], "")
+        assert [store.has_assessment("A", key) for key in ("k1", "k2", "k3")] == [False, True, True]
         assert store.assessment("A", "k1") is None
-        assert store.has("B", "k1")
-        assert not store.has("C", "k1")
-        assert [(told.machine, told.key) for told in store.told()] == [("A", "k3")]
+        assert store.has_assessment("B", "k1")
+        assert not store.has_assessment("C", "k1")
+        assert [(told.machine, told.key) for told in store.published()] == [("A", "k3")]
 
 
 def test_the_earlier_report_is_the_newest_of_another_key(url: str, tmp_path: Path) -> None:
@@ -298,13 +302,13 @@ def test_the_earlier_report_is_the_newest_of_another_key(url: str, tmp_path: Pat
         def tell(key: str) -> str | None:
             judgement = replace(one.judgement, verdict=words[key])
             keep(store, "A", key, replace(one, judgement=judgement))
-            before = store.earlier("A", key)
+            before = store.previous_summary("A", key)
             return before and before.verdict
 
         assert [tell(key) for key in ("k1", "k1", "k2", "k2", "k1", "k3")] == [
             *(None, None, "healthy", "healthy", "preload", "healthy")
         ]
-        assert store.earlier("B", "k1") is None
+        assert store.previous_summary("B", "k1") is None
 
 
 def test_refused_logs_are_those_of_the_last_run_of_each_machine(url: str, tmp_path: Path) -> None:
@@ -314,8 +318,8 @@ def test_refused_logs_are_those_of_the_last_run_of_each_machine(url: str, tmp_pa
 
         def tell(machines: str, refused: tuple[Refusal, ...]) -> tuple[Refusal, ...]:
             for machine in machines:
-                store.tell(machine, "k1", store.keep_refused(refused))
-            return store.refused(told.refused for told in store.told())
+                store.publish(machine, ["k1"], store.put_refused(refused))
+            return store.refused(one.refused for one in store.published())
 
         assert tell("ABC", ()) == ()
         assert tell("AB", one) == one
@@ -334,11 +338,11 @@ def test_names_of_machines_are_data(url: str, tmp_path: Path, evil: str) -> None
         keep(store, "A", "k1", one)
         keep(store, evil, "k2", replace(one, seed=7))
         assert recall(store, evil, "k1") is None
-        assert store.earlier(evil, "k2") is None
+        assert store.previous_summary(evil, "k2") is None
         got = recall(store, evil, "k2")
         assert got is not None and got.seed == 7
         assert recall(store, "A", "k1") is not None
-        assert {told.machine for told in store.told()} == {"A", evil}
+        assert {one.machine for one in store.published()} == {"A", evil}
 
 
 def test_a_row_that_cannot_be_read_counts_as_absent(file_url: str, tmp_path: Path) -> None:
@@ -350,15 +354,16 @@ def test_a_row_that_cannot_be_read_counts_as_absent(file_url: str, tmp_path: Pat
         with closing(sqlite3.connect(tmp_path / "store.sqlite")) as file, file:
             file.execute(f"UPDATE identified_{SCHEMA} SET content = ?", (b"nonsense",))
             file.execute(
-                f"UPDATE assessed_{SCHEMA} SET content = ? WHERE key = 'k1'", (pack({"stage": 3}),)
+                f"UPDATE assessed_{SCHEMA} SET content = ? WHERE key = 'k1'",
+                (pack({"stage": 3}),),
             )
             file.execute(f"UPDATE reported_{SCHEMA} SET content = x'00' WHERE key = 'k1'")
         assert got_from(store, "k", "a.h5") is None
         assert recall(store, "B", "k1") is None
         assert recall(store, "A", "k2") is not None
         # The newest that can be read, two reports ago: of the three there is no other.
-        assert store.earlier("A", "k2") is not None
-        assert store.earlier("B", "k2") is None
+        assert store.previous_summary("A", "k2") is not None
+        assert store.previous_summary("B", "k2") is None
         put_in(store, "k", reading())
         assert isinstance(got_from(store, "k", "a.h5"), LogEstimates)
 
@@ -385,22 +390,22 @@ def test_a_store_that_another_run_makes_at_the_same_moment_is_opened(tmp_path: P
 @pytest.mark.slow
 def test_two_that_write_the_same_at_once_leave_one_row(url: str, tmp_path: Path) -> None:
     """Of many threads that put, keep and tell the same, none fails and nothing is doubled."""
-    made = packed(worn(tmp_path))
+    made = pack_assessment(worn(tmp_path))
 
     def write(_: int) -> None:
         with closing(Store(url)) as store:
             for number in range(5):
                 put_in(store, f"k{number}", reading())
-            store.keep("A", "k1", made)
-            store.tell("A", "k1", store.keep_refused(()))
+            store.put_assessment("A", "k1", made)
+            store.publish("A", ["k1"], store.put_refused(()))
 
     with ThreadPoolExecutor(6) as threads:
         list(threads.map(write, range(12)))
     with closing(Store(url)) as store:
-        assert len(store.told()) == 1
+        assert len(store.published()) == 1
         assert recall(store, "A", "k1") is not None
         assert len(dict(store.identified(f"k{number}" for number in range(9)))) == 5
-        assert store.earlier("A", "k1") is None
+        assert store.previous_summary("A", "k1") is None
 
 
 # Stores that are only looked at
@@ -428,7 +433,7 @@ def test_a_store_without_results_is_told_from_an_older_one(file_url: str, tmp_pa
     store = Store(file_url)
     put_in(store, "k", reading())
     with pytest.raises(StoreError, match="no assessment"):
-        store.told()
+        store.published()
     store.close()
 
 
@@ -436,9 +441,62 @@ def test_a_store_in_a_folder_of_any_name_is_opened_as_it_is(tmp_path: Path) -> N
     """Signs that mean something in an address are parts of a name here."""
     folder = tmp_path / "a b?c#d%20ü"
     folder.mkdir()
-    store = Store(beside(folder))
+    store = Store(default_url(folder))
     keep(store, "A", "k1", worn(tmp_path))
     store.close()
-    again = Store(beside(folder), create=False)
-    assert len(again.told()) == 1
+    again = Store(default_url(folder), create=False)
+    assert len(again.published()) == 1
     again.close()
+
+
+# Addresses
+
+SECRET = "s3cr3t"
+
+
+@pytest.mark.parametrize(
+    ("address", "shown"),
+    [
+        ("postgresql://me:s3cr3t@host:5432/fleet?sslmode=s3cr3t", "postgresql://host:5432/fleet"),
+        ("postgresql+psycopg://me@[::1]/fleet", "postgresql+psycopg://[::1]/fleet"),
+        ("sqlite:////home/me@corp/a b.sqlite", "sqlite:////home/me@corp/a b.sqlite"),
+        ("sqlite://", "sqlite://"),
+        ("tcp://host:8786", "tcp://host:8786"),
+        ("no url at all", "no url at all"),
+        ("postgresql://me:s3/cr3t@host/fleet", "that was given"),
+    ],
+)
+def test_an_address_is_shown_by_kind_and_place(address: str, shown: str) -> None:
+    """User, password and options are left out; where they cannot be told apart, all is."""
+    assert shown_address(address) == shown
+
+
+@pytest.mark.parametrize("form", ADDRESSES)
+def test_no_part_of_a_password_is_told(form: str) -> None:
+    """Neither the address nor what a library quotes of it, whole or in part, shows the password."""
+    address = form.format(*[SECRET] * 2)
+    parts = {address, *(part for sign in "/@:?=&" for part in address.split(sign))}
+    for said in [part for part in parts if SECRET in part]:
+        assert SECRET not in without_secrets(f"cannot use {said!r}", address)
+    assert SECRET not in shown_address(address)
+
+
+def test_a_reason_without_secrets_is_told_as_it_is() -> None:
+    """What helps to mend an address stays."""
+    why = "connection to server at 127.0.0.1 failed: Connection refused"
+    assert without_secrets(why, "postgresql://me:s3cr3t@127.0.0.1/db?connect_timeout=1") == why
+
+
+def test_an_encoded_password_is_hidden_in_both_writings() -> None:
+    """Libraries quote it as it is written, or as it is meant."""
+    told = without_secrets("a%2Fb or a/b", "postgresql://me:a%2Fb@host/db")
+    assert told == "*** or ***"
+
+
+@pytest.mark.parametrize("user", ["me", "me@corp"])
+@pytest.mark.parametrize("password", ["123/geheim", "1/2", "5432/x@y"])
+def test_a_password_is_not_taken_for_a_port(user: str, password: str) -> None:
+    """Digits and a slash before the host are no place that could be shown."""
+    address = f"postgresql://{user}:{password}@127.0.0.1:1/fleet"
+    assert password not in shown_address(address)
+    assert password not in without_secrets(f"cannot use {address}", address)

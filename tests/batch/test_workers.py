@@ -129,12 +129,12 @@ def test_processes_end_with_a_parent_that_is_killed(root: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "begun", ["pool.map_unordered(dawdle, items, lost)", "map_parts(pool.executor, len, items)"]
+    "begun", ["pool.map_unordered(dawdle, items, lost)", "map_in_order(pool.executor, len, items)"]
 )
 def test_an_interrupt_as_work_begins_leaves_nothing_that_waits(root: Path, begun: str) -> None:
     """Processes that only start hear no interrupt, and what they were to do is let go."""
     code = (
-        "import signal\nfrom lmshealth.batch.assess import map_parts\n"
+        "import signal\nfrom lmshealth.batch.assess import map_in_order\n"
         "from lmshealth.batch.workers import processes\n"
         "from tests.batch.test_workers import dawdle, lost\n"
         "if __name__ == '__main__':\n"

@@ -17,8 +17,9 @@ import numpy as np
 import pytest
 from click.testing import CliRunner, Result
 
-from lmshealth.batch.assess import packed
-from lmshealth.batch.store import SCHEMA, Store, beside
+from lmshealth.batch import constants
+from lmshealth.batch.assess import pack_assessment
+from lmshealth.batch.store import Store, default_url
 from lmshealth.cli.main import main
 from lmshealth.report.tables import COLUMNS, LOG_COLUMNS
 from models.dynamics.stages import STAGES
@@ -771,17 +772,17 @@ def test_the_store_may_be_named_by_the_environment(tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_a_machine_that_cannot_be_read_is_told_and_the_others_are_written(tmp_path: Path) -> None:
     """One line names it, with status 3."""
-    store = Store(beside(tmp_path))
+    store = Store(default_url(tmp_path))
     for name in ("M7-Y", "M8-Y"):
-        store.keep(name, "k1", packed(nothing(worn(tmp_path, name))))
-        store.tell(name, "k1", "")
+        store.put_assessment(name, "k1", pack_assessment(nothing(worn(tmp_path, name))))
+        store.publish(name, ["k1"], "")
     store.close()
     with closing(sqlite3.connect(tmp_path / "lmshealth.sqlite")) as file, file:
         file.execute(
-            f"UPDATE assessed_{SCHEMA} SET content = x'00' WHERE machine = "
-            f"(SELECT machine FROM present_{SCHEMA} WHERE name = 'M8-Y')"
+            f"UPDATE assessed_{constants.SCHEMA} SET content = x'00' WHERE machine = "
+            f"(SELECT machine FROM present_{constants.SCHEMA} WHERE name = 'M8-Y')"
         )
-    url = beside(tmp_path).render_as_string()
+    url = default_url(tmp_path).render_as_string()
     result = call("report", "--store", url, "--out", tmp_path / "pages")
     assert result.exit_code == 3
     assert "M8-Y" in result.stderr and len(result.stderr.splitlines()) == 1
@@ -801,7 +802,7 @@ def test_pdfs_stand_beside_the_pages_of_run_and_report(
     assert list(out.glob("*.pdf")) == []
     assert call(*arguments, "--pdf").exit_code == 0
     assert [path.name for path in out.glob("*.pdf")] == ["test-A.pdf"]
-    url = beside(out).render_as_string()
+    url = default_url(out).render_as_string()
     assert call("report", "--store", url, "--out", tmp_path / "pages", "--pdf").exit_code == 0
     again = (tmp_path / "pages" / "test-A.pdf").read_bytes()
     assert again == (out / "test-A.pdf").read_bytes()

@@ -8,8 +8,8 @@ from typing import Any
 
 import pytest
 
-from lmshealth.batch.assess import packed
-from lmshealth.batch.telling import Content, Part, Tables, tell
+from lmshealth.batch.assess import pack_assessment
+from lmshealth.batch.outputs import CsvRows, MachineRecord, Tables, machine_output
 from lmshealth.io.log import Refusal
 from lmshealth.report.tables import COLUMNS
 from tests.assessments import worn
@@ -21,9 +21,9 @@ def read(path: Path) -> list[dict[str, str]]:
         return list(csv.DictReader(stream))
 
 
-def effect(mode: str, **more: Any) -> Part:
+def effect(mode: str, **more: Any) -> CsvRows:
     """Give a row of effects.csv."""
-    return Part.of("effects", [{"stage": "A", "mode": mode, "coefficient": 0.1 + 0.2, **more}])
+    return CsvRows.of("effects", [{"stage": "A", "mode": mode, "coefficient": 0.1 + 0.2, **more}])
 
 
 def test_rows_stand_in_the_order_of_the_machines(tmp_path: Path) -> None:
@@ -91,10 +91,10 @@ def test_tables_that_are_not_finished_leave_those_of_before(tmp_path: Path) -> N
 @pytest.mark.slow
 def test_a_page_is_told_without_tables_where_there_are_no_logs(tmp_path: Path) -> None:
     """What the store has of a machine is enough for its page; what is unreadable is nothing."""
-    made = packed(worn(tmp_path))
-    told = tell(Content("M7-Y", "M7-Y.html", made.content, (), None))
+    made = pack_assessment(worn(tmp_path))
+    told = machine_output(MachineRecord("M7-Y", "M7-Y.html", made.content, (), None))
     assert told is not None
     assert (told.page.file, told.page.summary.identity) == ("M7-Y.html", "M7-Y")
     assert told.tables == {}
-    assert tell(Content("M7-Y", "M7-Y.html", b"nonsense", (), None)) is None
-    assert tell(Content("M7-Y", "M7-Y.html", None, (), None)) is None
+    assert machine_output(MachineRecord("M7-Y", "M7-Y.html", b"nonsense", (), None)) is None
+    assert machine_output(MachineRecord("M7-Y", "M7-Y.html", None, (), None)) is None
