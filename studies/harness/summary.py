@@ -1,6 +1,6 @@
 """Write `README.md` of the studies: all claims, as they were recorded.
 
-``python -m studies.harness.summary`` writes the part of that page below the mark `MARK`.
+``python -m studies.harness.summary`` writes the part of that page between its two `MARKS`.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from studies.harness.study import STUDIES
 
 HERE = STUDIES
 PAGE = HERE / "README.md"
-MARK = "<!-- claims -->\n"
+MARKS = "<!-- claims -->\n", "<!-- end of claims -->\n"
 _DIGITS = 12  # of the digest of a record that is older than a correction
 
 
@@ -78,13 +78,14 @@ def _record(module: Any, script: Path, function: str, name: str) -> Record:
 
 
 def page() -> str:
-    """Return the page: its introduction as it is, and all claims."""
+    """Return the page: all claims, and the text around them as it is."""
+    head, rest = PAGE.read_text(encoding="utf-8").split(MARKS[0])
     found = list(records())
     there = [record for record in found if record.content is not None]
     claims = [claim for record in there for claim in record.claims]
     short = sum(not claim.met for claim in claims)
     lines = [
-        PAGE.read_text(encoding="utf-8").split(MARK)[0] + MARK,
+        head + MARKS[0],
         f"{len(claims)} claims of {len(there)} records; **{short} are not met**.",
     ]
     if missing := [f"{r.study}/{r.name}" for r in found if r.content is None]:
@@ -94,7 +95,7 @@ def page() -> str:
         for record in found:
             if record.step == step:
                 lines += ["", *section(record)]
-    return "\n".join(lines) + "\n"
+    return "\n".join(lines) + "\n\n" + MARKS[1] + rest.split(MARKS[1])[1]
 
 
 def section(record: Record) -> Iterator[str]:
