@@ -63,27 +63,25 @@ _STYLE: dict[str, Any] = {
     **dict.fromkeys(("xtick.labelcolor", "ytick.labelcolor"), INK),
 }
 _KM = 1000.0
-# Of what is drawn as an image; more than screens show, so that a page can be zoomed and printed.
-_DPI = 200
+_DPI = 200  # of images in a figure: enough for zooming and printing
 _LEVELS = np.array(constants.BAND_LEVELS)
 _GRID_POINTS = 72
-SIZE = (4.8, 2.8)  # of a picture in inches
+SIZE = (4.8, 2.8)  # of a figure in inches
 ROOM = 72  # characters that fit on a line of its legend
 
 
 def svg(draw: Callable[[Axes], object], *, salt: str, size: tuple[float, float] = SIZE) -> str:
-    """Draw one picture as an SVG element for the inside of a page.
+    """Draw a figure as an inline SVG element.
 
-    The same input gives the same bytes. Colours follow the style sheet of the page (``--ink``,
-    ``--blue``, ...) where it has one; prolog, comments and metadata are left out, and screen
-    readers skip the picture, because the page carries its text.
+    The bytes are reproducible. Colours follow the style sheet of the page (``--ink``, ``--blue``,
+    ...). Screen readers skip the figure, because the page contains its information as text.
 
     Parameters
     ----------
     draw : callable
         Takes the Axes and draws on it.
     salt : str
-        Prefix of all identifiers, of letters, digits and dashes; one for each picture of a page.
+        Prefix of all identifiers (letters, digits, dashes), unique on the page.
     size : (float, float)
         Width and height in inches.
     """
@@ -97,30 +95,30 @@ def svg(draw: Callable[[Axes], object], *, salt: str, size: tuple[float, float] 
     nothing = dict.fromkeys(("Date", "Creator", "Format", "Type"))
     style: Any = _STYLE | {"svg.hashsalt": salt}
     with matplotlib.rc_context(style), warnings.catch_warnings():
-        # A name in a script the font lacks is drawn as boxes; the page itself spells it out.
+        # Characters missing in the font are drawn as boxes; the page contains them as text.
         warnings.filterwarnings("ignore", message="Glyph .* missing")
         figure = Figure(figsize=size, dpi=_DPI, layout="constrained", facecolor="none")
         draw(figure.add_subplot())
-        # By itself, because `savefig` goes through everything once more before.
+        # Directly, because `savefig` draws everything twice.
         canvas: Any = FigureCanvasSVG(figure)
         canvas.print_svg(target, metadata=nothing)
     text = _LINK.sub(r'<g class="hint" fill-opacity="0.004"><title>\1</title>', target.getvalue())
     text = text.replace("</a>", "</g>").replace(_CLEAR, "")
     text = compact(text[text.index("<svg") :])
-    # Glyphs and groups carry the same identifiers in every file: give each picture its own.
+    # Glyphs and groups have the same identifiers in every figure: make them unique.
     text = re.sub(r'(\sid="|href="#|url\(#)', rf"\g<1>{salt}-", text)
     for colour, name in _NAMED.items():
         text = text.replace(colour, f"var(--{name}, {colour})")
     return text.replace("<svg ", '<svg aria-hidden="true" focusable="false" ', 1)
 
 
-# Hints travel as the addresses of links, the only text that matplotlib gives each of many artists.
+# Hints are written as addresses of links: the only text per point that matplotlib supports.
 _CLEAR = f' style="fill: {INK}; fill-opacity: 0.003922"'
 _LINK = re.compile(r'<a xlink:href="([^"]*)"[^>]*>')
 
 
 def hints(ax: Axes, x: FloatArray, y: FloatArray, texts: Sequence[str]) -> None:
-    """Lay invisible discs over points, which `svg` turns into titles shown by browsers.
+    """Cover points with invisible discs, whose texts browsers show under the pointer.
 
     Parameters
     ----------
@@ -129,25 +127,24 @@ def hints(ax: Axes, x: FloatArray, y: FloatArray, texts: Sequence[str]) -> None:
     x, y : ndarray
         Shape ``(n,)``.
     texts : sequence of str
-        What is shown at each point; line breaks are kept.
+        Shown at each point; line breaks are kept.
     """
     some = _thinned(len(texts))
-    # Opaque by one part in 255: what is not drawn at all feels no pointer.
+    # Opacity 1/255: fully transparent elements do not react to the pointer.
     discs = ax.scatter(x[some], y[some], s=80, color=INK, alpha=1 / 255, lw=0, zorder=9)
     discs.set_urls(list(texts[some]))
 
 
 def _thinned(n: int) -> slice:
-    """Choose as many of n things, evenly, as may have hints."""
+    """Return a slice that selects at most `constants.HINTS` of n points, evenly."""
     return slice(None, None, -(-n // constants.HINTS) or 1)
 
 
 def plot_posterior(ax: Axes, health: Health, parameters: tuple[str, ...]) -> Axes:
     """Plot the joint posterior of the last epoch.
 
-    Two parameters give the highest-density regions that hold 50 and 90 % of the draws, the
-    baseline, the medians and the marginal 90 % intervals (bars along the axes); one parameter
-    gives its density.
+    For two parameters: highest-density regions of 50 and 90 %, baseline, medians and marginal 90 %
+    intervals (bars along the axes). For one parameter: its density.
 
     Raises
     ------
@@ -156,7 +153,7 @@ def plot_posterior(ax: Axes, health: Health, parameters: tuple[str, ...]) -> Axe
     """
     if len(parameters) not in (1, 2):
         raise ValueError(
-            f"a posterior of {len(parameters)} parameters cannot be drawn, only 1 or 2"
+            f"cannot plot a posterior of {len(parameters)} parameters; needed are 1 or 2"
         )
     columns = [health.parameters.index(name) for name in parameters]
     draws = 100 * health.samples[-1][:, columns]
@@ -177,10 +174,10 @@ def plot_health(ax: Axes, health: Health, parameter: str, limit: float | None) -
     """
     column = health.parameters.index(parameter)
     bands = 100 * health.quantile(_LEVELS)[:, :, column]
-    told = _tells(health, parameter)
-    name = "each epoch by itself" if told else "mostly assumption, not measured"
-    _bands(ax, health.travel / _KM, bands, name, told=told)
-    if told:  # what is not told has no values to show
+    informed = _is_informed(health, parameter)
+    name = "each epoch by itself" if informed else "mostly prior, not measured"
+    _bands(ax, health.travel / _KM, bands, name, informed=informed)
+    if informed:  # else no values are published
         texts = [
             f"{moment(when)}, {whole_km(travel)}\n{spell(parameter)} {q[2]:.1f}{GAP}%, "
             f"90{GAP}%: {q[0]:.1f} to {q[4]:.1f}{GAP}%"
@@ -215,9 +212,9 @@ def plot_life(
     limit = float(prognosis.limits[column]) / baseline
     now, travel = prognosis.travel / _KM, prognosis.curve_travel / _KM
     bands = 100 * prognosis.curve_quantiles[:, :, column] / baseline
-    _bands(ax, travel, bands, "law", told=True)
+    _bands(ax, travel, bands, "law", informed=True)
     top = 108.0
-    if health is not None and _tells(health, parameter):
+    if health is not None and _is_informed(health, parameter):
         top = max(top, 1.04 * _epochs(ax, health, parameter))
     _levels(ax, limit)
     ax.axvline(now, color=INK, lw=1.2, ls=":", label="now")
@@ -245,7 +242,7 @@ def plot_life(
 def plot_survival(ax: Axes, prognosis: Prognosis, *, service: Service | None = None) -> Axes:
     """Plot the probability of not having reached a limit against the travel ahead.
 
-    With a service the risk that its day keeps is drawn: the accepted one, or that of least costs.
+    With a service, the risk on its day is drawn: the accepted risk, or that at least cost.
     """
     horizon = prognosis.horizon / _KM
     last = quantiles(prognosis.remaining[:, -1], (0.99,))[0] / _KM
@@ -267,7 +264,7 @@ def plot_survival(ax: Axes, prognosis: Prognosis, *, service: Service | None = N
     texts = [f"after {x:,.0f}{GAP}km: {y:.0f}{GAP}%" for x, y in zip(some, chance, strict=True)]
     hints(ax, some, chance, [text.replace(",", GAP) for text in texts])
     if service is not None and service.kept_risk is not None:
-        what = "accepted risk" if service.max_risk else "risk at least costs"
+        what = "accepted risk" if service.max_risk else "risk at least cost"
         label = f"{what} {100 * service.kept_risk:.3g} %"
         ax.axhline(100 * (1 - service.kept_risk), color=RED, lw=1.2, ls=(0, (5, 2)), label=label)
     ax.set_xlim(0, end)
@@ -283,15 +280,15 @@ def bars(ax: Axes, travel: FloatArray, bounds: FloatArray, label: str, size: flo
     ax.errorbar(travel / _KM, bounds[1], np.diff(bounds, axis=0), ms=size, label=label, **style)
 
 
-def _bands(ax: Axes, x: FloatArray, bands: FloatArray, name: str, *, told: bool) -> None:
-    """Draw median, 50 and 90 % bands; hatched and grey where the data do not tell."""
-    colour = BLUE if told else MUTED
+def _bands(ax: Axes, x: FloatArray, bands: FloatArray, name: str, *, informed: bool) -> None:
+    """Draw median, 50 and 90 % bands; hatched and grey when mostly prior."""
+    colour = BLUE if informed else MUTED
     for low, alpha, label in ((0, 0.18, "90 %"), (1, 0.32, "50 %")):
-        shown = label if told else None
+        shown = label if informed else None
         ax.fill_between(x, bands[low], bands[4 - low], fc=colour, alpha=alpha, lw=0, label=shown)
-    if not told:
+    if not informed:
         ax.fill_between(x, bands[0], bands[4], fc="none", ec=colour, hatch="///", lw=0)
-    line = "-" if told else (0, (1, 2))
+    line = "-" if informed else (0, (1, 2))
     marker = "o" if x.size < 3 else ""
     ax.plot(x, bands[2], color=colour, lw=1.8, ls=line, marker=marker, ms=4, label=name)
 
@@ -305,7 +302,7 @@ def _levels(ax: Axes, limit: float | None) -> None:
 
 
 def _room(ax: Axes, bands: FloatArray, limit: float | None) -> None:
-    """Show bands, baseline and limit, but not all of a band without end."""
+    """Set limits of the axis that show bands (up to 250 %), baseline and limit."""
     values = [100.0, float(np.nanmin(bands[0])), float(np.nanmax(bands[4]))]
     if limit is not None:
         values.append(100 * limit)
@@ -313,26 +310,26 @@ def _room(ax: Axes, bands: FloatArray, limit: float | None) -> None:
     ax.set_ylim(max(low - 0.06 * (high - low), 0.0), high + 0.06 * (high - low))
 
 
-def _tells(health: Health, parameter: str) -> bool:
-    """Tell whether the last epoch knows a parameter from the data."""
+def _is_informed(health: Health, parameter: str) -> bool:
+    """Return whether the data of the last epoch determine a parameter."""
     if parameter not in health.parameters:
         return False
     return bool(health.informed_parameters()[health.parameters.index(parameter)])
 
 
 def _epochs(ax: Axes, health: Health, parameter: str) -> float:
-    """Draw epochs that know nothing of the law; return the top of their bars."""
+    """Draw intervals of epochs without a law; return the top of their bars."""
     bounds = 100 * health.quantile(_LEVELS[::2])[:, :, health.parameters.index(parameter)]
-    # Twenty bars are enough to judge by; the last epoch is always among them.
-    some = np.arange(bounds.shape[1])[:: -max(1, bounds.shape[1] // 20)]
+    # The last epoch is always among them.
+    some = np.arange(bounds.shape[1])[:: -max(1, bounds.shape[1] // constants.EPOCHS_SHOWN)]
     bars(ax, health.travel[some], bounds[:, some], "epochs, 90 %", 2.5)
     return min(float(bounds[2].max()), 160.0)
 
 
 def _passage(ax: Axes, now: float, ahead: FloatArray, level: float) -> None:
-    """Mark where the limit is reached: 5 to 95 % as a bar on the limit, the median as a point."""
+    """Mark the first passage: 90 % interval as a bar on the limit, median as a point."""
     where = now + ahead
-    right = where[2] if np.isfinite(where[2]) else 1e9  # runs out of the picture
+    right = where[2] if np.isfinite(where[2]) else 1e9  # beyond the figure
     ax.plot([where[0], right], [level, level], color=RED, lw=5, alpha=0.55, solid_capstyle="butt")
     if np.isfinite(where[1]):
         ax.plot(where[1], level, "D", color=RED, mec=PAPER, ms=6, zorder=5, label="limit reached")
@@ -343,7 +340,7 @@ def _passage(ax: Axes, now: float, ahead: FloatArray, level: float) -> None:
 
 
 def _regions(ax: Axes, draws: FloatArray) -> None:
-    """Draw highest-density regions of two columns, smoothed along their principal axes."""
+    """Draw highest-density regions of two columns, shape ``(n_draws, 2)``, smoothed."""
     from scipy.ndimage import gaussian_filter, map_coordinates
 
     mean, cov = draws.mean(axis=0), np.cov(draws.T)
@@ -377,7 +374,7 @@ def _regions(ax: Axes, draws: FloatArray) -> None:
     ax.set_ylim(first[1], last[1])
     across, up = ax.get_xaxis_transform(), ax.get_yaxis_transform()
     ax.plot([low[0], high[0]], [0.05] * 2, "|-", color=INK, lw=1.4, ms=8, transform=across)
-    name = "single 90 %"
+    name = "marginal 90 %"
     ax.plot([0.04] * 2, [low[1], high[1]], "_-", color=INK, lw=1.4, ms=8, transform=up, label=name)
 
 
@@ -403,13 +400,13 @@ def _density(ax: Axes, draws: FloatArray) -> None:
 
 
 def odometer(ax: Axes, *, room: int = ROOM) -> Axes:
-    """Finish a picture over the odometer: axis and legend."""
+    """Label the odometer axis and add the legend."""
     ax.set_xlabel("odometer in km")
     return legend(ax, room=room)
 
 
 def legend(ax: Axes, *, room: int = ROOM) -> Axes:
-    """Put the legend above the picture, where it covers nothing; ``room`` characters are a line."""
+    """Add the legend above the axes, with at most ``room`` characters per line."""
     handles, labels = ax.get_legend_handles_labels()
     lengths = np.array([len(label) for label in labels])
     columns = max(min(4, len(labels)), 1)
@@ -421,25 +418,31 @@ def legend(ax: Axes, *, room: int = ROOM) -> Axes:
 
 
 def _spell(name: str) -> str:
-    """Spell a name for people; a dollar sign would open a formula."""
+    """Return a name for a label; a dollar sign would start a formula."""
     return name.replace("_", " ").replace("$", r"\$")
 
 
-# A band is shown on a logarithmic axis if its top is more than so many times its bottom.
+# Ratio of band limits above which the frequency axis is logarithmic.
 _WIDE = 4.0
-# A column of a waterfall reaches so many usual distances of logs to either side.
+# Half width of a waterfall's column, at most, in median distances of logs.
 _MOST_ROOM = 0.75
 _LINES = {"unknown": "other"}
-# On an image; not of the palette, which turns where a page is dark.
+_WORDS = {
+    "step": "sudden change",
+    "regreasing": "regreasing",
+    "servo": "servo retuned",
+    "sensor": "sensor changed",
+    "reset": "guide or mount serviced",
+}
+# On images; not from the palette, which changes on dark pages.
 _WHITE, _BLACK = "#ffffff", "#000000"
 
 
 def plot_frequencies(ax: Axes, history: History, track: Track | None, mode: str) -> Axes:
     """Plot the natural frequency of a mode against the odometer.
 
-    Each log's estimate with ± 2 standard deviations as it was measured; the filtered line with
-    its 95 % band has the covariates at their reference. Without a track of this mode the line
-    is left out.
+    Points are the estimates of the logs ± 2 standard deviations, as measured; the line is
+    filtered, with its 95 % band, with the covariates at their reference (only with a track).
     """
     for column in history.columns(mode):
         _logs(ax, history, column, history.ln_frequency[:, column], (1.0, "Hz"))
@@ -448,8 +451,8 @@ def plot_frequencies(ax: Axes, history: History, track: Track | None, mode: str)
         level = track.ln_frequency[:, k]
         _filtered(ax, track.travel, level, track.ln_frequency_std[:, k], 1.0)
         _baselines(ax, history, track, k)
-        _happenings(ax, track)
-    # A healthy mode must not look like a drama: at least 1 % of the frequency is shown.
+        _mark_steps(ax, track)
+    # Show at least 1 % of the frequency, so that noise does not appear as a change.
     low, high = ax.get_ylim()
     middle = (low + high) / 2
     if high - low < 0.01 * middle:
@@ -471,7 +474,7 @@ def plot_damping(ax: Axes, history: History, track: Track | None, mode: str) -> 
     if track is not None and mode in track.modes:
         k = track.modes.index(mode)
         _filtered(ax, track.travel, track.ln_damping[:, k], track.ln_damping_std[:, k], 100.0)
-    # A log that hardly saw the mode has bars without end; they may leave the picture.
+    # Bars of uncertain logs may exceed the figure.
     if top > 0:
         ax.set_ylim(0, 1.08 * min(top, 300 * float(np.exp(np.nanmax(level)))))
     ax.set_ylabel("damping ratio in %")
@@ -479,7 +482,7 @@ def plot_damping(ax: Axes, history: History, track: Track | None, mode: str) -> 
 
 
 def plot_nis(ax: Axes, track: Track) -> Axes:
-    """Plot the normalised innovation squared of each epoch and its 95 % chi-square band."""
+    """Plot the normalised innovation squared of each epoch with its 95 % chi-square band."""
     seen = (track.nis_dof > 0) & np.isfinite(track.nis)
     x, nis = track.travel[seen] / _KM, track.nis[seen]
     low, high = chi_square_band(track.nis_dof[seen])
@@ -512,16 +515,16 @@ def plot_waterfall(
 ) -> Axes:
     """Plot the spectra of all logs side by side: odometer, frequency, level in dB as colour.
 
-    The history has an odometer. The filtered frequencies of the modes stand above with their 95 %
-    bands, and every line of a log at its place. Where no log stands for longer than usual there is
-    a gap. ``moved`` is how far covariates have moved ln f, shape ``(n_logs, n_modes)``: with it the
-    modes stand where the logs saw them, else at the covariates' reference.
+    The history needs an odometer. Filtered frequencies with their 95 % bands and spectral lines are
+    drawn on top. Longer intervals without logs are gaps. ``moved`` is the shift of ln f by the
+    covariates, shape ``(n_logs, n_modes)``: with it the frequencies are those of the logs, else
+    those at the covariates' reference.
     """
     sides = _columns(history.travel / _KM)
     x, level = sides.ravel(), np.full((waterfall.level.shape[1], 2 * len(sides) - 1), np.nan)
     level[:, ::2] = waterfall.level.T
     low, high = _shown_levels(waterfall)
-    # As an image: thousands of rectangles would be a hundred times as many bytes.
+    # As an image: rectangles would need a hundred times the bytes.
     picture = ax.pcolormesh(
         x, waterfall.edges, level, cmap="cividis", vmin=low, vmax=high, rasterized=True
     )
@@ -538,14 +541,14 @@ def plot_waterfall(
     if waterfall.edges[-1] > _WIDE * waterfall.edges[0]:
         ax.set_yscale("log")
     ax.set_ylabel("frequency in Hz")
-    return odometer(ax, room=54)  # the bar of colours takes the rest
+    return odometer(ax, room=54)  # next to the colour bar
 
 
 def plot_influence(ax: Axes, influence: CovariateEffect, history: History) -> Axes:
-    """Plot what a covariate does to the frequency of a mode, before and after it is taken out.
+    """Plot the effect of a covariate on the frequency of a mode, before and after correction.
 
-    Changes are in % of the frequency at the covariate's reference, without wear and whatever else
-    is known to move the mode. Of the line a 95 % band is shown where the effect is a straight one.
+    Changes are in % of the frequency at the covariate's reference, without wear and all other
+    known effects. A linear effect has a 95 % band.
     """
     x, before, after = influence.values, 100 * influence.measured, 100 * influence.corrected
     grid = np.linspace(float(x.min()), float(x.max()), 60)
@@ -553,7 +556,7 @@ def plot_influence(ax: Axes, influence: CovariateEffect, history: History) -> Ax
     if std is not None:
         reach = 196 * std
         ax.fill_between(grid, line - reach, line + reach, color=BLUE, alpha=0.18, lw=0)
-    ax.plot(grid, line, color=BLUE, lw=1.6, label="taken out")
+    ax.plot(grid, line, color=BLUE, lw=1.6, label="effect")
     ax.plot(x, before, "o", mfc="none", mec=MUTED, ms=4.5, mew=1.0, label="as measured")
     ax.plot(x, after, "o", color=INK, ms=2.8, label="corrected")
     name, unit = covariate(influence.covariate)
@@ -569,7 +572,7 @@ def plot_influence(ax: Axes, influence: CovariateEffect, history: History) -> Ax
 
 
 def chi_square_band(dof: FloatArray) -> FloatArray:
-    """Bounds that hold a chi-square variable with 95 %, shape ``(2, ...)``."""
+    """Return the 95 % interval of chi-square variables, shape ``(2, ...)``."""
     return np.stack([2 * gammaincinv(dof / 2, level) for level in (0.025, 0.975)])
 
 
@@ -578,7 +581,7 @@ def _logs(
 ) -> float:
     """Draw logarithmic estimates with ± 2 standard deviations; return the top of the bars.
 
-    ``unit`` holds how many of it are one, and its name.
+    ``unit`` is the factor to the shown unit and its name.
     """
     std = np.sqrt(history.cov[:, row, row])
     seen = np.flatnonzero(np.isfinite(level) & np.isfinite(std))
@@ -594,7 +597,7 @@ def _logs(
 
 
 def title(lives: History | Track, k: int) -> str:
-    """Say which log it is, for hints: its name, moment and odometer."""
+    """Return name, time and odometer of a log, for hints."""
     return f"{lives.logs[k]}\n{moment(lives.recorded_at[k])}, {whole_km(lives.travel[k])}"
 
 
@@ -611,7 +614,7 @@ def _filtered(
 
 
 def _baselines(ax: Axes, history: History, track: Track, column: int) -> None:
-    """Draw what each baseline is now believed to have been, as far as it counts."""
+    """Draw the present estimate of each baseline over the logs that refer to it."""
     base = np.exp(track.ln_frequency[:, column] - track.drift[:, column])
     ends = [*history.baselines[1:], len(history.logs)]
     for number, (first, end) in enumerate(zip(history.baselines, ends, strict=True)):
@@ -624,16 +627,16 @@ def _baselines(ax: Axes, history: History, track: Track, column: int) -> None:
 
 
 def _columns(x: FloatArray) -> FloatArray:
-    """Give each log the room to its neighbours, but not much more than usual, ``(n_logs, 2)``."""
+    """Return the sides of each log's column, shape ``(n_logs, 2)``; gaps stay open."""
     gaps = np.diff(x)
     usual = float(np.median(gaps[gaps > 0])) if (gaps > 0).any() else 1.0
-    # A log beside another at the same place still is a stroke.
+    # Logs at the same odometer get a narrow column.
     half = np.clip(gaps / 2, 0.1 * usual, _MOST_ROOM * usual)
     return np.stack([x - np.append(usual / 2, half), x + np.append(half, usual / 2)], axis=1)
 
 
 def _shown_levels(waterfall: Waterfall) -> tuple[float, float]:
-    """Choose the ends of the colours in dB: what lines do not reach decides, in steps of 5 dB."""
+    """Return the range of colours in dB, without spectral lines, in steps of 5 dB."""
     free = waterfall.level.copy()
     for row, lines in zip(free, waterfall.lines, strict=True):
         for line in lines:
@@ -644,7 +647,7 @@ def _shown_levels(waterfall: Waterfall) -> tuple[float, float]:
 
 
 def _column_hints(ax: Axes, sides: FloatArray, waterfall: Waterfall, history: History) -> None:
-    """Let each column tell its log, and where it has the modes."""
+    """Add a hint to each column: its log and the frequencies of its modes."""
     from matplotlib.collections import PolyCollection
 
     low, high = waterfall.edges[[0, -1]]
@@ -657,7 +660,7 @@ def _column_hints(ax: Axes, sides: FloatArray, waterfall: Waterfall, history: Hi
 
 
 def _found(history: History, k: int) -> str:
-    """List the frequencies that a log gave, a line each."""
+    """List the frequencies of a log, one per line."""
     return "".join(
         f"\n{spell(one.mode)} {np.exp(ln_f):.2f}{GAP}Hz"
         for one, ln_f in zip(history.series, history.ln_frequency[k], strict=True)
@@ -666,7 +669,7 @@ def _found(history: History, k: int) -> str:
 
 
 def _waterfall_lines(ax: Axes, waterfall: Waterfall, history: History) -> None:
-    """Mark the lines of every log; each kind has its own marker."""
+    """Mark the spectral lines of every log; each kind has its own marker."""
     seen: dict[str, list[tuple[float, Line, int]]] = {}
     for k, (x, lines) in enumerate(zip(history.travel / _KM, waterfall.lines, strict=True)):
         for line in lines:
@@ -685,7 +688,7 @@ def _waterfall_lines(ax: Axes, waterfall: Waterfall, history: History) -> None:
 
 
 def _on_image(ax: Axes, track: Track, k: int, moved: FloatArray | float) -> None:
-    """Draw the filtered line of a mode and its 95 % band so that they show on every colour."""
+    """Draw the filtered line of a mode with its 95 % band, visible on every colour."""
     level, reach = track.ln_frequency[:, k] + moved, 1.96 * track.ln_frequency_std[:, k]
     x = track.travel / _KM
     name = None if k else "tracked modes, 95 % band"
@@ -705,20 +708,11 @@ def _halo(width: float) -> list[Any]:
     return [withStroke(linewidth=width, foreground=_BLACK)]
 
 
-def _happenings(ax: Axes, track: Track) -> None:
-    """Mark what happened at once."""
+def _mark_steps(ax: Axes, track: Track) -> None:
+    """Mark sudden changes and declared work."""
     marked: set[str] = set()
     for kind, first in dict.fromkeys((step.kind, step.first) for step in track.steps):
         colour, style = (RED, "-") if kind == "step" else (INK, ":")
         name = None if kind in marked else _WORDS[kind]
         marked.add(kind)
         ax.axvline(track.travel[first] / _KM, color=colour, ls=style, lw=1.0, label=name, zorder=1)
-
-
-_WORDS = {
-    "step": "sudden change",
-    "regreasing": "regreasing",
-    "servo": "servo retuned",
-    "sensor": "sensor changed",
-    "reset": "guide or mount serviced",
-}

@@ -1,4 +1,4 @@
-"""Report pages as PDFs, to be sent and filed."""
+"""Pages as PDF (WeasyPrint)."""
 
 from __future__ import annotations
 
@@ -14,23 +14,23 @@ from lmshealth.report.svg import give_letters
 
 
 class PdfError(LmshealthError):
-    """A PDF that cannot be made; the page it would be made of is there."""
+    """A PDF cannot be made; its HTML page exists."""
 
 
 def write_pdfs(pages: Iterable[Path]) -> list[Path]:
-    """Write a PDF beside each page, under the same name.
+    """Write a PDF next to each page, under the same name.
 
-    The same page gives the same bytes, whatever the time. Nothing is loaded from anywhere.
+    The bytes are reproducible, and nothing is loaded from the network or other files.
 
     Parameters
     ----------
     pages : iterable of Path
-        HTML files that `write_report` wrote.
+        HTML files of `make_page`.
 
     Raises
     ------
     PdfError
-        If the library for it is not there, or cannot lay out a page.
+        If WeasyPrint is missing or cannot lay out a page.
     """
     html, fetcher = _library()
     style = (resources.files("lmshealth") / "report" / "templates" / "pdf.css").read_text(
@@ -40,12 +40,12 @@ def write_pdfs(pages: Iterable[Path]) -> list[Path]:
     for page in pages:
         text = page.read_text(encoding="utf-8").replace("</style>", f"{style}</style>", 1)
         text = give_letters(text)
-        # Pictures name colours of the style sheet, which are not looked up inside of them.
+        # WeasyPrint does not resolve CSS variables inside SVG.
         text = re.sub(r"var\(--\w+, (#\w+)\)", r"\1", text)
         target = page.with_suffix(".pdf")
         try:
             content = html(string=text, url_fetcher=fetcher).write_pdf()
-        except Exception as error:  # whatever it stumbles over, the page is there
+        except Exception as error:  # any failure: the HTML page exists
             raise PdfError(
                 f"{target}: cannot be made: {type(error).__name__} {error}; print {page} from a "
                 "browser instead"
@@ -56,7 +56,7 @@ def write_pdfs(pages: Iterable[Path]) -> list[Path]:
 
 
 def _library() -> tuple[Any, Any]:
-    """Load WeasyPrint, and a fetcher that reads nothing outside of a page."""
+    """Import WeasyPrint, with a fetcher that allows nothing outside of a page."""
     try:
         from weasyprint import HTML
         from weasyprint.urls import URLFetcher
@@ -67,7 +67,7 @@ def _library() -> tuple[Any, Any]:
         ) from error
     except OSError as error:
         raise PdfError(
-            "WeasyPrint does not find its libraries; Debian has them in libpangoft2-1.0-0 and "
-            f"libharfbuzz-subset0; the pages are written ({error})"
+            "WeasyPrint does not find its libraries; install libpangoft2-1.0-0 and "
+            f"libharfbuzz-subset0 (Debian); the pages are written ({error})"
         ) from error
     return HTML, URLFetcher(allowed_protocols=("data",))

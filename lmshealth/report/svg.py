@@ -1,4 +1,4 @@
-"""Pictures as light SVG: what no eye sees is left out, and letters are drawn once for a page."""
+"""Compact SVG: without invisible content, and glyphs defined once per page."""
 
 from __future__ import annotations
 
@@ -14,25 +14,25 @@ _GLYPH = re.compile(
 
 
 def compact(text: str) -> str:
-    """Leave out what no eye sees: a third of what matplotlib writes.
+    """Remove invisible content, a third of the text that matplotlib writes.
 
     Parameters
     ----------
     text : str
-        An SVG as matplotlib writes it, with letters as paths.
+        An SVG by matplotlib, with glyphs as paths.
     """
     text = re.sub(r"(?s)<!--.*?-->|<metadata>.*?</metadata>", "", text)
     text = re.sub(r"\n\s*", "\n", text).strip().replace("xlink:href", "href")
-    # Two decimals of a point are finer than any screen or printer.
+    # Two decimals of a point are finer than screens and printers.
     text = re.sub(
         r'\s[dxy]="[^"]*"|translate\([^)]*\)', lambda m: re.sub(r"(\.\d\d)\d+", r"\1", m[0]), text
     )
     text = re.sub(r'(?<=\sd=")[^"]*', lambda m: re.sub(r"\s*([A-Za-z])\s*", r"\1", m[0]), text)
     text = re.sub(r'style="[^"]*"', lambda m: re.sub(r"([:;,]) ", r"\1", m[0]), text)
-    # A letter is put in its place by an attribute.
+    # Glyphs are placed by attributes instead of a transform.
     text = re.sub(r'" transform="translate\(([\d.-]+) ([\d.-]+)\)"/>', r'" x="\1" y="\2"/>', text)
     text = text.replace(' y="0"/>', "/>")
-    # Markers in a row say how they look once.
+    # Successive equal markers share their style.
     text = re.sub(r'(?:<use [^>]*? (style="[^"]*")/>\n)(?:<use [^>]*? \1/>\n)+', _once, text)
     used = set(re.findall(r'(?:href="|url\()#([^")]+)', text))
     text = re.sub(r'\sid="([^"]*)"', lambda m: m[0] if m[1] in used else "", text)
@@ -44,19 +44,19 @@ def _once(found: re.Match[str]) -> str:
 
 
 def share_letters(pictures: Mapping[Key, str]) -> tuple[str, dict[Key, str]]:
-    """Take the letters out of the pictures of a page.
+    """Move the glyphs of all figures of a page into one definition.
 
     Parameters
     ----------
     pictures : mapping of str
-        Lean SVG elements.
+        Compact SVG elements.
 
     Returns
     -------
     letters : str
-        An SVG element for the same page that defines each letter once; empty without any.
+        SVG element that defines each glyph once; empty without any.
     pictures : dict of str
-        What refers to it.
+        The figures, which refer to it.
     """
     letters: dict[str, str] = {}
     shared = {}
@@ -72,7 +72,7 @@ def share_letters(pictures: Mapping[Key, str]) -> tuple[str, dict[Key, str]]:
 
 
 def give_letters(page: str) -> str:
-    """Put the letters of a page back into each of its pictures, for who reads them one by one."""
+    """Copy the glyphs of a page into each of its figures, for readers that render them alone."""
     found = re.search(r'(?s)<svg class="letters"[^>]*>(<defs>.*?</defs>)</svg>', page)
     if found is None:
         return page

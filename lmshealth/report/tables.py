@@ -1,7 +1,4 @@
-"""Tables of a run, with the columns of the public contract: units stand in the names again.
-
-Tables of what single logs show, as the commands print them; `run` writes no such files.
-"""
+"""Tables of a run and of single logs, with the columns of the public contract (units in names)."""
 
 from __future__ import annotations
 
@@ -25,20 +22,16 @@ from lmshealth.report.constants import RUL_LEVELS
 from lmshealth.signal.acceleration_levels import Growth, Magnitude
 from lmshealth.signal.following_error import FollowingError
 from lmshealth.signal.spectral_lines import Line
-from lmshealth.stage.check import (
-    Diagnostic,
-    ModeCheck,
-    ParameterCheck,
-    StageCheck,
-)
+from lmshealth.stage.check import Diagnostic, ModeCheck, ParameterCheck, StageCheck
 from lmshealth.stage.constants import TYPICAL_DURATION
 from lmshealth.stage.planning import Plan
 from lmshealth.tracking.history import LogEstimates
 from lmshealth.tracking.smoother import Smoothed
 from lmshealth.tracking.track import Track
 
-_KM, _MICRO = 1000.0, 1e-6
+_KM, _MILLI, _MICRO, _NANO = 1000.0, 1e-3, 1e-6, 1e-9
 
+# Tables of a run: files without their ending.
 COLUMNS = {
     "modes": "log stage recorded_at travel_km temperature_c payload_kg position_mm servo_id "
     "delta_e_below_40hz_um mode source channel frequency_hz frequency_std_hz damping_ratio "
@@ -64,49 +57,27 @@ COLUMNS = {
     "refused": "log channel mode source reason detail",
 }
 
+# Tables of single logs and of plans.
+LOG_COLUMNS = {
+    "error": "log channel velocity_mm_s duration_s min_um max_um std_um mean_um n_harmonics "
+    "bandwidth_hz lowest_hz highest_hz max_magnitude_um strongest_hz share_explained floor_nm "
+    "n_above_floor bandwidth_above_floor_hz lowest_above_floor_hz highest_above_floor_hz "
+    "share_explained_above_floor",
+    "magnitudes": "log stage velocity_mm_s channel band kind low_hz high_hz placed_by "
+    "magnitude_mm_s2 strongest_hz line rms_mm_s2 dof slope slope_std p_value grows",
+    "frf": "log frequency_hz gain phase_rad gain_std coherence h1_gain h1_phase_rad h2_gain "
+    "h2_phase_rad hv_gain hv_phase_rad fit_gain fit_phase_rad",
+    "detect": "parameter loss power false_alarm n_baseline seconds_for_one_log",
+    "plan": "parameter loss seconds_per_log n_logs hindrance power_of_one_log "
+    "smallest_loss_of_one_log smallest_loss",
+    "fit": "log input output period_s n_averages n_lines low_hz high_hz mean_coherence "
+    "chi_square distortion colour",
+    "harmonics": "log channel frequency_hz amplitude_um phase_rad above_floor",
+    "growth": "stage channel band n_logs n_velocities slope slope_std p_value grows",
+    "lines": "frequency_hz amplitude unit kind channel",
+}
+
 Row = dict[str, Any]
-
-
-def modes_rows(reading: LogEstimates) -> list[Row]:
-    """List the estimates of one log, one row per mode, with a column per channel of a shape."""
-    metadata, modes, error = reading.metadata, reading.modes, reading.loop_error
-    circumstances = {
-        "log": reading.log,
-        "stage": metadata.stage,
-        "recorded_at": _moment(metadata.recorded_at),
-        "travel_km": None if metadata.travel is None else metadata.travel / _KM,
-        **{name: metadata.covariates.get(name) for name in COVARIATES},
-        "servo_id": metadata.servo_id,
-        "delta_e_below_40hz_um": None if error is None else error / _MICRO,
-    }
-    return [
-        {
-            **circumstances,
-            "mode": modes.names[i],
-            "source": modes.sources[i],
-            "channel": modes.channels[i],
-            "frequency_hz": float(modes.frequency[i]),
-            "frequency_std_hz": float(modes.frequency_std[i]),
-            "damping_ratio": float(modes.damping_ratio[i]),
-            "damping_ratio_std": float(modes.damping_ratio_std[i]),
-            "correlation_f_zeta": float(modes.correlation[i]),
-            "snr": float(modes.snr[i]),
-            "dispersion": float(modes.dispersion[i]),
-            "flags": modes.flags[i],
-            **{
-                f"shape_{channel}": float(own)
-                for channel, own in zip(modes.shape_channels, modes.shapes[i], strict=True)
-            },
-        }
-        for i in range(len(modes.names))
-    ]
-
-
-def refused_rows(refused: Iterable[Refusal]) -> list[Row]:
-    """List what was not analysed, one row each."""
-    return [
-        {name: getattr(refusal, name) for name in COLUMNS["refused"].split()} for refusal in refused
-    ]
 
 
 def frame(columns: str, rows: Sequence[Row]) -> pd.DataFrame:
@@ -115,9 +86,9 @@ def frame(columns: str, rows: Sequence[Row]) -> pd.DataFrame:
     Parameters
     ----------
     columns : str
-        Those that every table of its kind has, separated by blanks.
+        Columns of every table of this kind, separated by blanks.
     rows : sequence of dict
-        What else they hold is appended, in the order in which it comes.
+        Their further columns are appended in order of appearance.
     """
     order = dict.fromkeys([*columns.split(), *(name for row in rows for name in row)])
     return pd.DataFrame(list(rows), columns=list(order))
@@ -126,14 +97,14 @@ def frame(columns: str, rows: Sequence[Row]) -> pd.DataFrame:
 def machine_tables(
     readings: Sequence[LogEstimates], assessment: Assessment
 ) -> dict[str, list[Row]]:
-    """List everything about one machine, by the name of the table, which is a file without ending.
+    """Return the rows of all tables of one machine, by table (a key of `COLUMNS`).
 
     Parameters
     ----------
     readings : sequence of LogEstimates
-        Its logs.
+        Estimates of its logs.
     assessment : Assessment
-        What they say together.
+        Its results.
     """
     rows: dict[str, list[Row]] = {name: [] for name in COLUMNS}
     for reading in readings:
@@ -149,32 +120,73 @@ def machine_tables(
     if assessment.prognosis is not None:
         life = summarise_life(assessment.prognosis, assessment.stage)
         rows["prognosis"] = prognosis_rows(life, assessment.service())
-    judgement = assessment.judgement
-    verdict = judgement.verdict, judgement.probability
-    values = judgement.stage, _moment(judgement.recorded_at), *verdict
-    rows["verdict"] = [dict(zip(COLUMNS["verdict"].split(), values, strict=True))]
+    found = assessment.judgement
+    verdict = found.stage, _iso(found.recorded_at), found.verdict, found.probability
+    rows["verdict"] = _rows(COLUMNS["verdict"], [verdict])
     rows["refused"] = refused_rows(assessment.refused)
     return rows
 
 
-def _moment(moment: datetime | None) -> str | None:
+def _rows(columns: str, values: Iterable[Sequence[Any]]) -> list[Row]:
+    """Return rows of columns separated by blanks; values in their order."""
+    names = columns.split()
+    return [dict(zip(names, one, strict=True)) for one in values]
+
+
+def _iso(moment: datetime | None) -> str | None:
     return None if moment is None else moment.isoformat()
+
+
+def modes_rows(reading: LogEstimates) -> list[Row]:
+    """Return the estimates of one log, one row per mode, with a column per channel of a shape."""
+    metadata, modes, error = reading.metadata, reading.modes, reading.loop_error
+    log = (
+        reading.log,
+        metadata.stage,
+        _iso(metadata.recorded_at),
+        None if metadata.travel is None else metadata.travel / _KM,
+        *(metadata.covariates.get(name) for name in COVARIATES),
+        metadata.servo_id,
+        None if error is None else error / _MICRO,
+    )
+    values = zip(
+        modes.names,
+        modes.sources,
+        modes.channels,
+        modes.frequency.tolist(),
+        modes.frequency_std.tolist(),
+        modes.damping_ratio.tolist(),
+        modes.damping_ratio_std.tolist(),
+        modes.correlation.tolist(),
+        modes.snr.tolist(),
+        modes.dispersion.tolist(),
+        modes.flags,
+        strict=True,
+    )
+    rows = _rows(COLUMNS["modes"], [(*log, *one) for one in values])
+    for row, shape in zip(rows, modes.shapes.tolist(), strict=True):
+        channels = zip(modes.shape_channels, shape, strict=True)
+        row |= {f"shape_{channel}": part for channel, part in channels}
+    return rows
 
 
 def _modes_cov_rows(reading: LogEstimates) -> list[Row]:
     modes = reading.modes
-    return [
-        {
-            "log": reading.log,
-            "source_a": modes.sources[a],
-            "mode_a": modes.names[a],
-            "source_b": modes.sources[b],
-            "mode_b": modes.names[b],
-            "cov_ln_f": float(modes.cov[a, b]),
-        }
-        for a, b in combinations(range(len(modes.names)), 2)
-        if modes.cov[a, b] != 0
-    ]
+    names = list(zip(modes.sources, modes.names, strict=True))
+    return _rows(
+        COLUMNS["modes_cov"],
+        [
+            (reading.log, *names[a], *names[b], float(modes.cov[a, b]))
+            for a, b in combinations(range(len(names)), 2)
+            if modes.cov[a, b] != 0
+        ],
+    )
+
+
+def refused_rows(refused: Iterable[Refusal]) -> list[Row]:
+    """Return refusals, one row each."""
+    names = COLUMNS["refused"].split()
+    return [{name: getattr(refusal, name) for name in names} for refusal in refused]
 
 
 def track_rows(
@@ -185,97 +197,92 @@ def track_rows(
     With `epochs` only these.
     """
     drift_std = np.sqrt(np.einsum("kii->ki", track.drift_cov))
-    frequency, damping = np.exp(track.ln_frequency), np.exp(track.ln_damping)
+    columns = _mode_columns(track, drift_std)
+    later = {} if smoothed is None else _mode_columns(smoothed, smoothed.drift_std)
     return [
         {
             "stage": track.stage,
-            "recorded_at": _moment(track.recorded_at[k]),
+            "recorded_at": _iso(track.recorded_at[k]),
             "travel_km": track.travel[k] / _KM,
             "mode": mode,
-            "frequency_hz": frequency[k, i],
-            "frequency_std_hz": frequency[k, i] * track.ln_frequency_std[k, i],
-            "damping_ratio": damping[k, i],
-            "damping_ratio_std": damping[k, i] * track.ln_damping_std[k, i],
-            "drift": track.drift[k, i],
-            "drift_std": drift_std[k, i],
+            **{name: values[k, i] for name, values in columns.items()},
             "nis": track.nis[k],
             "nis_dof": track.nis_dof[k],
             "noise_scale": track.noise_scale[k].max(),
             "widening": track.widening[k],
-            **({} if smoothed is None else _smoothed_columns(smoothed, k, i)),
+            **{f"{name}_smoothed": values[k, i] for name, values in later.items()},
         }
         for k in (range(len(track.logs)) if epochs is None else epochs)
         for i, mode in enumerate(track.modes)
     ]
 
 
+def _mode_columns(track: Track | Smoothed, drift_std: FloatArray) -> dict[str, FloatArray]:
+    """Return the columns of all modes, shape ``(n_epochs, n_modes)`` each."""
+    frequency, damping = np.exp(track.ln_frequency), np.exp(track.ln_damping)
+    return {
+        "frequency_hz": frequency,
+        "frequency_std_hz": frequency * track.ln_frequency_std,
+        "damping_ratio": damping,
+        "damping_ratio_std": damping * track.ln_damping_std,
+        "drift": track.drift,
+        "drift_std": drift_std,
+    }
+
+
 def track_cov_rows(track: Track) -> list[Row]:
-    """List the covariances between drifts of one epoch, one row per pair of modes."""
-    return [
-        {
-            "stage": track.stage,
-            "recorded_at": _moment(track.recorded_at[k]),
-            "mode_a": track.modes[a],
-            "mode_b": track.modes[b],
-            "cov_drift": track.drift_cov[k, a, b],
-        }
-        for k in range(len(track.logs))
-        for a, b in combinations(range(len(track.modes)), 2)
-    ]
+    """Return the covariances of the drifts of one epoch, one row per pair of modes."""
+    return _rows(
+        COLUMNS["track_cov"],
+        [
+            (
+                track.stage,
+                _iso(track.recorded_at[k]),
+                track.modes[a],
+                track.modes[b],
+                track.drift_cov[k, a, b],
+            )
+            for k in range(len(track.logs))
+            for a, b in combinations(range(len(track.modes)), 2)
+        ],
+    )
 
 
 def effects_rows(track: Track) -> list[Row]:
-    """List what moves modes without wear, one row per mode and cause."""
-    return [
-        {
-            "stage": track.stage,
-            "mode": effect.mode,
-            "covariate": effect.covariate,
-            "coefficient": effect.coefficient,
-            "std": effect.std,
-        }
-        for effect in track.effects
-    ]
+    """Return effects other than wear, one row per mode and cause."""
+    effects = [(track.stage, e.mode, e.covariate, e.coefficient, e.std) for e in track.effects]
+    return _rows(COLUMNS["effects"], effects)
 
 
 def events_rows(track: Track) -> list[Row]:
-    """List what happened to a machine, one row per event and mode."""
-    return [
-        {
-            "stage": track.stage,
-            "recorded_at": _moment(track.recorded_at[event.epoch]),
-            "travel_km": track.travel[event.epoch] / _KM,
-            "kind": event.kind,
-            "mode": event.mode,
-            "source": event.source,
-            "size": event.size,
-            "std": event.std,
-            "evidence": event.evidence,
-            "declared": event.declared,
-            "known_at": _moment(track.recorded_at[event.found_at]),
-        }
-        for event in track.events
-    ]
+    """Return the events of a machine, one row per event and mode."""
+    return _rows(
+        COLUMNS["events"],
+        [
+            (
+                track.stage,
+                _iso(track.recorded_at[event.epoch]),
+                track.travel[event.epoch] / _KM,
+                event.kind,
+                event.mode,
+                event.source,
+                event.size,
+                event.std,
+                event.evidence,
+                event.declared,
+                _iso(track.recorded_at[event.found_at]),
+            )
+            for event in track.events
+        ],
+    )
 
 
 def health_rows(health: Health) -> list[Row]:
-    """List a posterior of health, one row per epoch and parameter."""
+    """Return a posterior of the health parameters, one row per epoch and parameter."""
     return [
         {str(name): value for name, value in row.items()}
         for row in health.to_frame().to_dict("records")
     ]
-
-
-def _smoothed_columns(smoothed: Smoothed, k: int, i: int) -> Row:
-    frequency, damping = np.exp(smoothed.ln_frequency[k, i]), np.exp(smoothed.ln_damping[k, i])
-    return {
-        "frequency_hz_smoothed": frequency,
-        "frequency_std_hz_smoothed": frequency * smoothed.ln_frequency_std[k, i],
-        "damping_ratio_smoothed": damping,
-        "damping_ratio_std_smoothed": damping * smoothed.ln_damping_std[k, i],
-        "drift_smoothed": smoothed.drift[k, i],
-        "drift_std_smoothed": smoothed.drift_std[k, i],
-    }
 
 
 def prognosis_rows(
@@ -333,187 +340,133 @@ def _rul_columns(one: LimitLife) -> Row:
     return row
 
 
-_MICRO, _MILLI, _NANO = 1e-6, 1e-3, 1e-9
-
-LOG_COLUMNS = {
-    "error": "log channel velocity_mm_s duration_s min_um max_um std_um mean_um n_harmonics "
-    "bandwidth_hz lowest_hz highest_hz max_magnitude_um strongest_hz share_explained floor_nm "
-    "n_above_floor bandwidth_above_floor_hz lowest_above_floor_hz highest_above_floor_hz "
-    "share_explained_above_floor",
-    "magnitudes": "log stage velocity_mm_s channel band kind low_hz high_hz placed_by "
-    "magnitude_mm_s2 strongest_hz line rms_mm_s2 dof slope slope_std p_value grows",
-    "frf": "log frequency_hz gain phase_rad gain_std coherence h1_gain h1_phase_rad h2_gain "
-    "h2_phase_rad hv_gain hv_phase_rad fit_gain fit_phase_rad",
-    "detect": "parameter loss power false_alarm n_baseline seconds_for_one_log",
-    "plan": "parameter loss seconds_per_log n_logs hindrance power_of_one_log "
-    "smallest_loss_of_one_log smallest_loss",
-    "fit": "log input output period_s n_averages n_lines low_hz high_hz mean_coherence "
-    "chi_square distortion colour",
-}
-
-
 def error_row(log: str, error: FollowingError) -> Row:
-    """Give the reading of the following error of one log; a bandwidth is highest minus lowest."""
+    """Return the analysis of the following error of one log; bandwidth: highest minus lowest."""
     (low, high), (low_above, high_above) = error.band, error.band_above
-    return {
-        "log": log,
-        "channel": error.channel,
-        "velocity_mm_s": error.velocity / _MILLI,
-        "duration_s": error.duration,
-        "min_um": error.lowest / _MICRO,
-        "max_um": error.highest / _MICRO,
-        "std_um": error.std / _MICRO,
-        "mean_um": error.mean / _MICRO,
-        "n_harmonics": error.kept.size,
-        "bandwidth_hz": high - low,
-        "lowest_hz": low,
-        "highest_hz": high,
-        "max_magnitude_um": error.max_magnitude / _MICRO,
-        "strongest_hz": float(error.harmonics.frequency[error.kept[0]]),
-        "share_explained": error.share_explained,
-        "floor_nm": error.floor / _NANO,
-        "n_above_floor": error.above.size,
-        "bandwidth_above_floor_hz": high_above - low_above,
-        "lowest_above_floor_hz": low_above,
-        "highest_above_floor_hz": high_above,
-        "share_explained_above_floor": error.share_explained_above,
-    }
+    values = (
+        log,
+        error.channel,
+        error.velocity / _MILLI,
+        error.duration,
+        *(v / _MICRO for v in (error.lowest, error.highest, error.std, error.mean)),
+        *(error.kept.size, high - low, low, high),
+        error.max_magnitude / _MICRO,
+        float(error.harmonics.frequency[error.kept[0]]),
+        error.share_explained,
+        error.floor / _NANO,
+        *(error.above.size, high_above - low_above, low_above, high_above),
+        error.share_explained_above,
+    )
+    return _rows(LOG_COLUMNS["error"], [values])[0]
 
 
 def harmonics_rows(log: str, error: FollowingError) -> list[Row]:
-    """List the kept harmonics of one log, strongest first: A cos(2πft + φ)."""
-    harmonics, above = error.harmonics, set(error.above.tolist())
-    return [
-        {
-            "log": log,
-            "channel": error.channel,
-            "frequency_hz": float(harmonics.frequency[i]),
-            "amplitude_um": float(harmonics.amplitude[i]) / _MICRO,
-            "phase_rad": float(harmonics.phase[i]),
-            "above_floor": i in above,
-        }
-        for i in error.kept.tolist()
-    ]
+    """Return the kept harmonics of one log, strongest first: A cos(2πft + φ)."""
+    found, above = error.harmonics, set(error.above.tolist())
+    return _rows(
+        LOG_COLUMNS["harmonics"],
+        [
+            (
+                log,
+                error.channel,
+                float(found.frequency[i]),
+                float(found.amplitude[i]) / _MICRO,
+                float(found.phase[i]),
+                i in above,
+            )
+            for i in error.kept.tolist()
+        ],
+    )
 
 
 def frf_rows(log: str, reading: FrfReading) -> list[Row]:
-    """List a frequency response, one row per line, in SI units of the output per the input's."""
+    """Return a frequency response, one row per line, in SI units of output per input."""
     frf, fit = reading.frf, reading.fit
     lines = fit.ordinates.frequency
     fitted = np.interp(frf.frequency, lines, fit.response.real) + 1j * np.interp(
         frf.frequency, lines, fit.response.imag
     )
-    columns: dict[str, FloatArray] = {"frequency_hz": frf.frequency}
-    for name, response in (
-        ("", frf.response),
-        ("h1_", frf.h1),
-        ("h2_", frf.h2),
-        ("hv_", frf.hv),
-        ("fit_", fitted),
-    ):
-        columns |= {f"{name}gain": np.abs(response), f"{name}phase_rad": np.angle(response)}
-    columns |= {"gain_std": frf.std, "coherence": frf.coherence}
-    names = LOG_COLUMNS["frf"].split()[1:]
-    rows = zip(*(columns[name].tolist() for name in names), strict=True)
-    return [{"log": log, **dict(zip(names, row, strict=True))} for row in rows]
+    responses = [
+        part
+        for response in (frf.h1, frf.h2, frf.hv, fitted)
+        for part in (np.abs(response), np.angle(response))
+    ]
+    columns = [
+        *(frf.frequency, np.abs(frf.response), np.angle(frf.response), frf.std, frf.coherence),
+        *responses,
+    ]
+    values = zip(*(column.tolist() for column in columns), strict=True)
+    return _rows(LOG_COLUMNS["frf"], [(log, *row) for row in values])
 
 
 def fit_row(log: str, reading: FrfReading) -> Row:
-    """Give how a frequency response was measured and how well its modes describe it."""
+    """Return how a frequency response was measured, and the quality of its modal fit."""
     frf, fit = reading.frf, reading.fit
-    return {
-        "log": log,
-        "input": frf.input,
-        "output": frf.output,
-        "period_s": frf.period,
-        "n_averages": float(frf.n_averages),
-        "n_lines": frf.frequency.size,
-        "low_hz": float(frf.frequency[0]),
-        "high_hz": float(frf.frequency[-1]),
-        "mean_coherence": float(frf.coherence.mean()),
-        "chi_square": fit.chi_square,
-        "distortion": fit.distortion,
-        "colour": fit.colour,
-    }
+    values = (
+        *(log, frf.input, frf.output, frf.period, float(frf.n_averages), frf.frequency.size),
+        *(float(frf.frequency[0]), float(frf.frequency[-1]), float(frf.coherence.mean())),
+        *(fit.chi_square, fit.distortion, fit.colour),
+    )
+    return _rows(LOG_COLUMNS["fit"], [values])[0]
 
 
 def magnitudes_rows(
     magnitudes: Iterable[Magnitude], growth: Iterable[Growth], lines: Iterable[tuple[str, Line]]
 ) -> list[Row]:
-    """List what accelerometers read, one row per log, channel and band, with its growth.
+    """Return accelerations, one row per log, channel and band, with their growth.
 
-    ``line`` is the kind of the line (given with its log) that the strongest harmonic belongs to.
+    Column ``line`` is the kind of the spectral line (given with its log) at the strongest harmonic.
     """
-    seen: dict[tuple[str, str], list[Line]] = {}
+    found: dict[tuple[str, str], list[Line]] = {}
     for log, line in lines:
-        seen.setdefault((log, line.channel), []).append(line)
+        found.setdefault((log, line.channel), []).append(line)
     grown = {(g.stage, g.channel, g.band): g for g in growth}
-    rows = []
+    values = []
     for m in magnitudes:
         own = grown[m.stage, m.channel, m.band.name]
         near = [
             line.kind
-            for line in seen.get((m.log, m.channel), ())
+            for line in found.get((m.log, m.channel), ())
             if abs(line.frequency - m.frequency) <= m.resolution
         ]
-        rows.append(
-            {
-                "log": m.log,
-                "stage": m.stage or None,
-                "velocity_mm_s": m.velocity / _MILLI,
-                "channel": m.channel,
-                "band": m.band.name,
-                "kind": m.band.kind,
-                "low_hz": m.band.low,
-                "high_hz": m.band.high,
-                "placed_by": m.band.placed_by or None,
-                "magnitude_mm_s2": m.magnitude / _MILLI,
-                "strongest_hz": m.frequency,
-                "line": near[0] if near else None,
-                "rms_mm_s2": m.rms / _MILLI,
-                "dof": m.dof,
-                "slope": own.slope,
-                "slope_std": own.slope_std,
-                "p_value": own.p_value,
-                "grows": own.grows,
-            }
+        values.append(
+            (
+                *(m.log, m.stage or None, m.velocity / _MILLI, m.channel),
+                *(m.band.name, m.band.kind, m.band.low, m.band.high, m.band.placed_by or None),
+                *(m.magnitude / _MILLI, m.frequency, near[0] if near else None),
+                *(m.rms / _MILLI, m.dof, own.slope, own.slope_std, own.p_value, own.grows),
+            )
         )
-    return rows
+    return _rows(LOG_COLUMNS["magnitudes"], values)
 
 
 def growth_rows(growth: Iterable[Growth]) -> list[Row]:
-    """List how magnitudes depend on velocity, one row per machine, channel and band."""
-    return [
-        {
-            "stage": g.stage or None,
-            "channel": g.channel,
-            "band": g.band,
-            "n_logs": g.n_logs,
-            "n_velocities": g.n_velocities,
-            "slope": g.slope,
-            "slope_std": g.slope_std,
-            "p_value": g.p_value,
-            "grows": g.grows,
-        }
-        for g in growth
-    ]
+    """Return the growth of accelerations with velocity, one row per machine, channel and band."""
+    names = LOG_COLUMNS["growth"].split()
+    return [{n: getattr(g, n) for n in names} | {"stage": g.stage or None} for g in growth]
+
+
+def lines_rows(lines: Iterable[Line]) -> list[Row]:
+    """Return spectral lines, one row each."""
+    values = [(one.frequency, one.amplitude, one.unit, one.kind, one.channel) for one in lines]
+    return _rows(LOG_COLUMNS["lines"], values)
 
 
 def plan_rows(plans: Sequence[Plan]) -> dict[str, list[Row]]:
-    """List what plans were asked for, and what logs can do, one row per length of log."""
+    """Return the questions of plans (``detect``), and their answers per length of log."""
     asked = [
         (p.parameter, p.loss, p.power, p.false_alarm, p.n_baseline, p.duration_of_one)
         for p in plans
     ]
     efforts = [(p.parameter, p.loss, *astuple(effort)) for p in plans for effort in p.efforts]
     return {
-        name: [dict(zip(LOG_COLUMNS[name].split(), row, strict=True)) for row in rows]
-        for name, rows in (("detect", asked), ("plan", efforts))
+        "detect": _rows(LOG_COLUMNS["detect"], asked),
+        "plan": _rows(LOG_COLUMNS["plan"], efforts),
     }
 
 
 def stage_rows(examined: StageCheck, found: Sequence[Diagnostic]) -> dict[str, list[Row]]:
-    """List what an examination of a stage description measured, and what it comes to."""
+    """Return the results of a check of a stage description, by table."""
     names = [check.name for check in examined.parameters]
     return {
         "stage": [
@@ -582,17 +535,3 @@ def _parameter_row(check: ParameterCheck) -> Row:
         "informed": check.informed(check.usual_std),
         "verdict": check.verdict,
     }
-
-
-def lines_rows(lines: Iterable[Line]) -> list[Row]:
-    """List spectral lines that are no modes, one row each."""
-    return [
-        {
-            "frequency_hz": line.frequency,
-            "amplitude": line.amplitude,
-            "unit": line.unit,
-            "kind": line.kind,
-            "channel": line.channel,
-        }
-        for line in lines
-    ]

@@ -134,7 +134,7 @@ def test_posterior_regions_hold_their_share(ax: Axes, health: Health) -> None:
     outlines = next(c for c in ax.collections if len(c.get_paths()) == 2).get_paths()
     shares = [path.contains_points(100 * health.samples[-1]).mean() for path in outlines]
     np.testing.assert_allclose(shares, [0.9, 0.5], atol=0.03)
-    assert {"baseline", "median", "single 90 %"} <= set(labels(ax))
+    assert {"baseline", "median", "marginal 90 %"} <= set(labels(ax))
 
 
 def test_posterior_of_one_parameter_is_a_density(ax: Axes, health: Health) -> None:
@@ -175,7 +175,7 @@ def test_health_that_is_not_told_does_not_look_measured(ax: Axes, history: Histo
     plots.plot_health(
         ax, make_health(history, life(8000, 0.68)[1], (0.9, 0.1)), PARAMETERS[1], None
     )
-    assert "mostly assumption, not measured" in labels(ax)
+    assert "mostly prior, not measured" in labels(ax)
     assert any(collection.get_hatch() for collection in ax.collections)
 
 
@@ -202,7 +202,7 @@ def test_survival_shows_the_risk_of_least_costs(ax: Axes, prognosis: Prognosis) 
     """Where costs choose the day the line is at its risk; where they choose none there is none."""
     service = decide(prognosis, Decision(cost_ratio=20.0))
     plots.plot_survival(ax, prognosis, service=service)
-    label = f"risk at least costs {100 * service.risk:.3g} %"
+    label = f"risk at least cost {100 * service.risk:.3g} %"
     np.testing.assert_allclose(data(ax, label)[1], 100 * (1 - service.risk))
     endless = replace(prognosis, remaining=np.full_like(prognosis.remaining, np.inf))
     bare = Figure().add_subplot()
@@ -320,7 +320,7 @@ def test_influence_shows_before_and_after(ax: Axes, history: History) -> None:
     np.testing.assert_allclose(data(ax, "as measured"), [values, 100 * measured])
     left = 100 * (measured + 1.2e-3 * (values - 21))
     np.testing.assert_allclose(data(ax, "corrected"), [values, left])
-    x, y = data(ax, "taken out")
+    x, y = data(ax, "effect")
     np.testing.assert_allclose(y, -0.12 * (x - 21))
     band = next(c for c in ax.collections if c.get_alpha() == 0.18).get_paths()[0].vertices
     np.testing.assert_allclose(
