@@ -12,13 +12,12 @@ from itertools import product
 
 import numpy as np
 
-from lmshealth.modal.ambient.cluster_fit import BandFit, View, fit_band
-from lmshealth.modal.ambient.expected_periodogram import Block, make_block
-from lmshealth.modal.ambient.initial_values import (
-    Coarse,
-    coarsen,
-)
+from lmshealth.modal.ambient.cluster_fit import fit_cluster
+from lmshealth.modal.ambient.cluster_modes import ClusterModes
+from lmshealth.modal.ambient.expected_periodogram import MeanOrdinates, average_ordinates
+from lmshealth.modal.ambient.log_spectra import BinnedSpectrum, LogSpectra
 from lmshealth.modal.ambient.whittle import Likelihood, lay_out
+from lmshealth.modal.modes import Rejection
 from lmshealth.modal.targets import Target
 from lmshealth.signal.segments import Segment
 from lmshealth.signal.spectra import CrossSpectrum, cross_spectra
@@ -54,7 +53,7 @@ def flat_point(modes: Sequence[Mode], n_channels: int, noise: float = NOISE) -> 
 
 
 def likelihood(
-    modes: Sequence[Mode], n_channels: int, blocks: Sequence[Block], noise: float = NOISE
+    modes: Sequence[Mode], n_channels: int, blocks: Sequence[MeanOrdinates], noise: float = NOISE
 ) -> Likelihood:
     """Build a likelihood that starts at the truth; mode i is one in channel i."""
     reference = [i % n_channels for i in range(len(modes))]
@@ -116,11 +115,11 @@ def spectrum_of(matrix: np.ndarray, duration: float, count: int = 1) -> CrossSpe
     return CrossSpectrum(f, matrix, duration, float("nan"), np.ones(f.size, dtype=bool), (), count)
 
 
-def block_of(spectra: Sequence[CrossSpectrum], *, merge: bool = False) -> Block:
+def block_of(spectra: Sequence[CrossSpectrum], *, merge: bool = False) -> MeanOrdinates:
     """Keep all ordinates; the bandwidth is that of the lightest mode of these tests."""
     keep = [np.ones(s.frequency.size, dtype=bool) for s in spectra]
     near = [mode.frequency for mode in MODES] if merge else None
-    return make_block(spectra, keep, 2 * 105.0 * 0.015, near=near)
+    return average_ordinates(spectra, keep, 2 * 105.0 * 0.015, near=near)
 
 
 def drawn(cov: np.ndarray, rng: np.random.Generator) -> np.ndarray:
@@ -150,32 +149,39 @@ def scatter_free(
     return replace(truth, blocks=(replace(empty, matrix=expected),))
 
 
-def view_of(channels: np.ndarray) -> tuple[View, tuple[Coarse, ...]]:
+def spectra_of(channels: np.ndarray) -> tuple[LogSpectra, tuple[BinnedSpectrum, ...]]:
     """Transform accelerometers, and bin them around the modes of these tests."""
     rows = np.atleast_2d(channels)
     made = make_log({f"acc_{k}": row for k, row in enumerate(rows)}, RATE).channels
-    view = View(
+    spectra = LogSpectra(
         tuple(channel.name for channel in made),
         ("acc",) * len(made),
         cross_spectra(made, [Segment(0, rows.shape[1], float("nan"))], RATE, 200.0),
     )
-    return view, tuple(coarsen(view.single(c), 75.0, 165.0, 0.8) for c in range(len(made)))
+    return spectra, spectra.binned(75.0, 165.0, 0.8)
+
+
+def fit_spectra(
+    spectra: LogSpectra, binned: tuple[BinnedSpectrum, ...], targets: Sequence[Target]
+) -> tuple[ClusterModes | None, dict[str, Rejection]]:
+    """Return published modes and rejections."""
+    result = fit_cluster(spectra, binned, tuple(targets))
+    return result.modes, result.rejected
 
 
 def fit(
     channels: np.ndarray, targets: Sequence[Target]
-) -> tuple[BandFit | None, dict[str, tuple[str, str]]]:
+) -> tuple[ClusterModes | None, dict[str, Rejection]]:
     """Fit targets to the samples of accelerometers."""
-    view, coarse = view_of(channels)
-    return fit_band(view, coarse, tuple(targets))
+    return fit_spectra(*spectra_of(channels), targets)
 
 
-def found(channels: np.ndarray, targets: Sequence[Target] = (ROLL, PITCH)) -> BandFit:
+def found(channels: np.ndarray, targets: Sequence[Target] = (ROLL, PITCH)) -> ClusterModes:
     """Fit targets of which all must be found."""
-    result, missing = fit(channels, targets)
-    assert result is not None
-    assert missing == {}
-    return result
+    modes, rejected = fit(channels, targets)
+    assert modes is not None
+    assert rejected == {}
+    return modes
 
 
 def both(seed: int = 1, n: int = 60_000, noise: float = 0.5, psd: float = 1.0) -> np.ndarray:

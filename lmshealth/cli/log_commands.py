@@ -221,7 +221,8 @@ def frf(ctx: click.Context, /, logs: tuple[Path, ...], style: str, **options: An
     json also the response with H1, H2, Hv and coherence. With a stage, a mode gets its name there
     when it is the only one in its search band.
     """
-    from lmshealth.modal.frf.identification import name_modes, read_frf, why_unnamed
+    from lmshealth.modal.frf.identification import read_frf
+    from lmshealth.modal.naming import name_response, why_unnamed
     from lmshealth.report.tables import COLUMNS, fit_row, frf_rows, modes_rows
     from lmshealth.tracking.history import LogEstimates
 
@@ -233,7 +234,10 @@ def frf(ctx: click.Context, /, logs: tuple[Path, ...], style: str, **options: An
     )
     estimates = [
         LogEstimates(
-            log.name, log.digest, log.metadata, name_modes(own.modes, stage) if stage else own.modes
+            log.name,
+            log.digest,
+            log.metadata,
+            name_response(own.modes, stage) if stage else own.modes,
         )
         for log, own in found
     ]

@@ -1,49 +1,45 @@
-"""Identification of modes: the Whittle likelihood of all channels, fitted cluster by cluster.
+"""Identification of modes under ambient excitation, with and without a stage description.
 
-Channels of one log share the excitation, so that their errors are not independent: they come from
-one likelihood and are not averaged as if they were.
+Channels of one log share the excitation, so that their errors are dependent: one Whittle
+likelihood holds all channels, fitted cluster by cluster (`fit_cluster`). The two drivers differ in
+where the start values come from, how modes are named and what happens to modes that are too close.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from itertools import combinations
+from dataclasses import replace
 
 import numpy as np
-from scipy.special import softmax
 
-from lmshealth._arrays import FloatArray
 from lmshealth.errors import BadLog
 from lmshealth.io.log import Channel, Log, Refusal
-from lmshealth.modal.ambient.close_modes import keep_separate
-from lmshealth.modal.ambient.cluster_fit import BandFit, Missing, View, fit_band
-from lmshealth.modal.ambient.initial_values import (
-    coarsen,
-    locate,
-    shift_cost,
+from lmshealth.modal import constants
+from lmshealth.modal.ambient.cluster_fit import fit_cluster
+from lmshealth.modal.ambient.cluster_modes import (
+    ClusterFit,
+    ClusterModes,
+    merge_close_modes,
+    refuse_close_modes,
 )
+from lmshealth.modal.ambient.initial_values import locate
+from lmshealth.modal.ambient.log_spectra import BinnedSpectrum, LogSpectra, transform
 from lmshealth.modal.ambient.peak_picking import find_excess, find_peaks
-from lmshealth.modal.modes import Modes
-from lmshealth.modal.targets import USABLE, Target, choose_channels, choose_targets
+from lmshealth.modal.modes import Modes, merge, numbered
+from lmshealth.modal.naming import assign
+from lmshealth.modal.targets import Target, choose_channels, choose_targets, clusters
 from lmshealth.signal.segments import find_segments
-from lmshealth.signal.spectra import ANY_RESONANCE, ResonanceRange, cross_spectra
+from lmshealth.signal.spectra import ResonanceRange
 from lmshealth.signal.spectral_lines import Line, find_lines, name_lines
 from lmshealth.stage.constants import BAND, LEAST_RESOLUTION
 from lmshealth.stage.description import Stage
 
-# Modes whose bands touch are fitted together, but never more than this many.
-_MOST_TOGETHER = 4
-# Factor between the bandwidths of modes that are fitted together.
-_ALIKE = 8.0
-# Probability from which on a found mode is given its name.
-_CLEAR_NAME = 0.8
-# Without a description, so many times what a fit leaves over is searched for further modes.
+# Without a description, searches for further modes in the residual of a fit.
 _MOST_ROUNDS = 3
-# Shortest useful segment: half-power bandwidth times duration; without a description, periods of
-# the top of the band.
-_LEAST_PERIODS = 10.0
-_BEYOND = 4.0  # times the top of the band: more than any found mode's flanks reach
+# Without a description spectra reach up to this multiple of the band: further than flanks do.
+_CEILING = 4.0
+# A cluster is fitted below this share of the sample rate.
+_TOP = 0.49
 
 
 def identify(
@@ -53,34 +49,35 @@ def identify(
     channels: Sequence[str] | None = None,
     band: tuple[float, float] | None = None,
 ) -> Modes:
-    r"""Identify the modes of a log with their covariance.
+    r"""Identify the modes of a log under ambient excitation, with their covariance.
 
     Parameters
     ----------
     log : Log
         Displacement (following error) and acceleration channels are used.
     stage : Stage, optional
-        Says which modes to look for; without it resonances are searched for in the band.
+        Modes to identify; without it resonances are searched for in the band.
     channels : sequence of str, optional
         Use only these channels.
     band : (float, float), optional
-        Use only modes between these frequencies in Hz. Without a stage the default reaches from
-        twenty periods per record to 0.45 of the sample rate.
+        Use only modes between these frequencies in Hz. Without a stage the default is from twenty
+        periods per record to 0.45 of the sample rate.
 
     Returns
     -------
     Modes
-        With the modes that were looked for and refused, and why.
+        With the modes that are refused, and why.
 
     Raises
     ------
     BadLog
-        If no channel is left, or the record is too short or too slow for the modes.
+        If no channel is left, or the record is too short or its sample rate too low.
+    BadStage
+        If the stage has no mode in the band.
 
     Examples
     --------
-    A minute of an accelerometer on something that rings at 126.4 Hz with a damping of 1.5 % while
-    white noise shakes it:
+    A minute of an accelerometer on a mode of 126.4 Hz with a damping of 1.5 % under white noise:
 
     >>> import numpy as np
     >>> from scipy.signal import lfilter
@@ -99,200 +96,138 @@ def identify(
     126.4 ± 0.1 Hz, 1.5% ± 0.1%
     """
     used = choose_channels(log, channels)
-    seen: list[tuple[str, float, float]] = []
-    if stage is not None:
-        targets = choose_targets(stage, band)
-        view = _transform(log, used, targets, band)
+    if stage is None:
+        spectra, fits, tested = _identify_found(log, used, band)
     else:
-        view = _transform(log, used, (), band)
-        targets, seen = _search(log, used, view, band)
-        known = [frequency for _, frequency, _ in seen]
-        view = replace(view, spectra=tuple(s.without(known) for s in view.spectra))
-    seen += [(view.channels[c], f, a) for s in view.spectra for c, f, a in s.lines]
-    fits: list[BandFit] = []
-    refused: list[Refusal] = []
-    for cluster in _clusters(targets):
-        if stage is not None:
-            found = _fit_cluster(log, view, cluster, targets, known=True)
-        else:
-            own = _territory(cluster, targets)
-            found = _fit_further(log, view.band(*own), cluster, targets)
-        if found.fit is not None:
-            seen += [(s.channel, s.frequency, s.amplitude) for s in found.fit.lines]
-            fits.append(found.fit)
-        refused += found.refused
-    resolution = 1.5 / max(s.duration for s in view.spectra)
-    lines = name_lines(seen, log, stage, resolution)
-    if stage is not None:
-        return _collect(fits, view.channels, lines, (*log.refused, *refused))
-    modes = _renumber(_collect(_distinct(fits), view.channels, lines, log.refused))
-    if modes.names:
-        return modes
-    return replace(modes, refused=(*log.refused, _nothing(log, lines, refused)))
+        spectra, fits = _identify_described(log, used, choose_targets(stage, band))
+        tested = []
+    found = [fit.modes for fit in fits if fit.modes is not None]
+    masked = [line for modes in found for line in modes.lines]
+    seen = [*tested, *spectra.removed_lines, *masked]
+    lines = name_lines(seen, log, stage, 1.5 / spectra.duration)
+    refused = [refusal for fit in fits for refusal in fit.refusals(log.name)]
+    if stage is None:
+        found = _distinct(found)
+        anything = any(modes.names for modes in found)
+        refused = [] if anything else [_nothing_found(log, lines, refused)]
+    parts = [modes.as_modes(spectra.channels) for modes in found]
+    modes = merge(parts, lines, (*log.refused, *refused), spectra.channels)
+    return numbered(modes) if stage is None else modes
 
 
-def _nothing(log: Log, lines: tuple[Line, ...], refused: list[Refusal]) -> Refusal:
-    """Say that nothing was found where nothing was sought by name."""
-    if refused:
-        first = refused[0]
-        places = "1 place" if len(refused) == 1 else f"{len(refused)} places"
-        told = f"what stands out of the noise at {places} makes no mode"
-        return Refusal(log.name, first.reason, f"{told}: {first.detail}")
-    told = f"{len(lines)} lines, which are no modes" if lines else "no line either"
-    return Refusal(
-        log.name,
-        "not-excited",
-        f"no resonance stands out of the noise in any channel; {told}: excite the machine, record "
-        "longer, or look in another band",
+def _identify_described(
+    log: Log, channels: tuple[Channel, ...], targets: tuple[Target, ...]
+) -> tuple[LogSpectra, list[ClusterFit]]:
+    """Fit the modes of a description."""
+    spectra = _described_spectra(log, channels, targets)
+    top = _TOP * log.sample_rate
+    return spectra, [_fit_described(spectra, c, targets, top) for c in clusters(targets)]
+
+
+def _described_spectra(
+    log: Log, channels: tuple[Channel, ...], targets: tuple[Target, ...]
+) -> LogSpectra:
+    """Transform every channel up to the highest frequency of any search."""
+    top = max(target.band(BAND)[1] for target in targets)
+    reach = (1 + max(target.search for target in targets)) * top
+    shortest = LEAST_RESOLUTION / min(2 * t.damping_ratio * t.frequency for t in targets)
+    resonances = [_resonance(target) for target in targets]
+    return transform(
+        log, channels, reach, shortest=shortest, ceiling=reach, highest=top, resonances=resonances
     )
 
 
-def _transform(
-    log: Log,
-    channels: tuple[Channel, ...],
-    targets: tuple[Target, ...],
-    band: tuple[float, float] | None,
-) -> View:
-    """Transform every channel, as far up as anything is looked for."""
-    top = max((target.band(BAND)[1] for target in targets), default=0.0)
-    if top > log.sample_rate / 2:
-        raise BadLog(
-            log.name,
-            "sample-rate",
-            f"{log.sample_rate:g} Hz cannot show modes up to {top:.0f} Hz; "
-            f"needed is at least {2 * top:.0f} Hz",
-        )
-    widest = max((target.search for target in targets), default=0.0)
-    reach = (1 + widest) * top if targets else (band or (0.0, np.inf))[1]
-    # What is found without a description is fitted beyond the band as well.
-    ceiling = reach if targets else _BEYOND * reach
-    needed = _LEAST_PERIODS / min(reach, USABLE * log.sample_rate)
-    if targets:
-        needed = LEAST_RESOLUTION / min(2 * t.damping_ratio * t.frequency for t in targets)
-    segments = find_segments(log, needed)
-    if not segments:
-        longest = max((b - a for a, b in log.pieces), default=0) / log.sample_rate
-        raise BadLog(
-            log.name,
-            "too-short",
-            f"no stretch of constant velocity without gaps lasts {needed:.3g} s, which is needed "
-            f"for what is looked for; the longest piece without gaps has {longest:.3g} s",
-        )
-    return View(
-        tuple(channel.name for channel in channels),
-        tuple("delta_e" if c.kind == "displacement" else "acc" for c in channels),
-        cross_spectra(
-            channels,
-            segments,
-            log.sample_rate,
-            reach,
-            ceiling=ceiling,
-            resonances=tuple(_expected(target) for target in targets) or ANY_RESONANCE,
-        ),
-    )
-
-
-def _expected(target: Target) -> ResonanceRange:
-    """Say where a mode may stand; its damping may be half of what is known of it."""
+def _resonance(target: Target) -> ResonanceRange:
+    """Return where a mode may lie; its damping may be half of the described one."""
     low, high = target.band(1.0)
     low, high = low * (1 - target.search), high * (1 + target.search)
     return ResonanceRange(low, high, target.damping_ratio / 2)
 
 
-def _search(
-    log: Log,
-    channels: tuple[Channel, ...],
-    view: View,
-    band: tuple[float, float] | None,
-) -> tuple[tuple[Target, ...], list[tuple[str, float, float]]]:
-    """Find candidate modes, and lines in the longest segment, in the band."""
-    longest = max(s.duration for s in view.spectra)
-    low, high = band or (20 / longest, USABLE * log.sample_rate)
-    low, high = max(low, 2 / longest), min(high, USABLE * log.sample_rate)
-    held = max(0.0, (high - low) * longest)
-    if held < 50:
+def _fit_described(
+    spectra: LogSpectra, cluster: tuple[Target, ...], targets: tuple[Target, ...], top: float
+) -> ClusterFit:
+    """Fit a described cluster: locate it, fit it, name what was found, reject close modes."""
+    searches = [target.search for target in cluster]
+    binned, located = locate(_binned(spectra, cluster, targets, searches, top), cluster)
+    return refuse_close_modes(_assigned(fit_cluster(spectra, binned, located), cluster))
+
+
+def _assigned(fit: ClusterFit, cluster: tuple[Target, ...]) -> ClusterFit:
+    """Assign the modes of a fit to the targets; one may have started at another's frequency."""
+    modes = fit.modes
+    if modes is None or not modes.names:
+        return fit
+    ln_f = modes.estimate[: len(modes.names)]
+    order = sorted(range(ln_f.size), key=lambda i: (ln_f[i], modes.names[i]))
+    assignment = assign(np.exp(ln_f[order]).tolist(), cluster, complete=True)
+    names = {modes.names[i]: name for i, name in zip(order, assignment.names, strict=True) if name}
+    if not names and not assignment.ambiguous:
+        return fit  # no assignment keeps the order within the searches
+    kept = modes.keep(names)
+    kept = replace(kept, targets=tuple(replace(t, name=names[t.name]) for t in kept.targets))
+    return ClusterFit(kept, fit.rejected | assignment.ambiguous)
+
+
+def _identify_found(
+    log: Log, channels: tuple[Channel, ...], band: tuple[float, float] | None
+) -> tuple[LogSpectra, list[ClusterFit], list[tuple[str, float, float]]]:
+    """Search the band for modes and fit them; return the lines that Thomson's test shows, too."""
+    reach = band[1] if band else np.inf
+    shortest = constants.LEAST_PERIODS / min(reach, constants.USABLE * log.sample_rate)
+    spectra = transform(log, channels, reach, shortest=shortest, ceiling=_CEILING * reach)
+    limits = _search_limits(log, spectra.duration, band)
+    segment = max(find_segments(log, 0.0), key=lambda s: s.stop - s.start)
+    tested = [
+        (channel.name, *line)
+        for channel in channels
+        for line in find_lines(channel, segment, log.sample_rate, limits).tolist()
+    ]
+    frequencies = [frequency for _, frequency, _ in tested]
+    by_channel = tuple(spectra.channel(c) for c in range(len(channels)))
+    targets = find_peaks(by_channel, *limits, frequencies)
+    spectra, top = spectra.without(frequencies), _TOP * log.sample_rate
+    return spectra, [_fit_found(spectra, c, targets, top) for c in clusters(targets)], tested
+
+
+def _search_limits(
+    log: Log, longest: float, band: tuple[float, float] | None
+) -> tuple[float, float]:
+    """Return the band in Hz that a log of segments of so many seconds can be searched in."""
+    usable = constants.USABLE * log.sample_rate
+    low, high = band or (20 / longest, usable)
+    low, high = max(low, 2 / longest), min(high, usable)
+    n = max(0.0, (high - low) * longest)
+    if n < constants.LEAST_FREQUENCIES:
         raise BadLog(
             log.name,
             "too-short",
-            f"{longest:.3g} s at {log.sample_rate:g} Hz hold {held:.0f} Fourier frequencies from "
-            f"{low:.4g} to {high:.4g} Hz; needed are at least 50",
+            f"{longest:.3g} s at {log.sample_rate:g} Hz hold {n:.0f} Fourier frequencies from "
+            f"{low:.4g} to {high:.4g} Hz; needed are at least {constants.LEAST_FREQUENCIES}",
         )
-    segment = max(find_segments(log, 0.0), key=lambda s: s.stop - s.start)
-    lines = [
-        (channel.name, *line)
-        for channel in channels
-        for line in find_lines(channel, segment, log.sample_rate, (low, high)).tolist()
-    ]
-    spectra = tuple(view.single(c) for c in range(len(channels)))
-    return find_peaks(spectra, low, high, [frequency for _, frequency, _ in lines]), lines
+    return low, high
 
 
-def _clusters(targets: tuple[Target, ...]) -> list[tuple[Target, ...]]:
-    """Group neighbouring targets that belong together."""
-    groups: list[list[Target]] = []
-    for target in targets:
-        last = groups[-1] if groups else []
-        if last and len(last) < _MOST_TOGETHER and _belong_together(last[-1], target):
-            last.append(target)
-        else:
-            groups.append([target])
-    return [tuple(group) for group in groups]
+def _fit_found(
+    spectra: LogSpectra, cluster: tuple[Target, ...], targets: tuple[Target, ...], top: float
+) -> ClusterFit:
+    """Fit a cluster of peaks, then again with each excess of the residual as a further mode."""
+    spectra = spectra.band(*_nearest(cluster, targets))
+    for _ in range(1 + _MOST_ROUNDS):
+        searches = [0.0] * len(cluster)
+        fit = fit_cluster(spectra, _binned(spectra, cluster, targets, searches, top), cluster)
+        if fit.modes is None:
+            break
+        modes = merge_close_modes(fit.modes)
+        fit = ClusterFit(modes, fit.rejected)
+        before, cluster = cluster, _with_excess(modes, cluster)
+        if len(cluster) == len(before):
+            break
+    return fit
 
 
-def _belong_together(lower: Target, upper: Target) -> bool:
-    """Tell whether the bands of two targets overlap and their bandwidths are alike."""
-    # Beside a broad resonance a narrow one is a line's business: it would ask for the finest
-    # resolution over all of the band.
-    ratio = (upper.frequency * upper.damping_ratio) / (lower.frequency * lower.damping_ratio)
-    return upper.band(BAND)[0] < lower.band(BAND)[1] and 1 / _ALIKE < ratio < _ALIKE
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _ClusterResult:
-    fit: BandFit | None
-    refused: list[Refusal]
-
-
-def _fit_cluster(
-    log: Log,
-    view: View,
-    cluster: tuple[Target, ...],
-    targets: tuple[Target, ...],
-    *,
-    known: bool,
-) -> _ClusterResult:
-    """Fit a cluster to all channels together."""
-    reach = [target.search if known else 0.0 for target in cluster]
-    low = min(t.band(BAND)[0] * (1 - r) for t, r in zip(cluster, reach, strict=True))
-    high = max(t.band(BAND)[1] * (1 + r) for t, r in zip(cluster, reach, strict=True))
-    width = 0.5 * min(t.damping_ratio * t.frequency for t in cluster)
-    high = min(high, 0.49 * log.sample_rate)
-    beside = tuple(t for t in targets if t not in cluster and low / 1.3 < t.frequency < 1.3 * high)
-    coarse = tuple(
-        replace(coarsen(view.single(c), low, high, width), neighbours=beside)
-        for c in range(len(view.channels))
-    )
-    placed = cluster
-    if known:
-        placed, coarse = locate(coarse, cluster)
-    fit, reasons = fit_band(view, coarse, placed)
-    if known and fit is not None:
-        fit, unclear = _named(fit, cluster)
-        reasons = reasons | unclear
-    if fit is not None:
-        fit, close = keep_separate(fit, known=known)
-        reasons = reasons | close
-    seen = set() if fit is None else {target.name for target in fit.targets}
-    refused = [
-        Refusal(log=log.name, mode=name, reason=reason, detail=detail)
-        for name, (reason, detail) in reasons.items()
-        if name not in seen
-    ]
-    return _ClusterResult(fit, refused)
-
-
-def _territory(cluster: tuple[Target, ...], targets: tuple[Target, ...]) -> tuple[float, float]:
-    """Frequencies that are nearer to a cluster than to the modes beside it."""
+def _nearest(cluster: tuple[Target, ...], targets: tuple[Target, ...]) -> tuple[float, float]:
+    """Return the frequencies in Hz that are nearer to a cluster than to other peaks."""
     first, last = cluster[0].frequency, cluster[-1].frequency
     below = [t.frequency for t in targets if t.frequency < first]
     above = [t.frequency for t in targets if t.frequency > last]
@@ -300,155 +235,63 @@ def _territory(cluster: tuple[Target, ...], targets: tuple[Target, ...]) -> tupl
     return float(low), float(np.sqrt(last * min(above))) if above else np.inf
 
 
-def _fit_further(
-    log: Log, view: View, cluster: tuple[Target, ...], targets: tuple[Target, ...]
-) -> _ClusterResult:
-    """Fit a cluster that was found, with what stands out of what its fit leaves over."""
-    found = _fit_cluster(log, view, cluster, targets, known=False)
-    for _ in range(_MOST_ROUNDS):
-        more = cluster if found.fit is None else _unexplained(found.fit, cluster)
-        if len(more) == len(cluster):
-            break
-        cluster = more
-        found = _fit_cluster(log, view, cluster, targets, known=False)
-    return found
-
-
-def _named(fit: BandFit, cluster: tuple[Target, ...]) -> tuple[BandFit, Missing]:
-    """Give the modes that were found the names that their frequencies speak for.
-
-    Where fewer were found than sought, one may stand where another began. Every assignment that
-    keeps the order is weighed by the prior of shifts; a mode whose name is not clear is refused.
-    """
-    found = sorted((float(fit.estimate[i]), t.name) for i, t in enumerate(fit.targets))
-    if not found:
-        return fit, {}
-    if len(found) == len(cluster):
-        # All are there, and in order: at which target each began does not matter.
-        names = {name: t.name for (_, name), t in zip(found, cluster, strict=True)}
-        return _renamed(fit, names), {}
-    ln_f = np.array([f for f, _ in found])
-    choices = list(combinations(cluster, len(found)))
-    search = np.array([[target.search for target in choice] for choice in choices])
-    home = np.log([[target.frequency for target in choice] for choice in choices])
-    shifts = ln_f - home
-    cost = np.array(
-        [shift_cost(s[None], w, len(found))[0] for s, w in zip(shifts, search, strict=True)]
-    )
-    cost[(np.abs(shifts) > np.log1p(search)).any(axis=1)] = np.inf
-    if not np.isfinite(cost).any():
-        return fit, {}
-    weight = softmax(-cost)
-    names = {}
-    unclear: Missing = {}
-    for i, (f, name) in enumerate(found):
-        chance: dict[str, float] = {}
-        for choice, w in zip(choices, weight.tolist(), strict=True):
-            chance[choice[i].name] = chance.get(choice[i].name, 0.0) + w
-        likely = max(chance, key=lambda n: chance[n])
-        if chance[likely] >= _CLEAR_NAME:
-            names[name] = likely
-            continue
-        told = ", ".join(f"{n} {100 * p:.0f} %" for n, p in chance.items() if p > 0.01)
-        detail = f"the resonance at {np.exp(f):.5g} Hz may be {told}; its neighbours were not found"
-        unclear |= {n: ("ambiguous", detail) for n in chance if chance[n] > 0.01}
-    kept = fit.only([t.name for t in fit.targets if t.name in names])
-    return _renamed(kept, names), {n: w for n, w in unclear.items() if n not in names.values()}
-
-
-def _renamed(fit: BandFit, names: dict[str, str]) -> BandFit:
-    return replace(fit, targets=tuple(replace(t, name=names[t.name]) for t in fit.targets))
-
-
-def _unexplained(fit: BandFit, cluster: tuple[Target, ...]) -> tuple[Target, ...]:
-    """Add to a cluster what stands out of what its fit leaves over."""
-    # What is narrower than that would have stood out by itself, unless it is a line.
+def _with_excess(modes: ClusterModes, cluster: tuple[Target, ...]) -> tuple[Target, ...]:
+    """Add the excess of the residual to a cluster."""
+    if len(cluster) > constants.MOST_TOGETHER:
+        return cluster
+    # A narrower excess would have been a peak, unless it is a line.
     narrowest = 0.5 * min(target.damping_ratio for target in cluster)
-    candidate = find_excess(fit.residual, narrowest)
-    if candidate is None or len(cluster) > _MOST_TOGETHER:
+    excess = find_excess(modes.residual, narrowest)
+    if excess is None or any(
+        abs(excess.frequency / t.frequency - 1) < t.damping_ratio for t in cluster
+    ):
         return cluster
-    if any(abs(candidate.frequency / t.frequency - 1) < t.damping_ratio for t in cluster):
-        return cluster
-    more = replace(candidate, name=f"{cluster[0].name}_and_{len(cluster)}")
-    return tuple(sorted((*cluster, more), key=lambda target: target.frequency))
+    excess = replace(excess, name=f"{cluster[0].name}_and_{len(cluster)}")
+    return tuple(sorted((*cluster, excess), key=lambda target: target.frequency))
 
 
-def _distinct(fits: list[BandFit]) -> list[BandFit]:
-    """Drop a found mode that another channel has found more clearly at the same place."""
+def _distinct(found: list[ClusterModes]) -> list[ClusterModes]:
+    """Drop modes within half a half-power bandwidth of a clearer one of another cluster."""
     rows = [
-        (float(fit.clarity[i]), float(fit.estimate[i]), float(np.exp(fit.estimate[m + i])), name)
-        for fit in fits
-        for m in [len(fit.targets)]
-        for i, name in enumerate(target.name for target in fit.targets)
+        (float(clarity), float(ln_f), float(np.exp(ln_zeta)), name)
+        for modes in found
+        for clarity, (ln_f, ln_zeta), name in zip(
+            modes.clarity, modes.estimate.reshape(2, -1).T, modes.names, strict=True
+        )
     ]
     kept: list[tuple[float, float, float, str]] = []
     for row in sorted(rows, reverse=True):
-        # Within half a half-power bandwidth of each other no two modes can be told apart.
         if all(abs(row[1] - other[1]) > 0.5 * (row[2] + other[2]) for other in kept):
             kept.append(row)
-    names = {row[3] for row in kept}
-    return [fit.only([t.name for t in fit.targets if t.name in names]) for fit in fits]
+    return [modes.keep(row[3] for row in kept) for modes in found]
 
 
-def _collect(
-    fits: list[BandFit],
-    channels: tuple[str, ...],
-    lines: tuple[Line, ...],
-    refused: tuple[Refusal, ...],
-) -> Modes:
-    sizes = [len(fit.targets) for fit in fits]
-    n = sum(sizes)
-    cov = np.zeros((2 * n, 2 * n))
-    estimate = np.zeros(2 * n)
-    at = 0
-    for fit, size in zip(fits, sizes, strict=True):
-        index = np.concatenate([np.arange(at, at + size), np.arange(n + at, n + at + size)])
-        cov[np.ix_(index, index)] = fit.cov
-        estimate[index] = fit.estimate
-        at += size
-    order = np.argsort(estimate[:n], kind="stable")
-    both = np.concatenate([order, order + n])
-    names = [target.name for fit in fits for target in fit.targets]
-    sources = [fit.view.source for fit in fits for _ in fit.targets]
-    best = [name for fit in fits for name in fit.best]
-    snr, dispersion = (
-        np.concatenate([np.empty(0), *(getattr(fit, name) for fit in fits)])
-        for name in ("snr", "dispersion")
-    )
-    flags = [flag for fit in fits for flag in fit.flags]
-    nothing = np.empty((0, len(channels)))
-    shapes = np.concatenate([nothing, *(_shapes(fit, channels) for fit in fits)])
-    return Modes(
-        names=tuple(names[i] for i in order),
-        sources=tuple(sources[i] for i in order),
-        channels=tuple(best[i] for i in order),
-        ln_frequency=estimate[order],
-        ln_damping=estimate[n + order],
-        cov=cov[np.ix_(both, both)],
-        snr=snr[order],
-        dispersion=dispersion[order],
-        flags=tuple(flags[i] for i in order),
-        shape_channels=channels,
-        shapes=shapes[order],
-        lines=lines,
-        refused=refused,
+def _nothing_found(log: Log, lines: tuple[Line, ...], rejected: list[Refusal]) -> Refusal:
+    """Return the refusal of a log without modes."""
+    if rejected:
+        places = "1 peak" if len(rejected) == 1 else f"{len(rejected)} peaks"
+        detail = f"{places} above the noise, of which none is a mode: {rejected[0].detail}"
+        return Refusal(log.name, rejected[0].reason, detail)
+    shown = f"{len(lines)} lines, which are no modes" if lines else "no line either"
+    return Refusal(
+        log.name,
+        "not-excited",
+        f"no resonance above the noise in any channel; {shown}: excite the machine, record "
+        "longer, or choose another band",
     )
 
 
-def _shapes(fit: BandFit, channels: tuple[str, ...]) -> FloatArray:
-    """Give shapes in units of acceleration, NaN in the channels that the fit left out."""
-    own = (fit.unit[:, None] * fit.shapes).T
-    own = own / np.linalg.norm(own, axis=1, keepdims=True)
-    largest = np.take_along_axis(own, np.abs(own).argmax(axis=1, keepdims=True), axis=1)
-    shapes = np.full((len(own), len(channels)), np.nan)
-    shapes[:, [channels.index(name) for name in fit.view.channels]] = own * np.sign(largest)
-    return shapes
-
-
-def _renumber(modes: Modes) -> Modes:
-    """Name found modes in ascending order.
-
-    Candidates that turned out to be no modes leave no gap and no refusal: they were our own idea,
-    not the user's question.
-    """
-    return replace(modes, names=tuple(f"mode_{n}" for n in range(1, len(modes.names) + 1)))
+def _binned(
+    spectra: LogSpectra,
+    cluster: tuple[Target, ...],
+    targets: tuple[Target, ...],
+    searches: Sequence[float],
+    top: float,
+) -> tuple[BinnedSpectrum, ...]:
+    """Bin the band of a cluster, widened by the search of each mode, with its neighbours."""
+    low = min(t.band(BAND)[0] * (1 - s) for t, s in zip(cluster, searches, strict=True))
+    high = max(t.band(BAND)[1] * (1 + s) for t, s in zip(cluster, searches, strict=True))
+    high = min(high, top)
+    width = 0.5 * min(t.damping_ratio * t.frequency for t in cluster)
+    near = tuple(t for t in targets if t not in cluster and low / 1.3 < t.frequency < 1.3 * high)
+    return spectra.binned(low, high, width, near)

@@ -1,19 +1,28 @@
-"""Result of the identification: modal estimates of one log with their joint covariance.
+"""Modes of one log: estimates with their joint covariance.
 
-Arrays are read-only, time (or log) axis first, mode axis last, NaN where a value is missing.
-SI units throughout: s, m, m/s, Hz, m/s²; temperatures are in °C because only their differences
-are used.
+Arrays are read-only; NaN marks a missing value. Units are SI.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import chain
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 from lmshealth._arrays import FloatArray, expect_shape, freeze
 from lmshealth.io.log import Refusal
 from lmshealth.signal.spectral_lines import Line
+
+
+class Rejection(NamedTuple):
+    """Reason code and detail for which a mode is not published."""
+
+    reason: str
+    detail: str
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -23,11 +32,11 @@ class Modes:
     Attributes
     ----------
     names : tuple of str
-        Mode names, unique per source; empty where another program gave none.
+        Mode names, unique per source; empty where there is none.
     sources : tuple of str
         ``acc``, ``delta_e``, ``frf`` or ``joint`` per mode.
     channels : tuple of str
-        The channel each estimate comes from.
+        Channel that shows each mode most clearly.
     ln_frequency : ndarray
         Natural logarithm of the natural frequency in Hz, shape ``(n_modes,)``.
     ln_damping : ndarray
@@ -37,24 +46,22 @@ class Modes:
     snr : ndarray
         Modal signal-to-noise ratio S / (4 ζ² S_e), shape ``(n_modes,)``.
     dispersion : ndarray
-        Variance of what the fit leaves about each mode over what noise has: about one where the
-        model is right, more where lines, other modes or changing conditions are in the data; NaN
-        where it was not measured. Shape ``(n_modes,)``.
+        Variance of the residual near each mode over that of noise: about one where the model
+        fits; NaN where it was not measured. Shape ``(n_modes,)``.
     flags : tuple of str
-        What to bear in mind of each mode, separated by blanks: ``resolution-limited`` where the
-        half-power bandwidth spans few Fourier frequencies, ``at-bound`` where frequency or
-        damping is at the end of what was searched, ``loose-fit`` where the dispersion is clearly
-        more than one, ``cluster`` where one stands for two that cannot be told apart.
+        Of each mode, separated by blanks: ``resolution-limited`` (few Fourier frequencies in the
+        half-power bandwidth), ``at-bound`` (frequency or damping at the end of the search),
+        ``loose-fit`` (dispersion above 1.5), ``cluster`` (stands for two close modes).
     shape_channels : tuple of str
-        The channels that shapes tell of; none where shapes were not identified.
+        Channels of the shapes; empty where shapes were not identified.
     shapes : ndarray
-        Acceleration of each channel in each mode, the following error's as its second derivative,
-        shape ``(n_modes, n_shape_channels)``. Of each mode they have unit Euclidean norm, and the
-        largest is positive; NaN in channels that did not see it.
+        Acceleration of each channel in each mode (of a following error its second derivative),
+        shape ``(n_modes, n_shape_channels)``; unit Euclidean norm, largest component positive,
+        NaN in channels that do not show the mode.
     lines : tuple of Line
-        Spectral lines that were kept out of the likelihood.
+        Spectral lines excluded from the likelihood.
     refused : tuple of Refusal
-        Modes that were looked for and not found, with the reason.
+        Modes that were sought and are not published, with the reason.
     """
 
     names: tuple[str, ...]
@@ -111,3 +118,121 @@ class Modes:
         std = np.sqrt(np.diag(self.cov))
         index = np.arange(n)
         return np.asarray(self.cov[index, index + n] / (std[:n] * std[n:]))
+
+    def select(self, index: Sequence[int]) -> Modes:
+        """Return some modes, in the order of ``index``; the others are marginalised."""
+        both = paired(index, len(self.names))
+        rows = both[: len(index)]
+        return Modes(
+            names=tuple(self.names[i] for i in rows),
+            sources=tuple(self.sources[i] for i in rows),
+            channels=tuple(self.channels[i] for i in rows),
+            ln_frequency=self.ln_frequency[rows],
+            ln_damping=self.ln_damping[rows],
+            cov=self.cov[np.ix_(both, both)],
+            snr=self.snr[rows],
+            dispersion=self.dispersion[rows],
+            flags=tuple(self.flags[i] for i in rows),
+            shape_channels=self.shape_channels,
+            shapes=self.shapes[rows],
+            lines=self.lines,
+            refused=self.refused,
+        )
+
+
+def paired(index: ArrayLike, n_modes: int) -> NDArray[np.intp]:
+    """Return the places of ln f, then of ln ζ, of some modes in ``[ln f, ln ζ]``."""
+    rows = np.asarray(index, dtype=np.intp)
+    return np.concatenate([rows, rows + n_modes])
+
+
+def estimates_only(
+    estimate: FloatArray,
+    cov: FloatArray,
+    snr: FloatArray,
+    sources: Sequence[str],
+    channels: Sequence[str],
+) -> Modes:
+    """Return unnamed modes without shapes, dispersion, lines or refusals.
+
+    Parameters
+    ----------
+    estimate : ndarray
+        ``[ln f, ln ζ]``, shape ``(2 n_modes,)``.
+    cov : ndarray
+        Its covariance, shape ``(2 n_modes, 2 n_modes)``.
+    snr : ndarray
+        Signal-to-noise ratio, shape ``(n_modes,)``.
+    sources, channels : sequence of str
+        Of each mode.
+    """
+    n = len(channels)
+    return Modes(
+        names=("",) * n,
+        sources=tuple(sources),
+        channels=tuple(channels),
+        ln_frequency=estimate[:n],
+        ln_damping=estimate[n:],
+        cov=cov,
+        snr=snr,
+        dispersion=np.full(n, np.nan),
+        flags=("",) * n,
+        shape_channels=(),
+        shapes=np.empty((n, 0)),
+        lines=(),
+        refused=(),
+    )
+
+
+def merge(
+    parts: Sequence[Modes],
+    lines: Sequence[Line],
+    refused: Sequence[Refusal],
+    shape_channels: tuple[str, ...] = (),
+) -> Modes:
+    """Join independent estimates, ascending in frequency; the joint covariance has their blocks.
+
+    Parameters
+    ----------
+    parts : sequence of Modes
+        All with the same ``shape_channels``; their lines and refusals are replaced.
+    lines, refused : sequence of Line, sequence of Refusal
+        Of the log.
+    shape_channels : tuple of str
+        Channels of the shapes.
+    """
+    n, first = sum(len(part.names) for part in parts), 0
+    cov = np.zeros((2 * n, 2 * n))
+    for part in parts:
+        size = len(part.names)
+        both = paired(np.arange(first, first + size), n)
+        cov[np.ix_(both, both)] = part.cov
+        first += size
+
+    def joined(name: str) -> tuple[str, ...]:
+        return tuple(chain.from_iterable(getattr(part, name) for part in parts))
+
+    def stacked(name: str) -> FloatArray:
+        return np.concatenate([np.empty(0), *(getattr(part, name) for part in parts)])
+
+    modes = Modes(
+        names=joined("names"),
+        sources=joined("sources"),
+        channels=joined("channels"),
+        ln_frequency=stacked("ln_frequency"),
+        ln_damping=stacked("ln_damping"),
+        cov=cov,
+        snr=stacked("snr"),
+        dispersion=stacked("dispersion"),
+        flags=joined("flags"),
+        shape_channels=shape_channels,
+        shapes=np.concatenate([np.empty((0, len(shape_channels))), *(p.shapes for p in parts)]),
+        lines=tuple(lines),
+        refused=tuple(refused),
+    )
+    return modes.select(np.argsort(modes.ln_frequency, kind="stable").tolist())
+
+
+def numbered(modes: Modes) -> Modes:
+    """Name modes ``mode_1``, ``mode_2``, … in their order."""
+    return replace(modes, names=tuple(f"mode_{k}" for k in range(1, len(modes.names) + 1)))

@@ -1,4 +1,4 @@
-"""What is asked of a log: which channels and modes, how far up, and how surely."""
+"""Channels and modes that an identification uses: selection, and clusters of neighbours."""
 
 from __future__ import annotations
 
@@ -9,29 +9,27 @@ import numpy as np
 
 from lmshealth.errors import BadLog, BadStage
 from lmshealth.io.log import Channel, Log
+from lmshealth.modal import constants
+from lmshealth.stage.constants import BAND
 from lmshealth.stage.description import Stage
-
-USABLE = 0.45  # of the sample rate: anti-alias filters reach below Nyquist
-# Standard deviations of ln f and ln ζ beyond which an estimate is not reported.
-WORST_STD_LN_F, WORST_STD_LN_ZETA = 0.03, 0.7
 
 
 @dataclass(frozen=True, slots=True)
 class Target:
-    """A mode to look for.
+    """A mode to search for.
 
     Attributes
     ----------
     name : str
-        Of the mode.
+        Mode name.
     frequency : float
-        Where to look, in Hz.
+        Start value in Hz.
     damping_ratio : float
         Start value.
     search : float
         Half width of the search, as a fraction of the frequency.
     nominal : float or None
-        Where it was sought before it was placed, in Hz.
+        Described frequency in Hz, once ``frequency`` has been moved to the start value in a log.
     """
 
     name: str
@@ -41,32 +39,32 @@ class Target:
     nominal: float | None = None
 
     def band(self, widths: float) -> tuple[float, float]:
-        """Frequencies within so many damping ratios of the target."""
+        """Return the band in Hz within so many damping ratios of the frequency."""
         half = widths * self.damping_ratio
         return self.frequency * (1 - min(half, 0.5)), self.frequency * (1 + half)
 
 
 def choose_channels(log: Log, names: Sequence[str] | None = None) -> tuple[Channel, ...]:
-    """Choose the channels that show modes: displacements and accelerations, by name.
+    """Return the displacement and acceleration channels, sorted by name.
 
     Parameters
     ----------
     log : Log
-        With its channels in any order: it decides nothing, not even a rounding.
+        The order of its channels has no effect on results, not even on rounding.
     names : sequence of str, optional
         Use only these.
 
     Raises
     ------
     BadLog
-        If one of the names is no such channel, or none is left.
+        If a name is no such channel, or none is left.
     """
     usable = tuple(c for c in log.channels if c.kind in ("displacement", "acceleration"))
     if names is not None:
-        there = sorted(channel.name for channel in usable)
-        unknown = sorted(set(names) - set(there))
+        available = sorted(channel.name for channel in usable)
+        unknown = sorted(set(names) - set(available))
         if unknown:
-            raise BadLog(log.name, "channel", f"no usable channel {unknown}; there are {there}")
+            raise BadLog(log.name, "channel", f"no usable channel {unknown}; available {available}")
         usable = tuple(channel for channel in usable if channel.name in names)
     if not usable:
         raise BadLog(log.name, "no-signal", "no delta_e or acc channel is left to analyse")
@@ -74,7 +72,7 @@ def choose_channels(log: Log, names: Sequence[str] | None = None) -> tuple[Chann
 
 
 def choose_targets(stage: Stage, band: tuple[float, float] | None = None) -> tuple[Target, ...]:
-    """Choose the modes of a description to look for, ascending in frequency.
+    """Return the modes of a description, ascending in frequency.
 
     Parameters
     ----------
@@ -97,3 +95,28 @@ def choose_targets(stage: Stage, band: tuple[float, float] | None = None) -> tup
     if not targets:
         raise BadStage(f"{stage.name}: no [[mode]] lies between {low:g} and {high:g} Hz")
     return targets
+
+
+def clusters(targets: Sequence[Target]) -> list[tuple[Target, ...]]:
+    """Group neighbours that are fitted jointly: their bands overlap, their bandwidths are similar.
+
+    Parameters
+    ----------
+    targets : sequence of Target
+        Ascending in frequency.
+    """
+    groups: list[list[Target]] = []
+    for target in targets:
+        last = groups[-1] if groups else []
+        if last and len(last) < constants.MOST_TOGETHER and _interact(last[-1], target):
+            last.append(target)
+        else:
+            groups.append([target])
+    return [tuple(group) for group in groups]
+
+
+def _interact(lower: Target, upper: Target) -> bool:
+    # A narrow peak near a broad resonance would need the finest resolution over the whole band.
+    ratio = (upper.frequency * upper.damping_ratio) / (lower.frequency * lower.damping_ratio)
+    similar = 1 / constants.SIMILAR_BANDWIDTH < ratio < constants.SIMILAR_BANDWIDTH
+    return upper.band(BAND)[0] < lower.band(BAND)[1] and similar

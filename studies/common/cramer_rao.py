@@ -8,7 +8,7 @@ import numpy as np
 
 from lmshealth._arrays import ComplexArray, FloatArray, expect_shape
 from lmshealth.modal.free_decay.transient_likelihood import (
-    Block,
+    DecaySpectra,
     TransientLikelihood,
     pole_columns,
     unit_level,
@@ -215,7 +215,7 @@ def decay_bound(
     n_samples = int(np.ceil(20 * recording.band[1] * duration))
     fourier = fourier_frequencies(duration, recording.band)
     nothing = np.empty((fourier.size, 0))
-    block = Block(fourier, nothing, duration, n_samples / duration, nothing)
+    block = DecaySpectra(fourier, nothing, duration, n_samples / duration, nothing)
     columns, _ = pole_columns(block, f, zeta)
     exponent = 2 * np.pi * f * (-zeta + 1j * np.sqrt(1 - zeta**2))
     sizes = amplitude * (1 - np.exp(exponent * duration)) * np.sqrt(duration / 2)

@@ -7,7 +7,7 @@ from unittest.mock import patch
 import numpy as np
 
 from lmshealth import identify
-from lmshealth.modal.ambient import cluster_fit as band
+from lmshealth.modal import constants
 from lmshealth.signal import tone_removal as tones
 from lmshealth.stage.description import Description, ModeSpec, Order, Stage
 from studies.harness.study import Row
@@ -98,7 +98,7 @@ def moves(values: Array, at: float, std: float, velocity: Array | None = None) -
     # Strong lines are taken out of the transforms, and weak ones masked.
     with (
         patch.object(tones, "_TOWERING", np.inf),
-        patch.object(band, "_LINE_FALSE_ALARM", 0.0),
+        patch.object(constants, "LINE_FALSE_ALARM", 0.0),
     ):
         bare = (estimate(values, velocity)[0] - at) / std
     return {

@@ -468,7 +468,7 @@ def test_frf_says_why_a_mode_has_no_name(bench: Path, tmp_path: Path) -> None:
     result = frf(bench, "--stage", tmp_path / "two.toml", "--format", "csv")
     assert result.exit_code == 0
     assert next(csv.DictReader(io.StringIO(result.stdout)))["mode"] == ""
-    assert "has no name: roll and pitch are both looked for there; track finds" in result.stderr
+    assert "has no name: roll and pitch are both searched for there; track assigns" in result.stderr
 
 
 def test_frf_of_several_logs_is_a_table_for_track(bench: Path, tmp_path: Path) -> None:

@@ -8,7 +8,6 @@ import tracemalloc
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -20,13 +19,12 @@ from lmshealth.io.column_map import load_columns
 from lmshealth.io.log import Channel, Log
 from lmshealth.io.reading import read_log
 from lmshealth.modal import identification as modal
-from lmshealth.modal.ambient.cluster_fit import fit_band
-from lmshealth.modal.ambient.initial_values import (
-    Coarse,
-)
+from lmshealth.modal.ambient.cluster_fit import fit_cluster
+from lmshealth.modal.ambient.cluster_modes import ClusterFit
+from lmshealth.modal.ambient.log_spectra import BinnedSpectrum, LogSpectra
 from lmshealth.modal.identification import identify
 from lmshealth.modal.modes import Modes
-from lmshealth.modal.targets import Target
+from lmshealth.modal.targets import Target, clusters
 from lmshealth.signal import segments, spectra
 from tests.signals import (
     Mode,
@@ -393,7 +391,7 @@ def test_what_is_too_weak_for_a_mode_is_said_to_stand_out() -> None:
     assert found.names == ()
     (refusal,) = found.refused
     assert refusal.reason == "not-excited"
-    assert refusal.detail.startswith("what stands out of the noise at 1 place makes no mode")
+    assert refusal.detail.startswith("1 peak above the noise, of which none is a mode")
     assert "near 119.5 Hz" in refusal.detail
 
 
@@ -496,20 +494,22 @@ def test_a_mode_on_the_flank_of_another_is_found_in_what_that_one_leaves_over() 
 
 
 @pytest.fixture
-def fitted(monkeypatch: pytest.MonkeyPatch) -> list[tuple[spectra.View, tuple[Target, ...]]]:
+def fitted(monkeypatch: pytest.MonkeyPatch) -> list[tuple[LogSpectra, tuple[Target, ...]]]:
     """List the views and targets that are fitted."""
-    seen: list[tuple[spectra.View, tuple[Target, ...]]] = []
+    seen: list[tuple[LogSpectra, tuple[Target, ...]]] = []
 
-    def spy(view: spectra.View, coarse: Coarse, targets: tuple[Target, ...]) -> Any:
+    def spy(
+        view: LogSpectra, binned: tuple[BinnedSpectrum, ...], targets: tuple[Target, ...]
+    ) -> ClusterFit:
         seen.append((view, targets))
-        return fit_band(view, coarse, targets)
+        return fit_cluster(view, binned, targets)
 
-    monkeypatch.setattr(modal, "fit_band", spy)
+    monkeypatch.setattr(modal, "fit_cluster", spy)
     return seen
 
 
 def test_a_cluster_is_fitted_where_no_other_stands(
-    fitted: list[tuple[spectra.View, tuple[Target, ...]]],
+    fitted: list[tuple[LogSpectra, tuple[Target, ...]]],
 ) -> None:
     """What was found further down or up is not in the band of a cluster, and not found again."""
     modes = [Mode(60.0, 0.04), Mode(120.0, 0.03), Mode(210.0, 0.03)]
@@ -521,7 +521,7 @@ def test_a_cluster_is_fitted_where_no_other_stands(
 
 
 def test_spectra_reach_as_far_as_modes_are_looked_for(
-    fitted: list[tuple[spectra.View, tuple[Target, ...]]],
+    fitted: list[tuple[LogSpectra, tuple[Target, ...]]],
 ) -> None:
     """A mode of 105 Hz, sought within 15 %, with eight damping ratios beside it: to 135 Hz."""
     identify(one_mode_log(), make_stage(ROLL))
@@ -531,7 +531,7 @@ def test_spectra_reach_as_far_as_modes_are_looked_for(
 
 
 def test_lines_that_are_found_are_neither_sought_nor_fitted(
-    fitted: list[tuple[spectra.View, tuple[Target, ...]]],
+    fitted: list[tuple[LogSpectra, tuple[Target, ...]]],
 ) -> None:
     """Mains of 100 Hz that wander by 0.1 Hz are no candidate, and masked in every fit."""
     n = 60_000
@@ -722,8 +722,8 @@ def test_a_narrow_peak_is_not_fitted_with_a_broad_one() -> None:
     """Their bands overlap, but their widths differ by more than eight: each has its own cluster."""
     broad = Target("broad", 200.0, 0.0107, 0.05)
     narrow, alike = Target("narrow", 184.0, 0.0007, 0.02), Target("alike", 184.0, 0.008, 0.02)
-    assert [len(group) for group in modal._clusters((narrow, broad))] == [1, 1]
-    assert [len(group) for group in modal._clusters((alike, broad))] == [2]
+    assert [len(group) for group in clusters((narrow, broad))] == [1, 1]
+    assert [len(group) for group in clusters((alike, broad))] == [2]
 
 
 @pytest.mark.slow

@@ -1,6 +1,8 @@
-"""What the likelihood is given: ordinates of all channels, averaged where nothing is lost.
+"""Data of the likelihood: mean ordinates of the segments, and the expected periodogram.
 
-The expected periodogram of a short record: the density seen through the record's length.
+Ordinates of segments of one length are averaged, and neighbours where the density hardly changes
+between them. A record that does not resolve a resonance shows the density convolved with the
+Fejér kernel.
 """
 
 from __future__ import annotations
@@ -9,29 +11,39 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy import fft
 
 from lmshealth._arrays import BoolArray, ComplexArray, FloatArray
 from lmshealth.signal.spectra import CrossSpectrum, Spectrum
 
+# Half-power bandwidths times duration below which the expected periodogram replaces the density,
+# per segment: the bias of many is common, and their scatter smaller.
+_RESOLVED = 20.0
+# Samples of the density per half-power bandwidth; at least two per Fourier frequency. The grid
+# ends so many Fourier frequencies outside the band.
+_SAMPLES_PER_BANDWIDTH, _LEAST_FINER, _MOST_FINER = 12, 2, 12
+_MARGIN = 20
+# Least bins per half-power bandwidth where neighbours are averaged.
+_LEAST_BINS = 12.0
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Kernel:
-    """Turns a power spectral density into the expected periodogram.
+    """Convolution from a power spectral density to the expected periodogram.
 
-    A record of length T sees the density convolved with the Fejér kernel T sinc²(T (f - f')).
-    Where the density is given at multiples of 1/(rT), the Fourier frequencies are every r-th of
-    them, and the transform of the kernel does it. Weights are normalised so that a constant
-    density stays itself.
+    A record of length T shows the density convolved with the Fejér kernel T sinc²(T (f - f')).
+    With the density at multiples of 1/(rT) every r-th one is a Fourier frequency. The weights are
+    normalised so that a constant density is unchanged.
 
     Attributes
     ----------
     grid : ndarray
-        Where the density is given, in Hz, shape ``(n_grid,)``.
+        Frequencies of the density in Hz, shape ``(n_grid,)``.
     place : ndarray of int
-        Where on the grid the expected ordinates stand, shape ``(n,)``.
+        Indices of the ordinates in the grid, shape ``(n,)``.
     transform : ndarray
-        Of the kernel about its centre, long enough for the whole grid.
+        Transform of the kernel, zero-padded to the length of the grid.
     norm : ndarray
         Sum of the weights of each ordinate, shape ``(n,)``.
 
@@ -41,24 +53,24 @@ class Kernel:
     """
 
     grid: FloatArray
-    place: np.ndarray[tuple[int], np.dtype[np.intp]]
+    place: NDArray[np.intp]
     transform: FloatArray
     norm: FloatArray
 
     def expect(self, density: ComplexArray | FloatArray) -> ComplexArray:
-        """Give the expected ordinates, shape ``(..., n)``, of densities ``(..., n_grid)``."""
+        """Return expected ordinates, shape ``(..., n)``, of densities ``(..., n_grid)``."""
         return np.asarray(self._convolve(density)[..., self.place] / self.norm)
 
     def spread(self, values: ComplexArray) -> ComplexArray:
-        """Transpose of `expect`: from ordinates, ``(..., n)``, onto the grid, ``(..., n_grid)``."""
+        """Apply the transpose of `expect` to ordinates ``(..., n)``; shape ``(..., n_grid)``."""
         on_grid = np.zeros((*values.shape[:-1], self.grid.size), dtype=complex)
         on_grid[..., self.place] = values / self.norm
         return self._convolve(on_grid)
 
     def _convolve(self, values: ComplexArray | FloatArray) -> ComplexArray:
         size = self.transform.size
-        turned = fft.fft(values, size, axis=-1) * self.transform
-        return np.asarray(fft.ifft(turned, size, axis=-1)[..., : self.grid.size])
+        product = fft.fft(values, size, axis=-1) * self.transform
+        return np.asarray(fft.ifft(product, size, axis=-1)[..., : self.grid.size])
 
 
 def make_kernel(
@@ -68,14 +80,14 @@ def make_kernel(
 
     Parameters
     ----------
-    spectrum : Spectrum
+    spectrum : Spectrum or CrossSpectrum
         A band of Fourier frequencies.
     keep : ndarray of bool
-        Which ordinates are asked for, shape ``(n_ordinates,)``.
+        Ordinates to compute, shape ``(n_ordinates,)``.
     finer : int
-        So many frequencies of the grid per Fourier frequency.
+        Frequencies of the grid per Fourier frequency.
     margin : int
-        The grid reaches so many Fourier frequencies beyond the band.
+        Fourier frequencies of the grid outside the band.
     """
     first, last = np.rint(spectrum.frequency[[0, -1]] * spectrum.duration).astype(int).tolist()
     index = np.arange(max((first - margin) * finer, 1), (last + margin) * finer)
@@ -92,20 +104,9 @@ def make_kernel(
     return replace(kernel, norm=kernel.expect(np.ones(index.size)).real)
 
 
-# Below this many half-power bandwidths times duration the expected periodogram replaces the
-# density: the record no longer resolves the resonance. Many segments are surer than one, and
-# their common bias shows the more: they need as many times more.
-_RESOLVED = 20.0
-# The density is sampled this finely per half-power bandwidth; the kernel itself asks for two
-# samples per Fourier bin, and its tails end this many bins outside the band.
-_SAMPLES_PER_BANDWIDTH = 12
-_MARGIN_BINS = 20
-_LEAST_BINS = 12.0
-
-
 @dataclass(frozen=True, slots=True, eq=False)
-class Block:
-    """Ordinates of segments of one length within the band, each a mean of some neighbours.
+class MeanOrdinates:
+    """Mean ordinates of segments of one length in a band.
 
     Attributes
     ----------
@@ -114,9 +115,9 @@ class Block:
     matrix : ndarray
         Means of F F*, F the transform of all channels, shape ``(n, n_channels, n_channels)``.
     count : ndarray
-        How many ordinates of single segments each mean is of, shape ``(n,)``.
+        Number of ordinates of single segments in each mean, shape ``(n,)``.
     kernel : Kernel or None
-        Density to expected periodogram; None where they are the same.
+        From density to expected periodogram; None where they are equal.
     """
 
     frequency: FloatArray
@@ -126,36 +127,34 @@ class Block:
 
     @property
     def grid(self) -> FloatArray:
-        """Where the density is evaluated, in Hz, shape ``(n_grid,)``."""
+        """Frequencies of the density in Hz, shape ``(n_grid,)``."""
         return self.frequency if self.kernel is None else self.kernel.grid
 
     def smear(self, density: ComplexArray) -> ComplexArray:
-        """Turn densities on the grid, frequency last, into expectations."""
+        """Return the expectation of densities on the grid, frequency last."""
         return density if self.kernel is None else self.kernel.expect(density)
 
 
-def make_block(
+def average_ordinates(
     spectra: Sequence[CrossSpectrum],
     keep: Sequence[BoolArray],
     bandwidth: float,
     *,
     near: Sequence[float] | None = None,
-) -> Block:
-    """Prepare the ordinates of segments of one length for the likelihood.
-
-    It needs of each frequency the mean over the spectra that are kept there, and their number.
+) -> MeanOrdinates:
+    """Average the ordinates of segments of one length.
 
     Parameters
     ----------
     spectra : sequence of CrossSpectrum
-        Of the same frequencies, cut to the band.
+        With the same frequencies, cut to the band.
     keep : sequence of ndarray of bool
-        Ordinates of each that hold no line, shape ``(n_ordinates,)``.
+        Ordinates of each without lines, shape ``(n_ordinates,)``.
     bandwidth : float
         Smallest half-power bandwidth 2ζf expected, in Hz: decides whether the record resolves it.
     near : sequence of float, optional
-        Resonances in Hz: neighbours are averaged where the density hardly changes between them.
-        By default none are.
+        Resonances in Hz: neighbours are averaged as far as the density between them is constant.
+        Without it none are.
     """
     first = spectra[0]
     count = np.zeros(first.frequency.size)
@@ -168,9 +167,9 @@ def make_block(
     resolution = bandwidth * first.duration
     n_segments = sum(spectrum.count for spectrum in spectra)
     if resolution < _RESOLVED * n_segments:
-        finer = int(np.clip(np.ceil(_SAMPLES_PER_BANDWIDTH / resolution), 2, 12))
-        kernel = make_kernel(first, kept, finer, _MARGIN_BINS)
-        return Block(frequency, total / count[:, None, None], count, kernel)
+        finer = np.clip(np.ceil(_SAMPLES_PER_BANDWIDTH / resolution), _LEAST_FINER, _MOST_FINER)
+        kernel = make_kernel(first, kept, int(finer), _MARGIN)
+        return MeanOrdinates(frequency, total / count[:, None, None], count, kernel)
     if near is not None:
         fine = _bins_per_bandwidth(n_segments * resolution) / bandwidth
         starts = _bins(first.frequency, near, bandwidth, fine)[kept]
@@ -178,16 +177,16 @@ def make_block(
         weight = np.add.reduceat(count, starts)
         frequency = np.add.reduceat(count * frequency, starts) / weight
         total, count = np.add.reduceat(total, starts, axis=0), weight
-    return Block(frequency, total / count[:, None, None], count, None)
+    return MeanOrdinates(frequency, total / count[:, None, None], count, None)
 
 
 def _bins(
     frequency: FloatArray, near: Sequence[float], bandwidth: float, fine: float
-) -> np.ndarray[tuple[int], np.dtype[np.intp]]:
-    """Give each ordinate the number of its bin: ``fine`` of them per Hz at a resonance.
+) -> NDArray[np.intp]:
+    """Return the bin of each ordinate; ``fine`` bins per Hz at a resonance.
 
-    On its flank, at x half bandwidths, the logarithm of the density changes over x half
-    bandwidths: bins may be as much wider.
+    At x half bandwidths from a resonance the logarithm of the density varies over x half
+    bandwidths: bins widen in proportion.
     """
     distance = np.min([np.abs(frequency - f) for f in near], axis=0) / (bandwidth / 2)
     step = frequency[1] - frequency[0]
@@ -195,10 +194,10 @@ def _bins(
 
 
 def _bins_per_bandwidth(resolution: float) -> float:
-    """How finely a resonance must be sampled when neighbours are averaged.
+    """Return the bins per half-power bandwidth that leave the damping unbiased.
 
-    The mean over a bin of the r-th part of the half-power bandwidth is below the peak by the share
-    1/(3r²), and the damping too wide by as much, of which the standard deviation is
-    (π B T)^-½; a thirtieth of it does not matter.
+    The mean over the r-th part of the half-power bandwidth is below the peak by the share 1/(3r²),
+    and the damping too large by as much. Its standard deviation is (π B T)^-½; a thirtieth of it
+    is allowed.
     """
     return max(_LEAST_BINS, float(np.sqrt(12.0 * np.sqrt(np.pi * resolution))))

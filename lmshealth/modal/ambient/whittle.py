@@ -1,30 +1,16 @@
-"""Whittle likelihood of all channels that see one or several modes, with exact derivatives.
+"""Whittle likelihood of the modes of a cluster in all channels, with exact derivatives.
 
-The acceleration of mode i under a white modal force is h_i(f) = 1 / (1 - β² - 2iζβ), β = f_i/f.
-What a channel shows beside the modes, its floor, is h_c(f) = exp((e_c + d_c u + b_c u²) / 2) with
-u = -1 … 1 over the band. Modes and floors are driven by partly common forces: the floor of a
-channel is the tail of other modes and the motion of rigid bodies as well as noise, and it
-interferes with the modes. Each channel sees each mode by its shape φ. The ordinates of all
-channels at one frequency are then complex normal with the matrix
+The ordinates of all channels at one frequency are complex normal with the matrix
 
     E(f) = Φ D(f) Φᵀ,   D_ij = S_ij h_i h_j*,   S = L Lᵀ,   Φ = [shapes, 1],
 
-over modes and floors. Averages W of n ordinates keep all there is to know where E hardly changes
-between them:
+over modes and noise floors. Means W of n ordinates suffice where E is constant between them:
 
     -ln p = Σ n (ln det E + tr E⁻¹ W).
 
-Unknowns, in this order: ln f (m), ln ζ (m), e_c, d_c and b_c of each channel, L row by row up to
-its diagonal, which is one for the floors, and the shapes but for the channel of each mode where it
-is one. L is real, for one force moves all modes in phase; it is signed, in units of a start value:
-neither independent modes nor a single common force is a boundary.
-
-Every slope of E has the form E_a = b ω* + ω bᵀ, where b is a column of Φ or a unit vector: a change
-of one component or of one channel. That makes the Hessian a few matrix products.
-
-Which unknown of the likelihood is which.
-
-Responses of modes and of floors, with their derivatives.
+Unknowns, in this order: ln f (m), ln ζ (m), e_c, d_c and b_c of each floor, L row by row up to its
+diagonal (which is one for the floors), and the shapes but for the reference channel of each mode.
+README.md of this folder derives the model; `marginalise` integrates the nuisance parameters.
 """
 
 from __future__ import annotations
@@ -32,24 +18,29 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import product
 from typing import Generic, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 from scipy.optimize import OptimizeResult, minimize
+from scipy.special import softmax
 
 from lmshealth._arrays import ComplexArray, FloatArray
-from lmshealth.modal.ambient.expected_periodogram import Block
+from lmshealth.modal import constants
+from lmshealth.modal.ambient.expected_periodogram import MeanOrdinates
 
 
 @dataclass(frozen=True, slots=True)
 class Layout:
-    """Which unknown is which.
+    """Places of the unknowns.
 
     Attributes
     ----------
     n_modes, n_channels : int
-        Numbers of modes and of channels, whose floors are the components after the modes.
+        Numbers of modes and channels; the floors of the channels are the components after the
+        modes.
     force : tuple of (int, int)
         Row and column of each unknown of L.
     shape : tuple of (int, int)
@@ -68,12 +59,12 @@ class Layout:
 
     @property
     def n_poles(self) -> int:
-        """Number of the first unknowns, those of h: two per mode, three per floor."""
+        """Number of the unknowns of h, which come first: two per mode, three per floor."""
         return 2 * self.n_modes + 3 * self.n_channels
 
     @property
     def pole(self) -> list[tuple[int, int]]:
-        """Component of each of the first unknowns, and which derivative of h belongs to it."""
+        """Component of each unknown of h, and the index of its derivative of h."""
         modes = [(i, q) for q in (1, 2) for i in range(self.n_modes)]
         floors = [(i, q) for i in range(self.n_modes, self.n_components) for q in (1, 2, 3)]
         return modes + floors
@@ -85,13 +76,13 @@ class Layout:
 
     @property
     def shared(self) -> list[int]:
-        """Unknowns of L by which floors share the forces of modes."""
+        """Unknowns of L that make floors coherent with modes."""
         m, first = self.n_modes, self.forces.start
         return [first + a for a, (i, j) in enumerate(self.force) if i >= m > j]
 
     @property
     def common(self) -> list[int]:
-        """Unknowns of L by which floors share the forces of other floors."""
+        """Unknowns of L that make floors coherent with each other."""
         m, first = self.n_modes, self.forces.start
         return [first + a for a, (_, j) in enumerate(self.force) if j >= m]
 
@@ -112,47 +103,47 @@ class Layout:
 
 
 def lay_out(reference: Sequence[int], n_channels: int) -> Layout:
-    """Lay the unknowns out.
+    """Return the places of the unknowns.
 
     Parameters
     ----------
     reference : sequence of int
-        Of each mode the channel in which its shape is one.
+        Channel of each mode in which its shape is one.
     n_channels : int
         Number of channels.
     """
     m = len(reference)
-    # A single channel tells no more than which forces neighbours share.
+    # A single channel only shows which forces neighbours share.
     modes = [(i, j) for i in range(m) for j in range(i + 1) if n_channels > 1 or i - j < 2]
     floors = [(m + c, j) for c in range(n_channels) for j in range(m + c)]
     shape = [(c, i) for i in range(m) for c in range(n_channels) if c != reference[i]]
     return Layout(m, n_channels, (*modes, *floors), tuple(shape))
 
 
-# Where the second derivatives of h stand, by which first ones they are of.
+# Index of the second derivatives of h by the indices of the first ones.
 SECOND = np.array([[4, 5, 6], [5, 7, 8], [6, 8, 9]])
 
 
 def response(f: FloatArray, zeta: FloatArray, frequency: FloatArray) -> ComplexArray:
-    """Acceleration response h of modes to a white force, frequencies in the last axis."""
+    """Return the acceleration response h of modes to a white force, frequency last."""
     beta = f / frequency
     return np.asarray(1 / (1 - beta**2 - 2j * zeta * beta))
 
 
 def floor_response(p: FloatArray, u: FloatArray) -> FloatArray:
-    """Response exp((e + d u + b u²) / 2) of floors, shape ``(n_floors, n)``."""
+    """Return the response exp((e + d u + b u²) / 2) of floors, shape ``(n_floors, n)``."""
     return np.asarray(np.exp(p @ np.stack([np.ones_like(u), u, u * u]) / 2))
 
 
 def floors(p: FloatArray, u: FloatArray) -> ComplexArray:
-    """`floor_response` with its derivatives, as `receptance` has them.
+    """Return `floor_response` with its derivatives, in the layout of `receptance`.
 
     Parameters
     ----------
     p : ndarray
         e, d and b of each floor, shape ``(n_floors, 3)``.
     u : ndarray
-        Place in the band, shape ``(n,)``.
+        Position in the band, -1 to 1, shape ``(n,)``.
     """
     basis = np.stack([np.ones_like(u), u, u * u]) / 2
     h = np.exp(p @ basis)
@@ -161,11 +152,11 @@ def floors(p: FloatArray, u: FloatArray) -> ComplexArray:
 
 
 def receptance(f: FloatArray, zeta: FloatArray, frequency: FloatArray) -> ComplexArray:
-    """Acceleration response h of modes and its derivatives by x = ln f and z = ln ζ.
+    """Return the acceleration response h of modes and its derivatives by x = ln f and z = ln ζ.
 
-    Returns an array of shape ``(10, …, n)``: h, its first derivatives by three unknowns and its
-    second ones (11, 12, 13, 22, 23, 33), of which the third does not exist here. With d = 1/h,
-    h_a = -d_a h² and h_ab = (2 d_a d_b h - d_ab) h².
+    The array has shape ``(10, …, n)``: h, its first derivatives by three unknowns and its second
+    ones (11, 12, 13, 22, 23, 33); modes have no third unknown. With d = 1/h, h_a = -d_a h² and
+    h_ab = (2 d_a d_b h - d_ab) h².
     """
     beta = f / frequency
     damping = -2j * zeta * beta
@@ -191,29 +182,21 @@ def receptance(f: FloatArray, zeta: FloatArray, frequency: FloatArray) -> Comple
 
 T = TypeVar("T")
 
-# Newton decrement, a square in standard deviations, from which on no further step is worth it;
-# along a valley as flat as that of two modes at one place, after so many steps, a larger one.
+# Newton decrement, a square in standard deviations, below which the search ends; along a valley as
+# flat as that of two modes at one frequency, after so many steps, a larger one.
 _ARRIVED, _NEARLY, _MANY_STEPS = 1e-4, 0.1, 25
-# Standard deviations of the weak normal priors about the start, which only keep directions that
-# the data do not see from running away: of ln f, ln ζ, forces, shapes, floors.
-WEAK = (0.2, 2.0)
-_PRIOR_FORCE = 30.0
-_PRIOR_SHARED = 1.0
-_PRIOR_COMMON = 3.0
-_PRIOR_SHAPE = 30.0
-_PRIOR_FLOOR = (5.0, 2.0, 1.0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Likelihood:
-    """Negative log posterior of a band with priors about a start.
+    """Negative log posterior of the unknowns of a cluster.
 
     Attributes
     ----------
-    blocks : tuple of Block
+    blocks : tuple of MeanOrdinates
         One per length of segments.
     layout : Layout
-        Which unknown is which.
+        Places of the unknowns.
     start : ndarray
         Start value and centre of the priors, shape ``(n_unknowns,)``.
     scale : ndarray
@@ -224,7 +207,7 @@ class Likelihood:
         Half width of the band in ln f.
     """
 
-    blocks: tuple[Block, ...]
+    blocks: tuple[MeanOrdinates, ...]
     layout: Layout
     start: FloatArray
     scale: FloatArray
@@ -235,15 +218,15 @@ class Likelihood:
     def prior_std(self) -> FloatArray:
         """Standard deviations of the weak priors, shape ``(n_unknowns,)``."""
         lay = self.layout
-        forces = np.full(len(lay.force), _PRIOR_FORCE)
-        forces[np.array(lay.shared, dtype=int) - lay.forces.start] = _PRIOR_SHARED
-        forces[np.array(lay.common, dtype=int) - lay.forces.start] = _PRIOR_COMMON
+        forces = np.full(len(lay.force), constants.PRIOR_FORCE)
+        forces[np.array(lay.shared, dtype=int) - lay.forces.start] = constants.WIDTHS_SHARED[-1]
+        forces[np.array(lay.common, dtype=int) - lay.forces.start] = constants.WIDTHS_COMMON[-1]
         return np.concatenate(
             [
-                np.repeat(WEAK, lay.n_modes),
-                np.tile(_PRIOR_FLOOR, lay.n_channels),
+                np.repeat([constants.PRIOR_LN_F, constants.PRIOR_LN_ZETA], lay.n_modes),
+                np.tile(constants.PRIOR_FLOOR, lay.n_channels),
                 forces,
-                np.full(len(lay.shape), _PRIOR_SHAPE),
+                np.full(len(lay.shape), constants.PRIOR_SHAPE),
             ]
         )
 
@@ -291,7 +274,7 @@ class Likelihood:
     def signal_to_noise(self, p: FloatArray) -> FloatArray:
         """Modal signal-to-noise ratios S φ² / (4 ζ² N), shape ``(n_channels, n_modes)``."""
         m = self.layout.n_modes
-        at = Block(np.exp(p[:m]), np.empty((m, 0, 0), dtype=complex), np.ones(m), None)
+        at = MeanOrdinates(np.exp(p[:m]), np.empty((m, 0, 0), dtype=complex), np.ones(m), None)
         point = _Point(self, p, at)
         return point.strength / (4 * np.exp(2 * p[m : 2 * m]) * point.floor)
 
@@ -310,10 +293,10 @@ class Likelihood:
         Returns
         -------
         ndarray
-            Where the search ended; the caller judges it by its Newton decrement.
+            The end of the search; its Newton decrement shows whether it converged.
         """
-        # The optimiser asks for value, gradient and Hessian of a point in an order of its own, and
-        # comes back to the point before where a step was too long.
+        # The optimiser evaluates value, gradient and Hessian in an order of its own, and returns to
+        # the point before where a step was too long.
         points = _Last(self._at)
         both = _Last(lambda p: self._derivatives(p, points(p)))
 
@@ -327,7 +310,7 @@ class Likelihood:
             return both(p)[1]
 
         def decrement(p: FloatArray) -> float:
-            """Give the Newton decrement; infinite where there is no minimum near."""
+            """Return the Newton decrement; infinite where there is no minimum near."""
             slope, curvature = both(p)
             try:
                 return float(slope @ cho_solve(cho_factor(curvature), slope))
@@ -354,7 +337,7 @@ class Likelihood:
 
 
 class _Last(Generic[T]):
-    """A function that remembers its last value.
+    """Function with a cache of its last value.
 
     Parameters
     ----------
@@ -367,16 +350,16 @@ class _Last(Generic[T]):
         self._last: tuple[FloatArray, T] | None = None
 
     def __call__(self, p: FloatArray) -> T:
-        """Give the value at p."""
+        """Return the value at p."""
         if self._last is None or not np.array_equal(p, self._last[0]):
             self._last = p.copy(), self._function(p)
         return self._last[1]
 
 
 class _Point:
-    """The model of a block at one point; frequency is the last axis unless said otherwise."""
+    """Model of a block at one point; frequency is the last axis unless stated otherwise."""
 
-    def __init__(self, likelihood: Likelihood, p: FloatArray, block: Block) -> None:
+    def __init__(self, likelihood: Likelihood, p: FloatArray, block: MeanOrdinates) -> None:
         self._block, self._scale = block, likelihood.scale
         self._layout = lay = likelihood.layout
         m, n = lay.n_modes, lay.n_components
@@ -409,13 +392,13 @@ class _Point:
 
     @property
     def strength(self) -> FloatArray:
-        """PSD of each modal force as each channel sees it, shape ``(channels, modes)``."""
+        """PSD of each modal force in each channel, shape ``(channels, modes)``."""
         m = self._layout.n_modes
         return np.asarray(self._phi[:, :m] ** 2 * np.diag(self._s)[:m])
 
     @property
     def floor(self) -> FloatArray:
-        """PSD of what each floor does not share with a mode, shape ``(channels, grid)``."""
+        """PSD of the part of each floor incoherent with modes, shape ``(channels, grid)``."""
         m = self._layout.n_modes
         own = np.sum(self._root[m:, m:] ** 2, axis=1)
         return np.asarray(np.abs(self._response[m:]) ** 2 * own[:, None])
@@ -461,7 +444,7 @@ class _Point:
     def _slopes(self) -> tuple[np.ndarray, ComplexArray]:
         """Rows of the slopes of E in the basis of Φ's columns and the channels.
 
-        Of each unknown the index of b in the basis and its row w, E_a = b (Φ w)ᵀ and its adjoint,
+        Returns the index of b in the basis and the row w of each unknown, E_a = b (Φ w)ᵀ + adjoint,
         shapes ``(unknowns,)`` and ``(unknowns, components, n)``.
         """
         lay, h, s = self._layout, self._h, self._s
@@ -499,7 +482,7 @@ class _Point:
         return curvature
 
     def _by_poles(self, curvature: FloatArray, turned: ComplexArray) -> None:
-        """By two unknowns of h: Q = Σ_ij S_ij B_ji h_i h_j*."""
+        """Add the part of two unknowns of h: Q = Σ_ij S_ij B_ji h_i h_j*."""
         h, n = self._h, self._layout.n_poles
         component, slope = _columns(self._layout.pole)
         weight = self._s[..., None] * turned
@@ -514,7 +497,7 @@ class _Point:
         curvature[:n, :n] += 2 * term.real
 
     def _by_forces(self, curvature: FloatArray, turned: ComplexArray) -> None:
-        """By two forces, and by a force and an unknown of h."""
+        """Add the part of two forces, and of a force and an unknown of h."""
         lay, h = self._layout, self._h
         driven, force = _columns(lay.force)
         overlap = np.einsum("ijk,ik,jk->ij", turned, h[0], h[0].conj()).real
@@ -532,7 +515,7 @@ class _Point:
     def _by_shapes(
         self, curvature: FloatArray, w: ComplexArray, g: ComplexArray, pull: ComplexArray
     ) -> None:
-        """By two shapes, and by a shape and what D depends on."""
+        """Add the part of two shapes, and of a shape and an unknown of D."""
         lay = self._layout
         channel, mode = _columns(lay.shape)
         own = np.tensordot(self._modal, g, axes=(2, 2))  # (i, j, d, c)
@@ -547,7 +530,7 @@ class _Point:
         curvature[lay.shapes, : lay.shapes.start] += 2 * term.real.T
 
 
-def _columns(pairs: Sequence[tuple[int, int]]) -> np.ndarray[tuple[int, int], np.dtype[np.intp]]:
+def _columns(pairs: Sequence[tuple[int, int]]) -> NDArray[np.intp]:
     return np.array(pairs, dtype=np.intp).reshape(-1, 2).T
 
 
@@ -572,3 +555,77 @@ def _inner(a: ComplexArray, b: ComplexArray) -> FloatArray:
 
 def _frequency_last(matrices: ComplexArray | FloatArray) -> ComplexArray:
     return np.ascontiguousarray(np.moveaxis(matrices, 0, -1), dtype=np.complex128)
+
+
+def marginalise(likelihood: Likelihood, p: FloatArray) -> tuple[FloatArray, FloatArray, float]:
+    """Return mean and covariance of ln f and ln ζ by Laplace's approximation.
+
+    One log hardly constrains how coherent a floor is with modes and other floors, or how it bends;
+    neglected, these shift the estimates by up to two standard deviations, and without a prior they
+    cost a third of the information. They get a normal prior of unknown width, and the posterior is
+    averaged over the widths, weighted by their evidence.
+
+    Parameters
+    ----------
+    likelihood : Likelihood
+        With its priors.
+    p : ndarray
+        Near the posterior mode, shape ``(n_unknowns,)``.
+
+    Returns
+    -------
+    mean : ndarray
+        ``[ln f, ln ζ]``, shape ``(2 n_modes,)``.
+    cov : ndarray
+        Their covariance, shape ``(2 n_modes, 2 n_modes)``.
+    decrement : float
+        Newton decrement g H⁻¹ g at ``p``; infinite where there is no maximum.
+    """
+    n, layout = 2 * likelihood.layout.n_modes, likelihood.layout
+    gradient, hessian = likelihood.derivatives(p)
+    try:
+        np.linalg.cholesky(hessian)  # exists at a maximum only
+    except np.linalg.LinAlgError:
+        return p[:n], np.full((n, n), np.nan), np.inf
+    cov = np.linalg.inv(hessian)
+    # The search ends at a small gradient: one Newton step to the centre of the normal.
+    step = cov @ gradient
+    p, decrement = p - step, float(gradient @ step)
+    groups = (layout.shared, layout.common, layout.bends)
+    index = np.array([unknown for group in groups for unknown in group], dtype=int)
+    precision = np.linalg.inv(cov[np.ix_(index, index)])
+    follow = cov[:n, index] @ precision  # regression of ln f and ln ζ on these unknowns
+    weight, mean, narrowed = _narrow(p[index], precision, [len(group) for group in groups])
+    moved = (mean - p[index]) @ follow.T
+    estimate = p[:n] + weight @ moved
+    apart = p[:n] + moved - estimate
+    less = cov[np.ix_(index, index)] - np.tensordot(weight, narrowed, axes=1)
+    cov = cov[:n, :n] - follow @ less @ follow.T + (weight[:, None] * apart).T @ apart
+    return estimate, np.asarray(cov, dtype=np.float64), decrement
+
+
+def _narrow(
+    x: FloatArray, precision: FloatArray, sizes: list[int]
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Evaluate narrower priors of groups of unknowns, whose posterior is normal under the widest.
+
+    Returns
+    -------
+    weight : ndarray
+        Normalised evidence of each choice of widths, shape ``(n_choices,)``.
+    mean, cov : ndarray
+        Of the unknowns, shapes ``(n_choices, n)`` and ``(n_choices, n, n)``.
+    """
+    choices = (constants.WIDTHS_SHARED, constants.WIDTHS_COMMON, constants.WIDTHS_BEND)
+    widths = np.array(list(product(*choices)))
+    widest = np.array([choice[-1] for choice in choices])
+    # Precision of the narrower prior less that of the prior in ``precision``.
+    extra = np.repeat(widths**-2 - widest**-2, sizes, axis=1)
+    narrower = precision + extra[:, :, None] * np.eye(x.size)
+    cov = np.asarray(np.linalg.inv(narrower), dtype=np.float64)
+    mean = cov @ (precision @ x)
+    shift = mean - x
+    cost = np.einsum("ki,ij,kj->k", shift, precision, shift) + np.sum(extra * mean**2, axis=1)
+    log_det = np.linalg.slogdet(narrower)[1]
+    weight = softmax(-0.5 * (cost + log_det) - np.log(widths) @ sizes)
+    return np.asarray(weight), mean, cov

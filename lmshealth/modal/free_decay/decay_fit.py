@@ -1,21 +1,24 @@
-"""Fit neighbouring modes to the decays of some channels, and say what they are known to.
+"""Fit of neighbouring modes to free decays: poles, ambient responses, covariance.
 
-Maximum of the likelihood of decays, and its average over what few ordinates tell.
+Poles are added by an information criterion (`fit_decays`); the ambient response of each mode, which
+few ordinates constrain, is averaged over (`estimate`).
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from scipy import linalg, stats
 from scipy.special import softmax
 
 from lmshealth._arrays import BoolArray, ComplexArray, FloatArray
+from lmshealth.modal import constants
 from lmshealth.modal.free_decay.transient_likelihood import (
-    Block,
     BlockFit,
+    DecaySpectra,
     Evaluation,
     IntArray,
     TransientLikelihood,
@@ -25,22 +28,28 @@ from lmshealth.modal.free_decay.transient_likelihood import (
 )
 
 _MOST_STEPS, _STEP_TOLERANCE = 60, 1e-5
-# The Hessian is differenced over this share of a standard deviation.
+# Step of the difference of the Hessian in standard deviations.
 _DIFFERENCE = 0.02
-# Levels of the ambient response that are averaged over: where to begin if it is not seen, the
-# least that shows, and how much less likely than the best they may be.
+# Levels of the ambient response: start where none is found, least level, and the log posterior
+# below the largest from which on they are left out.
 _FIRST_AVERAGE_LEVEL, _LEAST_LEVEL, _UNLIKELY = 0.5, 0.1, 6.0
-# Largest step of their logarithm, and the step in standard deviations of a level that is known: a
-# sum over a normal density in such steps is exact to 1e-5.
+# Largest step of the logarithm of a level, and its step in standard deviations where the level is
+# well known: a sum over a normal density in such steps is exact to 1e-5.
 _COARSE, _SPREADS = 0.6, 1.3
-# Longest steps, of half a Fourier frequency, that a mode may move by when its ambient response is
-# raised.
+# Longest steps, of half a Fourier frequency, by which a mode may move while its level is raised.
 _STAYS = 2.0
+# Poles tried per Fourier frequency, and their dampings.
+_TRIALS, _DAMPINGS = 4.0, np.geomspace(2e-4, 0.1, 10)
+_FIRST_LEVEL = 0.3  # of the ambient response
+# A line's damping is within this share of the least one.
+_AT_BOUND = 0.01
+# Tolerance in log likelihood while poles are counted.
+_ROUGH = 0.02
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Optimum:
-    """Where the likelihood is largest.
+    """Maximum of the likelihood.
 
     Attributes
     ----------
@@ -49,7 +58,7 @@ class Optimum:
     at : Evaluation
         The likelihood there.
     decrement : float
-        How much larger it might be, by the last step.
+        Gain in log likelihood that the last step predicted.
     """
 
     p: FloatArray
@@ -64,18 +73,18 @@ def maximise(
     *,
     tolerance: float = _STEP_TOLERANCE,
 ) -> Optimum:
-    """Find the maximum along some parameters by quasi-Newton steps from the Fisher information.
+    """Maximise over some parameters by quasi-Newton steps from the Fisher information.
 
     Parameters
     ----------
     likelihood : TransientLikelihood
-        Of which.
+        Of the decays.
     p : ndarray
         Start, shape ``(n_parameters,)``.
     free : ndarray of int
-        Which parameters may move, shape ``(n_free,)``.
+        Parameters to maximise over, shape ``(n_free,)``.
     tolerance : float
-        Gain in log likelihood below which no further step is worth it.
+        Gain in log likelihood below which the search ends.
     """
     at = likelihood.evaluate(p)
     metric, fresh, decrement = likelihood.metric(at), True, np.inf
@@ -97,7 +106,7 @@ def maximise(
 
 
 def _step(metric: FloatArray, gradient: FloatArray, free: IntArray) -> FloatArray:
-    """Solve for the step along the free parameters, scaled because they differ by 10⁵."""
+    """Return the step of the free parameters, whose scales differ by 10⁵."""
     scale = np.sqrt(np.diag(metric)[free])
     system = metric[np.ix_(free, free)] / np.outer(scale, scale) + 1e-9 * np.eye(free.size)
     step = np.zeros(gradient.size)
@@ -106,7 +115,7 @@ def _step(metric: FloatArray, gradient: FloatArray, free: IntArray) -> FloatArra
 
 
 def _updated(metric: FloatArray, step: FloatArray, change: FloatArray) -> FloatArray:
-    """Update the metric by what a step did to the gradient, as Broyden and others do."""
+    """Update the metric by the change of the gradient (BFGS)."""
     along = metric @ step
     expected, seen = float(step @ along), float(step @ change)
     if seen < 1e-2 * expected:
@@ -117,7 +126,7 @@ def _updated(metric: FloatArray, step: FloatArray, change: FloatArray) -> FloatA
 def _shorten(
     likelihood: TransientLikelihood, p: FloatArray, step: FloatArray, at: Evaluation
 ) -> tuple[FloatArray, Evaluation] | None:
-    """Shorten a step until it gains; None where none does."""
+    """Shorten a step until the likelihood improves; None where it does not."""
     for share in (1.0, 0.3, 0.1, 0.03, 0.01, 1e-3):
         tried = likelihood.clip(p + share * step)
         there = likelihood.evaluate(tried)
@@ -126,17 +135,8 @@ def _shorten(
     return None
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Average:
-    """The posterior with one mode's ambient response averaged over.
-
-    Attributes
-    ----------
-    mean : ndarray
-        Of all parameters, shape ``(n_parameters,)``.
-    cov : ndarray
-        Their covariance, shape ``(n_parameters, n_parameters)``; zero where held.
-    """
+class Average(NamedTuple):
+    """Mean of all parameters and covariance, zero where held, over ambient responses of a mode."""
 
     mean: FloatArray
     cov: FloatArray
@@ -145,20 +145,20 @@ class Average:
 def average_ambient(
     likelihood: TransientLikelihood, p: FloatArray, mode: int, free: IntArray
 ) -> Average:
-    """Average over the ambient response of a mode, which few ordinates tell.
+    """Average the posterior over the ambient response of a mode.
 
-    A stop shows it at two or three Fourier frequencies beside the resonance, and the most
-    probable level is often far below the true one. Intervals at that level cover two times out of
-    three; averaged over all levels under Jeffreys' prior they cover as they say.
+    A stop shows it at two or three Fourier frequencies near the resonance, and the most probable
+    level is often far below the true one. Intervals at that level cover two times out of
+    three; averaged over all levels under Jeffreys' prior they cover as stated.
 
     Parameters
     ----------
     likelihood : TransientLikelihood
-        Of which.
+        Of the decays.
     p : ndarray
         Its maximum, shape ``(n_parameters,)``.
     mode : int
-        Which mode's.
+        Index of the mode.
     free : ndarray of int
         The other parameters that are not held, shape ``(n_free,)``.
     """
@@ -168,8 +168,8 @@ def average_ambient(
     weight, levels = _average_levels(likelihood, start, place, free, _COARSE)
     best = levels[int(np.argmax(weight))]
     if abs(best.p[mode] - p[mode]) > _STAYS * likelihood.reach(p)[mode]:
-        # An ambient response far above a clean decay's noise drives the mode out of its place, and
-        # another pole takes it: the response is raised from the least one on.
+        # A level far above the noise of a clean decay displaces the mode, and another pole takes
+        # its place: start from the least level.
         start[place] = max(abs(p[place]), _LEAST_LEVEL * (1 + _STEP_TOLERANCE))
         weight, levels = _average_levels(likelihood, start, place, free, _COARSE)
         best = levels[int(np.argmax(weight))]
@@ -179,7 +179,7 @@ def average_ambient(
         weight, levels = _average_levels(likelihood, best.p, place, free, _SPREADS * spread)
     weights, most = softmax(weight), int(np.argmax(weight))
     inverses = np.array([np.linalg.inv(level.at.fisher[np.ix_(free, free)]) for level in levels])
-    # The Hessian is costly: what it is over the Fisher information is taken from the best level.
+    # The Hessian is costly: its ratio to the Fisher information is that of the best level.
     wide = np.linalg.cholesky(invert(likelihood, levels[most], free))
     stretch = wide @ np.linalg.inv(np.linalg.cholesky(inverses[most]))
     where = np.array([level.p for level in levels])
@@ -192,14 +192,14 @@ def average_ambient(
 def _average_levels(
     likelihood: TransientLikelihood, p: FloatArray, place: int, free: IntArray, step: float
 ) -> tuple[FloatArray, list[Optimum]]:
-    """Maximise at levels in both directions from a first one, until they are too unlikely.
+    """Maximise at levels in both directions from a first one, until they are unlikely.
 
     Returns
     -------
     weights : ndarray
-        Log posterior of each level, the others integrated, under Jeffreys' prior on a log grid.
+        Log posterior of each level on a log grid, the other parameters integrated.
     levels : list of Optimum
-        The levels.
+        Maximum at each level.
     """
     found: list[tuple[float, Optimum]] = []
     for way in (1, -1):
@@ -227,11 +227,11 @@ def invert(likelihood: TransientLikelihood, optimum: Optimum, free: IntArray) ->
     Parameters
     ----------
     likelihood : TransientLikelihood
-        Of which.
+        Of the decays.
     optimum : Optimum
         Its maximum.
     free : ndarray of int
-        Along which parameters, shape ``(n_free,)``.
+        Parameters, shape ``(n_free,)``.
 
     Returns
     -------
@@ -246,7 +246,7 @@ def invert(likelihood: TransientLikelihood, optimum: Optimum, free: IntArray) ->
 
 
 def _hessian(likelihood: TransientLikelihood, optimum: Optimum, free: IntArray) -> FloatArray:
-    """Differentiate the gradient along some parameters, shape ``(n_free, n_free)``."""
+    """Differentiate the gradient by some parameters, shape ``(n_free, n_free)``."""
     p = optimum.p
     scale = 1 / np.sqrt(np.diag(likelihood.metric(optimum.at)))
     reach = likelihood.reach(p)
@@ -259,26 +259,14 @@ def _hessian(likelihood: TransientLikelihood, optimum: Optimum, free: IntArray) 
     return np.asarray(np.add(rows, np.transpose(rows)) / 2)
 
 
-MOST_POLES = 6
-# Log likelihood beyond the Bayesian information criterion that a further pole must bring.
-_EVIDENCE_MARGIN = 5.0
-# Poles tried per Fourier frequency, and their dampings.
-_TRIALS, _DAMPINGS = 4.0, np.geomspace(2e-4, 0.1, 10)
-_FIRST_LEVEL = 0.3  # of the ambient response
-# A line's damping is within this share of the least that can be told from none.
-_AT_BOUND = 0.01
-# Log likelihood that is not worth a step while poles are counted.
-_ROUGH = 0.02
-
-
 @dataclass(frozen=True, slots=True, eq=False)
-class Ringing:
-    """Poles that decays in a band show, at their most probable place.
+class DecayFit:
+    """Poles of the decays in a band, at the maximum of the likelihood.
 
     Attributes
     ----------
     likelihood : TransientLikelihood
-        Of the band.
+        Of the decays in the band.
     optimum : Optimum
         Its maximum.
     """
@@ -298,12 +286,12 @@ class Ringing:
         return np.exp(self.optimum.p[m : 2 * m])
 
     def is_line(self) -> BoolArray:
-        """Tell which modes do not fade at all over the record, shape ``(n_modes,)``."""
+        """Return which modes do not decay over the record, shape ``(n_modes,)``."""
         m, p = self.likelihood.n_modes, self.optimum.p
         return np.asarray(p[m : 2 * m] < self.likelihood.least_damping(p) + _AT_BOUND)
 
     def sizes(self, mode: int) -> list[ComplexArray]:
-        """Complex size of a mode's transient, per block of ``(n_channels, n_segments)``."""
+        """Return the complex size of a mode's transient, per block ``(n_channels, n_segments)``."""
         pairs = [
             fit.sizes[:, 2 * mode - 2 * self.likelihood.n_modes :][:, :2]
             for fit in self.optimum.at.fits
@@ -311,14 +299,14 @@ class Ringing:
         return [pair[:, 0] + 1j * pair[:, 1] for pair in pairs]
 
     def white_level(self) -> FloatArray:
-        """Power spectral density of the white noise in mid-band, shape ``(n_channels,)``."""
+        """Return the density of the white noise in mid-band, shape ``(n_channels,)``."""
         m, n = self.likelihood.n_modes, self.likelihood.n_channels
         return np.exp(self.optimum.p[3 * m : 3 * m + n])
 
     def snr(self, mode: int) -> FloatArray:
-        """Largest mean ordinate of a mode's decays over the noise, shape ``(n_channels,)``.
+        """Return the largest mean ordinate of a mode's decays over the noise, ``(n_channels,)``.
 
-        As S / (4 ζ² S_e) is of an ambient response.
+        It corresponds to S / (4 ζ² S_e) of an ambient response.
         """
         block, size = self.likelihood.blocks[0], self.sizes(mode)[0]
         own = slice(mode, mode + 1)
@@ -328,14 +316,14 @@ class Ringing:
         return np.asarray(mean / self.white_level())
 
     def excitation(self, mode: int, level: float) -> float:
-        """Mean square of a mode's vibration at the stops over that of its ambient response.
+        """Return the mean square of a vibration at the stops over that of the ambient response.
 
         Parameters
         ----------
         mode : int
-            Which.
+            Index of the mode.
         level : float
-            Its ambient response, h of the likelihood.
+            Ambient response h of the mode.
         """
         f, zeta = float(self.frequency[mode]), float(self.damping_ratio[mode])
         exponent = 2 * np.pi * f * (-zeta + 1j * np.sqrt(1 - zeta**2))
@@ -343,7 +331,7 @@ class Ringing:
         squares = []
         for block, size in zip(self.likelihood.blocks, self.sizes(mode), strict=True):
             start = size * np.sqrt(2 / block.duration) / (1 - np.exp(exponent * block.duration))
-            # Seen along the mode's shape, every channel in units of its noise.
+            # Projection on the mode's shape, every channel in units of its noise.
             along = (shape / self.white_level()) @ start / (shape**2 / self.white_level()).sum()
             squares.append(np.abs(along) ** 2)
         # Twice the variance π f S / (4 ζ) of the response to a force of density S.
@@ -352,7 +340,7 @@ class Ringing:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Estimate:
+class DecayEstimate:
     """Modes of a band with their joint covariance.
 
     Attributes
@@ -371,32 +359,32 @@ class Estimate:
     excitation: FloatArray
 
 
-def find_ringing(blocks: tuple[Block, ...], *, displacement: bool = False) -> Ringing:
-    """Add poles as long as the Bayesian information criterion asks for them.
+def fit_decays(blocks: tuple[DecaySpectra, ...], *, displacement: bool = False) -> DecayFit:
+    """Add poles while the Bayesian information criterion improves.
 
     Parameters
     ----------
-    blocks : tuple of Block
+    blocks : tuple of DecaySpectra
         Decays in a band.
     displacement : bool
         The channels are displacements.
 
     Returns
     -------
-    Ringing
-        Without modes where the band holds noise only.
+    DecayFit
+        Without modes where the band holds only noise.
     """
     n = blocks[0].ordinates.shape[2]
     levels = np.log(_levels(blocks))
     likelihood = TransientLikelihood(blocks, np.empty((0, n)), np.empty(0), levels, displacement)
     start = np.concatenate([levels, np.zeros(n)])
-    found = Ringing(likelihood, maximise(likelihood, start, np.arange(2 * n)))
+    found = DecayFit(likelihood, maximise(likelihood, start, np.arange(2 * n)))
     sizes = [block.ordinates.shape for block in blocks]
-    # A pole and its ambient response are told by all ordinates, the sizes of a segment by its own.
+    # All ordinates constrain a pole and its ambient response; those of a segment its sizes.
     total = sum(2 * s * k * n for s, k, _ in sizes)
     own = sum(2 * s * n * np.log(2 * k) for s, k, _ in sizes)
-    needed = 1.5 * np.log(total) + own / 2 + _EVIDENCE_MARGIN
-    while found.likelihood.n_modes < MOST_POLES:
+    needed = 1.5 * np.log(total) + own / 2 + constants.DECAY_EVIDENCE_MARGIN
+    while found.likelihood.n_modes < constants.DECAY_MOST_POLES:
         more = _add_pole(found, *_best_pole(found))
         gain = found.optimum.at.profile - more.optimum.at.profile
         if gain < needed:
@@ -405,14 +393,14 @@ def find_ringing(blocks: tuple[Block, ...], *, displacement: bool = False) -> Ri
     return found
 
 
-def _levels(blocks: tuple[Block, ...]) -> FloatArray:
-    """Level of the noise between the peaks of each channel."""
+def _levels(blocks: tuple[DecaySpectra, ...]) -> FloatArray:
+    """Return the level of the noise between the peaks of each channel."""
     medians = [np.median(np.abs(block.ordinates) ** 2, axis=(0, 1)) for block in blocks]
     return np.asarray(np.mean(medians, axis=0) / np.log(2))
 
 
-def _best_pole(found: Ringing) -> tuple[float, float]:
-    """Try poles all over the band on what the fit leaves, and choose the one that gains most."""
+def _best_pole(found: DecayFit) -> tuple[float, float]:
+    """Return frequency and damping of the pole that explains most of the residual."""
     longest = max(found.likelihood.blocks, key=lambda block: block.duration)
     step = 1 / (_TRIALS * longest.duration)
     grid = np.arange(longest.frequency[0] + 2 * step, longest.frequency[-1] - step, step)
@@ -435,8 +423,8 @@ def _best_pole(found: Ringing) -> tuple[float, float]:
     return float(f[best]), float(zeta[best])
 
 
-def _add_pole(found: Ringing, f: float, zeta: float) -> Ringing:
-    """Fit one pole more: first without its ambient response, then with it in the decay's shape."""
+def _add_pole(found: DecayFit, f: float, zeta: float) -> DecayFit:
+    """Fit one more pole, first without its ambient response, then with the shape of its decays."""
     before, m = found.likelihood, found.likelihood.n_modes
     p = found.optimum.p
     start = np.concatenate(
@@ -450,7 +438,7 @@ def _add_pole(found: Ringing, f: float, zeta: float) -> Ringing:
         units=np.append(before.units, unit),
     )
     without = np.delete(np.arange(start.size), 3 * m + 2)
-    first = Ringing(
+    first = DecayFit(
         likelihood, maximise(likelihood, likelihood.clip(start), without, tolerance=_ROUGH)
     )
     shape = _shape(np.concatenate(first.sizes(m), axis=1), first.white_level())
@@ -458,25 +446,27 @@ def _add_pole(found: Ringing, f: float, zeta: float) -> Ringing:
     likelihood = replace(likelihood, shapes=shapes)
     start = first.optimum.p + 0.0
     start[3 * m + 2] = _FIRST_LEVEL
-    return Ringing(likelihood, maximise(likelihood, start, np.arange(start.size), tolerance=_ROUGH))
+    return DecayFit(
+        likelihood, maximise(likelihood, start, np.arange(start.size), tolerance=_ROUGH)
+    )
 
 
 def _shape(sizes: ComplexArray, noise: FloatArray) -> FloatArray:
-    """Find the real shape that a mode's decays have in common, in units of the noise."""
+    """Return the common real shape of a mode's decays."""
     scale = np.sqrt(noise)
     seen = np.concatenate([sizes.real, sizes.imag], axis=1) / scale[:, None]
     return np.asarray(np.linalg.svd(seen, full_matrices=False)[0][:, 0] * scale)
 
 
-def estimate(found: Ringing, modes: Sequence[int] | None = None) -> Estimate:
-    """Average modes of a band over their ambient responses.
+def estimate(found: DecayFit, modes: Sequence[int] | None = None) -> DecayEstimate:
+    """Estimate modes of a band, averaged over their ambient responses.
 
     Parameters
     ----------
-    found : Ringing
+    found : DecayFit
         With at least one mode.
     modes : sequence of int, optional
-        Which, at least one; by default all.
+        Indices, at least one; by default all.
     """
     likelihood, m = found.likelihood, found.likelihood.n_modes
     modes = range(m) if modes is None else modes
@@ -484,7 +474,7 @@ def estimate(found: Ringing, modes: Sequence[int] | None = None) -> Estimate:
     at_bound = m + np.flatnonzero(found.is_line())
     free = np.setdiff1d(np.arange(p.size), [*range(2 * m, 3 * m), *at_bound])
     averages = []
-    # The ambient response of one mode hardly tells on another: each is averaged over in turn.
+    # The ambient response of one mode hardly affects another: each is averaged over in turn.
     for i in modes:
         averages.append(average_ambient(likelihood, p, i, free))
         p[2 * m + i] = averages[-1].mean[2 * m + i]
@@ -497,30 +487,29 @@ def estimate(found: Ringing, modes: Sequence[int] | None = None) -> Estimate:
     for k, average in enumerate(averages):
         pair = np.array([k, n + k])
         mean[pair] = average.mean[own[pair]]
-        # The joint covariance is stretched until each mode has that of its average.
+        # The joint covariance is scaled until each mode has that of its average.
         wide = np.linalg.cholesky(average.cov[np.ix_(own[pair], own[pair])])
         narrow = np.linalg.cholesky(joint[np.ix_(pair, pair)])
         scales[np.ix_(pair, pair)] = wide @ np.linalg.inv(narrow)
     excitation = [found.excitation(i, float(p[2 * m + i])) for i in modes]
-    return Estimate(mean, scales @ joint @ scales.T, np.array(excitation))
+    return DecayEstimate(mean, scales @ joint @ scales.T, np.array(excitation))
 
 
-def stationarity(found: Ringing) -> float:
-    """Test whether what the fit leaves is the same all through the record.
+def stationarity(found: DecayFit) -> float:
+    """Test whether the residual is stationary over the record.
 
-    What fades with the decay or grows towards the end of a record ties ordinates to their
-    neighbours. The lag-one products of the whitened residual are compared with what white noise
-    would leave of itself after the same fit.
+    Noise whose power varies over the record correlates neighbouring ordinates. The lag-one
+    products of the whitened residual are compared with those of white noise after the same fit.
 
     Parameters
     ----------
-    found : Ringing
+    found : DecayFit
         Any fit.
 
     Returns
     -------
     float
-        Probability of at least that much correlation in stationary noise.
+        p value: probability of at least that correlation in stationary noise.
     """
     total = np.zeros((3, 2))
     for fit in found.optimum.at.fits:
@@ -529,20 +518,20 @@ def stationarity(found: Ringing) -> float:
 
 
 def _lag_one(fit: BlockFit, n: int) -> FloatArray:
-    """Lag-one products, real and imaginary: found, expected and variance, shape ``(3, 2)``."""
+    """Return lag-one products, real and imaginary: found, expected, variance; ``(3, 2)``."""
     found = np.empty((3, 2))
     for k, turn in enumerate((1.0, -1j)):
         moved_residual = _neighbours(fit.residual, n, turn)
-        moved_base = _neighbours(fit.removed, n, turn)
+        moved_removed = _neighbours(fit.removed, n, turn)
         n_segments = fit.residual.shape[1]
         n_rows = fit.residual.shape[0]
-        inner = fit.removed.T @ moved_base
+        inner = fit.removed.T @ moved_removed
         # tr(A²) of the symmetric shift: half of the ordinates that have a neighbour, twice.
         whole = n_rows / 2 - n
         found[0, k] = np.sum(fit.residual * moved_residual)
         found[1, k] = -0.5 * n_segments * np.trace(inner)
         found[2, k] = (
-            0.5 * n_segments * (whole - 2 * np.sum(moved_base**2) + np.sum(inner * inner.T))
+            0.5 * n_segments * (whole - 2 * np.sum(moved_removed**2) + np.sum(inner * inner.T))
         )
     return found
 

@@ -1,14 +1,13 @@
-"""Identification of modes from free decays: what a machine does after every stop.
+"""Identification of modes from the free decays after the stops of a stage.
 
-The stretches after the stops of a log share frequencies, dampings and noise; sizes and phases are
-each stop's own. Noise is what the sensors add and what still shakes the same modes: the second is
-what least squares forget.
+The decays of a log share frequencies, dampings and noise; sizes and phases differ between stops.
+The noise comes from the sensors and from forces that still excite the same modes.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
@@ -16,50 +15,33 @@ from scipy import ndimage, stats
 
 from lmshealth._arrays import FloatArray
 from lmshealth.errors import BadLog
-from lmshealth.io.log import Channel, Log
+from lmshealth.io.log import Channel, Log, Refusal
+from lmshealth.modal import constants
 from lmshealth.modal.free_decay.decay_fit import (
-    Estimate,
-    Ringing,
+    DecayEstimate,
+    DecayFit,
     estimate,
-    find_ringing,
+    fit_decays,
     stationarity,
 )
-from lmshealth.modal.free_decay.transient_likelihood import make_block
-from lmshealth.modal.modes import Modes
-from lmshealth.modal.naming import Band, Pole, is_near, name_modes
-from lmshealth.modal.targets import (
-    USABLE,
-    WORST_STD_LN_F,
-    Target,
-    choose_channels,
-    choose_targets,
-)
+from lmshealth.modal.free_decay.transient_likelihood import transform_decays
+from lmshealth.modal.modes import Modes, Rejection, estimates_only, merge, numbered
+from lmshealth.modal.naming import assign, is_near
+from lmshealth.modal.targets import Target, choose_channels, choose_targets
 from lmshealth.signal.segments import Segment, select_segments
 from lmshealth.stage.description import Stage
 
-# A band reaches so many Fourier frequencies, and such a share of the frequency, beyond its modes;
-# modes closer than that are fitted together, but never more than a few.
-_REACH, _SHARE, _MOST_TOGETHER = 20.0, 0.06, 4
-# So near to the end of a band, in Fourier frequencies, no mode is believed.
-_EDGE = 3.0
-# Decays as long as each other within this share are cut to one length.
+# Reach of a band beyond its modes, in Fourier frequencies and as a share of the frequency: closer
+# modes are fitted together. No mode is accepted this near to the end of a band.
+_REACH, _SHARE, _EDGE = 20.0, 0.06, 3.0
+# Decays whose lengths differ by less than this share are cut to one length.
 _SAME_LENGTH = 0.95
-# Probability that noise alone makes a peak somewhere, and how many neighbours tell its level.
-_FALSE_ALARM, _AROUND = 1e-3, 24
-# Periods of the lowest mode that a decay must hold; ordinates that a band must.
-_PERIODS, _LEAST_ORDINATES = 4.0, 12
-# Shares of a decay that are left out until the rest is one in stationary noise, and the
-# probability below which it is said not to be.
+# Neighbours that give the level of a peak.
+_AROUND = 24
+# Shares of a decay that are skipped until the rest is a sum of modes in stationary noise.
 _SKIPS = (0.0, 0.1, 0.2, 0.3, 0.4, 0.5)
-_NOT_STATIONARY = 1e-3
-# What a later beginning may mend in the loudest mode.
+# Rejections of the strongest mode that a later start may avoid.
 _TOO_EARLY = ("too-uncertain", "too-close")
-# A damping that is fewer than so many standard deviations off zero may be a line's.
-_LEAST_DAMPING = 3.0
-_FADED, _HEAVY = 0.6, 0.1
-_LINE = "line-not-mode"
-# Mean square of a mode's vibration at the stops over that of its ambient response.
-_EXCITED = 16.0
 
 
 def identify_decays(
@@ -77,31 +59,31 @@ def identify_decays(
     log : Log
         Displacement (following error) and acceleration channels are used.
     stage : Stage, optional
-        Says which modes to look for; without it all that rings in the band is found.
+        Modes to identify; without it all that decay in the band.
     segments : sequence of Segment, optional
-        The decays; by default what follows the moves of the set point.
+        The decays; by default the segments after the moves of the set point.
     channels : sequence of str, optional
         Use only these channels.
     band : (float, float), optional
-        Use only modes between these frequencies in Hz. Without a stage the default reaches from
-        four periods per decay to 0.45 of the sample rate.
+        Use only modes between these frequencies in Hz. Without a stage the default is from four
+        periods per decay to 0.45 of the sample rate.
 
     Returns
     -------
     Modes
-        With the modes that were looked for and refused, and why. ``snr`` is the mean ordinate of
-        the decays at the resonance over the noise.
+        With the modes that are refused, and why. ``snr`` is the mean ordinate of the decays at the
+        resonance over the noise.
 
     Raises
     ------
     BadLog
-        If no channel or decay is left, or nothing rings and no stage says what should.
+        If no channel or decay is left, or no mode is found without a stage.
     BadStage
         If the stage has no mode in the band.
 
     Examples
     --------
-    After each of six moves of a second the stage rings at 85 Hz with a damping of 1 %:
+    After each of six moves of a second a mode of 85 Hz with a damping of 1 % decays:
 
     >>> import numpy as np
     >>> import lmshealth
@@ -120,19 +102,57 @@ def identify_decays(
     0.97% ± 0.03%
     """
     used = choose_channels(log, channels)
-    decays = _stops(log, segments)
+    decays = _decays(log, segments)
     targets = () if stage is None else choose_targets(stage, band)
     limits = _limits(log, decays, targets, band)
-    found: list[Band] = []
+    found: list[_BandModes] = []
     for source, kind in (("acc", "acceleration"), ("delta_e", "displacement")):
         group = tuple(c for c in used if c.kind == kind)
         if group:
-            found += _ringing(log, group, source, decays, limits, targets)
-    return name_modes(log, targets, found)
+            found += _fit_bands(log, group, source, decays, limits, targets)
+    if not targets:
+        return _number(log, found)
+    named, ambiguous = _name(targets, found)
+    names = {name for modes in named for name in modes.names}
+    refused = [
+        Refusal(log.name, *(ambiguous.get(t.name) or _why_missing(t, found)), mode=t.name)
+        for t in targets
+        if t.name not in names
+    ]
+    return merge(named, (), (*log.refused, *refused))
 
 
-def _stops(log: Log, segments: Sequence[Segment] | None) -> tuple[Segment, ...]:
-    """Find the decays; those less than half as long as the longest would only cost."""
+@dataclass(frozen=True, slots=True, eq=False)
+class _Pole:
+    """A decaying resonance: Hz, damping ratio, SNR of each channel, why it is no mode."""
+
+    frequency: float
+    damping: float
+    snr: FloatArray
+    rejection: Rejection | None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _BandModes:
+    """Modes of a band of one kind of channels: accepted poles, their estimates, rejected poles."""
+
+    source: str
+    poles: tuple[_Pole, ...]
+    modes: Modes
+    rejected: tuple[_Pole, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class _Request:
+    """Source and names of the channels, and the frequencies in Hz in which modes are accepted."""
+
+    source: str
+    channels: tuple[str, ...]
+    limits: tuple[float, float]
+
+
+def _decays(log: Log, segments: Sequence[Segment] | None) -> tuple[Segment, ...]:
+    """Return the decays at least half as long as the longest."""
     if segments is None:
         segments = select_segments(log, "settling")
     longest = max((s.stop - s.start for s in segments), default=0)
@@ -147,9 +167,9 @@ def _limits(
     targets: tuple[Target, ...],
     band: tuple[float, float] | None,
 ) -> tuple[float, float]:
-    """Find where modes are looked for, and insist that the decays resolve it."""
+    """Return the frequencies in Hz between which modes are searched for."""
     duration = max(s.stop - s.start for s in decays) / log.sample_rate
-    least, top = _PERIODS / duration, USABLE * log.sample_rate
+    least, top = constants.DECAY_PERIODS / duration, constants.USABLE * log.sample_rate
     if targets:
         low = min(t.frequency / (1 + t.search) for t in targets)
         high = max(t.frequency * (1 + t.search) for t in targets)
@@ -160,15 +180,16 @@ def _limits(
             log.name,
             "sample-rate",
             f"{log.sample_rate:g} Hz cannot show modes up to {high:.0f} Hz; needed is at least "
-            f"{high / USABLE:.0f} Hz",
+            f"{high / constants.USABLE:.0f} Hz",
         )
     low, high = max(low, least), min(high, top)
-    if high * duration < _PERIODS + _LEAST_ORDINATES:
+    needed = constants.DECAY_PERIODS + constants.DECAY_ORDINATES
+    if high * duration < needed:
         raise BadLog(
             log.name,
             "too-short",
             f"decays of {duration:.3g} s hold {max(high * duration, 0):.0f} periods of the highest "
-            f"mode; needed are {_PERIODS + _LEAST_ORDINATES:.0f}: record on after the stop",
+            f"mode; needed are {needed:.0f}: continue recording after the stop",
         )
     return low, high
 
@@ -176,7 +197,7 @@ def _limits(
 def _cut(
     log: Log, channels: tuple[Channel, ...], decays: tuple[Segment, ...], skip: float
 ) -> list[FloatArray]:
-    """Cut decays out, those of about one length to one length, the longest first.
+    """Cut out decays, those of similar length to one length, the longest first.
 
     Returns
     -------
@@ -202,75 +223,67 @@ def _cut(
     ]
 
 
-def _ringing(
+def _fit_bands(
     log: Log,
     channels: tuple[Channel, ...],
     source: str,
     decays: tuple[Segment, ...],
     limits: tuple[float, float],
     targets: tuple[Target, ...],
-) -> list[Band]:
-    """Fit, band by band, all that rings where modes are looked for."""
-    # Cut anew for every band: six copies of all decays would not fit beside a long log.
+) -> list[_BandModes]:
+    """Fit the modes of each band with peaks."""
+    # Cut again for every band: copies of all decays at every start would exceed the memory.
     cut = partial(_cut, log, channels, decays)
     longest = cut(0.0)[0]
     duration = longest.shape[1] / log.sample_rate
     peaks = _peaks(longest, log.sample_rate, limits)
     if targets:
         peaks = [f for f in peaks if any(is_near(t, f, slack=1.2) for t in targets)]
+    names = tuple(c.name for c in channels)
     bands = []
-    for group, (low, high) in _groups(peaks, duration):
+    for group, (low, high) in _bands(peaks, duration):
         reach = _reach(duration, group[-1])
         ends = max(group[0] - reach, 1.5 / duration), min(group[-1] + reach, 0.49 * log.sample_rate)
-        inside = max(low, limits[0]), min(high, limits[1])
-        names = tuple(c.name for c in channels)
-        bands += _settled(cut, log.sample_rate, ends, _View(source, names, inside))
+        request = _Request(source, names, (max(low, limits[0]), min(high, limits[1])))
+        bands += _fit_band(cut, log.sample_rate, ends, request)
     return bands
 
 
-@dataclass(frozen=True, slots=True)
-class _View:
-    """Of what kind and name the channels are, and between which Hz modes are asked for."""
-
-    source: str
-    channels: tuple[str, ...]
-    inside: tuple[float, float]
-
-
-def _settled(
+def _fit_band(
     cut: Callable[[float], list[FloatArray]],
     sample_rate: float,
     ends: tuple[float, float],
-    view: _View,
-) -> list[Band]:
-    """Begin the decays later until they are sums of distinct modes in stationary noise.
+    request: _Request,
+) -> list[_BandModes]:
+    """Start the decays later until they are sums of separate modes in stationary noise.
 
-    Right after a stop a machine is still moving and not yet linear. Two poles that a Fourier
-    frequency does not part, or a loud one that is not known, are its way of telling so.
+    Right after a stop the machine still moves and is nonlinear: two poles within a Fourier
+    frequency, or a strong uncertain one, show it.
     """
-    never: Ringing | None = None
-    early: Ringing | None = None
+    nonstationary: DecayFit | None = None
+    stationary: DecayFit | None = None
     for skip in _SKIPS:
-        blocks = tuple(make_block(samples, sample_rate, *ends) for samples in cut(skip))
-        found = find_ringing(blocks, displacement=view.source == "delta_e")
-        if not found.likelihood.n_modes:
+        blocks = tuple(transform_decays(samples, sample_rate, *ends) for samples in cut(skip))
+        fit = fit_decays(blocks, displacement=request.source == "delta_e")
+        if not fit.likelihood.n_modes:
             break
-        if stationarity(found) <= _NOT_STATIONARY:
-            never = never or found
+        if stationarity(fit) <= constants.NOT_STATIONARY:
+            nonstationary = nonstationary or fit
             continue
-        early = early or found
-        if (np.diff(np.sort(found.frequency)) > 1 / blocks[0].duration).all():
-            band = _judged(found, view)
+        stationary = stationary or fit
+        if (np.diff(np.sort(fit.frequency)) > 1 / blocks[0].duration).all():
+            band = _accept(fit, request)
             if not _too_early(band):
                 return [band]
-    if early is not None:
-        return [_judged(early, view)]
-    return [_not_linear(never, view)] if never is not None else []
+    if stationary is not None:
+        return [_accept(stationary, request)]
+    return [_reject_nonlinear(nonstationary, request)] if nonstationary is not None else []
 
 
-def _too_early(band: Band) -> bool:
-    loudest = max((*band.poles, *band.doubted), key=lambda pole: pole.snr.max(), default=None)
-    return loudest is not None and loudest.why is not None and loudest.why[0] in _TOO_EARLY
+def _too_early(band: _BandModes) -> bool:
+    strongest = max((*band.poles, *band.rejected), key=lambda pole: pole.snr.max(), default=None)
+    why = None if strongest is None else strongest.rejection
+    return why is not None and why.reason in _TOO_EARLY
 
 
 def _reach(duration: float, f: float) -> float:
@@ -278,120 +291,197 @@ def _reach(duration: float, f: float) -> float:
 
 
 def _peaks(samples: FloatArray, sample_rate: float, limits: tuple[float, float]) -> list[float]:
-    """Find frequencies at which the sum over decays and channels towers over its neighbours."""
+    """Return frequencies of peaks of the sum over decays and channels, relative to its level."""
     n_segments, n_samples, n = samples.shape
     reach = (_AROUND + 2) * sample_rate / n_samples
-    block = make_block(samples, sample_rate, limits[0] - reach, limits[1] + reach)
+    block = transform_decays(samples, sample_rate, limits[0] - reach, limits[1] + reach)
     power = np.mean(np.abs(block.ordinates) ** 2, axis=0)
     middle = stats.gamma.median(n_segments) / n_segments
     level = ndimage.median_filter(power, (2 * _AROUND + 1, 1), mode="nearest") / middle
     excess = np.sum(power / np.maximum(level, 1e-300), axis=1) * n_segments
-    threshold = stats.gamma.isf(_FALSE_ALARM / excess.size, n_segments * n)
+    threshold = stats.gamma.isf(constants.DECAY_FALSE_ALARM / excess.size, n_segments * n)
     top = (excess == ndimage.maximum_filter1d(excess, 5)) & (excess > threshold)
     top &= (block.frequency >= limits[0]) & (block.frequency <= limits[1])
     return [float(f) for f in block.frequency[top]]
 
 
-def _groups(peaks: list[float], duration: float) -> list[tuple[list[float], tuple[float, float]]]:
-    """Group peaks whose bands overlap, and share out to them what lies in between.
+def _bands(peaks: list[float], duration: float) -> list[tuple[list[float], tuple[float, float]]]:
+    """Group peaks whose bands overlap, and divide the frequencies between the groups.
 
-    A mode on the flank of a louder one is no peak, but the fit of the louder one's band finds it.
+    A mode on the flank of a stronger one is no peak; the fit of its band finds it.
     """
     groups: list[list[float]] = []
     for f in peaks:
         close = bool(groups) and f - groups[-1][-1] < _reach(duration, f)
-        if close and len(groups[-1]) < _MOST_TOGETHER:
+        if close and len(groups[-1]) < constants.MOST_TOGETHER:
             groups[-1].append(f)
         else:
             groups.append([f])
-    shared = []
+    bands = []
     for k, group in enumerate(groups):
         most = _reach(duration, group[-1]) - _EDGE / duration
         before = (group[0] - groups[k - 1][-1]) / 2 if k else most
         after = (groups[k + 1][0] - group[-1]) / 2 if k + 1 < len(groups) else most
-        shared.append((group, (group[0] - min(most, before), group[-1] + min(most, after))))
-    return shared
+        bands.append((group, (group[0] - min(most, before), group[-1] + min(most, after))))
+    return bands
 
 
-def _judged(found: Ringing, view: _View) -> Band:
-    """Say of every pole of a band inside its limits whether it is believed."""
-    kept, lines = _inside(found, view), found.is_line()
-    doubted = [
-        _pole(found, i, (_LINE, f"{found.frequency[i]:.5g} Hz does not fade"))
-        for i in kept
+def _accept(fit: DecayFit, request: _Request) -> _BandModes:
+    """Estimate the poles of a band within its limits; reject those that are not credible."""
+    inside, lines = _inside(fit, request), fit.is_line()
+    rejected = [
+        _pole(fit, i, Rejection("line-not-mode", f"{fit.frequency[i]:.5g} Hz does not decay"))
+        for i in inside
         if lines[i]
     ]
-    kept = [i for i in kept if not lines[i]]
-    if not kept:
-        return Band(view.source, view.channels, (), np.empty(0), np.empty((0, 0)), tuple(doubted))
-    result = estimate(found, kept)
-    poles = [_pole(found, i, _incredible(found, i, result, k)) for k, i in enumerate(kept)]
-    sure = [k for k, pole in enumerate(poles) if pole.why is None]
-    doubted += [pole for pole in poles if pole.why is not None]
-    own = np.array([*sure, *(len(kept) + k for k in sure)], dtype=int)
-    return Band(
-        source=view.source,
-        channels=view.channels,
-        poles=tuple(poles[k] for k in sure),
-        mean=result.mean[own],
-        cov=result.cov[np.ix_(own, own)],
-        doubted=tuple(doubted),
-    )
+    modal = [i for i in inside if not lines[i]]
+    if not modal:
+        return _BandModes(request.source, (), _no_modes(), tuple(rejected))
+    result = estimate(fit, modal)
+    poles = [_pole(fit, i, _incredible(fit, i, result, k)) for k, i in enumerate(modal)]
+    snr = np.array([pole.snr for pole in poles])
+    best = [request.channels[c] for c in snr.argmax(axis=1)]
+    sources = [request.source] * len(poles)
+    modes = estimates_only(result.mean, result.cov, snr.max(axis=1), sources, best)
+    credible = [k for k, pole in enumerate(poles) if pole.rejection is None]
+    rejected += [pole for pole in poles if pole.rejection is not None]
+    accepted = tuple(poles[k] for k in credible)
+    return _BandModes(request.source, accepted, modes.select(credible), tuple(rejected))
 
 
-def _not_linear(found: Ringing, view: _View) -> Band:
-    """Refuse all that rings in a band."""
-    doubted = tuple(
+def _no_modes() -> Modes:
+    return estimates_only(np.empty(0), np.empty((0, 0)), np.empty(0), (), ())
+
+
+def _reject_nonlinear(fit: DecayFit, request: _Request) -> _BandModes:
+    rejected = [
         _pole(
-            found,
+            fit,
             i,
-            (
+            Rejection(
                 "not-linear",
-                f"what rings at {found.frequency[i]:.5g} Hz is no sum of decays in stationary "
-                "noise, however late in the decay it is begun",
+                f"the resonance at {fit.frequency[i]:.5g} Hz is no sum of decays in stationary "
+                "noise, however late the decay is started",
             ),
         )
-        for i in _inside(found, view)
-    )
-    return Band(view.source, view.channels, (), np.empty(0), np.empty((0, 0)), doubted)
+        for i in _inside(fit, request)
+    ]
+    return _BandModes(request.source, (), _no_modes(), tuple(rejected))
 
 
-def _inside(found: Ringing, view: _View) -> list[int]:
-    low, high = view.inside
-    return [i for i, f in enumerate(found.frequency.tolist()) if low <= f <= high]
+def _inside(fit: DecayFit, request: _Request) -> list[int]:
+    low, high = request.limits
+    return [i for i, f in enumerate(fit.frequency.tolist()) if low <= f <= high]
 
 
-def _pole(found: Ringing, i: int, why: tuple[str, str] | None) -> Pole:
-    f, zeta = float(found.frequency[i]), float(found.damping_ratio[i])
-    return Pole(f, zeta, found.snr(i), why)
+def _pole(fit: DecayFit, i: int, rejection: Rejection | None) -> _Pole:
+    return _Pole(float(fit.frequency[i]), float(fit.damping_ratio[i]), fit.snr(i), rejection)
 
 
-def _incredible(found: Ringing, i: int, result: Estimate, k: int) -> tuple[str, str] | None:
-    """Say why the k-th estimate, of pole i, is not believed to be of a mode; None when it is."""
+def _incredible(fit: DecayFit, i: int, result: DecayEstimate, k: int) -> Rejection | None:
+    """Return why the k-th estimate, of pole i, is not credible; None if it is."""
     n = result.excitation.size
     f, zeta = np.exp(result.mean[[k, n + k]]).tolist()
     std_f, std_zeta = np.sqrt(np.diag(result.cov))[[k, n + k]].tolist()
-    duration = found.likelihood.blocks[0].duration
+    duration = fit.likelihood.blocks[0].duration
     faded = 1 - np.exp(-2 * np.pi * f * zeta * duration)
-    if std_zeta > 1 / _LEAST_DAMPING and faded < _FADED:
-        return (
-            _LINE,
-            f"{f:.5g} Hz fades by {100 * faded:.2g} % in {duration:.3g} s, its damping is known to "
-            f"{100 * min(std_zeta, 9.99):.0f} % only: it may be a line; record on after the stop",
+    worst_zeta = 1 / constants.DECAY_DAMPING_SIGMAS
+    if std_zeta > worst_zeta and faded < constants.FADED:
+        return Rejection(
+            "line-not-mode",
+            f"{f:.5g} Hz decays by {100 * faded:.2g} % in {duration:.3g} s, its damping has a "
+            f"standard deviation of {100 * min(std_zeta, 9.99):.0f} %: it may be a line; continue "
+            "recording after the stop",
         )
-    if std_f > WORST_STD_LN_F or std_zeta > 1 / _LEAST_DAMPING or zeta > _HEAVY:
-        return (
+    most = constants.DECAY_MOST_DAMPING
+    if std_f > constants.WORST_STD_LN_F or std_zeta > worst_zeta or zeta > most:
+        return Rejection(
             "too-uncertain",
-            f"{f:.5g} Hz is known to {100 * std_f:.2g} % only, its damping {zeta:.2g} to "
-            f"{100 * std_zeta:.0f} %; record more stops or excite more",
+            f"{f:.5g} Hz has a standard deviation of {100 * std_f:.2g} %, its damping {zeta:.2g} "
+            f"of {100 * std_zeta:.0f} %; record more stops or excite more",
         )
-    if result.excitation[k] < _EXCITED:
-        return (
+    if result.excitation[k] < constants.DECAY_EXCITATION:
+        needed = np.sqrt(constants.DECAY_EXCITATION)
+        return Rejection(
             "not-excited",
             f"{f:.5g} Hz vibrates after the stop with {np.sqrt(result.excitation[k]):.2g} times "
-            f"its ambient response; needed is {np.sqrt(_EXCITED):.2g}: stop harder",
+            f"its ambient response; needed is {needed:.2g}: stop harder",
         )
-    apart = np.abs(np.log(np.delete(found.frequency, i) / f))
+    apart = np.abs(np.log(np.delete(fit.frequency, i) / f))
     if apart.size and apart.min() < 2 * std_f:
-        return ("too-close", f"{f:.5g} Hz has another pole {apart.min() * f:.2g} Hz from it")
+        return Rejection(
+            "too-close", f"{f:.5g} Hz has another pole {apart.min() * f:.2g} Hz from it"
+        )
     return None
+
+
+def _number(log: Log, bands: list[_BandModes]) -> Modes:
+    """Merge and number the modes; of Δe only those that accelerometers do not show."""
+    seen = [pole for band in bands if band.source == "acc" for pole in band.poles]
+    kept = [
+        band.modes.select(
+            [
+                i
+                for i, pole in enumerate(band.poles)
+                if band.source == "acc"
+                or all(abs(pole.frequency / p.frequency - 1) >= 2 * pole.damping for p in seen)
+            ]
+        )
+        for band in bands
+    ]
+    modes = numbered(merge(kept, (), log.refused))
+    if not modes.names:
+        rejected = [pole for band in bands for pole in band.rejected]
+        strongest = max(rejected, key=lambda pole: pole.snr.max(), default=None)
+        nothing = ("not-excited", "nothing decays in the band: stop harder, or change the band")
+        raise BadLog(log.name, *((strongest and strongest.rejection) or nothing))
+    return modes
+
+
+def _name(
+    targets: tuple[Target, ...], bands: list[_BandModes]
+) -> tuple[list[Modes], dict[str, Rejection]]:
+    """Assign accelerometers' modes to the targets, then those of Δe to the remaining ones."""
+    named: list[Modes] = []
+    ambiguous: dict[str, Rejection] = {}
+    for source in ("acc", "delta_e"):
+        names = {name for modes in named for name in modes.names}
+        missing = [target for target in targets if target.name not in names]
+        found = [
+            (pole, band.modes, i)
+            for band in bands
+            if band.source == source
+            for i, pole in enumerate(band.poles)
+        ]
+        found.sort(key=lambda item: item[0].frequency)
+        poles = [pole for pole, _, _ in found]
+        assignment = assign(
+            [pole.frequency for pole in poles], missing, damping=[pole.damping for pole in poles]
+        )
+        ambiguous |= assignment.ambiguous
+        for band in bands:
+            own = {
+                i: name
+                for (_, modes, i), name in zip(found, assignment.names, strict=True)
+                if modes is band.modes and name
+            }
+            named.append(replace(band.modes.select([*own]), names=tuple(own.values())))
+    return named, ambiguous
+
+
+def _why_missing(target: Target, bands: list[_BandModes]) -> Rejection:
+    """Return why a mode was not found, from the strongest resonance within its search."""
+    poles = [pole for band in bands for pole in (*band.poles, *band.rejected)]
+    near = [pole for pole in poles if is_near(target, pole.frequency)]
+    if not near:
+        return Rejection(
+            "not-excited",
+            f"nothing decays within {100 * target.search:.0f} % of {target.frequency:.4g} Hz; "
+            "excite it more, or identify it while the stage moves",
+        )
+    strongest = max(near, key=lambda pole: pole.snr.max())
+    return strongest.rejection or Rejection(
+        "outside-search",
+        f"the damping {strongest.damping:.2g} at {strongest.frequency:.5g} Hz is not within a "
+        f"factor of {constants.DAMPING_SPAN:g} of {target.damping_ratio:.2g}",
+    )

@@ -1,16 +1,11 @@
-"""Likelihood of decays in noise that holds the same modes.
+"""Restricted likelihood of free decays in noise with the same modes.
 
-What a lightly damped mode does after a stop is a decay plus the response to whatever still shakes
-it. A stretch of both transforms to the mode's transient, of unknown size, plus ordinates that are
-independent from frequency to frequency with the power spectral density of the response. Sizes are
-marginalised in the restricted likelihood, which does not depend on how they are parametrised and
-does not lose the degrees of freedom that they take.
-
-Free vibration in the frequency domain: what a stretch of it transforms to.
-
-The discrete Fourier transform of a stretch of a decaying mode is exactly a transient that has the
-mode's pole, its size given by the state at the beginning less the state at the end: no window, no
-leakage, no correction for short records.
+After a stop a mode responds with a decay plus its ambient response. The discrete Fourier transform
+of a segment of both is the mode's transient, of unknown size, plus ordinates that are independent
+between frequencies with the power spectral density of the response. The transient is exact: it has
+the mode's pole, and its size is the state at the beginning less that at the end; no window, no
+leakage, no correction for short records. Sizes are marginalised in the restricted likelihood, which
+does not depend on their parametrisation and keeps the degrees of freedom that they take.
 """
 
 from __future__ import annotations
@@ -24,15 +19,15 @@ from scipy import fft, linalg
 
 from lmshealth._arrays import ComplexArray, FloatArray
 
-# Degree of the polynomial, over the band, of what leaks into it from outside.
+# Degree of the polynomial over the band that represents leakage from outside.
 _DEGREE = 2
-# Directions in which the base of that leakage is thinner than this are dropped.
+# Relative singular value below which a direction of the leakage is dropped.
 _THIN = 1e-5
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Block:
-    """Stretches of one length in a band of the frequency domain.
+class DecaySpectra:
+    """Transforms of decays of one length in a band.
 
     Attributes
     ----------
@@ -42,18 +37,18 @@ class Block:
         Transform, scaled so that its squared magnitude is the one-sided periodogram, shape
         ``(n_segments, n_ordinates, n_channels)``.
     duration : float
-        Length of each stretch in s.
+        Length of each decay in s.
     sample_rate : float
         In Hz.
     base : ndarray of complex
-        Orthonormal base of what leaks into the band from outside, ``(n_ordinates, n_base)``.
+        Orthonormal basis of the leakage from outside the band, ``(n_ordinates, n_base)``.
     """
 
     frequency: FloatArray
-    ordinates: np.ndarray
+    ordinates: ComplexArray
     duration: float
     sample_rate: float
-    base: np.ndarray
+    base: ComplexArray
 
     @property
     def stacked(self) -> FloatArray:
@@ -62,11 +57,13 @@ class Block:
         return np.asarray(np.moveaxis(y, 0, -1))
 
 
-def make_block(samples: FloatArray, sample_rate: float, low: float, high: float) -> Block:
-    """Transform stretches of one length.
+def transform_decays(
+    samples: FloatArray, sample_rate: float, low: float, high: float
+) -> DecaySpectra:
+    """Transform decays of one length.
 
-    A linear trend is taken out exactly: over a record it has a pole at zero frequency. A constant
-    is nothing at Fourier frequencies.
+    A linear trend is represented exactly by a pole at zero frequency; a constant vanishes at
+    Fourier frequencies.
 
     Parameters
     ----------
@@ -88,7 +85,7 @@ def make_block(samples: FloatArray, sample_rate: float, low: float, high: float)
     leaks = np.concatenate([leaks, trend[:, None]], axis=1)
     leaks /= np.linalg.norm(leaks, axis=0)
     base, size, _ = np.linalg.svd(leaks, full_matrices=False)
-    return Block(
+    return DecaySpectra(
         frequency=frequency,
         ordinates=ordinates * np.sqrt(2 / (n * sample_rate)),
         duration=n / sample_rate,
@@ -97,18 +94,18 @@ def make_block(samples: FloatArray, sample_rate: float, low: float, high: float)
     )
 
 
-def stack(values: np.ndarray) -> FloatArray:
-    """Put real above imaginary parts."""
+def stack(values: ComplexArray) -> FloatArray:
+    """Stack real above imaginary parts."""
     return np.concatenate([values.real, values.imag], axis=0)
 
 
-def transient(block: Block, f: FloatArray, zeta: FloatArray) -> np.ndarray:
-    """Transform decays at positive frequencies, up to a constant, without derivatives.
+def transient(block: DecaySpectra, f: FloatArray, zeta: FloatArray) -> ComplexArray:
+    """Return transforms of decays at positive frequencies, up to a constant.
 
     Parameters
     ----------
-    block : Block
-        Where.
+    block : DecaySpectra
+        Its Fourier frequencies.
     f, zeta : ndarray
         Natural frequencies in Hz and damping ratios, shape ``(n,)``.
 
@@ -122,16 +119,18 @@ def transient(block: Block, f: FloatArray, zeta: FloatArray) -> np.ndarray:
     return np.asarray(1 / (1 - np.exp(exponent) * back[:, None]))
 
 
-def pole_columns(block: Block, f: FloatArray, zeta: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Transform decaying cosines and sines, up to a constant, with derivatives.
+def pole_columns(
+    block: DecaySpectra, f: FloatArray, zeta: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return transforms of decaying cosines and sines, up to a constant, with derivatives.
 
     Samples Re(a ρⁿ) transform to c/(1 − ρ z⁻¹) + c*/(1 − ρ* z⁻¹) with c = a (1 − ρᴺ)/2, because
     z⁻ᴺ = 1 at Fourier frequencies.
 
     Parameters
     ----------
-    block : Block
-        Where.
+    block : DecaySpectra
+        Its Fourier frequencies.
     f, zeta : ndarray
         Natural frequencies in Hz and damping ratios, shape ``(n_modes,)``.
 
@@ -147,7 +146,7 @@ def pole_columns(block: Block, f: FloatArray, zeta: FloatArray) -> tuple[FloatAr
     exponent = omega * (-zeta + 1j * root)
     pole = np.exp(exponent)
     turns = pole * np.array([exponent, -omega * zeta * (1 + 1j * zeta / root)])
-    # This scale makes sizes of order one for a decay as long as the record.
+    # Sizes are of order one for a decay as long as the record.
     scale = 1 / (block.sample_rate * block.duration)
     up = scale / (1 - pole[:, None] * back)
     down = scale / (1 - pole.conj()[:, None] * back)
@@ -163,28 +162,28 @@ def pole_columns(block: Block, f: FloatArray, zeta: FloatArray) -> tuple[FloatAr
 
 IntArray = NDArray[np.intp]
 
-# A decay of less than this share over the record is none, and damping cannot be that heavy.
+# Least decay over the record, and largest damping ratio.
 _LEAST_DECAY, _HEAVIEST = 0.01, 0.5
-# A pole further off the band than this factor only runs away.
+# Factor by which a pole may lie outside the band.
 _BEYOND = 2.0
-# Of the logarithm of a frequency or damping: this near to its bound it stands there.
+# Distance of a logarithm from its bound at which it is at the bound.
 _AT_BOUND = 1e-6
-# Standard deviations of the logarithm of the white noise about what is seen between the peaks, and
-# of its slope over half of the band.
+# Standard deviations of the prior of the white noise: its logarithm about the level between the
+# peaks, and its slope over half of the band.
 _LEVEL_STD, _SLOPE_STD = 3.0, 1.0
 
 
 def unit_level(f: float, zeta: float, duration: float, *, displacement: bool = False) -> float:
-    """Response to a white force of density one at one Fourier frequency above the resonance.
+    """Return the response to a unit white force one Fourier frequency above the resonance.
 
     Parameters
     ----------
     f, zeta : float
         Natural frequency in Hz and damping ratio.
     duration : float
-        Of the record in s.
+        Duration of the record in s.
     displacement : bool
-        Of a displacement, in the unit of the force times 1/ω_n², and not of an acceleration.
+        Displacement, in the unit of the force times 1/ω_n², instead of acceleration.
     """
     beta2 = (f / (f + 1 / duration)) ** 2
     level = 1 / ((1 - beta2) ** 2 + 4 * zeta**2 * beta2)
@@ -193,22 +192,22 @@ def unit_level(f: float, zeta: float, duration: float, *, displacement: bool = F
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Evaluation:
-    """The restricted likelihood of one or more blocks at one point.
+    """Restricted likelihood at one point.
 
     Attributes
     ----------
     value : float
         Negative log restricted likelihood.
     profile : float
-        Negative log likelihood at the best sizes: this, unlike the former, can be compared
-        between different numbers of modes.
+        Negative log likelihood at the best sizes: comparable between numbers of modes, unlike
+        ``value``.
     gradient : ndarray
-        Of ``value``, shape ``(n_parameters,)``.
+        Gradient of ``value``, shape ``(n_parameters,)``.
     fisher : ndarray
         Fisher information of the likelihood at the best sizes, shape
         ``(n_parameters, n_parameters)``.
     fits : tuple of BlockFit
-        What is left of each block.
+        Residual of each block.
     """
 
     value: float
@@ -220,7 +219,7 @@ class Evaluation:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BlockFit:
-    """A block whitened by its noise, and what the columns leave of it.
+    """Least-squares fit of a whitened block.
 
     Attributes
     ----------
@@ -229,11 +228,10 @@ class BlockFit:
     sizes : ndarray
         Of each column, those of the base first, shape ``(n_channels, n_columns, n_segments)``.
     removed : ndarray
-        Orthonormal base of what was fitted away from the whitened data, shape
-        ``(2 n_ordinates n_channels, n_removed)``.
+        Orthonormal basis of the fitted columns, shape ``(2 n_ordinates n_channels, n_removed)``.
     tangent : ndarray
-        Change of the whitened transients by ln f and ln ζ of each mode as far as the sizes cannot
-        undo it, shape ``(2 n_modes, 2 n_ordinates n_channels, n_segments)``.
+        Derivative of the whitened transients by ln f and ln ζ of each mode, orthogonal to the
+        columns, shape ``(2 n_modes, 2 n_ordinates n_channels, n_segments)``.
     """
 
     residual: FloatArray
@@ -246,30 +244,30 @@ class BlockFit:
 class TransientLikelihood:
     """Restricted likelihood of transients of some modes in white and ambient noise.
 
-    The parameters are ``[ln f, ln ζ, h]`` of all modes, then the logarithm of the white noise's
-    power spectral density in the middle of the band and its slope for each channel. The noise's
-    covariance at a frequency is diag(S_e) + Σ h² D φφᵀ.
+    The ``3 n_modes + 2 n_channels`` parameters are ``[ln f, ln ζ, h]`` of all modes, then the
+    logarithm of the white noise's power spectral density in mid-band and its slope for each
+    channel. The covariance of the noise at a frequency is diag(S_e) + Σ h² D φφᵀ.
 
     Attributes
     ----------
-    blocks : tuple of Block
+    blocks : tuple of DecaySpectra
         Data.
     shapes : ndarray
-        φ, the mode's part in each channel, shape ``(n_modes, n_channels)``.
+        Mode shapes φ, shape ``(n_modes, n_channels)``.
     units : ndarray
-        What D is divided by, shape ``(n_modes,)``.
+        Divisors of D, shape ``(n_modes,)``.
     levels : ndarray
-        Where the white noise's logarithm is expected, shape ``(n_channels,)``: all that tells it
-        where the ambient response hides it.
+        Prior mean of the white noise's logarithm, shape ``(n_channels,)``, which alone constrains
+        it where the ambient response hides it.
     displacement : bool
-        D is that of a displacement, not of an acceleration.
+        D is that of a displacement instead of an acceleration.
 
     References
     ----------
     Harville1977, Pintelon2012
     """
 
-    blocks: tuple[Block, ...]
+    blocks: tuple[DecaySpectra, ...]
     shapes: FloatArray
     units: FloatArray
     levels: FloatArray
@@ -284,11 +282,6 @@ class TransientLikelihood:
     def n_channels(self) -> int:
         """Number of channels."""
         return int(self.blocks[0].ordinates.shape[2])
-
-    @property
-    def n_parameters(self) -> int:
-        """Number of parameters."""
-        return 3 * self.n_modes + 2 * self.n_channels
 
     def evaluate(self, p: FloatArray) -> Evaluation:
         """Evaluate the likelihood, its gradient and its Fisher information.
@@ -317,31 +310,31 @@ class TransientLikelihood:
         )
 
     def clip(self, p: FloatArray) -> FloatArray:
-        """Keep poles about the band, and dampings where they are no line's and not nothing's."""
+        """Keep poles near the band, and dampings between that of a line and the heaviest."""
         m = self.n_modes
         kept = p + 0.0
-        # The bound of a damping goes with its frequency.
+        # The bound of a damping depends on its frequency.
         kept[:m] = np.clip(p[:m], *(bound[:m] for bound in self._bounds(p)))
         kept[: 2 * m] = np.clip(kept[: 2 * m], *self._bounds(kept))
         return kept
 
     def _bounds(self, p: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Give the least and the most of ln f and ln ζ of each mode, both ``(2 n_modes,)``."""
+        """Return lower and upper bounds of ``[ln f, ln ζ]``, shape ``(2 n_modes,)`` each."""
         low, high = self._band
         ones = np.ones(self.n_modes)
         least = np.concatenate([np.log(low / _BEYOND) * ones, self.least_damping(p)])
         return least, np.concatenate([np.log(high * _BEYOND) * ones, np.log(_HEAVIEST) * ones])
 
     def least_damping(self, p: FloatArray) -> FloatArray:
-        """Give ln ζ of each mode below which it is a line, shape ``(n_modes,)``."""
+        """Return ln ζ of each mode below which it is a line, shape ``(n_modes,)``."""
         cycles = np.exp(p[: self.n_modes]) * self._duration
         return np.asarray(np.log(_LEAST_DECAY / (2 * np.pi * cycles)))
 
     def metric(self, at: Evaluation) -> FloatArray:
-        """Lend the Fisher information what it lacks where a parameter loses its effect.
+        """Regularise the Fisher information where a parameter has no effect.
 
-        At h = 0 the curvature is the derivative by h², which noise makes of this size; and dampings
-        that do nothing any more must not run away.
+        At h = 0 the curvature is the derivative by h², which noise makes of this size; dampings
+        without effect must stay bounded.
         """
         m = self.n_modes
         n_segments = sum(block.ordinates.shape[0] for block in self.blocks)
@@ -351,7 +344,7 @@ class TransientLikelihood:
         return np.asarray(metric)
 
     def reach(self, p: FloatArray) -> FloatArray:
-        """Say how far one step may go: half a Fourier frequency, a factor of e, a doubling."""
+        """Return the largest step: half a Fourier frequency, a factor of e, a doubling."""
         m = self.n_modes
         reach = np.ones(p.size)
         reach[2 * m : 3 * m] += np.abs(p[2 * m : 3 * m])
@@ -359,19 +352,19 @@ class TransientLikelihood:
         return reach
 
     def movable(self, p: FloatArray, gradient: FloatArray, free: IntArray) -> IntArray:
-        """Leave out frequencies and dampings that stand at their bound and press against it."""
+        """Return the free parameters without those at a bound with the gradient against it."""
         poles = slice(2 * self.n_modes)
         least, most = self._bounds(p)
         down = gradient[poles] > 0
         low, high = p[poles] <= least + _AT_BOUND, p[poles] >= most - _AT_BOUND
         return np.asarray(np.setdiff1d(free, np.flatnonzero(np.where(down, low, high))))
 
-    def density(self, block: Block, p: FloatArray) -> FloatArray:
-        """Give the noise's power spectral density, ``(n_ordinates, n_channels, n_channels)``."""
+    def density(self, block: DecaySpectra, p: FloatArray) -> FloatArray:
+        """Return the noise's spectral density, shape ``(n_ordinates, n_channels, n_channels)``."""
         directions, level, _ = self._noise(block, p)
         return np.asarray(np.einsum("jk,ja,jb->kab", level, directions, directions))
 
-    def _evaluate_block(self, block: Block, p: FloatArray) -> Evaluation:
+    def _evaluate_block(self, block: DecaySpectra, p: FloatArray) -> Evaluation:
         m, n, n_segments = self.n_modes, self.n_channels, block.ordinates.shape[0]
         directions, level, slopes = self._noise(block, p)
         lower = np.linalg.cholesky(np.einsum("jk,ja,jb->kab", level, directions, directions))
@@ -389,7 +382,7 @@ class TransientLikelihood:
         residual = data - q @ found
         sizes = linalg.solve_triangular(r, found, check_finite=False).reshape(n, -1, n_segments)
 
-        # Change of the transients by each pole, and of the volume that the columns span.
+        # Derivatives of the transients, and of the volume spanned by the columns.
         first = sizes.shape[1] - 2 * m
         own = sizes[:, first:].reshape(n, m, 2, n_segments)
         change = whiten @ np.einsum("dikp,cips->dikcs", turned, own)
@@ -411,18 +404,19 @@ class TransientLikelihood:
         )
         return Evaluation(profile + n_segments * float(volume), profile, gradient, fisher, (fit,))
 
-    def _noise(self, block: Block, p: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Give the parts of the noise's covariance, each of rank one.
+    def _noise(
+        self, block: DecaySpectra, p: FloatArray
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return the rank-one parts of the noise's covariance.
 
         Returns
         -------
         directions : ndarray
             Modes, then channels, shape ``(n_modes + n_channels, n_channels)``.
         level : ndarray
-            Power spectral density of each, shape ``(n_modes + n_channels, n_ordinates)``.
+            Power spectral density of each part, ``(n_modes + n_channels, n_ordinates)``.
         slopes : ndarray
-            Derivative of its part's level by each parameter, shape
-            ``(n_parameters, n_ordinates)``.
+            Derivative of the level by each parameter, shape ``(n_parameters, n_ordinates)``.
         """
         m, n = self.n_modes, self.n_channels
         low, high = self._band
@@ -452,9 +446,9 @@ class TransientLikelihood:
 def _by_noise(
     fit: BlockFit, seen: FloatArray, slopes: FloatArray, m: int
 ) -> tuple[FloatArray, FloatArray]:
-    """Differentiate by what the parameters do to the noise.
+    """Return gradient and Fisher information through the noise.
 
-    Every part of its covariance has rank one, so that it acts along one whitened direction.
+    Every part of the noise's covariance has rank one and acts along one whitened direction.
 
     Parameters
     ----------
@@ -463,7 +457,7 @@ def _by_noise(
     seen : ndarray
         Whitened directions, shape ``(n_modes + n_channels, n_ordinates, n_channels)``.
     slopes : ndarray
-        As of `TransientLikelihood._noise`.
+        As in `TransientLikelihood._noise`.
     m : int
         Number of modes.
     """
@@ -485,14 +479,14 @@ def _by_noise(
 def _volume_slope(
     columns: FloatArray, turned: FloatArray, whiten: FloatArray, q: FloatArray, r: FloatArray
 ) -> FloatArray:
-    """Differentiate ln of the volume of the whitened columns over that of the plain ones.
+    """Differentiate the log of the volume of the whitened columns over that of the plain ones.
 
     Parameters
     ----------
     columns : ndarray
         Shape ``(2 n_ordinates, n_columns)``, those of the poles last.
     turned : ndarray
-        As of `pole_columns`.
+        As in `pole_columns`.
     whiten : ndarray
         Shape ``(2 n_ordinates, n_channels, n_channels)``.
     q, r : ndarray

@@ -1,4 +1,4 @@
-"""Periodic excitation: how long its period is, and a record cut into whole periods."""
+"""Periodic excitation: estimation of the period, and spectra of whole periods."""
 
 from __future__ import annotations
 
@@ -9,62 +9,61 @@ from scipy import fft
 
 from lmshealth._arrays import ComplexArray, FloatArray
 
-# A signal that correlates with itself by this much after a lag, and after all its multiples, has
-# at least as much of it in common as is noise.
-_ALIKE = 0.5
-# Of several such lags the first that comes so close to the best is the period.
+# Correlation of a signal with itself at a period and its multiples: half of it is no noise.
+_REPEATS = 0.5
+# The first lag whose correlation is this share of the largest is the period.
 _NEAR_BEST = 0.95
-# A stated period is taken to be right within this share: clocks and tables differ.
+# Tolerance of a stated period: clocks and tables differ.
 _STATED_WITHIN = 0.01
-# Tracking a peak of the correlation from lag to double lag, it moves by no more samples than this.
+# Samples by which a peak of the correlation moves at most from a lag to its double.
 _REACH = 3
 # Periods that slip by less than this many samples over the record are whole numbers of samples.
 _SLIP = 0.1
-# Samples to either side of the interpolating kernel, and its shape: below 0.45 of the sample rate
-# what it leaves wrong is some 1e-4 of the signal.
+# Samples to either side of the interpolation kernel, and its shape: below 0.45 of the sample rate
+# its error is some 1e-4 of the signal.
 _HALF_WIDTH, _KAISER = 32, 8.0
 _BLOCK = 1 << 14
 
 
 def find_period(values: FloatArray, stated: float | None = None) -> float | None:
-    """Find after how many samples a signal repeats itself.
+    """Estimate the period of a signal in samples.
 
-    The correlation of the record with itself has a peak at the period and at each of its
-    multiples. The last one tells the period to a small fraction of a sample.
+    The autocorrelation has a peak at the period and at each multiple. The last one determines the
+    period to a small fraction of a sample.
 
     Parameters
     ----------
     values : ndarray
         Shape ``(n_samples,)``.
     stated : float, optional
-        Samples in a period as far as known, at most half the record: the peak is sought within
-        1 % of it, and where there is none the stated value stands.
+        Approximate period, at most half the record: the peak is searched for within 1 % of it, and
+        where there is none this value is returned.
 
     Returns
     -------
     float or None
-        Samples in a period, in general no whole number; None for a signal that does not repeat.
+        Period in samples, in general no whole number; None for a signal that is not periodic.
     """
-    alike = _self_correlation(values)
+    correlation = _autocorrelation(values)
     n = values.size
     if stated is None:
-        first = _first_repeat(alike, n // 2)
+        first = _first_repeat(correlation, n // 2)
         if first is None:
             return None
-        period = _refine(alike, first)
-        # A narrow band of noise repeats itself too, but not for long.
+        period = _refine(correlation, first)
+        # Narrow-band noise repeats only for a while.
         multiples = np.round(np.arange(1, int(n / 2 / period) + 1) * period).astype(int)
-        return period if bool((alike[multiples] > 0.9 * _ALIKE).all()) else None
+        return period if bool((correlation[multiples] > 0.9 * _REPEATS).all()) else None
     reach = max(_REACH, int(_STATED_WITHIN * stated))
     low, high = max(1, round(stated) - reach), min(n - 2, round(stated) + reach)
-    first = low + int(np.argmax(alike[low : high + 1]))
-    if first in (low, high) or alike[first] < _ALIKE:
+    first = low + int(np.argmax(correlation[low : high + 1]))
+    if first in (low, high) or correlation[first] < _REPEATS:
         return stated
-    return _refine(alike, first)
+    return _refine(correlation, first)
 
 
-def _self_correlation(values: FloatArray) -> FloatArray:
-    """Correlate a record with itself at every lag, over what overlaps, shape ``(n_samples,)``."""
+def _autocorrelation(values: FloatArray) -> FloatArray:
+    """Return the autocorrelation over the overlap at every lag, shape ``(n_samples,)``."""
     x = values - values.mean()
     n = x.size
     size = fft.next_fast_len(2 * n, real=True)
@@ -75,28 +74,28 @@ def _self_correlation(values: FloatArray) -> FloatArray:
     return np.asarray(2 * product / np.maximum(both, np.finfo(float).tiny))
 
 
-def _first_repeat(alike: FloatArray, longest: int) -> int | None:
-    apart = np.flatnonzero(alike[: longest + 1] < _ALIKE)
+def _first_repeat(correlation: FloatArray, longest: int) -> int | None:
+    apart = np.flatnonzero(correlation[: longest + 1] < _REPEATS)
     if apart.size == 0:
         return None
-    rest = alike[apart[0] : longest + 1]
+    rest = correlation[apart[0] : longest + 1]
     best = float(rest.max())
-    if best < _ALIKE:
+    if best < _REPEATS:
         return None
     first = int(np.argmax(rest >= _NEAR_BEST * best))
-    # Up the slope on which that lag lies.
+    # To the top of the peak.
     falls = np.flatnonzero(np.diff(rest[first:]) < 0)
     return int(apart[0]) + first + (int(falls[0]) if falls.size else rest.size - 1 - first)
 
 
-def _refine(alike: FloatArray, period: int) -> float:
-    """Follow the peak to later and later multiples of the period."""
+def _refine(correlation: FloatArray, period: int) -> float:
+    """Follow the peak to ever later multiples of the period."""
     estimate, multiple = float(period), 1
-    # Towards the end little overlaps.
-    while multiple * estimate < 0.9 * alike.size - _REACH:
+    # The overlap at the end is too short.
+    while multiple * estimate < 0.9 * correlation.size - _REACH:
         centre = round(multiple * estimate)
         low = max(1, centre - _REACH)
-        near = alike[low : centre + _REACH + 1]
+        near = correlation[low : centre + _REACH + 1]
         top = int(np.argmax(near))
         if not 0 < top < near.size - 1:
             break
@@ -110,20 +109,17 @@ def _refine(alike: FloatArray, period: int) -> float:
 def cut_periods(signals: Sequence[FloatArray], period: float) -> tuple[ComplexArray, float]:
     """Transform a record period by period.
 
-    The last period ends where the record does. A drift is taken out first: the mean of a period
-    holds nothing of what repeats, so that the slope from each mean to the next is that of the
-    drift alone; a straight line fitted to a period would take some of every harmonic along.
-
-    Where the period is no whole number of samples they are interpolated onto a grid that has a
-    whole number per period: cut at the nearest sample, every period would leak into its
-    harmonics in another way.
+    The last period ends with the record. A drift is removed first by the slope between the means
+    of periods, which hold no harmonic; a line fitted to a period would remove part of every
+    harmonic. A period that is no whole number of samples is interpolated onto a grid with a whole
+    number: cut at the nearest sample, every period would leak differently.
 
     Parameters
     ----------
     signals : sequence of ndarray
-        Of the same length, shape ``(n_samples,)`` each.
+        Shape ``(n_samples,)`` each.
     period : float
-        In samples; the record holds at least two.
+        In samples; at most half the record.
 
     Returns
     -------
@@ -131,7 +127,7 @@ def cut_periods(signals: Sequence[FloatArray], period: float) -> tuple[ComplexAr
         Amplitudes of the harmonics 0, 1, … of every signal and period: a sine of amplitude A has
         modulus A, shape ``(n_signals, n_periods, n_harmonics)``.
     period : float
-        In samples, as it was cut.
+        In samples, as used.
     """
     n = signals[0].size
     whole = round(period)
@@ -158,7 +154,7 @@ def _without_drift(periods: FloatArray) -> FloatArray:
 
 
 def _interpolate(values: FloatArray, at: FloatArray) -> FloatArray:
-    """Interpolate between samples by a sinc under a Kaiser window, at places within the record."""
+    """Interpolate between samples by a sinc with a Kaiser window."""
     offsets = np.arange(1 - _HALF_WIDTH, _HALF_WIDTH + 1)
     found = np.empty(at.size)
     for first in range(0, at.size, _BLOCK):

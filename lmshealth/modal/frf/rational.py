@@ -1,10 +1,9 @@
-"""Rational transfer function with modes: its likelihood at the lines of a band, and the best poles.
+"""Rational transfer function with modes: likelihood at the lines of a band, and search of poles.
 
-The model is H(s) = Σ R/(s - p) + R*/(s - p*) + Σ a_k s^k with real a_k: powers of s stand for the
-modes outside the band, the lower ones for those below. A record that does not repeat answers
-Y = H U + T, with a transient T of the same poles. Errors are circular normal. Residues and powers
-are linear and solved for; only ln f and ln ζ are searched (variable projection), and the Fisher
-information of these is that with everything linear marginalised.
+H(s) = Σ R/(s - p) + R*/(s - p*) + Σ a_k s^k with real a_k: powers of s represent modes outside the
+band. A record that is not periodic responds with Y = H U + T, a transient T of the same poles.
+Errors are circular normal. Residues and powers are linear and solved for; only ln f and ln ζ are
+searched (variable projection).
 """
 
 from __future__ import annotations
@@ -15,15 +14,14 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from lmshealth._arrays import BoolArray, ComplexArray, FloatArray, freeze
+from lmshealth.modal import constants
 
-# A transient of a band is smooth: powers of s in it.
+# A transient is smooth over a band: powers of s.
 _TRANSIENT_POWERS = (-1, 0, 1)
 # Damping ratios at which modes are searched for, and bounds of the fit.
 _TRIED_DAMPING = (0.003, 0.01, 0.03, 0.1)
 _LEAST_DAMPING, _MOST_DAMPING = 1e-5, 0.7
-# What is damped more heavily is a background and no mode.
-HEAVY = 0.2
-_OUTSIDE = 0.5  # of the band's ends: so far beyond them a pole may go
+_OUTSIDE = 0.5  # share of the band's ends by which a pole may lie outside
 _BLOCK = 128
 
 
@@ -38,13 +36,13 @@ class Ordinates:
     given, answer : ndarray of complex
         Amplitudes of input and output, shape ``(n_lines,)``.
     noise : ndarray
-        Variance of ``answer - H given`` by noise, shape ``(n_lines,)``; where the excitation is
-        not periodic a first guess.
+        Variance of ``answer - H given`` by noise, shape ``(n_lines,)``; a start value where the
+        excitation is not periodic.
     freedom : float
         Complex degrees of freedom of each variance.
     periodic : bool
-        Whether they are means over whole periods: there is no transient in them then, and the
-        noise is known from the scatter over periods.
+        Whether they are means over whole periods: without transient, and with the noise from the
+        scatter over periods.
     """
 
     frequency: FloatArray
@@ -75,14 +73,14 @@ class Ordinates:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Order:
-    """What a model is made of.
+    """Order of a model, with start values of its modes.
 
     Attributes
     ----------
     theta : ndarray
         ``[ln f, ln ζ]`` of the modes, shape ``(2 n_modes,)``.
     low, high : int
-        Lowest and highest power of s beside them.
+        Lowest and highest power of s.
     """
 
     theta: FloatArray
@@ -102,8 +100,8 @@ class Order:
 
     def unknowns(self, periodic: bool) -> int:
         """Count real unknowns."""
-        each, beside = (4, 0) if periodic else (6, len(_TRANSIENT_POWERS))
-        return each * self.n_modes + self.high - self.low + 1 + beside
+        each, transient = (4, 0) if periodic else (6, len(_TRANSIENT_POWERS))
+        return each * self.n_modes + self.high - self.low + 1 + transient
 
     def with_mode(self, f: float, zeta: float) -> Order:
         """Add a mode at a frequency in Hz."""
@@ -112,29 +110,29 @@ class Order:
         return replace(self, theta=theta)
 
     def without_mode(self, i: int) -> Order:
-        """Leave a mode out."""
+        """Remove a mode."""
         return replace(self, theta=np.delete(self.theta, [i, i + self.n_modes]))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Solution:
-    """A model with what is linear in it solved for.
+    """A model with its linear unknowns.
 
     Attributes
     ----------
     basis : ndarray
-        Orthonormal, spans the whitened columns of what is linear, shape ``(2 n_lines, n)``.
+        Orthonormal basis of the whitened columns of the linear unknowns, shape ``(2 n_lines, n)``.
     residues : ndarray of complex
         Over the centre of the band in rad/s, shape ``(n_modes,)``.
     swing : ndarray of complex
         The same of the transient.
     error : ndarray of complex
-        Answer less fit, shape ``(n_lines,)``.
+        Measured less fitted answer, shape ``(n_lines,)``.
     response : ndarray of complex
         The fitted H, shape ``(n_lines,)``.
     parts : ndarray
-        Power of the parts of H, each mode and the background of powers of s and heavily damped
-        poles, whether or not they cancel, shape ``(n_lines,)``.
+        Sum of the powers of the parts of H: each mode, and the background of powers of s and
+        heavily damped poles; shape ``(n_lines,)``.
     """
 
     basis: FloatArray
@@ -151,7 +149,7 @@ def stack(values: ComplexArray) -> FloatArray:
 
 
 def _poles(ordinates: Ordinates, order: Order) -> tuple[ComplexArray, ComplexArray]:
-    """Give jω, shape ``(n_lines,)``, and the poles, ``(n_modes,)``, over the band's centre."""
+    """Return jω, shape ``(n_lines,)``, and poles, ``(n_modes,)``, over the band's centre."""
     centre = np.sqrt(ordinates.frequency[0] * ordinates.frequency[-1])
     f, zeta = order.modes
     return (
@@ -161,13 +159,13 @@ def _poles(ordinates: Ordinates, order: Order) -> tuple[ComplexArray, ComplexArr
 
 
 def _modal(s: ComplexArray, pole: ComplexArray) -> ComplexArray:
-    """Columns that real and imaginary parts of the residues multiply, ``(n_lines, 2 n_modes)``."""
+    """Return the columns of real and imaginary parts of residues, ``(n_lines, 2 n_modes)``."""
     upper, lower = 1 / (s[:, None] - pole), 1 / (s[:, None] - pole.conj())
     return np.hstack([upper + lower, 1j * (upper - lower)])
 
 
 def solve(ordinates: Ordinates, order: Order, variance: FloatArray) -> Solution:
-    """Solve for what is linear at given poles and variances of the lines, shape ``(n_lines,)``."""
+    """Solve for the linear unknowns at given poles and variances of shape ``(n_lines,)``."""
     m = order.n_modes
     s, pole = _poles(ordinates, order)
     modal = _modal(s, pole)
@@ -184,8 +182,8 @@ def solve(ordinates: Ordinates, order: Order, variance: FloatArray) -> Solution:
     weights = np.linalg.lstsq(triangle, seen, rcond=None)[0] / scale
     fitted = response @ weights[:n]
     parts = modal[:, :m] * weights[:m] + modal[:, m:] * weights[m : 2 * m]
-    # Poles of a background and powers may cancel each other, as no modes do.
-    parts = parts[:, order.modes[1] <= HEAVY]
+    # Powers and poles of a background may cancel each other; modes do not.
+    parts = parts[:, order.modes[1] <= constants.FRF_MOST_DAMPING]
     rest = fitted - parts.sum(axis=1)
     swing = np.zeros(m, dtype=complex)
     if not ordinates.periodic:
@@ -209,8 +207,8 @@ def slopes(
 ) -> FloatArray:
     """Differentiate the whitened error by ``[ln f, ln ζ]``, shape ``(2 n_lines, 2 n_modes)``.
 
-    What is linear is projected out (Kaufman's form of variable projection): the product with its
-    transpose is the Fisher information of ln f and ln ζ with all else marginalised.
+    The linear unknowns are projected out (Kaufman's form of variable projection): the product with
+    its transpose is the Fisher information of ln f and ln ζ, all else marginalised.
 
     References
     ----------
@@ -230,7 +228,7 @@ def slopes(
 
 
 def refine(ordinates: Ordinates, order: Order, variance: FloatArray) -> Order:
-    """Find the poles of greatest likelihood near given ones by a trust-region method."""
+    """Maximise the likelihood over the poles by a trust-region method."""
     m = order.n_modes
     if m == 0:
         return order
@@ -261,10 +259,7 @@ def refine(ordinates: Ordinates, order: Order, variance: FloatArray) -> Order:
 def best_place(
     ordinates: Ordinates, variance: FloatArray, solution: Solution
 ) -> tuple[float, float, float]:
-    """Find frequency in Hz and damping ratio of the mode that explains most of the error left.
-
-    The third is what it gains in -2 ln L.
-    """
+    """Return frequency in Hz, damping ratio and gain in -2 ln L of the best further mode."""
     low, high = ordinates.frequency[[0, -1]].tolist()
     whiten = np.sqrt(2 / variance)
     error = stack(solution.error * whiten)
@@ -283,7 +278,7 @@ def best_place(
 
 
 def _explained(columns: FloatArray, error: FloatArray, basis: FloatArray) -> FloatArray:
-    """Gain in -2 ln L by each pair of columns beside those of a basis, shape ``(n_pairs,)``."""
+    """Return the gain in -2 ln L by each pair of columns in addition to a basis, ``(n_pairs,)``."""
     first, second = np.split(columns, 2, axis=1)
     known_first, known_second = np.split(basis.T @ columns, 2, axis=1)
     a = np.sum(first**2, axis=0) - np.sum(known_first**2, axis=0)

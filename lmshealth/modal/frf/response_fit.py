@@ -1,4 +1,4 @@
-"""Fit the modes of a response: how many there are, how large the error is, how sure they are."""
+"""Fit of a frequency response: number of modes, noise and distortion, covariance."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ import numpy as np
 from scipy.optimize import minimize_scalar
 
 from lmshealth._arrays import BoolArray, ComplexArray, FloatArray, freeze
+from lmshealth.modal import constants
 from lmshealth.modal.frf.rational import (
-    HEAVY,
     Order,
     Ordinates,
     Solution,
@@ -20,34 +20,20 @@ from lmshealth.modal.frf.rational import (
 )
 from lmshealth.modal.frf.responses import smooth_noise
 
-_MOST_MODES = 8
-# Powers of s beside the modes, downwards and upwards. Modes beside the band, too weak for a power
-# to show by itself, bias those in it by up to one standard deviation where four are fitted, by
-# half of one where six are; that costs a few percent of it. Powers enter in twos: an even one for
-# what is elastic, an odd one for what is lost.
+# Powers of s, downwards and upwards. Modes outside the band, too weak for a power to be
+# significant, bias those inside by up to one standard deviation with four powers, by half of one
+# with six, which costs a few percent of it. Powers enter in pairs: an even one for elasticity, an
+# odd one for loss.
 _FEWEST_POWERS, _MOST_POWERS, _POWER_STEP = 6, 8, 2
-# Gain in -2 ln L that a mode needs beyond the Bayesian information criterion: a place for it is
-# searched for, and the best of many places gains by chance. A background, of powers and of poles
-# damped too heavily to be modes, needs less (Akaike's criterion, per unknown): nobody reads it,
-# and what it lacks, too weak to be seen, would bias the modes by more than it costs.
-_EVIDENCE_MARGIN = 10.0
-_BACKGROUND_COSTS = 2.0
-# Lines over which the noise of a record that does not repeat is averaged.
+# Lines over which the noise of a record that is not periodic is averaged.
 _NOISE_LINES = 41
-# Gain in -2 ln L before anything else has moved, from which on a larger model is fitted.
+# Gain in -2 ln L at fixed poles from which on a larger model is fitted.
 _WORTH = 2.0
-# Gain in -2 ln L from which on a distortion is believed: 1 % of linear responses show as much.
-_DISTORTED = 6.6
-# Two modes within a half-power bandwidth are believed where they leave so much less distortion.
-_LESS_DISTORTED = 1 / 3
 # Lines of an end of the band.
 _END = 3
 _ROUNDS = 4
-# Standard deviation of ln f and ln ζ before anything is measured: what data say nothing about stays
-# as unknown as that, and leaves all else as it is.
+# Standard deviation of the prior of ln f and ln ζ: directions without data stay this uncertain.
 _PRIOR_STD = 10.0
-# Probability that noise alone gives an outlier somewhere, and share of lines that may be outliers.
-_FALSE_ALARM, _MOST_OUTLIERS = 1e-3, 0.1
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -57,32 +43,30 @@ class ResponseFit:
     Attributes
     ----------
     ordinates : Ordinates
-        The lines it was fitted to; outliers are not among them.
+        The lines of the fit, without outliers.
     outliers : ndarray
-        Frequency in Hz and amplitude, in the unit of the output, of lines that are no answer to
+        Frequency in Hz and amplitude, in the unit of the output, of lines that are no response to
         the input, shape ``(n_outliers, 2)``.
     estimate : ndarray
         ``[ln f, ln ζ]``, shape ``(2 n_modes,)``, modes ascending in frequency.
     cov : ndarray
-        Their covariance, residues and residual terms marginalised, shape
-        ``(2 n_modes, 2 n_modes)``.
+        Its covariance, linear unknowns marginalised, shape ``(2 n_modes, 2 n_modes)``.
     noise_cov : ndarray
-        The part of it by noise alone: how estimates scatter when the same is recorded again.
+        The part of it by noise alone: scatter of repeated measurements.
     snr : ndarray
-        Power of each mode's response at its resonance over that of noise and distortion in one
-        line, shape ``(n_modes,)``.
+        Power of each mode at its resonance over noise and distortion in one line, shape
+        ``(n_modes,)``.
     over_distortion : ndarray
-        The same over that of the distortion alone; infinite where there is none.
+        The same over the distortion alone; infinite where there is none.
     response : ndarray of complex
         The fitted response at the lines.
     chi_square : float
-        Mean squared error over the variance of the noise, corrected for what was fitted: about
-        one where nothing but noise keeps the response from being rational. NaN where the noise is
-        not known by itself: without periods.
+        Mean squared error over the variance of the noise, per degree of freedom: about one where
+        the response is rational but for noise. NaN without periods, as the noise is unknown.
     distortion : float
-        Error as a share of the response beyond the noise: by a nonlinearity or a lacking term.
+        Error beyond the noise as a share of the response: a nonlinearity or a missing term.
     colour : float
-        Correlation of the whitened errors of neighbouring lines, where it is beyond chance.
+        Correlation of the whitened errors of neighbouring lines, where it is significant.
     """
 
     ordinates: Ordinates
@@ -104,26 +88,26 @@ class ResponseFit:
 def fit_response(ordinates: Ordinates) -> ResponseFit:
     """Fit poles, residues and residual terms to the response of a band.
 
-    Modes enter one by one where the error left shows them best, powers of s at either end, as
-    long as an information criterion gains; a mode that others have made superfluous leaves again.
+    Modes enter one by one where they reduce the error most, powers of s at either end, while an
+    information criterion improves; a mode that others have made superfluous is removed.
 
-    Noise of a periodic excitation is known from the scatter over periods. An error beyond it is
-    taken to be a share of each part of the response, random in phase, as that of a weak
-    nonlinearity under a random multisine is; the share is found by maximum likelihood and its
-    variance added. Otherwise the noise is what is left over, averaged over neighbouring lines.
+    With periods the noise is their scatter. An error beyond it is modelled as a share of each part
+    of the response with random phase, as of a weak nonlinearity under a random multisine; the
+    share is estimated by maximum likelihood. Without periods the noise is the residual, averaged
+    over neighbouring lines.
 
-    The covariance is that of the Fisher information, widened where errors of neighbouring lines
-    are found to be alike; those of a distortion are taken to be within a half-power bandwidth.
+    The covariance is the inverse of the Fisher information, widened where errors of neighbouring
+    lines correlate; those of a distortion count as one within a half-power bandwidth.
 
     Parameters
     ----------
     ordinates : Ordinates
-        Of a band.
+        Lines of a band.
 
     Returns
     -------
     ResponseFit
-        Without modes where none improves it.
+        Without modes where none is significant.
 
     References
     ----------
@@ -132,10 +116,10 @@ def fit_response(ordinates: Ordinates) -> ResponseFit:
     start = Order(np.empty(0), -_FEWEST_POWERS, _FEWEST_POWERS)
     state = _grow(_settle(ordinates, start, ordinates.noise))
     for _ in range(_ROUNDS):
-        keep = _credible(state)
-        if keep.all() or keep.sum() < (1 - _MOST_OUTLIERS) * ordinates.frequency.size:
+        keep = _inliers(state)
+        if keep.all() or keep.sum() < (1 - constants.MOST_OUTLIERS) * ordinates.frequency.size:
             break
-        state = _grow(_left(state, keep))
+        state = _grow(_without_lines(state, keep))
     state = _shrink(state)
     state = _settle(state.ordinates, state.order, state.variance, _ROUNDS)
     return _conclude(state, ordinates)
@@ -143,7 +127,7 @@ def fit_response(ordinates: Ordinates) -> ResponseFit:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _State:
-    """An order at its maximum of likelihood, with the variance that it leaves."""
+    """An order at its maximum of likelihood, with the variance of its error."""
 
     ordinates: Ordinates
     order: Order
@@ -153,7 +137,7 @@ class _State:
 
     @property
     def white(self) -> ComplexArray:
-        """Whitened error of the response: in phase with the input, which may change by line."""
+        """Whitened error of the response, its phase relative to the input."""
         given = self.ordinates.given
         turn = np.abs(given) / np.where(given == 0, 1, given)
         return np.asarray(self.solution.error * turn / np.sqrt(self.variance))
@@ -165,50 +149,52 @@ class _State:
 
     @property
     def colour(self) -> float:
-        """Correlation of neighbouring errors where it is beyond chance, by three of its std."""
+        """Correlation of neighbouring errors where it exceeds three of its standard deviations."""
         white = self.white
         n = white.size
         found = np.sum((white[1:] * white[:-1].conj()).real) / np.sum(np.abs(white) ** 2)
         return float(found) if found > 3 / np.sqrt(2 * n) else 0.0
 
     @property
-    def alike(self) -> float:
-        """So many lines are worth one that is independent."""
+    def dependent_lines(self) -> float:
+        """Number of lines that count as one independent line."""
         return (1 + self.colour) / (1 - self.colour)
 
     @property
     def penalty(self) -> float:
-        """What modes and background must gain to be worth it."""
+        """Gain that modes and background need."""
         order = self.order
         each = 4 if self.ordinates.periodic else 6
-        heavy = int(np.count_nonzero(order.modes[1] > HEAVY))
-        modes = each * np.log(2 * self.variance.size) + _EVIDENCE_MARGIN
-        background = _BACKGROUND_COSTS * (each * heavy + order.high - order.low)
+        heavy = int(np.count_nonzero(order.modes[1] > constants.FRF_MOST_DAMPING))
+        modes = each * np.log(2 * self.variance.size) + constants.FRF_EVIDENCE_MARGIN
+        background = constants.FRF_BACKGROUND_COST * (each * heavy + order.high - order.low)
         return float((order.n_modes - heavy) * modes + background)
 
 
 def _gain(larger: _State, smaller: _State) -> float:
-    """Tell by how much the larger of two models is the better one."""
+    """Return the gain of the larger of two models, less its penalty."""
     return smaller.cost - larger.cost - larger.penalty + smaller.penalty
 
 
 def _settle(ordinates: Ordinates, order: Order, variance: FloatArray, rounds: int = 2) -> _State:
-    """Find poles and variance of greatest likelihood, turn by turn."""
+    """Maximise the likelihood over poles and variance alternately."""
     for _ in range(rounds):
         order = refine(ordinates, order, variance)
         solution = solve(ordinates, order, variance)
         before = variance
-        variance, distortion = _left_over(ordinates, order, solution)
+        variance, distortion = _error_variance(ordinates, order, solution)
         if np.abs(np.log(variance / before)).max() < 0.05:
             break
     solution = solve(ordinates, order, variance)
     return _State(ordinates, order, variance, distortion, solution)
 
 
-def _left_over(ordinates: Ordinates, order: Order, solution: Solution) -> tuple[FloatArray, float]:
-    """Variance of the error of each line, and the share of the response that is distortion."""
+def _error_variance(
+    ordinates: Ordinates, order: Order, solution: Solution
+) -> tuple[FloatArray, float]:
+    """Return the variance of the error of each line, and the distortion as a share of H."""
     n = solution.error.size
-    # What is fitted takes some of the error along.
+    # Corrected for the degrees of freedom of the fit.
     power = np.abs(solution.error) ** 2 * (n / (n - order.unknowns(ordinates.periodic) / 2))
     if not ordinates.periodic:
         return smooth_noise(power, solution.parts, _NOISE_LINES), 0.0
@@ -219,26 +205,26 @@ def _left_over(ordinates: Ordinates, order: Order, solution: Solution) -> tuple[
         return 2 * float(np.sum(np.log(total) + power / total))
 
     found = minimize_scalar(cost, bounds=(np.log(1e-12), 0.0), method="bounded")
-    if cost(-np.inf) - found.fun < _DISTORTED:
+    if cost(-np.inf) - found.fun < constants.DISTORTED:
         return ordinates.noise, 0.0
     share = float(np.exp(found.x))
     return ordinates.noise + share * parts, float(np.sqrt(share))
 
 
-def _left(state: _State, keep: BoolArray) -> _State:
-    """Leave lines out."""
+def _without_lines(state: _State, keep: BoolArray) -> _State:
+    """Fit without some of the lines."""
     return _settle(state.ordinates.only(keep), state.order, state.variance[keep])
 
 
-def _credible(state: _State) -> BoolArray:
-    """Tell which lines answer the input; next to an outlier of a record none does."""
+def _inliers(state: _State) -> BoolArray:
+    """Return which lines are no outliers; in a record neighbours of an outlier count as ones."""
     # Over a variance from ν degrees of freedom the error has heavier tails: (1 + x/ν)^-ν.
     freedom = state.ordinates.freedom if state.ordinates.periodic else _NOISE_LINES
-    rare = (state.white.size / _FALSE_ALARM) ** (1 / freedom)
+    rare = (state.white.size / constants.OUTLIER_FALSE_ALARM) ** (1 / freedom)
     odd = np.abs(state.white) ** 2 > freedom * (rare - 1)
     if not state.ordinates.periodic:
         return np.asarray(np.convolve(odd, np.ones(5), mode="same") == 0)
-    # A distorted resonance has lines of its own that are far off.
+    # Lines of a distorted resonance are no outliers.
     f, zeta = state.order.modes
     near = np.abs(state.ordinates.frequency[:, None] - f) < 2 * zeta * f
     distorted = state.variance > 2 * state.ordinates.noise
@@ -246,26 +232,26 @@ def _credible(state: _State) -> BoolArray:
 
 
 def _grow(state: _State) -> _State:
-    """Add modes and powers as long as the criterion gains."""
-    fewest = (1 - _MOST_OUTLIERS) * state.variance.size
+    """Add modes and powers while the criterion improves."""
+    fewest = (1 - constants.MOST_OUTLIERS) * state.variance.size
     while True:
         trials = [
             _settle(state.ordinates, order, state.variance)
             for order in _larger(state)
             if order.unknowns(state.ordinates.periodic) < state.variance.size
         ]
-        gains = [_gain(t, state) if _is_meant(t, state) else -np.inf for t in trials]
+        gains = [_gain(t, state) if _is_admissible(t, state) else -np.inf for t in trials]
         if not gains or max(gains) <= 0:
             return state
         best = trials[int(np.argmax(gains))]
         keep = _wide_enough(best)
         if keep.sum() < fewest:
             return state
-        state = best if keep.all() else _left(state, keep)
+        state = best if keep.all() else _without_lines(state, keep)
 
 
 def _larger(state: _State) -> list[Order]:
-    """List models of one mode or one power more that may be worth a fit."""
+    """Return models with a further mode or two further powers that may be worth a fit."""
     ordinates, order = state.ordinates, state.order
     larger = []
     if order.low > -_MOST_POWERS:
@@ -277,18 +263,18 @@ def _larger(state: _State) -> list[Order]:
         2 * float(error - np.sum(np.abs(solution.error) ** 2 / state.variance))
         for solution in (solve(ordinates, o, state.variance) for o in larger)
     ]
-    if order.n_modes < _MOST_MODES:
+    if order.n_modes < constants.FRF_MOST_MODES:
         f, zeta, gain = best_place(ordinates, state.variance, state.solution)
         larger.append(order.with_mode(f, zeta))
         gains.append(gain)
     return [o for o, gain in zip(larger, gains, strict=True) if gain > _WORTH]
 
 
-def _is_meant(trial: _State, before: _State) -> bool:
-    """Tell whether modes are more than one distorted resonance, and more than a band's end.
+def _is_admissible(trial: _State, before: _State) -> bool:
+    """Return whether modes are not one distorted resonance, and not an end of the band.
 
-    Modes within a half-power bandwidth must leave much less distortion. What is narrower than a
-    line at an end of the band stands for a mode beyond it.
+    Modes within a half-power bandwidth must reduce the distortion. A mode narrower than a line at
+    an end of the band represents one outside.
     """
     narrow = ~_wide_enough(trial)
     if narrow[:_END].any() or narrow[-_END:].any():
@@ -298,11 +284,11 @@ def _is_meant(trial: _State, before: _State) -> bool:
     near = np.abs(f[:, None] - f) < np.maximum(half[:, None], half)
     if near.sum() == f.size:
         return True
-    return trial.distortion <= _LESS_DISTORTED * before.distortion
+    return trial.distortion <= constants.LESS_DISTORTED * before.distortion
 
 
 def _wide_enough(state: _State) -> BoolArray:
-    """Tell which lines are not what a mode of less than a line's width stands for."""
+    """Return which lines are not the centre of a mode narrower than a line."""
     f, zeta = state.order.modes
     frequency = state.ordinates.frequency
     narrow = f[2 * zeta * f < state.ordinates.spacing]
@@ -312,17 +298,16 @@ def _wide_enough(state: _State) -> BoolArray:
 
 
 def _shrink(state: _State) -> _State:
-    """Leave out modes that the others have made superfluous.
-
-    Errors that are alike in neighbouring lines tell less than independent ones: what a mode gains
-    counts by as much less.
-    """
+    """Remove modes that the others have made superfluous; correlated errors reduce their gain."""
     while state.order.n_modes:
         trials = [
             _settle(state.ordinates, state.order.without_mode(i), state.variance)
             for i in range(state.order.n_modes)
         ]
-        gains = [(t.cost - state.cost) / state.alike - state.penalty + t.penalty for t in trials]
+        gains = [
+            (t.cost - state.cost) / state.dependent_lines - state.penalty + t.penalty
+            for t in trials
+        ]
         if min(gains) > 0:
             break
         state = trials[int(np.argmin(gains))]
@@ -340,21 +325,21 @@ def _conclude(state: _State, everything: Ordinates) -> ResponseFit:
     centre = np.sqrt(ordinates.frequency[0] * ordinates.frequency[-1])
     peak = np.abs(solution.residues / (zeta * f / centre)) ** 2
     level = state.variance / np.abs(ordinates.given) ** 2
-    twisted = state.distortion**2 * np.interp(f, ordinates.frequency, solution.parts)
-    clear = np.divide(peak, twisted, out=np.full(m, np.inf), where=twisted > 0)
-    lost = ~np.isin(everything.frequency, ordinates.frequency)
+    distortion = state.distortion**2 * np.interp(f, ordinates.frequency, solution.parts)
+    over = np.divide(peak, distortion, out=np.full(m, np.inf), where=distortion > 0)
+    outlying = ~np.isin(everything.frequency, ordinates.frequency)
     expected = np.interp(everything.frequency, ordinates.frequency, solution.response)
-    strange = (everything.answer - everything.given * expected)[lost]
+    error = (everything.answer - everything.given * expected)[outlying]
     excess = np.sum(np.abs(solution.error) ** 2 / ordinates.noise)
     excess /= n - order.unknowns(ordinates.periodic) / 2
     return ResponseFit(
         ordinates=ordinates,
-        outliers=np.column_stack([everything.frequency[lost], np.abs(strange)]),
+        outliers=np.column_stack([everything.frequency[outlying], np.abs(error)]),
         estimate=order.theta[both],
         cov=cov[np.ix_(both, both)],
         noise_cov=noise_cov[np.ix_(both, both)],
         snr=(peak / np.interp(f, ordinates.frequency, level))[rank],
-        over_distortion=clear[rank],
+        over_distortion=over[rank],
         response=solution.response,
         chi_square=float(excess) if ordinates.periodic else float("nan"),
         distortion=state.distortion,
@@ -363,12 +348,12 @@ def _conclude(state: _State, everything: Ordinates) -> ResponseFit:
 
 
 def _covariances(state: _State) -> tuple[FloatArray, FloatArray]:
-    """Covariance of ``[ln f, ln ζ]`` by noise, and by all there is.
+    """Return the covariance of ``[ln f, ln ζ]`` by noise, and by noise and distortion.
 
-    Weights from variances of ν degrees of freedom cost (ν - 1)/(ν - 2). Errors that are alike in
-    neighbouring lines count for fewer. Distortion is not taken to be independent from line to line
-    even where it looks so: within a half-power bandwidth it may bend a resonance one way, as a
-    spring that depends on position does, so that its lines there count as one.
+    Weights from variances of ν degrees of freedom cost (ν - 1)/(ν - 2). Correlated errors of
+    neighbouring lines count as fewer. Distortion is never independent from line to line: it may
+    bend a whole resonance, as a position-dependent spring does, so that its lines within a
+    half-power bandwidth count as one.
     """
     ordinates = state.ordinates
     slope = slopes(ordinates, state.order, state.variance, state.solution)
@@ -377,11 +362,11 @@ def _covariances(state: _State) -> tuple[FloatArray, FloatArray]:
     if not ordinates.periodic:
         freedom = min(_NOISE_LINES, state.variance.size)
         by_noise = inverse * (freedom / (freedom - 2))
-        return by_noise, by_noise * state.alike
+        return by_noise, by_noise * state.dependent_lines
     share = np.tile(ordinates.noise / state.variance, 2)[:, None]
     by_noise = inverse @ (slope.T @ (share * slope) + prior) @ inverse
     by_noise *= (ordinates.freedom - 1) / (ordinates.freedom - 2)
     by_distortion = inverse @ (slope.T @ ((1 - share) * slope)) @ inverse
     f, zeta = state.order.modes
-    lines = np.tile(np.sqrt(np.maximum(state.alike, 2 * zeta * f / ordinates.spacing)), 2)
-    return by_noise, by_noise * state.alike + by_distortion * np.outer(lines, lines)
+    lines = np.tile(np.sqrt(np.maximum(state.dependent_lines, 2 * zeta * f / ordinates.spacing)), 2)
+    return by_noise, by_noise * state.dependent_lines + by_distortion * np.outer(lines, lines)

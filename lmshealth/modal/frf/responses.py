@@ -1,6 +1,6 @@
-"""Frequency response of an output to an input: over periods, or over stretches of a record.
+"""Frequency response of an output to an input, over periods or over stretches of a record.
 
-Noise of the lines of a response: of the sensor, and of forces that the modes answer.
+Noise of the lines comes from the sensors and from forces that excite the same modes.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from scipy.stats import f as fisher
 from lmshealth._arrays import BoolArray, ComplexArray, FloatArray, expect_shape, freeze
 from lmshealth.errors import BadLog
 from lmshealth.io.log import Log
+from lmshealth.modal import constants
 from lmshealth.modal.frf.periods import cut_periods
 from lmshealth.modal.frf.rational import Ordinates
 
@@ -24,11 +25,10 @@ _LEAST_RATIO, _LARGEST_RATIO = 1e-6, 1e6
 
 
 def smooth_noise(power: FloatArray, response: FloatArray, width: int) -> FloatArray:
-    """Average the power of noise over neighbouring lines, without flattening its resonances.
+    """Average the power of noise over neighbouring lines, and preserve its resonances.
 
-    A disturbance that the machine answers has the modes' resonances, narrower than what is
-    averaged over. The power is divided by the shape a + b |H|² that suits it best by the likelihood
-    of exponential variables, averaged, and multiplied again.
+    Forces on the machine excite resonances narrower than the average. The power is divided by the
+    shape a + b |H|² of greatest likelihood for exponential variables, averaged and multiplied.
 
     Parameters
     ----------
@@ -58,35 +58,25 @@ def smooth_noise(power: FloatArray, response: FloatArray, width: int) -> FloatAr
     return np.asarray(shape * uniform_filter1d(power / shape, width, mode="nearest"))
 
 
-# A line is excited from this share of the strongest amplitude of the input on, and from so many
-# times its noise in power: with less, noise of the input where that is weak at a resonance would
-# bias the damping by more than half its standard deviation.
-EXCITED = 0.2
-_CLEAR = 30.0
-# Complex degrees of freedom that a variance needs; of few periods neighbouring lines help out.
+# Complex degrees of freedom that a variance needs; few periods are supplemented by neighbours.
 _FREEDOM = 16
-# Probability that the first of equal periods is taken for a transient.
-_TRANSIENT = 1e-3
 # Stretches of a record, half overlapping, that a coherence is averaged over.
 _STRETCHES = 8
-# Lines that a fit needs, more where they must tell the noise too, and can take.
-_FEWEST_LINES, _FEWEST_OF_RECORD, _MOST_LINES = 16, 64, 20_000
-_ROUNDING = 1e-9  # of what is largest
+_ROUNDING = 1e-9  # share of the largest amplitude
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Frf:
     """Frequency response function with its coherence.
 
-    With a periodic excitation ``response`` is the mean output over the mean input: noise of
-    neither biases it. Otherwise it is H1, from spectra of half overlapping stretches.
+    With a periodic excitation ``response`` is the mean output over the mean input, unbiased by
+    noise of either. Otherwise it is H1 from spectra of half overlapping stretches.
 
-    Noise of the input draws H1 towards zero, by the share of noise in the input's power, most
-    where the input is weak (at resonances of a driven structure); noise of the output raises H2,
-    most at antiresonances; Hv lies between them, and is right where both have the same share of
-    noise as the units weigh it: channels are weighed by their mean power. In a closed loop, where
-    the input answers the output's noise, all three are drawn towards the inverse of what feeds
-    back. Stretches too short for a resonance flatten it in all three.
+    Noise of the input reduces H1 by its share of the input's power, most at resonances of a driven
+    structure; noise of the output raises H2, most at antiresonances; Hv lies between them and is
+    unbiased where both have the same share of noise (channels are weighted by their mean power).
+    In a closed loop, where the input contains fed back noise of the output, all three are biased
+    towards the inverse of the feedback. Stretches too short for a resonance flatten it.
 
     Attributes
     ----------
@@ -103,9 +93,9 @@ class Frf:
     coherence : ndarray
         Between input and output over periods or stretches, 0 to 1, shape ``(n_lines,)``.
     period : float
-        Of the excitation in s; NaN where it does not repeat.
+        Of the excitation in s; NaN where it is not periodic.
     n_averages : float
-        Periods that were used, or stretches counted as if independent.
+        Number of periods, or equivalent number of independent stretches.
     """
 
     input: str
@@ -133,13 +123,13 @@ class Pair:
     Attributes
     ----------
     log : Log
-        Where they come from.
+        Source of the signals.
     names : (str, str)
         Of input and output.
     signals : (ndarray, ndarray)
         Shape ``(n_samples,)`` each.
     lag : int
-        Samples that a second difference taken of both reaches over; 0 for none.
+        Lag in samples of a second difference of both; 0 for none.
     """
 
     log: Log
@@ -148,19 +138,19 @@ class Pair:
     lag: int
 
     def gain(self, frequency: FloatArray) -> FloatArray:
-        """Gain of the difference at frequencies in Hz."""
+        """Return the gain of the difference at frequencies in Hz."""
         if self.lag == 0:
             return np.ones(frequency.size)
         return np.asarray(4 * np.sin(np.pi * frequency * self.lag / self.log.sample_rate) ** 2)
 
 
 def from_periods(pair: Pair, band: tuple[float, float], period: float) -> tuple[Frf, Ordinates]:
-    """Average whole periods; the noise is their scatter.
+    """Average whole periods; their scatter is the noise.
 
     Parameters
     ----------
     pair : Pair
-        Of an input that repeats itself.
+        With a periodic input.
     band : (float, float)
         In Hz.
     period : float
@@ -170,7 +160,7 @@ def from_periods(pair: Pair, band: tuple[float, float], period: float) -> tuple[
     ------
     BadLog
         If the record holds less than two periods, too few lines of the band are excited, or the
-        input is not the same in every period.
+        input differs between periods.
     """
     rate = pair.log.sample_rate
     spectra, period = cut_periods(pair.signals, period)
@@ -193,13 +183,13 @@ def from_periods(pair: Pair, band: tuple[float, float], period: float) -> tuple[
     frequency, spectra = frequency[excited], spectra[:, :, excited]
     given, answer = spectra.mean(axis=1)
     response = answer / given
-    # The scatter of Y - H U has the noise of both and what they have in common.
+    # The scatter of Y - H U includes the noise of both and its correlation.
     noise = np.var(spectra[1] - response * spectra[0], axis=0, ddof=1) / n
     width = max(1, 2 * int(np.ceil((_FREEDOM / (n - 1) - 1) / 2)) + 1)
     freedom = float(width * (n - 1))
-    # One over a variance of ν degrees of freedom is too large by ν/(ν - 1) on average.
+    # The inverse of a variance of ν degrees of freedom is too large by ν/(ν - 1) on average.
     noise = smooth_noise(noise, np.abs(response) ** 2, width) * (freedom / (freedom - 1))
-    # Simulated records may lack all noise; rounding is what is left.
+    # Simulated records may be free of noise but for rounding.
     noise = np.maximum(noise, (_ROUNDING * np.abs(answer).max()) ** 2)
     power = np.mean(np.abs(spectra) ** 2, axis=1)
     h1, h2, hv, coherence = _estimates(
@@ -223,46 +213,46 @@ def from_periods(pair: Pair, band: tuple[float, float], period: float) -> tuple[
 def _excited(
     pair: Pair, given: ComplexArray, strongest: float, period: float, band: tuple[float, float]
 ) -> BoolArray:
-    """Tell which lines stand out of the others and of the noise, from ``(n_periods, n_lines)``."""
+    """Return which lines are excited beyond the noise, from ``(n_periods, n_lines)``."""
     power = np.abs(given.mean(axis=0)) ** 2
     noise = np.var(given, axis=0, ddof=1) / given.shape[0]
-    strong = power >= EXCITED**2 * power.max(initial=0.0)
+    strong = power >= constants.EXCITED**2 * power.max(initial=0.0)
     strong &= np.abs(given).max(axis=0) > _ROUNDING * strongest
-    _check_lines(pair, int(strong.sum()), band, _FEWEST_LINES)
-    excited = np.asarray(strong & (power > _CLEAR * noise))
-    if excited.sum() < _FEWEST_LINES:
+    _check_lines(pair, int(strong.sum()), band, constants.FRF_LINES)
+    excited = np.asarray(strong & (power > constants.CLEARLY_EXCITED * noise))
+    if excited.sum() < constants.FRF_LINES:
         raise BadLog(
             pair.log.name,
             "period",
-            f"{pair.names[0]} does not repeat itself after {period:.4g} s: of its {strong.sum()} "
-            f"lines {excited.sum()} stand out of what differs between periods; state another "
-            "period or none, or excite more",
+            f"{pair.names[0]} does not repeat after {period:.4g} s: of its {strong.sum()} lines "
+            f"{excited.sum()} exceed the differences between periods; state another period or "
+            "none, or excite more",
         )
     return excited
 
 
 def _is_transient(answer: ComplexArray) -> bool:
-    """Tell whether the first of several periods is unlike the others, ``(n_periods, n_lines)``."""
+    """Return whether the first period differs from the others, ``(n_periods, n_lines)``."""
     n, n_lines = answer.shape
     if n < 4 or n_lines == 0:
         return False
     rest = answer[1:]
     scatter = np.var(rest, axis=0, ddof=1)
     apart = np.abs(answer[0] - rest.mean(axis=0)) ** 2 / (1 + 1 / (n - 1))
-    # Weighed alike: at a resonance that a disturbance shakes few lines would be all that counts.
+    # Whitened, so that the few lines of a disturbed resonance do not dominate.
     level = uniform_filter1d(scatter, min(_FREEDOM, n_lines), mode="nearest")
     level = np.maximum(level, np.finfo(float).tiny)
     ratio = np.sum(apart / level) / max(np.sum(scatter / level), np.finfo(float).tiny)
-    return bool(fisher.sf(ratio, 2 * n_lines, 2 * n_lines * (n - 2)) < _TRANSIENT)
+    return bool(fisher.sf(ratio, 2 * n_lines, 2 * n_lines * (n - 2)) < constants.TRANSIENT)
 
 
 def from_record(pair: Pair, band: tuple[float, float]) -> tuple[Frf, Ordinates]:
-    """Average half overlapping stretches for the response; for its modes transform all at once.
+    """Average half overlapping stretches for the response; transform the record for its modes.
 
     Parameters
     ----------
     pair : Pair
-        Of any input.
+        With any input.
     band : (float, float)
         In Hz.
 
@@ -274,7 +264,7 @@ def from_record(pair: Pair, band: tuple[float, float]) -> tuple[Frf, Ordinates]:
     size, rate = pair.signals[0].size, pair.log.sample_rate
     step = rate / size
     first, last = max(1, int(np.ceil(band[0] / step))), int(band[1] / step)
-    _check_lines(pair, last - first + 1, band, _FEWEST_OF_RECORD)
+    _check_lines(pair, last - first + 1, band, constants.FRF_LINES_OF_RECORD)
     lines: FloatArray = np.arange(first, last + 1, dtype=np.float64) * step
     given, answer = (
         np.asarray(fft.rfft(x - x.mean())[first : last + 1], dtype=np.complex128)
@@ -313,7 +303,7 @@ def from_record(pair: Pair, band: tuple[float, float]) -> tuple[Frf, Ordinates]:
 def _estimates(
     power_in: FloatArray, power_out: FloatArray, cross: ComplexArray
 ) -> tuple[ComplexArray, ComplexArray, ComplexArray, FloatArray]:
-    """Give H1, H2, Hv and the coherence from powers and E[Y U*]."""
+    """Return H1, H2, Hv and the coherence from powers and E[Y U*]."""
     h1 = cross / power_in
     h2 = power_out / cross.conj()
     weight = power_out.mean() / power_in.mean()
@@ -332,9 +322,9 @@ def _check_lines(pair: Pair, n: int, band: tuple[float, float], fewest: int) -> 
             f"{pair.names[0]} excites {max(n, 0)} lines {where}; needed are at least {fewest}: "
             "choose a wider band, or record longer (a longer period has more lines)",
         )
-    if n > _MOST_LINES:
+    if n > constants.FRF_MOST_LINES:
         raise BadLog(
             pair.log.name,
             "band-too-wide",
-            f"{n} lines {where}, at most {_MOST_LINES} are fitted together; choose a band",
+            f"{n} lines {where}, at most {constants.FRF_MOST_LINES} are fitted; choose a band",
         )

@@ -2,22 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from lmshealth.modal.ambient.initial_values import (
-    Coarse,
-    coarsen,
     incoherent_fit,
     locate,
     misfits,
     strengths,
 )
+from lmshealth.modal.ambient.log_spectra import BinnedSpectrum, LogSpectra
 from lmshealth.modal.targets import Target
 from lmshealth.signal.segments import Segment
-from lmshealth.signal.spectra import Spectrum, periodogram
+from lmshealth.signal.spectra import CrossSpectrum, Spectrum, periodogram
 from tests.signals import Mode, accelerations, density, make_log, sine, white
 
 RATE = 1000.0
@@ -29,19 +29,38 @@ def spectra(values: np.ndarray) -> tuple:  # type: ignore[type-arg]
     return (periodogram(channel, Segment(0, values.size, float("nan")), RATE),)
 
 
-def scatter_free(modes: list[Mode], noise: float) -> Coarse:
+def binned(parts: Sequence[Spectrum], low: float, high: float, width: float) -> BinnedSpectrum:
+    """Bin one channel."""
+    spectra = tuple(
+        CrossSpectrum(
+            s.frequency,
+            s.periodogram[:, None, None] + 0j,
+            s.duration,
+            s.velocity,
+            np.ones(s.frequency.size, dtype=bool),
+            (),
+            s.count,
+        )
+        for s in parts
+    )
+    return LogSpectra(("acc_a",), ("acc",), spectra).binned(low, high, width)[0]
+
+
+def scatter_free(modes: list[Mode], noise: float) -> BinnedSpectrum:
     """Give a binned spectrum that is its own expectation."""
     frequency = np.arange(80.0, 180.0, 0.5)
-    return Coarse(frequency, density(modes, frequency, noise), np.full(frequency.size, 10.0))
+    return BinnedSpectrum(
+        frequency, density(modes, frequency, noise), np.full(frequency.size, 10.0)
+    )
 
 
 def test_bins_read_the_density_of_white_noise() -> None:
     """The level from medians is the density within 4.5 standard errors of their mean."""
     level = 2.5e-3
-    coarse = coarsen(spectra(white(np.random.default_rng(1), level, 40_000, RATE)), 100, 200, 1.0)
-    assert coarse.count.sum() == 4000
+    bins = binned(spectra(white(np.random.default_rng(1), level, 40_000, RATE)), 100, 200, 1.0)
+    assert bins.count.sum() == 4000
     # A median of 40 exponentials scatters by 1/√40 of its mean over ln 2.
-    off = (coarse.level.mean() / level - 1) * np.log(2) * np.sqrt(coarse.count.sum())
+    off = (bins.level.mean() / level - 1) * np.log(2) * np.sqrt(bins.count.sum())
     assert abs(off) < 4.5
 
 
@@ -53,11 +72,11 @@ def test_bins_read_the_density_from_means_too(count: int) -> None:
     single = Spectrum(frequency, 3.0 * rng.exponential(size=n), n / 500.0, 0.1)
     mean = Spectrum(frequency, 3.0 * rng.gamma(count, 1 / count, size=n), n / 500.0, 0.1, count)
     for spectra_, weight in (((mean,), count), ((single, mean), count + 1)):
-        coarse = coarsen(spectra_, 0.0, 600.0, 1.0)
-        assert coarse.count.sum() == weight * n
-        assert abs(coarse.level.mean() / 3.0 - 1) < 4.5 / np.log(2) / np.sqrt(n)
+        bins = binned(spectra_, 0.0, 600.0, 1.0)
+        assert bins.count.sum() == weight * n
+        assert abs(bins.level.mean() / 3.0 - 1) < 4.5 / np.log(2) / np.sqrt(n)
     # Negative control: the median of exponentials would read too much.
-    once = coarsen((replace(mean, count=1),), 0.0, 600.0, 1.0)
+    once = binned((replace(mean, count=1),), 0.0, 600.0, 1.0)
     assert once.level.mean() / 3.0 - 1 > 0.15
 
 
@@ -65,7 +84,7 @@ def test_a_line_does_not_move_the_bins() -> None:
     """A line 2000 times above the noise leaves the level of its bin below twice the noise."""
     values = white(np.random.default_rng(1), 1.0, 40_000, RATE)
     lined = values + sine(values.size, RATE, 150.013, 10.0)
-    clean, dirty = (coarsen(spectra(v), 100, 200, 2.0) for v in (values, lined))
+    clean, dirty = (binned(spectra(v), 100, 200, 2.0) for v in (values, lined))
     assert (dirty.level / clean.level).max() < 2
     # Negative control: a mean would be moved tenfold.
     ordinates = spectra(lined)[0].band(149, 151).periodogram
@@ -74,8 +93,8 @@ def test_a_line_does_not_move_the_bins() -> None:
 
 def test_bins_are_widened_until_they_hold_four_ordinates() -> None:
     """A bin width below the resolution still gives bins of at least four ordinates."""
-    coarse = coarsen(spectra(white(np.random.default_rng(2), 1.0, 2000, RATE)), 100, 200, 0.01)
-    assert coarse.count.min() >= 4
+    bins = binned(spectra(white(np.random.default_rng(2), 1.0, 2000, RATE)), 100, 200, 0.01)
+    assert bins.count.min() >= 4
 
 
 def test_a_target_has_a_band_about_it() -> None:
@@ -85,7 +104,7 @@ def test_a_target_has_a_band_about_it() -> None:
     assert target.band(100.0)[0] == pytest.approx(50.0)
 
 
-def test_strengths_of_a_scatter_free_spectrum_are_found() -> None:
+def test_strengths_of_a_scatter_free_binsare_found() -> None:
     """Two resonances and noise of very different size are given back within 10 %."""
     modes = [Mode(105.0, 0.015, 2e-4), Mode(140.0, 0.02, 5e-2)]
     (strength,), _ = incoherent_fit(
@@ -96,42 +115,42 @@ def test_strengths_of_a_scatter_free_spectrum_are_found() -> None:
 
 def test_strengths_are_positive_and_scale_with_the_data() -> None:
     """Data a million times larger have strengths a million times larger, none of them negative."""
-    coarse = scatter_free([Mode(105.0, 0.015)], 0.01)
-    loud = replace(coarse, level=1e6 * coarse.level)
+    bins = scatter_free([Mode(105.0, 0.015)], 0.01)
+    loud = replace(bins, level=1e6 * bins.level)
     f, zeta = np.array([105.0, 150.0]), np.array([0.02, 0.02])
-    quiet, other = incoherent_fit((coarse, loud), f, zeta)[0]
+    quiet, other = incoherent_fit((bins, loud), f, zeta)[0]
     assert (quiet >= 0).all()
     np.testing.assert_allclose(other, 1e6 * quiet, rtol=1e-9)
 
 
 def test_many_candidates_are_fitted_as_each_alone() -> None:
     """One call for a stack of frequencies gives the misfits of single calls."""
-    coarse = scatter_free([Mode(105.0, 0.015), Mode(140.0, 0.02)], 0.01)
+    bins = scatter_free([Mode(105.0, 0.015), Mode(140.0, 0.02)], 0.01)
     f = np.array([[105.0, 140.0], [100.0, 140.0], [110.0, 150.0]])
     zeta = np.broadcast_to([0.015, 0.02], f.shape)
-    (together,) = incoherent_fit((coarse,), f, zeta)[1]
+    (together,) = incoherent_fit((bins,), f, zeta)[1]
     np.testing.assert_allclose(
-        together, [incoherent_fit((coarse,), row, zeta[0])[1][0] for row in f], rtol=1e-12
+        together, [incoherent_fit((bins,), row, zeta[0])[1][0] for row in f], rtol=1e-12
     )
     assert int(np.argmin(together)) == 0
 
 
 def test_a_missing_mode_costs_and_a_needless_one_does_not() -> None:
     """The misfit grows when a mode is left out, and not when one without strength is added."""
-    coarse = scatter_free([Mode(105.0, 0.015)], 0.01)
+    bins = scatter_free([Mode(105.0, 0.015)], 0.01)
     mode, ghost = (Target(name, f, 0.015, 0.1) for name, f in (("a", 105.0), ("b", 140.0)))
-    assert misfits((coarse,), (mode, ghost)) == pytest.approx(misfits((coarse,), (mode,)), abs=1.0)
-    assert misfits((coarse,), (ghost,)) > misfits((coarse,), (mode,)) + 100
+    assert misfits((bins,), (mode, ghost)) == pytest.approx(misfits((bins,), (mode,)), abs=1.0)
+    assert misfits((bins,), (ghost,)) > misfits((bins,), (mode,)) + 100
 
 
 def test_a_neighbour_takes_its_own_flank() -> None:
     """With the mode beside it known, an absent mode gains nothing; without, it takes the flank."""
-    coarse = scatter_free([Mode(105.0, 0.02)], 0.01)
+    bins = scatter_free([Mode(105.0, 0.02)], 0.01)
     beside = Target("beside", 105.0, 0.02, 0.1)
     absent = (Target("absent", 112.0, 0.02, 0.1),)
-    helped = replace(coarse, neighbours=(beside,))
+    helped = replace(bins, neighbours=(beside,))
     assert misfits((helped,), ()) - misfits((helped,), absent) < 1.0
-    assert misfits((coarse,), ()) - misfits((coarse,), absent) > 50
+    assert misfits((bins,), ()) - misfits((bins,), absent) > 50
     assert strengths((helped,), absent)[0].shape == (1, 1)
 
 
@@ -147,8 +166,8 @@ def test_modes_are_located_where_a_common_shift_took_them(shift: float) -> None:
     rng = np.random.default_rng(9)
     modes = [Mode(f, 0.018, 1.0, (1.0, 0.3)) for f in truth]
     values = accelerations(rng, modes, 30_000, RATE, 0.5)
-    coarse = tuple(coarsen(spectra(row), 85.0, 205.0, 1.0) for row in values)
-    placed, _ = locate(coarse, targets)
+    bins = tuple(binned(spectra(row), 85.0, 205.0, 1.0) for row in values)
+    _, placed = locate(bins, targets)
     np.testing.assert_allclose([t.frequency for t in placed], truth, rtol=0.018)
 
 
@@ -159,6 +178,6 @@ def test_a_mode_standing_where_its_neighbour_began_keeps_its_name() -> None:
     truth = np.array([126.4, 136.6]) * factor
     modes = [Mode(truth[0], 0.018), Mode(truth[1], 0.015)]
     values = accelerations(np.random.default_rng(10), modes, 30_000, RATE, 0.5)
-    placed, _ = locate((coarsen(spectra(values[0]), 85.0, 190.0, 1.0),), targets)
+    _, placed = locate((binned(spectra(values[0]), 85.0, 190.0, 1.0),), targets)
     assert [target.name for target in placed] == ["roll", "pitch"]
     np.testing.assert_allclose([t.frequency for t in placed], truth, rtol=0.015)

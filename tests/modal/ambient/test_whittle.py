@@ -1,4 +1,4 @@
-"""The likelihood of a band: its density, derivatives, invariances and maximum."""
+"""Whittle likelihood: density, derivatives, invariances, maximum, and marginalisation."""
 
 from __future__ import annotations
 
@@ -9,8 +9,17 @@ from itertools import product
 import numpy as np
 import pytest
 
-from lmshealth.modal.ambient.expected_periodogram import Block
-from lmshealth.modal.ambient.whittle import Likelihood
+from lmshealth.modal.ambient.expected_periodogram import MeanOrdinates
+from lmshealth.modal.ambient.whittle import (
+    SECOND,
+    Likelihood,
+    floor_response,
+    floors,
+    lay_out,
+    marginalise,
+    receptance,
+    response,
+)
 from lmshealth.signal.segments import Segment
 from lmshealth.signal.spectra import cross_spectra
 from tests.bands import (
@@ -110,7 +119,7 @@ def test_one_mode_in_equal_noise_is_the_eigenvalue_form() -> None:
     assert target.data_value(p) > au
 
 
-def f_size(block: Block) -> int:
+def f_size(block: MeanOrdinates) -> int:
     """Count the ordinates of a block."""
     return int(block.count.sum())
 
@@ -139,7 +148,7 @@ def test_derivatives_are_those_of_the_value(m: int, n: int, duration: float) -> 
     assert (block.kernel is not None) == (duration < 5)
     if block.kernel is None:
         cut = slice(200, 1400, 13)
-        block = Block(block.frequency[cut], block.matrix[cut], 1.0 + block.count[cut], None)
+        block = MeanOrdinates(block.frequency[cut], block.matrix[cut], 1.0 + block.count[cut], None)
         target = replace(target, blocks=(block,))
     p = other_point(target, m + 1)
     gradient, hessian = target.derivatives(p)
@@ -292,3 +301,155 @@ def test_nonsense_is_infinitely_unlikely_not_an_error() -> None:
     p = target.start.copy()
     p[2] = 2000.0
     assert target.value(p) == np.inf
+
+
+F = np.linspace(80.0, 160.0, 41)
+U = np.linspace(-1.2, 1.2, 41)
+
+
+def test_a_mode_moves_as_the_equation_of_motion_has_it() -> None:
+    """The response is that of -ω² / (ω_n² - ω² + 2iζω_nω), in size and phase."""
+    mode = Mode(120.0, 0.02)
+    expected = mode.response(F)
+    np.testing.assert_allclose(response(120.0, 0.02, F), expected, rtol=1e-12)
+    # The mirrored phase is another machine.
+    assert np.abs(response(120.0, 0.02, F) - expected.conj()).max() > 1
+
+
+def test_floors_are_exponentials_of_parabolas() -> None:
+    """Half the logarithm of the density: at the middle e/2, at the ends with tilt and bend."""
+    found = floor_response(np.array([[0.4, 0.6, -0.2]]), np.array([-1.0, 0.0, 1.0]))
+    np.testing.assert_allclose(np.log(found[0]), [-0.2, 0.2, 0.4], atol=1e-15)
+
+
+def test_derivatives_of_modes_are_those_of_their_response() -> None:
+    """First and second derivatives by ln f and ln ζ agree with central differences."""
+    at, h = np.log([120.0, 0.02]), 1e-5
+
+    def moved(*step: float) -> np.ndarray:
+        return response(*np.exp(at + step), F)
+
+    found = receptance(np.array([[120.0]]), np.array([[0.02]]), F)[:, 0]
+    np.testing.assert_allclose(found[0], moved(0, 0), rtol=1e-12)
+    for q, step in enumerate(np.eye(2) * h):
+        first = (moved(*step) - moved(*-step)) / (2 * h)
+        np.testing.assert_allclose(found[1 + q], first, atol=1e-6 * np.abs(first).max())
+        for r, other in enumerate(np.eye(2) * h):
+            second = moved(*(step + other)) - moved(*(step - other))
+            second = (second - moved(*(other - step)) + moved(*(-step - other))) / (4 * h**2)
+            np.testing.assert_allclose(
+                found[SECOND[q, r]], second, atol=1e-4 * np.abs(second).max()
+            )
+    assert not found[[3, 6, 8, 9]].any()
+
+
+def test_derivatives_of_floors_are_those_of_their_response() -> None:
+    """First and second derivatives by e, d and b agree with central differences."""
+    at, h = np.array([0.4, 0.6, -0.2]), 1e-4
+
+    def moved(step: np.ndarray) -> np.ndarray:
+        return floor_response((at + step)[None], U)[0]
+
+    found = floors(at[None], U)[:, 0].real
+    np.testing.assert_allclose(found[0], moved(np.zeros(3)), rtol=1e-12)
+    for q, step in enumerate(np.eye(3) * h):
+        np.testing.assert_allclose(found[1 + q], (moved(step) - moved(-step)) / (2 * h), atol=1e-7)
+        for r, other in enumerate(np.eye(3) * h):
+            second = moved(step + other) - moved(step - other) - moved(other - step)
+            second = (second + moved(-step - other)) / (4 * h**2)
+            np.testing.assert_allclose(found[SECOND[q, r]], second, atol=1e-6)
+
+
+@pytest.mark.parametrize(("m", "n"), list(product(range(4), range(1, 5))))
+def test_every_unknown_has_one_place(m: int, n: int) -> None:
+    """Poles, forces and shapes follow each other without gap, and fill all places."""
+    layout = lay_out([i % n for i in range(m)], n)
+    assert len(layout.pole) == layout.n_poles == layout.forces.start
+    assert layout.forces.stop == layout.shapes.start
+    assert layout.shapes.stop == layout.size == 2 * m + 3 * n + len(layout.force) + m * (n - 1)
+    assert len(set(layout.pole)) == layout.n_poles
+    assert len(set(layout.force)) == len(layout.force)
+    assert all(j < i or (j == i < m) for i, j in layout.force)
+
+
+def test_parts_that_floors_share_are_those_of_their_rows() -> None:
+    """Of two modes and three channels: six shared with modes, three with other floors."""
+    layout = lay_out([0, 1], 3)
+    pairs = {k: layout.force[k - layout.forces.start] for k in (*layout.shared, *layout.common)}
+    assert {pairs[k] for k in layout.shared} == set(product((2, 3, 4), (0, 1)))
+    assert {pairs[k] for k in layout.common} == {(3, 2), (4, 2), (4, 3)}
+    assert [layout.pole[k] for k in layout.bends] == [(2, 3), (3, 3), (4, 3)]
+
+
+def test_a_single_channel_tells_what_neighbours_share_and_no_more() -> None:
+    """Of three modes in one channel the first and the last have no force in common."""
+    layout = lay_out([0, 0, 0], 1)
+    assert (2, 0) not in layout.force
+    assert {(1, 0), (2, 1)} <= set(layout.force)
+    assert layout.shape == ()
+    assert np.array(layout.force).max() == 3
+
+
+def fitted(target: Likelihood) -> np.ndarray:
+    """Find the posterior mode."""
+    return target.minimise(target.start)
+
+
+@pytest.mark.parametrize(("m", "n"), [(1, 1), (1, 3), (2, 2)])
+def test_it_lies_between_nothing_shared_and_anything_shared(m: int, n: int) -> None:
+    """Deviations are at least those with the shared parts known, at most those with wide priors."""
+    target = noisy(m, n, 7.0)
+    p = fitted(target)
+    mean, cov, decrement = marginalise(target, p)
+    assert decrement < 1e-2
+    hessian = target.derivatives(p)[1]
+    layout = target.layout
+    loose = [*layout.shared, *layout.common, *layout.bends]
+    known = np.setdiff1d(np.arange(layout.size), loose)
+    size = 2 * m
+    narrow = np.diag(np.linalg.inv(hessian[np.ix_(known, known)]))[:size]
+    wide = np.diag(np.linalg.inv(hessian))[:size]
+    spread = np.diag(cov)
+    assert (spread > 0.99 * narrow).all()
+    # What the means of different widths differ by adds to the variance.
+    assert (spread < wide + (mean - p[:size]) ** 2 + 0.5 * wide).all()
+    assert np.linalg.eigvalsh(cov).min() > 0
+
+
+def test_without_anything_shared_the_narrow_priors_win() -> None:
+    """Without shared forces the truth is the mean, and half the information at most is lost."""
+    target = scatter_free(MODES[:1], 2, 30.0)
+    mean, cov, _ = marginalise(target, fitted(target))
+    std = np.sqrt(np.diag(cov))
+    assert np.abs((mean - target.start[:2]) / std).max() < 0.1
+    known = np.linalg.inv(target.derivatives(target.start)[1][:2, :2])
+    assert (std < 2 * np.sqrt(np.diag(known))).all()
+
+
+def test_floors_that_share_much_pull_the_wide_priors_in() -> None:
+    """Where a floor is driven by the mode's force the mean stays near the free optimum."""
+    truth = noisy(1, 2, 30.0)
+    p = truth.start.copy()
+    p[truth.layout.shared] = 1.0, -1.0
+    x = drawn(covariance(truth, p, frequencies(30.0)), np.random.default_rng(4))
+    block = block_of([spectrum_of(x[:, :, None] * x[:, None].conj(), 30.0)])
+    target = replace(truth, blocks=(block,))
+    optimum = fitted(target)
+    mean, cov, _ = marginalise(target, optimum)
+    std = np.sqrt(np.diag(cov))
+    assert np.abs((mean - optimum[:2]) / std).max() < 0.3
+    assert np.abs((mean - truth.start[:2]) / std).max() < 4
+
+
+def test_where_there_is_no_maximum_it_says_so() -> None:
+    """Off the maximum the decrement is large, and infinite where the Hessian has no root."""
+    target = noisy(1, 2, 7.0)
+    p = fitted(target)
+    off = p.copy()
+    off[0] += 1e-2
+    assert marginalise(target, off)[2] > 1
+    saddle = p.copy()
+    saddle[0] += 0.15
+    _, cov, decrement = marginalise(target, saddle)
+    assert decrement == np.inf
+    assert np.isnan(cov).all()

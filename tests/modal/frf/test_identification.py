@@ -18,10 +18,9 @@ from lmshealth.io.log import Channel, Log, Refusal
 from lmshealth.io.reading import read_log
 from lmshealth.modal.frf.identification import (
     FrfReading,
-    name_modes,
     read_frf,
-    why_unnamed,
 )
+from lmshealth.modal.naming import name_response, why_unnamed
 from lmshealth.stage.description import load_stage
 from models.dynamics.stages import stage_named
 from models.recordings.formats import write_log
@@ -243,7 +242,7 @@ def test_a_name_is_given_where_there_is_no_doubt(tmp_path: Path) -> None:
         )
         (tmp_path / "stage.toml").write_text(text)
         stage = load_stage(str(tmp_path / "stage.toml"))
-        result = name_modes(modes, stage)
+        result = name_response(modes, stage)
         why[:] = why_unnamed(result, stage)
         return result.names
 
@@ -253,11 +252,12 @@ def test_a_name_is_given_where_there_is_no_doubt(tmp_path: Path) -> None:
     assert named(("high", high, 0.1), ("none", 200.0, 0.1)) == ("", "high")
     assert why == []
     assert named(("both", (low + high) / 2, 0.5)) == ("", "")
-    assert len(why) == 2 and all("it is not alone where both is looked for; " in w for w in why)
+    assert len(why) == 2
+    assert all("it is not the only one where both is searched for; " in w for w in why)
     assert named(("one", low, 0.05), ("two", low + 1, 0.05), ("high", high, 0.1)) == ("", "high")
     (told,) = why
     assert told.startswith(f"the mode at {modes.frequency[0]:.5g} Hz has no name: one and two are ")
-    assert "both looked for there; track finds out whose it is" in told
+    assert "both searched for there; track assigns it" in told
 
 
 def test_channels_that_are_not_there_are_named_with_those_that_are() -> None:
@@ -296,7 +296,7 @@ def test_a_stated_period_that_cannot_be_is_refused() -> None:
     assert "1.6 samples" in error.detail
     error = refusal(driven(random=True), "current", "acc_x", band=BAND, period=4.0)
     assert error.reason == "period"
-    assert "current does not repeat itself after 4 s" in error.detail
+    assert "current does not repeat after 4 s" in error.detail
 
 
 def test_a_band_beyond_the_sample_rate_or_the_excitation_is_refused() -> None:
@@ -341,7 +341,7 @@ def test_an_output_that_does_not_answer_is_refused(repeats: bool) -> None:
     log = make_log({"current": given, "acc_x": rng.standard_normal(6 * SIZE)}, RATE)
     error = refusal(log, "current", "acc_x", band=BAND)
     assert error.reason == "coherence"
-    assert "acc_x does not answer current" in error.detail
+    assert "acc_x does not respond to current" in error.detail
 
 
 def test_a_response_without_a_mode_says_that_none_is_there() -> None:

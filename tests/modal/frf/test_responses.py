@@ -1,13 +1,14 @@
-"""Frequency responses: over periods and over stretches, and what noise does to each estimate."""
+"""Frequency responses over periods and stretches, and the noise of their lines."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.ndimage import uniform_filter1d
 
 from lmshealth.errors import BadLog
 from lmshealth.modal.frf.rational import Ordinates
-from lmshealth.modal.frf.responses import Frf, Pair, from_periods, from_record
+from lmshealth.modal.frf.responses import Frf, Pair, from_periods, from_record, smooth_noise
 from studies.frf_modes.records import RATE, Machine, at_random, multisine, periodic
 from tests.signals import make_log
 
@@ -123,7 +124,7 @@ def test_a_transient_in_the_first_period_is_left_out() -> None:
 def test_an_input_that_does_not_repeat_has_no_periods() -> None:
     """White noise cut as if it were periodic: said so, and not that nothing is excited."""
     given, answer = at_random(np.random.default_rng(9), Machine(), 6 * SIZE)
-    with pytest.raises(BadLog, match=r"period.* current does not repeat itself after 4 s"):
+    with pytest.raises(BadLog, match=r"period.* current does not repeat after 4 s"):
         from_periods(pair(given, answer), BAND, SIZE)
 
 
@@ -173,3 +174,38 @@ def test_the_difference_is_undone() -> None:
     _, plain = from_periods(pair(given, answer), BAND, SIZE)
     _, undone = from_periods(pair(*differenced, lag=1), BAND, SIZE)
     np.testing.assert_allclose(np.abs(undone.answer), np.abs(plain.answer), rtol=1e-6)
+
+
+F = np.arange(40.0, 120.0, 0.25)
+RESONANCE = 1 / np.abs(62**2 - F**2 + 2j * 0.01 * 62 * F) ** 2
+
+
+def test_one_line_is_not_averaged() -> None:
+    """A width of one gives back what it was given."""
+    power = np.random.default_rng(1).exponential(size=F.size)
+    np.testing.assert_allclose(smooth_noise(power, RESONANCE, 1), power)
+
+
+def test_a_resonance_narrower_than_the_average_is_kept() -> None:
+    """Noise of sensor and force: within a quarter at the peak, where a plain average loses half."""
+    rng = np.random.default_rng(2)
+    truth = 1 + 100 * RESONANCE / RESONANCE.max()
+    power = truth * rng.exponential(size=(50, F.size))
+    peak = int(np.argmax(RESONANCE))
+    found = np.mean([smooth_noise(row, RESONANCE, 41)[peak] for row in power])
+    assert found == pytest.approx(truth[peak], rel=0.25)
+    assert uniform_filter1d(truth, 41)[peak] < 0.5 * truth[peak]
+
+
+def test_noise_of_the_sensor_alone_stays_flat() -> None:
+    """Where no force shakes the machine its resonance leaves no trace in the noise."""
+    power = np.random.default_rng(3).exponential(size=F.size)
+    found = smooth_noise(power, RESONANCE, 41)
+    assert found[int(np.argmax(RESONANCE))] == pytest.approx(1, abs=0.5)
+
+
+def test_more_lines_than_there_are_is_all_of_them() -> None:
+    """A width beyond the band averages over the band; zeros do no harm."""
+    found = smooth_noise(np.array([0.0, 1.0, 2.0]), np.ones(3), 41)
+    np.testing.assert_allclose(found, 1.0, atol=0.7)
+    assert (found > 0).all()

@@ -1,0 +1,118 @@
+"""Constants that decide which modes are published, flagged or refused.
+
+Probabilities of false alarms, margins of evidence, limits of uncertainty and bounds of searches.
+Numerical tolerances, step sizes and iteration counts stand beside the code that uses them.
+"""
+
+from __future__ import annotations
+
+# Every method
+
+# Usable share of the sample rate: anti-alias filters reach below the Nyquist frequency.
+USABLE = 0.45
+# Standard deviations of ln f and ln ζ beyond which an estimate is refused: a frequency known to
+# 3 % cannot show the drifts that are tracked, a damping known to a factor of two is none.
+WORST_STD_LN_F, WORST_STD_LN_ZETA = 0.03, 0.7
+# Most modes that are fitted together.
+MOST_TOGETHER = 4
+
+# Naming
+
+# Probability of an assignment from which on a resonance gets the name; pairings below the second
+# are not quoted in a refusal.
+CLEAR_NAME, UNLIKELY_NAME = 0.8, 0.01
+# Log likelihood that a named mode gains over a missed mode and an unknown resonance.
+MATCH = 3.5
+# Largest factor between the damping ratio found and the one described.
+DAMPING_SPAN = 6.0
+# Standard deviations of the prior of shifts of ln f, as shares of the search: common to all modes
+# (wear of a guide moves them together), and of each mode alone.
+COMMON_SHIFT, OWN_SHIFT = 1 / 2, 1 / 6
+
+# Ambient identification
+
+# Least duration of a segment in periods of the top of the band, without a description; with one,
+# `stage.constants.LEAST_RESOLUTION` holds.
+LEAST_PERIODS = 10.0
+# Least number of Fourier frequencies in the band, without a description.
+LEAST_FREQUENCIES = 50
+# Largest factor between the bandwidths of modes that are fitted together: a narrow peak on a broad
+# resonance needs a resolution of its own.
+SIMILAR_BANDWIDTH = 8.0
+# Probability that noise alone makes a line somewhere in the band of a cluster.
+LINE_FALSE_ALARM = 1e-3
+# Gain in log likelihood of the binned spectra: below the first a mode is absent; above the second
+# it is present; between them the Bayesian information criterion decides, with this margin.
+ABSENT, PRESENT, EVIDENCE_MARGIN = 3.0, 60.0, 10.0
+# Contrast in standard deviations by which a peak stands out without a description, and by which
+# the residual of a fit shows a further mode.
+PEAK_THRESHOLD, EXCESS_THRESHOLD = 6.0, 5.0
+# Dispersion (variance of the residual over that of noise): flagged as loose-fit, refused as
+# poor-fit; and the ordinates needed to measure it.
+LOOSE_FIT, POOR_FIT, LEAST_ORDINATES = 1.5, 3.0, 30
+# Fourier frequencies in the half-power bandwidth below which a mode is flagged resolution-limited.
+RESOLVED = 4.0
+# Share of the search, or of the span of dampings, beyond which a mode is flagged at-bound.
+AT_BOUND = 0.9
+# Largest Newton decrement of a fit that has converged.
+WORST_DECREMENT = 0.1
+# Damping ratio above which a resonance without a description is a hump of the noise.
+MOST_DAMPING = 0.1
+# Least distance of two modes in half-power bandwidths, where channels see them alike (modal
+# assurance criterion above the third) and otherwise: closer modes trade strength and damping, and
+# their likelihood is not normal.
+APART_ALIKE, APART, ALIKE = 1.0, 0.2, 0.8
+# Standard deviations of the priors. Weak ones about the start, which bound directions that data do
+# not constrain: ln f, ln ζ, forces of modes, shapes, and level, slope and bend of ln noise floors.
+PRIOR_LN_F, PRIOR_LN_ZETA, PRIOR_FORCE, PRIOR_SHAPE = 0.2, 2.0, 30.0, 30.0
+PRIOR_FLOOR = (5.0, 2.0, 1.0)
+# Of the share of a floor that is coherent with the modes and with other floors (in units of the
+# floor), and of its bend: marginalised over these widths, of which the fit uses the last.
+WIDTHS_SHARED, WIDTHS_COMMON, WIDTHS_BEND = (0.03, 0.1, 1.0), (0.03, 0.3, 3.0), (0.03, 0.1, 1.0)
+
+# Frequency responses
+
+# Least samples of a stretch, and of a period.
+FRF_SAMPLES, FRF_PERIOD_SAMPLES = 256, 32
+# Standard deviations by which the mean coherence must exceed that of noise.
+ANSWERS = 5.0
+# A line counts as excited from this share of the strongest amplitude of the input, and from this
+# ratio of its power to its noise: noise of a weaker input biases the damping by more than half its
+# standard deviation.
+EXCITED, CLEARLY_EXCITED = 0.2, 30.0
+# Lines needed with periods and without (the noise has to be estimated, too), and most that are
+# fitted.
+FRF_LINES, FRF_LINES_OF_RECORD, FRF_MOST_LINES = 16, 64, 20_000
+# Probability that the first of several equal periods is taken for a transient.
+TRANSIENT = 1e-3
+# Probability that noise alone makes an outlier, and the largest share of lines that may be ones.
+OUTLIER_FALSE_ALARM, MOST_OUTLIERS = 1e-3, 0.1
+# Most modes of one response. A mode must gain this in -2 ln L beyond the Bayesian information
+# criterion, as the best of many places gains by chance; a background of powers and heavily damped
+# poles needs this per unknown (Akaike's criterion): lacking, it would bias the modes.
+FRF_MOST_MODES, FRF_EVIDENCE_MARGIN, FRF_BACKGROUND_COST = 8, 10.0, 2.0
+# Damping ratio above which a pole belongs to the background.
+FRF_MOST_DAMPING = 0.2
+# Gain in -2 ln L from which on a distortion is included: 1 % of linear responses reach it. Two
+# modes within a half-power bandwidth must reduce the distortion to this share.
+DISTORTED, LESS_DISTORTED = 6.6, 1 / 3
+# Least power of a mode over that of the distortion around it.
+OVER_DISTORTION = 16.0
+
+# Free decays
+
+# Least periods of the lowest mode in a decay, and least ordinates of a band.
+DECAY_PERIODS, DECAY_ORDINATES = 4.0, 12
+# Probability that noise alone makes a peak somewhere.
+DECAY_FALSE_ALARM = 1e-3
+# Probability of the residual's correlation below which decays are not in stationary noise.
+NOT_STATIONARY = 1e-3
+# Most poles of a band, and gain in log likelihood beyond the Bayesian information criterion that
+# one needs.
+DECAY_MOST_POLES, DECAY_EVIDENCE_MARGIN = 6, 5.0
+# A damping less than this many standard deviations from zero is too uncertain; where the mode
+# fades by less than this share over the record it may be a line.
+DECAY_DAMPING_SIGMAS, FADED = 3.0, 0.6
+# Largest damping ratio, and least mean square of a vibration after the stops over that of the
+# ambient response.
+DECAY_MOST_DAMPING, DECAY_EXCITATION = 0.1, 16.0

@@ -1,0 +1,228 @@
+"""Estimates of a cluster: dispersion, flags, rejections, and modes too close to be separated."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from lmshealth.modal.ambient.cluster_modes import (
+    ClusterFit,
+    ClusterModes,
+    _dispersion,
+    _flags,
+    _incredible,
+    merge_close_modes,
+    refuse_close_modes,
+)
+from lmshealth.modal.identification import identify
+from lmshealth.signal.spectra import Spectrum
+from tests.bands import PITCH, RATE, ROLL, both, fit, found
+from tests.signals import Mode, acceleration_log, make_stage
+
+
+def brought_to(apart: float, fit: ClusterModes, shapes: list[list[float]]) -> ClusterModes:
+    """Move the second mode so many half-power bandwidths above the first, with these shapes."""
+    estimate = fit.estimate.copy()
+    estimate[2:] = np.log(0.02)
+    estimate[1] = estimate[0] + np.log1p(2 * 0.02 * apart)
+    return replace(fit, estimate=estimate, shapes=np.array(shapes).T)
+
+
+ALIKE, UNLIKE = [[1.0, 0.5], [1.0, 0.45]], [[1.0, 0.5], [0.5, -1.0]]
+
+
+@pytest.mark.parametrize(
+    ("apart", "shapes", "close"),
+    [
+        (1.2, ALIKE, False),
+        (0.9, ALIKE, True),
+        (0.3, UNLIKE, False),
+        (0.1, UNLIKE, True),
+    ],
+)
+def test_modes_are_close_within_a_bandwidth_unless_their_shapes_differ(
+    apart: float, shapes: list[list[float]], close: bool
+) -> None:
+    """What is too close is refused by name, with both frequencies and where they stand together."""
+    fit = brought_to(apart, found(both()), shapes)
+    result = refuse_close_modes(ClusterFit(fit, {}))
+    kept, rejected = result.modes, result.rejected
+    assert kept is not None
+    assert (set(rejected) == {"roll", "pitch"}) is close
+    assert (len(kept.targets) == 0) is close
+    if close:
+        reason, detail = rejected["roll"]
+        assert reason == "too-close"
+        assert f"{np.exp(fit.estimate[0]):.5g}" in detail
+
+
+def test_what_was_not_sought_by_name_is_left_as_one() -> None:
+    """One mode for both, half of their distance in its standard deviation, and flagged."""
+    fit = brought_to(0.5, found(both()), ALIKE)
+    kept = merge_close_modes(fit)
+    assert [t.name for t in kept.targets] == ["roll"]
+    assert kept.flags == ("cluster",)
+    assert kept.estimate[0] == pytest.approx(fit.estimate[:2].mean())
+    half = (fit.estimate[1] - fit.estimate[0]) / 2
+    own = (fit.cov[0, 0] + fit.cov[1, 1] + 2 * fit.cov[0, 1]) / 4
+    assert kept.cov[0, 0] == pytest.approx(own + half**2)
+    assert kept.cov.shape == (2, 2)
+
+
+@pytest.mark.slow
+def test_modes_at_one_place_in_one_channel_are_refused_and_not_guessed() -> None:
+    """Of 8 records of two modes half a bandwidth apart none gives both by name."""
+    modes = [Mode(120.0, 0.02), Mode(122.4, 0.02)]
+    stage = make_stage([("roll", 120.0, 0.02), ("pitch", 122.4, 0.02)])
+    for seed in range(8):
+        log = acceleration_log(np.random.default_rng(seed), modes, 60.0, RATE, 6.25)
+        result = identify(log, stage)
+        assert len(result.names) < 2
+        assert {r.reason for r in result.refused} <= {"too-close", "ambiguous", "not-identified"}
+
+
+@pytest.mark.slow
+def test_modes_that_channels_see_differently_are_told_apart_at_one_place() -> None:
+    """A third of a bandwidth apart both are found, in order, within 4σ."""
+    modes = [Mode(120.0, 0.02, 1.0, (1.0, 0.6, -0.4)), Mode(121.5, 0.02, 1.0, (0.5, -1.0, 0.7))]
+    stage = make_stage([("roll", 120.0, 0.02), ("pitch", 121.5, 0.02)])
+    for seed in range(6):
+        log = acceleration_log(np.random.default_rng(seed), modes, 60.0, RATE, 6.25)
+        result = identify(log, stage)
+        assert result.names == ("roll", "pitch")
+        off = (result.ln_frequency - np.log([120.0, 121.5])) / np.sqrt(np.diag(result.cov)[:2])
+        assert np.abs(off).max() < 4
+
+
+TRUTH = np.log([105.0, 125.0, 0.015, 0.02])
+
+
+def test_a_mode_narrower_than_a_record_resolves_is_a_line() -> None:
+    """A half-power bandwidth of 0.95 Fourier frequencies is not believed, one of 1.05 is."""
+    result = found(both())
+    width = 2 * np.exp(result.estimate[0] + result.estimate[2])
+    why = _incredible(result, 0, 0.95 / width)
+    assert why is not None
+    assert why[0] == "line-not-mode"
+    assert "is narrower" in why[1]
+    assert _incredible(result, 0, 1.05 / width) is None
+
+
+# How well the model fits, and what to bear in mind
+
+
+def residual(values: np.ndarray, count: int = 1) -> Spectrum:
+    """Wrap what a fit leaves over, of 50 s from 95 to 115 Hz."""
+    frequency = np.arange(95 * 50, 115 * 50) / 50
+    return Spectrum(frequency, values, 50.0, float("nan"), count)
+
+
+def scatter(seed: int, count: int = 1) -> np.ndarray:
+    """Draw means of so many exponential variables, one for each ordinate."""
+    return np.random.default_rng(seed).exponential(size=(1000, count)).mean(axis=1)
+
+
+F, ZETA = np.array([105.0]), np.array([0.02])
+
+
+@pytest.mark.parametrize("count", [1, 12])
+def test_dispersion_of_noise_is_about_one(count: int) -> None:
+    """Whatever the number of records and channels, over 100 residuals within 4.5 errors."""
+    values = [_dispersion(residual(scatter(k, count), count), F, ZETA)[0] for k in range(100)]
+    # Within ±4.2 Hz stand 419 ordinates; the fourth moment of an exponential is 9.
+    error = np.sqrt((2 + 6 / count) / (100 * 419))
+    assert abs(np.mean(values) - 1) < 4.5 * error
+    # Negative control: with the count forgotten it is not.
+    wrong = _dispersion(residual(scatter(0, 12)), F, ZETA)[0]
+    assert wrong < 0.2
+
+
+def test_dispersion_is_that_of_what_stands_near_the_mode_and_is_not_masked() -> None:
+    """What is further away, or masked as a line, does not count; twice the scatter does."""
+    values = scatter(1)
+    noise = residual(values)
+    near = np.abs(noise.frequency - 105.0) < 2 * 0.02 * 105.0
+    (plain,) = _dispersion(noise, F, ZETA)
+    assert plain == pytest.approx(np.mean((values[near] - 1) ** 2), rel=1e-12)
+    far = np.where(near, values, 50.0)
+    assert _dispersion(residual(far), F, ZETA)[0] == plain
+    masked = values.copy()
+    masked[near.nonzero()[0][::2]] = 1.0
+    kept = near & (masked != 1.0)
+    (rest,) = _dispersion(residual(masked), F, ZETA)
+    assert rest == pytest.approx(np.mean((values[kept] - 1) ** 2), rel=1e-12)
+    (loose,) = _dispersion(residual(1 + 2 * (values - 1)), F, ZETA)
+    assert loose == pytest.approx(4 * plain, rel=1e-12)
+
+
+def test_too_few_ordinates_tell_no_dispersion() -> None:
+    """Thirty about a mode say something, 28 do not; each mode is judged by itself."""
+    left = residual(scatter(2))
+    wide, narrow = _dispersion(left, np.array([100.0, 110.0]), np.array([0.02, 5e-4]))
+    assert np.isfinite(wide)
+    assert np.isnan(narrow)
+    between = np.array([105.01])  # half way between two ordinates, 0.02 Hz apart
+    for reach, enough in ((0.291, True), (0.289, False)):
+        assert np.isfinite(_dispersion(left, between, reach / (2 * between))[0]) == enough
+
+
+def flags(result: ClusterModes) -> list[list[str]]:
+    """List the flags of both modes."""
+    values = zip(*np.exp(result.estimate).reshape(2, -1), result.dispersion, strict=True)
+    (duration,) = (spectrum.duration for spectrum in result.data.spectra)
+    return [
+        _flags(target, *value, duration).split()
+        for target, value in zip(result.targets, values, strict=True)
+    ]
+
+
+def test_a_good_fit_has_no_flags() -> None:
+    """A record of a minute that shows both modes as described leaves nothing to bear in mind."""
+    result = found(both())
+    assert result.flags == ("", "")
+    assert (result.dispersion > 0.7).all()
+    assert (result.dispersion < 1.4).all()
+
+
+def test_flags_say_what_a_reading_lacks() -> None:
+    """Each of them is raised by its own reason, for its own mode, and together."""
+    result = found(both())
+    (spectrum,) = result.data.spectra
+    # Half-power bandwidths of 3.15 and 5 Hz: a second holds 3.15 and 5 ordinates.
+    brief = replace(result.data, spectra=(replace(spectrum, duration=1.0),))
+    short = replace(result, data=brief)
+    assert flags(short) == [["resolution-limited"], []]
+    assert flags(replace(result, dispersion=np.array([np.nan, 1.6]))) == [[], ["loose-fit"]]
+    far, heavy = TRUTH.copy(), TRUTH.copy()
+    far[0] += 0.95 * np.log1p(0.15)
+    heavy[3] = np.log(0.02 * 5.8)
+    assert flags(replace(result, estimate=far)) == [["at-bound"], []]
+    assert flags(replace(result, estimate=heavy)) == [[], ["at-bound"]]
+    worst = replace(short, estimate=far, dispersion=np.array([2.0, 1.0]))
+    assert flags(worst) == [["resolution-limited", "at-bound", "loose-fit"], []]
+    # What was sought counts, not where the search of this log began.
+    moved = tuple(
+        replace(t, frequency=1.14 * t.frequency, nominal=t.frequency) for t in (ROLL, PITCH)
+    )
+    assert flags(replace(result, targets=tuple(moved))) == [[], []]
+
+
+@pytest.mark.slow
+def test_a_mode_under_a_line_that_is_too_unsteady_to_be_told_is_refused() -> None:
+    """A line that wanders by 0.3 Hz about roll is no noise: roll is refused, pitch is not."""
+    t = np.arange(60_000) / RATE
+    phase = 2 * np.pi * np.cumsum(105 + 0.3 * np.sin(2 * np.pi * t / 17)) / RATE
+    result, rejected = fit(both() + 10.0 * np.sin(phase), [ROLL, PITCH])
+    assert result is not None
+    assert [target.name for target in result.targets] == ["pitch"]
+    assert np.abs((result.estimate - TRUTH[[1, 3]]) / np.sqrt(np.diag(result.cov))).max() < 4
+    reason, detail = rejected["roll"]
+    assert reason == "poor-fit"
+    assert "times as much as noise" in detail
+    # As faint as a third of that it is told, and the reading is only said to be loose.
+    faint, rejected = fit(both() + 5.0 * np.sin(phase), [ROLL, PITCH])
+    assert faint is not None
+    assert rejected == {}
+    assert faint.flags == ("loose-fit", "")
