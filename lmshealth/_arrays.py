@@ -1,4 +1,4 @@
-"""Types of arrays, and how frozen results keep theirs."""
+"""Types of arrays, and checks of the arrays of frozen results."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def freeze(result: Any) -> None:
 
 
 def expect_shape(name: str, array: np.ndarray[Any, Any], shape: tuple[int, ...]) -> None:
-    """Insist on the shape of a field.
+    """Require the shape of a field.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Files that are written: whole or not at all, where they are asked for and nowhere else."""
+"""Write files: completely or not at all."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 def write_text(target: Path, text: str) -> None:
-    """Write a text as `replacing` does, folders included.
+    """Write a text as `replacing` does, with missing folders.
 
     Raises
     ------
@@ -27,12 +27,12 @@ def write_text(target: Path, text: str) -> None:
 
 
 def write_bytes(target: Path, content: bytes) -> None:
-    """Write what is no text in the same way.
+    """Write bytes in the same way.
 
     Raises
     ------
     BadTable
-        If it cannot be written.
+        If they cannot be written.
     """
     with _writing(target), _in_place_of(target) as part, part.open("xb") as stream:
         stream.write(content)
@@ -40,11 +40,11 @@ def write_bytes(target: Path, content: bytes) -> None:
 
 @contextmanager
 def replacing(target: Path) -> Iterator[IO[str]]:
-    """Give a file to write that takes the place of another in one step, when it is whole.
+    """Open a text file that replaces another in one step, once it is complete.
 
-    A link that stands there is replaced, not followed.
+    A symbolic link in its place is replaced, not followed.
     """
-    # One name that is no text must not keep all others from being told.
+    # One unprintable name must not keep all others from being written.
     odd = "backslashreplace"
     with (
         _in_place_of(target) as part,
@@ -55,8 +55,7 @@ def replacing(target: Path) -> Iterator[IO[str]]:
 
 @contextmanager
 def _in_place_of(target: Path) -> Iterator[Path]:
-    """Give the path of a new file that becomes another when it is closed."""
-    # A name under which nobody can have laid a link, and which fits beside any other.
+    # A random name: nobody can have put a link there.
     part = target.with_name(f".{secrets.token_hex(8)}.part")
     try:
         yield part
@@ -66,7 +65,7 @@ def _in_place_of(target: Path) -> Iterator[Path]:
 
 
 def write_draws(target: Path, stages: Sequence[str], trees: Sequence[DataTree]) -> None:
-    """Write draws as NetCDF: of one machine as ArviZ has it, of several under the name of each."""
+    """Write posterior draws as NetCDF: in ArviZ's layout, of several machines in named groups."""
     from xarray import DataTree  # late: it takes a second to import
 
     names = [stage.replace("/", "_") for stage in stages]

@@ -1,7 +1,7 @@
-"""Results as bytes and back, by the types of their fields.
+"""Serialise results to bytes by the types of their fields, and their fingerprints.
 
-Nothing in the bytes names a type or is ever run: what comes back is what the reader asked for, or
-nothing. Floats keep all their bits, NaN and infinity too; moments keep their offset from UTC.
+The bytes name no type and are never executed. Floats keep all their bits, NaN and infinity too;
+dates keep their offset from UTC.
 """
 
 from __future__ import annotations
@@ -15,41 +15,41 @@ import msgspec
 import numpy as np
 
 VERSION = version("lmshealth")
-"""Of the package, a part of the names of what it makes; asking anew takes a millisecond."""
+"""Version of the package, a part of the cache's keys; reading it takes a millisecond."""
 
-# What an array may hold: bool, numbers, text and moments. Objects would be addresses in memory.
+# Kinds of arrays: bool, numbers, text and dates. Objects would be addresses in memory.
 _KINDS = "biufcUMm"
-# Fast; most of what is kept are draws, whose digits no level makes smaller.
+# Fast; most results are draws, whose digits no level compresses.
 _LEVEL = 1
 _MOST_BYTES = 2**31
 
 
 def pack(value: Any) -> bytes:
-    """Turn dataclasses, structs, arrays, moments and plain values into bytes.
+    """Serialise dataclasses, structs, arrays, dates and plain values.
 
     Raises
     ------
     TypeError
-        If something among it is none of these.
+        For anything else.
     """
     return zlib.compress(_plain(value), _LEVEL)
 
 
 def unpack(content: bytes, kind: Any) -> Any:
-    """Rebuild what was packed.
+    """Rebuild a serialised value.
 
     Parameters
     ----------
     content : bytes
-        From `pack`, or from somewhere that is not to be trusted.
+        From `pack`, or from an untrusted source.
     kind : type
-        What it has to be: a dataclass or struct, or a union that msgspec can tell apart. Arrays
-        come back read-only, in the order of C.
+        Its type: a dataclass or struct, or a union that msgspec can distinguish. Arrays are
+        read-only, in C order.
 
     Raises
     ------
     ValueError
-        If it is not that.
+        If it is not of this type.
     """
     try:
         inflater = zlib.decompressobj()
@@ -62,18 +62,17 @@ def unpack(content: bytes, kind: Any) -> Any:
 
 
 def fingerprint(*values: Any) -> str:
-    """Give the SHA-256 of values: of what a result depends on, it is the result's name."""
+    """Return the SHA-256 of values: the key of a result that depends on them."""
     return hashlib.sha256(_plain(values)).hexdigest()
 
 
 def _plain(value: Any) -> bytes:
-    # By way of plain values, because MessagePack itself would move every moment to UTC.
+    # By way of plain values, because MessagePack itself would convert every date to UTC.
     plain = msgspec.to_builtins(value, builtin_types=(bytes,), enc_hook=_replace)
     return msgspec.msgpack.encode(plain)
 
 
 def _replace(value: Any) -> Any:
-    """Put plain values in the place of what numpy has."""
     if isinstance(value, np.generic):
         return value.item()
     if isinstance(value, np.ndarray) and value.dtype.kind in _KINDS:
@@ -82,7 +81,6 @@ def _replace(value: Any) -> Any:
 
 
 def _revive(kind: type, value: Any) -> Any:
-    """Rebuild an array."""
     dtype, shape, content = value
     array = np.frombuffer(content, np.dtype(dtype)).reshape(shape).copy()
     if array.dtype.kind not in _KINDS:

@@ -1,4 +1,4 @@
-"""TOML into structs, with every slip told by its line and key."""
+"""Decode TOML into structs; every error names line and key."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from typing import Any, TypeVar
 import msgspec
 from msgspec.inspect import StructType, Type, UnionType, VarTupleType, type_info
 
-# A hundred modes take a tenth of it; each line of it is read by itself where a slip is sought.
-_LONGEST = 1 << 17
-# A statement of more is a string or an array without end.
+# A hundred modes take a tenth of it.
+_MOST_BYTES = 1 << 17
+# A statement of more lines is a string or an array without end.
 _MOST_LINES = 500
 
 Kind = TypeVar("Kind")
@@ -21,25 +21,18 @@ Keys = tuple[str | int, ...]
 
 _PLACE = re.compile(r" - at `\$(?P<path>.*)`$")
 _STEP = re.compile(r"\.([^.\[\]]+)|\[(\d+)\]")
-# Which value of a table with free keys is wrong, msgspec does not say.
+# msgspec does not name the wrong value of a table with free keys.
 _ANY_VALUE = "[...]"
 _FIELD = re.compile(r"Object (?P<what>contains unknown|missing required) field `(?P<field>.*)`$")
 
 
 def decode(content: bytes, kind: type[Kind]) -> Kind:
-    """Read TOML into a struct.
-
-    Parameters
-    ----------
-    content : bytes
-        The file.
-    kind : type
-        A msgspec struct.
+    """Decode TOML into a msgspec struct.
 
     Raises
     ------
     ValueError
-        If the file is no TOML or breaks the schema: the message has line, key, what was got and
+        If the file is no TOML or breaks the schema: the message has line, key, what was found and
         what is needed.
     """
     text = _text(content)
@@ -53,20 +46,20 @@ def decode(content: bytes, kind: type[Kind]) -> Kind:
     try:
         return msgspec.convert(table, kind)
     except msgspec.ValidationError as error:
-        keys, message = _told(str(error), table, type_info(kind))
+        keys, message = _explained(str(error), table, type_info(kind))
         raise ValueError(f"{place(content, *keys)}: {message}") from error
 
 
 def place(content: bytes, *keys: str | int) -> str:
-    """Name a key of a TOML file, and the line on which it stands.
+    """Name a key of a TOML file with its line.
 
     Parameters
     ----------
     content : bytes
         The file; it has to be TOML.
     keys : str or int
-        Names of tables and keys, and places in arrays. For a key that is not there the line is
-        that of the table which lacks it.
+        Names of tables and keys, and places in arrays. For a missing key the line is that of the
+        table which lacks it.
 
     Returns
     -------
@@ -74,13 +67,17 @@ def place(content: bytes, *keys: str | int) -> str:
         For example ``line 12: mode[1].damping_ratio``.
     """
     shown = "".join(f"[{key}]" if isinstance(key, int) else f".{key}" for key in keys)
-    line = _line(_text(content), keys)
-    return (f"line {line}: " if line else "") + shown.lstrip(".")
+    text = _text(content)
+    table, found = tomllib.loads(text), keys
+    while found and not _holds(table, found):
+        found = found[:-1]
+    line = f"line {_first(text, lambda table: _holds(table, found))}: " if found else ""
+    return line + shown.lstrip(".")
 
 
 def _text(content: bytes) -> str:
-    if len(content) > _LONGEST:
-        raise ValueError(f"{len(content)} bytes are too many; needed at most {_LONGEST}")
+    if len(content) > _MOST_BYTES:
+        raise ValueError(f"{len(content)} bytes are too many; needed at most {_MOST_BYTES}")
     try:
         return content.decode("utf-8-sig").replace("\r\n", "\n")
     except UnicodeDecodeError as error:
@@ -88,33 +85,21 @@ def _text(content: bytes) -> str:
         raise ValueError(f"line {line}: byte {content[error.start]:#04x} is not UTF-8") from error
 
 
-def _line(text: str, keys: Keys) -> int | None:
-    """Find the line that brings a key, or the table which lacks it; None for the file itself."""
-    table = tomllib.loads(text)
-    while keys and not _holds(table, keys):
-        keys = keys[:-1]
-    return _first(text, lambda table: _holds(table, keys)) if keys else None
-
-
 def _first(text: str, reached: Callable[[Any], bool]) -> int:
-    """Find the line at which the statement begins by which something is reached.
+    """Find the line at which the statement begins that satisfies a monotonic condition.
 
-    What is asked of is the file up to the end of a statement, or None where that is no TOML.
+    The condition is called with the file up to the end of a statement, None where that is no TOML.
     """
-    lines, ends = text.split("\n"), _ends(text)
-    k = bisect_left(ends, True, key=lambda last: reached(_loaded("\n".join(lines[:last]))))
-    return 1 + ends[k - 1]
-
-
-def _ends(text: str) -> list[int]:
-    """List the lines at which statements end: a string or an array may go on in the next."""
-    lines, ends = text.split("\n"), [0]
+    lines = text.split("\n")
+    # Statements may continue in the next line: their ends are where the lines since are TOML.
+    ends = [0]
     for last in range(1, len(lines) + 1):
         if last > ends[-1] + _MOST_LINES:
             break
         if _loaded("\n".join(lines[ends[-1] : last])) is not None:
             ends.append(last)
-    return ends
+    k = bisect_left(ends, True, key=lambda last: reached(_loaded("\n".join(lines[:last]))))
+    return 1 + ends[k - 1]
 
 
 def _loaded(text: str) -> dict[str, Any] | None:
@@ -138,8 +123,8 @@ def _value(table: Any, keys: Keys) -> Any:
     return table
 
 
-def _told(error: str, table: Any, schema: Type) -> tuple[Keys, str]:
-    """Turn msgspec's message into the keys that are meant, and what is to be said of them."""
+def _explained(error: str, table: Any, schema: Type) -> tuple[Keys, str]:
+    """Convert msgspec's message into keys and a message with the known names."""
     path = _PLACE.search(error)
     keys: Keys = ()
     if path:
@@ -157,28 +142,28 @@ def _told(error: str, table: Any, schema: Type) -> tuple[Keys, str]:
     if error.startswith("Invalid value") and (tags := _tags(schema, keys)):
         error = f"there are {_listed(tags)}"
     if "matching regex" in error:
-        error = "needed text without signs that cannot be seen"
+        error = "needed printable text"
     if "got" not in error and not isinstance(value, dict | list):
         error = f"{error}, got {value!r}"
     return keys, error.replace("object", "table")
 
 
 def _tags(schema: Type, keys: Keys) -> list[object]:
-    """List what a key may hold that says which of several structs is meant."""
+    """List the values of a key that selects one of several structs."""
     return [part.tag for part in _structs(schema, keys[:-1]) if part.tag_field == keys[-1]]
 
 
 def _fields(schema: Type, keys: Keys, table: Any) -> list[str]:
     parts = _structs(schema, keys)
     own = _value(table, keys)
-    meant = [part for part in parts if part.tag_field and part.tag == own.get(part.tag_field)]
-    part = (meant or parts)[0]
+    selected = [part for part in parts if part.tag_field and part.tag == own.get(part.tag_field)]
+    part = (selected or parts)[0]
     tag = [part.tag_field] if part.tag_field else []
     return [*tag, *(field.encode_name for field in part.fields)]
 
 
 def _structs(schema: Type, keys: Keys) -> list[StructType]:
-    """List the structs that may stand at a place of the schema."""
+    """List the structs that may be at a place of the schema."""
     types = list(_branches(schema))
     for key in keys:
         types = [inner for one in types for inner in _inside(one, key)]

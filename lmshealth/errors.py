@@ -1,4 +1,4 @@
-"""Errors of lmshealth: each says what was got, what is needed and what to do next."""
+"""Errors of lmshealth: each names what was found, what is needed and what to do next."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ class BadLog(LmshealthError):
     Parameters
     ----------
     log : str
-        The file, as the user knows it.
+        Name of the log.
     reason : str
-        Short kind of the trouble, the ``reason`` column of ``refused.csv``.
+        Code of the refusal, the ``reason`` column of ``refused.csv``.
     detail : str
         What was found, what is needed, and the next step.
     """
@@ -37,7 +37,7 @@ class BadLog(LmshealthError):
         self.detail = detail
 
     def __reduce__(self) -> tuple[type[BadLog], tuple[str, str, str]]:
-        """Survive the way back from a worker process (arguments differ from the message)."""
+        """Pickle by the arguments, which differ from the message."""
         return type(self), (self.log, self.reason, self.detail)
 
 
@@ -46,7 +46,7 @@ class BadStage(LmshealthError):
 
 
 class BadQuestion(LmshealthError):
-    """A question that a stage description cannot answer."""
+    """A request that a stage description cannot answer."""
 
 
 class OutsideMap(LmshealthError):
@@ -58,7 +58,7 @@ class BadTable(LmshealthError):
 
 
 class NotEnoughData(LmshealthError):
-    """Fewer usable logs or modes than the question needs."""
+    """Fewer usable logs or modes than the analysis needs."""
 
 
 class NotConverged(LmshealthError):
@@ -79,4 +79,4 @@ class NotConverged(LmshealthError):
 
 
 class NothingUsable(LmshealthError):
-    """Every log of a batch was refused."""
+    """A batch of which every log was refused."""

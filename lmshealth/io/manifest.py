@@ -1,10 +1,10 @@
-"""Folders of logs: which files are logs, and what the manifests beside them say."""
+"""Folders of logs: which files are logs, and the rows of their manifests."""
 
 from __future__ import annotations
 
 import os
 import stat
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
@@ -21,14 +21,14 @@ NOT_LOGS = frozenset({MANIFEST, "maintenance.csv", "truth.csv"})
 
 
 class Found(NamedTuple):
-    """What a folder holds.
+    """Files of a folder.
 
     Attributes
     ----------
     logs : tuple of Path
-        Files with a suffix of the log contract, sorted.
+        The files that were searched for, sorted.
     refused : tuple of Refusal
-        Files that look like logs and must not or cannot be opened, named relative to the folder.
+        Those that must not or cannot be opened, named relative to the folder.
     """
 
     logs: tuple[Path, ...]
@@ -37,7 +37,7 @@ class Found(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Manifest:
-    """What the manifests of a folder say about its logs.
+    """Rows of the manifests of a folder.
 
     Attributes
     ----------
@@ -46,7 +46,7 @@ class Manifest:
     refused : tuple of Refusal
         Manifests that cannot be read, and rows that name no log of the folder.
     bad : dict of Path to str
-        By absolute path of the log, what is wrong with a row of it.
+        By absolute path of the log, the fault of one of its rows.
     """
 
     rows: dict[Path, dict[str, str]]
@@ -54,17 +54,16 @@ class Manifest:
     bad: dict[Path, str]
 
     def names(self, log: Path) -> bool:
-        """Tell whether a row is about this log."""
+        """Return whether this log has a row."""
         return _absolute(log) in self.rows
 
     def overrides(self, log: Path) -> dict[str, str]:
-        """Give the metadata that override what a log says; empty for a log without a row.
+        """Return the metadata that override those of a log; empty for a log without a row.
 
         Raises
         ------
         BadLog
-            With reason ``bad-row``: what a manifest says of the log cannot be understood, and what
-            the log says of itself is not what was meant.
+            With reason ``bad-row`` for a log whose row cannot be read or is contradicted.
         """
         path = _absolute(log)
         if path in self.bad:
@@ -75,76 +74,59 @@ class Manifest:
 def find_logs(folder: str | Path) -> Found:
     """Find the logs of a folder and its subfolders by their suffix.
 
-    Hidden files and folders are passed over. Symbolic links to files are followed as long as
-    they stay in the folder; links to folders are not, what they hold is found where it is.
-
-    Parameters
-    ----------
-    folder : str or Path
-        The archive.
+    Hidden files and folders are ignored. Symbolic links to files are followed as long as they
+    stay in the folder; links to folders are not.
 
     Raises
     ------
     BadTable
         If it is no folder.
     """
-    root = Path(folder)
-    logs: list[Path] = []
-    refused: list[Refusal] = []
-    for path in _walk(root, refused):
-        if path.name in NOT_LOGS or not is_log(path):
-            continue
-        trouble = _trouble(path, root)
-        if trouble is None:
-            logs.append(path)
-        else:
-            refused.append(Refusal(name_of(path, root), *trouble))
-    return Found(tuple(logs), tuple(refused))
+    return _find(Path(folder), lambda path: path.name not in NOT_LOGS and is_log(path))
+
+
+def find_sheets(folder: str | Path, name: str) -> Found:
+    """Find the tables of a name, such as ``manifest.csv``, where `find_logs` finds logs.
+
+    Raises
+    ------
+    BadTable
+        If it is no folder.
+    """
+    found = _find(Path(folder), lambda path: path.name == name)
+    # What else is wrong with the folder, `find_logs` lists.
+    return Found(found.logs, tuple(r for r in found.refused if Path(r.log).name == name))
 
 
 def read_manifest(folder: str | Path) -> Manifest:
     """Read every ``manifest.csv`` of a folder and its subfolders; it may have none.
 
     Paths in a manifest are relative to it. Where two manifests name a log, the one nearer to the
-    log has the last word. A bad row refuses the log that it names, and nothing else.
-
-    Parameters
-    ----------
-    folder : str or Path
-        The archive.
+    log overrides the other. A bad row refuses the log that it names, and nothing else.
 
     Raises
     ------
     BadTable
         If it is no folder.
     """
-    root = Path(folder)
-    found = find_sheets(root, MANIFEST)
-    return _together(root, found.logs, found.refused)
+    return _merged(Path(folder), find_sheets(folder, MANIFEST))
 
 
 def read_manifest_beside(log: str | Path) -> Manifest:
-    """Read the ``manifest.csv`` in the folder of a log, and no other; there may be none.
-
-    Parameters
-    ----------
-    log : str or Path
-        The log, which need not exist.
-    """
+    """Read the ``manifest.csv`` in the folder of a log, which may have none, and no other."""
     root = Path(log).parent
     path = root / MANIFEST
-    if not os.path.lexists(path):
-        return Manifest({}, (), {})
-    trouble = _trouble(path, root)
+    trouble = _trouble(path, root) if os.path.lexists(path) else None
     refused = (Refusal(MANIFEST, *trouble),) if trouble else ()
-    return _together(root, () if trouble else (path,), refused)
+    there = os.path.lexists(path) and not trouble
+    return _merged(root, Found((path,) if there else (), refused))
 
 
-def _together(root: Path, paths: Iterable[Path], refused: Iterable[Refusal]) -> Manifest:
+def _merged(root: Path, found: Found) -> Manifest:
     """Read manifests of a folder, the nearest to the logs last."""
     manifest = Manifest({}, (), {})
-    refused = list(refused)
-    for path in sorted(paths, key=lambda path: (len(path.parts), path)):
+    refused = list(found.refused)
+    for path in sorted(found.logs, key=lambda path: (len(path.parts), path)):
         try:
             refused += _add(manifest, path, root)
         except Unusable as error:
@@ -152,32 +134,8 @@ def _together(root: Path, paths: Iterable[Path], refused: Iterable[Refusal]) -> 
     return replace(manifest, refused=tuple(refused))
 
 
-def find_sheets(folder: str | Path, name: str) -> Found:
-    """Find the tables of a name beside the logs of a folder, where `find_logs` looks for logs.
-
-    Parameters
-    ----------
-    folder : str or Path
-        The archive.
-    name : str
-        Such as ``manifest.csv``.
-
-    Raises
-    ------
-    BadTable
-        If it is no folder.
-    """
-    root = Path(folder)
-    paths = [path for path in _walk(root, []) if path.name == name]
-    troubles = {path: _trouble(path, root) for path in paths}
-    return Found(
-        tuple(path for path in paths if troubles[path] is None),
-        tuple(Refusal(name_of(path, root), *why) for path, why in troubles.items() if why),
-    )
-
-
 def name_of(path: Path, folder: Path) -> str:
-    """Name a file as the user knows it: relative to the folder of logs, and fit to be printed."""
+    """Name a file relative to the folder of logs, as printable text."""
     return shown(path.relative_to(folder).as_posix())
 
 
@@ -185,10 +143,12 @@ def _absolute(path: Path) -> Path:
     return Path(os.path.abspath(path))
 
 
-def _walk(root: Path, refused: list[Refusal]) -> Iterator[Path]:
-    """Yield all files in a fixed order, without entering links or hidden folders."""
+def _find(root: Path, fits: Callable[[Path], bool]) -> Found:
+    """Find files in a fixed order, without entering links or hidden folders."""
     if not root.is_dir():
         raise BadTable(f"{shown(root)} is no folder")
+    logs: list[Path] = []
+    refused: list[Refusal] = []
 
     def unreadable(error: OSError) -> None:
         folder = name_of(Path(error.filename), root)
@@ -196,12 +156,17 @@ def _walk(root: Path, refused: list[Refusal]) -> Iterator[Path]:
 
     for parent, folders, files in os.walk(root, onerror=unreadable):
         folders[:] = sorted(name for name in folders if not name.startswith("."))
-        here = Path(parent)
-        for name in folders:
-            if (here / name).is_symlink() and _escapes(here / name, root):
-                folder = name_of(here / name, root)
-                refused.append(Refusal(folder, "escapes", "a link out of the folder of logs"))
-        yield from (here / name for name in sorted(files) if not name.startswith("."))
+        for here in (Path(parent) / name for name in folders):
+            if here.is_symlink() and _escapes(here, root):
+                detail = "a link out of the folder of logs"
+                refused.append(Refusal(name_of(here, root), "escapes", detail))
+        visible = (Path(parent) / name for name in sorted(files) if not name.startswith("."))
+        for path in filter(fits, visible):
+            if trouble := _trouble(path, root):
+                refused.append(Refusal(name_of(path, root), *trouble))
+            else:
+                logs.append(path)
+    return Found(tuple(logs), tuple(refused))
 
 
 def _escapes(path: Path, root: Path) -> bool:
@@ -209,7 +174,7 @@ def _escapes(path: Path, root: Path) -> bool:
 
 
 def _trouble(path: Path, root: Path) -> tuple[str, str] | None:
-    """Say why a file must not be opened; None if it may."""
+    """Return reason and detail why a file must not be opened; None if it may."""
     if _escapes(path, root):
         return "escapes", "a link out of the folder of logs; copy the file into it"
     try:
@@ -220,7 +185,7 @@ def _trouble(path: Path, root: Path) -> tuple[str, str] | None:
 
 
 def _add(manifest: Manifest, path: Path, root: Path) -> Iterator[Refusal]:
-    """Add what one table says to a manifest; yield the rows that name no log of the folder."""
+    """Add the rows of one table to a manifest; yield those that name no log of the folder."""
     own: dict[Path, dict[str, str]] = {}
     for where, cells, trouble in read_sheet(path, ("file",)):
         place = f"{where} of {name_of(path, root)}"
@@ -239,6 +204,6 @@ def _add(manifest: Manifest, path: Path, root: Path) -> Iterator[Refusal]:
         if trouble:
             manifest.bad[log] = f"{place}: {trouble}"
         if not os.path.isfile(log):
-            yield Refusal(shown(file), "missing-file", f"{place} names what is no file")
+            yield Refusal(shown(file), "missing-file", f"{place} names no file")
     for log, row in own.items():
         manifest.rows[log] = manifest.rows.get(log, {}) | row

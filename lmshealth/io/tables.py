@@ -1,6 +1,7 @@
-"""Tables that lie beside logs: read row by row, so that a bad row costs itself and no other.
+"""Tables: those beside logs, read row by row, and those of estimates, read as text by columns.
 
-Tables that others wrote, read row by row: what is missing or wrong is named by its line.
+A bad row of a table beside logs costs itself and no other; a bad cell of a table of estimates
+refuses the table. Both are named by their line.
 """
 
 from __future__ import annotations
@@ -10,7 +11,7 @@ import io
 from collections.abc import Iterable, Iterator, Sequence
 from datetime import datetime
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -19,22 +20,21 @@ from lmshealth.errors import BadTable
 from lmshealth.io import constants
 from lmshealth.io.refusal import Unusable, listed
 
-# A cell of more lines than these is a quote that was never closed.
-_MOST_LINES = 50
+_MOST_LISTED = 3
 
 
 class Row(NamedTuple):
-    """One row of a table.
+    """One row of a table beside logs.
 
     Attributes
     ----------
     where : str
-        The lines of the file that it takes, such as ``line 3``.
+        Its lines in the file, such as ``line 3``.
     cells : dict of str to str
-        By column, stripped, empty where there is none; of a bad row what can be told apart. Bytes
-        that are no UTF-8 stay what they are, as in names of files.
+        By column, stripped, empty where there is none; of a bad row as far as it can be split.
+        Bytes that are no UTF-8 are kept as surrogates, as in names of files.
     trouble : str
-        What is wrong with it; empty for a good row.
+        Its fault; empty for a good row.
     """
 
     where: str
@@ -43,12 +43,12 @@ class Row(NamedTuple):
 
 
 def read_sheet(path: Path, needed: Sequence[str]) -> Iterator[Row]:
-    """Read a table row by row.
+    """Read a table of comma-separated values row by row.
 
     Parameters
     ----------
     path : Path
-        Comma-separated values with a header line.
+        With a header line.
     needed : sequence of str
         Columns that must be there.
 
@@ -56,9 +56,16 @@ def read_sheet(path: Path, needed: Sequence[str]) -> Iterator[Row]:
     ------
     Unusable
         With the reasons ``missing-file``, ``too-large``, ``empty``, and ``columns`` where one is
-        missing or stands there twice.
+        missing or there twice.
     """
-    records = _records(_lines(path))
+    try:
+        if (size := path.stat().st_size) > constants.SMALL_ENOUGH:
+            allowed = constants.SMALL_ENOUGH
+            raise Unusable("too-large", f"{size} bytes, allowed are {allowed}; split it")
+        text = path.read_bytes().decode("utf-8-sig", "surrogateescape")
+    except OSError as error:
+        raise Unusable("missing-file", f"cannot be opened: {error.strerror}") from error
+    records = _records(io.StringIO(text, newline=None).readlines())
     names = [name.strip() for name in next(records, ("", [], ""))[1]]
     if not names:
         raise Unusable("empty", f"no header line; needed {listed(needed)}")
@@ -76,27 +83,16 @@ def read_sheet(path: Path, needed: Sequence[str]) -> Iterator[Row]:
         yield Row(where, dict(zip(names, stripped, strict=False)), trouble)
 
 
-def _lines(path: Path) -> list[str]:
-    try:
-        if (size := path.stat().st_size) > constants.SMALL_ENOUGH:
-            raise Unusable(
-                "too-large", f"{size} bytes, allowed are {constants.SMALL_ENOUGH}; split it"
-            )
-        text = path.read_bytes().decode("utf-8-sig", "surrogateescape")
-    except OSError as error:
-        raise Unusable("missing-file", f"cannot be opened: {error.strerror}") from error
-    return io.StringIO(text, newline=None).readlines()
-
-
 def _records(lines: list[str]) -> Iterator[tuple[str, list[str], str]]:
     """Yield place, cells and trouble of each record.
 
-    Every record begins anew at the line after the last: else an open quote would swallow all rows
-    up to the next one, and nobody would miss them.
+    A new reader starts at the line after every record: an open quote would else include all rows
+    up to the next one without an error.
     """
     at = 0
     while at < len(lines):
-        reader = csv.reader(lines[at : at + _MOST_LINES], strict=True, skipinitialspace=True)
+        some = lines[at : at + constants.LONGEST_CELL]
+        reader = csv.reader(some, strict=True, skipinitialspace=True)
         try:
             cells, n, trouble = next(reader), reader.line_num, ""
         except csv.Error as error:
@@ -107,11 +103,8 @@ def _records(lines: list[str]) -> Iterator[tuple[str, list[str], str]]:
             yield where, cells, trouble
 
 
-_TOLD = 3
-
-
 def read_rows(path: Path, needed: Sequence[str]) -> pd.DataFrame:
-    """Read a table as text, cell by cell.
+    """Read a table of estimates as text.
 
     Raises
     ------
@@ -122,15 +115,14 @@ def read_rows(path: Path, needed: Sequence[str]) -> pd.DataFrame:
         table = pd.read_csv(path, dtype=str, keep_default_na=False)
     except (OSError, ValueError) as error:
         raise BadTable(f"{path}: cannot be read as a table: {error}") from error
-    missing = [name for name in needed if name not in table.columns]
-    if missing:
-        told = "; columns are parted by commas" if len(table.columns) == 1 else ""
-        raise BadTable(f"{path}: no column {missing}; there are {list(table.columns)}{told}")
+    if missing := [name for name in needed if name not in table.columns]:
+        hint = "; columns are separated by commas" if len(table.columns) == 1 else ""
+        raise BadTable(f"{path}: no column {missing}; there are {list(table.columns)}{hint}")
     return table
 
 
 def name_machine(path: Path, table: pd.DataFrame) -> list[str]:
-    """Fill in the column stage where there is none, in place, and give the note that says so."""
+    """Fill in a missing column stage, in place, and return a note of it."""
     if "stage" in table.columns:
         return []
     table["stage"] = path.stem
@@ -138,23 +130,21 @@ def name_machine(path: Path, table: pd.DataFrame) -> list[str]:
 
 
 def lines(table: pd.DataFrame, wrong: pd.Series[bool]) -> str:
-    """Name the first lines of the file that are meant."""
+    """Name the lines of the file that are marked, at most three of them."""
     found = [str(int(i) + 2) for i in table.index[wrong]]
-    more = f" and {len(found) - _TOLD} more" if len(found) > _TOLD else ""
-    return f"line {', '.join(found[:_TOLD])}{more}"
+    more = f" and {len(found) - _MOST_LISTED} more" if len(found) > _MOST_LISTED else ""
+    return f"line {', '.join(found[:_MOST_LISTED])}{more}"
 
 
 def to_numbers(path: Path, table: pd.DataFrame, names: Iterable[str]) -> None:
-    """Turn columns that are there into numbers, in place; empty cells into NaN.
+    """Convert columns to numbers, in place; empty cells to NaN, missing columns are ignored.
 
     Raises
     ------
     BadTable
-        If a cell holds something else.
+        For any other cell.
     """
-    for name in names:
-        if name not in table.columns:
-            continue
+    for name in [name for name in names if name in table.columns]:
         given = table[name].str.strip() != ""
         table[name] = pd.to_numeric(table[name], errors="coerce")
         wrong = given & ~np.isfinite(table[name])
@@ -163,22 +153,20 @@ def to_numbers(path: Path, table: pd.DataFrame, names: Iterable[str]) -> None:
 
 
 def to_moments(path: Path, table: pd.DataFrame) -> None:
-    """Turn the column recorded_at into moments, in place.
+    """Convert the column recorded_at to dates with time zone, in place.
 
     Raises
     ------
     BadTable
         If one is no ISO date with time zone.
     """
-    table["recorded_at"] = [_moment(path, i, text) for i, text in table["recorded_at"].items()]
-
-
-def _moment(path: Path, index: Any, text: str) -> datetime:
-    where = f"{path}, line {int(index) + 2}: recorded_at {text!r}"
-    try:
-        moment = datetime.fromisoformat(text)
-    except ValueError as error:
-        raise BadTable(f"{where} is no ISO date, such as 2026-03-01T06:00:00+00:00") from error
-    if moment.tzinfo is None:
-        raise BadTable(f"{where} needs a time zone, such as {text}+00:00")
-    return moment
+    moments = []
+    for index, text in zip(table.index, table["recorded_at"], strict=True):
+        where = f"{path}, line {int(index) + 2}: recorded_at {text!r}"
+        try:
+            moments.append(datetime.fromisoformat(text))
+        except ValueError as error:
+            raise BadTable(f"{where} is no ISO date, such as 2026-03-01T06:00:00+00:00") from error
+        if moments[-1].tzinfo is None:
+            raise BadTable(f"{where} needs a time zone, such as {text}+00:00")
+    table["recorded_at"] = moments

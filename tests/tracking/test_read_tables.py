@@ -115,7 +115,7 @@ def test_what_is_assumed_is_said(tmp_path: Path) -> None:
         (HEAD + row(std=""), "line 2: frequency_std_hz is missing"),
         (HEAD + row(std=-0.1), "line 2: frequency_std_hz is -0.1"),
         (HEAD + row(std=1e-9), "line 2: frequency_std_hz is 1e-09, below 1e-07 of the frequency"),
-        ("recorded_at;frequency_hz\n1;2\n", "columns are parted by commas"),
+        ("recorded_at;frequency_hz\n1;2\n", "columns are separated by commas"),
         (HEAD + row(f=0), "line 2: frequency_hz is 0"),
         (HEAD + row(f="fast"), "line 2: frequency_hz is no finite number"),
         (HEAD + row(f="inf"), "line 2: frequency_hz is no finite number"),
