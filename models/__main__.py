@@ -50,7 +50,7 @@ def _epilog(command: str) -> str:
 
 
 def _condition_options(command: Callable[..., None]) -> Callable[..., None]:
-    """Give a command the two health parameters as options."""
+    """Add the two health parameters to a command as options."""
     preload = click.option(
         "--preload", default=1.0, show_default=True, help="Guide preload, 1 as new."
     )
@@ -215,7 +215,7 @@ def map_command(stage: str, out: Path) -> None:
     type=click.Choice(UNTIL),
     default="now",
     show_default=True,
-    help="Where the last log stands: at 1,400 to 2,000 km, or past the first limit crossed.",
+    help="Odometer of the last log: at 1,400 to 2,000 km, or past the first limit crossed.",
 )
 @click.option(
     "--fault",
@@ -276,7 +276,7 @@ def sweep(stage: str, out: Path, file_format: str | None, **options: Any) -> Non
     The sine alone is the column current_excitation_a, with the servo's current it is current_a.
     A response to the first has the poles of the closed loop, as `modes` prints them; one to the
     second has those of the structure without it. Every period is a whole sweep; from the
-    difference between periods the noise is known. The suffix of --out says the format.
+    difference between periods the noise can be estimated. The suffix of --out selects the format.
     """
     chosen = format_of(out, file_format)
     wave = Sweep(*(options[name] for name in ("low", "high", "amplitude", "period", "law")))

@@ -1,4 +1,4 @@
-"""Named errors of the simulated stages: each says what was got and what is needed."""
+"""Errors of the simulated stages: each states the value found and what is needed."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ class ModelError(Exception):
 
 
 class _Unknown(ModelError):
-    """A name that is in no registry; carries the name and the known ones."""
+    """A name that is in no registry; carries the name and the registered ones."""
 
     noun = "name"
 
@@ -39,7 +39,7 @@ class UnknownReading(_Unknown):
 
 
 class UnknownServo(_Unknown):
-    """A servo_id for which no tuning of the loop is known."""
+    """A servo_id without a tuning of the loop."""
 
     noun = "servo_id"
 
@@ -76,7 +76,7 @@ class MissingLibrary(ModelError):
 
 
 class OccupiedFolder(ModelError):
-    """A folder that holds logs which a run would leave beside its own."""
+    """A folder with logs that a run would not overwrite."""
 
     def __init__(self, folder: str, log: str, count: int) -> None:
         self.folder = folder

@@ -1,6 +1,6 @@
 """Calibration of the free numbers of both stages to the paper's modal tables.
 
-The paper gives no preload, geometry, inertia or isolator: more unknowns than frequencies.  Each
+The paper states no preload, geometry, inertia or isolator: more unknowns than frequencies.  Each
 unknown therefore has a prior (a reasonable value and its relative width), and the fit is the most
 probable set.  Frequencies are those of the closed loop, which is what an observer sees.
 """
@@ -61,9 +61,9 @@ FREE = (
     Free("granite_spread_feed", ("lms-y",), 0.433, 0.2),
 )
 
-# Labels 1 and 3 of Table 5 are swapped between X and Y: the frequencies are what is met.
+# Labels 1 and 3 of Table 5 are swapped between X and Y: the frequencies are matched.
 # Of Table 2 (resonances seen along the feed) those are targets that three rigid bodies have and
-# that Table 5 does not give; between 160 and 350 Hz, and in X above 272 Hz, Table 2 lists more
+# that are not in Table 5; between 160 and 350 Hz, and in X above 272 Hz, Table 2 lists more
 # resonances than three bodies have modes that move along the feed.
 TARGETS = (
     Target("lms-x", "granite_feed", 12.6, 0.01, "Table 5"),

@@ -1,9 +1,9 @@
 """Equations (1)-(11) of the paper [Piscalov2021] as printed, as corrected, as derived.
 
-``printed`` has the digits and exponents of the text as it stands.
+``printed`` has the digits and exponents of the paper.
 
 ``corrected`` applies `ERRATA` to the printed coefficients; the open loops (10), (11) are then
-products of (6)-(9).  K_v = 15.0, which stands in the s³ term of (6) and (7) where R = 6.4 is
+products of (6)-(9).  K_v = 15.0, which is in the s³ term of (6) and (7) where R = 6.4 is
 expected, is kept.
 
 ``derived`` has no coefficient of the equations in it: the plant follows from (1)-(5) and the
@@ -32,7 +32,7 @@ PLANT = {"lms-x": 6, "lms-y": 7}
 CONTROLLER = {"lms-x": 8, "lms-y": 9}
 OPEN_LOOP = {"lms-x": 10, "lms-y": 11}
 
-# Constants of equation (3); those of the current loop (5) stand in `servo.Tuning`.
+# Constants of equation (3); those of the current loop (5) are in `servo.Tuning`.
 RESISTANCE = 6.4
 BACK_EMF = 15.0
 # Table 1 and the text; see the module's first lines.
@@ -62,7 +62,7 @@ class Ratio:
     def transfer_function(self) -> Any:
         """Return it as a ``control.TransferFunction``.
 
-        Good for values at given s.  Roots of high orders are lost to rounding: take poles and
+        Valid for values at single s.  Roots of high orders are lost to rounding: take poles and
         stability from `state_space` of the factors.
         """
         control = python_control()
@@ -103,7 +103,7 @@ class Ratio:
 
 @dataclass(frozen=True, slots=True)
 class Erratum:
-    """A printed coefficient that cannot stand, its equation, place (power of s) and reason."""
+    """A printed coefficient that is wrong, its equation, place (power of s) and reason."""
 
     equation: int
     part: Literal["numerator", "denominator"]
@@ -138,8 +138,8 @@ PRINTED = {
 
 _SIGN = "the exponent has lost its minus sign"
 ERRATA = (
-    Erratum(6, "denominator", 4, 6.126e-1, "s·L·m with the s that gives the s² term from K_i"),
-    Erratum(7, "denominator", 4, 5.580e-1, "s·L·m with the s that gives the s² term from K_i"),
+    Erratum(6, "denominator", 4, 6.126e-1, "s·L·m with the s that yields the s² term from K_i"),
+    Erratum(7, "denominator", 4, 5.580e-1, "s·L·m with the s that yields the s² term from K_i"),
     Erratum(7, "numerator", 0, 2.172e10, "K_i/K_p = 840 times the s term, as in equation (6)"),
     Erratum(8, "denominator", 5, 6.192e-3, _SIGN),
     Erratum(9, "denominator", 1, 1.977e10, "a digit too many: the low pass is then at 300 Hz"),

@@ -224,13 +224,13 @@ def _response(loop: Any, hertz: float | Array) -> ComplexArray:
 
 
 def _roots(curve: Callable[[float], float], grid: Array, values: Array) -> list[float]:
-    """Return where a curve, known on a grid, changes sign."""
+    """Return where a curve, sampled on a grid, changes sign."""
     at = np.flatnonzero(np.signbit(values[1:]) != np.signbit(values[:-1]))
     return [float(brentq(curve, grid[k], grid[k + 1], rtol=1e-12)) for k in at]
 
 
 def _crossovers(loop: Any, grid: Array, values: ComplexArray) -> tuple[Crossover, ...]:
-    """Return all crossovers, given the loop's response on a grid (Hz), ascending."""
+    """Return all crossovers from the loop's response on a grid (Hz), ascending."""
 
     def log_gain(hertz: float) -> float:
         return float(np.log(np.abs(_response(loop, hertz))))

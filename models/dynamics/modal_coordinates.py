@@ -185,7 +185,7 @@ def simulate(
     sample_rate_hz: float,
     rng: np.random.Generator,
 ) -> Array:
-    """Return a stationary record (output, time) under white held inputs of given std (input,).
+    """Return a stationary record (output, time) under held white noise of std (input,).
 
     The first state is drawn from the stationary distribution: no samples are thrown away.
     """

@@ -1,4 +1,4 @@
-"""How a mode looks: motion of the bodies, what the sensors see, where the strain energy sits."""
+"""Mode shapes: motion of the bodies, participation at the sensors, strain energy of the joints."""
 
 from __future__ import annotations
 

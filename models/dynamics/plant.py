@@ -39,7 +39,7 @@ NOISE_INPUTS = (
     "motor_force",
     "encoder_error",
 )
-# What the motion controller knows beforehand.
+# Signals that the motion controller has in advance.
 COMMAND_INPUTS = ("reference_acceleration", "feedforward_current")
 INPUTS = (*NOISE_INPUTS, *COMMAND_INPUTS)
 GUIDE_MODES = ("roll", "pitch", "yaw")
@@ -62,7 +62,7 @@ class LinearSystem:
     d: Array
 
     def driven_by(self, inputs: Sequence[str]) -> LinearSystem:
-        """Return the system with some of its inputs only, in the given order."""
+        """Return the system with some of its inputs only, in the order of the argument."""
         chosen = [INPUTS.index(name) for name in inputs]
         return LinearSystem(self.a, self.b[:, chosen], self.c, self.d[:, chosen])
 
@@ -228,11 +228,13 @@ def assurance(mass: Array, first: ComplexArray, second: ComplexArray) -> Array:
 
 
 def _match(
-    mass: Array, known: tuple[ComplexArray, ComplexArray], found: tuple[ComplexArray, ComplexArray]
+    mass: Array,
+    reference: tuple[ComplexArray, ComplexArray],
+    found: tuple[ComplexArray, ComplexArray],
 ) -> tuple[NDArray[np.intp], Array]:
-    """Assign each known (eigenvalues, shapes) to one of the found; return indices, assurance."""
-    similar = assurance(mass, known[1], found[1])
-    apart = np.log(np.abs(found[0])[None, :] / np.abs(known[0])[:, None])
+    """Match reference modes (eigenvalues, shapes) to found ones; return indices, assurance."""
+    similar = assurance(mass, reference[1], found[1])
+    apart = np.log(np.abs(found[0])[None, :] / np.abs(reference[0])[:, None])
     # Shapes of the same kind (platform and housing in pitch) differ little: frequency decides.
     rows, columns = linear_sum_assignment(-similar + np.minimum((apart / 0.3) ** 2, 4.0))
     return columns, similar[rows, columns]
@@ -248,8 +250,8 @@ def _nominal(stage: Stage, servo_id: str) -> tuple[tuple[str, ...], ComplexArray
     structure = build_structure(stage)
     named = named_modes(structure)
     values, shapes = _oscillations(stage, Condition(servo_id=servo_id))
-    known = (named.omega.astype(complex), named.shapes.astype(complex))
-    columns, similar = _match(structure.mass, known, (values, shapes))
+    reference = (named.omega.astype(complex), named.shapes.astype(complex))
+    columns, similar = _match(structure.mass, reference, (values, shapes))
     if similar.min() < _LOST_ASSURANCE:
         lost = named.names[int(np.argmin(similar))]
         where = f"{stage.name}, nominal condition, servo {servo_id}, {lost}"

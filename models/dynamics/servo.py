@@ -43,7 +43,7 @@ class Biquad:
     damping_below: float
 
     def __post_init__(self) -> None:
-        """Refuse numbers that are not positive."""
+        """Reject numbers that are not positive."""
         _refuse_not_positive(self)
 
 
@@ -75,7 +75,7 @@ class Tuning:
     resistance: float = 15.0
 
     def __post_init__(self) -> None:
-        """Refuse numbers that are not positive."""
+        """Reject numbers that are not positive."""
         _refuse_not_positive(self)
 
 

@@ -59,7 +59,7 @@ class Condition:
     servo_id: str = "commissioning"
 
     def __post_init__(self) -> None:
-        """Refuse conditions in which the laws of contact and mass mean nothing."""
+        """Reject conditions in which the laws of contact and mass mean nothing."""
         for name in ("guide_preload", "mount_stiffness", "guide_damping"):
             value = getattr(self, name)
             if not (math.isfinite(value) and 0.01 <= value <= 100.0):
@@ -78,7 +78,7 @@ class Stage:
     """All numbers of one configuration.
 
     ``mount_half_spacing``, ``isolator_half_spacing`` and ``block_half_spacing`` give the half
-    distances along x and y, and the height of the joints' plane.  What is added to the nominal
+    distances along x and y, and the height of the joints' plane.  A mass added to the nominal
     payload is a block of ``payload_box`` centred at ``payload_height``, straight above the centre
     of gravity of the moving mass.
     """
@@ -134,7 +134,7 @@ class Stage:
     acc_range: Number
 
     def __post_init__(self) -> None:
-        """Refuse a number without a known source, and a mass or stiffness that is not positive."""
+        """Reject a number without a source, and a mass or stiffness that is not positive."""
         for field in fields(self):
             entry = getattr(self, field.name)
             if isinstance(entry, Number | Point) and entry.source not in SOURCES:
@@ -267,13 +267,13 @@ def tuning_named(stage: str, servo_id: str) -> Tuning:
 
 
 def _box_radii(box: tuple[float, float, float]) -> tuple[float, float, float]:
-    """Return the radii of gyration (m) of a solid box with the given edges (m)."""
+    """Return the radii of gyration (m) of a solid box from its edges (m)."""
     x, y, z = box
     return math.hypot(y, z) / 12**0.5, math.hypot(x, z) / 12**0.5, math.hypot(x, y) / 12**0.5
 
 
 def _radii(stage: Stage, body: str) -> tuple[float, float, float]:
-    """Return the radii of gyration (m) of a body whose mass has given spreads.
+    """Return the radii of gyration (m) of a body from the spreads of its mass.
 
     A spread is the root mean square distance of the mass from the centre of gravity along an axis:
     any three make a possible body, which any three radii of gyration do not.
@@ -347,7 +347,7 @@ def corners(spacing: Point) -> list[tuple[float, float, float]]:
     return [(sx * x, sy * y, z) for sx in (1, -1) for sy in (1, -1)]
 
 
-# One look at a plant asks for its structure four times: nothing writes to what is kept.
+# Each evaluation of a plant needs its structure four times; cached values are read-only.
 @lru_cache(maxsize=64)
 def build_structure(stage: Stage, condition: Condition = NOMINAL) -> Structure:
     """Assemble the structure of a stage in a condition.

@@ -1,7 +1,7 @@
 """Rigid bodies joined by springs at points: mass, damping and stiffness matrices, named modes.
 
 Coordinates are the six motions (x, y, z, roll, pitch, yaw) of each body's centre of gravity,
-relative to the ground, bodies in the order in which they are given.
+relative to the ground, bodies in the order of the argument.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ class Body:
     radii: tuple[float, float, float]
 
     def __post_init__(self) -> None:
-        """Refuse a body without inertia, and one that no distribution of mass can be."""
+        """Reject a body without inertia, or with moments that no distribution of mass has."""
         if self.mass <= 0 or min(self.radii) <= 0:
             raise BadParameter(f"body {self.name}", (self.mass, self.radii), "positive inertia")
         moments = sorted(radius**2 for radius in self.radii)

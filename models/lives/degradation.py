@@ -35,7 +35,7 @@ class Law(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class HertzWear:
-    """Preload loss by wear: P(s) = (1 − (s/s_w)^n)^1.5, as Hertz gives for lost interference.
+    """Preload loss by wear: P(s) = (1 − (s/s_w)^n)^1.5, by Hertz contact with lost interference.
 
     Parameters
     ----------
@@ -208,7 +208,7 @@ class Life:
     jobs
         Added payload.
     work
-        What is done to it and when; ``servo`` brings the tuning ``retuned``.
+        Maintenance with its odometer; ``servo`` sets the tuning ``retuned``.
     """
 
     name: str
@@ -245,7 +245,7 @@ class Life:
 
 @dataclass(frozen=True, slots=True)
 class Draws:
-    """The parameters that a seed gives to any life; what happens once happens at ``event_km``."""
+    """Parameters of a life that its seed determines; single events are at ``event_km``."""
 
     wear: HertzWear
     loosening: Loosening
@@ -270,7 +270,7 @@ def draw_laws(rng: np.random.Generator) -> Draws:
     bolt = float(rng.uniform(0.65, 0.9))
     fresh, aged = float(rng.uniform(1.2, 1.5)), float(rng.uniform(0.7, 0.85))
     grease = Grease(event_km, fresh, aged, float(rng.uniform(600.0, 1000.0)))
-    # Weighed to 0.1 kg: what the log says of its payload is exact.
+    # Weighed to 0.1 kg: the payload in the log is exact.
     heavy, light = round(float(rng.uniform(1.0, 3.0)), 1), -round(float(rng.uniform(1.0, 2.0)), 1)
     jobs = Jobs((0.0, heavy, light), float(rng.uniform(200.0, 400.0)))
     return Draws(

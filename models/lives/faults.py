@@ -1,4 +1,4 @@
-"""Faults of the recording itself: what a real archive holds besides clean logs."""
+"""Faults of recordings, as real archives contain them."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def drop_samples(recording: Recording, rng: np.random.Generator) -> Recording:
     for start in rng.integers(1, count, _GAPS):
         keep[start : start + int(rng.integers(1, _LONGEST_GAP))] = False
     kept = {name: values[keep] for name, values in recording.columns.items()}
-    # Single precision would not tell one sample from the next after a few minutes.
+    # Single precision would not separate two samples after a few minutes.
     time = (np.arange(count) / SAMPLE_RATE_HZ)[keep]
     return Recording({"time_s": time, **kept}, recording.metadata)
 
@@ -51,7 +51,7 @@ def kill_channel(recording: Recording, rng: np.random.Generator) -> Recording:
 
 
 def mistake_gain(recording: Recording, rng: np.random.Generator) -> Recording:
-    """Write one accelerometer in g under a name that says m/s²."""
+    """Write one accelerometer in g under a column name in m/s²."""
     return _changed(recording, {_STRUCK: recording.columns[_STRUCK] / _STANDARD_GRAVITY})
 
 

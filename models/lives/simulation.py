@@ -1,4 +1,4 @@
-"""A life of one stage: schedule, logs, and the truth beside them."""
+"""Simulate the life of one stage: schedule, logs, and a table of the truth."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from models.recordings.recording import move_velocity, payload_kg, record
 
 _KM_PER_DAY = 12.0
 _NOW_KM = (1400.0, 2000.0)
-# A life that is followed to its failure goes on for this part of it.
+# A life that is simulated to its failure continues for this fraction of it.
 _PAST_FAILURE = 0.15
 UNTIL = ("now", "failure")
 _MAINTENANCE = ["stage", "recorded_at", "travel_km", "action"]
@@ -37,7 +37,7 @@ _THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
 class Plan:
     """What to simulate: stage and life by name, count of logs, seconds of each, seed.
 
-    ``until`` says where the last log stands: ``now``, at an odometer that does not depend on the
+    ``until`` sets the odometer of the last log: ``now``, at an odometer that does not depend on the
     life, or past its ``failure``.  ``faults`` are faults of the recording, by name: each strikes
     a tenth of the logs, at least one.
     """
@@ -52,7 +52,7 @@ class Plan:
     faults: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        """Refuse impossible plans before any file is written."""
+        """Reject impossible plans before any file is written."""
         if self.logs < 1:
             raise BadParameter("logs", self.logs, "at least 1")
         if self.seed < 0:
@@ -65,7 +65,7 @@ class Plan:
             raise BadParameter("until", self.until, " or ".join(UNTIL))
         if self.draw_life().failure_km() is None and self.until == "failure":
             raise BadParameter("until", self.until, f"now, as {self.life} crosses no limit")
-        # The first log stands at the beginning.
+        # The first log is at the beginning.
         if self.until == "failure" and self.logs < 2:
             raise BadParameter("logs", self.logs, "at least 2 for a life until its failure")
 
@@ -87,7 +87,7 @@ class Plan:
         ]
 
     def end_km(self, now_km: float) -> float:
-        """Return the odometer (km) of the last log, given that of the present."""
+        """Return the odometer (km) of the last log from that of the present."""
         failure = self.draw_life().failure_km()
         if self.until == "now" or failure is None:
             return now_km
@@ -110,7 +110,7 @@ def schedule(plan: Plan) -> list[Visit]:
     """Return the logs of a life, oldest first.
 
     Until now, the odometer of the last log does not depend on the life: how far a stage has run
-    says nothing about its damage.
+    does not depend on its damage.
     """
     rng = plan.rng("schedule")
     end_km = plan.end_km(float(rng.uniform(*_NOW_KM)))
@@ -180,7 +180,7 @@ def truth_row(stage: Stage, visit: Visit) -> dict[str, object]:
 
 @contextmanager
 def _single_threaded_children() -> Iterator[None]:
-    """Give child processes one linear-algebra thread each: two workers fill two cores."""
+    """Limit child processes to one linear-algebra thread each: two workers fill two cores."""
     before = {name: os.environ.get(name) for name in _THREADS}
     os.environ.update(dict.fromkeys(_THREADS, "1"))
     try:
@@ -260,7 +260,7 @@ def _maintenance(life: Life, visits: list[Visit]) -> pd.DataFrame:
 
 
 def _manifest(stage: Stage, visits: list[Visit]) -> pd.DataFrame:
-    """Return the manifest: what is known of each log without opening it."""
+    """Return the manifest: metadata of each log, as a user would list them."""
     return pd.DataFrame(
         [
             {

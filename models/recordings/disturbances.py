@@ -1,6 +1,6 @@
 """What shakes a moving stage: friction, guide roughness, ground, orders of the velocity, mains.
 
-The paper gives none of these levels: they are fitted to its Tables 3, 4, 6 and 7, see the study
+The paper states none of these levels: they are fitted to its Tables 3, 4, 6 and 7, see the study
 ``paper_tables``.
 """
 

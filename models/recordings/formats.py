@@ -16,7 +16,7 @@ _CHUNK = 1 << 16
 
 
 def _write_csv(recording: Recording, path: Path) -> None:
-    """Write `# key: value` lines, a header and shortest decimals that give float32 back."""
+    """Write `# key: value` lines, a header and the shortest decimals that round-trip float32."""
     with path.open("w", encoding="utf-8", newline="") as stream:
         for key, value in recording.metadata.items():
             stream.write(f"# {key}: {value}\n")
@@ -82,7 +82,7 @@ def file_suffix(file_format: str) -> str:
 
 
 def format_of(path: Path, wanted: str | None = None) -> str:
-    """Return the format that a file's suffix says.
+    """Return the format of a file's suffix.
 
     Parameters
     ----------
@@ -96,17 +96,17 @@ def format_of(path: Path, wanted: str | None = None) -> str:
     UnknownFormat
         If no writer is registered under the wanted name.
     """
-    known = {file_suffix(name): name for name in WRITERS if wanted in (None, name)}
-    if wanted is not None and not known:
+    suffixes = {file_suffix(name): name for name in WRITERS if wanted in (None, name)}
+    if wanted is not None and not suffixes:
         raise UnknownFormat(wanted, WRITERS)
-    if path.suffix not in known:
+    if path.suffix not in suffixes:
         chosen = "" if wanted is None else f", the suffix of {wanted}"
-        raise BadParameter("out", path.name, f"a name ending in {' or '.join(known)}{chosen}")
-    return known[path.suffix]
+        raise BadParameter("out", path.name, f"a name ending in {' or '.join(suffixes)}{chosen}")
+    return suffixes[path.suffix]
 
 
 def refuse_other_logs(folder: Path, names: Iterable[str]) -> None:
-    """Refuse a folder in which simulated logs of other names would stay beside a new manifest.
+    """Reject a folder where simulated logs of other names would stay next to a new manifest.
 
     Raises
     ------

@@ -24,7 +24,7 @@ def stream(stage: str, seed: int, step: str, *numbers: int) -> np.random.Generat
     Parameters
     ----------
     numbers
-        Tell apart what the step does several times.
+        Distinguish repetitions of the step.
     """
-    words = [seed, zlib.crc32(f"{stage}/{step}".encode()), *numbers]
-    return np.random.default_rng(np.random.SeedSequence(words))
+    entropy = [seed, zlib.crc32(f"{stage}/{step}".encode()), *numbers]
+    return np.random.default_rng(np.random.SeedSequence(entropy))

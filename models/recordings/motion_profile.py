@@ -49,7 +49,7 @@ class Profile:
     jerk: float = JERK
 
     def __post_init__(self) -> None:
-        """Refuse a move without end, or a stroke on which the set velocity is never reached."""
+        """Reject a move without end, or a stroke on which the set velocity is never reached."""
         for name in ("velocity", "stroke", "acceleration", "jerk"):
             value = getattr(self, name)
             if not (math.isfinite(value) and value > 0):
@@ -116,7 +116,7 @@ class Profile:
     def sampled(self, time: Array) -> Array:
         """Return position, velocity, acceleration and jerk (4, time) at times (s), SI.
 
-        Before the first stroke and after the last dwell the reference stands.
+        Before the first stroke and after the last dwell the reference is constant.
         """
         path = self.position()
         moving = (time >= path.x[0]) & (time < path.x[-1])

@@ -116,7 +116,7 @@ def _order_gains(
     frequency = cycles * abs(velocity)
     response = frequency_response(diagonalise(closed_loop(stage, condition)), frequency)
     gain = response[np.arange(frequency.size), :, inputs].T * amplitudes
-    # The drive's anti-alias filter removes what is above half the sample rate.
+    # The drive's anti-alias filter removes frequencies above half the sample rate.
     gain[:, frequency >= SAMPLE_RATE_HZ / 2] = 0.0
     return frequency, gain
 

@@ -76,16 +76,16 @@ def _add_orders(inputs: Array, drawn: Orders, reference: Array) -> None:
     position, velocity = reference[:2]
     moving = np.tanh(np.abs(velocity) / _TURNING)
     for cycles, index, amplitude in zip(*drawn, strict=True):
-        # The drive's anti-alias filter removes what is above half the sample rate.
-        heard = moving * (cycles * np.abs(velocity) < SAMPLE_RATE_HZ / 2)
-        inputs[index] += heard * (amplitude * np.exp(2j * np.pi * cycles * position)).real
+        # The drive's anti-alias filter removes frequencies above half the sample rate.
+        passed = moving * (cycles * np.abs(velocity) < SAMPLE_RATE_HZ / 2)
+        inputs[index] += passed * (amplitude * np.exp(2j * np.pi * cycles * position)).real
 
 
 def _lead_in_s(profile: Profile, start: float) -> float:
     """Return how long before a window (its start in s) the simulation has to begin, s.
 
-    Either the stage stands there, or it has moved evenly long enough to have forgotten how it got
-    into motion.
+    Either the stage is at rest, or it has moved evenly until the transients of its start have
+    decayed.
     """
     if start <= 0:
         return 0.0
@@ -96,7 +96,7 @@ def _lead_in_s(profile: Profile, start: float) -> float:
     if start - max(before) >= _FORGOTTEN_S:
         return _ORDERS_S
     # Back to a moment that is steady itself: not within a ramp.
-    # Just before 0, where the stage stands: at 0 the reference has its first jerk already.
+    # Just before 0, where the stage is at rest: at 0 the reference has its first jerk already.
     first = max(-0.01, start - _FORGOTTEN_S)
     inside = [path.x[i] for i in ramps if path.x[i] < first < path.x[i + 1]]
     return float(start - min([first, *(x - profile.ramp_s for x in inside)]))
@@ -126,7 +126,7 @@ def commanded(
     early = time[0] - np.arange(lead, 0, -1) / SAMPLE_RATE_HZ
     reference = profile.sampled(np.concatenate([early, time]))
     direct = diagonalise(closed_loop(stage, condition))
-    # What is commanded at the first sample has been commanded for long.
+    # The command of the first sample has been constant before.
     state = -(direct.b @ commands(stage, condition, reference[:, :1])[:, 0]) / direct.poles
     drawn = drawn_orders(stage, rng)
     outputs = np.empty((direct.c.shape[0], reference.shape[1]))
@@ -170,7 +170,7 @@ def record_strokes(
     profile
         Its last dwell does not count when the middle is found.
     seconds
-        Length of the window, s; what is longer than the move shows standstill at both ends.
+        Length of the window, s; longer than the move, it has standstill at both ends.
 
     Raises
     ------

@@ -3,7 +3,7 @@
 The sine is added to the servo's current, so that two responses can be read from such a log.  From
 ``current_excitation_a`` to a sensor it is that of the closed loop, whose poles are the modes of
 `closed_loop_modes` and of the modal map.  From ``current_a``, which holds servo and sine together,
-it is that of the structure alone: `without_loop` says where the poles are then.
+it is that of the structure alone: `without_loop` returns its poles.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ from models.recordings.recording import (
 
 Array = NDArray[np.float64]
 
-# In the contract's family of currents, so that a reader of logs knows its unit.
+# Among the contract's names of currents, which fixes its unit.
 EXCITATION = "current_excitation_a"
 _LAWS = ("log", "linear")
 # Columns of the outputs, in their order, and their unit's count in one of SI.
@@ -57,7 +57,7 @@ class Sweep:
         Changed by less than half a cycle per period, so that the phase has no jump.
     amplitude
         Of the current, A.  It adds up to 5 µm to the following error of stage Y at the defaults,
-        and ten times as much from 5 Hz on, where the loop gives way.
+        and ten times as much from 5 Hz on, where the loop is compliant.
     period
         s; a whole number of samples.
     law
@@ -71,7 +71,7 @@ class Sweep:
     law: str = "log"
 
     def __post_init__(self) -> None:
-        """Refuse a sweep that a log cannot hold."""
+        """Reject a sweep that a log cannot hold."""
         if not 0 < self.low_hz < self.high_hz < SAMPLE_RATE_HZ / 2:
             band = f"{self.low_hz}..{self.high_hz} Hz"
             raise BadParameter("band", band, f"0 < low < high < {SAMPLE_RATE_HZ / 2:g} Hz")
@@ -103,7 +103,7 @@ class Sweep:
 
 
 def _from_current(stage: Stage, condition: Condition) -> Diagonal:
-    """Return the closed loop with a current beside the servo's (A) as its only input."""
+    """Return the closed loop with a current (A), added to the servo's, as its only input."""
     diagonal = diagonalise(closed_loop(stage, condition))
     force = tuning_named(stage.name, condition.servo_id).force_constant
     index = INPUTS.index("motor_force")

@@ -33,7 +33,7 @@ class Experiment:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        """Refuse a window that no log can have."""
+        """Reject a window that no log can have."""
         sample_count(self.seconds)
 
     @property
