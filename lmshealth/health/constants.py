@@ -8,9 +8,9 @@ from __future__ import annotations
 MAX_EPOCHS = 40
 """Epochs that `infer` takes by default, some two seconds each; a trend shows no more detail."""
 
-# Convergence. Four independent ensembles are the least for which R-hat is calibrated, and 1.01 is
-# its recommended limit [Vehtari2021]; 50 autocorrelation times is what emcee's authors require for
-# an estimate of that time [ForemanMackey2013]. An epoch that needs more steps is not published.
+# Convergence. Four chains are the least that [Vehtari2021] recommends for R-hat, and 1.01 is its
+# recommended limit; 50 autocorrelation times are what the authors of emcee require for an estimate
+# of that time [ForemanMackey2013]. An epoch that needs more steps is not published.
 N_ENSEMBLES = 4
 MIN_AUTOCORRELATION_TIMES = 50
 MAX_R_HAT = 1.01
