@@ -118,18 +118,8 @@ class EpochPosterior:
 def one_at_a_time(stage: Stage, x: FloatArray) -> FloatArray:
     """Stack points with copies in which all parameters but one are at baseline.
 
-    Parameters
-    ----------
-    stage : Stage
-        Description with the baseline.
-    x : ndarray
-        Ln parameters, shape ``(n_points, n_parameters)``.
-
-    Returns
-    -------
-    ndarray
-        The points, then for each parameter the points with all others at baseline,
-        shape ``((1 + n_parameters) n_points, n_parameters)``.
+    Ln parameters ``(n_points, n_parameters)`` become ``((1 + n_parameters) n_points,
+    n_parameters)``: the points, then for each parameter those with all others at baseline.
     """
     stacked = np.empty((x.shape[1] + 1, *x.shape))
     stacked[0] = x

@@ -109,16 +109,9 @@ def importance_sample_to_ess(
 
 
 def tempered(points: FloatArray, log_weight: FloatArray, min_ess: float) -> WeightedDraws:
-    """Raise weights to the power, at most 1, that leaves an effective sample size.
+    """Raise weights ``(n,)`` of points ``(n, n_dim)`` to a power that leaves an effective size.
 
-    Parameters
-    ----------
-    points : ndarray
-        Shape ``(n, n_dim)``.
-    log_weight : ndarray
-        Shape ``(n,)``; -inf drops a point.
-    min_ess : float
-        Effective sample size to leave.
+    The power is at most 1; a log weight of -inf drops its point.
     """
     draws = _weighted(points, log_weight)
     low, high = 0.0, 1.0

@@ -21,7 +21,7 @@ from lmshealth.health.ensemble_sampling import (
     thin,
 )
 from lmshealth.health.epoch_posterior import EpochPosterior, MachineDrifts
-from lmshealth.health.laplace import approximate
+from lmshealth.health.laplace import Laplace, approximate
 from lmshealth.health.results import CHECKS, Health
 from lmshealth.stage.description import Stage
 from lmshealth.stage.identifiability import identifiability_of, identifiable_parameters
@@ -247,33 +247,26 @@ def _drifts_at(
     return modes, track.drift[k][columns], np.array(track.drift_cov[k][np.ix_(columns, columns)])
 
 
-def draw(posterior: EpochPosterior, seed: np.random.SeedSequence) -> Sample:
-    """Draw ln parameters from the posterior of an epoch.
+def draw(posterior: EpochPosterior, seed: np.random.SeedSequence) -> tuple[Sample, Laplace | None]:
+    """Draw ln parameters from the posterior of an epoch; return Laplace's approximation too.
 
     Raises
     ------
     NotConverged
         With the chains.
     """
-    return _draw(posterior, seed)[0]
-
-
-def _draw(
-    posterior: EpochPosterior, seed: np.random.SeedSequence
-) -> tuple[Sample, FloatArray, FloatArray]:
-    """Sample; return the draws, and mode and standard deviations of Laplace's approximation."""
     from scipy.stats import qmc  # late: it takes longer to import than all else here
 
     low, high = posterior.prior.support
     halton = qmc.Halton(low.size, scramble=False).random(_N_SEARCHED + 1)[1:]
     points = posterior.prior.quantile(halton)
     normal = approximate(posterior.log_probability, points, low, high)
-    if normal is None:
-        start = start_from_prior(posterior.log_probability, posterior.draw_prior)
-        none = np.full(low.size, np.nan)
-        return sample(posterior.log_probability, start, seed), none, none
-    start = start_near(normal.mode, normal.cov, posterior.log_probability)
-    return sample(posterior.log_probability, start, seed), normal.mode, normal.std
+    start = (
+        start_from_prior(posterior.log_probability, posterior.draw_prior)
+        if normal is None
+        else start_near(normal.mode, normal.cov, posterior.log_probability)
+    )
+    return sample(posterior.log_probability, start, seed), normal
 
 
 def _infer_epoch(
@@ -283,7 +276,7 @@ def _infer_epoch(
     chain_seed, wider_seed = stream(seed, epoch).spawn(2)
     found: dict[str, Any] = dict.fromkeys(CHECKS, np.full(len(posterior.prior.names), np.nan))
     try:
-        drawn, mode, std = _draw(posterior, chain_seed)
+        drawn, normal = draw(posterior, chain_seed)
     except NotConverged as error:
         chains = np.asarray(error.chains)
         if chains.ndim != 4:  # no start: a fault of the description, not of this epoch
@@ -298,8 +291,9 @@ def _infer_epoch(
         except NotConverged:  # only the check is missing
             wider = np.full((len(_LEVELS), x.shape[1]), np.nan)
         found |= {name: getattr(drawn, name) for name in ("ess_bulk", "ess_tail", "r_hat")}
-        found["laplace_shift"] = (x.mean(axis=0) - mode) / std
-        found["laplace_ratio"] = x.std(axis=0) / std
+        if normal is not None:
+            found["laplace_shift"] = (x.mean(axis=0) - normal.mode) / normal.std
+            found["laplace_ratio"] = x.std(axis=0) / normal.std
         found["prior_shift"] = (wider[1] - middle) / x.std(axis=0)
         found["prior_ratio"] = (wider[2] - wider[0]) / (high - low)
     found |= {"draws": draws, "converged": converged}
@@ -315,26 +309,17 @@ def _wider_quantiles(
 
     NaN for a parameter whose prior the map hardly lets widen.
     """
-    quantiles = _under_wider_priors(posterior, drawn, seed)
-    ends = np.array([[_LEVELS[0]], [_LEVELS[-1]]])
-    before, after = (
-        np.ptp(prior.quantile(ends), axis=0)
-        for prior in (posterior.prior, posterior.widened().prior)
-    )
-    return np.where(after < constants.MIN_WIDENING * before, np.nan, quantiles)
-
-
-def _under_wider_priors(
-    posterior: EpochPosterior, drawn: Sample, seed: np.random.SeedSequence
-) -> FloatArray:
-    x, wider = drawn.flat, posterior.widened()
-    log_weight = wider.prior.log_density(x) - posterior.prior.log_density(x)
+    x, prior, wider = drawn.flat, posterior.prior, posterior.widened()
+    log_weight = wider.prior.log_density(x) - prior.log_density(x)
     weight = np.exp(log_weight - log_weight.max())
     if weight.sum() ** 2 / np.sum(weight**2) < _MIN_SHARE * weight.size:
-        return np.quantile(_draw(wider, seed)[0].flat, _LEVELS, axis=0)
-    return np.column_stack(
-        [np.quantile(column, _LEVELS, weights=weight, method="inverted_cdf") for column in x.T]
-    )
+        quantiles = np.quantile(draw(wider, seed)[0].flat, _LEVELS, axis=0)
+    else:
+        options: dict[str, Any] = {"weights": weight, "method": "inverted_cdf"}
+        quantiles = np.column_stack([np.quantile(one, _LEVELS, **options) for one in x.T])
+    ends = np.array([[_LEVELS[0]], [_LEVELS[-1]]])
+    before, after = (np.ptp(one.quantile(ends), axis=0) for one in (prior, wider.prior))
+    return np.where(after < constants.MIN_WIDENING * before, np.nan, quantiles)
 
 
 def _infer_all(

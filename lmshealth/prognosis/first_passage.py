@@ -64,39 +64,27 @@ def first_passage(
     left[above & (left <= 0)] = np.inf
     moving = (rate > 0) & (left > 0)
     if moving.any():
-        left[moving] = _with_deviation(
-            path,
-            theta[moving],
-            off[moving] - np.log(limit),
-            rate[moving],
-            rng,
-            now=now,
-            near=np.minimum(_BEYOND * left[moving], 0.5 * horizon),
-            horizon=horizon,
-        )
+        near = np.minimum(_BEYOND * left[moving], 0.5 * horizon)[:, None]
+        fraction, rest = np.linspace(0, 1, _NEAR + 1), np.linspace(0, 1, _FAR + 1)[1:]
+        ahead = np.hstack([near * fraction, near + (horizon - near) * rest])
+        with np.errstate(divide="ignore"):  # health is 0 past the end of a law
+            distance = np.log(path.health(theta[moving], now + ahead))
+        distance += (off[moving] - np.log(limit))[:, None]
+        left[moving] = _with_deviation(distance, ahead, rate[moving], rng)
     return left
 
 
 def _with_deviation(
-    path: DegradationPath,
-    theta: FloatArray,
-    above: FloatArray,
-    rate: FloatArray,
-    rng: np.random.Generator,
-    *,
-    now: float,
-    near: FloatArray,
-    horizon: float,
+    distance: FloatArray, ahead: FloatArray, rate: FloatArray, rng: np.random.Generator
 ) -> FloatArray:
-    fraction = np.linspace(0, 1, _NEAR + 1)
-    rest = np.linspace(0, 1, _FAR + 1)[1:]
-    ahead = np.hstack([near[:, None] * fraction, near[:, None] + (horizon - near)[:, None] * rest])
+    """Draw the first passage of 0 by a Wiener process about a path.
+
+    Path of ln health over the limit, and travel from now in m, both ``(n, n_grid)``; variance of
+    the process per m ``(n,)``.
+    """
     step = np.diff(ahead, axis=1)
     variance = rate[:, None] * step
-    walk = np.cumsum(np.sqrt(variance) * rng.standard_normal(step.shape), axis=1)
-    with np.errstate(divide="ignore"):  # health is 0 past the end of a law
-        distance = np.log(path.health(theta, now + ahead)) + above[:, None]
-    distance[:, 1:] += walk
+    distance[:, 1:] += np.cumsum(np.sqrt(variance) * rng.standard_normal(step.shape), axis=1)
     a, b = distance[:, :-1], distance[:, 1:]
     # Below the limit at the end of the interval, or the bridge touches it in between.
     with np.errstate(invalid="ignore", over="ignore"):
@@ -107,8 +95,8 @@ def _with_deviation(
         np.take_along_axis(part, first, axis=1)[:, 0] for part in (a, b, ahead[:, :-1], step)
     )
     # First passage t of a bridge of length T that touches 0: t / (T - t) is inverse Gaussian.
-    spread = rate * length
     with np.errstate(divide="ignore", invalid="ignore"):
-        odds = rng.wald(np.clip(a / np.abs(b), _RARE, 1 / _RARE), np.maximum(a * a / spread, _RARE))
+        mean = np.clip(a / np.abs(b), _RARE, 1 / _RARE)
+        odds = rng.wald(mean, np.maximum(a * a / (rate * length), _RARE))
     share = np.where(np.isneginf(b), 0.5, odds / (1 + odds))
     return np.where(crossed.any(axis=1), begin + length * share, np.inf)

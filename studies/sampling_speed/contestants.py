@@ -78,7 +78,7 @@ def ours(posterior: EpochPosterior, seed: int) -> Found:
     """Draw as `lmshealth infer` does: Laplace's start, four ensembles, arviz's judgement."""
 
     def work() -> tuple[Array, float]:
-        found = draw(posterior, stream(seed))
+        found, _ = draw(posterior, stream(seed))
         ess = min(found.ess_bulk.min(), found.ess_tail.min())
         return np.quantile(found.flat, LEVELS, axis=0), float(ess)
 

@@ -116,7 +116,7 @@ def test_ensembles_of_one_process_differ(drawn: Sample) -> None:
 
 @pytest.mark.slow
 def test_sample_sizes_are_honest() -> None:
-    """Means of independent samples scatter by as much as their effective sample size says."""
+    """Means of independent samples scatter by as much as for their effective sample size."""
     found = [sample(gaussian, begin, stream(7, 20 + k)) for k in range(24)]
     means = np.array([one.flat.mean(axis=0) for one in found])
     ess = np.mean([one.ess_bulk for one in found], axis=0)
@@ -173,7 +173,7 @@ def test_one_dimension_with_an_edge() -> None:
 
 @pytest.mark.slow
 def test_modes_far_apart_are_refused_with_their_chains(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Ensembles that keep to their own mixture of two far modes are told from a posterior."""
+    """Ensembles that stay in their own mixture of two far modes do not converge."""
     monkeypatch.setattr(constants, "MAX_STEPS", 1200)
 
     def two(x: FloatArray) -> FloatArray:
@@ -191,7 +191,7 @@ def test_modes_far_apart_are_refused_with_their_chains(monkeypatch: pytest.Monke
 
 
 def test_too_few_steps_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Fewer steps than 50 autocorrelation times are not enough, however good they look."""
+    """Fewer steps than 50 autocorrelation times are not enough, whatever R-hat is."""
     monkeypatch.setattr(sampling, "_FIRST_STEPS", 60)
     monkeypatch.setattr(constants, "MAX_STEPS", 60)
     with pytest.raises(NotConverged, match="needed are 50"):
@@ -219,11 +219,11 @@ def test_chains_grow_by_half_at_least(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(autocorr, "integrated_time", counted)
     with pytest.raises(NotConverged, match=r"after 50 steps .* R-hat 2\.000"):
         sample(gaussian, arrived, stream(15))
-    looks = np.unique(lengths)
-    assert looks[0] == first
-    assert looks[-1] == most
-    assert looks.size > 2
-    assert (looks[1:] >= np.minimum(1.5 * looks[:-1], most)).all()
+    lengths_seen = np.unique(lengths)
+    assert lengths_seen[0] == first
+    assert lengths_seen[-1] == most
+    assert lengths_seen.size > 2
+    assert (lengths_seen[1:] >= np.minimum(1.5 * lengths_seen[:-1], most)).all()
 
 
 def test_a_walker_that_never_moves_is_no_convergence(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -341,14 +341,14 @@ def test_starts_go_on_until_they_have_arrived() -> None:
 
 
 def test_a_prior_outside_the_support_is_refused() -> None:
-    """Where no draw of the prior is possible the error says what to widen, with the draws."""
+    """Where no draw of the prior is possible the error names what to widen, with the draws."""
     with pytest.raises(NotConverged, match="widen the map or the prior") as caught:
         start_from_prior(lambda x: np.full(x.shape[0], -np.inf), wide)(np.random.default_rng(3))
     assert np.asarray(caught.value.chains).shape[-1] == 2
 
 
 def test_a_prior_with_too_few_possible_draws_is_refused() -> None:
-    """Where fewer draws are possible than an ensemble has walkers the error says so."""
+    """Where fewer draws are possible than an ensemble has walkers the error gives both numbers."""
 
     def seldom(x: FloatArray) -> FloatArray:
         possible = np.arange(x.shape[0]) < 7

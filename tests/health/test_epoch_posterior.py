@@ -57,7 +57,7 @@ def test_log_posterior_is_the_textbook_one(tmp_path: Path, model_std: float) -> 
 
 
 def test_outside_the_map_is_impossible_and_raises_nothing(stage: Stage) -> None:
-    """Points outside have log probability minus infinity beside finite ones inside."""
+    """Points outside have log probability minus infinity, points inside a finite one."""
     posterior = EpochPosterior.of(stage, ("roll", "pitch"), true_drift(NAMES, TRUTH)[:2], COV)
     x = np.array([[0.0, 0.0], [-9.0, 0.0], [0.0, 9.0], [-0.1, -0.1]])
     found = posterior.log_probability(x)

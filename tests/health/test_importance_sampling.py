@@ -27,7 +27,7 @@ def start(n_dim: int, seed: int = 1) -> FloatArray:
 
 
 def gaussian(n_dim: int) -> Density:
-    """Give a correlated Gaussian off the origin, far narrower than where one begins."""
+    """Return a correlated Gaussian off the origin, far narrower than the start."""
     rng = np.random.default_rng(n_dim)
     root = 0.2 * rng.standard_normal((n_dim, n_dim)) + 0.1 * np.eye(n_dim)
     book = stats.multivariate_normal(np.linspace(-1, 2, n_dim), root @ root.T)
@@ -35,7 +35,7 @@ def gaussian(n_dim: int) -> Density:
 
 
 def two_peaks(x: FloatArray) -> FloatArray:
-    """Give 30 % about (-3, -3) and 70 % about (3, 3), twelve standard deviations apart."""
+    """Return 30 % about (-3, -3) and 70 % about (3, 3), twelve standard deviations apart."""
     parts = [
         np.log(share) + stats.multivariate_normal(np.full(2, centre), 0.5**2).logpdf(x)
         for share, centre in ((0.3, -3.0), (0.7, 3.0))
@@ -44,12 +44,12 @@ def two_peaks(x: FloatArray) -> FloatArray:
 
 
 def half(x: FloatArray) -> FloatArray:
-    """Give a Gaussian of which the left half is missing."""
+    """Return a Gaussian without its left half."""
     return np.where(x[:, 0] > 0, LN_SCALE + stats.norm.logpdf(x).sum(axis=1), -np.inf)
 
 
 def banana(x: FloatArray) -> FloatArray:
-    """Give y about 0.3 x²."""
+    """Return y about 0.3 x²."""
     y = stats.norm(0.3 * x[:, 0] ** 2, 0.5)
     return LN_SCALE + stats.norm.logpdf(x[:, 0]) + y.logpdf(x[:, 1])
 
@@ -81,7 +81,7 @@ def test_evidences_are_right_within_their_error(density: Density, n_dim: int, kn
 
 @pytest.mark.slow
 def test_the_stated_error_is_that_of_many_evidences() -> None:
-    """Evidences of 40 seeds scatter by no more than their effective sample sizes say."""
+    """Evidences of 40 seeds scatter by no more than for their effective sample sizes."""
     scores = []
     for seed in range(40):
         found = importance_sample(
@@ -97,7 +97,7 @@ def test_the_stated_error_is_that_of_many_evidences() -> None:
 
 
 def test_peaks_far_apart_have_their_share() -> None:
-    """Draws stand on both peaks as their integrals do, weighted and resampled."""
+    """Draws are on both peaks by their integrals, weighted and resampled."""
     rng = np.random.default_rng(3)
     found = importance_sample_to_ess(two_peaks, start(2), rng, 4000)
     right = found.points[:, 0] > 0
@@ -133,7 +133,7 @@ def test_points_are_resampled_by_their_weight() -> None:
 
 
 def test_the_generator_alone_decides() -> None:
-    """One seed gives the same draws, another one others."""
+    """One seed has the same draws, another one others."""
     one, two, other = (
         importance_sample(two_peaks, start(2), np.random.default_rng(seed), 500)
         for seed in (6, 6, 7)
@@ -162,14 +162,14 @@ def test_too_few_draws_are_drawn_anew() -> None:
 
 
 def test_what_stays_too_little_is_refused_with_its_points() -> None:
-    """After three times less than 400 effective draws are an error that says so."""
+    """After three times less than 400 effective draws are an error with their number."""
     with pytest.raises(NotConverged, match=r"of 270 by importance.*needed are 400") as caught:
         importance_sample_to_ess(gaussian(2), start(2), np.random.default_rng(10), 30)
     assert np.shape(caught.value.chains) == (270, 2)
 
 
 def test_a_start_outside_of_the_support_is_refused() -> None:
-    """Where no point has a density the error says what to widen, with the points."""
+    """Where no point has a density the error names what to widen, with the points."""
     with pytest.raises(NotConverged, match="widen the map or the prior") as caught:
         importance_sample(half, -np.abs(start(2)), np.random.default_rng(11), 500)
     assert np.shape(caught.value.chains) == (600, 2)

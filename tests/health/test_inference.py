@@ -1,4 +1,4 @@
-"""Health of one epoch against grid integration, and what the data do not tell."""
+"""Health of one epoch against grid integration, its diagnostics, and refusals."""
 
 from __future__ import annotations
 
@@ -91,7 +91,7 @@ def test_posterior_quantiles_are_those_of_a_grid(stage: Stage, health: Health) -
 
 
 @pytest.mark.slow
-def test_health_is_sharp_where_modes_tell_it(health: Health) -> None:
+def test_identifiable_health_is_sharp(health: Health) -> None:
     """The truth lies inside, both epochs converge, and the data and not the prior speak."""
     low, high = health.quantile(np.array([0.005, 0.995]))
     assert ((low[-1] < np.exp(TRUTH)) & (np.exp(TRUTH) < high[-1])).all()
@@ -102,7 +102,7 @@ def test_health_is_sharp_where_modes_tell_it(health: Health) -> None:
 
 @pytest.mark.slow
 def test_map_error_widens_the_posterior(tmp_path: Path, worn: Track, health: Health) -> None:
-    """A map that is believed less gives wider health, in proportion to the drift."""
+    """A larger model_std makes health wider, in proportion to the drift."""
     doubtful = infer(worn, make_stage(tmp_path, model_std=0.2), 5, epochs=[2])
     ratio = doubtful.samples[0].std(axis=0) / health.samples[1].std(axis=0)
     assert (ratio > 2).all()
@@ -122,7 +122,7 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.usefixtures("quick")
 def test_an_epoch_has_its_own_stream(stage: Stage, worn: Track) -> None:
-    """An epoch inferred alone gives the very draws it gives among others; another seed does not."""
+    """An epoch alone has the same draws as among others; another seed has not."""
     both, alone = infer(worn, stage, 5), infer(worn, stage, 5, epochs=[2])
     other = infer(worn, stage, 6, epochs=[2])
     np.testing.assert_array_equal(alone.samples[0], both.samples[1])
@@ -181,7 +181,7 @@ def test_a_parameter_no_mode_sees_keeps_its_prior(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_one_mode_cannot_tell_two_parameters(stage: Stage) -> None:
+def test_one_mode_does_not_identify_two_parameters(stage: Stage) -> None:
     """With one mode the posterior is a ridge: the product is sharp, the two are strongly tied."""
     drift = true_drift(NAMES, TRUTH)[:1]
     found = infer(epochs([drift], COV[:1, :1]), stage, 10)
@@ -255,7 +255,7 @@ def test_logs_on_the_spot_of_the_baseline_are_no_epochs(stage: Stage) -> None:
     assert epochs_to_infer(followed, stage, 100) == (3, 4, 5, 6, 7)
 
 
-def test_a_sampler_that_fails_is_told_epoch_by_epoch(
+def test_a_sampler_that_fails_is_reported_by_epoch(
     stage: Stage, worn: Track, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A refusal of the sampler keeps its chains but claims no convergence and no sample size."""
@@ -290,16 +290,16 @@ def test_a_track_of_the_baseline_alone_is_refused(stage: Stage) -> None:
 
 
 @pytest.mark.slow
-def test_laplace_stands_beside_the_sampler(
+def test_laplace_checks_the_sampler(
     tmp_path: Path, stage: Stage, worn: Track, health: Health
 ) -> None:
-    """Both agree where the posterior is all but normal; where it is not, by how much is told."""
+    """Both agree where the posterior is all but normal; where it is not, the difference is reported."""
     sure = infer(worn, make_stage(tmp_path, model_std=0.0), 5, epochs=[2])
     assert (np.abs(sure.laplace_shift) < 0.06).all()
     assert (np.abs(sure.laplace_ratio - 1) < 0.04).all()
     # The error of the map grows with the loss and bends the posterior.
     assert (np.abs(health.laplace_ratio[1] - 1) > 0.05).all()
-    # A prior that ends inside the posterior: no normal distribution is like it, and it is said.
+    # A prior that ends inside the posterior: no normal distribution approximates it.
     cut = make_stage_with(stage, low=0.76)
     found = infer(worn, cut, 5, epochs=[2])
     assert np.isnan(found.laplace_shift).all()
@@ -309,7 +309,7 @@ def test_laplace_stands_beside_the_sampler(
 
 
 def make_stage_with(stage: Stage, low: float, high: float = 1.2) -> Stage:
-    """Give the stage with a uniform prior of the preload."""
+    """Return the stage with a uniform prior of the preload."""
     preload, mount = stage.parameters
     bounded = msgspec.structs.replace(preload, prior=Uniform(low, high))
     description = msgspec.structs.replace(stage.description, parameter=(bounded, mount))
@@ -317,8 +317,10 @@ def make_stage_with(stage: Stage, low: float, high: float = 1.2) -> Stage:
 
 
 @pytest.mark.slow
-def test_what_the_prior_does_is_told(tmp_path: Path, worn: Track, health: Health) -> None:
-    """Priors twice as wide hardly move what the data tell, and widen by twice what they do not."""
+def test_the_influence_of_the_prior_is_reported(
+    tmp_path: Path, worn: Track, health: Health
+) -> None:
+    """Priors twice as wide hardly move informed parameters, and widen others by two."""
     assert (np.abs(health.prior_shift) < 0.2).all()
     assert (np.abs(health.prior_ratio - 1) < 0.05).all()
     blind = infer(worn, make_stage(tmp_path, (PRELOAD, MOUNT, FOOT)), 6, epochs=[2])
@@ -333,7 +335,7 @@ def test_what_the_prior_does_is_told(tmp_path: Path, worn: Track, health: Health
 def test_reweighting_and_sampling_agree(stage: Stage, monkeypatch: pytest.MonkeyPatch) -> None:
     """The wider posterior is the same by weights on the draws and by chains of its own.
 
-    Where weights would be far from even, chains are taken: what weights would say is too narrow.
+    Where weights would be far from even, chains are taken: reweighting is too narrow.
     """
     cov = 60 * COV
     track = epochs([true_drift(NAMES, TRUTH)[:2]], cov)
@@ -369,7 +371,7 @@ def test_the_wider_posterior_may_have_draws_of_its_own(
 
 @pytest.mark.slow
 def test_correlation_is_that_of_the_draws(health: Health) -> None:
-    """Preload and mount trade off, and by how much is told."""
+    """The correlation is that of the draws: preload and mount trade off."""
     for k in range(2):
         known = np.corrcoef(np.log(health.samples[k]).T)
         np.testing.assert_allclose(health.correlation[k], known, atol=1e-12)
@@ -403,7 +405,7 @@ def two_machines(stage: Stage, offset: timedelta) -> list[tuple[Track, Stage]]:
 
 @pytest.mark.slow
 def test_a_shared_guide_is_known_better(stage: Stage) -> None:
-    """Two machines on one guide tell its preload better than either; their mounts stay their own.
+    """Two machines on one guide inform its preload better than one; mounts stay apart.
 
     The posterior is that of a grid over all three parameters.
     """
@@ -479,8 +481,8 @@ def test_health_goes_to_arviz_and_back(health: Health, tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_drifts_that_no_state_explains_claim_nothing(tmp_path: Path) -> None:
-    """Modes that moved against the map are told as such, and nothing is told from them."""
+def test_unexplained_drifts_inform_no_parameter(tmp_path: Path) -> None:
+    """Drifts against the map are unexplained, and inform no parameter."""
     stage = make_stage(tmp_path, n_modes=3)
     right = true_drift(NAMES, TRUTH)
     cov = 1e-6 * np.eye(3)
@@ -496,7 +498,7 @@ def test_drifts_that_no_state_explains_claim_nothing(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_a_posterior_at_the_edge_of_the_map_is_a_bound(stage: Stage) -> None:
-    """Drifts further than the map reaches pile up at its end, which is told by parameter."""
+    """Drifts further than the map reaches pile up at its end, reported by parameter."""
     edge = np.log([AXES["guide_preload"][0], 0.9])
     beyond = infer(epochs([1.3 * true_drift(NAMES, edge)[:2]], COV), stage, 1)
     assert beyond.at_edge[-1].tolist() == [True, False]
@@ -513,10 +515,10 @@ def test_machines_of_one_name_are_refused(stage: Stage) -> None:
         infer_together(machines, ["guide_preload"], 4)
 
 
-def test_nothing_is_told_by_what_did_not_converge(
+def test_an_epoch_without_convergence_informs_no_parameter(
     stage: Stage, worn: Track, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """However narrow its draws, an epoch without convergence tells nothing; its edge is told."""
+    """An epoch without convergence informs no parameter; its edge is reported."""
     low = np.log(AXES["guide_preload"][0])
 
     def fail(*_: object) -> None:
@@ -540,7 +542,7 @@ def test_a_check_that_fails_leaves_the_posterior(
     def fail(*_: object) -> FloatArray:
         raise NotConverged("stuck", np.zeros((4, 50, 32, 2)))
 
-    monkeypatch.setattr(inference, "_under_wider_priors", fail)
+    monkeypatch.setattr(inference, "_wider_quantiles", fail)
     found = infer(worn, stage, 5, epochs=[2])
     assert found.converged.all()
     np.testing.assert_array_equal(found.samples, right.samples)
@@ -550,7 +552,7 @@ def test_a_check_that_fails_leaves_the_posterior(
 
 @pytest.mark.slow
 def test_a_prior_as_wide_as_the_map_has_no_check(stage: Stage, worn: Track) -> None:
-    """Where the map keeps a prior from getting wider nothing is said of what hangs on it."""
+    """Where the map keeps a prior from widening the check is missing."""
     found = infer(worn, make_stage_with(stage, low=0.21), 5, epochs=[2])
     assert np.isfinite(found.prior_ratio[0, 1])
     low, high = AXES["guide_preload"][[0, -1]]
@@ -562,7 +564,7 @@ def test_a_prior_as_wide_as_the_map_has_no_check(stage: Stage, worn: Track) -> N
 
 @pytest.mark.slow
 def test_what_is_identifiable_goes_by_the_modes_of_an_epoch(tmp_path: Path) -> None:
-    """One mode of two tells the mount beside the preload, but not the preload beside the mount."""
+    """One mode of two identifies the mount, but not the preload."""
     stage = make_stage(tmp_path)
     drift = np.vstack([np.zeros(2), np.tile(true_drift(NAMES, TRUTH)[:2], (2, 1))])
     cov = np.stack([np.zeros((2, 2)), COV, COV])

@@ -31,7 +31,7 @@ def test_a_gaussian_is_its_own_approximation() -> None:
 
 
 def test_a_skew_density_has_its_curvature() -> None:
-    """Of a gamma density in the logarithm, mode and curvature are known: ln k and 1/k."""
+    """Of a gamma density in the logarithm, mode and curvature are ln k and 1/k."""
     k = 12.0
 
     def gamma(x: FloatArray) -> FloatArray:

@@ -43,7 +43,7 @@ def around(preload: float, mount: float, n: int = 1000) -> FloatArray:
 
 
 def test_degraded_is_a_quarter_of_what_may_be_lost(stage: Stage, tmp_path: Path) -> None:
-    """Without a limit a loss of 40 % stands for one."""
+    """Without a limit a loss of 40 % is the limit."""
     assert [degraded_below(p) for p in stage.parameters] == pytest.approx([0.9, 0.925])
     foot = make_stage(tmp_path, (PRELOAD, MOUNT, FOOT)).parameters[2]
     assert degraded_below(foot) == pytest.approx(0.9)
@@ -58,7 +58,7 @@ def test_degraded_is_a_quarter_of_what_may_be_lost(stage: Stage, tmp_path: Path)
         (0.7, 0.75, "both"),
     ],
 )
-def test_the_word_is_what_the_draws_say(
+def test_the_verdict_is_that_of_the_draws(
     stage: Stage, preload: float, mount: float, word: str
 ) -> None:
     """Clear cases get their word with probability near 1, and numbers in the sentence."""
@@ -102,8 +102,8 @@ def test_a_verdict_names_every_degraded_parameter(
     assert found.probability > 0.99
 
 
-def test_a_parameter_the_logs_do_not_tell_is_left_out(stage: Stage) -> None:
-    """An uninformed mount cannot be blamed, however low its draws lie, and the sentence says so."""
+def test_an_uninformed_parameter_is_left_out(stage: Stage) -> None:
+    """An uninformed mount is not in the verdict, however low its draws are, and the sentence names it."""
     found = judge(stage, logs(8), make_health(around(0.99, 0.5), informed=(0.9, 0.1)))
     assert found.verdict == "healthy"
     assert "Mount stiffness: not constrained by these logs." in found.why
@@ -119,7 +119,7 @@ def stepped(*, declared: bool = False, epoch: int = 5, evidence: float = 30.0) -
     return replace(bare, events=events)
 
 
-def test_a_jump_that_nobody_explains_is_the_verdict(stage: Stage) -> None:
+def test_an_undeclared_step_is_the_verdict(stage: Stage) -> None:
     """The word is step, with what jumped and what health is left; its odds are the evidence's."""
     health = make_health(around(0.99, 0.6))
     found = judge(stage, logs(8), health, stepped(evidence=3.0))
@@ -132,7 +132,7 @@ def test_a_jump_that_nobody_explains_is_the_verdict(stage: Stage) -> None:
     assert judge(stage, logs(8), None, stepped()).verdict == "step"
 
 
-def test_a_jump_that_is_explained_or_past_is_not_the_verdict(stage: Stage) -> None:
+def test_a_declared_or_past_step_is_not_the_verdict(stage: Stage) -> None:
     """Declared steps, and those before the last overhaul, leave the word to health."""
     health = make_health(around(0.99, 0.99))
     assert judge(stage, logs(8), health, stepped(declared=True)).verdict == "healthy"
@@ -148,7 +148,7 @@ def test_a_jump_that_is_explained_or_past_is_not_the_verdict(stage: Stage) -> No
         (8, {"informed": (0.2, 0.4)}, "do not constrain any health parameter"),
     ],
 )
-def test_too_little_data_gets_no_word(
+def test_too_little_data_has_no_verdict(
     stage: Stage, n_logs: int, options: dict, needle: str
 ) -> None:
     """Few logs, no convergence or no information: not-enough-data, without a probability."""
@@ -158,8 +158,8 @@ def test_too_little_data_gets_no_word(
     assert needle in found.why
 
 
-def test_without_health_there_is_no_word(stage: Stage) -> None:
-    """Logs that do not carry the parameters are told as such."""
+def test_without_health_there_is_no_verdict(stage: Stage) -> None:
+    """Logs without health have the reason in the verdict."""
     found = judge(stage, logs(8), None)
     assert found.verdict == "not-enough-data"
     assert "do not contain enough information" in found.why
@@ -178,8 +178,8 @@ def test_without_parameters_the_description_is_the_reason(tmp_path: Path) -> Non
         assert "no [[parameter]]" in found.why
 
 
-def test_an_alarm_without_a_verdict_is_told(stage: Stage) -> None:
-    """Which mode moved, by how much and since when stands first; past alarms do not."""
+def test_an_alarm_without_a_verdict_is_reported(stage: Stage) -> None:
+    """Mode, drift and date of an alarm come first; those before the baseline do not count."""
     drift = np.zeros((8, 2))
     drift[5:, 0] = np.log(0.96)
     bare = make_track(drift, np.tile(1e-6 * np.eye(2), (8, 1, 1)))
@@ -195,8 +195,8 @@ def test_an_alarm_without_a_verdict_is_told(stage: Stage) -> None:
     assert "Alarm" not in judge(stage, serviced, None, alarmed).why
 
 
-def test_a_parameter_with_a_unit_is_told_in_it(tmp_path: Path) -> None:
-    """A parameter of its own unit is told in that unit, not in percent."""
+def test_a_parameter_with_a_unit_is_reported_in_it(tmp_path: Path) -> None:
+    """A parameter with a unit is reported in that unit, not in percent."""
     stage = make_stage(tmp_path, (PRELOAD.replace("limit", 'unit = "kN"\nlimit'), MOUNT))
     found = judge(stage, logs(8), make_health(around(0.8, 0.99)))
     assert re.search(r"Guide preload is 0\.(79|80)\d* kN \(90 %: 0\.79", found.why)

@@ -59,7 +59,7 @@ def follows(found: FloatArray, book: stats.rv_continuous) -> bool:
 
 
 def inverse_gaussian(above: float, rate: float, life: float = LIFE) -> stats.rv_continuous:
-    """Give the first passage of a Wiener process with the drift 1 / life."""
+    """Return the first passage of a Wiener process with the drift 1 / life."""
     mean, shape = above * life, above**2 / rate
     return stats.invgauss(mean / shape, scale=shape)
 
@@ -79,7 +79,7 @@ class NoBridge:
         return self._rng.wald(mean, scale)
 
     def uniform(self, size: tuple[int, ...]) -> FloatArray:
-        """Give what no probability exceeds."""
+        """Return the upper end of the probabilities."""
         return np.ones(size)
 
 
@@ -202,7 +202,7 @@ def test_draws_that_wander_stand_among_those_that_do_not() -> None:
 
 
 def test_nothing_is_claimed_past_the_horizon() -> None:
-    """Lives that wander end before the horizon, or are not said to end."""
+    """Lives with deviation end before the horizon, or are infinite."""
     found = draw(DegradationPath(FALLING, 0.0, ()), (0.0, 4 * LIFE), off=0.0, rate=1e-8, limit=0.5)
     finite = np.isfinite(found)
     assert 0.05 < finite.mean() < 0.95

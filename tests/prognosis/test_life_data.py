@@ -1,4 +1,4 @@
-"""Condensed histories: neighbours know together what all know, and a life reads the same."""
+"""Condensed histories: no information is lost, and the posterior of a life is the same."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def _block(blocks: list[np.ndarray]) -> np.ndarray:
 
 
 def test_baseline_last_log_and_steps_are_not_mixed() -> None:
-    """What is told apart in a history is so in the short one."""
+    """The baseline, the last log and both sides of a step stay apart."""
     history = make_history(np.tile(np.log(FREQUENCY[:2]), (50, 1)), baseline=7)
     there = np.zeros(50, dtype=bool)
     there[30:41] = True
@@ -79,7 +79,7 @@ def test_baseline_last_log_and_steps_are_not_mixed() -> None:
 
 @pytest.fixture(scope="module")
 def lives(tmp_path_factory: pytest.TempPathFactory) -> tuple:
-    """Give a stage and a worn life of 240 logs in three modes."""
+    """Return a stage and a worn life of 240 logs in two modes."""
     stage = make_stage(tmp_path_factory.mktemp("stage"))
     rng = np.random.default_rng(5)
     travel = np.linspace(0.0, 3.0e6, 240)

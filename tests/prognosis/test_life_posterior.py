@@ -1,4 +1,4 @@
-"""The posterior of a life: which scenario it took, what it says of itself, and where it goes."""
+"""Posterior of a life: scenarios, convergence, mixture, tables."""
 
 from __future__ import annotations
 
@@ -140,7 +140,7 @@ def both_ess(one: float, two: float) -> float:
 def test_laws_and_health_are_those_of_importance_sampling(
     found: LifePosterior, history: History, stage: Stage
 ) -> None:
-    """Chains and importance sampling give the same quantiles, within the error of both."""
+    """Chains and importance sampling have the same quantiles, within the error of both."""
     likelihood = LifeLikelihood.of(history, stage)
     (scenario,) = likelihood.data.scenarios
     density = LifeDensity.of(likelihood, scenario)
@@ -253,9 +253,9 @@ def test_a_prognosis_is_of_the_same_draws(
     found: LifePosterior, history: History, stage: Stage
 ) -> None:
     """Health now of the prognosis is that of the fitted life, draw by draw."""
-    told = prognose(history, stage, (3, 4))
-    np.testing.assert_allclose(told.health, found.health.reshape(-1, 2), rtol=1e-12)
-    assert told.ess == found.ess
+    prognosis = prognose(history, stage, (3, 4))
+    np.testing.assert_allclose(prognosis.health, found.health.reshape(-1, 2), rtol=1e-12)
+    assert prognosis.ess == found.ess
 
 
 @pytest.mark.slow
@@ -283,7 +283,7 @@ def test_laws_without_parameters_have_no_draws_of_them(history: History, tmp_pat
 
 @pytest.mark.slow
 def test_a_value_that_is_kept_is_read_as_kept(tmp_path: Path) -> None:
-    """Rough logs of a mount that keeps its value: read as 1, unless it is told that it settles."""
+    """Rough logs of a constant mount: health is 1, unless the description has it settle."""
     noise = 8e-3 * np.random.default_rng(1).standard_normal((12, 2))
     history = make_history(np.log(FREQUENCY[:2]) + noise, travel=TRAVEL, std=8e-3)
     may, must = (
@@ -346,7 +346,7 @@ def test_a_course_of_little_probability_has_no_chains(
 
 @pytest.mark.slow
 def test_probabilities_are_those_of_the_evidence(tmp_path: Path) -> None:
-    """One law of one coordinate against none: the integral on a grid says how probable it is."""
+    """One law of one coordinate against none: its probability is that of the integral on a grid."""
     weighty = FADING_OR_NOT.replace(NONE, '{ kind = "none", weight = 3 }')
     stage = make_stage(tmp_path, (weighty,))
     history = lived(TRAVEL, 1 - 0.008e-6 * TRAVEL, np.ones(12))
@@ -359,25 +359,25 @@ def test_probabilities_are_those_of_the_evidence(tmp_path: Path) -> None:
     evidence = np.sum(np.exp(value - top)) * (y[1] - y[0])
     known = 0.25 * evidence / (0.25 * evidence + 0.75)
     fit = fit_life(history, stage, 2)
-    told = fit.laws("guide_preload")["linear", 0.0]
+    found = fit.laws("guide_preload")["linear", 0.0]
     assert 0.1 < known < 0.9
     std = max(way.evidence_std for way in fit.scenarios)
     # Narrowing the grid may lose a hundredth of the evidence.
-    off = abs(np.log(told / (1 - told)) - np.log(known / (1 - known)))
+    off = abs(np.log(found / (1 - found)) - np.log(known / (1 - known)))
     assert off < 4 * std + 0.01
     even = evidence / (evidence + 1)  # negative control: weights left out
-    assert abs(np.log(told / (1 - told)) - np.log(even / (1 - even))) > 4 * std + 0.01
+    assert abs(np.log(found / (1 - found)) - np.log(even / (1 - even))) > 4 * std + 0.01
 
 
 @pytest.mark.slow
 def test_a_step_is_followed_by_a_jump(tmp_path: Path) -> None:
-    """Preload that loses an eighth between two logs is followed; unless that is told, it is not."""
+    """A loss of an eighth between two logs is followed if the history has the step."""
     stage = make_stage(tmp_path, (FADING,))
     travel = np.linspace(0.0, 2.4e6, 13)
     preload = (1 - 0.04e-6 * travel) * np.where(travel > 1.3e6, 0.875, 1.0)
     history = lived(travel, preload, np.ones(13))
-    told = replace(history, steps=(Step.found("step", 7, 13),))
-    fit, blind = fit_life(told, stage, 3), fit_life(history, stage, 3)
+    stepped = replace(history, steps=(Step.found("step", 7, 13),))
+    fit, blind = fit_life(stepped, stage, 3), fit_life(history, stage, 3)
     for way in fit.scenarios:
         path = way.scenario.paths[0]
         assert path.steps == (1.3e6,)
@@ -390,7 +390,7 @@ def test_a_step_is_followed_by_a_jump(tmp_path: Path) -> None:
     low, high = np.quantile(fit.health, [0.005, 0.995])
     assert low < preload[-1] < high
     assert fit.chi_square / fit.degrees_of_freedom < 2
-    # Negative control: what is not told stays off the law, or is a walk.
+    # Negative control: without the step it is a deviation from the law, or a walk.
     assert blind.walk + blind.deviation > 1.5 * (fit.walk + fit.deviation)
 
 
@@ -412,7 +412,7 @@ def test_a_life_goes_to_arviz_and_back(found: LifePosterior, tmp_path: Path) -> 
 
 @pytest.mark.slow
 def test_a_course_without_parameters_has_no_group_in_arviz(faded: LifePosterior) -> None:
-    """Groups are of scenarios that have draws; the probability of every one is told."""
+    """Groups are of scenarios that have draws; every scenario has its probability."""
     tree = faded.to_arviz()
     for k, way in enumerate(faded.scenarios):
         assert (f"way_{k + 1}" in tree.children) == (way.scenario.n_dim > 0)
@@ -438,7 +438,7 @@ def test_a_life_is_a_table(found: LifePosterior) -> None:
 
 
 def test_a_table_and_arviz_are_told_every_way(forked: LifePosterior) -> None:
-    """Draws, checks and probability of each way stand under its number in both."""
+    """Draws, checks and probability of each scenario have its number in both."""
     table, tree = forked.to_frame(), forked.to_arviz()
     checks = tree["checks_data"]
     np.testing.assert_array_equal(tree["posterior/guide_preload"], forked.health[..., 0])

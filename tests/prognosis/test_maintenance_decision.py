@@ -1,4 +1,4 @@
-"""Days of service: closed forms of age replacement, accepted risks, and what no draw tells."""
+"""Service dates: closed forms of age replacement, accepted risks, and draws past the horizon."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ SHARES = (np.arange(10_000) + 0.5) / 10_000
 
 @pytest.fixture
 def rng() -> np.random.Generator:
-    """Give a generator with a fixed seed."""
+    """Return a generator with a fixed seed."""
     return np.random.default_rng(8)
 
 
@@ -149,7 +149,7 @@ def test_a_constant_hazard_is_now_or_never() -> None:
 
 
 def test_a_falling_hazard_asks_for_no_service(rng: np.random.Generator) -> None:
-    """Who has lived long lives longer: nothing is saved, also where draws are random."""
+    """With a falling failure rate a service saves nothing, also with random draws."""
     for draws in (weibull(0.6), SCALE * rng.weibull(0.6, 10_000)):
         assert cheapest_travel(aged(draws, 0.0), 20.0) == np.inf
         service = decide(aged(draws, 0.0), Decision(cost_ratio=20.0))
@@ -157,7 +157,7 @@ def test_a_falling_hazard_asks_for_no_service(rng: np.random.Generator) -> None:
 
 
 def test_the_dearer_a_failure_the_earlier_the_service(rng: np.random.Generator) -> None:
-    """Days never get later with the ratio; an endless one gives the day before the first draw."""
+    """Days never get later with the ratio; an infinite one has the day before the first draw."""
     prognosis = aged(SCALE * rng.weibull(2.0, 2000), 2e5)
     ratios = np.geomspace(1.01, 1e4, 60)
     found = np.array([cheapest_travel(prognosis, ratio) for ratio in ratios])
@@ -206,7 +206,7 @@ def test_the_unit_of_length_does_not_matter(factor: float) -> None:
 
 
 def test_costs_choose_a_day_at_the_median_usage() -> None:
-    """Travel over usage are days, and the risk told is that of the chosen day."""
+    """Days are travel over usage, and the risk is that of the chosen day."""
     prognosis = aged(weibull(3.0), 1e5)
     travel = cheapest_travel(prognosis, 10.0)
     service = decide(prognosis, Decision(cost_ratio=10.0, next_service=date(2026, 3, 21)))
@@ -241,7 +241,7 @@ def test_the_probability_before_a_day_is_the_share_of_draws() -> None:
 
 
 def test_a_day_behind_the_horizon_has_bounds() -> None:
-    """Draws that are past the horizon by then are not known to fail, nor to live."""
+    """Draws that are past the horizon by then count in the upper bound only."""
     remaining = np.r_[np.full(30, 5e6), np.full(50, 2e7), np.full(20, np.inf)]
     prognosis = make_prognosis(remaining, np.full(100, 1e4), horizon=1e7)
     for days, low, high in ((400, 0.0, 0.0), (900, 0.3, 0.3), (1200, 0.3, 1.0)):
@@ -251,7 +251,7 @@ def test_a_day_behind_the_horizon_has_bounds() -> None:
 
 
 def test_a_day_that_is_past_has_what_is_reached_already() -> None:
-    """No day asks for less than what the last log says."""
+    """The probability before the last log is that of having passed the limit."""
     prognosis = make_prognosis(np.r_[-1e5, -1.0, 1e6, 2e6], np.full(4, 1e4))
     for day in (START.date(), date(2020, 1, 1)):
         assert (

@@ -190,7 +190,7 @@ def test_usage_that_is_stated_is_taken(fading: Prognosis) -> None:
 
 
 def test_usage_that_is_stated_asks_no_odometer(stage: Stage) -> None:
-    """A machine of one log, which no usage could be learned from, has the stated one as numbers."""
+    """A machine with one log, which gives no usage, has the stated usage."""
     rng, left = np.random.default_rng(9), np.array([-1e5, 1e6, np.inf])
     usage = _usage(cut(fading_life(1e-4), 1), stage, rng, left, 2e7)
     np.testing.assert_array_equal(usage, np.full(3, 2e4), strict=True)
@@ -216,12 +216,12 @@ def test_usage_is_learned_from_the_odometer(unstated: Stage) -> None:
     usage = _usage(history, unstated, np.random.default_rng(8), np.full(n_draws, np.inf), 2e8)
     off = np.log(usage * 7 / steps.mean()) / (np.std(steps, ddof=1) / steps.mean())
     assert stats.kstest(off * np.sqrt(3), stats.t(2).cdf).pvalue > 1e-3
-    # Negative control: as if three weeks told the variance.
+    # Negative control: a normal distribution in place of Student's t.
     assert stats.kstest(off * np.sqrt(3), stats.norm.cdf).pvalue < 1e-3
 
 
 def test_a_short_life_has_the_usage_of_few_days(unstated: Stage) -> None:
-    """What is not known of the next week is how weeks scatter, beside the mean of 40 of them."""
+    """The uncertainty of the next week is the scatter of weeks and that of the mean of 40."""
     history, n_draws = moved(np.random.default_rng(7), 40, 0.2), 10_000
     steps = np.diff(history.travel)
     usage = _usage(history, unstated, np.random.default_rng(8), np.full(n_draws, 1.4e5), 1e7)
@@ -244,7 +244,7 @@ def test_life_past_or_without_end_has_a_usage(unstated: Stage) -> None:
 
 
 def test_an_odometer_that_tells_no_usage_is_refused(unstated: Stage) -> None:
-    """Logs of one moment cannot tell the usage; the error says what to state."""
+    """Logs of one moment give no usage; the error names the key to state."""
     history, rng, left = fading_life(1e-4), np.random.default_rng(9), np.full(10, 1e6)
     once = replace(history, recorded_at=(START,) * 8)
     with pytest.raises(NotEnoughData, match=r"state \[usage\] km_per_day"):
@@ -273,7 +273,7 @@ def test_a_stage_without_any_law_never_fails(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_what_no_mode_tells_is_named_and_left_out(stage: Stage, fading: Prognosis) -> None:
-    """The foot has a limit, but no mode moves with it: nothing is said of it, nor in "any"."""
+    """The foot has a limit, but moves no mode: it has no remaining life and is not in "any"."""
     assert fading.unidentifiable == ("foot",)
     assert fading.health.shape == (10_000, 2)
     assert fading.curve_quantiles.shape[2] == 2
@@ -283,21 +283,21 @@ def test_what_no_mode_tells_is_named_and_left_out(stage: Stage, fading: Prognosi
         "mount_stiffness",
         "foot",
     ]
-    told = identifiable_limits(stage, ("roll", "pitch"))
-    assert [(j, p.name) for j, p in told] == [(0, "guide_preload"), (1, "mount_stiffness")]
+    found = identifiable_limits(stage, ("roll", "pitch"))
+    assert [(j, p.name) for j, p in found] == [(0, "guide_preload"), (1, "mount_stiffness")]
 
 
 @pytest.mark.slow
 def test_a_life_of_which_nothing_is_told_is_refused(tmp_path: Path) -> None:
-    """Where modes tell no parameter that has a limit there is no prognosis, and this is why."""
+    """Without an identifiable parameter with a limit there is no prognosis, but the reason."""
     stage = make_stage(tmp_path, (PRELOAD.replace("limit = { below = 0.6 }", ""), LIMITED_FOOT))
-    with pytest.raises(NotEnoughData, match="roll, pitch cannot tell any parameter that has a"):
+    with pytest.raises(NotEnoughData, match="roll, pitch identify no parameter that has a limit"):
         prognose(fading_life(0.0), stage, 1)
 
 
 @pytest.mark.slow
 def test_laws_are_told_with_their_probability(tmp_path: Path) -> None:
-    """Of a small loss the law and none are told by their weight in the posterior and the draws."""
+    """Of a small loss, law and none have the weights of the posterior and of the draws."""
     stage = make_stage(tmp_path, (FADING_OR_NOT, STILL_MOUNT), tail=KNOWN_USAGE)
     history = fading_life(2e-5)
     found, fitted = prognose(history, stage, 3), fit_life(history, stage, 3)
@@ -315,7 +315,7 @@ def test_laws_are_told_with_their_probability(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_a_law_that_begins_anew_is_told_with_its_travel(tmp_path: Path) -> None:
-    """A preload that fades since a step only is told to do so from there."""
+    """A preload that fades from a step on has a law that begins there."""
     stage = make_stage(tmp_path, (FADING,), tail=KNOWN_USAGE)
     travel = np.linspace(0, 1.4e6, 15)
     step = float((travel[6] + travel[7]) / 2)

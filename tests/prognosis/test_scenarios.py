@@ -1,4 +1,4 @@
-"""Courses of lives: probabilities beforehand, jumps, laws begun anew, priors and passages."""
+"""Scenarios of lives: prior probabilities, steps, restarted laws, priors and passages."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ MOUNT = parameter("mount", LOOSE, NONE)
     ("steps", "n"), [((), 3 * 2), (STEPS, 5 * 3), ((0.0, NOW), 3 * 2)], ids=["none", "two", "ends"]
 )
 def test_courses_have_all_the_probability(steps: tuple[float, ...], n: int) -> None:
-    """Every choice of laws and beginnings stands once, and weights add up to one."""
+    """Every choice of laws and begins occurs once, and weights add up to one."""
     scenarios = list_scenarios((PRELOAD, MOUNT), steps, NOW)
     assert len(scenarios) == n
     assert sum(scenario.weight for scenario in scenarios) == pytest.approx(1, abs=1e-14)
@@ -161,7 +161,7 @@ def test_a_gain_never_reaches_what_no_step_has_jumped_over() -> None:
 
 
 def test_each_draw_may_have_its_own_limit() -> None:
-    """An array of limits gives what each limit alone gives."""
+    """An array of limits has the passages of each limit alone."""
     path = DegradationPath(LOOSE, 0.0, STEPS)
     theta, limit = natural(path, 40), np.linspace(0.4, 1.2, 40)
     alone = [path.passage(row[None], float(one))[0] for row, one in zip(theta, limit, strict=True)]
@@ -190,7 +190,7 @@ def test_the_prior_of_a_line_with_a_jump_integrates_to_one(begin: float) -> None
 @pytest.mark.parametrize("begin", [0.0, 0.5e6])
 @pytest.mark.parametrize("law", [WEAR, LOOSE], ids=["hertz-wear", "loosening"])
 def test_priors_of_two_coordinates_integrate_to_one(law: AnyLaw, begin: float) -> None:
-    """Wear and loosening, begun anew or not, by quadrature on a grid of coordinates."""
+    """Wear and loosening, restarted or not, by quadrature on a grid of coordinates."""
     scenario = one_course(DegradationPath(law, begin, ()))
     y = scenario.draw(np.random.default_rng(3), 20_000)
     low, high = y.min(axis=0) - 2, y.max(axis=0) + 2
