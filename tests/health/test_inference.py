@@ -293,7 +293,7 @@ def test_a_track_of_the_baseline_alone_is_refused(stage: Stage) -> None:
 def test_laplace_checks_the_sampler(
     tmp_path: Path, stage: Stage, worn: Track, health: Health
 ) -> None:
-    """Both agree where the posterior is all but normal; where it is not, the difference is reported."""
+    """Both agree where the posterior is all but normal; the difference is reported."""
     sure = infer(worn, make_stage(tmp_path, model_std=0.0), 5, epochs=[2])
     assert (np.abs(sure.laplace_shift) < 0.06).all()
     assert (np.abs(sure.laplace_ratio - 1) < 0.04).all()

@@ -103,7 +103,7 @@ def test_a_verdict_names_every_degraded_parameter(
 
 
 def test_an_uninformed_parameter_is_left_out(stage: Stage) -> None:
-    """An uninformed mount is not in the verdict, however low its draws are, and the sentence names it."""
+    """An uninformed mount is not in the verdict, however low its draws are, but named."""
     found = judge(stage, logs(8), make_health(around(0.99, 0.5), informed=(0.9, 0.1)))
     assert found.verdict == "healthy"
     assert "Mount stiffness: not constrained by these logs." in found.why
