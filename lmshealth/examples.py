@@ -1,8 +1,7 @@
-"""An example to try things on: half a year of a machine, as its logs told it.
+"""Example data: half a year of a simulated Y stage, whose guide wears and whose mount loosens.
 
-A simulated Y stage, whose guide wears and whose mount loosens, made 24 logs of 20 s over 1,632 km.
-This is what `lmshealth modes` said of them. Of the preload 72 % is left at the last one, of the
-mount stiffness 87 %; the preload reaches its limit of 60 % at 2,457 km.
+24 logs of 20 s over 1,632 km, as estimates of `lmshealth modes`. At the last one 72 % of the
+preload is left and 87 % of the mount stiffness; the preload reaches its limit of 60 % at 2,457 km.
 """
 
 from __future__ import annotations
@@ -19,10 +18,10 @@ TABLE = Path(str(resources.files("lmshealth") / "stage" / "descriptions" / "exam
 
 
 def readings() -> tuple[LogEstimates, ...]:
-    """Give what each log of the example said."""
+    """Return the estimates of every log of the example."""
     return read_estimates(TABLE, stage=load_stage("lms-y")).readings
 
 
 def history() -> History:
-    """Give the history of the example."""
+    """Return the history of the example."""
     return build_history(readings(), load_stage("lms-y"))[0]

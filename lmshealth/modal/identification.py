@@ -181,7 +181,7 @@ def _identify_found(
     tested = [
         (channel.name, *line)
         for channel in channels
-        for line in find_lines(channel, segment, log.sample_rate, limits).tolist()
+        for line in find_lines(channel, (segment,), log.sample_rate, limits).tolist()
     ]
     frequencies = [frequency for _, frequency, _ in tested]
     by_channel = tuple(spectra.channel(c) for c in range(len(channels)))

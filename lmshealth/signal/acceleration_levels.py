@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal, NamedTuple
+from typing import Literal
 
 import numpy as np
 from scipy.special import stdtr
@@ -13,7 +13,13 @@ from lmshealth.errors import BadLog
 from lmshealth.io.log import Channel, Log
 from lmshealth.signal import constants
 from lmshealth.signal.harmonics import Harmonics, decompose
-from lmshealth.signal.segments import Part, Segment, nominal_velocity, select_segments
+from lmshealth.signal.segments import (
+    Part,
+    Segment,
+    nominal_velocity,
+    select_channels,
+    select_segments,
+)
 from lmshealth.stage.description import Stage
 
 BandKind = Literal["mode", "grid", "health", "watch"]
@@ -200,22 +206,14 @@ def read_magnitudes(
     Raises
     ------
     BadLog
-        With reason ``no-accelerometer`` without such a channel, ``sample-rate`` where no band is
-        below half of it, ``too-short`` where a band holds fewer than three harmonics, or as
-        `select_segments` does.
+        With reason ``sample-rate`` where no band is below half of it, ``too-short`` where a band
+        holds fewer than three harmonics, or as `select_channels` and `select_segments` do.
 
     References
     ----------
     Piscalov2021
     """
-    channels = [channel for channel in log.channels if channel.kind == "acceleration"]
-    if not channels:
-        there = ", ".join(channel.name for channel in log.channels)
-        raise BadLog(
-            log.name,
-            "no-accelerometer",
-            f"no usable acc channel; there are: {there}; needed acc_<name>_m_s2",
-        )
+    channels = select_channels(log, "acceleration")
     segments = select_segments(log, part)
     usable = _usable(log, bands, max(s.stop - s.start for s in segments))
     velocity = nominal_velocity(log)
@@ -251,23 +249,13 @@ def _usable(log: Log, bands: Iterable[FrequencyBand], longest: int) -> list[Freq
     return usable
 
 
-class _Reading(NamedTuple):
-    """Levels of a `Magnitude`."""
-
-    magnitude: float
-    frequency: float
-    resolution: float
-    rms: float
-    dof: int
-
-
 def _read(
     channel: Channel,
     sample_rate: float,
     segments: Sequence[Segment],
     bands: Sequence[FrequencyBand],
-) -> list[_Reading]:
-    """Measure all bands of a channel, one stretch at a time, the longest first."""
+) -> list[tuple[float, float, float, float, int]]:
+    """Return the last five fields of `Magnitude` in all bands, the longest stretch first."""
     ordered = sorted(segments, key=lambda s: s.start - s.stop)
     strongest: list[tuple[float, float, float]] = []
     total, seconds = np.zeros(len(bands)), np.zeros(len(bands))
@@ -285,10 +273,7 @@ def _read(
                 seconds[i] += harmonics.duration
                 dof[i] += 2 * (own.stop - own.start)
     rms = np.sqrt(total / seconds)
-    return [
-        _Reading(*best, r, n)
-        for best, r, n in zip(strongest, rms.tolist(), dof.tolist(), strict=True)
-    ]
+    return [(*best, r, n) for best, r, n in zip(strongest, rms.tolist(), dof.tolist(), strict=True)]
 
 
 def _strongest(harmonics: Harmonics, inside: slice) -> tuple[float, float, float]:

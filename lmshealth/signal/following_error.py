@@ -18,6 +18,7 @@ from lmshealth.signal.segments import (
     Segment,
     find_segments,
     nominal_velocity,
+    select_channels,
     select_segments,
 )
 
@@ -131,21 +132,14 @@ def read_error(
     Raises
     ------
     BadLog
-        With reason ``no-delta-e`` without such a channel, ``too-short`` where the longest stretch
-        has fewer than ``count`` harmonics, or as `select_segments` does.
+        With reason ``too-short`` where the longest stretch has fewer than ``count`` harmonics, or
+        as `select_channels` and `select_segments` do.
 
     References
     ----------
     Piscalov2021
     """
-    channels = [channel for channel in log.channels if channel.kind == "displacement"]
-    if not channels:
-        there = ", ".join(channel.name for channel in log.channels)
-        raise BadLog(
-            log.name,
-            "no-delta-e",
-            f"no usable delta_e channel; there are: {there}; needed delta_e_um",
-        )
+    channels = select_channels(log, "displacement")
     segments = select_segments(log, part)
     longest = max(segments, key=lambda segment: segment.stop - segment.start)
     n, needed = longest.stop - longest.start, 2 * count + 1

@@ -11,12 +11,17 @@ import numpy as np
 from lmshealth._arrays import BoolArray, FloatArray
 from lmshealth.errors import BadLog
 from lmshealth.io.buffers import MINUTE, Samples, blocks
-from lmshealth.io.log import Log
+from lmshealth.io.log import Channel, Log
 from lmshealth.signal import constants
 
 Kind = Literal["whole", "ramp", "constant", "settling", "idle"]
 Part = Literal["record", "constant", "settling", "idle"]
 PARTS: tuple[Part, ...] = get_args(Part)
+# Reason of a refusal without a channel, and what to provide.
+_CHANNELS = {
+    "displacement": ("no-delta-e", "delta_e", "delta_e_um"),
+    "acceleration": ("no-accelerometer", "acc", "acc_<name>_m_s2"),
+}
 _KINDS: tuple[Kind, ...] = ("ramp", "constant", "settling", "idle")
 
 
@@ -154,6 +159,23 @@ def _join(found: list[Segment], segment: Segment) -> None:
     n, more = before.stop - before.start, segment.stop - segment.start
     mean = (n * before.velocity + more * segment.velocity) / (n + more)
     found[-1] = replace(before, stop=segment.stop, velocity=mean)
+
+
+def select_channels(log: Log, kind: Literal["displacement", "acceleration"]) -> list[Channel]:
+    """Return the channels of a kind.
+
+    Raises
+    ------
+    BadLog
+        With reason ``no-delta-e`` or ``no-accelerometer`` without such a channel.
+    """
+    channels = [channel for channel in log.channels if channel.kind == kind]
+    if not channels:
+        reason, name, column = _CHANNELS[kind]
+        there = ", ".join(channel.name for channel in log.channels)
+        detail = f"no usable {name} channel; there are: {there}; needed {column}"
+        raise BadLog(log.name, reason, detail)
+    return channels
 
 
 def select_segments(log: Log, part: Part) -> tuple[Segment, ...]:

@@ -41,25 +41,25 @@ class Line:
 
 def find_lines(
     channel: Channel,
-    segment: Segment,
+    segments: Sequence[Segment],
     sample_rate: float,
     band: tuple[float, float],
     false_alarm: float = constants.FALSE_ALARM,
 ) -> FloatArray:
-    """Find narrow lines in a segment by Thomson's multitaper test.
+    """Find the narrow lines that segments have in common by Thomson's multitaper test.
 
     Parameters
     ----------
     channel : Channel
         Displacements are read as accelerations.
-    segment : Segment
-        Which samples.
+    segments : sequence of Segment
+        At least one.
     sample_rate : float
         In Hz.
     band : (float, float)
         In Hz; the first and last four ordinates cannot be tested.
     false_alarm : float
-        Probability that a segment without lines shows any in the band, as `detect_sinusoids`
+        Probability that segments without lines show any in the band, as `detect_sinusoids`
         defines it.
 
     Returns
@@ -71,17 +71,6 @@ def find_lines(
     ----------
     Thomson1982, Riedel1995
     """
-    return _find_together(channel, (segment,), sample_rate, band, false_alarm)
-
-
-def _find_together(
-    channel: Channel,
-    segments: Sequence[Segment],
-    sample_rate: float,
-    band: tuple[float, float],
-    false_alarm: float,
-) -> FloatArray:
-    """Find the lines that segments have in common."""
 
     def read(number: int) -> tuple[FloatArray, int]:
         return as_acceleration(channel, segments[number], sample_rate, band[1])
@@ -174,7 +163,7 @@ def find_lines_by_velocity(
             resolution = 0.5 * _ordinate(log, group)
             bases = _bases(stage, [velocity])
             share = false_alarm / len(groups)
-            found = _find_together(channel, group, log.sample_rate, band, share)
+            found = find_lines(channel, group, log.sample_rate, band, share)
             for frequency, amplitude in found.tolist():
                 kind = _kind(frequency, bases, resolution)
                 line = Line(frequency, amplitude, "m/s²", kind, channel.name)

@@ -66,20 +66,12 @@ class ModalMap:
     def gradient(self, x: FloatArray) -> FloatArray:
         """Differentiate the polynomial of ln frequency by the ln parameters at many points.
 
-        Parameters
-        ----------
-        x : ndarray
-            ln parameters, shape ``(n_points, n_parameters)``.
+        Parameters and errors are those of `ln_frequency`.
 
         Returns
         -------
         ndarray
             d ln frequency / d ln parameter, shape ``(n_points, n_modes, n_parameters)``.
-
-        Raises
-        ------
-        OutsideMap
-            If a point lies outside the grid; there is no extrapolation.
         """
         unit = self._unit(x)
         slopes = [

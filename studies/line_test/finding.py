@@ -146,7 +146,7 @@ def strokes(n: int) -> list[Row]:
             found = find_lines_by_velocity(log, log.channels, None, BAND, USUAL)
             together += any(abs(line.frequency - f) < 0.5 / STROKE for line in found)
             for segment in segments:
-                own = find_lines(channel, segment, RATE, BAND, USUAL / len(segments))
+                own = find_lines(channel, (segment,), RATE, BAND, USUAL / len(segments))
                 if np.any(np.abs(own[:, 0] - f) < 0.5 / STROKE):
                     alone += 1
                     break
@@ -190,7 +190,7 @@ def simulated_strokes() -> list[Row]:
             for channel in channels:
                 for segment in segments:
                     share = USUAL / len(segments)
-                    found = find_lines(channel, segment, log.sample_rate, (10.0, 400.0), share)
+                    found = find_lines(channel, (segment,), log.sample_rate, (10.0, 400.0), share)
                     alone += [(channel.name, round(f, 2)) for f, _ in found.tolist()]
             together = find_lines_by_velocity(log, channels, load_stage(name), (10.0, 400.0), USUAL)
             rows.append(

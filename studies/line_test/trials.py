@@ -24,7 +24,7 @@ def rng_of(*key: int) -> np.random.Generator:
 def tested(values: Array, declared: float) -> Array:
     """Test a whole record."""
     channel = Channel("acc", "acceleration", values)
-    return find_lines(channel, Segment(0, values.size, np.nan), RATE, BAND, declared)
+    return find_lines(channel, (Segment(0, values.size, np.nan),), RATE, BAND, declared)
 
 
 def rated(hits: int, n: int, declared: float) -> Row:

@@ -33,7 +33,7 @@ BAND = (20.0, 450.0)
 def lines(values: np.ndarray, kind: str = "acceleration", alarm: float = 0.01) -> np.ndarray:
     """Test a whole record."""
     channel = Channel("acc_a", kind, values)  # type: ignore[arg-type]
-    return find_lines(channel, Segment(0, values.size, np.nan), RATE, BAND, alarm)
+    return find_lines(channel, (Segment(0, values.size, np.nan),), RATE, BAND, alarm)
 
 
 @pytest.mark.parametrize("n", [4000, 3997])
@@ -175,7 +175,7 @@ def test_short_strokes_show_their_order_together() -> None:
     assert line.amplitude == pytest.approx(0.6, rel=0.25)
     channel, segments = log.channels[0], find_segments(log, 0.2)
     assert len(segments) == 12
-    alone = [find_lines(channel, segment, RATE, BAND, 0.01 / 12) for segment in segments]
+    alone = [find_lines(channel, (segment,), RATE, BAND, 0.01 / 12) for segment in segments]
     assert not any(found.size for found in alone)
 
 

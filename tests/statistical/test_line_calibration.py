@@ -28,7 +28,7 @@ def _calls(rng: np.random.Generator, declared: float, n: int) -> int:
         values = accelerations(rng, _MODES, _N, _RATE, 0.01)[0]
         channel = Channel("acc_a", "acceleration", values)
         segment = Segment(0, _N, float("nan"))
-        found += len(find_lines(channel, segment, _RATE, _BAND, declared)) > 0
+        found += len(find_lines(channel, (segment,), _RATE, _BAND, declared)) > 0
     return found
 
 
