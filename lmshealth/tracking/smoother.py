@@ -1,4 +1,4 @@
-"""Smoother: what all logs together say of every epoch, later ones included."""
+"""Smoother: the states of all epochs given all logs."""
 
 from __future__ import annotations
 
@@ -9,20 +9,27 @@ from filterpy.kalman import KalmanFilter
 
 from lmshealth._arrays import FloatArray, freeze
 from lmshealth.stage.description import Stage
-from lmshealth.tracking.filter_bank import Bank, Filter, Settings
+from lmshealth.tracking.filter_bank import (
+    FilterBank,
+    FilterModel,
+    Hyperparameters,
+    advance,
+    initial,
+    predict,
+)
 from lmshealth.tracking.history import History
 from lmshealth.tracking.state_space import state_space
 from lmshealth.tracking.track import Track
 
-# Settings that together have less of the posterior are left out.
+# Filters that together have less of the posterior are left out.
 _SHARE = 1e-3
-# Eigenvalues of correlations below are rounding.
+# Eigenvalues of correlations below this are rounding.
 _SINGULAR = 1e-10
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Smoothed:
-    """What all logs together say of every epoch, later ones included.
+    """Modes at every epoch given all logs, later ones included.
 
     Attributes
     ----------
@@ -42,14 +49,14 @@ class Smoothed:
 
 
 def smooth(history: History, followed: Track, stage: Stage | None = None) -> Smoothed:
-    """Smooth a track by the Rauch-Tung-Striebel recursion under every likely setting.
+    """Smooth a track by the Rauch-Tung-Striebel recursion, averaged over the model.
 
     Parameters
     ----------
     history : History
         Modal estimates.
     followed : Track
-        The history's track, whose steps are let happen where they did.
+        The history's track, whose steps are in the model.
     stage : Stage, optional
         As for `track`.
 
@@ -58,14 +65,14 @@ def smooth(history: History, followed: Track, stage: Stage | None = None) -> Smo
     Rauch1965.
     """
     space = state_space(history, stage, followed.steps)
-    # Where a chapter begins the track lets rates be unknown anew.
+    # Where a segment begins, rates have their prior variance again.
     begun = {step.first for step in followed.steps if step.kind == "reset" or not step.declared}
-    filters = Filter(space, history.baselines, begun - {0})
-    bank = filters.advance(filters.start(), 0, len(history.logs) - 1)
+    model = FilterModel(space, history.baselines, begun - {0})
+    bank = advance(model, initial(model), 0, len(history.logs) - 1)
     order = np.argsort(bank.weight)
     bank = bank.only(order[np.cumsum(bank.weight[order]) > _SHARE])
     weight = bank.weight
-    runs = [smooth_one(filters, bank.settings.only(np.array([g]))) for g in range(weight.size)]
+    runs = [smooth_one(model, bank.hyperparameters.only(np.array([g]))) for g in range(weight.size)]
     mean = np.einsum("g,gki->ki", weight, [run[0] for run in runs])
     cov = np.einsum("g,gkij->kij", weight, [run[1] for run in runs])
     for share, (own, _) in zip(weight, runs, strict=True):
@@ -90,25 +97,25 @@ def smooth(history: History, followed: Track, stage: Stage | None = None) -> Smo
     )
 
 
-def smooth_one(filters: Filter, setting: Settings) -> tuple[FloatArray, FloatArray]:
-    """Filter and smooth under one setting: states ``(n, size)`` and covariances."""
-    space = filters.space
+def smooth_one(model: FilterModel, own: Hyperparameters) -> tuple[FloatArray, FloatArray]:
+    """Filter and smooth with one set of hyperparameters: states ``(n, size)`` and covariances."""
+    space = model.space
     n, size = len(space.history.logs), space.size
     kalman = KalmanFilter(dim_x=size, dim_z=1)
     kalman.x, kalman.P = space.prior()
     rate = np.arange(space.rate.start, space.rate.stop)
-    kalman.P[rate, rate] = setting.rate_std[0] ** 2
+    kalman.P[rate, rate] = own.rate_std[0] ** 2
     means, covs = np.empty((n, size)), np.empty((n, size, size))
     moves, noises = np.empty((n, size, size)), np.empty((n, size, size))
     for k in range(n):
-        moves[k], noises[k] = transition(filters, setting, k)
+        moves[k], noises[k] = transition(model, own, k)
         kalman.predict(F=moves[k], Q=noises[k])
-        rows = np.flatnonzero(filters.there[k])
+        rows = np.flatnonzero(model.there[k])
         if rows.size:
-            scale = setting.scales[0, filters.scale_of[rows]]
-            noise = filters.noise[k][np.ix_(rows, rows)] * np.outer(scale, scale)
-            noise += np.diag(filters.extra[k, rows])
-            kalman.update(filters.values[k, rows], R=noise, H=space.matrix(k)[rows])
+            scale = own.scales[0, model.scale_of[rows]]
+            noise = model.noise[k][np.ix_(rows, rows)] * np.outer(scale, scale)
+            noise += np.diag(model.extra[k, rows])
+            kalman.update(model.values[k, rows], R=noise, H=space.matrix(k)[rows])
         means[k], covs[k] = kalman.x, kalman.P
     smoothed = kalman.rts_smoother(means, covs, moves, noises, inv=_inverse)
     return smoothed[0], smoothed[1]
@@ -117,26 +124,25 @@ def smooth_one(filters: Filter, setting: Settings) -> tuple[FloatArray, FloatArr
 def _inverse(cov: FloatArray) -> FloatArray:
     """Invert a covariance where it is not singular.
 
-    An exact copy of ℓ, and jumps that have not happened yet, make it singular. Of the correlations,
-    because variances of ln ζ lie ten orders of magnitude above those that ln f wanders by.
+    An exact copy of ℓ, and steps that are still to come, make it singular. The correlations are
+    inverted, because variances of ln ζ are ten orders of magnitude above process noise of ln f.
     """
     std = np.sqrt(np.maximum(np.diag(cov), 0.0))
     scale = np.outer(np.where(std > 0, std, 1.0), np.where(std > 0, std, 1.0))
     return np.asarray(np.linalg.pinv(cov / scale, rcond=_SINGULAR, hermitian=True) / scale)
 
 
-def transition(filters: Filter, setting: Settings, k: int) -> tuple[FloatArray, FloatArray]:
-    """Give transition matrix and process noise into log k, ``(size, size)`` each.
+def transition(model: FilterModel, own: Hyperparameters, k: int) -> tuple[FloatArray, FloatArray]:
+    """Return transition matrix and process noise into log k, ``(size, size)`` each.
 
-    They are what `Filter.move` does to one state at a time: to the units of the state, and to the
-    covariance of an exactly known one.
+    They are what `predict` does to unit states, and to the covariance of an exactly known state.
     """
-    size = filters.space.size
-    unit = Bank(
-        setting.only(np.zeros(size + 1, dtype=int)),
+    size = model.space.size
+    unit = FilterBank(
+        own.only(np.zeros(size + 1, dtype=int)),
         np.zeros(size + 1),
         np.vstack([np.eye(size), np.zeros(size)]),
         np.zeros((size + 1, size, size)),
     )
-    filters.move(unit, k)
+    unit = predict(model, unit, k)
     return unit.mean[:-1].T, unit.cov[-1]

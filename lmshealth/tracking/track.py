@@ -1,14 +1,14 @@
-"""Kalman filter over a machine's life: modes followed with every uncertainty used.
+"""Track: Kalman filtering of all modes over a machine's life, with steps and alarms.
 
 All modes share one state space, because their estimates may be correlated, and one bank of
-filters, which averages over what is not known of the process. What happens at once is told from
-drift: steps that maintenance declares are let happen where they did, others are found and let
-happen from then on. No epoch knows of later logs; `smooth` does.
+filters, which averages over the unknown process noise. Declared steps are in the model from the
+start; a detected step is added, and the logs from it on are filtered again from the checkpoint
+before it. No epoch uses later logs; `smoother.smooth` does.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from datetime import datetime
 from typing import Literal
 
@@ -19,27 +19,39 @@ from lmshealth._arrays import BoolArray, FloatArray, expect_shape, freeze
 from lmshealth.errors import NotEnoughData
 from lmshealth.io.log import Refusal
 from lmshealth.stage.description import Stage
-from lmshealth.tracking.change_detection import MEMORY, Finding, Watch, explain, reborn, threshold
-from lmshealth.tracking.constants import JUMP_STD
-from lmshealth.tracking.filter_bank import Bank, Filter
+from lmshealth.tracking import constants
+from lmshealth.tracking.change_detection import (
+    N_CHECKPOINTS,
+    Change,
+    add_to_sums,
+    running_sums,
+    suspect,
+    threshold,
+    unexplained_leaps,
+    weigh_changes,
+)
+from lmshealth.tracking.filter_bank import (
+    FilterBank,
+    FilterModel,
+    Innovation,
+    advance,
+    initial,
+    predict,
+    restart,
+    update,
+)
 from lmshealth.tracking.history import History, Step
 from lmshealth.tracking.state_space import StateSpace, state_space
 
 EventKind = Literal["step", "regreasing", "servo", "sensor", "alarm"]
 
-# Below this probability of their innovations a filter is not consistent with its data: where it
-# makes results too sure of themselves, and where it only makes them too cautious.
-_TOO_SURE, _TOO_CAUTIOUS, _UNUSUAL = 1e-3, 1e-6, 0.05
-# Innovations further out are hardly believed before the next log is there.
-_FAR = 6.0
-# A filter is widened once its innovations are less probable than that.
-_WIDEN = 5e-4
-_ROUNDING = 1e-15  # of the variance of a drift
+# Variance of a drift below which it is rounding.
+_ROUNDING = 1e-15
 
 
 @dataclass(frozen=True, slots=True)
 class Effect:
-    """What moves a mode without wear: one row of ``effects.csv``.
+    """Coefficient of ln f that is no wear: one row of ``effects.csv``.
 
     ``covariate`` is the name of a covariate, ``bias:<source>``, ``servo:<id>``, ``sensor:<date>``,
     or ``scale:<source>`` for the factor on the standard deviations of a source (then `mode` is
@@ -54,15 +66,15 @@ class Effect:
 
 @dataclass(frozen=True, slots=True)
 class Event:
-    """Something that happened to a machine, as one mode shows it: one row of ``events.csv``.
+    """Step or alarm, as one mode shows it: one row of ``events.csv``.
 
     Attributes
     ----------
     kind : str
         ``step``, ``regreasing``, ``servo``, ``sensor``, or ``alarm``: unexplained change of the
-        modes since the baseline, at the declared rate of false alarms.
+        modes since the baseline, at the declared false-alarm probability.
     epoch : int
-        First log that shows it; of an alarm, the log at which it is raised.
+        First log after a step; of an alarm, the log at which it is raised.
     mode : str
         The mode.
     source : str
@@ -70,12 +82,11 @@ class Event:
     size, std : float
         Change of ln f, of a regreasing change of ln ζ, of an alarm the drift.
     evidence : float
-        Log Bayes factor against nothing having happened; of what was found by itself, the place
-        of the step is not known beforehand and counted in.
+        Log Bayes factor against no event; of a detected step with the prior of its unknown place.
     declared : bool
-        Whether maintenance or the log's ``servo_id`` told of it.
+        Whether maintenance or the log's ``servo_id`` declared it.
     found_at : int
-        The log after which it was known.
+        The log after which it was detected.
     """
 
     kind: EventKind
@@ -91,7 +102,7 @@ class Event:
 
 @dataclass(frozen=True, slots=True)
 class Consistency:
-    """Whether a filter's innovations are what it expects.
+    """Tests of a filter's innovations.
 
     Attributes
     ----------
@@ -112,22 +123,22 @@ class Consistency:
 
     @property
     def holds(self) -> bool:
-        """Whether neither is improbable; an average is somewhat cautious with quiet machines."""
-        least = _TOO_SURE if self.nis > 1 else _TOO_CAUTIOUS
-        least_of_all = _TOO_SURE if self.autocorrelation > 0 else _TOO_CAUTIOUS
-        return self.p_value >= least and self.autocorrelation_p_value >= least_of_all
+        """Whether neither test rejects the filter."""
+        bounds = (constants.CAUTIOUS_P_VALUE, constants.OVERCONFIDENT_P_VALUE)
+        least = bounds[self.autocorrelation > 0]
+        return self.p_value >= bounds[self.nis > 1] and self.autocorrelation_p_value >= least
 
     @property
     def side(self) -> Literal["below", "inside", "above"]:
-        """Where the sum lies beside the band that holds 95 % of those of a filter that is right."""
-        if self.p_value >= _UNUSUAL:
+        """Position of the sum relative to its 95 % band under a consistent filter."""
+        if self.p_value >= constants.NIS_P_VALUE:
             return "inside"
         return "above" if self.nis > 1 else "below"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Track:
-    """Modes followed over a machine's life by a Kalman filter.
+    """Filtered modes of a machine over its life.
 
     Attributes
     ----------
@@ -153,26 +164,25 @@ class Track:
     effects : tuple of Effect
         Coefficients after the last epoch.
     events : tuple of Event
-        What happened, in order.
+        Steps and alarms, in order.
     steps : tuple of Step
-        The steps among it, declared and found.
+        Declared and detected steps.
     outliers : tuple of (int, str)
-        Epochs and modes whose estimates lie so far off that they were hardly believed, and that no
-        later log confirmed.
+        Epochs and modes whose estimates are outliers that no later log confirmed.
     nis : ndarray
-        Normalised innovation squared, shape ``(n_epochs,)``. Logs that were filtered again with an
-        event have that of the last time.
+        Normalised innovation squared, shape ``(n_epochs,)``. Logs that were filtered again with a
+        detected step have that of the last time.
     nis_dof : ndarray
         Its degrees of freedom, shape ``(n_epochs,)``; the first estimate of a mode has none,
         because the filter starts from it, and outliers have none.
     innovations : ndarray
         Standardised innovations of ``[ln f, ln ζ]`` of all series, ``(n_epochs, 2 n_series)``.
     noise_scale : ndarray
-        Factor on the reported standard deviations of each source that the innovations ask for,
+        Factor on the reported standard deviations of each source, estimated from the innovations,
         shape ``(n_epochs, n_sources)``; 1 when they are consistent.
     widening : ndarray
-        Factor on all standard deviations, as the filter's innovations were not consistent up to
-        there, shape ``(n_epochs,)``; 1 when they are.
+        Factor on all published standard deviations where the innovations up to that epoch are not
+        consistent, shape ``(n_epochs,)``; else 1.
     """
 
     stage: str
@@ -210,18 +220,18 @@ class Track:
 
     @property
     def alarms(self) -> tuple[Event, ...]:
-        """The damage alarms."""
+        """Damage alarms."""
         return tuple(event for event in self.events if event.kind == "alarm")
 
     def consistency(self) -> Consistency:
-        """Judge the filter by its innovations."""
+        """Test the filter by its innovations."""
         return consistency(self.nis, self.nis_dof, self.innovations)
 
 
-def neighbours(innovations: FloatArray) -> tuple[FloatArray, np.ndarray]:
-    """Multiply innovations by those of the log before: sums over each log, and how many they are.
+def lagged_products(innovations: FloatArray) -> tuple[FloatArray, np.ndarray]:
+    """Multiply innovations by those of the log before: their sum over each log and their number.
 
-    Series of one log may have errors in common: the sums over a log are what is independent.
+    Series of one log may have common errors: only sums over different logs are independent.
     """
     products = np.full_like(innovations, np.nan)
     products[1:] = innovations[1:] * innovations[:-1]
@@ -230,7 +240,7 @@ def neighbours(innovations: FloatArray) -> tuple[FloatArray, np.ndarray]:
 
 
 def consistency(nis: FloatArray, dof: FloatArray, innovations: FloatArray) -> Consistency:
-    """Judge innovations: their sum of squares by χ², their independence by the autocorrelation.
+    """Test innovations: their sum of squares by χ², their independence by the autocorrelation.
 
     Parameters
     ----------
@@ -246,7 +256,7 @@ def consistency(nis: FloatArray, dof: FloatArray, innovations: FloatArray) -> Co
     judged = dof > 0
     total, degrees = float(nis[judged].sum()), float(dof[judged].sum())
     tail = stats.chi2.sf(total, degrees) if degrees else 0.5
-    sums, counts = neighbours(innovations)
+    sums, counts = lagged_products(innovations)
     n = int(counts.sum())
     scale = float(np.sqrt(np.sum(sums**2)))
     size = float(np.mean(innovations[np.isfinite(innovations)] ** 2)) if n else 1.0
@@ -260,20 +270,20 @@ def consistency(nis: FloatArray, dof: FloatArray, innovations: FloatArray) -> Co
 
 
 def track(history: History, stage: Stage | None = None) -> Track:
-    """Follow the modes of a history by a Kalman filter.
+    """Track the modes of a history by a bank of Kalman filters.
 
     Parameters
     ----------
     history : History
         Modal estimates with covariance; missing ones are NaN.
     stage : Stage, optional
-        Its covariates are regressed out, and rates are counted per its horizon. Without it every
-        covariate present is, about its median, and rates are counted per length of the history.
+        Its covariates are regressed out, and rates are per its horizon. Without it every covariate
+        present is, about its median, and rates are per length of the history.
 
     Returns
     -------
     Track
-        Filtered, so that no epoch knows of later logs.
+        Filtered: no epoch uses later logs.
 
     Raises
     ------
@@ -302,295 +312,271 @@ def track(history: History, stage: Stage | None = None) -> Track:
     [('alarm', '19 March')]
     """
     if not np.isfinite(history.ln_frequency).any():
-        told = f"{history.stage}: no modal estimate in {len(history.logs)} logs is of a known mode"
-        raise NotEnoughData(f"{told}; without a name it is known once three logs show it")
-    return _Follower(history, state_space(history, stage, history.steps)).follow()
+        raise NotEnoughData(
+            f"{history.stage}: no modal estimate in {len(history.logs)} logs is of a known mode; "
+            "a mode without a name is known once three logs show it"
+        )
+    model = FilterModel(state_space(history, stage, history.steps), history.baselines)
+    return _Driver(model).run()
 
 
-@dataclass(slots=True, eq=False)
-class _Record:
-    """What is published of every epoch."""
+@dataclass(frozen=True, slots=True, eq=False)
+class _Filtered:
+    """Innovations of one filtered log.
+
+    Attributes
+    ----------
+    innovation : Innovation
+        Without outliers.
+    outlying : ndarray of bool or None
+        Rows of the modes with an outlier, shape ``(2 n_series,)``.
+    """
+
+    innovation: Innovation
+    outlying: BoolArray | None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Epoch:
+    """Published state of one log: mean, covariance, and the noise scale of each source."""
 
     mean: FloatArray
     cov: FloatArray
-    nis: FloatArray
     scale: FloatArray
-    widening: FloatArray
-    settled: int = 0
 
 
-@dataclass(slots=True, eq=False)
-class _Found:
-    """Events, and steps that were found, as they come."""
+class _Driver:
+    """Filters a history log by log and filters again from a checkpoint where a step is detected.
 
-    events: list[Event] = field(default_factory=list)
-    findings: dict[int, tuple[Finding, int]] = field(default_factory=dict)
-    alarmed: bool = False
-    tested: tuple[int, int] = (-1, -1)
-    # Believed to have happened, but not yet what it was.
-    open: Finding | None = None
-
-
-class _Follower:
-    """Takes a bank of filters through a history, and starts new chapters where something happened.
-
-    A chapter begins where a step does: the state stays, the settings start anew.
+    A segment begins at a reset and at a detected step: the state continues, the process noise has
+    its prior again, and changes before the segment are not weighed again.
     """
 
-    def __init__(self, history: History, space: StateSpace) -> None:
-        self.history = history
-        self.filters = Filter(space, history.baselines)
-        self.resets = {step.first for step in history.steps if step.kind == "reset"}
-        n, rows = len(history.logs), 2 * len(history.series)
-        size = 4 * len(history.modes)
-        self.record = _Record(
-            np.empty((n, size)),
-            np.empty((n, size, size)),
-            np.zeros(n),
-            np.ones((n, len(self.filters.sources))),
-            np.ones(n),
-        )
-        self.watch = Watch(rows, history.loop_error)
-        self.watch.settle(space.steps)
-        self.memory: dict[int, Bank] = {}
-        # Rows of a log that are taken for outliers, until an event explains them.
-        self.doubted: dict[int, np.ndarray] = {}
-        self.found = _Found()
+    def __init__(self, model: FilterModel) -> None:
+        self.model, self.history = model, model.space.history
+        self.resets = {step.first for step in self.history.steps if step.kind == "reset"}
+        self.bank = initial(model)
+        # Banks after each of the last logs of the segment, and the first log of its windows.
+        self.checkpoints: dict[int, FilterBank] = {}
+        self.first = 1
+        self.filtered: list[_Filtered] = []
+        self.sums = [running_sums(model.values.shape[1])]
+        self.published: list[_Epoch] = []
+        self.widening = np.empty(0)
+        self.leaps = unexplained_leaps(self.history.loop_error, model.space.steps)
+        # Detected changes by the number of their step, with the log that detected them.
+        self.changes: dict[int, tuple[Change, int]] = {}
+        self.alarms: list[Event] = []
+        self.alarmed = False
+        # A significant change whose kind is not settled, and the last suspicion that was weighed.
+        self.open: Change | None = None
+        self.weighed = (-1, -1)
 
-    def follow(self) -> Track:
-        """Filter log by log."""
-        bank = self.filters.start()
+    def run(self) -> Track:
+        """Filter all logs."""
         for k in range(len(self.history.logs)):
             if k in self.resets and k:
-                bank = self._begin_chapter(bank, k)
-                self.found.alarmed = False
-            bank = self._step(bank, k, doubting=k not in self.resets)
-            bank = self._look_for_events(bank, k)
-            self._publish(bank, k)
-        return self._result(bank)
+                self._begin_segment(self.bank, k)
+                self.alarmed = False
+            self._filter(k, reject_outliers=k not in self.resets)
+            self._detect(k)
+            self.published.append(self._publish(k))
+        return self._track()
 
-    def _begin_chapter(self, bank: Bank, watched: int) -> Bank:
-        """Start the settings anew, and watch from some log on.
+    def _begin_segment(self, bank: FilterBank, first: int) -> None:
+        """Continue from a bank; evidence before the segment is not comparable."""
+        self.bank, self.first, self.checkpoints = restart(self.model, bank), first, {}
 
-        Evidence is counted from here: what is remembered of the chapter before is no measure.
+    def _filter(self, k: int, *, reject_outliers: bool = True) -> None:
+        """Filter log k; records of this log and later ones are dropped before.
+
+        An estimate outside the gate is an outlier until the next log confirms it; two outliers in
+        a row are accepted.
         """
-        self.watch.first = watched
-        self.memory.clear()
-        return reborn(bank, self.filters)
+        del self.filtered[k:], self.sums[k + 1 :]
+        model, before = self.model, self.bank
+        predicted = predict(model, before, k)
+        bank, full = update(model, predicted, k)
+        innovation, outlying = full, None
+        far = np.abs(full.standardised) > constants.OUTLIER_GATE
+        in_a_row = k > 1 and all(one.outlying is not None for one in self.filtered[k - 2 :])
+        if reject_outliers and far.any() and k - 1 in self.checkpoints and not in_a_row:
+            mode = np.tile(self.history.mode_of(), 2)
+            outlying = np.isin(mode, mode[full.rows[far]])
+            bank, innovation = update(model, predicted, k, outlying)
+        self.filtered.append(_Filtered(innovation, outlying))
+        self.sums.append(add_to_sums(self.sums[-1], full.rows, full.standardised))
+        self.bank = self.checkpoints[k] = bank.pruned()
+        self.checkpoints.pop(k - N_CHECKPOINTS, None)
 
-    def _step(self, bank: Bank, k: int, *, doubting: bool = True) -> Bank:
-        """Take the bank over one log and remember it.
+    def _detect(self, k: int) -> None:
+        """Weigh a suspected change, and raise the alarm of a drift."""
+        suspected = suspect(self.sums, self.first, self.leaps)
+        if self.open is not None and suspected is not None:
+            # A significant change keeps its place until it is settled.
+            suspected = self.open.first
+        if suspected is not None and not self._just_weighed(suspected, k):
+            self.weighed, self.open = (suspected, k), None
+            change = weigh_changes(self.model, self.checkpoints, k, suspected)
+            if change is not None and change.significant:
+                if not change.settled(k):
+                    self.open = change
+                elif self._adopt(change, k):
+                    return
+        # A single log that deviates may be an outlier or the first after a step, and an open change
+        # need not be damage: later logs decide.
+        waiting = self.open is not None and not self.open.settled(k)
+        evidence = self.bank.log_bayes_factor()
+        lone = suspected is not None and k - suspected <= 1
+        if evidence >= threshold() and not waiting and not lone:
+            self._alarm(k, evidence)
 
-        What lies far off is an outlier or the beginning of something. It is hardly believed until
-        the next log tells which; two in a row are believed.
+    def _just_weighed(self, suspected: int, k: int) -> bool:
+        """Return whether the suspicion was weighed with nearly as many logs."""
+        before, when = self.weighed
+        return abs(before - suspected) <= 2 and k - when < (k - suspected) / 4
+
+    def _adopt(self, change: Change, k: int) -> bool:
+        """Add a change to the model and filter again from the checkpoint before it.
+
+        A drift that is no damage, or follows an alarm, is not adopted.
         """
-        self.filters.move(bank, k)
-        kept = surprise = self.filters.see(bank, k)
-        self.doubted.pop(k, None)
-        far = np.abs(surprise.innovation) > _FAR
-        in_a_row = {k - 1, k - 2} <= self.doubted.keys()
-        if doubting and far.any() and k - 1 in self.memory and not in_a_row:
-            self.doubted[k] = self._of_same_modes(surprise.rows[far])
-            bank = self.memory[k - 1].copy()
-            self.filters.move(bank, k)
-            kept = self.filters.see(bank, k, self.doubted[k])
-        bank = bank.pruned()
-        self.watch.add(k, surprise, kept)
-        self.record.nis[k] = kept.nis
-        self.memory[k] = bank.copy()
-        self.memory.pop(k - MEMORY, None)
-        return bank
-
-    def _of_same_modes(self, rows: np.ndarray) -> np.ndarray:
-        """Mark all rows of the modes of some rows, shape ``(2 n_series,)``."""
-        mode = np.tile(self.history.mode_of(), 2)
-        return np.isin(mode, mode[rows])
-
-    def _publish(self, bank: Bank, k: int) -> None:
-        record = self.record
-        size = record.mean.shape[1]
-        mean, cov = bank.collapse(size)
-        if k in self.doubted:
-            # As likely the first log after a step: nobody can tell yet, and that is what is said.
-            stepped = self.filters.with_step(Step.found("step", k, len(self.history.logs)))
-            other = stepped.advance(self.memory[k - 1].padded(stepped.space.size), k, k)
-            moved, spread = other.collapse(size)
-            off = 0.5 * (moved - mean)
-            mean, cov = mean + off, 0.5 * (cov + spread) + np.outer(off, off)
-        record.mean[k], record.cov[k] = mean, cov
-        record.scale[k] = bank.weight @ bank.settings.scales
-
-    def _look_for_events(self, bank: Bank, k: int) -> Bank:
-        """Raise the alarm of a drift, and explain what looks like more than that."""
-        found = self.found
-        suspect = self.watch.suspect(k)
-        if found.open is not None and suspect is not None:
-            # What is believed to have happened keeps its place until it is settled.
-            suspect = found.open.first
-        # What was weighed a moment ago is weighed again once there is notably more to it.
-        if suspect is not None and not self._just_tested(suspect, k):
-            found.tested = (suspect, k)
-            found.open = None
-            finding = explain(self.filters, self.memory, k, suspect)
-            if finding is not None and finding.believed:
-                if finding.settled(k):
-                    adopted = self._adopt(finding, bank, k)
-                    # A drift that is no damage yet leaves all as it was, the alarm too.
-                    if adopted is not bank:
-                        return adopted
-                else:
-                    found.open = finding
-        # A single log that leans may be an outlier, or the first after a step: the next one tells.
-        # Of what is not settled yet, later logs tell whether it is damage.
-        waiting = found.open is not None and not found.open.settled(k)
-        evidence = bank.log_bayes_factor()
-        if evidence >= threshold() and not waiting and (suspect is None or k - suspect > 1):
-            self._alarm(bank, k, evidence)
-        return bank
-
-    def _just_tested(self, suspect: int, k: int) -> bool:
-        before, when = self.found.tested
-        return abs(before - suspect) <= 2 and k - when < (k - suspect) / 4
-
-    def _adopt(self, finding: Finding, bank: Bank, k: int) -> Bank:
-        """Take what was found for true, from its first log on."""
-        j = finding.first
-        before = self.memory[j - 1]
-        if finding.kind == "drift":
-            if self.found.alarmed or not finding.damage:
-                return bank
+        j = change.first
+        before = self.checkpoints[j - 1]
+        if change.kind == "drift":
+            if self.alarmed or not change.damage:
+                return False
         else:
-            step = Step.found(finding.kind, j, len(self.history.logs), finding.source)
-            self.filters = self.filters.with_step(step)
-            self.found.findings[len(self.filters.space.steps) - 1] = (finding, k)
-            self.watch.settle(self.filters.space.steps)
-            before = before.padded(self.filters.space.size)
-        self._settle(k)
-        begun = self._begin_chapter(before, j + 1)
+            self.model = self.model.with_step(change.step(len(self.history.logs)))
+            steps = self.model.space.steps
+            self.changes[len(steps) - 1] = (change, k)
+            self.leaps = unexplained_leaps(self.history.loop_error, steps)
+            before = before.padded(self.model.space.size)
+        self._extend_widening(k)
+        self._begin_segment(before, j + 1)
         for again in range(j, k + 1):
-            begun = self._step(begun, again, doubting=False)
-        if finding.damage:
-            self._alarm(begun, k, finding.log_bayes_factor)
-        return begun
+            self._filter(again, reject_outliers=False)
+        if change.damage:
+            self._alarm(k, change.log_bayes_factor)
+        return True
 
-    def _settle(self, k: int) -> None:
-        """Keep how much the logs before k are widened: filtered again they are judged anew."""
-        record = self.record
-        factor = _widening(record.nis[:k], self._dof()[:k], self.watch.innovations[:k])
-        record.widening[record.settled : k] = factor[record.settled :]
-        record.settled = k
+    def _alarm(self, k: int, evidence: float) -> None:
+        """Raise an alarm, once between two resets."""
+        if self.alarmed:
+            return
+        self.alarmed = True
+        mean, cov = self.bank.collapse(4 * len(self.history.modes))
+        contrast = self.model.space.drift()
+        drift = contrast @ mean
+        std = np.sqrt(np.maximum(np.diag(contrast @ cov @ contrast.T), 0.0))
+        i = int(np.argmax(np.abs(drift) / np.maximum(std, 1e-12)))
+        mode, size = self.history.modes[i], float(drift[i])
+        self.alarms.append(
+            Event("alarm", k, mode, "", size, float(std[i]), evidence, declared=False, found_at=k)
+        )
 
-    def _dof(self) -> FloatArray:
-        """Count the measurements of each log that could surprise: the first of a mode cannot."""
+    def _publish(self, k: int) -> _Epoch:
+        size = 4 * len(self.history.modes)
+        mean, cov = self.bank.collapse(size)
+        if self.filtered[k].outlying is not None:
+            # As likely an outlier as the first log after a step: publish the mixture of both.
+            stepped = self.model.with_step(Step.found("step", k, len(self.history.logs)))
+            before = self.checkpoints[k - 1].padded(stepped.space.size)
+            other, other_cov = advance(stepped, before, k, k).collapse(size)
+            off = 0.5 * (other - mean)
+            mean, cov = mean + off, 0.5 * (cov + other_cov) + np.outer(off, off)
+        return _Epoch(mean, cov, self.bank.weight @ self.bank.hyperparameters.scales)
+
+    def _innovations(self) -> FloatArray:
+        """Return standardised innovations of all filtered logs, NaN where there are none."""
+        found = np.full((len(self.filtered), self.model.values.shape[1]), np.nan)
+        for k, one in enumerate(self.filtered):
+            found[k, one.innovation.rows] = one.innovation.standardised
+        return found
+
+    def _dof(self, innovations: FloatArray) -> FloatArray:
+        """Count the innovations of each log; the first estimate of a mode has none."""
         history = self.history
-        there = np.isfinite(self.watch.innovations)
+        there = np.isfinite(innovations)
         for mode in history.modes:
             own = np.array(history.columns(mode), dtype=int)
             seen = np.cumsum(np.isfinite(history.ln_frequency[:, own]).any(axis=1)) > 1
-            there[:, np.r_[own, own + len(history.series)]] &= seen[:, None]
+            there[:, np.r_[own, own + len(history.series)]] &= seen[: len(there), None]
         return np.asarray(there.sum(axis=1), dtype=float)
 
-    def _unseen(self) -> BoolArray:
-        """Mark ln f and ln ζ that no log has seen yet, ``(n_logs, 4 n_modes)``."""
+    def _extend_widening(self, n: int) -> None:
+        """Fix the widening of the first n logs, before some of them are filtered again."""
+        innovations = self._innovations()
+        nis = np.array([one.innovation.nis for one in self.filtered])
+        factor = _widening(nis[:n], self._dof(innovations)[:n], innovations[:n])
+        self.widening = np.append(self.widening, factor[self.widening.size :])
+
+    def _undetected(self) -> BoolArray:
+        """Mark entries of the state before the first estimate of their mode, (n_logs, 4 m)."""
         there = np.isfinite([self.history.ln_frequency, self.history.ln_damping])
         seen = np.logical_or.accumulate(there, axis=1)
         modes = [seen[:, :, self.history.columns(m)].any(axis=2) for m in self.history.modes]
         ln_f, ln_zeta = ~np.stack(modes, axis=2)
         return np.hstack([ln_f, ln_f, ln_zeta, ln_f])
 
-    def _alarm(self, bank: Bank, k: int, evidence: float) -> None:
-        """Raise the alarm once in every chapter between resets."""
-        if self.found.alarmed:
-            return
-        self.found.alarmed = True
-        mean, cov = bank.collapse(self.record.mean.shape[1])
-        contrast = self.filters.space.drift()
-        drift = contrast @ mean
-        std = np.sqrt(np.maximum(np.diag(contrast @ cov @ contrast.T), 0.0))
-        i = int(np.argmax(np.abs(drift) / np.maximum(std, 1e-12)))
-        self.found.events.append(
-            Event(
-                kind="alarm",
-                epoch=k,
-                mode=self.history.modes[i],
-                source="",
-                size=float(drift[i]),
-                std=float(std[i]),
-                evidence=evidence,
-                declared=False,
-                found_at=k,
-            )
-        )
-
-    def _result(self, bank: Bank) -> Track:
-        history, record, space = self.history, self.record, self.filters.space
-        contrast = space.drift()
-        drift = record.mean @ contrast.T
-        drift_cov = np.einsum("mi,kij,nj->kmn", contrast, record.cov, contrast)
-        early = np.arange(len(history.logs)) < history.baselines[0]
-        drift[early], drift_cov[early] = np.nan, np.nan
-        # At a baseline, and on its spot until something happens, ℓ and ℓ₀ are the same.
-        clock, spread = history.clock(), np.einsum("kmm->km", drift_cov).max(axis=1)
-        for first in history.baselines:
-            still = (clock == clock[first]) & (np.arange(clock.size) > first) & (spread < _ROUNDING)
-            still[first] = True
-            drift[still], drift_cov[still] = 0.0, 0.0
-        # A variance of nearly zero may become negative by rounding, and then has no covariances.
-        negative = np.einsum("kmm->km", drift_cov) < 0
-        drift_cov[negative[:, :, None] | negative[:, None, :]] = 0.0
-        self._settle(len(history.logs))
-        widening = record.widening
-        variance = np.maximum(np.einsum("kii->ki", record.cov), 0.0)
-        std = np.sqrt(variance) * widening[:, None]
-        unseen = self._unseen()
-        record.mean[unseen], std[unseen] = np.nan, np.nan
+    def _track(self) -> Track:
+        history, space = self.history, self.model.space
+        mean = np.array([one.mean for one in self.published])
+        cov = np.array([one.cov for one in self.published])
+        drift, drift_cov = _drifts(space, mean, cov)
+        self._extend_widening(len(history.logs))
+        innovations, widening = self._innovations(), self.widening
+        std = np.sqrt(np.maximum(np.einsum("kii->ki", cov), 0.0)) * widening[:, None]
+        undetected = self._undetected()
+        mean[undetected], std[undetected] = np.nan, np.nan
+        r, mode_of = len(history.series), history.mode_of()
         return Track(
             stage=history.stage,
             logs=history.logs,
             recorded_at=history.recorded_at,
             travel=history.travel,
             modes=history.modes,
-            sources=self.filters.sources,
-            ln_frequency=record.mean[:, space.level],
+            sources=self.model.sources,
+            ln_frequency=mean[:, space.level],
             ln_frequency_std=std[:, space.level],
-            ln_damping=record.mean[:, space.damping],
+            ln_damping=mean[:, space.damping],
             ln_damping_std=std[:, space.damping],
             drift=drift,
             drift_cov=drift_cov * widening[:, None, None] ** 2,
-            effects=_effects(space, bank, self.filters.sources),
-            events=tuple(
-                sorted([*self.found.events, *self._events(bank)], key=lambda event: event.epoch)
-            ),
+            effects=_effects(space, self.bank, self.model.sources),
+            events=tuple(sorted([*self.alarms, *self._step_events()], key=lambda e: e.epoch)),
             steps=space.steps,
-            nis=record.nis,
-            nis_dof=self._dof(),
+            nis=np.array([one.innovation.nis for one in self.filtered]),
+            nis_dof=self._dof(innovations),
             outliers=tuple(
                 (k, mode)
-                for k, rows in sorted(self.doubted.items())
+                for k, one in enumerate(self.filtered)
+                if one.outlying is not None
                 for i, mode in enumerate(history.modes)
-                if rows[: len(history.series)][history.mode_of() == i].any()
+                if one.outlying[:r][mode_of == i].any()
             ),
-            innovations=self.watch.innovations,
-            noise_scale=record.scale,
+            innovations=innovations,
+            noise_scale=np.array([one.scale for one in self.published]),
             widening=widening,
         )
 
-    def _events(self, bank: Bank) -> list[Event]:
-        """Tell the steps, found and declared, mode by mode."""
-        space, m = self.filters.space, len(self.history.modes)
-        mean, cov = bank.collapse()
+    def _step_events(self) -> list[Event]:
+        """List the steps, detected and declared, mode by mode."""
+        space, m = self.model.space, len(self.history.modes)
+        mean, cov = self.bank.collapse()
         events: list[Event] = []
         for j, step in enumerate(space.steps):
             if step.kind == "reset":
                 continue
             jump = space.jump(j)
-            # Of grease the damping, of all else the frequency.
+            # A regreasing is measured by ln ζ, all others by ln f.
             own = slice(jump.start, jump.start + m)
             if step.kind == "regreasing":
                 own = slice(jump.start + m, jump.stop)
             size, spread = mean[own], cov[own, own]
-            finding, found_at = self.found.findings.get(j, (None, step.first))
-            evidence = finding.log_bayes_factor if finding else _evidence(space, step, size, spread)
+            change, found_at = self.changes.get(j, (None, step.first))
+            evidence = change.log_bayes_factor if change else _evidence(step, size, spread)
+            std = np.sqrt(np.maximum(np.diag(spread), 0.0))
             events += [
                 Event(
                     kind=step.kind,
@@ -598,7 +584,7 @@ class _Follower:
                     mode=mode,
                     source=step.source,
                     size=float(size[i]),
-                    std=float(np.sqrt(max(spread[i, i], 0.0))),
+                    std=float(std[i]),
                     evidence=evidence,
                     declared=step.declared,
                     found_at=found_at,
@@ -608,35 +594,54 @@ class _Follower:
         return events
 
 
-def _evidence(space: StateSpace, step: Step, size: FloatArray, spread: FloatArray) -> float:
-    """Log Bayes factor of a declared step: the density ratio at no jump [Dickey1971]."""
-    prior = JUMP_STD[step.kind][1 if step.kind == "regreasing" else 0]
+def _drifts(space: StateSpace, mean: FloatArray, cov: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the drifts of all epochs, ``(n, m)``, and their covariances; NaN before a baseline."""
+    history, contrast = space.history, space.drift()
+    drift = mean @ contrast.T
+    drift_cov = np.einsum("mi,kij,nj->kmn", contrast, cov, contrast)
+    early = np.arange(len(history.logs)) < history.baselines[0]
+    drift[early], drift_cov[early] = np.nan, np.nan
+    # At a baseline, and at its place on the clock until a step, ℓ and ℓ₀ are equal.
+    clock, spread = history.clock(), np.einsum("kmm->km", drift_cov).max(axis=1)
+    for first in history.baselines:
+        still = (clock == clock[first]) & (np.arange(clock.size) > first) & (spread < _ROUNDING)
+        still[first] = True
+        drift[still], drift_cov[still] = 0.0, 0.0
+    # A variance of nearly zero may become negative by rounding, and then has no covariances.
+    negative = np.einsum("kmm->km", drift_cov) < 0
+    drift_cov[negative[:, :, None] | negative[:, None, :]] = 0.0
+    return drift, drift_cov
+
+
+def _evidence(step: Step, size: FloatArray, spread: FloatArray) -> float:
+    """Return the log Bayes factor of a declared step: the density ratio at no jump [Dickey1971]."""
+    prior = constants.JUMP_STD[step.kind][1 if step.kind == "regreasing" else 0]
     log_det = np.linalg.slogdet(spread)[1] - 2 * size.size * np.log(prior)
     return float(0.5 * (log_det + size @ np.linalg.solve(spread, size)))
 
 
 def _widening(nis: FloatArray, dof: FloatArray, innovations: FloatArray) -> FloatArray:
-    """Factor on standard deviations up to each log, one while the innovations are consistent.
+    """Return the factor on standard deviations up to each log, 1 while innovations are consistent.
 
-    Innovations that are larger than their bound widen by the ratio; that go on from log to log, by
-    what an autocorrelation takes of the number of independent ones.
+    Innovations that are too large widen by the ratio to their bound; positively autocorrelated ones
+    by the reduction of the number of independent innovations.
     """
     total, degrees = np.cumsum(np.where(dof > 0, nis, 0.0)), np.cumsum(dof)
-    bound = stats.chi2.isf(_WIDEN, np.maximum(degrees, 1.0))
+    bound = stats.chi2.isf(constants.WIDENING_P_VALUE, np.maximum(degrees, 1.0))
     factor = np.where(degrees > 0, np.maximum(total / bound, 1.0), 1.0)
-    sums, counts = neighbours(innovations)
+    sums, counts = lagged_products(innovations)
     n = np.cumsum(counts)
     squares = np.cumsum(np.nansum(innovations**2, axis=1))
     count = np.cumsum(np.isfinite(innovations).sum(axis=1))
     size = squares / np.maximum(count, 1)
     rho = np.clip(np.cumsum(sums) / np.maximum(n, 1) / np.maximum(size, 1e-12), -0.9, 0.9)
-    clear = np.cumsum(sums) > stats.norm.isf(_WIDEN) * np.sqrt(np.cumsum(sums**2))
-    factor = factor * np.where(clear, (1 + rho) / (1 - rho), 1.0)
+    bound = stats.norm.isf(constants.WIDENING_P_VALUE) * np.sqrt(np.cumsum(sums**2))
+    factor = factor * np.where(np.cumsum(sums) > bound, (1 + rho) / (1 - rho), 1.0)
     return np.asarray(np.sqrt(factor))
 
 
-def _effects(space: StateSpace, bank: Bank, sources: tuple[str, ...]) -> tuple[Effect, ...]:
-    """Tell what moves the modes without wear, after the last log."""
+def _effects(space: StateSpace, bank: FilterBank, sources: tuple[str, ...]) -> tuple[Effect, ...]:
+    """List the effects that are no wear, after the last log."""
     modes = space.history.modes
     mean, cov = bank.collapse()
     std = np.sqrt(np.maximum(np.diag(cov), 0.0))
@@ -655,36 +660,36 @@ def _effects(space: StateSpace, bank: Bank, sources: tuple[str, ...]) -> tuple[E
         at, one = space.first_bias + 2 * j, space.history.series[i]
         effects.append(Effect(one.mode, f"bias:{one.source}", float(mean[at]), float(std[at])))
     for s, source in enumerate(sources):
-        values = bank.settings.scales[:, s]
+        values = bank.hyperparameters.scales[:, s]
         scale = float(bank.weight @ values)
         spread = float(np.sqrt(bank.weight @ (values - scale) ** 2))
         effects.append(Effect("", f"scale:{source}", scale, spread))
     return tuple(effects)
 
 
-def accepted_estimates(history: History, followed: Track) -> History:
-    """Give a history as its track takes it: with all steps, without the outliers."""
+def accepted_estimates(history: History, track: Track) -> History:
+    """Return a history with the steps of its track and without its outliers."""
     values = [np.array(part) for part in (history.ln_frequency, history.ln_damping, history.cov)]
     ln_f, ln_zeta, cov = values
     r = len(history.series)
-    for k, mode in followed.outliers:
+    for k, mode in track.outliers:
         own = history.columns(mode)
         ln_f[k, own] = ln_zeta[k, own] = np.nan
         both = [*own, *(r + i for i in own)]
         cov[k, both], cov[k][:, both] = np.nan, np.nan
-    return replace(history, ln_frequency=ln_f, ln_damping=ln_zeta, cov=cov, steps=followed.steps)
+    return replace(history, ln_frequency=ln_f, ln_damping=ln_zeta, cov=cov, steps=track.steps)
 
 
-def outlier_refusals(history: History, followed: Track) -> list[Refusal]:
-    """Tell which estimates the track hardly believed."""
+def outlier_refusals(history: History, track: Track) -> list[Refusal]:
+    """List the outliers of a track as refusals."""
     refused = []
-    for k, mode in followed.outliers:
-        i, own = followed.modes.index(mode), history.columns(mode)
+    for k, mode in track.outliers:
+        i, own = track.modes.index(mode), history.columns(mode)
         found = float(np.exp(np.nanmean(history.ln_frequency[k, own])))
-        before = float(np.exp(followed.ln_frequency[max(k - 1, 0), i]))
+        before = float(np.exp(track.ln_frequency[max(k - 1, 0), i]))
         detail = (
-            f"{found:.5g} Hz, or its damping, lies far from what all logs before it tell "
-            f"({before:.5g} Hz): a jump is believed once the next log confirms it"
+            f"{found:.5g} Hz, or its damping, is far from the estimates of all logs before "
+            f"({before:.5g} Hz): a jump is accepted once the next log confirms it"
         )
         refused.append(Refusal(log=history.logs[k], mode=mode, reason="jump", detail=detail))
     return refused

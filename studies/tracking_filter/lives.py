@@ -13,7 +13,14 @@ from scipy import stats
 
 from lmshealth.stage.description import Stage, load_stage
 from lmshealth.tracking.constants import BIAS_STD, DAMPING_WALK
-from lmshealth.tracking.filter_bank import Filter, Settings, settings
+from lmshealth.tracking.filter_bank import (
+    FilterModel,
+    Hyperparameters,
+    hyperparameter_grid,
+    initial,
+    predict,
+    update,
+)
 from lmshealth.tracking.history import History, Series
 from lmshealth.tracking.state_space import state_space
 
@@ -47,7 +54,7 @@ class Life:
     """A history, the setting it was drawn with, and the truth ``(n_logs, n_modes)``."""
 
     history: History
-    setting: Settings
+    setting: Hyperparameters
     level: Array
     damping: Array
 
@@ -70,7 +77,7 @@ def draw(rng: np.random.Generator, sources: tuple[str, ...] = ("acc",)) -> Life:
     Errors of the estimates of a log are correlated, by 0.9 where two sources see one mode; a
     tenth of the estimates and of the temperatures are missing.
     """
-    grid = settings(len(sources))
+    grid = hyperparameter_grid(len(sources))
     chosen = grid.only(rng.choice(grid.rate_std.size, size=1, p=np.exp(grid.log_prior)))
     n, m, r = int(rng.integers(20, 41)), len(MODES), len(MODES) * len(sources)
     travel = np.cumsum(np.r_[1e5, HORIZON * rng.uniform(0.002, 0.05, n - 1)])
@@ -105,7 +112,7 @@ def draw(rng: np.random.Generator, sources: tuple[str, ...] = ("acc",)) -> Life:
     return Life(history, chosen, level, damping)
 
 
-def _walk(rng: np.random.Generator, chosen: Settings, ticks: Array) -> tuple[Array, Array]:
+def _walk(rng: np.random.Generator, chosen: Hyperparameters, ticks: Array) -> tuple[Array, Array]:
     """Let both modes wander: ln f and ln ζ, ``(n_logs, n_modes)`` each."""
     m = len(MODES)
     rate = chosen.rate_std * rng.standard_normal(m)
@@ -188,9 +195,9 @@ class Filtered:
 def filtered(life: Life, machine: Stage) -> Filtered:
     """Filter a life by the setting it was drawn with."""
     space = state_space(life.history, machine)
-    filters = Filter(space, life.history.baselines)
-    filters.grid = replace(life.setting, log_prior=np.zeros(1))
-    bank, n, m = filters.start(), len(life.history.logs), space.n_modes
+    model = FilterModel(space, life.history.baselines)
+    model.grid = replace(life.setting, log_prior=np.zeros(1))
+    bank, n, m = initial(model), len(life.history.logs), space.n_modes
     contrasts = {name: np.zeros((m, space.size)) for name in ("ln f", "ln ζ", "drift")}
     contrasts["ln f"][:, space.level] = contrasts["drift"][:, space.level] = np.eye(m)
     contrasts["drift"][:, space.base] = -np.eye(m)
@@ -199,8 +206,8 @@ def filtered(life: Life, machine: Stage) -> Filtered:
     cov = {name: np.empty((n, m, m)) for name in contrasts}
     nis = np.empty(n)
     for k in range(n):
-        filters.move(bank, k)
-        nis[k] = filters.see(bank, k).nis
+        bank, innovation = update(model, predict(model, bank, k), k)
+        nis[k] = innovation.nis
         for name, contrast in contrasts.items():
             mean[name][k] = contrast @ bank.mean[0]
             cov[name][k] = contrast @ bank.cov[0] @ contrast.T
@@ -212,12 +219,10 @@ def filtered(life: Life, machine: Stage) -> Filtered:
 def mixture(life: Life, machine: Stage, k: int, i: int) -> dict[str, float]:
     """Probability that the average over all settings gives to less than the truth, at one log."""
     space = state_space(life.history, machine)
-    filters = Filter(space, life.history.baselines)
-    bank = filters.start()
+    model = FilterModel(space, life.history.baselines)
+    bank = initial(model)
     for j in range(k + 1):
-        filters.move(bank, j)
-        filters.see(bank, j)
-        bank = bank.pruned()
+        bank = update(model, predict(model, bank, j), j)[0].pruned()
     levels, bases = space.level.start + i, space.base.start + i
     places = {"ln f": [levels], "ln ζ": [space.damping.start + i], "drift": [levels, bases]}
     below = {}

@@ -16,7 +16,13 @@ from filterpy.kalman import KalmanFilter
 from lmshealth.stage.description import Stage
 from lmshealth.tracking.constants import DAMPING_WALK, LN_F_STD, LN_ZETA_STD
 from lmshealth.tracking.covariates import Regressor
-from lmshealth.tracking.filter_bank import Filter, Settings
+from lmshealth.tracking.filter_bank import (
+    FilterModel,
+    Hyperparameters,
+    initial,
+    predict,
+    update,
+)
 from lmshealth.tracking.history import History, Series
 from lmshealth.tracking.state_space import StateSpace, state_space
 from lmshealth.tracking.track import track
@@ -40,7 +46,7 @@ class Loop:
 
 
 def filterpy_loop(
-    history: History, setting: Settings, life: float, regressed: tuple[Regressor, ...] = ()
+    history: History, setting: Hyperparameters, life: float, regressed: tuple[Regressor, ...] = ()
 ) -> Loop:
     """Filter one setting by filterpy, log by log: [ln f, rate, ln ζ, baseline, coefficients]."""
     m, n = len(history.modes), len(history.logs)
@@ -130,9 +136,9 @@ def long_life(n: int, m: int) -> History:
     )
 
 
-def one_setting() -> Settings:
+def one_setting() -> Hyperparameters:
     """Give the setting that all of them can express."""
-    return Settings(
+    return Hyperparameters(
         np.array([LEVEL_WALK]), np.array([RATE_STD]), np.zeros(1), np.ones((1, 1)), np.zeros(1)
     )
 
@@ -140,13 +146,12 @@ def one_setting() -> Settings:
 def bank_of_one(history: History) -> tuple[Array, Array]:
     """Filter by the bank with one setting: ln f and its std, ``(n_logs, n_modes)``."""
     space: StateSpace = state_space(history, None)
-    filters = Filter(space, history.baselines)
-    filters.grid = one_setting()
-    bank, n = filters.start(), len(history.logs)
+    model = FilterModel(space, history.baselines)
+    model.grid = one_setting()
+    bank, n = initial(model), len(history.logs)
     mean, variance = np.empty((n, space.n_modes)), np.empty((n, space.n_modes))
     for k in range(n):
-        filters.move(bank, k)
-        filters.see(bank, k)
+        bank = update(model, predict(model, bank, k), k)[0]
         mean[k] = bank.mean[0, space.level]
         variance[k] = np.diag(bank.cov[0])[space.level]
     return mean, np.sqrt(variance)

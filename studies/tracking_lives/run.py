@@ -44,7 +44,7 @@ from unittest.mock import patch
 
 import numpy as np
 
-from lmshealth.tracking import filter_bank as bank
+from lmshealth.tracking import constants
 from studies.common.lives import (
     DAMAGED,
     HEALTHY,
@@ -189,7 +189,7 @@ def halved(sizes: Sizes, n: int) -> Row:
         if kind in DAMAGED:
             pairs = pairs_of(sizes, i, n)
             small = [(life, replace(one, cov=one.cov / 2)) for life, one in pairs]
-            with patch.object(bank, "_SCALES", ((1.0, 1.0),)):
+            with patch.object(constants, "NOISE_SCALES", ((1.0, 1.0),)):
                 found += follow(small)
     return coverage(found)
 

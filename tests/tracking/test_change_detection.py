@@ -11,10 +11,18 @@ from scipy import integrate, stats
 
 from lmshealth._arrays import FloatArray
 from lmshealth.stage.description import Stage
-from lmshealth.tracking import change_detection as events
+from lmshealth.tracking import constants
 from lmshealth.tracking import filter_bank as bank
-from lmshealth.tracking.change_detection import Finding, Watch, loop_evidence, reborn, threshold
-from lmshealth.tracking.filter_bank import Filter, Surprise
+from lmshealth.tracking.change_detection import (
+    Change,
+    add_to_sums,
+    loop_evidence,
+    running_sums,
+    suspect,
+    threshold,
+    unexplained_leaps,
+)
+from lmshealth.tracking.filter_bank import FilterModel, restart
 from lmshealth.tracking.history import History, Step
 from lmshealth.tracking.state_space import state_space
 from lmshealth.tracking.track import Track, track
@@ -167,68 +175,55 @@ def test_a_drift_that_begins_is_an_alarm(stage: Stage) -> None:
     assert alarm.size == pytest.approx(found.drift[alarm.epoch, i])
 
 
-def test_windows_that_lean_raise_a_suspicion() -> None:
-    """The suspect is the first log of the window that leans most; outliers keep their lean."""
-    watch = Watch(2, np.full(30, np.nan))
-    rows = np.arange(2)
-    for k in range(20):
-        own = Surprise(rows, np.array([0.5, -0.5]) * (-1) ** k, 0.5)
-        watch.add(k, own, own)
-        assert watch.suspect(k) is None
-    nothing = Surprise(rows[:0], np.array([]), 0.0)
-    for k in range(20, 24):
-        watch.add(k, Surprise(rows, np.array([0.0, 2.5]), 6.25), nothing)
-    assert watch.suspect(23) == 20
-    assert np.isnan(watch.innovations[20:24]).all()
-    # What is filtered again replaces what was noted.
-    for k in range(20, 24):
-        calm = Surprise(rows, np.zeros(2), 0.0)
-        watch.add(k, calm, calm)
-    assert watch.suspect(23) is None
-    assert (watch.innovations[20:24] == 0).all()
+def sums_of(innovations: FloatArray) -> list[tuple[FloatArray, FloatArray]]:
+    """Sum innovations ``(n_logs, n_rows)`` log by log."""
+    sums = [running_sums(innovations.shape[1])]
+    for own in innovations:
+        sums.append(add_to_sums(sums[-1], np.arange(own.size), own))
+    return sums
+
+
+def test_windows_of_large_mean_innovations_are_suspected() -> None:
+    """The suspect is the first log of the window with the largest mean."""
+    innovations = 0.5 * np.array([1.0, -1.0]) * (-1.0) ** np.arange(20)[:, None]
+    sums = sums_of(np.vstack([innovations, np.tile([0.0, 2.5], (4, 1))]))
+    assert [suspect(sums[: k + 2], 1, []) for k in range(20)] == [None] * 20
+    assert suspect(sums, 1, []) == 20
+    assert suspect(sums_of(np.vstack([innovations, np.zeros((4, 2))])), 1, []) is None
 
 
 def test_leaps_of_the_loop_are_suspected() -> None:
     """Two following errors in a row that differ from the dozen before are, with the second log.
 
-    One alone is not, and neither is one that a known step explains.
+    One alone is not, and neither is one that a step in the model explains.
     """
     rng = np.random.default_rng(34)
     error = 1e-6 * np.exp(0.05 * rng.standard_normal(30))
     lone = error.copy()
     lone[15] *= 1.5
     error[20:] *= 1.5
-    watch = Watch(2, error)
-    assert watch.suspect(20) is None
-    assert watch.suspect(21) == 20
-    assert Watch(2, lone).suspect(16) is None
-    watch.settle((since("servo", 20, 30),))
-    assert watch.suspect(21) is None
+    leaps, none = unexplained_leaps(error, ()), np.full((30, 2), np.nan)
+    sums = [running_sums(2)] * (none.shape[0] + 1)
+    assert suspect(sums[:22], 1, leaps) is None
+    assert suspect(sums[:23], 1, leaps) == 20
+    assert 15 not in unexplained_leaps(lone, ())
+    assert 20 not in unexplained_leaps(error, (since("servo", 20, 30),))
 
 
-def test_windows_do_not_reach_before_the_chapter() -> None:
-    """What leaned before an event is explained by it."""
-    watch = Watch(2, np.full(10, np.nan))
-    rows = np.arange(2)
-    for k in range(6):
-        own = Surprise(rows, np.array([4.0, 0.0]), 16.0)
-        watch.add(k, own, own)
-    assert watch.suspect(5) == 2
-    watch.first = 4
-    assert watch.suspect(5) == 4
-    watch.first = 5
-    assert watch.suspect(5) is None
+def test_windows_do_not_reach_before_the_segment() -> None:
+    """Innovations before a step are explained by it."""
+    sums = sums_of(np.tile([4.0, 0.0], (6, 1)))
+    assert suspect(sums, 1, []) == 2
+    assert suspect(sums, 4, []) == 4
+    assert suspect(sums, 5, []) is None
 
 
-def test_what_moves_all_dampings_is_suspected_before_each_of_them() -> None:
-    """Four rows that lean by 2.2 together lean as far as one by 4.4; one alone does not."""
-    for leaning, suspected in (((0, 0, 1, 1), 10), ((0, 0, 1, 0), None)):
-        watch, rows = Watch(4, np.full(20, np.nan)), np.arange(4)
-        for k in range(12):
-            lean = 2.2 * (k >= 10) * np.array(leaning)
-            own = Surprise(rows, lean, float(lean @ lean))
-            watch.add(k, own, own)
-        assert watch.suspect(11) == suspected
+def test_a_change_of_all_dampings_is_suspected_before_each_of_them() -> None:
+    """Two dampings with a mean of 2.2 are as far as one with 3.1; one of them alone is not."""
+    for moved, suspected in (((0, 0, 1, 1), 10), ((0, 0, 1, 0), None)):
+        innovations = np.zeros((12, 4))
+        innovations[10:] = 2.2 * np.array(moved)
+        assert suspect(sums_of(innovations), 1, []) == suspected
 
 
 def student_bayes_factor(before: FloatArray, after: FloatArray) -> float:
@@ -272,56 +267,56 @@ def test_evidence_of_the_loop_needs_logs_on_both_sides() -> None:
     assert still is not None and still < -2
 
 
-def test_a_new_chapter_keeps_the_state_and_forgets_the_settings(stage: Stage) -> None:
+def test_a_segment_keeps_the_state_and_restarts_the_process_noise(stage: Stage) -> None:
     """Means stay, rates are open again, the noise stays known, and the weights are the prior's."""
     kept = run(rough_history(np.random.default_rng(32), n=30), stage)
     old = kept[-1][0].pruned()
-    filters = Filter(state_space(rough_history(np.random.default_rng(32), n=30), stage), (0,))
-    new = reborn(old, filters)
-    space, healthy = filters.space, new.settings.healthy
+    model = FilterModel(state_space(rough_history(np.random.default_rng(32), n=30), stage), (0,))
+    new = restart(model, old)
+    space, healthy = model.space, new.hyperparameters.healthy
     assert new.weight.sum() == pytest.approx(1.0)
-    assert new.weight[healthy].sum() == pytest.approx(bank.HEALTHY_PRIOR)
-    for scale in np.unique(new.settings.scales):
-        share = new.weight[new.settings.scales[:, 0] == scale].sum()
-        before = old.weight[old.settings.scales[:, 0] == scale].sum()
+    assert new.weight[healthy].sum() == pytest.approx(constants.HEALTHY_PROBABILITY)
+    for scale in np.unique(new.hyperparameters.scales):
+        share = new.weight[new.hyperparameters.scales[:, 0] == scale].sum()
+        before = old.weight[old.hyperparameters.scales[:, 0] == scale].sum()
         assert share == pytest.approx(before, abs=1e-9)
     for still in (True, False):
         group = healthy == still
-        mean, cov = old.only(old.settings.healthy == still).collapse()
+        mean, cov = old.only(old.hyperparameters.healthy == still).collapse()
         rest = np.setdiff1d(np.arange(space.size), np.arange(space.rate.start, space.rate.stop))
         np.testing.assert_allclose(new.mean[group][:, rest], np.tile(mean[rest], (group.sum(), 1)))
         for own in new.cov[group]:
             np.testing.assert_allclose(own[np.ix_(rest, rest)], cov[np.ix_(rest, rest)], atol=1e-18)
     rates = np.einsum("gii->gi", new.cov[:, space.rate, space.rate])
     assert (rates[healthy] == 0).all()
-    assert (rates[~healthy] >= new.settings.rate_std[~healthy, None] ** 2).all()
+    assert (rates[~healthy] >= new.hyperparameters.rate_std[~healthy, None] ** 2).all()
     # The bank it came from is untouched.
     assert old.mean.shape[0] < new.mean.shape[0]
 
 
-def test_one_setting_is_born_again_as_it_was(stage: Stage, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_one_setting_restarts_as_it_was(stage: Stage, monkeypatch: pytest.MonkeyPatch) -> None:
     """With a grid of one only the rate is open anew."""
     grid = one(SETTINGS[0], ("acc",))
     history = rough_history(np.random.default_rng(33))
-    monkeypatch.setattr(bank, "settings", lambda n: grid)
-    filters = Filter(state_space(history, stage), history.baselines)
+    monkeypatch.setattr(bank, "hyperparameter_grid", lambda n: grid)
+    model = FilterModel(state_space(history, stage), history.baselines)
     old = run(history, stage, grid)[-1][0]
-    new = reborn(old, filters)
+    new = restart(model, old)
     np.testing.assert_allclose(new.mean, old.mean, rtol=1e-12)
     opened = np.zeros_like(old.cov)
-    rate = np.arange(filters.space.rate.start, filters.space.rate.stop)
+    rate = np.arange(model.space.rate.start, model.space.rate.stop)
     opened[:, rate, rate] = SETTINGS[0].rate ** 2
     np.testing.assert_allclose(new.cov, old.cov + opened, atol=1e-16)
     assert new.log_evidence == pytest.approx(0.0, abs=1e-12)
 
 
-def test_findings_are_believed_at_the_declared_rate() -> None:
+def test_changes_are_significant_at_the_declared_probability() -> None:
     """One in a hundred is the bound for an event; an alarm shares it among three routes."""
     assert threshold(1) == pytest.approx(np.log(100))
     assert threshold() == pytest.approx(np.log(300))
-    likely = Finding("step", "", 3, np.log(200), 10.0)
-    assert likely.believed and not likely.damage
-    assert Finding("step", "", 3, 10.0, 10.0).damage
-    assert not Finding("step", "", 3, 10.0, 1.0).damage
-    assert not Finding("servo", "", 3, 10.0, 10.0).damage
-    assert events.constants.FALSE_ALARM_PROBABILITY == 0.01
+    likely = Change("step", "", 3, np.log(200), 10.0)
+    assert likely.significant and not likely.damage
+    assert Change("step", "", 3, 10.0, 10.0).damage
+    assert not Change("step", "", 3, 10.0, 1.0).damage
+    assert not Change("servo", "", 3, 10.0, 10.0).damage
+    assert constants.FALSE_ALARM_PROBABILITY == 0.01

@@ -10,7 +10,16 @@ from scipy.special import softmax
 
 from lmshealth._arrays import FloatArray
 from lmshealth.stage.description import Stage
-from lmshealth.tracking.filter_bank import HEALTHY_PRIOR, Bank, Filter, Settings, settings
+from lmshealth.tracking import constants
+from lmshealth.tracking.filter_bank import (
+    FilterBank,
+    FilterModel,
+    Hyperparameters,
+    hyperparameter_grid,
+    initial,
+    predict,
+    update,
+)
 from lmshealth.tracking.history import History
 from lmshealth.tracking.state_space import state_space
 from tests.lives import PRELOAD, TWO, awkward_history, make_stage, rough_history
@@ -32,10 +41,10 @@ def stage(tmp_path_factory: pytest.TempPathFactory) -> Stage:
     return make_stage(tmp_path_factory.mktemp("stage"), (PRELOAD,), tail=TWO)
 
 
-def one(wander: Wander, sources: tuple[str, ...]) -> Settings:
+def one(wander: Wander, sources: tuple[str, ...]) -> Hyperparameters:
     """Put a setting of the oracles as a grid of one."""
     scales = np.array([[wander.scales[source] for source in sources]])
-    return Settings(
+    return Hyperparameters(
         np.array([wander.level]),
         np.array([wander.rate]),
         np.array([wander.bend]),
@@ -44,22 +53,23 @@ def one(wander: Wander, sources: tuple[str, ...]) -> Settings:
     )
 
 
-def run(history: History, stage: Stage, grid: Settings | None = None) -> list[tuple[Bank, float]]:
-    """Filter all logs and keep a copy of the bank, and the NIS, after each."""
-    filters = Filter(state_space(history, stage, history.steps), history.baselines)
-    filters.grid = grid or filters.grid
-    at, kept = filters.start(), []
+def run(
+    history: History, stage: Stage, grid: Hyperparameters | None = None
+) -> list[tuple[FilterBank, float]]:
+    """Filter all logs and keep the bank and the NIS after each."""
+    model = FilterModel(state_space(history, stage, history.steps), history.baselines)
+    model.grid = grid or model.grid
+    at, kept = initial(model), []
     for k in range(len(history.logs)):
-        filters.move(at, k)
-        surprise = filters.see(at, k)
-        kept.append((at.copy(), surprise.nis))
+        at, innovation = update(model, predict(model, at, k), k)
+        kept.append((at, innovation.nis))
     return kept
 
 
 def told(history: History, stage: Stage, wander: Wander) -> Followed:
     """Tell what the bank says under one setting, as the oracles say it."""
     space = state_space(history, stage, history.steps)
-    sources = Filter(space, ()).sources
+    sources = FilterModel(space, ()).sources
     m = space.n_modes
     c = np.zeros((3, m, space.size))
     c[0, :, space.level] = c[1, :, space.damping] = c[2, :, space.level] = np.eye(m)
@@ -109,7 +119,7 @@ def test_another_setting_is_told_from_it(stage: Stage) -> None:
 
 def every() -> list[Wander]:
     """Give all settings of the grid as the oracles know them."""
-    grid = settings(1)
+    grid = hyperparameter_grid(1)
     return [
         Wander(walk, rate, bend, {"acc": scale})
         for walk, rate, bend, scale in zip(
@@ -124,7 +134,7 @@ def test_averaging_keeps_the_law_of_total_variance(stage: Stage) -> None:
     history = rough_history(np.random.default_rng(4))
     space = state_space(history, stage)
     books = [kalman(history, wander, ALONE) for wander in every()]
-    log_weight = settings(1).log_prior[:, None] + [book.log_evidence for book in books]
+    log_weight = hyperparameter_grid(1).log_prior[:, None] + [book.log_evidence for book in books]
     kept = run(history, stage)
     between = 0.0
     for k, (at, _) in enumerate(kept):
@@ -149,7 +159,7 @@ def test_evidence_of_a_drift_is_that_of_one_group_over_the_other(stage: Stage) -
     """The Bayes factor is the mean evidence with a rate over the mean evidence without one."""
     history = rough_history(np.random.default_rng(5))
     evidence = np.array([kalman(history, w, ALONE).log_evidence[-1] for w in every()])
-    grid = settings(1)
+    grid = hyperparameter_grid(1)
     groups = [
         np.logaddexp.reduce(evidence[own] + grid.log_prior[own])
         - np.logaddexp.reduce(grid.log_prior[own])
@@ -166,13 +176,11 @@ def test_pruning_changes_next_to_nothing(stage: Stage) -> None:
     Negative control: dropping all but the likeliest does.
     """
     history = rough_history(np.random.default_rng(6), n=60)
-    filters = Filter(state_space(history, stage), history.baselines)
-    banks = [filters.start() for _ in range(3)]
+    model = FilterModel(state_space(history, stage), history.baselines)
+    banks = [initial(model) for _ in range(3)]
     moved, narrowed, poorest, least = np.zeros(60), np.zeros(60), np.zeros(60), 10**6
     for k in range(60):
-        for at in banks:
-            filters.move(at, k)
-            filters.see(at, k)
+        banks = [update(model, predict(model, at, k), k)[0] for at in banks]
         banks[1] = banks[1].pruned()
         banks[2] = banks[2].only(banks[2].log_weight == banks[2].log_weight.max())
         (mean, cov), (pruned, own), (poor, _) = (at.collapse() for at in banks)
@@ -181,35 +189,34 @@ def test_pruning_changes_next_to_nothing(stage: Stage) -> None:
         narrowed[k] = np.abs(np.sqrt(np.maximum(np.diag(own), 1e-12)) / std - 1).max()
         poorest[k] = np.abs((poor - mean) / std).max()
         least = min(least, banks[1].weight.size)
-        healthy = banks[1].settings.healthy
+        healthy = banks[1].hyperparameters.healthy
         assert healthy.any() and not healthy.all()
     assert max(moved.max(), narrowed.max()) < 1e-3
     assert poorest.max() > 0.1
-    assert least < settings(1).rate_std.size / 2
+    assert least < hyperparameter_grid(1).rate_std.size / 2
 
 
 def test_the_prior_of_the_settings_adds_up() -> None:
     """Probabilities sum to one, a tenth of them healthy, for any number of sources."""
     for n_sources in (1, 2, 3, 5):
-        grid = settings(n_sources)
+        grid = hyperparameter_grid(n_sources)
         share = np.exp(grid.log_prior)
         assert share.sum() == pytest.approx(1.0)
-        assert share[grid.healthy].sum() == pytest.approx(HEALTHY_PRIOR)
+        assert share[grid.healthy].sum() == pytest.approx(constants.HEALTHY_PROBABILITY)
         assert (grid.rate_walk[grid.healthy] == 0).all()
         assert grid.scales.shape == (share.size, n_sources)
         # Sources past the third have no factor of their own.
         assert (grid.scales[:, 3:] == grid.scales[:, 2:3]).all() or n_sources <= 3
 
 
-def test_copies_of_a_bank_are_its_own(stage: Stage) -> None:
-    """Advancing a copy, or a longer one, leaves the bank as it was."""
+def test_banks_are_immutable(stage: Stage) -> None:
+    """Predicting and updating a bank, or a longer one, leaves it as it was."""
     history = rough_history(np.random.default_rng(7))
-    filters = Filter(state_space(history, stage), history.baselines)
-    at = filters.start()
+    model = FilterModel(state_space(history, stage), history.baselines)
+    at = initial(model)
     before = at.mean.copy(), at.cov.copy(), at.log_weight.copy()
-    for other in (at.copy(), at.padded(at.mean.shape[1])):
-        filters.move(other, 0)
-        filters.see(other, 0)
+    for other in (at, at.padded(at.mean.shape[1])):
+        update(model, predict(model, other, 0), 0)
     for was, now in zip(before, (at.mean, at.cov, at.log_weight), strict=True):
         np.testing.assert_array_equal(was, now)
     longer = at.padded(at.mean.shape[1] + 2)
@@ -217,34 +224,29 @@ def test_copies_of_a_bank_are_its_own(stage: Stage) -> None:
     assert (longer.cov[:, -2:] == 0).all() and (longer.cov[:, :, -2:] == 0).all()
 
 
-def test_what_is_doubted_is_hardly_believed(stage: Stage) -> None:
-    """A doubted log moves the state by a fiftieth of what it did at most, at a cost."""
+def test_outliers_have_next_to_no_weight(stage: Stage) -> None:
+    """An outlying log moves the state by a fiftieth of what it did at most, at a cost."""
     history = rough_history(np.random.default_rng(8))
-    filters = Filter(state_space(history, stage), history.baselines)
-    filters.grid = one(SETTINGS[0], ("acc",))
-    plain, doubted = filters.start(), filters.start()
-    for at in (plain, doubted):
-        filters.move(at, 0)
-        filters.see(at, 0)
-        filters.move(at, 1)
-    before = plain.mean[0].copy()
-    surprise = filters.see(plain, 1)
-    filters.see(doubted, 1, np.full(4, True))
-    level = filters.space.level.start
-    moved = np.abs(plain.mean[0] - before)[level], np.abs(doubted.mean[0] - before)[level]
+    model = FilterModel(state_space(history, stage), history.baselines)
+    model.grid = one(SETTINGS[0], ("acc",))
+    first, _ = update(model, predict(model, initial(model), 0), 0)
+    predicted = predict(model, first, 1)
+    plain, innovation = update(model, predicted, 1)
+    outlying, none = update(model, predicted, 1, np.full(4, True))
+    level = model.space.level.start
+    moved = [abs(at.mean[0] - predicted.mean[0])[level] for at in (plain, outlying)]
     assert moved[1] < 0.02 * moved[0]
-    assert surprise.rows.tolist() == [0, 1, 2, 3]
-    assert doubted.log_weight[0] < plain.log_weight[0]
+    assert innovation.rows.tolist() == [0, 1, 2, 3] and none.rows.size == 0
+    assert outlying.log_weight[0] < plain.log_weight[0]
 
 
-def test_a_log_without_estimates_brings_nothing(stage: Stage) -> None:
-    """An empty log leaves states, covariances and weights, and surprises nobody."""
+def test_a_log_without_estimates_changes_nothing(stage: Stage) -> None:
+    """An empty log leaves states, covariances and weights, and has no innovation."""
     history = rough_history(np.random.default_rng(9))
-    filters = Filter(state_space(history, stage), history.baselines)
-    at = filters.start()
-    before = at.copy()
-    surprise = filters.see(at, 4)
-    assert surprise.rows.size == 0 and surprise.nis == 0
+    model = FilterModel(state_space(history, stage), history.baselines)
+    before = initial(model)
+    at, innovation = update(model, before, 4)
+    assert innovation.rows.size == 0 and innovation.nis == 0
     np.testing.assert_array_equal(at.mean, before.mean)
     np.testing.assert_array_equal(at.log_weight, before.log_weight)
 
@@ -253,6 +255,6 @@ def test_a_log_without_estimates_brings_nothing(stage: Stage) -> None:
 def test_covariances_stay_positive_and_symmetric(stage: Stage) -> None:
     """Covariances of all settings are symmetric with no eigenvalue that is notably negative."""
     at, _ = run(awkward_history(np.random.default_rng(10), n=40), stage)[-1]
-    assert settings(2).rate_std.size == at.weight.size
+    assert hyperparameter_grid(2).rate_std.size == at.weight.size
     np.testing.assert_allclose(at.cov, np.swapaxes(at.cov, 1, 2), rtol=0, atol=1e-15)
     assert np.linalg.eigvalsh(at.cov).min() > -1e-13

@@ -9,7 +9,7 @@ import pytest
 
 from lmshealth.stage.description import Stage
 from lmshealth.tracking import filter_bank as bank
-from lmshealth.tracking.filter_bank import Filter
+from lmshealth.tracking.filter_bank import FilterModel
 from lmshealth.tracking.smoother import smooth, smooth_one
 from lmshealth.tracking.state_space import state_space
 from lmshealth.tracking.track import track
@@ -42,8 +42,8 @@ def test_one_setting_is_the_joint_gaussian_given_all_logs(
     """Means and covariances of all epochs are those of the joint Gaussian, to 1e-6 of the std."""
     history = awkward_history(np.random.default_rng(1))
     space = state_space(history, stage, history.steps)
-    filters = Filter(space, history.baselines, reopened)
-    mean, cov = smooth_one(filters, one(wander, filters.sources))
+    model = FilterModel(space, history.baselines, reopened)
+    mean, cov = smooth_one(model, one(wander, model.sources))
     book = batch(history, wander, replace(KNOWN, reopened=reopened), smoothed=True)
     variance = np.einsum("kpipi->kpi", book.cov)
     std = np.sqrt(np.maximum(variance, 1e-2 * variance[:, :1]))
@@ -62,7 +62,7 @@ def test_settings_are_averaged_by_their_evidence(stage: Stage) -> None:
     """Mean and variance are those of the mixture over settings, given all logs."""
     history = replace(rough_history(np.random.default_rng(2)), covariates={})
     found = smooth(history, track(history, stage), stage)
-    grid = bank.settings(1)
+    grid = bank.hyperparameter_grid(1)
     books, log_weight = [], []
     for g in range(grid.rate_std.size):
         wander = Wander(

@@ -12,15 +12,8 @@ import pytest
 from lmshealth._arrays import FloatArray
 from lmshealth.errors import NotEnoughData
 from lmshealth.stage.description import Stage
-from lmshealth.tracking import (
-    change_detection as events,
-)
-from lmshealth.tracking import (
-    filter_bank as bank,
-)
-from lmshealth.tracking import (
-    track as tracking,
-)
+from lmshealth.tracking import constants
+from lmshealth.tracking import filter_bank as bank
 from lmshealth.tracking.change_detection import loop_evidence
 from lmshealth.tracking.constants import JUMP_STD
 from lmshealth.tracking.history import History
@@ -64,9 +57,9 @@ def plain(monkeypatch: pytest.MonkeyPatch) -> Callable[[Wander], None]:
 
     def choose(wander: Wander) -> None:
         sources = tuple(wander.scales)
-        monkeypatch.setattr(bank, "settings", lambda n: one(wander, sources[:n]))
-        monkeypatch.setattr(tracking, "_FAR", inf)
-        monkeypatch.setattr(events, "_SUSPICIOUS", inf)
+        monkeypatch.setattr(bank, "hyperparameter_grid", lambda n: one(wander, sources[:n]))
+        monkeypatch.setattr(constants, "OUTLIER_GATE", inf)
+        monkeypatch.setattr(constants, "SUSPICION_GATE", inf)
 
     return choose
 
@@ -541,7 +534,7 @@ def test_one_log_only_is_tracked(stage: Stage) -> None:
         found = track(history, given)
         np.testing.assert_allclose(found.ln_frequency, history.ln_frequency, atol=1e-12)
         # By what factor the estimates' own std is wrong is not known after one log.
-        grid = bank.settings(1)
+        grid = bank.hyperparameter_grid(1)
         factor = np.sqrt(np.exp(grid.log_prior) @ grid.scales[:, 0] ** 2)
         np.testing.assert_allclose(found.ln_frequency_std, factor * 5e-4, rtol=0.01)
         assert (found.drift == 0).all()
