@@ -96,7 +96,8 @@ def assign(
         rivals = [i for i in open_ if probability[i, j] > constants.UNLIKELY_NAME]
         if target.name not in names and rivals:
             odds = "; ".join(_odds(frequency[i], probability[i], targets) for i in rivals)
-            ambiguous[target.name] = Rejection("ambiguous", f"the assignment is not clear: {odds}")
+            remedy = "the assignment is not clear; excite the other modes, or narrow searches"
+            ambiguous[target.name] = Rejection("ambiguous", f"{odds}: {remedy}")
     return Assignment(names, ambiguous)
 
 
