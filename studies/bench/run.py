@@ -1,16 +1,14 @@
-"""What does each step cost beside a peer or a lower bound in the same turn?
+"""Is every figure of speed still met, relative to a peer or a lower bound in the same turn?
 
-Question
-    Is every figure of speed still reached: identification, sampling, whole lives, remaining life,
-    tracking, reading, simulation, batches?
 Method
-    ``tests/bench``, by pytest-benchmark. Peer and ours take turns in one process; the figure is the
-    ratio of their processor times (of wall times for workers), its median over the turns. It is
-    missed where more turns are above the bound than chance allows at 1 % if the median were on it.
-    Where seconds were asked for, the bound is those seconds in times of the peer, as the study of
-    that step recorded both. Figures whose peer is not installed are left out.
+    ``tests/bench`` with pytest-benchmark: identification, sampling, lives, remaining life,
+    tracking, reading, simulation, batches. Peer and program take turns in one process; the figure
+    is the median ratio of their processor times (wall times for workers). It is missed if more
+    turns exceed the bound than chance allows at 1 % for a median on the bound. A requirement in
+    seconds is expressed in times of the peer, as the study of that step recorded both. Figures
+    without an installed peer are left out.
 Run time
-    Some ten minutes.
+    Ten minutes.
 """
 
 from __future__ import annotations

@@ -1,21 +1,47 @@
-"""Lives drawn blind, and what is true of them at their last log."""
+"""How right the answers are, and how right they say that they are."""
 
 from __future__ import annotations
 
+import re
+from collections import Counter
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
 
 from lmshealth.health.verdict import degraded_below
+from lmshealth.stage.constants import INFORMED
 from lmshealth.stage.description import Stage, load_stage
 from models.dynamics.stages import stage_named
 from models.lives.degradation import LIVES, Delayed, Law, Steady, Stepped
 from models.lives.simulation import Plan, schedule
 from models.recordings.machines import machine_identity
-from studies.harness.study import Row
+from studies.common.metrics import clopper_pearson
+from studies.harness.command_line import call
+from studies.harness.study import LEVEL, Row
 
+EPOCHS = 3
+QUANTILES = ("q05", "q25", "q50", "q75", "q95")
+_UNEXPLAINED = 1e-4  # of `fit`, as the README tells it
+# What the front page writes for each word of verdict.csv.
+SHOWN = {
+    "healthy": "Healthy",
+    "preload": "Loss of guide preload",
+    "mount": "Loss of mount stiffness",
+    "both": "Loss of guide preload and mount stiffness",
+    "step": "Sudden change without a known cause",
+    "not-enough-data": "Not enough data for a verdict",
+}
+# Instead of the last where modes have moved.
+ALARM = "Alarm: "
+_INDEX_ROW = re.compile(
+    r'<tr role="row" data-state.*?<a href="([^"]+)">([^<]+)</a>.*?'
+    r'<span class="mark \w+"><span[^>]*>.</span>([^<]*)</span>',
+    re.S,
+)
 SEED = 20261123
 STAGES = ("lms-x", "lms-y")
 # What the modes of a stage can tell; in X the mount moves none of them.
@@ -44,6 +70,222 @@ class BlindPlan(Plan):
     def identity(self) -> str:
         """The name that the machine has in its logs."""
         return machine_identity(stage_named(self.stage), self.seed)
+
+
+LEVELS = {0.5: ("q25", "q75"), 0.9: ("q05", "q95")}
+_BINS = (0.0, 0.5, 0.8, 0.95, 0.99, 1.0)
+# Nothing that is told is surer than that when it is scored: a posterior has some thousand draws.
+_SUREST = 1e-3
+_SHRUNK = 3.0
+# Standard deviations by which rights may fall short of what was told: one run in a thousand.
+_SHORT = -3.09
+
+
+def confusion(rows: Iterable[Row]) -> dict[str, dict[str, int]]:
+    """Count what was told of what is true, each in the order of `WORDS`."""
+    seen = Counter((row["truth"]["verdict"], row["told"]["verdict"]) for row in rows)
+    return {true: {told: seen[true, told] for told in WORDS} for true in WORDS}
+
+
+def share(hits: Iterable[bool]) -> Row:
+    """Count hits, with the 95 % Clopper-Pearson interval of their share."""
+    found = list(hits)
+    low, high = clopper_pearson(sum(found), len(found)) if found else (0.0, 1.0)
+    return {"hits": sum(found), "n": len(found), "low": low, "high": high}
+
+
+def of_others(rows: Sequence[Row]) -> list[Row]:
+    """Give every answer the truth of another life of the same stage: a control."""
+    rng = np.random.default_rng([SEED, 0, 1])
+    mixed: list[Row] = []
+    for stage in sorted({row["stage"] for row in rows}):
+        own = [row for row in rows if row["stage"] == stage]
+        order = rng.permutation(len(own))
+        other = np.roll(order, 1)
+        mixed += [own[i] | {"truth": own[j]["truth"]} for i, j in zip(order, other, strict=True)]
+    return mixed
+
+
+def sureness(rows: Iterable[Row]) -> Row:
+    """Tell whether verdicts are right as often as they say, and score their probabilities.
+
+    Returns
+    -------
+    dict
+        How many were right and how many their probabilities promise, by how many standard
+        deviations (of so many independent trials) the first exceeds the second and whether it is
+        no less; Brier and logarithmic score beside those of the share of rights told of all; the
+        same in bins of what was told.
+    """
+    pairs = [
+        (row["told"]["probability"], row["told"]["verdict"] == row["truth"]["verdict"])
+        for row in rows
+        if row["told"]["probability"] is not None
+    ]
+    if not pairs:
+        return {"n": 0}
+    told, right = np.array(pairs, dtype=float).T
+    base = np.full(told.size, right.mean())
+    spread = np.sqrt(np.sum(told * (1 - told)))
+    # With hardly any doubt told, the spread of rights is that of one trial at least.
+    z = float((right.sum() - told.sum()) / max(spread, 0.5))
+    places = np.clip(np.searchsorted(_BINS, told, side="left") - 1, 0, len(_BINS) - 2)
+    return {
+        "n": told.size,
+        "right": int(right.sum()),
+        "promised": round(float(told.sum()), 2),
+        "z": round(z, 2),
+        "holds": z > _SHORT,
+        "brier": [round(float(np.mean((p - right) ** 2)), 4) for p in (told, base)],
+        "log_score": [round(_log_score(p, right), 4) for p in (told, base)],
+        "bins": [
+            {"from": _BINS[k], "to": _BINS[k + 1], "told": round(float(told[own].mean()), 4)}
+            | share(map(bool, right[own]))
+            for k in range(len(_BINS) - 1)
+            if (own := places == k).any()
+        ],
+    }
+
+
+def _log_score(told: np.ndarray, right: np.ndarray) -> float:
+    p = np.clip(told, _SUREST, 1 - _SUREST)
+    return float(-np.mean(np.where(right == 1, np.log(p), np.log(1 - p))))
+
+
+def coverages(rows: Iterable[Row], what: str, names: Iterable[str]) -> dict[str, dict[str, Row]]:
+    """Count intervals of what is claimed that hold the truth: ``health`` or what is ``left``.
+
+    Returns
+    -------
+    dict
+        Of every name and level, as they are and shrunk to a third about the median.
+    """
+    found = list(rows)
+    told: dict[str, dict[str, Row]] = {}
+    for name in names:
+        pairs = [(row["told"][what][name], row["truth"][what][name]) for row in found
+                 if name in row["told"][what] and name in row["truth"][what]]  # fmt: skip
+        told[name] = {
+            f"{100 * level:.0f}{way}": _at_least(level, [hold(*pair, ends) for pair in pairs])
+            for level, ends in LEVELS.items()
+            for way, hold in _WAYS.items()
+        }
+    return told
+
+
+def _at_least(level: float, held: Sequence[bool]) -> Row:
+    """Judge a coverage that must not be less than told: the map's error is in every interval."""
+    high = clopper_pearson(sum(held), len(held), LEVEL)[1] if held else 1.0
+    return share(held) | {"holds": high >= level}
+
+
+def _holds(interval: Row, truth: float | None, ends: tuple[str, str]) -> bool:
+    low, high = (_number(interval[end]) for end in ends)
+    return low <= _number(truth) <= high
+
+
+def _shrunk_holds(interval: Row, truth: float | None, ends: tuple[str, str]) -> bool:
+    low, middle, high = (_number(interval[key]) for key in (ends[0], "q50", ends[1]))
+    true = _number(truth)
+    if not np.isfinite(middle):  # most of it lies past the horizon, and so must the truth
+        return not np.isfinite(true)
+    return middle - (middle - low) / _SHRUNK <= true <= middle + (high - middle) / _SHRUNK
+
+
+def _number(value: float | None) -> float:
+    """Read a travel: None is past the horizon."""
+    return np.inf if value is None else value
+
+
+_WAYS: dict[str, Callable[[Row, float | None, tuple[str, str]], bool]] = {
+    "": _holds,
+    " shrunk": _shrunk_holds,
+}
+
+
+def analyse(logs: Path, out: Path, *, quick: bool = False) -> dict[str, Row]:
+    """Run the command line over an archive of both stages, and read what it says of each machine.
+
+    Parameters
+    ----------
+    logs, out : Path
+        Folders of the archive, and of the answers.
+    quick : bool
+        As in `call`, and with health at the last log alone.
+
+    Returns
+    -------
+    dict
+        By machine: ``verdict`` and ``probability``, ``shown`` on the front page as on its row,
+        quantiles of ``health`` where it is told and of what is ``left`` in km (None past the
+        horizon), counts of ``events`` that are no declared work, and of ``refused`` by reason.
+    """
+    stages = [word for name in STAGES for word in ("--stage", name)]
+    call("lmshealth", "run", logs, *stages, "--out", out,
+         "--epochs", 1 if quick else EPOCHS, "--workers", 1,
+         quick=quick, some_refused=True)  # fmt: skip
+    shown = front_page(out / "index.html")
+    verdicts = pd.read_csv(out / "verdict.csv")
+    health, left = _read_health(out / "health.csv"), _read_left(out / "prognosis.csv")
+    events = pd.read_csv(out / "events.csv")
+    events = events[~events["declared"].astype(bool)]
+    refused = pd.read_csv(out / "refused.csv")
+    refused["stage"] = refused["log"].str.split("/").str[0]  # logs stand in folders of machines
+    answers = {}
+    for row in verdicts.to_dict("records"):
+        name, told = row["stage"], float(row["probability"])
+        answers[name] = {
+            "verdict": row["verdict"],
+            "probability": told if np.isfinite(told) else None,
+            "shown": shown.get(name),
+            "health": health.get(name, {}),
+            "left": left.get(name, {}),
+            "events": _counts(events[events["stage"] == name].drop_duplicates("kind")["kind"]),
+            "refused": _counts(refused[refused["stage"] == name]["reason"]),
+        }
+    return answers
+
+
+def agrees(told: Row) -> bool:
+    """Whether the front page says what the table of verdicts does."""
+    alarm = told["verdict"] == "not-enough-data" and (told["shown"] or "").startswith(ALARM)
+    return alarm or told["shown"] == SHOWN[told["verdict"]]
+
+
+def front_page(path: Path) -> dict[str, str]:
+    """Read the rows of the front page: the verdict in words, of each machine that has a page."""
+    rows = _INDEX_ROW.findall(path.read_text(encoding="utf-8"))
+    return {name: words.strip() for file, name, words in rows if (path.parent / file).exists()}
+
+
+def _counts(values: pd.Series) -> dict[str, int]:
+    return {str(name): int(count) for name, count in values.value_counts().items()}
+
+
+def _read_health(path: Path) -> dict[str, dict[str, Row]]:
+    """Read the last epoch of every machine, of what is told and not only believed."""
+    found: dict[str, dict[str, Row]] = {}
+    table = pd.read_csv(path)
+    for (stage, name), rows in table.groupby(["stage", "parameter"]):
+        row = rows.iloc[-1]
+        claimed = row["converged"] and row["identifiable"] and not row["fit"] < _UNEXPLAINED
+        if claimed and row["informed"] >= INFORMED:
+            own = {"q50" if k == "median" else k: float(row[k])
+                   for k in ("q05", "q25", "median", "q75", "q95")}  # fmt: skip
+            found.setdefault(str(stage), {})[str(name)] = own
+    return found
+
+
+def _read_left(path: Path) -> dict[str, dict[str, Row]]:
+    """Read the quantiles of the remaining travel; an empty one lies past the horizon."""
+    found: dict[str, dict[str, Row]] = {}
+    for row in pd.read_csv(path).to_dict("records"):
+        values = {level: float(row[f"rul_km_{level}"]) for level in QUANTILES}
+        own = {level: None if np.isnan(km) else km for level, km in values.items()}
+        own["past"] = float(row["probability_already_past"])
+        own["beyond"] = float(row["probability_beyond_horizon"])
+        found.setdefault(str(row["stage"]), {})[str(row["parameter"])] = own
+    return found
 
 
 def plan_of(number: int) -> BlindPlan:

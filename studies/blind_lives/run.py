@@ -1,42 +1,28 @@
-"""Raw logs of lives drawn blind: is the report right, and as sure as it may be?
+"""Is the report right on raw logs of lives drawn blind, and are its probabilities and intervals?
 
-Question
-    Of an archive of raw logs, whose machines live any of ten kinds of lives that the analysis does
-    not know, is the verdict of every machine right, and as often as its probability says? Do the
-    intervals of preload, mount and remaining life hold the truth?
 Method
-    A generator draws the kind of every life (all of `models.lives`), its stage, its seed, how many
-    logs it has and how long they are, and where it is cut; a tenth have fewer logs than make a
-    baseline. They are written at 20 kHz, in archives of ten machines whose names tell nothing; the
-    truth is moved to another folder. Then `lmshealth run` is called as a user calls it, with both
-    shipped descriptions and their priors, and health at three epochs. What it says is read from its
-    tables and its front page.
-
-    What verdict is right at the last log follows from the truth alone, by the words of the README:
-    a part counts as degraded once a quarter of what it may lose is gone, in X the mount moves no
-    mode, a step of what the modes tell has no other verdict, nor has a machine of fewer than five
-    logs. Lives near a border (a part within 0.02 of where it counts as degraded, or a step that
-    only one log has seen) are told beside the others; of all, as many verdicts must be right as
-    their probabilities promise (99.9 %).
-
-    Intervals of 50 and 90 % of what is claimed must hold the truth at least as often as they say
-    (99.9 % Clopper-Pearson): the map's error of 5 % is in them, and this map has none. Travel that
-    is left is censored at the horizon, and told once more of those that reach a limit; a crash or a
-    loosened bolt to come is in no law, and the truth of such a life is that of a machine to which
-    none happens. Controls that must fail: every answer with the truth of another life of its stage,
-    and intervals shrunk to a third.
+    A generator draws for every machine the kind of life (all of `models.lives`), stage, seed,
+    number and length of logs, and the end of the record; a tenth has fewer logs than a baseline
+    needs. Logs are written at 20 kHz in archives of ten machines with neutral names; the truth is
+    moved elsewhere. `lmshealth run` is called with both shipped descriptions and health at three
+    epochs; its tables and front page are read.
+    The right verdict follows from the truth by the definitions of the README: a part is degraded
+    when a quarter of the loss to its limit is gone; in X the mount moves no mode; a step that
+    changes the modes has its own verdict, and so have machines with fewer than five logs. Lives
+    near a border (within 0.02, or a step seen by one log only) are also counted separately. At
+    least as many verdicts must be right as their probabilities promise, and intervals of 50 and 90
+    % must cover at least as often as stated (both at 99.9 %): they include a map error of 5 %, and
+    this map has none. Remaining travel is censored at the horizon, and also judged for lives that
+    reach a limit. Jumps after the record are in no law and not in the truth. Controls that must
+    fail: the truth of another life of the stage, and intervals shrunk to a third.
 Answer
-    Yes. 99 of 100 verdicts are right, 87.3 of the 88 that have a probability were promised to be
-    and 87 are; the one that is wrong is told with 58 %, of a machine whose mount stands 0.009 above
-    where it counts as degraded. All steps that a log has seen, all young machines and all losses
-    are told as such, and none of 56 machines of sound kinds is called worn or raises an alarm. The
-    intervals hold more than they promise, those of 90 % in 99 of 100 (preload), 52 of 52 (mount)
-    and 96 of 96 (remaining life), since the error of the map that they allow for is not there. Of
-    59 machines that reach no limit none is told an end within the horizon in the median, and of 37
-    that do all are.
+    Yes. 99 of 100 verdicts are right; of 88 with a probability 87 are, and 87.3 were promised. The
+    wrong one has 58 %, for a mount 0.009 above its border. No machine of 56 of healthy kinds is
+    called degraded or raises an alarm. Intervals of 90 % cover 99 of 100 (preload), 52 of 52
+    (mount), 96 of 96 (remaining life). Of 59 machines that reach no limit none has a median end
+    within the horizon; all 37 that reach one have.
 Run time
-    An hour and twenty minutes of one processor; archives done before are not done again, and
-    ``--again`` judges the recorded lives anew.
+    80 minutes on one processor; ``--again`` judges the recorded lives again.
 """
 
 from __future__ import annotations
@@ -51,9 +37,8 @@ from pathlib import Path
 import pandas as pd
 
 from models.lives.simulation import simulate_life
-from studies.blind_lives import judging
-from studies.blind_lives.answers import agrees, analyse
-from studies.blind_lives.lives import SEED, BlindPlan, plan_of, truth_of
+from studies.blind_lives import lives
+from studies.blind_lives.lives import SEED, BlindPlan, agrees, analyse, plan_of, truth_of
 from studies.common.lives import HEALTHY
 from studies.common.metrics import clopper_pearson
 from studies.harness.claims import Claim, counted, number
@@ -142,35 +127,35 @@ def archive_of(
 def judged(rows: Sequence[Row]) -> Row:
     """Judge what was said of all machines, and the same beside the truth of others."""
     clear = [row for row in rows if row["truth"]["clear"]]
-    others = judging.of_others(rows)
+    others = lives.of_others(rows)
     sound = [row for row in rows if row["kind"] in HEALTHY]
     ending = [row for row in rows if row["truth"]["left"]["any"] is not None]
     return {
         "seed": SEED,
         "lives": len(rows),
         "verdicts": {
-            name: {"right": judging.share(_right(row) for row in own),
-                   "told_of_true": judging.confusion(own)}
+            name: {"right": lives.share(_right(row) for row in own),
+                   "told_of_true": lives.confusion(own)}
             for name, own in (("all", rows), ("clear of borders", clear), (OTHERS, others))
         },
-        "sureness": {"all": judging.sureness(rows), OTHERS: judging.sureness(others)},
-        "health": judging.coverages(rows, "health", PARTS),
-        "left": judging.coverages(rows, "left", LIMITS),
-        "left, ending": judging.coverages(ending, "left", LIMITS),
+        "sureness": {"all": lives.sureness(rows), OTHERS: lives.sureness(others)},
+        "health": lives.coverages(rows, "health", PARTS),
+        "left": lives.coverages(rows, "left", LIMITS),
+        "left, ending": lives.coverages(ending, "left", LIMITS),
         OTHERS: {
-            "health": judging.coverages(others, "health", PARTS),
-            "left": judging.coverages(others, "left", LIMITS),
+            "health": lives.coverages(others, "health", PARTS),
+            "left": lives.coverages(others, "left", LIMITS),
         },
         "sound_kinds": {
-            "called worn or stepped": judging.share(
+            "called worn or stepped": lives.share(
                 row["told"]["verdict"] not in ("healthy", "not-enough-data") for row in sound
             ),
-            "alarms": judging.share("alarm" in row["told"]["events"] for row in sound),
+            "alarms": lives.share("alarm" in row["told"]["events"] for row in sound),
         },
         "steps_to_come": sum(row["truth"]["to_come"] for row in rows),
         "ends_beyond_horizon": _beyond(rows),
         "refused": _refused(rows),
-        "front_page": judging.share(agrees(row["told"]) for row in rows),
+        "front_page": lives.share(agrees(row["told"]) for row in rows),
     }  # fmt: skip
 
 
@@ -186,7 +171,7 @@ def _beyond(rows: Iterable[Row]) -> dict[str, Row]:
     pairs = [(row["truth"]["left"]["any"], row["told"]["left"]["any"]) for row in rows
              if "any" in row["told"]["left"]]  # fmt: skip
     return {
-        name: judging.share(told["q50"] is None for true, told in pairs if (true is None) is never)
+        name: lives.share(told["q50"] is None for true, told in pairs if (true is None) is never)
         for name, never in (("reach no limit", True), ("reach a limit", False))
     }
 

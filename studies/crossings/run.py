@@ -1,29 +1,24 @@
-"""Do modes that cross keep their names, and is it said where nothing tells?
+"""Do crossing modes keep their labels, and is ambiguity reported where nothing resolves it?
 
-Question
-    Two modes whose frequencies cross are confused by what names peaks in order of frequency and
-    by what follows the nearest. Is a label ever given to the wrong mode after the crossing? How
-    many estimates get a label, and are tracks founded that are no modes?
 Method
-    Lives of 60 logs at irregular places, σ(ln f) = 0.001, of modes that cross on straight lines:
-    named by order, without names, with shapes, with a fifth of the estimates missed and a tenth of
-    the logs with a spurious one. Modes that veer and exchange their shapes. Modes that come
-    together, stay so for 15 logs and part on either side, of equal damping and without shapes:
-    nothing tells which is which. Five modes well apart. Labels are counted from the log on in
-    which the modes are six σ apart again for good; a track is the mode that it shows at first. A
-    life is swapped silently if any later estimate bears the label of another mode. Negative
-    controls that must fail: each estimate to the mode that was last seen nearest; and the best
-    guess in place of a label of 95 %, where nothing tells.
+    Lives of 60 irregular logs, σ(ln f) = 0.001: modes that cross on straight lines (named by
+    order, unnamed, with shapes, with a fifth of the estimates missing and a spurious one in a
+    tenth of the logs); modes that veer and exchange shapes; modes that merge for 15 logs and part
+    on either side, with equal damping and no shapes; five separate modes. Labels are counted from
+    the log on after which the modes stay six σ apart; the mode of a track is that of its first
+    estimate. A life is silently swapped if any later estimate has the label of another mode.
+    Controls that must fail: assignment to the nearest mode of the log before; the most probable
+    label instead of one with 95 %.
 Answer
-    No life is swapped silently in 200 of each kind: below 1.8 % each with 95 % confidence. The
-    nearest swaps every crossing and half of the merged lives; so does the best guess where nothing
-    tells, all of which is said to be ambiguous. After the crossing 91 % of the estimates named by
-    order are labelled, 97 % without names (names by order speak against a crossing), 88 % with
-    gaps, and all with shapes. The rest stays ambiguous: slopes too alike. Where shapes mix, labels
-    go over a few logs early or late. One spurious estimate in 28 is taken for a mode that the log
-    misses; none founds a track. Of 60,000 estimates of modes well apart none is refused.
+    No life of 200 of each kind is silently swapped (below 1.8 % at 95 % confidence). Assignment to
+    the nearest swaps every crossing and half of the merged lives, and so does the most probable
+    label there; all of these are reported as ambiguous. After a crossing 91 % of estimates named
+    by order are labelled, 97 % of unnamed ones, 88 % with gaps, all with shapes; the rest is
+    ambiguous because slopes are alike. Where shapes mix, labels change a few logs early or late.
+    One spurious estimate in 28 is taken for a missing mode; none starts a track. Of 60,000
+    estimates of separate modes none is refused.
 Run time
-    Five minutes of one processor.
+    Five minutes on one processor.
 """
 
 from __future__ import annotations
@@ -38,8 +33,7 @@ from numpy.typing import NDArray
 from lmshealth.tracking import constants
 from lmshealth.tracking.association.associate import Association, associate
 from studies.common.metrics import clopper_pearson
-from studies.crossings.judging import judge, nearest, recovered
-from studies.crossings.lives import KINDS, Kind, Life, make_life
+from studies.crossings.lives import KINDS, Kind, Life, judge, make_life, nearest, recovered
 from studies.harness.claims import Claim, counted, percents
 from studies.harness.study import Row, Study
 

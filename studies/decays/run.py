@@ -1,37 +1,25 @@
-"""Do intervals from free decays cover, and what do they say of real and simulated machines?
+"""Do intervals from free decays cover, and are decays of real and simulated machines right?
 
-Question
-    After every stop a machine rings, while something still shakes it: do 95 % intervals of
-    natural frequency and damping ratio from `identify_decays` cover 95 of 100 truths, how near
-    does their scatter come to the Cramér-Rao bound, what do they say of simulated stages after
-    real moves, and does a real beam whose stiffness is changed in known steps give the frequencies
-    known of it?
 Method
-    Decays of one to three modes after one to eight stops, with the ambient response of the same
-    modes and white noise at three levels, 400 logs of each case with seeds of their own. A
-    coverage passes when its 99.9 % Clopper-Pearson interval holds 95 %. Negative controls that
-    must fail on the same logs: the same intervals 1.5 times as wide and as narrow; least squares
-    in white noise, which knows nothing of the ambient response. Scatter is set against
-    `decay_bound`. Without any ambient response intervals may be too wide, which is told and not
-    judged.
-    The X and Y stages of `models` are stopped from 100 and 400 mm/s, with their loop, mains,
-    orders and accelerometers: intervals of all modes together are judged alike.
-    The beam is the movable-roller testbed DROPBEAR (data set 8): its dwells are cut from the
-    measured position of the roller, and the beam's mode is sought in each within 30 % of 33 Hz
-    with a damping of 0.2 % within a factor of six; frequencies to compare with were estimated by
-    another method (Welch and least squares) and are good to 0.15 Hz.
+    Decays of one to three modes after one to eight stops, with ambient response and white noise at
+    three levels, 400 logs of each case. A coverage passes if its 99.9 % Clopper-Pearson interval
+    contains 95 %. Controls that must fail: intervals 1.5 times as wide and as narrow; least
+    squares that assume white noise. Errors are compared with `decay_bound`. Intervals without
+    ambient response may be too wide and are not judged.
+    The stages X and Y of `models` stop from 100 and 400 mm/s with loop, mains, orders and
+    accelerometers; coverage is judged over all modes.
+    The beam is the movable-roller testbed DROPBEAR (data set 8). Dwells follow from the measured
+    roller position; the mode is searched within 30 % of 33 Hz with a damping of 0.2 % within a
+    factor of six. Reference frequencies come from Welch spectra and least squares, good to 0.15
+    Hz.
 Answer
-    Yes: in all nine cases, 24 of 24 coverages. Intervals 1.5 times as narrow are found out 24
-    times, as wide 22 times (``not_met``: the most lightly damped mode after a single stop has
-    tails heavier than normal). Least squares in white noise cover 15 to 65 %. Scatter is 1.0 to
-    1.4 times the bound, which knows what leaks into the band; 1.1 times in most cases. Without
-    any ambient response intervals from one stop are too wide. The simulated stages tell 112 of
-    120 modes, none for another, in intervals that cover 98 and 99 %. The beam is right to 0.05 Hz
-    in 28 dwells and refused in 5, among them the three that nothing excites.
+    Yes: 24 of 24 coverages in nine cases. Narrow intervals are detected 24 times, wide ones 22
+    times (``not_met``: the least damped mode after one stop has heavy tails). Least squares cover
+    15 to 65 %. Errors are 1.0 to 1.4 times the bound. Simulated stages give 112 of 120 modes, none
+    confused with another, with coverages of 98 and 99 %. The beam is right to 0.05 Hz in 28 dwells
+    and refused in 5, among them the three that nothing excites.
 Run time
-    Thirteen minutes on one processor.
-Data
-    Folder ``dropbear_ds8`` of LMSHEALTH_DATA; left out where it is not set.
+    13 minutes on one processor. The beam needs ``dropbear_ds8`` in LMSHEALTH_DATA.
 """
 
 from __future__ import annotations
@@ -49,8 +37,7 @@ from lmshealth.signal.segments import Segment
 from lmshealth.stage.description import Description, ModeSpec, Stage
 from studies.common.metrics import clopper_pearson
 from studies.decays.beam import REPEATS, judge_beam, one_beam
-from studies.decays.cases import CASES, QUIET, RATE, Case, simulate, to_log
-from studies.decays.stops import one_machine
+from studies.decays.cases import CASES, QUIET, RATE, Case, one_machine, simulate, to_log
 from studies.harness.claims import Claim, percents, span
 from studies.harness.study import Row, Study, Trials
 

@@ -1,16 +1,13 @@
-"""Do the intervals for preload and mount hold the truth on the demo's kind of life?
+"""Do the intervals of preload and mount contain the truth on lives such as that of the demo?
 
-Question
-    On lives whose preload wears while the mount loosens (LMS-Y, 40 logs of 20 s), are the true
-    final preload and mount stiffness inside their 90 % intervals, how wide are these against the
-    prior's, and does the interval of the remaining life hold the truth?
 Method
-    `python -m models simulate` and `lmshealth run`, as `make demo` calls them, once per seed; the
-    life itself (wear, loosening, odometer, temperature) is drawn by the seed. Negative control:
-    the same count for intervals shrunk to a third about their median. Last, `make demo` itself is
-    timed, installed already.
+    Preload wears while the mount loosens (LMS-Y, 40 logs of 20 s): `python -m models simulate` and
+    `lmshealth run` as in `make demo`, once per seed, which draws wear, loosening, odometer and
+    temperature. Counted are 90 % intervals of final preload, mount stiffness and remaining life
+    that contain the truth, and their width relative to the prior's. Control: intervals shrunk to a
+    third about the median. At the end `make demo` is timed.
 Run time
-    About a minute and a half per seed on two processors; seeds done before are not done again.
+    A minute and a half per seed on two processors.
 """
 
 from __future__ import annotations

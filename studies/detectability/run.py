@@ -1,30 +1,24 @@
-"""Which loss of preload or mount stiffness can be seen, by how many logs of which length?
+"""Which loss of preload or mount stiffness is detectable, with how many logs of which length?
 
-Question
-    What is the smallest loss that a one-sided test finds with 95 % power at 1 % false alarms,
-    against the length of the logs and their number, and does the real estimator find it? How does
-    it follow from the uncertainty law, and does identification keep to that?
 Method
-    Maps of `lmshealth.plan`: as many logs now as in the baseline, of one length. At some points
-    drifts are drawn with the covariance of the plan, and a loss is called where `EpochPosterior`
-    gives it a probability above 99 %: of the planned smallest loss and of none, as planned (the
-    map exact, the other parameter drawn from its prior), and as shipped (the map's sensitivities
-    believed to 5 %) with the other parameter as it was, and with it drawn from its prior. Shares
-    have the Clopper-Pearson interval of 99.9 %. The law is the Cramér-Rao bound of ln f that
-    planning uses; beside it stands what identification says of simulated logs of four lengths, and
-    their scatter about the truth.
+    Maps of `lmshealth.plan` (as many logs now as in the baseline) give the smallest loss that a
+    one-sided test detects with 95 % power at 1 % false alarms. At some points drifts are drawn
+    with the planned covariance, and a loss is detected if `EpochPosterior` gives it more than 99
+    %: for the planned loss and for none; as planned (map exact, other parameter drawn from its
+    prior), and as shipped (map sensitivities good to 5 %) with the other parameter unchanged or
+    drawn from its prior. Shares have 99.9 % Clopper-Pearson intervals. The Cramér-Rao law of
+    planning is compared with standard deviations and errors of identified simulated logs of four
+    lengths.
 Answer
-    One log of 20 s against one shows 5.0 % of preload and 4.4 % of mount stiffness on LMS-Y and
-    2.7 % of preload on LMS-X; five of 60 s against five 1.3, 1.2 and 0.8 %; twenty of 300 s
-    against twenty 0.3, 0.3 and 0.2 %. The mount of X is refused: no log shows it. At all nine
-    points the posterior's power (93 to 97 %) and false alarms (0.7 to 2.3 %) are the planned
-    ones, as shipped too as long as the other parameter is as it was. Where the other may be
-    anywhere in its prior the map's 5 % decide on LMS-Y: the power of the same losses falls to 68
-    and 79 % from single logs and to 6 % from the most, which is what planning leaves out; false
-    alarms stay below the declared. Standard deviations of simulated logs are 1.0 to 1.3 times the
-    bound, most where logs are long, and their errors agree with them within chance.
+    One log of 20 s against one detects 5.0 % of preload and 4.4 % of mount on LMS-Y, 2.7 % of
+    preload on LMS-X; five of 60 s 1.3, 1.2 and 0.8 %; twenty of 300 s 0.3, 0.3 and 0.2 %. The
+    mount of X is refused: no log constrains it. At all nine points power (93 to 97 %) and false
+    alarms (0.7 to 2.3 %) are as planned, also as shipped if the other parameter is unchanged. If
+    it may be anywhere in its prior, the map's 5 % dominate on LMS-Y: power falls to 68 and 79 %
+    for single logs and 6 % for the most logs; false alarms stay below 1 %. Standard deviations of
+    simulated logs are 1.0 to 1.3 times the bound, and their errors agree with them.
 Run time
-    Six minutes of one processor.
+    Six minutes on one processor.
 """
 
 from __future__ import annotations

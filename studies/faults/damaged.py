@@ -1,25 +1,19 @@
 """Is every good log of an archive analysed, and every damaged one listed with the right reason?
 
-Question
-    An archive holds damaged logs of every kind that the log contract names, in every format that
-    can be damaged so, among good ones of several machines. Is each good log analysed? Is each bad
-    one in ``refused.csv`` with the reason that is right for it, does the exit status say so, and
-    is nothing on standard error?
 Method
-    Four simulated recordings are written a thousand times, each time with a thousandth of fresh
-    noise and the next moment of a machine's life, in seven formats by turns. `KINDS` of
-    `studies.faults.damage` says beforehand what each kind of damage must be refused with; each is
-    done once in each format. One `lmshealth run` with two workers. A kind that costs a channel or
-    a stretch must leave the rest of its log analysed. Damage that no file shows is not asked for:
-    bits that flip under no checksum, and text that is cut off between two rows or inside the last
-    number of one. Negative controls: a good log said to be bad, a bad one said to be good, and a
-    wrong reason must each be found out by the comparison.
+    Four simulated recordings are written a thousand times, each with a thousandth of fresh noise
+    and the next moment of a machine's life, in seven formats in turn. Among them are damaged logs
+    of every kind in `KINDS` of `studies.faults.damage`, which states the reason of each, once in
+    each format that can be damaged so. One `lmshealth run` with two workers. Damage of a channel
+    or a stretch must leave the rest of its log analysed. Damage that no file shows is left out:
+    flipped bits without a checksum, text cut between rows or inside the last number. The exit
+    status must report refused logs, and standard error must be empty. Controls: a good log
+    expected to be bad, a bad one expected to be good, and a wrong reason must be detected.
 Answer
-    All 1,000 good logs are analysed, and all 329 damaged ones of 73 kinds are told by the reason
-    stated beforehand: `confusion` of the record has no entry beside it. Status 3, nothing on
-    standard error.
+    All 1,000 good logs are analysed, and all 329 damaged ones of 73 kinds have the stated reason.
+    Exit status 3, nothing on standard error.
 Run time
-    Some ten minutes of two processors.
+    Ten minutes on two processors.
 """
 
 from __future__ import annotations

@@ -1,25 +1,20 @@
-"""Does anything that a log, a table or an address says ever act, or reach outside the output?
+"""Can the content of a log, a table or an address execute anything or reach outside the output?
 
-Question
-    Names of machines and files, metadata, cells of tables, descriptions and addresses may hold
-    SQL, markup, commands, paths, formulas and control characters; files may be links, pipes and
-    bombs. Is anything of it executed, is anything written outside the folder of the output, is
-    anything read that must not be, and is a password ever shown or kept?
 Method
-    An archive of hostile logs (`studies.faults.hostile`) is run and reported with a SQLite store,
-    and with PostgreSQL where there is one, at the most talkative level of logging. Everything
-    around is compared before and after by the hash of every file; a table that nobody may touch
-    stands in the database; whatever was printed, written and kept is searched for signs that
-    act, for markup that is not escaped, for passwords and for the content of files outside. Links
-    stand in the place of files of the output. Bombs are read one by one, and the memory that each
-    took is measured. Negative controls: each guard is given what it must notice.
+    An archive of hostile logs (`studies.faults.hostile`: SQL, markup, commands, paths, formulas,
+    control characters, links, pipes) is run and reported on SQLite and, where installed,
+    PostgreSQL, with debug logging. Every file around it is hashed before and after; the database
+    has a table that must not change; all printed, written and stored text is searched for control
+    characters, unescaped markup, passwords and contents of files outside. Links take the place of
+    output files. Files that expand are read one by one and their memory is measured. Controls:
+    each check is given what it must detect.
 Answer
-    Nothing acts and nothing outside is touched, with either store: 32 machines are told by the
-    names they have, 17 logs that reach for more or hold what cannot be seen are refused. No
-    password is shown or kept, in 14 forms of addresses that are each tried three times. A bomb
-    takes no more than 223 MB with all libraries.
+    Nothing is executed and nothing outside is changed: 32 machines are reported with their names,
+    17 logs that reach outside or hold invisible characters are refused. No password is shown or
+    stored in 14 forms of addresses, tried three times each. An expanding file takes at most 223 MB
+    with all libraries.
 Run time
-    Some eight minutes of one processor.
+    Eight minutes on one processor.
 """
 
 from __future__ import annotations

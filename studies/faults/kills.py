@@ -1,23 +1,17 @@
-"""Does a batch that is killed again and again end as if nothing had happened?
+"""Does a batch that is killed repeatedly end as if it had not been interrupted?
 
-Question
-    When a run over 200 logs is killed at random moments and started again until it ends, in a
-    SQLite file and in PostgreSQL: are tables and pages those of a run without interruption, row by
-    row, is every log once in the store, does no process stay, and is an interrupt told in one line?
 Method
-    The command line as users start it, with two worker processes. Kills come by a Poisson process,
-    so that no moment is spared: `kill -9` of the main process or of one worker, SIGINT or SIGTERM
-    to the group, as from a terminal. A run that ended is compared, and the next begins with an
-    empty store, until there were 100 kills. Of the machines one is young, and three others teach
-    it. Negative control: the comparison has to see one row doubled, lost or moved, one digit
-    changed, one page changed or lost.
+    The command line over 200 logs with two worker processes, on SQLite and on PostgreSQL. Kills
+    come by a Poisson process: `kill -9` of the main process or of a worker, SIGINT or SIGTERM to
+    the group. A completed run is compared with an uninterrupted one: tables and pages row by row,
+    every log once in the store, no remaining process, one line per interrupt. The next run begins
+    with an empty store, up to 100 kills. Control: the comparison must detect a row doubled, lost
+    or moved, a digit changed, a page changed or lost.
 Answer
-    Yes. After 100 kills in SQLite and 100 in PostgreSQL (101 of the main process, 33 of a worker,
-    35 SIGINT, 31 SIGTERM; before the first log, among logs, machines and tables) fifteen batches
-    came to their end as if nothing had been: no line of a table or page and no row of a store
-    differs, and the last process of a killed run was gone within 5.3 s. All 35 interrupts were told
-    in one line; one that comes while Python still imports, in the first half second, may be told in
-    Python's own way, but none of these was.
+    Yes. After 100 kills on either store (101 of the main process, 33 of a worker, 35 SIGINT, 31
+    SIGTERM, in all phases) fifteen batches ended without a different line or row; the last process
+    of a killed run ended within 5.3 s. All 35 interrupts were reported in one line; during the
+    first half second, while Python imports, its own message is possible.
 Run time
     Half an hour.
 """

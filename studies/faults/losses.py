@@ -1,21 +1,16 @@
-"""What becomes of a run whose disk is full, or whose database goes away?
+"""What happens to a run whose disk is full, or whose database stops?
 
-Question
-    Does a run tell in one line, with exit status 1, that the disk is full or that its database is
-    gone, without showing the password? Is nothing lost by it: does the next run end as if nothing
-    had happened?
 Method
-    Full disk: output and store, or output alone, on a file system of its own that is too small,
-    larger at each new run, until all finds room. Lost database: the PostgreSQL server is ended
-    without a word in the middle of a run, at random moments after the first log, and started again
-    before the next run. What is left in the end is compared with what a run without trouble leaves.
-    Negative control: see `kills`.
+    Full disk: output and store, or output alone, on a file system that is too small and grows with
+    each run until everything fits. Lost database: PostgreSQL is stopped at a random moment after
+    the first log and started before the next run. Each failed run must exit with status 1 and one
+    line without the password; the final output must equal that of a run without failure. Control:
+    see `kills`.
 Answer
-    Yes. Twelve runs on full disks (six with output and store, six with output alone) and five whose
-    database went away tell it in one line, without the password; what is left in the end is in all
-    three cases that of a run without trouble.
+    Twelve runs on full disks (six with output and store, six with output alone) and five without
+    database report it in one line, without the password; all final outputs are equal.
 Run time
-    Four minutes to a quarter of an hour.
+    Four to fifteen minutes.
 """
 
 from __future__ import annotations

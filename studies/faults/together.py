@@ -1,21 +1,16 @@
-"""Do two runs at once on one store get in each other's way?
+"""Do two simultaneous runs on one store disturb each other?
 
-Question
-    Of two runs that share a store, a SQLite file or a PostgreSQL database, on the same folder of
-    logs or on two different ones: do both end, with the tables of a run alone, and is every log
-    once in the store, even where one of the two is killed?
 Method
-    Two command lines at once, each with an output folder of its own, started together or one a
-    random moment after the other: on the same logs, on those of other machines, and on the same
-    with some more; and again with one killed by `kill -9` at a random moment while the other goes
-    on. Each has to give the tables and pages that it gives alone. Only where one knows of more logs
-    pages are left out: what they say of the report before depends on which run comes first.
-    Negative control: see `kills`.
+    Two command lines with output folders of their own on one SQLite file or PostgreSQL database,
+    started together or one at a random moment after the other: on the same logs, on those of other
+    machines, on the same and some more; and again with one killed by `kill -9`. Each must give the
+    tables and pages that it gives alone, and every log must be stored once. With different numbers
+    of logs pages are left out, because their changes depend on which run ends first. Control: see
+    `kills`.
 Answer
-    No. All 36 pairs, 18 in either kind of store, end as each run alone does, and in none is a row
-    lost or twice; in 18 of them one run was killed.
+    No. All 36 pairs, 18 on either store, end as each run alone; in 18 of them one was killed.
 Run time
-    Half an hour of one processor.
+    Half an hour on one processor.
 """
 
 from __future__ import annotations

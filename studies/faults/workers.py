@@ -1,21 +1,16 @@
 """Does a batch on a Dask cluster survive the death of its workers?
 
-Question
-    When workers of a Dask cluster are killed one after the other in the middle of a batch, and new
-    ones come: are tables and pages those of a run in one process, and is every log once in the
-    store? What becomes of a run whose scheduler is lost?
 Method
-    A real scheduler and two worker processes without nannies, and the command line with
-    ``--scheduler``. A random worker is killed by `kill -9` at random moments (a Poisson process)
-    and another started in its place, until ten were killed in the middle of a batch; each batch
-    begins with an empty store. Then the scheduler is killed in the middle of a run, and the next
-    run goes on with a new cluster. Negative control: see `kills`.
+    A scheduler and two workers without nannies, and the command line with ``--scheduler``. A
+    random worker is killed by `kill -9` at random moments (a Poisson process) and replaced, until
+    ten were killed during batches; each batch begins with an empty store. Then the scheduler is
+    killed during a run, and the next run uses a new cluster. Tables, pages and store must equal
+    those of a run in one process. Control: see `kills`.
 Answer
-    Yes. Ten workers were killed in five batches, with 86 to all 195 logs known: no line of a table
-    or page and no row of a store differs from those of a run in one process. A lost scheduler is
-    told in one line, with status 1, and the next run ends as if nothing had been.
+    Yes. Ten workers were killed in five batches, with 86 to all 195 logs stored: no line or row
+    differs. A lost scheduler is reported in one line with status 1; the next run completes.
 Run time
-    Four minutes to a quarter of an hour.
+    Four to fifteen minutes.
 """
 
 from __future__ import annotations

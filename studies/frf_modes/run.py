@@ -1,30 +1,25 @@
-"""Are the modes of a frequency response, and their uncertainties, true?
+"""Are modes of frequency responses, and their uncertainties, right?
 
-Question
-    Do 95 % intervals of f and ζ from driven logs cover 95 %, are the estimates as good as the data
-    allow, and do two real benches and two simulated stages give what is known of them?
 Method
-    (1) Machines of two modes in the band and two beside it, driven by a multisine of random phases
-    (sensor noise, a random disturbance that shakes the machine, noise of the measured input) or by
-    white noise, one record: share of intervals that hold the truth over all seeds and both modes,
-    judged by its 99.9 % Clopper-Pearson interval. Negative controls: intervals 1.5 times as wide,
-    and as narrow, must fail. A motor with a cubic term distorts without moving the poles: there
-    the coverage must not be less. Efficiency: root mean square error over the Cramér-Rao bound of
-    poles, residues and the fewest residual terms that are fitted, at the true densities of noise,
-    by numerical derivatives.
-    (2) A sine sweeps through the current of the simulated stages X and Y while they move: pitch
-    from three sensors against the eigenvalue of the closed loop. In a band around it z must be
-    standard normal; over all that is excited, from 20 Hz on, below 2 in root mean square: modes too
-    weak to be seen bias there.
-    (3) A linear guide with friction (two experiments, two encoders) and a bench of two inertias
-    (motor and load side): against the values of the data's readers, sides and experiments against
-    each other, noise-only uncertainty against the jackknife over periods.
-Run time
-    Eleven minutes on one processor.
+    (1) Machines with two modes in the band and two outside it, driven by a multisine of random
+    phases (sensor noise, random disturbance, noise of the input) or by white noise, one record
+    each: coverage over all seeds and both modes by its 99.9 % Clopper-Pearson interval. Controls
+    that must fail: intervals 1.5 times as wide and as narrow. A motor with a cubic term distorts
+    without moving the poles; there coverage must not be lower. Efficiency: root mean square error
+    over the Cramér-Rao bound of poles, residues and the fewest residual terms, at the true noise
+    densities. (2) A sine sweeps through the current of the simulated stages X and Y in motion:
+    pitch from three sensors against the eigenvalue of the closed loop. In a band around it z must
+    be standard normal; from 20 Hz on, its root mean square must be below 2, because weak modes
+    cause bias.
+    (3) A linear guide with friction (two experiments, two encoders) and a bench of two inertias:
+    against published values, sides and experiments against each other, noise-only uncertainty
+    against the jackknife over periods.
 Answer
-    Yes around the modes: all coverages hold 95 %, root mean square errors are 1.00 to 1.11 times
-    the bound. Distortion that neighbouring lines do not share is overstated threefold. No in a band
-    that reaches over many weak modes (``not_met``): there X's pitch is off by up to 6 σ, 0.12 Hz.
+    Yes around the modes: all coverages contain 95 %, errors are 1.00 to 1.11 times the bound.
+    Distortion that neighbouring lines do not share is overestimated threefold. No in a band with
+    many weak modes (``not_met``): X's pitch is off by up to 6 σ, 0.12 Hz.
+Run time
+    Eleven minutes on one processor. The benches need LMSHEALTH_DATA.
 """
 
 from __future__ import annotations

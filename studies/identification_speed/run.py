@@ -1,16 +1,13 @@
 """What does identification cost in time and memory?
 
-Question
-    Is the headline record (three modes in three channels, 60 s at 1 kHz) identified in less than
-    0.05 s? Does a log of 60 s at 20 kHz with four channels go from Parquet to modes in at most
-    three times what reading and transforming it costs, and in at most three times its own memory?
 Method
-    Each is done alternately with its yardstick in one process: medians of the times and of the
-    ratios, and the least times, which other work on the machine lengthens least. Memory is the peak
-    of what Python and numpy allocate from the file on, over all columns of the file in double
-    precision.
+    Required: the headline record (three modes in three channels, 60 s at 1 kHz) in less than 0.05
+    s; a log of 60 s at 20 kHz with four channels from Parquet to modes in at most three times the
+    cost of reading and transforming it, with at most three times its memory. Each alternates with
+    its reference in one process; medians of times and ratios, and least times. Memory is the peak
+    that Python and numpy allocate from the file on, relative to all columns in double precision.
 Run time
-    About a minute.
+    One minute.
 """
 
 from __future__ import annotations

@@ -20,8 +20,7 @@ from studies.common.lives import (
     measured,
     plan_of,
 )
-from studies.crossings.judging import judge, nearest
-from studies.crossings.lives import KINDS, make_life
+from studies.crossings.lives import KINDS, judge, make_life, nearest
 from studies.crossings.run import labels_of
 from studies.tracking_filter.lives import alone, draw, mixture, stage
 from studies.tracking_filter.trials import QUANTITIES, errors, known_setting

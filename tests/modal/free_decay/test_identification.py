@@ -17,7 +17,7 @@ from lmshealth.modal.modes import Modes
 from lmshealth.signal.segments import Segment
 from lmshealth.stage.description import Stage
 from studies.decays.beam import judge_beam, one_beam
-from studies.decays.stops import one_machine
+from studies.decays.cases import one_machine
 from tests.signals import deviations, make_log, make_stage, sine
 from tests.stops import Ring, ring, stop, stop_log, whole
 
