@@ -221,15 +221,7 @@ class Machine:
 
 @dataclass(frozen=True, slots=True)
 class FleetUpdate:
-    """Outcome of `apply_fleet_priors`.
-
-    Attributes
-    ----------
-    keys : dict of str to str
-        Key of the assessment of each machine that is to be published.
-    failed : dict of str to str
-        Machines whose prognosis could not be recomputed, and why: they keep the one from before.
-    """
+    """Key of the assessment of each machine to publish, and why some could not be recomputed."""
 
     keys: dict[str, str]
     failed: dict[str, str]
@@ -238,16 +230,7 @@ class FleetUpdate:
 def assess_all(
     machines: Sequence[Machine], resources: Resources, *, force: bool = False
 ) -> dict[str, str]:
-    """Assess every machine whose assessment is not in the store.
-
-    Parameters
-    ----------
-    machines : sequence of Machine
-        With all that their assessments depend on.
-    resources : Resources
-        Its store has the estimates of their logs, and receives the assessments.
-    force : bool
-        Assess machines whose assessment is in the store, too.
+    """Assess every machine whose assessment is not in the store; with ``force``, every machine.
 
     Returns
     -------
@@ -325,16 +308,8 @@ def apply_fleet_priors(
 ) -> FleetUpdate:
     """Recompute the prognosis of young machines with the prior of their fleet.
 
-    A fleet is all machines of one description.
-
-    Parameters
-    ----------
-    machines : sequence of Machine
-        All machines of the run that are assessed.
-    resources : Resources
-        Its store has their evidence and assessments.
-    force : container of str
-        Names of machines that are updated although the result is in the store.
+    A fleet is all machines of one description. The result of machines named by ``force`` is
+    computed although it is in the store.
     """
     store, failed = resources.store, dict[str, str]()
     keys = {machine.name: machine.key for machine in machines}
@@ -392,18 +367,7 @@ def _update(job: tuple[str, str, bytes | None, FleetPrior]) -> PackedAssessment 
 
 
 def with_fleet_prior(content: bytes, prior: FleetPrior) -> PackedAssessment | None:
-    """Recompute the prognosis of a packed assessment with a fleet prior.
-
-    Returns
-    -------
-    PackedAssessment or None
-        None where this version cannot decode the assessment.
-
-    Raises
-    ------
-    LmshealthError
-        If its life cannot be fitted with that prior.
-    """
+    """Recompute the prognosis of a packed assessment; None where it cannot be decoded."""
     found: Assessment | None = unpack_or_none(content, Assessment)
     if found is None or found.track is None:
         return None

@@ -79,7 +79,7 @@ class CsvRows:
     def of(cls, name: str, rows: Sequence[Row]) -> Self:
         """Encode rows of a table."""
         table = frame(COLUMNS[name], rows)
-        # Of a cell that holds CR or LF csv quotes only what is part of this line terminator.
+        # With this line terminator a cell that contains CR or LF is quoted.
         text = table.to_csv(index=False, header=False, lineterminator="\r\n")
         return cls(tuple(table.columns), len(rows), text)
 

@@ -410,8 +410,8 @@ def _engine(url: URL, *, shared: bool = True) -> Engine:
 
     @event.listens_for(engine, "connect")
     def _set_up(connection: Any, _: Any) -> None:
-        # Readers beside one writer, and no wait for the disk at every log: results that a crash
-        # of the computer loses are computed again.
+        # WAL allows readers during a write. No wait for the disk at every log: results that a
+        # crash of the computer loses are computed again.
         with suppress(Exception):  # another run may do so now, or the file may be no database
             if shared:
                 connection.execute("PRAGMA journal_mode = WAL")

@@ -22,8 +22,7 @@ from concurrent.futures import (
     wait,
 )
 from contextlib import contextmanager
-from functools import cache, partial
-from importlib.metadata import version
+from functools import partial
 from itertools import islice
 from multiprocessing import connection, resource_tracker
 from multiprocessing.connection import Connection
@@ -33,12 +32,14 @@ from urllib.parse import urlsplit
 from loky import ProcessPoolExecutor
 from threadpoolctl import threadpool_limits
 
+from lmshealth._serialize import VERSION
 from lmshealth.batch import constants
 from lmshealth.batch.store import shown_address, without_secrets
 from lmshealth.errors import LmshealthError
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
+Task = Callable[[Item], Result]
 OnCrash = Callable[[Item, str], Result]
 
 # Of worker processes: loky restarts a process that has grown by 300 MB, which logs of unequal
@@ -68,10 +69,7 @@ class Pool:
     crashes: tuple[type[Exception], ...] = (BrokenExecutor,)
 
     def map_unordered(
-        self,
-        function: Callable[[Item], Result],
-        items: Iterable[Item],
-        on_crash: OnCrash[Item, Result],
+        self, function: Task[Item, Result], items: Iterable[Item], on_crash: OnCrash[Item, Result]
     ) -> Iterator[tuple[Item, Result]]:
         """Apply a function to items; yield each item with its result, in the order of completion.
 
@@ -145,10 +143,7 @@ class _ProcessPool(Pool):
         self._open_end.close()
 
     def map_unordered(
-        self,
-        function: Callable[[Item], Result],
-        items: Iterable[Item],
-        on_crash: OnCrash[Item, Result],
+        self, function: Task[Item, Result], items: Iterable[Item], on_crash: OnCrash[Item, Result]
     ) -> Iterator[tuple[Item, Result]]:
         left = iter(items)
         while True:
@@ -178,7 +173,7 @@ class _ProcessPool(Pool):
 
 
 def _completed(
-    executor: Executor, function: Callable[[Item], Result], items: Iterator[Item], size: int
+    executor: Executor, function: Task[Item, Result], items: Iterator[Item], size: int
 ) -> Iterator[tuple[Item, Future[Result]]]:
     """Yield items with their futures when these are done; after a crash take no more items."""
     running: dict[Future[Result], Item] = {}
@@ -270,16 +265,13 @@ class _Cluster(Pool):
         self.size = max(1, sum(client.nthreads().values()))
 
     def map_unordered(
-        self,
-        function: Callable[[Item], Result],
-        items: Iterable[Item],
-        on_crash: OnCrash[Item, Result],
+        self, function: Task[Item, Result], items: Iterable[Item], on_crash: OnCrash[Item, Result]
     ) -> Iterator[tuple[Item, Result]]:
         # Not `submit` of the executor: a result that arrives as its worker dies is neither
         # finished nor cancelled, which distributed/cfexecutor.py takes for an error.
         from distributed import as_completed
 
-        checked = partial(_run_checked, version("lmshealth"), function)
+        checked = partial(_run_checked, VERSION, function)
         left = iter(items)
         running: dict[Any, Item] = {}
         finished: Any = as_completed
@@ -341,23 +333,18 @@ def cluster(address: str) -> Iterator[Pool]:
         ) from error
     comm_closed: Any = CommClosedError  # the library has no types
     try:
-        _await_worker(client, shown)
+        client.wait_for_workers(1, timeout=constants.SCHEDULER_TIMEOUT_S)
         client.register_plugin(_one_thread(), name="lmshealth")  # also of workers that join later
-        client.run(_require_version, version("lmshealth"))
+        client.run(_require_version, VERSION)
         yield _Cluster(client)
+    except TimeoutError as error:
+        raise SchedulerError(f"the Dask scheduler {shown} has no workers: start some") from error
     except (CancelledError, comm_closed) as error:
         raise SchedulerError(
             f"lost the Dask scheduler {shown}; finished results are stored: run again to continue"
         ) from error
     finally:
         _close(client)
-
-
-def _await_worker(client: Any, shown: str) -> None:
-    try:
-        client.wait_for_workers(1, timeout=constants.SCHEDULER_TIMEOUT_S)
-    except TimeoutError as error:
-        raise SchedulerError(f"the Dask scheduler {shown} has no workers: start some") from error
 
 
 def _check_address(address: str) -> None:
@@ -423,20 +410,14 @@ def _close(client: Any) -> None:
     client.status = "closed"
 
 
-def _run_checked(needed: str, function: Callable[[Item], Result], item: Item) -> Result:
+def _run_checked(needed: str, function: Task[Item, Result], item: Item) -> Result:
     """Run a task on a worker of the needed version only: the store names results by version."""
     _require_version(needed)
     return function(item)
 
 
-@cache
-def _own_version() -> str:
-    return version("lmshealth")
-
-
 def _require_version(needed: str) -> None:
-    found = _own_version()
-    if found != needed:
+    if needed != VERSION:
         raise SchedulerError(
-            f"a worker has lmshealth {found}, this run has {needed}: install one version"
+            f"a worker has lmshealth {VERSION}, this run has {needed}: install one version"
         )

@@ -276,7 +276,7 @@ def test_a_worker_of_another_version_is_refused(
     cluster: servers.Cluster, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Its results would be kept under the name of this version."""
-    monkeypatch.setattr(workers, "version", lambda name: "0.0.1")
+    monkeypatch.setattr(workers, "VERSION", "0.0.1")
     with (
         pytest.raises(SchedulerError, match=f"lmshealth {version('lmshealth')}.*has 0.0.1"),
         workers.cluster(cluster.address),
