@@ -184,6 +184,8 @@ def _health_content(assessment: Assessment) -> dict[str, Any]:
         "scatter": list(_scatter(assessment.fleet, assessment.stage)),
         "pace": _pace,
         "fit": prognosis and chi_square_side(prognosis.chi_square, prognosis.degrees_of_freedom),
+        # Laws without parameters to sample, and improbable ones, have no chains.
+        "chains": prognosis is not None and bool(np.isfinite(prognosis.ess)),
         "walk_share": constants.WALK_SHARE,
         "correlation_shown": constants.CORRELATION_SHOWN,
         "scale_shown": constants.SCALE_SHOWN,

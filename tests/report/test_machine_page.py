@@ -423,7 +423,7 @@ def test_numbers_of_a_page_agree_and_are_grounded(make: Maker, tmp_path: Path) -
     text = path.read_text()
     odometer = f"{worn.history.travel[-1] / 1000:,.0f}".replace(",", "\u202f")
     assert f"odometer {odometer}\u202fkm" in text
-    assert f"the largest drift is {drift:.2f} %" in text
+    assert f"largest drift: {drift:.2f}\u202f%" in text
     assert f"<td>{worn.prognosis.ess:.0f}</td>" in text
     still = replace(worn, prognosis=replace(worn.prognosis, ess=np.inf, r_hat=1.0))
     text = write_report(tmp_path / "b", [still], ())[0].read_text()
