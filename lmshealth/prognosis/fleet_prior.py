@@ -170,17 +170,8 @@ def machine_evidence(stage: Stage, life: LifePosterior) -> MachineEvidence:
 def pace_likelihood(z: FloatArray, weight: FloatArray) -> FloatArray:
     """Return the log likelihood ratio of fleets with mean m and variance v to the description.
 
-    Parameters
-    ----------
-    z : ndarray
-        Draws of the standardised pace under the description, shape ``(n,)``.
-    weight : ndarray
-        Normalised weights, shape ``(n,)``.
-
-    Returns
-    -------
-    ndarray
-        Ln of the mean of N(z; m, v) / N(z; 0, 1), shape ``(n_means, n_variances)``.
+    For draws ``(n,)`` of the standardised pace under the description and their normalised weights
+    ``(n,)``: ln of the mean of N(z; m, v) / N(z; 0, 1), shape ``(n_means, n_variances)``.
     """
     columns = [
         logsumexp(0.5 * z**2 - 0.5 * (z - _MEAN) ** 2 / v, axis=1, b=weight) - 0.5 * np.log(v)

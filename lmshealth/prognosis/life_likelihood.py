@@ -238,14 +238,9 @@ class LifeLikelihood:
         return x[inside, : self.basis.nodes.size], inside
 
     def terms(self, grid: Grid, x: FloatArray) -> FloatArray:
-        """Return the log likelihood plus log prior of each point of a grid, ``(n_points, n)``.
+        """Return the log likelihood plus log prior at the points of a grid, ``(n_points, n)``.
 
-        Parameters
-        ----------
-        grid : Grid
-            Points.
-        x : ndarray
-            Ln parameters at the nodes, shape ``(n, n_nodes, n_parameters)``.
+        Ln parameters at the nodes are of shape ``(n, n_nodes, n_parameters)``.
         """
         chi_square, log_det = self.quadratic(grid, x)
         return np.asarray(grid.log_weight[:, None] - 0.5 * (chi_square + log_det))
@@ -263,23 +258,10 @@ class LifeLikelihood:
     ) -> tuple[FloatArray, FloatArray]:
         """Return mean and covariance of ln health about its law, given a life and all data.
 
-        Parameters
-        ----------
-        grid : Grid
-            Points of the grid.
-        k : int
-            Index of a point.
-        x : ndarray
-            Ln parameters at the nodes, shape ``(n, n_nodes, n_parameters)``.
-        moments : ndarray
-            Travel in m since the baseline, past or future, shape ``(n_moments,)``.
-
-        Returns
-        -------
-        mean : ndarray
-            Shape ``(n, n_moments, n_parameters)``.
-        cov : ndarray
-            Between the parameters, shape ``(n, n_moments, n_parameters, n_parameters)``.
+        For the k-th point of a grid, ln parameters at the nodes ``(n, n_nodes, n_parameters)`` and
+        moments ``(n_moments,)`` in m since the baseline, past or future: mean
+        ``(n, n_moments, n_parameters)`` and covariance between the parameters
+        ``(n, n_moments, n_parameters, n_parameters)``.
         """
         data, deviation = self.data, float(grid.deviation[k])
         point = grid.chosen(np.arange(grid.walk.size) == k)

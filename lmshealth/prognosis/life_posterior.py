@@ -112,23 +112,11 @@ class LifeDensity:
     def deviations(
         self, y: FloatArray, moments: FloatArray, rng: np.random.Generator
     ) -> tuple[FloatArray, FloatArray]:
-        """Draw the deviation of ln health from its laws.
+        """Draw the deviation of ln health from its laws at moments.
 
-        Parameters
-        ----------
-        y : ndarray
-            Coordinates inside the support, shape ``(n, n_dim)``.
-        moments : ndarray
-            Travel in m since the baseline, past or future, shape ``(n_moments,)``.
-        rng : Generator
-            Random numbers.
-
-        Returns
-        -------
-        off : ndarray
-            Independent from moment to moment, shape ``(n, n_moments, n_parameters)``.
-        rate : ndarray
-            Variance added per m of future travel, shape ``(n, n_parameters)``.
+        For coordinates ``(n, n_dim)`` inside the support and moments ``(n_moments,)`` in m since
+        the baseline, past or future: deviations ``(n, n_moments, n_parameters)``, independent from
+        moment to moment, and their variance per m of future travel ``(n, n_parameters)``.
         """
         free, horizon = self.likelihood.data.free, self.likelihood.data.horizon
         # Without coordinates all draws are of one life.
@@ -229,8 +217,6 @@ class LifePosterior:
         Deviation of ln health from its law now, like `health`.
     rate : ndarray
         Variance of the deviation added per m of future travel, like `health`.
-    correlation : ndarray
-        Of ln health now, shape ``(n_parameters, n_parameters)``; NaN for a constant parameter.
     chi_square : float
         Of the residuals at the posterior mean of each scenario, averaged.
     degrees_of_freedom : int
@@ -248,7 +234,6 @@ class LifePosterior:
     health: FloatArray
     off: FloatArray
     rate: FloatArray
-    correlation: FloatArray
     chi_square: float
     degrees_of_freedom: int
     walk: float
@@ -260,7 +245,6 @@ class LifePosterior:
         shape, p = self.health.shape, len(self.parameters)
         for name in ("health", "off", "rate"):
             expect_shape(name, getattr(self, name), (*shape[:2], p))
-        expect_shape("correlation", self.correlation, (p, p))
         if sum(one.n_mixture for one in self.scenarios) != shape[1]:
             raise ValueError("the draws of the scenarios do not add up to those of health")
         freeze(self)
@@ -421,9 +405,6 @@ def fit_life(
         rate.append(own_rate.reshape(shape))
         settings.append(one.density.settings(y[:: max(1, y.shape[0] // _N_SETTINGS)]))
     mixed = np.concatenate(health, axis=1)
-    with np.errstate(invalid="ignore"):  # constant health has no correlation
-        flat = np.log(mixed.reshape(-1, mixed.shape[-1]))
-        correlation = np.atleast_2d(np.corrcoef(flat, rowvar=False))
     share = np.array([one.n_mixture for one in scenarios]) / n_kept
     walk, noise_scale, deviation, chi_square = (float(v) for v in share @ np.array(settings))
     return LifePosterior(
@@ -434,7 +415,6 @@ def fit_life(
         health=mixed,
         off=np.concatenate(off, axis=1),
         rate=np.concatenate(rate, axis=1),
-        correlation=correlation,
         chi_square=chi_square,
         degrees_of_freedom=likelihood.data.y.size - scenarios[0].scenario.n_dim,
         walk=walk,

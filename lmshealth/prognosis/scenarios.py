@@ -140,12 +140,7 @@ class Scenario:
     def health(self, theta: FloatArray, travel: FloatArray) -> FloatArray:
         """Return health as fractions of baseline, shape ``(n, n_travel, n_parameters)``.
 
-        Parameters
-        ----------
-        theta : ndarray
-            Natural parameters, shape ``(n, n_dim)``.
-        travel : ndarray
-            Travel in m since the baseline, shape ``(n_travel,)``.
+        Natural parameters ``(n, n_dim)``; travel ``(n_travel,)`` in m since the baseline.
         """
         parts = zip(self.paths, self.split(theta), strict=True)
         return np.stack([path.health(own, travel) for path, own in parts], axis=-1)

@@ -227,7 +227,7 @@ def test_a_life_says_what_it_rests_on(found: LifePosterior) -> None:
     assert found.ess > 1000
     assert way.informed[0] > 0.9
     assert way.informed[1] < way.informed[0]
-    assert found.correlation[0, 1] < -0.5
+    assert np.corrcoef(np.log(found.health.reshape(-1, 2)).T)[0, 1] < -0.5
     ratio = found.chi_square / found.degrees_of_freedom
     assert 0.2 < ratio < 2.5
     assert found.degrees_of_freedom == 24 - 4
@@ -278,7 +278,6 @@ def test_laws_without_parameters_have_no_draws_of_them(history: History, tmp_pat
     assert nothing.scenarios[0].evidence_std == 0
     assert nothing.ess == np.inf
     assert nothing.worst_r_hat == 1
-    assert np.isnan(nothing.correlation).all()
 
 
 @pytest.mark.slow
