@@ -325,7 +325,7 @@ def test_starts_find_a_posterior_far_narrower_than_the_prior() -> None:
     assert 0.7 * 3e-3 < points.std() < 2 * 3e-3
 
 
-def test_starts_go_on_until_they_have_arrived() -> None:
+def test_starts_reach_a_narrow_ridge() -> None:
     """A ridge that is a ten thousandth of the prior wide is reached."""
     slope = np.array([1.0, 0.99, -0.98, 1.01])
 

@@ -154,7 +154,7 @@ def test_points_outside_of_the_support_are_left_out_but_count() -> None:
     assert not agrees(found, wrong)
 
 
-def test_too_few_draws_are_drawn_anew() -> None:
+def test_too_few_draws_are_repeated() -> None:
     """Draws worth less than 400 are drawn again, three times as many."""
     found = importance_sample_to_ess(gaussian(2), start(2), np.random.default_rng(9), 300)
     assert found.points.shape[0] == 900

@@ -404,7 +404,7 @@ def two_machines(stage: Stage, offset: timedelta) -> list[tuple[Track, Stage]]:
 
 
 @pytest.mark.slow
-def test_a_shared_guide_is_known_better(stage: Stage) -> None:
+def test_a_shared_guide_is_better_informed(stage: Stage) -> None:
     """Two machines on one guide inform its preload better than one; mounts stay apart.
 
     The posterior is that of a grid over all three parameters.

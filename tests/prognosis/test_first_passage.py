@@ -86,7 +86,7 @@ class NoBridge:
 @pytest.mark.parametrize(
     "law", [WEAR, FALLING, LINEAR, Unchanging()], ids=["wear", "loosening", "linear", "none"]
 )
-def test_without_wandering_it_is_the_law(law: AnyLaw) -> None:
+def test_without_deviation_it_is_the_law(law: AnyLaw) -> None:
     """The closed form of each law, at the limit that is left where health is off it."""
     path = DegradationPath(law, 0.0, ())
     rng = np.random.default_rng(2)
@@ -179,7 +179,7 @@ def test_a_bent_law_is_that_of_brute_force() -> None:
     assert abs(np.mean(known < 1.1 * np.median(found)) - 0.5) > 4.5 * 0.5 / np.sqrt(n)
 
 
-def test_a_limit_that_is_past_needs_no_wandering() -> None:
+def test_a_limit_that_is_past_needs_no_deviation() -> None:
     """Health below its limit now has been there since the law, so lowered, was."""
     path = DegradationPath(FALLING, 0.0, ())
     found = draw(path, (0.0, LIFE), off=-0.2, rate=1e-7, limit=0.7)
@@ -188,7 +188,7 @@ def test_a_limit_that_is_past_needs_no_wandering() -> None:
     np.testing.assert_allclose(found, left)
 
 
-def test_draws_that_wander_stand_among_those_that_do_not() -> None:
+def test_draws_with_deviation_stay_among_those_without() -> None:
     """Each draw has its own rate: what does not move is at the closed form, what does about it."""
     path = DegradationPath(FALLING, 0.0, ())
     rate = np.where(np.arange(1000) % 2, 1e-9, 0.0)
@@ -201,7 +201,7 @@ def test_draws_that_wander_stand_among_those_that_do_not() -> None:
     assert abs(found[1::2].mean() - left) < 4.5 * found[1::2].std() / np.sqrt(500)
 
 
-def test_nothing_is_claimed_past_the_horizon() -> None:
+def test_nothing_is_published_past_the_horizon() -> None:
     """Lives with deviation end before the horizon, or are infinite."""
     found = draw(DegradationPath(FALLING, 0.0, ()), (0.0, 4 * LIFE), off=0.0, rate=1e-8, limit=0.5)
     finite = np.isfinite(found)

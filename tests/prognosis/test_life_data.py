@@ -21,7 +21,7 @@ def test_few_logs_are_left_as_they_are() -> None:
     assert condense(history, len(history.logs)) is history
 
 
-def test_neighbours_are_averaged_by_all_that_is_known_of_them() -> None:
+def test_neighbours_are_averaged_by_their_covariance() -> None:
     """Means and covariances are those of generalised least squares written out as one system."""
     history = awkward_history(np.random.default_rng(2), n=24)
     history = replace(history, steps=())
@@ -91,7 +91,7 @@ def lives(tmp_path_factory: pytest.TempPathFactory) -> tuple:
 
 
 @pytest.mark.slow
-def test_a_life_reads_the_same(lives: tuple) -> None:
+def test_a_condensed_life_has_the_same_posterior(lives: tuple) -> None:
     """Of 240 logs and of some 40 made of them, medians and widths of health agree."""
     stage, history = lives
     whole, short = (

@@ -129,7 +129,7 @@ def test_likelihood_is_the_dense_multivariate_normal(
 
 
 @pytest.mark.usefixtures("short_grid")
-def test_every_course_after_a_step_is_the_dense_normal(tmp_path: Path) -> None:
+def test_every_scenario_after_a_step_is_the_dense_normal(tmp_path: Path) -> None:
     """Laws or none, steps and restarted laws: values, not only differences, are comparable."""
     stage = make_stage(tmp_path, (NO_PRELOAD, MOUNT))
     history = rough_history(np.random.default_rng(3))
@@ -162,7 +162,7 @@ def test_what_is_wrong_is_noticed(stage: Stage, what: str, monkeypatch: pytest.M
     assert np.abs(found - known).max() > 1e-5
 
 
-def test_walkers_do_not_see_each_other(stage: Stage) -> None:
+def test_walkers_are_independent(stage: Stage) -> None:
     """A batch equals its walkers one at a time, also where some are impossible."""
     density = density_of(rough_history(np.random.default_rng(3)), stage)
     y = density.draw_prior(np.random.default_rng(4), 40)
@@ -260,7 +260,7 @@ def test_laws_without_parameters_take_no_coordinate(tmp_path: Path) -> None:
     assert (density.likelihood.data.sensitivity[:, 1] == 0).all()
 
 
-def test_what_has_no_law_does_not_deviate(tmp_path: Path) -> None:
+def test_a_parameter_without_law_does_not_deviate(tmp_path: Path) -> None:
     """A parameter that only keeps its value adds nothing to the covariance, seen or not."""
     still = MOUNT[: MOUNT.index("[parameter.law]")]
     history = rough_history(np.random.default_rng(13))
@@ -427,7 +427,7 @@ def test_chi_square_of_a_life_as_stated_is_near_its_degrees_of_freedom(tmp_path:
 
 
 @pytest.fixture
-def wandering(monkeypatch: pytest.MonkeyPatch) -> LifeSetting:
+def with_deviation(monkeypatch: pytest.MonkeyPatch) -> LifeSetting:
     """One point of the grid, at which health is far off its laws."""
     monkeypatch.setattr(constants, "WALKS", (1.5e-3,))
     monkeypatch.setattr(constants, "NOISE_SCALES", (1.0,))
@@ -455,7 +455,9 @@ def off_by_hand(
     return life_deviation(history, drift, alone, belief, setting, moment)
 
 
-def test_deviations_are_those_of_a_dense_gaussian(poor_map: Stage, wandering: LifeSetting) -> None:
+def test_deviations_are_those_of_a_dense_gaussian(
+    poor_map: Stage, with_deviation: LifeSetting
+) -> None:
     """Mean and covariance given a life and its data: past, now and to come, to 1e-8."""
     history = rough_history(np.random.default_rng(13), baseline=2)
     density = density_of(history, poor_map)
@@ -467,11 +469,11 @@ def test_deviations_are_those_of_a_dense_gaussian(poor_map: Stage, wandering: Li
     assert mean.shape == (3, 4, 2)
     for i, point in enumerate(y):
         for m, moment in enumerate(moments):
-            known = off_by_hand(density, history, point, wandering, moment)
+            known = off_by_hand(density, history, point, with_deviation, moment)
             np.testing.assert_allclose(mean[i, m], known[0], rtol=1e-7, atol=1e-10)
             np.testing.assert_allclose(cov[i, m], known[1], rtol=1e-7, atol=1e-10)
     # From now on the variance grows as that of a Wiener process.
-    rate = wandering.deviation**2 / density.likelihood.data.horizon
+    rate = with_deviation.deviation**2 / density.likelihood.data.horizon
     np.testing.assert_allclose(mean[:, 3], mean[:, 2], rtol=1e-9)
     np.testing.assert_allclose(
         cov[:, 3] - cov[:, 2], np.tile(1.5 * now * rate * np.eye(2), (3, 1, 1))
@@ -479,7 +481,7 @@ def test_deviations_are_those_of_a_dense_gaussian(poor_map: Stage, wandering: Li
     assert np.abs(cov[:, 2, 0, 1]).min() > 1e-5  # preload and mount trade off
 
 
-def test_a_wrong_deviation_is_noticed(poor_map: Stage, wandering: LifeSetting) -> None:
+def test_a_wrong_deviation_is_noticed(poor_map: Stage, with_deviation: LifeSetting) -> None:
     """Negative control: with a slightly larger deviation the numbers are others."""
     history = rough_history(np.random.default_rng(13))
     density = density_of(history, poor_map)
@@ -487,14 +489,14 @@ def test_a_wrong_deviation_is_noticed(poor_map: Stage, wandering: LifeSetting) -
     moments = np.array([density.likelihood.data.now])
     x, _ = density.likelihood.path(density.scenario, y)
     mean, cov = density.likelihood.deviation(density.grid, 0, x, moments)
-    wrong = replace(wandering, deviation=0.41)
+    wrong = replace(with_deviation, deviation=0.41)
     known = off_by_hand(density, history, y[0], wrong, density.likelihood.data.now)
     assert np.abs(mean[0, 0] / known[0] - 1).min() > 1e-3
     assert np.abs(np.diag(cov[0, 0]) / np.diag(known[1]) - 1).min() > 1e-3
 
 
 def test_draws_of_deviations_have_their_mean_and_covariance(
-    poor_map: Stage, wandering: LifeSetting
+    poor_map: Stage, with_deviation: LifeSetting
 ) -> None:
     """Means and variances of draws of one life lie within five standard errors."""
     history = rough_history(np.random.default_rng(14))
@@ -503,13 +505,13 @@ def test_draws_of_deviations_have_their_mean_and_covariance(
     one = coordinates(density, 1)
     moments = np.array([0.0, density.likelihood.data.now])
     off, rate = density.deviations(np.tile(one, (n, 1)), moments, np.random.default_rng(1))
-    mean, cov = off_by_hand(density, history, one[0], wandering, density.likelihood.data.now)
+    mean, cov = off_by_hand(density, history, one[0], with_deviation, density.likelihood.data.now)
     assert np.abs(off[:, 0]).max() < 1e-6  # health is relative to the baseline
     std = np.sqrt(np.diag(cov))
     assert (np.abs(off[:, 1].mean(axis=0) - mean) < 5 * std / np.sqrt(n)).all()
     assert (np.abs(np.cov(off[:, 1].T) - cov) < 8 / np.sqrt(n) * np.outer(std, std)).all()
     assert (np.abs(off[:, 1].mean(axis=0) - 1.2 * mean) > 5 * std / np.sqrt(n)).any()
-    np.testing.assert_allclose(rate, wandering.deviation**2 / density.likelihood.data.horizon)
+    np.testing.assert_allclose(rate, with_deviation.deviation**2 / density.likelihood.data.horizon)
 
 
 def test_points_of_the_grid_are_drawn_by_their_weight(
@@ -531,7 +533,7 @@ def test_points_of_the_grid_are_drawn_by_their_weight(
     assert abs(still.mean() - expected) < 5 * np.sqrt(expected * (1 - expected) / n)
 
 
-def test_only_what_has_a_law_deviates(tmp_path: Path, wandering: LifeSetting) -> None:
+def test_only_what_has_a_law_deviates(tmp_path: Path, with_deviation: LifeSetting) -> None:
     """A parameter that keeps its value is never off it, nor will be, seen by the modes or not."""
     still = MOUNT[: MOUNT.index("[parameter.law]")]
     stage = make_stage(tmp_path, (FADING, still, FOOT))
@@ -544,8 +546,8 @@ def test_only_what_has_a_law_deviates(tmp_path: Path, wandering: LifeSetting) ->
     assert (rate[:, 1:] == 0).all()
 
 
-def test_a_course_without_coordinates_has_draws_of_one_life(
-    tmp_path: Path, wandering: LifeSetting
+def test_a_scenario_without_coordinates_has_draws_of_one_life(
+    tmp_path: Path, with_deviation: LifeSetting
 ) -> None:
     """Where no law is followed but one was possible, health still wanders."""
     several = FADING.replace("law = ", "law = [").replace("} }\n", '} }, { kind = "none" }]\n')

@@ -163,7 +163,7 @@ def test_laws_and_health_are_those_of_importance_sampling(
 
 
 @pytest.mark.slow
-def test_importance_sampling_alone_gives_the_same(
+def test_importance_sampling_alone_has_the_same_posterior(
     found: LifePosterior, history: History, stage: Stage
 ) -> None:
     """Without chains quantiles are the same within their error, and so many draws are given."""
@@ -208,14 +208,14 @@ def test_importance_sampling_alone_has_no_chains(unchained: LifePosterior) -> No
     assert unchained.worst_r_hat == 1
 
 
-def test_the_worst_of_all_chains_is_told(forked: LifePosterior) -> None:
+def test_the_worst_of_all_chains_is_reported(forked: LifePosterior) -> None:
     """Of the checks of all ways the worst speaks for the whole."""
     assert forked.ess == 697
     assert forked.worst_r_hat == pytest.approx(1.0053)
 
 
 @pytest.mark.slow
-def test_a_life_says_what_it_rests_on(found: LifePosterior) -> None:
+def test_a_life_has_its_diagnostics(found: LifePosterior) -> None:
     """Names, convergence, what is informed, and the trade-off of preload and mount."""
     (way,) = found.scenarios
     assert found.parameters == NAMES
@@ -235,7 +235,7 @@ def test_a_life_says_what_it_rests_on(found: LifePosterior) -> None:
 
 
 @pytest.mark.slow
-def test_health_is_its_law_times_how_far_it_is_off(found: LifePosterior) -> None:
+def test_health_is_its_law_times_its_deviation(found: LifePosterior) -> None:
     """Draws of laws, of what is off them and of health belong together, one by one."""
     ((way, off, rate),) = found.by_scenario()
     theta = way.scenario.natural(way.mixture_draws)
@@ -281,7 +281,7 @@ def test_laws_without_parameters_have_no_draws_of_them(history: History, tmp_pat
 
 
 @pytest.mark.slow
-def test_a_value_that_is_kept_is_read_as_kept(tmp_path: Path) -> None:
+def test_a_constant_value_is_found_constant(tmp_path: Path) -> None:
     """Rough logs of a constant mount: health is 1, unless the description has it settle."""
     noise = 8e-3 * np.random.default_rng(1).standard_normal((12, 2))
     history = make_history(np.log(FREQUENCY[:2]) + noise, travel=TRAVEL, std=8e-3)
@@ -298,7 +298,7 @@ def test_a_value_that_is_kept_is_read_as_kept(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_the_law_that_the_logs_ask_for_wins(faded: LifePosterior, wavering: Stage) -> None:
+def test_the_law_of_the_data_is_the_most_probable(faded: LifePosterior, wavering: Stage) -> None:
     """A clear loss is the law's, a still life is none's; probabilities add up to one."""
     still = fit_life(lived(TRAVEL, np.ones(12), np.ones(12)), wavering, 7)
     assert faded.laws("guide_preload")["linear", 0.0] > 0.99
@@ -316,7 +316,7 @@ def test_the_law_that_the_logs_ask_for_wins(faded: LifePosterior, wavering: Stag
 
 
 @pytest.mark.slow
-def test_draws_of_several_courses_stand_one_after_the_other(faded: LifePosterior) -> None:
+def test_draws_of_several_scenarios_follow_each_other(faded: LifePosterior) -> None:
     """Each scenario has its own part of the draws, and health in it is that of its laws."""
     assert len(faded.scenarios) > 1
     first = 0
@@ -330,7 +330,7 @@ def test_draws_of_several_courses_stand_one_after_the_other(faded: LifePosterior
 
 
 @pytest.mark.slow
-def test_a_course_of_little_probability_has_no_chains(
+def test_a_scenario_of_little_probability_has_no_chains(
     wavering: Stage, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """What is improbable is drawn by importance sampling alone, the rest by chains."""
@@ -410,7 +410,7 @@ def test_a_life_goes_to_arviz_and_back(found: LifePosterior, tmp_path: Path) -> 
 
 
 @pytest.mark.slow
-def test_a_course_without_parameters_has_no_group_in_arviz(faded: LifePosterior) -> None:
+def test_a_scenario_without_parameters_has_no_group_in_arviz(faded: LifePosterior) -> None:
     """Groups are of scenarios that have draws; every scenario has its probability."""
     tree = faded.to_arviz()
     for k, way in enumerate(faded.scenarios):
@@ -436,7 +436,7 @@ def test_a_life_is_a_table(found: LifePosterior) -> None:
     assert (table["q05"] < table["q95"]).all()
 
 
-def test_a_table_and_arviz_are_told_every_way(forked: LifePosterior) -> None:
+def test_a_table_and_arviz_have_every_scenario(forked: LifePosterior) -> None:
     """Draws, checks and probability of each scenario have its number in both."""
     table, tree = forked.to_frame(), forked.to_arviz()
     checks = tree["checks_data"]

@@ -63,7 +63,7 @@ def test_the_service_day_is_the_last_with_the_risk_allowed() -> None:
         assert np.mean(remaining / 1e4 <= midnight(day) + 1) > risk
 
 
-def test_a_limit_that_is_passed_asks_for_service_today() -> None:
+def test_a_limit_that_is_passed_needs_service_today() -> None:
     """More risk than allowed already: the day of the last log, not one before it."""
     prognosis = make_prognosis(np.full(100, -5e5), np.full(100, 1e4))
     assert decide(prognosis, Decision(max_risk=0.05)).by == START.date()
@@ -72,7 +72,7 @@ def test_a_limit_that_is_passed_asks_for_service_today() -> None:
     assert service.wait == -50
 
 
-def test_no_service_is_asked_for_past_the_horizon() -> None:
+def test_no_service_is_needed_past_the_horizon() -> None:
     """A quantile past the horizon, or never, is no date."""
     few = np.r_[np.full(4, 1e5), np.full(96, np.inf)]
     for remaining in (np.full(100, 2e7), np.full(100, np.inf), few):
@@ -125,7 +125,7 @@ def test_a_new_machine_is_replaced_at_the_age_of_the_known_equation(
 
 
 @pytest.mark.slow
-def test_the_costs_of_an_old_machine_are_least_where_the_formula_says() -> None:
+def test_the_costs_of_an_old_machine_are_least_by_the_formula() -> None:
     """With an age, costs per travel by numerical integration are nowhere less than 0.1 % lower."""
     age, ratio, life = 4e5, 8.0, weibull_min(2.5, scale=SCALE)
 
@@ -148,7 +148,7 @@ def test_a_constant_hazard_is_now_or_never() -> None:
     assert cheapest_travel(aged(weibull(1.0), 0.0), 1e3) == np.inf
 
 
-def test_a_falling_hazard_asks_for_no_service(rng: np.random.Generator) -> None:
+def test_a_falling_hazard_needs_no_service(rng: np.random.Generator) -> None:
     """With a falling failure rate a service saves nothing, also with random draws."""
     for draws in (weibull(0.6), SCALE * rng.weibull(0.6, 10_000)):
         assert cheapest_travel(aged(draws, 0.0), 20.0) == np.inf
@@ -173,7 +173,7 @@ def test_a_life_that_is_known_is_used_to_its_end() -> None:
     assert cheapest_travel(aged(np.full(100, SCALE), 1e5), 10.0) == SCALE
 
 
-def test_draws_past_their_limit_ask_for_service_now_and_not_later() -> None:
+def test_draws_past_their_limit_need_service_now_and_not_later() -> None:
     """The larger their share the less worth it is to go on; none of them is taken for a life."""
     future = weibull(4.0)
     kinds = []
@@ -259,7 +259,7 @@ def test_a_day_that_is_past_has_what_is_reached_already() -> None:
         )
 
 
-def test_without_a_prognosis_nothing_is_known() -> None:
+def test_without_a_prognosis_the_service_is_unknown() -> None:
     """No kind but unknown, no day and no risk."""
     service = decide(None, Decision(max_risk=0.1, next_service=date(2026, 3, 21)))
     assert (service.kind, service.by, service.planned) == ("unknown", None, None)

@@ -106,7 +106,7 @@ def test_remaining_life_is_that_of_a_grid(stage: Stage, fading: Prognosis) -> No
 
 
 @pytest.mark.slow
-def test_the_truth_is_where_it_should_be(fading: Prognosis) -> None:
+def test_intervals_hold_the_truth(fading: Prognosis) -> None:
     """Truth of health and remaining life lie within the central 99 % of this life's draws."""
     left = 0.4 / 1.5e-7 - 1.4e6
     low, high = np.quantile(fading.remaining[:, 0], [0.005, 0.995])
@@ -163,7 +163,7 @@ def test_curves_start_whole_and_fall(fading: Prognosis) -> None:
 
 
 @pytest.mark.slow
-def test_draws_now_and_left_tell_one_story(fading: Prognosis) -> None:
+def test_draws_of_health_and_remaining_life_agree(fading: Prognosis) -> None:
     """Draw by draw, health now and remaining travel come from the same life."""
     rate = (1 - fading.health[:, 0]) / 1.4e6
     losing = rate > 0
@@ -189,7 +189,7 @@ def test_usage_that_is_stated_is_taken(fading: Prognosis) -> None:
     assert fading.horizon == 5e6
 
 
-def test_usage_that_is_stated_asks_no_odometer(stage: Stage) -> None:
+def test_stated_usage_needs_no_odometer(stage: Stage) -> None:
     """A machine with one log, which gives no usage, has the stated usage."""
     rng, left = np.random.default_rng(9), np.array([-1e5, 1e6, np.inf])
     usage = _usage(cut(fading_life(1e-4), 1), stage, rng, left, 2e7)
@@ -209,7 +209,7 @@ def moved(rng: np.random.Generator, n: int, spread: float) -> History:
     return make_history(ln_f, travel=np.r_[0, np.cumsum(steps)])
 
 
-def test_usage_is_learned_from_the_odometer(unstated: Stage) -> None:
+def test_usage_is_estimated_from_the_odometer(unstated: Stage) -> None:
     """Of three weeks' logs the mean of years to come has the relative error of Student's t."""
     history, n_draws = moved(np.random.default_rng(7), 3, 0.2), 10_000
     steps = np.diff(history.travel)
@@ -243,7 +243,7 @@ def test_life_past_or_without_end_has_a_usage(unstated: Stage) -> None:
     assert stds[0] > stds[1] > stds[2] > 0
 
 
-def test_an_odometer_that_tells_no_usage_is_refused(unstated: Stage) -> None:
+def test_an_odometer_without_usage_is_refused(unstated: Stage) -> None:
     """Logs of one moment give no usage; the error names the key to state."""
     history, rng, left = fading_life(1e-4), np.random.default_rng(9), np.full(10, 1e6)
     once = replace(history, recorded_at=(START,) * 8)
@@ -272,7 +272,7 @@ def test_a_stage_without_any_law_never_fails(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_what_no_mode_tells_is_named_and_left_out(stage: Stage, fading: Prognosis) -> None:
+def test_an_unidentifiable_parameter_is_named_and_left_out(stage: Stage, fading: Prognosis) -> None:
     """The foot has a limit, but moves no mode: it has no remaining life and is not in "any"."""
     assert fading.unidentifiable == ("foot",)
     assert fading.health.shape == (10_000, 2)
@@ -288,7 +288,7 @@ def test_what_no_mode_tells_is_named_and_left_out(stage: Stage, fading: Prognosi
 
 
 @pytest.mark.slow
-def test_a_life_of_which_nothing_is_told_is_refused(tmp_path: Path) -> None:
+def test_a_life_without_identifiable_limit_is_refused(tmp_path: Path) -> None:
     """Without an identifiable parameter with a limit there is no prognosis, but the reason."""
     stage = make_stage(tmp_path, (PRELOAD.replace("limit = { below = 0.6 }", ""), LIMITED_FOOT))
     with pytest.raises(NotEnoughData, match="roll, pitch identify no parameter that has a limit"):
@@ -296,7 +296,7 @@ def test_a_life_of_which_nothing_is_told_is_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_laws_are_told_with_their_probability(tmp_path: Path) -> None:
+def test_laws_have_their_probability(tmp_path: Path) -> None:
     """Of a small loss, law and none have the weights of the posterior and of the draws."""
     stage = make_stage(tmp_path, (FADING_OR_NOT, STILL_MOUNT), tail=KNOWN_USAGE)
     history = fading_life(2e-5)
@@ -314,7 +314,7 @@ def test_laws_are_told_with_their_probability(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_a_law_that_begins_anew_is_told_with_its_travel(tmp_path: Path) -> None:
+def test_a_restarted_law_is_reported_with_its_begin(tmp_path: Path) -> None:
     """A preload that fades from a step on has a law that begins there."""
     stage = make_stage(tmp_path, (FADING,), tail=KNOWN_USAGE)
     travel = np.linspace(0, 1.4e6, 15)
@@ -332,7 +332,7 @@ def test_a_law_that_begins_anew_is_told_with_its_travel(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_health_off_its_law_makes_life_less_certain(
+def test_deviation_makes_life_less_certain(
     stage: Stage, fading: Prognosis, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A deviation widens what is left, and what is past is so of the health that is now."""

@@ -47,7 +47,7 @@ MOUNT = parameter("mount", LOOSE, NONE)
 @pytest.mark.parametrize(
     ("steps", "n"), [((), 3 * 2), (STEPS, 5 * 3), ((0.0, NOW), 3 * 2)], ids=["none", "two", "ends"]
 )
-def test_courses_have_all_the_probability(steps: tuple[float, ...], n: int) -> None:
+def test_scenarios_have_all_the_probability(steps: tuple[float, ...], n: int) -> None:
     """Every choice of laws and begins occurs once, and weights add up to one."""
     scenarios = list_scenarios((PRELOAD, MOUNT), steps, NOW)
     assert len(scenarios) == n
@@ -57,7 +57,7 @@ def test_courses_have_all_the_probability(steps: tuple[float, ...], n: int) -> N
     assert all(path.steps == steps for scenario in scenarios for path in scenario.paths)
 
 
-def test_a_law_has_its_weight_whether_it_begins_anew_or_not() -> None:
+def test_a_law_has_its_weight_whether_it_restarts_or_not() -> None:
     """Beginnings share what a law has; weights count against those of the same parameter."""
     scenarios = list_scenarios((PRELOAD, MOUNT), STEPS, NOW)
     weights: dict[tuple[str, float], float] = {}
@@ -77,7 +77,7 @@ def test_a_law_has_its_weight_whether_it_begins_anew_or_not() -> None:
     assert weights == pytest.approx(known)
 
 
-def test_a_course_without_parameters_is_one_certain_life() -> None:
+def test_a_scenario_without_parameters_is_one_certain_life() -> None:
     """One law of each parameter, and no step, is one scenario."""
     (scenario,) = list_scenarios((parameter("foot", NONE), MOUNT_ONLY), (), NOW)
     assert scenario.weight == 1
@@ -108,7 +108,7 @@ def test_jumps_act_from_their_step_on(law: AnyLaw) -> None:
 
 
 @pytest.mark.parametrize("law", LAWS[:3], ids=[law.kind for law in LAWS[:3]])
-def test_a_law_begun_anew_is_whole_until_then(law: AnyLaw) -> None:
+def test_a_restarted_law_is_1_until_then(law: AnyLaw) -> None:
     """Up to where it begins only jumps act; from there it is the law of the travel since."""
     path, k = DegradationPath(law, 1.2e6, STEPS), len(law.names)
     theta = natural(path, 30)
@@ -168,7 +168,7 @@ def test_each_draw_may_have_its_own_limit() -> None:
     np.testing.assert_array_equal(path.passage(theta, limit), alone)
 
 
-def one_course(*paths: DegradationPath) -> Scenario:
+def one_scenario(*paths: DegradationPath) -> Scenario:
     """Make a scenario of some paths."""
     return Scenario(paths, NOW, 1.0)
 
@@ -176,7 +176,7 @@ def one_course(*paths: DegradationPath) -> Scenario:
 @pytest.mark.parametrize("begin", [0.0, 0.5e6])
 def test_the_prior_of_a_line_with_a_jump_integrates_to_one(begin: float) -> None:
     """A rate and a jump, by quadrature on a grid of coordinates."""
-    scenario = one_course(DegradationPath(LINEAR, begin, (0.5e6,)))
+    scenario = one_scenario(DegradationPath(LINEAR, begin, (0.5e6,)))
     loss, jump = np.linspace(-4, 4, 801), np.linspace(-2.5, 2.5, 501)
     y = np.stack(np.meshgrid(loss, jump, indexing="ij"), axis=-1).reshape(-1, 2)
     cell = (loss[1] - loss[0]) * (jump[1] - jump[0])
@@ -191,7 +191,7 @@ def test_the_prior_of_a_line_with_a_jump_integrates_to_one(begin: float) -> None
 @pytest.mark.parametrize("law", [WEAR, LOOSE], ids=["hertz-wear", "loosening"])
 def test_priors_of_two_coordinates_integrate_to_one(law: AnyLaw, begin: float) -> None:
     """Wear and loosening, restarted or not, by quadrature on a grid of coordinates."""
-    scenario = one_course(DegradationPath(law, begin, ()))
+    scenario = one_scenario(DegradationPath(law, begin, ()))
     y = scenario.draw(np.random.default_rng(3), 20_000)
     low, high = y.min(axis=0) - 2, y.max(axis=0) + 2
     axes = [np.linspace(a, b, 1201) for a, b in zip(low, high, strict=True)]
@@ -203,13 +203,15 @@ def test_priors_of_two_coordinates_integrate_to_one(law: AnyLaw, begin: float) -
     mean = density @ grid * cell
     assert (np.abs(y.mean(axis=0) - mean) < 5 * y.std(axis=0) / np.sqrt(20_000) + 5e-3).all()
     # Negative control: draws as if the law had another travel behind it.
-    other = one_course(DegradationPath(law, 1.2e6, ())).draw(np.random.default_rng(3), 20_000)
+    other = one_scenario(DegradationPath(law, 1.2e6, ())).draw(np.random.default_rng(3), 20_000)
     assert (np.abs(other.mean(axis=0) - mean) > 0.05).any()
 
 
 def test_draws_follow_the_prior() -> None:
     """Rates and jumps of draws have the stated distributions, one independent of the other."""
-    scenario = one_course(DegradationPath(LINEAR, 0.5e6, STEPS), DegradationPath(NONE, 0.0, STEPS))
+    scenario = one_scenario(
+        DegradationPath(LINEAR, 0.5e6, STEPS), DegradationPath(NONE, 0.0, STEPS)
+    )
     y = scenario.draw(np.random.default_rng(4), 5000)
     assert y.shape == (5000, 5)
     assert np.isfinite(scenario.log_prior(y)).all()
@@ -222,14 +224,14 @@ def test_draws_follow_the_prior() -> None:
     assert stats.kstest(1.1 * theta[:, 0], books[0].cdf).pvalue < 1e-3  # negative control
 
 
-def test_a_course_joins_its_branches() -> None:
+def test_a_scenario_joins_its_paths() -> None:
     """Coordinates, densities and health of a scenario are those of its paths, side by side."""
     paths = (
         DegradationPath(WEAR, 0.0, STEPS),
         DegradationPath(NONE, 0.0, STEPS),
         DegradationPath(LOOSE, 1.2e6, STEPS),
     )
-    scenario = one_course(*paths)
+    scenario = one_scenario(*paths)
     assert scenario.sizes == (4, 2, 4)
     y = scenario.draw(np.random.default_rng(5), 20)
     parts = scenario.split(y)
@@ -247,7 +249,7 @@ def test_a_course_joins_its_branches() -> None:
 
 def test_far_off_walkers_are_impossible_and_raise_no_warning() -> None:
     """Coordinates beyond the range of floats have a prior of next to nothing, never NaN."""
-    scenario = one_course(DegradationPath(LOOSE, 0.0, STEPS), DegradationPath(WEAR, 0.0, STEPS))
+    scenario = one_scenario(DegradationPath(LOOSE, 0.0, STEPS), DegradationPath(WEAR, 0.0, STEPS))
     y = scenario.draw(np.random.default_rng(6), 1)
     for shift in (-1e3, 1e3):
         far = y + shift * np.eye(scenario.n_dim)
