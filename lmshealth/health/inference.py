@@ -178,8 +178,8 @@ def infer_together(
             kept.append(k)
     if not kept:
         raise NotEnoughData(
-            f"{first.stage}: no epoch has an epoch of {machines[1][0].stage} at or before it; "
-            "give the machine first whose logs end last"
+            f"{first.stage}: none of its epochs has an epoch of {machines[1][0].stage} at or "
+            "before it; name the machine whose logs end last first"
         )
     label = " + ".join(track.stage for track, _ in machines)
     return _infer_all(label, first, tuple(kept), tasks, seed, mapper)

@@ -438,12 +438,12 @@ def test_a_shared_guide_is_better_informed(stage: Stage) -> None:
 
 @pytest.mark.slow
 def test_epochs_of_the_first_meet_the_last_of_the_others(stage: Stage) -> None:
-    """An epoch takes what the other machine showed last; where that is nothing yet, it is none."""
+    """An epoch is combined with the last one of the other machine, or left out without one."""
     later = two_machines(stage, timedelta(days=7))
     found = infer_together(later, ["guide_preload"], 4)
     assert found.recorded_at == (later[0][0].recorded_at[2],)
     too_late = two_machines(stage, timedelta(days=70))
-    with pytest.raises(NotEnoughData, match="AX-1 one before"):
+    with pytest.raises(NotEnoughData, match="an epoch of AX-1 at or before it"):
         infer_together(too_late, ["guide_preload"], 4)
 
 
