@@ -39,7 +39,7 @@ ROLL, PITCH = Target("roll", 105.0, 0.015, 0.15), Target("pitch", 125.0, 0.02, 0
 
 
 def flat_point(modes: Sequence[Mode], n_channels: int, noise: float = NOISE) -> np.ndarray:
-    """Give the unknowns of independent forces and white floors."""
+    """Return the unknowns of independent forces and white floors."""
     layout = lay_out([i % n_channels for i in range(len(modes))], n_channels)
     return np.concatenate(
         [
@@ -69,7 +69,7 @@ def likelihood(
 
 
 def other_point(target: Likelihood, seed: int = 0) -> np.ndarray:
-    """Give a point with coherent forces and bent floors."""
+    """Return a point with coherent forces and bent floors."""
     rng = np.random.default_rng(seed)
     m = target.layout.n_modes
     p = target.start + rng.normal(0, 0.3, target.layout.size)
@@ -141,7 +141,7 @@ def noisy(m: int, n: int, duration: float, count: int = 1) -> Likelihood:
 def scatter_free(
     modes: Sequence[Mode], n: int, duration: float, noise: float = NOISE, count: int = 1
 ) -> Likelihood:
-    """Give a likelihood whose data are their own expectation."""
+    """Return a likelihood whose data are their own expectation."""
     truth = likelihood(modes, n, [], noise)
     f = frequencies(duration)
     empty = block_of([spectrum_of(np.tile(np.eye(n) + 0j, (f.size, 1, 1)), duration, count)])
@@ -185,6 +185,6 @@ def found(channels: np.ndarray, targets: Sequence[Target] = (ROLL, PITCH)) -> Cl
 
 
 def both(seed: int = 1, n: int = 60_000, noise: float = 0.5, psd: float = 1.0) -> np.ndarray:
-    """Give two channels that show both modes, each of them one better."""
+    """Return two channels that show both modes, each of them one better."""
     modes = [Mode(105.0, 0.015, psd, (1.0, -0.3)), Mode(125.0, 0.02, psd, (0.4, 1.0))]
     return accelerations(np.random.default_rng(seed), modes, n, RATE, noise)

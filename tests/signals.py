@@ -115,7 +115,7 @@ def make_log(
     pieces: Sequence[tuple[int, int]] | None = None,
     metadata: Metadata = Metadata(),  # noqa: B008
 ) -> Log:
-    """Make a log; channels are of the kind that their names say, else accelerations."""
+    """Make a log; the kind follows from the name, else acceleration."""
     n = len(next(iter(signals.values())))
     return Log(
         name="synthetic.h5",
@@ -155,20 +155,20 @@ def make_stage(
 def expected_spectrum(
     modes: Sequence[Mode], duration: float, low: float, high: float, noise: float
 ) -> Spectrum:
-    """Give a periodogram that equals its density: data without any scatter."""
+    """Return a periodogram that equals its density: data without any scatter."""
     frequency = np.arange(np.ceil(low * duration), high * duration) / duration
     return Spectrum(frequency, density(modes, frequency, noise), duration, float("nan"))
 
 
 def deviations(modes: Modes, name: str, frequency: float, damping: float) -> np.ndarray:
-    """How many standard deviations ln f and ln ζ of a mode are off their truth, shape (2,)."""
+    """Return the errors of ln f and ln ζ of a mode in standard deviations, shape (2,)."""
     i, n = modes.names.index(name), len(modes.names)
     std = np.sqrt(np.diag(modes.cov))[[i, n + i]]
     found = np.array([modes.ln_frequency[i], modes.ln_damping[i]])
     return (found - np.log([frequency, damping])) / std
 
 
-# An archive of one small machine: two modes that know its only parameter.
+# An archive of one small machine: two modes that depend on its only parameter.
 
 ARCHIVE_MODES = (("roll", 62.0, 0.02, 0.25), ("pitch", 105.0, 0.02, 0.4))
 MACHINE = "test-A"

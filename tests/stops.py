@@ -1,4 +1,4 @@
-"""Synthetic logs of what rings after a stop: decays, ambient response of their modes, noise."""
+"""Synthetic logs of decays after stops with ambient responses of their modes and noise."""
 
 from __future__ import annotations
 

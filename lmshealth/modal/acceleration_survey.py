@@ -1,4 +1,4 @@
-"""Survey of a log's accelerometers: where its modes are, how strong they are, and which lines."""
+"""Accelerations at the modes of a log, and its spectral lines."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ from lmshealth.stage.description import Stage
 
 @dataclass(frozen=True, slots=True)
 class Survey:
-    """What the accelerometers of one log say.
+    """Accelerations and lines of one log.
 
     Attributes
     ----------
     log : str
-        The file, as the user knows it.
+        File name.
     magnitudes : tuple of Magnitude
         Channel by channel.
     lines : tuple of Line
@@ -44,18 +44,18 @@ class Survey:
 def survey(
     log: Log, stage: Stage | None, band: tuple[float, float] | None, *, part: Part = "record"
 ) -> Survey:
-    """Read the accelerometers of a log.
+    """Read accelerations and spectral lines of the accelerometers of a log.
 
     Parameters
     ----------
     log : Log
         With at least one acceleration channel.
     stage : Stage or None
-        Says which modes and bands to read; without it a grid.
+        Modes and bands to read; without it a grid.
     band : (float, float) or None
-        Only modes, grid and lines between these, in Hz.
+        Use only modes, grid and lines between these, in Hz.
     part : str
-        Which stretches of the log; see `select_segments`.
+        Segments of the log; see `select_segments`.
 
     Returns
     -------
@@ -72,7 +72,7 @@ def survey(
         try:
             found = identify(log, stage, channels=[c.name for c in accelerometers])
         except BadLog:
-            found = None  # its modes are read where the description has them
+            found = None  # accelerations are read at the described frequencies
     identified = (
         None if found is None else dict(zip(found.names, found.frequency.tolist(), strict=True))
     )

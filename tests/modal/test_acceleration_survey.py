@@ -1,4 +1,4 @@
-"""Survey of accelerometers: bands where a log shows its modes, and the lines beside them."""
+"""Survey of accelerometers: bands where a log shows its modes, and spectral lines."""
 
 from __future__ import annotations
 

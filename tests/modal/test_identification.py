@@ -1,4 +1,4 @@
-"""Identification: truth within its own uncertainty, refusals that say why, and invariances."""
+"""Identification: truth within its uncertainty, refusals with their reasons, invariances."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ ROLL = (("roll", 105.0, 0.015),)
 
 
 def rng(seed: int = 1) -> np.random.Generator:
-    """Give a generator."""
+    """Return a generator."""
     return np.random.default_rng(seed)
 
 
@@ -54,7 +54,7 @@ def one_mode_log(seconds: float = 60.0, seed: int = 1, noise: float = 0.5) -> Lo
 
 
 def why(modes: Modes, name: str) -> str:
-    """Give the reason for which a mode was refused."""
+    """Return the reason for which a mode was refused."""
     (reason,) = {refusal.reason for refusal in modes.refused if refusal.mode == name}
     return reason
 
@@ -110,7 +110,7 @@ def test_two_modes_of_a_common_force_keep_their_truth() -> None:
 
 
 def lms_y_modes(shift: float = 1.0) -> list[Mode]:
-    """Give three modes as the Y stage has them, in three channels of different shape."""
+    """Return three modes as the Y stage has them, in three channels of different shape."""
     shapes = ((1.0, 0.2, 0.5), (0.3, 1.0, 0.4), (0.1, 0.3, 1.0))
     return [
         Mode(f * shift, zeta, 1.0, shape) for (_, f, zeta), shape in zip(LMS_Y, shapes, strict=True)
@@ -193,7 +193,7 @@ def test_shapes_are_accelerations_whatever_the_noise_of_each_channel(
 
 
 def test_the_following_error_counts_as_an_acceleration_in_a_shape() -> None:
-    """Δe of 0.8 beside accelerometers of 1.0 and 0.6 has that part of the shape."""
+    """Δe of 0.8 with accelerometers of 1.0 and 0.6 has that share of the shape."""
     found = identify(joint_log(3, 60_000), make_stage(ROLL))
     assert found.shape_channels == ("acc_0", "acc_1", "delta_e")
     np.testing.assert_allclose(found.shapes, np.array([[1.0, 0.6, 0.8]]) / np.sqrt(2), atol=0.03)
@@ -243,7 +243,7 @@ def test_the_floor_of_the_following_error_is_its_noise_also_in_short_moves() -> 
         found = identify(log, make_stage([("roll", 130.0, 0.02)]))
         assert found.names == ("roll",)
         snr.append(found.snr[0])
-    # Under the skirts of the resonance one log tells the noise to a factor of three only.
+    # Under the skirts of the resonance one log determines the noise only to a factor of three.
     assert mode.snr(1.0) == pytest.approx(20)
     assert mode.snr(1.0) / 3 < np.median(snr) < mode.snr(1.0) * 3
 
@@ -420,7 +420,7 @@ def test_a_pure_sine_is_a_line_and_no_mode(frequency: float) -> None:
 
 @pytest.mark.parametrize("seed", range(8))
 def test_a_strong_line_takes_no_name_from_a_mode(seed: int) -> None:
-    """Mains at 150 Hz, beside yaw, leave roll, pitch and yaw of 20 s their names and places."""
+    """Mains at 150 Hz, near yaw, leave roll, pitch and yaw of 20 s their names and places."""
     log = acceleration_log(rng(100 + seed), lms_y_modes(), 20, RATE, 0.5)
     mains = sine(20_000, RATE, 150.0, 60.0)
     dirty = make_log({c.name: c.values + mains for c in log.channels}, RATE)
@@ -432,7 +432,7 @@ def test_a_strong_line_takes_no_name_from_a_mode(seed: int) -> None:
 
 
 def test_a_record_too_short_names_the_seconds_needed() -> None:
-    """The error says how many seconds the narrowest mode needs, and how many there are."""
+    """The error quotes the seconds that the narrowest mode needs and those available."""
     with pytest.raises(BadLog, match=r"0\.635 s.*0\.3 s") as caught:
         identify(one_mode_log(0.3), make_stage(ROLL))
     assert caught.value.reason == "too-short"
@@ -523,7 +523,7 @@ def test_a_cluster_is_fitted_where_no_other_stands(
 def test_spectra_reach_as_far_as_modes_are_looked_for(
     fitted: list[tuple[LogSpectra, tuple[Target, ...]]],
 ) -> None:
-    """A mode of 105 Hz, sought within 15 %, with eight damping ratios beside it: to 135 Hz."""
+    """For a mode of 105 Hz, a search of 15 % and eight damping ratios, spectra end at 135 Hz."""
     identify(one_mode_log(), make_stage(ROLL))
     reach = 1.15 * 105.0 * (1 + 8 * 0.015)
     (ends,) = {float(view.spectra[0].frequency[-1]) for view, _ in fitted}
@@ -549,7 +549,7 @@ def test_lines_that_are_found_are_neither_sought_nor_fitted(
 
 
 def test_a_very_light_damping_is_found_without_a_description() -> None:
-    """A resonance of ζ = 0.2 % that towers over the noise in 60 s is not overlooked."""
+    """A resonance of ζ = 0.2 % far above the noise is found in 60 s."""
     log = acceleration_log(rng(18), [Mode(120.0, 0.002)], 60, RATE, 1.0)
     found = identify(log, band=(40.0, 300.0))
     assert found.names == ("mode_1",)
@@ -587,7 +587,7 @@ def test_stretches_of_an_instant_are_passed_over() -> None:
 
 
 def test_modes_outside_the_band_are_left_alone() -> None:
-    """Only modes of the band are looked for, with a description and without."""
+    """Only modes of the band are identified, with a description and without."""
     log = acceleration_log(rng(19), lms_y_modes(), 60, RATE, 0.5)
     assert identify(log, make_stage(LMS_Y), band=(130.0, 140.0)).names == ("pitch",)
     found = identify(log, band=(145.0, 165.0))
@@ -697,7 +697,7 @@ def test_a_lonely_resonance_is_not_named_by_guessing(lonely: str) -> None:
 
 @pytest.mark.parametrize("pair", [("roll", "yaw"), ("roll", "pitch"), ("pitch", "yaw")])
 def test_two_of_three_modes_keep_their_names(pair: tuple[str, str]) -> None:
-    """The distance between two resonances tells which of three they are."""
+    """The distance between two resonances identifies them among three modes."""
     nominal = {"roll": 126.4, "pitch": 136.6, "yaw": 155.0}
     stage = make_stage([(name, f, 0.017) for name, f in nominal.items()])
     for seed in range(4):

@@ -1,4 +1,4 @@
-"""What is asked of a log: which channels are used, and which modes are looked for."""
+"""Channels and modes that an identification uses."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def test_a_channel_that_is_not_usable_is_named_with_those_that_are(unknown: str)
 
 @pytest.mark.parametrize(("there", "chosen"), [(("current",), None), (NAMES, [])])
 def test_no_channel_left_is_an_error(there: tuple[str, ...], chosen: list[str] | None) -> None:
-    """A log of currents alone, or none asked for, is refused."""
+    """A log of currents only, or an empty choice, is refused."""
     with pytest.raises(BadLog, match="delta_e or acc") as caught:
         names(there, chosen)
     assert caught.value.reason == "no-signal"
@@ -57,12 +57,12 @@ def test_modes_are_looked_for_as_they_are_described_and_in_order() -> None:
 
 
 def test_a_band_takes_the_modes_inside_it_ends_included() -> None:
-    """Modes beyond are not looked for."""
+    """Modes outside are left out."""
     assert [t.name for t in choose_targets(STAGE, (105.0, 136.6))] == ["roll", "pitch"]
     assert [t.name for t in choose_targets(STAGE, (105.1, 154.9))] == ["pitch"]
 
 
 def test_a_band_without_modes_is_an_error() -> None:
-    """Nothing to look for is said, not shown as an empty table."""
+    """A band without described modes is an error, not an empty table."""
     with pytest.raises(BadStage, match="300 and 400 Hz"):
         choose_targets(STAGE, (300.0, 400.0))

@@ -95,7 +95,7 @@ def test_channels_of_different_units_are_fitted_as_one() -> None:
 
 
 def test_a_mode_that_is_not_there_is_refused_and_the_other_kept() -> None:
-    """Without excitation of pitch the fit holds roll alone, and the reason says where and why."""
+    """Without excitation of pitch the fit holds only roll; the rejection quotes its frequency."""
     modes = [Mode(105.0, 0.015, 1.0, (1.0, 0.5))]
     result, rejected = fit(
         accelerations(np.random.default_rng(2), modes, 60_000, RATE, 0.5), [ROLL, PITCH]
@@ -108,7 +108,7 @@ def test_a_mode_that_is_not_there_is_refused_and_the_other_kept() -> None:
 
 
 def test_noise_alone_has_no_fit() -> None:
-    """White noise shows none of the modes, and says so for each."""
+    """White noise rejects each of the modes."""
     rng = np.random.default_rng(3)
     noise = np.array([white(rng, 1.0, 60_000, RATE) for _ in range(3)])
     result, rejected = fit(noise, [ROLL, PITCH])
@@ -136,8 +136,8 @@ def test_a_channel_that_does_not_see_the_modes_is_left_out() -> None:
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_channels_that_hardly_see_a_mode_do_not_talk_it_away(seed: int) -> None:
-    """A weak mode that one channel shows is found as well beside five that show a trace of it."""
+def test_channels_that_hardly_show_a_mode_do_not_hide_it(seed: int) -> None:
+    """A weak mode that one channel shows is found as well with five that show a trace of it."""
     shape = (1.0, *(0.4,) * 5)
     mode = Mode(105.0, 0.015, 0.0016, shape)
     values = accelerations(np.random.default_rng(seed), [mode], 60_000, RATE, 1.0)
@@ -219,7 +219,7 @@ def test_the_clearer_record_has_the_higher_clarity() -> None:
 
 
 def test_the_following_error_and_an_accelerometer_are_one_source_together() -> None:
-    """A spectra of both kinds is joint; each alone keeps its own source."""
+    """Spectra of both kinds are joint; each alone keeps its own source."""
     mode = [Mode(105.0, 0.015)]
     x = displacements(np.random.default_rng(6), mode, 20_000, RATE, 1e-13)[0]
     a = accelerations(np.random.default_rng(6), mode, 20_000, RATE, 0.5)[0]
@@ -238,10 +238,10 @@ def test_the_following_error_and_an_accelerometer_are_one_source_together() -> N
 
 
 def test_a_line_known_beforehand_is_masked() -> None:
-    """Where a line is said to stand nothing is read, and it is not found once more."""
+    """Ordinates of a known line are excluded, and it is not listed again."""
     spectra, binned = spectra_of(both())
-    told = spectra.without([110.0])
-    result, _ = fit_spectra(told, binned, (ROLL, PITCH))
+    excluded = spectra.without([110.0])
+    result, _ = fit_spectra(excluded, binned, (ROLL, PITCH))
     clean, _ = fit_spectra(spectra, binned, (ROLL, PITCH))
     assert result is not None
     assert clean is not None
@@ -257,8 +257,8 @@ def test_a_band_that_known_lines_cover_is_too_short() -> None:
     """Where lines leave nothing to fit, the mode is refused with what is left."""
     spectra, binned = spectra_of(both())
     everywhere = np.arange(80.0, 160.0, 0.1).tolist()
-    told = spectra.without(everywhere)
-    result, rejected = fit_spectra(told, binned, (ROLL,))
+    excluded = spectra.without(everywhere)
+    result, rejected = fit_spectra(excluded, binned, (ROLL,))
     assert result is None
     assert rejected["roll"][0] == "too-short"
     assert "hold no line, needed 16" in rejected["roll"][1]
@@ -320,7 +320,7 @@ def test_the_mean_of_parts_shows_lines_that_none_of_them_shows() -> None:
 
 @pytest.mark.slow
 def test_what_a_fit_of_a_sure_mean_lacks_is_no_line() -> None:
-    """A mode that nobody looks for is left over for the search, and not masked as lines."""
+    """A mode that is no target remains in the residual, and is not masked as lines."""
     modes = [Mode(105.0, 0.015), Mode(112.0, 0.01, 0.05)]
     values = accelerations(np.random.default_rng(10), modes, 1_200_000, RATE, 0.5)
     result = fit_mean(mean_of(values, 60), (ROLL,), (90.0, 120.0))
@@ -329,23 +329,23 @@ def test_what_a_fit_of_a_sure_mean_lacks_is_no_line() -> None:
 
 
 def test_a_stretch_too_short_for_the_band_does_no_harm() -> None:
-    """A segment of six samples beside a record leaves the fit as it is."""
+    """A further segment of six samples does not change the fit."""
     spectra, binned = spectra_of(both())
     made = make_log({f"acc_{k}": row for k, row in enumerate(both(n=6))}, RATE).channels
     tiny = cross_spectra(made, [Segment(0, 6, float("nan"))], RATE, 200.0)
     alone, _ = fit_spectra(spectra, binned, (ROLL, PITCH))
     more = replace(spectra, spectra=(*spectra.spectra, *tiny))
-    beside, _ = fit_spectra(more, binned, (ROLL, PITCH))
+    extended, _ = fit_spectra(more, binned, (ROLL, PITCH))
     assert alone is not None
-    assert beside is not None
-    np.testing.assert_allclose(beside.estimate, alone.estimate, atol=1e-9)
+    assert extended is not None
+    np.testing.assert_allclose(extended.estimate, alone.estimate, atol=1e-9)
 
 
 @pytest.mark.parametrize(("nominal", "reason"), [(None, "line-not-mode"), (105.0, None)])
 def test_a_peak_as_narrow_as_mains_is_no_mode_unless_sought(
     nominal: float | None, reason: str | None
 ) -> None:
-    """Of ζ = 0.03 % a resonance cannot be told from a line that wanders, though it is resolved."""
+    """A resolved resonance of ζ = 0.03 % cannot be distinguished from a wandering line."""
     mode = Mode(105.0, 0.0003)
     spectra, _ = spectra_of(accelerations(np.random.default_rng(9), [mode], 400_000, RATE, 0.5))
     binned = spectra.binned(103.0, 107.0, 0.02)
@@ -360,7 +360,7 @@ def test_a_peak_as_narrow_as_mains_is_no_mode_unless_sought(
 def test_bins_are_as_fine_as_the_resonance_that_is_found(
     monkeypatch: pytest.MonkeyPatch, damping: float, again: bool
 ) -> None:
-    """One much narrower than sought is binned anew, by its own width; one as sought is not."""
+    """Bins are refined for a mode much narrower than expected, and only then."""
     widths: list[float] = []
 
     def spy(
@@ -436,8 +436,8 @@ def test_noise_and_resonance_are_no_lines() -> None:
 
 
 @pytest.mark.parametrize("channel", [0, 1])
-def test_a_tower_in_any_channel_is_masked_with_its_foot_and_read(channel: int) -> None:
-    """A line in one of the channels takes five ordinates from all, and is told with its size."""
+def test_a_line_in_any_channel_is_masked_with_its_neighbours_and_read(channel: int) -> None:
+    """A line in one channel masks five ordinates of all, and is listed with its amplitude."""
     k, size = 2500, 30.0
     band = band_of(spectrum(3, [(k, channel, size)]))
     band = mask_prominent_lines(band)
@@ -468,7 +468,7 @@ def test_what_a_fit_does_not_expect_is_masked_and_what_it_does_is_not(
 
 
 @pytest.mark.parametrize(("apart", "masked"), [(6, 0.0), (12, 5 / 12)])
-def test_towers_are_masked_unless_they_are_most_of_the_band(apart: int, masked: float) -> None:
+def test_lines_are_masked_unless_they_are_most_of_the_band(apart: int, masked: float) -> None:
     """Five of every twelve ordinates are masked as lines; where it would be five of six, none."""
     band = band_of(spectrum(5, [(k, 0, 300.0) for k in range(0, 3000, apart)]))
     band = mask_prominent_lines(band)

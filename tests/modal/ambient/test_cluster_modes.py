@@ -100,7 +100,7 @@ TRUTH = np.log([105.0, 125.0, 0.015, 0.02])
 
 
 def test_a_mode_narrower_than_a_record_resolves_is_a_line() -> None:
-    """A half-power bandwidth of 0.95 Fourier frequencies is not believed, one of 1.05 is."""
+    """A half-power bandwidth of 0.95 Fourier frequencies is refused, one of 1.05 accepted."""
     result = found(both())
     width = 2 * np.exp(result.estimate[0] + result.estimate[2])
     why = _incredible(result, 0, 0.95 / width)
@@ -158,7 +158,7 @@ def test_dispersion_is_that_of_what_stands_near_the_mode_and_is_not_masked() -> 
 
 
 def test_too_few_ordinates_tell_no_dispersion() -> None:
-    """Thirty about a mode say something, 28 do not; each mode is judged by itself."""
+    """Thirty ordinates near a mode suffice, 28 do not; modes are independent."""
     left = residual(scatter(2))
     wide, narrow = _dispersion(left, np.array([100.0, 110.0]), np.array([0.02, 5e-4]))
     assert np.isfinite(wide)
@@ -221,7 +221,7 @@ def test_a_mode_under_a_line_that_is_too_unsteady_to_be_told_is_refused() -> Non
     reason, detail = rejected["roll"]
     assert reason == "poor-fit"
     assert "times as much as noise" in detail
-    # As faint as a third of that it is told, and the reading is only said to be loose.
+    # At a third of that amplitude the mode is published with a flag.
     faint, rejected = fit(both() + 5.0 * np.sin(phase), [ROLL, PITCH])
     assert faint is not None
     assert rejected == {}

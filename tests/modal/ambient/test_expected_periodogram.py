@@ -75,7 +75,7 @@ def test_averaged_neighbours_say_what_they_say_apart_where_nothing_changes() -> 
 def test_averaging_neighbours_moves_nothing_by_a_thirtieth_of_its_uncertainty(
     duration: float, n_segments: int
 ) -> None:
-    """On data without scatter ln f and ln ζ move by less than σ / 30, as the rule of bins says."""
+    """On data without scatter ln f and ln ζ move by less than σ / 30, as bins require."""
     exact = scatter_free(MODES[:1], 2, duration, count=n_segments)
     (block,) = exact.blocks
     merged = block_of([spectrum_of(block.matrix, duration, n_segments)], merge=True)
@@ -259,7 +259,7 @@ def test_the_kernel_is_the_fejer_kernel_on_its_grid() -> None:
 def test_the_transform_is_as_exact_as_the_sum(
     low: int, high: int, duration: float, finer: int
 ) -> None:
-    """Beside a resonance a million times above the floor both agree to 10⁻⁹, with gaps."""
+    """Near a resonance a million times above the floor both agree to 10⁻⁹, with gaps."""
     frequency = np.arange(low, high) / duration
     keep = np.random.default_rng(1).random(frequency.size) > 0.1
     spectrum = Spectrum(frequency, np.ones(frequency.size), duration, float("nan"))

@@ -47,7 +47,7 @@ def binned(parts: Sequence[Spectrum], low: float, high: float, width: float) -> 
 
 
 def scatter_free(modes: list[Mode], noise: float) -> BinnedSpectrum:
-    """Give a binned spectrum that is its own expectation."""
+    """Return a binned spectrum that is its own expectation."""
     frequency = np.arange(80.0, 180.0, 0.5)
     return BinnedSpectrum(
         frequency, density(modes, frequency, noise), np.full(frequency.size, 10.0)
@@ -66,7 +66,7 @@ def test_bins_read_the_density_of_white_noise() -> None:
 
 @pytest.mark.parametrize("count", [2, 10])
 def test_bins_read_the_density_from_means_too(count: int) -> None:
-    """Beside single segments and means over parts, bins read the density, each with its weight."""
+    """Bins of single segments and means over parts estimate the density, each with its weight."""
     rng, n = np.random.default_rng(3), 40_000
     frequency = np.arange(1, n + 1) / n * 500.0
     single = Spectrum(frequency, 3.0 * rng.exponential(size=n), n / 500.0, 0.1)
@@ -144,11 +144,11 @@ def test_a_missing_mode_costs_and_a_needless_one_does_not() -> None:
 
 
 def test_a_neighbour_takes_its_own_flank() -> None:
-    """With the mode beside it known, an absent mode gains nothing; without, it takes the flank."""
+    """An absent mode gains nothing with its neighbour; without, it explains the flank."""
     bins = scatter_free([Mode(105.0, 0.02)], 0.01)
-    beside = Target("beside", 105.0, 0.02, 0.1)
+    neighbour = Target("neighbour", 105.0, 0.02, 0.1)
     absent = (Target("absent", 112.0, 0.02, 0.1),)
-    helped = replace(bins, neighbours=(beside,))
+    helped = replace(bins, neighbours=(neighbour,))
     assert misfits((helped,), ()) - misfits((helped,), absent) < 1.0
     assert misfits((bins,), ()) - misfits((bins,), absent) > 50
     assert strengths((helped,), absent)[0].shape == (1, 1)

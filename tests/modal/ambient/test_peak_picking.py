@@ -21,7 +21,7 @@ def transform(values: np.ndarray) -> tuple[Spectrum, ...]:
 
 
 def near(targets: tuple[Target, ...], frequency: float, share: float = 0.04) -> bool:
-    """Tell whether a target is within a share of a frequency."""
+    """Return whether a target is within a share of a frequency."""
     return any(abs(target.frequency / frequency - 1) < share for target in targets)
 
 
@@ -138,7 +138,7 @@ def test_lines_tower_in_means_as_in_single_records() -> None:
 
 
 def test_an_excess_narrower_than_asked_for_does_not_count() -> None:
-    """Where only broad humps are looked for, one beside a narrow one is found, or none."""
+    """With a least damping only a broad excess is found, near a narrow one, or none."""
     frequency = np.arange(2000, 3500) / 20.0
     narrow = 30 / (1 + ((frequency - 126.4) / 0.1) ** 2)
     broad = 1 / (1 + ((frequency - 150.0) / 3.0) ** 2)

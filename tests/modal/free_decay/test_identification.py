@@ -106,7 +106,7 @@ def test_decays_of_different_lengths_share_their_modes() -> None:
 
 @pytest.mark.slow
 def test_a_following_error_rings_too() -> None:
-    """A displacement gives the mode by itself, and is not asked what accelerometers tell."""
+    """A displacement shows the mode alone, and is not used for modes of accelerometers."""
     rng = np.random.default_rng(7)
     wave = stop(rng, [Ring(60.0, 0.01)], 400, RATE, 0.02)[0]
     error = 1e-6 * stop(rng, [Ring(60.0, 0.01)], 400, RATE, 0.02)[0]
@@ -122,7 +122,7 @@ def test_a_following_error_rings_too() -> None:
 
 @pytest.mark.slow
 def test_the_decay_begins_where_the_machine_is_linear() -> None:
-    """A rattle right after the stop is left out, and the frequency is that of the ringing."""
+    """An impact right after the stop is skipped; the frequency is that of the decay."""
     rng = np.random.default_rng(8)
     x = stop(rng, [Ring(60.0, 0.002)], 800, RATE, 0.01)[0]
     x[:60] += 2 * rng.standard_normal(60)
@@ -175,7 +175,7 @@ def test_noise_is_refused_and_never_an_empty_success() -> None:
 
 @pytest.mark.slow
 def test_a_sine_is_a_line_and_not_a_mode() -> None:
-    """Mains does not fade: it is refused as a line, and the mode beside it is found."""
+    """Mains does not fade: it is refused as a line, and a neighbouring mode is found."""
     rng = np.random.default_rng(11)
     x = stop(rng, [Ring(60.0, 0.01)], 800, RATE, 0.02)[0] + sine(800, RATE, 70.13, 0.5)
     modes = of_pieces(make_log({"acc_0": x}, RATE))

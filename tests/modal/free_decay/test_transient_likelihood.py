@@ -99,7 +99,7 @@ def test_a_decay_of_any_length_is_its_transient_and_nothing_else() -> None:
 
 
 def test_derivatives_of_a_transient_are_differences_of_it() -> None:
-    """Changes of ln f and ln ζ do to the columns what their derivatives say."""
+    """Derivatives of the columns by ln f and ln ζ agree with differences."""
     block = transform_decays(np.zeros((1, 400, 1)), RATE, 40, 90)
     f, zeta = np.array([60.3, 71.0]), np.array([0.01, 0.002])
     _, slopes = pole_columns(block, f, zeta)
@@ -119,7 +119,7 @@ def test_a_linear_trend_lies_in_the_base() -> None:
 
 
 def test_what_a_record_cuts_off_an_ambient_response_lies_along_its_transients() -> None:
-    """Beside the transients the ordinates of a stationary response are exactly uncorrelated.
+    """Apart from transients the ordinates of a stationary response are exactly uncorrelated.
 
     The autocovariance of a mode under white force is known, and with it the covariance of the
     transform of a stretch far shorter than the mode's memory: nothing off its diagonal, and on it

@@ -1,4 +1,4 @@
-"""FRF logs: modes of simulated and real machines, and a clear answer to what cannot be read."""
+"""FRF logs: modes of simulated and real machines, and refusals."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def driven(
 
 
 def off(reading: FrfReading) -> np.ndarray:
-    """Tell how many standard deviations the two modes of the band are off, (2, 2)."""
+    """Return the errors of the two modes of the band in standard deviations, shape (2, 2)."""
     modes = reading.modes
     assert modes.names == ("mode_1", "mode_2"), modes.frequency
     truth = np.log([[f for f, _, _ in MODES[:2]], [zeta for _, zeta, _ in MODES[:2]]])
@@ -96,7 +96,7 @@ def test_a_random_input_needs_no_whole_number_of_anything() -> None:
 
 @pytest.mark.slow
 def test_without_noise_the_modes_are_exact() -> None:
-    """Modes beside the band are all that keeps a simulation from being fitted to rounding."""
+    """Only modes outside the band keep a simulation from being fitted to rounding."""
     modes = read_frf(driven(Machine(white=0.0, process=0.0)), "current", "acc_x", band=BAND).modes
     assert modes.frequency == pytest.approx([62, 90], rel=1e-6)
     assert modes.damping_ratio == pytest.approx([0.015, 0.02], rel=1e-4)
@@ -230,7 +230,7 @@ def refusal(log: Log, *names: str, **options: object) -> BadLog:
 
 
 def test_a_name_is_given_where_there_is_no_doubt(tmp_path: Path) -> None:
-    """One mode where a name is looked for has it; two there, or one for two names, have none."""
+    """A mode alone in one search gets the name; two in one search, or one in two, get none."""
     modes = replace(read_frf(driven(), "current", "acc_x", band=BAND).modes, names=("a", "b"))
 
     why: list[str] = []
@@ -255,13 +255,15 @@ def test_a_name_is_given_where_there_is_no_doubt(tmp_path: Path) -> None:
     assert len(why) == 2
     assert all("it is not the only one where both is searched for; " in w for w in why)
     assert named(("one", low, 0.05), ("two", low + 1, 0.05), ("high", high, 0.1)) == ("", "high")
-    (told,) = why
-    assert told.startswith(f"the mode at {modes.frequency[0]:.5g} Hz has no name: one and two are ")
-    assert "both searched for there; track assigns it" in told
+    (reason,) = why
+    assert reason.startswith(
+        f"the mode at {modes.frequency[0]:.5g} Hz has no name: one and two are "
+    )
+    assert "both searched for there; track assigns it" in reason
 
 
 def test_channels_that_are_not_there_are_named_with_those_that_are() -> None:
-    """Input or output missing, or one twice; a channel refused at the door says why."""
+    """Input or output missing, or one twice; of a refused channel the reason is quoted."""
     log = driven()
     for names in (("volts", "acc_x"), ("current", "acc_y")):
         error = refusal(log, *names)
@@ -282,7 +284,7 @@ def test_a_constant_signal_is_named() -> None:
 
 
 def test_a_period_longer_than_half_the_record_is_refused() -> None:
-    """The seconds that there are stand beside those that two periods need."""
+    """The refusal quotes the seconds available and those of two periods."""
     error = refusal(driven(periods=3), "current", "acc_x", period=7.0)
     assert error.reason == "period"
     assert "7 s" in error.detail
@@ -300,14 +302,14 @@ def test_a_stated_period_that_cannot_be_is_refused() -> None:
 
 
 def test_a_band_beyond_the_sample_rate_or_the_excitation_is_refused() -> None:
-    """Above 0.45 of the sample rate nothing is shown; where nothing is excited nothing is told."""
+    """Above 0.45 of the sample rate nothing is shown; an unexcited band is refused."""
     assert refusal(driven(), "current", "acc_x", band=(190, 300)).reason == "sample-rate"
     assert refusal(driven(), "current", "acc_x", band=(130, 150)).reason == "not-excited"
     assert refusal(driven(), "current", "acc_x", band=(60, 61)).reason == "band-too-narrow"
 
 
 def test_a_short_record_is_refused_with_its_length() -> None:
-    """Samples and seconds that there are; a record of few lines says what a fit needs."""
+    """The refusal quotes samples and seconds available, or the lines that a fit needs."""
     log = driven(random=True)
     short = make_log({c.name: c.values[:100] for c in log.channels}, RATE)
     error = refusal(short, "current", "acc_x")
@@ -335,7 +337,7 @@ def test_a_sine_excites_too_few_lines() -> None:
 
 @pytest.mark.parametrize("repeats", [True, False])
 def test_an_output_that_does_not_answer_is_refused(repeats: bool) -> None:
-    """Noise beside an excitation: the coherence is what noise shows, and said so."""
+    """Noise independent of an excitation is refused with its coherence."""
     rng = np.random.default_rng(2)
     given = np.tile(multisine(rng, SIZE), 6) if repeats else rng.standard_normal(6 * SIZE)
     log = make_log({"current": given, "acc_x": rng.standard_normal(6 * SIZE)}, RATE)
@@ -370,7 +372,7 @@ def test_a_gap_leaves_the_longest_piece() -> None:
 
 
 def test_mains_on_a_harmonic_is_a_line_and_no_mode() -> None:
-    """50 Hz that is in step with the excitation: told as mains with its amplitude."""
+    """50 Hz synchronous with the excitation is listed as mains with its amplitude."""
     rng = np.random.default_rng(4)
     given, answer = periodic(rng, Machine(), SIZE, 6)
     size = 0.2 * answer.std()

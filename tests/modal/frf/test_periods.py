@@ -56,7 +56,7 @@ def test_what_does_not_repeat_has_no_period() -> None:
 
 
 def test_a_stated_period_stands_where_the_signal_shows_none() -> None:
-    """What drowns in noise is cut as the user says."""
+    """A period hidden in noise is the one that the user states."""
     assert find_period(np.random.default_rng(4).standard_normal(N), 1000.3) == 1000.3
 
 

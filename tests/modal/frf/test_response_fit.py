@@ -12,7 +12,7 @@ LINES = np.arange(40.0, 120.0, 0.25)
 
 
 def respond(modes: tuple[tuple[float, float], ...], f: np.ndarray = LINES) -> np.ndarray:
-    """Respond by modes (Hz, damping ratio) of one sign, and two beside the band."""
+    """Respond by modes (Hz, damping ratio) of one sign, and two outside the band."""
     s = 2j * np.pi * f
     total = np.zeros(f.size, dtype=complex)
     for frequency, zeta in (*modes, (20.0, 0.05), (200.0, 0.02)):
@@ -40,7 +40,7 @@ def measured(
 
 
 def frequencies(fit: ResponseFit) -> np.ndarray:
-    """Give natural frequencies in Hz."""
+    """Return natural frequencies in Hz."""
     return np.exp(fit.estimate[: fit.estimate.size // 2])
 
 
@@ -97,7 +97,7 @@ def test_close_modes_are_told_apart_where_the_noise_allows() -> None:
 
 
 def test_distortion_is_found_and_widens_what_is_said() -> None:
-    """5 % of random error in each line: its share is found; noise alone would say far less."""
+    """5 % of random error in each line: its share is found; noise alone is far less."""
     fit = fit_response(measured(respond(TWO), 0.02, distortion=0.05))
     assert fit.distortion == pytest.approx(0.05, rel=0.25)
     assert fit.chi_square > 20

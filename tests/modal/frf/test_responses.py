@@ -122,7 +122,7 @@ def test_a_transient_in_the_first_period_is_left_out() -> None:
 
 
 def test_an_input_that_does_not_repeat_has_no_periods() -> None:
-    """White noise cut as if it were periodic: said so, and not that nothing is excited."""
+    """White noise with a stated period is refused for its period, not for lack of excitation."""
     given, answer = at_random(np.random.default_rng(9), Machine(), 6 * SIZE)
     with pytest.raises(BadLog, match=r"period.* current does not repeat after 4 s"):
         from_periods(pair(given, answer), BAND, SIZE)
@@ -138,7 +138,7 @@ def test_two_periods_are_enough_and_less_are_not() -> None:
 
 
 def test_too_few_lines_and_too_many_are_refused() -> None:
-    """A narrow band says how many lines it has; a wide one of a long record asks for a band."""
+    """A refusal quotes the lines of a narrow band; a wide one of a long record needs a band."""
     with pytest.raises(BadLog, match=r"band-too-narrow.* 9 lines"):
         from_periods(pair(*periodic(np.random.default_rng(5), QUIET, SIZE, 4)), (60.0, 62.0), SIZE)
     with pytest.raises(BadLog, match=r"not-excited.* 0 lines"):
