@@ -342,7 +342,8 @@ def _rul_columns(one: LimitLife) -> Row:
 
 def error_row(log: str, error: FollowingError) -> Row:
     """Return the analysis of the following error of one log; bandwidth: highest minus lowest."""
-    (low, high), (low_above, high_above) = error.band, error.band_above
+    harmonics, above = error.harmonics, error.above
+    (low, high), (low_above, high_above) = harmonics.span(error.kept), harmonics.span(above)
     values = (
         log,
         error.channel,
@@ -351,11 +352,11 @@ def error_row(log: str, error: FollowingError) -> Row:
         *(v / _MICRO for v in (error.lowest, error.highest, error.std, error.mean)),
         *(error.kept.size, high - low, low, high),
         error.max_magnitude / _MICRO,
-        float(error.harmonics.frequency[error.kept[0]]),
-        error.share_explained,
+        float(harmonics.frequency[error.kept[0]]),
+        harmonics.share(error.kept),
         error.floor / _NANO,
-        *(error.above.size, high_above - low_above, low_above, high_above),
-        error.share_explained_above,
+        *(above.size, high_above - low_above, low_above, high_above),
+        harmonics.share(above),
     )
     return _rows(LOG_COLUMNS["error"], [values])[0]
 

@@ -12,7 +12,7 @@ from lmshealth._arrays import FloatArray, freeze
 from lmshealth.errors import BadLog
 from lmshealth.io.log import Channel, Log
 from lmshealth.signal import constants
-from lmshealth.signal.harmonics import Harmonics, decompose
+from lmshealth.signal.harmonics import Harmonics, Indices, decompose
 from lmshealth.signal.segments import (
     Part,
     Segment,
@@ -53,14 +53,14 @@ class FollowingError:
     std: float
     mean: float
     harmonics: Harmonics
-    kept: np.ndarray[tuple[int], np.dtype[np.intp]]
+    kept: Indices
     floor: float
 
     def __post_init__(self) -> None:
         freeze(self)
 
     @property
-    def above(self) -> np.ndarray[tuple[int], np.dtype[np.intp]]:
+    def above(self) -> Indices:
         """Indices of the kept harmonics above the floor, strongest first."""
         return self.kept[self.harmonics.amplitude[self.kept] > self.floor]
 
@@ -69,39 +69,9 @@ class FollowingError:
         """Amplitude of the strongest harmonic in m."""
         return float(self.harmonics.amplitude[self.kept[0]])
 
-    @property
-    def band(self) -> tuple[float, float]:
-        """Lowest and highest frequency of the kept harmonics in Hz."""
-        return self._span(self.kept)
-
-    @property
-    def band_above(self) -> tuple[float, float]:
-        """Band in Hz of those above the floor; NaN where there are none."""
-        return self._span(self.above)
-
-    @property
-    def share_explained(self) -> float:
-        """Share of the variance in the kept harmonics."""
-        return self._share(self.kept)
-
-    @property
-    def share_explained_above(self) -> float:
-        """Share of the variance in those above the floor."""
-        return self._share(self.above)
-
     def rebuilt(self) -> FloatArray:
         """Return Δe in m from the kept harmonics above the floor, shape ``(n_samples,)``."""
         return self.harmonics.rebuild(self.above)
-
-    def _span(self, index: np.ndarray[tuple[int], np.dtype[np.intp]]) -> tuple[float, float]:
-        if index.size == 0:
-            return float("nan"), float("nan")
-        frequency = self.harmonics.frequency[index]
-        return float(frequency.min()), float(frequency.max())
-
-    def _share(self, index: np.ndarray[tuple[int], np.dtype[np.intp]]) -> float:
-        power = self.harmonics.power
-        return float(power[index].sum() / power.sum())
 
 
 def read_error(
@@ -152,23 +122,13 @@ def read_error(
         )
 
     velocity = nominal_velocity(log)
+    duration = sum(s.stop - s.start for s in segments) / log.sample_rate
     readings = []
     for channel in channels:
-        lowest, highest, mean, std = _statistics(channel, segments)
         harmonics = decompose(channel.values[longest.start : longest.stop], log.sample_rate)
+        kept, statistics = harmonics.strongest(count), _statistics(channel, segments)
         readings.append(
-            FollowingError(
-                channel=channel.name,
-                velocity=velocity,
-                duration=sum(s.stop - s.start for s in segments) / log.sample_rate,
-                lowest=lowest,
-                highest=highest,
-                std=std,
-                mean=mean,
-                harmonics=harmonics,
-                kept=harmonics.strongest(count),
-                floor=floor,
-            )
+            FollowingError(channel.name, velocity, duration, *statistics, harmonics, kept, floor)
         )
     return tuple(readings)
 
@@ -218,7 +178,7 @@ def _mean_square(values: FloatArray, sample_rate: float) -> float:
 
 
 def _statistics(channel: Channel, segments: Sequence[Segment]) -> tuple[float, float, float, float]:
-    """Return minimum, maximum, mean and standard deviation of all samples."""
+    """Return minimum, maximum, standard deviation and mean of all samples."""
     size, low, high, mean, var = np.array(
         [
             (x.size, x.min(), x.max(), x.mean(), x.var())
@@ -227,4 +187,4 @@ def _statistics(channel: Channel, segments: Sequence[Segment]) -> tuple[float, f
     ).T
     total = float(np.average(mean, weights=size))
     scatter = float(np.average(var + (mean - total) ** 2, weights=size))
-    return float(low.min()), float(high.max()), total, float(np.sqrt(scatter))
+    return float(low.min()), float(high.max()), float(np.sqrt(scatter)), total

@@ -9,6 +9,9 @@ from scipy import fft
 
 from lmshealth._arrays import FloatArray, freeze
 
+Indices = np.ndarray[tuple[int], np.dtype[np.intp]]
+"""Indices of harmonics."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Harmonics:
@@ -51,7 +54,7 @@ class Harmonics:
             power[-1] *= 2
         return power
 
-    def strongest(self, count: int) -> np.ndarray[tuple[int], np.dtype[np.intp]]:
+    def strongest(self, count: int) -> Indices:
         """Return the indices of the strongest harmonics, at most ``count``, strongest first."""
         return np.argsort(-self.amplitude, kind="stable")[:count]
 
@@ -60,7 +63,18 @@ class Harmonics:
         first = np.searchsorted(self.frequency, low, side="right")
         return slice(int(first), int(np.searchsorted(self.frequency, high)))
 
-    def rebuild(self, kept: np.ndarray[tuple[int], np.dtype[np.intp]]) -> FloatArray:
+    def span(self, kept: Indices) -> tuple[float, float]:
+        """Return lowest and highest frequency in Hz of some harmonics, NaN without any."""
+        if kept.size == 0:
+            return float("nan"), float("nan")
+        return float(self.frequency[kept].min()), float(self.frequency[kept].max())
+
+    def share(self, kept: Indices) -> float:
+        """Return the share of the variance in some harmonics."""
+        power = self.power
+        return float(power[kept].sum() / power.sum())
+
+    def rebuild(self, kept: Indices) -> FloatArray:
         """Return the sum of the mean and some harmonics, by index; shape ``(size,)``."""
         transform = np.zeros(self.size // 2 + 1, dtype=complex)
         transform[0] = self.mean * self.size

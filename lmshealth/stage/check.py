@@ -158,19 +158,9 @@ class StageCheck:
 def check_stage(stage: Stage) -> StageCheck:
     """Check a stage description, with or without health parameters."""
     if stage.modal_map is None:
-        none = np.empty((0, 0))
-        return StageCheck(
-            name=stage.name,
-            modes=tuple(ModeCheck(mode, informs=False) for mode in stage.modes),
-            parameters=(),
-            informative=(),
-            slopes=none,
-            limit_slopes=none,
-            correlation=none,
-            n_logs=stage.description.baseline.logs,
-            model_std=np.nan,
-            unused=(),
-        )
+        modes = tuple(ModeCheck(mode, informs=False) for mode in stage.modes)
+        n_logs, none = stage.description.baseline.logs, np.empty((0, 0))
+        return StageCheck(stage.name, modes, (), (), none, none, none, n_logs, np.nan, ())
     information = identifiability_of(stage)
     rows = [stage.modal_map.modes.index(mode.name) for mode in information.modes]
     limits = _limits(stage)
@@ -182,7 +172,7 @@ def check_stage(stage: Stage) -> StageCheck:
         name=stage.name,
         modes=tuple(_check_mode(stage, mode, information, limits) for mode in stage.modes),
         parameters=tuple(
-            _check_parameter(stage, information, j, noise) for j in range(len(stage.parameters))
+            _check_parameter(spec, j, stage, information) for j, spec in enumerate(stage.parameters)
         ),
         informative=tuple(mode.name for mode in information.modes),
         slopes=information.slopes,
@@ -230,10 +220,10 @@ def _check_mode(
 
 
 def _check_parameter(
-    stage: Stage, information: Identifiability, j: int, noise: FloatArray
+    spec: ParameterSpec, j: int, stage: Stage, information: Identifiability
 ) -> ParameterCheck:
     assert stage.modal_map is not None
-    spec = stage.parameters[j]
+    noise = information.drift_variance(constants.TYPICAL_DURATION, information.n_baseline)
     low, high = np.exp([stage.modal_map.low[j], stage.modal_map.high[j]]).tolist()
     below, upto = spec.prior.probability(np.array([low, high])).tolist()
     lowest, lower, upper, highest = spec.prior.quantile(
@@ -355,9 +345,8 @@ def _combination(checked: StageCheck, parameter: ParameterCheck) -> str:
 
 
 def _correlated(checked: StageCheck) -> Iterator[Diagnostic]:
-    identified = [k for k, p in enumerate(checked.parameters) if p.verdict == "told"]
-    for i, j in combinations(identified, 2):
-        first, second = (checked.parameters[k].name for k in (i, j))
+    identified = [(k, p.name) for k, p in enumerate(checked.parameters) if p.verdict == "told"]
+    for (i, first), (j, second) in combinations(identified, 2):
         value = checked.correlation[i, j]
         text = f"{first} and {second} are identifiable separately; their errors have a correlation"
         text += f" of {value:+.2f}"
@@ -390,19 +379,13 @@ def _map_range(parameter: ParameterCheck) -> Iterator[Diagnostic]:
     name, ends = parameter.name, f"{parameter.low:.3g} to {parameter.high:.3g}"
     outside = parameter.below + parameter.above
     if outside > constants.PRIOR_OUTSIDE:
-        yield Diagnostic(
-            "map",
-            False,
-            f"The map of {name} covers {ends}; {_share(outside)} of its prior lies outside and is "
-            "cut off. Make a wider map, or a narrower prior.",
-        )
+        text = f"{_share(outside)} of its prior lies outside and is cut off"
+        text = f"The map of {name} covers {ends}; {text}. Make a wider map, or a narrower prior."
+        yield Diagnostic("map", False, text)
     if not parameter.has_limit_on_map and parameter.spec.limit is not None:
-        yield Diagnostic(
-            "map",
-            False,
-            f"The limit {parameter.spec.limit.below:g} of {name} does not lie inside the map "
-            f"({ends}), so logs cannot show that it is passed. Make a wider map.",
-        )
+        text = f"The limit {parameter.spec.limit.below:g} of {name} does not lie inside the map"
+        text += f" ({ends}), so logs cannot show that it is passed. Make a wider map."
+        yield Diagnostic("map", False, text)
 
 
 def _searched(check: ModeCheck) -> Iterator[Diagnostic]:
@@ -417,12 +400,9 @@ def _searched(check: ModeCheck) -> Iterator[Diagnostic]:
         ("with every parameter at its limit", check.limit_frequency),
     ):
         if np.isfinite(frequency) and not low <= frequency <= high:
-            yield Diagnostic(
-                "modes",
-                False,
-                f"{mode.name} is searched from {low:.4g} to {high:.4g} Hz, but the map has it at "
-                f"{frequency:.4g} Hz {when}. Widen its search, or correct the map or frequency.",
-            )
+            text = f"{mode.name} is searched from {low:.4g} to {high:.4g} Hz, but the map has it at"
+            text += f" {frequency:.4g} Hz {when}. Widen its search, or correct map or frequency."
+            yield Diagnostic("modes", False, text)
 
 
 def _unused(checked: StageCheck) -> Iterator[Diagnostic]:

@@ -369,7 +369,10 @@ def _faults(description: Description) -> Iterator[tuple[Keys, str]]:
                 yield (kind, k, "name"), f"[[{kind}]] names must be unique, twice: {name!r}"
     if description.parameter and description.map is None:
         yield ("parameter", 0), "[[parameter]] needs a [map] of its effect on the modes"
-    yield from _decision_faults(description.decision)
+    risk, ratio = description.decision.max_risk, description.decision.cost_ratio
+    if risk is not None and ratio is not None:
+        fault = f"cost_ratio = {ratio:g} and max_risk = {risk:g} each choose a service date"
+        yield ("decision", "cost_ratio"), f"{fault}: state one of them"
     for k, parameter in enumerate(description.parameter):
         yield from _parameter_faults(k, parameter)
 
@@ -391,16 +394,6 @@ def _parameter_faults(k: int, parameter: ParameterSpec) -> Iterator[tuple[Keys, 
             ("parameter", k, "limit", "below"),
             f"{parameter.name}: limit {parameter.limit.below:g} must lie below the baseline "
             f"{parameter.baseline:g}",
-        )
-
-
-def _decision_faults(decision: Decision) -> Iterator[tuple[Keys, str]]:
-    """Find two criteria of the service date."""
-    if decision.max_risk is not None and decision.cost_ratio is not None:
-        yield (
-            ("decision", "cost_ratio"),
-            f"cost_ratio = {decision.cost_ratio:g} and max_risk = {decision.max_risk:g} each "
-            "choose a service date: state one of them",
         )
 
 

@@ -101,10 +101,6 @@ def plan(
     durations : sequence of float
         Durations of logs in s to compare.
 
-    Returns
-    -------
-    Plan
-
     Raises
     ------
     BadStage

@@ -147,7 +147,7 @@ def rebuilt(path: Path, harmonics: list[Row], truth: Row) -> dict[str, float]:
             np.abs(ours - MEAN_UM - cosines).max() / top
         ),
         "share explained against one minus the variance left": abs(
-            reading.share_explained_above - (1 - left)
+            reading.harmonics.share(reading.above) - (1 - left)
         ),
     }
 

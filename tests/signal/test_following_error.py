@@ -42,11 +42,13 @@ def test_known_sines_are_read_to_a_billionth() -> None:
         assert found.harmonics.amplitude[i] == pytest.approx(a, rel=1e-9)
         assert found.harmonics.phase[i] == pytest.approx(p, abs=1e-9)
     assert found.max_magnitude == pytest.approx(2e-6, rel=1e-9)
-    assert found.band == pytest.approx((12.5, 610.0), rel=1e-9)
-    assert found.band_above == pytest.approx((12.5, 137.0), rel=1e-9)
-    assert found.share_explained == pytest.approx(1.0, rel=1e-9)
+    assert found.harmonics.span(found.kept) == pytest.approx((12.5, 610.0), rel=1e-9)
+    assert found.harmonics.span(found.above) == pytest.approx((12.5, 137.0), rel=1e-9)
+    assert found.harmonics.share(found.kept) == pytest.approx(1.0, rel=1e-9)
     power = [a * a for _, a, _ in SINES]
-    assert found.share_explained_above == pytest.approx(sum(power[:3]) / sum(power), rel=1e-9)
+    assert found.harmonics.share(found.above) == pytest.approx(
+        sum(power[:3]) / sum(power), rel=1e-9
+    )
 
 
 def test_the_rebuilt_error_leaves_the_share_that_is_not_explained() -> None:
@@ -55,16 +57,16 @@ def test_the_rebuilt_error_leaves_the_share_that_is_not_explained() -> None:
     (found,) = read_error(make_log({"delta_e": x}, RATE))
     left = np.var(x - found.rebuilt()) / np.var(x)
     assert 0.01 < left < 0.9
-    assert left == pytest.approx(1 - found.share_explained_above, rel=1e-9)
-    assert found.share_explained > found.share_explained_above
+    assert left == pytest.approx(1 - found.harmonics.share(found.above), rel=1e-9)
+    assert found.harmonics.share(found.kept) > found.harmonics.share(found.above)
 
 
 def test_nothing_above_the_floor_has_no_bandwidth() -> None:
     """A floor above every harmonic leaves none: no band, no share, and the mean rebuilt."""
     (found,) = read_error(make_log({"delta_e": known()}, RATE), count=5, floor=1e-5)
     assert found.above.size == 0
-    assert np.isnan(found.band_above).all()
-    assert found.share_explained_above == 0
+    assert np.isnan(found.harmonics.span(found.above)).all()
+    assert found.harmonics.share(found.above) == 0
     np.testing.assert_allclose(found.rebuilt(), found.mean, rtol=1e-9)
 
 
@@ -165,13 +167,14 @@ def test_the_papers_moves_read_as_its_tables_do(name: str, tmp_path: Path) -> No
         )
         oracle = error_reading(recording)
         (found,) = read_error(read_log(tmp_path / f"velocity-{1e3 * velocity:08.3f}.h5"))
-        above = found.band_above[1] - found.band_above[0]
+        whole, above = (np.ptp(found.harmonics.span(own)) for own in (found.kept, found.above))
         ours = {
             "min_um": 1e6 * found.lowest,
             "max_um": 1e6 * found.highest,
             "std_um": 1e6 * found.std,
             "mean_um": 1e6 * found.mean,
-            "bandwidth_hz": found.band[1] - found.band[0],
+            "bandwidth_hz": found.harmonics.span(found.kept)[1]
+            - found.harmonics.span(found.kept)[0],
             "bandwidth_above_30nm_hz": 0.0 if np.isnan(above) else above,
             "max_magnitude_um": 1e6 * found.max_magnitude,
         }
