@@ -12,7 +12,7 @@ from lmshealth.errors import BadTable
 
 
 def test_folders_are_made_and_nothing_else_is_left(tmp_path: Path) -> None:
-    """A text is written as UTF-8, twice over itself, with no half file beside it."""
+    """A text is written as UTF-8, twice over itself, with no partial file left."""
     target = tmp_path / "a" / "b" / "table.csv"
     for text in ("Δe\n", "again\n"):
         write_text(target, text)
@@ -65,7 +65,7 @@ def test_what_is_no_text_is_written_as_its_number(tmp_path: Path) -> None:
     assert (tmp_path / "x").read_bytes() == b"\\udcff"
 
 
-def test_what_cannot_be_written_is_told(tmp_path: Path) -> None:
+def test_a_failure_to_write_is_an_error(tmp_path: Path) -> None:
     """The file and the system's reason are named."""
     (tmp_path / "file").touch()
     for target in (tmp_path / "file" / "below", tmp_path / ("long" * 100)):

@@ -18,7 +18,7 @@ from lmshealth._serialize import fingerprint, pack, unpack
 
 
 class Law(msgspec.Struct, frozen=True, tag="law", tag_field="kind"):
-    """A struct that a tag tells from others."""
+    """A struct that a tag distinguishes from others."""
 
     rate: float = 1.0
 

@@ -1,4 +1,4 @@
-"""TOML: slips are told by line and key, wherever and however the key is written."""
+"""TOML: mistakes are named by line and key, wherever and however the key is written."""
 
 from __future__ import annotations
 
@@ -83,7 +83,7 @@ def test_a_key_is_found_on_its_line(keys: tuple[str | int, ...], shown: str, new
         (("name",), "name"),
     ],
 )
-def test_a_key_that_is_missing_is_told_by_its_table(
+def test_a_key_that_is_missing_is_named_by_its_table(
     keys: tuple[str | int, ...], shown: str
 ) -> None:
     """The line is that of the table which lacks it; the file itself has none."""
@@ -91,7 +91,7 @@ def test_a_key_that_is_missing_is_told_by_its_table(
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "message"),
     [
         ("size = 1", "line 1: size: unknown key; known are name, part"),
         ("part = []", "name: missing"),
@@ -128,14 +128,14 @@ def test_a_key_that_is_missing_is_told_by_its_table(
         ("name = " + 9999 * "[", "no TOML that can be read: it is nested too deeply"),
     ],
 )
-def test_what_is_wrong_is_said(text: str, said: str) -> None:
-    """The message has line, key, what was got and what is needed."""
+def test_mistakes_are_named(text: str, message: str) -> None:
+    """The message has line, key, found and needed value."""
     with pytest.raises(ValueError) as caught:
         decode(text.encode(), _Tree)
-    assert str(caught.value).startswith(said)
+    assert str(caught.value).startswith(message)
 
 
-def test_text_that_is_not_utf_8_is_told_by_its_line() -> None:
+def test_text_that_is_not_utf_8_is_named_by_its_line() -> None:
     """A file of another encoding names the byte."""
     with pytest.raises(ValueError, match="line 2: byte 0xfc is not UTF-8"):
         decode('# a\nname = "Stü"'.encode("latin-1"), _Tree)

@@ -14,13 +14,12 @@ LARGEST_RATIO = 200
 """Most bytes of decoded samples per byte of the file. Noise compresses by single digits; constant
 channels are refused anyway."""
 SMALL_ENOUGH = 256 << 20
-"""Decoded bytes that are accepted whatever the ratio; also the largest table beside logs."""
+"""Decoded bytes that are accepted whatever the ratio; also the largest table next to logs."""
 
 # Channels
 
 LARGEST_MISSING = 0.10
-"""Largest share of missing samples of a channel: one that misses more is left out, because the
-other channels would be cut at each of its gaps."""
+"""Largest share of missing samples of a channel: the others would be cut at each of its gaps."""
 ABSURD = 1e12
 """Magnitude in SI units from which a sample counts as missing: no acceleration, position or current
 reaches it, and its square is still finite."""
@@ -75,7 +74,7 @@ LONGEST_LINE = 1 << 20
 LONGEST_BLOCK = 64 << 20
 """Bytes of text without the end of a row: an open quote makes one field of all rows after it."""
 LONGEST_CELL = 50
-"""Lines of a cell of a table beside logs: an open quote again."""
+"""Lines of a cell of a table next to logs: an open quote again."""
 LONGEST_ATTRIBUTE = 1 << 16
 """Bytes of a text attribute of HDF5, which stores no larger one in an object header."""
 LARGEST_HEAP = 1 << 20

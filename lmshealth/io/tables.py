@@ -1,6 +1,6 @@
-"""Tables: those beside logs, read row by row, and those of estimates, read as text by columns.
+"""Tables: those next to logs, read row by row, and those of estimates, read as text by columns.
 
-A bad row of a table beside logs costs itself and no other; a bad cell of a table of estimates
+A bad row of a table next to logs is refused alone; a bad cell of a table of estimates
 refuses the table. Both are named by their line.
 """
 
@@ -24,7 +24,7 @@ _MOST_LISTED = 3
 
 
 class Row(NamedTuple):
-    """One row of a table beside logs.
+    """One row of a table next to logs.
 
     Attributes
     ----------

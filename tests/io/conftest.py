@@ -119,7 +119,7 @@ def make(tmp_path: Path) -> Writer:
 def peaks(root: Path) -> Callable[[Path, Path], tuple[int, int]]:
     """Measure the bytes of memory that a file takes, in blocks and by the bare library.
 
-    A short one of its kind is read before, so that what is set up once does not count.
+    A short one of its kind is read before, so that imports and caches do not count.
     """
 
     def peaks(short: Path, path: Path) -> tuple[int, int]:

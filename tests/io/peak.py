@@ -43,7 +43,7 @@ def peak() -> int:
 
 
 def main() -> None:
-    """Read a short file first: what is imported and set up once does not count."""
+    """Read a short file first: imports and caches do not count."""
     short, path = Path(sys.argv[1]), Path(sys.argv[2])
     load(short, ColumnMap())
     bare(short)

@@ -55,7 +55,7 @@ def test_what_overflows_is_missing() -> None:
 @pytest.mark.parametrize("size", [0, 1, BLOCK, BLOCK + 1, 3 * BLOCK - 7])
 @pytest.mark.parametrize("overlap", [0, 2])
 def test_blocks_are_all_of_it(size: int, overlap: int) -> None:
-    """Blocks without their overlap are the samples, each where it says it is; none is tiny."""
+    """Blocks without their overlap are the samples, each at its index; none is tiny."""
     values = np.arange(float(size))
     parts = []
     for at, block in blocks(values, overlap=overlap):
@@ -118,7 +118,7 @@ class Full:
         raise OSError(errno.ENOSPC, "No space left on device")
 
 
-def test_a_full_disk_is_said_with_the_next_step(monkeypatch):
+def test_a_full_disk_is_refused_with_the_next_step(monkeypatch):
     """The column's bytes, the folder and TMPDIR are named."""
     monkeypatch.setattr(tempfile, "TemporaryFile", lambda **_: Full())
     with pytest.raises(Unusable, match=r"96\d+ bytes .*No space left.*TMPDIR") as caught:

@@ -71,7 +71,7 @@ def test_missing_stretches():
 
 
 def test_a_stretch_across_blocks_is_one():
-    """What is missing at the end of a block and at the beginning of the next is one stretch."""
+    """Samples missing at the end of a block and at the beginning of the next are one stretch."""
     values = np.ones(3 * BLOCK)
     values[BLOCK - 2 : BLOCK + 3] = values[-1] = values[0] = np.nan
     stretches, note = missing_stretches(values)

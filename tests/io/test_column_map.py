@@ -29,7 +29,7 @@ variable = "log"
 
 
 def test_map_reads_an_export(tmp_path):
-    """A vendor's export is read by its map; columns that only look like signals are left."""
+    """A vendor's export is read by its map; columns that only resemble signals are ignored."""
     (tmp_path / "map.toml").write_text(GOOD)
     rows = "".join(f"{i % 7};{(i % 5) / 10};x\n" for i in range(100))
     (tmp_path / "log.csv").write_text("Vendor 3.1\nPE(0);Ch 1;current_limit\n" + rows)
@@ -41,7 +41,7 @@ def test_map_reads_an_export(tmp_path):
 
 
 def test_map_keeps_columns_of_the_contract(make, tmp_path):
-    """Beside the named columns, those that keep the contract are read too; the map wins."""
+    """Columns that keep the contract are read like the named ones; the map overrides them."""
     (tmp_path / "map.toml").write_text('[columns]\ndelta_e_um = "PE"\n')
     path = make(columns={"PE": np.sin(np.arange(400.0))})
     log = read_log(path, columns=load_columns(tmp_path / "map.toml"))
@@ -50,7 +50,7 @@ def test_map_keeps_columns_of_the_contract(make, tmp_path):
 
 
 def test_absent_source(make, tmp_path):
-    """A column that the map names and the file lacks is named, with what is there."""
+    """A column that the map names and the file lacks is named, with the columns that are there."""
     (tmp_path / "map.toml").write_text('[columns]\ndelta_e_um = "PE"\n')
     with pytest.raises(BadLog, match="needs PE; there: time_s, delta_e_um") as caught:
         read_log(make(), columns=load_columns(tmp_path / "map.toml"))
@@ -89,7 +89,7 @@ def test_absent_map(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "message"),
     [
         (
             "[columns]\nacc_x_g = 'a'\n\n[csv]\ndelimeter = ';'",
@@ -101,10 +101,10 @@ def test_absent_map(tmp_path):
         ("[csv]\nheader = false\n[", "line 3: no TOML"),
     ],
 )
-def test_a_slip_in_a_map_is_told_by_line_and_key(tmp_path, text, said):
+def test_a_mistake_in_a_map_has_line_and_key(tmp_path, text, message):
     """As in a stage description, and never in the words of a library."""
     (tmp_path / "map.toml").write_text(text)
-    with pytest.raises(BadTable, match=said) as error:
+    with pytest.raises(BadTable, match=message) as error:
         load_columns(tmp_path / "map.toml")
     assert "$" not in str(error.value)
 

@@ -1,4 +1,4 @@
-"""Long logs: what is kept on disk gives the same log and the same answers as what is in memory."""
+"""Long logs: samples on disk give the same log and the same results as samples in memory."""
 
 import h5py
 import numpy as np

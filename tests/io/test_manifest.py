@@ -12,7 +12,7 @@ HEADER = "file,stage,travel_km,baseline\n"
 
 
 def test_find_logs(tmp_path):
-    """Logs are found by suffix, sorted; tables and texts beside them and hidden files are none."""
+    """Logs are found by suffix, sorted; tables, texts and hidden files are none."""
     (tmp_path / "sub").mkdir()
     (tmp_path / ".git").mkdir()
     names = ["b.csv", "a.H5", "sub/c.csv.gz", "sub/manifest.csv", "maintenance.csv", "truth.csv"]
@@ -50,7 +50,7 @@ def test_links(tmp_path):
 
 
 def test_manifest_overrides(make, tmp_path):
-    """A row overrides what the file says; a manifest nearer to the log has the last word."""
+    """A row overrides the file; a manifest nearer to the log overrides the others."""
     (tmp_path / "sub").mkdir()
     path = make("sub/log.csv")
     (tmp_path / "manifest.csv").write_text(HEADER + "sub/log.csv,up,1,true\n")
@@ -138,14 +138,14 @@ def test_names_are_fit_to_be_printed_and_differ(tmp_path):
     names = [b"a\x1b[31m.csv", b"a\\x1b[31m.csv", b"\xff.csv", b"\xfe.csv", "\u202eb.csv".encode()]
     for name in names:
         open(os.path.join(os.fsencode(tmp_path), name), "wb").close()
-    told = [name_of(path, tmp_path) for path in find_logs(tmp_path).logs]
-    assert len(set(told)) == len(names)
-    assert all(name.isprintable() for name in told)
-    assert {r"a\x1b[31m.csv", r"a\\x1b[31m.csv", r"\udcff.csv", r"\u202eb.csv"} <= set(told)
+    shown = [name_of(path, tmp_path) for path in find_logs(tmp_path).logs]
+    assert len(set(shown)) == len(names)
+    assert all(name.isprintable() for name in shown)
+    assert {r"a\x1b[31m.csv", r"a\\x1b[31m.csv", r"\udcff.csv", r"\u202eb.csv"} <= set(shown)
 
 
 def test_no_folder(tmp_path):
-    """What is no folder is an error."""
+    """Anything but a folder is an error."""
     for verb in (find_logs, read_manifest):
         with pytest.raises(BadTable, match="no folder"):
             verb(tmp_path / "absent")

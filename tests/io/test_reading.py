@@ -20,7 +20,7 @@ ALL = ["log.csv", "log.csv.gz", "log.parquet", "log.h5", "log.hdf5", "log.tdms",
 
 
 def refused(path, reason, *words, **options):
-    """Expect a refusal and look for words in its detail."""
+    """Expect a refusal with words in its detail."""
     with pytest.raises(BadLog) as caught:
         read_log(path, **options)
     assert caught.value.reason == reason, caught.value
@@ -85,7 +85,7 @@ def test_truncated(make, file, share):
     ],
 )
 def test_wrong_extension(make, content, name, found):
-    """Content of another format than the name says is named."""
+    """Content of another format than the suffix promises is named."""
     path = make(content)
     refused(path.rename(path.with_name(name)), "format", found)
 
@@ -148,7 +148,7 @@ def test_parquet_without_pyarrow(make, monkeypatch):
 
 
 def test_require_identity(make):
-    """A log without identity can be looked at, and is refused where a life is followed."""
+    """A log without identity can be read, and is refused where a life is tracked."""
     require_identity(read_log(make()))
     log = read_log(make(meta={"stage": None, "travel_km": None}))
     with pytest.raises(BadLog, match="stage, travel_km not given"):
@@ -165,7 +165,7 @@ def test_overrides(make):
 def test_import_is_light():
     """Importing the readers brings none of the libraries that read the formats."""
     folder = str(Path(readers.__file__).parents[1])
-    # A bare stand-in for the package, whose own imports are not what is asked about here.
+    # A bare stand-in for the package, whose own imports do not count here.
     code = (
         "import sys, types; package = types.ModuleType('lmshealth'); "
         f"package.__path__ = [{folder!r}]; sys.modules['lmshealth'] = package; "
@@ -184,13 +184,13 @@ def fails(path, reason, words):
 
 
 def test_missing_signal(make):
-    """A log without Δe and acceleration says what is there and what is needed."""
+    """A log without Δe and acceleration is refused with what there is and what it needs."""
     path = make(columns={"delta_e_um": None, "acc_feed_m_s2": None, "current_a": np.arange(400.0)})
     fails(path, "columns", "no signal: needed delta_e_um.*there: time_s")
 
 
 def test_missing_rate(make):
-    """A log without time and sample rate says that one of them is needed."""
+    """A log without time and sample rate needs one of them."""
     fails(make(columns={"time_s": None}, meta={"sample_rate_hz": None}), "time", "needed one")
     assert read_log(make(columns={"time_s": None})).sample_rate == 2000.0
 
@@ -220,7 +220,7 @@ def test_lengths(make):
     ],
 )
 def test_bad_channel_is_refused_alone(make, values, reason):
-    """A bad channel is refused with its reason, the others go on over the whole record."""
+    """A bad channel is refused with its reason, the others are used over the whole record."""
     log = read_log(make(columns={"acc_bad_m_s2": values}))
     assert [(r.channel, r.reason) for r in log.refused] == [("acc_bad", reason)]
     assert {c.name for c in log.channels} == {"delta_e", "acc_feed"} and log.pieces == ((0, 400),)

@@ -64,7 +64,7 @@ def mapped(path, folder):
 
 
 def check(path, expected, columns=None):
-    """Compare what is read, or why not, with what is expected."""
+    """Compare the log, or the reason of its refusal, with the expected one."""
     if isinstance(expected[0], str):
         with pytest.raises(BadLog) as caught:
             read_log(path, columns=columns)

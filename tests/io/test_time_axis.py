@@ -35,7 +35,7 @@ def test_agreement():
 
 
 def test_gaps_are_counted_and_split():
-    """Dropped samples split the record in indices of what is stored."""
+    """Dropped samples split the record in indices of stored samples."""
     time = np.delete(np.arange(1000) / 1000, [100, 101, 500])
     axis = time_axis(time, 1000.0)
     assert "2 gaps with 3 dropped samples" in axis.note

@@ -95,7 +95,7 @@ def check_memory(what: str, needed: float, allowed: float) -> None:
 
 
 def wanted(names: Iterable[str], columns: ColumnMap) -> list[str]:
-    """Choose the columns of a file that the contract or the column map ask for.
+    """Choose the columns of a file that the contract or the column map names.
 
     Raises
     ------

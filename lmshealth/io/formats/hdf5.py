@@ -2,14 +2,12 @@
 
 Nothing outside the file is opened: links, external storage and virtual datasets are refused. The
 HDF5 library loops without end on a damaged heap of strings (HDFGroup/hdf5 issue 1707; still so in
-2.0.0), allocates as many bytes as a damaged attribute claims, and crashes Python at its end after a
-virtual dataset that cannot be opened. `Guarded` checks what the library reads before it gets it.
+2.0.0), and crashes Python at its end after a virtual dataset that cannot be opened. `Guarded`
+checks what the library reads before it gets it.
 """
 
 from __future__ import annotations
 
-import re
-import struct
 from io import FileIO
 from pathlib import Path
 from typing import Any, Literal
@@ -27,16 +25,12 @@ _MAGIC = b"\x89HDF\r\n\x1a\n"
 # Version 1 of a heap of strings, and the bytes of its header and of each object's.
 _HEAP = b"GCOL\1\0\0\0"
 _HEADER = 16
-# Layout of a virtual dataset that lists no files; one that lists some does it in a heap.
+# Layout of a virtual dataset without files; the files of others are listed in a heap.
 _NO_FILES = b"\x04\x03" + 8 * b"\xff" + bytes(4)
-# Attribute messages: version, bytes before the name, and what the sizes of name, type and space
-# are rounded up to. The sizes are at byte 2; a text begins with its length (4), heap and object.
-_LONGEST_MESSAGE = 512
-_MESSAGES = ((1, 8, 8), (2, 8, 1), (3, 9, 1))
 
 
 class Guarded(FileIO):
-    """A file for h5py's driver of Python files that checks heaps and text attributes.
+    """A file for h5py's driver of Python files that checks heaps of strings.
 
     Each heap is checked when the library reads it: to search the file for heaps takes half as long
     as to read it.
@@ -59,7 +53,6 @@ class Guarded(FileIO):
         self.size = path.stat().st_size
         self.now: Literal["columns", "texts", "samples"] = "columns"
         self.trouble: Unusable | None = None
-        self._read: list[tuple[int, int]] = []
 
     def readinto(self, buffer: Any) -> int:
         """Read for the library; zeros in the place of damaged bytes."""
@@ -68,36 +61,10 @@ class Guarded(FileIO):
         start = self.tell()
         n_read = super().readinto(buffer)
         content = bytes(buffer)
-        self._read.append((start, start + n_read))
         self.trouble = self.trouble or self._trouble(start, content)
         if self.trouble is not None:
             buffer[:] = bytes(len(buffer))
         return n_read
-
-    def claimed(self, attribute: str) -> int:
-        """Return the bytes that the library allocates when it reads a text attribute."""
-        most = 0
-        name = attribute.encode() + b"\0"
-        for start, stop in self._read:
-            # A message may continue where another read began.
-            content = self._bytes(start, stop + _LONGEST_MESSAGE)
-            for found in re.finditer(re.escape(name), content):
-                at = start + found.start()
-                most = max(most, *(self._length(at, len(name), *kind) for kind in _MESSAGES))
-        return most
-
-    def _length(self, at: int, size: int, version: int, header: int, unit: int) -> int:
-        """Read the length of a text from the message around its name; 0 if it is none."""
-        message = self._bytes(at - header, at + _LONGEST_MESSAGE)
-        sizes = struct.unpack_from("<3H", message, 2)
-        if message[0] != version or sizes[0] != size:
-            return 0
-        data = header + sum(-(-size // unit) * unit for size in sizes)
-        return int.from_bytes(message[data : data + 4], "little")
-
-    def _bytes(self, start: int, stop: int) -> bytes:
-        self.seek(max(start, 0))
-        return self.read(stop - max(start, 0))
 
     def _trouble(self, start: int, content: bytes) -> Unusable | None:
         is_heap = content.startswith(_HEAP)
@@ -107,7 +74,8 @@ class Guarded(FileIO):
 
     def _damage(self, start: int) -> Unusable | None:
         """Follow the objects of a heap as the library does."""
-        heap = self._bytes(start, start + constants.LARGEST_HEAP)
+        self.seek(start)
+        heap = self.read(constants.LARGEST_HEAP)
         size = int.from_bytes(heap[8:_HEADER], "little")
         if size > len(heap):
             return Unusable("corrupt", f"heap of strings of {size} bytes at byte {start}")
@@ -142,7 +110,7 @@ def _content(file: Any, stream: Guarded, columns: ColumnMap) -> Content:
     names = list(file)
     chosen = {name: _dataset(file, name) for name in wanted(names, columns)}
     stream.now = "texts"
-    metadata = {key: _attribute(file, stream, key) for key in KEYS if key in file.attrs}
+    metadata = {key: _attribute(file, key) for key in KEYS if key in file.attrs}
     check_size(8 * sum(dataset.size for dataset in chosen.values()), stream.size)
     stream.now = "samples"
     with spools(chosen) as taken:
@@ -184,7 +152,7 @@ def _read(dataset: Any, spool: Spool) -> None:
         spool.append(dataset[start : start + step])
 
 
-def _attribute(file: Any, stream: Guarded, key: str) -> str:
+def _attribute(file: Any, key: str) -> str:
     """Read an attribute of any plain type as text."""
     import h5py
 
@@ -195,10 +163,6 @@ def _attribute(file: Any, stream: Guarded, key: str) -> str:
     is_plain = isinstance(kind, plain) and kind.get_size() <= constants.LONGEST_ATTRIBUTE
     if not is_plain or attribute.shape not in ((), (1,)):
         raise Unusable("metadata", f"{key} is no single text or number; write it as text")
-    if isinstance(kind, h5py.h5t.TypeStringID) and kind.is_variable_str():
-        claimed = stream.claimed(key)
-        if claimed > constants.LONGEST_ATTRIBUTE:
-            raise Unusable("corrupt", f"{key} claims a text of {claimed} bytes")
     value = np.asarray(file.attrs[key]).reshape(-1)[0]
     if isinstance(value, bytes):
         return value.decode("utf-8", "replace")

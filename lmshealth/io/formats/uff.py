@@ -193,7 +193,9 @@ def _headers(sets: Sequence[_DataSet]) -> list[Header]:
         path.write_bytes(b"".join(found.header + _TAG + b"\n" for found in sets))
         file = pyuff.UFF(str(path))
         if file.get_n_sets() != len(sets):
-            raise Unusable("corrupt", "a header looks like the end of a data set; export it again")
+            raise Unusable(
+                "corrupt", "a header contains the end tag of a data set; export it again"
+            )
         return [_header(file, k, found.place) for k, found in enumerate(sets)]
 
 
@@ -219,7 +221,7 @@ def _names(headers: Sequence[Header], sets: Sequence[_DataSet]) -> list[str]:
 
 
 def _describe(header: Header, name: str) -> Described:
-    """Describe a data set; what is no time record of real numbers has no unit of a signal."""
+    """Describe a data set; all but time records of real numbers have no unit of a signal."""
     unit = header["ordinate_axis_units_lab"].strip()
     unit = "" if unit == "NONE" else unit
     if not _is_time_record(header):

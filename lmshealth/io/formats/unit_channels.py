@@ -22,9 +22,9 @@ class Described:
     name : str
         As in the file and in a column map.
     unit : str
-        As in the file; empty where it gives none.
+        As in the file; empty where there is none.
     rate : float or None
-        Sample rate in Hz; None where the channel gives none.
+        Sample rate in Hz; None where there is none.
     acceleration : bool
         Whether the file calls it an acceleration, whatever its unit.
     """
@@ -44,7 +44,7 @@ class Chosen:
     columns : dict of str to int
         Name as a column of the log to the index among the channels of the file.
     metadata : dict of str to str
-        Their sample rate, where they give one.
+        Their sample rate, where there is one.
     refused : tuple of Refusal
         Wanted channels of another sample rate.
     """
@@ -55,7 +55,7 @@ class Chosen:
 
 
 def choose(channels: Sequence[Described], columns: ColumnMap) -> Chosen:
-    """Choose the channels of one sample rate that the contract or the column map ask for.
+    """Choose the channels of one sample rate that the contract or the column map names.
 
     Without ``[columns]`` every channel whose unit is an acceleration is read as ``acc_<name>``;
     with it, the named ones and those that keep the contract.

@@ -41,7 +41,7 @@ def test_byte_order_mark_and_windows_lines():
 
 
 def test_layout():
-    """Skipped lines, delimiter and absent header lines are as the map says."""
+    """Skipped lines, delimiter and absent header lines are as in the map."""
     raw = parse("vendor \n\ndelta_e_um;b\n1;2\n", skip_rows=2, delimiter=";")
     assert raw.columns["delta_e_um"].tolist() == [1.0]
     raw = parse("1,2\n3,4\n", header=["delta_e_um", "x"])
@@ -69,7 +69,7 @@ def test_layout():
     ],
 )
 def test_damage(text, reason, word):
-    """Each kind of damage has its reason and says where it is."""
+    """Each kind of damage has its reason and its place."""
     with pytest.raises(Unusable) as caught:
         parse(text)
     assert caught.value.reason == reason and word in caught.value.detail
@@ -106,14 +106,14 @@ def small_blocks(monkeypatch):
 @pytest.mark.parametrize("place", [0, 9, 10, 11, 20, 34])
 @pytest.mark.parametrize("row", ["7,8,9", "7,8,9,10", "7,8,x", "x,8,9"])
 def test_long_row_anywhere(small_blocks, monkeypatch, version, place, row):
-    """A row with too many fields is found at every place of a block, and its number is said."""
+    """A row with too many fields is found at every place of a block, and named by its number."""
     monkeypatch.setattr(pd, "__version__", version)
     rows = ["1,2"] * 35
     rows[place] = row
     with pytest.raises(Unusable) as caught:
         parse("delta_e_um,b\n" + "\n".join(rows) + "\n")
     assert caught.value.reason == "corrupt"
-    # What is wrong with the very first row is a warning of pandas, without a number.
+    # A fault of the very first row is a warning of pandas, without a number.
     assert place == 0 or f"row {place + 1} has" in caught.value.detail
 
 
@@ -187,7 +187,7 @@ MAP = "[columns]\ndelta_e_um = 'PE(0)'\nacc_x_g = 'AI 3'\n[csv]\n"
 
 
 @pytest.mark.parametrize(
-    ("before", "layout", "said"),
+    ("before", "layout", "hint"),
     [
         ("", "", 'line 1 names them: set delimiter = ";" under [csv] of the column map'),
         ("Rate 20 kHz\n\n", "delimiter = ';'", "line 3 names them: set skip_rows = 1 under"),
@@ -197,7 +197,7 @@ MAP = "[columns]\ndelta_e_um = 'PE(0)'\nacc_x_g = 'AI 3'\n[csv]\n"
         ("", "delimiter = ';'\nskip_rows = 1", "line 1 names them: set skip_rows = 0 under [csv]"),
     ],
 )
-def test_a_layout_that_does_not_fit_is_told_by_its_key(tmp_path, before, layout, said):
+def test_a_layout_that_does_not_fit_is_named_by_its_key(tmp_path, before, layout, hint):
     """The line that has the wanted names, and what to set; with that the file is read."""
     (tmp_path / "log.csv").write_text(before + TABLE)
     (tmp_path / "map.toml").write_text(MAP + layout)
@@ -205,24 +205,24 @@ def test_a_layout_that_does_not_fit_is_told_by_its_key(tmp_path, before, layout,
         read_log(tmp_path / "log.csv", columns=load_columns(tmp_path / "map.toml"))
     assert refused.value.reason == "columns"
     assert "the column map needs AI 3, PE(0); there: " in refused.value.detail
-    assert said in refused.value.detail
+    assert hint in refused.value.detail
 
 
 def test_names_that_no_line_has_are_asked_for(tmp_path):
     """Where no layout finds the names the keys are named; where some are found no key is blamed."""
     (tmp_path / "log.csv").write_text(TABLE)
-    for names, said in ((("PE(1)", "AI 5"), True), (("PE(0)", "AI 5"), False)):
+    for names, asked in ((("PE(1)", "AI 5"), True), (("PE(0)", "AI 5"), False)):
         columns = ColumnMap(
             columns=dict(zip(("delta_e_um", "acc_x_g"), names, strict=True)),
             csv=CsvLayout(delimiter=";"),
         )
         with pytest.raises(BadLog, match="needs AI 5") as refused:
             read_log(tmp_path / "log.csv", columns=columns)
-        assert ("do skip_rows and delimiter" in refused.value.detail) is said
+        assert ("do skip_rows and delimiter" in refused.value.detail) is asked
 
 
-def test_a_contract_file_behind_a_preamble_is_told_where_it_begins(tmp_path):
-    """Without a column map the line that names a signal is told, and nothing where none does."""
+def test_the_beginning_of_a_contract_file_after_a_preamble_is_named(tmp_path):
+    """Without a column map the line that names a signal is named, if there is one."""
     (tmp_path / "log.csv").write_text("Rate 20 kHz\ntime_s,delta_e_um\n0,1\n1,2\n")
     with pytest.raises(BadLog, match="line 2 names them: set skip_rows = 1 under") as refused:
         read_log(tmp_path / "log.csv")

@@ -1,4 +1,4 @@
-"""MAT: names as MATLAB has them; what is no signal is refused, whatever size it claims."""
+"""MAT: names as MATLAB has them; all but signals are refused, whatever size they claim."""
 
 import struct
 import zlib
@@ -26,7 +26,7 @@ def write(path, variables, packed=True):
 
 
 def refused(path, reason, *words, **options):
-    """Expect a refusal and look for words in its detail."""
+    """Expect a refusal with words in its detail."""
     with pytest.raises(BadLog) as caught:
         read_log(path, **options)
     assert caught.value.reason == reason, caught.value
@@ -82,7 +82,7 @@ def test_matrix_as_variable(tmp_path):
 
 
 def test_what_is_missing_is_named(tmp_path):
-    """A variable or a field that the map needs is named with what is there."""
+    """A variable or a field that the map needs is named with those that are there."""
     path = write(tmp_path / "log.mat", {"log": {"a": NOISE}, "b": 1.0})
     columns = ColumnMap(mat=MatLayout("exp1"))
     refused(path, "columns", "exp1", "log, b", columns=columns)
@@ -188,7 +188,7 @@ def test_damaged_checksum(tmp_path):
 
 
 def test_more_than_claimed(tmp_path):
-    """A packed variable that goes on behind its end is damaged."""
+    """A packed variable that continues after its end is damaged."""
     good = array(6, (2, 1), content=element(9, bytes(16)))
     refused(mat_file(tmp_path / "log.mat", pack(good + bytes(8))), "corrupt", "damaged")
     refused(mat_file(tmp_path / "log.mat", pack(good[:-8])), "corrupt", "cut off")
@@ -202,7 +202,7 @@ def test_version_7_3(tmp_path):
 
 
 def test_same_variable_twice(tmp_path):
-    """A variable that stands in the file twice is ambiguous."""
+    """Two variables of one name are ambiguous."""
     path = write(tmp_path / "log.mat", {"delta_e_um": NOISE, **RATE})
     data = path.read_bytes()
     path.write_bytes(data + data[128:])
@@ -239,7 +239,7 @@ def test_stored_types(tmp_path, stored, order, packed):
 
 @pytest.mark.parametrize("packed", [False, True])
 def test_columns_of_a_matrix(tmp_path, packed):
-    """The wanted columns of a matrix are read, whatever stands between them."""
+    """The wanted columns of a matrix are read, whatever is between them."""
     table = np.random.default_rng(0).normal(size=(50, 5))
     scipy.io.savemat(tmp_path / "log.mat", {"m": table, "n": table}, do_compression=packed)
     names = {"delta_e_um": "m(:,2)", "acc_x_g": "m(:,5)", "acc_y_g": "n(:,1)"}
@@ -266,7 +266,7 @@ def test_entries_of_a_struct(tmp_path):
     [(1, "latin-1"), (2, "latin-1"), (4, "utf-16"), (16, "utf-8"), (17, "utf-16"), (18, "utf-32")],
 )
 def test_text(tmp_path, kind, encoding, order):
-    """Text is read in its encoding, and the shortest stands inside a tag."""
+    """Text is read in its encoding, and the shortest is inside a tag."""
     end = {"<": "-le", ">": "-be"}[order] if encoding in ("utf-16", "utf-32") else ""
     written = element(kind, "Bühne ä".encode(encoding + end), order)
     path = mat_file(
@@ -294,7 +294,7 @@ def test_numbers_as_metadata(tmp_path):
 
 @pytest.mark.parametrize("sizes", [(2, 99), (98, 1), (99, 1, 2)])
 def test_other_numbers_of_entries(tmp_path, sizes):
-    """An array whose content is not as long as its shape says is refused."""
+    """An array whose content has another length than its shape is refused."""
     with pytest.raises(Unusable, match="cut off") as caught:
         load(mat_file(tmp_path / "log.mat", vector(VALUES, sizes=sizes)), ColumnMap())
     assert caught.value.reason == "corrupt"

@@ -93,7 +93,7 @@ def whole(path, values):
 
 @pytest.mark.parametrize("name", ["log.uff", "log.mat", "log.tdms"])
 def test_long_columns_go_to_disk(tmp_path, monkeypatch, name):
-    """What is decoded as a whole does not stay in memory when it is long."""
+    """Long columns that are decoded as a whole do not stay in memory."""
     values = np.random.default_rng(0).normal(size=2500)
     path = whole(tmp_path / name, values)
     np.testing.assert_array_equal(load(path, ColumnMap()).columns["delta_e_um"], values)

@@ -33,7 +33,7 @@ def write(path, *channels, root=None, n_segments=1):
 
 
 def refused(path, reason, *words, **options):
-    """Expect a refusal and look for words in its detail."""
+    """Expect a refusal with words in its detail."""
     with pytest.raises(BadLog) as caught:
         read_log(path, **options)
     assert caught.value.reason == reason, caught.value
@@ -84,7 +84,7 @@ def test_mixed_rates(tmp_path):
 
 
 def test_groups(tmp_path):
-    """Equal names in two groups are told apart by the group, also in a map."""
+    """Equal names in two groups are distinguished by the group, also in a map."""
     unit = {"unit_string": "g", **RATE}
     path = write(tmp_path / "log.tdms", ("one", "x", NOISE, unit), ("two", "x", NOISE**2, unit))
     assert {c.name for c in read_log(path).channels} == {"acc_one_x", "acc_two_x"}
@@ -113,18 +113,18 @@ def test_properties_are_metadata(tmp_path):
 
 
 def test_velocity_is_metadata(tmp_path):
-    """The velocity at which a log was recorded is read in m/s; what is no number is refused."""
+    """The velocity at which a log was recorded is read in m/s; anything but a number is refused."""
     channel = ("x", NOISE, {"unit_string": "g", **RATE})
-    for said in (-100.0, "-100", 100):
-        path = write(tmp_path / "log.tdms", channel, root={"velocity_mm_s": said})
-        assert read_log(path).metadata.velocity == pytest.approx(0.001 * float(said), rel=1e-15)
+    for given in (-100.0, "-100", 100):
+        path = write(tmp_path / "log.tdms", channel, root={"velocity_mm_s": given})
+        assert read_log(path).metadata.velocity == pytest.approx(0.001 * float(given), rel=1e-15)
     assert read_log(write(tmp_path / "log.tdms", channel)).metadata.velocity is None
     path = write(tmp_path / "log.tdms", channel, root={"velocity_mm_s": "fast"})
     refused(path, "metadata", "velocity_mm_s", "'fast'")
 
 
 def test_scaled_samples(tmp_path):
-    """Raw counts are scaled as the properties say."""
+    """Raw counts are scaled by the properties."""
     scale = {
         "NI_Number_Of_Scales": 1,
         "NI_Scale[0]_Scale_Type": "Linear",
@@ -159,7 +159,7 @@ def test_text_channel(tmp_path):
 
 
 def test_truncated_anywhere(tmp_path):
-    """A file cut anywhere but between segments is refused; npTDMS would read what is left."""
+    """A file cut anywhere but between segments is refused; npTDMS would read the rest."""
     channel = ("x", NOISE, {"unit_string": "g", **RATE})
     path = write(tmp_path / "log.tdms", channel, n_segments=3)
     data = path.read_bytes()
@@ -177,8 +177,8 @@ def test_unfinished_segment(tmp_path):
     refused(path, "corrupt", "never finished")
 
 
-def test_index_beside_the_file_is_not_believed(tmp_path):
-    """An index file beside the log says nothing about it."""
+def test_an_index_file_is_ignored(tmp_path):
+    """An index file in the folder of the log is ignored."""
     channel = ("x", NOISE, {"unit_string": "g", **RATE})
     path = write(tmp_path / "log.tdms", channel)
     path.with_name("log.tdms_index").write_bytes(b"TDSh" + bytes(100))
@@ -241,7 +241,7 @@ def test_shorter_last_chunk(tmp_path):
 
 
 def test_channels_that_come_and_go(tmp_path):
-    """Text, channels of some segments only, and scaled counts stand between the samples."""
+    """Text, channels of some segments only, and scaled counts are between the samples."""
     scale = {
         "NI_Number_Of_Scales": 1,
         "NI_Scale[0]_Scale_Type": "Polynomial",
@@ -256,13 +256,13 @@ def test_channels_that_come_and_go(tmp_path):
     with TdmsWriter(str(path)) as writer:
         writer.write_segment(
             [
-                ChannelObject("log", "said", np.array(["a", "bcd"] * 20)),
+                ChannelObject("log", "remark", np.array(["a", "bcd"] * 20)),
                 ChannelObject("log", "delta_e_um", SHORT),
                 ChannelObject("log", "acc_x_g", counts, scale),
             ]
         )
         writer.write_segment([ChannelObject("log", "acc_x_g", counts[:7])])
-        writer.write_segment([ChannelObject("log", "said", np.array(["only text"]))])
+        writer.write_segment([ChannelObject("log", "remark", np.array(["only text"]))])
         writer.write_segment([ChannelObject("log", "delta_e_um", SHORT[:9])])
     columns = agree(path)
     assert {name: values.size for name, values in columns.items()} == {

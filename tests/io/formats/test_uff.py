@@ -31,7 +31,7 @@ def write(path, *, n=2, **entries):
 
 
 def refused(path, reason, *words, **options):
-    """Expect a refusal and look for words in its detail."""
+    """Expect a refusal with words in its detail."""
     with pytest.raises(BadLog) as caught:
         read_log(path, **options)
     assert caught.value.reason == reason, caught.value
@@ -60,7 +60,7 @@ def test_ascii_and_binary_agree(tmp_path):
 
 
 def test_names(tmp_path):
-    """Records are called by the first entry that tells them apart, else by their number."""
+    """Records are called by the first entry that distinguishes them, else by their number."""
     path = write(tmp_path / "a.uff", id1="all the same")
     assert [c.name for c in read_log(path).channels] == ["acc_set_1", "acc_set_2"]
     path = write(tmp_path / "b.uff", n=1, id1="NONE", rsp_ent_name="head")
@@ -221,21 +221,21 @@ def test_binary_is_read_as_pyuff_reads_it(tmp_path, ordinate, dtype, spacing):
 
 
 def test_binary_numbers_that_look_like_a_tag(tmp_path):
-    """Samples whose bytes are the end of a data set are samples, as the header says."""
+    """Samples whose bytes are the end of a data set are samples: the header counts them."""
     body = b"\n    -1\n" * 20 + VALUES[:10].tobytes()
     columns = loaded(tmp_path / "log.uff", uff_set(body, 30, binary=str(len(body))))
     np.testing.assert_array_equal(columns["delta_e_um"], np.frombuffer(body))
 
 
 def test_big_endian(tmp_path):
-    """The header says the order of bytes."""
+    """The header defines the order of bytes."""
     made = uff_set(VALUES.astype(">f8").tobytes(), 101, binary="808")
     columns = loaded(tmp_path / "log.uff", made.replace(b"b     1", b"b     2"))
     np.testing.assert_array_equal(columns["delta_e_um"], VALUES)
 
 
 def test_numbers_without_blanks_between(tmp_path):
-    """Numbers that fill their columns are told apart by the columns."""
+    """Numbers that fill their columns are separated by the columns."""
     body = b"-1.00000e-100-2.00000e-100\n 3.00000e+00\n"
     columns = loaded(tmp_path / "log.uff", uff_set(body, 3, ordinate=2))
     assert columns["delta_e_um"].tolist() == [-1e-100, -2e-100, 3.0]
@@ -249,7 +249,7 @@ def test_other_data_sets_are_passed_over(tmp_path):
 
 
 def test_what_is_no_data_set(tmp_path):
-    """Between data sets and behind them nothing stands but blank lines."""
+    """Between data sets and behind them there are only blank lines."""
     good = uff_set(lines(VALUES, 4), 101)
     path = tmp_path / "log.uff"
     assert loaded(path, good, b"\r\n \n\x1a")
@@ -262,7 +262,7 @@ def test_what_is_no_data_set(tmp_path):
     corrupt(path, "set 1 does not keep", good.replace(b"       101", b"      10.1"))
     corrupt(path, "set 1 does not keep", good.replace(b"e-", b"q-"))
     trap = good.replace(b"NONE\n01", b"x    -1\n01")
-    corrupt(path, "looks like the end", trap, trap)
+    corrupt(path, "contains the end tag", trap, trap)
 
 
 def test_spacing_that_does_not_exist(tmp_path):
@@ -272,7 +272,7 @@ def test_spacing_that_does_not_exist(tmp_path):
 
 @pytest.mark.parametrize("n", [-5, 0, 100, 102, 999_999_999])
 def test_other_numbers_of_samples(tmp_path, n):
-    """A record that has more or fewer samples than it says is refused, however many it says."""
+    """A record with another number of samples than its header has is refused."""
     corrupt(tmp_path / "log.uff", f"101 of {n} samples", uff_set(lines(VALUES, 4), n))
     body = VALUES.tobytes()
     corrupt(tmp_path / "log.uff", f"101 of {n} samples", uff_set(body, n, binary="808"))
