@@ -193,9 +193,7 @@ def _headers(sets: Sequence[_DataSet]) -> list[Header]:
         path.write_bytes(b"".join(found.header + _TAG + b"\n" for found in sets))
         file = pyuff.UFF(str(path))
         if file.get_n_sets() != len(sets):
-            raise Unusable(
-                "corrupt", "a header contains the end tag of a data set; export it again"
-            )
+            raise Unusable("corrupt", "a header contains the tag of a data set; export it again")
         return [_header(file, k, found.place) for k, found in enumerate(sets)]
 
 

@@ -67,7 +67,7 @@ def test_samples_with_the_bytes_of_a_heap(log):
 @pytest.mark.parametrize("lists_files", [False, True])
 @pytest.mark.parametrize("library", LIBRARIES)
 def test_virtual_columns_end_no_process(tmp_path, library, lists_files):
-    """A virtual column is refused, also one that cannot be opened, and Python ends without a crash."""
+    """A virtual column is refused, also one that cannot be opened, without a crash at the end."""
     path = tmp_path / "log.h5"
     layout = h5py.VirtualLayout((10,), "f8")
     if lists_files:

@@ -262,7 +262,7 @@ def test_what_is_no_data_set(tmp_path):
     corrupt(path, "set 1 does not keep", good.replace(b"       101", b"      10.1"))
     corrupt(path, "set 1 does not keep", good.replace(b"e-", b"q-"))
     trap = good.replace(b"NONE\n01", b"x    -1\n01")
-    corrupt(path, "contains the end tag", trap, trap)
+    corrupt(path, "contains the tag", trap, trap)
 
 
 def test_spacing_that_does_not_exist(tmp_path):
