@@ -1,4 +1,4 @@
-"""Telling: tables of parts, in the order of the machines, whole or not at all."""
+"""Outputs: tables of parts, in the order of the machines, complete or not at all."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def test_rows_stand_in_the_order_of_the_machines(tmp_path: Path) -> None:
 
 
 def test_a_machine_that_never_comes_keeps_no_other_from_its_place(tmp_path: Path) -> None:
-    """Rows of machines after one that failed are written all the same."""
+    """Rows of machines after one that failed are written nevertheless."""
     with Tables(tmp_path, ["A", "B", "C"]) as tables:
         for machine in ("C", "B"):
             tables.add(machine, {"effects": effect(machine)})
@@ -79,7 +79,7 @@ def test_what_belongs_to_no_machine_comes_first(tmp_path: Path) -> None:
 
 
 def test_tables_that_are_not_finished_leave_those_of_before(tmp_path: Path) -> None:
-    """Who is interrupted sees the last whole tables, and nothing else is left in the folder."""
+    """An interrupt leaves the last complete tables, and no other file in the folder."""
     (tmp_path / "effects.csv").write_text("as it was")
     with pytest.raises(KeyboardInterrupt), Tables(tmp_path, ["A"]) as tables:
         tables.add("A", {"effects": effect("roll")})
@@ -89,12 +89,12 @@ def test_tables_that_are_not_finished_leave_those_of_before(tmp_path: Path) -> N
 
 
 @pytest.mark.slow
-def test_a_page_is_told_without_tables_where_there_are_no_logs(tmp_path: Path) -> None:
-    """What the store has of a machine is enough for its page; what is unreadable is nothing."""
+def test_a_page_needs_no_logs(tmp_path: Path) -> None:
+    """The assessment is enough for the page; one that cannot be decoded has no output."""
     made = pack_assessment(worn(tmp_path))
-    told = machine_output(MachineRecord("M7-Y", "M7-Y.html", made.content, (), None))
-    assert told is not None
-    assert (told.page.file, told.page.summary.identity) == ("M7-Y.html", "M7-Y")
-    assert told.tables == {}
+    output = machine_output(MachineRecord("M7-Y", "M7-Y.html", made.content, (), None))
+    assert output is not None
+    assert (output.page.file, output.page.summary.identity) == ("M7-Y.html", "M7-Y")
+    assert output.tables == {}
     assert machine_output(MachineRecord("M7-Y", "M7-Y.html", b"nonsense", (), None)) is None
     assert machine_output(MachineRecord("M7-Y", "M7-Y.html", None, (), None)) is None

@@ -181,7 +181,7 @@ def test_a_second_run_takes_all_from_the_store_and_the_truth_does_not_matter(
     (done.logs / "truth.csv").unlink()
     monkeypatch.setattr(assessing, "assess", None)  # nothing may be inferred again
     again = run(done.logs, [done.stage], done.out, Settings(epochs=2))
-    # The broken file is told by its content and tried no more than once.
+    # The broken file is identified by its content and tried no more than once.
     assert again.n_remembered == N_LOGS + 2
     assert tables(done.out) == done.written
     assert pages(done.out) == done.pages
@@ -268,7 +268,7 @@ def test_descriptions_make_stale_what_is_theirs(tmp_path: Path) -> None:
 def test_a_log_that_changes_while_it_is_read_is_done_again(
     tmp_path: Path, modes_only: Stage, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """What is still being written is refused for now, and not remembered."""
+    """A log that is being written is refused, and not stored."""
     logs = write_archive(tmp_path / "logs", 2)
     with monkeypatch.context() as patch:
         patch.setattr(ingesting, "content_digest", lambda path: f"{path.name:0>64}")
@@ -284,7 +284,7 @@ def test_a_log_that_changes_while_it_is_read_is_done_again(
 def test_what_the_computer_failed_at_is_tried_again(
     tmp_path: Path, modes_only: Stage, monkeypatch: pytest.MonkeyPatch, error: Exception
 ) -> None:
-    """A full disk or memory says nothing of a log: it is refused for now, and not remembered."""
+    """A full disk or memory is no fault of a log: it is refused, and not stored."""
     logs = write_archive(tmp_path / "logs", 3)
     whole = ingesting.identify
 
@@ -321,7 +321,7 @@ def test_one_machine_has_one_description(tmp_path: Path) -> None:
 def test_an_assessment_that_cannot_be_read_is_made_again(
     tmp_path: Path, modes_only: Stage, assessed: list[str]
 ) -> None:
-    """Neither damage nor another run that forgets it keeps a machine from being told."""
+    """Neither damage nor deletion by another run keeps a machine from being reported."""
     logs, out = write_archive(tmp_path / "logs", 2), tmp_path / "out"
     run(logs, [modes_only], out)
     before = tables(out), pages(out)
@@ -345,7 +345,7 @@ def test_an_assessment_that_never_can_be_read_does_not_end_the_batch(
 
 
 @pytest.mark.slow
-def test_what_is_taught_is_taught_anew_where_it_cannot_be_read(
+def test_a_fleet_update_that_cannot_be_read_is_repeated(
     tmp_path: Path, modes_only: Stage, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A damaged assessment after the fleet's evidence is recomputed like the one before."""
@@ -376,7 +376,7 @@ def test_what_is_taught_is_taught_anew_where_it_cannot_be_read(
     assert assessment.fleet == learned
 
 
-def test_a_folder_that_cannot_be_written_to_is_told(tmp_path: Path, modes_only: Stage) -> None:
+def test_a_folder_that_cannot_be_written_to_is_an_error(tmp_path: Path, modes_only: Stage) -> None:
     """Before anything is done, and by its name."""
     logs = write_archive(tmp_path / "logs", 2)
     (tmp_path / "file").write_text("no folder")
@@ -394,7 +394,7 @@ def test_settings_show_no_password() -> None:
 def test_a_machine_that_cannot_be_assessed_does_not_end_the_batch(
     tmp_path: Path, modes_only: Stage, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """It is named with the reason, and the others are told."""
+    """It is named with the reason, and the others are reported."""
     logs = write_archive(tmp_path / "logs", 2)
     write_log(logs / "b.h5", 1.0, 7, stage="other-A")
     whole = assessing.assess
@@ -479,7 +479,7 @@ def test_a_page_says_what_is_new_since_the_last_report(tmp_path: Path, modes_onl
 
 @pytest.mark.slow
 def test_a_renamed_log_is_remembered(tmp_path: Path, modes_only: Stage) -> None:
-    """A log is known by its content; the tables carry its new name."""
+    """A log is identified by its content; the tables have its new name."""
     logs = write_archive(tmp_path / "logs", 2)
     run(logs, [modes_only], tmp_path / "out")
     (logs / "log-01.h5").rename(logs / "zero.h5")
@@ -519,10 +519,8 @@ def test_foreign_columns_are_read_by_a_map_that_is_part_of_the_key(
 
 
 @pytest.mark.slow
-def test_bad_rows_beside_the_logs_are_told_and_stop_nothing(
-    tmp_path: Path, modes_only: Stage
-) -> None:
-    """Logs are analysed, each bad row is listed, and the page of its machine tells of the work."""
+def test_bad_rows_of_tables_are_listed_and_stop_nothing(tmp_path: Path, modes_only: Stage) -> None:
+    """Logs are analysed, each bad row is listed, and the page shows the maintenance."""
     logs, out = write_archive(tmp_path / "logs", 2), tmp_path / "out"
     done = run(logs, [modes_only], out)
     assert (done.n_refused, done.n_unread) == (0, 0)
@@ -577,7 +575,7 @@ def test_each_log_goes_to_the_first_description_that_takes_it(tmp_path: Path) ->
 def test_an_archive_of_bad_logs_only_is_an_error_with_its_reasons_written(
     tmp_path: Path, modes_only: Stage
 ) -> None:
-    """When every log is refused the job fails, says how many and why; refused.csv has all."""
+    """When every log is refused the run fails with their number and reason; refused.csv has all."""
     logs = tmp_path / "logs"
     logs.mkdir()
     (logs / "broken.h5").write_bytes(b"nothing")
@@ -592,24 +590,24 @@ def test_an_archive_of_bad_logs_only_is_an_error_with_its_reasons_written(
 
 
 def test_an_empty_folder_is_an_error(tmp_path: Path, modes_only: Stage) -> None:
-    """No log at all is said."""
+    """A folder without a log has its own error."""
     (tmp_path / "logs").mkdir()
     with pytest.raises(NothingUsable, match="0 found"):
         run(tmp_path / "logs", [modes_only], tmp_path / "out")
 
 
 @pytest.mark.slow
-def test_progress_is_told_to_its_end(tmp_path: Path, modes_only: Stage) -> None:
-    """The callback hears of every step of the work, each up to its total."""
-    heard: dict[str, tuple[int, int]] = {}
+def test_progress_reaches_its_end(tmp_path: Path, modes_only: Stage) -> None:
+    """The callback is called for every step, each up to its total."""
+    seen: dict[str, tuple[int, int]] = {}
 
-    def hear(what: str, finished: int, total: int) -> None:
+    def record(what: str, finished: int, total: int) -> None:
         assert 0 <= finished <= total
-        heard[what] = (finished, total)
+        seen[what] = (finished, total)
 
-    run(write_archive(tmp_path / "logs", 2), [modes_only], tmp_path / "out", progress=hear)
+    run(write_archive(tmp_path / "logs", 2), [modes_only], tmp_path / "out", progress=record)
     steps = {"reading": (2, 2), "identifying": (2, 2), "assessing": (1, 1), "reporting": (1, 1)}
-    assert heard == steps
+    assert seen == steps
 
 
 @pytest.mark.slow

@@ -1,4 +1,4 @@
-"""The store: what goes in comes out bit for bit, and what is wrong with it is said."""
+"""The store: records come back bit for bit, and every fault is named."""
 
 from __future__ import annotations
 
@@ -111,7 +111,7 @@ def test_a_reading_comes_back_bit_for_bit(url: str, n: int) -> None:
 
 
 def test_missing_metadata_stay_missing(url: str) -> None:
-    """What a log did not say is None again, not a text or a zero."""
+    """Metadata that a log lacks are None again, not a text or a zero."""
     put = LogEstimates("a.h5", "d" * 64, Metadata(), reading(0).modes)
     store = Store(url)
     put_in(store, "k", put)
@@ -198,7 +198,7 @@ def test_a_url_that_cannot_be_opened_is_named_without_its_password(bad: str) -> 
 def test_a_server_that_says_nothing_is_not_waited_for(
     query: str, needs: Callable[[str], None], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Its port may be that of something else. Two seconds are the shortest that libpq knows."""
+    """Its port may be that of something else. Two seconds are the shortest time-out of libpq."""
     needs("postgres")
     monkeypatch.setattr(constants, "SERVER_TIMEOUT_S", 60 if query else 2)
     with socket.create_server(("127.0.0.1", 0)) as listener:
@@ -241,7 +241,7 @@ def test_a_damaged_store_is_named(file_url: str, tmp_path: Path) -> None:
 
 
 def keep(store: Store, machine: str, key: str, assessment: Assessment) -> None:
-    """Keep an assessment as a run does, and tell it."""
+    """Store an assessment as a run does, and publish it."""
     store.put_assessment(machine, key, pack_assessment(assessment))
     store.publish(machine, [key], store.put_refused(()))
 
@@ -278,8 +278,8 @@ def test_what_an_assessment_lacks_it_lacks_again(url: str, tmp_path: Path) -> No
     assert list(leaves(got)) == list(leaves(put))
 
 
-def test_only_what_is_told_and_what_it_comes_from_are_kept_whole(url: str, tmp_path: Path) -> None:
-    """Telling forgets the other assessments of the same machine, not of others."""
+def test_only_the_published_assessment_and_its_source_are_kept(url: str, tmp_path: Path) -> None:
+    """Publishing deletes the other assessments of the same machine, not of others."""
     one = pack_assessment(worn(tmp_path))
     with closing(Store(url)) as store:
         for machine, key in (("A", "k1"), ("B", "k1"), ("A", "k2"), ("A", "k3")):
@@ -290,41 +290,41 @@ def test_only_what_is_told_and_what_it_comes_from_are_kept_whole(url: str, tmp_p
         assert store.assessment("A", "k1") is None
         assert store.has_assessment("B", "k1")
         assert not store.has_assessment("C", "k1")
-        assert [(told.machine, told.key) for told in store.published()] == [("A", "k3")]
+        assert [(one.machine, one.key) for one in store.published()] == [("A", "k3")]
 
 
 def test_the_earlier_report_is_the_newest_of_another_key(url: str, tmp_path: Path) -> None:
-    """Telling the same again changes nothing; going back to a former state is news again."""
+    """Publishing the same again changes nothing; a former state is new again."""
     one = worn(tmp_path)
     words = {"k1": "healthy", "k2": "preload", "k3": "mount"}
     with closing(Store(url)) as store:
 
-        def tell(key: str) -> str | None:
+        def publish(key: str) -> str | None:
             judgement = replace(one.judgement, verdict=words[key])
             keep(store, "A", key, replace(one, judgement=judgement))
             before = store.previous_summary("A", key)
             return before and before.verdict
 
-        assert [tell(key) for key in ("k1", "k1", "k2", "k2", "k1", "k3")] == [
+        assert [publish(key) for key in ("k1", "k1", "k2", "k2", "k1", "k3")] == [
             *(None, None, "healthy", "healthy", "preload", "healthy")
         ]
         assert store.previous_summary("B", "k1") is None
 
 
 def test_refused_logs_are_those_of_the_last_run_of_each_machine(url: str, tmp_path: Path) -> None:
-    """A later run replaces what an earlier one refused, where it told the same machines."""
+    """A later run replaces what an earlier one refused, where it published the same machines."""
     one, two, three = ((Refusal(log, "gap", ""),) for log in ("one", "two", "three"))
     with closing(Store(url)) as store:
 
-        def tell(machines: str, refused: tuple[Refusal, ...]) -> tuple[Refusal, ...]:
+        def publish(machines: str, refused: tuple[Refusal, ...]) -> tuple[Refusal, ...]:
             for machine in machines:
                 store.publish(machine, ["k1"], store.put_refused(refused))
             return store.refused(one.refused for one in store.published())
 
-        assert tell("ABC", ()) == ()
-        assert tell("AB", one) == one
-        assert tell("C", two) == (*one, *two)
-        assert tell("AB", three) == (*three, *two)
+        assert publish("ABC", ()) == ()
+        assert publish("AB", one) == one
+        assert publish("C", two) == (*one, *two)
+        assert publish("AB", three) == (*three, *two)
 
 
 @pytest.mark.slow
@@ -346,7 +346,7 @@ def test_names_of_machines_are_data(url: str, tmp_path: Path, evil: str) -> None
 
 
 def test_a_row_that_cannot_be_read_counts_as_absent(file_url: str, tmp_path: Path) -> None:
-    """Damaged or foreign rows are as if they were not there, and may be written anew."""
+    """Damaged or foreign rows count as absent, and may be written again."""
     with closing(Store(file_url)) as store:
         put_in(store, "k", reading())
         for machine, key in (("A", "k0"), ("A", "k1"), ("A", "k2"), ("B", "k1")):
@@ -389,7 +389,7 @@ def test_a_store_that_another_run_makes_at_the_same_moment_is_opened(tmp_path: P
 
 @pytest.mark.slow
 def test_two_that_write_the_same_at_once_leave_one_row(url: str, tmp_path: Path) -> None:
-    """Of many threads that put, keep and tell the same, none fails and nothing is doubled."""
+    """Of many threads that write and publish the same, none fails and nothing is doubled."""
     made = pack_assessment(worn(tmp_path))
 
     def write(_: int) -> None:
@@ -419,8 +419,10 @@ def test_a_store_that_is_not_there_is_not_made(file_url: str, tmp_path: Path) ->
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_store_without_results_is_told_from_an_older_one(file_url: str, tmp_path: Path) -> None:
-    """An empty file, tables of another version, and tables without a row are said each."""
+def test_a_store_without_results_is_distinguished_from_an_older_one(
+    file_url: str, tmp_path: Path
+) -> None:
+    """An empty file, tables of another version, and tables without a row have an error each."""
     path = tmp_path / "store.sqlite"
     path.touch()
     with pytest.raises(StoreError, match="holds no results"):
@@ -467,21 +469,21 @@ SECRET = "s3cr3t"
     ],
 )
 def test_an_address_is_shown_by_kind_and_place(address: str, shown: str) -> None:
-    """User, password and options are left out; where they cannot be told apart, all is."""
+    """User, password and options are left out; where they cannot be separated, all is."""
     assert shown_address(address) == shown
 
 
 @pytest.mark.parametrize("form", ADDRESSES)
-def test_no_part_of_a_password_is_told(form: str) -> None:
+def test_no_part_of_a_password_is_shown(form: str) -> None:
     """Neither the address nor what a library quotes of it, whole or in part, shows the password."""
     address = form.format(*[SECRET] * 2)
     parts = {address, *(part for sign in "/@:?=&" for part in address.split(sign))}
-    for said in [part for part in parts if SECRET in part]:
-        assert SECRET not in without_secrets(f"cannot use {said!r}", address)
+    for quoted in [part for part in parts if SECRET in part]:
+        assert SECRET not in without_secrets(f"cannot use {quoted!r}", address)
     assert SECRET not in shown_address(address)
 
 
-def test_a_reason_without_secrets_is_told_as_it_is() -> None:
+def test_a_reason_without_secrets_is_unchanged() -> None:
     """What helps to mend an address stays."""
     why = "connection to server at 127.0.0.1 failed: Connection refused"
     assert without_secrets(why, "postgresql://me:s3cr3t@127.0.0.1/db?connect_timeout=1") == why
@@ -489,8 +491,8 @@ def test_a_reason_without_secrets_is_told_as_it_is() -> None:
 
 def test_an_encoded_password_is_hidden_in_both_writings() -> None:
     """Libraries quote it as it is written, or as it is meant."""
-    told = without_secrets("a%2Fb or a/b", "postgresql://me:a%2Fb@host/db")
-    assert told == "*** or ***"
+    shown = without_secrets("a%2Fb or a/b", "postgresql://me:a%2Fb@host/db")
+    assert shown == "*** or ***"
 
 
 @pytest.mark.parametrize("user", ["me", "me@corp"])

@@ -36,7 +36,7 @@ def die_of_three(number: int) -> int:
 
 
 def process_of(_: int) -> int:
-    """Say which process works."""
+    """Return the process that works."""
     return os.getpid()
 
 
@@ -132,7 +132,7 @@ def test_processes_end_with_a_parent_that_is_killed(root: Path) -> None:
     "begun", ["pool.map_unordered(dawdle, items, lost)", "map_in_order(pool.executor, len, items)"]
 )
 def test_an_interrupt_as_work_begins_leaves_nothing_that_waits(root: Path, begun: str) -> None:
-    """Processes that only start hear no interrupt, and what they were to do is let go."""
+    """Processes that are starting ignore an interrupt, and their tasks are dropped."""
     code = (
         "import signal\nfrom lmshealth.batch.assess import map_in_order\n"
         "from lmshealth.batch.workers import processes\n"
@@ -153,11 +153,11 @@ def test_an_interrupt_as_work_begins_leaves_nothing_that_waits(root: Path, begun
             parent.stdout.readline()
             time.sleep(0.3)
             os.killpg(parent.pid, signal.SIGINT)
-            _, said = parent.communicate(timeout=60)
+            _, errors = parent.communicate(timeout=60)
         finally:
             parent.kill()
     assert parent.returncode == -signal.SIGINT
-    assert said.count("Traceback") == 1, said
+    assert errors.count("Traceback") == 1, errors
 
 
 def test_processes_that_cannot_start_end_the_batch(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -246,10 +246,10 @@ def slowly(number: int) -> tuple[int, int]:
 
 
 @pytest.mark.slow
-def test_a_lost_scheduler_is_told(
+def test_a_lost_scheduler_ends_the_batch(
     cluster: servers.Cluster, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    """It ends the batch with one error that says so, and with no other words."""
+    """It ends the batch with one error, and no other output."""
     with (
         pytest.raises(SchedulerError, match=f"lost the Dask scheduler {cluster.address}"),
         workers.cluster(cluster.address) as pool,
@@ -261,7 +261,7 @@ def test_a_lost_scheduler_is_told(
 
 @pytest.mark.slow
 def test_a_connection_that_breaks_is_that_of_a_lost_scheduler(cluster: servers.Cluster) -> None:
-    """Who fetches a result in that moment hears of the connection alone."""
+    """A result that is fetched in that moment fails by its connection."""
     from distributed.comm.core import CommClosedError
 
     with (
@@ -286,7 +286,7 @@ def test_a_worker_of_another_version_is_refused(
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("address", "said"),
+    ("address", "message"),
     [
         ("nonsense", "needed is an address"),
         ("tcp://127.0.0.1", "needed is an address"),
@@ -297,22 +297,22 @@ def test_a_worker_of_another_version_is_refused(
         ("tls://127.0.0.1:{listening}", "TLS"),
     ],
 )
-def test_an_address_that_is_none_is_told(
-    address: str, said: str, needs: Callable[[str], None], monkeypatch: pytest.MonkeyPatch
+def test_an_invalid_address_is_an_error(
+    address: str, message: str, needs: Callable[[str], None], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Each is an error soon, without what is secret in it."""
+    """Each is an error soon, without its secrets."""
     needs("distributed")
     monkeypatch.setattr(constants, "SCHEDULER_TIMEOUT_S", 2)
     with socket.create_server(("127.0.0.1", 0)) as listener:
         full = address.format(port=servers.free_port(), listening=listener.getsockname()[1])
-        with pytest.raises(SchedulerError, match=said) as caught, workers.cluster(full):
+        with pytest.raises(SchedulerError, match=message) as caught, workers.cluster(full):
             pass
     assert "hunter2" not in str(caught.value)
     _assert_no_client_is_open()
 
 
 @pytest.mark.slow
-def test_settings_that_cannot_be_followed_are_told(
+def test_settings_that_cannot_be_applied_are_an_error(
     needs: Callable[[str], None], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Dask is there: what it misses is named, not Dask."""
@@ -333,7 +333,7 @@ def test_settings_that_cannot_be_followed_are_told(
 @pytest.mark.slow
 @pytest.mark.parametrize("words", [b"SSH-2.0-OpenSSH_9.2\r\n", b"220 ready\r\n", bytes(64), b""])
 def test_another_service_is_no_scheduler(words: bytes, needs: Callable[[str], None]) -> None:
-    """Whatever it says of itself: a wrong port is told as that."""
+    """Whatever it sends: a wrong port is reported as such."""
     needs("distributed")
 
     def serve(listener: socket.socket) -> None:
@@ -360,7 +360,7 @@ def _assert_no_client_is_open() -> None:
 
 
 @pytest.mark.slow
-def test_a_cluster_without_workers_is_told(
+def test_a_cluster_without_workers_is_an_error(
     cluster: servers.Cluster, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Nobody waits for work that nobody does."""

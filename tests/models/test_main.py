@@ -113,7 +113,7 @@ BOUNDS = "needed: 0.01 to 600 s"
     ],
 )
 def test_numbers_without_meaning_are_one_line_and_no_file(tmp_path, arguments, error):
-    """Status 1, one line that says what was got and is needed, no traceback, nothing written."""
+    """Status 1, one line with what was found and is needed, no traceback, nothing written."""
     out = tmp_path / ("out.h5" if arguments[0] == "sweep" else "out")
     done = run(*arguments, "--out", str(out))
     assert (done.returncode, done.stderr) == (1, f"error: {error}\n")
@@ -135,7 +135,7 @@ def test_stale_logs_are_one_line(tmp_path):
 
 
 def test_help_says_that_the_velocity_is_lowered():
-    """The help of `sweep` says what becomes of a velocity that the travel does not allow."""
+    """The help of `sweep` explains a velocity that the travel does not allow."""
     output = CliRunner().invoke(cli, ["sweep", "--help"]).output
     assert "lowered to what the travel" in " ".join(output.split())
 

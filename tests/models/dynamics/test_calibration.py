@@ -42,14 +42,14 @@ def test_calibration_gives_the_stored_numbers():
 
 
 def test_calibrated_means_calibrated():
-    """The numbers whose source says so are those that the calibration finds, and no others."""
+    """The numbers with the source 'calibrated' are those of the fit, and no others."""
     for name, stage in STAGES.items():
-        said = {
+        calibrated = {
             field.name
             for field in fields(stage)
             if getattr(getattr(stage, field.name), "source", None) == "calibrated"
         }
-        assert said == {free.field for free in FREE if name in free.stages}
+        assert calibrated == {free.field for free in FREE if name in free.stages}
 
 
 def test_no_other_mode_in_the_health_band_of_y():

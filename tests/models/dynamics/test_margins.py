@@ -251,7 +251,7 @@ def test_phase_of_a_full_turn_is_no_crossover():
 @pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
 def test_printed_loops_do_not_work(name):
-    """As printed the product of the equations is unstable, rigid and flexible, and says so."""
+    """As printed the product of the equations is unstable, rigid and flexible, and is called so."""
     for case in cases(name):
         if case.reading == "printed" and "×" in case.equations:
             assert case.margins.verdict == "unstable"

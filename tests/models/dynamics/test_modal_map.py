@@ -38,7 +38,7 @@ def test_map_reproduces_points_left_out():
         assert max(leave_out_error(stage, table, points).values()) < 3e-5
 
 
-def test_causes_can_be_told_apart_in_y_and_not_in_x():
+def test_causes_can_be_separated_in_y_and_not_in_x():
     """Roll and pitch answer preload and mount differently in Y; X does not see its mount."""
 
     def slopes(stage, mode):

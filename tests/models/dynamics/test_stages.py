@@ -39,7 +39,7 @@ def test_both_stages_share_one_guide():
 
 
 def test_unknown_stage_lists_the_known():
-    """An unknown stage raises and says which exist."""
+    """An unknown stage raises with the list of those that exist."""
     with pytest.raises(UnknownStage, match="lms-x, lms-y") as caught:
         stage_named("lms-z")
     assert caught.value.got == "lms-z"
@@ -77,7 +77,7 @@ def test_impossible_damping_is_refused(bad):
 
 
 def test_unknown_servo_lists_the_known():
-    """A servo_id without a tuning raises and says which exist."""
+    """A servo_id without a tuning raises with the list of those that exist."""
     with pytest.raises(UnknownServo, match="commissioning, retuned") as caught:
         tuning_named("lms-x", "yesterday")
     assert caught.value.got == "yesterday"

@@ -29,7 +29,7 @@ from models.lives.degradation import (
 )
 
 SEEDS = range(200)
-# What each life changes besides the temperature.
+# What each life changes other than the temperature.
 CHANGES = {
     "healthy": set(),
     "preload-wear": {"guide_preload"},

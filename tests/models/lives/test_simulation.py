@@ -135,7 +135,7 @@ def test_schedule_runs_forward():
         assert 1400 <= travel[-1] <= 2000
 
 
-def test_now_does_not_tell_the_life():
+def test_now_does_not_depend_on_the_life():
     """Every life of a seed has the same odometer readings."""
     readings = {
         tuple(v.travel_km for v in schedule(Plan("lms-y", name, 10, 1.0, 3))) for name in LIVES
@@ -176,7 +176,7 @@ STEPS = {"regreasing": "regrease", "servo-retuning": "servo"}
 @pytest.mark.slow
 @pytest.mark.parametrize("name", sorted(LIVES))
 def test_every_life_is_written_with_its_truth(tmp_path, name):
-    """Truth is the modes of its condition; logs, manifest and maintenance say the same of it."""
+    """Truth is the modes of its condition; logs, manifest and maintenance agree with it."""
     simulate_life(Plan("lms-y", name, 3, 2.0, 6), tmp_path)
     truth = pd.read_csv(tmp_path / "truth.csv")
     manifest = pd.read_csv(tmp_path / "manifest.csv")
@@ -252,7 +252,7 @@ def test_a_life_until_its_failure_needs_two_logs():
 
 @pytest.mark.parametrize("changed", [{"logs": 1}, {"file_format": "csv"}])
 def test_logs_of_another_plan_are_not_left_behind(tmp_path, changed):
-    """What would stay beside the new manifest is refused by name; the same plan runs again."""
+    """Logs that would stay next to a new manifest are refused; the same plan runs again."""
     plan = Plan("lms-y", "healthy", 2, 0.1, 0)
     simulate_life(plan, tmp_path)
     before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
@@ -270,7 +270,7 @@ def test_work_still_to_come_is_not_in_maintenance(tmp_path):
 
 @pytest.mark.slow
 def test_faults_strike_a_tenth_of_the_logs_and_stand_in_the_truth(tmp_path):
-    """Struck logs differ from their clean twins, the others do not, and the truth says which."""
+    """Struck logs differ from their clean twins, the others do not, and the truth lists them."""
     clean = Plan("lms-y", "healthy", 12, 0.5, 3)
     faulty = replace(clean, faults=("dead-channel", "mains-hum"))
     simulate_life(clean, tmp_path / "clean")

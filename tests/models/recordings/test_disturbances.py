@@ -45,7 +45,7 @@ def test_noise_follows_a_changing_velocity_sample_by_sample():
 
 
 def test_standstill_leaves_ground_and_electronics():
-    """Nothing that rolls or rubs is heard at standstill."""
+    """Rolling and friction excite nothing at standstill."""
     level = dict(zip(NOISE_INPUTS, noise_levels(STAGE, np.array(0.0), 20000.0), strict=True))
     silent = {name for name, value in level.items() if value == 0}
     assert silent == {name for name in NOISE_INPUTS if name.startswith("block")}

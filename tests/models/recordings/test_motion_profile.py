@@ -28,7 +28,7 @@ def test_limits_are_kept_and_the_set_velocity_is_reached(velocity):
 
 
 def test_fast_moves_reach_the_acceleration_of_the_paper():
-    """From 100 mm/s on the acceleration is 5000 mm/s², as the paper says of all its moves."""
+    """From 100 mm/s on the acceleration is 5000 mm/s², as in all moves of the paper."""
     for velocity in (0.1, 0.2, 0.4):
         _, (_, _, acceleration, _) = sampled(Profile(velocity, 0.28))
         assert acceleration.max() == pytest.approx(5.0)

@@ -56,7 +56,7 @@ def test_periods_join_without_a_jump():
 
 @pytest.mark.slow
 def test_columns_are_those_of_a_log_and_the_excitation(log_y):
-    """The columns of every log, and the injected current beside the whole."""
+    """The columns of every log, and the injected current next to the total."""
     assert tuple(log_y.columns) == (*COLUMNS, EXCITATION)
     assert {v.dtype for v in log_y.columns.values()} == {np.dtype("float32")}
     assert {v.size for v in log_y.columns.values()} == {400000}
