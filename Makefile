@@ -1,4 +1,4 @@
-# Every target first makes a virtual environment, so that a clean checkout is enough.
+# Every target creates the virtual environment first; a clean checkout is enough.
 
 PYTHON ?= python3
 BIN := .venv/bin
@@ -8,49 +8,49 @@ DEMO := demo
 
 demo: .venv/installed
 	@rm -rf $(DEMO)
-	@echo "Simulating the life of a Y stage whose preload wears and whose mount loosens ..."
+	@echo "Simulating a Y stage with wearing preload and loosening mount ..."
 	@$(BIN)/python -m models simulate lms-y --life both --logs 40 --seconds 20 --seed 3 --out $(DEMO)/logs
-	@echo "Analysing its logs ..."
+	@echo "Analysing the logs ..."
 	@$(BIN)/lmshealth run $(DEMO)/logs --stage lms-y --out $(DEMO)/result
 
-# The picture in the README, from the report of the demo.
+# The picture in the README: a screenshot of the report of the demo.
 picture: .venv/installed
 	@test -d $(DEMO)/result || $(MAKE) demo
 	$(BIN)/python -m studies.demo_life.picture $(DEMO)/result
 
-# Linters and types.
+# Linters, types, layers of the packages.
 check: .venv/installed
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 
-# Tests run side by side: threads inside linear algebra would only get in their way.
+# Tests run in parallel processes: one thread each for linear algebra.
 test slow coverage statistics bench: export OPENBLAS_NUM_THREADS = 1
 test slow coverage statistics bench: export OMP_NUM_THREADS = 1
-# They start many programs: these find compiled what one of them has compiled.
+# Tests start many programs: let them share compiled byte code.
 unexport PYTHONDONTWRITEBYTECODE
 test: .venv/installed
 	$(BIN)/pytest -n 2 --dist worksteal -m "not slow and not statistical"
 
-# Tests that take seconds each: whole files, servers, browsers, chains.
+# Tests of seconds each: whole files, servers, browsers, chains.
 slow: .venv/installed
 	$(BIN)/pytest -n 2 --dist worksteal -m "slow and not statistical"
 
-# Which lines of the package does no fast test run? Fails below 95 %. What studies run does not count.
+# Lines of the package that no fast test runs; fails below 95 %. Studies do not count.
 coverage: .venv/installed
 	$(BIN)/pytest -n 2 -m "not slow and not statistical" --ignore=tests/test_studies.py \
 		--cov=lmshealth --cov-fail-under=95
 
-# Is what is said of errors and intervals true? LMSHEALTH_SEED=7 draws all anew.
+# Calibration of errors and intervals; LMSHEALTH_SEED=7 draws other data.
 statistics: .venv/installed
 	$(BIN)/pytest -n 2 --dist worksteal -m statistical
 
-# Every figure of speed beside its peer, into studies/bench/result.json.
+# Speed of every step relative to a peer, recorded in studies/bench/result.json.
 bench: .venv/installed
 	$(BIN)/python -m studies.bench.run
 
-# The stamp is newer than what it was made from, or the installation is done again.
+# Reinstall when pyproject.toml is newer than the installation.
 .venv/installed: pyproject.toml
 	$(PYTHON) -m venv .venv
 	$(BIN)/pip install --quiet --disable-pip-version-check --editable ".[dev]"

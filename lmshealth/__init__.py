@@ -1,7 +1,7 @@
 """Health of linear-motor stages from the logs they already write.
 
-Guide preload, mount stiffness and remaining life, with every uncertainty carried from the raw
-samples to the date. Inside the package all quantities are in SI units.
+Estimates of guide preload, mount stiffness and remaining life, with uncertainty propagated from the
+raw samples to the service date. All quantities are in SI units.
 """
 
 import warnings
@@ -32,8 +32,8 @@ if TYPE_CHECKING:
 
 __version__ = version("lmshealth")
 
-# Where each public name is at home. It is fetched when it is first asked for: who reads one log
-# pays for no database, and the command line sets its threads before numpy is there.
+# Module of each public name, imported on first use: reading a log needs no database, and the command
+# line sets the number of threads before numpy is imported.
 _HOMES = {
     "LmshealthError": "errors",
     "LogEstimates": "tracking.history",
@@ -61,10 +61,10 @@ _FORMER = {"Reading": "LogEstimates"}
 
 __all__ = [*_HOMES]
 
-if not TYPE_CHECKING:  # else a type checker would take any name for one of these
+if not TYPE_CHECKING:  # a type checker would accept any attribute otherwise
 
     def __getattr__(name: str) -> object:
-        """Fetch a public name from its home."""
+        """Import a public name on first use."""
         if name in _FORMER:
             warnings.warn(
                 f"lmshealth.{name} is deprecated: use lmshealth.{_FORMER[name]}",
