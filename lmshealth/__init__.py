@@ -1,6 +1,6 @@
 """Health of linear-motor stages from the logs they already write.
 
-Estimates of guide preload, mount stiffness and remaining life, with uncertainty propagated from the
+Estimates guide preload, mount stiffness and remaining life, with uncertainty propagated from the
 raw samples to the service date. All quantities are in SI units.
 """
 
@@ -32,8 +32,8 @@ if TYPE_CHECKING:
 
 __version__ = version("lmshealth")
 
-# Module of each public name, imported on first use: reading a log needs no database, and the command
-# line sets the number of threads before numpy is imported.
+# Module of each public name, imported on first use: reading a log needs no database, and the
+# command line sets the number of threads before numpy is imported.
 _HOMES = {
     "LmshealthError": "errors",
     "LogEstimates": "tracking.history",
