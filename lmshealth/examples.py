@@ -19,7 +19,7 @@ TABLE = Path(str(resources.files("lmshealth") / "stage" / "descriptions" / "exam
 
 def readings() -> tuple[LogEstimates, ...]:
     """Return the estimates of every log of the example."""
-    return read_estimates(TABLE, stage=load_stage("lms-y")).readings
+    return read_estimates(TABLE, stage=load_stage("lms-y")).entries
 
 
 def history() -> History:

@@ -40,9 +40,10 @@ if TYPE_CHECKING:
     from lmshealth.report.tables import Row
     from lmshealth.stage.description import Decision, Stage
     from lmshealth.tracking.history import History
-    from lmshealth.tracking.read_tables import Drifts, MachineHistories
+    from lmshealth.tracking.read_tables import Drifts, Table
 
     Prognosed = tuple[Prognosis, LifePosterior | None]
+    Machines = Table[tuple[History, list[Refusal]]]
 
 _TABLES = ("track", "track_cov", "effects", "events", "refused")
 
@@ -80,7 +81,7 @@ def track(table: Path, out: Path, **options: Any) -> None:
     read = _read_machines(table, stage, options)
     rows: dict[str, list[Row]] = {name: [] for name in _TABLES}
     notes = list(read.notes)
-    for history, refused in read.machines:
+    for history, refused in read.entries:
         found = track_modes(history, stage)
         refused += outlier_refusals(history, found)
         smoothed = None
@@ -221,7 +222,7 @@ def _read_drifts(table: Path, cov: Path | None) -> tuple[Drifts, ...]:
     default = table.with_name("track_cov.csv")
     read = read_drifts(table, cross_terms=cov or (default if default.exists() else None))
     _print_notes([f"{table}: {note}" for note in read.notes])
-    return read.machines
+    return read.entries
 
 
 def _single(table: Path, machines: tuple[Drifts, ...]) -> Drifts:
@@ -275,10 +276,10 @@ def prognose(ctx: click.Context, /, table: Path, **options: Any) -> None:
     decision = _decision(stage.description.decision, options)
     read = _read_machines(table, stage, options)
     _print_notes(read.notes)
-    for history, refused in read.machines:
+    for history, refused in read.entries:
         _print_notes([f"{history.stage}: {n}" for n in missing_mode_notes(history, refused)])
     with progress_bars() as progress:
-        histories = [history for history, _ in read.machines]
+        histories = [history for history, _ in read.entries]
         found, lost = _prognose_machines(histories, stage, options, progress)
     rows = []
     for prognosis, _ in found:
@@ -353,7 +354,7 @@ def _prognose_machines(
     return found, lost
 
 
-def _read_machines(table: Path, stage: Stage | None, options: dict[str, Any]) -> MachineHistories:
+def _read_machines(table: Path, stage: Stage | None, options: dict[str, Any]) -> Machines:
     from lmshealth.tracking.read_tables import read_machines
 
     cov, maintenance = options["cov"], options["maintenance"]

@@ -1,4 +1,4 @@
-"""What temperature, payload and the like do to the modes: taken out of them, log by log."""
+"""Effects of temperature, payload and position on the modes, with the estimates that show them."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from lmshealth.tracking.track import Effect, Track, accepted_estimates
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CovariateEffect:
-    """What a covariate does to a mode: its effects beside the estimates that they were found from.
+    """Effect of a covariate on a mode, and the estimates that it was regressed on.
 
     Attributes
     ----------
@@ -26,15 +26,14 @@ class CovariateEffect:
     reference : float
         The covariate at which the effect is zero.
     effects : tuple of Effect
-        Per unit, and where the description has a curvature per unit squared.
+        Per unit, and per unit squared where the description has a curvature.
     epochs : ndarray of int
         Logs of the estimates, shape ``(n,)``.
     values : ndarray
         The covariate in these logs, shape ``(n,)``.
     measured : ndarray
-        ln f less all that moves it but this covariate: wear, steps, biases and other covariates,
-        as all logs together tell them; shape ``(n,)``. Their level follows the logs, so that what
-        is left scatters less than the estimates are uncertain.
+        ln f minus its smoothed level, steps, biases and other covariates, shape ``(n,)``. The
+        smoothed level follows the logs: residuals scatter less than the estimates' errors.
     """
 
     mode: str
@@ -51,19 +50,19 @@ class CovariateEffect:
         freeze(self)
 
     def explained(self, values: FloatArray) -> FloatArray:
-        """Change of ln f at some values of the covariate, shape of ``values``."""
+        """Return the change of ln f at values of the covariate, shape of ``values``."""
         offset = values - self.reference
         return np.asarray(sum(e.coefficient * offset**p for p, e in enumerate(self.effects, 1)))
 
     def explained_std(self, values: FloatArray) -> FloatArray | None:
-        """Its standard deviation; None with a curvature, because only each alone is known."""
+        """Return its standard deviation; None with a curvature, whose covariance is not kept."""
         if len(self.effects) > 1:
             return None
         return np.abs(values - self.reference) * self.effects[0].std
 
     @property
     def corrected(self) -> FloatArray:
-        """What is left of the measured changes, shape ``(n,)``."""
+        """Residuals of the measured changes, shape ``(n,)``."""
         return self.measured - self.explained(self.values)
 
     @property
@@ -75,22 +74,22 @@ class CovariateEffect:
 def find_covariate_effects(
     history: History, track: Track, stage: Stage
 ) -> tuple[CovariateEffect, ...]:
-    """Compare what covariates explain with the estimates, mode by mode.
+    """Return the effect of every described covariate on every mode.
 
     Parameters
     ----------
     history : History
-        Modal estimates; those that the track hardly believed are left out.
+        Modal estimates; outliers of the track are left out.
     track : Track
         Their track.
     stage : Stage
-        Its description, which names the covariates.
+        Description that names the covariates.
 
     Returns
     -------
     tuple of CovariateEffect
-        Covariate by covariate, in the order of the description; none for a covariate that is
-        unknown or never left its reference.
+        In the order of the description; none for a covariate that is unknown or never left its
+        reference.
     """
     columns = regressors(history.covariates, stage)
     if not columns:
@@ -130,7 +129,7 @@ def find_covariate_effects(
 
 
 def covariate_shifts(history: History, track: Track, stage: Stage) -> FloatArray:
-    """Give how far covariates have moved ln f of every mode, shape ``(n_logs, n_modes)``."""
+    """Return the change of ln f of every mode by covariates, shape ``(n_logs, n_modes)``."""
     columns = regressors(history.covariates, stage)
     known = {(e.mode, e.covariate): e for e in track.effects}
     moved = np.zeros((len(history.logs), len(track.modes)))
@@ -144,7 +143,7 @@ def _explained(columns: Sequence[Regressor], effects: Sequence[Effect]) -> Float
 
 
 def _offsets(history: History, known: dict[tuple[str, str], Effect]) -> FloatArray:
-    """Give how far sources, tunings and sensors read ln f off, shape ``(n_logs, n_series)``."""
+    """Return the offsets of ln f by sources, servo and sensors, shape ``(n_logs, n_series)``."""
     offsets = np.zeros_like(history.ln_frequency)
     for i, one in enumerate(history.series):
         bias = known.get((one.mode, f"bias:{one.source}"))

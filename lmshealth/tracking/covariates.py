@@ -15,7 +15,7 @@ from lmshealth.tracking import constants
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Regressor:
-    """One column that ln f depends on without wear.
+    """One column of the regression of ln f on covariates.
 
     Attributes
     ----------
@@ -24,9 +24,9 @@ class Regressor:
     values : ndarray
         Offset from the reference, 0 where unknown, shape ``(n_logs,)``.
     prior_std : float
-        Of d ln f per unit.
+        Prior standard deviation of d ln f per unit.
     unknown : ndarray
-        Variance that ln f has where the value is unknown, shape ``(n_logs,)``.
+        Variance of ln f where the value is unknown, shape ``(n_logs,)``.
     """
 
     name: str
@@ -36,10 +36,10 @@ class Regressor:
 
 
 def regressors(covariates: Mapping[str, FloatArray], stage: Stage | None) -> tuple[Regressor, ...]:
-    """Take the covariates that are asked for and known in at least one log.
+    """Return the regressors of the described covariates that at least one log has.
 
-    Without a stage every covariate present is taken, about its median. Keys are column names,
-    values of shape ``(n_logs,)``.
+    Without a stage every covariate present is one, about its median. Keys are column names, values
+    have shape ``(n_logs,)``.
     """
     wanted = (
         stage.description.covariate
@@ -57,10 +57,10 @@ def regressors(covariates: Mapping[str, FloatArray], stage: Stage | None) -> tup
             continue
         known = np.isfinite(values)
         offset = np.where(known, values - covariate.reference, 0.0)
-        # What never leaves its reference moves nothing.
+        # A covariate that never leaves its reference has no effect.
         if not offset.any():
             continue
-        # Of the values up to each log: no log knows of later ones.
+        # Of the values up to each log: no log uses later ones.
         spread = pd.Series(values).expanding().std(ddof=0).fillna(0.0).clip(lower=1.0).to_numpy()
         unknown = np.where(known, 0.0, (covariate.prior_std * spread) ** 2)
         found.append(Regressor(covariate.name, offset, covariate.prior_std, unknown))

@@ -1,4 +1,4 @@
-"""Histories: the modal estimates of one machine put in order, each given to its mode."""
+"""History: the modal estimates of one machine in order of time, each assigned to its mode."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from lmshealth.tracking.maintenance import RESETS, Action
 
 StepKind = Literal["step", "regreasing", "servo", "sensor", "reset"]
 
-# Sources in the order in which they stand where a mode has several.
+# Order of the series of one mode.
 _SOURCES = ("joint", "acc", "frf", "delta_e")
 _KINDS: dict[str, StepKind] = {"regrease": "regreasing", "servo": "servo", "sensor": "sensor"}
 _NO_MOMENT = datetime.max.replace(tzinfo=UTC)
@@ -39,25 +39,24 @@ class Series:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Step:
-    """Something that happens between two logs and moves the estimates at once.
+    """A sudden change of the estimates between two logs.
 
     Attributes
     ----------
     kind : str
-        ``step``: the modes themselves jump, without a declared cause. ``regreasing``: their
-        dampings do. ``servo``: the closed loop reads otherwise, in all sources, and ``sensor``:
-        one source does; neither counts as drift. ``reset``: work on guide or mount, which opens a
-        new baseline.
+        ``step``: the modes change without a declared cause. ``regreasing``: their dampings change.
+        ``servo``: the closed loop changes, in all sources, and ``sensor``: one source does; neither
+        is drift. ``reset``: work on guide or mount, which opens a new baseline.
     first : int
-        Index of the first log that sees it.
+        Index of the first log after it.
     there : ndarray of bool
-        The logs that see it, shape ``(n_logs,)``.
+        Logs that it applies to, shape ``(n_logs,)``.
     source : str
-        Of a sensor; empty where all sources are meant.
+        Of a sensor; empty for all sources.
     name : str
-        What tells it from others of its kind: a ``servo_id``, or a date.
+        Its ``servo_id``, or a date.
     declared : bool
-        Whether somebody said so, or the estimates did.
+        Whether it was declared, else it was detected.
     """
 
     kind: StepKind
@@ -77,7 +76,7 @@ class Step:
 
     @classmethod
     def found(cls, kind: StepKind, first: int, n_logs: int, source: str = "") -> Step:
-        """Make a step that nobody declared, and that all logs from one on see."""
+        """Make a detected step, which applies to all logs from the first on."""
         return cls(kind, first, np.arange(n_logs) >= first, source, declared=False)
 
 
@@ -100,7 +99,7 @@ class History:
     modes : tuple of str
         Mode names.
     series : tuple of Series
-        What the columns of the estimates are: a mode as one source sees it.
+        Columns of the estimates.
     ln_frequency, ln_damping : ndarray
         Shape ``(n_logs, n_series)``, NaN where the mode was not found.
     cov : ndarray
@@ -112,7 +111,7 @@ class History:
         Indices of the logs at which health is one by definition: the first, and one after every
         reset, ascending.
     steps : tuple of Step
-        What is known to have happened, in order.
+        Declared steps, in order.
     """
 
     stage: str
@@ -145,13 +144,7 @@ class History:
         freeze(self)
 
     def _expect_order(self) -> None:
-        """Insist on logs in the order of recording, and on an odometer that never runs backwards.
-
-        Raises
-        ------
-        ValueError
-            Naming the log that comes too late.
-        """
+        """Require ascending moments and, where there is one, an ascending odometer."""
         for name, ticks in (
             ("recorded_at", [moment.timestamp() for moment in self.recorded_at]),
             ("travel", self.travel if self.has_odometer else []),
@@ -163,13 +156,7 @@ class History:
                 )
 
     def _expect_errors(self) -> None:
-        """Insist on a covariance of every estimate.
-
-        Raises
-        ------
-        ValueError
-            Naming a log and a series whose estimate has none, or a variance that is not positive.
-        """
+        """Require a covariance of every estimate, with positive variances."""
         there = np.isfinite(np.hstack([self.ln_frequency, self.ln_damping]))
         variance = np.einsum("kii->ki", self.cov)
         both = there[:, :, None] & there[:, None, :]
@@ -193,7 +180,7 @@ class History:
         return bool(np.isfinite(self.travel).all())
 
     def clock(self) -> FloatArray:
-        """Odometer (m), or time (s) without one, since the baseline log, shape ``(n_logs,)``."""
+        """Return odometer (m), or time (s) without one, since the baseline, shape ``(n_logs,)``."""
         if self.has_odometer:
             ticks = self.travel
         else:
@@ -201,37 +188,36 @@ class History:
         return np.asarray(ticks - ticks[self.baseline])
 
     def mode_of(self) -> np.ndarray:
-        """Column of `modes` that each series belongs to, shape ``(n_series,)``."""
+        """Return the index of the mode of each series, shape ``(n_series,)``."""
         return np.array([self.modes.index(one.mode) for one in self.series], dtype=int)
 
     def columns(self, mode: str) -> list[int]:
-        """Give the series of a mode, in their order."""
+        """Return the indices of the series of a mode, in their order."""
         return [i for i, one in enumerate(self.series) if one.mode == mode]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LogEstimates:
-    r"""What one log said.
+    r"""Modal estimates of one log, with its metadata.
 
     Attributes
     ----------
     log : str
-        Its name.
+        Name of the log.
     digest : str
         SHA-256 of its content.
     metadata : Metadata
-        With identity, moment and odometer.
+        With identity of the machine, moment and odometer.
     modes : Modes
-        Its modal estimates.
+        The estimates.
     loop_error : float or None
-        RMS of the following error from 1 to 40 Hz in m, see `loop_error` of `following`; None
-        where the log does not tell.
+        RMS of the following error from 1 to 40 Hz in m; None where unknown.
     levels : RelativeSpectrum or None
-        The band of the tracked modes, for people to look at; None where the log does not show it.
+        Spectrum about the tracked modes, for plots; None where the log has none.
 
     Examples
     --------
-    Of a log of noise alone, which shows no mode:
+    A log of noise has no mode:
 
     >>> import numpy as np
     >>> import lmshealth
@@ -240,10 +226,10 @@ class LogEstimates:
     >>> np.savetxt("log.csv", noise, header=head, comments="")
     >>> log = lmshealth.read_log("log.csv")
     >>> modes = lmshealth.identify(log, lmshealth.load_stage("lms-y"))
-    >>> reading = lmshealth.LogEstimates(log.name, log.digest, log.metadata, modes)
-    >>> reading.metadata.stage, reading.metadata.travel, reading.modes.names
+    >>> estimates = lmshealth.LogEstimates(log.name, log.digest, log.metadata, modes)
+    >>> estimates.metadata.stage, estimates.metadata.travel, estimates.modes.names
     ('AX-3-Y', 12500.0, ())
-    >>> [(refusal.mode, refusal.reason) for refusal in reading.modes.refused]
+    >>> [(refusal.mode, refusal.reason) for refusal in estimates.modes.refused]
     [('roll', 'not-excited'), ('pitch', 'not-excited'), ('yaw', 'not-excited')]
     """
 
@@ -256,14 +242,14 @@ class LogEstimates:
 
 
 def sort_by_time(readings: Sequence[LogEstimates]) -> tuple[LogEstimates, ...]:
-    """Sort readings by the moment of recording, then by name."""
+    """Sort the estimates of logs by the moment of recording, then by name."""
     return tuple(sorted(readings, key=lambda r: (r.metadata.recorded_at or _NO_MOMENT, r.log)))
 
 
 def build_history(
     readings: Sequence[LogEstimates], stage: Stage | None = None, actions: Sequence[Action] = ()
 ) -> tuple[History, list[Refusal]]:
-    """Line up the modes of one machine.
+    """Assign the estimates of one machine to its modes, in the order of time.
 
     Parameters
     ----------
@@ -271,25 +257,24 @@ def build_history(
         Logs of one machine in any order, with identity and moment; the odometer is the clock where
         every log has it, else the time is.
     stage : Stage, optional
-        Says which modes are tracked; without it all are, and those without a name are named by
-        their frequency.
+        Names the tracked modes; without it all are, and those without a name are named by their
+        frequency.
     actions : sequence of Action
-        What was done to the machine. Work on guide or mount opens a new baseline; a regreasing, a
-        retuning and a new sensor are steps, as is every change of ``servo_id``.
+        Maintenance. Work on guide or mount opens a new baseline; a regreasing, a retuning and a new
+        sensor are steps, as is every change of ``servo_id``.
 
     Returns
     -------
     history : History
-        In the order of recording. Its first baseline is the first log that the manifest declares
-        one, else the first log.
+        Its first baseline is the first log that the manifest declares one, else the first log.
     refused : list of Refusal
-        Logs whose odometer contradicts the others, which are left out, and estimates that cannot
-        be given to a mode, which are missing.
+        Logs whose odometer contradicts the others, which are left out, and estimates that are
+        assigned to no mode, which are missing.
 
     Raises
     ------
     NotEnoughData
-        If there is no reading.
+        If there is no log.
 
     Examples
     --------
@@ -346,9 +331,9 @@ def build_history(
 def _without_contradictions(
     ordered: tuple[LogEstimates, ...],
 ) -> tuple[tuple[LogEstimates, ...], list[Refusal]]:
-    """Keep the longest run of logs whose odometer never runs backwards.
+    """Keep the longest run of logs with an ascending odometer; refuse the others.
 
-    One mistyped odometer contradicts all logs after or before it; it is the odd one out that goes.
+    One mistyped odometer contradicts all logs after or before it, and is the one that is refused.
     """
     if any(reading.metadata.travel is None for reading in ordered):
         return ordered, []
@@ -388,7 +373,7 @@ def _covariates(ordered: Sequence[LogEstimates]) -> dict[str, FloatArray]:
 
 
 def _steps(ordered: Sequence[LogEstimates], actions: Sequence[Action]) -> tuple[Step, ...]:
-    """Say what is known to have happened between the logs."""
+    """Return the declared steps between the logs."""
     moments = [reading.metadata.recorded_at for reading in ordered]
     steps: list[Step] = []
     ids = np.array([reading.metadata.servo_id or "" for reading in ordered])
@@ -400,7 +385,7 @@ def _steps(ordered: Sequence[LogEstimates], actions: Sequence[Action]) -> tuple[
     for action in sorted(actions, key=lambda action: action.recorded_at):
         later = np.array([m is not None and m >= action.recorded_at for m in moments])
         first = int(np.argmax(later))
-        # Before the first log and after the last nothing is seen of it.
+        # Actions before the first log or after the last have no effect on the estimates.
         if not later.any() or first == 0:
             continue
         kind: StepKind = "reset" if action.action in RESETS else _KINDS[action.action]
@@ -413,7 +398,7 @@ def _steps(ordered: Sequence[LogEstimates], actions: Sequence[Action]) -> tuple[
 
 
 def _baselines(declared: list[int], resets: list[int], n_logs: int) -> tuple[int, ...]:
-    """Give the log at which each baseline begins: the first declared one since the last reset."""
+    """Return the first log of each baseline: the first declared one since the last reset."""
     begins = [0, *resets]
     ends = [*resets, n_logs]
     chosen = [
@@ -424,13 +409,15 @@ def _baselines(declared: list[int], resets: list[int], n_logs: int) -> tuple[int
 
 
 def _estimates(ordered: Sequence[LogEstimates], stage: Stage | None) -> list[Estimates]:
-    """Give what each log says of the modes that are tracked, with shapes over all channels."""
+    """Return the estimates of tracked modes of each log, with shapes over all channels."""
     tracked = None if stage is None else {mode.name for mode in stage.modes if mode.tracked}
     channels = list(dict.fromkeys(c for r in ordered for c in r.modes.shape_channels))
     estimates = []
     for reading in ordered:
         modes = reading.modes
-        named = [_named(modes, i, stage) for i in range(len(modes.names))]
+        named = [
+            name or _nearest(float(modes.frequency[i]), stage) for i, name in enumerate(modes.names)
+        ]
         kept = np.array([i for i, n in enumerate(named) if tracked is None or n in tracked], int)
         shapes = np.full((kept.size, len(channels)), np.nan)
         places = [channels.index(channel) for channel in modes.shape_channels]
@@ -449,14 +436,15 @@ def _estimates(ordered: Sequence[LogEstimates], stage: Stage | None) -> list[Est
     return estimates
 
 
-def _named(modes: Modes, i: int, stage: Stage | None) -> str:
-    """Name of an estimate; without one, that of the nearest mode of the stage within its search."""
-    if modes.names[i] or stage is None:
-        return modes.names[i]
-    found = float(modes.frequency[i])
-    away = {m.name: abs(found / m.frequency_hz - 1) for m in stage.modes if m.tracked}
-    near = [m.name for m in stage.modes if m.tracked and away[m.name] <= m.search]
-    return min(near, key=lambda name: away[name], default="")
+def _nearest(frequency: float, stage: Stage | None) -> str:
+    """Return the nearest tracked mode whose search holds a frequency in Hz, else no name."""
+    if stage is None:
+        return ""
+    off = {
+        m.name: (abs(frequency / m.frequency_hz - 1), m.search) for m in stage.modes if m.tracked
+    }
+    near = {name: away for name, (away, search) in off.items() if away <= search}
+    return min(near, key=lambda name: near[name], default="")
 
 
 def _unassigned(

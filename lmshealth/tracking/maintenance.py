@@ -1,4 +1,4 @@
-"""Maintenance: what was done to a machine, and where its life starts anew."""
+"""Maintenance: actions on a machine, and which of them open a new baseline."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from lmshealth.io.tables import Row, read_sheet
 
 _FILE = "maintenance.csv"
 _NEEDED = ("stage", "recorded_at", "action")
-# Work on guide or mount changes what "the state at baseline" means.
+# Work on guide or mount opens a new baseline.
 RESETS = ("preload-adjust", "guide-replaced", "mount-tightened")
-# These move dampings, closed loop and readings at once, without wear.
+# Steps without wear: of dampings, of the closed loop, of one source.
 STEPS = ("regrease", "servo", "sensor")
 
 
@@ -33,14 +33,14 @@ class Action:
 
 @dataclass(frozen=True, slots=True)
 class Unread:
-    """Something of ``maintenance.csv`` that is not understood.
+    """A refused row or table of ``maintenance.csv``.
 
     Attributes
     ----------
     refusal : Refusal
-        What and why, under the name of the table.
+        Under the name of the table.
     stage : str or None
-        The machine that a row names, empty where it names none; None for a whole table.
+        The machine of the row, empty where it names none; None for a whole table.
     """
 
     refusal: Refusal
@@ -49,14 +49,14 @@ class Unread:
 
 @dataclass(frozen=True, slots=True)
 class Maintenance:
-    """What was done, as far as it is understood.
+    """Actions, and rows that cannot be read.
 
     Attributes
     ----------
     actions : tuple of Action
         In the order of time.
     unread : tuple of Unread
-        What may have been done besides.
+        Possible further actions.
     """
 
     actions: tuple[Action, ...] = ()
@@ -64,11 +64,11 @@ class Maintenance:
 
     @property
     def refused(self) -> tuple[Refusal, ...]:
-        """What is not understood, for ``refused.csv``."""
+        """Refusals for ``refused.csv``."""
         return tuple(one.refusal for one in self.unread)
 
     def of(self, machine: str) -> Maintenance:
-        """Give what concerns one machine; what names none may concern any."""
+        """Return the part that concerns one machine; rows without a machine concern all."""
         return Maintenance(
             tuple(action for action in self.actions if action.stage == machine),
             tuple(one for one in self.unread if one.stage in (machine, "", None)),
@@ -76,7 +76,7 @@ class Maintenance:
 
 
 NO_MAINTENANCE = Maintenance()
-"""What is known where there is no table."""
+"""Maintenance without a table."""
 
 
 def read_maintenance(folder: Path) -> Maintenance:
@@ -85,7 +85,7 @@ def read_maintenance(folder: Path) -> Maintenance:
     Raises
     ------
     BadTable
-        If it is no folder.
+        If the path is no folder.
     """
     found = find_sheets(folder, _FILE)
     actions: list[Action] = []
@@ -101,7 +101,7 @@ def read_actions(path: Path) -> tuple[Action, ...]:
     Raises
     ------
     BadTable
-        If anything in it is not understood: who names one table can mend it.
+        If any row cannot be read.
     """
     actions: list[Action] = []
     unread: list[Unread] = []
@@ -124,7 +124,7 @@ def _read(path: Path, name: str, actions: list[Action], unread: list[Unread]) ->
 
 
 def _action(row: Row) -> Action:
-    """Read a row; what is not used of it is not judged."""
+    """Read a row; other columns are ignored."""
     if row.trouble:
         raise Unusable("bad-row", row.trouble)
     if row.cells["action"] not in (known := (*RESETS, *STEPS)):
@@ -138,7 +138,7 @@ def _action(row: Row) -> Action:
 
 
 def _machine(row: Row) -> str:
-    """Name the machine of a row that is not understood, as well as can be."""
+    """Return the machine of a refused row, or an empty name."""
     try:
         return parse_name(row.cells, "stage") or ""
     except Unusable:
@@ -146,29 +146,30 @@ def _machine(row: Row) -> str:
 
 
 def maintenance_notes(work: Maintenance, moments: Sequence[datetime | None]) -> list[str]:
-    """Say what the reader of a report must know of the work on a machine.
+    """Return notes for a report: rows that cannot be read, and new baselines.
 
     Parameters
     ----------
     work : Maintenance
-        What was done to it.
+        Of one machine.
     moments : sequence of datetime or None
-        When its logs were recorded.
+        Times of recording of its logs.
     """
     notes = [
-        f"{one.refusal.log} is not fully understood ({one.refusal.detail}): if it tells of work on "
-        "this machine, nothing here knows of it."
+        f"{one.refusal.log} cannot be read completely ({one.refusal.detail}): work on this machine "
+        "that it lists there is not used."
         for one in work.unread
     ]
-    resets = [action for action in work.actions if action.action in RESETS]
-    for action in resets:
+    for action in work.actions:
+        if action.action not in RESETS:
+            continue
         before = sum(moment is not None and moment < action.recorded_at for moment in moments)
-        told = f"{action.action} on {action.recorded_at.date().isoformat()}"
+        work_done = f"{action.action} on {action.recorded_at.date().isoformat()}"
         if before == len(moments):
-            notes.append(f"{told}: no log since, so nothing is known after it.")
+            notes.append(f"{work_done}: no log since, so nothing is known after it.")
         elif before:
             notes.append(
-                f"{told} opened a new baseline: fractions are relative to the state after it, and "
-                f"{before} earlier logs only tell what temperature, load and loop do."
+                f"{work_done} opened a new baseline: fractions are relative to the state after it, "
+                f"and {before} earlier logs only inform the effects of temperature, load and loop."
             )
     return notes

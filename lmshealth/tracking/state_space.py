@@ -1,14 +1,12 @@
-"""State space of a machine's modes: what is in the state, how it moves, and how logs see it.
+"""State space of a machine's modes: state vector, measurement matrices and prior.
 
 For M modes the state is
 
     [ℓ, ℓ̇, ln ζ, ℓ₀ | covariates | biases | steps]
 
-each but the biases in blocks of M: ln frequency at the covariates' reference, its rate, ln damping,
-a copy of ℓ at the baseline; a coefficient per regressor; the bias of ln f and of ln ζ of every
-series but the first seen of its mode; and for every step the jumps of ln f and of ln ζ. The copy ℓ₀
-makes the covariance hold Cov(ℓ, ℓ₀), so that the drift ℓ - ℓ₀ has the right variance and the error
-of the baseline stays common to all epochs.
+all but the biases in blocks of M: ln f at the covariates' reference, its rate, ln ζ, a copy of ℓ
+at the baseline; a coefficient per regressor; the bias of ln f and of ln ζ of every series but the
+first detected of its mode; the jumps of ln f and of ln ζ of every step. The drift is ℓ - ℓ₀.
 """
 
 from __future__ import annotations
@@ -27,9 +25,9 @@ _KM = 1000.0
 
 
 def state_space(history: History, stage: Stage | None, steps: tuple[Step, ...] = ()) -> StateSpace:
-    """Make the state space of a history.
+    """Return the state space of a history, with rates and random walks per life.
 
-    Rates and walks are counted per horizon of the stage, or without one per length of the history.
+    A life is the horizon of the stage, or without one the length of the history.
     """
     life = float(np.ptp(history.clock()))
     if stage is not None and history.has_odometer:
@@ -38,18 +36,18 @@ def state_space(history: History, stage: Stage | None, steps: tuple[Step, ...] =
 
 
 class StateSpace:
-    """Where everything stands in the state, and the matrices of a history.
+    """Layout of the state, and the measurement matrices of a history.
 
     Parameters
     ----------
     history : History
-        Says which modes and series there are, and when logs were recorded.
+        Modes, series and times of the logs.
     regressed : tuple of Regressor
         Covariates.
     life : float
-        Ticks of the clock that rates and walks are counted per.
+        Length of a life on the clock.
     steps : tuple of Step
-        What happened.
+        Steps in the model.
 
     Attributes
     ----------
@@ -77,39 +75,39 @@ class StateSpace:
         self.size = self.first_step + 2 * m * len(steps)
         self.ticks = np.diff(history.clock(), prepend=history.clock()[:1]) / life
         self._fixed = self._without_steps()
-        self._read = [(step, self._reading(step)) for step in steps]
+        self._jumps = [(step, self._jump_matrix(step)) for step in steps]
 
     def with_step(self, step: Step) -> StateSpace:
-        """Give the same with one more step at its end: the state only grows."""
+        """Return the state space with one more step at the end of the state."""
         longer = copy(self)
         longer.steps = (*self.steps, step)
         longer.size = self.size + 2 * self.n_modes
-        longer._read = [*self._read, (step, self._reading(step))]
+        longer._jumps = [*self._jumps, (step, self._jump_matrix(step))]
         return longer
 
     def matrix(self, k: int) -> FloatArray:
-        """Give the measurement matrix of ``[ln f, ln ζ]`` of log k, ``(2 n_series, size)``."""
+        """Return the measurement matrix of ``[ln f, ln ζ]`` of log k, ``(2 n_series, size)``."""
         fixed: FloatArray = self._fixed[k]
         if not self.steps:
             return fixed
         matrix = np.zeros((fixed.shape[0], self.size))
         matrix[:, : self.first_step] = fixed
-        for j, (step, reading) in enumerate(self._read):
+        for j, (step, reading) in enumerate(self._jumps):
             if step.there[k]:
                 matrix[:, self.jump(j)] = reading
         return matrix
 
     def regressor(self, j: int) -> slice:
-        """Where the coefficients of a regressor stand."""
+        """Return the place of the coefficients of a regressor."""
         return slice((4 + j) * self.n_modes, (5 + j) * self.n_modes)
 
     def jump(self, j: int) -> slice:
-        """Where the jumps of a step stand: those of ln f, then those of ln ζ."""
+        """Return the place of the jumps of a step: those of ln f, then those of ln ζ."""
         first = self.first_step + 2 * self.n_modes * j
         return slice(first, first + 2 * self.n_modes)
 
     def _biased(self) -> tuple[int, ...]:
-        """Series that are measured against another: all of a mode but the one seen first."""
+        """Return the series that have a bias: all of a mode but the one detected first."""
         there = np.isfinite(self.history.ln_frequency)
         first = np.where(there.any(axis=0), there.argmax(axis=0), len(there))
         biased: list[int] = []
@@ -120,7 +118,7 @@ class StateSpace:
         return tuple(biased)
 
     def _without_steps(self) -> FloatArray:
-        """Give what all logs see of a state without steps, ``(n_logs, 2 n_series, first_step)``."""
+        """Return all measurement matrices without steps, ``(n_logs, 2 n_series, first_step)``."""
         history, r = self.history, len(self.history.series)
         mode, series = history.mode_of(), np.arange(r)
         matrix = np.zeros((len(history.logs), 2 * r, self.first_step))
@@ -133,10 +131,10 @@ class StateSpace:
             matrix[:, r + i, self.first_bias + 2 * j + 1] = 1
         return matrix
 
-    def _reading(self, step: Step) -> FloatArray:
-        """Give how a log reads the jumps of a step, ``(2 n_series, 2 n_modes)``.
+    def _jump_matrix(self, step: Step) -> FloatArray:
+        """Return the measurement matrix of the jumps of a step, ``(2 n_series, 2 n_modes)``.
 
-        What moves the modes themselves is read in them.
+        It is zero for a step that changes the modes: ℓ and ln ζ contain its jumps.
         """
         series, r, m = self.history.series, len(self.history.series), self.n_modes
         reading = np.zeros((2 * r, 2 * m))
@@ -147,9 +145,9 @@ class StateSpace:
         return reading
 
     def prior(self) -> tuple[FloatArray, FloatArray]:
-        """Mean and covariance before the first log, without rates and steps.
+        """Return mean and covariance before the first log, without rates and steps.
 
-        The centre is each mode's first estimate.
+        The mean is each mode's first estimate.
         """
         history = self.history
         mean, std = np.zeros(self.size), np.zeros(self.size)
@@ -168,14 +166,14 @@ class StateSpace:
         return mean, np.diag(std**2)
 
     def unknown(self) -> FloatArray:
-        """Variance that ln f has where a covariate is unknown, shape ``(n_logs,)``."""
+        """Return the variance of ln f due to unknown covariates, shape ``(n_logs,)``."""
         total = np.zeros(len(self.history.logs))
         for regressor in self.regressed:
             total += regressor.unknown
         return total
 
     def drift(self) -> FloatArray:
-        """Contrast that makes the drift of a state, shape ``(n_modes, 4 n_modes)``."""
+        """Return the contrast ℓ - ℓ₀ of a state, shape ``(n_modes, 4 n_modes)``."""
         m = self.n_modes
         contrast = np.zeros((m, 4 * m))
         contrast[:, self.level] = np.eye(m)

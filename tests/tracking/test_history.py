@@ -12,10 +12,16 @@ import pytest
 from lmshealth.errors import NotEnoughData
 from lmshealth.io.log import Refusal
 from lmshealth.stage.description import Stage
-from lmshealth.tracking.history import Series, build_history, missing_mode_notes, sort_by_time
+from lmshealth.tracking.history import (
+    History,
+    Series,
+    build_history,
+    missing_mode_notes,
+    sort_by_time,
+)
 from lmshealth.tracking.maintenance import Action
 from lmshealth.tracking.track import accepted_estimates, outlier_refusals, track
-from tests.lives import FADING, START, make_reading, make_stage
+from tests.lives import FADING, START, awkward_history, make_reading, make_stage, make_track
 
 
 @pytest.fixture
@@ -231,3 +237,90 @@ def test_a_mode_that_is_no_longer_seen_is_told(stage: Stage) -> None:
     assert told == ["pitch: no estimate in the last 3 logs; nothing new is known."]
     history, refused = build_history(logs[:5], stage)
     assert missing_mode_notes(history, refused) == []
+
+
+@pytest.fixture
+def history() -> History:
+    """Make two modes by two sources, with a second baseline at log 9."""
+    return awkward_history(np.random.default_rng(1))
+
+
+def test_the_present_baseline_is_the_last(history: History) -> None:
+    """Of several baselines the last counts, and the clock is 0 there."""
+    assert history.baseline == 9
+    assert history.clock()[9] == 0
+    np.testing.assert_allclose(np.diff(history.clock()), np.diff(history.travel))
+
+
+def test_without_odometer_the_clock_is_time(history: History) -> None:
+    """One odometer reading that is missing makes the time the clock, in seconds."""
+    travel = history.travel.copy()
+    assert history.has_odometer
+    travel[3] = np.nan
+    timed = replace(history, travel=travel)
+    assert not timed.has_odometer
+    week = timedelta(days=7).total_seconds()
+    np.testing.assert_allclose(timed.clock(), week * (np.arange(16) - 9))
+    assert timed.recorded_at[0] == START
+
+
+def test_series_know_their_mode(history: History) -> None:
+    """Columns of the estimates are found by mode."""
+    assert history.mode_of().tolist() == [0, 1, 0, 1]
+    assert history.columns("pitch") == [1, 3]
+    assert history.columns("yaw") == []
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "message"),
+    [
+        ("travel", np.zeros(3), r"travel has shape \(3,\), needed \(16,\)"),
+        ("loop_error", np.zeros((16, 1)), "loop_error has shape"),
+        ("ln_damping", np.zeros((16, 2)), r"ln_damping has shape \(16, 2\), needed \(16, 4\)"),
+        ("cov", np.zeros((16, 4, 4)), r"cov has shape .* needed \(16, 8, 8\)"),
+        ("baselines", (), "baselines are logs"),
+        ("baselines", (0, 16), r"baselines are logs \(0, 16\) of 16"),
+        ("series", (Series("strange", "acc"),) * 4, "not among"),
+    ],
+)
+def test_histories_that_contradict_themselves_are_refused(
+    history: History, field: str, value: object, message: str
+) -> None:
+    """Wrong shapes, baselines that are no logs and series of unknown modes are named."""
+    with pytest.raises(ValueError, match=message):
+        replace(history, **{field: value})
+
+
+@pytest.mark.parametrize("variance", [np.nan, 0.0, -1e-6])
+def test_estimates_without_errors_are_refused(history: History, variance: float) -> None:
+    """No std, none at all and a negative variance are named, with their log and series."""
+    cov = np.array(history.cov)
+    cov[5, 2, 2] = variance
+    with pytest.raises(ValueError, match=r"005.csv: roll by delta_e has an estimate of variance"):
+        replace(history, cov=cov)
+    cov = np.array(history.cov)
+    cov[5, 2, 3] = np.nan
+    with pytest.raises(ValueError, match=r"005.csv: roll by delta_e .* without covariances"):
+        replace(history, cov=cov)
+
+
+def test_logs_out_of_order_are_refused(history: History) -> None:
+    """A clock or an odometer that runs backwards is named; logs at one moment are not refused."""
+    moments = list(history.recorded_at)
+    moments[4], moments[5] = moments[5], moments[4]
+    with pytest.raises(ValueError, match=r"recorded_at runs backwards at 005.csv"):
+        replace(history, recorded_at=tuple(moments))
+    travel = np.array(history.travel)
+    travel[7] = travel[8] + 1
+    with pytest.raises(ValueError, match=r"travel runs backwards at 008.csv"):
+        replace(history, travel=travel)
+    moments[5] = moments[4] = moments[3]
+    assert replace(history, recorded_at=tuple(moments)).clock().size == 16
+
+
+def test_arrays_are_read_only(history: History) -> None:
+    """Nobody writes to a history, a step or a track."""
+    followed = make_track(np.zeros((3, 2)), np.zeros((3, 2, 2)))
+    for array in (history.cov, history.steps[0].there, followed.drift, followed.innovations):
+        with pytest.raises(ValueError, match="read-only"):
+            array[0] = 1

@@ -5,13 +5,15 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 
 from lmshealth.errors import BadTable
+from lmshealth.report.tables import COLUMNS, frame, track_cov_rows, track_rows
 from lmshealth.stage.description import Stage
 from lmshealth.tracking.history import LogEstimates
-from lmshealth.tracking.read_tables import read_estimates
-from tests.lives import FADING, make_stage
+from lmshealth.tracking.read_tables import read_drifts, read_estimates
+from tests.lives import FADING, make_stage, make_track
 
 HEAD = "stage,log,recorded_at,travel_km,temperature_c,mode,source,frequency_hz,frequency_std_hz,"
 HEAD += "damping_ratio,damping_ratio_std,correlation_f_zeta\n"
@@ -46,11 +48,11 @@ def read(
 ) -> list[LogEstimates]:
     """Write tables and read them."""
     path, cross = _write(tmp_path, text, terms)
-    return list(read_estimates(path, cross_terms=cross, stage=stage).readings)
+    return list(read_estimates(path, cross_terms=cross, stage=stage).entries)
 
 
 def notes(tmp_path: Path, text: str, terms: str = "") -> str:
-    """Read tables and give what is said about them."""
+    """Read tables and return its notes."""
     path, cross = _write(tmp_path, text, terms)
     return "\n".join(read_estimates(path, cross_terms=cross).notes)
 
@@ -88,7 +90,7 @@ def test_another_program_needs_three_columns(tmp_path: Path) -> None:
     assert "no column stage" in notes(tmp_path, text)
 
 
-def test_what_is_assumed_is_said(tmp_path: Path) -> None:
+def test_assumptions_are_noted(tmp_path: Path) -> None:
     """Order of time, dampings without a standard deviation, sources without cross terms."""
     text = HEAD + row(day=2) + row(log="b", day=1)
     assert "not in the order of time" in notes(tmp_path, text)
@@ -96,12 +98,12 @@ def test_what_is_assumed_is_said(tmp_path: Path) -> None:
     assert "1 damping ratios" in notes(tmp_path, text)
     assert "line 2" in notes(tmp_path, text)
     text = HEAD + row() + row(source="delta_e")
-    assert "give modes_cov.csv" in notes(tmp_path, text)
+    assert "add modes_cov.csv" in notes(tmp_path, text)
     terms = "a,acc,roll,delta_e,roll,1e-8\n"
     assert notes(tmp_path, text, terms) == ""
     told = notes(tmp_path, text, terms.replace("delta_e,roll", "delta_e,heave"))
     assert "1 of 1 cross terms are of estimates that the table does not have (line 2)" in told
-    assert "give modes_cov.csv" in told
+    assert "add modes_cov.csv" in told
     text = HEAD + row(day=2) + row(log="b", day=1).replace("AX-1", "AX-2")
     assert notes(tmp_path, text) == ""
     assert notes(tmp_path, HEAD + row()) == ""
@@ -114,19 +116,22 @@ def test_what_is_assumed_is_said(tmp_path: Path) -> None:
         ("recorded_at,frequency_hz\n2026-03-01T06:00:00Z,1\n", "no column ['frequency_std_hz']"),
         (HEAD + row(std=""), "line 2: frequency_std_hz is missing"),
         (HEAD + row(std=-0.1), "line 2: frequency_std_hz is -0.1"),
-        (HEAD + row(std=1e-9), "line 2: frequency_std_hz is 1e-09, below 1e-07 of the frequency"),
+        (
+            HEAD + row(std=1e-9),
+            "line 2: frequency_std_hz is 1e-09; needed is one that a measurement can have",
+        ),
         ("recorded_at;frequency_hz\n1;2\n", "columns are separated by commas"),
         (HEAD + row(f=0), "line 2: frequency_hz is 0"),
         (HEAD + row(f="fast"), "line 2: frequency_hz is no finite number"),
         (HEAD + row(f="inf"), "line 2: frequency_hz is no finite number"),
-        (HEAD + row() + row(), "line 2, 3: roll by acc stands there twice"),
+        (HEAD + row() + row(), "line 2, 3: roll by acc exists twice"),
         (HEAD + row() + row(mode="pitch", km=11), "log a has travel_km 10 and 11"),
         (HEAD + row(rho=1.0), "correlation_f_zeta reaches 1"),
         (HEAD + row().replace("+00:00", ""), "needs a time zone"),
         (HEAD + row().replace("2026-03-01T", "1.3.2026 "), "is no ISO date"),
     ],
 )
-def test_what_makes_no_sense_is_refused_with_its_line(
+def test_values_that_are_not_valid_are_refused_with_their_line(
     tmp_path: Path, text: str, needle: str
 ) -> None:
     """The error names the file, the line, what was got and what is needed."""
@@ -149,3 +154,135 @@ def test_names_that_the_stage_does_not_know_are_refused(tmp_path: Path, stage: S
     with pytest.raises(BadTable, match=r"modes \['shaker'\] are none of small") as caught:
         read(tmp_path, HEAD + row(mode="shaker"), stage=stage)
     assert "leave the column mode empty" in str(caught.value)
+
+
+DRIFT_HEAD = "stage,recorded_at,travel_km,mode,drift,drift_std\n"
+DRIFT_ROW = "AX-1,2026-03-{day:02d}T06:00:00+00:00,{km},{mode},{drift},{std}\n"
+DRIFT_TERMS = "stage,recorded_at,mode_a,mode_b,cov_drift\n"
+DRIFT_TERM = "AX-1,2026-03-{day:02d}T06:00:00+00:00,roll,pitch,{cov}\n"
+
+
+def write_drifts(tmp_path: Path, text: str, terms: str = "") -> tuple[Path, Path | None]:
+    """Write a table, and its cross terms where there are any."""
+    path, cross = tmp_path / "track.csv", tmp_path / "track_cov.csv"
+    path.write_text(text)
+    cross.write_text(DRIFT_TERMS + terms)
+    return path, cross if terms else None
+
+
+def drift_row(day: int = 1, mode: str = "roll", drift: object = -0.01, std: object = 1e-3) -> str:
+    """Write one drift_row."""
+    return DRIFT_ROW.format(day=day, km=10 * day, mode=mode, drift=drift, std=std)
+
+
+def test_what_a_track_writes_is_read_again(tmp_path: Path) -> None:
+    """Drifts, covariances, moments and odometer come back as they were; so do missing drifts."""
+    rng = np.random.default_rng(1)
+    root = 1e-3 * rng.standard_normal((5, 3, 3))
+    cov = root @ np.swapaxes(root, 1, 2)
+    drift = 0.01 * rng.standard_normal((5, 3))
+    drift[0], cov[0] = 0.0, 0.0
+    drift[3, 2], cov[3, 2], cov[3, :, 2] = np.nan, np.nan, np.nan
+    known = make_track(drift, cov)
+    for name, rows in (("track", track_rows(known)), ("track_cov", track_cov_rows(known))):
+        frame(COLUMNS[name], rows).to_csv(tmp_path / f"{name}.csv", index=False)
+    read = read_drifts(tmp_path / "track.csv", cross_terms=tmp_path / "track_cov.csv")
+    (found,) = read.entries
+    assert read.notes == ()
+    assert (found.stage, found.modes) == (known.stage, known.modes)
+    assert found.recorded_at == known.recorded_at
+    np.testing.assert_allclose(found.travel, known.travel)
+    np.testing.assert_array_equal(found.drift, known.drift)
+    np.testing.assert_allclose(found.drift_cov, known.drift_cov, rtol=1e-14)
+
+
+def test_logs_of_one_moment_are_epochs_of_their_own(tmp_path: Path) -> None:
+    """Two logs of one moment keep their drifts and cross terms apart, in their order."""
+    text = DRIFT_HEAD + "".join(
+        drift_row(1, mode, d) for d in (-0.01, -0.02) for mode in ("roll", "pitch")
+    )
+    path, terms = write_drifts(
+        tmp_path, text, DRIFT_TERM.format(day=1, cov=1e-7) + DRIFT_TERM.format(day=1, cov=2e-7)
+    )
+    (found,) = read_drifts(path, cross_terms=terms).entries
+    np.testing.assert_array_equal(found.drift, [[-0.01, -0.01], [-0.02, -0.02]])
+    np.testing.assert_array_equal(found.drift_cov[:, 0, 1], [1e-7, 2e-7])
+
+
+def test_rows_are_put_in_the_order_of_time(tmp_path: Path) -> None:
+    """Epochs ascend whatever the order of rows."""
+    path, _ = write_drifts(
+        tmp_path, DRIFT_HEAD + drift_row(3, drift=-0.03) + drift_row(1) + drift_row(2, drift=-0.02)
+    )
+    (found,) = read_drifts(path).entries
+    np.testing.assert_array_equal(found.drift[:, 0], [-0.01, -0.02, -0.03])
+    np.testing.assert_array_equal(found.travel, [1e4, 2e4, 3e4])
+
+
+def test_what_is_missing_is_assumed_and_said(tmp_path: Path) -> None:
+    """Without stage and cross terms: one machine, independent drifts, no odometer; two notes."""
+    table = pd.DataFrame(
+        {
+            "recorded_at": ["2026-03-01T06:00:00Z"] * 2,
+            "mode": ["roll", "pitch"],
+            "drift": [-0.01, -0.02],
+            "drift_std": [1e-3, 2e-3],
+        }
+    )
+    path = tmp_path / "mine.csv"
+    table.to_csv(path, index=False)
+    read = read_drifts(path)
+    (found,) = read.entries
+    assert found.stage == "mine"
+    assert np.isnan(found.travel).all()
+    np.testing.assert_allclose(found.drift_cov[0], np.diag([1e-6, 4e-6]))
+    assert "one machine, mine" in read.notes[0]
+    assert "independent" in read.notes[1]
+
+
+def test_several_machines_stay_apart(tmp_path: Path) -> None:
+    """Every machine has its own drifts, modes and cross terms."""
+    other = (drift_row(1, "yaw") + drift_row(2, "yaw")).replace("AX-1", "AX-2")
+    text = DRIFT_HEAD + drift_row(1) + drift_row(1, "pitch") + other
+    path, terms = write_drifts(tmp_path, text, DRIFT_TERM.format(day=1, cov=5e-7))
+    one, two = read_drifts(path, cross_terms=terms).entries
+    assert (one.modes, two.modes) == (("roll", "pitch"), ("yaw",))
+    assert one.drift_cov[0, 0, 1] == 5e-7
+    assert two.drift.shape == (2, 1)
+
+
+@pytest.mark.parametrize(
+    ("text", "terms", "told"),
+    [
+        ("stage;recorded_at\n", "", "separated by commas"),
+        (DRIFT_HEAD, "", "no row"),
+        (DRIFT_HEAD + drift_row(drift="much"), "", "line 2: drift is no finite number"),
+        (DRIFT_HEAD + drift_row() + drift_row(2, std=-1), "", "line 3: drift_std is -1"),
+        (DRIFT_HEAD + drift_row() + drift_row(2, std=1e-170), "", "line 3: drift_std is 1e-170"),
+        (
+            DRIFT_HEAD + drift_row() + drift_row(2, std=1e200),
+            "",
+            "drift_std is 1e.200; needed is a standard",
+        ),
+        (
+            DRIFT_HEAD + drift_row(drift=1e300),
+            "",
+            "line 2: drift is 1e.300; needed is a change of ln",
+        ),
+        (DRIFT_HEAD + drift_row().replace("AX-1", ""), "", "line 2: stage is empty"),
+        (DRIFT_HEAD + drift_row().replace("+00:00", ""), "", "needs a time zone"),
+        (
+            DRIFT_HEAD + drift_row() + drift_row(mode="pitch"),
+            DRIFT_TERM.format(day=1, cov=1),
+            "are no covariance",
+        ),
+    ],
+)
+def test_bad_tables_are_refused_by_their_line(
+    tmp_path: Path, text: str, terms: str, told: str
+) -> None:
+    """Every error names the file and what is wrong where."""
+    path, cross = write_drifts(tmp_path, text, terms)
+    with pytest.raises(BadTable, match=told) as caught:
+        read_drifts(path, cross_terms=cross)
+    assert "track.csv" in str(caught.value)

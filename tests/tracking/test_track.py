@@ -8,6 +8,7 @@ from math import inf
 
 import numpy as np
 import pytest
+from scipy import stats
 
 from lmshealth._arrays import FloatArray
 from lmshealth.errors import NotEnoughData
@@ -17,7 +18,7 @@ from lmshealth.tracking import filter_bank as bank
 from lmshealth.tracking.change_detection import loop_evidence
 from lmshealth.tracking.constants import JUMP_STD
 from lmshealth.tracking.history import History
-from lmshealth.tracking.track import Track, track
+from lmshealth.tracking.track import Event, Track, consistency, track
 from tests.lives import (
     DAMPING,
     FREQUENCY,
@@ -26,11 +27,12 @@ from tests.lives import (
     cut,
     make_history,
     make_stage,
+    make_track,
     rough_history,
     seen_by,
     since,
 )
-from tests.oracles import JUMPS, Known, Wander, filterpy_loop
+from tests.oracles import JUMPS, Known, Wander, binomial_band, filterpy_loop
 from tests.tracking.test_filter_bank import KNOWN, SETTINGS, one
 
 PUBLISHED = (
@@ -546,3 +548,91 @@ def test_a_history_without_estimates_is_refused(stage: Stage) -> None:
     """No estimate in any log: the error counts the logs."""
     with pytest.raises(NotEnoughData, match="no modal estimate in 5 logs"):
         track(make_history(np.full((5, 2), np.nan)), stage)
+
+
+@pytest.mark.parametrize("field", ["drift", "drift_cov", "noise_scale", "nis", "widening"])
+def test_tracks_of_wrong_shape_are_refused(field: str) -> None:
+    """Every array of a track has as many epochs as there are logs."""
+    followed = make_track(np.zeros((3, 2)), np.zeros((3, 2, 2)))
+    with pytest.raises(ValueError, match=f"{field} has shape"):
+        replace(followed, **{field: getattr(followed, field)[:2]})
+
+
+def test_alarms_are_events_of_damage() -> None:
+    """Of all events only those of kind alarm are alarms."""
+    followed = make_track(np.zeros((3, 1)), np.zeros((3, 1, 1)))
+    events = tuple(
+        Event(kind, 1, "roll", "", 0.1, 0.01, 9.0, False, 2) for kind in ("step", "alarm")
+    )
+    assert replace(followed, events=events).alarms == events[1:]
+
+
+def white(rng: np.random.Generator, n: int = 200, rows: int = 4) -> np.ndarray:
+    """Draw innovations of a filter that is right, with a few missing."""
+    innovations = rng.standard_normal((n, rows))
+    innovations[rng.random((n, rows)) < 0.1] = np.nan
+    return innovations
+
+
+def judged(innovations: np.ndarray) -> tuple[float, float]:
+    """Judge innovations that are independent of one another: both p values."""
+    squares = np.nansum(innovations**2, axis=1)
+    found = consistency(squares, np.isfinite(innovations).sum(axis=1).astype(float), innovations)
+    least = [1e-3 if sign > 0 else 1e-6 for sign in (found.nis - 1, found.autocorrelation)]
+    assert found.holds == (found.p_value >= least[0] and found.autocorrelation_p_value >= least[1])
+    return found.p_value, found.autocorrelation_p_value
+
+
+@pytest.mark.slow
+def test_p_values_of_a_filter_that_is_right_are_uniform() -> None:
+    """A tenth of them lies under a tenth, of the sum of squares and of the autocorrelation."""
+    rng = np.random.default_rng(2)
+    p = np.array([judged(white(rng)) for _ in range(1000)])
+    for column in p.T:
+        low, high = binomial_band(int((column < 0.1).sum()), column.size)
+        assert low <= 0.1 <= high
+
+
+@pytest.mark.parametrize("factor", [0.8, 1.25])
+def test_innovations_of_wrong_size_are_not_consistent(factor: float) -> None:
+    """Negative control: too large and too small ones are both found out."""
+    p, correlated = judged(factor * white(np.random.default_rng(3)))
+    assert p < 1e-3 < correlated
+
+
+def test_innovations_that_go_on_are_not_consistent() -> None:
+    """Negative control: what leans the same way from log to log is found out."""
+    innovations = white(np.random.default_rng(4))
+    innovations[1:] = (innovations[1:] + 0.5 * innovations[:-1]) / np.sqrt(1.25)
+    assert judged(innovations)[1] < 1e-3
+
+
+def test_consistency_is_what_it_says() -> None:
+    """Mean of squares over their degrees of freedom, and the lag-one autocorrelation, by hand."""
+    innovations = np.array([[1.0, -2.0], [2.0, np.nan], [-1.0, 3.0]])
+    found = consistency(np.array([5.0, 4.0, 10.0]), np.array([0.0, 1.0, 2.0]), innovations)
+    assert found.nis == pytest.approx(14 / 3)
+    assert found.p_value == pytest.approx(2 * stats.chi2.sf(14, 3))
+    # Two products exist, 2 and -2; the third series' neighbours are missing.
+    assert found.autocorrelation == 0
+    assert found.autocorrelation_p_value == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize(
+    ("mean_square", "holds", "side"),
+    [(1.0, True, "inside"), (0.57, True, "below"), (0.4, False, "below"), (1.4, True, "above"),
+     (1.7, False, "above")],
+)  # fmt: skip
+def test_unusual_innovations_are_told_before_they_are_wrong(
+    mean_square: float, holds: bool, side: str
+) -> None:
+    """Beside the band of 95 % a filter may hold and leans; far outside it does not hold."""
+    n = 100
+    found = consistency(np.full(n, mean_square), np.ones(n), np.full((n, 1), np.nan))
+    assert (found.holds, found.side) == (holds, side)
+
+
+def test_nothing_to_judge_is_consistent() -> None:
+    """A filter that has seen one log only is neither right nor wrong."""
+    found = consistency(np.zeros(1), np.zeros(1), np.full((1, 2), np.nan))
+    assert (found.nis, found.p_value, found.holds) == (1.0, 1.0, True)
