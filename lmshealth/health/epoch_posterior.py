@@ -61,15 +61,7 @@ class MachineDrifts:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class EpochPosterior:
-    """Log posterior of the ln parameters at one epoch, of one machine or several together.
-
-    Attributes
-    ----------
-    prior : JointPrior
-        Prior of all parameters.
-    machines : tuple of MachineDrifts
-        One per machine.
-    """
+    """Log posterior of the ln parameters at one epoch, of one machine or several together."""
 
     prior: JointPrior
     machines: tuple[MachineDrifts, ...]

@@ -21,17 +21,7 @@ _GOOD_SHARE = 0.3
 
 @dataclass(frozen=True, slots=True, eq=False)
 class WeightedDraws:
-    """Weighted draws from a density.
-
-    Attributes
-    ----------
-    points : ndarray
-        Shape ``(n, n_dim)``.
-    weight : ndarray
-        Normalised weights, shape ``(n,)``.
-    log_evidence : float
-        Logarithm of the integral of the density.
-    """
+    """Draws of a density ``(n, n_dim)``, normalised weights ``(n,)``, and log of its integral."""
 
     points: FloatArray
     weight: FloatArray

@@ -21,14 +21,10 @@ _SEARCHES = 3
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Laplace:
-    """A normal approximation.
+    """Normal approximation.
 
-    Attributes
-    ----------
-    mode : ndarray
-        Maximum of the density, shape ``(n_dim,)``.
-    cov : ndarray
-        Inverse of the negative Hessian of the log density there, shape ``(n_dim, n_dim)``.
+    Maximum of the density ``(n_dim,)``, and inverse of the negative Hessian of the log density
+    there ``(n_dim, n_dim)``.
     """
 
     mode: FloatArray

@@ -27,26 +27,20 @@ def first_passage(
     """Draw the travel from now to the first passage of a limit.
 
     Without deviation the passage is that of the law, in closed form. With deviation, ln health is
-    drawn at grid points and a Brownian bridge is between them; README.md has the equations.
+    drawn at grid points with Brownian bridges between them; README.md has the equations.
 
     Parameters
     ----------
     path : DegradationPath
-        Degradation of the parameter.
-    theta : ndarray
-        Natural parameters, shape ``(n, k)``.
-    off : ndarray
-        Deviation of ln health from its law now, shape ``(n,)``.
-    rate : ndarray
-        Variance of the deviation per m, shape ``(n,)``.
+        Degradation of the parameter, with natural parameters `theta`, shape ``(n, k)``.
+    off, rate : ndarray
+        Deviation of ln health from its law now, and its variance per m, shape ``(n,)``.
     rng : Generator
         Random numbers.
-    now : float
-        Travel in m since the baseline.
+    now, horizon : float
+        Travel in m since the baseline, and from now to the horizon.
     limit : float
         Limit as a fraction of baseline.
-    horizon : float
-        Travel in m from now beyond which nothing is published.
 
     Returns
     -------

@@ -41,13 +41,9 @@ Pace = Lognormal | Normal
 class LawEvidence:
     """Evidence of a machine on one of several laws, or values of the scatter.
 
-    Attributes
-    ----------
-    prior, posterior : float
-        Probability of the law by the description and by the machine's logs.
-    pace : ndarray
-        Log likelihood of mean and variance of the fleet under the law, relative to that of the
-        description's prior, shape ``(n_means, n_variances)``, or ``(1, 1)`` without a pace.
+    Prior and posterior probability of the law, by the description and by the machine's logs;
+    `pace` is the log likelihood of mean and variance of the fleet under the law, relative to the
+    description's prior, shape ``(n_means, n_variances)``, or ``(1, 1)`` without a pace.
     """
 
     prior: float
@@ -59,15 +55,9 @@ class LawEvidence:
 class MachineEvidence:
     """Evidence of one machine for the prior of the others.
 
-    Attributes
-    ----------
-    laws : dict
-        By health parameter, then by kind of law.
-    scatter : dict
-        By field of `ScatterPrior`, of each value.
-    informed : float
-        Share of the prior variance of a law's pace that the logs removed, the least of all probable
-        laws of identifiable parameters with a limit.
+    `laws` by health parameter and kind of law; `scatter` by field of `ScatterPrior`, of each value;
+    `informed` is the share of the prior variance of a law's pace that the logs removed, the least
+    of all probable laws of identifiable parameters with a limit.
     """
 
     laws: dict[str, dict[str, LawEvidence]]
@@ -77,18 +67,10 @@ class MachineEvidence:
 
 @dataclass(frozen=True, slots=True)
 class LawPrior:
-    """Prior of a law by the description, then by the fleet.
+    """Prior of a law of a health parameter by the description, then by the fleet.
 
-    Attributes
-    ----------
-    parameter, kind : str
-        Health parameter and kind of law.
-    share : tuple of float
-        Probability that a machine follows the law.
-    field : str
-        Field of the law with the prior of its pace, ``life_km`` or ``rate_per_km``; empty without.
-    pace : tuple of prior, or None
-        Prior of the pace.
+    `share` is the probability that a machine follows the law; `pace` the prior of its pace, which
+    is the law's `field` ``life_km`` or ``rate_per_km`` (empty and None without).
     """
 
     parameter: str
@@ -100,17 +82,7 @@ class LawPrior:
 
 @dataclass(frozen=True, slots=True)
 class FleetPrior:
-    """Prior of a machine from the other machines of its fleet.
-
-    Attributes
-    ----------
-    n_machines : int
-        Number of the others.
-    laws : tuple of LawPrior
-        Laws of all health parameters.
-    scatter : ScatterPrior
-        Prior of the scatter of logs about a life.
-    """
+    """Prior of a machine from the other `n_machines` of its fleet: laws, and scatter of logs."""
 
     n_machines: int
     laws: tuple[LawPrior, ...]
@@ -139,14 +111,8 @@ class FleetPrior:
 def machine_evidence(stage: Stage, life: LifePosterior) -> MachineEvidence:
     """Return the evidence of a machine for the prior of its fleet.
 
-    A law that restarts at a step has the prior of one from the baseline on, and counts alike.
-
-    Parameters
-    ----------
-    stage : Stage
-        The description itself: with a fleet prior the others' evidence would count twice.
-    life : LifePosterior
-        Posterior of the machine under it.
+    The life is fitted under the description itself: with a fleet prior the evidence of others would
+    count twice. A law that restarts at a step counts like one from the baseline on.
     """
     limited = {j for j, _ in identifiable_limits(stage, life.modes)}
     laws: dict[str, dict[str, LawEvidence]] = {}

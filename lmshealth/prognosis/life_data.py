@@ -17,26 +17,20 @@ from lmshealth.tracking.history import History
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LifeData:
-    """Data of a life.
-
-    The data are ordered by series, and those of a series by log.
+    """Data of a life, ordered by series, and those of a series by log.
 
     Attributes
     ----------
-    stage : Stage
-        Description.
-    history : History
-        All logs, condensed.
+    stage, history : Stage, History
+        Description, and all logs, condensed.
     columns : list of int
         Series of the history that are used.
     modes : tuple of str
-        Modes of these series.
-    mode_of_series : ndarray of int
-        Index of the mode of each series used, shape ``(n_series,)``.
+        Modes of these series; `mode_of_series` are their indices, shape ``(n_series,)``.
     clock : ndarray
-        Travel since the baseline of each log since then in m, shape ``(n_logs,)``.
+        Travel since the baseline in m of each log since then, shape ``(n_logs,)``.
     steps : tuple of float
-        Travel since the baseline of each step of the modes in m.
+        Travel since the baseline in m of each step of the modes.
     rows : ndarray of int
         Index of each datum among all series and logs, shape ``(n_data,)``.
     y : ndarray
@@ -143,23 +137,11 @@ class LifeData:
 
 
 def condense(history: History, most: int) -> History:
-    """Average neighbouring logs until there are about so many.
+    """Average neighbouring logs until there are about so many; return a short history as it is.
 
     Estimates are averaged by generalised least squares over the logs, series and cross terms of a
-    group; moments, odometer and covariates are plain means. The first log of a baseline and the
-    last log stay alone, and no group reaches across a step.
-
-    Parameters
-    ----------
-    history : History
-        Any number of logs; no more than `most` are returned as they are.
-    most : int
-        Number of logs.
-
-    Returns
-    -------
-    History
-        Each log named by the last log of its group.
+    group; moments, odometer and covariates are plain means. A group has the name of its last log.
+    The first log of a baseline and the last log stay alone, and no group reaches across a step.
     """
     n = len(history.logs)
     if n <= most:

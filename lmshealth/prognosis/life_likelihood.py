@@ -33,16 +33,9 @@ _N_EXAMPLES, _RESIDUAL = 300, 1e-8
 class LifeCovariance:
     """Parts of the covariance Σ of the data, each of shape ``(n_data, n_data)``.
 
-    Attributes
-    ----------
-    fixed : ndarray
-        Intercepts, covariates, biases and declared steps.
-    noise : ndarray
-        Reported covariance of the estimates; times noise scale squared.
-    walk : ndarray
-        Random walk of ln f, of variance 1 at the last log; times walk squared.
-    deviation : ndarray
-        Deviation of ln health, of variance 1 at the horizon; times deviation squared.
+    `fixed` has intercepts, covariates, biases and declared steps; `noise` the reported covariances
+    of the estimates; `walk` the random walk of ln f with variance 1 at the last log; `deviation`
+    that of ln health with variance 1 at the horizon.
     """
 
     fixed: FloatArray
@@ -101,7 +94,7 @@ def _offsets(data: LifeData, same: BoolArray) -> FloatArray:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class NodeBasis:
-    """Nodes: logs whose drifts give the drifts of all logs linearly.
+    """Nodes: logs whose drifts determine the drifts of all logs linearly.
 
     Attributes
     ----------
@@ -110,9 +103,9 @@ class NodeBasis:
     weights : ndarray
         W, shape ``(n_logs, n_nodes)``.
     moments : ndarray
-        Travel in m since the baseline of the nodes, of the ends of the life and of both sides of
-        each step, shape ``(n_nodes + 2 + 2 n_steps,)``. Laws are monotonic: a life that is inside
-        the map at all of them is inside at all logs.
+        Travel in m since the baseline of nodes, ends of the life and both sides of each step, shape
+        ``(n_nodes + 2 + 2 n_steps,)``: as laws are monotonic, a life inside the map at all of them
+        is inside at all logs.
     """
 
     nodes: np.ndarray
@@ -156,18 +149,9 @@ class NodeBasis:
 class Grid:
     """Data whitened at the points of a grid of walk, noise scale and deviation.
 
-    Attributes
-    ----------
-    walk, noise_scale, deviation : ndarray
-        Values of the points, shape ``(n_points,)``.
-    design : ndarray
-        R of each mode, shape ``(n_points, n_modes, n_nodes, n_rows)``.
-    target : ndarray
-        Qᵀ L⁻¹ y, shape ``(n_points, n_rows)``.
-    rest : ndarray
-        χ² of the data that no life explains, shape ``(n_points,)``.
-    log_weight : ndarray
-        Log prior of the point minus ln |L|, shape ``(n_points,)``.
+    `design` is R of each mode, shape ``(n_points, n_modes, n_nodes, n_rows)``; `target` is
+    Qᵀ L⁻¹ y, ``(n_points, n_rows)``; `rest` the χ² that no life explains, and `log_weight` the log
+    prior minus ln |L|, both ``(n_points,)``.
     """
 
     walk: FloatArray
@@ -203,19 +187,7 @@ class Grid:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LifeLikelihood:
-    """Likelihood of a life under any scenario, vectorised over walkers.
-
-    Attributes
-    ----------
-    data : LifeData
-        Selected data.
-    covariance : LifeCovariance
-        Their covariance.
-    basis : NodeBasis
-        Nodes.
-    grid : Grid
-        Whitened data at all points of the grid of nuisance parameters.
-    """
+    """Likelihood of a life under any scenario, vectorised over walkers."""
 
     data: LifeData
     covariance: LifeCovariance

@@ -39,17 +39,7 @@ _CHECKS = ("ess_bulk", "ess_tail", "r_hat", "informed")
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LifeDensity:
-    """Log posterior density of the coordinates of one scenario.
-
-    Attributes
-    ----------
-    likelihood : LifeLikelihood
-        Data.
-    scenario : Scenario
-        Laws with their priors.
-    grid : Grid
-        Points of walk, noise scale and deviation to average over.
-    """
+    """Log posterior density of the coordinates of one scenario, averaged over a grid."""
 
     likelihood: LifeLikelihood
     scenario: Scenario
@@ -144,10 +134,8 @@ class ScenarioPosterior:
     ----------
     density : LifeDensity
         Density of its coordinates.
-    probability : float
-        Posterior probability of the scenario.
-    evidence_std : float
-        Relative standard deviation of its evidence.
+    probability, evidence_std : float
+        Posterior probability of the scenario, and relative standard deviation of its evidence.
     coordinates : ndarray
         Draws, shape ``(n_ensembles, n_draws, n_dim)``.
     ess_bulk, ess_tail, r_hat : ndarray
@@ -157,7 +145,7 @@ class ScenarioPosterior:
         One minus the squared ratio of posterior to prior width of the 90 % interval of each natural
         parameter, at least 0, shape ``(n_dim,)``.
     n_mixture : int
-        Draws of each ensemble that stand for this scenario in the mixture of all.
+        Draws of each ensemble that represent this scenario in the mixture of all.
     """
 
     density: LifeDensity
@@ -204,23 +192,19 @@ class LifePosterior:
     ----------
     stage : str
         Identity of the machine.
-    parameters : tuple of str
-        Health parameters.
-    modes : tuple of str
-        Modes that were used.
+    parameters, modes : tuple of str
+        Health parameters, and modes that were used.
     scenarios : tuple of ScenarioPosterior
         Scenarios above the least probability, the most probable first.
     health : ndarray
         Draws of the health parameters now, as fractions of baseline, those of the first scenario
         first, shape ``(n_ensembles, n_draws, n_parameters)``.
-    off : ndarray
-        Deviation of ln health from its law now, like `health`.
-    rate : ndarray
-        Variance of the deviation added per m of future travel, like `health`.
-    chi_square : float
-        Of the residuals at the posterior mean of each scenario, averaged.
-    degrees_of_freedom : int
-        Number of data minus parameters of the most probable scenario.
+    off, rate : ndarray
+        Deviation of ln health from its law now, and its variance per m of future travel, like
+        `health`.
+    chi_square, degrees_of_freedom : float, int
+        Of the residuals at the posterior mean of each scenario, averaged; number of data minus
+        parameters of the most probable scenario.
     walk, noise_scale, deviation : float
         As in `Prognosis`.
     seed : tuple of int

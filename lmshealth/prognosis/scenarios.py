@@ -151,14 +151,7 @@ def list_scenarios(
 ) -> tuple[Scenario, ...]:
     """List the scenarios of a life with their prior probabilities.
 
-    Parameters
-    ----------
-    parameters : sequence of ParameterSpec
-        Parameters with their laws.
-    steps : sequence of float
-        Travel in m since the baseline at each step, ascending.
-    now : float
-        Travel in m since the baseline at the last log.
+    Steps, ascending, and the last log by their travel in m since the baseline.
     """
     choices = []
     for parameter in parameters:
