@@ -73,7 +73,7 @@ def test_gaps_and_parts_keep_the_rms() -> None:
 
 
 def test_what_a_log_cannot_show_is_refused() -> None:
-    """No accelerometer, too slow, too short: each says what there is and what is needed."""
+    """No accelerometer, too slow, too short: each names what there is and what is needed."""
     with pytest.raises(BadLog, match=r"delta_e.*acc_<name>_m_s2") as caught:
         read_magnitudes(make_log({"delta_e": np.ones(10)}, RATE), [TEN])
     assert caught.value.reason == "no-accelerometer"
@@ -123,7 +123,7 @@ def test_without_a_stage_there_is_the_papers_grid() -> None:
 
 
 def test_a_stage_has_modes_health_band_and_watched_bands() -> None:
-    """lms-y is read where its description says, lms-x without watched bands."""
+    """lms-y has the bands of its description, lms-x no watched bands."""
     bands = choose_bands(load_stage("lms-y"), None, None)
     assert [b.name for b in bands if b.kind == "mode"] == ["roll", "pitch", "yaw"]
     (health,) = [b for b in bands if b.kind == "health"]
@@ -189,7 +189,7 @@ def test_what_grows_is_said_to() -> None:
 
 
 def test_one_velocity_has_no_slope_and_two_logs_no_uncertainty() -> None:
-    """What cannot be told is not a number, and neither yes nor no."""
+    """An unknown slope is NaN, and its significance None."""
     (one,) = find_growth([at(0.1, 1.0), at(0.1, 1.1), at(0.1, 1.2)])
     assert (one.n_logs, one.n_velocities) == (3, 1)
     assert np.isnan(one.slope)
@@ -225,7 +225,7 @@ def test_the_papers_own_numbers_grow_where_it_says() -> None:
 
 
 def test_metadata_give_the_velocity_where_no_set_point_does() -> None:
-    """The reading carries the velocity that the metadata tell."""
+    """The reading carries the velocity of the metadata."""
     log = replace(known(), metadata=Metadata(stage="A", velocity=0.02))
     assert read_magnitudes(log, [TEN])[0].velocity == 0.02
     assert np.isnan(read_magnitudes(known(), [TEN])[0].velocity)

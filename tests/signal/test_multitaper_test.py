@@ -1,4 +1,4 @@
-"""The line test: its statistic, its tails in noise and in resonances, and what it takes out."""
+"""Multitaper test: its statistic, its tails in noise and resonances, and removal of lines."""
 
 from __future__ import annotations
 

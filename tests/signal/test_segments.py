@@ -1,4 +1,4 @@
-"""Segments: what the set point says a log does, which stretches are taken, how fast it moves."""
+"""Segments: motion phases by the set point, selection of stretches, speed of a log."""
 
 from __future__ import annotations
 
@@ -34,11 +34,11 @@ def strokes(*speeds: float) -> np.ndarray:
     return np.concatenate(parts)
 
 
-def log_of(set_point: np.ndarray | None, told: float | None = None) -> Log:
-    """Make a log with one accelerometer; its metadata may tell a velocity."""
+def log_of(set_point: np.ndarray | None, stated: float | None = None) -> Log:
+    """Make a log with one accelerometer; its metadata may state a velocity."""
     size = 4000 if set_point is None else set_point.size
     return make_log(
-        {"acc_a": np.zeros(size)}, RATE, velocity=set_point, metadata=Metadata(velocity=told)
+        {"acc_a": np.zeros(size)}, RATE, velocity=set_point, metadata=Metadata(velocity=stated)
     )
 
 
@@ -58,7 +58,7 @@ def test_a_stroke_has_all_its_parts() -> None:
 
 
 def test_without_a_set_point_there_is_the_whole_record_only() -> None:
-    """Record and constant velocity are everything; settling needs the set point and says so."""
+    """Record and constant velocity are everything; settling needs the set point."""
     log = log_of(None)
     parts: tuple[Part, ...] = ("constant", "record")
     for part in parts:
@@ -190,7 +190,7 @@ def test_a_record_at_rest_throughout_is_one_segment() -> None:
 
 
 def test_a_continuously_accelerating_sweep_has_no_segment() -> None:
-    """Where the velocity never stands still there is nothing to take."""
+    """Without constant velocity there is no segment."""
     log = make_log({"acc_a": np.zeros(4000)}, 2000.0, velocity=np.linspace(0, 0.4, 4000))
     assert find_segments(log, 0.05) == ()
 
@@ -199,7 +199,7 @@ def test_a_continuously_accelerating_sweep_has_no_segment() -> None:
 
 
 def test_phases_do_not_depend_on_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Moves, settling and rests are cut alike whether they are looked at in one block or many."""
+    """Moves, settling and rests are cut alike in one block or many."""
     velocity = strokes(0.1, -0.2, 0.1)
     log = log_of(velocity)
     whole = find_phases(log)

@@ -97,7 +97,7 @@ def test_a_sine_reads_its_amplitude_to_a_millionth(kind: str, phase: float) -> N
 
 
 def test_what_the_trend_takes_from_the_lowest_ordinates_is_as_stated() -> None:
-    """White noise loses the share 3/(πk)² at the k-th ordinate: the projection says so exactly."""
+    """White noise loses the share 3/(πk)² at the k-th ordinate, as the projection predicts."""
     n, ks = 4000, np.array([1, 2, 10, 100, 800])
     t = np.arange(n)
     ramp = t - (n - 1) / 2
@@ -107,7 +107,7 @@ def test_what_the_trend_takes_from_the_lowest_ordinates_is_as_stated() -> None:
 
 
 def test_the_mean_ordinate_of_a_band_has_two_degrees_of_freedom_each() -> None:
-    """The density of a band scatters over seeds as χ² of its degrees of freedom says."""
+    """The density of a band scatters over seeds as χ² of its degrees of freedom."""
     rng = np.random.default_rng(12)
     readings = [whole(white(rng, 2.0, 2000, RATE)).density(100.0, 150.0) for _ in range(500)]
     level = np.array([level for level, _ in readings])
@@ -210,7 +210,7 @@ def transform(
 
 
 def test_the_diagonal_holds_the_periodograms_of_the_channels() -> None:
-    """Each channel alone is what its own periodogram says; together they are Hermitian, rank 1."""
+    """Each channel alone is its own periodogram; together they are Hermitian, rank 1."""
     rng, n = np.random.default_rng(14), 8000
     values = {"acc_a": rng.normal(size=n), "acc_b": rng.normal(size=n) + np.linspace(0, 9, n)}
     (found,) = transform(values, [Segment(0, n, 0.3)])
@@ -263,7 +263,7 @@ def test_long_parts_of_one_velocity_are_averaged_and_short_ones_are_not() -> Non
 
 
 def test_a_strong_line_is_out_of_the_matrix_and_on_the_list() -> None:
-    """Its ordinates are not free, its frequency and amplitude are told, and bands cut it along."""
+    """Its ordinates are not free, frequency and amplitude are reported, and bands include it."""
     n = 40_000
     values = white(np.random.default_rng(18), 1.0, n, RATE)
     lined = values + sine(n, RATE, 150.01, 100.0)
@@ -364,7 +364,7 @@ def test_only_what_is_alike_is_averaged(segments: list[Segment], counts: list[in
 @pytest.mark.slow
 @pytest.mark.usefixtures("short_minute")
 def test_means_have_the_degrees_of_freedom_they_state() -> None:
-    """The density of a band of five parts scatters over seeds as χ² of its degrees says."""
+    """The density of a band of five parts scatters over seeds as χ² of its degrees of freedom."""
     rng = np.random.default_rng(22)
     readings = [
         averaged(white(rng, 2.0, 5000, RATE), parts(*[1000] * 5))[0].density(100.0, 150.0)
@@ -374,10 +374,10 @@ def test_means_have_the_degrees_of_freedom_they_state() -> None:
     (dof,) = {dof for _, dof in readings}
     assert dof == 2 * 5 * 25
     assert abs(level.mean() / 2 - 1) < 4.5 * np.sqrt(2 / dof / 500)
-    # Negative control: the degrees of a single part would be told.
+    # Negative control: the degrees of a single part would be detected.
     for wrong, off in ((1.0, False), (5.0, True)):
-        told = abs(level.var() / (2**2 * 2 * wrong / dof) - 1) > 4.5 * np.sqrt(2.5 / 500)
-        assert told == off
+        detected = abs(level.var() / (2**2 * 2 * wrong / dof) - 1) > 4.5 * np.sqrt(2.5 / 500)
+        assert detected == off
 
 
 @pytest.mark.usefixtures("short_minute")

@@ -1,4 +1,4 @@
-"""Lines: sines are found where they stand, as strong as they are, and told by what moves them."""
+"""Lines: frequency and amplitude of sines, and names by their sources."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def test_two_lines_beside_each_other_are_two() -> None:
 
 
 def test_a_line_on_a_resonance_is_found_and_the_resonance_is_not() -> None:
-    """On the flank of a mode the line stands out; without it there is none."""
+    """On the flank of a mode the line is found; without it there is none."""
     rng = np.random.default_rng(4)
     for damping in (0.002, 0.015):
         mode = Mode(120.0, damping)
@@ -108,7 +108,7 @@ def test_records_too_short_have_no_lines() -> None:
 
 
 def named(frequency: float, velocity: float, order_mm: float = 4.0) -> str:
-    """Tell the kind of a line in a log of one velocity."""
+    """Name a line in a log of one velocity."""
     log = make_log({"acc_a": np.zeros(8000)}, RATE, velocity=np.full(8000, velocity))
     seen = [("acc_a", frequency, 1.0)]
     (line,) = name_lines(seen, log, make_stage([("r", 105.0, 0.02)], order_mm=order_mm), 0.2)

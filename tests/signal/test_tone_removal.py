@@ -1,4 +1,4 @@
-"""Tones: what is taken out of a segment, what is left, and what is let alone."""
+"""Removal of sinusoids: estimates, residuals, and resonances that are not removed."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from tests.signals import (
 
 RATE, N = 1000.0, 20_000
 SECONDS = N / RATE
-SPARED = np.zeros(N // 2, dtype=bool)
+PROTECTED = np.zeros(N // 2, dtype=bool)
 ROLL = (("roll", 105.0, 0.015),)
 
 
@@ -62,9 +62,9 @@ def around(frequency: float, reach: int = 100) -> np.ndarray:
     return mask
 
 
-def read(tone: Sinusoid) -> tuple[float, float]:
-    """Frequency in Hz and amplitude of a tone."""
-    return (tone.ordinate + 1) / SECONDS, float(np.sqrt(2 * tone.power / SECONDS))
+def read(sinusoid: Sinusoid) -> tuple[float, float]:
+    """Frequency in Hz and amplitude of a sinusoid."""
+    return (sinusoid.ordinate + 1) / SECONDS, float(np.sqrt(2 * sinusoid.power / SECONDS))
 
 
 # What is taken out
@@ -82,12 +82,12 @@ def test_a_tone_is_taken_out_down_to_the_noise(amplitude: float, by: float) -> N
     for seed in range(10):
         frequency = 150 + 0.005 * seed
         x = noise(seed) + wandering(frequency, amplitude, by, seed)
-        rest, free, tones = remove_sinusoids(transform(x), SECONDS, SPARED)
+        rest, free, sinusoids = remove_sinusoids(transform(x), SECONDS, PROTECTED)
         near = around(frequency) & free
         assert near.sum() >= 201 - 27
         left.append(np.abs(rest[near, 0]) ** 2)
-        (tone,) = tones
-        readings.append(np.subtract(read(tone), (frequency, amplitude)))
+        (sinusoid,) = sinusoids
+        readings.append(np.subtract(read(sinusoid), (frequency, amplitude)))
     mean = np.mean(np.concatenate(left))
     assert abs(mean - 1) < 0.1 + 4.5 / np.sqrt(sum(part.size for part in left))
     # Noise in the sixteen ordinates or fewer of the fit adds to the amplitude.
@@ -98,20 +98,20 @@ def test_a_tone_is_taken_out_down_to_the_noise(amplitude: float, by: float) -> N
 
 
 def test_masking_the_peak_alone_leaves_the_skirt() -> None:
-    """Negative control: without its peak and two ordinates beside it a tone leaves a hump."""
+    """Negative control: masking its peak alone leaves a pedestal of the sinusoid."""
     raw = transform(noise(1) + wandering(150.02, 100.0, 0.0))
     near = around(150.02) & ~around(150.02, 2)
     assert np.mean(np.abs(raw[near, 0]) ** 2) > 30
-    rest, free, _ = remove_sinusoids(raw, SECONDS, SPARED)
+    rest, free, _ = remove_sinusoids(raw, SECONDS, PROTECTED)
     assert np.mean(np.abs(rest[near & free, 0]) ** 2) < 1.5
 
 
 def test_other_ordinates_and_channels_keep_what_they_have() -> None:
-    """A tone in one channel takes less than 1 % of the noise of another, and none far away."""
+    """A sinusoid in one channel takes less than 1 % of the noise of another, and none far away."""
     quiet, loud = noise(2), noise(3) + sine(N, RATE, 150.02, 100.0)
     raw = transform(quiet, loud)
-    rest, free, tones = remove_sinusoids(raw, SECONDS, SPARED)
-    assert [tone.channel for tone in tones] == [1]
+    rest, free, sinusoids = remove_sinusoids(raw, SECONDS, PROTECTED)
+    assert [sinusoid.channel for sinusoid in sinusoids] == [1]
     near = around(150.02, 300) & free
     lost = np.abs(rest - raw)[:, 0] ** 2
     assert lost[near].sum() < 0.01 * np.sum(np.abs(raw[near, 0]) ** 2)
@@ -122,11 +122,11 @@ def test_other_ordinates_and_channels_keep_what_they_have() -> None:
 
 def test_a_tone_seen_by_two_channels_leaves_both() -> None:
     """Taken out of all channels, and reported once, in the one that shows it most clearly."""
-    tone = sine(N, RATE, 150.02, 100.0)
-    rest, free, tones = remove_sinusoids(
-        transform(noise(4) + 0.3 * tone, noise(5) + tone), SECONDS, SPARED
+    sinusoid = sine(N, RATE, 150.02, 100.0)
+    rest, free, sinusoids = remove_sinusoids(
+        transform(noise(4) + 0.3 * sinusoid, noise(5) + sinusoid), SECONDS, PROTECTED
     )
-    assert [t.channel for t in tones] == [1]
+    assert [t.channel for t in sinusoids] == [1]
     near = around(150.02) & free
     mean = np.mean(np.abs(rest[near]) ** 2, axis=0)
     np.testing.assert_allclose(mean, 1.0, atol=0.1 + 4.5 / np.sqrt(near.sum()))
@@ -134,23 +134,23 @@ def test_a_tone_seen_by_two_channels_leaves_both() -> None:
 
 @pytest.mark.parametrize("factor", [1e-3, 1e3])
 def test_the_unit_of_a_channel_makes_no_tones(factor: float) -> None:
-    """A tone of two channels stays one, and takes the same ordinates, in whatever unit one is."""
-    tone = sine(N, RATE, 150.02, 100.0)
+    """A sinusoid of two channels is one, with the same ordinates, whatever the units."""
+    sinusoid = sine(N, RATE, 150.02, 100.0)
     for seed in range(3):
-        one, other = noise(seed) + tone, noise(10 + seed) + 0.3 * tone
-        _, free, tones = remove_sinusoids(transform(one, other), SECONDS, SPARED)
-        _, same, scaled = remove_sinusoids(transform(one, factor * other), SECONDS, SPARED)
-        assert [t.channel for t in scaled] == [t.channel for t in tones] == [0]
+        one, other = noise(seed) + sinusoid, noise(10 + seed) + 0.3 * sinusoid
+        _, free, sinusoids = remove_sinusoids(transform(one, other), SECONDS, PROTECTED)
+        _, same, scaled = remove_sinusoids(transform(one, factor * other), SECONDS, PROTECTED)
+        assert [t.channel for t in scaled] == [t.channel for t in sinusoids] == [0]
         np.testing.assert_array_equal(same, free)
 
 
 @pytest.mark.parametrize("apart", [0.6, 1.0, 3.0, 10.0])
 @pytest.mark.parametrize("amplitude", [20.0, 60.0])
 def test_neighbouring_tones_are_both_taken_out(apart: float, amplitude: float) -> None:
-    """Two tones of different strength, twelve ordinates apart and more, leave the noise."""
+    """Two sinusoids of different strength, twelve ordinates apart and more, leave the noise."""
     values = noise(6) + sine(N, RATE, 150.02, 100.0) + sine(N, RATE, 150.02 + apart, amplitude)
-    rest, free, tones = remove_sinusoids(transform(values), SECONDS, SPARED)
-    found = sorted(read(tone) for tone in tones)
+    rest, free, sinusoids = remove_sinusoids(transform(values), SECONDS, PROTECTED)
+    found = sorted(read(sinusoid) for sinusoid in sinusoids)
     np.testing.assert_allclose([f for f, _ in found], [150.02, 150.02 + apart], atol=0.03)
     np.testing.assert_allclose([a for _, a in found], [100.0, amplitude], rtol=0.05)
     near = around(150.0, 300) & free
@@ -166,8 +166,8 @@ def test_noise_has_no_tones() -> None:
     for seed in range(20):
         white_noise = transform(noise(seed))
         for raw in (white_noise, white_noise * f[:, None] ** 2):
-            rest, free, tones = remove_sinusoids(raw, SECONDS, SPARED)
-            assert not tones
+            rest, free, sinusoids = remove_sinusoids(raw, SECONDS, PROTECTED)
+            assert not sinusoids
             assert free.all()
             np.testing.assert_array_equal(rest, raw)
 
@@ -180,43 +180,43 @@ def test_narrow_modes_are_seldom_taken_for_tones(width: float, most: int) -> Non
     taken = 0
     for seed in range(40):
         values = accelerations(rng(seed), [mode], N, RATE, 1.0)[0]
-        _, free, _ = remove_sinusoids(transform(values), SECONDS, SPARED)
+        _, free, _ = remove_sinusoids(transform(values), SECONDS, PROTECTED)
         taken += not free[around(120.0, round(width))].all()
     assert taken <= most
 
 
 @pytest.mark.parametrize("n", [3, 100])
 def test_too_few_ordinates_are_left_as_they_are(n: int) -> None:
-    """Transforms too short to tell a tone from its surroundings come back untouched."""
+    """Transforms too short to separate a sinusoid from its surroundings come back untouched."""
     raw = transform(sine(N, RATE, 2.5, 100.0) + noise(1))[:n]
-    rest, free, tones = remove_sinusoids(raw, SECONDS, SPARED)
-    assert (free.all(), tones) == (True, ())
+    rest, free, sinusoids = remove_sinusoids(raw, SECONDS, PROTECTED)
+    assert (free.all(), sinusoids) == (True, ())
     np.testing.assert_array_equal(rest, raw)
 
 
-def test_what_is_spared_is_left_and_the_rest_is_not() -> None:
-    """Of two tones the one that may be a resonance stays; both go where none may stand."""
+def test_what_is_protected_is_left_and_the_rest_is_not() -> None:
+    """Of two sinusoids the one that may be a resonance stays; both go where none may stand."""
     raw = transform(noise(8) + sine(N, RATE, 150.02, 100.0) + sine(N, RATE, 300.02, 100.0))
-    spared = SPARED.copy()
-    spared[at(140.0) : at(160.0)] = True
-    rest, free, tones = remove_sinusoids(raw, SECONDS, spared)
-    assert [read(tone)[0] for tone in tones] == [pytest.approx(300.02, abs=0.02)]
+    protected = PROTECTED.copy()
+    protected[at(140.0) : at(160.0)] = True
+    rest, free, sinusoids = remove_sinusoids(raw, SECONDS, protected)
+    assert [read(sinusoid)[0] for sinusoid in sinusoids] == [pytest.approx(300.02, abs=0.02)]
     assert free[around(150.0)].all()
     peak = around(150.02, 2)
     np.testing.assert_allclose(rest[peak], raw[peak], rtol=0.01)
-    assert len(remove_sinusoids(raw, SECONDS, SPARED)[2]) == 2
+    assert len(remove_sinusoids(raw, SECONDS, PROTECTED)[2]) == 2
 
 
 @pytest.mark.slow
 def test_a_comb_too_close_to_be_told_apart_does_not_grow() -> None:
     """Of an excitation that repeats, every third ordinate towers: nothing is put in there."""
     raw = transform(np.tile(noise(9)[: N // 3], 3)[: N - 2] + 0.01 * noise(10)[: N - 2])[:600]
-    rest, _, _ = remove_sinusoids(raw, SECONDS, SPARED[:600])
+    rest, _, _ = remove_sinusoids(raw, SECONDS, PROTECTED[:600])
     assert np.isfinite(rest).all()
     assert np.sum(np.abs(rest) ** 2) < np.sum(np.abs(raw) ** 2)
 
 
-# Beside a mode
+# Close to a mode
 
 
 @pytest.mark.parametrize("frequency", [150.0, 150.02])
@@ -246,7 +246,7 @@ def test_a_strong_line_beside_a_mode_moves_it_less_than_its_uncertainty(
         if frequency == 150.0:  # on an ordinate nothing leaks
             continue
         with monkeypatch.context() as patch:
-            # Negative control: with the tone left in, the mode moves or is lost.
+            # Negative control: with the sinusoid left in, the mode moves or is lost.
             patch.setattr(
                 spectra,
                 "remove_sinusoids",

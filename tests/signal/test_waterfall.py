@@ -1,4 +1,4 @@
-"""Spectra over life: where power stands in the band, whatever its unit, and what is missing."""
+"""Waterfall: power over frequency whatever its unit, and missing values."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def test_resonances_and_lines_stand_out_where_they_are() -> None:
 
 
 def test_level_is_that_of_white_noise_about_its_median() -> None:
-    """White noise stands at 0 dB, as far as the number of ordinates in a bin allows."""
+    """White noise is at 0 dB, as far as the number of ordinates in a bin allows."""
     noise = white(np.random.default_rng(3), NOISE, 8 * N, RATE)
     levels = relative_spectrum(make_log({"acc_a": noise}, RATE), STAGE, n_bins=40)
     assert levels is not None

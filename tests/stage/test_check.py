@@ -49,7 +49,7 @@ def verdicts(checked: StageCheck) -> dict[str, str]:
 
 
 def test_modes_stand_where_the_map_has_them(two: StageCheck) -> None:
-    """At the baseline the nominal frequency, at the limits what the formula says."""
+    """At the baseline the nominal frequency, at the limits that of the formula."""
     at_limits = FREQUENCY[:2] * np.exp(true_drift(NAMES, LIMITS)[:2])
     for k, check in enumerate(two.modes):
         assert check.informs
@@ -231,7 +231,7 @@ def test_a_description_in_order_has_no_faults(fine: StageCheck) -> None:
 
 
 def test_errors_that_hardly_correlate_are_not_explained(fine: StageCheck) -> None:
-    """The number stands alone; a positive one goes the same way."""
+    """Only the number is given; the sign of a large one is explained."""
     small, large = fine.correlation * [[1, 0.1], [0.1, 1]], abs(fine.correlation)
     assert "tends" not in merits(replace(fine, correlation=small))
     assert "that of the other tends to be too high" in merits(replace(fine, correlation=large))

@@ -58,7 +58,7 @@ def test_without_noise_the_bound_is_the_law(kappa: float) -> None:
 
 
 def test_noise_and_an_unknown_noise_level_only_cost() -> None:
-    """The bound grows as the SNR falls; more channels of the same total SNR tell the noise."""
+    """The bound grows as the SNR falls; more channels of the same total SNR determine the noise."""
     stds = [
         np.sqrt(np.diag(ambient_bound(100.0, 0.01, snr, 100.0, band=(80, 120))))
         for snr in (1e6, 100.0, 10.0, 1.0)
@@ -89,7 +89,7 @@ def stds(cov: np.ndarray) -> np.ndarray:
 
 @pytest.mark.parametrize("noise", [0.02, 2.0])
 def test_the_joint_bound_inverts_the_curvature_of_the_divergence(noise: float) -> None:
-    """The divergence from the truth to what is near, from plain response functions, says the same.
+    """The divergence from the truth to what is near, from plain response functions, is the same.
 
     Two modes, two channels with different noise, all else unknown: differenced twice by all ten
     parameters.

@@ -153,7 +153,7 @@ def test_before_it_begins_a_law_changes_nothing(law: AnyLaw) -> None:
     ("law", "kind"), [*zip(LAWS, NAMES, strict=True), (Unchanging(), "none")], ids=[*NAMES, "none"]
 )
 def test_laws_have_a_kind_and_a_weight(law: AnyLaw, kind: str) -> None:
-    """A law is called as in a description, and counts as any other unless it is told."""
+    """A law has the name of the description, and weight 1 by default."""
     assert law.kind == kind
     assert law.weight == 1
     assert msgspec.structs.replace(law, weight=2.5).weight == 2.5
@@ -210,7 +210,7 @@ def test_far_off_walkers_raise_no_warning(law: AnyLaw, y: list[float]) -> None:
 
 
 @pytest.mark.parametrize(
-    ("law", "told"),
+    ("law", "message"),
     [
         (lambda: HertzWear(life_km=Uniform(-5.0, -1.0)), "life_km must lie between 0 and inf"),
         (lambda: HertzWear(Lognormal(8000, 1), Uniform(-0.7, 1.6)), "exponent needs a range above"),
@@ -221,7 +221,7 @@ def test_far_off_walkers_raise_no_warning(law: AnyLaw, y: list[float]) -> None:
         (lambda: Loosening(Normal(-9.0, 1.0), Uniform(0.3, 1.0)), "life_km must lie between"),
     ],
 )
-def test_laws_that_cannot_be_are_refused(law: Callable[[], Law], told: str) -> None:
+def test_laws_that_cannot_be_are_refused(law: Callable[[], Law], message: str) -> None:
     """Priors outside of what makes sense are refused before anything is drawn from them."""
-    with pytest.raises(ValueError, match=told):
+    with pytest.raises(ValueError, match=message):
         law()

@@ -23,7 +23,7 @@ def stage(tmp_path: Path) -> Stage:
 
 
 def load(folder: Path, text: str) -> Stage:
-    """Write a description beside a full map and load it."""
+    """Write a description and a full map, and load it."""
     (folder / "map.csv").write_text("\n".join(map_rows(("guide_preload", "mount_stiffness"))))
     path = folder / "odd.toml"
     path.write_text(text)
@@ -146,7 +146,7 @@ def test_a_baseline_outside_the_map_is_refused(tmp_path: Path) -> None:
 
 
 def test_a_prior_beyond_the_map_is_refused(tmp_path: Path) -> None:
-    """A prior that the map does not reach says nothing about this machine."""
+    """A prior outside the map is refused."""
     inside = 'kind = "lognormal", median = 1.0, sigma = 0.3'
     far = MOUNT.replace(inside, 'kind = "uniform", low = 5, high = 6')
     with pytest.raises(BadStage, match=r"line 18: parameter\[1\]\.prior: .*mount_stiffness has"):
@@ -154,14 +154,14 @@ def test_a_prior_beyond_the_map_is_refused(tmp_path: Path) -> None:
 
 
 def test_a_map_without_any_tracked_mode_is_refused(tmp_path: Path) -> None:
-    """A map whose modes are none of the description's says nothing, and both lists are told."""
+    """A map without any mode of the description is refused with both lists."""
     text = stage_text().replace('name = "roll"', 'name = "bounce"').replace('"pitch"', '"sway"')
     with pytest.raises(BadStage, match=r"none of them is a tracked.*bounce"):
         load(tmp_path, text)
 
 
 def test_a_file_that_is_not_there_and_a_name_nobody_knows(tmp_path: Path) -> None:
-    """A missing path is named; an unknown name is told which ones there are."""
+    """A missing path is named; for an unknown name the shipped ones are listed."""
     with pytest.raises(BadStage, match=r"gone\.toml"):
         load_stage(str(tmp_path / "gone.toml"))
     with pytest.raises(BadStage, match="lms-x, lms-y"):
@@ -198,7 +198,7 @@ def test_a_stage_without_parameters_needs_no_map(tmp_path: Path) -> None:
 
 
 def test_modes_that_are_not_tracked_do_not_inform(tmp_path: Path) -> None:
-    """Health is read from tracked modes that the map knows."""
+    """Health is inferred from tracked modes on the map."""
     text = stage_text(n_modes=3).replace(
         "damping_ratio = 0.015", "damping_ratio = 0.015\ntracked = false"
     )
@@ -254,7 +254,7 @@ def with_laws(*laws: str) -> str:
 
 
 def test_a_parameter_has_one_law_or_several(tmp_path: Path) -> None:
-    """One law stands alone, several in an array, in their order and with their weights."""
+    """One law is a table, several are an array, in their order and with their weights."""
     linear = 'rate_per_km = { kind = "normal", mean = 0.0, std = 2e-4 }'
     parameter = with_laws(
         WEAR, f'{{ kind = "linear", weight = 2.5, {linear} }}', '{ kind = "none" }'

@@ -1,4 +1,4 @@
-"""Sight: sensitivities, bounds and precisions against closed forms, and against drawn drifts."""
+"""Identifiability: sensitivities and precisions against closed forms and drawn drifts."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def test_drift_variances_are_bounds_of_both_groups(information: Identifiability)
 
 
 def test_with_an_exact_map_both_deviations_agree(tmp_path: Path) -> None:
-    """Generalised least squares with the prior added is what the joint precision says."""
+    """Generalised least squares with the prior added equals the joint precision."""
     exact = identifiability_of(make_stage(tmp_path, model_std=0.0))
     noise = exact.drift_variance(60.0, 5)
     joint = np.linalg.inv(exact.precision(noise))
@@ -88,8 +88,8 @@ def test_the_precision_is_that_of_drawn_drifts(
     x = rng.normal(0, np.sqrt(prior), (n, 2))
     wrong = 1 + 0.3 * rng.normal(size=(n, 2, 2))
     drifts = np.einsum("nij,ij,nj->ni", wrong, slopes, x) + rng.normal(0, np.sqrt(noise), (n, 2))
-    believed = Identifiability(NAMES, information.modes, slopes, prior, model_std, np.zeros(2), 5)
-    cov = np.linalg.inv(believed.precision(noise))
+    model = Identifiability(NAMES, information.modes, slopes, prior, model_std, np.zeros(2), 5)
+    cov = np.linalg.inv(model.precision(noise))
     weights = 1 / (noise + model_std**2 * slopes**2 @ prior)
     estimates = (drifts * weights) @ slopes @ cov
     ratio = ((estimates - x) ** 2).mean(axis=0) / np.diag(cov)
@@ -103,7 +103,7 @@ def test_the_weakest_mode_sets_the_least_duration(information: Identifiability) 
 
 
 def test_without_a_map_there_is_nothing_to_see(tmp_path: Path) -> None:
-    """The error says what to describe."""
+    """The error names what to describe."""
     with pytest.raises(BadStage, match=r"no \[map\].*describe \[\[parameter\]\]"):
         identifiability_of(make_stage(tmp_path, ()))
 

@@ -195,7 +195,7 @@ def test_a_map_that_breaks_its_contract_is_refused(tmp_path: Path, change, needl
 
 
 def test_text_where_numbers_belong_is_refused_as_such(tmp_path: Path) -> None:
-    """A word in a number column is an error of the map, told by its line; blank lines count."""
+    """A word in a number column is an error of the map with its line; blank lines count."""
     rows = map_rows(NAMES)
     rows[3] = "low" + rows[3][rows[3].index(",") :]
     rows.insert(2, "")

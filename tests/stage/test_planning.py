@@ -44,7 +44,7 @@ def variance(mode: int, duration: float) -> float:
 
 
 def std_of_one_log(found: Plan) -> float:
-    """Give the standard deviation that the smallest loss stands for."""
+    """Return the standard deviation from the smallest loss."""
     return float(-np.log1p(-found.efforts[0].smallest_loss) / LEVELS)
 
 
@@ -79,7 +79,7 @@ def test_unknown_others_cost_what_the_information_matrix_says(two: Stage, name: 
     noise = FIVE_LOGS * np.array([variance(k, 60.0) for k in range(2)])
     known = planned_std(slopes, noise, names.index(name), prior_std=0.28)
     found = std_of_one_log(plan(two, name, 0.05, durations=(60.0,)))
-    # The prior ends at the map: 0.28 is near enough where the modes tell more than it.
+    # The prior ends at the map: 0.28 is near enough where the modes are more informative.
     assert found == pytest.approx(known, rel=1e-3)
     alone = np.sqrt(1 / (slopes[:, names.index(name)] ** 2 / noise).sum())
     assert found > 1.5 * alone
@@ -116,10 +116,10 @@ def test_more_is_never_worse(two: Stage) -> None:
 
 
 def test_the_baseline_bounds_what_more_logs_can_do(tmp_path: Path) -> None:
-    """Where no number of logs suffices beside five, some do beside a hundred."""
+    """No number of logs suffices for a baseline of five, some do for a hundred."""
     few = make_stage(tmp_path / "few")
     many = make_stage(tmp_path / "many", tail="[baseline]\nlogs = 100")
-    # Two groups of five see this; endless logs beside five would see 1/√2 of it.
+    # Two groups of five detect this; unlimited logs against five would detect 1/√2 of it.
     least = plan(few, "guide_preload", 0.05, durations=(10.0,)).efforts[0].smallest_loss_many
     near, beyond = (plan(few, "guide_preload", share * least, durations=(10.0,)).efforts[0]
                     for share in (0.75, 0.69))  # fmt: skip
@@ -132,7 +132,7 @@ def test_the_baseline_bounds_what_more_logs_can_do(tmp_path: Path) -> None:
 
 
 def test_what_other_parameters_hide_no_log_shows(tmp_path: Path) -> None:
-    """One mode cannot tell two parameters apart by more than what their priors know."""
+    """One mode cannot separate two parameters beyond their priors."""
     stage = make_stage(tmp_path, n_modes=1)
     found = plan(stage, "mount_stiffness", 0.1, durations=(60.0, 600.0))
     assert [effort.hindrance for effort in found.efforts] == ["parameters"] * 2
@@ -151,7 +151,7 @@ def test_logs_too_short_to_be_identified_are_told(one: Stage) -> None:
 
 @pytest.mark.parametrize("model_std", [0.0, 0.05])
 def test_a_parameter_that_no_mode_feels_is_refused(tmp_path: Path, model_std: float) -> None:
-    """Sensitivities, what the prior knows and the next step are named."""
+    """Sensitivities, the prior and the next step are named."""
     stage = make_stage(tmp_path, (PRELOAD, FOOT), model_std=model_std)
     with pytest.raises(BadQuestion, match=r"do not identify foot.*roll .*Track a mode"):
         plan(stage, "foot", 0.2)
