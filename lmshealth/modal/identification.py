@@ -102,16 +102,15 @@ def identify(
         spectra, fits = _identify_described(log, used, choose_targets(stage, band))
         tested = []
     found = [fit.modes for fit in fits if fit.modes is not None]
-    masked = [line for modes in found for line in modes.lines]
+    masked = [line for one in found for line in one.lines]
     seen = [*tested, *spectra.removed_lines, *masked]
     lines = name_lines(seen, log, stage, 1.5 / spectra.duration)
     refused = [refusal for fit in fits for refusal in fit.refusals(log.name)]
     if stage is None:
         found = _distinct(found)
-        anything = any(modes.names for modes in found)
+        anything = any(one.names for one in found)
         refused = [] if anything else [_nothing_found(log, lines, refused)]
-    parts = [modes.as_modes(spectra.channels) for modes in found]
-    modes = merge(parts, lines, (*log.refused, *refused), spectra.channels)
+    modes = merge([one.modes for one in found], lines, (*log.refused, *refused), spectra.channels)
     return numbered(modes) if stage is None else modes
 
 
@@ -158,15 +157,15 @@ def _assigned(fit: ClusterFit, cluster: tuple[Target, ...]) -> ClusterFit:
     modes = fit.modes
     if modes is None or not modes.names:
         return fit
-    ln_f = modes.estimate[: len(modes.names)]
+    ln_f = modes.modes.ln_frequency
     order = sorted(range(ln_f.size), key=lambda i: (ln_f[i], modes.names[i]))
     assignment = assign(np.exp(ln_f[order]).tolist(), cluster, complete=True)
     names = {modes.names[i]: name for i, name in zip(order, assignment.names, strict=True) if name}
     if not names and not assignment.ambiguous:
         return fit  # no assignment keeps the order within the searches
     kept = modes.keep(names)
-    kept = replace(kept, targets=tuple(replace(t, name=names[t.name]) for t in kept.targets))
-    return ClusterFit(kept, fit.rejected | assignment.ambiguous)
+    named = replace(kept.modes, names=tuple(names[name] for name in kept.names))
+    return ClusterFit(replace(kept, modes=named), fit.rejected | assignment.ambiguous)
 
 
 def _identify_found(
@@ -253,17 +252,17 @@ def _with_excess(modes: ClusterModes, cluster: tuple[Target, ...]) -> tuple[Targ
 def _distinct(found: list[ClusterModes]) -> list[ClusterModes]:
     """Drop modes within half a half-power bandwidth of a clearer one of another cluster."""
     rows = [
-        (float(clarity), float(ln_f), float(np.exp(ln_zeta)), name)
-        for modes in found
-        for clarity, (ln_f, ln_zeta), name in zip(
-            modes.clarity, modes.estimate.reshape(2, -1).T, modes.names, strict=True
+        (float(clarity), float(ln_f), float(zeta), name)
+        for one in found
+        for clarity, ln_f, zeta, name in zip(
+            one.clarity, one.modes.ln_frequency, one.modes.damping_ratio, one.names, strict=True
         )
     ]
     kept: list[tuple[float, float, float, str]] = []
     for row in sorted(rows, reverse=True):
         if all(abs(row[1] - other[1]) > 0.5 * (row[2] + other[2]) for other in kept):
             kept.append(row)
-    return [modes.keep(row[3] for row in kept) for modes in found]
+    return [one.keep(row[3] for row in kept) for one in found]
 
 
 def _nothing_found(log: Log, lines: tuple[Line, ...], rejected: list[Refusal]) -> Refusal:

@@ -90,6 +90,11 @@ class Modes:
         freeze(self)
 
     @property
+    def estimate(self) -> FloatArray:
+        """``[ln_frequency, ln_damping]``, shape ``(2 n_modes,)``."""
+        return np.concatenate([self.ln_frequency, self.ln_damping])
+
+    @property
     def frequency(self) -> FloatArray:
         """Natural frequency in Hz, shape ``(n_modes,)``."""
         return np.exp(self.ln_frequency)
@@ -155,16 +160,7 @@ def estimates_only(
 ) -> Modes:
     """Return unnamed modes without shapes, dispersion, lines or refusals.
 
-    Parameters
-    ----------
-    estimate : ndarray
-        ``[ln f, ln ζ]``, shape ``(2 n_modes,)``.
-    cov : ndarray
-        Its covariance, shape ``(2 n_modes, 2 n_modes)``.
-    snr : ndarray
-        Signal-to-noise ratio, shape ``(n_modes,)``.
-    sources, channels : sequence of str
-        Of each mode.
+    ``estimate`` is ``[ln f, ln ζ]``, shape ``(2 n_modes,)``, ``cov`` its covariance.
     """
     n = len(channels)
     return Modes(
@@ -195,19 +191,21 @@ def merge(
     Parameters
     ----------
     parts : sequence of Modes
-        All with the same ``shape_channels``; their lines and refusals are replaced.
+        Their lines and refusals are replaced.
     lines, refused : sequence of Line, sequence of Refusal
         Of the log.
     shape_channels : tuple of str
-        Channels of the shapes.
+        Channels of the shapes, among them those of all parts.
     """
     n, first = sum(len(part.names) for part in parts), 0
-    cov = np.zeros((2 * n, 2 * n))
+    cov, shapes = np.zeros((2 * n, 2 * n)), np.full((n, len(shape_channels)), np.nan)
     for part in parts:
-        size = len(part.names)
-        both = paired(np.arange(first, first + size), n)
+        rows = np.arange(first, first + len(part.names))
+        both = paired(rows, n)
         cov[np.ix_(both, both)] = part.cov
-        first += size
+        columns = [shape_channels.index(name) for name in part.shape_channels]
+        shapes[rows[:, None], columns] = part.shapes
+        first += rows.size
 
     def joined(name: str) -> tuple[str, ...]:
         return tuple(chain.from_iterable(getattr(part, name) for part in parts))
@@ -226,7 +224,7 @@ def merge(
         dispersion=stacked("dispersion"),
         flags=joined("flags"),
         shape_channels=shape_channels,
-        shapes=np.concatenate([np.empty((0, len(shape_channels))), *(p.shapes for p in parts)]),
+        shapes=shapes,
         lines=tuple(lines),
         refused=tuple(refused),
     )

@@ -111,21 +111,10 @@ def _odds(frequency: float, probability: FloatArray, targets: Sequence[Target]) 
 
 
 def shift_cost(shifts: FloatArray, search: FloatArray, own: int) -> FloatArray:
-    """Return the negative log prior of shifts: half the search in common, a sixth of each mode.
+    """Return the negative log prior of shifts of ln f, ``(n_candidates, n_modes)``.
 
-    Parameters
-    ----------
-    shifts : ndarray
-        Of ln f, shape ``(n_candidates, n_modes)``.
-    search : ndarray
-        Half widths of the searches, shape ``(n_modes,)``.
-    own : int
-        The common shift is the mean over the first modes, as many as this.
-
-    Returns
-    -------
-    ndarray
-        Shape ``(n_candidates,)``.
+    The common shift, the mean over the first ``own`` modes, has a standard deviation of half the
+    search, what each mode differs from it a sixth. ``search`` has shape ``(n_modes,)``.
     """
     common = shifts[:, :own].mean(axis=1, keepdims=True)
     cost = 0.5 * (common[:, 0] / (search.mean() * constants.COMMON_SHIFT)) ** 2
@@ -142,13 +131,6 @@ def name_response(modes: Modes, stage: Stage) -> Modes:
     """Name modes of a frequency response where the assignment is unique.
 
     A mode gets a name if it alone lies in the search of one described mode and of no other.
-
-    Parameters
-    ----------
-    modes : Modes
-        Of one response.
-    stage : Stage
-        The description.
     """
     near = _within_search(modes, stage)
     names = [""] * len(modes.names)
@@ -159,15 +141,7 @@ def name_response(modes: Modes, stage: Stage) -> Modes:
 
 
 def why_unnamed(modes: Modes, stage: Stage) -> Iterator[str]:
-    """Yield why modes have no name after `name_response`, where the description has a mode there.
-
-    Parameters
-    ----------
-    modes : Modes
-        Named.
-    stage : Stage
-        The description.
-    """
+    """Yield why modes have no name after `name_response` where the description has a mode."""
     near = _within_search(modes, stage)
     for place in np.flatnonzero([not name for name in modes.names]):
         sought = [spec.name for spec, own in zip(stage.modes, near, strict=True) if own[place]]

@@ -98,13 +98,7 @@ def choose_targets(stage: Stage, band: tuple[float, float] | None = None) -> tup
 
 
 def clusters(targets: Sequence[Target]) -> list[tuple[Target, ...]]:
-    """Group neighbours that are fitted jointly: their bands overlap, their bandwidths are similar.
-
-    Parameters
-    ----------
-    targets : sequence of Target
-        Ascending in frequency.
-    """
+    """Group neighbours to fit jointly: their bands overlap, their bandwidths are similar."""
     groups: list[list[Target]] = []
     for target in targets:
         last = groups[-1] if groups else []

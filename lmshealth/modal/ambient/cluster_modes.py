@@ -41,27 +41,10 @@ class ClusterModes:
 
     Attributes
     ----------
-    data : LogSpectra
-        The band and the channels that show any of the modes, in units of their noise.
-    targets : tuple of Target
-        The modes at their start values.
-    estimate : ndarray
-        ``[ln f, ln ζ]``, shape ``(2 n_modes,)``.
-    cov : ndarray
-        Its covariance, forces, shapes and noise marginalised, ``(2 n_modes, 2 n_modes)``.
-    shapes : ndarray
-        Motion of each channel in units of its noise, one in the channel with the largest, shape
-        ``(n_channels, n_modes)``.
+    modes : Modes
+        With shapes over the channels that show any of them.
     unit : ndarray
-        Root of the noise of each channel in (m/s²)/Hz^½, shape ``(n_channels,)``.
-    snr : ndarray
-        Modal signal-to-noise ratio, summed over the channels, shape ``(n_modes,)``.
-    dispersion : ndarray
-        Variance of the residual near each mode over that of noise, shape ``(n_modes,)``.
-    flags : tuple of str
-        As in `Modes`.
-    best : tuple of str
-        The channel that shows each mode most clearly.
+        Root of the noise of these channels in (m/s²)/Hz^½, shape ``(n_channels,)``.
     clarity : ndarray
         Gain in log likelihood of the binned spectra by each mode at its start, ``(n_modes,)``.
     lines : tuple of LineEstimate
@@ -71,16 +54,8 @@ class ClusterModes:
         on average where the model fits; exactly one where a line was masked.
     """
 
-    data: LogSpectra
-    targets: tuple[Target, ...]
-    estimate: FloatArray
-    cov: FloatArray
-    shapes: FloatArray
+    modes: Modes
     unit: FloatArray
-    snr: FloatArray
-    dispersion: FloatArray
-    flags: tuple[str, ...]
-    best: tuple[str, ...]
     clarity: FloatArray
     lines: tuple[LineEstimate, ...]
     residual: Spectrum
@@ -88,42 +63,13 @@ class ClusterModes:
     @property
     def names(self) -> tuple[str, ...]:
         """Names of the modes."""
-        return tuple(target.name for target in self.targets)
+        return self.modes.names
 
     def keep(self, names: Iterable[str]) -> ClusterModes:
         """Keep the named modes; the others are marginalised."""
         kept = set(names)
-        index = np.array([i for i, name in enumerate(self.names) if name in kept], dtype=int)
-        both = paired(index, len(self.targets))
-        return replace(
-            self,
-            targets=tuple(self.targets[i] for i in index),
-            estimate=self.estimate[both],
-            cov=self.cov[np.ix_(both, both)],
-            shapes=self.shapes[:, index],
-            snr=self.snr[index],
-            dispersion=self.dispersion[index],
-            flags=tuple(self.flags[i] for i in index),
-            best=tuple(self.best[i] for i in index),
-            clarity=self.clarity[index],
-        )
-
-    def as_modes(self, channels: tuple[str, ...]) -> Modes:
-        """Return the estimates with shapes in units of acceleration over these channels."""
-        own = (self.unit[:, None] * self.shapes).T
-        own = own / np.linalg.norm(own, axis=1, keepdims=True)
-        largest = np.take_along_axis(own, np.abs(own).argmax(axis=1, keepdims=True), axis=1)
-        shapes = np.full((len(own), len(channels)), np.nan)
-        shapes[:, [channels.index(name) for name in self.data.channels]] = own * np.sign(largest)
-        sources = (self.data.source,) * len(self.names)
-        return replace(
-            estimates_only(self.estimate, self.cov, self.snr, sources, self.best),
-            names=self.names,
-            dispersion=self.dispersion,
-            flags=self.flags,
-            shape_channels=channels,
-            shapes=shapes,
-        )
+        index = [i for i, name in enumerate(self.names) if name in kept]
+        return replace(self, modes=self.modes.select(index), clarity=self.clarity[index])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -160,18 +106,9 @@ def conclude(
 ) -> ClusterFit:
     """Marginalise the posterior, and publish the modes whose estimates are credible.
 
-    Parameters
-    ----------
-    data : ClusterData
-        To which the modes were fitted.
-    targets : tuple of Target
-        The modes.
-    posterior : (Likelihood, ndarray)
-        With its mode, shape ``(n_unknowns,)``.
-    expected : list of ndarray
-        Expectation of each spectrum, shape ``(n_ordinates, n_channels, n_channels)``.
-    gains : dict of str to float
-        Gain in log likelihood of the binned spectra by each mode, by name.
+    ``posterior`` is the likelihood with its mode, shape ``(n_unknowns,)``; ``expected`` the
+    expectation of each spectrum, ``(n_ordinates, n_channels, n_channels)``; ``gains`` the gain in
+    log likelihood of the binned spectra by each mode.
     """
     likelihood, p = posterior
     estimate, cov, decrement = marginalise(likelihood, p)
@@ -184,24 +121,28 @@ def conclude(
     ratio = likelihood.signal_to_noise(p)
     residual = _residual(data, expected)
     dispersion = _dispersion(residual, f, zeta)
-    modes = zip(targets, f.tolist(), zeta.tolist(), dispersion.tolist(), strict=True)
-    return _accept(
-        ClusterModes(
-            data=data.spectra,
-            targets=targets,
-            estimate=estimate,
-            cov=cov,
-            shapes=likelihood.shapes(p),
-            unit=data.unit,
-            snr=ratio.sum(axis=0),
-            dispersion=dispersion,
-            flags=tuple(_flags(*mode, residual.duration) for mode in modes),
-            best=tuple(data.spectra.channels[c] for c in ratio.argmax(axis=0)),
-            clarity=np.array([gains[target.name] for target in targets]),
-            lines=masked_lines(data),
-            residual=residual,
-        )
+    each = zip(targets, f.tolist(), zeta.tolist(), dispersion.tolist(), strict=True)
+    channels = data.spectra.channels
+    best = [channels[c] for c in ratio.argmax(axis=0)]
+    sources = [data.spectra.source] * len(targets)
+    modes = replace(
+        estimates_only(estimate, cov, ratio.sum(axis=0), sources, best),
+        names=tuple(target.name for target in targets),
+        dispersion=dispersion,
+        flags=tuple(_flags(*one, residual.duration) for one in each),
+        shape_channels=channels,
+        shapes=_unit_shapes(data.unit * likelihood.shapes(p).T),
     )
+    clarity = np.array([gains[target.name] for target in targets])
+    found = ClusterModes(modes, data.unit, clarity, masked_lines(data), residual)
+    return _accept(found, targets, data.spectra)
+
+
+def _unit_shapes(shapes: FloatArray) -> FloatArray:
+    """Scale shapes, ``(n_modes, n_channels)``, to unit norm, the largest component positive."""
+    shapes = shapes / np.linalg.norm(shapes, axis=1, keepdims=True)
+    largest = np.take_along_axis(shapes, np.abs(shapes).argmax(axis=1, keepdims=True), axis=1)
+    return np.asarray(shapes * np.sign(largest))
 
 
 def _residual(data: ClusterData, expected: list[ComplexArray]) -> Spectrum:
@@ -260,30 +201,29 @@ def _read_line(spectra: LogSpectra, unit: FloatArray, first: int, last: int) -> 
     return LineEstimate(spectra.channels[c], frequency, amplitude * float(unit[c]))
 
 
-def _accept(modes: ClusterModes) -> ClusterFit:
+def _accept(found: ClusterModes, targets: tuple[Target, ...], spectra: LogSpectra) -> ClusterFit:
     """Reject estimates that are not credible; those that are lines are added to the lines."""
-    longest = max(modes.data.spectra, key=lambda s: s.observed)
+    longest = max(spectra.spectra, key=lambda s: s.observed)
     rejected: dict[str, Rejection] = {}
-    lines = list(modes.lines)
-    for i, name in enumerate(modes.names):
-        why = _incredible(modes, i, longest.duration)
+    lines = list(found.lines)
+    for i, target in enumerate(targets):
+        why = _incredible(found.modes, i, target, longest.duration)
         if why is None:
             continue
-        rejected[name] = why
+        rejected[target.name] = why
         if why.reason == "line-not-mode":
-            k = int(np.searchsorted(longest.frequency, np.exp(modes.estimate[i])))
+            k = int(np.searchsorted(longest.frequency, found.modes.frequency[i]))
             first, last = max(0, k - _LINE_BINS), k + _LINE_BINS + 1
-            lines.append(_read_line(modes.data, modes.unit, first, last))
-    kept = modes.keep(name for name in modes.names if name not in rejected)
+            lines.append(_read_line(spectra, found.unit, first, last))
+    kept = found.keep(name for name in found.names if name not in rejected)
     return ClusterFit(replace(kept, lines=tuple(lines)), rejected)
 
 
-def _incredible(modes: ClusterModes, i: int, duration: float) -> Rejection | None:
+def _incredible(modes: Modes, i: int, target: Target, duration: float) -> Rejection | None:
     """Return why an estimate is not credible; None if it is."""
-    m = len(modes.targets)
-    target, channel = modes.targets[i], modes.best[i]
-    f, zeta = float(np.exp(modes.estimate[i])), float(np.exp(modes.estimate[m + i]))
-    std_f, std_zeta = np.sqrt(np.diag(modes.cov))[[i, m + i]].tolist()
+    channel = modes.channels[i]
+    f, zeta = float(modes.frequency[i]), float(modes.damping_ratio[i])
+    std_f, std_zeta = np.sqrt(np.diag(modes.cov))[paired([i], len(modes.names))].tolist()
     low, high = _damping_bounds(target)
     if 2 * zeta * f * duration < 1:
         return Rejection(
@@ -328,14 +268,13 @@ def refuse_close_modes(fit: ClusterFit) -> ClusterFit:
     while modes is not None and (pair := _closest(modes)) is not None:
         i, j = pair
         names = [modes.names[k] for k in pair]
-        f = np.sort(np.exp(modes.estimate[[i, j]]))
-        common = _common(modes, i, j)
-        centre, ratio = np.exp(common.estimate[[i, len(modes.names) + i]]).tolist()
-        std = centre * float(np.sqrt(common.cov[i, i]))
+        f = np.sort(modes.modes.frequency[[i, j]])
+        mean = _common(modes, i, j).modes.select([i])
         detail = (
             f"resonances at {f[0]:.5g} and {f[1]:.5g} Hz cannot be separated; their mean is "
-            f"{centre:.5g} ± {std:.2g} Hz, damping {100 * ratio:.2g} %: record longer, or in a "
-            "channel that they move differently"
+            f"{mean.frequency[0]:.5g} ± {mean.frequency_std[0]:.2g} Hz, damping "
+            f"{100 * mean.damping_ratio[0]:.2g} %: record longer, or in a channel that they move "
+            "differently"
         )
         rejected = rejected | dict.fromkeys(names, Rejection("too-close", detail))
         modes = modes.keep(name for name in modes.names if name not in names)
@@ -350,27 +289,30 @@ def merge_close_modes(modes: ClusterModes) -> ClusterModes:
     return modes
 
 
-def _closest(modes: ClusterModes) -> tuple[int, int] | None:
+def _closest(found: ClusterModes) -> tuple[int, int] | None:
     """Return a pair of modes that are too close; None where there is none."""
-    m = len(modes.targets)
-    f, zeta = np.exp(modes.estimate[:m]), np.exp(modes.estimate[m:])
-    shapes = modes.shapes / np.linalg.norm(modes.shapes, axis=0)
-    for i, j in combinations(range(m), 2):
+    f, zeta = found.modes.frequency, found.modes.damping_ratio
+    shapes = found.modes.shapes / found.unit
+    shapes = shapes / np.linalg.norm(shapes, axis=1, keepdims=True)
+    for i, j in combinations(range(f.size), 2):
         apart = abs(f[i] - f[j]) / (zeta[i] * f[i] + zeta[j] * f[j])
-        alike = float(shapes[:, i] @ shapes[:, j]) ** 2 > constants.ALIKE
+        alike = float(shapes[i] @ shapes[j]) ** 2 > constants.ALIKE
         if apart < (constants.APART_ALIKE if alike else constants.APART):
             return i, j
     return None
 
 
-def _common(modes: ClusterModes, i: int, j: int) -> ClusterModes:
+def _common(found: ClusterModes, i: int, j: int) -> ClusterModes:
     """Put the mean of two modes in the place of the first, its covariance covering both."""
-    m = len(modes.targets)
+    modes = found.modes
+    m = len(modes.names)
     mean = np.eye(2 * m)
     for a, b in ((i, j), (m + i, m + j)):
         mean[a, [a, b]] = 0.5
     half = (modes.estimate[[i, m + i]] - modes.estimate[[j, m + j]]) / 2
     cov = mean @ modes.cov @ mean.T
     cov[[i, m + i], [i, m + i]] += half**2
+    ln_f, ln_zeta = np.split(mean @ modes.estimate, 2)
     flags = [f"{flag} cluster".strip() if k == i else flag for k, flag in enumerate(modes.flags)]
-    return replace(modes, estimate=mean @ modes.estimate, cov=cov, flags=tuple(flags))
+    common = replace(modes, ln_frequency=ln_f, ln_damping=ln_zeta, cov=cov, flags=tuple(flags))
+    return replace(found, modes=common)

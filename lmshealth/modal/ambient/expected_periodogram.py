@@ -78,16 +78,8 @@ def make_kernel(
 ) -> Kernel:
     """Prepare the expected periodogram of some ordinates of a spectrum.
 
-    Parameters
-    ----------
-    spectrum : Spectrum or CrossSpectrum
-        A band of Fourier frequencies.
-    keep : ndarray of bool
-        Ordinates to compute, shape ``(n_ordinates,)``.
-    finer : int
-        Frequencies of the grid per Fourier frequency.
-    margin : int
-        Fourier frequencies of the grid outside the band.
+    ``keep`` selects ordinates, shape ``(n_ordinates,)``; the grid has ``finer`` frequencies per
+    Fourier frequency and ends ``margin`` Fourier frequencies outside the band.
     """
     first, last = np.rint(spectrum.frequency[[0, -1]] * spectrum.duration).astype(int).tolist()
     index = np.arange(max((first - margin) * finer, 1), (last + margin) * finer)

@@ -152,12 +152,8 @@ def screen(
 ) -> tuple[tuple[Target, ...], dict[str, float]]:
     """Drop modes that the binned spectra do not need.
 
-    Returns
-    -------
-    targets : tuple of Target
-        Those that remain, with refined start dampings.
-    gains : dict of str to float
-        Gain in log likelihood by each mode, by name.
+    Returns those that remain, with refined start dampings, and the gain in log likelihood by each
+    mode, by name.
     """
 
     def misfit(some: tuple[Target, ...]) -> float:

@@ -102,19 +102,10 @@ def _peaks(
 
 
 def find_excess(residual: Spectrum, narrowest: float = 0.0) -> Target | None:
-    """Return the frequency and scale where the residual of a fit is most above one.
+    """Return the frequency and scale where the residual of a fit is most above one, if any is.
 
-    Parameters
-    ----------
-    residual : Spectrum
-        Periodogram over its expectation; exponential about one where the model fits.
-    narrowest : float
-        Least damping ratio of an excess; narrower ones are ignored.
-
-    Returns
-    -------
-    Target or None
-        None where no excess is significant.
+    The residual is a periodogram over its expectation, exponential about one where the model fits.
+    Excesses with a damping ratio below ``narrowest`` are ignored.
     """
     ordinates = residual.periodogram.copy()
     for _ in range(_MOST_NARROW):

@@ -103,15 +103,7 @@ class Layout:
 
 
 def lay_out(reference: Sequence[int], n_channels: int) -> Layout:
-    """Return the places of the unknowns.
-
-    Parameters
-    ----------
-    reference : sequence of int
-        Channel of each mode in which its shape is one.
-    n_channels : int
-        Number of channels.
-    """
+    """Return the places of the unknowns; ``reference`` is the channel in which a shape is one."""
     m = len(reference)
     # A single channel only shows which forces neighbours share.
     modes = [(i, j) for i in range(m) for j in range(i + 1) if n_channels > 1 or i - j < 2]
@@ -283,17 +275,9 @@ class Likelihood:
         return self._derivatives(p, self._at(p))
 
     def minimise(self, start: FloatArray) -> FloatArray:
-        """Find the posterior mode by Newton's method in a trust region.
+        """Find the posterior mode by Newton's method in a trust region, from ``(n_unknowns,)``.
 
-        Parameters
-        ----------
-        start : ndarray
-            Shape ``(n_unknowns,)``.
-
-        Returns
-        -------
-        ndarray
-            The end of the search; its Newton decrement shows whether it converged.
+        The Newton decrement at the result shows whether the search converged.
         """
         # The optimiser evaluates value, gradient and Hessian in an order of its own, and returns to
         # the point before where a step was too long.
@@ -609,12 +593,8 @@ def _narrow(
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Evaluate narrower priors of groups of unknowns, whose posterior is normal under the widest.
 
-    Returns
-    -------
-    weight : ndarray
-        Normalised evidence of each choice of widths, shape ``(n_choices,)``.
-    mean, cov : ndarray
-        Of the unknowns, shapes ``(n_choices, n)`` and ``(n_choices, n, n)``.
+    Returns the normalised evidence of each choice of widths, shape ``(n_choices,)``, and means and
+    covariances of the unknowns, ``(n_choices, n)`` and ``(n_choices, n, n)``.
     """
     choices = (constants.WIDTHS_SHARED, constants.WIDTHS_COMMON, constants.WIDTHS_BEND)
     widths = np.array(list(product(*choices)))

@@ -194,12 +194,8 @@ def _average_levels(
 ) -> tuple[FloatArray, list[Optimum]]:
     """Maximise at levels in both directions from a first one, until they are unlikely.
 
-    Returns
-    -------
-    weights : ndarray
-        Log posterior of each level on a log grid, the other parameters integrated.
-    levels : list of Optimum
-        Maximum at each level.
+    Returns the log posterior of each level on a log grid, the other parameters integrated, and the
+    maximum at each level.
     """
     found: list[tuple[float, Optimum]] = []
     for way in (1, -1):
@@ -224,19 +220,7 @@ def _average_levels(
 def invert(likelihood: TransientLikelihood, optimum: Optimum, free: IntArray) -> FloatArray:
     """Invert the Hessian, or the Fisher information where that has no inverse.
 
-    Parameters
-    ----------
-    likelihood : TransientLikelihood
-        Of the decays.
-    optimum : Optimum
-        Its maximum.
-    free : ndarray of int
-        Parameters, shape ``(n_free,)``.
-
-    Returns
-    -------
-    ndarray
-        Covariance of the free parameters, shape ``(n_free, n_free)``.
+    Returns the covariance of the free parameters, shape ``(n_free, n_free)``.
     """
     try:
         factor = np.linalg.cholesky(_hessian(likelihood, optimum, free))
@@ -318,12 +302,7 @@ class DecayFit:
     def excitation(self, mode: int, level: float) -> float:
         """Return the mean square of a vibration at the stops over that of the ambient response.
 
-        Parameters
-        ----------
-        mode : int
-            Index of the mode.
-        level : float
-            Ambient response h of the mode.
+        ``level`` is the ambient response h of the mode.
         """
         f, zeta = float(self.frequency[mode]), float(self.damping_ratio[mode])
         exponent = 2 * np.pi * f * (-zeta + 1j * np.sqrt(1 - zeta**2))
@@ -362,17 +341,7 @@ class DecayEstimate:
 def fit_decays(blocks: tuple[DecaySpectra, ...], *, displacement: bool = False) -> DecayFit:
     """Add poles while the Bayesian information criterion improves.
 
-    Parameters
-    ----------
-    blocks : tuple of DecaySpectra
-        Decays in a band.
-    displacement : bool
-        The channels are displacements.
-
-    Returns
-    -------
-    DecayFit
-        Without modes where the band holds only noise.
+    The result has no modes where the band holds only noise.
     """
     n = blocks[0].ordinates.shape[2]
     levels = np.log(_levels(blocks))
@@ -459,15 +428,7 @@ def _shape(sizes: ComplexArray, noise: FloatArray) -> FloatArray:
 
 
 def estimate(found: DecayFit, modes: Sequence[int] | None = None) -> DecayEstimate:
-    """Estimate modes of a band, averaged over their ambient responses.
-
-    Parameters
-    ----------
-    found : DecayFit
-        With at least one mode.
-    modes : sequence of int, optional
-        Indices, at least one; by default all.
-    """
+    """Estimate modes of a band, by default all, averaged over their ambient responses."""
     likelihood, m = found.likelihood, found.likelihood.n_modes
     modes = range(m) if modes is None else modes
     p = found.optimum.p.copy()
@@ -496,20 +457,10 @@ def estimate(found: DecayFit, modes: Sequence[int] | None = None) -> DecayEstima
 
 
 def stationarity(found: DecayFit) -> float:
-    """Test whether the residual is stationary over the record.
+    """Return the p value of a test whether the residual is stationary over the record.
 
-    Noise whose power varies over the record correlates neighbouring ordinates. The lag-one
-    products of the whitened residual are compared with those of white noise after the same fit.
-
-    Parameters
-    ----------
-    found : DecayFit
-        Any fit.
-
-    Returns
-    -------
-    float
-        p value: probability of at least that correlation in stationary noise.
+    Noise whose power varies over the record correlates neighbouring ordinates. The lag-one products
+    of the whitened residual are compared with those of white noise after the same fit.
     """
     total = np.zeros((3, 2))
     for fit in found.optimum.at.fits:

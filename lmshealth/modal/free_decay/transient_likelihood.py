@@ -102,17 +102,8 @@ def stack(values: ComplexArray) -> FloatArray:
 def transient(block: DecaySpectra, f: FloatArray, zeta: FloatArray) -> ComplexArray:
     """Return transforms of decays at positive frequencies, up to a constant.
 
-    Parameters
-    ----------
-    block : DecaySpectra
-        Its Fourier frequencies.
-    f, zeta : ndarray
-        Natural frequencies in Hz and damping ratios, shape ``(n,)``.
-
-    Returns
-    -------
-    ndarray of complex
-        Shape ``(n_ordinates, n)``.
+    Natural frequencies in Hz and damping ratios have shape ``(n,)``, the result
+    ``(n_ordinates, n)``.
     """
     exponent = 2 * np.pi * f * (-zeta + 1j * np.sqrt(1 - zeta**2)) / block.sample_rate
     back = np.exp(-2j * np.pi * block.frequency / block.sample_rate)
@@ -176,14 +167,8 @@ _LEVEL_STD, _SLOPE_STD = 3.0, 1.0
 def unit_level(f: float, zeta: float, duration: float, *, displacement: bool = False) -> float:
     """Return the response to a unit white force one Fourier frequency above the resonance.
 
-    Parameters
-    ----------
-    f, zeta : float
-        Natural frequency in Hz and damping ratio.
-    duration : float
-        Duration of the record in s.
-    displacement : bool
-        Displacement, in the unit of the force times 1/ω_n², instead of acceleration.
+    The frequency is in Hz, the duration of the record in s; of a displacement in the unit of the
+    force times 1/ω_n².
     """
     beta2 = (f / (f + 1 / duration)) ** 2
     level = 1 / ((1 - beta2) ** 2 + 4 * zeta**2 * beta2)
@@ -284,13 +269,7 @@ class TransientLikelihood:
         return int(self.blocks[0].ordinates.shape[2])
 
     def evaluate(self, p: FloatArray) -> Evaluation:
-        """Evaluate the likelihood, its gradient and its Fisher information.
-
-        Parameters
-        ----------
-        p : ndarray
-            Shape ``(n_parameters,)``.
-        """
+        """Evaluate the likelihood at parameters of shape ``(n_parameters,)``."""
         parts = [self._evaluate_block(block, p) for block in self.blocks]
         gradient = np.sum([part.gradient for part in parts], axis=0)
         fisher = np.sum([part.fisher for part in parts], axis=0)
@@ -407,16 +386,10 @@ class TransientLikelihood:
     def _noise(
         self, block: DecaySpectra, p: FloatArray
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return the rank-one parts of the noise's covariance.
+        """Return directions, levels and slopes of the rank-one parts of the noise's covariance.
 
-        Returns
-        -------
-        directions : ndarray
-            Modes, then channels, shape ``(n_modes + n_channels, n_channels)``.
-        level : ndarray
-            Power spectral density of each part, ``(n_modes + n_channels, n_ordinates)``.
-        slopes : ndarray
-            Derivative of the level by each parameter, shape ``(n_parameters, n_ordinates)``.
+        Modes, then channels: shapes ``(n_modes + n_channels, n_channels)`` and
+        ``(n_modes + n_channels, n_ordinates)``; slopes ``(n_parameters, n_ordinates)``.
         """
         m, n = self.n_modes, self.n_channels
         low, high = self._band
@@ -448,18 +421,8 @@ def _by_noise(
 ) -> tuple[FloatArray, FloatArray]:
     """Return gradient and Fisher information through the noise.
 
-    Every part of the noise's covariance has rank one and acts along one whitened direction.
-
-    Parameters
-    ----------
-    fit : BlockFit
-        The block.
-    seen : ndarray
-        Whitened directions, shape ``(n_modes + n_channels, n_ordinates, n_channels)``.
-    slopes : ndarray
-        As in `TransientLikelihood._noise`.
-    m : int
-        Number of modes.
+    Every part of its covariance has rank one and acts along one whitened direction of ``seen``,
+    ``(n_modes + n_channels, n_ordinates, n_channels)``; ``slopes`` as in `_noise`.
     """
     n = seen.shape[2]
     n_segments = fit.residual.shape[1]
@@ -479,23 +442,11 @@ def _by_noise(
 def _volume_slope(
     columns: FloatArray, turned: FloatArray, whiten: FloatArray, q: FloatArray, r: FloatArray
 ) -> FloatArray:
-    """Differentiate the log of the volume of the whitened columns over that of the plain ones.
+    """Differentiate the log volume of the whitened columns less that of the plain ones.
 
-    Parameters
-    ----------
-    columns : ndarray
-        Shape ``(2 n_ordinates, n_columns)``, those of the poles last.
-    turned : ndarray
-        As in `pole_columns`.
-    whiten : ndarray
-        Shape ``(2 n_ordinates, n_channels, n_channels)``.
-    q, r : ndarray
-        Factors of the whitened columns.
-
-    Returns
-    -------
-    ndarray
-        By ln f and ln ζ of each mode, shape ``(2 n_modes,)``.
+    ``columns`` has shape ``(2 n_ordinates, n_columns)``, those of the poles last; ``turned`` as in
+    `pole_columns`; ``whiten`` has shape ``(2 n_ordinates, n_channels, n_channels)``; ``q``, ``r``
+    are the factors of the whitened columns. The result, by ln f and ln ζ: ``(2 n_modes,)``.
     """
     n, m = whiten.shape[1], turned.shape[1]
     whitened = linalg.solve_triangular(r, q.T, check_finite=False)

@@ -31,16 +31,16 @@ TRUTH = np.log([105.0, 125.0, 0.015, 0.02])
 
 def off(result: ClusterModes, truth: np.ndarray = TRUTH) -> np.ndarray:
     """Deviations from the truth in standard deviations."""
-    return np.asarray((result.estimate - truth) / np.sqrt(np.diag(result.cov)))
+    return np.asarray((result.modes.estimate - truth) / np.sqrt(np.diag(result.modes.cov)))
 
 
 def test_both_modes_are_fitted_with_their_truth_inside_four_sigma() -> None:
     """Frequency and damping of both are within 4 standard deviations of the truth."""
     result = found(both())
     assert np.abs(off(result)).max() < 4
-    assert np.sqrt(np.diag(result.cov))[:2].max() < 2e-3
-    assert result.best == ("acc_0", "acc_1")
-    assert result.data.channels == ("acc_0", "acc_1")
+    assert np.sqrt(np.diag(result.modes.cov))[:2].max() < 2e-3
+    assert result.modes.channels == ("acc_0", "acc_1")
+    assert result.modes.shape_channels == ("acc_0", "acc_1")
 
 
 @pytest.mark.slow
@@ -83,7 +83,7 @@ def test_snr_is_the_modal_signal_to_noise_ratio_of_all_channels() -> None:
     """Σ S φ² / (4 ζ² S_e) is found within 40 % where the noise shows between the modes."""
     result = found(both(6, noise=20.0))
     truth = [Mode(105.0, 0.015).snr(20.0) * 1.09, Mode(125.0, 0.02).snr(20.0) * 1.16]
-    np.testing.assert_allclose(result.snr, truth, rtol=0.4)
+    np.testing.assert_allclose(result.modes.snr, truth, rtol=0.4)
 
 
 def test_channels_of_different_units_are_fitted_as_one() -> None:
@@ -91,7 +91,7 @@ def test_channels_of_different_units_are_fitted_as_one() -> None:
     one = found(both())
     other = found(both() * [[1.0], [1e-6]])
     np.testing.assert_allclose(off(one), off(other), atol=1e-2)
-    np.testing.assert_allclose(np.diag(other.cov), np.diag(one.cov), rtol=1e-2)
+    np.testing.assert_allclose(np.diag(other.modes.cov), np.diag(one.modes.cov), rtol=1e-2)
 
 
 def test_a_mode_that_is_not_there_is_refused_and_the_other_kept() -> None:
@@ -101,7 +101,7 @@ def test_a_mode_that_is_not_there_is_refused_and_the_other_kept() -> None:
         accelerations(np.random.default_rng(2), modes, 60_000, RATE, 0.5), [ROLL, PITCH]
     )
     assert result is not None
-    assert [target.name for target in result.targets] == ["roll"]
+    assert list(result.names) == ["roll"]
     reason, detail = rejected["pitch"]
     assert reason == "not-excited"
     assert "125 Hz in any channel" in detail
@@ -125,14 +125,14 @@ def test_a_pure_sine_is_no_mode(noise: float) -> None:
     rng = np.random.default_rng(4)
     values = sine(60_000, RATE, 105.01, 30.0) + white(rng, noise, 60_000, RATE)
     result, rejected = fit(values, [ROLL])
-    assert result is None or result.targets == ()
+    assert result is None or result.names == ()
     assert rejected["roll"][0] in ("not-excited", "line-not-mode")
 
 
 def test_a_channel_that_does_not_see_the_modes_is_left_out() -> None:
     """The spectra of a fit holds the channels that show any of its modes."""
     values = np.vstack([both(), white(np.random.default_rng(5), 1.0, 60_000, RATE)])
-    assert found(values).data.channels == ("acc_0", "acc_1")
+    assert found(values).modes.shape_channels == ("acc_0", "acc_1")
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -157,7 +157,12 @@ def test_a_line_is_kept_out_and_listed_with_its_amplitude() -> None:
     assert line.channel == "acc_1"
     assert line.frequency == pytest.approx(110.0, abs=0.02)
     assert line.amplitude == pytest.approx(3.0, rel=0.3)
-    assert np.abs((dirty.estimate - clean.estimate) / np.sqrt(np.diag(clean.cov))).max() < 1
+    assert (
+        np.abs(
+            (dirty.modes.estimate - clean.modes.estimate) / np.sqrt(np.diag(clean.modes.cov))
+        ).max()
+        < 1
+    )
 
 
 def test_a_mode_far_from_where_it_is_sought_is_not_taken() -> None:
@@ -166,7 +171,7 @@ def test_a_mode_far_from_where_it_is_sought_is_not_taken() -> None:
     modes = [Mode(125.0, 0.02, 1.0, (1.0, 1.0))]
     values = accelerations(np.random.default_rng(4), modes, 60_000, RATE, 0.5)
     result, rejected = fit(values, [target])
-    assert result is None or result.targets == ()
+    assert result is None or result.names == ()
     assert set(rejected) == {"roll"}
 
 
@@ -201,11 +206,11 @@ def test_keeping_some_modes_marginalises_the_others() -> None:
     """The covariance of what is kept is the block of the whole; the names follow."""
     result = found(both())
     kept = result.keep(["pitch"])
-    assert [target.name for target in kept.targets] == ["pitch"]
-    np.testing.assert_array_equal(kept.estimate, result.estimate[[1, 3]])
-    np.testing.assert_array_equal(kept.cov, result.cov[np.ix_([1, 3], [1, 3])])
-    np.testing.assert_array_equal(kept.snr, result.snr[[1]])
-    assert kept.best == ("acc_1",)
+    assert list(kept.names) == ["pitch"]
+    np.testing.assert_array_equal(kept.modes.estimate, result.modes.estimate[[1, 3]])
+    np.testing.assert_array_equal(kept.modes.cov, result.modes.cov[np.ix_([1, 3], [1, 3])])
+    np.testing.assert_array_equal(kept.modes.snr, result.modes.snr[[1]])
+    assert kept.modes.channels == ("acc_1",)
 
 
 def test_the_clearer_record_has_the_higher_clarity() -> None:
@@ -250,7 +255,12 @@ def test_a_line_known_beforehand_is_masked() -> None:
     assert (result.residual.periodogram[reach] == 1).all()
     assert (clean.residual.periodogram[reach] != 1).all()
     assert result.lines == ()
-    assert np.abs((result.estimate - clean.estimate) / np.sqrt(np.diag(clean.cov))).max() < 0.5
+    assert (
+        np.abs(
+            (result.modes.estimate - clean.modes.estimate) / np.sqrt(np.diag(clean.modes.cov))
+        ).max()
+        < 0.5
+    )
 
 
 def test_a_band_that_known_lines_cover_is_too_short() -> None:
@@ -297,11 +307,11 @@ def test_the_mean_of_parts_is_as_sure_as_the_whole_record() -> None:
     values = both(seed=7, n=200_000)
     whole, mean = fit_mean(mean_of(values, 1)), fit_mean(mean_of(values, 10))
     assert np.abs(off(mean)).max() < 4
-    std = np.sqrt(np.diag(mean.cov))
-    np.testing.assert_allclose(std, np.sqrt(np.diag(whole.cov)), rtol=0.1)
+    std = np.sqrt(np.diag(mean.modes.cov))
+    np.testing.assert_allclose(std, np.sqrt(np.diag(whole.modes.cov)), rtol=0.1)
     # Negative control: taken for a single record it would be three times less sure.
     once = fit_mean(replace(mean_of(values, 10), count=1))
-    assert (np.sqrt(np.diag(once.cov)) > 2 * std).all()
+    assert (np.sqrt(np.diag(once.modes.cov)) > 2 * std).all()
 
 
 @pytest.mark.slow
@@ -338,7 +348,7 @@ def test_a_stretch_too_short_for_the_band_does_no_harm() -> None:
     extended, _ = fit_spectra(more, binned, (ROLL, PITCH))
     assert alone is not None
     assert extended is not None
-    np.testing.assert_allclose(extended.estimate, alone.estimate, atol=1e-9)
+    np.testing.assert_allclose(extended.modes.estimate, alone.modes.estimate, atol=1e-9)
 
 
 @pytest.mark.parametrize(("nominal", "reason"), [(None, "line-not-mode"), (105.0, None)])
@@ -352,7 +362,7 @@ def test_a_peak_as_narrow_as_mains_is_no_mode_unless_sought(
     target = Target("roll", 105.0, 0.0005, 0.02, nominal=nominal)
     result, rejected = fit_spectra(spectra, binned, (target,))
     assert result is not None
-    assert [t.name for t in result.targets] == ([] if reason else ["roll"])
+    assert list(result.names) == ([] if reason else ["roll"])
     assert reason is None or rejected["roll"][0] == reason
 
 

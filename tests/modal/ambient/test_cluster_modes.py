@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -17,6 +18,8 @@ from lmshealth.modal.ambient.cluster_modes import (
     refuse_close_modes,
 )
 from lmshealth.modal.identification import identify
+from lmshealth.modal.modes import Modes
+from lmshealth.modal.targets import Target
 from lmshealth.signal.spectra import Spectrum
 from tests.bands import PITCH, RATE, ROLL, both, fit, found
 from tests.signals import Mode, acceleration_log, make_stage
@@ -24,10 +27,16 @@ from tests.signals import Mode, acceleration_log, make_stage
 
 def brought_to(apart: float, fit: ClusterModes, shapes: list[list[float]]) -> ClusterModes:
     """Move the second mode so many half-power bandwidths above the first, with these shapes."""
-    estimate = fit.estimate.copy()
+    estimate = fit.modes.estimate.copy()
     estimate[2:] = np.log(0.02)
     estimate[1] = estimate[0] + np.log1p(2 * 0.02 * apart)
-    return replace(fit, estimate=estimate, shapes=np.array(shapes).T)
+    moved = replace(
+        fit.modes,
+        ln_frequency=estimate[:2],
+        ln_damping=estimate[2:],
+        shapes=np.array(shapes) * fit.unit,
+    )
+    return replace(fit, modes=moved)
 
 
 ALIKE, UNLIKE = [[1.0, 0.5], [1.0, 0.45]], [[1.0, 0.5], [0.5, -1.0]]
@@ -51,24 +60,24 @@ def test_modes_are_close_within_a_bandwidth_unless_their_shapes_differ(
     kept, rejected = result.modes, result.rejected
     assert kept is not None
     assert (set(rejected) == {"roll", "pitch"}) is close
-    assert (len(kept.targets) == 0) is close
+    assert (len(kept.names) == 0) is close
     if close:
         reason, detail = rejected["roll"]
         assert reason == "too-close"
-        assert f"{np.exp(fit.estimate[0]):.5g}" in detail
+        assert f"{np.exp(fit.modes.estimate[0]):.5g}" in detail
 
 
 def test_what_was_not_sought_by_name_is_left_as_one() -> None:
     """One mode for both, half of their distance in its standard deviation, and flagged."""
     fit = brought_to(0.5, found(both()), ALIKE)
     kept = merge_close_modes(fit)
-    assert [t.name for t in kept.targets] == ["roll"]
-    assert kept.flags == ("cluster",)
-    assert kept.estimate[0] == pytest.approx(fit.estimate[:2].mean())
-    half = (fit.estimate[1] - fit.estimate[0]) / 2
-    own = (fit.cov[0, 0] + fit.cov[1, 1] + 2 * fit.cov[0, 1]) / 4
-    assert kept.cov[0, 0] == pytest.approx(own + half**2)
-    assert kept.cov.shape == (2, 2)
+    assert list(kept.names) == ["roll"]
+    assert kept.modes.flags == ("cluster",)
+    assert kept.modes.estimate[0] == pytest.approx(fit.modes.estimate[:2].mean())
+    half = (fit.modes.estimate[1] - fit.modes.estimate[0]) / 2
+    own = (fit.modes.cov[0, 0] + fit.modes.cov[1, 1] + 2 * fit.modes.cov[0, 1]) / 4
+    assert kept.modes.cov[0, 0] == pytest.approx(own + half**2)
+    assert kept.modes.cov.shape == (2, 2)
 
 
 @pytest.mark.slow
@@ -102,12 +111,12 @@ TRUTH = np.log([105.0, 125.0, 0.015, 0.02])
 def test_a_mode_narrower_than_a_record_resolves_is_a_line() -> None:
     """A half-power bandwidth of 0.95 Fourier frequencies is refused, one of 1.05 accepted."""
     result = found(both())
-    width = 2 * np.exp(result.estimate[0] + result.estimate[2])
-    why = _incredible(result, 0, 0.95 / width)
+    width = 2 * np.exp(result.modes.estimate[0] + result.modes.estimate[2])
+    why = _incredible(result.modes, 0, ROLL, 0.95 / width)
     assert why is not None
     assert why[0] == "line-not-mode"
     assert "is narrower" in why[1]
-    assert _incredible(result, 0, 1.05 / width) is None
+    assert _incredible(result.modes, 0, ROLL, 1.05 / width) is None
 
 
 # How well the model fits, and what to bear in mind
@@ -168,45 +177,40 @@ def test_too_few_ordinates_tell_no_dispersion() -> None:
         assert np.isfinite(_dispersion(left, between, reach / (2 * between))[0]) == enough
 
 
-def flags(result: ClusterModes) -> list[list[str]]:
+def flags(
+    modes: Modes, duration: float = 60.0, targets: Sequence[Target] = (ROLL, PITCH)
+) -> list[list[str]]:
     """List the flags of both modes."""
-    values = zip(*np.exp(result.estimate).reshape(2, -1), result.dispersion, strict=True)
-    (duration,) = (spectrum.duration for spectrum in result.data.spectra)
+    values = zip(modes.frequency, modes.damping_ratio, modes.dispersion, strict=True)
     return [
         _flags(target, *value, duration).split()
-        for target, value in zip(result.targets, values, strict=True)
+        for target, value in zip(targets, values, strict=True)
     ]
 
 
 def test_a_good_fit_has_no_flags() -> None:
     """A record of a minute that shows both modes as described leaves nothing to bear in mind."""
     result = found(both())
-    assert result.flags == ("", "")
-    assert (result.dispersion > 0.7).all()
-    assert (result.dispersion < 1.4).all()
+    assert result.modes.flags == ("", "")
+    assert (result.modes.dispersion > 0.7).all()
+    assert (result.modes.dispersion < 1.4).all()
 
 
-def test_flags_say_what_a_reading_lacks() -> None:
-    """Each of them is raised by its own reason, for its own mode, and together."""
-    result = found(both())
-    (spectrum,) = result.data.spectra
+def test_each_flag_has_its_own_reason() -> None:
+    """Resolution, bounds of frequency and damping, and dispersion raise flags, also together."""
+    modes = found(both()).modes
     # Half-power bandwidths of 3.15 and 5 Hz: a second holds 3.15 and 5 ordinates.
-    brief = replace(result.data, spectra=(replace(spectrum, duration=1.0),))
-    short = replace(result, data=brief)
-    assert flags(short) == [["resolution-limited"], []]
-    assert flags(replace(result, dispersion=np.array([np.nan, 1.6]))) == [[], ["loose-fit"]]
-    far, heavy = TRUTH.copy(), TRUTH.copy()
-    far[0] += 0.95 * np.log1p(0.15)
-    heavy[3] = np.log(0.02 * 5.8)
-    assert flags(replace(result, estimate=far)) == [["at-bound"], []]
-    assert flags(replace(result, estimate=heavy)) == [[], ["at-bound"]]
-    worst = replace(short, estimate=far, dispersion=np.array([2.0, 1.0]))
-    assert flags(worst) == [["resolution-limited", "at-bound", "loose-fit"], []]
-    # What was sought counts, not where the search of this log began.
-    moved = tuple(
-        replace(t, frequency=1.14 * t.frequency, nominal=t.frequency) for t in (ROLL, PITCH)
-    )
-    assert flags(replace(result, targets=tuple(moved))) == [[], []]
+    assert flags(modes, 1.0) == [["resolution-limited"], []]
+    assert flags(replace(modes, dispersion=np.array([np.nan, 1.6]))) == [[], ["loose-fit"]]
+    far = replace(modes, ln_frequency=TRUTH[:2] + np.array([0.95 * np.log1p(0.15), 0.0]))
+    heavy = replace(modes, ln_damping=np.log([0.015, 0.02 * 5.8]))
+    assert flags(far) == [["at-bound"], []]
+    assert flags(heavy) == [[], ["at-bound"]]
+    worst = replace(far, dispersion=np.array([2.0, 1.0]))
+    assert flags(worst, 1.0) == [["resolution-limited", "at-bound", "loose-fit"], []]
+    # The described frequency counts, not the start value in this log.
+    moved = [replace(t, frequency=1.14 * t.frequency, nominal=t.frequency) for t in (ROLL, PITCH)]
+    assert flags(modes, targets=moved) == [[], []]
 
 
 @pytest.mark.slow
@@ -216,8 +220,11 @@ def test_a_mode_under_a_line_that_is_too_unsteady_to_be_told_is_refused() -> Non
     phase = 2 * np.pi * np.cumsum(105 + 0.3 * np.sin(2 * np.pi * t / 17)) / RATE
     result, rejected = fit(both() + 10.0 * np.sin(phase), [ROLL, PITCH])
     assert result is not None
-    assert [target.name for target in result.targets] == ["pitch"]
-    assert np.abs((result.estimate - TRUTH[[1, 3]]) / np.sqrt(np.diag(result.cov))).max() < 4
+    assert list(result.names) == ["pitch"]
+    assert (
+        np.abs((result.modes.estimate - TRUTH[[1, 3]]) / np.sqrt(np.diag(result.modes.cov))).max()
+        < 4
+    )
     reason, detail = rejected["roll"]
     assert reason == "poor-fit"
     assert "times as much as noise" in detail
@@ -225,4 +232,4 @@ def test_a_mode_under_a_line_that_is_too_unsteady_to_be_told_is_refused() -> Non
     faint, rejected = fit(both() + 5.0 * np.sin(phase), [ROLL, PITCH])
     assert faint is not None
     assert rejected == {}
-    assert faint.flags == ("loose-fit", "")
+    assert faint.modes.flags == ("loose-fit", "")
