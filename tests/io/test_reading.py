@@ -10,8 +10,10 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
+from click.testing import CliRunner
 
 from lmshealth import io as readers
+from lmshealth.cli.main import main
 from lmshealth.errors import BadLog
 from lmshealth.io import constants
 from lmshealth.io.reading import content_digest, read_log, require_identity
@@ -282,3 +284,12 @@ def test_arrays_are_read_only(make):
     """A log cannot be changed by who reads it."""
     with pytest.raises(ValueError, match="read-only"):
         read_log(make()).channels[0].values[0] = 1.0
+
+
+def test_the_limit_of_memory_is_an_option(make):
+    """The command line passes --max-memory to the reader, and names it in the refusal."""
+    path = str(make("log.mat"))
+    run = CliRunner().invoke(main, ["error", path, "--max-memory", "1e-6"])
+    assert run.exit_code == 1 and "too-large: variable" in run.output + run.stderr
+    assert "raise --max-memory" in run.output + run.stderr
+    assert CliRunner().invoke(main, ["error", path]).exit_code == 0
