@@ -65,9 +65,7 @@ class Ratio:
         Valid for values at single s.  Roots of high orders are lost to rounding: take poles and
         stability from `state_space` of the factors.
         """
-        control = python_control()
-
-        return control.tf(self.numerator[::-1], self.denominator[::-1])
+        return python_control().tf(self.numerator[::-1], self.denominator[::-1])
 
     def state_space(self) -> Any:
         """Return it as a ``control.StateSpace``, time scaled to the geometric mean of its poles.
@@ -78,7 +76,6 @@ class Ratio:
             If the numerator has the higher order.
         """
         control = python_control()
-
         order = len(self.denominator) - 1
         if len(self.numerator) > order + 1:
             raise BadParameter(
@@ -273,11 +270,3 @@ def controller(stage: str, reading: str) -> Any:
 def plant(stage: str, reading: str) -> Any:
     """Return the plant of (6) or (7), command to position (m), with its fitted gain."""
     return factors(stage, reading)[1].transfer_function()
-
-
-def open_loop(stage: str, reading: str) -> Any:
-    """Return the open loop, controller times plant, as a ``control.TransferFunction``.
-
-    For the open loops as written in (10), (11) see `ratio`.
-    """
-    return _series(factors(stage, reading)).transfer_function()

@@ -18,8 +18,8 @@ from scipy.optimize import brentq, minimize_scalar
 
 from models.dynamics.equations import CONTROLLER, OPEN_LOOP, PLANT, READINGS, Ratio, factors, ratio
 from models.dynamics.plant import sensor_rows, structure_state
-from models.dynamics.servo import controller, current_loop, python_control
-from models.dynamics.stages import NOMINAL, Condition, build_structure, stage_named, tuning_named
+from models.dynamics.servo import python_control
+from models.dynamics.stages import NOMINAL, Condition, build_structure, stage_named
 from models.dynamics.structure import named_modes
 
 Array = NDArray[np.float64]
@@ -150,15 +150,12 @@ class Case:
 
 def rigid_loop(stage: str, reading: str) -> Any:
     """Return the open loop of a reading around the rigid platform, as a ``StateSpace``."""
-    control = python_control()
-
-    return control.series(*(part.state_space() for part in factors(stage, reading)))
+    return python_control().series(*(part.state_space() for part in factors(stage, reading)))
 
 
 def structure_path(stage: str, condition: Condition = NOMINAL) -> Any:
     """Return the flexible structure from motor force (N) to encoder (m), as a ``StateSpace``."""
     control = python_control()
-
     machine = stage_named(stage)
     structure = build_structure(machine, condition)
     a, b = structure_state(machine, structure)
@@ -170,7 +167,6 @@ def structure_path(stage: str, condition: Condition = NOMINAL) -> Any:
 def flexible_loop(stage: str, reading: str, condition: Condition = NOMINAL) -> Any:
     """Return the open loop of a reading with the flexible structure in place of the rigid mass."""
     control = python_control()
-
     shaping, plant = factors(stage, reading)
     mass = stage_named(stage).moving_mass.value
     # The plant is force over command current, times 1/(m s²).
@@ -180,31 +176,14 @@ def flexible_loop(stage: str, reading: str, condition: Condition = NOMINAL) -> A
     )
 
 
-def simulated_loop(stage: str, condition: Condition = NOMINAL) -> Any:
-    """Return the open loop that the simulation closes, factored as in `servo`.
-
-    It is the corrected reading to within the rounding of the printed coefficients.
-    """
-    control = python_control()
-
-    tuning = tuning_named(stage_named(stage).name, condition.servo_id)
-    force = control.ss([], [], [], [[tuning.force_constant]])
-    servo = control.series(controller(tuning), current_loop(tuning), force)
-    return control.series(servo, structure_path(stage, condition))
-
-
 def sensitivity(loop: Any) -> Any:
     """Return 1/(1+L), reference to error."""
-    control = python_control()
-
-    return control.feedback(1, loop)
+    return python_control().feedback(1, loop)
 
 
 def complementary_sensitivity(loop: Any) -> Any:
     """Return L/(1+L), reference to position."""
-    control = python_control()
-
-    return control.feedback(loop, 1)
+    return python_control().feedback(loop, 1)
 
 
 def _grid(loop: Any) -> Array:

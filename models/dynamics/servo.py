@@ -140,7 +140,6 @@ def second_order(numerator: tuple[float, float, float], omega: float, zeta: floa
     differ by ω and spoil eigenvectors.
     """
     control = python_control()
-
     high, middle, low = numerator
     a = np.array([[0.0, omega], [-omega, -2 * zeta * omega]])
     b = np.array([[0.0], [omega]])
@@ -151,7 +150,6 @@ def second_order(numerator: tuple[float, float, float], omega: float, zeta: floa
 def controller(tuning: Tuning) -> Any:
     """Return the controller, position error (m) to command current (A), as a series connection."""
     control = python_control()
-
     # (velocity_p s + velocity_i) / s
     velocity = control.ss([[0.0]], [[1.0]], [[tuning.velocity_i]], [[tuning.velocity_p]])
     omega = 2 * np.pi * tuning.low_pass_hz
@@ -182,7 +180,6 @@ def current_loop(tuning: Tuning) -> Any:
 def servo_matrices(tuning: Tuning) -> ServoMatrices:
     """Return controller and current loop in series, a feedforward between, as plain arrays."""
     control = python_control()
-
     summed = control.ss([], [], [], [[1.0, 1.0]])
     command = control.append(controller(tuning), control.ss([], [], [], [[1.0]]))
     system = control.series(command, summed, current_loop(tuning))

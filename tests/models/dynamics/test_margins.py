@@ -23,13 +23,25 @@ from models.dynamics.margins import (
     margins,
     rigid_loop,
     sensitivity,
-    simulated_loop,
+    structure_path,
 )
 from models.dynamics.plant import closed_loop
-from models.dynamics.stages import STAGES, Condition, stage_named
+from models.dynamics.servo import controller, current_loop
+from models.dynamics.stages import NOMINAL, STAGES, Condition, stage_named, tuning_named
 from models.errors import BadParameter, UnknownStage, UnstableLoop
 
 NAMES = sorted(STAGES)
+
+
+def simulated_loop(stage, condition=NOMINAL):
+    """Return the open loop that the simulation closes, factored as in `servo`.
+
+    It is the corrected reading to within the rounding of the printed coefficients.
+    """
+    tuning = tuning_named(stage_named(stage).name, condition.servo_id)
+    force = control.ss([], [], [], [[tuning.force_constant]])
+    servo = control.series(controller(tuning), current_loop(tuning), force)
+    return control.series(servo, structure_path(stage, condition))
 
 
 def of_kind(found, kind):
