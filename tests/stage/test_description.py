@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from msgspec import structs
 
 from lmshealth.errors import BadStage
 from lmshealth.io.log import Metadata
@@ -235,6 +236,16 @@ def test_a_verdict_names_a_parameter_by_its_name(tmp_path: Path) -> None:
     stage = make_stage(tmp_path, (PRELOAD, MOUNT, FOOT + 'verdict = "preload"\n'))
     assert stage.parameters[2].word == "preload"
     assert stage.parameters[2].laws == (Unchanging(),)
+
+
+def test_keys_that_nothing_uses_are_accepted(tmp_path: Path) -> None:
+    """Existing files with source, direction and loops load, whatever a loop holds."""
+    text = stage_text().replace('name = "small"', 'name = "small"\nsource = "a note"')
+    text = text.replace("damping_ratio = 0.015", 'damping_ratio = 0.015\ndirection = "roll"')
+    loop = '[[loop]]\nid = "first"\nnumerator = [1.0]\ndenominator = [1.0, 2.0]\n'
+    assert load(tmp_path, text + loop).modes == load(tmp_path, stage_text()).modes[:1] + tuple(
+        structs.replace(mode, direction="roll") for mode in load(tmp_path, stage_text()).modes[1:]
+    )
 
 
 @pytest.mark.parametrize("word", ["healthy", "both", "a+b"])
