@@ -81,7 +81,7 @@ def test_generators_depend_on_seed_and_name_alone() -> None:
 
 
 def settled(claims: Claims) -> str:
-    """Give what a test fails with, or nothing."""
+    """Return what a test fails with, or nothing."""
     try:
         claims.settle()
     except pytest.fail.Exception as failure:

@@ -17,7 +17,7 @@ from tests.signals import make_log
 
 
 def two_modes() -> Modes:
-    """Give two modes with a full covariance."""
+    """Return two modes with a full covariance."""
     rng = np.random.default_rng(1)
     root = rng.normal(0, 0.01, (4, 4))
     return Modes(
@@ -38,7 +38,7 @@ def two_modes() -> Modes:
 
 
 def history(**changes: object) -> History:
-    """Give a history of three logs of one mode."""
+    """Return a history of three logs of one mode."""
     parts: dict[str, object] = {
         "stage": "test-A",
         "logs": ("a", "b", "c"),

@@ -53,7 +53,7 @@ class Result:
 
 
 def result() -> Result:
-    """Give one whose numbers use all bits, and all that floats can be."""
+    """Return one whose numbers use all bits, and all that floats can be."""
     rng = np.random.default_rng(1)
     odd = [np.nan, np.inf, -np.inf, -0.0, 5e-324, 1 / 3]
     return Result(

@@ -1,4 +1,4 @@
-"""Draw figure.svg from result.json: the beam followed blind, and told where its roller is."""
+"""Draw figure.svg from result.json: the beam tracked without and with its roller position."""
 
 from __future__ import annotations
 
@@ -33,10 +33,10 @@ def draw_figure(figure: Figure, result: Row) -> None:
     left, right = figure.subplots(1, 2)
     draw(left, result["repeats"], "blind")
     left.set_ylim(-30, 60)
-    left.set_title("nothing known but the estimates")
+    left.set_title("estimates alone")
     left.set_ylabel("drift of ln f since the first dwell in %, ± 2σ")
     draw(right, result["repeats"], "told")
-    right.set_title("roller position told, taken out")
+    right.set_title("roller position as covariate")
     right.legend(loc="upper right")
     figure.suptitle("Tracked beam through ramp and return; circles: back at the first position")
 

@@ -58,12 +58,12 @@ def main() -> None:
 
 
 def one_repeat(folder: Path, repeat: int, some: slice = slice(None)) -> Row:
-    """Follow the beam through one ramp and return, or some dwells of it, blind and told."""
+    """Track one ramp and return, or some of its dwells, without and with covariate."""
     rows = [row for row in one_beam(folder, repeat, some) if row["f_hz"] is not None]
     history, refused = build_history([to_reading(row) for row in rows])
     start = rows[0]["roller_v"]
     covariate = Covariate("roller_v", start, PRIOR_STD, CURVATURE_STD)
-    told = Stage(Description(name="beam", mode=(BEAM,), covariate=(covariate,)), None, "0" * 64)
+    informed = Stage(Description(name="beam", mode=(BEAM,), covariate=(covariate,)), None, "0" * 64)
     blind = Stage(Description(name="beam", mode=(BEAM,)), None, "0" * 64)
     return {
         "repeat": repeat,
@@ -72,7 +72,7 @@ def one_repeat(folder: Path, repeat: int, some: slice = slice(None)) -> Row:
         "f_std_hz": [row["f_std_hz"] for row in rows],
         "refused": [refusal.reason for refusal in refused],
         "blind": follow(history, blind, rows),
-        "told": follow(history, told, rows),
+        "told": follow(history, informed, rows),
     }
 
 
@@ -126,7 +126,7 @@ def follow(history: History, stage: Stage, rows: list[Row]) -> Row:
 
 
 def judge(repeats: list[Row]) -> dict[str, bool]:
-    """Say whether the state returns, and whether the tracker says what it does not know."""
+    """Check that the state returns, and that consistency fails without the covariate."""
     return {
         "the state returns within two standard deviations, blind": all(
             abs(r["blind"]["off_in_std"]) < 2 for r in repeats
@@ -144,7 +144,7 @@ def judge(repeats: list[Row]) -> dict[str, bool]:
 
 
 def claims(answer: Row) -> Iterator[Claim]:
-    """Claim how far a beam goes, and that it is said to return."""
+    """Claim the excursion of the beam, and its return."""
     repeats, passed = answer["repeats"], answer["passed"]
     ways = [(row, way) for row in repeats for way in ("blind", "told")]
     off = [abs(row[way]["off_in_std"]) for row, way in ways]
@@ -152,8 +152,8 @@ def claims(answer: Row) -> Iterator[Claim]:
     yield Claim(
         "a real beam, stiffened and released, returns to its start within, standard deviations",
         span(off),
-        f"{len(repeats)} repeats, told and not told of the roller",
-        f"2 asked; it went {span(far)} in ln f away",
+        f"{len(repeats)} repeats, with and without the roller position",
+        f"2 required; excursion {span(far)} in ln f",
         all(passed.values()),
     )
 

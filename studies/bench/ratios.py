@@ -1,4 +1,4 @@
-"""Times told as ratios to something else in the same turn, and whether a figure is missed."""
+"""Times as ratios to a peer in the same turn, and the test whether a figure is missed."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from scipy.stats import binom
 
 from studies.harness.study import Row
 
-# Probability at most that a figure which is just held is said to be missed.
+# Largest probability that a figure exactly on its bound counts as missed.
 FALSE_ALARM = 0.01
 
 
@@ -21,7 +21,7 @@ FALSE_ALARM = 0.01
 class Figure:
     """A figure that is held, and what was measured of it."""
 
-    name: str  # What is timed, and beside what
+    name: str  # What is timed, and its peer
     peer: str
     at_most: float  # The largest ratio of both times with which the figure is met
     ratios: tuple[float, ...]  # One per turn
@@ -32,7 +32,7 @@ class Figure:
 
     @property
     def median(self) -> float:
-        """What is told of it."""
+        """Row of the table."""
         return float(np.median(self.ratios))
 
     @property

@@ -1,4 +1,4 @@
-"""Draw figure.svg from result.json: verdicts beside the truth, and intervals beside theirs."""
+"""Draw figure.svg from result.json: verdicts and intervals against the truth."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def _confusion(ax: Axes, table: dict[str, dict[str, int]]) -> None:
     names = [name.replace("not-enough-data", "not enough") for name in table]
     ax.set_xticks(range(len(names)), names, rotation=45, ha="right", fontsize=8)
     ax.set_yticks(range(len(names)), names, fontsize=8)
-    ax.set_xlabel("told", fontsize=8)
+    ax.set_xlabel("reported", fontsize=8)
     ax.set_ylabel("true", fontsize=8)
 
 

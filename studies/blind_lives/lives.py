@@ -1,4 +1,4 @@
-"""How right the answers are, and how right they say that they are."""
+"""Blind lives: plans and truth, reading the report of an archive, scores and coverages."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from studies.harness.study import LEVEL, Row
 
 EPOCHS = 3
 QUANTILES = ("q05", "q25", "q50", "q75", "q95")
-_UNEXPLAINED = 1e-4  # of `fit`, as the README tells it
+_UNEXPLAINED = 1e-4  # of `fit`, as documented
 # What the front page writes for each word of verdict.csv.
 SHOWN = {
     "healthy": "Healthy",
@@ -44,7 +44,7 @@ _INDEX_ROW = re.compile(
 )
 SEED = 20261123
 STAGES = ("lms-x", "lms-y")
-# What the modes of a stage can tell; in X the mount moves none of them.
+# Parameters that the modes of a stage constrain; in X the mount moves none of them.
 SEEN = {"lms-x": ("guide_preload",), "lms-y": ("guide_preload", "mount_stiffness")}
 WORDS = ("healthy", "preload", "mount", "both", "step", "not-enough-data")
 # Of logs: of most lives, and of the share that have too few; and seconds of each.
@@ -52,7 +52,7 @@ N_LOGS, N_FEW, FEW, SECONDS = (18, 28), (2, 4), 0.1, (8.0, 12.0)
 # Every third life that ends is drawn past its end, and every life is cut on the way.
 TO_FAILURE, SEEN_PART = 1 / 3, (0.3, 1.0)
 # A life is near the border if a parameter is as near to where it counts as degraded, or if so few
-# logs have seen its step: one log's jump is believed once the next confirms it.
+# logs have seen its step: a jump counts once the next log confirms it.
 NEAR, CONFIRMED = 0.02, 2
 
 
@@ -74,17 +74,17 @@ class BlindPlan(Plan):
 
 LEVELS = {0.5: ("q25", "q75"), 0.9: ("q05", "q95")}
 _BINS = (0.0, 0.5, 0.8, 0.95, 0.99, 1.0)
-# Nothing that is told is surer than that when it is scored: a posterior has some thousand draws.
+# Smallest doubt in scores: a posterior has some thousand draws.
 _SUREST = 1e-3
 _SHRUNK = 3.0
-# Standard deviations by which rights may fall short of what was told: one run in a thousand.
+# Largest deficit of right verdicts, in standard deviations: exceeded once in a thousand runs.
 _SHORT = -3.09
 
 
 def confusion(rows: Iterable[Row]) -> dict[str, dict[str, int]]:
-    """Count what was told of what is true, each in the order of `WORDS`."""
+    """Count reported by true verdicts, each in the order of `WORDS`."""
     seen = Counter((row["truth"]["verdict"], row["told"]["verdict"]) for row in rows)
-    return {true: {told: seen[true, told] for told in WORDS} for true in WORDS}
+    return {true: {reported: seen[true, reported] for reported in WORDS} for true in WORDS}
 
 
 def share(hits: Iterable[bool]) -> Row:
@@ -95,7 +95,7 @@ def share(hits: Iterable[bool]) -> Row:
 
 
 def of_others(rows: Sequence[Row]) -> list[Row]:
-    """Give every answer the truth of another life of the same stage: a control."""
+    """Return every answer the truth of another life of the same stage: a control."""
     rng = np.random.default_rng([SEED, 0, 1])
     mixed: list[Row] = []
     for stage in sorted({row["stage"] for row in rows}):
@@ -107,15 +107,15 @@ def of_others(rows: Sequence[Row]) -> list[Row]:
 
 
 def sureness(rows: Iterable[Row]) -> Row:
-    """Tell whether verdicts are right as often as they say, and score their probabilities.
+    """Return whether verdicts are right as often as stated, with scores of their probabilities.
 
     Returns
     -------
     dict
         How many were right and how many their probabilities promise, by how many standard
         deviations (of so many independent trials) the first exceeds the second and whether it is
-        no less; Brier and logarithmic score beside those of the share of rights told of all; the
-        same in bins of what was told.
+        no less; Brier and logarithmic score, and those of a constant probability; the
+        same in bins of the probability.
     """
     pairs = [
         (row["told"]["probability"], row["told"]["verdict"] == row["truth"]["verdict"])
@@ -124,22 +124,22 @@ def sureness(rows: Iterable[Row]) -> Row:
     ]
     if not pairs:
         return {"n": 0}
-    told, right = np.array(pairs, dtype=float).T
-    base = np.full(told.size, right.mean())
-    spread = np.sqrt(np.sum(told * (1 - told)))
-    # With hardly any doubt told, the spread of rights is that of one trial at least.
-    z = float((right.sum() - told.sum()) / max(spread, 0.5))
-    places = np.clip(np.searchsorted(_BINS, told, side="left") - 1, 0, len(_BINS) - 2)
+    reported, right = np.array(pairs, dtype=float).T
+    base = np.full(reported.size, right.mean())
+    spread = np.sqrt(np.sum(reported * (1 - reported)))
+    # With hardly any doubt the spread is at least that of one trial.
+    z = float((right.sum() - reported.sum()) / max(spread, 0.5))
+    places = np.clip(np.searchsorted(_BINS, reported, side="left") - 1, 0, len(_BINS) - 2)
     return {
-        "n": told.size,
+        "n": reported.size,
         "right": int(right.sum()),
-        "promised": round(float(told.sum()), 2),
+        "promised": round(float(reported.sum()), 2),
         "z": round(z, 2),
         "holds": z > _SHORT,
-        "brier": [round(float(np.mean((p - right) ** 2)), 4) for p in (told, base)],
-        "log_score": [round(_log_score(p, right), 4) for p in (told, base)],
+        "brier": [round(float(np.mean((p - right) ** 2)), 4) for p in (reported, base)],
+        "log_score": [round(_log_score(p, right), 4) for p in (reported, base)],
         "bins": [
-            {"from": _BINS[k], "to": _BINS[k + 1], "told": round(float(told[own].mean()), 4)}
+            {"from": _BINS[k], "to": _BINS[k + 1], "told": round(float(reported[own].mean()), 4)}
             | share(map(bool, right[own]))
             for k in range(len(_BINS) - 1)
             if (own := places == k).any()
@@ -147,8 +147,8 @@ def sureness(rows: Iterable[Row]) -> Row:
     }
 
 
-def _log_score(told: np.ndarray, right: np.ndarray) -> float:
-    p = np.clip(told, _SUREST, 1 - _SUREST)
+def _log_score(reported: np.ndarray, right: np.ndarray) -> float:
+    p = np.clip(reported, _SUREST, 1 - _SUREST)
     return float(-np.mean(np.where(right == 1, np.log(p), np.log(1 - p))))
 
 
@@ -161,20 +161,20 @@ def coverages(rows: Iterable[Row], what: str, names: Iterable[str]) -> dict[str,
         Of every name and level, as they are and shrunk to a third about the median.
     """
     found = list(rows)
-    told: dict[str, dict[str, Row]] = {}
+    reported: dict[str, dict[str, Row]] = {}
     for name in names:
         pairs = [(row["told"][what][name], row["truth"][what][name]) for row in found
                  if name in row["told"][what] and name in row["truth"][what]]  # fmt: skip
-        told[name] = {
+        reported[name] = {
             f"{100 * level:.0f}{way}": _at_least(level, [hold(*pair, ends) for pair in pairs])
             for level, ends in LEVELS.items()
             for way, hold in _WAYS.items()
         }
-    return told
+    return reported
 
 
 def _at_least(level: float, held: Sequence[bool]) -> Row:
-    """Judge a coverage that must not be less than told: the map's error is in every interval."""
+    """Judge a coverage that must not be less than stated: the map's error is in every interval."""
     high = clopper_pearson(sum(held), len(held), LEVEL)[1] if held else 1.0
     return share(held) | {"holds": high >= level}
 
@@ -204,7 +204,7 @@ _WAYS: dict[str, Callable[[Row, float | None, tuple[str, str]], bool]] = {
 
 
 def analyse(logs: Path, out: Path, *, quick: bool = False) -> dict[str, Row]:
-    """Run the command line over an archive of both stages, and read what it says of each machine.
+    """Run the command line over an archive of both stages, and read its results for each machine.
 
     Parameters
     ----------
@@ -217,7 +217,7 @@ def analyse(logs: Path, out: Path, *, quick: bool = False) -> dict[str, Row]:
     -------
     dict
         By machine: ``verdict`` and ``probability``, ``shown`` on the front page as on its row,
-        quantiles of ``health`` where it is told and of what is ``left`` in km (None past the
+        quantiles of ``health`` where it is claimed and of what is ``left`` in km (None past the
         horizon), counts of ``events`` that are no declared work, and of ``refused`` by reason.
     """
     stages = [word for name in STAGES for word in ("--stage", name)]
@@ -230,13 +230,13 @@ def analyse(logs: Path, out: Path, *, quick: bool = False) -> dict[str, Row]:
     events = pd.read_csv(out / "events.csv")
     events = events[~events["declared"].astype(bool)]
     refused = pd.read_csv(out / "refused.csv")
-    refused["stage"] = refused["log"].str.split("/").str[0]  # logs stand in folders of machines
+    refused["stage"] = refused["log"].str.split("/").str[0]  # logs are in folders of machines
     answers = {}
     for row in verdicts.to_dict("records"):
-        name, told = row["stage"], float(row["probability"])
+        name, reported = row["stage"], float(row["probability"])
         answers[name] = {
             "verdict": row["verdict"],
-            "probability": told if np.isfinite(told) else None,
+            "probability": reported if np.isfinite(reported) else None,
             "shown": shown.get(name),
             "health": health.get(name, {}),
             "left": left.get(name, {}),
@@ -246,10 +246,10 @@ def analyse(logs: Path, out: Path, *, quick: bool = False) -> dict[str, Row]:
     return answers
 
 
-def agrees(told: Row) -> bool:
-    """Whether the front page says what the table of verdicts does."""
-    alarm = told["verdict"] == "not-enough-data" and (told["shown"] or "").startswith(ALARM)
-    return alarm or told["shown"] == SHOWN[told["verdict"]]
+def agrees(reported: Row) -> bool:
+    """Return whether the front page agrees with the table of verdicts."""
+    alarm = reported["verdict"] == "not-enough-data" and (reported["shown"] or "").startswith(ALARM)
+    return alarm or reported["shown"] == SHOWN[reported["verdict"]]
 
 
 def front_page(path: Path) -> dict[str, str]:
@@ -263,7 +263,7 @@ def _counts(values: pd.Series) -> dict[str, int]:
 
 
 def _read_health(path: Path) -> dict[str, dict[str, Row]]:
-    """Read the last epoch of every machine, of what is told and not only believed."""
+    """Read the last epoch of every machine, of parameters that the data constrain."""
     found: dict[str, dict[str, Row]] = {}
     table = pd.read_csv(path)
     for (stage, name), rows in table.groupby(["stage", "parameter"]):
@@ -302,7 +302,7 @@ def plan_of(number: int) -> BlindPlan:
 
 
 def truth_of(plan: Plan, table: pd.DataFrame) -> Row:
-    """Tell what is true at the last log.
+    """Return what is true at the last log.
 
     Parameters
     ----------
@@ -317,7 +317,7 @@ def truth_of(plan: Plan, table: pd.DataFrame) -> Row:
         ``verdict`` that is right, whether it is ``clear`` of every border, ``health`` as a fraction
         of the first log, and ``left`` until each limit and any, in km: 0 where it is past, None
         where no limit is reached. A step to come is in no law: what is left is that of a machine
-        to which none happens, and ``to_come`` says so.
+        without it, and ``to_come`` is set.
     """
     stage = _described(plan.stage)
     limits = {p.name: p for p in stage.parameters if p.name in SEEN[plan.stage]}
@@ -347,7 +347,7 @@ def _word(lost: list[str]) -> str:
 
 
 def _logs_since_step(plan: Plan) -> int:
-    """Count the logs after the step of a part that the modes tell; 0 where there is none."""
+    """Count the logs after the step of a part that the modes show; 0 without a step."""
     life, visits = plan.draw_life(), schedule(plan)
     laws = {"guide_preload": life.preload, "mount_stiffness": life.mount}
     steps = [
@@ -376,7 +376,7 @@ def _left(
 
 
 def _without_what_comes(law: Law, now_km: float) -> Law:
-    """Give a law as it goes on if nothing more happens at once."""
+    """Return a law as it continues without a further jump."""
     if isinstance(law, Stepped) and law.step_km > now_km:
         return _without_what_comes(law.law, now_km)
     return Steady() if isinstance(law, Delayed) and law.start_km > now_km else law

@@ -111,21 +111,21 @@ def archive_of(
         for plan in plans:
             simulate_life(plan, logs / plan.identity)
             shutil.move(logs / plan.identity / "truth.csv", truths / f"{plan.identity}.csv")
-        told = analyse(logs, keep or out, quick=quick)
+        reported = analyse(logs, keep or out, quick=quick)
         return [
             {
                 "stage": plan.stage,
                 "kind": plan.life,
                 "logs": plan.logs,
                 "truth": truth_of(plan, pd.read_csv(truths / f"{plan.identity}.csv")),
-                "told": told.get(plan.identity, SILENT),
+                "told": reported.get(plan.identity, SILENT),
             }
             for plan in plans
         ]
 
 
 def judged(rows: Sequence[Row]) -> Row:
-    """Judge what was said of all machines, and the same beside the truth of others."""
+    """Judge the reports of all machines, and the same against the truth of others."""
     clear = [row for row in rows if row["truth"]["clear"]]
     others = lives.of_others(rows)
     sound = [row for row in rows if row["kind"] in HEALTHY]
@@ -164,14 +164,13 @@ def _right(row: Row) -> bool:
 
 
 def _beyond(rows: Iterable[Row]) -> dict[str, Row]:
-    """Count machines that reach no limit, and those that do, of which no end is told to be near.
-
-    The median of what is left until any limit lies past the horizon.
-    """
+    """Count machines, with and without a limit reached, whose median end is past the horizon."""
     pairs = [(row["truth"]["left"]["any"], row["told"]["left"]["any"]) for row in rows
              if "any" in row["told"]["left"]]  # fmt: skip
     return {
-        name: lives.share(told["q50"] is None for true, told in pairs if (true is None) is never)
+        name: lives.share(
+            reported["q50"] is None for true, reported in pairs if (true is None) is never
+        )
         for name, never in (("reach no limit", True), ("reach a limit", False))
     }
 
@@ -185,7 +184,7 @@ def _refused(rows: Iterable[Row]) -> dict[str, int]:
 
 
 def verdicts(answer: Row) -> dict[str, bool]:
-    """Say what was asked and whether it is so; controls only where there are lives enough."""
+    """Return the checks; controls only with enough lives."""
     page, sure = answer["front_page"], answer["sureness"]
     checks = {
         "the front page shows every machine with its verdict": page["hits"] == page["n"],
@@ -217,7 +216,7 @@ def claims(answer: Row) -> Iterator[Claim]:
     for name, row in answer["sound_kinds"].items():
         fine = answer["passed"][f"at most 1 in 100 of sound kinds: {name}"]
         yield counted(
-            f"machines of sound kinds: {name}", row["hits"], row["n"], "1 in 100 asked", met=fine
+            f"machines of sound kinds: {name}", row["hits"], row["n"], "1 in 100 required", met=fine
         )
     for what, of in (("health", ""), ("left", "what is left until ")):
         for name, found in answer[what].items():
@@ -232,7 +231,7 @@ def claims(answer: Row) -> Iterator[Claim]:
     )
     page = answer["front_page"]
     yield counted(
-        "rows of the front page that say what the table of verdicts says",
+        "rows of the front page that agree with the table of verdicts",
         page["hits"],
         page["n"],
         met=page["hits"] == page["n"],
@@ -251,7 +250,7 @@ def _verdicts(answer: Row) -> Iterator[Claim]:
             f"{wrong['hits']} of {wrong['n']} with the {OTHERS}" if name == "all" else "",
         )
     yield Claim(
-        "verdicts with a probability that are right, beside what the probabilities promise",
+        "verdicts with a probability that are right, and their number by these probabilities",
         f"{sure['right']} of {sure['n']}",
         f"{number(sure['z'])} standard deviations from it",
         f"{number(sure['promised'])} promised",
@@ -262,7 +261,7 @@ def _verdicts(answer: Row) -> Iterator[Claim]:
         "Brier score of the verdicts' probabilities",
         number(own),
         "",
-        f"{number(base)} of who tells the share of rights of all",
+        f"{number(base)} for a constant probability",
         met=own <= base,
     )
 

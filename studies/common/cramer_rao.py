@@ -20,7 +20,7 @@ _STEP = 1e-5
 
 
 def band_factors(kappa: FloatArray | float) -> tuple[FloatArray, FloatArray]:
-    """Tell how much of the information about a mode lies in a band around it.
+    """Return how much of the information about a mode lies in a band around it.
 
     With x = (f_k − f)/(ζ f) the resonance is 1/(1 + x²), its derivatives by ln f and ln ζ are
     2x/(1 + x²)/ζ and −2/(1 + x²); integrated from −κ to κ, and less what the unknown strength
@@ -59,7 +59,7 @@ def long_record_law(
     """Predict standard deviations from a long, noise-free ambient record of a single mode.
 
     std(ln f) = √(ζ/(2π N_c B_f)) and std(ln ζ) = 1/√(2π ζ N_c B_ζ), where the record holds
-    N_c = f T cycles. It says nothing of noise, of which `ambient_bound` knows.
+    N_c = f T cycles. It leaves out noise, which `ambient_bound` includes.
 
     Parameters
     ----------
@@ -161,7 +161,7 @@ def joint_bound(modes: Vibration, force: FloatArray, recording: Recording) -> Fl
         for (i, j), change in zip(pairs, coherence, strict=True):
             forces[i, j] += np.sqrt((force[i, i] * force[j, j]).real) * change
             forces[j, i] = forces[i, j].conj()
-        # A shape's length stands for the strength of its force.
+        # The norm of a shape is the strength of its force.
         paths = response[:, None, :] * p[2 * m : levels.start].reshape(n, m)
         seen = paths @ forces @ np.swapaxes(paths.conj(), 1, 2)
         return np.asarray(seen + np.diag(np.exp(p[levels])))

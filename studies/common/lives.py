@@ -1,7 +1,4 @@
-"""Lives as a tracker sees them: what is really so at every log, and estimates of it.
-
-Several studies judge by them, see tracking_lives and health_robustness.
-"""
+"""Lives of simulated machines for several studies: the truth of every log, and estimates of it."""
 
 from __future__ import annotations
 
@@ -49,7 +46,7 @@ def rng_of(*key: int) -> np.random.Generator:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Life:
-    """What is really so at every log.
+    """True state of a machine at every log.
 
     Attributes
     ----------
@@ -92,7 +89,7 @@ class Life:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Estimates:
-    """What identification gives of every log of a life.
+    """Estimates of every log of a life.
 
     Attributes
     ----------
@@ -160,7 +157,7 @@ def life_with(plan: Plan, visits: Sequence[Visit]) -> Life:
 
 
 def _at_reference(condition: Condition) -> Condition:
-    """Give what wear and grease alone have made of a stage."""
+    """Return what wear and grease alone have made of a stage."""
     return replace(
         NOMINAL,
         guide_preload=condition.guide_preload,
@@ -221,7 +218,7 @@ def history_of(
     Parameters
     ----------
     declared : bool
-        Whether logs carry their ``servo_id`` and maintenance tells of regreasing.
+        Whether logs carry their ``servo_id`` and maintenance records regreasing.
     covariates : tuple of str
         Which of them are known.
     loop_error : bool
@@ -246,7 +243,7 @@ def history_of(
 
 
 def _declared(life: Life) -> tuple[Step, ...]:
-    """Tell what maintenance and metadata know."""
+    """Return the steps that maintenance and metadata declare."""
     k = life.event
     if k is None or life.kind not in ("regreasing", "servo-retuning"):
         return ()
@@ -267,26 +264,26 @@ def recorded(stage: str, logs: int = 8) -> tuple[Estimates, Life]:
 
     It is for quick forms, which have no time to simulate and identify logs.
     """
-    told = read_record(_RECORD)["sizes"][stage]
+    record = read_record(_RECORD)["sizes"][stage]
     life = life_of(plan_of(stage, "servo-retuning", _SIZES_SEED, logs))
-    std = np.array(told["median_std_ln_frequency"] + told["median_std_ln_damping"])
+    std = np.array(record["median_std_ln_frequency"] + record["median_std_ln_damping"])
     tuned = life.servo != "commissioning"
     # Up and down by as much as the logarithms scatter, each tuning by itself.
     side = np.where(np.arange(logs) % 2, 1.0, -1.0)
-    loop = told["ln_loop_error_jump"] * tuned + told["ln_loop_error_scatter"] * side
+    loop = record["ln_loop_error_jump"] * tuned + record["ln_loop_error_scatter"] * side
     cov = np.tile(np.diag(std**2), (logs, 1, 1))
     return Estimates(life.ln_frequency, life.ln_damping, cov, _LOOP_ERROR * np.exp(loop)), life
 
 
 def identified(plan: Plan, cache: Path | None = None) -> Estimates:
     """Simulate a life and identify its logs, unless a file keeps that from before."""
-    told = Trials(cache).once(
+    record = Trials(cache).once(
         partial(_identified, plan),
         type(plan).__name__,
         *astuple(plan),
         also=[type(plan).__module__],
     )
-    return Estimates(*(np.array(told[field], dtype=float) for field in _FIELDS))
+    return Estimates(*(np.array(record[field], dtype=float) for field in _FIELDS))
 
 
 def _identified(plan: Plan, *_: object) -> dict[str, list[Any]]:
@@ -297,7 +294,7 @@ def _identified(plan: Plan, *_: object) -> dict[str, list[Any]]:
 
 
 def _identify_all(folder: Path, plan: Plan) -> Estimates:
-    """Identify the logs of a folder, which stand in the order of recording."""
+    """Identify the logs of a folder, in the order of recording."""
     stage, manifest = load_stage(plan.stage), read_manifest(folder)
     n, m = plan.logs, len(GUIDE_MODES)
     ln_f, ln_zeta, loop = np.full((n, m), np.nan), np.full((n, m), np.nan), np.full(n, np.nan)
@@ -305,7 +302,7 @@ def _identify_all(folder: Path, plan: Plan) -> Estimates:
     for k, path in enumerate(find_logs(folder).logs):
         log = read_log(path, overrides=manifest.overrides(path), name=path.name)
         modes = identify(log, stage)
-        # Those that were found: where they stand in the result, and where they belong.
+        # Those that were found: their places in the result and among the guide modes.
         at = [i for i, name in enumerate(modes.names) if name in GUIDE_MODES]
         to = [GUIDE_MODES.index(modes.names[i]) for i in at]
         ln_f[k, to], ln_zeta[k, to] = modes.ln_frequency[at], modes.ln_damping[at]

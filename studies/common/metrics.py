@@ -19,7 +19,7 @@ from lmshealth._arrays import BoolArray, FloatArray
 
 
 def mass_within(draws: FloatArray, truth: ArrayLike, margin: ArrayLike) -> FloatArray:
-    """Give the share of draws that lie within a margin of the truth.
+    """Return the share of draws that lie within a margin of the truth.
 
     Parameters
     ----------
@@ -44,7 +44,7 @@ def mass_within(draws: FloatArray, truth: ArrayLike, margin: ArrayLike) -> Float
 def within(
     draws: FloatArray, truth: ArrayLike, margin: ArrayLike, *, mass: float | None = None
 ) -> BoolArray:
-    """Tell which predictions lie within a margin of the truth.
+    """Return which predictions lie within a margin of the truth.
 
     Parameters
     ----------
@@ -66,7 +66,7 @@ def within(
 def alpha_lambda(
     draws: FloatArray, truth: ArrayLike, alpha: float, *, mass: float | None = None
 ) -> BoolArray:
-    """Tell which predictions lie within the share α of the true remaining life: α-λ accuracy.
+    """Return which predictions lie within the share α of the true remaining life: α-λ accuracy.
 
     Parameters
     ----------
@@ -98,7 +98,7 @@ def alpha_lambda(
 
 
 def relative_accuracy(draws: FloatArray, truth: ArrayLike) -> FloatArray:
-    """Give one minus the relative error of the median.
+    """Return one minus the relative error of the median.
 
     Parameters
     ----------
@@ -153,7 +153,7 @@ def cumulative_relative_accuracy(
 
 
 def prognostic_horizon(held: BoolArray, left: FloatArray) -> FloatArray:
-    """Give the life that is left when predictions begin to be good and stay so.
+    """Return the life that is left when predictions begin to be good and stay so.
 
     Saxena2010 count from the first moment at which a criterion is met. Here it must be met at all
     later moments too: a criterion that is met once by chance warns of nothing.
@@ -181,7 +181,7 @@ def prognostic_horizon(held: BoolArray, left: FloatArray) -> FloatArray:
 
 
 def crps(draws: FloatArray, truth: ArrayLike, *, horizon: ArrayLike = np.inf) -> FloatArray:
-    """Give the continuous ranked probability score of draws, up to a horizon.
+    """Return the continuous ranked probability score of draws, up to a horizon.
 
     With F the distribution of the draws and y the truth it is ∫ (F(z) - 1{y ≤ z})² dz over all z
     up to the horizon, which is the score of the draws and the truth cut off there. It is proper:
@@ -227,7 +227,7 @@ def place(
     *,
     horizon: ArrayLike = np.inf,
 ) -> FloatArray:
-    """Give the place of truths among draws, from 0 to 1: probability integral transforms.
+    """Return the place of truths among draws, from 0 to 1: probability integral transforms.
 
     Where draws equal the truth, as all do that lie beyond the horizon with it, the place is drawn
     evenly from where they stand, so that places of truths that are one more draw are uniform.
@@ -310,7 +310,7 @@ def coverage(places: FloatArray, nominal: float, *, level: float = 0.999) -> Cov
 
 
 def clopper_pearson(hits: int, trials: int, level: float = 0.95) -> tuple[float, float]:
-    """Give the exact interval of a proportion.
+    """Return the exact interval of a proportion.
 
     References
     ----------
@@ -323,7 +323,7 @@ def clopper_pearson(hits: int, trials: int, level: float = 0.95) -> tuple[float,
 
 
 def service_at(draws: FloatArray, risk: float, *, horizon: ArrayLike = np.inf) -> FloatArray:
-    """Give the latest service before which no more than a share of the draws have ended.
+    """Return the latest service before which no more than a share of the draws have ended.
 
     Parameters
     ----------
@@ -346,7 +346,7 @@ def service_at(draws: FloatArray, risk: float, *, horizon: ArrayLike = np.inf) -
 
 
 def unexpected_breaks(service: FloatArray, truth: ArrayLike) -> BoolArray:
-    """Tell which lives end before their service.
+    """Return which lives end before their service.
 
     Parameters
     ----------
@@ -368,7 +368,7 @@ def unexpected_breaks(service: FloatArray, truth: ArrayLike) -> BoolArray:
 def unexploited_life(
     service: FloatArray, truth: ArrayLike, *, horizon: ArrayLike = np.inf
 ) -> FloatArray:
-    """Give the life that a service throws away.
+    """Return the life that a service throws away.
 
     Parameters
     ----------

@@ -55,7 +55,7 @@ def rank(truth: Array, draws: Array, rng: np.random.Generator) -> list[float]:
 
 @cache
 def band(n: int) -> tuple[Array, Array]:
-    """Give the simultaneous band of the distribution of n ranks, minus that of a uniform one."""
+    """Return the simultaneous band of the distribution of n ranks, minus that of a uniform one."""
     rng = np.random.default_rng(n)
     simulations = _SIMULATIONS if n >= _FEW else _FEW_SIMULATIONS
     prob = simulate_confidence_bands(n, 1, _POINTS, LEVEL, simulations, rng)
@@ -64,7 +64,7 @@ def band(n: int) -> tuple[Array, Array]:
 
 
 def judge(ranks: Array) -> Row:
-    """Tell whether ranks may be uniform: their band, a test of their histogram, coverages."""
+    """Return whether ranks may be uniform: their band, a test of their histogram, coverages."""
     n = ranks.size
     low, high = band(n)
     off = compute_ecdf(ranks, _POINTS) - _POINTS
@@ -82,7 +82,7 @@ def judge(ranks: Array) -> Row:
 
 
 def uniform(rows: Mapping[str, Row]) -> bool:
-    """Tell whether all of several judgements are those of uniform ranks."""
+    """Return whether all of several judgements are those of uniform ranks."""
     return all(
         row["inside_band"] and all(level["holds"] for level in row["coverage"])
         for row in rows.values()
@@ -90,7 +90,7 @@ def uniform(rows: Mapping[str, Row]) -> bool:
 
 
 def bands(rows: Iterable[Row]) -> dict[str, Any]:
-    """Give the bands of as many ranks as each of several judgements has."""
+    """Return the bands of as many ranks as each of several judgements has."""
     return {
         str(n): {"low": band(n)[0].round(5).tolist(), "high": band(n)[1].round(5).tolist()}
         for n in sorted({row["n"] for row in rows})

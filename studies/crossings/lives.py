@@ -162,7 +162,7 @@ def _log(
     order = np.argsort(values)
     values, seen, modes = values[order], seen[order], [modes[i] for i in order]
     n = len(modes)
-    # What is spurious has any damping; modes have the same, so that it does not tell them.
+    # What is spurious has any damping; modes have the same, which cannot distinguish them.
     spread = np.where(np.array(modes, dtype=int) < 0, 1.0, STD_ZETA)
     zeta = np.log(0.015) + spread * rng.standard_normal(n)
     estimates = Estimates(
@@ -181,8 +181,8 @@ def _named(modes: list[int], values: Array, ln_f: Array, names: list[str]) -> tu
     if len(modes) == ln_f.size and -1 not in modes:
         return tuple(names)
     places = np.sort(ln_f)
-    told = [names[int(np.argmin(np.abs(places - value)))] for value in values]
-    return tuple(name if told.index(name) == i else "" for i, name in enumerate(told))
+    given = [names[int(np.argmin(np.abs(places - value)))] for value in values]
+    return tuple(name if given.index(name) == i else "" for i, name in enumerate(given))
 
 
 def judge(life: Life, labels: Labels) -> Counter[str]:
@@ -199,9 +199,9 @@ def judge(life: Life, labels: Labels) -> Counter[str]:
     own = _owners(life, labels)
     modes = list(own.values())
     count = Counter(lives=1, false_births=len(modes) - len({mode for mode in modes if mode >= 0}))
-    for k, (told, truth) in enumerate(zip(labels, life.truth, strict=True)):
+    for k, (given, truth) in enumerate(zip(labels, life.truth, strict=True)):
         part = "before" if k < life.before else "after" if k >= life.after else "near"
-        for label, mode in zip(told, truth, strict=True):
+        for label, mode in zip(given, truth, strict=True):
             if mode < 0:
                 count["spurious"] += 1
                 count["taken"] += label is not None
@@ -216,8 +216,8 @@ def judge(life: Life, labels: Labels) -> Counter[str]:
 def _owners(life: Life, labels: Labels) -> dict[str, int]:
     """Find the mode of each track: what most of its first five estimates are of."""
     shown: dict[str, list[int]] = {}
-    for told, truth in zip(labels, life.truth, strict=True):
-        for label, mode in zip(told, truth, strict=True):
+    for given, truth in zip(labels, life.truth, strict=True):
+        for label, mode in zip(given, truth, strict=True):
             if label is not None:
                 shown.setdefault(label, []).append(mode)
     return {label: Counter(modes[:5]).most_common(1)[0][0] for label, modes in shown.items()}
@@ -235,14 +235,14 @@ def recovered(life: Life, labels: Labels) -> NDArray[np.float64]:
 
 
 def nearest(life: Life) -> Labels:
-    """Give each estimate to the mode that was last seen nearest: what is commonly done."""
+    """Return each estimate to the mode that was last seen nearest: what is commonly done."""
     last = np.sort(life.ln_f[0])
     labels = []
     for epoch in life.epochs:
-        told = []
+        given = []
         for value in epoch.ln_frequency:
             mode = int(np.argmin(np.abs(last - value)))
-            told.append(f"track_{mode}")
+            given.append(f"track_{mode}")
             last[mode] = value
-        labels.append(told)
+        labels.append(given)
     return labels

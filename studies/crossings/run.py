@@ -113,13 +113,13 @@ def average(share: NDArray[np.float64]) -> list[float | None]:
 
 
 def swaps(count: Counter[str]) -> Row:
-    """Put the share of swapped lives beside its 95 % interval."""
+    """Return the share of swapped lives with its 95 % interval."""
     low, high = clopper_pearson(count["lives_swapped"], count["lives"])
     return {"hits": count["lives_swapped"], "n": count["lives"], "low": low, "high": high}
 
 
 def guessed(n: int) -> Row:
-    """Count silent swaps where nothing tells and the best guess is given."""
+    """Count silent swaps of merged lives with the most probable label."""
     count: Counter[str] = Counter()
     with patch.object(constants, "LABEL_PROBABILITY", 0.5):
         for seed in range(n):
@@ -129,7 +129,7 @@ def guessed(n: int) -> Row:
 
 
 def verdicts(answer: Row) -> dict[str, bool]:
-    """Say what was asked and whether it is so."""
+    """Return the checks."""
     kinds = answer["kinds"]
     turning = [row for name, row in kinds.items() if name not in ("merging", "well apart")]
     checks = {
@@ -165,7 +165,7 @@ def example(name: str) -> Row:
 
 
 def claims(answer: Row) -> Iterator[Claim]:
-    """Claim that nothing is swapped silently, and what is said to be ambiguous."""
+    """Claim that no label is swapped silently, and that ambiguity is reported."""
     kinds, passed = answer["kinds"], answer["passed"]
     swapped = [row["lives_swapped"] for row in kinds.values()]
     nearest = [
@@ -189,7 +189,7 @@ def claims(answer: Row) -> Iterator[Claim]:
     )
     merging, guess = kinds["merging"], answer["best_guess_where_nothing_tells"]
     yield Claim(
-        "the same where nothing tells modes apart",
+        "the same for indistinguishable modes",
         percents([merging["labelled_after"]]),
         "",
         f"a best guess swaps {guess['hits']} of {guess['n']} lives",

@@ -21,7 +21,7 @@ REPEATS = 3
 TABLE = {1.227: 26.25, 1.648: 28.22, 2.085: 30.81, 2.505: 33.90, 2.935: 37.55, 3.367: 41.98}
 TOLERANCE, UP_AND_DOWN = 0.15, 0.1
 BEAM = ModeSpec("beam", 33.0, 0.002, search=0.3)
-# The position is in volts; it stands where the contract has a displacement.
+# The position is in volts; it takes the place of a displacement.
 COLUMN_MAP = """
 [columns]
 time_s = "3"
@@ -104,7 +104,7 @@ def one_beam(folder: Path, repeat: int, some: slice = slice(None)) -> list[Row]:
 
 
 def judge_beam(beam: list[Row]) -> dict[str, bool]:
-    """Say whether every dwell is right or refused, and the first one refused."""
+    """Return whether every dwell is right or refused, and the first one refused."""
     seen = [row for row in beam if row["f_hz"] is not None]
     places: dict[tuple[int, float], list[float]] = {}
     for row in seen:

@@ -36,7 +36,7 @@ class Case:
     n_channels: int = 1  # Channels with independent noise; shapes alternate in sign
 
     def vibration(self) -> Vibration:
-        """Give the true modes."""
+        """Return the true modes."""
         f, zeta = np.array(self.modes).T
         shapes = [
             [(-1.0) ** (i * c) * (1 - 0.2 * c) for i in range(f.size)]

@@ -81,7 +81,7 @@ def draw_machines(ax: Axes, machines: Row) -> None:
         ax.plot(place, z, marker, color=colour, ms=3, alpha=0.7, label=label)
     ax.set_xlabel("expected of a normal distribution")
     ax.set_ylabel("deviation in standard deviations")
-    title = f"Simulated X and Y stages: {len(seen)} of {machines['n_modes']} modes told"
+    title = f"Simulated X and Y stages: {len(seen)} of {machines['n_modes']} modes found"
     ax.set_title(title, fontsize=10)
     ax.legend(fontsize=7, loc="upper left")
     ax.grid(alpha=0.25)

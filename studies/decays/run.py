@@ -52,8 +52,8 @@ STAGES = ("lms-x", "lms-y")
 QUICK_SEEDS = 10
 # What does not hold, and why.
 NOT_MET = {
-    "wide intervals do not": "0.1 %, one stop: few ordinates tell its ambient response, tails are "
-    "heavier than normal ones, and 400 logs do not tell 98 % in wider intervals from 95 %",
+    "wide intervals do not": "0.1 %, one stop: few ordinates give its ambient response, tails are "
+    "heavier than normal ones, and 400 logs do not distinguish 98 % from 95 %",
 }
 
 
@@ -79,13 +79,13 @@ def main() -> None:
     }
     answer |= judge(answer, quick=quick)
     study.conclude(answer, not_met=answer["not_met"])
-    # What is said not to be met and is met after all is to be told, too.
+    # A check that is documented as not met and is met must be noticed, too.
     if met := [name for name in answer["not_met"] if answer["passed"][name]]:
         raise SystemExit(f"met after all: {met}")
 
 
 def judge(answer: Row, *, quick: bool) -> Row:
-    """Say what holds of the intervals, of their negative controls, of machines and beam."""
+    """Return what holds of the intervals, of their negative controls, of machines and beam."""
     modes = [mode for case in answer["cases"].values() for mode in case["modes"]]
     parts = [mode[quantity] for mode in modes for quantity in ("f", "zeta")]
     machines = answer["machines"]
@@ -222,7 +222,7 @@ def coverage(off: np.ndarray, width: float = 1.0) -> Row:
 
 
 def claims(answer: Row) -> Iterator[Claim]:
-    """Claim coverages, scatter beside the bound, machines, and a real beam."""
+    """Claim coverages, errors over their bound, simulated machines and a real beam."""
     parts = [
         mode[quantity]
         for case in answer["cases"].values()
@@ -243,11 +243,11 @@ def claims(answer: Row) -> Iterator[Claim]:
         "root mean square error over the Cramér-Rao bound",
         span(part["rmse_over_bound"] for part in parts),
     )
-    for width, told in (("narrow", "1.5 times as narrow"), ("wide", "1.5 times as wide")):
+    for width, label in (("narrow", "1.5 times as narrow"), ("wide", "1.5 times as wide")):
         found = answer["controls_found_out"][width]
         caught, of = found.split(" of ")
         yield Claim(
-            f"cases in which intervals {told} are found out (control)", found, met=caught == of
+            f"cases in which intervals {label} are detected (control)", found, met=caught == of
         )
     machines = answer["machines"]
     yield Claim(
@@ -260,10 +260,10 @@ def claims(answer: Row) -> Iterator[Claim]:
     seen = [row for row in answer["beam"] if row["f_hz"] is not None]
     off = max(abs(row["f_hz"] - row["reference_hz"]) for row in seen)
     yield Claim(
-        "a real beam: dwells told, and how far they are off at most",
+        "a real beam: dwells identified, and their largest error",
         f"{len(seen)} of {len(answer['beam'])}, {off:.2f} Hz",
         "",
-        "0.15 Hz asked",
+        "0.15 Hz required",
         off < 0.15,
     )
 

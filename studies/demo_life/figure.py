@@ -1,4 +1,4 @@
-"""Draw figure.svg from result.json: intervals of every life beside its truth."""
+"""Draw figure.svg from result.json: intervals and truth of every life."""
 
 from __future__ import annotations
 

@@ -111,7 +111,7 @@ def smallest_losses(name: str, parameter: str, counts: tuple[int, ...]) -> Row:
 
 
 def refused(name: str, parameter: str) -> Row:
-    """Tell what planning says of a parameter that the modes do not show."""
+    """Return the answer of planning to a parameter that the modes do not constrain."""
     try:
         plan(load_stage(name), parameter, 0.05)
     except BadQuestion as error:
@@ -155,7 +155,7 @@ def called(
     stage: Stage, parameter: str, loss: float, variance: Array, free: bool,
     rng: np.random.Generator,
 ) -> bool:  # fmt: skip
-    """Draw one machine's drifts and tell whether its loss is called."""
+    """Draw one machine's drifts and return whether its loss is detected."""
     j = [p.name for p in stage.parameters].index(parameter)
     x = stage.prior.draw(rng, 1)[0] if free else stage.baseline_point.copy()
     x[j] = stage.baseline_point[j] + np.log1p(-loss)
@@ -218,7 +218,7 @@ def measured(name: str, duration: float, logs: int) -> Row:
 
 
 def verdicts(answer: Row) -> dict[str, bool]:
-    """Say what was asked and whether it is so."""
+    """Return the checks."""
     arms = {arm: [row for row in answer["checks"] if row["arm"] == arm]
             for arm in ("as planned", "as shipped, the other as it was")}  # fmt: skip
     tables = [np.array(one["smallest_loss"], dtype=float) for one in answer["maps"]]

@@ -95,7 +95,7 @@ def mat(value: Callable[[np.ndarray], object]) -> Maker:
 
 
 def parquet(kind: str) -> Maker:
-    """Give a column of a Parquet file a type that is no number."""
+    """Return a column of a Parquet file a type that is no number."""
 
     def make(archive: Archive, path: Path, log: LogFile, rng: Rng) -> str:
         import pyarrow as pa
@@ -133,7 +133,7 @@ def unfinished(content: bytes, rng: Rng) -> bytes:
 
 
 def two_rates(archive: Archive, path: Path, log: LogFile, rng: Rng) -> str:
-    """Give a channel another rate."""
+    """Return a channel another rate."""
     from nptdms import ChannelObject, RootObject, TdmsWriter
 
     channels = [

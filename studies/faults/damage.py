@@ -45,7 +45,7 @@ class Kind:
     """A kind of damage."""
 
     name: str  # In words
-    reason: str  # What refused.csv must say
+    reason: str  # Reason in refused.csv
     suffixes: tuple[str, ...]  # Formats that it can happen to
     make: Maker  # Does it
     lost: bool = True  # Whether the whole log is lost by it; else the rest of it is analysed
@@ -72,12 +72,12 @@ def _of_columns(change: Callable[[Columns, Rng], Columns]) -> Maker:
     return make
 
 
-def _of_metadata(**said: str | None) -> Maker:
-    """Say other things of a log, or nothing."""
+def _of_metadata(**changes: str | None) -> Maker:
+    """Change or remove metadata of a log."""
 
     def make(archive: Archive, path: Path, log: LogFile, rng: Rng) -> str:
-        told = {key: v for key, v in {**log.metadata, **said}.items() if v is not None}
-        write(archive, path, replace(log, metadata=told))
+        metadata = {key: v for key, v in {**log.metadata, **changes}.items() if v is not None}
+        write(archive, path, replace(log, metadata=metadata))
         return name_of(archive, path)
 
     return make
@@ -112,7 +112,7 @@ def _cut_row(lines: list[bytes], rng: Rng) -> list[bytes]:
 
 
 def _struck(content: bytes, rng: Rng) -> bytes:
-    """Flip bits of a few bytes in the middle, where only a checksum tells."""
+    """Flip bits of a few bytes in the middle, which only a checksum detects."""
     at = len(content) // 2
     return content[:at] + bytes(255 - b for b in content[at : at + 4]) + content[at + 4 :]
 
@@ -269,7 +269,7 @@ def _copy(archive: Archive, path: Path, log: LogFile, rng: Rng) -> str:
     return name_of(archive, copy)
 
 
-# Tables beside the logs
+# Tables in the folder of the logs
 
 
 def _bad_row(archive: Archive, path: Path, log: LogFile, rng: Rng) -> str:
@@ -279,7 +279,7 @@ def _bad_row(archive: Archive, path: Path, log: LogFile, rng: Rng) -> str:
 
 
 def _row(cells: Callable[[str], list[str]]) -> Maker:
-    """Let the manifest override what a good log says."""
+    """Override the metadata of a good log by the manifest."""
 
     def make(archive: Archive, path: Path, log: LogFile, rng: Rng) -> str:
         write(archive, path, log)
@@ -307,7 +307,7 @@ def _named(template: str) -> Maker:
 
 
 def _work(*cells: str) -> Maker:
-    """Tell of work that cannot be understood."""
+    """Return for work that cannot be understood."""
 
     def make(archive: Archive, path: Path, log: LogFile, rng: Rng) -> str:
         archive.maintenance.append([log.metadata["stage"], *cells])

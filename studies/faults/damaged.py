@@ -65,7 +65,7 @@ class Expected:
 
 @dataclass(frozen=True, slots=True)
 class Found:
-    """What became of all logs."""
+    """Results of the run for all logs."""
 
     # By log, the reasons for which all of it and a channel of it is refused
     whole: dict[str, set[str]]
@@ -123,7 +123,7 @@ def make_archive(folder: Path, quick: bool) -> list[Expected]:
 
 
 def chosen(quick: bool) -> Iterator[tuple[Any, str]]:
-    """Give kinds of damage with the format that each happens to."""
+    """Return kinds of damage with the format that each happens to."""
     for k, kind in enumerate(KINDS):
         if not quick:
             yield from ((kind, suffix) for suffix in kind.suffixes)
@@ -132,7 +132,7 @@ def chosen(quick: bool) -> Iterator[tuple[Any, str]]:
 
 
 def carry_out(folder: Path, workers: int) -> subprocess.CompletedProcess[str]:
-    """Run the command that is asked about."""
+    """Run the command line on the archive."""
     command = [sys.executable, "-m", "lmshealth", "run", str(folder / "logs"), "--stage"]
     command += [str(folder / "stage.toml"), "--out", str(folder / "out"), "--workers", str(workers)]
     return subprocess.run(command, capture_output=True, text=True, check=False)
@@ -145,8 +145,8 @@ def read_found(out: Path) -> Found:
     found = Found({}, {}, set(modes["log"]))
     for row in refused.itertuples():
         # Rows of a table have no name of their own but their line.
-        beside = row.log in ("manifest.csv", "maintenance.csv")
-        name = f"{row.log}, {row.detail.split(':')[0]}" if beside else row.log
+        in_table = row.log in ("manifest.csv", "maintenance.csv")
+        name = f"{row.log}, {row.detail.split(':')[0]}" if in_table else row.log
         if not row.channel and not row.mode:
             found.whole.setdefault(name, set()).add(row.reason)
         elif row.channel and not row.mode:
@@ -162,7 +162,7 @@ def wrong(expected: Sequence[Expected], found: Found) -> list[str]:
         if found.reason(one) != one.reason
     ]
     known = {one.name for one in expected}
-    return other + [f"{name}: nobody knows it" for name in sorted(set(found.whole) - known)]
+    return other + [f"{name}: not expected at all" for name in sorted(set(found.whole) - known)]
 
 
 def judge(
@@ -208,9 +208,9 @@ def judge(
 
 
 def claims(answer: Row) -> Iterator[Claim]:
-    """Claim that damaged logs are told, and good ones analysed."""
+    """Claim that damaged logs are refused, and good ones analysed."""
     yield counted(
-        f"damaged logs of {answer['kinds']} kinds told with the right reason",
+        f"damaged logs of {answer['kinds']} kinds refused with the right reason",
         answer["damaged_told_right"],
         answer["damaged"],
         _control(answer, "controls"),

@@ -32,7 +32,7 @@ from studies.harness.servers import MARK, Popen, marked, missing_postgres, postg
 _MODES = (("roll", 62.0, 0.02, 0.25), ("pitch", 105.0, 0.02, 0.4))
 _RATE_HZ, _SECONDS = 500.0, 4.0
 
-# 200 logs; enough machines that three teach a fleet's prior to a fourth, which is young.
+# 200 logs; enough for a fleet prior of three machines for a fourth, young one.
 MACHINES = {"WORN-A": 50, "WORN-B": 46, "WORN-C": 46, "WORN-D": 8, "WATCHED-A": 50}
 LONG_S = 1200.0  # no run takes as long
 ENDED_S = 60.0  # by then every process of a killed run has to be gone, on a busy machine too
@@ -68,7 +68,7 @@ class Batch:
     workers: int
 
     def command(self, out: Path, store: str, *more: str) -> list[str]:
-        """Give the command that analyses the batch, health at one epoch: that is slow."""
+        """Return the command that analyses the batch, health at one epoch: that is slow."""
         stages = [word for stage in self.stages for word in ("--stage", str(stage))]
         return [*_PROGRAM, "run", str(self.logs), *stages,
                 "--out", str(out), "--store", store, "--epochs", "1",
@@ -83,17 +83,17 @@ class Run:
     command : sequence of str
         What to run.
     said : file
-        Takes what it writes to standard error.
+        File for its standard error.
     """
 
-    def __init__(self, command: Sequence[str], said: IO[bytes]) -> None:
+    def __init__(self, command: Sequence[str], messages: IO[bytes]) -> None:
         self.mark = secrets.token_hex()
-        self._said = said
+        self._messages = messages
         # What a shell runs in the background ignores interrupts, and so do its children.
         if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
             signal.signal(signal.SIGINT, signal.default_int_handler)
         self._process: Popen = subprocess.Popen(
-            command, stdout=subprocess.DEVNULL, stderr=self._said, start_new_session=True,
+            command, stdout=subprocess.DEVNULL, stderr=self._messages, start_new_session=True,
             env={**os.environ, MARK: self.mark}, cwd=Path(__file__).parents[2],
         )  # fmt: skip
 
@@ -105,18 +105,18 @@ class Run:
             return None
 
     def begun(self, store: str) -> bool:
-        """Wait until the store has the first log; say whether it has, or the run ended before."""
+        """Wait until the store has the first log; return False if the run ends before."""
         while not (known := rows(store).get("identified")) and self.status(0.05) is None:
             pass
         return bool(known)
 
-    def said(self) -> list[str]:
-        """Give the lines that it wrote to standard error."""
-        self._said.seek(0)
-        return self._said.read().decode(errors="replace").splitlines()
+    def messages(self) -> list[str]:
+        """Return the lines that it wrote to standard error."""
+        self._messages.seek(0)
+        return self._messages.read().decode(errors="replace").splitlines()
 
     def kill(self, how: str, rng: random.Random) -> bool:
-        """Disturb the run; say whether there was anything to disturb.
+        """Disturb the run; return False if there is nothing to disturb.
 
         ``main`` kills its main process, ``worker`` one of its workers; ``SIGINT`` and ``SIGTERM``
         reach the whole group, as from a terminal.
@@ -158,8 +158,8 @@ class Run:
 @contextmanager
 def running(command: Sequence[str]) -> Iterator[Run]:
     """Start a run, and leave nothing of it behind."""
-    with tempfile.TemporaryFile() as said:
-        run = Run(command, said)
+    with tempfile.TemporaryFile() as messages:
+        run = Run(command, messages)
         try:
             yield run
         finally:
@@ -178,13 +178,13 @@ def completed(command: Sequence[str], *, quick: bool = False) -> float:
     with running(command) as run:
         status = run.status()
         if status != SOME_REFUSED:
-            raise RuntimeError(f"{command} ended with {status}: {run.said()}")
+            raise RuntimeError(f"{command} ended with {status}: {run.messages()}")
     return time.monotonic() - begin
 
 
-def one_line(said: Sequence[str]) -> bool:
-    """Say whether a failed run told why, in one line."""
-    return len(said) == 1 and said[0].startswith("lmshealth: ")
+def one_line(messages: Sequence[str]) -> bool:
+    """Return whether a failed run reported the reason in one line."""
+    return len(messages) == 1 and messages[0].startswith("lmshealth: ")
 
 
 # What a run leaves
@@ -272,7 +272,7 @@ def backends(folder: Path) -> Iterator[dict[str, Stores]]:
 
 
 def control(reference: Reference, folder: Path) -> dict[str, bool]:
-    """Say of outputs that are wrong in one place each whether the comparison sees it."""
+    """Return for outputs that are wrong in one place each whether the comparison sees it."""
     copy = folder / "control"
 
     def seen(name: str, change: Callable[[list[str]], list[str]]) -> bool:

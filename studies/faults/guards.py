@@ -1,4 +1,4 @@
-"""What must not happen, seen from outside: files that change, SQL that is run, text that acts."""
+"""Detection of changed files, executed SQL, control characters, and active markup."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def plant(url: str) -> None:
 
 
 def touched(url: str) -> list[str]:
-    """Say what happened to the planted table, and which tables nobody asked for."""
+    """Return what happened to the planted table, and unexpected tables."""
     engine = create_engine(url)
     with engine.connect() as connection:
         names = inspect(connection).get_table_names()
@@ -139,5 +139,5 @@ def loaded(page: str) -> list[str]:
 
 
 def scripts(page: str) -> list[str]:
-    """Give the scripts of a page."""
+    """Return the scripts of a page."""
     return re.findall(r"<script.*?</script>", page, re.DOTALL | re.IGNORECASE)

@@ -1,4 +1,4 @@
-"""Inputs of somebody who means harm: names, tables, links and files that reach for more."""
+"""Hostile inputs: names, tables, links, and files that refer to others."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ import numpy as np
 
 from studies.faults.logfiles import Archive, Columns, LogFile, log_of, write
 
-SECRET = "what-nobody-may-see-7d1f"  # stands in files that must not be read
+SECRET = "what-nobody-may-see-7d1f"  # content of files that must not be read
 # What a name that is run as a command would make.
 MARK = "somebody-ran-this"
 
-# Names of machines that are only text: they are followed, and told as they are.
+# Names of machines that are only text: they are tracked and reported unchanged.
 MACHINES = (
     "x'); DROP TABLE canary; --",
     'x"; DELETE FROM canary; --',
@@ -112,7 +112,7 @@ file = "../outside/secret.txt"
 
 
 def make_hostile(root: Path, base: Columns, *, every: int = 1) -> tuple[list[str], list[str]]:
-    """Write an archive of hostile logs, and what must stay as it is beside it.
+    """Write an archive of hostile logs, and files around it that must not change.
 
     Parameters
     ----------
@@ -157,7 +157,7 @@ def _log(base: Columns, number: int, stage: str) -> LogFile:
 
 
 def _reaching(root: Path, archive: Archive, base: Columns) -> list[str]:
-    """Write logs that reach for other files, or stand for them."""
+    """Write logs that refer to other files."""
     outside = root / "outside"
     (archive.folder / "link.h5").symlink_to(outside / "log.h5")
     (archive.folder / "passwd.csv").symlink_to("/etc/passwd")

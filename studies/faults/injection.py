@@ -104,7 +104,7 @@ def main() -> None:
 
 
 def verdicts(answer: Row) -> dict[str, bool]:
-    """Say what was asked and whether it is so."""
+    """Return the checks."""
     stores = answer["stores"].values()
     wrong = {name for store in stores for name, found in store["wrong"].items() if found}
     names = {name for store in stores for name in store["wrong"]}
@@ -121,7 +121,7 @@ def verdicts(answer: Row) -> dict[str, bool]:
 
 
 def _store(kind: str, folder: Path, stack: ExitStack) -> tuple[str, str]:
-    """Give the address of a store with a planted table, and its password."""
+    """Return the address of a store with a planted table, and its password."""
     if kind == "sqlite":
         (folder / "out").mkdir()
         return f"sqlite:///{folder / 'out' / 'lmshealth.sqlite'}", PASSWORD
@@ -163,13 +163,13 @@ def attack(folder: Path, base: Columns, url: str, password: str, _kind: str, *, 
     }
     pages = [text for path, text in written.items() if path.suffix == ".html"]
     kept = guards.everything_in(url).decode("utf-8", "replace")
-    told = pd.read_csv(out / "verdict.csv", dtype=str, keep_default_na=False)["stage"].tolist()
+    reported = pd.read_csv(out / "verdict.csv", dtype=str, keep_default_na=False)["stage"].tolist()
     lost = set(pd.read_csv(out / "refused.csv", dtype=str, keep_default_na=False)["log"])
     names = [path.name for path in out.iterdir() if path.suffix == ".html"]
     wrong = {
         "nothing outside the output is changed": changed,
         "no SQL is executed": guards.touched(url),
-        "every machine is told as it is named": sorted({*machines} ^ {*told}),
+        "every machine is told as it is named": sorted({*machines} ^ {*reported}),
         "every reaching log is refused": sorted({*refused} - lost),
         "pages have names of their own": guards.bad_names(names)
         + ([] if len(names) == len(machines) + 1 else [f"{len(names)} pages"]),
@@ -232,7 +232,7 @@ def _links(folder: Path, out: Path) -> list[Path]:
 
 
 def _leaked(text: str) -> bool:
-    """Tell whether a file outside was read: ours, or that of the system's users."""
+    """Return whether a file outside was read: ours, or that of the system's users."""
     return hostile.SECRET in text or "root:x:0" in text
 
 
@@ -266,10 +266,10 @@ def descriptions(folder: Path) -> list[str]:
         path = folder / "stages" / "bad.toml"
         path.write_text(content)
         done = lmshealth("stage", path, cwd=folder)
-        said = done.stderr
-        fine = done.returncode == 1 and said.count("\n") == 1 and not guards.acting(said)
-        if not fine or hostile.SECRET in said + done.stdout:
-            wrong.append(f"{name}: {done.returncode} {said[-300:]}")
+        messages = done.stderr
+        fine = done.returncode == 1 and messages.count("\n") == 1 and not guards.acting(messages)
+        if not fine or hostile.SECRET in messages + done.stdout:
+            wrong.append(f"{name}: {done.returncode} {messages[-300:]}")
     return wrong
 
 
@@ -333,7 +333,7 @@ def _weigh(path: Path, folder: Path) -> Row:
 
 
 def controls() -> dict[str, bool]:
-    """Give every guard what it must notice."""
+    """Return every guard what it must notice."""
     with tempfile.TemporaryDirectory(prefix="controls-") as name:
         folder = Path(name)
         victim, link = folder / "victim", folder / "out" / "index.html"
@@ -369,7 +369,7 @@ def controls() -> dict[str, bool]:
 
 
 def claims(answer: Row) -> Iterator[Claim]:
-    """Claim that what names, tables and addresses say never acts."""
+    """Claim that the content of names, tables and addresses is never executed."""
     for kind, row in answer["stores"].items():
         wrong = [line for found in row["wrong"].values() for line in found]
         yield Claim(

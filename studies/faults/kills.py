@@ -87,7 +87,7 @@ def main() -> None:
 
 
 def verdicts(answer: Row) -> dict[str, bool]:
-    """Say of each thing asked whether it is so."""
+    """Return the checks."""
     passed = {"the comparison sees what is wrong": all(answer["control"].values())}
     for kind, found in answer["kills"].items():
         passed[f"as uninterrupted, {kind}"] = not found["differences"]
@@ -163,7 +163,7 @@ class Kills:
 def run_killed(
     reference: Reference, store: str, out: Path, kills: Kills, other_ends: list[str]
 ) -> bool:
-    """Start a run and kill it when the time comes; say whether it came to its end all the same."""
+    """Start a run and kill it when the time comes; return whether it completed."""
     how = ""
     begun = time.monotonic()
     with running(reference.batch.command(out, store)) as run:
@@ -178,14 +178,18 @@ def run_killed(
             kill = {"how": how, "after_s": after_s, "when": when(reference, store, out),
                     "gone_s": 0.0}  # fmt: skip
             kills.done.append(kill)
-            if how != "worker":  # who loses a worker may go on
+            if how != "worker":  # a run may survive the loss of a worker
                 kill["gone_s"] = round(run.gone_after(), 2)
                 break
-        status, said = run.status(), run.said()
+        status, messages = run.status(), run.messages()
     if how == "SIGINT":
-        kills.done[-1] |= {"told": one_line(said), "lines": len(said), "last": said[-1:]}
-    elif status != SOME_REFUSED and status != ENDS.get(how) and not (how and one_line(said)):
-        other_ends.append(f"{how or 'not killed'}: {status}: {said[-3:]}")
+        kills.done[-1] |= {
+            "told": one_line(messages),
+            "lines": len(messages),
+            "last": messages[-1:],
+        }
+    elif status != SOME_REFUSED and status != ENDS.get(how) and not (how and one_line(messages)):
+        other_ends.append(f"{how or 'not killed'}: {status}: {messages[-3:]}")
         if len(other_ends) > MOST_OTHER:
             raise RuntimeError(f"the batch does not come to its end: {other_ends}")
     return status == SOME_REFUSED

@@ -25,7 +25,7 @@ SECONDS, VELOCITY = 6.0, 0.010
 _EVERY_TENTH = 10
 RATE = SAMPLE_RATE_HZ / _EVERY_TENTH
 _SIGNALS = ("delta_e_um", "acc_feed_m_s2", "acc_pitch_m_s2")
-# Two modes of the simulated stage and nothing to infer: what is asked is what becomes of files.
+# Two modes of the simulated stage and nothing to infer: the study examines files.
 DESCRIPTION = """name = "faults"
 [match]
 stage = "damaged-?-Y"
@@ -50,7 +50,7 @@ class LogFile:
 
 @dataclass(slots=True)
 class Archive:
-    """A folder of logs with the tables beside them."""
+    """A folder of logs with its tables."""
 
     folder: Path  # Of the logs
     # Rows of the tables without their header, in the order in which they are added
@@ -83,7 +83,7 @@ def _recording(k: int, seconds: float) -> Columns:
 
 
 def log_of(base: Columns, number: int, rng: np.random.Generator) -> LogFile:
-    """Give one recording as another log: a thousandth of noise, and the next moment of a life."""
+    """Return one recording as another log: a thousandth of noise, and the next moment of a life."""
     columns = {
         name: values
         if name.startswith("reference")
@@ -107,8 +107,8 @@ def write(archive: Archive, path: Path, log: LogFile) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     WRITERS[suffix](path, log)
     if suffix == ".uff":
-        said = [log.metadata.get(key, "") for key in ("stage", "recorded_at", "travel_km")]
-        archive.manifest.append([path.relative_to(archive.folder).as_posix(), *said])
+        cells = [log.metadata.get(key, "") for key in ("stage", "recorded_at", "travel_km")]
+        archive.manifest.append([path.relative_to(archive.folder).as_posix(), *cells])
 
 
 def text_of(log: LogFile) -> bytes:

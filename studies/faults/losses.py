@@ -71,7 +71,7 @@ def main() -> None:
 
 
 def verdicts(answer: Row) -> dict[str, bool]:
-    """Say of each thing asked whether it is so; what this machine does not allow is left out."""
+    """Return the checks; those that this machine does not allow are left out."""
     passed = {}
     for name, found in answer.items():
         if isinstance(found, dict):
@@ -139,7 +139,7 @@ def lost_database(
                     run.begun(store)
                     run.status(rng.uniform(0.0, latest) * reference.seconds)
                     server.stop(signal.SIGQUIT)
-                    ends.append((run.status(), run.said()))
+                    ends.append((run.status(), run.messages()))
                 server.start()
                 if any(server.password in line for line in ends[-1][1]):
                     differences.append("the password was shown")
@@ -149,16 +149,18 @@ def lost_database(
 
 
 def _failures(ends: list[tuple[int | None, list[str]]]) -> Row:
-    """Tell what failed runs said, their addresses left out, and which ended in another way."""
-    failed = [said[0] for status, said in ends if status == 1 and one_line(said)]
-    other = [f"{end}: {said[-3:]}" for end, said in ends if end not in (1, SOME_REFUSED)]
-    other += [f"1: {said[-3:]}" for end, said in ends if end == 1 and not one_line(said)]
-    told = {re.sub(r"\w+:/\S+|'?/\S+", "…", line) for line in failed}
-    return {"failed": len(failed), "said": sorted(told), "other_ends": other}
+    """Return messages of failed runs without addresses, and other ends."""
+    failed = [messages[0] for status, messages in ends if status == 1 and one_line(messages)]
+    other = [f"{end}: {messages[-3:]}" for end, messages in ends if end not in (1, SOME_REFUSED)]
+    other += [
+        f"1: {messages[-3:]}" for end, messages in ends if end == 1 and not one_line(messages)
+    ]
+    reported = {re.sub(r"\w+:/\S+|'?/\S+", "…", line) for line in failed}
+    return {"failed": len(failed), "said": sorted(reported), "other_ends": other}
 
 
 def claims(answer: Row) -> Iterator[Claim]:
-    """Claim that a full disk and a lost database are told, and cost nothing."""
+    """Claim that a full disk and a lost database are reported, and lose nothing."""
     for name in ("full disk", "full disk, output alone", "lost database"):
         row = answer[name]
         if row is None:

@@ -1,6 +1,6 @@
 """What can go wrong around a batch, and does it then end as if nothing had happened?
 
-Question, method and answer stand in each part:
+Each part has its question, method and answer:
 
 - `kills`: runs killed at random moments, on a SQLite file and on PostgreSQL
 - `losses`: a full disk, a lost database

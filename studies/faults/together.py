@@ -93,7 +93,7 @@ class Pair:
     logs: str
 
     def rows(self) -> dict[str, int]:
-        """Count what a store holds after both; of more logs, what can be said beforehand."""
+        """Count what a store holds after both; of more logs, the tables whose size is known."""
         one, two = self.first.rows, self.second.rows
         if self.logs == "other":
             return {name: one[name] + two[name] for name in one}
@@ -148,7 +148,7 @@ def one_pair(
             second.kill("main", rng)
         ends = [first.status(), second.status()]
         if ends[0] != SOME_REFUSED or (ends[1] != SOME_REFUSED and not kill):
-            found.append(f"ended with {ends}: {first.said()[-3:]}, {second.said()[-3:]}")
+            found.append(f"ended with {ends}: {first.messages()[-3:]}, {second.messages()[-3:]}")
         if kill:
             completed(commands[1], quick=quick)
         return found + pair.wrong(store, outs)

@@ -77,10 +77,10 @@ def main() -> None:
         "the comparison sees what is wrong": all(answer["control"].values()),
     }
     if lost := answer["scheduler lost"]:
-        told = lost["status"] == 1 and one_line(lost["said"])
+        reported = lost["status"] == 1 and one_line(lost["said"])
         answer["passed"] |= {
             "as uninterrupted, scheduler lost": not lost["differences"],
-            "told in one line, scheduler lost": told,
+            "told in one line, scheduler lost": reported,
         }
     study.conclude(answer)
 
@@ -103,7 +103,7 @@ def workers_killed(reference: Reference, cluster: Cluster, n_kills: int, per_run
                     cluster.replace_worker(rng)
                     known.append(rows(store).get("identified", 0))
                 if (status := run.status()) != SOME_REFUSED:
-                    found["other_ends"].append(f"{status}: {run.said()[-3:]}")
+                    found["other_ends"].append(f"{status}: {run.messages()[-3:]}")
                     completed(command)
             found["differences"] += reference.judge(out, store)
             found["batches"] += 1
@@ -122,10 +122,10 @@ def scheduler_lost(reference: Reference) -> Row:
             run.begun(store)
             run.status(rng.uniform(0, 0.5) * reference.seconds)
             cluster.scheduler.send_signal(signal.SIGKILL)
-            status, said = run.status(), run.said()
+            status, messages = run.status(), run.messages()
         with dask_cluster() as cluster:
             completed(reference.batch.command(out, store, "--scheduler", cluster.address))
-        return {"status": status, "said": said, "differences": reference.judge(out, store)}
+        return {"status": status, "said": messages, "differences": reference.judge(out, store)}
 
 
 def claims(answer: Row) -> Iterator[Claim]:

@@ -1,4 +1,4 @@
-"""Draw figure.svg from result.json: what is lost to who knows the fleet, coverages, and priors."""
+"""Draw figure.svg from result.json: loss against the known fleet, coverages, and priors."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ COLOURS = {"description": BLACK, "learned": BLUE, "learned, laws alone": BLUE, "
 
 
 def colour(way: str) -> str:
-    """Give the colour of a way: controls share one."""
+    """Return the colour of a way: controls share one."""
     return COLOURS.get(way, ORANGE)
 
 
@@ -35,7 +35,7 @@ def draw_lost(ax: Axes, ways: Row) -> None:
     ax.invert_yaxis()
     ax.set_xlim(left=-60)
     ax.set_xlabel(
-        "score lost to who knows the fleet, km\n(CRPS, mean ± standard error over fleets)"
+        "score lost against the known fleet, km\n(CRPS, mean ± standard error over fleets)"
     )
     ax.grid(axis="x", lw=0.3)
 

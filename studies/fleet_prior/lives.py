@@ -69,19 +69,21 @@ def draw_fleet(rng: np.random.Generator, stage: Stage) -> Stage:
         msgspec.structs.replace(wear, life_km=life_km, weight=share),
         msgspec.structs.replace(none, weight=1 - share),
     )
-    believed = model.scatter_prior(stage)
-    scatter = ScatterPrior(*(_of_values(rng, getattr(believed, f)) for f in ScatterPrior.__slots__))
+    parameters = model.scatter_prior(stage)
+    scatter = ScatterPrior(
+        *(_of_values(rng, getattr(parameters, f)) for f in ScatterPrior.__slots__)
+    )
     own = _with(stage, (msgspec.structs.replace(preload, law=laws), mount))
     return replace(own, scatter=scatter)
 
 
-def _of_values(rng: np.random.Generator, believed: tuple[float, ...]) -> tuple[float, ...]:
-    drawn = rng.dirichlet(len(believed) * np.array(believed) / sum(believed))
+def _of_values(rng: np.random.Generator, parameters: tuple[float, ...]) -> tuple[float, ...]:
+    drawn = rng.dirichlet(len(parameters) * np.array(parameters) / sum(parameters))
     return tuple((drawn + 1e-9).tolist())
 
 
 def longer_lived(fleet: Stage, times: float) -> Stage:
-    """Give a fleet whose lives are so many times as long."""
+    """Return a fleet whose lives are so many times as long."""
     preload, mount = fleet.parameters
     wear, none = preload.laws
     assert isinstance(wear, HertzWear)

@@ -54,11 +54,11 @@ STEP = "prognose, young machines"
 Array = NDArray[np.float64]
 SEED = 20261122
 FLEETS, QUICK = 40, 1
-# How many machines of a fleet teach, by its kind, and how many learn.
+# Numbers of mature and young machines of a fleet, by its kind.
 FLEET, SMALL, LEAST = "fleet", "small fleet", "fleet of the quick form"
 N_TEACHERS = {FLEET: 16, SMALL: 8, LEAST: 4}
 N_YOUNG, MOST_DRAWN = {FLEET: 4, SMALL: 4, LEAST: 2}, 12
-# Fleets that are taught by another one too.
+# Fleets with a prior from another fleet too.
 FOREIGN_FLEETS, TIMES = 20, 5.0
 ENOUGH = 5  # fleets, of which a mean has a standard error
 N_POSTERIOR = 2000
@@ -80,7 +80,7 @@ def main() -> None:
         "fleets": n,
         "teachers": N_TEACHERS[kind],
         "young": sum(len(row["young"]) for row in rows),
-        # Of a small fleet too few may be worn to teach.
+        # A small fleet may have too few worn machines.
         "ways": {way: judged(rows, way) for way in WAYS if was_told(rows, way)},
         "priors": [
             {"true": row["true"]} | young["priors"] for row in rows for young in row["young"][:1]
@@ -92,7 +92,7 @@ def main() -> None:
 
 @cache
 def described() -> Stage:
-    """Give the description that nobody has taught."""
+    """Return the description without a fleet prior."""
     return machine()
 
 
@@ -102,33 +102,33 @@ def horizon() -> float:
 
 
 def one(kind: str, number: int) -> Row:
-    """Draw a fleet, let it teach its young machines, and score what is told of these."""
+    """Draw a fleet, learn its prior, and score prognoses of its young machines."""
     rng = np.random.default_rng([SEED, number])
     fleet = draw_fleet(rng, described())
-    teachers = lessons(rng, fleet, kind, number)
-    worn = {k: lesson for k, lesson in teachers.items() if wears(lesson)}
-    schools = {LEARNED: teachers, WORN: worn}
+    mature = evidence_of(rng, fleet, kind, number)
+    worn = {k: evidence for k, evidence in mature.items() if visibly_wears(evidence)}
+    sources = {LEARNED: mature, WORN: worn}
     if number < FOREIGN_FLEETS:
         other = np.random.default_rng([SEED, number, 1])
-        schools[FOREIGN] = lessons(other, longer_lived(fleet, TIMES), kind, number)
+        sources[FOREIGN] = evidence_of(other, longer_lived(fleet, TIMES), kind, number)
     wear = fleet.parameters[0].laws[0]
     assert isinstance(wear, HertzWear)
     row: Row = {"true": numbers(wear.life_km, wear.weight), "young": []}
     for _ in range(MOST_DRAWN):
         drawn = draw(rng, fleet, YOUNG)
         own = posterior(drawn, described(), number)
-        lesson = machine_evidence(described(), own)
-        if needs_fleet_prior(lesson):
-            row["young"].append(pupil(drawn, own, lesson, fleet, schools, number))
+        evidence = machine_evidence(described(), own)
+        if needs_fleet_prior(evidence):
+            row["young"].append(young_machine(drawn, own, evidence, fleet, sources, number))
         if len(row["young"]) == N_YOUNG[kind]:
             break
     return row
 
 
-def lessons(
+def evidence_of(
     rng: np.random.Generator, fleet: Stage, kind: str, number: int
 ) -> dict[str, MachineEvidence]:
-    """Draw the grown machines of a fleet, and what each teaches."""
+    """Draw the mature machines of a fleet, and the evidence of each."""
     found = {}
     for k in range(N_TEACHERS[kind]):
         life = posterior(draw(rng, fleet, MATURE), described(), number)
@@ -136,9 +136,9 @@ def lessons(
     return found
 
 
-def wears(lesson: MachineEvidence) -> bool:
-    """Tell whether a machine is seen to wear."""
-    return lesson.laws["guide_preload"]["hertz-wear"].posterior >= SEEN_TO_WEAR
+def visibly_wears(evidence: MachineEvidence) -> bool:
+    """Return whether a machine is seen to wear."""
+    return evidence.laws["guide_preload"]["hertz-wear"].posterior >= SEEN_TO_WEAR
 
 
 def posterior(drawn: Life, stage: Stage, number: int) -> LifePosterior:
@@ -146,55 +146,57 @@ def posterior(drawn: Life, stage: Stage, number: int) -> LifePosterior:
     return fit_life(drawn.history, stage, [SEED, number], chains=False, n_draws=N_POSTERIOR)
 
 
-def taught(lesson: MachineEvidence, teachers: Mapping[str, MachineEvidence]) -> FleetPrior | None:
-    """Give what teachers teach a young machine; None if they are too few."""
-    return fleet_priors(described(), dict(teachers) | {"young": lesson}).get("young")
+def learned_prior(
+    evidence: MachineEvidence, mature: Mapping[str, MachineEvidence]
+) -> FleetPrior | None:
+    """Return the fleet prior for a young machine; None with too few machines."""
+    return fleet_priors(described(), dict(mature) | {"young": evidence}).get("young")
 
 
-def pupil(
+def young_machine(
     drawn: Life,
     own: LifePosterior,
-    lesson: MachineEvidence,
+    evidence: MachineEvidence,
     fleet: Stage,
-    schools: Mapping[str, Mapping[str, MachineEvidence]],
+    sources: Mapping[str, Mapping[str, MachineEvidence]],
     number: int,
 ) -> Row:
-    """Score what is told of a young machine with every prior."""
+    """Score the prognoses of a young machine with every prior."""
     rng = np.random.default_rng([SEED, number, 2])
     limit = described().parameters[0].limit
     assert limit is not None
     truth = drawn.part.left(rng, drawn.now, limit.below, horizon())
-    told = {
+    predicted = {
         DESCRIPTION: left(own, drawn.now),
         KNOWN: left(posterior(drawn, fleet, number), drawn.now),
     }
     priors = {}
-    for way, teachers in schools.items():
-        if (prior := taught(lesson, teachers)) is None:
+    for way, mature in sources.items():
+        if (prior := learned_prior(evidence, mature)) is None:
             continue
         stage = prior.apply_to(described())
-        told[way] = left(posterior(drawn, stage, number), drawn.now)
+        predicted[way] = left(posterior(drawn, stage, number), drawn.now)
         priors[way] = learned_numbers(prior)
         if way == LEARNED:
             laws = replace(stage, scatter=None)
-            told[LAWS] = left(posterior(drawn, laws, number), drawn.now)
+            predicted[LAWS] = left(posterior(drawn, laws, number), drawn.now)
     return {
         "priors": priors,
         "km": round(drawn.now / 1000),
         "truth_km": None if truth > horizon() else round(truth / 1000),
-        **{way: scored(draws, truth, told[KNOWN], rng) for way, draws in told.items()},
+        **{way: scored(draws, truth, predicted[KNOWN], rng) for way, draws in predicted.items()},
     }
 
 
 def learned_numbers(prior: FleetPrior) -> list[float]:
-    """Give median and sigma of wear lives in km, and the share that wears, as they were learned."""
+    """Return the learned median (km) and sigma of wear lives, and the share that wears."""
     law = prior.laws[0]
     assert law.pace is not None
     return numbers(law.pace[1], law.share[1])
 
 
 def numbers(prior: Prior, share: float) -> list[float]:
-    """Give median and sigma of a prior of lives, and the share that has one."""
+    """Return median and sigma of a prior of lives, and the share that has one."""
     assert isinstance(prior, Lognormal)
     return [round(prior.median), round(prior.sigma, 3), round(share, 3)]
 
@@ -208,7 +210,7 @@ def left(life: LifePosterior, now: float) -> Array:
 
 
 def scored(draws: Array, truth: float, known: Array, rng: np.random.Generator) -> Row:
-    """Give the place of the truth among draws, their score, and what it loses to who knows."""
+    """Return the place of the truth among draws, the score, and its loss to the known fleet."""
     column, y = draws[:, None], np.array([truth])
     travel = np.linspace(0, horizon(), 4001)[:-1]
     off = below(draws, travel) - below(known, travel)
@@ -221,17 +223,17 @@ def scored(draws: Array, truth: float, known: Array, rng: np.random.Generator) -
 
 
 def below(draws: Array, travel: Array) -> Array:
-    """Give the distribution of draws at some travels."""
+    """Return the distribution of draws at some travels."""
     return np.asarray(np.searchsorted(np.sort(draws), travel, side="right") / draws.size)
 
 
 def was_told(rows: list[Row], way: str) -> bool:
-    """Tell whether any machine was told anything in one way."""
+    """Return whether any machine has a prognosis in one way."""
     return any(way in young for row in rows for young in row["young"])
 
 
 def judged(rows: list[Row], way: str) -> Row:
-    """Judge what is told in one way, where it is told, with errors by fleet."""
+    """Judge the prognoses of one way, with standard errors over fleets."""
     fleets = [[one for one in row["young"] if way in one] for row in rows]
     fleets = [young for young in fleets if young]
     places = np.array([one[way]["place"] for young in fleets for one in young])
@@ -256,13 +258,13 @@ def judged(rows: list[Row], way: str) -> Row:
 
 
 def mean(values: Array) -> list[float]:
-    """Give a mean over fleets and its standard error; one fleet has none, which is told as 0."""
+    """Return a mean over fleets and its standard error; 0 for a single fleet."""
     error = values.std(ddof=1) / np.sqrt(values.size) if values.size > 1 else 0.0
     return [round(float(values.mean()), 4), round(float(error), 4)]
 
 
 def verdicts(ways: Mapping[str, Row], n: int) -> dict[str, bool]:
-    """Say what was asked and whether it is so."""
+    """Return the checks."""
 
     def surely(value: list[float], sign: int) -> bool:
         return sign * value[0] > SURE * value[1]
@@ -283,7 +285,7 @@ def verdicts(ways: Mapping[str, Row], n: int) -> dict[str, bool]:
 
 
 def claims(answer: Row) -> Iterator[Claim]:
-    """Claim what a fleet teaches its young machines."""
+    """Claim the gain by a fleet prior."""
     ways = answer["ways"]
     own, learned = ways["description"], ways["learned"]
     gain = own["crps_km_over_learned"]
@@ -296,7 +298,7 @@ def claims(answer: Row) -> Iterator[Claim]:
         gain[0] > 0,
     )
     yield Claim(
-        "of it lost to who knows the fleet",
+        "of it lost against the known fleet",
         *measured(learned["lost_km"], "km"),
         f"{' '.join(measured(own['lost_km'], 'km'))} by the description",
         learned["lost_km"][0] < own["lost_km"][0],

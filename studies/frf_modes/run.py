@@ -380,7 +380,7 @@ def scatter_over_periods(
 
 
 def judge(answer: Row, *, quick: bool) -> dict[str, bool]:
-    """Tell what was asked for and what came out; few seeds cannot make the controls fail."""
+    """Return what was asked for and what came out; few seeds cannot make the controls fail."""
     both = ("frequency", "damping")
     parts = [(CASES[name].exact, part[what]) for name, part in answer["cases"].items()
              for what in both]  # fmt: skip
@@ -423,7 +423,7 @@ def judge(answer: Row, *, quick: bool) -> dict[str, bool]:
 
 
 def agree(one: dict[str, float], other: dict[str, float]) -> bool:
-    """Tell whether two estimates are within twice the standard deviation of their difference."""
+    """Return whether two estimates are within twice the standard deviation of their difference."""
     return all(
         abs(one[key] - other[key]) < 2 * np.hypot(one[std], other[std])
         for key, std in (

@@ -72,9 +72,9 @@ def call_here(program: str, words: Sequence[str], *, some_refused: bool = False)
     return done.stdout
 
 
-def _insist(status: int, some_refused: bool, command: str, said: str) -> None:
+def _insist(status: int, some_refused: bool, command: str, messages: str) -> None:
     if status not in ((0, _SOME_REFUSED) if some_refused else (0,)):
-        raise SystemExit(f"{command} ended with {status}: {said}")
+        raise SystemExit(f"{command} ended with {status}: {messages}")
 
 
 @contextmanager

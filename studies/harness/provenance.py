@@ -21,7 +21,7 @@ _GATHERING = PROJECT / "lmshealth" / "__init__.py"
 
 
 def bare(work: Callable[..., Any]) -> Any:
-    """Give the function of which a work is a part."""
+    """Return the function of which a work is a part."""
     return bare(work.func) if isinstance(work, partial) else work
 
 
@@ -75,7 +75,7 @@ def _tree(path: Path) -> ast.Module:
 
 
 def _reached(tree: ast.Module, names: set[str]) -> list[ast.stmt]:
-    """Give the statements of a module that define names, and what these need in turn."""
+    """Return the statements of a module that define names, and what these need in turn."""
     wanted, left = set(names), list(tree.body)
     while more := [statement for statement in left if _defined(statement) & wanted]:
         left = [statement for statement in left if statement not in more]
@@ -96,7 +96,7 @@ def _defined(statement: ast.stmt) -> set[str]:
 
 
 def _closure(roots: set[Path]) -> set[Path]:
-    """Give modules and all that they import of the project."""
+    """Return modules and all that they import of the project."""
     found: set[Path] = set()
     left = set(roots)
     while left:
@@ -110,7 +110,7 @@ def _closure(roots: set[Path]) -> set[Path]:
 
 
 def _imports(statements: Iterable[ast.stmt]) -> set[Path]:
-    """Give the modules of the project that statements import, at the top or within functions."""
+    """Return the modules of the project that statements import, at the top or within functions."""
     found: set[Path | None] = set()
     for node in (node for statement in statements for node in ast.walk(statement)):
         if isinstance(node, ast.Import):
@@ -122,7 +122,7 @@ def _imports(statements: Iterable[ast.stmt]) -> set[Path]:
 
 
 def _source(package: list[str], name: str) -> Path | None:
-    """Tell where a name comes from: a module of its own, or one that has it or gathers it."""
+    """Return where a name comes from: a module of its own, or one that has it or gathers it."""
     path = _file([*package, name]) or _file(package)
     if path == _GATHERING:
         home = getattr(getattr(import_module(package[0]), name, None), "__module__", package[0])

@@ -1,7 +1,7 @@
 """Real servers for studies and tests: PostgreSQL, and a Dask scheduler with its workers.
 
 Each is a child of the process that starts it and ends with it, even where that is killed: the
-kernel tells it (`setpriv --pdeathsig`). All listen on this machine alone.
+kernel signals it (`setpriv --pdeathsig`). All listen on this machine alone.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ _SETTINGS = ("fsync=off", "shared_buffers=16MB", "max_connections=50", "log_min_
 
 
 def free_port() -> int:
-    """Give a port of 127.0.0.1 on which nothing listens."""
+    """Return a port of 127.0.0.1 on which nothing listens."""
     with socket.socket() as listener:
         listener.bind(("127.0.0.1", 0))
         return int(listener.getsockname()[1])
@@ -45,7 +45,7 @@ def wait_until(done: Callable[[], bool], what: str, within_s: float = WAIT_S) ->
     Raises
     ------
     TimeoutError
-        If it takes too long; says what was waited for.
+        If it takes too long; names the event.
     """
     end = time.monotonic() + within_s
     while not done():
@@ -97,7 +97,7 @@ def postgres_programs() -> Path | None:
 
 
 def missing_postgres() -> str | None:
-    """Say why no PostgreSQL can be started here; None when one can."""
+    """Return why no PostgreSQL can be started here; None when one can."""
     if postgres_programs() is None:
         return "PostgreSQL's server is not installed (Debian: postgresql)"
     if shutil.which("setpriv") is None:
@@ -139,7 +139,7 @@ class Postgres:
         wait_until(self._answers, f"PostgreSQL (see {self.folder / 'log'})")
 
     def stop(self, how: int = signal.SIGINT) -> None:
-        """End the server: SIGINT ends its sessions, SIGQUIT leaves all as it stands."""
+        """End the server: SIGINT ends its sessions, SIGQUIT stops at once."""
         if self._process is not None:
             self._process.send_signal(how)
             self._process.wait(WAIT_S)
@@ -153,13 +153,13 @@ class Postgres:
     def database(self) -> Iterator[str]:
         """Make an empty database, give its address, and drop it with whoever still uses it."""
         name = f"db_{secrets.token_hex(6)}"
-        self._tell(f"CREATE DATABASE {name}")
+        self._execute(f"CREATE DATABASE {name}")
         try:
             yield self.url(name)
         finally:
-            self._tell(f"DROP DATABASE {name} WITH (FORCE)")
+            self._execute(f"DROP DATABASE {name} WITH (FORCE)")
 
-    def _tell(self, statement: str) -> None:
+    def _execute(self, statement: str) -> None:
         import psycopg
 
         place = f"host={self.folder} port={self.port} user={_USER} password={self.password}"
@@ -173,7 +173,7 @@ class Postgres:
         if self._process.poll() is not None:
             raise RuntimeError((self.folder / "log").read_text(errors="replace"))
         try:
-            self._tell("SELECT 1")
+            self._execute("SELECT 1")
         except psycopg.OperationalError:
             return False
         return True
@@ -223,7 +223,7 @@ _HERE_ALONE = ("--host", "127.0.0.1", "--no-dashboard", "--dashboard-address", "
 
 @dataclass
 class Cluster:
-    """A Dask scheduler and worker processes, each without a nanny: who is killed stays dead.
+    """A Dask scheduler and worker processes, without nannies: a killed worker is not restarted.
 
     Attributes
     ----------
@@ -257,7 +257,7 @@ class Cluster:
         self.add_worker()
 
     def await_workers(self, n: int) -> None:
-        """Wait until the scheduler knows so many workers."""
+        """Wait until so many workers have registered."""
         from distributed import Client
 
         with Client(self.address, timeout=WAIT_S, set_as_default=False) as client:
@@ -271,7 +271,7 @@ class Cluster:
 
 
 def missing_distributed() -> str | None:
-    """Say why no Dask cluster can be started here; None when one can."""
+    """Return why no Dask cluster can be started here; None when one can."""
     if shutil.which("setpriv") is None:
         return "setpriv is not installed (Debian: util-linux)"
     found = find_spec("distributed")

@@ -113,7 +113,7 @@ def section(record: Record) -> Iterator[str]:
     if record.older:
         yield f"**Recorded before {record.older.why}.**"
     yield ""
-    yield "| claim | figure | how sure | beside it | |"
+    yield "| claim | figure | uncertainty | comparison | |"
     yield "| --- | --- | --- | --- | --- |"
     for claim in record.claims:
         cells = (claim.what, claim.figure, claim.interval, claim.beside)

@@ -78,7 +78,7 @@ from studies.health_robustness.trials import (
     told,
 )
 
-STEP = "health, on machines that it does not know"
+STEP = "health, on machines outside the model"
 OLDER = {
     "result": Older("62df3d765a0b", "laws were weighed"),
     "control": Older("0c702f1698ba", "laws were weighed"),
@@ -313,7 +313,7 @@ def wrong_plants(stage: str, n: dict[str, int], sizes: Sizes, lost: list[str]) -
 
 
 def demo(n: int, sizes: Sizes) -> list[Row]:
-    """Tell why intervals of the demo's kind of life are wide: with and without the map's error."""
+    """Compare widths of intervals of lives as in the demo with and without the map's error."""
     right = list(of_kind("lms-y", "both", n, sizes, 99))
     wrong = []
     for case in right:
@@ -399,7 +399,7 @@ def control(n: int, kept: Path | None) -> Row:
 
 
 def verdicts(answer: Row) -> dict[str, bool]:
-    """Say what was asked and whether it is so."""
+    """Return what was asked and whether it is so."""
 
     def fleet(world: str, arm: str) -> list[Row]:
         return [row for row in answer["fleets"] if (row["world"], row["arm"]) == (world, arm)]

@@ -207,7 +207,7 @@ def stage_with(name: str, model_std: float, plant: str = "", *, losing: bool = F
 
 @cache
 def told(name: str) -> dict[str, bool]:
-    """Say which parameters the modes of a stage tell at all; ``any`` stands for all of them."""
+    """Return which parameters the modes of a stage tell at all; ``any`` stands for all of them."""
     seen = identifiability_of(load_stage(name))
     shown = identifiable_parameters([seen], [range(len(seen.parameters))], seen.prior)
     return {
@@ -367,7 +367,7 @@ def life_draws(
 
 
 def claimed(left: Array, stage: Stage) -> Array:
-    """Give of the travel left what is claimed: no end past the horizon, no time of one passed."""
+    """Return of the travel left what is claimed: no end past the horizon, no time of one passed."""
     horizon = 1000 * stage.description.usage.horizon_km
     return np.where(left > horizon, np.inf, np.maximum(left, 0.0))
 

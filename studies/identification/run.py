@@ -166,7 +166,7 @@ def _pooled(coverages: list[Row]) -> Row:
 
 
 def verdicts(rows: list[Row], *, quick: bool) -> dict[str, bool]:
-    """Say what was asked and whether it is so."""
+    """Return what was asked and whether it is so."""
     sure = [row for row in rows if row["n"] >= 300]
     headline = [row for row in rows if row["case"] in HEADLINES]
     passed = {"headline coverages hold": all(row["coverage"]["holds"] for row in headline)}
@@ -208,7 +208,7 @@ def shortfalls(rows: list[Row]) -> list[str]:
 
 
 def _too_far(row: Row) -> bool:
-    """Tell whether an error is beyond what was asked, its own scatter allowed for."""
+    """Return whether an error is beyond what was asked, its own scatter allowed for."""
     asked = row.get("asked")
     return asked is not None and row["rmse_over_bound"] - 2 * row["its_error"] > asked
 

@@ -97,7 +97,7 @@ def installed(folder: Path) -> Path:
 
 
 def sizes(python: Path, environment: Path) -> Row:
-    """Give the megabytes of an environment, and of its largest distributions."""
+    """Return the megabytes of an environment, and of its largest distributions."""
     done = subprocess.run([python, "-c", _SIZES], check=True, capture_output=True, text=True)
     found = {name: size / 1e6 for name, size in json.loads(done.stdout).items()}
     found.pop("pip", None)

@@ -131,7 +131,7 @@ def one(kind: str, seed: int, *, logs: int, cache: Path | None, seconds: float =
 
 
 def true_quantities(plan: PriorPlan, health: Array) -> Array:
-    """Give what is true of a life, in the order of `QUANTITIES`."""
+    """Return what is true of a life, in the order of `QUANTITIES`."""
     drawn, now = plan.draw_life(), life_of(plan).travel[-1] / 1000
     limits = drawn.limits_km().values()
     left = [np.inf if km is None else 1000 * (km - now) for km in limits]
@@ -139,7 +139,7 @@ def true_quantities(plan: PriorPlan, health: Array) -> Array:
 
 
 def quantities(found: Prognosis, stage: Stage) -> Array:
-    """Give draws of the same; what lies past the horizon is not claimed."""
+    """Return draws of the same; what lies past the horizon is not claimed."""
     left = found.censored()
     baseline = [p.baseline for p in stage.parameters]
     days = left[:, -1:] / found.usage[:, None]
@@ -180,7 +180,7 @@ def judged(rows: list[Row]) -> Row:
 
 
 def verdicts(answer: Row) -> dict[str, bool]:
-    """Say what was asked and whether it is so."""
+    """Return what was asked and whether it is so."""
     found = answer["ranks"]
     checks = {f"ranks are uniform: {BELIEVED}": uniform(found[BELIEVED])}
     if found[HALVED][QUANTITIES[0]]["n"] >= 0.9 * N_LIVES:  # fewer tell little

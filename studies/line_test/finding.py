@@ -186,7 +186,7 @@ def stroke_log(rng: np.random.Generator, count: int) -> tuple[Log, float]:
 
 
 def simulated_strokes() -> list[Row]:
-    """Tell what the strokes of the simulated stages show together, and each on its own."""
+    """Return what the strokes of the simulated stages show together, and each on its own."""
     rows = []
     for name in STAGES:
         for speed in (0.2, 0.4):

@@ -92,12 +92,12 @@ def main() -> None:
 
 
 def verdicts(answer: Row) -> dict[str, bool]:
-    """Say what was asked and whether it is so."""
+    """Return what was asked and whether it is so."""
     return judge_building(answer["building"]) | judge_others(answer)
 
 
 def judge_building(building: Row) -> dict[str, bool]:
-    """Say whether the building is what it is known to be."""
+    """Return whether the building is what it is known to be."""
     modes = building["modes"].values()
     low, _, high = building["stiffness"].values()
     seen = [part for part in building["parts"] if "f_hz" in part]
@@ -137,7 +137,7 @@ def judge_building(building: Row) -> dict[str, bool]:
 
 
 def judge_others(answer: Row) -> dict[str, bool]:
-    """Say whether all others are what they are known to be."""
+    """Return whether all others are what they are known to be."""
     shear, light, weak = answer["shear_frame"], answer["light_frame"], answer["weak_mode"]
     shake = answer["shake"]["rows"]
     seen = {(row["frame"], row["mode"]) for row in shake if "f_hz" in row}

@@ -64,7 +64,7 @@ def identify_known(
 
 
 def tell(modes: Modes, i: int) -> Row:
-    """Give what was identified of one mode."""
+    """Return what was identified of one mode."""
     return {
         "f_hz": float(modes.frequency[i]),
         "f_std_hz": float(modes.frequency_std[i]),

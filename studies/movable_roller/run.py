@@ -270,7 +270,7 @@ def straight_line(
 
 
 def describe(found: Calibration, known: pd.DataFrame) -> Row:
-    """Tell what the map is and how good it is."""
+    """Return what the map is and how good it is."""
     columns = ["repeat", "dwell", "roller_v", "frequency_hz", "frequency_std_hz"]
     volts = np.linspace(found.low, found.high, 60)
     return {
@@ -286,7 +286,7 @@ def describe(found: Calibration, known: pd.DataFrame) -> Row:
 
 
 def judge(answer: Row) -> dict[str, bool]:
-    """Say whether the positions are found, and whether the controls lose them."""
+    """Return whether the positions are found, and whether the controls lose them."""
     rows = answer["dwells"]
     inferred = [row for row in rows if row["median"] is not None]
     travel = max(row["roller_v"] for row in rows) - min(row["roller_v"] for row in rows)

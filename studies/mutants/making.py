@@ -112,14 +112,14 @@ def _is_alias(node: cst.CSTNode) -> bool:
 
 
 def _gone(old: cst.CSTNode, new: cst.CSTNode) -> Iterable[cst.CSTNode]:
-    """Give the arguments of a call that a mutant does not have, or has changed."""
+    """Return the arguments of a call that a mutant does not have, or has changed."""
     if not isinstance(old, cst.Call) or not isinstance(new, cst.Call):
         return []
     return [arg for arg in old.args if not any(arg is other for other in new.args)]
 
 
 def _differing(old: str, new: str) -> tuple[str, str]:
-    """Give the lines that two texts do not share at their beginning and end."""
+    """Return the lines that two texts do not share at their beginning and end."""
     a, b = old.splitlines(), new.splitlines()
     first = next((k for k, pair in enumerate(zip(a, b, strict=False)) if pair[0] != pair[1]), 0)
     last = 0
@@ -144,7 +144,7 @@ def planted(source: str, line: int) -> str:
 
 
 def reach(source: str, line: int) -> int:
-    """Give the lines of which a test must run one to see a change, as bits of a number.
+    """Return the lines of which a test must run one to see a change, as bits of a number.
 
     They are those of the statement, without what it holds; of the function's body where it is the
     head of one; of all functions where it stands in none.
@@ -173,7 +173,7 @@ def _inside(node: ast.FunctionDef) -> range:
 
 
 def _body(tree: ast.AST, line: int) -> list[ast.stmt] | None:
-    """Give the body of the innermost function that holds a line in it."""
+    """Return the body of the innermost function that holds a line in it."""
     holding = [
         node
         for node in ast.walk(tree)

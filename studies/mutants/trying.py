@@ -39,7 +39,7 @@ class Outcome:
 
     @property
     def fate(self) -> str:
-        """Tell what this means for a mutant."""
+        """Return what this means for a mutant."""
         if self.code == _FINE:
             return "survived"
         return "timed out" if self.code in (-signal.SIGXCPU, -signal.SIGKILL) else "killed"
@@ -77,7 +77,7 @@ def collect(file: str, digest: str, *, modules: tuple[str, ...]) -> Row:
 
 
 def _lines(data: CoverageData, tree: Path) -> dict[str, dict[str, str]]:
-    """Give by test and module the lines that are run, as bits of a hexadecimal number."""
+    """Return by test and module the lines that are run, as bits of a hexadecimal number."""
     found: dict[str, dict[str, set[int]]] = {}
     for name in data.measured_files():
         module = Path(name).relative_to(tree.resolve()).stem

@@ -56,7 +56,7 @@ def write_logs(recording: Path, folder: Path) -> None:
 
 
 def stiffness_of(k: int) -> float:
-    """Tell what is left of the stiffness of bench-B at its log ``k``."""
+    """Return what is left of the stiffness of bench-B at its log ``k``."""
     return (1 - SLOWER * k) ** 2
 
 

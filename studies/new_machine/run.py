@@ -97,7 +97,7 @@ def followed(some: list[Step], scratch: Path) -> list[Row]:
 
 
 def files_as_shown(bench: Path) -> dict[str, bool]:
-    """Tell whether the files beside the tutorial are those that it makes."""
+    """Return whether the files beside the tutorial are those that it makes."""
     return {
         name: (bench / made).read_bytes() == (HERE / name).read_bytes()
         for name, made in (("bench.map.csv", "bench.map.csv"),
@@ -125,7 +125,7 @@ def answered(scratch: Path) -> Row:
 
 
 def follow(step: Step, scratch: Path) -> Row:
-    """Give a step to a shell, and see whether what comes out is what the tutorial shows."""
+    """Return a step to a shell, and see whether what comes out is what the tutorial shows."""
     words = {"lmshealth": "-m lmshealth", "python": ""}
     tools = "".join(
         f"{name}() {{ '{sys.executable}' {how} \"$@\"; }}\n" for name, how in words.items()
@@ -154,7 +154,7 @@ def plain(line: str) -> str:
 
 
 def tell_modes(bench: Path) -> Row:
-    """Tell how far the estimates of the machine that does not change scatter and say they do."""
+    """Return how far the estimates of the machine that does not change scatter and say they do."""
     modes = pd.read_csv(bench / "modes.csv")
     own = modes[modes["stage"] == "bench-A"]
     return {
@@ -182,7 +182,7 @@ def tell_stiffness(bench: Path) -> list[Row]:
 
 
 def tell_remaining(bench: Path) -> Row:
-    """Tell what is left, and what is left if bench-B goes on as it was made to."""
+    """Return what is left, and what is left if bench-B goes on as it was made to."""
     table = pd.read_csv(bench / "prognosis.csv")
     own = table[table["parameter"] == "coupling_stiffness"].set_index("stage")
     columns = ["rul_km_q05", "rul_km_q50", "rul_km_q95", "probability_beyond_horizon"]
@@ -195,7 +195,7 @@ def tell_remaining(bench: Path) -> Row:
 
 
 def as_shown(told: list[Row], made: dict[str, bool]) -> dict[str, bool]:
-    """Say whether what is shown comes out."""
+    """Return whether what is shown comes out."""
     return {
         "what is shown comes out": not any(step["shown_and_not_come_out"] for step in told),
         "the files of this folder are those that are made": all(made.values()),
@@ -203,7 +203,7 @@ def as_shown(told: list[Row], made: dict[str, bool]) -> dict[str, bool]:
 
 
 def judge(answer: Row) -> dict[str, bool]:
-    """Say whether the tutorial does what it says, and whether it ends where the truth is."""
+    """Return whether the tutorial does what it says, and whether it ends where the truth is."""
     sound, worn = (
         [row for row in answer["stiffness"] if row["stage"] == name]
         for name in ("bench-A", "bench-B")

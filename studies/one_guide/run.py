@@ -93,7 +93,7 @@ def one_trial(stages: tuple[Stage, Stage], seed: int, *, apart: bool) -> Row:
 
 
 def told(health: Health, truth: tuple[float, ...]) -> Row:
-    """Say of each parameter what its posterior says: level of the truth, ln width, claims."""
+    """Return for each parameter what its posterior says: level of the truth, ln width, claims."""
     draws = health.samples[0]
     return {
         name: {
@@ -159,7 +159,7 @@ def main() -> None:
 
 
 def verdicts(answer: Row, *, quick: bool) -> dict[str, bool]:
-    """Say what was asked and whether it is so; one pair has no control."""
+    """Return what was asked and whether it is so; one pair has no control."""
     ways = answer["ways"]
     checks = {
         "all intervals cover": all(

@@ -130,7 +130,7 @@ def verdict(row: TableRow) -> str:
 
 
 def reason(row: TableRow) -> str:
-    """Say why a row is not met cell by cell; empty where it is."""
+    """Return why a row is not met cell by cell; empty where it is."""
     judged = verdict(row)
     if judged.startswith("match within") and "cells" not in judged:
         return ""
@@ -200,7 +200,7 @@ def summarise(rows: list[TableRow]) -> dict[str, str]:
 
 
 def grows(cells: tuple[float, ...]) -> bool:
-    """Tell whether magnitudes (mm/s²) over velocity depend strongly on it."""
+    """Return whether magnitudes (mm/s²) over velocity depend strongly on it."""
     return cells[-1] >= HIGH_MM_S2 and cells[-1] >= GROWTH * float(np.median(cells[:4]))
 
 

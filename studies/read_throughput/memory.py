@@ -33,7 +33,7 @@ def needs(path: Path, short: Path) -> dict[str, dict[str, float]]:
 
 
 def peak() -> int:
-    """Give the most memory that this process ever had; `resource` would count its parent's too."""
+    """Return the peak memory of this process; `resource` would count its parent's too."""
     status = Path("/proc/self/status").read_text()
     (kilobytes,) = re.findall(r"VmHWM:\s*(\d+) kB", status)
     return int(kilobytes) << 10

@@ -129,7 +129,7 @@ def compare(path: Path, calls: tuple[Call, ...], rounds: int) -> Row:
 
 
 def long_log(name: str, n_minutes: int, chosen: tuple[str, ...]) -> dict[str, float]:
-    """Give the peak memory of reader and library, in minutes of the log, and their time."""
+    """Return the peak memory of reader and library, in minutes of the log, and their time."""
     with tempfile.TemporaryDirectory() as folder:
         (Path(folder) / "short").mkdir()
         paths = Path(folder) / name, Path(folder) / "short" / name
@@ -155,7 +155,7 @@ def samples() -> dict[str, dict[str, str]]:
 
 
 def outcomes(path: Path, data: Path) -> dict[str, str]:
-    """Say what becomes of one sample."""
+    """Return what becomes of one sample."""
     name = path.relative_to(data).as_posix()
     found = {"as it is": outcome(path, ColumnMap(), name)}
     if name in MAPS:

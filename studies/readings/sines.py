@@ -159,7 +159,7 @@ def between(offset: float) -> Array:
 
 
 def leak(row: Row, offset: float) -> dict[str, float]:
-    """Tell how far the reading of such a sine is off, and where its power went."""
+    """Return how far the reading of such a sine is off, and where its power went."""
     (reading,) = read_error(read_log(Path(row["log"])))
     amplitude = 1e6 * reading.harmonics.amplitude
     return {

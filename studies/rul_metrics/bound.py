@@ -84,7 +84,7 @@ def _vector(law: object) -> Array:
 
 
 def bound(case: Case, history: History, stage: Stage, model_std: float) -> float:
-    """Give the least standard deviation in m of the remaining life that a history allows.
+    """Return the least standard deviation in m of the remaining life that a history allows.
 
     Fisher's information of the laws' parameters from the ln frequencies of all logs, with their
     covariance, unknown intercepts and temperature coefficients of each mode, and relative errors of

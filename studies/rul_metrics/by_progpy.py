@@ -62,17 +62,17 @@ class Wearing(PrognosticsModel):
         return left**1.5 * math.exp(x["off_preload"]), (1 - lost) * math.exp(x["off_mount"])
 
     def output(self, x: Any) -> Any:
-        """Give health."""
+        """Return health."""
         return self.OutputContainer(dict(zip(self.outputs, self._health(x), strict=True)))
 
     def event_state(self, x: Any) -> dict[str, float]:
-        """Give the smaller share of what may be lost that is left."""
+        """Return the smaller share of what may be lost that is left."""
         limits = self.parameters["preload_limit"], self.parameters["mount_limit"]
         pairs = zip(self._health(x), limits, strict=True)
         return {"end": min((own - limit) / (1 - limit) for own, limit in pairs)}
 
     def threshold_met(self, x: Any) -> dict[str, bool]:
-        """Tell whether a limit is reached."""
+        """Return whether a limit is reached."""
         preload, mount = self._health(x)
         limits = self.parameters["preload_limit"], self.parameters["mount_limit"]
         return {"end": preload <= limits[0] or mount <= limits[1]}

@@ -91,7 +91,7 @@ def states_of(life: LifePosterior, history: History) -> dict[str, Array]:
 
 
 def health_index(history: History, stage: Stage) -> tuple[Array, Array]:
-    """Give the health of single epochs, without a law.
+    """Return the health of single epochs, without a law.
 
     It is the mode of the posterior that `infer` draws from, for a median.
 

@@ -79,7 +79,7 @@ from studies.rul_metrics.bound import bound, share_within
 from studies.rul_metrics.lives import CUTS, HEALTHY, KINDS, STAGE, Case, case_of, cut
 from studies.rul_metrics.ways import CONTROL, LINE, MISSING, OURS, PROGPY, WAYS, all_ways
 
-STEP = "prognose, beside others"
+STEP = "prognose, compared with others"
 
 SEED = 20261124
 LIVES, UNENDING = 16, 6  # of each kind, and healthy ones
@@ -313,7 +313,7 @@ def healthy(rows: list[Row]) -> Row:
 
 
 def seconds(rows: list[Row]) -> Row:
-    """Give median and largest processor times of what was asked at all cuts."""
+    """Return median and largest processor times of what was asked at all cuts."""
     cuts = [one["seconds"] for row in rows for one in row["cuts"] if "seconds" in one]
     names = dict.fromkeys(name for one in cuts for name in one)
     own = {name: [one[name] for one in cuts if name in one] for name in names}
@@ -324,7 +324,7 @@ def seconds(rows: list[Row]) -> Row:
 
 
 def verdicts(answer: Row, *, quick: bool) -> dict[str, bool]:
-    """Say what was asked and whether it is so; times are judged in the recorded run alone."""
+    """Return what was asked and whether it is so; times are judged in the recorded run alone."""
     (main,) = (row["ways"] for row in answer["cuts"] if row["share"] == MAIN_CUT)
     times = answer["seconds"]
     checks = {"every life is told": all(

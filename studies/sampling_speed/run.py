@@ -91,7 +91,7 @@ def main() -> None:
 
 
 def verdicts(answer: Row, *, quick: bool) -> dict[str, bool]:
-    """Say what was asked and whether it is so; times are judged in the recorded run alone."""
+    """Return what was asked and whether it is so; times are judged in the recorded run alone."""
     rows = {row["program"]: row for row in answer["epoch"]["programs"]}
     life, likelihood = answer["life"], answer["life"]["likelihood"]
     checks = {

@@ -27,7 +27,7 @@ class Life:
 
 
 def believing(machine: Stage, share: float) -> Stage:
-    """Give the same stage with a share of the error of its map."""
+    """Return the same stage with a share of the error of its map."""
     assert machine.description.map is not None
     less = share * machine.description.map.model_std
     spec = msgspec.structs.replace(machine.description.map, model_std=less)

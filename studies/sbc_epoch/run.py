@@ -167,7 +167,7 @@ def judged(rows: list[Row]) -> Row:
 
 
 def verdicts(found: dict[str, dict[str, Row]]) -> dict[str, bool]:
-    """Say what was asked and whether it is so."""
+    """Return what was asked and whether it is so."""
     first = machine(ONE).parameters[0].name
     checks = {f"ranks are uniform: {kind}": uniform(found[kind]) for kind in (ONE, SHARED, X)}
     if CHAINS in found:

@@ -133,7 +133,7 @@ def one(kind: str, life: int) -> Row:
 
 
 def always_losing(stage: Stage) -> Stage:
-    """Give the same stage without the laws by which a parameter keeps its value."""
+    """Return the same stage without the laws by which a parameter keeps its value."""
     parameters = tuple(
         msgspec.structs.replace(p, law=tuple(law for law in p.laws if law.names))
         for p in stage.parameters
@@ -144,7 +144,7 @@ def always_losing(stage: Stage) -> Stage:
 
 
 def true_quantities(drawn: Life, rng: np.random.Generator) -> Array:
-    """Give what is true of a life, in the order of `QUANTITIES`."""
+    """Return what is true of a life, in the order of `QUANTITIES`."""
     now = np.array([drawn.now])
     horizon = 1000 * machine().description.usage.horizon_km
     loses = [bool(part.law.names) for part in drawn.parts]
@@ -158,7 +158,7 @@ def true_quantities(drawn: Life, rng: np.random.Generator) -> Array:
 
 
 def quantities(found: LifePosterior, now: float, rng: np.random.Generator) -> Array:
-    """Give what a posterior says of the same, ``(n_draws, n)``."""
+    """Return what a posterior says of the same, ``(n_draws, n)``."""
     horizon = 1000 * machine().description.usage.horizon_km
     told = [(j, p) for j, p in enumerate(machine().parameters) if p.limit is not None]
     left = remaining_travel(found, told, rng, now=now, horizon=horizon)
@@ -185,7 +185,7 @@ def judged(rows: list[Row]) -> Row:
 
 
 def verdicts(found: dict[str, dict[str, Row]]) -> dict[str, bool]:
-    """Say what was asked and whether it is so."""
+    """Return what was asked and whether it is so."""
     checks = {f"ranks are uniform: {kind}": uniform(found[kind]) for kind in (ONE, CHAINS)
               if kind in found}  # fmt: skip
     shown = {EXACT: HEALTH, LOSING: (*HEALTH, REMAINING[0])}

@@ -68,7 +68,7 @@ class Meter:
         self.yardstick: list[tuple[float, float, float]] = []
 
     def __call__(self, what: str, done: int, total: int) -> None:
-        """Hear of progress, as `run` tells it."""
+        """Measure of progress, as `run` tells it."""
         spent = time.process_time() - self._since
         self.seconds[self._step] = self.seconds.get(self._step, 0.0) + spent
         if what == "identifying" and done and done % self._every == self._every // 2:
@@ -141,7 +141,7 @@ def marginal(less: Row, more: Row, *, by: Row | None = None) -> float:
 
 
 def overhead_of(row: Row) -> float:
-    """Tell what reading, store and bookkeeping cost, as a share of the identification."""
+    """Return what reading, store and bookkeeping cost, as a share of the identification."""
     _, identified, other = row["yardstick_ms"]
     whole = row["seconds"]["reading"] + row["seconds"]["identifying"]
     return float((1e3 * whole / row["logs"] - other) / identified - 1)

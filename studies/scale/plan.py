@@ -54,7 +54,7 @@ class Steps:
         self.seconds: dict[str, float] = {}
 
     def __call__(self, what: str, done: int, total: int) -> None:
-        """Hear of progress, as `run` tells it."""
+        """Measure of progress, as `run` tells it."""
         now = time.process_time()
         self.seconds[self._step] = self.seconds.get(self._step, 0.0) + now - self._since
         self._step, self._since = what, now
@@ -68,7 +68,7 @@ def staged(folder: Path, quick: bool) -> Row:
 
 
 def without_health(stage: Stage) -> Stage:
-    """Give the same stage with its modes alone."""
+    """Return the same stage with its modes alone."""
     told = msgspec.structs.replace(stage.description, parameter=(), map=None)
     return replace(stage, description=told, modal_map=None)
 
@@ -105,7 +105,7 @@ def one_stage(folder: Path, plan: Plan, epochs: int, stage: Stage) -> Row:
 
 
 def plan_for(n_workers: int, stage: Row, serial_s: float, efficiency: float) -> Row:
-    """Tell how long the archive takes, and what it waits for."""
+    """Return how long the archive takes, and what it waits for."""
     whole = stage["health_s"] + stage["life_s"] + stage["page_s"]
     shared = N_LOGS * stage["log_s"] + N_STAGES * whole
     gain = n_workers * (efficiency if n_workers > 1 else 1.0)

@@ -53,7 +53,7 @@ class Clock:
         self.first = self.last = (0.0, 0.0, 0)
 
     def __call__(self, what: str, done: int, total: int) -> None:
-        """Hear of progress, as `run` tells it."""
+        """Measure of progress, as `run` tells it."""
         if what == "identifying" and done:
             now = time.perf_counter(), time.process_time(), done
             self.first = now if done == 1 else self.first
@@ -89,7 +89,7 @@ def _again_and_again(folder: Path, n: int) -> float:
 
 
 def bare(folder: Path, n: int, each: int) -> float:
-    """Give what n processes identify in a second by themselves, each so many logs.
+    """Return what n processes identify in a second by themselves, each so many logs.
 
     One of them is this one, which nothing else keeps busy.
     """

@@ -59,7 +59,7 @@ class Life:
     damping: Array
 
     def truth(self) -> dict[str, Array]:
-        """Give ln f, ln ζ and drift since the first log."""
+        """Return ln f, ln ζ and drift since the first log."""
         return {"ln f": self.level, "ln ζ": self.damping, "drift": self.level - self.level[0]}
 
 
@@ -159,7 +159,7 @@ def _covariance(rng: np.random.Generator, n: int, n_sources: int) -> Array:
 
 
 def alone(history: History, source: str) -> History:
-    """Give the history that one source alone makes."""
+    """Return the history that one source alone makes."""
     own = np.array([i for i, one in enumerate(history.series) if one.source == source])
     both = np.r_[own, own + len(history.series)]
     return replace(
@@ -172,7 +172,7 @@ def alone(history: History, source: str) -> History:
 
 
 def without_common_errors(history: History) -> History:
-    """Give the history as if the errors of two sources had nothing to do with each other."""
+    """Return the history as if the errors of two sources had nothing to do with each other."""
     source = np.array([one.source for one in history.series] * 2)
     same = source[:, None] == source
     return replace(history, cov=np.where(np.isnan(history.cov) | same, history.cov, 0.0))

@@ -137,7 +137,7 @@ def long_life(n: int, m: int) -> History:
 
 
 def one_setting() -> Hyperparameters:
-    """Give the setting that all of them can express."""
+    """Return the setting that all of them can express."""
     return Hyperparameters(
         np.array([LEVEL_WALK]), np.array([RATE_STD]), np.zeros(1), np.ones((1, 1)), np.zeros(1)
     )

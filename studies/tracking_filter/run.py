@@ -75,7 +75,7 @@ def main() -> None:
 
 
 def verdicts(answer: Row, *, quick: bool) -> dict[str, bool]:
-    """Say what was asked and whether it is so; few lives tell no control from what it controls."""
+    """Return the checks; controls only with enough lives."""
     known, average, sources = (answer[k] for k in ("known_setting", "averaged", "two_sources"))
     programs = {row["program"]: row for row in answer["speed"]["programs"]}
     checks = {

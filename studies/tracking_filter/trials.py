@@ -39,7 +39,7 @@ def band(total: float, dof: float) -> Row:
 
 
 def halved(history: History) -> History:
-    """Give the same history with half the reported covariance."""
+    """Return the same history with half the reported covariance."""
     return replace(history, cov=history.cov / 2)
 
 
@@ -82,7 +82,7 @@ def errors(life: Life, history: History, k: int, machine: Stage) -> dict[str, Ar
 
 
 def coverage(z: Array) -> list[Row]:
-    """Tell how often intervals of both levels hold the truth."""
+    """Return how often intervals of both levels hold the truth."""
     rows = []
     for level in NOMINAL:
         hits = int(np.sum(np.abs(z) < stats.norm.ppf((1 + level) / 2)))

@@ -195,7 +195,7 @@ def halved(sizes: Sizes, n: int) -> Row:
 
 
 def power(sizes: tuple[Estimates, Life], n: int) -> Row:
-    """Tell how soon a loss of preload is found, beside the best that is possible."""
+    """Return how soon a loss of preload is found, beside the best that is possible."""
     rows: list[dict[str, float]] = []
     false = {"knows": 0, "learns": 0}
     found = []
@@ -239,7 +239,7 @@ def raw(seeds: int, cache: Path | None) -> Row:
 
 
 def verdicts(answer: Row, *, quick: bool) -> dict[str, bool]:
-    """Say what was asked and whether it is so; one life of a kind tells no rate of alarms."""
+    """Return what was asked and whether it is so; one life of a kind tells no rate of alarms."""
     checks = verdicts_of_lives(answer["lives"])
     if not quick:
         checks["halved covariances do not cover"] = not answer["halved"]["90"]["holds"]
@@ -252,7 +252,7 @@ def verdicts(answer: Row, *, quick: bool) -> dict[str, bool]:
 
 
 def verdicts_of_lives(rows: list[Row]) -> dict[str, bool]:
-    """Say what was asked of alarms, intervals and events."""
+    """Return what was asked of alarms, intervals and events."""
     healthy = [row for row in rows if row["kind"] in HEALTHY]
     damaged = [row for row in rows if row["kind"] in DAMAGED]
     retuned = [row for row in rows if row["name"] == "servo-retuning, undeclared"]

@@ -120,7 +120,7 @@ def _one(one: Followed, z: Array) -> float:
 
 
 def told(followed: list[Followed]) -> Row:
-    """Say what was found that nobody had declared, and how soon."""
+    """Return what was found that nobody had declared, and how soon."""
     kinds: Counter[str] = Counter()
     delays, right, wrong = [], 0, 0
     for one in followed:

@@ -28,10 +28,10 @@ from studies.fleet_prior.run import (
     MOST_DRAWN,
     SMALL,
     described,
+    evidence_of,
     horizon,
-    lessons,
+    learned_prior,
     posterior,
-    taught,
 )
 from studies.sbc_life.lives import draw
 from studies.sbc_life.run import N_POSTERIOR, machine, quantities, true_quantities
@@ -192,11 +192,14 @@ def test_young_machines_are_told_right_by_their_fleet(
     while len(places) < claims.trials:
         fleet = draw_fleet(rng, described())
         number = int(rng.integers(1 << 32))
-        teachers = lessons(rng, fleet, SMALL, number)
+        mature = evidence_of(rng, fleet, SMALL, number)
         for _ in range(MOST_DRAWN):
             young = draw_machine(rng, fleet, YOUNG)
-            lesson = machine_evidence(described(), posterior(young, described(), number))
-            if needs_fleet_prior(lesson) and (prior := taught(lesson, teachers)) is not None:
+            evidence = machine_evidence(described(), posterior(young, described(), number))
+            if (
+                needs_fleet_prior(evidence)
+                and (prior := learned_prior(evidence, mature)) is not None
+            ):
                 break
         else:
             continue
