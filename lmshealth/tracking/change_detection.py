@@ -59,15 +59,9 @@ def suspect(
 ) -> int | None:
     """Return the log since which the following error, or else innovations, differ suspiciously.
 
-    Parameters
-    ----------
-    sums : sequence
-        Running sums before the first log and after every log up to the present one.
-    first : int
-        First log of the present segment.
-    leaps : sequence of int
-        Logs of unexplained leaps of the following error. They locate a retuning better than
-        innovations do.
+    `sums` has the running sums before the first log and after every log up to the present one,
+    `first` is the first log of the segment, and `leaps` the logs of unexplained leaps of the
+    following error, which locate a retuning better than innovations do.
     """
     k = len(sums) - 2
     recent = [j for j in leaps if first <= j < k]
@@ -140,21 +134,8 @@ def weigh_changes(
 ) -> Change | None:
     """Weigh all kinds of change about a suspected log by their evidence.
 
-    Parameters
-    ----------
-    model : FilterModel
-        Of the history.
-    checkpoints : mapping of int to FilterBank
-        Banks after each of the last logs.
-    now : int
-        The present log.
-    suspected : int
-        Probable first log after the change.
-
-    Returns
-    -------
-    Change or None
-        The most likely; None where no checkpoint is before it.
+    `checkpoints` are the banks after each of the last logs, `now` is the present log. Returned is
+    the most likely change, or None where no checkpoint is before it.
     """
     # The suspected log is first: where it gains nothing, its neighbours gain nothing.
     about = sorted((suspected + _ABOUT).tolist(), key=lambda j: abs(j - suspected))
@@ -258,19 +239,8 @@ def loop_evidence(loop_error: FloatArray, first: int, now: int, kind: str) -> fl
     The logarithms before and after are two samples of unknown variance; the Bayes factor of a
     difference of their means has a closed form [Gonen2005].
 
-    Parameters
-    ----------
-    loop_error : ndarray
-        RMS in m, shape ``(n_logs,)``, NaN where unknown.
-    first, now : int
-        First log after the step, and the last log.
-    kind : str
-        Kind of the step.
-
-    Returns
-    -------
-    float or None
-        None where too few values exist.
+    `loop_error` is its RMS in m, shape ``(n_logs,)``, NaN where unknown; `first` and `now` are the
+    first log after the step and the last log. None where too few values exist.
     """
     values = _logarithms(loop_error)
     before = values[max(first - constants.LOOP_LOGS, 0) : first]

@@ -63,7 +63,7 @@ JUMP_STD: dict[str, tuple[float, float]] = {
     "reset": (0.05, 0.5),
 }
 
-# --- Process noise, averaged over its evidence (INFERENCE: maximum likelihood collapses to none) --
+# --- Process noise, averaged over its evidence (maximum likelihood collapses to none) -------------
 # Random walk of ln f of a healthy machine, which has no rate.
 HEALTHY_WALKS = (1e-5, 3e-4, 1e-3)
 # Random walk of ln f of a changing machine, its initial rates, and the random walks of the rate.

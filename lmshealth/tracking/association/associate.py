@@ -16,7 +16,7 @@ from typing import Literal
 import numpy as np
 
 from lmshealth._arrays import BoolArray, FloatArray, expect_shape, freeze
-from lmshealth.errors import BadTable, NotEnoughData
+from lmshealth.errors import BadTable
 from lmshealth.tracking import constants
 from lmshealth.tracking.association.hypotheses import (
     Hypotheses,
@@ -243,18 +243,13 @@ def associate(
 
     Raises
     ------
-    NotEnoughData
-        If there is no log.
     BadTable
-        If an estimate is not finite or has no positive variance, logs differ in the number of
-        channels, the clock descends, or covariates, their prior or jumps do not fit the logs.
+        If an estimate is not finite or has no positive variance.
 
     References
     ----------
     [BarShalom1988]_, [Reid1979]_, [Murty1968]_, [Allemang2003]_
     """
-    clock, offsets, prior_std = (np.asarray(a, float) for a in (clock, offsets, prior_std))
-    _check(epochs, clock, offsets, prior_std, jumps)
     state = State.start(prior_std, epochs[0].shapes.shape[1])
     declared, lives, places = frozenset(jumps), _lives(clock), clock.tolist()
     labels = []
@@ -464,16 +459,9 @@ def _unique_assignment(state: State, scan: Scan) -> IntArray | None:
 def _resolve(
     state: State, scan: Scan, log: Log, confirmed: set[int]
 ) -> tuple[State, list[int], list[Label]]:
-    """Associate a scan by hypotheses; mark the candidates that it makes modes as confirmed.
+    """Associate a scan by hypotheses; add the candidates that become modes to `confirmed`.
 
-    Returns
-    -------
-    state : State
-        After the scan.
-    modes : list of int
-        Mode of each estimate, -1 for none.
-    labels : list of Label
-        Of each estimate.
+    Returned are the next state, and the mode (-1 for none) and the label of each estimate.
     """
     expected = state.hypotheses.filters.predicted(scan.row)[0][0]
     extended = extend(state.hypotheses, scan, state.order, opened=log.opened)
@@ -620,40 +608,6 @@ def measurements_of(epochs: Sequence[Estimates]) -> list[Measurements]:
         shapes /= np.where(norm > 0, norm, np.nan)
     columns = (ln_f, var_f, ln_zeta, var_zeta, shapes)
     return [Measurements(*(column[a:b] for column in columns)) for a, b in pairwise(start)]
-
-
-def _check(
-    epochs: Sequence[Estimates],
-    clock: FloatArray,
-    offsets: FloatArray,
-    prior_std: FloatArray,
-    jumps: Collection[int],
-) -> None:
-    n = len(epochs)
-    if not n:
-        raise NotEnoughData("no log to associate: give at least one")
-    if clock.shape != (n,) or not np.isfinite(clock).all():
-        raise BadTable(f"clock has shape {clock.shape}: needed one finite value for each of {n}")
-    back = np.flatnonzero(np.diff(clock) < 0)
-    if back.size:
-        k = int(back[0]) + 1
-        raise BadTable(f"clock descends to {clock[k]:g} at epoch {k}: put the logs in order")
-    if prior_std.ndim != 1 or not (np.isfinite(prior_std) & (prior_std >= 0)).all():
-        raise BadTable(f"prior_std is {prior_std}: needed one finite value ≥ 0 per covariate")
-    if offsets.shape != (n, prior_std.size) or not np.isfinite(offsets).all():
-        raise BadTable(
-            f"offsets have shape {offsets.shape}: needed finite values of shape "
-            f"{(n, prior_std.size)}, 0 where a covariate is unknown"
-        )
-    channels = {e.shapes.shape[1] for e in epochs}
-    if len(channels) > 1:
-        raise BadTable(
-            f"shapes have {sorted(channels)} channels in different logs: give all logs the "
-            "same channels, NaN where one is absent"
-        )
-    wrong = sorted(k for k in jumps if not 0 <= k < n)
-    if wrong:
-        raise BadTable(f"jumps at epochs {wrong}: there are epochs 0 to {n - 1}")
 
 
 def _lives(clock: FloatArray) -> list[float]:

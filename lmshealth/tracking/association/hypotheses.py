@@ -105,21 +105,11 @@ def clutter_gains(filters: ModeFilters, scan: Scan) -> FloatArray:
 def best_assignments(
     score: FloatArray, least: float, most: int
 ) -> list[tuple[float, tuple[int, ...]]]:
-    """Find the best one-to-one assignments of rows to columns or to nothing [Murty1968]_.
+    """Return the best one-to-one assignments of rows to columns or to nothing [Murty1968]_.
 
-    Parameters
-    ----------
-    score : ndarray
-        Gain of each pair over leaving its row unassigned, ``(n, m)``; -inf where not allowed.
-    least : float
-        Assignments below the best by more than this (a negative number) are left out.
-    most : int
-        Largest number of assignments.
-
-    Returns
-    -------
-    list of (float, tuple of int)
-        Gain and the column of each row, -1 for nothing; the best first.
+    `score` is the gain of each pair over leaving its row unassigned, ``(n, m)``, -inf where not
+    allowed. At most `most` assignments are returned, none below the best by more than `least`
+    (negative): gain and the column of each row, -1 for nothing, the best first.
     """
     n, m = score.shape
     cost = np.full((n, m + n), np.inf)
@@ -162,18 +152,8 @@ def shape_gains(shapes: FloatArray, of_modes: FloatArray) -> FloatArray:
     The density about the shape of the mode is Watson's, exp(κ MAC) / M(1/2, n/2, κ), over the
     channels that both have [Mardia2000]_, with the modal assurance criterion [Allemang2003]_. A
     small share has random directions: sensors are moved.
-
-    Parameters
-    ----------
-    shapes : ndarray
-        Shapes of estimates, ``(n, n_channels)``.
-    of_modes : ndarray
-        Shapes of modes, ``(h, m, n_channels)``.
-
-    Returns
-    -------
-    ndarray
-        Log likelihood ratio, ``(h, n, m)``; 0 where fewer than two channels are common.
+    Shapes of estimates are ``(n, n_channels)``, those of modes ``(h, m, n_channels)``; the ratios
+    are ``(h, n, m)``, 0 where fewer than two channels are common.
     """
     both = np.isfinite(shapes)[:, None] & np.isfinite(of_modes)[:, None]
     a = np.where(both, shapes[:, None], 0.0)
@@ -191,19 +171,8 @@ def shape_gains(shapes: FloatArray, of_modes: FloatArray) -> FloatArray:
 def name_gains(names: IntArray, labels: IntArray, order: IntArray) -> FloatArray:
     """Return log likelihood ratios of names that follow the mode, against clutter of any name.
 
-    Parameters
-    ----------
-    names : ndarray
-        Index of the mode that each estimate's name means, ``(n,)``: see `Scan`.
-    labels : ndarray
-        Modes of the estimates, ``(..., n)``; -1 for none.
-    order : ndarray
-        Modes that have names.
-
-    Returns
-    -------
-    ndarray
-        Shape ``(..., n)``.
+    `names` is that of a `Scan`, ``(n,)``; `labels` the modes of the estimates, ``(..., n)``, -1 for
+    none; `order` the modes that have names. The ratios have the shape of `labels`.
     """
     k = max(order.size, 1)
     wrong = (1 - constants.NAME_PROBABILITY) / max(k - 1, 1)
@@ -219,21 +188,9 @@ def order_gains(
     Detected modes have the order of their estimates; missed modes are below an estimate with the
     probability that their filters predict.
 
-    Parameters
-    ----------
-    scan : Scan
-        The estimates.
-    labels : ndarray
-        Modes of the estimates, ``(c, n)``; -1 for none.
-    order : ndarray
-        Modes that have names, in the order that names follow.
-    predicted : (ndarray, ndarray)
-        Predicted ln f of each mode and its variance, each ``(c, m)``.
-
-    Returns
-    -------
-    ndarray
-        Against clutter of any name, shape ``(c, n)``.
+    `labels` are the modes of the estimates, ``(c, n)``, -1 for none; `order` the modes that have
+    names, in the order that names follow; `predicted` ln f of each mode and its variance, each
+    ``(c, m)``. The ratios, against clutter of any name, are ``(c, n)``.
     """
     k, (c, n) = order.size, labels.shape
     if k == 0 or (scan.names < 0).all():
@@ -265,21 +222,9 @@ def order_gains(
 def extend(now: Hypotheses, scan: Scan, order: IntArray, *, opened: bool) -> Hypotheses:
     """Extend hypotheses by all assignments of a scan that are not pruned [Reid1979]_.
 
-    Parameters
-    ----------
-    now : Hypotheses
-        With filters predicted to the log.
-    scan : Scan
-        The estimates.
-    order : ndarray
-        Modes that have names, in the order that names follow.
-    opened : bool
-        Whether frequencies may step in this log.
-
-    Returns
-    -------
-    Hypotheses
-        Each with its filters updated and its labels of the scan's estimates.
+    The filters of `now` are predicted to the log; `order` are the modes that have names, in the
+    order that names follow; `opened` is whether frequencies may step in this log. Each hypothesis
+    returned has its filters updated and its labels of the scan's estimates.
     """
     if scan.measurements.shapes.shape[1] > 1:
         now = _with_veering(now, scan)
@@ -370,11 +315,6 @@ def reduce_hypotheses(extended: Hypotheses) -> Hypotheses:
 
     Merged hypotheses have the mean and covariance of their mixture [Salmond1990]_, and the labels
     of the heaviest: read the probabilities before.
-
-    Parameters
-    ----------
-    extended : Hypotheses
-        Of any weights.
     """
     total = logsumexp(extended.log_weights, axis=1)
     order = np.argsort(-total)

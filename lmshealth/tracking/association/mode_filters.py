@@ -135,16 +135,9 @@ class ModeFilters:
     ) -> Self:
         """Append modes, each started from its first estimate.
 
-        Parameters
-        ----------
-        first : Measurements
-            One estimate per mode.
-        row : ndarray
-            Observation row ``[1, 0, covariates]``, shape ``(d,)``.
-        prior_std : ndarray
-            Prior standard deviations of the covariates' coefficients, shape ``(d - 2,)``.
-        life : float
-            Length of a life on the clock; 0 while unknown.
+        `row` is the observation row ``[1, 0, covariates]``, ``(d,)``; `prior_std` has the prior
+        standard deviations of the covariates' coefficients, ``(d - 2,)``; `life` is the length of a
+        life on the clock, 0 while unknown.
         """
         n, d = first.ln_f.size, row.size
         rate = (constants.RATE_STD / life) ** 2 if life else _FLAT_VARIANCE
@@ -182,14 +175,8 @@ class ModeFilters:
 def predict(filters: ModeFilters, step: float, life: float, *, opened: bool = False) -> ModeFilters:
     """Predict all filters over a step of the clock.
 
-    Parameters
-    ----------
-    filters : ModeFilters
-        After the log before.
-    step, life : float
-        Step and length of a life on the clock; with a life of 0 only `opened` has an effect.
-    opened : bool
-        Whether levels may step here.
+    `step` and `life` are the step and the length of a life on the clock; with a life of 0 only
+    `opened` has an effect: whether levels may step here.
     """
     mean, cov, var_zeta = filters.mean.copy(), filters.cov.copy(), filters.var_zeta.copy()
     if life:
@@ -219,16 +206,8 @@ def update(
 ) -> ModeFilters:
     """Update some filters, each with its own estimate.
 
-    Parameters
-    ----------
-    filters : ModeFilters
-        Predicted to the log.
-    at : (ndarray, ndarray)
-        Hypothesis and mode of each filter, none twice.
-    new : Measurements
-        Their estimates.
-    row : ndarray
-        Observation row ``[1, 0, covariates]``, shape ``(d,)``.
+    `at` has the hypothesis and the mode of each filter, none twice; `row` is the observation row
+    ``[1, 0, covariates]``, shape ``(d,)``.
     """
     mean, cov = filters.mean[at], filters.cov[at]
     side = cov @ row

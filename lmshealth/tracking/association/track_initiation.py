@@ -63,23 +63,10 @@ def follow(
 ) -> tuple[Candidates, list[int | None]]:
     """Update candidates with a scan and start new ones.
 
-    Parameters
-    ----------
-    candidates : Candidates
-        With filters predicted to the log.
-    scan : Scan
-        Estimates of no mode; `names` holds the mode of which each may be the new level, else -1.
-    prior_std : ndarray
-        Prior standard deviations of the covariates' coefficients, ``(n_covariates,)``.
-    life : float
-        Length of a life on the clock.
-
-    Returns
-    -------
-    candidates : Candidates
-        Those before, and new ones at the end.
-    confirmed : list of int or None
-        For each estimate the candidate that it confirms.
+    Their filters are predicted to the log. The scan has the estimates of no mode, with the mode of
+    which each may be the new level as its name, else -1. `prior_std` and `life` are those of
+    `ModeFilters.start`. Returned are the candidates, new ones at the end, and for each estimate the
+    candidate that it confirms, or None.
     """
     candidates, mine = _assign(candidates, scan)
     known = [j for j in mine if j is not None]
@@ -126,18 +113,10 @@ def _assign(candidates: Candidates, scan: Scan) -> tuple[Candidates, list[int | 
 def prune(
     candidates: Candidates, epoch: int, confirmed: Collection[int], detected: Collection[int]
 ) -> Candidates:
-    """Delete candidates after a log.
+    """Delete candidates after all scans of a log.
 
-    Parameters
-    ----------
-    candidates : Candidates
-        After all scans of the log.
-    epoch : int
-        The log.
-    confirmed : collection of int
-        Candidates that have become modes.
-    detected : collection of int
-        Modes that were detected at their old level: they have no new one.
+    Those that have become modes (`confirmed`), those for new levels of modes that were detected at
+    their old level (`detected`), and those whose odds are too low.
     """
     if not len(candidates):
         return candidates

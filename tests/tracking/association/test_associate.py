@@ -13,7 +13,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.stats import norm
 
-from lmshealth.errors import BadTable, NotEnoughData
+from lmshealth.errors import BadTable
 from lmshealth.tracking import constants
 from lmshealth.tracking.association import associate as module
 from lmshealth.tracking.association.associate import (
@@ -589,34 +589,3 @@ def test_equal_clocks_are_one_moment(rng: np.random.Generator) -> None:
     rows = [say(row, "ab") for row in steady(rng, 10)]
     found = associate(rows, np.zeros(10), offsets=np.zeros((10, 0)), prior_std=np.zeros(0))
     assert found.assigned == (("a", "b"),) * 10
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"clock": [0.0, 2.0, 1.0]}, "clock descends to 1 at epoch 2"),
-        ({"clock": [0.0, 1.0]}, "clock has shape"),
-        ({"offsets": np.zeros((3, 2))}, "offsets have shape"),
-        ({"prior_std": np.array([-1.0])}, "prior_std"),
-        ({"jumps": [3]}, r"jumps at epochs \[3\]"),
-    ],
-)
-def test_tables_that_do_not_fit_are_refused(change: dict[str, Any], message: str) -> None:
-    """The error names what was got and what is needed."""
-    told = {"clock": [0.0, 1.0, 2.0], "offsets": np.zeros((3, 1)), "prior_std": np.ones(1)}
-    told |= change
-    clock = np.array(told.pop("clock"))
-    with pytest.raises(BadTable, match=message):
-        associate([say([4.6], "a")] * 3, clock, **told)
-
-
-def test_different_channels_are_refused() -> None:
-    """All logs give shapes in the same channels."""
-    with pytest.raises(BadTable, match=r"\[0, 2\] channels"):
-        run([say([4.6], "a"), say([4.6], "a", shapes=np.ones((1, 2)))])
-
-
-def test_no_log_is_refused() -> None:
-    """Without a log there is nothing to do."""
-    with pytest.raises(NotEnoughData, match="no log"):
-        run([])
