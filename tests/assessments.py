@@ -227,7 +227,7 @@ def write_stage(folder: Path, limited: bool = True, parameters: int = 2) -> Stag
 
 @pytest.fixture
 def make(tmp_path: Path) -> Maker:
-    """Return a maker of assessments: worn unless told otherwise."""
+    """Return a maker of assessments: worn by default."""
     stage = write_stage(tmp_path)
 
     def assess(identity: str = "M7-Y", wear_km: float = 8000, floor: float = 0.68) -> Assessment:
@@ -246,7 +246,7 @@ def make(tmp_path: Path) -> Maker:
                 recorded_at=history.recorded_at[-1],
                 verdict="healthy" if healthy else "both",
                 probability=0.97 if healthy else 0.93,
-                why="No parameter has left its baseline by more than the logs can tell."
+                why="No parameter differs from its baseline by more than its uncertainty."
                 if healthy
                 else "Roll, pitch and yaw have fallen by 7, 7 and 4 % since the baseline; the "
                 "map explains this by less guide preload and a looser mount together.",
@@ -286,7 +286,7 @@ def nothing(assessment: Assessment) -> Assessment:
 
 
 def blind(assessment: Assessment) -> Assessment:
-    """Return the same stage with a mount that the logs do not tell, as in LMS-X."""
+    """Return the same stage with an undetermined mount stiffness, as in LMS-X."""
     truth = life(8000, 0.68)[1]
     return replace(assessment, health=make_health(assessment.history, truth, (0.95, 0.08)))
 

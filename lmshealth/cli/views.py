@@ -611,7 +611,8 @@ def print_life(
     blocks = [tuple(_limit_cells(life, k, before)) for k in range(len(life.limits))]
     same = _same_as_any(blocks)
     title = (
-        f"{life.stage}: remaining life after {life.recorded_at:%Y-%m-%d}, at {_km(life.travel)} km"
+        f"{life.stage}: remaining life after {life.recorded_at:%Y-%m-%d}, at {_km(life.travel)} km "
+        f"(horizon {_km(life.horizon)} km)"
     )
     heads = ("chance %", "km", "hours", "days", "date")
     cells = [cell for block in (blocks if same is None else blocks[:-1]) for cell in block]
@@ -654,7 +655,7 @@ def _limit_cells(
         text = ""
     notes = {
         "already": probability(one.already_past),
-        f"beyond {_km(life.horizon)} km": probability(one.beyond_horizon),
+        "beyond horizon": probability(one.beyond_horizon),
     }
     if before is not None:
         asked, bounds = before

@@ -1,4 +1,4 @@
-"""Commands on tables and descriptions: what they write, what they say, how they fail."""
+"""Commands on tables and descriptions: files, output, errors."""
 
 from __future__ import annotations
 
@@ -92,7 +92,7 @@ def test_without_stage_and_names_modes_are_born(estimates: Path, tmp_path: Path)
 
 
 def test_one_log_is_the_baseline(estimates: Path, tmp_path: Path) -> None:
-    """One epoch is no failure: nothing has drifted, which is said."""
+    """One epoch is no failure; a note explains that there is no drift."""
     single = tmp_path / "single.csv"
     pd.read_csv(estimates).iloc[:2].to_csv(single, index=False)
     result = run(single, "--out", tmp_path / "track.csv")
@@ -115,7 +115,7 @@ def test_bad_tables_are_one_line_and_status_1(estimates: Path, tmp_path: Path) -
     assert not (tmp_path / "track.csv").exists()
 
 
-def test_an_output_that_cannot_be_written_is_told(estimates: Path, tmp_path: Path) -> None:
+def test_an_output_that_cannot_be_written_is_reported(estimates: Path, tmp_path: Path) -> None:
     """A file stands where a folder is needed: status 1 and the reason. Folders are made."""
     result = run(estimates, "--out", estimates / "track.csv")
     assert result.exit_code == 1
@@ -124,7 +124,7 @@ def test_an_output_that_cannot_be_written_is_told(estimates: Path, tmp_path: Pat
     assert (tmp_path / "new" / "track.csv").exists()
 
 
-def test_maintenance_of_other_machines_is_told(estimates: Path, tmp_path: Path) -> None:
+def test_maintenance_of_other_machines_is_noted(estimates: Path, tmp_path: Path) -> None:
     """A name that the table does not have may be a slip of the pen."""
     actions = tmp_path / "maintenance.csv"
     actions.write_text("stage,recorded_at,action\nAX-9,2026-03-02T00:00:00Z,servo\n")
@@ -133,7 +133,7 @@ def test_maintenance_of_other_machines_is_told(estimates: Path, tmp_path: Path) 
     assert "maintenance of AX-9 is not used" in result.stderr
 
 
-def test_fewer_logs_than_a_birth_takes_are_told(estimates: Path, tmp_path: Path) -> None:
+def test_too_few_logs_for_track_initiation_are_noted(estimates: Path, tmp_path: Path) -> None:
     """Two logs without names know no mode yet: status 1 and what is needed."""
     table = pd.read_csv(estimates)
     two = table[table["recorded_at"].isin(table["recorded_at"].unique()[:2])]
@@ -230,7 +230,7 @@ def test_machines_that_share_a_guide_are_inferred_together(drifts: Path, tmp_pat
 
 
 @pytest.mark.slow
-def test_a_machine_without_drifts_is_told_and_the_others_go_on(
+def test_a_machine_without_drifts_is_reported_and_the_others_are_inferred(
     drifts: Path, tmp_path: Path
 ) -> None:
     """Status 3 where one of two machines has nothing to infer from, 1 where none has."""
@@ -257,7 +257,7 @@ def check(*words: object) -> Result:
     return CliRunner().invoke(main, ["stage", *map(str, words)])
 
 
-def test_a_description_in_order_is_told_in_tables_and_sentences(tmp_path: Path) -> None:
+def test_a_valid_description_gives_tables_and_sentences(tmp_path: Path) -> None:
     """Status 0, nothing on standard error; what the X stage cannot see is no failure."""
     make_stage(tmp_path)
     for reference in (tmp_path / "small.toml", "lms-x"):
@@ -289,7 +289,7 @@ def test_as_json_it_has_numbers_and_null(tmp_path: Path, parameters: tuple[str, 
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "said"),
+    ("old", "new", "expected"),
     [
         ("damping_ratio = 0.018", "damping_ratio = 1.8", "line 5: mode[0].damping_ratio: "),
         ("limit =", "limits =", "line 13: parameter[0].limits: unknown key; known are name, prior"),
@@ -297,19 +297,19 @@ def test_as_json_it_has_numbers_and_null(tmp_path: Path, parameters: tuple[str, 
         ("[map]", "[map", "line 26: no TOML: "),
     ],
 )
-def test_a_slip_is_one_line_and_status_1(tmp_path: Path, old: str, new: str, said: str) -> None:
+def test_a_slip_is_one_line_and_status_1(tmp_path: Path, old: str, new: str, expected: str) -> None:
     """The line names file, line, key, and what is needed."""
     make_stage(tmp_path)
     path = tmp_path / "small.toml"
     path.write_text(path.read_text().replace(old, new, 1))
     result = check(path)
     assert (result.exit_code, result.stdout) == (1, "")
-    assert result.stderr.startswith(f"lmshealth: {path}: {said}")
+    assert result.stderr.startswith(f"lmshealth: {path}: {expected}")
     assert result.stderr.count("\n") == 1
 
 
 def test_a_map_that_is_none_and_names_nobody_knows(tmp_path: Path) -> None:
-    """A cell that is no number has its line; unknown names are told which ones there are."""
+    """Invalid cells are reported with their line, unknown names with the known ones."""
     make_stage(tmp_path)
     table = tmp_path / "map.csv"
     table.write_text(table.read_text().replace("\n0.2", "\na", 1))

@@ -95,14 +95,14 @@ def test_every_command_has_help_with_an_example() -> None:
         assert f"\n      lmshealth {name} " in result.stdout
 
 
-def test_the_exit_statuses_are_told() -> None:
+def test_the_help_lists_the_exit_statuses() -> None:
     """The help of the program names its exit statuses; -h is help too."""
     result = call("-h")
     assert result.exit_code == 0
     assert "Exit status" in result.stdout
 
 
-def test_the_version_is_told() -> None:
+def test_the_version_is_printed() -> None:
     """``--version`` prints the version of the package."""
     from lmshealth import __version__
 
@@ -144,7 +144,7 @@ def test_the_version_is_told() -> None:
     ],
 )
 def test_wrong_usage_is_status_2(arguments: tuple[str, ...]) -> None:
-    """What is wrongly asked is said on standard error with status 2."""
+    """Wrong usage is reported on standard error with status 2."""
     result = call(*arguments)
     assert result.exit_code == 2
     assert "Error" in result.stderr
@@ -167,7 +167,7 @@ def test_modes_as_json_have_the_keys_of_the_contract(folder: Path, stage: Path) 
 
 
 def test_modes_of_a_bare_log_have_nulls_and_need_no_metadata(folder: Path) -> None:
-    """A log of samples and a rate alone is analysed; what it does not say is null."""
+    """A log with samples and a sample rate only is analysed; missing metadata are null."""
     result = call("modes", folder / "bare.csv", "--band", 30, 200, "--format", "json")
     assert result.exit_code == 0
     (mode,) = strict(result.stdout)["modes"]
@@ -197,7 +197,7 @@ def test_modes_as_a_table_name_frequency_and_damping(folder: Path, stage: Path) 
     assert "±" in result.stdout
 
 
-def test_a_refused_log_is_told_once_and_without_an_empty_table(folder: Path, stage: Path) -> None:
+def test_a_refused_log_is_printed_once(folder: Path, stage: Path) -> None:
     """On standard error alone; json has it too, for programs."""
     broken = folder / "bad" / "broken.h5"
     result = call("modes", broken, "--stage", stage)
@@ -211,10 +211,10 @@ def test_a_refused_log_is_told_once_and_without_an_empty_table(folder: Path, sta
     assert [Path(row["log"]).name for row in found] == ["broken.h5"]
 
 
-def test_modes_without_a_band_say_what_may_be_missed(folder: Path, stage: Path) -> None:
-    """Only people are told, and only where neither a band nor a description is given."""
-    log, said = folder / "bare.csv", "select them with --band LOW HIGH."
-    assert said in " ".join(call("modes", log).stdout.split())
+def test_modes_without_a_band_print_a_note(folder: Path, stage: Path) -> None:
+    """The note is printed with tables only, and only without a band and a description."""
+    log, expected = folder / "bare.csv", "select them with --band LOW HIGH."
+    assert expected in " ".join(call("modes", log).stdout.split())
     for more in (("--band", 30, 200), ("--format", "csv"), ("--stage", stage)):
         assert "--band" not in call("modes", log, *more).stdout
 
@@ -231,7 +231,7 @@ def test_a_refused_mode_alone_is_still_status_0(folder: Path, stage: Path) -> No
 
 
 def test_some_bad_logs_are_status_3_and_all_bad_are_1(folder: Path, stage: Path) -> None:
-    """One line on standard error per bad log; standard output stays what the format says."""
+    """One line on standard error per bad log; standard output keeps its format."""
     good, bad = folder / "good" / "log-00.h5", folder / "bad" / "broken.h5"
     some = call("modes", good, bad, "--stage", stage, "--format", "json")
     assert some.exit_code == 3
@@ -290,7 +290,7 @@ def strokes(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
 
 @pytest.mark.slow
 def test_modes_of_what_settles(strokes: list[Path]) -> None:
-    """A stop from 400 mm/s tells the modes, with a stage or without; a log without is refused."""
+    """The decay after 400 mm/s identifies the modes, with and without a stage; else refused."""
     arguments = ("--part", "settling", "--format", "json")
     result = call("modes", strokes[-1], strokes[0], "--stage", "lms-y", *arguments)
     assert result.exit_code == 3
@@ -347,7 +347,7 @@ def test_error_of_a_part_and_its_refusals(strokes: list[Path], folder: Path) -> 
 
 
 @pytest.mark.slow
-def test_spectrum_as_json_says_what_grows(strokes: list[Path]) -> None:
+def test_spectrum_as_json_contains_growth(strokes: list[Path]) -> None:
     """Pitch grows with velocity and is read by both accelerometers; 50 Hz is mains."""
     result = call("spectrum", *strokes, "--stage", "lms-y", "--format", "json")
     assert (result.exit_code, result.stderr) == (0, "")
@@ -372,7 +372,7 @@ def test_spectrum_without_a_stage_reads_the_papers_grid(strokes: list[Path]) -> 
 
 
 def test_one_velocity_has_no_slope_and_that_is_no_failure(strokes: list[Path]) -> None:
-    """A single log is read; what grows cannot be told: null, and a dash in the table."""
+    """A single log has no growth: null, and a dash in the table."""
     content = strict(call("spectrum", strokes[0], "--format", "json").stdout)
     assert {row["slope"] for row in content["growth"]} == {None}
     assert {row["grows"] for row in content["growth"]} == {None}
@@ -455,7 +455,7 @@ def test_frf_as_csv_lists_modes_and_as_a_table_both(bench: Path) -> None:
     assert max(len(line) for line in shown.splitlines()) <= 80
 
 
-def test_frf_says_why_a_mode_has_no_name(bench: Path, tmp_path: Path) -> None:
+def test_frf_gives_the_reason_for_an_unnamed_mode(bench: Path, tmp_path: Path) -> None:
     """Where two are looked for at one place both are named, in the form that goes on to track."""
     frequency = MODES[0][0]
     (tmp_path / "two.toml").write_text(
@@ -489,9 +489,9 @@ def test_frf_of_several_logs_is_a_table_for_track(bench: Path, tmp_path: Path) -
         "--stage", tmp_path / "stage.toml", "--format", "csv",
     )  # fmt: skip
     assert (result.exit_code, result.stderr) == (0, "")
-    told = list(csv.DictReader(io.StringIO(result.stdout)))
-    assert [row["mode"] for row in told] == ["low", "high"] * 2
-    assert [row["travel_km"] for row in told] == ["1.0", "1.0", "2.0", "2.0"]
+    rows = list(csv.DictReader(io.StringIO(result.stdout)))
+    assert [row["mode"] for row in rows] == ["low", "high"] * 2
+    assert [row["travel_km"] for row in rows] == ["1.0", "1.0", "2.0", "2.0"]
     (tmp_path / "modes.csv").write_text(result.stdout)
     track = ("--stage", tmp_path / "stage.toml", "--out", tmp_path / "track.csv")
     assert call("track", tmp_path / "modes.csv", *track).exit_code == 0
@@ -536,7 +536,7 @@ def test_frf_that_cannot_be_read_is_status_1_with_one_line(bench: Path) -> None:
 PLAN = ("plan", "--stage", "lms-y", "--detect")
 
 
-def test_plan_as_json_has_what_was_asked_and_one_row_per_length() -> None:
+def test_plan_as_json_has_the_question_and_one_row_per_length() -> None:
     """Two losses, three lengths of which one is too short: nulls there, no NaN."""
     lengths = ("--seconds", 0.2, "--seconds", 10, "--seconds", 60)
     detect = ("guide_preload=0.05", "--detect", "mount_stiffness=0.02")
@@ -573,7 +573,7 @@ def test_plan_as_a_table_follows_power_and_false_alarms() -> None:
 
 
 @pytest.mark.parametrize(
-    ("stage", "detect", "said"),
+    ("stage", "detect", "expected"),
     [
         ("lms-x", "mount_stiffness=0.1", "do not identify mount_stiffness"),
         ("lms-y", "preload=0.1", "there are ['guide_preload', 'mount_stiffness']"),
@@ -582,12 +582,12 @@ def test_plan_as_a_table_follows_power_and_false_alarms() -> None:
     ],
 )
 def test_plan_without_an_answer_is_status_1_with_one_line(
-    stage: str, detect: str, said: str
+    stage: str, detect: str, expected: str
 ) -> None:
     """What cannot be seen, is unknown, or is no fraction."""
     result = call("plan", "--stage", stage, "--detect", detect)
     assert (result.exit_code, result.stdout) == (1, "")
-    assert said in result.stderr
+    assert expected in result.stderr
     assert len(result.stderr.splitlines()) == 1
 
 
@@ -607,7 +607,7 @@ def run(logs: Path, stage: Path | str, out: Path) -> Result:
 
 
 @pytest.mark.slow
-def test_a_clean_run_is_status_0_and_says_where_its_report_is(
+def test_a_clean_run_is_status_0_and_prints_the_path_of_its_report(
     folder: Path, stage: Path, tmp_path: Path
 ) -> None:
     """The count of logs, a line per stage and the front page; no bar where no terminal is."""
@@ -646,14 +646,16 @@ def test_a_run_of_bad_logs_only_is_status_1_with_one_line(
 
 
 def test_a_log_that_no_description_takes_is_refused(stage: Path, tmp_path: Path) -> None:
-    """A machine without a description is ``no-stage``, and says which there are."""
+    """A machine without a description is ``no-stage``; the message lists the descriptions."""
     logs = tmp_path / "logs"
     write_log(logs / "foreign.h5", 1.0, 1, stage="other-Z")
     result = run(logs, stage, tmp_path / "out")
     assert result.exit_code == 1
     (row,) = csv.DictReader((tmp_path / "out" / "refused.csv").read_text().splitlines())
     assert row["reason"] == "no-stage"
-    assert "no description takes stage 'other-Z': [match] stage is '*-A' in small" in row["detail"]
+    assert (
+        "no description matches stage 'other-Z': [match] stage is '*-A' in small" in row["detail"]
+    )
     assert "mend it there, or give by --stage" in row["detail"]
     assert len(result.stderr.splitlines()) == 1
     assert f"1 refused: 1 as no-stage, such as foreign.h5: {row['detail']}; " in result.stderr
@@ -734,7 +736,7 @@ def test_report_writes_the_pages_of_run_without_its_logs(stage: Path, tmp_path: 
 
 
 @pytest.mark.parametrize(
-    ("url", "said"),
+    ("url", "expected"),
     [
         ("sqlite:///{}/nowhere.sqlite", "nowhere.sqlite"),
         ("sqlite:///{}/empty.sqlite", "no results"),
@@ -745,14 +747,14 @@ def test_report_writes_the_pages_of_run_without_its_logs(stage: Path, tmp_path: 
     ],
 )
 def test_a_store_that_has_no_report_is_status_1_with_one_line(
-    tmp_path: Path, url: str, said: str
+    tmp_path: Path, url: str, expected: str
 ) -> None:
     """Each kind is named without its password; no file is made and no page written."""
     (tmp_path / "empty.sqlite").touch()
     (tmp_path / "text.sqlite").write_text("these are my notes\n" * 100)
     result = call("report", "--store", url.format(tmp_path.as_posix()), "--out", tmp_path / "pages")
     assert result.exit_code == 1
-    assert said in result.stderr
+    assert expected in result.stderr
     assert "hunter2" not in result.stderr
     assert len(result.stderr.splitlines()) == 1
     assert sorted(path.name for path in tmp_path.iterdir()) == ["empty.sqlite", "text.sqlite"]
@@ -770,7 +772,7 @@ def test_the_store_may_be_named_by_the_environment(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_a_machine_that_cannot_be_read_is_told_and_the_others_are_written(tmp_path: Path) -> None:
+def test_an_unreadable_machine_is_reported_and_the_others_are_written(tmp_path: Path) -> None:
     """One line names it, with status 3."""
     store = Store(default_url(tmp_path))
     for name in ("M7-Y", "M8-Y"):
@@ -791,7 +793,7 @@ def test_a_machine_that_cannot_be_read_is_told_and_the_others_are_written(tmp_pa
 
 
 @pytest.mark.slow
-def test_pdfs_stand_beside_the_pages_of_run_and_report(
+def test_pdfs_are_written_next_to_the_pages_of_run_and_report(
     folder: Path, stage: Path, tmp_path: Path, needs: Callable[[str], None]
 ) -> None:
     """One per stage, under the name of its page; none without being asked for."""
@@ -809,10 +811,10 @@ def test_pdfs_stand_beside_the_pages_of_run_and_report(
 
 
 @pytest.mark.slow
-def test_without_the_library_pages_are_written_and_the_lack_is_told(
+def test_without_weasyprint_pages_are_written_and_the_error_names_it(
     folder: Path, stage: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Status 1 with one line that says what to install; the work is done and kept."""
+    """Status 1 with one line that names the package; the results are kept."""
     monkeypatch.setitem(sys.modules, "weasyprint", None)
     out = tmp_path / "out"
     result = call(

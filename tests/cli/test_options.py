@@ -18,7 +18,7 @@ def test_a_band_has_its_ends_in_order() -> None:
             checked_band(band)
 
 
-def test_examples_stand_one_per_line_and_are_not_wrapped() -> None:
+def test_examples_are_one_per_line_and_not_wrapped() -> None:
     """The mark that keeps click from wrapping comes first."""
     assert examples("modes a", "modes b").splitlines() == [
         "\b", "Examples:", "    lmshealth modes a", "    lmshealth modes b",
@@ -40,7 +40,7 @@ def test_losses_are_read_once_each() -> None:
 
 @pytest.mark.parametrize("value", ["a", "a=", "a=much", "a=b=0.1", "0.1"])
 def test_what_is_no_name_and_number_is_wrong_usage(value: str) -> None:
-    """The form wanted and what was got are told."""
+    """The error contains the expected form and the input."""
     result = CliRunner().invoke(echo, ["--detect", value])
     assert result.exit_code == 2
     assert "NAME=LOSS" in result.output

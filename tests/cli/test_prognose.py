@@ -1,4 +1,4 @@
-"""From a table of estimates to remaining life: what is written, said and refused."""
+"""The command prognose: tables, output and refusals."""
 
 from __future__ import annotations
 
@@ -128,9 +128,7 @@ def test_two_choices_of_the_day_are_wrong_usage(table: Path, toml: Path, tmp_pat
 
 
 @pytest.mark.usefixtures("quick")
-def test_a_machine_that_cannot_be_foretold_is_left_out(
-    table: Path, toml: Path, tmp_path: Path
-) -> None:
+def test_a_machine_without_odometer_is_left_out(table: Path, toml: Path, tmp_path: Path) -> None:
     """Status 3 where one of two machines has no odometer, 1 and no file where none has."""
     rows, out = pd.read_csv(table), tmp_path / "p.csv"
     rows.loc[rows["stage"] == "AX-2", "travel_km"] = np.nan
@@ -156,7 +154,7 @@ def test_a_description_without_limits_is_one_line_and_status_1(table: Path, tmp_
 
 
 @pytest.mark.usefixtures("quick")
-def test_maintenance_of_other_machines_is_told(table: Path, toml: Path, tmp_path: Path) -> None:
+def test_maintenance_of_other_machines_is_noted(table: Path, toml: Path, tmp_path: Path) -> None:
     """A name that the table does not have may be a slip of the pen."""
     actions = tmp_path / "maintenance.csv"
     actions.write_text("stage,recorded_at,action\nAX-9,2026-03-02T00:00:00Z,servo\n")
@@ -168,7 +166,7 @@ def test_maintenance_of_other_machines_is_told(table: Path, toml: Path, tmp_path
 
 @pytest.mark.parametrize("option", ["--max-risk", "--cost-ratio"])
 @pytest.mark.parametrize("value", ["nan", "inf"])
-def test_what_is_no_finite_number_is_wrong_usage(
+def test_a_number_that_is_not_finite_is_wrong_usage(
     table: Path, toml: Path, tmp_path: Path, option: str, value: str
 ) -> None:
     """Neither NaN nor infinity chooses a day: status 2, the option is named, nothing is written."""
@@ -179,9 +177,7 @@ def test_what_is_no_finite_number_is_wrong_usage(
 
 
 @pytest.mark.usefixtures("quick")
-def test_nothing_is_foretold_for_a_day_that_is_past(
-    table: Path, toml: Path, tmp_path: Path
-) -> None:
+def test_a_past_day_has_no_probability(table: Path, toml: Path, tmp_path: Path) -> None:
     """The day of the last log, or one before it, has a note and no probability anywhere."""
     out = tmp_path / "p.csv"
     for day in ("2026-01-01", START.date().isoformat()):
@@ -193,7 +189,7 @@ def test_nothing_is_foretold_for_a_day_that_is_past(
 
 
 @pytest.mark.parametrize("day", ["soon", "01.03.2027", "2027-13-01"])
-def test_what_is_no_day_is_told_how_a_day_is_written(
+def test_an_invalid_day_is_refused_with_an_example(
     table: Path, toml: Path, tmp_path: Path, day: str
 ) -> None:
     """Status 2, with the form and an example instead of the signs of a format."""

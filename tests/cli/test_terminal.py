@@ -22,10 +22,10 @@ def test_json_has_null_for_what_is_no_number(capsys: pytest.CaptureFixture[str])
 
 
 def test_there_is_no_bar_where_there_is_no_terminal(capsys: pytest.CaptureFixture[str]) -> None:
-    """Progress is told without a trace in a pipe."""
-    with progress_bars() as tell:
-        tell("logs", 1, 2)
-        tell("logs", 2, 2)
+    """Nothing is written to a pipe."""
+    with progress_bars() as report:
+        report("logs", 1, 2)
+        report("logs", 2, 2)
     captured = capsys.readouterr()
     assert captured.err == captured.out == ""
 

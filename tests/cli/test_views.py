@@ -81,7 +81,7 @@ def test_magnitudes_fit_eighty_columns(capsys: pytest.CaptureFixture[str]) -> No
     assert line.count("777") == 7
 
 
-def test_more_velocities_than_fit_are_said_to_be_left_out(
+def test_omitted_velocities_are_counted(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     """Of twelve velocities seven are shown, the slowest and the fastest among them."""
@@ -92,7 +92,7 @@ def test_more_velocities_than_fit_are_said_to_be_left_out(
     assert (head[1], head[-2]) == ("1", "12")
 
 
-def test_what_cannot_be_told_is_a_dash_and_lines_are_marked(
+def test_missing_values_are_dashes_and_lines_are_marked(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     """Unknown velocity is called so, no slope a dash, a line a tilde, listed once."""
@@ -111,7 +111,7 @@ def test_what_cannot_be_told_is_a_dash_and_lines_are_marked(
 def test_an_error_without_harmonics_above_the_floor_shows_a_dash(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    """Missing bandwidth is a dash; two channels are told apart; the table fits 80 columns."""
+    """Missing bandwidth is a dash; two channels are separate; the table fits 80 columns."""
     row = {
         "log": "velocity-0001.000.h5", "channel": "delta_e", "velocity_mm_s": 1.0,
         "duration_s": 4.0, "min_um": -12345.6, "max_um": 0.5, "std_um": 0.04, "mean_um": 0.0,
@@ -133,12 +133,12 @@ def test_an_error_without_harmonics_above_the_floor_shows_a_dash(
 def test_refusals_alone_are_shown(capsys: pytest.CaptureFixture[str]) -> None:
     """Where nothing was read there is no empty table, but why."""
     print_modes([], [refused()])
-    told = capsys.readouterr().out
-    assert "no bytes" in told and told.startswith("No modes found.\nRefused\n")
+    text_ = capsys.readouterr().out
+    assert "no bytes" in text_ and text_.startswith("No modes found.\nRefused\n")
     for show in (print_error, print_magnitudes):
         show([], [], [refused()])
-        told = capsys.readouterr().out
-        assert "no bytes" in told and told.startswith("Refused\n")
+        text_ = capsys.readouterr().out
+        assert "no bytes" in text_ and text_.startswith("Refused\n")
 
 
 def response_line(frequency: float) -> dict[str, object]:
@@ -170,7 +170,7 @@ def test_a_response_is_shown_at_some_of_its_lines(capsys: pytest.CaptureFixture[
     assert "nonlinear" not in out and "correlated" not in out
 
 
-def test_several_responses_are_told_apart(capsys: pytest.CaptureFixture[str]) -> None:
+def test_several_responses_are_separate(capsys: pytest.CaptureFixture[str]) -> None:
     """Each response stands under the name of its log, with its own lines only."""
     lines = [response_line(10.0), response_line(20.0) | {"log": "other"}]
     print_frf([fitted(), fitted(log="other")], lines, [], [])
@@ -181,7 +181,7 @@ def test_several_responses_are_told_apart(capsys: pytest.CaptureFixture[str]) ->
     assert "20" not in first
 
 
-def test_a_response_says_what_its_fit_misses(capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_response_reports_what_its_fit_misses(capsys: pytest.CaptureFixture[str]) -> None:
     """Distortion, errors that neighbours share, and an input that does not repeat."""
     fit = fitted(period_s=NAN, chi_square=300.0, distortion=0.061, colour=0.35)
     print_frf([fit], [response_line(10.0)], [], [])
@@ -195,7 +195,7 @@ def test_a_response_says_what_its_fit_misses(capsys: pytest.CaptureFixture[str])
 def test_a_mode_is_read_in_a_band_and_strongest_somewhere_in_it(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    """The strongest harmonic is told as such, with the band and what placed it, not as the mode."""
+    """The strongest harmonic is printed as such, with its band, not as the mode."""
     band = {"kind": "mode", "low_hz": 131.6, "high_hz": 141.9, "strongest_hz": 133.2}
     found = magnitude("pitch", 10.0, **band, placed_by="identified")
     other = magnitude("pitch", 20.0, **band | {"strongest_hz": 139.1}, placed_by="identified")
@@ -203,13 +203,13 @@ def test_a_mode_is_read_in_a_band_and_strongest_somewhere_in_it(
     print_magnitudes([found, other, sought], [], [])
     out = capsys.readouterr().out
     assert max(map(len, out.splitlines())) <= 80
-    told = " ".join(out.split())
-    assert "Strongest harmonic of pitch at 133 to 139 Hz (band 132 to 142 Hz, around" in told
-    assert "yaw at 140 Hz (band 132 to 142 Hz, as described; mode not identified)." in told
+    text_ = " ".join(out.split())
+    assert "Strongest harmonic of pitch at 133 to 139 Hz (band 132 to 142 Hz, around" in text_
+    assert "yaw at 140 Hz (band 132 to 142 Hz, as described; mode not identified)." in text_
     assert "137 Hz" not in out
 
 
-def test_harmonics_are_listed_and_say_whose_they_are(capsys: pytest.CaptureFixture[str]) -> None:
+def test_harmonics_are_listed_with_their_channel(capsys: pytest.CaptureFixture[str]) -> None:
     """All of one channel, a dozen each of several; each column of the tables has its own name."""
     row = {
         "log": "logs/a.h5", "channel": "delta_e", "velocity_mm_s": 1.0, "duration_s": 4.0,
@@ -270,7 +270,7 @@ def test_the_shipped_descriptions_fit_eighty_columns(
     assert ("! mount_stiffness is not identifiable" in out) == (name == "lms-x")
 
 
-def test_what_is_missing_is_a_dash(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_missing_limits_are_dashes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Three parameters, one without a limit whose map ends above another's limit."""
     low = PRELOAD.replace("below = 0.6", "below = 0.1")
     out = checked(make_stage(tmp_path, (low, MOUNT, FOOT)), capsys)
@@ -290,7 +290,7 @@ def test_without_health_only_modes_are_shown(
     assert "No [[parameter]]" in out
 
 
-def test_plans_are_one_table_each_and_say_why_there_is_none(
+def test_plans_are_one_table_each_with_reasons(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     """A number of logs or what hinders, dashes for what is not known, what stands for what."""
@@ -321,8 +321,8 @@ def test_plans_are_one_table_each_and_say_why_there_is_none(
     assert max(len(line) for line in shown.splitlines()) <= 80
 
 
-def test_changes_are_percent_of_what_was_before(capsys: pytest.CaptureFixture[str]) -> None:
-    """Half the frequency is 50 % less, not ln 2; a damping that nobody told is a dash."""
+def test_changes_are_in_percent(capsys: pytest.CaptureFixture[str]) -> None:
+    """Half the frequency is −50 %, not ln 2; a missing damping ratio is a dash."""
     ln_f = np.log(FREQUENCY[:1]) - np.log(2) * (np.arange(8) >= 4)[:, None]
     history = make_history(ln_f, ln_damping=np.full((8, 1), np.nan), std=1e-3)
     print_track(track(history))
@@ -333,10 +333,10 @@ def test_changes_are_percent_of_what_was_before(capsys: pytest.CaptureFixture[st
     assert "nan" not in shown
 
 
-def test_a_filter_that_is_too_cautious_is_not_said_to_be_widened(
+def test_a_too_cautious_filter_is_not_widened(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    """Logs that vary less than they say ask for no missing cause."""
+    """Logs that vary less than their uncertainty need no missing cause."""
     ln_f = np.tile(np.log(FREQUENCY[:2]), (40, 1))
     ln_zeta = np.tile(np.log(DAMPING[:2]), (40, 1))
     print_track(track(make_history(ln_f, ln_damping=ln_zeta, std=1e-3)))
@@ -349,12 +349,12 @@ def test_a_filter_that_is_too_cautious_is_not_said_to_be_widened(
 
 
 def test_health_that_did_not_converge_shows_no_interval(capsys: pytest.CaptureFixture[str]) -> None:
-    """What was not found is no number; what stands at an edge or fits nothing is told."""
+    """Missing values are no numbers; edges of the map and a bad fit are reported."""
     sure = make_health(np.random.default_rng(1).lognormal(-0.2, 0.02, (40, 2)))
     print_health(sure)
-    told = capsys.readouterr().out
-    assert " to " in told
-    assert "Correlation of guide_preload and mount_stiffness" in told
+    text_ = capsys.readouterr().out
+    assert " to " in text_
+    assert "Correlation of guide_preload and mount_stiffness" in text_
     nothing = np.full((1, 2), np.nan)
     lost = replace(
         sure, converged=np.array([False]), ess_bulk=nothing, ess_tail=nothing, r_hat=nothing,
@@ -362,23 +362,23 @@ def test_health_that_did_not_converge_shows_no_interval(capsys: pytest.CaptureFi
         fit=np.array([1e-9]), at_edge=np.array([[True, False]]),
     )  # fmt: skip
     print_health(lost)
-    told = capsys.readouterr().out
-    assert "nan" not in told
-    assert told.count("not converged") == 2
-    assert max(map(len, told.splitlines())) <= 80
-    assert "p = 1e-09): no health is reported" in " ".join(told.split())
-    assert "guide_preload: the posterior ends at the edge" in told
-    assert "mount_stiffness: the posterior ends" not in told
+    text_ = capsys.readouterr().out
+    assert "nan" not in text_
+    assert text_.count("not converged") == 2
+    assert max(map(len, text_.splitlines())) <= 80
+    assert "p = 1e-09): no health is reported" in " ".join(text_.split())
+    assert "guide_preload: the posterior ends at the edge" in text_
+    assert "mount_stiffness: the posterior ends" not in text_
     odd = replace(
         sure, laplace_shift=np.array([[0.9, 0.0]]), identifiable=np.array([[True, False]])
     )
     print_health(odd)
-    told = " ".join(capsys.readouterr().out.split())
+    text_ = " ".join(capsys.readouterr().out.split())
     assert (
         "guide_preload: the posterior is not normal; Laplace's approximation lies +0.9 σ lower"
-        in told
+        in text_
     )
-    assert "mount_stiffness: not identifiable" in told
+    assert "mount_stiffness: not identifiable" in text_
 
 
 @pytest.fixture
@@ -416,14 +416,14 @@ def test_the_numbers_are_those_of_the_table(printed: Printed) -> None:
     assert "Before the service planned for 2026-04-01: 23 %" in text
 
 
-def test_what_is_past_the_horizon_has_no_number(printed: Printed) -> None:
-    """Censored levels say so; of a life that is past its limit the service is now."""
+def test_quantiles_beyond_the_horizon_have_no_number(printed: Printed) -> None:
+    """Censored levels have no number; for a passed limit the service is now."""
     life = make_prognosis(np.r_[np.full(40, 1e6), np.full(60, np.inf)], np.full(100, 1e4))
     text = shown(life, Decision(), printed)
     line = next(line.split() for line in text.splitlines() if " beyond 10,000 " in line)
     assert line == ["50", "to", "95", "beyond", "10,000", "–", "–", "–"]
-    assert text.count("beyond 10,000 ") == 1 + 1
-    assert "beyond 10,000 km: 60 %" in text and "inf" not in text and "nan" not in text
+    assert text.count("beyond 10,000 ") == 1
+    assert "beyond horizon: 60 %" in text and "inf" not in text and "nan" not in text
     late = make_prognosis(np.r_[np.full(90, -1e6), np.full(10, np.inf)], np.full(100, 1e4))
     text = shown(late, Decision(cost_ratio=9.0), printed)
     assert "Service: now (least cost, where a failure costs 9 times a service)" in text
@@ -435,17 +435,17 @@ def test_what_is_past_the_horizon_has_no_number(printed: Printed) -> None:
     assert "no date" in text and "out of range" in text and "too low for a calendar" in text
 
 
-def test_what_else_is_known_of_a_limit_stands_in_no_row_of_a_level(printed: Printed) -> None:
+def test_probabilities_of_a_limit_have_their_own_lines(printed: Printed) -> None:
     """Each probability that belongs to the limit has a line without numbers of a level."""
     life = make_prognosis(np.linspace(1e5, 1e6, 1001), np.full(1001, 1e4))
     lines = shown(life, Decision(), printed, date(2026, 4, 1)).splitlines()
-    for text in ("already: below 1 %", "beyond 10,000 km: below 1 %", "before 2026-04-01: 23 %"):
+    for text in ("already: below 1 %", "beyond horizon: below 1 %", "before 2026-04-01: 23 %"):
         assert text in [line.strip() for line in lines]
     assert any("chance %" in line for line in lines)
 
 
 @pytest.mark.parametrize("other", [np.inf, 2e6, 1.5e5])
-def test_any_limit_is_not_told_twice(printed: Printed, other: float) -> None:
+def test_any_limit_is_not_printed_twice(printed: Printed, other: float) -> None:
     """Where one limit always comes first, any limit is that one in a line; else it has its rows."""
     remaining = np.column_stack([np.linspace(1e5, 1e6, 1001), np.full(1001, other)])
     both = np.column_stack([remaining, remaining.min(axis=1)])
@@ -463,31 +463,33 @@ def test_any_limit_is_not_told_twice(printed: Printed, other: float) -> None:
     assert (" any limit " in text) is not alone
 
 
-def test_the_risk_of_a_service_is_told_once(printed: Printed) -> None:
-    """Where it is the one that is accepted it is not said again; where it is less it is."""
+def test_the_risk_of_a_service_is_printed_once(printed: Printed) -> None:
+    """The risk is printed only where it differs from the accepted one."""
     life = make_prognosis(np.linspace(1e3, 1e6, 1001), np.full(1001, 1e4))
-    told = "Probability that a limit is reached before that day, at most"
+    text_ = "Probability that a limit is reached before that day, at most"
     risks = [decide(life, Decision(max_risk=risk)).risk for risk in (0.05, 0.0592)]
     for risk, found in zip((0.05, 0.0592), risks, strict=True):
         text = shown(life, Decision(max_risk=risk), printed)
-        assert (told in text) is (f"{100 * found:.0f} %" != f"{100 * risk:.3g} %")
+        assert (text_ in text) is (f"{100 * found:.0f} %" != f"{100 * risk:.3g} %")
     assert f"{100 * risks[0]:.0f} %" == "5 %"
 
 
-def test_laws_and_what_no_mode_tells_are_named(printed: Printed) -> None:
+def test_laws_and_unidentifiable_limits_are_named(printed: Printed) -> None:
     """Laws with their probability, improbable ones left out; a limit nobody sees is no part."""
     life = make_prognosis(np.full(9, 1e6), np.full(9, 1e4))
     assert "Law of" not in shown(life, Decision(), printed)
     weights = (("linear", 0.0, 0.7), ("none", 3e5, 0.295), ("power", 0.0, 0.005))
     laws = tuple(LawWeight("guide_preload", *weight) for weight in weights)
     text = shown(replace(life, laws=laws, unidentifiable=("mount_stiffness",)), Decision(), printed)
-    told = "Law of guide preload: linear 70 %, none from 300 km after the baseline 30 %."
-    assert told in " ".join(text.split()) and "power" not in text
+    text_ = "Law of guide preload: linear 70 %, none from 300 km after the baseline 30 %."
+    assert text_ in " ".join(text.split()) and "power" not in text
     assert "Not included: the limit of mount stiffness" in text
 
 
-def test_a_few_machines_are_told_in_full(make: Callable[..., Assessment], printed: Printed) -> None:
-    """Verdict, gauges, remaining life of every limit and of any, and the service; worst first."""
+def test_a_few_machines_are_printed_in_full(
+    make: Callable[..., Assessment], printed: Printed
+) -> None:
+    """Verdict, gauges, remaining life of every limit and of any, and the service, in order."""
     good, bad = make("A", wear_km=400000, floor=0.98), make("B")
     print_fleet([good, blind(bad), nothing(make("C"))])
     text = printed()
@@ -502,7 +504,7 @@ def test_a_few_machines_are_told_in_full(make: Callable[..., Assessment], printe
 
 
 def test_many_machines_have_a_row_each(make: Callable[..., Assessment], printed: Printed) -> None:
-    """Twenty rows, the worst first, the rest counted; nothing runs off the terminal."""
+    """Twenty rows, the most urgent first, the rest counted; nothing runs off the terminal."""
     good, bad = make("good", wear_km=400000, floor=0.98), make("worst")
     fleet = [replace(good, judgement=replace(good.judgement, stage=f"M{k}")) for k in range(21)]
     print_fleet([*fleet, bad])

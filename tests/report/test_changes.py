@@ -1,4 +1,4 @@
-"""What changed since the last report: sentences, and what they must not compare."""
+"""Sentences about changes since the last report."""
 
 from __future__ import annotations
 
@@ -45,14 +45,14 @@ NOW = replace(
 )
 
 
-def told(now: Reported, before: Reported = THEN) -> list[str]:
+def sentences(now: Reported, before: Reported = THEN) -> list[str]:
     """Give the sentences with all spaces alike."""
     return [sentence.replace("\u202f", " ") for sentence in changes(before, now, PARAMETERS)]
 
 
 def test_every_number_of_two_reports_is_set_side_by_side() -> None:
     """Verdict, health, life, date and logs, each in one sentence."""
-    assert told(NOW) == [
+    assert sentences(NOW) == [
         "Verdict: healthy (93 %) → loss of guide preload (88 %).",
         "Guide preload: 97 % → 91 % (90 %: 89 to 93 %).",
         "Remaining life, median: 5 000 km → 3 000 km (90 %: 1 000 km to beyond 20 000 km).",
@@ -61,9 +61,9 @@ def test_every_number_of_two_reports_is_set_side_by_side() -> None:
     ]
 
 
-def test_nothing_new_is_said_as_such() -> None:
-    """What stays is called so, not repeated as a change."""
-    assert told(THEN) == [
+def test_unchanged_values_are_marked_as_such() -> None:
+    """Unchanged values are not shown as changes."""
+    assert sentences(THEN) == [
         "Verdict: still healthy (93 %).",
         "Guide preload: 97 % → 97 % (90 %: 95 to 99 %).",
         "Remaining life, median: still 5 000 km (90 %: 3 000 km to 9 000 km).",
@@ -72,12 +72,15 @@ def test_nothing_new_is_said_as_such() -> None:
     ]
     coupling = replace(THEN, verdict="mount+coupling_stiffness")
     loss = "Verdict: healthy (93 %) → loss of mount stiffness and coupling stiffness (93 %)."
-    assert told(coupling)[0] == loss
-    assert told(replace(THEN, probability=0.8))[0] == "Verdict: still healthy (80 %), before 93 %."
+    assert sentences(coupling)[0] == loss
+    assert (
+        sentences(replace(THEN, probability=0.8))[0]
+        == "Verdict: still healthy (80 %), before 93 %."
+    )
 
 
 @pytest.mark.parametrize(
-    ("now", "said"),
+    ("now", "state"),
     [
         (replace(NOW, health={}), "Guide preload: 97 % → not determined."),
         (
@@ -103,39 +106,39 @@ def test_nothing_new_is_said_as_such() -> None:
         ),
     ],
 )
-def test_what_is_not_known_on_one_side_is_said(now: Reported, said: str) -> None:
-    """A number that one of the reports lacks is named, never left out or made up."""
-    assert said in told(now)
-    assert "nan" not in " ".join(told(now)) and "inf" not in " ".join(told(now))
+def test_values_missing_in_one_report_are_named(now: Reported, state: str) -> None:
+    """A number that one of the reports lacks is named."""
+    assert state in sentences(now)
+    assert "nan" not in " ".join(sentences(now)) and "inf" not in " ".join(sentences(now))
 
 
 def test_what_keeps_reports_from_being_compared_comes_first() -> None:
-    """Another description or another baseline is said before any number."""
+    """A changed description or baseline comes before any number."""
     other = replace(NOW, description="d2", baseline_at=datetime(2026, 7, 1, tzinfo=UTC))
-    description, baseline, *rest = told(other)
+    description, baseline, *rest = sentences(other)
     assert "stage description has changed" in description
     assert "from 2026-01-01 to 2026-07-01" in baseline
-    assert rest == told(NOW)
+    assert rest == sentences(NOW)
 
 
-def test_a_report_is_told_by_the_numbers_of_its_page(tmp_path: Path) -> None:
+def test_a_report_keeps_the_numbers_of_its_page(tmp_path: Path) -> None:
     """Quantiles, date and counts are those of the assessment, and come back from bytes."""
     assessment = worn(tmp_path)
     assert assessment.health is not None and assessment.prognosis is not None
-    said = reported(assessment)
+    state = reported(assessment)
     expected = assessment.health.quantile(np.array([0.05, 0.5, 0.95]))[:, -1]
-    assert list(said.health) == ["guide_preload", "mount_stiffness"]
-    np.testing.assert_array_equal(np.array(list(said.health.values())).T, expected)
-    assert said.service_by == assessment.service().by
-    assert (said.n_logs, said.travel) == (40, 1.72e6)
-    assert said.remaining is not None
-    share = np.mean(assessment.prognosis.remaining[:, -1] <= said.remaining[1])
+    assert list(state.health) == ["guide_preload", "mount_stiffness"]
+    np.testing.assert_array_equal(np.array(list(state.health.values())).T, expected)
+    assert state.service_by == assessment.service().by
+    assert (state.n_logs, state.travel) == (40, 1.72e6)
+    assert state.remaining is not None
+    share = np.mean(assessment.prognosis.remaining[:, -1] <= state.remaining[1])
     assert share == pytest.approx(0.5, abs=1e-3)
-    assert unpack(pack(said), Reported) == said
+    assert unpack(pack(state), Reported) == state
 
 
-def test_a_parameter_that_the_logs_do_not_tell_is_not_kept(tmp_path: Path) -> None:
-    """A value that a page does not show is not compared with later."""
+def test_an_undetermined_parameter_is_not_kept(tmp_path: Path) -> None:
+    """A value that a page does not show is not compared later."""
     assessment = worn(tmp_path)
     assert assessment.health is not None
     blind = replace(assessment.health, informed=assessment.health.informed * [1.0, 0.1])
@@ -143,11 +146,15 @@ def test_a_parameter_that_the_logs_do_not_tell_is_not_kept(tmp_path: Path) -> No
 
 
 def test_a_report_without_results_or_logs_has_gaps_not_failures(tmp_path: Path) -> None:
-    """Before anything is known, only the verdict is kept; without logs that too."""
+    """Without results only the verdict is kept; also without logs."""
     bare = nothing(worn(tmp_path))
-    said = reported(bare)
-    assert (said.health, said.remaining, said.service_by) == ({}, None, None)
-    assert told(said, said) == [
+    state = reported(bare)
+    assert (state.health, state.remaining, state.service_by) == (
+        {},
+        None,
+        None,
+    )
+    assert sentences(state, state) == [
         "Verdict: still not enough data for a verdict.",
         "Same number of logs.",
     ]
@@ -163,6 +170,6 @@ def test_a_report_without_results_or_logs_has_gaps_not_failures(tmp_path: Path) 
         cov=history.cov[:0],
         loop_error=history.loop_error[:0],
     )
-    said = reported(replace(bare, history=empty))
-    assert said.n_logs == 0 and np.isnan(said.travel)
-    assert said.baseline_at == bare.judgement.recorded_at
+    state = reported(replace(bare, history=empty))
+    assert state.n_logs == 0 and np.isnan(state.travel)
+    assert state.baseline_at == bare.judgement.recorded_at

@@ -19,7 +19,6 @@ from lmshealth.health.results import Health
 from lmshealth.prognosis.maintenance_decision import decide
 from lmshealth.prognosis.results import Prognosis
 from lmshealth.report import figures as plots
-from lmshealth.report import figures as trackplots
 from lmshealth.signal.waterfall import Waterfall
 from lmshealth.stage.description import Decision
 from lmshealth.tracking.covariate_effects import CovariateEffect
@@ -94,7 +93,7 @@ def test_import_leaves_matplotlib_alone() -> None:
 
 def test_frequencies_in_hz_over_km(ax: Axes, history: History, track: Track) -> None:
     """Logs, filtered line and baseline stand at the right numbers, missing logs are left out."""
-    assert trackplots.plot_frequencies(ax, history, track, "roll") is ax
+    assert plots.plot_frequencies(ax, history, track, "roll") is ax
     points = np.asarray(ax.lines[0].get_xydata())
     assert len(points) == EPOCHS - 1
     np.testing.assert_allclose(points[-1, 0], history.travel[-1] / 1000)
@@ -107,22 +106,22 @@ def test_frequencies_in_hz_over_km(ax: Axes, history: History, track: Track) -> 
 
 def test_frequency_without_track(ax: Axes, history: History) -> None:
     """Without a track the logs alone are shown."""
-    trackplots.plot_frequencies(ax, history, None, "yaw")
+    plots.plot_frequencies(ax, history, None, "yaw")
     assert labels(ax) == ["each log, ±2σ"]
 
 
-def test_quiet_mode_is_no_drama(ax: Axes, history: History) -> None:
+def test_a_constant_mode_is_shown_on_a_wide_scale(ax: Axes, history: History) -> None:
     """A mode that hardly moves is shown on a scale of at least 1 %."""
     flat = np.where(np.isnan(history.ln_frequency), np.nan, np.log(100.0))
     still = replace(history, ln_frequency=flat)
-    trackplots.plot_frequencies(ax, replace(still, cov=1e-12 * history.cov), None, "yaw")
+    plots.plot_frequencies(ax, replace(still, cov=1e-12 * history.cov), None, "yaw")
     low, high = ax.get_ylim()
     assert high - low >= 0.99
 
 
 def test_damping_in_percent_from_zero(ax: Axes, history: History, track: Track) -> None:
     """Damping is in percent and its axis starts at zero."""
-    trackplots.plot_damping(ax, history, track, "pitch")
+    plots.plot_damping(ax, history, track, "pitch")
     assert ax.get_ylim()[0] == 0
     assert ax.get_ylim()[1] < 10
     assert "%" in ax.get_ylabel()
@@ -161,17 +160,15 @@ def test_health_marks_limit_and_failures(ax: Axes, health: Health) -> None:
     assert high > 100
 
 
-def test_life_hides_epochs_that_are_not_told(
-    ax: Axes, history: History, prognosis: Prognosis
-) -> None:
-    """Epochs that are mostly assumption do not stand beside the law."""
+def test_life_hides_undetermined_epochs(ax: Axes, history: History, prognosis: Prognosis) -> None:
+    """Epochs that are mostly prior are not drawn with the law."""
     health = make_health(history, life(8000, 0.68)[1], (0.9, 0.1))
     plots.plot_life(ax, prognosis, "mount_stiffness", health=health)
     assert "epochs, 90 %" not in labels(ax)
 
 
-def test_health_that_is_not_told_does_not_look_measured(ax: Axes, history: History) -> None:
-    """A parameter the data do not tell is hatched and named as an assumption."""
+def test_undetermined_health_is_drawn_as_prior(ax: Axes, history: History) -> None:
+    """An undetermined parameter is hatched and labelled as prior."""
     plots.plot_health(
         ax, make_health(history, life(8000, 0.68)[1], (0.9, 0.1)), PARAMETERS[1], None
     )
@@ -224,7 +221,7 @@ def test_nis_band_is_chi_square(ax: Axes, track: Track) -> None:
 
     nis = track.nis.copy()
     nis[3], nis[4] = 60.0, np.nan
-    trackplots.plot_nis(ax, replace(track, nis=nis))
+    plots.plot_nis(ax, replace(track, nis=nis))
     seen = np.isfinite(nis)
     cdf = chi2.cdf(nis[seen], track.nis_dof[seen])
     assert data(ax, "outside")[0].size == np.sum((cdf < 0.025) | (cdf > 0.975))
@@ -234,7 +231,7 @@ def test_nis_band_is_chi_square(ax: Axes, track: Track) -> None:
 def test_waterfall_shows_every_log_in_its_column(ax: Axes, history: History, track: Track) -> None:
     """Colours are the levels, columns hold their logs, and lines do not decide the colours."""
     waterfall = make_waterfall(history)
-    assert trackplots.plot_waterfall(ax, waterfall, history, track) is ax
+    assert plots.plot_waterfall(ax, waterfall, history, track) is ax
     mesh = next(c for c in ax.collections if isinstance(c, QuadMesh))
     shown = np.ma.filled(mesh.get_array(), np.nan)[:, ::2].T
     np.testing.assert_array_equal(shown, waterfall.level)
@@ -254,7 +251,7 @@ def test_waterfall_moves_the_modes_to_where_logs_saw_them(
 ) -> None:
     """What covariates did is added to the tracked frequencies."""
     moved = np.linspace(0, 0.02, EPOCHS)[:, None] * np.ones(3)
-    trackplots.plot_waterfall(ax, make_waterfall(history), history, track, moved=moved)
+    plots.plot_waterfall(ax, make_waterfall(history), history, track, moved=moved)
     np.testing.assert_allclose(
         data(ax, "tracked modes, 95 % band")[1], np.exp(track.ln_frequency[:, 0] + moved[:, 0])
     )
@@ -265,7 +262,7 @@ def test_waterfall_leaves_a_gap_where_logs_are_missing(ax: Axes, history: Histor
     travel = history.travel.copy()
     travel[20:] += 10 * (travel[1] - travel[0])
     apart = replace(history, travel=travel)
-    trackplots.plot_waterfall(ax, make_waterfall(apart), apart)
+    plots.plot_waterfall(ax, make_waterfall(apart), apart)
     mesh = next(c for c in ax.collections if isinstance(c, QuadMesh))
     left, right = mesh.get_coordinates()[0, :, 0].reshape(-1, 2).T
     gaps = left[1:] - right[:-1]
@@ -284,7 +281,7 @@ def test_waterfall_of_one_log_or_of_a_machine_at_rest(
     few = replace(few, travel=np.full(n, few.travel[0]))
     waterfall = make_waterfall(history)
     own = Waterfall(waterfall.edges, waterfall.level[:n], waterfall.lines[:n])
-    trackplots.plot_waterfall(ax, own, few)
+    plots.plot_waterfall(ax, own, few)
     low, high = ax.get_xlim()
     assert low < few.travel[0] / 1000 < high
 
@@ -295,7 +292,7 @@ def test_waterfall_keeps_its_width_beside_long_names(history: History) -> None:
     long = replace(waterfall.lines[0][0], kind="a disturbance of unknown origin")
     waterfall = replace(waterfall, lines=((long,), *waterfall.lines[1:]))
     figure = Figure(figsize=(4.8, 3.6), layout="constrained")
-    ax = trackplots.plot_waterfall(figure.add_subplot(), waterfall, history)
+    ax = plots.plot_waterfall(figure.add_subplot(), waterfall, history)
     figure.draw_without_rendering()
     assert ax.get_position().width > 0.6
 
@@ -303,7 +300,7 @@ def test_waterfall_keeps_its_width_beside_long_names(history: History) -> None:
 def test_wide_waterfall_is_logarithmic(ax: Axes, history: History) -> None:
     """A band over more than two octaves has a logarithmic axis."""
     waterfall = replace(make_waterfall(history), edges=np.geomspace(20.0, 2000.0, 81))
-    trackplots.plot_waterfall(ax, waterfall, history)
+    plots.plot_waterfall(ax, waterfall, history)
     assert ax.get_yscale() == "log"
 
 
@@ -316,7 +313,7 @@ def test_influence_shows_before_and_after(ax: Axes, history: History) -> None:
     one = CovariateEffect(
         "roll", "temperature_c", 21.0, (effect,), np.arange(EPOCHS), np.array(values), measured
     )
-    assert trackplots.plot_influence(ax, one, history) is ax
+    assert plots.plot_influence(ax, one, history) is ax
     np.testing.assert_allclose(data(ax, "as measured"), [values, 100 * measured])
     left = 100 * (measured + 1.2e-3 * (values - 21))
     np.testing.assert_allclose(data(ax, "corrected"), [values, left])
@@ -328,75 +325,75 @@ def test_influence_shows_before_and_after(ax: Axes, history: History) -> None:
     )
     assert ax.get_xlabel() == "temperature in °C"
     bent = replace(one, effects=(effect, replace(effect, covariate="temperature_c^2")))
-    plain = trackplots.plot_influence(Figure().add_subplot(), bent, history)
+    plain = plots.plot_influence(Figure().add_subplot(), bent, history)
     assert not [c for c in plain.collections if c.get_alpha() == 0.18]
 
 
 def titles(text: str) -> list[str]:
-    """Give what a picture tells where the pointer rests."""
+    """Return the texts of the hints of a figure."""
     tree = ElementTree.fromstring(text)
     return [element.text or "" for element in tree.iter("{http://www.w3.org/2000/svg}title")]
 
 
-def test_hints_tell_the_values_of_points(history: History, track: Track) -> None:
+def test_hints_contain_the_values_of_points(history: History, track: Track) -> None:
     """Every log that shows the mode has a title with its name and value on what feels a pointer."""
-    text = plots.svg(lambda ax: trackplots.plot_frequencies(ax, history, track, "roll"), salt="a")
-    told = titles(text)
+    text = plots.svg(lambda ax: plots.plot_frequencies(ax, history, track, "roll"), salt="a")
+    found = titles(text)
     seen = np.flatnonzero(np.isfinite(history.ln_frequency[:, 0]))
-    assert len(told) == seen.size
-    for one, k in zip(told, seen, strict=True):
+    assert len(found) == seen.size
+    for one, k in zip(found, seen, strict=True):
         assert one.startswith(f"{history.logs[k]}\n")
         assert f"{np.exp(history.ln_frequency[k, 0]):.2f} ± " in one
     assert "<a " not in text and text.count("</title>\n<use") + text.count("</title>\n<g") == len(
-        told
+        found
     )
 
 
 def test_hints_of_dense_pictures_are_thinned() -> None:
-    """A thousand points have no more hints than a pointer can tell apart."""
+    """A thousand points have at most `constants.HINTS` hints."""
     x = np.arange(1000.0)
     text = plots.svg(
         lambda ax: plots.hints(ax, x, x, [f"point {k}" for k in range(1000)]), salt="a"
     )
-    told = titles(text)
-    assert told[:2] == ["point 0", "point 4"] and len(told) == 250
+    found = titles(text)
+    assert found[:2] == ["point 0", "point 4"] and len(found) == 250
 
 
 @pytest.mark.slow
 def test_hints_of_other_pictures(
     history: History, track: Track, health: Health, prognosis: Prognosis
 ) -> None:
-    """Health, passage, survival, NIS, columns and lines tell their numbers."""
-    told = titles(
+    """Health, passage, survival, NIS, columns and lines have hints with their values."""
+    found = titles(
         plots.svg(lambda ax: plots.plot_health(ax, health, "guide_preload", 0.6), salt="a")
     )
     middle = 100 * np.median(health.samples[-1, :, 0])
-    assert len(told) == EPOCHS and f"guide preload {middle:.1f}" in told[-1]
-    told = titles(plots.svg(lambda ax: plots.plot_life(ax, prognosis, "guide_preload"), salt="a"))
-    assert [one.split(":")[0] for one in told] == ["Early (5 %)", "Median", "Late (95 %)"]
-    told = titles(plots.svg(lambda ax: plots.plot_survival(ax, prognosis), salt="a"))
-    assert told[0] == "after 0\u202fkm: 100\u202f%" and len(told) == 25
-    told = titles(plots.svg(lambda ax: trackplots.plot_nis(ax, track), salt="a"))
-    assert len(told) == EPOCHS and f"NIS {track.nis[-1]:.1f}" in told[-1]
+    assert len(found) == EPOCHS and f"guide preload {middle:.1f}" in found[-1]
+    found = titles(plots.svg(lambda ax: plots.plot_life(ax, prognosis, "guide_preload"), salt="a"))
+    assert [one.split(":")[0] for one in found] == ["Early (5 %)", "Median", "Late (95 %)"]
+    found = titles(plots.svg(lambda ax: plots.plot_survival(ax, prognosis), salt="a"))
+    assert found[0] == "after 0\u202fkm: 100\u202f%" and len(found) == 25
+    found = titles(plots.svg(lambda ax: plots.plot_nis(ax, track), salt="a"))
+    assert len(found) == EPOCHS and f"NIS {track.nis[-1]:.1f}" in found[-1]
     waterfall = make_waterfall(history)
-    told = titles(plots.svg(lambda ax: trackplots.plot_waterfall(ax, waterfall, history), salt="a"))
-    assert len(told) == 2 * EPOCHS
-    assert f"yaw {np.exp(history.ln_frequency[0, 2]):.2f}" in told[0]
-    assert "mains line at 150.00\u202fHz, 0.002\u202fm/s² in acc_feed" in told[EPOCHS]
+    found = titles(plots.svg(lambda ax: plots.plot_waterfall(ax, waterfall, history), salt="a"))
+    assert len(found) == 2 * EPOCHS
+    assert f"yaw {np.exp(history.ln_frequency[0, 2]):.2f}" in found[0]
+    assert "mains line at 150.00\u202fHz, 0.002\u202fm/s² in acc_feed" in found[EPOCHS]
 
 
-def test_health_that_is_not_told_gives_no_values(history: History) -> None:
-    """What is mostly assumption shows no number under the pointer either."""
+def test_undetermined_health_has_no_hints(history: History) -> None:
+    """A parameter that is mostly prior has no number under the pointer."""
     health = make_health(history, life(8000, 0.68)[1], (0.9, 0.1))
     text = plots.svg(lambda ax: plots.plot_health(ax, health, PARAMETERS[1], None), salt="a")
     assert titles(text) == []
 
 
-def test_svg_repeats_and_stands_alone(history: History, track: Track) -> None:
+def test_svg_is_reproducible_and_self_contained(history: History, track: Track) -> None:
     """Same input, same bytes; other salt, no identifier in common; nothing from outside."""
 
     def draw(ax: Axes) -> Axes:
-        return trackplots.plot_frequencies(ax, history, track, "roll")
+        return plots.plot_frequencies(ax, history, track, "roll")
 
     one, two = plots.svg(draw, salt="a"), plots.svg(draw, salt="a")
     assert one == two
@@ -423,6 +420,6 @@ def test_hints_survive_hostile_names(history: History) -> None:
     """Markup, quotes, formula signs and ends of links in a log's name are text in its title."""
     evil = "'\"></a><script>alert(1)</script>$x_2$ url(#a) &amp;"
     strange = replace(history, logs=(evil, *history.logs[1:]))
-    text = plots.svg(lambda ax: trackplots.plot_damping(ax, strange, None, "roll"), salt="x")
+    text = plots.svg(lambda ax: plots.plot_damping(ax, strange, None, "roll"), salt="x")
     assert "<script" not in text
     assert titles(text)[0].replace("#x-", "#").startswith(evil)

@@ -40,7 +40,7 @@ def test_rows_go_to_other_processes_and_into_a_store(make: Callable[..., Assessm
             assert list(leaves(again)) == list(leaves(row))
 
 
-def test_rows_are_light(make: Callable[..., Assessment]) -> None:
+def test_summaries_are_small(make: Callable[..., Assessment]) -> None:
     """A row takes less than a hundredth of what its assessment takes."""
     assessment = make()
     row = row_of(assessment)
@@ -149,7 +149,7 @@ def seen_rows(page: Any) -> list[str]:
 
 @pytest.mark.slow
 def test_a_stage_is_found_by_its_name(browser: Any, fleet: Path) -> None:
-    """Parts of name and verdict in any order find it, accents or not; the count is told aloud."""
+    """Parts of name and verdict match in any order and without accents; the count is announced."""
     page, seen = watch(browser, fleet)
     status = page.locator("[role=status]")
     assert status.inner_text() == f"{N} of {N} stages, most urgent first"
@@ -220,7 +220,7 @@ def test_columns_sort(browser: Any, fleet: Path) -> None:
 
 
 @pytest.mark.slow
-def test_what_was_asked_for_is_there_on_the_way_back(browser: Any, fleet: Path) -> None:
+def test_filters_are_restored_on_return(browser: Any, fleet: Path) -> None:
     """After a look at a page of a stage the list is as it was left."""
     page, _ = watch(browser, fleet)
     page.get_by_label("Find").fill("fuhrung")
@@ -242,7 +242,7 @@ def test_the_list_is_complete_without_script(browser: Any, fleet: Path) -> None:
 
 
 @pytest.mark.slow
-def test_the_header_stays_in_sight_and_a_phone_is_wide_enough(browser: Any, fleet: Path) -> None:
+def test_the_header_stays_visible_and_the_page_fits_a_phone(browser: Any, fleet: Path) -> None:
     """Far down the columns have names; on a phone nothing goes sideways, order is chosen."""
     page, _ = watch(browser, fleet)
     page.locator("tbody tr").last.scroll_into_view_if_needed()

@@ -1,4 +1,4 @@
-"""Pages: what they say about healthy, worn, unknown and hostile stages, and what they never do."""
+"""Pages of healthy, worn, unknown and hostile stages."""
 
 from __future__ import annotations
 
@@ -61,8 +61,8 @@ def one(folder: Path, assessment: Assessment) -> Page:
 
 
 @pytest.mark.usefixtures("blank")
-def test_worn_stage_says_it_first(make: Maker, tmp_path: Path) -> None:
-    """Verdict, probability, reason, date and remaining life stand on the first screen."""
+def test_the_first_screen_of_a_worn_stage(make: Maker, tmp_path: Path) -> None:
+    """Verdict, probability, reason, date and remaining life are on the first screen."""
     assessment = make()
     by = assessment.service().by
     assert by is not None
@@ -80,13 +80,13 @@ def test_worn_stage_says_it_first(make: Maker, tmp_path: Path) -> None:
 def test_what_is_new_follows_the_first_screen(make: Maker, tmp_path: Path) -> None:
     """The earlier report of this stage is compared with, another stage's is not."""
     before = replace(reported(make(wear_km=400000, floor=0.98)), n_logs=28)
-    for identity, said in (
+    for identity, expected in (
         ("M7-Y", "Verdict: healthy (97 %) → loss of guide preload and mount stiffness (93 %)."),
         ("M8-Y", "This is the first report on this stage"),
     ):
         page = Page(write_report(tmp_path, [make()], (), earlier={identity: before})[0])
         text = words(page)
-        place = text.index(said)
+        place = text.index(expected)
         assert text.index("Notes") < place < text.index("Tracked modes")
         assert ("on 28 logs up to" in text) == (identity == "M7-Y")
 
@@ -105,8 +105,8 @@ def test_numbers_are_those_of_the_results(make: Maker, tmp_path: Path) -> None:
 
 
 @pytest.mark.usefixtures("blank")
-def test_parameter_that_is_not_told_shows_no_number(make: Maker, tmp_path: Path) -> None:
-    """A parameter the logs do not tell says so, in the gauge, the table and the index."""
+def test_an_undetermined_parameter_shows_no_number(make: Maker, tmp_path: Path) -> None:
+    """An undetermined parameter is named as such on the bar, in the table and on the fleet page."""
     page = one(tmp_path, blind(make()))
     text = words(page)
     gauge = text[text.index("Mount stiffness") : text.index("Service")]
@@ -117,8 +117,8 @@ def test_parameter_that_is_not_told_shows_no_number(make: Maker, tmp_path: Path)
 
 
 @pytest.mark.usefixtures("blank")
-def test_nothing_known_is_said_in_words(make: Maker, tmp_path: Path) -> None:
-    """A page without track, health and prognosis says why for each."""
+def test_a_page_without_results_gives_the_reasons(make: Maker, tmp_path: Path) -> None:
+    """A page without track, health and prognosis gives the reason for each."""
     text = words(one(tmp_path, nothing(make())))
     assert "Not enough data for a verdict" in text
     assert "No log contains an estimate of a tracked mode" in text
@@ -175,7 +175,7 @@ def test_limit_already_passed_means_now(make: Maker, tmp_path: Path) -> None:
 
 
 @pytest.mark.usefixtures("blank")
-def test_a_day_of_least_costs_says_so(make: Maker, tmp_path: Path) -> None:
+def test_a_day_of_least_cost_is_named_as_such(make: Maker, tmp_path: Path) -> None:
     """With a ratio of costs page, table and picture have the day of least costs and its risk."""
     assessment = make()
     by_costs = Decision(cost_ratio=3.0)
@@ -202,7 +202,7 @@ def endless(assessment: Assessment) -> Prognosis:
 
 @pytest.mark.slow
 def test_one_parameter_without_limit(make: Maker, tmp_path: Path) -> None:
-    """A stage with one parameter and no limit has a density, and says why it has no life."""
+    """A stage with one parameter and no limit has a density, and the reason for no life."""
     (tmp_path / "one").mkdir()
     stage = write_stage(tmp_path / "one", limited=False, parameters=1)
     assessment = make()
@@ -222,8 +222,8 @@ def test_one_parameter_without_limit(make: Maker, tmp_path: Path) -> None:
 
 
 @pytest.mark.usefixtures("blank")
-def test_law_that_does_not_fit_is_told(make: Maker, tmp_path: Path) -> None:
-    """A bad fit, a wide walk and a sampler without convergence are said in words."""
+def test_a_bad_fit_of_the_laws_is_reported(make: Maker, tmp_path: Path) -> None:
+    """A bad fit, a large random walk and missing convergence are reported in words."""
     assessment = make()
     assert assessment.prognosis is not None and assessment.health is not None
     bad = replace(assessment.prognosis, chi_square=400.0, walk=0.04)
@@ -264,7 +264,7 @@ def test_files_never_collide(make: Maker, tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_same_input_same_bytes(make: Maker, tmp_path: Path) -> None:
-    """Pages repeat to the byte in any order of the stages, and tell a time only if given."""
+    """Pages are reproducible to the byte in any order, and print a time only if given."""
     stages = [make(), nothing(make("M8-Y"))]
     first = write_report(tmp_path / "a", stages, ())
     second = write_report(tmp_path / "b", stages[::-1], ())
@@ -313,14 +313,14 @@ def test_index_is_sorted_by_risk(make: Maker, tmp_path: Path) -> None:
 
 
 def test_empty_fleet(tmp_path: Path) -> None:
-    """No stage at all still gives an index that says so."""
+    """Without any stage the fleet page is written, with a sentence."""
     paths = write_report(tmp_path / "out", [], ())
     assert [path.name for path in paths] == ["index.html"]
     assert "No log belongs to a stage" in Page(paths[0]).text
 
 
 @pytest.mark.slow
-def test_page_stands_alone_and_is_well_formed(make: Maker, tmp_path: Path) -> None:
+def test_a_page_is_self_contained_and_well_formed(make: Maker, tmp_path: Path) -> None:
     """Nothing is loaded from outside, identifiers are unique, headings descend by one."""
     for path in write_report(tmp_path / "out", [make()], ()):
         page = Page(path)
@@ -336,8 +336,8 @@ def test_page_stands_alone_and_is_well_formed(make: Maker, tmp_path: Path) -> No
 
 
 @pytest.mark.usefixtures("blank")
-def test_what_was_taken_out_is_told(make: Maker, tmp_path: Path) -> None:
-    """Range, reference, coefficient and scatter of a covariate stand there; so does what is not."""
+def test_corrected_covariates_are_reported(make: Maker, tmp_path: Path) -> None:
+    """The page contains range, reference, coefficient and scatter of a covariate."""
     assessment = make()
     found = find_covariate_effects(assessment.history, assessment.track, assessment.stage)  # type: ignore[arg-type]
     text = words(one(tmp_path, assessment))
@@ -353,8 +353,8 @@ def test_what_was_taken_out_is_told(make: Maker, tmp_path: Path) -> None:
 
 
 @pytest.mark.usefixtures("blank")
-def test_what_was_not_taken_out_is_told(make: Maker, tmp_path: Path) -> None:
-    """Unknown covariates, such as never left their reference, and such as nobody named are told."""
+def test_uncorrected_covariates_are_reported(make: Maker, tmp_path: Path) -> None:
+    """Missing, constant and undescribed covariates are reported."""
     assessment = make()
     n = len(assessment.history.logs)
 
@@ -370,7 +370,7 @@ def test_what_was_not_taken_out_is_told(make: Maker, tmp_path: Path) -> None:
 
 @pytest.mark.usefixtures("blank")
 def test_use_of_the_logs_is_counted(make: Maker, tmp_path: Path) -> None:
-    """Of each mode the page counts logs, estimates that are not believed, and reasons."""
+    """The page counts logs, outliers and reasons per mode."""
     assessment = make()
     assert assessment.track is not None
     track = replace(assessment.track, outliers=((5, "pitch"), (9, "pitch")))

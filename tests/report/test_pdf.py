@@ -1,4 +1,4 @@
-"""PDFs: what is on them, and what is said where they cannot be made."""
+"""PDFs: content, reproducibility, and errors."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def colours(content: bytes) -> set[tuple[float, ...]]:
 
 
 @pytest.mark.slow
-def test_a_pdf_stands_beside_its_page_with_its_pictures_in_colour(page: Path) -> None:
+def test_a_pdf_is_written_next_to_its_page_with_coloured_figures(page: Path) -> None:
     """Red and green of the pictures are there: names of colours are not looked up inside them."""
     before = page.read_bytes()
     assert write_pdfs([page]) == [page.with_suffix(".pdf")]
@@ -97,7 +97,7 @@ def test_nothing_is_loaded_from_outside(tmp_path: Path) -> None:
 
 
 def test_a_missing_library_is_named(small: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The error says what to install, and no PDF is begun."""
+    """The error names the package to install, and no PDF is written."""
     monkeypatch.setitem(sys.modules, "weasyprint", None)
     with pytest.raises(PdfError, match=r'pip install "lmshealth\[pdf\]"'):
         write_pdfs([small])
@@ -107,7 +107,7 @@ def test_a_missing_library_is_named(small: Path, monkeypatch: pytest.MonkeyPatch
 def test_missing_libraries_of_the_library_are_named(
     small: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Where Pango is not installed the error says which Debian packages have it."""
+    """Without Pango the error names its Debian packages."""
     (tmp_path / "weasyprint.py").write_text("raise OSError('cannot load library pango')")
     monkeypatch.delitem(sys.modules, "weasyprint", raising=False)
     monkeypatch.syspath_prepend(tmp_path)
@@ -119,7 +119,7 @@ def test_missing_libraries_of_the_library_are_named(
 def test_a_page_that_cannot_be_laid_out_is_named(
     small: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Whatever the library stumbles over is told with the name of the page."""
+    """Any error of the library is reported with the name of the page."""
     import weasyprint
 
     def stumble(self: object) -> bytes:

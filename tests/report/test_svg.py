@@ -59,7 +59,7 @@ def test_lean_keeps_what_is_seen() -> None:
     )
 
 
-def test_markers_in_a_row_say_once_how_they_look() -> None:
+def test_successive_markers_share_their_style() -> None:
     """A run of equal markers shares its style, one that looks otherwise has its own."""
     red, blue = 'style="fill:red"', 'style="fill:blue"'
     rows = [f'<use href="#m" x="{k}" {red if k < 3 else blue}/>\n' for k in range(4)]

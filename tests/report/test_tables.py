@@ -87,7 +87,7 @@ def prognosis(remaining: np.ndarray, usage: float = 10_000.0) -> Prognosis:
     )
 
 
-def assessment(stage: Stage, foretold: Prognosis | None) -> Assessment:
+def assessment(stage: Stage, prognosis_: Prognosis | None) -> Assessment:
     """Give an assessment of two logs."""
     two = (WHEN, WHEN.replace(month=4))
     travel = np.array([1e5, 5e5])
@@ -110,7 +110,7 @@ def assessment(stage: Stage, foretold: Prognosis | None) -> Assessment:
         converged=np.array([True, False]), informed=np.full((2, 1), 0.9), stage="test-A",
     )  # fmt: skip
     verdict = Verdict("test-A", two[-1], "healthy", 0.8, "")
-    return Assessment(stage, history, ("d", "e"), track, health, foretold, verdict, (), (), 0)
+    return Assessment(stage, history, ("d", "e"), track, health, prognosis_, verdict, (), (), 0)
 
 
 @pytest.fixture(scope="module")
@@ -157,7 +157,7 @@ def test_modes_leave_with_units_in_their_names() -> None:
 
 
 def test_unknown_metadata_are_empty_cells() -> None:
-    """A log that says nothing about itself leaves empty cells, never a text like nan."""
+    """A log without metadata leaves empty cells, never the text nan."""
     reading = LogEstimates("a.h5", "d", Metadata(), two_modes())
     text = frame(COLUMNS["modes"], modes_rows(reading)).to_csv(index=False)
     assert text.splitlines()[1].startswith("a.h5,,,,,,,,,roll,acc,")
@@ -202,15 +202,15 @@ def test_track_and_its_covariance_agree(stage: Stage) -> None:
     assert made["effects"].to_dict("records")[0]["covariate"] == "temperature_c"
 
 
-def test_health_quantiles_are_ordered_and_told_with_their_convergence(stage: Stage) -> None:
-    """Every row has q05 ≤ q25 ≤ median ≤ q75 ≤ q95, and says whether it converged."""
+def test_health_quantiles_are_ordered_and_have_their_convergence(stage: Stage) -> None:
+    """Every row has q05 ≤ q25 ≤ median ≤ q75 ≤ q95, and its convergence."""
     health = tables(stage, np.full(100, 1e6))["health"]
     values = health[["q05", "q25", "median", "q75", "q95"]].to_numpy()
     assert (np.diff(values, axis=1) > 0).all()
     assert health["converged"].tolist() == [True, False]
 
 
-def test_remaining_life_is_told_in_three_units(stage: Stage) -> None:
+def test_remaining_life_has_three_units(stage: Stage) -> None:
     """Kilometres over kilometres per day are days, and 24 hours are a day."""
     remaining = np.linspace(1e5, 1e6, 1001)
     row = tables(stage, remaining)["prognosis"].iloc[0]
@@ -223,7 +223,7 @@ def test_remaining_life_is_told_in_three_units(stage: Stage) -> None:
 
 
 def test_quantiles_past_the_horizon_are_empty(stage: Stage) -> None:
-    """With 60 % of the draws past the horizon q50 and above are empty, and the level is told."""
+    """With 60 % of the draws beyond the horizon q50 and above are empty; the level is given."""
     remaining = np.concatenate(
         [np.linspace(1e5, 1e6, 400), np.full(300, 3e7), np.full(300, np.inf)]
     )
@@ -250,7 +250,7 @@ def test_a_life_wholly_past_the_horizon_has_no_quantile_and_no_service(stage: St
 
 
 def test_a_limit_already_passed_has_no_life_left(stage: Stage) -> None:
-    """Remaining life is never negative, and the probability of having passed is told."""
+    """Remaining life is never negative; the probability of having passed is given."""
     made = tables(stage, np.full(100, -5e5))["prognosis"]
     assert (made["rul_km_q05"] == 0).all()
     assert (made["probability_already_past"] == 1).all()
@@ -259,7 +259,7 @@ def test_a_limit_already_passed_has_no_life_left(stage: Stage) -> None:
     assert made["service_risk"].iloc[1] == 1
 
 
-def test_a_day_that_is_asked_for_has_columns_of_its_own() -> None:
+def test_a_requested_day_has_columns_of_its_own() -> None:
     """The day and the two bounds of its probability stand after all other columns."""
     life = prognosis(np.r_[np.full(50, 1e5), np.full(50, np.inf)])
     day = date(2046, 1, 1)
@@ -273,7 +273,7 @@ def test_a_day_that_is_asked_for_has_columns_of_its_own() -> None:
 
 
 def test_refusals_are_rows() -> None:
-    """Log, channel, mode, source, reason and detail are told as they are."""
+    """Log, channel, mode, source, reason and detail are written unchanged."""
     refusal = Refusal("a.h5", "flat", 'all "0", really', channel="acc_x")
     table = frame(COLUMNS["refused"], refused_rows([refusal]))
     assert table.iloc[0].tolist() == ["a.h5", "acc_x", "", "", "flat", 'all "0", really']
@@ -314,7 +314,7 @@ def test_events_and_smoothed_columns_leave_with_their_units(stage: Stage) -> Non
 
 
 def test_lines_have_the_keys_of_the_contract() -> None:
-    """A line is told by frequency, amplitude with unit, kind and channel."""
+    """A line has frequency, amplitude with unit, kind and channel."""
     (row,) = lines_rows([Line(50.0, 0.1, "m/s²", "mains", "acc_x")])
     assert row == {
         "frequency_hz": 50.0,
