@@ -1,7 +1,7 @@
 """Constants that decide which modes are published, flagged or refused.
 
 Probabilities of false alarms, margins of evidence, limits of uncertainty and bounds of searches.
-Numerical tolerances, step sizes and iteration counts stand beside the code that uses them.
+Numerical tolerances, step sizes and iteration counts are next to the code that uses them.
 """
 
 from __future__ import annotations
