@@ -16,7 +16,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
-from urllib.parse import parse_qsl, quote, unquote
+from urllib.parse import quote
 
 from sqlalchemy import (
     Column,
@@ -41,6 +41,7 @@ from sqlalchemy.schema import CreateTable
 
 from lmshealth._serialize import VERSION, fingerprint, pack, unpack
 from lmshealth.batch import constants
+from lmshealth.batch.addresses import shown_address, without_secrets
 from lmshealth.errors import LmshealthError
 from lmshealth.io.log import Refusal
 from lmshealth.report.changes import Reported
@@ -452,62 +453,3 @@ def _reason(error: Exception, address: str) -> str:
     text = str(getattr(error, "orig", None) or error).strip()
     first = text.splitlines()[0] if text else type(error).__name__
     return without_secrets(first, address)
-
-
-# Addresses of stores and schedulers in messages
-
-# A password that contains characters with a meaning in URLs could be read as a host or a port: such
-# an address does not match.
-_URL = re.compile(
-    r"(?P<kind>[\w+.-]+)://"
-    r"(?:[^:@/?#]*(?::(?P<password>[^:@/?#]*))?@)?"
-    # Only the path of a file, after no host, may contain an @: elsewhere it ends a password.
-    r"(?P<place>(?:\[[\da-fA-F:]*\]|[\w.-]*)(?::\d+)?(?:(?<=://)/[^?]*|/[^?@]*)?)"
-    r"(?:\?(?P<options>.*))?",
-    re.DOTALL,
-)
-# Without any character of an address or option there is no password.
-_NO_URL = re.compile(r"[\w .-]*")
-
-
-def shown_address(address: str) -> str:
-    """Return an address without user, password and options."""
-    found = _URL.fullmatch(address)
-    if found is None:
-        return address if _NO_URL.fullmatch(address) else "that was given"
-    return f"{found['kind']}://{found['place']}"
-
-
-def without_secrets(text: str, address: str) -> str:
-    """Mask the secrets of an address in the message of an error about it.
-
-    Parameters
-    ----------
-    text : str
-        Message of the error, which may quote the address.
-    address : str
-        URL of a store or a scheduler.
-
-    Returns
-    -------
-    str
-        With ``***`` for password and values of options; where the password cannot be separated
-        from the rest of the address, only what to do.
-    """
-    found = _URL.fullmatch(address)
-    if found is None:
-        if _NO_URL.fullmatch(address):
-            return text
-        return (
-            "needed is an address such as postgresql://user:password@host/database, with special "
-            "characters of a password percent-encoded, @ as %40; the reason may contain the "
-            "password and is not shown"
-        )
-    options = found["options"] or ""
-    values = [value for _, value in parse_qsl(options)]
-    values += [part.partition("=")[2] for part in options.split("&")]
-    secrets = [value for value in values if len(value) >= constants.SHORTEST_SECRET]
-    secrets += [found["password"] or "", unquote(found["password"] or "")]
-    for secret in sorted(set(secrets) - {""}, key=len, reverse=True):
-        text = text.replace(secret, "***")
-    return text

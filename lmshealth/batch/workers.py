@@ -1,6 +1,7 @@
 """Workers: this process, processes of this machine (loky), or a Dask cluster.
 
-A worker that dies loses its task, not the batch: see `Pool.map_unordered`.
+A worker that dies loses its task, not the batch: see `Pool.map_unordered`. This module imports
+little, because the processes import it before the batch begins; the rest follows with the tasks.
 """
 
 from __future__ import annotations
@@ -34,7 +35,7 @@ from threadpoolctl import threadpool_limits
 
 from lmshealth._serialize import VERSION
 from lmshealth.batch import constants
-from lmshealth.batch.store import shown_address, without_secrets
+from lmshealth.batch.addresses import shown_address, without_secrets
 from lmshealth.errors import LmshealthError
 
 Item = TypeVar("Item")
