@@ -656,7 +656,7 @@ def test_a_log_that_no_description_takes_is_refused(stage: Path, tmp_path: Path)
     assert (
         "no description matches stage 'other-Z': [match] stage is '*-A' in small" in row["detail"]
     )
-    assert "mend it there, or give by --stage" in row["detail"]
+    assert "correct it there, or give by --stage" in row["detail"]
     assert len(result.stderr.splitlines()) == 1
     assert f"1 refused: 1 as no-stage, such as foreign.h5: {row['detail']}; " in result.stderr
 
