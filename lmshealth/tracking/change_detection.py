@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Literal
 
 import numpy as np
@@ -34,29 +35,28 @@ N_CHECKPOINTS = int(_WINDOWS.max()) + 4
 _ABOUT = np.array([-2, -1, 0, 1, 2])
 
 
-def running_sums(n_rows: int) -> tuple[FloatArray, FloatArray]:
+@lru_cache(maxsize=16)
+def _columns(n_rows: int) -> FloatArray:
+    """Return the columns that each row is added to, shape ``(n_rows, n_rows + 2)``."""
+    return np.hstack([np.eye(n_rows), np.repeat(np.eye(2), n_rows // 2, axis=0)])
+
+
+def running_sums(n_rows: int) -> FloatArray:
     """Return the sums of standardised innovations, and their numbers, before the first log.
 
-    Both have shape ``(n_rows + 2,)``: a column per row, one for all ln f, and one for all ln ζ,
+    The shape is ``(2, n_rows + 2)``: a column per row, one for all ln f, and one for all ln ζ,
     because grease changes all dampings.
     """
-    return np.zeros(n_rows + 2), np.zeros(n_rows + 2)
+    return np.zeros((2, n_rows + 2))
 
 
-def add_to_sums(
-    sums: tuple[FloatArray, FloatArray], rows: np.ndarray, innovation: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Add the innovations of one log to running sums."""
-    n = sums[0].size - 2
-    own = np.zeros((rows.size, n + 2))
-    own[np.arange(rows.size), rows] = 1
-    own[np.arange(rows.size), n + (rows >= n // 2)] = 1
-    return sums[0] + innovation @ own, sums[1] + own.sum(axis=0)
+def add_to_sums(sums: FloatArray, rows: np.ndarray, innovation: FloatArray) -> FloatArray:
+    """Return running sums with the innovations of one more log."""
+    own = _columns(sums.shape[1] - 2)[rows]
+    return sums + np.stack([innovation @ own, own.sum(axis=0)])
 
 
-def suspect(
-    sums: Sequence[tuple[FloatArray, FloatArray]], first: int, leaps: Sequence[int]
-) -> int | None:
+def suspect(sums: Sequence[FloatArray], first: int, leaps: Sequence[int]) -> int | None:
     """Return the log since which the following error, or else innovations, differ suspiciously.
 
     `sums` has the running sums before the first log and after every log up to the present one,
@@ -71,9 +71,8 @@ def suspect(
     start = start[start >= first]
     if start.size == 0:
         return None
-    total, count = (np.array([sums[j][part] for j in start]) for part in (0, 1))
-    count = np.maximum(sums[-1][1] - count, 1)
-    mean = np.abs(sums[-1][0] - total) / np.sqrt(count)
+    windows = sums[-1] - np.array([sums[j] for j in start])
+    mean = np.abs(windows[:, 0]) / np.sqrt(np.maximum(windows[:, 1], 1))
     window, row = np.unravel_index(np.argmax(mean), mean.shape)
     return int(start[window]) if mean[window, row] > constants.SUSPICION_GATE else None
 

@@ -253,7 +253,7 @@ def predict(model: FilterModel, bank: FilterBank, k: int) -> FilterBank:
         mean[:, base] = mean[:, level]
         cov[:, base, :] = cov[:, level, :]
         cov[:, :, base] = cov[:, :, level]
-    return replace(bank, mean=mean, cov=cov)
+    return FilterBank(own, bank.log_weight, mean, cov)
 
 
 def _begin_step(space: StateSpace, cov: FloatArray, step: Step, j: int) -> None:

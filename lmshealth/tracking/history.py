@@ -429,7 +429,7 @@ def _estimates(ordered: Sequence[LogEstimates], stage: Stage | None) -> list[Est
                 sources=tuple(modes.sources[i] for i in kept),
                 ln_frequency=modes.ln_frequency[kept],
                 ln_damping=modes.ln_damping[kept],
-                cov=modes.cov[np.ix_(both, both)],
+                cov=modes.cov[both[:, None], both],
                 shapes=shapes,
             )
         )
@@ -504,7 +504,7 @@ def _line_up(
         to, of = (np.array(side) for side in zip(*pairs, strict=True))
         ln_f[k, to], ln_zeta[k, to] = one.ln_frequency[of], one.ln_damping[of]
         to, of = np.concatenate([to, to + r]), np.concatenate([of, of + len(own)])
-        cov[k][np.ix_(to, to)] = one.cov[np.ix_(of, of)]
+        cov[k, to[:, None], to] = one.cov[of[:, None], of]
     return modes, series, {"ln_frequency": ln_f, "ln_damping": ln_zeta, "cov": cov}
 
 

@@ -175,7 +175,7 @@ def test_a_drift_that_begins_is_an_alarm(stage: Stage) -> None:
     assert alarm.size == pytest.approx(found.drift[alarm.epoch, i])
 
 
-def sums_of(innovations: FloatArray) -> list[tuple[FloatArray, FloatArray]]:
+def sums_of(innovations: FloatArray) -> list[FloatArray]:
     """Sum innovations ``(n_logs, n_rows)`` log by log."""
     sums = [running_sums(innovations.shape[1])]
     for own in innovations:

@@ -325,7 +325,8 @@ def _repeats(state: State, log: Log) -> bool:
     if np.count_nonzero(jumped) > 1:
         return False
     if new.shapes.shape[1] > 1:
-        mac = np.nansum(new.shapes * old.shapes, axis=1) ** 2
+        product = new.shapes * old.shapes
+        mac = np.where(np.isnan(product), 0.0, product).sum(axis=1) ** 2
         if (mac < constants.LEAST_MAC).any():
             return False
     gap = np.abs(new.ln_f[:, None] - new.ln_f)
