@@ -53,7 +53,7 @@ def running_sums(n_rows: int) -> FloatArray:
 def add_to_sums(sums: FloatArray, rows: np.ndarray, innovation: FloatArray) -> FloatArray:
     """Return running sums with the innovations of one more log."""
     own = _columns(sums.shape[1] - 2)[rows]
-    return sums + np.stack([innovation @ own, own.sum(axis=0)])
+    return np.asarray(sums + np.array([innovation @ own, own.sum(axis=0)]))
 
 
 def suspect(sums: Sequence[FloatArray], first: int, leaps: Sequence[int]) -> int | None:
