@@ -80,7 +80,7 @@ def _lines(data: CoverageData, tree: Path) -> dict[str, dict[str, str]]:
     """Return by test and module the lines that are run, as bits of a hexadecimal number."""
     found: dict[str, dict[str, set[int]]] = {}
     for name in data.measured_files():
-        module = Path(name).relative_to(tree.resolve()).stem
+        module = Path(name).relative_to(tree.resolve() / "lmshealth").with_suffix("").as_posix()
         for line, contexts in data.contexts_by_lineno(name).items():
             for context in contexts:
                 test = context.rpartition("|")[0]
