@@ -399,7 +399,7 @@ def control(n: int, kept: Path | None) -> Row:
 
 
 def verdicts(answer: Row) -> dict[str, bool]:
-    """Return what was asked and whether it is so."""
+    """Return the checks."""
 
     def fleet(world: str, arm: str) -> list[Row]:
         return [row for row in answer["fleets"] if (row["world"], row["arm"]) == (world, arm)]
@@ -493,7 +493,7 @@ def claims(answer: Row) -> Iterator[Claim]:
         yield covered(
             f"the map is 5 % wrong, its error believed: {arm}" + (" (control)" if control else ""),
             [row["90"] for row in own],
-            "90 % asked" if not control else "",
+            "90 % required" if not control else "",
             met=any(not row["90"]["holds"] for row in own)
             if control
             else all(row["90"]["holds"] for row in own),
@@ -515,13 +515,13 @@ def claims(answer: Row) -> Iterator[Claim]:
         "quantiles by importance sampling and by chains apart, standard deviations",
         number(max(apart)),
         f"{chains['n']} lives",
-        "0.25 asked",
+        "0.25 required",
         max(apart) < 0.25,
     )
 
 
 def claims_control(answer: Row) -> Iterator[Claim]:
-    """Claim that halved covariances are found out."""
+    """Claim that halved covariances are detected."""
     for what, name in (("last", "at epochs"), ("now", "by the laws")):
         own = [row["90"] for row in answer["fleets"] if row["what"] == what]
         yield covered(

@@ -166,7 +166,7 @@ def _pooled(coverages: list[Row]) -> Row:
 
 
 def verdicts(rows: list[Row], *, quick: bool) -> dict[str, bool]:
-    """Return what was asked and whether it is so."""
+    """Return the checks."""
     sure = [row for row in rows if row["n"] >= 300]
     headline = [row for row in rows if row["case"] in HEADLINES]
     passed = {"headline coverages hold": all(row["coverage"]["holds"] for row in headline)}
@@ -251,7 +251,7 @@ def claims(answer: Row) -> Iterator[Claim]:
             f"root mean square errors over the Cramér-Rao bound, {what}",
             span(row["rmse_over_bound"] for row in own),
             f"± {number(max(row['its_error'] for row in own))} at most",
-            f"{span(asked)} asked" if asked else "",
+            f"{span(asked)} required" if asked else "",
             not any(
                 row["asked"] and row["rmse_over_bound"] - 2 * row["its_error"] > row["asked"]
                 for row in own

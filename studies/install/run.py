@@ -149,7 +149,7 @@ def claims(answer: Row) -> Iterator[Claim]:
         "import lmshealth, processor time",
         f"{number(own)} s",
         f"least of {start['turns']} turns",
-        f"1.5 s asked; numpy, scipy and pandas {number(bare)} s",
+        f"1.5 s required; numpy, scipy and pandas {number(bare)} s",
         passed["import in 1.5 s"],
     )
     yield Claim(

@@ -10,7 +10,7 @@ from studies.harness.study import Row
 
 
 def draw_figure(figure: Figure, result: Row) -> None:
-    """Draw a panel for the map believed, one for its error, one for the control."""
+    """Draw a panel for the map assumed, one for its error, one for the control."""
     axes = figure.subplots(1, 3, sharey=True)
     for ax, (name, rows) in zip(axes, result["ranks"].items(), strict=True):
         lives = next(iter(rows.values()))["n"]

@@ -180,7 +180,7 @@ def judged(rows: list[Row]) -> Row:
 
 
 def verdicts(answer: Row) -> dict[str, bool]:
-    """Return what was asked and whether it is so."""
+    """Return the checks."""
     found = answer["ranks"]
     checks = {f"ranks are uniform: {BELIEVED}": uniform(found[BELIEVED])}
     if found[HALVED][QUANTITIES[0]]["n"] >= 0.9 * N_LIVES:  # fewer tell little

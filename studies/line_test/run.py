@@ -96,7 +96,7 @@ def main() -> None:
 
 
 def verdicts(answer: Row) -> dict[str, bool]:
-    """Return what was asked and whether it is so."""
+    """Return the checks."""
     rates = [rate for row in answer["false_alarms"] for rate in row["rates"]]
     found = {row["ratio_db"]: row["share_found"] for row in answer["detection"]["white, 3 s"]}
     far = [row for row in answer["beside"] if row["gap"] >= 10 and row["contrast_db"] == 20]

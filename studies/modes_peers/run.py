@@ -213,7 +213,7 @@ def coverage(off: Array) -> Row:
 
 
 def verdicts(cases: list[Row], *, quick: bool) -> dict[str, bool]:
-    """Return what was asked and whether it is so."""
+    """Return the checks."""
     ours = [next(iter(case["tools"].values())) for case in cases]
     peers = [row for case in cases for row in list(case["tools"].values())[1:]]
     told = [part for row in peers for part in row["against_ours"].values()]

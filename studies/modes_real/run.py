@@ -92,7 +92,7 @@ def main() -> None:
 
 
 def verdicts(answer: Row) -> dict[str, bool]:
-    """Return what was asked and whether it is so."""
+    """Return the checks."""
     return judge_building(answer["building"]) | judge_others(answer)
 
 
@@ -174,7 +174,7 @@ def claims(answer: Row) -> Iterator[Claim]:
         "its median frequencies off the published ones, at most",
         f"{100 * max(off):.2f} %",
         "",
-        "0.5 % asked",
+        "0.5 % required",
         max(off) < 0.005,
     )
     low = min(row["frequency_hz_coverage_95_interval"][0] for row in modes)
@@ -184,7 +184,7 @@ def claims(answer: Row) -> Iterator[Claim]:
         "95 % intervals of its windows hold the frequency of the whole record",
         percents(row["frequency_hz_coverage_95"] for row in modes),
         f"{percents([low, high])} (95 %)",
-        f"95 % asked; half the standard deviations {percents(half)}",
+        f"95 % required; half the standard deviations {percents(half)}",
         all(row["frequency_hz_coverage_95_interval"][1] >= 0.95 for row in modes)
         and answer["passed"]["building: intervals of each third hold the whole"],
     )
@@ -194,7 +194,7 @@ def claims(answer: Row) -> Iterator[Claim]:
         f"a light frame: {len(light)} frequencies off the known ones, at most",
         f"{100 * max(off):.3f} %",
         "",
-        "0.1 % asked",
+        "0.1 % required",
         max(off) < 1e-3,
     )
     frame, weak = answer["shear_frame"], answer["weak_mode"]

@@ -83,7 +83,7 @@ def holds(row: Row, what: str, truth: float) -> bool:
 
 
 def study_koma(data: Path) -> list[Row]:
-    """Identify the simulated shear frame; beside its parameters those of what was integrated.
+    """Identify the simulated shear frame; with its parameters those of what was integrated.
 
     Steps of the trapezoidal rule of length h turn the pole λ into ln((1 + λh/2) / (1 - λh/2)) / h.
     """

@@ -140,7 +140,7 @@ def read_modes(dwells: pd.DataFrame, stage: Path, *, quick: bool) -> pd.DataFram
     Parameters
     ----------
     dwells : DataFrame
-        As `write_dwells` returns it; ``modes.csv`` is written beside its logs.
+        As `write_dwells` returns it; ``modes.csv`` is written with its logs.
     stage : Path
         Description that says what to look for.
     quick : bool
@@ -263,7 +263,7 @@ def straight_line(
     *,
     quick: bool,
 ) -> Row:
-    """Infer with a map that is a straight line through the same dwells, believed as much."""
+    """Infer with a map that is a straight line through the same dwells, assumed as much."""
     line = calibrate(known, degree=1)
     stage = write_stage(line, track.parent / "line", model_std=model_std)
     return count(compare(read, track, infer(track, stage, epochs, quick=quick)))
@@ -333,7 +333,7 @@ def claims(answer: Row) -> Iterator[Claim]:
         "width of the intervals, of the travel",
         f"{number(min(share))} to {number(max(share))} %",
         "",
-        "3 % asked",
+        "3 % required",
         passed["no interval is wider than 3 % of the travel"],
     )
     apart = max(abs(row["difference_v"]) / row["half_interval_v"] for row in answer["up_and_down"])

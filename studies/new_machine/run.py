@@ -228,7 +228,7 @@ def judge(answer: Row) -> dict[str, bool]:
 
 
 def claims(answer: Row) -> Iterator[Claim]:
-    """Claim that a described machine is told right, and that its tutorial does what it says."""
+    """Claim that a described machine is reported right, and that its tutorial does what it says."""
     rows, left, passed = answer["stiffness"], answer["remaining"], answer["passed"]
     lines = [line for step in answer["steps"] for line in step["commands"]]
     yield Claim(

@@ -159,7 +159,7 @@ def main() -> None:
 
 
 def verdicts(answer: Row, *, quick: bool) -> dict[str, bool]:
-    """Return what was asked and whether it is so; one pair has no control."""
+    """Return the checks; one pair has no control."""
     ways = answer["ways"]
     checks = {
         "all intervals cover": all(

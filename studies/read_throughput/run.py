@@ -183,7 +183,7 @@ def claims(answer: Row) -> Iterator[Claim]:
         "processor time of a reader over that of the bare library, six formats",
         span(bounded),
         "least of nine turns",
-        f"{answer['bound']} asked",
+        f"{answer['bound']} required",
         max(bounded) <= answer["bound"],
     )
     yield Claim(

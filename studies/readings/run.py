@@ -96,7 +96,7 @@ def claims(answer: Row) -> Iterator[Claim]:
         "spectra: error of the amplitude of a sine, relative, at most",
         number(max(sines)),
         "",
-        "10⁻⁶ asked",
+        "10⁻⁶ required",
         max(sines) < 1e-6,
     )
     sums = [c["measured"] for c in checks["error"].values() if c["asked"] == "below 1e-09"]
@@ -104,7 +104,7 @@ def claims(answer: Row) -> Iterator[Claim]:
         "following error: largest error of a sum of sines",
         number(max(sums)),
         "",
-        "10⁻⁹ asked",
+        "10⁻⁹ required",
         max(sums) < 1e-9,
     )
     growth = checks["growth"]

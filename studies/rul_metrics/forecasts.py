@@ -27,7 +27,7 @@ _KM = 1000.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Futures:
-    """What a posterior says of the time to come."""
+    """What a posterior states of the time to come."""
 
     remaining: Array  # Draws of the travel in m to the first limit, shape ``(n_draws,)``
     # The draws that they are from, each of shape ``(n_draws,)``: travel now, life and exponent of

@@ -324,7 +324,7 @@ def seconds(rows: list[Row]) -> Row:
 
 
 def verdicts(answer: Row, *, quick: bool) -> dict[str, bool]:
-    """Return what was asked and whether it is so; times are judged in the recorded run alone."""
+    """Return the checks; times are judged in the recorded run alone."""
     (main,) = (row["ways"] for row in answer["cuts"] if row["share"] == MAIN_CUT)
     times = answer["seconds"]
     checks = {"every life is told": all(

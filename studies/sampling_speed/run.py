@@ -91,7 +91,7 @@ def main() -> None:
 
 
 def verdicts(answer: Row, *, quick: bool) -> dict[str, bool]:
-    """Return what was asked and whether it is so; times are judged in the recorded run alone."""
+    """Return the checks; times are judged in the recorded run alone."""
     rows = {row["program"]: row for row in answer["epoch"]["programs"]}
     life, likelihood = answer["life"], answer["life"]["likelihood"]
     checks = {
@@ -132,7 +132,7 @@ def claims(answer: Row) -> Iterator[Claim]:
         "effective draws of an epoch a second",
         number(ours["ess_per_s"]),
         f"median of {epoch['turns']} turns",
-        f"2,000 asked; {beside}",
+        f"2,000 required; {beside}",
         ours["ess_per_s"] >= 2000
         and all(row["ours_is_times_faster"] >= 1 for row in rows.values()),
     )
@@ -141,7 +141,7 @@ def claims(answer: Row) -> Iterator[Claim]:
         "a converged epoch",
         f"{number(one['cpu_s'])} s",
         f"median of {one['turns']} turns",
-        "3 s asked",
+        "3 s required",
         one["cpu_s"] < 3,
     )
     walker = life["likelihood"]
@@ -149,14 +149,14 @@ def claims(answer: Row) -> Iterator[Claim]:
         "a walker of a life, with the likelihood of a loop over filterpy",
         f"{number(walker['us_per_walker'])} µs, {number(walker['times_faster'])} times faster",
         "",
-        f"20 times asked; likelihoods differ by {number(walker['largest_difference'])}",
+        f"20 times required; likelihoods differ by {number(walker['largest_difference'])}",
         walker["times_faster"] >= 20,
     )
     yield Claim(
         f"the posterior of a life of {walker['logs']} logs",
         f"{number(life['cpu_s'])} s",
         f"median of {len(life['runs'])} turns" if "runs" in life else "",
-        "10 s asked",
+        "10 s required",
         life["cpu_s"] < 10,
     )
 

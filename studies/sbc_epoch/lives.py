@@ -38,7 +38,7 @@ def draw(rng: np.random.Generator, machine: Stage, n_epochs: int) -> Life:
     """Draw a life: a real track gives the covariances, the model all that is true.
 
     The relative errors of the map's sensitivities, one per parameter and mode, are those of the
-    life; parameters and the errors of the drifts are drawn anew at every epoch.
+    life; parameters and the errors of the drifts are drawn again at every epoch.
     """
     assert machine.description.map is not None
     followed = track(history(rng, machine), machine)

@@ -167,7 +167,7 @@ def judged(rows: list[Row]) -> Row:
 
 
 def verdicts(found: dict[str, dict[str, Row]]) -> dict[str, bool]:
-    """Return what was asked and whether it is so."""
+    """Return the checks."""
     first = machine(ONE).parameters[0].name
     checks = {f"ranks are uniform: {kind}": uniform(found[kind]) for kind in (ONE, SHARED, X)}
     if CHAINS in found:
@@ -181,7 +181,7 @@ def verdicts(found: dict[str, dict[str, Row]]) -> dict[str, bool]:
 
 
 def claims(answer: Row) -> Iterator[Claim]:
-    """Claim uniform ranks of the truth, and controls that are found out."""
+    """Claim uniform ranks of the truth, and controls that are detected."""
     for kind, rows in answer["ranks"].items():
         if kind == UNSEEN:
             yield from ranked(f"{kind}, which is not seen", rows.values())

@@ -158,7 +158,7 @@ def true_quantities(drawn: Life, rng: np.random.Generator) -> Array:
 
 
 def quantities(found: LifePosterior, now: float, rng: np.random.Generator) -> Array:
-    """Return what a posterior says of the same, ``(n_draws, n)``."""
+    """Return what a posterior states of the same, ``(n_draws, n)``."""
     horizon = 1000 * machine().description.usage.horizon_km
     told = [(j, p) for j, p in enumerate(machine().parameters) if p.limit is not None]
     left = remaining_travel(found, told, rng, now=now, horizon=horizon)
@@ -185,7 +185,7 @@ def judged(rows: list[Row]) -> Row:
 
 
 def verdicts(found: dict[str, dict[str, Row]]) -> dict[str, bool]:
-    """Return what was asked and whether it is so."""
+    """Return the checks."""
     checks = {f"ranks are uniform: {kind}": uniform(found[kind]) for kind in (ONE, CHAINS)
               if kind in found}  # fmt: skip
     shown = {EXACT: HEALTH, LOSING: (*HEALTH, REMAINING[0])}

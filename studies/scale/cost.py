@@ -192,7 +192,7 @@ def claims(answer: Row) -> Iterator[Claim]:
         f"cost of one more log between {sizes[1]:,} and {sizes[2]:,}, over that from {sizes[0]:,}",
         f"{answer['marginal_ratio']:.3f}",
         "",
-        f"0.9 to 1.1 asked; where logs get longer {answer['control_ratio']:.2f} of a log",
+        f"0.9 to 1.1 required; where logs get longer {answer['control_ratio']:.2f} of a log",
         passed["flat"] and passed["control is seen"],
     )
     memory = [f"{row['memory_mb']:.0f}" for row in answer["sizes"]]
@@ -201,7 +201,7 @@ def claims(answer: Row) -> Iterator[Claim]:
         "reading, store and bookkeeping over the identification",
         f"{100 * answer['overhead']:.1f} %",
         "",
-        "15 % asked",
+        "15 % required",
         passed["little beside identification"],
     )
 

@@ -164,7 +164,7 @@ def claims(answer: Row) -> Iterator[Claim]:
             f"{median:.2f} times",
             f"{least:.2f} to {most:.2f} in {answer['turns']} turns",
             f"the machine gives two bare processes {middle:.2f} ({low:.2f} to {high:.2f}); "
-            f"{answer['of the bound'][kind]:.2f} of it, 0.9 asked",
+            f"{answer['of the bound'][kind]:.2f} of it, 0.9 required",
             answer["passed"][f"{kind}: 1.8 of 2"],
         )
 

@@ -121,14 +121,14 @@ def claims(answer: Row) -> Iterator[Claim]:
         "60 s of four signals, processor time",
         span((row["record_60s_cpu_s"] for row in rows), "s"),
         "least of three turns",
-        f"{answer['bound_s']} s asked; stepping by python-control takes {peers} times",
+        f"{answer['bound_s']} s required; stepping by python-control takes {peers} times",
         passed["time"],
     )
     yield Claim(
         "its memory",
         span((row["peak_mb"] for row in rows), "MB"),
         "",
-        f"{answer['bound_mb']:.0f} MB asked",
+        f"{answer['bound_mb']:.0f} MB required",
         passed["memory"],
     )
 

@@ -37,7 +37,7 @@ LEVEL_WALK, RATE_STD = 1e-3, 0.03
 
 @dataclass(frozen=True)
 class Loop:
-    """What a plain loop says of ln f, ``(n_logs, n_modes)`` each, and of the drift."""
+    """What a plain loop states of ln f, ``(n_logs, n_modes)`` each, and of the drift."""
 
     level: Array
     level_std: Array

@@ -102,7 +102,7 @@ def draw_delays(ax: Axes, delays: Row) -> None:
 
 
 def draw_events(ax: Axes, rows: list[Row]) -> None:
-    """Draw the share of undeclared events that are told for what they are."""
+    """Draw the share of undeclared events that are reported for what they are."""
     rows = [
         row
         for row in rows

@@ -239,7 +239,7 @@ def raw(seeds: int, cache: Path | None) -> Row:
 
 
 def verdicts(answer: Row, *, quick: bool) -> dict[str, bool]:
-    """Return what was asked and whether it is so; one life of a kind tells no rate of alarms."""
+    """Return the checks; one life of a kind tells no rate of alarms."""
     checks = verdicts_of_lives(answer["lives"])
     if not quick:
         checks["halved covariances do not cover"] = not answer["halved"]["90"]["holds"]
@@ -293,7 +293,7 @@ def claims(answer: Row) -> Iterator[Claim]:
         "5 % of preload lost over 60 logs is told",
         alarms["hits"],
         alarms["n"],
-        "95 % asked",
+        "95 % required",
         met=alarms["share"] >= 0.95,
     )
     delays = power["delays"]
