@@ -197,7 +197,7 @@ def test_pages_come_from_the_store_alone(
     with closing(Store(default_url(tmp_path), create=False)) as store:
         again = report(store, tmp_path, Settings(workers=8))
     assert pages(tmp_path) == done.pages
-    assert again.rows == done.result.rows
+    assert repr(again.rows) == repr(done.result.rows)  # NaN stands for a missing limit
 
 
 @pytest.mark.slow
@@ -472,7 +472,7 @@ def test_a_page_says_what_is_new_since_the_last_report(tmp_path: Path, modes_onl
     run(logs, [modes_only], out)
     second = (out / "test-A.html").read_text()
     assert "Compared with the report on 2 logs" in second
-    assert "<li>1 log and " in second
+    assert "<li>1 log more, " in second
     run(logs, [modes_only], out)
     assert (out / "test-A.html").read_text() == second
 
