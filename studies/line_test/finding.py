@@ -240,9 +240,7 @@ def estimate(values: Array, velocity: Array | None = None) -> tuple[float, float
 
 
 def modes(
-    n: int,
-    crossings: tuple[float, ...] = CROSSINGS,
-    places: tuple[float, ...] = PLACES_ON_MODE,
+    n: int, crossings: tuple[float, ...] = CROSSINGS, places: tuple[float, ...] = PLACES_ON_MODE
 ) -> Row:
     """Tell by how many σ lines on a mode move it, with lines kept out and without."""
     rows = []

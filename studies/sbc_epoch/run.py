@@ -45,15 +45,7 @@ from lmshealth.health.importance_sampling import importance_sample_to_ess
 from lmshealth.health.inference import draw as draw_chains
 from lmshealth.health.inference import infer
 from lmshealth.stage.description import Stage, load_stage
-from studies.common.ranks import (
-    N_DRAWS,
-    Array,
-    bands,
-    judge,
-    rank,
-    thinned,
-    uniform,
-)
+from studies.common.ranks import N_DRAWS, Array, bands, judge, rank, thinned, uniform
 from studies.harness.claims import Claim, ranked
 from studies.harness.study import Row, Study
 from studies.sbc_epoch.lives import Life, believing, draw

@@ -158,11 +158,7 @@ def _path(machine: Stage, clock: Array, parts: tuple[Part, ...]) -> Array:
 
 
 def _modes(
-    rng: np.random.Generator,
-    machine: Stage,
-    names: tuple[str, ...],
-    clock: Array,
-    path: Array,
+    rng: np.random.Generator, machine: Stage, names: tuple[str, ...], clock: Array, path: Array
 ) -> Array:
     """Ln f of the modes: health through a map that is wrong, an intercept, and a random walk."""
     assert machine.description.map is not None
@@ -182,10 +178,7 @@ def _modes(
 def _covariates(rng: np.random.Generator) -> dict[str, Array]:
     temperature = 21 + 3 * rng.standard_normal(N_LOGS)
     temperature[rng.random(N_LOGS) < 0.05] = np.nan
-    return {
-        "temperature_c": temperature,
-        "payload_kg": rng.choice([10.0, 20.0, 35.0], size=N_LOGS),
-    }
+    return {"temperature_c": temperature, "payload_kg": rng.choice([10.0, 20.0, 35.0], size=N_LOGS)}
 
 
 def _covariate_effects(

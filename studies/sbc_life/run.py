@@ -50,14 +50,7 @@ from lmshealth.errors import NotConverged
 from lmshealth.prognosis.life_posterior import LifePosterior, fit_life
 from lmshealth.prognosis.remaining_life import remaining_travel
 from lmshealth.stage.description import Stage, load_stage
-from studies.common.ranks import (
-    N_DRAWS,
-    Array,
-    bands,
-    judge,
-    rank,
-    uniform,
-)
+from studies.common.ranks import N_DRAWS, Array, bands, judge, rank, uniform
 from studies.harness.claims import Claim, Older, ranked
 from studies.harness.study import Row, Study
 from studies.sbc_epoch.lives import believing

@@ -16,13 +16,7 @@ from filterpy.kalman import KalmanFilter
 from lmshealth.stage.description import Stage
 from lmshealth.tracking.constants import DAMPING_WALK, LN_F_STD, LN_ZETA_STD
 from lmshealth.tracking.covariates import Regressor
-from lmshealth.tracking.filter_bank import (
-    FilterModel,
-    Hyperparameters,
-    initial,
-    predict,
-    update,
-)
+from lmshealth.tracking.filter_bank import FilterModel, Hyperparameters, initial, predict, update
 from lmshealth.tracking.history import History, Series
 from lmshealth.tracking.state_space import StateSpace, state_space
 from lmshealth.tracking.track import track

@@ -146,11 +146,7 @@ def two_sources(rng: np.random.Generator, n: int, machine: Stage) -> Row:
     for _ in range(n):
         life = draw(rng, ("acc", "delta_e"))
         k, i = int(rng.integers(1, len(life.history.logs))), int(rng.integers(2))
-        histories = (
-            life.history,
-            alone(life.history, "acc"),
-            without_common_errors(life.history),
-        )
+        histories = (life.history, alone(life.history, "acc"), without_common_errors(life.history))
         for kind, history in zip(kinds, histories, strict=True):
             found = errors(life, history, k, machine)
             rows[kind].append(float(found["drift"][i]))

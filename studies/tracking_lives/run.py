@@ -76,12 +76,7 @@ from studies.tracking_lives.trials import (
 )
 
 STEP = "track"
-EVENTS = (
-    "crash",
-    "sudden-loosening",
-    "servo-retuning, undeclared",
-    "regreasing, undeclared",
-)
+EVENTS = ("crash", "sudden-loosening", "servo-retuning, undeclared", "regreasing, undeclared")
 
 CASES = [("lms-y", kind) for kind in HEALTHY + DAMAGED] + [("lms-x", kind) for kind in HEALTHY]
 QUICK = [
