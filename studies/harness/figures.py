@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -47,6 +47,21 @@ def write(
         figure = Figure(figsize=width_and_height, layout="constrained")
         draw(figure, record)
         figure.savefig(folder / "figure.svg", metadata={"Date": None}, **options)
+
+
+def draw_shares(
+    ax: Axes, y: float, rows: Iterable[Row], colour: str, marker: str = "o", **options: Any
+) -> None:
+    """Draw shares with their intervals on one line of a panel."""
+    for row in rows:
+        ax.plot([row["low"], row["high"]], [y, y], lw=2, color=colour, alpha=0.6)
+        ax.plot(row["share"], y, marker, color=colour, **{"ms": 5, **options})
+
+
+def name_lines(ax: Axes, names: Sequence[str], **options: Any) -> None:
+    """Name the lines of a panel, from top to bottom."""
+    ax.set_yticks(range(len(names)), names, **options)
+    ax.set_ylim(len(names) - 0.4, -0.6)
 
 
 def legend_above(figure: Figure, ax: Axes, **options: Any) -> None:

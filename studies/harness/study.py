@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 import platform
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -21,6 +22,10 @@ from importlib.metadata import version
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import norm
 
 from studies.common.metrics import Coverage, clopper_pearson
 from studies.harness.provenance import code_of, name_of
@@ -243,6 +248,25 @@ def judge_coverage(hits: int, n: int, nominal: float = NOMINAL) -> Row:
     It holds if the Clopper-Pearson interval of the share at level `LEVEL` contains the nominal.
     """
     return as_row(Coverage(nominal, hits, n, *clopper_pearson(hits, n, LEVEL)))
+
+
+def judge_scores(z: NDArray[np.float64], nominal: float = NOMINAL) -> Row:
+    """Return the coverage of normal intervals from errors in standard deviations."""
+    hits = int(np.sum(np.abs(z) < norm.isf((1 - nominal) / 2)))
+    return judge_coverage(hits, z.size, nominal)
+
+
+def share_row(hits: int, n: int, level: float = LEVEL) -> Row:
+    """Return a share with its Clopper-Pearson interval."""
+    low, high = clopper_pearson(hits, n, level)
+    return {"hits": hits, "n": n, "share": hits / n, "low": low, "high": high}
+
+
+def real_data() -> Path:
+    """Return the folder of real measurements."""
+    if "LMSHEALTH_DATA" not in os.environ:
+        raise SystemExit("LMSHEALTH_DATA is not set: it names the folder of real measurements")
+    return Path(os.environ["LMSHEALTH_DATA"])
 
 
 def as_row(found: Coverage) -> Row:

@@ -36,11 +36,10 @@ class Wearing(PrognosticsModel):
         "off_mount",
         "rate",
     ]
+    _limits = 0.6, 0.7
     outputs: ClassVar[list[str]] = ["preload", "mount"]
     events: ClassVar[list[str]] = ["end"]
     default_parameters: ClassVar[Row] = {
-        "preload_limit": 0.6,
-        "mount_limit": 0.7,
         "process_noise": 0,
         "measurement_noise": 0,
         "rng": np.random.default_rng(0),
@@ -67,38 +66,21 @@ class Wearing(PrognosticsModel):
 
     def event_state(self, x: Any) -> dict[str, float]:
         """Return the smaller share of what may be lost that is left."""
-        limits = self.parameters["preload_limit"], self.parameters["mount_limit"]
-        pairs = zip(self._health(x), limits, strict=True)
+        pairs = zip(self._health(x), self._limits, strict=True)
         return {"end": min((own - limit) / (1 - limit) for own, limit in pairs)}
 
     def threshold_met(self, x: Any) -> dict[str, bool]:
         """Return whether a limit is reached."""
-        preload, mount = self._health(x)
-        limits = self.parameters["preload_limit"], self.parameters["mount_limit"]
-        return {"end": preload <= limits[0] or mount <= limits[1]}
+        pairs = zip(self._health(x), self._limits, strict=True)
+        return {"end": any(own <= limit for own, limit in pairs)}
 
 
 def predicted(
     states: dict[str, Array], horizon: float, rng: np.random.Generator
 ) -> tuple[Array, float]:
-    """Let progpy run draws of the states forward.
+    """Let progpy run `N_SAMPLES` of the states forward; return their ends in m, and processor time.
 
-    Parameters
-    ----------
-    states : dict of str to ndarray
-        As `studies.rul_metrics.forecasts.Futures` has them; `N_SAMPLES` of them are taken.
-    horizon : float
-        In m.
-    rng : Generator
-        Of what wanders.
-
-    Returns
-    -------
-    ends : ndarray
-        Travel in m at the end of each run; NaN where the horizon comes first, which progpy gives as
-        none and leaves out of its statistics.
-    seconds : float
-        Processor time.
+    Ends are NaN where the horizon (m) comes first, which progpy leaves out of its statistics.
     """
     n = states["travel"].size
     chosen = rng.choice(n, N_SAMPLES, replace=False)

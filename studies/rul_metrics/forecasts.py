@@ -1,12 +1,13 @@
-"""Remaining life as we draw it, and by a straight line through the health of single epochs."""
+"""Ways to the remaining life: ours, a line through the health of single epochs, and progpy."""
 
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
+from importlib.util import find_spec
 
 import numpy as np
 
+from lmshealth.errors import NotConverged
 from lmshealth.health.epoch_posterior import EpochPosterior
 from lmshealth.health.laplace import approximate
 from lmshealth.prognosis.life_posterior import LifePosterior, fit_life
@@ -20,44 +21,53 @@ from lmshealth.tracking.history import History
 from lmshealth.tracking.track import track
 from studies.common.lives import Array
 
+OURS, LINE, PROGPY = "lmshealth", "line", "progpy"
+KEPT, CONTROL = "progpy, all runs kept", "a tenth of the spread"
+WAYS = (OURS, LINE, PROGPY, KEPT, CONTROL)
+MISSING = "progpy: not installed; pip install '.[peers]'"
 N_DRAWS = 10_000
 _N_BEGIN = 64
 _KM = 1000.0
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Futures:
-    """What a posterior states of the time to come."""
+def all_ways(
+    history: History, stage: Stage, seed: list[int], rng: np.random.Generator
+) -> tuple[dict[str, Array], dict[str, float]]:
+    """Draw the remaining life in m in every way, with the processor times of the steps in s.
 
-    remaining: Array  # Draws of the travel in m to the first limit, shape ``(n_draws,)``
-    # The draws that they are from, each of shape ``(n_draws,)``: travel now, life and exponent of
-    # the wear, floor and length of the loosening, of either parameter ln of health over its law,
-    # and the variance that every unit of travel adds to these; lengths in km
-    states: dict[str, Array]
-    posterior_s: float  # Processor times of both steps
-    futures_s: float
-
-
-def ours(history: History, stage: Stage, seed: list[int]) -> Futures:
-    """Draw the remaining life as `prognose` does, but without chains."""
+    Draws are infinite where life does not end, and at least 0: the machine still runs.
+    """
+    horizon = 1000 * stage.description.usage.horizon_km
+    draws, seconds = {LINE: linear(history, stage, rng)}, {}
     begin = time.process_time()
-    # Chains would take five times as long, and say the same (sbc_life judges both).
-    life = fit_life(history, stage, seed, chains=False)
-    fitted = time.process_time()
-    remaining = futures(life, history, stage, seed)
-    ended = time.process_time()
-    return Futures(remaining, states_of(life, history), fitted - begin, ended - fitted)
+    try:
+        # Chains would take five times as long, and say the same (sbc_life judges both).
+        life = fit_life(history, stage, seed, chains=False)
+    except NotConverged:
+        life = None
+    if life is not None:
+        fitted = time.process_time()
+        draws[OURS] = futures(life, history, stage, seed)
+        seconds = {"posterior": fitted - begin, OURS: time.process_time() - fitted}
+        middle = np.median(draws[OURS])
+        finite = np.isfinite(middle)
+        draws[CONTROL] = middle + (draws[OURS] - middle) / 10 if finite else draws[OURS]
+        if find_spec("progpy"):
+            from studies.rul_metrics.by_progpy import predicted
+
+            ends, seconds[PROGPY] = predicted(states_of(life, history), horizon, rng)
+            draws[KEPT] = np.where(np.isnan(ends), np.inf, ends)
+            if np.isfinite(ends).any():
+                draws[PROGPY] = ends[np.isfinite(ends)]
+    return {name: np.maximum(own, 0.0) for name, own in draws.items()}, seconds
 
 
 def futures(life: LifePosterior, history: History, stage: Stage, seed: list[int]) -> Array:
-    """Draw the travel to the first limit from a posterior."""
-    return remaining_travel(
-        life,
-        identifiable_limits(stage, life.modes),
-        np.random.default_rng(seed),
-        now=_since_baseline(history),
-        horizon=stage.description.usage.horizon_km * _KM,
-    )[:, -1]
+    """Draw the travel to the first limit from a posterior, as `prognose` does."""
+    limits, rng = identifiable_limits(stage, life.modes), np.random.default_rng(seed)
+    horizon = stage.description.usage.horizon_km * _KM
+    now = _since_baseline(history)
+    return remaining_travel(life, limits, rng, now=now, horizon=horizon)[:, -1]
 
 
 def _since_baseline(history: History) -> float:
@@ -65,7 +75,11 @@ def _since_baseline(history: History) -> float:
 
 
 def states_of(life: LifePosterior, history: History) -> dict[str, Array]:
-    """Write every draw as wear and loosening; of what never changes nothing is ever lost."""
+    """Express every draw of a posterior as states of progpy's model, lengths in km.
+
+    These are the travel, life and exponent of wear, floor and length of loosening, ln of either
+    health over its law, and the variance that every km adds to it.
+    """
     now, parts = _since_baseline(history), []
     for way, off, rate in life.by_scenario():
         n = rate.shape[0]
@@ -91,26 +105,14 @@ def states_of(life: LifePosterior, history: History) -> dict[str, Array]:
 
 
 def health_index(history: History, stage: Stage) -> tuple[Array, Array]:
-    """Return the health of single epochs, without a law.
-
-    It is the mode of the posterior that `infer` draws from, for a median.
-
-    Returns
-    -------
-    travel : ndarray
-        Of the epochs in m, from now, shape ``(n,)``.
-    health : ndarray
-        Shape ``(n, n_parameters)``.
-    """
-    followed, prior = track(history, stage), stage.prior
-    begin = prior.draw(np.random.default_rng(0), _N_BEGIN)
-    low, high = prior.support
+    """Return the travel in m from now and the health (posterior mode) of single epochs."""
+    followed = track(history, stage)
+    begin = stage.prior.draw(np.random.default_rng(0), _N_BEGIN)
     epochs, found = [], []
     for k in range(history.baseline + 1, len(history.logs)):
-        posterior = EpochPosterior.of(
-            stage, followed.modes, followed.drift[k], followed.drift_cov[k]
-        )
-        normal = approximate(posterior.log_probability, begin, low, high)
+        drift = followed.drift[k], followed.drift_cov[k]
+        posterior = EpochPosterior.of(stage, followed.modes, *drift)
+        normal = approximate(posterior.log_probability, begin, *stage.prior.support)
         if normal is not None:
             epochs.append(k)
             found.append(np.exp(normal.mode))
@@ -118,16 +120,11 @@ def health_index(history: History, stage: Stage) -> tuple[Array, Array]:
 
 
 def linear(history: History, stage: Stage, rng: np.random.Generator) -> Array:
-    """Extrapolate the health index by least squares to the first limit, with what is not known.
+    """Extrapolate the health index by least squares to the first limit.
 
     Lines are drawn from the posterior of the regression under a flat prior, both parameters
-    together, and what a next reading would be off its line is added, so that quantiles of health
-    are the ends of prediction intervals.
-
-    Returns
-    -------
-    ndarray
-        Draws of the travel left in m, infinite where a line does not fall, shape ``(N_DRAWS,)``.
+    together, with the scatter of one more reading, so that quantiles of health are the ends of
+    prediction intervals. Draws are infinite where a line does not fall.
     """
     s, health = health_index(history, stage)
     x = np.column_stack([np.ones_like(s), s])
@@ -139,9 +136,7 @@ def linear(history: History, stage: Stage, rng: np.random.Generator) -> Array:
     normal = rng.standard_normal((N_DRAWS, 3, health.shape[1])) @ scatter.T * scale
     lines = best + root @ normal[:, :2]
     level, slope = lines[:, 0] + normal[:, 2], lines[:, 1]
-    limits = np.array(
-        [p.limit.below for _, p in parameters_with_limit(stage) if p.limit is not None]
-    )
+    limits = np.array([p.limit.below for _, p in parameters_with_limit(stage)])
     falling = slope < 0
     passed = (limits - level) / np.where(falling, slope, 1.0)
     ends = np.where(falling, passed, np.where(level <= limits, 0.0, np.inf))
