@@ -12,15 +12,14 @@ from itertools import product
 
 import numpy as np
 
-from lmshealth.modal.ambient.cluster_fit import fit_cluster
+from lmshealth.modal.ambient.cluster_fit import BinnedSpectra, bin_spectra, fit_cluster
 from lmshealth.modal.ambient.cluster_modes import ClusterModes
 from lmshealth.modal.ambient.expected_periodogram import MeanOrdinates, average_ordinates
-from lmshealth.modal.ambient.log_spectra import BinnedSpectrum, LogSpectra
 from lmshealth.modal.ambient.whittle import Likelihood, lay_out
 from lmshealth.modal.modes import Rejection
 from lmshealth.modal.targets import Target
 from lmshealth.signal.segments import Segment
-from lmshealth.signal.spectra import CrossSpectrum, cross_spectra
+from lmshealth.signal.spectra import CrossSpectrum, LogSpectra, cross_spectra
 from tests.oracles import channel_covariance
 from tests.signals import Mode, accelerations, make_log
 
@@ -149,7 +148,7 @@ def scatter_free(
     return replace(truth, blocks=(replace(empty, matrix=expected),))
 
 
-def spectra_of(channels: np.ndarray) -> tuple[LogSpectra, tuple[BinnedSpectrum, ...]]:
+def spectra_of(channels: np.ndarray) -> tuple[LogSpectra, BinnedSpectra]:
     """Transform accelerometers, and bin them around the modes of these tests."""
     rows = np.atleast_2d(channels)
     made = make_log({f"acc_{k}": row for k, row in enumerate(rows)}, RATE).channels
@@ -158,11 +157,11 @@ def spectra_of(channels: np.ndarray) -> tuple[LogSpectra, tuple[BinnedSpectrum, 
         ("acc",) * len(made),
         cross_spectra(made, [Segment(0, rows.shape[1], float("nan"))], RATE, 200.0),
     )
-    return spectra, spectra.binned(75.0, 165.0, 0.8)
+    return spectra, bin_spectra(spectra, 75.0, 165.0, 0.8)
 
 
 def fit_spectra(
-    spectra: LogSpectra, binned: tuple[BinnedSpectrum, ...], targets: Sequence[Target]
+    spectra: LogSpectra, binned: BinnedSpectra, targets: Sequence[Target]
 ) -> tuple[ClusterModes | None, dict[str, Rejection]]:
     """Return published modes and rejections."""
     result = fit_cluster(spectra, binned, tuple(targets))

@@ -15,21 +15,19 @@ import numpy as np
 from lmshealth.errors import BadLog
 from lmshealth.io.log import Channel, Log, Refusal
 from lmshealth.modal import constants
-from lmshealth.modal.ambient.cluster_fit import fit_cluster
+from lmshealth.modal.ambient.cluster_fit import bin_cluster, fit_cluster, locate
 from lmshealth.modal.ambient.cluster_modes import (
     ClusterFit,
     ClusterModes,
     merge_close_modes,
     refuse_close_modes,
 )
-from lmshealth.modal.ambient.initial_values import locate
-from lmshealth.modal.ambient.log_spectra import BinnedSpectrum, LogSpectra, transform
 from lmshealth.modal.ambient.peak_picking import find_excess, find_peaks
 from lmshealth.modal.modes import Modes, merge, numbered
 from lmshealth.modal.naming import assign
 from lmshealth.modal.targets import Target, choose_channels, choose_targets, clusters
-from lmshealth.signal.segments import find_segments
-from lmshealth.signal.spectra import ResonanceRange
+from lmshealth.signal.segments import Segment, find_phases, stationary
+from lmshealth.signal.spectra import ANY_RESONANCE, LogSpectra, ResonanceRange, cross_spectra
 from lmshealth.signal.spectral_lines import Line, find_lines, name_lines
 from lmshealth.stage.constants import BAND, LEAST_RESOLUTION
 from lmshealth.stage.description import Stage
@@ -96,16 +94,23 @@ def identify(
     126.4 ± 0.1 Hz, 1.5% ± 0.1%
     """
     used = choose_channels(log, channels)
+    targets = () if stage is None else choose_targets(stage, band)
+    phases = find_phases(log)
+    stretches = stationary(phases, 0)
+    spectra = _transform(log, used, phases, targets, band)
+    tested: list[tuple[str, float, float]] = []
+    top = _TOP * log.sample_rate
     if stage is None:
-        spectra, fits, tested = _identify_found(log, used, band)
+        targets, tested = _search(log, used, stretches, spectra, band)
+        spectra = spectra.without([frequency for _, frequency, _ in tested])
+        fits = [_fit_found(spectra, cluster, targets, top) for cluster in clusters(targets)]
     else:
-        spectra, fits = _identify_described(log, used, choose_targets(stage, band))
-        tested = []
+        fits = [_fit_described(spectra, cluster, targets, top) for cluster in clusters(targets)]
+    refused = [refusal for fit in fits for refusal in fit.refusals(log.name)]
     found = [fit.modes for fit in fits if fit.modes is not None]
     masked = [line for one in found for line in one.lines]
     seen = [*tested, *spectra.removed_lines, *masked]
-    lines = name_lines(seen, log, stage, 1.5 / spectra.duration)
-    refused = [refusal for fit in fits for refusal in fit.refusals(log.name)]
+    lines = name_lines(seen, [s.velocity for s in stretches], stage, 1.5 / spectra.duration)
     if stage is None:
         found = _distinct(found)
         anything = any(one.names for one in found)
@@ -114,25 +119,45 @@ def identify(
     return numbered(modes) if stage is None else modes
 
 
-def _identify_described(
-    log: Log, channels: tuple[Channel, ...], targets: tuple[Target, ...]
-) -> tuple[LogSpectra, list[ClusterFit]]:
-    """Fit the modes of a description."""
-    spectra = _described_spectra(log, channels, targets)
-    top = _TOP * log.sample_rate
-    return spectra, [_fit_described(spectra, c, targets, top) for c in clusters(targets)]
-
-
-def _described_spectra(
-    log: Log, channels: tuple[Channel, ...], targets: tuple[Target, ...]
+def _transform(
+    log: Log,
+    channels: tuple[Channel, ...],
+    phases: Sequence[Segment],
+    targets: tuple[Target, ...],
+    band: tuple[float, float] | None,
 ) -> LogSpectra:
-    """Transform every channel up to the highest frequency of any search."""
-    top = max(target.band(BAND)[1] for target in targets)
-    reach = (1 + max(target.search for target in targets)) * top
-    shortest = LEAST_RESOLUTION / min(2 * t.damping_ratio * t.frequency for t in targets)
-    resonances = [_resonance(target) for target in targets]
-    return transform(
-        log, channels, reach, shortest=shortest, ceiling=reach, highest=top, resonances=resonances
+    """Transform the segments that are long enough for the targets, or without any for the band."""
+    resonances: Sequence[ResonanceRange] = ANY_RESONANCE
+    highest, rate = 0.0, log.sample_rate
+    if targets:
+        highest = max(target.band(BAND)[1] for target in targets)
+        reach = ceiling = (1 + max(target.search for target in targets)) * highest
+        shortest = LEAST_RESOLUTION / min(2 * t.damping_ratio * t.frequency for t in targets)
+        resonances = [_resonance(target) for target in targets]
+    else:
+        reach = band[1] if band else np.inf
+        ceiling = _CEILING * reach
+        shortest = constants.LEAST_PERIODS / min(reach, constants.USABLE * rate)
+    segments = stationary(phases, round(shortest * rate))
+    if highest > rate / 2:
+        raise BadLog(
+            log.name,
+            "sample-rate",
+            f"{rate:g} Hz cannot show modes up to {highest:.0f} Hz; "
+            f"needed is at least {2 * highest:.0f} Hz",
+        )
+    if not segments:
+        longest = max((b - a for a, b in log.pieces), default=0) / rate
+        raise BadLog(
+            log.name,
+            "too-short",
+            f"no segment of constant velocity without gaps lasts {shortest:.3g} s, which the modes "
+            f"need; the longest piece without gaps has {longest:.3g} s",
+        )
+    return LogSpectra(
+        tuple(channel.name for channel in channels),
+        tuple("delta_e" if c.kind == "displacement" else "acc" for c in channels),
+        cross_spectra(channels, segments, rate, reach, ceiling=ceiling, resonances=resonances),
     )
 
 
@@ -143,12 +168,42 @@ def _resonance(target: Target) -> ResonanceRange:
     return ResonanceRange(low, high, target.damping_ratio / 2)
 
 
+def _search(
+    log: Log,
+    channels: tuple[Channel, ...],
+    stretches: Sequence[Segment],
+    spectra: LogSpectra,
+    band: tuple[float, float] | None,
+) -> tuple[tuple[Target, ...], list[tuple[str, float, float]]]:
+    """Return candidate modes in the band, and the lines that Thomson's test shows."""
+    duration, usable = spectra.duration, constants.USABLE * log.sample_rate
+    low, high = band or (20 / duration, usable)
+    low, high = max(low, 2 / duration), min(high, usable)
+    n = max(0.0, (high - low) * duration)
+    if n < constants.LEAST_FREQUENCIES:
+        raise BadLog(
+            log.name,
+            "too-short",
+            f"{duration:.3g} s at {log.sample_rate:g} Hz hold {n:.0f} Fourier frequencies from "
+            f"{low:.4g} to {high:.4g} Hz; needed are at least {constants.LEAST_FREQUENCIES}",
+        )
+    longest = max(stretches, key=lambda s: s.stop - s.start)
+    tested = [
+        (channel.name, *line)
+        for channel in channels
+        for line in find_lines(channel, (longest,), log.sample_rate, (low, high)).tolist()
+    ]
+    spectrum = max(spectra.spectra, key=lambda spectrum: spectrum.observed)
+    each = [spectrum.channel(c) for c in range(len(channels))]
+    return find_peaks(each, low, high, [frequency for _, frequency, _ in tested]), tested
+
+
 def _fit_described(
     spectra: LogSpectra, cluster: tuple[Target, ...], targets: tuple[Target, ...], top: float
 ) -> ClusterFit:
     """Fit a described cluster: locate it, fit it, name what was found, reject close modes."""
-    searches = [target.search for target in cluster]
-    binned, located = locate(_binned(spectra, cluster, targets, searches, top), cluster)
+    binned = bin_cluster(spectra, cluster, targets, top, searched=True)
+    binned, located = locate(binned, cluster)
     return refuse_close_modes(_assigned(fit_cluster(spectra, binned, located), cluster))
 
 
@@ -168,53 +223,14 @@ def _assigned(fit: ClusterFit, cluster: tuple[Target, ...]) -> ClusterFit:
     return ClusterFit(replace(kept, modes=named), fit.rejected | assignment.ambiguous)
 
 
-def _identify_found(
-    log: Log, channels: tuple[Channel, ...], band: tuple[float, float] | None
-) -> tuple[LogSpectra, list[ClusterFit], list[tuple[str, float, float]]]:
-    """Search the band for modes and fit them; return the lines that Thomson's test shows, too."""
-    reach = band[1] if band else np.inf
-    shortest = constants.LEAST_PERIODS / min(reach, constants.USABLE * log.sample_rate)
-    spectra = transform(log, channels, reach, shortest=shortest, ceiling=_CEILING * reach)
-    limits = _search_limits(log, spectra.duration, band)
-    segment = max(find_segments(log, 0.0), key=lambda s: s.stop - s.start)
-    tested = [
-        (channel.name, *line)
-        for channel in channels
-        for line in find_lines(channel, (segment,), log.sample_rate, limits).tolist()
-    ]
-    frequencies = [frequency for _, frequency, _ in tested]
-    by_channel = tuple(spectra.channel(c) for c in range(len(channels)))
-    targets = find_peaks(by_channel, *limits, frequencies)
-    spectra, top = spectra.without(frequencies), _TOP * log.sample_rate
-    return spectra, [_fit_found(spectra, c, targets, top) for c in clusters(targets)], tested
-
-
-def _search_limits(
-    log: Log, longest: float, band: tuple[float, float] | None
-) -> tuple[float, float]:
-    """Return the band in Hz that a log of segments of so many seconds can be searched in."""
-    usable = constants.USABLE * log.sample_rate
-    low, high = band or (20 / longest, usable)
-    low, high = max(low, 2 / longest), min(high, usable)
-    n = max(0.0, (high - low) * longest)
-    if n < constants.LEAST_FREQUENCIES:
-        raise BadLog(
-            log.name,
-            "too-short",
-            f"{longest:.3g} s at {log.sample_rate:g} Hz hold {n:.0f} Fourier frequencies from "
-            f"{low:.4g} to {high:.4g} Hz; needed are at least {constants.LEAST_FREQUENCIES}",
-        )
-    return low, high
-
-
 def _fit_found(
     spectra: LogSpectra, cluster: tuple[Target, ...], targets: tuple[Target, ...], top: float
 ) -> ClusterFit:
     """Fit a cluster of peaks, then again with each excess of the residual as a further mode."""
     spectra = spectra.band(*_nearest(cluster, targets))
     for _ in range(1 + _MOST_ROUNDS):
-        searches = [0.0] * len(cluster)
-        fit = fit_cluster(spectra, _binned(spectra, cluster, targets, searches, top), cluster)
+        binned = bin_cluster(spectra, cluster, targets, top, searched=False)
+        fit = fit_cluster(spectra, binned, cluster)
         if fit.modes is None:
             break
         modes = merge_close_modes(fit.modes)
@@ -278,19 +294,3 @@ def _nothing_found(log: Log, lines: tuple[Line, ...], rejected: list[Refusal]) -
         f"no resonance above the noise in any channel; {shown}: excite the machine, record "
         "longer, or choose another band",
     )
-
-
-def _binned(
-    spectra: LogSpectra,
-    cluster: tuple[Target, ...],
-    targets: tuple[Target, ...],
-    searches: Sequence[float],
-    top: float,
-) -> tuple[BinnedSpectrum, ...]:
-    """Bin the band of a cluster, widened by the search of each mode, with its neighbours."""
-    low = min(t.band(BAND)[0] * (1 - s) for t, s in zip(cluster, searches, strict=True))
-    high = max(t.band(BAND)[1] * (1 + s) for t, s in zip(cluster, searches, strict=True))
-    high = min(high, top)
-    width = 0.5 * min(t.damping_ratio * t.frequency for t in cluster)
-    near = tuple(t for t in targets if t not in cluster and low / 1.3 < t.frequency < 1.3 * high)
-    return spectra.binned(low, high, width, near)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Literal, get_args
@@ -10,7 +11,7 @@ import numpy as np
 
 from lmshealth._arrays import BoolArray, FloatArray
 from lmshealth.errors import BadLog
-from lmshealth.io.buffers import MINUTE, Samples, blocks
+from lmshealth.io.buffers import MINUTE, blocks
 from lmshealth.io.log import Channel, Log
 from lmshealth.signal import constants
 
@@ -67,10 +68,28 @@ def find_phases(log: Log) -> tuple[Segment, ...]:
         default=0.0,
     )
     settling = round(constants.SETTLING_TIME * log.sample_rate)
-    found: list[Segment] = []
+    phases: list[Segment] = []
     for start, stop in log.pieces:
-        found += _phases(velocity, start, stop, scale, settling)
-    return tuple(found)
+        found: list[Segment] = []
+        # Differences over some 1 ms: between neighbouring samples a slow ramp appears constant.
+        lag = max(1, min(20, (stop - start) // 4))
+        # A piece that begins at rest is idle.
+        last_move = start - settling - 1
+        for at, block in blocks(velocity, start, stop):
+            low, high = max(start, at - lag), min(stop, at + block.size + lag)
+            inner = slice(at - low, at - low + block.size)
+            steady = _steady(velocity[low:high], lag, scale)[inner]
+            moving = np.abs(block) > constants.VELOCITY_TOLERANCE * scale
+            index = np.arange(at, at + block.size)
+            last = np.maximum.accumulate(np.where(moving, index, last_move))
+            last_move = int(last[-1])
+            code = np.where(moving, steady, np.where(index - last <= settling, 2, 3))
+            cuts = [0, *(np.flatnonzero(np.diff(code)) + 1).tolist(), block.size]
+            for a, b in pairwise(cuts):
+                mean = float(np.mean(block[a:b]))
+                _join(found, Segment(at + a, at + b, mean, _KINDS[int(code[a])]))
+        phases += found
+    return tuple(phases)
 
 
 def find_segments(log: Log, shortest: float) -> tuple[Segment, ...]:
@@ -90,9 +109,16 @@ def find_segments(log: Log, shortest: float) -> tuple[Segment, ...]:
         In order of time; empty if none is long enough. A stretch of more than a minute at 20 kHz
         is cut into parts of one length, each at least ten times ``shortest``.
     """
-    phases = find_phases(log)
+    return stationary(find_phases(log), round(shortest * log.sample_rate))
+
+
+def stationary(phases: Sequence[Segment], n_least: int) -> tuple[Segment, ...]:
+    """Return the phases in which a log is stationary, as `find_segments` does.
+
+    ``n_least`` is the least number of samples.
+    """
     rests = all(phase.kind == "idle" for phase in phases)
-    n_least = max(8, round(shortest * log.sample_rate))
+    n_least = max(8, n_least)
     longest = max(MINUTE, constants.PARTS_LENGTH * n_least)
     return tuple(
         part
@@ -114,29 +140,6 @@ def _parts(segment: Segment, longest: int) -> list[Segment]:
     each = fft.prev_fast_len(size // n_parts, real=True)
     starts = [segment.start + k * each for k in range(n_parts)]
     return [replace(segment, start=start, stop=start + each) for start in starts]
-
-
-def _phases(velocity: Samples, start: int, stop: int, scale: float, settling: int) -> list[Segment]:
-    """Cut a gap-free piece by its set velocity; ``settling`` in samples."""
-    # Differences over some 1 ms: between neighbouring samples a slow ramp appears constant.
-    lag = max(1, min(20, (stop - start) // 4))
-    # A piece that begins at rest is idle.
-    last_move = start - settling - 1
-    found: list[Segment] = []
-    for at, block in blocks(velocity, start, stop):
-        low, high = max(start, at - lag), min(stop, at + block.size + lag)
-        inner = slice(at - low, at - low + block.size)
-        steady = _steady(velocity[low:high], lag, scale)[inner]
-        moving = np.abs(block) > constants.VELOCITY_TOLERANCE * scale
-        index = np.arange(at, at + block.size)
-        last = np.maximum.accumulate(np.where(moving, index, last_move))
-        last_move = int(last[-1])
-        code = np.where(moving, steady, np.where(index - last <= settling, 2, 3))
-        cuts = [0, *(np.flatnonzero(np.diff(code)) + 1).tolist(), block.size]
-        for a, b in pairwise(cuts):
-            mean = float(np.mean(block[a:b]))
-            _join(found, Segment(at + a, at + b, mean, _KINDS[int(code[a])]))
-    return found
 
 
 def _steady(velocity: FloatArray, lag: int, scale: float) -> BoolArray:

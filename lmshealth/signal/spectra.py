@@ -156,6 +156,56 @@ class CrossSpectrum:
         return Spectrum(self.frequency, own, self.duration, self.velocity, self.count)
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class LogSpectra:
+    """Cross spectra of the segments of a log.
+
+    Attributes
+    ----------
+    channels, sources : tuple of str
+        Channel names, and ``acc`` or ``delta_e`` of each.
+    spectra : tuple of CrossSpectrum
+        Of segments, or means over several.
+    """
+
+    channels: tuple[str, ...]
+    sources: tuple[str, ...]
+    spectra: tuple[CrossSpectrum, ...]
+
+    @property
+    def source(self) -> str:
+        """Source of all channels, or ``joint``."""
+        return self.sources[0] if len(set(self.sources)) == 1 else "joint"
+
+    @property
+    def duration(self) -> float:
+        """Duration of the longest segment in s."""
+        return max(spectrum.duration for spectrum in self.spectra)
+
+    @property
+    def removed_lines(self) -> list[tuple[str, float, float]]:
+        """Channel, frequency in Hz and amplitude in m/s² of lines subtracted from the samples."""
+        return [(self.channels[c], f, a) for s in self.spectra for c, f, a in s.lines]
+
+    def select(self, index: Sequence[int]) -> LogSpectra:
+        """Keep some channels."""
+        rows, columns = np.ix_(index, index)
+        return LogSpectra(
+            tuple(self.channels[c] for c in index),
+            tuple(self.sources[c] for c in index),
+            tuple(replace(s, matrix=s.matrix[:, rows, columns]) for s in self.spectra),
+        )
+
+    def band(self, low: float, high: float) -> LogSpectra:
+        """Cut out a band in Hz."""
+        cut = (spectrum.band(low, high) for spectrum in self.spectra)
+        return replace(self, spectra=tuple(s for s in cut if s.frequency.size))
+
+    def without(self, frequencies: Sequence[float]) -> LogSpectra:
+        """Exclude the ordinates that lines at these frequencies in Hz may reach."""
+        return replace(self, spectra=tuple(s.without(frequencies) for s in self.spectra))
+
+
 def _near(frequency: FloatArray, duration: float, line: float) -> slice:
     half = max(constants.LINE_WIDTH * line, 2 / duration)
     first, last = np.searchsorted(frequency, [line - half, line + half])

@@ -84,7 +84,10 @@ def find_lines(
 
 
 def name_lines(
-    seen: Sequence[tuple[str, float, float]], log: Log, stage: Stage | None, resolution: float
+    seen: Sequence[tuple[str, float, float]],
+    velocities: Iterable[float],
+    stage: Stage | None,
+    resolution: float,
 ) -> tuple[Line, ...]:
     """Name the source of each line: an order of the velocity, mains, or unknown.
 
@@ -92,8 +95,8 @@ def name_lines(
     ----------
     seen : sequence of (str, float, float)
         Channel, frequency in Hz and amplitude in m/s² of each; a line may occur twice.
-    log : Log
-        For the velocity of the stage.
+    velocities : iterable of float
+        Set velocities of the log in m/s.
     stage : Stage or None
         For its orders.
     resolution : float
@@ -104,9 +107,6 @@ def name_lines(
     tuple of Line
         Ascending in frequency, each line once per channel.
     """
-    if not seen:
-        return ()
-    velocities = [segment.velocity for segment in find_segments(log, 0.0)]
     bases = _bases(stage, velocities)
     named = [
         Line(frequency, amplitude, "m/s²", _kind(frequency, bases, resolution), channel)

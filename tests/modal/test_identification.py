@@ -19,13 +19,13 @@ from lmshealth.io.column_map import load_columns
 from lmshealth.io.log import Channel, Log
 from lmshealth.io.reading import read_log
 from lmshealth.modal import identification as modal
-from lmshealth.modal.ambient.cluster_fit import fit_cluster
+from lmshealth.modal.ambient.cluster_fit import BinnedSpectra, fit_cluster
 from lmshealth.modal.ambient.cluster_modes import ClusterFit
-from lmshealth.modal.ambient.log_spectra import BinnedSpectrum, LogSpectra
 from lmshealth.modal.identification import identify
 from lmshealth.modal.modes import Modes
 from lmshealth.modal.targets import Target, clusters
 from lmshealth.signal import segments, spectra
+from lmshealth.signal.spectra import LogSpectra
 from tests.signals import (
     Mode,
     acceleration_log,
@@ -498,9 +498,7 @@ def fitted(monkeypatch: pytest.MonkeyPatch) -> list[tuple[LogSpectra, tuple[Targ
     """List the views and targets that are fitted."""
     seen: list[tuple[LogSpectra, tuple[Target, ...]]] = []
 
-    def spy(
-        view: LogSpectra, binned: tuple[BinnedSpectrum, ...], targets: tuple[Target, ...]
-    ) -> ClusterFit:
+    def spy(view: LogSpectra, binned: BinnedSpectra, targets: tuple[Target, ...]) -> ClusterFit:
         seen.append((view, targets))
         return fit_cluster(view, binned, targets)
 

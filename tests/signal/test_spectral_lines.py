@@ -109,9 +109,8 @@ def test_records_too_short_have_no_lines() -> None:
 
 def named(frequency: float, velocity: float, order_mm: float = 4.0) -> str:
     """Name a line in a log of one velocity."""
-    log = make_log({"acc_a": np.zeros(8000)}, RATE, velocity=np.full(8000, velocity))
-    seen = [("acc_a", frequency, 1.0)]
-    (line,) = name_lines(seen, log, make_stage([("r", 105.0, 0.02)], order_mm=order_mm), 0.2)
+    seen, stage = [("acc_a", frequency, 1.0)], make_stage([("r", 105.0, 0.02)], order_mm=order_mm)
+    (line,) = name_lines(seen, [velocity], stage, 0.2)
     return line.kind
 
 

@@ -1,7 +1,8 @@
-"""Joint fit of a cluster of neighbouring modes to all channels.
+"""Joint fit of a cluster of neighbouring modes to all channels of a log.
 
-`fit_cluster` screens the modes on binned spectra, masks spectral lines, maximises the posterior
-and prunes modes without evidence.
+`bin_cluster` bins the spectra around a cluster, `locate` shifts described modes to their start
+values, and `fit_cluster` screens the modes, masks spectral lines, maximises the posterior, prunes
+modes without evidence, marginalises, and rejects estimates that are not credible.
 """
 
 from __future__ import annotations
@@ -13,18 +14,23 @@ import numpy as np
 from scipy.ndimage import median_filter
 from scipy.stats import gamma
 
-from lmshealth._arrays import ComplexArray, FloatArray
+from lmshealth._arrays import BoolArray, ComplexArray, FloatArray
 from lmshealth.modal import constants
-from lmshealth.modal.ambient.cluster_modes import ClusterFit, conclude
+from lmshealth.modal.ambient.cluster_modes import ClusterFit, ClusterModes, LineEstimate
 from lmshealth.modal.ambient.expected_periodogram import MeanOrdinates, average_ordinates
-from lmshealth.modal.ambient.initial_values import prepare, screen, strengths
-from lmshealth.modal.ambient.log_spectra import BinnedSpectrum, ClusterData, LogSpectra
-from lmshealth.modal.ambient.whittle import Likelihood, lay_out
-from lmshealth.modal.modes import Rejection
+from lmshealth.modal.ambient.whittle import Likelihood, lay_out, marginalise
+from lmshealth.modal.modes import Modes, Rejection, paired
+from lmshealth.modal.naming import shift_cost
 from lmshealth.modal.targets import Target
-from lmshealth.signal.spectra import CrossSpectrum, median_ordinate
+from lmshealth.signal.constants import LINE_WIDTH
+from lmshealth.signal.spectra import CrossSpectrum, LogSpectra, Spectrum, median_ordinate
 from lmshealth.stage.constants import BAND
 
+# Steps of the common shift and of the shift of each mode.
+_COMMON_STEPS, _OWN_STEPS = 41, 15
+# Multiplicative updates to convergence, and enough to rank candidates; their exponent over that
+# for which monotonicity is proved.
+_UPDATES, _FEW_UPDATES, _STRIDE = 25, 10, 1.8
 # Ordinates over which the level near a line is taken, and that it covers to either side.
 _LINE_NEIGHBOURS, _LINE_BINS = 41, 2
 _MOST_LINE_ROUNDS = 4
@@ -32,6 +38,53 @@ _MOST_LINE_ROUNDS = 4
 _SIGN_BAND = 1.5
 # Bins made for an expected bandwidth suffice for one that is narrower by this factor.
 _NARROWER = 0.7
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class BinnedSpectra:
+    """Spectra of all channels around a cluster, binned by medians, which lines do not move.
+
+    Attributes
+    ----------
+    frequency, count : ndarray
+        Mean frequency in Hz and number of ordinates of single segments, shape ``(n_bins,)``.
+    level : ndarray
+        Density from the median in (m/s²)²/Hz, shape ``(n_channels, n_bins)``.
+    neighbours : tuple of Target
+        Modes outside the band whose flanks reach into it.
+    """
+
+    frequency: FloatArray
+    level: FloatArray
+    count: FloatArray
+    neighbours: tuple[Target, ...] = ()
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ClusterData:
+    """Data that a cluster is fitted to.
+
+    Attributes
+    ----------
+    spectra : LogSpectra
+        The band, of the channels that show any of the modes, in units of their noise.
+    unit : ndarray
+        Root of the noise in (m/s²)/Hz^½, shape ``(n_channels,)``.
+    binned : BinnedSpectra
+        In the same units.
+    masks : tuple of ndarray of bool
+        Ordinates of each spectrum without lines.
+    """
+
+    spectra: LogSpectra
+    unit: FloatArray
+    binned: BinnedSpectra
+    masks: tuple[BoolArray, ...]
+
+    @property
+    def longest(self) -> int:
+        """Index of the spectrum with the longest observation."""
+        return int(np.argmax([s.observed for s in self.spectra.spectra]))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -44,8 +97,155 @@ class _Optimum:
     misfit: float
 
 
+def bin_cluster(
+    spectra: LogSpectra,
+    cluster: tuple[Target, ...],
+    targets: tuple[Target, ...],
+    top: float,
+    *,
+    searched: bool,
+) -> BinnedSpectra:
+    """Bin the band of a cluster below ``top`` in Hz; other targets near it become neighbours.
+
+    ``searched`` widens the band by the search of each mode.
+    """
+    searches = [searched * target.search for target in cluster]
+    low = min(t.band(BAND)[0] * (1 - s) for t, s in zip(cluster, searches, strict=True))
+    high = max(t.band(BAND)[1] * (1 + s) for t, s in zip(cluster, searches, strict=True))
+    high = min(high, top)
+    width = 0.5 * min(t.damping_ratio * t.frequency for t in cluster)
+    near = tuple(t for t in targets if t not in cluster and low / 1.3 < t.frequency < 1.3 * high)
+    return bin_spectra(spectra, low, high, width, near)
+
+
+def bin_spectra(
+    spectra: LogSpectra, low: float, high: float, width: float, neighbours: tuple[Target, ...] = ()
+) -> BinnedSpectra:
+    """Bin a band; bins of ``width``, all in Hz, are widened to hold at least four ordinates."""
+    cut = [spectrum.band(low, high) for spectrum in spectra.spectra]
+    frequency = np.concatenate([s.frequency for s in cut])
+    count = np.concatenate([np.full(s.frequency.size, float(s.count)) for s in cut])
+    order = np.argsort(frequency, kind="stable")
+    n_bins = max(3, min(int((high - low) / width), frequency.size // 4))
+    # The first bins hold one ordinate more than the others.
+    size, n_larger = divmod(frequency.size, n_bins)
+    larger, smaller = np.split(order, [n_larger * (size + 1)])
+    parts = [larger.reshape(n_larger, size + 1), smaller.reshape(n_bins - n_larger, size)]
+    levels = []
+    for c in range(len(spectra.channels)):
+        ordinates = np.concatenate([s.matrix[:, c, c].real / median_ordinate(s.count) for s in cut])
+        levels.append(np.concatenate([np.median(ordinates[part], axis=1) for part in parts]))
+    return BinnedSpectra(
+        np.concatenate([frequency[part].mean(axis=1) for part in parts]),
+        np.array(levels).clip(1e-300),
+        np.concatenate([count[part].sum(axis=1) for part in parts]),
+        neighbours,
+    )
+
+
+def fit_strengths(
+    binned: BinnedSpectra, targets: Sequence[Target]
+) -> tuple[FloatArray, FloatArray]:
+    """Fit the strengths of targets and neighbours and white noise as `incoherent_fit` does."""
+    modes = (*targets, *binned.neighbours)
+    f = np.array([mode.frequency for mode in modes])
+    return incoherent_fit(binned, f, np.array([mode.damping_ratio for mode in modes]))
+
+
+def incoherent_fit(
+    binned: BinnedSpectra, f: FloatArray, zeta: FloatArray, *, updates: int = _UPDATES
+) -> tuple[FloatArray, FloatArray]:
+    """Fit strengths of resonances and white noise to binned spectra, for many candidates.
+
+    Multiplicative updates maximise the Whittle likelihood and keep the strengths positive; least
+    squares would depend on the bins that happen to be low.
+
+    Parameters
+    ----------
+    binned : BinnedSpectra
+        Its neighbours have no effect.
+    f, zeta : ndarray
+        Natural frequencies in Hz and damping ratios, shape ``(..., n_modes)``.
+    updates : int
+        Number of updates.
+
+    Returns
+    -------
+    strength : ndarray
+        Modal PSD of each mode, then the noise PSD, shape ``(n_channels, ..., n_modes + 1)``.
+    misfit : ndarray
+        Whittle misfit, shape ``(n_channels, ...)``.
+
+    References
+    ----------
+    Fevotte2009
+    """
+    frequency, count = binned.frequency, binned.count
+    beta = f[..., None, :] / frequency[:, None]
+    shapes = 1 / ((1 - beta**2) ** 2 + (2 * zeta[..., None, :] * beta) ** 2)
+    design = np.concatenate([shapes, np.ones((*shapes.shape[:-1], 1))], axis=-1)
+    unit = design.mean(axis=-2)
+    design = design / unit[..., None, :]
+    levels = binned.level.reshape(-1, *[1] * (f.ndim - 1), count.size)
+    # Every part starts with an equal share of the mean level.
+    weight = np.average(levels, axis=-1, weights=count)[..., None] / unit.shape[-1]
+    weight = weight * np.ones(unit.shape)
+    transposed = np.swapaxes(design, -1, -2)
+    for _ in range(updates):
+        model = (design @ weight[..., None])[..., 0]
+        share = count / model
+        numerator = transposed @ (share * levels / model)[..., None]
+        denominator = transposed @ share[..., None]
+        weight = weight * np.sqrt(numerator / denominator)[..., 0] ** _STRIDE
+    model = (design @ weight[..., None])[..., 0]
+    misfit = np.sum(count * (np.log(model) + levels / model), axis=-1)
+    return weight / unit, np.asarray(misfit)
+
+
+def locate(
+    binned: BinnedSpectra, targets: tuple[Target, ...]
+) -> tuple[BinnedSpectra, tuple[Target, ...]]:
+    """Shift the targets to where all channels show them.
+
+    Wear moves all modes of a guide together, so that one mode may reach the described frequency of
+    another: a common shift is searched first, then a small one of each mode.
+
+    Returns
+    -------
+    binned : BinnedSpectra
+        With the neighbours moved by the common shift.
+    targets : tuple of Target
+        At their start values; ``nominal`` holds the described frequency.
+    """
+    own = len(targets)
+    modes = (*targets, *binned.neighbours)
+    nominal = np.array([mode.frequency for mode in modes])
+    zeta = np.array([mode.damping_ratio for mode in modes])
+    search = np.array([mode.search for mode in modes])
+
+    def best(shifts: FloatArray) -> FloatArray:
+        cost = shift_cost(shifts, search, own)
+        f = nominal * np.exp(shifts)
+        dampings = np.broadcast_to(zeta, f.shape)
+        cost += incoherent_fit(binned, f, dampings, updates=_FEW_UPDATES)[1].sum(axis=0)
+        return np.asarray(shifts[int(np.argmin(cost))])
+
+    reach = float(np.log1p(search.min()))
+    shift = best(np.linspace(-reach, reach, _COMMON_STEPS)[:, None] * np.ones(nominal.size))
+    for width in (3.0, 1.0):
+        for i in range(own):
+            moved = np.tile(shift, (_OWN_STEPS, 1))
+            moved[:, i] += width * zeta[i] * np.linspace(-1, 1, _OWN_STEPS)
+            shift = best(moved[np.abs(moved[:, i]) <= np.log1p(search[i])])
+    located = tuple(
+        replace(mode, frequency=float(f), nominal=mode.frequency)
+        for mode, f in zip(modes, nominal * np.exp(shift), strict=True)
+    )
+    return replace(binned, neighbours=located[own:]), located[:own]
+
+
 def fit_cluster(
-    spectra: LogSpectra, binned: tuple[BinnedSpectrum, ...], targets: tuple[Target, ...]
+    spectra: LogSpectra, binned: BinnedSpectra, targets: tuple[Target, ...]
 ) -> ClusterFit:
     """Fit the modes of a cluster to all channels that show any of them.
 
@@ -53,8 +253,8 @@ def fit_cluster(
     ----------
     spectra : LogSpectra
         All channels.
-    binned : tuple of BinnedSpectrum
-        Of each channel around the cluster, with its neighbours.
+    binned : BinnedSpectra
+        Of the same channels around the cluster, with its neighbours.
     targets : tuple of Target
         The modes at their start values.
     """
@@ -81,8 +281,56 @@ def fit_cluster(
         before, data = data, mask_residual_lines(data, expected)
         if data is before:
             break
-    fit = conclude(data, present, (optimum.likelihood, optimum.p), expected, gains)
+    fit = _conclude(data, optimum, expected, gains)
     return ClusterFit(fit.modes, _not_excited(absent, gains) | fit.rejected)
+
+
+def screen(
+    binned: BinnedSpectra, targets: tuple[Target, ...]
+) -> tuple[tuple[Target, ...], dict[str, float]]:
+    """Drop modes that the binned spectra do not need.
+
+    Returns those that remain, with refined start dampings, and the gain in log likelihood by each
+    mode, by name.
+    """
+
+    def misfit(some: tuple[Target, ...]) -> float:
+        return float(fit_strengths(binned, some)[1].sum())
+
+    scaled = (
+        tuple(replace(t, damping_ratio=t.damping_ratio * factor) for t in targets)
+        for factor in (0.5, 1.0, 2.0)
+    )
+    kept = min(scaled, key=misfit)
+    gains: dict[str, float] = {}
+    while kept:
+        full = misfit(kept)
+        losses = [misfit(kept[:i] + kept[i + 1 :]) - full for i in range(len(kept))]
+        gains |= {t.name: loss for t, loss in zip(kept, losses, strict=True)}
+        worst = int(np.argmin(losses))
+        if losses[worst] >= constants.ABSENT:
+            break
+        kept = kept[:worst] + kept[worst + 1 :]
+    return kept, gains
+
+
+def prepare(spectra: LogSpectra, binned: BinnedSpectra, present: tuple[Target, ...]) -> ClusterData:
+    """Select the channels that show any of the modes, and scale each by its noise."""
+    strength, misfit = fit_strengths(binned, present)
+    gains = fit_strengths(binned, ())[1] - misfit
+    index = [c for c, gain in enumerate(gains) if gain >= constants.ABSENT]
+    index = index or [int(np.argmax(gains))]
+    level = binned.level[index]
+    noise = np.maximum(strength[index, -1], 1e-2 * level.min(axis=1))
+    unit = np.sqrt(noise)
+    chosen = spectra.select(index)
+    scaled = tuple(replace(s, matrix=s.matrix / np.outer(unit, unit)) for s in chosen.spectra)
+    return ClusterData(
+        replace(chosen, spectra=scaled),
+        unit,
+        replace(binned, level=level / noise[:, None]),
+        tuple(s.free for s in scaled),
+    )
 
 
 def _not_excited(targets: Sequence[Target], gains: dict[str, float]) -> dict[str, Rejection]:
@@ -105,7 +353,7 @@ def mask_prominent_lines(data: ClusterData) -> ClusterData:
     own peak.
     """
     levels = [
-        np.stack([np.interp(s.frequency, one.frequency, one.level) for one in data.binned], axis=-1)
+        np.stack([np.interp(s.frequency, data.binned.frequency, x) for x in data.binned.level], -1)
         for s in data.spectra.spectra
     ]
     return _mask_above(data, [2 * level for level in levels])
@@ -138,7 +386,7 @@ def _mask_above(data: ClusterData, levels: list[FloatArray]) -> ClusterData:
     ``levels`` holds the mean level of each spectrum, shape ``(n_ordinates, n_channels)``.
     """
     n_free = sum(int(mask.sum()) for mask in data.masks)
-    false_alarm = constants.LINE_FALSE_ALARM / (len(data.binned) * n_free)
+    false_alarm = constants.LINE_FALSE_ALARM / (data.unit.size * n_free)
     masks = []
     found = False
     for spectrum, mask, level in zip(data.spectra.spectra, data.masks, levels, strict=True):
@@ -184,8 +432,10 @@ def _fit_and_prune(
     def evidence(full: _Optimum, less: _Optimum) -> float:
         """Twice the log evidence (BIC) for the modes that one has and the other has not."""
         extra = full.p.size - less.p.size
-        return float(2 * (less.misfit - full.misfit) - extra * np.log(data.n_ordinates))
+        return float(2 * (less.misfit - full.misfit) - extra * np.log(n_ordinates))
 
+    pairs = zip(data.spectra.spectra, data.masks, strict=True)
+    n_ordinates = sum(spectrum.count * int(mask.sum()) for spectrum, mask in pairs)
     bandwidth = min(2 * t.frequency * t.damping_ratio for t in present)
     blocks = make_blocks(data, bandwidth, [target.frequency for target in present])
     optimum = _solve(data, blocks, present)
@@ -221,14 +471,16 @@ def _solve(
     data: ClusterData, blocks: tuple[MeanOrdinates, ...], targets: tuple[Target, ...]
 ) -> _Optimum:
     """Find the posterior mode of a set of modes."""
-    n_channels = len(data.binned)
+    n_channels = data.unit.size
     zeta = np.array([target.damping_ratio for target in targets])
     # A strength of zero would leave a mode without a gradient.
-    least = np.outer([0.01 * channel.level.min() for channel in data.binned], 4 * zeta**2)
-    amplitude = np.sqrt(np.maximum(strengths(data.binned, targets)[0], least))
+    least = np.outer(0.01 * data.binned.level.min(axis=1), 4 * zeta**2)
+    strength, _ = fit_strengths(data.binned, targets)
+    amplitude = np.sqrt(np.maximum(strength[:, : len(targets)], least))
     reference = amplitude.argmax(axis=0).tolist()
     scale = amplitude.max(axis=0)
     layout = lay_out(reference, n_channels)
+    near = [target.band(_SIGN_BAND) for target in targets]
     start = np.concatenate(
         [
             np.log([target.frequency for target in targets]),
@@ -236,7 +488,7 @@ def _solve(
             np.zeros(layout.n_poles - 2 * len(targets)),
             [float(i == j) for i, j in layout.force],
             [
-                relative_sign(blocks, targets[i], c, reference[i]) * amplitude[c, i] / scale[i]
+                relative_sign(blocks, near[i], c, reference[i]) * amplitude[c, i] / scale[i]
                 for c, i in layout.shape
             ],
         ]
@@ -256,10 +508,10 @@ def _solve(
 
 
 def relative_sign(
-    blocks: tuple[MeanOrdinates, ...], target: Target, channel: int, reference: int
+    blocks: tuple[MeanOrdinates, ...], band: tuple[float, float], channel: int, reference: int
 ) -> float:
-    """Return the sign of the cross spectrum of two channels near a mode."""
-    low, high = target.band(_SIGN_BAND)
+    """Return the sign of the cross spectrum of two channels in a band in Hz."""
+    low, high = band
     total = 0.0
     for block in blocks:
         near = (block.frequency >= low) & (block.frequency <= high)
@@ -272,7 +524,7 @@ def _expected(data: ClusterData, optimum: _Optimum) -> list[ComplexArray]:
     m = optimum.likelihood.layout.n_modes
     bandwidth = float(np.min(2 * np.exp(optimum.p[:m] + optimum.p[m : 2 * m])))
     likelihood = replace(optimum.likelihood, blocks=make_blocks(data, bandwidth))
-    masked = np.diag(np.full(len(data.binned), np.inf)).astype(complex)
+    masked = np.diag(np.full(data.unit.size, np.inf)).astype(complex)
     full = [np.tile(masked, (mask.size, 1, 1)) for mask in data.masks]
     groups = group_lengths(data.spectra.spectra)
     for group, values in zip(groups, likelihood.expected(optimum.p), strict=True):
@@ -280,3 +532,148 @@ def _expected(data: ClusterData, optimum: _Optimum) -> list[ComplexArray]:
         for i in group:
             full[i][kept] = values
     return full
+
+
+def _conclude(
+    data: ClusterData, optimum: _Optimum, expected: list[ComplexArray], gains: dict[str, float]
+) -> ClusterFit:
+    """Marginalise the posterior, and publish the modes whose estimates are credible."""
+    targets, likelihood, p = optimum.targets, optimum.likelihood, optimum.p
+    names = tuple(target.name for target in targets)
+    estimate, cov, decrement = marginalise(likelihood, p)
+    if not decrement < constants.WORST_DECREMENT:
+        detail = f"the fit did not converge (Newton decrement {decrement:.2g}); record longer"
+        return ClusterFit(None, dict.fromkeys(names, Rejection("not-identified", detail)))
+    n, (f, zeta) = len(targets), np.exp(estimate).reshape(2, -1)
+    ratio = likelihood.signal_to_noise(p)
+    residual = _residual(data, expected)
+    dispersion = _dispersion(residual, f, zeta)
+    each = zip(targets, f.tolist(), zeta.tolist(), dispersion.tolist(), strict=True)
+    channels = data.spectra.channels
+    modes = Modes(
+        names=names,
+        sources=(data.spectra.source,) * n,
+        channels=tuple(channels[c] for c in ratio.argmax(axis=0)),
+        ln_frequency=estimate[:n],
+        ln_damping=estimate[n:],
+        cov=cov,
+        snr=ratio.sum(axis=0),
+        dispersion=dispersion,
+        flags=tuple(_flags(*one, residual.duration) for one in each),
+        shape_channels=channels,
+        shapes=_unit_shapes(data.unit * likelihood.shapes(p).T),
+        lines=(),
+        refused=(),
+    )
+    rejected: dict[str, Rejection] = {}
+    lines = masked_lines(data)
+    for i, target in enumerate(targets):
+        why = _incredible(modes, i, target, residual.duration)
+        if why is None:
+            continue
+        rejected[target.name] = why
+        if why.reason == "line-not-mode":
+            k = int(np.searchsorted(residual.frequency, f[i]))
+            lines.append(_read_line(data, max(0, k - _LINE_BINS), k + _LINE_BINS + 1))
+    clarity = np.array([gains[name] for name in names])
+    found = ClusterModes(modes, data.unit, clarity, tuple(lines), residual)
+    return ClusterFit(found.keep(name for name in names if name not in rejected), rejected)
+
+
+def _unit_shapes(shapes: FloatArray) -> FloatArray:
+    """Scale shapes, ``(n_modes, n_channels)``, to unit norm, the largest component positive."""
+    shapes = shapes / np.linalg.norm(shapes, axis=1, keepdims=True)
+    largest = np.take_along_axis(shapes, np.abs(shapes).argmax(axis=1, keepdims=True), axis=1)
+    return np.asarray(shapes * np.sign(largest))
+
+
+def _residual(data: ClusterData, expected: list[ComplexArray]) -> Spectrum:
+    """Divide the ordinates of the longest observation by their expectation: tr E⁻¹ W."""
+    spectrum, mask = data.spectra.spectra[data.longest], data.masks[data.longest]
+    n_channels = data.unit.size
+    ratio = np.ones(mask.size)
+    white = np.linalg.solve(expected[data.longest][mask], spectrum.matrix[mask])
+    ratio[mask] = np.trace(white, axis1=1, axis2=2).real / n_channels
+    return replace(spectrum.channel(0), periodogram=ratio, count=spectrum.count * n_channels)
+
+
+def _dispersion(residual: Spectrum, f: FloatArray, zeta: FloatArray) -> FloatArray:
+    """Return the variance of the residual within two half-power bandwidths over that of noise."""
+    off = np.abs(residual.frequency - f[:, None])
+    near = (off < 2 * (zeta * f)[:, None]) & (residual.periodogram != 1.0)
+    squares = residual.count * (residual.periodogram - 1.0) ** 2
+    n = near.sum(axis=1)
+    return np.where(n >= constants.LEAST_ORDINATES, near @ squares / n.clip(1), np.nan)
+
+
+def _flags(target: Target, f: float, zeta: float, dispersion: float, duration: float) -> str:
+    """Return the flags of a mode in segments of this duration."""
+    shift = abs(np.log(f / (target.nominal or target.frequency))) / np.log1p(target.search)
+    low, high = _damping_bounds(target)
+    bound = constants.AT_BOUND
+    flags = {
+        "resolution-limited": 2 * zeta * f * duration < constants.RESOLVED,
+        "at-bound": shift > bound or not low / bound < zeta < high * bound,
+        "loose-fit": dispersion > constants.LOOSE_FIT,
+    }
+    return " ".join(name for name, raised in flags.items() if raised)
+
+
+def _damping_bounds(target: Target) -> tuple[float, float]:
+    zeta, span = target.damping_ratio, constants.DAMPING_SPAN
+    return zeta / span, min(zeta * span, max(constants.MOST_DAMPING, 2 * zeta))
+
+
+def masked_lines(data: ClusterData) -> list[LineEstimate]:
+    """Return the masked lines of the longest observation, each in its strongest channel."""
+    masked = data.spectra.spectra[data.longest].free & ~data.masks[data.longest]
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], masked.astype(int), [0]])))
+    return [_read_line(data, int(a), int(b)) for a, b in edges.reshape(-1, 2)]
+
+
+def _read_line(data: ClusterData, first: int, last: int) -> LineEstimate:
+    """Read a line within some ordinates of the longest observation."""
+    spectrum = data.spectra.spectra[data.longest]
+    power = np.diagonal(spectrum.matrix[first:last], axis1=1, axis2=2).real.sum(axis=0)
+    c = int(np.argmax(power))
+    frequency, amplitude = spectrum.channel(c).sine(first, last)
+    return LineEstimate(data.spectra.channels[c], frequency, amplitude * float(data.unit[c]))
+
+
+def _incredible(modes: Modes, i: int, target: Target, duration: float) -> Rejection | None:
+    """Return why an estimate is not credible; None if it is."""
+    channel = modes.channels[i]
+    f, zeta = float(modes.frequency[i]), float(modes.damping_ratio[i])
+    std_f, std_zeta = np.sqrt(np.diag(modes.cov))[paired([i], len(modes.names))].tolist()
+    low, high = _damping_bounds(target)
+    if 2 * zeta * f * duration < 1:
+        return Rejection(
+            "line-not-mode",
+            f"{f:.5g} Hz in {channel} is narrower ({2 * zeta * f:.2g} Hz) than a record of "
+            f"{duration:.3g} s resolves",
+        )
+    if target.nominal is None and 2 * zeta < LINE_WIDTH:
+        return Rejection(
+            "line-not-mode", f"{f:.5g} Hz in {channel} is as narrow as a line that wanders"
+        )
+    if modes.dispersion[i] > constants.POOR_FIT:
+        return Rejection(
+            "poor-fit",
+            f"the residual near {f:.5g} Hz scatters {modes.dispersion[i]:.1f} times as much as "
+            "noise: lines, unsteady operation or an impact; choose a steadier part of the log",
+        )
+    described = target.nominal or target.frequency
+    if abs(np.log(f / described)) > np.log1p(target.search) or not low < zeta < high:
+        return Rejection(
+            "outside-search",
+            f"the fit in {channel} converged to {f:.5g} Hz, damping {zeta:.2g}; the search is "
+            f"within {100 * target.search:.0f} % of {described:.5g} Hz, damping from {low:.2g} "
+            f"to {high:.2g}",
+        )
+    if std_f > constants.WORST_STD_LN_F or std_zeta > constants.WORST_STD_LN_ZETA:
+        return Rejection(
+            "too-uncertain",
+            f"{f:.5g} Hz in {channel} has a standard deviation of {100 * std_f:.2g} %, its damping "
+            f"of {100 * std_zeta:.0f} %; record longer or excite more",
+        )
+    return None

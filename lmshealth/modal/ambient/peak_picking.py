@@ -24,10 +24,7 @@ _NEAR_LINE = (3, 4, 5, 6, 7, 8)
 
 
 def find_peaks(
-    channels: tuple[tuple[Spectrum, ...], ...],
-    low: float,
-    high: float,
-    lines: Sequence[float] = (),
+    channels: Sequence[Spectrum], low: float, high: float, lines: Sequence[float] = ()
 ) -> tuple[Target, ...]:
     """Return candidate modes of all channels in a band, ascending in frequency.
 
@@ -38,18 +35,18 @@ def find_peaks(
 
     Parameters
     ----------
-    channels : tuple of tuple of Spectrum
-        Spectra of each channel.
+    channels : sequence of Spectrum
+        The longest observation of each channel.
     low, high : float
         Band in Hz.
     lines : sequence of float
         Frequencies of lines in Hz, where no resonance is searched.
     """
     found: list[tuple[float, float, float]] = []
-    for spectra in channels:
-        longest = _without_lines(max(spectra, key=lambda spectrum: spectrum.observed), lines)
+    for spectrum in channels:
+        clear = _without_lines(spectrum, lines)
         for scale in _SCALES:
-            found += _peaks(longest, low, high, scale)
+            found += _peaks(clear, low, high, scale)
     chosen: list[tuple[float, float, float]] = []
     for score, frequency, scale in sorted(found, key=lambda c: (c[2], -c[0])):
         # A resonance is found at several scales and in several channels.

@@ -292,4 +292,4 @@ def _lines(log: Log, output: Channel, fit: ResponseFit) -> tuple[Line, ...]:
         amplitude = amplitude * (2 * np.pi * frequency) ** 2
     pairs = zip(frequency.tolist(), amplitude.tolist(), strict=True)
     seen = [(output.name, f, a) for f, a in pairs]
-    return name_lines(seen, log, None, fit.ordinates.spacing)
+    return name_lines(seen, (), None, fit.ordinates.spacing)

@@ -8,12 +8,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from lmshealth.modal.ambient.cluster_fit import _dispersion, _flags, _incredible
 from lmshealth.modal.ambient.cluster_modes import (
     ClusterFit,
     ClusterModes,
-    _dispersion,
-    _flags,
-    _incredible,
     merge_close_modes,
     refuse_close_modes,
 )
