@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Literal
 
 import numpy as np
@@ -27,18 +28,10 @@ BandKind = Literal["mode", "grid", "health", "watch"]
 
 @dataclass(frozen=True, slots=True)
 class FrequencyBand:
-    """A frequency band with one level.
+    """A frequency band with one level, its ends in Hz.
 
-    Attributes
-    ----------
-    name : str
-        Of the mode, or the band in Hz; the same in all logs.
-    kind : str
-        ``mode``, ``grid`` (no description), ``health`` or ``watch``.
-    low, high : float
-        In Hz.
-    placed_by : str
-        Source of the frequency of a mode: ``identified`` in this log, or ``stage``.
+    The name is that of the mode or the band in Hz, the same in all logs; `placed_by` is the source
+    of the frequency of a mode: ``identified`` in this log, or ``stage``.
     """
 
     name: str
@@ -54,21 +47,15 @@ class Magnitude:
 
     Attributes
     ----------
-    log, stage : str
-        Name of the log and identity of the machine, empty where unknown.
+    stage : str
+        Identity of the machine, empty where unknown.
     velocity : float
         Set velocity in m/s, NaN where unknown.
-    channel : str
-        Name of the accelerometer.
-    band : FrequencyBand
-    magnitude, frequency : float
-        Amplitude in m/s² and frequency in Hz of the strongest harmonic of the longest stretch.
-    resolution : float
-        Spacing of its harmonics in Hz.
-    rms : float
-        Of all stretches, in m/s².
-    dof : int
-        Degrees of freedom of the mean square: two per harmonic.
+    magnitude, frequency, resolution : float
+        Amplitude in m/s² and frequency in Hz of the strongest harmonic of the longest stretch, and
+        the spacing of its harmonics in Hz.
+    rms, dof : float, int
+        Of all stretches, in m/s², and the degrees of freedom of the mean square: two per harmonic.
     """
 
     log: str
@@ -92,17 +79,8 @@ class Magnitude:
 class Growth:
     """Regression of a level on velocity: ln level = constant + slope · ln velocity.
 
-    Attributes
-    ----------
-    stage, channel, band : str
-        Machine, accelerometer and name of the band.
-    n_logs, n_velocities : int
-        Number of points, and of different velocities.
-    slope, slope_std : float
-        Least squares, with its standard deviation from the residuals; NaN with fewer than two
-        velocities or three logs.
-    p_value : float
-        One-sided, of no growth (Student's t).
+    The standard deviation of the slope is that of the residuals, and the p value, of no growth, is
+    one-sided by Student's t; NaN with fewer than two velocities or three logs.
     """
 
     stage: str
@@ -143,21 +121,17 @@ def choose_bands(
     if stage is None:
         step = constants.GRID
         low, high = span or constants.GRID_BAND
-        grid = step * np.arange(np.ceil(low / step), np.floor(high / step) + 1)
+        grid = step * np.arange(max(1, np.ceil(low / step)), np.floor(high / step) + 1)
         return tuple(
-            FrequencyBand(f"{f:g} Hz", "grid", f - step / 2, f + step / 2)
-            for f in grid.tolist()
-            if f > 0
+            FrequencyBand(f"{f:g} Hz", "grid", f - step / 2, f + step / 2) for f in grid.tolist()
         )
-    bands = _mode_bands(stage, found or {}, span)
-    description = stage.description
-    if description.health_band_hz is not None:
-        low, high = description.health_band_hz
-        bands.append(FrequencyBand(f"{low:g}-{high:g} Hz", "health", low, high))
-    for watch in description.watch:
-        name = f"{watch.low_hz:g}-{watch.high_hz:g} Hz"
-        bands.append(FrequencyBand(name, "watch", watch.low_hz, watch.high_hz))
-    return tuple(bands)
+    health = stage.description.health_band_hz
+    wide: list[tuple[BandKind, float, float]] = [] if health is None else [("health", *health)]
+    wide += [("watch", band.low_hz, band.high_hz) for band in stage.description.watch]
+    return (
+        *_mode_bands(stage, found or {}, span),
+        *(FrequencyBand(f"{low:g}-{high:g} Hz", kind, low, high) for kind, low, high in wide),
+    )
 
 
 def _mode_bands(
@@ -170,17 +144,14 @@ def _mode_bands(
         for mode in stage.modes
         if low <= mode.frequency_hz <= high
     )
+    middles = [(a + b) / 2 for (a, *_), (b, *_) in pairwise(places)]
+    ends = pairwise([-np.inf, *middles, np.inf])
     bands = []
-    for i, (f, damping, name) in enumerate(places):
-        below = f * (1 - constants.BAND_WIDTHS * damping)
-        above = f * (1 + constants.BAND_WIDTHS * damping)
-        if i > 0:
-            below = max(below, (places[i - 1][0] + f) / 2)
-        if i + 1 < len(places):
-            above = min(above, (places[i + 1][0] + f) / 2)
-        bands.append(
-            FrequencyBand(name, "mode", below, above, "identified" if name in found else "stage")
-        )
+    for (f, damping, name), (least, most) in zip(places, ends, strict=False):
+        below = max(f * (1 - constants.BAND_WIDTHS * damping), least)
+        above = min(f * (1 + constants.BAND_WIDTHS * damping), most)
+        source = "identified" if name in found else "stage"
+        bands.append(FrequencyBand(name, "mode", below, above, source))
     return bands
 
 
@@ -189,19 +160,8 @@ def read_magnitudes(
 ) -> tuple[Magnitude, ...]:
     """Measure the levels of every accelerometer of a log in every band.
 
-    Parameters
-    ----------
-    log : Log
-        With at least one acceleration channel.
-    bands : iterable of FrequencyBand
-        Those above half the sample rate are omitted.
-    part : str
-        Motion phase; see `select_segments`.
-
-    Returns
-    -------
-    tuple of Magnitude
-        Channel by channel.
+    Bands above half the sample rate are omitted; `part` is a motion phase, see `select_segments`.
+    The result is ordered channel by channel.
 
     Raises
     ------
@@ -216,14 +176,12 @@ def read_magnitudes(
     channels = select_channels(log, "acceleration")
     segments = select_segments(log, part)
     usable = _usable(log, bands, max(s.stop - s.start for s in segments))
-    velocity = nominal_velocity(log)
-    return tuple(
-        Magnitude(log.name, log.metadata.stage or "", velocity, channel.name, band, *reading)
-        for channel in channels
-        for band, reading in zip(
-            usable, _read(channel, log.sample_rate, segments, usable), strict=True
-        )
-    )
+    stage, velocity = log.metadata.stage or "", nominal_velocity(log)
+    found: list[Magnitude] = []
+    for channel in channels:
+        read = zip(usable, _read(channel, log.sample_rate, segments, usable), strict=True)
+        found += [Magnitude(log.name, stage, velocity, channel.name, band, *r) for band, r in read]
+    return tuple(found)
 
 
 def _usable(log: Log, bands: Iterable[FrequencyBand], longest: int) -> list[FrequencyBand]:
@@ -231,21 +189,13 @@ def _usable(log: Log, bands: Iterable[FrequencyBand], longest: int) -> list[Freq
     usable = [band for band in asked if band.high < log.sample_rate / 2]
     if not usable:
         lowest = min((band.high for band in asked), default=np.nan)
-        raise BadLog(
-            log.name,
-            "sample-rate",
-            f"a sample rate of {log.sample_rate:g} Hz covers none of the bands; needed is more "
-            f"than {2 * lowest:.4g} Hz",
-        )
+        found = f"a sample rate of {log.sample_rate:g} Hz covers none of the bands"
+        raise BadLog(log.name, "sample-rate", f"{found}; needed is more than {2 * lowest:.4g} Hz")
     narrowest = min(band.high - band.low for band in usable)
     needed, seconds = constants.LEAST_ORDINATES / narrowest, longest / log.sample_rate
     if seconds < needed:
-        raise BadLog(
-            log.name,
-            "too-short",
-            f"the longest stretch has {seconds:.3g} s; a band of {narrowest:.3g} Hz needs "
-            f"{needed:.3g} s",
-        )
+        needs = f"a band of {narrowest:.3g} Hz needs {needed:.3g} s"
+        raise BadLog(log.name, "too-short", f"the longest stretch has {seconds:.3g} s; {needs}")
     return usable
 
 
@@ -258,7 +208,7 @@ def _read(
     """Return the last five fields of `Magnitude` in all bands, the longest stretch first."""
     ordered = sorted(segments, key=lambda s: s.start - s.stop)
     strongest: list[tuple[float, float, float]] = []
-    total, seconds = np.zeros(len(bands)), np.zeros(len(bands))
+    total, seconds = np.zeros((2, len(bands)))
     dof = np.zeros(len(bands), dtype=int)
     for segment in ordered:
         if segment.stop - segment.start < 2:

@@ -29,14 +29,10 @@ class FollowingError:
 
     Attributes
     ----------
-    channel : str
-        Its name.
     velocity : float
         Set velocity in m/s; NaN where unknown or where the log has several.
-    duration : float
-        Total duration of the statistics in s.
-    lowest, highest, std, mean : float
-        Of all samples, in m.
+    duration, lowest, highest, std, mean : float
+        Total duration in s, and statistics of all samples in m.
     harmonics : Harmonics
         Of the longest gap-free stretch, at most of a minute at 20 kHz.
     kept : ndarray
@@ -87,17 +83,10 @@ def read_error(
     ----------
     log : Log
         With at least one displacement channel.
-    count : int
-        Number of the strongest harmonics to keep.
-    floor : float
-        Amplitude of noise in m.
+    count, floor : int, float
+        Number of the strongest harmonics to keep, and amplitude of noise in m.
     part : str
         Motion phase; see `select_segments`.
-
-    Returns
-    -------
-    tuple of FollowingError
-        One per displacement channel.
 
     Raises
     ------
@@ -114,13 +103,9 @@ def read_error(
     longest = max(segments, key=lambda segment: segment.stop - segment.start)
     n, needed = longest.stop - longest.start, 2 * count + 1
     if n < needed:
-        raise BadLog(
-            log.name,
-            "too-short",
-            f"the longest stretch has {n / log.sample_rate:.3g} s; {count} harmonics need "
-            f"{needed / log.sample_rate:.3g} s: record longer or lower --count",
-        )
-
+        found = f"the longest stretch has {n / log.sample_rate:.3g} s"
+        needs = f"{count} harmonics need {needed / log.sample_rate:.3g} s"
+        raise BadLog(log.name, "too-short", f"{found}; {needs}: record longer or lower --count")
     velocity = nominal_velocity(log)
     duration = sum(s.stop - s.start for s in segments) / log.sample_rate
     readings = []
@@ -134,42 +119,28 @@ def read_error(
 
 
 def loop_error(log: Log) -> float | None:
-    """Measure the RMS following error from 1 to 40 Hz, which depends on the servo tuning.
+    """Measure the RMS following error in m from 1 to 40 Hz, which depends on the servo tuning.
 
-    Disturbances depend on velocity: only logs of one velocity are comparable.
-
-    Parameters
-    ----------
-    log : Log
-        Its stretches of constant velocity of two seconds or more, detrended.
-
-    Returns
-    -------
-    float or None
-        In m, stretches weighted by duration, channels equally. None without a displacement
-        channel, a stretch that resolves 1 Hz, or a sample rate above 80 Hz.
+    Stretches of constant velocity of two seconds or more are detrended and weighted by duration,
+    channels equally. Disturbances depend on velocity: only logs of one velocity are comparable.
+    None without a displacement channel, such a stretch, or a sample rate above 80 Hz.
     """
     low, high = constants.LOOP_BAND
     channels = [channel for channel in log.channels if channel.kind == "displacement"]
     segments = find_segments(log, constants.LOOP_PERIODS / low)
     if not channels or not segments or log.sample_rate <= 2 * high:
         return None
-    weights = [s.stop - s.start for s in segments]
     squares = [
-        np.average(
-            [_mean_square(c.values[s.start : s.stop], log.sample_rate) for s in segments],
-            weights=weights,
-        )
+        [_mean_square(c.values[s.start : s.stop], log.sample_rate) for s in segments]
         for c in channels
     ]
-    return float(np.sqrt(np.mean(squares)))
+    mean = [np.average(own, weights=[s.stop - s.start for s in segments]) for own in squares]
+    return float(np.sqrt(np.mean(mean)))
 
 
 def _mean_square(values: FloatArray, sample_rate: float) -> float:
-    """Return the mean square of a stretch in the band of the loop.
-
-    The window prevents leakage of drift below the band and of lines above it.
-    """
+    """Return the mean square of a stretch in the band of the loop."""
+    # The window prevents leakage of drift below the band and of lines above it.
     frequency, density = signal.periodogram(
         values, sample_rate, window="hann", detrend=signal.detrend, scaling="density"
     )
@@ -179,12 +150,9 @@ def _mean_square(values: FloatArray, sample_rate: float) -> float:
 
 def _statistics(channel: Channel, segments: Sequence[Segment]) -> tuple[float, float, float, float]:
     """Return minimum, maximum, standard deviation and mean of all samples."""
-    size, low, high, mean, var = np.array(
-        [
-            (x.size, x.min(), x.max(), x.mean(), x.var())
-            for x in (channel.values[s.start : s.stop] for s in segments)
-        ]
-    ).T
+    parts = (channel.values[s.start : s.stop] for s in segments)
+    moments = [(x.size, x.min(), x.max(), x.mean(), x.var()) for x in parts]
+    size, low, high, mean, var = np.array(moments).T
     total = float(np.average(mean, weights=size))
     scatter = float(np.average(var + (mean - total) ** 2, weights=size))
     return float(low.min()), float(high.max()), float(np.sqrt(scatter)), total

@@ -17,20 +17,8 @@ Indices = np.ndarray[tuple[int], np.dtype[np.intp]]
 class Harmonics:
     """A record as its mean and a sum of cosines, A cos(2πft + φ) with t from its first sample.
 
-    Attributes
-    ----------
-    mean : float
-        In the record's unit.
-    frequency : ndarray
-        In Hz, ascending from 1 / duration, shape ``(n_harmonics,)``.
-    amplitude : ndarray
-        In the record's unit, same shape.
-    phase : ndarray
-        In rad, of the cosine, same shape.
-    duration : float
-        Of the record, in s.
-    size : int
-        Samples of the record.
+    Frequencies in Hz, ascending from 1 / duration (s), amplitudes in the record's unit and phases
+    in rad have the shape ``(n_harmonics,)``; `size` is the number of samples.
     """
 
     mean: float
@@ -65,9 +53,8 @@ class Harmonics:
 
     def span(self, kept: Indices) -> tuple[float, float]:
         """Return lowest and highest frequency in Hz of some harmonics, NaN without any."""
-        if kept.size == 0:
-            return float("nan"), float("nan")
-        return float(self.frequency[kept].min()), float(self.frequency[kept].max())
+        own = self.frequency[kept]
+        return (float(own.min()), float(own.max())) if own.size else (float("nan"), float("nan"))
 
     def share(self, kept: Indices) -> float:
         """Return the share of the variance in some harmonics."""
@@ -86,15 +73,7 @@ class Harmonics:
 
 
 def decompose(values: FloatArray, sample_rate: float) -> Harmonics:
-    """Decompose a gap-free record into its harmonics.
-
-    Parameters
-    ----------
-    values : ndarray
-        Samples, shape ``(n_samples,)``, at least two.
-    sample_rate : float
-        In Hz.
-    """
+    """Decompose a gap-free record, at least two samples ``(n_samples,)``, into its harmonics."""
     n = values.size
     mean = float(values.mean())
     transform = fft.rfft(values - mean)[1:]

@@ -36,11 +36,7 @@ def detect_sinusoids(
     band: tuple[float, float],
     false_alarm: float,
 ) -> FloatArray:
-    """Detect the sinusoids that several segments have in common.
-
-    Octaves are tested in stretches of a thousand periods; Fisher's method combines their p values.
-    Detected lines are removed and weaker ones searched in their vicinity. See README.md for the
-    test and its limits.
+    """Detect the sinusoids that several segments have in common; README.md has test and limits.
 
     Parameters
     ----------
@@ -48,9 +44,7 @@ def detect_sinusoids(
         Samples of each segment; those less than half as long as the longest are omitted.
     read : callable
         Returns the samples of a segment by its number, shape ``(n,)``.
-    sample_rate : float
-        In Hz.
-    band : (float, float)
+    sample_rate, band : float, (float, float)
         In Hz; the first and last four ordinates cannot be tested.
     false_alarm : float
         Probability that segments without lines show any in the band, shared by all frequencies;
@@ -87,16 +81,9 @@ def _octaves(low: float, high: float) -> list[tuple[float, float]]:
 class _Octave:
     """Stretches and frequencies by which an octave is tested.
 
-    Attributes
-    ----------
-    sample_rate : float
-        In Hz.
-    n : int
-        Samples of a stretch; 0 where the segments are too short.
-    stretches : list of range
-        First samples of the stretches of each segment.
-    start, stop : int
-        Half-open range of indices of the padded transform of a stretch.
+    `n` are the samples of a stretch, 0 where the segments are too short; `stretches` the first
+    samples of those of each segment; `start` and `stop` a half-open range of indices of the padded
+    transform of a stretch.
     """
 
     sample_rate: float
@@ -123,17 +110,13 @@ def _plan(lengths: Sequence[int], sample_rate: float, low: float, high: float) -
     """Cut segments into stretches of one length, in which a line keeps its phase."""
     top = _EDGE * 2.0 ** np.ceil(np.log2(high / _EDGE))
     coherent = (1 / constants.LINE_WIDTH) * sample_rate
-    counts = [max(1, round(length * top / coherent)) for length in lengths]
-    room = min(
-        length // count
-        for length, count in zip(lengths, counts, strict=True)
-        if 2 * length >= max(lengths)
-    )
+    apart = [length // max(1, round(length * top / coherent)) for length in lengths]
+    room = min(own for own, size in zip(apart, lengths, strict=True) if 2 * size >= max(lengths))
     # A few samples are omitted for a fast transform.
     n = fft.prev_fast_len(room + 1, real=True) - 1 if room > 4 * _TAPERS else 0
     stretches = [
-        range(0, length - n + 1, length // count) if n and 2 * length >= max(lengths) else range(0)
-        for length, count in zip(lengths, counts, strict=True)
+        range(0, length - n + 1, own) if n and 2 * length >= max(lengths) else range(0)
+        for length, own in zip(lengths, apart, strict=True)
     ]
     size = _PER_ORDINATE * (n + 1)
     start, stop = (int(np.ceil(edge * size / sample_rate)) for edge in (low, high))
@@ -146,9 +129,7 @@ def _search(
 ) -> list[tuple[float, float]]:
     """Return frequency in Hz and amplitude of the lines of an octave."""
     evidence, power = np.zeros((2, octave.stop - octave.start))
-    count = 0
     for part in octave.each(read):
-        count += 1
         transform = fft.rfft(part, _PER_ORDINATE * (octave.n + 1))
         for first in range(octave.start, octave.stop, _BLOCK):
             stop = min(first + _BLOCK, octave.stop)
@@ -156,7 +137,7 @@ def _search(
             here = slice(first - octave.start, stop - octave.start)
             evidence[here] += _white(ratio)
             power[here] += squared
-    threshold = float(gamma.isf(p_value, count))
+    threshold = float(gamma.isf(p_value, sum(map(len, octave.stretches))))
     passed = np.flatnonzero(evidence > threshold)
     centres: list[int] = []
     for index in passed[np.argsort(-power[passed])].tolist():
@@ -165,7 +146,8 @@ def _search(
             centres.append(centre)
     low, high = octave.start * octave.ordinates, octave.stop * octave.ordinates
     found: list[tuple[float, float]] = []
-    for first, window in _windows(octave.each(read), centres):
+    starts = [centre - _WINDOW // 2 for centre in centres]
+    for first, window in zip(starts, _windows(octave.each(read), starts), strict=True):
         for ordinate, amplitude in _clean(window, first, threshold):
             # Windows overlap.
             new = all(abs(ordinate - other) > _TAPERS / 2 for other, _ in found)
@@ -174,20 +156,16 @@ def _search(
     return [(ordinate * octave.sample_rate / octave.n, amplitude) for ordinate, amplitude in found]
 
 
-def _windows(
-    stretches: Iterator[FloatArray], centres: list[int]
-) -> Iterator[tuple[int, ComplexArray]]:
-    """Yield first ordinate and series, ``(n_stretches, _WINDOW)``, of windows around centres."""
-    starts = [centre - _WINDOW // 2 for centre in centres]
-    cut: list[list[ComplexArray]] = [[] for _ in centres]
-    for part in stretches if centres else ():
+def _windows(stretches: Iterator[FloatArray], starts: list[int]) -> list[ComplexArray]:
+    """Return the series of windows, ``(n_stretches, _WINDOW)``, from their first ordinates on."""
+    cut: list[list[ComplexArray]] = [[] for _ in starts]
+    for part in stretches if starts else ():
         transform = fft.fft(part, norm="forward")
         for own, start in zip(cut, starts, strict=True):
             # The transform is periodic.
             index = np.arange(start, start + _WINDOW)
             own.append(fft.ifft(transform.take(index, mode="wrap"), norm="forward"))
-    for own, start in zip(cut, starts, strict=True):
-        yield start, np.array(own)
+    return [np.array(own) for own in cut]
 
 
 def _line_test(
@@ -280,16 +258,8 @@ def _clean(window: ComplexArray, first: int, threshold: float) -> list[tuple[flo
 class _LineFit:
     """Fit of a sine to a window.
 
-    Attributes
-    ----------
-    base : ndarray
-        Window demodulated by the sine, shape ``(n_stretches, _WINDOW)``.
-    carrier : ndarray
-        Conjugate of the sine, shape ``(_WINDOW,)``.
-    mean : ndarray
-        Complex amplitude of the sine, shape ``(n_stretches,)``.
-    ratio : ndarray
-        Power explained by the sine over the rest, shape ``(n_stretches,)``.
+    The window demodulated by the sine, shape ``(n_stretches, _WINDOW)``; the conjugate of the sine
+    ``(_WINDOW,)``; its complex amplitude, and its power over the rest, ``(n_stretches,)``.
     """
 
     base: ComplexArray

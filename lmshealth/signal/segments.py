@@ -28,17 +28,11 @@ _KINDS: tuple[Kind, ...] = ("ramp", "constant", "settling", "idle")
 
 @dataclass(frozen=True, slots=True)
 class Segment:
-    """A gap-free stretch of a log.
+    """A gap-free stretch of a log: a half-open range of samples.
 
-    Attributes
-    ----------
-    start, stop : int
-        Half-open range of samples.
-    velocity : float
-        Mean set velocity in m/s; NaN where the log has no set point.
-    kind : str
-        ``constant`` velocity, ``ramp`` between two velocities, ``settling`` after a move, ``idle``
-        otherwise at rest; ``whole`` where the log has no set point.
+    `velocity` is the mean set velocity in m/s; `kind` is ``constant`` velocity, ``ramp`` between
+    two velocities, ``settling`` after a move, or ``idle`` otherwise at rest. Where the log has no
+    set point they are NaN and ``whole``.
     """
 
     start: int
@@ -50,15 +44,7 @@ class Segment:
 def find_phases(log: Log) -> tuple[Segment, ...]:
     """Cut a log at its gaps and at changes of its motion phase.
 
-    Parameters
-    ----------
-    log : Log
-        Without a set point each gap-free piece is one segment.
-
-    Returns
-    -------
-    tuple of Segment
-        In order of time; together the whole log without its gaps.
+    In order of time; without a set point each gap-free piece is one segment.
     """
     velocity = log.reference_velocity
     if velocity is None:
@@ -95,19 +81,10 @@ def find_phases(log: Log) -> tuple[Segment, ...]:
 def find_segments(log: Log, shortest: float) -> tuple[Segment, ...]:
     """Cut a log into gap-free stretches in which it is stationary.
 
-    Parameters
-    ----------
-    log : Log
-        Segments are the stretches of constant velocity; without a set point, and in a log at rest
-        (ambient vibration), the gap-free pieces.
-    shortest : float
-        Least duration of a segment in s.
-
-    Returns
-    -------
-    tuple of Segment
-        In order of time; empty if none is long enough. A stretch of more than a minute at 20 kHz
-        is cut into parts of one length, each at least ten times ``shortest``.
+    These are the stretches of constant velocity of at least ``shortest`` s; without a set point,
+    and in a log at rest (ambient vibration), the gap-free pieces. A stretch of more than a minute
+    at 20 kHz is cut into parts of one length, each at least ten times ``shortest``. The result is
+    in order of time, and empty if no stretch is long enough.
     """
     return stationary(find_phases(log), round(shortest * log.sample_rate))
 
@@ -144,9 +121,8 @@ def _parts(segment: Segment, longest: int) -> list[Segment]:
 
 def _steady(velocity: FloatArray, lag: int, scale: float) -> BoolArray:
     """Return which samples have the same velocity ``lag`` samples before and after."""
-    change = np.abs(velocity[lag:] - velocity[:-lag]) > constants.VELOCITY_TOLERANCE * max(
-        scale, 1e-12
-    )
+    most = constants.VELOCITY_TOLERANCE * max(scale, 1e-12)
+    change = np.abs(velocity[lag:] - velocity[:-lag]) > most
     steady = np.ones(velocity.size, dtype=bool)
     for shift in (0, lag):
         steady[shift : shift + change.size] &= ~change
@@ -184,18 +160,9 @@ def select_channels(log: Log, kind: Literal["displacement", "acceleration"]) -> 
 def select_segments(log: Log, part: Part) -> tuple[Segment, ...]:
     """Select the gap-free stretches of one motion phase.
 
-    Parameters
-    ----------
-    log : Log
-        Without a set point only its whole record can be selected, also as ``constant``.
-    part : str
-        ``record`` (all of it, acceleration and braking included), ``constant`` velocity,
-        ``settling`` after a move, or ``idle``.
-
-    Returns
-    -------
-    tuple of Segment
-        At least one, in order of time, each of at most a minute at 20 kHz.
+    ``record`` is all of the log, acceleration and braking included; without a set point only it can
+    be selected, also as ``constant``. The result is at least one segment, in order of time, each of
+    at most a minute at 20 kHz.
 
     Raises
     ------
@@ -207,12 +174,9 @@ def select_segments(log: Log, part: Part) -> tuple[Segment, ...]:
         pieces = [Segment(start, stop, float("nan")) for start, stop in log.pieces]
         return tuple(cut for piece in pieces for cut in _parts(piece, MINUTE))
     if log.reference_velocity is None:
-        raise BadLog(
-            log.name,
-            "no-set-point",
-            f"no set point, which defines the part {part!r}; needed reference_position_mm or "
-            "reference_velocity_mm_s",
-        )
+        needed = "needed reference_position_mm or reference_velocity_mm_s"
+        detail = f"no set point, which defines the part {part!r}; {needed}"
+        raise BadLog(log.name, "no-set-point", detail)
     phases = find_phases(log)
     chosen = tuple(cut for phase in phases if phase.kind == part for cut in _parts(phase, MINUTE))
     if not chosen:

@@ -31,15 +31,11 @@ class Spectrum:
 
     Attributes
     ----------
-    frequency : ndarray
-        Fourier frequencies in Hz, shape ``(n_ordinates,)``.
-    periodogram : ndarray
-        One-sided periodogram in (m/s²)²/Hz: the power spectral density times the mean of
-        ``count`` exponential variables, shape ``(n_ordinates,)``.
-    duration : float
-        Of a segment in s.
-    velocity : float
-        Set velocity in m/s, NaN where unknown.
+    frequency, periodogram : ndarray
+        Fourier frequencies in Hz, and one-sided periodogram in (m/s²)²/Hz: the power spectral
+        density times the mean of ``count`` exponential variables, shape ``(n_ordinates,)``.
+    duration, velocity : float
+        Of a segment in s, and set velocity in m/s, NaN where unknown.
     count : int
         Number of averaged segments.
     """
@@ -53,8 +49,7 @@ class Spectrum:
     def __post_init__(self) -> None:
         if self.frequency.shape != self.periodogram.shape:
             raise ValueError("frequency and periodogram differ in shape")
-        self.frequency.setflags(write=False)
-        self.periodogram.setflags(write=False)
+        freeze(self)
 
     @property
     def observed(self) -> float:
@@ -69,7 +64,9 @@ class Spectrum:
 
     def near(self, line: float) -> slice:
         """Return the ordinates of a line: its relative width, at least two to either side."""
-        return _near(self.frequency, self.duration, line)
+        half = max(constants.LINE_WIDTH * line, 2 / self.duration)
+        first, last = np.searchsorted(self.frequency, [line - half, line + half])
+        return slice(int(first), int(last))
 
     def clear_of(self, lines: Sequence[float]) -> BoolArray:
         """Return which ordinates lie outside lines at these frequencies in Hz."""
@@ -94,23 +91,17 @@ class Spectrum:
 class CrossSpectrum:
     """All channels as acceleration over one segment, or the mean over several of one length.
 
+    Frequencies, duration, velocity and count are those of `Spectrum`.
+
     Attributes
     ----------
-    frequency : ndarray
-        Fourier frequencies in Hz, shape ``(n_ordinates,)``.
     matrix : ndarray
         F F*, F the transforms of all channels; its diagonal holds their one-sided periodograms in
         (m/s²)²/Hz, shape ``(n_ordinates, n_channels, n_channels)``.
-    duration : float
-        Of a segment in s.
-    velocity : float
-        Set velocity in m/s, NaN where unknown.
     free : ndarray of bool
         Ordinates without a removed or masked line, shape ``(n_ordinates,)``.
     lines : tuple of (int, float, float)
         Index of the channel, frequency in Hz and amplitude in m/s² of each removed sinusoid.
-    count : int
-        Number of averaged segments.
     """
 
     frequency: FloatArray
@@ -145,10 +136,7 @@ class CrossSpectrum:
 
     def without(self, lines: Sequence[float]) -> CrossSpectrum:
         """Mask the ordinates of lines at these frequencies in Hz."""
-        free = self.free.copy()
-        for line in lines:
-            free[_near(self.frequency, self.duration, line)] = False
-        return replace(self, free=free)
+        return replace(self, free=self.free & self.channel(0).clear_of(lines))
 
     def channel(self, index: int) -> Spectrum:
         """Return the spectrum of one channel."""
@@ -206,12 +194,6 @@ class LogSpectra:
         return replace(self, spectra=tuple(s.without(frequencies) for s in self.spectra))
 
 
-def _near(frequency: FloatArray, duration: float, line: float) -> slice:
-    half = max(constants.LINE_WIDTH * line, 2 / duration)
-    first, last = np.searchsorted(frequency, [line - half, line + half])
-    return slice(int(first), int(last))
-
-
 def median_ordinate(count: int) -> float:
     """Return the median of the mean of ``count`` exponential variables of mean 1."""
     return float(gamma.ppf(0.5, count)) / count
@@ -254,9 +236,7 @@ def cross_spectra(
         Displacements or accelerations.
     segments : sequence of Segment
         Which samples.
-    sample_rate : float
-        In Hz.
-    top, ceiling : float
+    sample_rate, top, ceiling : float
         In Hz, as in `periodogram`.
     resonances : sequence of ResonanceRange
         Possible resonances: where a segment does not resolve them no sinusoid is removed.
@@ -266,23 +246,21 @@ def cross_spectra(
     tuple of CrossSpectrum
         In the order of their first segments.
     """
-    return tuple(
-        _mean(
-            _cross_spectrum(channels, part, sample_rate, (top, ceiling), resonances)
-            for part in group
-        )
-        for group in _exchangeable(segments)
-    )
+
+    def transformed(part: Segment) -> CrossSpectrum:
+        return _cross_spectrum(channels, part, sample_rate, top, ceiling, resonances)
+
+    return tuple(_mean(map(transformed, group)) for group in _exchangeable(segments))
 
 
 def _cross_spectrum(
     channels: Sequence[Channel],
     segment: Segment,
     sample_rate: float,
-    reach: tuple[float, float],
+    top: float,
+    ceiling: float,
     resonances: Sequence[ResonanceRange],
 ) -> CrossSpectrum:
-    top, ceiling = reach
     parts = [as_acceleration(channel, segment, sample_rate, top) for channel in channels]
     # A second difference has no values at the ends; the other channels are cut there, too.
     short = max(lag for _, lag in parts)
@@ -319,24 +297,22 @@ def _frequencies(n: int, sample_rate: float, ceiling: float) -> FloatArray:
 def _exchangeable(segments: Sequence[Segment]) -> list[list[Segment]]:
     """Group long segments of one length and one set speed."""
     groups: list[list[Segment]] = []
-    long: list[list[Segment]] = []
     for segment in segments:
-        if segment.stop - segment.start < _LEAST_PART:
-            groups.append([segment])
-            continue
-        group = next((group for group in long if _same(group[0], segment)), None)
+        long = segment.stop - segment.start >= _LEAST_PART
+        alike = (group for group in groups if _same(group[0], segment))
+        group = next(alike, None) if long else None
         if group is None:
             groups.append([segment])
-            long.append(groups[-1])
         else:
             group.append(segment)
     return groups
 
 
 def _same(one: Segment, other: Segment) -> bool:
-    speed, another = abs(one.velocity), abs(other.velocity)
-    alike = np.isclose(speed, another, rtol=constants.SAME_VELOCITY, atol=0.0, equal_nan=True)
-    return one.stop - one.start == other.stop - other.start and bool(alike)
+    if one.stop - one.start != other.stop - other.start:
+        return False
+    speeds = abs(one.velocity), abs(other.velocity)
+    return bool(np.isclose(*speeds, rtol=constants.SAME_VELOCITY, atol=0.0, equal_nan=True))
 
 
 def _mean(spectra: Iterator[CrossSpectrum]) -> CrossSpectrum:
@@ -360,27 +336,18 @@ def periodogram(
 
     Mean and linear trend are removed. Of a displacement the second difference is transformed,
     over a lag that the top of the band permits, so that neither its large slow part nor its
-    amplified fast noise leaks into the band.
+    amplified fast noise leaks into the band. Ordinates reach from the first Fourier frequency to
+    below Nyquist, the ceiling, and for a displacement four times ``top``.
 
     Parameters
     ----------
-    channel : Channel
-        Displacement or acceleration.
-    segment : Segment
-        Which samples.
-    sample_rate : float
+    channel, segment : Channel, Segment
+        Displacement or acceleration, and which samples of it.
+    sample_rate, ceiling : float
         In Hz.
     top : float
         Highest frequency of interest in Hz, which sets the lag; by default Nyquist, at the price
         of leakage.
-    ceiling : float
-        Upper end of the ordinates in Hz.
-
-    Returns
-    -------
-    Spectrum
-        From the first Fourier frequency to below Nyquist, the ceiling, and for a displacement
-        four times ``top``.
     """
     x, lag = as_acceleration(channel, segment, sample_rate, top)
     if lag:
@@ -413,14 +380,9 @@ def _without_trend(x: FloatArray) -> FloatArray:
 def as_acceleration(
     channel: Channel, segment: Segment, sample_rate: float, top: float
 ) -> tuple[FloatArray, int]:
-    """Return a segment of a channel; of a displacement its second difference.
+    """Return a segment of a channel, or of a displacement its second difference; and its lag.
 
-    Returns
-    -------
-    values : ndarray
-        In m/s² up to `lag_gain`, shape ``(n,)``.
-    lag : int
-        Lag of the difference in samples; 0 for an acceleration.
+    The values, ``(n,)``, are in m/s² up to `lag_gain`; the lag in samples is 0 for an acceleration.
     """
     x = channel.values[segment.start : segment.stop]
     if channel.kind != "displacement":

@@ -16,20 +16,10 @@ from lmshealth.stage.description import Stage
 
 @dataclass(frozen=True, slots=True)
 class Line:
-    """A narrow spectral line that is not a mode.
+    """A narrow spectral line of a channel that is not a mode.
 
-    Attributes
-    ----------
-    frequency : float
-        In Hz.
-    amplitude : float
-        Of the sine, in ``unit``.
-    unit : str
-        SI unit of the amplitude.
-    kind : str
-        Name of an order of the stage, ``order of … mm``, ``mains`` or ``unknown``.
-    channel : str
-        Name of the channel.
+    Its frequency is in Hz and the amplitude of its sine in `unit`; `kind` is the name of an order
+    of the stage, ``order of … mm``, ``mains`` or ``unknown``.
     """
 
     frequency: float
@@ -46,30 +36,10 @@ def find_lines(
     band: tuple[float, float],
     false_alarm: float = constants.FALSE_ALARM,
 ) -> FloatArray:
-    """Find the narrow lines that segments have in common by Thomson's multitaper test.
+    """Find the narrow lines that segments, at least one, have in common; see `detect_sinusoids`.
 
-    Parameters
-    ----------
-    channel : Channel
-        Displacements are read as accelerations.
-    segments : sequence of Segment
-        At least one.
-    sample_rate : float
-        In Hz.
-    band : (float, float)
-        In Hz; the first and last four ordinates cannot be tested.
-    false_alarm : float
-        Probability that segments without lines show any in the band, as `detect_sinusoids`
-        defines it.
-
-    Returns
-    -------
-    ndarray
-        Frequency in Hz and amplitude in m/s² of each, ascending, shape ``(n_lines, 2)``.
-
-    References
-    ----------
-    Thomson1982, Riedel1995
+    Displacements are read as accelerations: frequency in Hz and amplitude in m/s² of each line,
+    ascending, shape ``(n_lines, 2)``.
     """
 
     def read(number: int) -> tuple[FloatArray, int]:
@@ -91,21 +61,9 @@ def name_lines(
 ) -> tuple[Line, ...]:
     """Name the source of each line: an order of the velocity, mains, or unknown.
 
-    Parameters
-    ----------
-    seen : sequence of (str, float, float)
-        Channel, frequency in Hz and amplitude in m/s² of each; a line may occur twice.
-    velocities : iterable of float
-        Set velocities of the log in m/s.
-    stage : Stage or None
-        For its orders.
-    resolution : float
-        Of the spectrum, in Hz.
-
-    Returns
-    -------
-    tuple of Line
-        Ascending in frequency, each line once per channel.
+    Seen are channel, frequency in Hz and amplitude in m/s² of each, which may occur twice; set
+    velocities of the log are in m/s, the resolution of the spectrum in Hz. The result is ascending
+    in frequency, each line once per channel.
     """
     bases = _bases(stage, velocities)
     named = [
@@ -133,25 +91,19 @@ def find_lines_by_velocity(
 ) -> tuple[Line, ...]:
     """Find the lines at every velocity of a log, and name those that are proportional to it.
 
+    Segments of one speed are searched together, those less than half as long as the longest are
+    omitted. A line that is no order of the description, but at one wavelength of several
+    velocities, is named ``order of … mm``. The result is ascending in frequency, each line once
+    per channel, at its strongest.
+
     Parameters
     ----------
-    log : Log
-        Its segments of one speed are searched together; those less than half as long as the
-        longest are omitted.
-    channels : sequence of Channel
-        Displacements or accelerations.
-    stage : Stage or None
-        For its orders. Any other line at one wavelength of several velocities is named
-        ``order of … mm``.
+    log, channels, stage : Log, sequence of Channel, Stage or None
+        The stage for its orders.
     band : (float, float)
         In Hz.
     false_alarm : float
         Probability that a channel without lines shows any, at all velocities together.
-
-    Returns
-    -------
-    tuple of Line
-        Ascending in frequency, each line once per channel, at its strongest.
     """
     segments = find_segments(log, 0.0)
     groups = _by_velocity(segments)
@@ -159,10 +111,8 @@ def find_lines_by_velocity(
     for channel in channels:
         detections = []
         for group in groups:
-            velocity = abs(group[0].velocity)
-            resolution = 0.5 * _ordinate(log, group)
-            bases = _bases(stage, [velocity])
-            share = false_alarm / len(groups)
+            velocity, resolution = abs(group[0].velocity), 0.5 * _ordinate(log, group)
+            bases, share = _bases(stage, [velocity]), false_alarm / len(groups)
             found = find_lines(channel, group, log.sample_rate, band, share)
             for frequency, amplitude in found.tolist():
                 kind = _kind(frequency, bases, resolution)
@@ -219,10 +169,8 @@ def _orders(unknown: Sequence[_Detection]) -> list[Line]:
     for one in unknown:
         kind = "unknown"
         for other in unknown:
-            apart = max(one.velocity, other.velocity) > constants.OTHER_VELOCITY * min(
-                one.velocity, other.velocity
-            )
-            if not (apart and one.velocity > 0 and other.velocity > 0):
+            slow, fast = sorted((one.velocity, other.velocity))
+            if not (slow > 0 and fast > constants.OTHER_VELOCITY * slow):
                 continue
             expected = one.line.frequency * other.velocity / one.velocity
             # The resolution of the first scales with the ratio of velocities.
@@ -237,9 +185,7 @@ def _without_duplicates(lines: Iterable[Line], resolution: float) -> tuple[Line,
     """Keep the strongest of equal lines of a channel, ascending in frequency."""
     kept: list[Line] = []
     for line in sorted(lines, key=lambda s: (s.channel, -s.amplitude)):
-        if all(
-            other.channel != line.channel or abs(other.frequency - line.frequency) >= 3 * resolution
-            for other in kept
-        ):
+        stronger = (other.frequency for other in kept if other.channel == line.channel)
+        if all(abs(frequency - line.frequency) >= 3 * resolution for frequency in stronger):
             kept.append(line)
     return tuple(sorted(kept, key=lambda line: (line.frequency, line.channel)))

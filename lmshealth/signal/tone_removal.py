@@ -41,7 +41,7 @@ class Sinusoid(NamedTuple):
 def remove_sinusoids(
     transforms: ComplexArray, duration: float, protected: BoolArray
 ) -> tuple[ComplexArray, BoolArray, tuple[Sinusoid, ...]]:
-    """Remove the strong sinusoids of a segment.
+    """Remove the strong sinusoids of a segment from its transforms.
 
     Parameters
     ----------
@@ -54,11 +54,9 @@ def remove_sinusoids(
 
     Returns
     -------
-    rest : ndarray
-        Transforms without them, same shape; at their ordinates noise is removed as well.
-    free : ndarray of bool
-        Ordinates without a sinusoid, shape ``(n_ordinates,)``.
-    sinusoids : tuple of Sinusoid
+    rest, free, sinusoids : ndarray, ndarray of bool, tuple of Sinusoid
+        Transforms without them (at their ordinates noise is removed as well), and the ordinates
+        without a sinusoid, shape ``(n_ordinates,)``.
     """
     free = np.ones(len(transforms), dtype=bool)
     if len(transforms) < 3 * _FAR:

@@ -25,12 +25,8 @@ _LEAST_SHARE = 1e-9
 class RelativeSpectrum:
     """Spectrum of a log relative to its median in the band of the tracked modes.
 
-    Attributes
-    ----------
-    low, high : float
-        Ends of the band in Hz.
-    level : ndarray
-        In dB, in bins of equal width in ln f, NaN above half the sample rate, shape ``(n_bins,)``.
+    Ends of the band in Hz, and level in dB in bins of equal width in ln f, NaN above half the
+    sample rate, shape ``(n_bins,)``.
     """
 
     low: float
@@ -51,14 +47,8 @@ class RelativeSpectrum:
 class Waterfall:
     """Relative spectra and lines of the logs of a machine.
 
-    Attributes
-    ----------
-    edges : ndarray
-        Edges of the bins in Hz, shape ``(n_bins + 1,)``.
-    level : ndarray
-        In dB, NaN where a log has none, shape ``(n_logs, n_bins)``.
-    lines : tuple of tuple of Line
-        Of each log, within the band.
+    Edges of the bins in Hz, shape ``(n_bins + 1,)``; levels in dB, NaN where a log has none,
+    ``(n_logs, n_bins)``; and the lines of each log within the band.
     """
 
     edges: FloatArray
@@ -72,16 +62,16 @@ class Waterfall:
     @classmethod
     def stack(cls, logs: Sequence[tuple[RelativeSpectrum | None, Sequence[Line]]]) -> Self | None:
         """Stack logs of one description; None without any spectrum."""
-        there = [levels for levels, _ in logs if levels is not None]
-        if not there:
+        first = next((levels for levels, _ in logs if levels is not None), None)
+        if first is None:
             return None
-        missing = np.full(there[0].level.size, np.nan)
-        low, high = there[0].low, there[0].high
+        missing = np.full(first.level.size, np.nan)
         return cls(
-            edges=there[0].edges,
+            edges=first.edges,
             level=np.stack([missing if own is None else own.level for own, _ in logs]),
             lines=tuple(
-                tuple(line for line in lines if low <= line.frequency <= high) for _, lines in logs
+                tuple(line for line in lines if first.low <= line.frequency <= first.high)
+                for _, lines in logs
             ),
         )
 
@@ -100,23 +90,11 @@ def relative_spectrum(
 ) -> RelativeSpectrum | None:
     """Compute the spectrum of a log relative to its median in the band of the tracked modes.
 
-    Periodograms of parts of the constant-velocity stretches are averaged within bins. Each channel
-    is divided by its median over the band, and the mean of all channels is returned: logs of
-    different velocity, load or sensors then differ in their resonances only.
-
-    Parameters
-    ----------
-    log : Log
-        Displacements and accelerations are used, both as accelerations.
-    stage : Stage
-        Its modes define the band.
-    n_bins : int
-        Number of bins.
-
-    Returns
-    -------
-    RelativeSpectrum or None
-        None without such a channel, a stretch of twenty periods, or a sufficient sample rate.
+    Periodograms of parts of the constant-velocity stretches are averaged within bins. Each channel,
+    also a displacement as acceleration, is divided by its median over the band, and the mean of all
+    channels is returned: logs of different velocity, load or sensors then differ in their
+    resonances only. None without a channel, a stretch of twenty periods, or a sufficient sample
+    rate.
     """
     low, high = shown_band(stage)
     edges = np.geomspace(low, high, n_bins + 1)
@@ -152,10 +130,8 @@ def _density(
     channel: Channel, segments: Sequence[Segment], sample_rate: float, edges: FloatArray
 ) -> FloatArray:
     """Average the power spectral density of a channel over stretches and within bins."""
-    spectra = [
-        periodogram(channel, segment, sample_rate, float(edges[-1]), ceiling=1.1 * float(edges[-1]))
-        for segment in segments
-    ]
+    top = float(edges[-1])
+    spectra = [periodogram(channel, s, sample_rate, top, ceiling=1.1 * top) for s in segments]
     duration = np.array([spectrum.duration for spectrum in spectra])
     binned = np.array([bin_density(spectrum, edges) for spectrum in spectra])
     return np.asarray(duration @ binned / duration.sum())
