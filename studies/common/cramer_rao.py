@@ -27,21 +27,9 @@ def band_factors(kappa: FloatArray | float) -> tuple[FloatArray, FloatArray]:
     takes of the damping,
 
         B_f = 2/π (arctan κ − κ/(κ² + 1)),
-        B_ζ = 2/π (arctan κ + κ/(κ² + 1) − 2 (arctan κ)²/κ).
+        B_ζ = 2/π (arctan κ + κ/(κ² + 1) − 2 (arctan κ)²/κ),
 
-    Parameters
-    ----------
-    kappa : ndarray or float
-        The band reaches from f (1 − κ ζ) to f (1 + κ ζ).
-
-    Returns
-    -------
-    b_f, b_zeta : ndarray
-        Of the shape of ``kappa``; both rise to 1 for a wide band.
-
-    References
-    ----------
-    Au2014
+    for a band from f (1 − κ ζ) to f (1 + κ ζ) (Au2014).
     """
     kappa = np.asarray(kappa, dtype=np.float64)
     arc, fraction = np.arctan(kappa), kappa / (kappa**2 + 1)
@@ -59,22 +47,7 @@ def long_record_law(
     """Predict standard deviations from a long, noise-free ambient record of a single mode.
 
     std(ln f) = √(ζ/(2π N_c B_f)) and std(ln ζ) = 1/√(2π ζ N_c B_ζ), where the record holds
-    N_c = f T cycles. It leaves out noise, which `ambient_bound` includes.
-
-    Parameters
-    ----------
-    frequency, damping_ratio, duration, kappa : ndarray or float
-        Natural frequency in Hz, damping ratio, total length of the records in s, and half width
-        of the band as of `band_factors`; broadcast against each other.
-
-    Returns
-    -------
-    std_ln_f, std_ln_zeta : ndarray
-        Coefficients of variation, of the broadcast shape.
-
-    References
-    ----------
-    Au2014
+    N_c = f T cycles, f is in Hz, T in s, and κ as in `band_factors` (Au2014).
     """
     zeta = np.asarray(damping_ratio, dtype=np.float64)
     cycles = np.asarray(frequency, dtype=np.float64) * duration
@@ -86,19 +59,11 @@ def long_record_law(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Vibration:
-    """Modes as channels see them.
+    """Modes as channels see them."""
 
-    Attributes
-    ----------
-    frequency, damping_ratio : ndarray
-        Natural frequencies in Hz and damping ratios, shape ``(n_modes,)``.
-    shapes : ndarray
-        Φ, real, shape ``(n_channels, n_modes)``.
-    """
-
-    frequency: FloatArray
-    damping_ratio: FloatArray
-    shapes: FloatArray
+    frequency: FloatArray  # in Hz, (n_modes,)
+    damping_ratio: FloatArray  # (n_modes,)
+    shapes: FloatArray  # Φ, real, (n_channels, n_modes)
 
     def __post_init__(self) -> None:
         n_modes = self.frequency.size
@@ -108,45 +73,21 @@ class Vibration:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Recording:
-    """What is recorded of them.
+    """What is recorded of them."""
 
-    Attributes
-    ----------
-    noise : ndarray
-        One-sided power spectral density of each channel's white noise, (m/s²)²/Hz, shape
-        ``(n_channels,)``.
-    duration : float
-        In s.
-    band : (float, float)
-        In which all is looked at, in Hz.
-    """
-
-    noise: FloatArray
-    duration: float
-    band: tuple[float, float]
+    noise: FloatArray  # one-sided density of each channel's white noise, (m/s²)²/Hz, (n_channels,)
+    duration: float  # in s
+    band: tuple[float, float]  # that is evaluated, in Hz
 
 
 def joint_bound(modes: Vibration, force: FloatArray, recording: Recording) -> FloatArray:
     """Bound the joint covariance of several, possibly close, modes from ambient accelerations.
 
     The channels have the power spectral density matrix Φ D Φᵀ + diag(S_e) with D = H S Hᴴ, where S
-    is that of the modal forces. Unknown besides frequencies and dampings are shapes, strengths,
-    the coherence of forces that are coherent, and each channel's noise.
-
-    Parameters
-    ----------
-    modes : Vibration
-        The modes.
-    force : ndarray
-        S, Hermitian, (m/s²)²/Hz, shape ``(n_modes, n_modes)``. Where it is diagonal the forces
-        are taken to be known as independent.
-    recording : Recording
-        One record. Of several records of one length the bound is that over their number.
-
-    Returns
-    -------
-    ndarray
-        Covariance of ``[ln f, ln ζ]``, shape ``(2 n_modes, 2 n_modes)``.
+    in (m/s²)²/Hz is the ``force``, Hermitian, ``(n_modes, n_modes)``; where it is 0 off the
+    diagonal, forces are known to be independent. Unknown besides frequencies and dampings are
+    shapes, strengths, the coherence of coherent forces, and each channel's noise. Returns the
+    covariance of ``[ln f, ln ζ]`` from one record; of several it is this over their number.
     """
     n, m = modes.shapes.shape
     f = fourier_frequencies(recording.duration, recording.band)
@@ -190,24 +131,9 @@ def decay_bound(
 
     Unknown besides frequencies and dampings are amplitude and phase of every decay in every
     channel, and the levels of all noises; what leaks into the band is known to be nothing.
-
-    Parameters
-    ----------
-    modes : Vibration
-        The modes.
-    amplitude : ndarray of complex
-        Of each mode's acceleration at the beginning of each decay, m/s², shape
-        ``(n_decays, n_modes)``.
-    ambient : ndarray
-        One-sided power spectral density S of each mode's force, (m/s²)²/Hz, shape ``(n_modes,)``.
-        Where it is 0 it is known to be.
-    recording : Recording
-        Each decay.
-
-    Returns
-    -------
-    ndarray
-        Covariance of ``[ln f, ln ζ]``, shape ``(2 n_modes, 2 n_modes)``.
+    ``amplitude`` is that of each mode's acceleration at the beginning of each decay, m/s²,
+    ``(n_decays, n_modes)``; ``ambient`` the one-sided density of each mode's force, (m/s²)²/Hz,
+    known to be 0 where it is. Returns the covariance of ``[ln f, ln ζ]``.
     """
     n, m = modes.shapes.shape
     f, zeta, duration = modes.frequency, modes.damping_ratio, recording.duration

@@ -46,65 +46,32 @@ def rng_of(*key: int) -> np.random.Generator:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Life:
-    """True state of a machine at every log.
-
-    Attributes
-    ----------
-    stage, kind : str
-        As in `models.lives`.
-    seed : int
-        Of its plan.
-    recorded_at : tuple of datetime
-        When, shape ``(n,)`` as all that follows.
-    travel : ndarray
-        Odometer in m.
-    covariates : dict of str to ndarray
-        Temperature in °C and payload in kg.
-    servo : ndarray of str
-        Which tuning.
-    event : int or None
-        First log after what happens once in this kind of life.
-    health : ndarray
-        Guide preload and mount stiffness as fractions of commissioning, shape ``(n, 2)``.
-    ln_frequency, ln_damping : ndarray
-        Of roll, pitch and yaw, shape ``(n, 3)``.
-    drift : ndarray
-        Of ln frequency since the first log at the reference temperature, the nominal payload and
-        the tuning of commissioning, shape ``(n, 3)``.
-    """
+    """True state of a machine at all n logs."""
 
     stage: str
     kind: str
-    seed: int
+    seed: int  # of its plan
     recorded_at: tuple[datetime, ...]
-    travel: Array
-    covariates: dict[str, Array]
-    servo: NDArray[np.str_]
-    event: int | None
-    health: Array
-    ln_frequency: Array
-    ln_damping: Array
+    travel: Array  # odometer in m
+    covariates: dict[str, Array]  # temperature in °C, payload in kg
+    servo: NDArray[np.str_]  # tuning
+    event: int | None  # first log after what happens once in this kind of life
+    health: Array  # guide preload and mount stiffness over those at commissioning, (n, 2)
+    ln_frequency: Array  # of roll, pitch and yaw, (n, 3)
+    ln_damping: Array  # (n, 3)
+    # Of ln frequency at the reference temperature, the nominal payload and the tuning of
+    # commissioning, (n, 3)
     drift: Array
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Estimates:
-    """Estimates of every log of a life.
+    """Estimates of every log of a life."""
 
-    Attributes
-    ----------
-    ln_frequency, ln_damping : ndarray
-        Shape ``(n, 3)``, NaN where a mode was not found.
-    cov : ndarray
-        Of both, shape ``(n, 6, 6)``.
-    loop_error : ndarray
-        RMS of the following error from 1 to 40 Hz in m, shape ``(n,)``.
-    """
-
-    ln_frequency: Array
-    ln_damping: Array
-    cov: Array
-    loop_error: Array
+    ln_frequency: Array  # (n, 3), NaN where a mode was not found
+    ln_damping: Array  # (n, 3)
+    cov: Array  # of both, (n, 6, 6)
+    loop_error: Array  # RMS of the following error from 1 to 40 Hz in m, (n,)
 
 
 def plan_of(stage: str, kind: str, seed: int, logs: int = 40) -> Plan:
@@ -177,16 +144,9 @@ def _modes(stage: str, condition: Condition) -> tuple[tuple[float, ...], tuple[f
 
 
 def drawn(life: Life, sizes: Estimates, sizes_of: Life, rng: np.random.Generator) -> Estimates:
-    """Draw estimates about the truth, each with the covariance of some really identified log.
+    """Draw estimates about a life, each with the covariance of some really identified log.
 
-    Parameters
-    ----------
-    life : Life
-        The truth.
-    sizes, sizes_of : Estimates and Life
-        Logs that were really identified, of both tunings, and their truth.
-    rng : Generator
-        Random numbers.
+    ``sizes`` are estimates of such logs, of both tunings, and ``sizes_of`` their truth.
     """
     n = len(life.recorded_at)
     picked = np.empty(n, dtype=int)
@@ -215,14 +175,8 @@ def history_of(
 ) -> History:
     """Make the history that a tracker is given.
 
-    Parameters
-    ----------
-    declared : bool
-        Whether logs carry their ``servo_id`` and maintenance records regreasing.
-    covariates : tuple of str
-        Which of them are known.
-    loop_error : bool
-        Whether the following error is there.
+    ``declared``: logs have their ``servo_id``, and regreasing is recorded; ``covariates``: those
+    that are known; ``loop_error``: whether the following error is.
     """
     n = len(life.recorded_at)
     return History(

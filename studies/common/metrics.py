@@ -1,10 +1,15 @@
-"""How good predictions of remaining life were, once the truth is known.
+"""Metrics of predictions of remaining life whose truth is known.
 
-A prediction is a set of draws, one column per life: ``(n_draws, n)``. A draw that is infinite never
-reaches its limit, and so does a truth that is infinite. All lengths are in one unit, m elsewhere in
-the package. A truth that is known only to lie beyond some travel is *censored* there: nothing that
-counts what lies beyond can be computed, and leaving such lives out biases all the rest. `crps` and
-`place` therefore take a horizon of each life.
+A prediction is a set of draws, one column per life: ``(n_draws, n)``; truths, horizons and results
+have the shape ``(n,)``, or one value for all, in the unit of the draws. Draws and truths that never
+reach their limit are infinite. A truth that is known only to lie beyond some travel is *censored*
+there: a count of what lies beyond cannot be computed, and to leave such lives out biases the rest.
+`crps` and `place` therefore take the horizon of each life.
+
+References
+----------
+Saxena2008, Saxena2010 for α-λ accuracy and horizons, Gneiting2007 and Gneiting2011 for the score,
+Czado2009 for places, Clopper1934 for intervals of shares, Susto2015 for services.
 """
 
 from __future__ import annotations
@@ -19,24 +24,9 @@ from lmshealth._arrays import BoolArray, FloatArray
 
 
 def mass_within(draws: FloatArray, truth: ArrayLike, margin: ArrayLike) -> FloatArray:
-    """Return the share of draws that lie within a margin of the truth.
-
-    Parameters
-    ----------
-    draws : ndarray
-        Shape ``(n_draws, n)``.
-    truth : array_like
-        Shape ``(n,)``. Within any margin of a truth that is infinite are infinite draws alone.
-    margin : array_like
-        In the unit of the draws, shape ``(n,)`` or one for all.
-
-    Returns
-    -------
-    ndarray
-        Shape ``(n,)``.
-    """
+    """Return the share of draws within a margin of the truth; of an infinite truth, of infinite."""
     draws, truth = np.asarray(draws, float), np.asarray(truth, float)
-    with np.errstate(invalid="ignore"):  # what never ends from what never ends
+    with np.errstate(invalid="ignore"):  # infinite minus infinite
         near = np.abs(draws - truth) <= np.asarray(margin, float)
     return np.asarray(np.mean(np.where(np.isfinite(truth), near, draws == truth), axis=0))
 
@@ -44,20 +34,7 @@ def mass_within(draws: FloatArray, truth: ArrayLike, margin: ArrayLike) -> Float
 def within(
     draws: FloatArray, truth: ArrayLike, margin: ArrayLike, *, mass: float | None = None
 ) -> BoolArray:
-    """Return which predictions lie within a margin of the truth.
-
-    Parameters
-    ----------
-    draws, truth, margin
-        As in `mass_within`.
-    mass : float, optional
-        What share of the draws must lie there, β of Saxena2010; by default the median must.
-
-    Returns
-    -------
-    ndarray of bool
-        Shape ``(n,)``.
-    """
+    """Return whether the median is within a margin of the truth, or a share ``mass`` of draws."""
     if mass is None:
         return np.asarray(mass_within(np.median(draws, axis=0)[None], truth, margin) == 1)
     return np.asarray(mass_within(draws, truth, margin) >= mass)
@@ -66,64 +43,17 @@ def within(
 def alpha_lambda(
     draws: FloatArray, truth: ArrayLike, alpha: float, *, mass: float | None = None
 ) -> BoolArray:
-    """Return which predictions lie within the share α of the true remaining life: α-λ accuracy.
-
-    Parameters
-    ----------
-    draws : ndarray
-        Remaining life, shape ``(n_draws, n)``.
-    truth : array_like
-        True remaining life at the same moment, positive, shape ``(n,)``.
-    alpha : float
-        As 0.2 for a fifth of what is left.
-    mass : float, optional
-        As in `within`.
-
-    Returns
-    -------
-    ndarray of bool
-        Shape ``(n,)``.
-
-    Raises
-    ------
-    ValueError
-        If a life is over.
-
-    References
-    ----------
-    Saxena2008 for the point form, Saxena2010 for the one by probability mass.
-    """
+    """Return `within` for a margin that is the share α of the true remaining life."""
     left = _left(truth)
     return within(draws, left, alpha * left, mass=mass)
 
 
 def relative_accuracy(draws: FloatArray, truth: ArrayLike) -> FloatArray:
-    """Return one minus the relative error of the median.
-
-    Parameters
-    ----------
-    draws, truth
-        As in `alpha_lambda`.
-
-    Returns
-    -------
-    ndarray
-        Shape ``(n,)``: 1 for a median that is right, 0 for one that is off by all that is left,
-        -inf where the median never ends and the life does.
-
-    Raises
-    ------
-    ValueError
-        If a life is over.
-
-    References
-    ----------
-    Saxena2008
-    """
+    """Return one minus the relative error of the median: -inf where only the median is infinite."""
     left, median = _left(truth), np.median(draws, axis=0)
     with np.errstate(invalid="ignore"):
         accuracy = 1 - np.abs(median - left) / left
-    # The limit for lives that get ever longer.
+    # The limit for ever longer lives.
     never = np.where(np.isfinite(median), 0.0, 1.0)
     return np.asarray(np.where(np.isfinite(left), accuracy, never))
 
@@ -131,48 +61,16 @@ def relative_accuracy(draws: FloatArray, truth: ArrayLike) -> FloatArray:
 def cumulative_relative_accuracy(
     accuracy: FloatArray, weights: FloatArray | None = None
 ) -> FloatArray:
-    """Average relative accuracies over the moments of prediction.
-
-    Parameters
-    ----------
-    accuracy : ndarray
-        Of `relative_accuracy`, shape ``(n_moments, n)``.
-    weights : ndarray, optional
-        Of each moment, shape ``(n_moments,)``; equal by default.
-
-    Returns
-    -------
-    ndarray
-        Shape ``(n,)``.
-
-    References
-    ----------
-    Saxena2008
-    """
+    """Average relative accuracies ``(n_moments, n)`` over the moments of prediction."""
     return np.asarray(np.average(accuracy, axis=0, weights=weights))
 
 
 def prognostic_horizon(held: BoolArray, left: FloatArray) -> FloatArray:
-    """Return the life that is left when predictions begin to be good and stay so.
+    """Return the remaining life from which on a criterion is met at all later moments.
 
-    Saxena2010 count from the first moment at which a criterion is met. Here it must be met at all
-    later moments too: a criterion that is met once by chance warns of nothing.
-
-    Parameters
-    ----------
-    held : ndarray of bool
-        Whether a criterion is met, as of `within`, shape ``(n_moments, n)``, in order of time.
-    left : ndarray
-        True remaining life at these moments, shape ``(n_moments, n)``.
-
-    Returns
-    -------
-    ndarray
-        Shape ``(n,)``; 0 where the last prediction does not meet it.
-
-    References
-    ----------
-    Saxena2008, Saxena2010
+    ``held`` and ``left``, the true remaining life, have the shape ``(n_moments, n)``, in order of
+    time. The result is 0 where the last prediction misses. Saxena2010 count from the first moment
+    that meets the criterion; one that is met once by chance warns of nothing.
     """
     held, left = np.asarray(held, bool), np.asarray(left, float)
     lasting = np.logical_and.accumulate(held[::-1], axis=0)[::-1]
@@ -181,35 +79,11 @@ def prognostic_horizon(held: BoolArray, left: FloatArray) -> FloatArray:
 
 
 def crps(draws: FloatArray, truth: ArrayLike, *, horizon: ArrayLike = np.inf) -> FloatArray:
-    """Return the continuous ranked probability score of draws, up to a horizon.
+    """Return the continuous ranked probability score of draws, up to a horizon; 0 is best.
 
     With F the distribution of the draws and y the truth it is ∫ (F(z) - 1{y ≤ z})² dz over all z
-    up to the horizon, which is the score of the draws and the truth cut off there. It is proper:
-    who states what he believes of life up to the horizon has the least expected score. A life that
-    is censored has its moment of censoring for horizon.
-
-    Parameters
-    ----------
-    draws : ndarray
-        Shape ``(n_draws, n)``.
-    truth : array_like
-        Shape ``(n,)``; of a censored life anything past the horizon, as infinity.
-    horizon : array_like
-        Shape ``(n,)`` or one for all. It must not depend on when the life ends.
-
-    Returns
-    -------
-    ndarray
-        In the unit of the draws, shape ``(n,)``; 0 is best. Of a single draw, its absolute error.
-
-    Raises
-    ------
-    ValueError
-        If draws or truths are infinite and there is no horizon.
-
-    References
-    ----------
-    Gneiting2007, Gneiting2011 for weights by thresholds.
+    up to the horizon, which is the score of draws and truth cut off there, and proper. The horizon
+    must not depend on the end of the life; that of a censored life is its moment of censoring.
     """
     x, y = np.minimum(draws, horizon), np.minimum(truth, horizon)
     if not (np.isfinite(x).all() and np.isfinite(y).all()):
@@ -221,37 +95,12 @@ def crps(draws: FloatArray, truth: ArrayLike, *, horizon: ArrayLike = np.inf) ->
 
 
 def place(
-    draws: FloatArray,
-    truth: ArrayLike,
-    rng: np.random.Generator,
-    *,
-    horizon: ArrayLike = np.inf,
+    draws: FloatArray, truth: ArrayLike, rng: np.random.Generator, *, horizon: ArrayLike = np.inf
 ) -> FloatArray:
     """Return the place of truths among draws, from 0 to 1: probability integral transforms.
 
-    Where draws equal the truth, as all do that lie beyond the horizon with it, the place is drawn
-    evenly from where they stand, so that places of truths that are one more draw are uniform.
-    Counting the draws below (0 for a certainty that is right), or the middle, is not.
-
-    Parameters
-    ----------
-    draws : ndarray
-        Shape ``(n_draws, n)``.
-    truth : array_like
-        Shape ``(n,)``.
-    rng : Generator
-        Breaks ties.
-    horizon : array_like
-        As in `crps`.
-
-    Returns
-    -------
-    ndarray
-        Shape ``(n,)``.
-
-    References
-    ----------
-    Czado2009
+    Among draws equal to the truth, as all that lie beyond the horizon with it, the place is drawn
+    at random, so that places of truths that are one more draw are uniform.
     """
     x, y = np.minimum(draws, horizon), np.minimum(truth, horizon)
     below, tied = np.sum(x < y, axis=0), np.sum(x == y, axis=0)
@@ -260,17 +109,7 @@ def place(
 
 @dataclass(frozen=True, slots=True)
 class Coverage:
-    """How often intervals hold the truth.
-
-    Attributes
-    ----------
-    nominal : float
-        How often they claim to.
-    hits, n : int
-        How often they do, of how many.
-    low, high : float
-        Interval of the share by Clopper and Pearson.
-    """
+    """Share of intervals that contain the truth, with its Clopper-Pearson interval."""
 
     nominal: float
     hits: int
@@ -280,42 +119,23 @@ class Coverage:
 
     @property
     def share(self) -> float:
-        """How often they do."""
+        """Measured coverage."""
         return self.hits / self.n
 
     @property
     def holds(self) -> bool:
-        """Whether that may be as often as they claim."""
+        """Whether the interval of the share contains the nominal coverage."""
         return self.low <= self.nominal <= self.high
 
 
 def coverage(places: FloatArray, nominal: float, *, level: float = 0.999) -> Coverage:
-    """Count how often central intervals hold the truth.
-
-    Parameters
-    ----------
-    places : ndarray
-        Of `place`, of any shape.
-    nominal : float
-        Probability of the intervals, as 0.9.
-    level : float
-        Of the interval of the share.
-
-    References
-    ----------
-    Clopper1934
-    """
+    """Count how often central intervals contain the truth, from places of any shape."""
     hits, n = int(np.sum(np.abs(np.asarray(places) - 0.5) < nominal / 2)), int(np.size(places))
     return Coverage(nominal, hits, n, *clopper_pearson(hits, n, level))
 
 
 def clopper_pearson(hits: int, trials: int, level: float = 0.95) -> tuple[float, float]:
-    """Return the exact interval of a proportion.
-
-    References
-    ----------
-    Clopper1934
-    """
+    """Return the exact interval of a proportion."""
     tail = (1 - level) / 2
     low = float(beta_distribution.ppf(tail, hits, trials - hits + 1)) if hits else 0.0
     high = float(beta_distribution.ppf(1 - tail, hits + 1, trials - hits)) if hits < trials else 1.0
@@ -323,22 +143,7 @@ def clopper_pearson(hits: int, trials: int, level: float = 0.95) -> tuple[float,
 
 
 def service_at(draws: FloatArray, risk: float, *, horizon: ArrayLike = np.inf) -> FloatArray:
-    """Return the latest service before which no more than a share of the draws have ended.
-
-    Parameters
-    ----------
-    draws : ndarray
-        Remaining life, shape ``(n_draws, n)``.
-    risk : float
-        The share, from 0 up to but not including 1.
-    horizon : array_like
-        The latest that is planned at all, shape ``(n,)`` or one for all.
-
-    Returns
-    -------
-    ndarray
-        Shape ``(n,)``; 0 where the risk is exceeded already.
-    """
+    """Return the latest service, up to a horizon, before which at most a share of draws end."""
     ordered = np.sort(draws, axis=0)
     # That many may have ended; a share that is whole is not lost by rounding.
     after = int(np.floor(risk * ordered.shape[0] * (1 + 1e-12)))
@@ -346,46 +151,14 @@ def service_at(draws: FloatArray, risk: float, *, horizon: ArrayLike = np.inf) -
 
 
 def unexpected_breaks(service: FloatArray, truth: ArrayLike) -> BoolArray:
-    """Return which lives end before their service.
-
-    Parameters
-    ----------
-    service, truth : array_like
-        When it is, as of `service_at`, and when the life ends, shape ``(n,)``.
-
-    Returns
-    -------
-    ndarray of bool
-        Shape ``(n,)``.
-
-    References
-    ----------
-    Susto2015
-    """
+    """Return which lives end before their service."""
     return np.asarray(np.asarray(truth) < service)
 
 
 def unexploited_life(
     service: FloatArray, truth: ArrayLike, *, horizon: ArrayLike = np.inf
 ) -> FloatArray:
-    """Return the life that a service throws away.
-
-    Parameters
-    ----------
-    service, truth : array_like
-        As in `unexpected_breaks`.
-    horizon : array_like
-        Life beyond it is not counted, shape ``(n,)`` or one for all.
-
-    Returns
-    -------
-    ndarray
-        Shape ``(n,)``; 0 where the life ends before.
-
-    References
-    ----------
-    Susto2015
-    """
+    """Return the life up to the horizon that a service discards; 0 where it ends before."""
     return np.asarray(np.maximum(np.minimum(truth, horizon) - service, 0.0))
 
 

@@ -37,43 +37,21 @@ STEPS = (
 
 @dataclass(frozen=True, slots=True)
 class Claim:
-    """One claim of a study.
+    """One claim of a study."""
 
-    Attributes
-    ----------
-    what : str
-        Quantity that is claimed.
-    figure : str
-        Measured value.
-    interval : str
-        Uncertainty: an interval or a Monte-Carlo error.
-    beside : str
-        Comparison in the same run: a peer, a bound, a requirement or a control.
-    met : bool
-        Whether the requirement is met.
-    """
-
-    what: str
-    figure: str
-    interval: str = ""
-    beside: str = ""
-    met: bool = True
+    what: str  # quantity that is claimed
+    figure: str  # measured value
+    interval: str = ""  # uncertainty: an interval or a Monte-Carlo error
+    beside: str = ""  # peer, bound, requirement or control in the same run
+    met: bool = True  # the requirement
 
 
 @dataclass(frozen=True, slots=True)
 class Older:
-    """A record that is older than a correction of the code that it measures.
+    """A record that is older than a correction of the code that it measures."""
 
-    Attributes
-    ----------
-    digest : str
-        First digits of the SHA-256 of the record: a new record ends the note.
-    why : str
-        Correction since then.
-    """
-
-    digest: str
-    why: str
+    digest: str  # first digits of the SHA-256 of the record: a new record ends the note
+    why: str  # correction since then
 
 
 def number(value: float) -> str:

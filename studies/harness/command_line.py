@@ -25,25 +25,10 @@ _GROUPS = {"lmshealth": ("lmshealth.cli.main", "main"), "models": ("models.__mai
 
 
 def call(program: str, *arguments: object, quick: bool, some_refused: bool = False) -> str:
-    """Call a command line, and give what it prints.
+    """Call ``lmshealth`` or ``models``, and return what it prints; exit if it fails.
 
-    Parameters
-    ----------
-    program : str
-        ``lmshealth`` or ``models``.
-    arguments : object
-        Told as text.
-    quick : bool
-        In this process, which has imported everything already, with short chains of health, lives
-        by importance sampling alone, and no pictures on pages: most of the time goes into these.
-        Not as a user calls it.
-    some_refused : bool
-        Whether logs may be refused.
-
-    Raises
-    ------
-    SystemExit
-        If it fails.
+    The quick call is in this process, which has imported everything already, with short chains of
+    health, lives by importance sampling alone, and no pictures: most of the time goes into these.
     """
     words = [str(word) for word in arguments]
     if quick:

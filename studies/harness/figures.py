@@ -25,20 +25,9 @@ def write(
     font: float = 10,
     **options: Any,
 ) -> None:
-    """Draw ``figure.svg`` beside ``figure.py`` from ``result.json``.
+    """Draw ``figure.svg`` beside ``figure.py``, ``script``, from ``result.json``.
 
-    Parameters
-    ----------
-    script : str
-        ``__file__`` of figure.py.
-    draw : callable
-        Fills the figure from the record.
-    size : tuple of float or callable
-        Width and height in inches, or a function of the record that returns them.
-    font : float
-        Font size in points.
-    options : object
-        Further arguments of `Figure.savefig`.
+    ``draw`` fills the figure; its size is in inches, or a function of the record.
     """
     record = read_record(script)
     folder = Path(script).parent

@@ -40,13 +40,7 @@ def free_port() -> int:
 
 
 def wait_until(done: Callable[[], bool], what: str, within_s: float = WAIT_S) -> None:
-    """Wait for something to become true.
-
-    Raises
-    ------
-    TimeoutError
-        If it takes too long; names the event.
-    """
+    """Wait for something to become true; raise TimeoutError, which names it, after too long."""
     end = time.monotonic() + within_s
     while not done():
         if time.monotonic() > end:
@@ -107,20 +101,10 @@ def missing_postgres() -> str | None:
 
 @dataclass
 class Postgres:
-    """A cluster of its own, with one user and a password.
+    """A cluster of its own, with one user and a password."""
 
-    Attributes
-    ----------
-    folder : Path
-        Holds the data, the Unix socket and the log.
-    port : int
-        Of 127.0.0.1, and in the name of the socket.
-    password : str
-        Of the only user.
-    """
-
-    folder: Path
-    port: int
+    folder: Path  # of the data, the Unix socket and the log
+    port: int  # of 127.0.0.1, and in the name of the socket
     password: str
     _process: Popen | None = None
 
@@ -223,24 +207,12 @@ _HERE_ALONE = ("--host", "127.0.0.1", "--no-dashboard", "--dashboard-address", "
 
 @dataclass
 class Cluster:
-    """A Dask scheduler and worker processes, without nannies: a killed worker is not restarted.
+    """A Dask scheduler and worker processes, without nannies: a killed worker is not restarted."""
 
-    Attributes
-    ----------
-    folder : str
-        Where workers keep what they need while they live.
-    address : str
-        Of the scheduler.
-    scheduler : Popen
-        Its process.
-    workers : list of Popen
-        Processes of the workers, those that were killed too.
-    """
-
-    folder: str
+    folder: str  # of what workers keep while they live
     address: str
     scheduler: Popen
-    workers: list[Popen] = field(default_factory=list)
+    workers: list[Popen] = field(default_factory=list)  # those that were killed too
 
     def add_worker(self) -> None:
         """Start one more worker of one thread."""

@@ -43,24 +43,9 @@ _PACKAGES = ("lmshealth", "numpy", "scipy", "emcee", "filterpy")
 class Study:
     """A run of a study: its options, its trials, its run time, its record.
 
-    Parameters
-    ----------
-    script : str
-        ``__file__`` of the script. ``run.py`` writes ``result.json``, any other script a record of
-        its own name.
-    doc : str
-        Docstring of the script; its first line is the question.
-    options : bool, int or str
-        Options of the command line beyond ``--quick``, by name, with their defaults.
-
-    Attributes
-    ----------
-    options : Namespace
-        Options as given.
-    quick : bool
-        Whether this is the quick form: a small part, nothing is recorded or kept.
-    trials : Trials
-        Trials that are computed once.
+    ``script`` is its ``__file__``: ``run.py`` writes ``result.json``, any other script a record of
+    its own name. The first line of ``doc`` is the question. Further arguments are options of the
+    command line with their defaults. ``quick`` is the form that records and keeps nothing.
     """
 
     def __init__(self, script: str, doc: str | None, **options: Any) -> None:
@@ -96,23 +81,9 @@ class Study:
     ) -> None:
         """Print the answer, record it unless this is the quick form, and exit on a failed check.
 
-        Parameters
-        ----------
-        answer : mapping
-            Results; ``passed`` has a bool for each check.
-        details : mapping, optional
-            Results that are recorded and not printed.
-        name : str, optional
-            Name of the record, if it is not that of the script.
-        not_met : iterable of str
-            Checks that are documented as not passed.
-        quick_may_fail : bool
-            Whether the quick form is too small to be judged.
-
-        Raises
-        ------
-        SystemExit
-            If another check has not passed.
+        ``passed`` of the answer has a bool for each check; those in ``not_met`` are documented as
+        not passed. ``details`` are recorded and not printed, in a record of another ``name`` than
+        the script's if it is given. A quick form that is too small to be judged may fail.
         """
         print(json.dumps(answer, indent=1))
         if not self.quick:
@@ -140,17 +111,9 @@ class Study:
 
 
 class Trials:
-    """Trials of a study, each computed once.
+    """Trials of a study, each computed once and kept in a file, if there is one.
 
-    Parameters
-    ----------
-    path : Path or None
-        File that keeps their values; None keeps nothing.
-
-    Attributes
-    ----------
-    kept_s : float
-        Run time in s of the trials whose values were kept before.
+    ``kept_s`` is the run time in s of the trials whose values were kept before.
     """
 
     def __init__(self, path: Path | None) -> None:
@@ -168,23 +131,11 @@ class Trials:
         also: Iterable[str] = (),
         pool: Executor | None = None,
     ) -> list[Any]:
-        """Compute trials, except those whose values are kept.
+        """Compute trials, except those whose values are kept, and return them in order.
 
-        Parameters
-        ----------
-        work : callable
-            Function of a module, or a partial of one; JSON can express its value.
-        tasks : iterable of tuples
-            Arguments of each trial: strings, numbers and the like.
-        also : iterable of str
-            Modules of the project that the work needs and does not import, as programs it starts.
-        pool : Executor, optional
-            Where trials are computed; one after the other without it.
-
-        Returns
-        -------
-        list
-            Values in the order of the tasks.
+        ``work`` is a function of a module, or a partial of one, and JSON can express its arguments
+        (``tasks``) and its value; ``also`` names modules of the project that it needs and does not
+        import, as programs that it starts.
         """
         tasks = [tuple(task) for task in tasks]
         if self._path is None:

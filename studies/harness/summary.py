@@ -25,29 +25,15 @@ _DIGITS = 12  # of the digest of a record that is older than a correction
 
 @dataclass(frozen=True, slots=True)
 class Record:
-    """A record of a study, or the place of a record that does not exist yet.
+    """A record of a study, or the place of a record that does not exist yet."""
 
-    Attributes
-    ----------
-    study, script, name : str
-        Folder, script in it, and record without its suffix.
-    step : str
-        Step of the method that it examines.
-    older : Older or None
-        Correction since it was recorded.
-    content : dict or None
-        Contents; None if there is no record.
-    claims : tuple of Claim
-        Claims computed from the contents.
-    """
-
-    study: str
+    study: str  # folder
     script: str
-    name: str
-    step: str
-    older: Older | None
+    name: str  # of the record, without suffix
+    step: str  # of the method that it examines
+    older: Older | None  # correction since it was recorded
     content: dict[str, Any] | None
-    claims: tuple[Claim, ...]
+    claims: tuple[Claim, ...]  # computed from the content
 
 
 def records() -> Iterator[Record]:
