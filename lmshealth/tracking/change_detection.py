@@ -1,18 +1,13 @@
 """Change detection: steps that nobody declared, and drift that begins.
 
-A mean innovation over the last logs raises a suspicion. Only then all kinds of change are weighed:
-the bank is taken from the checkpoint before the suspected log, a step is added to the model, and
-the logs are filtered again. The gain in log evidence is the log Bayes factor of a step at log j.
-
-A healthy machine is judged after every log, and a step may happen at every log. With prior
-probabilities π_j of the place that sum to one, Σ_j π_j B_j is a martingale of mean one if nothing
-happened [Ville1939]: the probability that it ever reaches 1/α is at most α, for any number of logs.
-Changes that are not weighed only reduce it.
+A mean innovation over the last logs raises a suspicion. Only then all kinds of change are weighed
+by their log Bayes factors, as the README of this folder describes; changes that are not weighed
+only reduce the probability of a false alarm.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Literal
@@ -21,7 +16,7 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from scipy import stats
 
-from lmshealth._arrays import BoolArray, FloatArray
+from lmshealth._arrays import FloatArray
 from lmshealth.tracking import constants
 from lmshealth.tracking.filter_bank import FilterBank, FilterModel, advance, restart
 from lmshealth.tracking.history import Step, StepKind
@@ -41,27 +36,22 @@ def _columns(n_rows: int) -> FloatArray:
     return np.hstack([np.eye(n_rows), np.repeat(np.eye(2), n_rows // 2, axis=0)])
 
 
-def running_sums(n_rows: int) -> FloatArray:
-    """Return the sums of standardised innovations, and their numbers, before the first log.
+def add_to_sums(sums: FloatArray, rows: np.ndarray, innovation: FloatArray) -> FloatArray:
+    """Add the standardised innovations of one log to running sums, and their numbers.
 
     The shape is ``(2, n_rows + 2)``: a column per row, one for all ln f, and one for all ln ζ,
     because grease changes all dampings.
     """
-    return np.zeros((2, n_rows + 2))
-
-
-def add_to_sums(sums: FloatArray, rows: np.ndarray, innovation: FloatArray) -> FloatArray:
-    """Return running sums with the innovations of one more log."""
     own = _columns(sums.shape[1] - 2)[rows]
     return np.asarray(sums + np.array([innovation @ own, own.sum(axis=0)]))
 
 
-def suspect(sums: Sequence[FloatArray], first: int, leaps: Sequence[int]) -> int | None:
+def suspect(sums: FloatArray, first: int, leaps: list[int]) -> int | None:
     """Return the log since which the following error, or else innovations, differ suspiciously.
 
-    `sums` has the running sums before the first log and after every log up to the present one,
-    `first` is the first log of the segment, and `leaps` the logs of unexplained leaps of the
-    following error, which locate a retuning better than innovations do.
+    `sums` are the running sums before the first log and after every log so far, `first` is the
+    first log of the segment, and `leaps` are those of `unexplained_leaps`, which locate a retuning
+    better than innovations do.
     """
     k = len(sums) - 2
     recent = [j for j in leaps if first <= j < k]
@@ -71,7 +61,7 @@ def suspect(sums: Sequence[FloatArray], first: int, leaps: Sequence[int]) -> int
     start = start[start >= first]
     if start.size == 0:
         return None
-    windows = sums[-1] - np.array([sums[j] for j in start])
+    windows = sums[-1] - sums[start]
     mean = np.abs(windows[:, 0]) / np.sqrt(np.maximum(windows[:, 1], 1))
     window, row = np.unravel_index(np.argmax(mean), mean.shape)
     return int(start[window]) if mean[window, row] > constants.SUSPICION_GATE else None
@@ -79,27 +69,13 @@ def suspect(sums: Sequence[FloatArray], first: int, leaps: Sequence[int]) -> int
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Change:
-    """The most likely change about a suspected log.
+    """The most likely change about a suspected log."""
 
-    Attributes
-    ----------
-    kind : str
-        Of the step, or ``drift`` where a rate begins.
-    source : str
-        The sensor's source; else empty.
-    first : int
-        First log after it.
-    log_bayes_factor : float
-        Against no change, with the prior of the unknown place.
-    log_odds : float
-        Against all other kinds of change together.
-    """
-
-    kind: ChangeKind
-    source: str
-    first: int
-    log_bayes_factor: float
-    log_odds: float
+    kind: ChangeKind  # of the step, or ``drift`` where a rate begins
+    source: str  # the sensor's source; else empty
+    first: int  # first log after it
+    log_bayes_factor: float  # against no change, with the prior of the unknown place
+    log_odds: float  # against all other kinds of change together
 
     @property
     def significant(self) -> bool:
@@ -172,47 +148,31 @@ def _gains(
         # Without a change of the following error, or without data of it, there is no retuning.
         if kind == "servo" and (loop is None or loop < 0):
             continue
-        changed = model.with_step(Step.found(kind, j, len(history.logs), source))
-        after = advance(changed, before.padded(changed.space.size), j, now)
+        stepped = model.with_step(Step.found(kind, j, len(history.logs), source))
+        after = advance(stepped, before.padded(stepped.space.size), j, now)
         gain = after.log_evidence - checkpoints[now].log_evidence + (loop or 0.0)
         gains[kind, source, j] = gain + place - float(np.log(len(kinds)))
-    unchanged = checkpoints[now].log_evidence - before.log_evidence
-    gains["drift", "", j] = _drift(model, before, now, j) - unchanged + place
+    gains["drift", "", j] = -np.inf
+    if before.hyperparameters.healthy.any():
+        # A healthy machine begins to change.
+        begun = restart(model, before.only(before.hyperparameters.healthy))
+        begun = begun.only(~begun.hyperparameters.healthy)
+        changed = advance(model, begun, j, now).log_evidence - begun.log_evidence
+        unchanged = checkpoints[now].log_evidence - before.log_evidence
+        gains["drift", "", j] = changed - unchanged + place
     return gains
 
 
-def _drift(model: FilterModel, before: FilterBank, now: int, j: int) -> float:
-    """Return the log evidence of the logs from j on if a healthy machine begins to change there."""
-    if not before.hyperparameters.healthy.any():
-        return -np.inf
-    begun = restart(model, before.only(before.hyperparameters.healthy))
-    begun = begun.only(~begun.hyperparameters.healthy)
-    return advance(model, begun, j, now).log_evidence - begun.log_evidence
-
-
 def unexplained_leaps(loop_error: FloatArray, steps: tuple[Step, ...]) -> list[int]:
-    """List logs since which two following errors in a row differ from those before.
+    """List logs since which two following errors in a row differ from the dozen before.
 
     Logs about a step that is in the model are left out.
     """
-    leaps: list[int] = np.flatnonzero(_leaps(loop_error)).tolist()
-    return [j for j in leaps if not _is_explained(steps, j)]
-
-
-def _is_explained(steps: tuple[Step, ...], j: int) -> bool:
-    """Return whether a step begins or ends about a log."""
-    there = [step.there[max(j + _ABOUT[0] - 1, 0) : j + _ABOUT[-1] + 1] for step in steps]
-    return any(part.any() and not part.all() for part in there)
-
-
-def _leaps(loop_error: FloatArray) -> BoolArray:
-    """Mark logs since which two following errors in a row differ from the dozen before."""
     values = _logarithms(loop_error)
-    leaps = np.zeros(values.size, dtype=bool)
     if values.size < constants.LOOP_FEWEST + 2:
-        return leaps
+        return []
     padded = np.concatenate([np.full(constants.LOOP_LOGS, np.nan), values])
-    before = sliding_window_view(padded, constants.LOOP_LOGS)[: values.size]
+    before = sliding_window_view(padded, constants.LOOP_LOGS)[: values.size - 1]
     there = np.isfinite(before)
     n = np.maximum(there.sum(axis=1), 2)
     mean = np.where(there, before, 0.0).sum(axis=1) / n
@@ -220,10 +180,15 @@ def _leaps(loop_error: FloatArray) -> BoolArray:
     std = np.sqrt(square.sum(axis=1) / (n - 1) * (1 + 1 / n))
     enough = (there.sum(axis=1) >= constants.LOOP_FEWEST) & (std > 0)
     reach = std * stats.t.isf(constants.LOOP_P_VALUE / 2, n - 1)
-    off = np.stack([values[:-1], values[1:]]) - mean[:-1]
-    same = (np.abs(off) > reach[:-1]).all(axis=0) & (off[0] * off[1] > 0)
-    leaps[:-1] = same & enough[:-1]
-    return leaps
+    off = np.stack([values[:-1], values[1:]]) - mean
+    leaps = (np.abs(off) > reach).all(axis=0) & (off[0] * off[1] > 0) & enough
+    return [j for j in np.flatnonzero(leaps).tolist() if not _is_explained(steps, j)]
+
+
+def _is_explained(steps: tuple[Step, ...], j: int) -> bool:
+    """Return whether a step begins or ends about a log."""
+    there = [step.there[max(j + _ABOUT[0] - 1, 0) : j + _ABOUT[-1] + 1] for step in steps]
+    return any(part.any() and not part.all() for part in there)
 
 
 def _logarithms(loop_error: FloatArray) -> FloatArray:
@@ -233,13 +198,10 @@ def _logarithms(loop_error: FloatArray) -> FloatArray:
 
 
 def loop_evidence(loop_error: FloatArray, first: int, now: int, kind: str) -> float | None:
-    """Return the log evidence of the following error below 40 Hz for a kind of step.
+    """Return the log evidence of the following error for a kind of step, from log `first` to `now`.
 
     The logarithms before and after are two samples of unknown variance; the Bayes factor of a
-    difference of their means has a closed form [Gonen2005].
-
-    `loop_error` is its RMS in m, shape ``(n_logs,)``, NaN where unknown; `first` and `now` are the
-    first log after the step and the last log. None where too few values exist.
+    difference of their means has a closed form [Gonen2005]. None where too few values exist.
     """
     values = _logarithms(loop_error)
     before = values[max(first - constants.LOOP_LOGS, 0) : first]

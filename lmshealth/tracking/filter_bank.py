@@ -32,27 +32,13 @@ _NEGLIGIBLE = float(np.log(1e-5))
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Hyperparameters:
-    """Process noise and noise scales, one set per filter.
+    """Process noise and noise scales, one set per filter: standard deviations of ln f and lives."""
 
-    Attributes
-    ----------
-    level_walk : ndarray
-        Standard deviation of the random walk of ln f over a life, shape ``(n,)``.
-    rate_std : ndarray
-        Standard deviation of the initial rate of ln f per life; 0 for a healthy machine, ``(n,)``.
-    rate_walk : ndarray
-        Standard deviation of the random walk of the rate over a life, shape ``(n,)``.
-    scales : ndarray
-        Factor on the reported standard deviations of each source, shape ``(n, n_sources)``.
-    log_prior : ndarray
-        Log of the prior probability, shape ``(n,)``.
-    """
-
-    level_walk: FloatArray
-    rate_std: FloatArray
-    rate_walk: FloatArray
-    scales: FloatArray
-    log_prior: FloatArray
+    level_walk: FloatArray  # of the random walk of ln f over a life, ``(n,)``
+    rate_std: FloatArray  # of the initial rate per life, 0 for a healthy machine, ``(n,)``
+    rate_walk: FloatArray  # of the random walk of the rate over a life, ``(n,)``
+    scales: FloatArray  # factor on the reported errors of each source, ``(n, n_sources)``
+    log_prior: FloatArray  # log of the prior probability, ``(n,)``
 
     @property
     def healthy(self) -> BoolArray:
@@ -84,24 +70,12 @@ def hyperparameter_grid(n_sources: int) -> Hyperparameters:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FilterBank:
-    """Filters of all hyperparameters that are left, at one log.
-
-    Attributes
-    ----------
-    hyperparameters : Hyperparameters
-        One set per filter.
-    log_weight : ndarray
-        Log of prior times evidence so far, shape ``(n,)``.
-    mean : ndarray
-        States, shape ``(n, size)``.
-    cov : ndarray
-        Their covariances, shape ``(n, size, size)``.
-    """
+    """Filters of all hyperparameters that are left, at one log."""
 
     hyperparameters: Hyperparameters
-    log_weight: FloatArray
-    mean: FloatArray
-    cov: FloatArray
+    log_weight: FloatArray  # log of prior times evidence so far, ``(n,)``
+    mean: FloatArray  # states, ``(n, size)``
+    cov: FloatArray  # their covariances, ``(n, size, size)``
 
     def only(self, keep: np.ndarray) -> FilterBank:
         """Return some of the filters, by index or mask."""
@@ -112,11 +86,8 @@ class FilterBank:
     def padded(self, size: int) -> FilterBank:
         """Return a bank with a longer state, whose new entries are exactly 0."""
         more = size - self.mean.shape[1]
-        return replace(
-            self,
-            mean=np.pad(self.mean, ((0, 0), (0, more))),
-            cov=np.pad(self.cov, ((0, 0), (0, more), (0, more))),
-        )
+        mean = np.pad(self.mean, ((0, 0), (0, more)))
+        return replace(self, mean=mean, cov=np.pad(self.cov, ((0, 0), (0, more), (0, more))))
 
     @property
     def weight(self) -> FloatArray:
@@ -154,63 +125,36 @@ class FilterBank:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Innovation:
-    """Innovations of one log, without outliers.
+    """Innovations of one log, without outliers, by mean and covariance of the mixture."""
 
-    Attributes
-    ----------
-    rows : ndarray of int
-        Rows of ``[ln f, ln ζ]`` that the log has, shape ``(n_rows,)``.
-    standardised : ndarray
-        By mean and variance of the mixture, shape ``(n_rows,)``.
-    nis : float
-        Normalised innovation squared, by mean and covariance of the mixture.
-    """
-
-    rows: np.ndarray
-    standardised: FloatArray
-    nis: float
+    rows: np.ndarray  # rows of ``[ln f, ln ζ]`` that the log has, ``(n_rows,)``
+    standardised: FloatArray  # ``(n_rows,)``
+    nis: float  # normalised innovation squared
 
 
 class FilterModel:
     """State space and measurements of a history, as the filters use them.
 
-    Parameters
-    ----------
-    space : StateSpace
-        The state and its measurement matrices.
-    baselines : collection of int
-        Logs at which a baseline begins.
-    reopened : collection of int
-        Logs before which rates have their prior variance again.
-
-    Attributes
-    ----------
-    values, there : ndarray
-        ``[ln f, ln ζ]`` and whether it exists, shape ``(n_logs, 2 n_series)``.
-    sources : tuple of str
-        Sources of estimates; `scale_of` has the index of the source of each row.
-    grid : Hyperparameters
-        Those that a bank starts with.
+    Rates have their prior variance again before the logs `reopened`. `values` are the estimates
+    ``[ln f, ln ζ]``, ``(n_logs, 2 n_series)``, `scale_of` the index of the source of each row, and
+    `grid` the hyperparameters that a bank starts with.
     """
 
-    def __init__(
-        self, space: StateSpace, baselines: Collection[int], reopened: Collection[int] = ()
-    ) -> None:
-        self.space, self.baselines, self.reopened = space, frozenset(baselines), frozenset(reopened)
-        history = space.history
+    def __init__(self, space: StateSpace, reopened: Collection[int] = ()) -> None:
+        self.space, self.reopened = space, frozenset(reopened)
+        history, r = space.history, len(space.history.series)
         self.values = np.hstack([history.ln_frequency, history.ln_damping])
         self.there = np.isfinite(self.values)
         self.complete: BoolArray = np.asarray(self.there.all(axis=1))
-        self.all_rows = np.arange(self.values.shape[1])
+        self.all_rows = np.arange(2 * r)
         self.sources = tuple(dict.fromkeys(one.source for one in history.series))
-        place = [self.sources.index(one.source) for one in history.series]
-        self.scale_of = np.array(place + place, dtype=int)
+        self.scale_of = np.array([self.sources.index(one.source) for one in history.series] * 2)
         self.grid = hyperparameter_grid(len(self.sources))
-        self.noise = history.cov
-        prior = np.square([constants.LN_F_STD, constants.LN_ZETA_STD])
-        self.outlier_variance = np.repeat(prior, len(history.series))
-        self.extra = np.zeros((len(history.logs), 2 * len(history.series)))
-        self.extra[:, : len(history.series)] = space.unknown()[:, None]
+        self.outlier_variance = np.repeat(np.square([constants.LN_F_STD, constants.LN_ZETA_STD]), r)
+        # Variance of ln f due to unknown covariates.
+        self.extra = np.zeros((len(history.logs), 2 * r))
+        for regressor in space.regressed:
+            self.extra[:, :r] += regressor.unknown[:, None]
 
     def with_step(self, step: Step) -> FilterModel:
         """Return the model with one more step."""
@@ -249,7 +193,7 @@ def predict(model: FilterModel, bank: FilterBank, k: int) -> FilterBank:
     for j, step in enumerate(space.steps):
         if step.first == k:
             _begin_step(space, cov, step, j)
-    if k in model.baselines:
+    if k in space.history.baselines:
         mean[:, base] = mean[:, level]
         cov[:, base, :] = cov[:, level, :]
         cov[:, :, base] = cov[:, :, level]
@@ -273,40 +217,25 @@ def _begin_step(space: StateSpace, cov: FloatArray, step: Step, j: int) -> None:
 def update(
     model: FilterModel, bank: FilterBank, k: int, outlying: np.ndarray | None = None
 ) -> tuple[FilterBank, Innovation]:
-    """Update all filters with the estimates of log k that exist.
+    """Update filters that are predicted to log k with its estimates; nothing is pruned.
 
-    Parameters
-    ----------
-    model : FilterModel
-        Of the history.
-    bank : FilterBank
-        Predicted to log k.
-    k : int
-        The log.
-    outlying : ndarray of bool, optional
-        Rows that are outliers, shape ``(2 n_series,)``: their variance is that of the prior.
-
-    Returns
-    -------
-    bank : FilterBank
-        Updated, not pruned.
-    innovation : Innovation
-        Of the rows that are no outliers.
+    Rows that are `outlying`, ``(2 n_series,)``, have the variance of the prior, and no innovation.
     """
     complete = model.complete[k]
     rows: np.ndarray = model.all_rows if complete else np.flatnonzero(model.there[k])
-    matrix, value = model.space.matrix(k)[rows], model.values[k, rows]
+    space = model.space
+    matrix, value = space.matrix(k)[rows], model.values[k, rows]
     if value.size == 0:
         return bank, Innovation(np.array([], dtype=int), np.array([]), 0.0)
     scales = bank.hyperparameters.scales[:, model.scale_of[rows]]
-    noise = model.noise[k] if complete else model.noise[k][np.ix_(rows, rows)]
+    noise = space.history.cov[k] if complete else space.history.cov[k][np.ix_(rows, rows)]
     log_weight = bank.log_weight
     n, size = bank.mean.shape
     # One product of all states with the matrix instead of one each.
     crossed = (bank.cov.reshape(-1, size) @ matrix.T).reshape(n, size, -1)
     total = matrix @ crossed + noise * scales[:, :, None] * scales[:, None, :]
     i = model.all_rows[: value.size]
-    total[:, i, i] += model.extra[k, rows]
+    _diagonal(total, slice(0, value.size))[:] += model.extra[k, rows]
     if outlying is not None:
         own = np.flatnonzero(outlying[rows])
         # The same for all hyperparameters: an outlier does not weigh them.

@@ -18,7 +18,7 @@ from lmshealth.tracking.filter_bank import (
     predict,
 )
 from lmshealth.tracking.history import History
-from lmshealth.tracking.state_space import state_space
+from lmshealth.tracking.state_space import StateSpace
 from lmshealth.tracking.track import Track
 
 # Filters that together have less of the posterior are left out.
@@ -64,10 +64,10 @@ def smooth(history: History, followed: Track, stage: Stage | None = None) -> Smo
     ----------
     Rauch1965.
     """
-    space = state_space(history, stage, followed.steps)
+    space = StateSpace(history, stage, followed.steps)
     # Where a segment begins, rates have their prior variance again.
     begun = {step.first for step in followed.steps if step.kind == "reset" or not step.declared}
-    model = FilterModel(space, history.baselines, begun - {0})
+    model = FilterModel(space, begun - {0})
     bank = advance(model, initial(model), 0, len(history.logs) - 1)
     order = np.argsort(bank.weight)
     bank = bank.only(order[np.cumsum(bank.weight[order]) > _SHARE])
@@ -113,7 +113,7 @@ def smooth_one(model: FilterModel, own: Hyperparameters) -> tuple[FloatArray, Fl
         rows = np.flatnonzero(model.there[k])
         if rows.size:
             scale = own.scales[0, model.scale_of[rows]]
-            noise = model.noise[k][np.ix_(rows, rows)] * np.outer(scale, scale)
+            noise = space.history.cov[k][np.ix_(rows, rows)] * np.outer(scale, scale)
             noise += np.diag(model.extra[k, rows])
             kalman.update(model.values[k, rows], R=noise, H=space.matrix(k)[rows])
         means[k], covs[k] = kalman.x, kalman.P

@@ -18,53 +18,34 @@ import numpy as np
 from lmshealth._arrays import FloatArray
 from lmshealth.stage.description import Stage
 from lmshealth.tracking import constants
-from lmshealth.tracking.covariates import Regressor, regressors
+from lmshealth.tracking.covariates import regressors
 from lmshealth.tracking.history import History, Step
 
 _KM = 1000.0
 
 
-def state_space(history: History, stage: Stage | None, steps: tuple[Step, ...] = ()) -> StateSpace:
-    """Return the state space of a history, with rates and random walks per life.
-
-    A life is the horizon of the stage, or without one the length of the history.
-    """
-    life = float(np.ptp(history.clock()))
-    if stage is not None and history.has_odometer:
-        life = stage.description.usage.horizon_km * _KM
-    return StateSpace(history, regressors(history.covariates, stage), life or 1.0, steps)
-
-
 class StateSpace:
     """Layout of the state, and the measurement matrices of a history.
 
-    Parameters
-    ----------
-    history : History
-        Modes, series and times of the logs.
-    regressed : tuple of Regressor
-        Covariates.
-    life : float
-        Length of a life on the clock.
-    steps : tuple of Step
-        Steps in the model.
+    Rates and random walks are per life: the horizon of the stage, or without one the length of the
+    history.
 
     Attributes
     ----------
     size : int
         Length of the state.
+    life : float
+        Length of a life on the clock.
     ticks : ndarray
         Parts of a life between each log and the one before, shape ``(n_logs,)``.
     """
 
-    def __init__(
-        self,
-        history: History,
-        regressed: tuple[Regressor, ...],
-        life: float,
-        steps: tuple[Step, ...] = (),
-    ) -> None:
-        self.history, self.regressed, self.life, self.steps = history, regressed, life, steps
+    def __init__(self, history: History, stage: Stage | None, steps: tuple[Step, ...] = ()) -> None:
+        self.history, self.steps = history, steps
+        regressed = self.regressed = regressors(history.covariates, stage)
+        self.life = float(np.ptp(history.clock())) or 1.0
+        if stage is not None and history.has_odometer:
+            self.life = stage.description.usage.horizon_km * _KM
         m = self.n_modes = len(history.modes)
         self.level, self.rate, self.damping, self.base = (
             slice(part * m, (part + 1) * m) for part in range(4)
@@ -73,7 +54,7 @@ class StateSpace:
         self.biased = self._biased()
         self.first_step = self.first_bias + 2 * len(self.biased)
         self.size = self.first_step + 2 * m * len(steps)
-        self.ticks = np.diff(history.clock(), prepend=history.clock()[:1]) / life
+        self.ticks = np.diff(history.clock(), prepend=history.clock()[:1]) / self.life
         self._fixed = self._without_steps()
         self._jumps = [(step, self._jump_matrix(step)) for step in steps]
 
@@ -164,13 +145,6 @@ class StateSpace:
             std[self.regressor(j)] = regressor.prior_std
         std[self.first_bias : self.first_step] = np.tile(constants.BIAS_STD, len(self.biased))
         return mean, np.diag(std**2)
-
-    def unknown(self) -> FloatArray:
-        """Return the variance of ln f due to unknown covariates, shape ``(n_logs,)``."""
-        total = np.zeros(len(self.history.logs))
-        for regressor in self.regressed:
-            total += regressor.unknown
-        return total
 
     def drift(self) -> FloatArray:
         """Return the contrast ℓ - ℓ₀ of a state, shape ``(n_modes, 4 n_modes)``."""

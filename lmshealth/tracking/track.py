@@ -24,7 +24,6 @@ from lmshealth.tracking.change_detection import (
     N_CHECKPOINTS,
     Change,
     add_to_sums,
-    running_sums,
     suspect,
     threshold,
     unexplained_leaps,
@@ -33,7 +32,6 @@ from lmshealth.tracking.change_detection import (
 from lmshealth.tracking.filter_bank import (
     FilterBank,
     FilterModel,
-    Innovation,
     advance,
     initial,
     predict,
@@ -41,7 +39,7 @@ from lmshealth.tracking.filter_bank import (
     update,
 )
 from lmshealth.tracking.history import History, Step
-from lmshealth.tracking.state_space import StateSpace, state_space
+from lmshealth.tracking.state_space import StateSpace
 
 EventKind = Literal["step", "regreasing", "servo", "sensor", "alarm"]
 
@@ -316,33 +314,8 @@ def track(history: History, stage: Stage | None = None) -> Track:
             f"{history.stage}: no modal estimate in {len(history.logs)} logs is of a known mode; "
             "a mode without a name is known once three logs show it"
         )
-    model = FilterModel(state_space(history, stage, history.steps), history.baselines)
+    model = FilterModel(StateSpace(history, stage, history.steps))
     return _Driver(model).run()
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Filtered:
-    """Innovations of one filtered log.
-
-    Attributes
-    ----------
-    innovation : Innovation
-        Without outliers.
-    outlying : ndarray of bool or None
-        Rows of the modes with an outlier, shape ``(2 n_series,)``.
-    """
-
-    innovation: Innovation
-    outlying: BoolArray | None
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Epoch:
-    """Published state of one log: mean, covariance, and the noise scale of each source."""
-
-    mean: FloatArray
-    cov: FloatArray
-    scale: FloatArray
 
 
 class _Driver:
@@ -359,9 +332,15 @@ class _Driver:
         # Banks after each of the last logs of the segment, and the first log of its windows.
         self.checkpoints: dict[int, FilterBank] = {}
         self.first = 1
-        self.filtered: list[_Filtered] = []
-        self.sums = [running_sums(model.values.shape[1])]
-        self.published: list[_Epoch] = []
+        n, n_rows = model.values.shape
+        size = self.size = 4 * len(self.history.modes)
+        # Of each log: NIS and innovations without outliers, rows of outliers, running sums.
+        self.nis, self.innovations = np.zeros(n), np.full((n, n_rows), np.nan)
+        self.outlying: dict[int, BoolArray] = {}
+        self.sums = np.zeros((n + 1, 2, n_rows + 2))
+        # Published: mean, covariance, noise scales, factor on standard deviations.
+        self.mean, self.cov = np.empty((n, size)), np.empty((n, size, size))
+        self.noise_scale = np.empty((n, len(model.sources)))
         self.widening = np.empty(0)
         self.leaps = unexplained_leaps(self.history.loop_error, model.space.steps)
         # Detected changes by the number of their step, with the log that detected them.
@@ -380,38 +359,37 @@ class _Driver:
                 self.alarmed = False
             self._filter(k, reject_outliers=k not in self.resets)
             self._detect(k)
-            self.published.append(self._publish(k))
+            self._publish(k)
         return self._track()
 
     def _begin_segment(self, bank: FilterBank, first: int) -> None:
         """Continue from a bank; evidence before the segment is not comparable."""
         self.bank, self.first, self.checkpoints = restart(self.model, bank), first, {}
 
-    def _filter(self, k: int, *, reject_outliers: bool = True) -> None:
-        """Filter log k; records of this log and later ones are dropped before.
+    def _filter(self, k: int, *, reject_outliers: bool) -> None:
+        """Filter log k, for the first time or again.
 
         An estimate outside the gate is an outlier until the next log confirms it; two outliers in
         a row are accepted.
         """
-        del self.filtered[k:], self.sums[k + 1 :]
-        model, before = self.model, self.bank
-        predicted = predict(model, before, k)
-        bank, full = update(model, predicted, k)
-        innovation, outlying = full, None
-        far = np.abs(full.standardised) > constants.OUTLIER_GATE
-        in_a_row = k > 1 and all(one.outlying is not None for one in self.filtered[k - 2 :])
-        if reject_outliers and far.any() and k - 1 in self.checkpoints and not in_a_row:
+        predicted = predict(self.model, self.bank, k)
+        bank, found = update(self.model, predicted, k)
+        self.sums[k + 1] = add_to_sums(self.sums[k], found.rows, found.standardised)
+        self.outlying.pop(k, None)
+        far = found.rows[np.abs(found.standardised) > constants.OUTLIER_GATE]
+        in_a_row = {k - 1, k - 2} <= self.outlying.keys()
+        if reject_outliers and far.size and k - 1 in self.checkpoints and not in_a_row:
             mode = np.tile(self.history.mode_of(), 2)
-            outlying = np.isin(mode, mode[full.rows[far]])
-            bank, innovation = update(model, predicted, k, outlying)
-        self.filtered.append(_Filtered(innovation, outlying))
-        self.sums.append(add_to_sums(self.sums[-1], full.rows, full.standardised))
+            self.outlying[k] = np.isin(mode, mode[far])
+            bank, found = update(self.model, predicted, k, self.outlying[k])
+        self.nis[k], self.innovations[k] = found.nis, np.nan
+        self.innovations[k, found.rows] = found.standardised
         self.bank = self.checkpoints[k] = bank.pruned()
         self.checkpoints.pop(k - N_CHECKPOINTS, None)
 
     def _detect(self, k: int) -> None:
         """Weigh a suspected change, and raise the alarm of a drift."""
-        suspected = suspect(self.sums, self.first, self.leaps)
+        suspected = suspect(self.sums[: k + 2], self.first, self.leaps)
         if self.open is not None and suspected is not None:
             # A significant change keeps its place until it is settled.
             suspected = self.open.first
@@ -452,7 +430,7 @@ class _Driver:
             self.changes[len(steps) - 1] = (change, k)
             self.leaps = unexplained_leaps(self.history.loop_error, steps)
             before = before.padded(self.model.space.size)
-        self._extend_widening(k)
+        self._extend_widening(k, self._dof())
         self._begin_segment(before, j + 1)
         for again in range(j, k + 1):
             self._filter(again, reject_outliers=False)
@@ -465,7 +443,7 @@ class _Driver:
         if self.alarmed:
             return
         self.alarmed = True
-        mean, cov = self.bank.collapse(4 * len(self.history.modes))
+        mean, cov = self.bank.collapse(self.size)
         contrast = self.model.space.drift()
         drift = contrast @ mean
         std = np.sqrt(np.maximum(np.diag(contrast @ cov @ contrast.T), 0.0))
@@ -475,40 +453,32 @@ class _Driver:
             Event("alarm", k, mode, "", size, float(std[i]), evidence, declared=False, found_at=k)
         )
 
-    def _publish(self, k: int) -> _Epoch:
-        size = 4 * len(self.history.modes)
-        mean, cov = self.bank.collapse(size)
-        if self.filtered[k].outlying is not None:
+    def _publish(self, k: int) -> None:
+        """Record the state of log k, and the noise scale of each source."""
+        mean, cov = self.bank.collapse(self.size)
+        if k in self.outlying:
             # As likely an outlier as the first log after a step: publish the mixture of both.
             stepped = self.model.with_step(Step.found("step", k, len(self.history.logs)))
             before = self.checkpoints[k - 1].padded(stepped.space.size)
-            other, other_cov = advance(stepped, before, k, k).collapse(size)
+            other, other_cov = advance(stepped, before, k, k).collapse(self.size)
             off = 0.5 * (other - mean)
             mean, cov = mean + off, 0.5 * (cov + other_cov) + np.outer(off, off)
-        return _Epoch(mean, cov, self.bank.weight @ self.bank.hyperparameters.scales)
+        self.mean[k], self.cov[k] = mean, cov
+        self.noise_scale[k] = self.bank.weight @ self.bank.hyperparameters.scales
 
-    def _innovations(self) -> FloatArray:
-        """Return standardised innovations of all filtered logs, NaN where there are none."""
-        found = np.full((len(self.filtered), self.model.values.shape[1]), np.nan)
-        for k, one in enumerate(self.filtered):
-            found[k, one.innovation.rows] = one.innovation.standardised
-        return found
-
-    def _dof(self, innovations: FloatArray) -> FloatArray:
+    def _dof(self) -> FloatArray:
         """Count the innovations of each log; the first estimate of a mode has none."""
         history = self.history
-        there = np.isfinite(innovations)
+        there = np.isfinite(self.innovations)
         for mode in history.modes:
             own = np.array(history.columns(mode), dtype=int)
             seen = np.cumsum(np.isfinite(history.ln_frequency[:, own]).any(axis=1)) > 1
-            there[:, np.r_[own, own + len(history.series)]] &= seen[: len(there), None]
+            there[:, np.r_[own, own + len(history.series)]] &= seen[:, None]
         return np.asarray(there.sum(axis=1), dtype=float)
 
-    def _extend_widening(self, n: int) -> None:
+    def _extend_widening(self, n: int, dof: FloatArray) -> None:
         """Fix the widening of the first n logs, before some of them are filtered again."""
-        innovations = self._innovations()
-        nis = np.array([one.innovation.nis for one in self.filtered])
-        factor = _widening(nis[:n], self._dof(innovations)[:n], innovations[:n])
+        factor = _widening(self.nis[:n], dof[:n], self.innovations[:n])
         self.widening = np.append(self.widening, factor[self.widening.size :])
 
     def _undetected(self) -> BoolArray:
@@ -520,16 +490,14 @@ class _Driver:
         return np.hstack([ln_f, ln_f, ln_zeta, ln_f])
 
     def _track(self) -> Track:
-        history, space = self.history, self.model.space
-        mean = np.array([one.mean for one in self.published])
-        cov = np.array([one.cov for one in self.published])
-        drift, drift_cov = _drifts(space, mean, cov)
-        self._extend_widening(len(history.logs))
-        innovations, widening = self._innovations(), self.widening
-        std = np.sqrt(np.maximum(np.einsum("kii->ki", cov), 0.0)) * widening[:, None]
+        history, space, mean = self.history, self.model.space, self.mean
+        drift, drift_cov = _drifts(space, mean, self.cov)
+        dof = self._dof()
+        self._extend_widening(len(history.logs), dof)
+        widening = self.widening
+        std = np.sqrt(np.maximum(np.einsum("kii->ki", self.cov), 0.0)) * widening[:, None]
         undetected = self._undetected()
         mean[undetected], std[undetected] = np.nan, np.nan
-        r, mode_of = len(history.series), history.mode_of()
         return Track(
             stage=history.stage,
             logs=history.logs,
@@ -546,17 +514,16 @@ class _Driver:
             effects=_effects(space, self.bank, self.model.sources),
             events=tuple(sorted([*self.alarms, *self._step_events()], key=lambda e: e.epoch)),
             steps=space.steps,
-            nis=np.array([one.innovation.nis for one in self.filtered]),
-            nis_dof=self._dof(innovations),
             outliers=tuple(
                 (k, mode)
-                for k, one in enumerate(self.filtered)
-                if one.outlying is not None
-                for i, mode in enumerate(history.modes)
-                if one.outlying[:r][mode_of == i].any()
+                for k, outlying in self.outlying.items()
+                for mode in history.modes
+                if outlying[history.columns(mode)].any()
             ),
-            innovations=innovations,
-            noise_scale=np.array([one.scale for one in self.published]),
+            nis=self.nis,
+            nis_dof=dof,
+            innovations=self.innovations,
+            noise_scale=self.noise_scale,
             widening=widening,
         )
 

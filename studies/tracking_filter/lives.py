@@ -22,7 +22,7 @@ from lmshealth.tracking.filter_bank import (
     update,
 )
 from lmshealth.tracking.history import History, Series
-from lmshealth.tracking.state_space import state_space
+from lmshealth.tracking.state_space import StateSpace
 
 Array = NDArray[np.float64]
 HORIZON = 2e7  # m of travel in a life
@@ -194,8 +194,8 @@ class Filtered:
 
 def filtered(life: Life, machine: Stage) -> Filtered:
     """Filter a life by the setting it was drawn with."""
-    space = state_space(life.history, machine)
-    model = FilterModel(space, life.history.baselines)
+    space = StateSpace(life.history, machine)
+    model = FilterModel(space)
     model.grid = replace(life.setting, log_prior=np.zeros(1))
     bank, n, m = initial(model), len(life.history.logs), space.n_modes
     contrasts = {name: np.zeros((m, space.size)) for name in ("ln f", "ln ζ", "drift")}
@@ -218,8 +218,8 @@ def filtered(life: Life, machine: Stage) -> Filtered:
 
 def mixture(life: Life, machine: Stage, k: int, i: int) -> dict[str, float]:
     """Probability that the average over all settings gives to less than the truth, at one log."""
-    space = state_space(life.history, machine)
-    model = FilterModel(space, life.history.baselines)
+    space = StateSpace(life.history, machine)
+    model = FilterModel(space)
     bank = initial(model)
     for j in range(k + 1):
         bank = update(model, predict(model, bank, j), j)[0].pruned()

@@ -18,7 +18,7 @@ from lmshealth.tracking.constants import DAMPING_WALK, LN_F_STD, LN_ZETA_STD
 from lmshealth.tracking.covariates import Regressor
 from lmshealth.tracking.filter_bank import FilterModel, Hyperparameters, initial, predict, update
 from lmshealth.tracking.history import History, Series
-from lmshealth.tracking.state_space import StateSpace, state_space
+from lmshealth.tracking.state_space import StateSpace
 from lmshealth.tracking.track import track
 from studies.harness.study import Row
 from studies.tracking_filter.lives import START, Array, Life, draw, filtered
@@ -94,7 +94,7 @@ def deviation(rng: np.random.Generator, n: int, machine: Stage) -> dict[str, flo
     for _ in range(n):
         life: Life = draw(rng)
         found = filtered(life, machine)
-        space = state_space(life.history, machine)
+        space = StateSpace(life.history, machine)
         book = filterpy_loop(life.history, life.setting, space.life, space.regressed)
         std = np.sqrt(np.einsum("kii->ki", found.cov["ln f"]))
         # Drifts of machines that hardly wander have next to no std, but numbers of ln f.
@@ -139,8 +139,8 @@ def one_setting() -> Hyperparameters:
 
 def bank_of_one(history: History) -> tuple[Array, Array]:
     """Filter by the bank with one setting: ln f and its std, ``(n_logs, n_modes)``."""
-    space: StateSpace = state_space(history, None)
-    model = FilterModel(space, history.baselines)
+    space: StateSpace = StateSpace(history, None)
+    model = FilterModel(space)
     model.grid = one_setting()
     bank, n = initial(model), len(history.logs)
     mean, variance = np.empty((n, space.n_modes)), np.empty((n, space.n_modes))

@@ -17,14 +17,13 @@ from lmshealth.tracking.change_detection import (
     Change,
     add_to_sums,
     loop_evidence,
-    running_sums,
     suspect,
     threshold,
     unexplained_leaps,
 )
 from lmshealth.tracking.filter_bank import FilterModel, restart
 from lmshealth.tracking.history import History, Step
-from lmshealth.tracking.state_space import state_space
+from lmshealth.tracking.state_space import StateSpace
 from lmshealth.tracking.track import Track, track
 from tests.lives import DAMPING, FREQUENCY, make_stage, rough_history, seen_by, since
 from tests.tracking.test_filter_bank import SETTINGS, one, run
@@ -175,12 +174,12 @@ def test_a_drift_that_begins_is_an_alarm(stage: Stage) -> None:
     assert alarm.size == pytest.approx(found.drift[alarm.epoch, i])
 
 
-def sums_of(innovations: FloatArray) -> list[FloatArray]:
+def sums_of(innovations: FloatArray) -> FloatArray:
     """Sum innovations ``(n_logs, n_rows)`` log by log."""
-    sums = [running_sums(innovations.shape[1])]
+    sums = [np.zeros((2, innovations.shape[1] + 2))]
     for own in innovations:
         sums.append(add_to_sums(sums[-1], np.arange(own.size), own))
-    return sums
+    return np.array(sums)
 
 
 def test_windows_of_large_mean_innovations_are_suspected() -> None:
@@ -202,8 +201,7 @@ def test_leaps_of_the_loop_are_suspected() -> None:
     lone = error.copy()
     lone[15] *= 1.5
     error[20:] *= 1.5
-    leaps, none = unexplained_leaps(error, ()), np.full((30, 2), np.nan)
-    sums = [running_sums(2)] * (none.shape[0] + 1)
+    leaps, sums = unexplained_leaps(error, ()), np.zeros((31, 2, 4))
     assert suspect(sums[:22], 1, leaps) is None
     assert suspect(sums[:23], 1, leaps) == 20
     assert 15 not in unexplained_leaps(lone, ())
@@ -271,7 +269,7 @@ def test_a_segment_keeps_the_state_and_restarts_the_process_noise(stage: Stage) 
     """Means stay, rates are open again, the noise stays known, and the weights are the prior's."""
     kept = run(rough_history(np.random.default_rng(32), n=30), stage)
     old = kept[-1][0].pruned()
-    model = FilterModel(state_space(rough_history(np.random.default_rng(32), n=30), stage), (0,))
+    model = FilterModel(StateSpace(rough_history(np.random.default_rng(32), n=30), stage))
     new = restart(model, old)
     space, healthy = model.space, new.hyperparameters.healthy
     assert new.weight.sum() == pytest.approx(1.0)
@@ -299,7 +297,7 @@ def test_one_setting_restarts_as_it_was(stage: Stage, monkeypatch: pytest.Monkey
     grid = one(SETTINGS[0], ("acc",))
     history = rough_history(np.random.default_rng(33))
     monkeypatch.setattr(bank, "hyperparameter_grid", lambda n: grid)
-    model = FilterModel(state_space(history, stage), history.baselines)
+    model = FilterModel(StateSpace(history, stage))
     old = run(history, stage, grid)[-1][0]
     new = restart(model, old)
     np.testing.assert_allclose(new.mean, old.mean, rtol=1e-12)

@@ -11,7 +11,7 @@ from lmshealth.stage.description import Stage
 from lmshealth.tracking.covariate_effects import covariate_shifts, find_covariate_effects
 from lmshealth.tracking.history import History
 from lmshealth.tracking.smoother import smooth
-from lmshealth.tracking.state_space import state_space
+from lmshealth.tracking.state_space import StateSpace
 from lmshealth.tracking.track import accepted_estimates, track
 from tests.lives import FREQUENCY, PRELOAD, TWO, awkward_history, make_history, make_stage
 
@@ -45,7 +45,7 @@ def test_what_is_left_is_what_the_state_space_leaves(bent: Stage) -> None:
     history = awkward_history(np.random.default_rng(3))
     followed = track(history, bent)
     taken = accepted_estimates(history, followed)
-    space = state_space(taken, bent, taken.steps)
+    space = StateSpace(taken, bent, taken.steps)
     state = np.zeros((len(history.logs), space.size))
     state[:, space.level] = smooth(taken, followed, bent).ln_frequency
     effects = {(e.mode, e.covariate): e.coefficient for e in followed.effects}

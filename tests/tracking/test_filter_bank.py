@@ -21,7 +21,7 @@ from lmshealth.tracking.filter_bank import (
     update,
 )
 from lmshealth.tracking.history import History
-from lmshealth.tracking.state_space import state_space
+from lmshealth.tracking.state_space import StateSpace
 from tests.lives import PRELOAD, TWO, awkward_history, make_stage, rough_history
 from tests.oracles import Followed, Known, Wander, batch, filterpy_loop, kalman
 
@@ -57,7 +57,7 @@ def run(
     history: History, stage: Stage, grid: Hyperparameters | None = None
 ) -> list[tuple[FilterBank, float]]:
     """Filter all logs and keep the bank and the NIS after each."""
-    model = FilterModel(state_space(history, stage, history.steps), history.baselines)
+    model = FilterModel(StateSpace(history, stage, history.steps))
     model.grid = grid or model.grid
     at, kept = initial(model), []
     for k in range(len(history.logs)):
@@ -68,8 +68,8 @@ def run(
 
 def told(history: History, stage: Stage, wander: Wander) -> Followed:
     """Tell what the bank says under one setting, as the oracles say it."""
-    space = state_space(history, stage, history.steps)
-    sources = FilterModel(space, ()).sources
+    space = StateSpace(history, stage, history.steps)
+    sources = FilterModel(space).sources
     m = space.n_modes
     c = np.zeros((3, m, space.size))
     c[0, :, space.level] = c[1, :, space.damping] = c[2, :, space.level] = np.eye(m)
@@ -132,7 +132,7 @@ def every() -> list[Wander]:
 def test_averaging_keeps_the_law_of_total_variance(stage: Stage) -> None:
     """Mean and covariance over the grid are those of the mixture weighted by evidence so far."""
     history = rough_history(np.random.default_rng(4))
-    space = state_space(history, stage)
+    space = StateSpace(history, stage)
     books = [kalman(history, wander, ALONE) for wander in every()]
     log_weight = hyperparameter_grid(1).log_prior[:, None] + [book.log_evidence for book in books]
     kept = run(history, stage)
@@ -176,7 +176,7 @@ def test_pruning_changes_next_to_nothing(stage: Stage) -> None:
     Negative control: dropping all but the likeliest does.
     """
     history = rough_history(np.random.default_rng(6), n=60)
-    model = FilterModel(state_space(history, stage), history.baselines)
+    model = FilterModel(StateSpace(history, stage))
     banks = [initial(model) for _ in range(3)]
     moved, narrowed, poorest, least = np.zeros(60), np.zeros(60), np.zeros(60), 10**6
     for k in range(60):
@@ -212,7 +212,7 @@ def test_the_prior_of_the_settings_adds_up() -> None:
 def test_banks_are_immutable(stage: Stage) -> None:
     """Predicting and updating a bank, or a longer one, leaves it as it was."""
     history = rough_history(np.random.default_rng(7))
-    model = FilterModel(state_space(history, stage), history.baselines)
+    model = FilterModel(StateSpace(history, stage))
     at = initial(model)
     before = at.mean.copy(), at.cov.copy(), at.log_weight.copy()
     for other in (at, at.padded(at.mean.shape[1])):
@@ -227,7 +227,7 @@ def test_banks_are_immutable(stage: Stage) -> None:
 def test_outliers_have_next_to_no_weight(stage: Stage) -> None:
     """An outlying log moves the state by a fiftieth of what it did at most, at a cost."""
     history = rough_history(np.random.default_rng(8))
-    model = FilterModel(state_space(history, stage), history.baselines)
+    model = FilterModel(StateSpace(history, stage))
     model.grid = one(SETTINGS[0], ("acc",))
     first, _ = update(model, predict(model, initial(model), 0), 0)
     predicted = predict(model, first, 1)
@@ -243,7 +243,7 @@ def test_outliers_have_next_to_no_weight(stage: Stage) -> None:
 def test_a_log_without_estimates_changes_nothing(stage: Stage) -> None:
     """An empty log leaves states, covariances and weights, and has no innovation."""
     history = rough_history(np.random.default_rng(9))
-    model = FilterModel(state_space(history, stage), history.baselines)
+    model = FilterModel(StateSpace(history, stage))
     before = initial(model)
     at, innovation = update(model, before, 4)
     assert innovation.rows.size == 0 and innovation.nis == 0

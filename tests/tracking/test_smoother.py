@@ -11,7 +11,7 @@ from lmshealth.stage.description import Stage
 from lmshealth.tracking import filter_bank as bank
 from lmshealth.tracking.filter_bank import FilterModel
 from lmshealth.tracking.smoother import smooth, smooth_one
-from lmshealth.tracking.state_space import state_space
+from lmshealth.tracking.state_space import StateSpace
 from lmshealth.tracking.track import track
 from tests.lives import (
     PRELOAD,
@@ -41,8 +41,8 @@ def test_one_setting_is_the_joint_gaussian_given_all_logs(
 ) -> None:
     """Means and covariances of all epochs are those of the joint Gaussian, to 1e-6 of the std."""
     history = awkward_history(np.random.default_rng(1))
-    space = state_space(history, stage, history.steps)
-    model = FilterModel(space, history.baselines, reopened)
+    space = StateSpace(history, stage, history.steps)
+    model = FilterModel(space, reopened)
     mean, cov = smooth_one(model, one(wander, model.sources))
     book = batch(history, wander, replace(KNOWN, reopened=reopened), smoothed=True)
     variance = np.einsum("kpipi->kpi", book.cov)

@@ -9,8 +9,9 @@ import pytest
 
 from lmshealth.stage.description import Stage
 from lmshealth.tracking.constants import COVARIATE_STD, LN_F_STD, LN_ZETA_STD
+from lmshealth.tracking.filter_bank import FilterModel
 from lmshealth.tracking.history import History
-from lmshealth.tracking.state_space import state_space
+from lmshealth.tracking.state_space import StateSpace
 from tests.lives import (
     PRELOAD,
     TWO,
@@ -49,7 +50,7 @@ def history() -> History:
 
 def test_the_state_is_laid_out_without_gaps(history: History, stage: Stage) -> None:
     """Blocks of two modes follow one another: 4, three regressors, two biased series, steps."""
-    space = state_space(history, stage, history.steps)
+    space = StateSpace(history, stage, history.steps)
     places = [space.level, space.rate, space.damping, space.base]
     places += [space.regressor(j) for j in range(3)]
     assert [one.name for one in space.regressed] == [
@@ -67,28 +68,28 @@ def test_the_state_is_laid_out_without_gaps(history: History, stage: Stage) -> N
 def test_ticks_are_parts_of_the_horizon(history: History, stage: Stage) -> None:
     """With a stage a life is its horizon, without one it is the length of the history."""
     gaps = np.diff(history.travel)
-    np.testing.assert_allclose(state_space(history, stage).ticks, np.r_[0, gaps / 1e7])
-    bare = state_space(history, None)
+    np.testing.assert_allclose(StateSpace(history, stage).ticks, np.r_[0, gaps / 1e7])
+    bare = StateSpace(history, None)
     np.testing.assert_allclose(bare.ticks, np.r_[0, gaps / np.ptp(history.travel)])
 
 
 def test_without_odometer_ticks_are_of_time(history: History, stage: Stage) -> None:
     """A horizon in km says nothing of days: rates are counted per length of the history."""
     timed = replace(history, travel=np.full(len(history.logs), np.nan))
-    np.testing.assert_allclose(state_space(timed, stage).ticks, np.r_[0, np.full(15, 1 / 15)])
+    np.testing.assert_allclose(StateSpace(timed, stage).ticks, np.r_[0, np.full(15, 1 / 15)])
 
 
 def test_a_history_without_length_has_ticks_of_nothing(stage: Stage) -> None:
     """Logs at one place are divided by one, not by nothing."""
     history = make_history(np.full((4, 2), 4.8), travel=np.full(4, 1e5))
-    assert (state_space(history, None).ticks == 0).all()
+    assert (StateSpace(history, None).ticks == 0).all()
 
 
 def test_covariates_are_about_their_reference_and_0_where_unknown(
     history: History, stage: Stage
 ) -> None:
     """Offsets and their squares stand in the measurement matrix of ln f alone."""
-    space = state_space(history, stage)
+    space = StateSpace(history, stage)
     temperature = history.covariates["temperature_c"]
     for k in (0, 3):
         offset = 0.0 if np.isnan(temperature[k]) else temperature[k] - 21
@@ -102,7 +103,7 @@ def test_covariates_are_about_their_reference_and_0_where_unknown(
 
 def test_unknown_covariates_widen_ln_f(history: History, stage: Stage) -> None:
     """An unknown value brings the variance of what those before it span, and only there."""
-    unknown = state_space(history, stage).unknown()
+    unknown = FilterModel(StateSpace(history, stage)).extra[:, 0]
     temperature, payload = history.covariates["temperature_c"], history.covariates["payload_kg"]
     spread = 0.001 * np.std(temperature[:3]), 0.0005 * np.std(payload[:3])
     assert unknown[3] == pytest.approx(spread[0] ** 2 + spread[1] ** 2)
@@ -112,7 +113,7 @@ def test_unknown_covariates_widen_ln_f(history: History, stage: Stage) -> None:
 
 def test_without_a_stage_covariates_are_about_their_median(history: History) -> None:
     """Every covariate present is taken, with a common prior and without curvature."""
-    space = state_space(history, None)
+    space = StateSpace(history, None)
     assert [one.name for one in space.regressed] == ["temperature_c", "payload_kg"]
     for one in space.regressed:
         values = history.covariates[one.name]
@@ -125,14 +126,14 @@ def test_a_covariate_that_is_never_known_is_left_out(history: History) -> None:
     """A column of nothing has no coefficient."""
     empty = {"temperature_c": np.full(len(history.logs), np.nan)}
     for covariates in ({}, empty):
-        assert state_space(replace(history, covariates=covariates), None).regressed == ()
+        assert StateSpace(replace(history, covariates=covariates), None).regressed == ()
 
 
 def test_the_series_seen_first_of_a_mode_has_no_bias(history: History, stage: Stage) -> None:
     """Others are measured against it; of two that are seen at once the first is the reference."""
     # The first log has both estimates of one mode, and of the other that by Δe alone.
     assert np.isfinite(history.ln_frequency[0]).tolist() == [True, False, True, True]
-    space = state_space(history, stage)
+    space = StateSpace(history, stage)
     assert space.biased == (2, 1)
     matrix = space.matrix(0)[:, space.first_bias : space.first_step]
     expected = np.zeros((8, 4))
@@ -145,7 +146,7 @@ def test_steps_are_read_where_they_are_there(history: History, stage: Stage) -> 
 
     What moves the modes themselves is read in them.
     """
-    space = state_space(history, stage, history.steps)
+    space = StateSpace(history, stage, history.steps)
     for k in range(len(history.logs)):
         matrix = space.matrix(k)
         for j, step in enumerate(history.steps):
@@ -159,8 +160,8 @@ def test_steps_are_read_where_they_are_there(history: History, stage: Stage) -> 
 
 def test_one_more_step_only_makes_the_state_longer(history: History, stage: Stage) -> None:
     """With a step at its end the state space is the one made with all steps."""
-    short = state_space(history, stage, history.steps[:-1])
-    longer, whole = short.with_step(history.steps[-1]), state_space(history, stage, history.steps)
+    short = StateSpace(history, stage, history.steps[:-1])
+    longer, whole = short.with_step(history.steps[-1]), StateSpace(history, stage, history.steps)
     assert longer.size == whole.size == short.size + 4
     assert longer.steps == history.steps
     for k in (0, 4, 14):
@@ -174,7 +175,7 @@ def test_the_prior_is_about_the_first_estimates(stage: Stage) -> None:
     ln_f = history.ln_frequency.copy()
     ln_f[0, 1] = np.nan
     history = replace(history, ln_frequency=ln_f, steps=(since("step", 3, 10),))
-    space = state_space(history, stage, history.steps)
+    space = StateSpace(history, stage, history.steps)
     mean, cov = space.prior()
     assert mean[space.level].tolist() == [ln_f[0, 0], ln_f[1, 1]]
     assert mean[space.damping].tolist() == history.ln_damping[0].tolist()
@@ -187,6 +188,6 @@ def test_the_prior_is_about_the_first_estimates(stage: Stage) -> None:
 
 def test_the_drift_is_the_level_less_its_copy(history: History, stage: Stage) -> None:
     """The contrast takes ℓ₀ from ℓ, mode by mode."""
-    space = state_space(history, stage)
+    space = StateSpace(history, stage)
     state = np.arange(8.0)
     np.testing.assert_array_equal(space.drift() @ state, state[space.level] - state[space.base])

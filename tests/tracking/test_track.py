@@ -85,9 +85,7 @@ def std_of(found: Track) -> FloatArray:
 
 @pytest.mark.parametrize("wander", SETTINGS)
 def test_one_setting_is_a_filterpy_loop(
-    tmp_path_factory: pytest.TempPathFactory,
-    plain: Callable[[Wander], None],
-    wander: Wander,
+    tmp_path_factory: pytest.TempPathFactory, plain: Callable[[Wander], None], wander: Wander
 ) -> None:
     """For one setting a track is what filterpy filters, to 1e-10 of the std, work and all."""
     stage = make_stage(tmp_path_factory.mktemp("two"), tail=TWO)
@@ -469,10 +467,7 @@ def test_two_sources_are_told_apart_by_their_bias(stage: Stage) -> None:
 
 @pytest.mark.parametrize("kind", ["step", "servo", "regreasing"])
 def test_evidence_of_a_declared_step_is_that_of_two_filters(
-    stage: Stage,
-    plain: Callable[[Wander], None],
-    monkeypatch: pytest.MonkeyPatch,
-    kind: str,
+    stage: Stage, plain: Callable[[Wander], None], monkeypatch: pytest.MonkeyPatch, kind: str
 ) -> None:
     """The density ratio at no jump is the evidence with the jump over that without, to 1e-8."""
     n = 20

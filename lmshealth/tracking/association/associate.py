@@ -18,12 +18,7 @@ import numpy as np
 from lmshealth._arrays import BoolArray, FloatArray, expect_shape, freeze
 from lmshealth.errors import BadTable
 from lmshealth.tracking import constants
-from lmshealth.tracking.association.hypotheses import (
-    Hypotheses,
-    Scan,
-    extend,
-    reduce_hypotheses,
-)
+from lmshealth.tracking.association.hypotheses import Hypotheses, Scan, extend, reduce_hypotheses
 from lmshealth.tracking.association.mode_filters import IntArray, Measurements, predict, update
 from lmshealth.tracking.association.track_initiation import Candidates, follow, prune
 

@@ -130,9 +130,5 @@ def prune(
     if kept.size < len(candidates):
         filters = filters.keep(kept)
     return Candidates(
-        filters,
-        candidates.modes[kept],
-        odds[kept],
-        candidates.n_logs[kept],
-        candidates.last[kept],
+        filters, candidates.modes[kept], odds[kept], candidates.n_logs[kept], candidates.last[kept]
     )
