@@ -15,17 +15,17 @@ import numpy as np
 from lmshealth.errors import BadLog
 from lmshealth.io.log import Channel, Log, Refusal
 from lmshealth.modal import constants
+from lmshealth.modal.ambient.candidates import add_excess, clusters, find_peaks
 from lmshealth.modal.ambient.cluster_fit import bin_cluster, fit_cluster, locate
 from lmshealth.modal.ambient.cluster_modes import (
     ClusterFit,
-    ClusterModes,
+    drop_duplicates,
     merge_close_modes,
     refuse_close_modes,
 )
-from lmshealth.modal.ambient.peak_picking import find_excess, find_peaks
 from lmshealth.modal.modes import Modes, merge, numbered
 from lmshealth.modal.naming import assign
-from lmshealth.modal.targets import Target, choose_channels, choose_targets, clusters
+from lmshealth.modal.targets import Target, choose_channels, choose_targets
 from lmshealth.signal.segments import Segment, find_phases, stationary
 from lmshealth.signal.spectra import ANY_RESONANCE, LogSpectra, ResonanceRange, cross_spectra
 from lmshealth.signal.spectral_lines import Line, find_lines, name_lines
@@ -95,24 +95,23 @@ def identify(
     """
     used = choose_channels(log, channels)
     targets = () if stage is None else choose_targets(stage, band)
-    phases = find_phases(log)
-    stretches = stationary(phases, 0)
-    spectra = _transform(log, used, phases, targets, band)
+    stretches, spectra = _transform(log, used, targets, band)
     tested: list[tuple[str, float, float]] = []
-    top = _TOP * log.sample_rate
     if stage is None:
         targets, tested = _search(log, used, stretches, spectra, band)
         spectra = spectra.without([frequency for _, frequency, _ in tested])
-        fits = [_fit_found(spectra, cluster, targets, top) for cluster in clusters(targets)]
+    top, groups = _TOP * log.sample_rate, clusters(targets)
+    if stage is None:
+        fits = [_fit_found(spectra, cluster, targets, top) for cluster in groups]
     else:
-        fits = [_fit_described(spectra, cluster, targets, top) for cluster in clusters(targets)]
+        fits = [_fit_described(spectra, cluster, targets, top) for cluster in groups]
     refused = [refusal for fit in fits for refusal in fit.refusals(log.name)]
     found = [fit.modes for fit in fits if fit.modes is not None]
     masked = [line for one in found for line in one.lines]
     seen = [*tested, *spectra.removed_lines, *masked]
     lines = name_lines(seen, [s.velocity for s in stretches], stage, 1.5 / spectra.duration)
     if stage is None:
-        found = _distinct(found)
+        found = drop_duplicates(found)
         anything = any(one.names for one in found)
         refused = [] if anything else [_nothing_found(log, lines, refused)]
     modes = merge([one.modes for one in found], lines, (*log.refused, *refused), spectra.channels)
@@ -122,22 +121,26 @@ def identify(
 def _transform(
     log: Log,
     channels: tuple[Channel, ...],
-    phases: Sequence[Segment],
     targets: tuple[Target, ...],
     band: tuple[float, float] | None,
-) -> LogSpectra:
-    """Transform the segments that are long enough for the targets, or without any for the band."""
+) -> tuple[tuple[Segment, ...], LogSpectra]:
+    """Return the stationary segments, and spectra of those long enough for the targets or band."""
     resonances: Sequence[ResonanceRange] = ANY_RESONANCE
     highest, rate = 0.0, log.sample_rate
     if targets:
         highest = max(target.band(BAND)[1] for target in targets)
         reach = ceiling = (1 + max(target.search for target in targets)) * highest
         shortest = LEAST_RESOLUTION / min(2 * t.damping_ratio * t.frequency for t in targets)
-        resonances = [_resonance(target) for target in targets]
+        # The damping may be half of the described one.
+        resonances = [
+            ResonanceRange(low * (1 - t.search), high * (1 + t.search), t.damping_ratio / 2)
+            for t, (low, high) in ((target, target.band(1.0)) for target in targets)
+        ]
     else:
         reach = band[1] if band else np.inf
         ceiling = _CEILING * reach
         shortest = constants.LEAST_PERIODS / min(reach, constants.USABLE * rate)
+    phases = find_phases(log)
     segments = stationary(phases, round(shortest * rate))
     if highest > rate / 2:
         raise BadLog(
@@ -154,18 +157,11 @@ def _transform(
             f"no segment of constant velocity without gaps lasts {shortest:.3g} s, which the modes "
             f"need; the longest piece without gaps has {longest:.3g} s",
         )
-    return LogSpectra(
+    return stationary(phases, 0), LogSpectra(
         tuple(channel.name for channel in channels),
         tuple("delta_e" if c.kind == "displacement" else "acc" for c in channels),
         cross_spectra(channels, segments, rate, reach, ceiling=ceiling, resonances=resonances),
     )
-
-
-def _resonance(target: Target) -> ResonanceRange:
-    """Return where a mode may lie; its damping may be half of the described one."""
-    low, high = target.band(1.0)
-    low, high = low * (1 - target.search), high * (1 + target.search)
-    return ResonanceRange(low, high, target.damping_ratio / 2)
 
 
 def _search(
@@ -204,30 +200,33 @@ def _fit_described(
     """Fit a described cluster: locate it, fit it, name what was found, reject close modes."""
     binned = bin_cluster(spectra, cluster, targets, top, searched=True)
     binned, located = locate(binned, cluster)
-    return refuse_close_modes(_assigned(fit_cluster(spectra, binned, located), cluster))
-
-
-def _assigned(fit: ClusterFit, cluster: tuple[Target, ...]) -> ClusterFit:
-    """Assign the modes of a fit to the targets; one may have started at another's frequency."""
-    modes = fit.modes
-    if modes is None or not modes.names:
-        return fit
-    ln_f = modes.modes.ln_frequency
-    order = sorted(range(ln_f.size), key=lambda i: (ln_f[i], modes.names[i]))
-    assignment = assign(np.exp(ln_f[order]).tolist(), cluster, complete=True)
-    names = {modes.names[i]: name for i, name in zip(order, assignment.names, strict=True) if name}
-    if not names and not assignment.ambiguous:
-        return fit  # no assignment keeps the order within the searches
-    kept = modes.keep(names)
-    named = replace(kept.modes, names=tuple(names[name] for name in kept.names))
-    return ClusterFit(replace(kept, modes=named), fit.rejected | assignment.ambiguous)
+    fit = fit_cluster(spectra, binned, located)
+    found = fit.modes
+    if found is not None and found.names:
+        # A mode may have started at the frequency of another.
+        ln_f = found.modes.ln_frequency
+        order = sorted(range(ln_f.size), key=lambda i: (ln_f[i], found.names[i]))
+        assigned = assign(np.exp(ln_f[order]).tolist(), cluster, complete=True)
+        names = {
+            found.names[i]: name for i, name in zip(order, assigned.names, strict=True) if name
+        }
+        # Without either no assignment keeps the order within the searches.
+        if names or assigned.ambiguous:
+            fit = ClusterFit(found.rename(names), fit.rejected | assigned.ambiguous)
+    return refuse_close_modes(fit)
 
 
 def _fit_found(
     spectra: LogSpectra, cluster: tuple[Target, ...], targets: tuple[Target, ...], top: float
 ) -> ClusterFit:
     """Fit a cluster of peaks, then again with each excess of the residual as a further mode."""
-    spectra = spectra.band(*_nearest(cluster, targets))
+    # Only what is nearer to the cluster than to other peaks.
+    first, last = cluster[0].frequency, cluster[-1].frequency
+    below = [t.frequency for t in targets if t.frequency < first]
+    above = [t.frequency for t in targets if t.frequency > last]
+    low = float(np.sqrt(max(below) * first)) if below else 0.0
+    high = float(np.sqrt(last * min(above))) if above else np.inf
+    spectra = replace(spectra, spectra=tuple(s.band(low, high) for s in spectra.spectra))
     for _ in range(1 + _MOST_ROUNDS):
         binned = bin_cluster(spectra, cluster, targets, top, searched=False)
         fit = fit_cluster(spectra, binned, cluster)
@@ -235,50 +234,10 @@ def _fit_found(
             break
         modes = merge_close_modes(fit.modes)
         fit = ClusterFit(modes, fit.rejected)
-        before, cluster = cluster, _with_excess(modes, cluster)
+        before, cluster = cluster, add_excess(cluster, modes.residual)
         if len(cluster) == len(before):
             break
     return fit
-
-
-def _nearest(cluster: tuple[Target, ...], targets: tuple[Target, ...]) -> tuple[float, float]:
-    """Return the frequencies in Hz that are nearer to a cluster than to other peaks."""
-    first, last = cluster[0].frequency, cluster[-1].frequency
-    below = [t.frequency for t in targets if t.frequency < first]
-    above = [t.frequency for t in targets if t.frequency > last]
-    low = np.sqrt(max(below) * first) if below else 0.0
-    return float(low), float(np.sqrt(last * min(above))) if above else np.inf
-
-
-def _with_excess(modes: ClusterModes, cluster: tuple[Target, ...]) -> tuple[Target, ...]:
-    """Add the excess of the residual to a cluster."""
-    if len(cluster) > constants.MOST_TOGETHER:
-        return cluster
-    # A narrower excess would have been a peak, unless it is a line.
-    narrowest = 0.5 * min(target.damping_ratio for target in cluster)
-    excess = find_excess(modes.residual, narrowest)
-    if excess is None or any(
-        abs(excess.frequency / t.frequency - 1) < t.damping_ratio for t in cluster
-    ):
-        return cluster
-    excess = replace(excess, name=f"{cluster[0].name}_and_{len(cluster)}")
-    return tuple(sorted((*cluster, excess), key=lambda target: target.frequency))
-
-
-def _distinct(found: list[ClusterModes]) -> list[ClusterModes]:
-    """Drop modes within half a half-power bandwidth of a clearer one of another cluster."""
-    rows = [
-        (float(clarity), float(ln_f), float(zeta), name)
-        for one in found
-        for clarity, ln_f, zeta, name in zip(
-            one.clarity, one.modes.ln_frequency, one.modes.damping_ratio, one.names, strict=True
-        )
-    ]
-    kept: list[tuple[float, float, float, str]] = []
-    for row in sorted(rows, reverse=True):
-        if all(abs(row[1] - other[1]) > 0.5 * (row[2] + other[2]) for other in kept):
-            kept.append(row)
-    return [one.keep(row[3] for row in kept) for one in found]
 
 
 def _nothing_found(log: Log, lines: tuple[Line, ...], rejected: list[Refusal]) -> Refusal:

@@ -175,20 +175,6 @@ class LogSpectra:
         """Channel, frequency in Hz and amplitude in m/s² of lines subtracted from the samples."""
         return [(self.channels[c], f, a) for s in self.spectra for c, f, a in s.lines]
 
-    def select(self, index: Sequence[int]) -> LogSpectra:
-        """Keep some channels."""
-        rows, columns = np.ix_(index, index)
-        return LogSpectra(
-            tuple(self.channels[c] for c in index),
-            tuple(self.sources[c] for c in index),
-            tuple(replace(s, matrix=s.matrix[:, rows, columns]) for s in self.spectra),
-        )
-
-    def band(self, low: float, high: float) -> LogSpectra:
-        """Cut out a band in Hz."""
-        cut = (spectrum.band(low, high) for spectrum in self.spectra)
-        return replace(self, spectra=tuple(s for s in cut if s.frequency.size))
-
     def without(self, frequencies: Sequence[float]) -> LogSpectra:
         """Exclude the ordinates that lines at these frequencies in Hz may reach."""
         return replace(self, spectra=tuple(s.without(frequencies) for s in self.spectra))
@@ -304,7 +290,7 @@ def _exchangeable(segments: Sequence[Segment]) -> list[list[Segment]]:
         if group is None:
             groups.append([segment])
         else:
-            group.append(segment)
+            group += [segment]
     return groups
 
 

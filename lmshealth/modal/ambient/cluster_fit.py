@@ -265,7 +265,7 @@ def fit_cluster(
         return ClusterFit(None, _not_excited(absent, gains))
     low = min(target.band(BAND)[0] for target in present)
     high = max(target.band(BAND)[1] for target in present)
-    data = prepare(spectra.band(low, high), binned, present)
+    data = prepare(spectra, binned, present, (low, high))
     n, needed = sum(int(mask.sum()) for mask in data.masks), 10 + 6 * len(present)
     if n < needed:
         detail = f"{n} Fourier frequencies in the band hold no line, needed {needed}: record longer"
@@ -281,8 +281,9 @@ def fit_cluster(
         before, data = data, mask_residual_lines(data, expected)
         if data is before:
             break
+    rejected = _not_excited(absent, gains)
     fit = _conclude(data, optimum, expected, gains)
-    return ClusterFit(fit.modes, _not_excited(absent, gains) | fit.rejected)
+    return ClusterFit(fit.modes, rejected | fit.rejected)
 
 
 def screen(
@@ -314,8 +315,13 @@ def screen(
     return kept, gains
 
 
-def prepare(spectra: LogSpectra, binned: BinnedSpectra, present: tuple[Target, ...]) -> ClusterData:
-    """Select the channels that show any of the modes, and scale each by its noise."""
+def prepare(
+    spectra: LogSpectra,
+    binned: BinnedSpectra,
+    present: tuple[Target, ...],
+    band: tuple[float, float],
+) -> ClusterData:
+    """Cut out the band in Hz of the channels that show any of the modes, in units of noise."""
     strength, misfit = fit_strengths(binned, present)
     gains = fit_strengths(binned, ())[1] - misfit
     index = [c for c, gain in enumerate(gains) if gain >= constants.ABSENT]
@@ -323,10 +329,18 @@ def prepare(spectra: LogSpectra, binned: BinnedSpectra, present: tuple[Target, .
     level = binned.level[index]
     noise = np.maximum(strength[index, -1], 1e-2 * level.min(axis=1))
     unit = np.sqrt(noise)
-    chosen = spectra.select(index)
-    scaled = tuple(replace(s, matrix=s.matrix / np.outer(unit, unit)) for s in chosen.spectra)
+    rows, columns = np.ix_(index, index)
+    scaled = tuple(
+        replace(s, matrix=s.matrix[:, rows, columns] / np.outer(unit, unit))
+        for s in (spectrum.band(*band) for spectrum in spectra.spectra)
+        if s.frequency.size
+    )
     return ClusterData(
-        replace(chosen, spectra=scaled),
+        LogSpectra(
+            tuple(spectra.channels[c] for c in index),
+            tuple(spectra.sources[c] for c in index),
+            scaled,
+        ),
         unit,
         replace(binned, level=level / noise[:, None]),
         tuple(s.free for s in scaled),
@@ -565,18 +579,15 @@ def _conclude(
         lines=(),
         refused=(),
     )
-    rejected: dict[str, Rejection] = {}
-    lines = masked_lines(data)
-    for i, target in enumerate(targets):
-        why = _incredible(modes, i, target, residual.duration)
-        if why is None:
-            continue
-        rejected[target.name] = why
-        if why.reason == "line-not-mode":
-            k = int(np.searchsorted(residual.frequency, f[i]))
-            lines.append(_read_line(data, max(0, k - _LINE_BINS), k + _LINE_BINS + 1))
+    judged = [_incredible(modes, i, one, residual.duration) for i, one in enumerate(targets)]
+    rejected = {name: why for name, why in zip(names, judged, strict=True) if why is not None}
+    narrow = [why is not None and why.reason == "line-not-mode" for why in judged]
+    ordinates = masked_ordinates(data)
+    for k in np.searchsorted(residual.frequency, f[narrow]).tolist():
+        ordinates.append((max(0, k - _LINE_BINS), k + _LINE_BINS + 1))
     clarity = np.array([gains[name] for name in names])
-    found = ClusterModes(modes, data.unit, clarity, tuple(lines), residual)
+    lines = tuple(read_line(data, first, last) for first, last in ordinates)
+    found = ClusterModes(modes, data.unit, clarity, lines, residual)
     return ClusterFit(found.keep(name for name in names if name not in rejected), rejected)
 
 
@@ -594,7 +605,8 @@ def _residual(data: ClusterData, expected: list[ComplexArray]) -> Spectrum:
     ratio = np.ones(mask.size)
     white = np.linalg.solve(expected[data.longest][mask], spectrum.matrix[mask])
     ratio[mask] = np.trace(white, axis1=1, axis2=2).real / n_channels
-    return replace(spectrum.channel(0), periodogram=ratio, count=spectrum.count * n_channels)
+    count = spectrum.count * n_channels
+    return Spectrum(spectrum.frequency, ratio, spectrum.duration, spectrum.velocity, count)
 
 
 def _dispersion(residual: Spectrum, f: FloatArray, zeta: FloatArray) -> FloatArray:
@@ -624,15 +636,15 @@ def _damping_bounds(target: Target) -> tuple[float, float]:
     return zeta / span, min(zeta * span, max(constants.MOST_DAMPING, 2 * zeta))
 
 
-def masked_lines(data: ClusterData) -> list[LineEstimate]:
-    """Return the masked lines of the longest observation, each in its strongest channel."""
+def masked_ordinates(data: ClusterData) -> list[tuple[int, int]]:
+    """Return the half-open ranges of masked ordinates of the longest observation."""
     masked = data.spectra.spectra[data.longest].free & ~data.masks[data.longest]
     edges = np.flatnonzero(np.diff(np.concatenate([[0], masked.astype(int), [0]])))
-    return [_read_line(data, int(a), int(b)) for a, b in edges.reshape(-1, 2)]
+    return [(int(a), int(b)) for a, b in edges.reshape(-1, 2)]
 
 
-def _read_line(data: ClusterData, first: int, last: int) -> LineEstimate:
-    """Read a line within some ordinates of the longest observation."""
+def read_line(data: ClusterData, first: int, last: int) -> LineEstimate:
+    """Read a line within some ordinates of the longest observation, in its strongest channel."""
     spectrum = data.spectra.spectra[data.longest]
     power = np.diagonal(spectrum.matrix[first:last], axis1=1, axis2=2).real.sum(axis=0)
     c = int(np.argmax(power))

@@ -60,6 +60,12 @@ class ClusterModes:
         index = [i for i, name in enumerate(self.names) if name in kept]
         return replace(self, modes=self.modes.select(index), clarity=self.clarity[index])
 
+    def rename(self, names: dict[str, str]) -> ClusterModes:
+        """Keep the modes that get a new name."""
+        kept = self.keep(names)
+        named = replace(kept.modes, names=tuple(names[name] for name in kept.names))
+        return replace(kept, modes=named)
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ClusterFit:
@@ -144,3 +150,19 @@ def _common(found: ClusterModes, i: int, j: int) -> ClusterModes:
     flags = [f"{flag} cluster".strip() if k == i else flag for k, flag in enumerate(modes.flags)]
     common = replace(modes, ln_frequency=ln_f, ln_damping=ln_zeta, cov=cov, flags=tuple(flags))
     return replace(found, modes=common)
+
+
+def drop_duplicates(found: list[ClusterModes]) -> list[ClusterModes]:
+    """Drop modes within half a half-power bandwidth of a clearer one of another cluster."""
+    rows = [
+        (float(clarity), float(ln_f), float(zeta), name)
+        for one in found
+        for clarity, ln_f, zeta, name in zip(
+            one.clarity, one.modes.ln_frequency, one.modes.damping_ratio, one.names, strict=True
+        )
+    ]
+    kept: list[tuple[float, float, float, str]] = []
+    for row in sorted(rows, reverse=True):
+        if all(abs(row[1] - other[1]) > 0.5 * (row[2] + other[2]) for other in kept):
+            kept.append(row)
+    return [one.keep(row[3] for row in kept) for one in found]

@@ -1,4 +1,4 @@
-"""Candidate modes without a description: peaks of spectra, and excesses of residuals."""
+"""Candidate modes: peaks of spectra, excesses of residuals, and clusters of neighbours."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from lmshealth._arrays import BoolArray, FloatArray
 from lmshealth.modal import constants
 from lmshealth.modal.targets import Target
 from lmshealth.signal.spectra import Spectrum, median_ordinate
+from lmshealth.stage.constants import BAND
 
 # Half widths of peaks, as fractions of the frequency: about 1.5 damping ratios.
 _SCALES = (0.001, 0.002, 0.004, 0.008, 0.016, 0.032, 0.064)
@@ -98,10 +99,26 @@ def _peaks(
     return [(float(contrast[i]), float(centre[i]), scale) for i in index]
 
 
-def find_excess(residual: Spectrum, narrowest: float = 0.0) -> Target | None:
-    """Return the frequency and scale where the residual of a fit is most above one, if any is.
+def add_excess(cluster: tuple[Target, ...], residual: Spectrum) -> tuple[Target, ...]:
+    """Add the mode that the residual of a fit shows most clearly to its cluster, if there is one.
 
     The residual is a periodogram over its expectation, exponential about one where the model fits.
+    """
+    if len(cluster) > constants.MOST_TOGETHER:
+        return cluster
+    # A narrower excess would have been a peak, unless it is a line.
+    excess = find_excess(residual, 0.5 * min(target.damping_ratio for target in cluster))
+    if excess is None or any(
+        abs(excess.frequency / t.frequency - 1) < t.damping_ratio for t in cluster
+    ):
+        return cluster
+    excess = replace(excess, name=f"{cluster[0].name}_and_{len(cluster)}")
+    return tuple(sorted((*cluster, excess), key=lambda target: target.frequency))
+
+
+def find_excess(residual: Spectrum, narrowest: float = 0.0) -> Target | None:
+    """Return where the residual of a fit is most above one, if anywhere.
+
     Excesses with a damping ratio below ``narrowest`` are ignored.
     """
     ordinates = residual.periodogram.copy()
@@ -162,3 +179,22 @@ def _without_lines(spectrum: Spectrum, lines: Sequence[float]) -> Spectrum:
         if near.size:
             ordinates[reach] = np.median(near) / median_ordinate(spectrum.count)
     return replace(spectrum, periodogram=ordinates)
+
+
+def clusters(targets: Sequence[Target]) -> list[tuple[Target, ...]]:
+    """Group neighbours to fit jointly: their bands overlap, their bandwidths are similar."""
+    groups: list[list[Target]] = []
+    for target in targets:
+        last = groups[-1] if groups else []
+        if last and len(last) < constants.MOST_TOGETHER and _interact(last[-1], target):
+            last.append(target)
+        else:
+            groups.append([target])
+    return [tuple(group) for group in groups]
+
+
+def _interact(lower: Target, upper: Target) -> bool:
+    # A narrow peak near a broad resonance would need the finest resolution over the whole band.
+    ratio = (upper.frequency * upper.damping_ratio) / (lower.frequency * lower.damping_ratio)
+    similar = 1 / constants.SIMILAR_BANDWIDTH < ratio < constants.SIMILAR_BANDWIDTH
+    return upper.band(BAND)[0] < lower.band(BAND)[1] and similar

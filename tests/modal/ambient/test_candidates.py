@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from lmshealth.modal.ambient.peak_picking import find_excess, find_peaks
+from lmshealth.modal.ambient.candidates import find_excess, find_peaks
 from lmshealth.modal.targets import Target
 from lmshealth.signal.segments import Segment
 from lmshealth.signal.spectra import Spectrum, periodogram
