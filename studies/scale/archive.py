@@ -1,7 +1,8 @@
-"""Archives of any number of short logs: each another file, none dearer to analyse than another."""
+"""Archives of any number of short logs of equal cost, and the cost of the steps of a run."""
 
 from __future__ import annotations
 
+import time
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
@@ -14,16 +15,9 @@ _N_BASES = 8
 
 
 def make_archive(folder: Path, n_logs: int, *, longer: bool = False) -> None:
-    """Write a stage description and so many logs of machines that do not age.
+    """Write ``stage.toml`` and ``logs``: so many of machines that do not age, 100 to a machine.
 
-    Parameters
-    ----------
-    folder : Path
-        Gets ``stage.toml`` and ``logs``.
-    n_logs : int
-        A hundred to a machine.
-    longer : bool
-        Whether the later half is three times as long, which must be seen.
+    With ``longer`` the later half is three times as long.
     """
     (folder / "stage.toml").write_text(DESCRIPTION.replace("damaged-?-Y", "many-*-Y"))
     archive = Archive(folder / "logs")
@@ -40,3 +34,22 @@ def make_archive(folder: Path, n_logs: int, *, longer: bool = False) -> None:
         log.metadata["recorded_at"] = moment.isoformat()
         log.metadata["travel_km"] = f"{0.5 * own:g}"
         write(archive, archive.folder / f"{machine:04d}" / f"{own:03d}.h5", log)
+
+
+class Steps:
+    """Divides processor time among the steps of a run, by its reports of progress."""
+
+    def __init__(self) -> None:
+        self._step, self._since = "starting", time.process_time()
+        self.seconds: dict[str, float] = {}
+
+    def __call__(self, what: str, done: int, total: int) -> None:
+        """Add the time since the last report to the step that it named."""
+        now = time.process_time()
+        self.seconds[self._step] = self.seconds.get(self._step, 0.0) + now - self._since
+        self._step, self._since = what, time.process_time()
+
+
+def size_mb(folder: Path, pattern: str) -> float:
+    """Return the size of some files of a folder in MB."""
+    return sum(path.stat().st_size for path in folder.glob(pattern)) / 1e6

@@ -1,19 +1,14 @@
 """Does the front page stay usable for 1,000 stages?
 
-Question
-    How large is the page of 1,000 stages, how long until it shows, how does that compare with a
-    plain table of the same text, and how long does a key stroke in its search field take?
 Method
     Rows of an invented fleet, in Chromium without a network. In turns, each in a page of its own:
-    the front page; the same with every row laid out, in sight or not; and a bare table of the same
-    text, without bars, style and script. Time runs from the start of navigation to the second
-    frame after loading. A key stroke is typed into the search field, letter by letter, and ends
-    when rows and count are laid out again. Negative control, which must be slower: the page with
-    every row laid out.
+    the front page; the same with every row laid out, in sight or not (control, must be slower); and
+    a bare table of the same text, without bars, style and script. Time runs from the start of
+    navigation to the second frame after loading. A key stroke is typed into the search field,
+    letter by letter, and ends when rows and count are laid out again.
 Answer
-    1.1 kB a stage. The page shows in 1.5 times the time of the bare table, and in 7.5 times with
-    every row laid out. A key stroke takes 16 ms where the page takes 1.2 s to load, medians on a
-    machine that is busy with other work; the slowest of all took 0.13 s.
+    Yes. A key stroke takes 16 ms where the page takes 1.2 s to load, medians on a busy machine; the
+    slowest of all took 0.13 s.
 Run time
     Half a minute.
 """

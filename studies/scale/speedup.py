@@ -1,19 +1,14 @@
 """How much faster do two workers identify an archive than one, and what would a cluster take?
 
-Question
-    Do two workers, of this machine and of Dask, identify logs at least 1.8 times as fast as one?
-    What serial work is left per log, and how many workers could it keep busy?
 Method
-    An archive of short logs, each worker count with an empty store, in turns. Time runs from the
-    first log identified to the last, so that starting is no part of it. Two cores of a machine that
-    other programs use, too, are seldom twice one: beside it, in the same turn, as many processes as
-    workers identify the same logs again and again without `lmshealth run`; that is the bound.
-    Serial is what the main process alone does for a log while others work: its processor time.
+    An archive of short logs, each number of workers with an empty store, in turns. Time runs from
+    the first log identified to the last, without the start. The bound is measured in the same turn:
+    as many processes as workers identify the same logs without `lmshealth run`, because two cores
+    of a shared machine are seldom twice one. Serial is the processor time per log that the main
+    process takes while others work.
 Answer
-    Yes. Two workers of one machine identify 1.88 times as fast as one (1.74 to 2.06 in three
-    turns), two of Dask 1.84 times (1.81 to 2.01), where bare processes reach 2.03 (1.84 to 2.05):
-    scheduler and main process share the two processors with them. The main process takes 3.3 ms per
-    log by itself, with Dask 6.8 ms: short logs keep some 60 and 30 such workers busy.
+    Yes; scheduler and main process share the two processors with the workers. The main process
+    takes 3.3 ms per log, with Dask 6.8 ms: short logs keep some 60 and 30 such workers busy.
 Run time
     Nine minutes of both processors.
 """
@@ -47,27 +42,20 @@ _BARE, _QUICK_BARE = 40, 1  # identifications in each process of the bound
 
 
 class Clock:
-    """Hears when the first and the last log are identified, and what that took this process."""
+    """Measures rate (logs per s) and serial processor time (s per log) between first and last."""
 
     def __init__(self) -> None:
-        self.first = self.last = (0.0, 0.0, 0)
+        self._moments: list[tuple[float, float, int]] = []
 
     def __call__(self, what: str, done: int, total: int) -> None:
-        """Measure of progress, as `run` tells it."""
+        """Keep the moment of a report of progress."""
         if what == "identifying" and done:
-            now = time.perf_counter(), time.process_time(), done
-            self.first = now if done == 1 else self.first
-            self.last = now
+            self._moments.append((time.perf_counter(), time.process_time(), done))
 
-    @property
-    def rate(self) -> float:
-        """Logs per second."""
-        return (self.last[2] - self.first[2]) / (self.last[0] - self.first[0])
-
-    @property
-    def serial(self) -> float:
-        """Processor time of this process in s per log."""
-        return (self.last[1] - self.first[1]) / (self.last[2] - self.first[2])
+    def rates(self) -> tuple[float, float]:
+        """Return logs per s, and processor time of this process in s per log."""
+        wall, cpu, n = np.subtract(self._moments[-1], self._moments[0])
+        return float(n / wall), float(cpu / n)
 
 
 def identified(folder: Path, settings: Settings) -> Clock:
@@ -106,19 +94,19 @@ def _loaded(_: int) -> None:
 
 def one_turn(folder: Path, kinds: tuple[str, ...], each: int, _: int) -> Row:
     """Measure everything once, the bound by so many logs in each process."""
-    found: Row = {}
     bound = [bare(folder, n, each) for n in (1, 2)]
-    found["bound"] = bound[1] / bound[0]
-    clocks = {}
+    rates = {}
     for n in (1, 2):
         if "dask" in kinds:
             with dask_cluster(n) as cluster:
-                clocks["dask", n] = identified(folder, Settings(scheduler=cluster.address))
-        clocks["local", n] = identified(folder, Settings(workers=n))
+                settings = Settings(scheduler=cluster.address)
+                rates["dask", n] = identified(folder, settings).rates()
+        rates["local", n] = identified(folder, Settings(workers=n)).rates()
+    found: Row = {"bound": bound[1] / bound[0]}
     for kind in kinds:
-        found[kind] = clocks[kind, 2].rate / clocks[kind, 1].rate
-        found[f"{kind}_serial_ms"] = 1e3 * clocks[kind, 2].serial
-        found[f"{kind}_rate"] = clocks[kind, 2].rate
+        rate, serial = rates[kind, 2]
+        found[kind] = rate / rates[kind, 1][0]
+        found |= {f"{kind}_serial_ms": 1e3 * serial, f"{kind}_rate": rate}
     return found
 
 

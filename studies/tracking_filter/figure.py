@@ -5,24 +5,24 @@ from __future__ import annotations
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from studies.harness.figures import BLACK, BLUE, GREEN, ORANGE, write
+from studies.harness.figures import BLACK, BLUE, GREEN, ORANGE, draw_shares, name_lines, write
 from studies.harness.study import Row
+
+LABELS = ("99.9 % band", "covariance as reported", "halved (control)")
 
 
 def draw_sums(ax: Axes, known: Row) -> None:
     """Draw mean squares of errors and innovations with their bands, and those of the control."""
-    names = list(known["as reported"])
-    for y, name in enumerate(names):
-        row = known["as reported"][name]
-        ax.plot([row["low"], row["high"]], [y, y], lw=9, color=BLACK, alpha=0.25,
-                solid_capstyle="butt", label="99.9 % band" if y == 0 else None)  # fmt: skip
-        for kind, colour, marker in (("as reported", BLUE, "o"), ("halved", ORANGE, "x")):
-            label = {"as reported": "covariance as reported", "halved": "halved (control)"}[kind]
-            ax.plot(known[kind][name]["mean"], y, marker, color=colour, ms=6,
-                    label=label if y == 0 else None)  # fmt: skip
+    band = {"lw": 9, "color": BLACK, "alpha": 0.25, "solid_capstyle": "butt"}
+    for y, (row, control) in enumerate(
+        zip(known["as reported"].values(), known["halved"].values(), strict=True)
+    ):
+        labels = iter(LABELS if y == 0 else (None,) * 3)
+        ax.plot([row["low"], row["high"]], [y, y], label=next(labels), **band)
+        ax.plot(row["mean"], y, "o", color=BLUE, ms=6, label=next(labels))
+        ax.plot(control["mean"], y, "x", color=ORANGE, ms=6, label=next(labels))
     ax.axvline(1.0, color=BLACK, lw=0.8)
-    ax.set_yticks(range(len(names)), names)
-    ax.set_ylim(len(names) - 0.4, -0.9)
+    name_lines(ax, list(known["as reported"]))
     ax.set_xlabel("mean square in units of what the filter says")
     ax.set_title(f"True setting, {known['lives']:,} lives", fontsize=10)
     ax.legend(fontsize=7, loc="lower right")
@@ -31,16 +31,11 @@ def draw_sums(ax: Axes, known: Row) -> None:
 def draw_coverage(ax: Axes, rows: dict[str, list[Row]], title: str) -> None:
     """Draw measured coverages of 50 and 90 % intervals with their Clopper-Pearson intervals."""
     for y, (name, levels) in enumerate(rows.items()):
-        colour = ORANGE if "control" in name else BLUE
-        for row in levels:
-            ax.plot([row["low"], row["high"]], [y, y], lw=2, color=colour)
-            ax.plot(row["share"], y, "x" if colour == ORANGE else "o", color=colour, ms=5)
+        draw_shares(ax, y, levels, *((ORANGE, "x") if "control" in name else (BLUE, "o")))
     for level in (0.5, 0.9):
         ax.axvline(level, color=BLACK, lw=0.8, ls="--")
-    ax.set_yticks(range(len(rows)), list(rows))
-    ax.set_ylim(len(rows) - 0.5, -0.5)
-    ax.set_xlim(0.1, 1.0)
-    ax.set_xlabel("share of intervals of 50 and 90 % that hold the truth")
+    name_lines(ax, list(rows))
+    ax.set(xlim=(0.1, 1.0), xlabel="share of intervals of 50 and 90 % that hold the truth")
     ax.set_title(title, fontsize=10)
 
 
@@ -54,8 +49,7 @@ def draw_times(ax: Axes, speed: Row) -> None:
         if "deviation" in row:
             text += f", ln f within {row['deviation']:.0e} std"
         ax.text(row["times_filterpy"] + 0.1, y, text, va="center", fontsize=7)
-    ax.set_yticks(range(len(rows)), [row["program"] for row in rows])
-    ax.invert_yaxis()
+    name_lines(ax, [row["program"] for row in rows])
     ax.set_xlim(0, 1.45 * max(row["times_filterpy"] for row in rows))
     ax.set_xlabel("processor time over that of the filterpy loop")
     ax.set_title(f"{speed['epochs']:,} epochs of {speed['modes']} modes", fontsize=10)
@@ -70,12 +64,9 @@ def draw_figure(figure: Figure, result: Row) -> None:
     rows |= {f"{name}, ± std": levels for name, levels in average["coverage"].items()}
     rows |= {"drift, half width\n(control)": average["control"]}
     draw_coverage(axes[0, 1], rows, f"Tracker, {average['lives']:,} lives")
-    names = {
-        "both": "both",
-        "accelerometers alone": "one alone",
-        "common errors ignored": "common errors\nignored (control)",
-    }
-    rows = {label: sources[name]["coverage"] for name, label in names.items()}
+    names = ("both", "one alone", "common errors\nignored (control)")
+    kinds = ("both", "accelerometers alone", "common errors ignored")
+    rows = {label: sources[kind]["coverage"] for label, kind in zip(names, kinds, strict=True)}
     draw_coverage(axes[1, 0], rows, f"Drift by two sources, {sources['lives']:,} lives")
     draw_times(axes[1, 1], result["speed"])
 

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -12,24 +12,19 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from lmshealth.stage.description import Stage, load_stage
+from lmshealth.tracking import filter_bank
 from lmshealth.tracking.constants import BIAS_STD, DAMPING_WALK
-from lmshealth.tracking.filter_bank import (
-    FilterModel,
-    Hyperparameters,
-    hyperparameter_grid,
-    initial,
-    predict,
-    update,
-)
+from lmshealth.tracking.filter_bank import FilterModel, Hyperparameters, hyperparameter_grid
 from lmshealth.tracking.history import History, Series
 from lmshealth.tracking.state_space import StateSpace
+from studies.common.histories import keep_series, make_history
 
 Array = NDArray[np.float64]
+QUANTITIES = ("ln f", "ln ζ", "drift")
 HORIZON = 2e7  # m of travel in a life
 REFERENCE, TEMPERATURE_STD = 21.0, 1e-3
 MODES = ("roll", "pitch")
 LEVEL, DAMPING = np.log([126.4, 136.6]), np.log([0.018, 0.015])
-START = datetime(2026, 3, 1, tzinfo=UTC)
 DESCRIPTION = f"""
 name = "small"
 [[mode]]
@@ -51,7 +46,7 @@ horizon_km = {HORIZON / 1000}
 
 @dataclass(frozen=True)
 class Life:
-    """A history, the setting it was drawn with, and the truth ``(n_logs, n_modes)``."""
+    """A history, the setting it was drawn with, and the true ln f and ln ζ."""
 
     history: History
     setting: Hyperparameters
@@ -59,7 +54,7 @@ class Life:
     damping: Array
 
     def truth(self) -> dict[str, Array]:
-        """Return ln f, ln ζ and drift since the first log."""
+        """Return ln f, ln ζ and drift since the first log, ``(n_logs, n_modes)``."""
         return {"ln f": self.level, "ln ζ": self.damping, "drift": self.level - self.level[0]}
 
 
@@ -82,32 +77,24 @@ def draw(rng: np.random.Generator, sources: tuple[str, ...] = ("acc",)) -> Life:
     n, m, r = int(rng.integers(20, 41)), len(MODES), len(MODES) * len(sources)
     travel = np.cumsum(np.r_[1e5, HORIZON * rng.uniform(0.002, 0.05, n - 1)])
     level, damping = _walk(rng, chosen, np.diff(travel) / HORIZON)
-    temperature, read = _temperature(rng, n)
+    temperature, effect = _temperature(rng, n)
     mode = np.tile(np.arange(m), len(sources))
     bias = rng.standard_normal((2, r)) * np.array(BIAS_STD)[:, None]
     bias[:, :m] = 0.0
     cov = _covariance(rng, n, len(sources))
     scales = np.tile(np.repeat(chosen.scales[0], m), 2)
     noise = (np.linalg.cholesky(cov) @ rng.standard_normal((n, 2 * r, 1)))[:, :, 0] * scales
-    values = np.hstack([(level + read)[:, mode] + bias[0], damping[:, mode] + bias[1]]) + noise
     missing = rng.random((n, r)) < 0.1
     missing[0] = False
-    gone = np.hstack([missing, missing])
-    values[gone] = np.nan
-    cov[gone[:, :, None] | gone[:, None, :]] = np.nan
-    history = History(
-        stage="AX-1",
-        logs=tuple(f"{k:03d}.csv" for k in range(n)),
-        recorded_at=tuple(START + timedelta(days=k) for k in range(n)),
-        travel=travel,
+    ln_frequency = (level + effect)[:, mode] + bias[0] + noise[:, :r]
+    ln_damping = damping[:, mode] + bias[1] + noise[:, r:]
+    history = make_history(
+        MODES,
+        travel,
+        (ln_frequency, ln_damping, cov),
+        series=[Series(name, source) for source in sources for name in MODES],
         covariates={"temperature_c": temperature},
-        modes=MODES,
-        series=tuple(Series(name, source) for source in sources for name in MODES),
-        ln_frequency=values[:, :r],
-        ln_damping=values[:, r:],
-        cov=cov,
-        loop_error=np.full(n, np.nan),
-        baselines=(0,),
+        missing=missing,
     )
     return Life(history, chosen, level, damping)
 
@@ -129,18 +116,18 @@ def _walk(rng: np.random.Generator, chosen: Hyperparameters, ticks: Array) -> tu
 
 
 def _temperature(rng: np.random.Generator, n: int) -> tuple[Array, Array]:
-    """Draw temperatures, some unknown, and what they do to ln f of both modes."""
+    """Draw temperatures, some unknown, and their effect on ln f of both modes."""
     temperature = REFERENCE + 5 * rng.standard_normal(n)
     temperature[1:][rng.random(n - 1) < 0.1] = np.nan
-    read = np.empty((n, len(MODES)))
+    effect = np.empty((n, len(MODES)))
     coefficient = TEMPERATURE_STD * rng.standard_normal(len(MODES))
     for k in range(n):
         known = temperature[:k][np.isfinite(temperature[:k])]
         spread = max(float(np.std(known)), 1.0) if known.size else 1.0
         unknown = TEMPERATURE_STD * spread * rng.standard_normal(len(MODES))
         offset = temperature[k] - REFERENCE
-        read[k] = unknown if np.isnan(offset) else coefficient * offset
-    return temperature, read
+        effect[k] = unknown if np.isnan(offset) else coefficient * offset
+    return temperature, effect
 
 
 def _covariance(rng: np.random.Generator, n: int, n_sources: int) -> Array:
@@ -160,30 +147,34 @@ def _covariance(rng: np.random.Generator, n: int, n_sources: int) -> Array:
 
 def alone(history: History, source: str) -> History:
     """Return the history that one source alone makes."""
-    own = np.array([i for i, one in enumerate(history.series) if one.source == source])
-    both = np.r_[own, own + len(history.series)]
-    return replace(
-        history,
-        series=tuple(history.series[i] for i in own),
-        ln_frequency=history.ln_frequency[:, own],
-        ln_damping=history.ln_damping[:, own],
-        cov=history.cov[:, both[:, None], both],
-    )
+    return keep_series(history, [i for i, s in enumerate(history.series) if s.source == source])
 
 
 def without_common_errors(history: History) -> History:
-    """Return the history as if the errors of two sources had nothing to do with each other."""
+    """Return the history as if the errors of two sources were independent."""
     source = np.array([one.source for one in history.series] * 2)
     same = source[:, None] == source
     return replace(history, cov=np.where(np.isnan(history.cov) | same, history.cov, 0.0))
 
 
+def banks(
+    history: History, machine: Stage | None, setting: Hyperparameters
+) -> Iterator[tuple[filter_bank.FilterBank, float]]:
+    """Filter log by log with one setting; yield the bank and the squared innovation."""
+    model = FilterModel(StateSpace(history, machine))
+    model.grid = replace(setting, log_prior=np.zeros(1))
+    bank = filter_bank.initial(model)
+    for k in range(len(history.logs)):
+        bank, innovation = filter_bank.update(model, filter_bank.predict(model, bank, k), k)
+        yield bank, float(innovation.nis)
+
+
 @dataclass(frozen=True)
 class Filtered:
-    """What the filter of the right setting says.
+    """Mean and covariance of each quantity by the filter of the right setting, log by log.
 
-    ``mean`` is ``(n_logs, n_modes)`` of ln f, ln ζ and drift, ``cov`` its covariance; ``nis`` the
-    normalised innovation squared of every log and ``dof`` its degrees of freedom.
+    ``nis`` is the normalised innovation squared of every log but the first, ``dof`` its degrees of
+    freedom.
     """
 
     mean: dict[str, Array]
@@ -195,36 +186,31 @@ class Filtered:
 def filtered(life: Life, machine: Stage) -> Filtered:
     """Filter a life by the setting it was drawn with."""
     space = StateSpace(life.history, machine)
-    model = FilterModel(space)
-    model.grid = replace(life.setting, log_prior=np.zeros(1))
-    bank, n, m = initial(model), len(life.history.logs), space.n_modes
-    contrasts = {name: np.zeros((m, space.size)) for name in ("ln f", "ln ζ", "drift")}
+    n, m = len(life.history.logs), space.n_modes
+    contrasts = {name: np.zeros((m, space.size)) for name in QUANTITIES}
     contrasts["ln f"][:, space.level] = contrasts["drift"][:, space.level] = np.eye(m)
     contrasts["drift"][:, space.base] = -np.eye(m)
     contrasts["ln ζ"][:, space.damping] = np.eye(m)
     mean = {name: np.empty((n, m)) for name in contrasts}
     cov = {name: np.empty((n, m, m)) for name in contrasts}
     nis = np.empty(n)
-    for k in range(n):
-        bank, innovation = update(model, predict(model, bank, k), k)
-        nis[k] = innovation.nis
+    for k, (bank, innovation) in enumerate(banks(life.history, machine, life.setting)):
+        nis[k] = innovation
         for name, contrast in contrasts.items():
             mean[name][k] = contrast @ bank.mean[0]
             cov[name][k] = contrast @ bank.cov[0] @ contrast.T
-    # The prior is centred on the first log, which surprises nobody.
+    # The prior is centred on the first log, which has no innovation.
     dof = 2.0 * np.isfinite(life.history.ln_frequency).sum(axis=1)
     return Filtered(mean, cov, nis[1:], dof[1:])
 
 
 def mixture(life: Life, machine: Stage, k: int, i: int) -> dict[str, float]:
-    """Probability that the average over all settings gives to less than the truth, at one log."""
+    """Return the probability below the truth in the average over all settings, at one log."""
     space = StateSpace(life.history, machine)
     model = FilterModel(space)
-    bank = initial(model)
-    for j in range(k + 1):
-        bank = update(model, predict(model, bank, j), j)[0].pruned()
-    levels, bases = space.level.start + i, space.base.start + i
-    places = {"ln f": [levels], "ln ζ": [space.damping.start + i], "drift": [levels, bases]}
+    bank = filter_bank.advance(model, filter_bank.initial(model), 0, k)
+    level, base, damping = (part.start + i for part in (space.level, space.base, space.damping))
+    places = {"ln f": [level], "ln ζ": [damping], "drift": [level, base]}
     below = {}
     for name, own in places.items():
         sign = np.array([1.0, -1.0])[: len(own)]

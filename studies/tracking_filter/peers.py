@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
-from dataclasses import dataclass
-from datetime import timedelta
+from functools import partial
 from importlib.metadata import version
 from importlib.util import find_spec
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
 from filterpy.kalman import KalmanFilter
@@ -16,22 +14,22 @@ from filterpy.kalman import KalmanFilter
 from lmshealth.stage.description import Stage
 from lmshealth.tracking.constants import DAMPING_WALK, LN_F_STD, LN_ZETA_STD
 from lmshealth.tracking.covariates import Regressor
-from lmshealth.tracking.filter_bank import FilterModel, Hyperparameters, initial, predict, update
-from lmshealth.tracking.history import History, Series
+from lmshealth.tracking.filter_bank import Hyperparameters
+from lmshealth.tracking.history import History
 from lmshealth.tracking.state_space import StateSpace
 from lmshealth.tracking.track import track
+from studies.common.cost import in_turns
+from studies.common.histories import make_history
 from studies.harness.study import Row
-from studies.tracking_filter.lives import START, Array, Life, draw, filtered
+from studies.tracking_filter.lives import Array, banks, draw, filtered
 
-PEERS = ("simdkalman", "statsmodels")
 STD = (5e-4, 0.05)
 # One setting for all: walk of ln f, its rate per life, and no walk of the rate.
 LEVEL_WALK, RATE_STD = 1e-3, 0.03
 
 
-@dataclass(frozen=True)
-class Loop:
-    """What a plain loop states of ln f, ``(n_logs, n_modes)`` each, and of the drift."""
+class Loop(NamedTuple):
+    """Ln f, its standard deviation, and the drift with its own, ``(n_logs, n_modes)`` each."""
 
     level: Array
     level_std: Array
@@ -80,11 +78,12 @@ def filterpy_loop(
         states[k], covs[k] = kalman.x, kalman.P
     variance = np.einsum("kii->ki", covs)
     both = np.einsum("kii->ki", covs[:, level, base])
+    drift_variance = variance[:, level] + variance[:, base] - 2 * both
     return Loop(
         states[:, level],
         np.sqrt(variance[:, level]),
         states[:, level] - states[:, base],
-        np.sqrt(np.maximum(variance[:, level] + variance[:, base] - 2 * both, 0.0)),
+        np.sqrt(np.maximum(drift_variance, 0.0)),
     )
 
 
@@ -92,9 +91,8 @@ def deviation(rng: np.random.Generator, n: int, machine: Stage) -> dict[str, flo
     """Compare the bank with filterpy on drawn lives: largest difference in standard deviations."""
     worst = {"ln f": 0.0, "std of ln f": 0.0, "drift": 0.0}
     for _ in range(n):
-        life: Life = draw(rng)
-        found = filtered(life, machine)
-        space = StateSpace(life.history, machine)
+        life = draw(rng)
+        found, space = filtered(life, machine), StateSpace(life.history, machine)
         book = filterpy_loop(life.history, life.setting, space.life, space.regressed)
         std = np.sqrt(np.einsum("kii->ki", found.cov["ln f"]))
         # Drifts of machines that hardly wander have next to no std, but numbers of ln f.
@@ -111,23 +109,12 @@ def deviation(rng: np.random.Generator, n: int, machine: Stage) -> dict[str, flo
 def long_life(n: int, m: int) -> History:
     """Make a long healthy life of evenly spaced logs with errors of one constant size."""
     rng = np.random.default_rng(7)
-    std = np.repeat(STD, m)
     walk = np.cumsum(rng.standard_normal((n, m)) * LEVEL_WALK / np.sqrt(n), axis=0)
-    modes = tuple(f"mode {i + 1}" for i in range(m))
-    return History(
-        stage="AX-1",
-        logs=tuple(f"{k:05d}.csv" for k in range(n)),
-        recorded_at=tuple(START + timedelta(hours=k) for k in range(n)),
-        travel=1e3 * np.arange(n),
-        covariates={},
-        modes=modes,
-        series=tuple(Series(mode, "acc") for mode in modes),
-        ln_frequency=5 + walk + STD[0] * rng.standard_normal((n, m)),
-        ln_damping=-4 + STD[1] * rng.standard_normal((n, m)),
-        cov=np.tile(np.diag(std**2), (n, 1, 1)),
-        loop_error=np.full(n, np.nan),
-        baselines=(0,),
-    )
+    ln_frequency = 5 + walk + STD[0] * rng.standard_normal((n, m))
+    ln_damping = -4 + STD[1] * rng.standard_normal((n, m))
+    cov = np.tile(np.diag(np.repeat(STD, m) ** 2), (n, 1, 1))
+    modes = [f"mode {i + 1}" for i in range(m)]
+    return make_history(modes, 1e3 * np.arange(n), (ln_frequency, ln_damping, cov))
 
 
 def one_setting() -> Hyperparameters:
@@ -139,16 +126,12 @@ def one_setting() -> Hyperparameters:
 
 def bank_of_one(history: History) -> tuple[Array, Array]:
     """Filter by the bank with one setting: ln f and its std, ``(n_logs, n_modes)``."""
-    space: StateSpace = StateSpace(history, None)
-    model = FilterModel(space)
-    model.grid = one_setting()
-    bank, n = initial(model), len(history.logs)
-    mean, variance = np.empty((n, space.n_modes)), np.empty((n, space.n_modes))
-    for k in range(n):
-        bank = update(model, predict(model, bank, k), k)[0]
-        mean[k] = bank.mean[0, space.level]
-        variance[k] = np.diag(bank.cov[0])[space.level]
-    return mean, np.sqrt(variance)
+    level = StateSpace(history, None).level
+    rows = [
+        (bank.mean[0, level], np.diag(bank.cov[0])[level])
+        for bank, _ in banks(history, None, one_setting())
+    ]
+    return np.array([mean for mean, _ in rows]), np.sqrt([variance for _, variance in rows])
 
 
 def by_simdkalman(history: History) -> tuple[Array, Array]:
@@ -177,65 +160,54 @@ def by_simdkalman(history: History) -> tuple[Array, Array]:
 def by_statsmodels(history: History) -> tuple[Array, Array]:
     """Filter ln f mode by mode by the local linear trend of statsmodels, variances given.
 
-    Its trend counts per log: ticks are taken into the numbers. It takes a covariance that changes
-    by less than 1e-19 for steady, which variances of 1e-8 are not: that is switched off.
+    Its trend counts per log. It takes a covariance that changes by less than 1e-19 as steady,
+    which variances of 1e-8 are not: that is switched off.
     """
     from statsmodels.tsa.statespace.structural import UnobservedComponents
 
     tick = 1 / (len(history.logs) - 1)
+    prior = np.diag([LN_F_STD**2, (RATE_STD * tick) ** 2])
     means, stds = [], []
     for column in history.ln_frequency.T:
         model = UnobservedComponents(column, level="lltrend")
         model.ssm.tolerance = 0.0
-        model.ssm.initialize_known(
-            np.array([column[0], 0.0]), np.diag([LN_F_STD**2, (RATE_STD * tick) ** 2])
-        )
+        model.ssm.initialize_known(np.array([column[0], 0.0]), prior)
         found = model.filter([STD[0] ** 2, LEVEL_WALK**2 * tick, 0.0])
         means.append(found.filtered_state[0])
         stds.append(np.sqrt(found.filtered_state_cov[0, 0]))
     return np.array(means).T, np.array(stds).T
 
 
-def seconds(work: Callable[[], Any]) -> float:
-    """Measure processor time."""
-    begin = time.process_time()
-    work()
-    return time.process_time() - begin
+PEERS = {"simdkalman": by_simdkalman, "statsmodels": by_statsmodels}
+LOOP = "filterpy, one setting"
 
 
 def speed(n: int, m: int, repeats: int) -> Row:
     """Compare numbers and processor time on one long life; programs take turns."""
     history = long_life(n, m)
-    missing = [name for name in PEERS if find_spec(name) is None]
-    mean, std = bank_of_one(history)
     life = float(np.ptp(history.travel))
-    others: dict[str, Callable[[], tuple[Array, Array]]] = {}
-    if "simdkalman" not in missing:
-        others["simdkalman"] = lambda: by_simdkalman(history)
-    if "statsmodels" not in missing:
-        others["statsmodels"] = lambda: by_statsmodels(history)
-    work: dict[str, Callable[[], Any]] = {
-        "filterpy, one setting": lambda: filterpy_loop(history, one_setting(), life),
+    mean, std = bank_of_one(history)
+    there = {name: work for name, work in PEERS.items() if find_spec(name)}
+    others: dict[str, Callable[[], tuple[Array, Array]]] = {
+        LOOP: lambda: filterpy_loop(history, one_setting(), life)[:2],
+        **{name: partial(work, history) for name, work in there.items()},
+    }
+    works = {
+        LOOP: others[LOOP],
         "bank, one setting": lambda: bank_of_one(history),
         "track, all settings": lambda: track(history),
         **others,
     }
-    times: dict[str, list[float]] = {name: [] for name in work}
-    for _ in range(repeats):
-        for name, run in work.items():
-            times[name].append(seconds(run))
-    loop = filterpy_loop(history, one_setting(), life)
-    numbers = {"filterpy, one setting": (loop.level, loop.level_std)}
-    numbers |= {name: run() for name, run in others.items()}
+    times = in_turns(works, repeats)
     rows = []
     for name, taken in times.items():
-        ratios = np.array(taken) / times["filterpy, one setting"]
-        row: Row = {"program": name, "cpu_s": min(taken),
-                               "times_filterpy": float(np.median(ratios))}  # fmt: skip
-        if name in numbers:
-            other, other_std = numbers[name]
+        ratio = float(np.median(np.divide(taken, times[LOOP])))
+        row: Row = {"program": name, "cpu_s": min(taken), "times_filterpy": ratio}
+        if name in others:
+            other, other_std = others[name]()
             row["deviation"] = float(np.abs((other - mean) / std).max())
             row["deviation_of_std"] = float(np.abs(other_std / std - 1).max())
         rows.append(row)
-    versions = {name: version(name) for name in PEERS if name not in missing}
+    versions = {name: version(name) for name in there}
+    missing = [name for name in PEERS if name not in there]
     return {"epochs": n, "modes": m, "programs": rows, "missing": missing, "versions": versions}
