@@ -31,7 +31,9 @@ def write(
     """
     record = read_record(script)
     folder = Path(script).parent
-    with matplotlib.rc_context({"svg.hashsalt": folder.name, "font.size": font}):
+    with matplotlib.rc_context(
+        {"svg.hashsalt": folder.name, "font.size": font, "axes.titlesize": 10}
+    ):
         width_and_height = size(record) if callable(size) else size
         figure = Figure(figsize=width_and_height, layout="constrained")
         draw(figure, record)

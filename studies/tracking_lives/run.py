@@ -1,37 +1,24 @@
 """Does the tracker cover the drift of whole lives, and alarm when it should and only then?
 
-Question
-    On lives of ten kinds: do the intervals of the drift hold the truth as often as they say? How
-    many healthy lives raise an alarm, where one in a hundred is declared? How soon is a loss of
-    5 % of the preload told, against the best that is possible? Are events found and told apart?
 Method
-    Schedules and truth are those of `models`. Estimates are drawn about the truth with the
-    covariance that identification really gives of logs of 20 s: that of a dozen simulated and
-    identified logs of each stage, each log of a life taking one of them. The following error below
-    40 Hz scatters and moves with the retuning as in these logs. The true drift is that of a mode at
-    the reference temperature, the nominal payload and the tuning of commissioning. Judged is one
-    interval a life, of one mode after one log, by the Clopper-Pearson interval of 99.9 %.
-    Where the true drift is exactly zero, a filter that knows that machines may be healthy covers
-    more than it says: of healthy lives only too low a coverage is a failure. Negative controls
-    that must fail: covariances halved while the filter may not learn by how much they are wrong;
-    the retuning neither declared nor to be seen; temperature unknown; payload unknown.
-    The loss is spread evenly over 60 logs. Its optimum knows onset, direction and course: one knows
-    also where the modes begin and what temperature does, the other learns it as a tracker must.
-    With ``--raw`` lives are instead simulated at 20 kHz and identified log by log, and judged alike
-    in raw.json. Of so many seeds every one
-    is used of the kinds healthy, temperature, payload and retuning on LMS-Y, and every fourth of
-    the others.
+    Lives of ten kinds; schedules and truth are those of `models`. Estimates are drawn about the
+    truth with the covariance of a dozen simulated and identified logs of 20 s of each stage; the
+    following error below 40 Hz scatters and moves with the retuning as in these logs. The true
+    drift is that of a mode at the reference temperature, the nominal payload and the tuning of
+    commissioning. Judged is one interval a life, of one mode after one log (99.9 %
+    Clopper-Pearson); where the true drift is zero, a filter that allows for healthy machines covers
+    more than it states: of healthy lives only too low a coverage is a failure. A loss of 5 % of
+    preload is spread evenly over 60 logs; its optimum knows onset, direction and course, and either
+    knows or has to estimate the initial modes and the effect of temperature. Controls that must
+    fail: covariances halved while the filter may not estimate their size; the retuning neither
+    declared nor visible; temperature unknown; payload unknown. With ``--raw`` lives are simulated
+    at 20 kHz and identified log by log, and judged alike in raw.json.
 Answer
-    Intervals of 90 and 50 % cover in all five kinds of damage; of healthy lives they hold the truth
-    in 98 to 100 % and 79 to 88 %. Of 4,200 healthy tracks one alarms, all 1,500 damaged ones do.
-    Temperature, payload or retuning unknown alarm in 68 to 100 of 100 lives; halved covariances
-    cover 83 % of 90. The loss of 5 % is told in 300 of 300 lives, after 23 logs in the median:
-    1.4 times the optimum that has to learn what a tracker must, 2.2 times the one that knows it.
-    Retunings are found in all lives, crashes and broken bolts in all but one of 600, as a rule with
-    their second log; regreasings in 270 of 300 on LMS-Y, where some move little, and all on LMS-X.
-    Raw lives are few, and agree.
+    Yes. Retunings are found in all lives, crashes and broken bolts in all but one of 600, as a rule
+    with their second log; regreasings in 270 of 300 on LMS-Y, where some move little, and all on
+    LMS-X. Raw lives are few, and agree.
 Run time
-    A quarter of an hour of one processor; of raw lives half a minute each, where not kept.
+    A quarter of an hour on one processor; of raw lives half a minute each, where not kept.
 """
 
 from __future__ import annotations
@@ -45,25 +32,11 @@ from unittest.mock import patch
 import numpy as np
 
 from lmshealth.tracking import constants
-from studies.common.lives import (
-    DAMAGED,
-    HEALTHY,
-    RAW,
-    Estimates,
-    Life,
-    drawn,
-    identified,
-    life_of,
-    losing_life,
-    measured,
-    plan_of,
-    recorded,
-    rng_of,
-)
+from studies.common import lives
+from studies.common.lives import DAMAGED, HEALTHY, Estimates, Life, plan_of, rng_of
 from studies.common.metrics import clopper_pearson
 from studies.harness.claims import Claim, counted, covered, number
 from studies.harness.study import LEVEL, Row, Study, Trials
-from studies.tracking_lives.optimum import optimum
 from studies.tracking_lives.trials import (
     DECLARED_RATE,
     MOST,
@@ -72,17 +45,15 @@ from studies.tracking_lives.trials import (
     alarmed,
     coverage,
     follow,
+    optimum,
     summed,
 )
 
 STEP = "track"
 EVENTS = ("crash", "sudden-loosening", "servo-retuning, undeclared", "regreasing, undeclared")
-
 CASES = [("lms-y", kind) for kind in HEALTHY + DAMAGED] + [("lms-x", kind) for kind in HEALTHY]
-QUICK = [
-    ("lms-y", "healthy"), ("lms-y", "servo-retuning"), ("lms-y", "temperature-only"),
-    ("lms-y", "payload-change"), ("lms-y", "crash"), ("lms-x", "healthy"),
-]  # fmt: skip
+_QUICK = ("healthy", "servo-retuning", "temperature-only", "payload-change", "crash")
+QUICK = [("lms-y", kind) for kind in _QUICK] + [("lms-x", "healthy")]
 # Kinds whose cause is declared by somebody, or not.
 DECLARABLE = ("servo-retuning", "regreasing")
 FIRST_SEED, RAW_SEED = 6000, 100
@@ -98,15 +69,15 @@ Sizes = dict[str, tuple[Estimates, Life]]
 def main() -> None:
     """Run the study; ``--quick`` does one life of some kinds and records nothing."""
     study = Study(__file__, __doc__, raw=0)
-    kept, seeds = study.kept(RAW), study.options.raw
+    kept, seeds = study.kept(lives.RAW), study.options.raw
     answer = raw(seeds, kept) if seeds else drawn_lives(study.trials, study.quick, kept)
     study.conclude(answer, name="raw" if seeds else "", quick_may_fail=True)
 
 
 def drawn_lives(trials: Trials, quick: bool, kept: Path | None) -> Row:
-    """Draw, track and judge lives of each kind: 300, or one with the sizes on record."""
+    """Draw, track and judge lives of each kind: 300, or one with the recorded covariances."""
     n = 1 if quick else 300
-    sizes = {s: recorded(s) if quick else measured(s, SIZED, kept) for s in STAGES}
+    sizes = {s: lives.recorded(s) if quick else lives.measured(s, SIZED, kept) for s in STAGES}
     cases = [i for i, case in enumerate(CASES) if not quick or case in QUICK]
     found = trials.collect(partial(of_kind, sizes), [(i, n) for i in cases], also=SIZES)
     answer = {
@@ -126,16 +97,14 @@ def of_kind(sizes: Sizes, i: int, n: int) -> Row:
 
 
 def pairs_of(sizes: Sizes, i: int, n: int) -> Pairs:
-    """Draw so many lives of one kind."""
+    """Draw so many lives of one kind, and estimates of them."""
     stage, kind = CASES[i]
-    return [
-        (life, drawn(life, *sizes[stage], rng_of(1, i, life.seed)))
-        for life in lives(stage, kind, n)
-    ]
+    drawn = (lives.life_of(plan_of(stage, kind, FIRST_SEED + k)) for k in range(n))
+    return [(one, lives.drawn(one, *sizes[stage], rng_of(1, i, one.seed))) for one in drawn]
 
 
 def described(sizes: Estimates, life: Life) -> Row:
-    """Tell the sizes that lives are drawn with."""
+    """Return the errors that lives are drawn with."""
     std = np.sqrt(np.einsum("kii->ki", sizes.cov))
     loop, m = np.log(sizes.loop_error), life.drift.shape[1]
     first = life.servo == "commissioning"
@@ -147,11 +116,6 @@ def described(sizes: Estimates, life: Life) -> Row:
         "ln_loop_error_scatter": float(np.sqrt(np.sum(scatter**2) / (scatter.size - 2))),
         "ln_loop_error_jump": float(loop[~first].mean() - loop[first].mean()),
     }
-
-
-def lives(stage: str, kind: str, n: int) -> Iterator[Life]:
-    """Take lives of one kind."""
-    return (life_of(plan_of(stage, kind, FIRST_SEED + i)) for i in range(n))
 
 
 def judged(pairs: Pairs) -> list[Row]:
@@ -191,45 +155,51 @@ def halved(sizes: Sizes, n: int) -> Row:
 
 def power(sizes: tuple[Estimates, Life], n: int) -> Row:
     """Return how soon a loss of preload is found, beside the best that is possible."""
-    rows: list[dict[str, float]] = []
+    rows: list[Row] = []
     false = {"knows": 0, "learns": 0}
     found = []
     for i in range(n):
         plan = plan_of("lms-y", "healthy", FIRST_SEED + i, 60)
-        life, calm = losing_life(plan), life_of(plan)
-        estimates, idle = (drawn(one, *sizes, rng_of(3, plan.seed)) for one in (life, calm))
-        (followed,) = follow([(life, estimates)])
-        found.append(followed)
-        alarms = followed.track.alarms
+        life, calm = lives.losing_life(plan), lives.life_of(plan)
+        estimates, idle = (lives.drawn(one, *sizes, rng_of(3, plan.seed)) for one in (life, calm))
+        found += follow([(life, estimates)])
+        alarms = found[-1].track.alarms
         row: Row = {"tracker": alarms[0].epoch if alarms else None}
         for name in false:
-            best = optimum(life, estimates, life.drift, learns=name == "learns")
-            row |= {name: best.told, f"bound_{name}": best.bound}
-            calmly = optimum(calm, idle, life.drift, learns=name == "learns")
-            false[name] += calmly.told is not None
-        # What is never told is told after the last log.
+            learns = name == "learns"
+            row[f"bound_{name}"], row[name] = optimum(life, estimates, life.drift, learns=learns)
+            false[name] += optimum(calm, idle, life.drift, learns=learns)[1] is not None
+        # What is never reported counts as reported after the last log.
         logs = {who: 60 if at is None else at for who, at in row.items()}
         km = np.append(life.travel, life.travel[-1]) / 1000.0
         rows.append(logs | {f"{who}_km": float(km[at]) for who, at in logs.items()})
     columns = {key: np.array([row[key] for row in rows]) for key in rows[0]}
+    mean = {key: float(values.mean()) for key, values in columns.items()}
+    delays = {
+        key: {"mean": mean[key], **{f"q{q}": float(np.percentile(v, q)) for q in (5, 50, 95)}}
+        for key, v in columns.items()
+    }
     return {
         "alarms": alarmed(found),
         "coverage": coverage(found),
-        "delays": {key: {"mean": float(v.mean()), **{f"q{q}": float(np.percentile(v, q))
-                   for q in (5, 50, 95)}} for key, v in columns.items()},
-        "over_best_that_learns": float(columns["tracker"].mean() / columns["learns"].mean()),
-        "over_best_that_knows": float(columns["tracker"].mean() / columns["knows"].mean()),
+        "delays": delays,
+        "over_best_that_learns": mean["tracker"] / mean["learns"],
+        "over_best_that_knows": mean["tracker"] / mean["knows"],
         "false_alarms_of_best": {name: {"hits": hits, "n": n} for name, hits in false.items()},
-    }  # fmt: skip
+    }
 
 
 def raw(seeds: int, cache: Path | None) -> Row:
-    """Track and judge lives that were simulated and identified."""
+    """Track and judge lives that were simulated and identified.
+
+    Every seed is used of the kinds healthy, temperature, payload and retuning on LMS-Y, and every
+    fourth of the others.
+    """
     rows = []
     for stage, kind in CASES:
         often = stage == "lms-y" and kind in HEALTHY and kind != "regreasing"
         plans = [plan_of(stage, kind, RAW_SEED + i) for i in range(0, seeds, 1 if often else 4)]
-        rows += judged([(life_of(plan), identified(plan, cache)) for plan in plans])
+        rows += judged([(lives.life_of(plan), lives.identified(plan, cache)) for plan in plans])
     return {"lives": rows, "passed": verdicts_of_lives(rows)}
 
 
@@ -283,7 +253,7 @@ def claims(answer: Row) -> Iterator[Claim]:
         met=not answer["halved"]["90"]["holds"],
     )
     power = answer["power"]
-    alarms, learns = power["alarms"], number(power["over_best_that_learns"])
+    alarms, delay = power["alarms"], power["delays"]["tracker"]
     yield counted(
         "5 % of preload lost over 60 logs is told",
         alarms["hits"],
@@ -291,20 +261,22 @@ def claims(answer: Row) -> Iterator[Claim]:
         "95 % required",
         met=alarms["share"] >= 0.95,
     )
-    delays = power["delays"]
-    spread = [delays["tracker"][q] for q in ("q5", "q95")]
     yield Claim(
         "logs until it is told, over those of the best that must learn as much",
-        learns,
-        f"{number(delays['tracker']['mean'])} logs in the mean, 90 % of lives "
-        f"{number(spread[0])} to {number(spread[1])}",
+        number(power["over_best_that_learns"]),
+        f"{number(delay['mean'])} logs in the mean, 90 % of lives {number(delay['q5'])} to "
+        f"{number(delay['q95'])}",
         f"{number(power['over_best_that_knows'])} times those of who knows all",
     )
-    hits = [row["alarms"] for row in answer["controls"]]
-    yield counted(
+    yield _counted(
         "lives alarm of which temperature, payload or a retuning is hidden (control)",
-        sum(row["hits"] for row in hits),
-        sum(row["n"] for row in hits),
+        [row["alarms"] for row in answer["controls"]],
+    )
+
+
+def _counted(what: str, rows: list[Row], beside: str = "", *, met: bool = True) -> Claim:
+    return counted(
+        what, sum(row["hits"] for row in rows), sum(row["n"] for row in rows), beside, met=met
     )
 
 
@@ -328,22 +300,15 @@ def _lives(answer: Row) -> Iterator[Claim]:
         "wider than asked" if any(not r["coverage"]["90"]["holds"] for r in healthy) else "",
         met=passed["intervals of healthy lives cover at least"],
     )
-    for what, own, asked in (
-        ("healthy lives that alarm", healthy, "healthy lives alarm as declared"),
-        ("damaged lives that alarm", damaged, "damage alarms"),
+    for what, own, beside, asked in (
+        ("healthy lives that alarm", healthy, "1 % declared", "healthy lives alarm as declared"),
+        ("damaged lives that alarm", damaged, "", "damage alarms"),
     ):
-        hits = sum(row["alarms"]["hits"] for row in own)
-        n = sum(row["n"] for row in own)
-        yield counted(what, hits, n, "1 % declared" if own is healthy else "", met=passed[asked])
+        yield _counted(what, [row["alarms"] for row in own], beside, met=passed[asked])
     for name in EVENTS:
         own = [row["events"]["found_right"] for row in rows if row["name"] == name]
-        each = " (" + ", ".join(f"{row['hits']} of {row['n']}" for row in own) + ")"
-        yield counted(
-            f"told for what it is: {name}",
-            sum(row["hits"] for row in own),
-            sum(row["n"] for row in own),
-            each.strip(" ()") if len(own) > 1 else "",
-        )
+        each = ", ".join(f"{row['hits']} of {row['n']}" for row in own) if len(own) > 1 else ""
+        yield _counted(f"told for what it is: {name}", own, each)
 
 
 if __name__ == "__main__":

@@ -1,36 +1,33 @@
-"""Tracks of many lives, and what is counted in them: alarms, coverage, events."""
+"""Tracks of many lives, what is counted in them, and the best detector of a known loss."""
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import cache
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy import stats
 
 from lmshealth.stage.description import Stage, load_stage
-from lmshealth.tracking.history import History
+from lmshealth.tracking.constants import FALSE_ALARM_PROBABILITY, LN_F_STD
 from lmshealth.tracking.track import Track, track
 from studies.common.lives import HEALTHY, Array, Estimates, Life, history_of, rng_of
-from studies.common.metrics import clopper_pearson
-from studies.harness.study import LEVEL, Row, judge_coverage
+from studies.harness.study import Row, judge_scores, share_row
 
 STAGES = ("lms-y", "lms-x")
 NOMINALS = (0.9, 0.5)
 DECLARED_RATE, MOST = 0.01, 0.05
-# An event counts as found where it is told so many logs about its own.
+# An event counts as found where it is reported so many logs about its own.
 _ABOUT = 2
 _EXPECTED = {
     "crash": "step", "sudden-loosening": "step", "regreasing": "regreasing",
     "servo-retuning": "servo",
 }  # fmt: skip
+_TEMPERATURE_STD = 0.001  # per K, as in the descriptions of the stages
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Followed:
+class Followed(NamedTuple):
     """One life, its estimates and its track."""
 
     life: Life
@@ -47,18 +44,13 @@ def stage_of(name: str) -> Stage:
 def follow(pairs: Sequence[tuple[Life, Estimates]], **known: Any) -> list[Followed]:
     """Track lives; what is known of them goes to `history_of`."""
     return [
-        Followed(life, estimates, tracked(life, history_of(life, estimates, **known)))
-        for life, estimates in pairs
+        Followed(life, seen, track(history_of(life, seen, **known), stage_of(life.stage)))
+        for life, seen in pairs
     ]
 
 
-def tracked(life: Life, history: History) -> Track:
-    """Track one history with the description of its stage."""
-    return track(history, stage_of(life.stage))
-
-
 def summed(followed: list[Followed], name: str) -> Row:
-    """Sum up lives of one kind."""
+    """Summarise lives of one kind."""
     life = followed[0].life
     return {
         "name": name,
@@ -67,21 +59,19 @@ def summed(followed: list[Followed], name: str) -> Row:
         "n": len(followed),
         "alarms": alarmed(followed),
         "coverage": coverage(followed),
-        "events": told(followed),
+        "events": events(followed),
     }
 
 
 def alarmed(followed: list[Followed]) -> Row:
     """Count the lives with an alarm."""
-    hits, n = sum(bool(one.track.alarms) for one in followed), len(followed)
-    low, high = clopper_pearson(hits, n, LEVEL)
-    return {"hits": hits, "n": n, "share": hits / n, "low": low, "high": high}
+    return share_row(sum(bool(one.track.alarms) for one in followed), len(followed))
 
 
 def scores(one: Followed) -> Array:
-    """Errors of the drift over their standard deviations, from the second log on, ``(n - 1, 3)``.
+    """Return errors of the drift over their standard deviations, from the second log on.
 
-    A log at the baseline's own odometer has no drift and no error.
+    Shape ``(n - 1, 3)``. A log at the baseline's own odometer has no drift and no error.
     """
     std = np.sqrt(np.einsum("kii->ki", one.track.drift_cov)[1:])
     off = one.track.drift[1:] - one.life.drift[1:]
@@ -92,25 +82,22 @@ def coverage(followed: list[Followed]) -> Row:
     """Count the intervals of the drift that hold the truth.
 
     Judged is one interval a life, of one mode after one log, because those of one life depend on
-    each other; of lives with damage one at which the truth has moved. Beside it stands the share
-    of all.
+    each other; of lives with damage one at which the truth has moved. Beside it is the share of
+    all.
     """
     every = [scores(one) for one in followed]
     judged = np.array([_one(one, z) for one, z in zip(followed, every, strict=True)])
     together = np.concatenate([z.ravel() for z in every])
     rows: Row = {"rms": float(np.sqrt(np.mean(together**2)))}
     for nominal in NOMINALS:
-        reach = float(stats.norm.isf((1 - nominal) / 2))
-        hits = int(np.sum(np.abs(judged) <= reach))
-        rows[f"{100 * nominal:g}"] = {
-            **judge_coverage(hits, judged.size, nominal),
-            "share_of_all": float(np.mean(np.abs(together) <= reach)),
-        }
+        inside = np.abs(together) <= stats.norm.isf((1 - nominal) / 2)
+        row = judge_scores(judged, nominal) | {"share_of_all": float(inside.mean())}
+        rows[f"{100 * nominal:g}"] = row
     return rows
 
 
 def _one(one: Followed, z: Array) -> float:
-    """Pick the interval of a life that is judged."""
+    """Choose the interval of a life that is judged."""
     rng = rng_of(2, one.life.seed, len(one.life.kind))
     mode = int(rng.integers(z.shape[1]))
     moved = np.flatnonzero(one.life.drift[1:, mode])
@@ -119,28 +106,60 @@ def _one(one: Followed, z: Array) -> float:
     return float(z[rng.choice(moved), mode])
 
 
-def told(followed: list[Followed]) -> Row:
-    """Return what was found that nobody had declared, and how soon."""
-    kinds: Counter[str] = Counter()
-    delays, right, wrong = [], 0, 0
-    for one in followed:
-        found = {(e.kind, e.epoch): e for e in one.track.events
-                 if e.kind != "alarm" and not e.declared}  # fmt: skip
-        kinds.update({kind for kind, _ in found})
-        if one.life.event is None:
+def events(followed: list[Followed]) -> Row:
+    """Count the undeclared events of a kind of lives that are reported right, and how soon."""
+    delays, wrong = [], 0
+    for life, _, found in followed:
+        if life.event is None:
             continue
-        near = [e for e in found.values() if abs(e.epoch - one.life.event) <= _ABOUT]
-        own = [e for e in near if e.kind == _EXPECTED[one.life.kind]]
-        right += bool(own)
+        near = [
+            e
+            for e in found.events
+            if e.kind != "alarm" and not e.declared and abs(e.epoch - life.event) <= _ABOUT
+        ]
+        own = [e.found_at for e in near if e.kind == _EXPECTED[life.kind]]
+        delays += [min(own) - life.event] if own else []
         wrong += bool(near) and not own
-        delays += [min(e.found_at for e in own) - one.life.event] if own else []
-    n = len(followed)
-    events: Row = {"lives_with": {kind: kinds[kind] for kind in sorted(kinds)}}
-    if any(one.life.event is not None for one in followed):
-        low, high = clopper_pearson(right, n, LEVEL)
-        events |= {"found_right": {"hits": right, "n": n, "share": right / n,
-                                   "low": low, "high": high},
-                   "taken_for_another": wrong,
-                   "logs_until": {f"q{q}": float(np.percentile(delays, q)) for q in (50, 95)}
-                   if delays else None}  # fmt: skip
-    return events
+    if all(one.life.event is None for one in followed):
+        return {}
+    until = {f"q{q}": float(np.percentile(delays, q)) for q in (50, 95)} if delays else None
+    right = share_row(len(delays), len(followed))
+    return {"found_right": right, "taken_for_another": wrong, "logs_until": until}
+
+
+def optimum(
+    life: Life, estimates: Estimates, loss: Array, *, learns: bool
+) -> tuple[int | None, int | None]:
+    """Return the logs after which the best detectors report a loss ``(n, 3)`` of ln frequency.
+
+    The likelihood ratio of a loss whose course is known against none, log by log. By Ville's
+    inequality it reaches 1/α in at most a share α of healthy lives, and no test of this rate is
+    much faster: Lorden's bound on the delay of a CUSUM is ln(1/α) over the information per log, and
+    for a loss that grows, the log at which the information reaches ln(1/α). Returned are the logs
+    of bound and ratio, None where they are not reached. ``learns``: the detector has to estimate
+    the initial modes and their temperature coefficients, as a tracker has, or else knows them.
+    """
+    n, m = loss.shape
+    warmer = life.covariates["temperature_c"] - 21.0
+    prior = np.repeat([LN_F_STD, _TEMPERATURE_STD], m) ** 2 if learns else np.zeros(2 * m)
+    known = life.ln_frequency[:1] if learns else life.ln_frequency - life.drift
+    seen = np.stack([estimates.ln_frequency - known, loss], axis=2)
+    # One filter for both: the estimates, and the loss.
+    mean, cov = np.zeros((2 * m, 2)), np.diag(prior)
+    ratio, information = np.zeros(n), np.zeros(n)
+    for k in range(n):
+        design = np.hstack([np.eye(m), warmer[k] * np.eye(m)])
+        spread = design @ cov @ design.T + estimates.cov[k, :m, :m]
+        gain = np.linalg.solve(spread, design @ cov).T
+        off = seen[k] - design @ mean
+        mean = mean + gain @ off
+        cov = cov - gain @ design @ cov
+        weighed = np.linalg.solve(spread, off[:, 1])
+        information[k] = 0.5 * off[:, 1] @ weighed
+        ratio[k] = off[:, 0] @ weighed - information[k]
+    return _first(information), _first(ratio)
+
+
+def _first(per_log: Array) -> int | None:
+    enough = np.flatnonzero(np.cumsum(per_log) >= np.log(1 / FALSE_ALARM_PROBABILITY))
+    return int(enough[0]) if enough.size else None
