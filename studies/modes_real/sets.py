@@ -2,23 +2,24 @@
 
 from __future__ import annotations
 
-import tempfile
-from collections.abc import Sequence
+import tomllib
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 from scipy.stats import norm
 
 from lmshealth import identify, read_log
-from lmshealth.io.column_map import load_columns
+from lmshealth.io.column_map import ColumnMap
 from lmshealth.io.log import Channel, Log, Metadata
 from lmshealth.modal.modes import Modes
 from lmshealth.stage.description import Description, ModeSpec, Stage
 from studies.harness.study import Row
 from studies.read_throughput.samples import MAPS
 
-_Z = float(norm.isf(0.025))
+Z95 = float(norm.isf(0.025))
 
 # Estimated once by another method: lowest and highest frequency in Hz, and how far off is right.
 SHAKE = {
@@ -46,31 +47,32 @@ def to_log(values: np.ndarray[Any, Any], rate: float) -> Log:
 
 
 def identify_known(
-    log: Log, frequency: Sequence[float], damping: Sequence[float], channels: Sequence[str] | None
+    log: Log,
+    frequency: Iterable[float],
+    damping: Iterable[float],
+    channels: Sequence[str] | None = None,
 ) -> list[Row]:
     """Identify modes that a description names; those refused have their reason instead."""
-    specs = tuple(
-        ModeSpec(str(k), f, z) for k, (f, z) in enumerate(zip(frequency, damping, strict=True))
-    )
+    pairs = enumerate(zip(frequency, damping, strict=True))
+    specs = tuple(ModeSpec(str(k), f, z) for k, (f, z) in pairs)
     stage = Stage(Description(name="known", mode=specs), None, "0" * 64)
     modes = identify(log, stage, channels=channels)
     why = {refusal.mode: refusal.reason for refusal in modes.refused}
     return [
-        tell(modes, modes.names.index(spec.name))
+        describe(modes, modes.names.index(spec.name))
         if spec.name in modes.names
         else {"refused": why[spec.name]}
         for spec in specs
     ]
 
 
-def tell(modes: Modes, i: int) -> Row:
-    """Return what was identified of one mode."""
+def describe(modes: Modes, i: int) -> Row:
+    """Return the estimates of one mode."""
     return {
         "f_hz": float(modes.frequency[i]),
         "f_std_hz": float(modes.frequency_std[i]),
         "zeta": float(modes.damping_ratio[i]),
         "zeta_std": float(modes.damping_ratio_std[i]),
-        "snr": float(modes.snr[i]),
     }
 
 
@@ -79,7 +81,7 @@ def holds(row: Row, what: str, truth: float) -> bool:
     if "refused" in row:
         return False
     value, std = (row["f_hz"], row["f_std_hz"]) if what == "f" else (row["zeta"], row["zeta_std"])
-    return bool(abs(np.log(value / truth)) < _Z * std / value)
+    return bool(abs(np.log(value / truth)) < Z95 * std / value)
 
 
 def study_koma(data: Path) -> list[Row]:
@@ -96,7 +98,7 @@ def study_koma(data: Path) -> list[Row]:
         "stepped": (np.abs(stepped) / (2 * np.pi), -stepped.real / np.abs(stepped)),
     }
     log = to_log(np.load(folder / "data_shearframe.npy"), KOMA_RATE)
-    rows = identify_known(log, *known["documented"], None)
+    rows = identify_known(log, *known["documented"])
     for k, row in enumerate(rows):
         for name, (f, damping) in known.items():
             row[f"{name}_f_hz"], row[f"{name}_zeta"] = float(f[k]), float(damping[k])
@@ -109,7 +111,7 @@ def study_weimar(data: Path) -> list[Row]:
     """Identify the simulated frame of the lowest damping."""
     record = np.load(data / "SIMULATED_weimar_frame/measurement_2.npy")
     log = to_log(record[:, WEIMAR_CHANNELS], WEIMAR_RATE)
-    rows = identify_known(log, WEIMAR, [WEIMAR_DAMPING] * len(WEIMAR), None)
+    rows = identify_known(log, WEIMAR, [WEIMAR_DAMPING] * len(WEIMAR))
     for f, row in zip(WEIMAR, rows, strict=True):
         row |= {"known_f_hz": f, "holds_zeta": holds(row, "zeta", WEIMAR_DAMPING)}
         # Half-power bandwidth of one Fourier step, as a damping ratio.
@@ -121,16 +123,13 @@ def study_mpstd(data: Path) -> Row:
     """Search for a weak mode beside the mains, without a description."""
     modes = identify(read_log(data / MPSTD), band=MPSTD_BAND)
     f, damping = MPSTD_MODE
-    row = tell(modes, int(np.argmin(np.abs(modes.frequency - f))))
+    row = describe(modes, int(np.argmin(np.abs(modes.frequency - f))))
+    lines = [line for line in modes.lines if abs(line.frequency - MAINS) < 1]
     return row | {
         "holds_f": holds(row, "f", f),
         "holds_zeta": holds(row, "zeta", damping),
         "modes_at_mains": int(np.sum(np.abs(modes.frequency - MAINS) < 1)),
-        "lines": [
-            {"frequency_hz": line.frequency, "kind": line.kind}
-            for line in modes.lines
-            if abs(line.frequency - MAINS) < 1
-        ],
+        "lines": [{"frequency_hz": line.frequency, "kind": line.kind} for line in lines],
     }
 
 
@@ -141,10 +140,8 @@ def study_shake(data: Path) -> Row:
         middle = [(low + high) / 2 for low, high, _ in known]
         for floor in FLOORS:
             name = f"shake_3storey/open/{frame}_BonusEvent_{floor}.csv"
-            with tempfile.TemporaryDirectory() as scratch:
-                path = Path(scratch) / "columns.toml"
-                path.write_text(MAPS[name], encoding="utf-8")
-                log = read_log(data / name, columns=load_columns(path))
+            columns = msgspec.convert(tomllib.loads(MAPS[name]), ColumnMap)
+            log = read_log(data / name, columns=columns)
             found = identify_known(log, middle, [SHAKE_DAMPING] * len(known), ["acc_x"])
             for k, (row, (low, high, tolerance)) in enumerate(zip(found, known, strict=True)):
                 row |= {"frame": frame, "floor": floor, "mode": k, "low_hz": low, "high_hz": high}
@@ -154,6 +151,6 @@ def study_shake(data: Path) -> Row:
                 rows.append(row)
     first = [
         np.median([r["f_hz"] for r in rows if r["frame"] == f and r["mode"] == 0 and "f_hz" in r])
-        for f in ("Flexible", "Stiff")
+        for f in SHAKE
     ]
     return {"rows": rows, "stiffness_ratio": float((first[1] / first[0]) ** 2)}

@@ -13,6 +13,7 @@ import ast
 import re
 from collections.abc import Iterable
 from dataclasses import dataclass
+from itertools import takewhile
 
 import libcst as cst
 from libcst import matchers as m
@@ -75,7 +76,8 @@ class _Finder(cst.CSTVisitor):
 
     def on_visit(self, node: cst.CSTNode) -> bool:
         self._depth += isinstance(node, cst.FunctionDef | cst.ClassDef)
-        if _tells(node) or (self._depth == 0 and _is_alias(node)):
+        alias = m.matches(node, m.Assign(value=m.Subscript())) or isinstance(node, cst.TypeAlias)
+        if _tells(node) or (self._depth == 0 and alias):
             return False
         for of, operator in mutation_operators:
             if isinstance(node, of):
@@ -106,11 +108,6 @@ def _tells(node: cst.CSTNode) -> bool:
     return isinstance(node, _TOLD)
 
 
-def _is_alias(node: cst.CSTNode) -> bool:
-    """Whether a statement outside of functions names a type."""
-    return m.matches(node, m.Assign(value=m.Subscript())) or isinstance(node, cst.TypeAlias)
-
-
 def _gone(old: cst.CSTNode, new: cst.CSTNode) -> Iterable[cst.CSTNode]:
     """Return the arguments of a call that a mutant does not have, or has changed."""
     if not isinstance(old, cst.Call) or not isinstance(new, cst.Call):
@@ -121,21 +118,21 @@ def _gone(old: cst.CSTNode, new: cst.CSTNode) -> Iterable[cst.CSTNode]:
 def _differing(old: str, new: str) -> tuple[str, str]:
     """Return the lines that two texts do not share at their beginning and end."""
     a, b = old.splitlines(), new.splitlines()
-    first = next((k for k, pair in enumerate(zip(a, b, strict=False)) if pair[0] != pair[1]), 0)
-    last = 0
-    while last < min(len(a), len(b)) - first - 1 and a[-1 - last] == b[-1 - last]:
-        last += 1
+    first = _shared(a, b)
+    last = _shared(a[first:][::-1], b[first:][::-1])
     told = (" ".join(line.strip() for line in text[first : len(text) - last]) for text in (a, b))
     return next(told), next(told)
+
+
+def _shared(a: list[str], b: list[str]) -> int:
+    return sum(1 for _ in takewhile(lambda pair: pair[0] == pair[1], zip(a, b, strict=False)))
 
 
 def planted(source: str, line: int) -> str:
     """Make the function that holds a line fail, or the module, where no function does."""
     body = _body(ast.parse(source), line) or ast.parse(source).body
-    documented = isinstance(body[0], ast.Expr) and isinstance(body[0].value, ast.Constant)
-    future = [k for k, node in enumerate(body) if isinstance(node, ast.ImportFrom)
-              and node.module == "__future__"]  # fmt: skip
-    after = body[future[0] + 1 if future else min(int(documented), len(body) - 1)]
+    kept = (ast.Expr, ast.ImportFrom)  # docstring and __future__
+    after = next((node for node in body if not isinstance(node, kept)), body[-1])
     decorators = getattr(after, "decorator_list", [])
     first = min(node.lineno for node in (after, *decorators))
     lines = source.splitlines()
@@ -162,10 +159,7 @@ def reach(source: str, line: int) -> int:
 
 def bits(lines: Iterable[int]) -> int:
     """Write lines as bits of a number."""
-    total = 0
-    for line in lines:
-        total |= 1 << line
-    return total
+    return sum(1 << line for line in set(lines))
 
 
 def _inside(node: ast.FunctionDef) -> range:
@@ -174,21 +168,15 @@ def _inside(node: ast.FunctionDef) -> range:
 
 def _body(tree: ast.AST, line: int) -> list[ast.stmt] | None:
     """Return the body of the innermost function that holds a line in it."""
-    holding = [
-        node
-        for node in ast.walk(tree)
-        if isinstance(node, ast.FunctionDef) and line in _inside(node)
-    ]
+    functions = (node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef))
+    holding = [node for node in functions if line in _inside(node)]
     return max(holding, key=lambda node: node.lineno).body if holding else None
 
 
 def _innermost(body: list[ast.stmt], line: int) -> ast.stmt:
-    inside = [
-        node
-        for statement in body
-        for node in ast.walk(statement)
-        if isinstance(node, ast.stmt) and node.lineno <= line <= (node.end_lineno or 0)
-    ]
+    nodes = (node for statement in body for node in ast.walk(statement))
+    statements = (node for node in nodes if isinstance(node, ast.stmt))
+    inside = [node for node in statements if node.lineno <= line <= (node.end_lineno or 0)]
     return max(inside, key=lambda node: node.lineno)
 
 

@@ -11,43 +11,31 @@ import signal
 import subprocess
 import sys
 import tempfile
+from collections import defaultdict
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import NamedTuple
 
 from coverage import CoverageData
 
 from studies.harness.study import Row
-from studies.mutants.making import Mutants, bits, planted
+from studies.mutants.making import Mutants, planted
 from studies.mutants.watching import WATCH
 
 ROOT = Path(__file__).parents[2]
 CUT_OFF_S = 1200.0  # of processor time, for a file of tests of the unchanged project
 MEMORY = 6 << 30
-_FINE, _NO_TESTS = 0, 5  # what pytest returns
+_NO_TESTS = 5  # returned by pytest
 
 
-@dataclass(frozen=True, slots=True)
-class Outcome:
+class Outcome(NamedTuple):
     """What a run of tests came to."""
 
     code: int  # Returned by pytest, or minus the signal that ended it
     rows: list[Row]  # One for each test
     seconds: float  # Of the processor
-
-    @property
-    def fate(self) -> str:
-        """Return what this means for a mutant."""
-        if self.code == _FINE:
-            return "survived"
-        return "timed out" if self.code in (-signal.SIGXCPU, -signal.SIGKILL) else "killed"
-
-    @property
-    def by(self) -> str:
-        """Name the first test that failed; none did where tests could not begin."""
-        return next((row["test"] for row in self.rows if row["failed"]), "")
 
 
 def collect(file: str, digest: str, *, modules: tuple[str, ...]) -> Row:
@@ -78,20 +66,16 @@ def collect(file: str, digest: str, *, modules: tuple[str, ...]) -> Row:
 
 def _lines(data: CoverageData, tree: Path) -> dict[str, dict[str, str]]:
     """Return by test and module the lines that are run, as bits of a hexadecimal number."""
-    found: dict[str, dict[str, set[int]]] = {}
+    found: dict[str, dict[str, int]] = defaultdict(lambda: defaultdict(int))
     for name in data.measured_files():
         module = Path(name).relative_to(tree.resolve() / "lmshealth").with_suffix("").as_posix()
         for line, contexts in data.contexts_by_lineno(name).items():
             for context in contexts:
-                test = context.rpartition("|")[0]
-                found.setdefault(test, {}).setdefault(module, set()).add(line)
-    return {
-        test: {module: f"{bits(lines):x}" for module, lines in modules.items()}
-        for test, modules in found.items()
-    }
+                found[context.rpartition("|")[0]][module] |= 1 << line
+    return {test: {k: f"{bits:x}" for k, bits in own.items()} for test, own in found.items()}
 
 
-def attempt(module: str, change: str, digest: str, *, plans: Path, root: Path = ROOT) -> Row:
+def attempt(module: str, change: str, digest: str, *, plans: Path) -> Row:
     """Run the tests of a plan on a changed module, until one fails.
 
     ``change`` is the number of a mutant, ``as it is``, or ``planted`` and a line.
@@ -99,15 +83,18 @@ def attempt(module: str, change: str, digest: str, *, plans: Path, root: Path = 
     plan = json.loads((plans / f"{digest}.json").read_text(encoding="utf-8"))
     if not plan["tests"]:
         return {"fate": "survived", "by": "", "tests": 0, "cpu_s": 0.0}
-    with _copy(root) as tree:
+    with _copy() as tree:
         path = tree / "lmshealth" / f"{module}.py"
         path.write_text(_changed(path.read_text(encoding="utf-8"), change), encoding="utf-8")
         chosen = tree / "plan.txt"
         chosen.write_text("\n".join(plan["tests"]) + "\n", encoding="utf-8")
         outcome = _run(tree, (f"@{chosen}", "-x"), plan["limit_s"])
     assert outcome.code != _NO_TESTS
-    return {"fate": outcome.fate, "by": outcome.by, "tests": len(outcome.rows),
-            "cpu_s": outcome.seconds}  # fmt: skip
+    fate = "survived" if outcome.code == 0 else "killed"
+    if outcome.code in (-signal.SIGXCPU, -signal.SIGKILL):
+        fate = "timed out"
+    by = next((row["test"] for row in outcome.rows if row["failed"]), "")
+    return {"fate": fate, "by": by, "tests": len(outcome.rows), "cpu_s": outcome.seconds}
 
 
 def _changed(source: str, change: str) -> str:
@@ -121,11 +108,11 @@ def _changed(source: str, change: str) -> str:
 
 
 @contextmanager
-def _copy(root: Path = ROOT) -> Iterator[Path]:
+def _copy() -> Iterator[Path]:
     """Copy the project to where tests may write, with what is compiled of it."""
     leave = shutil.ignore_patterns(".[a-z]*", "demo", "build", "*.egg-info")
     with tempfile.TemporaryDirectory() as name:
-        yield Path(shutil.copytree(root, Path(name) / "tree", ignore=leave))
+        yield Path(shutil.copytree(ROOT, Path(name) / "tree", ignore=leave))
 
 
 def _run(tree: Path, words: Iterable[str], limit_s: float) -> Outcome:
@@ -145,11 +132,12 @@ def _run(tree: Path, words: Iterable[str], limit_s: float) -> Outcome:
         preexec_fn=partial(_limit, limit_s),
     ) as program:  # fmt: skip
         try:
-            # Who waits for ever uses no processor.
+            # A program that waits for ever uses no processor.
             with suppress(subprocess.TimeoutExpired):
                 program.wait(60 + 10 * limit_s)
-        finally:
-            _end(program.pid)
+        finally:  # all that it has started and left
+            with suppress(ProcessLookupError):
+                os.killpg(program.pid, signal.SIGKILL)
     rows = [json.loads(line) for line in watch.read_text(encoding="utf-8").splitlines()]
     return Outcome(program.returncode, rows, round(_spent() - before, 2))
 
@@ -159,12 +147,6 @@ def _limit(seconds: float) -> None:
     resource.setrlimit(resource.RLIMIT_CPU, (int(seconds), int(seconds) + 5))
     resource.setrlimit(resource.RLIMIT_DATA, (MEMORY, MEMORY))
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-
-
-def _end(group: int) -> None:
-    """End all that a run of tests has started and left."""
-    with suppress(ProcessLookupError):
-        os.killpg(group, signal.SIGKILL)
 
 
 def _spent() -> float:
