@@ -29,16 +29,9 @@ PROMINENCE_DB = 0.5
 # Rows of Tables 6 and 7 that belong to a mode of three rigid bodies.
 MODE_ROWS = {
     "x": {10: "granite_feed", 50: "granite_pitch", 100: "roll", 150: "yaw", 250: "pitch"},
-    "y": {
-        10: "granite_feed",
-        40: "granite_vertical",
-        50: "granite_pitch",
-        130: "roll",
-        140: "pitch",
-        160: "yaw",
-        380: "vertical",
-    },
-}
+    "y": {10: "granite_feed", 40: "granite_vertical", 50: "granite_pitch", 130: "roll",
+          140: "pitch", 160: "yaw", 380: "vertical"},
+}  # fmt: skip
 # Section 4 of the paper, from its Figure 18.
 PRINTED_GROWING = {
     "x": [10, 50, 150],
@@ -91,18 +84,13 @@ def acceleration_reading(recording: Recording, bands: Iterable[Array]) -> list[f
 
     The paper does not say which of its two directions a magnitude belongs to.
     """
-    names = ("acc_feed_m_s2", "acc_pitch_m_s2")
-    magnitude = np.max(
-        [1e3 * amplitude_spectrum(recording.columns[name].astype(float)) for name in names], axis=0
+    both = [recording.columns[f"acc_{name}_m_s2"].astype(float) for name in ("feed", "pitch")]
+    magnitude = np.max([1e3 * amplitude_spectrum(values) for values in both], axis=0)
+    hertz = np.fft.rfftfreq(both[0].size, 1 / recording.metadata["sample_rate_hz"])
+    inside = (
+        np.any([(low < hertz) & (hertz < high) for low, high in row], axis=0) for row in bands
     )
-    rate = recording.metadata["sample_rate_hz"]
-    hertz = np.fft.rfftfreq(recording.columns[names[0]].size, 1 / rate)
-    return [
-        float(
-            magnitude[np.any([(low < hertz) & (hertz < high) for low, high in row], axis=0)].max()
-        )
-        for row in bands
-    ]
+    return [float(magnitude[row].max()) for row in inside]
 
 
 def bands_of(axis: str) -> list[Array]:
@@ -140,43 +128,34 @@ def moves(axis: str, seed: int, constant: float | None = None) -> list[Recording
 
 def velocity_rows(axis: str, seeds: int, constant: float | None = None) -> list[TableRow]:
     """Return the rows of Tables 3, 4 and 6 or 7 of one configuration; see `moves`."""
-    bands = bands_of(axis)
+    bands, number = bands_of(axis), 6 if axis == "x" else 7
     errors, accelerations = [], []
     for seed in range(seeds):
         records = moves(axis, seed, constant)
-        errors.append([list(error_reading(record).values()) for record in records])
+        errors.append([error_reading(record) for record in records])
         accelerations.append([acceleration_reading(record, bands) for record in records])
-    keys = list(error_reading(records[0]))
-    table = {**printed(3).to_dict("list"), **printed(4).to_dict("list")}
-    rows = [
-        _row("Table 3" if i < 4 else "Table 4", f"{axis} {key}", table[f"{axis}_{key}"],
-             np.array(errors)[:, :, i])
-        for i, key in enumerate(keys)
-    ]  # fmt: skip
-    number = 6 if axis == "x" else 7
-    for i, line in printed(number).iterrows():
-        hertz = int(line["frequency_hz"])
-        cells = list(line.iloc[2:])
-        rows.append(
-            _row(f"Table {number}", f"{axis} {hertz} Hz", cells, np.array(accelerations)[:, :, i],
-                 MODE_ROWS[axis].get(hertz))
-        )  # fmt: skip
+    cells = {**printed(3).to_dict("list"), **printed(4).to_dict("list")}
+    rows = []
+    for i, key in enumerate(errors[0][0]):
+        found = np.array([[one[key] for one in of_seed] for of_seed in errors])
+        name = f"{axis} {key}"
+        rows.append(_row("Table 3" if i < 4 else "Table 4", name, cells[f"{axis}_{key}"], found))
+    for line, found in zip(
+        printed(number).to_numpy(), np.moveaxis(accelerations, 2, 0), strict=True
+    ):
+        hertz = int(line[1])
+        mode = MODE_ROWS[axis].get(hertz)
+        rows.append(_row(f"Table {number}", f"{axis} {hertz} Hz", line[2:], found, mode))
     return rows
 
 
 def _row(
-    table: str, name: str, cells: list[float], found: Array, mode: str | None = None
+    table: str, name: str, cells: Iterable[float], found: Array, mode: str | None = None
 ) -> TableRow:
-    """Make a row of the mean over seeds (seed, velocity) and its scatter."""
+    """Make a row of the mean over seeds ``(n_seeds, n_velocities)`` and its scatter."""
     spread = found.std(axis=0, ddof=1) if len(found) > 1 else np.full(found.shape[1], np.nan)
-    return TableRow(
-        table,
-        name,
-        tuple(float(c) for c in cells),
-        tuple(found.mean(axis=0).tolist()),
-        tuple(spread.tolist()),
-        mode,
-    )
+    return TableRow(table, name, tuple(map(float, cells)), tuple(found.mean(axis=0).tolist()),
+                    tuple(spread.tolist()), mode)  # fmt: skip
 
 
 def loop_rows() -> list[TableRow]:
@@ -186,26 +165,28 @@ def loop_rows() -> list[TableRow]:
     I/P alone.
     """
     table = printed(1).set_index("parameter")
-    table.loc["velocity_loop_i_over_p"] = (
-        table.loc["velocity_loop_i"] / table.loc["velocity_loop_p"]
-    )
-    table = table.drop(index=["velocity_loop_i", "velocity_loop_p"])
-    found: dict[str, list[float]] = {name: [] for name in table.index}
+    ratio = table.loc["velocity_loop_i"] / table.loc["velocity_loop_p"]
+    table.loc["velocity_loop_i_over_p"] = ratio
+    found: dict[str, list[float]] = {}
     for name in STAGES:
-        loops = [margin_record(case) for case in cases(name)]
-        loop = next(
-            row for row in loops if (row["reading"], row["structure"]) == ("corrected", "flexible")
+        (loop,) = (
+            row
+            for row in map(margin_record, cases(name))
+            if (row["reading"], row["structure"]) == ("corrected", "flexible")
         )
         gain = next(c for c in loop["crossovers"] if c["phase_margin_deg"] is not None)
         upper = [c for c in loop["crossovers"] if c["crossover"].startswith("upper")]
-        found["bandwidth_hz"].append(gain["frequency_hz"])
-        found["phase_margin_deg"].append(gain["phase_margin_deg"])
-        found["gain_margin_db"].append(min(c["gain_margin_db"] for c in upper))
-        for key, value in _controller_numbers(name).items():
-            found[key].append(value)
+        margins = {
+            "bandwidth_hz": gain["frequency_hz"],
+            "gain_margin_db": min(c["gain_margin_db"] for c in upper),
+            "phase_margin_deg": gain["phase_margin_deg"],
+        }
+        for key, value in (margins | _controller_numbers(name)).items():
+            found.setdefault(key, []).append(value)
+    order = [key for key in table.index if key in found]
     return [
-        TableRow("Table 1", key, tuple(map(float, table.loc[key])), tuple(values))
-        for key, values in found.items()
+        TableRow("Table 1", key, tuple(map(float, table.loc[key])), tuple(found[key]))
+        for key in order
     ]
 
 
