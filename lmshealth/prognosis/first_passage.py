@@ -31,16 +31,12 @@ def first_passage(
 
     Parameters
     ----------
-    path : DegradationPath
-        Degradation of the parameter, with natural parameters `theta`, shape ``(n, k)``.
+    path, theta : DegradationPath, ndarray
+        Degradation of the parameter, with natural parameters of shape ``(n, k)``.
     off, rate : ndarray
         Deviation of ln health from its law now, and its variance per m, shape ``(n,)``.
-    rng : Generator
-        Random numbers.
-    now, horizon : float
-        Travel in m since the baseline, and from now to the horizon.
-    limit : float
-        Limit as a fraction of baseline.
+    now, limit, horizon : float
+        Travel in m since the baseline, limit as a fraction of it, and m from now to the horizon.
 
     Returns
     -------

@@ -21,20 +21,15 @@ class LifeData:
 
     Attributes
     ----------
-    stage, history : Stage, History
-        Description, and all logs, condensed.
-    columns : list of int
-        Series of the history that are used.
-    modes : tuple of str
-        Modes of these series; `mode_of_series` are their indices, shape ``(n_series,)``.
-    clock : ndarray
-        Travel since the baseline in m of each log since then, shape ``(n_logs,)``.
-    steps : tuple of float
-        Travel since the baseline in m of each step of the modes.
-    rows : ndarray of int
-        Index of each datum among all series and logs, shape ``(n_data,)``.
-    y : ndarray
-        Ln f minus the mean of its mode, shape ``(n_data,)``.
+    history : History
+        All logs, condensed.
+    columns, modes, mode_of_series : list of int, tuple of str, ndarray of int
+        Series of the history that are used, their modes, and the mode of each, ``(n_series,)``.
+    clock, steps : ndarray, tuple of float
+        Travel since the baseline in m of each log, shape ``(n_logs,)``, and step of the modes.
+    rows, y : ndarray
+        Index of each datum among all series and logs, and its ln f minus the mean of its mode,
+        shape ``(n_data,)``.
     """
 
     stage: Stage
@@ -62,17 +57,15 @@ class LifeData:
         """
         history = condense(history, constants.MAX_LOGS)
         if not history.has_odometer:
-            raise NotEnoughData(
-                f"{history.stage}: not every log has travel_km, and degradation laws count by the "
-                "odometer; add it to manifest.csv"
-            )
+            missing = "not every log has travel_km, and degradation laws count by the odometer"
+            raise NotEnoughData(f"{history.stage}: {missing}; add it to manifest.csv")
         observed = np.any(np.isfinite(history.ln_frequency[history.baseline :]), axis=0)
         names = [name for name in stage.informative if name in history.modes]
         columns = [i for name in names for i in history.columns(name) if observed[i]]
         of_series = [history.series[i].mode for i in columns]
         modes = tuple(dict.fromkeys(of_series))
         ln_f = history.ln_frequency[history.baseline :, columns]
-        all_clock = _clock_before_steps(history)
+        all_clock, steps = _clock_and_steps(history)
         clock = all_clock[history.baseline :]
         now, n_logs = float(clock.max(initial=0.0)), np.isfinite(ln_f).any(axis=1).sum()
         if n_logs < constants.MIN_LOGS or now <= 0:
@@ -91,7 +84,7 @@ class LifeData:
             modes=modes,
             mode_of_series=mode_of_series,
             clock=clock,
-            steps=_steps(history, all_clock),
+            steps=steps,
             rows=rows,
             y=flat[rows] - means[mode_of_series[rows // clock.size]],
         )
@@ -214,27 +207,20 @@ def _average(history: History, part: slice) -> tuple[FloatArray, FloatArray]:
     return mean, total
 
 
-def _first_logs(history: History) -> list[int]:
-    """Return the first log after each step of the modes since the baseline."""
-    first = {s.first for s in history.steps if s.kind == "step" and s.first > history.baseline}
-    return sorted(first)
+def _clock_and_steps(history: History) -> tuple[FloatArray, tuple[float, ...]]:
+    """Return the travel since the baseline in m of each log, and of each step halfway between two.
 
-
-def _clock_before_steps(history: History) -> FloatArray:
-    """Return the travel since the baseline in m, at least 1 m between a step and the log before."""
+    At least 1 m is between a step and the log before.
+    """
+    steps = {s.first for s in history.steps if s.kind == "step" and s.first > history.baseline}
+    first = sorted(steps)
     clock = history.clock()
-    for k in reversed(_first_logs(history)):
+    for k in reversed(first):
         before = clock[:k]
         before[before >= clock[k]] = clock[k] - 1.0
-    return clock
-
-
-def _steps(history: History, clock: FloatArray) -> tuple[float, ...]:
-    """Return the travel since the baseline of each step, halfway between two logs."""
-    first = _first_logs(history)
     if len(first) > constants.MAX_STEPS:
         raise NotEnoughData(
             f"{history.stage}: the modes jumped {len(first)} times since the baseline; no law of "
             "a life holds over so many; maintenance.csv can declare a new baseline"
         )
-    return tuple(float((clock[k - 1] + clock[k]) / 2) for k in first)
+    return clock, tuple(float((clock[k - 1] + clock[k]) / 2) for k in first)

@@ -94,18 +94,11 @@ def _offsets(data: LifeData, same: BoolArray) -> FloatArray:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class NodeBasis:
-    """Nodes: logs whose drifts determine the drifts of all logs linearly.
+    """Nodes: logs ``(n_nodes,)`` whose drifts determine those of all logs linearly.
 
-    Attributes
-    ----------
-    nodes : ndarray of int
-        Logs, shape ``(n_nodes,)``.
-    weights : ndarray
-        W, shape ``(n_logs, n_nodes)``.
-    moments : ndarray
-        Travel in m since the baseline of nodes, ends of the life and both sides of each step, shape
-        ``(n_nodes + 2 + 2 n_steps,)``: as laws are monotonic, a life inside the map at all of them
-        is inside at all logs.
+    `weights` are W, shape ``(n_logs, n_nodes)``. `moments` are the travel in m since the baseline
+    of nodes, ends of the life and both sides of each step, shape ``(n_nodes + 2 + 2 n_steps,)``: as
+    laws are monotonic, a life inside the map at all of them is inside at all logs.
     """
 
     nodes: np.ndarray
@@ -117,13 +110,7 @@ class NodeBasis:
 
     @classmethod
     def of(cls, data: LifeData) -> NodeBasis:
-        """Choose the nodes by a pivoted QR decomposition of the drifts of lives of the prior.
-
-        Raises
-        ------
-        NotEnoughData
-            If no life of the prior stays inside the map.
-        """
+        """Choose the nodes by a pivoted QR decomposition of the drifts of lives of the prior."""
         rng, examples, n_logs = np.random.default_rng(0), [], data.clock.size
         for scenario in data.scenarios:
             y = scenario.draw(rng, _N_EXAMPLES if scenario.n_dim else 1)
@@ -231,9 +218,8 @@ class LifeLikelihood:
         """Return mean and covariance of ln health about its law, given a life and all data.
 
         For the k-th point of a grid, ln parameters at the nodes ``(n, n_nodes, n_parameters)`` and
-        moments ``(n_moments,)`` in m since the baseline, past or future: mean
-        ``(n, n_moments, n_parameters)`` and covariance between the parameters
-        ``(n, n_moments, n_parameters, n_parameters)``.
+        moments ``(n_moments,)`` in m since the baseline: ``(n, n_moments, n_parameters)``, and
+        covariance between the parameters ``(n, n_moments, n_parameters, n_parameters)``.
         """
         data, deviation = self.data, float(grid.deviation[k])
         point = grid.chosen(np.arange(grid.walk.size) == k)
@@ -279,8 +265,8 @@ def ln_health(
 ) -> tuple[FloatArray, BoolArray]:
     """Return ln parameters of lives at moments, and which lives stay inside the map.
 
-    Shapes ``(n, n_moments, n_parameters)`` and ``(n,)`` for coordinates ``(n, n_dim)`` and moments
-    ``(n_moments,)`` in m since the baseline.
+    Shapes ``(n, n_moments, n_parameters)`` and ``(n,)`` for coordinates ``(n, n_dim)`` and travels
+    ``(n_moments,)`` in m.
     """
     assert stage.modal_map is not None  # prognose() has checked
     health = scenario.health(scenario.natural(y), clock)
@@ -290,10 +276,9 @@ def ln_health(
 
 
 def _drifts(data: LifeData, x: FloatArray) -> FloatArray:
-    """Return the drifts along lives, then of each parameter alone.
+    """Return the drifts along lives, then of each parameter alone, at ln parameters of `ln_health`.
 
-    Shape ``(n_modes, 1 + n_parameters, n, n_moments)`` for ln parameters
-    ``(n, n_moments, n_parameters)``.
+    Shape ``(n_modes, 1 + n_parameters, n, n_moments)``.
     """
     n, n_moments, n_parameters = x.shape
     flat = one_at_a_time(data.stage, x.reshape(-1, n_parameters))
@@ -307,8 +292,8 @@ def _reduced(
     """Return L⁻¹ y, and Q and R of L⁻¹ W for the nodes of all modes."""
     own = data.mode_of[:, None] == np.arange(len(data.modes))
     shapes = own[:, :, None] * basis.weights[data.log_of][:, None]
-    shapes = shapes.reshape(data.rows.size, -1)
-    both = solve_triangular(factor, np.column_stack([shapes, data.y]), lower=True)
+    columns = np.column_stack([shapes.reshape(data.rows.size, -1), data.y])
+    both = solve_triangular(factor, columns, lower=True)
     q, r = np.linalg.qr(both[:, :-1])
     return both[:, -1], q, r
 
@@ -323,9 +308,8 @@ def scatter_prior(stage: Stage) -> ScatterPrior:
 
 def expected_scatter(scatter: ScatterPrior) -> tuple[float, float, float]:
     """Return the prior means of walk, noise scale and deviation."""
-    values = (constants.WALKS, constants.NOISE_SCALES, constants.DEVIATIONS)
-    priors = (scatter.walk, scatter.noise_scale, scatter.deviation)
-    walk, noise_scale, deviation = (
-        float(np.average(v, weights=p)) for v, p in zip(values, priors, strict=True)
+    return (
+        float(np.average(constants.WALKS, weights=scatter.walk)),
+        float(np.average(constants.NOISE_SCALES, weights=scatter.noise_scale)),
+        float(np.average(constants.DEVIATIONS, weights=scatter.deviation)),
     )
-    return walk, noise_scale, deviation

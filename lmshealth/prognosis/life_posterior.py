@@ -50,10 +50,6 @@ class LifeDensity:
         """Make the density of a scenario over the whole grid."""
         return cls(likelihood, scenario, likelihood.grid)
 
-    def draw_prior(self, rng: np.random.Generator, n: int) -> FloatArray:
-        """Draw coordinates from the prior, shape ``(n, n_dim)``."""
-        return self.scenario.draw(rng, n)
-
     def log_probability(self, y: FloatArray) -> FloatArray:
         """Return the log posterior density, -inf outside the map, shape ``(n,)``.
 
@@ -86,10 +82,7 @@ class LifeDensity:
         return replace(self, grid=self.grid.chosen(kept))
 
     def settings(self, y: FloatArray) -> FloatArray:
-        """Return the means of walk, noise scale, deviation, and χ² at the mean of coordinates.
-
-        Coordinates ``(n, n_dim)`` lie inside the support.
-        """
+        """Return the means of walk, noise scale, deviation, and χ² at the mean of coordinates."""
         weight, grid = self.weights(y), self.grid
         centre = y.mean(axis=0, keepdims=True)
         possible = np.isfinite(self.scenario.log_prior(centre))
@@ -102,11 +95,11 @@ class LifeDensity:
     def deviations(
         self, y: FloatArray, moments: FloatArray, rng: np.random.Generator
     ) -> tuple[FloatArray, FloatArray]:
-        """Draw the deviation of ln health from its laws at moments.
+        """Draw the deviation of ln health from its laws at moments in m since the baseline.
 
-        For coordinates ``(n, n_dim)`` inside the support and moments ``(n_moments,)`` in m since
-        the baseline, past or future: deviations ``(n, n_moments, n_parameters)``, independent from
-        moment to moment, and their variance per m of future travel ``(n, n_parameters)``.
+        For coordinates ``(n, n_dim)`` inside the support: deviations of shape ``(n, n_moments,
+        n_parameters)``, independent from moment to moment, and their variance per m of future
+        travel ``(n, n_parameters)``.
         """
         free, horizon = self.likelihood.data.free, self.likelihood.data.horizon
         # Without coordinates all draws are of one life.
@@ -132,8 +125,6 @@ class ScenarioPosterior:
 
     Attributes
     ----------
-    density : LifeDensity
-        Density of its coordinates.
     probability, evidence_std : float
         Posterior probability of the scenario, and relative standard deviation of its evidence.
     coordinates : ndarray
@@ -173,15 +164,13 @@ class ScenarioPosterior:
     @property
     def chains(self) -> FloatArray:
         """Draws of the natural parameters (lengths in m), ``(n_ensembles, n_draws, n_dim)``."""
-        n, own = self.coordinates.shape[:2], self.scenario.n_dim
-        flat = self.coordinates.reshape(n[0] * n[1], own)
-        return self.scenario.natural(flat).reshape(self.coordinates.shape)
+        natural = self.scenario.natural(np.concatenate(self.coordinates))
+        return natural.reshape(self.coordinates.shape)
 
     @property
     def mixture_draws(self) -> FloatArray:
         """Coordinates in the mixture of all scenarios, ``(n_ensembles n_mixture, n_dim)``."""
-        kept = thin(self.coordinates, self.n_mixture)
-        return kept.reshape(kept.shape[0] * kept.shape[1], self.scenario.n_dim)
+        return np.concatenate(thin(self.coordinates, self.n_mixture))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -190,25 +179,19 @@ class LifePosterior:
 
     Attributes
     ----------
-    stage : str
-        Identity of the machine.
     parameters, modes : tuple of str
         Health parameters, and modes that were used.
     scenarios : tuple of ScenarioPosterior
         Scenarios above the least probability, the most probable first.
-    health : ndarray
-        Draws of the health parameters now, as fractions of baseline, those of the first scenario
-        first, shape ``(n_ensembles, n_draws, n_parameters)``.
-    off, rate : ndarray
-        Deviation of ln health from its law now, and its variance per m of future travel, like
-        `health`.
+    health, off, rate : ndarray
+        Draws of the health parameters now, as fractions of baseline; deviation of ln health from
+        its law now; its variance per m of future travel. Those of the first scenario first, shape
+        ``(n_ensembles, n_draws, n_parameters)``.
     chi_square, degrees_of_freedom : float, int
         Of the residuals at the posterior mean of each scenario, averaged; number of data minus
         parameters of the most probable scenario.
     walk, noise_scale, deviation : float
         As in `Prognosis`.
-    seed : tuple of int
-        Seed of all random streams.
     """
 
     stage: str
@@ -272,37 +255,30 @@ class LifePosterior:
         ]
         for k, one in enumerate(self.scenarios, start=1):
             chains = one.chains
-            rows += [
-                {"way": k, "probability": one.probability, "parameter": name}
-                | _quantiles(chains[..., i])
-                | {check: getattr(one, check)[i] for check in _CHECKS}
-                for i, name in enumerate(self._names(one))
-            ]
+            for i, name in enumerate(self._names(one)):
+                head = {"way": k, "probability": one.probability, "parameter": name}
+                checks = {check: getattr(one, check)[i] for check in _CHECKS}
+                rows.append(head | _quantiles(chains[..., i]) | checks)
         return pd.DataFrame(rows).assign(stage=self.stage)
 
     def to_arviz(self) -> DataTree:
         """Return health now and the natural parameters of each scenario for ArviZ; see `Health`."""
         import arviz_base  # late: its import takes a second
 
-        groups: dict[str, dict[str, FloatArray]] = {
-            "posterior": {name: self.health[..., j] for j, name in enumerate(self.parameters)}
-        }
-        checks = {
-            name: np.array(getattr(self, name))
-            for name in ("chi_square", "degrees_of_freedom", "walk", "noise_scale", "deviation")
-        }
+        posterior = {name: self.health[..., j] for j, name in enumerate(self.parameters)}
+        groups: dict[str, dict[str, FloatArray]] = {"posterior": posterior}
+        scalars = ("chi_square", "degrees_of_freedom", "walk", "noise_scale", "deviation")
+        checks = {name: np.array(getattr(self, name)) for name in scalars}
         for k, one in enumerate(self.scenarios, start=1):
             names, chains = self._names(one), one.chains
-            groups[f"way_{k}"] = {name: chains[..., i] for i, name in enumerate(names)}
+            if names:
+                groups[f"way_{k}"] = {name: chains[..., i] for i, name in enumerate(names)}
             checks[f"probability_{k}"] = np.array(one.probability)
             for what in _CHECKS:
                 values = zip(names, getattr(one, what), strict=True)
                 checks |= {f"{what}_{k}_{name}": value for name, value in values}
-        groups["checks_data"] = checks
-        return arviz_base.from_dict(
-            {name: group for name, group in groups.items() if group},
-            attrs={"/": {"stage": self.stage, "seed": " ".join(map(str, self.seed))}},
-        )
+        attrs = {"/": {"stage": self.stage, "seed": " ".join(map(str, self.seed))}}
+        return arviz_base.from_dict(groups | {"checks_data": checks}, attrs=attrs)
 
     def _names(self, one: ScenarioPosterior) -> list[str]:
         """Name natural parameters by health parameter, law, and begin if not at the baseline."""
@@ -332,10 +308,8 @@ def fit_life(
 
     Parameters
     ----------
-    history : History
-        Modal estimates of all logs.
-    stage : Stage
-        Laws, priors, covariates and modal map.
+    history, stage : History, Stage
+        Modal estimates of all logs; laws, priors, covariates and modal map.
     seed : int or sequence of int
         Seed of all random numbers.
     chains : bool
@@ -378,17 +352,16 @@ def fit_life(
         scenarios = _sampled_scenarios(found, chain_seed, n_kept, min_probability)
     rng = np.random.default_rng(off_seed)
     now = np.array([likelihood.data.now])
-    health, off, rate, settings = [], [], [], []
+    draws, settings = [], []
     for one in scenarios:
         y = one.mixture_draws
         own_off, own_rate = one.density.deviations(y, now, rng)
         by_law = one.scenario.health(one.scenario.natural(y), now)
         shape = (_N_ENSEMBLES, one.n_mixture, own_off.shape[-1])
-        health.append((by_law * np.exp(own_off)).reshape(shape))
-        off.append(own_off.reshape(shape))
-        rate.append(own_rate.reshape(shape))
+        parts = (by_law * np.exp(own_off), own_off, own_rate)
+        draws.append([part.reshape(shape) for part in parts])
         settings.append(one.density.settings(y[:: max(1, y.shape[0] // _N_SETTINGS)]))
-    mixed = np.concatenate(health, axis=1)
+    health, off, rate = (np.concatenate(part, axis=1) for part in zip(*draws, strict=True))
     share = np.array([one.n_mixture for one in scenarios]) / n_kept
     walk, noise_scale, deviation, chi_square = (float(v) for v in share @ np.array(settings))
     return LifePosterior(
@@ -396,9 +369,9 @@ def fit_life(
         parameters=tuple(parameter.name for parameter in stage.parameters),
         modes=likelihood.data.modes,
         scenarios=scenarios,
-        health=mixed,
-        off=np.concatenate(off, axis=1),
-        rate=np.concatenate(rate, axis=1),
+        health=health,
+        off=off,
+        rate=rate,
         chi_square=chi_square,
         degrees_of_freedom=likelihood.data.y.size - scenarios[0].scenario.n_dim,
         walk=walk,
@@ -442,7 +415,7 @@ def _rough(density: LifeDensity, rng: np.random.Generator) -> _Explored:
         point = np.empty((1, 0))
         value = float(density.log_probability(point)[0])
         return density.narrowed(point), WeightedDraws(point, np.ones(1), value)
-    start = density.draw_prior(rng, _N_ROUGH)
+    start = density.scenario.draw(rng, _N_ROUGH)
     return density, importance_sample(density.log_probability, start, rng, _N_ROUGH)
 
 
@@ -463,39 +436,27 @@ def _sampled_scenarios(
     sampled = []
     for k, share, own in zip(order, shares, kept, strict=True):
         density, weighted = found[k]
-        draws = _drawn(density, weighted, seeds[k], n_kept, chains=own >= min_chain_probability)
-        sampled.append(
-            ScenarioPosterior(
-                density=density,
-                probability=float(own),
-                evidence_std=float(np.sqrt(1 / weighted.ess)) if density.scenario.n_dim else 0.0,
-                coordinates=draws.thinned(n_kept),
-                ess_bulk=draws.ess_bulk,
-                ess_tail=draws.ess_tail,
-                r_hat=draws.r_hat,
-                informed=_informed(density.scenario, draws.thinned(n_kept)),
-                n_mixture=int(share),
-            )
+        n_dim = density.scenario.n_dim
+        if n_dim and own >= min_chain_probability:
+            start = start_among(weighted.points, weighted.weight)
+            draws = sample(density.log_probability, start, seeds[k])
+        else:
+            y = weighted.resampled(np.random.default_rng(seeds[k]), _N_ENSEMBLES * n_kept)
+            ess, unknown = np.full(n_dim, weighted.ess), np.full(n_dim, np.nan)
+            draws = Sample(y.reshape(_N_ENSEMBLES, n_kept, n_dim), ess, ess, unknown, unknown)
+        one = ScenarioPosterior(
+            density=density,
+            probability=float(own),
+            evidence_std=float(np.sqrt(1 / weighted.ess)) if n_dim else 0.0,
+            coordinates=draws.thinned(n_kept),
+            ess_bulk=draws.ess_bulk,
+            ess_tail=draws.ess_tail,
+            r_hat=draws.r_hat,
+            informed=_informed(density.scenario, draws.thinned(n_kept)),
+            n_mixture=int(share),
         )
+        sampled.append(one)
     return tuple(sampled)
-
-
-def _drawn(
-    density: LifeDensity,
-    weighted: WeightedDraws,
-    seed: np.random.SeedSequence,
-    n_kept: int,
-    *,
-    chains: bool,
-) -> Sample:
-    """Draw coordinates from the posterior of a scenario."""
-    n_dim = density.scenario.n_dim
-    if n_dim and chains:
-        start = start_among(weighted.points, weighted.weight)
-        return sample(density.log_probability, start, seed)
-    draws = weighted.resampled(np.random.default_rng(seed), _N_ENSEMBLES * n_kept)
-    ess, unknown = np.full(n_dim, weighted.ess), np.full(n_dim, np.nan)
-    return Sample(draws.reshape(_N_ENSEMBLES, n_kept, n_dim), ess, ess, unknown, unknown)
 
 
 def _informed(scenario: Scenario, y: FloatArray) -> FloatArray:

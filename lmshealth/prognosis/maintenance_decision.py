@@ -18,15 +18,10 @@ _SECONDS_PER_DAY = 86_400.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ProbabilityBounds:
-    """Bounds of the probability to reach each limit before a day.
+    """Bounds of the probability to reach each limit, ``any`` last, ``(n_parameters + 1,)``.
 
     They differ if draws pass the horizon before that day, beyond which nothing is published: such
     a draw counts as no failure in the lower bound and as a failure in the upper one.
-
-    Attributes
-    ----------
-    at_least, at_most : ndarray
-        In the order of the prognosis's parameters, ``any`` last, shape ``(n_parameters + 1,)``.
     """
 
     at_least: FloatArray
@@ -44,17 +39,13 @@ class Service:
     ----------
     kind : str
         ``now``, ``by`` a day, ``later`` than the horizon or never, or ``unknown``.
-    by : date or None
-        Last day; that of the last log for ``now``.
-    wait : float
-        Days from the last log, negative if the accepted risk was reached before it, infinite for
-        ``later``, NaN for ``unknown``.
+    by, wait : date or None, float
+        Last day, that of the last log for ``now``; days from the last log, negative if the accepted
+        risk was reached before it, infinite for ``later``, NaN for ``unknown``.
     risk : float
         Upper bound of the probability to reach a limit before that day; NaN without one.
-    planned : date or None
-        Next service by the description.
-    planned_risk : tuple of float
-        Bounds of the probability to reach a limit before it; NaN without one.
+    planned, planned_risk : date or None, tuple of float
+        Next service by the description, and bounds of the probability to reach a limit before it.
     max_risk, cost_ratio : float or None
         Criterion: one of them is None.
     """
@@ -96,45 +87,30 @@ def decide(prognosis: Prognosis | None, decision: Decision) -> Service:
     >>> service.risk <= 0.05
     True
     """
-    kind: Literal["now", "by", "later", "unknown"] = "unknown"
-    by, wait, risk = None, np.nan, np.nan
-    planned, planned_risk = None, (np.nan, np.nan)
-    if prognosis is not None:
-        wait = _wait(prognosis, decision)
-        by = day_after(prognosis, wait)
-        if by is not None:
-            kind = "now" if by <= prognosis.recorded_at.date() else "by"
-            risk = float(probability_before(prognosis, by).at_most[-1])
-        elif np.isinf(wait):
-            kind = "later"
-        planned = decision.next_service
-        if planned is not None:
-            reached = probability_before(prognosis, planned)
-            planned_risk = float(reached.at_least[-1]), float(reached.at_most[-1])
-    return Service(
-        kind, by, wait, risk, planned, planned_risk, decision.accepted, decision.cost_ratio
-    )
+    criterion, unknown = (decision.accepted, decision.cost_ratio), (np.nan, np.nan)
+    if prognosis is None:
+        return Service("unknown", None, np.nan, np.nan, None, unknown, *criterion)
+    wait = _wait(prognosis, decision)
+    by, planned = day_after(prognosis, wait), decision.next_service
+    kind: Literal["now", "by", "later", "unknown"] = "later" if np.isinf(wait) else "unknown"
+    if by is not None:
+        kind = "now" if by <= prognosis.recorded_at.date() else "by"
+    risk = np.nan if by is None else _any_risk(prognosis, by)[1]
+    planned_risk = unknown if planned is None else _any_risk(prognosis, planned)
+    return Service(kind, by, wait, risk, planned, planned_risk, *criterion)
+
+
+def _any_risk(prognosis: Prognosis, day: date) -> tuple[float, float]:
+    """Return the bounds of the probability to reach any limit before a day."""
+    reached = probability_before(prognosis, day)
+    return float(reached.at_least[-1]), float(reached.at_most[-1])
 
 
 def cheapest_travel(prognosis: Prognosis, cost_ratio: float) -> float:
-    """Return the travel from now of the service of least long-run costs (age replacement).
+    """Return the travel in m from now of the service of least long-run costs (age replacement).
 
-    The cost per travel of a service at t from now is (S(t) + r F(t)) / (a + E[min(T, t)]), with T
-    the remaining life to any limit, a the travel since the baseline and r the cost ratio. README.md
-    has the assumptions.
-
-    Parameters
-    ----------
-    prognosis : Prognosis
-        Draws for any limit.
-    cost_ratio : float
-        Cost of a failure over that of a planned service, above 1.
-
-    Returns
-    -------
-    float
-        In m; 0 for now, infinite if no service within the horizon saves 1 % of the costs of
-        operation up to it.
+    README.md has the equation and its assumptions. 0 for now, infinite if no service within the
+    horizon saves 1 % of the costs of operation up to it.
 
     References
     ----------

@@ -34,9 +34,7 @@ def prognose(
         Modal estimates of all logs.
     stage : Stage
         Laws, limits, modal map and usage.
-    seed : int or sequence of int
-        Seed of all random numbers.
-    chains : bool
+    seed, chains : int or sequence of int, bool
         As in `fit_life`.
 
     Returns
@@ -88,14 +86,13 @@ def prognose_with_posterior(
         )
     horizon = stage.description.usage.horizon_km * _KM
     since = float(history.travel[-1] - history.travel[history.baseline])
-    remaining = remaining_travel(
-        life, limited, np.random.default_rng(seeds[0]), now=since, horizon=horizon
-    )
-    usage = _usage(history, stage, np.random.default_rng(seeds[1]), remaining[:, -1], horizon)
+    of_passage, of_usage, of_curve = (np.random.default_rng(own) for own in seeds)
+    remaining = remaining_travel(life, limited, of_passage, now=since, horizon=horizon)
+    usage = _usage(history, stage, of_usage, remaining[:, -1], horizon)
     travel = _curve_grid(remaining, since, horizon)
     columns = [j for j, _ in limited]
     unit = np.array([parameter.baseline for _, parameter in limited])
-    curve = _curve(life, travel, np.random.default_rng(seeds[2]))[..., columns] * unit
+    curve = _curve(life, travel, of_curve)[..., columns] * unit
     found = Prognosis(
         stage=history.stage,
         recorded_at=history.recorded_at[-1],
@@ -133,41 +130,20 @@ def remaining_travel(
     now: float,
     horizon: float,
 ) -> FloatArray:
-    """Draw the travel left to each limit, and to the first of them.
+    """Draw the travel in m left to each limit, and to the first of them.
 
-    Parameters
-    ----------
-    life : LifePosterior
-        Draws of the laws and of the deviations of health.
-    limited : sequence of (int, ParameterSpec)
-        Parameters with a limit, and their index among all.
-    rng : Generator
-        Random numbers.
-    now, horizon : float
-        Travel in m since the baseline, and from now to the horizon.
-
-    Returns
-    -------
-    ndarray
-        In m, shape ``(n_draws, n_limits + 1)``, in the order of the draws of `life`.
+    For parameters with a limit, and their indices; `now` is the travel in m since the baseline, and
+    the horizon is in m from now. Shape ``(n_draws, n_limits + 1)``, in the order of the draws.
     """
     parts = []
     for one, off, rate in life.by_scenario():
         theta = one.scenario.split(one.scenario.natural(one.mixture_draws))
-        columns = [
-            first_passage(
-                one.scenario.paths[j],
-                theta[j],
-                off[:, j],
-                rate[:, j],
-                rng,
-                now=now,
-                limit=parameter.limit.below / parameter.baseline,
-                horizon=horizon,
-            )
-            for j, parameter in limited
-            if parameter.limit is not None
-        ]
+        columns = []
+        for j, parameter in limited:
+            assert parameter.limit is not None
+            path, limit = one.scenario.paths[j], parameter.limit.below / parameter.baseline
+            of_health = (path, theta[j], off[:, j], rate[:, j], rng)
+            columns.append(first_passage(*of_health, now=now, limit=limit, horizon=horizon))
         found = np.column_stack([*columns, np.min(columns, axis=0)])
         parts.append(found.reshape(life.rate.shape[0], one.n_mixture, -1))
     joined = np.concatenate(parts, axis=1)
@@ -193,17 +169,9 @@ def _curve_grid(remaining: FloatArray, since: float, horizon: float) -> FloatArr
 
 
 def _usage(
-    history: History,
-    stage: Stage,
-    rng: np.random.Generator,
-    remaining: FloatArray,
-    horizon: float,
+    history: History, stage: Stage, rng: np.random.Generator, remaining: FloatArray, horizon: float
 ) -> FloatArray:
-    """Draw the mean travel in m per day over the remaining life, shape ``(n_draws,)``.
-
-    Stated by the description, or estimated from independent increments of the odometer: the future
-    rate differs from the past mean by Student's t; README.md has the equation.
-    """
+    """Draw the mean travel in m per day over the remaining life, ``(n_draws,)`` (README.md)."""
     stated = stage.description.usage.km_per_day
     if stated is not None:
         return np.full(remaining.size, stated * _KM)
@@ -211,9 +179,8 @@ def _usage(
     days, steps = np.diff(seconds) / _SECONDS_PER_DAY, np.diff(history.travel)
     days, steps = days[days > 0], steps[days > 0]
     if days.size < 2 or steps.sum() <= 0:
-        raise NotEnoughData(
-            f"{history.stage}: the odometer gives no usage; state [usage] km_per_day"
-        )
+        needed = "state [usage] km_per_day"
+        raise NotEnoughData(f"{history.stage}: the odometer gives no usage; {needed}")
     total, rate = days.sum(), steps.sum() / days.sum()
     per_day = np.sum((steps - rate * days) ** 2 / days) / (days.size - 1)
     ahead = np.clip(remaining, 0.01 * horizon, horizon) / rate

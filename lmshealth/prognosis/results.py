@@ -12,18 +12,9 @@ from lmshealth._arrays import FloatArray, expect_shape, freeze
 
 @dataclass(frozen=True, slots=True)
 class LawWeight:
-    """Posterior probability of a law of a parameter.
+    """Posterior probability of a law of a health parameter.
 
-    Attributes
-    ----------
-    parameter : str
-        Name of the health parameter.
-    kind : str
-        Kind of the law, as in the stage description.
-    begin : float
-        Travel in m since the baseline at which the law begins: 0, or that of a step.
-    probability : float
-        Posterior probability.
+    It begins at the baseline, or at a step: `begin` is the travel in m since the baseline.
     """
 
     parameter: str
@@ -40,10 +31,8 @@ class Prognosis:
     ----------
     stage : str
         Identity of the machine.
-    recorded_at : datetime
-        The last log, at which the prognosis is made.
-    travel : float
-        Odometer then in m.
+    recorded_at, travel : datetime, float
+        The last log, at which the prognosis is made, and the odometer then in m.
     parameters : tuple of str
         Health parameters with a limit, then ``any`` (the first limit reached).
     unidentifiable : tuple of str
@@ -59,23 +48,17 @@ class Prognosis:
         Travel in m beyond which nothing is published.
     health : ndarray
         Draws of the parameters now in their units, shape ``(n_draws, n_parameters)``.
-    curve_travel : ndarray
-        Odometer grid in m of the life curves, shape ``(n_grid,)``.
-    curve_quantiles : ndarray
-        5, 25, 50, 75, 95 % quantiles of the parameters on that grid,
-        shape ``(5, n_grid, n_parameters)``.
+    curve_travel, curve_quantiles : ndarray
+        Odometer grid in m of the life curves, shape ``(n_grid,)``, and 5, 25, 50, 75, 95 %
+        quantiles of the parameters there, shape ``(5, n_grid, n_parameters)``.
     laws : tuple of LawWeight
         Laws of each parameter, the most probable first.
-    chi_square : float
-        Of the residuals at the posterior mean.
-    degrees_of_freedom : int
-        Number of data minus law parameters.
-    walk : float
-        Posterior mean of the standard deviation over the history of the random walk of ln f.
-    noise_scale : float
-        Posterior mean of the factor on the reported standard deviations.
-    deviation : float
-        Posterior mean of the standard deviation at the horizon of ln health about its laws.
+    chi_square, degrees_of_freedom : float, int
+        Of the residuals at the posterior mean; number of data minus law parameters.
+    walk, noise_scale, deviation : float
+        Posterior means: standard deviation over the history of the random walk of ln f, factor on
+        the reported standard deviations, and standard deviation at the horizon of ln health about
+        its laws.
     ess, r_hat : float
         Worst of all law parameters.
     """

@@ -20,18 +20,10 @@ from lmshealth.stage.description import ParameterSpec
 
 @dataclass(frozen=True, slots=True)
 class DegradationPath:
-    """Degradation of one health parameter.
+    """Degradation of one health parameter: its law, and the begin of the law and the steps.
 
-    Coordinates are those of the law, then the ln factor at each step.
-
-    Attributes
-    ----------
-    law : Law
-        Degradation law.
-    begin : float
-        Travel in m since the baseline at which the law begins.
-    steps : tuple of float
-        Travel in m since the baseline at each step.
+    Both are in m since the baseline. Coordinates are those of the law, then the ln factor at each
+    step.
     """
 
     law: Law
@@ -41,8 +33,7 @@ class DegradationPath:
     @property
     def names(self) -> tuple[str, ...]:
         """Names of the natural parameters: those of the law, then the factor at each step."""
-        jumps = (f"jump_{k + 1}" for k in range(len(self.steps)))
-        return (*self.law.names, *jumps)
+        return (*self.law.names, *(f"jump_{k + 1}" for k in range(len(self.steps))))
 
     def _split(self, values: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Split coordinates or natural parameters into those of the law and of the steps."""
@@ -91,16 +82,9 @@ class DegradationPath:
 
 @dataclass(frozen=True)
 class Scenario:
-    """Degradation of all health parameters.
+    """Degradation of all health parameters, its prior probability, and the travel now.
 
-    Attributes
-    ----------
-    paths : tuple of DegradationPath
-        One per health parameter.
-    now : float
-        Travel in m since the baseline at the last log.
-    weight : float
-        Prior probability.
+    `now` is in m since the baseline at the last log.
     """
 
     paths: tuple[DegradationPath, ...]
@@ -128,9 +112,8 @@ class Scenario:
 
     def log_prior(self, y: FloatArray) -> FloatArray:
         """Return the log prior density of coordinates, shape ``(n,)``."""
-        total = np.zeros(y.shape[0])
-        for path, part in zip(self.paths, self.split(y), strict=True):
-            total = total + path.log_prior(part, self.now)
+        parts = zip(self.paths, self.split(y), strict=True)
+        total = sum((path.log_prior(part, self.now) for path, part in parts), np.zeros(len(y)))
         return np.where(np.isnan(total), -np.inf, total)
 
     def draw(self, rng: np.random.Generator, n: int) -> FloatArray:
@@ -165,10 +148,6 @@ def list_scenarios(
             own += [(DegradationPath(law, begin, tuple(steps)), share) for begin in begins]
         choices.append(own)
     return tuple(
-        Scenario(
-            paths=tuple(path for path, _ in chosen),
-            now=now,
-            weight=float(np.prod([share for _, share in chosen])),
-        )
-        for chosen in product(*choices)
+        Scenario(tuple(path for path, _ in one), now, float(np.prod([share for _, share in one])))
+        for one in product(*choices)
     )

@@ -104,7 +104,7 @@ def two_ways(history: History, stage: Stage, walkers: int, looped: int) -> Walke
     # Both parts lose: of all scenarios the one with the most to draw.
     scenario = max(likelihood.data.scenarios, key=lambda one: one.n_dim)
     density = LifeDensity.of(likelihood, scenario)
-    begin = start_from_prior(density.log_probability, density.draw_prior)
+    begin = start_from_prior(density.log_probability, scenario.draw)
     y = np.concatenate([begin(np.random.default_rng(k)) for k in range(8)])[:walkers]
     density = density.narrowed(y)
     grid, n_kept = density.grid, density.grid.walk.size

@@ -58,7 +58,7 @@ def density_of(history: History, stage: Stage) -> LifeDensity:
 
 def coordinates(density: LifeDensity, n: int = 6, seed: int = 1) -> FloatArray:
     """Draw coordinates inside the support."""
-    y = density.draw_prior(np.random.default_rng(seed), 300)
+    y = density.scenario.draw(np.random.default_rng(seed), 300)
     return y[np.isfinite(density.log_probability(y))][:n]
 
 
@@ -165,7 +165,7 @@ def test_what_is_wrong_is_noticed(stage: Stage, what: str, monkeypatch: pytest.M
 def test_walkers_are_independent(stage: Stage) -> None:
     """A batch equals its walkers one at a time, also where some are impossible."""
     density = density_of(rough_history(np.random.default_rng(3)), stage)
-    y = density.draw_prior(np.random.default_rng(4), 40)
+    y = density.scenario.draw(np.random.default_rng(4), 40)
     y[5, 0] = 50.0  # preload gone long before now
     together = density.log_probability(y)
     alone = np.concatenate([density.log_probability(point[None]) for point in y])

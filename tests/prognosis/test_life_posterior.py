@@ -146,7 +146,7 @@ def test_laws_and_health_are_those_of_importance_sampling(
     density = LifeDensity.of(likelihood, scenario)
     rng = np.random.default_rng(5)
     drawn = importance_sample_to_ess(
-        density.log_probability, density.draw_prior(rng, 600), rng, 4000
+        density.log_probability, density.scenario.draw(rng, 600), rng, 4000
     )
     y = drawn.resampled(rng, 4000)
     now = np.array([likelihood.data.now])
