@@ -128,13 +128,15 @@ class Spool:
             With reason ``too-large`` where the disk is full.
         """
         start, self.size = self.size, self.size + block.size
+        # A whole column is kept as it is: to copy it may take longer than to read it.
+        is_whole = block.size == self._memory.size and block.flags.c_contiguous
         # Damaged bytes may be a signalling NaN, which warns when it is widened.
         with np.errstate(invalid="ignore"):
-            if self.size <= self._memory.size:
+            if self.size <= self._memory.size and not is_whole:
                 self._memory[start : self.size] = block
                 return
             if self._memory.size:
-                self._parts, self._memory = [self._memory[:start]], np.empty(0)
+                self._parts, self._memory = [self._memory[:start]] if start else [], np.empty(0)
             self._parts.append(np.asarray(block, dtype=np.float64))
         if self._file is not None or self.size > MINUTE:
             self._write()

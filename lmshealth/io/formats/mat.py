@@ -12,7 +12,7 @@ import re
 import struct
 import zlib
 from collections.abc import Iterator
-from dataclasses import dataclass
+from io import SEEK_END
 from math import prod
 from pathlib import Path
 from typing import IO, NamedTuple
@@ -20,17 +20,11 @@ from typing import IO, NamedTuple
 import numpy as np
 
 from lmshealth.io import constants
-from lmshealth.io.buffers import Spool
+from lmshealth.io.buffers import Samples, Spool
 from lmshealth.io.column_map import ColumnMap
-from lmshealth.io.formats.content import (
-    Content,
-    Format,
-    check_memory,
-    check_size,
-    not_numeric,
-)
+from lmshealth.io.formats.content import Content, Format, check_memory, check_size, not_numeric
 from lmshealth.io.metadata import KEYS
-from lmshealth.io.refusal import Unusable, listed
+from lmshealth.io.refusal import Unusable, listed, repeated
 
 _HEADER, _TAG = 128, 8
 _ORDERS = {b"\x00\x01IM": "<", b"\x01\x00MI": ">"}
@@ -53,29 +47,20 @@ _NUMBERS, _TEXT = "numbers", "text"
 
 
 class _Variable(NamedTuple):
-    """A variable in the file: name, whether compressed, start and size of its bytes."""
+    """A variable: name, whether compressed, start and bytes in the file, bytes without its tag."""
 
     name: str
     packed: bool
     start: int
+    stored: int
     size: int
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Array:
-    """An array that is no struct.
+class _Array(NamedTuple):
+    """An array that is no struct, called as in MATLAB, which stores column after column.
 
-    Attributes
-    ----------
-    name : str
-        As MATLAB calls it.
-    shape : tuple of int
-        As in MATLAB, whose arrays are stored column after column.
-    what : str
-        `_NUMBERS`, `_TEXT`, or words for a message.
-    values : ndarray
-        Numbers as stored, shape ``(prod(shape),)``.
-    text : str
+    ``what`` is `_NUMBERS`, `_TEXT`, or words for a message; ``values`` are the numbers as stored,
+    shape ``(prod(shape),)``.
     """
 
     name: str
@@ -87,27 +72,35 @@ class _Array:
 
 def _load(path: Path, columns: ColumnMap, max_memory: float) -> Content:
     stored = path.stat().st_size
+    read: dict[str, Samples] = {}
+    metadata: dict[str, str] = {}
+    present: list[str] = []
+    n_samples = 0
     with path.open("rb") as stream:
         version = stream.read(_HEADER)[-4:]
         if version in _HDF5_INSIDE:
-            raise Unusable(
-                "format", "MAT-file of version 7.3; save it in MATLAB with the option -v7"
-            )
+            needed = "save it in MATLAB with the option -v7"
+            raise Unusable("format", f"MAT-file of version 7.3; {needed}")
         order = _ORDERS[version]
         variables = list(_variables(stream, order, stored))
         names = [variable.name for variable in variables]
         chosen = _chosen(names, columns)
-        content = Content({}, {}, ())
-        unpacked = 0
-        for variable in variables:
-            if variable.name in chosen:
-                view = _unpacked(stream, order, variable, unpacked, stored, max_memory)
-                unpacked += len(view)
-                inside = columns.mat.variable is not None
-                arrays = _arrays(view[_TAG:], order, variable.name, inside=inside)
-                content = _added(content, arrays, columns, stored)
-    others = tuple(name for name in names if name and name not in chosen)
-    return Content(content.columns, content.metadata, content.present + others)
+        wanted = [variable for variable in variables if variable.name in chosen]
+        inside = columns.mat.variable is not None
+        for array in _signals(stream, order, wanted, max_memory, inside=inside):
+            present.append(array.name)
+            if columns.target(array.name) is not None:
+                values = _vector(array)
+                n_samples += values.size
+                # MATLAB stores whole numbers in fewer bytes than they take here.
+                check_size(8 * n_samples, stored)
+                spool = Spool(values.size)
+                spool.append(values)
+                read[array.name] = spool.samples()
+            elif array.name in KEYS:
+                metadata[array.name] = _text(array)
+    present += [name for name in names if name and name not in chosen]
+    return Content(read, metadata, tuple(present))
 
 
 def _variables(stream: IO[bytes], order: str, end: int) -> Iterator[_Variable]:
@@ -115,69 +108,42 @@ def _variables(stream: IO[bytes], order: str, end: int) -> Iterator[_Variable]:
     at = _HEADER
     while at < end:
         stream.seek(at)
-        tag = stream.read(_TAG)
-        if len(tag) < _TAG:
-            raise _cut_off(at)
-        kind, size = struct.unpack(order + "II", tag)
+        kind, size = _tag(stream.read(_TAG), order)
         if kind not in (_COMPRESSED, _MATRIX):
-            raise Unusable("corrupt", f"no variable begins at byte {at}; copy the file again")
-        if at + _TAG + size > end:
-            raise _cut_off(at)
+            raise _corrupt(f"no variable begins at byte {at}")
+        start, stored = at + _TAG, size
+        at = start + stored
+        if at > end:
+            raise _corrupt("the last variable is cut off")
+        head = stream.read(min(stored, _PEEK))
         packed = kind == _COMPRESSED
-        head = stream.read(min(size, _PEEK))
         if packed:
-            head = _inflate(zlib.decompressobj(), head, _PEEK)[_TAG:]
+            head = _inflate(zlib.decompressobj(), head, _PEEK)
+            kind, size = _tag(head[:_TAG], order)
+            if kind != _MATRIX:
+                raise _corrupt("a compressed element is no variable")
+            head = head[_TAG:]
         # Objects of newer classes have no name, and neither have empty variables.
         name = _head(_elements(memoryview(head), order), order)[2] if head else ""
-        yield _Variable(name, packed, at, _TAG + size)
-        at += _TAG + size
+        yield _Variable(name, packed, start, stored, size)
+
+
+def _tag(tag: bytes, order: str) -> tuple[int, int]:
+    """Read type and size of an element."""
+    if len(tag) < _TAG:
+        raise _corrupt("the last variable is cut off")
+    kind, size = struct.unpack(order + "II", tag)
+    return kind, size
 
 
 def _inflate(inflater: zlib._Decompress, packed: bytes, size: int) -> bytes:
     try:
         return inflater.decompress(packed, size)
     except zlib.error as error:
-        raise _damaged() from error
+        raise _corrupt("a compressed variable is damaged") from error
 
 
-def _unpacked(
-    stream: IO[bytes],
-    order: str,
-    variable: _Variable,
-    unpacked: int,
-    stored: int,
-    max_memory: float,
-) -> memoryview:
-    """Read a variable with its tag, unless it takes too much memory."""
-    stream.seek(variable.start)
-    if not variable.packed:
-        check_memory(f"variable {variable.name[:80]!r}", variable.size, max_memory)
-        return memoryview(stream.read(variable.size))
-    packed = stream.read(variable.size)[_TAG:]
-    tag = _inflate(zlib.decompressobj(), packed[:_PEEK], _TAG)
-    if len(tag) < _TAG:
-        raise _cut_off(variable.start)
-    kind, size = struct.unpack(order + "II", tag)
-    if kind != _MATRIX:
-        raise Unusable("corrupt", "a compressed element is no variable; copy the file again")
-    size += _TAG
-    check_size(unpacked + size, stored)
-    check_memory(f"variable {variable.name[:80]!r}", size, max_memory)
-    inflater = zlib.decompressobj()
-    content = _inflate(inflater, packed, size + 1)
-    if len(content) < size:
-        raise _cut_off(variable.start)
-    # The checksum is that of the whole variable.
-    if len(content) > size or not inflater.eof:
-        raise _damaged()
-    return memoryview(content)
-
-
-def _cut_off(at: int) -> Unusable:
-    return Unusable("corrupt", f"the variable at byte {at} is cut off; copy the file again")
-
-
-def _damaged(what: str = "a compressed variable is damaged") -> Unusable:
+def _corrupt(what: str) -> Unusable:
     return Unusable("corrupt", f"{what}; copy the file again")
 
 
@@ -192,44 +158,60 @@ def _chosen(names: list[str], columns: ColumnMap) -> set[str]:
         roots = {re.split(r"[.({]", source)[0] for source in columns.columns.values()}
         known = roots | set(KEYS)
         chosen = {name for name in names if name and (name in known or columns.target(name))}
-    if twice := sorted({name for name in chosen if names.count(name) > 1}):
+    if twice := repeated(name for name in names if name in chosen):
         raise Unusable("columns", f"the file holds {listed(twice)} more than once")
     return chosen
 
 
-def _added(content: Content, arrays: Iterator[_Array], columns: ColumnMap, stored: int) -> Content:
-    """Add the arrays of a variable to the columns and metadata of a file."""
-    read, metadata, present = dict(content.columns), dict(content.metadata), [*content.present]
-    n_samples = sum(samples.size for samples in read.values())
-    for k, whole in enumerate(arrays):
-        for array in _columns(whole):
-            present.append(array.name)
-            if columns.target(array.name) is not None:
-                values = _vector(array)
-                n_samples += values.size
-                # MATLAB stores whole numbers in fewer bytes than they take here.
-                check_size(8 * n_samples, stored)
-                spool = Spool(values.size)
-                spool.append(values)
-                read[array.name] = spool.samples()
-            elif array.name in KEYS:
-                metadata[array.name] = _text(array)
-        if k + len(present) > constants.MOST_ARRAYS:
-            raise Unusable(
-                "columns", f"more than {constants.MOST_ARRAYS} arrays; save the log by itself"
-            )
-    return Content(read, metadata, tuple(present))
+def _signals(
+    stream: IO[bytes], order: str, variables: list[_Variable], max_memory: float, *, inside: bool
+) -> Iterator[_Array]:
+    """Yield the arrays of variables, matrices column by column, unless they take too much memory.
+
+    With ``inside`` the fields of a struct are called without the name of the variable.
+    """
+    stored = stream.seek(0, SEEK_END)
+    unpacked = n_columns = 0
+    for variable in variables:
+        unpacked += _TAG + variable.size
+        check_size(unpacked, stored)
+        check_memory(f"variable {variable.name[:80]!r}", _TAG + variable.size, max_memory)
+        name = "" if inside else variable.name
+        for k, array in enumerate(_arrays(_content(stream, variable), order, variable.name, name)):
+            columns = _columns(array)
+            n_columns += len(columns)
+            if k + n_columns > constants.MOST_ARRAYS:
+                detail = f"more than {constants.MOST_ARRAYS} arrays; save the log by itself"
+                raise Unusable("columns", detail)
+            yield from columns
 
 
-def _columns(array: _Array) -> Iterator[_Array]:
+def _content(stream: IO[bytes], variable: _Variable) -> memoryview:
+    """Read a variable without its tag."""
+    stream.seek(variable.start)
+    stored = stream.read(variable.stored)
+    if not variable.packed:
+        return memoryview(stored)
+    inflater = zlib.decompressobj()
+    content = _inflate(inflater, stored, _TAG + variable.size + 1)
+    if len(content) < _TAG + variable.size:
+        raise _corrupt(f"the variable at byte {variable.start} is cut off")
+    # The checksum is that of the whole variable.
+    if len(content) > _TAG + variable.size or not inflater.eof:
+        raise _corrupt("a compressed variable is damaged")
+    return memoryview(content)[_TAG:]
+
+
+def _columns(array: _Array) -> list[_Array]:
     """Split a matrix of signals into its columns; any other array stays whole."""
     values, shape = array.values, array.shape
     is_matrix = len(shape) == 2 and 1 not in shape and shape[1] <= constants.MOST_COLUMNS
     if values is None or not is_matrix:
-        yield array
-        return
-    for k, column in enumerate(values.reshape(shape[::-1])):
-        yield _Array(f"{array.name}(:,{k + 1})", (shape[0], 1), _NUMBERS, column)
+        return [array]
+    return [
+        _Array(f"{array.name}(:,{k + 1})", (shape[0], 1), _NUMBERS, column)
+        for k, column in enumerate(values.reshape(shape[::-1]))
+    ]
 
 
 def _vector(array: _Array) -> np.ndarray:
@@ -260,7 +242,7 @@ def _elements(view: memoryview, order: str) -> Elements:
     at, stop = 0, len(view)
     while at < stop:
         if at + _TAG > stop:
-            raise _damaged("a variable is cut off")
+            raise _corrupt("a variable is cut off")
         kind, size = struct.unpack_from(order + "II", view, at)
         if kind >> 16:  # up to four bytes are inside the tag itself
             start, after, kind, size = at + 4, at + _TAG, kind & 0xFFFF, kind >> 16
@@ -270,7 +252,7 @@ def _elements(view: memoryview, order: str) -> Elements:
         # The last element need not be padded.
         at = min(after, stop)
         if start + size > at:
-            raise _damaged("an element of a variable is cut off")
+            raise _corrupt("an element of a variable is cut off")
         yield kind, view[start : start + size]
 
 
@@ -278,7 +260,7 @@ def _next(elements: Elements, *kinds: int) -> tuple[int, memoryview]:
     """Return the next element, which must be of one of some types."""
     kind, content = next(elements, (0, memoryview(b"")))
     if kind not in kinds:
-        raise _damaged("a variable is cut off or damaged")
+        raise _corrupt("a variable is cut off or damaged")
     return kind, content
 
 
@@ -291,46 +273,32 @@ def _head(elements: Elements, order: str) -> tuple[int, tuple[int, ...], str, bo
     """Read class, shape, name, and whether complex; objects of newer classes have but a class."""
     _, flags = _next(elements, _UINT32)
     if len(flags) != 8:
-        raise _damaged("a variable has no class")
+        raise _corrupt("a variable has no class")
     (word,) = struct.unpack_from(order + "I", flags)
     kind = word & 0xFF
     if kind == _OPAQUE:
         return kind, (), "", False
     shape = _integers(elements, order)
     if not 1 <= len(shape) <= constants.DEEPEST or min(shape) < 0:
-        raise _damaged("a variable has impossible dimensions")
+        raise _corrupt("a variable has impossible dimensions")
     name = str(_next(elements, _INT8)[1], "latin-1")
     return kind, shape, name, bool(word & _COMPLEX)
 
 
 def _arrays(
-    view: memoryview, order: str, name: str, depth: int = 0, *, inside: bool = False
+    view: memoryview, order: str, name: str, prefix: str, depth: int = 0
 ) -> Iterator[_Array]:
-    """Yield all arrays of a matrix that are no structs.
-
-    Parameters
-    ----------
-    view : memoryview
-        Content of the matrix.
-    order : str
-        Byte order as `struct` writes it.
-    name : str
-        As MATLAB calls it.
-    depth : int
-        Number of structs around it.
-    inside : bool
-        Whether the fields of a struct are called without the name of the variable.
-    """
+    """Yield all arrays of a matrix that are no structs; the prefix names fields of a struct."""
     if not len(view):
         yield _Array(name, (0, 0), _NUMBERS, np.empty(0))
         return
     if depth > constants.DEEPEST:
-        raise _damaged(f"{name[:80]!r} is nested deeper than {constants.DEEPEST}")
+        raise _corrupt(f"{name[:80]!r} is nested deeper than {constants.DEEPEST}")
     elements = _elements(view, order)
     kind, shape, _, is_complex = _head(elements, order)
     if kind == _STRUCT:
-        for label, field in _fields(elements, order, "" if inside else name, shape, len(view)):
-            yield from _arrays(field, order, label, depth + 1)
+        for label, field in _fields(elements, order, prefix, shape, len(view)):
+            yield from _arrays(field, order, label, label, depth + 1)
     elif kind in _OTHERS:
         yield _Array(name, shape, _OTHERS[kind])
     elif kind == _CHAR:
@@ -343,12 +311,12 @@ def _arrays(
         stored, content = _next(elements, *_TYPES)
         dtype = np.dtype(order + _TYPES[stored])
         if len(content) != prod(shape) * dtype.itemsize:
-            raise _damaged(f"{name[:80]!r} is cut off")
+            raise _corrupt(f"{name[:80]!r} is cut off")
         what = "complex numbers" if is_complex else _NUMBERS
         values = None if is_complex else np.frombuffer(content, dtype=dtype)
         yield _Array(name, shape, what, values)
     else:
-        raise _damaged(f"{name[:80]!r} is of the unknown class {kind}")
+        raise _corrupt(f"{name[:80]!r} is of the unknown class {kind}")
 
 
 def _fields(
@@ -357,13 +325,13 @@ def _fields(
     """Yield name and content of the fields of a struct, entry after entry."""
     length, (_, names) = sum(_integers(elements, order)), _next(elements, _INT8)
     if not 1 <= length <= _PEEK or len(names) % length:
-        raise _damaged("a struct has impossible fields")
+        raise _corrupt("a struct has impossible fields")
     fields = [
         str(names[k : k + length], "latin-1").split("\0")[0] for k in range(0, len(names), length)
     ]
     n_items = prod(shape)
     if n_items * len(fields) * _TAG > size:
-        raise _damaged(f"{name[:80]!r} is cut off")
+        raise _corrupt(f"{name[:80]!r} is cut off")
     for k in range(n_items if fields else 0):
         whole = name if n_items == 1 else f"{name}({k + 1})"
         for field in fields:
