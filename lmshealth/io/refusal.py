@@ -28,6 +28,11 @@ class Unusable(Exception):
         super().__init__(f"{reason}: {self.detail}")
 
 
+def corrupt(what: str) -> Unusable:
+    """Return the refusal of a damaged file."""
+    return Unusable("corrupt", f"{what}; copy the file again")
+
+
 def listed(names: Iterable[str]) -> str:
     """List names for a message: the first dozen, with control characters escaped."""
     all_names = list(names)

@@ -23,7 +23,7 @@ from lmshealth.io import constants
 from lmshealth.io.buffers import MINUTE, Samples, spools
 from lmshealth.io.column_map import ColumnMap, CsvLayout
 from lmshealth.io.formats.content import Content, Format, check_size, not_numeric, wanted
-from lmshealth.io.refusal import Unusable
+from lmshealth.io.refusal import Unusable, corrupt
 
 # The filters of warnings belong to the process, which threads share.
 _WARNINGS = threading.Lock()
@@ -34,6 +34,7 @@ _DELIMITERS, _HEAD = ",;\t| ", 100
 # Rows per block, fewer of wide tables: a block stays in the processor's cache.
 _ROWS = 1 << 16
 _FIELDS = 1 << 18
+_NO_ROWS = "a header line and no rows; needed rows"
 # Message of pandas for a row with too many fields.
 _LONG_ROW = re.compile(r"in line (\d+), saw (\d+)")
 
@@ -47,40 +48,35 @@ class Text:
         Bytes of the text, decompressed; seekable.
     stored : int
         Bytes on disk, which limit the decompressed size.
+    delimiter : str
+        Between the fields of a row.
+
+    Attributes
+    ----------
+    position : int
+        Byte that is read next.
+    n_fields : int
+        Fields of every row from the position on; 0 where no rows have begun.
+    pending : int
+        Bytes since the last complete row.
     """
 
-    def __init__(self, stream: BufferedIOBase, stored: int) -> None:
+    def __init__(self, stream: BufferedIOBase, stored: int, delimiter: str) -> None:
         self._stream = stream
         self._stored = stored
+        self._delimiter = delimiter.encode()
         self.n_fields = 0
-        self._delimiter = b","
         self.seek(0)
 
     def seek(self, position: int) -> None:
         """Go to the beginning of a line, a former `position`."""
         self._stream.seek(position)
         self.position = position
-        # Bytes after the last line feed, and since the last complete row.
-        self._tail = b""
-        self._pending = 0
-
-    def rows_begin(self, n_fields: int, delimiter: str) -> None:
-        """Expect only rows of so many fields from here on."""
-        self.n_fields = n_fields
-        self._delimiter = delimiter.encode()
-
-    def rows_end(self) -> None:
-        """Note that the text so far makes complete rows."""
-        self._pending = 0
+        self.pending = 0
+        self._tail = b""  # bytes after the last line feed
 
     def line(self) -> bytes:
-        """Read a line with its end; empty at the end of the file.
-
-        Raises
-        ------
-        Unusable
-            As `read` does.
-        """
+        """Read a line with its end, with the checks of `read`; empty at the end of the file."""
         return self._checked(self._stream.readline(constants.LONGEST_LINE + 1))
 
     def read(self, size: int = -1) -> bytes:
@@ -93,10 +89,13 @@ class Text:
             inside a row, ``too-large`` for more than the file can honestly hold.
         """
         block = self._checked(self._stream.read(size))
-        if not block:
-            self._check_end()
-        self._pending += len(block)
-        if self._pending > constants.LONGEST_BLOCK:
+        if not block and self._tail and not self._tail.endswith(b"\r"):
+            # The last number of a file that ends inside a row may be incomplete.
+            n_found = self._tail.count(self._delimiter) + 1
+            if n_found < self.n_fields:
+                raise corrupt(f"the last row is cut off: {n_found} of {self.n_fields} fields")
+        self.pending += len(block)
+        if self.pending > constants.LONGEST_BLOCK:
             raise Unusable(
                 "corrupt",
                 f"no row ends in {constants.LONGEST_BLOCK} bytes before byte {self.position}; "
@@ -118,37 +117,18 @@ class Text:
         self._tail = block[end:] if end else self._tail + block
         if len(self._tail) > constants.LONGEST_LINE:
             start = self.position - len(self._tail)
-            raise Unusable(
-                "corrupt",
-                f"the line at offset {start} is longer than {constants.LONGEST_LINE} bytes; "
-                "needed one row per line",
-            )
+            too_long = f"is longer than {constants.LONGEST_LINE} bytes; needed one row per line"
+            raise Unusable("corrupt", f"the line at offset {start} {too_long}")
         return block
 
-    def _check_end(self) -> None:
-        """Refuse a file that ends inside a row: its last number may be incomplete."""
-        if not self._tail or self._tail.endswith(b"\r"):
-            return
-        n_found = self._tail.count(self._delimiter) + 1
-        if n_found < self.n_fields:
-            raise Unusable(
-                "corrupt",
-                f"the last row is cut off: {n_found} of {self.n_fields} fields; "
-                "copy the file again",
-            )
 
-
-def _load_plain(path: Path, columns: ColumnMap, max_memory: float) -> Content:
-    with path.open("rb") as stream:
+def _load(path: Path, columns: ColumnMap, max_memory: float) -> Content:
+    opened = gzip.open if path.name.lower().endswith(".gz") else open
+    with opened(path, "rb") as stream:
         return parse_text(stream, path.stat().st_size, columns)
 
 
-def _load_gzip(path: Path, columns: ColumnMap, max_memory: float) -> Content:
-    with gzip.open(path, "rb") as stream:
-        return parse_text(stream, path.stat().st_size, columns)
-
-
-def parse_text(stream: BufferedIOBase, stored: int, columns: ColumnMap) -> Content:
+def parse_text(stream: Any, stored: int, columns: ColumnMap) -> Content:
     """Read delimited text block by block.
 
     Parameters
@@ -166,7 +146,7 @@ def parse_text(stream: BufferedIOBase, stored: int, columns: ColumnMap) -> Conte
         With the reasons ``empty``, ``corrupt``, ``too-large``, ``metadata`` and ``columns``.
     """
     layout = columns.csv
-    text = Text(stream, stored)
+    text = Text(stream, stored, layout.delimiter)
     # The skipped lines may be in any encoding.
     text.seek(len(_BOM) if text.line().startswith(_BOM) else 0)
     for _ in range(layout.skip_rows):
@@ -176,7 +156,8 @@ def parse_text(stream: BufferedIOBase, stored: int, columns: ColumnMap) -> Conte
     places = {name: names.index(name) for name in wanted(names, columns)}
     if not places:
         return Content({}, metadata, tuple(names), hint=_hint(text, columns))
-    return Content(_numbers(text, len(names), places, layout.delimiter), metadata, tuple(names))
+    text.n_fields = len(names)
+    return Content(_numbers(text, places, layout.delimiter), metadata, tuple(names))
 
 
 def _line(text: Text) -> str:
@@ -186,11 +167,8 @@ def _line(text: Text) -> str:
     try:
         return line.decode("utf-8")
     except UnicodeDecodeError as error:
-        raise Unusable(
-            "corrupt",
-            f"byte {line[error.start]:#04x} at offset {start + error.start} is not UTF-8; "
-            "save the file as UTF-8",
-        ) from error
+        what = f"byte {line[error.start]:#04x} at offset {start + error.start}"
+        raise Unusable("corrupt", f"{what} is not UTF-8; save the file as UTF-8") from error
 
 
 def _leading_lines(text: Text) -> dict[str, str]:
@@ -203,9 +181,8 @@ def _leading_lines(text: Text) -> dict[str, str]:
         key, colon, value = line.lstrip("# \t").partition(":")
         key, value = key.strip(), value.strip()
         if colon and metadata.setdefault(key, value) != value:
-            raise Unusable(
-                "metadata", f"{key} is given twice, as {metadata[key]!r} and {value!r}; keep one"
-            )
+            both = f"{metadata[key]!r} and {value!r}"
+            raise Unusable("metadata", f"{key} is given twice, as {both}; keep one")
         start = text.position
     text.seek(start)
     return metadata
@@ -227,10 +204,8 @@ def _header(text: Text, layout: CsvLayout) -> list[str]:
     if layout.header is False:
         return [str(i) for i in range(len(fields))]
     if len(layout.header) != len(fields):
-        raise Unusable(
-            "columns",
-            f"[csv] header names {len(layout.header)} columns, the first row has {len(fields)}",
-        )
+        found = f"[csv] header names {len(layout.header)} columns"
+        raise Unusable("columns", f"{found}, the first row has {len(fields)}")
     return list(layout.header)
 
 
@@ -265,14 +240,11 @@ def _names(line: str, delimiter: str, columns: ColumnMap) -> bool:
     return any(columns.target(field) is not None for field in fields)
 
 
-def _numbers(
-    text: Text, n_fields: int, places: dict[str, int], delimiter: str
-) -> dict[str, Samples]:
+def _numbers(text: Text, places: dict[str, int], delimiter: str) -> dict[str, Samples]:
     """Read the wanted columns, ``(n_rows,)`` each, NaN where a field is empty."""
     import pandas as pd
 
     start = text.position
-    text.rows_begin(n_fields, delimiter)
     # Before 3.1 pandas drops an extra field of the first row of a block (pandas-dev/pandas pull
     # request 66944): a spare column receives it.
     major, minor = pd.__version__.split(".")[:2]
@@ -282,11 +254,11 @@ def _numbers(
         text,
         sep=delimiter,
         header=None,
-        names=list(range(n_fields + n_spare)),
+        names=list(range(text.n_fields + n_spare)),
         index_col=False,
         # A block is small enough as a whole.
         low_memory=False,
-        chunksize=max(1, min(_ROWS, _FIELDS // n_fields)),
+        chunksize=max(1, min(_ROWS, _FIELDS // text.n_fields)),
     )
     with _WARNINGS, warnings.catch_warnings():
         # A row longer than the header is a warning in pandas and a loss of data here.
@@ -300,10 +272,10 @@ def _numbers(
         try:
             return _spooled(partial(read, skipinitialspace=True), text, places)
         except pd.errors.EmptyDataError as error:
-            raise Unusable("empty", "a header line and no rows; needed rows") from error
+            raise Unusable("empty", _NO_ROWS) from error
         except (pd.errors.ParserError, pd.errors.ParserWarning, UnicodeDecodeError) as error:
             if found := _LONG_ROW.search(str(error)):
-                raise _too_long(found[1], found[2], n_fields) from error
+                raise _too_long(found[1], found[2], text.n_fields) from error
             raise Unusable("corrupt", f"rows cannot be read: {error}") from error
 
 
@@ -313,7 +285,7 @@ def _spooled(read: Callable[[], Any], text: Text, places: dict[str, int]) -> dic
     # The number of rows is unknown: memory for a minute is touched only as it is filled.
     with spools(places, expected=MINUTE) as taken, read() as blocks:
         for table in blocks:
-            text.rows_end()
+            text.pending = 0
             for extra in table.columns[text.n_fields :]:
                 filled = table[extra].notna().to_numpy()
                 if filled.any():
@@ -325,14 +297,12 @@ def _spooled(read: Callable[[], Any], text: Text, places: dict[str, int]) -> dic
                 taken[name].append(table[place].to_numpy())
             n_rows += len(table)
     if not n_rows:
-        raise Unusable("empty", "a header line and no rows; needed rows")
+        raise Unusable("empty", _NO_ROWS)
     return {name: spool.samples() for name, spool in taken.items()}
 
 
 def _too_long(row: object, found: str, needed: int) -> Unusable:
-    return Unusable(
-        "corrupt", f"row {row} has {found} fields, the first line {needed}; copy the file again"
-    )
+    return corrupt(f"row {row} has {found} fields, the first line {needed}")
 
 
 def _first_text(values: list[object], n_before: int) -> str:
@@ -345,9 +315,9 @@ def _first_text(values: list[object], n_before: int) -> str:
     return "text"
 
 
-def _sniff_text(head: bytes) -> bool:
+def _is_text(head: bytes) -> bool:
     return b"\0" not in head and not head.startswith((_GZIP_MAGIC, b"PAR1", b"\x89HDF"))
 
 
-CSV = Format("CSV", (".csv",), _sniff_text, _load_plain)
-CSV_GZ = Format("gzipped CSV", (".csv.gz",), lambda head: head.startswith(_GZIP_MAGIC), _load_gzip)
+CSV = Format("CSV", (".csv",), _is_text, _load)
+CSV_GZ = Format("gzipped CSV", (".csv.gz",), lambda head: head.startswith(_GZIP_MAGIC), _load)

@@ -24,7 +24,7 @@ from lmshealth.io.buffers import Samples, Spool
 from lmshealth.io.column_map import ColumnMap
 from lmshealth.io.formats.content import Content, Format, check_memory, check_size, not_numeric
 from lmshealth.io.metadata import KEYS
-from lmshealth.io.refusal import Unusable, listed, repeated
+from lmshealth.io.refusal import Unusable, corrupt, listed, repeated
 
 _HEADER, _TAG = 128, 8
 _ORDERS = {b"\x00\x01IM": "<", b"\x01\x00MI": ">"}
@@ -110,18 +110,18 @@ def _variables(stream: IO[bytes], order: str, end: int) -> Iterator[_Variable]:
         stream.seek(at)
         kind, size = _tag(stream.read(_TAG), order)
         if kind not in (_COMPRESSED, _MATRIX):
-            raise _corrupt(f"no variable begins at byte {at}")
+            raise corrupt(f"no variable begins at byte {at}")
         start, stored = at + _TAG, size
         at = start + stored
         if at > end:
-            raise _corrupt("the last variable is cut off")
+            raise corrupt("the last variable is cut off")
         head = stream.read(min(stored, _PEEK))
         packed = kind == _COMPRESSED
         if packed:
             head = _inflate(zlib.decompressobj(), head, _PEEK)
             kind, size = _tag(head[:_TAG], order)
             if kind != _MATRIX:
-                raise _corrupt("a compressed element is no variable")
+                raise corrupt("a compressed element is no variable")
             head = head[_TAG:]
         # Objects of newer classes have no name, and neither have empty variables.
         name = _head(_elements(memoryview(head), order), order)[2] if head else ""
@@ -131,7 +131,7 @@ def _variables(stream: IO[bytes], order: str, end: int) -> Iterator[_Variable]:
 def _tag(tag: bytes, order: str) -> tuple[int, int]:
     """Read type and size of an element."""
     if len(tag) < _TAG:
-        raise _corrupt("the last variable is cut off")
+        raise corrupt("the last variable is cut off")
     kind, size = struct.unpack(order + "II", tag)
     return kind, size
 
@@ -140,11 +140,7 @@ def _inflate(inflater: zlib._Decompress, packed: bytes, size: int) -> bytes:
     try:
         return inflater.decompress(packed, size)
     except zlib.error as error:
-        raise _corrupt("a compressed variable is damaged") from error
-
-
-def _corrupt(what: str) -> Unusable:
-    return Unusable("corrupt", f"{what}; copy the file again")
+        raise corrupt("a compressed variable is damaged") from error
 
 
 def _chosen(names: list[str], columns: ColumnMap) -> set[str]:
@@ -195,10 +191,10 @@ def _content(stream: IO[bytes], variable: _Variable) -> memoryview:
     inflater = zlib.decompressobj()
     content = _inflate(inflater, stored, _TAG + variable.size + 1)
     if len(content) < _TAG + variable.size:
-        raise _corrupt(f"the variable at byte {variable.start} is cut off")
+        raise corrupt(f"the variable at byte {variable.start} is cut off")
     # The checksum is that of the whole variable.
     if len(content) > _TAG + variable.size or not inflater.eof:
-        raise _corrupt("a compressed variable is damaged")
+        raise corrupt("a compressed variable is damaged")
     return memoryview(content)[_TAG:]
 
 
@@ -242,7 +238,7 @@ def _elements(view: memoryview, order: str) -> Elements:
     at, stop = 0, len(view)
     while at < stop:
         if at + _TAG > stop:
-            raise _corrupt("a variable is cut off")
+            raise corrupt("a variable is cut off")
         kind, size = struct.unpack_from(order + "II", view, at)
         if kind >> 16:  # up to four bytes are inside the tag itself
             start, after, kind, size = at + 4, at + _TAG, kind & 0xFFFF, kind >> 16
@@ -252,7 +248,7 @@ def _elements(view: memoryview, order: str) -> Elements:
         # The last element need not be padded.
         at = min(after, stop)
         if start + size > at:
-            raise _corrupt("an element of a variable is cut off")
+            raise corrupt("an element of a variable is cut off")
         yield kind, view[start : start + size]
 
 
@@ -260,7 +256,7 @@ def _next(elements: Elements, *kinds: int) -> tuple[int, memoryview]:
     """Return the next element, which must be of one of some types."""
     kind, content = next(elements, (0, memoryview(b"")))
     if kind not in kinds:
-        raise _corrupt("a variable is cut off or damaged")
+        raise corrupt("a variable is cut off or damaged")
     return kind, content
 
 
@@ -273,14 +269,14 @@ def _head(elements: Elements, order: str) -> tuple[int, tuple[int, ...], str, bo
     """Read class, shape, name, and whether complex; objects of newer classes have but a class."""
     _, flags = _next(elements, _UINT32)
     if len(flags) != 8:
-        raise _corrupt("a variable has no class")
+        raise corrupt("a variable has no class")
     (word,) = struct.unpack_from(order + "I", flags)
     kind = word & 0xFF
     if kind == _OPAQUE:
         return kind, (), "", False
     shape = _integers(elements, order)
     if not 1 <= len(shape) <= constants.DEEPEST or min(shape) < 0:
-        raise _corrupt("a variable has impossible dimensions")
+        raise corrupt("a variable has impossible dimensions")
     name = str(_next(elements, _INT8)[1], "latin-1")
     return kind, shape, name, bool(word & _COMPLEX)
 
@@ -293,7 +289,7 @@ def _arrays(
         yield _Array(name, (0, 0), _NUMBERS, np.empty(0))
         return
     if depth > constants.DEEPEST:
-        raise _corrupt(f"{name[:80]!r} is nested deeper than {constants.DEEPEST}")
+        raise corrupt(f"{name[:80]!r} is nested deeper than {constants.DEEPEST}")
     elements = _elements(view, order)
     kind, shape, _, is_complex = _head(elements, order)
     if kind == _STRUCT:
@@ -311,12 +307,12 @@ def _arrays(
         stored, content = _next(elements, *_TYPES)
         dtype = np.dtype(order + _TYPES[stored])
         if len(content) != prod(shape) * dtype.itemsize:
-            raise _corrupt(f"{name[:80]!r} is cut off")
+            raise corrupt(f"{name[:80]!r} is cut off")
         what = "complex numbers" if is_complex else _NUMBERS
         values = None if is_complex else np.frombuffer(content, dtype=dtype)
         yield _Array(name, shape, what, values)
     else:
-        raise _corrupt(f"{name[:80]!r} is of the unknown class {kind}")
+        raise corrupt(f"{name[:80]!r} is of the unknown class {kind}")
 
 
 def _fields(
@@ -325,13 +321,13 @@ def _fields(
     """Yield name and content of the fields of a struct, entry after entry."""
     length, (_, names) = sum(_integers(elements, order)), _next(elements, _INT8)
     if not 1 <= length <= _PEEK or len(names) % length:
-        raise _corrupt("a struct has impossible fields")
+        raise corrupt("a struct has impossible fields")
     fields = [
         str(names[k : k + length], "latin-1").split("\0")[0] for k in range(0, len(names), length)
     ]
     n_items = prod(shape)
     if n_items * len(fields) * _TAG > size:
-        raise _corrupt(f"{name[:80]!r} is cut off")
+        raise corrupt(f"{name[:80]!r} is cut off")
     for k in range(n_items if fields else 0):
         whole = name if n_items == 1 else f"{name}({k + 1})"
         for field in fields:
