@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from datetime import date, datetime
+from datetime import datetime
 from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -17,8 +17,8 @@ from msgspec import Meta, Struct
 from lmshealth._toml import decode
 from lmshealth.errors import BadTable
 from lmshealth.io import constants
-from lmshealth.io.metadata import KEYS
-from lmshealth.io.refusal import Unusable, listed
+from lmshealth.io.metadata import KEYS, as_text
+from lmshealth.io.refusal import Unusable, listed, repeated
 
 Role = Literal[
     "displacement", "acceleration", "current", "reference_velocity", "reference_position", "time"
@@ -67,16 +67,9 @@ _PREFIXES: dict[str, Role] = {
 
 @dataclass(frozen=True, slots=True)
 class Signal:
-    """Content of a column.
+    """Content of a column: its name without unit, its role, and the SI value of one in its unit.
 
-    Attributes
-    ----------
-    name : str
-        Column name without its unit.
-    role : str
-        Physical quantity, and whether it is measured or a set point.
-    factor : float
-        SI value of one in the column's unit.
+    The role is the physical quantity, and whether it is measured or a set point.
     """
 
     name: str
@@ -97,17 +90,12 @@ def role_of(column: str) -> Role | None:
     return None
 
 
-def unit_key(text: str) -> str | None:
-    """Return a unit as the contract writes it (``m/s²`` is ``m_s2``); None for an unknown unit."""
+def unit_key(text: str, dimension: str | None = None) -> str | None:
+    """Return a unit as the contract writes it (``m/s²`` is ``m_s2``); None for any other unit."""
     word = text.strip().translate(_SPELLINGS)
     word = _ALIASES.get(word, word)
-    return word if word in _UNITS else None
-
-
-def acceleration_unit(text: str) -> str | None:
-    """Return a unit of acceleration as the contract writes it; None for any other unit."""
-    word = unit_key(text)
-    return word if word is not None and _UNITS[word][0] == "acceleration" else None
+    known = word in _UNITS and dimension in (None, _UNITS[word][0])
+    return word if known else None
 
 
 def parse_column(column: str, unit: str | float | None = None) -> Signal:
@@ -123,8 +111,8 @@ def parse_column(column: str, unit: str | float | None = None) -> Signal:
     Raises
     ------
     Unusable
-        With reason ``unit`` when the unit is missing, unknown or of another quantity; with reason
-        ``columns`` for a column outside the contract or an unprintable or very long name.
+        With reason ``unit`` for a missing, unknown or contradicting unit, ``columns`` for a column
+        outside the contract or an unprintable or very long name.
     """
     role = role_of(column)
     if role is None:
@@ -133,19 +121,19 @@ def parse_column(column: str, unit: str | float | None = None) -> Signal:
         needed = f"printable text of at most {constants.LONGEST_NAME} characters"
         raise Unusable("columns", f"a column is called {column[:80]!r}, needed {needed}")
     suffix = next((word for word in _LONGEST_FIRST if column.endswith("_" + word)), None)
+    name = column.removesuffix(f"_{suffix}")
     fits = suffix is not None and _UNITS[suffix][0] == _DIMENSIONS[role]
     if unit is None and suffix is not None and fits:
-        return Signal(column.removesuffix("_" + suffix), role, _UNITS[suffix][1])
+        return Signal(name, role, _UNITS[suffix][1])
     if unit is None:
         found = "no known unit" if suffix is None else f"the unit {suffix}"
-        raise Unusable(
-            "unit", f"column {column!r} carries {found}; needed one of {_choices(role)} as suffix"
-        )
+        needed = f"needed one of {_choices(role)} as suffix"
+        raise Unusable("unit", f"column {column!r} carries {found}; {needed}")
     if fits:
         raise Unusable(
             "unit",
             f"column {column!r} carries the unit {suffix} and is given {unit!r} as well; name it "
-            f"{column.removesuffix(f'_{suffix}')!r} to read it by the latter",
+            f"{name!r} to read it by the latter",
         )
     return Signal(column, role, _factor(column, role, unit))
 
@@ -153,11 +141,10 @@ def parse_column(column: str, unit: str | float | None = None) -> Signal:
 def _factor(column: str, role: Role, unit: str | float) -> float:
     """Return the SI value of one in the unit that a column map gives."""
     if isinstance(unit, str):
-        key = unit_key(unit)
-        if key is None or _UNITS[key][0] != _DIMENSIONS[role]:
-            raise Unusable(
-                "unit", f"column {column!r} is given the unit {unit!r}; needed {_choices(role)}"
-            )
+        key = unit_key(unit, _DIMENSIONS[role])
+        if key is None:
+            detail = f"column {column!r} is given the unit {unit!r}; needed {_choices(role)}"
+            raise Unusable("unit", detail)
         return _UNITS[key][1]
     if not math.isfinite(unit) or unit == 0:
         raise Unusable("unit", f"column {column!r} is given the scale {unit}; needed a number")
@@ -171,15 +158,9 @@ def _choices(role: Role) -> str:
 class CsvLayout(Struct, frozen=True, forbid_unknown_fields=True):
     """Layout of a delimited text file.
 
-    Attributes
-    ----------
-    skip_rows : int
-        Lines before the metadata lines and the header, skipped unread.
-    delimiter : str
-        One character.
-    header : bool or list of str
-        Whether a header line names the columns (else they are called ``"0"``, ``"1"``, ...), or
-        the names for a file without a header line.
+    ``skip_rows`` lines before the metadata lines and the header are skipped unread. ``header`` is
+    whether a header line names the columns (else they are called ``"0"``, ``"1"``, ...), or the
+    names for a file without a header line.
     """
 
     skip_rows: Annotated[int, Meta(ge=0)] = 0
@@ -241,18 +222,12 @@ class ColumnMap(Struct, frozen=True, forbid_unknown_fields=True, dict=True):
         return source
 
     def signal(self, target: str) -> Signal:
-        """Read quantity, name and unit of a contract name.
-
-        Raises
-        ------
-        Unusable
-            Where the name carries no usable unit and the map gives none.
-        """
+        """Read quantity, name and unit of a contract name, as `parse_column` does."""
         return parse_column(target, self.units.get(target))
 
     def constants(self) -> dict[str, str]:
         """Return the metadata of the map as text, with the keys of the contract."""
-        text = {key: _as_text(value) for key, value in self.metadata.items()}
+        text = {key: as_text(value) for key, value in self.metadata.items()}
         if self.sample_rate_hz is not None:
             text["sample_rate_hz"] = repr(self.sample_rate_hz)
         return text
@@ -285,9 +260,9 @@ def load_columns(path: str | Path) -> ColumnMap:
 def _check(columns: ColumnMap) -> None:
     """Check names, units and metadata keys before any log is read."""
     signals = [columns.signal(target).name for target in columns.columns]
-    if twice := _repeated(signals):
+    if twice := repeated(signals):
         raise ValueError(f"[columns] names one signal twice: {listed(twice)}")
-    if twice := _repeated([*columns.columns.values()]):
+    if twice := repeated(columns.columns.values()):
         raise ValueError(f"[columns] reads one column twice: {listed(twice)}")
     for target in columns.units:
         columns.signal(target)
@@ -301,13 +276,3 @@ def _check(columns: ColumnMap) -> None:
     delimiter = columns.csv.delimiter
     if not delimiter.isascii() or delimiter in '\r\n"#':
         raise ValueError(f"[csv] delimiter is {delimiter!r}, needed one ASCII separator")
-
-
-def _repeated(names: list[str]) -> list[str]:
-    return sorted({name for name in names if names.count(name) > 1})
-
-
-def _as_text(value: object) -> str:
-    if isinstance(value, bool):
-        return "true" if value else "false"
-    return value.isoformat() if isinstance(value, date) else str(value)

@@ -5,7 +5,9 @@ from __future__ import annotations
 import math
 import unicodedata
 from collections.abc import Mapping
-from datetime import UTC, datetime
+from datetime import UTC, date, datetime
+
+import numpy as np
 
 from lmshealth.io import constants
 from lmshealth.io.log import Metadata
@@ -29,11 +31,6 @@ _BOOLEANS = {"true": True, "1": True, "false": False, "0": False}
 
 def parse_metadata(text: Mapping[str, str]) -> tuple[Metadata, float | None]:
     """Convert the metadata of a log; unknown keys and empty values are ignored.
-
-    Parameters
-    ----------
-    text : mapping of str to str
-        Values by keys of the log contract.
 
     Returns
     -------
@@ -70,15 +67,10 @@ def _bad(given: Mapping[str, str], key: str, needed: str) -> Unusable:
 
 
 def parse_name(given: Mapping[str, str], key: str) -> str | None:
-    """Read a name; None where there is none.
+    """Read a name; None where there is none. Unprintable or very long ones are refused.
 
     Names are normalised (NFC): systems differ in how they write an accented letter, and one
     machine must not become two.
-
-    Raises
-    ------
-    Unusable
-        With reason ``metadata`` for an unprintable or very long name.
     """
     if not given.get(key):
         return None
@@ -88,13 +80,7 @@ def parse_name(given: Mapping[str, str], key: str) -> str | None:
 
 
 def parse_moment(given: Mapping[str, str]) -> datetime | None:
-    """Read ``recorded_at``; None where it is not given.
-
-    Raises
-    ------
-    Unusable
-        With reason ``metadata`` if it is no date and time with a time zone.
-    """
+    """Read ``recorded_at``; None where it is not given, refused without date or time zone."""
     if not given.get("recorded_at"):
         return None
     needed = "ISO 8601 with a time zone, such as 2026-03-01T08:30:00+01:00"
@@ -133,9 +119,15 @@ def _number(
 
 
 def _boolean(given: Mapping[str, str]) -> bool | None:
-    if "baseline" not in given:
-        return None
-    value = _BOOLEANS.get(given["baseline"].lower())
-    if value is None:
+    if "baseline" in given and given["baseline"].lower() not in _BOOLEANS:
         raise _bad(given, "baseline", "true or false")
-    return value
+    return _BOOLEANS.get(given.get("baseline", "").lower())
+
+
+def as_text(value: object) -> str:
+    """Write a value of a file or a column map as the text that `parse_metadata` reads."""
+    if isinstance(value, bool | np.bool_):
+        return "true" if value else "false"
+    if isinstance(value, np.datetime64):  # of TDMS, in UTC
+        return f"{np.datetime_as_string(value, unit='us')}+00:00"
+    return value.isoformat() if isinstance(value, date) else str(value)

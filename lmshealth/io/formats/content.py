@@ -10,7 +10,7 @@ from lmshealth.io import constants
 from lmshealth.io.buffers import Samples
 from lmshealth.io.column_map import ColumnMap
 from lmshealth.io.log import Refusal
-from lmshealth.io.refusal import Unusable, listed
+from lmshealth.io.refusal import Unusable, listed, repeated
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -42,17 +42,9 @@ class Content:
 class Format:
     """One file format.
 
-    Attributes
-    ----------
-    name : str
-        For messages.
-    suffixes : tuple of str
-        In lower case, with the leading dot.
-    sniff : callable
-        Return from the leading bytes of a file whether it has this format.
-    load : callable
-        Read a file: path, column map, most memory in bytes. It may raise anything:
-        `lmshealth.io.formats.registry.load` turns it into a refusal.
+    ``name`` is for messages; the suffixes are in lower case, with the leading dot; ``sniff``
+    returns whether a file has this format from its leading bytes; ``load`` reads a file: path,
+    column map, most memory in bytes. It may raise anything: the registry turns it into a refusal.
     """
 
     name: str
@@ -62,13 +54,7 @@ class Format:
 
 
 def check_size(decoded: int, stored: int) -> None:
-    """Refuse content that would decode to an unreasonable size, before it does.
-
-    Raises
-    ------
-    Unusable
-        With reason ``too-large``.
-    """
+    """Refuse (``too-large``) what would decode to an unreasonable size, before it does."""
     limit = max(constants.SMALL_ENOUGH, constants.LARGEST_RATIO * stored)
     if decoded > limit:
         raise Unusable(
@@ -79,13 +65,7 @@ def check_size(decoded: int, stored: int) -> None:
 
 
 def check_memory(what: str, needed: float, allowed: float) -> None:
-    """Refuse a part of a file that takes too much memory, before it is read.
-
-    Raises
-    ------
-    Unusable
-        With reason ``too-large``.
-    """
+    """Refuse (``too-large``) a part of a file that takes too much memory, before it is read."""
     if needed > allowed:
         raise Unusable(
             "too-large",
@@ -95,16 +75,9 @@ def check_memory(what: str, needed: float, allowed: float) -> None:
 
 
 def wanted(names: Iterable[str], columns: ColumnMap) -> list[str]:
-    """Choose the columns of a file that the contract or the column map names.
-
-    Raises
-    ------
-    Unusable
-        With reason ``columns`` where two of them have one name.
-    """
-    every = list(names)
-    chosen = [name for name in every if columns.target(name) is not None]
-    if twice := sorted({name for name in chosen if every.count(name) > 1}):
+    """Choose the columns that contract or column map name; refuse (``columns``) a name twice."""
+    chosen = [name for name in names if columns.target(name) is not None]
+    if twice := repeated(chosen):
         raise Unusable("columns", f"the file names {listed(twice)} more than once")
     return chosen
 

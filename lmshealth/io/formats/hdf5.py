@@ -18,7 +18,7 @@ from lmshealth.io import constants
 from lmshealth.io.buffers import BLOCK, MINUTE, Spool, spools
 from lmshealth.io.column_map import ColumnMap
 from lmshealth.io.formats.content import Content, Format, check_size, not_numeric, wanted
-from lmshealth.io.metadata import KEYS
+from lmshealth.io.metadata import KEYS, as_text
 from lmshealth.io.refusal import Unusable
 
 _MAGIC = b"\x89HDF\r\n\x1a\n"
@@ -166,9 +166,7 @@ def _attribute(file: Any, key: str) -> str:
     value = np.asarray(file.attrs[key]).reshape(-1)[0]
     if isinstance(value, bytes):
         return value.decode("utf-8", "replace")
-    if isinstance(value, np.bool_):
-        return "true" if value else "false"
-    return str(value)
+    return as_text(value)
 
 
 HDF5 = Format("HDF5", (".h5", ".hdf5"), lambda head: head.startswith(_MAGIC), _load)

@@ -28,7 +28,7 @@ from lmshealth.io.formats.content import (
     not_numeric,
 )
 from lmshealth.io.formats.unit_channels import Chosen, Described, choose, present, rate_of
-from lmshealth.io.metadata import KEYS
+from lmshealth.io.metadata import KEYS, as_text
 from lmshealth.io.refusal import Unusable, listed
 
 _MAGIC = b"TDSm"
@@ -162,17 +162,8 @@ def _metadata(properties: dict[str, Any], wanted: Iterable[Any], chosen: Chosen)
     """Read properties of the file under the keys of the contract, and the start of its channels."""
     starts = [channel.properties.get("wf_start_time") for channel in wanted]
     start = next((s for s in starts if isinstance(s, np.datetime64) and s > _EPOCH), None)
-    own = {key: _text(properties[key]) for key in KEYS if key in properties}
-    return ({} if start is None else {"recorded_at": _text(start)}) | chosen.metadata | own
-
-
-def _text(value: object) -> str:
-    if isinstance(value, bool | np.bool_):
-        return "true" if value else "false"
-    if isinstance(value, np.datetime64):
-        # Time stamps of TDMS are in UTC.
-        return f"{np.datetime_as_string(value, unit='us')}+00:00"
-    return str(value)
+    own = {key: as_text(properties[key]) for key in KEYS if key in properties}
+    return ({} if start is None else {"recorded_at": as_text(start)}) | chosen.metadata | own
 
 
 TDMS = Format("TDMS", (".tdms",), lambda head: head.startswith(_MAGIC), _load)

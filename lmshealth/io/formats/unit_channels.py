@@ -8,25 +8,17 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 from lmshealth.io import constants
-from lmshealth.io.column_map import ColumnMap, acceleration_unit, parse_column, role_of, unit_key
+from lmshealth.io.column_map import ColumnMap, parse_column, role_of, unit_key
 from lmshealth.io.log import Refusal
 from lmshealth.io.refusal import Unusable, listed
 
 
 @dataclass(frozen=True, slots=True)
 class Described:
-    """Description of a channel in a file.
+    """Name and unit of a channel as in the file, empty where there is none.
 
-    Attributes
-    ----------
-    name : str
-        As in the file and in a column map.
-    unit : str
-        As in the file; empty where there is none.
-    rate : float or None
-        Sample rate in Hz; None where there is none.
-    acceleration : bool
-        Whether the file calls it an acceleration, whatever its unit.
+    ``rate`` is its sample rate in Hz; ``acceleration`` whether the file calls it one, whatever its
+    unit.
     """
 
     name: str
@@ -37,16 +29,9 @@ class Described:
 
 @dataclass(frozen=True, slots=True)
 class Chosen:
-    """Channels that make the log.
+    """Channels that make the log: name as a column of the log to the index in the file.
 
-    Attributes
-    ----------
-    columns : dict of str to int
-        Name as a column of the log to the index among the channels of the file.
-    metadata : dict of str to str
-        Their sample rate, where there is one.
-    refused : tuple of Refusal
-        Wanted channels of another sample rate.
+    ``metadata`` holds their sample rate, where there is one; channels of another one are refused.
     """
 
     columns: dict[str, int]
@@ -58,27 +43,23 @@ def choose(channels: Sequence[Described], columns: ColumnMap) -> Chosen:
     """Choose the channels of one sample rate that the contract or the column map names.
 
     Without ``[columns]`` every channel whose unit is an acceleration is read as ``acc_<name>``;
-    with it, the named ones and those that keep the contract.
-
-    Raises
-    ------
-    Unusable
-        With reason ``columns`` where two channels would be one column, ``unit`` where a name
-        contradicts the unit of its channel.
+    with it, the named ones and those that keep the contract. Two channels that would be one column
+    are refused as ``columns``, a name that contradicts the unit of its channel as ``unit``.
     """
     found: dict[str, int] = {}
     for k, channel in enumerate(channels):
         column = _column(channel, columns)
         if column in found:
             both = listed([channels[found[column]].name, channel.name])
-            raise Unusable(
-                "columns", f"{both} would both be read as {column}; rename them or map one of them"
-            )
+            detail = f"{both} would both be read as {column}; rename them or map one of them"
+            raise Unusable("columns", detail)
         if column is not None:
             found[column] = k
-    rate = _most_common(channels[k].rate for k in found.values())
-    if rate is None:
+    counts = Counter(own for k in found.values() if (own := channels[k].rate) is not None)
+    if not counts:
         return Chosen(found, {}, ())
+    # The rate of most channels, of several the highest.
+    rate = max(counts, key=lambda rate: (counts[rate], rate))
     kept, refused = {}, []
     for name, k in found.items():
         own = channels[k].rate
@@ -111,7 +92,7 @@ def _column(channel: Described, columns: ColumnMap) -> str | None:
     if role_of(channel.name) is not None:
         column = _with_unit(channel, columns)
     else:
-        unit = acceleration_unit(channel.unit)
+        unit = unit_key(channel.unit, "acceleration")
         if columns.columns or (unit is None and not channel.acceleration):
             return None
         column = "acc_" + re.sub(r"\W+", "_", channel.name).strip("_")
@@ -130,13 +111,6 @@ def _with_unit(channel: Described, columns: ColumnMap) -> str:
     except Unusable:
         return f"{channel.name}_{unit}"
     if parse_column(own.name, unit).factor != own.factor:
-        raise Unusable(
-            "unit", f"channel {channel.name!r} has the unit {channel.unit!r}; they must agree"
-        )
+        detail = f"channel {channel.name!r} has the unit {channel.unit!r}; they must agree"
+        raise Unusable("unit", detail)
     return channel.name
-
-
-def _most_common(rates: Iterable[float | None]) -> float | None:
-    """Return the rate of most channels, of several the highest; None where no channel has one."""
-    counts = Counter(rate for rate in rates if rate is not None)
-    return max(counts, key=lambda rate: (counts[rate], rate)) if counts else None
