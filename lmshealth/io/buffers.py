@@ -21,15 +21,7 @@ BLOCK = 1 << 18
 
 
 class Stored:
-    """Samples in a file of float64, sliced as an array is.
-
-    Parameters
-    ----------
-    file : IO
-        Open for reading; closed with the last view of it.
-    size : int
-        Number of samples.
-    """
+    """Samples in a file of float64, sliced as an array is; the file closes with the last view."""
 
     def __init__(self, file: IO[bytes], size: int) -> None:
         self._file = file
@@ -58,17 +50,7 @@ Samples = FloatArray | Stored
 
 
 def in_unit(values: FloatArray, factor: float, limit: float) -> FloatArray:
-    """Multiply samples by a factor, and set those from the limit on to NaN.
-
-    Parameters
-    ----------
-    values : ndarray
-        Shape ``(n,)``; left unchanged.
-    factor : float
-        SI value of one.
-    limit : float
-        In SI units.
-    """
+    """Multiply samples by a factor, and set those from the limit (in SI units) on to NaN."""
     # A damaged float may be so large that its SI value is infinite: missing, without a warning.
     with np.errstate(over="ignore", invalid="ignore"):
         scaled = values * factor
@@ -83,14 +65,8 @@ def blocks(
 ) -> Iterator[tuple[int, FloatArray]]:
     """Read samples block by block, each with the index of its first sample.
 
-    Parameters
-    ----------
-    samples : ndarray or Stored
-        Shape ``(n_samples,)``.
-    start, stop : int, optional
-        Half-open range; by default all.
-    overlap : int
-        Samples of the block before that are repeated at the beginning of each but the first.
+    The half-open range is all samples by default; ``overlap`` samples of the block before are
+    repeated at the beginning of each block but the first.
     """
     end = samples.size if stop is None else stop
     at = start
@@ -105,12 +81,8 @@ def blocks(
 class Spool:
     """Collects the samples of one column in blocks.
 
-    The temporary file of a long column has no name and is deleted with the last `Stored` of it.
-
-    Parameters
-    ----------
-    expected : int
-        Number of samples, where it is known: up to a minute of them need no concatenation then.
+    Up to a minute of an expected number of samples need no concatenation. The temporary file of a
+    long column has no name and is deleted with the last `Stored` of it.
     """
 
     def __init__(self, expected: int = 0) -> None:
@@ -120,13 +92,7 @@ class Spool:
         self.size = 0
 
     def append(self, block: np.ndarray) -> None:
-        """Add the next samples, shape ``(n,)``, of any numeric type.
-
-        Raises
-        ------
-        Unusable
-            With reason ``too-large`` where the disk is full.
-        """
+        """Add the next samples, ``(n,)``, of any numeric type; a full disk is ``too-large``."""
         start, self.size = self.size, self.size + block.size
         # A whole column is kept as it is: to copy it may take longer than to read it.
         is_whole = block.size == self._memory.size and block.flags.c_contiguous
@@ -164,25 +130,15 @@ class Spool:
             for values in self._parts:
                 self._file.write(np.ascontiguousarray(values).data)
         except OSError as error:
-            raise Unusable(
-                "too-large",
-                f"{8 * self.size} bytes of a column do not fit into {tempfile.gettempdir()} "
-                f"({error.strerror}); set TMPDIR to a folder on a larger disk",
-            ) from error
+            found = f"{8 * self.size} bytes of a column do not fit into {tempfile.gettempdir()}"
+            needed = "set TMPDIR to a folder on a larger disk"
+            raise Unusable("too-large", f"{found} ({error.strerror}); {needed}") from error
         self._parts.clear()
 
 
 @contextmanager
 def spools(names: Iterable[str], *, expected: int = 0) -> Iterator[dict[str, Spool]]:
-    """Make a spool for each column; where reading fails, their files are closed.
-
-    Parameters
-    ----------
-    names : iterable of str
-        The columns.
-    expected : int
-        Number of samples of each, where it is known.
-    """
+    """Make a spool for each column; where reading fails, their files are closed."""
     opened = {name: Spool(expected) for name in names}
     try:
         yield opened

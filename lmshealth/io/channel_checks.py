@@ -14,18 +14,12 @@ from lmshealth.io.time_axis import IntArray, too_many
 
 
 def missing_stretches(values: Samples) -> tuple[IntArray, str]:
-    """Find the missing samples of a channel.
-
-    Parameters
-    ----------
-    values : ndarray or Stored
-        Samples in SI units, shape ``(n_samples,)``.
+    """Find the missing samples (NaN, infinite or absurd) of a channel, ``(n_samples,)`` in SI.
 
     Returns
     -------
     ndarray of int
-        Half-open ranges in which every sample is NaN, infinite or absurd, ascending, shape
-        ``(n_stretches, 2)``.
+        Half-open ranges in which every sample is missing, ascending, shape ``(n_stretches, 2)``.
     str
         Their counts; empty if nothing is missing.
 
@@ -56,18 +50,7 @@ def missing_stretches(values: Samples) -> tuple[IntArray, str]:
 
 
 def check_signal(values: Samples) -> None:
-    """Refuse a constant or clipped channel.
-
-    Parameters
-    ----------
-    values : ndarray or Stored
-        Samples in SI units, shape ``(n_samples,)``; missing ones are ignored.
-
-    Raises
-    ------
-    Unusable
-        With reason ``flat`` or ``clipped``.
-    """
+    """Refuse a constant (``flat``) or ``clipped`` channel, ``(n_samples,)`` in SI units."""
     low = min(float(block.min()) for block in _measured(values))
     high = max(float(block.max()) for block in _measured(values))
     if low == high:

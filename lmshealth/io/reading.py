@@ -5,9 +5,10 @@ from __future__ import annotations
 import hashlib
 import stat
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
-from typing import cast
+from typing import NamedTuple, cast
 
 import numpy as np
 
@@ -20,7 +21,7 @@ from lmshealth.io.formats.content import Content
 from lmshealth.io.formats.registry import load
 from lmshealth.io.log import Channel, ChannelKind, Log, Refusal
 from lmshealth.io.metadata import parse_metadata
-from lmshealth.io.refusal import Unusable, listed, shown
+from lmshealth.io.refusal import Unusable, listed, repeated, shown, visible
 from lmshealth.io.time_axis import IntArray, pieces, set_velocity, time_axis
 
 _NEEDED = "needed delta_e_um or acc_<name>_m_s2 (or another unit of the contract)"
@@ -80,19 +81,18 @@ def read_log(
     >>> print(f"{log.channels[0].values.max():.2g} m, {log.channels[1].values.max():.3g} m/s²")
     6e-08 m, 0.0785 m/s²
     """
-    file = Path(path)
     label = shown(path) if name is None else name
+    digest = content_digest(path, name=label)
+    used = ColumnMap() if columns is None else columns
     try:
-        digest = _digest(file)
-        used = ColumnMap() if columns is None else columns
-        content = load(file, used, max_memory)
+        content = load(Path(path), used, max_memory)
         return _to_log(content, used, overrides or {}, name=label, digest=digest)
     except Unusable as error:
         raise BadLog(label, error.reason, error.detail) from error
 
 
-def content_digest(path: str | Path) -> str:
-    """Return the SHA-256 of a file's content.
+def content_digest(path: str | Path, *, name: str | None = None) -> str:
+    """Return the SHA-256 of a file's content; the name is for messages, by default the path.
 
     Raises
     ------
@@ -100,50 +100,34 @@ def content_digest(path: str | Path) -> str:
         With reason ``missing-file`` where no file can be read, ``empty`` for 0 bytes: empty files
         are no copies of each other.
     """
+    label = shown(path) if name is None else name
     try:
-        return _digest(Path(path))
-    except Unusable as error:
-        raise BadLog(shown(path), error.reason, error.detail) from error
+        found = Path(path).stat()
+        # Opening a named pipe would wait until somebody writes to it.
+        if not stat.S_ISREG(found.st_mode):
+            raise BadLog(label, "missing-file", "is no regular file")
+        if not found.st_size:
+            raise BadLog(label, "empty", "0 bytes; copy the file again")
+        with Path(path).open("rb") as stream:
+            return hashlib.file_digest(stream, "sha256").hexdigest()
+    except (OSError, ValueError) as error:
+        why = getattr(error, "strerror", None) or visible(str(error))
+        raise BadLog(label, "missing-file", f"cannot be opened: {why}") from error
 
 
 def require_identity(log: Log) -> None:
-    """Require the metadata that tracking a machine over its life needs.
-
-    Raises
-    ------
-    BadLog
-        With reason ``metadata``, naming the missing keys.
-    """
+    """Require the metadata that tracking needs; `BadLog` (``metadata``) names the missing keys."""
     given = {
         "stage": log.metadata.stage,
         "recorded_at": log.metadata.recorded_at,
         "travel_km": log.metadata.travel,
     }
     if absent := [key for key, value in given.items() if value is None]:
-        raise BadLog(
-            log.name,
-            "metadata",
-            f"{', '.join(absent)} not given; needed in the file's metadata or in manifest.csv",
-        )
+        needed = "needed in the file's metadata or in manifest.csv"
+        raise BadLog(log.name, "metadata", f"{', '.join(absent)} not given; {needed}")
 
 
-def _digest(file: Path) -> str:
-    try:
-        found = file.stat()
-        # Opening a named pipe would wait until somebody writes to it.
-        if not stat.S_ISREG(found.st_mode):
-            raise Unusable("missing-file", "is no regular file")
-        if not found.st_size:
-            raise Unusable("empty", "0 bytes; copy the file again")
-        with file.open("rb") as stream:
-            return hashlib.file_digest(stream, "sha256").hexdigest()
-    except (OSError, ValueError) as error:
-        why = getattr(error, "strerror", None) or str(error)
-        raise Unusable("missing-file", f"cannot be opened: {why}") from error
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Series:
+class _Series(NamedTuple):
     """A column in SI units, shape ``(n_samples,)``; NaN where a sample is missing."""
 
     signal: Signal
@@ -214,12 +198,9 @@ def _series(content: Content, columns: ColumnMap) -> list[_Series]:
         except Unusable as error:
             raise Unusable(error.reason, f"{error.detail}; {there}") from error
         limit = np.inf if signal.role == "time" else constants.ABSURD
-        if isinstance(values, Stored):
-            series.append(_Series(signal, values.scaled(signal.factor, limit)))
-        else:
-            series.append(_Series(signal, in_unit(values, signal.factor, limit)))
-    names = [item.signal.name for item in series]
-    if twice := sorted({item for item in names if names.count(item) > 1}):
+        scaled = values.scaled if isinstance(values, Stored) else partial(in_unit, values)
+        series.append(_Series(signal, scaled(signal.factor, limit)))
+    if twice := repeated(item.signal.name for item in series):
         raise Unusable("columns", f"{listed(twice)} comes in more than one unit; {there}")
     if not any(item.signal.role in _DYNAMIC for item in series):
         hint += "" if columns.columns else "; a column map (--columns) translates other names"

@@ -13,12 +13,8 @@ _MOST_LISTED = 12
 class Unusable(Exception):
     """A file that cannot be used; `read_log` turns it into a ``BadLog`` with the file's name.
 
-    Parameters
-    ----------
-    reason : str
-        Code of the refusal, the ``reason`` column of ``refused.csv``.
-    detail : str
-        What was found, what is needed, and the next step.
+    The reason is the code in ``refused.csv``; the detail is what was found, what is needed, and
+    the next step.
     """
 
     def __init__(self, reason: str, detail: str) -> None:
@@ -57,8 +53,5 @@ def visible(text: str) -> str:
 
 
 def shown(path: str | Path) -> str:
-    """Write a path as printable text, whatever bytes its name has.
-
-    The backslash is doubled, so that different names stay different.
-    """
+    """Write a path as printable text; a doubled backslash keeps different names different."""
     return visible(os.fsdecode(path).replace("\\", "\\\\"))

@@ -18,23 +18,16 @@ import pandas as pd
 
 from lmshealth.errors import BadTable
 from lmshealth.io import constants
-from lmshealth.io.refusal import Unusable, listed
+from lmshealth.io.refusal import Unusable, listed, repeated
 
 _MOST_LISTED = 3
 
 
 class Row(NamedTuple):
-    """One row of a table next to logs.
+    """One row of a table next to logs: its lines, such as ``line 3``, its cells, its fault.
 
-    Attributes
-    ----------
-    where : str
-        Its lines in the file, such as ``line 3``.
-    cells : dict of str to str
-        By column, stripped, empty where there is none; of a bad row as far as it can be split.
-        Bytes that are no UTF-8 are kept as surrogates, as in names of files.
-    trouble : str
-        Its fault; empty for a good row.
+    Cells are stripped, and empty where there is none; a bad row has those that can be split. Bytes
+    that are no UTF-8 are kept as surrogates, as in names of files. A good row has no trouble.
     """
 
     where: str
@@ -43,24 +36,17 @@ class Row(NamedTuple):
 
 
 def read_sheet(path: Path, needed: Sequence[str]) -> Iterator[Row]:
-    """Read a table of comma-separated values row by row.
-
-    Parameters
-    ----------
-    path : Path
-        With a header line.
-    needed : sequence of str
-        Columns that must be there.
+    """Read a table of comma-separated values row by row, after a header line.
 
     Raises
     ------
     Unusable
-        With the reasons ``missing-file``, ``too-large``, ``empty``, and ``columns`` where one is
-        missing or there twice.
+        With the reasons ``missing-file``, ``too-large``, ``empty``, and ``columns`` where a needed
+        one is missing, or any is there twice.
     """
+    allowed = constants.SMALL_ENOUGH
     try:
-        if (size := path.stat().st_size) > constants.SMALL_ENOUGH:
-            allowed = constants.SMALL_ENOUGH
+        if (size := path.stat().st_size) > allowed:
             raise Unusable("too-large", f"{size} bytes, allowed are {allowed}; split it")
         text = path.read_bytes().decode("utf-8-sig", "surrogateescape")
     except OSError as error:
@@ -69,12 +55,9 @@ def read_sheet(path: Path, needed: Sequence[str]) -> Iterator[Row]:
     names = [name.strip() for name in next(records, ("", [], ""))[1]]
     if not names:
         raise Unusable("empty", f"no header line; needed {listed(needed)}")
-    twice = {name for name in names if name and names.count(name) > 1}
-    if twice or not set(needed) <= set(names):
-        raise Unusable(
-            "columns",
-            f"columns are {listed(names)}; needed {listed(needed)}, none twice, and commas between",
-        )
+    if repeated(filter(None, names)) or not set(needed) <= set(names):
+        detail = f"needed {listed(needed)}, none twice, and commas between"
+        raise Unusable("columns", f"columns are {listed(names)}; {detail}")
     for where, cells, trouble in records:
         stripped = [cell.strip() for cell in cells]
         if not trouble and any(stripped[len(names) :]):
@@ -104,13 +87,7 @@ def _records(lines: list[str]) -> Iterator[tuple[str, list[str], str]]:
 
 
 def read_rows(path: Path, needed: Sequence[str]) -> pd.DataFrame:
-    """Read a table of estimates as text.
-
-    Raises
-    ------
-    BadTable
-        If it cannot be read, or a column is missing.
-    """
+    """Read a table of estimates as text; `BadTable` if a column is missing or it cannot be read."""
     try:
         table = pd.read_csv(path, dtype=str, keep_default_na=False)
     except (OSError, ValueError) as error:
@@ -137,12 +114,9 @@ def lines(table: pd.DataFrame, wrong: pd.Series[bool]) -> str:
 
 
 def to_numbers(path: Path, table: pd.DataFrame, names: Iterable[str]) -> None:
-    """Convert columns to numbers, in place; empty cells to NaN, missing columns are ignored.
+    """Convert columns to numbers, in place; missing columns are ignored, empty cells are NaN.
 
-    Raises
-    ------
-    BadTable
-        For any other cell.
+    Any other cell raises `BadTable`.
     """
     for name in [name for name in names if name in table.columns]:
         given = table[name].str.strip() != ""
@@ -153,13 +127,7 @@ def to_numbers(path: Path, table: pd.DataFrame, names: Iterable[str]) -> None:
 
 
 def to_moments(path: Path, table: pd.DataFrame) -> None:
-    """Convert the column recorded_at to dates with time zone, in place.
-
-    Raises
-    ------
-    BadTable
-        If one is no ISO date with time zone.
-    """
+    """Convert the column recorded_at to dates with time zone, in place, or raise `BadTable`."""
     moments = []
     for index, text in zip(table.index, table["recorded_at"], strict=True):
         where = f"{path}, line {int(index) + 2}: recorded_at {text!r}"

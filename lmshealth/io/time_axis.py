@@ -6,7 +6,7 @@ Samples are never sorted and never interpolated.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,18 +22,10 @@ IntArray = NDArray[np.int64]
 _QUANTILE = 0.9
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class TimeAxis:
-    """How the samples of a log lie in time.
+class TimeAxis(NamedTuple):
+    """Sample rate in Hz, samples before which a record is interrupted, ``(n_breaks,)``.
 
-    Attributes
-    ----------
-    sample_rate : float
-        In Hz.
-    breaks : ndarray of int
-        Samples before which the record is interrupted, shape ``(n_breaks,)``.
-    note : str
-        Counts of the interruptions; empty if there are none.
+    ``note`` counts the interruptions; it is empty if there are none.
     """
 
     sample_rate: float
@@ -64,9 +56,8 @@ def time_axis(time: Samples | None, rate: float | None) -> TimeAxis:
     """
     if time is None:
         if rate is None:
-            raise Unusable(
-                "time", "neither a column time_s nor the metadata sample_rate_hz; needed one"
-            )
+            detail = "neither a column time_s nor the metadata sample_rate_hz; needed one"
+            raise Unusable("time", detail)
         return TimeAxis(rate, np.empty(0, dtype=np.int64), "")
     _check_order(time)
     interval, total, n_regular, n_gaps, missing = 0.0, 0.0, 0, 0, 0.0
@@ -83,7 +74,13 @@ def time_axis(time: Samples | None, rate: float | None) -> TimeAxis:
         n_regular += int(np.count_nonzero(~irregular))
         breaks.append(np.flatnonzero(irregular) + at + 1)
     where: IntArray = np.concatenate(breaks)
-    note = _note(n_gaps, missing, where.size - n_gaps, time.size - 1, interval)
+    notes = [f"{n_gaps} gaps with {missing:.0f} dropped samples"] if n_gaps else []
+    if n_odd := where.size - n_gaps:
+        notes.append(
+            f"{n_odd} of {time.size - 1} intervals differ by more than {constants.JITTER:.0%} "
+            f"from the median {interval:.6g} s"
+        )
+    note = " and ".join(notes)
     if too_many(where.size, time.size):
         raise Unusable("time", f"{note}; needed uniform samples, export them at the sampling clock")
     # The mean over all regular intervals averages the rounding of time stamps out.
@@ -94,21 +91,10 @@ def time_axis(time: Samples | None, rate: float | None) -> TimeAxis:
 def pieces(
     n_samples: int, missing: Sequence[IntArray], breaks: IntArray
 ) -> tuple[tuple[int, int], ...]:
-    """Cut a record into ranges without gaps.
+    """Cut a record into half-open ranges without gaps; single samples are left out.
 
-    Parameters
-    ----------
-    n_samples : int
-        Length of the record.
-    missing : sequence of ndarray
-        For each channel the half-open ranges in which it has no samples, shape ``(n, 2)``.
-    breaks : ndarray of int
-        Samples before which time is interrupted, ascending, shape ``(n_breaks,)``.
-
-    Returns
-    -------
-    tuple of (int, int)
-        Half-open ranges of sample indices; single samples are left out.
+    ``missing`` holds for each channel the half-open ranges in which it has no samples, shape
+    ``(n, 2)``; ``breaks`` the samples before which time is interrupted, ascending.
     """
     gone = np.concatenate([*missing, np.empty((0, 2), dtype=np.int64)])
     gone = gone[np.argsort(gone[:, 0], kind="stable")]
@@ -147,18 +133,6 @@ def _check_order(time: Samples) -> None:
         )
 
 
-def _note(n_gaps: int, missing: float, n_odd: int, n_steps: int, interval: float) -> str:
-    parts = []
-    if n_gaps:
-        parts.append(f"{n_gaps} gaps with {missing:.0f} dropped samples")
-    if n_odd:
-        parts.append(
-            f"{n_odd} of {n_steps} intervals differ by more than {constants.JITTER:.0%} "
-            f"from the median {interval:.6g} s"
-        )
-    return " and ".join(parts)
-
-
 def _agreed(interval: float, rate: float | None) -> float:
     """Choose the sample rate in Hz: that of the metadata, if the time stamps confirm it."""
     if rate is None:
@@ -179,20 +153,7 @@ def set_velocity(
     """Differentiate a set position piece by piece, never across a gap.
 
     The difference spans so many samples that the steps in which positions are stored do not show.
-
-    Parameters
-    ----------
-    position : ndarray or Stored
-        In m, shape ``(n_samples,)``.
-    pieces : sequence of (int, int)
-        Half-open ranges without gaps, ascending.
-    sample_rate : float
-        In Hz.
-
-    Returns
-    -------
-    ndarray or Stored
-        In m/s, shape ``(n_samples,)``; NaN outside the pieces.
+    Position in m, velocity in m/s, both ``(n_samples,)``; NaN outside the pieces, which ascend.
     """
     reach = _reach(position, pieces, sample_rate)
     velocity = Spool()

@@ -13,7 +13,7 @@ from lmshealth.io.formats.mat import MAT
 from lmshealth.io.formats.parquet import PARQUET
 from lmshealth.io.formats.tdms import TDMS
 from lmshealth.io.formats.uff import UFF
-from lmshealth.io.refusal import Unusable, listed
+from lmshealth.io.refusal import Unusable, corrupt, listed
 
 # Binary formats first: text is recognised by the absence of other signatures.
 FORMATS: tuple[Format, ...] = (HDF5, PARQUET, TDMS, MAT, CSV_GZ, UFF, CSV)
@@ -47,15 +47,6 @@ def format_name(path: Path) -> str:
 def load(path: Path, columns: ColumnMap, max_memory: float = constants.MAX_MEMORY) -> Content:
     """Read a file by the format of its suffix, which its first bytes must confirm.
 
-    Parameters
-    ----------
-    path : Path
-        A regular file.
-    columns : ColumnMap
-        Which columns are wanted, and the layout of exports.
-    max_memory : float
-        In bytes, for formats that are not read in blocks.
-
     Raises
     ------
     Unusable
@@ -79,17 +70,13 @@ def load(path: Path, columns: ColumnMap, max_memory: float = constants.MAX_MEMOR
     except Exception as error:
         # Libraries raise any exception on damaged files; one file must not end a batch.
         text = " ".join(str(error).split())[:200]
-        raise Unusable(
-            "corrupt", f"cannot be read as {form.name} ({type(error).__name__}: {text})"
-        ) from error
+        detail = f"cannot be read as {form.name} ({type(error).__name__}: {text})"
+        raise Unusable("corrupt", detail) from error
 
 
 def _mismatch(form: Format, head: bytes) -> Unusable:
     actual = next((other for other in FORMATS if other.sniff(head)), None)
     if actual is None:
-        return Unusable("corrupt", f"does not start as {form.name} does; copy the file again")
-    return Unusable(
-        "format",
-        f"the suffix is that of {form.name}, the content is {actual.name}; "
-        f"rename the file to {actual.suffixes[0]}",
-    )
+        return corrupt(f"does not start as {form.name} does")
+    found = f"the suffix is that of {form.name}, the content is {actual.name}"
+    return Unusable("format", f"{found}; rename the file to {actual.suffixes[0]}")
