@@ -19,7 +19,13 @@ from lmshealth._arrays import BoolArray, FloatArray, expect_shape, freeze
 from lmshealth.errors import BadTable
 from lmshealth.tracking import constants
 from lmshealth.tracking.association.hypotheses import Hypotheses, Scan, extend, reduce_hypotheses
-from lmshealth.tracking.association.mode_filters import IntArray, Measurements, predict, update
+from lmshealth.tracking.association.mode_filters import (
+    IntArray,
+    Measurements,
+    ModeFilters,
+    predict,
+    update,
+)
 from lmshealth.tracking.association.track_initiation import Candidates, follow, prune
 
 Reason = Literal["ambiguous", "jump", "unconfirmed"]
@@ -32,31 +38,18 @@ _MOST_PENDING = 64
 class Estimates:
     """The modal estimates of one log.
 
-    Attributes
-    ----------
-    names : tuple of str
-        Names that the identification assigned, empty where it assigned none.
-    sources : tuple of str
-        Source of each. Two estimates of one source are never of one mode.
-    ln_frequency, ln_damping : ndarray
-        ln of frequency (Hz) and of damping ratio, shape ``(n,)``; ln ζ is NaN where unknown.
-    cov : ndarray
-        Covariance of ``[ln f, ln ζ]``, ``(2 n, 2 n)``; NaN where ln ζ is unknown.
-    shapes : ndarray
-        Real mode shapes, ``(n, n_channels)``, of any length; NaN where a channel is absent.
-
     Raises
     ------
     ValueError
         If shapes of arrays do not match.
     """
 
-    names: tuple[str, ...]
-    sources: tuple[str, ...]
-    ln_frequency: FloatArray
-    ln_damping: FloatArray
-    cov: FloatArray
-    shapes: FloatArray
+    names: tuple[str, ...]  # from the identification, empty where it assigned none
+    sources: tuple[str, ...]  # two estimates of one source are never of one mode
+    ln_frequency: FloatArray  # ln of Hz, ``(n,)``
+    ln_damping: FloatArray  # ln ζ, ``(n,)``; NaN where unknown
+    cov: FloatArray  # covariance of ``[ln f, ln ζ]``, ``(2 n, 2 n)``; NaN where ln ζ is unknown
+    shapes: FloatArray  # real, of any length, ``(n, n_channels)``; NaN where a channel is absent
 
     def __post_init__(self) -> None:
         n = len(self.names)
@@ -73,37 +66,19 @@ class Estimates:
 
 @dataclass(frozen=True, slots=True)
 class Label:
-    """The mode of one estimate, or why it has none.
-
-    Attributes
-    ----------
-    mode : str or None
-        Name of the mode.
-    reason : str
-        ``ambiguous``, ``jump`` or ``unconfirmed``; empty with a mode.
-    detail : str
-        The reason in a sentence.
-    """
+    """The mode of one estimate, or why it has none."""
 
     mode: str | None
     reason: Reason | Literal[""] = ""
-    detail: str = ""
+    detail: str = ""  # the reason in a sentence
 
 
 @dataclass(frozen=True, slots=True)
 class Association:
-    """Labels of all estimates.
+    """Labels of all estimates."""
 
-    Attributes
-    ----------
-    modes : tuple of str
-        Ascending in first frequency; modes without a name are named by their frequency.
-    labels : tuple of tuple of Label
-        For each log and each of its estimates.
-    """
-
-    modes: tuple[str, ...]
-    labels: tuple[tuple[Label, ...], ...]
+    modes: tuple[str, ...]  # ascending in first frequency, by which modes without a name are named
+    labels: tuple[tuple[Label, ...], ...]  # for each log and each of its estimates
 
     @property
     def assigned(self) -> tuple[tuple[str | None, ...], ...]:
@@ -123,29 +98,13 @@ class Association:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Log:
-    """One log, as `associate_log` takes it.
+    """One log, as `associate_log` takes it."""
 
-    Attributes
-    ----------
-    epoch : int
-        Index of the log.
-    clock, life : float
-        Its place on the clock, and the length of a life as known then.
-    offsets : ndarray
-        Covariates about their references, shape ``(n_covariates,)``.
-    opened : bool
-        Whether frequencies may step before it, as after declared maintenance.
-    names, sources : tuple of str
-        Of its n estimates.
-    measurements : Measurements
-        The estimates.
-    """
-
-    epoch: int
+    epoch: int  # index of the log
     clock: float
-    life: float
-    offsets: FloatArray
-    opened: bool
+    life: float  # length of a life on the clock as known at this log, 0 while unknown
+    offsets: FloatArray  # covariates about their references, ``(n_covariates,)``
+    opened: bool  # whether frequencies may step before it, as after declared maintenance
     names: tuple[str, ...]
     sources: tuple[str, ...]
     measurements: Measurements
@@ -157,48 +116,23 @@ Place = tuple[float, float, FloatArray]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class State:
-    """All that later labels depend on.
+    """All that later labels depend on."""
 
-    Attributes
-    ----------
-    prior_std : ndarray
-        Prior standard deviations of the covariates' coefficients, ``(n_covariates,)``.
-    hypotheses : Hypotheses
-        Over the m modes found so far.
-    candidates : Candidates
-        Tentative tracks.
-    order : ndarray of int
-        Modes that have names from the identification, ascending in first frequency.
-    names : tuple of str
-        Of the modes, in the order in which they were found.
-    first : tuple of float
-        Their first ln f.
-    places : dict
-        Last place of each named mode and source, before the last log.
-    last : Log or None
-        The last log.
-    labels : tuple of Label
-        Its labels.
-    repeatable : bool
-        Whether one hypothesis is left without candidates, and all names of the last log are right.
-    pending : tuple of Log
-        Logs that repeat the one before and that the filters have not processed yet.
-    clock : float or None
-        Place on the clock to which the filters are predicted.
-    """
-
-    prior_std: FloatArray
-    hypotheses: Hypotheses
+    prior_std: FloatArray  # of the covariates' coefficients, ``(n_covariates,)``
+    hypotheses: Hypotheses  # over the m modes found so far
     candidates: Candidates
-    order: IntArray
-    names: tuple[str, ...] = ()
-    first: tuple[float, ...] = ()
+    order: IntArray  # modes that the identification names, ascending in first frequency
+    names: tuple[str, ...] = ()  # of the modes, in the order in which they were found
+    first: tuple[float, ...] = ()  # their first ln f
+    # Last place of each named mode and source, before the last log.
     places: dict[tuple[str, str], Place] | None = None
     last: Log | None = None
-    labels: tuple[Label, ...] = ()
+    labels: tuple[Label, ...] = ()  # of the last log
+    # Whether one hypothesis is left without candidates, and all names of the last log are right.
     repeatable: bool = False
+    # Logs that repeat the one before and that the filters have not processed yet.
     pending: tuple[Log, ...] = ()
-    clock: float | None = None
+    clock: float | None = None  # to which the filters are predicted
 
     @classmethod
     def start(cls, prior_std: FloatArray, n_channels: int) -> State:
@@ -246,7 +180,10 @@ def associate(
     [BarShalom1988]_, [Reid1979]_, [Murty1968]_, [Allemang2003]_
     """
     state = State.start(prior_std, epochs[0].shapes.shape[1])
-    declared, lives, places = frozenset(jumps), _lives(clock), clock.tolist()
+    declared, places = frozenset(jumps), clock.tolist()
+    # Length of a life as known at each log.
+    count = np.maximum(np.arange(clock.size), 1)
+    lives = ((clock - clock[0]) * np.maximum(1.0, constants.LEAST_LIFE_LOGS / count)).tolist()
     labels = []
     for k, (own, new) in enumerate(zip(epochs, measurements_of(epochs), strict=True)):
         log = Log(k, places[k], lives[k], offsets[k], k in declared, own.names, own.sources, new)
@@ -270,7 +207,9 @@ def associate_log(state: State, log: Log) -> tuple[State, tuple[Label, ...]]:
     if not log.opened and _is_common_jump(places, log, state.prior_std):
         log = replace(log, opened=True)
     for late in state.pending:
-        state = _catch_up(state, late)
+        state = _predict(state, late)
+        for rows, meant in _groups(state.names, late.names, late.sources):
+            state = _update(state, meant, late.measurements.pick(rows), _row(late))
     state = _predict(state, log)
     found: list[Label] = [Label(None)] * len(log.names)
     confirmed: set[int] = set()
@@ -282,7 +221,7 @@ def associate_log(state: State, log: Log) -> tuple[State, tuple[Label, ...]]:
         scan = Scan(log.epoch, rows, meant, own, _row(log))
         unique = None if log.opened else _unique_assignment(state, scan)
         if unique is not None:
-            state, modes = _update(state, unique, scan), unique.tolist()
+            state, modes = _update(state, unique, own, scan.row), unique.tolist()
             labels = [Label(state.names[mode]) for mode in modes]
         else:
             state, modes, labels = _resolve(state, scan, log, confirmed)
@@ -291,9 +230,12 @@ def associate_log(state: State, log: Log) -> tuple[State, tuple[Label, ...]]:
             found[row] = label
     candidates = prune(state.candidates, log.epoch, confirmed, detected)
     state = replace(state, candidates=candidates, places=places, last=log, labels=tuple(found))
-    certain = len(state.hypotheses.filters.mean) == 1 and not len(candidates)
+    filters = state.hypotheses.filters
+    certain = len(filters.mean) == 1 and not len(candidates)
     right = all(label.mode == name for label, name in zip(found, log.names, strict=True))
-    return replace(state, repeatable=certain and right and _in_order(state, log)), state.labels
+    # Names by order and by mode must be the same.
+    rising = np.diff(filters.predicted(_row(log))[0][0, state.order]) > 0
+    return replace(state, repeatable=bool(certain and right and rising.all())), state.labels
 
 
 def _repeats(state: State, log: Log) -> bool:
@@ -396,27 +338,10 @@ def _predict(state: State, log: Log) -> State:
     return replace(state, hypotheses=hypotheses, candidates=candidates, clock=log.clock, pending=())
 
 
-def _update(state: State, modes: IntArray, scan: Scan) -> State:
+def _update(state: State, modes: IntArray, new: Measurements, row: FloatArray) -> State:
     """Update the filters of a single hypothesis with estimates of known modes."""
-    hypotheses = state.hypotheses
-    at = (np.zeros_like(modes), modes)
-    filters = update(hypotheses.filters, at, scan.measurements, scan.row)
-    return replace(state, hypotheses=replace(hypotheses, filters=filters))
-
-
-def _catch_up(state: State, log: Log) -> State:
-    """Process a log that repeats the one before it: its names are right."""
-    state = _predict(state, log)
-    for rows, meant in _groups(state.names, log.names, log.sources):
-        own = log.measurements.pick(rows)
-        state = _update(state, meant, Scan(log.epoch, rows, meant, own, _row(log)))
-    return state
-
-
-def _in_order(state: State, log: Log) -> bool:
-    """Return whether names by order and by mode are the same."""
-    at = state.hypotheses.filters.predicted(_row(log))[0][0, state.order]
-    return bool((np.diff(at) > 0).all())
+    filters = update(state.hypotheses.filters, (np.zeros_like(modes), modes), new, row)
+    return replace(state, hypotheses=replace(state.hypotheses, filters=filters))
 
 
 def _unique_assignment(state: State, scan: Scan) -> IntArray | None:
@@ -437,10 +362,8 @@ def _unique_assignment(state: State, scan: Scan) -> IntArray | None:
     if (rows != np.arange(rows.size)).any() or (squared[rows, modes] > inner).any():
         return None
     named = scan.names >= 0
-    # Names by order and by mode must be the same.
-    if named.any() and not (
-        np.array_equal(scan.names[named], modes[named]) and (np.diff(at[state.order]) > 0).all()
-    ):
+    rising = (np.diff(at[state.order]) > 0).all()
+    if named.any() and not (rising and np.array_equal(scan.names[named], modes[named])):
         return None
     off = (new.ln_zeta - filters.ln_zeta[0, modes]) ** 2
     if (off > inner * (new.var_zeta + filters.var_zeta[0, modes])).any():
@@ -490,7 +413,12 @@ def _resolve(
             continue
         frequency = float(np.exp(scan.measurements.ln_f[i]))
         if i in jumps:
-            detail = _jump_detail(frequency, log.names[scan.rows[i]], expected[scan.names[i]])
+            before = float(np.exp(expected[scan.names[i]]))
+            detail = (
+                f"{frequency:.5g} Hz named {log.names[scan.rows[i]]}, expected at {before:.5g} Hz: "
+                "a jump that the log before does not show; it is accepted once the next log "
+                "confirms it"
+            )
             labels.append(Label(None, "jump", detail))
         else:
             labels.append(_doubtful(frequency, chances[i], known))
@@ -510,37 +438,33 @@ def _is_jump(i: int, scan: Scan, chances: FloatArray, best: IntArray) -> bool:
 
 def _start_named(state: State, scan: Scan, name: str, life: float) -> State:
     """Start a mode at the first estimate that has its name."""
-    hypotheses = state.hypotheses
-    filters = hypotheses.filters.start(scan.measurements, scan.row, state.prior_std, life)
-    state = _add_mode(
-        replace(state, hypotheses=replace(hypotheses, filters=filters)),
-        name,
-        float(scan.measurements.ln_f[0]),
-    )
-    named = (*state.order.tolist(), len(state.names) - 1)
-    by_first = np.argsort([state.first[i] for i in named], kind="stable")
-    return replace(state, order=np.array(named)[by_first])
+    filters = state.hypotheses.filters
+    filters = filters.start(scan.measurements, scan.row, state.prior_std, life)
+    state = _add_mode(state, filters, name, float(scan.measurements.ln_f[0]))
+    named = np.append(state.order, len(state.names) - 1)
+    by_first = np.argsort(np.array(state.first)[named], kind="stable")
+    return replace(state, order=named[by_first])
 
 
 def _confirm(state: State, j: int, row: FloatArray) -> tuple[State, int]:
     """Make a candidate a mode, or the new level of the mode that it is named after."""
     new = state.candidates.filters.keep(np.array([j]))
-    mode = int(state.candidates.modes[j])
-    hypotheses = state.hypotheses
-    filters = hypotheses.filters
+    mode, filters = int(state.candidates.modes[j]), state.hypotheses.filters
     if mode < 0:
         ln_f = float(new.predicted(row)[0][0, 0])
-        state = replace(state, hypotheses=replace(hypotheses, filters=filters.join(new)))
-        state = _add_mode(state, _unique_name(state.names, float(np.exp(ln_f))), ln_f)
-        return state, len(state.names) - 1
+        name = _unique_name(state.names, float(np.exp(ln_f)))
+        return _add_mode(state, filters.join(new), name, ln_f), len(state.names)
     filters = filters.take(np.arange(len(filters.mean)))
-    for name in ("mean", "cov", "ln_zeta", "var_zeta"):
-        getattr(filters, name)[:, mode] = getattr(new, name)[0, 0]
-    return replace(state, hypotheses=replace(hypotheses, filters=filters)), mode
+    for part in ("mean", "cov", "ln_zeta", "var_zeta"):
+        getattr(filters, part)[:, mode] = getattr(new, part)[0, 0]
+    return replace(state, hypotheses=replace(state.hypotheses, filters=filters)), mode
 
 
-def _add_mode(state: State, name: str, ln_f: float) -> State:
-    return replace(state, names=(*state.names, name), first=(*state.first, ln_f))
+def _add_mode(state: State, filters: ModeFilters, name: str, ln_f: float) -> State:
+    """Append a mode, for which the filters have an entry more."""
+    hypotheses = replace(state.hypotheses, filters=filters)
+    names, first = (*state.names, name), (*state.first, ln_f)
+    return replace(state, hypotheses=hypotheses, names=names, first=first)
 
 
 def _unique_name(names: tuple[str, ...], frequency: float) -> str:
@@ -550,13 +474,6 @@ def _unique_name(names: tuple[str, ...], frequency: float) -> str:
         if name not in names:
             return name
     return f"{name[:-3]}_{len(names)}_hz"
-
-
-def _jump_detail(frequency: float, name: str, expected: float) -> str:
-    return (
-        f"{frequency:.5g} Hz named {name}, expected at {float(np.exp(expected)):.5g} Hz: a jump "
-        "that the log before does not show; it is accepted once the next log confirms it"
-    )
 
 
 def _doubtful(frequency: float, chances: FloatArray, modes: tuple[str, ...]) -> Label:
@@ -604,11 +521,3 @@ def measurements_of(epochs: Sequence[Estimates]) -> list[Measurements]:
         shapes /= np.where(norm > 0, norm, np.nan)
     columns = (ln_f, var_f, ln_zeta, var_zeta, shapes)
     return [Measurements(*(column[a:b] for column in columns)) for a, b in pairwise(start)]
-
-
-def _lives(clock: FloatArray) -> list[float]:
-    """Return the length of a life as known at each log."""
-    passed = clock - clock[0]
-    count = np.maximum(np.arange(clock.size), 1)
-    lives: list[float] = (passed * np.maximum(1.0, constants.LEAST_LIFE_LOGS / count)).tolist()
-    return lives

@@ -16,7 +16,7 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 from scipy.special import hyp1f1, logsumexp, ndtr
 
-from lmshealth._arrays import BoolArray, FloatArray
+from lmshealth._arrays import FloatArray
 from lmshealth.tracking import constants
 from lmshealth.tracking.association.mode_filters import IntArray, Measurements, ModeFilters, update
 
@@ -26,28 +26,15 @@ _RIDGE = 1e-9
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Scan:
-    """The estimates of one source in one log.
+    """The n estimates of one source in one log."""
 
-    Attributes
-    ----------
-    epoch : int
-        Index of the log.
-    rows : ndarray
-        Indices of the estimates in their log, shape ``(n,)``.
-    names : ndarray
-        Index of the mode that each name means, shape ``(n,)``; -1 without a name, the number of
-        modes for a name that no mode has.
-    measurements : Measurements
-        The n estimates.
-    row : ndarray
-        Observation row ``[1, 0, covariates]``, shape ``(d,)``.
-    """
-
-    epoch: int
-    rows: IntArray
+    epoch: int  # index of the log
+    rows: IntArray  # indices of the estimates in their log, ``(n,)``
+    # Index of the mode that each name means, ``(n,)``; -1 without a name, the number of modes for a
+    # name that no mode has.
     names: IntArray
     measurements: Measurements
-    row: FloatArray
+    row: FloatArray  # observation row ``[1, 0, covariates]``, ``(d,)``
 
     def pick(self, chosen: IntArray) -> Scan:
         """Return some of the estimates."""
@@ -57,21 +44,11 @@ class Scan:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Hypotheses:
-    """Weighted association hypotheses.
+    """Weighted association hypotheses."""
 
-    Attributes
-    ----------
-    filters : ModeFilters
-        Filters of m modes under h hypotheses.
-    log_weights : ndarray
-        With names by mode and by order, shape ``(h, 2)``; their exponentials sum to 1.
-    labels : ndarray
-        Mode of each estimate of the present scan, shape ``(h, n)``; -1 for none.
-    """
-
-    filters: ModeFilters
-    log_weights: FloatArray
-    labels: IntArray
+    filters: ModeFilters  # of m modes under h hypotheses
+    log_weights: FloatArray  # of names by mode and by order, ``(h, 2)``; the weights sum to 1
+    labels: IntArray  # mode of each estimate of the present scan, ``(h, n)``; -1 for none
 
     @classmethod
     def empty(cls, n_covariates: int, n_channels: int) -> Hypotheses:
@@ -87,13 +64,7 @@ class Hypotheses:
 
 
 def clutter_gains(filters: ModeFilters, scan: Scan) -> FloatArray:
-    """Return log odds of a detection of each mode against clutter and a missed detection.
-
-    Returns
-    -------
-    ndarray
-        Shape ``(h, n, m)``.
-    """
+    """Return log odds of a detection of each mode against clutter and a miss, ``(h, n, m)``."""
     both = np.isfinite(scan.measurements.var_zeta[:, None] + filters.var_zeta[:, None])
     clutter = np.log(constants.CLUTTER_DENSITY)
     clutter = clutter + np.where(both, np.log(constants.CLUTTER_LN_ZETA_DENSITY), 0.0)
@@ -240,8 +211,10 @@ def extend(now: Hypotheses, scan: Scan, order: IntArray, *, opened: bool) -> Hyp
     log_weights[:, 0] += name_gains(scan.names, labels, order).sum(1)
     log_weights[:, 1] += order_gains(scan, labels, order, predicted).sum(1)
     if opened:
-        reordered = _is_reordered(scan, labels, predicted[0])[:, None]
-        log_weights += np.log(constants.REORDERING_PROBABILITY) * reordered
+        rising = np.argsort(scan.measurements.ln_f)
+        for i, modes in enumerate(labels[:, rising]):
+            if (np.diff(predicted[0][i, modes[modes >= 0]]) < 0).any():
+                log_weights[i] += np.log(constants.REORDERING_PROBABILITY)
     total = logsumexp(log_weights, axis=1)
     kept = np.flatnonzero(total > total.max() + constants.PRUNING_LOG_ODDS)
     chosen, filters = labels[kept], now.filters.take(parents[kept])
@@ -255,31 +228,17 @@ def _assignments(
     now: Hypotheses, gains: FloatArray, scan: Scan, order: IntArray
 ) -> tuple[IntArray, IntArray]:
     """Enumerate assignments: index of the parent hypothesis, and modes of the estimates."""
-    own = now.log_weights - logsumexp(now.log_weights, axis=1, keepdims=True)
+    share = now.log_weights - logsumexp(now.log_weights, axis=1, keepdims=True)
     by_mode = name_gains(scan.names[:, None], np.arange(gains.shape[2]), order)
     # Names by order are as likely under all assignments, unless modes are missing.
-    by_order = np.where(
-        scan.names >= 0, np.log(constants.NAME_PROBABILITY * max(order.size, 1)), 0.0
-    )[:, None]
-    score = gains + np.logaddexp(own[:, :1, None] + by_mode, own[:, 1:, None] + by_order)
+    named = np.log(constants.NAME_PROBABILITY * max(order.size, 1))
+    by_order = np.where(scan.names >= 0, named, 0.0)[:, None]
+    score = gains + np.logaddexp(share[:, :1, None] + by_mode, share[:, 1:, None] + by_order)
     score[score < constants.PRUNING_LOG_ODDS] = -np.inf
-    parents, labels = [], []
-    for h, own_score in enumerate(score):
-        for _, columns in best_assignments(
-            own_score, constants.PRUNING_LOG_ODDS, constants.MOST_ASSIGNMENTS
-        ):
-            parents.append(h)
-            labels.append(columns)
-    return np.array(parents), np.array(labels, dtype=int).reshape(-1, scan.rows.size)
-
-
-def _is_reordered(scan: Scan, labels: IntArray, at: FloatArray) -> BoolArray:
-    """Return whether modes change their order of frequency, shape ``(c,)``."""
-    rising = np.argsort(scan.measurements.ln_f)
-    turned = []
-    for modes, own in zip(labels[:, rising], at, strict=True):
-        turned.append(bool((np.diff(own[modes[modes >= 0]]) < 0).any()))
-    return np.array(turned)
+    limits = (constants.PRUNING_LOG_ODDS, constants.MOST_ASSIGNMENTS)
+    found = [(h, own[1]) for h, one in enumerate(score) for own in best_assignments(one, *limits)]
+    labels = np.array([columns for _, columns in found], dtype=int)
+    return np.array([h for h, _ in found]), labels.reshape(-1, scan.rows.size)
 
 
 def _with_veering(now: Hypotheses, scan: Scan) -> Hypotheses:

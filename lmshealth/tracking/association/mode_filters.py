@@ -25,33 +25,17 @@ _FLAT_VARIANCE = 1e100
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Measurements:
-    """Estimates of one log.
+    """Estimates of one log."""
 
-    Attributes
-    ----------
-    ln_f, var_f : ndarray
-        ln frequency (of Hz) and its variance, shape ``(n,)``.
-    ln_zeta, var_zeta : ndarray
-        ln damping ratio and its variance, shape ``(n,)``; 0 and infinite where unknown.
-    shapes : ndarray
-        Mode shapes of unit length, shape ``(n, n_channels)``; NaN where a channel is absent.
-    """
-
-    ln_f: FloatArray
+    ln_f: FloatArray  # of Hz, ``(n,)``
     var_f: FloatArray
-    ln_zeta: FloatArray
+    ln_zeta: FloatArray  # ``(n,)``; 0 with infinite variance where unknown
     var_zeta: FloatArray
-    shapes: FloatArray
+    shapes: FloatArray  # of unit length, ``(n, n_channels)``; NaN where a channel is absent
 
     def pick(self, rows: IntArray) -> Measurements:
         """Return some of them, in any order and any number of times."""
-        return Measurements(
-            self.ln_f[rows],
-            self.var_f[rows],
-            self.ln_zeta[rows],
-            self.var_zeta[rows],
-            self.shapes[rows],
-        )
+        return Measurements(*(getattr(self, item.name)[rows] for item in fields(self)))
 
 
 def _log_densities(x: FloatArray, var: FloatArray, std: float) -> tuple[FloatArray, FloatArray]:
@@ -73,38 +57,21 @@ def _is_stray(x: FloatArray, var: FloatArray, std: float) -> BoolArray:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ModeFilters:
-    """Filters of m modes under h hypotheses.
+    """Filters of m modes under h hypotheses."""
 
-    Attributes
-    ----------
-    mean, cov : ndarray
-        State and its covariance, shapes ``(h, m, d)`` and ``(h, m, d, d)``.
-    ln_zeta, var_zeta : ndarray
-        ln damping ratio and its variance, shape ``(h, m)``.
-    shapes, n_shapes : ndarray
-        Mean mode shape, NaN where unknown, shape ``(h, m, n_channels)``, and the number of shapes
-        in it, ``(h, m)``.
-    """
-
-    mean: FloatArray
-    cov: FloatArray
-    ln_zeta: FloatArray
+    mean: FloatArray  # states, ``(h, m, d)``
+    cov: FloatArray  # their covariances, ``(h, m, d, d)``
+    ln_zeta: FloatArray  # ``(h, m)``
     var_zeta: FloatArray
-    shapes: FloatArray
-    n_shapes: FloatArray
+    shapes: FloatArray  # mean mode shapes, ``(h, m, n_channels)``; NaN where unknown
+    n_shapes: FloatArray  # number of shapes in it, ``(h, m)``
 
     @classmethod
     def empty(cls, n_covariates: int, n_channels: int) -> Self:
         """Return one hypothesis without modes."""
         d = 2 + n_covariates
-        return cls(
-            np.empty((1, 0, d)),
-            np.empty((1, 0, d, d)),
-            np.empty((1, 0)),
-            np.empty((1, 0)),
-            np.empty((1, 0, n_channels)),
-            np.empty((1, 0)),
-        )
+        sizes: list[tuple[int, ...]] = [(d,), (d, d), (), (), (n_channels,), ()]
+        return cls(*(np.empty((1, 0, *size)) for size in sizes))
 
     @property
     def n_modes(self) -> int:
@@ -121,14 +88,16 @@ class ModeFilters:
 
     def join(self, other: ModeFilters) -> Self:
         """Append the modes of other filters that have one hypothesis."""
-        h = len(self.mean)
-        pairs = ((getattr(self, i.name), getattr(other, i.name)) for i in fields(self))
-        return type(self)(*(np.concatenate([a, np.repeat(b, h, 0)], 1) for a, b in pairs))
+        more = other.take(np.zeros(len(self.mean), dtype=int))
+        return self._with(more, axis=1)
 
     def stack(self, other: ModeFilters) -> Self:
         """Append the hypotheses of other filters that have the same modes."""
+        return self._with(other, axis=0)
+
+    def _with(self, other: ModeFilters, axis: int) -> Self:
         pairs = ((getattr(self, i.name), getattr(other, i.name)) for i in fields(self))
-        return type(self)(*(np.concatenate([a, b]) for a, b in pairs))
+        return type(self)(*(np.concatenate(pair, axis) for pair in pairs))
 
     def start(
         self, first: Measurements, row: FloatArray, prior_std: FloatArray, life: float

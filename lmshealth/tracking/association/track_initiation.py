@@ -20,25 +20,13 @@ from lmshealth.tracking.association.mode_filters import IntArray, ModeFilters, u
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Candidates:
-    """Tentative tracks, all arrays of shape ``(n,)``.
+    """Tentative tracks, all arrays of shape ``(n,)``."""
 
-    Attributes
-    ----------
-    filters : ModeFilters
-        One hypothesis, a mode per candidate.
-    modes : ndarray of int
-        Mode of which this may be the new level; -1 for a new mode.
-    log_odds : ndarray
-        Log odds of being a mode.
-    n_logs, last : ndarray of int
-        Number of logs that detect it, and the last of them.
-    """
-
-    filters: ModeFilters
-    modes: IntArray
-    log_odds: FloatArray
-    n_logs: IntArray
-    last: IntArray
+    filters: ModeFilters  # one hypothesis, a mode per candidate
+    modes: IntArray  # mode of which this may be the new level; -1 for a new mode
+    log_odds: FloatArray  # of being a mode
+    n_logs: IntArray  # number of logs that detect it
+    last: IntArray  # the last of them
 
     @classmethod
     def empty(cls, n_covariates: int, n_channels: int) -> Candidates:
