@@ -424,17 +424,17 @@ def test_faults_workers(root: Path, needs: Callable[[str], None]) -> None:
     assert answer["workers killed"]["n"] == 1
 
 
-def test_faults_damaged(root: Path) -> None:
+def test_bad_inputs_damaged(root: Path) -> None:
     """Of an archive with damage of many kinds every log is told right, and wrong tales are not."""
-    answer = json.loads(run_study(root, "faults", "damaged"))
+    answer = json.loads(run_study(root, "bad_inputs", "damaged"))
     assert all(answer["passed"].values())
     assert answer["good_analysed"] == answer["good"] == 8
     assert answer["damaged_told_right"] == answer["damaged"] > 12
 
 
-def test_faults_injection(root: Path) -> None:
+def test_bad_inputs_injection(root: Path) -> None:
     """Some hostile names, files and addresses are text, reach nothing, and show no password."""
-    answer = json.loads(run_study(root, "faults", "injection"))
+    answer = json.loads(run_study(root, "bad_inputs", "injection"))
     assert all(answer["passed"].values())
     assert answer["stores"]["sqlite"]["pages"] == answer["stores"]["sqlite"]["machines"] + 1
 

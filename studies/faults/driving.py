@@ -42,26 +42,9 @@ _PROGRAM = (sys.executable, "-m", "lmshealth")
 SOME_REFUSED = 3  # exit status of a run over the batch, which has damaged logs
 
 
-def make_batch(folder: Path, machines: Mapping[str, int], workers: int = 2) -> Batch:
-    """Write descriptions, and so many logs of each machine.
-
-    Parameters
-    ----------
-    folder : Path
-        Where to.
-    machines : mapping of str to int
-        How many logs of each machine; ``WORN-…`` have health, ``WATCHED-…`` only modes.
-    workers : int
-        Processes that analyse them.
-    """
-    for machine, n_logs in machines.items():
-        write_machine(folder / "logs", machine, n_logs)
-    return Batch(folder / "logs", write_stages(folder / "stages"), workers)
-
-
 @dataclass(frozen=True)
 class Batch:
-    """Logs, the descriptions of their machines, and by how many processes they are analysed."""
+    """Logs, descriptions of their machines, and the number of processes that analyse them."""
 
     logs: Path
     stages: tuple[Path, ...]
@@ -78,12 +61,7 @@ class Batch:
 class Run:
     """A run in a process group of its own; all its processes carry a mark.
 
-    Parameters
-    ----------
-    command : sequence of str
-        What to run.
-    said : file
-        File for its standard error.
+    Its standard error goes into the file ``messages``.
     """
 
     def __init__(self, command: Sequence[str], messages: IO[bytes]) -> None:
@@ -98,7 +76,7 @@ class Run:
         )  # fmt: skip
 
     def status(self, within_s: float = LONG_S) -> int | None:
-        """Wait for the end and give its status; None where it does not end so soon."""
+        """Wait for the end and return its status; None if it does not end in time."""
         try:
             return self._process.wait(within_s)
         except subprocess.TimeoutExpired:
@@ -135,10 +113,7 @@ class Run:
         return True
 
     def gone_after(self) -> float:
-        """Wait until none of its processes lives; give how long that took, in seconds.
-
-        Those that live still after `ENDED_S` are waited for no longer.
-        """
+        """Wait until none of its processes lives, up to `ENDED_S`; return the time in s."""
         begin = time.monotonic()
         # Its own end counts only when it is fetched: until then it is there, without a command.
         while (took := time.monotonic() - begin) <= ENDED_S:
@@ -167,10 +142,7 @@ def running(command: Sequence[str]) -> Iterator[Run]:
 
 
 def completed(command: Sequence[str], *, quick: bool = False) -> float:
-    """Carry out a run to its end; give how long it took, in seconds.
-
-    When quick in this process, which has imported everything already.
-    """
+    """Complete a run, when quick in this process; return its time in s."""
     begin = time.monotonic()
     if quick:
         call_here("lmshealth", command[len(_PROGRAM) :], some_refused=True)
@@ -208,12 +180,8 @@ def _lines(path: Path) -> list[str]:
 
 def rows(store: str) -> dict[str, int]:
     """Count the rows of every table of a store, their version left out of their names."""
-    if (
-        (file := make_url(store).database)
-        and store.startswith("sqlite")
-        and not Path(file).exists()
-    ):
-        return {}  # looking would make it
+    if store.startswith("sqlite") and not Path(make_url(store).database or "").exists():
+        return {}  # to connect would make it
     engine = create_engine(store)
     try:
         names = inspect(engine).get_table_names()
@@ -226,7 +194,7 @@ def rows(store: str) -> dict[str, int]:
 
 @dataclass(frozen=True)
 class Reference:
-    """A batch, what an uninterrupted run made of it, and how long that took, in seconds."""
+    """A batch, what an uninterrupted run makes of it, and the time of that in s."""
 
     batch: Batch
     out: Path
@@ -241,17 +209,19 @@ class Reference:
         return found
 
 
-def reference_of(batch: Batch, folder: Path, *, quick: bool) -> Reference:
-    """Analyse a batch without interruption; ``quick`` as in `completed`."""
-    out = folder / "out"
-    store = f"sqlite:///{folder / 'reference.sqlite'}"
-    folder.mkdir(parents=True)
+def reference_of(folder: Path, machines: Mapping[str, int], *, quick: bool) -> Reference:
+    """Write so many logs of each machine, and analyse them without interruption."""
+    for machine, n_logs in machines.items():
+        write_machine(folder / "logs", machine, n_logs)
+    batch = Batch(folder / "logs", write_stages(folder / "stages"), 1 if quick else 2)
+    out = folder / "reference" / "out"
+    out.parent.mkdir()
+    store = f"sqlite:///{out.parent / 'reference.sqlite'}"
     seconds = completed(batch.command(out, store), quick=quick)
     return Reference(batch, out, rows(store), seconds)
 
 
-Stores = Callable[[], AbstractContextManager[str]]
-"""Gives the address of a new empty store."""
+Stores = Callable[[], AbstractContextManager[str]]  # makes an empty store; its value is the URL
 
 
 @contextmanager
@@ -291,15 +261,16 @@ def control(reference: Reference, folder: Path) -> dict[str, bool]:
         "row lost": seen("refused.csv", lambda lines: lines[:-1]),
         "rows in another order": seen("modes.csv", lambda lines: [lines[0], *lines[:0:-1]]),
         "last digit changed": seen(
-            "track.csv", lambda lines: [*lines[:-1], re.sub(r"\d(?=\D*$)", _next, lines[-1])]
+            "track.csv", lambda lines: [*lines[:-1], other_digit(lines[-1])]
         ),
         "page changed": seen("index.html", lambda lines: [*lines, "<p>"]),
         "page lost": seen("index.html", lambda lines: []),
     }
 
 
-def _next(digit: re.Match[str]) -> str:
-    return str((int(digit.group()) + 1) % 10)
+def other_digit(line: str) -> str:
+    """Change the last digit of a line."""
+    return re.sub(r"\d(?=\D*$)", lambda digit: str((int(digit.group()) + 1) % 10), line)
 
 
 def write_stages(folder: Path) -> tuple[Path, Path]:
@@ -337,14 +308,7 @@ max_risk = 0.05
 def write_machine(folder: Path, machine: str, n_logs: int) -> None:
     """Write the logs of a wearing machine; one is damaged, one a copy, one of an unknown machine.
 
-    Parameters
-    ----------
-    folder : Path
-        Where to; a folder of the machine's name is made there.
-    machine : str
-        Its identity.
-    n_logs : int
-        How many, at least four.
+    Machines ``WORN-…`` have health, ``WATCHED-…`` modes only; there are at least four logs.
     """
     own = folder / machine
     own.mkdir(parents=True)
@@ -370,9 +334,5 @@ def _write_log(path: Path, stage: str, seed: list[int]) -> None:
     moment = datetime(2026, 1, 1, 8, tzinfo=UTC) + timedelta(days=5 * number)
     with h5py.File(path, "w") as file:
         file["acc_feed_m_s2"] = values
-        file.attrs.update(
-            stage=stage,
-            recorded_at=moment.isoformat(),
-            travel_km=f"{50 * number}",
-            sample_rate_hz=f"{_RATE_HZ:g}",
-        )
+        file.attrs.update(stage=stage, recorded_at=moment.isoformat(), travel_km=f"{50 * number}",
+                          sample_rate_hz=f"{_RATE_HZ:g}")  # fmt: skip

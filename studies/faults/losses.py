@@ -25,16 +25,8 @@ from collections.abc import Iterator, Sequence
 from functools import partial
 from pathlib import Path
 
-from studies.faults.driving import (
-    PROGRAM,
-    SOME_REFUSED,
-    Reference,
-    completed,
-    make_batch,
-    one_line,
-    reference_of,
-    running,
-)
+from studies.faults import driving
+from studies.faults.driving import SOME_REFUSED, Reference, one_line
 from studies.harness.claims import Claim
 from studies.harness.servers import missing_postgres, postgres
 from studies.harness.study import Row, Study
@@ -43,51 +35,48 @@ STEP = "batch"
 
 SEED = 20261122
 MACHINES, QUICK_MACHINES = {"WORN-A": 40, "WATCHED-A": 40}, {"WATCHED-A": 4}
-N_LOST = 5
+# Fractions of the space that output, and store where it is there too, need.
 SIZES, QUICK_SIZES = (0.05, 0.2, 0.4, 0.6, 0.75, 0.9, 4.0), (0.4, 4.0)
+# Failed runs, and the latest end of the database after the first log, over the time of a run.
+LOST, QUICK_LOST = (5, 0.5), (1, 0.0)
+Ends = list[tuple[int | None, list[str]]]  # statuses and messages
 
 
 def main() -> None:
     """Run the study; ``--quick`` does a small part and records nothing."""
     study = Study(__file__, __doc__)
-    quick, once = study.quick, study.trials.once
+    quick, once = study.quick, partial(study.trials.once, also=driving.PROGRAM)
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        batch = make_batch(folder, *((QUICK_MACHINES, 1) if quick else (MACHINES, 2)))
-        reference = reference_of(batch, folder / "reference", quick=quick)
-        sizes, lost = (QUICK_SIZES, (1, 0.0)) if quick else (SIZES, (N_LOST, 0.5))
+        machines = QUICK_MACHINES if quick else MACHINES
+        reference = driving.reference_of(folder, machines, quick=quick)
         both = partial(full_disk, reference, folder / "both", with_store=True)
         output = partial(full_disk, reference, folder / "output", with_store=False)
+        lost = partial(lost_database, reference, quick=quick)
         answer: Row = {
             "seed": SEED,
-            "full disk": once(both, sizes, also=PROGRAM),
-            "full disk, output alone": None if quick else once(output, sizes, also=PROGRAM),
-            "lost database": once(
-                partial(lost_database, reference, quick=quick), *lost, also=PROGRAM
-            ),
+            "full disk": once(both, QUICK_SIZES if quick else SIZES),
+            "full disk, output alone": None if quick else once(output, SIZES),
+            "lost database": once(lost, *(QUICK_LOST if quick else LOST)),
         }
-    answer["passed"] = verdicts(answer)
+    # What this machine does not allow is left out.
+    tried = {name: found for name, found in answer.items() if isinstance(found, dict)}
+    answer["passed"] = {
+        f"{check}, {name}": held
+        for name, found in tried.items()
+        for check, held in {
+            "it did fail": found["failed"] > 0,
+            "told in one line": not found["other_ends"],
+            "as uninterrupted": not found["differences"],
+        }.items()
+    }
     study.conclude(answer)
-
-
-def verdicts(answer: Row) -> dict[str, bool]:
-    """Return the checks; those that this machine does not allow are left out."""
-    passed = {}
-    for name, found in answer.items():
-        if isinstance(found, dict):
-            passed[f"it did fail, {name}"] = found["failed"] > 0
-            passed[f"told in one line, {name}"] = not found["other_ends"]
-            passed[f"as uninterrupted, {name}"] = not found["differences"]
-    return passed
 
 
 def full_disk(
     reference: Reference, folder: Path, sizes: Sequence[float], *, with_store: bool
 ) -> Row | None:
-    """Run on a file system that is too small, enlarge it and go on; None where none can be made.
-
-    Sizes are fractions of what output, and store where it is there too, need.
-    """
+    """Run on a file system that is too small, enlarge it and go on; None if none can be made."""
     place, kept = folder / "disk", folder / "kept"
     place.mkdir(parents=True)
     # In a mount namespace of its own: whatever happens, the file system ends with the shell.
@@ -106,36 +95,30 @@ def full_disk(
         script += f"{command} >/dev/null 2>{folder}/said-{k}; echo $?\n"
     script += f"cp -r {place} {kept}"
     done = subprocess.run([*shell, script], capture_output=True, text=True, check=True)
-    ends = [
+    ends: Ends = [
         (int(status), (folder / f"said-{k}").read_text().splitlines())
         for k, status in enumerate(done.stdout.split())
     ]
     store = kept / store.name if with_store else store
-    return {
-        "sizes_of_what_is_needed": sizes,
-        **_failures(ends),
-        "differences": reference.judge(kept / "out", f"sqlite:///{store}"),
-    }
+    differences = reference.judge(kept / "out", f"sqlite:///{store}")
+    return {"sizes_of_what_is_needed": sizes, **failures(ends), "differences": differences}
 
 
-def lost_database(
-    reference: Reference, n: int, latest: float, *, quick: bool = False
-) -> Row | None:
-    """End the database server in the middle of runs, start it, and run again.
+def lost_database(reference: Reference, n: int, latest: float, *, quick: bool) -> Row | None:
+    """Stop the database server in the middle of runs, start it, and run again.
 
-    It ends at a random moment between the first log and a part of a run's time later. A run that
-    did not need it any more is left out, until n have failed.
+    Runs that did not need it any more are not counted, until n have failed.
     """
     if missing_postgres() is not None:
         return None
     rng = random.Random(SEED)
-    ends: list[tuple[int | None, list[str]]] = []
+    ends: Ends = []
     differences: list[str] = []
     with postgres() as server:
         while sum(status != SOME_REFUSED for status, _ in ends) < n and len(ends) < 4 * n:
             with server.database() as store, tempfile.TemporaryDirectory() as name:
                 command = reference.batch.command(Path(name) / "out", store)
-                with running(command) as run:
+                with driving.running(command) as run:
                     run.begun(store)
                     run.status(rng.uniform(0.0, latest) * reference.seconds)
                     server.stop(signal.SIGQUIT)
@@ -143,17 +126,18 @@ def lost_database(
                 server.start()
                 if any(server.password in line for line in ends[-1][1]):
                     differences.append("the password was shown")
-                completed(command, quick=quick)
+                driving.completed(command, quick=quick)
                 differences += reference.judge(Path(name) / "out", store)
-    return {"runs": len(ends), **_failures(ends), "differences": differences}
+    return {"runs": len(ends), **failures(ends), "differences": differences}
 
 
-def _failures(ends: list[tuple[int | None, list[str]]]) -> Row:
+def failures(ends: Ends) -> Row:
     """Return messages of failed runs without addresses, and other ends."""
     failed = [messages[0] for status, messages in ends if status == 1 and one_line(messages)]
-    other = [f"{end}: {messages[-3:]}" for end, messages in ends if end not in (1, SOME_REFUSED)]
-    other += [
-        f"1: {messages[-3:]}" for end, messages in ends if end == 1 and not one_line(messages)
+    other = [
+        f"{status}: {messages[-3:]}"
+        for status, messages in ends
+        if status != SOME_REFUSED and not (status == 1 and one_line(messages))
     ]
     reported = {re.sub(r"\w+:/\S+|'?/\S+", "…", line) for line in failed}
     return {"failed": len(failed), "said": sorted(reported), "other_ends": other}

@@ -24,29 +24,17 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
-from studies.faults.driving import (
-    PROGRAM,
-    SOME_REFUSED,
-    Reference,
-    Stores,
-    backends,
-    completed,
-    differences,
-    make_batch,
-    reference_of,
-    rows,
-    running,
-)
+from studies.faults import driving
+from studies.faults.driving import SOME_REFUSED, Reference, Stores
 from studies.harness.claims import Claim
 from studies.harness.study import Row, Study
 
 STEP = "batch"
 
 SEED = 20261122
-ONE = {"WORN-A": 12, "WATCHED-A": 28}
-OTHER = {"WORN-B": 12, "WATCHED-B": 28}
-MORE = {"WORN-A": 14, "WATCHED-A": 30}  # begins with the logs of the first
-QUICK_ONE = {"WATCHED-A": 6}
+# Logs of the first run, of other machines, and some more of the same machines.
+FIRST = {"WORN-A": 12, "WATCHED-A": 28}
+BATCHES = (FIRST, {"WORN-B": 12, "WATCHED-B": 28}, {"WORN-A": 14, "WATCHED-A": 30})
 N_PAIRS = 3
 
 # The second run of a pair is the first once more, or one of the others.
@@ -58,22 +46,20 @@ QUICK_WAYS = {"sqlite": (f"same logs{KILLED}",)}  # the other kind is in that of
 def main() -> None:
     """Run the study; ``--quick`` does a small part and records nothing."""
     study = Study(__file__, __doc__)
-    quick, once = study.quick, study.trials.once
+    quick, once = study.quick, partial(study.trials.once, also=driving.PROGRAM)
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        kinds_of_logs = (QUICK_ONE,) if quick else (ONE, OTHER, MORE)
-        batches = [
-            make_batch(folder / str(k), machines, 1 if quick else 2)
-            for k, machines in enumerate(kinds_of_logs)
+        alone = [
+            driving.reference_of(folder / str(k), machines, quick=quick)
+            for k, machines in enumerate([{"WATCHED-A": 6}] if quick else BATCHES)
         ]
-        alone = [reference_of(batch, batch.logs.parent / "alone", quick=quick) for batch in batches]
         answer: Row = {"seed": SEED, "pairs": {}}
-        with backends(folder) as kinds:
+        with driving.backends(folder) as kinds:
             for kind, new_store in kinds.items():
                 ways = QUICK_WAYS.get(kind, ()) if quick else WAYS
-                n, of_kind = 1 if quick else N_PAIRS, partial(pairs, alone, new_store, quick)
+                of_kind = partial(pairs, alone, new_store, quick)
                 answer["pairs"][kind] = {
-                    way: once(of_kind, kind, way, n, also=PROGRAM) for way in ways
+                    way: once(of_kind, kind, way, 1 if quick else N_PAIRS) for way in ways
                 }
                 print(kind, answer["pairs"][kind], file=sys.stderr, flush=True)
     answer["passed"] = {
@@ -97,17 +83,16 @@ class Pair:
         one, two = self.first.rows, self.second.rows
         if self.logs == "other":
             return {name: one[name] + two[name] for name in one}
-        return (
-            two if self.logs == "same" else {name: two[name] for name in ("identified", "present")}
-        )
+        known = two if self.logs == "same" else ("identified", "present")
+        return {name: two[name] for name in known}
 
     def wrong(self, store: str, outs: Sequence[Path]) -> list[str]:
         """List what is not as in a run alone."""
         found = []
         for reference, out in zip((self.first, self.second), outs, strict=True):
-            lines = differences(reference.out, out)
+            lines = driving.differences(reference.out, out)
             found += [line for line in lines if self.logs != "more" or ".csv:" in line]
-        full, now = self.rows(), rows(store)
+        full, now = self.rows(), driving.rows(store)
         if any(now.get(name) != n for name, n in full.items()):
             found.append(f"store: {now} rows, not {full}")
         return found
@@ -140,9 +125,9 @@ def one_pair(
             reference.batch.command(out, store)
             for reference, out in zip((pair.first, pair.second), outs, strict=True)
         ]
-        first = stack.enter_context(running(commands[0]))
+        first = stack.enter_context(driving.running(commands[0]))
         first.status(gap)
-        second = stack.enter_context(running(commands[1]))
+        second = stack.enter_context(driving.running(commands[1]))
         if kill:
             second.status(rng.uniform(0.2, 1.0) * pair.second.seconds)
             second.kill("main", rng)
@@ -150,7 +135,7 @@ def one_pair(
         if ends[0] != SOME_REFUSED or (ends[1] != SOME_REFUSED and not kill):
             found.append(f"ended with {ends}: {first.messages()[-3:]}, {second.messages()[-3:]}")
         if kill:
-            completed(commands[1], quick=quick)
+            driving.completed(commands[1], quick=quick)
         return found + pair.wrong(store, outs)
 
 

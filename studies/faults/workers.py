@@ -23,53 +23,39 @@ from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 
-from studies.faults.driving import (
-    MACHINES,
-    PROGRAM,
-    SOME_REFUSED,
-    Reference,
-    completed,
-    control,
-    make_batch,
-    one_line,
-    reference_of,
-    rows,
-    running,
-)
-from studies.harness.claims import Claim
+from studies.faults import driving
+from studies.faults.driving import SOME_REFUSED, Reference
+from studies.harness.claims import Claim, controls_seen
 from studies.harness.servers import Cluster, dask_cluster, missing_distributed
 from studies.harness.study import Row, Study
 
 STEP = "batch"
 
 SEED = 20261122
-QUICK_MACHINES = {"WATCHED-A": 10}
-N_KILLS, QUICK_KILLS = 10, 1
-KILLS_PER_RUN, QUICK_PER_RUN = 3.0, 20.0  # in the mean, over the time that a run takes
+# Number of kills, and mean number in the time that a run takes.
+WANTED, QUICK_WANTED = (10, 3.0), (1, 20.0)
 
 
 def main() -> None:
     """Run the study; ``--quick`` does a small part and records nothing."""
     study = Study(__file__, __doc__)
-    quick, once = study.quick, study.trials.once
+    quick, once = study.quick, partial(study.trials.once, also=driving.PROGRAM)
     if why := missing_distributed():
         sys.exit(why)
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        batch = make_batch(folder, *((QUICK_MACHINES, 1) if quick else (MACHINES, 2)))
-        reference = reference_of(batch, folder / "reference", quick=quick)
+        machines = {"WATCHED-A": 10} if quick else driving.MACHINES
+        reference = driving.reference_of(folder, machines, quick=quick)
         with dask_cluster(1 if quick else 2) as cluster:
-            pace = (QUICK_KILLS, QUICK_PER_RUN) if quick else (N_KILLS, KILLS_PER_RUN)
-            killed = once(partial(workers_killed, reference, cluster), *pace, also=PROGRAM)
+            work = partial(workers_killed, reference, cluster)
+            killed = once(work, *(QUICK_WANTED if quick else WANTED))
         answer: Row = {
             "seed": SEED,
             "uninterrupted": {"seconds": round(reference.seconds, 1), "rows": reference.rows},
             "workers killed": killed,
             # A client waits long for its scheduler to come again.
-            "scheduler lost": None
-            if quick
-            else once(partial(scheduler_lost, reference), also=PROGRAM),
-            "control": control(reference, folder),
+            "scheduler lost": None if quick else once(partial(scheduler_lost, reference)),
+            "control": driving.control(reference, folder),
         }
     answer["passed"] = {
         "as uninterrupted, workers killed": not killed["differences"],
@@ -77,7 +63,7 @@ def main() -> None:
         "the comparison sees what is wrong": all(answer["control"].values()),
     }
     if lost := answer["scheduler lost"]:
-        reported = lost["status"] == 1 and one_line(lost["said"])
+        reported = lost["status"] == 1 and driving.one_line(lost["said"])
         answer["passed"] |= {
             "as uninterrupted, scheduler lost": not lost["differences"],
             "told in one line, scheduler lost": reported,
@@ -94,17 +80,17 @@ def workers_killed(reference: Reference, cluster: Cluster, n_kills: int, per_run
         with tempfile.TemporaryDirectory() as name:
             store, out = f"sqlite:///{name}/store.sqlite", Path(name) / "out"
             command = reference.batch.command(out, store, "--scheduler", cluster.address)
-            with running(command) as run:
+            with driving.running(command) as run:
                 run.begun(store)
                 while len(known) < n_kills:
                     wait_s = rng.expovariate(per_run / reference.seconds)
                     if run.status(wait_s) is not None:
                         break
                     cluster.replace_worker(rng)
-                    known.append(rows(store).get("identified", 0))
+                    known.append(driving.rows(store).get("identified", 0))
                 if (status := run.status()) != SOME_REFUSED:
                     found["other_ends"].append(f"{status}: {run.messages()[-3:]}")
-                    completed(command)
+                    driving.completed(command)
             found["differences"] += reference.judge(out, store)
             found["batches"] += 1
     return found | {"n": n_kills, "logs_known_at_kill": known}
@@ -117,14 +103,16 @@ def scheduler_lost(reference: Reference) -> Row:
         store, out = f"sqlite:///{name}/store.sqlite", Path(name) / "out"
         with (
             dask_cluster() as cluster,
-            running(reference.batch.command(out, store, "--scheduler", cluster.address)) as run,
+            driving.running(
+                reference.batch.command(out, store, "--scheduler", cluster.address)
+            ) as run,
         ):
             run.begun(store)
             run.status(rng.uniform(0, 0.5) * reference.seconds)
             cluster.scheduler.send_signal(signal.SIGKILL)
             status, messages = run.status(), run.messages()
         with dask_cluster() as cluster:
-            completed(reference.batch.command(out, store, "--scheduler", cluster.address))
+            driving.completed(reference.batch.command(out, store, "--scheduler", cluster.address))
         return {"status": status, "said": messages, "differences": reference.judge(out, store)}
 
 
@@ -136,7 +124,7 @@ def claims(answer: Row) -> Iterator[Claim]:
         "what is not as uninterrupted after workers were killed",
         f"{wrong} in {row['n']} kills, {row['batches']} batches",
         "",
-        _control(answer),
+        controls_seen(answer["control"]),
         wrong == 0,
     )
     if lost := answer["scheduler lost"]:
@@ -150,11 +138,6 @@ def claims(answer: Row) -> Iterator[Claim]:
             "told in one line" if fine else "not told in one line",
             fine,
         )
-
-
-def _control(answer: Row, name: str = "control") -> str:
-    found = answer[name].values()
-    return f"{sum(map(bool, found))} of {len(found)} controls are seen"
 
 
 if __name__ == "__main__":

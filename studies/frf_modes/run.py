@@ -40,19 +40,8 @@ from lmshealth.modal.frf.identification import FrfReading
 from models.dynamics.stages import stage_named
 from models.recordings.formats import write_log
 from models.recordings.sweep import Sweep, record_sweep, without_loop
-from studies.frf_modes.records import (
-    BAND,
-    BENCH,
-    EXCITED,
-    GUIDE,
-    MAPS,
-    MODES,
-    RATE,
-    Array,
-    Machine,
-    at_random,
-    periodic,
-)
+from studies.frf_modes import records
+from studies.frf_modes.records import Array, Machine
 from studies.harness.claims import Claim, covered, number, percents, span
 from studies.harness.study import Row, Study, judge_coverage
 
@@ -76,7 +65,7 @@ class Case:
     exact: bool = True  # else intervals may be too wide, and there is no bound
 
 
-CLOSE = ((62.0, 0.015, 1.0), (67.6, 0.015, -0.6), *MODES[2:])
+CLOSE = ((62.0, 0.015, 1.0), (67.6, 0.015, -0.6), *records.MODES[2:])
 CASES = {
     "multisine": Case(Machine(input_noise=0.05), 8),
     "three periods, displacement": Case(Machine(displacement=True, white=0.01), 3),
@@ -122,7 +111,9 @@ def make_log(given: Array, answer: Array, displacement: bool) -> Log:
     """Return a log of a current and a sensor."""
     kind: ChannelKind = "displacement" if displacement else "acceleration"
     channels = (Channel("current", "current", given), Channel("sensor", kind, answer))
-    return Log("simulated", "0" * 64, Metadata(), RATE, channels, None, ((0, given.size),), ())
+    return Log(
+        "simulated", "0" * 64, Metadata(), records.RATE, channels, None, ((0, given.size),), ()
+    )
 
 
 def one_seed(name: str, seed: int) -> Row:
@@ -130,12 +121,12 @@ def one_seed(name: str, seed: int) -> Row:
     rng = np.random.default_rng([seed, list(CASES).index(name)])
     case = CASES[name]
     signals = (
-        periodic(rng, case.machine, SIZE, case.periods)
+        records.periodic(rng, case.machine, SIZE, case.periods)
         if case.periods
-        else at_random(rng, case.machine, case.samples)
+        else records.at_random(rng, case.machine, case.samples)
     )
     log = make_log(*signals, case.machine.displacement)
-    modes = read_frf(log, "current", "sensor", band=BAND).modes
+    modes = read_frf(log, "current", "sensor", band=records.BAND).modes
     found: Row = {"seed": seed, "n_modes": len(modes.names)}
     if len(modes.names) == 2:
         std = np.sqrt(np.diag(modes.cov)).reshape(2, 2)
@@ -151,21 +142,21 @@ def bound(case: Case) -> Array:
     input is taken at its mean power, its transient as known.
     """
     machine = case.machine
-    everywhere = np.abs(machine.response(np.arange(1, SIZE // 2) * RATE / SIZE)) ** 2
+    everywhere = np.abs(machine.response(np.arange(1, SIZE // 2) * records.RATE / SIZE)) ** 2
     if case.periods:
-        hertz = np.arange(BAND[0], BAND[1] + 1e-9, RATE / SIZE)
-        excited = np.arange(EXCITED[0], EXCITED[1] + 1e-9, RATE / SIZE)
+        hertz = np.arange(records.BAND[0], records.BAND[1] + 1e-9, records.RATE / SIZE)
+        excited = np.arange(records.EXCITED[0], records.EXCITED[1] + 1e-9, records.RATE / SIZE)
         moved = np.mean(np.abs(machine.response(excited)) ** 2)
         # All of the power in the lines that are excited, over white noise of the same.
         power = case.periods * SIZE / (2 * excited.size)
     else:
-        hertz = np.arange(BAND[0], BAND[1], RATE / case.samples)
+        hertz = np.arange(records.BAND[0], records.BAND[1], records.RATE / case.samples)
         moved, power = np.mean(everywhere), 1.0
     shaken = machine.process**2
     white = machine.white**2 * (moved + shaken * np.mean(everywhere))
     response = np.abs(machine.response(hertz)) ** 2
     variance = (white + response * (shaken + machine.input_noise**2)) / power
-    s = 1j * hertz / np.sqrt(BAND[0] * BAND[1])
+    s = 1j * hertz / np.sqrt(records.BAND[0] * records.BAND[1])
     theta = _true_unknowns(machine, s)
 
     def stacked(unknowns: Array) -> Array:
@@ -194,7 +185,7 @@ def _rational(unknowns: Array, s: Array) -> Array:
 
 def _true_unknowns(machine: Machine, s: Array) -> Array:
     """Return the truth in the unknowns of `_rational`: what is left over as powers of s."""
-    centre = np.sqrt(BAND[0] * BAND[1])
+    centre = np.sqrt(records.BAND[0] * records.BAND[1])
     f, zeta, part = (np.array([m[k] for m in machine.modes[:2]]) for k in range(3))
     w = f / centre
     pole = w * (-zeta + 1j * np.sqrt(1 - zeta**2))
@@ -287,14 +278,14 @@ def read_benches(data: Path, *, quick: bool) -> tuple[Row, Row]:
     """Return what the benches say, and pictures of two of their responses."""
     guide = {}
     pictures = {}
-    for name in GUIDE:
+    for name in records.GUIDE:
         log = mapped(data, name)
         for output in ("delta_e_motor", "delta_e_load"):
             reading = read_frf(log, "current_input", output, period=5.0)
             guide[f"{Path(name).stem} {output}"] = told(reading)
             if output == "delta_e_load":
                 pictures[f"linear guide, {Path(name).stem}"] = pictured(reading)
-    log = mapped(data, BENCH)
+    log = mapped(data, records.BENCH)
     bench: dict[str, Row] = {}
     for output in ("delta_e_motor", "delta_e_load"):
         reading = read_frf(log, "current", output)
@@ -315,7 +306,7 @@ def mapped(data: Path, name: str) -> Log:
     """Read a real log with its column map."""
     with tempfile.TemporaryDirectory() as scratch:
         path = Path(scratch) / "map.toml"
-        path.write_text(MAPS[name], encoding="utf-8")
+        path.write_text(records.MAPS[name], encoding="utf-8")
         return read_log(data / name, columns=load_columns(path))
 
 

@@ -81,6 +81,11 @@ def counted(what: str, hits: int, n: int, beside: str = "", *, met: bool = True)
     return Claim(what, f"{hits:,} of {n:,}", interval, beside, met)
 
 
+def controls_seen(found: Mapping[str, bool]) -> str:
+    """Format how many negative controls were detected."""
+    return f"{sum(map(bool, found.values()))} of {len(found)} controls are seen"
+
+
 def covered(what: str, rows: Iterable[Row], beside: str = "", *, met: bool | None = None) -> Claim:
     """Claim the coverage of intervals; each row is judged at 99.9 %."""
     found = list(rows)

@@ -29,16 +29,8 @@ from models.dynamics.modal_map import modal_map
 from models.dynamics.plant import GUIDE_MODES
 from models.dynamics.stages import stage_named
 from models.lives.simulation import Visit, schedule
-from studies.common.lives import (
-    HEALTHY,
-    Array,
-    Estimates,
-    Life,
-    history_of,
-    life_of,
-    life_with,
-    plan_of,
-)
+from studies.common import lives
+from studies.common.lives import Array, Estimates, Life
 from studies.common.metrics import place
 from studies.harness.study import Row, judge_coverage
 from studies.sbc_life.run import always_losing
@@ -115,7 +107,7 @@ def followed(cases: Iterable[Case], stage: Stage) -> list[Followed]:
     """Track lives."""
     found = []
     for case in cases:
-        history = history_of(case.life, case.estimates)
+        history = lives.history_of(case.life, case.estimates)
         own = track(history, stage)
         found.append(Followed(case, own, accepted_estimates(history, own)))
     return found
@@ -234,8 +226,8 @@ def _wrong_map(name: str, plant: str) -> ModalMap:
 
 def modelled(stage: str, kind: str, seed: int, identify: Callable[[Life], Estimates]) -> Case:
     """Take a life of `models` and estimates of it."""
-    plan = plan_of(stage, kind, seed)
-    life = life_of(plan)
+    plan = lives.plan_of(stage, kind, seed)
+    life = lives.life_of(plan)
     limits = plan.draw_life().limits_km()
     ends = [np.inf if limits[name] is None else _KM * limits[name] for name in PARAMETERS]
     return Case(
@@ -252,7 +244,7 @@ def on_path(stage: str, seed: int, rng: np.random.Generator) -> Life:
     kind, visits = _healthy(stage, seed, rng)
     s = np.array([visit.travel_km - visits[0].travel_km for visit in visits])
     health = last ** (s / s[-1])[:, None]
-    return life_with(plan_of(stage, kind, seed), _with_health(visits, health))
+    return lives.life_with(lives.plan_of(stage, kind, seed), _with_health(visits, health))
 
 
 def by_law(stage: str, seed: int, rng: np.random.Generator) -> tuple[Life, Array]:
@@ -280,14 +272,14 @@ def by_law(stage: str, seed: int, rng: np.random.Generator) -> tuple[Life, Array
             scenario.paths, scenario.split(theta), description.parameters, strict=True
         )
     ]
-    life = life_with(plan_of(stage, kind, seed), _with_health(visits, health))
+    life = lives.life_with(lives.plan_of(stage, kind, seed), _with_health(visits, health))
     return life, np.array(ends)
 
 
 def _healthy(stage: str, seed: int, rng: np.random.Generator) -> tuple[str, list[Visit]]:
     """Draw which effects without wear a life has: hall, payload, retuning, grease or none."""
-    kind = str(rng.choice(HEALTHY))
-    return kind, schedule(plan_of(stage, kind, seed))
+    kind = str(rng.choice(lives.HEALTHY))
+    return kind, schedule(lives.plan_of(stage, kind, seed))
 
 
 def _with_health(visits: list[Visit], health: Array) -> list[Visit]:

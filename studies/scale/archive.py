@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from studies.faults.logfiles import DESCRIPTION, Archive, log_of, recordings, write
+from studies.bad_inputs.logfiles import DESCRIPTION, Archive, log_of, recordings, write
 
 LOGS_PER_MACHINE, SECONDS = 100, 10.0
 _N_BASES = 8

@@ -3,8 +3,8 @@
 Method
     Four simulated recordings are written a thousand times, each with a thousandth of fresh noise
     and the next moment of a machine's life, in seven formats in turn. Among them are damaged logs
-    of every kind in `KINDS` of `studies.faults.damage`, which states the reason of each, once in
-    each format that can be damaged so. One `lmshealth run` with two workers. Damage of a channel
+    of every kind in `KINDS` of `damage.py`, which states the reason of each, once in each format
+    that can be damaged so. One `lmshealth run` with two workers. Damage of a channel
     or a stretch must leave the rest of its log analysed. Damage that no file shows is left out:
     flipped bits without a checksum, text cut between rows or inside the last number. The exit
     status must report refused logs, and standard error must be empty. Controls: a good log
@@ -21,7 +21,7 @@ from __future__ import annotations
 import subprocess
 import sys
 import tempfile
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -30,17 +30,10 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from studies.faults.damage import KINDS
-from studies.faults.logfiles import (
-    DESCRIPTION,
-    MACHINES,
-    SUFFIXES,
-    Archive,
-    log_of,
-    recordings,
-    write,
-)
-from studies.harness.claims import Claim, counted
+from studies.bad_inputs import logfiles
+from studies.bad_inputs.damage import KINDS
+from studies.bad_inputs.logfiles import MACHINES, SUFFIXES
+from studies.harness.claims import Claim, controls_seen, counted
 from studies.harness.study import Row, Study
 
 STEP = "batch"
@@ -68,18 +61,18 @@ class Found:
     """Results of the run for all logs."""
 
     # By log, the reasons for which all of it and a channel of it is refused
-    whole: dict[str, set[str]]
-    partly: dict[str, set[str]]
+    whole: defaultdict[str, set[str]]
+    partly: defaultdict[str, set[str]]
     analysed: set[str]  # Logs with a mode in ``modes.csv``
 
     def reason(self, expected: Expected) -> str:
         """Tell in one word what became of a log."""
-        whole = self.whole.get(expected.name, set())
+        whole = self.whole[expected.name]
         if whole or expected.lost:
             return " and ".join(sorted(whole)) or "not refused"
         if expected.name not in self.analysed:
             return "not analysed"
-        partly = " and ".join(sorted(self.partly.get(expected.name, set())))
+        partly = " and ".join(sorted(self.partly[expected.name]))
         return partly if expected.reason != _GOOD else _GOOD
 
 
@@ -89,17 +82,19 @@ def main() -> None:
     quick = study.quick
     with tempfile.TemporaryDirectory(prefix="damaged-") as folder:
         expected = make_archive(Path(folder), quick)
-        done = carry_out(Path(folder), workers=1 if quick else 2)
+        command = [sys.executable, "-m", "lmshealth", "run", "logs", "--stage", "stage.toml",
+                   "--out", "out", "--workers", "1" if quick else "2"]  # fmt: skip
+        done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=folder)
         answer = judge(expected, read_found(Path(folder) / "out"), done)
     study.conclude(answer)
 
 
 def make_archive(folder: Path, quick: bool) -> list[Expected]:
     """Write the logs, good and bad ones mixed over the lives of the machines."""
-    archive = Archive(folder / "logs")
+    archive = logfiles.Archive(folder / "logs")
     archive.folder.mkdir()
-    (folder / "stage.toml").write_text(DESCRIPTION)
-    bases = recordings(1 if quick else N_BASES)
+    (folder / "stage.toml").write_text(logfiles.DESCRIPTION)
+    bases = logfiles.recordings(1 if quick else N_BASES)
     damages = list(chosen(quick))
     n = len(damages) + (N_GOOD_QUICK if quick else N_GOOD)
     # No damage at either end of a life: an odometer is contradicted by what comes after.
@@ -109,11 +104,11 @@ def make_archive(folder: Path, quick: bool) -> list[Expected]:
     for k in range(n):
         rng = np.random.default_rng([_SEED, k])
         number = len(MACHINES) * (k // _FEW) + k % _FEW if quick else k
-        log = log_of(bases[k % len(bases)], number, rng)
+        log = logfiles.log_of(bases[k % len(bases)], number, rng)
         kind, suffix = damaged.get(k, (None, SUFFIXES[k % len(SUFFIXES)]))
         path = archive.folder / f"log-{k:04d}{suffix}"
         if kind is None:
-            write(archive, path, log)
+            logfiles.write(archive, path, log)
             expected.append(Expected(path.name, _GOOD, _GOOD, False))
         else:
             name = kind.make(archive, path, log, rng)
@@ -131,26 +126,17 @@ def chosen(quick: bool) -> Iterator[tuple[Any, str]]:
             yield kind, kind.suffixes[k // _EVERY % len(kind.suffixes)]
 
 
-def carry_out(folder: Path, workers: int) -> subprocess.CompletedProcess[str]:
-    """Run the command line on the archive."""
-    command = [sys.executable, "-m", "lmshealth", "run", str(folder / "logs"), "--stage"]
-    command += [str(folder / "stage.toml"), "--out", str(folder / "out"), "--workers", str(workers)]
-    return subprocess.run(command, capture_output=True, text=True, check=False)
-
-
 def read_found(out: Path) -> Found:
     """Read what the run wrote."""
     refused = pd.read_csv(out / "refused.csv", dtype=str, keep_default_na=False)
     modes = pd.read_csv(out / "modes.csv", dtype=str, keep_default_na=False)
-    found = Found({}, {}, set(modes["log"]))
+    found = Found(defaultdict(set), defaultdict(set), set(modes["log"]))
     for row in refused.itertuples():
         # Rows of a table have no name of their own but their line.
         in_table = row.log in ("manifest.csv", "maintenance.csv")
         name = f"{row.log}, {row.detail.split(':')[0]}" if in_table else row.log
-        if not row.channel and not row.mode:
-            found.whole.setdefault(name, set()).add(row.reason)
-        elif row.channel and not row.mode:
-            found.partly.setdefault(name, set()).add(row.reason)
+        if not row.mode:
+            (found.partly if row.channel else found.whole)[name].add(row.reason)
     return found
 
 
@@ -162,7 +148,8 @@ def wrong(expected: Sequence[Expected], found: Found) -> list[str]:
         if found.reason(one) != one.reason
     ]
     known = {one.name for one in expected}
-    return other + [f"{name}: not expected at all" for name in sorted(set(found.whole) - known)]
+    refused = {name for name, reasons in found.whole.items() if reasons}
+    return other + [f"{name}: not expected at all" for name in sorted(refused - known)]
 
 
 def judge(
@@ -213,7 +200,7 @@ def claims(answer: Row) -> Iterator[Claim]:
         f"damaged logs of {answer['kinds']} kinds refused with the right reason",
         answer["damaged_told_right"],
         answer["damaged"],
-        _control(answer, "controls"),
+        controls_seen(answer["controls"]),
         met=answer["damaged_told_right"] == answer["damaged"],
     )
     yield counted(
@@ -222,11 +209,6 @@ def claims(answer: Row) -> Iterator[Claim]:
         answer["good"],
         met=answer["good_analysed"] == answer["good"],
     )
-
-
-def _control(answer: Row, name: str = "control") -> str:
-    found = answer[name].values()
-    return f"{sum(map(bool, found))} of {len(found)} controls are seen"
 
 
 if __name__ == "__main__":

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import os
 import unicodedata
 from dataclasses import replace
@@ -11,7 +10,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 
-from studies.faults.logfiles import Archive, Columns, LogFile, log_of, write
+from studies.bad_inputs.logfiles import Archive, Columns, LogFile, log_of, write, write_table
 
 SECRET = "what-nobody-may-see-7d1f"  # content of files that must not be read
 # What a name that is run as a command would make.
@@ -114,21 +113,9 @@ file = "../outside/secret.txt"
 def make_hostile(root: Path, base: Columns, *, every: int = 1) -> tuple[list[str], list[str]]:
     """Write an archive of hostile logs, and files around it that must not change.
 
-    Parameters
-    ----------
-    root : Path
-        Gets the folders ``logs`` and ``outside``.
-    base : dict of str to ndarray
-        A recording that all logs are copies of, each with noise of its own.
-    every : int
-        Take every so many of the names only.
-
-    Returns
-    -------
-    machines : list of str
-        Machines that are to be followed.
-    refused : list of str
-        Logs that are to be refused.
+    Below ``root`` are the folders ``logs`` and ``outside`` then; logs are copies of a recording,
+    each with noise of its own, of every so many of the names. Returns the machines that are to be
+    followed, and the logs that are to be refused.
     """
     archive = Archive(root / "logs")
     archive.folder.mkdir()
@@ -183,7 +170,6 @@ def _reaching(root: Path, archive: Archive, base: Columns) -> list[str]:
 
 def _tables(archive: Archive) -> None:
     """Write tables with rows that reach outside, and cells that are more than text."""
-    head = ["file", "stage", "recorded_at", "travel_km", "servo_id"]
     moment = "2026-03-01T00:00:00Z"
     rows = [
         ["../outside/log.h5", SECRET, moment, "1", ""],
@@ -200,9 +186,5 @@ def _tables(archive: Archive) -> None:
         [MACHINES[0], moment, "0", "'); DROP TABLE canary; --<script>alert(1)</script>\x1b[2J"],
         [MACHINES[0], f"$(touch {MARK})\u202e", "0", "servo"],
     ]
-    for name, content in (
-        ("manifest", [head, *rows]),
-        ("maintenance", [["stage", "recorded_at", "travel_km", "action"], *work]),
-    ):
-        with (archive.folder / f"{name}.csv").open("w", encoding="utf-8", newline="") as stream:
-            csv.writer(stream).writerows(content)
+    write_table(archive.folder, "manifest", rows, "servo_id")
+    write_table(archive.folder, "maintenance", work)

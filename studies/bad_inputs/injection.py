@@ -1,7 +1,7 @@
 """Can the content of a log, a table or an address execute anything or reach outside the output?
 
 Method
-    An archive of hostile logs (`studies.faults.hostile`: SQL, markup, commands, paths, formulas,
+    An archive of hostile logs (`hostile.py`: SQL, markup, commands, paths, formulas,
     control characters, links, pipes) is run and reported on SQLite and, where installed,
     PostgreSQL, with debug logging. Every file around it is hashed before and after; the database
     has a table that must not change; all printed, written and stored text is searched for control
@@ -36,12 +36,12 @@ import numpy as np
 import pandas as pd
 from sqlalchemy import create_engine
 
-from studies.faults import guards, hostile
-from studies.faults.damage import KINDS
+from studies.bad_inputs import guards, hostile
+from studies.bad_inputs.damage import KINDS
+from studies.bad_inputs.logfiles import DESCRIPTION, Archive, Columns, log_of, recordings
 from studies.faults.driving import PROGRAM
-from studies.faults.logfiles import DESCRIPTION, Archive, Columns, log_of, recordings
 from studies.harness import servers
-from studies.harness.claims import Claim
+from studies.harness.claims import Claim, controls_seen
 from studies.harness.study import Row, Study
 
 STEP = "batch"
@@ -91,25 +91,17 @@ def main() -> None:
             own = partial(attack, folder, base, url, password, every=_EVERY if quick else 1)
             answer["stores"][kind] = once(own, kind)
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="addresses-")))
-        answer["addresses"] = once(
-            # Addresses have tests of their own.
-            partial(addresses, folder),
-            () if quick else ADDRESSES,
-        )
+        # Addresses have tests of their own.
+        answer["addresses"] = once(partial(addresses, folder), () if quick else ADDRESSES)
         answer["descriptions"] = [] if quick else descriptions(folder)
         answer["network"] = [] if quick else network(folder)
         answer["bombs"] = [] if quick else once(partial(bombs, folder, base))
-    answer["passed"] = verdicts(answer)
-    study.conclude(answer)
-
-
-def verdicts(answer: Row) -> dict[str, bool]:
-    """Return the checks."""
     stores = answer["stores"].values()
-    wrong = {name for store in stores for name, found in store["wrong"].items() if found}
-    names = {name for store in stores for name in store["wrong"]}
-    return {
-        **{name: name not in wrong for name in sorted(names)},
+    answer["passed"] = {
+        **{
+            name: not any(store["wrong"][name] for store in stores)
+            for name in sorted(answer["stores"]["sqlite"]["wrong"])
+        },
         "no address shows its password": not answer["addresses"]["shown"],
         "descriptions are refused in a line": not answer["descriptions"],
         "nobody is called": not answer["network"],
@@ -118,6 +110,7 @@ def verdicts(answer: Row) -> dict[str, bool]:
         ),
         "controls are noticed": all(answer["controls"].values()),
     }
+    study.conclude(answer)
 
 
 def _store(kind: str, folder: Path, stack: ExitStack) -> tuple[str, str]:
@@ -197,7 +190,10 @@ def in_words(texts: Sequence[str], kept: str, password: str) -> dict[str, list[s
         "nothing printed or written acts": sorted(
             {sign for text in texts for sign in guards.acting(text)}
         ),
-        "no file outside is read": [f"text {k}" for k, text in every if _leaked(text)],
+        # Of this study, or the system's users.
+        "no file outside is read": [
+            f"text {k}" for k, text in every if hostile.SECRET in text or "root:x:0" in text
+        ],
         "no password is shown or kept": [f"text {k}" for k, text in every if password in text],
         "no traceback": ["there is one"] if "Traceback" in texts[0] else [],
     }
@@ -229,11 +225,6 @@ def _links(folder: Path, out: Path) -> list[Path]:
     links.append(out / "track.csv")
     links[-1].symlink_to(folder / "outside" / "not-there")
     return links
-
-
-def _leaked(text: str) -> bool:
-    """Return whether a file outside was read: ours, or that of the system's users."""
-    return hostile.SECRET in text or "root:x:0" in text
 
 
 def addresses(folder: Path, forms: Sequence[str]) -> Row:
@@ -302,19 +293,17 @@ def bombs(folder: Path, base: Columns) -> list[Row]:
     rows = []
     archive = Archive(folder / "bombs")
     archive.folder.mkdir()
-    for kind in KINDS:
-        if kind.reason != "too-large":
-            continue
+    log = log_of(base, 0, np.random.default_rng(0))
+    for kind in (kind for kind in KINDS if kind.reason == "too-large"):
         for suffix in kind.suffixes:
             path = archive.folder / f"bomb{suffix}"
-            log = log_of(base, 0, np.random.default_rng(0))
             kind.make(archive, path, log, np.random.default_rng(0))
-            rows.append({"bomb": kind.name, "suffix": suffix, **_weigh(path, folder)})
+            rows.append({"bomb": kind.name, "suffix": suffix, **_weigh(path)})
     return rows
 
 
-def _weigh(path: Path, folder: Path) -> Row:
-    """Read a log in a process of its own, and give its peak of memory in MB."""
+def _weigh(path: Path) -> Row:
+    """Read a log in a process of its own; return why it is refused, and its peak memory in MB."""
     script = (
         "import json, resource, sys\nfrom lmshealth.io.reading import read_log\n"
         "from lmshealth.errors import BadLog\n"
@@ -376,7 +365,7 @@ def claims(answer: Row) -> Iterator[Claim]:
             f"what hostile names and metadata do ({kind})",
             f"{len(wrong)} of {len(row['wrong'])} things that must not be",
             f"{row['machines']} machines",
-            _control(answer, "controls"),
+            controls_seen(answer["controls"]),
             not wrong,
         )
     peaks = [row["peak_mb"] for row in answer["bombs"]]
@@ -394,11 +383,6 @@ def claims(answer: Row) -> Iterator[Claim]:
         f"{len(tried['shown'])} of {tried['tried']}",
         met=not tried["shown"],
     )
-
-
-def _control(answer: Row, name: str = "control") -> str:
-    found = answer[name].values()
-    return f"{sum(map(bool, found))} of {len(found)} controls are seen"
 
 
 if __name__ == "__main__":

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import os
 import re
+import zlib
 from collections.abc import Iterable, Mapping, Sequence
 from html.parser import HTMLParser
 from pathlib import Path
@@ -69,8 +70,6 @@ def touched(url: str) -> list[str]:
 
 def everything_in(url: str) -> bytes:
     """Read all that a database holds, unpacked where it is packed."""
-    import zlib
-
     engine = create_engine(url)
     found = b""
     with engine.connect() as connection:

@@ -13,7 +13,12 @@ from pathlib import Path
 
 import h5py
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pyuff
+from nptdms import ChannelObject, RootObject, TdmsWriter
 from numpy.typing import NDArray
+from scipy.io import savemat
 from scipy.signal import decimate
 
 from models.dynamics.stages import STAGES
@@ -25,6 +30,10 @@ SECONDS, VELOCITY = 6.0, 0.010
 _EVERY_TENTH = 10
 RATE = SAMPLE_RATE_HZ / _EVERY_TENTH
 _SIGNALS = ("delta_e_um", "acc_feed_m_s2", "acc_pitch_m_s2")
+_HEADS = {
+    "manifest": ("file", "stage", "recorded_at", "travel_km"),
+    "maintenance": ("stage", "recorded_at", "travel_km", "action"),
+}
 # Two modes of the simulated stage and nothing to infer: the study examines files.
 DESCRIPTION = """name = "faults"
 [match]
@@ -59,13 +68,14 @@ class Archive:
 
     def close(self) -> None:
         """Write the tables."""
-        heads = {
-            "manifest": ["file", "stage", "recorded_at", "travel_km"],
-            "maintenance": ["stage", "recorded_at", "travel_km", "action"],
-        }
-        for name, rows in (("manifest", self.manifest), ("maintenance", self.maintenance)):
-            with (self.folder / f"{name}.csv").open("w", encoding="utf-8", newline="") as stream:
-                csv.writer(stream).writerows([heads[name], *rows])
+        write_table(self.folder, "manifest", self.manifest)
+        write_table(self.folder, "maintenance", self.maintenance)
+
+
+def write_table(folder: Path, name: str, rows: list[list[str]], *more: str) -> None:
+    """Write a table with its header, and with more columns than it needs."""
+    with (folder / f"{name}.csv").open("w", encoding="utf-8", newline="") as stream:
+        csv.writer(stream).writerows([[*_HEADS[name], *more], *rows])
 
 
 def recordings(n: int, seconds: float = SECONDS) -> list[Columns]:
@@ -92,12 +102,9 @@ def log_of(base: Columns, number: int, rng: np.random.Generator) -> LogFile:
     }
     own = number // len(MACHINES)
     moment = datetime(2026, 1, 1, tzinfo=UTC) + timedelta(hours=own)
-    metadata = {
-        "stage": MACHINES[number % len(MACHINES)],
-        "recorded_at": moment.isoformat(),
-        "travel_km": f"{0.5 * own:g}",
-        "sample_rate_hz": f"{RATE:g}",
-    }
+    stage = MACHINES[number % len(MACHINES)]
+    metadata = {"stage": stage, "recorded_at": moment.isoformat(), "travel_km": f"{0.5 * own:g}",
+                "sample_rate_hz": f"{RATE:g}"}  # fmt: skip
     return LogFile(columns, metadata)
 
 
@@ -127,30 +134,21 @@ def _hdf5(path: Path, log: LogFile) -> None:
 
 
 def _parquet(path: Path, log: LogFile) -> None:
-    import pyarrow as pa
-    import pyarrow.parquet as pq
-
     table = pa.table(dict(log.columns)).replace_schema_metadata(dict(log.metadata))
     pq.write_table(table, path, use_dictionary=False, write_page_checksum=True)
 
 
 def _tdms(path: Path, log: LogFile) -> None:
-    from nptdms import ChannelObject, RootObject, TdmsWriter
-
     channels = [ChannelObject("log", name, values) for name, values in log.columns.items()]
     with TdmsWriter(str(path)) as writer:
         writer.write_segment([RootObject(dict(log.metadata)), *channels])
 
 
 def _mat(path: Path, log: LogFile) -> None:
-    import scipy.io
-
-    scipy.io.savemat(path, {**log.columns, **log.metadata}, do_compression=True)
+    savemat(path, {**log.columns, **log.metadata}, do_compression=True)
 
 
 def _uff(path: Path, log: LogFile) -> None:
-    import pyuff
-
     path.unlink(missing_ok=True)
     file = pyuff.UFF(str(path))
     for name, values in log.columns.items():
