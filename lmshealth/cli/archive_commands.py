@@ -9,27 +9,16 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from lmshealth.cli import terminal, views
-from lmshealth.cli.options import (
-    EPOCHS,
-    PDF,
-    SCHEDULER,
-    SEED,
-    SOME_REFUSED,
-    WORKERS,
-    examples,
-    reading_options,
-    store_option,
-)
+from lmshealth.cli import options, terminal, views
 from lmshealth.cli.progress import progress_bars
 from lmshealth.report.pdf import write_pdfs
 
 if TYPE_CHECKING:
-    from lmshealth.batch.run import RunResult
+    from lmshealth.stage.description import Stage
 
 
 @click.command(
-    epilog=examples(
+    epilog=options.examples(
         "run logs/ --stage lms-y --out result/",
         "run exports/ --columns map.toml --stage my-stage.toml --out result/",
         "run archive/ --stage lms-x --stage lms-y --out result/ "
@@ -40,79 +29,61 @@ if TYPE_CHECKING:
 @click.option(
     "--stage",
     "stages",
+    type=options.StageFile(),
     multiple=True,
     required=True,
     help="Stage description: a .toml file or a shipped name; may be given several times.",
 )
-@click.option(
-    "--out",
-    type=click.Path(file_okay=False, path_type=Path),
-    required=True,
-    help="Folder for tables and report.",
-)
-@store_option(
+@options.out_option("Folder for tables and report.", options.FOLDER)
+@options.store_option(
     help="Store of results: sqlite:///PATH or a PostgreSQL database; default a file in --out."
 )
-@reading_options
-@WORKERS
-@SCHEDULER
-@EPOCHS
-@SEED
-@PDF
+@options.reading_options
+@options.WORKERS
+@click.option(
+    "--scheduler",
+    metavar="ADDRESS",
+    help="Run on the Dask cluster with this scheduler. It needs the same version of lmshealth, and "
+    "its workers access to the logs under the same paths.",
+)
+@options.EPOCHS
+@options.SEED
+@options.PDF
 @click.pass_context
 def run(
-    ctx: click.Context, /, logs: Path, stages: tuple[str, ...], out: Path, **options: Any
+    ctx: click.Context, /, logs: Path, stages: tuple[Stage, ...], out: Path, **given: Any
 ) -> None:
     """Analyse a folder of logs: tables, verdicts and report. Run again to continue."""
     from lmshealth.batch.run import Settings
     from lmshealth.batch.run import run as run_pipeline
-    from lmshealth.io.column_map import load_columns
-    from lmshealth.stage.description import load_stage
 
-    settings = Settings(
-        store=options["store"],
-        workers=options["workers"] or _processors(),
-        scheduler=options["scheduler"],
-        epochs=options["epochs"],
-        seed=options["seed"],
-        columns=load_columns(options["columns"]) if options["columns"] else None,
-        max_memory=options["max_memory"],
-    )
-    loaded = [load_stage(reference) for reference in stages]
+    pdf, workers = given.pop("pdf"), given.pop("workers") or _processors()
     with progress_bars() as progress:
-        result = run_pipeline(logs, loaded, out, settings, progress)
-    _print_result(result)
-    if options["pdf"]:
-        write_pdfs(result.pages)
-    ctx.exit(SOME_REFUSED if result.n_refused or result.n_unread or result.failed else 0)
-
-
-def _print_result(result: RunResult) -> None:
+        result = run_pipeline(logs, stages, out, Settings(workers=workers, **given), progress)
     used = result.n_logs - result.n_refused
     again = f", {result.n_remembered} of them in an earlier run" if result.n_remembered else ""
     click.echo(f"{used} of {result.n_logs} logs analysed{again}.")
     if result.n_unread:
         click.echo(f"{result.n_unread} invalid tables or table rows: see refused.csv.")
     views.print_summaries(result.rows)
-    terminal.print_failed(result.failed)
+    terminal.print_errors(f"{machine}: {why}" for machine, why in result.failed.items())
     click.echo(f"Report: {result.index}")
+    if pdf:
+        write_pdfs(result.pages)
+    some = result.n_refused or result.n_unread or result.failed
+    ctx.exit(options.SOME_REFUSED if some else 0)
 
 
 @click.command(
-    epilog=examples(
+    epilog=options.examples(
         "report --store sqlite:///result/lmshealth.sqlite --out pages/",
         "report --store postgresql://me@host/fleet --out pages/ --pdf",
     )
 )
-@store_option(required=True, help="Store that `run` has filled.")
-@click.option(
-    "--out",
-    type=click.Path(file_okay=False, path_type=Path),
-    required=True,
-    help="Folder of the pages.",
-)
-@WORKERS
-@PDF
+@options.store_option(required=True, help="Store that `run` has filled.")
+@options.out_option("Folder of the pages.", options.FOLDER)
+@options.WORKERS
+@options.PDF
 @click.pass_context
 def report(ctx: click.Context, /, store: str, out: Path, workers: int | None, pdf: bool) -> None:
     """Write the pages of all machines in a store, without their logs.
@@ -127,10 +98,10 @@ def report(ctx: click.Context, /, store: str, out: Path, workers: int | None, pd
     with progress_bars() as progress, closing(Store(store, create=False)) as opened:
         result = write_pages(opened, out, settings, progress)
     click.echo(f"Report: {result.index}")
-    terminal.print_failed(result.failed)
+    terminal.print_errors(f"{machine}: {why}" for machine, why in result.failed.items())
     if pdf:
         write_pdfs(result.pages)
-    ctx.exit(SOME_REFUSED if result.failed else 0)
+    ctx.exit(options.SOME_REFUSED if result.failed else 0)
 
 
 def _processors() -> int:

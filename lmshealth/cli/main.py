@@ -16,6 +16,7 @@ from lmshealth.cli.archive_commands import report, run
 from lmshealth.cli.log_commands import error, frf, modes, spectrum
 from lmshealth.cli.machine_commands import infer, prognose, track
 from lmshealth.cli.stage_commands import plan, stage
+from lmshealth.cli.terminal import print_errors
 from lmshealth.errors import LmshealthError
 
 
@@ -26,17 +27,17 @@ class _Group(click.Group):
         try:
             return super().invoke(ctx)
         except LmshealthError as error:
-            click.echo(f"lmshealth: {error}", err=True)
+            print_errors([str(error)])
         except OSError as error:
-            click.echo(f"lmshealth: {error.filename or 'output'}: {error.strerror}", err=True)
+            print_errors([f"{error.filename or 'output'}: {error.strerror}"])
         except KeyboardInterrupt:
-            click.echo("lmshealth: interrupted; run again to continue", err=True)
+            print_errors(["interrupted; run again to continue"])
         ctx.exit(1)
 
 
 @click.group(
     cls=_Group,
-    context_settings={"help_option_names": ["-h", "--help"]},
+    context_settings={"help_option_names": ["-h", "--help"], "show_default": True},
     epilog="Exit status: 0 done, 1 failed (one line on standard error gives the reason), 2 wrong "
     "usage, 3 done but some logs were refused.",
 )

@@ -5,73 +5,15 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import click
 
 from lmshealth.io.constants import MAX_MEMORY
 from lmshealth.signal.segments import PARTS
 
-if TYPE_CHECKING:
-    from lmshealth.io.column_map import ColumnMap
-    from lmshealth.stage.description import Stage
-
 # Exit status: done, but some logs or machines were refused.
 SOME_REFUSED = 3
-# An address on the command line is visible to all users of the machine, with its password.
-_STORE_VARIABLE = "LMSHEALTH_STORE"
-
-TABLE = click.Path(exists=True, dir_okay=False, path_type=Path)
-OUT = click.Path(dir_okay=False, path_type=Path)
-
-LOGS = click.argument("logs", nargs=-1, required=True, type=click.Path(path_type=Path))
-_STAGE_HELP = "Stage description: a .toml file or a shipped name."
-STAGE = click.option("--stage", help=_STAGE_HELP)
-REQUIRED_STAGE = click.option("--stage", required=True, help=_STAGE_HELP)
-_COLUMNS = click.option(
-    "--columns", type=click.Path(path_type=Path), help="Column map of the export."
-)
-FORMAT = click.option(
-    "--format",
-    "style",
-    type=click.Choice(["table", "csv", "json"]),
-    default="table",
-    show_default=True,
-)
-PART = click.option(
-    "--part",
-    type=click.Choice(PARTS),
-    default="record",
-    show_default=True,
-    help="Use the whole log, or the part that its set point marks as such.",
-)
-TABLE_OR_JSON = click.option(
-    "--format", "style", type=click.Choice(["table", "json"]), default="table", show_default=True
-)
-COV = click.option(
-    "--cov", type=TABLE, help="Covariances of estimates; default modes_cov.csv in the same folder."
-)
-MAINTENANCE = click.option(
-    "--maintenance", type=TABLE, help="Table of maintenance, like maintenance.csv."
-)
-EPOCHS = click.option(
-    "--epochs",
-    type=click.IntRange(1),
-    default=40,
-    show_default=True,
-    help="Infer health at no more than this many epochs per machine.",
-)
-SEED = click.option("--seed", type=click.IntRange(0), default=0, show_default=True)
-WORKERS = click.option(
-    "--workers", type=click.IntRange(1), help="Number of processes; default one per processor."
-)
-SCHEDULER = click.option(
-    "--scheduler",
-    metavar="ADDRESS",
-    help="Run on the Dask cluster with this scheduler. It needs the same version of lmshealth, and "
-    "its workers access to the logs under the same paths.",
-)
-PDF = click.option("--pdf", is_flag=True, help="Also write the page of each stage as PDF.")
 
 
 class Finite(click.FloatRange):
@@ -103,19 +45,68 @@ class Day(click.DateTime):
             )
 
 
+class StageFile(click.types.StringParamType):
+    """Stage description, loaded."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """Load a .toml file or a shipped description."""
+        from lmshealth.stage.description import load_stage  # late: --help needs no scipy
+
+        return load_stage(value)
+
+
+class _ColumnFile(click.Path):
+    """Column map, loaded."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        from lmshealth.io.column_map import load_columns
+
+        return load_columns(value)
+
+
+TABLE = click.Path(exists=True, dir_okay=False, path_type=Path)
+OUT = click.Path(dir_okay=False, path_type=Path)
+FOLDER = click.Path(file_okay=False, path_type=Path)
 SHARE = Finite(0, 1, min_open=True, max_open=True)
 
+LOGS = click.argument("logs", nargs=-1, required=True, type=click.Path(path_type=Path))
+_STAGE_HELP = "Stage description: a .toml file or a shipped name."
+STAGE = click.option("--stage", type=StageFile(), help=_STAGE_HELP)
+REQUIRED_STAGE = click.option("--stage", type=StageFile(), required=True, help=_STAGE_HELP)
+_COLUMNS = click.option("--columns", type=_ColumnFile(), help="Column map of the export.")
 _MAX_MEMORY = click.option(
     "--max-memory",
     type=Finite(0, min_open=True),
     default=MAX_MEMORY / 1e9,
-    show_default=True,
     envvar="LMSHEALTH_MAX_MEMORY",
     show_envvar=True,
     metavar="GB",
     callback=lambda ctx, option, gigabytes: 1e9 * gigabytes,
     help="Refuse a log that needs more memory than this to be read (MAT, UFF58, TDMS).",
 )
+PART = click.option(
+    "--part",
+    type=click.Choice(PARTS),
+    default="record",
+    help="Use the whole log, or the part that its set point marks as such.",
+)
+COV = click.option(
+    "--cov", type=TABLE, help="Covariances of estimates; default modes_cov.csv in the same folder."
+)
+MAINTENANCE = click.option(
+    "--maintenance", type=TABLE, help="Table of maintenance, like maintenance.csv."
+)
+EPOCHS = click.option(
+    "--epochs",
+    type=click.IntRange(1),
+    default=40,
+    help="Infer health at no more than this many epochs per machine.",
+)
+SEED = click.option("--seed", type=click.IntRange(0), default=0)
+WORKERS = click.option(
+    "--workers", type=click.IntRange(1), help="Number of processes; default one per processor."
+)
+PDF = click.option("--pdf", is_flag=True, help="Also write the page of each stage as PDF.")
 
 
 def reading_options(command: Callable[..., Any]) -> Callable[..., Any]:
@@ -123,31 +114,26 @@ def reading_options(command: Callable[..., Any]) -> Callable[..., Any]:
     return _COLUMNS(_MAX_MEMORY(command))
 
 
-def out_option(text: str) -> Callable[[Any], Any]:
-    """Return the required option of the output table."""
-    return click.option("--out", required=True, type=OUT, help=text)
+def out_option(text: str, kind: click.Path = OUT) -> Callable[[Any], Any]:
+    """Return the required option of the output."""
+    return click.option("--out", required=True, type=kind, help=text)
 
 
 def store_option(**more: Any) -> Callable[[Any], Any]:
-    """Return the option of the store."""
-    return click.option("--store", envvar=_STORE_VARIABLE, show_envvar=True, metavar="URL", **more)
+    """Return the option of the store; addresses in arguments are visible to all users."""
+    return click.option(
+        "--store", envvar="LMSHEALTH_STORE", show_envvar=True, metavar="URL", **more
+    )
 
 
-def band_help(text: str) -> Callable[[Any], Any]:
+def format_option(*styles: str) -> Callable[[Any], Any]:
+    """Return the option of the output format; the first is the default."""
+    return click.option("--format", "style", type=click.Choice(styles), default=styles[0])
+
+
+def band_option(text: str) -> Callable[[Any], Any]:
     """Return the option of a frequency band."""
     return click.option("--band", nargs=2, type=float, metavar="LOW HIGH", help=text)
-
-
-BAND = band_help("Use only this band, in Hz.")
-
-
-def load_columns_and_stage(options: dict[str, Any]) -> tuple[ColumnMap | None, Stage | None]:
-    """Load the files of --columns and --stage."""
-    from lmshealth.io.column_map import load_columns
-    from lmshealth.stage.description import load_stage
-
-    columns, stage = options["columns"], options.get("stage")
-    return load_columns(columns) if columns else None, load_stage(stage) if stage else None
 
 
 def examples(*lines: str) -> str:

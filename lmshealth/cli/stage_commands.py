@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
-from lmshealth.cli import terminal, views
-from lmshealth.cli.options import DETECT, REQUIRED_STAGE, SHARE, TABLE_OR_JSON, examples
+from lmshealth.cli import options, terminal, views
+
+if TYPE_CHECKING:
+    from lmshealth.stage.description import Stage
 
 
-@click.command(epilog=examples("stage lms-y", "stage my-stage.toml --format json"))
-@click.argument("reference", metavar="STAGE")
-@TABLE_OR_JSON
-def stage(reference: str, style: str) -> None:
+@click.command(epilog=options.examples("stage lms-y", "stage my-stage.toml --format json"))
+@click.argument("described", metavar="STAGE", type=options.StageFile())
+@options.format_option("table", "json")
+def stage(described: Stage, style: str) -> None:
     """Check a stage description and the identifiability of its parameters.
 
     STAGE is a .toml file or a shipped name. Reports errors with line and key; else the range and
@@ -22,9 +24,8 @@ def stage(reference: str, style: str) -> None:
     """
     from lmshealth.report.tables import stage_rows
     from lmshealth.stage.check import check_stage, diagnose
-    from lmshealth.stage.description import load_stage
 
-    checked = check_stage(load_stage(reference))
+    checked = check_stage(described)
     content = stage_rows(checked, diagnose(checked))
     if style == "json":
         terminal.print_json(content)
@@ -33,21 +34,18 @@ def stage(reference: str, style: str) -> None:
 
 
 @click.command(
-    epilog=examples(
+    epilog=options.examples(
         "plan --stage lms-y --detect guide_preload=0.05",
         "plan --stage lms-y --detect guide_preload=0.1 --detect mount_stiffness=0.1 --seconds 45",
     )
 )
-@REQUIRED_STAGE
-@DETECT
-@click.option(
-    "--power", type=SHARE, default=0.95, show_default=True, help="Probability to detect the loss."
-)
+@options.REQUIRED_STAGE
+@options.DETECT
+@click.option("--power", type=options.SHARE, default=0.95, help="Probability to detect the loss.")
 @click.option(
     "--false-alarm",
-    type=SHARE,
+    type=options.SHARE,
     default=0.01,
-    show_default=True,
     help="Probability to report a loss when there is none.",
 )
 @click.option(
@@ -56,8 +54,14 @@ def stage(reference: str, style: str) -> None:
     multiple=True,
     help="Length of a log in s; may be given several times. Default 10 to 600 s.",
 )
-@TABLE_OR_JSON
-def plan(detections: list[tuple[str, float]], style: str, **options: Any) -> None:
+@options.format_option("table", "json")
+def plan(
+    stage: Stage,
+    detections: list[tuple[str, float]],
+    seconds: tuple[float, ...],
+    style: str,
+    **given: Any,
+) -> None:
     """Plan the length and number of logs that are needed to detect a loss.
 
     Lower bound for vibration at constant velocity (Cramér-Rao): logs of the present are compared
@@ -65,20 +69,10 @@ def plan(detections: list[tuple[str, float]], style: str, **options: Any) -> Non
     """
     from lmshealth.report.tables import plan_rows
     from lmshealth.stage.constants import DURATIONS
-    from lmshealth.stage.description import load_stage
     from lmshealth.stage.planning import plan as make_plan
 
-    loaded = load_stage(options["stage"])
-    plans = [
-        make_plan(
-            loaded,
-            *detection,
-            power=options["power"],
-            false_alarm=options["false_alarm"],
-            durations=options["seconds"] or DURATIONS,
-        )
-        for detection in detections
-    ]
+    durations = seconds or DURATIONS
+    plans = [make_plan(stage, *one, durations=durations, **given) for one in detections]
     content = plan_rows(plans)
     if style == "json":
         terminal.print_json(content)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from textwrap import wrap
 from typing import TYPE_CHECKING, Any
@@ -38,10 +38,16 @@ def _without_nan(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def print_failed(failed: dict[str, str]) -> None:
-    """Print machines without a result and the reasons, on standard error."""
-    for machine, why in failed.items():
-        click.echo(f"lmshealth: {machine}: {why}", err=True)
+def print_notes(notes: Iterable[str]) -> None:
+    """Print on standard error what the reader must take into account."""
+    for note in notes:
+        click.echo(f"note: {note}", err=True)
+
+
+def print_errors(errors: Iterable[str]) -> None:
+    """Print on standard error what has no result, and why."""
+    for error in errors:
+        click.echo(f"lmshealth: {error}", err=True)
 
 
 def print_text(text: str, mark: str = "") -> None:

@@ -58,7 +58,8 @@ class LifeData:
         history = condense(history, constants.MAX_LOGS)
         if not history.has_odometer:
             missing = "not every log has travel_km, and degradation laws count by the odometer"
-            raise NotEnoughData(f"{history.stage}: {missing}; add it to manifest.csv")
+            todo = "add it to manifest.csv, or to every row of the table"
+            raise NotEnoughData(f"{history.stage}: {missing}; {todo}")
         observed = np.any(np.isfinite(history.ln_frequency[history.baseline :]), axis=0)
         names = [name for name in stage.informative if name in history.modes]
         columns = [i for name in names for i in history.columns(name) if observed[i]]

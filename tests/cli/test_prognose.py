@@ -69,8 +69,11 @@ def table(tmp_path: Path) -> Path:
 @pytest.fixture
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     """Put a life with a known end in the place of the inference."""
+    fit = foretelling.prognose_with_posterior
 
-    def prognose(history: History, stage: Stage, seed: object) -> tuple[Prognosis, None]:
+    def prognose(history: History, stage: Stage, seed: int) -> tuple[Prognosis, object]:
+        if not history.has_odometer:
+            return fit(history, stage, seed)
         made = make_prognosis(np.linspace(1e5, 1e6, 1000), np.full(1000, 1e4))
         object.__setattr__(made, "stage", history.stage)
         return made, None
