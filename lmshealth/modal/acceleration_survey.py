@@ -21,45 +21,20 @@ from lmshealth.stage.description import Stage
 
 @dataclass(frozen=True, slots=True)
 class Survey:
-    """Accelerations and lines of one log.
+    """Accelerations and lines of one log."""
 
-    Attributes
-    ----------
-    log : str
-        File name.
-    magnitudes : tuple of Magnitude
-        Channel by channel.
-    lines : tuple of Line
-        Spectral lines in the bands and between them.
-    refused : tuple of Refusal
-        Channels that could not be used.
-    """
-
-    log: str
-    magnitudes: tuple[Magnitude, ...]
-    lines: tuple[Line, ...]
-    refused: tuple[Refusal, ...]
+    log: str  # file name
+    magnitudes: tuple[Magnitude, ...]  # channel by channel
+    lines: tuple[Line, ...]  # in the bands and between them
+    refused: tuple[Refusal, ...]  # channels that could not be used
 
 
 def survey(
     log: Log, stage: Stage | None, band: tuple[float, float] | None, *, part: Part = "record"
 ) -> Survey:
-    """Read accelerations and spectral lines of the accelerometers of a log.
+    """Read accelerations and spectral lines of the accelerometers of a part of a log.
 
-    Parameters
-    ----------
-    log : Log
-        With at least one acceleration channel.
-    stage : Stage or None
-        Modes and bands to read; without it a grid.
-    band : (float, float) or None
-        Use only modes, grid and lines between these, in Hz.
-    part : str
-        Segments of the log; see `select_segments`.
-
-    Returns
-    -------
-    Survey
+    Without a stage a grid of bands is read; ``band`` in Hz restricts modes, grid and lines.
 
     Raises
     ------

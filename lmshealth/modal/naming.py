@@ -23,18 +23,10 @@ from lmshealth.stage.description import Stage
 
 @dataclass(frozen=True, slots=True)
 class Assignment:
-    """Names of resonances.
+    """Names of resonances."""
 
-    Attributes
-    ----------
-    names : tuple of str
-        Of each resonance; empty where it is no target or the assignment is not clear.
-    ambiguous : dict of str to Rejection
-        Targets that are not assigned, but may be one of the resonances.
-    """
-
-    names: tuple[str, ...]
-    ambiguous: dict[str, Rejection]
+    names: tuple[str, ...]  # empty where a resonance is no target or the assignment is not clear
+    ambiguous: dict[str, Rejection]  # targets that are not assigned, but may be a resonance
 
 
 def assign(
@@ -47,18 +39,8 @@ def assign(
     """Assign resonances to targets by the posterior of all order-preserving assignments.
 
     The prior of an assignment is that of its shifts of ln f (`shift_cost`) and a gain for every
-    pair. Pairs outside the search, or with another damping, are excluded.
-
-    Parameters
-    ----------
-    frequency : sequence of float
-        Of the resonances in Hz, ascending.
-    targets : sequence of Target
-        Ascending in frequency.
-    damping : sequence of float, optional
-        Damping ratios; without them only frequencies count.
-    complete : bool
-        Every resonance is one of the targets.
+    pair. Pairs outside the search, or with another damping where it is given, are excluded.
+    Resonances, in Hz, and targets ascend; ``complete`` states that every resonance is a target.
     """
     n, m = len(frequency), len(targets)
     if complete and n == m:

@@ -14,27 +14,13 @@ from lmshealth.stage.description import Stage
 
 @dataclass(frozen=True, slots=True)
 class Target:
-    """A mode to search for.
-
-    Attributes
-    ----------
-    name : str
-        Mode name.
-    frequency : float
-        Start value in Hz.
-    damping_ratio : float
-        Start value.
-    search : float
-        Half width of the search, as a fraction of the frequency.
-    nominal : float or None
-        Described frequency in Hz, once ``frequency`` has been moved to the start value in a log.
-    """
+    """A mode to search for."""
 
     name: str
-    frequency: float
-    damping_ratio: float
-    search: float
-    nominal: float | None = None
+    frequency: float  # start value in Hz
+    damping_ratio: float  # start value
+    search: float  # half width of the search, as a fraction of the frequency
+    nominal: float | None = None  # described frequency in Hz, once the start value is another
 
     def band(self, widths: float) -> tuple[float, float]:
         """Return the band in Hz within so many damping ratios of the frequency."""
@@ -43,14 +29,9 @@ class Target:
 
 
 def choose_channels(log: Log, names: Sequence[str] | None = None) -> tuple[Channel, ...]:
-    """Return the displacement and acceleration channels, sorted by name.
+    """Return the displacement and acceleration channels, by default all, sorted by name.
 
-    Parameters
-    ----------
-    log : Log
-        The order of its channels has no effect on results, not even on rounding.
-    names : sequence of str, optional
-        Use only these.
+    The order of the channels in a log has no effect on results, not even on rounding.
 
     Raises
     ------
@@ -70,14 +51,7 @@ def choose_channels(log: Log, names: Sequence[str] | None = None) -> tuple[Chann
 
 
 def choose_targets(stage: Stage, band: tuple[float, float] | None = None) -> tuple[Target, ...]:
-    """Return the modes of a description, ascending in frequency.
-
-    Parameters
-    ----------
-    stage : Stage
-        The description.
-    band : (float, float), optional
-        Use only modes between these frequencies in Hz.
+    """Return the modes of a description in a band in Hz, ascending in frequency.
 
     Raises
     ------

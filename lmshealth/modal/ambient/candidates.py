@@ -27,21 +27,13 @@ _NEAR_LINE = (3, 4, 5, 6, 7, 8)
 def find_peaks(
     channels: Sequence[Spectrum], low: float, high: float, lines: Sequence[float] = ()
 ) -> tuple[Target, ...]:
-    """Return candidate modes of all channels in a band, ascending in frequency.
+    """Return candidate modes of the longest observation of each channel in a band in Hz.
 
     At every frequency and scale the mean ordinate within the scale is compared with the means to
     the left and to the right. A resonance exceeds both at its own scale and, by its skirts, at
-    wider ones; the narrowest significant scale gives its damping. Candidates are start values: the
-    fit accepts or rejects them.
-
-    Parameters
-    ----------
-    channels : sequence of Spectrum
-        The longest observation of each channel.
-    low, high : float
-        Band in Hz.
-    lines : sequence of float
-        Frequencies of lines in Hz, where no resonance is searched.
+    wider ones; the narrowest significant scale gives its damping. None is searched for at the
+    frequencies of ``lines``. Candidates, ascending in frequency, are start values: the fit accepts
+    or rejects them.
     """
     found: list[tuple[float, float, float]] = []
     for spectrum in channels:

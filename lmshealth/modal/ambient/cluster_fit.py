@@ -42,44 +42,22 @@ _NARROWER = 0.7
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BinnedSpectra:
-    """Spectra of all channels around a cluster, binned by medians, which lines do not move.
+    """Spectra of all channels around a cluster, binned by medians, which lines do not move."""
 
-    Attributes
-    ----------
-    frequency, count : ndarray
-        Mean frequency in Hz and number of ordinates of single segments, shape ``(n_bins,)``.
-    level : ndarray
-        Density from the median in (m/s²)²/Hz, shape ``(n_channels, n_bins)``.
-    neighbours : tuple of Target
-        Modes outside the band whose flanks reach into it.
-    """
-
-    frequency: FloatArray
-    level: FloatArray
-    count: FloatArray
-    neighbours: tuple[Target, ...] = ()
+    frequency: FloatArray  # mean in Hz, (n_bins,)
+    level: FloatArray  # density from the median in (m/s²)²/Hz, (n_channels, n_bins)
+    count: FloatArray  # ordinates of single segments, (n_bins,)
+    neighbours: tuple[Target, ...] = ()  # outside the band, with flanks in it
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ClusterData:
-    """Data that a cluster is fitted to.
+    """Data that a cluster is fitted to: the band of the channels that show any of the modes."""
 
-    Attributes
-    ----------
-    spectra : LogSpectra
-        The band, of the channels that show any of the modes, in units of their noise.
-    unit : ndarray
-        Root of the noise in (m/s²)/Hz^½, shape ``(n_channels,)``.
-    binned : BinnedSpectra
-        In the same units.
-    masks : tuple of ndarray of bool
-        Ordinates of each spectrum without lines.
-    """
-
-    spectra: LogSpectra
-    unit: FloatArray
-    binned: BinnedSpectra
-    masks: tuple[BoolArray, ...]
+    spectra: LogSpectra  # in units of the noise of each channel
+    unit: FloatArray  # root of the noise in (m/s²)/Hz^½, (n_channels,)
+    binned: BinnedSpectra  # in the same units
+    masks: tuple[BoolArray, ...]  # ordinates of each spectrum without lines
 
     @property
     def longest(self) -> int:
@@ -157,28 +135,11 @@ def incoherent_fit(
 ) -> tuple[FloatArray, FloatArray]:
     """Fit strengths of resonances and white noise to binned spectra, for many candidates.
 
-    Multiplicative updates maximise the Whittle likelihood and keep the strengths positive; least
-    squares would depend on the bins that happen to be low.
-
-    Parameters
-    ----------
-    binned : BinnedSpectra
-        Its neighbours have no effect.
-    f, zeta : ndarray
-        Natural frequencies in Hz and damping ratios, shape ``(..., n_modes)``.
-    updates : int
-        Number of updates.
-
-    Returns
-    -------
-    strength : ndarray
-        Modal PSD of each mode, then the noise PSD, shape ``(n_channels, ..., n_modes + 1)``.
-    misfit : ndarray
-        Whittle misfit, shape ``(n_channels, ...)``.
-
-    References
-    ----------
-    Fevotte2009
+    Multiplicative updates [Fevotte2009] maximise the Whittle likelihood and keep the strengths
+    positive; least squares would depend on the bins that happen to be low. Natural frequencies in
+    Hz and damping ratios have shape ``(..., n_modes)``. Returns the modal PSD of each mode, then
+    the noise PSD, ``(n_channels, ..., n_modes + 1)``, and the Whittle misfit, ``(n_channels,
+    ...)``.
     """
     frequency, count = binned.frequency, binned.count
     beta = f[..., None, :] / frequency[:, None]
@@ -208,14 +169,9 @@ def locate(
     """Shift the targets to where all channels show them.
 
     Wear moves all modes of a guide together, so that one mode may reach the described frequency of
-    another: a common shift is searched first, then a small one of each mode.
-
-    Returns
-    -------
-    binned : BinnedSpectra
-        With the neighbours moved by the common shift.
-    targets : tuple of Target
-        At their start values; ``nominal`` holds the described frequency.
+    another: a common shift is searched first, then a small one of each mode. Returns the binned
+    spectra with neighbours at the common shift, and the targets at their start values; ``nominal``
+    holds the described frequency.
     """
     own = len(targets)
     modes = (*targets, *binned.neighbours)

@@ -26,27 +26,13 @@ class LineEstimate(NamedTuple):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ClusterModes:
-    """Estimates of the modes of a cluster.
+    """Estimates of the modes of a cluster."""
 
-    Attributes
-    ----------
-    modes : Modes
-        With shapes over the channels that show any of them.
-    unit : ndarray
-        Root of the noise of these channels in (m/s²)/Hz^½, shape ``(n_channels,)``.
-    clarity : ndarray
-        Gain in log likelihood of the binned spectra by each mode at its start, ``(n_modes,)``.
-    lines : tuple of LineEstimate
-        Lines excluded from the fit.
-    residual : Spectrum
-        Ordinates of the longest observation over their expectation, mean over the channels: one
-        on average where the model fits; exactly one where a line was masked.
-    """
-
-    modes: Modes
-    unit: FloatArray
-    clarity: FloatArray
-    lines: tuple[LineEstimate, ...]
+    modes: Modes  # with shapes over the channels that show any of them
+    unit: FloatArray  # root of the noise of these channels in (m/s²)/Hz^½
+    clarity: FloatArray  # gain in log likelihood of the binned spectra by each mode, (n_modes,)
+    lines: tuple[LineEstimate, ...]  # excluded from the fit
+    # ordinates of the longest observation over their expectation, mean over channels
     residual: Spectrum
 
     @property

@@ -30,32 +30,17 @@ _LEAST_BINS = 12.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Kernel:
-    """Convolution from a power spectral density to the expected periodogram.
+    """Convolution from a power spectral density to the expected periodogram [Sykulski2019].
 
-    A record of length T shows the density convolved with the Fejér kernel T sinc²(T (f - f')).
-    With the density at multiples of 1/(rT) every r-th one is a Fourier frequency. The weights are
+    A record of length T shows the density convolved with the Fejér kernel T sinc²(T (f - f')). With
+    the density at multiples of 1/(rT) every r-th one is a Fourier frequency. The weights are
     normalised so that a constant density is unchanged.
-
-    Attributes
-    ----------
-    grid : ndarray
-        Frequencies of the density in Hz, shape ``(n_grid,)``.
-    place : ndarray of int
-        Indices of the ordinates in the grid, shape ``(n,)``.
-    transform : ndarray
-        Transform of the kernel, zero-padded to the length of the grid.
-    norm : ndarray
-        Sum of the weights of each ordinate, shape ``(n,)``.
-
-    References
-    ----------
-    Sykulski2019
     """
 
-    grid: FloatArray
-    place: NDArray[np.intp]
-    transform: FloatArray
-    norm: FloatArray
+    grid: FloatArray  # frequencies of the density in Hz, (n_grid,)
+    place: NDArray[np.intp]  # of the ordinates in the grid, (n,)
+    transform: FloatArray  # of the kernel, zero-padded to twice the grid
+    norm: FloatArray  # sum of the weights of each ordinate, (n,)
 
     def expect(self, density: ComplexArray | FloatArray) -> ComplexArray:
         """Return expected ordinates, shape ``(..., n)``, of densities ``(..., n_grid)``."""
@@ -98,24 +83,12 @@ def make_kernel(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MeanOrdinates:
-    """Mean ordinates of segments of one length in a band.
+    """Mean ordinates of segments of one length in a band."""
 
-    Attributes
-    ----------
-    frequency : ndarray
-        Mean frequency in Hz, shape ``(n,)``.
-    matrix : ndarray
-        Means of F F*, F the transform of all channels, shape ``(n, n_channels, n_channels)``.
-    count : ndarray
-        Number of ordinates of single segments in each mean, shape ``(n,)``.
-    kernel : Kernel or None
-        From density to expected periodogram; None where they are equal.
-    """
-
-    frequency: FloatArray
-    matrix: ComplexArray
-    count: FloatArray
-    kernel: Kernel | None
+    frequency: FloatArray  # mean in Hz, (n,)
+    matrix: ComplexArray  # F F*, F the transform of all channels, (n, n_channels, n_channels)
+    count: FloatArray  # ordinates of single segments in each mean, (n,)
+    kernel: Kernel | None  # None where density and expected periodogram are equal
 
     @property
     def grid(self) -> FloatArray:
@@ -136,17 +109,9 @@ def average_ordinates(
 ) -> MeanOrdinates:
     """Average the ordinates of segments of one length.
 
-    Parameters
-    ----------
-    spectra : sequence of CrossSpectrum
-        With the same frequencies, cut to the band.
-    keep : sequence of ndarray of bool
-        Ordinates of each without lines, shape ``(n_ordinates,)``.
-    bandwidth : float
-        Smallest half-power bandwidth 2ζf expected, in Hz: decides whether the record resolves it.
-    near : sequence of float, optional
-        Resonances in Hz: neighbours are averaged as far as the density between them is constant.
-        Without it none are.
+    ``keep`` selects the ordinates of each without lines; ``bandwidth``, the smallest 2ζf expected,
+    decides whether the record resolves it. Neighbours are averaged as far as the density between
+    resonances ``near`` is constant; without these none are. Frequencies are in Hz.
     """
     first = spectra[0]
     count = np.zeros(first.frequency.size)

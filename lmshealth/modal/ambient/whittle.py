@@ -34,23 +34,12 @@ from lmshealth.modal.ambient.expected_periodogram import MeanOrdinates
 
 @dataclass(frozen=True, slots=True)
 class Layout:
-    """Places of the unknowns.
-
-    Attributes
-    ----------
-    n_modes, n_channels : int
-        Numbers of modes and channels; the floors of the channels are the components after the
-        modes.
-    force : tuple of (int, int)
-        Row and column of each unknown of L.
-    shape : tuple of (int, int)
-        Channel and mode of each unknown of the shapes.
-    """
+    """Places of the unknowns; the floors of the channels are the components after the modes."""
 
     n_modes: int
     n_channels: int
-    force: tuple[tuple[int, int], ...]
-    shape: tuple[tuple[int, int], ...]
+    force: tuple[tuple[int, int], ...]  # row and column of each unknown of L
+    shape: tuple[tuple[int, int], ...]  # channel and mode of each unknown of the shapes
 
     @property
     def n_components(self) -> int:
@@ -130,12 +119,7 @@ def floor_response(p: FloatArray, u: FloatArray) -> FloatArray:
 def floors(p: FloatArray, u: FloatArray) -> ComplexArray:
     """Return `floor_response` with its derivatives, in the layout of `receptance`.
 
-    Parameters
-    ----------
-    p : ndarray
-        e, d and b of each floor, shape ``(n_floors, 3)``.
-    u : ndarray
-        Position in the band, -1 to 1, shape ``(n,)``.
+    ``p`` holds e, d and b of each floor, ``(n_floors, 3)``; u runs from -1 to 1 over the band.
     """
     basis = np.stack([np.ones_like(u), u, u * u]) / 2
     h = np.exp(p @ basis)
@@ -181,30 +165,14 @@ _ARRIVED, _NEARLY, _MANY_STEPS = 1e-4, 0.1, 25
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Likelihood:
-    """Negative log posterior of the unknowns of a cluster.
+    """Negative log posterior of the unknowns of a cluster."""
 
-    Attributes
-    ----------
-    blocks : tuple of MeanOrdinates
-        One per length of segments.
-    layout : Layout
-        Places of the unknowns.
-    start : ndarray
-        Start value and centre of the priors, shape ``(n_unknowns,)``.
-    scale : ndarray
-        Unit of the rows of L, shape ``(n_components,)``; one for the floors.
-    centre : float
-        Geometric centre of the band in Hz.
-    spread : float
-        Half width of the band in ln f.
-    """
-
-    blocks: tuple[MeanOrdinates, ...]
+    blocks: tuple[MeanOrdinates, ...]  # one per length of segments
     layout: Layout
-    start: FloatArray
-    scale: FloatArray
-    centre: float
-    spread: float
+    start: FloatArray  # and centre of the priors, (n_unknowns,)
+    scale: FloatArray  # unit of the rows of L, one for floors, (n_components,)
+    centre: float  # geometric, of the band in Hz
+    spread: float  # half width of the band in ln f
 
     @property
     def prior_std(self) -> FloatArray:
@@ -542,28 +510,13 @@ def _frequency_last(matrices: ComplexArray | FloatArray) -> ComplexArray:
 
 
 def marginalise(likelihood: Likelihood, p: FloatArray) -> tuple[FloatArray, FloatArray, float]:
-    """Return mean and covariance of ln f and ln ζ by Laplace's approximation.
+    """Return mean and covariance of ``[ln f, ln ζ]`` by Laplace's approximation.
 
     One log hardly constrains how coherent a floor is with modes and other floors, or how it bends;
     neglected, these shift the estimates by up to two standard deviations, and without a prior they
     cost a third of the information. They get a normal prior of unknown width, and the posterior is
-    averaged over the widths, weighted by their evidence.
-
-    Parameters
-    ----------
-    likelihood : Likelihood
-        With its priors.
-    p : ndarray
-        Near the posterior mode, shape ``(n_unknowns,)``.
-
-    Returns
-    -------
-    mean : ndarray
-        ``[ln f, ln ζ]``, shape ``(2 n_modes,)``.
-    cov : ndarray
-        Their covariance, shape ``(2 n_modes, 2 n_modes)``.
-    decrement : float
-        Newton decrement g H⁻¹ g at ``p``; infinite where there is no maximum.
+    averaged over the widths, weighted by their evidence. ``p`` is near the posterior mode; returned
+    last is the Newton decrement g H⁻¹ g there, infinite where there is no maximum.
     """
     n, layout = 2 * likelihood.layout.n_modes, likelihood.layout
     gradient, hessian = likelihood.derivatives(p)

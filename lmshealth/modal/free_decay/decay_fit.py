@@ -49,21 +49,11 @@ _ROUGH = 0.02
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Optimum:
-    """Maximum of the likelihood.
+    """Maximum of the likelihood."""
 
-    Attributes
-    ----------
-    p : ndarray
-        Shape ``(n_parameters,)``.
-    at : Evaluation
-        The likelihood there.
-    decrement : float
-        Gain in log likelihood that the last step predicted.
-    """
-
-    p: FloatArray
+    p: FloatArray  # (n_parameters,)
     at: Evaluation
-    decrement: float
+    decrement: float  # gain in log likelihood that the last step predicted
 
 
 def maximise(
@@ -73,18 +63,9 @@ def maximise(
     *,
     tolerance: float = _STEP_TOLERANCE,
 ) -> Optimum:
-    """Maximise over some parameters by quasi-Newton steps from the Fisher information.
+    """Maximise over the free parameters by quasi-Newton steps from the Fisher information.
 
-    Parameters
-    ----------
-    likelihood : TransientLikelihood
-        Of the decays.
-    p : ndarray
-        Start, shape ``(n_parameters,)``.
-    free : ndarray of int
-        Parameters to maximise over, shape ``(n_free,)``.
-    tolerance : float
-        Gain in log likelihood below which the search ends.
+    The search ends where a step gains less than ``tolerance`` in log likelihood.
     """
     at = likelihood.evaluate(p)
     metric, fresh, decrement = likelihood.metric(at), True, np.inf
@@ -145,22 +126,11 @@ class Average(NamedTuple):
 def average_ambient(
     likelihood: TransientLikelihood, p: FloatArray, mode: int, free: IntArray
 ) -> Average:
-    """Average the posterior over the ambient response of a mode.
+    """Average the posterior over the ambient response of a mode; ``free`` are the other parameters.
 
     A stop shows it at two or three Fourier frequencies near the resonance, and the most probable
-    level is often far below the true one. Intervals at that level cover two times out of
-    three; averaged over all levels under Jeffreys' prior they cover as stated.
-
-    Parameters
-    ----------
-    likelihood : TransientLikelihood
-        Of the decays.
-    p : ndarray
-        Its maximum, shape ``(n_parameters,)``.
-    mode : int
-        Index of the mode.
-    free : ndarray of int
-        The other parameters that are not held, shape ``(n_free,)``.
+    level is often far below the true one. Intervals at that level cover two times out of three;
+    averaged over all levels under Jeffreys' prior they cover as stated.
     """
     place = 2 * likelihood.n_modes + mode
     start = p.copy()
@@ -245,15 +215,7 @@ def _hessian(likelihood: TransientLikelihood, optimum: Optimum, free: IntArray) 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DecayFit:
-    """Poles of the decays in a band, at the maximum of the likelihood.
-
-    Attributes
-    ----------
-    likelihood : TransientLikelihood
-        Of the decays in the band.
-    optimum : Optimum
-        Its maximum.
-    """
+    """Poles of the decays in a band, at the maximum of the likelihood."""
 
     likelihood: TransientLikelihood
     optimum: Optimum
@@ -320,21 +282,11 @@ class DecayFit:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DecayEstimate:
-    """Modes of a band with their joint covariance.
+    """Modes of a band with their joint covariance."""
 
-    Attributes
-    ----------
-    mean : ndarray
-        ``[ln f, ln ζ]`` of n modes, shape ``(2 n,)``.
-    cov : ndarray
-        Shape ``(2 n, 2 n)``.
-    excitation : ndarray
-        Mean square of each mode's vibration at the stops over that of its ambient response,
-        shape ``(n,)``.
-    """
-
-    mean: FloatArray
-    cov: FloatArray
+    mean: FloatArray  # [ln f, ln ζ], (2 n_modes,)
+    cov: FloatArray  # (2 n_modes, 2 n_modes)
+    # mean square of each vibration at the stops over the ambient one, (n_modes,)
     excitation: FloatArray
 
 

@@ -197,12 +197,9 @@ def _limits(
 def _cut(
     log: Log, channels: tuple[Channel, ...], decays: tuple[Segment, ...], skip: float
 ) -> list[FloatArray]:
-    """Cut out decays, those of similar length to one length, the longest first.
+    """Cut out decays, those of similar length to one length.
 
-    Returns
-    -------
-    list of ndarray
-        Shape ``(n_segments, n_samples, n_channels)``.
+    Arrays have shape ``(n_segments, n_samples, n_channels)``, the longest first.
     """
     starts = [s.start + round(skip * (s.stop - s.start)) for s in decays]
     sizes = [s.stop - start for s, start in zip(decays, starts, strict=True)]

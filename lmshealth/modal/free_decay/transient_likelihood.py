@@ -27,28 +27,14 @@ _THIN = 1e-5
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DecaySpectra:
-    """Transforms of decays of one length in a band.
+    """Transforms of decays of one length in a band."""
 
-    Attributes
-    ----------
-    frequency : ndarray
-        Fourier frequencies in Hz, shape ``(n_ordinates,)``.
-    ordinates : ndarray of complex
-        Transform, scaled so that its squared magnitude is the one-sided periodogram, shape
-        ``(n_segments, n_ordinates, n_channels)``.
-    duration : float
-        Length of each decay in s.
-    sample_rate : float
-        In Hz.
-    base : ndarray of complex
-        Orthonormal basis of the leakage from outside the band, ``(n_ordinates, n_base)``.
-    """
-
-    frequency: FloatArray
+    frequency: FloatArray  # in Hz, (n_ordinates,)
+    # root of the one-sided periodogram, (n_segments, n_ordinates, n_channels)
     ordinates: ComplexArray
-    duration: float
-    sample_rate: float
-    base: ComplexArray
+    duration: float  # of each decay in s
+    sample_rate: float  # in Hz
+    base: ComplexArray  # orthonormal, of the leakage from outside the band, (n_ordinates, n_base)
 
     @property
     def stacked(self) -> FloatArray:
@@ -60,19 +46,10 @@ class DecaySpectra:
 def transform_decays(
     samples: FloatArray, sample_rate: float, low: float, high: float
 ) -> DecaySpectra:
-    """Transform decays of one length.
+    """Transform decays, ``(n_segments, n_samples, n_channels)``; the band is in Hz.
 
     A linear trend is represented exactly by a pole at zero frequency; a constant vanishes at
     Fourier frequencies.
-
-    Parameters
-    ----------
-    samples : ndarray
-        Shape ``(n_segments, n_samples, n_channels)``.
-    sample_rate : float
-        In Hz.
-    low, high : float
-        Band in Hz.
     """
     n = samples.shape[1]
     frequency = np.arange(1, (n + 1) // 2) * (sample_rate / n)
@@ -115,22 +92,9 @@ def pole_columns(
 ) -> tuple[FloatArray, FloatArray]:
     """Return transforms of decaying cosines and sines, up to a constant, with derivatives.
 
-    Samples Re(a ρⁿ) transform to c/(1 − ρ z⁻¹) + c*/(1 − ρ* z⁻¹) with c = a (1 − ρᴺ)/2, because
-    z⁻ᴺ = 1 at Fourier frequencies.
-
-    Parameters
-    ----------
-    block : DecaySpectra
-        Its Fourier frequencies.
-    f, zeta : ndarray
-        Natural frequencies in Hz and damping ratios, shape ``(n_modes,)``.
-
-    Returns
-    -------
-    columns : ndarray
-        Of the real and the imaginary part of each c, shape ``(n_modes, 2 n_ordinates, 2)``.
-    slopes : ndarray
-        Their derivatives by ln f and ln ζ, shape ``(2, n_modes, 2 n_ordinates, 2)``.
+    Samples Re(a ρⁿ) transform to c/(1 − ρ z⁻¹) + c*/(1 − ρ* z⁻¹) with c = a (1 − ρᴺ)/2, because z⁻ᴺ
+    = 1 at Fourier frequencies. The columns belong to the real and the imaginary part of each c,
+    ``(n_modes, 2 n_ordinates, 2)``; the slopes are by ln f and ln ζ, ``(2, *columns.shape)``.
     """
     back = np.exp(-2j * np.pi * block.frequency / block.sample_rate)
     omega, root = 2 * np.pi * f / block.sample_rate, np.sqrt(1 - zeta**2)
@@ -177,52 +141,23 @@ def unit_level(f: float, zeta: float, duration: float, *, displacement: bool = F
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Evaluation:
-    """Restricted likelihood at one point.
+    """Restricted likelihood at one point."""
 
-    Attributes
-    ----------
-    value : float
-        Negative log restricted likelihood.
-    profile : float
-        Negative log likelihood at the best sizes: comparable between numbers of modes, unlike
-        ``value``.
-    gradient : ndarray
-        Gradient of ``value``, shape ``(n_parameters,)``.
-    fisher : ndarray
-        Fisher information of the likelihood at the best sizes, shape
-        ``(n_parameters, n_parameters)``.
-    fits : tuple of BlockFit
-        Residual of each block.
-    """
-
-    value: float
-    profile: float
-    gradient: FloatArray
-    fisher: FloatArray
-    fits: tuple[BlockFit, ...]
+    value: float  # negative log restricted likelihood
+    profile: float  # -ln L at the best sizes: comparable between numbers of modes
+    gradient: FloatArray  # of value, (n_parameters,)
+    fisher: FloatArray  # information at the best sizes, (n_parameters, n_parameters)
+    fits: tuple[BlockFit, ...]  # one per block
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BlockFit:
-    """Least-squares fit of a whitened block.
+    """Least-squares fit of a whitened block; ``n_rows`` is ``2 n_ordinates n_channels``."""
 
-    Attributes
-    ----------
-    residual : ndarray
-        White with variance one half, shape ``(2 n_ordinates n_channels, n_segments)``.
-    sizes : ndarray
-        Of each column, those of the base first, shape ``(n_channels, n_columns, n_segments)``.
-    removed : ndarray
-        Orthonormal basis of the fitted columns, shape ``(2 n_ordinates n_channels, n_removed)``.
-    tangent : ndarray
-        Derivative of the whitened transients by ln f and ln ζ of each mode, orthogonal to the
-        columns, shape ``(2 n_modes, 2 n_ordinates n_channels, n_segments)``.
-    """
-
-    residual: FloatArray
-    sizes: FloatArray
-    removed: FloatArray
-    tangent: FloatArray
+    residual: FloatArray  # white with variance one half, (n_rows, n_segments)
+    sizes: FloatArray  # of each column, the base first, (n_channels, n_columns, n_segments)
+    removed: FloatArray  # orthonormal basis of the fitted columns, (n_rows, n_removed)
+    tangent: FloatArray  # slopes by ln f and ln ζ less the columns, (2 n_modes, n_rows, n_segments)
 
 
 @dataclass(frozen=True, eq=False)
@@ -231,32 +166,16 @@ class TransientLikelihood:
 
     The ``3 n_modes + 2 n_channels`` parameters are ``[ln f, ln ζ, h]`` of all modes, then the
     logarithm of the white noise's power spectral density in mid-band and its slope for each
-    channel. The covariance of the noise at a frequency is diag(S_e) + Σ h² D φφᵀ.
-
-    Attributes
-    ----------
-    blocks : tuple of DecaySpectra
-        Data.
-    shapes : ndarray
-        Mode shapes φ, shape ``(n_modes, n_channels)``.
-    units : ndarray
-        Divisors of D, shape ``(n_modes,)``.
-    levels : ndarray
-        Prior mean of the white noise's logarithm, shape ``(n_channels,)``, which alone constrains
-        it where the ambient response hides it.
-    displacement : bool
-        D is that of a displacement instead of an acceleration.
-
-    References
-    ----------
-    Harville1977, Pintelon2012
+    channel. The covariance of the noise at a frequency is diag(S_e) + Σ h² D φφᵀ [Harville1977,
+    Pintelon2012]. The prior of the white noise alone constrains it where the ambient response hides
+    it.
     """
 
     blocks: tuple[DecaySpectra, ...]
-    shapes: FloatArray
-    units: FloatArray
-    levels: FloatArray
-    displacement: bool = False
+    shapes: FloatArray  # φ, (n_modes, n_channels)
+    units: FloatArray  # divisors of D, (n_modes,)
+    levels: FloatArray  # prior mean of the white noise's logarithm, (n_channels,)
+    displacement: bool = False  # D is that of a displacement
 
     @property
     def n_modes(self) -> int:
@@ -444,9 +363,8 @@ def _volume_slope(
 ) -> FloatArray:
     """Differentiate the log volume of the whitened columns less that of the plain ones.
 
-    ``columns`` has shape ``(2 n_ordinates, n_columns)``, those of the poles last; ``turned`` as in
-    `pole_columns`; ``whiten`` has shape ``(2 n_ordinates, n_channels, n_channels)``; ``q``, ``r``
-    are the factors of the whitened columns. The result, by ln f and ln ζ: ``(2 n_modes,)``.
+    ``columns``, ``(2 n_ordinates, n_columns)``, end with those of the poles, whose slopes are
+    ``turned``; ``q`` and ``r`` are the factors of the whitened columns.
     """
     n, m = whiten.shape[1], turned.shape[1]
     whitened = linalg.solve_triangular(r, q.T, check_finite=False)

@@ -24,21 +24,11 @@ _LAG_PERIODS = 8.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FrfReading:
-    """Frequency response of one channel to another, and its modes.
+    """Frequency response of one channel to another, and its modes."""
 
-    Attributes
-    ----------
-    frf : Frf
-        Measured response.
-    fit : ResponseFit
-        Rational transfer function fitted to it.
-    modes : Modes
-        Credible modes, and why others are refused.
-    """
-
-    frf: Frf
-    fit: ResponseFit
-    modes: Modes
+    frf: Frf  # measured response
+    fit: ResponseFit  # rational transfer function fitted to it
+    modes: Modes  # credible modes, and why others are refused
 
 
 def read_frf(

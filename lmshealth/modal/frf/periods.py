@@ -26,23 +26,11 @@ _BLOCK = 1 << 14
 
 
 def find_period(values: FloatArray, stated: float | None = None) -> float | None:
-    """Estimate the period of a signal in samples.
+    """Estimate the period of a signal in samples, in general no whole number; None without one.
 
     The autocorrelation has a peak at the period and at each multiple. The last one determines the
-    period to a small fraction of a sample.
-
-    Parameters
-    ----------
-    values : ndarray
-        Shape ``(n_samples,)``.
-    stated : float, optional
-        Approximate period, at most half the record: the peak is searched for within 1 % of it, and
-        where there is none this value is returned.
-
-    Returns
-    -------
-    float or None
-        Period in samples, in general no whole number; None for a signal that is not periodic.
+    period to a small fraction of a sample. The peak is searched for within 1 % of a stated period,
+    at most half the record; where there is none this is returned.
     """
     correlation = _autocorrelation(values)
     n = values.size
@@ -107,27 +95,13 @@ def _refine(correlation: FloatArray, period: int) -> float:
 
 
 def cut_periods(signals: Sequence[FloatArray], period: float) -> tuple[ComplexArray, float]:
-    """Transform a record period by period.
+    """Transform a record period by period; return harmonics and the period as used, in samples.
 
-    The last period ends with the record. A drift is removed first by the slope between the means
-    of periods, which hold no harmonic; a line fitted to a period would remove part of every
-    harmonic. A period that is no whole number of samples is interpolated onto a grid with a whole
-    number: cut at the nearest sample, every period would leak differently.
-
-    Parameters
-    ----------
-    signals : sequence of ndarray
-        Shape ``(n_samples,)`` each.
-    period : float
-        In samples; at most half the record.
-
-    Returns
-    -------
-    spectra : ndarray of complex
-        Amplitudes of the harmonics 0, 1, … of every signal and period: a sine of amplitude A has
-        modulus A, shape ``(n_signals, n_periods, n_harmonics)``.
-    period : float
-        In samples, as used.
+    The last period ends with the record. A drift is removed first by the slope between the means of
+    periods, which hold no harmonic; a line fitted to a period would remove part of every harmonic.
+    A period that is no whole number of samples is interpolated onto a grid with a whole number: cut
+    at the nearest sample, every period would leak differently. Amplitudes of the harmonics 0, 1, …
+    have shape ``(n_signals, n_periods, n_harmonics)``: a sine of amplitude A has modulus A.
     """
     n = signals[0].size
     whole = round(period)

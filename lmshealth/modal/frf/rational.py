@@ -27,30 +27,14 @@ _BLOCK = 128
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Ordinates:
-    """Spectra of an input and an output at the lines of a band.
+    """Spectra of an input and an output at the lines of a band, arrays ``(n_lines,)``."""
 
-    Attributes
-    ----------
-    frequency : ndarray
-        In Hz, ascending, shape ``(n_lines,)``.
-    given, answer : ndarray of complex
-        Amplitudes of input and output, shape ``(n_lines,)``.
-    noise : ndarray
-        Variance of ``answer - H given`` by noise, shape ``(n_lines,)``; a start value where the
-        excitation is not periodic.
-    freedom : float
-        Complex degrees of freedom of each variance.
-    periodic : bool
-        Whether they are means over whole periods: without transient, and with the noise from the
-        scatter over periods.
-    """
-
-    frequency: FloatArray
-    given: ComplexArray
-    answer: ComplexArray
-    noise: FloatArray
-    freedom: float
-    periodic: bool
+    frequency: FloatArray  # in Hz, ascending
+    given: ComplexArray  # amplitudes of the input
+    answer: ComplexArray  # of the output
+    noise: FloatArray  # variance of answer - H given by noise; without periods a start value
+    freedom: float  # complex degrees of freedom of each variance
+    periodic: bool  # means over whole periods: no transient, noise from their scatter
 
     def __post_init__(self) -> None:
         freeze(self)
@@ -73,19 +57,11 @@ class Ordinates:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Order:
-    """Order of a model, with start values of its modes.
+    """Order of a model, with start values of its modes."""
 
-    Attributes
-    ----------
-    theta : ndarray
-        ``[ln f, ln ζ]`` of the modes, shape ``(2 n_modes,)``.
-    low, high : int
-        Lowest and highest power of s.
-    """
-
-    theta: FloatArray
-    low: int
-    high: int
+    theta: FloatArray  # [ln f, ln ζ] of the modes, (2 n_modes,)
+    low: int  # lowest power of s
+    high: int  # highest power of s
 
     @property
     def n_modes(self) -> int:
@@ -116,31 +92,14 @@ class Order:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Solution:
-    """A model with its linear unknowns.
+    """A model with its linear unknowns; ``parts`` holds the modes and the background."""
 
-    Attributes
-    ----------
-    basis : ndarray
-        Orthonormal basis of the whitened columns of the linear unknowns, shape ``(2 n_lines, n)``.
-    residues : ndarray of complex
-        Over the centre of the band in rad/s, shape ``(n_modes,)``.
-    swing : ndarray of complex
-        The same of the transient.
-    error : ndarray of complex
-        Measured less fitted answer, shape ``(n_lines,)``.
-    response : ndarray of complex
-        The fitted H, shape ``(n_lines,)``.
-    parts : ndarray
-        Sum of the powers of the parts of H: each mode, and the background of powers of s and
-        heavily damped poles; shape ``(n_lines,)``.
-    """
-
-    basis: FloatArray
-    residues: ComplexArray
-    swing: ComplexArray
-    error: ComplexArray
-    response: ComplexArray
-    parts: FloatArray
+    basis: FloatArray  # orthonormal, of the whitened columns of the linear unknowns, (2 n_lines, n)
+    residues: ComplexArray  # over the centre of the band in rad/s, (n_modes,)
+    swing: ComplexArray  # the same of the transient
+    error: ComplexArray  # measured less fitted answer, (n_lines,)
+    response: ComplexArray  # the fitted H, (n_lines,)
+    parts: FloatArray  # sum of the powers of the parts of H, (n_lines,)
 
 
 def stack(values: ComplexArray) -> FloatArray:
@@ -207,12 +166,8 @@ def slopes(
 ) -> FloatArray:
     """Differentiate the whitened error by ``[ln f, ln ζ]``, shape ``(2 n_lines, 2 n_modes)``.
 
-    The linear unknowns are projected out (Kaufman's form of variable projection): the product with
-    its transpose is the Fisher information of ln f and ln ζ, all else marginalised.
-
-    References
-    ----------
-    Golub2003
+    The linear unknowns are projected out (Kaufman's variable projection [Golub2003]): the product
+    with its transpose is the Fisher information of ln f and ln ζ, all else marginalised.
     """
     s, pole = _poles(ordinates, order)
     _, zeta = order.modes

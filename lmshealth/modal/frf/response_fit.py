@@ -97,21 +97,8 @@ def fit_response(ordinates: Ordinates) -> ResponseFit:
     over neighbouring lines.
 
     The covariance is the inverse of the Fisher information, widened where errors of neighbouring
-    lines correlate; those of a distortion count as one within a half-power bandwidth.
-
-    Parameters
-    ----------
-    ordinates : Ordinates
-        Lines of a band.
-
-    Returns
-    -------
-    ResponseFit
-        Without modes where none is significant.
-
-    References
-    ----------
-    Pintelon2012
+    lines correlate; those of a distortion count as one within a half-power bandwidth
+    [Pintelon2012].
     """
     start = Order(np.empty(0), -_FEWEST_POWERS, _FEWEST_POWERS)
     state = _grow(_settle(ordinates, start, ordinates.noise))

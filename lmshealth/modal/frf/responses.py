@@ -25,24 +25,11 @@ _LEAST_RATIO, _LARGEST_RATIO = 1e-6, 1e6
 
 
 def smooth_noise(power: FloatArray, response: FloatArray, width: int) -> FloatArray:
-    """Average the power of noise over neighbouring lines, and preserve its resonances.
+    """Average the power of noise over ``width`` neighbouring lines, and preserve its resonances.
 
     Forces on the machine excite resonances narrower than the average. The power is divided by the
-    shape a + b |H|² of greatest likelihood for exponential variables, averaged and multiplied.
-
-    Parameters
-    ----------
-    power : ndarray
-        Shape ``(n_lines,)``.
-    response : ndarray
-        |H|² up to a factor, shape ``(n_lines,)``.
-    width : int
-        Lines to average over.
-
-    Returns
-    -------
-    ndarray
-        Shape ``(n_lines,)``.
+    shape a + b |H|² of greatest likelihood for exponential variables, averaged and multiplied;
+    ``response`` is |H|² up to a factor, all of shape ``(n_lines,)``.
     """
     relative = response / response.max()
     power = np.maximum(power, np.finfo(float).tiny)
@@ -118,24 +105,12 @@ class Frf:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Pair:
-    """Signals of an input and an output.
-
-    Attributes
-    ----------
-    log : Log
-        Source of the signals.
-    names : (str, str)
-        Of input and output.
-    signals : (ndarray, ndarray)
-        Shape ``(n_samples,)`` each.
-    lag : int
-        Lag in samples of a second difference of both; 0 for none.
-    """
+    """Signals of an input and an output."""
 
     log: Log
-    names: tuple[str, str]
-    signals: tuple[FloatArray, FloatArray]
-    lag: int
+    names: tuple[str, str]  # of input and output
+    signals: tuple[FloatArray, FloatArray]  # (n_samples,) each
+    lag: int  # in samples of a second difference of both; 0 for none
 
     def gain(self, frequency: FloatArray) -> FloatArray:
         """Return the gain of the difference at frequencies in Hz."""
@@ -145,16 +120,7 @@ class Pair:
 
 
 def from_periods(pair: Pair, band: tuple[float, float], period: float) -> tuple[Frf, Ordinates]:
-    """Average whole periods; their scatter is the noise.
-
-    Parameters
-    ----------
-    pair : Pair
-        With a periodic input.
-    band : (float, float)
-        In Hz.
-    period : float
-        In samples.
+    """Average whole periods of ``period`` samples; their scatter is the noise.
 
     Raises
     ------
@@ -248,13 +214,6 @@ def _is_transient(answer: ComplexArray) -> bool:
 
 def from_record(pair: Pair, band: tuple[float, float]) -> tuple[Frf, Ordinates]:
     """Average half overlapping stretches for the response; transform the record for its modes.
-
-    Parameters
-    ----------
-    pair : Pair
-        With any input.
-    band : (float, float)
-        In Hz.
 
     Raises
     ------
