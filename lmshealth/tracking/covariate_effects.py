@@ -17,31 +17,16 @@ from lmshealth.tracking.track import Effect, Track, accepted_estimates
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CovariateEffect:
-    """Effect of a covariate on a mode, and the estimates that it was regressed on.
-
-    Attributes
-    ----------
-    mode, covariate : str
-        Names.
-    reference : float
-        The covariate at which the effect is zero.
-    effects : tuple of Effect
-        Per unit, and per unit squared where the description has a curvature.
-    epochs : ndarray of int
-        Logs of the estimates, shape ``(n,)``.
-    values : ndarray
-        The covariate in these logs, shape ``(n,)``.
-    measured : ndarray
-        ln f minus its smoothed level, steps, biases and other covariates, shape ``(n,)``. The
-        smoothed level follows the logs: residuals scatter less than the estimates' errors.
-    """
+    """Effect of a covariate on a mode, and the n estimates that it was regressed on."""
 
     mode: str
     covariate: str
-    reference: float
-    effects: tuple[Effect, ...]
-    epochs: np.ndarray
-    values: FloatArray
+    reference: float  # the covariate at which the effect is zero
+    effects: tuple[Effect, ...]  # per unit, and per unit squared where there is a curvature
+    epochs: np.ndarray  # logs of the estimates, ``(n,)``
+    values: FloatArray  # the covariate in these logs, ``(n,)``
+    # ln f minus its smoothed level, steps, biases and other covariates, ``(n,)``. The level follows
+    # the logs: residuals scatter less than the estimates' errors.
     measured: FloatArray
 
     def __post_init__(self) -> None:
@@ -74,45 +59,26 @@ class CovariateEffect:
 def find_covariate_effects(
     history: History, track: Track, stage: Stage
 ) -> tuple[CovariateEffect, ...]:
-    """Return the effect of every described covariate on every mode.
+    """Return the effect of every described covariate on every mode, without outliers of the track.
 
-    Parameters
-    ----------
-    history : History
-        Modal estimates; outliers of the track are left out.
-    track : Track
-        Their track.
-    stage : Stage
-        Description that names the covariates.
-
-    Returns
-    -------
-    tuple of CovariateEffect
-        In the order of the description; none for a covariate that is unknown or never left its
-        reference.
+    The order is that of the description; a covariate that is unknown or never left its reference
+    has no effect.
     """
     columns = regressors(history.covariates, stage)
     if not columns:
         return ()
-    taken, known = (
-        accepted_estimates(history, track),
-        {(e.mode, e.covariate): e for e in track.effects},
-    )
+    taken = accepted_estimates(history, track)
+    known = {(e.mode, e.covariate): e for e in track.effects}
     level = smooth(taken, track, stage).ln_frequency
-    modes = [one.mode for one in taken.series]
-    moved = covariate_shifts(history, track, stage)
-    places = [track.modes.index(mode) for mode in modes]
-    rest = taken.ln_frequency - level[:, places] - moved[:, places] - _offsets(taken, known)
+    moved, mode_of = covariate_shifts(history, track, stage), taken.mode_of()
+    rest = taken.ln_frequency - level[:, mode_of] - moved[:, mode_of] - _offsets(taken, known)
     found = []
     for covariate in stage.description.covariate:
         own = [r for r in columns if r.name.removesuffix("^2") == covariate.name]
         for mode in track.modes if own else ():
             effects = tuple(known[mode, r.name] for r in own)
-            at = [i for i, name in enumerate(modes) if name == mode]
-            there = (
-                np.isfinite(rest[:, at]) & np.isfinite(history.covariates[covariate.name])[:, None]
-            )
-            epochs, series = np.nonzero(there)
+            at, values = history.columns(mode), history.covariates[covariate.name]
+            epochs, series = np.nonzero(np.isfinite(rest[:, at]) & np.isfinite(values)[:, None])
             explained = _explained(own, effects)
             found.append(
                 CovariateEffect(
@@ -121,7 +87,7 @@ def find_covariate_effects(
                     reference=covariate.reference,
                     effects=effects,
                     epochs=epochs,
-                    values=history.covariates[covariate.name][epochs],
+                    values=values[epochs],
                     measured=rest[:, at][epochs, series] + explained[epochs],
                 )
             )

@@ -6,6 +6,7 @@ from bisect import bisect_right
 from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from itertools import pairwise
 from typing import Literal
 
 import numpy as np
@@ -41,30 +42,17 @@ class Series:
 class Step:
     """A sudden change of the estimates between two logs.
 
-    Attributes
-    ----------
-    kind : str
-        ``step``: the modes change without a declared cause. ``regreasing``: their dampings change.
-        ``servo``: the closed loop changes, in all sources, and ``sensor``: one source does; neither
-        is drift. ``reset``: work on guide or mount, which opens a new baseline.
-    first : int
-        Index of the first log after it.
-    there : ndarray of bool
-        Logs that it applies to, shape ``(n_logs,)``.
-    source : str
-        Of a sensor; empty for all sources.
-    name : str
-        Its ``servo_id``, or a date.
-    declared : bool
-        Whether it was declared, else it was detected.
+    ``step``: the modes change without a declared cause. ``regreasing``: their dampings change.
+    ``servo``: the closed loop changes, in all sources, and ``sensor``: one source does; neither is
+    drift. ``reset``: work on guide or mount, which opens a new baseline.
     """
 
     kind: StepKind
-    first: int
-    there: BoolArray
-    source: str = ""
-    name: str = ""
-    declared: bool = True
+    first: int  # first log after it
+    there: BoolArray  # logs that it applies to, ``(n_logs,)``
+    source: str = ""  # of a sensor; empty for all sources
+    name: str = ""  # its ``servo_id``, or a date
+    declared: bool = True  # else it was detected
 
     def __post_init__(self) -> None:
         freeze(self)
@@ -82,51 +70,23 @@ class Step:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class History:
-    """All modal estimates of one stage, in the order of recording.
+    """All modal estimates of one stage, in the order of recording."""
 
-    Attributes
-    ----------
-    stage : str
-        Identity of the machine.
-    logs : tuple of str
-        Log names.
-    recorded_at : tuple of datetime
-        Ascending.
-    travel : ndarray
-        Odometer in m, shape ``(n_logs,)``; NaN throughout where there is none.
-    covariates : dict of str to ndarray
-        Column name to values, each of shape ``(n_logs,)``, NaN where unknown.
-    modes : tuple of str
-        Mode names.
-    series : tuple of Series
-        Columns of the estimates.
-    ln_frequency, ln_damping : ndarray
-        Shape ``(n_logs, n_series)``, NaN where the mode was not found.
-    cov : ndarray
-        Covariance of ``[ln_frequency, ln_damping]`` per log, shape
-        ``(n_logs, 2 n_series, 2 n_series)``, NaN in rows and columns of what is missing.
-    loop_error : ndarray
-        RMS of the following error below 40 Hz in m, shape ``(n_logs,)``, NaN where unknown.
-    baselines : tuple of int
-        Indices of the logs at which health is one by definition: the first, and one after every
-        reset, ascending.
-    steps : tuple of Step
-        Declared steps, in order.
-    """
-
-    stage: str
-    logs: tuple[str, ...]
-    recorded_at: tuple[datetime, ...]
-    travel: FloatArray
-    covariates: dict[str, FloatArray]
-    modes: tuple[str, ...]
-    series: tuple[Series, ...]
-    ln_frequency: FloatArray
-    ln_damping: FloatArray
+    stage: str  # identity of the machine
+    logs: tuple[str, ...]  # their names
+    recorded_at: tuple[datetime, ...]  # ascending
+    travel: FloatArray  # odometer in m, ``(n_logs,)``; NaN throughout where there is none
+    covariates: dict[str, FloatArray]  # by column name, ``(n_logs,)`` each, NaN where unknown
+    modes: tuple[str, ...]  # their names
+    series: tuple[Series, ...]  # columns of the estimates
+    ln_frequency: FloatArray  # ln of Hz, ``(n_logs, n_series)``, NaN where the mode was not found
+    ln_damping: FloatArray  # ln ζ, likewise
+    # Covariance of ``[ln_frequency, ln_damping]``, ``(n_logs, 2 n_series, 2 n_series)``, NaN in the
+    # rows and columns of what is missing.
     cov: FloatArray
-    loop_error: FloatArray
-    baselines: tuple[int, ...]
-    steps: tuple[Step, ...] = ()
+    loop_error: FloatArray  # RMS following error below 40 Hz in m, ``(n_logs,)``, NaN where unknown
+    baselines: tuple[int, ...]  # logs at which health is 1: the first, and one after each reset
+    steps: tuple[Step, ...] = ()  # declared ones, in order
 
     def __post_init__(self) -> None:
         n, r = len(self.logs), len(self.series)
@@ -151,9 +111,8 @@ class History:
         ):
             back = np.flatnonzero(np.diff(ticks) < 0)
             if back.size:
-                raise ValueError(
-                    f"{name} runs backwards at {self.logs[back[0] + 1]}: sort the logs"
-                )
+                log = self.logs[back[0] + 1]
+                raise ValueError(f"{name} runs backwards at {log}: sort the logs")
 
     def _expect_errors(self) -> None:
         """Require a covariance of every estimate, with positive variances."""
@@ -202,10 +161,8 @@ class LogEstimates:
 
     Attributes
     ----------
-    log : str
-        Name of the log.
-    digest : str
-        SHA-256 of its content.
+    log, digest : str
+        Name of the log, and SHA-256 of its content.
     metadata : Metadata
         With identity of the machine, moment and odometer.
     modes : Modes
@@ -291,15 +248,17 @@ def build_history(
         name = "" if stage is None else f"{stage.name}: "
         raise NotEnoughData(f"{name}no usable log")
     ordered, refused = _without_contradictions(sort_by_time(readings))
-    travel = np.array(
-        [np.nan if r.metadata.travel is None else r.metadata.travel for r in ordered], dtype=float
-    )
+    # Missing values are None here and NaN in arrays.
+    travel = np.array([r.metadata.travel for r in ordered], dtype=float)
     moments = tuple(r.metadata.recorded_at or _NO_MOMENT for r in ordered)
     has_odometer = bool(np.isfinite(travel).all())
     clock = travel if has_odometer else np.array([moment.timestamp() for moment in moments])
-    covariates = _covariates(ordered)
+    names = sorted({name for reading in ordered for name in reading.metadata.covariates})
+    covariates = {
+        name: np.array([r.metadata.covariates.get(name) for r in ordered], dtype=float)
+        for name in names
+    }
     steps = _steps(ordered, actions)
-    resets = [step.first for step in steps if step.kind == "reset"]
     regressed = regressors(covariates, stage)
     estimates = _estimates(ordered, stage)
     found = associate(
@@ -311,7 +270,6 @@ def build_history(
     )
     refused += _unassigned(ordered, estimates, found)
     modes, series, columns = _line_up(estimates, found, stage)
-    declared = [k for k, reading in enumerate(ordered) if reading.metadata.baseline]
     history = History(
         stage=str(ordered[0].metadata.stage),
         logs=tuple(reading.log for reading in ordered),
@@ -322,7 +280,7 @@ def build_history(
         series=series,
         **columns,
         loop_error=np.array([r.loop_error or np.nan for r in ordered], dtype=float),
-        baselines=_baselines(declared, resets, len(ordered)),
+        baselines=_baselines(ordered, steps),
         steps=steps,
     )
     return history, refused
@@ -364,14 +322,6 @@ def _without_contradictions(
     return tuple(ordered[k] for k in sorted(kept)), refused
 
 
-def _covariates(ordered: Sequence[LogEstimates]) -> dict[str, FloatArray]:
-    names = sorted({name for reading in ordered for name in reading.metadata.covariates})
-    return {
-        name: np.array([r.metadata.covariates.get(name, np.nan) for r in ordered], dtype=float)
-        for name in names
-    }
-
-
 def _steps(ordered: Sequence[LogEstimates], actions: Sequence[Action]) -> tuple[Step, ...]:
     """Return the declared steps between the logs."""
     moments = [reading.metadata.recorded_at for reading in ordered]
@@ -397,15 +347,16 @@ def _steps(ordered: Sequence[LogEstimates], actions: Sequence[Action]) -> tuple[
     return tuple(sorted(steps, key=lambda step: step.first))
 
 
-def _baselines(declared: list[int], resets: list[int], n_logs: int) -> tuple[int, ...]:
+def _baselines(ordered: Sequence[LogEstimates], steps: Sequence[Step]) -> tuple[int, ...]:
     """Return the first log of each baseline: the first declared one since the last reset."""
-    begins = [0, *resets]
-    ends = [*resets, n_logs]
-    chosen = [
-        next((k for k in declared if begin <= k < end), begin)
-        for begin, end in zip(begins, ends, strict=True)
-    ]
-    return tuple(dict.fromkeys(chosen))
+    declared = [k for k, reading in enumerate(ordered) if reading.metadata.baseline]
+    begins = [0, *(step.first for step in steps if step.kind == "reset"), len(ordered)]
+    return tuple(
+        dict.fromkeys(
+            next((k for k in declared if begin <= k < end), begin)
+            for begin, end in pairwise(begins)
+        )
+    )
 
 
 def _estimates(ordered: Sequence[LogEstimates], stage: Stage | None) -> list[Estimates]:
@@ -469,47 +420,33 @@ def _line_up(
 ) -> tuple[tuple[str, ...], tuple[Series, ...], dict[str, FloatArray]]:
     """Put the estimates of every mode and source in a column; missing ones are NaN."""
     # A jump keeps its name: the tracker decides whether it is an outlier or a step.
-    given = [
-        [
-            name if label.reason == "jump" else label.mode
-            for name, label in zip(e.names, own, strict=True)
-        ]
-        for e, own in zip(estimates, found.labels, strict=True)
+    assigned = [
+        (k, i, (name if label.reason == "jump" else label.mode, source))
+        for k, (one, labels) in enumerate(zip(estimates, found.labels, strict=True))
+        for i, (name, source, label) in enumerate(zip(one.names, one.sources, labels, strict=True))
     ]
-    seen = {
-        (mode, source)
-        for own, one in zip(given, estimates, strict=True)
-        for mode, source in zip(own, one.sources, strict=True)
-        if mode is not None
-    }
+    seen = {(mode, source) for _, _, (mode, source) in assigned if mode is not None}
     order = found.modes
     if stage is not None:
         order = tuple(mode.name for mode in stage.modes if mode.tracked)
     named = {mode for mode, _ in seen}
     modes = tuple(mode for mode in order if mode in named)
-    sources = sorted({source for _, source in seen}, key=_rank)
+    sources = [*_SOURCES, *sorted({source for _, source in seen} - {*_SOURCES})]
     series = tuple(Series(m, s) for m in modes for s in sources if (m, s) in seen)
     places = {(one.mode, one.source): i for i, one in enumerate(series)}
+    pairs: list[list[tuple[int, int]]] = [[] for _ in estimates]
+    for k, i, (mode, source) in assigned:
+        if mode is not None and (mode, source) in places:
+            pairs[k].append((places[mode, source], i))
     n, r = len(estimates), len(series)
     ln_f, ln_zeta = np.full((n, r), np.nan), np.full((n, r), np.nan)
     cov = np.full((n, 2 * r, 2 * r), np.nan)
-    for k, (own, one) in enumerate(zip(given, estimates, strict=True)):
-        pairs = [
-            (places[mode, source], i)
-            for i, (mode, source) in enumerate(zip(own, one.sources, strict=True))
-            if mode is not None and (mode, source) in places
-        ]
-        if not pairs:
-            continue
-        to, of = (np.array(side) for side in zip(*pairs, strict=True))
+    for k, one in enumerate(estimates):
+        to, of = np.array(pairs[k], dtype=int).reshape(-1, 2).T
         ln_f[k, to], ln_zeta[k, to] = one.ln_frequency[of], one.ln_damping[of]
-        to, of = np.concatenate([to, to + r]), np.concatenate([of, of + len(own)])
+        to, of = np.concatenate([to, to + r]), np.concatenate([of, of + len(one.names)])
         cov[k, to[:, None], to] = one.cov[of[:, None], of]
     return modes, series, {"ln_frequency": ln_f, "ln_damping": ln_zeta, "cov": cov}
-
-
-def _rank(source: str) -> tuple[int, str]:
-    return (_SOURCES.index(source) if source in _SOURCES else len(_SOURCES), source)
 
 
 def missing_mode_notes(history: History, refused: Sequence[Refusal]) -> list[str]:

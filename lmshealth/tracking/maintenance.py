@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
 from datetime import datetime
 from pathlib import Path
 
@@ -33,34 +33,18 @@ class Action:
 
 @dataclass(frozen=True, slots=True)
 class Unread:
-    """A refused row or table of ``maintenance.csv``.
+    """A refused row or table of ``maintenance.csv``."""
 
-    Attributes
-    ----------
-    refusal : Refusal
-        Under the name of the table.
-    stage : str or None
-        The machine of the row, empty where it names none; None for a whole table.
-    """
-
-    refusal: Refusal
-    stage: str | None
+    refusal: Refusal  # under the name of the table
+    stage: str | None  # machine of the row, empty where it names none; None for a whole table
 
 
 @dataclass(frozen=True, slots=True)
 class Maintenance:
-    """Actions, and rows that cannot be read.
+    """Actions, and rows that cannot be read."""
 
-    Attributes
-    ----------
-    actions : tuple of Action
-        In the order of time.
-    unread : tuple of Unread
-        Possible further actions.
-    """
-
-    actions: tuple[Action, ...] = ()
-    unread: tuple[Unread, ...] = ()
+    actions: tuple[Action, ...] = ()  # in the order of time
+    unread: tuple[Unread, ...] = ()  # possible further actions
 
     @property
     def refused(self) -> tuple[Refusal, ...]:
@@ -88,11 +72,8 @@ def read_maintenance(folder: Path) -> Maintenance:
         If the path is no folder.
     """
     found = find_sheets(folder, _FILE)
-    actions: list[Action] = []
-    unread = [Unread(refusal, None) for refusal in found.refused]
-    for path in found.logs:
-        _read(path, name_of(path, folder), actions, unread)
-    return Maintenance(tuple(sorted(actions, key=lambda a: a.recorded_at)), tuple(unread))
+    work = _read((path, name_of(path, folder)) for path in found.logs)
+    return replace(work, unread=(*(Unread(one, None) for one in found.refused), *work.unread))
 
 
 def read_actions(path: Path) -> tuple[Action, ...]:
@@ -103,24 +84,27 @@ def read_actions(path: Path) -> tuple[Action, ...]:
     BadTable
         If any row cannot be read.
     """
+    work = _read([(path, shown(path))])
+    for one in work.unread:
+        raise BadTable(f"{one.refusal.log}, {one.refusal.detail}")
+    return work.actions
+
+
+def _read(tables: Iterable[tuple[Path, str]]) -> Maintenance:
+    """Read tables, each with the name that its refusals have."""
     actions: list[Action] = []
     unread: list[Unread] = []
-    _read(path, shown(path), actions, unread)
-    for one in unread:
-        raise BadTable(f"{one.refusal.log}, {one.refusal.detail}")
-    return tuple(sorted(actions, key=lambda a: a.recorded_at))
-
-
-def _read(path: Path, name: str, actions: list[Action], unread: list[Unread]) -> None:
-    try:
-        for row in read_sheet(path, _NEEDED):
-            try:
-                actions.append(_action(row))
-            except Unusable as error:
-                refusal = Refusal(name, "bad-row", f"{row.where}: {error.detail}")
-                unread.append(Unread(refusal, _machine(row)))
-    except Unusable as error:
-        unread.append(Unread(Refusal(name, error.reason, error.detail), None))
+    for path, name in tables:
+        try:
+            for row in read_sheet(path, _NEEDED):
+                try:
+                    actions.append(_action(row))
+                except Unusable as error:
+                    refusal = Refusal(name, "bad-row", f"{row.where}: {error.detail}")
+                    unread.append(Unread(refusal, _machine(row)))
+        except Unusable as error:
+            unread.append(Unread(Refusal(name, error.reason, error.detail), None))
+    return Maintenance(tuple(sorted(actions, key=lambda a: a.recorded_at)), tuple(unread))
 
 
 def _action(row: Row) -> Action:
@@ -148,12 +132,7 @@ def _machine(row: Row) -> str:
 def maintenance_notes(work: Maintenance, moments: Sequence[datetime | None]) -> list[str]:
     """Return notes for a report: rows that cannot be read, and new baselines.
 
-    Parameters
-    ----------
-    work : Maintenance
-        Of one machine.
-    moments : sequence of datetime or None
-        Times of recording of its logs.
+    `work` is that of one machine, `moments` are the times of recording of its logs.
     """
     notes = [
         f"{one.refusal.log} cannot be read completely ({one.refusal.detail}): work on this machine "

@@ -16,7 +16,7 @@ from typing import Generic, TypeVar
 import numpy as np
 import pandas as pd
 
-from lmshealth._arrays import FloatArray, expect_shape, freeze
+from lmshealth._arrays import BoolArray, FloatArray, expect_shape, freeze
 from lmshealth.errors import BadTable
 from lmshealth.io.log import Metadata, Refusal
 from lmshealth.io.metadata import COVARIATES
@@ -41,29 +41,15 @@ Entry = TypeVar("Entry")
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Table(Generic[Entry]):
-    """Content of a table.
+    """Content of a table."""
 
-    Attributes
-    ----------
-    entries : tuple
-        In the order of the table.
-    notes : tuple of str
-        What the table lacks, and what is assumed instead.
-    """
-
-    entries: tuple[Entry, ...]
-    notes: tuple[str, ...]
+    entries: tuple[Entry, ...]  # in the order of the table
+    notes: tuple[str, ...]  # what the table lacks, and what is assumed instead
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Drifts:
-    """The drifts of one machine, from which health is inferred.
-
-    Attributes
-    ----------
-    stage, recorded_at, travel, modes, drift, drift_cov
-        As in `track.Track`.
-    """
+    """The drifts of one machine, from which health is inferred; fields are as in `Track`."""
 
     stage: str
     recorded_at: tuple[datetime, ...]
@@ -90,10 +76,8 @@ def read_estimates(
 
     Parameters
     ----------
-    path : Path
-        The table.
-    cross_terms : Path, optional
-        Covariances between estimates of one log, in the columns of ``modes_cov.csv``.
+    path, cross_terms : Path
+        The table; covariances between estimates of one log, in the columns of ``modes_cov.csv``.
     stage : Stage, optional
         Its covariates are read too, and other mode names than its own are refused.
 
@@ -146,21 +130,8 @@ def read_machines(
 ) -> Table[tuple[History, list[Refusal]]]:
     """Read a table in the columns of ``modes.csv``: a history per machine, with its refusals.
 
-    Parameters
-    ----------
-    path : Path
-        The table, see `read_estimates`.
-    stage : Stage, optional
-        Description of the machines.
-    cross_terms : Path, optional
-        Without it a ``modes_cov.csv`` in the same folder is used.
-    maintenance : Path, optional
-        Actions, in the columns of ``maintenance.csv``.
-
-    Raises
-    ------
-    BadTable
-        As `read_estimates` does.
+    Parameters are those of `read_estimates`, and a table of `maintenance`; a ``modes_cov.csv`` in
+    the same folder has the cross terms if none are given. Raises `BadTable` as `read_estimates`.
     """
     default = path.with_name("modes_cov.csv")
     terms = cross_terms or (default if default.exists() else None)
@@ -188,10 +159,8 @@ def read_drifts(path: Path, *, cross_terms: Path | None = None) -> Table[Drifts]
 
     Parameters
     ----------
-    path : Path
-        The table.
-    cross_terms : Path, optional
-        Covariances between drifts of one epoch, in the columns of ``track_cov.csv``.
+    path, cross_terms : Path
+        The table; covariances between drifts of one epoch, in the columns of ``track_cov.csv``.
 
     Raises
     ------
@@ -257,13 +226,8 @@ def _drop_bad_damping(table: pd.DataFrame) -> list[str]:
 
 def _check(path: Path, table: pd.DataFrame, stage: Stage | None) -> None:
     """Refuse estimates that are not valid, exist twice or have an unknown name."""
-    for name, what in (
-        ("frequency_hz", "a frequency"),
-        (
-            "frequency_std_hz",
-            "the standard deviation of a frequency, without which nothing is known",
-        ),
-    ):
+    std = "the standard deviation of a frequency, without which nothing is known"
+    for name, what in (("frequency_hz", "a frequency"), ("frequency_std_hz", std)):
         needed = f"{what}, a positive number; leave rows out that have none"
         _refuse(path, table, name, ~(table[name] > 0), needed)
     named = table[table["mode"] != ""]
@@ -305,12 +269,11 @@ def _term_notes(table: pd.DataFrame, terms: pd.DataFrame | None) -> list[str]:
     """List cross terms that are not used, and logs that need some."""
     notes, covered = [], set()
     if terms is not None:
-        known = set(zip(table["log"], table["mode"], table["source"], strict=True))
-        ends = [
-            list(zip(terms["log"], terms[f"mode_{end}"], terms[f"source_{end}"], strict=True))
-            for end in ("a", "b")
-        ]
-        used = np.array([a in known and b in known for a, b in zip(*ends, strict=True)], dtype=bool)
+        known = pd.MultiIndex.from_frame(table[["log", "mode", "source"]])
+        used: BoolArray = np.ones(len(terms), dtype=bool)
+        for end in ("a", "b"):
+            own = terms[["log", f"mode_{end}", f"source_{end}"]]
+            used &= pd.MultiIndex.from_frame(own).isin(known)
         if not used.all():
             notes.append(
                 f"{int((~used).sum())} of {used.size} cross terms are of estimates that the table "
@@ -422,33 +385,19 @@ def _drifts(path: Path, stage: str, rows: pd.DataFrame, terms: pd.DataFrame | No
     cov[known[:, :, None] & known[:, None, :]] = 0.0
     cov[k, i, i] = np.where(known[k, i], rows["drift_std"].to_numpy(dtype=float) ** 2, np.nan)
     if terms is not None:
-        _put_terms(cov, terms, place, column)
+        turn = terms.groupby(["recorded_at", "mode_a", "mode_b"], sort=False).cumcount()
+        moments, values = terms["recorded_at"], terms["cov_drift"]
+        ends = (terms[f"mode_{end}"].map(column) for end in ("a", "b"))
+        for moment, count, a, b, value in zip(moments, turn, *ends, values, strict=True):
+            # Those of other epochs or modes are ignored.
+            at = place.get((moment, count))
+            if at is not None and np.isfinite([a, b, value]).all() and a != b:
+                cov[at, int(a), int(b)] = cov[at, int(b), int(a)] = value
     _expect_covariances(path, stage, cov, epochs)
     travel = np.full(shape[0], np.nan)
     if "travel_km" in rows.columns:
         travel[k] = rows["travel_km"].to_numpy(dtype=float) * _KM
     return Drifts(stage, tuple(moment for moment, _ in epochs), travel, modes, drift, cov)
-
-
-def _put_terms(
-    cov: FloatArray,
-    terms: pd.DataFrame,
-    place: dict[tuple[object, int], int],
-    column: dict[str, int],
-) -> None:
-    """Fill in the covariances between modes; those of other epochs or modes are ignored."""
-    turn = terms.groupby(["recorded_at", "mode_a", "mode_b"], sort=False).cumcount()
-    for moment, count, a, b, value in zip(
-        terms["recorded_at"],
-        turn,
-        terms["mode_a"].map(column),
-        terms["mode_b"].map(column),
-        terms["cov_drift"],
-        strict=True,
-    ):
-        k = place.get((moment, count))
-        if k is not None and np.isfinite([a, b, value]).all() and a != b:
-            cov[k, int(a), int(b)] = cov[k, int(b), int(a)] = value
 
 
 def _expect_covariances(

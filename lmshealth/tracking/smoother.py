@@ -29,13 +29,7 @@ _SINGULAR = 1e-10
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Smoothed:
-    """Modes at every epoch given all logs, later ones included.
-
-    Attributes
-    ----------
-    ln_frequency, ln_frequency_std, ln_damping, ln_damping_std, drift, drift_std : ndarray
-        As in `Track`, shape ``(n_epochs, n_modes)``.
-    """
+    """Modes at every epoch given all logs; fields are as in `Track`, ``(n_epochs, n_modes)``."""
 
     ln_frequency: FloatArray
     ln_frequency_std: FloatArray
@@ -49,20 +43,9 @@ class Smoothed:
 
 
 def smooth(history: History, followed: Track, stage: Stage | None = None) -> Smoothed:
-    """Smooth a track by the Rauch-Tung-Striebel recursion, averaged over the model.
+    """Smooth a history by the Rauch-Tung-Striebel recursion [Rauch1965], averaged over the model.
 
-    Parameters
-    ----------
-    history : History
-        Modal estimates.
-    followed : Track
-        The history's track, whose steps are in the model.
-    stage : Stage, optional
-        As for `track`.
-
-    References
-    ----------
-    Rauch1965.
+    The steps of its track are in the model; the stage is that of `track`.
     """
     space = StateSpace(history, stage, followed.steps)
     # Where a segment begins, rates have their prior variance again.
@@ -108,7 +91,7 @@ def smooth_one(model: FilterModel, own: Hyperparameters) -> tuple[FloatArray, Fl
     means, covs = np.empty((n, size)), np.empty((n, size, size))
     moves, noises = np.empty((n, size, size)), np.empty((n, size, size))
     for k in range(n):
-        moves[k], noises[k] = transition(model, own, k)
+        moves[k], noises[k] = _transition(model, own, k)
         kalman.predict(F=moves[k], Q=noises[k])
         rows = np.flatnonzero(model.there[k])
         if rows.size:
@@ -132,11 +115,8 @@ def _inverse(cov: FloatArray) -> FloatArray:
     return np.asarray(np.linalg.pinv(cov / scale, rcond=_SINGULAR, hermitian=True) / scale)
 
 
-def transition(model: FilterModel, own: Hyperparameters, k: int) -> tuple[FloatArray, FloatArray]:
-    """Return transition matrix and process noise into log k, ``(size, size)`` each.
-
-    They are what `predict` does to unit states, and to the covariance of an exactly known state.
-    """
+def _transition(model: FilterModel, own: Hyperparameters, k: int) -> tuple[FloatArray, FloatArray]:
+    """Return transition matrix and process noise into log k: `predict` of exactly known states."""
     size = model.space.size
     unit = FilterBank(
         own.only(np.zeros(size + 1, dtype=int)),
