@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
-from dataclasses import dataclass
+from importlib.util import find_spec
+from typing import NamedTuple
 
 import emcee
 import numpy as np
@@ -16,9 +16,9 @@ from lmshealth.health.ensemble_sampling import start_from_prior, stream
 from lmshealth.health.epoch_posterior import EpochPosterior
 from lmshealth.health.inference import draw
 from lmshealth.stage.description import Stage, load_stage
-from lmshealth.stage.priors import JointPrior
 from models.dynamics.modal_map import guide_frequencies
 from models.dynamics.stages import stage_named
+from studies.common.cost import cpu_s
 from studies.harness.study import Row
 
 Array = NDArray[np.float64]
@@ -38,20 +38,12 @@ def epoch_posterior(stage: Stage) -> EpochPosterior:
     return EpochPosterior.of(stage, modes, stage.drift(TRUTH, modes)[0], cov)
 
 
-@dataclass(frozen=True, slots=True)
-class Found:
+class Found(NamedTuple):
     """Quantiles of ln parameters, ``(3, n)``, effective sample size, and processor time in s."""
 
     quantiles: Array
     ess: float
     cpu_s: float
-
-
-def timed(work: Callable[[], tuple[Array, float]]) -> Found:
-    """Measure processor time, so that what else runs on the machine hardly counts."""
-    begin = time.process_time()
-    quantiles, ess = work()
-    return Found(quantiles, ess, time.process_time() - begin)
 
 
 def exact(posterior: EpochPosterior, points: int) -> Array:
@@ -76,20 +68,30 @@ def exact(posterior: EpochPosterior, points: int) -> Array:
 
 def ours(posterior: EpochPosterior, seed: int) -> Found:
     """Draw as `lmshealth infer` does: Laplace's start, four ensembles, arviz's judgement."""
+    begin = time.process_time()
+    found, _ = draw(posterior, stream(seed))
+    ess = float(min(found.ess_bulk.min(), found.ess_tail.min()))
+    quantiles = np.quantile(found.flat, LEVELS, axis=0)
+    return Found(quantiles, ess, time.process_time() - begin)
 
-    def work() -> tuple[Array, float]:
-        found, _ = draw(posterior, stream(seed))
-        ess = min(found.ess_bulk.min(), found.ess_tail.min())
-        return np.quantile(found.flat, LEVELS, axis=0), float(ess)
 
-    return timed(work)
+def start_of(posterior: EpochPosterior, seed: int) -> emcee.State:
+    """Return the walkers that plain loops begin with."""
+    rng = np.random.default_rng(seed)
+    begin = start_from_prior(posterior.log_probability, posterior.draw_prior)(rng)[:N_WALKERS]
+    return emcee.State(begin, random_state=RandomState(MT19937(seed)).get_state(legacy=False))
+
+
+def autocorrelation_time(sampler: emcee.EnsembleSampler, steps: int) -> float:
+    """Return the autocorrelation time of a chain without its first fifth."""
+    return float(np.max(integrated_time(sampler.get_chain()[steps // 5 :], tol=0, quiet=True)))
 
 
 def plain_loop(posterior: EpochPosterior, seed: int, steps: int, long: int) -> Row:
     """Time emcee's default with one walker at a time and the plant solved for each.
 
-    So few steps tell no autocorrelation time. It is that of the same moves on the same density,
-    evaluated by the surrogate over many more steps.
+    The autocorrelation time, for which so few steps are not enough, is that of the same moves on
+    the same density, evaluated by the surrogate over many more steps.
     """
     machine, view = stage_named("lms-y"), posterior.machines[0]
     model_std = view.stage.description.map.model_std  # type: ignore[union-attr]
@@ -109,43 +111,35 @@ def plain_loop(posterior: EpochPosterior, seed: int, steps: int, long: int) -> R
         off = view.drift - drift(preload, mount)
         return prior - 0.5 * float(off @ np.linalg.solve(cov, off) + np.linalg.slogdet(cov)[1])
 
-    rng = np.random.default_rng(seed)
-    begin = start_from_prior(posterior.log_probability, posterior.draw_prior)(rng)[:N_WALKERS]
-    same = np.array([log_probability(x) for x in begin[:5]])
-    difference = np.ptp(same - posterior.log_probability(begin[:5]))
-    state = emcee.State(begin, random_state=RandomState(MT19937(seed)).get_state(legacy=False))
+    state = start_of(posterior, seed)
+    few = state.coords[:5]
+    same = np.array([log_probability(x) for x in few])
     sampler = emcee.EnsembleSampler(N_WALKERS, 2, log_probability)
-    clock = time.process_time()
-    sampler.run_mcmc(state, steps)
-    cpu = (time.process_time() - clock) / steps
-    sampler = emcee.EnsembleSampler(N_WALKERS, 2, posterior.log_probability, vectorize=True)
-    sampler.run_mcmc(state, long)
-    tau = float(np.max(integrated_time(sampler.get_chain()[long // 5 :], tol=0, quiet=True)))
+    cpu = cpu_s(lambda: sampler.run_mcmc(state, steps)) / steps
+    fast = emcee.EnsembleSampler(N_WALKERS, 2, posterior.log_probability, vectorize=True)
+    fast.run_mcmc(state, long)
+    tau = autocorrelation_time(fast, long)
     return {
         "program": "emcee, plain loop with the eigenproblem inside",
-        "steps_measured": steps,
         "autocorrelation_time": tau,
         "ms_per_likelihood": 1e3 * cpu / N_WALKERS,
         "ess_per_s": N_WALKERS / tau / cpu,
-        "largest_difference_of_log_probability": float(difference),
+        "largest_difference_of_log_probability": float(
+            np.ptp(same - posterior.log_probability(few))
+        ),
     }
 
 
 def walker_loop(posterior: EpochPosterior, seed: int, steps: int) -> Row:
     """Time emcee's default with the surrogate, but one walker at a time."""
-    rng = np.random.default_rng(seed)
-    begin = start_from_prior(posterior.log_probability, posterior.draw_prior)(rng)[:N_WALKERS]
-    state = emcee.State(begin, random_state=RandomState(MT19937(seed)).get_state(legacy=False))
     sampler = emcee.EnsembleSampler(
         N_WALKERS, 2, lambda x: float(posterior.log_probability(x[None])[0])
     )
-    clock = time.process_time()
-    sampler.run_mcmc(state, steps)
-    cpu = time.process_time() - clock
-    tau = float(np.max(integrated_time(sampler.get_chain()[steps // 5 :], tol=0, quiet=True)))
+    state = start_of(posterior, seed)
+    cpu = cpu_s(lambda: sampler.run_mcmc(state, steps))
+    tau = autocorrelation_time(sampler, steps)
     return {
         "program": "emcee, plain loop over our surrogate",
-        "steps_measured": steps,
         "autocorrelation_time": tau,
         "ess_per_s": N_WALKERS * steps / tau / cpu,
     }
@@ -155,82 +149,55 @@ def by_dynesty(posterior: EpochPosterior, seed: int) -> Found:
     """Run dynesty's nested sampler as its guide does, with our surrogate one point at a time."""
     import dynesty
 
-    prior = posterior.prior
-
-    def work() -> tuple[Array, float]:
-        sampler = dynesty.NestedSampler(
-            lambda x: float(_log_likelihood(posterior, x[None])[0]),
-            lambda u: prior.quantile(u[None])[0],
-            2,
-            rstate=np.random.default_rng(seed),
-        )
-        sampler.run_nested(print_progress=False)
-        weight = sampler.results.importance_weights()
-        return _weighted(sampler.results.samples, weight)
-
-    return timed(work)
+    begin, log_likelihood = time.process_time(), posterior.machines[0].log_likelihood
+    sampler = dynesty.NestedSampler(
+        lambda x: float(log_likelihood(x[None])[0]),
+        lambda u: posterior.prior.quantile(u[None])[0],
+        2,
+        rstate=np.random.default_rng(seed),
+    )
+    sampler.run_nested(print_progress=False)
+    return _weighted(sampler.results.samples, sampler.results.importance_weights(), begin)
 
 
 def by_nautilus(posterior: EpochPosterior, seed: int) -> Found:
     """Run nautilus with our surrogate for all points at once."""
     import nautilus
 
-    prior: JointPrior = posterior.prior
-
-    def work() -> tuple[Array, float]:
-        sampler = nautilus.Sampler(
-            prior.quantile,
-            lambda x: _log_likelihood(posterior, x),
-            n_dim=2,
-            vectorized=True,
-            pass_dict=False,
-            seed=seed,
-        )
-        sampler.run(verbose=False, n_eff=10_000)
-        points, log_weight, _ = sampler.posterior()
-        return _weighted(points, np.exp(log_weight - log_weight.max()))
-
-    return timed(work)
+    begin, log_likelihood = time.process_time(), posterior.machines[0].log_likelihood
+    how = {"n_dim": 2, "vectorized": True, "pass_dict": False, "seed": seed}
+    sampler = nautilus.Sampler(posterior.prior.quantile, log_likelihood, **how)
+    sampler.run(verbose=False, n_eff=10_000)
+    points, log_weight, _ = sampler.posterior()
+    return _weighted(points, np.exp(log_weight - log_weight.max()), begin)
 
 
-def _log_likelihood(posterior: EpochPosterior, x: Array) -> Array:
-    return posterior.machines[0].log_likelihood(x)
-
-
-def _weighted(points: Array, weight: Array) -> tuple[Array, float]:
-    ess = float(weight.sum() ** 2 / np.sum(weight**2))
-    quantiles = [
+def _weighted(points: Array, weight: Array, begin: float) -> Found:
+    columns = [
         np.quantile(column, LEVELS, weights=weight, method="inverted_cdf") for column in points.T
     ]
-    return np.column_stack(quantiles), ess
+    ess = float(weight.sum() ** 2 / np.sum(weight**2))
+    return Found(np.column_stack(columns), ess, time.process_time() - begin)
 
 
 def compare(seed: int, turns: int, *, quick: bool) -> Row:
-    """Let all ways take turns, and hold their quantiles to those of a grid."""
+    """Let all ways take turns, and compare their quantiles with those of a grid."""
     posterior = epoch_posterior(load_stage("lms-y"))
     known = exact(posterior, 201 if quick else 401)
-    ways: dict[str, Callable[[EpochPosterior, int], Found]] = {"lmshealth": ours}
-    missing = []
-    for name, way in (("dynesty", by_dynesty), ("nautilus", by_nautilus)):
-        try:
-            __import__(name)
-        except ImportError:
-            missing.append(f"{name}: {MISSING}")
-        else:
-            ways[name] = way
-    found: dict[str, list[Found]] = {name: [] for name in ways}
-    for turn in range(turns):
-        for name, way in ways.items():
-            found[name].append(way(posterior, seed + turn))
     width = (known[2] - known[0]) / (2 * 1.645)
+    ways = {"lmshealth": ours, "dynesty": by_dynesty, "nautilus": by_nautilus}
+    missing = [name for name in ways if name != "lmshealth" and not find_spec(name)]
+    found: dict[str, list[Found]] = {name: [] for name in ways if name not in missing}
+    for turn in range(turns):
+        for name, runs in found.items():
+            runs.append(ways[name](posterior, seed + turn))
     rows: list[Row] = []
     for name, runs in found.items():
-        off = np.array([np.abs(run.quantiles - known) / width for run in runs])
+        off = np.array([(run.quantiles - known) / width for run in runs])
         rows.append(
             {
                 "program": name,
                 "cpu_s": float(np.median([run.cpu_s for run in runs])),
-                "ess": float(np.median([run.ess for run in runs])),
                 "ess_per_s": float(np.median([run.ess / run.cpu_s for run in runs])),
                 "rms_error_of_quantiles": float(np.sqrt(np.mean(off**2))),
             }
@@ -239,4 +206,5 @@ def compare(seed: int, turns: int, *, quick: bool) -> Row:
     rows.append(plain_loop(posterior, seed, 1 if quick else 60, 200 if quick else 20_000))
     for row in rows:
         row["ours_is_times_faster"] = rows[0]["ess_per_s"] / row["ess_per_s"]
-    return {"turns": turns, "programs": rows, "missing": missing}
+    told = [f"{name}: {MISSING}" for name in missing]
+    return {"turns": turns, "programs": rows, "missing": told}

@@ -5,7 +5,7 @@ from __future__ import annotations
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from studies.harness.figures import BLACK, BLUE, GREEN, ORANGE, write
+from studies.harness.figures import BLACK, BLUE, GREEN, ORANGE, name_lines, write
 from studies.harness.study import Row
 
 
@@ -23,10 +23,9 @@ def draw_rates(ax: Axes, rows: list[Row]) -> None:
     ax.set_xscale("log")
     ax.set_xlim(0.5, 4e5)
     names = [row["program"].replace(", ", ",\n").replace(" with the", "\nwith the") for row in rows]
-    ax.set_yticks(range(len(rows)), names, fontsize=8)
-    ax.set_ylim(len(rows) - 0.4, -0.9)
+    name_lines(ax, names, fontsize=8)
     ax.set_xlabel("effective draws per second of processor time")
-    ax.set_title("Posterior of one epoch, LMS-Y", fontsize=10)
+    ax.set_title("Posterior of one epoch, LMS-Y")
 
 
 def draw_ratios(ax: Axes, answer: Row) -> None:
@@ -43,11 +42,10 @@ def draw_ratios(ax: Axes, answer: Row) -> None:
         ax.barh(y, share, color=BLUE if share <= 1 else ORANGE, height=0.5)
         ax.text(share + 0.02, y, text, va="center", fontsize=8)
     ax.axvline(1.0, color=BLACK, lw=0.8, ls="--")
-    ax.set_yticks(range(len(rows)), [name for name, _, _ in rows], fontsize=8)
-    ax.set_ylim(len(rows) - 0.4, -0.6)
+    name_lines(ax, [name for name, _, _ in rows], fontsize=8)
     ax.set_xlim(0, 1.35)
     ax.set_xlabel("share of what was asked for at most")
-    ax.set_title("What results take", fontsize=10)
+    ax.set_title("What results take")
 
 
 def draw_figure(figure: Figure, answer: Row) -> None:

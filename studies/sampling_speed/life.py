@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, replace
-from datetime import UTC, datetime, timedelta
+from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 from filterpy.kalman import KalmanFilter
@@ -17,13 +17,14 @@ from lmshealth.prognosis.life_likelihood import LifeLikelihood, ln_health
 from lmshealth.prognosis.life_posterior import LifeDensity
 from lmshealth.prognosis.remaining_life import prognose
 from lmshealth.stage.description import Stage, load_stage
-from lmshealth.tracking.history import History, Series
+from lmshealth.tracking.history import History
+from studies.common.cost import cpu_s
+from studies.common.histories import make_history
 from studies.harness.study import Row
 
 Array = NDArray[np.float64]
 MODES = ("roll", "pitch")
 NOISE, WALK, TEMPERATURE = 8e-4, 5e-4, -8e-4
-START = datetime(2026, 3, 1, tzinfo=UTC)
 # Priors of life.py that a filter must know too.
 INTERCEPT_STD, TEMPERATURE_STD, REFERENCE = 0.1, 1e-3, 21.0
 
@@ -40,21 +41,10 @@ def degrading_life(stage: Stage, n: int, rng: np.random.Generator) -> History:
     drift = stage.drift(np.log(np.column_stack([preload, mount])), MODES)
     warm = TEMPERATURE * (temperature - REFERENCE)[:, None]
     ln_f = level + drift + warm + walk + NOISE * rng.standard_normal((n, 2))
+    damping = np.tile(np.log([specs[name].damping_ratio for name in MODES]), (n, 1))
     cov = np.tile(np.diag([NOISE**2, NOISE**2, 0.05**2, 0.05**2]), (n, 1, 1))
-    return History(
-        stage="AX-Y",
-        logs=tuple(f"{k:04d}" for k in range(n)),
-        recorded_at=tuple(START + timedelta(days=2 * k) for k in range(n)),
-        travel=travel,
-        covariates={"temperature_c": temperature},
-        modes=MODES,
-        series=tuple(Series(name, "acc") for name in MODES),
-        ln_frequency=ln_f,
-        ln_damping=np.tile(np.log([specs[name].damping_ratio for name in MODES]), (n, 1)),
-        cov=cov,
-        loop_error=np.full(n, np.nan),
-        baselines=(0,),
-    )
+    covariates = {"temperature_c": temperature}
+    return make_history(MODES, travel, (ln_f, damping, cov), covariates=covariates)
 
 
 def by_filterpy(
@@ -86,11 +76,10 @@ def by_filterpy(
     return total
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Walkers:
-    """Points of a life's posterior, at one point of the grid of settings, and both ways to it."""
+class Walkers(NamedTuple):
+    """Both ways to log likelihoods, up to a constant, at one point of the grid of settings."""
 
-    ours: Callable[[], Array]  # Give log likelihoods up to a constant, of so many walkers
+    ours: Callable[[], Array]
     by_filterpy: Callable[[], Array]
     walkers: int  # How many ours has at once, and how many filterpy one after the other
     looped: int
@@ -122,28 +111,18 @@ def two_ways(history: History, stage: Stage, walkers: int, looped: int) -> Walke
         setting = {"walk": walk, "scale": scale, "model_std": model_std}
         return np.array([by_filterpy(history, flat[0], flat[1:], **setting) for flat in flats])
 
+    n_settings = likelihood.grid.walk.size
     return Walkers(
-        lambda: density.log_probability(y) - prior,
-        loop,
-        y.shape[0],
-        looped,
-        likelihood.grid.walk.size,
-        n_kept,
+        lambda: density.log_probability(y) - prior, loop, y.shape[0], looped, n_settings, n_kept
     )
 
 
 def likelihoods(history: History, stage: Stage, walkers: int, looped: int) -> Row:
     """Compare the time of a walker and the values, at one point of the grid of settings."""
-    ways = two_ways(history, stage, walkers, looped)
-    found = ways.ours()
-    turns = max(400 // walkers, 1)
-    clock = time.process_time()
-    for _ in range(turns):
-        ways.ours()
-    ours = (time.process_time() - clock) / turns / walkers
-    clock = time.process_time()
-    book = ways.by_filterpy()
-    loop = (time.process_time() - clock) / looped
+    ways, turns = two_ways(history, stage, walkers, looped), max(400 // walkers, 1)
+    found, book = ways.ours(), []
+    ours = cpu_s(lambda: [ways.ours() for _ in range(turns)]) / turns / walkers
+    loop = cpu_s(lambda: book.append(ways.by_filterpy())) / looped
     return {
         "logs": len(history.logs),
         "modes": len(MODES),
@@ -153,8 +132,8 @@ def likelihoods(history: History, stage: Stage, walkers: int, looped: int) -> Ro
         "us_per_walker_by_filterpy": 1e6 * loop,
         "times_faster": loop / ours,
         # Up to a constant, which is that of the grid's prior.
-        "largest_difference": float(np.ptp(found[:looped] - book)),
-        "spread_of_values": float(np.ptp(book)),
+        "largest_difference": float(np.ptp(found[:looped] - book[0])),
+        "spread_of_values": float(np.ptp(book[0])),
     }
 
 
@@ -166,16 +145,10 @@ def life_posterior(seed: int, turns: int, *, quick: bool) -> Row:
     history = degrading_life(stage, 20 if quick else 100, rng)
     runs = []
     for turn in range(turns):
-        wall, cpu = time.perf_counter(), time.process_time()
+        begin = time.process_time()
         found = prognose(history, stage, seed + turn, chains=not quick)
-        runs.append(
-            {
-                "cpu_s": time.process_time() - cpu,
-                "wall_s": time.perf_counter() - wall,
-                "ess": found.ess,
-                "r_hat": found.r_hat,
-            }
-        )
+        seconds = time.process_time() - begin
+        runs.append({"cpu_s": seconds, "ess": found.ess, "r_hat": found.r_hat})
     return {
         "runs": runs,
         "cpu_s": float(np.median([run["cpu_s"] for run in runs])),

@@ -28,13 +28,15 @@ from lmshealth.tracking.track import track
 from models.dynamics.stages import stage_named
 from models.recordings.recording import record
 from studies.bench.ratios import recorded
+from studies.common.cost import cpu_s
+from studies.common.histories import START
 from studies.identification.records import describe
 from studies.identification_speed.run import CASE, headline_log, parquet_log
 from studies.read_throughput.files import BARE, RATE, signals, write
-from studies.read_throughput.run import BOUND, BOUNDED, cost
+from studies.read_throughput.run import BOUND, BOUNDED
 from studies.rul_metrics.forecasts import N_DRAWS, futures, states_of
 from studies.sampling_speed.contestants import epoch_posterior, ours, walker_loop
-from studies.sampling_speed.life import START, degrading_life, two_ways
+from studies.sampling_speed.life import degrading_life, two_ways
 from studies.scale.archive import make_archive
 from studies.scale.cost import EVERY, FLAT, OVERHEAD, Meter
 from studies.scale.speedup import SPEEDUP, bare, identified
@@ -100,7 +102,7 @@ def test_epoch(race: Race, stage: Stage) -> None:
         loop = walker_loop(posterior, turn, LOOP_STEPS)["ess_per_s"]
         found = ours(posterior, turn)
         draws.append(loop * found.cpu_s / found.ess)
-        epochs.append(loop * cost(partial(infer, drifts, stage, turn)))
+        epochs.append(loop * cpu_s(partial(infer, drifts, stage, turn)))
     beside = f"one effective draw of {LOOP}"
     race.told(draws, name="an effective draw of an epoch", beside=beside, at_most=rate / 2000)
     race.told(epochs, name="a converged epoch", beside=beside, at_most=3.0 * rate)
@@ -196,7 +198,7 @@ def minute() -> Iterator[Path]:
 def test_reading(race: Race, minute: Path, name: str) -> None:
     """A format is read in 1.3 times what the library of the format takes; CSV, the faster one."""
     path = minute / name
-    times = {call: min(cost(partial(call, path)) for _ in range(3)) for call in BARE[name]}
+    times = {call: min(cpu_s(partial(call, path)) for _ in range(3)) for call in BARE[name]}
     library = min(times, key=lambda call: times[call])
     race(
         lambda: load(path, ColumnMap()) and None,
