@@ -9,7 +9,15 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import h5py
 import numpy as np
+import pandas as pd
+import pyarrow as pa
+import pyarrow.csv
+import pyarrow.parquet as pq
+import pyuff
+import scipy.io
+from nptdms import ChannelObject, RootObject, TdmsFile, TdmsWriter
 
 RATE = 20_000
 META = {
@@ -32,15 +40,7 @@ def signals(n: int) -> Columns:
     }
 
 
-def write(path: Path, columns: Columns) -> Path:
-    """Write a log in the format that the file's name asks for."""
-    WRITERS[path.name](path, columns)
-    return path
-
-
 def _hdf5(path: Path, columns: Columns) -> None:
-    import h5py
-
     with h5py.File(path, "w") as file:
         for name, values in columns.items():
             file[name] = values
@@ -48,17 +48,12 @@ def _hdf5(path: Path, columns: Columns) -> None:
 
 
 def _parquet(path: Path, columns: Columns) -> None:
-    import pyarrow as pa
-    import pyarrow.parquet as pq
-
     table = pa.table(columns).replace_schema_metadata(META)
     # One row group holds the whole log: the most that a reader can be asked to stream.
     pq.write_table(table, path, use_dictionary=False, row_group_size=table.num_rows)
 
 
 def _tdms(path: Path, columns: Columns) -> None:
-    from nptdms import ChannelObject, RootObject, TdmsWriter
-
     n = columns["delta_e_um"].size
     with TdmsWriter(str(path)) as writer:
         for start in range(0, n, RATE):
@@ -68,15 +63,10 @@ def _tdms(path: Path, columns: Columns) -> None:
 
 
 def _mat(path: Path, columns: Columns) -> None:
-    import scipy.io
-
     scipy.io.savemat(path, columns | META, do_compression=path.stem == "packed")
 
 
 def _csv(path: Path, columns: Columns) -> None:
-    import pyarrow as pa
-    import pyarrow.csv
-
     options = pyarrow.csv.WriteOptions(quoting_style="none")
     with path.open("wb") as stream:
         stream.writelines(f"# {key}: {value}\n".encode() for key, value in META.items())
@@ -93,8 +83,6 @@ def _csv_gz(path: Path, columns: Columns) -> None:
 
 def _uff(path: Path, columns: Columns) -> None:
     """Write time records, each under its column's name."""
-    import pyuff
-
     file = pyuff.UFF(str(path))
     for name, values in columns.items():
         record = pyuff.prepare_58(
@@ -108,7 +96,7 @@ def _uff(path: Path, columns: Columns) -> None:
             file.write_sets([record], mode="add")
 
 
-WRITERS: dict[str, Callable[[Path, Columns], None]] = {
+_WRITERS: dict[str, Callable[[Path, Columns], None]] = {
     "log.h5": _hdf5,
     "log.parquet": _parquet,
     "log.tdms": _tdms,
@@ -121,69 +109,56 @@ WRITERS: dict[str, Callable[[Path, Columns], None]] = {
 }
 
 
-def bare_hdf5(path: Path) -> object:
-    """Read every dataset with h5py."""
-    import h5py
+def write(path: Path, columns: Columns) -> Path:
+    """Write a log in the format that the file's name asks for."""
+    _WRITERS[path.name](path, columns)
+    return path
 
+
+def bare_h5py(path: Path) -> object:
+    """Read every dataset with h5py."""
     with h5py.File(path) as file:
         return {name: file[name][()] for name in file}
 
 
-def bare_parquet(path: Path) -> object:
-    """Read every column with pyarrow."""
-    import pyarrow.parquet as pq
-
-    table = pq.read_table(path)
+def bare_pyarrow(path: Path) -> object:
+    """Read every column of a Parquet or CSV file with pyarrow, which unpacks gzip by itself."""
+    skip = pyarrow.csv.ReadOptions(skip_rows=len(META))
+    is_parquet = path.suffix == ".parquet"
+    table = pq.read_table(path) if is_parquet else pyarrow.csv.read_csv(path, read_options=skip)
     return {name: table.column(name).to_numpy() for name in table.column_names}
 
 
-def bare_tdms(path: Path) -> object:
+def bare_nptdms(path: Path) -> object:
     """Read every channel with npTDMS."""
-    from nptdms import TdmsFile
-
-    file = TdmsFile.read(path)
-    return {channel.name: channel[:] for group in file.groups() for channel in group.channels()}
-
-
-def bare_scipy(path: Path) -> object:
-    """Read every variable with scipy."""
-    import scipy.io
-
-    return scipy.io.loadmat(path)
+    groups = TdmsFile.read(path).groups()
+    return {channel.name: channel[:] for group in groups for channel in group.channels()}
 
 
 def bare_pandas(path: Path) -> object:
     """Read every column with pandas; it unpacks gzip by itself."""
-    import pandas as pd
-
     return dict(pd.read_csv(path, skiprows=len(META), engine="c").items())
 
 
-def bare_arrow(path: Path) -> object:
-    """Read every column with pyarrow; it unpacks gzip by itself."""
-    import pyarrow.csv
-
-    skip = pyarrow.csv.ReadOptions(skip_rows=len(META))
-    table = pyarrow.csv.read_csv(path, read_options=skip)
-    return {name: table.column(name).to_numpy() for name in table.column_names}
+def bare_scipy(path: Path) -> object:
+    """Read every variable with scipy."""
+    return scipy.io.loadmat(path)
 
 
-def bare_uff(path: Path) -> object:
+def bare_pyuff(path: Path) -> object:
     """Read every data set with pyuff."""
-    import pyuff
-
     return pyuff.UFF(str(path)).read_sets()
 
 
 Call = Callable[[Path], Any]
 BARE: dict[str, tuple[Call, ...]] = {
-    "log.h5": (bare_hdf5,),
-    "log.parquet": (bare_parquet,),
-    "log.tdms": (bare_tdms,),
+    "log.h5": (bare_h5py,),
+    "log.parquet": (bare_pyarrow,),
+    "log.tdms": (bare_nptdms,),
     "plain.mat": (bare_scipy,),
     "packed.mat": (bare_scipy,),
-    "log.csv": (bare_pandas, bare_arrow),
-    "log.csv.gz": (bare_pandas, bare_arrow),
-    "ascii.uff": (bare_uff,),
-    "binary.uff": (bare_uff,),
+    "log.csv": (bare_pandas, bare_pyarrow),
+    "log.csv.gz": (bare_pandas, bare_pyarrow),
+    "ascii.uff": (bare_pyuff,),
+    "binary.uff": (bare_pyuff,),
 }

@@ -1,19 +1,15 @@
 """Does reading a log cost more than the library that reads its format, and what is refused?
 
-Question
-    How long does each reader take, as a ratio to the bare library call that gives the same
-    columns in the same process? How much memory does it take for a long log? Which of the real
-    samples are read, which refused and why?
 Method
     One minute of four signals at 20 kHz with the metadata of a log, written once in each format.
-    Bare call and reader take turns; the least processor time of each counts. Beside it what
-    `read_log` takes as a whole, which also hashes the file and judges every sample. CSV is
-    compared with the faster one of pandas' C engine and pyarrow's reader. Then ten minutes of the
-    same signals, read in a process of its own by the reader and by the bare call: the peak of its
-    memory, less what it had after a short file, in minutes of the log (8 bytes for each sample of
-    each channel), and the processor time. The bare call is the control: it holds all of the log,
-    and what the reader puts on disk costs time that it does not. Then every UFF58, TDMS,
-    MAT and delimited file of the real samples is read without and with its column map.
+    The bare library call that gives the same columns and the reader take turns in one process; the
+    least processor time of each counts, beside that of `read_log`, which also hashes the file and
+    judges every sample. CSV is compared with the faster one of pandas' C engine and pyarrow's
+    reader. Then ten minutes of the same signals, read in a process of its own by the reader and by
+    the bare call, which holds all of the log (control): the peak of its memory, less what it had
+    after a short file, in minutes of the log (8 bytes for each sample of each channel), and the
+    processor time. Then every UFF58, TDMS, MAT and delimited file of the real samples is read
+    without and with its column map.
 Run time
     About ten minutes, and 2 GB of disk.
 Data
@@ -22,11 +18,9 @@ Data
 
 from __future__ import annotations
 
-import os
 import tempfile
-import time
 import tomllib
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 
@@ -36,10 +30,10 @@ from lmshealth.errors import BadLog
 from lmshealth.io.column_map import ColumnMap
 from lmshealth.io.formats.registry import load
 from lmshealth.io.reading import read_log
+from studies.common.cost import in_own_process, in_turns
 from studies.harness.claims import Claim, span
-from studies.harness.study import Row, Study
-from studies.read_throughput.files import BARE, RATE, Call, signals, write
-from studies.read_throughput.memory import needs
+from studies.harness.study import Row, Study, real_data
+from studies.read_throughput.files import BARE, RATE, signals, write
 from studies.read_throughput.samples import MAPS
 
 STEP = "read"
@@ -61,16 +55,14 @@ SUFFIXES = (".uff", ".tdms", ".mat", ".csv", ".gz")
 def main() -> None:
     """Run the study; ``--quick`` reads less of fewer formats, no samples, and records nothing."""
     study = Study(__file__, __doc__)
-    if not study.quick and "LMSHEALTH_DATA" not in os.environ:
-        raise SystemExit("LMSHEALTH_DATA is not set: it names the folder of real measurements")
-    quick, trials = study.quick, study.trials
-    names = BOUNDED if quick else tuple(BARE)
-    found = trials.collect(timed, [(name, *((8, 3) if quick else (60,))) for name in names])
+    quick, collect = study.quick, study.trials.collect
+    data = None if quick else real_data()
+    names, how = (BOUNDED, (8, 3)) if quick else (tuple(BARE), (60, ROUNDS))
+    found = collect(timed, [(name, *how) for name in names])
     times = dict(zip(names, found, strict=True))
-    long = QUICK_MINUTES if quick else LONG_MINUTES
-    names = QUICK_MEMORY if quick else tuple(BARE)
+    names, minutes = (QUICK_MEMORY, QUICK_MINUTES) if quick else (tuple(BARE), LONG_MINUTES)
     chosen = ("delta_e_um",) if quick else tuple(signals(1))
-    found = trials.collect(long_log, [(name, long, chosen) for name in names])
+    found = collect(long_log, [(name, minutes, chosen) for name in names])
     memory = dict(zip(names, found, strict=True))
     bound = QUICK_BOUND if quick else BOUND
     answer = {
@@ -78,53 +70,39 @@ def main() -> None:
         "times": times,
         "bound": bound,
         "passed": {name: times[name]["ratio"] <= bound for name in BOUNDED},
-        "memory_minutes": long,
+        "memory_minutes": minutes,
         "memory": memory,
         "memory_bound": MOST_MINUTES,
         "memory_passed": {
-            name: row["minutes_of_reader"] < MOST_MINUTES < row["minutes_of_library"]
-            for name, row in memory.items()
-            if name in STREAMED
+            name: memory[name]["minutes_of_reader"]
+            < MOST_MINUTES
+            < memory[name]["minutes_of_library"]
+            for name in STREAMED
+            if name in memory
         },
-        "samples": None if quick else samples(),
+        "samples": samples(data) if data else None,
     }
     study.conclude(answer, quick_may_fail=True)
 
 
-def timed(name: str, seconds: int, rounds: int = ROUNDS) -> Row:
-    """Compare reader and libraries on a file of a format."""
+def timed(name: str, seconds: int, rounds: int) -> Row:
+    """Let libraries and reader take turns on a file of a format."""
     with tempfile.TemporaryDirectory() as folder:
-        return compare(write(Path(folder) / name, signals(RATE * seconds)), BARE[name], rounds)
-
-
-def cost(work: Callable[[], object]) -> float:
-    """Return the processor time of one call in s, over all threads."""
-    start = time.process_time()
-    work()
-    return time.process_time() - start
-
-
-def compare(path: Path, calls: tuple[Call, ...], rounds: int) -> Row:
-    """Let libraries and reader take turns on one file."""
-    rounds = 2 if path.suffix == ".uff" else rounds
-    libraries: dict[str, list[float]] = {call.__name__: [] for call in calls}
-    reader, whole = [], []
-    for _ in range(rounds):
-        for call in calls:
-            libraries[call.__name__].append(cost(partial(call, path)))
-        reader.append(cost(lambda: load(path, ColumnMap())))
-        whole.append(cost(lambda: read_log(path)))
-    least = {name: min(seconds) for name, seconds in libraries.items()}
-    bare = min(least.values())
-    megabytes = path.stat().st_size / 1e6
+        path = write(Path(folder) / name, signals(RATE * seconds))
+        works = {call.__name__: partial(call, path) for call in BARE[name]}
+        ours = {"reader": lambda: load(path, ColumnMap()), "read_log": lambda: read_log(path)}
+        spent = in_turns(works | ours, 2 if path.suffix == ".uff" else rounds)
+        megabytes = path.stat().st_size / 1e6
+    least = {way: min(own) for way, own in spent.items()}
+    bare = min(least[way] for way in works)
     return {
         "file_mb": round(megabytes, 1),
-        "library_s": {name: round(seconds, 4) for name, seconds in least.items()},
-        "reader_s": round(min(reader), 4),
-        "ratio": round(min(reader) / bare, 2),
-        "reader_mb_s": round(megabytes / min(reader)),
-        "read_log_s": round(min(whole), 4),
-        "read_log_ratio": round(min(whole) / bare, 2),
+        "library_s": {way: round(least[way], 4) for way in works},
+        "reader_s": round(least["reader"], 4),
+        "ratio": round(least["reader"] / bare, 2),
+        "reader_mb_s": round(megabytes / least["reader"]),
+        "read_log_s": round(least["read_log"], 4),
+        "read_log_ratio": round(least["read_log"] / bare, 2),
     }
 
 
@@ -137,35 +115,32 @@ def long_log(name: str, n_minutes: int, chosen: tuple[str, ...]) -> dict[str, fl
             columns = signals(RATE * seconds)
             write(path, {key: columns[key] for key in chosen})
         del columns
-        found = needs(*paths)
+        found = in_own_process("studies.read_throughput.memory", *paths)
     minute = 8 * 60 * RATE * len(chosen)
     return {
-        "minutes_of_reader": round(found["reader"]["bytes"] / minute, 2),
-        "minutes_of_library": round(found["library"]["bytes"] / minute, 2),
-        "cpu_s_of_reader": round(found["reader"]["cpu_s"], 3),
-        "cpu_s_of_library": round(found["library"]["cpu_s"], 3),
+        f"{key}_of_{way}": round(value, digits)
+        for way, own in found.items()
+        for key, value, digits in (
+            ("minutes", own["bytes"] / minute, 2),
+            ("cpu_s", own["cpu_s"], 3),
+        )
     }
 
 
-def samples() -> dict[str, dict[str, str]]:
+def samples(data: Path) -> dict[str, dict[str, str]]:
     """Read every sample without and with its column map."""
-    data = Path(os.environ["LMSHEALTH_DATA"])
-    files = sorted(path for path in data.rglob("*") if path.suffix in SUFFIXES)
-    return {path.relative_to(data).as_posix(): outcomes(path, data) for path in files}
-
-
-def outcomes(path: Path, data: Path) -> dict[str, str]:
-    """Return what becomes of one sample."""
-    name = path.relative_to(data).as_posix()
-    found = {"as it is": outcome(path, ColumnMap(), name)}
-    if name in MAPS:
-        columns = msgspec.convert(tomllib.loads(MAPS[name]), ColumnMap)
-        found["with its map"] = outcome(path, columns, name)
+    found = {}
+    for path in sorted(path for path in data.rglob("*") if path.suffix in SUFFIXES):
+        name = path.relative_to(data).as_posix()
+        found[name] = {"as it is": outcome(path, ColumnMap(), name)}
+        if name in MAPS:
+            columns = msgspec.convert(tomllib.loads(MAPS[name]), ColumnMap)
+            found[name]["with its map"] = outcome(path, columns, name)
     return found
 
 
 def outcome(path: Path, columns: ColumnMap, name: str) -> str:
-    """Say in a line what `read_log` makes of a file."""
+    """Return in a line what `read_log` makes of a file."""
     try:
         log = read_log(path, columns=columns, name=name)
     except BadLog as error:

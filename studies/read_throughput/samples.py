@@ -3,22 +3,6 @@
 from __future__ import annotations
 
 MAPS = {
-    "lsb250_linear_guide/open/exp1.mat": """
-[columns]
-time_s = "X.Data"
-delta_e_motor_mm = "Y(1).Data"
-delta_e_load_mm = "Y(2).Data"
-[mat]
-variable = "exp1"
-""",
-    "lsb250_linear_guide/open/exp2.mat": """
-[columns]
-time_s = "X.Data"
-delta_e_motor_mm = "Y(1).Data"
-delta_e_load_mm = "Y(2).Data"
-[mat]
-variable = "exp2"
-""",
     # Angles in rad stand where the contract has lengths: only their spectra are looked at.
     "fditools_two_inertia_bench/open/MultisineTypeA.mat": """
 [columns]
@@ -63,6 +47,14 @@ acc_sound = \
 acc_sound = 1.0
 """,
 }
+_GUIDE = """
+[columns]
+time_s = "X.Data"
+delta_e_motor_mm = "Y(1).Data"
+delta_e_load_mm = "Y(2).Data"
+[mat]
+variable = "{name}"
+"""
 _SHAKE = """
 [columns]
 time = "SampleTimeFine"
@@ -79,6 +71,7 @@ acc_sound = "Mic 01.0Scalar"
 [units]
 acc_sound = 1.0
 """
+MAPS |= {f"lsb250_linear_guide/open/{k}.mat": _GUIDE.format(name=k) for k in ("exp1", "exp2")}
 MAPS |= {
     f"shake_3storey/open/{frame}_BonusEvent_{floor}.csv": _SHAKE
     for frame in ("Flexible", "Stiff")

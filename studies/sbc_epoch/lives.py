@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from datetime import UTC, datetime, timedelta
 
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
 from lmshealth.stage.description import Stage
-from lmshealth.tracking.history import History, Series
+from lmshealth.tracking.history import History
 from lmshealth.tracking.track import Track, track
+from studies.common.histories import make_history
 
 Array = NDArray[np.float64]
-START = datetime(2026, 3, 1, tzinfo=UTC)
 
 
 @dataclass(frozen=True)
@@ -80,27 +79,20 @@ def history(rng: np.random.Generator, machine: Stage) -> History:
     Reported standard deviations of ln f are between 0.0002 and 0.005 and differ from mode to mode
     and log to log; temperature is regressed, and in half of the lives payload.
     """
-    names = tuple(mode.name for mode in machine.modes if mode.tracked)
-    n, m = int(rng.integers(8, 81)), len(names)
+    modes = [mode for mode in machine.modes if mode.tracked]
+    n, m = int(rng.integers(8, 81)), len(modes)
     level = np.exp(rng.uniform(*np.log([2e-4, 5e-3])) + 0.3 * rng.standard_normal(m))
     std = level * np.exp(0.2 * rng.standard_normal((n, m)))
-    centre = np.log([mode.frequency_hz for mode in machine.modes if mode.tracked])
-    damping = np.log([mode.damping_ratio for mode in machine.modes if mode.tracked])
     spread = np.hstack([std, np.full((n, m), 0.05)])
     covariates = {"temperature_c": 21 + 3 * rng.standard_normal(n)}
     if rng.random() < 0.5:
         covariates["payload_kg"] = rng.choice([10.0, 20.0, 30.0], size=n)
-    return History(
-        stage="SBC-1",
-        logs=tuple(f"{k:03d}" for k in range(n)),
-        recorded_at=tuple(START + timedelta(days=k) for k in range(n)),
-        travel=1000 * np.cumsum(rng.uniform(10, 200, n)),
-        covariates=covariates,
-        modes=names,
-        series=tuple(Series(name, "acc") for name in names),
-        ln_frequency=centre + std * rng.standard_normal((n, m)),
-        ln_damping=damping + 0.05 * rng.standard_normal((n, m)),
-        cov=spread[:, :, None] ** 2 * np.eye(2 * m),
-        loop_error=np.full(n, np.nan),
-        baselines=(0,),
+    travel = 1000 * np.cumsum(rng.uniform(10, 200, n))
+    frequency, damping = np.log([(mode.frequency_hz, mode.damping_ratio) for mode in modes]).T
+    estimates = (
+        frequency + std * rng.standard_normal((n, m)),
+        damping + 0.05 * rng.standard_normal((n, m)),
+        spread[:, :, None] ** 2 * np.eye(2 * m),
     )
+    names = [mode.name for mode in modes]
+    return make_history(names, travel, estimates, covariates=covariates)

@@ -1,30 +1,20 @@
 """Are posteriors of health at one epoch calibrated, over everything that is not known of it?
 
-Question
-    Of epochs drawn from the estimator's own model: is the rank of the true preload and mount among
-    draws of the posterior uniform, and do 50 and 90 % intervals cover as often? Also at several
-    epochs of a life that share one error of the map, in the X configuration, whose mount modes
-    hardly tell, and by the chains of `infer`?
 Method
     Simulation-based calibration. The covariance of the drifts is that of the real tracker, of 8 to
-    80 logs whose estimates are good to 0.02 to 0.5 %, with temperature and in half of the lives
-    payload to be regressed. ln parameters are drawn from the priors of the description, inside the
-    map, and a relative error of the map's sensitivities per parameter and mode by `model_std`;
-    drifts are those of the map, with these errors, and with noise of that covariance. Draws of
-    `EpochPosterior` are independent, by importance sampling; those of `infer`, on some of the
-    same lives, are its chains. Ranks among 127 draws, ties at random, are held to the simultaneous
-    band of their distribution at 99.9 %, and coverages to their 99.9 % Clopper-Pearson interval.
-    Negative controls that must fail: half of all covariances is told, those of the drifts and of
-    the map's error; a map is taken for exact that is wrong by 5 %. Told beside them: half of the
-    covariance of the drifts alone.
+    80 logs whose estimates have errors of 0.02 to 0.5 %, with temperature and in half of the lives
+    payload. ln parameters are drawn from the priors of the description, inside the map, and a
+    relative error of the map's sensitivities per parameter and mode by `model_std`; drifts are
+    those of the map, with these errors, and with noise of that covariance: one epoch of Y, three
+    epochs of a life that share one error of the map, one epoch of X. Draws of `EpochPosterior` are
+    by importance sampling; those of `infer`, on some of the same lives, are its chains. Ranks among
+    127 draws, ties at random, are compared with the simultaneous band of their distribution at 99.9
+    %, coverages with their 99.9 % Clopper-Pearson interval. Controls that must fail: half of all
+    covariances is stated, those of the drifts and of the map's error; a map is taken as exact that
+    is wrong by 5 %. Beside them: half of the covariance of the drifts alone.
 Answer
-    Yes. Over 4,000 lives of Y ranks of preload and mount stay inside their bands, intervals of 50
-    and 90 % cover 50 to 51 and 90 to 91 %; over 1,000 lives of three epochs under one error of the
-    map 47 to 52 and 89 to 92 % at each of them; over 1,000 lives of X 51 to 52 and 90 to 91 %, the
-    mount's too. The chains of `infer` cover 50 and 88 % in 200 lives, within their bands. With half
-    of all covariances 37 to 40 and 78 % are covered, with the map taken for exact 10 to 12 and 22
-    to 24 %. Half the covariance of the drifts alone is not seen in 1,000 lives (49 to 52 and 89 %):
-    of what one does not know after so many logs most is the error of the map.
+    Yes. Half the covariance of the drifts alone is not detected in 1,000 lives: of what is unknown
+    after so many logs most is the error of the map.
 Run time
     Of one processor some 25 lives a second, and a second for each of the chains of `infer`.
     The recorded time is that after an interruption.
@@ -51,18 +41,15 @@ from studies.harness.study import Row, Study
 from studies.sbc_epoch.lives import Life, believing, draw
 
 STEP = "infer"
-CONTROLS = ("all covariances halved", "map taken as exact")
-UNSEEN = "covariance of the drifts halved"
 
 SEED = 20261122
 EPOCHS = ("first third", "second third", "last")
 ONE, SHARED, X, CHAINS = "lms-y", "lms-y, three epochs of a life", "lms-x", "lms-y, by infer"
-DRIFTS, HALVED, EXACT = (
-    "covariance of the drifts halved", "all covariances halved", "map taken as exact",
-)  # fmt: skip
-LIVES = {
-    ONE: 4000, SHARED: 1000, X: 1000, CHAINS: 200, DRIFTS: 1000, HALVED: 1000, EXACT: 1000,
-}  # fmt: skip
+DRIFTS, HALVED = "covariance of the drifts halved", "all covariances halved"
+EXACT = "map taken as exact"
+LIVES = {ONE: 4000, SHARED: 1000, X: 1000, CHAINS: 200} | dict.fromkeys(
+    (DRIFTS, HALVED, EXACT), 1000
+)
 QUICK = {ONE: 8, SHARED: 2, X: 2, EXACT: 8}
 # Lives that tell a control from what it controls.
 ENOUGH = 250
@@ -70,8 +57,6 @@ ENOUGH = 250
 N_PRIOR, N_POINTS = 500, 2000
 # Share of the map's true error that is believed.
 _LESS = {HALVED: np.sqrt(0.5), EXACT: 0.0}
-# What a posterior is made of, and what chains are made of.
-MODEL, SAMPLER = ("epoch", "importance", "modalmap", "priors", "stage"), ("laplace", "sampling")
 
 
 def main() -> None:
@@ -114,10 +99,7 @@ def one(kind: str, life: int) -> Row:
 def ranks_of(
     drawn: Life, believed: Stage, rng: np.random.Generator, key: list[int]
 ) -> tuple[list[list[float]], int]:
-    """Rank the truth of each epoch, by chains of a key where importance sampling does not do.
-
-    Also tells whether it did not.
-    """
+    """Rank the truth of each epoch; also return whether chains replaced importance sampling."""
     told, names = drawn.track, believed.informative
     columns = [told.modes.index(name) for name in names]
     draws, chains = [], 0
@@ -175,10 +157,10 @@ def verdicts(found: dict[str, dict[str, Row]]) -> dict[str, bool]:
 def claims(answer: Row) -> Iterator[Claim]:
     """Claim uniform ranks of the truth, and controls that are detected."""
     for kind, rows in answer["ranks"].items():
-        if kind == UNSEEN:
+        if kind == DRIFTS:
             yield from ranked(f"{kind}, which is not seen", rows.values())
         else:
-            yield from ranked(kind, rows.values(), control=kind in CONTROLS)
+            yield from ranked(kind, rows.values(), control=kind in (HALVED, EXACT))
 
 
 if __name__ == "__main__":

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from datetime import UTC, datetime, timedelta
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,9 +13,9 @@ from lmshealth.stage.description import ParameterSpec, Stage
 from lmshealth.tracking.constants import BIAS_STD, JUMP_STD
 from lmshealth.tracking.covariates import regressors
 from lmshealth.tracking.history import History, Series, Step
+from studies.common.histories import make_history
 
 Array = NDArray[np.float64]
-START = datetime(2026, 3, 1, tzinfo=UTC)
 N_LOGS = 60
 # Odometer now since the baseline in km: median, and standard deviation of its logarithm.
 NOW_KM = 2000.0, 0.7
@@ -94,10 +93,14 @@ def draw(rng: np.random.Generator, machine: Stage) -> Life:
     values = level[:, mode] + _offsets(rng, series, mode, steps)
     cov = _covariance(rng, mode)
     scale = rng.choice(constants.NOISE_SCALES, p=constants.NOISE_SCALE_PRIOR)
-    values += (
-        scale * (np.linalg.cholesky(cov) @ rng.standard_normal((N_LOGS, mode.size, 1)))[..., 0]
-    )
-    return Life(_history(rng, names, travel, covariates, series, steps, values, cov), parts)
+    noise = np.linalg.cholesky(cov) @ rng.standard_normal((N_LOGS, mode.size, 1))
+    r = len(series)
+    both = np.zeros((N_LOGS, 2 * r, 2 * r))
+    both[:, :r, :r], both[:, r:, r:] = cov, 0.05**2 * np.eye(r)
+    estimates = values + scale * noise[..., 0], np.full((N_LOGS, r), np.log(0.015)), both
+    missing = rng.random((N_LOGS, r)) < 0.05
+    how = {"series": series, "covariates": covariates, "steps": steps, "missing": missing}
+    return Life(make_history(names, travel, estimates, **how), parts)
 
 
 def _travel(rng: np.random.Generator) -> Array:
@@ -178,7 +181,8 @@ def _modes(
 def _covariates(rng: np.random.Generator) -> dict[str, Array]:
     temperature = 21 + 3 * rng.standard_normal(N_LOGS)
     temperature[rng.random(N_LOGS) < 0.05] = np.nan
-    return {"temperature_c": temperature, "payload_kg": rng.choice([10.0, 20.0, 35.0], size=N_LOGS)}
+    payload = rng.choice([10.0, 20.0, 35.0], size=N_LOGS)
+    return {"temperature_c": temperature, "payload_kg": payload}
 
 
 def _covariate_effects(
@@ -224,40 +228,3 @@ def _covariance(rng: np.random.Generator, mode: Array) -> Array:
     correlation = np.where(np.equal.outer(mode, mode), 0.9, 0.2)
     np.fill_diagonal(correlation, 1.0)
     return np.asarray(std[:, :, None] * std[:, None, :] * correlation)
-
-
-def _history(
-    rng: np.random.Generator,
-    names: tuple[str, ...],
-    travel: Array,
-    covariates: dict[str, Array],
-    series: tuple[Series, ...],
-    steps: tuple[Step, ...],
-    values: Array,
-    cov: Array,
-) -> History:
-    """Put estimates into a history, and leave some of them out."""
-    r = len(series)
-    both = np.zeros((N_LOGS, 2 * r, 2 * r))
-    both[:, :r, :r] = cov
-    both[:, r:, r:] = 0.05**2 * np.eye(r)
-    damping = np.tile(np.log(0.015), (N_LOGS, r))
-    missing = rng.random((N_LOGS, r)) < 0.05
-    values, damping = np.where(missing, np.nan, values), np.where(missing, np.nan, damping)
-    gone = np.hstack([missing, missing])
-    both[gone[:, :, None] | gone[:, None, :]] = np.nan
-    return History(
-        stage="SBC-1",
-        logs=tuple(f"{k:03d}" for k in range(N_LOGS)),
-        recorded_at=tuple(START + timedelta(days=k) for k in range(N_LOGS)),
-        travel=travel,
-        covariates=covariates,
-        modes=names,
-        series=series,
-        ln_frequency=values,
-        ln_damping=damping,
-        cov=both,
-        loop_error=np.full(N_LOGS, np.nan),
-        baselines=(0,),
-        steps=steps,
-    )
