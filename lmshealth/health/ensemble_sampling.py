@@ -38,13 +38,8 @@ class Sample:
     draws : ndarray
         Of every ensemble after burn-in, step after step and in a step walker after walker, shape
         ``(n_ensembles, n_draws, n_dim)``.
-    ess_bulk, ess_tail : ndarray
-        Effective sample size of all ensembles, for the middle of the posterior and for its 5 and
-        95 % quantiles, shape ``(n_dim,)``.
-    r_hat : ndarray
-        Rank-normalised split R-hat over the ensembles, shape ``(n_dim,)``.
-    autocorrelation_time : ndarray
-        Steps, the longest of the ensembles, shape ``(n_dim,)``.
+    ess_bulk, ess_tail, r_hat, autocorrelation_time : ndarray
+        As in `Health`, and steps, the longest of the ensembles, shape ``(n_dim,)``.
     """
 
     draws: FloatArray
@@ -84,19 +79,10 @@ def seed_of(seed: int, *inputs: str) -> tuple[int, int]:
 
 
 def sample(log_probability: LogProbability, start: Start, seed: np.random.SeedSequence) -> Sample:
-    """Sample a posterior with several independent emcee ensembles.
+    """Sample a posterior, its log density -inf outside its support, by independent ensembles.
 
     Every ensemble has its own start and random stream: walkers of one ensemble depend on each
     other, so that R-hat over them is no diagnostic.
-
-    Parameters
-    ----------
-    log_probability : callable
-        Vectorised log density; -inf outside its support.
-    start : callable
-        Draws the start of an ensemble.
-    seed : SeedSequence
-        Seed of all random numbers.
 
     Raises
     ------
@@ -113,25 +99,17 @@ def sample(log_probability: LogProbability, start: Start, seed: np.random.SeedSe
     samplers = []
     for start_seed, chain_seed in zip(streams[::2], streams[1::2], strict=True):
         points = start(np.random.default_rng(start_seed))
-        sampler = emcee.EnsembleSampler(
-            *points.shape,
-            log_probability,
-            vectorize=True,
-            # Proposals from a kernel density of the other walkers need a quarter of the steps of
-            # differential evolution, but rarely reach tails without a walker; differences do, and
-            # with gamma0 = 1 they jump between modes of the posterior. DESnookerMove of emcee
-            # 3.1.6 does not keep the target: it narrows a Gaussian of six dimensions by 9 %.
-            moves=[
-                (emcee.moves.KDEMove(), 0.7),
-                (emcee.moves.DEMove(), 0.2),
-                (emcee.moves.DEMove(gamma0=1.0), 0.1),
-            ],
-        )
+        # Proposals from a kernel density of the other walkers need a quarter of the steps of
+        # differential evolution, but rarely reach tails without a walker; differences do, and with
+        # gamma0 = 1 they jump between modes of the posterior. DESnookerMove of emcee 3.1.6 does not
+        # keep the target: it narrows a Gaussian of six dimensions by 9 %.
+        moves = [emcee.moves.KDEMove(), emcee.moves.DEMove(), emcee.moves.DEMove(gamma0=1.0)]
+        weighted = list(zip(moves, (0.7, 0.2, 0.1), strict=True))
+        options = {"vectorize": True, "moves": weighted}
+        sampler = emcee.EnsembleSampler(*points.shape, log_probability, **options)
         # emcee ignores a Generator; without a state all samplers of a process draw the same.
-        state = emcee.State(
-            points, random_state=RandomState(MT19937(chain_seed)).get_state(legacy=False)
-        )
-        samplers.append((sampler, state))
+        random_state = RandomState(MT19937(chain_seed)).get_state(legacy=False)
+        samplers.append((sampler, emcee.State(points, random_state=random_state)))
     return _run(samplers)
 
 
@@ -169,13 +147,9 @@ def _run(samplers: list[tuple[emcee.EnsembleSampler, emcee.State]]) -> Sample:
         target = min(max(wanted, n_steps + n_steps // 2), constants.MAX_STEPS)
     # Effective sample sizes need each walker as a chain in time.
     walkers = np.swapaxes(kept, 1, 2)
-    return Sample(
-        draws=flattened(kept),
-        ess_bulk=_diagnose("ess", walkers, method="bulk"),
-        ess_tail=_diagnose("ess", walkers, method="tail", prob=(0.05, 0.95)),
-        r_hat=r_hat,
-        autocorrelation_time=tau,
-    )
+    ess_bulk = _diagnose("ess", walkers, method="bulk")
+    ess_tail = _diagnose("ess", walkers, method="tail", prob=(0.05, 0.95))
+    return Sample(flattened(kept), ess_bulk, ess_tail, r_hat, tau)
 
 
 def flattened(chains: FloatArray) -> FloatArray:
@@ -188,10 +162,9 @@ def _diagnose(what: str, chains: FloatArray, **options: Any) -> FloatArray:
     from arviz_stats.base.array import array_stats  # late: it costs more than numpy to import
 
     diagnostic: Any = getattr(array_stats, what)  # the library has no types
-    flat = flattened(chains)
-    axes = {"chain_axis": 0, "draw_axis": 1}
-    columns = np.moveaxis(flat, -1, 0)
-    return np.array([float(diagnostic(column, **axes, **options)) for column in columns])
+    columns = np.moveaxis(flattened(chains), -1, 0)
+    options |= {"chain_axis": 0, "draw_axis": 1}
+    return np.array([float(diagnostic(column, **options)) for column in columns])
 
 
 def _n_walkers(n_dim: int) -> int:
@@ -246,12 +219,7 @@ def start_from_prior(
 ) -> Start:
     """Start from draws of the posterior by adaptive importance sampling from the prior.
 
-    Parameters
-    ----------
-    log_probability : callable
-        As in `sample`.
-    draw_prior : callable
-        Draws from the prior: ``(rng, n)`` to ``(n, n_dim)``.
+    `draw_prior` draws from the prior: ``(rng, n)`` to ``(n, n_dim)``.
     """
 
     def start(rng: np.random.Generator) -> FloatArray:

@@ -18,20 +18,10 @@ from lmshealth.stage.priors import JointPrior
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MachineDrifts:
-    """Drifts of one machine at one epoch.
+    """Drifts of ln f of the modes of one machine since its baseline, at one epoch.
 
-    Attributes
-    ----------
-    stage : Stage
-        Description with the modal map.
-    modes : tuple of str
-        Modes used.
-    drift : ndarray
-        Drift of ln f since the baseline, shape ``(n_modes,)``.
-    cov : ndarray
-        Covariance of the drifts, shape ``(n_modes, n_modes)``.
-    columns : tuple of int
-        Index of each parameter of the machine among all parameters.
+    Drifts ``(n_modes,)`` with their covariance ``(n_modes, n_modes)``; `columns` are the indices of
+    the machine's parameters among all parameters.
     """
 
     stage: Stage

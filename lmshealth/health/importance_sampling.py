@@ -45,16 +45,8 @@ def importance_sample(
 ) -> WeightedDraws:
     """Draw from a density by importance sampling from a mixture adapted in rounds.
 
-    Parameters
-    ----------
-    log_probability : callable
-        Vectorised log density, -inf outside its support.
-    start : ndarray
-        Points that cover the support, shape ``(n_start, n_dim)``.
-    rng : Generator
-        Random numbers.
-    n : int
-        Number of draws of the last round.
+    The start are points that cover the support of the density, ``(n_start, n_dim)``; n is the
+    number of draws of the last round.
 
     Raises
     ------
@@ -81,10 +73,7 @@ def importance_sample_to_ess(
 ) -> WeightedDraws:
     """Repeat `importance_sample` with three times the draws until 400 of them are effective.
 
-    Raises
-    ------
-    NotConverged
-        If the third attempt has fewer; carries the points.
+    Raises `NotConverged`, with the points, if the third attempt has fewer.
     """
     for _ in range(_MAX_ATTEMPTS):
         found = importance_sample(log_probability, start, rng, n)

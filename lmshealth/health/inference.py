@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -25,7 +27,7 @@ from lmshealth.health.laplace import Laplace, approximate
 from lmshealth.health.results import CHECKS, Health
 from lmshealth.stage.description import Stage
 from lmshealth.stage.identifiability import identifiability_of, identifiable_parameters
-from lmshealth.stage.priors import JointPrior, combine_priors
+from lmshealth.stage.priors import combine_priors
 from lmshealth.tracking.read_tables import Drifts
 from lmshealth.tracking.track import Track
 
@@ -61,10 +63,8 @@ def infer(
 
     Parameters
     ----------
-    track : Drifts or Track
-        Drifts with covariance.
-    stage : Stage
-        Parameters, priors and modal map.
+    track, stage : Drifts or Track, Stage
+        Drifts with covariance; parameters, priors and modal map.
     seed : int or sequence of int
         Epoch k has the stream ``SeedSequence([*seed, k])``.
     epochs : sequence of int, optional
@@ -117,10 +117,8 @@ def infer_together(
 
     Parameters
     ----------
-    machines : sequence of (Drifts or Track, Stage)
-        At least two.
-    shared : sequence of str
-        Shared parameters; the others are named ``<machine>:<parameter>``.
+    machines, shared : sequence of (Drifts or Track, Stage), sequence of str
+        At least two; shared parameters: the others are named ``<machine>:<parameter>``.
     seed, epochs, mapper
         As in `infer`; epochs count those of the first machine.
 
@@ -161,8 +159,7 @@ def infer_together(
     modes = [_usable_modes(track, stage) for track, stage in machines]
     first, stage = machines[0]
     usable = [epochs_to_infer(track, own, len(track.recorded_at)) for track, own in machines]
-    prior = combine_priors([own.prior for _, own in machines], columns)
-    prior = JointPrior(names, prior.priors, prior.low, prior.high)
+    prior = replace(combine_priors([own.prior for _, own in machines], columns), names=names)
     tasks, kept = [], []
     for k in _chosen(first, stage, epochs):
         rows = [k]
@@ -170,11 +167,11 @@ def infer_together(
             rows += [r for r in own if track.recorded_at[r] <= first.recorded_at[k]][-1:]
         if len(rows) == len(machines):
             parts = zip(machines, modes, rows, columns, strict=True)
-            own_drifts = tuple(
+            drifts = tuple(
                 MachineDrifts(own, *_drifts_at(track, used, row), places)
                 for (track, own), used, row, places in parts
             )
-            tasks.append(EpochPosterior(prior, own_drifts))
+            tasks.append(EpochPosterior(prior, drifts))
             kept.append(k)
     if not kept:
         raise NotEnoughData(
@@ -192,10 +189,8 @@ def _place_parameters(
     machine_names = [track.stage for track, _ in machines]
     twice = [name for k, name in enumerate(machine_names) if name in machine_names[:k]]
     if twice:
-        raise BadTable(
-            f"two machines are called {twice[0]!r}; their own parameters need different names: "
-            "give the tables a column stage"
-        )
+        needed = "their own parameters need different names: give the tables a column stage"
+        raise BadTable(f"two machines are called {twice[0]!r}; {needed}")
     names: list[str] = []
     columns = []
     for track, stage in machines:
@@ -214,9 +209,8 @@ def _usable_modes(track: Drifts | Track, stage: Stage) -> tuple[str, ...]:
         raise BadStage(f"{stage.name}: no [[parameter]] to infer")
     modes = tuple(name for name in stage.informative if name in track.modes)
     if not modes:
-        raise NotEnoughData(
-            f"{track.stage}: none of the modes {list(stage.informative)} was tracked"
-        )
+        needed = list(stage.informative)
+        raise NotEnoughData(f"{track.stage}: none of the modes {needed} was tracked")
     return modes
 
 
@@ -248,24 +242,17 @@ def _drifts_at(
 
 
 def draw(posterior: EpochPosterior, seed: np.random.SeedSequence) -> tuple[Sample, Laplace | None]:
-    """Draw ln parameters from the posterior of an epoch; return Laplace's approximation too.
-
-    Raises
-    ------
-    NotConverged
-        With the chains.
-    """
+    """Draw ln parameters from the posterior of an epoch; return Laplace's approximation too."""
     from scipy.stats import qmc  # late: it takes longer to import than all else here
 
     low, high = posterior.prior.support
     halton = qmc.Halton(low.size, scramble=False).random(_N_SEARCHED + 1)[1:]
     points = posterior.prior.quantile(halton)
     normal = approximate(posterior.log_probability, points, low, high)
-    start = (
-        start_from_prior(posterior.log_probability, posterior.draw_prior)
-        if normal is None
-        else start_near(normal.mode, normal.cov, posterior.log_probability)
-    )
+    if normal is None:
+        start = start_from_prior(posterior.log_probability, posterior.draw_prior)
+    else:
+        start = start_near(normal.mode, normal.cov, posterior.log_probability)
     return sample(posterior.log_probability, start, seed), normal
 
 
@@ -281,10 +268,11 @@ def _infer_epoch(
         chains = np.asarray(error.chains)
         if chains.ndim != 4:  # no start: a fault of the description, not of this epoch
             raise
-        draws, converged = thin(flattened(chains), _N_KEPT), False
-        x = draws.reshape(-1, draws.shape[-1])
+        draws = thin(flattened(chains), _N_KEPT)
+        x = np.concatenate(draws)
+        found["converged"] = False
     else:
-        draws, converged, x = drawn.thinned(_N_KEPT), True, drawn.flat
+        draws, x, found["converged"] = drawn.thinned(_N_KEPT), drawn.flat, True
         low, middle, high = np.quantile(x, _LEVELS, axis=0)
         try:
             wider = _wider_quantiles(posterior, drawn, wider_seed)
@@ -296,10 +284,8 @@ def _infer_epoch(
             found["laplace_ratio"] = x.std(axis=0) / normal.std
         found["prior_shift"] = (wider[1] - middle) / x.std(axis=0)
         found["prior_ratio"] = (wider[2] - wider[0]) / (high - low)
-    found |= {"draws": draws, "converged": converged}
-    found["fit"] = posterior.fit(x[:: x.shape[0] // _N_FIT])
-    found["at_edge"] = posterior.at_edge(x)
-    return found
+    fit = posterior.fit(x[:: x.shape[0] // _N_FIT])
+    return found | {"draws": draws, "fit": fit, "at_edge": posterior.at_edge(x)}
 
 
 def _wider_quantiles(
@@ -357,12 +343,12 @@ def _infer_all(
 
 def _identifiable(tasks: Sequence[EpochPosterior], prior: FloatArray) -> BoolArray:
     """Return the identifiable parameters by the modes of each epoch, as `Health` has them."""
-    known: dict[tuple[tuple[str, ...], ...], BoolArray] = {}
     models = [identifiability_of(machine.stage) for machine in tasks[0].machines]
-    for task in tasks:
-        modes = tuple(machine.modes for machine in task.machines)
-        if modes not in known:
-            cut = [one.restricted_to(own) for one, own in zip(models, modes, strict=True)]
-            columns = [machine.columns for machine in task.machines]
-            known[modes] = identifiable_parameters(cut, columns, prior)
-    return np.stack([known[tuple(machine.modes for machine in task.machines)] for task in tasks])
+    columns = [machine.columns for machine in tasks[0].machines]
+
+    @cache
+    def by_modes(*modes: tuple[str, ...]) -> BoolArray:
+        cut = [one.restricted_to(own) for one, own in zip(models, modes, strict=True)]
+        return identifiable_parameters(cut, columns, prior)
+
+    return np.stack([by_modes(*(machine.modes for machine in task.machines)) for task in tasks])

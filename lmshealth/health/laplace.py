@@ -21,11 +21,7 @@ _SEARCHES = 3
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Laplace:
-    """Normal approximation.
-
-    Maximum of the density ``(n_dim,)``, and inverse of the negative Hessian of the log density
-    there ``(n_dim, n_dim)``.
-    """
+    """Maximum of a density, and inverse of the negative Hessian of its logarithm there."""
 
     mode: FloatArray
     cov: FloatArray
@@ -44,24 +40,12 @@ def approximate(
 ) -> Laplace | None:
     """Approximate a density by a normal distribution at its maximum.
 
-    Parameters
-    ----------
-    log_probability : callable
-        Vectorised log density.
-    points : ndarray
-        Candidate starts of the search, of which the best three are used,
-        shape ``(n_points, n_dim)``.
-    low, high : ndarray
-        Box outside of which the density is zero, shape ``(n_dim,)``.
-
-    Returns
-    -------
-    Laplace or None
-        None if the maximum lies at the edge of the box or the Hessian there is not negative
-        definite.
+    The search starts from the best three of the points ``(n_points, n_dim)``; the density is zero
+    outside the box from low to high, ``(n_dim,)``. None if the maximum lies at the edge of the box
+    or the Hessian there is not negative definite.
     """
     margin = 1e-9 * (high - low)
-    bounds = Bounds(low + margin, high - margin)
+    box, bounds = Bounds(low, high), Bounds(low + margin, high - margin)
 
     def cost(x: FloatArray) -> float:
         return -float(log_probability(x[None])[0])
@@ -70,13 +54,13 @@ def approximate(
     begins = points[np.argsort(-value, kind="stable")[:_SEARCHES]]
     ends = [minimize(cost, begin, method="L-BFGS-B", bounds=bounds) for begin in begins]
     mode = min(ends, key=lambda end: float(end.fun)).x
-    cov = _inverse_curvature(log_probability, mode, _FIRST_STEP * (high - low), low, high)
+    cov = _inverse_curvature(log_probability, mode, _FIRST_STEP * (high - low), box)
     for _ in range(2):  # a Newton step, then the curvature at its end
         if cov is None:
             return None
         step = _STEP * np.sqrt(np.diag(cov))
         mode = mode + cov @ _slope(log_probability, mode, step)
-        cov = _inverse_curvature(log_probability, mode, step, low, high)
+        cov = _inverse_curvature(log_probability, mode, step, box)
     return None if cov is None else Laplace(mode=mode, cov=cov)
 
 
@@ -87,15 +71,11 @@ def _slope(log_probability: LogProbability, x: FloatArray, step: FloatArray) -> 
 
 
 def _inverse_curvature(
-    log_probability: LogProbability,
-    x: FloatArray,
-    step: FloatArray,
-    low: FloatArray,
-    high: FloatArray,
+    log_probability: LogProbability, x: FloatArray, step: FloatArray, box: Bounds
 ) -> FloatArray | None:
     """Invert the negative matrix of second differences; None if it is not positive definite."""
     n = x.size
-    if (x - 2 * step <= low).any() or (x + 2 * step >= high).any():
+    if (x - 2 * step <= box.lb).any() or (x + 2 * step >= box.ub).any():
         return None
     shifts = np.diag(step)
     one, other = np.repeat(shifts, n, axis=0), np.tile(shifts, (n, 1))

@@ -32,50 +32,42 @@ class Health:
 
     Attributes
     ----------
+    Arrays have the shape ``(n_epochs, n_parameters)`` where none is stated.
+
+    Attributes
+    ----------
     stage : str
         Identity of the machine.
-    recorded_at : tuple of datetime
-        Epochs, ascending.
-    travel : ndarray
-        Odometer in m, shape ``(n_epochs,)``.
-    parameters : tuple of str
-        Parameter names.
+    recorded_at, travel : tuple of datetime, ndarray
+        Epochs, ascending, and odometer in m, shape ``(n_epochs,)``.
     chains : ndarray
         Draws of the ensembles, shape ``(n_epochs, n_ensembles, n_draws, n_parameters)``.
-    ess_bulk, ess_tail : ndarray
+    ess_bulk, ess_tail, r_hat : ndarray
         Effective sample size over all ensembles, for the middle and for the 5 and 95 % quantiles,
-        shape ``(n_epochs, n_parameters)``; NaN where the sampler did not converge, as are `r_hat`
-        and the shifts and ratios.
-    r_hat : ndarray
-        Rank-normalised split R-hat over the ensembles, shape ``(n_epochs, n_parameters)``.
+        and rank-normalised split R-hat; NaN where the sampler did not converge, as are the shifts
+        and ratios.
     converged : ndarray of bool
         Shape ``(n_epochs,)``.
     informed : ndarray
-        Share of the prior variance of ln parameter that the data removed, at least 0,
-        shape ``(n_epochs, n_parameters)``.
+        Share of the prior variance of ln parameter that the data removed, at least 0.
     prior_width : ndarray
         Width of the prior's 90 % interval, shape ``(n_parameters,)``.
     identifiable : ndarray of bool
         Whether unlimited logs with the modes of the epoch inform the parameter on average over the
-        priors, shape ``(n_epochs, n_parameters)``. An unidentifiable one may be `informed` by
-        chance: at drifts near 0 the map's error is negligible.
+        priors. An unidentifiable one may be `informed` by chance: at drifts near 0 the map's error
+        is negligible.
     correlation : ndarray
         Posterior correlation of ln parameters, shape ``(n_epochs, n_parameters, n_parameters)``.
     laplace_shift, laplace_ratio : ndarray
         Difference of the posterior mean of ln parameter from the mode of Laplace's approximation in
-        its standard deviations, and ratio of the standard deviations, shape
-        ``(n_epochs, n_parameters)``; NaN also where the approximation does not exist.
+        its standard deviations, and ratio of the standard deviations; NaN also without it.
     prior_shift, prior_ratio : ndarray
         Change of the median of ln parameter under priors twice as wide, in posterior standard
-        deviations, and ratio of the 90 % intervals, shape ``(n_epochs, n_parameters)``; NaN also
-        where the map hardly lets the prior widen.
+        deviations, and ratio of the 90 % intervals; NaN also where the map hardly lets them widen.
     fit : ndarray
         Upper bound of the p value of the drifts under the best draw, shape ``(n_epochs,)``.
     at_edge : ndarray of bool
-        Whether the posterior ends at an end of the map, which then bounds the value,
-        shape ``(n_epochs, n_parameters)``.
-    seed : tuple of int
-        Seed of all random streams.
+        Whether the posterior ends at an end of the map, which then bounds the value.
     """
 
     stage: str
@@ -157,10 +149,8 @@ class Health:
             "prior_width": np.tile(self.prior_width, (n, 1)),
         }
         columns |= {name: getattr(self, name) for name in ("informed", *CHECKS)}
-        columns |= {
-            f"correlation_{name}": self.correlation[:, :, j]
-            for j, name in enumerate(self.parameters)
-        }
+        names = enumerate(self.parameters)
+        columns |= {f"correlation_{name}": self.correlation[:, :, j] for j, name in names}
         return pd.DataFrame(
             {
                 "stage": self.stage,
@@ -188,10 +178,8 @@ class Health:
             for what in ("informed", "identifiable", "at_edge", *CHECKS)
             for j, name in enumerate(self.parameters)
         }
-        checks |= {
-            f"correlation_{a}_{b}": self.correlation[:, i, j]
-            for (i, a), (j, b) in combinations(enumerate(self.parameters), 2)
-        }
+        pairs = combinations(enumerate(self.parameters), 2)
+        checks |= {f"correlation_{a}_{b}": self.correlation[:, i, j] for (i, a), (j, b) in pairs}
         checks |= {"travel_m": self.travel, "converged": self.converged, "fit": self.fit}
         posterior = {name: draws[..., j] for j, name in enumerate(self.parameters)}
         return arviz_base.from_dict(

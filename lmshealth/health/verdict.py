@@ -41,21 +41,10 @@ def degraded_words(verdict: str) -> tuple[str, ...]:
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """State of a stage with its probability.
+    """State of a stage at its last log with its probability, and sentences that explain it.
 
-    Attributes
-    ----------
-    stage : str
-        Identity of the machine.
-    recorded_at : datetime
-        The last log.
-    verdict : str
-        ``healthy``, ``step``, ``not-enough-data``, or what `verdict_of` returns for the degraded
-        parameters.
-    probability : float
-        Posterior probability of that state; NaN for ``not-enough-data``.
-    why : str
-        Sentences for the reader of the report.
+    The verdict is ``healthy``, ``step``, ``not-enough-data``, or what `verdict_of` returns for the
+    degraded parameters; the probability is NaN for ``not-enough-data``.
     """
 
     stage: str
@@ -67,9 +56,8 @@ class Verdict:
 
 def degraded_below(parameter: ParameterSpec) -> float:
     """Return the value below which a parameter is degraded."""
-    limit = parameter.baseline * (1 - constants.LOSS_WITHOUT_LIMIT)
-    if parameter.limit:
-        limit = parameter.limit.below
+    own, without = parameter.limit, parameter.baseline * (1 - constants.LOSS_WITHOUT_LIMIT)
+    limit = own.below if own else without
     return parameter.baseline - constants.DEGRADED_SHARE * (parameter.baseline - limit)
 
 
@@ -80,10 +68,8 @@ def judge(
 
     Parameters
     ----------
-    stage : Stage
-        Parameters with their limits and words.
-    history : History
-        All logs.
+    stage, history : Stage, History
+        Parameters with their limits and words, and all logs.
     health : Health or None
         Posterior of the parameters; None if they could not be inferred.
     track : Track, optional
@@ -149,11 +135,9 @@ def undeclared_events(
     track: Track | None, baseline: int, kind: Literal["step", "alarm"]
 ) -> list[Event]:
     """Return the events of a kind after a log that no maintenance declares, one per mode."""
-    return [
-        event
-        for event in (() if track is None else track.events)
-        if event.kind == kind and not event.declared and event.epoch > baseline
-    ]
+    events = () if track is None else track.events
+    undeclared = (one for one in events if one.kind == kind and not one.declared)
+    return [one for one in undeclared if one.epoch > baseline]
 
 
 def _alarm_sentences(track: Track | None, baseline: int) -> Iterator[str]:
@@ -175,16 +159,11 @@ def _judge_step(
     stage: Stage, history: History, health: Health | None, jumps: list[Event]
 ) -> Verdict:
     last = max(event.epoch for event in jumps)
-    sizes = ", ".join(
-        f"{event.mode} {100 * np.expm1(event.size):+.1f} %".replace("-", "−")
-        for event in jumps
-        if event.epoch == last
-    )
-    when = history.recorded_at[last].date().isoformat()
-    why = (
-        f"The frequencies jumped before the log of {when} ({sizes}), and no declared maintenance "
-        "explains it."
-    )
+    latest = (event for event in jumps if event.epoch == last)
+    sizes = ", ".join(f"{one.mode} {100 * np.expm1(one.size):+.1f} %" for one in latest)
+    when, moved = history.recorded_at[last].date().isoformat(), sizes.replace("-", "−")
+    why = f"The frequencies jumped before the log of {when} ({moved}), and no declared maintenance "
+    why += "explains it."
     if health is not None and health.informed_parameters().any():
         why += " " + _parameter_sentences(stage, health)
     evidence = max(event.evidence for event in jumps)
@@ -200,33 +179,27 @@ def _judge_posterior(stage: Stage, history: History, health: Health) -> Verdict:
     draws = Counter(map(tuple, np.column_stack(list(lost.values())).tolist()))
     # Of equally probable verdicts the one with fewer degraded parameters.
     degraded, count = max(draws.items(), key=lambda one: (one[1], -sum(one[0]), one[0]))
-    return Verdict(
-        stage=history.stage,
-        recorded_at=history.recorded_at[-1],
-        verdict=verdict_of(tuple(compress(lost, degraded))),
-        probability=count / health.samples.shape[1],
-        why=_parameter_sentences(stage, health),
-    )
+    verdict, probability = verdict_of(tuple(compress(lost, degraded))), count / draws.total()
+    why = _parameter_sentences(stage, health)
+    return Verdict(history.stage, history.recorded_at[-1], verdict, probability, why)
 
 
 def _parameter_sentences(stage: Stage, health: Health) -> str:
-    low, middle, high = health.latest(np.array([0.05, 0.5, 0.95]))
+    quantiles = health.latest(np.array([0.05, 0.5, 0.95]))
     informed = health.informed_parameters()
     sentences = []
     for j, parameter in enumerate(stage.parameters):
         name = parameter.name.replace("_", " ").capitalize()
+        low, middle, high = quantiles[:, j]
         if not health.identifiable[-1, j]:
-            sentences.append(f"{name}: not identifiable from the tracked modes.")
+            text = f"{name}: not identifiable from the tracked modes."
         elif not informed[j]:
-            sentences.append(f"{name}: not constrained by these logs.")
+            text = f"{name}: not constrained by these logs."
         elif parameter.unit:
-            sentences.append(
-                f"{name} is {middle[j]:.4g} {parameter.unit} (90 %: {low[j]:.4g} to {high[j]:.4g})."
-            )
+            text = f"{name} is {middle:.4g} {parameter.unit} (90 %: {low:.4g} to {high:.4g})."
         else:
-            low_j, middle_j, high_j = (100 * q[j] / parameter.baseline for q in (low, middle, high))
-            sentences.append(
-                f"{name} is at {middle_j:.0f} % of its baseline value "
-                f"(90 %: {low_j:.0f} to {high_j:.0f} %)."
-            )
+            low, middle, high = (100 * q / parameter.baseline for q in (low, middle, high))
+            text = f"{name} is at {middle:.0f} % of its baseline value "
+            text += f"(90 %: {low:.0f} to {high:.0f} %)."
+        sentences.append(text)
     return " ".join(sentences)

@@ -41,9 +41,9 @@ Pace = Lognormal | Normal
 class LawEvidence:
     """Evidence of a machine on one of several laws, or values of the scatter.
 
-    Prior and posterior probability of the law, by the description and by the machine's logs;
-    `pace` is the log likelihood of mean and variance of the fleet under the law, relative to the
-    description's prior, shape ``(n_means, n_variances)``, or ``(1, 1)`` without a pace.
+    Its probability by the description and by the machine's logs; `pace` is the log likelihood of
+    mean and variance of the fleet under the law, relative to the description's prior, shape
+    ``(n_means, n_variances)``, or ``(1, 1)`` without a pace.
     """
 
     prior: float
@@ -91,21 +91,15 @@ class FleetPrior:
     def apply_to(self, stage: Stage) -> Stage:
         """Return the stage with this prior, and a digest of both."""
         known = {(law.parameter, law.kind): law for law in self.laws}
-        parameters = tuple(
-            msgspec.structs.replace(
-                parameter,
-                law=tuple(
-                    _with_prior(law, known[parameter.name, law.kind]) for law in parameter.laws
-                ),
+        parameters = []
+        for parameter in stage.parameters:
+            laws = tuple(
+                _with_prior(law, known[parameter.name, law.kind]) for law in parameter.laws
             )
-            for parameter in stage.parameters
-        )
-        return replace(
-            stage,
-            description=msgspec.structs.replace(stage.description, parameter=parameters),
-            digest=fingerprint(stage.digest, self.laws, self.scatter),
-            scatter=self.scatter,
-        )
+            parameters.append(msgspec.structs.replace(parameter, law=laws))
+        description = msgspec.structs.replace(stage.description, parameter=tuple(parameters))
+        digest = fingerprint(stage.digest, self.laws, self.scatter)
+        return replace(stage, description=description, digest=digest, scatter=self.scatter)
 
 
 def machine_evidence(stage: Stage, life: LifePosterior) -> MachineEvidence:
@@ -134,10 +128,9 @@ def machine_evidence(stage: Stage, life: LifePosterior) -> MachineEvidence:
 
 
 def pace_likelihood(z: FloatArray, weight: FloatArray) -> FloatArray:
-    """Return the log likelihood ratio of fleets with mean m and variance v to the description.
+    """Return ln of the mean of N(z; m, v) / N(z; 0, 1) over draws, ``(n_means, n_variances)``.
 
-    For draws ``(n,)`` of the standardised pace under the description and their normalised weights
-    ``(n,)``: ln of the mean of N(z; m, v) / N(z; 0, 1), shape ``(n_means, n_variances)``.
+    Of the standardised pace under the description ``(n,)``, with normalised weights ``(n,)``.
     """
     columns = [
         logsumexp(0.5 * z**2 - 0.5 * (z - _MEAN) ** 2 / v, axis=1, b=weight) - 0.5 * np.log(v)
@@ -149,28 +142,16 @@ def pace_likelihood(z: FloatArray, weight: FloatArray) -> FloatArray:
 def needs_fleet_prior(evidence: MachineEvidence) -> bool:
     """Return whether a machine's own logs inform the pace of a probable law too little.
 
-    A machine without wear needs the fleet prior, however far it has travelled, until a law by which
-    it would wear is improbable.
+    So do those of a machine without wear, until a law by which it would wear is improbable.
     """
     return evidence.informed < INFORMED
 
 
 def fleet_priors(stage: Stage, evidence: Mapping[str, MachineEvidence]) -> dict[str, FleetPrior]:
-    """Estimate a prior for each machine that needs one from all others.
+    """Estimate a prior for each machine that needs one from all others of its description.
 
-    Machines without wear count too: without them all machines would seem to wear, and fast.
-
-    Parameters
-    ----------
-    stage : Stage
-        Their common description.
-    evidence : mapping of str to MachineEvidence
-        By machine, in any order.
-
-    Returns
-    -------
-    dict of str to FleetPrior
-        By machine; empty with fewer than three others.
+    Machines without wear count too: without them all machines would seem to wear, and fast. Empty
+    with fewer than three others.
     """
     machines, n_others = sorted(evidence), len(evidence) - 1
     needy = [machine for machine in machines if needs_fleet_prior(evidence[machine])]
@@ -186,9 +167,9 @@ def fleet_priors(stage: Stage, evidence: Mapping[str, MachineEvidence]) -> dict[
         for name, priors in found.items():
             # Estimated one by one: their probabilities are normalised.
             total = sum(one.share[1] for one in priors)
-            laws[name] += [
-                replace(one, share=(one.share[0], _rounded(one.share[1] / total))) for one in priors
-            ]
+            for one in priors:
+                share = one.share[0], _rounded(one.share[1] / total)
+                laws[name].append(replace(one, share=share))
     scatters: dict[str, list[tuple[float, ...]]] = {name: [] for name in needy}
     for field in _SCATTERS:
         columns = zip(*(evidence[name].scatter[field] for name in machines), strict=True)
@@ -225,11 +206,8 @@ def _predictives(
 
 
 def _hyperprior(evidence: LawEvidence, n: int) -> tuple[FloatArray, FloatArray]:
-    """Return nodes of the share, and the log prior of share, mean and variance at the nodes.
-
-    Shapes ``(n_shares,)`` and ``(n_shares, n_means, n_variances)``.
-    """
-    own = _LOG_PRIOR if evidence.pace.size > 1 else np.zeros((1, 1))
+    """Return nodes of the share, and the log prior there, ``(n_shares, n_means, n_variances)``."""
+    own = _LOG_PRIOR if evidence.pace.size > 1 else _NO_PACE
     if n == 1:
         return np.ones(1), own[None]
     a, b = n * evidence.prior, n * (1 - evidence.prior)
@@ -269,7 +247,7 @@ def _law_prior(parameter: str, law: AnyLaw, before: float, predictive: _Predicti
     if field:
         prior = getattr(law, field)
         placed = prior.placed(predictive.mean, predictive.std)
-        pace = (prior, type(prior)(*(_rounded(value) for value in msgspec.structs.astuple(placed))))
+        pace = (prior, type(prior)(*map(_rounded, msgspec.structs.astuple(placed))))
     return LawPrior(parameter, law.kind, (before, _rounded(predictive.share)), field, pace)
 
 
