@@ -2,63 +2,65 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from studies.harness.figures import BLACK, BLUE, ORANGE, write
+from studies.harness.figures import BLACK, BLUE, ORANGE, name_lines, write
 from studies.harness.study import Row, read_record
 
 PARAMETERS = {"guide_preload": (BLUE, "o", "preload"), "mount_stiffness": (ORANGE, "s", "mount")}
 WHAT = {"last": "last log, no law", "now": "now, by laws", "left": "remaining life"}
 
 
-def coverage(
-    ax: Axes, rows: list[Row], named: Callable[[Row], str], names: list[str], raw: list[Row]
-) -> None:
-    """Draw how often intervals hold the truth, one line per name."""
-    nominal = "90"
-    ax.axvline(float(nominal) / 100, color=BLACK, ls="--", lw=1)
-    for row in rows:
+Name = Callable[[Row], str]
+
+
+def draw_lines(
+    ax: Axes, values: Callable[[Row], list[float | None]], own: list[Row], raw: list[Row],
+    name: Name, names: list[str],
+) -> None:  # fmt: skip
+    """Draw low, middle and high values of rows and the middle of raw lives, one line per name."""
+    for row in own:
         colour, marker, _ = PARAMETERS.get(row["parameter"], (BLACK, "D", "first of both"))
         place = list(PARAMETERS).index(row["parameter"]) if row["parameter"] in PARAMETERS else 2
-        y, own = names.index(named(row)) + 0.2 * (place - 0.5), row[nominal]
-        ax.plot([own["low"], own["high"]], [y, y], lw=1.3, color=colour, alpha=0.6)
-        ax.plot(own["share"], y, marker, ms=4, color=colour)
+        y, (low, middle, high) = names.index(name(row)) + 0.2 * (place - 0.5), values(row)
+        ax.plot([low, high], [y, y], lw=1.3, color=colour, alpha=0.6)
+        ax.plot(middle, y, marker, ms=4, color=colour)
     for row in raw:
-        if named(row) in names and row["parameter"] in PARAMETERS:
+        if name(row) in names and row["parameter"] in PARAMETERS:
             colour = PARAMETERS[row["parameter"]][0]
-            ax.plot(row[nominal]["share"], names.index(named(row)) + 0.36, "x", ms=4, color=colour)
-    ax.set_yticks(range(len(names)), names)
-    ax.set_ylim(len(names) - 0.4, -0.6)
-    ax.set_xlim(-0.02, 1.02)
-    ax.set_xlabel(f"share of {nominal} % intervals holding the truth")
+            ax.plot(values(row)[1], names.index(name(row)) + 0.36, "x", ms=4, color=colour)
+    name_lines(ax, names)
     ax.grid(axis="x", alpha=0.25)
 
 
-def bias(
-    ax: Axes, rows: list[Row], named: Callable[[Row], str], names: list[str], raw: list[Row]
+def coverage(
+    ax: Axes, own: list[Row], name: Name, names: list[str], raw: Sequence[Row] = ()
 ) -> None:
-    """Draw how far medians are off on average."""
+    """Draw how often intervals contain the truth."""
+    ax.axvline(0.9, color=BLACK, ls="--", lw=1)
+    draw_lines(ax, lambda row: [row["90"][key] for key in ("low", "share", "high")],
+               own, list(raw), name, names)  # fmt: skip
+    ax.set_xlim(-0.02, 1.02)
+    ax.set_xlabel("share of 90 % intervals holding the truth")
+
+
+def off(row: Row) -> list[float | None]:
+    """Return the mean error of medians in %, with two standard errors below and above."""
+    mean, se = row["error"]["mean"], row["error"]["se"] or 0.0
+    return [100 * (mean - 2 * se), 100 * mean, 100 * (mean + 2 * se)]
+
+
+def bias(ax: Axes, own: list[Row], name: Name, names: list[str], raw: list[Row]) -> None:
+    """Draw the mean error of medians."""
     ax.axvline(0, color=BLACK, lw=1)
-    for row in rows:
-        colour, marker, _ = PARAMETERS[row["parameter"]]
-        y = names.index(named(row)) + 0.2 * (list(PARAMETERS).index(row["parameter"]) - 0.5)
-        mean, se = row["error"]["mean"], row["error"]["se"] or 0.0
-        ax.plot([100 * (mean - 2 * se), 100 * (mean + 2 * se)], [y, y], lw=1.3, color=colour)
-        ax.plot(100 * mean, y, marker, ms=4, color=colour)
-    for row in raw:
-        if named(row) in names:
-            mean, colour = row["error"]["mean"], PARAMETERS[row["parameter"]][0]
-            ax.plot(100 * mean, names.index(named(row)) + 0.36, "x", ms=4, color=colour)
-    ax.set_yticks(range(len(names)), names)
-    ax.set_ylim(len(names) - 0.4, -0.6)
+    draw_lines(ax, off, own, raw, name, names)
     ax.set_xscale("symlog", linthresh=2)
     ticks = (-20, -5, -2, 0, 2, 5, 20)
     ax.set_xticks(ticks, [str(tick) for tick in ticks])
     ax.set_xlabel("mean error of the median in %, ± 2 std errors")
-    ax.grid(axis="x", alpha=0.25)
 
 
 def kind(row: Row) -> str:
@@ -97,7 +99,7 @@ def draw_demo(ax: Axes, rows: list[Row]) -> None:
     ax.legend(fontsize=7, loc="lower right")
 
 
-def named_in(rows: list[Row], named: Callable[[Row], str]) -> list[str]:
+def named_in(rows: list[Row], named: Name) -> list[str]:
     """Names of rows, each once."""
     return list(dict.fromkeys(named(row) for row in rows))
 
@@ -128,11 +130,11 @@ def draw_figure(figure: Figure, result: Row) -> None:
     axes = middle.subplots(1, 3, sharey=True)
     own = [row for row in fleets if row["stage"] == "lms-y"]
     for ax, (what, title) in zip(axes, WHAT.items(), strict=True):
-        coverage(ax, of(own, what), fleet, named_in(own, fleet), [])
+        coverage(ax, of(own, what), fleet, named_in(own, fleet))
         ax.set_title(f"Y, drawn from the priors: {title}", fontsize=10)
     left, right = bottom.subfigures(1, 2, width_ratios=(2, 1.1))
     for ax, (what, title) in zip(left.subplots(1, 2, sharey=True), WHAT.items(), strict=False):
-        coverage(ax, of(plants, what), plant, named_in(plants, plant), [])
+        coverage(ax, of(plants, what), plant, named_in(plants, plant))
         ax.set_title(f"Y, a wrong plant's map: {title}", fontsize=10)
     draw_demo(right.subplots(), result["demo"])
     for colour, marker, what in (*PARAMETERS.values(), (BLACK, "D", "first limit of both"),

@@ -30,7 +30,7 @@ Run time
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -40,43 +40,12 @@ import numpy as np
 
 from lmshealth.errors import NotConverged, NotEnoughData
 from lmshealth.health.inference import infer
-from studies.common.lives import (
-    DAMAGED,
-    HEALTHY,
-    RAW,
-    Array,
-    Estimates,
-    Life,
-    drawn,
-    identified,
-    measured,
-    plan_of,
-    recorded,
-    rng_of,
-)
+from studies.common import lives
+from studies.common.lives import DAMAGED, HEALTHY, Array, Estimates, Life, rng_of
 from studies.harness.claims import Claim, Older, counted, covered, number, percents
-from studies.harness.study import Row, Study, Trials
-from studies.health_robustness.trials import (
-    ENDS,
-    PARAMETERS,
-    WRONG_PLANTS,
-    Answer,
-    Arm,
-    Case,
-    Followed,
-    at_epoch,
-    by_law,
-    by_laws,
-    elsewhere,
-    epoch_draws,
-    followed,
-    life_draws,
-    modelled,
-    on_path,
-    stage_with,
-    summed,
-    told,
-)
+from studies.harness.study import Row, Study
+from studies.health_robustness import trials
+from studies.health_robustness.trials import Answer, Arm, Case, Followed, followed, stage_with
 
 STEP = "health, on machines outside the model"
 OLDER = {
@@ -84,13 +53,13 @@ OLDER = {
     "control": Older("0c702f1698ba", "laws were weighed"),
 }
 AXES = {"lms-y": "Y", "lms-x": "X"}
+STAGES = tuple(AXES)
 ASKED = {
     "at epochs": ("epoch", "last"),
     "by the laws": ("now",),
     "of the remaining life": ("left",),
 }
 
-STAGES = ("lms-y", "lms-x")
 KINDS = HEALTHY + DAMAGED
 JUMPING = ("sudden-loosening", "crash")
 FIRST_SEED, RAW_SEED = 8000, 100
@@ -98,32 +67,28 @@ SIZES = ("studies.common.lives",)  # where the sizes of estimates come from
 MAP_STD = 0.05  # as the descriptions have it
 _LEVELS = (0.05, 0.5, 0.95)
 RIGHT, WRONG = "map right", "map 5 % wrong"
+BARE, COHERENT = Arm("no error term", 0.0), Arm("coherent", MAP_STD)
 HALVED = Arm("no error term, R halved", 0.0, shrink=0.5)
 # World, and what the estimator believes there.
 ARMS: dict[str, tuple[Arm, ...]] = {
-    RIGHT: (
-        Arm("no error term", 0.0),
-        Arm("coherent", MAP_STD),
-    ),
-    WRONG: (
-        Arm("no error term", 0.0),
-        Arm("independent", 0.0, independent=MAP_STD),
-        Arm("coherent", MAP_STD),
-    ),
+    RIGHT: (BARE, COHERENT),
+    WRONG: (BARE, Arm("independent", 0.0, independent=MAP_STD), COHERENT),
 }
 Sizes = dict[str, tuple[Estimates, Life]]
+# Lives drawn from the priors, with their first seed: on paths, and by laws.
+ON_PATH, BY_LAW = (trials.on_path, 20_000), (trials.by_law, 30_000)
 
 
 def main() -> None:
     """Run the study; ``--quick`` does a few lives and records nothing."""
     study = Study(__file__, __doc__, raw=0, control=0)
-    kept, name = study.kept(RAW), "result"
+    kept, name = study.kept(lives.RAW), "result"
     if study.options.raw:
         name, answer = "raw", raw(study.options.raw, kept)
     elif study.options.control:
         name, answer = "control", control(study.options.control, kept)
     else:
-        answer = drawn_lives(study.trials, QUICK if study.quick else FULL, kept)
+        answer = drawn_lives(study, QUICK if study.quick else FULL, kept)
     study.conclude(answer, name=name, quick_may_fail=True)
 
 
@@ -139,16 +104,16 @@ QUICK = {"kind": 1, "kind_law": 0, "kind_other": 0, "path": 8, "law": 1, "other"
          "stages": 1, "every_kind": 5, "worlds": 1}  # fmt: skip
 
 
-def drawn_lives(trials: Trials, n: dict[str, int], kept: Path | None) -> Row:
+def drawn_lives(study: Study, n: dict[str, int], kept: Path | None) -> Row:
     """Draw all fleets and judge them."""
     stages = STAGES[: n["stages"]]
     sizes = {
-        stage: measured(stage, n["sized"], kept) if n["sized"] else recorded(stage)
+        stage: lives.measured(stage, n["sized"], kept) if n["sized"] else lives.recorded(stage)
         for stage in stages
     }
     n_law = dict(zip(STAGES, (n["kind_law"], n["kind_other"]), strict=True))
     laws = dict(zip(STAGES, (n["law"], n["other"]), strict=True))
-    once, each = partial(trials.once, also=SIZES), partial(trials.collect, also=SIZES)
+    each = partial(study.trials.collect, also=SIZES)
     kinds = [(stage, kind, n["kind"], n_law[stage]) for stage in stages
              for kind in KINDS[:: -n["every_kind"]][::-1]]  # fmt: skip
     worlds = [(stage, world, n["path"], laws[stage])
@@ -156,159 +121,133 @@ def drawn_lives(trials: Trials, n: dict[str, int], kept: Path | None) -> Row:
     parts = {
         "lives": each(partial(lives_of, sizes), kinds),
         "fleets": each(partial(fleet_of, sizes), worlds),
-        "plants": [once(partial(plants_of, sizes), n["plant_path"], n["plants"], n["maps"])],
+        "plants": each(partial(plants_of, sizes), [(n["plant_path"], n["plants"], n["maps"])]),
     }
     answer: Row = {
         name: [row for part in found for row in part["rows"]] for name, found in parts.items()
     }
     answer |= {
-        "demo": once(partial(demo, sizes=sizes), n["demo"]),
-        "chains": once(partial(chains, sizes=sizes), n["chains"]),
+        "demo": study.trials.once(partial(demo, sizes=sizes), n["demo"], also=SIZES),
+        "chains": study.trials.once(partial(chains, sizes=sizes), n["chains"], also=SIZES),
         "not_drawn": [line for found in parts.values() for part in found for line in part["lost"]],
     }
     return answer | {"passed": verdicts(answer)}
 
 
-def lives_of(sizes: Sizes, stage: str, kind: str, n: int, n_law: int) -> Row:
-    """Judge lives of one kind."""
-    lost: list[str] = []
-    cases = list(of_kind(stage, kind, n, sizes, KINDS.index(kind)))
-    return {"rows": judged(cases, n_law, lost), "lost": lost}
-
-
-def fleet_of(sizes: Sizes, stage: str, world: str, n_path: int, n_law: int) -> Row:
-    """Judge drawn lives in one world."""
-    lost: list[str] = []
-    rows = drawn_fleets(stage, n_path, n_law, sizes, lost, {world: ARMS[world]})
-    return {"rows": rows, "lost": lost}
-
-
-def plants_of(sizes: Sizes, n_path: int, n_law: int, n_maps: int) -> Row:
-    """Judge lives with maps of plants that are not theirs."""
-    lost: list[str] = []
-    n = {"path": n_path, "plants": n_law, "maps": n_maps}
-    return {"rows": wrong_plants("lms-y", n, sizes, lost), "lost": lost}
-
-
 def of_kind(stage: str, kind: str, n: int, sizes: Sizes, key: int) -> Iterator[Case]:
     """Take lives of one kind with drawn estimates."""
-    for i in range(n):
-        seed = FIRST_SEED + i
-
-        def estimates(life: Life, seed: int = seed) -> Estimates:
-            return drawn(life, *sizes[stage], rng_of(11, STAGES.index(stage), key, seed))
-
-        yield modelled(stage, kind, seed, estimates)
+    for seed in range(FIRST_SEED, FIRST_SEED + n):
+        rng = rng_of(11, STAGES.index(stage), key, seed)
+        yield trials.modelled(
+            stage, kind, seed, lambda life, rng=rng: lives.drawn(life, *sizes[stage], rng)
+        )
 
 
-def judged(cases: list[Case], n_law: int, lost: list[str]) -> list[Row]:
-    """Judge lives of one kind: health at a random epoch and the last, and by the laws."""
-    life = cases[0].life
-    stage = stage_with(life.stage, MAP_STD)
-    lives = followed(cases, stage)
-    found: dict[str, list[list[Answer]]] = {"epoch": [], "last": [], "now": [], "left": []}
-    for one in lives:
+def lives_of(sizes: Sizes, stage: str, kind: str, n: int, n_law: int) -> Row:
+    """Judge lives of one kind."""
+    return judged(of_kind(stage, kind, n, sizes, KINDS.index(kind)), stage, kind, n_law)
+
+
+def judged(cases: Iterable[Case], stage: str, kind: str, n_law: int | None = None) -> Row:
+    """Judge lives of one kind: health at a random epoch and the last, and some by the laws."""
+    believed = stage_with(stage, MAP_STD)
+    own = followed(cases, believed)
+    found: dict[str, list[list[Answer]]] = {"epoch": [], "last": []}
+    for one in own:
         rng = rng_of(12, one.case.life.seed, len(one.case.life.kind))
         last = len(one.case.health) - 1
-        found["epoch"].append(at_epoch(one, stage, int(rng.integers(1, last)), rng))
-        found["last"].append(at_epoch(one, stage, last, rng))
-    for one in lives[:n_law]:
-        whole_life(found, one, Arm("coherent", MAP_STD), lost)
-    return rows(found, {"stage": life.stage, "kind": life.kind})
+        at = int(rng.integers(1, last))
+        found["epoch"].append(trials.at_epoch(one, believed, at, rng))
+        found["last"].append(trials.at_epoch(one, believed, last, rng))
+    by_laws, lost = whole_lives(own[:n_law], COHERENT)
+    return {"rows": rows(found | by_laws, stage, {"kind": kind}), "lost": lost}
 
 
-def whole_life(
-    found: dict[str, list[list[Answer]]], one: Followed, arm: Arm, lost: list[str], plant: str = ""
-) -> None:
-    """Ask one life by the laws, and note where no posterior could be drawn."""
-    life = one.case.life
-    rng = rng_of(13, life.seed, len(life.kind))
-    stage = stage_with(life.stage, arm.model_std, plant, losing=one.case.losing)
-    try:
-        now, left = by_laws(one, stage, arm, rng)
-    except (NotConverged, NotEnoughData) as error:
-        lost.append(f"{life.stage} {life.kind} {life.seed} {arm.name}: {error}")
-        return
-    found["now"].append(now)
-    found["left"].append(left)
+def whole_lives(
+    own: Iterable[Followed], arm: Arm, plant: str = ""
+) -> tuple[dict[str, list[list[Answer]]], list[str]]:
+    """Ask lives by the laws; return health now, what is left, and where no posterior was drawn."""
+    found: dict[str, list[list[Answer]]] = {"now": [], "left": []}
+    lost = []
+    for one in own:
+        life = one.case.life
+        stage = stage_with(life.stage, arm.model_std, plant, losing=one.case.losing)
+        try:
+            now, left = trials.by_laws(one, stage, arm, rng_of(13, life.seed, len(life.kind)))
+        except (NotConverged, NotEnoughData) as error:
+            lost.append(f"{life.stage} {life.kind} {life.seed} {arm.name}: {error}")
+            continue
+        found["now"].append(now)
+        found["left"].append(left)
+    return found, lost
 
 
-def rows(found: dict[str, list[list[Answer]]], head: Row) -> list[Row]:
-    """Sum up per question and parameter."""
+def rows(found: dict[str, list[list[Answer]]], stage: str, head: Row) -> list[Row]:
+    """Summarise per question and parameter."""
+    told = trials.told(stage)
     return [
-        {**head, "what": what, "parameter": name, "told": told(head["stage"])[name]}
-        | summed([answers[j] for answers in lives])
-        for what, lives in found.items()
-        if lives
-        for j, name in enumerate(ENDS if what == "left" else PARAMETERS)
+        {"stage": stage, **head, "what": what, "parameter": name, "told": told[name]}
+        | trials.summed([answers[j] for answers in own])
+        for what, own in found.items()
+        if own
+        for j, name in enumerate(trials.ENDS if what == "left" else trials.PARAMETERS)
     ]
 
 
-def drawn_fleets(
-    stage: str, n_path: int, n_law: int, sizes: Sizes, lost: list[str],
-    worlds: dict[str, tuple[Arm, ...]] = ARMS,
-) -> list[Row]:  # fmt: skip
-    """Judge lives on paths and by laws, drawn from the priors, in both worlds and all arms."""
-    result = []
-    for world, arms in worlds.items():
-        believing = stage_with(stage, MAP_STD)
-        paths = followed(on_paths(stage, n_path, sizes, world), believing)
-        laws = followed(by_laws_drawn(stage, n_law, sizes, world), believing)
-        for arm in arms:
-            found: dict[str, list[list[Answer]]] = {"last": [], "now": [], "left": []}
-            # One epoch cannot tell errors that are new at every log from others.
-            if not arm.independent:
-                found["last"] = [last_of(one, arm) for one in paths]
-            for one in laws:
-                whole_life(found, one, arm, lost)
-            result += rows(found, {"stage": stage, "world": world, "arm": arm.name})
-    return result
+def drawn_cases(
+    stage: str, n: int, sizes: Sizes, drawing: tuple[Callable[..., Any], int], world: str = RIGHT
+) -> list[Followed]:
+    """Track lives drawn from the priors, on paths or by laws."""
+    make, first = drawing
+    cases = []
+    for seed in range(first, first + n):
+        rng = rng_of(15, STAGES.index(stage), seed)
+        made = make(stage, seed, rng)
+        losing = isinstance(made, tuple)
+        life, passage = made if losing else (made, np.full(2, np.nan))
+        seen = trials.elsewhere(life, MAP_STD, rng_of(16, seed)) if world == WRONG else life
+        estimates = lives.drawn(seen, *sizes[stage], rng)
+        cases.append(Case(seen, estimates, life.health, passage, losing))
+    return followed(cases, stage_with(stage, MAP_STD))
 
 
 def last_of(one: Followed, arm: Arm, plant: str = "") -> list[Answer]:
     """Ask for health at the last epoch."""
     stage = stage_with(one.case.life.stage, arm.model_std, plant)
     rng = rng_of(14, one.case.life.seed)
-    return at_epoch(one, stage, len(one.case.health) - 1, rng, arm.shrink)
+    return trials.at_epoch(one, stage, len(one.case.health) - 1, rng, arm.shrink)
 
 
-def on_paths(stage: str, n: int, sizes: Sizes, world: str = RIGHT) -> list[Case]:
-    """Take lives that end where the prior says."""
-    make: Callable[..., Any] = on_path
-    return [case for case in _drawn(stage, n, sizes, world, make, 20_000)]
+def fleet_of(
+    sizes: Sizes, stage: str, world: str, n_path: int, n_law: int,
+    arms: tuple[Arm, ...] | None = None,
+) -> Row:  # fmt: skip
+    """Judge lives on paths and by laws, drawn from the priors, in one world and its arms."""
+    paths = drawn_cases(stage, n_path, sizes, ON_PATH, world)
+    laws = drawn_cases(stage, n_law, sizes, BY_LAW, world)
+    result: Row = {"rows": [], "lost": []}
+    for arm in arms or ARMS[world]:
+        # One epoch cannot tell errors that are new at every log from others.
+        last = [] if arm.independent else [last_of(one, arm) for one in paths]
+        by_laws, lost = whole_lives(laws, arm)
+        result["rows"] += rows({"last": last} | by_laws, stage, {"world": world, "arm": arm.name})
+        result["lost"] += lost
+    return result
 
 
-def by_laws_drawn(stage: str, n: int, sizes: Sizes, world: str = RIGHT) -> list[Case]:
-    """Take lives by laws drawn from their priors."""
-    return [case for case in _drawn(stage, n, sizes, world, by_law, 30_000)]
-
-
-def _drawn(
-    stage: str, n: int, sizes: Sizes, world: str, make: Callable[..., Any], first: int
-) -> Iterator[Case]:
-    for seed in range(first, first + n):
-        rng = rng_of(15, STAGES.index(stage), seed)
-        made = make(stage, seed, rng)
-        losing = isinstance(made, tuple)
-        life, passage = made if losing else (made, np.full(2, np.nan))
-        seen = elsewhere(life, MAP_STD, rng_of(16, seed)) if world == WRONG else life
-        yield Case(seen, drawn(seen, *sizes[stage], rng), life.health, passage, losing)
-
-
-def wrong_plants(stage: str, n: dict[str, int], sizes: Sizes, lost: list[str]) -> list[Row]:
+def plants_of(sizes: Sizes, n_path: int, n_law: int, n_maps: int) -> Row:
     """Judge the same lives with maps of plants that are not theirs."""
-    believing = stage_with(stage, MAP_STD)
-    paths = followed(on_paths(stage, n["path"], sizes), believing)
-    laws = followed(by_laws_drawn(stage, n["plants"], sizes), believing)
-    result = []
-    for plant in list(WRONG_PLANTS)[len(WRONG_PLANTS) - n["maps"] :]:
-        for arm in (Arm("no error term", 0.0), Arm("coherent", MAP_STD)):
-            found: dict[str, list[list[Answer]]] = {
-                "last": [last_of(one, arm, plant) for one in paths], "now": [], "left": []
-            }  # fmt: skip
-            for one in laws:
-                whole_life(found, one, arm, lost, plant)
-            result += rows(found, {"stage": stage, "plant": plant, "arm": arm.name})
+    stage = "lms-y"
+    paths = drawn_cases(stage, n_path, sizes, ON_PATH)
+    laws = drawn_cases(stage, n_law, sizes, BY_LAW)
+    result: Row = {"rows": [], "lost": []}
+    for plant in list(trials.WRONG_PLANTS)[len(trials.WRONG_PLANTS) - n_maps :]:
+        for arm in (BARE, COHERENT):
+            last = [last_of(one, arm, plant) for one in paths]
+            by_laws, lost = whole_lives(laws, arm, plant)
+            head = {"plant": plant, "arm": arm.name}
+            result["rows"] += rows({"last": last} | by_laws, stage, head)
+            result["lost"] += lost
     return result
 
 
@@ -317,16 +256,15 @@ def demo(n: int, sizes: Sizes) -> list[Row]:
     right = list(of_kind("lms-y", "both", n, sizes, 99))
     wrong = []
     for case in right:
-        seen = elsewhere(case.life, MAP_STD, rng_of(17, case.life.seed))
-        estimates = drawn(seen, *sizes["lms-y"], rng_of(18, case.life.seed))
+        seen = trials.elsewhere(case.life, MAP_STD, rng_of(17, case.life.seed))
+        estimates = lives.drawn(seen, *sizes["lms-y"], rng_of(18, case.life.seed))
         wrong.append(replace(case, life=seen, estimates=estimates))
     result = []
-    for world, cases, model_std in (
-        (RIGHT, right, MAP_STD), (RIGHT, right, 0.0), (WRONG, wrong, MAP_STD),
+    for world, cases, arm in (
+        (RIGHT, right, COHERENT), (RIGHT, right, BARE), (WRONG, wrong, COHERENT),
     ):  # fmt: skip
-        arm = Arm("coherent" if model_std else "no error term", model_std)
         answers = [last_of(one, arm) for one in followed(cases, stage_with("lms-y", MAP_STD))]
-        result += rows({"last": answers}, {"stage": "lms-y", "world": world, "arm": arm.name})
+        result += rows({"last": answers}, "lms-y", {"world": world, "arm": arm.name})
     return result
 
 
@@ -338,62 +276,61 @@ def chains(n: int, sizes: Sizes) -> Row:
         (one,) = followed(of_kind("lms-y", kind, 1, sizes, 98), stage)
         last = len(one.case.health) - 1
         chain = infer(one.track, stage, 1, epochs=[last]).samples[0]
-        epoch.append(_apart(epoch_draws(one.track, stage, last, rng_of(19, i)), chain))
+        epoch.append(_apart(trials.epoch_draws(one.track, stage, last, rng_of(19, i)), chain))
         if n > 1:
             # Which scenario a life took is weighed by importance sampling in both.
             (by_points, _), (by_chains, _) = (
-                life_draws(one.history, stage, rng_of(19, i), chains=way) for way in (False, True)
+                trials.life_draws(one.history, stage, rng_of(19, i), chains=way)
+                for way in (False, True)
             )
             now.append(_apart(by_points, by_chains))
     return {
         "n": n,
         "quantiles": _LEVELS,
-        "infer": _worst(epoch),
-        "fit_life": _worst(now) if now else None,
+        "infer": max(epoch),
+        "fit_life": max(now, default=None),
         "unit": "difference of quantiles over the chain's standard deviation, largest",
     }
 
 
-def _apart(draws: Array, chain: Array) -> Array:
+def _apart(draws: Array, chain: Array) -> float:
     cuts, by_chain = (np.quantile(x, _LEVELS, axis=0) for x in (draws, chain))
-    return np.asarray(np.abs(cuts - by_chain) / chain.std(axis=0))
-
-
-def _worst(apart: list[Array]) -> float:
-    return float(np.max(apart))
+    return float(np.max(np.abs(cuts - by_chain) / chain.std(axis=0)))
 
 
 def raw(seeds: int, cache: Path | None) -> Row:
     """Judge lives that were simulated and identified, as many of each kind as tracking_lives."""
-    result: list[Row] = []
-    lost: list[str] = []
+
+    def identified(life: Life) -> Estimates:
+        return lives.identified(lives.plan_of(life.stage, life.kind, life.seed), cache)
+
+    found = []
     for stage in STAGES:
         for kind in KINDS if stage == "lms-y" else HEALTHY:
             often = stage == "lms-y" and kind in HEALTHY and kind != "regreasing"
-            cases = [
-                modelled(stage, kind, seed, lambda life: identified(
-                    plan_of(life.stage, life.kind, life.seed), cache))
-                for seed in range(RAW_SEED, RAW_SEED + seeds, 1 if often else 4)
-            ]  # fmt: skip
-            result += judged(cases, len(cases), lost)
-    return {"lives": result, "not_drawn": lost}
+            own = range(RAW_SEED, RAW_SEED + seeds, 1 if often else 4)
+            cases = [trials.modelled(stage, kind, seed, identified) for seed in own]
+            found.append(judged(cases, stage, kind))
+    return {
+        "lives": [row for own in found for row in own["rows"]],
+        "not_drawn": [line for own in found for line in own["lost"]],
+    }
 
 
 def control(n: int, kept: Path | None) -> Row:
     """Judge more lives with halved covariances, which must not cover."""
-    lost: list[str] = []
-    sizes = {"lms-y": measured("lms-y", FULL["sized"], kept)}
-    rows = drawn_fleets("lms-y", n, n, sizes, lost, {RIGHT: (HALVED,)})
-    failing = {
-        what: all(row["90"]["high"] < 0.9 for row in rows if row["what"] == what)
-        for what in ("last", "now")
-    }
+    sizes = {"lms-y": lives.measured("lms-y", FULL["sized"], kept)}
+    found = fleet_of(sizes, "lms-y", RIGHT, n, n, (HALVED,))
+
+    def fails(what: str) -> bool:
+        return all(row["90"]["high"] < 0.9 for row in found["rows"] if row["what"] == what)
+
     return {
-        "fleets": rows,
-        "not_drawn": lost,
+        "fleets": found["rows"],
+        "not_drawn": found["lost"],
         "passed": {
-            "halved covariances fail at epochs": failing["last"],
-            "halved covariances fail by the laws": failing["now"],
+            "halved covariances fail at epochs": fails("last"),
+            "halved covariances fail by the laws": fails("now"),
         },
     }
 
@@ -446,12 +383,9 @@ def claims_raw(answer: Row) -> Iterator[Claim]:
     for how, asked in ASKED.items():
         for stage, name in AXES.items():
             own = [
-                row["90"]
-                for row in rows
-                if row["stage"] == stage
-                and row["what"] in asked
+                row["90"] for row in rows if row["stage"] == stage and row["what"] in asked
                 and (row["told"] or how == "of the remaining life")
-            ]
+            ]  # fmt: skip
             yield counted(
                 f"90 % intervals {how} hold the truth ({name}, raw lives of ten kinds)",
                 sum(row["hits"] for row in own),
@@ -460,10 +394,9 @@ def claims_raw(answer: Row) -> Iterator[Claim]:
                 met=all(row["high"] >= 0.9 for row in own),
             )
     jumped = [
-        row["error"]
-        for row in rows
+        row["error"] for row in rows
         if row["kind"] in JUMPING and row["what"] == "now" and row["told"]
-    ]
+    ]  # fmt: skip
     worst = max(jumped, key=lambda row: abs(row["mean"]))
     yield Claim(
         "medians by the laws after a crash or a broken bolt, off in the mean at most",
@@ -485,18 +418,15 @@ def claims(answer: Row) -> Iterator[Claim]:
     )
     for arm in ("coherent", "independent", "no error term"):
         own = [
-            row
-            for row in answer["fleets"]
-            if (row["stage"], row["world"], row["arm"]) == ("lms-y", "map 5 % wrong", arm)
-        ]
+            row["90"] for row in answer["fleets"]
+            if (row["stage"], row["world"], row["arm"]) == ("lms-y", WRONG, arm)
+        ]  # fmt: skip
         control = arm != "coherent"
         yield covered(
             f"the map is 5 % wrong, its error believed: {arm}" + (" (control)" if control else ""),
-            [row["90"] for row in own],
-            "90 % required" if not control else "",
-            met=any(not row["90"]["holds"] for row in own)
-            if control
-            else all(row["90"]["holds"] for row in own),
+            own,
+            "" if control else "90 % required",
+            met=all(row["holds"] for row in own) != control,
         )
     for plant in dict.fromkeys(row["plant"] for row in answer["plants"]):
         own = [row for row in answer["plants"] if row["plant"] == plant and row["what"] == "last"]

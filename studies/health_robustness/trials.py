@@ -93,14 +93,11 @@ class Arm:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Followed:
-    """A life as the estimator has it: its track, and the history as the track takes it.
-
-    That has the steps that the tracker found beside those declared, and no outliers.
-    """
+    """A life as the estimator has it."""
 
     case: Case
     track: Track
-    history: History
+    history: History  # as the track takes it: with the steps that it found, and without outliers
 
 
 def followed(cases: Iterable[Case], stage: Stage) -> list[Followed]:
@@ -190,11 +187,8 @@ def stage_with(name: str, model_std: float, plant: str = "", *, losing: bool = F
     assert stage.description.map is not None
     spec = msgspec.structs.replace(stage.description.map, model_std=model_std)
     surrogate = _wrong_map(name, plant) if plant else stage.modal_map
-    return replace(
-        stage,
-        description=msgspec.structs.replace(stage.description, map=spec),
-        modal_map=surrogate,
-    )
+    description = msgspec.structs.replace(stage.description, map=spec)
+    return replace(stage, description=description, modal_map=surrogate)
 
 
 @cache
@@ -202,10 +196,7 @@ def told(name: str) -> dict[str, bool]:
     """Return which parameters the modes of a stage tell at all; ``any`` stands for all of them."""
     seen = identifiability_of(load_stage(name))
     shown = identifiable_parameters([seen], [range(len(seen.parameters))], seen.prior)
-    return {
-        **dict(zip(seen.parameters, shown.tolist(), strict=True)),
-        "any": bool(shown.all()),
-    }
+    return dict(zip(seen.parameters, shown.tolist(), strict=True)) | {"any": bool(shown.all())}
 
 
 @cache
@@ -230,21 +221,19 @@ def modelled(stage: str, kind: str, seed: int, identify: Callable[[Life], Estima
     life = lives.life_of(plan)
     limits = plan.draw_life().limits_km()
     ends = [np.inf if limits[name] is None else _KM * limits[name] for name in PARAMETERS]
-    return Case(
-        life,
-        identify(life),
-        life.health / life.health[0],
-        np.array(ends) - life.travel[0],
-    )
+    passage = np.array(ends) - life.travel[0]
+    return Case(life, identify(life), life.health / life.health[0], passage)
 
 
 def on_path(stage: str, seed: int, rng: np.random.Generator) -> Life:
     """Take a life that ends at health drawn from the prior and goes there evenly."""
     last = np.exp(load_stage(stage).prior.draw(rng, 1)[0])
-    kind, visits = _healthy(stage, seed, rng)
+    # Effects without wear: hall, payload, retuning, grease or none.
+    plan = lives.plan_of(stage, str(rng.choice(lives.HEALTHY)), seed)
+    visits = schedule(plan)
     s = np.array([visit.travel_km - visits[0].travel_km for visit in visits])
     health = last ** (s / s[-1])[:, None]
-    return lives.life_with(lives.plan_of(stage, kind, seed), _with_health(visits, health))
+    return lives.life_with(plan, _with_health(visits, health))
 
 
 def by_law(stage: str, seed: int, rng: np.random.Generator) -> tuple[Life, Array]:
@@ -255,7 +244,8 @@ def by_law(stage: str, seed: int, rng: np.random.Generator) -> tuple[Life, Array
     """
     description = always_losing(load_stage(stage))
     assert description.modal_map is not None
-    kind, visits = _healthy(stage, seed, rng)
+    plan = lives.plan_of(stage, str(rng.choice(lives.HEALTHY)), seed)
+    visits = schedule(plan)
     s = _KM * np.array([visit.travel_km - visits[0].travel_km for visit in visits])
     scenarios = list_scenarios(description.parameters, (), s[-1])
     for _ in range(_REDRAWS):
@@ -272,14 +262,7 @@ def by_law(stage: str, seed: int, rng: np.random.Generator) -> tuple[Life, Array
             scenario.paths, scenario.split(theta), description.parameters, strict=True
         )
     ]
-    life = lives.life_with(lives.plan_of(stage, kind, seed), _with_health(visits, health))
-    return life, np.array(ends)
-
-
-def _healthy(stage: str, seed: int, rng: np.random.Generator) -> tuple[str, list[Visit]]:
-    """Draw which effects without wear a life has: hall, payload, retuning, grease or none."""
-    kind = str(rng.choice(lives.HEALTHY))
-    return kind, schedule(lives.plan_of(stage, kind, seed))
+    return lives.life_with(plan, _with_health(visits, health)), np.array(ends)
 
 
 def _with_health(visits: list[Visit], health: Array) -> list[Visit]:
@@ -334,22 +317,10 @@ def life_draws(
 ) -> tuple[Array, Array]:
     """Draw health now, and the travel left to each limit and to the first, by the laws.
 
-    Parameters
-    ----------
-    noise_known : bool
-        Whether the stated covariance is all; otherwise a factor on it, a random walk of the
-        frequencies and a deviation of health from its laws are averaged over, and take what it
-        does not explain.
-    chains : bool
-        As in `fit_life`.
-
-    Returns
-    -------
-    now : ndarray
-        Fractions of baseline, shape ``(n_draws, n_parameters)``.
-    left : ndarray
-        In m, infinite past the horizon and 0 where a limit is passed already,
-        shape ``(n_draws, n_limits + 1)``.
+    With ``noise_known`` the stated covariance is all; otherwise a factor on it, a random walk of
+    the frequencies and a deviation of health from its laws take what it does not explain. Returns
+    fractions of baseline, ``(n_draws, n_parameters)``, and travel in m, infinite past the horizon
+    and 0 where a limit is passed already, ``(n_draws, n_limits + 1)``.
     """
     with _noise_as_stated() if noise_known else nullcontext():
         found = fit_life(history, stage, int(rng.integers(2**32)), chains=chains, n_draws=_N_DRAWS)
@@ -359,7 +330,7 @@ def life_draws(
 
 
 def claimed(left: Array, stage: Stage) -> Array:
-    """Return of the travel left what is claimed: no end past the horizon, no time of one passed."""
+    """Return the travel left as it is claimed: infinite past the horizon, 0 if passed."""
     horizon = 1000 * stage.description.usage.horizon_km
     return np.where(left > horizon, np.inf, np.maximum(left, 0.0))
 
