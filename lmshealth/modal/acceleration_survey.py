@@ -8,11 +8,7 @@ from lmshealth.errors import BadLog
 from lmshealth.io.log import Log, Refusal
 from lmshealth.modal.identification import identify
 from lmshealth.modal.modes import Modes
-from lmshealth.signal.acceleration_levels import (
-    Magnitude,
-    choose_bands,
-    read_magnitudes,
-)
+from lmshealth.signal.acceleration_levels import Magnitude, choose_bands, read_magnitudes
 from lmshealth.signal.constants import GRID_BAND
 from lmshealth.signal.segments import Part
 from lmshealth.signal.spectral_lines import Line, find_lines_by_velocity

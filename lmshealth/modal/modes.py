@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import chain
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -16,6 +16,10 @@ from numpy.typing import ArrayLike, NDArray
 from lmshealth._arrays import FloatArray, expect_shape, freeze
 from lmshealth.io.log import Refusal
 from lmshealth.signal.spectral_lines import Line
+
+# Fields of `Modes` with one entry per mode.
+_TEXTS = ("names", "sources", "channels", "flags")
+_ARRAYS = ("ln_frequency", "ln_damping", "snr", "dispersion")
 
 
 class Rejection(NamedTuple):
@@ -83,7 +87,7 @@ class Modes:
         named = [pair for pair in zip(self.names, self.sources, strict=True) if pair[0]]
         if len(set(named)) != len(named):
             raise ValueError(f"mode names are not unique per source: {self.names}")
-        for name in ("ln_frequency", "ln_damping", "snr", "dispersion"):
+        for name in _ARRAYS:
             expect_shape(name, getattr(self, name), (n,))
         expect_shape("cov", self.cov, (2 * n, 2 * n))
         expect_shape("shapes", self.shapes, (n, len(self.shape_channels)))
@@ -128,21 +132,10 @@ class Modes:
         """Return some modes, in the order of ``index``; the others are marginalised."""
         both = paired(index, len(self.names))
         rows = both[: len(index)]
-        return Modes(
-            names=tuple(self.names[i] for i in rows),
-            sources=tuple(self.sources[i] for i in rows),
-            channels=tuple(self.channels[i] for i in rows),
-            ln_frequency=self.ln_frequency[rows],
-            ln_damping=self.ln_damping[rows],
-            cov=self.cov[np.ix_(both, both)],
-            snr=self.snr[rows],
-            dispersion=self.dispersion[rows],
-            flags=tuple(self.flags[i] for i in rows),
-            shape_channels=self.shape_channels,
-            shapes=self.shapes[rows],
-            lines=self.lines,
-            refused=self.refused,
-        )
+        own: dict[str, Any] = {name: getattr(self, name)[rows] for name in (*_ARRAYS, "shapes")}
+        for name in _TEXTS:
+            own[name] = tuple(getattr(self, name)[i] for i in rows)
+        return replace(self, **own, cov=self.cov[np.ix_(both, both)])
 
 
 def paired(index: ArrayLike, n_modes: int) -> NDArray[np.intp]:
@@ -188,14 +181,7 @@ def merge(
 ) -> Modes:
     """Join independent estimates, ascending in frequency; the joint covariance has their blocks.
 
-    Parameters
-    ----------
-    parts : sequence of Modes
-        Their lines and refusals are replaced.
-    lines, refused : sequence of Line, sequence of Refusal
-        Of the log.
-    shape_channels : tuple of str
-        Channels of the shapes, among them those of all parts.
+    Lines and refusals of the parts are replaced; ``shape_channels`` holds those of all parts.
     """
     n, first = sum(len(part.names) for part in parts), 0
     cov, shapes = np.zeros((2 * n, 2 * n)), np.full((n, len(shape_channels)), np.nan)
@@ -207,22 +193,14 @@ def merge(
         shapes[rows[:, None], columns] = part.shapes
         first += rows.size
 
-    def joined(name: str) -> tuple[str, ...]:
-        return tuple(chain.from_iterable(getattr(part, name) for part in parts))
-
-    def stacked(name: str) -> FloatArray:
-        return np.concatenate([np.empty(0), *(getattr(part, name) for part in parts)])
-
+    joined: dict[str, Any] = {}
+    for name in _TEXTS:
+        joined[name] = tuple(chain.from_iterable(getattr(part, name) for part in parts))
+    for name in _ARRAYS:
+        joined[name] = np.concatenate([np.empty(0), *(getattr(part, name) for part in parts)])
     modes = Modes(
-        names=joined("names"),
-        sources=joined("sources"),
-        channels=joined("channels"),
-        ln_frequency=stacked("ln_frequency"),
-        ln_damping=stacked("ln_damping"),
+        **joined,
         cov=cov,
-        snr=stacked("snr"),
-        dispersion=stacked("dispersion"),
-        flags=joined("flags"),
         shape_channels=shape_channels,
         shapes=shapes,
         lines=tuple(lines),

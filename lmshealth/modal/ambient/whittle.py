@@ -15,11 +15,10 @@ README.md of this folder derives the model; `marginalise` integrates the nuisanc
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from itertools import product
-from typing import Generic, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -156,8 +155,6 @@ def receptance(f: FloatArray, zeta: FloatArray, frequency: FloatArray) -> Comple
     )
 
 
-T = TypeVar("T")
-
 # Newton decrement, a square in standard deviations, below which the search ends; along a valley as
 # flat as that of two modes at one frequency, after so many steps, a larger one.
 _ARRIVED, _NEARLY, _MANY_STEPS = 1e-4, 0.1, 25
@@ -190,9 +187,27 @@ class Likelihood:
             ]
         )
 
-    def value(self, p: FloatArray) -> float:
-        """Negative log posterior up to a constant."""
-        return self._value(p, self._at(p))
+    def value(self, p: FloatArray, points: list[_Point] | None = None) -> float:
+        """Negative log posterior up to a constant; ``points`` are the models at p."""
+        total = 0.5 * float(np.sum(((p - self.start) / self.prior_std) ** 2))
+        with np.errstate(over="ignore", invalid="ignore"):
+            try:
+                total += sum(point.misfit() for point in points or self._at(p))
+            except np.linalg.LinAlgError:
+                return np.inf
+        return total if np.isfinite(total) else np.inf
+
+    def derivatives(
+        self, p: FloatArray, points: list[_Point] | None = None
+    ) -> tuple[FloatArray, FloatArray]:
+        """Exact gradient and Hessian of `value`, shapes ``(n_unknowns,)`` and square."""
+        gradient = (p - self.start) / self.prior_std**2
+        hessian = np.diag(1 / self.prior_std**2)
+        for point in points or self._at(p):
+            first, second = point.derivatives()
+            gradient = gradient + first
+            hessian = hessian + second
+        return gradient, hessian
 
     def data_value(self, p: FloatArray) -> float:
         """Negative log likelihood without the priors."""
@@ -205,24 +220,6 @@ class Likelihood:
     def _at(self, p: FloatArray) -> list[_Point]:
         with np.errstate(over="ignore", invalid="ignore"):
             return [_Point(self, p, block) for block in self.blocks]
-
-    def _value(self, p: FloatArray, points: list[_Point]) -> float:
-        total = 0.5 * float(np.sum(((p - self.start) / self.prior_std) ** 2))
-        with np.errstate(over="ignore", invalid="ignore"):
-            try:
-                total += sum(point.misfit() for point in points)
-            except np.linalg.LinAlgError:
-                return np.inf
-        return total if np.isfinite(total) else np.inf
-
-    def _derivatives(self, p: FloatArray, points: list[_Point]) -> tuple[FloatArray, FloatArray]:
-        gradient = (p - self.start) / self.prior_std**2
-        hessian = np.diag(1 / self.prior_std**2)
-        for point in points:
-            first, second = point.derivatives()
-            gradient = gradient + first
-            hessian = hessian + second
-        return gradient, hessian
 
     def shapes(self, p: FloatArray) -> FloatArray:
         """Shapes of the modes, shape ``(n_channels, n_modes)``."""
@@ -238,10 +235,6 @@ class Likelihood:
         point = _Point(self, p, at)
         return point.strength / (4 * np.exp(2 * p[m : 2 * m]) * point.floor)
 
-    def derivatives(self, p: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Exact gradient and Hessian of `value`, shapes ``(n_unknowns,)`` and square."""
-        return self._derivatives(p, self._at(p))
-
     def minimise(self, start: FloatArray) -> FloatArray:
         """Find the posterior mode by Newton's method in a trust region, from ``(n_unknowns,)``.
 
@@ -249,63 +242,34 @@ class Likelihood:
         """
         # The optimiser evaluates value, gradient and Hessian in an order of its own, and returns to
         # the point before where a step was too long.
-        points = _Last(self._at)
-        both = _Last(lambda p: self._derivatives(p, points(p)))
+        points = lru_cache(maxsize=1)(lambda raw: self._at(np.frombuffer(raw)))
+        both = lru_cache(maxsize=1)(lambda raw: self.derivatives(np.frombuffer(raw), points(raw)))
 
         def value(p: FloatArray) -> float:
-            return self._value(p, points(p))
-
-        def gradient(p: FloatArray) -> FloatArray:
-            return both(p)[0]
-
-        def hessian(p: FloatArray) -> FloatArray:
-            return both(p)[1]
-
-        def decrement(p: FloatArray) -> float:
-            """Return the Newton decrement; infinite where there is no minimum near."""
-            slope, curvature = both(p)
-            try:
-                return float(slope @ cho_solve(cho_factor(curvature), slope))
-            except np.linalg.LinAlgError:
-                return np.inf
+            return self.value(p, points(p.tobytes()))
 
         steps = iter(range(1, 1000))
 
         def arrived(intermediate_result: OptimizeResult) -> None:
             near = _ARRIVED if next(steps) < _MANY_STEPS else _NEARLY
-            if decrement(np.asarray(intermediate_result.x)) < near:
+            slope, curvature = both(intermediate_result.x.tobytes())
+            try:
+                decrement = float(slope @ cho_solve(cho_factor(curvature), slope))
+            except np.linalg.LinAlgError:
+                return  # no minimum near
+            if decrement < near:
                 raise StopIteration
 
         found = minimize(
             value,
             start,
-            jac=gradient,
-            hess=hessian,
+            jac=lambda p: both(p.tobytes())[0],
+            hess=lambda p: both(p.tobytes())[1],
             method="trust-exact",
             callback=arrived,
             options={"gtol": 1e-9, "maxiter": 100, "initial_trust_radius": 0.3},
         )
         return np.asarray(found.x)
-
-
-class _Last(Generic[T]):
-    """Function with a cache of its last value.
-
-    Parameters
-    ----------
-    function : callable
-        Of an array.
-    """
-
-    def __init__(self, function: Callable[[FloatArray], T]) -> None:
-        self._function = function
-        self._last: tuple[FloatArray, T] | None = None
-
-    def __call__(self, p: FloatArray) -> T:
-        """Return the value at p."""
-        if self._last is None or not np.array_equal(p, self._last[0]):
-            self._last = p.copy(), self._function(p)
-        return self._last[1]
 
 
 class _Point:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import numpy as np
 from scipy import linalg, stats
@@ -26,6 +25,7 @@ from lmshealth.modal.free_decay.transient_likelihood import (
     transient,
     unit_level,
 )
+from lmshealth.modal.modes import paired
 
 _MOST_STEPS, _STEP_TOLERANCE = 60, 1e-5
 # Step of the difference of the Hessian in standard deviations.
@@ -116,21 +116,15 @@ def _shorten(
     return None
 
 
-class Average(NamedTuple):
-    """Mean of all parameters and covariance, zero where held, over ambient responses of a mode."""
-
-    mean: FloatArray
-    cov: FloatArray
-
-
 def average_ambient(
     likelihood: TransientLikelihood, p: FloatArray, mode: int, free: IntArray
-) -> Average:
+) -> tuple[FloatArray, FloatArray]:
     """Average the posterior over the ambient response of a mode; ``free`` are the other parameters.
 
     A stop shows it at two or three Fourier frequencies near the resonance, and the most probable
     level is often far below the true one. Intervals at that level cover two times out of three;
-    averaged over all levels under Jeffreys' prior they cover as stated.
+    averaged over all levels under Jeffreys' prior they cover as stated. Returns mean and covariance
+    of all parameters, zero where held.
     """
     place = 2 * likelihood.n_modes + mode
     start = p.copy()
@@ -156,7 +150,7 @@ def average_ambient(
     mean = weights @ where
     cov = (where - mean).T @ (weights[:, None] * (where - mean))
     cov[np.ix_(free, free)] += stretch @ np.tensordot(weights, inverses, 1) @ stretch.T
-    return Average(mean, cov)
+    return mean, cov
 
 
 def _average_levels(
@@ -390,18 +384,18 @@ def estimate(found: DecayFit, modes: Sequence[int] | None = None) -> DecayEstima
     # The ambient response of one mode hardly affects another: each is averaged over in turn.
     for i in modes:
         averages.append(average_ambient(likelihood, p, i, free))
-        p[2 * m + i] = averages[-1].mean[2 * m + i]
-    own = np.array([*modes, *(m + i for i in modes)])
+        p[2 * m + i] = averages[-1][0][2 * m + i]
+    own = paired(modes, m)
     n = len(modes)
     inverse = np.zeros((p.size, p.size))
     inverse[np.ix_(free, free)] = invert(likelihood, maximise(likelihood, p, free), free)
     joint = inverse[np.ix_(own, own)]
     mean, scales = np.empty(2 * n), np.zeros((2 * n, 2 * n))
-    for k, average in enumerate(averages):
+    for k, (average, cov) in enumerate(averages):
         pair = np.array([k, n + k])
-        mean[pair] = average.mean[own[pair]]
+        mean[pair] = average[own[pair]]
         # The joint covariance is scaled until each mode has that of its average.
-        wide = np.linalg.cholesky(average.cov[np.ix_(own[pair], own[pair])])
+        wide = np.linalg.cholesky(cov[np.ix_(own[pair], own[pair])])
         narrow = np.linalg.cholesky(joint[np.ix_(pair, pair)])
         scales[np.ix_(pair, pair)] = wide @ np.linalg.inv(narrow)
     excitation = [found.excitation(i, float(p[2 * m + i])) for i in modes]

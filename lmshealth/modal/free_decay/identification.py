@@ -270,17 +270,14 @@ def _fit_band(
         stationary = stationary or fit
         if (np.diff(np.sort(fit.frequency)) > 1 / blocks[0].duration).all():
             band = _accept(fit, request)
-            if not _too_early(band):
+            poles = (*band.poles, *band.rejected)
+            strongest = max(poles, key=lambda pole: pole.snr.max(), default=None)
+            why = strongest.rejection if strongest is not None else None
+            if why is None or why.reason not in _TOO_EARLY:
                 return [band]
     if stationary is not None:
         return [_accept(stationary, request)]
-    return [_reject_nonlinear(nonstationary, request)] if nonstationary is not None else []
-
-
-def _too_early(band: _BandModes) -> bool:
-    strongest = max((*band.poles, *band.rejected), key=lambda pole: pole.snr.max(), default=None)
-    why = None if strongest is None else strongest.rejection
-    return why is not None and why.reason in _TOO_EARLY
+    return [_accept(nonstationary, request, linear=False)] if nonstationary is not None else []
 
 
 def _reach(duration: float, f: float) -> float:
@@ -323,56 +320,42 @@ def _bands(peaks: list[float], duration: float) -> list[tuple[list[float], tuple
     return bands
 
 
-def _accept(fit: DecayFit, request: _Request) -> _BandModes:
+def _accept(fit: DecayFit, request: _Request, *, linear: bool = True) -> _BandModes:
     """Estimate the poles of a band within its limits; reject those that are not credible."""
-    inside, lines = _inside(fit, request), fit.is_line()
-    rejected = [
-        _pole(fit, i, Rejection("line-not-mode", f"{fit.frequency[i]:.5g} Hz does not decay"))
-        for i in inside
-        if lines[i]
-    ]
-    modal = [i for i in inside if not lines[i]]
+    low, high = request.limits
+    lines = fit.is_line()
+    rejected: list[_Pole] = []
+    modal: list[int] = []
+
+    def pole(i: int, rejection: Rejection | None) -> _Pole:
+        return _Pole(float(fit.frequency[i]), float(fit.damping_ratio[i]), fit.snr(i), rejection)
+
+    for i, f in enumerate(fit.frequency.tolist()):
+        if not low <= f <= high:
+            continue
+        if not linear:
+            detail = (
+                f"the resonance at {f:.5g} Hz is no sum of decays in stationary noise, however "
+                "late the decay is started"
+            )
+            rejected.append(pole(i, Rejection("not-linear", detail)))
+        elif lines[i]:
+            rejected.append(pole(i, Rejection("line-not-mode", f"{f:.5g} Hz does not decay")))
+        else:
+            modal.append(i)
     if not modal:
-        return _BandModes(request.source, (), _no_modes(), tuple(rejected))
+        nothing = estimates_only(np.empty(0), np.empty((0, 0)), np.empty(0), (), ())
+        return _BandModes(request.source, (), nothing, tuple(rejected))
     result = estimate(fit, modal)
-    poles = [_pole(fit, i, _incredible(fit, i, result, k)) for k, i in enumerate(modal)]
-    snr = np.array([pole.snr for pole in poles])
+    poles = [pole(i, _incredible(fit, i, result, k)) for k, i in enumerate(modal)]
+    snr = np.array([one.snr for one in poles])
     best = [request.channels[c] for c in snr.argmax(axis=1)]
     sources = [request.source] * len(poles)
     modes = estimates_only(result.mean, result.cov, snr.max(axis=1), sources, best)
-    credible = [k for k, pole in enumerate(poles) if pole.rejection is None]
-    rejected += [pole for pole in poles if pole.rejection is not None]
+    credible = [k for k, one in enumerate(poles) if one.rejection is None]
+    rejected += [one for one in poles if one.rejection is not None]
     accepted = tuple(poles[k] for k in credible)
     return _BandModes(request.source, accepted, modes.select(credible), tuple(rejected))
-
-
-def _no_modes() -> Modes:
-    return estimates_only(np.empty(0), np.empty((0, 0)), np.empty(0), (), ())
-
-
-def _reject_nonlinear(fit: DecayFit, request: _Request) -> _BandModes:
-    rejected = [
-        _pole(
-            fit,
-            i,
-            Rejection(
-                "not-linear",
-                f"the resonance at {fit.frequency[i]:.5g} Hz is no sum of decays in stationary "
-                "noise, however late the decay is started",
-            ),
-        )
-        for i in _inside(fit, request)
-    ]
-    return _BandModes(request.source, (), _no_modes(), tuple(rejected))
-
-
-def _inside(fit: DecayFit, request: _Request) -> list[int]:
-    low, high = request.limits
-    return [i for i, f in enumerate(fit.frequency.tolist()) if low <= f <= high]
-
-
-def _pole(fit: DecayFit, i: int, rejection: Rejection | None) -> _Pole:
-    return _Pole(float(fit.frequency[i]), float(fit.damping_ratio[i]), fit.snr(i), rejection)
 
 
 def _incredible(fit: DecayFit, i: int, result: DecayEstimate, k: int) -> Rejection | None:
@@ -415,17 +398,14 @@ def _incredible(fit: DecayFit, i: int, result: DecayEstimate, k: int) -> Rejecti
 def _number(log: Log, bands: list[_BandModes]) -> Modes:
     """Merge and number the modes; of Δe only those that accelerometers do not show."""
     seen = [pole for band in bands if band.source == "acc" for pole in band.poles]
-    kept = [
-        band.modes.select(
-            [
-                i
-                for i, pole in enumerate(band.poles)
-                if band.source == "acc"
-                or all(abs(pole.frequency / p.frequency - 1) >= 2 * pole.damping for p in seen)
-            ]
-        )
-        for band in bands
-    ]
+
+    def is_new(pole: _Pole) -> bool:
+        return all(abs(pole.frequency / p.frequency - 1) >= 2 * pole.damping for p in seen)
+
+    kept = []
+    for band in bands:
+        new = [i for i, pole in enumerate(band.poles) if band.source == "acc" or is_new(pole)]
+        kept.append(band.modes.select(new))
     modes = numbered(merge(kept, (), log.refused))
     if not modes.names:
         rejected = [pole for band in bands for pole in band.rejected]
@@ -442,26 +422,17 @@ def _name(
     named: list[Modes] = []
     ambiguous: dict[str, Rejection] = {}
     for source in ("acc", "delta_e"):
-        names = {name for modes in named for name in modes.names}
-        missing = [target for target in targets if target.name not in names]
-        found = [
-            (pole, band.modes, i)
-            for band in bands
-            if band.source == source
-            for i, pole in enumerate(band.poles)
-        ]
-        found.sort(key=lambda item: item[0].frequency)
-        poles = [pole for pole, _, _ in found]
+        taken = {name for modes in named for name in modes.names}
+        missing = [target for target in targets if target.name not in taken]
+        poles = [pole for band in bands if band.source == source for pole in band.poles]
+        poles.sort(key=lambda pole: pole.frequency)
         assignment = assign(
             [pole.frequency for pole in poles], missing, damping=[pole.damping for pole in poles]
         )
         ambiguous |= assignment.ambiguous
+        names = dict(zip(poles, assignment.names, strict=True))
         for band in bands:
-            own = {
-                i: name
-                for (_, modes, i), name in zip(found, assignment.names, strict=True)
-                if modes is band.modes and name
-            }
+            own = {i: names[pole] for i, pole in enumerate(band.poles) if names.get(pole)}
             named.append(replace(band.modes.select([*own]), names=tuple(own.values())))
     return named, ambiguous
 

@@ -9,6 +9,7 @@ searched (variable projection).
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 from scipy.optimize import least_squares
@@ -111,10 +112,7 @@ def _poles(ordinates: Ordinates, order: Order) -> tuple[ComplexArray, ComplexArr
     """Return jω, shape ``(n_lines,)``, and poles, ``(n_modes,)``, over the band's centre."""
     centre = np.sqrt(ordinates.frequency[0] * ordinates.frequency[-1])
     f, zeta = order.modes
-    return (
-        1j * ordinates.frequency / centre,
-        f / centre * (-zeta + 1j * np.sqrt(1 - zeta**2)),
-    )
+    return (1j * ordinates.frequency / centre, f / centre * (-zeta + 1j * np.sqrt(1 - zeta**2)))
 
 
 def _modal(s: ComplexArray, pole: ComplexArray) -> ComplexArray:
@@ -144,9 +142,7 @@ def solve(ordinates: Ordinates, order: Order, variance: FloatArray) -> Solution:
     # Powers and poles of a background may cancel each other; modes do not.
     parts = parts[:, order.modes[1] <= constants.FRF_MOST_DAMPING]
     rest = fitted - parts.sum(axis=1)
-    swing = np.zeros(m, dtype=complex)
-    if not ordinates.periodic:
-        swing = _residues(weights[n:], m)
+    swing = np.zeros(m, dtype=complex) if ordinates.periodic else _residues(weights[n:], m)
     return Solution(
         basis=basis,
         residues=_residues(weights, m),
@@ -188,17 +184,18 @@ def refine(ordinates: Ordinates, order: Order, variance: FloatArray) -> Order:
     if m == 0:
         return order
     whiten = np.sqrt(2 / variance)
-    latest: list[tuple[FloatArray, Solution]] = []
+
+    @lru_cache(maxsize=1)
+    def solved_at(theta: bytes) -> tuple[Order, Solution]:
+        tried = replace(order, theta=np.frombuffer(theta))
+        return tried, solve(ordinates, tried, variance)
 
     def error(theta: FloatArray) -> FloatArray:
-        solution = solve(ordinates, replace(order, theta=theta), variance)
-        latest[:] = [(theta.copy(), solution)]
-        return stack(solution.error * whiten)
+        return stack(solved_at(theta.tobytes())[1].error * whiten)
 
     def derivative(theta: FloatArray) -> FloatArray:
-        if not np.array_equal(latest[0][0], theta):
-            error(theta)
-        return slopes(ordinates, replace(order, theta=theta), variance, latest[0][1])
+        tried, solution = solved_at(theta.tobytes())
+        return slopes(ordinates, tried, variance, solution)
 
     low, high = ordinates.frequency[[0, -1]]
     least = np.repeat(np.log([low * (1 - _OUTSIDE), _LEAST_DAMPING]), m)

@@ -158,21 +158,10 @@ def from_periods(pair: Pair, band: tuple[float, float], period: float) -> tuple[
     # Simulated records may be free of noise but for rounding.
     noise = np.maximum(noise, (_ROUNDING * np.abs(answer).max()) ** 2)
     power = np.mean(np.abs(spectra) ** 2, axis=1)
-    h1, h2, hv, coherence = _estimates(
-        power[0], power[1], np.mean(spectra[1] * spectra[0].conj(), axis=0)
-    )
-    frf = Frf(
-        *pair.names,
-        frequency=frequency,
-        response=response,
-        std=np.sqrt(noise) / np.abs(given),
-        h1=h1,
-        h2=h2,
-        hv=hv,
-        coherence=coherence,
-        period=period / rate,
-        n_averages=n,
-    )
+    cross = np.mean(spectra[1] * spectra[0].conj(), axis=0)
+    h1, h2, hv, coherence = _estimates(power[0], power[1], cross)
+    std = np.sqrt(noise) / np.abs(given)
+    frf = Frf(*pair.names, frequency, response, std, h1, h2, hv, coherence, period / rate, n)
     return frf, Ordinates(frequency, given, answer, noise, freedom, periodic=True)
 
 
@@ -243,18 +232,8 @@ def from_record(pair: Pair, band: tuple[float, float]) -> tuple[Frf, Ordinates]:
     power_in, power_out = auto_in.real[inside] * weight, auto_out.real[inside] * weight
     h1, h2, hv, coherence = _estimates(power_in, power_out, cross[inside] * weight)
     unexplained = np.maximum(1 - coherence, _ROUNDING) * power_out * n / (n - 1)
-    frf = Frf(
-        *pair.names,
-        frequency=frequency,
-        response=h1,
-        std=np.sqrt(unexplained / (n * power_in)),
-        h1=h1,
-        h2=h2,
-        hv=hv,
-        coherence=coherence,
-        period=float("nan"),
-        n_averages=n,
-    )
+    std = np.sqrt(unexplained / (n * power_in))
+    frf = Frf(*pair.names, frequency, h1, std, h1, h2, hv, coherence, float("nan"), n)
     noise = np.interp(lines, frequency, unexplained) * (2 * step)
     return frf, Ordinates(lines, given, answer, noise, n - 1, periodic=False)
 

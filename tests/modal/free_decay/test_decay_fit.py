@@ -131,12 +131,12 @@ def test_a_level_that_is_well_known_is_averaged_in_fine_steps() -> None:
     x = np.array([stop(rng, rings, 400, RATE, 0.02)[0] for _ in range(60)])
     likelihood, start = one_mode(x)
     optimum = maximise(likelihood, start, np.arange(5))
-    found = average_ambient(likelihood, optimum.p, 0, np.array([0, 1, 3, 4]))
+    mean, cov = average_ambient(likelihood, optimum.p, 0, np.array([0, 1, 3, 4]))
     normal = invert(likelihood, optimum, np.arange(5))
     assert normal[2, 2] < (0.2 * optimum.p[2]) ** 2
     own = slice(0, 3)  # the level of white noise below a loud response is not normal
-    np.testing.assert_allclose(np.diag(found.cov)[own], np.diag(normal)[own], rtol=0.1)
-    off = (found.mean - optimum.p) / np.sqrt(np.diag(normal))
+    np.testing.assert_allclose(np.diag(cov)[own], np.diag(normal)[own], rtol=0.1)
+    off = (mean - optimum.p) / np.sqrt(np.diag(normal))
     assert (np.abs(off[:2]) < 0.2).all()
 
 
@@ -148,15 +148,15 @@ def test_the_average_over_the_ambient_response_is_the_posterior_s_moments() -> N
     x = stop(rng, rings, 400, RATE, 0.02)
     likelihood, start = one_mode(x)
     optimum = maximise(likelihood, start, np.arange(5))
-    found = average_ambient(likelihood, optimum.p, 0, np.array([0, 1, 3, 4]))
+    mean, cov = average_ambient(likelihood, optimum.p, 0, np.array([0, 1, 3, 4]))
 
     centre = optimum.p.copy()
-    centre[2] = np.log(found.mean[2])
-    cov = found.cov.copy()
-    cov[2] /= found.mean[2]
-    cov[:, 2] /= found.mean[2]
+    centre[2] = np.log(mean[2])
+    scaled = cov.copy()
+    scaled[2] /= mean[2]
+    scaled[:, 2] /= mean[2]
     normal = rng.standard_normal((3000, 5)) / np.sqrt(rng.chisquare(5, 3000) / 5)[:, None]
-    points = centre + normal @ np.linalg.cholesky(1.3 * cov).T
+    points = centre + normal @ np.linalg.cholesky(1.3 * scaled).T
     weights = 5 * np.log1p(np.sum(normal**2, axis=1) / 5)
     for k, point in enumerate(points):
         p = point.copy()
@@ -165,14 +165,14 @@ def test_the_average_over_the_ambient_response_is_the_posterior_s_moments() -> N
         weights[k] += 0.5 * np.log(at.fisher[2, 2]) + point[2] - at.value
     weights = np.exp(weights - weights.max())
     weights /= weights.sum()
-    mean = weights @ points
-    std = np.sqrt(weights @ (points - mean) ** 2)
+    sampled = weights @ points
+    std = np.sqrt(weights @ (points - sampled) ** 2)
     effective = 1 / np.sum(weights**2)
     assert effective > 200
-    own = np.sqrt(np.diag(found.cov))
+    own = np.sqrt(np.diag(cov))
     for j in (0, 1):
         # A standard deviation from n samples with a heavy tail is off by about √(κ/4n).
         assert own[j] == pytest.approx(std[j], rel=4 / np.sqrt(effective))
-        assert abs(found.mean[j] - mean[j]) < 4 / np.sqrt(effective) * std[j]
+        assert abs(mean[j] - sampled[j]) < 4 / np.sqrt(effective) * std[j]
     held = np.sqrt(np.diag(invert(likelihood, optimum, np.array([0, 1, 3, 4]))))
     assert own[0] > 1.05 * held[0]
