@@ -18,22 +18,8 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
-from sqlalchemy import (
-    Column,
-    Integer,
-    LargeBinary,
-    MetaData,
-    String,
-    Table,
-    Text,
-    create_engine,
-    delete,
-    event,
-    func,
-    inspect,
-    literal,
-    select,
-)
+from sqlalchemy import Column, Integer, LargeBinary, MetaData, String, Table, Text
+from sqlalchemy import create_engine, delete, event, func, inspect, literal, select
 from sqlalchemy.dialects import postgresql, sqlite
 from sqlalchemy.engine import URL, Connection, Engine, make_url
 from sqlalchemy.exc import SQLAlchemyError
@@ -99,16 +85,9 @@ _REFUSED = _table("refused", "key", content=LargeBinary)
 class Identified:
     """Outcome of a log, and what it depends on.
 
-    Attributes
-    ----------
-    outcome : LogEstimates or tuple of Refusal
-        Result of the log.
-    description : str
-        Digest of the stage description that was used; empty if none was.
-    stage, asked : str or None
-        Identity of the machine and name of the description in the metadata of the log.
-    lasting : bool
-        Whether another attempt would give the same; False if the failure was not of the log.
+    ``description`` is the digest of the stage description that was used, empty if none was;
+    ``stage`` and ``asked`` are the identity of the machine and the name of the description in the
+    metadata of the log. Another attempt at a ``lasting`` outcome would give the same.
     """
 
     outcome: Outcome
@@ -119,14 +98,13 @@ class Identified:
 
     def renamed(self, log: str) -> Identified:
         """Replace the name of the log, which may have been moved since."""
-        if not isinstance(self.outcome, LogEstimates):
-            return replace(self, outcome=_renamed(self.outcome, log))
-        modes = replace(self.outcome.modes, refused=_renamed(self.outcome.modes.refused, log))
+        modes = self.outcome.modes if isinstance(self.outcome, LogEstimates) else None
+        listed = self.outcome if modes is None else modes.refused
+        refused = tuple(replace(refusal, log=log) for refusal in listed)
+        if modes is None:
+            return replace(self, outcome=refused)
+        modes = replace(modes, refused=refused)
         return replace(self, outcome=replace(self.outcome, log=log, modes=modes))
-
-
-def _renamed(refused: tuple[Refusal, ...], log: str) -> tuple[Refusal, ...]:
-    return tuple(replace(refusal, log=log) for refusal in refused)
 
 
 @dataclass(frozen=True, slots=True)
@@ -157,13 +135,7 @@ def unpack_or_none(content: bytes, kind: Any) -> Any:
 
 
 def default_url(folder: Path) -> URL:
-    """Return the URL of the default store: a SQLite file in the folder of the output.
-
-    Raises
-    ------
-    StoreError
-        If the file is a symbolic link: its target is not in the folder.
-    """
+    """Return the URL of the default store: a SQLite file in the folder of the output, no link."""
     path = folder / "lmshealth.sqlite"
     if path.is_symlink():
         raise StoreError(f"the store {path} is a link; remove it, or name its target by --store")

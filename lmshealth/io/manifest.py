@@ -21,15 +21,7 @@ NOT_LOGS = frozenset({MANIFEST, "maintenance.csv", "truth.csv"})
 
 
 class Found(NamedTuple):
-    """Files of a folder.
-
-    Attributes
-    ----------
-    logs : tuple of Path
-        The files that were searched for, sorted.
-    refused : tuple of Refusal
-        Those that must not or cannot be opened, named relative to the folder.
-    """
+    """Files of a folder, sorted, and refusals of those that must not or cannot be opened."""
 
     logs: tuple[Path, ...]
     refused: tuple[Refusal, ...]
@@ -37,16 +29,10 @@ class Found(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Manifest:
-    """Rows of the manifests of a folder.
+    """Rows of the manifests of a folder, by the absolute path of the log.
 
-    Attributes
-    ----------
-    rows : dict of Path to dict of str to str
-        Metadata by absolute path of the log, empty cells left out.
-    refused : tuple of Refusal
-        Manifests that cannot be read, and rows that name no log of the folder.
-    bad : dict of Path to str
-        By absolute path of the log, the fault of one of its rows.
+    ``rows`` are metadata without empty cells; ``refused`` manifests that cannot be read, and rows
+    that name no log of the folder; ``bad`` the fault of one of the rows of a log.
     """
 
     rows: dict[Path, dict[str, str]]
@@ -60,10 +46,7 @@ class Manifest:
     def overrides(self, log: Path) -> dict[str, str]:
         """Return the metadata that override those of a log; empty for a log without a row.
 
-        Raises
-        ------
-        BadLog
-            With reason ``bad-row`` for a log whose row cannot be read or is contradicted.
+        `BadLog` (``bad-row``) for a log whose row cannot be read or is contradicted.
         """
         path = _absolute(log)
         if path in self.bad:
@@ -72,42 +55,26 @@ class Manifest:
 
 
 def find_logs(folder: str | Path) -> Found:
-    """Find the logs of a folder and its subfolders by their suffix.
+    """Find the logs of a folder and its subfolders by their suffix; `BadTable` if it is none.
 
     Hidden files and folders are ignored. Symbolic links to files are followed as long as they
     stay in the folder; links to folders are not.
-
-    Raises
-    ------
-    BadTable
-        If it is no folder.
     """
     return _find(Path(folder), lambda path: path.name not in NOT_LOGS and is_log(path))
 
 
 def find_sheets(folder: str | Path, name: str) -> Found:
-    """Find the tables of a name, such as ``manifest.csv``, where `find_logs` finds logs.
-
-    Raises
-    ------
-    BadTable
-        If it is no folder.
-    """
+    """Find the tables of a name, such as ``manifest.csv``, where `find_logs` finds logs."""
     found = _find(Path(folder), lambda path: path.name == name)
     # What else is wrong with the folder, `find_logs` lists.
     return Found(found.logs, tuple(r for r in found.refused if Path(r.log).name == name))
 
 
 def read_manifest(folder: str | Path) -> Manifest:
-    """Read every ``manifest.csv`` of a folder and its subfolders; it may have none.
+    """Read every ``manifest.csv`` of a folder and its subfolders, as found by `find_sheets`.
 
     Paths in a manifest are relative to it. Where two manifests name a log, the one nearer to the
     log overrides the other. A bad row refuses the log that it names, and nothing else.
-
-    Raises
-    ------
-    BadTable
-        If it is no folder.
     """
     return _merged(Path(folder), find_sheets(folder, MANIFEST))
 

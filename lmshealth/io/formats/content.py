@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -82,9 +83,14 @@ def wanted(names: Iterable[str], columns: ColumnMap) -> list[str]:
     return chosen
 
 
-def missing_library(form: str, library: str) -> Unusable:
-    """Return the refusal of a file whose library is not installed."""
-    return Unusable("format", f"reading {form} needs {library}: pip install 'lmshealth[formats]'")
+@contextmanager
+def library(form: str, name: str) -> Iterator[None]:
+    """Import the library of a format, or refuse the file if it is not installed."""
+    try:
+        yield
+    except ImportError as error:
+        needed = f"reading {form} needs {name}: pip install 'lmshealth[formats]'"
+        raise Unusable("format", needed) from error
 
 
 def not_numeric(column: str, found: str) -> Unusable:

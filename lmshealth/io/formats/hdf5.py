@@ -19,7 +19,7 @@ from lmshealth.io.buffers import BLOCK, MINUTE, Spool, spools
 from lmshealth.io.column_map import ColumnMap
 from lmshealth.io.formats.content import Content, Format, check_size, not_numeric, wanted
 from lmshealth.io.metadata import KEYS, as_text
-from lmshealth.io.refusal import Unusable
+from lmshealth.io.refusal import Unusable, corrupt
 
 _MAGIC = b"\x89HDF\r\n\x1a\n"
 # Version 1 of a heap of strings, and the bytes of its header and of each object's.
@@ -33,19 +33,9 @@ class Guarded(FileIO):
     """A file for h5py's driver of Python files that checks heaps of strings.
 
     Each heap is checked when the library reads it: to search the file for heaps takes half as long
-    as to read it.
-
-    Parameters
-    ----------
-    path : Path
-        The file.
-
-    Attributes
-    ----------
-    now : str
-        Content that is read: ``columns`` are opened, ``texts`` are read, or ``samples``.
-    trouble : Unusable or None
-        Why bytes were withheld from the library, which then fails with an error of its own.
+    as to read it. ``now`` is what is read: ``columns`` are opened, ``texts`` are read, or
+    ``samples``; ``trouble`` why bytes were withheld from the library, which then fails with an
+    error of its own.
     """
 
     def __init__(self, path: Path) -> None:
@@ -61,16 +51,14 @@ class Guarded(FileIO):
         start = self.tell()
         n_read = super().readinto(buffer)
         content = bytes(buffer)
-        self.trouble = self.trouble or self._trouble(start, content)
+        is_heap = content.startswith(_HEAP)
+        if self.trouble is None and self.now == "columns" and (is_heap or _NO_FILES in content):
+            self.trouble = Unusable("escapes", "a column keeps its samples in other files")
+        elif self.trouble is None and is_heap:
+            self.trouble = self._damage(start)
         if self.trouble is not None:
             buffer[:] = bytes(len(buffer))
         return n_read
-
-    def _trouble(self, start: int, content: bytes) -> Unusable | None:
-        is_heap = content.startswith(_HEAP)
-        if self.now == "columns" and (is_heap or _NO_FILES in content):
-            return Unusable("escapes", "a column keeps its samples in other files")
-        return self._damage(start) if is_heap else None
 
     def _damage(self, start: int) -> Unusable | None:
         """Follow the objects of a heap as the library does."""
@@ -86,9 +74,7 @@ class Guarded(FileIO):
             free = heap[at : at + 2] == bytes(2)
             step = claimed if free else _HEADER + -(-claimed // 8) * 8
             if step < _HEADER or at + step > size:
-                return Unusable(
-                    "corrupt", f"damaged heap of strings at byte {start + at}; copy the file again"
-                )
+                return corrupt(f"damaged heap of strings at byte {start + at}")
             at += step
         return None
 

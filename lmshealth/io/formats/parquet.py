@@ -7,14 +7,7 @@ from typing import Any
 
 from lmshealth.io.buffers import BLOCK, MINUTE, spools
 from lmshealth.io.column_map import ColumnMap
-from lmshealth.io.formats.content import (
-    Content,
-    Format,
-    check_size,
-    missing_library,
-    not_numeric,
-    wanted,
-)
+from lmshealth.io.formats.content import Content, Format, check_size, library, not_numeric, wanted
 
 _MAGIC = b"PAR1"
 # Bytes of each column of the file that are read ahead.
@@ -24,11 +17,9 @@ _LIBRARY_KEYS = frozenset({b"pandas", b"ARROW:schema"})
 
 
 def _load(path: Path, columns: ColumnMap, max_memory: float) -> Content:
-    try:
+    with library("Parquet", "pyarrow"):
         import pyarrow as pa
         import pyarrow.parquet as pq
-    except ImportError as error:
-        raise missing_library("Parquet", "pyarrow") from error
     # With pre_buffer, or without a buffer's size, a whole row group is held, which may be the file.
     with pq.ParquetFile(
         path, pre_buffer=False, buffer_size=_BUFFER, page_checksum_verification=True

@@ -24,12 +24,12 @@ from lmshealth.io.formats.content import (
     Format,
     check_memory,
     check_size,
-    missing_library,
+    library,
     not_numeric,
 )
 from lmshealth.io.formats.unit_channels import Chosen, Described, choose, present, rate_of
 from lmshealth.io.metadata import KEYS, as_text
-from lmshealth.io.refusal import Unusable, listed
+from lmshealth.io.refusal import Unusable, corrupt, listed
 
 _MAGIC = b"TDSm"
 # Lead-in of a segment: tag, table of contents, version, length of the rest, offset of its samples.
@@ -43,11 +43,9 @@ _EPOCH = np.datetime64("1904-01-01", "us")
 
 
 def _load(path: Path, columns: ColumnMap, max_memory: float) -> Content:
-    try:
+    with library("TDMS", "npTDMS"):
         from nptdms import TdmsFile
         from nptdms.log import log_manager
-    except ImportError as error:
-        raise missing_library("TDMS", "npTDMS") from error
     # npTDMS prints on standard error where it guesses; here a guess is an error of the file.
     log_manager.set_level(logging.ERROR)
     segments = _segments(path)
@@ -70,10 +68,7 @@ def _load(path: Path, columns: ColumnMap, max_memory: float) -> Content:
 def _segments(path: Path) -> list[int]:
     """Follow the segments to the end of the file, and list the bytes of their samples.
 
-    Raises
-    ------
-    Unusable
-        With reason ``corrupt`` where npTDMS would stop reading, and ignore the rest.
+    What is refused as ``corrupt`` is where npTDMS would stop reading, and ignore the rest.
     """
     size, at = path.stat().st_size, 0
     found: list[int] = []
@@ -83,7 +78,7 @@ def _segments(path: Path) -> list[int]:
             lead_in = stream.read(_LEAD_IN)
             where = f"at byte {at} of {size}, after {len(found)} whole segments,"
             if not lead_in.startswith(_MAGIC):
-                raise Unusable("corrupt", f"{where} no segment begins; copy the file again")
+                raise corrupt(f"{where} no segment begins")
             if len(lead_in) < _LEAD_IN:
                 raise Unusable("corrupt", f"{where} the file is cut off; copy it again")
             order = ">" if lead_in[4] & _BIG_ENDIAN else "<"
@@ -119,9 +114,8 @@ def _check_scales(objects: Iterable[Mapping[str, object]]) -> None:
             is_count = key == _N_SCALES or (scale is not None and key.endswith("_Size"))
             many = is_count and not (isinstance(value, int) and value <= constants.MOST_SCALES)
             if many or (scale is not None and int(scale[1]) > constants.MOST_SCALES):
-                raise Unusable(
-                    "corrupt", f"{listed([key])} is {str(value)[:20]!r}; export it again"
-                )
+                detail = f"{listed([key])} is {str(value)[:20]!r}; export it again"
+                raise Unusable("corrupt", detail)
 
 
 def _described(channels: Sequence[Any]) -> list[Described]:
@@ -152,9 +146,8 @@ def _read(file: Any, wanted: dict[str, Any], stored: int) -> dict[str, Samples]:
                     taken[name].append(samples[:])
         for name, channel in wanted.items():
             if taken[name].size != len(channel):
-                raise Unusable(
-                    "corrupt", f"{name}: {taken[name].size} of {len(channel)} samples are there"
-                )
+                found = f"{taken[name].size} of {len(channel)} samples are there"
+                raise Unusable("corrupt", f"{name}: {found}")
         return {name: spool.samples() for name, spool in taken.items()}
 
 

@@ -10,25 +10,18 @@ from __future__ import annotations
 import re
 import tempfile
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from itertools import accumulate
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, Any, NamedTuple
 
 import numpy as np
 
 from lmshealth._arrays import FloatArray
 from lmshealth.io.buffers import Samples, blocks, spools
 from lmshealth.io.column_map import ColumnMap
-from lmshealth.io.formats.content import (
-    Content,
-    Format,
-    check_memory,
-    missing_library,
-    not_numeric,
-)
+from lmshealth.io.formats.content import Content, Format, check_memory, library, not_numeric
 from lmshealth.io.formats.unit_channels import Described, choose, present, rate_of
-from lmshealth.io.refusal import Unusable
+from lmshealth.io.refusal import Unusable, corrupt
 
 _START = re.compile(rb"\s*-1[ \t]*\r?\n[ \t]*\d+")
 _TAG = b"    -1"
@@ -59,23 +52,16 @@ _BINARY = {2: "f4", 4: "f8"}
 # Bytes of memory for a byte of ASCII: the text, its lines, the fields of a column, the numbers.
 _ASCII_MEMORY = 4
 
+_CUT_OFF = "the last data set is cut off"
+
 Header = dict[str, Any]
 
 
-@dataclass(frozen=True, slots=True)
-class _DataSet:
-    """A function at nodal degrees of freedom.
+class _DataSet(NamedTuple):
+    """A function at nodal degrees of freedom: its place among all data sets, from 1.
 
-    Attributes
-    ----------
-    place : int
-        Among all data sets of the file, from 1.
-    header : bytes
-        Tag, number and eleven records, as they are in the file.
-    binary : bool
-        Whether the numbers are binary.
-    start, stop : int
-        Bytes of the file that the numbers take.
+    ``header`` are tag, number and eleven records as in the file; ``start`` and ``stop`` the bytes
+    of its numbers.
     """
 
     place: int
@@ -102,34 +88,27 @@ def _load(path: Path, columns: ColumnMap, max_memory: float) -> Content:
     if stamps:
         first = next(iter(stamps.values()))
         if len(stamps) < len(read) or not all(_equal(x, first) for x in stamps.values()):
-            raise Unusable(
-                "time", "the records have different time stamps; needed the same for all"
-            )
+            detail = "the records have different time stamps; needed the same for all"
+            raise Unusable("time", detail)
         read["time_s"] = first
     return Content(read, chosen.metadata, present(described), chosen.refused)
 
 
 def _data_sets(stream: IO[bytes]) -> Iterator[_DataSet]:
-    """Find the data sets 58, and check that all data sets are whole.
-
-    Raises
-    ------
-    Unusable
-        With reason ``corrupt`` where tags or numbers of data sets are damaged or cut off.
-    """
+    """Find the data sets 58, and check that the tags and numbers of all data sets are whole."""
     place = 0
     while tag := stream.readline(_LONGEST_LINE):
         if not tag.strip(_BLANK):
             continue
         if not _is_tag(tag):
             at = stream.tell() - len(tag)
-            raise Unusable("corrupt", f"no data set begins at byte {at}; copy the file again")
+            raise corrupt(f"no data set begins at byte {at}")
         place += 1
         number = stream.readline(_LONGEST_LINE)
         if not number.strip(_BLANK):
-            raise _cut_off()
+            raise corrupt(_CUT_OFF)
         if not number[:6].strip().isdigit() or not int(number[:6]):
-            raise Unusable("corrupt", f"data set {place} has no number; copy the file again")
+            raise corrupt(f"data set {place} has no number")
         if int(number[:6]) != _FUNCTION:
             _end(stream)
             continue
@@ -151,10 +130,6 @@ def _malformed(place: int) -> Unusable:
 
 def _is_tag(line: bytes) -> bool:
     return line.rstrip(_BLANK) == _TAG
-
-
-def _cut_off() -> Unusable:
-    return Unusable("corrupt", "the last data set is cut off; copy the file again")
 
 
 def _claimed_end(stream: IO[bytes], number: bytes) -> int | None:
@@ -179,29 +154,26 @@ def _end(stream: IO[bytes], *, binary: bool = False) -> int:
     while line := stream.readline(_LONGEST_LINE):
         if _is_tag(line) or (binary and line.rstrip(_BLANK).endswith(_TAG)):
             return stream.tell() - len(line) + line.rindex(_TAG)
-    raise _cut_off()
+    raise corrupt(_CUT_OFF)
 
 
 def _headers(sets: Sequence[_DataSet]) -> list[Header]:
     """Read the headers with pyuff, which gets a file without the samples."""
-    try:
+    with library("UFF58", "pyuff"):
         import pyuff
-    except ImportError as error:
-        raise missing_library("UFF58", "pyuff") from error
     with tempfile.TemporaryDirectory(prefix="lmshealth-") as folder:
         path = Path(folder) / "headers.uff"
         path.write_bytes(b"".join(found.header + _TAG + b"\n" for found in sets))
         file = pyuff.UFF(str(path))
         if file.get_n_sets() != len(sets):
             raise Unusable("corrupt", "a header contains the tag of a data set; export it again")
-        return [_header(file, k, found.place) for k, found in enumerate(sets)]
-
-
-def _header(file: Any, k: int, place: int) -> Header:
-    try:
-        return dict(file.read_sets(k, header_only=True))
-    except Exception as error:  # pyuff raises nothing more specific
-        raise _malformed(place) from error
+        headers: list[Header] = []
+        for k, found in enumerate(sets):
+            try:
+                headers.append(dict(file.read_sets(k, header_only=True)))
+            except Exception as error:  # pyuff raises nothing more specific
+                raise _malformed(found.place) from error
+        return headers
 
 
 def _names(headers: Sequence[Header], sets: Sequence[_DataSet]) -> list[str]:
@@ -235,10 +207,8 @@ def _describe(header: Header, name: str) -> Described:
 
 def _is_time_record(header: Header) -> bool:
     kind = header["func_type"]
-    over_time = kind == _TIME_RESPONSE or (
-        kind == _UNKNOWN and header["abscissa_spec_data_type"] == _TIME
-    )
-    return over_time and header["ord_data_type"] in _REAL
+    of_unknown = kind == _UNKNOWN and header["abscissa_spec_data_type"] == _TIME
+    return (kind == _TIME_RESPONSE or of_unknown) and header["ord_data_type"] in _REAL
 
 
 def _check_record(header: Header, found: _DataSet, name: str, max_memory: float) -> None:
