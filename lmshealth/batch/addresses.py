@@ -30,20 +30,10 @@ def shown_address(address: str) -> str:
 
 
 def without_secrets(text: str, address: str) -> str:
-    """Mask the secrets of an address in the message of an error about it.
+    """Mask the password and the values of options of an address in an error message about it.
 
-    Parameters
-    ----------
-    text : str
-        Message of the error, which may quote the address.
-    address : str
-        URL of a store or a scheduler.
-
-    Returns
-    -------
-    str
-        With ``***`` for password and values of options; where the password cannot be separated
-        from the rest of the address, only what to do.
+    Where the password cannot be separated from the rest of the address, only what to do is
+    returned.
     """
     found = _URL.fullmatch(address)
     if found is None:

@@ -109,7 +109,7 @@ def assess(
         health=found.health,
         prognosis=found.prognosis,
         judgement=judge(stage, history, found.health, found.track),
-        refused=tuple([*not_excited, *refused]),
+        refused=(*not_excited, *refused),
         notes=(*notes, *found.notes),
         seed=seed,
         waterfall=Waterfall.stack([(reading.levels, reading.modes.lines) for reading in used]),
@@ -129,11 +129,7 @@ class _Results:
 
 
 def _results(
-    history: History,
-    stage: Stage,
-    most_epochs: int,
-    seed: tuple[int, int],
-    executor: Executor | None,
+    history: History, stage: Stage, epochs: int, seed: tuple[int, int], executor: Executor | None
 ) -> _Results:
     found = _Results()
     try:
@@ -146,8 +142,8 @@ def _results(
         has_limit = any(parameter.limit for parameter in stage.parameters)
         mapper = map if executor is None else partial(map_in_order, executor)
         life = mapper(_prognose, [history], [stage], [seed]) if has_limit else None
-        epochs = epochs_to_infer(tracked, stage, most_epochs)
-        found = replace(found, health=infer(tracked, stage, seed, epochs=epochs, mapper=mapper))
+        chosen = epochs_to_infer(tracked, stage, epochs)
+        found = replace(found, health=infer(tracked, stage, seed, epochs=chosen, mapper=mapper))
         if life is None:
             return found
         prognosis, evidence = next(iter(life))
@@ -155,11 +151,8 @@ def _results(
     except LmshealthError as error:
         return replace(found, notes=(str(error),))
     except LinAlgError as error:  # one machine must not end the run
-        why = (
-            f"{history.stage}: its logs lead to a singular matrix ({error}); please report this "
-            "with modes.csv"
-        )
-        return replace(found, notes=(why,))
+        why = f"its logs lead to a singular matrix ({error}); please report this with modes.csv"
+        return replace(found, notes=(f"{history.stage}: {why}",))
 
 
 def map_in_order(
@@ -187,23 +180,7 @@ def _prognose(
 
 @dataclass(frozen=True, slots=True)
 class Machine:
-    """One machine of a run, and all that its assessment depends on.
-
-    Attributes
-    ----------
-    name : str
-        Its identity.
-    logs : tuple of LogKey
-        Names of its logs, and the keys of their estimates.
-    stage : Stage
-        Its description.
-    work : Maintenance
-        Maintenance done to it.
-    epochs : int
-        Most epochs at which health is inferred.
-    seed : int
-        Of all random numbers.
-    """
+    """One machine of a run, and all that its assessment depends on: see `assess`."""
 
     name: str
     logs: tuple[LogKey, ...]
@@ -219,23 +196,12 @@ class Machine:
         return fingerprint(VERSION, *inputs)
 
 
-@dataclass(frozen=True, slots=True)
-class FleetUpdate:
-    """Key of the assessment of each machine to publish, and why some could not be recomputed."""
-
-    keys: dict[str, str]
-    failed: dict[str, str]
-
-
 def assess_all(
     machines: Sequence[Machine], resources: Resources, *, force: bool = False
 ) -> dict[str, str]:
     """Assess every machine whose assessment is not in the store; with ``force``, every machine.
 
-    Returns
-    -------
-    dict of str to str
-        Machines that could not be assessed, and why: one must not end the batch.
+    Return the machines that could not be assessed, and why: one must not end the batch.
     """
     store, failed = resources.store, dict[str, str]()
     left = [m for m in machines if force or not store.has_assessment(m.name, m.key)]
@@ -293,23 +259,24 @@ def _assess_packed(
 ) -> PackedAssessment | str:
     """Assess a machine; return why it fails, but raise what workers fail of."""
     machine, logs = job
-    options = {"epochs": machine.epochs, "seed": machine.seed}
-    return _reason_if_failed(
-        lambda: pack_assessment(
-            assess(unpack_logs(logs), machine.stage, machine.work, **options, executor=executor)
-        ),
-        machine.name,
-        (CancelledError, *crashes),
-    )
+    stage, done, epochs, seed = machine.stage, machine.work, machine.epochs, machine.seed
+
+    def work() -> PackedAssessment:
+        readings = unpack_logs(logs)
+        made = assess(readings, stage, done, epochs=epochs, seed=seed, executor=executor)
+        return pack_assessment(made)
+
+    return reason_if_failed(work, machine.name, (CancelledError, *crashes))
 
 
 def apply_fleet_priors(
     machines: Sequence[Machine], resources: Resources, *, force: Container[str] = ()
-) -> FleetUpdate:
+) -> tuple[dict[str, str], dict[str, str]]:
     """Recompute the prognosis of young machines with the prior of their fleet.
 
     A fleet is all machines of one description. The result of machines named by ``force`` is
-    computed although it is in the store.
+    computed although it is in the store. Return the key of the assessment of each machine to
+    publish, and why some could not be recomputed.
     """
     store, failed = resources.store, dict[str, str]()
     keys = {machine.name: machine.key for machine in machines}
@@ -334,7 +301,7 @@ def apply_fleet_priors(
         elif made is not None:
             failed[name] = made
         resources.progress("fleet priors", k, len(left))
-    return FleetUpdate(keys, failed)
+    return keys, failed
 
 
 def _machines_to_update(
@@ -348,14 +315,13 @@ def _machines_to_update(
         evidence = {}
         for name, machine in fleet.items():
             content = store.evidence(name, machine.key)
-            own = None if content is None else unpack_or_none(content, MachineEvidence | None)
+            own = unpack_or_none(content, MachineEvidence | None)
             if own is not None:
                 evidence[name] = own
         if evidence:
             stage = next(iter(fleet.values())).stage
-            yield from (
-                (fleet[name], prior) for name, prior in fleet_priors(stage, evidence).items()
-            )
+            priors = fleet_priors(stage, evidence)
+            yield from ((fleet[name], prior) for name, prior in priors.items())
 
 
 def _update(job: tuple[str, str, bytes | None, FleetPrior]) -> PackedAssessment | str | None:
@@ -363,7 +329,7 @@ def _update(job: tuple[str, str, bytes | None, FleetPrior]) -> PackedAssessment 
     name, _, content, prior = job
     if content is None:
         return None
-    return _reason_if_failed(lambda: with_fleet_prior(content, prior), name)
+    return reason_if_failed(lambda: with_fleet_prior(content, prior), name)
 
 
 def with_fleet_prior(content: bytes, prior: FleetPrior) -> PackedAssessment | None:
@@ -380,10 +346,10 @@ def _reason(job: object, why: str) -> str:
     return why
 
 
-def _reason_if_failed(
-    work: Callable[[], Work], name: str, raised: tuple[type[BaseException], ...] = ()
+def reason_if_failed(
+    work: Callable[[], Work], machine: str, raised: tuple[type[BaseException], ...] = ()
 ) -> Work | str:
-    """Return the result of a work, or why it fails; raise only certain exceptions."""
+    """Return the result of work for a machine, or why it fails; raise only certain exceptions."""
     try:
         return work()
     except raised:
@@ -391,5 +357,5 @@ def _reason_if_failed(
     except LmshealthError as error:
         return str(error)
     except Exception as error:
-        _logger.exception("%s", name)
+        _logger.exception("%s", machine)
         return unexpected(error, "its logs")

@@ -14,7 +14,6 @@ from lmshealth.batch.store import Identified, Store
 from lmshealth.batch.workers import Pool
 from lmshealth.errors import BadLog
 from lmshealth.io.column_map import ColumnMap
-from lmshealth.io.constants import MAX_MEMORY
 from lmshealth.io.formats.registry import format_name
 from lmshealth.io.log import Log, Metadata, Refusal
 from lmshealth.io.manifest import find_logs, name_of, read_manifest
@@ -46,20 +45,10 @@ class Resources:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Ingested:
-    """Result of ingesting a folder of logs.
+    """Logs of each machine that have estimates, and the digest of its description.
 
-    Attributes
-    ----------
-    machines : dict of str to tuple of LogKey
-        Logs of each machine that have estimates, by the identity of the machine.
-    descriptions : dict of str to str
-        Digest of the stage description of each machine.
-    refused : tuple of Refusal
-        Logs refused as a whole, copies, and rows of a manifest that name no log.
-    logs : frozenset of str
-        Names of all logs found.
-    n_cached : int
-        Logs whose outcome was in the store.
+    Refused are logs as a whole, copies, and rows of a manifest that name no log; ``logs`` are the
+    names of all logs found; the outcomes of ``n_cached`` logs were in the store.
     """
 
     machines: dict[str, tuple[LogKey, ...]]
@@ -89,25 +78,13 @@ def ingest(
     resources: Resources,
     *,
     out: Path,
-    columns: ColumnMap | None = None,
-    max_memory: float = MAX_MEMORY,
+    columns: ColumnMap | None,
+    max_memory: float,
 ) -> Ingested:
     """Identify every log of a folder whose outcome is not in the store yet.
 
-    Parameters
-    ----------
-    folder : Path
-        Read recursively, with its ``manifest.csv``.
-    stages : sequence of Stage
-        Each log is read with the first description that matches it.
-    resources : Resources
-        Results do not depend on its pool.
-    out : Path
-        Folder of the output: no file inside it is a log.
-    columns : ColumnMap, optional
-        How all logs are read; by default their columns are those of the log contract.
-    max_memory : float
-        Most memory in bytes that reading a log may take.
+    Each log is read with the first description that matches it. No file inside the folder of the
+    output is a log. The columns and the most memory in bytes are those of `read_log`.
     """
     store, pool, progress = resources.store, resources.pool, resources.progress
     folder = folder.absolute()  # workers may have another working directory
@@ -115,10 +92,20 @@ def ingest(
     inside = out.resolve()
     found = [path for path in archive.logs if inside not in path.resolve().parents]
     tasks, refused = _tasks(folder, found, columns, resources)
-    groups = _Groups([stage.digest for stage in stages])
+    # By machine and description; only names and keys are kept, not the estimates.
+    groups: dict[str, dict[str, list[LogKey]]] = {}
+    lost: list[Refusal] = []
+
+    def add(task: _Task, found: Identified) -> None:
+        if isinstance(found.outcome, LogEstimates):
+            own = groups.setdefault(str(found.stage), {}).setdefault(found.description, [])
+            own.append((task.name, task.key(found.description)))
+        else:
+            lost.extend(found.outcome)
+
     cached = set()
     for task, outcome in _cached(tasks, stages, store):
-        groups.add(task, outcome)
+        add(task, outcome)
         cached.add(task.name)
     progress("identifying", len(cached), len(tasks))
     left = [task for task in tasks if task.name not in cached]
@@ -126,49 +113,35 @@ def ingest(
     for k, (task, outcome) in enumerate(pool.map_unordered(work, left, _crashed), start=1):
         if outcome.lasting:
             store.put_identified(task.key(outcome.description), task.digest, outcome)
-        groups.add(task, outcome)
+        add(task, outcome)
         progress("identifying", len(cached) + k, len(tasks))
     names = {name_of(path, folder) for path in found}
-    machines, descriptions, ungrouped = groups.result()
+    machines, descriptions, others = _grouped(groups, [stage.digest for stage in stages])
+    lost = sorted([*lost, *others], key=lambda refusal: refusal.log)
     return Ingested(
         machines=machines,
         descriptions=descriptions,
-        refused=(*archive.refused, *refused, *ungrouped),
+        refused=(*archive.refused, *refused, *lost),
         logs=frozenset(names | {refusal.log for refusal in archive.refused}),
         n_cached=len(cached),
     )
 
 
-class _Groups:
-    """Logs by machine and description; only names and keys are kept, not the estimates."""
-
-    def __init__(self, order: list[str]) -> None:
-        self._order = order
-        self._found: dict[str, dict[str, list[LogKey]]] = {}
-        self._refused: list[Refusal] = []
-
-    def add(self, task: _Task, found: Identified) -> None:
-        """Add the outcome of a log."""
-        if isinstance(found.outcome, LogEstimates):
-            own = self._found.setdefault(str(found.stage), {})
-            log = task.name, task.key(found.description)
-            own.setdefault(found.description, []).append(log)
-        else:
-            self._refused += found.outcome
-
-    def result(self) -> tuple[dict[str, tuple[LogKey, ...]], dict[str, str], list[Refusal]]:
-        """Return logs and description of each machine, and refusals in the order of names."""
-        machines, descriptions, refused = {}, {}, list(self._refused)
-        for name, by in sorted(self._found.items()):
-            most = max(by, key=lambda digest: (len(by[digest]), -self._order.index(digest)))
-            machines[name], descriptions[name] = tuple(sorted(by[most])), most
-            others = [log for digest in by if digest != most for log, _ in by[digest]]
-            detail = (
-                f"{len(by[most])} logs of {name} belong to another stage description than this "
-                "one; a machine has one: see column description of manifest.csv"
-            )
-            refused += [Refusal(log, "no-stage", detail) for log in others]
-        return machines, descriptions, sorted(refused, key=lambda refusal: refusal.log)
+def _grouped(
+    found: dict[str, dict[str, list[LogKey]]], order: list[str]
+) -> tuple[dict[str, tuple[LogKey, ...]], dict[str, str], list[Refusal]]:
+    """Return logs and description of each machine, and refusals of logs of its other ones."""
+    machines, descriptions, refused = {}, {}, []
+    for name, by in sorted(found.items()):
+        most = max(by, key=lambda digest: (len(by[digest]), -order.index(digest)))
+        machines[name], descriptions[name] = tuple(sorted(by[most])), most
+        others = [log for digest in by if digest != most for log, _ in by[digest]]
+        detail = (
+            f"{len(by[most])} logs of {name} belong to another stage description than this "
+            "one; a machine has one: see column description of manifest.csv"
+        )
+        refused += [Refusal(log, "no-stage", detail) for log in others]
+    return machines, descriptions, refused
 
 
 def _tasks(
@@ -183,10 +156,10 @@ def _tasks(
     size = constants.FILES_PER_HASH_TASK
     batches = (tuple(found[first : first + size]) for first in range(0, len(found), size))
     for _, part in resources.pool.map_unordered(_digests, batches, _no_digests):
-        for path, (digest, refusal) in part.items():
-            digests[path] = digest
-            if refusal is not None:
-                refused.append(Refusal(name_of(path, folder), *refusal))
+        for path, found_there in part.items():
+            digests[path] = found_there if isinstance(found_there, str) else ""
+            if isinstance(found_there, tuple):
+                refused.append(Refusal(name_of(path, folder), *found_there))
         resources.progress("reading", len(digests), len(found))
     seen: dict[tuple[str, str], str] = {}
     # Of several copies the one in a manifest is analysed: only that one has its metadata.
@@ -210,22 +183,22 @@ def _tasks(
     return tasks, refused
 
 
-_Digests = dict[Path, tuple[str, tuple[str, str] | None]]
+_Digests = dict[Path, str | tuple[str, str]]
 
 
 def _digests(paths: Iterable[Path]) -> _Digests:
-    """Hash files; one that cannot be read has an empty digest, and the reason."""
+    """Hash files; one that cannot be read has a reason and a detail instead."""
     found: _Digests = {}
     for path in paths:
         try:
-            found[path] = content_digest(path), None
+            found[path] = content_digest(path)
         except BadLog as error:
-            found[path] = "", (error.reason, error.detail)
+            found[path] = error.reason, error.detail
     return found
 
 
 def _no_digests(paths: Iterable[Path], why: str) -> _Digests:
-    return {path: ("", ("missing-file", f"{why}: it cannot be read")) for path in paths}
+    return {path: ("missing-file", f"{why}: it cannot be read") for path in paths}
 
 
 def _cached(
@@ -262,13 +235,8 @@ def identify_log(task: _Task, stages: tuple[Stage, ...], max_memory: float) -> I
     """Read and identify one log; every failure becomes its refusal, never an exception."""
     by, stage, asked = "", None, None
     try:
-        log = read_log(
-            task.path,
-            columns=task.columns,
-            overrides=task.overrides,
-            name=task.name,
-            max_memory=max_memory,
-        )
+        read = partial(read_log, columns=task.columns, overrides=task.overrides)
+        log = read(task.path, name=task.name, max_memory=max_memory)
         if log.digest != task.digest:
             raise BadLog(task.name, "changed", "it is being written to; run again")
         require_identity(log)

@@ -6,7 +6,6 @@ Memory holds rows of the index and the machines in progress, however many machin
 from __future__ import annotations
 
 import csv
-import logging
 import threading
 from collections import deque
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -18,8 +17,7 @@ from tempfile import TemporaryFile
 from typing import IO, Self
 
 from lmshealth._files import replacing, write_text
-from lmshealth.batch.assess import PackedLogs, unpack_logs
-from lmshealth.batch.ingest import unexpected
+from lmshealth.batch.assess import PackedLogs, reason_if_failed, unpack_logs
 from lmshealth.batch.store import unpack_or_none
 from lmshealth.batch.workers import Pool
 from lmshealth.io.log import Refusal
@@ -32,23 +30,12 @@ from lmshealth.tracking.history import sort_by_time
 # matplotlib's settings are shared by the threads of a Dask worker.
 _DRAWING = threading.Lock()
 
-_logger = logging.getLogger(__name__)
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MachineRecord:
-    """Packed results of a machine, from which its page and its rows are made.
+    """Packed results of a machine, from which its page (a file) and its rows are made.
 
-    Attributes
-    ----------
-    machine, file : str
-        Its identity, and the name of its page.
-    assessment : bytes or None
-        The present one; None where there is none.
-    logs : PackedLogs
-        Names and estimates of its logs; empty where no tables are needed.
-    before : Reported or None
-        Summary of its previous report.
+    Its logs are empty where no tables are needed; ``before`` is its previous report.
     """
 
     machine: str
@@ -86,8 +73,7 @@ class CsvRows:
 
 def machine_output(record: MachineRecord) -> MachineOutput | None:
     """Make the page and the rows of a machine; None where this version cannot decode them."""
-    content = record.assessment
-    found: Assessment | None = None if content is None else unpack_or_none(content, Assessment)
+    found: Assessment | None = unpack_or_none(record.assessment, Assessment)
     if found is None:
         return None
     with _DRAWING:
@@ -116,24 +102,13 @@ def write_pages(
 
 
 def _output_or_reason(record: MachineRecord) -> MachineOutput | str | None:
-    try:
-        return machine_output(record)
-    except Exception as error:  # an error of this program in one page must not end the batch
-        _logger.exception("%s", record.machine)
-        return unexpected(error, "its logs")
+    return reason_if_failed(lambda: machine_output(record), record.machine)
 
 
 class Tables:
-    """Tables of a run, collected in parts whose columns may differ.
+    """Tables of a run, collected in parts whose columns may differ, in the order of machines.
 
     They replace older tables at the end: an interrupted run leaves those of the run before.
-
-    Parameters
-    ----------
-    folder : Path
-        Of the output.
-    machines : sequence of str
-        Order of the rows, in whatever order they are added.
     """
 
     def __init__(self, folder: Path, machines: Sequence[str]) -> None:

@@ -7,10 +7,11 @@ from contextlib import AbstractContextManager, closing
 from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath
 from tempfile import TemporaryFile
+from typing import NamedTuple
 
 from lmshealth.batch import constants
-from lmshealth.batch.assess import Machine, apply_fleet_priors, assess_all, packed_logs
-from lmshealth.batch.ingest import Ingested, Progress, Resources, ingest
+from lmshealth.batch.assess import Machine, PackedLogs, apply_fleet_priors, assess_all, packed_logs
+from lmshealth.batch.ingest import Progress, Resources, ingest
 from lmshealth.batch.outputs import MachineRecord, Tables, write_pages
 from lmshealth.batch.store import Store, StoreError, default_url
 from lmshealth.batch.workers import Pool, cluster, processes
@@ -22,7 +23,7 @@ from lmshealth.io.manifest import NOT_LOGS
 from lmshealth.report.assessment import Summary
 from lmshealth.report.fleet_page import by_urgency, file_names, write_index
 from lmshealth.stage.description import Stage
-from lmshealth.tracking.maintenance import Maintenance, read_maintenance
+from lmshealth.tracking.maintenance import read_maintenance
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,21 +79,21 @@ class RunResult:
         Front page of the report.
     rows : tuple of Summary
         One per machine, most urgent first.
-    n_logs, n_refused, n_remembered : int
-        Distinct logs found, refused as a whole, and taken from the store.
-    n_unread : int
-        Rows of ``manifest.csv`` and ``maintenance.csv`` that cannot be read, or whole such tables.
     failed : dict of str to str
         Machines that could not be assessed or reported, and why.
+    n_logs, n_refused, n_remembered : int
+        Distinct logs found, refused as a whole, and taken from the store; 0 in a report.
+    n_unread : int
+        Rows of ``manifest.csv`` and ``maintenance.csv`` that cannot be read, or whole such tables.
     """
 
     index: Path
     rows: tuple[Summary, ...]
-    n_logs: int
-    n_refused: int
-    n_remembered: int
-    n_unread: int
     failed: dict[str, str]
+    n_logs: int = 0
+    n_refused: int = 0
+    n_remembered: int = 0
+    n_unread: int = 0
 
     @property
     def pages(self) -> tuple[Path, ...]:
@@ -155,7 +156,13 @@ def run(
         columns, limit = settings.columns, settings.max_memory
         ingested = ingest(folder, stages, resources, out=out, columns=columns, max_memory=limit)
         refused = (*ingested.refused, *work.refused)
-        machines = _machines(ingested, stages, work, settings)
+        by_digest = {stage.digest: stage for stage in stages}
+        described = {name: by_digest[own] for name, own in ingested.descriptions.items()}
+        options = {"epochs": settings.epochs, "seed": settings.seed}
+        machines = [
+            Machine(name, logs, described[name], work.of(name), **options)
+            for name, logs in ingested.machines.items()
+        ]
         failed = assess_all(machines, resources)
         usable = [machine for machine in machines if machine.name not in failed]
         published = _report(usable, refused, resources, out)
@@ -184,18 +191,7 @@ def report(
     settings: Settings = Settings(),
     progress: Progress = lambda step, done, total: None,
 ) -> RunResult:
-    """Write the pages of all machines in a store, without their logs.
-
-    Parameters
-    ----------
-    store : Store
-        Filled by `run`.
-    out : Path
-        Folder of the pages, created if needed.
-    settings : Settings
-        Its workers write the pages.
-    progress : callable
-        Called as the report proceeds.
+    """Write the pages of all machines in a store that `run` has filled, without their logs.
 
     Raises
     ------
@@ -210,16 +206,7 @@ def report(
     # A process takes longer to start than a page to write.
     few = replace(settings, workers=min(settings.workers, len(present)))
     with few.pool() as pool:
-        records = (
-            MachineRecord(
-                machine=one.machine,
-                file=files[one.machine],
-                assessment=store.assessment(one.machine, one.key),
-                logs=(),
-                before=store.previous_summary(one.machine, one.key),
-            )
-            for one in present
-        )
+        records = (_record(one.machine, one.key, files[one.machine], store) for one in present)
         for name, output in write_pages(records, pool, out):
             if isinstance(output, str):
                 failed[name] = output
@@ -227,19 +214,13 @@ def report(
                 rows[name] = output.page.summary
             progress("reporting", len(rows) + len(failed), len(present))
     if not rows and not failed:
-        raise StoreError(
-            "the store holds only results of another version of lmshealth; `lmshealth run LOGS "
-            "--store URL` fills it"
-        )
+        found = "the store holds only results of another version of lmshealth"
+        raise StoreError(f"{found}; `lmshealth run LOGS --store URL` fills it")
     ranked = tuple(by_urgency(rows.values()))
     unread = "not readable for this version of lmshealth; run its logs again"
     return RunResult(
         index=write_index(out, ranked, store.refused(one.refused for one in present)),
         rows=ranked,
-        n_logs=0,
-        n_refused=0,
-        n_remembered=0,
-        n_unread=0,
         failed={one.machine: unread for one in present if one.machine not in rows} | failed,
     )
 
@@ -266,30 +247,11 @@ def _commonest(refused: Iterable[Refusal], lost: Container[str]) -> str:
     return f": {len(details)} as {reason}, such as {log}: {detail}"
 
 
-def _machines(
-    ingested: Ingested, stages: Sequence[Stage], work: Maintenance, settings: Settings
-) -> list[Machine]:
-    """Collect what the assessment of each machine depends on."""
-    by_digest = {stage.digest: stage for stage in stages}
-    return [
-        Machine(
-            name=name,
-            logs=logs,
-            stage=by_digest[ingested.descriptions[name]],
-            work=work.of(name),
-            epochs=settings.epochs,
-            seed=settings.seed,
-        )
-        for name, logs in ingested.machines.items()
-    ]
-
-
-@dataclass(frozen=True, slots=True)
-class _Published:
+class _Published(NamedTuple):
     """Rows of the index by machine, logs excluded from a life, and machines that failed."""
 
     rows: dict[str, Summary]
-    excluded: frozenset[str]
+    excluded: set[str]
     failed: dict[str, str]
 
 
@@ -313,15 +275,18 @@ def _report(
             if attempt:
                 failed |= assess_all(left, resources, force=True)
             force = {machine.name for machine in left} if attempt else ()
-            update = apply_fleet_priors(machines, resources, force=force)
-            not_updated |= update.failed
-            records = (_record(m, update.keys[m.name], files[m.name], store) for m in left)
+            keys, not_recomputed = apply_fleet_priors(machines, resources, force=force)
+            not_updated |= not_recomputed
+            records = (
+                _record(m.name, keys[m.name], files[m.name], store, packed_logs(m, store))
+                for m in left
+            )
             for name, output in write_pages(records, resources.pool, out):
                 if isinstance(output, str):
                     failed[name] = output
                     tables.add(name, {})
                     continue
-                store.publish(name, (update.keys[name], own_keys[name]), refused_key)
+                store.publish(name, (keys[name], own_keys[name]), refused_key)
                 tables.add(name, output.tables)
                 excluded.update(output.excluded)
                 rows[name] = output.page.summary
@@ -331,15 +296,12 @@ def _report(
                 break
         tables.write()
     unread = {machine.name: "its assessment cannot be read back from the store" for machine in left}
-    return _Published(rows, frozenset(excluded), not_updated | unread | failed)
+    return _Published(rows, excluded, not_updated | unread | failed)
 
 
-def _record(machine: Machine, key: str, file: str, store: Store) -> MachineRecord:
+def _record(
+    machine: str, key: str, file: str, store: Store, logs: PackedLogs = ()
+) -> MachineRecord:
     """Fetch the results of a machine from the store."""
-    return MachineRecord(
-        machine=machine.name,
-        file=file,
-        assessment=store.assessment(machine.name, key),
-        logs=packed_logs(machine, store),
-        before=store.previous_summary(machine.name, key),
-    )
+    assessment, before = store.assessment(machine, key), store.previous_summary(machine, key)
+    return MachineRecord(machine, file, assessment, logs, before)

@@ -18,8 +18,7 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
-from sqlalchemy import Column, Integer, LargeBinary, MetaData, String, Table, Text
-from sqlalchemy import create_engine, delete, event, func, inspect, literal, select
+import sqlalchemy as sql
 from sqlalchemy.dialects import postgresql, sqlite
 from sqlalchemy.engine import URL, Connection, Engine, make_url
 from sqlalchemy.exc import SQLAlchemyError
@@ -47,35 +46,32 @@ class StoreError(LmshealthError):
 
 # Tables: the key of a machine is a digest, because its name may be longer than an index allows
 
-_METADATA = MetaData()
+_METADATA = sql.MetaData()
+_BYTES, _DIGEST = sql.LargeBinary, sql.String(64)
+_KINDS: dict[str, Any] = {"content": _BYTES, "evidence": _BYTES, "summary": _BYTES}
+_KINDS |= {"number": sql.Integer, "version": sql.Text, "machine": sql.Text, "name": sql.Text}
 
 
-def _table(table: str, keys: str, /, **columns: Any) -> Table:
-    primary = [Column(key, String(64), primary_key=True) for key in keys.split()]
-    others = [Column(key, kind, nullable=key == "machine") for key, kind in columns.items()]
-    return Table(f"{table}_{constants.SCHEMA}", _METADATA, *primary, *others)
+def _table(table: str, keys: str, columns: str) -> sql.Table:
+    """Declare a table; keys, and columns of no other kind, are digests."""
+    primary = [sql.Column(name, _DIGEST, primary_key=True) for name in keys.split()]
+    others = [
+        sql.Column(name, _KINDS.get(name, _DIGEST), nullable=name == "machine")
+        for name in columns.split()
+    ]
+    return sql.Table(f"{table}_{constants.SCHEMA}", _METADATA, *primary, *others)
 
 
 # Outcome of each log; the columns between key and content are for people.
-_IDENTIFIED = _table(
-    "identified",
-    "key",
-    digest=String(64),
-    description=String(64),
-    version=Text,
-    machine=Text,
-    content=LargeBinary,
-)
+_IDENTIFIED = _table("identified", "key", "digest description version machine content")
 # The present assessment of each machine, and the one before the fleet prior was applied.
-_ASSESSED = _table(
-    "assessed", "machine key", content=LargeBinary, evidence=LargeBinary, summary=LargeBinary
-)
+_ASSESSED = _table("assessed", "machine key", "content evidence summary")
 # Which assessment of each machine was published last, and the key of its list of refused logs.
-_PRESENT = _table("present", "machine", name=Text, key=String(64), refused=String(64))
+_PRESENT = _table("present", "machine", "name key refused")
 # Summaries of all published assessments, numbered in the order of publication.
-_REPORTED = _table("reported", "machine key", number=Integer, content=LargeBinary)
+_REPORTED = _table("reported", "machine key", "number content")
 # Lists of logs that belong to no machine, by the fingerprint of the list.
-_REFUSED = _table("refused", "key", content=LargeBinary)
+_REFUSED = _table("refused", "key", "content")
 
 
 # Records
@@ -98,13 +94,14 @@ class Identified:
 
     def renamed(self, log: str) -> Identified:
         """Replace the name of the log, which may have been moved since."""
-        modes = self.outcome.modes if isinstance(self.outcome, LogEstimates) else None
-        listed = self.outcome if modes is None else modes.refused
-        refused = tuple(replace(refusal, log=log) for refusal in listed)
-        if modes is None:
-            return replace(self, outcome=refused)
-        modes = replace(modes, refused=refused)
+        if not isinstance(self.outcome, LogEstimates):
+            return replace(self, outcome=_renamed(self.outcome, log))
+        modes = replace(self.outcome.modes, refused=_renamed(self.outcome.modes.refused, log))
         return replace(self, outcome=replace(self.outcome, log=log, modes=modes))
+
+
+def _renamed(refused: tuple[Refusal, ...], log: str) -> tuple[Refusal, ...]:
+    return tuple(replace(refusal, log=log) for refusal in refused)
 
 
 @dataclass(frozen=True, slots=True)
@@ -125,8 +122,10 @@ class Published:
     refused: str
 
 
-def unpack_or_none(content: bytes, kind: Any) -> Any:
-    """Decode a packed record of a store; None where this version cannot."""
+def unpack_or_none(content: bytes | None, kind: Any) -> Any:
+    """Decode a packed record of a store; None where there is none or this version cannot."""
+    if content is None:
+        return None
     try:
         return unpack(content, kind)
     except ValueError as error:
@@ -143,25 +142,18 @@ def default_url(folder: Path) -> URL:
 
 
 class Store:
-    """Results behind an SQLAlchemy URL, of SQLite or PostgreSQL.
-
-    Parameters
-    ----------
-    url : str or URL
-        Such as ``sqlite:///results.sqlite`` or ``postgresql://me@host/fleet``.
-    create : bool
-        Whether to create the database file and tables that are missing.
+    """Results behind an SQLAlchemy URL, such as ``postgresql://me@host/fleet``.
 
     Raises
     ------
     StoreError
-        If it cannot be opened, or does not exist and may not be created.
+        If it cannot be opened, or does not exist and is not to be created.
     """
 
     def __init__(self, url: str | URL, *, create: bool = True) -> None:
         self._engine, self._address = _connect(url, create=create)
         self._shown = shown_address(self._address)
-        tables = inspect(self._engine).get_table_names()
+        tables = sql.inspect(self._engine).get_table_names()
         if missing := set(_METADATA.tables) - set(tables):
             older = any(re.fullmatch(r"(identified|assessed)_\d+", table) for table in tables)
             found = "only results of another version of lmshealth" if older else "no results"
@@ -190,7 +182,7 @@ class Store:
         asked = list(dict.fromkeys(keys))
         for first in range(0, len(asked), constants.ROWS_PER_QUERY):
             part = asked[first : first + constants.ROWS_PER_QUERY]
-            query = select(_IDENTIFIED.c.key, _IDENTIFIED.c.content)
+            query = sql.select(_IDENTIFIED.c.key, _IDENTIFIED.c.content)
             with self._begin() as connection:
                 rows = connection.execute(query.where(_IDENTIFIED.c.key.in_(part))).all()
             yield from ((row.key, row.content) for row in rows)
@@ -199,13 +191,13 @@ class Store:
         """Store the outcome of a log whose content has a digest."""
         row = {"key": key, "digest": digest, "description": found.description, "version": VERSION}
         machine = found.stage if isinstance(found.outcome, LogEstimates) else None
-        self._upsert(_IDENTIFIED, row | {"machine": machine, "content": pack(found)})
+        self._put(_IDENTIFIED, row | {"machine": machine, "content": pack(found)})
 
     # Machines
 
     def has_assessment(self, machine: str, key: str) -> bool:
         """Return whether a machine has an assessment under a key."""
-        return self._of_assessment(literal(True), machine, key) is not None
+        return self._of_assessment(sql.literal(True), machine, key) is not None
 
     def assessment(self, machine: str, key: str) -> bytes | None:
         """Fetch a packed assessment; None where it is not stored."""
@@ -220,44 +212,37 @@ class Store:
     def put_assessment(self, machine: str, key: str, made: PackedAssessment) -> None:
         """Store an assessment of a machine."""
         row = {"machine": _id(machine), "key": key, "content": made.content}
-        self._upsert(_ASSESSED, row | {"evidence": made.evidence, "summary": made.summary})
+        self._put(_ASSESSED, row | {"evidence": made.evidence, "summary": made.summary})
 
     def put_refused(self, refused: tuple[Refusal, ...]) -> str:
         """Store a list of logs that belong to no machine, and return its key."""
         key = fingerprint(refused)
-        self._upsert(_REFUSED, {"key": key, "content": pack(refused)})
+        self._put(_REFUSED, {"key": key, "content": pack(refused)})
         return key
 
     def publish(self, machine: str, keys: Sequence[str], refused: str) -> None:
         """Make an assessment the present one of a machine, and delete its other assessments.
 
-        Parameters
-        ----------
-        machine : str
-            Its name.
-        keys : sequence of str
-            Of the assessment, and of others of the machine that stay.
-        refused : str
-            Key of the list of logs that belong to no machine.
+        The keys are that of the assessment, and those of others of the machine that stay;
+        ``refused`` is that of the list of logs that belong to no machine.
         """
         own, key, stored = _id(machine), keys[0], _ASSESSED.c
-        number = select(func.coalesce(func.max(_REPORTED.c.number), 0) + 1).scalar_subquery()
-        summary = select(literal(own), literal(key), number, stored.summary).where(
-            stored.machine == own, stored.key == key
-        )
-        columns = ["machine", "key", "number", "content"]
-        row = {"machine": own, "name": machine, "key": key, "refused": refused}
+        present = {"machine": own, "name": machine, "key": key, "refused": refused}
+        newest = sql.func.coalesce(sql.func.max(_REPORTED.c.number), 0)
+        summary: dict[str, Any] = {"machine": sql.literal(own), "key": sql.literal(key)}
+        summary["number"] = sql.select(newest + 1).scalar_subquery()
+        summary["content"] = stored.summary
+        others = sql.delete(_ASSESSED).where(stored.machine == own, stored.key.not_in(keys))
         with self._begin() as connection:
-            self._upsert_in(connection, _PRESENT, row)
-            add = self._insert(_REPORTED).from_select(columns, summary)
-            connection.execute(_or_update(add, _REPORTED, columns))
-            others = delete(_ASSESSED).where(stored.machine == own, stored.key.not_in(keys))
+            connection.execute(self._upsert(_PRESENT, present))
+            of_this = (stored.machine == own) & (stored.key == key)
+            connection.execute(self._upsert(_REPORTED, summary, where=of_this))
             connection.execute(others)
 
     def previous_summary(self, machine: str, key: str) -> Reported | None:
         """Fetch the summary of the newest published assessment under another key; None if none."""
         query = (
-            select(_REPORTED.c.content)
+            sql.select(_REPORTED.c.content)
             .where(_REPORTED.c.machine == _id(machine), _REPORTED.c.key != key)
             .order_by(_REPORTED.c.number.desc())
         )
@@ -266,14 +251,8 @@ class Store:
             return next((summary for summary in summaries if summary is not None), None)
 
     def published(self) -> tuple[Published, ...]:
-        """List the published assessments of all machines, in the order of their names.
-
-        Raises
-        ------
-        StoreError
-            If there is none.
-        """
-        query = select(_PRESENT.c.name, _PRESENT.c.key, _PRESENT.c.refused)
+        """List the published assessments of all machines by name; `StoreError` if none is."""
+        query = sql.select(_PRESENT.c.name, _PRESENT.c.key, _PRESENT.c.refused)
         with self._begin() as connection:
             rows = connection.execute(query).all()
         if not rows:
@@ -284,31 +263,35 @@ class Store:
         """Fetch lists of logs that belong to no machine, each refusal once."""
         found: dict[Refusal, None] = {}
         for key in dict.fromkeys(keys):
-            content = self._first(select(_REFUSED.c.content).where(_REFUSED.c.key == key))
-            own = None if content is None else unpack_or_none(content, tuple[Refusal, ...])
-            found |= dict.fromkeys(own or ())
+            content = self._first(sql.select(_REFUSED.c.content).where(_REFUSED.c.key == key))
+            found |= dict.fromkeys(unpack_or_none(content, tuple[Refusal, ...]) or ())
         return tuple(found)
 
     # Statements
 
     def _of_assessment(self, column: Any, machine: str, key: str) -> Any:
-        stored = _ASSESSED.c
-        return self._first(select(column).where(stored.machine == _id(machine), stored.key == key))
+        where = _ASSESSED.c.machine == _id(machine), _ASSESSED.c.key == key
+        return self._first(sql.select(column).where(*where))
 
     def _first(self, query: Any) -> Any:
         """Fetch the first value of a query; None if there is none."""
         with self._begin() as connection:
             return connection.scalars(query).first()
 
-    def _insert(self, table: Table) -> Any:
-        return _INSERT[self._engine.dialect.name](table)
-
-    def _upsert(self, table: Table, row: dict[str, Any]) -> None:
+    def _put(self, table: sql.Table, row: dict[str, Any]) -> None:
         with self._begin() as connection:
-            self._upsert_in(connection, table, row)
+            connection.execute(self._upsert(table, row))
 
-    def _upsert_in(self, connection: Connection, table: Table, row: dict[str, Any]) -> None:
-        connection.execute(_or_update(self._insert(table).values(row), table, row))
+    def _upsert(self, table: sql.Table, row: dict[str, Any], *, where: Any = None) -> Any:
+        """Insert or update a row, of another table with ``where``: a later write replaces it."""
+        insert = _INSERT[self._engine.dialect.name](table)
+        if where is None:
+            insert = insert.values(row)
+        else:
+            insert = insert.from_select(list(row), sql.select(*row.values()).where(where))
+        keys = [column.name for column in table.primary_key]
+        rest = {name: insert.excluded[name] for name in row if name not in keys}
+        return insert.on_conflict_do_update(index_elements=keys, set_=rest)
 
     @contextmanager
     def _begin(self) -> Iterator[Connection]:
@@ -317,17 +300,9 @@ class Store:
             with self._engine.begin() as connection:
                 yield connection
         except SQLAlchemyError as error:
-            raise StoreError(
-                f"the store {self._shown} failed: {_reason(error, self._address)}; its results "
-                "are kept, run again to continue"
-            ) from None  # the cause would quote the row
-
-
-def _or_update(insert: Any, table: Table, columns: Iterable[str]) -> Any:
-    """Update a row that exists: of two that are written at once the later one stays."""
-    keys = [column.name for column in table.primary_key]
-    rest = {name: insert.excluded[name] for name in columns if name not in keys}
-    return insert.on_conflict_do_update(index_elements=keys, set_=rest)
+            why = f"{_reason(error, self._address)}; its results are kept, run again to continue"
+            # The cause would quote the row.
+            raise StoreError(f"the store {self._shown} failed: {why}") from None
 
 
 def _id(machine: str) -> str:
@@ -341,14 +316,12 @@ def _connect(url: str | URL, *, create: bool) -> tuple[Engine, str]:
     """Open a database; return its engine and its URL as text."""
     address = url if isinstance(url, str) else url.render_as_string(False)
     if "://" not in address:
-        raise StoreError(
-            "cannot open the store: the given address is no URL; a file is sqlite:///PATH, a "
-            "database postgresql://user@host/name"
-        )
+        needed = "a file is sqlite:///PATH, a database postgresql://user@host/name"
+        raise StoreError(f"cannot open the store: the given address is no URL; {needed}")
     engine: Engine | None = None
     try:
         parsed = _parsed(url)
-        engine = _engine(parsed) if create else _engine(_existing(parsed), shared=False)
+        engine = _engine(parsed, create=create)
         if create:
             _create_tables(engine)
         with engine.connect():
@@ -371,22 +344,29 @@ def _parsed(url: str | URL) -> URL:
     return parsed.set(drivername="postgresql+psycopg") if plain else parsed
 
 
-def _engine(url: URL, *, shared: bool = True) -> Engine:
+def _engine(url: URL, *, create: bool) -> Engine:
+    """Make the engine of a database; without ``create`` SQLite must not create the file."""
     if url.get_backend_name() != "sqlite":
         timeout = constants.SERVER_TIMEOUT_S
         wait = {} if "connect_timeout" in url.query else {"connect_timeout": timeout}
-        return create_engine(url, pool_pre_ping=True, connect_args=wait)
-    folder = Path(url.database or "").parent
-    if not (url.database or "").startswith("file:") and not folder.is_dir():
-        raise ValueError(f"there is no folder {folder}")
-    engine = create_engine(url, connect_args={"timeout": constants.SQLITE_BUSY_TIMEOUT_S})
+        return sql.create_engine(url, pool_pre_ping=True, connect_args=wait)
+    name = url.database or ":memory:"
+    is_uri = name.startswith("file:")
+    if create and not is_uri and not Path(name).parent.is_dir():
+        raise ValueError(f"there is no folder {Path(name).parent}")
+    if not create and name != ":memory:":
+        if not is_uri and not Path(name).exists():
+            raise ValueError("there is no such file; `lmshealth run LOGS --store URL` makes it")
+        path = name if is_uri else f"file:{quote(name)}"
+        url = url.set(database=path).update_query_dict({"mode": "rw", "uri": "true"})
+    engine = sql.create_engine(url, connect_args={"timeout": constants.SQLITE_BUSY_TIMEOUT_S})
 
-    @event.listens_for(engine, "connect")
+    @sql.event.listens_for(engine, "connect")
     def _set_up(connection: Any, _: Any) -> None:
         # WAL allows readers during a write. No wait for the disk at every log: results that a
         # crash of the computer loses are computed again.
         with suppress(Exception):  # another run may do so now, or the file may be no database
-            if shared:
+            if create:
                 connection.execute("PRAGMA journal_mode = WAL")
         connection.execute("PRAGMA synchronous = NORMAL")
 
@@ -399,7 +379,7 @@ def _create_tables(engine: Engine) -> None:
     for attempt in range(attempts):
         try:
             with engine.begin() as connection:
-                existing = set(inspect(connection).get_table_names())
+                existing = set(sql.inspect(connection).get_table_names())
                 for table in _METADATA.sorted_tables:
                     if table.name not in existing:
                         connection.execute(CreateTable(table, if_not_exists=True))
@@ -407,17 +387,6 @@ def _create_tables(engine: Engine) -> None:
         except SQLAlchemyError:
             if attempt == attempts - 1:
                 raise
-
-
-def _existing(url: URL) -> URL:
-    """Add to a URL that SQLite must not create the file."""
-    name = url.database or ":memory:"
-    if url.get_backend_name() != "sqlite" or name == ":memory:":
-        return url
-    if not name.startswith("file:") and not Path(name).exists():
-        raise ValueError("there is no such file; `lmshealth run LOGS --store URL` makes it")
-    path = name if name.startswith("file:") else f"file:{quote(name)}"
-    return url.set(database=path).update_query_dict({"mode": "rw", "uri": "true"})
 
 
 def _reason(error: Exception, address: str) -> str:

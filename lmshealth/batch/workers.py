@@ -55,14 +55,8 @@ class SchedulerError(LmshealthError):
 class Pool:
     """Execute tasks in this process, one after the other.
 
-    Attributes
-    ----------
-    executor : Executor or None
-        For the parts of one task; None where parts cannot run side by side.
-    size : int
-        Number of tasks that run at a time.
-    crashes : tuple of type
-        What futures of the executor raise where a worker died.
+    Other pools run ``size`` tasks at a time. Their executor is for the parts of one task, and its
+    futures raise one of ``crashes`` where a worker died.
     """
 
     executor: Executor | None = None
@@ -74,31 +68,18 @@ class Pool:
     ) -> Iterator[tuple[Item, Result]]:
         """Apply a function to items; yield each item with its result, in the order of completion.
 
-        No more than `constants.TASKS_AHEAD` items per worker are taken before their results are
-        fetched, so that memory does not grow with the number of items.
-
-        Parameters
-        ----------
-        function : callable
-            Of a module, or a `partial` of one. Its exceptions end the batch.
-        items : iterable
-            Arguments of the function.
-        on_crash : callable
-            Makes the result of an item that ends its worker, from the item and the reason. Other
-            items that were running when a worker died are run again.
+        The function is one of a module, or a `partial` of one; its exceptions end the batch. No
+        more than `constants.TASKS_AHEAD` items per worker are taken before their results are
+        fetched, so that memory does not grow with the number of items. ``on_crash`` makes the
+        result of an item that ends its worker, from the item and the reason; other items that were
+        running when a worker died are run again.
         """
         for item in items:
             yield item, function(item)
 
 
 class _ProcessPool(Pool):
-    """Processes on this machine, restarted when one of them dies.
-
-    Raises
-    ------
-    LmshealthError
-        If the processes cannot be started.
-    """
+    """Processes on this machine, restarted when one of them dies."""
 
     def __init__(self, size: int) -> None:
         self.size = size
@@ -243,12 +224,12 @@ def _initialise(parent_exit: Connection) -> None:
     if hasattr(signal, "pthread_sigmask"):
         signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
     threadpool_limits(1)  # as in `processes`: sums in another order differ in their last digits
-    threading.Thread(target=_exit_with_parent, args=(parent_exit,), daemon=True).start()
 
+    def exit_with_parent() -> None:
+        connection.wait([parent_exit])  # ready when the other end is closed
+        os._exit(1)
 
-def _exit_with_parent(parent_exit: Connection) -> None:
-    connection.wait([parent_exit])  # ready when the other end is closed
-    os._exit(1)
+    threading.Thread(target=exit_with_parent, daemon=True).start()
 
 
 # Dask
@@ -300,13 +281,8 @@ class _Cluster(Pool):
 def cluster(address: str) -> Iterator[Pool]:
     """Open a pool of the workers of a Dask cluster.
 
-    Scheduler and workers need this version of lmshealth, and the workers need the logs under the
-    same paths.
-
-    Parameters
-    ----------
-    address : str
-        Of its scheduler, such as ``tcp://host:8786``.
+    The address is that of the scheduler, such as ``tcp://host:8786``. Scheduler and workers need
+    this version of lmshealth, and the workers need the logs under the same paths.
 
     Raises
     ------
@@ -317,9 +293,8 @@ def cluster(address: str) -> Iterator[Pool]:
     try:
         from distributed.comm.core import CommClosedError
     except ImportError as error:
-        raise SchedulerError(
-            "--scheduler needs Dask: pip install 'lmshealth[distributed]'"
-        ) from error
+        needed = "pip install 'lmshealth[distributed]'"
+        raise SchedulerError(f"--scheduler needs Dask: {needed}") from error
     try:
         _check_address(address)
         client = _connected(address)
@@ -329,9 +304,8 @@ def cluster(address: str) -> Iterator[Pool]:
         detail = f"{why}; is it running?" if why else without_secrets(str(error), address)
         raise SchedulerError(f"cannot work on the Dask scheduler {shown}: {detail}") from None
     except Exception as error:  # whatever the library makes of an answer that it cannot parse
-        raise SchedulerError(
-            f"the service at {shown} does not answer like a Dask scheduler: is it the right port?"
-        ) from error
+        why = "does not answer like a Dask scheduler: is it the right port?"
+        raise SchedulerError(f"the service at {shown} {why}") from error
     comm_closed: Any = CommClosedError  # the library has no types
     try:
         client.wait_for_workers(1, timeout=constants.SCHEDULER_TIMEOUT_S)
@@ -341,9 +315,8 @@ def cluster(address: str) -> Iterator[Pool]:
     except TimeoutError as error:
         raise SchedulerError(f"the Dask scheduler {shown} has no workers: start some") from error
     except (CancelledError, comm_closed) as error:
-        raise SchedulerError(
-            f"lost the Dask scheduler {shown}; finished results are stored: run again to continue"
-        ) from error
+        kept = "finished results are stored: run again to continue"
+        raise SchedulerError(f"lost the Dask scheduler {shown}; {kept}") from error
     finally:
         _close(client)
 
@@ -363,9 +336,8 @@ def _check_address(address: str) -> None:
         try:
             service.recv(1)
         except TimeoutError:
-            raise ValueError(
-                f"no greeting within {timeout} s: is it a scheduler, and the right port?"
-            ) from None
+            why = f"no greeting within {timeout} s: is it a scheduler, and the right port?"
+            raise ValueError(why) from None
 
 
 def _connected(address: str) -> Any:
