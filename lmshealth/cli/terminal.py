@@ -65,27 +65,26 @@ def print_text(text: str, mark: str = "") -> None:
 
 def print_refused(rows: Sequence[Row]) -> None:
     """Print refusals and their reasons."""
-    names = ("log", "channel", "mode", "reason", "detail")
     logs = short_names([row["log"] for row in rows])
+    names = ("log", "channel", "mode", "reason", "detail")
+    cells = [{name: row[name] for name in names} | {"log": logs[row["log"]]} for row in rows]
     if rows:
-        cells = [(logs[row["log"]], *(row[name] for name in names[1:])) for row in rows]
-        print_table("Refused", names, (), cells)
+        print_table("Refused", cells, len(names))
 
 
-def print_table(
-    title: str, texts: Sequence[str], numbers: Sequence[str], cells: Sequence[Sequence[str]]
-) -> None:
-    """Print a table: text columns left-aligned, then number columns right-aligned."""
+def print_table(title: str, rows: Sequence[dict[str, str]], n_texts: int = 1) -> None:
+    """Print rows under their keys: texts left-aligned, then numbers right-aligned."""
     table = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False)
-    for place, name in enumerate(texts):
-        # The last text column is the longest and is wrapped first; names before it are not split.
-        words = " ".join([name, *(row[place] for row in cells)]).split()
-        least = min(max(map(len, words), default=0), _NAME) if place < len(texts) - 1 else None
-        table.add_column(name, overflow="fold", min_width=least)
-    for name in numbers:
-        table.add_column(name, justify="right", no_wrap=True)
-    for row in cells:
-        table.add_row(*map(plain, row))
+    for place, name in enumerate(rows[0]):
+        if place < n_texts:
+            # The last text is the longest and is wrapped first; names before it are not split.
+            words = " ".join([name, *(row[name] for row in rows)]).split()
+            least = min(max(map(len, words), default=0), _NAME) if place < n_texts - 1 else None
+            table.add_column(name, overflow="fold", min_width=least)
+        else:
+            table.add_column(name, justify="right", no_wrap=True)
+    for row in rows:
+        table.add_row(*map(plain, row.values()))
     click.echo(plain(title))
     # Brackets in the cells are not markup.
     Console(markup=False, emoji=False, highlight=False).print(table)

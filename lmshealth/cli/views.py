@@ -15,7 +15,10 @@ from lmshealth.report import constants
 from lmshealth.report.text import (
     GAP,
     change,
+    day,
+    exponent,
     fixed,
+    in_brackets,
     interval,
     number,
     percent,
@@ -51,24 +54,24 @@ _VERDICTS = {
 def print_modes(rows: Sequence[Row], refused: Sequence[Row]) -> None:
     """Print modes with their standard deviations."""
     logs = short_names([row["log"] for row in rows])
-    cells = [
-        (
-            logs[row["log"]],
-            row["mode"],
-            row["channel"],
-            f"{number(row['frequency_hz'], 4)} ± {number(row['frequency_std_hz'], 2)}"
-            if row["frequency_std_hz"] >= 1
-            else f"{fixed(row['frequency_hz'], 3)} ± {fixed(row['frequency_std_hz'], 3)}",
-            f"{100 * row['damping_ratio']:.2f} ± {100 * row['damping_ratio_std']:.2f}",
-            number(row["snr"]),
-            row["flags"],
+    cells = []
+    for row in rows:
+        frequency, std, damping = row["frequency_hz"], row["frequency_std_hz"], row["damping_ratio"]
+        cells.append(
+            {
+                "log": logs[row["log"]],
+                "mode": row["mode"],
+                "channel": row["channel"],
+                "frequency Hz": f"{number(frequency, 4)} ± {number(std, 2)}"
+                if std >= 1
+                else f"{fixed(frequency, 3)} ± {fixed(std, 3)}",
+                "damping %": f"{100 * damping:.2f} ± {100 * row['damping_ratio_std']:.2f}",
+                "SNR": number(row["snr"]),
+                "flags": row["flags"],
+            }
         )
-        for row in rows
-    ]
     if rows:
-        heads = ("frequency Hz", "damping %", "SNR", "flags")
-        title = "Modes (± one standard deviation)"
-        print_table(title, ("log", "mode", "channel"), heads, cells)
+        print_table("Modes (± one standard deviation)", cells, 3)
     else:
         print_text("No modes found.")
     print_refused(refused)
@@ -88,17 +91,17 @@ def print_frf(
 def _print_response(fit: Row, frf: Sequence[Row]) -> None:
     step = max(1, -(-len(frf) // constants.TERMINAL_LINES))
     cells = [
-        (
-            f"{row['frequency_hz']:.5g}",
-            f"{row['gain']:.4g} ± {row['gain_std']:.2g}",
-            f"{math.degrees(row['phase_rad']):.1f}",
-            f"{row['coherence']:.4f}",
-            f"{row['fit_gain']:.4g}",
-        )
+        {
+            "Hz": f"{row['frequency_hz']:.5g}",
+            "gain (SI)": f"{row['gain']:.4g} ± {row['gain_std']:.2g}",
+            "phase °": f"{math.degrees(row['phase_rad']):.1f}",
+            "coherence": f"{row['coherence']:.4f}",
+            "fit": f"{row['fit_gain']:.4g}",
+        }
         for row in frf[step // 2 :: step]
     ]
     title = f"Response of {fit['output']} to {fit['input']}, {len(cells)} of {len(frf)} lines"
-    print_table(title, (), ("Hz", "gain (SI)", "phase °", "coherence", "fit"), cells)
+    print_table(title, cells, 0)
     if math.isnan(fit["period_s"]):
         print_text(f"H1 of {fit['n_averages']:.0f} segments: the input is not periodic.")
     else:
@@ -119,48 +122,32 @@ def _print_response(fit: Row, frf: Sequence[Row]) -> None:
 def print_error(rows: Sequence[Row], harmonics: Sequence[Row], refused: Sequence[Row]) -> None:
     """Print the following error: statistics and strongest harmonics."""
     if rows:
-        _print_statistics(rows)
+        columns = {"mm/s": "velocity_mm_s", "s": "duration_s", "min": "min_um", "max": "max_um"}
+        columns |= {"std": "std_um", "mean": "mean_um"}
+        _print_statistics("Following error (µm)", rows, columns)
+        columns = {"number": "n_harmonics", "max µm": "max_magnitude_um", "at Hz": "strongest_hz"}
+        columns |= {"bandwidth Hz": "bandwidth_hz", "share": "share_explained"}
+        _print_statistics("Strongest harmonics", rows, columns)
+        columns = {"number": "n_above_floor", "bandwidth Hz": "bandwidth_above_floor_hz"}
+        columns |= {"share": "share_explained_above_floor"}
+        _print_statistics(f"Those above {rows[0]['floor_nm']:g} nm", rows, columns)
+        print_text(
+            "bandwidth: highest minus lowest frequency; share: of the variance they explain."
+        )
         _print_harmonics(rows, harmonics)
     print_refused(refused)
 
 
-def _print_statistics(rows: Sequence[Row]) -> None:
-    several = len({row["channel"] for row in rows}) > 1
-    texts = ("log", "channel") if several else ("log",)
+def _print_statistics(title: str, rows: Sequence[Row], columns: dict[str, str]) -> None:
     logs = short_names([row["log"] for row in rows])
-
-    def show(title: str, columns: dict[str, str]) -> None:
-        cells = [
-            (
-                *(logs[row["log"]], row["channel"])[: len(texts)],
-                *(_statistic(key, row[key]) for key in columns.values()),
-            )
-            for row in rows
-        ]
-        print_table(title, texts, tuple(columns), cells)
-
-    show(
-        "Following error (µm)",
-        {
-            "mm/s": "velocity_mm_s", "s": "duration_s", "min": "min_um", "max": "max_um",
-            "std": "std_um", "mean": "mean_um",
-        },
-    )  # fmt: skip
-    show(
-        "Strongest harmonics",
-        {
-            "number": "n_harmonics", "max µm": "max_magnitude_um", "at Hz": "strongest_hz",
-            "bandwidth Hz": "bandwidth_hz", "share": "share_explained",
-        },
-    )  # fmt: skip
-    show(
-        f"Those above {rows[0]['floor_nm']:g} nm",
-        {
-            "number": "n_above_floor", "bandwidth Hz": "bandwidth_above_floor_hz",
-            "share": "share_explained_above_floor",
-        },
-    )  # fmt: skip
-    print_text("bandwidth: highest minus lowest frequency; share: of the variance they explain.")
+    several = len({row["channel"] for row in rows}) > 1
+    cells = [
+        {"log": logs[row["log"]]}
+        | ({"channel": row["channel"]} if several else {})
+        | {head: _statistic(key, row[key]) for head, key in columns.items()}
+        for row in rows
+    ]
+    print_table(title, cells, 2 if several else 1)
 
 
 def _statistic(key: str, value: float) -> str:
@@ -222,16 +209,21 @@ def _print_channel(title: str, rows: Sequence[Row]) -> None:
         speeds = [speeds[round(k * step)] for k in range(constants.TERMINAL_VELOCITIES)]
         title += f" ({left_out} more velocities in csv and json)"
     kinds = {row["band"]: row for row in rows}
-    table = [
-        (
-            _band_name(kinds[band]),
-            *(_mean(own.get(v, [])) + ("~" if (band, v) in lines else " ") for v in speeds),
-            _slope(kinds[band]),
-        )
-        for band, own in cells.items()
-    ]
-    heads = tuple("unknown" if speed < 0 else f"{speed:g}" for speed in speeds)
-    print_table(f"{title}: mm/s² at velocities in mm/s", ("band",), (*heads, "grows"), table)
+    table = []
+    for band, own in cells.items():
+        levels = {
+            "unknown" if v < 0 else f"{v:g}": _mean(own.get(v, []))
+            + ("~" if (band, v) in lines else " ")
+            for v in speeds
+        }
+        row = kinds[band]
+        in_hz = f"RMS {row['low_hz']:g}-{row['high_hz']:g}"
+        name = band if row["kind"] in ("mode", "grid") else in_hz
+        slope = "–"
+        if row["grows"] is not None:
+            slope = f"{row['slope']:.2f}±{row['slope_std']:.2f}{'*' if row['grows'] else ' '}"
+        table.append({"band": name, **levels, "grows": slope})
+    print_table(f"{title}: mm/s² at velocities in mm/s", table)
     _print_places([row for row in rows if row["kind"] == "mode"])
 
 
@@ -255,18 +247,6 @@ def _range(values: Sequence[float]) -> str:
     return " to ".join(dict.fromkeys(ends))
 
 
-def _band_name(row: Row) -> str:
-    if row["kind"] in ("mode", "grid"):
-        return str(row["band"])
-    return f"RMS {row['low_hz']:g}-{row['high_hz']:g}"
-
-
-def _slope(row: Row) -> str:
-    if row["grows"] is None:
-        return "–"
-    return f"{row['slope']:.2f}±{row['slope_std']:.2f}{'*' if row['grows'] else ' '}"
-
-
 def _mean(values: Sequence[float]) -> str:
     mean = sum(values) / len(values) if values else 0.0
     return number(mean, 3 if mean >= 0.1 else 2) if values else ""
@@ -278,16 +258,16 @@ def _print_lines(lines: Sequence[Row]) -> None:
     for row in lines:
         groups.setdefault((row["channel"], row["kind"], round(row["frequency_hz"])), []).append(row)
     cells = [
-        (
-            channel,
-            kind,
-            f"{rows[0]['frequency_hz']:.2f}",
-            number(1e3 * max(row["amplitude"] for row in rows)),
-            str(len({row["log"] for row in rows})),
-        )
+        {
+            "channel": channel,
+            "kind": kind,
+            "Hz": f"{rows[0]['frequency_hz']:.2f}",
+            "largest mm/s²": number(1e3 * max(row["amplitude"] for row in rows)),
+            "in logs": str(len({row["log"] for row in rows})),
+        }
         for (channel, kind, _), rows in sorted(groups.items())
     ]
-    print_table("Lines", ("channel", "kind"), ("Hz", "largest mm/s²", "in logs"), cells)
+    print_table("Lines", cells, 2)
 
 
 # --- Stage descriptions and plans ---
@@ -297,18 +277,19 @@ def print_stage(content: dict[str, list[Row]]) -> None:
     """Print the modes, parameters, sensitivities and findings of a stage description."""
     (stage,), parameters = content["stage"], content["parameters"]
     cells = [
-        (
-            row["mode"],
-            "yes" if row["tracked"] else "no",
-            f"{row['frequency_hz']:.1f}",
-            f"{row['searched_low_hz']:.0f}-{row['searched_high_hz']:.0f}",
-            *(fixed(row[key], 1) for key in ("map_hz", "map_at_limits_hz")),
-            *(_exponent(row[key]) for key in ("surrogate_error_ln_f", "logs_reach_ln_f")),
-        )
+        {
+            "mode": row["mode"],
+            "tracked": "yes" if row["tracked"] else "no",
+            "Hz": f"{row['frequency_hz']:.1f}",
+            "search band": f"{row['searched_low_hz']:.0f}-{row['searched_high_hz']:.0f}",
+            "map Hz": fixed(row["map_hz"], 1),
+            "at limits": fixed(row["map_at_limits_hz"], 1),
+            "map error": exponent(row["surrogate_error_ln_f"]),
+            "log std": exponent(row["logs_reach_ln_f"]),
+        }
         for row in content["modes"]
     ]
-    heads = ("Hz", "search band", "map Hz", "at limits", "map error", "log std")
-    print_table(f"{stage['name']}: modes", ("mode", "tracked"), heads, cells)
+    print_table(f"{stage['name']}: modes", cells, 2)
     if parameters:
         _print_coverage(parameters)
         _print_identifiability(stage, parameters)
@@ -317,38 +298,34 @@ def print_stage(content: dict[str, list[Row]]) -> None:
         print_text(row["text"], "+ " if row["good"] else "! ")
 
 
-def _exponent(value: float) -> str:
-    return "–" if math.isnan(value) else f"{value:.1e}"
-
-
 def _print_coverage(parameters: Sequence[Row]) -> None:
     cells = [
-        (
-            row["parameter"],
-            f"{row['baseline']:g}",
-            "–" if row["limit"] is None else f"{row['limit']:g}",
-            f"{row['prior_q05']:.3g}-{row['prior_q95']:.3g}",
-            f"{row['map_low']:.3g}-{row['map_high']:.3g}",
-            percent(row["prior_below_map"] + row["prior_above_map"], 1),
-        )
+        {
+            "parameter": row["parameter"],
+            "baseline": f"{row['baseline']:g}",
+            "limit": "–" if row["limit"] is None else f"{row['limit']:g}",
+            "prior 90 %": f"{row['prior_q05']:.3g}-{row['prior_q95']:.3g}",
+            "map": f"{row['map_low']:.3g}-{row['map_high']:.3g}",
+            "prior outside": percent(row["prior_below_map"] + row["prior_above_map"], 1),
+        }
         for row in parameters
     ]
-    heads = ("baseline", "limit", "prior 90 %", "map", "prior outside")
-    print_table("Health parameters", ("parameter",), heads, cells)
+    print_table("Health parameters", cells)
 
 
 def _print_identifiability(stage: Row, parameters: Sequence[Row]) -> None:
     cells = [
-        (
-            row["parameter"],
-            *(percent(row[f"{key}_std_ln"], 1) for key in ("prior", "logs", "endless_logs")),
-            percent(row["informed"], 1),
-            _VERDICTS[row["verdict"]],
-        )
+        {
+            "parameter": row["parameter"],
+            "prior": percent(row["prior_std_ln"], 1),
+            "logs": percent(row["logs_std_ln"], 1),
+            "endless logs": percent(row["endless_logs_std_ln"], 1),
+            "informed": percent(row["informed"], 1),
+            "": _VERDICTS[row["verdict"]],
+        }
         for row in parameters
     ]
-    heads = ("prior", "logs", "endless logs", "informed", "")
-    print_table("Standard deviation of the parameters", ("parameter",), heads, cells)
+    print_table("Standard deviation of the parameters", cells)
     print_text(
         f"logs: {stage['n_logs']} logs of {stage['seconds_per_log']:g} s now and at the baseline, "
         "averaged over the priors (Cramér-Rao bound). map error, log std: of ln f. informed: share "
@@ -358,13 +335,13 @@ def _print_identifiability(stage: Row, parameters: Sequence[Row]) -> None:
 
 
 def _print_sensitivities(content: dict[str, list[Row]]) -> None:
-    names = [row["parameter"] for row in content["parameters"]]
-    cells: dict[str, list[str]] = {}
+    cells: dict[str, dict[str, str]] = {}
     for row in content["sensitivities"]:
         ends = [number(row[key], 2) for key in ("at_baseline", "at_limits")]
-        cells.setdefault(row["mode"], []).append(" → ".join(ends))
+        own = cells.setdefault(row["mode"], {"mode": row["mode"]})
+        own[row["parameter"]] = " → ".join(ends)
     title = "Sensitivity d ln f / d ln parameter, at the baseline → at the limits"
-    print_table(title, ("mode",), names, [(mode, *own) for mode, own in cells.items()])
+    print_table(title, list(cells.values()))
     for row in content["correlations"]:
         pair = f"{row['parameter_a']} and {row['parameter_b']}"
         click.echo(f"Correlation of {pair} after these logs: {row['correlation']:+.2f}")
@@ -376,22 +353,23 @@ def print_plans(detect: Sequence[Row], plan: Sequence[Row]) -> None:
     for asked in detect:
         name, n_baseline = asked["parameter"], asked["n_baseline"]
         cells = [
-            (
-                f"{row['seconds_per_log']:g}",
-                _HINDRANCES[row["hindrance"]][0] if row["hindrance"] else str(row["n_logs"]),
-                percent(row["power_of_one_log"], 1),
-                percent(row["smallest_loss_of_one_log"], 1),
-                percent(row["smallest_loss"], 1),
-            )
+            {
+                "s per log": f"{row['seconds_per_log']:g}",
+                "logs": _HINDRANCES[row["hindrance"]][0]
+                if row["hindrance"]
+                else str(row["n_logs"]),
+                "power, 1 log": percent(row["power_of_one_log"], 1),
+                "loss, 1 log": percent(row["smallest_loss_of_one_log"], 1),
+                f"loss, {n_baseline} logs": percent(row["smallest_loss"], 1),
+            }
             for row in plan
             if row["parameter"] == name and row["loss"] == asked["loss"]
         ]
-        heads = ("s per log", "logs", "power, 1 log", "loss, 1 log", f"loss, {n_baseline} logs")
         title = (
             f"{name}: to detect a loss of {percent(asked['loss'], 1)} with power "
             f"{asked['power']:g}, false-alarm probability {asked['false_alarm']:g}"
         )
-        print_table(title, (), heads, cells)
+        print_table(title, cells, 0)
         alone = asked["seconds_for_one_log"]
         click.echo(
             f"One log is enough from {alone} s on.\n"
@@ -413,32 +391,34 @@ def print_track(track: Track) -> None:
     """Print the latest modes of a machine, its events and the consistency of the filter."""
     from lmshealth.report.tables import track_rows
 
-    cells: list[tuple[str, ...]] = [
-        (
-            row["mode"],
-            f"{fixed(row['frequency_hz'], 3)} ± {fixed(row['frequency_std_hz'], 3)}",
-            change(row["drift"], row["drift_std"], 3),
-            f"{fixed(100 * row['damping_ratio'], 2)} ± {percent(row['damping_ratio_std'], 2)}"
+    cells = [
+        {
+            "mode": row["mode"],
+            "frequency Hz": " ± ".join(fixed(row[f"frequency{k}_hz"], 3) for k in ("", "_std")),
+            "drift": change(row["drift"], row["drift_std"], 3),
+            "damping ratio": f"{fixed(100 * row['damping_ratio'], 2)} ± "
+            f"{percent(row['damping_ratio_std'], 2)}"
             if row["damping_ratio"] >= 0
             else "–",
-        )
+        }
         for row in track_rows(track, epochs=[len(track.logs) - 1])
     ]
-    title = f"{track.stage}: modes after {len(track.logs)} logs (± one standard deviation)"
-    print_table(title, ("mode",), ("frequency Hz", "drift", "damping ratio"), cells)
+    print_table(
+        f"{track.stage}: modes after {len(track.logs)} logs (± one standard deviation)", cells
+    )
     cells = [
-        (
-            f"{track.recorded_at[event.epoch]:%Y-%m-%d}",
-            event.kind,
-            event.mode,
-            "declared" if event.declared else "detected",
-            change(event.size, event.std),
-            f"{event.evidence:.1f}",
-        )
+        {
+            "since": day(track.recorded_at[event.epoch]),
+            "kind": event.kind,
+            "mode": event.mode,
+            "": "declared" if event.declared else "detected",
+            "size": change(event.size, event.std),
+            "ln Bayes factor": f"{event.evidence:.1f}",
+        }
         for event in track.events
     ]
     if cells:
-        print_table("Events", ("since", "kind", "mode", ""), ("size", "ln Bayes factor"), cells)
+        print_table("Events", cells, 4)
     print_text(_consistency(track))
 
 
@@ -468,25 +448,23 @@ def print_health(health: Health) -> None:
     """Print the health parameters at the last epoch with their diagnostics."""
     low, middle, high = (health.latest(level) for level in constants.LEVELS)
     cells = [
-        (
-            name,
-            f"{middle[j]:.3f}",
-            f"{low[j]:.3f} to {high[j]:.3f}" if health.converged[-1] else "not converged",
-            percent(health.informed[-1, j], 0),
-            "–"
+        {
+            "parameter": name,
+            "median": f"{middle[j]:.3f}",
+            "90 % interval": f"{low[j]:.3f} to {high[j]:.3f}"
+            if health.converged[-1]
+            else "not converged",
+            "informed": percent(health.informed[-1, j], 0),
+            "prior × 2": "–"
             if math.isnan(health.prior_ratio[-1, j])
             else f"{health.prior_shift[-1, j]:+.2f} σ × {health.prior_ratio[-1, j]:.2f}",
-            fixed(health.ess[-1, j], 0),
-            fixed(health.r_hat[-1, j], 3),
-        )
+            "ESS": fixed(health.ess[-1, j], 0),
+            "R-hat": fixed(health.r_hat[-1, j], 3),
+        }
         for j, name in enumerate(health.parameters)
     ]
-    numbers = ("median", "90 % interval", "informed", "prior × 2", "ESS", "R-hat")
-    title = (
-        f"{health.stage}: health at {health.recorded_at[-1]:%Y-%m-%d}, the last of "
-        f"{len(health.recorded_at)} epochs"
-    )
-    print_table(title, ("parameter",), numbers, cells)
+    when, n_epochs = day(health.recorded_at[-1]), len(health.recorded_at)
+    print_table(f"{health.stage}: health at {when}, the last of {n_epochs} epochs", cells)
     print_text(
         "informed: share of the prior variance that the data remove; prior × 2: shift of the "
         "median and factor on the interval with priors twice as wide, within the map."
@@ -525,50 +503,35 @@ def _print_doubts(health: Health) -> None:
             print_text(f"{name}: not determined by these drifts.")
     for when, converged in zip(health.recorded_at, health.converged, strict=True):
         if not converged:
-            print_text(f"The sampler did not converge at {when:%Y-%m-%d}.")
+            print_text(f"The sampler did not converge at {day(when)}.")
 
 
 def print_summaries(summaries: Sequence[Summary]) -> None:
-    """Print the results of a run: a few machines in full, many in a table.
-
-    Parameters
-    ----------
-    summaries : sequence of Summary
-        Of all machines, most urgent first.
-    """
-    if len(summaries) > constants.TERMINAL_MACHINES:
-        _print_fleet(summaries)
+    """Print the results of a run, most urgent first: a few machines in full, many in a table."""
+    if len(summaries) <= constants.TERMINAL_MACHINES:
+        for one in summaries:
+            print_text(f"{one.identity}: {one.verdict}{in_brackets(one.probability)}. {one.why}")
+            for parameter in one.health:
+                print_text(f"  {_parameter(parameter)}")
+            if one.life is not None:
+                print_life(one.life, one.service)
         return
-    for one in summaries:
-        print_text(f"{one.identity}: {_verdict(one)}. {one.why}")
-        for parameter in one.health:
-            print_text(f"  {_parameter(parameter)}")
-        if one.life is not None:
-            print_life(one.life, one.service)
-
-
-def _print_fleet(summaries: Sequence[Summary]) -> None:
     shown = summaries[: constants.TERMINAL_ROWS]
     cells = [
-        (
-            one.identity,
-            _verdict(one),
-            "\n".join(map(_parameter, one.health)),
-            _travel_left(one.life),
-            service_text(one.service),
-        )
+        {
+            "stage": one.identity,
+            "verdict": one.verdict + in_brackets(one.probability),
+            "health": "\n".join(map(_parameter, one.health)),
+            "km left": _travel_left(one.life),
+            "service": service_text(one.service),
+        }
         for one in shown
     ]
     title = f"{len(summaries)} stages, most urgent first (medians with 90 % intervals)"
-    print_table(title, ("stage", "verdict", "health", "km left", "service"), (), cells)
-    rest = len(summaries) - len(shown)
-    if rest > 0:
+    print_table(title, cells, 5)
+    if len(summaries) > len(shown):
+        rest = len(summaries) - len(shown)
         click.echo(f"{rest} more stages; verdict.csv and prognosis.csv list all.")
-
-
-def _verdict(one: Summary) -> str:
-    sure = f" ({probability(one.probability)})" if one.probability >= 0 else ""
-    return one.verdict + sure
 
 
 def _parameter(one: ParameterHealth) -> str:
@@ -599,24 +562,17 @@ def print_life(
 ) -> None:
     """Print the quantiles of the remaining life for each limit and any, then the service.
 
-    Parameters
-    ----------
-    life : Life
-        The remaining life.
-    service : Service
-        When to service.
-    before : tuple of date and ProbabilityBounds, optional
-        A day, and the probabilities that a limit is reached before it.
+    ``before`` is a day with the probabilities that each limit is reached before it.
     """
-    blocks = [tuple(_limit_cells(life, k, before)) for k in range(len(life.limits))]
+    blocks = [list(_limit_cells(life, k, before)) for k in range(len(life.limits))]
     same = _same_as_any(blocks)
     title = (
-        f"{life.stage}: remaining life after {life.recorded_at:%Y-%m-%d}, at {_km(life.travel)} km "
+        f"{life.stage}: remaining life after {day(life.recorded_at)}, at {_km(life.travel)} km "
         f"(horizon {_km(life.horizon)} km)"
     )
-    heads = ("chance %", "km", "hours", "days", "date")
+    heads = ("until", "chance %", "km", "hours", "days", "date")
     cells = [cell for block in (blocks if same is None else blocks[:-1]) for cell in block]
-    print_table(title, ("until",), heads, cells)
+    print_table(title, [dict(zip(heads, cell, strict=True)) for cell in cells])
     if same is not None:
         print_text(f"Any limit: the same as {same}.")
     for name in dict.fromkeys(law.parameter for law in life.laws):
@@ -640,41 +596,31 @@ def _limit_cells(
 ) -> Iterator[tuple[str, ...]]:
     """Yield one row per quantile, then the probabilities of the limit, one row each."""
     one = life.limits[index]
-    any_limit = one.parameter == "any"
-    text = "any limit" if any_limit else f"{spell(one.parameter)} below {one.limit:g}"
+    text = "any limit" if one.parameter == "any" else f"{spell(one.parameter)} below {one.limit:g}"
     last = constants.RUL_LEVELS[-1]
-    for k, level in enumerate(constants.RUL_LEVELS):
-        share, days = f"{100 * level:.0f}", one.days[k]
+    for level, travel, days, when in zip(
+        constants.RUL_LEVELS, one.travel, one.days, one.dates, strict=True
+    ):
+        share = f"{100 * level:.0f}"
         if math.isinf(days):
             share = share if level == last else f"{share} to {100 * last:.0f}"
             yield text, share, f"beyond {_km(life.horizon)}", "–", "–", "–"
             break
-        day = one.dates[k]
-        calendar = "out of range" if day is None else day.isoformat()
-        yield text, share, _km(one.travel[k]), f"{24 * days:,.0f}", f"{days:,.1f}", calendar
+        calendar = "out of range" if when is None else when.isoformat()
+        yield text, share, _km(travel), f"{24 * days:,.0f}", f"{days:,.1f}", calendar
         text = ""
-    notes = {
-        "already": probability(one.already_past),
-        "beyond horizon": probability(one.beyond_horizon),
-    }
+    yield f"  already: {probability(one.already_past)}", *[""] * 5
+    yield f"  beyond horizon: {probability(one.beyond_horizon)}", *[""] * 5
     if before is not None:
         asked, bounds = before
-        notes[f"before {asked}"] = probability_range(
-            (bounds.at_least[index], bounds.at_most[index])
-        )
-    for what, chance in notes.items():
-        yield f"  {what}: {chance}", "", "", "", "", ""
+        chance = probability_range((bounds.at_least[index], bounds.at_most[index]))
+        yield f"  before {asked}: {chance}", *[""] * 5
 
 
-def _same_as_any(blocks: Sequence[tuple[tuple[str, ...], ...]]) -> str | None:
-    """Return the limit whose rows equal those of any limit."""
-    *each, last = blocks
-    for block in each:
-        if [b[1:] for b in block] == [b[1:] for b in last] and [b[0] for b in block[1:]] == [
-            b[0] for b in last[1:]
-        ]:
-            return block[0][0]
-    return None
+def _same_as_any(blocks: Sequence[Sequence[tuple[str, ...]]]) -> str | None:
+    """Return the limit whose rows equal those of any limit, but for its name."""
+    *each, last = ([("", *rows[0][1:]), *rows[1:]] for rows in blocks)
+    return next((rows[0][0] for rows, own in zip(blocks, each, strict=False) if own == last), None)
 
 
 def _advice(life: Life, service: Service) -> Iterator[str]:

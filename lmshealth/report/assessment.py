@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from datetime import date, datetime
 from typing import Literal
@@ -32,8 +33,6 @@ class Assessment:
     ----------
     stage : Stage
         Description that the logs were analysed with.
-    history : History
-        Modal estimates of all logs.
     digests : tuple of str
         SHA-256 of each log of the history.
     track : Track or None
@@ -42,14 +41,10 @@ class Assessment:
         None without a health parameter, or with too few logs.
     prognosis : Prognosis or None
         None without health, or without a limit.
-    judgement : Verdict
-        The verdict.
     refused : tuple of Refusal
         Everything of this machine that was not analysed.
     notes : tuple of str
         What the reader must take into account, one sentence each.
-    seed : int
-        Seed of all random streams.
     waterfall : Waterfall or None
         Spectra of the logs of the history; None when no log covers the band of the modes.
     evidence : MachineEvidence or None
@@ -108,8 +103,6 @@ class ParameterHealth:
 
     Attributes
     ----------
-    name : str
-        Of the parameter.
     determined : bool
         Whether the data determine it; else its interval is mostly the prior.
     converged : bool
@@ -179,10 +172,8 @@ class Life:
 
     Attributes
     ----------
-    stage : str
-        Identity of the machine.
-    recorded_at : datetime
-        The last log.
+    stage, recorded_at : str, datetime
+        Identity of the machine, and its last log.
     travel, horizon : float
         Odometer at the last log, and travel from there beyond which nothing is claimed, in m.
     limits : tuple of LimitLife
@@ -215,24 +206,14 @@ class Summary:
     ----------
     file : str
         Its page, in the folder of the fleet page.
-    identity : str
-        Of the machine.
     urgency : tuple
         Sort key, most urgent first.
-    last_log : date
-        Day of the last log.
     state : str
         ``good``, ``bad`` or ``open`` (no verdict).
     headline : str
         The verdict in words.
-    verdict, probability, why : str, float, str
+    verdict, probability, why
         As in `Verdict`.
-    health : tuple of ParameterHealth
-        One per health parameter; empty without any.
-    life : Life or None
-        The remaining life.
-    service : Service
-        When to service, and by which rule.
     """
 
     file: str
@@ -250,32 +231,22 @@ class Summary:
 
 
 def summarise(assessment: Assessment, service: Service, file: str = "") -> Summary:
-    """Summarise an assessment.
-
-    Parameters
-    ----------
-    assessment : Assessment
-        Of the machine.
-    service : Service
-        Result of `Assessment.service`, which takes time to compute.
-    file : str
-        Name of its page.
-    """
-    judgement = assessment.judgement
+    """Summarise an assessment, with its page and the result of `Assessment.service`."""
+    judgement, prognosis = assessment.judgement, assessment.prognosis
+    states: dict[str, State] = {"healthy": "good", "not-enough-data": "open"}
+    state = "bad" if assessment.alarmed else states.get(judgement.verdict, "bad")
     return Summary(
         file=file,
         identity=judgement.stage,
         urgency=assessment.urgency(service),
         last_log=judgement.recorded_at.date(),
-        state=_state(assessment),
+        state=state,
         headline=_headline(assessment),
         verdict=judgement.verdict,
         probability=judgement.probability,
         why=judgement.why,
-        health=_parameters(assessment),
-        life=None
-        if assessment.prognosis is None
-        else summarise_life(assessment.prognosis, assessment.stage),
+        health=tuple(_parameters(assessment)),
+        life=None if prognosis is None else summarise_life(prognosis, assessment.stage),
         service=service,
     )
 
@@ -287,7 +258,7 @@ def summarise_life(prognosis: Prognosis, stage: Stage) -> Life:
         recorded_at=prognosis.recorded_at,
         travel=prognosis.travel,
         horizon=prognosis.horizon,
-        limits=_limits(prognosis, stage),
+        limits=tuple(_limits(prognosis, stage)),
         laws=prognosis.laws,
         undetermined=prognosis.unidentifiable,
     )
@@ -310,13 +281,6 @@ def verdict_text(verdict: str, parameters: tuple[ParameterSpec, ...]) -> str:
     return texts.get(verdict, f"loss of {' and '.join(names or map(spell, lost))}")
 
 
-def _state(assessment: Assessment) -> State:
-    if assessment.alarmed:
-        return "bad"
-    states: dict[str, State] = {"healthy": "good", "not-enough-data": "open"}
-    return states.get(assessment.judgement.verdict, "bad")
-
-
 def _headline(assessment: Assessment) -> str:
     """Return the verdict in words, or the alarm when there is no verdict."""
     verdict, parameters = assessment.judgement.verdict, assessment.stage.parameters
@@ -328,57 +292,46 @@ def _headline(assessment: Assessment) -> str:
     return text[0].upper() + text[1:]
 
 
-def _parameters(assessment: Assessment) -> tuple[ParameterHealth, ...]:
+def _parameters(assessment: Assessment) -> Iterator[ParameterHealth]:
     health = assessment.latest_health
     if health is None:
-        return ()
+        return
     specs = {spec.name: spec for spec in assessment.stage.parameters}
     levels = health.latest(np.array(constants.LEVELS)).T.tolist()
-    return tuple(
-        _parameter(specs.get(name), health, k, *levels[k])
-        for k, name in enumerate(health.parameters)
-    )
+    for k, (name, (low, median, high)) in enumerate(zip(health.parameters, levels, strict=True)):
+        spec = specs.get(name)
+        limit = limit_of(spec)
+        below = np.nan if limit is None else float(np.mean(health.samples[-1, :, k] < limit))
+        yield ParameterHealth(
+            name=name,
+            determined=bool(health.informed_parameters()[k]),
+            converged=bool(health.converged[-1]),
+            informed=float(health.informed[-1, k]),
+            low=low,
+            median=median,
+            high=high,
+            limit=limit,
+            below_limit=below,
+            baseline=spec.baseline if spec else 1.0,
+            unit=spec.unit if spec else "",
+        )
 
 
-def _parameter(
-    spec: ParameterSpec | None, health: Health, column: int, low: float, median: float, high: float
-) -> ParameterHealth:
-    limit = limit_of(spec)
-    draws = health.samples[-1, :, column]
-    return ParameterHealth(
-        name=health.parameters[column],
-        determined=bool(health.informed_parameters()[column]),
-        converged=bool(health.converged[-1]),
-        informed=float(health.informed[-1, column]),
-        low=low,
-        median=median,
-        high=high,
-        limit=limit,
-        below_limit=np.nan if limit is None else float(np.mean(draws < limit)),
-        baseline=spec.baseline if spec else 1.0,
-        unit=spec.unit if spec else "",
-    )
-
-
-def _limits(prognosis: Prognosis, stage: Stage) -> tuple[LimitLife, ...]:
+def _limits(prognosis: Prognosis, stage: Stage) -> Iterator[LimitLife]:
     baselines = {spec.name: spec.baseline for spec in stage.parameters}
     past, beyond = prognosis.already_past(), prognosis.beyond_horizon()
     travel, days = np.maximum(prognosis.censored(), 0), np.maximum(remaining_days(prognosis), 0)
-    found = []
     for k, name in enumerate(prognosis.parameters):
         baseline = baselines.get(name, 1.0)
         wait = quantiles(days[:, k], constants.RUL_LEVELS)
-        found.append(
-            LimitLife(
-                parameter=name,
-                limit=float(prognosis.limits[k]),
-                travel=quantiles(travel[:, k], constants.RUL_LEVELS),
-                days=wait,
-                dates=tuple(day_after(prognosis, one) for one in wait),
-                already_past=float(past[k]),
-                beyond_horizon=float(beyond[k]),
-                baseline=baseline,
-                health=() if name == "any" else quantiles(prognosis.health[:, k] / baseline),
-            )
+        yield LimitLife(
+            parameter=name,
+            limit=float(prognosis.limits[k]),
+            travel=quantiles(travel[:, k], constants.RUL_LEVELS),
+            days=wait,
+            dates=tuple(day_after(prognosis, one) for one in wait),
+            already_past=float(past[k]),
+            beyond_horizon=float(beyond[k]),
+            baseline=baseline,
+            health=() if name == "any" else quantiles(prognosis.health[:, k] / baseline),
         )
-    return tuple(found)

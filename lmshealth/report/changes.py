@@ -12,6 +12,8 @@ from lmshealth.report.assessment import Assessment, verdict_text
 from lmshealth.report.constants import LEVELS
 from lmshealth.report.text import (
     GAP,
+    day,
+    in_brackets,
     interval,
     km,
     percent,
@@ -138,16 +140,15 @@ def _caveats(before: Reported, now: Reported) -> list[str]:
         found.append("The stage description has changed: not all differences are wear.")
     if before.baseline_at != now.baseline_at:
         found.append(
-            f"The baseline has changed from {_day(before.baseline_at)} to "
-            f"{_day(now.baseline_at)}: percentages of the two reports cannot be compared."
+            f"The baseline has changed from {day(before.baseline_at)} to "
+            f"{day(now.baseline_at)}: percentages of the two reports cannot be compared."
         )
     return found
 
 
 def _verdict(before: Reported, now: Reported, parameters: tuple[ParameterSpec, ...]) -> str:
     def text(report: Reported) -> str:
-        sure = f" ({probability(report.probability)})" if report.probability >= 0 else ""
-        return verdict_text(report.verdict, parameters) + sure
+        return verdict_text(report.verdict, parameters) + in_brackets(report.probability)
 
     if before.verdict != now.verdict:
         return f"Verdict: {text(before)} → {text(now)}."
@@ -203,10 +204,6 @@ def _logs(before: Reported, now: Reported) -> str:
 
 def _from_to(before: str, now: str) -> str:
     return f"still {now}" if before == now else f"{before} → {now}"
-
-
-def _day(moment: datetime) -> str:
-    return moment.date().isoformat()
 
 
 def _s(count: int) -> str:

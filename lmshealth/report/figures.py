@@ -24,7 +24,6 @@ from lmshealth.prognosis.results import Prognosis
 from lmshealth.report import constants
 from lmshealth.report.svg import compact
 from lmshealth.report.text import GAP, covariate, km, moment, quantiles, signed, spell, whole_km
-from lmshealth.signal.spectral_lines import Line
 from lmshealth.signal.waterfall import Waterfall
 from lmshealth.tracking.covariate_effects import CovariateEffect
 from lmshealth.tracking.history import History
@@ -35,13 +34,8 @@ if TYPE_CHECKING:
 
 INK, MUTED, GRID, PAPER = "#1f2933", "#5f6b7a", "#d9dee5", "#fefefe"
 BLUE, RED, GREEN = "#0072b2", "#c44e00", "#007a5a"
-_NAMED = dict(
-    zip(
-        (INK, MUTED, GRID, PAPER, BLUE, RED, GREEN),
-        ("ink", "muted", "line", "card", "blue", "red", "green"),
-        strict=True,
-    )
-)
+_NAMED = {INK: "ink", MUTED: "muted", GRID: "line", PAPER: "card"}
+_NAMED |= {BLUE: "blue", RED: "red", GREEN: "green"}
 _STYLE: dict[str, Any] = {
     "font.family": "DejaVu Sans",  # comes with matplotlib: the same outlines everywhere
     "font.size": 9,
@@ -62,6 +56,7 @@ _STYLE: dict[str, Any] = {
     **dict.fromkeys(("axes.labelcolor", "legend.labelcolor", "text.color"), INK),
     **dict.fromkeys(("xtick.labelcolor", "ytick.labelcolor"), INK),
 }
+_DASHED: Any = (0, (5, 3))  # of baselines
 _KM = 1000.0
 _DPI = 200  # of images in a figure: enough for zooming and printing
 _LEVELS = np.array(constants.BAND_LEVELS)
@@ -71,19 +66,11 @@ ROOM = 72  # characters that fit on a line of its legend
 
 
 def svg(draw: Callable[[Axes], object], *, salt: str, size: tuple[float, float] = SIZE) -> str:
-    """Draw a figure as an inline SVG element.
+    """Draw a figure as an inline SVG element, of a size in inches.
 
     The bytes are reproducible. Colours follow the style sheet of the page (``--ink``, ``--blue``,
-    ...). Screen readers skip the figure, because the page contains its information as text.
-
-    Parameters
-    ----------
-    draw : callable
-        Takes the Axes and draws on it.
-    salt : str
-        Prefix of all identifiers (letters, digits, dashes), unique on the page.
-    size : (float, float)
-        Width and height in inches.
+    ...). Screen readers skip the figure, because the page contains its information as text. All
+    identifiers start with ``salt`` (letters, digits, dashes), which is unique on the page.
     """
     import io
 
@@ -118,17 +105,7 @@ _LINK = re.compile(r'<a xlink:href="([^"]*)"[^>]*>')
 
 
 def hints(ax: Axes, x: FloatArray, y: FloatArray, texts: Sequence[str]) -> None:
-    """Cover points with invisible discs, whose texts browsers show under the pointer.
-
-    Parameters
-    ----------
-    ax : Axes
-        In its data coordinates.
-    x, y : ndarray
-        Shape ``(n,)``.
-    texts : sequence of str
-        Shown at each point; line breaks are kept.
-    """
+    """Cover points, shape ``(n,)`` each, with discs whose texts browsers show under the pointer."""
     some = _thinned(len(texts))
     # Opacity 1/255: fully transparent elements do not react to the pointer.
     discs = ax.scatter(x[some], y[some], s=80, color=INK, alpha=1 / 255, lw=0, zorder=9)
@@ -145,16 +122,9 @@ def plot_posterior(ax: Axes, health: Health, parameters: tuple[str, ...]) -> Axe
 
     For two parameters: highest-density regions of 50 and 90 %, baseline, medians and marginal 90 %
     intervals (bars along the axes). For one parameter: its density.
-
-    Raises
-    ------
-    ValueError
-        If the number of parameters is neither one nor two.
     """
     if len(parameters) not in (1, 2):
-        raise ValueError(
-            f"cannot plot a posterior of {len(parameters)} parameters; needed are 1 or 2"
-        )
+        raise ValueError(f"cannot plot {len(parameters)} parameters; needed are 1 or 2")
     columns = [health.parameters.index(name) for name in parameters]
     draws = 100 * health.samples[-1][:, columns]
     draws = draws[np.isfinite(draws).all(axis=1)]
@@ -168,10 +138,7 @@ def plot_posterior(ax: Axes, health: Health, parameters: tuple[str, ...]) -> Axe
 
 
 def plot_health(ax: Axes, health: Health, parameter: str, limit: float | None) -> Axes:
-    """Plot median, 50 and 90 % bands of a health parameter against the odometer.
-
-    The limit is a fraction of baseline.
-    """
+    """Plot the bands of a health parameter against the odometer; the limit is a fraction."""
     column = health.parameters.index(parameter)
     bands = 100 * health.quantile(_LEVELS)[:, :, column]
     informed = _is_informed(health, parameter)
@@ -189,7 +156,11 @@ def plot_health(ax: Axes, health: Health, parameter: str, limit: float | None) -
         where = health.travel[failed] / _KM
         ax.plot(where, bands[2, failed], "x", color=RED, ms=6, label="sampler not converged")
     _levels(ax, limit)
-    _room(ax, bands, limit)
+    # Show bands up to 250 %, baseline and limit.
+    values = [100.0, float(np.nanmin(bands[0])), float(np.nanmax(bands[4]))]
+    values += [] if limit is None else [100 * limit]
+    low, high = min(values), min(max(values), 250.0)
+    ax.set_ylim(max(low - 0.06 * (high - low), 0.0), high + 0.06 * (high - low))
     ax.set_ylabel("% of baseline")
     return odometer(ax)
 
@@ -261,8 +232,8 @@ def plot_survival(ax: Axes, prognosis: Prognosis, *, service: Service | None = N
             ax.plot(ahead, 100 * (1 - past), color=MUTED, lw=1.2, ls=line, label=_spell(name))
     some = np.linspace(0, end, 25)
     chance = 100 * (1 - np.searchsorted(ordered[:, -1], some, side="right") / ordered.shape[0])
-    texts = [f"after {x:,.0f}{GAP}km: {y:.0f}{GAP}%" for x, y in zip(some, chance, strict=True)]
-    hints(ax, some, chance, [text.replace(",", GAP) for text in texts])
+    pairs = zip(_KM * some, chance, strict=True)
+    hints(ax, some, chance, [f"after {whole_km(x)}: {y:.0f}{GAP}%" for x, y in pairs])
     if service is not None and service.kept_risk is not None:
         what = "accepted risk" if service.max_risk else "risk at least cost"
         label = f"{what} {100 * service.kept_risk:.3g} %"
@@ -282,39 +253,28 @@ def bars(ax: Axes, travel: FloatArray, bounds: FloatArray, label: str, size: flo
 
 def _bands(ax: Axes, x: FloatArray, bands: FloatArray, name: str, *, informed: bool) -> None:
     """Draw median, 50 and 90 % bands; hatched and grey when mostly prior."""
-    colour = BLUE if informed else MUTED
+    colour, line = (BLUE, "-") if informed else (MUTED, (0, (1, 2)))
     for low, alpha, label in ((0, 0.18, "90 %"), (1, 0.32, "50 %")):
         shown = label if informed else None
         ax.fill_between(x, bands[low], bands[4 - low], fc=colour, alpha=alpha, lw=0, label=shown)
     if not informed:
         ax.fill_between(x, bands[0], bands[4], fc="none", ec=colour, hatch="///", lw=0)
-    line = "-" if informed else (0, (1, 2))
     marker = "o" if x.size < 3 else ""
     ax.plot(x, bands[2], color=colour, lw=1.8, ls=line, marker=marker, ms=4, label=name)
 
 
 def _levels(ax: Axes, limit: float | None) -> None:
     """Draw baseline and limit."""
-    ax.axhline(100, color=GREEN, lw=1.1, ls=(0, (5, 3)), label="baseline")
+    ax.axhline(100, color=GREEN, lw=1.1, ls=_DASHED, label="baseline")
     if limit is not None:
         name = f"limit {100 * limit:.3g} %"
         ax.axhline(100 * limit, color=RED, lw=1.6, ls=(0, (8, 2)), label=name)
 
 
-def _room(ax: Axes, bands: FloatArray, limit: float | None) -> None:
-    """Set limits of the axis that show bands (up to 250 %), baseline and limit."""
-    values = [100.0, float(np.nanmin(bands[0])), float(np.nanmax(bands[4]))]
-    if limit is not None:
-        values.append(100 * limit)
-    low, high = min(values), min(max(values), 250.0)
-    ax.set_ylim(max(low - 0.06 * (high - low), 0.0), high + 0.06 * (high - low))
-
-
 def _is_informed(health: Health, parameter: str) -> bool:
     """Return whether the data of the last epoch determine a parameter."""
-    if parameter not in health.parameters:
-        return False
-    return bool(health.informed_parameters()[health.parameters.index(parameter)])
+    informed = dict(zip(health.parameters, health.informed_parameters(), strict=True))
+    return bool(informed.get(parameter, False))
 
 
 def _epochs(ax: Axes, health: Health, parameter: str) -> float:
@@ -394,7 +354,7 @@ def _density(ax: Axes, draws: FloatArray) -> None:
         ax.fill_between(x[part], density[part], color=BLUE, alpha=alpha, lw=0, label=name)
     ax.plot(x, density, color=BLUE, lw=1.6)
     ax.axvline(float(q[2]), color=INK, lw=1.4, label="median")
-    ax.axvline(100, color=GREEN, lw=1.3, ls=(0, (5, 3)), label="baseline")
+    ax.axvline(100, color=GREEN, lw=1.3, ls=_DASHED, label="baseline")
     ax.set_ylim(0, 1.06 * density.max())
     ax.set_ylabel("probability density per %")
 
@@ -419,14 +379,13 @@ def legend(ax: Axes, *, room: int = ROOM) -> Axes:
 
 def _spell(name: str) -> str:
     """Return a name for a label; a dollar sign would start a formula."""
-    return name.replace("_", " ").replace("$", r"\$")
+    return spell(name).replace("$", r"\$")
 
 
 # Ratio of band limits above which the frequency axis is logarithmic.
 _WIDE = 4.0
 # Half width of a waterfall's column, at most, in median distances of logs.
 _MOST_ROOM = 0.75
-_LINES = {"unknown": "other"}
 _WORDS = {
     "step": "sudden change",
     "regreasing": "regreasing",
@@ -463,20 +422,15 @@ def plot_frequencies(ax: Axes, history: History, track: Track | None, mode: str)
 
 def plot_damping(ax: Axes, history: History, track: Track | None, mode: str) -> Axes:
     """Plot the damping ratio of a mode against the odometer, as `plot_frequencies` does."""
+    level, n = history.ln_damping, len(history.series)
     columns = history.columns(mode)
-    level = history.ln_damping[:, columns]
-    top = max(
-        _logs(
-            ax, history, len(history.series) + column, history.ln_damping[:, column], (100.0, "%")
-        )
-        for column in columns
-    )
+    top = max(_logs(ax, history, n + k, level[:, k], (100.0, "%")) for k in columns)
     if track is not None and mode in track.modes:
         k = track.modes.index(mode)
         _filtered(ax, track.travel, track.ln_damping[:, k], track.ln_damping_std[:, k], 100.0)
     # Bars of uncertain logs may exceed the figure.
     if top > 0:
-        ax.set_ylim(0, 1.08 * min(top, 300 * float(np.exp(np.nanmax(level)))))
+        ax.set_ylim(0, 1.08 * min(top, 300 * float(np.exp(np.nanmax(level[:, columns])))))
     ax.set_ylabel("damping ratio in %")
     return odometer(ax)
 
@@ -516,18 +470,16 @@ def plot_waterfall(
     """Plot the spectra of all logs side by side: odometer, frequency, level in dB as colour.
 
     The history needs an odometer. Filtered frequencies with their 95 % bands and spectral lines are
-    drawn on top. Longer intervals without logs are gaps. ``moved`` is the shift of ln f by the
-    covariates, shape ``(n_logs, n_modes)``: with it the frequencies are those of the logs, else
-    those at the covariates' reference.
+    drawn on top. ``moved`` is the shift of ln f by the covariates, shape ``(n_logs, n_modes)``:
+    with it the frequencies are those of the logs, else those at the covariates' reference.
     """
     sides = _columns(history.travel / _KM)
     x, level = sides.ravel(), np.full((waterfall.level.shape[1], 2 * len(sides) - 1), np.nan)
     level[:, ::2] = waterfall.level.T
     low, high = _shown_levels(waterfall)
     # As an image: rectangles would need a hundred times the bytes.
-    picture = ax.pcolormesh(
-        x, waterfall.edges, level, cmap="cividis", vmin=low, vmax=high, rasterized=True
-    )
+    colours: Any = {"cmap": "cividis", "vmin": low, "vmax": high}
+    picture = ax.pcolormesh(x, waterfall.edges, level, rasterized=True, **colours)
     bar = ax.figure.colorbar(picture, ax=ax, extend="both", pad=0.02, aspect=30)
     bar.set_label("level in dB")
     bar.outline.set_visible(False)
@@ -566,7 +518,7 @@ def plot_influence(ax: Axes, influence: CovariateEffect, history: History) -> Ax
         for k, value, a, b in zip(influence.epochs.tolist(), x, before, after, strict=True)
     ]
     hints(ax, x, before, texts)
-    ax.set_xlabel(f"{name} in {unit}".replace("$", r"\$") if unit else name.replace("$", r"\$"))
+    ax.set_xlabel(_spell(f"{name} in {unit}" if unit else name))
     ax.set_ylabel("change of frequency in %")
     return legend(ax)
 
@@ -579,13 +531,9 @@ def chi_square_band(dof: FloatArray) -> FloatArray:
 def _logs(
     ax: Axes, history: History, row: int, level: FloatArray, unit: tuple[float, str]
 ) -> float:
-    """Draw logarithmic estimates with ± 2 standard deviations; return the top of the bars.
-
-    ``unit`` is the factor to the shown unit and its name.
-    """
-    std = np.sqrt(history.cov[:, row, row])
+    """Draw logarithmic estimates ± 2 std in a unit (factor, name); return the top of the bars."""
+    std, (per, name) = np.sqrt(history.cov[:, row, row]), unit
     seen = np.flatnonzero(np.isfinite(level) & np.isfinite(std))
-    per, name = unit
     bounds = per * np.exp(level[seen] + np.array([-2, 0, 2])[:, None] * std[seen])
     bars(ax, history.travel[seen], bounds, "each log, ±2σ", 3)
     texts = [
@@ -623,7 +571,7 @@ def _baselines(ax: Axes, history: History, track: Track, column: int) -> None:
             value = float(own[np.isfinite(own)][-1])
             x = track.travel[[first, end - 1]] / _KM
             name = None if number else "baseline"
-            ax.plot(x, [value, value], color=GREEN, lw=1.1, ls=(0, (5, 3)), label=name)
+            ax.plot(x, [value, value], color=GREEN, lw=1.1, ls=_DASHED, label=name)
 
 
 def _columns(x: FloatArray) -> FloatArray:
@@ -639,8 +587,7 @@ def _shown_levels(waterfall: Waterfall) -> tuple[float, float]:
     """Return the range of colours in dB, without spectral lines, in steps of 5 dB."""
     free = waterfall.level.copy()
     for row, lines in zip(free, waterfall.lines, strict=True):
-        for line in lines:
-            at = int(np.searchsorted(waterfall.edges, line.frequency))
+        for at in np.searchsorted(waterfall.edges, [line.frequency for line in lines]):
             row[max(at - 3, 0) : at + 2] = np.nan
     low, high = np.nanquantile(free, [0.02, 0.998])
     return 5 * float(np.floor(low / 5)), 5 * float(np.ceil(high / 5))
@@ -654,35 +601,32 @@ def _column_hints(ax: Axes, sides: FloatArray, waterfall: Waterfall, history: Hi
     some = _thinned(len(sides))
     corners = [[(a, low), (a, high), (b, high), (b, low)] for a, b in sides[some]]
     columns = PolyCollection(corners, facecolor=INK, alpha=1 / 255, lw=0)
-    texts = [title(history, k) + _found(history, k) for k in range(len(sides))]
+    texts = []
+    for k, ln_f in enumerate(history.ln_frequency):
+        lines = [
+            f"{spell(history.series[i].mode)} {np.exp(ln_f[i]):.2f}{GAP}Hz"
+            for i in np.flatnonzero(np.isfinite(ln_f))
+        ]
+        texts.append("\n".join([title(history, k), *lines]))
     columns.set_urls(texts[some])
     ax.add_collection(columns)
 
 
-def _found(history: History, k: int) -> str:
-    """List the frequencies of a log, one per line."""
-    return "".join(
-        f"\n{spell(one.mode)} {np.exp(ln_f):.2f}{GAP}Hz"
-        for one, ln_f in zip(history.series, history.ln_frequency[k], strict=True)
-        if np.isfinite(ln_f)
-    )
-
-
 def _waterfall_lines(ax: Axes, waterfall: Waterfall, history: History) -> None:
     """Mark the spectral lines of every log; each kind has its own marker."""
-    seen: dict[str, list[tuple[float, Line, int]]] = {}
-    for k, (x, lines) in enumerate(zip(history.travel / _KM, waterfall.lines, strict=True)):
-        for line in lines:
-            seen.setdefault(line.kind, []).append((x, line, k))
-    for marker, (kind, own) in zip(cycle("_x+1|"), sorted(seen.items()), strict=False):
-        x = np.array([place for place, _, _ in own])
-        y = np.array([line.frequency for _, line, _ in own])
-        name = f"{_LINES.get(kind, spell(kind))} line".replace("$", r"\$")
-        ax.plot(x, y, marker, color=RED, ms=3.5, mew=1.0, path_effects=_halo(2.0), label=name)
+    seen = [(line, k) for k, lines in enumerate(waterfall.lines) for line in lines]
+    kinds = sorted({line.kind for line, _ in seen})
+    for marker, kind in zip(cycle("_x+1|"), kinds, strict=False):
+        own = [(line, k) for line, k in seen if line.kind == kind]
+        x = history.travel[[k for _, k in own]] / _KM
+        y = np.array([line.frequency for line, _ in own])
+        name = f"{'other' if kind == 'unknown' else spell(kind)} line"
+        label = _spell(name)
+        ax.plot(x, y, marker, color=RED, ms=3.5, mew=1.0, path_effects=_halo(2.0), label=label)
         texts = [
-            f"{title(history, k)}\n{_LINES.get(kind, spell(kind))} line at "
-            f"{line.frequency:.2f}{GAP}Hz, {line.amplitude:.2g}{GAP}{line.unit} in {line.channel}"
-            for _, line, k in own
+            f"{title(history, k)}\n{name} at {line.frequency:.2f}{GAP}Hz, "
+            f"{line.amplitude:.2g}{GAP}{line.unit} in {line.channel}"
+            for line, k in own
         ]
         hints(ax, x, y, texts)
 
@@ -697,8 +641,8 @@ def _on_image(ax: Axes, track: Track, k: int, moved: FloatArray | float) -> None
     if np.isfinite(level).any():
         first = int(np.argmax(np.isfinite(level)))
         style: Any = {"color": _WHITE, "size": 8, "clip_on": True, "path_effects": _halo(1.8)}
-        name = spell(track.modes[k]).replace("$", r"\$")
         place = (x[first], np.exp(level[first]))
+        name = _spell(track.modes[k])
         ax.annotate(name, place, xytext=(2, 3), textcoords="offset points", **style)
 
 

@@ -17,7 +17,7 @@ from lmshealth.io.log import Refusal
 from lmshealth.io.metadata import COVARIATES
 from lmshealth.modal.frf.identification import FrfReading
 from lmshealth.prognosis.maintenance_decision import ProbabilityBounds, Service
-from lmshealth.report.assessment import Assessment, Life, LimitLife, summarise_life
+from lmshealth.report.assessment import Assessment, Life, summarise_life
 from lmshealth.report.constants import RUL_LEVELS
 from lmshealth.signal.acceleration_levels import Growth, Magnitude
 from lmshealth.signal.following_error import FollowingError
@@ -81,15 +81,7 @@ Row = dict[str, Any]
 
 
 def frame(columns: str, rows: Sequence[Row]) -> pd.DataFrame:
-    """Make a table of rows.
-
-    Parameters
-    ----------
-    columns : str
-        Columns of every table of this kind, separated by blanks.
-    rows : sequence of dict
-        Their further columns are appended in order of appearance.
-    """
+    """Make a table of rows with some columns; their further ones follow as they appear."""
     order = dict.fromkeys([*columns.split(), *(name for row in rows for name in row)])
     return pd.DataFrame(list(rows), columns=list(order))
 
@@ -97,15 +89,7 @@ def frame(columns: str, rows: Sequence[Row]) -> pd.DataFrame:
 def machine_tables(
     readings: Sequence[LogEstimates], assessment: Assessment
 ) -> dict[str, list[Row]]:
-    """Return the rows of all tables of one machine, by table (a key of `COLUMNS`).
-
-    Parameters
-    ----------
-    readings : sequence of LogEstimates
-        Estimates of its logs.
-    assessment : Assessment
-        Its results.
-    """
+    """Return the rows of all tables of one machine and its logs, by table (key of `COLUMNS`)."""
     rows: dict[str, list[Row]] = {name: [] for name in COLUMNS}
     for reading in readings:
         rows["modes"] += modes_rows(reading)
@@ -122,14 +106,14 @@ def machine_tables(
         rows["prognosis"] = prognosis_rows(life, assessment.service())
     found = assessment.judgement
     verdict = found.stage, _iso(found.recorded_at), found.verdict, found.probability
-    rows["verdict"] = _rows(COLUMNS["verdict"], [verdict])
+    rows["verdict"] = _rows("verdict", [verdict])
     rows["refused"] = refused_rows(assessment.refused)
     return rows
 
 
-def _rows(columns: str, values: Iterable[Sequence[Any]]) -> list[Row]:
-    """Return rows of columns separated by blanks; values in their order."""
-    names = columns.split()
+def _rows(table: str, values: Iterable[Sequence[Any]]) -> list[Row]:
+    """Return rows of a table; values in the order of its columns."""
+    names = (COLUMNS.get(table) or LOG_COLUMNS[table]).split()
     return [dict(zip(names, one, strict=True)) for one in values]
 
 
@@ -149,21 +133,10 @@ def modes_rows(reading: LogEstimates) -> list[Row]:
         metadata.servo_id,
         None if error is None else error / _MICRO,
     )
-    values = zip(
-        modes.names,
-        modes.sources,
-        modes.channels,
-        modes.frequency.tolist(),
-        modes.frequency_std.tolist(),
-        modes.damping_ratio.tolist(),
-        modes.damping_ratio_std.tolist(),
-        modes.correlation.tolist(),
-        modes.snr.tolist(),
-        modes.dispersion.tolist(),
-        modes.flags,
-        strict=True,
-    )
-    rows = _rows(COLUMNS["modes"], [(*log, *one) for one in values])
+    names = "frequency frequency_std damping_ratio damping_ratio_std correlation snr dispersion"
+    numbers = [getattr(modes, name).tolist() for name in names.split()]
+    values = zip(modes.names, modes.sources, modes.channels, *numbers, modes.flags, strict=True)
+    rows = _rows("modes", [(*log, *one) for one in values])
     for row, shape in zip(rows, modes.shapes.tolist(), strict=True):
         channels = zip(modes.shape_channels, shape, strict=True)
         row |= {f"shape_{channel}": part for channel, part in channels}
@@ -173,14 +146,12 @@ def modes_rows(reading: LogEstimates) -> list[Row]:
 def _modes_cov_rows(reading: LogEstimates) -> list[Row]:
     modes = reading.modes
     names = list(zip(modes.sources, modes.names, strict=True))
-    return _rows(
-        COLUMNS["modes_cov"],
-        [
-            (reading.log, *names[a], *names[b], float(modes.cov[a, b]))
-            for a, b in combinations(range(len(names)), 2)
-            if modes.cov[a, b] != 0
-        ],
-    )
+    values = [
+        (reading.log, *names[a], *names[b], float(modes.cov[a, b]))
+        for a, b in combinations(range(len(names)), 2)
+        if modes.cov[a, b] != 0
+    ]
+    return _rows("modes_cov", values)
 
 
 def refused_rows(refused: Iterable[Refusal]) -> list[Row]:
@@ -192,10 +163,7 @@ def refused_rows(refused: Iterable[Refusal]) -> list[Row]:
 def track_rows(
     track: Track, smoothed: Smoothed | None = None, *, epochs: Iterable[int] | None = None
 ) -> list[Row]:
-    """Return a track, one row per epoch and mode; smoothed values have columns of their own.
-
-    With `epochs` only these.
-    """
+    """Return a track, one row per epoch (of `epochs`) and mode, with columns of smoothed values."""
     drift_std = np.sqrt(np.einsum("kii->ki", track.drift_cov))
     columns = _mode_columns(track, drift_std)
     later = {} if smoothed is None else _mode_columns(smoothed, smoothed.drift_std)
@@ -232,81 +200,57 @@ def _mode_columns(track: Track | Smoothed, drift_std: FloatArray) -> dict[str, F
 
 def track_cov_rows(track: Track) -> list[Row]:
     """Return the covariances of the drifts of one epoch, one row per pair of modes."""
-    return _rows(
-        COLUMNS["track_cov"],
-        [
-            (
-                track.stage,
-                _iso(track.recorded_at[k]),
-                track.modes[a],
-                track.modes[b],
-                track.drift_cov[k, a, b],
-            )
-            for k in range(len(track.logs))
-            for a, b in combinations(range(len(track.modes)), 2)
-        ],
-    )
+    values = [
+        (track.stage, _iso(moment), track.modes[a], track.modes[b], cov[a, b])
+        for moment, cov in zip(track.recorded_at, track.drift_cov, strict=True)
+        for a, b in combinations(range(len(track.modes)), 2)
+    ]
+    return _rows("track_cov", values)
 
 
 def effects_rows(track: Track) -> list[Row]:
     """Return effects other than wear, one row per mode and cause."""
     effects = [(track.stage, e.mode, e.covariate, e.coefficient, e.std) for e in track.effects]
-    return _rows(COLUMNS["effects"], effects)
+    return _rows("effects", effects)
 
 
 def events_rows(track: Track) -> list[Row]:
     """Return the events of a machine, one row per event and mode."""
-    return _rows(
-        COLUMNS["events"],
-        [
-            (
-                track.stage,
-                _iso(track.recorded_at[event.epoch]),
-                track.travel[event.epoch] / _KM,
-                event.kind,
-                event.mode,
-                event.source,
-                event.size,
-                event.std,
-                event.evidence,
-                event.declared,
-                _iso(track.recorded_at[event.found_at]),
-            )
-            for event in track.events
-        ],
-    )
+    values = [
+        (
+            *(track.stage, _iso(track.recorded_at[one.epoch]), track.travel[one.epoch] / _KM),
+            *(one.kind, one.mode, one.source, one.size, one.std, one.evidence, one.declared),
+            _iso(track.recorded_at[one.found_at]),
+        )
+        for one in track.events
+    ]
+    return _rows("events", values)
 
 
 def health_rows(health: Health) -> list[Row]:
     """Return a posterior of the health parameters, one row per epoch and parameter."""
-    return [
-        {str(name): value for name, value in row.items()}
-        for row in health.to_frame().to_dict("records")
-    ]
+    rows = health.to_frame().to_dict("records")
+    return [{str(name): value for name, value in row.items()} for row in rows]
 
 
 def prognosis_rows(
     life: Life, service: Service, before: tuple[date, ProbabilityBounds] | None = None
 ) -> list[Row]:
-    """Return a remaining life, one row per limit and one for any of them.
+    """Return a remaining life, one row per limit and one for any, which has the service.
 
-    Parameters
-    ----------
-    life : Life
-        Its quantiles and probabilities.
-    service : Service
-        When to service; in the row of any limit.
-    before : tuple of date and ProbabilityBounds, optional
-        A day, and the probabilities that a limit is reached before it: in extra columns.
+    ``before`` is a day with the probabilities that a limit is reached before it: extra columns.
     """
     rows = []
     for j, one in enumerate(life.limits):
         last = one.parameter == "any"
-        row = {
-            "stage": life.stage,
-            "parameter": one.parameter,
-            "limit": one.limit,
-            **_rul_columns(one),
+        row: Row = {"stage": life.stage, "parameter": one.parameter, "limit": one.limit}
+        in_units = {"km": np.array(one.travel) / _KM, "hours": 24 * np.array(one.days)}
+        for unit, values in (in_units | {"days": np.array(one.days)}).items():
+            for level, value in zip(RUL_LEVELS, values.tolist(), strict=True):
+                row[f"rul_{unit}_q{100 * level:02.0f}"] = None if np.isinf(value) else value
+        pairs = zip(RUL_LEVELS, one.days, strict=True)
+        row |= {
+            "censored_from": next((level for level, days in pairs if np.isinf(days)), None),
             "probability_beyond_horizon": one.beyond_horizon,
             "probability_already_past": one.already_past,
             "service": service.kind if last else None,
@@ -315,29 +259,10 @@ def prognosis_rows(
         }
         if before is not None:
             day, reached = before
-            row |= {
-                "before": day,
-                "probability_at_least": reached.at_least[j],
-                "probability_at_most": reached.at_most[j],
-            }
+            at_least, at_most = reached.at_least[j], reached.at_most[j]
+            row |= {"before": day, "probability_at_least": at_least, "probability_at_most": at_most}
         rows.append(row)
     return rows
-
-
-def _rul_columns(one: LimitLife) -> Row:
-    """Return the quantiles of a remaining life; empty beyond the horizon."""
-    hours = [24 * days for days in one.days]
-    row: Row = {}
-    for unit, values in (
-        ("km", [metres / _KM for metres in one.travel]),
-        ("hours", hours),
-        ("days", one.days),
-    ):
-        for level, value in zip(RUL_LEVELS, values, strict=True):
-            row[f"rul_{unit}_q{100 * level:02.0f}"] = None if np.isinf(value) else value
-    censored = [level for level, days in zip(RUL_LEVELS, one.days, strict=True) if np.isinf(days)]
-    row["censored_from"] = censored[0] if censored else None
-    return row
 
 
 def error_row(log: str, error: FollowingError) -> Row:
@@ -358,46 +283,32 @@ def error_row(log: str, error: FollowingError) -> Row:
         *(above.size, high_above - low_above, low_above, high_above),
         harmonics.share(above),
     )
-    return _rows(LOG_COLUMNS["error"], [values])[0]
+    return _rows("error", [values])[0]
 
 
 def harmonics_rows(log: str, error: FollowingError) -> list[Row]:
     """Return the kept harmonics of one log, strongest first: A cos(2πft + φ)."""
     found, above = error.harmonics, set(error.above.tolist())
-    return _rows(
-        LOG_COLUMNS["harmonics"],
-        [
-            (
-                log,
-                error.channel,
-                float(found.frequency[i]),
-                float(found.amplitude[i]) / _MICRO,
-                float(found.phase[i]),
-                i in above,
-            )
-            for i in error.kept.tolist()
-        ],
-    )
+    values = [
+        (
+            *(log, error.channel, float(found.frequency[i])),
+            *(float(found.amplitude[i]) / _MICRO, float(found.phase[i]), i in above),
+        )
+        for i in error.kept.tolist()
+    ]
+    return _rows("harmonics", values)
 
 
 def frf_rows(log: str, reading: FrfReading) -> list[Row]:
     """Return a frequency response, one row per line, in SI units of output per input."""
     frf, fit = reading.frf, reading.fit
-    lines = fit.ordinates.frequency
-    fitted = np.interp(frf.frequency, lines, fit.response.real) + 1j * np.interp(
-        frf.frequency, lines, fit.response.imag
-    )
-    responses = [
-        part
-        for response in (frf.h1, frf.h2, frf.hv, fitted)
-        for part in (np.abs(response), np.angle(response))
-    ]
-    columns = [
-        *(frf.frequency, np.abs(frf.response), np.angle(frf.response), frf.std, frf.coherence),
-        *responses,
-    ]
+    f, lines, response = frf.frequency, fit.ordinates.frequency, fit.response
+    fitted = np.interp(f, lines, response.real) + 1j * np.interp(f, lines, response.imag)
+    columns = [f, np.abs(frf.response), np.angle(frf.response), frf.std, frf.coherence]
+    for one in (frf.h1, frf.h2, frf.hv, fitted):
+        columns += [np.abs(one), np.angle(one)]
     values = zip(*(column.tolist() for column in columns), strict=True)
-    return _rows(LOG_COLUMNS["frf"], [(log, *row) for row in values])
+    return _rows("frf", [(log, *row) for row in values])
 
 
 def fit_row(log: str, reading: FrfReading) -> Row:
@@ -408,7 +319,7 @@ def fit_row(log: str, reading: FrfReading) -> Row:
         *(float(frf.frequency[0]), float(frf.frequency[-1]), float(frf.coherence.mean())),
         *(fit.chi_square, fit.distortion, fit.colour),
     )
-    return _rows(LOG_COLUMNS["fit"], [values])[0]
+    return _rows("fit", [values])[0]
 
 
 def magnitudes_rows(
@@ -438,7 +349,7 @@ def magnitudes_rows(
                 *(m.rms / _MILLI, m.dof, own.slope, own.slope_std, own.p_value, own.grows),
             )
         )
-    return _rows(LOG_COLUMNS["magnitudes"], values)
+    return _rows("magnitudes", values)
 
 
 def growth_rows(growth: Iterable[Growth]) -> list[Row]:
@@ -450,51 +361,46 @@ def growth_rows(growth: Iterable[Growth]) -> list[Row]:
 def lines_rows(lines: Iterable[Line]) -> list[Row]:
     """Return spectral lines, one row each."""
     values = [(one.frequency, one.amplitude, one.unit, one.kind, one.channel) for one in lines]
-    return _rows(LOG_COLUMNS["lines"], values)
+    return _rows("lines", values)
 
 
 def plan_rows(plans: Sequence[Plan]) -> dict[str, list[Row]]:
     """Return the questions of plans (``detect``), and their answers per length of log."""
-    asked = [
-        (p.parameter, p.loss, p.power, p.false_alarm, p.n_baseline, p.duration_of_one)
-        for p in plans
-    ]
+    asked = ["parameter", "loss", "power", "false_alarm", "n_baseline", "duration_of_one"]
+    questions = [[getattr(plan, name) for name in asked] for plan in plans]
     efforts = [(p.parameter, p.loss, *astuple(effort)) for p in plans for effort in p.efforts]
-    return {
-        "detect": _rows(LOG_COLUMNS["detect"], asked),
-        "plan": _rows(LOG_COLUMNS["plan"], efforts),
-    }
+    return {"detect": _rows("detect", questions), "plan": _rows("plan", efforts)}
 
 
 def stage_rows(examined: StageCheck, found: Sequence[Diagnostic]) -> dict[str, list[Row]]:
     """Return the results of a check of a stage description, by table."""
     names = [check.name for check in examined.parameters]
+    stage = {
+        "name": examined.name,
+        "model_std": examined.model_std,
+        "n_logs": examined.n_logs,
+        "seconds_per_log": TYPICAL_DURATION,
+    }
+    sensitivities = [
+        {
+            "mode": mode,
+            "parameter": name,
+            "at_baseline": float(examined.slopes[i, j]),
+            "at_limits": float(examined.limit_slopes[i, j]),
+        }
+        for i, mode in enumerate(examined.informative)
+        for j, name in enumerate(names)
+    ]
+    correlations = [
+        {"parameter_a": a, "parameter_b": b, "correlation": float(examined.correlation[i, j])}
+        for (i, a), (j, b) in combinations(enumerate(names), 2)
+    ]
     return {
-        "stage": [
-            {
-                "name": examined.name,
-                "model_std": examined.model_std,
-                "n_logs": examined.n_logs,
-                "seconds_per_log": TYPICAL_DURATION,
-            }
-        ],
+        "stage": [stage],
         "modes": [_mode_row(check) for check in examined.modes],
         "parameters": [_parameter_row(check) for check in examined.parameters],
-        "sensitivities": [
-            {
-                "mode": mode,
-                "parameter": name,
-                "at_baseline": float(examined.slopes[i, j]),
-                "at_limits": float(examined.limit_slopes[i, j]),
-            }
-            for i, mode in enumerate(examined.informative)
-            for j, name in enumerate(names)
-        ],
-        "correlations": [
-            {"parameter_a": names[i], "parameter_b": names[j], "correlation": float(value)}
-            for i, j in combinations(range(len(names)), 2)
-            for value in [examined.correlation[i, j]]
-        ],
+        "sensitivities": sensitivities,
+        "correlations": correlations,
         "findings": [asdict(finding) for finding in found],
     }
 

@@ -50,6 +50,11 @@ def moment(when: datetime) -> str:
     return when.strftime("%Y-%m-%d %H:%M %Z").strip()
 
 
+def day(when: datetime) -> str:
+    """Format the day of a moment."""
+    return when.date().isoformat()
+
+
 def number(value: Number, digits: int = 3) -> str:
     """Format a number with significant digits and grouped thousands; NaN is a dash."""
     if np.isnan(value):
@@ -63,6 +68,11 @@ def number(value: Number, digits: int = 3) -> str:
 def fixed(value: Number, digits: int) -> str:
     """Format a number with fixed decimals; NaN is a dash."""
     return "–" if np.isnan(value) else f"{value:.{digits}f}".replace("-", "−")
+
+
+def exponent(value: Number) -> str:
+    """Format a small number with two significant digits; NaN is a dash."""
+    return "–" if np.isnan(value) else f"{value:.1e}"
 
 
 def signed(value: Number, digits: int) -> str:
@@ -90,6 +100,11 @@ def probability(value: float) -> str:
     if value > constants.LARGEST_PROBABILITY:
         return f"above {percent(constants.LARGEST_PROBABILITY)}"
     return percent(value, 0)
+
+
+def in_brackets(value: float) -> str:
+    """Format a probability behind a verdict; nothing where there is none."""
+    return f" ({probability(value)})" if value >= 0 else ""
 
 
 def probability_range(bounds: tuple[float, float]) -> str:
