@@ -248,6 +248,12 @@ class Likelihood:
         def value(p: FloatArray) -> float:
             return self.value(p, points(p.tobytes()))
 
+        def gradient(p: FloatArray) -> FloatArray:
+            return both(p.tobytes())[0]
+
+        def hessian(p: FloatArray) -> FloatArray:
+            return both(p.tobytes())[1]
+
         steps = iter(range(1, 1000))
 
         def arrived(intermediate_result: OptimizeResult) -> None:
@@ -263,8 +269,8 @@ class Likelihood:
         found = minimize(
             value,
             start,
-            jac=lambda p: both(p.tobytes())[0],
-            hess=lambda p: both(p.tobytes())[1],
+            jac=gradient,
+            hess=hessian,
             method="trust-exact",
             callback=arrived,
             options={"gtol": 1e-9, "maxiter": 100, "initial_trust_radius": 0.3},
