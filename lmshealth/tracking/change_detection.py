@@ -93,11 +93,6 @@ class Change:
         least = threshold()
         return self.kind in ("step", "drift") and min(self.log_bayes_factor, self.log_odds) >= least
 
-    def step(self, n_logs: int) -> Step:
-        """Return the step, which all logs from the first one on have."""
-        assert self.kind != "drift"
-        return Step.found(self.kind, self.first, n_logs, self.source)
-
 
 def threshold(routes: int = constants.ALARM_ROUTES) -> float:
     """Return the log Bayes factor that raises an alarm that may come by so many routes."""

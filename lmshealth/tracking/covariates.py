@@ -15,24 +15,12 @@ from lmshealth.tracking import constants
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Regressor:
-    """One column of the regression of ln f on covariates.
+    """One column of the regression of ln f on covariates."""
 
-    Attributes
-    ----------
-    name : str
-        Of the covariate, with ``^2`` for its square.
-    values : ndarray
-        Offset from the reference, 0 where unknown, shape ``(n_logs,)``.
-    prior_std : float
-        Prior standard deviation of d ln f per unit.
-    unknown : ndarray
-        Variance of ln f where the value is unknown, shape ``(n_logs,)``.
-    """
-
-    name: str
-    values: FloatArray
-    prior_std: float
-    unknown: FloatArray
+    name: str  # of the covariate, with ``^2`` for its square
+    values: FloatArray  # offset from the reference, 0 where unknown, ``(n_logs,)``
+    prior_std: float  # prior standard deviation of d ln f per unit
+    unknown: FloatArray  # variance of ln f where the value is unknown, ``(n_logs,)``
 
 
 def regressors(covariates: Mapping[str, FloatArray], stage: Stage | None) -> tuple[Regressor, ...]:
@@ -41,24 +29,22 @@ def regressors(covariates: Mapping[str, FloatArray], stage: Stage | None) -> tup
     Without a stage every covariate present is one, about its median. Keys are column names, values
     have shape ``(n_logs,)``.
     """
-    wanted = (
-        stage.description.covariate
-        if stage is not None
-        else tuple(
+    if stage is not None:
+        wanted = stage.description.covariate
+    else:
+        wanted = tuple(
             Covariate(name, float(np.nanmedian(values)), constants.COVARIATE_STD)
             for name, values in covariates.items()
             if np.isfinite(values).any()
         )
-    )
     found: list[Regressor] = []
     for covariate in wanted:
         values = covariates.get(covariate.name)
-        if values is None or not np.isfinite(values).any():
+        if values is None:
             continue
         known = np.isfinite(values)
         offset = np.where(known, values - covariate.reference, 0.0)
-        # A covariate that never leaves its reference has no effect.
-        if not offset.any():
+        if not offset.any():  # it never leaves its reference
             continue
         # Of the values up to each log: no log uses later ones.
         spread = pd.Series(values).expanding().std(ddof=0).fillna(0.0).clip(lower=1.0).to_numpy()

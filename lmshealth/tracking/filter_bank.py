@@ -1,14 +1,8 @@
 """Bank of Kalman filters: one state space under many hyperparameters, all advanced at once.
 
-The process noise of a mode, and the factor by which reported standard deviations are wrong, are
-unknown. Every hyperparameter set is a filter of its own, weighted by its evidence; maximising the
-evidence instead collapses to no process noise and makes the tracker overconfident. Sets that the
-data rule out are pruned, so that long histories cost no more than a few filters.
-
-The sets form two groups: a healthy machine has no rate and a small random walk, a changing one has
-a rate. An alarm depends on the evidence of one group over the other.
-
-States are immutable: `predict` and `update` return a new bank.
+Every set of hyperparameters (process noise, scale of reported errors) is a filter of its own,
+weighted by its evidence. The sets form two groups: a healthy machine has no rate and a small random
+walk, a changing one has a rate. States are immutable: `predict` and `update` return a new bank.
 """
 
 from __future__ import annotations
@@ -105,9 +99,9 @@ class FilterBank:
         if healthy.all() or not healthy.any():
             return 0.0
         chance = constants.HEALTHY_PROBABILITY
-        prior = np.log(chance) - np.log1p(-chance)
-        odds = np.logaddexp.reduce(self.log_weight[~healthy])
-        return float(odds - np.logaddexp.reduce(self.log_weight[healthy]) + prior)
+        changing = np.logaddexp.reduce(self.log_weight[~healthy])
+        odds = changing - np.logaddexp.reduce(self.log_weight[healthy])
+        return float(odds + (np.log(chance) - np.log1p(-chance)))
 
     def pruned(self) -> FilterBank:
         """Remove filters with a negligible share of their group; both groups stay."""

@@ -391,11 +391,10 @@ def _nearest(frequency: float, stage: Stage | None) -> str:
     """Return the nearest tracked mode whose search holds a frequency in Hz, else no name."""
     if stage is None:
         return ""
-    off = {
-        m.name: (abs(frequency / m.frequency_hz - 1), m.search) for m in stage.modes if m.tracked
-    }
-    near = {name: away for name, (away, search) in off.items() if away <= search}
-    return min(near, key=lambda name: near[name], default="")
+    tracked = [mode for mode in stage.modes if mode.tracked]
+    off = [(abs(frequency / mode.frequency_hz - 1), mode) for mode in tracked]
+    near = [(away, mode.name) for away, mode in off if away <= mode.search]
+    return min(near, key=lambda one: one[0], default=(0.0, ""))[1]
 
 
 def _unassigned(

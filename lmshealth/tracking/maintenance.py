@@ -64,26 +64,14 @@ NO_MAINTENANCE = Maintenance()
 
 
 def read_maintenance(folder: Path) -> Maintenance:
-    """Read every ``maintenance.csv`` below a folder.
-
-    Raises
-    ------
-    BadTable
-        If the path is no folder.
-    """
+    """Read every ``maintenance.csv`` below a folder, or raise `BadTable` if it is none."""
     found = find_sheets(folder, _FILE)
     work = _read((path, name_of(path, folder)) for path in found.logs)
     return replace(work, unread=(*(Unread(one, None) for one in found.refused), *work.unread))
 
 
 def read_actions(path: Path) -> tuple[Action, ...]:
-    """Read one table of maintenance, in the order of time.
-
-    Raises
-    ------
-    BadTable
-        If any row cannot be read.
-    """
+    """Read one table of maintenance, or raise `BadTable` if any row cannot be read."""
     work = _read([(path, shown(path))])
     for one in work.unread:
         raise BadTable(f"{one.refusal.log}, {one.refusal.detail}")

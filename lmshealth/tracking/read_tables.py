@@ -34,6 +34,9 @@ _NUMBERS = (*_NEEDED[1:], *_DAMPING, "travel_km", "correlation_f_zeta", "snr")
 _LOOP = "delta_e_below_40hz_um"
 # Columns that have one value per log.
 _OF_LOG = ("stage", "recorded_at", "travel_km", "servo_id", _LOOP, "baseline")
+# Columns of text that may be missing, and what is assumed instead.
+_TEXTS = {"mode": "", "source": "unknown", "servo_id": "", "channel": "", "baseline": ""}
+_CROSS_TERMS = ("log", "source_a", "mode_a", "source_b", "mode_b", "cov_ln_f")
 _SHAPE = "shape_"
 
 Entry = TypeVar("Entry")
@@ -93,23 +96,17 @@ def read_estimates(
         covariates += [c.name for c in stage.description.covariate if c.name not in covariates]
     shapes = [name for name in table.columns if name.startswith(_SHAPE)]
     to_numbers(path, table, (*_NUMBERS, _LOOP, *covariates, *shapes))
-    for name, fallback in (("mode", ""), ("source", "unknown"), ("servo_id", "")):
+    fallbacks = dict.fromkeys((*_NUMBERS, _LOOP), np.nan) | _TEXTS | {"log": table["recorded_at"]}
+    for name, value in fallbacks.items():
         if name not in table.columns:
-            table[name] = fallback
+            table[name] = value
     notes = name_machine(path, table)
-    if "log" not in table.columns:
-        table["log"] = table["recorded_at"]
-    for name in _DAMPING:
-        if name not in table.columns:
-            table[name] = np.nan
     to_moments(path, table)
     notes += _drop_bad_damping(table)
     _check(path, table, stage)
     terms = None
     if cross_terms is not None:
-        terms = read_rows(
-            cross_terms, ("log", "source_a", "mode_a", "source_b", "mode_b", "cov_ln_f")
-        )
+        terms = read_rows(cross_terms, _CROSS_TERMS)
         to_numbers(cross_terms, terms, ("cov_ln_f",))
         if (empty := terms["cov_ln_f"].isna()).any():
             raise BadTable(f"{cross_terms}, {lines(terms, empty)}: cov_ln_f is empty")
@@ -155,12 +152,8 @@ def read_drifts(path: Path, *, cross_terms: Path | None = None) -> Table[Drifts]
     """Read a table in the columns of ``track.csv``: the drifts per machine.
 
     Needed are ``recorded_at``, ``mode``, ``drift`` (of ln frequency against baseline) and
-    ``drift_std``. Without ``stage`` all rows are of one machine.
-
-    Parameters
-    ----------
-    path, cross_terms : Path
-        The table; covariances between drifts of one epoch, in the columns of ``track_cov.csv``.
+    ``drift_std``. Without ``stage`` all rows are of one machine. `cross_terms` are covariances
+    between drifts of one epoch, in the columns of ``track_cov.csv``.
 
     Raises
     ------
@@ -305,13 +298,12 @@ def _log(
             values = list(dict.fromkeys(rows[name]))[:2]
             raise BadTable(f"{path}: log {log} has {name} {values[0]} and {values[1]}; needed: one")
     first = rows.iloc[0]
-    loop = first.get(_LOOP, np.nan)
-    travel = first.get("travel_km", np.nan)
-    flag = str(first.get("baseline", "")).strip().lower()
+    loop, travel = float(first[_LOOP]), float(first["travel_km"])
+    flag = str(first["baseline"]).strip().lower()
     metadata = Metadata(
         stage=str(first["stage"]),
         recorded_at=first["recorded_at"],
-        travel=None if np.isnan(travel) else float(travel) * _KM,
+        travel=None if np.isnan(travel) else travel * _KM,
         covariates={c: float(first[c]) for c in covariates if np.isfinite(first[c])},
         servo_id=str(first["servo_id"]) or None,
         baseline=flag in ("true", "1", "yes") if flag else None,
@@ -322,11 +314,11 @@ def _log(
     modes = Modes(
         names=tuple(rows["mode"]),
         sources=tuple(rows["source"]),
-        channels=tuple(rows["channel"]) if "channel" in rows.columns else ("",) * n,
+        channels=tuple(rows["channel"]),
         ln_frequency=np.log(frequency),
         ln_damping=np.log(damping),
         cov=_covariance(path, log, rows, terms),
-        snr=rows["snr"].to_numpy(float) if "snr" in rows.columns else np.full(n, np.nan),
+        snr=rows["snr"].to_numpy(float),
         dispersion=np.full(n, np.nan),
         flags=("",) * n,
         shape_channels=tuple(name[len(_SHAPE) :] for name in shapes),
@@ -334,7 +326,7 @@ def _log(
         lines=(),
         refused=(),
     )
-    loop_error = float(loop) * _MICRO if np.isfinite(loop) and loop > 0 else None
+    loop_error = loop * _MICRO if loop > 0 else None
     return LogEstimates(log, "", metadata, modes, loop_error)
 
 
@@ -344,12 +336,11 @@ def _covariance(path: Path, log: str, rows: pd.DataFrame, terms: pd.DataFrame | 
     std_f = (rows["frequency_std_hz"] / rows["frequency_hz"]).to_numpy(float)
     std_z = (rows["damping_ratio_std"] / rows["damping_ratio"]).to_numpy(float)
     cov = np.diag(np.concatenate([std_f, std_z]) ** 2)
-    if "correlation_f_zeta" in rows.columns:
-        rho = rows["correlation_f_zeta"].fillna(0.0).to_numpy(float)
-        if (np.abs(rho) >= 1).any():
-            raise BadTable(f"{path}: log {log}: correlation_f_zeta reaches 1; needed is less")
-        i = np.arange(n)
-        cov[i, n + i] = cov[n + i, i] = rho * std_f * std_z
+    rho = rows["correlation_f_zeta"].fillna(0.0).to_numpy(float)
+    if (np.abs(rho) >= 1).any():
+        raise BadTable(f"{path}: log {log}: correlation_f_zeta reaches 1; needed is less")
+    i = np.arange(n)
+    cov[i, n + i] = cov[n + i, i] = rho * std_f * std_z
     if terms is not None:
         place = {key: i for i, key in enumerate(zip(rows["mode"], rows["source"], strict=True))}
         for term in terms[terms["log"] == log].itertuples():

@@ -1,12 +1,7 @@
 """State space of a machine's modes: state vector, measurement matrices and prior.
 
-For M modes the state is
-
-    [ℓ, ℓ̇, ln ζ, ℓ₀ | covariates | biases | steps]
-
-all but the biases in blocks of M: ln f at the covariates' reference, its rate, ln ζ, a copy of ℓ
-at the baseline; a coefficient per regressor; the bias of ln f and of ln ζ of every series but the
-first detected of its mode; the jumps of ln f and of ln ζ of every step. The drift is ℓ - ℓ₀.
+The state is ``[ℓ, ℓ̇, ln ζ, ℓ₀ | covariates | biases | steps]``, as the README of this folder
+describes. All but the biases are in blocks of the modes, biases and steps have ln f and ln ζ.
 """
 
 from __future__ import annotations
@@ -28,16 +23,8 @@ class StateSpace:
     """Layout of the state, and the measurement matrices of a history.
 
     Rates and random walks are per life: the horizon of the stage, or without one the length of the
-    history.
-
-    Attributes
-    ----------
-    size : int
-        Length of the state.
-    life : float
-        Length of a life on the clock.
-    ticks : ndarray
-        Parts of a life between each log and the one before, shape ``(n_logs,)``.
+    history. `life` is its length on the clock, `ticks` are the parts of it between each log and the
+    one before, ``(n_logs,)``, and `size` is the length of the state.
     """
 
     def __init__(self, history: History, stage: Stage | None, steps: tuple[Step, ...] = ()) -> None:

@@ -1,9 +1,8 @@
 """Track: Kalman filtering of all modes over a machine's life, with steps and alarms.
 
-All modes share one state space, because their estimates may be correlated, and one bank of
-filters, which averages over the unknown process noise. Declared steps are in the model from the
-start; a detected step is added, and the logs from it on are filtered again from the checkpoint
-before it. No epoch uses later logs; `smoother.smooth` does.
+All modes share one state space, because their estimates may be correlated, and one bank of filters.
+Declared steps are in the model from the start; a detected step is added, and the logs from it on
+are filtered again from the checkpoint before it. No epoch uses later logs; `smoother.smooth` does.
 """
 
 from __future__ import annotations
@@ -66,58 +65,30 @@ class Effect:
 class Event:
     """Step or alarm, as one mode shows it: one row of ``events.csv``.
 
-    Attributes
-    ----------
-    kind : str
-        ``step``, ``regreasing``, ``servo``, ``sensor``, or ``alarm``: unexplained change of the
-        modes since the baseline, at the declared false-alarm probability.
-    epoch : int
-        First log after a step; of an alarm, the log at which it is raised.
-    mode : str
-        The mode.
-    source : str
-        The sensor's; else empty.
-    size, std : float
-        Change of ln f, of a regreasing change of ln ζ, of an alarm the drift.
-    evidence : float
-        Log Bayes factor against no event; of a detected step with the prior of its unknown place.
-    declared : bool
-        Whether maintenance or the log's ``servo_id`` declared it.
-    found_at : int
-        The log after which it was detected.
+    An alarm is an unexplained change of the modes since the baseline, at the declared false-alarm
+    probability.
     """
 
     kind: EventKind
-    epoch: int
+    epoch: int  # first log after a step; of an alarm, the log at which it is raised
     mode: str
-    source: str
-    size: float
+    source: str  # the sensor's; else empty
+    size: float  # change of ln f, of a regreasing change of ln ζ, of an alarm the drift
     std: float
-    evidence: float
-    declared: bool
-    found_at: int
+    evidence: float  # log Bayes factor against no event, with the prior of an unknown place
+    declared: bool  # whether maintenance or the log's ``servo_id`` declared it
+    found_at: int  # the log after which it was detected
 
 
 @dataclass(frozen=True, slots=True)
 class Consistency:
-    """Tests of a filter's innovations.
+    """Tests of a filter's innovations, with two-sided p-values."""
 
-    Attributes
-    ----------
-    nis : float
-        Sum of the normalised innovations squared over their degrees of freedom.
-    p_value : float
-        Two-sided, of that sum under χ².
-    autocorrelation : float
-        Of standardised innovations of one series from one log to the next, all series together.
-    autocorrelation_p_value : float
-        Two-sided, if they were independent.
-    """
-
-    nis: float
-    p_value: float
+    nis: float  # sum of the normalised innovations squared over their degrees of freedom
+    p_value: float  # of that sum under χ²
+    # Of standardised innovations of one series from one log to the next, all series together.
     autocorrelation: float
-    autocorrelation_p_value: float
+    autocorrelation_p_value: float  # if they were independent
 
     @property
     def holds(self) -> bool:
@@ -140,18 +111,12 @@ class Track:
 
     Attributes
     ----------
-    stage : str
-        Identity of the machine.
-    logs : tuple of str
-        Names of the logs, one epoch each.
+    stage, logs, modes, sources : str, tuple of str
+        Names of the machine, its logs (an epoch each), modes and sources of estimates.
     recorded_at : tuple of datetime
         Ascending.
     travel : ndarray
         Odometer in m, shape ``(n_epochs,)``; NaN throughout where there is none.
-    modes : tuple of str
-        Mode names.
-    sources : tuple of str
-        Sources of estimates.
     ln_frequency, ln_frequency_std, ln_damping, ln_damping_std : ndarray
         Filtered (no future data), covariates at their reference, shape ``(n_epochs, n_modes)``;
         NaN before the first estimate of a mode.
@@ -238,18 +203,10 @@ def lagged_products(innovations: FloatArray) -> tuple[FloatArray, np.ndarray]:
 
 
 def consistency(nis: FloatArray, dof: FloatArray, innovations: FloatArray) -> Consistency:
-    """Test innovations: their sum of squares by χ², their independence by the autocorrelation.
+    """Test innovations by their sum of squares and their autocorrelation [BarShalom2001, 5.4].
 
-    Parameters
-    ----------
-    nis, dof : ndarray
-        Normalised innovation squared and its degrees of freedom, shape ``(n_epochs,)``.
-    innovations : ndarray
-        Standardised, NaN where there is none, shape ``(n_epochs, n)``.
-
-    References
-    ----------
-    BarShalom2001, section 5.4.
+    `nis` and `dof` have the shape ``(n_epochs,)``, standardised innovations ``(n_epochs, n)``, NaN
+    where there is none.
     """
     judged = dof > 0
     total, degrees = float(nis[judged].sum()), float(dof[judged].sum())
@@ -393,7 +350,11 @@ class _Driver:
         if self.open is not None and suspected is not None:
             # A significant change keeps its place until it is settled.
             suspected = self.open.first
-        if suspected is not None and not self._just_weighed(suspected, k):
+        before, when = self.weighed
+        # What was weighed with nearly as many logs is not weighed again.
+        if suspected is not None and (
+            abs(before - suspected) > 2 or k - when >= (k - suspected) / 4
+        ):
             self.weighed, self.open = (suspected, k), None
             change = weigh_changes(self.model, self.checkpoints, k, suspected)
             if change is not None and change.significant:
@@ -409,11 +370,6 @@ class _Driver:
         if evidence >= threshold() and not waiting and not lone:
             self._alarm(k, evidence)
 
-    def _just_weighed(self, suspected: int, k: int) -> bool:
-        """Return whether the suspicion was weighed with nearly as many logs."""
-        before, when = self.weighed
-        return abs(before - suspected) <= 2 and k - when < (k - suspected) / 4
-
     def _adopt(self, change: Change, k: int) -> bool:
         """Add a change to the model and filter again from the checkpoint before it.
 
@@ -425,7 +381,8 @@ class _Driver:
             if self.alarmed or not change.damage:
                 return False
         else:
-            self.model = self.model.with_step(change.step(len(self.history.logs)))
+            step = Step.found(change.kind, j, len(self.history.logs), change.source)
+            self.model = self.model.with_step(step)
             steps = self.model.space.steps
             self.changes[len(steps) - 1] = (change, k)
             self.leaps = unexplained_leaps(self.history.loop_error, steps)
@@ -448,10 +405,8 @@ class _Driver:
         drift = contrast @ mean
         std = np.sqrt(np.maximum(np.diag(contrast @ cov @ contrast.T), 0.0))
         i = int(np.argmax(np.abs(drift) / np.maximum(std, 1e-12)))
-        mode, size = self.history.modes[i], float(drift[i])
-        self.alarms.append(
-            Event("alarm", k, mode, "", size, float(std[i]), evidence, declared=False, found_at=k)
-        )
+        mode, size, error = self.history.modes[i], float(drift[i]), float(std[i])
+        self.alarms.append(Event("alarm", k, mode, "", size, error, evidence, False, k))
 
     def _publish(self, k: int) -> None:
         """Record the state of log k, and the noise scale of each source."""
@@ -636,8 +591,7 @@ def _effects(space: StateSpace, bank: FilterBank, sources: tuple[str, ...]) -> t
 
 def accepted_estimates(history: History, track: Track) -> History:
     """Return a history with the steps of its track and without its outliers."""
-    values = [np.array(part) for part in (history.ln_frequency, history.ln_damping, history.cov)]
-    ln_f, ln_zeta, cov = values
+    ln_f, ln_zeta, cov = map(np.array, (history.ln_frequency, history.ln_damping, history.cov))
     r = len(history.series)
     for k, mode in track.outliers:
         own = history.columns(mode)

@@ -150,7 +150,7 @@ def associate(
     prior_std: FloatArray,
     jumps: Collection[int] = (),
 ) -> Association:
-    """Assign the estimates of all logs to modes.
+    """Assign the estimates of all logs to modes; the labels of a log use it and earlier logs.
 
     Parameters
     ----------
@@ -158,26 +158,16 @@ def associate(
         One per log, all with equally many channels of shapes.
     clock : ndarray
         Ascending odometer or time in any unit, shape ``(n_epochs,)``.
-    offsets : ndarray
-        Covariates about their references, ``(n_epochs, n_covariates)``; 0 where unknown.
-    prior_std : ndarray
-        Prior standard deviation of d ln f per unit of each covariate, ``(n_covariates,)``.
+    offsets, prior_std : ndarray
+        Covariates about their references, 0 where unknown, ``(n_epochs, n_covariates)``, and prior
+        standard deviations of d ln f per unit of each, ``(n_covariates,)``.
     jumps : collection of int
         Epochs at which frequencies may step, as after declared maintenance.
-
-    Returns
-    -------
-    Association
-        The labels of a log use it and earlier logs.
 
     Raises
     ------
     BadTable
         If an estimate is not finite or has no positive variance.
-
-    References
-    ----------
-    [BarShalom1988]_, [Reid1979]_, [Murty1968]_, [Allemang2003]_
     """
     state = State.start(prior_std, epochs[0].shapes.shape[1])
     declared, places = frozenset(jumps), clock.tolist()
@@ -488,19 +478,11 @@ def _doubtful(frequency: float, chances: FloatArray, modes: tuple[str, ...]) -> 
 
 
 def measurements_of(epochs: Sequence[Estimates]) -> list[Measurements]:
-    """Return the measurements of each log, with shapes of unit length.
-
-    Raises
-    ------
-    BadTable
-        If an estimate is not finite or has no positive variance.
-    """
+    """Return the measurements of each log, with shapes of unit length, or raise `BadTable`."""
     start = np.cumsum([0, *(len(e.names) for e in epochs)]).tolist()
-    every = [(e.cov.diagonal(), len(e.names)) for e in epochs]
     ln_f = np.concatenate([e.ln_frequency for e in epochs])
     ln_zeta = np.concatenate([e.ln_damping for e in epochs])
-    var_f = np.concatenate([var[:n] for var, n in every])
-    var_zeta = np.concatenate([var[n:] for var, n in every])
+    var_f, var_zeta = np.hstack([e.cov.diagonal().reshape(2, -1) for e in epochs])
     shapes = np.concatenate([e.shapes for e in epochs])
     good = np.isfinite(ln_f) & np.isfinite(var_f) & (var_f > 0)
     good &= (np.isfinite(var_zeta) & (var_zeta > 0)) | ~np.isfinite(ln_zeta)

@@ -79,8 +79,8 @@ def best_assignments(
     """Return the best one-to-one assignments of rows to columns or to nothing [Murty1968]_.
 
     `score` is the gain of each pair over leaving its row unassigned, ``(n, m)``, -inf where not
-    allowed. At most `most` assignments are returned, none below the best by more than `least`
-    (negative): gain and the column of each row, -1 for nothing, the best first.
+    allowed. Returned are gain and the column of each row, -1 for nothing, the best first; at most
+    `most`, none below the best by more than `least` (negative).
     """
     n, m = score.shape
     cost = np.full((n, m + n), np.inf)
@@ -118,13 +118,11 @@ def best_assignments(
 
 
 def shape_gains(shapes: FloatArray, of_modes: FloatArray) -> FloatArray:
-    """Return log likelihood ratios of shapes against shapes of random direction.
+    """Return log likelihood ratios of shapes against shapes of random direction, ``(h, n, m)``.
 
-    The density about the shape of the mode is Watson's, exp(κ MAC) / M(1/2, n/2, κ), over the
-    channels that both have [Mardia2000]_, with the modal assurance criterion [Allemang2003]_. A
-    small share has random directions: sensors are moved.
     Shapes of estimates are ``(n, n_channels)``, those of modes ``(h, m, n_channels)``; the ratios
-    are ``(h, n, m)``, 0 where fewer than two channels are common.
+    are 0 where fewer than two channels are common. A small share has random directions: sensors are
+    moved.
     """
     both = np.isfinite(shapes)[:, None] & np.isfinite(of_modes)[:, None]
     a = np.where(both, shapes[:, None], 0.0)
@@ -154,14 +152,11 @@ def name_gains(names: IntArray, labels: IntArray, order: IntArray) -> FloatArray
 def order_gains(
     scan: Scan, labels: IntArray, order: IntArray, predicted: tuple[FloatArray, FloatArray]
 ) -> FloatArray:
-    """Return log likelihood ratios of names that follow the order of frequencies.
+    """Return log likelihood ratios of names that follow the order of frequencies, ``(c, n)``.
 
     Detected modes have the order of their estimates; missed modes are below an estimate with the
-    probability that their filters predict.
-
-    `labels` are the modes of the estimates, ``(c, n)``, -1 for none; `order` the modes that have
-    names, in the order that names follow; `predicted` ln f of each mode and its variance, each
-    ``(c, m)``. The ratios, against clutter of any name, are ``(c, n)``.
+    probability that their filters predict: ln f of each mode and its variance, each ``(c, m)``.
+    `labels`, ``(c, n)``, and `order` are those of `name_gains`.
     """
     k, (c, n) = order.size, labels.shape
     if k == 0 or (scan.names < 0).all():

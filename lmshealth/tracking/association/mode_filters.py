@@ -104,9 +104,8 @@ class ModeFilters:
     ) -> Self:
         """Append modes, each started from its first estimate.
 
-        `row` is the observation row ``[1, 0, covariates]``, ``(d,)``; `prior_std` has the prior
-        standard deviations of the covariates' coefficients, ``(d - 2,)``; `life` is the length of a
-        life on the clock, 0 while unknown.
+        `row` is the observation row ``[1, 0, covariates]``, ``(d,)``; `prior_std` that of a
+        `State`, ``(d - 2,)``; `life` the length of a life on the clock, 0 while unknown.
         """
         n, d = first.ln_f.size, row.size
         rate = (constants.RATE_STD / life) ** 2 if life else _FLAT_VARIANCE
@@ -142,10 +141,9 @@ class ModeFilters:
 
 
 def predict(filters: ModeFilters, step: float, life: float, *, opened: bool = False) -> ModeFilters:
-    """Predict all filters over a step of the clock.
+    """Predict all filters over a step of the clock; `opened` is whether levels may step here.
 
-    `step` and `life` are the step and the length of a life on the clock; with a life of 0 only
-    `opened` has an effect: whether levels may step here.
+    With a `life` of 0, of unknown length, there is no drift.
     """
     mean, cov, var_zeta = filters.mean.copy(), filters.cov.copy(), filters.var_zeta.copy()
     if life:
@@ -175,8 +173,7 @@ def update(
 ) -> ModeFilters:
     """Update some filters, each with its own estimate.
 
-    `at` has the hypothesis and the mode of each filter, none twice; `row` is the observation row
-    ``[1, 0, covariates]``, shape ``(d,)``.
+    `at` has the hypothesis and the mode of each filter, none twice.
     """
     mean, cov = filters.mean[at], filters.cov[at]
     side = cov @ row

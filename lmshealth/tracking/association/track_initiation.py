@@ -52,9 +52,8 @@ def follow(
     """Update candidates with a scan and start new ones.
 
     Their filters are predicted to the log. The scan has the estimates of no mode, with the mode of
-    which each may be the new level as its name, else -1. `prior_std` and `life` are those of
-    `ModeFilters.start`. Returned are the candidates, new ones at the end, and for each estimate the
-    candidate that it confirms, or None.
+    which each may be the new level as its name, else -1. Returned are the candidates, new ones at
+    the end, and for each estimate the candidate that it confirms, or None.
     """
     candidates, mine = _assign(candidates, scan)
     known = [j for j in mine if j is not None]
@@ -101,10 +100,9 @@ def _assign(candidates: Candidates, scan: Scan) -> tuple[Candidates, list[int | 
 def prune(
     candidates: Candidates, epoch: int, confirmed: Collection[int], detected: Collection[int]
 ) -> Candidates:
-    """Delete candidates after all scans of a log.
+    """Delete candidates that have become modes (`confirmed`), or whose odds are too low.
 
-    Those that have become modes (`confirmed`), those for new levels of modes that were detected at
-    their old level (`detected`), and those whose odds are too low.
+    Those for new levels of modes that were `detected` at their old level are deleted too.
     """
     if not len(candidates):
         return candidates
