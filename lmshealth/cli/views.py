@@ -432,16 +432,14 @@ def _consistency(track: Track) -> str:
     if found.holds:
         less = {"below": " (they vary less than expected)", "above": " (they vary more)"}
         return f"The filter is consistent with its logs{less.get(found.side, '')}: {values}."
+    remedy = "The logs vary less than expected: its standard deviations are too large."
     if track.widening[-1] > 1:
-        return (
-            f"The filter is NOT consistent with its logs: {values}. Its standard deviations are "
-            f"multiplied by {track.widening[-1]:.2f}. A cause may be missing: a covariate, a "
-            "change of servo tuning, or wrong standard deviations in the table."
+        remedy = (
+            f"Its standard deviations are multiplied by {track.widening[-1]:.2f}. A cause may be "
+            "missing: a covariate, a change of servo tuning, or wrong standard deviations in the "
+            "table."
         )
-    return (
-        f"The filter is NOT consistent with its logs: {values}. The logs vary less than expected: "
-        "its standard deviations are too large."
-    )
+    return f"The filter is NOT consistent with its logs: {values}. {remedy}"
 
 
 def print_health(health: Health) -> None:

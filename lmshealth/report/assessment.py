@@ -142,10 +142,8 @@ class LimitLife:
         Of the limit; ``any`` for the first limit reached.
     limit, baseline : float
         In the unit of the parameter; the limit of ``any`` is NaN.
-    travel : tuple of float
-        In m, at least 0, infinite beyond the horizon.
-    days : tuple of float
-        Likewise in days.
+    travel, days : tuple of float
+        In m and days, at least 0, infinite beyond the horizon.
     dates : tuple of (date or None)
         Days of the calendar; None beyond the horizon or the calendar.
     already_past, beyond_horizon : float
@@ -178,8 +176,6 @@ class Life:
         Odometer at the last log, and travel from there beyond which nothing is claimed, in m.
     limits : tuple of LimitLife
         One per limit, then any.
-    laws : tuple of LawWeight
-        Laws of each parameter with their posterior probability.
     undetermined : tuple of str
         Parameters with a limit that the modes do not determine: excluded.
     """

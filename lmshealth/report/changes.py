@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from datetime import date, datetime
+from typing import Any
 
 import numpy as np
 
@@ -34,20 +35,14 @@ class Reported:
 
     Attributes
     ----------
-    recorded_at : datetime
-        The last log.
-    baseline_at : datetime
-        The log at the baseline.
+    recorded_at, baseline_at : datetime
+        The last log, and that at the baseline.
     description : str
         Digest of the stage description.
-    n_logs : int
-        Logs used.
     travel : float
         Odometer at the last log in m, NaN without one.
-    verdict : str
-        As in ``verdict.csv``.
-    probability : float
-        Of the verdict; NaN for ``not-enough-data``.
+    verdict, probability : str, float
+        As in ``verdict.csv``; NaN for ``not-enough-data``.
     health : dict of str to tuple of float
         Quantiles of each parameter that the data determine, as fractions of the baseline.
     remaining : tuple of float or None
@@ -72,26 +67,15 @@ class Reported:
 
 
 def reported(assessment: Assessment, service: Service | None = None) -> Reported:
-    """Return what a later report compares itself with.
-
-    Parameters
-    ----------
-    assessment : Assessment
-        Of the machine.
-    service : Service or None
-        Result of `Assessment.service` where it is known; it takes time to compute.
-    """
+    """Return what a later report compares itself with; finding the service again takes time."""
     history, judgement = assessment.history, assessment.judgement
     health, prognosis = assessment.latest_health, assessment.prognosis
-    determined: dict[str, Interval] = {}
+    determined: dict[str, Any] = {}
     if health is not None:
-        low, middle, high = health.latest(np.array(LEVELS))
-        for k in np.flatnonzero(health.informed_parameters()).tolist():
-            determined[health.parameters[k]] = float(low[k]), float(middle[k]), float(high[k])
-    remaining: Interval | None = None
-    if prognosis is not None:
-        low, middle, high = quantiles(prognosis.censored()[:, -1])
-        remaining = low, middle, high
+        levels = health.latest(np.array(LEVELS)).T.tolist()
+        for k in np.flatnonzero(health.informed_parameters()):
+            determined[health.parameters[k]] = tuple(levels[k])
+    remaining: Any = None if prognosis is None else quantiles(prognosis.censored()[:, -1])
     return Reported(
         recorded_at=judgement.recorded_at,
         baseline_at=[*history.recorded_at, judgement.recorded_at][history.baseline],
@@ -110,19 +94,9 @@ def reported(assessment: Assessment, service: Service | None = None) -> Reported
 def changes(
     before: Reported, now: Reported, parameters: tuple[ParameterSpec, ...]
 ) -> tuple[str, ...]:
-    """Describe in sentences what changed since an earlier report.
+    """Describe in sentences what changed since an earlier report on a machine.
 
-    Parameters
-    ----------
-    before, now : Reported
-        The earlier and the present report on a machine.
-    parameters : tuple of ParameterSpec
-        Of its description.
-
-    Returns
-    -------
-    tuple of str
-        Reasons why the reports cannot be compared come first.
+    Reasons why the reports cannot be compared come first.
     """
     return (
         *_caveats(before, now),
@@ -152,10 +126,8 @@ def _verdict(before: Reported, now: Reported, parameters: tuple[ParameterSpec, .
 
     if before.verdict != now.verdict:
         return f"Verdict: {text(before)} → {text(now)}."
-    same = text(before) == text(now)
-    return f"Verdict: still {text(now)}" + (
-        "." if same else f", before {probability(before.probability)}."
-    )
+    earlier = f", before {probability(before.probability)}"
+    return f"Verdict: still {text(now)}{'' if text(before) == text(now) else earlier}."
 
 
 def _health(before: Reported, now: Reported) -> list[str]:

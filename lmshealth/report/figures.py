@@ -11,7 +11,7 @@ from __future__ import annotations
 import re
 import warnings
 from collections.abc import Callable, Sequence
-from itertools import cycle
+from itertools import cycle, pairwise
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -222,16 +222,18 @@ def plot_survival(ax: Axes, prognosis: Prognosis, *, service: Service | None = N
     ordered = np.sort(prognosis.remaining / _KM, axis=0)
     dashes = ["--", "-.", ":", (0, (7, 2, 1, 2, 1, 2))]
     several = len(prognosis.parameters) > 2
-    for k, name in enumerate(prognosis.parameters):
-        past = np.searchsorted(ordered[:, k], ahead, side="right") / ordered.shape[0]
-        if name == "any":
-            label = "no limit reached" if several else f"{_spell(prognosis.parameters[0])} limit"
-            ax.plot(ahead, 100 * (1 - past), color=BLUE, lw=2.2, label=label)
-        elif several:
-            line = dashes[k % len(dashes)]
-            ax.plot(ahead, 100 * (1 - past), color=MUTED, lw=1.2, ls=line, label=_spell(name))
+
+    def chance_after(travel: FloatArray, k: int) -> FloatArray:
+        past = np.searchsorted(ordered[:, k], travel, side="right")
+        return np.asarray(100 * (1 - past / ordered.shape[0]))
+
+    for k, name in enumerate(prognosis.parameters[:-1] if several else ()):
+        style: Any = {"color": MUTED, "lw": 1.2, "ls": dashes[k % len(dashes)]}
+        ax.plot(ahead, chance_after(ahead, k), label=_spell(name), **style)
+    label = "no limit reached" if several else f"{_spell(prognosis.parameters[0])} limit"
+    ax.plot(ahead, chance_after(ahead, -1), color=BLUE, lw=2.2, label=label)
     some = np.linspace(0, end, 25)
-    chance = 100 * (1 - np.searchsorted(ordered[:, -1], some, side="right") / ordered.shape[0])
+    chance = chance_after(some, -1)
     pairs = zip(_KM * some, chance, strict=True)
     hints(ax, some, chance, [f"after {whole_km(x)}: {y:.0f}{GAP}%" for x, y in pairs])
     if service is not None and service.kept_risk is not None:
@@ -556,22 +558,19 @@ def _filtered(
     x, reach = travel / _KM, 1.96 * std
     low, high = unit * np.exp(level - reach), unit * np.exp(level + reach)
     ax.fill_between(x, low, high, color=BLUE, alpha=0.25, lw=0, zorder=3)
-    marker = "o" if travel.size < 3 else ""
-    name = "filtered, 95 % band"
-    ax.plot(x, unit * np.exp(level), color=BLUE, lw=1.8, marker=marker, zorder=4, label=name)
+    style: Any = {"color": BLUE, "lw": 1.8, "marker": "o" if travel.size < 3 else "", "zorder": 4}
+    ax.plot(x, unit * np.exp(level), label="filtered, 95 % band", **style)
 
 
 def _baselines(ax: Axes, history: History, track: Track, column: int) -> None:
     """Draw the present estimate of each baseline over the logs that refer to it."""
     base = np.exp(track.ln_frequency[:, column] - track.drift[:, column])
-    ends = [*history.baselines[1:], len(history.logs)]
-    for number, (first, end) in enumerate(zip(history.baselines, ends, strict=True)):
-        own = base[first:end]
-        if np.isfinite(own).any():
-            value = float(own[np.isfinite(own)][-1])
+    for first, end in pairwise([*history.baselines, len(history.logs)]):
+        own = base[first:end][np.isfinite(base[first:end])]
+        if own.size:
             x = track.travel[[first, end - 1]] / _KM
-            name = None if number else "baseline"
-            ax.plot(x, [value, value], color=GREEN, lw=1.1, ls=_DASHED, label=name)
+            name = None if first > history.baselines[0] else "baseline"
+            ax.plot(x, [own[-1]] * 2, color=GREEN, lw=1.1, ls=_DASHED, label=name)
 
 
 def _columns(x: FloatArray) -> FloatArray:
@@ -654,9 +653,8 @@ def _halo(width: float) -> list[Any]:
 
 def _mark_steps(ax: Axes, track: Track) -> None:
     """Mark sudden changes and declared work."""
-    marked: set[str] = set()
+    names = dict(_WORDS)  # each kind has one entry in the legend
     for kind, first in dict.fromkeys((step.kind, step.first) for step in track.steps):
         colour, style = (RED, "-") if kind == "step" else (INK, ":")
-        name = None if kind in marked else _WORDS[kind]
-        marked.add(kind)
+        name = names.pop(kind, None)
         ax.axvline(track.travel[first] / _KM, color=colour, ls=style, lw=1.0, label=name, zorder=1)

@@ -35,13 +35,7 @@ class Month:
 
 
 def file_names(identities: Iterable[str]) -> dict[str, str]:
-    """Name the pages of machines: valid on every file system and unique regardless of case.
-
-    Returns
-    -------
-    dict of str to str
-        File name by identity, independent of their order.
-    """
+    """Name the pages of machines: valid on every file system and unique regardless of case."""
     taken = {"index"}
     names = {}
     for identity in sorted(set(identities)):
@@ -71,19 +65,13 @@ def write_index(
 ) -> Path:
     """Write ``index.html``; its bytes do not depend on the order of the summaries.
 
-    Parameters
-    ----------
-    folder : Path
-        Folder of the machines' pages.
-    summaries : iterable of Summary
-        One per machine.
-    refused : sequence of Refusal
-        Logs that belong to no machine.
-    generated : datetime or None
-        Time to print on the page; none is printed for None.
+    ``refused`` are logs that belong to no machine; ``generated`` is printed on the page.
     """
     ranked = by_urgency(summaries)
-    script = _script() if len(ranked) > constants.MANY_MACHINES else ""
+    script = ""
+    if len(ranked) > constants.MANY_MACHINES:
+        templates = resources.files("lmshealth") / "report" / "templates"
+        script = (templates / "index.js").read_text(encoding="utf-8")
     newest = max((one.last_log for one in ranked), default=date.min)
     text = render(
         "index.html.j2",
@@ -103,12 +91,6 @@ def write_index(
     path = folder / "index.html"
     write_text(path, text)
     return path
-
-
-def _script() -> str:
-    """Return the script that filters and sorts; the page allows no other, by its digest."""
-    path = resources.files("lmshealth") / "report" / "templates" / "index.js"
-    return path.read_text(encoding="utf-8")
 
 
 def _months(summaries: Sequence[Summary], newest: date) -> list[Month]:

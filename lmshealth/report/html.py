@@ -17,17 +17,7 @@ _FILTERS = (
 
 
 def render(template: str, generated: datetime | None = None, /, **content: Any) -> str:
-    """Render a page.
-
-    Parameters
-    ----------
-    template : str
-        File name in ``templates/``.
-    generated : datetime or None
-        Time to print on the page; none is printed for None.
-    content : Any
-        Values of the template's names; a missing name is an error.
-    """
+    """Render a template with the values of its names, and a time to print unless it is None."""
     version = metadata.version("lmshealth")
     page = _environment().get_template(template)
     return str(page.render(content, generated=generated, version=version))

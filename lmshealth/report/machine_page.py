@@ -30,11 +30,8 @@ from lmshealth.report.svg import share_letters
 from lmshealth.report.tables import track_rows
 from lmshealth.report.text import GAP, coarse, km, spell
 from lmshealth.stage.description import Stage
-from lmshealth.tracking.covariate_effects import (
-    CovariateEffect,
-    covariate_shifts,
-    find_covariate_effects,
-)
+from lmshealth.tracking import covariate_effects
+from lmshealth.tracking.covariate_effects import CovariateEffect
 from lmshealth.tracking.history import History
 from lmshealth.tracking.track import Effect, Event, Track
 
@@ -43,17 +40,7 @@ _SIZES = {"waterfall": (4.8, 3.6), "influence": (3.8, 2.6)}  # in inches; others
 
 @dataclass(frozen=True, slots=True)
 class Page:
-    """The page of a machine.
-
-    Attributes
-    ----------
-    file : str
-        Its file name.
-    text : str
-        HTML.
-    summary : Summary
-        The machine on the fleet page.
-    """
+    """Page of a machine: its file name, HTML, and the machine as the fleet page shows it."""
 
     file: str
     text: str
@@ -67,18 +54,9 @@ def make_page(
     before: Reported | None = None,
     generated: datetime | None = None,
 ) -> Page:
-    """Make the page of one machine.
+    """Make the page of one machine, under a name from `file_names`.
 
-    Parameters
-    ----------
-    assessment : Assessment
-        Of the machine.
-    file : str
-        Name of the page, from `file_names`.
-    before : Reported or None
-        State of the machine in its previous report.
-    generated : datetime or None
-        Time to print on the page; none is printed for None.
+    ``before`` is the state of the machine in its previous report; ``generated`` is printed.
     """
     service, parameters = assessment.service(), assessment.stage.parameters
     summary = summarise(assessment, service, file)
@@ -95,10 +73,10 @@ def make_page(
         **_track_content(assessment),
         **_health_content(assessment),
     }
-    influences = content["influences"]
-    content["letters"], content["picture"] = share_letters(
-        _pictures(assessment, service, influences)
-    )
+    draw = _track_pictures(assessment, content["influences"])
+    draw |= _health_pictures(assessment, service)
+    pictures = {key: _inline(one, key[0], f"p{k}") for k, (key, one) in enumerate(draw.items())}
+    content["letters"], content["picture"] = share_letters(pictures)
     return Page(file, render("stage.html.j2", generated, **content), summary)
 
 
@@ -152,7 +130,7 @@ def _track_content(assessment: Assessment) -> dict[str, Any]:
     content: dict[str, Any] = dict.fromkeys(("consistency", "nis", "noise_scale", "widening"))
     content |= {"modes": [], "events": [], "effects": [], "largest_drift": 0.0}
     if track is not None:
-        influences = find_covariate_effects(history, track, stage)
+        influences = covariate_effects.find_covariate_effects(history, track, stage)
         content |= {
             "modes": latest_modes(track),
             "events": list(_events(track)),
@@ -163,10 +141,14 @@ def _track_content(assessment: Assessment) -> dict[str, Any]:
             "widening": float(track.widening[-1]),
             "largest_drift": float(np.nanmax(np.abs(np.expm1(track.drift[-1])), initial=0.0)),
         }
+    corrected: dict[str, list[CovariateEffect]] = {}
+    for one in influences:
+        if one.values.size:
+            corrected.setdefault(one.covariate, []).append(one)
     return content | {
         "seen": _seen(history),
         "influences": influences,
-        "corrected": _by_covariate(influences),
+        "corrected": corrected,
         "uncorrected": list(_uncorrected(history, stage)),
         "mode_use": list(_mode_use(history, track, stage, assessment.refused)),
         "reasons": Counter(item.reason for item in assessment.refused).most_common(),
@@ -219,15 +201,6 @@ def _nis(track: Track) -> dict[str, Any] | None:
     return total and {"inside": inside, "epochs": nis.size, "side": total["side"]}
 
 
-def _by_covariate(influences: Sequence[CovariateEffect]) -> dict[str, list[CovariateEffect]]:
-    """Group influences by covariate; without those that have no estimate."""
-    groups: dict[str, list[CovariateEffect]] = {}
-    for one in influences:
-        if one.values.size:
-            groups.setdefault(one.covariate, []).append(one)
-    return groups
-
-
 def _uncorrected(history: History, stage: Stage) -> Iterator[dict[str, Any]]:
     """Yield covariates without correction: missing, constant, or not described."""
     described = {one.name: one.reference for one in stage.description.covariate}
@@ -253,12 +226,8 @@ def _mode_use(
     for mode in dict.fromkeys([*history.modes, *tracked]):
         found = np.isfinite(history.ln_frequency[:, history.columns(mode)]).any(axis=1)
         reasons = Counter(r.reason for r in refused if r.mode == mode and r.reason != "jump")
-        yield {
-            "mode": mode,
-            "found": int(found.sum()),
-            "rejected": outliers[mode],
-            "reasons": reasons.most_common(),
-        }
+        used = {"mode": mode, "found": int(found.sum()), "rejected": outliers[mode]}
+        yield used | {"reasons": reasons.most_common()}
 
 
 def _scatter(fleet: FleetPrior | None, stage: Stage) -> Iterator[tuple[str, str, float, float]]:
@@ -271,9 +240,7 @@ def _scatter(fleet: FleetPrior | None, stage: Stage) -> Iterator[tuple[str, str,
         "deviation": "deviation of health from its law",
     }
     described, learned = expected_scatter(scatter_prior(stage)), expected_scatter(fleet.scatter)
-    pairs = zip(described, learned, strict=True)
-    for (key, name), pair in zip(names.items(), pairs, strict=True):
-        yield key, name, *pair
+    yield from zip(names, names.values(), described, learned, strict=True)
 
 
 def _pace(law: LawPrior, pace: Pace) -> str:
@@ -285,33 +252,26 @@ def _pace(law: LawPrior, pace: Pace) -> str:
     return f"{coarse(middle)}{GAP}% per {km(1e6)} ({coarse(low)} to {coarse(high)}{GAP}%)"
 
 
-def _pictures(
-    assessment: Assessment, service: Service, influences: Sequence[CovariateEffect]
-) -> dict[tuple[str, ...], str]:
-    """Draw all figures of a page, by kind and subject."""
-    draw = _track_pictures(assessment, influences) | _health_pictures(assessment, service)
-    return {key: _inline(one, key[0], f"p{k}") for k, (key, one) in enumerate(draw.items())}
-
-
 def _track_pictures(
     assessment: Assessment, influences: Sequence[CovariateEffect]
 ) -> dict[tuple[str, ...], Any]:
     history, track, waterfall = assessment.history, assessment.track, assessment.waterfall
     draw: dict[tuple[str, ...], Any] = {}
-    pair = {"frequency": figures.plot_frequencies, "damping": figures.plot_damping}
+    own: dict[str, Any]
     for mode in _seen(history):
-        for kind, plot in pair.items():
-            draw[kind, mode] = partial(plot, history=history, track=track, mode=mode)
+        own = {"history": history, "track": track, "mode": mode}
+        draw["frequency", mode] = partial(figures.plot_frequencies, **own)
+        draw["damping", mode] = partial(figures.plot_damping, **own)
     if waterfall is not None and history.has_odometer:
-        moved = None if track is None else covariate_shifts(history, track, assessment.stage)
-        draw["waterfall", "all"] = partial(
-            figures.plot_waterfall, waterfall=waterfall, history=history, track=track, moved=moved
-        )
+        moved = None
+        if track is not None:
+            moved = covariate_effects.covariate_shifts(history, track, assessment.stage)
+        own = {"waterfall": waterfall, "history": history, "track": track, "moved": moved}
+        draw["waterfall", "all"] = partial(figures.plot_waterfall, **own)
     for one in influences:
         if one.values.size:
-            draw["influence", one.covariate, one.mode] = partial(
-                figures.plot_influence, influence=one, history=history
-            )
+            plot = partial(figures.plot_influence, influence=one, history=history)
+            draw["influence", one.covariate, one.mode] = plot
     if track is not None and _nis(track) is not None:
         draw["nis", "all"] = partial(figures.plot_nis, track=track)
     return draw
@@ -319,30 +279,23 @@ def _track_pictures(
 
 def _health_pictures(assessment: Assessment, service: Service) -> dict[tuple[str, ...], Any]:
     prognosis, health = assessment.prognosis, assessment.latest_health
+    specs = {spec.name: spec for spec in assessment.stage.parameters}
     draw: dict[tuple[str, ...], Any] = {}
+    own: dict[str, Any]
     if health is not None:
         for names, key, _ in _pairs(health):
             draw["posterior", key] = partial(
                 figures.plot_posterior, health=health, parameters=names
             )
-        limits = {spec.name: limit_of(spec) for spec in assessment.stage.parameters}
         for name in health.parameters:
-            draw["health", name] = partial(
-                figures.plot_health, health=health, parameter=name, limit=limits.get(name)
-            )
+            own = {"health": health, "parameter": name, "limit": limit_of(specs.get(name))}
+            draw["health", name] = partial(figures.plot_health, **own)
     if prognosis is not None:
-        baselines = {spec.name: spec.baseline for spec in assessment.stage.parameters}
         for name in prognosis.parameters[:-1]:
-            draw["life", name] = partial(
-                figures.plot_life,
-                prognosis=prognosis,
-                parameter=name,
-                health=health,
-                baseline=baselines[name],
-            )
-        draw["survival", "any"] = partial(
-            figures.plot_survival, prognosis=prognosis, service=service
-        )
+            own = {"parameter": name, "health": health, "baseline": specs[name].baseline}
+            draw["life", name] = partial(figures.plot_life, prognosis=prognosis, **own)
+        survival = partial(figures.plot_survival, prognosis=prognosis, service=service)
+        draw["survival", "any"] = survival
     return draw
 
 

@@ -22,20 +22,14 @@ def write_pdfs(pages: Iterable[Path]) -> list[Path]:
 
     The bytes are reproducible, and nothing is loaded from the network or other files.
 
-    Parameters
-    ----------
-    pages : iterable of Path
-        HTML files of `make_page`.
-
     Raises
     ------
     PdfError
         If WeasyPrint is missing or cannot lay out a page.
     """
     html, fetcher = _library()
-    style = (resources.files("lmshealth") / "report" / "templates" / "pdf.css").read_text(
-        encoding="utf-8"
-    )
+    templates = resources.files("lmshealth") / "report" / "templates"
+    style = (templates / "pdf.css").read_text(encoding="utf-8")
     written = []
     for page in pages:
         text = page.read_text(encoding="utf-8").replace("</style>", f"{style}</style>", 1)
@@ -46,10 +40,8 @@ def write_pdfs(pages: Iterable[Path]) -> list[Path]:
         try:
             content = html(string=text, url_fetcher=fetcher).write_pdf()
         except Exception as error:  # any failure: the HTML page exists
-            raise PdfError(
-                f"{target}: cannot be made: {type(error).__name__} {error}; print {page} from a "
-                "browser instead"
-            ) from error
+            found = f"cannot be made: {type(error).__name__} {error}"
+            raise PdfError(f"{target}: {found}; print {page} from a browser instead") from error
         write_bytes(target, content)
         written.append(target)
     return written

@@ -14,19 +14,12 @@ _GLYPH = re.compile(
 
 
 def compact(text: str) -> str:
-    """Remove invisible content, a third of the text that matplotlib writes.
-
-    Parameters
-    ----------
-    text : str
-        An SVG by matplotlib, with glyphs as paths.
-    """
+    """Remove invisible content of an SVG by matplotlib: a third of its text."""
     text = re.sub(r"(?s)<!--.*?-->|<metadata>.*?</metadata>", "", text)
     text = re.sub(r"\n\s*", "\n", text).strip().replace("xlink:href", "href")
     # Two decimals of a point are finer than screens and printers.
-    text = re.sub(
-        r'\s[dxy]="[^"]*"|translate\([^)]*\)', lambda m: re.sub(r"(\.\d\d)\d+", r"\1", m[0]), text
-    )
+    places = r'\s[dxy]="[^"]*"|translate\([^)]*\)'
+    text = re.sub(places, lambda m: re.sub(r"(\.\d\d)\d+", r"\1", m[0]), text)
     text = re.sub(r'(?<=\sd=")[^"]*', lambda m: re.sub(r"\s*([A-Za-z])\s*", r"\1", m[0]), text)
     text = re.sub(r'style="[^"]*"', lambda m: re.sub(r"([:;,]) ", r"\1", m[0]), text)
     # Glyphs are placed by attributes instead of a transform.
@@ -44,20 +37,7 @@ def _once(found: re.Match[str]) -> str:
 
 
 def share_letters(pictures: Mapping[Key, str]) -> tuple[str, dict[Key, str]]:
-    """Move the glyphs of all figures of a page into one definition.
-
-    Parameters
-    ----------
-    pictures : mapping of str
-        Compact SVG elements.
-
-    Returns
-    -------
-    letters : str
-        SVG element that defines each glyph once; empty without any.
-    pictures : dict of str
-        The figures, which refer to it.
-    """
+    """Move the glyphs of all figures of a page into one element; return it and the figures."""
     letters: dict[str, str] = {}
     shared = {}
     for key, text in pictures.items():

@@ -133,9 +133,12 @@ def modes_rows(reading: LogEstimates) -> list[Row]:
         metadata.servo_id,
         None if error is None else error / _MICRO,
     )
-    names = "frequency frequency_std damping_ratio damping_ratio_std correlation snr dispersion"
-    numbers = [getattr(modes, name).tolist() for name in names.split()]
-    values = zip(modes.names, modes.sources, modes.channels, *numbers, modes.flags, strict=True)
+    numbers = (
+        *(modes.frequency, modes.frequency_std, modes.damping_ratio, modes.damping_ratio_std),
+        *(modes.correlation, modes.snr, modes.dispersion),
+    )
+    lists = [one.tolist() for one in numbers]
+    values = zip(modes.names, modes.sources, modes.channels, *lists, modes.flags, strict=True)
     rows = _rows("modes", [(*log, *one) for one in values])
     for row, shape in zip(rows, modes.shapes.tolist(), strict=True):
         channels = zip(modes.shape_channels, shape, strict=True)
@@ -336,11 +339,8 @@ def magnitudes_rows(
     values = []
     for m in magnitudes:
         own = grown[m.stage, m.channel, m.band.name]
-        near = [
-            line.kind
-            for line in found.get((m.log, m.channel), ())
-            if abs(line.frequency - m.frequency) <= m.resolution
-        ]
+        lines_there = found.get((m.log, m.channel), ())
+        near = [x.kind for x in lines_there if abs(x.frequency - m.frequency) <= m.resolution]
         values.append(
             (
                 *(m.log, m.stage or None, m.velocity / _MILLI, m.channel),

@@ -162,13 +162,5 @@ def time_left(days: float) -> str:
 def quantiles(
     values: FloatArray, levels: tuple[float, ...] = constants.LEVELS
 ) -> tuple[float, ...]:
-    """Return quantiles of draws that may be infinite: each is one of the draws.
-
-    Parameters
-    ----------
-    values : ndarray
-        Draws, shape ``(n_draws,)``.
-    levels : tuple of float
-        Probabilities.
-    """
-    return tuple(float(q) for q in np.quantile(values, levels, method="inverted_cdf"))
+    """Return quantiles of draws, shape ``(n_draws,)``, that may be infinite: each is a draw."""
+    return tuple(np.quantile(values, levels, method="inverted_cdf").tolist())
