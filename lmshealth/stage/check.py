@@ -27,17 +27,14 @@ class ModeCheck:
 
     Attributes
     ----------
-    mode : ModeSpec
-        As described.
     informs : bool
         Whether health is inferred from it: it is tracked and on the map.
     map_frequency, limit_frequency : float
         On the map, in Hz: at the baseline, and with every parameter at its limit. NaN without a
         map; the second also without limits, or where they lie outside the map.
-    surrogate_error : float
-        Largest error of ln f at grid points left out of the fit.
-    reached : float
-        Standard deviation that typical logs reach of the drift of ln f.
+    surrogate_error, reached : float
+        Largest error of ln f at grid points left out of the fit, and standard deviation that
+        typical logs reach of its drift.
     """
 
     mode: ModeSpec
@@ -60,23 +57,16 @@ class ParameterCheck:
 
     Attributes
     ----------
-    spec : ParameterSpec
-        As described.
-    low, high : float
-        Range of the map.
-    quantiles : tuple of float
-        Of the prior at 0.5, 5, 95 and 99.5 %.
-    below, above : float
-        Prior probability outside either end of the map.
+    low, high, below, above, quantiles : float, tuple of float
+        Range of the map, prior probability outside either end, and its 0.5, 5, 95 and 99.5 %.
     verdict : str
         Identified by typical logs (``told``), by ``longer-logs`` only, ``together`` with other
         parameters as one combination, or ``not-told``.
     prior_std, usual_std, endless_std : float
         In the prior, after typical logs, and after unlimited ones.
-    exact_map_std : float
-        After typical logs, were the map exact.
-    known_std : float
-        After unlimited logs, were the other parameters known; also that of the combination.
+    exact_map_std, known_std : float
+        After typical logs, were the map exact; after unlimited logs, were the other parameters
+        known: also that of the combination.
     exponents : ndarray
         Of the parameters in the combination, its own being 1, shape ``(n_parameters,)``.
     """
@@ -84,7 +74,7 @@ class ParameterCheck:
     spec: ParameterSpec
     low: float
     high: float
-    quantiles: tuple[float, float, float, float]
+    quantiles: tuple[float, ...]
     below: float
     above: float
     verdict: Verdict
@@ -115,29 +105,19 @@ class ParameterCheck:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StageCheck:
-    """Capabilities of a stage description.
+    """Capabilities of a stage description; without a map it has no parameters.
 
     Attributes
     ----------
-    name : str
-        Of the description.
-    modes : tuple of ModeCheck
-        All that are described.
-    parameters : tuple of ParameterCheck
-        One per parameter; empty without a map.
-    informative : tuple of str
-        Modes in the order of the sensitivities.
+    informative, unused : tuple of str
+        Modes in the order of the sensitivities, and modes of the map that are not described.
     slopes, limit_slopes : ndarray
         d ln f / d ln parameter at the baseline and with every parameter at its limit, NaN where
         there is none, shape ``(n_modes, n_parameters)``.
     correlation : ndarray
         Of the ln parameters after typical logs, shape ``(n_parameters, n_parameters)``.
-    n_logs : int
-        Number of typical logs.
-    model_std : float
-        Relative standard deviation of the map's sensitivities; NaN without a map.
-    unused : tuple of str
-        Modes of the map that are not described.
+    n_logs, model_std : int, float
+        Number of typical logs; relative standard deviation of the map's sensitivities, NaN without.
     """
 
     name: str
@@ -167,18 +147,18 @@ def check_stage(stage: Stage) -> StageCheck:
     noise = information.drift_variance(constants.TYPICAL_DURATION, information.n_baseline)
     cov = np.linalg.inv(information.precision(noise))
     std = np.sqrt(np.diag(cov))
+    limit_slopes = np.full(information.slopes.shape, np.nan)
+    if limits is not None:
+        limit_slopes = stage.modal_map.gradient(limits[None])[0, rows]
+    parameters = enumerate(stage.parameters)
     described = {mode.name for mode in stage.modes}
     return StageCheck(
         name=stage.name,
         modes=tuple(_check_mode(stage, mode, information, limits) for mode in stage.modes),
-        parameters=tuple(
-            _check_parameter(spec, j, stage, information) for j, spec in enumerate(stage.parameters)
-        ),
+        parameters=tuple(_check_parameter(own, j, stage, information) for j, own in parameters),
         informative=tuple(mode.name for mode in information.modes),
         slopes=information.slopes,
-        limit_slopes=np.full(information.slopes.shape, np.nan)
-        if limits is None
-        else stage.modal_map.gradient(limits[None])[0, rows],
+        limit_slopes=limit_slopes,
         correlation=cov / np.outer(std, std),
         n_logs=information.n_baseline,
         model_std=information.model_std,
@@ -189,10 +169,9 @@ def check_stage(stage: Stage) -> StageCheck:
 def _limits(stage: Stage) -> FloatArray | None:
     """Return the ln parameters at their limits, or baselines; None off the map or without any."""
     assert stage.modal_map is not None
-    if not any(parameter.limit for parameter in stage.parameters):
-        return None
     point = np.log([p.limit.below if p.limit else p.baseline for p in stage.parameters])
-    return point if stage.modal_map.inside(point[None]).all() else None
+    any_limit = any(parameter.limit for parameter in stage.parameters)
+    return point if any_limit and stage.modal_map.inside(point[None]).all() else None
 
 
 def _check_mode(
@@ -206,17 +185,11 @@ def _check_mode(
     def frequency(point: FloatArray) -> float:
         return float(np.exp(modal_map.ln_frequency(point[None])[0, column]))
 
-    reached = replace(information, modes=(mode,)).drift_variance(
-        constants.TYPICAL_DURATION, information.n_baseline
-    )
-    return ModeCheck(
-        mode,
-        informs=mode.tracked,
-        map_frequency=frequency(stage.baseline_point),
-        limit_frequency=np.nan if limits is None else frequency(limits),
-        surrogate_error=float(modal_map.leave_out_error[column]),
-        reached=float(np.sqrt(reached[0])),
-    )
+    own = replace(information, modes=(mode,))
+    reached = own.drift_variance(constants.TYPICAL_DURATION, information.n_baseline)[0]
+    frequencies = frequency(stage.baseline_point), np.nan if limits is None else frequency(limits)
+    error = float(modal_map.leave_out_error[column])
+    return ModeCheck(mode, mode.tracked, *frequencies, error, float(np.sqrt(reached)))
 
 
 def _check_parameter(
@@ -226,9 +199,7 @@ def _check_parameter(
     noise = information.drift_variance(constants.TYPICAL_DURATION, information.n_baseline)
     low, high = np.exp([stage.modal_map.low[j], stage.modal_map.high[j]]).tolist()
     below, upto = spec.prior.probability(np.array([low, high])).tolist()
-    lowest, lower, upper, highest = spec.prior.quantile(
-        np.array([0.005, 0.05, 0.95, 0.995])
-    ).tolist()
+    quantiles = spec.prior.quantile(np.array([0.005, 0.05, 0.95, 0.995])).tolist()
 
     def left(model: Identifiability, variance: FloatArray) -> float:
         return float(np.sqrt(np.linalg.inv(model.precision(variance))[j, j]))
@@ -236,10 +207,10 @@ def _check_parameter(
     unlimited = information.limiting_variance()
     precision = information.precision(unlimited)
     found = ParameterCheck(
-        spec=spec,
+        spec,
         low=low,
         high=high,
-        quantiles=(lowest, lower, upper, highest),
+        quantiles=tuple(quantiles),
         below=below,
         above=1 - upto,
         verdict="not-told",
@@ -261,16 +232,9 @@ def _check_parameter(
 
 @dataclass(frozen=True, slots=True)
 class Diagnostic:
-    """One or two sentences about a stage description.
+    """One or two sentences about a stage description: what was found, and what to do.
 
-    Attributes
-    ----------
-    topic : str
-        ``modes``, ``map`` or ``parameters``.
-    good : bool
-        False for a possible fault.
-    text : str
-        What was found, and what to do.
+    The topic is ``modes``, ``map`` or ``parameters``; a possible fault is not good.
     """
 
     topic: str
@@ -281,19 +245,17 @@ class Diagnostic:
 def diagnose(checked: StageCheck) -> tuple[Diagnostic, ...]:
     """State the results of a check in sentences: of parameters, of the map, then of modes."""
     if not checked.parameters:
-        text = (
-            "No [[parameter]]: modes are tracked and no health is inferred. For health, describe "
-            "[[parameter]] and a [map] of its effect on the modes."
-        )
+        text = "No [[parameter]]: modes are tracked and no health is inferred. For health, describe"
+        text += " [[parameter]] and a [map] of its effect on the modes."
         return (Diagnostic("parameters", True, text),)
-    return (
-        *(_identified(checked, parameter) for parameter in checked.parameters),
-        *_correlated(checked),
-        _surrogate(checked),
-        *(found for parameter in checked.parameters for found in _map_range(parameter)),
-        *(found for mode in checked.modes for found in _searched(mode)),
-        *_unused(checked),
-    )
+    found = [_identified(checked, parameter) for parameter in checked.parameters]
+    found += [*_correlated(checked), _surrogate(checked)]
+    found += [one for parameter in checked.parameters for one in _map_range(parameter)]
+    found += [one for mode in checked.modes for one in _searched(mode)]
+    if checked.unused:
+        text = f"The map also has {', '.join(checked.unused)}, which no [[mode]] describes."
+        found.append(Diagnostic("modes", True, text))
+    return tuple(found)
 
 
 def _identified(checked: StageCheck, parameter: ParameterCheck) -> Diagnostic:
@@ -320,19 +282,17 @@ def _identified(checked: StageCheck, parameter: ParameterCheck) -> Diagnostic:
     else:
         text = (
             f"{name} is not identifiable: its standard deviation is {after} after {logs}, "
-            f"{unlimited} after unlimited logs and {prior} in the prior. {_hindrance(parameter)}"
+            f"{unlimited} after unlimited logs and {prior} in the prior. "
         )
+        if parameter.informed(parameter.exact_map_std) >= constants.INFORMED:
+            text += (
+                "Its effect on the modes is less than the map's error (model_std) in the effects "
+                f"of the others; with an exact map it would be {_share(parameter.exact_map_std)}. "
+                "Track a mode that depends on it more, or make a better map."
+            )
+        else:
+            text += "The modes hardly depend on it: track a mode that depends on it more."
     return Diagnostic("parameters", parameter.verdict == "told", text)
-
-
-def _hindrance(parameter: ParameterCheck) -> str:
-    if parameter.informed(parameter.exact_map_std) >= constants.INFORMED:
-        return (
-            "Its effect on the modes is less than the map's error (model_std) in the effects of "
-            f"the others; with an exact map it would be {_share(parameter.exact_map_std)}. Track a "
-            "mode that depends on it more, or make a better map."
-        )
-    return "The modes hardly depend on it: track a mode that depends on it more."
 
 
 def _combination(checked: StageCheck, parameter: ParameterCheck) -> str:
@@ -403,12 +363,6 @@ def _searched(check: ModeCheck) -> Iterator[Diagnostic]:
             text = f"{mode.name} is searched from {low:.4g} to {high:.4g} Hz, but the map has it at"
             text += f" {frequency:.4g} Hz {when}. Widen its search, or correct map or frequency."
             yield Diagnostic("modes", False, text)
-
-
-def _unused(checked: StageCheck) -> Iterator[Diagnostic]:
-    if checked.unused:
-        text = f"The map also has {', '.join(checked.unused)}, which no [[mode]] describes."
-        yield Diagnostic("modes", True, text)
 
 
 def _share(value: float) -> str:

@@ -27,16 +27,13 @@ def ambient_bound(
 
     Parameters
     ----------
-    frequency, damping_ratio : float
-        Natural frequency in Hz and damping ratio.
-    snr : float
-        Modal signal-to-noise ratio S / (4 ζ² S_e), summed over the channels.
+    frequency, damping_ratio, snr : float
+        Natural frequency in Hz, damping ratio, and modal signal-to-noise ratio S / (4 ζ² S_e),
+        summed over the channels.
     duration : float
         Of the record in s. For n records of one length divide the result by n.
-    band : (float, float)
-        Band in Hz in which the noise is white with an unknown level.
-    n_channels : int
-        Number of channels with that noise.
+    band, n_channels : (float, float), int
+        Band in Hz in which the noise is white with an unknown level, and channels with that noise.
 
     Returns
     -------
@@ -54,14 +51,8 @@ def ambient_bound(
     modal = 4 * damping_ratio**2 * snr / under
     share = modal / (modal + 1)
     # Derivatives of ln(S D + S_e) by ln f, ln ζ, ln S and ln S_e.
-    slopes = np.stack(
-        [
-            share * (4 * beta2 * (1 - beta2) - 2 * damped) / under,
-            -2 * share * damped / under,
-            share,
-            1 - share,
-        ]
-    )
+    by_frequency = share * (4 * beta2 * (1 - beta2) - 2 * damped) / under
+    slopes = np.stack([by_frequency, -2 * share * damped / under, share, 1 - share])
     fisher = slopes @ slopes.T
     fisher[3, 3] += (n_channels - 1) * f.size + NOISE_STD**-2
     return marginal_covariance(fisher, 2)

@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from datetime import date
 from fnmatch import fnmatchcase
 from functools import cached_property
-from importlib import resources
 from pathlib import Path
 from typing import Annotated
 
@@ -25,16 +24,12 @@ from lmshealth.stage.degradation_laws import AnyLaw, Unchanging
 from lmshealth.stage.modal_map import ModalMap, read_map
 from lmshealth.stage.priors import JointPrior, Prior
 
+_SHIPPED = Path(__file__).parent / "descriptions"
 Positive = Annotated[float, Meta(gt=0, le=sys.float_info.max)]
 Share = Annotated[float, Meta(gt=0, lt=1)]
 # Names appear on terminals, in tables and pages: no control or bidirectional characters.
-Name = Annotated[
-    str,
-    Meta(
-        max_length=200,
-        pattern="^[^\x00-\x1f\x7f-\x9f\u200b-\u200f\u2028-\u202e\u2060-\u206f]*\\Z",
-    ),
-]
+_NAME = "^[^\x00-\x1f\x7f-\x9f\u200b-\u200f\u2028-\u202e\u2060-\u206f]*\\Z"
+Name = Annotated[str, Meta(max_length=200, pattern=_NAME)]
 CostRatio = Annotated[float, Meta(gt=1, le=sys.float_info.max)]
 
 
@@ -178,10 +173,10 @@ class Description(_Part, frozen=True):
 
 @dataclass(frozen=True, slots=True)
 class ScatterPrior:
-    """Prior weights of the grid of scatter parameters of a life, in its order.
+    """Prior weights of the grid of scatter of a life, in its order.
 
-    ``walk`` is the random walk of ln f, ``noise_scale`` the factor on reported standard deviations,
-    ``deviation`` that of ln health from its law.
+    Of the random walk of ln f, of the factor on reported standard deviations, and of the deviation
+    of ln health from its law.
     """
 
     walk: tuple[float, ...]
@@ -191,18 +186,10 @@ class ScatterPrior:
 
 @dataclass(frozen=True)
 class Stage:
-    """A checked stage description with its modal map.
+    """A checked stage description with its modal map, None when there is no health parameter.
 
-    Attributes
-    ----------
-    description : Description
-        As written.
-    modal_map : ModalMap or None
-        Surrogate of the map; None when there is no health parameter.
-    digest : str
-        SHA-256 over description and map.
-    scatter : ScatterPrior or None
-        Prior of the scatter of logs; None for the common one.
+    `digest` is the SHA-256 over both; `scatter` the prior of the scatter of logs, None for the
+    common one.
     """
 
     description: Description
@@ -249,24 +236,13 @@ class Stage:
         """Return whether the description applies to a log."""
         if metadata.description is not None:
             return metadata.description in (self.name, f"{self.name}.toml")
-        return metadata.stage is not None and fnmatchcase(
-            metadata.stage, self.description.match.stage
-        )
+        pattern = self.description.match.stage
+        return metadata.stage is not None and fnmatchcase(metadata.stage, pattern)
 
     def drift(self, x: FloatArray, modes: tuple[str, ...]) -> FloatArray:
-        """Predict the drift of modes from health parameters.
+        """Predict the drift of ln f of modes on the map since the baseline.
 
-        Parameters
-        ----------
-        x : ndarray
-            ln parameters inside the map, shape ``(n_points, n_parameters)``.
-        modes : tuple of str
-            Names of modes on the map.
-
-        Returns
-        -------
-        ndarray
-            ln frequency minus its value at baseline, shape ``(n_points, n_modes)``.
+        From ln parameters ``(n_points, n_parameters)`` inside the map; ``(n_points, n_modes)``.
         """
         if self.modal_map is None:
             raise BadStage(f"{self.name}: no [map], so nothing links health to frequencies")
@@ -281,9 +257,7 @@ class Stage:
 
 def shipped() -> tuple[str, ...]:
     """List the names of the shipped descriptions."""
-    folder = resources.files("lmshealth") / "stage" / "descriptions"
-    names = (item.name for item in folder.iterdir())
-    return tuple(sorted(name[:-5] for name in names if name.endswith(".toml")))
+    return tuple(sorted(path.stem for path in _SHIPPED.glob("*.toml")))
 
 
 def load_stage(reference: str) -> Stage:
@@ -317,14 +291,10 @@ def load_stage(reference: str) -> Stage:
     if reference.endswith(".toml"):
         path = Path(reference)
     elif reference in shipped():
-        path = Path(
-            str(resources.files("lmshealth") / "stage" / "descriptions" / f"{reference}.toml")
-        )
+        path = _SHIPPED / f"{reference}.toml"
     else:
-        raise BadStage(
-            f"no stage description {reference!r}: needed is a path ending in .toml, "
-            f"or one of {', '.join(shipped())}"
-        )
+        needed = f"needed is a path ending in .toml, or one of {', '.join(shipped())}"
+        raise BadStage(f"no stage description {reference!r}: {needed}")
     try:
         content = path.read_bytes()
         description = decode(content, Description)
@@ -380,21 +350,19 @@ def _faults(description: Description) -> Iterator[tuple[Keys, str]]:
 def _parameter_faults(k: int, parameter: ParameterSpec) -> Iterator[tuple[Keys, str]]:
     """Find faults of the k-th parameter."""
     if parameter.word in constants.RESERVED_WORDS or "+" in parameter.word:
-        yield (
-            ("parameter", k, "verdict" if parameter.verdict else "name"),
-            f"{parameter.word!r} cannot name a parameter in verdict.csv, nor can anything with '+' "
-            f"or {', '.join(constants.RESERVED_WORDS)}: choose another name, or set verdict",
+        fault = f"{parameter.word!r} cannot name a parameter in verdict.csv, nor can anything with "
+        fault += (
+            f"'+' or {', '.join(constants.RESERVED_WORDS)}: choose another name, or set verdict"
         )
+        yield ("parameter", k, "verdict" if parameter.verdict else "name"), fault
     kinds = [law.kind for law in parameter.laws]
     for j, kind in enumerate(kinds):
         if kind in kinds[:j]:
             yield ("parameter", k, "law", j), f"{parameter.name}: two laws of the kind {kind!r}"
     if parameter.limit is not None and parameter.limit.below >= parameter.baseline:
-        yield (
-            ("parameter", k, "limit", "below"),
-            f"{parameter.name}: limit {parameter.limit.below:g} must lie below the baseline "
-            f"{parameter.baseline:g}",
-        )
+        wrong = f"limit {parameter.limit.below:g} must lie below the baseline"
+        fault = f"{parameter.name}: {wrong} {parameter.baseline:g}"
+        yield ("parameter", k, "limit", "below"), fault
 
 
 def _map_faults(description: Description, modal_map: ModalMap) -> Iterator[tuple[Keys, str]]:
@@ -403,18 +371,15 @@ def _map_faults(description: Description, modal_map: ModalMap) -> Iterator[tuple
     for k, parameter in enumerate(description.parameter):
         low, high = ends[:, k]
         if not low <= np.log(parameter.baseline) <= high:
-            yield (
-                ("parameter", k, "baseline"),
-                f"the baseline {parameter.baseline:g} of {parameter.name} lies outside the modal "
-                f"map, which covers {np.exp(low):.4g} to {np.exp(high):.4g}",
+            fault = (
+                f"the baseline {parameter.baseline:g} of {parameter.name} lies outside the modal"
             )
+            covered = f"{np.exp(low):.4g} to {np.exp(high):.4g}"
+            yield ("parameter", k, "baseline"), f"{fault} map, which covers {covered}"
         try:
             JointPrior((parameter.name,), (parameter.prior,), *ends[:, [k]])
         except BadStage as error:
             yield ("parameter", k, "prior"), str(error)
     if not any(mode.tracked and mode.name in modal_map.modes for mode in description.mode):
-        yield (
-            ("map", "file"),
-            f"the map has modes {list(modal_map.modes)}, but none of them is a tracked [[mode]] "
-            f"({[mode.name for mode in description.mode]})",
-        )
+        fault = f"the map has modes {list(modal_map.modes)}, but none of them is a tracked [[mode]]"
+        yield ("map", "file"), f"{fault} ({[mode.name for mode in description.mode]})"

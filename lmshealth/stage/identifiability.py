@@ -21,18 +21,15 @@ class Identifiability:
 
     Attributes
     ----------
-    parameters : tuple of str
-        Names of the parameters.
     modes : tuple of ModeSpec
         Tracked modes on the map.
     slopes : ndarray
         d ln f / d ln parameter at the baseline, shape ``(n_modes, n_parameters)``.
     prior : ndarray
         Prior variances of the ln parameters, shape ``(n_parameters,)``.
-    model_std : float
-        Relative standard deviation of the map's sensitivities.
-    leave_out : ndarray
-        Error of ln f of the map's surrogate, shape ``(n_modes,)``.
+    model_std, leave_out : float, ndarray
+        Relative standard deviation of the map's sensitivities, and error of ln f of its surrogate,
+        shape ``(n_modes,)``.
     n_baseline : int
         Logs of the baseline.
     """
@@ -68,12 +65,8 @@ class Identifiability:
     def restricted_to(self, modes: Sequence[str]) -> Identifiability:
         """Return the identifiability by some of the modes only."""
         rows = [k for k, mode in enumerate(self.modes) if mode.name in modes]
-        return replace(
-            self,
-            modes=tuple(self.modes[k] for k in rows),
-            slopes=self.slopes[rows],
-            leave_out=self.leave_out[rows],
-        )
+        kept = tuple(self.modes[k] for k in rows)
+        return replace(self, modes=kept, slopes=self.slopes[rows], leave_out=self.leave_out[rows])
 
     def std(self, parameter: int, noise: FloatArray) -> float:
         """Return the standard deviation of one ln parameter by an exact map.
@@ -89,15 +82,7 @@ class Identifiability:
     def precision(self, noise: FloatArray) -> FloatArray:
         """Return the posterior precision of all ln parameters, Λ⁻¹ + Sᵀ (C + E)⁻¹ S.
 
-        Parameters
-        ----------
-        noise : ndarray
-            Variances of the drifts, shape ``(n_modes,)``.
-
-        Returns
-        -------
-        ndarray
-            Shape ``(n_parameters, n_parameters)``.
+        With variances of the drifts ``(n_modes,)``; shape ``(n_parameters, n_parameters)``.
         """
         error = self.model_std**2 * self.slopes**2 @ self.prior + self.leave_out**2
         weighted = self.slopes / (noise + error)[:, None]
@@ -109,19 +94,8 @@ def identifiable_parameters(
 ) -> BoolArray:
     """Decide which parameters unlimited logs would inform, of one or several machines together.
 
-    Parameters
-    ----------
-    machines : sequence of Identifiability
-        One per machine.
-    columns : sequence of sequence of int
-        Indices of the parameters of each machine among all.
-    prior : ndarray
-        Prior variances of all ln parameters, shape ``(n_parameters,)``.
-
-    Returns
-    -------
-    ndarray of bool
-        Shape ``(n_parameters,)``.
+    For indices of the parameters of each machine among all, and prior variances of all ln
+    parameters, ``(n_parameters,)``.
     """
     precision = np.diag(1 / prior)
     for machine, places in zip(machines, columns, strict=True):
@@ -132,18 +106,10 @@ def identifiable_parameters(
 
 
 def identifiability_of(stage: Stage) -> Identifiability:
-    """Linearise the modal map of a stage at the baseline.
-
-    Raises
-    ------
-    BadStage
-        If the description has no map.
-    """
+    """Linearise the modal map of a stage at the baseline; refuse a description without one."""
     if stage.modal_map is None or stage.description.map is None:
-        raise BadStage(
-            f"{stage.name}: no [map], so nothing links health to frequencies; "
-            "describe [[parameter]] and [map]"
-        )
+        missing = "no [map], so nothing links health to frequencies"
+        raise BadStage(f"{stage.name}: {missing}; describe [[parameter]] and [map]")
     rows = [stage.modal_map.modes.index(name) for name in stage.informative]
     return Identifiability(
         parameters=stage.prior.names,

@@ -21,15 +21,12 @@ class ModalMap:
 
     Attributes
     ----------
-    parameters, modes : tuple of str
-        Names, in the order of the axes below.
     low, high : ndarray
         Bounds of ln parameter, shape ``(n_parameters,)``.
     coefficients : ndarray
         Tensor Chebyshev coefficients, shape ``(d_1 + 1, ..., d_P + 1, n_modes)``.
     leave_out_error : ndarray
-        Largest error of ln frequency at inner grid points, each left out of the fit,
-        ``(n_modes,)``.
+        Largest error of ln f at inner grid points, each left out of the fit, ``(n_modes,)``.
     """
 
     parameters: tuple[str, ...]
@@ -44,34 +41,17 @@ class ModalMap:
         return np.asarray(np.all((x >= self.low) & (x <= self.high), axis=-1))
 
     def ln_frequency(self, x: FloatArray) -> FloatArray:
-        """Evaluate ln frequency at many points.
+        """Evaluate ln of frequency in Hz, ``(n_points, n_modes)``.
 
-        Parameters
-        ----------
-        x : ndarray
-            ln parameters, shape ``(n_points, n_parameters)``.
-
-        Returns
-        -------
-        ndarray
-            ln of frequency in Hz, shape ``(n_points, n_modes)``.
-
-        Raises
-        ------
-        OutsideMap
-            If a point lies outside the grid; there is no extrapolation.
+        At ln parameters ``(n_points, n_parameters)``. `OutsideMap` is raised for a point outside
+        the grid: there is no extrapolation.
         """
         return _evaluate(self.coefficients, self._unit(x))
 
     def gradient(self, x: FloatArray) -> FloatArray:
-        """Differentiate the polynomial of ln frequency by the ln parameters at many points.
+        """Differentiate ln frequency by the ln parameters, ``(n_points, n_modes, n_parameters)``.
 
         Parameters and errors are those of `ln_frequency`.
-
-        Returns
-        -------
-        ndarray
-            d ln frequency / d ln parameter, shape ``(n_points, n_modes, n_parameters)``.
         """
         unit = self._unit(x)
         slopes = [
@@ -95,12 +75,8 @@ class ModalMap:
 def read_map(path: str, parameters: tuple[str, ...]) -> ModalMap:
     """Read a modal map and fit its surrogate.
 
-    Parameters
-    ----------
-    path : str
-        CSV with one column per parameter, then ``mode`` and ``frequency_hz``; a full grid.
-    parameters : tuple of str
-        Columns to use as health parameters.
+    It is a CSV file with one column per health parameter, then ``mode`` and ``frequency_hz``: a
+    full grid.
 
     Raises
     ------
@@ -113,13 +89,12 @@ def read_map(path: str, parameters: tuple[str, ...]) -> ModalMap:
     except (OSError, ValueError) as error:
         why = getattr(error, "strerror", None) or error
         raise BadStage(f"{path}: cannot read the modal map: {why}") from error
-    missing = {*parameters, "mode", "frequency_hz"} - set(table.columns)
+    needed = {*parameters, "mode", "frequency_hz"}
+    missing, extra = needed - set(table.columns), set(table.columns) - needed
     if missing:
         # A description may name any file: the columns of one that is no map are not disclosed.
-        is_map = missing != {*parameters, "mode", "frequency_hz"}
-        there = f"there are {list(table.columns)}" if is_map else "it is not a modal map"
+        there = "it is not a modal map" if missing == needed else f"there are {list(table.columns)}"
         raise BadStage(f"{path}: no column {sorted(missing)}; {there}")
-    extra = set(table.columns) - {*parameters, "mode", "frequency_hz"}
     if extra:
         raise BadStage(
             f"{path}: columns {sorted(extra)} are not parameters of the stage description; "
@@ -129,10 +104,8 @@ def read_map(path: str, parameters: tuple[str, ...]) -> ModalMap:
     for name, column in numbers.items():
         wrong = ~(np.isfinite(column) & (column > 0)).to_numpy()
         if wrong.any():
-            cell = table[name].iloc[wrong.argmax()]
-            raise BadStage(
-                f"{_line(path, table, wrong)}: {name} is {cell}; needed is a positive number"
-            )
+            found = f"{_line(path, table, wrong)}: {name} is {table[name].iloc[wrong.argmax()]}"
+            raise BadStage(f"{found}; needed is a positive number")
     unnamed = table["mode"].isna().to_numpy()
     if unnamed.any():
         raise BadStage(f"{_line(path, table, unnamed)}: a mode without a name")
@@ -166,14 +139,9 @@ def _fit(path: str, table: pd.DataFrame, parameters: tuple[str, ...]) -> ModalMa
     low, high = points.min(axis=0), points.max(axis=0)
     unit = 2 * (points - low) / (high - low) - 1
     degrees, miss = _choose_degrees(unit, np.log(values), [axis.size for axis in axes])
-    return ModalMap(
-        parameters=parameters,
-        modes=modes,
-        low=low,
-        high=high,
-        coefficients=_least_squares(unit, np.log(values), degrees),
-        leave_out_error=miss,
-    )
+    solution = np.linalg.lstsq(_basis(unit, degrees), np.log(values), rcond=None)[0]
+    coefficients = solution.reshape(*[d + 1 for d in degrees], len(modes))
+    return ModalMap(parameters, modes, low, high, coefficients, miss)
 
 
 def _evaluate(coefficients: FloatArray, unit: FloatArray) -> FloatArray:
@@ -210,25 +178,13 @@ def _basis(unit: FloatArray, degrees: list[int]) -> FloatArray:
     return basis
 
 
-def _least_squares(unit: FloatArray, values: FloatArray, degrees: list[int]) -> FloatArray:
-    solution = np.linalg.lstsq(_basis(unit, degrees), values, rcond=None)[0]
-    return np.asarray(solution.reshape(*[d + 1 for d in degrees], values.shape[1]))
-
-
 def _choose_degrees(
     unit: FloatArray, values: FloatArray, sizes: list[int]
 ) -> tuple[list[int], FloatArray]:
-    """Choose the degree with the least error at inner grid points, each left out.
+    """Choose the degree of each axis with the least error at inner grid points, each left out.
 
     The error of a fit without a point is r / (1 - h) there, r the residual and h the leverage of
-    the fit with it.
-
-    Returns
-    -------
-    degrees : list of int
-        One per axis.
-    error : ndarray
-        Largest error of ln frequency of each mode, shape ``(n_modes,)``.
+    the fit with it. The largest of each mode is returned, too, ``(n_modes,)``.
     """
     interior = np.all(np.abs(unit) < 1 - 1e-9, axis=1)
     best: tuple[list[int], FloatArray] | None = None

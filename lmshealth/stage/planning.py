@@ -26,16 +26,13 @@ class Effort:
     ----------
     duration : float
         Of each log in s.
-    n_logs : int or None
-        Least number of logs now that reaches the power; None where no number does.
-    hindrance : str
-        Why no number does: logs ``too-short`` for identification; the ``baseline``, where a longer
-        one would do; other ``parameters`` that change the modes alike. Else empty.
-    power : float
-        Of one log now. NaN for logs too short, as are the following fields.
-    smallest_loss, smallest_loss_many : float
-        Smallest fraction lost that is detected with the required power, by one log now and by as
-        many as the baseline has.
+    n_logs, hindrance : int or None, str
+        Least number of logs now that reaches the power, or why no number does: logs ``too-short``
+        for identification; the ``baseline``, where a longer one would do; other ``parameters`` that
+        change the modes alike.
+    power, smallest_loss, smallest_loss_many : float
+        Power of one log now; smallest fraction lost that is detected with the required power, by
+        one log now and by as many as the baseline has. NaN for logs too short.
     """
 
     duration: float
@@ -52,16 +49,11 @@ class Plan:
 
     Attributes
     ----------
-    parameter : str
-        Its name.
-    loss : float
-        Fraction of its baseline value that is lost.
-    power, false_alarm : float
-        Probabilities to detect this loss, and to detect one where there is none.
-    n_baseline : int
-        Logs of the baseline, of the same duration as those now.
-    efforts : tuple of Effort
-        One per duration.
+    loss, power, false_alarm : float
+        Fraction of its baseline value that is lost; probabilities to detect this loss, and to
+        detect one where there is none.
+    n_baseline, efforts : int, tuple of Effort
+        Logs of the baseline, of the same duration as those now; one effort per duration.
     duration_of_one : int or None
         Least whole seconds from which one log now reaches the power; None where an hour does not.
     """
@@ -90,14 +82,10 @@ def plan(
     ----------
     stage : Stage
         Modes with their modal SNR, modal map, priors, and number of logs of the baseline.
-    parameter : str
-        Name of the parameter.
-    loss : float
-        Fraction of its baseline value that is lost.
-    power : float
-        Required probability to detect the loss.
-    false_alarm : float
-        Probability to detect a loss where there is none.
+    parameter, loss : str, float
+        Name of the parameter, and fraction of its baseline value that is lost.
+    power, false_alarm : float
+        Required probability to detect the loss, and probability to detect one where there is none.
     durations : sequence of float
         Durations of logs in s to compare.
 
@@ -139,15 +127,9 @@ def plan(
 
     seconds = range(max(1, int(np.ceil(information.least_duration))), constants.LONGEST_LOG + 1)
     place = bisect_left(seconds, power, key=lambda duration: power_of(duration, 1))
-    return Plan(
-        parameter=parameter,
-        loss=loss,
-        power=power,
-        false_alarm=false_alarm,
-        n_baseline=information.n_baseline,
-        efforts=tuple(_effort(information, j, test, size, duration) for duration in durations),
-        duration_of_one=seconds[place] if place < len(seconds) else None,
-    )
+    efforts = tuple(_effort(information, j, test, size, duration) for duration in durations)
+    shortest = seconds[place] if place < len(seconds) else None
+    return Plan(parameter, loss, power, false_alarm, information.n_baseline, efforts, shortest)
 
 
 @dataclass(frozen=True, slots=True)
@@ -179,9 +161,8 @@ def _index(stage: Stage, parameter: str, loss: float) -> int:
     if parameter not in names:
         raise BadQuestion(f"{stage.name}: no parameter {parameter!r}; there are {names}")
     if not 0 < loss < 1:
-        raise BadQuestion(
-            f"{parameter}={loss:g}: needed is the fraction lost, between 0 and 1: 0.05 for 5 %"
-        )
+        needed = "needed is the fraction lost, between 0 and 1: 0.05 for 5 %"
+        raise BadQuestion(f"{parameter}={loss:g}: {needed}")
     j = names.index(parameter)
     lost = stage.baseline_point.copy()
     lost[j] += np.log1p(-loss)
@@ -195,10 +176,8 @@ def _expect_identifiable(stage: Stage, information: Identifiability, j: int) -> 
     if left < (1 - constants.INFORMED) * information.prior[j]:
         return
     name = information.parameters[j]
-    slopes = ", ".join(
-        f"{mode.name} {slope:.2g}"
-        for mode, slope in zip(information.modes, information.slopes[:, j], strict=True)
-    )
+    pairs = zip(information.modes, information.slopes[:, j], strict=True)
+    slopes = ", ".join(f"{mode.name} {slope:.2g}" for mode, slope in pairs)
     rest = [other for other in information.parameters if other != name]
     raise BadQuestion(
         f"{stage.name}: the modes do not identify {name}. Its sensitivities d ln f / d ln {name} "
@@ -224,11 +203,6 @@ def _effort(
     if place == len(counts):
         best = test.power(size, std(constants.MOST_LOGS, constants.MOST_LOGS))
         hindrance = "baseline" if best >= test.required else "parameters"
-    return Effort(
-        duration=duration,
-        n_logs=None if hindrance else counts[place],
-        hindrance=hindrance,
-        power=test.power(size, std(1)),
-        smallest_loss=test.smallest_loss(std(1)),
-        smallest_loss_many=test.smallest_loss(std(information.n_baseline)),
-    )
+    n_logs = None if hindrance else counts[place]
+    losses = [test.smallest_loss(std(n)) for n in (1, information.n_baseline)]
+    return Effort(duration, n_logs, hindrance, test.power(size, std(1)), *losses)

@@ -132,16 +132,9 @@ Prior = Lognormal | Normal | Uniform
 
 @dataclass(frozen=True, slots=True, eq=False)
 class JointPrior:
-    """Independent priors of several parameters, in their logarithms, truncated to a box.
+    """Independent priors of several parameters, truncated to a box of their logarithms.
 
-    Attributes
-    ----------
-    names : tuple of str
-        Names of the parameters.
-    priors : tuple of Prior
-        Of the parameters, not of their logarithms.
-    low, high : ndarray
-        Bounds of the ln parameters, the range of the modal map, shape ``(n_parameters,)``.
+    The box from low to high is the range of the modal map, each of shape ``(n_parameters,)``.
     """
 
     names: tuple[str, ...]
@@ -210,19 +203,9 @@ class JointPrior:
 
 
 def combine_priors(parts: Sequence[JointPrior], columns: Sequence[Sequence[int]]) -> JointPrior:
-    """Combine priors of several machines that share parameters.
+    """Combine priors of several machines; those of a shared parameter must be equal.
 
-    Parameters
-    ----------
-    parts : sequence of JointPrior
-        One per machine.
-    columns : sequence of sequence of int
-        Indices of the parameters of each among all; a shared index is a shared parameter.
-
-    Raises
-    ------
-    BadStage
-        If a shared parameter has different priors.
+    `columns` are the indices of the parameters of each machine among all.
     """
     n = 1 + max(place for places in columns for place in places)
     names, priors = [""] * n, [parts[0].priors[0]] * n
