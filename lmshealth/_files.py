@@ -15,25 +15,13 @@ if TYPE_CHECKING:
 
 
 def write_text(target: Path, text: str) -> None:
-    """Write a text as `replacing` does, with missing folders.
-
-    Raises
-    ------
-    BadTable
-        If it cannot be written.
-    """
+    """Write a text as `replacing` does, with missing folders, or raise `BadTable`."""
     with _writing(target), replacing(target) as stream:
         stream.write(text)
 
 
 def write_bytes(target: Path, content: bytes) -> None:
-    """Write bytes in the same way.
-
-    Raises
-    ------
-    BadTable
-        If they cannot be written.
-    """
+    """Write bytes in the same way."""
     with _writing(target), _in_place_of(target) as part, part.open("xb") as stream:
         stream.write(content)
 
@@ -44,8 +32,7 @@ def replacing(target: Path) -> Iterator[IO[str]]:
 
     A symbolic link in its place is replaced, not followed.
     """
-    # One unprintable name must not keep all others from being written.
-    odd = "backslashreplace"
+    odd = "backslashreplace"  # one unprintable name must not keep all others from being written
     with (
         _in_place_of(target) as part,
         part.open("x", encoding="utf-8", errors=odd, newline="\n") as stream,

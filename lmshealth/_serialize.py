@@ -25,31 +25,15 @@ _MOST_BYTES = 2**31
 
 
 def pack(value: Any) -> bytes:
-    """Serialise dataclasses, structs, arrays, dates and plain values.
-
-    Raises
-    ------
-    TypeError
-        For anything else.
-    """
+    """Serialise dataclasses, structs, arrays, dates and plain values; `TypeError` for others."""
     return zlib.compress(_plain(value), _LEVEL)
 
 
 def unpack(content: bytes, kind: Any) -> Any:
-    """Rebuild a serialised value.
+    """Rebuild a serialised value of a type, from `pack` or from an untrusted source.
 
-    Parameters
-    ----------
-    content : bytes
-        From `pack`, or from an untrusted source.
-    kind : type
-        Its type: a dataclass or struct, or a union that msgspec can distinguish. Arrays are
-        read-only, in C order.
-
-    Raises
-    ------
-    ValueError
-        If it is not of this type.
+    The type is a dataclass or struct, or a union that msgspec can distinguish; `ValueError` if it
+    is another. Arrays are read-only, in C order.
     """
     try:
         inflater = zlib.decompressobj()

@@ -6,6 +6,8 @@ import re
 import tomllib
 from bisect import bisect_left
 from collections.abc import Callable, Iterable
+from functools import reduce
+from operator import getitem
 from typing import Any, TypeVar
 
 import msgspec
@@ -51,20 +53,10 @@ def decode(content: bytes, kind: type[Kind]) -> Kind:
 
 
 def place(content: bytes, *keys: str | int) -> str:
-    """Name a key of a TOML file with its line.
+    """Name a key of a TOML file with its line, such as ``line 12: mode[1].damping_ratio``.
 
-    Parameters
-    ----------
-    content : bytes
-        The file; it has to be TOML.
-    keys : str or int
-        Names of tables and keys, and places in arrays. For a missing key the line is that of the
-        table which lacks it.
-
-    Returns
-    -------
-    str
-        For example ``line 12: mode[1].damping_ratio``.
+    The keys are names of tables and keys, and places in arrays. For a missing key the line is that
+    of the table which lacks it.
     """
     shown = "".join(f"[{key}]" if isinstance(key, int) else f".{key}" for key in keys)
     text = _text(content)
@@ -118,20 +110,17 @@ def _holds(table: Any, keys: Keys) -> bool:
 
 
 def _value(table: Any, keys: Keys) -> Any:
-    for key in keys:
-        table = table[key]
-    return table
+    return reduce(getitem, keys, table)
 
 
 def _explained(error: str, table: Any, schema: Type) -> tuple[Keys, str]:
     """Convert msgspec's message into keys and a message with the known names."""
-    path = _PLACE.search(error)
-    keys: Keys = ()
-    if path:
-        error = error[: path.start()]
-        if path["path"].endswith(_ANY_VALUE):
-            error = f"one of its values: {error}"
-        keys = tuple(name or int(index) for name, index in _STEP.findall(path["path"]))
+    path = ""
+    if found := _PLACE.search(error):
+        error, path = error[: found.start()], found["path"]
+    if path.endswith(_ANY_VALUE):
+        error = f"one of its values: {error}"
+    keys: Keys = tuple(name or int(index) for name, index in _STEP.findall(path))
     if field := _FIELD.match(error):
         name = field["field"]
         tags = _tags(schema, (*keys, name))
@@ -173,10 +162,9 @@ def _structs(schema: Type, keys: Keys) -> list[StructType]:
 def _inside(schema: Type, key: str | int) -> Iterable[Type]:
     if isinstance(schema, VarTupleType):
         yield from _branches(schema.item_type)
-    if isinstance(schema, StructType):
-        for field in schema.fields:
-            if field.encode_name == key:
-                yield from _branches(field.type)
+    for field in schema.fields if isinstance(schema, StructType) else ():
+        if field.encode_name == key:
+            yield from _branches(field.type)
 
 
 def _branches(schema: Type) -> Iterable[Type]:

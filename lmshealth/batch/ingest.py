@@ -15,7 +15,7 @@ from lmshealth.batch.workers import Pool
 from lmshealth.errors import BadLog
 from lmshealth.io.column_map import ColumnMap
 from lmshealth.io.formats.registry import format_name
-from lmshealth.io.log import Log, Metadata, Refusal
+from lmshealth.io.log import Metadata, Refusal
 from lmshealth.io.manifest import find_logs, name_of, read_manifest
 from lmshealth.io.reading import content_digest, read_log, require_identity
 from lmshealth.io.refusal import visible
@@ -156,10 +156,10 @@ def _tasks(
     size = constants.FILES_PER_HASH_TASK
     batches = (tuple(found[first : first + size]) for first in range(0, len(found), size))
     for _, part in resources.pool.map_unordered(_digests, batches, _no_digests):
-        for path, found_there in part.items():
-            digests[path] = found_there if isinstance(found_there, str) else ""
-            if isinstance(found_there, tuple):
-                refused.append(Refusal(name_of(path, folder), *found_there))
+        for path, (digest, *trouble) in part.items():
+            digests[path] = digest
+            if trouble:
+                refused.append(Refusal(name_of(path, folder), *trouble))
         resources.progress("reading", len(digests), len(found))
     seen: dict[tuple[str, str], str] = {}
     # Of several copies the one in a manifest is analysed: only that one has its metadata.
@@ -171,34 +171,33 @@ def _tasks(
             continue
         try:
             overrides = manifest.overrides(path)
+            if content in seen:
+                detail = f"same content as {seen[content]}, which is analysed for both"
+                raise BadLog(name, "duplicate", detail)
         except BadLog as error:
             refused.append(Refusal(name, error.reason, error.detail))
-            continue
-        if content in seen:
-            detail = f"same content as {seen[content]}, which is analysed for both"
-            refused.append(Refusal(name, "duplicate", detail))
             continue
         seen[content] = name
         tasks.append(_Task(path, name, overrides, digests[path], columns))
     return tasks, refused
 
 
-_Digests = dict[Path, str | tuple[str, str]]
+_Digests = dict[Path, tuple[str, ...]]
 
 
 def _digests(paths: Iterable[Path]) -> _Digests:
-    """Hash files; one that cannot be read has a reason and a detail instead."""
+    """Hash files; one that cannot be read has an empty digest, a reason and a detail."""
     found: _Digests = {}
     for path in paths:
         try:
-            found[path] = content_digest(path)
+            found[path] = (content_digest(path),)
         except BadLog as error:
-            found[path] = error.reason, error.detail
+            found[path] = "", error.reason, error.detail
     return found
 
 
 def _no_digests(paths: Iterable[Path], why: str) -> _Digests:
-    return {path: ("missing-file", f"{why}: it cannot be read") for path in paths}
+    return {path: ("", "missing-file", f"{why}: it cannot be read") for path in paths}
 
 
 def _cached(
@@ -211,14 +210,15 @@ def _cached(
     digests = ["", _none_of(stages), *(stage.digest for stage in stages)]
     own = {task.key(digest): task for task in tasks for digest in digests}
     for key, found in store.identified(own):
-        metadata = Metadata(stage=found.stage, description=found.asked)
-        if found.description in ("", _none_of(stages), _matching(stages, metadata)):
+        matching = _matching(stages, Metadata(stage=found.stage, description=found.asked))
+        used = "" if matching is None else matching.digest
+        if found.description in ("", _none_of(stages), used):
             yield own[key], found.renamed(own[key].name)
 
 
-def _matching(stages: Sequence[Stage], metadata: Metadata) -> str | None:
-    """Return the digest of the first description that matches a log."""
-    return next((stage.digest for stage in stages if stage.matches(metadata)), None)
+def _matching(stages: Sequence[Stage], metadata: Metadata) -> Stage | None:
+    """Return the first description that matches a log."""
+    return next((stage for stage in stages if stage.matches(metadata)), None)
 
 
 def _none_of(stages: Sequence[Stage]) -> str:
@@ -241,8 +241,16 @@ def identify_log(task: _Task, stages: tuple[Stage, ...], max_memory: float) -> I
             raise BadLog(task.name, "changed", "it is being written to; run again")
         require_identity(log)
         stage, asked = log.metadata.stage, log.metadata.description
-        by = _matching(stages, log.metadata) or _none_of(stages)
-        return Identified(_estimates(log, stages), by, stage, asked)
+        described = _matching(stages, log.metadata)
+        if described is None:
+            by = _none_of(stages)
+            raise BadLog(task.name, "no-stage", _unmatched(log.metadata, stages))
+        by = described.digest
+        modes, spectrum = identify(log, described), relative_spectrum(log, described)
+        estimates = LogEstimates(
+            log.name, log.digest, log.metadata, modes, loop_error(log), spectrum
+        )
+        return Identified(estimates, by, stage, asked)
     except BadLog as error:
         refusal = Refusal(task.name, error.reason, error.detail)
         lasting = error.reason not in constants.RETRIED_REASONS
@@ -260,16 +268,6 @@ def identify_log(task: _Task, stages: tuple[Stage, ...], max_memory: float) -> I
 def unexpected(error: Exception, attachment: str) -> str:
     """Describe an exception that this program should not raise, and ask for a report."""
     return visible(f"{type(error).__name__}: {error}; please report this with {attachment}")
-
-
-def _estimates(log: Log, stages: tuple[Stage, ...]) -> LogEstimates:
-    """Identify a log with the description that matches it."""
-    stage = next((stage for stage in stages if stage.matches(log.metadata)), None)
-    if stage is None:
-        raise BadLog(log.name, "no-stage", _unmatched(log.metadata, stages))
-    modes, error = identify(log, stage), loop_error(log)
-    spectrum = relative_spectrum(log, stage)
-    return LogEstimates(log.name, log.digest, log.metadata, modes, error, spectrum)
 
 
 def _unmatched(metadata: Metadata, stages: Sequence[Stage]) -> str:

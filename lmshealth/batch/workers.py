@@ -96,10 +96,8 @@ class _ProcessPool(Pool):
             except BaseException:
                 self.kill()
                 raise
-        raise LmshealthError(
-            f"worker processes end as they start ({constants.START_ATTEMPTS} attempts): is there "
-            "enough memory? Use fewer --workers"
-        )
+        found = f"worker processes end as they start ({constants.START_ATTEMPTS} attempts)"
+        raise LmshealthError(f"{found}: is there enough memory? Use fewer --workers")
 
     def _start(self) -> None:
         # The processes exit when the other end of this pipe is closed, by us or by our own end.
@@ -197,12 +195,12 @@ def processes(size: int) -> Iterator[Pool]:
 
     The processes end with the pool, with an interrupt, and with this process, whatever ends it.
     """
-    if size <= 1:
+    if size > 1:
+        with _process_pool(size) as pool:
+            yield pool
+    else:
         with threadpool_limits(1):
             yield Pool()
-        return
-    with _process_pool(size) as pool:
-        yield pool
 
 
 @contextmanager
@@ -253,11 +251,10 @@ class _Cluster(Pool):
         # finished nor cancelled, which distributed/cfexecutor.py takes for an error.
         from distributed import as_completed
 
+        completed: Any = as_completed  # the library has no types
+        done = completed(loop=self.client.loop)
         checked = partial(_run_checked, VERSION, function)
-        left = iter(items)
-        running: dict[Any, Item] = {}
-        finished: Any = as_completed
-        done = finished(loop=self.client.loop)
+        left, running = iter(items), dict[Any, Item]()
         try:
             while True:
                 for item in islice(left, constants.TASKS_AHEAD * self.size - len(running)):
@@ -296,7 +293,6 @@ def cluster(address: str) -> Iterator[Pool]:
         needed = "pip install 'lmshealth[distributed]'"
         raise SchedulerError(f"--scheduler needs Dask: {needed}") from error
     try:
-        _check_address(address)
         client = _connected(address)
     # Dask's settings may name modules that are missing, or lack certificates (a TypeError).
     except (ImportError, OSError, TypeError, ValueError) as error:
@@ -344,6 +340,7 @@ def _connected(address: str) -> Any:
     """Open a client of a scheduler."""
     from distributed import Client
 
+    _check_address(address)
     # Our own errors report what becomes of its connections. Each logger has a level of its own.
     for name in logging.root.manager.loggerDict:
         if name.split(".")[0] == "distributed":
@@ -391,6 +388,5 @@ def _run_checked(needed: str, function: Task[Item, Result], item: Item) -> Resul
 
 def _require_version(needed: str) -> None:
     if needed != VERSION:
-        raise SchedulerError(
-            f"a worker has lmshealth {VERSION}, this run has {needed}: install one version"
-        )
+        found = f"a worker has lmshealth {VERSION}, this run has {needed}"
+        raise SchedulerError(f"{found}: install one version")
