@@ -58,11 +58,9 @@ def check_signal(values: Samples) -> None:
     at_high = _stuck(values, low, high, 1.0)
     at_low = _stuck(values, -high, -low, -1.0)
     if at_high + at_low >= constants.CLIPPED_SHARE * values.size:
-        raise Unusable(
-            "clipped",
-            f"{at_low} samples are at the minimum {low:.6g} and {at_high} at the maximum "
-            f"{high:.6g} (SI) of {values.size}; widen the range of the sensor",
-        )
+        found = f"{at_low} samples are at the minimum {low:.6g} and {at_high} at the maximum"
+        needed = "widen the range of the sensor"
+        raise Unusable("clipped", f"{found} {high:.6g} (SI) of {values.size}; {needed}")
 
 
 def _measured(values: Samples) -> Iterator[FloatArray]:

@@ -48,21 +48,15 @@ _SPELLINGS = str.maketrans(
 )
 _ALIASES = {"A": "a", "mA": "ma", "gn": "g", "m_s_s": "m_s2", "m_sec2": "m_s2"}
 
-_DIMENSIONS: dict[Role, str] = {
-    "displacement": "length",
-    "acceleration": "acceleration",
-    "current": "current",
-    "reference_velocity": "velocity",
-    "reference_position": "length",
-    "time": "time",
+# By prefix of a column: its role, and the dimension of its units.
+_PREFIXES: dict[str, tuple[Role, str]] = {
+    "delta_e": ("displacement", "length"),
+    "acc": ("acceleration", "acceleration"),
+    "current": ("current", "current"),
+    "reference_velocity": ("reference_velocity", "velocity"),
+    "reference_position": ("reference_position", "length"),
 }
-_PREFIXES: dict[str, Role] = {
-    "delta_e": "displacement",
-    "acc": "acceleration",
-    "current": "current",
-    "reference_velocity": "reference_velocity",
-    "reference_position": "reference_position",
-}
+_DIMENSIONS: dict[Role, str] = {**dict(_PREFIXES.values()), "time": "time"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,10 +78,10 @@ def role_of(column: str) -> Role | None:
     """
     if column in ("time", "time_s"):
         return "time"
-    for prefix, role in _PREFIXES.items():
-        if column == prefix or column.startswith(prefix + "_"):
-            return role
-    return None
+    fitting = (
+        role for prefix, (role, _) in _PREFIXES.items() if f"{column}_".startswith(f"{prefix}_")
+    )
+    return next(fitting, None)
 
 
 def unit_key(text: str, dimension: str | None = None) -> str | None:
@@ -99,14 +93,9 @@ def unit_key(text: str, dimension: str | None = None) -> str | None:
 
 
 def parse_column(column: str, unit: str | float | None = None) -> Signal:
-    """Read quantity, name and unit from a column name.
+    """Read quantity, name and unit from a column name that `role_of` recognises.
 
-    Parameters
-    ----------
-    column : str
-        A name that `role_of` recognises.
-    unit : str or float, optional
-        For a column whose name carries no unit: its unit, or the SI value of one count.
+    A unit, or the SI value of one count, is given for a column whose name carries no unit.
 
     Raises
     ------
@@ -130,11 +119,8 @@ def parse_column(column: str, unit: str | float | None = None) -> Signal:
         needed = f"needed one of {_choices(role)} as suffix"
         raise Unusable("unit", f"column {column!r} carries {found}; {needed}")
     if fits:
-        raise Unusable(
-            "unit",
-            f"column {column!r} carries the unit {suffix} and is given {unit!r} as well; name it "
-            f"{name!r} to read it by the latter",
-        )
+        found = f"column {column!r} carries the unit {suffix} and is given {unit!r} as well"
+        raise Unusable("unit", f"{found}; name it {name!r} to read it by the latter")
     return Signal(column, role, _factor(column, role, unit))
 
 
@@ -234,12 +220,7 @@ class ColumnMap(Struct, frozen=True, forbid_unknown_fields=True, dict=True):
 
 
 def load_columns(path: str | Path) -> ColumnMap:
-    """Read a column map from a TOML file.
-
-    Parameters
-    ----------
-    path : str or Path
-        The file given to ``--columns``.
+    """Read a column map from the TOML file given to ``--columns``.
 
     Raises
     ------

@@ -45,7 +45,9 @@ def parse_metadata(text: Mapping[str, str]) -> tuple[Metadata, float | None]:
         With reason ``metadata``, naming key and value.
     """
     given = {key: text[key].strip() for key in KEYS if text.get(key, "").strip()}
-    travel = _number(given, "travel_km", "an odometer of 0 or more", low=0.0, scale=1e3)
+    travel = _number(given, "travel_km", scale=1e3)
+    if travel is not None and travel < 0:
+        raise _bad(given, "travel_km", "an odometer of 0 or more")
     metadata = Metadata(
         stage=parse_name(given, "stage"),
         recorded_at=parse_moment(given),
@@ -94,27 +96,17 @@ def parse_moment(given: Mapping[str, str]) -> datetime | None:
     return moment
 
 
-def _number(
-    given: Mapping[str, str],
-    key: str,
-    needed: str = "a finite number",
-    *,
-    low: float = -math.inf,
-    scale: float = 1.0,
-) -> float | None:
+def _number(given: Mapping[str, str], key: str, *, scale: float = 1.0) -> float | None:
     """Read a number times a scale; None where it is not given."""
     if key not in given:
         return None
     try:
         # Python reads 1_000 as a number; no exporter means that.
-        value = math.nan if "_" in given[key] else float(given[key])
+        value = math.nan if "_" in given[key] else float(given[key]) * scale
     except ValueError:
         value = math.nan
     if not math.isfinite(value):
         raise _bad(given, key, "a finite number")
-    value *= scale
-    if not (low <= value and math.isfinite(value)):
-        raise _bad(given, key, needed)
     return value
 
 

@@ -62,8 +62,8 @@ def read_sheet(path: Path, needed: Sequence[str]) -> Iterator[Row]:
         stripped = [cell.strip() for cell in cells]
         if not trouble and any(stripped[len(names) :]):
             trouble = f"{len(cells)} cells in {len(names)} columns"
-        stripped += [""] * (len(names) - len(cells))
-        yield Row(where, dict(zip(names, stripped, strict=False)), trouble)
+        padded = dict.fromkeys(names, "") | dict(zip(names, stripped, strict=False))
+        yield Row(where, padded, trouble)
 
 
 def _records(lines: list[str]) -> Iterator[tuple[str, list[str], str]]:

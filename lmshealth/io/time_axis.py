@@ -85,7 +85,11 @@ def time_axis(time: Samples | None, rate: float | None) -> TimeAxis:
         raise Unusable("time", f"{note}; needed uniform samples, export them at the sampling clock")
     # The mean over all regular intervals averages the rounding of time stamps out.
     interval = total / n_regular if n_regular else interval
-    return TimeAxis(_agreed(interval, rate), where, note)
+    if rate is not None and abs(interval * rate - 1) > constants.AGREEMENT:
+        found = f"time_s gives {1 / interval:.8g} Hz, sample_rate_hz is {rate:.8g}"
+        raise Unusable("time", f"{found}; needed agreement within {constants.AGREEMENT:g}")
+    # 20000.000000000004 Hz is an artefact of the division.
+    return TimeAxis(rate or float(f"{1 / interval:.10g}"), where, note)
 
 
 def pieces(
@@ -111,40 +115,21 @@ def pieces(
 
 def _check_order(time: Samples) -> None:
     """Require that time stamps are numbers and increase."""
-    if time.size < constants.SHORTEST_PIECE:
-        raise Unusable("empty", f"{time.size} samples; needed at least {constants.SHORTEST_PIECE}")
     unknown = backwards = repeated = 0
     first = None
     for at, stamps in blocks(time, overlap=1):
         steps = np.diff(stamps)
-        wrong = ~(steps > 0)
-        if wrong.any() and first is None:
-            first = at + int(np.argmax(wrong)) + 1
+        if first is None and not (steps > 0).all():
+            first = at + int(np.argmin(steps > 0)) + 1
         unknown += int(np.count_nonzero(~(np.abs(stamps[at > 0 :]) < constants.ABSURD)))
         backwards += int(np.count_nonzero(steps < 0))
         repeated += int(np.count_nonzero(steps == 0))
     if unknown:
         raise Unusable("time", f"{unknown} of {time.size} time stamps are no numbers")
     if backwards or repeated:
-        raise Unusable(
-            "time",
-            f"time_s runs backwards {backwards} times and repeats {repeated} times in "
-            f"{time.size} samples, first at sample {first}; needed increasing time stamps",
-        )
-
-
-def _agreed(interval: float, rate: float | None) -> float:
-    """Choose the sample rate in Hz: that of the metadata, if the time stamps confirm it."""
-    if rate is None:
-        # 20000.000000000004 Hz is an artefact of the division.
-        return float(f"{1 / interval:.10g}")
-    if abs(interval * rate - 1) > constants.AGREEMENT:
-        raise Unusable(
-            "time",
-            f"time_s gives {1 / interval:.8g} Hz, sample_rate_hz is {rate:.8g}; "
-            f"needed agreement within {constants.AGREEMENT:g}",
-        )
-    return rate
+        found = f"time_s runs backwards {backwards} times and repeats {repeated} times"
+        where = f"in {time.size} samples, first at sample {first}"
+        raise Unusable("time", f"{found} {where}; needed increasing time stamps")
 
 
 def set_velocity(

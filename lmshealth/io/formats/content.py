@@ -18,18 +18,10 @@ from lmshealth.io.refusal import Unusable, listed, repeated
 class Content:
     """Content of a file before the log contract is applied.
 
-    Attributes
-    ----------
-    columns : dict of str to ndarray or Stored
-        Wanted columns under their name in the file, each of shape ``(n_samples,)``.
-    metadata : dict of str to str
-        As the file has it.
-    present : tuple of str
-        All column names of the file, for messages.
-    refused : tuple of Refusal
-        Wanted channels that cannot go with the others; the name of the log is added later.
-    hint : str
-        What in the column map may not fit the file, where wanted columns are not found.
+    ``columns`` are the wanted ones under their names in the file, ``(n_samples,)`` each; metadata
+    are text as in the file; ``present`` are the names of all columns, for messages. Refused are
+    wanted channels that cannot go with the others; the name of the log is added later. The hint is
+    what in the column map may not fit the file, where wanted columns are not found.
     """
 
     columns: dict[str, Samples]
@@ -58,21 +50,17 @@ def check_size(decoded: int, stored: int) -> None:
     """Refuse (``too-large``) what would decode to an unreasonable size, before it does."""
     limit = max(constants.SMALL_ENOUGH, constants.LARGEST_RATIO * stored)
     if decoded > limit:
-        raise Unusable(
-            "too-large",
-            f"{stored} bytes would swell to {decoded} or more, allowed are {limit}; "
-            "split the recording, or check where the file comes from",
-        )
+        found = f"{stored} bytes would swell to {decoded} or more, allowed are {limit}"
+        needed = "split the recording, or check where the file comes from"
+        raise Unusable("too-large", f"{found}; {needed}")
 
 
 def check_memory(what: str, needed: float, allowed: float) -> None:
     """Refuse (``too-large``) a part of a file that takes too much memory, before it is read."""
     if needed > allowed:
-        raise Unusable(
-            "too-large",
-            f"{what} needs {needed / 1e9:.2g} GB of memory, allowed are {allowed / 1e9:.2g} GB; "
-            "convert the file to HDF5 or Parquet, or raise --max-memory",
-        )
+        found = f"needs {needed / 1e9:.2g} GB of memory, allowed are {allowed / 1e9:.2g} GB"
+        step = "convert the file to HDF5 or Parquet, or raise --max-memory"
+        raise Unusable("too-large", f"{what} {found}; {step}")
 
 
 def wanted(names: Iterable[str], columns: ColumnMap) -> list[str]:

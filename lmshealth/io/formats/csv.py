@@ -42,23 +42,9 @@ _LONG_ROW = re.compile(r"in line (\d+), saw (\d+)")
 class Text:
     """A text file, read by lines and then by blocks, and checked on the way.
 
-    Parameters
-    ----------
-    stream : BufferedIOBase
-        Bytes of the text, decompressed; seekable.
-    stored : int
-        Bytes on disk, which limit the decompressed size.
-    delimiter : str
-        Between the fields of a row.
-
-    Attributes
-    ----------
-    position : int
-        Byte that is read next.
-    n_fields : int
-        Fields of every row from the position on; 0 where no rows have begun.
-    pending : int
-        Bytes since the last complete row.
+    The stream is seekable and decompressed; ``stored`` bytes on disk limit its size. From
+    ``position`` on, the byte that is read next, every row has ``n_fields`` (0 where no rows have
+    begun); ``pending`` counts the bytes since the last complete row.
     """
 
     def __init__(self, stream: BufferedIOBase, stored: int, delimiter: str) -> None:
@@ -96,11 +82,9 @@ class Text:
                 raise corrupt(f"the last row is cut off: {n_found} of {self.n_fields} fields")
         self.pending += len(block)
         if self.pending > constants.LONGEST_BLOCK:
-            raise Unusable(
-                "corrupt",
-                f"no row ends in {constants.LONGEST_BLOCK} bytes before byte {self.position}; "
-                "needed shorter rows, and a second quote to every quote",
-            )
+            found = f"no row ends in {constants.LONGEST_BLOCK} bytes before byte {self.position}"
+            needed = "needed shorter rows, and a second quote to every quote"
+            raise Unusable("corrupt", f"{found}; {needed}")
         return block
 
     def __iter__(self) -> Iterator[bytes]:
@@ -129,21 +113,9 @@ def _load(path: Path, columns: ColumnMap, max_memory: float) -> Content:
 
 
 def parse_text(stream: Any, stored: int, columns: ColumnMap) -> Content:
-    """Read delimited text block by block.
+    """Read delimited UTF-8 text, with or without byte order mark, block by block.
 
-    Parameters
-    ----------
-    stream : BufferedIOBase
-        UTF-8 text, with or without byte order mark.
-    stored : int
-        Bytes on disk.
-    columns : ColumnMap
-        Wanted columns and the layout.
-
-    Raises
-    ------
-    Unusable
-        With the reasons ``empty``, ``corrupt``, ``too-large``, ``metadata`` and ``columns``.
+    What is wrong is refused as ``empty``, ``corrupt``, ``too-large``, ``metadata`` or ``columns``.
     """
     layout = columns.csv
     text = Text(stream, stored, layout.delimiter)
