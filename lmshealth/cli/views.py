@@ -232,7 +232,7 @@ def _print_places(rows: Sequence[Row]) -> None:
     found = []
     for band in dict.fromkeys(row["band"] for row in rows):
         own = [row for row in rows if row["band"] == band]
-        ends = _range([row["low_hz"] for row in own] + [row["high_hz"] for row in own])
+        ends = _range([row[end] for row in own for end in ("low_hz", "high_hz")])
         identified = any(row["placed_by"] == "identified" for row in own)
         how = "around the identified mode" if identified else "as described; mode not identified"
         strongest = _range([row["strongest_hz"] for row in own])

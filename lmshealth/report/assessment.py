@@ -33,6 +33,8 @@ class Assessment:
     ----------
     stage : Stage
         Description that the logs were analysed with.
+    history, judgement : History, Verdict
+        Modal estimates of all logs, and the verdict.
     digests : tuple of str
         SHA-256 of each log of the history.
     track : Track or None
@@ -45,6 +47,8 @@ class Assessment:
         Everything of this machine that was not analysed.
     notes : tuple of str
         What the reader must take into account, one sentence each.
+    seed : int
+        Seed of all random streams.
     waterfall : Waterfall or None
         Spectra of the logs of the history; None when no log covers the band of the modes.
     evidence : MachineEvidence or None

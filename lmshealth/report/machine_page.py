@@ -60,13 +60,14 @@ def make_page(
     """
     service, parameters = assessment.service(), assessment.stage.parameters
     summary = summarise(assessment, service, file)
+    highest = max((one.high for one in summary.health), default=1.0)
     news: tuple[str, ...] = ()
     if before is not None:
         news = changes(before, reported(assessment, service), parameters)
     content = {
         "assessment": assessment,
         "summary": summary,
-        "bar": _bar_length(summary),
+        "bar": float(np.clip(np.ceil(10 * highest + 0.5) / 10, 1.2, 2.0)),
         "first_limit": _first_limit(assessment.prognosis),
         "before": before,
         "news": news,
@@ -75,7 +76,11 @@ def make_page(
     }
     draw = _track_pictures(assessment, content["influences"])
     draw |= _health_pictures(assessment, service)
-    pictures = {key: _inline(one, key[0], f"p{k}") for k, (key, one) in enumerate(draw.items())}
+    pictures = {}
+    for k, (key, plot) in enumerate(draw.items()):
+        text = figures.svg(plot, salt=f"p{k}", size=_SIZES.get(key[0], figures.SIZE))
+        # An HTML parser needs no namespaces; without them the page names no address at all.
+        pictures[key] = re.sub(r'\sxmlns(:xlink)?="[^"]*"', "", text)
     content["letters"], content["picture"] = share_letters(pictures)
     return Page(file, render("stage.html.j2", generated, **content), summary)
 
@@ -99,12 +104,6 @@ def chi_square_side(value: float, dof: float) -> dict[str, Any] | None:
     low, high = figures.chi_square_band(np.array(dof, dtype=float)).tolist()
     side = "above" if value > high else "below" if value < low else "inside"
     return {"value": value, "dof": dof, "low": low, "high": high, "side": side}
-
-
-def _bar_length(summary: Summary) -> float:
-    """Return one length for all bars of a page, as a fraction of the baseline."""
-    highest = max((one.high for one in summary.health), default=1.0)
-    return float(np.clip(np.ceil(10 * highest + 0.5) / 10, 1.2, 2.0))
 
 
 def _first_limit(prognosis: Prognosis | None) -> tuple[str, float] | None:
@@ -297,12 +296,6 @@ def _health_pictures(assessment: Assessment, service: Service) -> dict[tuple[str
         survival = partial(figures.plot_survival, prognosis=prognosis, service=service)
         draw["survival", "any"] = survival
     return draw
-
-
-def _inline(draw: Any, kind: str, salt: str) -> str:
-    size = _SIZES.get(kind, figures.SIZE)
-    # An HTML parser does not need these namespaces; without them the page names no address at all.
-    return re.sub(r'\sxmlns(:xlink)?="[^"]*"', "", figures.svg(draw, salt=salt, size=size))
 
 
 def _pairs(health: Health) -> Iterator[tuple[tuple[str, ...], str, float]]:

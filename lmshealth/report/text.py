@@ -139,12 +139,6 @@ def whole_km(metres: Number) -> str:
     return f"{metres / _KM:,.0f}{GAP}km".replace(",", GAP).replace("-", "−")
 
 
-def day_count(days: Number) -> str:
-    """Format a number of days, with years from 1,000 days on."""
-    years = f" ({days / 365.25:.1f} years)" if days >= 1000 else ""
-    return f"{coarse(days)}{GAP}days{years}"
-
-
 def travel_left(metres: float, horizon: float) -> str:
     """Format a remaining travel in m; infinite stands for beyond the horizon (m)."""
     if np.isinf(metres):
@@ -153,10 +147,11 @@ def travel_left(metres: float, horizon: float) -> str:
 
 
 def time_left(days: float) -> str:
-    """Format remaining days; infinite stands for beyond the horizon."""
-    if np.isinf(days):
-        return "beyond"
-    return "already passed" if days <= 0 else day_count(days)
+    """Format remaining days, with years from 1,000 on; infinite is beyond the horizon."""
+    if np.isinf(days) or days <= 0:
+        return "already passed" if days <= 0 else "beyond"
+    years = f" ({days / 365.25:.1f} years)" if days >= 1000 else ""
+    return f"{coarse(days)}{GAP}days{years}"
 
 
 def quantiles(
