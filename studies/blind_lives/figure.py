@@ -6,11 +6,9 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from studies.harness.figures import BLUE, ORANGE, write
+from studies.harness.figures import draw_intervals, legend_above, write
 from studies.harness.study import Row
 
-INTERVAL = BLUE
-TRUTH = ORANGE
 PANELS = (
     ("health", "guide_preload", "guide preload, fraction of the first log"),
     ("health", "mount_stiffness", "mount stiffness, fraction of the first log"),
@@ -25,8 +23,7 @@ def draw_figure(figure: Figure, record: Row) -> None:
     _confusion(axes[0], record["verdicts"]["all"]["told_of_true"])
     for ax, panel in zip(axes[1:], PANELS, strict=True):
         _intervals(ax, record["rows"], *panel)
-    handles, labels = axes[1].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside upper right", ncols=2, frameon=False, fontsize=8)
+    legend_above(figure, axes[1], ncols=2, fontsize=8)
 
 
 def _confusion(ax: Axes, table: dict[str, dict[str, int]]) -> None:
@@ -38,10 +35,10 @@ def _confusion(ax: Axes, table: dict[str, dict[str, int]]) -> None:
             ax.text(j, i, f"{count:.0f}", ha="center", va="center", fontsize=9,
                     color="white" if share[i, j] > 0.6 else "black")  # fmt: skip
     names = [name.replace("not-enough-data", "not enough") for name in table]
-    ax.set_xticks(range(len(names)), names, rotation=45, ha="right", fontsize=8)
-    ax.set_yticks(range(len(names)), names, fontsize=8)
-    ax.set_xlabel("reported", fontsize=8)
-    ax.set_ylabel("true", fontsize=8)
+    ax.set_xticks(range(len(names)), names, rotation=45, ha="right")
+    ax.set_yticks(range(len(names)), names)
+    ax.set_xlabel("reported")
+    ax.set_ylabel("true")
 
 
 def _intervals(ax: Axes, rows: list[Row], what: str, name: str, label: str) -> None:
@@ -54,17 +51,8 @@ def _intervals(ax: Axes, rows: list[Row], what: str, name: str, label: str) -> N
             values = (row["truth"][what][name], own["q50"], own["q05"], own["q95"])
             found.append([scale * (top if v is None else v) for v in values])
     if found:
-        true, middle, low, high = np.array(sorted(found)).T
-        y = np.arange(true.size)
-        error = np.stack([middle - low, high - middle])
-        ax.errorbar(middle, y, xerr=error, fmt="o", ms=3, lw=1.0, color=INTERVAL,
-                    label="median and 90 % interval")  # fmt: skip
-        ax.plot(true, y, "D", ms=3.5, mfc="none", mew=1.1, color=TRUTH, label="truth")
-    ax.set_xlabel(label, fontsize=8)
-    ax.set_yticks([])
-    ax.tick_params(labelsize=7)
-    ax.grid(axis="x", alpha=0.3)
+        draw_intervals(ax, *np.array(sorted(found)).T, label)
 
 
 if __name__ == "__main__":
-    write(__file__, draw_figure, (13.0, 4.6), bbox_inches="tight")
+    write(__file__, draw_figure, (13.0, 4.6), font=8, bbox_inches="tight")

@@ -80,23 +80,14 @@ def one_beam(folder: Path, repeat: int, some: slice = slice(None)) -> list[Row]:
     for k, (dwell, volts) in list(enumerate(find_dwells(log)))[some]:
         found = identify_decays(log, stage, segments=[dwell], channels=("acc_low", "acc_high"))
         reference = TABLE[min(TABLE, key=lambda v: abs(v - volts))]
-        row: Row = {
-            "repeat": repeat,
-            "dwell": k,
-            "roller_v": round(volts, 4),
-            "seconds": round((dwell.stop - dwell.start) / log.sample_rate, 3),
-            "reference_hz": reference,
-            "f_hz": None,
-            "refused": "",
-        }
+        seconds = round((dwell.stop - dwell.start) / log.sample_rate, 3)
+        row: Row = {"repeat": repeat, "dwell": k, "roller_v": round(volts, 4), "seconds": seconds,
+                    "reference_hz": reference, "f_hz": None, "refused": ""}  # fmt: skip
         if found.names:
-            row |= {
-                "f_hz": float(found.frequency[0]),
-                "f_std_hz": float(found.frequency_std[0]),
-                "off_hz": float(found.frequency[0] - reference),
-                "zeta": float(found.damping_ratio[0]),
-                "zeta_std": float(found.damping_ratio_std[0]),
-            }
+            row |= {"f_hz": float(found.frequency[0]), "f_std_hz": float(found.frequency_std[0]),
+                    "off_hz": float(found.frequency[0] - reference),
+                    "zeta": float(found.damping_ratio[0]),
+                    "zeta_std": float(found.damping_ratio_std[0])}  # fmt: skip
         else:
             row["refused"] = found.refused[-1].reason
         rows.append(row)

@@ -9,11 +9,12 @@ from pathlib import Path
 import numpy as np
 
 from lmshealth import identify_decays, load_stage, read_log
-from lmshealth.io.log import Channel, Log, Metadata
-from models.dynamics.plant import Mode, closed_loop_modes
+from lmshealth.io.log import Log
+from models.dynamics.plant import closed_loop_modes
 from models.dynamics.stages import STAGES
 from models.recordings.velocities import Experiment, drive_velocities
 from studies.common.cramer_rao import Recording, Vibration, decay_bound
+from studies.common.logs import make_log
 from studies.harness.study import Row
 
 VELOCITIES = (0.1, 0.4)
@@ -25,14 +26,12 @@ RATE = 400.0
 class Case:
     """Stops of a machine."""
 
-    name: str  # What it is about
+    name: str
     modes: tuple[tuple[float, float], ...]  # Natural frequency in Hz and damping ratio
     n_stops: int = 1  # Decays in a log
     seconds: float = 1.0  # Length of each
-    # Standard deviations of the ambient response and of the noise of a sample over the amplitude
-    # right after a stop
-    ambient: float = 0.03
-    noise: float = 0.02
+    ambient: float = 0.03  # Standard deviation of the response over the amplitude after a stop
+    noise: float = 0.02  # The same of the noise of a sample
     n_channels: int = 1  # Channels with independent noise; shapes alternate in sign
 
     def vibration(self) -> Vibration:
@@ -47,8 +46,7 @@ class Case:
     def bound(self) -> np.ndarray:
         """Bound standard deviations of ln f and ln ζ, shape ``(2, n_modes)``.
 
-        Decays begin at random phases, of which the bound is nearly free: phases spread evenly are
-        taken.
+        Decays begin at random phases; the bound hardly depends on them, and has them spread evenly.
         """
         modes = self.vibration()
         f, zeta = modes.frequency, modes.damping_ratio
@@ -111,18 +109,8 @@ def _shaken(rng: np.random.Generator, f: float, zeta: float, std: float, n: int)
 def to_log(x: np.ndarray) -> Log:
     """Join stops to a log whose pieces are one decay each."""
     n_stops, n_channels, n = x.shape
-    return Log(
-        name="simulated",
-        digest="0" * 64,
-        metadata=Metadata(),
-        sample_rate=RATE,
-        channels=tuple(
-            Channel(f"acc_{c}", "acceleration", x[:, c].ravel()) for c in range(n_channels)
-        ),
-        reference_velocity=None,
-        pieces=tuple((k * n, (k + 1) * n) for k in range(n_stops)),
-        refused=(),
-    )
+    signals = {f"acc_{c}": x[:, c].ravel() for c in range(n_channels)}
+    return make_log(signals, RATE, [(k * n, (k + 1) * n) for k in range(n_stops)])
 
 
 def one_machine(name: str, seed: int) -> list[Row]:
@@ -147,11 +135,6 @@ def one_machine(name: str, seed: int) -> list[Row]:
                     row["f_hz"] = f
                     row["z_f"] = float(np.log(f / true.frequency_hz) / std[0, i])
                     row["z_zeta"] = float(np.log(zeta / true.damping_ratio) / std[1, i])
-                    row["nearest"] = _nearest(truth, f)
+                    row["nearest"] = min(truth, key=lambda m: abs(truth[m].frequency_hz - f))
                 rows.append(row)
     return rows
-
-
-def _nearest(truth: dict[str, Mode], f: float) -> str:
-    """Name the mode whose frequency is nearest."""
-    return min(truth, key=lambda name: abs(truth[name].frequency_hz - f))

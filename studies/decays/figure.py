@@ -16,12 +16,11 @@ SYMBOLS = {"f": "frequency", "zeta": "damping"}
 
 def rows_of(cases: Row) -> list[tuple[str, Row]]:
     """List every mode of every case with a name."""
-    rows = []
-    for name, case in cases.items():
-        several = len(case["modes"]) > 1
-        for mode in case["modes"]:
-            rows.append((f"{name}: {mode['f_hz']:g} Hz" if several else name, mode))
-    return rows
+    return [
+        (f"{name}: {mode['f_hz']:g} Hz" if len(case["modes"]) > 1 else name, mode)
+        for name, case in cases.items()
+        for mode in case["modes"]
+    ]
 
 
 def draw_coverage(ax: Axes, rows: list[tuple[str, Row]]) -> None:
@@ -34,12 +33,11 @@ def draw_coverage(ax: Axes, rows: list[tuple[str, Row]]) -> None:
             low, high = found["interval"]
             ax.plot([100 * low, 100 * high], [y + shift] * 2, color=colour, lw=2, alpha=0.6)
             ax.plot(100 * found["share"], y + shift, marker, color=colour, ms=5)
-            for control, sign in (("narrow", "<"), ("wide", ">")):
-                share = 100 * own[control]["share"]
-                ax.plot(share, y + shift, sign, color=colour, ms=4, mfc="white")
-            if "least_squares" in own:
-                share = 100 * own["least_squares"]["share"]
-                ax.plot(share, y + shift, "x", color=PINK, ms=6)
+            for control, sign, ink, size in (("narrow", "<", colour, 4), ("wide", ">", colour, 4),
+                                             ("least_squares", "x", PINK, 6)):  # fmt: skip
+                if control in own:
+                    ax.plot(100 * own[control]["share"], y + shift, sign, color=ink, ms=size,
+                            mfc="white")  # fmt: skip
     for quantity, colour, marker, _ in QUANTITIES:
         ax.plot([], [], marker + "-", color=colour, label=SYMBOLS[quantity])
     ax.plot([], [], "<", color="grey", mfc="white", label="control: 1.5 × narrower")

@@ -26,6 +26,7 @@ from __future__ import annotations
 
 import os
 import zlib
+from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -62,14 +63,12 @@ def main() -> None:
     study = Study(__file__, __doc__)
     quick, trials = study.quick, study.trials
     n_seeds = QUICK_SEEDS if quick else SEEDS
-    cases = CASES[1:2] if quick else CASES
+    cases, quiet = (CASES[1:2], ()) if quick else (CASES, QUIET)
     data = os.environ.get("LMSHEALTH_DATA")
     answer: Row = {
         "n_seeds": n_seeds,
         "cases": {case.name: run_case(case, n_seeds, trials) for case in cases},
-        "quiet": {
-            case.name: run_case(case, QUIET_SEEDS, trials) for case in (() if quick else QUIET)
-        },
+        "quiet": {case.name: run_case(case, QUIET_SEEDS, trials) for case in quiet},
         "machines": judge_machines(1, STAGES[:1]) if quick else judge_machines(MACHINES, STAGES),
         "beam": [
             row
@@ -115,16 +114,12 @@ def judge(answer: Row, *, quick: bool) -> Row:
 
 def run_case(case: Case, n_seeds: int, trials: Trials) -> Row:
     """Identify logs of a case; count what intervals cover, set scatter against the bound."""
-    rows = trials.collect(one_named, [(case.name, seed) for seed in range(n_seeds)])
+    rows = trials.collect(one_log, [(case.name, seed) for seed in range(n_seeds)])
     bound, modes = case.bound(), []
     for i, (f, zeta) in enumerate(case.modes):
         kept = [row[f"mode {f}"] for row in rows if not isinstance(row[f"mode {f}"], str)]
         reasons = [row[f"mode {f}"] for row in rows if isinstance(row[f"mode {f}"], str)]
-        mode: Row = {
-            "f_hz": f,
-            "zeta": zeta,
-            "refused": {reason: reasons.count(reason) for reason in sorted(set(reasons))},
-        }
+        mode: Row = {"f_hz": f, "zeta": zeta, "refused": Counter(sorted(reasons))}
         for k, (quantity, truth) in enumerate((("f", np.log(f)), ("zeta", np.log(zeta)))):
             own = np.array(kept)[:, [k, 2 + k]] - [truth, 0.0]
             mode[quantity] = {name: coverage(own, width) for name, width in WIDTHS.items()} | {
@@ -137,23 +132,13 @@ def run_case(case: Case, n_seeds: int, trials: Trials) -> Row:
                 squares = np.array([row["least squares"] for row in rows])[:, [k, 2 + k]]
                 mode[quantity]["least_squares"] = coverage(squares - [truth, 0.0])
         modes.append(mode)
-    return {
-        "stops": case.n_stops,
-        "seconds": case.seconds,
-        "ambient": case.ambient,
-        "noise": case.noise,
-        "modes": modes,
-    }
+    return {"stops": case.n_stops, "seconds": case.seconds, "ambient": case.ambient,
+            "noise": case.noise, "modes": modes}  # fmt: skip
 
 
-def one_named(name: str, seed: int) -> Row:
-    """Identify one log of the case of a name."""
-    (case,) = (case for case in (*CASES, *QUIET) if case.name == name)
-    return one_log(case, seed)
-
-
-def one_log(case: Case, seed: int) -> Row:
+def one_log(name: str, seed: int) -> Row:
     """Identify one log; return estimates, standard deviations or the reason of each mode."""
+    (case,) = (case for case in (*CASES, *QUIET) if case.name == name)
     rng = np.random.default_rng([seed, zlib.crc32(case.name.encode())])
     x = simulate(case, rng)
     # The description is off by what wear and other people's estimates are off by.
@@ -194,13 +179,12 @@ def least_squares(x: np.ndarray, f: float, zeta: float) -> list[float]:
 
 def judge_machines(n_seeds: int, names: tuple[str, ...]) -> Row:
     """Stop simulated stages; count what the intervals of all their modes cover."""
-    rows = [row for name in names for k in range(n_seeds)
-            for row in one_machine(name, k)]  # fmt: skip
+    rows = [row for name in names for k in range(n_seeds) for row in one_machine(name, k)]
     seen = [row for row in rows if row["f_hz"] is not None]
     reasons = [row["refused"] for row in rows if row["f_hz"] is None]
     return {
         "n_modes": len(rows),
-        "refused": {reason: reasons.count(reason) for reason in sorted(set(reasons))},
+        "refused": Counter(sorted(reasons)),
         "n_taken_for_another": sum(row["nearest"] != row["mode"] for row in seen),
         "largest_z": max(abs(row[z]) for row in seen for z in ("z_f", "z_zeta")),
         "f": coverage(np.array([[row["z_f"], 1.0] for row in seen])),
@@ -213,22 +197,14 @@ def coverage(off: np.ndarray, width: float = 1.0) -> Row:
     """Count how many intervals hold the truth, from deviations and standard deviations."""
     hits, n = int(np.sum(np.abs(off[:, 0]) < Z * width * off[:, 1])), len(off)
     low, high = clopper_pearson(hits, n, LEVEL)
-    return {
-        "n": n,
-        "share": hits / n,
-        "interval": [low, high],
-        "holds": bool(low <= NOMINAL <= high),
-    }
+    holds = low <= NOMINAL <= high
+    return {"n": n, "share": hits / n, "interval": [low, high], "holds": holds}
 
 
 def claims(answer: Row) -> Iterator[Claim]:
     """Claim coverages, errors over their bound, simulated machines and a real beam."""
-    parts = [
-        mode[quantity]
-        for case in answer["cases"].values()
-        for mode in case["modes"]
-        for quantity in ("f", "zeta")
-    ]
+    modes = [mode for case in answer["cases"].values() for mode in case["modes"]]
+    parts = [mode[quantity] for mode in modes for quantity in ("f", "zeta")]
     held = sum(part["coverage"]["holds"] for part in parts)
     squares = [part["least_squares"]["share"] for part in parts if "least_squares" in part]
     shares = [part["coverage"]["share"] for part in parts]

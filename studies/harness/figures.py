@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import matplotlib
+import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
@@ -47,6 +48,17 @@ def draw_shares(
     for row in rows:
         ax.plot([row["low"], row["high"]], [y, y], lw=2, color=colour, alpha=0.6)
         ax.plot(row["share"], y, marker, color=colour, **{"ms": 5, **options})
+
+
+def draw_intervals(ax: Axes, true: Any, middle: Any, low: Any, high: Any, label: str) -> None:
+    """Draw medians and 90 % intervals of several lives, and their truths, one line each."""
+    y, error = np.arange(len(true)), np.stack([middle - low, high - middle])
+    ax.errorbar(middle, y, xerr=error, fmt="o", ms=3.5, lw=1.2, color=BLUE,
+                label="median and 90 % interval")  # fmt: skip
+    ax.plot(true, y, "D", ms=4, mfc="none", mew=1.2, color=ORANGE, label="truth")
+    ax.set_xlabel(label)
+    ax.set_yticks([])
+    ax.grid(axis="x", alpha=0.3)
 
 
 def name_lines(ax: Axes, names: Sequence[str], **options: Any) -> None:

@@ -10,14 +10,8 @@ import numpy as np
 
 from lmshealth.io.log import Log
 from studies.common.cramer_rao import Recording, Vibration, joint_bound
-from studies.identification.records import (
-    Array,
-    Truth,
-    accelerations,
-    counted,
-    fused,
-    with_lines,
-)
+from studies.identification import records
+from studies.identification.records import Array, Truth
 
 # A fit reaches that many damping ratios beyond its modes: the bound is that of the same band.
 REACH = 8.0
@@ -29,14 +23,14 @@ SHAPES = ((1.0, 0.6, -0.4), (0.5, -1.0, 0.7), (-0.3, 0.8, 1.0))
 class Case:
     """A kind of record."""
 
-    name: str  #
-    modes: tuple[Truth, ...]  #
+    name: str
+    modes: tuple[Truth, ...]
     noise: float  # PSD of the noise of each accelerometer, (m/s²)²/Hz
     # Makes a log of a generator, modes and noise
     make: Callable[[np.random.Generator, tuple[Truth, ...], float], Log]
     seconds: float  # Length and number of the records
     moves: int = 1
-    seeds: int = OTHERS  #
+    seeds: int = OTHERS
     # Largest root mean square error over the Cramér-Rao bound that is asked for
     worst: float | None = None
     bounded: bool = True
@@ -68,14 +62,8 @@ def _case(
     name: str, modes: tuple[Truth, ...], snr: float, seconds: float = 60.0, moves: int = 1,
     seeds: int = OTHERS, worst: float | None = None,
 ) -> Case:  # fmt: skip
-    make = partial(_accelerations, seconds=seconds, moves=moves)
+    make = partial(records.accelerations, seconds=seconds, moves=moves)
     return Case(name, modes, _noise(modes[0].damping, snr), make, seconds, moves, seeds, worst)
-
-
-def _accelerations(
-    rng: np.random.Generator, modes: tuple[Truth, ...], noise: float, seconds: float, moves: int
-) -> Log:
-    return accelerations(rng, modes, noise, seconds, moves)
 
 
 def _isolated(damping: float = 0.02) -> tuple[Truth, ...]:
@@ -117,9 +105,9 @@ CASES = (
     _case("isolated as 30 moves of 0.67 s", _isolated(), 100.0, 0.67, 30, worst=1.1),
     _case("isolated as 7 moves of 3 s", _isolated(), 100.0, 3.0, 7, worst=1.1),
     Case("following error and two accelerometers", THREE, _noise(0.015, 100.0),
-         partial(fused, seconds=60.0), 60.0, bounded=False),
+         partial(records.fused, seconds=60.0), 60.0, bounded=False),
     Case("mains and ball pass beside the mode", _isolated(), _noise(0.02, 100.0),
-         partial(with_lines, seconds=60.0), 60.0, worst=1.1),
+         partial(records.with_lines, seconds=60.0), 60.0, worst=1.1),
     Case("following error in encoder counts", _ALONE, 100.0,
-         partial(counted, seconds=20.0), 20.0, bounded=False),
+         partial(records.counted, seconds=20.0), 20.0, bounded=False),
 )  # fmt: skip

@@ -5,7 +5,7 @@ from __future__ import annotations
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from studies.harness.figures import BLUE, GREEN, ORANGE, write
+from studies.harness.figures import BLUE, GREEN, GREY, ORANGE, draw_shares, name_lines, write
 from studies.harness.study import Row
 
 QUANTITIES = {"ln f": (BLUE, "o", -0.18), "ln zeta": (ORANGE, "s", 0.18)}
@@ -19,8 +19,7 @@ def draw_figure(figure: Figure, record: Row) -> None:
     left, right = figure.subplots(1, 2, sharey=True)
     draw_coverage(left, cases, rows)
     draw_efficiency(right, cases, rows)
-    left.set_yticks(range(len(cases)), cases)
-    left.set_ylim(len(cases) - 0.4, -0.6)
+    name_lines(left, cases)
 
 
 def cases_of(rows: list[Row]) -> list[str]:
@@ -42,23 +41,15 @@ def places(cases: list[str], rows: list[Row]) -> list[tuple[float, Row]]:
 def draw_coverage(ax: Axes, cases: list[str], rows: list[Row]) -> None:
     """Draw the share of intervals that hold the truth, with its 99.9 % interval."""
     for quantity, (colour, marker, _) in QUANTITIES.items():
-        own = [(y, row) for y, row in places(cases, rows) if row["quantity"] == quantity]
-        for y, row in own:
-            part = row["coverage"]
-            ax.plot([100 * part["low"], 100 * part["high"]], [y, y], lw=1, color=colour)
-        ax.plot(
-            [100 * row["coverage"]["share"] for _, row in own], [y for y, _ in own], marker,
-            ms=3, color=colour, label=NAMES[quantity], ls="",
-        )  # fmt: skip
-    narrow, wide = (
-        [100 * row[key]["share"] for _, row in places(cases, rows)]
-        for key in ("too_narrow", "too_wide")
-    )
-    y = [place for place, _ in places(cases, rows)]
-    ax.plot(narrow, y, "|", ms=4, color="#999999", label="1.5 times narrower or wider")
-    ax.plot(wide, y, "|", ms=4, color="#999999")
-    ax.axvline(95, color="black", lw=0.8)
-    ax.set_xlabel("95 % intervals that hold the truth, in %;\nbars: 99.9 % Clopper-Pearson")
+        ax.plot([], [], marker, ms=3, color=colour, label=NAMES[quantity])
+    for y, row in places(cases, rows):
+        colour, marker, _ = QUANTITIES[row["quantity"]]
+        draw_shares(ax, y, [row["coverage"]], colour, marker, ms=3)
+        ax.plot([row[key]["share"] for key in ("too_narrow", "too_wide")], [y, y], "|", ms=4,
+                color=GREY)  # fmt: skip
+    ax.plot([], [], "|", ms=4, color=GREY, label="1.5 times narrower or wider")
+    ax.axvline(0.95, color="black", lw=0.8)
+    ax.set_xlabel("share of 95 % intervals that hold the truth;\nbars: 99.9 % Clopper-Pearson")
     ax.legend(loc="upper left", frameon=True, framealpha=0.9)
     ax.grid(axis="x", alpha=0.25)
 
@@ -84,9 +75,5 @@ def draw_efficiency(ax: Axes, cases: list[str], rows: list[Row]) -> None:
 
 
 if __name__ == "__main__":
-    write(
-        __file__,
-        draw_figure,
-        lambda record: (10, 0.42 * len(cases_of(record["cases"])) + 1.4),
-        font=8,
-    )
+    write(__file__, draw_figure,
+          lambda record: (10, 0.42 * len(cases_of(record["cases"])) + 1.4), font=8)  # fmt: skip

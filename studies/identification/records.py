@@ -13,8 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
 
-from lmshealth.io.log import Channel, Log, Metadata
+from lmshealth.io.log import Log
 from lmshealth.stage.description import Description, ModeSpec, Order, Stage
+from studies.common.logs import make_log
 
 Array = NDArray[np.float64]
 
@@ -59,7 +60,7 @@ def accelerations(
     moved = _moved(rng, modes, total, RATE, displacement=False)
     values = moved + rng.standard_normal(moved.shape) * np.sqrt(noise * RATE / 2)
     pieces = [(2 * k * n, 2 * k * n + n) for k in range(moves)]
-    return _log({f"acc_{c}": row for c, row in enumerate(values)}, RATE, pieces)
+    return make_log({f"acc_{c}": row for c, row in enumerate(values)}, RATE, pieces)
 
 
 def fused(rng: np.random.Generator, modes: tuple[Truth, ...], noise: float, seconds: float) -> Log:
@@ -78,7 +79,7 @@ def fused(rng: np.random.Generator, modes: tuple[Truth, ...], noise: float, seco
     floor = noise / (2 * np.pi * 120.0) ** 4
     error = error + rng.standard_normal(n) * np.sqrt(floor * RATE / 2)
     named = {f"acc_{c}": row for c, row in enumerate(values[1:])}
-    return _log({"delta_e": error, **named}, RATE, [(0, n)])
+    return make_log({"delta_e": error, **named}, RATE)
 
 
 def with_lines(
@@ -99,7 +100,7 @@ def with_lines(
     lines = lines + np.sin(ball + phase[0])
     size = np.sqrt(2) * np.std(clean.channels[0].values)
     named = {c.name: c.values + size * lines for c in clean.channels}
-    return _log(named, RATE, [(0, n)], velocity=0.98 * VELOCITY)
+    return make_log(named, RATE, velocity=0.98 * VELOCITY)
 
 
 def counted(rng: np.random.Generator, modes: tuple[Truth, ...], snr: float, seconds: float) -> Log:
@@ -119,7 +120,7 @@ def counted(rng: np.random.Generator, modes: tuple[Truth, ...], snr: float, seco
     slow *= (frequency > 1.0) & (frequency < _SLOW_BELOW)
     motion = fft.irfft(slow, size)[:n]
     error = moved + _SLOW * motion / motion.std()
-    return _log({"delta_e": COUNT * np.round(error / COUNT)}, ENCODER_RATE, [(0, n)])
+    return make_log({"delta_e": COUNT * np.round(error / COUNT)}, ENCODER_RATE)
 
 
 def _moved(
@@ -138,25 +139,3 @@ def _moved(
             mode.shape, force
         )
     return np.asarray(fft.irfft(spectrum, size)[:, :n])
-
-
-def _log(
-    signals: dict[str, Array],
-    rate: float,
-    pieces: list[tuple[int, int]],
-    velocity: float | None = None,
-) -> Log:
-    n = next(iter(signals.values())).size
-    return Log(
-        name="simulated",
-        digest="0" * 64,
-        metadata=Metadata(),
-        sample_rate=rate,
-        channels=tuple(
-            Channel(name, "displacement" if name == "delta_e" else "acceleration", values)
-            for name, values in signals.items()
-        ),
-        reference_velocity=None if velocity is None else np.full(n, velocity),
-        pieces=tuple(pieces),
-        refused=(),
-    )
