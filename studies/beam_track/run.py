@@ -20,7 +20,6 @@ Run time
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterator
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -34,7 +33,7 @@ from lmshealth.tracking.history import History, LogEstimates, build_history
 from lmshealth.tracking.track import track
 from studies.decays.beam import BEAM, REPEATS, one_beam
 from studies.harness.claims import Claim, span
-from studies.harness.study import Row, Study
+from studies.harness.study import Row, Study, real_data
 
 STEP = "track"
 
@@ -49,15 +48,12 @@ QUICK = slice(1, None, 2)
 def main() -> None:
     """Run the study; ``--quick`` does every other dwell of one repeat and records nothing."""
     study = Study(__file__, __doc__)
-    folder = Path(os.environ["LMSHEALTH_DATA"])
-    if study.quick:
-        repeats = [one_repeat(folder, 0, QUICK)]
-    else:
-        repeats = [one_repeat(folder, repeat) for repeat in range(REPEATS)]
+    asked = [(0, QUICK)] if study.quick else [(k, slice(None)) for k in range(REPEATS)]
+    repeats = [one_repeat(real_data(), *one) for one in asked]
     study.conclude({"repeats": repeats, "passed": judge(repeats)})
 
 
-def one_repeat(folder: Path, repeat: int, some: slice = slice(None)) -> Row:
+def one_repeat(folder: Path, repeat: int, some: slice) -> Row:
     """Track one ramp and return, or some of its dwells, without and with covariate."""
     rows = [row for row in one_beam(folder, repeat, some) if row["f_hz"] is not None]
     history, refused = build_history([to_reading(row) for row in rows])

@@ -6,11 +6,19 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from studies.harness.figures import BLUE, GREEN, ORANGE, PINK, SKY, YELLOW, write
+from studies.harness.figures import (
+    BLUE,
+    COLOURS,
+    GREEN,
+    GREY,
+    ORANGE,
+    PINK,
+    draw_shares,
+    name_lines,
+    write,
+)
 from studies.harness.study import Row
 
-GREY = "#888888"
-COLOURS = (BLUE, ORANGE, GREEN, PINK, YELLOW, SKY, "#000000")
 MARKERS = "osD^vPX"
 
 
@@ -35,6 +43,11 @@ def draw_life(ax: Axes, name: str, life: Row) -> None:
     ax.legend(fontsize=7)
 
 
+def draw_rate(ax: Axes, y: float, rate: Row, colour: str, marker: str) -> None:
+    """Draw a share with its interval."""
+    draw_shares(ax, y, [rate | {"share": rate["hits"] / rate["n"]}], colour, marker)
+
+
 def draw_swaps(ax: Axes, result: Row) -> None:
     """Draw the share of lives swapped silently, with its interval."""
     kinds = result["kinds"]
@@ -42,17 +55,13 @@ def draw_swaps(ax: Axes, result: Row) -> None:
         ("nearest_lives_swapped", ORANGE, "s", 0.15, "nearest frequency (control)"),
         ("lives_swapped", BLUE, "o", -0.15, "as associated"),
     ):
+        ax.plot([], [], marker, ms=5, color=colour, label=label)
         for y, row in enumerate(kinds.values()):
-            rate = row[key]
-            ax.plot([rate["low"], rate["high"]], [y + shift] * 2, lw=2, color=colour, alpha=0.6)
-            ax.plot(rate["hits"] / rate["n"], y + shift, marker, ms=5, color=colour,
-                    label=label if y == 0 else None)  # fmt: skip
-    guess, y = result["best_guess_where_nothing_tells"], list(kinds).index("merging")
-    ax.plot([guess["low"], guess["high"]], [y + 0.3] * 2, lw=2, color=PINK, alpha=0.6)
-    ax.plot(guess["hits"] / guess["n"], y + 0.3, "D", ms=5, color=PINK,
-            label="best guess (control)")  # fmt: skip
-    ax.set_yticks(range(len(kinds)), list(kinds), fontsize=8)
-    ax.invert_yaxis()
+            draw_rate(ax, y + shift, row[key], colour, marker)
+    ax.plot([], [], "D", ms=5, color=PINK, label="best guess (control)")
+    y = list(kinds).index("merging") + 0.3
+    draw_rate(ax, y, result["best_guess_where_nothing_tells"], PINK, "D")
+    name_lines(ax, list(kinds), fontsize=8)
     ax.set_xlim(-0.03, 1.03)
     ax.set_xlabel("share of lives, 95 % interval")
     ax.set_title(f"Silent swaps in {result['lives']} lives", fontsize=10)
@@ -62,7 +71,7 @@ def draw_swaps(ax: Axes, result: Row) -> None:
 
 def draw_recovery(ax: Axes, kinds: dict[str, Row]) -> None:
     """Draw the share labelled over logs since the modes are clear of each other."""
-    for (name, row), colour, marker in zip(kinds.items(), COLOURS, MARKERS, strict=True):
+    for (name, row), colour, marker in zip(kinds.items(), COLOURS, MARKERS, strict=False):
         if name != "well apart":
             ax.plot(row["labelled_by_logs_after"], marker + "-", ms=4, color=colour, label=name)
     ax.set_ylim(-0.03, 1.03)
@@ -73,7 +82,7 @@ def draw_recovery(ax: Axes, kinds: dict[str, Row]) -> None:
     ax.grid(alpha=0.25)
 
 
-def draw_shares(ax: Axes, kinds: dict[str, Row]) -> None:
+def draw_labelled(ax: Axes, kinds: dict[str, Row]) -> None:
     """Draw the shares labelled before and after."""
     for key, colour, shift, label in (
         ("labelled_before", GREEN, -0.18, "before"),
@@ -84,8 +93,7 @@ def draw_shares(ax: Axes, kinds: dict[str, Row]) -> None:
         ax.barh(y, share, 0.34, color=colour, label=f"{label} the crossing")
         for at, value in zip(y, share, strict=True):
             ax.text(value + 0.01, at, f"{100 * value:.1f} %", va="center", fontsize=7)
-    ax.set_yticks(range(len(kinds)), list(kinds), fontsize=8)
-    ax.invert_yaxis()
+    name_lines(ax, list(kinds), fontsize=8)
     ax.set_xlim(0, 2.6)
     ax.set_xticks([0, 0.5, 1])
     ax.set_xlabel("share of estimates labelled")
@@ -100,7 +108,7 @@ def draw_figure(figure: Figure, result: Row) -> None:
         draw_life(ax, name, life)
     draw_swaps(axes[1, 0], result)
     draw_recovery(axes[1, 1], result["kinds"])
-    draw_shares(axes[1, 2], result["kinds"])
+    draw_labelled(axes[1, 2], result["kinds"])
 
 
 if __name__ == "__main__":

@@ -25,6 +25,8 @@ MERGED_LOGS = 15
 CLEAR, PURE = 6 * STD_F, 0.9
 
 
+# True ln frequencies ``(n_logs, n_modes)``, shapes ``(n_logs, n_modes, n)``, and the logs in which
+# modes are not clear, ``(n_logs,)``
 Paths = tuple[Array, Array, NDArray[np.bool_]]
 
 
@@ -36,24 +38,18 @@ class Life:
     epochs: tuple[Estimates, ...]  # One for each log
     truth: tuple[tuple[int, ...], ...]  # For each estimate its mode; -1 for a spurious one
     ln_f: Array  # True ln frequencies, ``(n_logs, n_modes)``
-    # Logs before the one are before modes come near each other, from the other on they are clear of
-    # each other again
-    before: int
-    after: int
+    before: int  # The first log with modes near each other
+    after: int  # The first log with modes clear of each other again
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Kind:
     """What a life is like."""
 
-    # Makes true ln frequencies ``(n_logs, n_modes)``, shapes ``(n_logs, n_modes, n)`` and the logs
-    # in which modes are not clear, ``(n_logs,)``
     paths: Callable[[Array, np.random.Generator], Paths]
-    # Whether names are given by the order of frequencies, there are shapes, and logs miss modes and
-    # show what is none
-    named: bool = True
-    shaped: bool = False
-    gaps: bool = False
+    named: bool = True  # By the order of frequencies
+    shaped: bool = False  # With shapes
+    gaps: bool = False  # Logs miss modes and show spurious ones
 
 
 def odometer(rng: np.random.Generator) -> Array:
@@ -188,13 +184,9 @@ def _named(modes: list[int], values: Array, ln_f: Array, names: list[str]) -> tu
 def judge(life: Life, labels: Labels) -> Counter[str]:
     """Compare labels with the truth; a track is the mode that it shows at first.
 
-    Returns
-    -------
-    Counter
-        For the logs before, in and after the crossing: ``real`` estimates of modes, ``labelled``
-        ones of them, ``swapped`` ones that bear the label of another mode; ``spurious`` ones and
-        those ``taken`` for a mode. ``false_births`` are tracks of spurious estimates and second
-        tracks of a mode; ``lives`` is 1, and ``lives_swapped`` too if any is after the crossing.
+    For the logs before, in and after the crossing are counted estimates of modes, those labelled
+    and those with the label of another mode; ``false_births`` are tracks of spurious estimates and
+    second tracks of a mode; ``lives`` is 1, and ``lives_swapped`` if any is after the crossing.
     """
     own = _owners(life, labels)
     modes = list(own.values())
@@ -228,7 +220,7 @@ def recovered(life: Life, labels: Labels) -> NDArray[np.float64]:
     share = np.full(N_AFTER, np.nan)
     for j, k in enumerate(range(life.after, min(life.after + N_AFTER, len(labels)))):
         own = [
-            label is not None for label, i in zip(labels[k], life.truth[k], strict=True) if i >= 0
+            given is not None for given, i in zip(labels[k], life.truth[k], strict=True) if i >= 0
         ]
         share[j] = np.mean(own) if own else np.nan
     return share

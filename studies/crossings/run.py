@@ -32,10 +32,9 @@ from numpy.typing import NDArray
 
 from lmshealth.tracking import constants
 from lmshealth.tracking.association.associate import Association, associate
-from studies.common.metrics import clopper_pearson
-from studies.crossings.lives import KINDS, Kind, Life, judge, make_life, nearest, recovered
+from studies.crossings.lives import KINDS, Life, judge, make_life, nearest, recovered
 from studies.harness.claims import Claim, counted, percents
-from studies.harness.study import Row, Study
+from studies.harness.study import Row, Study, share_row
 
 STEP = "track"
 
@@ -72,11 +71,6 @@ def labels_of(life: Life) -> Association:
 
 
 def of_kind(name: str, n: int) -> Row:
-    """Count what becomes of lives of the kind of a name."""
-    return followed(name, KINDS[name], n)
-
-
-def followed(name: str, kind: Kind, n: int) -> Row:
     """Count what becomes of lives of one kind."""
     count: Counter[str] = Counter()
     control: Counter[str] = Counter()
@@ -99,23 +93,19 @@ def followed(name: str, kind: Kind, n: int) -> Row:
         "spurious_taken_for_a_mode": count["taken"],
         "refused": {why: count[f"refused_{why}"] for why in ("ambiguous", "jump", "spurious")},
         "nearest_lives_swapped": swaps(control),
-        "names": kind.named,
+        "names": KINDS[name].named,
     }
 
 
 def average(share: NDArray[np.float64]) -> list[float | None]:
     """Average over the lives that have a log there."""
-    there = np.isfinite(share)
-    return [
-        round(float(column[own].mean()), 4) if own.any() else None
-        for column, own in zip(share.T, there.T, strict=True)
-    ]
+    columns = [column[np.isfinite(column)] for column in share.T]
+    return [round(float(own.mean()), 4) if own.size else None for own in columns]
 
 
 def swaps(count: Counter[str]) -> Row:
     """Return the share of swapped lives with its 95 % interval."""
-    low, high = clopper_pearson(count["lives_swapped"], count["lives"])
-    return {"hits": count["lives_swapped"], "n": count["lives"], "low": low, "high": high}
+    return share_row(count["lives_swapped"], count["lives"], 0.95)
 
 
 def guessed(n: int) -> Row:
@@ -128,10 +118,15 @@ def guessed(n: int) -> Row:
     return swaps(count)
 
 
+def turning_kinds(kinds: Row) -> list[Row]:
+    """Return the kinds of lives whose modes cross or exchange shapes."""
+    return [row for name, row in kinds.items() if name not in ("merging", "well apart")]
+
+
 def verdicts(answer: Row) -> dict[str, bool]:
     """Return the checks."""
     kinds = answer["kinds"]
-    turning = [row for name, row in kinds.items() if name not in ("merging", "well apart")]
+    turning = turning_kinds(kinds)
     checks = {
         "no life is swapped silently": not any(
             row["lives_swapped"]["hits"] for row in kinds.values()
@@ -168,11 +163,8 @@ def claims(answer: Row) -> Iterator[Claim]:
     """Claim that no label is swapped silently, and that ambiguity is reported."""
     kinds, passed = answer["kinds"], answer["passed"]
     swapped = [row["lives_swapped"] for row in kinds.values()]
-    nearest = [
-        row["nearest_lives_swapped"]
-        for name, row in kinds.items()
-        if name not in ("merging", "well apart")
-    ]
+    turning = turning_kinds(kinds)
+    nearest = [row["nearest_lives_swapped"] for row in turning]
     yield counted(
         f"lives swapped silently, {len(kinds)} kinds",
         sum(row["hits"] for row in swapped),
@@ -181,7 +173,6 @@ def claims(answer: Row) -> Iterator[Claim]:
         f"{sum(row['n'] for row in nearest)} where modes cross or turn",
         met=passed["no life is swapped silently"],
     )
-    turning = [row for name, row in kinds.items() if name not in ("merging", "well apart")]
     yield Claim(
         "estimates labelled after modes have crossed or turned",
         percents(row["labelled_after"] for row in turning),

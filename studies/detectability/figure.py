@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.patheffects import withStroke
 from matplotlib.ticker import ScalarFormatter
 
-from studies.harness.figures import BLUE, GREEN, ORANGE, write
+from studies.harness.figures import BLUE, GREEN, ORANGE, draw_shares, name_lines, write
 from studies.harness.study import Row
 
 COLOURS = {"roll": BLUE, "pitch": ORANGE, "yaw": GREEN}
@@ -65,17 +65,14 @@ def draw_checks(ax: Axes, result: Row) -> None:
         k = arms.index(row["arm"])
         y = keys.index(key) + 0.22 * (k - 1)
         for what, marker in (("power", "o"), ("false_alarms", "x")):
-            rate = row[what]
-            ax.plot([rate["low"], rate["high"]], [y, y], lw=1.2, color=colours[k], alpha=0.6)
-            ax.plot(rate["share"], y, marker, ms=4, color=colours[k])
+            draw_shares(ax, y, [row[what]], colours[k], marker, ms=4)
     for arm, colour in zip(_ARMS.values(), colours, strict=True):
         ax.plot([], [], "o-", color=colour, label=arm)
     ax.plot([], [], "x", color="black", label="false alarms")
     for value in (result["power"], result["false_alarm"]):
         ax.axvline(value, color="black", ls="--", lw=1)
     names = [f"{s[-1].upper()} {_NAMES[p].split()[-1]}, {n} of {t:g} s" for s, p, t, n in keys]
-    ax.set_yticks(range(len(keys)), names)
-    ax.invert_yaxis()
+    name_lines(ax, names)
     ax.set_xlim(-0.02, 1.02)
     ax.set_xlabel("share of losses called, 99.9 % interval")
     ax.set_title("Power and false alarms of the posterior", fontsize=10)
@@ -89,14 +86,14 @@ def draw_law(ax: Axes, result: Row) -> None:
     for mode, colour in COLOURS.items():
         ax.plot(law["durations_s"], law["bound"][mode], color=colour, label=f"{mode}: bound")
         ax.plot(law["durations_s"], law["long_record"][mode], color=colour, ls=":", lw=1)
-        for k, row in enumerate(result["identified"]):
+        for row in result["identified"]:
             own = row["modes"][mode]
             x = row["duration_s"] * {"roll": 0.96, "pitch": 1.0, "yaw": 1.04}[mode]
             ax.errorbar(x, own["rms_error"], 2 * own["rms_error_se"], fmt="o", ms=4, color=colour,
-                        lw=1, label="errors of identified logs, ± 2 se" if k == 0 and mode == "roll"
-                        else None)  # fmt: skip
-            ax.plot(x, own["stated_std"], "_", ms=11, mew=2, color=colour,
-                    label="their stated std" if k == 0 and mode == "roll" else None)  # fmt: skip
+                        lw=1)  # fmt: skip
+            ax.plot(x, own["stated_std"], "_", ms=11, mew=2, color=colour)
+    ax.plot([], [], "o-", ms=4, color="black", label="errors of identified logs, ± 2 se")
+    ax.plot([], [], "_", ms=11, mew=2, color="black", label="their stated std")
     ax.plot([], [], ":", color="black", lw=1, label="law of long records, no noise")
     ax.set(xscale="log", yscale="log", xlabel="length of a log in s", ylabel="std of ln f, one log")
     ax.xaxis.set_major_formatter(ScalarFormatter())

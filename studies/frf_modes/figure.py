@@ -6,7 +6,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from studies.harness.figures import BLUE, GREEN, ORANGE, write
+from studies.harness.figures import BLUE, GREEN, GREY, ORANGE, draw_shares, name_lines, write
 from studies.harness.study import Row
 
 COLOURS = (BLUE, ORANGE)
@@ -34,17 +34,14 @@ def draw_coverage(ax: Axes, cases: Row) -> None:
         for what in ("frequency", "damping"):
             k = len(labels)
             for part, colour, marker in (
-                ("control_narrower", "#999999", "<"),
-                ("control_wider", "#999999", ">"),
+                ("control_narrower", GREY, "<"),
+                ("control_wider", GREY, ">"),
                 ("coverage", COLOURS[0], "o"),
             ):
-                row = case[what][part]
-                ax.plot([row["low"], row["high"]], [k, k], lw=2.5, color=colour)
-                ax.plot(row["share"], k, marker, ms=5, color=colour)
+                draw_shares(ax, k, [case[what][part]], colour, marker)
             labels.append(f"{name}: {'f' if what == 'frequency' else 'ζ'}")
     ax.axvline(0.95, color=GREEN, lw=1)
-    ax.set_yticks(range(len(labels)), labels, fontsize=8)
-    ax.invert_yaxis()
+    name_lines(ax, labels, fontsize=8)
     ax.set_title("simulated; grey: 1.5 × as narrow ◂, wide ▸", fontsize=10)
     ax.set_xlabel("coverage of 95 % intervals, with 99.9 % interval")
     ax.grid(alpha=0.25, axis="x")
