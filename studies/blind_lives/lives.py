@@ -4,17 +4,17 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from functools import cache
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
+from scipy.stats import bernoulli
 
 from lmshealth.health.verdict import degraded_below
 from lmshealth.stage.constants import INFORMED
-from lmshealth.stage.description import Stage, load_stage
+from lmshealth.stage.description import load_stage
 from models.dynamics.stages import stage_named
 from models.lives.degradation import LIVES, Delayed, Law, Steady, Stepped
 from models.lives.simulation import Plan, schedule
@@ -109,13 +109,9 @@ def of_others(rows: Sequence[Row]) -> list[Row]:
 def sureness(rows: Iterable[Row]) -> Row:
     """Return whether verdicts are right as often as stated, with scores of their probabilities.
 
-    Returns
-    -------
-    dict
-        How many were right and how many their probabilities promise, by how many standard
-        deviations (of so many independent trials) the first exceeds the second and whether it is
-        no less; Brier and logarithmic score, and those of a constant probability; the
-        same in bins of the probability.
+    ``z`` is by how many standard deviations (of so many independent trials) the number of right
+    verdicts exceeds what their probabilities promise. Brier and logarithmic scores are followed by
+    those of a constant probability.
     """
     pairs = [
         (row["told"]["probability"], row["told"]["verdict"] == row["truth"]["verdict"])
@@ -137,7 +133,10 @@ def sureness(rows: Iterable[Row]) -> Row:
         "z": round(z, 2),
         "holds": z > _SHORT,
         "brier": [round(float(np.mean((p - right) ** 2)), 4) for p in (reported, base)],
-        "log_score": [round(_log_score(p, right), 4) for p in (reported, base)],
+        "log_score": [
+            round(-float(np.mean(bernoulli.logpmf(right, np.clip(p, _SUREST, 1 - _SUREST)))), 4)
+            for p in (reported, base)
+        ],
         "bins": [
             {"from": _BINS[k], "to": _BINS[k + 1], "told": round(float(reported[own].mean()), 4)}
             | share(map(bool, right[own]))
@@ -147,28 +146,19 @@ def sureness(rows: Iterable[Row]) -> Row:
     }
 
 
-def _log_score(reported: np.ndarray, right: np.ndarray) -> float:
-    p = np.clip(reported, _SUREST, 1 - _SUREST)
-    return float(-np.mean(np.where(right == 1, np.log(p), np.log(1 - p))))
-
-
 def coverages(rows: Iterable[Row], what: str, names: Iterable[str]) -> dict[str, dict[str, Row]]:
-    """Count intervals of what is claimed that hold the truth: ``health`` or what is ``left``.
-
-    Returns
-    -------
-    dict
-        Of every name and level, as they are and shrunk to a third about the median.
-    """
+    """Count intervals of ``health`` or what is ``left`` that hold the truth, also shrunk to a third."""
     found = list(rows)
     reported: dict[str, dict[str, Row]] = {}
     for name in names:
         pairs = [(row["told"][what][name], row["truth"][what][name]) for row in found
                  if name in row["told"][what] and name in row["truth"][what]]  # fmt: skip
         reported[name] = {
-            f"{100 * level:.0f}{way}": _at_least(level, [hold(*pair, ends) for pair in pairs])
+            f"{100 * level:.0f}{way}": _at_least(
+                level, [_holds(*pair, ends, times) for pair in pairs]
+            )
             for level, ends in LEVELS.items()
-            for way, hold in _WAYS.items()
+            for way, times in (("", 1.0), (" shrunk", _SHRUNK))
         }
     return reported
 
@@ -179,46 +169,27 @@ def _at_least(level: float, held: Sequence[bool]) -> Row:
     return share(held) | {"holds": high >= level}
 
 
-def _holds(interval: Row, truth: float | None, ends: tuple[str, str]) -> bool:
-    low, high = (_number(interval[end]) for end in ends)
-    return low <= _number(truth) <= high
-
-
-def _shrunk_holds(interval: Row, truth: float | None, ends: tuple[str, str]) -> bool:
-    low, middle, high = (_number(interval[key]) for key in (ends[0], "q50", ends[1]))
-    true = _number(truth)
+def _holds(interval: Row, truth: float | None, ends: tuple[str, str], times: float) -> bool:
+    """Return whether an interval, shrunk so many times about its median, holds the truth."""
+    # None is past the horizon.
+    low, middle, high, true = (
+        np.inf if value is None else value
+        for value in (interval[ends[0]], interval["q50"], interval[ends[1]], truth)
+    )
+    if times == 1.0:
+        return bool(low <= true <= high)
     if not np.isfinite(middle):  # most of it lies past the horizon, and so must the truth
         return not np.isfinite(true)
-    return middle - (middle - low) / _SHRUNK <= true <= middle + (high - middle) / _SHRUNK
-
-
-def _number(value: float | None) -> float:
-    """Read a travel: None is past the horizon."""
-    return np.inf if value is None else value
-
-
-_WAYS: dict[str, Callable[[Row, float | None, tuple[str, str]], bool]] = {
-    "": _holds,
-    " shrunk": _shrunk_holds,
-}
+    return bool(middle - (middle - low) / times <= true <= middle + (high - middle) / times)
 
 
 def analyse(logs: Path, out: Path, *, quick: bool = False) -> dict[str, Row]:
     """Run the command line over an archive of both stages, and read its results for each machine.
 
-    Parameters
-    ----------
-    logs, out : Path
-        Folders of the archive, and of the answers.
-    quick : bool
-        As in `call`, and with health at the last log alone.
-
-    Returns
-    -------
-    dict
-        By machine: ``verdict`` and ``probability``, ``shown`` on the front page as on its row,
-        quantiles of ``health`` where it is claimed and of what is ``left`` in km (None past the
-        horizon), counts of ``events`` that are no declared work, and of ``refused`` by reason.
+    These are the ``verdict``, its ``probability``, what the front page has ``shown``, quantiles of
+    ``health`` where it is claimed and of what is ``left`` in km (None past the horizon), counts of
+    ``events`` that are no declared work, and of ``refused`` by reason. Quick calls infer health at
+    the last log alone.
     """
     stages = [word for name in STAGES for word in ("--stage", name)]
     call("lmshealth", "run", logs, *stages, "--out", out,
@@ -302,24 +273,14 @@ def plan_of(number: int) -> BlindPlan:
 
 
 def truth_of(plan: Plan, table: pd.DataFrame) -> Row:
-    """Return what is true at the last log.
+    """Return what is true at the last log, from a plan and its ``truth.csv``.
 
-    Parameters
-    ----------
-    plan : Plan
-        The life.
-    table : DataFrame
-        Its ``truth.csv``.
-
-    Returns
-    -------
-    dict
-        ``verdict`` that is right, whether it is ``clear`` of every border, ``health`` as a fraction
-        of the first log, and ``left`` until each limit and any, in km: 0 where it is past, None
-        where no limit is reached. A step to come is in no law: what is left is that of a machine
-        without it, and ``to_come`` is set.
+    This is the right ``verdict``, whether it is ``clear`` of every border, ``health`` as a fraction
+    of the first log, and what is ``left`` until each limit and any, in km: 0 where it is past, None
+    where no limit is reached. A step ``to_come`` is in no law: what is left is that of a machine
+    without it.
     """
-    stage = _described(plan.stage)
+    stage = load_stage(plan.stage)
     limits = {p.name: p for p in stage.parameters if p.name in SEEN[plan.stage]}
     first, last = table.iloc[0], table.iloc[-1]
     health = {name: float(last[name] / first[name]) for name in limits}
@@ -327,7 +288,8 @@ def truth_of(plan: Plan, table: pd.DataFrame) -> Row:
     since = _logs_since_step(plan)
     few = len(table) < stage.description.baseline.logs
     lost = [spec.word for name, spec in limits.items() if health[name] < borders[name]]
-    word = "not-enough-data" if few else "step" if since else _word(lost)
+    worn = "both" if len(lost) == 2 else lost[0] if lost else "healthy"
+    word = "not-enough-data" if few else "step" if since else worn
     if few or since:
         clear = not since if few else since >= CONFIRMED
     else:
@@ -335,15 +297,6 @@ def truth_of(plan: Plan, table: pd.DataFrame) -> Row:
     left, to_come = _left(plan, {n: p.limit.below for n, p in limits.items() if p.limit}, table)
     return {"verdict": word, "clear": clear, "health": health, "left": left,
             "to_come": to_come}  # fmt: skip
-
-
-@cache
-def _described(name: str) -> Stage:
-    return load_stage(name)
-
-
-def _word(lost: list[str]) -> str:
-    return "both" if len(lost) == 2 else lost[0] if lost else "healthy"
 
 
 def _logs_since_step(plan: Plan) -> int:

@@ -27,7 +27,6 @@ Run time
 
 from __future__ import annotations
 
-import json
 import shutil
 import tempfile
 from collections import Counter
@@ -42,7 +41,7 @@ from studies.blind_lives.lives import SEED, BlindPlan, agrees, analyse, plan_of,
 from studies.common.lives import HEALTHY
 from studies.common.metrics import clopper_pearson
 from studies.harness.claims import Claim, counted, number
-from studies.harness.study import LEVEL, Row, Study
+from studies.harness.study import LEVEL, Row, Study, read_record
 
 STEP = "all of it, from raw logs to the report"
 NAMES = {
@@ -53,7 +52,6 @@ NAMES = {
 
 
 N_LIVES, IN_ARCHIVE = 100, 10
-RECORD = Path(__file__).with_name("result.json")
 # A sound one, and one with too few logs.
 QUICK = (
     BlindPlan("lms-x", "temperature-only", 5, 3.0, 61),
@@ -74,7 +72,7 @@ def main() -> None:
     if study.quick:
         rows = archive_of(QUICK, quick=True)
     elif study.options.again:
-        record = json.loads(RECORD.read_text(encoding="utf-8"))
+        record = read_record(__file__)
         rows, took = record["rows"], record["recorded"]
         study.trials.kept_s = took["wall_s"] + took["kept_s"]
     else:
@@ -91,27 +89,15 @@ def one_archive(first: int, n: int) -> list[Row]:
     return archive_of([plan_of(number) for number in range(first, first + n)])
 
 
-def archive_of(
-    plans: Sequence[BlindPlan], keep: Path | None = None, *, quick: bool = False
-) -> list[Row]:
-    """Simulate an archive, have it analysed without its truth, and put both side by side.
-
-    Parameters
-    ----------
-    plans : sequence of BlindPlan
-        The lives.
-    keep : Path, optional
-        Folder that gets pages and tables.
-    quick : bool
-        As in `analyse`.
-    """
+def archive_of(plans: Sequence[BlindPlan], *, quick: bool = False) -> list[Row]:
+    """Simulate an archive, have it analysed without its truth, and put both side by side."""
     with tempfile.TemporaryDirectory() as folder:
         logs, truths, out = (Path(folder) / name for name in ("logs", "truth", "out"))
         truths.mkdir()
         for plan in plans:
             simulate_life(plan, logs / plan.identity)
             shutil.move(logs / plan.identity / "truth.csv", truths / f"{plan.identity}.csv")
-        reported = analyse(logs, keep or out, quick=quick)
+        reported = analyse(logs, out, quick=quick)
         return [
             {
                 "stage": plan.stage,
@@ -130,11 +116,15 @@ def judged(rows: Sequence[Row]) -> Row:
     others = lives.of_others(rows)
     sound = [row for row in rows if row["kind"] in HEALTHY]
     ending = [row for row in rows if row["truth"]["left"]["any"] is not None]
+    refused: Counter[str] = Counter()
+    for row in rows:
+        refused.update(row["told"]["refused"])
     return {
         "seed": SEED,
         "lives": len(rows),
         "verdicts": {
-            name: {"right": lives.share(_right(row) for row in own),
+            name: {"right": lives.share(row["told"]["verdict"] == row["truth"]["verdict"]
+                                        for row in own),
                    "told_of_true": lives.confusion(own)}
             for name, own in (("all", rows), ("clear of borders", clear), (OTHERS, others))
         },
@@ -154,13 +144,9 @@ def judged(rows: Sequence[Row]) -> Row:
         },
         "steps_to_come": sum(row["truth"]["to_come"] for row in rows),
         "ends_beyond_horizon": _beyond(rows),
-        "refused": _refused(rows),
+        "refused": {"logs": sum(row["logs"] for row in rows)} | dict(sorted(refused.items())),
         "front_page": lives.share(agrees(row["told"]) for row in rows),
     }  # fmt: skip
-
-
-def _right(row: Row) -> bool:
-    return bool(row["told"]["verdict"] == row["truth"]["verdict"])
 
 
 def _beyond(rows: Iterable[Row]) -> dict[str, Row]:
@@ -173,14 +159,6 @@ def _beyond(rows: Iterable[Row]) -> dict[str, Row]:
         )
         for name, never in (("reach no limit", True), ("reach a limit", False))
     }
-
-
-def _refused(rows: Iterable[Row]) -> dict[str, int]:
-    """Count what was refused by reason, and logs that exist."""
-    found: Counter[str] = Counter()
-    for row in rows:
-        found.update(row["told"]["refused"])
-    return {"logs": sum(row["logs"] for row in rows), **dict(sorted(found.items()))}
 
 
 def verdicts(answer: Row) -> dict[str, bool]:

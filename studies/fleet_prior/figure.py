@@ -6,10 +6,9 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from studies.harness.figures import BLACK, BLUE, ORANGE, write
+from studies.harness.figures import BLACK, BLUE, GREY, ORANGE, draw_shares, name_lines, write
 from studies.harness.study import Row
 
-GREY = "#999999"
 NAMES = {
     "description": "prior of the description",
     "learned": "learned from its fleet",
@@ -31,12 +30,10 @@ def draw_lost(ax: Axes, ways: Row) -> None:
     for k, (way, found) in enumerate(ways.items()):
         value, error = found["lost_km"]
         ax.errorbar(value, k, xerr=error, fmt="o", color=colour(way), capsize=3)
-    ax.set_yticks(range(len(ways)), [NAMES[way] for way in ways], fontsize=9)
-    ax.invert_yaxis()
+    name_lines(ax, [NAMES[way] for way in ways], fontsize=9)
     ax.set_xlim(left=-60)
-    ax.set_xlabel(
-        "score lost against the known fleet, km\n(CRPS, mean ± standard error over fleets)"
-    )
+    ax.set_xlabel("score lost against the known fleet, km\n"
+                  "(CRPS, mean ± standard error over fleets)")  # fmt: skip
     ax.grid(axis="x", lw=0.3)
 
 
@@ -44,17 +41,13 @@ def draw_coverage(ax: Axes, ways: Row) -> None:
     """Draw coverages of 50 and 90 % intervals with their Clopper-Pearson intervals."""
     for nominal, marker in ((0, "s"), (1, "o")):
         for k, (way, found) in enumerate(ways.items()):
-            one = found["coverage"][nominal]
             at = k + (-0.12, 0.12)[nominal]
-            ax.plot([100 * one["low"], 100 * one["high"]], [at, at], color=colour(way), lw=1.2)
-            ax.plot(100 * one["share"], at, marker, color=colour(way), ms=5)
-        ax.axvline((50, 90)[nominal], color=BLACK, lw=0.8, ls="--")
-    ax.set_yticks(range(len(ways)), [""] * len(ways))
-    ax.set_ylim(len(ways) - 0.5, -0.5)
-    ax.set_xlim(0, 100)
-    ax.set_xlabel(
-        "true remaining lives in 50 % (squares) and\n90 % intervals (circles), % (bars: 99.9 %)"
-    )
+            draw_shares(ax, at, [found["coverage"][nominal]], colour(way), marker)
+        ax.axvline((0.5, 0.9)[nominal], color=BLACK, lw=0.8, ls="--")
+    name_lines(ax, [""] * len(ways))
+    ax.set_xlim(0, 1)
+    ax.set_xlabel("share of true remaining lives in 50 % (squares)\n"
+                  "and 90 % intervals (circles; bars: 99.9 %)")  # fmt: skip
 
 
 def draw_priors(ax: Axes, priors: list[dict[str, list[float]]]) -> None:

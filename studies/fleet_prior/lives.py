@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from datetime import UTC, datetime, timedelta
 
 import msgspec
 import numpy as np
@@ -14,23 +13,20 @@ from lmshealth.prognosis import life_likelihood as model
 from lmshealth.stage.degradation_laws import HertzWear, Unchanging
 from lmshealth.stage.description import ScatterPrior, Stage, load_stage
 from lmshealth.tracking.covariates import regressors
-from lmshealth.tracking.history import History, Series
+from lmshealth.tracking.history import History
+from studies.common.histories import make_history
 from studies.sbc_life.lives import Part
 
 Array = NDArray[np.float64]
-START = datetime(2026, 3, 1, tzinfo=UTC)
 
 
 @dataclass(frozen=True)
 class Age:
-    """How long machines have been followed: logs, and the odometer in km.
-
-    The odometer is lognormal, by its median and the standard deviation of its logarithm.
-    """
+    """How long machines have been followed."""
 
     n_logs: int
-    median_km: float
-    sigma: float
+    median_km: float  # of the lognormal odometer
+    sigma: float  # of its logarithm
 
 
 MATURE, YOUNG = Age(24, 2000.0, 0.7), Age(8, 200.0, 0.5)
@@ -70,16 +66,12 @@ def draw_fleet(rng: np.random.Generator, stage: Stage) -> Stage:
         msgspec.structs.replace(none, weight=1 - share),
     )
     parameters = model.scatter_prior(stage)
-    scatter = ScatterPrior(
-        *(_of_values(rng, getattr(parameters, f)) for f in ScatterPrior.__slots__)
-    )
-    own = _with(stage, (msgspec.structs.replace(preload, law=laws), mount))
-    return replace(own, scatter=scatter)
-
-
-def _of_values(rng: np.random.Generator, parameters: tuple[float, ...]) -> tuple[float, ...]:
-    drawn = rng.dirichlet(len(parameters) * np.array(parameters) / sum(parameters))
-    return tuple((drawn + 1e-9).tolist())
+    scatter = []
+    for name in ScatterPrior.__slots__:
+        own = np.array(getattr(parameters, name))
+        scatter.append(tuple((rng.dirichlet(own.size * own / own.sum()) + 1e-9).tolist()))
+    fleet = _with(stage, (msgspec.structs.replace(preload, law=laws), mount))
+    return replace(fleet, scatter=ScatterPrior(*scatter))
 
 
 def longer_lived(fleet: Stage, times: float) -> Stage:
@@ -100,11 +92,13 @@ def _with(stage: Stage, parameters: tuple[object, ...]) -> Stage:
 
 def draw(rng: np.random.Generator, fleet: Stage, age: Age) -> Life:
     """Draw a machine of a fleet; one that leaves the modal map is taken out at the log before."""
+    assert fleet.modal_map is not None
     while True:
         now = 1000 * age.median_km * np.exp(age.sigma * rng.standard_normal())
         clock = now * np.r_[0.0, np.sort(rng.uniform(size=age.n_logs - 2)), 1.0]
         part, path = _part(rng, fleet, clock)
-        n = _inside(fleet, path)
+        inside = fleet.modal_map.inside(path)
+        n = clock.size if inside.all() else int(np.argmin(inside))
         if n >= 4:
             break
     clock, path = clock[:n], path[:n]
@@ -120,7 +114,11 @@ def draw(rng: np.random.Generator, fleet: Stage, age: Age) -> Life:
     for one in regressors(covariates, fleet):
         values += np.outer(one.values, one.prior_std * rng.standard_normal(2))
     values += scale * std * rng.standard_normal((n, 2))
-    return Life(_history(names, clock, covariates, values, std), part)
+    cov = np.zeros((n, 4, 4))
+    cov[:, [0, 1], [0, 1]] = std**2
+    cov[:, [2, 3], [2, 3]] = 0.05**2
+    estimates = values, np.full((n, 2), np.log(0.015)), cov
+    return Life(make_history(names, 1e5 + clock, estimates, covariates=covariates), part)
 
 
 def _part(rng: np.random.Generator, fleet: Stage, clock: Array) -> tuple[Part, Array]:
@@ -141,13 +139,6 @@ def _part(rng: np.random.Generator, fleet: Stage, clock: Array) -> tuple[Part, A
     return part, np.column_stack([ln_preload, np.zeros(clock.size)])
 
 
-def _inside(fleet: Stage, path: Array) -> int:
-    """Count the logs before a life leaves the modal map."""
-    assert fleet.modal_map is not None
-    inside = fleet.modal_map.inside(path)
-    return path.shape[0] if inside.all() else int(np.argmin(inside))
-
-
 def _modes(
     rng: np.random.Generator, fleet: Stage, names: tuple[str, ...], clock: Array, path: Array
 ) -> Array:
@@ -166,26 +157,3 @@ def _modes(
 def _shares(fleet: Stage, field: str) -> Array:
     weight = np.array(getattr(model.scatter_prior(fleet), field))
     return np.asarray(weight / weight.sum())
-
-
-def _history(
-    names: tuple[str, ...], clock: Array, covariates: dict[str, Array], values: Array, std: Array
-) -> History:
-    n = clock.size
-    cov = np.zeros((n, 4, 4))
-    cov[:, [0, 1], [0, 1]] = std**2
-    cov[:, [2, 3], [2, 3]] = 0.05**2
-    return History(
-        stage="FLEET-1",
-        logs=tuple(f"{k:03d}" for k in range(n)),
-        recorded_at=tuple(START + timedelta(days=k) for k in range(n)),
-        travel=1e5 + clock,
-        covariates=covariates,
-        modes=names,
-        series=tuple(Series(name, "acc") for name in names),
-        ln_frequency=values,
-        ln_damping=np.full((n, 2), np.log(0.015)),
-        cov=cov,
-        loop_error=np.full(n, np.nan),
-        baselines=(0,),
-    )

@@ -25,12 +25,13 @@ Run time
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import sem
 
 from lmshealth.prognosis.fleet_prior import (
     FleetPrior,
@@ -67,7 +68,6 @@ WORN, FOREIGN = "only the worn teach", "another fleet teaches"
 WAYS = (DESCRIPTION, LEARNED, LAWS, KNOWN, WORN, FOREIGN)
 SEEN_TO_WEAR = 0.95
 SURE = 3.0  # standard errors
-_MODEL = ("courses", "density", "fleet", "importance", "laws", "life", "lifefit", "passage")
 
 
 def main() -> None:
@@ -81,11 +81,12 @@ def main() -> None:
         "teachers": N_TEACHERS[kind],
         "young": sum(len(row["young"]) for row in rows),
         # A small fleet may have too few worn machines.
-        "ways": {way: judged(rows, way) for way in WAYS if was_told(rows, way)},
+        "ways": {way: judged(rows, way) for way in WAYS
+                 if any(way in young for row in rows for young in row["young"])},
         "priors": [
             {"true": row["true"]} | young["priors"] for row in rows for young in row["young"][:1]
         ],
-    }
+    }  # fmt: skip
     answer["passed"] = verdicts(answer["ways"], n)
     study.conclude(answer)
 
@@ -106,7 +107,10 @@ def one(kind: str, number: int) -> Row:
     rng = np.random.default_rng([SEED, number])
     fleet = draw_fleet(rng, described())
     mature = evidence_of(rng, fleet, kind, number)
-    worn = {k: evidence for k, evidence in mature.items() if visibly_wears(evidence)}
+    worn = {
+        k: evidence for k, evidence in mature.items()
+        if evidence.laws["guide_preload"]["hertz-wear"].posterior >= SEEN_TO_WEAR
+    }  # fmt: skip
     sources = {LEARNED: mature, WORN: worn}
     if number < FOREIGN_FLEETS:
         other = np.random.default_rng([SEED, number, 1])
@@ -134,11 +138,6 @@ def evidence_of(
         life = posterior(draw(rng, fleet, MATURE), described(), number)
         found[f"grown-{k:02d}"] = machine_evidence(described(), life)
     return found
-
-
-def visibly_wears(evidence: MachineEvidence) -> bool:
-    """Return whether a machine is seen to wear."""
-    return evidence.laws["guide_preload"]["hertz-wear"].posterior >= SEEN_TO_WEAR
 
 
 def posterior(drawn: Life, stage: Stage, number: int) -> LifePosterior:
@@ -176,7 +175,9 @@ def young_machine(
             continue
         stage = prior.apply_to(described())
         predicted[way] = left(posterior(drawn, stage, number), drawn.now)
-        priors[way] = learned_numbers(prior)
+        law = prior.laws[0]
+        assert law.pace is not None
+        priors[way] = numbers(law.pace[1], law.share[1])
         if way == LEARNED:
             laws = replace(stage, scatter=None)
             predicted[LAWS] = left(posterior(drawn, laws, number), drawn.now)
@@ -188,15 +189,8 @@ def young_machine(
     }
 
 
-def learned_numbers(prior: FleetPrior) -> list[float]:
-    """Return the learned median (km) and sigma of wear lives, and the share that wears."""
-    law = prior.laws[0]
-    assert law.pace is not None
-    return numbers(law.pace[1], law.share[1])
-
-
 def numbers(prior: Prior, share: float) -> list[float]:
-    """Return median and sigma of a prior of lives, and the share that has one."""
+    """Return median (km) and sigma of a prior of wear lives, and the share that wears."""
     assert isinstance(prior, Lognormal)
     return [round(prior.median), round(prior.sigma, 3), round(share, 3)]
 
@@ -204,9 +198,8 @@ def numbers(prior: Prior, share: float) -> list[float]:
 def left(life: LifePosterior, now: float) -> Array:
     """Draw the remaining life, in m."""
     part = [(0, described().parameters[0])]
-    return remaining_travel(life, part, np.random.default_rng(SEED), now=now, horizon=horizon())[
-        :, 0
-    ]
+    rng = np.random.default_rng(SEED)
+    return remaining_travel(life, part, rng, now=now, horizon=horizon())[:, 0]
 
 
 def scored(draws: Array, truth: float, known: Array, rng: np.random.Generator) -> Row:
@@ -227,11 +220,6 @@ def below(draws: Array, travel: Array) -> Array:
     return np.asarray(np.searchsorted(np.sort(draws), travel, side="right") / draws.size)
 
 
-def was_told(rows: list[Row], way: str) -> bool:
-    """Return whether any machine has a prognosis in one way."""
-    return any(way in young for row in rows for young in row["young"])
-
-
 def judged(rows: list[Row], way: str) -> Row:
     """Judge the prognoses of one way, with standard errors over fleets."""
     fleets = [[one for one in row["young"] if way in one] for row in rows]
@@ -246,21 +234,19 @@ def judged(rows: list[Row], way: str) -> Row:
         ],
     }
     for what in ("crps_km", "lost_km", "width_km"):
-        answer[what] = mean(np.array([np.mean([one[way][what] for one in y]) for y in fleets]))
-        off = [np.mean([one[way][what] - one[DESCRIPTION][what] for one in y]) for y in fleets]
-        answer[f"{what}_over_description"] = mean(np.array(off))
-        off = [
-            np.mean([one[way][what] - one[LEARNED][what] for one in y if LEARNED in one])
-            for y in fleets
-        ]
-        answer[f"{what}_over_learned"] = mean(np.array(off))
+        answer[what] = mean([np.mean([one[way][what] for one in young]) for young in fleets])
+        for other in (DESCRIPTION, LEARNED):
+            answer[f"{what}_over_{other}"] = mean([
+                np.mean([one[way][what] - one[other][what] for one in young if other in one])
+                for young in fleets
+            ])  # fmt: skip
     return answer
 
 
-def mean(values: Array) -> list[float]:
+def mean(values: Sequence[float | np.floating]) -> list[float]:
     """Return a mean over fleets and its standard error; 0 for a single fleet."""
-    error = values.std(ddof=1) / np.sqrt(values.size) if values.size > 1 else 0.0
-    return [round(float(values.mean()), 4), round(float(error), 4)]
+    error = sem(values) if len(values) > 1 else 0.0
+    return [round(float(np.mean(values)), 4), round(float(error), 4)]
 
 
 def verdicts(ways: Mapping[str, Row], n: int) -> dict[str, bool]:
@@ -308,7 +294,7 @@ def claims(answer: Row) -> Iterator[Claim]:
         learned["coverage"][1:],
         f"50 %: {percents([learned['coverage'][0]['share']])}",
     )
-    for way in ("only the worn teach", "another fleet teaches"):
+    for way in (WORN, FOREIGN):
         wrong = ways[way]
         yield Claim(
             f"lost if {way} (control)",
