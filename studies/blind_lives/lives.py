@@ -147,7 +147,7 @@ def sureness(rows: Iterable[Row]) -> Row:
 
 
 def coverages(rows: Iterable[Row], what: str, names: Iterable[str]) -> dict[str, dict[str, Row]]:
-    """Count intervals of ``health`` or what is ``left`` that hold the truth, also shrunk to a third."""
+    """Count intervals of ``health`` or what is ``left`` that hold the truth, and those shrunk."""
     found = list(rows)
     reported: dict[str, dict[str, Row]] = {}
     for name in names:
