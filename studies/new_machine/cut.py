@@ -55,10 +55,5 @@ def write_logs(recording: Path, folder: Path) -> None:
         table.writerows(rows)
 
 
-def stiffness_of(k: int) -> float:
-    """Return what is left of the stiffness of bench-B at its log ``k``."""
-    return (1 - SLOWER * k) ** 2
-
-
 if __name__ == "__main__":
     main()

@@ -26,29 +26,19 @@ def draw_figure(figure: Figure, result: Row) -> None:
         )
         week = week / HOURS_PER_WEEK
         ax.plot(week, truth, color="black", lw=0.8, label="truth" if name == "bench-A" else None)
-        ax.errorbar(
-            week,
-            mid,
-            [mid - low, high - mid],
-            fmt=marker,
-            color=colour,
-            ms=4,
-            capsize=3,
-            label=label,
-        )
+        style = {"fmt": marker, "color": colour, "ms": 4, "capsize": 3, "label": label}
+        ax.errorbar(week, mid, [mid - low, high - mid], **style)
     now = max(row["hours"] for row in result["stiffness"])
     left = result["remaining"]
     ends = [left["bench-B"][f"rul_km_{q}"] for q in ("q05", "q50", "q95")]
     low, mid, high = ((now + hours) / HOURS_PER_WEEK for hours in ends)
-    ax.errorbar(
-        mid, result["limit"], xerr=[[mid - low], [high - mid]], fmt="s", color=STYLES["bench-B"][0],
-        mfc="none", ms=6, capsize=3, label="bench-B reaches the limit, 90 %",
-    )  # fmt: skip
+    style = {"color": ORANGE, "mfc": "none", "ms": 6, "capsize": 3}
+    label, reach = "bench-B reaches the limit, 90 %", [[mid - low], [high - mid]]
+    ax.errorbar(mid, result["limit"], xerr=reach, fmt="s", label=label, **style)
     true_end = (now + left["true_of_bench-B_h"]) / HOURS_PER_WEEK
     ax.plot(true_end, result["limit"], "kx", ms=7, label="truth, if it goes on like this")
     ax.axhline(result["limit"], color="#777777", lw=0.8, ls="--")
-    ax.set_xlabel("weeks, as the manifest says")
-    ax.set_ylabel("coupling stiffness / baseline")
+    ax.set(xlabel="weeks, as the manifest says", ylabel="coupling stiffness / baseline")
     ax.legend(fontsize=8)
     ax.grid(alpha=0.3)
 

@@ -27,12 +27,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("hz", type=float, help="of the mode at commissioning")
     parser.add_argument("out", type=Path)
-    parser.add_argument(
-        "--motor",
-        type=Path,
-        metavar="FRF.json",
-        help="vary the load's inertia too; its share is told by the antiresonance of this response",
-    )
+    motor_help = "vary the load's inertia too; the antiresonance of this response gives its share"
+    parser.add_argument("--motor", type=Path, metavar="FRF.json", help=motor_help)
     options = parser.parse_args()
     write_map(options.out, options.hz, options.motor and read_antiresonance(options.motor))
 
@@ -44,14 +40,9 @@ def read_antiresonance(path: Path) -> float:
 
 
 def write_map(path: Path, hz: float, antiresonance: float | None = None) -> None:
-    """Write the frequency over a grid of the stiffness, and of the load's inertia where asked.
+    """Write the frequency (Hz) over a grid of the stiffness, and of the load's inertia.
 
-    Parameters
-    ----------
-    path : Path
-        Of the map.
-    hz, antiresonance : float
-        Of the mode, and of the motor's angle where the load is varied, in Hz.
+    The load is varied where the ``antiresonance`` of the motor's angle is given, in Hz.
     """
     motor_over_load = 0.0 if antiresonance is None else 1 / ((hz / antiresonance) ** 2 - 1)
     loads = np.ones(1) if antiresonance is None else LOAD

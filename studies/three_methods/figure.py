@@ -7,7 +7,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter, StrMethodFormatter
 
-from studies.harness.figures import BLUE, GREEN, ORANGE, write
+from studies.harness.figures import BLUE, GREEN, ORANGE, legend_above, write
 from studies.harness.study import Row
 
 SENSORS = {
@@ -30,19 +30,17 @@ def draw_response(gain: list[Axes], coherence: Axes, example: Row) -> None:
     for ax, (name, (label, scale, unit, colour)) in zip(gain, SENSORS.items(), strict=True):
         part = example[name]
         hertz = part["frequency_hz"]
-        ax.semilogy(hertz, scale * np.array(part["gain"]), ".", ms=3, color=colour,
-                    label="measured")  # fmt: skip
-        ax.semilogy(part["fit_hz"], scale * np.array(part["fit"]), lw=1, color="black", label="fit")
-        ax.set_title(f"FRF, current to {label}", fontsize=10)
+        measured, fit = scale * np.array(part["gain"]), scale * np.array(part["fit"])
+        ax.semilogy(hertz, measured, ".", ms=3, color=colour, label="measured")
+        ax.semilogy(part["fit_hz"], fit, lw=1, color="black", label="fit")
+        ax.set_title(f"FRF, current to {label}")
         ax.set_ylabel(f"gain in {unit}")
         ax.legend(frameon=False, fontsize=8)
         ax.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
         ax.yaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
         ax.yaxis.set_minor_formatter(NullFormatter())
-        missing = part["missing_coherence"]
-        coherence.semilogy(hertz, missing, ".", ms=3, color=colour, label=label)
-    coherence.set_title("what is missing of a coherence of 1", fontsize=10)
-    coherence.set_ylabel("1 - coherence")
+        coherence.semilogy(hertz, part["missing_coherence"], ".", ms=3, color=colour, label=label)
+    coherence.set(title="what is missing of a coherence of 1", ylabel="1 - coherence")
     coherence.legend(frameon=False, fontsize=8, loc="upper right")
     for ax in (*gain, coherence):
         ax.set_xlabel("frequency in Hz")
@@ -53,23 +51,22 @@ def draw_mode(ax: Axes, name: str, mode: Row, rows: list[Row]) -> None:
     """Draw what every method found in every log, less the truth."""
     reach = _REACH * max(m.get("median_std_hz", 0.0) for m in mode["methods"].values())
     for k, (method, (label, colour, marker)) in enumerate(METHODS.items()):
-        found = [(i, *row[method][name]) for i, row in enumerate(rows)
-                 if not isinstance(row[method][name], str)]  # fmt: skip
+        cells = [(i, row[method][name]) for i, row in enumerate(rows)]
+        found = [(i, *cell) for i, cell in cells if not isinstance(cell, str)]
         if not found or (method == "frf_worn" and name != "pitch"):
             continue
         index, f, std = np.array(found).T
-        off = f - mode["truth_hz"]
+        x, off = index + 0.2 * (k - 1), f - mode["truth_hz"]
         inside = np.abs(off) < reach
-        x = index + 0.2 * (k - 1)
-        ax.errorbar(x[inside], off[inside], 2 * std[inside], fmt=marker, ms=3.5, lw=0.9,
-                    color=colour, label=f"{label}, ±2σ")  # fmt: skip
+        style = {"fmt": marker, "ms": 3.5, "lw": 0.9, "label": f"{label}, ±2σ"}
+        ax.errorbar(x[inside], off[inside], 2 * std[inside], color=colour, **style)
         for at, by in zip(x[~inside], off[~inside], strict=True):
-            edge = np.sign(by) * 0.97 * reach
-            ax.annotate(f"{by:+.1f}", (at, edge), ha="center", va="top" if by > 0 else "bottom",
-                        fontsize=6, color=colour, rotation=90)  # fmt: skip
+            place = {"ha": "center", "va": "top" if by > 0 else "bottom", "rotation": 90}
+            edge = at, np.sign(by) * 0.97 * reach
+            ax.annotate(f"{by:+.1f}", edge, fontsize=6, color=colour, **place)
     ax.axhline(0.0, lw=1, color=GREEN)
     ax.set_ylim(-reach, reach)
-    ax.set_title(f"{name}, {mode['truth_hz']:.2f} Hz: {mode['verdict']}", fontsize=10)
+    ax.set_title(f"{name}, {mode['truth_hz']:.2f} Hz: {mode['verdict']}")
     ax.set_xlabel("seed")
     ax.xaxis.set_major_locator(MaxNLocator(integer=True))
     ax.grid(alpha=0.25)
@@ -83,8 +80,7 @@ def draw_figure(figure: Figure, result: Row) -> None:
     for ax, name in zip(axes[1], MODES, strict=True):
         draw_mode(ax, name, result["stages"][STAGE]["modes"][name], rows)
     axes[1, 0].set_ylabel("frequency less eigenvalue in Hz")
-    handles, labels = axes[1, 1].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=4, frameon=False)
+    legend_above(figure, axes[1, 1], ncols=4)
 
 
 if __name__ == "__main__":
