@@ -24,6 +24,7 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -61,23 +62,21 @@ def main() -> None:
     )
 
 
-class _checkout:
-    """A worktree of a revision while a block runs, unless the folder has it already."""
+@contextmanager
+def _checkout(revision: str, folder: Path) -> Iterator[Path]:
+    """Make a worktree of a revision while a block runs, unless the folder has it already."""
 
-    def __init__(self, revision: str, folder: Path) -> None:
-        self._revision, self._folder = revision, folder
-        self._own = not folder.exists()
+    def git(*words: object) -> None:
+        subprocess.run(["git", "worktree", *words], cwd=ROOT, check=True, capture_output=True)
 
-    def __enter__(self) -> Path:
-        if self._own:
-            command = ["git", "worktree", "add", "--detach", "-f", self._folder, self._revision]
-            subprocess.run(command, cwd=ROOT, check=True, capture_output=True)
-        return self._folder
-
-    def __exit__(self, *_: object) -> None:
-        if self._own:
-            command = ["git", "worktree", "remove", "--force", self._folder]
-            subprocess.run(command, cwd=ROOT, check=True, capture_output=True)
+    if folder.exists():
+        yield folder
+        return
+    git("add", "--detach", "-f", folder, revision)
+    try:
+        yield folder
+    finally:
+        git("remove", "--force", folder)
 
 
 def call(code: Path, *arguments: str | Path, out: Path | None = None) -> None:
