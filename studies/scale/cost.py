@@ -123,13 +123,6 @@ def marginal(less: Row, more: Row, *, by: Row | None = None) -> float:
     return (costs[1] - costs[0]) / (more["logs"] - less["logs"]) / yardstick
 
 
-def overhead_of(row: Row) -> float:
-    """Return what reading, store and bookkeeping cost, as a share of the identification."""
-    _, identified, other = row["yardstick_ms"]
-    whole = row["seconds"]["reading"] + row["seconds"]["identifying"]
-    return float((1e3 * whole / row["logs"] - other) / identified - 1)
-
-
 def main() -> None:
     """Run the study; ``--quick`` does small archives and records nothing."""
     study = Study(__file__, __doc__, one="")
@@ -143,15 +136,18 @@ def main() -> None:
     uneven = first[0] if quick else once(sized, LONGER, 4 * sizes[0])[0]
     beside = first[1] if quick else once(sized, "beside", sizes[1])[0]
     slopes = [marginal(*pair) for pair in pairwise(first)]
-    largest = first[-1]
+    _, identified, other = beside["yardstick_ms"]
+    per_log = (
+        1e3 * (beside["seconds"]["reading"] + beside["seconds"]["identifying"]) / beside["logs"]
+    )
     answer = {
         "sizes": list(first),
         "from the store": list(again),
         "marginal_cost": [round(slope, 3) for slope in slopes],
         "marginal_ratio": round(slopes[1] / slopes[0], 3),
         "beside": beside,
-        "overhead": round(overhead_of(beside), 3),
-        "memory_ratio": round(largest["memory_mb"] / first[1]["memory_mb"], 3),
+        "overhead": round((per_log - other) / identified - 1, 3),
+        "memory_ratio": round(first[-1]["memory_mb"] / first[1]["memory_mb"], 3),
         "control_ratio": None if quick else round(marginal(first[0], uneven, by=first[1]), 3),
     }
     loose = QUICK if quick else 1.0

@@ -41,16 +41,13 @@ FULL, QUICK = Plan("lms-y", "both", 40, 20.0, 3), Plan("lms-x", "preload-wear", 
 
 
 def staged(folder: Path, quick: bool) -> Row:
-    """Analyse the full life or a short one."""
-    if quick:  # health and life take most of the time by far
-        return one_stage(folder, QUICK, 1, without_health(load_stage(QUICK.stage)))
-    return one_stage(folder, FULL, 40, load_stage(FULL.stage))
-
-
-def without_health(stage: Stage) -> Stage:
-    """Return the same stage with its modes alone."""
-    told = msgspec.structs.replace(stage.description, parameter=(), map=None)
-    return replace(stage, description=told, modal_map=None)
+    """Analyse the full life, or a short one without health and life, which take most time."""
+    plan, epochs = (QUICK, 1) if quick else (FULL, 40)
+    stage = load_stage(plan.stage)
+    if quick:
+        modes = msgspec.structs.replace(stage.description, parameter=(), map=None)
+        stage = replace(stage, description=modes, modal_map=None)
+    return one_stage(folder, plan, epochs, stage)
 
 
 def one_stage(folder: Path, plan: Plan, epochs: int, stage: Stage) -> Row:

@@ -64,40 +64,19 @@ def _row(k: int, rng: np.random.Generator) -> Summary:
 
 
 def _parameter(name: str, level: float, std: float) -> ParameterHealth:
+    quantiles = {"low": level - 1.6 * std, "median": level, "high": level + 1.6 * std}
+    limit = {"limit": LIMITS[name], "below_limit": 0.0}
     return ParameterHealth(
-        name=name,
-        determined=True,
-        converged=True,
-        informed=0.96,
-        low=level - 1.6 * std,
-        median=level,
-        high=level + 1.6 * std,
-        limit=LIMITS[name],
-        below_limit=0.0,
+        name=name, determined=True, converged=True, informed=0.96, **quantiles, **limit
     )
 
 
 def _life(identity: str, days: float) -> Life:
     spread = tuple(max(factor * days, 0.0) for factor in (0.8, 0.85, 0.9, 1.0, 1.15, 1.3, 1.4))
-    any_limit = LimitLife(
-        parameter="any",
-        limit=np.nan,
-        baseline=1.0,
-        travel=tuple(day * USAGE for day in spread),
-        days=spread,
-        dates=(None,) * len(spread),
-        already_past=0.01,
-        beyond_horizon=0.01,
-    )
-    return Life(
-        stage=identity,
-        recorded_at=datetime(TODAY.year, TODAY.month, TODAY.day, tzinfo=UTC),
-        travel=1e6,
-        horizon=HORIZON,
-        limits=(any_limit,),
-        laws=(),
-        undetermined=(),
-    )
+    travel, dates = tuple(day * USAGE for day in spread), (None,) * len(spread)
+    any_limit = LimitLife("any", np.nan, 1.0, travel, spread, dates, 0.01, 0.01)
+    now = datetime(TODAY.year, TODAY.month, TODAY.day, tzinfo=UTC)
+    return Life(identity, now, 1e6, HORIZON, (any_limit,), laws=(), undetermined=())
 
 
 def _service(days: float | None) -> Service:

@@ -18,10 +18,8 @@ from __future__ import annotations
 import tempfile
 import time
 from collections.abc import Iterator
-from concurrent.futures import ProcessPoolExecutor
 from contextlib import nullcontext
 from functools import partial
-from multiprocessing import get_context
 from pathlib import Path
 
 import numpy as np
@@ -30,7 +28,7 @@ from lmshealth import Settings, identify, load_stage, read_log, run
 from studies.harness.claims import Claim
 from studies.harness.command_line import no_pictures
 from studies.harness.servers import dask_cluster
-from studies.harness.study import Row, Study
+from studies.harness.study import Row, Study, spawn_pool
 from studies.scale.archive import make_archive
 
 STEP = "batch"
@@ -83,13 +81,9 @@ def bare(folder: Path, n: int, each: int) -> float:
     """
     if n == 1:
         return _again_and_again(folder, each)
-    with ProcessPoolExecutor(n, mp_context=get_context("spawn")) as pool:
-        list(pool.map(_loaded, range(n)))
+    with spawn_pool(n) as pool:
+        list(pool.map(_again_and_again, [folder] * n, [1] * n))  # imports before the clock runs
         return sum(pool.map(_again_and_again, [folder] * n, [each] * n))
-
-
-def _loaded(_: int) -> None:
-    """Import what is needed before the clock runs."""
 
 
 def one_turn(folder: Path, kinds: tuple[str, ...], each: int, _: int) -> Row:

@@ -58,6 +58,12 @@ QUICK = [("lms-y", kind) for kind in _QUICK] + [("lms-x", "healthy")]
 DECLARABLE = ("servo-retuning", "regreasing")
 FIRST_SEED, RAW_SEED = 6000, 100
 CONTROLS = 100  # lives at most of each negative control
+# Controls: what the tracker does not know of a kind of lives, as `history_of` takes it.
+UNKNOWN: dict[str, tuple[str, Row]] = {
+    "servo-retuning": ("retuning unseen", {"declared": False, "loop_error": False}),
+    "temperature-only": ("temperature unknown", {"covariates": ("payload_kg",)}),
+    "payload-change": ("payload unknown", {"covariates": ("temperature_c",)}),
+}
 # Alarms of damage, and events found, of all.
 ENOUGH = 0.95
 SIZED = 12  # logs of each stage that the sizes of estimates are taken from
@@ -91,9 +97,14 @@ def drawn_lives(trials: Trials, quick: bool, kept: Path | None) -> Row:
 
 
 def of_kind(sizes: Sizes, i: int, n: int) -> Row:
-    """Draw, track and judge so many lives of one kind."""
+    """Draw, track and judge so many lives of one kind, with the control of the kind."""
     pairs = pairs_of(sizes, i, n)
-    return {"lives": judged(pairs), "controls": controls(pairs[:CONTROLS])}
+    found: Row = {"lives": judged(pairs), "controls": []}
+    if pairs[0][0].kind in UNKNOWN:
+        name, known = UNKNOWN[pairs[0][0].kind]
+        alarms = alarmed(follow(pairs[:CONTROLS], **known))
+        found["controls"] = [{"name": name, "stage": pairs[0][0].stage, "alarms": alarms}]
+    return found
 
 
 def pairs_of(sizes: Sizes, i: int, n: int) -> Pairs:
@@ -125,20 +136,6 @@ def judged(pairs: Pairs) -> list[Row]:
     if kind in DECLARABLE:
         rows.append(summed(follow(pairs, declared=False), f"{kind}, undeclared"))
     return rows
-
-
-def controls(pairs: Pairs) -> list[Row]:
-    """Track lives of which the tracker does not know what it must."""
-    unknown: dict[str, tuple[str, Row]] = {
-        "servo-retuning": ("retuning unseen", {"declared": False, "loop_error": False}),
-        "temperature-only": ("temperature unknown", {"covariates": ("payload_kg",)}),
-        "payload-change": ("payload unknown", {"covariates": ("temperature_c",)}),
-    }
-    life = pairs[0][0]
-    if life.kind not in unknown:
-        return []
-    name, known = unknown[life.kind]
-    return [{"name": name, "stage": life.stage, "alarms": alarmed(follow(pairs, **known))}]
 
 
 def halved(sizes: Sizes, n: int) -> Row:
@@ -205,15 +202,14 @@ def raw(seeds: int, cache: Path | None) -> Row:
 
 def verdicts(answer: Row, *, quick: bool) -> dict[str, bool]:
     """Return the checks; one life of a kind tells no rate of alarms."""
-    checks = verdicts_of_lives(answer["lives"])
+    unseen, told = answer["controls"], answer["power"]["alarms"]["share"]
+    checks = verdicts_of_lives(answer["lives"]) | {
+        "what is unknown alarms": all(r["alarms"]["low"] > DECLARED_RATE for r in unseen),
+        "a loss of 5 % is told": told >= ENOUGH,
+    }
     if not quick:
         checks["halved covariances do not cover"] = not answer["halved"]["90"]["holds"]
-    return checks | {
-        "what is unknown alarms": all(
-            row["alarms"]["low"] > DECLARED_RATE for row in answer["controls"]
-        ),
-        "a loss of 5 % is told": answer["power"]["alarms"]["share"] >= ENOUGH,
-    }
+    return checks
 
 
 def verdicts_of_lives(rows: list[Row]) -> dict[str, bool]:
@@ -221,26 +217,21 @@ def verdicts_of_lives(rows: list[Row]) -> dict[str, bool]:
     healthy = [row for row in rows if row["kind"] in HEALTHY]
     damaged = [row for row in rows if row["kind"] in DAMAGED]
     retuned = [row for row in rows if row["name"] == "servo-retuning, undeclared"]
-    total = sum(row["alarms"]["hits"] for row in healthy)
-    low = clopper_pearson(total, sum(row["n"] for row in healthy), LEVEL)[0]
+    events = [row["events"]["found_right"] for row in damaged + retuned if row["events"]]
+    calm = [row["alarms"] for row in healthy]
+    hits, n = (sum(alarms[key] for alarms in calm) for key in ("hits", "n"))
+    lows = [clopper_pearson(hits, n, LEVEL)[0], *(alarms["low"] for alarms in calm)]
+    wide, narrow = ([(p, row["coverage"][p]) for row in kind for p in ("90", "50")]
+                    for kind in (healthy, damaged))  # fmt: skip
     return {
-        "healthy lives alarm as declared": low <= DECLARED_RATE
-        and all(row["alarms"]["low"] <= DECLARED_RATE for row in healthy),
-        "at most 5 of 100 alarm": all(row["alarms"]["share"] <= MOST for row in healthy),
+        "healthy lives alarm as declared": max(lows) <= DECLARED_RATE,
+        "at most 5 of 100 alarm": all(alarms["share"] <= MOST for alarms in calm),
         "damage alarms": all(row["alarms"]["share"] >= ENOUGH for row in damaged),
-        "intervals of damaged lives cover": all(
-            row["coverage"][nominal]["holds"] for row in damaged for nominal in ("90", "50")
-        ),
+        "intervals of damaged lives cover": all(row["holds"] for _, row in narrow),
         "intervals of healthy lives cover at least": all(
-            row["coverage"][nominal]["high"] >= float(nominal) / 100
-            for row in healthy
-            for nominal in ("90", "50")
+            row["high"] >= float(p) / 100 for p, row in wide
         ),
-        "crashes, loosenings and retunings are found": all(
-            row["events"]["found_right"]["share"] >= ENOUGH
-            for row in damaged + retuned
-            if "found_right" in row["events"]
-        ),
+        "crashes, loosenings and retunings are found": all(e["share"] >= ENOUGH for e in events),
     }
 
 
