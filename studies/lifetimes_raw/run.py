@@ -32,10 +32,9 @@ import numpy as np
 from lmshealth.errors import LmshealthError
 from lmshealth.prognosis.maintenance_decision import decide
 from lmshealth.prognosis.remaining_life import prognose
-from lmshealth.prognosis.results import Prognosis
 from lmshealth.stage.degradation_laws import HertzWear as WearLaw
 from lmshealth.stage.degradation_laws import Loosening as LooseningLaw
-from lmshealth.stage.description import ParameterSpec, Stage, load_stage
+from lmshealth.stage.description import ParameterSpec, load_stage
 from lmshealth.tracking.track import accepted_estimates, track
 from models.lives.degradation import HertzWear, Law, Life, Loosening, Steady
 from models.lives.simulation import Plan
@@ -93,7 +92,7 @@ def main() -> None:
 
 def one(kind: str, seed: int, *, logs: int, cache: Path | None, seconds: float = SECONDS) -> Row:
     """Take a life from raw logs to its prognosis, and rank the truth."""
-    plan = plan_of(seed, logs, seconds)
+    plan = PriorPlan(STAGE, "by-prior", logs, seconds, seed)
     life = life_of(plan)
     stage = believing(load_stage(STAGE), 0.0) if kind == BELIEVED else load_stage(STAGE)
     history = history_of(life, identified(plan, cache))
@@ -104,7 +103,9 @@ def one(kind: str, seed: int, *, logs: int, cache: Path | None, seconds: float =
         return {"rank": None, "why": str(why)}
     truth, horizon = true_quantities(plan, life.health[-1] / life.health[0]), found.horizon
     rng = np.random.default_rng([SEED, seed])
-    draws = quantities(found, stage)[rng.permutation(found.usage.size)[:N_DRAWS]]
+    left, baseline = found.censored(), [p.baseline for p in stage.parameters]
+    every = np.hstack([found.health / baseline, left, left[:, -1:] / found.usage[:, None]])
+    draws = every[rng.permutation(found.usage.size)[:N_DRAWS]]
     truth[2:5][truth[2:5] > horizon] = np.inf
     truth[5] = np.inf if np.isinf(truth[4]) else truth[5]
     middle = np.median(draws, axis=0)
@@ -127,14 +128,6 @@ def true_quantities(plan: PriorPlan, health: Array) -> Array:
     limits = drawn.limits_km().values()
     left = [np.inf if km is None else 1000 * (km - now) for km in limits]
     return np.array([*health, *left, min(left), min(left) / 1000 / KM_PER_DAY])
-
-
-def quantities(found: Prognosis, stage: Stage) -> Array:
-    """Return draws of the same; what lies past the horizon is not claimed."""
-    left = found.censored()
-    baseline = [p.baseline for p in stage.parameters]
-    days = left[:, -1:] / found.usage[:, None]
-    return np.hstack([found.health / baseline, left, days])
 
 
 def judged(rows: list[Row]) -> Row:
@@ -174,11 +167,6 @@ def verdicts(answer: Row) -> dict[str, bool]:
     if found[HALVED][QUANTITIES[0]]["n"] >= 0.9 * N_LIVES:  # fewer tell little
         checks[f"they are not: {HALVED}"] = not uniform(found[HALVED])
     return checks
-
-
-def plan_of(seed: int, logs: int = N_LOGS, seconds: float = SECONDS) -> PriorPlan:
-    """Plan the life of a seed."""
-    return PriorPlan(STAGE, "by-prior", logs, seconds, seed)
 
 
 def _law(rng: np.random.Generator, parameter: ParameterSpec) -> Law:

@@ -33,6 +33,7 @@ _MODES = ("roll", "pitch")
 _SIZED = 12  # logs that are simulated and identified for the covariances of the estimates
 _KM = 1000.0
 _INTERCEPT_STD, _TEMPERATURE_STD, _STEP = 0.1, 0.001, 1e-4
+_measured = cache(lives.measured)
 _LIMITS = {HertzWear: GUIDE_PRELOAD_LIMIT, Loosening: MOUNT_STIFFNESS_LIMIT}
 # Prior standard deviations of the description: of ln s_w and n, and of the floor and ln s_m.
 _PRIOR_STD = {HertzWear: [1.0, 0.9 / np.sqrt(12)], Loosening: [0.7 / np.sqrt(12), 1.0]}
@@ -55,15 +56,12 @@ def case_of(kind: str, number: int, sizes: tuple[Estimates, Life] | None = None)
     at, until = (*KINDS, HEALTHY).index(kind), "now" if kind == HEALTHY else "failure"
     plan = Plan(STAGE, kind, N_LOGS, lives.SECONDS, FIRST_SEED + 4 * number + at, until=until)
     life, truth = lives.life_with(plan, schedule(plan)), plan.draw_life()
-    estimates = lives.drawn(life, *(sizes or _sizes()), lives.rng_of(31, at, number))
+    estimates = lives.drawn(
+        life, *(sizes or _measured(STAGE, _SIZED)), lives.rng_of(31, at, number)
+    )
     history, end = lives.history_of(life, estimates), truth.failure_km()
     columns = [i for i, one in enumerate(history.series) if one.mode in _MODES]
     return Case(truth, keep_series(history, columns), np.inf if end is None else _KM * end)
-
-
-@cache
-def _sizes() -> tuple[Estimates, Life]:
-    return lives.measured(STAGE, _SIZED)
 
 
 def cut(case: Case, share: float) -> History:

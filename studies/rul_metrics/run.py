@@ -65,12 +65,12 @@ _KM = 1000.0
 def main() -> None:
     """Run the study; ``--quick`` predicts once in one life and records nothing."""
     study = Study(__file__, __doc__)
-    tasks = [(kind, number) for number in range(LIVES) for kind in KINDS]
-    tasks += [(HEALTHY, number) for number in range(UNENDING)]
+    tasks = [(kind, number, False) for number in range(LIVES) for kind in KINDS]
+    tasks += [(HEALTHY, number, False) for number in range(UNENDING)]
     if study.quick:
-        tasks = [(KINDS[-1], 0)]
-    rows = study.trials.collect(quickly if study.quick else one, tasks)
-    ending = [row for row, (kind, _) in zip(rows, tasks, strict=True) if kind != HEALTHY]
+        tasks = [(KINDS[-1], 0, True)]
+    rows = study.trials.collect(one, tasks)
+    ending = [row for row, (kind, *_) in zip(rows, tasks, strict=True) if kind != HEALTHY]
     answer: Row = {
         "seed": SEED,
         "lives": len(ending),
@@ -97,18 +97,16 @@ def horizon() -> float:
     return machine().description.usage.horizon_km * _KM
 
 
-def one(kind: str, number: int) -> Row:
-    """Follow a life and predict at every cut, or at the last log of a healthy one."""
-    case = case_of(kind, number)
+def one(kind: str, number: int, quick: bool) -> Row:
+    """Follow a life and predict at every cut, or at the last log of a healthy one.
+
+    The quick form takes the recorded covariances of estimates, and predicts at one cut.
+    """
+    case = case_of(kind, number, recorded(STAGE) if quick else None)
     if kind == HEALTHY:
         return unending(case, number)
-    return {"end_km": case.end / _KM, "cuts": [ahead(case, kind, number, k) for k in CUTS]}
-
-
-def quickly(kind: str, number: int) -> Row:
-    """Predict at one cut only, of a life with the recorded covariances of estimates."""
-    case = case_of(kind, number, recorded(STAGE))
-    return {"end_km": case.end / _KM, "cuts": [ahead(case, kind, number, MAIN_CUT)]}
+    cuts = (MAIN_CUT,) if quick else CUTS
+    return {"end_km": case.end / _KM, "cuts": [ahead(case, kind, number, k) for k in cuts]}
 
 
 def ahead(case: Case, kind: str, number: int, share: float) -> Row:

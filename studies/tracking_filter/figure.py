@@ -1,11 +1,11 @@
-"""Draw figure.svg from result.json: sums of squares, coverages, numbers and times."""
+"""Draw figure.svg from result.json: sums of squares and coverages."""
 
 from __future__ import annotations
 
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from studies.harness.figures import BLACK, BLUE, GREEN, ORANGE, draw_shares, name_lines, write
+from studies.harness.figures import BLACK, BLUE, ORANGE, draw_shares, name_lines, write
 from studies.harness.study import Row
 
 LABELS = ("99.9 % band", "covariance as reported", "halved (control)")
@@ -39,37 +39,20 @@ def draw_coverage(ax: Axes, rows: dict[str, list[Row]], title: str) -> None:
     ax.set_title(title, fontsize=10)
 
 
-def draw_times(ax: Axes, speed: Row) -> None:
-    """Draw processor time in units of the filterpy loop, with the seconds and the differences."""
-    rows = speed["programs"]
-    for y, row in enumerate(rows):
-        colour = BLUE if row["program"].startswith(("bank", "track")) else GREEN
-        ax.barh(y, row["times_filterpy"], color=colour, height=0.6)
-        text = f"{row['cpu_s']:.2f} s"
-        if "deviation" in row:
-            text += f", ln f within {row['deviation']:.0e} std"
-        ax.text(row["times_filterpy"] + 0.1, y, text, va="center", fontsize=7)
-    name_lines(ax, [row["program"] for row in rows])
-    ax.set_xlim(0, 1.45 * max(row["times_filterpy"] for row in rows))
-    ax.set_xlabel("processor time over that of the filterpy loop")
-    ax.set_title(f"{speed['epochs']:,} epochs of {speed['modes']} modes", fontsize=10)
-
-
 def draw_figure(figure: Figure, result: Row) -> None:
-    """Draw four panels."""
+    """Draw three panels."""
     average, sources = result["averaged"], result["two_sources"]
-    axes = figure.subplots(2, 2)
-    draw_sums(axes[0, 0], result["known_setting"])
+    left, middle, right = figure.subplots(1, 3)
+    draw_sums(left, result["known_setting"])
     rows = {f"{name}, quantiles": levels for name, levels in average["mixture"].items()}
     rows |= {f"{name}, ± std": levels for name, levels in average["coverage"].items()}
     rows |= {"drift, half width\n(control)": average["control"]}
-    draw_coverage(axes[0, 1], rows, f"Tracker, {average['lives']:,} lives")
+    draw_coverage(middle, rows, f"Tracker, {average['lives']:,} lives")
     names = ("both", "one alone", "common errors\nignored (control)")
     kinds = ("both", "accelerometers alone", "common errors ignored")
     rows = {label: sources[kind]["coverage"] for label, kind in zip(names, kinds, strict=True)}
-    draw_coverage(axes[1, 0], rows, f"Drift by two sources, {sources['lives']:,} lives")
-    draw_times(axes[1, 1], result["speed"])
+    draw_coverage(right, rows, f"Drift by two sources, {sources['lives']:,} lives")
 
 
 if __name__ == "__main__":
-    write(__file__, draw_figure, (11.0, 6.5))
+    write(__file__, draw_figure, (13.0, 3.6))
