@@ -38,8 +38,8 @@ damping_ratio = {BEAM.damping_ratio}
 search = {BEAM.search}
 """
 _HEALTH = f"""
-# The reading of the roller's position sensor, whose scale to millimetres is not documented. The map
-# is that of repeats 0 and 1, the baseline the mean position of their first dwells that were read.
+# The reading of the roller's position sensor; its scale to millimetres is not told. The map is
+# made from repeats 0 and 1, the baseline is the mean position of their first dwells that were read.
 [[parameter]]
 name = "{PARAMETER}"
 unit = "V"

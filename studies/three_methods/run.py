@@ -36,7 +36,7 @@ from lmshealth.modal.frf.identification import FrfReading
 from models.dynamics.plant import GUIDE_MODES, SENSORS
 from models.dynamics.stages import NOMINAL, Condition, stage_named
 from models.recordings.formats import write_log
-from models.recordings.recording import record
+from models.recordings.recording import Recording, record
 from models.recordings.sweep import Sweep, record_sweep, without_loop
 from studies.common.cost import one_thread
 from studies.harness.claims import Claim, number
@@ -98,29 +98,23 @@ def main() -> None:
     study.conclude(answer, details={"example": example, "rows": rows})
 
 
-def generator(name: str, seed: int, step: str) -> np.random.Generator:
-    """Return the generator of one log."""
-    return np.random.default_rng([seed, zlib.crc32(f"{name}/{step}".encode())])
-
-
-def written(recording: Any, folder: Path) -> Log:
-    """Write a recording as a log and read it as a user's."""
+def logged(recording: Recording, folder: Path) -> Log:
+    """Write a recording as a log and read it as a user does."""
     path = folder / "log.h5"
     write_log(recording, path, "hdf5")
     return read_log(path)
 
 
-def moved(name: str, seed: int, step: str, folder: Path) -> Log:
-    """Return the log of an undisturbed move."""
-    rng = generator(name, seed, step)
-    return written(record(stage_named(name), seconds=SECONDS, rng=rng), folder)
+def generator(name: str, seed: int, step: str) -> np.random.Generator:
+    """Return the generator of one log."""
+    return np.random.default_rng([seed, zlib.crc32(f"{name}/{step}".encode())])
 
 
 def swept(name: str, seed: int, folder: Path, condition: Condition = NOMINAL) -> Log:
     """Return the log of a move during which a sine sweeps."""
     rng = generator(name, seed, f"sweep {condition.guide_preload}")
     stage, sweep = stage_named(name), SWEEPS[name]
-    return written(record_sweep(stage, sweep, condition, seconds=SWEEP_SECONDS, rng=rng), folder)
+    return logged(record_sweep(stage, sweep, condition, seconds=SWEEP_SECONDS, rng=rng), folder)
 
 
 def read(name: str, log: Log, source: str, sensor: str, modes: tuple[str, ...]) -> FrfReading:
@@ -166,7 +160,9 @@ def one_seed(name: str, seed: int) -> Row:
             "frf_whole_current": by_response(name, log, "current"),
         }
         for method, channels in CHANNELS.items():
-            row[method] = by_channels(name, moved(name, seed, method, folder), channels)
+            rng = generator(name, seed, method)
+            move = record(stage_named(name), seconds=SECONDS, rng=rng)
+            row[method] = by_channels(name, logged(move, folder), channels)
         row["frf_worn"] = by_response(name, swept(name, seed, folder, WORN), "current_excitation")
     return row
 
@@ -192,9 +188,9 @@ def scores(rows: list[Row], first: str, second: Callable[[Row], Any], mode: str)
 
 def summarise(name: str, rows: list[Row]) -> Row:
     """Compare the methods with each other and with the eigenvalues."""
-    modes = {}
+    modes, loop = {}, without_loop(stage_named(name))
     for mode in GUIDE_MODES:
-        closed, alone = without_loop(stage_named(name))[mode]
+        closed, alone = loop[mode]
         modes[mode] = compare(rows, mode, closed.frequency_hz) | {
             "damping_ratio": closed.damping_ratio,
             "without_servo_hz": float(abs(alone) / (2 * np.pi)),
