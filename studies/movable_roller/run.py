@@ -33,14 +33,7 @@ from studies.decays.beam import REPEATS
 from studies.harness.claims import Claim, counted, number
 from studies.harness.command_line import call
 from studies.harness.study import Row, Study, read_record, real_data
-from studies.movable_roller.roller import (
-    PARAMETER,
-    Calibration,
-    calibrate,
-    places,
-    write_dwells,
-    write_stage,
-)
+from studies.movable_roller import roller
 
 STEP = "infer"
 
@@ -68,9 +61,9 @@ def answered(data: Path, scratch: Path, *, quick: bool) -> Row:
     epochs = QUICK_EPOCHS if quick else ALL_EPOCHS
     known = recorded() if quick else read_known(data, scratch)
     used = known.dropna(subset="frequency_hz")
-    found, line = calibrate(used), calibrate(used, degree=1)
-    stage = write_stage(found, scratch / "map")
-    dwells = write_dwells(data, NEW, scratch / "new")
+    found, line = roller.calibrate(used), roller.calibrate(used, degree=1)
+    stage = roller.write_stage(found, scratch / "map")
+    dwells = roller.write_dwells(data, NEW, scratch / "new")
     if quick:
         dwells = dwells[dwells["dwell"].isin(QUICK_DWELLS)]
     new = read_modes(dwells, stage, quick=quick)
@@ -81,13 +74,13 @@ def answered(data: Path, scratch: Path, *, quick: bool) -> Row:
 
     rows, controls = inferred(track, stage), {}
     if not quick:
-        exact = write_stage(found, scratch / "exact", model_std=0.0)
+        exact = roller.write_stage(found, scratch / "exact", model_std=0.0)
         sure = pd.read_csv(track)
         sure["drift_std"] *= _TOO_SURE
         sure.to_csv(exact.with_name("track.csv"), index=False)
         certain = count(inferred(exact.with_name("track.csv"), exact))
         controls["exact map, quarter of the std"] = certain
-    straight = write_stage(line, scratch / "line", model_std=found.model_std)
+    straight = roller.write_stage(line, scratch / "line", model_std=found.model_std)
     controls["straight line for a map"] = count(inferred(track, straight))
     refused = pd.concat([known, new]).query("refused != ''").rename(columns={"refused": "reason"})
     answer = {
@@ -104,8 +97,8 @@ def answered(data: Path, scratch: Path, *, quick: bool) -> Row:
 
 def read_known(data: Path, scratch: Path) -> pd.DataFrame:
     """Read the dwells of all repeats but the new one, without a map."""
-    look = write_stage(None, scratch)
-    dwells = [write_dwells(data, k, scratch / f"repeat{k}") for k in range(NEW)]
+    look = roller.write_stage(None, scratch)
+    dwells = [roller.write_dwells(data, k, scratch / f"repeat{k}") for k in range(NEW)]
     return pd.concat([read_modes(own, look, quick=False) for own in dwells], ignore_index=True)
 
 
@@ -153,9 +146,9 @@ def compare(read: pd.DataFrame, track: Path, health: pd.DataFrame) -> list[Row]:
     """Join what was measured in each dwell with its drift and the inferred position."""
     moment = {"recorded_at": lambda t: pd.to_datetime(t["recorded_at"])}
     drift = pd.read_csv(track).assign(**moment)[["recorded_at", "drift", "drift_std"]]
-    own = health[health["parameter"] == PARAMETER].assign(**moment)
+    own = health[health["parameter"] == roller.PARAMETER].assign(**moment)
     columns = ["recorded_at", "median", "q05", "q95", "converged"]
-    both = read.assign(move=places(read)).dropna(subset="frequency_hz").assign(**moment)
+    both = read.assign(move=roller.places(read)).dropna(subset="frequency_hz").assign(**moment)
     both = both.merge(drift, on="recorded_at", how="left")
     both = both.merge(own[columns], on="recorded_at", how="left")
     both["inside"] = (both["q05"] <= both["roller_v"]) & (both["roller_v"] <= both["q95"])
@@ -197,7 +190,7 @@ def up_and_down(rows: list[Row]) -> list[Row]:
     return found
 
 
-def describe(found: Calibration, known: pd.DataFrame) -> Row:
+def describe(found: roller.Calibration, known: pd.DataFrame) -> Row:
     """Return what the map is and how good it is."""
     columns = ["repeat", "dwell", "roller_v", "frequency_hz", "frequency_std_hz"]
     volts = np.linspace(found.low, found.high, 60)

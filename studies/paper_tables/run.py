@@ -25,16 +25,7 @@ from scipy.stats import spearmanr
 from models.recordings.strokes import WINDOW_S
 from studies.harness.claims import Claim, percents
 from studies.harness.study import Row, Study
-from studies.paper_tables.tables import (
-    FILES,
-    PRINTED_GROWING,
-    TableRow,
-    loop_rows,
-    modal_rows,
-    printed,
-    resonance_rows,
-    velocity_rows,
-)
+from studies.paper_tables import tables
 
 STEP = "simulated plants"
 COUNTS = {
@@ -66,15 +57,15 @@ def main() -> None:
     """Run the study; ``--quick`` takes one seed, short controls, no Table 2, records nothing."""
     study = Study(__file__, __doc__, seeds=20)
     quick, seeds = study.quick, 1 if study.quick else study.options.seeds
-    rows = loop_rows() + ([] if quick else resonance_rows()) + modal_rows()
-    moved = [row for axis in FILES for row in velocity_rows(axis, seeds)]
+    rows = tables.loop_rows() + ([] if quick else tables.resonance_rows()) + tables.modal_rows()
+    moved = [row for axis in tables.FILES for row in tables.velocity_rows(axis, seeds)]
     few, length = min(seeds, 2), 1.0 if quick else WINDOW_S
-    control = [row for axis in FILES for row in velocity_rows(axis, few, length)]
+    control = [row for axis in tables.FILES for row in tables.velocity_rows(axis, few, length)]
     answer = {
         "seeds": seeds,
         "summary": summarise(moved),
         "control_constant_velocity_only": summarise(control),
-        "growing_with_velocity": {axis: growing(axis, moved) for axis in FILES},
+        "growing_with_velocity": {axis: growing(axis, moved) for axis in tables.FILES},
     }
     rows = [record(row) for row in (*rows, *moved)]
     study.conclude(answer, details={"rows": rows})
@@ -83,14 +74,14 @@ def main() -> None:
         page.write_text(markdown(rows, seeds), encoding="utf-8")
 
 
-def ratios(row: TableRow) -> np.ndarray:
+def ratios(row: tables.TableRow) -> np.ndarray:
     """Return simulated over printed per cell; NaN where one is missing or zero."""
     cells, found = np.abs(row.printed), np.abs(row.simulated)
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.where((cells > 0) & (found > 0), found / cells, np.nan)
 
 
-def within(row: TableRow, factor: float) -> list[bool]:
+def within(row: tables.TableRow, factor: float) -> list[bool]:
     """Return whether simulated and printed agree, cell by cell without errata.
 
     In Table 3 the paper repeats Y's column at 100 mm/s for X.
@@ -100,7 +91,7 @@ def within(row: TableRow, factor: float) -> list[bool]:
     return [hit for cell, hit in enumerate(inside) if cell != erratum]
 
 
-def verdict(row: TableRow) -> str:
+def verdict(row: tables.TableRow) -> str:
     """Judge a row: by its worst cell, then by its trend over velocity."""
     tight = {"Table 1": 1.05, "Table 2": 1.1, "Table 5": 1.03}.get(row.table)
     if tight is not None:
@@ -120,7 +111,7 @@ def verdict(row: TableRow) -> str:
     return "trend only" if rank >= 0.7 else "not reproduced"
 
 
-def reason(row: TableRow) -> str:
+def reason(row: tables.TableRow) -> str:
     """Return why a row is not met cell by cell; empty where it is."""
     judged = verdict(row)
     if judged.startswith("match within") and "cells" not in judged:
@@ -139,7 +130,7 @@ def reason(row: TableRow) -> str:
     return "one law of growth for all modes"
 
 
-def record(row: TableRow) -> Row:
+def record(row: tables.TableRow) -> Row:
     """Return a row as JSON."""
     cells = {key: getattr(row, key) for key in ("printed", "simulated", "scatter")}
     return {
@@ -155,7 +146,7 @@ def record(row: TableRow) -> Row:
     }
 
 
-def summarise(rows: list[TableRow]) -> dict[str, str]:
+def summarise(rows: list[tables.TableRow]) -> dict[str, str]:
     """Count the cells of the tables over velocity that agree."""
 
     def count(names: Iterable[str], factor: float) -> str:
@@ -163,7 +154,7 @@ def summarise(rows: list[TableRow]) -> dict[str, str]:
         return f"{sum(hits)} of {len(hits)}"
 
     def both(*keys: str) -> list[str]:
-        return [f"{axis} {key}_um" for axis in FILES for key in keys]
+        return [f"{axis} {key}_um" for axis in tables.FILES for key in keys]
 
     accelerations = [row for row in rows if row.table in ("Table 6", "Table 7")]
     modes = [row.name for row in accelerations if row.mode]
@@ -190,11 +181,11 @@ def grows(cells: tuple[float, ...]) -> bool:
     return cells[-1] >= HIGH_MM_S2 and cells[-1] >= GROWTH * float(np.median(cells[:4]))
 
 
-def growing(axis: str, rows: list[TableRow]) -> Row:
+def growing(axis: str, rows: list[tables.TableRow]) -> Row:
     """Return the frequencies (Hz) that depend strongly on velocity: named, printed, simulated."""
     table = "Table 6" if axis == "x" else "Table 7"
     own = {int(row.name.split()[1]): row for row in rows if row.table == table}
-    named = PRINTED_GROWING[axis]
+    named = tables.PRINTED_GROWING[axis]
     simulated = [hertz for hertz, row in own.items() if grows(row.simulated)]
     return {
         "named_by_the_paper": named,
@@ -215,7 +206,7 @@ def markdown(rows: list[Row], seeds: int) -> str:
     for table in dict.fromkeys(row["table"] for row in rows):
         own = [row for row in rows if row["table"] == table]
         width = max(len(row["printed"]) for row in own)
-        head = {7: list(printed(3)["velocity_mm_s"]), 2: ["X", "Y"], 1: ["Hz"]}[width]
+        head = {7: list(tables.printed(3)["velocity_mm_s"]), 2: ["X", "Y"], 1: ["Hz"]}[width]
         lines += [f"## {table}", "", "| row | " + " | ".join(map(str, head)) + " | verdict | why |"]
         lines.append("| --- |" + " --- |" * (width + 2))
         for row in own:

@@ -38,18 +38,8 @@ from studies.common import metrics
 from studies.common.lives import Array, recorded, rng_of
 from studies.harness.claims import Claim, counted, measured, number
 from studies.harness.study import LEVEL, Row, Study, as_row
+from studies.rul_metrics import lives
 from studies.rul_metrics.forecasts import CONTROL, LINE, MISSING, OURS, PROGPY, WAYS, all_ways
-from studies.rul_metrics.lives import (
-    CUTS,
-    HEALTHY,
-    KINDS,
-    STAGE,
-    Case,
-    bound,
-    case_of,
-    cut,
-    share_within,
-)
 
 STEP = "prognose, compared with others"
 
@@ -65,12 +55,12 @@ _KM = 1000.0
 def main() -> None:
     """Run the study; ``--quick`` predicts once in one life and records nothing."""
     study = Study(__file__, __doc__)
-    tasks = [(kind, number, False) for number in range(LIVES) for kind in KINDS]
-    tasks += [(HEALTHY, number, False) for number in range(UNENDING)]
+    tasks = [(kind, number, False) for number in range(LIVES) for kind in lives.KINDS]
+    tasks += [(lives.HEALTHY, number, False) for number in range(UNENDING)]
     if study.quick:
-        tasks = [(KINDS[-1], 0, True)]
+        tasks = [(lives.KINDS[-1], 0, True)]
     rows = study.trials.collect(one, tasks)
-    ending = [row for row, (kind, *_) in zip(rows, tasks, strict=True) if kind != HEALTHY]
+    ending = [row for row, (kind, *_) in zip(rows, tasks, strict=True) if kind != lives.HEALTHY]
     answer: Row = {
         "seed": SEED,
         "lives": len(ending),
@@ -89,7 +79,7 @@ def main() -> None:
 @cache
 def machine() -> Stage:
     """Load the stage that all lives are of."""
-    return load_stage(STAGE)
+    return load_stage(lives.STAGE)
 
 
 def horizon() -> float:
@@ -102,29 +92,29 @@ def one(kind: str, number: int, quick: bool) -> Row:
 
     The quick form takes the recorded covariances of estimates, and predicts at one cut.
     """
-    case = case_of(kind, number, recorded(STAGE) if quick else None)
-    if kind == HEALTHY:
+    case = lives.case_of(kind, number, recorded(lives.STAGE) if quick else None)
+    if kind == lives.HEALTHY:
         return unending(case, number)
-    cuts = (MAIN_CUT,) if quick else CUTS
+    cuts = (MAIN_CUT,) if quick else lives.CUTS
     return {"end_km": case.end / _KM, "cuts": [ahead(case, kind, number, k) for k in cuts]}
 
 
-def ahead(case: Case, kind: str, number: int, share: float) -> Row:
+def ahead(case: lives.Case, kind: str, number: int, share: float) -> Row:
     """Predict in all ways from one cut."""
-    history, stage = cut(case, share), machine()
-    key = [KINDS.index(kind), number, round(100 * share)]
+    history, stage = lives.cut(case, share), machine()
+    key = [lives.KINDS.index(kind), number, round(100 * share)]
     rng, left = rng_of(32, *key), case.end - float(history.travel[-1])
     draws, seconds = all_ways(history, stage, [SEED, *key], rng)
     return {
         "share": share,
         "left_km": left / _KM,
-        "bound_km": {k: bound(case, history, stage, std) / _KM for k, std in BOUNDS.items()},
+        "bound_km": {k: lives.bound(case, history, stage, std) / _KM for k, std in BOUNDS.items()},
         "ways": {name: scored(own, left, case.end, rng) for name, own in draws.items()},
         "seconds": seconds,
     }
 
 
-def unending(case: Case, number: int) -> Row:
+def unending(case: lives.Case, number: int) -> Row:
     """Predict where no limit is ever reached."""
     draws, _ = all_ways(case.history, machine(), [SEED, number], rng_of(33, number))
     far, score = horizon(), metrics.crps
@@ -164,7 +154,7 @@ def summed(cuts: tuple[Row, ...]) -> Row:
     bounds = {}
     for name in BOUNDS:
         std = np.array([row["bound_km"][name] for row in cuts])
-        inside = [share_within(*pair) for pair in zip(std, ALPHA * left, strict=True)]
+        inside = [lives.share_within(*pair) for pair in zip(std, ALPHA * left, strict=True)]
         bounds[name] = {
             "accurate": float(np.mean(inside)),
             "relative_std": float(np.median(std / left)),

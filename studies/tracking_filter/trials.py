@@ -12,16 +12,7 @@ from lmshealth.stage.description import Stage
 from lmshealth.tracking.history import History
 from lmshealth.tracking.track import track
 from studies.harness.study import LEVEL, Row, judge_scores
-from studies.tracking_filter.lives import (
-    QUANTITIES,
-    Array,
-    Life,
-    alone,
-    draw,
-    filtered,
-    mixture,
-    without_common_errors,
-)
+from studies.tracking_filter import lives
 
 
 def band(total: float, dof: float) -> Row:
@@ -41,15 +32,15 @@ def known_setting(rng: np.random.Generator, n: int, machine: Stage) -> Row:
 
     The errors of a life are those at one of its logs; the control has half the covariance.
     """
-    sums: dict[str, dict[str, Array]] = {
-        kind: {name: np.zeros(2) for name in (*QUANTITIES, "innovations")}
+    sums: dict[str, dict[str, lives.Array]] = {
+        kind: {name: np.zeros(2) for name in (*lives.QUANTITIES, "innovations")}
         for kind in ("as reported", "halved")
     }
     for _ in range(n):
-        life = draw(rng)
+        life = lives.draw(rng)
         k = int(rng.integers(1, len(life.history.logs)))
         for kind, history in (("as reported", life.history), ("halved", halved(life.history))):
-            found = filtered(replace(life, history=history), machine)
+            found = lives.filtered(replace(life, history=history), machine)
             for name, truth in life.truth().items():
                 off = found.mean[name][k] - truth[k]
                 sums[kind][name] += off @ np.linalg.solve(found.cov[name][k], off), off.size
@@ -60,7 +51,7 @@ def known_setting(rng: np.random.Generator, n: int, machine: Stage) -> Row:
     }
 
 
-def errors(life: Life, history: History, k: int, machine: Stage) -> dict[str, Array]:
+def errors(life: lives.Life, history: History, k: int, machine: Stage) -> dict[str, lives.Array]:
     """Return errors of the tracker at one log over their standard deviations, mode by mode.
 
     ``width`` is the standard deviation of the drift.
@@ -72,11 +63,11 @@ def errors(life: Life, history: History, k: int, machine: Stage) -> dict[str, Ar
         "drift": np.sqrt(np.diag(found.drift_cov[k])),
     }
     mean = {"ln f": found.ln_frequency[k], "ln ζ": found.ln_damping[k], "drift": found.drift[k]}
-    off = {name: (mean[name] - life.truth()[name][k]) / std[name] for name in QUANTITIES}
+    off = {name: (mean[name] - life.truth()[name][k]) / std[name] for name in lives.QUANTITIES}
     return off | {"width": std["drift"]}
 
 
-def coverage(z: list[float] | Array) -> list[Row]:
+def coverage(z: list[float] | lives.Array) -> list[Row]:
     """Judge intervals of both levels by errors in standard deviations."""
     return [{"nominal": p} | judge_scores(np.asarray(z), p) for p in (0.5, 0.9)]
 
@@ -89,7 +80,7 @@ def moment(z: list[float]) -> Row:
     return {"mean": mean, "error": error, "holds": abs(mean - 1) <= error}
 
 
-def one_log(rng: np.random.Generator, life: Life) -> tuple[int, int]:
+def one_log(rng: np.random.Generator, life: lives.Life) -> tuple[int, int]:
     """Choose the log and the mode of a life that are judged: one, so that all are independent."""
     return int(rng.integers(1, len(life.history.logs))), int(rng.integers(2))
 
@@ -105,10 +96,10 @@ def averaged(rng: np.random.Generator, n: int, n_halved: int, machine: Stage) ->
     z: dict[str, list[float]] = defaultdict(list)
     tails: dict[str, list[float]] = defaultdict(list)
     for j in range(n):
-        life = draw(rng)
+        life = lives.draw(rng)
         k, i = one_log(rng, life)
-        found, below = errors(life, life.history, k, machine), mixture(life, machine, k, i)
-        for name in QUANTITIES:
+        found, below = errors(life, life.history, k, machine), lives.mixture(life, machine, k, i)
+        for name in lives.QUANTITIES:
             z[name].append(float(found[name][i]))
             # As the error of a normal distribution that has as much below it.
             tails[name].append(float(stats.norm.ppf(below[name])))
@@ -119,7 +110,7 @@ def averaged(rng: np.random.Generator, n: int, n_halved: int, machine: Stage) ->
         "lives": n,
         "coverage": {name: coverage(values) for name, values in z.items()},
         "mixture": {name: coverage(values) for name, values in tails.items()},
-        "mean_square": {name: moment(z[name]) for name in QUANTITIES},
+        "mean_square": {name: moment(z[name]) for name in lives.QUANTITIES},
         "control": coverage(2 * np.array(z["drift"])),
     }
 
@@ -131,13 +122,13 @@ def two_sources(rng: np.random.Generator, n: int, machine: Stage) -> Row:
     """
     ways = {
         "both": lambda history: history,
-        "accelerometers alone": lambda history: alone(history, "acc"),
-        "common errors ignored": without_common_errors,
+        "accelerometers alone": lambda history: lives.alone(history, "acc"),
+        "common errors ignored": lives.without_common_errors,
     }
     z: dict[str, list[float]] = defaultdict(list)
     widths: dict[str, list[float]] = defaultdict(list)
     for _ in range(n):
-        life = draw(rng, ("acc", "delta_e"))
+        life = lives.draw(rng, ("acc", "delta_e"))
         k, i = one_log(rng, life)
         for kind, seen in ways.items():
             found = errors(life, seen(life.history), k, machine)

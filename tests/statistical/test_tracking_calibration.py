@@ -22,8 +22,8 @@ from studies.common.lives import (
 )
 from studies.crossings.lives import KINDS, judge, make_life, nearest
 from studies.crossings.run import labels_of
-from studies.tracking_filter.lives import alone, draw, mixture, stage
-from studies.tracking_filter.trials import QUANTITIES, errors, known_setting
+from studies.tracking_filter.lives import QUANTITIES, alone, draw, mixture, stage
+from studies.tracking_filter.trials import errors, known_setting
 from studies.tracking_lives.trials import DECLARED_RATE, alarmed, follow, scores
 from tests.claims import Claims
 from tests.statistical.evidence import all_of, as_often, at_least, at_most, sum_of_squares, uniform
