@@ -88,12 +88,12 @@ def told(health: Health, truth: tuple[float, ...]) -> Row:
     """
     rows = {}
     for j, name in enumerate(health.parameters):
-        draws, ln_truth = np.log(health.samples[0, :, j]), np.log(truth[j])
-        half = (draws + np.median(draws)) / 2
+        draws = health.samples[0, :, j]
+        half = (np.log(draws) + np.median(np.log(draws))) / 2
         rows[name] = {
-            "level": float(np.mean(draws < ln_truth)),
-            "half_level": float(np.mean(half < ln_truth)),
-            "width": float(np.ptp(np.quantile(draws, [0.05, 0.95]))),
+            "level": float(np.mean(draws < truth[j])),
+            "half_level": float(np.mean(half < np.log(truth[j]))),
+            "width": float(np.ptp(np.log(np.quantile(draws, [0.05, 0.95])))),
             "told": bool(health.informed_parameters()[j]),
         }
     return rows
