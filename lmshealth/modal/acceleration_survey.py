@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass
 
 from lmshealth.errors import BadLog
 from lmshealth.io.log import Log, Refusal
 from lmshealth.modal.identification import identify
-from lmshealth.modal.modes import Modes
 from lmshealth.signal.acceleration_levels import Magnitude, choose_bands, read_magnitudes
 from lmshealth.signal.constants import GRID_BAND
 from lmshealth.signal.segments import Part
@@ -38,15 +38,12 @@ def survey(
         As `read_magnitudes` does.
     """
     accelerometers = [c for c in log.channels if c.kind == "acceleration"]
-    found: Modes | None = None
+    identified: dict[str, float] | None = None
     if stage is not None and accelerometers:
-        try:
+        # Otherwise accelerations are read at the described frequencies.
+        with suppress(BadLog):
             found = identify(log, stage, channels=[c.name for c in accelerometers])
-        except BadLog:
-            found = None  # accelerations are read at the described frequencies
-    identified = (
-        None if found is None else dict(zip(found.names, found.frequency.tolist(), strict=True))
-    )
+            identified = dict(zip(found.names, found.frequency.tolist(), strict=True))
     bands = choose_bands(stage, identified, band)
     magnitudes = read_magnitudes(log, bands, part=part)
     widest = band or (

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from lmshealth._arrays import BoolArray, FloatArray
+from lmshealth._arrays import FloatArray
 from lmshealth.modal import constants
 from lmshealth.modal.targets import Target
 from lmshealth.signal.spectra import Spectrum, median_ordinate
@@ -46,12 +46,7 @@ def find_peaks(
         if all(abs(frequency - f) > max(scale, s) * f for _, f, s in chosen):
             chosen.append((score, frequency, scale))
     return tuple(
-        Target(
-            name=f"mode_{number}",
-            frequency=frequency,
-            damping_ratio=scale / 1.5,
-            search=min(max(3 * scale, 0.02), 0.15),
-        )
+        _start_value(f"mode_{number}", frequency, scale)
         for number, (_, frequency, scale) in enumerate(sorted(chosen, key=lambda c: c[1]), start=1)
     )
 
@@ -115,59 +110,52 @@ def find_excess(residual: Spectrum, narrowest: float = 0.0) -> Target | None:
     """
     ordinates = residual.periodogram.copy()
     for _ in range(_MOST_NARROW):
-        frequency, scale = _most_above_one(replace(residual, periodogram=ordinates.copy()))
+        total = np.concatenate([[0.0], np.cumsum(ordinates - 1.0)])
+        best = (constants.EXCESS_THRESHOLD, 0.0, 0.0)
+        for scale in _SCALES:
+            first = np.searchsorted(residual.frequency, residual.frequency * (1 - scale))
+            last = np.searchsorted(residual.frequency, residual.frequency * (1 + scale))
+            n = last - first
+            enough = (n >= _LEAST_ORDINATES) & (residual.count * n >= _LEAST_OF_EXCESS)
+            score = np.where(enough, (total[last] - total[first]) / np.sqrt(n), 0.0)
+            score *= np.sqrt(residual.count)
+            k = int(np.argmax(score))
+            best = max(best, (float(score[k]), float(residual.frequency[k]), scale))
+        _, frequency, scale = best
         if scale == 0.0:
             return None
         if scale >= 1.5 * narrowest:
-            return Target("excess", frequency, scale / 1.5, min(max(3 * scale, 0.02), 0.15))
+            return _start_value("excess", frequency, scale)
         reach = frequency * np.array([1 - 4 * scale, 1 + 4 * scale])
         ordinates[slice(*np.searchsorted(residual.frequency, reach).tolist())] = 1.0
     return None
 
 
-def _most_above_one(residual: Spectrum) -> tuple[float, float]:
-    """Return frequency and scale of the most significant excess; zeros where there is none."""
-    total = np.concatenate([[0.0], np.cumsum(residual.periodogram - 1.0)])
-    best = (constants.EXCESS_THRESHOLD, 0.0, 0.0)
-    for scale in _SCALES:
-        first = np.searchsorted(residual.frequency, residual.frequency * (1 - scale))
-        last = np.searchsorted(residual.frequency, residual.frequency * (1 + scale))
-        n = last - first
-        weight = residual.count * n
-        enough = (n >= _LEAST_ORDINATES) & (weight >= _LEAST_OF_EXCESS)
-        score = np.where(enough, (total[last] - total[first]) / np.sqrt(n), 0.0)
-        score *= np.sqrt(residual.count)
-        k = int(np.argmax(score))
-        best = max(best, (float(score[k]), float(residual.frequency[k]), scale))
-    return best[1], best[2]
+def _start_value(name: str, frequency: float, scale: float) -> Target:
+    """Return a candidate at a frequency in Hz whose peak has this relative half width."""
+    return Target(name, frequency, scale / 1.5, min(max(3 * scale, 0.02), 0.15))
 
 
-def _line_mask(spectrum: Spectrum) -> tuple[BoolArray, FloatArray]:
-    """Return ordinates far above those three to eight away, and the median of these.
+def _without_lines(spectrum: Spectrum, lines: Sequence[float]) -> Spectrum:
+    """Replace the ordinates of lines, also of isolated ones, by the level near them.
 
-    Neighbours of a resonance are high, too; those of a sine are not.
+    Neighbours of a resonance are high, too; those three to eight ordinates from a sine are not.
     """
     widest = _NEAR_LINE[-1]
     padded = np.pad(spectrum.periodogram, widest, mode="reflect")
     n = spectrum.periodogram.size
-    near = [padded[widest + k : widest + k + n] for b in _NEAR_LINE for k in (-b, b)]
-    level = np.median(near, axis=0)
+    around = [padded[widest + k : widest + k + n] for b in _NEAR_LINE for k in (-b, b)]
+    level = np.median(around, axis=0)
     ratio = _LINE_RATIO * median_ordinate(1) / median_ordinate(spectrum.count)
-    lines = spectrum.periodogram > ratio * level
     # A line between two ordinates reaches two more on either side.
-    return np.convolve(lines, np.ones(5), mode="same") > 0, np.asarray(level)
-
-
-def _without_lines(spectrum: Spectrum, lines: Sequence[float]) -> Spectrum:
-    """Replace the ordinates of lines by the level near them."""
-    mask, level = _line_mask(spectrum)
-    ordinates = np.where(mask, level, spectrum.periodogram)
+    isolated = np.convolve(spectrum.periodogram > ratio * level, np.ones(5), mode="same") > 0
+    ordinates = np.where(isolated, level, spectrum.periodogram)
     clear = spectrum.clear_of(lines)
     for line in lines:
         reach = spectrum.near(line)
         width = reach.stop - reach.start
-        around = slice(max(0, reach.start - width), reach.stop + width)
-        near = ordinates[around][clear[around]]
+        beside = slice(max(0, reach.start - width), reach.stop + width)
+        near = ordinates[beside][clear[beside]]
         if near.size:
             ordinates[reach] = np.median(near) / median_ordinate(spectrum.count)
     return replace(spectrum, periodogram=ordinates)
@@ -175,18 +163,18 @@ def _without_lines(spectrum: Spectrum, lines: Sequence[float]) -> Spectrum:
 
 def clusters(targets: Sequence[Target]) -> list[tuple[Target, ...]]:
     """Group neighbours to fit jointly: their bands overlap, their bandwidths are similar."""
+
+    def interact(lower: Target, upper: Target) -> bool:
+        # A narrow peak near a broad resonance would need the finest resolution over the whole band.
+        ratio = (upper.frequency * upper.damping_ratio) / (lower.frequency * lower.damping_ratio)
+        similar = 1 / constants.SIMILAR_BANDWIDTH < ratio < constants.SIMILAR_BANDWIDTH
+        return upper.band(BAND)[0] < lower.band(BAND)[1] and similar
+
     groups: list[list[Target]] = []
     for target in targets:
         last = groups[-1] if groups else []
-        if last and len(last) < constants.MOST_TOGETHER and _interact(last[-1], target):
+        if last and len(last) < constants.MOST_TOGETHER and interact(last[-1], target):
             last.append(target)
         else:
             groups.append([target])
     return [tuple(group) for group in groups]
-
-
-def _interact(lower: Target, upper: Target) -> bool:
-    # A narrow peak near a broad resonance would need the finest resolution over the whole band.
-    ratio = (upper.frequency * upper.damping_ratio) / (lower.frequency * lower.damping_ratio)
-    similar = 1 / constants.SIMILAR_BANDWIDTH < ratio < constants.SIMILAR_BANDWIDTH
-    return upper.band(BAND)[0] < lower.band(BAND)[1] and similar

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.ndimage import median_filter
+from scipy.ndimage import binary_dilation, median_filter
 from scipy.stats import gamma
 
 from lmshealth._arrays import BoolArray, ComplexArray, FloatArray
@@ -331,23 +331,17 @@ def mask_prominent_lines(data: ClusterData) -> ClusterData:
 
 def mask_residual_lines(data: ClusterData, expected: list[ComplexArray]) -> ClusterData:
     """Mask ordinates that noise about the expectation does not reach; return ``data`` if none."""
-    levels = [
-        _raised(spectrum, np.diagonal(e, axis1=1, axis2=2).real)
-        for spectrum, e in zip(data.spectra.spectra, expected, strict=True)
-    ]
+    levels = []
+    for spectrum, matrix in zip(data.spectra.spectra, expected, strict=True):
+        level = np.diagonal(matrix, axis1=1, axis2=2).real
+        # A misfit of the model is no line: the expectation of a mean is raised to the level near
+        # it. A single periodogram scatters too much for that, and its lines exceed any misfit.
+        if spectrum.count > 1:
+            ordinates = np.diagonal(spectrum.matrix, axis1=1, axis2=2).real
+            ratio = ordinates / level / median_ordinate(spectrum.count)
+            level = level * median_filter(ratio, (_LINE_NEIGHBOURS, 1)).clip(1.0)
+        levels.append(level)
     return _mask_above(data, levels)
-
-
-def _raised(spectrum: CrossSpectrum, expected: FloatArray) -> FloatArray:
-    """Raise the expectation of a mean to the level near it: a misfit of the model is no line.
-
-    A single periodogram scatters too much for that, and its lines exceed any misfit.
-    """
-    if spectrum.count == 1:
-        return expected
-    ordinates = np.diagonal(spectrum.matrix, axis1=1, axis2=2).real
-    ratio = ordinates / expected / median_ordinate(spectrum.count)
-    return np.asarray(expected * median_filter(ratio, (_LINE_NEIGHBOURS, 1)).clip(1.0))
 
 
 def _mask_above(data: ClusterData, levels: list[FloatArray]) -> ClusterData:
@@ -358,19 +352,15 @@ def _mask_above(data: ClusterData, levels: list[FloatArray]) -> ClusterData:
     n_free = sum(int(mask.sum()) for mask in data.masks)
     false_alarm = constants.LINE_FALSE_ALARM / (data.unit.size * n_free)
     masks = []
-    found = False
     for spectrum, mask, level in zip(data.spectra.spectra, data.masks, levels, strict=True):
         highest = gamma.isf(false_alarm, spectrum.count) / spectrum.count
         ordinates = np.diagonal(spectrum.matrix, axis1=1, axis2=2).real
         lines = mask & (ordinates > highest * level).any(axis=1)
-        found = found or bool(lines.any())
-        masks.append(mask.copy())
-        for k in np.flatnonzero(lines).tolist():
-            masks[-1][max(0, k - _LINE_BINS) : k + _LINE_BINS + 1] = False
+        reached = binary_dilation(lines, iterations=_LINE_BINS) if lines.any() else lines
+        masks.append(mask & ~reached)
     # A band that would lose more than half of its ordinates holds no lines.
-    if not found or sum(int(mask.sum()) for mask in masks) < n_free // 2:
-        return data
-    return replace(data, masks=tuple(masks))
+    n_left = sum(int(mask.sum()) for mask in masks)
+    return replace(data, masks=tuple(masks)) if n_free // 2 <= n_left < n_free else data
 
 
 def group_lengths(spectra: Sequence[CrossSpectrum]) -> list[list[int]]:

@@ -55,18 +55,11 @@ class ClusterModes:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ClusterFit:
-    """Result of the fit of a cluster.
+    """Result of the fit of a cluster."""
 
-    Attributes
-    ----------
-    modes : ClusterModes or None
-        Published modes, possibly none of them but lines; None where nothing was fitted.
-    rejected : dict of str to Rejection
-        Reason of each mode that is not published, by name.
-    """
-
+    # those published, possibly only lines; None where nothing was fitted
     modes: ClusterModes | None
-    rejected: dict[str, Rejection]
+    rejected: dict[str, Rejection]  # by the names of the modes that are not published
 
     def refusals(self, log: str) -> list[Refusal]:
         """Return the rejections as refusals of a log, except of names that were assigned."""

@@ -38,48 +38,25 @@ _PRIOR_STD = 10.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ResponseFit:
-    """A rational transfer function with its uncertainty.
+    """A rational transfer function with its uncertainty, modes ascending in frequency.
 
-    Attributes
-    ----------
-    ordinates : Ordinates
-        The lines of the fit, without outliers.
-    outliers : ndarray
-        Frequency in Hz and amplitude, in the unit of the output, of lines that are no response to
-        the input, shape ``(n_outliers, 2)``.
-    estimate : ndarray
-        ``[ln f, ln ζ]``, shape ``(2 n_modes,)``, modes ascending in frequency.
-    cov : ndarray
-        Its covariance, linear unknowns marginalised, shape ``(2 n_modes, 2 n_modes)``.
-    noise_cov : ndarray
-        The part of it by noise alone: scatter of repeated measurements.
-    snr : ndarray
-        Power of each mode at its resonance over noise and distortion in one line, shape
-        ``(n_modes,)``.
-    over_distortion : ndarray
-        The same over the distortion alone; infinite where there is none.
-    response : ndarray of complex
-        The fitted response at the lines.
-    chi_square : float
-        Mean squared error over the variance of the noise, per degree of freedom: about one where
-        the response is rational but for noise. NaN without periods, as the noise is unknown.
-    distortion : float
-        Error beyond the noise as a share of the response: a nonlinearity or a missing term.
-    colour : float
-        Correlation of the whitened errors of neighbouring lines, where it is significant.
+    ``chi_square`` is the mean squared error over the variance of the noise, per degree of freedom:
+    about one where the response is rational but for noise, NaN without periods, as the noise is
+    unknown.
     """
 
-    ordinates: Ordinates
+    ordinates: Ordinates  # the lines of the fit, without outliers
+    # Hz and amplitude of lines that are no response to the input, (n_outliers, 2)
     outliers: FloatArray
-    estimate: FloatArray
-    cov: FloatArray
-    noise_cov: FloatArray
-    snr: FloatArray
-    over_distortion: FloatArray
-    response: ComplexArray
+    estimate: FloatArray  # [ln f, ln ζ], (2 n_modes,)
+    cov: FloatArray  # its covariance, linear unknowns marginalised, (2 n_modes, 2 n_modes)
+    noise_cov: FloatArray  # the part of it by noise alone: scatter of repeated measurements
+    snr: FloatArray  # power at the resonance over noise and distortion in one line, (n_modes,)
+    over_distortion: FloatArray  # the same over the distortion alone; infinite where there is none
+    response: ComplexArray  # fitted, at the lines
     chi_square: float
-    distortion: float
-    colour: float
+    distortion: float  # error beyond noise over the response: nonlinear, or a missing term
+    colour: float  # correlation of errors of neighbouring lines, where it is significant
 
     def __post_init__(self) -> None:
         freeze(self)
