@@ -206,13 +206,11 @@ def _fit_described(
         # A mode may have started at the frequency of another.
         ln_f = found.modes.ln_frequency
         order = sorted(range(ln_f.size), key=lambda i: (ln_f[i], found.names[i]))
-        assigned = assign(np.exp(ln_f[order]).tolist(), cluster, complete=True)
-        names = {
-            found.names[i]: name for i, name in zip(order, assigned.names, strict=True) if name
-        }
+        assigned, ambiguous = assign(np.exp(ln_f[order]).tolist(), cluster, complete=True)
+        names = {found.names[i]: name for i, name in zip(order, assigned, strict=True) if name}
         # Without either no assignment keeps the order within the searches.
-        if names or assigned.ambiguous:
-            fit = ClusterFit(found.rename(names), fit.rejected | assigned.ambiguous)
+        if names or ambiguous:
+            fit = ClusterFit(found.rename(names), fit.rejected | ambiguous)
     return refuse_close_modes(fit)
 
 

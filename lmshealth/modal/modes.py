@@ -145,20 +145,16 @@ def paired(index: ArrayLike, n_modes: int) -> NDArray[np.intp]:
 
 
 def estimates_only(
-    estimate: FloatArray,
-    cov: FloatArray,
-    snr: FloatArray,
-    sources: Sequence[str],
-    channels: Sequence[str],
+    estimate: FloatArray, cov: FloatArray, snr: FloatArray, source: str, channels: Sequence[str]
 ) -> Modes:
-    """Return unnamed modes without shapes, dispersion, lines or refusals.
+    """Return unnamed modes of one source without shapes, dispersion, lines or refusals.
 
     ``estimate`` is ``[ln f, ln ζ]``, shape ``(2 n_modes,)``, ``cov`` its covariance.
     """
     n = len(channels)
     return Modes(
         names=("",) * n,
-        sources=tuple(sources),
+        sources=(source,) * n,
         channels=tuple(channels),
         ln_frequency=estimate[:n],
         ln_damping=estimate[n:],

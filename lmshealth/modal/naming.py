@@ -8,7 +8,7 @@ or name competes for (`name_response`): tracking assigns the rest.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import combinations
 
 import numpy as np
@@ -21,30 +21,25 @@ from lmshealth.modal.targets import Target
 from lmshealth.stage.description import Stage
 
 
-@dataclass(frozen=True, slots=True)
-class Assignment:
-    """Names of resonances."""
-
-    names: tuple[str, ...]  # empty where a resonance is no target or the assignment is not clear
-    ambiguous: dict[str, Rejection]  # targets that are not assigned, but may be a resonance
-
-
 def assign(
     frequency: Sequence[float],
     targets: Sequence[Target],
     *,
     damping: Sequence[float] | None = None,
     complete: bool = False,
-) -> Assignment:
+) -> tuple[tuple[str, ...], dict[str, Rejection]]:
     """Assign resonances to targets by the posterior of all order-preserving assignments.
 
     The prior of an assignment is that of its shifts of ln f (`shift_cost`) and a gain for every
     pair. Pairs outside the search, or with another damping where it is given, are excluded.
     Resonances, in Hz, and targets ascend; ``complete`` states that every resonance is a target.
+
+    Returns the name of each resonance, empty where it is no target or the assignment is not clear,
+    and the targets that are not assigned but may be one of the resonances.
     """
     n, m = len(frequency), len(targets)
     if complete and n == m:
-        return Assignment(tuple(target.name for target in targets), {})
+        return tuple(target.name for target in targets), {}
     ln_f = np.log(np.asarray(frequency, dtype=float))
     nominal = np.log([target.frequency for target in targets])
     search = np.array([target.search for target in targets])
@@ -80,7 +75,7 @@ def assign(
             odds = "; ".join(_odds(frequency[i], probability[i], targets) for i in rivals)
             remedy = "the assignment is not clear; excite the other modes, or narrow searches"
             ambiguous[target.name] = Rejection("ambiguous", f"{odds}: {remedy}")
-    return Assignment(names, ambiguous)
+    return names, ambiguous
 
 
 def _odds(frequency: float, probability: FloatArray, targets: Sequence[Target]) -> str:

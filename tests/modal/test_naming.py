@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from lmshealth.modal.naming import Assignment, assign
+from lmshealth.modal.modes import Rejection
+from lmshealth.modal.naming import assign
 from lmshealth.modal.targets import Target
 
 TARGETS = (
@@ -12,7 +13,9 @@ TARGETS = (
 )
 
 
-def named(*found: float, targets: tuple[Target, ...] = TARGETS) -> Assignment:
+def named(
+    *found: float, targets: tuple[Target, ...] = TARGETS
+) -> tuple[tuple[str, ...], dict[str, Rejection]]:
     """Assign resonances of the described damping."""
     return assign(found, targets, damping=[0.02] * len(found))
 
@@ -20,21 +23,21 @@ def named(*found: float, targets: tuple[Target, ...] = TARGETS) -> Assignment:
 def test_modes_where_they_are_expected_get_their_names() -> None:
     """Three modes shifted together by wear are named in order."""
     shifted = [0.9 * f for f in (105.0, 120.0, 150.0)]
-    assert named(*shifted) == Assignment(("roll", "pitch", "yaw"), {})
+    assert named(*shifted) == (("roll", "pitch", "yaw"), {})
     assert assign(shifted, TARGETS, complete=True) == named(*shifted)
 
 
 def test_a_resonance_outside_every_search_gets_no_name() -> None:
     """It stays unnamed and takes no name from a mode."""
     result = named(60.0, 105.5, 121.0, 150.5)
-    assert result == Assignment(("", "roll", "pitch", "yaw"), {})
+    assert result == (("", "roll", "pitch", "yaw"), {})
 
 
 def test_one_of_two_equal_candidates_is_not_guessed() -> None:
     """Of two resonances as far from one target neither gets its name, and both are quoted."""
-    result = named(98.0, 112.5, targets=TARGETS[:1])
-    assert result.names == ("", "")
-    reason, detail = result.ambiguous["roll"]
+    names, ambiguous = named(98.0, 112.5, targets=TARGETS[:1])
+    assert names == ("", "")
+    reason, detail = ambiguous["roll"]
     assert reason == "ambiguous"
     assert "98 Hz may be roll" in detail
     assert "112.5 Hz may be roll" in detail
@@ -42,20 +45,20 @@ def test_one_of_two_equal_candidates_is_not_guessed() -> None:
 
 def test_a_single_resonance_known_to_be_a_target_is_ambiguous_between_neighbours() -> None:
     """At the frequency of roll it may be roll or pitch; the message quotes both probabilities."""
-    result = assign([112.0], TARGETS, complete=True)
-    assert result.names == ("",)
-    assert set(result.ambiguous) == {"roll", "pitch"}
-    assert "112 Hz may be roll" in result.ambiguous["roll"].detail
-    assert "pitch" in result.ambiguous["roll"].detail
+    names, ambiguous = assign([112.0], TARGETS, complete=True)
+    assert names == ("",)
+    assert set(ambiguous) == {"roll", "pitch"}
+    assert "112 Hz may be roll" in ambiguous["roll"].detail
+    assert "pitch" in ambiguous["roll"].detail
 
 
 def test_nothing_found_names_nothing() -> None:
     """Without a resonance no target is ambiguous."""
-    assert named() == Assignment((), {})
-    assert named(50.0) == Assignment(("",), {})
+    assert named() == ((), {})
+    assert named(50.0) == (("",), {})
 
 
 def test_a_damping_far_off_belongs_to_something_else() -> None:
     """Of two resonances near one target, one ten times as damped, the other has the name."""
     result = assign([98.0, 112.5], TARGETS[:1], damping=[0.2, 0.02])
-    assert result == Assignment(("", "roll"), {})
+    assert result == (("", "roll"), {})

@@ -128,7 +128,11 @@ def average_ordinates(
         kernel = make_kernel(first, kept, int(finer), _MARGIN)
         return MeanOrdinates(frequency, total / count[:, None, None], count, kernel)
     if near is not None:
-        fine = _bins_per_bandwidth(n_segments * resolution) / bandwidth
+        # The mean over the r-th part of the half-power bandwidth B is below the peak by the share
+        # 1/(3r²), and the damping too large by as much. Its standard deviation is (π B T)^-½; a
+        # thirtieth of it is allowed.
+        unbiased = float(np.sqrt(12.0 * np.sqrt(np.pi * (n_segments * resolution))))
+        fine = max(_LEAST_BINS, unbiased) / bandwidth
         starts = _bins(first.frequency, near, bandwidth, fine)[kept]
         starts = np.flatnonzero(np.diff(starts, prepend=-1))
         weight = np.add.reduceat(count, starts)
@@ -148,13 +152,3 @@ def _bins(
     distance = np.min([np.abs(frequency - f) for f in near], axis=0) / (bandwidth / 2)
     step = frequency[1] - frequency[0]
     return np.asarray(np.cumsum(fine * step / np.hypot(1.0, distance)), dtype=np.intp)
-
-
-def _bins_per_bandwidth(resolution: float) -> float:
-    """Return the bins per half-power bandwidth that leave the damping unbiased.
-
-    The mean over the r-th part of the half-power bandwidth is below the peak by the share 1/(3r²),
-    and the damping too large by as much. Its standard deviation is (π B T)^-½; a thirtieth of it
-    is allowed.
-    """
-    return max(_LEAST_BINS, float(np.sqrt(12.0 * np.sqrt(np.pi * resolution))))

@@ -139,20 +139,9 @@ def receptance(f: FloatArray, zeta: FloatArray, frequency: FloatArray) -> Comple
     d_x, d_xx = damping - 2 * beta**2, damping - 4 * beta**2
     square = h * h
     none = np.zeros_like(h)
-    return np.stack(
-        [
-            h,
-            -d_x * square,
-            -damping * square,
-            none,
-            (2 * d_x * d_x * h - d_xx) * square,
-            (2 * d_x * damping * h - damping) * square,
-            none,
-            (2 * damping * damping * h - damping) * square,
-            none,
-            none,
-        ]
-    )
+    by_x = [(2 * d_x * d_x * h - d_xx) * square, (2 * d_x * damping * h - damping) * square]
+    by_z = (2 * damping * damping * h - damping) * square
+    return np.stack([h, -d_x * square, -damping * square, none, *by_x, none, by_z, none, none])
 
 
 # Newton decrement, a square in standard deviations, below which the search ends; along a valley as

@@ -102,7 +102,11 @@ def identify_decays(
     0.97% ± 0.03%
     """
     used = choose_channels(log, channels)
-    decays = _decays(log, segments)
+    segments = select_segments(log, "settling") if segments is None else segments
+    longest = max((s.stop - s.start for s in segments), default=0)
+    if longest < 8:
+        raise BadLog(log.name, "too-short", f"the longest decay has {longest} samples")
+    decays = tuple(s for s in segments if s.stop - s.start >= longest / 2)
     targets = () if stage is None else choose_targets(stage, band)
     limits = _limits(log, decays, targets, band)
     found: list[_BandModes] = []
@@ -149,16 +153,6 @@ class _Request:
     source: str
     channels: tuple[str, ...]
     limits: tuple[float, float]
-
-
-def _decays(log: Log, segments: Sequence[Segment] | None) -> tuple[Segment, ...]:
-    """Return the decays at least half as long as the longest."""
-    if segments is None:
-        segments = select_segments(log, "settling")
-    longest = max((s.stop - s.start for s in segments), default=0)
-    if longest < 8:
-        raise BadLog(log.name, "too-short", f"the longest decay has {longest} samples")
-    return tuple(s for s in segments if s.stop - s.start >= longest / 2)
 
 
 def _limits(
@@ -344,14 +338,13 @@ def _accept(fit: DecayFit, request: _Request, *, linear: bool = True) -> _BandMo
         else:
             modal.append(i)
     if not modal:
-        nothing = estimates_only(np.empty(0), np.empty((0, 0)), np.empty(0), (), ())
+        nothing = estimates_only(np.empty(0), np.empty((0, 0)), np.empty(0), request.source, ())
         return _BandModes(request.source, (), nothing, tuple(rejected))
     result = estimate(fit, modal)
     poles = [pole(i, _incredible(fit, i, result, k)) for k, i in enumerate(modal)]
     snr = np.array([one.snr for one in poles])
     best = [request.channels[c] for c in snr.argmax(axis=1)]
-    sources = [request.source] * len(poles)
-    modes = estimates_only(result.mean, result.cov, snr.max(axis=1), sources, best)
+    modes = estimates_only(result.mean, result.cov, snr.max(axis=1), request.source, best)
     credible = [k for k, one in enumerate(poles) if one.rejection is None]
     rejected += [one for one in poles if one.rejection is not None]
     accepted = tuple(poles[k] for k in credible)
@@ -426,11 +419,11 @@ def _name(
         missing = [target for target in targets if target.name not in taken]
         poles = [pole for band in bands if band.source == source for pole in band.poles]
         poles.sort(key=lambda pole: pole.frequency)
-        assignment = assign(
+        assigned, unclear = assign(
             [pole.frequency for pole in poles], missing, damping=[pole.damping for pole in poles]
         )
-        ambiguous |= assignment.ambiguous
-        names = dict(zip(poles, assignment.names, strict=True))
+        ambiguous |= unclear
+        names = dict(zip(poles, assigned, strict=True))
         for band in bands:
             own = {i: names[pole] for i, pole in enumerate(band.poles) if names.get(pole)}
             named.append(replace(band.modes.select([*own]), names=tuple(own.values())))

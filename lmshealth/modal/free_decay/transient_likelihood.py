@@ -36,12 +36,6 @@ class DecaySpectra:
     sample_rate: float  # in Hz
     base: ComplexArray  # orthonormal, of the leakage from outside the band, (n_ordinates, n_base)
 
-    @property
-    def stacked(self) -> FloatArray:
-        """Real above imaginary parts, shape ``(2 n_ordinates, n_channels, n_segments)``."""
-        y = np.concatenate([self.ordinates.real, self.ordinates.imag], axis=1)
-        return np.asarray(np.moveaxis(y, 0, -1))
-
 
 def transform_decays(
     samples: FloatArray, sample_rate: float, low: float, high: float
@@ -274,7 +268,8 @@ class TransientLikelihood:
         design = (whiten[:, :, :, None] * columns[:, None, None, :]).reshape(
             2 * n * slopes.shape[1], -1
         )
-        data = (whiten @ block.stacked).reshape(design.shape[0], -1)
+        stacked = stack(np.moveaxis(block.ordinates, 0, -1))
+        data = (whiten @ stacked).reshape(design.shape[0], -1)
         q, r = np.linalg.qr(design)
         found = q.T @ data
         residual = data - q @ found

@@ -129,10 +129,8 @@ def _channel(log: Log, name: str) -> Channel:
 def _longest_segment(log: Log) -> tuple[int, int]:
     """Return the longest segment of constant velocity, or of rest in a log that never moves."""
     phases = find_phases(log)
-    kinds = ("constant", "whole")
-    if all(phase.kind == "idle" for phase in phases):
-        kinds = ("idle", "idle")
-    usable = [phase for phase in phases if phase.kind in kinds]
+    rests = all(phase.kind == "idle" for phase in phases)
+    usable = [phase for phase in phases if rests or phase.kind in ("constant", "whole")]
     longest = max(usable, key=lambda phase: phase.stop - phase.start, default=None)
     if longest is None or longest.stop - longest.start < constants.FRF_SAMPLES:
         n = 0 if longest is None else longest.stop - longest.start
@@ -238,7 +236,7 @@ def _modes(log: Log, frf: Frf, output: Channel, fit: ResponseFit) -> Modes:
         low, high = frf.frequency[[0, -1]]
         detail = f"no resonance between {low:.4g} and {high:.4g} Hz from {frf.input}"
         refused.append(Refusal(log.name, "not-excited", detail, output.name, source="frf"))
-    found = estimates_only(fit.estimate, fit.cov, fit.snr, ["frf"] * m, [output.name] * m)
+    found = estimates_only(fit.estimate, fit.cov, fit.snr, "frf", [output.name] * m)
     kept = found.select([i for i in range(m) if i not in why])
     return numbered(merge([kept], _lines(log, output, fit), (*log.refused, *refused)))
 
@@ -280,6 +278,5 @@ def _lines(log: Log, output: Channel, fit: ResponseFit) -> tuple[Line, ...]:
     frequency, amplitude = fit.outliers.T
     if output.kind == "displacement":
         amplitude = amplitude * (2 * np.pi * frequency) ** 2
-    pairs = zip(frequency.tolist(), amplitude.tolist(), strict=True)
-    seen = [(output.name, f, a) for f, a in pairs]
+    seen = [(output.name, f, a) for f, a in np.column_stack([frequency, amplitude]).tolist()]
     return name_lines(seen, (), None, fit.ordinates.spacing)

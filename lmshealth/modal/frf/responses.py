@@ -61,41 +61,24 @@ class Frf:
 
     Noise of the input reduces H1 by its share of the input's power, most at resonances of a driven
     structure; noise of the output raises H2, most at antiresonances; Hv lies between them and is
-    unbiased where both have the same share of noise (channels are weighted by their mean power).
-    In a closed loop, where the input contains fed back noise of the output, all three are biased
+    unbiased where both have the same share of noise (channels are weighted by their mean power). In
+    a closed loop, where the input contains fed back noise of the output, all three are biased
     towards the inverse of the feedback. Stretches too short for a resonance flatten it.
 
-    Attributes
-    ----------
-    input, output : str
-        Channel names.
-    frequency : ndarray
-        In Hz, shape ``(n_lines,)``; with a periodic excitation only excited harmonics.
-    response : ndarray of complex
-        SI unit of the output per that of the input, shape ``(n_lines,)``.
-    std : ndarray
-        Standard deviation of the response by noise, sqrt(E|ΔH|²), shape ``(n_lines,)``.
-    h1, h2, hv : ndarray of complex
-        Estimates from the spectra of all periods or stretches, shape ``(n_lines,)``.
-    coherence : ndarray
-        Between input and output over periods or stretches, 0 to 1, shape ``(n_lines,)``.
-    period : float
-        Of the excitation in s; NaN where it is not periodic.
-    n_averages : float
-        Number of periods, or equivalent number of independent stretches.
+    Arrays have shape ``(n_lines,)``.
     """
 
-    input: str
-    output: str
-    frequency: FloatArray
-    response: ComplexArray
-    std: FloatArray
-    h1: ComplexArray
+    input: str  # channel name
+    output: str  # channel name
+    frequency: FloatArray  # in Hz; with a periodic excitation only excited harmonics
+    response: ComplexArray  # SI unit of the output per that of the input
+    std: FloatArray  # of the response by noise, sqrt(E|ΔH|²)
+    h1: ComplexArray  # from the spectra of all periods or stretches
     h2: ComplexArray
     hv: ComplexArray
-    coherence: FloatArray
-    period: float
-    n_averages: float
+    coherence: FloatArray  # over periods or stretches, 0 to 1
+    period: float  # of the excitation in s; NaN where it is not periodic
+    n_averages: float  # periods, or equivalent number of independent stretches
 
     def __post_init__(self) -> None:
         for name in ("response", "std", "h1", "h2", "hv", "coherence"):
