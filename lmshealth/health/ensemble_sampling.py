@@ -184,29 +184,22 @@ def start_near(centre: FloatArray, cov: FloatArray, log_probability: LogProbabil
             found = np.concatenate([found, points[np.isfinite(log_probability(points))]])
             if found.shape[0] >= n:
                 return found[:n]
-        raise NotConverged(
-            f"of {_START_ATTEMPTS * n} points about the posterior's mode {found.shape[0]} lie "
-            "inside the modal map: widen the map or the prior",
-            found,
-        )
+        number = f"of {_START_ATTEMPTS * n} points about the posterior's mode {found.shape[0]}"
+        raise NotConverged(f"{number} lie inside the modal map: widen the map or the prior", found)
 
     return start
 
 
 def start_among(points: FloatArray, weight: FloatArray) -> Start:
-    """Start from distinct draws of the posterior, shape ``(n, n_dim)``, by weight ``(n,)``.
-
-    Weights are tempered where few draws have all the weight.
-    """
+    """Start from distinct draws ``(n, n_dim)`` of the posterior by weight ``(n,)``, tempered."""
 
     def start(rng: np.random.Generator) -> FloatArray:
         n = _n_walkers(points.shape[1])
         if points.shape[0] < n:
-            raise NotConverged(
-                f"{points.shape[0]} draws lie inside the modal map, {n} are needed to start from: "
-                "widen the map or the prior",
-                points,
+            found = (
+                f"{points.shape[0]} draws lie inside the modal map, {n} are needed to start from"
             )
+            raise NotConverged(f"{found}: widen the map or the prior", points)
         log_weight = np.log(np.maximum(weight, 1e-300))
         flat = tempered(points, log_weight, min(2 * n, 0.5 * points.shape[0])).weight
         return np.asarray(points[rng.choice(points.shape[0], size=n, replace=False, p=flat)])

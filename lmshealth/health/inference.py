@@ -65,10 +65,8 @@ def infer(
     ----------
     track, stage : Drifts or Track, Stage
         Drifts with covariance; parameters, priors and modal map.
-    seed : int or sequence of int
-        Epoch k has the stream ``SeedSequence([*seed, k])``.
-    epochs : sequence of int, optional
-        Indices of epochs of the track; by default at most 40.
+    seed, epochs : int or sequence of int, sequence of int
+        Epoch k has the stream ``SeedSequence([*seed, k])``; by default at most 40 of the track.
     mapper : callable
         ``map``, or that of a pool of processes.
 
@@ -174,10 +172,9 @@ def infer_together(
             tasks.append(EpochPosterior(prior, drifts))
             kept.append(k)
     if not kept:
-        raise NotEnoughData(
-            f"{first.stage}: none of its epochs has an epoch of {machines[1][0].stage} at or "
-            "before it; name the machine whose logs end last first"
-        )
+        missing = f"none of its epochs has an epoch of {machines[1][0].stage} at or before it"
+        needed = "name the machine whose logs end last first"
+        raise NotEnoughData(f"{first.stage}: {missing}; {needed}")
     label = " + ".join(track.stage for track, _ in machines)
     return _infer_all(label, first, tuple(kept), tasks, seed, mapper)
 

@@ -111,10 +111,8 @@ def judge(
 def _reason_for_no_verdict(stage: Stage, history: History, health: Health | None) -> str:
     n_logs, needed = len(history.logs) - history.baseline, stage.description.baseline.logs
     if not stage.parameters:
-        return (
-            "The stage description has no [[parameter]]: the modes are tracked, and no health "
-            "parameter is inferred."
-        )
+        found = "The stage description has no [[parameter]]"
+        return f"{found}: the modes are tracked, and no health parameter is inferred."
     if n_logs < needed:
         return f"{n_logs} usable logs since the baseline began; it needs {needed}."
     if health is None:
@@ -122,10 +120,9 @@ def _reason_for_no_verdict(stage: Stage, history: History, health: Health | None
     if not health.converged[-1]:
         return "The sampler did not converge, so no value is published."
     if not health.explained:
-        return (
-            "No state of the parameters on the map explains the drifts "
-            f"(p = {health.fit[-1]:.1g}): something else moved the modes, or the map is wrong."
-        )
+        p = f"{health.fit[-1]:.1g}"
+        found = f"No state of the parameters on the map explains the drifts (p = {p})"
+        return f"{found}: something else moved the modes, or the map is wrong."
     if not health.informed_parameters().any():
         return "The data do not constrain any health parameter."
     return ""
@@ -149,10 +146,9 @@ def _alarm_sentences(track: Track | None, baseline: int) -> Iterator[str]:
         k = track.modes.index(mode)
         moved, std = track.drift[-1, k], np.sqrt(track.drift_cov[-1, k, k])
         size = f"{100 * np.expm1(moved):+.2f} ± {100 * np.exp(moved) * std:.2f} %"
-        yield (
-            f"Alarm since {track.recorded_at[event.epoch].date().isoformat()}: "
-            f"{mode.replace('_', ' ')} has moved by {size.replace('-', '−')} since the baseline."
-        )
+        when, name = track.recorded_at[event.epoch].date().isoformat(), mode.replace("_", " ")
+        size = size.replace("-", "−")
+        yield f"Alarm since {when}: {name} has moved by {size} since the baseline."
 
 
 def _judge_step(

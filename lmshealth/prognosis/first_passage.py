@@ -27,7 +27,9 @@ def first_passage(
     """Draw the travel from now to the first passage of a limit.
 
     Without deviation the passage is that of the law, in closed form. With deviation, ln health is
-    drawn at grid points with Brownian bridges between them; README.md has the equations.
+    drawn at grid points with Brownian bridges between them; README.md has the equations. The result
+    in m, shape ``(n,)``, is negative, by the law, if the limit has been passed, and infinite if it
+    is never reached or, with deviation, not before the horizon.
 
     Parameters
     ----------
@@ -37,12 +39,6 @@ def first_passage(
         Deviation of ln health from its law now, and its variance per m, shape ``(n,)``.
     now, limit, horizon : float
         Travel in m since the baseline, limit as a fraction of it, and m from now to the horizon.
-
-    Returns
-    -------
-    ndarray
-        In m, shape ``(n,)``: negative, by the law, if the limit has been passed; infinite if it is
-        never reached or, with deviation, not before the horizon.
 
     References
     ----------
@@ -67,11 +63,7 @@ def first_passage(
 def _with_deviation(
     distance: FloatArray, ahead: FloatArray, rate: FloatArray, rng: np.random.Generator
 ) -> FloatArray:
-    """Draw the first passage of 0 by a Wiener process about a path.
-
-    Path of ln health over the limit, and travel from now in m, both ``(n, n_grid)``; variance of
-    the process per m ``(n,)``.
-    """
+    """Draw the first passage of 0 by a Wiener process about a path, both ``(n, n_grid)``."""
     step = np.diff(ahead, axis=1)
     variance = rate[:, None] * step
     distance[:, 1:] += np.cumsum(np.sqrt(variance) * rng.standard_normal(step.shape), axis=1)

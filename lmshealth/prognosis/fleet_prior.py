@@ -132,11 +132,12 @@ def pace_likelihood(z: FloatArray, weight: FloatArray) -> FloatArray:
 
     Of the standardised pace under the description ``(n,)``, with normalised weights ``(n,)``.
     """
-    columns = [
-        logsumexp(0.5 * z**2 - 0.5 * (z - _MEAN) ** 2 / v, axis=1, b=weight) - 0.5 * np.log(v)
-        for v in _VARIANCE
-    ]
-    return np.column_stack(columns)
+    return np.column_stack(
+        [
+            logsumexp(0.5 * z**2 - 0.5 * (z - _MEAN) ** 2 / v, axis=1, b=weight) - 0.5 * np.log(v)
+            for v in _VARIANCE
+        ]
+    )
 
 
 def needs_fleet_prior(evidence: MachineEvidence) -> bool:
@@ -196,13 +197,11 @@ def _predictives(
     evidence: Mapping[str, LawEvidence], needy: Sequence[str], n: int
 ) -> dict[str, _Predictive]:
     """Return the predictive of one of n laws for each machine from the evidence of all others."""
-    share, log_prior = _hyperprior(evidence[needy[0]], n)
-    total = log_prior
+    share, total = _hyperprior(evidence[needy[0]], n)
     for one in evidence.values():
         total = total + _log_evidence(one, share)
-    return {
-        name: _predictive(share, total - _log_evidence(evidence[name], share)) for name in needy
-    }
+    others = {name: total - _log_evidence(evidence[name], share) for name in needy}
+    return {name: _predictive(share, log_posterior) for name, log_posterior in others.items()}
 
 
 def _hyperprior(evidence: LawEvidence, n: int) -> tuple[FloatArray, FloatArray]:

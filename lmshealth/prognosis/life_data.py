@@ -47,14 +47,7 @@ class LifeData:
 
     @classmethod
     def select(cls, history: History, stage: Stage) -> LifeData:
-        """Select the data of a life.
-
-        Raises
-        ------
-        NotEnoughData
-            If the odometer is missing or has not moved, fewer than three logs since the baseline
-            have an informative mode, or the modes stepped more than three times.
-        """
+        """Select the data of a life; raise `NotEnoughData` as `fit_life` describes it."""
         history = condense(history, constants.MAX_LOGS)
         if not history.has_odometer:
             missing = "not every log has travel_km, and degradation laws count by the odometer"
@@ -78,17 +71,8 @@ class LifeData:
         rows = np.flatnonzero(np.isfinite(flat))
         mode_of_series = np.array([modes.index(name) for name in of_series])
         means = np.array([np.nanmean(ln_f[:, mode_of_series == i]) for i in range(len(modes))])
-        return cls(
-            stage=stage,
-            history=history,
-            columns=columns,
-            modes=modes,
-            mode_of_series=mode_of_series,
-            clock=clock,
-            steps=steps,
-            rows=rows,
-            y=flat[rows] - means[mode_of_series[rows // clock.size]],
-        )
+        y = flat[rows] - means[mode_of_series[rows // clock.size]]
+        return cls(stage, history, columns, modes, mode_of_series, clock, steps, rows, y)
 
     @property
     def now(self) -> float:

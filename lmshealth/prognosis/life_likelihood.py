@@ -174,7 +174,10 @@ class Grid:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LifeLikelihood:
-    """Likelihood of a life under any scenario, vectorised over walkers."""
+    """Likelihood of a life under any scenario, vectorised over walkers.
+
+    Ln parameters at the nodes, `x`, are of shape ``(n, n_nodes, n_parameters)``.
+    """
 
     data: LifeData
     covariance: LifeCovariance
@@ -197,10 +200,7 @@ class LifeLikelihood:
         return x[inside, : self.basis.nodes.size], inside
 
     def terms(self, grid: Grid, x: FloatArray) -> FloatArray:
-        """Return the log likelihood plus log prior at the points of a grid, ``(n_points, n)``.
-
-        Ln parameters at the nodes are of shape ``(n, n_nodes, n_parameters)``.
-        """
+        """Return the log likelihood plus log prior at the points of a grid, ``(n_points, n)``."""
         chi_square, log_det = self.quadratic(grid, x)
         return np.asarray(grid.log_weight[:, None] - 0.5 * (chi_square + log_det))
 
@@ -217,9 +217,8 @@ class LifeLikelihood:
     ) -> tuple[FloatArray, FloatArray]:
         """Return mean and covariance of ln health about its law, given a life and all data.
 
-        For the k-th point of a grid, ln parameters at the nodes ``(n, n_nodes, n_parameters)`` and
-        moments ``(n_moments,)`` in m since the baseline: ``(n, n_moments, n_parameters)``, and
-        covariance between the parameters ``(n, n_moments, n_parameters, n_parameters)``.
+        For the k-th point of a grid and moments ``(n_moments,)`` in m since the baseline: ``(n,
+        n_moments, n_parameters)``, and between the parameters ``(…, n_parameters, n_parameters)``.
         """
         data, deviation = self.data, float(grid.deviation[k])
         point = grid.chosen(np.arange(grid.walk.size) == k)

@@ -30,10 +30,8 @@ def prognose(
 
     Parameters
     ----------
-    history : History
-        Modal estimates of all logs.
-    stage : Stage
-        Laws, limits, modal map and usage.
+    history, stage : History, Stage
+        Modal estimates of all logs; laws, limits, modal map and usage.
     seed, chains : int or sequence of int, bool
         As in `fit_life`.
 
@@ -107,9 +105,9 @@ def prognose_with_posterior(
         curve_travel=travel + history.travel[history.baseline],
         curve_quantiles=np.quantile(curve, _LEVELS, axis=0),
         laws=tuple(
-            LawWeight(p.name, kind, begin, probability)
+            LawWeight(p.name, *law, probability)
             for _, p in limited
-            for (kind, begin), probability in life.laws(p.name).items()
+            for law, probability in life.laws(p.name).items()
         ),
         chi_square=life.chi_square,
         degrees_of_freedom=life.degrees_of_freedom,

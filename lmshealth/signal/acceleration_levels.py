@@ -13,7 +13,7 @@ from scipy.special import stdtr
 from lmshealth.errors import BadLog
 from lmshealth.io.log import Channel, Log
 from lmshealth.signal import constants
-from lmshealth.signal.harmonics import Harmonics, decompose
+from lmshealth.signal.harmonics import decompose
 from lmshealth.signal.segments import (
     Part,
     Segment,
@@ -103,20 +103,9 @@ def choose_bands(
 ) -> tuple[FrequencyBand, ...]:
     """Choose the bands: modes and bands of the description, or a grid without one.
 
-    Parameters
-    ----------
-    stage : Stage or None
-        Its modes, health band and watched bands.
-    found : mapping of str to float, optional
-        Natural frequencies in Hz, by name, of the modes identified in this log; other modes have
-        the frequencies of the description.
-    span : (float, float) or None
-        Range in Hz of the modes or grid frequencies.
-
-    Returns
-    -------
-    tuple of FrequencyBand
-        Modes or grid ascending in frequency, then health band, then watched bands.
+    Modes have the natural frequencies in Hz that were found in this log, by name, or else those of
+    the description; the span in Hz is that of modes or grid frequencies. The order is modes or grid
+    ascending in frequency, then health band, then watched bands.
     """
     if stage is None:
         step = constants.GRID
@@ -200,10 +189,7 @@ def _usable(log: Log, bands: Iterable[FrequencyBand], longest: int) -> list[Freq
 
 
 def _read(
-    channel: Channel,
-    sample_rate: float,
-    segments: Sequence[Segment],
-    bands: Sequence[FrequencyBand],
+    channel: Channel, sample_rate: float, segments: Sequence[Segment], bands: list[FrequencyBand]
 ) -> list[tuple[float, float, float, float, int]]:
     """Return the last five fields of `Magnitude` in all bands, the longest stretch first."""
     ordered = sorted(segments, key=lambda s: s.start - s.stop)
@@ -215,7 +201,11 @@ def _read(
             continue
         harmonics = decompose(channel.values[segment.start : segment.stop], sample_rate)
         inside = [harmonics.between(band.low, band.high) for band in bands]
-        strongest = strongest or [_strongest(harmonics, own) for own in inside]
+        if not strongest:
+            for own in inside:
+                at = own.start + int(np.argmax(harmonics.amplitude[own]))
+                peak = float(harmonics.amplitude[at]), float(harmonics.frequency[at])
+                strongest.append((*peak, 1 / harmonics.duration))
         for i, own in enumerate(inside):
             # Stretches too short for the band are omitted.
             if own.stop - own.start >= constants.LEAST_ORDINATES - 1:
@@ -224,13 +214,6 @@ def _read(
                 dof[i] += 2 * (own.stop - own.start)
     rms = np.sqrt(total / seconds)
     return [(*best, r, n) for best, r, n in zip(strongest, rms.tolist(), dof.tolist(), strict=True)]
-
-
-def _strongest(harmonics: Harmonics, inside: slice) -> tuple[float, float, float]:
-    """Return amplitude and frequency of the strongest harmonic of a band, and the resolution."""
-    amplitude = harmonics.amplitude[inside]
-    at = int(np.argmax(amplitude))
-    return float(amplitude[at]), float(harmonics.frequency[inside][at]), 1 / harmonics.duration
 
 
 def find_growth(magnitudes: Iterable[Magnitude]) -> tuple[Growth, ...]:

@@ -79,14 +79,8 @@ def read_error(
 ) -> tuple[FollowingError, ...]:
     """Analyse the following error of a log.
 
-    Parameters
-    ----------
-    log : Log
-        With at least one displacement channel.
-    count, floor : int, float
-        Number of the strongest harmonics to keep, and amplitude of noise in m.
-    part : str
-        Motion phase; see `select_segments`.
+    The `count` strongest harmonics are kept; those up to the floor in m are noise. `part` is a
+    motion phase, see `select_segments`. The result has one reading per displacement channel.
 
     Raises
     ------

@@ -10,7 +10,6 @@ from scipy import fft
 from lmshealth._arrays import FloatArray, freeze
 
 Indices = np.ndarray[tuple[int], np.dtype[np.intp]]
-"""Indices of harmonics."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

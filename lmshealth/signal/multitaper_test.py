@@ -62,11 +62,9 @@ def detect_sinusoids(
     low, high = band
     cuts = _octaves(max(low, high / 2**_MOST_OCTAVES), high)
     octaves = [_plan(lengths, sample_rate, *cut) for cut in cuts]
-    n_tests = sum(max(octave.stop - octave.start, 0) for octave in octaves)
-    rows: list[tuple[float, float]] = []
-    for octave in octaves:
-        if octave.start < octave.stop:
-            rows += _search(octave, read, false_alarm / n_tests)
+    tested = [octave for octave in octaves if octave.start < octave.stop]
+    n_tests = sum(octave.stop - octave.start for octave in tested)
+    rows = [row for octave in tested for row in _search(octave, read, false_alarm / n_tests)]
     return np.array(sorted(rows)).reshape(-1, 2)
 
 
@@ -203,10 +201,9 @@ def _white(ratio: FloatArray) -> FloatArray:
 
 
 def _narrow(ratio: FloatArray, width: float) -> FloatArray:
-    """Return -ln p of the ratio at the peak of a resonance, its width in ordinates.
+    """Return -ln p of the ratio at the peak of a resonance, its width in ordinates (README.md).
 
-    Off the peak, in wider resonances and in more noise p is smaller. For independent exponential
-    variables e and all λ but one negative, Σ λ e > 0 has probability Π λ₊ / (λ₊ + |λⱼ|).
+    Off the peak, in wider resonances and in more noise p is smaller.
     """
     correlation = toeplitz(np.exp(-np.pi * width * np.arange(_WINDOW) / _WINDOW))
     root = np.linalg.cholesky(_tapers() @ correlation @ _tapers().T)

@@ -146,14 +146,9 @@ class CrossSpectrum:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LogSpectra:
-    """Cross spectra of the segments of a log.
+    """Cross spectra of the segments of a log, or means over several.
 
-    Attributes
-    ----------
-    channels, sources : tuple of str
-        Channel names, and ``acc`` or ``delta_e`` of each.
-    spectra : tuple of CrossSpectrum
-        Of segments, or means over several.
+    `sources` are ``acc`` or ``delta_e`` of each channel.
     """
 
     channels: tuple[str, ...]
@@ -226,11 +221,6 @@ def cross_spectra(
         In Hz, as in `periodogram`.
     resonances : sequence of ResonanceRange
         Possible resonances: where a segment does not resolve them no sinusoid is removed.
-
-    Returns
-    -------
-    tuple of CrossSpectrum
-        In the order of their first segments.
     """
 
     def transformed(part: Segment) -> CrossSpectrum:

@@ -93,17 +93,9 @@ def find_lines_by_velocity(
 
     Segments of one speed are searched together, those less than half as long as the longest are
     omitted. A line that is no order of the description, but at one wavelength of several
-    velocities, is named ``order of … mm``. The result is ascending in frequency, each line once
-    per channel, at its strongest.
-
-    Parameters
-    ----------
-    log, channels, stage : Log, sequence of Channel, Stage or None
-        The stage for its orders.
-    band : (float, float)
-        In Hz.
-    false_alarm : float
-        Probability that a channel without lines shows any, at all velocities together.
+    velocities, is named ``order of … mm``. The band is in Hz; `false_alarm` is the probability that
+    a channel without lines shows any, at all velocities together. The result is ascending in
+    frequency, each line once per channel, at its strongest.
     """
     segments = find_segments(log, 0.0)
     groups = _by_velocity(segments)

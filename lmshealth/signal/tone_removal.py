@@ -27,10 +27,9 @@ _SKIRT = 0.05
 
 
 class Sinusoid(NamedTuple):
-    """A removed sinusoid.
+    """A removed sinusoid: the channel that shows it most clearly, and its fractional ordinate.
 
-    ``channel`` is the index of the channel that shows it most clearly, ``ordinate`` its fractional
-    ordinate, ``power`` its one-sided periodogram summed over ordinates.
+    ``power`` is its one-sided periodogram summed over ordinates.
     """
 
     channel: int
@@ -163,8 +162,8 @@ def _fit(
 ) -> tuple[ComplexArray, FloatArray] | None:
     """Fit several sinusoids by the fewest polynomials of a choice that suffice.
 
-    Returns the coefficients of the first one, shape ``(n_terms, n_channels)``, and the power of
-    its surroundings, ``(n_channels,)``; None where no polynomial explains it.
+    Coefficients of the first one, ``(n_terms, n_channels)``, and power of its surroundings,
+    ``(n_channels,)``; None where no polynomial explains it.
     """
     apart = np.abs(np.arange(len(rest)) - places[:, None])
     widest = _foot(choice[-1])

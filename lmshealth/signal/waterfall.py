@@ -79,10 +79,8 @@ class Waterfall:
 def shown_band(stage: Stage) -> tuple[float, float]:
     """Return the band in Hz in which the tracked modes of a stage are searched."""
     modes = [mode for mode in stage.modes if mode.tracked] or stage.modes
-    return (
-        min(mode.frequency_hz * (1 - mode.search) for mode in modes),
-        max(mode.frequency_hz * (1 + mode.search) for mode in modes),
-    )
+    low = min(mode.frequency_hz * (1 - mode.search) for mode in modes)
+    return low, max(mode.frequency_hz * (1 + mode.search) for mode in modes)
 
 
 def relative_spectrum(
