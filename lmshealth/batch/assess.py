@@ -158,11 +158,9 @@ def _results(
 def map_in_order(
     executor: Executor, function: Callable[..., Part], *columns: Iterable[Any]
 ) -> Iterator[Part]:
-    """Apply a function to columns of arguments in parallel; yield the results in order.
-
-    Other than ``Executor.map`` it cancels no future when it is interrupted: an executor of loky
-    that is shut down afterwards would log that as an error of its own.
-    """
+    """Apply a function to columns of arguments in parallel; yield the results in order."""
+    # `Executor.map` cancels futures when it is interrupted, which an executor of loky that is shut
+    # down afterwards would log as an error of its own.
     futures = [executor.submit(function, *row) for row in zip(*columns, strict=True)]
     return (future.result() for future in futures)
 
@@ -289,10 +287,7 @@ def apply_fleet_priors(
             left.append((machine, prior, key))
     if left:
         resources.progress("fleet priors", 0, len(left))
-    updates = (
-        (machine.name, key, store.assessment(machine.name, machine.key), prior)
-        for machine, prior, key in left
-    )
+    updates = ((m.name, key, store.assessment(m.name, m.key), prior) for m, prior, key in left)
     done = resources.pool.map_unordered(_update, updates, _reason)
     for k, ((name, key, _, _), made) in enumerate(done, start=1):
         if isinstance(made, PackedAssessment):
@@ -327,12 +322,10 @@ def _machines_to_update(
 def _update(job: tuple[str, str, bytes | None, FleetPrior]) -> PackedAssessment | str | None:
     """Recompute the prognosis of a machine; return why it fails."""
     name, _, content, prior = job
-    if content is None:
-        return None
     return reason_if_failed(lambda: with_fleet_prior(content, prior), name)
 
 
-def with_fleet_prior(content: bytes, prior: FleetPrior) -> PackedAssessment | None:
+def with_fleet_prior(content: bytes | None, prior: FleetPrior) -> PackedAssessment | None:
     """Recompute the prognosis of a packed assessment; None where it cannot be decoded."""
     found: Assessment | None = unpack_or_none(content, Assessment)
     if found is None or found.track is None:

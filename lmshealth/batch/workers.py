@@ -91,11 +91,10 @@ class _ProcessPool(Pool):
             try:
                 self._start()
                 return
-            except BrokenExecutor:
+            except BaseException as error:
                 self.kill()
-            except BaseException:
-                self.kill()
-                raise
+                if not isinstance(error, BrokenExecutor):
+                    raise
         found = f"worker processes end as they start ({constants.START_ATTEMPTS} attempts)"
         raise LmshealthError(f"{found}: is there enough memory? Use fewer --workers")
 

@@ -83,10 +83,11 @@ def read_manifest_beside(log: str | Path) -> Manifest:
     """Read the ``manifest.csv`` in the folder of a log, which may have none, and no other."""
     root = Path(log).parent
     path = root / MANIFEST
-    trouble = _trouble(path, root) if os.path.lexists(path) else None
-    refused = (Refusal(MANIFEST, *trouble),) if trouble else ()
-    there = os.path.lexists(path) and not trouble
-    return _merged(root, Found((path,) if there else (), refused))
+    if not os.path.lexists(path):
+        return Manifest({}, (), {})
+    trouble = _trouble(path, root)
+    found = Found((), (Refusal(MANIFEST, *trouble),)) if trouble else Found((path,), ())
+    return _merged(root, found)
 
 
 def _merged(root: Path, found: Found) -> Manifest:

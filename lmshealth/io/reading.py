@@ -27,6 +27,7 @@ from lmshealth.io.time_axis import IntArray, pieces, set_velocity, time_axis
 _NEEDED = "needed delta_e_um or acc_<name>_m_s2 (or another unit of the contract)"
 _MEASURED: tuple[Role, ...] = ("displacement", "acceleration", "current")
 _DYNAMIC = ("displacement", "acceleration")
+_REFERENCES = ("reference_velocity", "reference_position")
 
 
 def read_log(
@@ -94,11 +95,8 @@ def read_log(
 def content_digest(path: str | Path, *, name: str | None = None) -> str:
     """Return the SHA-256 of a file's content; the name is for messages, by default the path.
 
-    Raises
-    ------
-    BadLog
-        With reason ``missing-file`` where no file can be read, ``empty`` for 0 bytes: empty files
-        are no copies of each other.
+    `BadLog` (``missing-file``, or ``empty``: empty files are no copies of each other) if there is
+    no content.
     """
     label = shown(path) if name is None else name
     try:
@@ -117,11 +115,8 @@ def content_digest(path: str | Path, *, name: str | None = None) -> str:
 
 def require_identity(log: Log) -> None:
     """Require the metadata that tracking needs; `BadLog` (``metadata``) names the missing keys."""
-    given = {
-        "stage": log.metadata.stage,
-        "recorded_at": log.metadata.recorded_at,
-        "travel_km": log.metadata.travel,
-    }
+    own = log.metadata
+    given = {"stage": own.stage, "recorded_at": own.recorded_at, "travel_km": own.travel}
     if absent := [key for key, value in given.items() if value is None]:
         needed = "needed in the file's metadata or in manifest.csv"
         raise BadLog(log.name, "metadata", f"{', '.join(absent)} not given; {needed}")
@@ -141,8 +136,8 @@ def _to_log(
     filled = {key: value for key, value in overrides.items() if value.strip()}
     metadata, rate = parse_metadata(content.metadata | columns.constants() | filled)
     series = _series(content, columns)
-    time = _first(series, "time")
-    axis = time_axis(None if time is None else time.values, rate)
+    stamps = [item.values for item in series if item.signal.role == "time"]
+    axis = time_axis(stamps[0] if stamps else None, rate)
     refused = [replace(refusal, log=name) for refusal in content.refused]
     if axis.note:
         refused.append(Refusal(name, "gaps", axis.note, channel="time_s"))
@@ -157,18 +152,16 @@ def _to_log(
                 channels.append(Channel(item.signal.name, kind, item.values))
     if not any(channel.kind in _DYNAMIC for channel in channels):
         raise Unusable("no-signal", f"no usable channel is left: {_why(refused)}")
-    reference = _first(series, "reference_velocity") or _first(series, "reference_position")
-    gone = None if reference is None else _missing(reference, name, refused)
+    references = [item for role in _REFERENCES for item in series if item.signal.role == role]
+    gone = _missing(references[0], name, refused) if references else None
     if gone is not None:
         missing.append(gone)
     ranges = pieces(series[0].values.size, missing, axis.breaks)
     if not ranges:
         raise Unusable("no-signal", f"no two samples in a row are complete; {_why(refused)}")
-    velocity = None
-    if reference is not None and gone is not None:
-        velocity = reference.values
-        if reference.signal.role == "reference_position":
-            velocity = set_velocity(velocity, ranges, axis.sample_rate)
+    velocity = None if gone is None else references[0].values
+    if velocity is not None and references[0].signal.role == "reference_position":
+        velocity = set_velocity(velocity, ranges, axis.sample_rate)
     return Log(
         name=name,
         digest=digest,
@@ -212,10 +205,6 @@ def _series(content: Content, columns: ColumnMap) -> list[_Series]:
     if (shortest := min(lengths.values())) < constants.SHORTEST_PIECE:
         raise Unusable("empty", f"{shortest} samples; needed at least {constants.SHORTEST_PIECE}")
     return series
-
-
-def _first(series: list[_Series], role: Role) -> _Series | None:
-    return next((item for item in series if item.signal.role == role), None)
 
 
 def _missing(item: _Series, name: str, refused: list[Refusal]) -> IntArray | None:

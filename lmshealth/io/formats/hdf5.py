@@ -121,9 +121,8 @@ def _dataset(file: Any, name: str) -> Any:
     if item.is_virtual or item.external:
         raise Unusable("escapes", f"column {name!r} keeps its samples in another file")
     # HDF5 reads blocks that a crashed recorder never wrote as zeros.
-    if item.size == 0 or item.chunks is None:
-        needed, found = int(item.size > 0), int(item.id.get_storage_size() > 0)
-    else:
+    needed, found = int(item.size > 0), int(item.id.get_storage_size() > 0)
+    if item.size > 0 and item.chunks is not None:
         needed, found = -(-item.size // item.chunks[0]), item.id.get_num_chunks()
     if found < needed:
         raise Unusable("corrupt", f"column {name!r}: {found} of {needed} blocks were ever written")
