@@ -1,4 +1,4 @@
-"""What happened at once is found with its kind, place and size; in quiet lives nothing is."""
+"""Changes are detected with kind, place and size; lives without changes have none."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def life(
     loop: float = 1.0,
     sources: tuple[str, ...] = ("acc", "delta_e"),
 ) -> History:
-    """Make a life of two modes that jump by ln f and ln ζ at one place, or as one source reads."""
+    """Make a life of two modes with a step of ln f and ln ζ, of all sources or of one."""
     rng = np.random.default_rng(seed)
     level, damping = np.tile(np.log(FREQUENCY[:2]), (N_LOGS, 1)), np.log(DAMPING[:2])
     damping = np.tile(damping, (N_LOGS, 1))
@@ -65,7 +65,7 @@ def life(
 
 
 def told(found: Track) -> set[tuple[str, int, str]]:
-    """Give kind, place and source of what was found, without the alarms that follow from it."""
+    """Return kind, place and source of the detected steps, without alarms."""
     return {(e.kind, e.epoch, e.source) for e in found.events if e.kind != "alarm"}
 
 
@@ -80,9 +80,9 @@ HAPPENINGS = {
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", HAPPENINGS)
 def test_what_happened_is_found_with_its_kind_place_and_size(stage: Stage, kind: str) -> None:
-    """In 8 lives of each kind nothing else is found, and sizes lie within 4 of their std.
+    """In 8 lives of each kind the change alone is detected, its size within 4 of its std.
 
-    Their errors are as large as they say: the sum of squares lies inside its 99.9 % band.
+    The sum of squares of the standardised errors is inside its 99.9 % band.
     """
     given = HAPPENINGS[kind]
     z = []
@@ -105,7 +105,7 @@ def test_what_happened_is_found_with_its_kind_place_and_size(stage: Stage, kind:
 
 @pytest.mark.slow
 def test_a_step_is_damage_and_a_retuning_is_not(stage: Stage) -> None:
-    """The alarm follows from a loosened bolt; what the loop explains, and grease, raise none."""
+    """A step of the modes raises an alarm; a retuning and a regreasing do not."""
     alarms = {
         kind: sum(bool(track(life(seed, **given), stage).alarms) for seed in range(8))
         for kind, given in HAPPENINGS.items()
@@ -116,7 +116,7 @@ def test_a_step_is_damage_and_a_retuning_is_not(stage: Stage) -> None:
 
 @pytest.mark.slow
 def test_the_same_jumps_without_the_loop_are_damage(stage: Stage) -> None:
-    """Negative control: with a following error as ever they are no retuning, and raise alarms."""
+    """Negative control: without a change of the following error the jumps raise alarms."""
     given = HAPPENINGS["servo"] | {"loop": 1.0}
     tracks = [track(life(seed, **given), stage) for seed in range(8)]
     assert not any(("servo", PLACE, "") in told(found) for found in tracks)
@@ -124,7 +124,7 @@ def test_the_same_jumps_without_the_loop_are_damage(stage: Stage) -> None:
 
 
 def test_a_declared_retuning_is_not_found_again(stage: Stage) -> None:
-    """What is declared explains its jumps and its following error."""
+    """A declared step explains its jumps and its following error."""
     step = Step("servo", PLACE, np.arange(N_LOGS) >= PLACE, name="second")
     found = track(replace(life(3, **HAPPENINGS["servo"]), steps=(step,)), stage)
     assert {(e.kind, e.declared) for e in found.events} == {("servo", True)}
@@ -134,7 +134,7 @@ def test_a_declared_retuning_is_not_found_again(stage: Stage) -> None:
 
 @pytest.mark.slow
 def test_nothing_is_found_in_quiet_lives(stage: Stage) -> None:
-    """In 40 lives of two sources nothing happens, and nothing is found or doubted."""
+    """Nothing is detected or taken for an outlier in 40 lives of two sources without changes."""
     for seed in range(100, 140):
         found = track(life(seed), stage)
         assert found.events == ()
@@ -143,9 +143,9 @@ def test_nothing_is_found_in_quiet_lives(stage: Stage) -> None:
 
 @pytest.mark.slow
 def test_two_steps_in_a_row_are_two_steps(stage: Stage) -> None:
-    """What follows soon after an event is weighed from that event on, not against what was before.
+    """A change soon after another is weighed relative to the state after the first one.
 
-    Two bolts that break three logs apart are two steps; a retuning then a sensor raise no alarm.
+    Two steps three logs apart are both detected; a retuning, then a sensor, raise no alarm.
     """
     for seed in range(4):
         history = life(seed, jump=(-0.03, 0.0))
@@ -160,7 +160,7 @@ def test_two_steps_in_a_row_are_two_steps(stage: Stage) -> None:
 
 
 def test_a_drift_that_begins_is_an_alarm(stage: Stage) -> None:
-    """A mode that was still and then falls by 3 % raises the alarm, with the drift as its size."""
+    """A mode that is constant and then falls by 3 % raises an alarm, with the drift as size."""
     rng = np.random.default_rng(30)
     level = np.tile(np.log(FREQUENCY[:2]), (N_LOGS, 1))
     level -= 0.03 * np.maximum(np.arange(N_LOGS) - PLACE, 0)[:, None] / (N_LOGS - PLACE)
@@ -183,7 +183,7 @@ def sums_of(innovations: FloatArray) -> FloatArray:
 
 
 def test_windows_of_large_mean_innovations_are_suspected() -> None:
-    """The suspect is the first log of the window with the largest mean."""
+    """The suspected log is the first of the window with the largest mean."""
     innovations = 0.5 * np.array([1.0, -1.0]) * (-1.0) ** np.arange(20)[:, None]
     sums = sums_of(np.vstack([innovations, np.tile([0.0, 2.5], (4, 1))]))
     assert [suspect(sums[: k + 2], 1, []) for k in range(20)] == [None] * 20
@@ -209,7 +209,7 @@ def test_leaps_of_the_loop_are_suspected() -> None:
 
 
 def test_windows_do_not_reach_before_the_segment() -> None:
-    """Innovations before a step are explained by it."""
+    """A step explains the innovations before it."""
     sums = sums_of(np.tile([4.0, 0.0], (6, 1)))
     assert suspect(sums, 1, []) == 2
     assert suspect(sums, 4, []) == 4
@@ -217,7 +217,7 @@ def test_windows_do_not_reach_before_the_segment() -> None:
 
 
 def test_a_change_of_all_dampings_is_suspected_before_each_of_them() -> None:
-    """Two dampings with a mean of 2.2 are as far as one with 3.1; one of them alone is not."""
+    """Two dampings with a mean of 2.2 equal one with 3.1; one of them alone is not suspected."""
     for moved, suspected in (((0, 0, 1, 1), 10), ((0, 0, 1, 0), None)):
         innovations = np.zeros((12, 4))
         innovations[10:] = 2.2 * np.array(moved)
@@ -225,7 +225,7 @@ def test_a_change_of_all_dampings_is_suspected_before_each_of_them() -> None:
 
 
 def student_bayes_factor(before: FloatArray, after: FloatArray) -> float:
-    """Integrate the noncentral t of a difference of means over its prior of reach 10."""
+    """Integrate the noncentral t of a difference of means over its prior of variance 100."""
     n, m = before.size, after.size
     dof, effective = n + m - 2, n * m / (n + m)
     pooled = (n * before.var() + m * after.var()) / dof
@@ -254,7 +254,7 @@ def test_evidence_of_the_loop_is_the_integral(change: float, kind: str) -> None:
 
 
 def test_evidence_of_the_loop_needs_logs_on_both_sides() -> None:
-    """Unknown errors, and too few before, tell nothing."""
+    """Unknown following errors, or too few before the step, give no evidence."""
     error = np.full(20, 1e-6)
     assert loop_evidence(np.full(20, np.nan), 8, 13, "servo") is None
     assert loop_evidence(error, 2, 13, "servo") is None
@@ -266,7 +266,7 @@ def test_evidence_of_the_loop_needs_logs_on_both_sides() -> None:
 
 
 def test_a_segment_keeps_the_state_and_restarts_the_process_noise(stage: Stage) -> None:
-    """Means stay, rates are open again, the noise stays known, and the weights are the prior's."""
+    """Means and noise scales are kept; rates and weights have their priors again."""
     kept = run(rough_history(np.random.default_rng(32), n=30), stage)
     old = kept[-1][0].pruned()
     model = FilterModel(StateSpace(rough_history(np.random.default_rng(32), n=30), stage))
@@ -293,7 +293,7 @@ def test_a_segment_keeps_the_state_and_restarts_the_process_noise(stage: Stage) 
 
 
 def test_one_setting_restarts_as_it_was(stage: Stage, monkeypatch: pytest.MonkeyPatch) -> None:
-    """With a grid of one only the rate is open anew."""
+    """With a grid of one setting only the rate has its prior again."""
     grid = one(SETTINGS[0], ("acc",))
     history = rough_history(np.random.default_rng(33))
     monkeypatch.setattr(bank, "hyperparameter_grid", lambda n: grid)
@@ -309,7 +309,7 @@ def test_one_setting_restarts_as_it_was(stage: Stage, monkeypatch: pytest.Monkey
 
 
 def test_changes_are_significant_at_the_declared_probability() -> None:
-    """One in a hundred is the bound for an event; an alarm shares it among three routes."""
+    """The bound of an event is 1 in 100; an alarm divides it among its three routes."""
     assert threshold(1) == pytest.approx(np.log(100))
     assert threshold() == pytest.approx(np.log(300))
     likely = Change("step", "", 3, np.log(200), 10.0)

@@ -1,4 +1,4 @@
-"""Influences: what covariates explain agrees with the state space and with known truths."""
+"""Effects of covariates agree with the state space and with known truths."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def warm(slope: np.ndarray = SLOPE, n: int = 60) -> History:
 
 @pytest.mark.slow
 def test_what_is_left_is_what_the_state_space_leaves(bent: Stage) -> None:
-    """Two sources, steps of every kind and two covariates: what is left is ln f - H x, exactly."""
+    """With two sources, two covariates and all steps, the residual is ln f - H x, exactly."""
     history = awkward_history(np.random.default_rng(3))
     followed = track(history, bent)
     taken = accepted_estimates(history, followed)
@@ -74,7 +74,7 @@ def test_what_is_left_is_what_the_state_space_leaves(bent: Stage) -> None:
 
 
 def test_a_known_slope_is_found_and_taken_out(straight: Stage) -> None:
-    """Effects lie within four standard deviations of the truth; only noise is left of the scatter.
+    """Effects are within four standard deviations of the truth; residuals are noise only.
 
     The slopes scatter the logs by 3.2 and 2.0 per mille, noise by 0.5, of which the level takes
     its part.
@@ -91,7 +91,7 @@ def test_a_known_slope_is_found_and_taken_out(straight: Stage) -> None:
 
 
 def test_a_covariate_that_does_nothing_takes_nothing_out(straight: Stage) -> None:
-    """Without an effect coefficients lie about zero, and nothing that is not there is taken out."""
+    """Without an effect, coefficients are about zero and no scatter is removed."""
     history = warm(np.zeros(2))
     for one in find_covariate_effects(history, track(history, straight), straight):
         assert abs(one.effects[0].coefficient) < 4 * one.effects[0].std
@@ -99,7 +99,7 @@ def test_a_covariate_that_does_nothing_takes_nothing_out(straight: Stage) -> Non
 
 
 def test_an_effect_is_seen_beyond_two_standard_deviations(straight: Stage) -> None:
-    """Of linear and square one is enough."""
+    """One significant coefficient of two is sufficient."""
     one = find_covariate_effects(warm(), track(warm(), straight), straight)[0]
     faint, clear = (replace(one.effects[0], coefficient=c, std=1.0) for c in (-1.9, -2.1))
     assert not replace(one, effects=(faint, faint)).seen
@@ -107,7 +107,7 @@ def test_an_effect_is_seen_beyond_two_standard_deviations(straight: Stage) -> No
 
 
 def test_line_and_band_are_those_of_the_effects(straight: Stage, bent: Stage) -> None:
-    """Zero at the reference; straight with a band that grows from there, bent without one."""
+    """The change is zero at the reference; it has a band if linear, none with a curvature."""
     history = warm()
     values = np.array([19.0, 21.0, 25.0])
     one = find_covariate_effects(history, track(history, straight), straight)[0]
@@ -125,7 +125,7 @@ def test_line_and_band_are_those_of_the_effects(straight: Stage, bent: Stage) ->
 
 
 def test_shifts_are_the_sum_of_what_covariates_explain(bent: Stage) -> None:
-    """Where all covariates are known ln f is moved by what each explains, else by those known."""
+    """The sum of all known covariates is the change of ln f."""
     history = awkward_history(np.random.default_rng(4))
     followed = track(history, bent)
     moved = covariate_shifts(history, followed, bent)
@@ -138,7 +138,7 @@ def test_shifts_are_the_sum_of_what_covariates_explain(bent: Stage) -> None:
 
 
 def test_without_covariates_there_is_nothing_to_take_out(straight: Stage) -> None:
-    """Neither an unknown temperature nor one that never leaves its reference has an influence."""
+    """A covariate that is unknown, or never leaves its reference, has no effect."""
     history = warm()
     still = replace(history, covariates={"temperature_c": np.full(len(history.logs), 21.0)})
     for quiet in (replace(history, covariates={}), still):

@@ -1,4 +1,4 @@
-"""The bank of filters against textbook filters, one setting at a time and all together."""
+"""The bank of filters equals textbook filters, for one setting and for their mixture."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def stage(tmp_path_factory: pytest.TempPathFactory) -> Stage:
 
 
 def one(wander: Wander, sources: tuple[str, ...]) -> Hyperparameters:
-    """Put a setting of the oracles as a grid of one."""
+    """Convert a setting of the oracles to a grid of one."""
     scales = np.array([[wander.scales[source] for source in sources]])
     return Hyperparameters(
         np.array([wander.level]),
@@ -67,7 +67,7 @@ def run(
 
 
 def told(history: History, stage: Stage, wander: Wander) -> Followed:
-    """Tell what the bank says under one setting, as the oracles say it."""
+    """Filter with the bank under one setting; return what the oracles return."""
     space = StateSpace(history, stage, history.steps)
     sources = FilterModel(space).sources
     m = space.n_modes
@@ -84,7 +84,7 @@ def told(history: History, stage: Stage, wander: Wander) -> Followed:
 
 
 def furthest(found: Followed, book: Followed, judged: FloatArray) -> float:
-    """Give the largest deviation of means and covariances in standard deviations of the oracle."""
+    """Return the largest deviation of means and covariances in the oracle's std."""
     variance = np.einsum("kpipi->kpi", book.cov)
     # A drift has no variance at its baseline: what differs there differs in units of ln f.
     std = np.sqrt(np.maximum(variance, 1e-2 * variance[:, :1]))
@@ -108,7 +108,7 @@ def test_one_setting_is_the_textbook_filter(stage: Stage, wander: Wander, oracle
 
 
 def test_another_setting_is_told_from_it(stage: Stage) -> None:
-    """Negative control: the bank is nowhere near the filter of another setting or other steps."""
+    """Negative control: the filter with another setting or other steps differs."""
     history = awkward_history(np.random.default_rng(1))
     found, judged = told(history, stage, SETTINGS[0]), np.arange(len(history.logs)) >= 1
     assert furthest(found, kalman(history, SETTINGS[2], KNOWN), judged) > 0.1
@@ -118,7 +118,7 @@ def test_another_setting_is_told_from_it(stage: Stage) -> None:
 
 
 def every() -> list[Wander]:
-    """Give all settings of the grid as the oracles know them."""
+    """Return all settings of the grid as the oracles take them."""
     grid = hyperparameter_grid(1)
     return [
         Wander(walk, rate, bend, {"acc": scale})
@@ -171,9 +171,9 @@ def test_evidence_of_a_drift_is_that_of_one_group_over_the_other(stage: Stage) -
 
 
 def test_pruning_changes_next_to_nothing(stage: Stage) -> None:
-    """Dropping what carries under 1e-5 of its group's best moves nothing by a thousandth of a std.
+    """Pruning below 1e-5 of the group's best changes nothing by a thousandth of a std.
 
-    Negative control: dropping all but the likeliest does.
+    Negative control: pruning all but the most probable does.
     """
     history = rough_history(np.random.default_rng(6), n=60)
     model = FilterModel(StateSpace(history, stage))
@@ -210,7 +210,7 @@ def test_the_prior_of_the_settings_adds_up() -> None:
 
 
 def test_banks_are_immutable(stage: Stage) -> None:
-    """Predicting and updating a bank, or a longer one, leaves it as it was."""
+    """Predicting and updating, or padding, leaves the given bank unchanged."""
     history = rough_history(np.random.default_rng(7))
     model = FilterModel(StateSpace(history, stage))
     at = initial(model)
@@ -225,7 +225,7 @@ def test_banks_are_immutable(stage: Stage) -> None:
 
 
 def test_outliers_have_next_to_no_weight(stage: Stage) -> None:
-    """An outlying log moves the state by a fiftieth of what it did at most, at a cost."""
+    """An outlier moves the state by at most a fiftieth, and costs evidence."""
     history = rough_history(np.random.default_rng(8))
     model = FilterModel(StateSpace(history, stage))
     model.grid = one(SETTINGS[0], ("acc",))
@@ -241,7 +241,7 @@ def test_outliers_have_next_to_no_weight(stage: Stage) -> None:
 
 
 def test_a_log_without_estimates_changes_nothing(stage: Stage) -> None:
-    """An empty log leaves states, covariances and weights, and has no innovation."""
+    """A log without estimates leaves the bank unchanged and has no innovation."""
     history = rough_history(np.random.default_rng(9))
     model = FilterModel(StateSpace(history, stage))
     before = initial(model)
@@ -253,7 +253,7 @@ def test_a_log_without_estimates_changes_nothing(stage: Stage) -> None:
 
 @pytest.mark.slow
 def test_covariances_stay_positive_and_symmetric(stage: Stage) -> None:
-    """Covariances of all settings are symmetric with no eigenvalue that is notably negative."""
+    """Covariances of all settings are symmetric without notably negative eigenvalues."""
     at, _ = run(awkward_history(np.random.default_rng(10), n=40), stage)[-1]
     assert hyperparameter_grid(2).rate_std.size == at.weight.size
     np.testing.assert_allclose(at.cov, np.swapaxes(at.cov, 1, 2), rtol=0, atol=1e-15)

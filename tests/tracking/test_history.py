@@ -1,4 +1,4 @@
-"""Histories: readings put in order, modes lined up, odometers that run backwards."""
+"""Histories: order of logs, columns of modes, contradictory odometers."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def stage(tmp_path: Path) -> Stage:
 
 
 def test_readings_are_sorted_by_moment_then_name(stage: Stage) -> None:
-    """The order given does not matter; equal moments are told apart by name."""
+    """Any order is sorted by time; equal moments are sorted by name."""
     late = make_reading("a", 5, 3e5, {"roll": 4.8})
     early = make_reading("z", 1, 1e5, {"roll": 4.81})
     twin = make_reading("b", 1, 1e5, {"roll": 4.81})
@@ -43,7 +43,7 @@ def test_readings_are_sorted_by_moment_then_name(stage: Stage) -> None:
 
 
 def test_modes_are_lined_up_with_their_covariances(stage: Stage) -> None:
-    """Whatever the order within a log, each mode has its column, rows and cross terms."""
+    """Each mode has its column, rows and cross terms, for any order within a log."""
     readings = [
         make_reading("0", 0, 0.0, {"pitch": 4.9, "roll": 4.8}),
         make_reading("1", 1, 1e5, {"roll": 4.79}),
@@ -61,7 +61,7 @@ def test_modes_are_lined_up_with_their_covariances(stage: Stage) -> None:
 
 
 def test_modes_that_are_not_tracked_or_never_found_are_left_out(stage: Stage) -> None:
-    """Only tracked modes that some log found make a column; empty logs stay as epochs."""
+    """Only tracked modes that a log detects make a column; logs without estimates are epochs."""
     readings = [
         make_reading("0", 0, 0.0, {"pitch": 4.9, "shaker": 3.0}),
         make_reading("1", 1, 1e5, {"shaker": 3.0}),
@@ -72,7 +72,7 @@ def test_modes_that_are_not_tracked_or_never_found_are_left_out(stage: Stage) ->
 
 
 def test_one_mistyped_odometer_does_not_rewrite_the_life(stage: Stage) -> None:
-    """The log that contradicts most others goes, whether its odometer is too high or too low."""
+    """The log that contradicts most others is refused, with an odometer too high or too low."""
     for wrong, at in ((1.8e7, 1), (1e3, 4)):
         travels = [1e5, 2e5, 3e5, 4e5, 5e5, 6e5]
         travels[at] = wrong
@@ -85,7 +85,7 @@ def test_one_mistyped_odometer_does_not_rewrite_the_life(stage: Stage) -> None:
 
 
 def jumping(values: list[float], stage: Stage) -> tuple[list[bool], list[str]]:
-    """Tell which logs kept their roll of these ln frequencies, and which were refused."""
+    """Return the logs that kept their roll of these ln frequencies, and those refused."""
     readings = [
         make_reading(str(k), k, 1e5 * k, {"roll": value, "pitch": 4.9})
         for k, value in enumerate(values)
@@ -103,28 +103,28 @@ def jumping(values: list[float], stage: Stage) -> tuple[list[bool], list[str]]:
 
 
 def test_a_jump_in_one_log_only_is_not_believed(stage: Stage) -> None:
-    """A frequency that is off in one log, also in the last, is refused and named."""
+    """A frequency that deviates in one log, also in the last, is refused with its mode."""
     kept, refused = jumping([4.84, 4.84, 4.92, 4.84, 4.839, 4.70], stage)
     assert kept == [True, True, False, True, True, False]
     assert refused == ["2", "5"]
 
 
 def test_a_jump_that_the_next_log_confirms_is_a_step(stage: Stage) -> None:
-    """A loosened bolt costs no log once the next one shows it too."""
+    """A step costs no log once the next log confirms it."""
     kept, refused = jumping([4.84, 4.84, 4.84, 4.79, 4.79, 4.789, 4.79], stage)
     assert all(kept)
     assert not refused
 
 
 def test_drift_within_reach_is_no_jump(stage: Stage) -> None:
-    """A steady loss of half a per cent a log, as fast wear may bring, is believed."""
+    """A steady loss of 0.5 % per log, as of fast wear, is accepted."""
     kept, refused = jumping([4.84 - 0.005 * k for k in range(6)], stage)
     assert all(kept)
     assert not refused
 
 
 def test_every_source_of_a_mode_has_its_column(stage: Stage) -> None:
-    """Logs with and without accelerometers make one mode of two series."""
+    """Logs with and without accelerometers make one mode with two series."""
     readings = [make_reading(str(k), k, 1e5 * k, {"roll": 4.8, "pitch": 4.9}) for k in range(4)]
     readings[2] = replace(
         readings[2], modes=replace(readings[2].modes, sources=("delta_e", "delta_e"))
@@ -143,7 +143,7 @@ def test_every_source_of_a_mode_has_its_column(stage: Stage) -> None:
 
 
 def test_a_new_tuning_is_a_step_of_the_servo(stage: Stage) -> None:
-    """A change of servo_id, declared by maintenance as well, is one step; its logs see it."""
+    """A change of servo_id that maintenance declares too is one step."""
     readings = [
         replace(r, metadata=replace(r.metadata, servo_id="b" if k in (2, 3) else "a"))
         for k, r in enumerate(make_reading(str(k), k, 1e5 * k, {"roll": 4.8}) for k in range(5))
@@ -155,7 +155,7 @@ def test_a_new_tuning_is_a_step_of_the_servo(stage: Stage) -> None:
 
 
 def test_work_is_a_step_or_a_baseline(stage: Stage) -> None:
-    """Work on guide or mount opens a baseline; what is done before the first log is not seen."""
+    """Work on guide or mount opens a baseline; actions before the first log have no effect."""
     readings = [make_reading(str(k), k, 1e5 * k, {"roll": 4.8}) for k in range(6)]
     days = {"regrease": 0.5, "sensor": 1.5, "mount-tightened": 3.5, "servo": -2.0}
     told = [Action("AX-1", START + timedelta(days=d), action) for action, d in days.items()]
@@ -167,7 +167,7 @@ def test_work_is_a_step_or_a_baseline(stage: Stage) -> None:
 
 
 def test_without_every_odometer_the_clock_is_time(stage: Stage) -> None:
-    """One log without travel makes the moments of recording the clock."""
+    """One log without travel makes the time of recording the clock."""
     readings = [make_reading(str(k), k, 1e5 * k, {"roll": 4.8}) for k in range(3)]
     readings[1] = replace(readings[1], metadata=replace(readings[1].metadata, travel=None))
     history, _ = build_history(readings, stage)
@@ -176,7 +176,7 @@ def test_without_every_odometer_the_clock_is_time(stage: Stage) -> None:
 
 
 def test_modes_without_a_name_are_given_one(stage: Stage) -> None:
-    """With a stage an unnamed estimate has the name of the mode it is near to, if it is near."""
+    """With a stage, an unnamed estimate has the name of the mode whose search contains it."""
     reading = make_reading("0", 0, 0.0, {"": float(np.log(126.0))})
     far = make_reading("1", 1, 1e5, {"": float(np.log(300.0))})
     history, _ = build_history([reading, far], stage)
@@ -185,7 +185,7 @@ def test_modes_without_a_name_are_given_one(stage: Stage) -> None:
 
 
 def test_the_first_declared_baseline_counts(stage: Stage) -> None:
-    """The first log declared a baseline is it; without a declaration the first log is."""
+    """The baseline is the first log declared one, or without a declaration the first log."""
     flags = [None, False, True, True]
     readings = [
         make_reading(str(k), k, 1e5 * k, {"roll": 4.8}, baseline=flag)
@@ -209,13 +209,13 @@ def test_covariates_are_nan_where_a_log_has_none(stage: Stage) -> None:
 
 
 def test_no_reading_is_refused(stage: Stage) -> None:
-    """A history of nothing names the stage."""
+    """The error for a history without logs names the stage."""
     with pytest.raises(NotEnoughData, match="small: no usable log"):
         build_history([], stage)
 
 
 def test_modes_that_stay_ambiguous_make_a_note(stage: Stage) -> None:
-    """Three logs in a row without a clear identity make a note, two do not."""
+    """Three logs in a row with ambiguous estimates make a note, two do not."""
     readings = [make_reading(str(k), k, 1e5 * k, {"roll": 4.8}) for k in range(5)]
     history, _ = build_history(readings, stage)
     doubts = [Refusal(str(k), "ambiguous", "", mode="roll") for k in range(5)]
@@ -227,7 +227,7 @@ def test_modes_that_stay_ambiguous_make_a_note(stage: Stage) -> None:
 
 
 def test_a_mode_that_is_no_longer_seen_is_told(stage: Stage) -> None:
-    """Three logs without it are worth a word, two are not."""
+    """Three logs in a row without a mode make a note, two do not."""
     logs = [
         make_reading(f"{day}", day, 1e5 * day, {"roll": 4.8} | ({"pitch": 4.9} if day < 4 else {}))
         for day in range(1, 7)
@@ -246,14 +246,14 @@ def history() -> History:
 
 
 def test_the_present_baseline_is_the_last(history: History) -> None:
-    """Of several baselines the last counts, and the clock is 0 there."""
+    """The last of several baselines counts, and the clock is 0 there."""
     assert history.baseline == 9
     assert history.clock()[9] == 0
     np.testing.assert_allclose(np.diff(history.clock()), np.diff(history.travel))
 
 
 def test_without_odometer_the_clock_is_time(history: History) -> None:
-    """One odometer reading that is missing makes the time the clock, in seconds."""
+    """With one odometer reading missing, the clock is the time in seconds."""
     travel = history.travel.copy()
     assert history.has_odometer
     travel[3] = np.nan
@@ -286,14 +286,14 @@ def test_series_know_their_mode(history: History) -> None:
 def test_histories_that_contradict_themselves_are_refused(
     history: History, field: str, value: object, message: str
 ) -> None:
-    """Wrong shapes, baselines that are no logs and series of unknown modes are named."""
+    """The error names wrong shapes, baselines that are no logs, and series of unknown modes."""
     with pytest.raises(ValueError, match=message):
         replace(history, **{field: value})
 
 
 @pytest.mark.parametrize("variance", [np.nan, 0.0, -1e-6])
 def test_estimates_without_errors_are_refused(history: History, variance: float) -> None:
-    """No std, none at all and a negative variance are named, with their log and series."""
+    """The error names log and series of a missing, zero or negative variance."""
     cov = np.array(history.cov)
     cov[5, 2, 2] = variance
     with pytest.raises(ValueError, match=r"005.csv: roll by delta_e has an estimate of variance"):
@@ -305,7 +305,7 @@ def test_estimates_without_errors_are_refused(history: History, variance: float)
 
 
 def test_logs_out_of_order_are_refused(history: History) -> None:
-    """A clock or an odometer that runs backwards is named; logs at one moment are not refused."""
+    """The error names a clock or odometer that runs backwards; equal moments are accepted."""
     moments = list(history.recorded_at)
     moments[4], moments[5] = moments[5], moments[4]
     with pytest.raises(ValueError, match=r"recorded_at runs backwards at 005.csv"):
@@ -319,7 +319,7 @@ def test_logs_out_of_order_are_refused(history: History) -> None:
 
 
 def test_arrays_are_read_only(history: History) -> None:
-    """Nobody writes to a history, a step or a track."""
+    """Arrays of a history, a step or a track are read-only."""
     followed = make_track(np.zeros((3, 2)), np.zeros((3, 2, 2)))
     for array in (history.cov, history.steps[0].there, followed.drift, followed.innovations):
         with pytest.raises(ValueError, match="read-only"):

@@ -1,4 +1,4 @@
-"""Maintenance records: what is read, what is refused, where a life starts anew."""
+"""Maintenance: rows read, rows refused, new baselines."""
 
 from __future__ import annotations
 
@@ -27,12 +27,12 @@ MOMENTS = [START + timedelta(days=k) for k in range(4)]
 
 
 def done(action: str, day: float) -> Action:
-    """Give one action so many days after the start."""
+    """Return an action some days after the start."""
     return Action("AX-1", START + timedelta(days=day), action)
 
 
 def test_all_files_below_a_folder_are_read_in_the_order_of_time(tmp_path: Path) -> None:
-    """Actions of several files come out sorted by their moment, zones respected."""
+    """Actions of several files are sorted by moment, with time zones."""
     (tmp_path / "deep").mkdir()
     (tmp_path / "maintenance.csv").write_text(HEAD + "A,2026-05-01T10:00:00+02:00,regrease\n")
     (tmp_path / "deep" / "maintenance.csv").write_text(HEAD + "B,2026-05-01T09:00:00Z,servo\n")
@@ -41,7 +41,7 @@ def test_all_files_below_a_folder_are_read_in_the_order_of_time(tmp_path: Path) 
 
 
 def test_rows_of_a_table_are_put_in_the_order_of_time(tmp_path: Path) -> None:
-    """A table that was not filled in by the day reads as one that was, zones respected."""
+    """Rows in any order are read in the order of time, with time zones."""
     path = tmp_path / "maintenance.csv"
     rows = ["A,2026-05-02T09:00:00Z,servo", "B,2026-05-01T09:00:00Z,regrease"]
     path.write_text(HEAD + "\n".join([*rows, "A,2026-05-01T10:00:00+02:00,servo\n"]))
@@ -50,7 +50,7 @@ def test_rows_of_a_table_are_put_in_the_order_of_time(tmp_path: Path) -> None:
 
 
 def test_no_file_is_no_maintenance(tmp_path: Path) -> None:
-    """A folder without records gives nothing."""
+    """A folder without tables has no actions."""
     assert read_maintenance(tmp_path) == Maintenance()
 
 
@@ -80,7 +80,7 @@ def test_a_table_that_is_named_is_refused_for_any_row(
 
 
 def test_a_bad_row_below_a_folder_costs_no_other_row(tmp_path: Path) -> None:
-    """The rows around it count, an open quote swallows none of them, and its machine is told."""
+    """The rows around a bad row are read, also after an open quote; its machine is kept."""
     (tmp_path / "deep").mkdir()
     (tmp_path / "deep" / "maintenance.csv").write_text(
         "stage,recorded_at,travel_km,action,remark\n"
@@ -111,7 +111,7 @@ def test_a_bad_row_below_a_folder_costs_no_other_row(tmp_path: Path) -> None:
 
 
 def test_what_is_not_understood_is_told_to_the_machine_it_names(tmp_path: Path) -> None:
-    """The page of that machine says so and no other does; of a lost table every page does."""
+    """The note is for the machine of the row, and for all machines if a table is unreadable."""
     (tmp_path / "maintenance.csv").write_text(HEAD + "A,2026-05-01T09:00:00Z,repainted\n")
     work = read_maintenance(tmp_path)
     (note,) = maintenance_notes(work.of("A"), MOMENTS)
@@ -124,7 +124,7 @@ def test_what_is_not_understood_is_told_to_the_machine_it_names(tmp_path: Path) 
 
 
 def test_maintenance_out_of_the_folder_is_not_read(tmp_path: Path) -> None:
-    """A link out of the folder, and what is no file, are refused without being opened."""
+    """Links out of the folder, and what is no file, are refused without being opened."""
     (tmp_path / "outside.csv").write_text(HEAD + "A,2026-05-01T09:00:00Z,servo\n")
     (tmp_path / "in" / "deep").mkdir(parents=True)
     (tmp_path / "in" / "maintenance.csv").symlink_to(tmp_path / "outside.csv")
@@ -136,7 +136,7 @@ def test_maintenance_out_of_the_folder_is_not_read(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("action", RESETS)
 def test_work_on_guide_or_mount_opens_a_new_baseline(action: str) -> None:
-    """The reader is told what earlier logs are still good for; a log at that moment is later."""
+    """The note states the use of earlier logs; a log at that moment is later."""
     notes = maintenance_notes(Maintenance((done(action, 2),)), MOMENTS)
     assert len(notes) == 1
     assert action in notes[0]
@@ -144,18 +144,18 @@ def test_work_on_guide_or_mount_opens_a_new_baseline(action: str) -> None:
 
 
 def test_a_reset_without_later_logs_says_so() -> None:
-    """Nothing is known after the last work, which the reader is told."""
+    """The note states that no log follows the last work."""
     assert (
         "no log since" in maintenance_notes(Maintenance((done("preload-adjust", 9),)), MOMENTS)[0]
     )
 
 
 def test_a_reset_before_the_first_log_needs_no_word() -> None:
-    """The life that the logs show begins after it."""
+    """An action before the first log has no note."""
     assert maintenance_notes(Maintenance((done("guide-replaced", -1),)), MOMENTS) == []
 
 
 @pytest.mark.parametrize("action", STEPS)
 def test_work_that_leaves_guide_and_mount_needs_no_word(action: str) -> None:
-    """What it did stands among the events."""
+    """An action without a reset has no note; its step is an event."""
     assert maintenance_notes(Maintenance((done(action, 2),)), MOMENTS) == []

@@ -1,4 +1,4 @@
-"""Tables of estimates: what is read, what is assumed and said, what is refused."""
+"""Tables of estimates: values read, notes on assumptions, refusals."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ def test_a_row_becomes_an_estimate_in_si_units(tmp_path: Path) -> None:
 
 
 def test_cross_terms_enter_the_covariance_of_their_log(tmp_path: Path) -> None:
-    """Terms of other logs, and of estimates that are not there, are left alone."""
+    """Cross terms of other logs, and of estimates that do not exist, are ignored."""
     text = HEAD + row() + row(mode="pitch") + row(log="b", day=2)
     terms = "a,acc,roll,acc,pitch,3e-7\nb,acc,roll,acc,pitch,4e-7\n"
     first, second = read(tmp_path, text, terms)
@@ -79,7 +79,7 @@ def test_cross_terms_enter_the_covariance_of_their_log(tmp_path: Path) -> None:
 
 
 def test_another_program_needs_three_columns(tmp_path: Path) -> None:
-    """Without names, sources, odometer and damping everything that is assumed is said."""
+    """The notes list what is assumed without names, sources, odometer and damping."""
     text = "recorded_at,frequency_hz,frequency_std_hz\n2026-03-01T06:00:00Z,126.4,0.1\n"
     (reading,) = read(tmp_path, text)
     assert reading.modes.names == ("",)
@@ -91,7 +91,7 @@ def test_another_program_needs_three_columns(tmp_path: Path) -> None:
 
 
 def test_assumptions_are_noted(tmp_path: Path) -> None:
-    """Order of time, dampings without a standard deviation, sources without cross terms."""
+    """Notes: order of time, dampings without a standard deviation, sources without cross terms."""
     text = HEAD + row(day=2) + row(log="b", day=1)
     assert "not in the order of time" in notes(tmp_path, text)
     text = HEAD + row().replace("0.02,0.001", "0.02,")
@@ -134,7 +134,7 @@ def test_assumptions_are_noted(tmp_path: Path) -> None:
 def test_values_that_are_not_valid_are_refused_with_their_line(
     tmp_path: Path, text: str, needle: str
 ) -> None:
-    """The error names the file, the line, what was got and what is needed."""
+    """The error states the file, the line, the value and what is needed."""
     with pytest.raises(BadTable, match=r"modes\.csv") as caught:
         read(tmp_path, text)
     assert needle in str(caught.value)
@@ -150,7 +150,7 @@ def test_cross_terms_that_are_no_covariance_are_refused(tmp_path: Path) -> None:
 
 
 def test_names_that_the_stage_does_not_know_are_refused(tmp_path: Path, stage: Stage) -> None:
-    """The error lists the stage's modes and says how to go on."""
+    """The error lists the modes of the stage and the next step."""
     with pytest.raises(BadTable, match=r"modes \['shaker'\] are none of small") as caught:
         read(tmp_path, HEAD + row(mode="shaker"), stage=stage)
     assert "leave the column mode empty" in str(caught.value)
@@ -176,7 +176,7 @@ def drift_row(day: int = 1, mode: str = "roll", drift: object = -0.01, std: obje
 
 
 def test_what_a_track_writes_is_read_again(tmp_path: Path) -> None:
-    """Drifts, covariances, moments and odometer come back as they were; so do missing drifts."""
+    """Drifts, covariances, moments and odometer are read as written; so are missing drifts."""
     rng = np.random.default_rng(1)
     root = 1e-3 * rng.standard_normal((5, 3, 3))
     cov = root @ np.swapaxes(root, 1, 2)
@@ -197,7 +197,7 @@ def test_what_a_track_writes_is_read_again(tmp_path: Path) -> None:
 
 
 def test_logs_of_one_moment_are_epochs_of_their_own(tmp_path: Path) -> None:
-    """Two logs of one moment keep their drifts and cross terms apart, in their order."""
+    """Two logs of one moment have separate drifts and cross terms, in their order."""
     text = DRIFT_HEAD + "".join(
         drift_row(1, mode, d) for d in (-0.01, -0.02) for mode in ("roll", "pitch")
     )
@@ -210,7 +210,7 @@ def test_logs_of_one_moment_are_epochs_of_their_own(tmp_path: Path) -> None:
 
 
 def test_rows_are_put_in_the_order_of_time(tmp_path: Path) -> None:
-    """Epochs ascend whatever the order of rows."""
+    """Epochs ascend for any order of rows."""
     path, _ = write_drifts(
         tmp_path, DRIFT_HEAD + drift_row(3, drift=-0.03) + drift_row(1) + drift_row(2, drift=-0.02)
     )
@@ -281,7 +281,7 @@ def test_several_machines_stay_apart(tmp_path: Path) -> None:
 def test_bad_tables_are_refused_by_their_line(
     tmp_path: Path, text: str, terms: str, told: str
 ) -> None:
-    """Every error names the file and what is wrong where."""
+    """Every error states the file, the place and the fault."""
     path, cross = write_drifts(tmp_path, text, terms)
     with pytest.raises(BadTable, match=told) as caught:
         read_drifts(path, cross_terms=cross)

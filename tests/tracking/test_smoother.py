@@ -1,4 +1,4 @@
-"""The smoother against the whole joint Gaussian."""
+"""The smoother equals the joint Gaussian of all logs."""
 
 from __future__ import annotations
 
@@ -91,7 +91,7 @@ def test_settings_are_averaged_by_their_evidence(stage: Stage) -> None:
 
 @pytest.mark.parametrize("n", [1, 2, 40])
 def test_the_last_epoch_is_the_tracks(stage: Stage, n: int) -> None:
-    """At the last log filter and smoother know the same, however few logs there are."""
+    """Filter and smoother are equal at the last log, for any number of logs."""
     history = quiet(np.random.default_rng(3), n)
     followed = track(history, stage)
     found = smooth(history, followed, stage)
@@ -104,7 +104,7 @@ def test_the_last_epoch_is_the_tracks(stage: Stage, n: int) -> None:
 
 
 def test_damping_that_no_log_tells_is_unknown(stage: Stage) -> None:
-    """What the filter does not say later logs do not say either."""
+    """The smoother has no value where the filter has none."""
     quiet_life = quiet(np.random.default_rng(4), 6)
     ln_damping = np.array(quiet_life.ln_damping)
     ln_damping[:, 0] = np.nan
@@ -126,7 +126,7 @@ def test_later_logs_make_early_epochs_sharper(stage: Stage) -> None:
 
 
 def test_a_step_that_was_found_stays_sharp(stage: Stage) -> None:
-    """What happened at once is not smeared over the logs about it, and its rates are open anew."""
+    """A step is not smoothed over the logs about it; rates have their prior again."""
     history = quiet(np.random.default_rng(5))
     ln_f = np.array(history.ln_frequency)
     ln_f[20:] -= 0.03
@@ -142,7 +142,7 @@ def test_a_step_that_was_found_stays_sharp(stage: Stage) -> None:
 
 @pytest.mark.parametrize("declared", [True, False])
 def test_only_what_nobody_declared_opens_rates_anew(stage: Stage, declared: bool) -> None:
-    """The last epoch is the track's, whether a step was said or found."""
+    """The last epoch equals the track's, for declared and detected steps."""
     ln_f, ln_zeta = still(np.random.default_rng(8), 24)
     ln_f -= 1e-3 * np.arange(24)[:, None] + 0.03 * (np.arange(24) >= 12)[:, None]
     history = make_history(ln_f, ln_damping=ln_zeta, std=5e-4)
@@ -158,7 +158,7 @@ def test_only_what_nobody_declared_opens_rates_anew(stage: Stage, declared: bool
 
 
 def test_nothing_is_said_before_the_baseline(stage: Stage) -> None:
-    """Before the first baseline drifts are NaN, and at it nothing."""
+    """Drifts are NaN before the first baseline, and 0 at it."""
     history = rough_history(np.random.default_rng(6), baseline=3)
     found = smooth(history, track(history, stage), stage)
     assert np.isnan(found.drift[:3]).all() and np.isnan(found.drift_std[:3]).all()
@@ -169,7 +169,7 @@ def test_nothing_is_said_before_the_baseline(stage: Stage) -> None:
 
 @pytest.mark.slow
 def test_an_inconsistent_filter_widens_the_smoother_as_well(stage: Stage) -> None:
-    """The factor of each epoch is on every standard deviation."""
+    """Every standard deviation has the widening of its epoch."""
     ln_f, ln_zeta = still(np.random.default_rng(7))
     history = replace(quiet(np.random.default_rng(7)), ln_frequency=ln_f, ln_damping=ln_zeta)
     followed = track(history, stage)

@@ -1,4 +1,4 @@
-"""What the state of a machine holds, and how logs see it."""
+"""Layout of the state, measurement matrices and prior."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ def test_the_state_is_laid_out_without_gaps(history: History, stage: Stage) -> N
 
 
 def test_ticks_are_parts_of_the_horizon(history: History, stage: Stage) -> None:
-    """With a stage a life is its horizon, without one it is the length of the history."""
+    """A life is the horizon of the stage, or without one the length of the history."""
     gaps = np.diff(history.travel)
     np.testing.assert_allclose(StateSpace(history, stage).ticks, np.r_[0, gaps / 1e7])
     bare = StateSpace(history, None)
@@ -74,13 +74,13 @@ def test_ticks_are_parts_of_the_horizon(history: History, stage: Stage) -> None:
 
 
 def test_without_odometer_ticks_are_of_time(history: History, stage: Stage) -> None:
-    """A horizon in km says nothing of days: rates are counted per length of the history."""
+    """Rates are per length of the history where a horizon in km has no odometer."""
     timed = replace(history, travel=np.full(len(history.logs), np.nan))
     np.testing.assert_allclose(StateSpace(timed, stage).ticks, np.r_[0, np.full(15, 1 / 15)])
 
 
 def test_a_history_without_length_has_ticks_of_nothing(stage: Stage) -> None:
-    """Logs at one place are divided by one, not by nothing."""
+    """Logs at one place have ticks of 0."""
     history = make_history(np.full((4, 2), 4.8), travel=np.full(4, 1e5))
     assert (StateSpace(history, None).ticks == 0).all()
 
@@ -88,7 +88,7 @@ def test_a_history_without_length_has_ticks_of_nothing(stage: Stage) -> None:
 def test_covariates_are_about_their_reference_and_0_where_unknown(
     history: History, stage: Stage
 ) -> None:
-    """Offsets and their squares stand in the measurement matrix of ln f alone."""
+    """Offsets and their squares are in the measurement matrix of ln f only."""
     space = StateSpace(history, stage)
     temperature = history.covariates["temperature_c"]
     for k in (0, 3):
@@ -102,7 +102,7 @@ def test_covariates_are_about_their_reference_and_0_where_unknown(
 
 
 def test_unknown_covariates_widen_ln_f(history: History, stage: Stage) -> None:
-    """An unknown value brings the variance of what those before it span, and only there."""
+    """An unknown value adds the variance of earlier values, and only in its log."""
     unknown = FilterModel(StateSpace(history, stage)).extra[:, 0]
     temperature, payload = history.covariates["temperature_c"], history.covariates["payload_kg"]
     spread = 0.001 * np.std(temperature[:3]), 0.0005 * np.std(payload[:3])
@@ -112,7 +112,7 @@ def test_unknown_covariates_widen_ln_f(history: History, stage: Stage) -> None:
 
 
 def test_without_a_stage_covariates_are_about_their_median(history: History) -> None:
-    """Every covariate present is taken, with a common prior and without curvature."""
+    """Every covariate present is a regressor, with a common prior and without curvature."""
     space = StateSpace(history, None)
     assert [one.name for one in space.regressed] == ["temperature_c", "payload_kg"]
     for one in space.regressed:
@@ -123,14 +123,14 @@ def test_without_a_stage_covariates_are_about_their_median(history: History) -> 
 
 
 def test_a_covariate_that_is_never_known_is_left_out(history: History) -> None:
-    """A column of nothing has no coefficient."""
+    """A covariate that no log knows has no coefficient."""
     empty = {"temperature_c": np.full(len(history.logs), np.nan)}
     for covariates in ({}, empty):
         assert StateSpace(replace(history, covariates=covariates), None).regressed == ()
 
 
 def test_the_series_seen_first_of_a_mode_has_no_bias(history: History, stage: Stage) -> None:
-    """Others are measured against it; of two that are seen at once the first is the reference."""
+    """The series detected first is the reference; of two in one log, the first in order."""
     # The first log has both estimates of one mode, and of the other that by Δe alone.
     assert np.isfinite(history.ln_frequency[0]).tolist() == [True, False, True, True]
     space = StateSpace(history, stage)
@@ -142,9 +142,9 @@ def test_the_series_seen_first_of_a_mode_has_no_bias(history: History, stage: St
 
 
 def test_steps_are_read_where_they_are_there(history: History, stage: Stage) -> None:
-    """A retuning shows in all series until it is taken back, a sensor's in its own source.
+    """A retuning is measured in all series until it is undone, a sensor's step in its source.
 
-    What moves the modes themselves is read in them.
+    A step that changes the modes is part of their levels.
     """
     space = StateSpace(history, stage, history.steps)
     for k in range(len(history.logs)):
@@ -159,7 +159,7 @@ def test_steps_are_read_where_they_are_there(history: History, stage: Stage) -> 
 
 
 def test_one_more_step_only_makes_the_state_longer(history: History, stage: Stage) -> None:
-    """With a step at its end the state space is the one made with all steps."""
+    """Appending a step gives the state space that is built with all steps."""
     short = StateSpace(history, stage, history.steps[:-1])
     longer, whole = short.with_step(history.steps[-1]), StateSpace(history, stage, history.steps)
     assert longer.size == whole.size == short.size + 4
@@ -170,7 +170,7 @@ def test_one_more_step_only_makes_the_state_longer(history: History, stage: Stag
 
 
 def test_the_prior_is_about_the_first_estimates(stage: Stage) -> None:
-    """The centre of each mode is its first estimate by any source; rates and steps are not yet."""
+    """The mean of each mode is its first estimate by any source; rates and steps are 0."""
     history = rough_history(np.random.default_rng(2))
     ln_f = history.ln_frequency.copy()
     ln_f[0, 1] = np.nan
@@ -187,7 +187,7 @@ def test_the_prior_is_about_the_first_estimates(stage: Stage) -> None:
 
 
 def test_the_drift_is_the_level_less_its_copy(history: History, stage: Stage) -> None:
-    """The contrast takes ℓ₀ from ℓ, mode by mode."""
+    """The contrast is ℓ - ℓ₀ of each mode."""
     space = StateSpace(history, stage)
     state = np.arange(8.0)
     np.testing.assert_array_equal(space.drift() @ state, state[space.level] - state[space.base])

@@ -1,4 +1,4 @@
-"""The tracker against textbook filters, and the lives that mislead others."""
+"""The tracker equals textbook filters; steps, outliers and covariates are no false drift."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def stage(tmp_path_factory: pytest.TempPathFactory) -> Stage:
 
 @pytest.fixture
 def plain(monkeypatch: pytest.MonkeyPatch) -> Callable[[Wander], None]:
-    """Shrink the grid to one setting, and let nothing be an outlier or an event."""
+    """Reduce the grid to one setting, and disable outliers and events."""
 
     def choose(wander: Wander) -> None:
         sources = tuple(wander.scales)
@@ -67,19 +67,19 @@ def plain(monkeypatch: pytest.MonkeyPatch) -> Callable[[Wander], None]:
 
 
 def still(rng: np.random.Generator, n: int = 40) -> tuple[FloatArray, FloatArray]:
-    """Ln f and ln ζ of two modes that do not change, with errors of 5e-4 and 0.05."""
+    """Return ln f and ln ζ of two modes that do not change, with errors of 5e-4 and 0.05."""
     ln_f = np.log(FREQUENCY[:2]) + 5e-4 * rng.standard_normal((n, 2))
     return ln_f, np.log(DAMPING[:2]) + 0.05 * rng.standard_normal((n, 2))
 
 
 def quiet(rng: np.random.Generator, n: int = 40) -> History:
-    """Make a life in which nothing happens."""
+    """Make a life without changes."""
     ln_f, ln_zeta = still(rng, n)
     return make_history(ln_f, ln_damping=ln_zeta, std=5e-4)
 
 
 def std_of(found: Track) -> FloatArray:
-    """Give the standard deviations of the drifts, ``(n_epochs, n_modes)``."""
+    """Return the standard deviations of the drifts, ``(n_epochs, n_modes)``."""
     return np.sqrt(np.einsum("kii->ki", found.drift_cov))
 
 
@@ -87,7 +87,7 @@ def std_of(found: Track) -> FloatArray:
 def test_one_setting_is_a_filterpy_loop(
     tmp_path_factory: pytest.TempPathFactory, plain: Callable[[Wander], None], wander: Wander
 ) -> None:
-    """For one setting a track is what filterpy filters, to 1e-10 of the std, work and all."""
+    """A track with one setting equals filterpy's to 1e-10 of the std, after resets too."""
     stage = make_stage(tmp_path_factory.mktemp("two"), tail=TWO)
     history = awkward_history(np.random.default_rng(1))
     plain(wander)
@@ -114,7 +114,7 @@ def test_one_setting_is_a_filterpy_loop(
 
 @pytest.mark.parametrize("baseline", [0, 4])
 def test_drift_and_its_variance_vanish_at_the_baseline(stage: Stage, baseline: int) -> None:
-    """The copy is exact: at the baseline drift and covariance are 0, not nearly so."""
+    """Drift and covariance are exactly 0 at the baseline."""
     found = track(rough_history(np.random.default_rng(5), baseline=baseline), stage)
     assert (found.drift[baseline] == 0).all()
     assert (found.drift_cov[baseline] == 0).all()
@@ -122,7 +122,7 @@ def test_drift_and_its_variance_vanish_at_the_baseline(stage: Stage, baseline: i
 
 
 def test_logs_on_the_spot_of_the_baseline_have_no_drift(stage: Stage) -> None:
-    """Where the odometer has not moved since the baseline there is nothing to infer."""
+    """Logs with the odometer of the baseline have no drift."""
     history = rough_history(np.random.default_rng(6))
     travel = np.r_[np.full(4, 1e5), np.linspace(2e5, 1e6, 6)]
     found = track(replace(history, travel=travel), stage)
@@ -131,7 +131,7 @@ def test_logs_on_the_spot_of_the_baseline_have_no_drift(stage: Stage) -> None:
 
 
 def test_a_step_where_the_machine_stands_is_a_drift(stage: Stage) -> None:
-    """A bolt may loosen where the odometer stands still: events and drift agree."""
+    """A step may occur where the odometer stands still: events and drift agree."""
     ln_f, ln_zeta = still(np.random.default_rng(7), 12)
     ln_f[6:] -= 0.02
     parked = replace(make_history(ln_f, ln_damping=ln_zeta, std=5e-4), travel=np.full(12, 1e5))
@@ -143,7 +143,7 @@ def test_a_step_where_the_machine_stands_is_a_drift(stage: Stage) -> None:
 
 
 def test_damping_that_no_log_tells_is_unknown(stage: Stage) -> None:
-    """A mode of which only frequencies are given has no damping, and the others keep theirs."""
+    """A mode without damping estimates has no damping; the others keep theirs."""
     ln_f, ln_zeta = still(np.random.default_rng(8), 6)
     ln_zeta[:, 0] = np.nan
     found = track(make_history(ln_f, ln_damping=ln_zeta), stage)
@@ -154,7 +154,7 @@ def test_damping_that_no_log_tells_is_unknown(stage: Stage) -> None:
 
 
 def test_nothing_is_said_before_the_baseline(stage: Stage) -> None:
-    """With the baseline in the middle earlier drifts are NaN, and later ones are not."""
+    """Drifts are NaN before a baseline in the middle, and finite after it."""
     found = track(rough_history(np.random.default_rng(7), baseline=3), stage)
     assert np.isnan(found.drift[:3]).all()
     assert np.isnan(found.drift_cov[:3]).all()
@@ -163,7 +163,7 @@ def test_nothing_is_said_before_the_baseline(stage: Stage) -> None:
 
 
 def test_work_on_the_machine_opens_a_new_baseline(stage: Stage) -> None:
-    """Drift is counted from the last work, however far that moved the modes."""
+    """Drift refers to the last reset, by whatever step it changed the modes."""
     ln_f, ln_zeta = still(np.random.default_rng(8))
     ln_f += 0.05 * (np.arange(40) >= 20)[:, None]
     history = make_history(ln_f, ln_damping=ln_zeta, std=5e-4)
@@ -176,7 +176,7 @@ def test_work_on_the_machine_opens_a_new_baseline(stage: Stage) -> None:
 
 
 def test_variance_of_the_drift_keeps_the_error_of_the_baseline(stage: Stage) -> None:
-    """However many logs follow, one poor baseline log leaves its own error in every drift."""
+    """The error of one poor baseline log remains in every drift, after any number of logs."""
     ln_f, _ = still(np.random.default_rng(8))
     cov = np.tile(np.diag([1e-8, 1e-8, 1e-3, 1e-3]), (40, 1, 1))
     sharp = track(make_history(ln_f, cov=cov), stage)
@@ -187,7 +187,7 @@ def test_variance_of_the_drift_keeps_the_error_of_the_baseline(stage: Stage) -> 
 
 
 def test_a_wholly_missing_log_changes_nothing(stage: Stage) -> None:
-    """A log without any mode leaves all other epochs as if it did not exist."""
+    """A log without any mode leaves all other epochs unchanged."""
     rough = rough_history(np.random.default_rng(9))
     temperature = np.nan_to_num(rough.covariates["temperature_c"], nan=21.0)
     history = replace(rough, covariates={"temperature_c": temperature})
@@ -209,7 +209,7 @@ def test_a_wholly_missing_log_changes_nothing(stage: Stage) -> None:
 def test_a_missing_mode_never_poisons_the_others(
     stage: Stage, plain: Callable[[Wander], None]
 ) -> None:
-    """With independent errors a mode is followed as if the half-missing one did not exist."""
+    """With independent errors, a mode's track does not depend on a mode that is partly missing."""
     rng = np.random.default_rng(10)
     ln_f, _ = still(rng, 12)
     temperature = 21 + rng.standard_normal(12)
@@ -225,7 +225,7 @@ def test_a_missing_mode_never_poisons_the_others(
 
 
 def test_a_mode_that_is_not_seen_yet_has_no_frequency(stage: Stage) -> None:
-    """Before its first estimate a mode has neither frequency nor damping, and a wide drift."""
+    """A mode has no frequency or damping, and a wide drift, before its first estimate."""
     ln_f, ln_zeta = still(np.random.default_rng(11), 10)
     ln_f[:3, 1] = np.nan
     found = track(make_history(ln_f, ln_damping=ln_zeta), stage)
@@ -248,14 +248,14 @@ def test_a_missing_baseline_log_is_bridged(stage: Stage) -> None:
 
 
 def test_covariances_stay_positive_and_symmetric(stage: Stage) -> None:
-    """Drift covariances are symmetric with no negative eigenvalue over a long awkward life."""
+    """Drift covariances of a long awkward life are symmetric without negative eigenvalues."""
     found = track(rough_history(np.random.default_rng(12), n=40), stage)
     np.testing.assert_allclose(found.drift_cov, np.swapaxes(found.drift_cov, 1, 2), atol=1e-18)
     assert np.linalg.eigvalsh(found.drift_cov).min() > -1e-16
 
 
 def eventful(seed: int) -> History:
-    """Make a life with everything that could look ahead: a late mode, an outlier, two events."""
+    """Make a life with a late mode, an outlier and two events, which later logs could change."""
     rng = np.random.default_rng(seed)
     n = 36
     level, damping = np.tile(np.log(FREQUENCY[:2]), (n, 1)), np.tile(np.log(DAMPING[:2]), (n, 1))
@@ -284,7 +284,7 @@ def eventful(seed: int) -> History:
 
 @pytest.mark.slow
 def test_no_epoch_knows_of_later_logs(stage: Stage) -> None:
-    """Appending logs changes nothing that was published: events, outliers and doubts included."""
+    """Appended logs change nothing published: events, outliers and uncertain states included."""
     history = eventful(13)
     whole = track(history, stage)
     assert {(e.kind, e.epoch) for e in whole.events if not e.declared} >= {("step", 14)}
@@ -309,7 +309,7 @@ def test_no_epoch_knows_of_later_logs(stage: Stage) -> None:
 
 
 def test_without_a_stage_the_length_of_the_history_counts() -> None:
-    """Negative control: without a horizon rates are per length of the history, known at its end."""
+    """Negative control: without a horizon, rates are per length of the whole history."""
     history = rough_history(np.random.default_rng(14), n=20)
     history = replace(history, covariates={})
     whole, part = track(history), track(cut(history, 10))
@@ -317,7 +317,7 @@ def test_without_a_stage_the_length_of_the_history_counts() -> None:
 
 
 def temperature_life(seed: int) -> History:
-    """Make a life in which only the temperature moves the modes, by 2 % between its ends."""
+    """Make a life in which only temperature moves the modes, by 2 % between its extremes."""
     rng = np.random.default_rng(seed)
     temperature = 21 + 12 * np.sin(np.arange(40) / 5) + rng.standard_normal(40)
     ln_f, _ = still(rng)
@@ -327,12 +327,12 @@ def temperature_life(seed: int) -> History:
 
 
 def worst_drift(found: Track) -> float:
-    """Largest drift in units of its own standard deviation."""
+    """Return the largest drift in its own standard deviations."""
     return float(np.abs(found.drift[1:] / std_of(found)[1:]).max())
 
 
 def test_temperature_alone_raises_no_drift(stage: Stage) -> None:
-    """A life of temperature alone keeps its drifts within their standard deviations."""
+    """Drifts of a life with temperature changes alone are within their standard deviations."""
     found = track(temperature_life(14), stage)
     assert worst_drift(found) < 3
     assert found.events == ()
@@ -344,7 +344,7 @@ def test_temperature_alone_raises_no_drift(stage: Stage) -> None:
 
 
 def test_temperature_that_is_not_recorded_reads_as_drift(stage: Stage) -> None:
-    """Negative control: the same life without its temperatures drifts far beyond its std."""
+    """Negative control: the same life without temperatures drifts far beyond its std."""
     assert worst_drift(track(replace(temperature_life(14), covariates={}), stage)) > 6
 
 
@@ -376,7 +376,7 @@ def test_without_a_stage_covariates_are_taken_about_their_median(
 
 
 def test_a_step_is_followed_and_its_size_told(stage: Stage) -> None:
-    """A 5 % step is taken up within its own uncertainty, and is an event of that size."""
+    """A step of 5 % is followed within its uncertainty, and is an event of that size."""
     history = quiet(np.random.default_rng(17))
     ln_f = np.array(history.ln_frequency)
     ln_f[15:] -= 0.05
@@ -390,7 +390,7 @@ def test_a_step_is_followed_and_its_size_told(stage: Stage) -> None:
 
 @pytest.mark.parametrize("rows", [(0,), (0, 1), (2,)])
 def test_one_log_that_is_far_off_is_an_outlier(stage: Stage, rows: tuple[int, ...]) -> None:
-    """It is named, it leaves the track where it was, and its log says that nobody can tell yet."""
+    """An outlier is listed and leaves the track unchanged; its epoch has a wide uncertainty."""
     history = quiet(np.random.default_rng(18))
     values = np.hstack([history.ln_frequency, history.ln_damping])
     far = 0.05 if rows[0] < 2 else 1.5
@@ -416,7 +416,7 @@ def test_one_log_that_is_far_off_is_an_outlier(stage: Stage, rows: tuple[int, ..
 
 
 def test_outliers_two_logs_in_a_row_are_no_step(stage: Stage) -> None:
-    """Negative control for the control: what goes back at once is not believed for good."""
+    """Negative control: two outliers in a row that return are not adopted as a step."""
     history = quiet(np.random.default_rng(19))
     ln_f = np.array(history.ln_frequency)
     ln_f[20, 0] += 0.05
@@ -427,7 +427,7 @@ def test_outliers_two_logs_in_a_row_are_no_step(stage: Stage) -> None:
 
 
 def test_estimates_that_scatter_more_than_they_say_raise_the_noise_scale(stage: Stage) -> None:
-    """Reported errors that are half the true ones are found out; honest ones are left alone."""
+    """The noise scale rises where reported errors are half the true ones, and only there."""
     history = quiet(np.random.default_rng(18), 60)
     honest = track(history, stage)
     boastful = track(replace(history, cov=history.cov / 4), stage)
@@ -438,7 +438,7 @@ def test_estimates_that_scatter_more_than_they_say_raise_the_noise_scale(stage: 
 
 
 def test_a_filter_that_is_inconsistent_widens(stage: Stage) -> None:
-    """Errors eight times as large as they say are beyond the grid: the intervals are widened."""
+    """Errors eight times as large as reported are beyond the grid: intervals are widened."""
     history = quiet(np.random.default_rng(20), 60)
     found = track(replace(history, cov=history.cov / 64), stage)
     assert found.widening[-1] > 1.2
@@ -448,7 +448,7 @@ def test_a_filter_that_is_inconsistent_widens(stage: Stage) -> None:
 
 
 def test_two_sources_are_told_apart_by_their_bias(stage: Stage) -> None:
-    """The bias of the second source is an effect of each mode, within its standard deviation."""
+    """The bias of the second source is estimated per mode, within its standard deviation."""
     rng = np.random.default_rng(21)
     n = 40
     history = seen_by(
@@ -469,7 +469,7 @@ def test_two_sources_are_told_apart_by_their_bias(stage: Stage) -> None:
 def test_evidence_of_a_declared_step_is_that_of_two_filters(
     stage: Stage, plain: Callable[[Wander], None], monkeypatch: pytest.MonkeyPatch, kind: str
 ) -> None:
-    """The density ratio at no jump is the evidence with the jump over that without, to 1e-8."""
+    """The density ratio at no jump equals the evidence ratio of two filters, to 1e-8."""
     n = 20
     rng = np.random.default_rng(22)
     ln_f, ln_zeta = still(rng, n)
@@ -495,7 +495,7 @@ def test_evidence_of_a_declared_step_is_that_of_two_filters(
 
 
 def test_a_declared_retuning_is_no_drift(stage: Stage) -> None:
-    """What a servo does to the estimates is an effect; undeclared it is found as the loop moved."""
+    """A retuning is an effect; an undeclared one is detected by the change of the loop."""
     n = 40
     ln_f, ln_zeta = still(np.random.default_rng(23), n)
     ln_f[20:] -= 0.015
@@ -517,7 +517,7 @@ def test_a_declared_retuning_is_no_drift(stage: Stage) -> None:
 
 
 def test_a_machine_that_never_moved_is_tracked_without_drift(stage: Stage) -> None:
-    """Logs at one odometer reading are averaged, not divided by their span of 0."""
+    """Logs at one odometer reading are averaged; nothing is divided by their span of 0."""
     ln_f, ln_zeta = still(np.random.default_rng(20), 6)
     found = track(make_history(ln_f, ln_damping=ln_zeta, travel=np.full(6, 1e5)), stage)
     np.testing.assert_allclose(found.drift, 0, atol=1e-12)
@@ -525,7 +525,7 @@ def test_a_machine_that_never_moved_is_tracked_without_drift(stage: Stage) -> No
 
 
 def test_one_log_only_is_tracked(stage: Stage) -> None:
-    """One epoch gives its own estimates, with next to their own std, and no drift."""
+    """A single log gives its own estimates, with nearly their std, and no drift."""
     history = cut(quiet(np.random.default_rng(25)), 1)
     for given in (stage, None):
         found = track(history, given)
@@ -540,7 +540,7 @@ def test_one_log_only_is_tracked(stage: Stage) -> None:
 
 
 def test_a_history_without_estimates_is_refused(stage: Stage) -> None:
-    """No estimate in any log: the error counts the logs."""
+    """The error for a history without estimates states the number of logs."""
     with pytest.raises(NotEnoughData, match="no modal estimate in 5 logs"):
         track(make_history(np.full((5, 2), np.nan)), stage)
 
@@ -554,7 +554,7 @@ def test_tracks_of_wrong_shape_are_refused(field: str) -> None:
 
 
 def test_alarms_are_events_of_damage() -> None:
-    """Of all events only those of kind alarm are alarms."""
+    """Only events of kind alarm are alarms."""
     followed = make_track(np.zeros((3, 1)), np.zeros((3, 1, 1)))
     events = tuple(
         Event(kind, 1, "roll", "", 0.1, 0.01, 9.0, False, 2) for kind in ("step", "alarm")
@@ -563,14 +563,14 @@ def test_alarms_are_events_of_damage() -> None:
 
 
 def white(rng: np.random.Generator, n: int = 200, rows: int = 4) -> np.ndarray:
-    """Draw innovations of a filter that is right, with a few missing."""
+    """Draw innovations of a consistent filter, with a few missing."""
     innovations = rng.standard_normal((n, rows))
     innovations[rng.random((n, rows)) < 0.1] = np.nan
     return innovations
 
 
 def judged(innovations: np.ndarray) -> tuple[float, float]:
-    """Judge innovations that are independent of one another: both p values."""
+    """Return both p-values of independent innovations."""
     squares = np.nansum(innovations**2, axis=1)
     found = consistency(squares, np.isfinite(innovations).sum(axis=1).astype(float), innovations)
     least = [1e-3 if sign > 0 else 1e-6 for sign in (found.nis - 1, found.autocorrelation)]
@@ -580,7 +580,7 @@ def judged(innovations: np.ndarray) -> tuple[float, float]:
 
 @pytest.mark.slow
 def test_p_values_of_a_filter_that_is_right_are_uniform() -> None:
-    """A tenth of them lies under a tenth, of the sum of squares and of the autocorrelation."""
+    """A tenth of each of the two p-values is below 0.1."""
     rng = np.random.default_rng(2)
     p = np.array([judged(white(rng)) for _ in range(1000)])
     for column in p.T:
@@ -590,20 +590,20 @@ def test_p_values_of_a_filter_that_is_right_are_uniform() -> None:
 
 @pytest.mark.parametrize("factor", [0.8, 1.25])
 def test_innovations_of_wrong_size_are_not_consistent(factor: float) -> None:
-    """Negative control: too large and too small ones are both found out."""
+    """Negative control: innovations that are too large or too small are rejected."""
     p, correlated = judged(factor * white(np.random.default_rng(3)))
     assert p < 1e-3 < correlated
 
 
 def test_innovations_that_go_on_are_not_consistent() -> None:
-    """Negative control: what leans the same way from log to log is found out."""
+    """Negative control: autocorrelated innovations are rejected."""
     innovations = white(np.random.default_rng(4))
     innovations[1:] = (innovations[1:] + 0.5 * innovations[:-1]) / np.sqrt(1.25)
     assert judged(innovations)[1] < 1e-3
 
 
 def test_consistency_is_what_it_says() -> None:
-    """Mean of squares over their degrees of freedom, and the lag-one autocorrelation, by hand."""
+    """NIS over degrees of freedom and lag-one autocorrelation equal values computed by hand."""
     innovations = np.array([[1.0, -2.0], [2.0, np.nan], [-1.0, 3.0]])
     found = consistency(np.array([5.0, 4.0, 10.0]), np.array([0.0, 1.0, 2.0]), innovations)
     assert found.nis == pytest.approx(14 / 3)
@@ -621,13 +621,13 @@ def test_consistency_is_what_it_says() -> None:
 def test_unusual_innovations_are_told_before_they_are_wrong(
     mean_square: float, holds: bool, side: str
 ) -> None:
-    """Beside the band of 95 % a filter may hold and leans; far outside it does not hold."""
+    """NIS outside of its 95 % band has a side; far outside the filter is rejected."""
     n = 100
     found = consistency(np.full(n, mean_square), np.ones(n), np.full((n, 1), np.nan))
     assert (found.holds, found.side) == (holds, side)
 
 
 def test_nothing_to_judge_is_consistent() -> None:
-    """A filter that has seen one log only is neither right nor wrong."""
+    """A filter with a single log is neither consistent nor inconsistent."""
     found = consistency(np.zeros(1), np.zeros(1), np.full((1, 2), np.nan))
     assert (found.nis, found.p_value, found.holds) == (1.0, 1.0, True)

@@ -1,4 +1,4 @@
-"""Estimates get the labels of their modes, no label uses later logs, and doubt is refused."""
+"""Estimates get the labels of their modes without later logs; doubtful ones are refused."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ CLOCK = np.arange(N) / (N - 1)
 
 @pytest.fixture
 def rng() -> np.random.Generator:
-    """One generator for a test."""
+    """Return the generator of a test."""
     return np.random.default_rng(20261121)
 
 
@@ -90,7 +90,7 @@ def test_identity_survives_a_crossing_though_names_go_by_order(rng: np.random.Ge
 
 
 def test_identity_survives_a_crossing_without_names(rng: np.random.Generator) -> None:
-    """Tracks are born by their third log, named by frequency, and cross."""
+    """Tracks are confirmed by their third log, named by frequency, and keep their names."""
     found = run(crossing(rng, named=False))
     low, high = found.modes
     assert low.endswith("_hz")
@@ -100,7 +100,7 @@ def test_identity_survives_a_crossing_without_names(rng: np.random.Generator) ->
 
 
 def test_names_that_follow_the_mode_are_accepted(rng: np.random.Generator) -> None:
-    """Where names stay with straight lines through a crossing, so do the labels."""
+    """Labels follow the names where names follow straight lines through a crossing."""
     rows = crossing(rng)
     swapped = [
         replace(e, names=("b", "a")) if t > 0.51 else e for t, e in zip(CLOCK, rows, strict=True)
@@ -111,7 +111,7 @@ def test_names_that_follow_the_mode_are_accepted(rng: np.random.Generator) -> No
 
 @pytest.mark.slow
 def test_damping_decides_where_frequency_does_not(rng: np.random.Generator) -> None:
-    """Two modes merge and part; the one of three times the damping is known again at once."""
+    """Two modes merge and part; the label of the one with three times the damping is kept."""
     gap = np.concatenate([np.linspace(0.02, 0, 20), np.zeros(15), np.linspace(0, 0.02, 25)])
     rows = []
     for k, g in enumerate(gap):
@@ -125,7 +125,7 @@ def test_damping_decides_where_frequency_does_not(rng: np.random.Generator) -> N
 
 @pytest.mark.slow
 def test_estimates_that_nothing_distinguishes_are_ambiguous(rng: np.random.Generator) -> None:
-    """Equal modes that merge and part get no labels any more, and the sentence names both."""
+    """Equal modes that merge and part get no labels afterwards; the reason names both."""
     gap = np.concatenate([np.linspace(0.02, 0, 20), np.zeros(15), np.linspace(0, 0.02, 25)])
     rows = [
         say(np.sort(4.8 + g * np.array([-0.5, 0.5]) + STD_F * rng.standard_normal(2)), "ab")
@@ -159,7 +159,7 @@ def test_shapes_decide_where_frequencies_merge(rng: np.random.Generator) -> None
 
 @pytest.mark.parametrize(("gap", "first", "last"), [(0.003, 20, 20), (0.01, 15, 10)])
 def test_modes_that_veer_are_labelled_by_their_shapes(gap: float, first: int, last: int) -> None:
-    """Frequencies turn away from each other, shapes go over, at once or in half of the life."""
+    """Frequencies veer and shapes are exchanged, at once or over half of the life."""
     half = np.linspace(-0.03, 0.03, N)
     reach, angle = np.hypot(half, gap), 0.5 * np.arctan2(gap, half)
     rows = [
@@ -173,7 +173,7 @@ def test_modes_that_veer_are_labelled_by_their_shapes(gap: float, first: int, la
 
 
 def test_sensors_that_are_moved_cost_no_label(rng: np.random.Generator) -> None:
-    """All shapes change at once: frequencies alone tell from then on."""
+    """All shapes change at once: from then on the labels follow the frequencies."""
     rows = []
     for k, row in enumerate(steady(rng, 30)):
         shapes = np.eye(4)[2 * (k >= 15) :][:2] + 0.05 * rng.standard_normal((2, 4))
@@ -183,7 +183,7 @@ def test_sensors_that_are_moved_cost_no_label(rng: np.random.Generator) -> None:
 
 @pytest.mark.slow
 def test_labels_use_no_later_log(rng: np.random.Generator) -> None:
-    """A life cut short has the labels that the whole life has there."""
+    """The labels of a truncated life equal those of the whole life."""
     rows = crossing(rng)
     whole = run(rows)
     for n in (1, 2, 25, 31, 34, 50):
@@ -193,7 +193,7 @@ def test_labels_use_no_later_log(rng: np.random.Generator) -> None:
 
 
 def test_a_jump_is_accepted_once_the_next_log_confirms_it(rng: np.random.Generator) -> None:
-    """A loosened bolt costs one estimate; the mode goes on at its new level."""
+    """A step costs the label of one estimate; the mode continues at its new level."""
     ln_f = steady(rng, 30)
     ln_f[15:, 1] -= 0.08
     found = run([say(row, "ab") for row in ln_f])
@@ -204,7 +204,7 @@ def test_a_jump_is_accepted_once_the_next_log_confirms_it(rng: np.random.Generat
 
 @pytest.mark.parametrize("step", [0.01, 0.04, 0.06])
 def test_jumps_of_any_size_cost_at_most_one_estimate(rng: np.random.Generator, step: float) -> None:
-    """One per cent is followed at once, what is more waits for the next log as a jump."""
+    """A step of 1 % is labelled at once; a larger one is a jump until the next log."""
     ln_f = steady(rng, 30)
     ln_f[15:, 1] -= step
     doubts = run([say(row, "ab") for row in ln_f]).unassigned
@@ -212,7 +212,7 @@ def test_jumps_of_any_size_cost_at_most_one_estimate(rng: np.random.Generator, s
 
 
 def test_a_single_outlier_stays_refused(rng: np.random.Generator) -> None:
-    """A peak under a wrong name moves nothing."""
+    """A peak with a wrong name moves no level."""
     ln_f = steady(rng, 30)
     ln_f[15, 1] -= 0.08
     found = run([say(row, "ab") for row in ln_f])
@@ -221,7 +221,7 @@ def test_a_single_outlier_stays_refused(rng: np.random.Generator) -> None:
 
 
 def test_declared_jumps_need_no_confirmation(rng: np.random.Generator) -> None:
-    """Where maintenance is declared the step is followed at once."""
+    """A step at declared maintenance is labelled at once."""
     ln_f = steady(rng, 30)
     ln_f[15:, 1] -= 0.08
     rows = [say(row, "ab") for row in ln_f]
@@ -230,7 +230,7 @@ def test_declared_jumps_need_no_confirmation(rng: np.random.Generator) -> None:
 
 
 def test_modes_that_jump_together_keep_their_names(rng: np.random.Generator) -> None:
-    """A crash moves all modes: where no mode was before, their names are accepted at once."""
+    """A crash moves all modes: names at places where no mode was are accepted at once."""
     ln_f = steady(rng, 30)
     ln_f[15:] -= 0.08
     assert run([say(row, "ab") for row in ln_f]).assigned == (("a", "b"),) * 30
@@ -243,7 +243,7 @@ def test_a_name_that_is_wrong_once_is_overruled(rng: np.random.Generator) -> Non
 
 
 def test_modes_vanish_and_return(rng: np.random.Generator) -> None:
-    """A track without a name is known again after ten logs without it."""
+    """A mode without a name is recognised after ten logs without it."""
     rows = [say(row[:1] if 20 <= k < 30 else row) for k, row in enumerate(steady(rng, 50))]
     found = run(rows)
     assert found.modes == ("100_hz", "126_hz")
@@ -252,7 +252,7 @@ def test_modes_vanish_and_return(rng: np.random.Generator) -> None:
 
 
 def test_spurious_estimates_found_no_tracks(rng: np.random.Generator) -> None:
-    """Estimates at random places are refused as spurious, with their reason."""
+    """Estimates at random frequencies are refused as spurious, with the reason."""
     rows = []
     for row in steady(rng, 50):
         extra = [float(rng.uniform(4.9, 5.5))] if rng.random() < 0.3 else []
@@ -264,7 +264,7 @@ def test_spurious_estimates_found_no_tracks(rng: np.random.Generator) -> None:
 
 
 def test_births_near_each_other_have_names_of_their_own(rng: np.random.Generator) -> None:
-    """Two modes that round to one frequency are told apart by more digits."""
+    """Two modes that round to one frequency are named with more digits."""
     ln_f = np.log([120.2, 119.7]) + 2e-4 * rng.standard_normal((10, 2))
     rows = []
     for row in ln_f:
@@ -286,7 +286,7 @@ def test_sources_share_a_mode(rng: np.random.Generator) -> None:
 
 @pytest.mark.slow
 def test_covariates_are_regressed(rng: np.random.Generator) -> None:
-    """Swings of temperature that move modes by 1 % cost no label, and do if not told."""
+    """Changes of temperature that move modes by 1 % cost no label, unless they are not given."""
     warm = 10 * np.sign(np.sin(np.arange(N))) + rng.standard_normal(N)
     ln_f = np.log([120.0, 122.0]) + 1e-3 * warm[:, None] + 2e-4 * rng.standard_normal((N, 2))
     rows = [replace(say(row), cov=np.diag([4e-8, 4e-8, 1e-2, 1e-2])) for row in ln_f]
@@ -296,7 +296,7 @@ def test_covariates_are_regressed(rng: np.random.Generator) -> None:
 
 
 def test_unknown_dampings_do_no_harm(rng: np.random.Generator) -> None:
-    """Estimates without damping are known by frequency alone."""
+    """Estimates without damping are assigned by frequency alone."""
     rows = [
         say(row, "ab", ln_zeta=[np.nan, -4.0] if k % 2 else [-4.0, np.nan])
         for k, row in enumerate(steady(rng, 20))
@@ -305,7 +305,7 @@ def test_unknown_dampings_do_no_harm(rng: np.random.Generator) -> None:
 
 
 def random_life(seed: int) -> tuple[list[Estimates], dict[str, Any]]:
-    """Draw a life that mostly repeats itself: jumps, outliers, gaps, modes that meet, shapes."""
+    """Simulate a life of mostly repeated logs: jumps, outliers, gaps, modes that meet, shapes."""
     rng = np.random.default_rng(seed)
     n, m = 120, 4
     warm = rng.uniform(-10, 10, n)
@@ -384,7 +384,7 @@ def test_the_step_is_pure(rng: np.random.Generator) -> None:
 def test_filters_catch_up_with_repeated_logs(
     monkeypatch: pytest.MonkeyPatch, rng: np.random.Generator, n: int, atol: float
 ) -> None:
-    """After repeated logs the filters are those of the full step; of very many, to a tenth of σ."""
+    """Filters after repeated logs equal the full step; after very many, within a tenth of σ."""
     logs = logs_of([say(row, "ab") for row in steady(rng, n)])
 
     def levels() -> Array:
@@ -400,7 +400,7 @@ def test_filters_catch_up_with_repeated_logs(
 
 
 def test_only_logs_that_repeat_the_one_before_take_the_fast_path(rng: np.random.Generator) -> None:
-    """One that moves, comes near, changes names, dampings or shapes does not."""
+    """A log with a changed level, gap, name, damping or shape is no repetition."""
     still = say([4.6, 4.8], "ab", shapes=np.eye(2))
     state = State.start(np.array([1e-3]), 2)
     for k, log in enumerate(logs_of([still] * 10)):
@@ -460,7 +460,7 @@ class Plain:
         self.z, self.q, self.fresh = z, STD_ZETA**2, True
 
     def predict(self, step: float, scale: float) -> None:
-        """Move on; the prior of the rate is known from the second log on."""
+        """Predict; the rate has its prior from the second log on."""
         rate = 0.3 / scale
         if self.fresh:
             self.p[1, 1], self.fresh = rate**2, False
@@ -492,7 +492,7 @@ class Plain:
 
 
 def likelihood_of_order(labels: Sequence[int], values: Array, modes: Sequence[Plain]) -> float:
-    """Probability of names 0 and 1 of two estimates, if they go by order, over a half each."""
+    """Return the probability of names 0 and 1 by order of frequency, relative to a half each."""
     total = 1.0
     for i, mode in enumerate(labels):
         if mode >= 0:
@@ -508,7 +508,7 @@ def likelihood_of_order(labels: Sequence[int], values: Array, modes: Sequence[Pl
 
 
 def enumerated(ln_f: Array, ln_zeta: Array) -> list[Array]:
-    """Chances of the labels in each log from the second on, over all sequences of assignments."""
+    """Return label probabilities of each log after the first, over all assignment sequences."""
     n = len(ln_f)
     ways = [(a, b) for a in (-1, 0, 1) for b in (-1, 0, 1) if a != b or a < 0]
     weights: dict[tuple[tuple[int, int], ...], float] = {}
@@ -543,7 +543,7 @@ def enumerated(ln_f: Array, ln_zeta: Array) -> list[Array]:
 def test_chances_are_those_of_all_sequences_of_assignments(
     monkeypatch: pytest.MonkeyPatch, seed: int
 ) -> None:
-    """Four logs of two near modes, enumerated with filters written plainly, give the same."""
+    """Enumerate four logs of two near modes with textbook filters: the probabilities agree."""
     monkeypatch.setattr(constants, "MERGING_DISTANCE", -1.0)
     monkeypatch.setattr(constants, "PRUNING_LOG_ODDS", -60.0)
     monkeypatch.setattr(constants, "MOST_HYPOTHESES", 10_000)
@@ -568,13 +568,13 @@ def test_chances_are_those_of_all_sequences_of_assignments(
 
 
 def test_one_log_alone() -> None:
-    """A single log gives its names, and nothing without names."""
+    """A single log gives the labels of its names, and none without names."""
     assert run([say([4.6, 4.8], "ab")]).assigned == (("a", "b"),)
     assert run([say([4.6, 4.8])]).modes == ()
 
 
 def test_logs_without_estimates(rng: np.random.Generator) -> None:
-    """An empty log is no news."""
+    """A log without estimates changes nothing."""
     rows = [say(row, "ab") if k % 3 else say([], []) for k, row in enumerate(steady(rng, 20))]
     assert set(run(rows).assigned) == {(), ("a", "b")}
 

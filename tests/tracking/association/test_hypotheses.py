@@ -45,7 +45,7 @@ def hypotheses(levels: list[list[float]], weights: list[float]) -> Hypotheses:
 
 @pytest.mark.parametrize("seed", range(10))
 def test_assignments_are_the_best_in_order(seed: int) -> None:
-    """All assignments of a small table, enumerated, are found in the same order."""
+    """Enumeration of all assignments of a small table finds the same ones in the same order."""
     rng = np.random.default_rng(seed)
     n, m = rng.integers(1, 4, 2)
     score = rng.normal(1.0, 3.0, (n, m))
@@ -68,7 +68,7 @@ def test_assignments_are_the_best_in_order(seed: int) -> None:
 
 @pytest.mark.parametrize("n", [2, 3, 5])
 def test_shape_likelihood_is_a_distribution(n: int) -> None:
-    """Against directions at random the likelihood ratio averages to one."""
+    """The likelihood ratio averages to one over random directions."""
     rng = np.random.default_rng(n)
     draws = rng.standard_normal((400_000, n))
     gains = shape_gains(draws, np.eye(n)[None, :1])[0, :, 0]
@@ -79,7 +79,7 @@ def test_shape_likelihood_is_a_distribution(n: int) -> None:
 
 
 def test_shapes_without_common_channels_have_no_weight() -> None:
-    """One common channel has no direction."""
+    """Shapes with one common channel have a ratio of zero."""
     shapes = np.array([[1.0, 1.0, np.nan], [np.nan, 1.0, 1.0]])
     modes = np.array([[[np.nan, 1.0, 1.0], [np.nan, np.nan, np.nan]]])
     gains = shape_gains(shapes, modes)
@@ -88,7 +88,7 @@ def test_shapes_without_common_channels_have_no_weight() -> None:
 
 
 def test_names_by_order_follow_the_estimates() -> None:
-    """Two estimates in order have the first and second name, whichever modes they are of."""
+    """Two estimates in order have the first and second name, for any pair of modes."""
     scan = Scan(0, np.arange(2), np.array([0, 1]), measured([4.6, 4.8]), ROW)
     labels, order = np.array([[0, 1], [1, 0], [1, -1]]), np.array([0, 1])
     seen = (np.tile([4.6, 4.7], (3, 1)), np.full((3, 2), 1e-8))
@@ -102,7 +102,7 @@ def test_names_by_order_follow_the_estimates() -> None:
 
 
 def test_estimates_without_a_name_are_of_any_mode() -> None:
-    """No name, and no mode, makes no hypothesis more likely than another."""
+    """Estimates without a name or without a mode change no weight."""
     labels = np.array([[0, 1], [1, -1]])
     gains = name_gains(np.array([-1, 1]), labels, np.array([0, 1]))
     assert (gains[:, 0] == 0).all()
@@ -110,7 +110,7 @@ def test_estimates_without_a_name_are_of_any_mode() -> None:
 
 
 def test_an_unknown_damping_is_averaged_over() -> None:
-    """Odds without ln ζ are the mean of odds with it over the ln ζ of clutter."""
+    """Odds without ln ζ are the mean of the odds with it over the ln ζ of clutter."""
     damping = np.linspace(-30.0, 30.0, 6001)
     n = damping.size
     first = Measurements(*(np.array([x]) for x in (4.6, 1e-6, 0.0, 0.005)), np.empty((1, 0)))
@@ -124,7 +124,7 @@ def test_an_unknown_damping_is_averaged_over() -> None:
 
 
 def test_far_dampings_are_not_merged() -> None:
-    """Hypotheses of one frequency and far dampings stay two."""
+    """Hypotheses of equal frequencies and different dampings are not merged."""
     kept = hypotheses([[4.6, 4.8], [4.6, 4.8]], [0.6, 0.4])
     kept.filters.var_zeta[:] = 0.01
     kept.filters.ln_zeta[:] = [[-4.0, -4.0], [-4.0, -3.0]]
@@ -144,7 +144,7 @@ def test_equal_hypotheses_become_one_and_keep_their_weight() -> None:
 
 
 def test_hypotheses_without_weight_are_pruned() -> None:
-    """Less than 1e-7 of the best is nothing."""
+    """Hypotheses with less than 1e-7 of the best are pruned."""
     kept = reduce_hypotheses(hypotheses([[4.6, 4.8], [4.6, 4.9]], [1.0, 1e-8]))
     assert len(kept.log_weights) == 1
     assert np.exp(kept.log_weights).sum() == pytest.approx(1.0)

@@ -50,7 +50,7 @@ def test_filters_are_textbook_filters() -> None:
 
 
 def test_a_stray_estimate_reopens_the_level() -> None:
-    """Ten σ off, a filter follows by more than half at once; within σ it hardly moves."""
+    """An innovation of ten σ moves the level by more than half of it, one within σ hardly."""
     row = np.array([1.0, 0.0])
     filters = ModeFilters.empty(0, 0).start(measured(np.full(2, 4.8)), row, np.zeros(0), 50.0)
     for _ in range(30):
@@ -63,7 +63,7 @@ def test_a_stray_estimate_reopens_the_level() -> None:
 
 
 def test_rates_are_held_within_their_prior() -> None:
-    """What the first two logs take for a rate shrinks once a life proves longer."""
+    """The rate estimated from the first two logs shrinks once a life proves longer."""
     row = np.array([1.0, 0.0])
     filters = ModeFilters.empty(0, 0).start(measured(np.array([4.8])), row, np.zeros(0), 0.0)
     for scale in (1.0, 100.0, 1e4):
@@ -72,7 +72,7 @@ def test_rates_are_held_within_their_prior() -> None:
 
 
 def test_shapes_are_averaged_whatever_their_sign() -> None:
-    """A shape of either sign gives the same mean, and channels seen later join it."""
+    """A shape of either sign gives the same mean; channels that appear later join it."""
     row = np.array([1.0, 0.0])
     first = np.array([[0.6, 0.8, np.nan]])
     filters = ModeFilters.empty(0, 3).start(

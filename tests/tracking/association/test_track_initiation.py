@@ -35,19 +35,19 @@ def followed(estimates: list[tuple[float, int] | None]) -> tuple[Candidates, lis
 
 
 def test_three_logs_make_a_mode() -> None:
-    """The third consistent estimate confirms, also after a log that misses it."""
+    """The third consistent estimate confirms a mode, also after a log without it."""
     assert followed([(4.8, -1)] * 3)[1] == [None, None, 0]
     assert followed([(4.8, -1), None, (4.8, -1), (4.8, -1)])[1][-1] == 0
 
 
 def test_two_logs_make_a_jump() -> None:
-    """With the name of a mode the second estimate confirms; another name does not."""
+    """The second estimate with the name of a mode confirms; another name does not."""
     assert followed([(4.8, 1), (4.8, 1)])[1] == [None, 0]
     assert followed([(4.8, 1), (4.8, 0)])[1] == [None, None]
 
 
 def test_scattered_estimates_make_no_mode() -> None:
-    """Estimates all over the band confirm nothing, and candidates without detections go."""
+    """Scattered estimates confirm nothing; candidates without detections are deleted."""
     candidates, confirmed = followed([(4.0 + 0.3 * k, -1) for k in range(6)])
     assert confirmed == [None] * 6
     before = len(candidates)
@@ -64,7 +64,7 @@ def test_a_mode_detected_at_its_old_level_has_not_jumped() -> None:
 
 
 def test_following_changes_no_candidates_given() -> None:
-    """The step is pure: the candidates before it stay as they were."""
+    """`follow` and `prune` leave the candidates that they are given unchanged."""
     before, _ = followed([(4.8, -1)])
     odds, mean = before.log_odds.copy(), before.filters.mean.copy()
     follow(before, scan(1, 4.8), np.zeros(0), 50.0)
