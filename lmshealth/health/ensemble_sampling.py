@@ -22,9 +22,7 @@ if TYPE_CHECKING:
 Start = Callable[[np.random.Generator], FloatArray]
 """Draw the start of an ensemble inside the support: ``(n_walkers, n_dim)``."""
 
-_FIRST_STEPS = 250
-_MIN_WALKERS = 32
-_START_ATTEMPTS = 100
+_FIRST_STEPS, _MIN_WALKERS, _START_ATTEMPTS = 250, 32, 100
 # Draws of the prior, and of the importance sampler, that starts are chosen from.
 _N_PRIOR, _N_START = 1000, 1000
 
@@ -84,10 +82,8 @@ def sample(log_probability: LogProbability, start: Start, seed: np.random.SeedSe
     Every ensemble has its own start and random stream: walkers of one ensemble depend on each
     other, so that R-hat over them is no diagnostic.
 
-    Raises
-    ------
-    NotConverged
-        If 50 autocorrelation times or R-hat below 1.01 are not reached; carries the chains.
+    `NotConverged`, with the chains, is raised if 50 autocorrelation times or R-hat below 1.01 are
+    not reached.
 
     References
     ----------

@@ -46,12 +46,7 @@ def importance_sample(
     """Draw from a density by importance sampling from a mixture adapted in rounds.
 
     The start are points that cover the support of the density, ``(n_start, n_dim)``; n is the
-    number of draws of the last round.
-
-    Raises
-    ------
-    NotConverged
-        If no point has a density above 0.
+    number of draws of the last round. `NotConverged` is raised if no point has a density above 0.
 
     References
     ----------

@@ -70,10 +70,8 @@ def judge(
     ----------
     stage, history : Stage, History
         Parameters with their limits and words, and all logs.
-    health : Health or None
-        Posterior of the parameters; None if they could not be inferred.
-    track : Track, optional
-        Steps and alarms.
+    health, track : Health or None, Track, optional
+        Posterior of the parameters, None if they could not be inferred; steps and alarms.
 
     Returns
     -------

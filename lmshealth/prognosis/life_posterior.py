@@ -321,8 +321,8 @@ def fit_life(
     Raises
     ------
     NotEnoughData
-        If fewer than three logs have an informative mode, the odometer has not moved, or the modes
-        stepped too often.
+        If fewer than three logs since the baseline have an informative mode, the odometer is
+        missing or has not moved, or the modes stepped more than three times.
     NotConverged
         If the sampler did not converge; carries the chains.
 

@@ -20,7 +20,7 @@ def ambient_bound(
     band: tuple[float, float],
     n_channels: int = 1,
 ) -> FloatArray:
-    """Bound the covariance of the estimate of one mode from ambient accelerations in white noise.
+    """Bound the covariance of [ln f, ln ζ], ``(2, 2)``, by ambient accelerations in white noise.
 
     Of the channels' covariance S D φφᵀ + S_e I one eigenvalue is S D + S_e and all others are S_e:
     further channels inform about the noise, and about the mode only by the sum of their SNR.
@@ -34,11 +34,6 @@ def ambient_bound(
         Of the record in s. For n records of one length divide the result by n.
     band, n_channels : (float, float), int
         Band in Hz in which the noise is white with an unknown level, and channels with that noise.
-
-    Returns
-    -------
-    ndarray
-        Covariance of ``[ln f, ln ζ]``, shape ``(2, 2)``.
 
     References
     ----------

@@ -91,12 +91,10 @@ def plan(
 
     Raises
     ------
-    BadStage
-        If the description has no map, or priors outside of it.
+    BadStage, OutsideMap
+        If the description has no map, or priors outside of it; if it does not reach to the loss.
     BadQuestion
         If there is no such parameter, the modes do not identify it, or a number is out of range.
-    OutsideMap
-        If the map does not reach to the loss.
 
     References
     ----------
