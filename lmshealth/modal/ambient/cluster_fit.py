@@ -291,16 +291,10 @@ def prepare(
         for s in (spectrum.band(*band) for spectrum in spectra.spectra)
         if s.frequency.size
     )
-    return ClusterData(
-        LogSpectra(
-            tuple(spectra.channels[c] for c in index),
-            tuple(spectra.sources[c] for c in index),
-            scaled,
-        ),
-        unit,
-        replace(binned, level=level / noise[:, None]),
-        tuple(s.free for s in scaled),
-    )
+    channels = tuple(spectra.channels[c] for c in index)
+    chosen = LogSpectra(channels, tuple(spectra.sources[c] for c in index), scaled)
+    whitened = replace(binned, level=level / noise[:, None])
+    return ClusterData(chosen, unit, whitened, tuple(s.free for s in scaled))
 
 
 def _not_excited(targets: Sequence[Target], gains: dict[str, float]) -> dict[str, Rejection]:
