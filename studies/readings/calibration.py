@@ -54,44 +54,33 @@ def cosine(k: int, n: int, phase: float, size: int) -> Array:
     return np.cos(2 * np.pi * (k * np.arange(size) % n) / n + phase)
 
 
-def read_sine(k: int, n: int, phase: float) -> tuple[float, float]:
-    """Return what `periodogram` and `decompose` read of amplitude 1 at the k-th ordinate."""
-    x = cosine(k, n, phase, n)
-    return spectrum(x).sine(k - 1, k)[1], float(decompose(x, RATE).amplitude[k - 1])
-
-
 def sines() -> tuple[dict[str, Check], Row]:
     """Read sines of whole numbers of periods: odd and even records, eight phases."""
-    off = np.array(
-        [
-            [[read_sine(k, n, phase) for phase in PHASES] for n in (16_000, 16_001)]
-            for k in ORDINATES
-        ]
-    )
-    worst = np.abs(off - 1).max(axis=(1, 2))
+    read = [
+        [(spectrum(x).sine(k - 1, k)[1], decompose(x, RATE).amplitude[k - 1])
+         for n in (16_000, 16_001) for x in (cosine(k, n, phase, n) for phase in PHASES)]
+        for k in ORDINATES
+    ]  # fmt: skip
+    worst = np.abs(np.array(read) - 1).max(axis=1)
     at = np.array(ORDINATES)
     stated = 6 / (np.pi * at) ** 2
+    windowed = spectrum(hann(16_000) * cosine(FROM, 16_000, 0.3, 16_000))
     checks = {
         f"periodogram: sine of amplitude A reads A from ordinate {FROM} on, relative": below(
-            float(worst[at >= FROM, 0].max()), 1e-6
+            worst[at >= FROM, 0].max(), 1e-6
         ),
         "periodogram: below it less is lost than the stated 6/(πk)², largest share of it": below(
-            float((worst[:, 0] / stated)[at < FROM].max()), 1.01
+            (worst[:, 0] / stated)[at < FROM].max(), 1.01
         ),
         "harmonics: sine of amplitude A reads A at every ordinate, relative": below(
-            float(worst[:, 1].max()), 1e-6
+            worst[:, 1].max(), 1e-6
         ),
         "control: a Hann window left uncorrected, sine reads A": control(
-            below(abs(spectrum(hann(16_000) * cosine(FROM, 16_000, 0.3, 16_000))
-                      .sine(FROM - 1, FROM)[1] - 1), 1e-6)
+            below(abs(windowed.sine(FROM - 1, FROM)[1] - 1), 1e-6)
         ),
-    }  # fmt: skip
-    curve = {
-        "ordinate": list(ORDINATES),
-        "sines_each": 2 * PHASES.size,
-        "periodogram": worst[:, 0].tolist(),
-        "harmonics": worst[:, 1].tolist(),
     }
+    curve = {"ordinate": list(ORDINATES), "sines_each": 2 * PHASES.size,
+             "periodogram": worst[:, 0].tolist(), "harmonics": worst[:, 1].tolist()}  # fmt: skip
     return checks, {"sine_error": curve}
 
 
@@ -122,16 +111,16 @@ def expected_noise(n: int) -> tuple[dict[str, Check], Row]:
     kept = np.unique(np.geomspace(1, at[-1], 60).round().astype(int)) - 1
     checks = {
         "periodogram is a quadratic form of the samples (parallelogram law), relative": below(
-            float(np.abs(form).max() / spectrum(x).periodogram.mean()), 1e-12
+            np.abs(form).max() / spectrum(x).periodogram.mean(), 1e-12
         ),
         f"periodogram: noise of density S reads S from ordinate {FROM} on, expectation": below(
-            float(lost[0, at >= FROM].max()), 1e-6
+            lost[0, at >= FROM].max(), 1e-6
         ),
         "periodogram: below it the stated share 3/(πk)² is lost, largest departure": below(
-            float(np.abs(lost[0] - 3 / (np.pi * at) ** 2).max()), 1e-6
+            np.abs(lost[0] - 3 / (np.pi * at) ** 2).max(), 1e-6
         ),
         "harmonics: noise of density S reads S/T at every ordinate, expectation": below(
-            float(lost[1].max()), 1e-6
+            lost[1].max(), 1e-6
         ),
     }
     return checks, {
@@ -170,10 +159,10 @@ def displacements(quick: bool) -> tuple[dict[str, Check], Row]:
     name = f"displacement, band to {TOP:g} Hz"
     checks = {
         f"{name}: sine of amplitude A reads ω²A from ordinate {FROM} on, relative": below(
-            float(np.abs(off).max()), 1e-6
+            np.abs(off).max(), 1e-6
         ),
         f"{name}: white acceleration of density S reads S (1 - 3/(πk)²), expectation": below(
-            float(np.abs(ratio[0] - 1 + trend)[inside].max()), 1e-3
+            np.abs(ratio[0] - 1 + trend)[inside].max(), 1e-3
         ),
     }
     edges = [LOW, 20.0, 40.0, 80.0, 160.0, TOP]
@@ -197,6 +186,7 @@ def sampled(rng: np.random.Generator, n: int) -> tuple[dict[str, Check], Row]:
     ratio = whole.periodogram[FROM:] / LEVEL
     windowed = spectrum(hann(n) * x).periodogram[FROM:] / LEVEL
     m = ratio.size
+    distribution = "exponential, Kolmogorov-Smirnov"
     checks = {
         "ordinates add up to the variance (Parseval), relative": below(
             abs(total / float(rest.var()) - 1), 1e-12
@@ -204,13 +194,13 @@ def sampled(rng: np.random.Generator, n: int) -> tuple[dict[str, Check], Row]:
         "mean of ordinates over S, one long record": unbiased(float(ratio.mean()), 1.0, m**-0.5),
         "variance of ordinates over S²": unbiased(float(ratio.var()), 1.0, (8 / m) ** 0.5),
         "distribution of ordinates over S": likely(
-            float(kstest(ratio, expon.cdf).pvalue), "exponential, Kolmogorov-Smirnov"
+            float(kstest(ratio, expon.cdf).pvalue), distribution
         ),
         "control: a Hann window left uncorrected, mean of ordinates over S": control(
             unbiased(float(windowed.mean()), 1.0, m**-0.5)
         ),
         "control: a Hann window left uncorrected, distribution": control(
-            likely(float(kstest(windowed, expon.cdf).pvalue), "exponential, Kolmogorov-Smirnov")
+            likely(float(kstest(windowed, expon.cdf).pvalue), distribution)
         ),
     }
     cuts = np.geomspace(20.0, RATE / 2, 17)

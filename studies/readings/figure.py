@@ -11,7 +11,6 @@ from matplotlib.figure import Figure
 from studies.harness.figures import BLUE, ORANGE, write
 from studies.harness.study import Row
 
-RED = ORANGE
 GREY = "#56606b"
 # Lines of one kind that are closer than this share a label.
 _TOGETHER_HZ = 10.0
@@ -22,10 +21,10 @@ def draw_gain(ax: Axes, details: Row) -> None:
     sine, noise = details["sine_error"], details["noise_error"]
     at = np.geomspace(1, 8000, 50)
     ax.loglog(at, 6 / (np.pi * at) ** 2, color=BLUE, lw=0.8, label="stated, 6/(πk)²")
-    ax.loglog(at, 3 / (np.pi * at) ** 2, color=RED, lw=0.8, ls="--", label="stated, 3/(πk)²")
+    ax.loglog(at, 3 / (np.pi * at) ** 2, color=ORANGE, lw=0.8, ls="--", label="stated, 3/(πk)²")
     ax.loglog(sine["ordinate"], sine["periodogram"], "o", ms=5, color=BLUE,
               label=f"sine, worst of {sine['sines_each']} (phases, odd and even n)")  # fmt: skip
-    ax.loglog(noise["ordinate"], noise["periodogram"], "^", ms=4, mfc="none", color=RED,
+    ax.loglog(noise["ordinate"], noise["periodogram"], "^", ms=4, mfc="none", color=ORANGE,
               label="white noise, expectation")  # fmt: skip
     ax.axhline(1e-6, color=GREY, lw=1)
     ax.text(1.1, 1.2e-6, "asked from k = 780 on", color=GREY, fontsize=8, va="bottom")
@@ -49,7 +48,7 @@ def draw_ratios(ax: Axes, details: Row) -> None:
         low, high = map(float, row["band"].split()[-2].split("-"))
         # A mean square has twice the relative error of its root.
         ax.errorbar((low * high) ** 0.5, row["ratio"] ** 2, 4 * row["standard_error"], fmt="s",
-                    ms=5, mfc="none", lw=1, color=RED,
+                    ms=5, mfc="none", lw=1, color=ORANGE,
                     label="" if i else logs)  # fmt: skip
     ax.axhline(1.0, color=GREY, lw=1)
     ax.set(xscale="log", ylim=(0.88, 1.17), xlabel="frequency in Hz",
@@ -65,7 +64,7 @@ def draw_distribution(ax: Axes, ordinates: Row) -> None:
     ax.semilogy(x, np.exp(-x), color=GREY, lw=1, label="exponential, two degrees of freedom")
     ax.semilogy(ordinates["quantile"], share, "o", ms=3.5, color=BLUE,
                 label=f"{ordinates['n']:,} ordinates of noise")  # fmt: skip
-    ax.semilogy(ordinates["quantile_hann"], share, "x", ms=4, color=RED,
+    ax.semilogy(ordinates["quantile_hann"], share, "x", ms=4, color=ORANGE,
                 label="control: Hann window, uncorrected")  # fmt: skip
     ax.set(xlim=(0, 15), ylim=(1e-6, 1.5), xlabel="ordinate / density",
            ylabel="share of ordinates above")  # fmt: skip
@@ -80,7 +79,7 @@ def draw_slopes(ax: Axes, shown: list[Row], checks: Row) -> None:
         off = np.array(part["slope"]) - part["exponent"]
         reach = np.array(part["half_width"])
         at = start + np.arange(off.size)
-        for missed, colour, marker in ((False, BLUE, "o"), (True, RED, "x")):
+        for missed, colour, marker in ((False, BLUE, "o"), (True, ORANGE, "x")):
             own = (np.abs(off) > reach) == missed
             ax.errorbar(
                 at[own], off[own], reach[own], fmt=marker, ms=3 + 3 * missed, lw=0.9, color=colour
@@ -105,7 +104,7 @@ def draw_lines(ax: Axes, mpstd: Row) -> None:
                 color=GREY, label="largest harmonic of every 0.5 Hz")  # fmt: skip
     mine = [line for line in mpstd["lines"] if line["channel"] == spectrum["channel"]]
     for kind, colour, marker, side in (("mains", BLUE, "o", "left"),
-                                       ("unknown", RED, "^", "center")):  # fmt: skip
+                                       ("unknown", ORANGE, "^", "center")):  # fmt: skip
         own = [line for line in mine if line["kind"] == kind]
         ax.plot([line["frequency_hz"] for line in own], [1e3 * line["amplitude"] for line in own],
                 marker, ms=6, color=colour, label=f"line found, called {kind}")  # fmt: skip

@@ -5,10 +5,9 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from scipy.special import erf
+from scipy.stats import norm
 from scipy.stats import t as student
 
-from lmshealth.io.log import Channel, Log, Metadata
 from lmshealth.signal.acceleration_levels import (
     FrequencyBand,
     Growth,
@@ -18,6 +17,7 @@ from lmshealth.signal.acceleration_levels import (
 )
 from lmshealth.stage.description import load_stage
 from models.recordings.strokes import VELOCITIES
+from studies.common.logs import make_log
 from studies.harness.study import Row
 from studies.readings.checks import Check, control, rate, unbiased
 
@@ -33,14 +33,6 @@ N_SHOWN = 20
 FLOOR = 1e-6
 HUMPS = ((4e-5, 40.0, 6.0), (1e-4, 126.4, 4.0), (6e-5, 136.6, 4.0), (3e-5, 270.0, 12.0),
          (2e-6, 2000.0, 20.0), (5e-6, 2900.0, 25.0), (3e-6, 3000.0, 15.0))  # fmt: skip
-
-
-def noise_log(values: Array, velocity: float) -> Log:
-    """Make a log of one accelerometer and its set point."""
-    channel = Channel("acc_feed", "acceleration", values)
-    still = np.full(values.size, velocity)
-    return Log("noise", "0" * 64, Metadata(stage="noise"), RATE, (channel,), still,
-               ((0, values.size),), ())  # fmt: skip
 
 
 def wide_bands(name: str) -> tuple[FrequencyBand, ...]:
@@ -75,7 +67,7 @@ def fit(
     readings = []
     for velocity in VELOCITIES:
         values = rng.standard_normal(N) * (0.1 * velocity**exponent)
-        readings += read_magnitudes(noise_log(values, velocity), bands)
+        readings += read_magnitudes(make_log({"acc_feed": values}, RATE, velocity=velocity), bands)
     return find_growth(readings)
 
 
@@ -117,10 +109,9 @@ def density(frequency: Array) -> Array:
 def mean_square(low: float, high: float) -> float:
     """Return the integral of the density."""
     humps = [
-        a * w * np.sqrt(np.pi / 2)
-        * (erf((high - f) / (w * np.sqrt(2))) - erf((low - f) / (w * np.sqrt(2))))
+        a * w * np.sqrt(2 * np.pi) * (norm.cdf(high, f, w) - norm.cdf(low, f, w))
         for a, f, w in HUMPS
-    ]  # fmt: skip
+    ]
     return float(FLOOR * (high - low) + sum(humps))
 
 
@@ -146,7 +137,8 @@ def known_rms(quick: bool) -> tuple[dict[str, Check], Row]:
     repetitions = 30 if quick else 600
     square = np.empty((repetitions, len(bands)))
     for i in range(repetitions):
-        readings = read_magnitudes(noise_log(coloured(rng), 0.01), bands.values())
+        log = make_log({"acc_feed": coloured(rng)}, RATE, velocity=0.01)
+        readings = read_magnitudes(log, bands.values())
         square[i] = [reading.rms**2 for reading in readings]
     half = 0.5 * RATE / N
     checks: dict[str, Check] = {}
@@ -161,14 +153,9 @@ def known_rms(quick: bool) -> tuple[dict[str, Check], Row]:
         checks[f"control: {label}: mean square over half of it, a two-sided density's"] = control(
             unbiased(2 * mean, 1.0, 2 * error)
         )
-        rows.append(
-            {
-                "band": label,
-                "rms_m_s2": float(np.sqrt(own.mean())),
-                "analytic_rms_m_s2": whole**0.5,
-                "ratio": float(np.sqrt(own.mean() / whole)),
-                "standard_error": 0.5 * error,
-                "lost_at_the_ends": 1 - (inside / whole) ** 0.5,
-            }
-        )
+        rows.append({
+            "band": label, "rms_m_s2": float(np.sqrt(own.mean())),
+            "analytic_rms_m_s2": whole**0.5, "ratio": float(np.sqrt(own.mean() / whole)),
+            "standard_error": 0.5 * error, "lost_at_the_ends": 1 - (inside / whole) ** 0.5,
+        })  # fmt: skip
     return checks, {"known_rms": {"repetitions": repetitions, "rows": rows}}

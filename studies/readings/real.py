@@ -60,9 +60,9 @@ def twins(folder: Path) -> tuple[dict[str, Check], Row]:
     printed = 10.0 ** (np.floor(np.log10(np.abs(one))) - (_DIGITS - 1))
     rounded = 0.5 * (printed + np.spacing(np.abs(other).astype(np.float32)))
     checks = {
-        f"{TWINS_AGREE}, in Pa": below(float(off.max()), 1e-6),
-        f"{TWINS_AGREE}, over the largest sample": below(float(off.max()) / top, 1e-6),
-        f"{TWINS_AGREE}, over what both round away": below(float((off / rounded).max()), 1.001),
+        f"{TWINS_AGREE}, in Pa": below(off.max(), 1e-6),
+        f"{TWINS_AGREE}, over the largest sample": below(off.max() / top, 1e-6),
+        f"{TWINS_AGREE}, over what both round away": below((off / rounded).max(), 1.001),
         f"control: {TWINS_AGREE}, one sample late, in Pa": control(below(late, 1e-6)),
     }
     return checks, {"ascii_and_binary": {"samples": one.size, "largest_sample_pa": top}}

@@ -47,7 +47,7 @@ def read_stages(quick: bool) -> tuple[dict[str, Check], Row]:
     seeds = 1 if quick else 5
     departures: list[dict[str, float]] = []
     details: Row = {"seeds": seeds, "accelerometer": EITHER}
-    shares, told = [], []
+    shares, spectra = [], []
     for axis, name in [("y", FILES["y"])] if quick else FILES.items():
         bands = (*choose_bands(None, None, None), *choose_bands(load_stage(name), None, None))
         series = []
@@ -58,8 +58,7 @@ def read_stages(quick: bool) -> tuple[dict[str, Check], Row]:
                 logs = [read_log(path) for path in paths]
                 if seed == 0:
                     departures += [beside_numpy(*pair) for pair in zip(paths, logs, strict=True)]
-                if seed == 0:
-                    told.append(spectrum_beside_numpy(paths, quick))
+                    spectra.append(spectrum_beside_numpy(paths, quick))
                 series.append([m for log in logs for m in larger(read_magnitudes(log, bands))])
         details[name] = beside_paper(axis, series)
         shares.append(shuffled(series[0], {f"{hertz} Hz" for hertz in table(axis)}))
@@ -71,12 +70,12 @@ def read_stages(quick: bool) -> tuple[dict[str, Check], Row]:
     }
     checks |= {
         f"spectrum of simulated moves beside numpy alone, {kind}": below(
-            max(own[kind] for own in told), 1e-9
+            max(own[kind] for own in spectra), 1e-9
         )
-        for kind in told[0]
+        for kind in spectra[0]
     }
     checks["control: rows of Tables 6 and 7 said to grow, velocities shuffled, share"] = below(
-        float(np.mean(shares)), RASH
+        np.mean(shares), RASH
     )
     return checks, {"simulated_stages": details}
 
@@ -169,14 +168,9 @@ def beside_paper(axis: str, series: list[list[Magnitude]]) -> Row:
     for hertz in table(axis):
         band = f"{hertz} Hz"
         mine = [one[band] for one in growth]
-        rows.append(
-            {
-                "frequency_hz": hertz,
-                "named_by_the_paper": hertz in PRINTED_GROWING[axis],
-                "printed": told(of_paper[band]),
-                "simulated": average(mine),
-            }
-        )
+        named = hertz in PRINTED_GROWING[axis]
+        rows.append({"frequency_hz": hertz, "named_by_the_paper": named,
+                     "printed": told(of_paper[band]), "simulated": average(mine)})  # fmt: skip
     others = {
         band: average([one[band] for one in growth])
         for band in growth[0] if band not in {f"{hertz:g} Hz" for hertz in range(10, 401, 10)}
@@ -203,34 +197,25 @@ def average(growth: list[Growth]) -> Row:
 def agreement(rows: list[Row]) -> Row:
     """Count where names, printed numbers and simulation agree and where they do not."""
 
-    def count(hits: Iterable[bool]) -> str:
-        answers = list(hits)
-        return f"{sum(answers)} of {len(answers)}"
+    def count(hits: Array) -> str:
+        return f"{hits.sum()} of {hits.size}"
 
-    def hertz(some: Iterable[Row]) -> list[int]:
-        return [row["frequency_hz"] for row in some]
-
-    named = [row for row in rows if row["named_by_the_paper"]]
-    unnamed = [row for row in rows if not row["named_by_the_paper"]]
-    slopes = np.array([(row["printed"]["slope"], row["simulated"]["slope"]) for row in rows])
-    chosen = np.array([row["named_by_the_paper"] for row in rows])
+    kinds = ("printed", "simulated")
+    slopes = np.array([[row[kind]["slope"] for kind in kinds] for row in rows])
+    printed, simulated = np.array([[row[kind]["grows"] for row in rows] for kind in kinds])
+    named = np.array([row["named_by_the_paper"] for row in rows])
+    hertz = np.array([row["frequency_hz"] for row in rows])
     # Share of pairs of a named and an unnamed row in which the named one has the larger slope.
-    above = mannwhitneyu(slopes[chosen], slopes[~chosen]).statistic
-    above = above / (len(named) * len(unnamed))
+    above = mannwhitneyu(slopes[named], slopes[~named]).statistic
+    above = above / (named.sum() * (~named).sum())
     return {
-        "named_grow_in_simulation": count(row["simulated"]["grows"] for row in named),
-        "named_grow_in_print": count(row["printed"]["grows"] for row in named),
-        "unnamed_do_not_grow_in_simulation": count(not r["simulated"]["grows"] for r in unnamed),
-        "unnamed_do_not_grow_in_print": count(not row["printed"]["grows"] for row in unnamed),
-        "print_and_simulation_say_the_same": count(
-            row["printed"]["grows"] == row["simulated"]["grows"] for row in rows
-        ),
-        "grow_in_print_only_hz": hertz(
-            row for row in rows if row["printed"]["grows"] and not row["simulated"]["grows"]
-        ),
-        "grow_in_simulation_only_hz": hertz(
-            row for row in rows if row["simulated"]["grows"] and not row["printed"]["grows"]
-        ),
+        "named_grow_in_simulation": count(simulated[named]),
+        "named_grow_in_print": count(printed[named]),
+        "unnamed_do_not_grow_in_simulation": count(~simulated[~named]),
+        "unnamed_do_not_grow_in_print": count(~printed[~named]),
+        "print_and_simulation_say_the_same": count(printed == simulated),
+        "grow_in_print_only_hz": hertz[printed & ~simulated].tolist(),
+        "grow_in_simulation_only_hz": hertz[simulated & ~printed].tolist(),
         "median_slope": {"printed": float(np.median(slopes[:, 0])),
                          "simulated": float(np.median(slopes[:, 1]))},
         "named_steeper_than_unnamed": {"printed": float(above[0]), "simulated": float(above[1])},
