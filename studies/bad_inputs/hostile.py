@@ -18,70 +18,30 @@ MARK = "somebody-ran-this"
 
 # Names of machines that are only text: they are tracked and reported unchanged.
 MACHINES = (
-    "x'); DROP TABLE canary; --",
-    'x"; DELETE FROM canary; --',
-    "x' OR '1'='1",
-    "%s %d {0} \\",
-    "../../outside/escaped",
-    "/etc/passwd",
-    "..",
-    ".",
-    "CON",
-    "nul.txt",
-    "C:\\outside",
-    "a:b",
-    "trailing dot.",
-    "index",
-    "INDEX",
-    "Case",
-    "CASE",
+    "x'); DROP TABLE canary; --", 'x"; DELETE FROM canary; --', "x' OR '1'='1", "%s %d {0} \\",
+    "../../outside/escaped", "/etc/passwd", "..", ".", "CON", "nul.txt", "C:\\outside", "a:b",
+    "trailing dot.", "index", "INDEX", "Case", "CASE",
     "ﬁ",  # folds to "fi"
-    "fi",
-    "<script>alert(1)</script>",
-    '" onmouseover="alert(1)',
-    "</style><img src=x onerror=alert(1)>",
-    "javascript:alert(1)",
-    "{{ 7 * 7 }}{% for x in y %}",
-    "[red]markup[/red] [/wrong]",
-    ":bomb: https://example.com/x.js",
-    '=HYPERLINK("http://example.com","x")',
-    "@SUM(1+1)",
-    f"$(touch {MARK})`touch {MARK}`; touch {MARK}",
-    "long " + "ä" * 190,
-)
+    "fi", "<script>alert(1)</script>", '" onmouseover="alert(1)',
+    "</style><img src=x onerror=alert(1)>", "javascript:alert(1)", "{{ 7 * 7 }}{% for x in y %}",
+    "[red]markup[/red] [/wrong]", ":bomb: https://example.com/x.js",
+    '=HYPERLINK("http://example.com","x")', "@SUM(1+1)",
+    f"$(touch {MARK})`touch {MARK}`; touch {MARK}", "long " + "ä" * 190,
+)  # fmt: skip
 # One machine, however its letters are written.
 ACCENTED = tuple(unicodedata.normalize(form, "Kä-Y") for form in ("NFC", "NFD"))
 # Names that hold what cannot be seen: their logs are refused.
 UNSEEN = (
-    "nul\0byte",
-    "\x1b[2J\x1b]0;title\x07",
-    "turned\u202eabout",
-    "two\nlines",
-    "carriage\rreturn",
-    "line\u2028separator",
-    "zero\u200bwidth",
-    "c1\x9b31m",
-    "long " * 60,
-)
+    "nul\0byte", "\x1b[2J\x1b]0;title\x07", "turned\u202eabout", "two\nlines", "carriage\rreturn",
+    "line\u2028separator", "zero\u200bwidth", "c1\x9b31m", "long " * 60,
+)  # fmt: skip
 FILES: tuple[bytes, ...] = (
-    b"x'); DROP TABLE canary; --.csv",
-    b"$(touch %s).csv" % MARK.encode(),
-    b"=cmd|'calc'!A0.csv",
-    b"<img src=x onerror=alert(1)>.csv",
-    b"[red].csv",
-    b"{{ 7 * 7 }}.csv",
-    b"-rf.csv",
-    b" space.csv",
-    b"back\\slash.csv",
-    b"\xff\xfe latin.csv",
-    b"\xff\xfd latin.csv",
-    b"\x1b[31mred.csv",
-    b"two\nlines.csv",
-    "turned\u202eabout.csv".encode(),
-    "Kä.csv".encode(),
-    unicodedata.normalize("NFD", "Kä.csv").encode(),
-    b"n" * 251 + b".csv",
-)
+    b"x'); DROP TABLE canary; --.csv", b"$(touch %s).csv" % MARK.encode(), b"=cmd|'calc'!A0.csv",
+    b"<img src=x onerror=alert(1)>.csv", b"[red].csv", b"{{ 7 * 7 }}.csv", b"-rf.csv",
+    b" space.csv", b"back\\slash.csv", b"\xff\xfe latin.csv", b"\xff\xfd latin.csv",
+    b"\x1b[31mred.csv", b"two\nlines.csv", "turned\u202eabout.csv".encode(), "Kä.csv".encode(),
+    unicodedata.normalize("NFD", "Kä.csv").encode(), b"n" * 251 + b".csv",
+)  # fmt: skip
 STAGE = """name = "<b>../{{ 7 * 7 }}</b>"
 source = "</script><script>alert(1)</script>"
 [[mode]]

@@ -27,7 +27,7 @@ import socket
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
@@ -87,7 +87,11 @@ def main() -> None:
             kinds.append("postgresql")
         for kind in kinds:
             folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="hostile-")))
-            url, password = _store(kind, folder, stack)
+            (folder / "out").mkdir()
+            url, password = f"sqlite:///{folder / 'out' / 'lmshealth.sqlite'}", PASSWORD
+            if kind == "postgresql":
+                server = stack.enter_context(servers.postgres())
+                url, password = stack.enter_context(server.database()), server.password
             own = partial(attack, folder, base, url, password, every=_EVERY if quick else 1)
             answer["stores"][kind] = once(own, kind)
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="addresses-")))
@@ -113,22 +117,13 @@ def main() -> None:
     study.conclude(answer)
 
 
-def _store(kind: str, folder: Path, stack: ExitStack) -> tuple[str, str]:
-    """Return the address of a store with a planted table, and its password."""
-    if kind == "sqlite":
-        (folder / "out").mkdir()
-        return f"sqlite:///{folder / 'out' / 'lmshealth.sqlite'}", PASSWORD
-    server = stack.enter_context(servers.postgres())
-    return stack.enter_context(server.database()), server.password
-
-
-def lmshealth(*words: str | Path, cwd: Path, limit: Callable[[], None] | None = None) -> Done:
+def lmshealth(*words: str | Path, cwd: Path) -> Done:
     """Run a command at the most talkative level of logging."""
     command = [sys.executable, "-c", _TALKATIVE, *(str(word) for word in words)]
     paths = {"PYTHONPATH": os.pathsep.join(path for path in sys.path if path)}
     return subprocess.run(
         command, capture_output=True, cwd=cwd, check=False, text=True, errors="surrogateescape",
-        env=os.environ | paths, preexec_fn=limit,
+        env=os.environ | paths,
     )  # fmt: skip
 
 
@@ -215,16 +210,14 @@ def on_pages(pages: Sequence[str], machines: Sequence[str]) -> dict[str, list[st
 
 
 def _links(folder: Path, out: Path) -> list[Path]:
-    """Lay links in the places of files that will be written."""
-    out.mkdir(exist_ok=True)
-    links = []
-    for name in ("index.html", "modes.csv", "refused.csv", "files.html", "health.csv"):
-        (folder / "outside" / f"victim-{name}").write_text("as it was")
-        links.append(out / name)
-        links[-1].symlink_to(folder / "outside" / f"victim-{name}")
-    links.append(out / "track.csv")
-    links[-1].symlink_to(folder / "outside" / "not-there")
-    return links
+    """Lay links in the places of files that will be written; that of the last has no target."""
+    names = ("index.html", "modes.csv", "refused.csv", "files.html", "health.csv", "track.csv")
+    for name in names:
+        victim = folder / "outside" / f"victim-{name}"
+        if name != names[-1]:
+            victim.write_text("as it was")
+        (out / name).symlink_to(victim)
+    return [out / name for name in names]
 
 
 def addresses(folder: Path, forms: Sequence[str]) -> Row:
@@ -341,19 +334,18 @@ def controls() -> dict[str, bool]:
         )
         raw.close()
         engine.dispose()
-        script = hostile.MACHINES[hostile.MACHINES.index("<script>alert(1)</script>")]
+        names = ["CON.html", "a.html", "A.html"]
         return {
             "a link that is followed": followed == [repr(os.fsencode(victim))],
             "a name in a statement": guards.touched(url) == ["the table is gone"],
-            "markup that is not escaped": bool(guards.scripts(f"<p>{script}</p>")),
+            "markup that is not escaped": bool(guards.scripts("<p><script>alert(1)</script></p>")),
             "an attribute that is not closed": bool(
                 guards.loaded('<p title="" onmouseover="alert(1)">')
             ),
             "a page that loads": bool(guards.loaded('<script src="https://example.com/x.js">')),
             "control characters": bool(guards.acting(hostile.UNSEEN[1])),
             "writing turned about": bool(guards.acting(hostile.UNSEEN[2])),
-            "names of devices and twins": guards.bad_names(["CON.html", "a.html", "A.html"])
-            == ["CON.html", "a.html", "A.html"],
+            "names of devices and twins": guards.bad_names(names) == names,
         }
 
 
@@ -368,8 +360,7 @@ def claims(answer: Row) -> Iterator[Claim]:
             controls_seen(answer["controls"]),
             not wrong,
         )
-    peaks = [row["peak_mb"] for row in answer["bombs"]]
-    if peaks:
+    if peaks := [row["peak_mb"] for row in answer["bombs"]]:
         yield Claim(
             "memory that a file which swells takes, with all libraries",
             f"{max(peaks)} MB at most",

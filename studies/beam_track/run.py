@@ -81,21 +81,12 @@ def to_reading(row: Row) -> LogEstimates:
         digest="",
         metadata=Metadata("beam", when, None, {"roller_v": row["roller_v"]}),
         modes=Modes(
-            names=("beam",),
-            sources=("acc",),
-            channels=("acc_low",),
-            ln_frequency=np.log([row["f_hz"]]),
-            ln_damping=np.log([row["zeta"]]),
-            cov=np.diag(std**2),
-            snr=np.ones(1),
-            dispersion=np.ones(1),
-            flags=("",),
-            shape_channels=(),
-            shapes=np.empty((1, 0)),
-            lines=(),
-            refused=(),
+            names=("beam",), sources=("acc",), channels=("acc_low",),
+            ln_frequency=np.log([row["f_hz"]]), ln_damping=np.log([row["zeta"]]),
+            cov=np.diag(std**2), snr=np.ones(1), dispersion=np.ones(1), flags=("",),
+            shape_channels=(), shapes=np.empty((1, 0)), lines=(), refused=(),
         ),
-    )
+    )  # fmt: skip
 
 
 def follow(history: History, stage: Stage, rows: list[Row]) -> Row:

@@ -5,13 +5,12 @@ from __future__ import annotations
 import json
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from scipy.stats import binom
 
-from studies.harness.study import Row
+from studies.harness.study import STUDIES, Row
 
 # Largest probability that a figure exactly on its bound counts as missed.
 FALSE_ALARM = 0.01
@@ -65,7 +64,7 @@ def table(rows: Mapping[str, Mapping[str, Any]]) -> Iterable[str]:
 
 def recorded(study: str, *keys: str | int) -> Any:
     """Look up what a study recorded."""
-    found: Any = json.loads((Path(__file__).parent.parent / study).read_text(encoding="utf-8"))
+    found: Any = json.loads((STUDIES / study).read_text(encoding="utf-8"))
     for key in keys:
         found = found[key]
     return found

@@ -17,20 +17,21 @@ import subprocess
 import tempfile
 import time
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 
+from studies.common.cost import wall_s
 from studies.common.metrics import clopper_pearson
 from studies.harness.claims import Claim, Older, counted, percents
-from studies.harness.command_line import call
+from studies.harness.command_line import ROOT, call
 from studies.harness.study import Row, Study
 
 STEP = "infer"
 OLDER = {"result": Older("b609ecec2899", "laws were weighed")}
 
-HERE = Path(__file__).parent
 PARAMETERS = ("guide_preload", "mount_stiffness")
 PROGRAMS = ("models.__main__", "lmshealth.__main__")
 PRIOR_WIDTH = float(np.diff(np.exp(0.3 * np.array([-1.6449, 1.6449])))[0])
@@ -40,22 +41,15 @@ def main() -> None:
     """Run the study; ``--quick`` does one life of short logs, without chains, records nothing."""
     study = Study(__file__, __doc__, seeds=10)
     seeds = [1] if study.quick else list(range(1, study.options.seeds + 1))
-    if study.quick:
-        lives = [one_life(seed, 8, 5, 1, quick=True) for seed in seeds]
-    else:
-        tasks = [(seed, 40, 20, 40) for seed in seeds]
-        lives = study.trials.collect(one_life, tasks, also=PROGRAMS)
+    size = (8, 5, 1) if study.quick else (40, 20, 40)
+    work = partial(one_life, quick=study.quick)
+    lives = study.trials.collect(work, [(seed, *size) for seed in seeds], also=PROGRAMS)
     answer = {"seeds": seeds} | summarise(lives)
-    if not study.quick:
-        answer["make_demo"] = time_demo()
-    if study.quick:
-        answer["lives"] = lives
+    answer |= {"lives": lives} if study.quick else {"make_demo": time_demo()}
     study.conclude(answer, details={"lives": lives})
 
 
-def one_life(
-    seed: int, n_logs: int = 40, seconds: int = 20, epochs: int = 40, *, quick: bool = False
-) -> Row:
+def one_life(seed: int, n_logs: int, seconds: int, epochs: int, *, quick: bool) -> Row:
     """Simulate and analyse one life; compare with its truth."""
     with tempfile.TemporaryDirectory() as folder:
         logs, out = Path(folder) / "logs", Path(folder) / "out"
@@ -72,12 +66,9 @@ def one_life(
         health = pd.read_csv(out / "health.csv")
         prognosis = pd.read_csv(out / "prognosis.csv").set_index("parameter")
         verdict = pd.read_csv(out / "verdict.csv").iloc[0]
-    row: Row = {
-        "seed": seed,
-        "verdict": str(verdict["verdict"]),
-        "simulate_s": round(simulated - begin, 1),
-        "run_s": round(done - simulated, 1),
-    }
+    row: Row = {"seed": seed, "verdict": str(verdict["verdict"]),
+                "simulate_s": round(simulated - begin, 1),
+                "run_s": round(done - simulated, 1)}  # fmt: skip
     for name in PARAMETERS:
         last = health[health["parameter"] == name].iloc[-1]
         row[name] = {"truth": float(truth[name])} | {
@@ -94,14 +85,10 @@ def one_life(
 
 def time_demo() -> dict[str, float]:
     """Time `make demo`; a first call makes sure that everything is installed."""
-    root = HERE.parents[1]
-    subprocess.run(["make", ".venv/installed"], cwd=root, check=True, capture_output=True)
-    begin = time.perf_counter()
-    subprocess.run(["make", "demo"], cwd=root, check=True, capture_output=True)
-    return {
-        "wall_s": round(time.perf_counter() - begin, 1),
-        "processors": len(os.sched_getaffinity(0)),
-    }
+    make = partial(subprocess.run, cwd=ROOT, check=True, capture_output=True)
+    make(["make", ".venv/installed"])
+    seconds = wall_s(lambda: make(["make", "demo"]))
+    return {"wall_s": round(seconds, 1), "processors": len(os.sched_getaffinity(0))}
 
 
 def summarise(lives: list[Row]) -> Row:
@@ -142,7 +129,7 @@ def coverage(rows: list[dict[str, float]], middle: str) -> Row:
 
 def claims(answer: Row) -> Iterator[Claim]:
     """Claim that intervals hold the truth of the demo's kind of life."""
-    for name in ("guide_preload", "mount_stiffness", "remaining_km"):
+    for name in (*PARAMETERS, "remaining_km"):
         row = answer[name]
         yield counted(
             f"lives whose true {name} lies inside its 90 % interval",
@@ -150,9 +137,7 @@ def claims(answer: Row) -> Iterator[Claim]:
             answer["n_lives"],
             f"{row['control_inside_when_shrunk_to_a_third']} inside a third of it",
         )
-    widest = [
-        answer[name]["widest_interval_over_prior"] for name in ("guide_preload", "mount_stiffness")
-    ]
+    widest = [answer[name]["widest_interval_over_prior"] for name in PARAMETERS]
     yield Claim("widest interval of preload and mount, over the prior's", percents(widest))
 
 

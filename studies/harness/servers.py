@@ -24,8 +24,7 @@ from importlib.util import find_spec
 from pathlib import Path
 
 WAIT_S = 60.0  # longer than any server takes to start on a busy machine
-MARK = "LMSHEALTH_STUDY_MARK"
-"""Variable of the environment by which processes are found, whatever sessions they make."""
+MARK = "LMSHEALTH_STUDY_MARK"  # variable of the environment by which processes are found
 _USER = "tester"
 Popen = subprocess.Popen[bytes]
 # Servers are killed here, machines are not: what is written need not reach the disk.
@@ -83,20 +82,22 @@ def _child(
 
 def postgres_programs() -> Path | None:
     """Find the folder of initdb and postgres, the newest version of several; None for none."""
-    debian = sorted(
-        Path("/usr/lib/postgresql").glob("*/bin/initdb"), key=lambda p: int(p.parts[-3])
-    )
-    found = str(debian[-1]) if debian else shutil.which("initdb")
-    return Path(found).resolve().parent if found else None
+    versions = Path("/usr/lib/postgresql").glob("*/bin/initdb")
+    newest = max(versions, key=lambda p: int(p.parts[-3]), default=shutil.which("initdb"))
+    return Path(newest).resolve().parent if newest else None
 
 
 def missing_postgres() -> str | None:
     """Return why no PostgreSQL can be started here; None when one can."""
     if postgres_programs() is None:
         return "PostgreSQL's server is not installed (Debian: postgresql)"
+    return _missing("psycopg", "postgres")
+
+
+def _missing(module: str, extra: str) -> str | None:
     if shutil.which("setpriv") is None:
         return "setpriv is not installed (Debian: util-linux)"
-    return None if find_spec("psycopg") else "psycopg is not installed: pip install '.[postgres]'"
+    return None if find_spec(module) else f"{module} is not installed: pip install '.[{extra}]'"
 
 
 @dataclass
@@ -130,7 +131,7 @@ class Postgres:
             self._process = None
 
     def url(self, database: str) -> str:
-        """Address of a database for SQLAlchemy, through TCP."""
+        """Return the address of a database for SQLAlchemy, through TCP."""
         return f"postgresql+psycopg://{_USER}:{self.password}@127.0.0.1:{self.port}/{database}"
 
     @contextmanager
@@ -244,10 +245,7 @@ class Cluster:
 
 def missing_distributed() -> str | None:
     """Return why no Dask cluster can be started here; None when one can."""
-    if shutil.which("setpriv") is None:
-        return "setpriv is not installed (Debian: util-linux)"
-    found = find_spec("distributed")
-    return None if found else "distributed is not installed: pip install '.[distributed]'"
+    return _missing("distributed", "distributed")
 
 
 @contextmanager
@@ -268,5 +266,4 @@ def dask_cluster(n_workers: int = 2) -> Iterator[Cluster]:
 
 def _dask(*words: str) -> Popen:
     """Start a program of Dask."""
-    command = [sys.executable, "-m", "dask", *words]
-    return _child(command)
+    return _child([sys.executable, "-m", "dask", *words])

@@ -35,7 +35,7 @@ from studies.harness.study import Row, Study
 STEP = "batch"
 
 ROOT = Path(__file__).parents[2]
-SOURCES = ("pyproject.toml", "README.md", "LICENSE", "lmshealth")
+SOURCES = ("pyproject.toml", "README.md", "LICENSE")
 BARE, OURS, ALL, HELP = "import numpy, scipy, pandas", "import lmshealth", "all names", "--help"
 PROGRAMS = {
     "nothing": ("-c", "pass"),
@@ -83,12 +83,9 @@ def installed(folder: Path) -> Path:
     source = folder / "source"
     source.mkdir()
     for name in SOURCES:
-        if (ROOT / name).is_dir():
-            shutil.copytree(
-                ROOT / name, source / name, ignore=shutil.ignore_patterns("__pycache__")
-            )
-        else:
-            shutil.copy(ROOT / name, source / name)
+        shutil.copy(ROOT / name, source / name)
+    ignored = shutil.ignore_patterns("__pycache__")
+    shutil.copytree(ROOT / "lmshealth", source / "lmshealth", ignore=ignored)
     venv.create(folder / "venv", with_pip=True)
     python = folder / "venv" / "bin" / "python"
     command = [python, "-m", "pip", "install", "--quiet", str(source)]
@@ -102,10 +99,9 @@ def sizes(python: Path, environment: Path) -> Row:
     found = {name: size / 1e6 for name, size in json.loads(done.stdout).items()}
     found.pop("pip", None)
     largest = sorted(found, key=lambda name: -found[name])
+    files = [path for path in environment.rglob("*") if path.is_file()]
     return {
-        "environment_mb": round(
-            sum(path.lstat().st_size for path in environment.rglob("*") if path.is_file()) / 1e6, 1
-        ),
+        "environment_mb": round(sum(path.lstat().st_size for path in files) / 1e6, 1),
         "distributions_mb": round(sum(found.values()), 1),
         "distributions": len(found),
         "lmshealth_mb": round(found["lmshealth"], 2),
@@ -119,11 +115,8 @@ def started(python: Path, folder: Path, turns: int, *, warm: bool = True) -> Row
         {name: spent(python, words, folder) for name, words in PROGRAMS.items()}
         for _ in range(turns + warm)
     ][warm:]
-    own = {
-        name: np.array([one[name] - one["nothing"] for one in rounds])
-        for name in PROGRAMS
-        if name != "nothing"
-    }
+    names = [name for name in PROGRAMS if name != "nothing"]
+    own = {name: np.array([one[name] - one["nothing"] for one in rounds]) for name in names}
     return {
         "turns": turns,
         "cpu_s": {name: round(float(times.min()), 3) for name, times in own.items()},
