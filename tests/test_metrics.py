@@ -11,7 +11,6 @@ from scipy import stats
 from studies.common.metrics import (
     alpha_lambda,
     clopper_pearson,
-    coverage,
     crps,
     cumulative_relative_accuracy,
     mass_within,
@@ -23,6 +22,7 @@ from studies.common.metrics import (
     unexploited_life,
     within,
 )
+from studies.harness.study import judge_places
 from tests.oracles import check_coverage
 
 NEVER = np.inf
@@ -191,8 +191,8 @@ def test_ranks_that_break_no_ties_are_not_uniform() -> None:
     middle = strict + 0.5 * np.mean(x == y, axis=0)
     for wrong in (strict, middle):
         assert stats.kstest(wrong, "uniform").pvalue < 1e-10
-        assert not coverage(wrong, 0.5).holds
-    assert coverage(middle, 0.5).low > 0.7
+        assert not judge_places(wrong, 0.5)["holds"]
+    assert judge_places(middle, 0.5)["low"] > 0.7
 
 
 def test_places_find_draws_that_are_too_sure() -> None:
@@ -214,9 +214,9 @@ def test_clopper_pearson_is_exact() -> None:
 
 def test_coverage_counts_and_judges() -> None:
     """Central intervals, their share, and whether it may be the nominal one."""
-    found = coverage(np.array([0.04, 0.06, 0.5, 0.94, 0.96]), 0.9)
-    assert (found.hits, found.n, found.share, found.holds) == (3, 5, 0.6, True)
-    assert not coverage(np.full(100, 0.01), 0.9).holds
+    found = judge_places(np.array([0.04, 0.06, 0.5, 0.94, 0.96]), 0.9)
+    assert (found["hits"], found["n"], found["share"], found["holds"]) == (3, 5, 0.6, True)
+    assert not judge_places(np.full(100, 0.01), 0.9)["holds"]
 
 
 def test_service_keeps_to_its_risk() -> None:

@@ -14,8 +14,6 @@ Czado2009 for places, Clopper1934 for intervals of shares, Susto2015 for service
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.stats import beta as beta_distribution
@@ -105,33 +103,6 @@ def place(
     x, y = np.minimum(draws, horizon), np.minimum(truth, horizon)
     below, tied = np.sum(x < y, axis=0), np.sum(x == y, axis=0)
     return np.asarray((below + rng.uniform(size=y.shape) * (tied + 1)) / (x.shape[0] + 1))
-
-
-@dataclass(frozen=True, slots=True)
-class Coverage:
-    """Share of intervals that contain the truth, with its Clopper-Pearson interval."""
-
-    nominal: float
-    hits: int
-    n: int
-    low: float
-    high: float
-
-    @property
-    def share(self) -> float:
-        """Measured coverage."""
-        return self.hits / self.n
-
-    @property
-    def holds(self) -> bool:
-        """Whether the interval of the share contains the nominal coverage."""
-        return self.low <= self.nominal <= self.high
-
-
-def coverage(places: FloatArray, nominal: float, *, level: float = 0.999) -> Coverage:
-    """Count how often central intervals contain the truth, from places of any shape."""
-    hits, n = int(np.sum(np.abs(np.asarray(places) - 0.5) < nominal / 2)), int(np.size(places))
-    return Coverage(nominal, hits, n, *clopper_pearson(hits, n, level))
 
 
 def clopper_pearson(hits: int, trials: int, level: float = 0.95) -> tuple[float, float]:

@@ -26,9 +26,9 @@ from matplotlib.axes import Axes
 from numpy.typing import NDArray
 from scipy import stats
 
-from studies.common.metrics import coverage, place
+from studies.common.metrics import place
 from studies.harness.figures import BLACK, BLUE
-from studies.harness.study import LEVEL, as_row
+from studies.harness.study import LEVEL, judge_places
 
 Array = NDArray[np.float64]
 Row = dict[str, Any]
@@ -73,9 +73,7 @@ def judge(ranks: Array) -> Row:
         "n": n,
         "inside_band": bool(np.all((low <= off) & (off <= high))),
         "p_value": float(stats.chisquare(counts).pvalue),
-        "coverage": [
-            {"nominal": level} | as_row(coverage(ranks, level, level=LEVEL)) for level in (0.5, 0.9)
-        ],
+        "coverage": [judge_places(ranks, level) for level in (0.5, 0.9)],
         "histogram": counts.tolist(),
         "ecdf_difference": off.round(5).tolist(),
     }

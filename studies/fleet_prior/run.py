@@ -45,10 +45,10 @@ from lmshealth.prognosis.remaining_life import remaining_travel
 from lmshealth.stage.degradation_laws import HertzWear
 from lmshealth.stage.description import Stage
 from lmshealth.stage.priors import Lognormal, Prior
-from studies.common.metrics import coverage, crps, place
+from studies.common.metrics import crps, place
 from studies.fleet_prior.lives import MATURE, YOUNG, Life, draw, draw_fleet, longer_lived, machine
 from studies.harness.claims import Claim, covered, measured, percents
-from studies.harness.study import LEVEL, Row, Study, as_row
+from studies.harness.study import Row, Study, judge_places
 
 STEP = "prognose, young machines"
 
@@ -228,10 +228,7 @@ def judged(rows: list[Row], way: str) -> Row:
     answer: Row = {
         "lives": len(places),
         "mean_place": round(float(places.mean()), 3),
-        "coverage": [
-            {"nominal": nominal} | as_row(coverage(places, nominal, level=LEVEL))
-            for nominal in (0.5, 0.9)
-        ],
+        "coverage": [judge_places(places, nominal) for nominal in (0.5, 0.9)],
     }
     for what in ("crps_km", "lost_km", "width_km"):
         answer[what] = mean([np.mean([one[way][what] for one in young]) for young in fleets])

@@ -27,7 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import norm
 
-from studies.common.metrics import Coverage, clopper_pearson
+from studies.common.metrics import clopper_pearson
 from studies.harness.provenance import code_of, name_of
 
 Row = dict[str, Any]
@@ -198,7 +198,14 @@ def judge_coverage(hits: int, n: int, nominal: float = NOMINAL) -> Row:
 
     It holds if the Clopper-Pearson interval of the share at level `LEVEL` contains the nominal.
     """
-    return as_row(Coverage(nominal, hits, n, *clopper_pearson(hits, n, LEVEL)))
+    row = share_row(hits, n)
+    return row | {"holds": row["low"] <= nominal <= row["high"]}
+
+
+def judge_places(places: NDArray[np.float64], nominal: float) -> Row:
+    """Return the coverage of central intervals from places of truths among draws, of any shape."""
+    hits = int(np.sum(np.abs(places - 0.5) < nominal / 2))
+    return {"nominal": nominal} | judge_coverage(hits, places.size, nominal)
 
 
 def judge_scores(z: NDArray[np.float64], nominal: float = NOMINAL) -> Row:
@@ -218,12 +225,6 @@ def real_data() -> Path:
     if "LMSHEALTH_DATA" not in os.environ:
         raise SystemExit("LMSHEALTH_DATA is not set: it names the folder of real measurements")
     return Path(os.environ["LMSHEALTH_DATA"])
-
-
-def as_row(found: Coverage) -> Row:
-    """Return a coverage as it is recorded."""
-    return {"hits": found.hits, "n": found.n, "share": found.share, "low": found.low,
-            "high": found.high, "holds": found.holds}  # fmt: skip
 
 
 def read_record(script: str, name: str = "result") -> Row:

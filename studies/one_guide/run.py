@@ -31,10 +31,9 @@ from lmshealth.stage.description import Stage, load_stage
 from lmshealth.tracking.read_tables import Drifts
 from models.dynamics.modal_map import guide_frequencies
 from models.dynamics.stages import stage_named
-from studies.common.metrics import coverage
 from studies.harness.claims import Claim, at_level, covered, percents
 from studies.harness.command_line import short_chains
-from studies.harness.study import LEVEL, Row, Study, as_row
+from studies.harness.study import Row, Study, judge_places
 
 STEP = "infer"
 
@@ -102,9 +101,7 @@ def told(health: Health, truth: tuple[float, ...]) -> Row:
 def judged(rows: list[Row], level_name: str = "level") -> list[Row]:
     """Judge the coverage of central intervals."""
     levels = np.array([row[level_name] for row in rows])
-    return [
-        {"nominal": nominal} | as_row(coverage(levels, nominal, level=LEVEL)) for nominal in LEVELS
-    ]
+    return [judge_places(levels, nominal) for nominal in LEVELS]
 
 
 def summary(rows: list[Row]) -> Row:

@@ -37,7 +37,7 @@ from lmshealth.stage.description import Stage, load_stage
 from studies.common import metrics
 from studies.common.lives import Array, recorded, rng_of
 from studies.harness.claims import Claim, counted, measured, number
-from studies.harness.study import LEVEL, Row, Study, as_row
+from studies.harness.study import Row, Study, judge_places
 from studies.rul_metrics import lives
 from studies.rul_metrics.forecasts import CONTROL, LINE, MISSING, OURS, PROGPY, WAYS, all_ways
 
@@ -190,10 +190,7 @@ def way(cuts: tuple[Row, ...], name: str, bounds: Row) -> Row:
         "median_accuracy": float(np.median(column["accuracy"])),
         "crps_km": float(column["crps_km"].mean()),
         "crps_more_than_ours_km": {"mean": float(more.mean()) if more.size else None, "se": error},
-        "coverage": [
-            {"nominal": p} | as_row(metrics.coverage(column["place"], p, level=LEVEL))
-            for p in (0.5, 0.9)
-        ],
+        "coverage": [judge_places(column["place"], p) for p in (0.5, 0.9)],
         "places": np.sort(column["place"]).round(4).tolist(),
         "beyond": float(column["beyond"].mean()),
         "width_over_left": float(np.median(column["width_over_left"])),
