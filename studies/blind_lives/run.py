@@ -50,7 +50,6 @@ NAMES = {
     "any": "the first of all limits",
 }
 
-
 N_LIVES, IN_ARCHIVE = 100, 10
 # A sound one, and one with too few logs.
 QUICK = (
@@ -58,8 +57,8 @@ QUICK = (
     BlindPlan("lms-x", "preload-wear", 2, 3.0, 63, until="failure"),
 )
 PROGRAMS = ("lmshealth.__main__",)
-PARTS = ("guide_preload", "mount_stiffness")
-LIMITS = (*PARTS, "any")
+LIMITS = tuple(NAMES)
+PARTS = LIMITS[:2]
 # Of a machine that the report does not name.
 SILENT = {"verdict": "not-enough-data", "probability": None, "shown": None, "health": {},
           "left": {}, "events": {}, "refused": {}}  # fmt: skip

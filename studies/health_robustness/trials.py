@@ -16,7 +16,6 @@ import numpy as np
 from lmshealth.health.epoch_posterior import EpochPosterior
 from lmshealth.health.importance_sampling import importance_sample_to_ess
 from lmshealth.prognosis import constants
-from lmshealth.prognosis import life_likelihood as life_module
 from lmshealth.prognosis.life_posterior import fit_life
 from lmshealth.prognosis.remaining_life import parameters_with_limit, remaining_travel
 from lmshealth.prognosis.scenarios import list_scenarios
@@ -52,12 +51,10 @@ _REDRAWS = 200
 class Case:
     """One life, its estimates, and the truth that is asked for."""
 
-    life: Life  # What is so at every log
-    estimates: Estimates  # What identification gives
-    health: Array  # Fractions of their value at the first log, shape ``(n_logs, 2)``
-    # Travel in m since the first log at which each limit is reached, infinite if never, shape
-    # ``(2,)``
-    passage: Array
+    life: Life
+    estimates: Estimates
+    health: Array  # Fractions of their value at the first log, (n_logs, 2)
+    passage: Array  # Travel in m since then to each limit, infinite if never, (2,)
     losing: bool = False  # Whether it is known that every parameter loses
 
 
@@ -83,12 +80,10 @@ class Answer:
 class Arm:
     """What the estimator believes."""
 
-    name: str  # Of the arm
-    model_std: float  # Relative error of the map's sensitivities that it believes in
-    # Factor on the covariance of what it is given, which it is not allowed to find out
-    shrink: float = 1.0
-    # Relative error of the map that it believes in as if it were new at every log
-    independent: float = 0.0
+    name: str
+    model_std: float  # Relative error of the map's sensitivities
+    shrink: float = 1.0  # Factor on the covariance of estimates, which it does not know
+    independent: float = 0.0  # Relative error of the map, as if it were new at every log
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -256,12 +251,8 @@ def by_law(stage: str, seed: int, rng: np.random.Generator) -> tuple[Life, Array
             break
     else:
         raise RuntimeError(f"{stage}: no life of {_REDRAWS} stays inside the map")
-    ends = [
-        path.passage(own, p.limit.below)[0] if p.limit else np.inf
-        for path, own, p in zip(
-            scenario.paths, scenario.split(theta), description.parameters, strict=True
-        )
-    ]
+    parts = zip(scenario.paths, scenario.split(theta), description.parameters, strict=True)
+    ends = [path.passage(own, p.limit.below)[0] if p.limit else np.inf for path, own, p in parts]
     return lives.life_with(plan, _with_health(visits, health)), np.array(ends)
 
 
@@ -275,10 +266,7 @@ def _with_health(visits: list[Visit], health: Array) -> list[Visit]:
 
 def alone(stage: Stage, health: Array) -> Array:
     """Drifts of the modes by each parameter alone, shape ``(n_parameters, n_points, n_modes)``."""
-    x = np.log(health)
-    only = np.zeros((x.shape[1], *x.shape))
-    for j in range(x.shape[1]):
-        only[j, :, j] = x[:, j]
+    only = np.eye(health.shape[1])[:, None] * np.log(health)
     return np.stack([stage.drift(own, GUIDE_MODES) for own in only])
 
 
@@ -308,13 +296,9 @@ def epoch_draws(
 
 
 def life_draws(
-    history: History,
-    stage: Stage,
-    rng: np.random.Generator,
-    *,
-    noise_known: bool = False,
-    chains: bool = False,
-) -> tuple[Array, Array]:
+    history: History, stage: Stage, rng: np.random.Generator, *,
+    noise_known: bool = False, chains: bool = False,
+) -> tuple[Array, Array]:  # fmt: skip
     """Draw health now, and the travel left to each limit and to the first, by the laws.
 
     With ``noise_known`` the stated covariance is all; otherwise a factor on it, a random walk of
@@ -336,12 +320,8 @@ def claimed(left: Array, stage: Stage) -> Array:
 
 
 def _noise_as_stated() -> patch.multiple:
-    """Leave of the grid of `lmshealth.life` the point at which estimates are all that errs."""
+    """Leave of the grid of scatter the point at which estimates are all that errs."""
     return patch.multiple(
-        life_module,
-        _WALKS=constants.WALKS[:1],
-        _NOISE_SCALES=(1.0,),
-        _NOISE_SCALE_PRIOR=(1.0,),
-        _DEVIATIONS=(0.0,),
-        _DEVIATION_PRIOR=(1.0,),
-    )
+        constants, WALKS=constants.WALKS[:1], NOISE_SCALES=(1.0,), NOISE_SCALE_PRIOR=(1.0,),
+        DEVIATIONS=(0.0,), DEVIATION_PRIOR=(1.0,),
+    )  # fmt: skip
