@@ -7,7 +7,7 @@ import pytest
 from scipy import stats
 
 from lmshealth._arrays import FloatArray
-from lmshealth.prognosis.first_passage import first_passage
+from lmshealth.prognosis.remaining_life import first_passage
 from lmshealth.prognosis.scenarios import DegradationPath
 from lmshealth.stage.degradation_laws import (
     AnyLaw,
