@@ -40,7 +40,7 @@ from studies.blind_lives import lives
 from studies.blind_lives.lives import SEED, BlindPlan, agrees, analyse, plan_of, truth_of
 from studies.common.lives import HEALTHY
 from studies.common.metrics import clopper_pearson
-from studies.harness.claims import Claim, counted, number
+from studies.harness.claims import Claim, number, share
 from studies.harness.study import LEVEL, Row, Study, read_record
 
 STEP = "all of it, from raw logs to the report"
@@ -192,27 +192,20 @@ def claims(answer: Row) -> Iterator[Claim]:
     yield from _verdicts(answer)
     for name, row in answer["sound_kinds"].items():
         fine = answer["passed"][f"at most 1 in 100 of sound kinds: {name}"]
-        yield counted(
-            f"machines of sound kinds: {name}", row["hits"], row["n"], "1 in 100 required", met=fine
-        )
+        yield share(f"machines of sound kinds: {name}", row, "1 in 100 required", met=fine)
     for what, of in (("health", ""), ("left", "what is left until ")):
         for name, found in answer[what].items():
             yield from _covered(of + NAMES.get(name, name), found, answer[OTHERS][what][name])
-    found = answer["left, ending"]["any"]["90"], answer["left, ending"]["any"]["90 shrunk"]
-    yield counted(
+    ending = answer["left, ending"]["any"]
+    yield share(
         "intervals of 90 % that hold the truth: what is left of those that reach a limit",
-        found[0]["hits"],
-        found[0]["n"],
-        f"{found[1]['hits']} shrunk to a third",
-        met=found[0]["holds"],
+        ending["90"],
+        f"{ending['90 shrunk']['hits']} shrunk to a third",
+        met=ending["90"]["holds"],
     )
     page = answer["front_page"]
-    yield counted(
-        "rows of the front page that agree with the table of verdicts",
-        page["hits"],
-        page["n"],
-        met=page["hits"] == page["n"],
-    )
+    what = "rows of the front page that agree with the table of verdicts"
+    yield share(what, page, met=page["hits"] == page["n"])
 
 
 def _verdicts(answer: Row) -> Iterator[Claim]:
@@ -220,12 +213,8 @@ def _verdicts(answer: Row) -> Iterator[Claim]:
     wrong = found[OTHERS]["right"]
     for name in ("all", "clear of borders"):
         row = found[name]["right"]
-        yield counted(
-            f"verdicts of blind lives that are right, {name}",
-            row["hits"],
-            row["n"],
-            f"{wrong['hits']} of {wrong['n']} with the {OTHERS}" if name == "all" else "",
-        )
+        beside = f"{wrong['hits']} of {wrong['n']} with the {OTHERS}" if name == "all" else ""
+        yield share(f"verdicts of blind lives that are right, {name}", row, beside)
     yield Claim(
         "verdicts with a probability that are right, and their number by these probabilities",
         f"{sure['right']} of {sure['n']}",
@@ -247,10 +236,9 @@ def _covered(name: str, found: Row, others: Row) -> Iterator[Claim]:
     for level in ("90", "50"):
         row, narrow, mixed = found[level], found[f"{level} shrunk"], others[level]
         if row["n"]:
-            yield counted(
+            yield share(
                 f"intervals of {level} % that hold the truth: {name}",
-                row["hits"],
-                row["n"],
+                row,
                 f"{narrow['hits']} shrunk to a third, {mixed['hits']} with the {OTHERS}",
                 met=row["holds"],
             )

@@ -52,12 +52,6 @@ class Kind:
     gaps: bool = False  # Logs miss modes and show spurious ones
 
 
-def odometer(rng: np.random.Generator) -> Array:
-    """Irregular logs over a life."""
-    steps = rng.gamma(2.0, size=N_LOGS - 1)
-    return np.concatenate([[0.0], np.cumsum(steps) / steps.sum()])
-
-
 def directions(rng: np.random.Generator, n_modes: int) -> Array:
     """Shapes at right angles, one a row."""
     return np.asarray(np.linalg.qr(rng.standard_normal((N_CHANNELS, n_modes)))[0].T)
@@ -132,8 +126,9 @@ KINDS = {
 
 
 def make_life(kind: Kind, rng: np.random.Generator) -> Life:
-    """Draw a life."""
-    clock = odometer(rng)
+    """Draw a life of irregular logs."""
+    steps = rng.gamma(2.0, size=N_LOGS - 1)
+    clock = np.concatenate([[0.0], np.cumsum(steps) / steps.sum()])
     ln_f, shapes, unclear = kind.paths(clock, rng)
     names = [f"mode_{i + 1}" for i in range(ln_f.shape[1])]
     rows = [_log(kind, ln_f[k], shapes[k], names, rng) for k in range(clock.size)]

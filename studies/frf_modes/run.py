@@ -248,13 +248,10 @@ def summarise_sweeps(rows: list[Row]) -> Row:
     found = {}
     for sensor in SENSORS:
         z = np.array([row[sensor]["z"] for row in rows])
-        found[sensor] = {
-            "n": len(rows),
-            "median_std_hz": float(np.median([row[sensor]["std_hz"] for row in rows])),
-            "z_mean": z.mean(axis=0).tolist(),
-            "z_rms": np.sqrt(np.mean(z**2, axis=0)).tolist(),
-            "p": chi2.sf(np.sum(z**2, axis=0), len(rows)).tolist(),
-        }
+        median = float(np.median([row[sensor]["std_hz"] for row in rows]))
+        found[sensor] = {"n": len(rows), "median_std_hz": median, "z_mean": z.mean(axis=0).tolist(),
+                         "z_rms": np.sqrt(np.mean(z**2, axis=0)).tolist(),
+                         "p": chi2.sf(np.sum(z**2, axis=0), len(rows)).tolist()}  # fmt: skip
     return found
 
 

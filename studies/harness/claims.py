@@ -81,6 +81,11 @@ def counted(what: str, hits: int, n: int, beside: str = "", *, met: bool = True)
     return Claim(what, f"{hits:,} of {n:,}", interval, beside, met)
 
 
+def share(what: str, row: Row, beside: str = "", *, met: bool = True) -> Claim:
+    """Claim a share that a study judged, as `counted`."""
+    return counted(what, row["hits"], row["n"], beside, met=met)
+
+
 def controls_seen(found: Mapping[str, bool]) -> str:
     """Format how many negative controls were detected."""
     return f"{sum(map(bool, found.values()))} of {len(found)} controls are seen"
