@@ -15,7 +15,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime, timedelta
 from functools import cache
 from pathlib import Path
@@ -40,22 +40,6 @@ ENDED_S = 60.0  # by then every process of a killed run has to be gone, on a bus
 PROGRAM = ("lmshealth.__main__",)
 _PROGRAM = (sys.executable, "-m", "lmshealth")
 SOME_REFUSED = 3  # exit status of a run over the batch, which has damaged logs
-
-
-@dataclass(frozen=True)
-class Batch:
-    """Logs, descriptions of their machines, and the number of processes that analyse them."""
-
-    logs: Path
-    stages: tuple[Path, ...]
-    workers: int
-
-    def command(self, out: Path, store: str, *more: str) -> list[str]:
-        """Return the command that analyses the batch, health at one epoch: that is slow."""
-        stages = [word for stage in self.stages for word in ("--stage", str(stage))]
-        return [*_PROGRAM, "run", str(self.logs), *stages,
-                "--out", str(out), "--store", store, "--epochs", "1",
-                *(more or ("--workers", str(self.workers)))]  # fmt: skip
 
 
 class Run:
@@ -194,12 +178,18 @@ def rows(store: str) -> dict[str, int]:
 
 @dataclass(frozen=True)
 class Reference:
-    """A batch, what an uninterrupted run makes of it, and the time of that in s."""
+    """A batch and its uninterrupted run."""
 
-    batch: Batch
+    analyse: list[str]  # the command without its output
+    workers: int
     out: Path
-    rows: dict[str, int]
+    rows: dict[str, int]  # of the store
     seconds: float
+
+    def command(self, out: Path, store: str, *more: str) -> list[str]:
+        """Return the command that analyses the batch, by its own workers if nothing is said."""
+        workers = more or ("--workers", str(self.workers))
+        return [*self.analyse, "--out", str(out), "--store", store, *workers]
 
     def judge(self, out: Path, store: str) -> list[str]:
         """List how output and store differ from the uninterrupted run's."""
@@ -213,12 +203,14 @@ def reference_of(folder: Path, machines: Mapping[str, int], *, quick: bool) -> R
     """Write so many logs of each machine, and analyse them without interruption."""
     for machine, n_logs in machines.items():
         write_machine(folder / "logs", machine, n_logs)
-    batch = Batch(folder / "logs", write_stages(folder / "stages"), 1 if quick else 2)
-    out = folder / "reference" / "out"
-    out.parent.mkdir()
-    store = f"sqlite:///{out.parent / 'reference.sqlite'}"
-    seconds = completed(batch.command(out, store), quick=quick)
-    return Reference(batch, out, rows(store), seconds)
+    stages = [word for path in write_stages(folder / "stages") for word in ("--stage", str(path))]
+    # Health at one epoch: that is slow.
+    analyse = [*_PROGRAM, "run", str(folder / "logs"), *stages, "--epochs", "1"]
+    first = Reference(analyse, 1 if quick else 2, folder / "reference" / "out", {}, 0.0)
+    first.out.parent.mkdir()
+    store = f"sqlite:///{first.out.parent / 'reference.sqlite'}"
+    seconds = completed(first.command(first.out, store), quick=quick)
+    return replace(first, rows=rows(store), seconds=seconds)
 
 
 Stores = Callable[[], AbstractContextManager[str]]  # makes an empty store; its value is the URL

@@ -55,7 +55,7 @@ def main() -> None:
         reference = driving.reference_of(folder, machines, quick=quick)
         answer: Row = {
             "seed": SEED,
-            "logs": len(list(reference.batch.logs.rglob("*.h5"))),
+            "logs": sum(machines.values()),
             "uninterrupted": {"seconds": round(reference.seconds, 1), "rows": reference.rows},
             "kills": {},
         }
@@ -126,7 +126,7 @@ def killed(
         out, status = Path(name) / "out", None
         while status != driving.SOME_REFUSED:
             begun = time.monotonic()
-            with driving.running(reference.batch.command(out, store)) as run:
+            with driving.running(reference.command(out, store)) as run:
                 how = ""
                 # A run may survive the loss of a worker.
                 while how in ("", "worker") and (drawn := draw()) and run.status(drawn[0]) is None:

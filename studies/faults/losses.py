@@ -88,7 +88,7 @@ def full_disk(
     first = reference.out.parent / "reference.sqlite"
     needing = [*reference.out.iterdir(), *([first] if with_store else [])]
     need = sum(path.stat().st_size for path in needing)
-    command = " ".join(reference.batch.command(place / "out", f"sqlite:///{store}"))
+    command = " ".join(reference.command(place / "out", f"sqlite:///{store}"))
     script = f"mount -t tmpfs -o size={need // 100} none {place}\n"
     for k, size in enumerate(sizes):
         script += f"mount -o remount,size={round(size * need)} {place}\n"
@@ -117,7 +117,7 @@ def lost_database(reference: Reference, n: int, latest: float, *, quick: bool) -
     with postgres() as server:
         while sum(status != SOME_REFUSED for status, _ in ends) < n and len(ends) < 4 * n:
             with server.database() as store, tempfile.TemporaryDirectory() as name:
-                command = reference.batch.command(Path(name) / "out", store)
+                command = reference.command(Path(name) / "out", store)
                 with driving.running(command) as run:
                     run.begun(store)
                     run.status(rng.uniform(0.0, latest) * reference.seconds)

@@ -122,7 +122,7 @@ def one_pair(
     with new_store() as store, tempfile.TemporaryDirectory() as name, ExitStack() as stack:
         outs = [Path(name) / "first", Path(name) / "second"]
         commands = [
-            reference.batch.command(out, store)
+            reference.command(out, store)
             for reference, out in zip((pair.first, pair.second), outs, strict=True)
         ]
         first = stack.enter_context(driving.running(commands[0]))

@@ -79,7 +79,7 @@ def workers_killed(reference: Reference, cluster: Cluster, n_kills: int, per_run
     while len(known) < n_kills:
         with tempfile.TemporaryDirectory() as name:
             store, out = f"sqlite:///{name}/store.sqlite", Path(name) / "out"
-            command = reference.batch.command(out, store, "--scheduler", cluster.address)
+            command = reference.command(out, store, "--scheduler", cluster.address)
             with driving.running(command) as run:
                 run.begun(store)
                 while len(known) < n_kills:
@@ -103,16 +103,14 @@ def scheduler_lost(reference: Reference) -> Row:
         store, out = f"sqlite:///{name}/store.sqlite", Path(name) / "out"
         with (
             dask_cluster() as cluster,
-            driving.running(
-                reference.batch.command(out, store, "--scheduler", cluster.address)
-            ) as run,
+            driving.running(reference.command(out, store, "--scheduler", cluster.address)) as run,
         ):
             run.begun(store)
             run.status(rng.uniform(0, 0.5) * reference.seconds)
             cluster.scheduler.send_signal(signal.SIGKILL)
             status, messages = run.status(), run.messages()
         with dask_cluster() as cluster:
-            driving.completed(reference.batch.command(out, store, "--scheduler", cluster.address))
+            driving.completed(reference.command(out, store, "--scheduler", cluster.address))
         return {"status": status, "said": messages, "differences": reference.judge(out, store)}
 
 
