@@ -29,18 +29,13 @@ _N_PRIOR, _N_START = 1000, 1000
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Sample:
-    """Draws from a posterior with their convergence diagnostics.
+    """Draws from a posterior with their convergence diagnostics."""
 
-    Attributes
-    ----------
-    draws : ndarray
-        Of every ensemble after burn-in, step after step and in a step walker after walker, shape
-        ``(n_ensembles, n_draws, n_dim)``.
-    ess_bulk, ess_tail, r_hat, autocorrelation_time : ndarray
-        As in `Health`, and steps, the longest of the ensembles, shape ``(n_dim,)``.
-    """
-
+    # Of every ensemble after burn-in, step after step and in a step walker after walker,
+    # shape ``(n_ensembles, n_draws, n_dim)``.
     draws: FloatArray
+    # ess_bulk, ess_tail, r_hat, autocorrelation_time: as in `Health`, and steps, the longest
+    # of the ensembles, shape ``(n_dim,)``.
     ess_bulk: FloatArray
     ess_tail: FloatArray
     r_hat: FloatArray

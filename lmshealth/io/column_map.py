@@ -161,26 +161,13 @@ class MatLayout(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class ColumnMap(Struct, frozen=True, forbid_unknown_fields=True, dict=True):
-    """Translation of an export into the log contract; by default its columns are the contract's.
+    """Translation of an export into the log contract; by default its columns are the contract's."""
 
-    Attributes
-    ----------
-    columns : dict of str to str
-        Contract name to the name in the file.
-    units : dict of str to str or float
-        Contract name without unit suffix to its unit, or to the SI value of one count.
-    metadata : dict of str to object
-        Constants that override the metadata of the file.
-    sample_rate_hz : float or None
-        In Hz.
-    csv : CsvLayout
-    mat : MatLayout
-    """
-
-    columns: dict[str, str] = {}
+    columns: dict[str, str] = {}  # contract name to the name in the file
+    # Contract name without unit suffix to its unit, or to the SI value of one count.
     units: dict[str, str | float] = {}
-    metadata: dict[str, Any] = {}
-    sample_rate_hz: Annotated[float, Meta(gt=0)] | None = None
+    metadata: dict[str, Any] = {}  # constants that override the metadata of the file
+    sample_rate_hz: Annotated[float, Meta(gt=0)] | None = None  # in Hz
     csv: CsvLayout = CsvLayout()
     mat: MatLayout = MatLayout()
 

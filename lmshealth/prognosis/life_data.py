@@ -17,28 +17,21 @@ from lmshealth.tracking.history import History
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LifeData:
-    """Data of a life, ordered by series, and those of a series by log.
-
-    Attributes
-    ----------
-    history : History
-        All logs, condensed.
-    columns, modes, mode_of_series : list of int, tuple of str, ndarray of int
-        Series of the history that are used, their modes, and the mode of each, ``(n_series,)``.
-    clock, steps : ndarray, tuple of float
-        Travel since the baseline in m of each log, shape ``(n_logs,)``, and step of the modes.
-    rows, y : ndarray
-        Index of each datum among all series and logs, and its ln f minus the mean of its mode,
-        shape ``(n_data,)``.
-    """
+    """Data of a life, ordered by series, and those of a series by log."""
 
     stage: Stage
-    history: History
+    history: History  # all logs, condensed
+    # columns, modes, mode_of_series: series of the history that are used, their modes, and
+    # the mode of each, ``(n_series,)``.
     columns: list[int]
     modes: tuple[str, ...]
     mode_of_series: np.ndarray
+    # clock, steps: travel since the baseline in m of each log, shape ``(n_logs,)``, and step
+    # of the modes.
     clock: FloatArray
     steps: tuple[float, ...]
+    # rows, y: index of each datum among all series and logs, and its ln f minus the mean of
+    # its mode, shape ``(n_data,)``.
     rows: np.ndarray
     y: FloatArray
 

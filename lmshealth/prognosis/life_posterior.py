@@ -121,33 +121,23 @@ class LifeDensity:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ScenarioPosterior:
-    """Posterior under one scenario.
-
-    Attributes
-    ----------
-    probability, evidence_std : float
-        Posterior probability of the scenario, and relative standard deviation of its evidence.
-    coordinates : ndarray
-        Draws, shape ``(n_ensembles, n_draws, n_dim)``.
-    ess_bulk, ess_tail, r_hat : ndarray
-        As in `Health`, of the coordinates, shape ``(n_dim,)``; after importance sampling the
-        effective sample size, and NaN for R-hat.
-    informed : ndarray
-        One minus the squared ratio of posterior to prior width of the 90 % interval of each natural
-        parameter, at least 0, shape ``(n_dim,)``.
-    n_mixture : int
-        Draws of each ensemble that represent this scenario in the mixture of all.
-    """
+    """Posterior under one scenario."""
 
     density: LifeDensity
+    # probability, evidence_std: posterior probability of the scenario, and relative standard
+    # deviation of its evidence.
     probability: float
     evidence_std: float
-    coordinates: FloatArray
+    coordinates: FloatArray  # draws, shape ``(n_ensembles, n_draws, n_dim)``
+    # ess_bulk, ess_tail, r_hat: as in `Health`, of the coordinates, shape ``(n_dim,)``; after
+    # importance sampling the effective sample size, and NaN for R-hat.
     ess_bulk: FloatArray
     ess_tail: FloatArray
     r_hat: FloatArray
+    # One minus the squared ratio of posterior to prior width of the 90 % interval of each
+    # natural parameter, at least 0, shape ``(n_dim,)``.
     informed: FloatArray
-    n_mixture: int
+    n_mixture: int  # draws of each ensemble that represent this scenario in the mixture of all
 
     def __post_init__(self) -> None:
         n = self.scenario.n_dim

@@ -27,48 +27,23 @@ State = Literal["good", "bad", "open"]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Assessment:
-    """All results of one machine, as far as its data carry them.
+    """All results of one machine, as far as its data carry them."""
 
-    Attributes
-    ----------
-    stage : Stage
-        Description that the logs were analysed with.
-    history, judgement : History, Verdict
-        Modal estimates of all logs, and the verdict.
-    digests : tuple of str
-        SHA-256 of each log of the history.
-    track : Track or None
-        None without an estimate of a tracked mode.
-    health : Health or None
-        None without a health parameter, or with too few logs.
-    prognosis : Prognosis or None
-        None without health, or without a limit.
-    refused : tuple of Refusal
-        Everything of this machine that was not analysed.
-    notes : tuple of str
-        What the reader must take into account, one sentence each.
-    seed : int
-        Seed of all random streams.
-    waterfall : Waterfall or None
-        Spectra of the logs of the history; None when no log covers the band of the modes.
-    evidence : MachineEvidence or None
-        Evidence for the fleet prior; None without a posterior of the life.
-    fleet : FleetPrior or None
-        Fleet prior of the prognosis; None when it rests on the prior of the description.
-    """
-
-    stage: Stage
-    history: History
-    digests: tuple[str, ...]
-    track: Track | None
-    health: Health | None
-    prognosis: Prognosis | None
+    stage: Stage  # description that the logs were analysed with
+    history: History  # history, judgement: modal estimates of all logs, and the verdict
+    digests: tuple[str, ...]  # SHA-256 of each log of the history
+    track: Track | None  # none without an estimate of a tracked mode
+    health: Health | None  # none without a health parameter, or with too few logs
+    prognosis: Prognosis | None  # none without health, or without a limit
     judgement: Verdict
-    refused: tuple[Refusal, ...]
-    notes: tuple[str, ...]
-    seed: int
+    refused: tuple[Refusal, ...]  # everything of this machine that was not analysed
+    notes: tuple[str, ...]  # what the reader must take into account, one sentence each
+    seed: int  # seed of all random streams
+    # Spectra of the logs of the history; None when no log covers the band of the modes.
     waterfall: Waterfall | None = None
+    # Evidence for the fleet prior; None without a posterior of the life.
     evidence: MachineEvidence | None = None
+    # Fleet prior of the prognosis; None when it rests on the prior of the description.
     fleet: FleetPrior | None = None
 
     def service(self) -> Service:
@@ -103,93 +78,52 @@ class Assessment:
 
 @dataclass(frozen=True, slots=True)
 class ParameterHealth:
-    """A health parameter at the last epoch.
-
-    Attributes
-    ----------
-    determined : bool
-        Whether the data determine it; else its interval is mostly the prior.
-    converged : bool
-        Whether the sampler converged.
-    informed : float
-        Share of the prior variance that the data remove.
-    low, median, high : float
-        5, 50 and 95 % quantiles, as fractions of the baseline.
-    limit : float or None
-        As a fraction of the baseline.
-    below_limit : float
-        Probability of being below the limit; NaN without one.
-    baseline, unit : float, str
-        Baseline value with its unit; "" for a pure fraction.
-    """
+    """A health parameter at the last epoch."""
 
     name: str
-    determined: bool
-    converged: bool
-    informed: float
-    low: float
+    determined: bool  # whether the data determine it; else its interval is mostly the prior
+    converged: bool  # whether the sampler converged
+    informed: float  # share of the prior variance that the data remove
+    low: float  # low, median, high: 5, 50 and 95 % quantiles, as fractions of the baseline
     median: float
     high: float
-    limit: float | None = None
-    below_limit: float = np.nan
-    baseline: float = 1.0
+    limit: float | None = None  # as a fraction of the baseline
+    below_limit: float = np.nan  # probability of being below the limit; NaN without one
+    baseline: float = 1.0  # baseline, unit: baseline value with its unit; "" for a pure fraction
     unit: str = ""
 
 
 @dataclass(frozen=True, slots=True)
 class LimitLife:
-    """Remaining life until one limit, quantiles at `constants.RUL_LEVELS`.
+    """Remaining life until one limit, quantiles at `constants.RUL_LEVELS`."""
 
-    Attributes
-    ----------
-    parameter : str
-        Of the limit; ``any`` for the first limit reached.
-    limit, baseline : float
-        In the unit of the parameter; the limit of ``any`` is NaN.
-    travel, days : tuple of float
-        In m and days, at least 0, infinite beyond the horizon.
-    dates : tuple of (date or None)
-        Days of the calendar; None beyond the horizon or the calendar.
-    already_past, beyond_horizon : float
-        Probabilities.
-    health : tuple of float
-        5, 50 and 95 % quantiles of the parameter now by its laws, as fractions of the baseline;
-        empty for ``any``.
-    """
-
-    parameter: str
-    limit: float
+    parameter: str  # of the limit; ``any`` for the first limit reached
+    limit: float  # limit, baseline: in the unit of the parameter; the limit of ``any`` is NaN
     baseline: float
+    # travel, days: in m and days, at least 0, infinite beyond the horizon.
     travel: tuple[float, ...]
     days: tuple[float, ...]
-    dates: tuple[date | None, ...]
-    already_past: float
+    dates: tuple[date | None, ...]  # days of the calendar; None beyond the horizon or the calendar
+    already_past: float  # already_past, beyond_horizon: probabilities
     beyond_horizon: float
+    # 5, 50 and 95 % quantiles of the parameter now by its laws, as fractions of the baseline;
+    # empty for ``any``.
     health: tuple[float, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
 class Life:
-    """Remaining life of a machine in a few numbers.
+    """Remaining life of a machine in a few numbers."""
 
-    Attributes
-    ----------
-    stage, recorded_at : str, datetime
-        Identity of the machine, and its last log.
-    travel, horizon : float
-        Odometer at the last log, and travel from there beyond which nothing is claimed, in m.
-    limits : tuple of LimitLife
-        One per limit, then any.
-    undetermined : tuple of str
-        Parameters with a limit that the modes do not determine: excluded.
-    """
-
-    stage: str
+    stage: str  # stage, recorded_at: identity of the machine, and its last log
     recorded_at: datetime
+    # travel, horizon: odometer at the last log, and travel from there beyond which nothing is
+    # claimed, in m.
     travel: float
     horizon: float
-    limits: tuple[LimitLife, ...]
+    limits: tuple[LimitLife, ...]  # one per limit, then any
     laws: tuple[LawWeight, ...]
+    # Parameters with a limit that the modes do not determine: excluded.
     undetermined: tuple[str, ...]
 
     @property
@@ -200,29 +134,15 @@ class Life:
 
 @dataclass(frozen=True, slots=True)
 class Summary:
-    """A machine as the fleet page and a terminal show it; small enough to keep for a whole fleet.
+    """A machine as the fleet page and a terminal show it, in a few numbers."""
 
-    Attributes
-    ----------
-    file : str
-        Its page, in the folder of the fleet page.
-    urgency : tuple
-        Sort key, most urgent first.
-    state : str
-        ``good``, ``bad`` or ``open`` (no verdict).
-    headline : str
-        The verdict in words.
-    verdict, probability, why
-        As in `Verdict`.
-    """
-
-    file: str
+    file: str  # its page, in the folder of the fleet page
     identity: str
-    urgency: tuple[int, float, float, str]
+    urgency: tuple[int, float, float, str]  # sort key, most urgent first
     last_log: date
-    state: State
-    headline: str
-    verdict: str
+    state: State  # ``good``, ``bad`` or ``open`` (no verdict)
+    headline: str  # the verdict in words
+    verdict: str  # verdict, probability, why: as in `Verdict`
     probability: float
     why: str
     health: tuple[ParameterHealth, ...]

@@ -31,39 +31,21 @@ Interval = tuple[float, float, float]
 
 @dataclass(frozen=True, slots=True)
 class Reported:
-    """State of a machine in a report, in a few numbers.
+    """State of a machine in a report, in a few numbers."""
 
-    Attributes
-    ----------
-    recorded_at, baseline_at : datetime
-        The last log, and that at the baseline.
-    description : str
-        Digest of the stage description.
-    travel : float
-        Odometer at the last log in m, NaN without one.
-    verdict, probability : str, float
-        As in ``verdict.csv``; NaN for ``not-enough-data``.
-    health : dict of str to tuple of float
-        Quantiles of each parameter that the data determine, as fractions of the baseline.
-    remaining : tuple of float or None
-        Quantiles of the remaining travel until any limit in m, infinite beyond the horizon.
-    horizon : float
-        Travel in m beyond which nothing is claimed.
-    service_by : date or None
-        Last day for the service; None without a due service.
-    """
-
-    recorded_at: datetime
+    recorded_at: datetime  # recorded_at, baseline_at: the last log, and that at the baseline
     baseline_at: datetime
-    description: str
+    description: str  # digest of the stage description
     n_logs: int
-    travel: float
-    verdict: str
+    travel: float  # odometer at the last log in m, NaN without one
+    verdict: str  # verdict, probability: as in ``verdict.csv``; NaN for ``not-enough-data``
     probability: float
+    # Quantiles of each parameter that the data determine, as fractions of the baseline.
     health: dict[str, Interval]
+    # Quantiles of the remaining travel until any limit in m, infinite beyond the horizon.
     remaining: Interval | None
-    horizon: float
-    service_by: date | None
+    horizon: float  # travel in m beyond which nothing is claimed
+    service_by: date | None  # last day for the service; None without a due service
 
 
 def reported(assessment: Assessment, service: Service | None = None) -> Reported:

@@ -43,29 +43,20 @@ class FrequencyBand:
 
 @dataclass(frozen=True, slots=True)
 class Magnitude:
-    """Levels of one accelerometer of one log in a band.
-
-    Attributes
-    ----------
-    stage : str
-        Identity of the machine, empty where unknown.
-    velocity : float
-        Set velocity in m/s, NaN where unknown.
-    magnitude, frequency, resolution : float
-        Amplitude in m/s² and frequency in Hz of the strongest harmonic of the longest stretch, and
-        the spacing of its harmonics in Hz.
-    rms, dof : float, int
-        Of all stretches, in m/s², and the degrees of freedom of the mean square: two per harmonic.
-    """
+    """Levels of one accelerometer of one log in a band."""
 
     log: str
-    stage: str
-    velocity: float
+    stage: str  # identity of the machine, empty where unknown
+    velocity: float  # set velocity in m/s, NaN where unknown
     channel: str
     band: FrequencyBand
+    # magnitude, frequency, resolution: amplitude in m/s² and frequency in Hz of the strongest
+    # harmonic of the longest stretch, and the spacing of its harmonics in Hz.
     magnitude: float
     frequency: float
     resolution: float
+    # rms, dof: of all stretches, in m/s², and the degrees of freedom of the mean square: two
+    # per harmonic.
     rms: float
     dof: int
 

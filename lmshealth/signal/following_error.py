@@ -25,32 +25,20 @@ from lmshealth.signal.segments import (
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FollowingError:
-    """Statistics and harmonics of one following-error channel of a log.
-
-    Attributes
-    ----------
-    velocity : float
-        Set velocity in m/s; NaN where unknown or where the log has several.
-    duration, lowest, highest, std, mean : float
-        Total duration in s, and statistics of all samples in m.
-    harmonics : Harmonics
-        Of the longest gap-free stretch, at most of a minute at 20 kHz.
-    kept : ndarray
-        Indices of the strongest harmonics, strongest first, shape ``(n_kept,)``.
-    floor : float
-        Amplitude in m above which a harmonic is no noise.
-    """
+    """Statistics and harmonics of one following-error channel of a log."""
 
     channel: str
-    velocity: float
+    velocity: float  # set velocity in m/s; NaN where unknown or where the log has several
+    # duration, lowest, highest, std, mean: total duration in s, and statistics of all samples
+    # in m.
     duration: float
     lowest: float
     highest: float
     std: float
     mean: float
-    harmonics: Harmonics
-    kept: Indices
-    floor: float
+    harmonics: Harmonics  # of the longest gap-free stretch, at most of a minute at 20 kHz
+    kept: Indices  # indices of the strongest harmonics, strongest first, shape ``(n_kept,)``
+    floor: float  # amplitude in m above which a harmonic is no noise
 
     def __post_init__(self) -> None:
         freeze(self)

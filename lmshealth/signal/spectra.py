@@ -27,24 +27,17 @@ _LEAST_PART = MINUTE // 2
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Spectrum:
-    """Periodogram of one channel as acceleration, over one segment or the mean over several.
+    """Periodogram of one channel as acceleration, over one segment or the mean over several."""
 
-    Attributes
-    ----------
-    frequency, periodogram : ndarray
-        Fourier frequencies in Hz, and one-sided periodogram in (m/s²)²/Hz: the power spectral
-        density times the mean of ``count`` exponential variables, shape ``(n_ordinates,)``.
-    duration, velocity : float
-        Of a segment in s, and set velocity in m/s, NaN where unknown.
-    count : int
-        Number of averaged segments.
-    """
-
+    # frequency, periodogram: fourier frequencies in Hz, and one-sided periodogram in
+    # (m/s²)²/Hz: the power spectral density times the mean of ``count`` exponential
+    # variables, shape ``(n_ordinates,)``.
     frequency: FloatArray
     periodogram: FloatArray
+    # duration, velocity: of a segment in s, and set velocity in m/s, NaN where unknown.
     duration: float
     velocity: float
-    count: int = 1
+    count: int = 1  # number of averaged segments
 
     def __post_init__(self) -> None:
         if self.frequency.shape != self.periodogram.shape:
@@ -92,23 +85,16 @@ class CrossSpectrum:
     """All channels as acceleration over one segment, or the mean over several of one length.
 
     Frequencies, duration, velocity and count are those of `Spectrum`.
-
-    Attributes
-    ----------
-    matrix : ndarray
-        F F*, F the transforms of all channels; its diagonal holds their one-sided periodograms in
-        (m/s²)²/Hz, shape ``(n_ordinates, n_channels, n_channels)``.
-    free : ndarray of bool
-        Ordinates without a removed or masked line, shape ``(n_ordinates,)``.
-    lines : tuple of (int, float, float)
-        Index of the channel, frequency in Hz and amplitude in m/s² of each removed sinusoid.
     """
 
     frequency: FloatArray
+    # F F*, F the transforms of all channels; its diagonal holds their one-sided periodograms
+    # in (m/s²)²/Hz, shape ``(n_ordinates, n_channels, n_channels)``.
     matrix: ComplexArray
     duration: float
     velocity: float
-    free: BoolArray
+    free: BoolArray  # ordinates without a removed or masked line, shape ``(n_ordinates,)``
+    # Index of the channel, frequency in Hz and amplitude in m/s² of each removed sinusoid.
     lines: tuple[tuple[int, float, float], ...] = ()
     count: int = 1
 

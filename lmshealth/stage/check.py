@@ -23,24 +23,17 @@ Verdict = Literal["told", "longer-logs", "together", "not-told"]
 
 @dataclass(frozen=True, slots=True)
 class ModeCheck:
-    """A mode of the description and its place on the map.
-
-    Attributes
-    ----------
-    informs : bool
-        Whether health is inferred from it: it is tracked and on the map.
-    map_frequency, limit_frequency : float
-        On the map, in Hz: at the baseline, and with every parameter at its limit. NaN without a
-        map; the second also without limits, or where they lie outside the map.
-    surrogate_error, reached : float
-        Largest error of ln f at grid points left out of the fit, and standard deviation that
-        typical logs reach of its drift.
-    """
+    """A mode of the description and its place on the map."""
 
     mode: ModeSpec
-    informs: bool
+    informs: bool  # whether health is inferred from it: it is tracked and on the map
+    # map_frequency, limit_frequency: on the map, in Hz: at the baseline, and with every
+    # parameter at its limit. NaN without a map; the second also without limits, or where they
+    # lie outside the map.
     map_frequency: float = np.nan
     limit_frequency: float = np.nan
+    # surrogate_error, reached: largest error of ln f at grid points left out of the fit, and
+    # standard deviation that typical logs reach of its drift.
     surrogate_error: float = np.nan
     reached: float = np.nan
 
@@ -53,36 +46,29 @@ class ModeCheck:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ParameterCheck:
-    """Range of the map and identifiability of one parameter; ``std`` is of its logarithm.
-
-    Attributes
-    ----------
-    low, high, below, above, quantiles : float, tuple of float
-        Range of the map, prior probability outside either end, and its 0.5, 5, 95 and 99.5 %.
-    verdict : str
-        Identified by typical logs (``told``), by ``longer-logs`` only, ``together`` with other
-        parameters as one combination, or ``not-told``.
-    prior_std, usual_std, endless_std : float
-        In the prior, after typical logs, and after unlimited ones.
-    exact_map_std, known_std : float
-        After typical logs, were the map exact; after unlimited logs, were the other parameters
-        known: also that of the combination.
-    exponents : ndarray
-        Of the parameters in the combination, its own being 1, shape ``(n_parameters,)``.
-    """
+    """Range of the map and identifiability of one parameter; ``std`` is of its logarithm."""
 
     spec: ParameterSpec
+    # low, high, below, above, quantiles: range of the map, prior probability outside either
+    # end, and its 0.5, 5, 95 and 99.5 %.
     low: float
     high: float
     quantiles: tuple[float, ...]
     below: float
     above: float
+    # Identified by typical logs (``told``), by ``longer-logs`` only, ``together`` with other
+    # parameters as one combination, or ``not-told``.
     verdict: Verdict
+    # prior_std, usual_std, endless_std: in the prior, after typical logs, and after unlimited
+    # ones.
     prior_std: float
     usual_std: float
     endless_std: float
+    # exact_map_std, known_std: after typical logs, were the map exact; after unlimited logs,
+    # were the other parameters known: also that of the combination.
     exact_map_std: float
     known_std: float
+    # Of the parameters in the combination, its own being 1, shape ``(n_parameters,)``.
     exponents: FloatArray
 
     def __post_init__(self) -> None:
@@ -105,28 +91,22 @@ class ParameterCheck:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StageCheck:
-    """Capabilities of a stage description; without a map it has no parameters.
-
-    Attributes
-    ----------
-    informative, unused : tuple of str
-        Modes in the order of the sensitivities, and modes of the map that are not described.
-    slopes, limit_slopes : ndarray
-        d ln f / d ln parameter at the baseline and with every parameter at its limit, NaN where
-        there is none, shape ``(n_modes, n_parameters)``.
-    correlation : ndarray
-        Of the ln parameters after typical logs, shape ``(n_parameters, n_parameters)``.
-    n_logs, model_std : int, float
-        Number of typical logs; relative standard deviation of the map's sensitivities, NaN without.
-    """
+    """Capabilities of a stage description; without a map it has no parameters."""
 
     name: str
     modes: tuple[ModeCheck, ...]
     parameters: tuple[ParameterCheck, ...]
+    # informative, unused: modes in the order of the sensitivities, and modes of the map that
+    # are not described.
     informative: tuple[str, ...]
+    # slopes, limit_slopes: d ln f / d ln parameter at the baseline and with every parameter
+    # at its limit, NaN where there is none, shape ``(n_modes, n_parameters)``.
     slopes: FloatArray
     limit_slopes: FloatArray
+    # Of the ln parameters after typical logs, shape ``(n_parameters, n_parameters)``.
     correlation: FloatArray
+    # n_logs, model_std: number of typical logs; relative standard deviation of the map's
+    # sensitivities, NaN without.
     n_logs: int
     model_std: float
     unused: tuple[str, ...]

@@ -23,17 +23,11 @@ class Law(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True)
 
     ``theta`` are its natural parameters, ``y`` the sampling coordinates, in which the posterior of
     a partly worn machine is close to a Gaussian; ``now`` is the travel of that machine in m.
-
-    Attributes
-    ----------
-    weight : float
-        Prior probability in proportion to the other laws of the parameter.
-    names : tuple of str
-        Names of the natural parameters, one per coordinate.
     """
 
+    # Prior probability in proportion to the other laws of the parameter.
     weight: Annotated[float, msgspec.Meta(gt=0, le=1e6)] = 1.0
-    names: ClassVar[tuple[str, ...]] = ()
+    names: ClassVar[tuple[str, ...]] = ()  # names of the natural parameters, one per coordinate
 
     @property
     def kind(self) -> str:

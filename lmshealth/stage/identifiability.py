@@ -17,30 +17,17 @@ from lmshealth.stage.description import ModeSpec, Stage
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Identifiability:
-    """Information of the tracked modes about small changes of the ln health parameters.
-
-    Attributes
-    ----------
-    modes : tuple of ModeSpec
-        Tracked modes on the map.
-    slopes : ndarray
-        d ln f / d ln parameter at the baseline, shape ``(n_modes, n_parameters)``.
-    prior : ndarray
-        Prior variances of the ln parameters, shape ``(n_parameters,)``.
-    model_std, leave_out : float, ndarray
-        Relative standard deviation of the map's sensitivities, and error of ln f of its surrogate,
-        shape ``(n_modes,)``.
-    n_baseline : int
-        Logs of the baseline.
-    """
+    """Information of the tracked modes about small changes of the ln health parameters."""
 
     parameters: tuple[str, ...]
-    modes: tuple[ModeSpec, ...]
-    slopes: FloatArray
-    prior: FloatArray
+    modes: tuple[ModeSpec, ...]  # tracked modes on the map
+    slopes: FloatArray  # d ln f / d ln parameter at the baseline, shape ``(n_modes, n_parameters)``
+    prior: FloatArray  # prior variances of the ln parameters, shape ``(n_parameters,)``
+    # model_std, leave_out: relative standard deviation of the map's sensitivities, and error
+    # of ln f of its surrogate, shape ``(n_modes,)``.
     model_std: float
     leave_out: FloatArray
-    n_baseline: int
+    n_baseline: int  # logs of the baseline
 
     @property
     def least_duration(self) -> float:

@@ -17,23 +17,15 @@ _MAX_DEGREE, _NEGLIGIBLE = 14, 1e-6
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ModalMap:
-    """Chebyshev surrogate of ln frequency over ln health parameters.
-
-    Attributes
-    ----------
-    low, high : ndarray
-        Bounds of ln parameter, shape ``(n_parameters,)``.
-    coefficients : ndarray
-        Tensor Chebyshev coefficients, shape ``(d_1 + 1, ..., d_P + 1, n_modes)``.
-    leave_out_error : ndarray
-        Largest error of ln f at inner grid points, each left out of the fit, ``(n_modes,)``.
-    """
+    """Chebyshev surrogate of ln frequency over ln health parameters."""
 
     parameters: tuple[str, ...]
     modes: tuple[str, ...]
-    low: FloatArray
+    low: FloatArray  # low, high: bounds of ln parameter, shape ``(n_parameters,)``
     high: FloatArray
+    # Tensor Chebyshev coefficients, shape ``(d_1 + 1, ..., d_P + 1, n_modes)``.
     coefficients: FloatArray
+    # Largest error of ln f at inner grid points, each left out of the fit, ``(n_modes,)``.
     leave_out_error: FloatArray
 
     def inside(self, x: FloatArray) -> BoolArray:
