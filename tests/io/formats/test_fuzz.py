@@ -15,7 +15,9 @@ from hypothesis import strategies as st
 from lmshealth.errors import LmshealthError
 from lmshealth.io.reading import read_log
 
-_SPEC = importlib.util.spec_from_file_location("_writers", Path(__file__).with_name("conftest.py"))
+_SPEC = importlib.util.spec_from_file_location(
+    "_writers", Path(__file__).parents[1] / "conftest.py"
+)
 _WRITERS = importlib.util.module_from_spec(_SPEC)
 _SPEC.loader.exec_module(_WRITERS)
 
