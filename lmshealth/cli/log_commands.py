@@ -31,6 +31,7 @@ _FORMAT = options.format_option("table", "csv", "json")
         "modes log.h5 --stage lms-y",
         "modes export.csv --columns map.toml --band 80 200 --format json",
         "modes moves.h5 --stage lms-y --part settling",
+        "modes log.h5 --band 80 200 --save my-stage.toml",
     )
 )
 @options.LOGS
@@ -44,6 +45,12 @@ _FORMAT = options.format_option("table", "csv", "json")
 @options.reading_options
 @click.option("--channels", help="Use only these channels, separated by commas.")
 @options.band_option("Use only this band, in Hz.")
+@click.option(
+    "--save",
+    type=options.OUT,
+    metavar="FILE.toml",
+    help="Write a stage description with the modes found in one log, ready to edit.",
+)
 @_FORMAT
 @click.pass_context
 def modes(ctx: click.Context, /, **given: Any) -> None:
@@ -57,6 +64,8 @@ def modes(ctx: click.Context, /, **given: Any) -> None:
     method = identify_decays if given["part"] == "settling" else identify
     stage, band, channels = given["stage"], options.checked_band(given["band"]), given["channels"]
     names = [name.strip() for name in channels.split(",")] if channels else None
+    if given["save"]:
+        _check_save(given["save"], stage, given["logs"])
 
     def estimate(log: Log) -> LogEstimates:
         found = method(log, stage, channels=names, band=band)
@@ -74,7 +83,44 @@ def modes(ctx: click.Context, /, **given: Any) -> None:
                 terminal.print_text(_NO_BAND)
 
     _publish(given["style"], content, refused, lost, show)
+    if given["save"] and found:
+        _save(given["save"], found[0])
     _exit(ctx, found, lost)
+
+
+def _check_save(path: Path, stage: object, logs: Sequence[Path]) -> None:
+    """Refuse an output that is no new description, before the log is analysed."""
+    if stage is not None:
+        raise click.UsageError("--save writes a first description; with --stage there is one.")
+    _check_one("--save", logs)
+    if path.suffix != ".toml":
+        raise click.BadParameter(f"{path} must end in .toml", param_hint="--save")
+    if path.exists():
+        raise click.BadParameter(
+            f"{path} exists and is not overwritten; choose another name", param_hint="--save"
+        )
+
+
+def _check_one(option: str, logs: Sequence[Path]) -> None:
+    if len(logs) != 1:
+        raise click.UsageError(f"{option} needs exactly one log; got {len(logs)}.")
+
+
+def _save(path: Path, found: LogEstimates) -> None:
+    """Write the skeleton of a stage description."""
+    from lmshealth.stage.description import ModeSpec
+    from lmshealth.stage.skeleton import searches, write_skeleton
+
+    modes = found.modes
+    specs = []
+    for k, search in enumerate(searches(modes.frequency.tolist())):
+        frequency, damping = float(modes.frequency[k]), float(modes.damping_ratio[k])
+        snr = float(modes.snr[k])
+        spec = ModeSpec(modes.names[k], frequency, damping, snr=snr, search=search)
+        comment = f"± {modes.frequency_std[k]:.2g}, clearest in {modes.channels[k]}"
+        specs.append((spec, comment))
+    write_skeleton(path, f"identified in {found.log}", found.metadata.stage, specs)
+    terminal.print_notes([f"{path}: description of {len(specs)} modes, ready to edit"])
 
 
 @click.command(

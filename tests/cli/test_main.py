@@ -21,7 +21,9 @@ from lmshealth.batch import constants
 from lmshealth.batch.assess import pack_assessment
 from lmshealth.batch.store import Store, default_url
 from lmshealth.cli.main import main
+from lmshealth.io.reading import read_log
 from lmshealth.report.tables import COLUMNS, LOG_COLUMNS
+from lmshealth.stage.description import load_stage
 from models.dynamics.stages import STAGES
 from models.recordings.velocities import Experiment, drive_velocities
 from studies.frf_modes.records import BAND, MODES, RATE, Machine, periodic
@@ -217,6 +219,36 @@ def test_modes_without_a_band_print_a_note(folder: Path, stage: Path) -> None:
     assert expected in " ".join(call("modes", log).stdout.split())
     for more in (("--band", 30, 200), ("--format", "csv"), ("--stage", stage)):
         assert "--band" not in call("modes", log, *more).stdout
+
+
+def test_saved_modes_are_a_description_that_finds_them_again(folder: Path, tmp_path: Path) -> None:
+    """The skeleton loads as it is, applies to the machine of the log, and names the same modes."""
+    log, path = folder / "good" / "log-00.h5", tmp_path / "my.toml"
+    band, style = ("--band", 30, 120), ("--format", "json")
+    result = call("modes", log, *band, *style, "--save", path)
+    assert result.exit_code == 0 and "my.toml" in result.stderr
+    assert load_stage(str(path)).matches(read_log(log).metadata)
+    found = strict(result.stdout)["modes"]
+    again = strict(call("modes", log, "--stage", path, *style).stdout)["modes"]
+    assert [mode["mode"] for mode in again] == [mode["mode"] for mode in found] != []
+    for key, tolerance in (("frequency_hz", 0.003), ("damping_ratio", 0.2)):
+        values = [[mode[key] for mode in modes] for modes in (again, found)]
+        assert values[0] == pytest.approx(values[1], rel=tolerance)
+    written = path.read_text()
+    for more in ((log, "--save", path), (log, log, "--save", tmp_path / "b.toml"),
+                 (log, "--save", tmp_path / "b.txt"),
+                 (log, "--save", tmp_path / "b.toml", "--stage", path)):  # fmt: skip
+        assert call("modes", *more).exit_code == 2
+    assert path.read_text() == written and list(tmp_path.iterdir()) == [path]
+
+
+def test_nothing_is_saved_without_modes(tmp_path: Path) -> None:
+    """A log that shows no mode gives no description, and the exit status says so."""
+    noise = np.random.default_rng(1).standard_normal(8000)
+    np.savetxt(tmp_path / "n.csv", noise, header="# sample_rate_hz: 500\nacc_x_m_s2", comments="")
+    result = call("modes", tmp_path / "n.csv", "--band", 30, 60, "--save", tmp_path / "my.toml")
+    assert result.exit_code == 1 and "none found" in result.stderr
+    assert not (tmp_path / "my.toml").exists()
 
 
 def test_a_refused_mode_alone_is_still_status_0(folder: Path, stage: Path) -> None:
