@@ -4,6 +4,10 @@ TASKS_AHEAD = 3
 """Tasks per worker that are submitted before their results are fetched. Two keep a worker busy
 while its result travels; the third covers tasks of unequal length. Each is held in memory."""
 
+ATTEMPTS_ALONE = 2
+"""How often a task that was running when its process died is run alone before it is refused. One
+attempt would refuse a sound log whose process is killed twice from outside."""
+
 START_ATTEMPTS = 3
 """How often worker processes are started when one of them is killed as it starts."""
 

@@ -142,13 +142,19 @@ class _ProcessPool(Pool):
             self.start()
             with _process_pool(1) as single:
                 for item in interrupted:
-                    try:
-                        result = single.executor.submit(function, item).result()
-                    except BrokenExecutor:
-                        single.kill()
-                        single.start()
-                        result = on_crash(item, "it ended the process that worked on it")
-                    yield item, result
+                    yield item, single.run_alone(function, item, on_crash)
+
+    def run_alone(
+        self, function: Task[Item, Result], item: Item, on_crash: OnCrash[Item, Result]
+    ) -> Result:
+        """Run a task that may have ended its process; a process may also be killed from outside."""
+        for _ in range(constants.ATTEMPTS_ALONE):
+            try:
+                return self.executor.submit(function, item).result()
+            except BrokenExecutor:
+                self.kill()
+                self.start()
+        return on_crash(item, "it ended the process that worked on it")
 
 
 def _completed(

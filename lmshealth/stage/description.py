@@ -122,7 +122,7 @@ class Covariate(_Part, frozen=True):
 
 
 class Baseline(_Part, frozen=True):
-    """Number of logs of the baseline where the manifest does not flag them."""
+    """Least number of logs since the baseline for a verdict, and its size in `stage` and `plan`."""
 
     logs: Annotated[int, Meta(ge=1)] = 5
 
