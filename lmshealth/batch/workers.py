@@ -1,6 +1,6 @@
 """Workers: this process, processes of this machine (loky), or a Dask cluster.
 
-A worker that dies loses its task, not the batch: see `Pool.map_unordered`. This module imports
+Only the task of a worker that dies is lost: see `Pool.map_unordered`. This module imports
 little, because the processes import it before the batch begins; the rest follows with the tasks.
 """
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 # Usable share of the sample rate: anti-alias filters reach below the Nyquist frequency.
 USABLE = 0.45
 # Standard deviations of ln f and ln ζ beyond which an estimate is refused: a frequency known to
-# 3 % cannot show the drifts that are tracked, a damping known to a factor of two is none.
+# 3 % cannot show the drifts that are tracked, a damping known to a factor of two cannot be used.
 WORST_STD_LN_F, WORST_STD_LN_ZETA = 0.03, 0.7
 # Most modes that are fitted together.
 MOST_TOGETHER = 4
@@ -56,11 +56,11 @@ RESOLVED = 4.0
 AT_BOUND = 0.9
 # Largest Newton decrement of a fit that has converged.
 WORST_DECREMENT = 0.1
-# Damping ratio above which a resonance without a description is a hump of the noise.
+# Damping ratio above which a resonance without a description is attributed to the noise.
 MOST_DAMPING = 0.1
 # Least distance of two modes in half-power bandwidths, where channels see them alike (modal
-# assurance criterion above the third) and otherwise: closer modes trade strength and damping, and
-# their likelihood is not normal.
+# assurance criterion above the third) and otherwise: strength and damping of closer modes cannot be
+# estimated separately, and their likelihood is not normal.
 APART_ALIKE, APART, ALIKE = 1.0, 0.2, 0.8
 # Standard deviations of the priors. Weak ones about the start, which bound directions that data do
 # not constrain: ln f, ln ζ, forces of modes, shapes, and level, slope and bend of ln noise floors.

@@ -1,10 +1,10 @@
-"""Cut the bench's one recording into logs as its controller might have exported them.
+"""Cut the recording of the bench into logs in the form of a controller's export.
 
-Twenty periods of a multisine are ten logs of two periods. As two machines: ``bench-A`` is what was
-measured. ``bench-B`` is the same samples, but the manifest says of each log that it was sampled
-0.4 % slower than the one before. That is a machine whose every frequency falls, and whose
-stiffness falls with the square: the only ageing that these data can be given without inventing a
-sample. Dates and running hours in the manifest are invented too, a week between logs.
+Twenty periods of a multisine give ten logs of two periods each, for two machines. ``bench-A`` is
+the machine as measured. ``bench-B`` has the same samples, but its manifest states for each log a
+sample rate that is lower by 0.4 % than for the log before. All its frequencies decrease in the same
+proportion, and its stiffness with their square: this simulates ageing without artificial samples.
+Dates and running hours in the manifest are artificial as well, with one week between logs.
 """
 
 from __future__ import annotations
@@ -26,14 +26,14 @@ BEGIN, APART_H = datetime(2019, 10, 7, 14, tzinfo=UTC), 168
 
 
 def main() -> None:
-    """Write logs and manifest into the folder that is named."""
+    """Write logs and manifest to the folder given as argument."""
     if "LMSHEALTH_DATA" not in os.environ:
         raise SystemExit("LMSHEALTH_DATA is not set: it names the folder of real measurements")
     write_logs(Path(os.environ["LMSHEALTH_DATA"]) / RECORDING, Path(sys.argv[1]))
 
 
 def write_logs(recording: Path, folder: Path) -> None:
-    """Write the logs of both machines, and the manifest beside them."""
+    """Write the logs of both machines and their manifest."""
     folder.mkdir(parents=True, exist_ok=True)
     matlab = loadmat(recording, squeeze_me=True, variable_names=COLUMNS)
     samples = np.column_stack([matlab[name] for name in COLUMNS])

@@ -1,4 +1,4 @@
-"""Draw figure.svg from result.json: the stiffness of both machines, told and true."""
+"""Draw figure.svg from result.json: inferred and true stiffness of both machines."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ HOURS_PER_WEEK = 168
 
 
 def draw_figure(figure: Figure, result: Row) -> None:
-    """Draw medians with 90 % intervals over the weeks, the truth, and when B reaches its limit."""
+    """Draw true values, medians with 90 % intervals over the weeks, and the end of life of B."""
     ax = figure.subplots()
     for name, (colour, marker, label) in STYLES.items():
         own = [row for row in result["stiffness"] if row["stage"] == name]

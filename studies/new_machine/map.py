@@ -1,12 +1,13 @@
-"""Write the modal map of two inertias on a spring: the whole physics of the bench.
+"""Write the modal map of two inertias on a spring, the model of the bench.
 
-Free to turn together, inertias J_m and J_l on a stiffness k have one torsional mode,
-(2 π f)² = k (1/J_m + 1/J_l), and the motor's angle an antiresonance (2 π f_a)² = k / J_l: the two
-frequencies give J_l/J_m = (f/f_a)² − 1. Over their values at commissioning
+Two inertias J_m and J_l that rotate freely and are connected by a stiffness k have one torsional
+mode, (2 π f)² = k (1/J_m + 1/J_l). The response of the motor's angle has an antiresonance at
+(2 π f_a)² = k / J_l. The two frequencies determine the ratio J_l/J_m = (f/f_a)² − 1. Relative to
+the values at commissioning
 
     f/f_0 = sqrt(κ (1 + r/λ) / (1 + r)),   κ = k/k_0, λ = J_l/J_l0, r = J_m/J_l0.
 
-With λ = 1 nothing of the inertias is left: f goes with the root of the stiffness.
+With λ = 1 the inertias cancel: f is proportional to the square root of the stiffness.
 """
 
 from __future__ import annotations
@@ -34,15 +35,15 @@ def main() -> None:
 
 
 def read_antiresonance(path: Path) -> float:
-    """Find where the response of the motor's angle is least, to one line of it, in Hz."""
+    """Return the spectral line (Hz) at which the response of the motor's angle is smallest."""
     lines = json.loads(path.read_text(encoding="utf-8"))["frf"]
     return float(min(lines, key=lambda line: line["gain"])["frequency_hz"])
 
 
 def write_map(path: Path, hz: float, antiresonance: float | None = None) -> None:
-    """Write the frequency (Hz) over a grid of the stiffness, and of the load's inertia.
+    """Write the frequency (Hz) over a grid of the stiffness and the load's inertia.
 
-    The load is varied where the ``antiresonance`` of the motor's angle is given, in Hz.
+    The inertia is varied only if the ``antiresonance`` of the motor's angle is given, in Hz.
     """
     motor_over_load = 0.0 if antiresonance is None else 1 / ((hz / antiresonance) ** 2 - 1)
     loads = np.ones(1) if antiresonance is None else LOAD

@@ -1,23 +1,23 @@
-"""Does the tutorial of this folder work, word for word, and does it end where the truth is?
+"""Do the tutorial's commands give the output shown, and do the results agree with the truth?
 
 Method
-    README.md describes a machine that the project does not know, step by step. Its commands are
-    given to a shell, in an empty folder that sees only the project and the data; the output is
-    compared with what the tutorial shows, line by line, digits apart. The machine is a motor bench
-    with a flexible coupling under a multisine (20 s, real) with an exact modal map: two inertias on
-    a spring. Nothing has aged in these data. The same recording is therefore read as two machines:
-    ``bench-A`` as it is, whose coupling must be reported as healthy, and ``bench-B``, whose logs
-    the manifest declares as sampled slower and slower, so that all its frequencies, and with the
-    square its stiffness, fall by a known amount. Weeks between the logs are invented as well.
-    Control: half of B's fall must be outside the interval.
+    README.md describes a new machine step by step. A shell runs its commands in an empty folder
+    from which only the project and the data are accessible. The output is compared with the
+    tutorial line by line, without digits. The machine is a motor bench with a flexible coupling,
+    excited by a multisine (20 s, real data); its modal map is that of two inertias on a spring.
+    These data contain no ageing. The same recording is therefore used for two machines: ``bench-A``
+    as measured, whose coupling must be reported as healthy, and ``bench-B``, whose manifest states
+    a decreasing sample rate, so that all frequencies, and with their square the stiffness, decrease
+    by a known amount. The dates of the logs are artificial. Control: a decrease half as large must
+    be outside the interval of B.
 Answer
-    Yes. Over ten logs of A the mode scatters by a sixth of its stated standard deviation, since the
-    nonlinearity is the same in each; no alarm, no end in sight. B raises an alarm at its third log,
-    after a loss of 1.6 %; its stiffness is 0.930 (0.923 to 0.935) at the last, in truth 0.929. That
-    one mode does not determine the load's inertia beside the stiffness is reported before any log
-    is recorded.
+    Yes. Over the ten logs of A the frequency scatters by a sixth of its stated standard deviation,
+    because the nonlinearity is the same in each log. A has no alarm, and no end of life within the
+    horizon. B raises an alarm at its third log, after a loss of 1.6 %; at its last log the inferred
+    stiffness is 0.930 (0.923 to 0.935), the true one 0.929. ``lmshealth stage`` reports from the
+    description alone that one mode does not determine both stiffness and load inertia.
 Run time
-    Two minutes of a processor.
+    Two minutes of processor time.
 Data
     Folder ``fditools_two_inertia_bench`` of LMSHEALTH_DATA.
 """
@@ -52,14 +52,14 @@ _DIGITS = re.compile(r"[-+]?\d[\d.,]*(e[-+]?\d+)?")
 
 
 class Step(NamedTuple):
-    """Commands of the tutorial, and what it shows of what comes out."""
+    """Commands of the tutorial, and the lines of output that it shows."""
 
     commands: str
     shown: str
 
 
 def main() -> None:
-    """Follow the tutorial; ``--quick`` goes as far as the map and records nothing."""
+    """Run the tutorial; ``--quick`` ends after the map and writes no record."""
     study = Study(__file__, __doc__)
     real_data()
     with tempfile.TemporaryDirectory() as scratch:
@@ -68,7 +68,7 @@ def main() -> None:
 
 
 def steps() -> list[Step]:
-    """Read the commands of the tutorial, each block with what is shown after it."""
+    """Read the blocks of commands of the tutorial, each with the output shown after it."""
     found: list[Step] = []
     for kind, text in _BLOCK.findall((HERE / "README.md").read_text(encoding="utf-8")):
         if kind == "sh":
@@ -79,7 +79,7 @@ def steps() -> list[Step]:
 
 
 def answered(scratch: Path, *, quick: bool) -> Row:
-    """Follow the tutorial, to its end or to the map, and compare its conclusions with the truth."""
+    """Run the tutorial, to its end or to the map, and compare its results with the truth."""
     (scratch / "studies").symlink_to(HERE.parent)
     told = [follow(step, scratch) for step in steps()[: QUICK_STEPS if quick else None]]
     bench = scratch / "bench"
@@ -99,7 +99,7 @@ def answered(scratch: Path, *, quick: bool) -> Row:
 
 
 def follow(step: Step, scratch: Path) -> Row:
-    """Give a step to a shell, and compare the output with what the tutorial shows."""
+    """Run a step in a shell, and compare the output with that in the tutorial."""
     python = f"'{sys.executable}'"
     tools = f'lmshealth() {{ {python} -m lmshealth "$@"; }}\npython() {{ {python} "$@"; }}\n'
     begin = time.perf_counter()
@@ -120,12 +120,12 @@ def follow(step: Step, scratch: Path) -> Row:
 
 
 def plain(line: str) -> str:
-    """Leave of a line its words: digits may differ by the last, and columns by a blank."""
+    """Normalise a line: replace numbers by 0, as last digits may differ, and collapse blanks."""
     return " ".join(_DIGITS.sub("0", line).split())
 
 
 def tell_modes(bench: Path) -> Row:
-    """Return how far the estimates of the machine that does not change scatter and say they do."""
+    """Return the scatter and the stated standard deviation of the frequency of bench-A."""
     modes = pd.read_csv(bench / "modes.csv")
     own = modes[modes["stage"] == "bench-A"]
     return {
@@ -137,7 +137,7 @@ def tell_modes(bench: Path) -> Row:
 
 
 def tell_stiffness(bench: Path) -> list[Row]:
-    """Compare the stiffness inferred with the one that the manifest amounts to."""
+    """Compare the inferred stiffness with the true one, which follows from the manifest."""
     health = pd.read_csv(bench / "health.csv").rename(columns={"travel_km": "hours"})
     falling = (1 - SLOWER * (health["hours"] / APART_H).round()) ** 2
     health["truth"] = falling.where(health["stage"] == "bench-B", 1.0)
@@ -149,7 +149,7 @@ def tell_stiffness(bench: Path) -> list[Row]:
 
 
 def tell_remaining(bench: Path) -> Row:
-    """Return the remaining hours, and those of bench-B if it goes on as it was made to."""
+    """Return the remaining life, and the true one of bench-B at a constant rate of loss (hours)."""
     table = pd.read_csv(bench / "prognosis.csv")
     own = table[table["parameter"] == "coupling_stiffness"].set_index("stage")
     columns = ["rul_km_q05", "rul_km_q50", "rul_km_q95", "probability_beyond_horizon"]
@@ -159,7 +159,7 @@ def tell_remaining(bench: Path) -> Row:
 
 
 def as_shown(answer: Row) -> dict[str, bool]:
-    """Return whether the tutorial shows what its commands print and make."""
+    """Return whether the commands print the output shown, and write the files of this folder."""
     missing = [line for step in answer["steps"] for line in step["shown_and_not_come_out"]]
     same = all(answer["files_as_shown"].values())
     return {
@@ -169,7 +169,7 @@ def as_shown(answer: Row) -> dict[str, bool]:
 
 
 def judge(answer: Row) -> dict[str, bool]:
-    """Return whether the tutorial does what it says, and whether it ends where the truth is."""
+    """Return whether the output is as shown, and whether the results agree with the truth."""
     sound, worn = (
         [row for row in answer["stiffness"] if row["stage"] == name]
         for name in ("bench-A", "bench-B")
@@ -189,7 +189,7 @@ def judge(answer: Row) -> dict[str, bool]:
 
 
 def claims(answer: Row) -> Iterator[Claim]:
-    """Claim that a described machine is reported right, and that its tutorial does what it says."""
+    """Claim that the results for both machines are correct, and the output is as shown."""
     rows, left, passed = answer["stiffness"], answer["remaining"], answer["passed"]
     lines = [line for step in answer["steps"] for line in step["commands"]]
     yield Claim(
