@@ -227,7 +227,7 @@ def _none_of(stages: Sequence[Stage]) -> str:
 
 
 def _crashed(task: _Task, why: str) -> Identified:
-    refusal = Refusal(task.name, "corrupt", f"{why}: the file is damaged, or too large")
+    refusal = Refusal(task.name, "corrupt", f"{why}: the file may be damaged or too large")
     return Identified((refusal,), lasting=False)
 
 

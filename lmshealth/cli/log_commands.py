@@ -233,8 +233,8 @@ def frf(ctx: click.Context, /, **given: Any) -> None:
     """Measure the frequency response between two channels and identify its modes.
 
     A periodic input is averaged over whole periods, any other over segments. csv lists the modes;
-    json also the response with H1, H2, Hv and coherence. With a stage, a mode gets its name there
-    when it is the only one in its search band.
+    json also the response with H1, H2, Hv and coherence. With a stage, a mode is named
+    if it is the only one in its search band.
     """
     from lmshealth.modal.frf.identification import read_frf
     from lmshealth.modal.naming import name_response, why_unnamed

@@ -49,9 +49,11 @@ _TABLES = ("track", "track_cov", "effects", "events", "refused")
     "--events", type=options.OUT, help="Table of steps, changes of servo tuning and alarms."
 )
 @click.option(
-    "--refused", type=options.OUT, help="Table of the estimates of no mode, with reasons."
+    "--refused", type=options.OUT, help="Table of the estimates assigned to no mode, with reasons."
 )
-@click.option("--smooth", "smoothed", is_flag=True, help="Add smoothed columns (later logs too).")
+@click.option(
+    "--smooth", "smoothed", is_flag=True, help="Add smoothed columns, which also use later logs."
+)
 def track(table: Path, **given: Any) -> None:
     """Track modes through a table of estimates of lmshealth or another program.
 

@@ -88,7 +88,7 @@ PART = click.option(
     "--part",
     type=click.Choice(PARTS),
     default="record",
-    help="Use the whole log, or the part that its set point marks as such.",
+    help="Use the whole log, or one motion phase, derived from the set point.",
 )
 COV = click.option(
     "--cov", type=TABLE, help="Covariances of estimates; default modes_cov.csv in the same folder."
@@ -100,9 +100,11 @@ EPOCHS = click.option(
     "--epochs",
     type=click.IntRange(1),
     default=40,
-    help="Infer health at no more than this many epochs per machine.",
+    help="Infer health at this many logs per machine at most.",
 )
-SEED = click.option("--seed", type=click.IntRange(0), default=0)
+SEED = click.option(
+    "--seed", type=click.IntRange(0), default=0, help="Seed of all random numbers: results repeat."
+)
 WORKERS = click.option(
     "--workers", type=click.IntRange(1), help="Number of processes; default one per processor."
 )

@@ -568,7 +568,7 @@ def print_life(
         f"{life.stage}: remaining life after {day(life.recorded_at)}, at {_km(life.travel)} km "
         f"(horizon {_km(life.horizon)} km)"
     )
-    heads = ("until", "chance %", "km", "hours", "days", "date")
+    heads = ("until", "probability %", "km", "hours", "days", "date")
     cells = [cell for block in (blocks if same is None else blocks[:-1]) for cell in block]
     print_table(title, [dict(zip(heads, cell, strict=True)) for cell in cells])
     if same is not None:

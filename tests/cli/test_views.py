@@ -441,7 +441,7 @@ def test_probabilities_of_a_limit_have_their_own_lines(printed: Printed) -> None
     lines = shown(life, Decision(), printed, date(2026, 4, 1)).splitlines()
     for text in ("already: below 1 %", "beyond horizon: below 1 %", "before 2026-04-01: 23 %"):
         assert text in [line.strip() for line in lines]
-    assert any("chance %" in line for line in lines)
+    assert any("probability %" in line for line in lines)
 
 
 @pytest.mark.parametrize("other", [np.inf, 2e6, 1.5e5])
