@@ -94,8 +94,12 @@ FRF_MOST_MODES, FRF_EVIDENCE_MARGIN, FRF_BACKGROUND_COST = 8, 10.0, 2.0
 # Damping ratio above which a pole belongs to the background.
 FRF_MOST_DAMPING = 0.2
 # Gain in -2 ln L from which on a distortion is included: 1 % of linear responses reach it. Two
-# modes within a half-power bandwidth must reduce the distortion to this share.
+# modes within a half-power bandwidth, and fits from other starts, must reduce the distortion to
+# this share: distortion bends whole resonances and looks like further modes.
 DISTORTED, LESS_DISTORTED = 6.6, 1 / 3
+# Lines of a periodic excitation within this many half-power bandwidths that a mode needs: with two
+# complex values the four real unknowns of a mode are solved for, with a third they are checked.
+LINES_OF_MODE, BANDWIDTHS_OF_LINES = 3, 3
 # Least power of a mode over that of the distortion around it.
 OVER_DISTORTION = 16.0
 

@@ -20,6 +20,8 @@ from lmshealth.signal.spectral_lines import Line, name_lines
 
 # The second difference of a displacement spans this part of the shortest period.
 _LAG_PERIODS = 8.0
+# Poles refused for these reasons are no resonance of the response.
+_NO_RESONANCE = {"outside-band", "overdamped", "line-not-mode"}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -232,7 +234,7 @@ def _modes(log: Log, frf: Frf, output: Channel, fit: ResponseFit) -> Modes:
         Refusal(log.name, reason, detail, output.name, f"{np.exp(fit.estimate[i]):.5g} Hz", "frf")
         for i, (reason, detail) in why.items()
     ]
-    if len(why) == m:
+    if {reason for reason, _ in why.values()} <= _NO_RESONANCE and len(why) == m:
         low, high = frf.frequency[[0, -1]]
         detail = f"no resonance between {low:.4g} and {high:.4g} Hz from {frf.input}"
         refused.append(Refusal(log.name, "not-excited", detail, output.name, source="frf"))
@@ -253,7 +255,19 @@ def _incredible(frf: Frf, fit: ResponseFit, i: int) -> Rejection | None:
     if zeta > constants.FRF_MOST_DAMPING:
         most = constants.FRF_MOST_DAMPING
         return Rejection("overdamped", f"damping {zeta:.2g}, at most {most:g}: background, no mode")
-    if 2 * zeta * f < spacing:
+    if fit.ordinates.periodic:
+        reach = constants.BANDWIDTHS_OF_LINES * zeta * f
+        n = int(np.count_nonzero(np.abs(fit.ordinates.frequency - f) <= reach))
+        if n < constants.LINES_OF_MODE:
+            most = 2 * reach / constants.LINES_OF_MODE
+            return Rejection(
+                "too-few-lines",
+                f"{n} excited lines in {2 * reach:.3g} Hz, {constants.BANDWIDTHS_OF_LINES} "
+                f"half-power bandwidths (damping {zeta:.2g}); needed {constants.LINES_OF_MODE}: "
+                f"excite lines at most {most:.2g} Hz apart (now {spacing:.3g} Hz), with a period "
+                f"of at least {1 / most:.2g} s",
+            )
+    elif 2 * zeta * f < spacing:
         return Rejection(
             "line-not-mode",
             f"{2 * zeta * f:.2g} Hz wide, but lines are {spacing:.2g} Hz apart; record longer",

@@ -11,7 +11,7 @@ from lmshealth._arrays import ComplexArray, FloatArray
 
 # Correlation of a signal with itself at a period and its multiples: half of it is no noise.
 _REPEATS = 0.5
-# The first lag whose correlation is this share of the largest is the period.
+# The first lag whose correlation is this share of the largest is tried as the period.
 _NEAR_BEST = 0.95
 # Tolerance of a stated period: clocks and tables differ.
 _STATED_WITHIN = 0.01
@@ -35,13 +35,16 @@ def find_period(values: FloatArray, stated: float | None = None) -> float | None
     correlation = _autocorrelation(values)
     n = values.size
     if stated is None:
-        first = _first_repeat(correlation, n // 2)
-        if first is None:
-            return None
-        period = _refine(correlation, first)
-        # Narrow-band noise repeats only for a while.
-        multiples = np.round(np.arange(1, int(n / 2 / period) + 1) * period).astype(int)
-        return period if bool((correlation[multiples] > 0.9 * _REPEATS).all()) else None
+        for share in (_NEAR_BEST, 1.0):
+            first = _first_repeat(correlation, n // 2, share)
+            if first is None:
+                break
+            period = _refine(correlation, first)
+            # Narrow-band noise, and lines whose distance nearly divides them, repeat for a while.
+            multiples = np.round(np.arange(1, int(n / 2 / period) + 1) * period).astype(int)
+            if bool((correlation[multiples] > 0.9 * _REPEATS).all()):
+                return period
+        return None
     reach = max(_REACH, int(_STATED_WITHIN * stated))
     low, high = max(1, round(stated) - reach), min(n - 2, round(stated) + reach)
     first = low + int(np.argmax(correlation[low : high + 1]))
@@ -62,7 +65,8 @@ def _autocorrelation(values: FloatArray) -> FloatArray:
     return np.asarray(2 * product / np.maximum(both, np.finfo(float).tiny))
 
 
-def _first_repeat(correlation: FloatArray, longest: int) -> int | None:
+def _first_repeat(correlation: FloatArray, longest: int, share: float) -> int | None:
+    """Return the first lag whose correlation is this share of the largest."""
     apart = np.flatnonzero(correlation[: longest + 1] < _REPEATS)
     if apart.size == 0:
         return None
@@ -70,7 +74,7 @@ def _first_repeat(correlation: FloatArray, longest: int) -> int | None:
     best = float(rest.max())
     if best < _REPEATS:
         return None
-    first = int(np.argmax(rest >= _NEAR_BEST * best))
+    first = int(np.argmax(rest >= share * best))
     # To the top of the peak.
     falls = np.flatnonzero(np.diff(rest[first:]) < 0)
     return int(apart[0]) + first + (int(falls[0]) if falls.size else rest.size - 1 - first)

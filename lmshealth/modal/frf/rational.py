@@ -24,6 +24,9 @@ _TRIED_DAMPING = (0.003, 0.01, 0.03, 0.1)
 _LEAST_DAMPING, _MOST_DAMPING = 1e-5, 0.7
 _OUTSIDE = 0.5  # share of the band's ends by which a pole may lie outside
 _BLOCK = 128
+# Vector fitting: iterations, and the share of the response that an error counts as at least, so
+# that lines without noise do not decide alone.
+_RELOCATIONS, _LEAST_ERROR = 12, 0.01
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -206,6 +209,40 @@ def refine(ordinates: Ordinates, order: Order, variance: FloatArray) -> Order:
         error, start, derivative, bounds=(least, most), x_scale=scale, ftol=1e-6, max_nfev=40
     )
     return replace(order, theta=solved.x)
+
+
+def vector_fit(ordinates: Ordinates, order: Order, n_modes: int) -> Order:
+    """Return an order with start values of modes from the response alone [Gustavsen1999].
+
+    With σ = 1 + Σ c/(s - p), the equation σ H = Σ r/(s - p) + Σ a_k s^k is linear in c, r and a;
+    the zeros of σ are the next poles p. They converge from poles spread over the band, however few
+    lines a resonance has. Real poles are dropped.
+    """
+    centre = np.sqrt(ordinates.frequency[0] * ordinates.frequency[-1])
+    s = 1j * ordinates.frequency / centre
+    measured = ordinates.answer / ordinates.given
+    noise = ordinates.noise / np.abs(ordinates.given) ** 2
+    whiten = 1 / np.sqrt(noise + (_LEAST_ERROR * np.abs(measured)) ** 2)
+    powers = s[:, None] ** np.arange(order.low, order.high + 1)
+    pole = np.linspace(s[0], s[-1], n_modes + 2)[1:-1] * (1 + 1j * _TRIED_DAMPING[1])
+    for _ in range(_RELOCATIONS):
+        modal = _modal(s, pole)
+        columns = np.hstack([modal, powers, -measured[:, None] * modal])
+        stacked = stack(columns * whiten[:, None])
+        scale = np.linalg.norm(stacked, axis=0)
+        weights = np.linalg.lstsq(stacked / scale, stack(measured * whiten), rcond=None)[0] / scale
+        # The zeros of σ in state space, real and imaginary parts of the poles apart.
+        real, imag = np.diag(pole.real), np.diag(pole.imag)
+        entry = np.repeat([2.0, 0.0], pole.size)
+        state = np.block([[real, imag], [-imag, real]])
+        zeros = np.linalg.eigvals(state - np.outer(entry, weights[-2 * pole.size :]))
+        zeros = zeros[zeros.imag > 0]
+        pole = -np.abs(zeros.real) + 1j * zeros.imag
+        if pole.size == 0:
+            break
+    damping = np.maximum(-pole.real / np.abs(pole), _LEAST_DAMPING)
+    theta = np.log(np.concatenate([np.abs(pole) * centre, damping]))
+    return replace(order, theta=theta)
 
 
 def best_place(

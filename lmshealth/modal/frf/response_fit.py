@@ -17,6 +17,7 @@ from lmshealth.modal.frf.rational import (
     refine,
     slopes,
     solve,
+    vector_fit,
 )
 from lmshealth.modal.frf.responses import smooth_noise
 
@@ -66,7 +67,9 @@ def fit_response(ordinates: Ordinates) -> ResponseFit:
     """Fit poles, residues and residual terms to the response of a band.
 
     Modes enter one by one where they reduce the error most, powers of s at either end, while an
-    information criterion improves; a mode that others have made superfluous is removed.
+    information criterion improves; a mode that others have made superfluous is removed. Where an
+    error beyond the noise is left, vector fits of every order are further starts: a resonance
+    narrower than the distance of the lines is not found one by one.
 
     With periods the noise is their scatter. An error beyond it is modelled as a share of each part
     of the response with random phase, as of a weak nonlinearity under a random multisine; the
@@ -78,7 +81,7 @@ def fit_response(ordinates: Ordinates) -> ResponseFit:
     [Pintelon2012].
     """
     start = Order(np.empty(0), -_FEWEST_POWERS, _FEWEST_POWERS)
-    state = _grow(_settle(ordinates, start, ordinates.noise))
+    state = _restart(_grow(_settle(ordinates, start, ordinates.noise)))
     for _ in range(_ROUNDS):
         keep = _inliers(state)
         if keep.all() or keep.sum() < (1 - constants.MOST_OUTLIERS) * ordinates.frequency.size:
@@ -207,11 +210,37 @@ def _grow(state: _State) -> _State:
         gains = [_gain(t, state) if _is_admissible(t, state) else -np.inf for t in trials]
         if not gains or max(gains) <= 0:
             return state
-        best = trials[int(np.argmax(gains))]
-        keep = _wide_enough(best)
-        if keep.sum() < fewest:
+        larger = _without_outliers(trials[int(np.argmax(gains))], state)
+        if larger.variance.size < fewest:
             return state
-        state = best if keep.all() else _without_lines(state, keep)
+        state = larger
+
+
+def _restart(state: _State) -> _State:
+    """Start from vector fits where the error exceeds the noise of periods."""
+    if state.distortion == 0:
+        return state
+    best = state
+    for n in range(1, constants.FRF_MOST_MODES + 1):
+        order = vector_fit(state.ordinates, state.order, n)
+        if order.unknowns(periodic=True) >= state.variance.size:
+            break
+        trial = _settle(state.ordinates, order, state.ordinates.noise)
+        less = trial.distortion <= constants.LESS_DISTORTED * best.distortion
+        if less and _gain(trial, best) > 0 and _is_admissible(trial, best):
+            best = trial
+    return best if best is state else _grow(_shrink(best))
+
+
+def _without_outliers(larger: _State, smaller: _State) -> _State:
+    """Remove lines that a mode narrower than their distance explains, unless others need it."""
+    keep = _wide_enough(larger)
+    if keep.all():
+        return larger
+    without = _without_lines(larger, keep)
+    if larger.ordinates.periodic and _gain(without, _without_lines(smaller, keep)) > 0:
+        return larger
+    return without
 
 
 def _larger(state: _State) -> list[Order]:

@@ -219,6 +219,39 @@ def test_a_resonance_beyond_the_band_leaves_no_lines_at_its_end(tmp_path: Path) 
     assert reading.modes.frequency[0] == pytest.approx(47.6, abs=4 * reading.modes.frequency_std[0])
 
 
+@pytest.mark.parametrize(
+    ("damping", "step", "found"),
+    [(0.05, 30, True), (0.05, 40, True), (0.015, 8, True), (0.015, 10, False), (0.015, 16, False)],
+)
+def test_few_lines_show_a_mode_or_are_the_reason_why_not(
+    damping: float, step: int, found: bool
+) -> None:
+    """Three lines in three half-power bandwidths of 77 Hz are enough, lines 2 to 10 Hz apart."""
+    log = sparse(damping, step)
+    modes = read_frf(log, "current", "acc_x", band=(8, 180)).modes
+    if found:
+        assert modes.frequency == pytest.approx([77], abs=4 * modes.frequency_std[0])
+        assert modes.damping_ratio == pytest.approx([damping], abs=4 * modes.damping_ratio_std[0])
+        return
+    assert modes.names == ()
+    (refused,) = modes.refused
+    assert (refused.reason, refused.mode[:2]) == ("too-few-lines", "77")
+    width = 2 * damping * 77
+    assert f"excite lines at most {width:.2g} Hz apart (now {step / 4:.3g} Hz)" in refused.detail
+    assert f"period of at least {1 / width:.2g} s" in refused.detail
+
+
+def sparse(damping: float, step: int) -> Log:
+    """Make a log of one mode of 77 Hz, of which a multisine excites every so many 0.25 Hz."""
+    rng = np.random.default_rng(1)
+    line = np.zeros(SIZE // 2 + 1, dtype=complex)
+    line[32 : 4 * 180 + 1 : step] = 1
+    given = np.fft.irfft(line * np.exp(2j * np.pi * rng.uniform(size=line.size)), SIZE)
+    machine = Machine(modes=((77.0, damping, 1.0),), white=0.001, process=0.0)
+    signals = machine.noise(rng, np.tile(given, 6), np.tile(machine.answer(given), 6))
+    return make_log({"current": signals[0], "acc_x": signals[1]}, RATE)
+
+
 # What cannot be read
 
 

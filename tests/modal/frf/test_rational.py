@@ -15,6 +15,7 @@ from lmshealth.modal.frf.rational import (
     slopes,
     solve,
     stack,
+    vector_fit,
 )
 
 F, ZETA = np.array([62.0, 90.0]), np.array([0.015, 0.02])
@@ -110,6 +111,17 @@ def test_poles_are_found_from_a_start_beside_them(periodic: bool) -> None:
     start = replace(ORDER, theta=np.log(np.concatenate([F * 1.007, 2 * ZETA])))
     found = refine(ordinates, start, ordinates.noise)
     np.testing.assert_allclose(found.theta, ORDER.theta, atol=1e-5)
+
+
+@pytest.mark.parametrize(("step", "n_modes"), [(1, 2), (4, 2), (8, 3), (12, 2)])
+def test_vector_fits_find_poles_at_any_distance_of_the_lines(step: int, n_modes: int) -> None:
+    """Lines up to 6 Hz apart for modes 1.9 and 3.6 Hz wide; a pole too many changes nothing."""
+    ordinates = make(noise=1e-12)
+    found = vector_fit(ordinates.only(np.arange(161) % step == 0), ORDER, n_modes)
+    f, zeta = found.modes
+    at = [int(np.argmin(np.abs(f - one))) for one in F]
+    np.testing.assert_allclose(f[at], F, rtol=1e-4)
+    np.testing.assert_allclose(zeta[at], ZETA, rtol=1e-2)
 
 
 def test_the_best_place_is_where_a_mode_is_missing() -> None:
