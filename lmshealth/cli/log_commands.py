@@ -24,6 +24,12 @@ _NO_BAND = (
     "LOW HIGH. The mode names are valid for this call only."
 )
 _FORMAT = options.format_option("table", "csv", "json")
+_PLOT = click.option(
+    "--plot",
+    type=options.OUT,
+    metavar="FILE",
+    help="Draw what was measured in one log, with modes, lines and refusals: svg, png or html.",
+)
 
 
 @click.command(
@@ -31,7 +37,7 @@ _FORMAT = options.format_option("table", "csv", "json")
         "modes log.h5 --stage lms-y",
         "modes export.csv --columns map.toml --band 80 200 --format json",
         "modes moves.h5 --stage lms-y --part settling",
-        "modes log.h5 --band 80 200 --save my-stage.toml",
+        "modes log.h5 --band 80 200 --save my-stage.toml --plot modes.html",
     )
 )
 @options.LOGS
@@ -51,6 +57,7 @@ _FORMAT = options.format_option("table", "csv", "json")
     metavar="FILE.toml",
     help="Write a stage description with the modes found in one log, ready to edit.",
 )
+@_PLOT
 @_FORMAT
 @click.pass_context
 def modes(ctx: click.Context, /, **given: Any) -> None:
@@ -66,9 +73,16 @@ def modes(ctx: click.Context, /, **given: Any) -> None:
     names = [name.strip() for name in channels.split(",")] if channels else None
     if given["save"]:
         _check_save(given["save"], stage, given["logs"])
+    _check_plot(given["plot"], given["logs"])
 
     def estimate(log: Log) -> LogEstimates:
         found = method(log, stage, channels=names, band=band)
+        if given["plot"]:
+            from lmshealth.report.log_figures import spectra_figure, write_figure
+
+            settling = given["part"] == "settling"
+            more: Any = {"channels": names, "band": band, "settling": settling}
+            write_figure(given["plot"], spectra_figure(log, found, stage, **more))
         return LogEstimates(log.name, log.digest, log.metadata, found, loop_error(log))
 
     found, lost = _each(ctx, estimate)
@@ -99,6 +113,14 @@ def _check_save(path: Path, stage: object, logs: Sequence[Path]) -> None:
         raise click.BadParameter(
             f"{path} exists and is not overwritten; choose another name", param_hint="--save"
         )
+
+
+def _check_plot(path: Path | None, logs: Sequence[Path]) -> None:
+    """Refuse an unknown format of a figure, before the log is analysed."""
+    if path is not None:
+        _check_one("--plot", logs)
+        if path.suffix not in (".svg", ".png", ".html"):
+            raise click.BadParameter(f"{path} must end in .svg, .png or .html", param_hint="--plot")
 
 
 def _check_one(option: str, logs: Sequence[Path]) -> None:
@@ -227,6 +249,7 @@ def spectrum(ctx: click.Context, /, **given: Any) -> None:
     help="Period of the excitation in s, to 1 %; default: found from a periodic input.",
 )
 @options.reading_options
+@_PLOT
 @_FORMAT
 @click.pass_context
 def frf(ctx: click.Context, /, **given: Any) -> None:
@@ -243,11 +266,16 @@ def frf(ctx: click.Context, /, **given: Any) -> None:
 
     stage, band, period = given["stage"], options.checked_band(given["band"]), given["period"]
     names = given["source"], given["output"]
+    _check_plot(given["plot"], given["logs"])
     found, lost = _each(ctx, lambda log: (log, read_frf(log, *names, band=band, period=period)))
     estimates = []
     for log, own in found:
         named = name_response(own.modes, stage) if stage else own.modes
         estimates.append(LogEstimates(log.name, log.digest, log.metadata, named))
+        if given["plot"]:
+            from lmshealth.report.log_figures import response_figure, write_figure
+
+            write_figure(given["plot"], response_figure(log, own, named, stage))
     rows = [row for one in estimates for row in modes_rows(one)]
     content = {
         "modes": rows,

@@ -31,6 +31,7 @@ from lmshealth.tracking.track import Track
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 INK, MUTED, GRID, PAPER = "#1f2933", "#5f6b7a", "#d9dee5", "#fefefe"
 BLUE, RED, GREEN = "#0072b2", "#c44e00", "#007a5a"
@@ -72,31 +73,54 @@ def svg(draw: Callable[[Axes], object], *, salt: str, size: tuple[float, float] 
     ...). Screen readers skip the figure, because the page contains its information as text. All
     identifiers start with ``salt`` (letters, digits, dashes), which is unique on the page.
     """
-    import io
-
-    import matplotlib
-    from matplotlib.backends.backend_svg import FigureCanvasSVG
-    from matplotlib.figure import Figure
-
-    target = io.StringIO()
-    nothing = dict.fromkeys(("Date", "Creator", "Format", "Type"))
-    style: Any = _STYLE | {"svg.hashsalt": salt}
-    with matplotlib.rc_context(style), warnings.catch_warnings():
-        # Characters missing in the font are drawn as boxes; the page contains them as text.
-        warnings.filterwarnings("ignore", message="Glyph .* missing")
-        figure = Figure(figsize=size, dpi=_DPI, layout="constrained", facecolor="none")
-        draw(figure.add_subplot())
-        # Directly, because `savefig` draws everything twice.
-        canvas: Any = FigureCanvasSVG(figure)
-        canvas.print_svg(target, metadata=nothing)
-    text = _LINK.sub(r'<g class="hint" fill-opacity="0.004"><title>\1</title>', target.getvalue())
+    text = print_figure(lambda figure: draw(figure.add_subplot()), size, salt=salt).decode()
+    text = _LINK.sub(r'<g class="hint" fill-opacity="0.004"><title>\1</title>', text)
     text = text.replace("</a>", "</g>").replace(_CLEAR, "")
     text = compact(text[text.index("<svg") :])
     # Glyphs and groups have the same identifiers in every figure: make them unique.
     text = re.sub(r'(\sid="|href="#|url\(#)', rf"\g<1>{salt}-", text)
+    return themed(text)
+
+
+def themed(svg: str) -> str:
+    """Let the colours of an SVG element follow the style sheet of its page; readers skip it."""
     for colour, name in _NAMED.items():
-        text = text.replace(colour, f"var(--{name}, {colour})")
-    return text.replace("<svg ", '<svg aria-hidden="true" focusable="false" ', 1)
+        svg = svg.replace(colour, f"var(--{name}, {colour})")
+    return svg.replace("<svg ", '<svg aria-hidden="true" focusable="false" ', 1)
+
+
+def print_figure(
+    draw: Callable[[Figure], object],
+    size: tuple[float, float],
+    *,
+    salt: str = "figure",
+    kind: str = "svg",
+    paper: str = "none",
+) -> bytes:
+    """Draw a figure of a size in inches as ``svg`` or ``png`` on a colour; reproducible."""
+    import io
+
+    import matplotlib
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.backends.backend_svg import FigureCanvasSVG
+    from matplotlib.figure import Figure
+
+    target = io.BytesIO()
+    style: Any = _STYLE | {"svg.hashsalt": salt}
+    with matplotlib.rc_context(style), warnings.catch_warnings():
+        # Characters missing in the font are drawn as boxes; the page contains them as text.
+        warnings.filterwarnings("ignore", message="Glyph .* missing")
+        figure = Figure(figsize=size, dpi=_DPI, layout="constrained", facecolor=paper)
+        draw(figure)
+        # Directly, because `savefig` draws everything twice.
+        canvas: Any
+        if kind == "svg":
+            canvas = FigureCanvasSVG(figure)
+            canvas.print_svg(target, metadata=dict.fromkeys(("Date", "Creator", "Format", "Type")))
+        else:
+            canvas = FigureCanvasAgg(figure)
+            canvas.print_png(target, metadata={"Software": None})
+    return target.getvalue()
 
 
 # Hints are written as addresses of links: the only text per point that matplotlib supports.
@@ -381,7 +405,12 @@ def legend(ax: Axes, *, room: int = ROOM) -> Axes:
 
 def _spell(name: str) -> str:
     """Return a name for a label; a dollar sign would start a formula."""
-    return spell(name).replace("$", r"\$")
+    return plain_label(spell(name))
+
+
+def plain_label(text: str) -> str:
+    """Return a text for a figure in which a dollar sign starts no formula."""
+    return text.replace("$", r"\$")
 
 
 # Ratio of band limits above which the frequency axis is logarithmic.

@@ -251,6 +251,28 @@ def test_nothing_is_saved_without_modes(tmp_path: Path) -> None:
     assert not (tmp_path / "my.toml").exists()
 
 
+@pytest.mark.parametrize(("suffix", "start"), [("svg", b"<?xml"), ("png", b"\x89PNG"),
+                                               ("html", b"<!DOCTYPE html>")])  # fmt: skip
+def test_modes_are_drawn(folder: Path, tmp_path: Path, suffix: str, start: bytes) -> None:
+    """Figures of one log, beside the usual output; a page loads nothing and lists refusals."""
+    path, stage = tmp_path / f"f.{suffix}", folder / "stage" / "small.toml"
+    result = call("modes", folder / "bare.csv", "--stage", stage, "--plot", path)
+    assert result.exit_code == 0 and "roll" in result.stdout
+    content = path.read_bytes()
+    assert content.lstrip().startswith(start)
+    if suffix == "html":
+        assert b"not-excited" in content and b"src=" not in content and b"<script" not in content
+
+
+def test_wrong_figures_are_refused_before_the_log_is_read(folder: Path, tmp_path: Path) -> None:
+    """Of other formats and several logs."""
+    log = folder / "bare.csv"
+    assert call("modes", log, "--plot", tmp_path / "f.pdf").exit_code == 2
+    assert call("modes", log, log, "--plot", tmp_path / "f.svg").exit_code == 2
+    names = ("--input", "a", "--output", "b")
+    assert call("frf", log, log, *names, "--plot", tmp_path / "f.svg").exit_code == 2
+
+
 def test_a_refused_mode_alone_is_still_status_0(folder: Path, stage: Path) -> None:
     """A mode that this log does not show is listed with its reason, and nothing failed."""
     result = call("modes", folder / "bare.csv", "--stage", stage, "--format", "json")
@@ -485,6 +507,12 @@ def test_frf_as_csv_lists_modes_and_as_a_table_both(bench: Path) -> None:
     assert "periods of 4 s" in shown
     assert "mode_1" in shown
     assert max(len(line) for line in shown.splitlines()) <= 80
+
+
+def test_frf_is_drawn(bench: Path, tmp_path: Path) -> None:
+    """The page shows gain, phase and coherence, and lists the modes."""
+    assert frf(bench, "--plot", tmp_path / "f.html").exit_code == 0
+    assert "mode 1" in (tmp_path / "f.html").read_text(encoding="utf-8")
 
 
 def test_frf_gives_the_reason_for_an_unnamed_mode(bench: Path, tmp_path: Path) -> None:

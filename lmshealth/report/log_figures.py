@@ -1,0 +1,285 @@
+"""Figures of one log: spectra or a frequency response, with the modes that were found in it."""
+
+from __future__ import annotations
+
+import textwrap
+from collections.abc import Callable, Sequence
+from itertools import cycle
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from scipy.optimize import isotonic_regression
+
+from lmshealth._arrays import FloatArray
+from lmshealth.errors import BadLog
+from lmshealth.io.log import Channel, Log, Refusal
+from lmshealth.modal.frf.identification import FrfReading
+from lmshealth.modal.modes import Modes
+from lmshealth.modal.targets import choose_channels
+from lmshealth.report import figures
+from lmshealth.report.html import render
+from lmshealth.report.svg import compact
+from lmshealth.report.text import spell
+from lmshealth.signal.segments import find_segments, select_segments
+from lmshealth.signal.spectra import periodogram
+from lmshealth.signal.waterfall import bin_density
+from lmshealth.stage.description import Stage
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+_WIDTH, _NOTE_COLUMNS = 8.0, 112
+# Heights of a panel, of legend and labels, of upright labels and of a line of notes, in inches.
+_PANEL, _FRAME, _LETTERS, _NOTE = 1.15, 1.75, 1.1, 0.16
+# Bins of a spectrum: at most so many, of at least so many ordinates, which average their scatter,
+# but not wider than this share of the half-power bandwidth of a mode.
+_BINS, _ORDINATES, _SHARE = 480, 4.0, 0.35
+# Distance of labels over the width of the axes: side by side, and upright from this many on.
+_APART, _APART_UPRIGHT, _UPRIGHT = 0.19, 0.03, 6
+# Ratio of the ends of a band from which on its axis is logarithmic.
+_WIDE = 6.0
+_MARKERS = "v^sDPX*<>"
+
+
+class LogFigure(NamedTuple):
+    """Figure of a log: its title, size in inches, and what draws it."""
+
+    title: str
+    size: tuple[float, float]
+    draw: Callable[[Figure], object]
+    modes: Modes
+
+
+def spectra_figure(
+    log: Log,
+    modes: Modes,
+    stage: Stage | None = None,
+    *,
+    channels: Sequence[str] | None = None,
+    band: tuple[float, float] | None = None,
+    settling: bool = False,
+) -> LogFigure:
+    """Return a figure of the power spectral density of each channel, with the modes found in it.
+
+    Arguments are those of `identify`; with ``settling`` spectra are of the decays after moves.
+    """
+    used = choose_channels(log, channels)
+    low, high = band or _band(log, modes, stage)
+    high = min(high, 0.49 * log.sample_rate)
+    edges = _edges(low, high, modes, sum(b - a for a, b in log.pieces) / log.sample_rate)
+    densities = [_density(log, channel, edges, settling) for channel in used]
+    middle = (edges[1:] + edges[:-1]) / 2
+
+    def draw(figure: Figure) -> None:
+        panels = list(figure.subplots(len(used), sharex=True, squeeze=False)[:, 0])
+        for ax, channel, density in zip(panels, used, densities, strict=True):
+            ax.plot(middle, density, color=figures.INK, lw=0.9)
+            ax.set_yscale("log")
+            name = figures.plain_label(channel.name)
+            name += "\n(2nd derivative)" if channel.kind == "displacement" else ""
+            ax.text(1.01, 0.5, name, transform=ax.transAxes, va="center", size=8.5)
+            _mark_lines(ax, modes, channel.name, middle, density)
+        figure.supylabel("acceleration PSD in (m/s²)²/Hz", fontsize=9)
+        _annotate(figure, panels, (low, high), modes, stage)
+
+    return LogFigure(f"Modes of {log.name}", _size(len(used), modes), draw, modes)
+
+
+def response_figure(
+    log: Log, reading: FrfReading, modes: Modes, stage: Stage | None = None
+) -> LogFigure:
+    """Return a figure of a frequency response with its fit, and the modes with their names."""
+    frf, fit = reading.frf, reading.fit
+    units = {"displacement": "m", "acceleration": "m/s²", "current": "A"}
+    kinds = {channel.name: channel.kind for channel in log.channels}
+    unit = f"({units[kinds[frf.output]]})/{units[kinds[frf.input]]}"
+
+    def draw(figure: Figure) -> None:
+        panels = list(figure.subplots(3, sharex=True, height_ratios=[2, 1.2, 0.8]))
+        points: Any = {"color": figures.MUTED, "ms": 2.5, "lw": 0}
+        fitted: Any = {"color": figures.INK, "lw": 1.2, "label": "fit"}
+        x, gain = fit.ordinates.frequency, np.abs(frf.response)
+        panels[0].plot(frf.frequency, gain, "o", label="measured", **points)
+        panels[0].plot(x, np.abs(fit.response), **fitted)
+        panels[0].set_yscale("log")
+        panels[0].set_ylabel(f"gain in {unit}")
+        _mark_lines(panels[0], modes, frf.output, frf.frequency, gain)
+        panels[1].plot(frf.frequency, np.angle(frf.response, deg=True), "o", **points)
+        panels[1].plot(x, np.angle(fit.response, deg=True), **fitted)
+        panels[1].set_ylabel("phase in °")
+        panels[1].set_yticks([-180, -90, 0, 90, 180])
+        panels[2].plot(frf.frequency, frf.coherence, color=figures.INK, lw=0.9)
+        panels[2].set_ylabel("coherence")
+        panels[2].set_ylim(0, 1.05)
+        low, high = frf.frequency[[0, -1]].tolist()
+        _annotate(figure, panels, (low, high), modes, stage)
+
+    title = f"Response of {frf.output} to {frf.input}, {log.name}"
+    return LogFigure(title, _size(4, modes), draw, modes)
+
+
+def write_figure(path: Path, figure: LogFigure) -> None:
+    """Write a figure as ``.svg``, ``.png`` or an HTML page with tables of modes and refusals."""
+    if path.suffix == ".html":
+        text = figures.print_figure(figure.draw, figure.size).decode()
+        svg = figures.themed(compact(text[text.index("<svg") :]))
+        page = render("log.html.j2", title=figure.title, modes=figure.modes, svg=svg)
+        path.write_text(page, encoding="utf-8")
+        return
+    notes = _notes(figure.modes)
+    width, height = figure.size
+    below = _NOTE * (len(notes) + 1) if notes else 0.0
+
+    def draw(whole: Figure) -> None:
+        parts: Any = whole.subfigures(2, height_ratios=[height, below or 1e-3])
+        upper, lower = parts
+        upper.suptitle(figures.plain_label(figure.title), x=0.01, ha="left", size=10)
+        figure.draw(upper)
+        lower.text(0.01, 1, "\n".join(notes), va="top", size=7.5, linespacing=1.3)
+
+    kind, size = path.suffix[1:], (width, height + below)
+    path.write_bytes(figures.print_figure(draw, size, kind=kind, paper="#ffffff"))
+
+
+def _size(n_panels: int, modes: Modes) -> tuple[float, float]:
+    upright = len(modes.names) + len(modes.refused) >= _UPRIGHT
+    return _WIDTH, _FRAME + _PANEL * n_panels + upright * _LETTERS
+
+
+def _band(log: Log, modes: Modes, stage: Stage | None) -> tuple[float, float]:
+    """Return the band of the searches, or of the modes found, with a margin."""
+    places = [(f, 0.3) for f in modes.frequency.tolist()]
+    if stage is not None:
+        places += [(mode.frequency_hz, mode.search) for mode in stage.modes]
+    if not places:
+        return 20 * log.sample_rate / max(b - a for a, b in log.pieces), 0.45 * log.sample_rate
+    return min(f * (1 - share) for f, share in places), max(f * (1 + share) for f, share in places)
+
+
+def _edges(low: float, high: float, modes: Modes, duration: float) -> FloatArray:
+    """Return bins that show each mode and average the scatter of the periodogram."""
+    if high > _WIDE * low > 0:
+        return np.geomspace(low, high, _BINS + 1)
+    widths = 2 * modes.damping_ratio * modes.frequency
+    width = min(_ORDINATES / duration, _SHARE * float(np.min(widths, initial=np.inf)))
+    return np.linspace(low, high, 1 + int(np.clip((high - low) / width, 8, _BINS)))
+
+
+def _density(log: Log, channel: Channel, edges: FloatArray, settling: bool) -> FloatArray:
+    """Average the spectrum of a channel over its segments and in bins, NaN where it is zero."""
+    shortest = 10 / edges[-1]
+    segments = select_segments(log, "settling") if settling else find_segments(log, shortest)
+    if not segments:
+        raise BadLog(log.name, "too-short", f"no segment of {shortest:.3g} s to plot")
+    weights = [segment.stop - segment.start for segment in segments]
+    top = float(edges[-1])
+    spectra = [periodogram(channel, s, log.sample_rate, top) for s in segments]
+    mean = np.average([bin_density(s, edges) for s in spectra], axis=0, weights=weights)
+    return np.where(mean > 0, mean, np.nan)
+
+
+def _mark_lines(
+    ax: Axes, modes: Modes, channel: str, frequency: FloatArray, level: FloatArray
+) -> None:
+    """Mark the spectral lines of a channel above its curve, each kind with its own marker."""
+    low, high = frequency[[0, -1]]
+    seen = [line for line in modes.lines if low <= line.frequency <= high]
+    for marker, kind in zip(cycle(_MARKERS), sorted({line.kind for line in seen}), strict=False):
+        own = [line for line in seen if (line.kind, line.channel) == (kind, channel)]
+        x = np.array([line.frequency for line in own])
+        y = 1.5 * np.interp(x, frequency, level)
+        name = "line of unknown origin" if kind == "unknown" else f"line: {spell(kind)}"
+        label = figures.plain_label(name)
+        ax.plot(x, y, marker, color=figures.RED, ms=4, mew=0, label=label)
+
+
+def _annotate(
+    figure: Figure,
+    panels: Sequence[Axes],
+    band: tuple[float, float],
+    modes: Modes,
+    stage: Stage | None,
+) -> None:
+    """Draw modes and refused candidates in all panels, their names, the legend and the notes."""
+    labels = []
+    for k, f in enumerate(modes.frequency.tolist()):
+        reach = 1.96 * float(np.sqrt(modes.cov[k, k]))
+        for ax in panels:
+            ax.axvspan(
+                f * np.exp(-reach), f * np.exp(reach),
+                color=figures.BLUE, alpha=0.35, lw=0, label="mode, 95 % interval of its frequency",
+            )  # fmt: skip
+            ax.axvline(f, color=figures.BLUE, lw=0.6)
+        name = spell(modes.names[k] or "unnamed")
+        labels.append((f, f"{name}\n{_value(f, float(modes.frequency_std[k]))}", figures.BLUE))
+    for refusal in modes.refused:
+        at = _place(refusal, stage)
+        if at is not None and band[0] <= at <= band[1]:
+            found = refusal.mode.endswith(" Hz")
+            label = "refused candidate" if found else "refused mode, where it is described"
+            for ax in panels:
+                ax.axvline(at, color=figures.RED, lw=1, ls=(0, (4, 3)), label=label)
+            labels.append((at, f"{spell(refusal.mode)}\n{refusal.reason}", figures.RED))
+    panels[-1].set_xlabel("frequency in Hz")
+    panels[-1].set_xlim(*band)
+    if band[1] > _WIDE * band[0] > 0:
+        from matplotlib.ticker import LogLocator, NullLocator, StrMethodFormatter
+
+        panels[-1].set_xscale("log")
+        panels[-1].xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+        panels[-1].xaxis.set_minor_locator(NullLocator())
+        panels[-1].xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
+    _write_labels(panels[0], [label for label in labels if band[0] <= label[0] <= band[1]])
+    entries: dict[str, Any] = {}
+    for ax in panels:
+        entries |= zip(*reversed(ax.get_legend_handles_labels()), strict=True)
+    figure.legend(list(entries.values()), list(entries), loc="outside lower left", ncols=3)
+
+
+def _value(frequency: float, std: float) -> str:
+    """Format a frequency to two digits of its standard deviation."""
+    digits = max(0, 1 - int(np.floor(np.log10(std))))
+    return f"{frequency:.{digits}f} ± {std:.{digits}f} Hz"
+
+
+def _write_labels(ax: Axes, labels: list[tuple[float, str, str]]) -> None:
+    """Write names above the axes, moved apart as little as needed."""
+    labels = sorted(labels)
+    upright = len(labels) >= _UPRIGHT
+    apart = _APART_UPRIGHT if upright else _APART
+    if not labels:
+        return
+    steps = apart * np.arange(len(labels))
+    bottom = ax.get_ylim()[0]
+    points = ax.transData.transform([(f, bottom) for f, _, _ in labels])
+    places = ax.transAxes.inverted().transform(points)[:, 0]
+    moved = isotonic_regression(places - steps).x.clip(0, None) + steps
+    style: Any = {"rotation": 90 if upright else 0, "ha": "center", "va": "bottom", "size": 8}
+    style |= {
+        "xycoords": ax.get_xaxis_transform(),
+        "textcoords": ("axes fraction", "offset points"),
+    }
+    for (f, text, colour), x in zip(labels, moved.tolist(), strict=True):
+        text = figures.plain_label(text.replace("\n", "  ") if upright else text)
+        arrow = {"arrowstyle": "-", "color": colour, "lw": 0.7, "shrinkA": 0, "shrinkB": 0}
+        ax.annotate(text, (f, 1), (x, 16), color=colour, arrowprops=arrow, **style)
+
+
+def _place(refusal: Refusal, stage: Stage | None) -> float | None:
+    """Return the frequency in Hz at which a refused candidate was sought; None if unknown."""
+    if refusal.mode.endswith(" Hz"):
+        return float(refusal.mode.removesuffix(" Hz"))
+    named = {mode.name: mode.frequency_hz for mode in stage.modes} if stage else {}
+    return named.get(refusal.mode)
+
+
+def _notes(modes: Modes) -> list[str]:
+    """Return the refusals in lines that fit."""
+    lines = []
+    for refusal in modes.refused:
+        what = spell(refusal.mode) or refusal.channel or "modes"
+        text = figures.plain_label(f"{what} refused, {refusal.reason}: {refusal.detail}")
+        lines += textwrap.wrap(text, _NOTE_COLUMNS, subsequent_indent="    ")
+    return lines

@@ -1,0 +1,103 @@
+"""Figures of single logs."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.text import Text
+
+from lmshealth.io.log import Log, Refusal
+from lmshealth.modal.modes import Modes, estimates_only, merge, numbered
+from lmshealth.report.log_figures import LogFigure, spectra_figure, write_figure
+from lmshealth.signal.spectral_lines import Line
+from tests.signals import Mode, accelerations, make_log, make_stage, sine, white
+
+RATE, N = 500.0, 16000
+
+
+@pytest.fixture(scope="module")
+def log() -> Log:
+    """White noise of density 1 with a line, and a mode at 62 Hz; a dollar sign in its name."""
+    rng = np.random.default_rng(3)
+    noise = white(rng, 1.0, N, RATE) + sine(N, RATE, 50.0, 10.0)
+    shaken = accelerations(rng, [Mode(62.0, 0.02)], N, RATE, 0.5)[0]
+    return make_log({"acc_n": noise, "acc_$s": shaken}, RATE)
+
+
+def some_modes(ln_f_std: float, *frequencies: float) -> Modes:
+    """Give modes with a line in acc_n and a candidate that was refused."""
+    n = len(frequencies)
+    estimate = np.log([*frequencies, *[0.02] * n])
+    cov = np.diag([ln_f_std**2] * n + [0.1**2] * n)
+    found = estimates_only(estimate, cov, np.full(n, 100.0), "acc", ["acc_$s"] * n)
+    refused = Refusal("log", "too-uncertain", "a $ and a $", mode="80.5 Hz")
+    return numbered(merge([found], [Line(50.0, 10.0, "m/s²", "mains", "acc_n")], [refused]))
+
+
+def draw(figure: LogFigure) -> Figure:
+    """Draw with matplotlib, and lay out."""
+    whole = Figure(figsize=figure.size, layout="constrained")
+    FigureCanvasAgg(whole)
+    figure.draw(whole)
+    whole.canvas.draw()
+    return whole
+
+
+def test_spectra_modes_lines_and_refusals_stand_at_their_places(log: Log) -> None:
+    """The level of white noise, the interval of a mode, a line in its channel, a candidate."""
+    whole = draw(spectra_figure(log, some_modes(0.01, 62.0), band=(40.0, 90.0)))
+    second, first = whole.axes  # by name
+    curves: dict[str, Any] = {line.get_label(): line for line in first.lines}
+    x, y = np.asarray(first.lines[0].get_data(), dtype=float)
+    away = np.abs(x - 50) > 2
+    assert y[away].mean() == pytest.approx(1.0, abs=5 / np.sqrt(away.sum() * 4))
+    assert curves["line: mains"].get_xdata() == pytest.approx([50.0])
+    assert curves["refused candidate"].get_xdata() == pytest.approx([80.5, 80.5])
+    assert not [line for line in second.lines if line.get_label() == "line: mains"
+                and len(np.asarray(line.get_xdata()))]  # fmt: skip
+    (span,) = (p for p in second.patches if "95 %" in str(p.get_label()))
+    box: Any = span
+    assert (box.get_x(), box.get_x() + box.get_width()) == pytest.approx(
+        62.0 * np.exp([-0.0196, 0.0196])
+    )
+    assert [text.get_text() for text in second.texts][1:] == [
+        "mode 1\n62.00 ± 0.62 Hz", "80.5 Hz\ntoo-uncertain"
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize("frequencies", [(60.0, 60.2, 60.4), tuple(60 + 0.1 * np.arange(12))])
+def test_names_of_close_modes_do_not_overlap(log: Log, frequencies: tuple[float, ...]) -> None:
+    """Labels above the axes are moved apart, upright when there are many."""
+    whole = draw(spectra_figure(log, some_modes(1e-4, *frequencies), band=(40.0, 90.0)))
+    # The extent of an annotation includes its arrow.
+    texts = [Text.get_window_extent(text) for text in whole.axes[0].texts[1:]]
+    spans = sorted((box.x0, box.x1) for box in texts)
+    assert len(spans) == len(frequencies) + 1
+    assert all(end <= start for (_, end), (start, _) in pairwise(spans))
+    assert spans[-1][1] <= whole.bbox.x1
+
+
+def test_a_described_mode_that_is_refused_is_drawn_where_it_is_described(log: Log) -> None:
+    """The whole search is shown."""
+    stage = make_stage([("roll", 80.0, 0.02)])
+    refusal = Refusal("log", "not-excited", "none", mode=stage.modes[0].name)
+    whole = draw(spectra_figure(log, merge([], [], [refusal]), stage))
+    (line,) = (one for one in whole.axes[0].lines if "described" in str(one.get_label()))
+    assert np.asarray(line.get_xdata()) == pytest.approx(80.0)
+    reach = stage.modes[0].search
+    assert whole.axes[0].get_xlim() == pytest.approx((80 * (1 - reach), 80 * (1 + reach)))
+
+
+def test_figures_are_reproducible_and_keep_dollar_signs(log: Log, tmp_path: Path) -> None:
+    """A dollar sign starts no formula; the bytes of a figure are the same each time."""
+    figure = spectra_figure(log, some_modes(0.01, 62.0), band=(40.0, 90.0))
+    for suffix in ("svg", "png", "html"):
+        for name in "ab":
+            write_figure(tmp_path / f"{name}.{suffix}", figure)
+        assert (tmp_path / f"a.{suffix}").read_bytes() == (tmp_path / f"b.{suffix}").read_bytes()
