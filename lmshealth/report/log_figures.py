@@ -37,7 +37,7 @@ _PANEL, _FRAME, _LETTERS, _NOTE = 1.15, 1.75, 1.1, 0.16
 # but not wider than this share of the half-power bandwidth of a mode.
 _BINS, _ORDINATES, _SHARE = 480, 4.0, 0.35
 # Distance of labels over the width of the axes: side by side, and upright from this many on.
-_APART, _APART_UPRIGHT, _UPRIGHT = 0.19, 0.03, 6
+_APART, _APART_UPRIGHT, _UPRIGHT = 0.2, 0.03, 6
 # Ratio of the ends of a band from which on its axis is logarithmic.
 _WIDE = 6.0
 _MARKERS = "v^sDPX*<>"
@@ -107,7 +107,9 @@ def response_figure(
         panels[0].set_ylabel(f"gain in {unit}")
         _mark_lines(panels[0], modes, frf.output, frf.frequency, gain)
         panels[1].plot(frf.frequency, np.angle(frf.response, deg=True), "o", **points)
-        panels[1].plot(x, np.angle(fit.response, deg=True), **fitted)
+        phase = np.angle(fit.response, deg=True)
+        phase[1:][np.abs(np.diff(phase)) > 180] = np.nan  # no line from -180 to 180
+        panels[1].plot(x, phase, **fitted)
         panels[1].set_ylabel("phase in °")
         panels[1].set_yticks([-180, -90, 0, 90, 180])
         panels[2].plot(frf.frequency, frf.coherence, color=figures.INK, lw=0.9)
@@ -239,8 +241,9 @@ def _annotate(
 
 
 def _value(frequency: float, std: float) -> str:
-    """Format a frequency to two digits of its standard deviation."""
+    """Format a frequency to two digits of its standard deviation, one of a very small one."""
     digits = max(0, 1 - int(np.floor(np.log10(std))))
+    digits -= digits > 3
     return f"{frequency:.{digits}f} ± {std:.{digits}f} Hz"
 
 
