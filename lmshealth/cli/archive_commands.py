@@ -11,7 +11,7 @@ import click
 
 from lmshealth.cli import options, terminal, views
 from lmshealth.cli.progress import progress_bars
-from lmshealth.report.pdf import write_pdfs
+from lmshealth.report.rendering import write_pdfs
 
 if TYPE_CHECKING:
     from lmshealth.stage.description import Stage

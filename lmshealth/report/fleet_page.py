@@ -17,7 +17,7 @@ from lmshealth._files import write_text
 from lmshealth.io.log import Refusal
 from lmshealth.report import constants
 from lmshealth.report.assessment import Summary
-from lmshealth.report.html import render
+from lmshealth.report.rendering import render
 
 # Names of devices on Windows, with any file name extension.
 _DEVICES = re.compile(r"con|prn|aux|nul|(com|lpt)[0-9\u00b9\u00b2\u00b3]", re.IGNORECASE)

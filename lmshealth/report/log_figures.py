@@ -18,7 +18,7 @@ from lmshealth.modal.frf.identification import FrfReading
 from lmshealth.modal.modes import Modes
 from lmshealth.modal.targets import choose_channels
 from lmshealth.report import figures
-from lmshealth.report.html import render
+from lmshealth.report.rendering import render
 from lmshealth.report.svg import compact
 from lmshealth.report.text import spell
 from lmshealth.signal.segments import find_segments, select_segments

@@ -25,7 +25,7 @@ from lmshealth.prognosis.results import Prognosis
 from lmshealth.report import constants, figures
 from lmshealth.report.assessment import Assessment, Summary, limit_of, summarise
 from lmshealth.report.changes import Reported, changes, reported
-from lmshealth.report.html import render
+from lmshealth.report.rendering import render
 from lmshealth.report.svg import share_letters
 from lmshealth.report.tables import track_rows
 from lmshealth.report.text import GAP, coarse, km, spell

@@ -5,7 +5,7 @@ from __future__ import annotations
 import jinja2
 import pytest
 
-from lmshealth.report.html import _environment, render
+from lmshealth.report.rendering import _environment, render
 
 
 def test_what_a_template_names_must_be_there() -> None:

@@ -15,7 +15,7 @@ from lmshealth.report.figures import (
     GREEN,
     RED,
 )
-from lmshealth.report.pdf import PdfError, write_pdfs
+from lmshealth.report.rendering import PdfError, write_pdfs
 from tests.assessments import worn, write_report
 
 
@@ -72,9 +72,10 @@ def test_the_same_page_gives_the_same_bytes(small: Path) -> None:
     """Made again, by another process too, a PDF is the same."""
     (target,) = write_pdfs([small])
     content = target.read_bytes()
-    code = (
-        "import sys, pathlib, lmshealth.report.pdf as p; p.write_pdfs([pathlib.Path(sys.argv[1])])"
+    modules = (
+        "import sys; from pathlib import Path; from lmshealth.report.rendering import write_pdfs"
     )
+    code = f"{modules}; write_pdfs([Path(sys.argv[1])])"
     subprocess.run([sys.executable, "-c", code, str(small)], check=True)
     assert target.read_bytes() == content
 

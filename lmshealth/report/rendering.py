@@ -1,16 +1,54 @@
-"""Pages as PDF (WeasyPrint)."""
+"""Rendering: templates to HTML pages (Jinja2, everything escaped), pages to PDF (WeasyPrint)."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Iterable
-from importlib import resources
+from datetime import datetime
+from functools import cache
+from importlib import metadata, resources
 from pathlib import Path
 from typing import Any
 
 from lmshealth._files import write_bytes
 from lmshealth.errors import LmshealthError
+from lmshealth.report import text
 from lmshealth.report.svg import give_letters
+
+_FILTERS = (
+    *(text.change, text.fixed, text.interval, text.km, text.law, text.moment, text.number),
+    *(text.percent, text.probability, text.probability_range, text.signed, text.spell),
+    *(text.time_left, text.travel_left, text.whole_km),
+)
+
+
+def render(template: str, generated: datetime | None = None, /, **content: Any) -> str:
+    """Render a template with the values of its names, and a time to print unless it is None."""
+    version = metadata.version("lmshealth")
+    page = _environment().get_template(template)
+    return str(page.render(content, generated=generated, version=version))
+
+
+def place(value: float, length: float) -> float:
+    """Return the position of a value on a bar, in % of the bar's length."""
+    return round(100 * min(max(value, 0.0) / length, 1.0), 2)
+
+
+@cache
+def _environment() -> Any:
+    """Load the templates once per process: parsing takes longer than rendering."""
+    import jinja2
+
+    pages = jinja2.Environment(
+        loader=jinja2.PackageLoader("lmshealth.report", "templates"),
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    pages.filters |= {function.__name__: function for function in (*_FILTERS, place)}
+    pages.globals["covariate"] = text.covariate
+    return pages
 
 
 class PdfError(LmshealthError):
@@ -32,13 +70,12 @@ def write_pdfs(pages: Iterable[Path]) -> list[Path]:
     style = (templates / "pdf.css").read_text(encoding="utf-8")
     written = []
     for page in pages:
-        text = page.read_text(encoding="utf-8").replace("</style>", f"{style}</style>", 1)
-        text = give_letters(text)
+        source = page.read_text(encoding="utf-8").replace("</style>", f"{style}</style>", 1)
         # WeasyPrint does not resolve CSS variables inside SVG.
-        text = re.sub(r"var\(--\w+, (#\w+)\)", r"\1", text)
+        source = re.sub(r"var\(--\w+, (#\w+)\)", r"\1", give_letters(source))
         target = page.with_suffix(".pdf")
         try:
-            content = html(string=text, url_fetcher=fetcher).write_pdf()
+            content = html(string=source, url_fetcher=fetcher).write_pdf()
         except Exception as error:  # any failure: the HTML page exists
             found = f"cannot be made: {type(error).__name__} {error}"
             raise PdfError(f"{target}: {found}; print {page} from a browser instead") from error
