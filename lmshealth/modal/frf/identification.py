@@ -12,7 +12,7 @@ from lmshealth.errors import BadLog
 from lmshealth.io.log import Channel, Log, Refusal
 from lmshealth.modal import constants
 from lmshealth.modal.frf.periods import find_period
-from lmshealth.modal.frf.response_fit import ResponseFit, fit_response
+from lmshealth.modal.frf.response_fit import FEWEST_POWERS, ResponseFit, fit_response
 from lmshealth.modal.frf.responses import Frf, Pair, from_periods, from_record
 from lmshealth.modal.modes import Modes, Rejection, estimates_only, merge, numbered
 from lmshealth.signal.segments import find_phases
@@ -230,17 +230,74 @@ def _modes(log: Log, frf: Frf, output: Channel, fit: ResponseFit) -> Modes:
     """Return the credible modes; the others are refused."""
     m = fit.estimate.size // 2
     why = {i: reason for i in range(m) if (reason := _incredible(frf, fit, i)) is not None}
+    nothing: Rejection | None = None
+    if fit.ordinates.periodic and fit.missed > constants.FRF_MISSED:
+        nothing = _why_missed(frf, fit)
+        why = dict.fromkeys(range(m), nothing)
+    elif len(why) == m and {reason for reason, _ in why.values()} <= _NO_RESONANCE:
+        nothing = _why_none(frf, fit)
     refused = [
         Refusal(log.name, reason, detail, output.name, f"{np.exp(fit.estimate[i]):.5g} Hz", "frf")
         for i, (reason, detail) in why.items()
     ]
-    if {reason for reason, _ in why.values()} <= _NO_RESONANCE and len(why) == m:
-        low, high = frf.frequency[[0, -1]]
-        detail = f"no resonance between {low:.4g} and {high:.4g} Hz from {frf.input}"
-        refused.append(Refusal(log.name, "not-excited", detail, output.name, source="frf"))
+    if nothing is not None:
+        refused.append(Refusal(log.name, *nothing, output.name, source="frf"))
     found = estimates_only(fit.estimate, fit.cov, fit.snr, "frf", [output.name] * m)
     kept = found.select([i for i in range(m) if i not in why])
     return numbered(merge([kept], _lines(log, output, fit), (*log.refused, *refused)))
+
+
+def _why_missed(frf: Frf, fit: ResponseFit) -> Rejection:
+    """Return why no rational response fits: lines too few for what there is, or no linear one."""
+    gain, frequency = np.abs(frf.response), frf.frequency
+    top = int(np.argmax(gain))
+    # A resonance falls to 1/√10 over three half-power bandwidths.
+    low = np.flatnonzero(gain[:top] ** 2 < gain[top] ** 2 / 10).max(initial=-1)
+    high = top + np.flatnonzero(gain[top:] ** 2 < gain[top] ** 2 / 10).min(initial=gain.size - top)
+    n = int(high - low - 1)
+    misses = (
+        f"the fit misses {100 * fit.missed:.0f} % of the response, allowed are "
+        f"{100 * constants.FRF_MISSED:.0f} %, and periods scatter by "
+        f"{100 * _noise_share(fit):.2g} %: "
+    )
+    needed = 4 * constants.FRF_MOST_MODES + 2 * FEWEST_POWERS + 2
+    spacing = fit.ordinates.spacing
+    if not frf.stray > constants.STRAY and (n < constants.LINES_OF_MODE or gain.size < needed):
+        return Rejection(
+            "too-few-lines",
+            f"{misses}{n} excited lines within three half-power bandwidths of the peak at "
+            f"{frequency[top]:.4g} Hz, needed {constants.LINES_OF_MODE}, and {gain.size} in all, "
+            f"needed {needed} for {constants.FRF_MOST_MODES} modes; excite lines closer than "
+            f"the {spacing:.3g} Hz of now, with a period longer than {1 / spacing:.2g} s",
+        )
+    return Rejection(
+        "nonlinear",
+        f"{misses}a nonlinearity: {n} lines around the peak at {frequency[top]:.4g} Hz and "
+        f"{100 * frf.stray:.2g} % of the answer at harmonics without input; excite less, and if "
+        f"that changes nothing choose a narrower band (at most {constants.FRF_MOST_MODES} modes "
+        "are fitted)",
+    )
+
+
+def _why_none(frf: Frf, fit: ResponseFit) -> Rejection:
+    """Return why no mode is found in a response that the fit does not miss."""
+    low, high = frf.frequency[[0, -1]]
+    share, most = _noise_share(fit), constants.FRF_MISSED
+    none = f"no resonance between {low:.4g} and {high:.4g} Hz from {frf.input}"
+    if share <= most:
+        return Rejection("not-excited", none)
+    return Rejection(
+        "noise",
+        f"{none}: noise is {100 * share:.0f} % of the response and hides modes above "
+        f"{100 * most:.0f} %; record "
+        f"{(share / most) ** 2:.1f} times as long, or excite {share / most:.1f} times as much",
+    )
+
+
+def _noise_share(fit: ResponseFit) -> float:
+    """Return the noise as a share of the amplitude of the answer, at most 1."""
+    o = fit.ordinates
+    return min(1.0, float(np.sqrt(np.sum(o.noise) / np.sum(np.abs(o.answer) ** 2))))
 
 
 def _incredible(frf: Frf, fit: ResponseFit, i: int) -> Rejection | None:

@@ -39,9 +39,15 @@ class Ordinates:
     noise: FloatArray  # variance of answer - H given by noise; without periods a start value
     freedom: float  # complex degrees of freedom of each variance
     periodic: bool  # means over whole periods: no transient, noise from their scatter
+    at_rest: bool = False  # at both ends of the record: no transient
 
     def __post_init__(self) -> None:
         freeze(self)
+
+    @property
+    def transient(self) -> bool:
+        """Whether the answer has a transient."""
+        return not (self.periodic or self.at_rest)
 
     @property
     def spacing(self) -> float:
@@ -78,10 +84,10 @@ class Order:
         f, zeta = np.exp(np.split(self.theta, 2))
         return f, zeta
 
-    def unknowns(self, periodic: bool) -> int:
+    def unknowns(self, transient: bool) -> int:
         """Count real unknowns."""
-        each, transient = (4, 0) if periodic else (6, len(_TRANSIENT_POWERS))
-        return each * self.n_modes + self.high - self.low + 1 + transient
+        each, powers = (6, len(_TRANSIENT_POWERS)) if transient else (4, 0)
+        return each * self.n_modes + self.high - self.low + 1 + powers
 
     def with_mode(self, f: float, zeta: float) -> Order:
         """Add a mode at a frequency in Hz."""
@@ -132,7 +138,7 @@ def solve(ordinates: Ordinates, order: Order, variance: FloatArray) -> Solution:
     response = np.hstack([modal, s[:, None] ** np.arange(order.low, order.high + 1)])
     n = response.shape[1]
     columns = response * ordinates.given[:, None]
-    if not ordinates.periodic:
+    if ordinates.transient:
         columns = np.hstack([columns, modal, s[:, None] ** np.array(_TRANSIENT_POWERS)])
     whiten = np.sqrt(2 / variance)
     stacked = stack(columns * whiten[:, None])
@@ -145,7 +151,7 @@ def solve(ordinates: Ordinates, order: Order, variance: FloatArray) -> Solution:
     # Powers and poles of a background may cancel each other; modes do not.
     parts = parts[:, order.modes[1] <= constants.FRF_MOST_DAMPING]
     rest = fitted - parts.sum(axis=1)
-    swing = np.zeros(m, dtype=complex) if ordinates.periodic else _residues(weights[n:], m)
+    swing = _residues(weights[n:], m) if ordinates.transient else np.zeros(m, dtype=complex)
     return Solution(
         basis=basis,
         residues=_residues(weights, m),

@@ -25,7 +25,7 @@ from lmshealth.modal.frf.responses import smooth_noise
 # significant, bias those inside by up to one standard deviation with four powers, by half of one
 # with six, which costs a few percent of it. Powers enter in pairs: an even one for elasticity, an
 # odd one for loss.
-_FEWEST_POWERS, _MOST_POWERS, _POWER_STEP = 6, 8, 2
+FEWEST_POWERS, _MOST_POWERS, _POWER_STEP = 6, 8, 2
 # Lines over which the noise of a record that is not periodic is averaged.
 _NOISE_LINES = 41
 # Gain in -2 ln L at fixed poles from which on a larger model is fitted.
@@ -33,6 +33,8 @@ _WORTH = 2.0
 # Lines of an end of the band.
 _END = 3
 _ROUNDS = 4
+# Amplitude of a fitted response over the answer from which on it cancels a transient.
+_CANCELS = 2.0
 # Standard deviation of the prior of ln f and ln ζ: directions without data stay this uncertain.
 _PRIOR_STD = 10.0
 
@@ -62,6 +64,20 @@ class ResponseFit:
     def __post_init__(self) -> None:
         freeze(self)
 
+    @property
+    def missed(self) -> float:
+        """Error beyond the noise of periods as a share of the answer, at most 1."""
+        o = self.ordinates
+        beyond = np.sum(np.abs(o.answer - o.given * self.response) ** 2 - o.noise)
+        share = float(beyond / np.sum(np.abs(o.answer) ** 2))
+        return float(np.sqrt(np.clip(share, 0, 1)))
+
+    @property
+    def excess(self) -> float:
+        """Amplitude of the fitted response to the input over that of the answer."""
+        o = self.ordinates
+        return float(np.linalg.norm(o.given * self.response) / np.linalg.norm(o.answer))
+
 
 def fit_response(ordinates: Ordinates) -> ResponseFit:
     """Fit poles, residues and residual terms to the response of a band.
@@ -79,8 +95,18 @@ def fit_response(ordinates: Ordinates) -> ResponseFit:
     The covariance is the inverse of the Fisher information, widened where errors of neighbouring
     lines correlate; those of a distortion count as one within a half-power bandwidth
     [Pintelon2012].
+
+    After a blow a transient cannot be separated from the response, and both may cancel; then the
+    record is fitted as one that begins and ends at rest.
     """
-    start = Order(np.empty(0), -_FEWEST_POWERS, _FEWEST_POWERS)
+    fit = _fit(ordinates)
+    if ordinates.transient and fit.excess > _CANCELS:
+        fit = _fit(replace(ordinates, at_rest=True))
+    return fit
+
+
+def _fit(ordinates: Ordinates) -> ResponseFit:
+    start = Order(np.empty(0), -FEWEST_POWERS, FEWEST_POWERS)
     state = _restart(_grow(_settle(ordinates, start, ordinates.noise)))
     for _ in range(_ROUNDS):
         keep = _inliers(state)
@@ -131,7 +157,7 @@ class _State:
     def penalty(self) -> float:
         """Gain that modes and background need."""
         order = self.order
-        each = 4 if self.ordinates.periodic else 6
+        each = 6 if self.ordinates.transient else 4
         heavy = int(np.count_nonzero(order.modes[1] > constants.FRF_MOST_DAMPING))
         modes = each * np.log(2 * self.variance.size) + constants.FRF_EVIDENCE_MARGIN
         background = constants.FRF_BACKGROUND_COST * (each * heavy + order.high - order.low)
@@ -162,7 +188,7 @@ def _error_variance(
     """Return the variance of the error of each line, and the distortion as a share of H."""
     n = solution.error.size
     # Corrected for the degrees of freedom of the fit.
-    power = np.abs(solution.error) ** 2 * (n / (n - order.unknowns(ordinates.periodic) / 2))
+    power = np.abs(solution.error) ** 2 * (n / (n - order.unknowns(ordinates.transient) / 2))
     if not ordinates.periodic:
         return smooth_noise(power, solution.parts, _NOISE_LINES), 0.0
     parts = solution.parts * np.abs(ordinates.given) ** 2
@@ -205,7 +231,7 @@ def _grow(state: _State) -> _State:
         trials = [
             _settle(state.ordinates, order, state.variance)
             for order in _larger(state)
-            if order.unknowns(state.ordinates.periodic) < state.variance.size
+            if order.unknowns(state.ordinates.transient) < state.variance.size
         ]
         gains = [_gain(t, state) if _is_admissible(t, state) else -np.inf for t in trials]
         if not gains or max(gains) <= 0:
@@ -223,7 +249,7 @@ def _restart(state: _State) -> _State:
     best = state
     for n in range(1, constants.FRF_MOST_MODES + 1):
         order = vector_fit(state.ordinates, state.order, n)
-        if order.unknowns(periodic=True) >= state.variance.size:
+        if order.unknowns(transient=False) >= state.variance.size:
             break
         trial = _settle(state.ordinates, order, state.ordinates.noise)
         less = trial.distortion <= constants.LESS_DISTORTED * best.distortion
@@ -324,7 +350,7 @@ def _conclude(state: _State, everything: Ordinates) -> ResponseFit:
     expected = np.interp(everything.frequency, ordinates.frequency, solution.response)
     error = (everything.answer - everything.given * expected)[outlying]
     excess = np.sum(np.abs(solution.error) ** 2 / ordinates.noise)
-    excess /= n - order.unknowns(ordinates.periodic) / 2
+    excess /= n - order.unknowns(ordinates.transient) / 2
     return ResponseFit(
         ordinates=ordinates,
         outliers=np.column_stack([everything.frequency[outlying], np.abs(error)]),

@@ -79,6 +79,9 @@ class Frf:
     coherence: FloatArray  # over periods or stretches, 0 to 1
     period: float  # of the excitation in s; NaN where it is not periodic
     n_averages: float  # periods, or equivalent number of independent stretches
+    # Amplitude of the output beyond noise at harmonics without input over that at excited ones:
+    # nonlinear. NaN where the excitation is not periodic or excites all harmonics.
+    stray: float = float("nan")
 
     def __post_init__(self) -> None:
         for name in ("response", "std", "h1", "h2", "hv", "coherence"):
@@ -123,6 +126,8 @@ def from_periods(pair: Pair, band: tuple[float, float], period: float) -> tuple[
     frequency: FloatArray = np.arange(spectra.shape[2], dtype=np.float64) * (rate / period)
     inside = (frequency >= band[0]) & (frequency <= band[1]) & (frequency > 0)
     strongest = np.abs(spectra[0]).max()
+    gain = np.maximum(pair.gain(frequency), _ROUNDING)
+    stray = _stray((spectra / gain)[:, spectra.shape[1] > 2 :])
     frequency = frequency[inside]
     spectra = spectra[:, :, inside] / pair.gain(frequency)
     if _is_transient(spectra[1]):
@@ -144,8 +149,21 @@ def from_periods(pair: Pair, band: tuple[float, float], period: float) -> tuple[
     cross = np.mean(spectra[1] * spectra[0].conj(), axis=0)
     h1, h2, hv, coherence = _estimates(power[0], power[1], cross)
     std = np.sqrt(noise) / np.abs(given)
-    frf = Frf(*pair.names, frequency, response, std, h1, h2, hv, coherence, period / rate, n)
+    frf = Frf(*pair.names, frequency, response, std, h1, h2, hv, coherence, period / rate, n, stray)
     return frf, Ordinates(frequency, given, answer, noise, freedom, periodic=True)
+
+
+def _stray(spectra: ComplexArray) -> float:
+    """Compare the output at harmonics with and without input, ``(2, n_periods, n_harmonics)``."""
+    power = np.abs(spectra.mean(axis=1)[:, 1:]) ** 2
+    noise = np.var(spectra[1, :, 1:], axis=0, ddof=1) / spectra.shape[1]
+    silent = power[0] < constants.SILENT**2 * power[0].max()
+    loud = power[0] >= constants.EXCITED**2 * power[0].max()
+    if not silent.any():
+        return float("nan")
+    # The median, since mains may be harmonics of the excitation.
+    beyond = float(np.median((power[1] - noise)[silent]) / power[1, loud].mean())
+    return float(np.sqrt(max(beyond, 0.0)))
 
 
 def _excited(

@@ -241,13 +241,15 @@ def test_few_lines_show_a_mode_or_are_the_reason_why_not(
     assert f"period of at least {1 / width:.2g} s" in refused.detail
 
 
-def sparse(damping: float, step: int) -> Log:
-    """Make a log of one mode of 77 Hz, of which a multisine excites every so many 0.25 Hz."""
+def sparse(
+    damping: float, step: int, modes: tuple[tuple[float, float, float], ...] | None = None
+) -> Log:
+    """Make a log of one mode of 77 Hz, or others, excited at every so many 0.25 Hz."""
     rng = np.random.default_rng(1)
     line = np.zeros(SIZE // 2 + 1, dtype=complex)
     line[32 : 4 * 180 + 1 : step] = 1
     given = np.fft.irfft(line * np.exp(2j * np.pi * rng.uniform(size=line.size)), SIZE)
-    machine = Machine(modes=((77.0, damping, 1.0),), white=0.001, process=0.0)
+    machine = Machine(modes=modes or ((77.0, damping, 1.0),), white=0.001, process=0.0)
     signals = machine.noise(rng, np.tile(given, 6), np.tile(machine.answer(given), 6))
     return make_log({"current": signals[0], "acc_x": signals[1]}, RATE)
 
@@ -385,6 +387,37 @@ def test_a_response_without_a_mode_says_that_none_is_there() -> None:
     modes = read_frf(driven(machine), "current", "acc_x", band=(60, 110)).modes
     assert modes.names == ()
     assert "not-excited" in {r.reason for r in modes.refused}
+
+
+def test_noise_is_the_reason_where_it_hides_the_mode() -> None:
+    """Six weak modes under noise of their size: none, its share, and how long to record."""
+    modes = tuple((f, 0.1, 1.0) for f in np.linspace(45, 115, 6).tolist())
+    log = driven(Machine(modes=modes, white=6.0, process=0.0))
+    (refused,) = read_frf(log, "current", "acc_x", band=BAND).modes.refused
+    assert refused.reason == "noise"
+    assert "hides modes above 33 %" in refused.detail
+    assert "times as long" in refused.detail
+
+
+def test_a_strong_nonlinearity_is_the_reason_where_lines_are_dense() -> None:
+    """A motor that adds three times its cube: the periods agree, no rational response does."""
+    rng = np.random.default_rng(2)
+    given = multisine(rng, SIZE)
+    bent = Machine().answer(given + 3 * given**3 - 9 * given)
+    log = make_log({"current": np.tile(given, 6), "acc_x": np.tile(bent, 6)}, RATE)
+    modes = read_frf(log, "current", "acc_x", band=BAND).modes
+    assert modes.names == ()
+    assert "nonlinear" in {r.reason for r in modes.refused}
+    assert "periods scatter by" in modes.refused[-1].detail
+
+
+def test_too_few_lines_for_many_modes_are_the_reason() -> None:
+    """Seven modes 0.6 to 2 Hz wide and 16 lines 10 Hz apart: no modes, and lines are asked for."""
+    modes = tuple((f, 0.005, (-1.0) ** i) for i, f in enumerate(np.linspace(23, 171, 7).tolist()))
+    found = read_frf(sparse(0.005, 40, modes), "current", "acc_x", band=(8, 180)).modes
+    assert found.names == ()
+    assert {r.reason for r in found.refused} == {"too-few-lines"}
+    assert "needed 46 for 8 modes" in found.refused[-1].detail
 
 
 def test_a_heavily_damped_mode_is_refused_by_name() -> None:

@@ -141,7 +141,7 @@ def test_the_best_place_is_where_a_mode_is_missing() -> None:
 
 def test_orders_count_their_unknowns() -> None:
     """A mode has four, six where it has a transient; a power one; the transient itself three."""
-    assert ORDER.unknowns(periodic=True) == 2 * 4 + 5
-    assert ORDER.unknowns(periodic=False) == 2 * 6 + 5 + 3
+    assert ORDER.unknowns(transient=False) == 2 * 4 + 5
+    assert ORDER.unknowns(transient=True) == 2 * 6 + 5 + 3
     assert ORDER.without_mode(0).modes[0] == pytest.approx(90)
     assert ORDER.with_mode(100.0, 0.1).modes[1] == pytest.approx([0.015, 0.02, 0.1])
