@@ -226,6 +226,13 @@ def test_frf_modes(root: Path, needs: Callable[[str], None]) -> None:
     assert narrow < stated
 
 
+def test_frf_lines(root: Path) -> None:
+    """A mode with three lines is found, one with fewer is refused as that."""
+    answer = json.loads(run_study(root, "frf_lines"))
+    assert all(answer["passed"].values())
+    assert answer["found"]["n"] and answer["refused"]["n"]
+
+
 def test_crossings(root: Path) -> None:
     """Some lives of each kind are never swapped silently, and both controls may be."""
     answer = json.loads(run_study(root, "crossings"))
