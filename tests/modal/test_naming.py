@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from lmshealth.modal.modes import Modes, Rejection, estimates_only
-from lmshealth.modal.naming import assign, flag_names
+from lmshealth.modal.naming import assign, flag_names, name_response, why_unnamed
 from lmshealth.modal.targets import Target
 from tests.signals import make_stage
 
@@ -95,3 +95,16 @@ def test_a_mode_off_its_description_is_flagged() -> None:
     """So is one by 4 % or a factor of 4 of damping, not one by 2 % or with a wide interval."""
     assert flagged(121.0, 0.015).flags == flagged(126.0, 0.06).flags == ("off-description",)
     assert flagged(123.5, 0.02).flags == flagged(121.0, 0.015, std=0.02).flags == ("",)
+
+
+def test_the_reason_for_no_name_lists_which_modes_are_searched_for_there() -> None:
+    """One mode in the searches of two has no name, and the reason names both; so for three."""
+    one = estimates_only(np.log([126.0, 0.015]), np.eye(2) * 1e-4, np.ones(1), "frf", ["acc_0"])
+    described = [("roll", 120.0, 0.015), ("pitch", 130.0, 0.015)]
+    (why,) = why_unnamed(name_response(one, make_stage(described)), make_stage(described))
+    assert why.startswith("the mode at 126 Hz has no name: roll and pitch are both searched for")
+    described += [("yaw", 135.0, 0.015)]
+    (why,) = why_unnamed(name_response(one, make_stage(described)), make_stage(described))
+    assert "roll, pitch and yaw are all searched for" in why
+    alone = make_stage(described[:1])
+    assert not list(why_unnamed(name_response(one, alone), alone))
