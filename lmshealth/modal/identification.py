@@ -8,32 +8,36 @@ where the start values come from, how modes are named and what happens to modes 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 
 from lmshealth.errors import BadLog
 from lmshealth.io.log import Channel, Log, Refusal
 from lmshealth.modal import constants
-from lmshealth.modal.ambient.candidates import add_excess, clusters, find_peaks
-from lmshealth.modal.ambient.cluster_fit import bin_cluster, fit_cluster, locate
+from lmshealth.modal.ambient.cluster_fit import bin_cluster, fit_cluster, fit_found, locate
 from lmshealth.modal.ambient.cluster_modes import (
     ClusterFit,
     drop_duplicates,
     merge_close_modes,
     refuse_close_modes,
 )
+from lmshealth.modal.ambient.search import Found, neighbourhood, search, split_groups
+from lmshealth.modal.ambient.wandering import Harmonic, Recording
 from lmshealth.modal.modes import Modes, merge, numbered
 from lmshealth.modal.naming import assign
-from lmshealth.modal.targets import Target, choose_channels, choose_targets
+from lmshealth.modal.targets import Target, choose_channels, choose_targets, clusters
 from lmshealth.signal.segments import Segment, find_phases, stationary
-from lmshealth.signal.spectra import ANY_RESONANCE, LogSpectra, ResonanceRange, cross_spectra
+from lmshealth.signal.spectra import (
+    ANY_RESONANCE,
+    LogSpectra,
+    ResonanceRange,
+    cross_spectra,
+    transform_segment,
+)
 from lmshealth.signal.spectral_lines import Line, find_lines, name_lines
 from lmshealth.stage.constants import BAND, LEAST_RESOLUTION
 from lmshealth.stage.description import Stage
 
-# Without a description, searches for further modes in the residual of a fit.
-_MOST_ROUNDS = 3
 # Without a description spectra reach up to this multiple of the band: further than flanks do.
 _CEILING = 4.0
 # A cluster is fitted below this share of the sample rate.
@@ -97,19 +101,23 @@ def identify(
     targets = () if stage is None else choose_targets(stage, band)
     stretches, spectra = _transform(log, used, targets, band)
     tested: list[tuple[str, float, float]] = []
+    harmonics: tuple[Harmonic, ...] = ()
+    top = _TOP * log.sample_rate
     if stage is None:
-        targets, tested = _search(log, used, stretches, spectra, band)
-        spectra = spectra.without([frequency for _, frequency, _ in tested])
-    top, groups = _TOP * log.sample_rate, clusters(targets)
-    if stage is None:
-        fits = [_fit_found(spectra, cluster, targets, top) for cluster in groups]
+        sought, tested = _search(log, used, stretches, spectra, band)
+        harmonics, spectra = sought.harmonics, sought.spectra
+        fits = [_fit_group(sought, group, top) for group in split_groups(sought.modes)]
     else:
-        fits = [_fit_described(spectra, cluster, targets, top) for cluster in groups]
+        fits = [_fit_described(spectra, c, targets, top) for c in clusters(targets)]
     refused = [refusal for fit in fits for refusal in fit.refusals(log.name)]
     found = [fit.modes for fit in fits if fit.modes is not None]
     masked = [line for one in found for line in one.lines]
     seen = [*tested, *spectra.removed_lines, *masked]
     lines = name_lines(seen, [s.velocity for s in stretches], stage, 1.5 / spectra.duration)
+    lines += tuple(
+        Line(h.frequency, h.amplitude, "m/s²", "wandering", spectra.channels[h.channel])
+        for h in harmonics
+    )
     if stage is None:
         found = drop_duplicates(found)
         anything = any(one.names for one in found)
@@ -170,8 +178,8 @@ def _search(
     stretches: Sequence[Segment],
     spectra: LogSpectra,
     band: tuple[float, float] | None,
-) -> tuple[tuple[Target, ...], list[tuple[str, float, float]]]:
-    """Return candidate modes in the band, and the lines that Thomson's test shows."""
+) -> tuple[Found, list[tuple[str, float, float]]]:
+    """Search the band for modes, and for the lines that Thomson's test shows."""
     duration, usable = spectra.duration, constants.USABLE * log.sample_rate
     low, high = band or (20 / duration, usable)
     low, high = max(low, 2 / duration), min(high, usable)
@@ -189,9 +197,13 @@ def _search(
         for channel in channels
         for line in find_lines(channel, (longest,), log.sample_rate, (low, high)).tolist()
     ]
-    spectrum = max(spectra.spectra, key=lambda spectrum: spectrum.observed)
-    each = [spectrum.channel(c) for c in range(len(channels))]
-    return find_peaks(each, low, high, [frequency for _, frequency, _ in tested]), tested
+    frequencies = [frequency for _, frequency, _ in tested]
+    reach = band[1] if band else np.inf
+    transforms = transform_segment(
+        channels, longest, log.sample_rate, reach, ceiling=_CEILING * reach
+    )
+    recording = Recording.of(transforms, frequencies)
+    return search(spectra.without(frequencies), recording, low, high), tested
 
 
 def _fit_described(
@@ -214,28 +226,27 @@ def _fit_described(
     return refuse_close_modes(fit)
 
 
-def _fit_found(
-    spectra: LogSpectra, cluster: tuple[Target, ...], targets: tuple[Target, ...], top: float
-) -> ClusterFit:
-    """Fit a cluster of peaks, then again with each excess of the residual as a further mode."""
-    # Only what is nearer to the cluster than to other peaks.
-    first, last = cluster[0].frequency, cluster[-1].frequency
-    below = [t.frequency for t in targets if t.frequency < first]
-    above = [t.frequency for t in targets if t.frequency > last]
-    low = float(np.sqrt(max(below) * first)) if below else 0.0
-    high = float(np.sqrt(last * min(above))) if above else np.inf
-    spectra = replace(spectra, spectra=tuple(s.band(low, high) for s in spectra.spectra))
-    for _ in range(1 + _MOST_ROUNDS):
-        binned = bin_cluster(spectra, cluster, targets, top, searched=False)
-        fit = fit_cluster(spectra, binned, cluster)
-        if fit.modes is None:
-            break
-        modes = merge_close_modes(fit.modes)
-        fit = ClusterFit(modes, fit.rejected)
-        before, cluster = cluster, add_excess(cluster, modes.residual)
-        if len(cluster) == len(before):
-            break
-    return fit
+def _fit_group(found: Found, group: tuple[Target, ...], top: float) -> ClusterFit:
+    """Fit neighbours that were found; those next to them are fitted, too, but not published."""
+    targets = found.modes
+    near = neighbourhood(group, targets)
+    first, last = targets.index(near[0]), targets.index(near[-1])
+    low, high = 0.0, top
+    if first:
+        low = (targets[first - 1].frequency * near[0].frequency) ** 0.5
+    if last + 1 < len(targets):
+        high = (targets[last + 1].frequency * near[-1].frequency) ** 0.5
+    low = max(low, min(target.band(BAND)[0] for target in near))
+    high = min(high, max(target.band(BAND)[1] for target in near))
+    spectra = found.around(near, low, high)
+    binned = bin_cluster(found.spectra, near, targets, top, searched=False)
+    fit = fit_found(spectra, binned, near, (low, high))
+    own = {t.name for t in group if found.band[0] <= t.frequency <= found.band[1]}
+    rejected = {name: why for name, why in fit.rejected.items() if name in own}
+    if fit.modes is None:
+        return ClusterFit(None, rejected)
+    modes = merge_close_modes(fit.modes)
+    return ClusterFit(modes.keep(name for name in modes.names if name in own), rejected)
 
 
 def _nothing_found(log: Log, lines: tuple[Line, ...], rejected: list[Refusal]) -> Refusal:

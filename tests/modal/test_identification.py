@@ -19,12 +19,11 @@ from lmshealth.io.column_map import load_columns
 from lmshealth.io.log import Channel, Log
 from lmshealth.io.reading import read_log
 from lmshealth.modal import identification as modal
-from lmshealth.modal.ambient.candidates import clusters
 from lmshealth.modal.ambient.cluster_fit import BinnedSpectra, fit_cluster
 from lmshealth.modal.ambient.cluster_modes import ClusterFit
 from lmshealth.modal.identification import identify
 from lmshealth.modal.modes import Modes
-from lmshealth.modal.targets import Target
+from lmshealth.modal.targets import Target, clusters
 from lmshealth.signal import segments, spectra
 from lmshealth.signal.spectra import LogSpectra
 from tests.signals import (
