@@ -277,7 +277,9 @@ def _prune(data: ClusterData, targets: tuple[Target, ...]) -> tuple[_Optimum, di
     n_ordinates = sum(spectrum.count * int(mask.sum()) for spectrum, mask in pairs)
 
     def solve(some: tuple[Target, ...]) -> _Optimum:
-        bandwidth = min(2 * t.frequency * t.damping_ratio for t in some)
+        # A pole that is narrow by error would need the finest bins.
+        widths = [2 * t.frequency * t.damping_ratio for t in some]
+        bandwidth = max(min(widths), float(np.median(widths)) / constants.SIMILAR_BANDWIDTH)
         blocks = make_blocks(data, bandwidth, [target.frequency for target in some])
         return _solve(data, blocks, some)
 

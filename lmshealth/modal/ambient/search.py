@@ -21,6 +21,7 @@ from lmshealth.modal.ambient.joint_model import LEAST_FLOOR, BandData, JointMode
 from lmshealth.modal.ambient.subspace import Candidate, find_candidates
 from lmshealth.modal.ambient.wandering import Harmonic, Recording, find_harmonic
 from lmshealth.modal.targets import Target
+from lmshealth.signal.constants import LINE_WIDTH
 from lmshealth.signal.spectra import LogSpectra
 from lmshealth.stage.constants import BAND
 
@@ -76,6 +77,8 @@ def search(spectra: LogSpectra, recording: Recording, low: float, high: float) -
             spectra = spectra.without_band(harmonic.low, harmonic.high)
         else:
             spectra = spectra.with_foreign(harmonic.expected)
+    # What is as narrow as a line stays in the model, as foreign to the modes next to it.
+    wide = (2 * model.zeta > LINE_WIDTH) & (2 * model.zeta * model.f * spectra.duration > 1)
     modes = tuple(
         Target(
             f"mode_{number}",
@@ -84,7 +87,7 @@ def search(spectra: LogSpectra, recording: Recording, low: float, high: float) -
             max(0.02, 4 * float(model.zeta[i])),
             amplitude=(model.phi[:, i] * model.data.scale).astype(np.complex128),
         )
-        for number, i in enumerate(np.argsort(model.f), start=1)
+        for number, i in enumerate((i for i in np.argsort(model.f) if wide[i]), start=1)
     )
     return Found(modes, tuple(harmonics), spectra, model, (low, high))
 
