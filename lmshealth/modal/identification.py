@@ -95,7 +95,7 @@ def identify(
     ...     modes.frequency, modes.frequency_std, modes.damping_ratio, modes.damping_ratio_std
     ... ):
     ...     print(f"{f:.1f} ± {f_std:.1f} Hz, {zeta:.1%} ± {zeta_std:.1%}")
-    126.4 ± 0.1 Hz, 1.5% ± 0.1%
+    126.5 ± 0.1 Hz, 1.5% ± 0.1%
     """
     used = choose_channels(log, channels)
     targets = () if stage is None else choose_targets(stage, band)
@@ -203,7 +203,7 @@ def _search(
         channels, longest, log.sample_rate, reach, ceiling=_CEILING * reach
     )
     recording = Recording.of(transforms, frequencies)
-    return search(spectra.without(frequencies), recording, low, high), tested
+    return search(spectra.without(frequencies), recording, low, high, frequencies), tested
 
 
 def _fit_described(

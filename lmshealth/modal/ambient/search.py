@@ -8,6 +8,7 @@ search is repeated.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import NamedTuple
@@ -29,6 +30,8 @@ from lmshealth.stage.constants import BAND
 # fraction of the frequency.
 _BIN, _NARROWEST, _WIDEST_BIN = 0.4, 2e-3, 0.006
 _MOST_HARMONICS = 6
+# A pole at a line that is narrower than so many of its widths is what masking left of it.
+_FOOT = 5.0
 # A mode is tried without if its loss, the others fixed, is below the first, or another one is
 # within so many half-power bandwidths.
 _DOUBTFUL, _NEAR, _MOST_TRIED = 150.0, 3.0, 6
@@ -59,8 +62,17 @@ class Found:
         return cut.with_foreign(lambda frequency: self.model.modal(others, frequency))
 
 
-def search(spectra: LogSpectra, recording: Recording, low: float, high: float) -> Found:
-    """Search a band in Hz; ``recording`` is the longest segment, to recognise harmonics."""
+def search(
+    spectra: LogSpectra,
+    recording: Recording,
+    low: float,
+    high: float,
+    lines: Sequence[float] = (),
+) -> Found:
+    """Search a band; frequencies are in Hz.
+
+    ``recording`` is the longest segment, to recognise harmonics; ``lines`` are masked.
+    """
     harmonics: list[Harmonic] = []
     while True:
         candidates = [
@@ -77,8 +89,12 @@ def search(spectra: LogSpectra, recording: Recording, low: float, high: float) -
             spectra = spectra.without_band(harmonic.low, harmonic.high)
         else:
             spectra = spectra.with_foreign(harmonic.expected)
-    # What is as narrow as a line stays in the model, as foreign to the modes next to it.
-    wide = (2 * model.zeta > LINE_WIDTH) & (2 * model.zeta * model.f * spectra.duration > 1)
+    # What is as narrow as a line, or is the foot of one, stays in the model, as foreign to modes.
+    width = 2 * model.zeta
+    wide = (width > LINE_WIDTH) & (width * model.f * spectra.duration > 1)
+    for line in lines:
+        foot = np.abs(model.f / line - 1) < LINE_WIDTH + model.zeta
+        wide &= ~(foot & (width < _FOOT * LINE_WIDTH))
     modes = tuple(
         Target(
             f"mode_{number}",
