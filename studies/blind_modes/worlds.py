@@ -107,7 +107,9 @@ def varied(rng: np.random.Generator) -> World:
 def eight_modes(rng: np.random.Generator) -> World:
     """Draw a structure: eight modes from 5 to 45 Hz, a close pair, a weak one, harmonics."""
     zeta = np.exp(rng.uniform(np.log(0.004), np.log(0.015), 8))
-    f = np.array([6.2, 9.5, 13.8, 18.5, 24.0, 30.5, 35.5, 41.5]) * (1 + 0.04 * rng.uniform(-1, 1, 8))
+    f = np.array([6.2, 9.5, 13.8, 18.5, 24.0, 30.5, 35.5, 41.5]) * (
+        1 + 0.04 * rng.uniform(-1, 1, 8)
+    )
     pair = int(rng.integers(1, 6))
     f[pair + 1] = f[pair] * (1 + 1.5 * (zeta[pair] + zeta[pair + 1]))
     strength = 10 ** rng.uniform(2.5, 4.0, 8)
@@ -121,7 +123,9 @@ def eight_modes(rng: np.random.Generator) -> World:
         steady=(_free_place(rng, f, zeta, 8.0, 20.0), _free_place(rng, f, zeta, 20.0, 44.0)),
         wandering=(base,), band=(4.0, 48.0), harmonic_level=float(10 ** rng.uniform(-1, 0.5)),
     )  # fmt: skip
-    return _record(rng, "eight modes", machine, 128.0, float(np.exp(rng.uniform(*np.log([150, 600])))))
+    return _record(
+        rng, "eight modes", machine, 128.0, float(np.exp(rng.uniform(*np.log([150, 600]))))
+    )
 
 
 FAMILIES: dict[str, Callable[[np.random.Generator], World]] = {

@@ -524,7 +524,7 @@ def test_neighbours_of_a_group_are_fitted_with_it_but_published_once(
     assert max(len(targets) for _, targets in fitted) > 1
     assert len(found.names) == 3
     for name, mode in zip(found.names, modes, strict=True):
-        assert np.abs(deviations(found, name, mode.frequency, mode.damping_ratio)).max() < 4
+        assert np.abs(deviations(found, name, mode.frequency, mode.damping)).max() < 4
 
 
 def test_spectra_reach_as_far_as_modes_are_looked_for(
