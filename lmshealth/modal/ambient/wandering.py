@@ -27,6 +27,8 @@ _CLOSE, _ALIKE = 0.03, 0.5
 # Power over that of everything else from which on the signal stands out.
 _STANDS_OUT = 2.0
 _LEAST_ORDINATES = 8
+# Its tails reach beyond where it stands out, by this share of that band to either side.
+_WIDER = 0.3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -115,10 +117,15 @@ def _test(model: JointModel, i: int, recording: Recording) -> tuple[float, Harmo
     amplitude = np.sqrt(2 * mean_square) * abs(phi[channel]) * model.data.scale[channel]
     strength = 1e2 * float(level[within].max())
     physical = phi * model.data.scale
+    more = _WIDER * float(wide[-1] - wide[0])
     harmonic = Harmonic(
-        float(np.average(wide, weights=np.abs(z[within]) ** 2)), float(wide[0]), float(wide[-1]),
-        float(amplitude), channel, strength * np.outer(physical, physical.conj()),
-    )  # fmt: skip
+        float(np.average(wide, weights=np.abs(z[within]) ** 2)),
+        float(wide[0]) - more,
+        float(wide[-1]) + more,
+        float(amplitude),
+        channel,
+        strength * np.outer(physical, physical.conj()),
+    )
     return min(sigmas), harmonic
 
 
