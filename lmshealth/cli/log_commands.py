@@ -92,7 +92,7 @@ def modes(ctx: click.Context, /, **given: Any) -> None:
 
     def show(rejected: list[Row]) -> None:
         if found:
-            views.print_modes(rows, rejected, stage)
+            views.print_modes(rows, rejected)
             if rows and stage is None and band is None:
                 terminal.print_text(_NO_BAND)
 

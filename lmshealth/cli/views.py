@@ -32,7 +32,6 @@ if TYPE_CHECKING:  # so that --help does not import pandas and scipy
     from lmshealth.prognosis.maintenance_decision import ProbabilityBounds, Service
     from lmshealth.report.assessment import Life, ParameterHealth, Summary
     from lmshealth.report.tables import Row
-    from lmshealth.stage.description import Stage
     from lmshealth.tracking.track import Track
 
 _KM = 1000.0
@@ -52,8 +51,8 @@ _VERDICTS = {
 # --- Single logs ---
 
 
-def print_modes(rows: Sequence[Row], refused: Sequence[Row], stage: Stage | None = None) -> None:
-    """Print modes with their standard deviations, and what differs from the description."""
+def print_modes(rows: Sequence[Row], refused: Sequence[Row]) -> None:
+    """Print modes with their standard deviations."""
     logs = short_names([row["log"] for row in rows])
     cells = []
     for row in rows:
@@ -75,38 +74,7 @@ def print_modes(rows: Sequence[Row], refused: Sequence[Row], stage: Stage | None
         print_table("Modes (± one standard deviation)", cells, 3)
     else:
         print_text("No modes found.")
-    if stage is not None:
-        _print_declared(rows, logs, stage)
     print_refused(refused)
-
-
-def _print_declared(rows: Sequence[Row], logs: dict[str, str], stage: Stage) -> None:
-    """Print the declared beside the found values of modes whose names need a check."""
-    described = {spec.name: spec for spec in stage.modes}
-    cells = []
-    for row in rows:
-        if {"off-description", "doubtful-name"}.isdisjoint(row["flags"].split()):
-            continue
-        spec = described[row["mode"]]
-        cells.append(
-            {
-                "log": logs[row["log"]],
-                "mode": row["mode"],
-                "declared Hz": fixed(spec.frequency_hz, 3),
-                "found Hz": fixed(row["frequency_hz"], 3),
-                "off %": f"{100 * (row['frequency_hz'] / spec.frequency_hz - 1):+.1f}",
-                "declared damping %": f"{100 * spec.damping_ratio:.2f}",
-                "found damping %": f"{100 * row['damping_ratio']:.2f}",
-            }
-        )
-    if cells:
-        print_table(
-            "Warning: declared and found differ, or another mode may have the name", cells, 2
-        )
-        print_text(
-            "A new machine must agree with its description: correct it, or describe the modes that "
-            "it lacks. On a worn machine compare with its baseline."
-        )
 
 
 def print_frf(

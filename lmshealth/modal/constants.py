@@ -21,12 +21,6 @@ MOST_TOGETHER = 4
 # Probability of an assignment from which on a resonance gets the name; pairings below the second
 # are not quoted in a refusal.
 CLEAR_NAME, UNLIKELY_NAME = 0.8, 0.01
-# Probability below which the name of a mode beside undescribed ones is flagged as doubtful: one
-# wrong name in twenty of those without a flag at most.
-SURE_NAME = 0.95
-# Beside undescribed resonances: standard deviation of the common shift, as a share of the search,
-# of a machine that stands at its description; scale of ln ζ about the described one.
-NO_SHIFT, DAMPING_PRIOR = 1 / 10, 0.5
 # Log likelihood that a named mode gains over a missed mode and an unknown resonance.
 MATCH = 3.5
 # Largest factor between the damping ratio found and the one described.
@@ -34,14 +28,6 @@ DAMPING_SPAN = 6.0
 # Standard deviations of the prior of shifts of ln f, as shares of the search: common to all modes
 # (wear of a guide moves them together), and of each mode alone.
 COMMON_SHIFT, OWN_SHIFT = 1 / 2, 1 / 6
-# Most resonances beside the described modes that are fitted with them, and fits with those that a
-# fit has left unexplained. They must gain PRESENT in log likelihood, and exceed both sides by this
-# ratio: a misfit of flanks does not.
-MOST_UNDESCRIBED, UNDESCRIBED_ROUNDS, PEAK_RATIO = 6, 3, 1.2
-# Differences from the description that are flagged as off-description: 3 % of frequency, which no
-# error of a search or of a modal map explains, and this factor of damping, beyond two standard
-# deviations.
-OFF_FREQUENCY, OFF_DAMPING = 0.03, 2.5
 
 # Ambient identification
 

@@ -23,9 +23,8 @@ from lmshealth.modal.ambient.cluster_modes import (
     merge_close_modes,
     refuse_close_modes,
 )
-from lmshealth.modal.ambient.undescribed import NamedFits, fit_undescribed
 from lmshealth.modal.modes import Modes, merge, numbered
-from lmshealth.modal.naming import assign, flag_names
+from lmshealth.modal.naming import assign
 from lmshealth.modal.targets import Target, choose_channels, choose_targets
 from lmshealth.signal.segments import Segment, find_phases, stationary
 from lmshealth.signal.spectra import ANY_RESONANCE, LogSpectra, ResonanceRange, cross_spectra
@@ -101,14 +100,12 @@ def identify(
     if stage is None:
         targets, tested = _search(log, used, stretches, spectra, band)
         spectra = spectra.without([frequency for _, frequency, _ in tested])
-    top = _TOP * log.sample_rate
+    top, groups = _TOP * log.sample_rate, clusters(targets)
     if stage is None:
-        named = NamedFits([_fit_found(spectra, one, targets, top) for one in clusters(targets)])
+        fits = [_fit_found(spectra, cluster, targets, top) for cluster in groups]
     else:
-        named = _fit_described(spectra, targets, top)
-    fits, undescribed, doubtful = named
-    refused = [Refusal(log.name, *why) for why in undescribed]
-    refused += [refusal for fit in fits for refusal in fit.refusals(log.name)]
+        fits = [_fit_described(spectra, cluster, targets, top) for cluster in groups]
+    refused = [refusal for fit in fits for refusal in fit.refusals(log.name)]
     found = [fit.modes for fit in fits if fit.modes is not None]
     masked = [line for one in found for line in one.lines]
     seen = [*tested, *spectra.removed_lines, *masked]
@@ -118,7 +115,7 @@ def identify(
         anything = any(one.names for one in found)
         refused = [] if anything else [_nothing_found(log, lines, refused)]
     modes = merge([one.modes for one in found], lines, (*log.refused, *refused), spectra.channels)
-    return numbered(modes) if stage is None else flag_names(modes, stage, doubtful)
+    return numbered(modes) if stage is None else modes
 
 
 def _transform(
@@ -197,20 +194,13 @@ def _search(
     return find_peaks(each, low, high, [frequency for _, frequency, _ in tested]), tested
 
 
-def _fit_described(spectra: LogSpectra, targets: tuple[Target, ...], top: float) -> NamedFits:
-    """Locate and fit described modes, and what they do not explain; name it, reject close modes."""
-    searched, fits, groups = [], [], clusters(targets)
-    for cluster in groups:
-        binned = bin_cluster(spectra, cluster, targets, top, searched=True)
-        binned, located = locate(binned, cluster)
-        searched.append(binned)
-        fits.append(fit_cluster(spectra, binned, located))
-    named = fit_undescribed(spectra, searched, fits, targets, top)
-    return named or NamedFits([_named(*pair) for pair in zip(fits, groups, strict=True)])
-
-
-def _named(fit: ClusterFit, cluster: tuple[Target, ...]) -> ClusterFit:
-    """Name the resonances of a cluster that are all described, and reject close modes."""
+def _fit_described(
+    spectra: LogSpectra, cluster: tuple[Target, ...], targets: tuple[Target, ...], top: float
+) -> ClusterFit:
+    """Fit a described cluster: locate it, fit it, name what was found, reject close modes."""
+    binned = bin_cluster(spectra, cluster, targets, top, searched=True)
+    binned, located = locate(binned, cluster)
+    fit = fit_cluster(spectra, binned, located)
     found = fit.modes
     if found is not None and found.names:
         # A mode may have started at the frequency of another.

@@ -55,8 +55,7 @@ class Modes:
     flags : tuple of str
         Of each mode, separated by blanks: ``resolution-limited`` (few Fourier frequencies in the
         half-power bandwidth), ``at-bound`` (frequency or damping at the end of the search),
-        ``loose-fit`` (dispersion above 1.5), ``cluster`` (represents two close modes),
-        ``off-description`` (frequency or damping), ``doubtful-name`` (may be another mode's).
+        ``loose-fit`` (dispersion above 1.5), ``cluster`` (represents two close modes).
     shape_channels : tuple of str
         Channels of the shapes; empty where shapes were not identified.
     shapes : ndarray

@@ -7,13 +7,12 @@ or name competes for (`name_response`): tracking assigns the rest.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from itertools import combinations
 
 import numpy as np
 from scipy.special import softmax
-from scipy.stats import norm
 
 from lmshealth._arrays import BoolArray, FloatArray
 from lmshealth.modal import constants
@@ -28,16 +27,12 @@ def assign(
     *,
     damping: Sequence[float] | None = None,
     complete: bool = False,
-    undescribed: bool = False,
-    clear: float = constants.CLEAR_NAME,
 ) -> tuple[tuple[str, ...], dict[str, Rejection]]:
     """Assign resonances to targets by the posterior of all order-preserving assignments.
 
     The prior of an assignment is that of its shifts of ln f (`shift_cost`) and a gain for every
     pair. Pairs outside the search, or with another damping where it is given, are excluded.
-    Resonances, in Hz, and targets ascend; ``complete`` states that every resonance is a target,
-    ``undescribed`` that some are none: then the damping counts, and that the machine stands at its
-    description is as likely as that it is worn. A name needs the probability ``clear``.
+    Resonances, in Hz, and targets ascend; ``complete`` states that every resonance is a target.
 
     Returns the name of each resonance, empty where it is no target or the assignment is not clear,
     and the targets that are not assigned but may be one of the resonances.
@@ -65,17 +60,10 @@ def assign(
         len(i) * constants.MATCH - (shift_cost(shift[i, j][None], search[j], len(i))[0] if i else 0)
         for i, j in pairings
     ]
-    if undescribed and damping is not None:
-        weights = [
-            w + _description_gain(shift[pair], search[pair[1]], np.log(ratio[pair]))
-            if pair[0]
-            else w
-            for w, pair in zip(weights, pairings, strict=True)
-        ]
     for pairing, weight in zip(pairings, softmax(weights) if weights else (), strict=True):
         probability[pairing] += weight
     names = tuple(
-        targets[int(np.argmax(row))].name if row.size and row.max() >= clear else ""
+        targets[int(np.argmax(row))].name if row.size and row.max() >= constants.CLEAR_NAME else ""
         for row in probability
     )
     # With complete assignments a named resonance cannot be another target as well.
@@ -88,19 +76,6 @@ def assign(
             remedy = "the assignment is not clear; excite the other modes, or narrow searches"
             ambiguous[target.name] = Rejection("ambiguous", f"{odds}: {remedy}")
     return names, ambiguous
-
-
-def _description_gain(shift: FloatArray, search: FloatArray, ln_ratio: FloatArray) -> float:
-    """Return the gain in log prior where the machine may stand at its description.
-
-    ``ln_ratio`` holds ln of the damping ratios over the described ones, ``(n_modes,)``; heavy
-    tails, as descriptions of dampings are rough.
-    """
-    common, reach = shift.mean(), search.mean()
-    scales = reach * np.array([constants.COMMON_SHIFT, constants.NO_SHIFT])
-    worn, new = norm.logpdf(common, scale=scales)
-    gain = np.log1p(np.exp(new - worn)) - np.log(2)
-    return float(gain - np.sum(np.log1p(0.5 * (ln_ratio / constants.DAMPING_PRIOR) ** 2)))
 
 
 def _odds(frequency: float, probability: FloatArray, targets: Sequence[Target]) -> str:
@@ -127,28 +102,6 @@ def shift_cost(shifts: FloatArray, search: FloatArray, own: int) -> FloatArray:
 def is_near(target: Target, frequency: float, *, slack: float = 1.0) -> bool:
     """Return whether a frequency in Hz is within so many times the search of a target."""
     return bool(abs(np.log(frequency / target.frequency)) <= slack * np.log1p(target.search))
-
-
-def flag_names(modes: Modes, stage: Stage, doubtful: Collection[str]) -> Modes:
-    """Flag modes that differ much from their description or from each other, and doubtful names.
-
-    A name is doubtful, too, at the described frequency of a mode that is found elsewhere.
-    """
-    described = {mode.name: [mode.frequency_hz, mode.damping_ratio] for mode in stage.modes}
-    nominal = np.log([described[name] for name in modes.names]).reshape(-1, 2)
-    limit = np.log([1 + constants.OFF_FREQUENCY, constants.OFF_DAMPING])
-    reach = limit + 2 * np.sqrt(np.diag(modes.cov)).reshape(2, -1).T
-    apart = modes.estimate.reshape(2, -1).T - nominal
-    alone = apart[:, 0] - (apart[:, 0].mean() if apart.size else 0.0)
-    off = (np.abs(apart) > reach).any(axis=1) | (np.abs(alone) > reach[:, 0])
-    taken = (np.abs(modes.ln_frequency[:, None] - nominal[off, 0]) < limit[0]).any(axis=1) & ~off
-    flags = []
-    for i, name in enumerate(modes.names):
-        own = modes.flags[i].split()
-        own += ["off-description"] * bool(off[i])
-        own += ["doubtful-name"] * bool(name in doubtful or taken[i])
-        flags.append(" ".join(own))
-    return replace(modes, flags=tuple(flags))
 
 
 def name_response(modes: Modes, stage: Stage) -> Modes:

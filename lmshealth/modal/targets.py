@@ -21,7 +21,6 @@ class Target:
     damping_ratio: float  # start value
     search: float  # half width of the search, as a fraction of the frequency
     nominal: float | None = None  # described frequency in Hz, once the start value is another
-    undescribed: bool = False  # beside a description: kept only with evidence of the full fit
 
     def band(self, widths: float) -> tuple[float, float]:
         """Return the band in Hz within so many damping ratios of the frequency."""

@@ -44,7 +44,6 @@ from tests.lives import (
     make_prognosis,
     make_stage,
 )
-from tests.signals import make_stage as describe
 
 __all__ = ["make"]
 NAN, STAGE = float("nan"), load_stage("lms-y")
@@ -129,19 +128,6 @@ def test_an_error_without_harmonics_above_the_floor_shows_a_dash(
     out = capsys.readouterr().out
     assert "delta_e_2" in out
     assert "corrupt" in out
-
-
-def test_declared_and_found_stand_side_by_side(capsys: pytest.CaptureFixture[str]) -> None:
-    """A mode off its description is shown with both values and a next step; others are not."""
-    row = {"log": "a.h5", "mode": "roll", "channel": "acc", "frequency_hz": 136.4, "snr": 100.0}
-    row |= {"frequency_std_hz": 0.1, "damping_ratio": 0.015, "damping_ratio_std": 0.001}
-    stage = describe([("roll", 126.5, 0.0147)])
-    print_modes([row | {"flags": "at-bound off-description"}], [], stage)
-    words = " ".join(capsys.readouterr().out.split())
-    assert "roll 126.500 136.400 +7.8 1.47 1.50" in words
-    assert "correct it, or describe the modes that it lacks" in words
-    print_modes([row | {"flags": "at-bound"}], [], stage)
-    assert "declared" not in capsys.readouterr().out
 
 
 def test_refusals_alone_are_shown(capsys: pytest.CaptureFixture[str]) -> None:

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 
-from lmshealth.modal.modes import Modes, Rejection, estimates_only
-from lmshealth.modal.naming import assign, flag_names, name_response, why_unnamed
+from lmshealth.modal.modes import Rejection, estimates_only
+from lmshealth.modal.naming import assign, name_response, why_unnamed
 from lmshealth.modal.targets import Target
 from tests.signals import make_stage
 
@@ -67,34 +65,6 @@ def test_a_damping_far_off_belongs_to_something_else() -> None:
     """Of two resonances near one target, one ten times as damped, the other has the name."""
     result = assign([98.0, 112.5], TARGETS[:1], damping=[0.2, 0.02])
     assert result == (("", "roll"), {})
-
-
-def test_unshifted_beside_an_undescribed_mode_beats_a_shift_to_the_neighbours() -> None:
-    """With 126.5, 136.4 and 155.1 Hz the described 126.5 and 136.5 Hz keep their places."""
-    described = (Target("roll", 126.5, 0.015, 0.15), Target("pitch", 136.5, 0.015, 0.15))
-    found, damping = [126.5, 136.4, 155.1], [0.015, 0.015, 0.017]
-    assert assign(found, described, damping=damping, undescribed=True)[0] == ("roll", "pitch", "")
-    # A regular row of modes shifted by its spacing is never certain.
-    described = tuple(
-        Target(name, f, 0.015, 0.15) for name, f in zip("abc", (126, 137, 148), strict=True)
-    )
-    sure = assign(
-        [117, 126, 137, 148], described, damping=[0.015] * 4, undescribed=True, clear=0.95
-    )
-    assert set(sure[0]) == {""}
-
-
-def flagged(frequency: float, damping: float, std: float = 1e-3) -> Modes:
-    """Flag one estimate of a mode described as 126 Hz and 1.5 %."""
-    cov = np.diag([std, 0.1]) ** 2
-    one = estimates_only(np.log([frequency, damping]), cov, np.ones(1), "acc", ["acc_0"])
-    return flag_names(replace(one, names=("roll",)), make_stage([("roll", 126.0, 0.015)]), ())
-
-
-def test_a_mode_off_its_description_is_flagged() -> None:
-    """So is one by 4 % or a factor of 4 of damping, not one by 2 % or with a wide interval."""
-    assert flagged(121.0, 0.015).flags == flagged(126.0, 0.06).flags == ("off-description",)
-    assert flagged(123.5, 0.02).flags == flagged(121.0, 0.015, std=0.02).flags == ("",)
 
 
 def test_the_reason_for_no_name_lists_which_modes_are_searched_for_there() -> None:

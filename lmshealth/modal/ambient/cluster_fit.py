@@ -142,7 +142,9 @@ def incoherent_fit(
     ...)``.
     """
     frequency, count = binned.frequency, binned.count
-    design = _design(frequency, f, zeta)
+    beta = f[..., None, :] / frequency[:, None]
+    shapes = 1 / ((1 - beta**2) ** 2 + (2 * zeta[..., None, :] * beta) ** 2)
+    design = np.concatenate([shapes, np.ones((*shapes.shape[:-1], 1))], axis=-1)
     unit = design.mean(axis=-2)
     design = design / unit[..., None, :]
     levels = binned.level.reshape(-1, *[1] * (f.ndim - 1), count.size)
@@ -159,20 +161,6 @@ def incoherent_fit(
     model = (design @ weight[..., None])[..., 0]
     misfit = np.sum(count * (np.log(model) + levels / model), axis=-1)
     return weight / unit, np.asarray(misfit)
-
-
-def incoherent_model(binned: BinnedSpectra, targets: Sequence[Target]) -> FloatArray:
-    """Return the PSD of targets and white noise as fitted, ``(n_channels, n_bins)``."""
-    f = np.array([mode.frequency for mode in targets])
-    zeta = np.array([mode.damping_ratio for mode in targets])
-    return np.asarray(incoherent_fit(binned, f, zeta)[0] @ _design(binned.frequency, f, zeta).T)
-
-
-def _design(frequency: FloatArray, f: FloatArray, zeta: FloatArray) -> FloatArray:
-    """Return the PSD per unit of modes and white noise, ``(..., n_bins, n_modes + 1)``."""
-    beta = f[..., None, :] / frequency[:, None]
-    shapes = 1 / ((1 - beta**2) ** 2 + (2 * zeta[..., None, :] * beta) ** 2)
-    return np.concatenate([shapes, np.ones((*shapes.shape[:-1], 1))], axis=-1)
 
 
 def locate(
@@ -407,9 +395,7 @@ def _fit_and_prune(
     optimum = _solve(data, blocks, present)
     pruned: list[Target] = []
     while present:
-        doubtful = [
-            i for i, t in enumerate(present) if t.undescribed or gains[t.name] < constants.PRESENT
-        ]
+        doubtful = [i for i, t in enumerate(present) if gains[t.name] < constants.PRESENT]
         less = {i: _solve(data, blocks, present[:i] + present[i + 1 :]) for i in doubtful}
         margin = {i: evidence(optimum, one) - constants.EVIDENCE_MARGIN for i, one in less.items()}
         worst = min(margin, key=lambda i: margin[i], default=None)
