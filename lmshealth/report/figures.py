@@ -73,20 +73,20 @@ def svg(draw: Callable[[Axes], object], *, salt: str, size: tuple[float, float] 
     ...). Screen readers skip the figure, because the page contains its information as text. All
     identifiers start with ``salt`` (letters, digits, dashes), which is unique on the page.
     """
-    text = print_figure(lambda figure: draw(figure.add_subplot()), size, salt=salt).decode()
+    return inline(lambda figure: draw(figure.add_subplot()), salt=salt, size=size)
+
+
+def inline(draw: Callable[[Figure], object], *, salt: str, size: tuple[float, float]) -> str:
+    """Draw a whole figure as `svg` draws one with a single plot."""
+    text = print_figure(draw, size, salt=salt).decode()
     text = _LINK.sub(r'<g class="hint" fill-opacity="0.004"><title>\1</title>', text)
     text = text.replace("</a>", "</g>").replace(_CLEAR, "")
     text = compact(text[text.index("<svg") :])
     # Glyphs and groups have the same identifiers in every figure: make them unique.
     text = re.sub(r'(\sid="|href="#|url\(#)', rf"\g<1>{salt}-", text)
-    return themed(text)
-
-
-def themed(svg: str) -> str:
-    """Let the colours of an SVG element follow the style sheet of its page; readers skip it."""
     for colour, name in _NAMED.items():
-        svg = svg.replace(colour, f"var(--{name}, {colour})")
-    return svg.replace("<svg ", '<svg aria-hidden="true" focusable="false" ', 1)
+        text = text.replace(colour, f"var(--{name}, {colour})")
+    return text.replace("<svg ", '<svg aria-hidden="true" focusable="false" ', 1)
 
 
 def print_figure(

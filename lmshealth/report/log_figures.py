@@ -12,6 +12,7 @@ import numpy as np
 from scipy.optimize import isotonic_regression
 
 from lmshealth._arrays import FloatArray
+from lmshealth._files import write_bytes, write_text
 from lmshealth.errors import BadLog
 from lmshealth.io.log import Channel, Log, Refusal
 from lmshealth.modal.frf.identification import FrfReading
@@ -19,7 +20,6 @@ from lmshealth.modal.modes import Modes
 from lmshealth.modal.targets import choose_channels
 from lmshealth.report import figures
 from lmshealth.report.rendering import render
-from lmshealth.report.svg import compact
 from lmshealth.report.text import spell
 from lmshealth.signal.segments import find_segments, select_segments
 from lmshealth.signal.spectra import periodogram
@@ -125,10 +125,9 @@ def response_figure(
 def write_figure(path: Path, figure: LogFigure) -> None:
     """Write a figure as ``.svg``, ``.png`` or an HTML page with tables of modes and refusals."""
     if path.suffix == ".html":
-        text = figures.print_figure(figure.draw, figure.size).decode()
-        svg = figures.themed(compact(text[text.index("<svg") :]))
+        svg = figures.inline(figure.draw, salt="log", size=figure.size)
         page = render("log.html.j2", title=figure.title, modes=figure.modes, svg=svg)
-        path.write_text(page, encoding="utf-8")
+        write_text(path, page)
         return
     notes = _notes(figure.modes)
     width, height = figure.size
@@ -142,7 +141,7 @@ def write_figure(path: Path, figure: LogFigure) -> None:
         lower.text(0.01, 1, "\n".join(notes), va="top", size=7.5, linespacing=1.3)
 
     kind, size = path.suffix[1:], (width, height + below)
-    path.write_bytes(figures.print_figure(draw, size, kind=kind, paper="#ffffff"))
+    write_bytes(path, figures.print_figure(draw, size, kind=kind, paper="#ffffff"))
 
 
 def _size(n_panels: int, modes: Modes) -> tuple[float, float]:

@@ -187,7 +187,7 @@ class Reference:
     seconds: float
 
     def command(self, out: Path, store: str, *more: str) -> list[str]:
-        """Return the command that analyses the batch, by its own workers if nothing is said."""
+        """Return the command that analyses the batch, by default with its own workers."""
         workers = more or ("--workers", str(self.workers))
         return [*self.analyse, "--out", str(out), "--store", store, *workers]
 

@@ -137,11 +137,17 @@ def killed(
                                   "when": when(reference, store, out),
                                   "gone_s": 0.0 if how == "worker"
                                   else round(run.gone_after(), 2)})  # fmt: skip
-                status, said = run.status(), run.messages()
+                status, messages = run.status(), run.messages()
             if how == "SIGINT":
-                kills[-1] |= {"told": one_line(said), "lines": len(said), "last": said[-1:]}
-            elif not (status in (driving.SOME_REFUSED, ENDS.get(how)) or (how and one_line(said))):
-                other_ends.append(f"{how or 'not killed'}: {status}: {said[-3:]}")
+                kills[-1] |= {
+                    "told": one_line(messages),
+                    "lines": len(messages),
+                    "last": messages[-1:],
+                }
+            elif not (
+                status in (driving.SOME_REFUSED, ENDS.get(how)) or (how and one_line(messages))
+            ):
+                other_ends.append(f"{how or 'not killed'}: {status}: {messages[-3:]}")
                 if len(other_ends) > MOST_OTHER:
                     raise RuntimeError(f"the batch does not come to its end: {other_ends}")
         differences = reference.judge(out, store)

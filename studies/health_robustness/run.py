@@ -227,7 +227,7 @@ def fleet_of(
     laws = drawn_cases(stage, n_law, sizes, BY_LAW, world)
     result: Row = {"rows": [], "lost": []}
     for arm in arms or ARMS[world]:
-        # One epoch cannot tell errors that are new at every log from others.
+        # One epoch does not separate errors that are new at every log from others.
         last = [] if arm.independent else [last_of(one, arm) for one in paths]
         by_laws, lost = whole_lives(laws, arm)
         result["rows"] += rows({"last": last} | by_laws, stage, {"world": world, "arm": arm.name})

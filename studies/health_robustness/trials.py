@@ -82,7 +82,7 @@ class Arm:
 
     name: str
     model_std: float  # Relative error of the map's sensitivities
-    shrink: float = 1.0  # Factor on the covariance of estimates, which it does not know
+    shrink: float = 1.0  # Factor on the covariance of estimates, unknown to the estimator
     independent: float = 0.0  # Relative error of the map, as if it were new at every log
 
 

@@ -38,7 +38,7 @@ damping_ratio = {BEAM.damping_ratio}
 search = {BEAM.search}
 """
 _HEALTH = f"""
-# The reading of the roller's position sensor; its scale to millimetres is not told. The map is
+# The reading of the roller's position sensor; its scale to millimetres is not published. The map is
 # made from repeats 0 and 1, the baseline is the mean position of their first dwells that were read.
 [[parameter]]
 name = "{PARAMETER}"

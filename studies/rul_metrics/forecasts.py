@@ -41,7 +41,7 @@ def all_ways(
     draws, seconds = {LINE: linear(history, stage, rng)}, {}
     begin = time.process_time()
     try:
-        # Chains would take five times as long, and say the same (sbc_life judges both).
+        # Chains would take five times as long, with the same results (sbc_life judges both).
         life = fit_life(history, stage, seed, chains=False)
     except NotConverged:
         life = None
