@@ -3,23 +3,17 @@
 from __future__ import annotations
 
 from datetime import datetime
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 
 from lmshealth._arrays import FloatArray
 from lmshealth.report import constants
+from lmshealth.stage.degradation_laws import AnyLaw
 
 _KM = 1000.0
 GAP = "\u202f"  # narrow no-break space between a number and its unit, and between thousands
 _UNITS = {"c": "°C", "kg": "kg", "mm": "mm"}
-_LAWS = {
-    "hertz-wear": "wear of the contacts (Hertz)",
-    "loosening": "loosening towards a floor",
-    "power": "loss as a power of travel",
-    "linear": "loss in proportion to travel",
-    "none": "no change",
-}
 
 Number = float | np.floating[Any]
 
@@ -42,7 +36,8 @@ def covariate(column: str) -> tuple[str, str]:
 
 def law(kind: str) -> str:
     """Return the description of a degradation law."""
-    return _LAWS.get(kind, kind)
+    labels = {law.__struct_config__.tag: law.label for law in get_args(AnyLaw)}
+    return str(labels.get(kind, kind))
 
 
 def moment(when: datetime) -> str:

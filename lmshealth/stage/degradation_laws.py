@@ -19,15 +19,18 @@ _LARGEST_LN = 300
 
 
 class Law(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """A degradation law: health as a fraction of its initial value over travel in m.
+    """A degradation law: health, as a fraction of its value at the begin, over travel from there.
 
-    ``theta`` are its natural parameters, ``y`` the sampling coordinates, in which the posterior of
-    a partly worn machine is close to a Gaussian; ``now`` is the travel of that machine in m.
+    A law of k natural parameters ``theta``, shape ``(n, k)`` (of equation and prior, such as a life
+    in m), is sampled in k coordinates ``y``, shape ``(n, k)``, without bounds. They may depend on
+    ``now``, the present travel in m, so that the posterior is close to a Gaussian: the logs
+    determine the loss up to now rather than the life. README.md has the steps to add a law.
     """
 
     # Prior probability in proportion to the other laws of the parameter.
     weight: Annotated[float, msgspec.Meta(gt=0, le=1e6)] = 1.0
-    names: ClassVar[tuple[str, ...]] = ()  # names of the natural parameters, one per coordinate
+    names: ClassVar[tuple[str, ...]] = ()  # of the natural parameters: columns of theta
+    label: ClassVar[str]  # words of the report
 
     @property
     def kind(self) -> str:
@@ -80,6 +83,7 @@ class HertzWear(Law, frozen=True, tag="hertz-wear", tag_field="kind"):
     life_km: Prior
     exponent: Uniform = Uniform(0.7, 1.6)
     outer: ClassVar[float] = 1.5
+    label: ClassVar[str] = "wear of the contacts (Hertz)"
     names: ClassVar[tuple[str, ...]] = ("life_m", "exponent")
 
     def __post_init__(self) -> None:
@@ -122,6 +126,7 @@ class Power(HertzWear, frozen=True, tag="power", tag_field="kind"):
     """Loss as a power of travel: h(s) = 1 - (s / s_p)^n, without a physical model."""
 
     outer: ClassVar[float] = 1.0
+    label: ClassVar[str] = "loss as a power of travel"
 
 
 class Loosening(Law, frozen=True, tag="loosening", tag_field="kind"):
@@ -129,6 +134,7 @@ class Loosening(Law, frozen=True, tag="loosening", tag_field="kind"):
 
     life_km: Prior
     floor: Prior
+    label: ClassVar[str] = "loosening towards a floor"
     names: ClassVar[tuple[str, ...]] = ("floor", "life_m")
 
     def __post_init__(self) -> None:
@@ -173,6 +179,7 @@ class Linear(Law, frozen=True, tag="linear", tag_field="kind"):
     """Loss proportional to travel: h(s) = 1 - r s; a negative rate is a gain."""
 
     rate_per_km: Prior
+    label: ClassVar[str] = "loss in proportion to travel"
     names: ClassVar[tuple[str, ...]] = ("rate_per_m",)
 
     def natural(self, y: FloatArray, now: float) -> FloatArray:
@@ -202,6 +209,8 @@ class Linear(Law, frozen=True, tag="linear", tag_field="kind"):
 
 class Unchanging(Law, frozen=True, tag="none", tag_field="kind"):
     """No degradation: h(s) = 1."""
+
+    label: ClassVar[str] = "no change"
 
     def natural(self, y: FloatArray, now: float) -> FloatArray:
         """Return the empty coordinates as they are."""

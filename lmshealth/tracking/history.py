@@ -289,7 +289,7 @@ def build_history(
 def _without_contradictions(
     ordered: tuple[LogEstimates, ...],
 ) -> tuple[tuple[LogEstimates, ...], list[Refusal]]:
-    """Keep the longest run of logs with an ascending odometer; refuse the others.
+    """Keep the longest run of logs whose odometer never decreases; refuse the others.
 
     One mistyped odometer contradicts all logs after or before it, and is the one that is refused.
     """
@@ -314,7 +314,8 @@ def _without_contradictions(
             log=reading.log,
             reason="odometer",
             detail=f"travel_km {travel[k] / 1000:g} contradicts the logs recorded before or after "
-            "it: an odometer never runs backwards; correct it in manifest.csv",
+            "it: an odometer never runs backwards; correct it in manifest.csv (after a "
+            "replaced or reset odometer add its last reading to all later rows)",
         )
         for k, reading in enumerate(ordered)
         if k not in kept

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from itertools import pairwise
+from typing import get_args
 
 import msgspec
 import numpy as np
@@ -19,7 +20,7 @@ from lmshealth.stage.degradation_laws import (
     Power,
     Unchanging,
 )
-from lmshealth.stage.priors import Lognormal, Normal, Uniform
+from lmshealth.stage.priors import Lognormal, Normal, Prior, Uniform
 
 NOW = 1.7e6
 WEAR = HertzWear(Lognormal(8000, 1.0), Uniform(0.7, 1.6))
@@ -30,18 +31,20 @@ LAWS = [WEAR, LOOSE, POWER, LINEAR]
 NAMES = ["hertz-wear", "loosening", "power", "linear"]
 
 
+def natural_prior(law: AnyLaw, name: str) -> tuple[Prior, float]:
+    """Prior of a natural parameter, and the unit of its field over that of the parameter."""
+    unit = 1e-3 if name.endswith("_m") else 1.0
+    unit = 1 / unit if name.endswith("_per_m") else unit
+    return getattr(law, f"{name.removesuffix('_m')}_km" if name.endswith("_m") else name), unit
+
+
 def natural_log_prior(law: AnyLaw, theta: np.ndarray) -> float:
-    """Log prior density of natural parameters, lengths in m, written out law by law."""
-    per_km = np.log(1000)
-    if isinstance(law, HertzWear):  # power is one of them
-        value = law.life_km.log_density(theta[:1] / 1000) - per_km
-        value = value + law.exponent.log_density(theta[1:])
-    elif isinstance(law, Loosening):
-        value = law.life_km.log_density(theta[1:] / 1000) - per_km
-        value = value + law.floor.log_density(theta[:1])
-    else:
-        value = law.rate_per_km.log_density(theta[:1] * 1000) + per_km
-    return float(value[0])
+    """Log prior density of natural parameters, lengths in m."""
+    total = 0.0
+    for name, value in zip(law.names, theta, strict=True):
+        prior, unit = natural_prior(law, name)
+        total += float(prior.log_density(np.array([value * unit]))[0] + np.log(unit))
+    return total
 
 
 def numerical_log_jacobian(law: AnyLaw, y: np.ndarray) -> float:
@@ -67,17 +70,15 @@ def test_prior_in_coordinates_is_the_natural_one_times_the_jacobian(law: AnyLaw)
     np.testing.assert_allclose(found, known, atol=2e-5)
 
 
-@pytest.mark.parametrize(
-    ("law", "column", "unit"),
-    [(WEAR, 0, 1e-3), (POWER, 0, 1e-3), (LOOSE, 1, 1e-3), (LINEAR, 0, 1e3)],
-)
-def test_draws_follow_the_prior(law: AnyLaw, column: int, unit: float) -> None:
-    """Draws, turned to natural parameters, have the quantiles of the stated prior."""
+@pytest.mark.parametrize("law", LAWS, ids=NAMES)
+def test_draws_follow_the_prior(law: AnyLaw) -> None:
+    """Draws, turned to natural parameters, have the quantiles of the stated priors."""
     theta = law.natural(law.draw(np.random.default_rng(2), 20_000, NOW), NOW)
-    prior = law.rate_per_km if isinstance(law, Linear) else law.life_km
-    for level in (0.1, 0.5, 0.9):
-        share = np.mean(theta[:, column] * unit < prior.quantile(level))
-        assert abs(share - level) < 5 * np.sqrt(level * (1 - level) / 20_000)
+    for name, values in zip(law.names, theta.T, strict=True):
+        prior, unit = natural_prior(law, name)
+        for level in (0.1, 0.5, 0.9):
+            share = np.mean(values * unit < prior.quantile(level))
+            assert abs(share - level) < 5 * np.sqrt(level * (1 - level) / 20_000)
 
 
 @pytest.mark.parametrize("law", [*LAWS, Unchanging()], ids=[*NAMES, "none"])
@@ -147,6 +148,12 @@ def test_before_it_begins_a_law_changes_nothing(law: AnyLaw) -> None:
     """Travel below 0 is of a time before the law: health is whole."""
     theta = law.natural(law.draw(np.random.default_rng(10), 20, NOW), NOW)
     np.testing.assert_allclose(law.health(theta, np.array([-1e6, 0.0])), 1.0, atol=1e-14)
+
+
+def test_every_law_of_a_description_is_tested() -> None:
+    """The laws above are all that a description may name, each with a label for reports."""
+    assert {type(law) for law in [*LAWS, Unchanging()]} == set(get_args(AnyLaw))
+    assert all(law.label for law in get_args(AnyLaw))
 
 
 @pytest.mark.parametrize(
