@@ -285,7 +285,7 @@ def print_stage(content: dict[str, list[Row]]) -> None:
             "map Hz": fixed(row["map_hz"], 1),
             "at limits": fixed(row["map_at_limits_hz"], 1),
             "map error": exponent(row["surrogate_error_ln_f"]),
-            "log std": exponent(row["logs_reach_ln_f"]),
+            "drift std": exponent(row["logs_reach_ln_f"]),
         }
         for row in content["modes"]
     ]
@@ -328,8 +328,9 @@ def _print_identifiability(stage: Row, parameters: Sequence[Row]) -> None:
     print_table("Standard deviation of the parameters", cells)
     print_text(
         f"logs: {stage['n_logs']} logs of {stage['seconds_per_log']:g} s now and at the baseline, "
-        "averaged over the priors (Cramér-Rao bound). map error, log std: of ln f. informed: share "
-        "of the prior variance that the logs remove; identifiable from 50 % on."
+        "averaged over the priors (Cramér-Rao bound). map error: of ln f. drift std: of the drift "
+        "of ln f between these two groups. informed: expected share of the prior variance of the "
+        "ln parameter that the logs remove; identifiable from 50 % on."
     )
     click.echo()
 
@@ -464,8 +465,9 @@ def print_health(health: Health) -> None:
     when, n_epochs = day(health.recorded_at[-1]), len(health.recorded_at)
     print_table(f"{health.stage}: health at {when}, the last of {n_epochs} epochs", cells)
     print_text(
-        "informed: share of the prior variance that the data remove; prior × 2: shift of the "
-        "median and factor on the interval with priors twice as wide, within the map."
+        "informed: share of the prior variance of the ln parameter that the data remove; "
+        "prior × 2: shift of the median and factor on the interval with priors twice as wide, "
+        "within the map."
     )
     for j, k in combinations(range(len(health.parameters)), 2):
         rho = health.correlation[-1, j, k]
@@ -497,7 +499,7 @@ def _print_doubts(health: Health) -> None:
             )
         if not health.identifiable[-1, j]:
             print_text(f"{name}: not identifiable from the tracked modes; see `lmshealth stage`.")
-        elif health.explained and not health.informed_parameters()[j]:
+        elif health.explained and not health.publishable_parameters()[j]:
             print_text(f"{name}: not determined by these drifts.")
     for when, converged in zip(health.recorded_at, health.converged, strict=True):
         if not converged:

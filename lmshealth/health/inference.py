@@ -146,9 +146,9 @@ def infer_together(
     ...     drifts = Drifts(name, when, np.array([1e6]), modes, drift, cov)
     ...     machines.append((drifts, stage))
     >>> both = lmshealth.infer_together(machines, ["guide_preload"], seed=0)
-    >>> rows = zip(both.parameters, both.latest(0.5), both.informed_parameters())
-    >>> for name, median, informed in rows:
-    ...     print(f"{name}: {median:.2f}" if informed else f"{name}: not informed")
+    >>> rows = zip(both.parameters, both.latest(0.5), both.publishable_parameters())
+    >>> for name, median, publishable in rows:
+    ...     print(f"{name}: {median:.2f}" if publishable else f"{name}: not informed")
     guide_preload: 0.80
     lms-x:mount_stiffness: not informed
     lms-y:mount_stiffness: 0.90

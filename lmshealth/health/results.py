@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from itertools import combinations
@@ -30,8 +31,6 @@ CHECKS = (
 class Health:
     """Posterior of the health parameters per epoch, as fractions of their baseline value.
 
-    Attributes
-    ----------
     Arrays have the shape ``(n_epochs, n_parameters)`` where none is stated.
 
     Attributes
@@ -112,7 +111,7 @@ class Health:
         """Smaller effective sample size, shape ``(n_epochs, n_parameters)``."""
         return np.minimum(self.ess_bulk, self.ess_tail)
 
-    def informed_parameters(self) -> BoolArray:
+    def publishable_parameters(self) -> BoolArray:
         """Return which values of the last epoch may be published, shape ``(n_parameters,)``.
 
         The sampler converged, the drifts are explained, and the parameter is identifiable and
@@ -120,6 +119,11 @@ class Health:
         """
         valid = bool(self.converged[-1]) and self.explained
         return np.asarray(valid & self.identifiable[-1] & (self.informed[-1] >= INFORMED))
+
+    def informed_parameters(self) -> BoolArray:
+        """Return `publishable_parameters`; deprecated name."""
+        warnings.warn("use Health.publishable_parameters", DeprecationWarning, stacklevel=2)
+        return self.publishable_parameters()
 
     @property
     def explained(self) -> bool:

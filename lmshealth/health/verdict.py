@@ -121,7 +121,7 @@ def _reason_for_no_verdict(stage: Stage, history: History, health: Health | None
         p = f"{health.fit[-1]:.1g}"
         found = f"No state of the parameters on the map explains the drifts (p = {p})"
         return f"{found}: something else moved the modes, or the map is wrong."
-    if not health.informed_parameters().any():
+    if not health.publishable_parameters().any():
         return "The data do not constrain any health parameter."
     return ""
 
@@ -158,7 +158,7 @@ def _judge_step(
     when, moved = history.recorded_at[last].date().isoformat(), sizes.replace("-", "−")
     why = f"The frequencies jumped before the log of {when} ({moved}), and no declared maintenance "
     why += "explains it."
-    if health is not None and health.informed_parameters().any():
+    if health is not None and health.publishable_parameters().any():
         why += " " + _parameter_sentences(stage, health)
     evidence = max(event.evidence for event in jumps)
     return Verdict(history.stage, history.recorded_at[-1], "step", float(expit(evidence)), why)
@@ -166,7 +166,7 @@ def _judge_step(
 
 def _judge_posterior(stage: Stage, history: History, health: Health) -> Verdict:
     lost: dict[str, BoolArray] = {}
-    for j in np.flatnonzero(health.informed_parameters()).tolist():
+    for j in np.flatnonzero(health.publishable_parameters()).tolist():
         parameter = stage.parameters[j]
         below = health.samples[-1, :, j] < degraded_below(parameter)
         lost[parameter.word] = lost.get(parameter.word, False) | below
@@ -180,7 +180,7 @@ def _judge_posterior(stage: Stage, history: History, health: Health) -> Verdict:
 
 def _parameter_sentences(stage: Stage, health: Health) -> str:
     quantiles = health.latest(np.array([0.05, 0.5, 0.95]))
-    informed = health.informed_parameters()
+    informed = health.publishable_parameters()
     sentences = []
     for j, parameter in enumerate(stage.parameters):
         name = parameter.name.replace("_", " ").capitalize()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
@@ -34,7 +35,7 @@ _N_ENSEMBLES, _N_PRIOR, _N_SETTINGS = 4, 10_000, 500
 _N_ROUGH, _N_FINE = 600, 2000
 # Share of the posterior of the grid points that are dropped once a scenario is sampled.
 _NEGLIGIBLE = 0.01
-_CHECKS = ("ess_bulk", "ess_tail", "r_hat", "informed")
+_CHECKS = ("ess_bulk", "ess_tail", "r_hat", "interval_shrinkage")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -136,7 +137,7 @@ class ScenarioPosterior:
     r_hat: FloatArray
     # One minus the squared ratio of posterior to prior width of the 90 % interval of each
     # natural parameter, at least 0, shape ``(n_dim,)``.
-    informed: FloatArray
+    interval_shrinkage: FloatArray
     n_mixture: int  # draws of each ensemble that represent this scenario in the mixture of all
 
     def __post_init__(self) -> None:
@@ -145,6 +146,12 @@ class ScenarioPosterior:
         for name in _CHECKS:
             expect_shape(name, getattr(self, name), (n,))
         freeze(self)
+
+    @property
+    def informed(self) -> FloatArray:
+        """`interval_shrinkage`; deprecated name."""
+        warnings.warn("use interval_shrinkage", DeprecationWarning, stacklevel=2)
+        return self.interval_shrinkage
 
     @property
     def scenario(self) -> Scenario:
@@ -442,14 +449,14 @@ def _sampled_scenarios(
             ess_bulk=draws.ess_bulk,
             ess_tail=draws.ess_tail,
             r_hat=draws.r_hat,
-            informed=_informed(density.scenario, draws.thinned(n_kept)),
+            interval_shrinkage=_interval_shrinkage(density.scenario, draws.thinned(n_kept)),
             n_mixture=int(share),
         )
         sampled.append(one)
     return tuple(sampled)
 
 
-def _informed(scenario: Scenario, y: FloatArray) -> FloatArray:
+def _interval_shrinkage(scenario: Scenario, y: FloatArray) -> FloatArray:
     if not scenario.n_dim:
         return np.empty(0)
     prior = scenario.natural(scenario.draw(np.random.default_rng(0), _N_PRIOR))

@@ -83,7 +83,7 @@ class ParameterHealth:
     name: str
     determined: bool  # whether the data determine it; else its interval is mostly the prior
     converged: bool  # whether the sampler converged
-    informed: float  # share of the prior variance that the data remove
+    informed: float  # as `Health.informed`
     low: float  # low, median, high: 5, 50 and 95 % quantiles, as fractions of the baseline
     median: float
     high: float
@@ -224,7 +224,7 @@ def _parameters(assessment: Assessment) -> Iterator[ParameterHealth]:
         below = np.nan if limit is None else float(np.mean(health.samples[-1, :, k] < limit))
         yield ParameterHealth(
             name=name,
-            determined=bool(health.informed_parameters()[k]),
+            determined=bool(health.publishable_parameters()[k]),
             converged=bool(health.converged[-1]),
             informed=float(health.informed[-1, k]),
             low=low,

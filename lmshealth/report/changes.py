@@ -55,7 +55,7 @@ def reported(assessment: Assessment, service: Service | None = None) -> Reported
     determined: dict[str, Any] = {}
     if health is not None:
         levels = health.latest(np.array(LEVELS)).T.tolist()
-        for k in np.flatnonzero(health.informed_parameters()):
+        for k in np.flatnonzero(health.publishable_parameters()):
             determined[health.parameters[k]] = tuple(levels[k])
     remaining: Any = None if prognosis is None else quantiles(prognosis.censored()[:, -1])
     return Reported(

@@ -299,7 +299,7 @@ def _levels(ax: Axes, limit: float | None) -> None:
 
 def _is_informed(health: Health, parameter: str) -> bool:
     """Return whether the data of the last epoch determine a parameter."""
-    informed = dict(zip(health.parameters, health.informed_parameters(), strict=True))
+    informed = dict(zip(health.parameters, health.publishable_parameters(), strict=True))
     return bool(informed.get(parameter, False))
 
 

@@ -439,6 +439,6 @@ def _parameter_row(check: ParameterCheck) -> Row:
         "endless_logs_std_ln": check.endless_std,
         "exact_map_std_ln": check.exact_map_std,
         "others_known_std_ln": check.known_std,
-        "informed": check.informed(check.usual_std),
+        "informed": check.variance_removed(check.usual_std),
         "verdict": check.verdict,
     }

@@ -84,7 +84,7 @@ class ParameterCheck:
         """Whether the limit, if there is one, lies inside the map."""
         return self.spec.limit is None or self.spec.limit.below > self.low
 
-    def informed(self, std: float) -> float:
+    def variance_removed(self, std: float) -> float:
         """Return the share of the prior variance removed by data that leave this deviation."""
         return 1 - (std / self.prior_std) ** 2
 
@@ -206,7 +206,9 @@ def _check_parameter(
         ("longer-logs", found.endless_std),
         ("together", found.known_std),
     )
-    passed = (verdict for verdict, std in cases if found.informed(std) >= constants.INFORMED)
+    passed = (
+        verdict for verdict, std in cases if found.variance_removed(std) >= constants.INFORMED
+    )
     return replace(found, verdict=next(passed, "not-told"))
 
 
@@ -264,7 +266,7 @@ def _identified(checked: StageCheck, parameter: ParameterCheck) -> Diagnostic:
             f"{name} is not identifiable: its standard deviation is {after} after {logs}, "
             f"{unlimited} after unlimited logs and {prior} in the prior. "
         )
-        if parameter.informed(parameter.exact_map_std) >= constants.INFORMED:
+        if parameter.variance_removed(parameter.exact_map_std) >= constants.INFORMED:
             text += (
                 "Its effect on the modes is less than the map's error (model_std) in the effects "
                 f"of the others; with an exact map it would be {_share(parameter.exact_map_std)}. "

@@ -93,7 +93,7 @@ def told(health: Health, truth: tuple[float, ...]) -> Row:
             "level": float(np.mean(draws < truth[j])),
             "half_level": float(np.mean(half < np.log(truth[j]))),
             "width": float(np.ptp(np.log(np.quantile(draws, [0.05, 0.95])))),
-            "told": bool(health.informed_parameters()[j]),
+            "told": bool(health.publishable_parameters()[j]),
         }
     return rows
 

@@ -489,11 +489,11 @@ def test_unexplained_drifts_inform_no_parameter(tmp_path: Path) -> None:
     fine = infer(epochs([right], cov), stage, 1)
     assert fine.fit[-1] > 0.01
     assert fine.explained
-    assert fine.informed_parameters().all()
+    assert fine.publishable_parameters().all()
     wrong = infer(epochs([right * [1, -1, 1]], cov), stage, 1)
     assert wrong.fit[-1] < 1e-6
     assert not wrong.explained
-    assert not wrong.informed_parameters().any()
+    assert not wrong.publishable_parameters().any()
 
 
 @pytest.mark.slow
@@ -527,7 +527,7 @@ def test_an_epoch_without_convergence_informs_no_parameter(
     monkeypatch.setattr(inference, "sample", fail)
     found = infer(worn, stage, 1)
     assert (found.informed > 0.9).all()
-    assert not found.informed_parameters().any()
+    assert not found.publishable_parameters().any()
     assert found.at_edge[-1].tolist() == [True, False]
     assert found.fit[-1] < 1e-6
 

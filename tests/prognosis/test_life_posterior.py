@@ -114,7 +114,7 @@ def forked(unchained: LifePosterior) -> LifePosterior:
             ess_bulk=900.0 - 100 * k - steps,
             ess_tail=800.0 - 100 * k - steps,
             r_hat=1.001 + 0.004 * k + 1e-4 * steps,
-            informed=0.9 - 0.4 * k - 0.01 * steps,
+            interval_shrinkage=0.9 - 0.4 * k - 0.01 * steps,
             n_mixture=int(100 * probability),
         )
         for k, probability in enumerate((0.75, 0.25))
@@ -225,8 +225,8 @@ def test_a_life_has_its_diagnostics(found: LifePosterior) -> None:
     assert way.n_mixture == found.health.shape[1] == 2500
     assert found.worst_r_hat < 1.01
     assert found.ess > 1000
-    assert way.informed[0] > 0.9
-    assert way.informed[1] < way.informed[0]
+    assert way.interval_shrinkage[0] > 0.9
+    assert way.interval_shrinkage[1] < way.interval_shrinkage[0]
     assert np.corrcoef(np.log(found.health.reshape(-1, 2)).T)[0, 1] < -0.5
     ratio = found.chi_square / found.degrees_of_freedom
     assert 0.2 < ratio < 2.5
@@ -406,7 +406,7 @@ def test_a_life_goes_to_arviz_and_back(found: LifePosterior, tmp_path: Path) -> 
     assert float(checks["chi_square"]) == found.chi_square
     assert float(checks["probability_1"]) == 1
     name = "mount_stiffness.loosening.floor"
-    assert float(checks[f"informed_1_{name}"]) == found.scenarios[0].informed[2]
+    assert float(checks[f"interval_shrinkage_1_{name}"]) == found.scenarios[0].interval_shrinkage[2]
 
 
 @pytest.mark.slow
@@ -431,8 +431,8 @@ def test_a_life_is_a_table(found: LifePosterior) -> None:
     ]
     assert list(table["way"]) == [0, 0, 1, 1, 1, 1]
     assert table.loc["guide_preload", "median"] == np.median(found.health[..., 0])
-    informed = found.scenarios[0].informed
-    assert table.loc["guide_preload.hertz-wear.life_m", "informed"] == informed[0]
+    shrinkage = found.scenarios[0].interval_shrinkage
+    assert table.loc["guide_preload.hertz-wear.life_m", "interval_shrinkage"] == shrinkage[0]
     assert (table["q05"] < table["q95"]).all()
 
 
@@ -450,7 +450,7 @@ def test_a_table_and_arviz_have_every_scenario(forked: LifePosterior) -> None:
         for i, name in enumerate(rows.index):
             np.testing.assert_array_equal(tree[f"way_{k}"][name], way.chains[..., i])
             assert rows.loc[name, "median"] == np.median(way.chains[..., i])
-            for what in ("ess_bulk", "ess_tail", "r_hat", "informed"):
+            for what in ("ess_bulk", "ess_tail", "r_hat", "interval_shrinkage"):
                 value = getattr(way, what)[i]
                 assert rows.loc[name, what] == float(checks[f"{what}_{k}_{name}"]) == value
 

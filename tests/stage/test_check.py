@@ -92,7 +92,7 @@ def test_one_parameter_and_one_mode_are_the_closed_form(tmp_path: Path) -> None:
     assert check.exact_map_std == pytest.approx(left(noise))
     assert check.endless_std == pytest.approx(left(error), rel=1e-3)
     assert check.known_std == pytest.approx(check.endless_std)
-    assert check.informed(check.prior_std / 2) == pytest.approx(0.75)
+    assert check.variance_removed(check.prior_std / 2) == pytest.approx(0.75)
     assert check_stage(stage).correlation == pytest.approx(np.eye(1))
 
 
