@@ -21,6 +21,15 @@ def freeze(result: Any) -> None:
             value.setflags(write=False)
 
 
+class ReadOnly:
+    """Base of frozen dataclasses whose arrays are read-only."""
+
+    __slots__ = ()
+
+    def __post_init__(self) -> None:
+        freeze(self)
+
+
 def expect_shape(name: str, array: np.ndarray[Any, Any], shape: tuple[int, ...]) -> None:
     """Require the shape of a field.
 

@@ -155,7 +155,7 @@ def run(
         resources = Resources(store, pool, progress)
         columns, limit = settings.columns, settings.max_memory
         ingested = ingest(folder, stages, resources, out=out, columns=columns, max_memory=limit)
-        refused = (*ingested.refused, *work.refused)
+        refused = (*ingested.refused, *(one.refusal for one in work.unread))
         by_digest = {stage.digest: stage for stage in stages}
         described = {name: by_digest[own] for name, own in ingested.descriptions.items()}
         options = {"epochs": settings.epochs, "seed": settings.seed}

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.random import MT19937, RandomState
 
-from lmshealth._arrays import FloatArray, freeze
+from lmshealth._arrays import FloatArray, ReadOnly
 from lmshealth.errors import NotConverged
 from lmshealth.health import constants
 from lmshealth.health.importance_sampling import importance_sample, tempered
@@ -28,7 +28,7 @@ _N_PRIOR, _N_START = 1000, 1000
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Sample:
+class Sample(ReadOnly):
     """Draws from a posterior with their convergence diagnostics."""
 
     # Of every ensemble after burn-in, step after step and in a step walker after walker,
@@ -40,9 +40,6 @@ class Sample:
     ess_tail: FloatArray
     r_hat: FloatArray
     autocorrelation_time: FloatArray
-
-    def __post_init__(self) -> None:
-        freeze(self)
 
     def thinned(self, n: int) -> FloatArray:
         """Thin each ensemble to n draws: ``(n_ensembles, n, n_dim)``."""

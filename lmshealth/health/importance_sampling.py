@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import gammaln, logsumexp
 
-from lmshealth._arrays import FloatArray, freeze
+from lmshealth._arrays import FloatArray, ReadOnly
 from lmshealth.errors import NotConverged
 from lmshealth.health import constants
 from lmshealth.health.laplace import LogProbability
@@ -20,15 +20,12 @@ _GOOD_SHARE = 0.3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class WeightedDraws:
+class WeightedDraws(ReadOnly):
     """Draws of a density ``(n, n_dim)``, normalised weights ``(n,)``, and log of its integral."""
 
     points: FloatArray
     weight: FloatArray
     log_evidence: float
-
-    def __post_init__(self) -> None:
-        freeze(self)
 
     @property
     def ess(self) -> float:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import Bounds, minimize
 
-from lmshealth._arrays import FloatArray, freeze
+from lmshealth._arrays import FloatArray, ReadOnly
 
 LogProbability = Callable[[FloatArray], FloatArray]
 """Log density of many points at once: ``(n_points, n_dim)`` to ``(n_points,)``."""
@@ -20,14 +20,11 @@ _SEARCHES = 3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Laplace:
+class Laplace(ReadOnly):
     """Maximum of a density, and inverse of the negative Hessian of its logarithm there."""
 
     mode: FloatArray
     cov: FloatArray
-
-    def __post_init__(self) -> None:
-        freeze(self)
 
     @property
     def std(self) -> FloatArray:

@@ -7,7 +7,7 @@ from datetime import UTC, datetime
 
 import numpy as np
 
-from lmshealth._arrays import FloatArray, freeze
+from lmshealth._arrays import FloatArray, ReadOnly
 from lmshealth.errors import NotEnoughData
 from lmshealth.prognosis import constants
 from lmshealth.prognosis.scenarios import Scenario, list_scenarios
@@ -16,7 +16,7 @@ from lmshealth.tracking.history import History
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class LifeData:
+class LifeData(ReadOnly):
     """Data of a life, ordered by series, and those of a series by log."""
 
     stage: Stage
@@ -34,9 +34,6 @@ class LifeData:
     # its mode, shape ``(n_data,)``.
     rows: np.ndarray
     y: FloatArray
-
-    def __post_init__(self) -> None:
-        freeze(self)
 
     @classmethod
     def select(cls, history: History, stage: Stage) -> LifeData:

@@ -13,7 +13,7 @@ from itertools import product
 import numpy as np
 from scipy.linalg import qr, solve_triangular
 
-from lmshealth._arrays import BoolArray, FloatArray, freeze
+from lmshealth._arrays import BoolArray, FloatArray, ReadOnly
 from lmshealth.errors import NotEnoughData
 from lmshealth.health.epoch_posterior import one_at_a_time
 from lmshealth.prognosis import constants
@@ -30,7 +30,7 @@ _N_EXAMPLES, _RESIDUAL = 300, 1e-8
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class LifeCovariance:
+class LifeCovariance(ReadOnly):
     """Parts of the covariance Σ of the data, each of shape ``(n_data, n_data)``.
 
     `fixed` has intercepts, covariates, biases and declared steps; `noise` the reported covariances
@@ -42,9 +42,6 @@ class LifeCovariance:
     noise: FloatArray
     walk: FloatArray
     deviation: FloatArray
-
-    def __post_init__(self) -> None:
-        freeze(self)
 
     @classmethod
     def of(cls, data: LifeData) -> LifeCovariance:
@@ -93,7 +90,7 @@ def _offsets(data: LifeData, same: BoolArray) -> FloatArray:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class NodeBasis:
+class NodeBasis(ReadOnly):
     """Nodes: logs ``(n_nodes,)`` whose drifts determine those of all logs linearly.
 
     `weights` are W, shape ``(n_logs, n_nodes)``. `moments` are the travel in m since the baseline
@@ -104,9 +101,6 @@ class NodeBasis:
     nodes: np.ndarray
     weights: FloatArray
     moments: FloatArray
-
-    def __post_init__(self) -> None:
-        freeze(self)
 
     @classmethod
     def of(cls, data: LifeData) -> NodeBasis:

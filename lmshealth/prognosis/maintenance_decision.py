@@ -8,7 +8,7 @@ from typing import Literal
 
 import numpy as np
 
-from lmshealth._arrays import FloatArray, freeze
+from lmshealth._arrays import FloatArray, ReadOnly
 from lmshealth.prognosis import constants
 from lmshealth.prognosis.results import Prognosis
 from lmshealth.stage.description import Decision
@@ -17,7 +17,7 @@ _SECONDS_PER_DAY = 86_400.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class ProbabilityBounds:
+class ProbabilityBounds(ReadOnly):
     """Bounds of the probability to reach each limit, ``any`` last, ``(n_parameters + 1,)``.
 
     They differ if draws pass the horizon before that day, beyond which nothing is published: such
@@ -26,9 +26,6 @@ class ProbabilityBounds:
 
     at_least: FloatArray
     at_most: FloatArray
-
-    def __post_init__(self) -> None:
-        freeze(self)
 
 
 @dataclass(frozen=True, slots=True)

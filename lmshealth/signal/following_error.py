@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import signal
 
-from lmshealth._arrays import FloatArray, freeze
+from lmshealth._arrays import FloatArray, ReadOnly
 from lmshealth.errors import BadLog
 from lmshealth.io.log import Channel, Log
 from lmshealth.signal import constants
@@ -24,7 +24,7 @@ from lmshealth.signal.segments import (
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class FollowingError:
+class FollowingError(ReadOnly):
     """Statistics and harmonics of one following-error channel of a log."""
 
     channel: str
@@ -39,9 +39,6 @@ class FollowingError:
     harmonics: Harmonics  # of the longest gap-free stretch, at most of a minute at 20 kHz
     kept: Indices  # indices of the strongest harmonics, strongest first, shape ``(n_kept,)``
     floor: float  # amplitude in m above which a harmonic is no noise
-
-    def __post_init__(self) -> None:
-        freeze(self)
 
     @property
     def above(self) -> Indices:

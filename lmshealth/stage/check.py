@@ -12,7 +12,7 @@ from typing import Literal
 
 import numpy as np
 
-from lmshealth._arrays import FloatArray, freeze
+from lmshealth._arrays import FloatArray, ReadOnly
 from lmshealth.stage import constants
 from lmshealth.stage.description import ModeSpec, ParameterSpec, Stage
 from lmshealth.stage.identifiability import Identifiability, identifiability_of
@@ -45,7 +45,7 @@ class ModeCheck:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class ParameterCheck:
+class ParameterCheck(ReadOnly):
     """Range of the map and identifiability of one parameter; ``std`` is of its logarithm."""
 
     spec: ParameterSpec
@@ -71,9 +71,6 @@ class ParameterCheck:
     # Of the parameters in the combination, its own being 1, shape ``(n_parameters,)``.
     exponents: FloatArray
 
-    def __post_init__(self) -> None:
-        freeze(self)
-
     @property
     def name(self) -> str:
         """Name of the parameter."""
@@ -90,7 +87,7 @@ class ParameterCheck:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class StageCheck:
+class StageCheck(ReadOnly):
     """Capabilities of a stage description; without a map it has no parameters."""
 
     name: str
@@ -110,9 +107,6 @@ class StageCheck:
     n_logs: int
     model_std: float
     unused: tuple[str, ...]
-
-    def __post_init__(self) -> None:
-        freeze(self)
 
 
 def check_stage(stage: Stage) -> StageCheck:

@@ -47,10 +47,10 @@ def regressors(covariates: Mapping[str, FloatArray], stage: Stage | None) -> tup
         if not offset.any():  # it never leaves its reference
             continue
         # Of the values up to each log: no log uses later ones.
-        spread = pd.Series(values).expanding().std(ddof=0).fillna(0.0).clip(lower=1.0).to_numpy()
-        unknown = np.where(known, 0.0, (covariate.prior_std * spread) ** 2)
+        std = pd.Series(values).expanding().std(ddof=0).fillna(0.0).clip(lower=1.0).to_numpy()
+        unknown = np.where(known, 0.0, (covariate.prior_std * std) ** 2)
         found.append(Regressor(covariate.name, offset, covariate.prior_std, unknown))
         if covariate.curvature_std:
-            name, std = f"{covariate.name}^2", covariate.curvature_std
-            found.append(Regressor(name, offset**2, std, np.zeros_like(unknown)))
+            square = (f"{covariate.name}^2", offset**2, covariate.curvature_std)
+            found.append(Regressor(*square, np.zeros_like(unknown)))
     return tuple(found)

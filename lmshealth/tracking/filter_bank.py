@@ -241,7 +241,6 @@ def update(
     white = (half @ off[:, :, None])[:, :, 0]
     gain = half @ np.swapaxes(crossed, 1, 2)
     nis = np.square(white).sum(axis=1)
-    innovation = _innovation(rows, bank.weight, off, total, outlying)
     log_det = np.log(root[:, i, i]).sum(axis=1)
     reduction = np.swapaxes(gain, 1, 2) @ gain
     updated = FilterBank(
@@ -250,7 +249,12 @@ def update(
         bank.mean + (white[:, None, :] @ gain)[:, 0, :],
         np.subtract(bank.cov, reduction, out=reduction),
     )
-    return updated, innovation
+    centre, cov = _mixture(bank.weight, off, total)
+    if outlying is not None:
+        kept = np.flatnonzero(~outlying[rows])
+        rows, centre, cov = rows[kept], centre[kept], cov[np.ix_(kept, kept)]
+    squared = float(centre @ np.linalg.solve(cov, centre))
+    return updated, Innovation(rows, centre / np.sqrt(cov.diagonal()), squared)
 
 
 def advance(model: FilterModel, bank: FilterBank, first: int, last: int) -> FilterBank:
@@ -296,22 +300,6 @@ def _mixture(
     n = centre.size
     within = (weight @ cov.reshape(-1, n * n)).reshape(n, n)
     return centre, within + (off * weight[:, None]).T @ off
-
-
-def _innovation(
-    rows: np.ndarray,
-    weight: FloatArray,
-    off: FloatArray,
-    total: FloatArray,
-    outlying: np.ndarray | None,
-) -> Innovation:
-    """Standardise innovations by their mean and covariance over all filters."""
-    centre, cov = _mixture(weight, off, total)
-    if outlying is not None:
-        kept = np.flatnonzero(~outlying[rows])
-        rows, centre, cov = rows[kept], centre[kept], cov[np.ix_(kept, kept)]
-    nis = float(centre @ np.linalg.solve(cov, centre))
-    return Innovation(rows, centre / np.sqrt(cov.diagonal()), nis)
 
 
 def _diagonal(cov: FloatArray, rows: slice, columns: slice | None = None) -> FloatArray:

@@ -11,7 +11,7 @@ from typing import Literal
 
 import numpy as np
 
-from lmshealth._arrays import BoolArray, FloatArray, expect_shape, freeze
+from lmshealth._arrays import BoolArray, FloatArray, ReadOnly, expect_shape, freeze
 from lmshealth.errors import NotEnoughData
 from lmshealth.io.log import Metadata, Refusal
 from lmshealth.modal.modes import Modes
@@ -39,7 +39,7 @@ class Series:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Step:
+class Step(ReadOnly):
     """A sudden change of the estimates between two logs.
 
     ``step``: the modes change without a declared cause. ``regreasing``: their dampings change.
@@ -53,9 +53,6 @@ class Step:
     source: str = ""  # of a sensor; empty for all sources
     name: str = ""  # its ``servo_id``, or a date
     declared: bool = True  # else it was detected
-
-    def __post_init__(self) -> None:
-        freeze(self)
 
     @property
     def changes_modes(self) -> bool:
@@ -268,7 +265,18 @@ def build_history(
         prior_std=np.array([one.prior_std for one in regressed]),
         jumps={step.first for step in steps},
     )
-    refused += _unassigned(ordered, estimates, found)
+    # Jumps are left to the tracker.
+    refused += [
+        Refusal(
+            log=ordered[k].log,
+            mode=estimates[k].names[i],
+            source=estimates[k].sources[i],
+            reason=label.reason,
+            detail=label.detail,
+        )
+        for k, i, label in found.unassigned
+        if label.reason != "jump"
+    ]
     modes, series, columns = _line_up(estimates, found, stage)
     history = History(
         stage=str(ordered[0].metadata.stage),
@@ -396,23 +404,6 @@ def _nearest(frequency: float, stage: Stage | None) -> str:
     off = [(abs(frequency / mode.frequency_hz - 1), mode) for mode in tracked]
     near = [(away, mode.name) for away, mode in off if away <= mode.search]
     return min(near, key=lambda one: one[0], default=(0.0, ""))[1]
-
-
-def _unassigned(
-    ordered: Sequence[LogEstimates], estimates: Sequence[Estimates], found: Association
-) -> list[Refusal]:
-    """List the estimates that are assigned to no mode. Jumps are left to the tracker."""
-    return [
-        Refusal(
-            log=ordered[k].log,
-            mode=estimates[k].names[i],
-            source=estimates[k].sources[i],
-            reason=label.reason,
-            detail=label.detail,
-        )
-        for k, i, label in found.unassigned
-        if label.reason != "jump"
-    ]
 
 
 def _line_up(

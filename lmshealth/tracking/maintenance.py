@@ -46,11 +46,6 @@ class Maintenance:
     actions: tuple[Action, ...] = ()  # in the order of time
     unread: tuple[Unread, ...] = ()  # possible further actions
 
-    @property
-    def refused(self) -> tuple[Refusal, ...]:
-        """Refusals for ``refused.csv``."""
-        return tuple(one.refusal for one in self.unread)
-
     def of(self, machine: str) -> Maintenance:
         """Return the part that concerns one machine; rows without a machine concern all."""
         return Maintenance(

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from filterpy.kalman import KalmanFilter
 
-from lmshealth._arrays import FloatArray, freeze
+from lmshealth._arrays import FloatArray, ReadOnly
 from lmshealth.stage.description import Stage
 from lmshealth.tracking.filter_bank import (
     FilterBank,
@@ -28,7 +28,7 @@ _SINGULAR = 1e-10
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Smoothed:
+class Smoothed(ReadOnly):
     """Modes at every epoch given all logs; fields are as in `Track`, ``(n_epochs, n_modes)``."""
 
     ln_frequency: FloatArray
@@ -37,9 +37,6 @@ class Smoothed:
     ln_damping_std: FloatArray
     drift: FloatArray
     drift_std: FloatArray
-
-    def __post_init__(self) -> None:
-        freeze(self)
 
 
 def smooth(history: History, followed: Track, stage: Stage | None = None) -> Smoothed:

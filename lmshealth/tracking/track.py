@@ -107,66 +107,33 @@ class Consistency:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Track:
-    """Filtered modes of a machine over its life.
+    """Filtered modes of a machine over its life: no epoch uses later logs."""
 
-    Attributes
-    ----------
-    stage, logs, modes, sources : str, tuple of str
-        Names of the machine, its logs (an epoch each), modes and sources of estimates.
-    recorded_at : tuple of datetime
-        Ascending.
-    travel : ndarray
-        Odometer in m, shape ``(n_epochs,)``; NaN throughout where there is none.
-    ln_frequency, ln_frequency_std, ln_damping, ln_damping_std : ndarray
-        Filtered (no future data), covariates at their reference, shape ``(n_epochs, n_modes)``;
-        NaN before the first estimate of a mode.
-    drift : ndarray
-        ln frequency minus its value at the baseline before it, shape ``(n_epochs, n_modes)``.
-    drift_cov : ndarray
-        Covariance of the drifts of one epoch, shape ``(n_epochs, n_modes, n_modes)``.
-    effects : tuple of Effect
-        Coefficients after the last epoch.
-    events : tuple of Event
-        Steps and alarms, in order.
-    steps : tuple of Step
-        Declared and detected steps.
-    outliers : tuple of (int, str)
-        Epochs and modes whose estimates are outliers that no later log confirmed.
-    nis : ndarray
-        Normalised innovation squared, shape ``(n_epochs,)``. Logs that were filtered again with a
-        detected step have that of the last time.
-    nis_dof : ndarray
-        Its degrees of freedom, shape ``(n_epochs,)``; the first estimate of a mode has none,
-        because the filter starts from it, and outliers have none.
-    innovations : ndarray
-        Standardised innovations of ``[ln f, ln ζ]`` of all series, ``(n_epochs, 2 n_series)``.
-    noise_scale : ndarray
-        Factor on the reported standard deviations of each source, estimated from the innovations,
-        shape ``(n_epochs, n_sources)``; 1 when they are consistent.
-    widening : ndarray
-        Factor on all published standard deviations where the innovations up to that epoch are not
-        consistent, shape ``(n_epochs,)``; else 1.
-    """
-
-    stage: str
-    logs: tuple[str, ...]
-    recorded_at: tuple[datetime, ...]
-    travel: FloatArray
+    stage: str  # identity of the machine
+    logs: tuple[str, ...]  # their names, an epoch each
+    recorded_at: tuple[datetime, ...]  # ascending
+    travel: FloatArray  # odometer in m, ``(n_epochs,)``; NaN throughout where there is none
     modes: tuple[str, ...]
-    sources: tuple[str, ...]
+    sources: tuple[str, ...]  # of the estimates
+    # ln of Hz and ln ζ, covariates at their reference, ``(n_epochs, n_modes)``; NaN before the
+    # first estimate of a mode.
     ln_frequency: FloatArray
     ln_frequency_std: FloatArray
     ln_damping: FloatArray
     ln_damping_std: FloatArray
-    drift: FloatArray
-    drift_cov: FloatArray
-    effects: tuple[Effect, ...]
-    events: tuple[Event, ...]
-    steps: tuple[Step, ...]
-    outliers: tuple[tuple[int, str], ...]
+    drift: FloatArray  # ln f minus its value at the baseline before it, ``(n_epochs, n_modes)``
+    drift_cov: FloatArray  # between the modes of one epoch, ``(n_epochs, n_modes, n_modes)``
+    effects: tuple[Effect, ...]  # after the last epoch
+    events: tuple[Event, ...]  # steps and alarms, in order
+    steps: tuple[Step, ...]  # declared and detected ones
+    outliers: tuple[tuple[int, str], ...]  # epochs and modes that no later log confirmed
+    # Normalised innovation squared, ``(n_epochs,)``, of the last time that a log was filtered, and
+    # its degrees of freedom: none of outliers, and of the first estimate of a mode.
     nis: FloatArray
     nis_dof: FloatArray
-    innovations: FloatArray
+    innovations: FloatArray  # standardised, of ``[ln f, ln ζ]``, ``(n_epochs, 2 n_series)``
+    # Factor on the reported standard deviations of each source, ``(n_epochs, n_sources)``, by the
+    # innovations, and on all published ones where innovations are inconsistent, ``(n_epochs,)``.
     noise_scale: FloatArray
     widening: FloatArray
 
@@ -495,10 +462,10 @@ class _Driver:
             own = slice(jump.start, jump.start + m)
             if step.kind == "regreasing":
                 own = slice(jump.start + m, jump.stop)
-            size, spread = mean[own], cov[own, own]
+            size, size_cov = mean[own], cov[own, own]
             change, found_at = self.changes.get(j, (None, step.first))
-            evidence = change.log_bayes_factor if change else _evidence(step, size, spread)
-            std = np.sqrt(np.maximum(np.diag(spread), 0.0))
+            evidence = change.log_bayes_factor if change else _evidence(step, size, size_cov)
+            std = np.sqrt(np.maximum(np.diag(size_cov), 0.0))
             events += [
                 Event(
                     kind=step.kind,
@@ -524,9 +491,9 @@ def _drifts(space: StateSpace, mean: FloatArray, cov: FloatArray) -> tuple[Float
     early = np.arange(len(history.logs)) < history.baselines[0]
     drift[early], drift_cov[early] = np.nan, np.nan
     # At a baseline, and at its place on the clock until a step, ℓ and ℓ₀ are equal.
-    clock, spread = history.clock(), np.einsum("kmm->km", drift_cov).max(axis=1)
+    clock, variance = history.clock(), np.einsum("kmm->km", drift_cov).max(axis=1)
     for first in history.baselines:
-        still = (clock == clock[first]) & (np.arange(clock.size) > first) & (spread < _ROUNDING)
+        still = (clock == clock[first]) & (np.arange(clock.size) > first) & (variance < _ROUNDING)
         still[first] = True
         drift[still], drift_cov[still] = 0.0, 0.0
     # A variance of nearly zero may become negative by rounding, and then has no covariances.
@@ -535,11 +502,11 @@ def _drifts(space: StateSpace, mean: FloatArray, cov: FloatArray) -> tuple[Float
     return drift, drift_cov
 
 
-def _evidence(step: Step, size: FloatArray, spread: FloatArray) -> float:
+def _evidence(step: Step, size: FloatArray, cov: FloatArray) -> float:
     """Return the log Bayes factor of a declared step: the density ratio at no jump [Dickey1971]."""
     prior = constants.JUMP_STD[step.kind][1 if step.kind == "regreasing" else 0]
-    log_det = np.linalg.slogdet(spread)[1] - 2 * size.size * np.log(prior)
-    return float(0.5 * (log_det + size @ np.linalg.solve(spread, size)))
+    log_det = np.linalg.slogdet(cov)[1] - 2 * size.size * np.log(prior)
+    return float(0.5 * (log_det + size @ np.linalg.solve(cov, size)))
 
 
 def _widening(nis: FloatArray, dof: FloatArray, innovations: FloatArray) -> FloatArray:
@@ -584,8 +551,8 @@ def _effects(space: StateSpace, bank: FilterBank, sources: tuple[str, ...]) -> t
     for s, source in enumerate(sources):
         values = bank.hyperparameters.scales[:, s]
         scale = float(bank.weight @ values)
-        spread = float(np.sqrt(bank.weight @ (values - scale) ** 2))
-        effects.append(Effect("", f"scale:{source}", scale, spread))
+        std_of_scale = float(np.sqrt(bank.weight @ (values - scale) ** 2))
+        effects.append(Effect("", f"scale:{source}", scale, std_of_scale))
     return tuple(effects)
 
 

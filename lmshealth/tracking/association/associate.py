@@ -15,7 +15,7 @@ from typing import Literal
 
 import numpy as np
 
-from lmshealth._arrays import BoolArray, FloatArray, expect_shape, freeze
+from lmshealth._arrays import FloatArray, expect_shape, freeze
 from lmshealth.errors import BadTable
 from lmshealth.tracking import constants
 from lmshealth.tracking.association.hypotheses import Hypotheses, Scan, extend, reduce_hypotheses
@@ -256,15 +256,9 @@ def _repeats(state: State, log: Log) -> bool:
         mac = np.where(np.isnan(product), 0.0, product).sum(axis=1) ** 2
         if (mac < constants.LEAST_MAC).any():
             return False
-    gap = np.abs(new.ln_f[:, None] - new.ln_f)
+    names, gap = np.array(log.names), np.abs(new.ln_f[:, None] - new.ln_f)
     near = gap < constants.REPEAT_SEPARATION + reach.max()
-    return not (near & _different(log.names)).any()
-
-
-@lru_cache(maxsize=64)
-def _different(names: tuple[str, ...]) -> BoolArray:
-    """Mark pairs of different names, shape ``(n, n)``."""
-    return np.array([[a != b for b in names] for a in names])
+    return not (near & (names[:, None] != names)).any()
 
 
 @lru_cache(maxsize=256)
@@ -309,8 +303,8 @@ def _is_common_jump(places: dict[tuple[str, str], Place], log: Log, prior_std: F
         reach = constants.JUMP_LN_F + constants.JUMP_COVARIATE_GATE * change
         if not any(
             other[1] == source
-            and abs(ln_f - place) <= reach + constants.JUMP_GATE * float(np.sqrt(var + spread))
-            for other, (place, spread, _) in places.items()
+            and abs(ln_f - place) <= reach + constants.JUMP_GATE * float(np.sqrt(var + place_var))
+            for other, (place, place_var, _) in places.items()
         ):
             moved.add(name)
     return len(moved) > 1

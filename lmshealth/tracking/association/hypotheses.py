@@ -164,8 +164,8 @@ def order_gains(
     at, var = (side[:, order] for side in predicted)
     own = labels[:, :, None] == order
     ln_f = scan.measurements.ln_f
-    spread = np.sqrt(var[:, None] + scan.measurements.var_f[:, None])
-    below = ndtr((ln_f[:, None] - at[:, None]) / spread)
+    std = np.sqrt(var[:, None] + scan.measurements.var_f[:, None])
+    below = ndtr((ln_f[:, None] - at[:, None]) / std)
     shown = own.any(1)
     place = np.einsum("cnk,n->ck", own, ln_f)
     below = np.where(shown[:, None], place[:, None] < ln_f[:, None], below)
@@ -255,7 +255,7 @@ def _with_veering(now: Hypotheses, scan: Scan) -> Hypotheses:
         other.cov[:, [t, u], 0, 0] += 0.25 * np.diff(levels) ** 2
         weights = (now.log_weights + np.log(1 - chance), now.log_weights + np.log(chance))
         labels = np.concatenate([now.labels] * 2)
-        now = Hypotheses(now.filters.stack(other), np.concatenate(weights), labels)
+        now = Hypotheses(now.filters.append(other, axis=0), np.concatenate(weights), labels)
     return now
 
 
@@ -321,6 +321,6 @@ def _merge(filters: ModeFilters, i: int, group: IntArray, weights: FloatArray) -
     filters.mean[i] = mean
     ln_zeta = share @ filters.ln_zeta[group]
     known = np.isfinite(filters.var_zeta[group]).all(0)
-    spread = np.where(known, filters.var_zeta[group], 0.0) + (filters.ln_zeta[group] - ln_zeta) ** 2
-    filters.var_zeta[i] = np.where(known, share @ spread, filters.var_zeta[i])
+    square = np.where(known, filters.var_zeta[group], 0.0) + (filters.ln_zeta[group] - ln_zeta) ** 2
+    filters.var_zeta[i] = np.where(known, share @ square, filters.var_zeta[i])
     filters.ln_zeta[i] = np.where(known, ln_zeta, filters.ln_zeta[i])

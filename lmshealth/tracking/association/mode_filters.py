@@ -88,14 +88,10 @@ class ModeFilters:
 
     def join(self, other: ModeFilters) -> Self:
         """Append the modes of other filters that have one hypothesis."""
-        more = other.take(np.zeros(len(self.mean), dtype=int))
-        return self._with(more, axis=1)
+        return self.append(other.take(np.zeros(len(self.mean), dtype=int)), axis=1)
 
-    def stack(self, other: ModeFilters) -> Self:
-        """Append the hypotheses of other filters that have the same modes."""
-        return self._with(other, axis=0)
-
-    def _with(self, other: ModeFilters, axis: int) -> Self:
+    def append(self, other: ModeFilters, *, axis: int) -> Self:
+        """Append the hypotheses (axis 0) or the modes (axis 1) of other filters."""
         pairs = ((getattr(self, i.name), getattr(other, i.name)) for i in fields(self))
         return type(self)(*(np.concatenate(pair, axis) for pair in pairs))
 
