@@ -41,10 +41,6 @@ class Sample(ReadOnly):
     r_hat: FloatArray
     autocorrelation_time: FloatArray
 
-    def thinned(self, n: int) -> FloatArray:
-        """Thin each ensemble to n draws: ``(n_ensembles, n, n_dim)``."""
-        return thin(self.draws, n)
-
     @property
     def flat(self) -> FloatArray:
         """Draws of the ensembles in turn, shape ``(n_ensembles n_draws, n_dim)``."""

@@ -73,10 +73,6 @@ class EpochPosterior:
                 total[inside] += machine.log_likelihood(x[inside])
         return total
 
-    def draw_prior(self, rng: np.random.Generator, n: int) -> FloatArray:
-        """Draw ln parameters from the prior inside the map, shape ``(n, n_parameters)``."""
-        return self.prior.draw(rng, n)
-
     def fit(self, x: FloatArray) -> float:
         """Return the probability of a χ² above the smallest of these points ``(n, n_parameters)``.
 

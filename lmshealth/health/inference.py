@@ -247,7 +247,7 @@ def draw(posterior: EpochPosterior, seed: np.random.SeedSequence) -> tuple[Sampl
     points = posterior.prior.quantile(halton)
     normal = approximate(posterior.log_probability, points, low, high)
     if normal is None:
-        start = start_from_prior(posterior.log_probability, posterior.draw_prior)
+        start = start_from_prior(posterior.log_probability, posterior.prior.draw)
     else:
         start = start_near(normal.mode, normal.cov, posterior.log_probability)
     return sample(posterior.log_probability, start, seed), normal
@@ -269,7 +269,7 @@ def _infer_epoch(
         x = np.concatenate(draws)
         found["converged"] = False
     else:
-        draws, x, found["converged"] = drawn.thinned(_N_KEPT), drawn.flat, True
+        draws, x, found["converged"] = thin(drawn.draws, _N_KEPT), drawn.flat, True
         low, middle, high = np.quantile(x, _LEVELS, axis=0)
         try:
             wider = _wider_quantiles(posterior, drawn, wider_seed)

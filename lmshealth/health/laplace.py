@@ -56,15 +56,11 @@ def approximate(
         if cov is None:
             return None
         step = _STEP * np.sqrt(np.diag(cov))
-        mode = mode + cov @ _slope(log_probability, mode, step)
+        shifts = np.diag(step)
+        value = log_probability(np.concatenate([mode + shifts, mode - shifts])).reshape(2, -1)
+        mode = mode + cov @ ((value[0] - value[1]) / (2 * step))
         cov = _inverse_curvature(log_probability, mode, step, box)
     return None if cov is None else Laplace(mode=mode, cov=cov)
-
-
-def _slope(log_probability: LogProbability, x: FloatArray, step: FloatArray) -> FloatArray:
-    shifts = np.diag(step)
-    value = log_probability(np.concatenate([x + shifts, x - shifts])).reshape(2, -1)
-    return np.asarray((value[0] - value[1]) / (2 * step))
 
 
 def _inverse_curvature(

@@ -32,62 +32,36 @@ class Health:
     """Posterior of the health parameters per epoch, as fractions of their baseline value.
 
     Arrays have the shape ``(n_epochs, n_parameters)`` where none is stated.
-
-    Attributes
-    ----------
-    stage : str
-        Identity of the machine.
-    recorded_at, travel : tuple of datetime, ndarray
-        Epochs, ascending, and odometer in m, shape ``(n_epochs,)``.
-    chains : ndarray
-        Draws of the ensembles, shape ``(n_epochs, n_ensembles, n_draws, n_parameters)``.
-    ess_bulk, ess_tail, r_hat : ndarray
-        Effective sample size over all ensembles, for the middle and for the 5 and 95 % quantiles,
-        and rank-normalised split R-hat; NaN where the sampler did not converge, as are the shifts
-        and ratios.
-    converged : ndarray of bool
-        Shape ``(n_epochs,)``.
-    informed : ndarray
-        Share of the prior variance of ln parameter that the data removed, at least 0.
-    prior_width : ndarray
-        Width of the prior's 90 % interval, shape ``(n_parameters,)``.
-    identifiable : ndarray of bool
-        Whether unlimited logs with the modes of the epoch inform the parameter on average over the
-        priors. An unidentifiable one may be `informed` by chance: at drifts near 0 the map's error
-        is negligible.
-    correlation : ndarray
-        Posterior correlation of ln parameters, shape ``(n_epochs, n_parameters, n_parameters)``.
-    laplace_shift, laplace_ratio : ndarray
-        Difference of the posterior mean of ln parameter from the mode of Laplace's approximation in
-        its standard deviations, and ratio of the standard deviations; NaN also without it.
-    prior_shift, prior_ratio : ndarray
-        Change of the median of ln parameter under priors twice as wide, in posterior standard
-        deviations, and ratio of the 90 % intervals; NaN also where the map hardly lets them widen.
-    fit : ndarray
-        Upper bound of the p value of the drifts under the best draw, shape ``(n_epochs,)``.
-    at_edge : ndarray of bool
-        Whether the posterior ends at an end of the map, which then bounds the value.
     """
 
-    stage: str
-    recorded_at: tuple[datetime, ...]
-    travel: FloatArray
+    stage: str  # identity of the machine
+    recorded_at: tuple[datetime, ...]  # ascending
+    travel: FloatArray  # odometer in m, ``(n_epochs,)``
     parameters: tuple[str, ...]
-    chains: FloatArray
+    chains: FloatArray  # draws, ``(n_epochs, n_ensembles, n_draws, n_parameters)``
+    # Effective sample size over all ensembles, for the middle and for the 5 and 95 % quantiles, and
+    # rank-normalised split R-hat; NaN where the sampler did not converge, as are shifts and ratios.
     ess_bulk: FloatArray
     ess_tail: FloatArray
     r_hat: FloatArray
-    converged: BoolArray
-    informed: FloatArray
-    prior_width: FloatArray
+    converged: BoolArray  # ``(n_epochs,)``
+    informed: FloatArray  # share of the prior variance of ln parameter that the data removed
+    prior_width: FloatArray  # width of the prior's 90 % interval, ``(n_parameters,)``
+    # Whether unlimited logs with the modes of the epoch inform the parameter on average over the
+    # priors. An unidentifiable one may be `informed` by chance: at drifts near 0 the map's error is
+    # negligible.
     identifiable: BoolArray
-    correlation: FloatArray
+    correlation: FloatArray  # of ln parameters, ``(n_epochs, n_parameters, n_parameters)``
+    # Difference of the posterior mean of ln parameter from the mode of Laplace's approximation in
+    # its standard deviations, and ratio of the standard deviations; NaN also without it.
     laplace_shift: FloatArray
     laplace_ratio: FloatArray
+    # Change of the median of ln parameter under priors twice as wide, in posterior standard
+    # deviations, and ratio of the 90 % intervals; NaN also where the map hardly lets them widen.
     prior_shift: FloatArray
     prior_ratio: FloatArray
-    fit: FloatArray
-    at_edge: BoolArray
+    fit: FloatArray  # upper bound of the p value of the drifts under the best draw, ``(n_epochs,)``
+    at_edge: BoolArray  # whether the posterior ends at an end of the map, which bounds the value
     seed: tuple[int, ...]
 
     def __post_init__(self) -> None:

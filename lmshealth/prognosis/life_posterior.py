@@ -46,11 +46,6 @@ class LifeDensity:
     scenario: Scenario
     grid: Grid
 
-    @classmethod
-    def of(cls, likelihood: LifeLikelihood, scenario: Scenario) -> LifeDensity:
-        """Make the density of a scenario over the whole grid."""
-        return cls(likelihood, scenario, likelihood.grid)
-
     def log_probability(self, y: FloatArray) -> FloatArray:
         """Return the log posterior density, -inf outside the map, shape ``(n,)``.
 
@@ -125,10 +120,7 @@ class ScenarioPosterior:
     """Posterior under one scenario."""
 
     density: LifeDensity
-    # probability, evidence_std: posterior probability of the scenario, and relative standard
-    # deviation of its evidence.
-    probability: float
-    evidence_std: float
+    probability: float  # posterior probability of the scenario
     coordinates: FloatArray  # draws, shape ``(n_ensembles, n_draws, n_dim)``
     # ess_bulk, ess_tail, r_hat: as in `Health`, of the coordinates, shape ``(n_dim,)``; after
     # importance sampling the effective sample size, and NaN for R-hat.
@@ -172,35 +164,21 @@ class ScenarioPosterior:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LifePosterior:
-    """Posterior of a life, a mixture over its scenarios.
+    """Posterior of a life, a mixture over its scenarios."""
 
-    Attributes
-    ----------
-    parameters, modes : tuple of str
-        Health parameters, and modes that were used.
-    scenarios : tuple of ScenarioPosterior
-        Scenarios above the least probability, the most probable first.
-    health, off, rate : ndarray
-        Draws of the health parameters now, as fractions of baseline; deviation of ln health from
-        its law now; its variance per m of future travel. Those of the first scenario first, shape
-        ``(n_ensembles, n_draws, n_parameters)``.
-    chi_square, degrees_of_freedom : float, int
-        Of the residuals at the posterior mean of each scenario, averaged; number of data minus
-        parameters of the most probable scenario.
-    walk, noise_scale, deviation : float
-        As in `Prognosis`.
-    """
-
-    stage: str
+    stage: str  # identity of the machine
     parameters: tuple[str, ...]
-    modes: tuple[str, ...]
-    scenarios: tuple[ScenarioPosterior, ...]
+    modes: tuple[str, ...]  # those that were used
+    scenarios: tuple[ScenarioPosterior, ...]  # above the least probability, in descending order
+    # Draws of the health parameters now, as fractions of baseline; deviation of ln health from its
+    # law now; its variance per m of future travel. Those of the first scenario first, shape
+    # ``(n_ensembles, n_draws, n_parameters)``.
     health: FloatArray
     off: FloatArray
     rate: FloatArray
-    chi_square: float
-    degrees_of_freedom: int
-    walk: float
+    chi_square: float  # of the residuals at the posterior mean of each scenario, averaged
+    degrees_of_freedom: int  # number of data minus parameters of the most probable scenario
+    walk: float  # walk, noise_scale, deviation: as in `Prognosis`
     noise_scale: float
     deviation: float
     seed: tuple[int, ...]
@@ -390,7 +368,8 @@ def _weighted_scenarios(
     likelihood: LifeLikelihood, seed: np.random.SeedSequence
 ) -> list[_Explored]:
     """Return weighted draws and evidences of the scenarios that a rough evidence does not drop."""
-    densities = [LifeDensity.of(likelihood, one) for one in likelihood.data.scenarios]
+    grid = likelihood.grid
+    densities = [LifeDensity(likelihood, one, grid) for one in likelihood.data.scenarios]
     generators = [np.random.default_rng(own) for own in seed.spawn(len(densities))]
     rough = [_rough(one, rng) for one, rng in zip(densities, generators, strict=True)]
     least = max(map(_log_probability, rough)) - constants.MAX_LOG_ODDS
@@ -441,15 +420,15 @@ def _sampled_scenarios(
             y = weighted.resampled(np.random.default_rng(seeds[k]), _N_ENSEMBLES * n_kept)
             ess, unknown = np.full(n_dim, weighted.ess), np.full(n_dim, np.nan)
             draws = Sample(y.reshape(_N_ENSEMBLES, n_kept, n_dim), ess, ess, unknown, unknown)
+        coordinates = thin(draws.draws, n_kept)
         one = ScenarioPosterior(
             density=density,
             probability=float(own),
-            evidence_std=float(np.sqrt(1 / weighted.ess)) if n_dim else 0.0,
-            coordinates=draws.thinned(n_kept),
+            coordinates=coordinates,
             ess_bulk=draws.ess_bulk,
             ess_tail=draws.ess_tail,
             r_hat=draws.r_hat,
-            interval_shrinkage=_interval_shrinkage(density.scenario, draws.thinned(n_kept)),
+            interval_shrinkage=_interval_shrinkage(density.scenario, coordinates),
             n_mixture=int(share),
         )
         sampled.append(one)

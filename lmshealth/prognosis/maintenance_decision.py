@@ -30,30 +30,17 @@ class ProbabilityBounds(ReadOnly):
 
 @dataclass(frozen=True, slots=True)
 class Service:
-    """Service date of a machine, and the criterion that chose it.
+    """Service date of a machine, and the criterion that chose it."""
 
-    Attributes
-    ----------
-    kind : str
-        ``now``, ``by`` a day, ``later`` than the horizon or never, or ``unknown``.
-    by, wait : date or None, float
-        Last day, that of the last log for ``now``; days from the last log, negative if the accepted
-        risk was reached before it, infinite for ``later``, NaN for ``unknown``.
-    risk : float
-        Upper bound of the probability to reach a limit before that day; NaN without one.
-    planned, planned_risk : date or None, tuple of float
-        Next service by the description, and bounds of the probability to reach a limit before it.
-    max_risk, cost_ratio : float or None
-        Criterion: one of them is None.
-    """
-
-    kind: Literal["now", "by", "later", "unknown"]
-    by: date | None
+    kind: Literal["now", "by", "later", "unknown"]  # by a day; later than the horizon or never
+    by: date | None  # last day, that of the last log for ``now``
+    # Days from the last log, negative if the accepted risk was reached before it, infinite for
+    # ``later``, NaN for ``unknown``.
     wait: float
-    risk: float
-    planned: date | None
-    planned_risk: tuple[float, float]
-    max_risk: float | None
+    risk: float  # upper bound of the probability to reach a limit before that day; NaN without one
+    planned: date | None  # next service by the description
+    planned_risk: tuple[float, float]  # bounds of the probability to reach a limit before it
+    max_risk: float | None  # max_risk, cost_ratio: criterion; one of them is None
     cost_ratio: float | None
 
     @property

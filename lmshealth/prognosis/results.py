@@ -25,63 +25,34 @@ class LawWeight:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Prognosis:
-    """Remaining useful life of one machine.
+    """Remaining useful life of one machine, of which `n` health parameters have a limit."""
 
-    Attributes
-    ----------
-    stage : str
-        Identity of the machine.
-    recorded_at, travel : datetime, float
-        The last log, at which the prognosis is made, and the odometer then in m.
-    parameters : tuple of str
-        Health parameters with a limit, then ``any`` (the first limit reached).
-    unidentifiable : tuple of str
-        Parameters with a limit that the modes do not identify; not in `parameters` nor ``any``.
-    limits : ndarray
-        Limit of each parameter, NaN for ``any``, shape ``(n_parameters + 1,)``.
-    remaining : ndarray
-        Draws of the remaining travel in m, negative if the limit has been passed and infinite if it
-        is never reached, shape ``(n_draws, n_parameters + 1)``.
-    usage : ndarray
-        Draws of the mean travel in m per day until the end, shape ``(n_draws,)``.
-    horizon : float
-        Travel in m beyond which nothing is published.
-    health : ndarray
-        Draws of the parameters now in their units, shape ``(n_draws, n_parameters)``.
-    curve_travel, curve_quantiles : ndarray
-        Odometer grid in m of the life curves, shape ``(n_grid,)``, and 5, 25, 50, 75, 95 %
-        quantiles of the parameters there, shape ``(5, n_grid, n_parameters)``.
-    laws : tuple of LawWeight
-        Laws of each parameter, the most probable first.
-    chi_square, degrees_of_freedom : float, int
-        Of the residuals at the posterior mean; number of data minus law parameters.
-    walk, noise_scale, deviation : float
-        Posterior means: standard deviation over the history of the random walk of ln f, factor on
-        the reported standard deviations, and standard deviation at the horizon of ln health about
-        its laws.
-    ess, r_hat : float
-        Worst of all law parameters.
-    """
-
-    stage: str
-    recorded_at: datetime
-    travel: float
-    parameters: tuple[str, ...]
+    stage: str  # identity of the machine
+    recorded_at: datetime  # of the last log, at which the prognosis is made
+    travel: float  # odometer then in m
+    parameters: tuple[str, ...]  # those with a limit, then ``any`` (the first limit reached)
+    # With a limit that the modes do not identify; not in `parameters` nor ``any``.
     unidentifiable: tuple[str, ...]
-    limits: FloatArray
+    limits: FloatArray  # NaN for ``any``, ``(n + 1,)``
+    # Draws of the remaining travel in m, negative if the limit has been passed and infinite if it
+    # is never reached, ``(n_draws, n + 1)``; and of the mean travel in m per day, ``(n_draws,)``.
     remaining: FloatArray
     usage: FloatArray
-    horizon: float
-    health: FloatArray
+    horizon: float  # travel in m beyond which nothing is published
+    health: FloatArray  # draws of the parameters now in their units, ``(n_draws, n)``
+    # Odometer grid in m of the life curves, ``(n_grid,)``, and 5, 25, 50, 75, 95 % quantiles of the
+    # parameters there, ``(5, n_grid, n)``.
     curve_travel: FloatArray
     curve_quantiles: FloatArray
-    laws: tuple[LawWeight, ...]
-    chi_square: float
-    degrees_of_freedom: int
+    laws: tuple[LawWeight, ...]  # of each parameter, the most probable first
+    chi_square: float  # of the residuals at the posterior mean
+    degrees_of_freedom: int  # number of data minus law parameters
+    # Posterior means: standard deviation over the history of the random walk of ln f, factor on the
+    # reported standard deviations, standard deviation at the horizon of ln health about its laws.
     walk: float
     noise_scale: float
     deviation: float
-    ess: float
+    ess: float  # ess, r_hat: worst of all law parameters
     r_hat: float
 
     def __post_init__(self) -> None:

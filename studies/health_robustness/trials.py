@@ -290,7 +290,7 @@ def epoch_draws(
     columns = [track.modes.index(name) for name in modes]
     cov = shrink * track.drift_cov[epoch][np.ix_(columns, columns)]
     posterior = EpochPosterior.of(stage, modes, track.drift[epoch][columns], cov)
-    start = posterior.draw_prior(rng, _N_PRIOR)
+    start = posterior.prior.draw(rng, _N_PRIOR)
     found = importance_sample_to_ess(posterior.log_probability, start, rng, _N_POINTS)
     return np.asarray(np.exp(found.resampled(rng, _N_DRAWS)))
 

@@ -78,7 +78,7 @@ def ours(posterior: EpochPosterior, seed: int) -> Found:
 def start_of(posterior: EpochPosterior, seed: int) -> emcee.State:
     """Return the walkers that plain loops begin with."""
     rng = np.random.default_rng(seed)
-    begin = start_from_prior(posterior.log_probability, posterior.draw_prior)(rng)[:N_WALKERS]
+    begin = start_from_prior(posterior.log_probability, posterior.prior.draw)(rng)[:N_WALKERS]
     return emcee.State(begin, random_state=RandomState(MT19937(seed)).get_state(legacy=False))
 
 

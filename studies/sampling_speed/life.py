@@ -92,7 +92,7 @@ def two_ways(history: History, stage: Stage, walkers: int, looped: int) -> Walke
     likelihood = LifeLikelihood.of(history, stage)
     # Both parts lose: of all scenarios the one with the most to draw.
     scenario = max(likelihood.data.scenarios, key=lambda one: one.n_dim)
-    density = LifeDensity.of(likelihood, scenario)
+    density = LifeDensity(likelihood, scenario, likelihood.grid)
     begin = start_from_prior(density.log_probability, scenario.draw)
     y = np.concatenate([begin(np.random.default_rng(k)) for k in range(8)])[:walkers]
     density = density.narrowed(y)

@@ -106,7 +106,7 @@ def ranks_of(
     for k in drawn.epochs:
         cov = told.drift_cov[k][np.ix_(columns, columns)]
         posterior = EpochPosterior.of(believed, names, told.drift[k][columns], cov)
-        start = posterior.draw_prior(rng, N_PRIOR)
+        start = posterior.prior.draw(rng, N_PRIOR)
         try:
             found = importance_sample_to_ess(posterior.log_probability, start, rng, N_POINTS)
             draws.append(found.resampled(rng, N_DRAWS))

@@ -53,7 +53,7 @@ def poor_map(tmp_path_factory: pytest.TempPathFactory) -> Stage:
 def density_of(history: History, stage: Stage) -> LifeDensity:
     """Return the density of the first scenario."""
     likelihood = LifeLikelihood.of(history, stage)
-    return LifeDensity.of(likelihood, likelihood.data.scenarios[0])
+    return LifeDensity(likelihood, likelihood.data.scenarios[0], likelihood.grid)
 
 
 def coordinates(density: LifeDensity, n: int = 6, seed: int = 1) -> FloatArray:
@@ -139,7 +139,7 @@ def test_every_scenario_after_a_step_is_the_dense_normal(tmp_path: Path) -> None
     assert len(likelihood.data.scenarios) == 3 * 2
     found, known = [], []
     for scenario in likelihood.data.scenarios:
-        density = LifeDensity.of(likelihood, scenario)
+        density = LifeDensity(likelihood, scenario, likelihood.grid)
         y = coordinates(density, 1)
         found.append((density.log_probability(y) - scenario.log_prior(y))[0])
         known.append(book(history, density, y[0], 0.05))
@@ -355,7 +355,7 @@ def test_a_step_without_travel_parts_the_logs(tmp_path: Path, last_still: int) -
     np.testing.assert_allclose(stepped.data.clock, without.data.clock, atol=1.0)
     assert without.data.clock[last_still] == without.data.clock[last_still - 1]
     for scenario in stepped.data.scenarios:
-        density = LifeDensity.of(stepped, scenario)
+        density = LifeDensity(stepped, scenario, stepped.grid)
         y = coordinates(density, 20)
         assert np.isfinite(density.log_probability(y)).all()
         off, _ = density.deviations(y, np.array([0.0, stepped.data.now]), np.random.default_rng(4))
@@ -553,7 +553,7 @@ def test_a_scenario_without_coordinates_has_draws_of_one_life(
     several = FADING.replace("law = ", "law = [").replace("} }\n", '} }, { kind = "none" }]\n')
     stage = make_stage(tmp_path, (several,))
     likelihood = LifeLikelihood.of(rough_history(np.random.default_rng(17)), stage)
-    density = LifeDensity.of(likelihood, likelihood.data.scenarios[1])
+    density = LifeDensity(likelihood, likelihood.data.scenarios[1], likelihood.grid)
     assert density.scenario.n_dim == 0
     y = np.empty((2000, 0))
     assert np.isfinite(density.log_probability(y[:1])).all()

@@ -143,7 +143,7 @@ def test_laws_and_health_are_those_of_importance_sampling(
     """Chains and importance sampling have the same quantiles, within the error of both."""
     likelihood = LifeLikelihood.of(history, stage)
     (scenario,) = likelihood.data.scenarios
-    density = LifeDensity.of(likelihood, scenario)
+    density = LifeDensity(likelihood, scenario, likelihood.grid)
     rng = np.random.default_rng(5)
     drawn = importance_sample_to_ess(
         density.log_probability, density.scenario.draw(rng, 600), rng, 4000
@@ -350,7 +350,8 @@ def test_probabilities_are_those_of_the_evidence(tmp_path: Path) -> None:
     stage = make_stage(tmp_path, (weighty,))
     history = lived(TRAVEL, 1 - 0.008e-6 * TRAVEL, np.ones(12))
     likelihood = LifeLikelihood.of(history, stage)
-    law, none = (LifeDensity.of(likelihood, scenario) for scenario in likelihood.data.scenarios)
+    scenarios, grid = likelihood.data.scenarios, likelihood.grid
+    law, none = (LifeDensity(likelihood, scenario, grid) for scenario in scenarios)
     assert (law.scenario.weight, none.scenario.weight) == (0.25, 0.75)
     y = np.linspace(-0.5, 0.6, 20_001)
     value = law.log_probability(y[:, None])

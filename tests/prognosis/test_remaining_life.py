@@ -95,7 +95,8 @@ def test_remaining_life_is_that_of_a_grid(stage: Stage, fading: Prognosis) -> No
     """Quantiles of the remaining travel have the right probability on a 1-D grid."""
     likelihood = LifeLikelihood.of(fading_life(1.5e-4), stage)
     y = np.linspace(-0.3, 0.6, 4001)[:, None]
-    value = LifeDensity.of(likelihood, likelihood.data.scenarios[0]).log_probability(y)
+    density = LifeDensity(likelihood, likelihood.data.scenarios[0], likelihood.grid)
+    value = density.log_probability(y)
     density = np.exp(value - value.max())
     cdf = (np.cumsum(density) - 0.5 * density) / density.sum()
     for level in (0.05, 0.25, 0.5, 0.75, 0.95):

@@ -95,7 +95,7 @@ def integrated(density: LifeDensity) -> tuple[FloatArray, FloatArray]:
 def density_of(history: History, stage: Stage) -> LifeDensity:
     """Give the density of the only scenario."""
     likelihood = LifeLikelihood.of(history, stage)
-    return LifeDensity.of(likelihood, likelihood.data.scenarios[0])
+    return LifeDensity(likelihood, likelihood.data.scenarios[0], likelihood.grid)
 
 
 def level_of_health(
