@@ -71,29 +71,15 @@ class Settings:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RunResult:
-    """Result of a run.
+    """Result of a run; the counts are 0 in a report."""
 
-    Attributes
-    ----------
-    index : Path
-        Front page of the report.
-    rows : tuple of Summary
-        One per machine, most urgent first.
-    failed : dict of str to str
-        Machines that could not be assessed or reported, and why.
-    n_logs, n_refused, n_remembered : int
-        Distinct logs found, refused as a whole, and taken from the store; 0 in a report.
-    n_unread : int
-        Rows of ``manifest.csv`` and ``maintenance.csv`` that cannot be read, or whole such tables.
-    """
-
-    index: Path
-    rows: tuple[Summary, ...]
-    failed: dict[str, str]
-    n_logs: int = 0
-    n_refused: int = 0
-    n_remembered: int = 0
-    n_unread: int = 0
+    index: Path  # front page of the report
+    rows: tuple[Summary, ...]  # one per machine, most urgent first
+    failed: dict[str, str]  # machines that could not be assessed or reported, and why
+    n_logs: int = 0  # distinct logs found
+    n_refused: int = 0  # of them, refused as a whole
+    n_remembered: int = 0  # of them, taken from the store
+    n_unread: int = 0  # unreadable rows of ``manifest.csv`` and ``maintenance.csv``, or tables
 
     @property
     def pages(self) -> tuple[Path, ...]:

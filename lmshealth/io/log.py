@@ -28,56 +28,27 @@ class Refusal:
 
 @dataclass(frozen=True, slots=True)
 class Metadata:
-    """Metadata of a log.
+    """Metadata of a log; None where nothing is stated."""
 
-    Attributes
-    ----------
-    stage : str or None
-        Identity of the physical machine.
-    recorded_at : datetime or None
-        Time of the recording, with time zone.
-    travel : float or None
-        Odometer in m.
-    covariates : dict of str to float
-        Values of ``temperature_c``, ``payload_kg`` and ``position_mm``: they move frequencies
-        without wear.
-    servo_id : str or None
-        Tuning of the control loop.
-    baseline : bool or None
-        Whether the log belongs to the baseline; None where nothing is declared.
-    description : str or None
-        Stage description that the manifest names for this log.
-    velocity : float or None
-        Set velocity in m/s, for logs without a set point.
-    """
-
-    stage: str | None = None
-    recorded_at: datetime | None = None
-    travel: float | None = None
+    stage: str | None = None  # identity of the physical machine
+    recorded_at: datetime | None = None  # with time zone
+    travel: float | None = None  # odometer in m
+    # Of ``temperature_c``, ``payload_kg`` and ``position_mm``: they move frequencies without wear.
     covariates: dict[str, float] = field(default_factory=dict)
-    servo_id: str | None = None
-    baseline: bool | None = None
-    description: str | None = None
-    velocity: float | None = None
+    servo_id: str | None = None  # tuning of the control loop
+    baseline: bool | None = None  # whether the log belongs to the baseline
+    description: str | None = None  # stage description that the manifest names for this log
+    velocity: float | None = None  # set velocity in m/s, for logs without a set point
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Channel:
-    """One signal of a log.
+    """One signal of a log."""
 
-    Attributes
-    ----------
-    name : str
-        Column name without its unit (``delta_e``, ``acc_feed``, ``current``).
-    kind : str
-        Physical quantity: ``displacement`` (m), ``acceleration`` (m/s²) or ``current`` (A).
-    values : ndarray or Stored
-        Samples in SI units, shape ``(n_samples,)``; NaN where a sample is missing. Those of a long
-        record are on disk: read a stretch of them by ``values[start:stop]``.
-    """
-
-    name: str
-    kind: ChannelKind
+    name: str  # column name without its unit (``delta_e``, ``acc_feed``, ``current``)
+    kind: ChannelKind  # physical quantity, in m, m/s² or A
+    # Samples in SI units, shape ``(n_samples,)``; NaN where a sample is missing. Those of a long
+    # record are on disk: read a stretch of them by ``values[start:stop]``.
     values: Samples
 
     def __post_init__(self) -> None:
@@ -88,35 +59,16 @@ class Channel:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Log:
-    """One recording of one stage, in SI units.
+    """One recording of one stage, in SI units."""
 
-    Attributes
-    ----------
-    name : str
-        Path as the user gave it.
-    digest : str
-        SHA-256 of the file's content.
-    metadata : Metadata
-    sample_rate : float
-        In Hz.
-    channels : tuple of Channel
-        Usable signals, all of the same length.
-    reference_velocity : ndarray, Stored or None
-        Set point in m/s, shape ``(n_samples,)``; NaN where it is missing.
-    pieces : tuple of (int, int)
-        Half-open sample ranges without gaps; the whole range when nothing is missing.
-    refused : tuple of Refusal
-        Channels that were left out, and stretches of those that were not.
-    """
-
-    name: str
-    digest: str
+    name: str  # path as the user gave it
+    digest: str  # SHA-256 of the file's content
     metadata: Metadata
-    sample_rate: float
-    channels: tuple[Channel, ...]
-    reference_velocity: Samples | None
-    pieces: tuple[tuple[int, int], ...]
-    refused: tuple[Refusal, ...]
+    sample_rate: float  # in Hz
+    channels: tuple[Channel, ...]  # usable signals, all of the same length
+    reference_velocity: Samples | None  # set point in m/s, ``(n_samples,)``; NaN where missing
+    pieces: tuple[tuple[int, int], ...]  # half-open sample ranges without gaps
+    refused: tuple[Refusal, ...]  # channels that were left out, and stretches of others
 
     def __post_init__(self) -> None:
         if self.sample_rate <= 0 or not np.isfinite(self.sample_rate):

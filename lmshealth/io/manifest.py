@@ -20,7 +20,7 @@ MANIFEST = "manifest.csv"
 NOT_LOGS = frozenset({MANIFEST, "maintenance.csv", "truth.csv"})
 
 
-class Found(NamedTuple):
+class FileList(NamedTuple):
     """Files of a folder, sorted, and refusals of those that must not or cannot be opened."""
 
     logs: tuple[Path, ...]
@@ -54,7 +54,7 @@ class Manifest:
         return dict(self.rows.get(path, {}))
 
 
-def find_logs(folder: str | Path) -> Found:
+def find_logs(folder: str | Path) -> FileList:
     """Find the logs of a folder and its subfolders by their suffix; `BadTable` if it is none.
 
     Hidden files and folders are ignored. Symbolic links to files are followed as long as they
@@ -63,11 +63,11 @@ def find_logs(folder: str | Path) -> Found:
     return _find(Path(folder), lambda path: path.name not in NOT_LOGS and is_log(path))
 
 
-def find_sheets(folder: str | Path, name: str) -> Found:
+def find_sheets(folder: str | Path, name: str) -> FileList:
     """Find the tables of a name, such as ``manifest.csv``, where `find_logs` finds logs."""
     found = _find(Path(folder), lambda path: path.name == name)
     # What else is wrong with the folder, `find_logs` lists.
-    return Found(found.logs, tuple(r for r in found.refused if Path(r.log).name == name))
+    return FileList(found.logs, tuple(r for r in found.refused if Path(r.log).name == name))
 
 
 def read_manifest(folder: str | Path) -> Manifest:
@@ -86,11 +86,11 @@ def read_manifest_beside(log: str | Path) -> Manifest:
     if not os.path.lexists(path):
         return Manifest({}, (), {})
     trouble = _trouble(path, root)
-    found = Found((), (Refusal(MANIFEST, *trouble),)) if trouble else Found((path,), ())
+    found = FileList((), (Refusal(MANIFEST, *trouble),)) if trouble else FileList((path,), ())
     return _merged(root, found)
 
 
-def _merged(root: Path, found: Found) -> Manifest:
+def _merged(root: Path, found: FileList) -> Manifest:
     """Read manifests of a folder, the nearest to the logs last."""
     manifest = Manifest({}, (), {})
     refused = list(found.refused)
@@ -111,7 +111,7 @@ def _absolute(path: Path) -> Path:
     return Path(os.path.abspath(path))
 
 
-def _find(root: Path, fits: Callable[[Path], bool]) -> Found:
+def _find(root: Path, fits: Callable[[Path], bool]) -> FileList:
     """Find files in a fixed order, without entering links or hidden folders."""
     if not root.is_dir():
         raise BadTable(f"{shown(root)} is no folder")
@@ -134,7 +134,7 @@ def _find(root: Path, fits: Callable[[Path], bool]) -> Found:
                 refused.append(Refusal(name_of(path, root), *trouble))
             else:
                 logs.append(path)
-    return Found(tuple(logs), tuple(refused))
+    return FileList(tuple(logs), tuple(refused))
 
 
 def _escapes(path: Path, root: Path) -> bool:

@@ -20,50 +20,31 @@ Hindrance = Literal["too-short", "baseline", "parameters", ""]
 
 @dataclass(frozen=True, slots=True)
 class Effort:
-    """Detection by logs of one duration.
+    """Detection by logs of one duration."""
 
-    Attributes
-    ----------
-    duration : float
-        Of each log in s.
-    n_logs, hindrance : int or None, str
-        Least number of logs now that reaches the power, or why no number does: logs ``too-short``
-        for identification; the ``baseline``, where a longer one would do; other ``parameters`` that
-        change the modes alike.
-    power, smallest_loss, smallest_loss_many : float
-        Power of one log now; smallest fraction lost that is detected with the required power, by
-        one log now and by as many as the baseline has. NaN for logs too short.
-    """
-
-    duration: float
-    n_logs: int | None
+    duration: float  # of each log in s
+    n_logs: int | None  # least number of logs now that reaches the power
+    # Why no number does: logs ``too-short`` for identification; the ``baseline``, where a longer
+    # one would do; other ``parameters`` that change the modes alike.
     hindrance: Hindrance
-    power: float = np.nan
+    power: float = np.nan  # of one log now; NaN, as the others, for logs too short
+    # Smallest fraction lost that is detected with the required power, by one log now and by as many
+    # as the baseline has.
     smallest_loss: float = np.nan
     smallest_loss_many: float = np.nan
 
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """Logs that detect the loss of one parameter.
-
-    Attributes
-    ----------
-    loss, power, false_alarm : float
-        Fraction of its baseline value that is lost; probabilities to detect this loss, and to
-        detect one where there is none.
-    n_baseline, efforts : int, tuple of Effort
-        Logs of the baseline, of the same duration as those now; one effort per duration.
-    duration_of_one : int or None
-        Least whole seconds from which one log now reaches the power; None where an hour does not.
-    """
+    """Logs that detect the loss of one parameter."""
 
     parameter: str
-    loss: float
-    power: float
-    false_alarm: float
-    n_baseline: int
-    efforts: tuple[Effort, ...]
+    loss: float  # fraction of its baseline value that is lost
+    power: float  # probability to detect this loss
+    false_alarm: float  # probability to detect one where there is none
+    n_baseline: int  # logs of the baseline, of the same duration as those now
+    efforts: tuple[Effort, ...]  # one per duration
+    # Least whole seconds from which one log now reaches the power; None where an hour does not.
     duration_of_one: int | None
 
 
