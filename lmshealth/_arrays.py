@@ -31,12 +31,6 @@ class ReadOnly:
 
 
 def expect_shape(name: str, array: np.ndarray[Any, Any], shape: tuple[int, ...]) -> None:
-    """Require the shape of a field.
-
-    Raises
-    ------
-    ValueError
-        Naming the field, its shape and the one needed.
-    """
+    """Require the shape of a field; `ValueError` names the field, its shape and the one needed."""
     if array.shape != shape:
         raise ValueError(f"{name} has shape {array.shape}, needed {shape}")

@@ -31,11 +31,8 @@ _FIELD = re.compile(r"Object (?P<what>contains unknown|missing required) field `
 def decode(content: bytes, kind: type[Kind]) -> Kind:
     """Decode TOML into a msgspec struct.
 
-    Raises
-    ------
-    ValueError
-        If the file is no TOML or breaks the schema: the message has line, key, what was found and
-        what is needed.
+    `ValueError` where it is no TOML or breaks the schema: with line, key, what was found and what
+    is needed.
     """
     text = _text(content)
     try:

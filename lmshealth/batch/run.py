@@ -179,10 +179,7 @@ def report(
 ) -> RunResult:
     """Write the pages of all machines in a store that `run` has filled, without their logs.
 
-    Raises
-    ------
-    StoreError
-        If there is no assessment that this version can decode.
+    `StoreError` if there is no assessment that this version can decode.
     """
     _prepare(out)
     present = store.published()

@@ -144,10 +144,7 @@ def default_url(folder: Path) -> URL:
 class Store:
     """Results behind an SQLAlchemy URL, such as ``postgresql://me@host/fleet``.
 
-    Raises
-    ------
-    StoreError
-        If it cannot be opened, or does not exist and is not to be created.
+    `StoreError` if it cannot be opened, or does not exist and is not to be created.
     """
 
     def __init__(self, url: str | URL, *, create: bool = True) -> None:

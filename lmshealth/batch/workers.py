@@ -284,12 +284,8 @@ def cluster(address: str) -> Iterator[Pool]:
     """Open a pool of the workers of a Dask cluster.
 
     The address is that of the scheduler, such as ``tcp://host:8786``. Scheduler and workers need
-    this version of lmshealth, and the workers need the logs under the same paths.
-
-    Raises
-    ------
-    SchedulerError
-        If the scheduler does not answer, has no worker, or has a worker of another version.
+    this version of lmshealth, and the workers need the logs under the same paths. `SchedulerError`
+    if the scheduler does not answer, has no worker, or has a worker of another version.
     """
     shown = shown_address(address)
     try:

@@ -65,17 +65,12 @@ def seed_of(seed: int, *inputs: str) -> tuple[int, int]:
 
 
 def sample(log_probability: LogProbability, start: Start, seed: np.random.SeedSequence) -> Sample:
-    """Sample a posterior, its log density -inf outside its support, by independent ensembles.
+    """Sample a posterior by independent ensembles [ForemanMackey2013], [Vehtari2021].
 
-    Every ensemble has its own start and random stream: walkers of one ensemble depend on each
-    other, so that R-hat over them is no diagnostic.
-
+    Its log density is -inf outside its support. Every ensemble has its own start and random stream:
+    walkers of one ensemble depend on each other, so that R-hat over them is no diagnostic.
     `NotConverged`, with the chains, is raised if 50 autocorrelation times or R-hat below 1.01 are
     not reached.
-
-    References
-    ----------
-    [ForemanMackey2013], [Vehtari2021]
     """
     import emcee  # late: it imports scipy.stats
 

@@ -40,14 +40,10 @@ class WeightedDraws(ReadOnly):
 def importance_sample(
     log_probability: LogProbability, start: FloatArray, rng: np.random.Generator, n: int
 ) -> WeightedDraws:
-    """Draw from a density by importance sampling from a mixture adapted in rounds.
+    """Draw from a density by importance sampling from a mixture adapted in rounds [Cappe2008].
 
     The start are points that cover the support of the density, ``(n_start, n_dim)``; n is the
     number of draws of the last round. `NotConverged` is raised if no point has a density above 0.
-
-    References
-    ----------
-    [Cappe2008]
     """
     points, proposal = start, np.zeros(start.shape[0])
     few = max(400, n // 4)

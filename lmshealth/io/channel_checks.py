@@ -16,18 +16,9 @@ from lmshealth.io.time_axis import IntArray, too_many
 def missing_stretches(values: Samples) -> tuple[IntArray, str]:
     """Find the missing samples (NaN, infinite or absurd) of a channel, ``(n_samples,)`` in SI.
 
-    Returns
-    -------
-    ndarray of int
-        Half-open ranges in which every sample is missing, ascending, shape ``(n_stretches, 2)``.
-    str
-        Their counts; empty if nothing is missing.
-
-    Raises
-    ------
-    Unusable
-        With reason ``missing-samples`` when they are so many that they would cut the other
-        channels to pieces.
+    Return half-open ranges in which every sample is missing, ascending, ``(n_stretches, 2)``, and
+    their counts as a text, empty if nothing is missing. `Unusable` (``missing-samples``) where they
+    are so many that they would cut the other channels to pieces.
     """
     found = [np.empty(0, dtype=np.int64)]
     for at, block in blocks(values):

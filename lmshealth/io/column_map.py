@@ -96,12 +96,8 @@ def parse_column(column: str, unit: str | float | None = None) -> Signal:
     """Read quantity, name and unit from a column name that `role_of` recognises.
 
     A unit, or the SI value of one count, is given for a column whose name carries no unit.
-
-    Raises
-    ------
-    Unusable
-        With reason ``unit`` for a missing, unknown or contradicting unit, ``columns`` for a column
-        outside the contract or an unprintable or very long name.
+    `Unusable`: ``unit`` for a missing, unknown or contradicting unit, ``columns`` for a column
+    outside the contract or an unprintable or very long name.
     """
     role = role_of(column)
     if role is None:
@@ -209,11 +205,8 @@ class ColumnMap(Struct, frozen=True, forbid_unknown_fields=True, dict=True):
 def load_columns(path: str | Path) -> ColumnMap:
     """Read a column map from the TOML file given to ``--columns``.
 
-    Raises
-    ------
-    BadTable
-        If the file cannot be read, has unknown keys, or names columns, units or metadata that
-        are not in the log contract.
+    `BadTable` if the file cannot be read, has unknown keys, or names columns, units or metadata
+    that are not in the log contract.
     """
     try:
         columns = decode(Path(path).read_bytes(), ColumnMap)

@@ -32,17 +32,8 @@ _BOOLEANS = {"true": True, "1": True, "false": False, "0": False}
 def parse_metadata(text: Mapping[str, str]) -> tuple[Metadata, float | None]:
     """Convert the metadata of a log; unknown keys and empty values are ignored.
 
-    Returns
-    -------
-    Metadata
-        Everything but the sample rate.
-    float or None
-        Sample rate in Hz.
-
-    Raises
-    ------
-    Unusable
-        With reason ``metadata``, naming key and value.
+    The sample rate in Hz is returned beside the rest. `Unusable` (``metadata``) names key and
+    value.
     """
     given = {key: text[key].strip() for key in KEYS if text.get(key, "").strip()}
     travel = _number(given, "travel_km", scale=1e3)

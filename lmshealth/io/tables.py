@@ -38,11 +38,8 @@ class Row(NamedTuple):
 def read_sheet(path: Path, needed: Sequence[str]) -> Iterator[Row]:
     """Read a table of comma-separated values row by row, after a header line.
 
-    Raises
-    ------
-    Unusable
-        With the reasons ``missing-file``, ``too-large``, ``empty``, and ``columns`` where a needed
-        one is missing, or any is there twice.
+    `Unusable`: ``missing-file``, ``too-large``, ``empty``, and ``columns`` where a needed one is
+    missing, or any is there twice.
     """
     allowed = constants.SMALL_ENOUGH
     try:

@@ -41,18 +41,9 @@ def too_many(n_interruptions: int, n_samples: int) -> bool:
 def time_axis(time: Samples | None, rate: float | None) -> TimeAxis:
     """Find the sample rate and the interruptions of a record.
 
-    Parameters
-    ----------
-    time : ndarray, Stored or None
-        Time stamps in s as recorded, shape ``(n_samples,)``.
-    rate : float or None
-        Sample rate in Hz from the metadata.
-
-    Raises
-    ------
-    Unusable
-        With reason ``time`` where both are absent or disagree, where time stamps are missing,
-        repeated or descending, and where the intervals are not uniform.
+    From time stamps in s as recorded, ``(n_samples,)``, and the sample rate in Hz of the metadata.
+    `Unusable` (``time``) where both are absent or disagree, where time stamps are missing, repeated
+    or descending, and where the intervals are not uniform.
     """
     if time is None:
         if rate is None:

@@ -93,12 +93,8 @@ def _any_risk(prognosis: Prognosis, day: date) -> tuple[float, float]:
 def cheapest_travel(prognosis: Prognosis, cost_ratio: float) -> float:
     """Return the travel in m from now of the service of least long-run costs (age replacement).
 
-    README.md has the equation and its assumptions. 0 for now, infinite if no service within the
-    horizon saves 1 % of the costs of operation up to it.
-
-    References
-    ----------
-    [Barlow1960], [Barlow1965]
+    README.md has the equation [Barlow1960] and its assumptions [Barlow1965]. 0 for now, infinite if
+    no service within the horizon saves 1 % of the costs of operation up to it.
     """
     age = prognosis.travel - float(prognosis.curve_travel[0])
     left = np.sort(np.maximum(prognosis.remaining[:, -1], 0))

@@ -138,20 +138,12 @@ def _mode_bands(
 def read_magnitudes(
     log: Log, bands: Iterable[FrequencyBand], *, part: Part = "record"
 ) -> tuple[Magnitude, ...]:
-    """Measure the levels of every accelerometer of a log in every band.
+    """Measure the levels of every accelerometer of a log in every band [Piscalov2021].
 
     Bands above half the sample rate are omitted; `part` is a motion phase, see `select_segments`.
-    The result is ordered channel by channel.
-
-    Raises
-    ------
-    BadLog
-        With reason ``sample-rate`` where no band is below half of it, ``too-short`` where a band
-        holds fewer than three harmonics, or as `select_channels` and `select_segments` do.
-
-    References
-    ----------
-    Piscalov2021
+    The result is ordered channel by channel. `BadLog`: ``sample-rate`` where no band is below half
+    of it, ``too-short`` where a band holds fewer than three harmonics, or as `select_channels` and
+    `select_segments` do.
     """
     channels = select_channels(log, "acceleration")
     segments = select_segments(log, part)

@@ -62,20 +62,11 @@ def read_error(
     floor: float = constants.ENCODER_FLOOR,
     part: Part = "record",
 ) -> tuple[FollowingError, ...]:
-    """Analyse the following error of a log.
+    """Analyse the following error of a log, one reading per displacement channel [Piscalov2021].
 
     The `count` strongest harmonics are kept; those up to the floor in m are noise. `part` is a
-    motion phase, see `select_segments`. The result has one reading per displacement channel.
-
-    Raises
-    ------
-    BadLog
-        With reason ``too-short`` where the longest stretch has fewer than ``count`` harmonics, or
-        as `select_channels` and `select_segments` do.
-
-    References
-    ----------
-    Piscalov2021
+    motion phase, see `select_segments`. `BadLog`: ``too-short`` where the longest stretch has fewer
+    than ``count`` harmonics, or as `select_channels` and `select_segments` do.
     """
     channels = select_channels(log, "displacement")
     segments = select_segments(log, part)

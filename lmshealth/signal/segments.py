@@ -141,13 +141,7 @@ def _join(found: list[Segment], segment: Segment) -> None:
 
 
 def select_channels(log: Log, kind: Literal["displacement", "acceleration"]) -> list[Channel]:
-    """Return the channels of a kind.
-
-    Raises
-    ------
-    BadLog
-        With reason ``no-delta-e`` or ``no-accelerometer`` without such a channel.
-    """
+    """Return the channels of a kind; without any `BadLog`: ``no-delta-e``, ``no-accelerometer``."""
     channels = [channel for channel in log.channels if channel.kind == kind]
     if not channels:
         reason, name, column = _CHANNELS[kind]
@@ -162,13 +156,8 @@ def select_segments(log: Log, part: Part) -> tuple[Segment, ...]:
 
     ``record`` is all of the log, acceleration and braking included; without a set point only it can
     be selected, also as ``constant``. The result is at least one segment, in order of time, each of
-    at most a minute at 20 kHz.
-
-    Raises
-    ------
-    BadLog
-        With reason ``no-set-point`` where the set point is needed and missing, and
-        ``no-such-part`` where the log has no such stretch.
+    at most a minute at 20 kHz. `BadLog`: ``no-set-point`` where the set point is needed and
+    missing, ``no-such-part`` where the log has no such stretch.
     """
     if part == "record" or (log.reference_velocity is None and part == "constant"):
         pieces = [Segment(start, stop, float("nan")) for start, stop in log.pieces]

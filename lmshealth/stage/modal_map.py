@@ -68,12 +68,8 @@ def read_map(path: str, parameters: tuple[str, ...]) -> ModalMap:
     """Read a modal map and fit its surrogate.
 
     It is a CSV file with one column per health parameter, then ``mode`` and ``frequency_hz``: a
-    full grid.
-
-    Raises
-    ------
-    BadStage
-        If columns are missing or unknown, values are not positive, or the grid is not full.
+    full grid. `BadStage` if columns are missing or unknown, values are not positive, or the grid is
+    not full.
     """
     try:
         # Blank lines are kept, so that the index of a row gives its line.

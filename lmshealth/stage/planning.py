@@ -101,11 +101,11 @@ def plan(
     _expect_identifiable(stage, information, j)
     size = -np.log1p(-loss)
 
-    def power_of(duration: float, n_logs: int) -> float:
-        return test.power(size, information.std(j, information.drift_variance(duration, n_logs)))
+    def power_of_one(duration: float) -> float:
+        return test.power(size, information.std(j, information.drift_variance(duration, 1)))
 
     seconds = range(max(1, int(np.ceil(information.least_duration))), constants.LONGEST_LOG + 1)
-    place = bisect_left(seconds, power, key=lambda duration: power_of(duration, 1))
+    place = bisect_left(seconds, power, key=power_of_one)
     efforts = tuple(_effort(information, j, test, size, duration) for duration in durations)
     shortest = seconds[place] if place < len(seconds) else None
     return Plan(parameter, loss, power, false_alarm, information.n_baseline, efforts, shortest)

@@ -74,14 +74,9 @@ def write_skeleton(
 ) -> None:
     """Write a description of modes, each with a comment, that `load_stage` reads as it is.
 
-    ``stage`` is the machine of the log, ``source`` a note on the origin of the modes.
-
-    Raises
-    ------
-    BadStage
-        If there is no mode.
-    FileExistsError
-        A description that somebody may have edited is not overwritten.
+    ``stage`` is the machine of the log, ``source`` a note on the origin of the modes. `BadStage` if
+    there is no mode; `FileExistsError`: a description that somebody may have edited is not
+    overwritten.
     """
     if not modes:
         raise BadStage(f"{path} is not written: a description needs at least one mode; none found")

@@ -77,18 +77,10 @@ def read_estimates(
     Needed are ``recorded_at``, ``frequency_hz`` and ``frequency_std_hz``; a row is one estimate.
     Without ``log`` the rows of one moment are one log, without ``stage`` all are of one machine.
 
-    Parameters
-    ----------
-    path, cross_terms : Path
-        The table; covariances between estimates of one log, in the columns of ``modes_cov.csv``.
-    stage : Stage, optional
-        Its covariates are read too, and other mode names than its own are refused.
-
-    Raises
-    ------
-    BadTable
-        If a table cannot be read, a column is missing, a value is not valid, an estimate exists
-        twice, or rows of one log contradict each other.
+    `cross_terms` are covariances between estimates of one log, in the columns of ``modes_cov.csv``.
+    The covariates of the stage are read too, and other mode names than its own are refused.
+    `BadTable` if a table cannot be read, a column is missing, a value is not valid, an estimate
+    exists twice, or rows of one log contradict each other.
     """
     table = _read(path, _NEEDED, "estimate")
     covariates = [*COVARIATES]
@@ -153,12 +145,8 @@ def read_drifts(path: Path, *, cross_terms: Path | None = None) -> Table[Drifts]
 
     Needed are ``recorded_at``, ``mode``, ``drift`` (of ln frequency against baseline) and
     ``drift_std``. Without ``stage`` all rows are of one machine. `cross_terms` are covariances
-    between drifts of one epoch, in the columns of ``track_cov.csv``.
-
-    Raises
-    ------
-    BadTable
-        If a table cannot be read, a column is missing, or a value is not valid.
+    between drifts of one epoch, in the columns of ``track_cov.csv``. `BadTable` if a table cannot
+    be read, a column is missing, or a value is not valid.
     """
     table = _read(path, ("recorded_at", "mode", "drift", "drift_std"), "drift")
     notes = name_machine(path, table)

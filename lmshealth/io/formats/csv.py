@@ -68,11 +68,8 @@ class Text:
     def read(self, size: int = -1) -> bytes:
         """Read a block of at most ``size`` bytes; empty at the end of the file.
 
-        Raises
-        ------
-        Unusable
-            With reason ``corrupt`` for a NUL byte, for lines or rows without end and for an end
-            inside a row, ``too-large`` for more than the file can honestly hold.
+        `Unusable`: ``corrupt`` for a NUL byte, for lines or rows without end and for an end inside
+        a row, ``too-large`` for more than the file can honestly hold.
         """
         block = self._checked(self._stream.read(size))
         if not block and self._tail and not self._tail.endswith(b"\r"):

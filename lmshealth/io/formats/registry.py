@@ -47,11 +47,8 @@ def format_name(path: Path) -> str:
 def load(path: Path, columns: ColumnMap, max_memory: float = constants.MAX_MEMORY) -> Content:
     """Read a file by the format of its suffix, which its first bytes must confirm.
 
-    Raises
-    ------
-    Unusable
-        With reason ``format`` for an unknown suffix or another format's content, ``empty`` for
-        0 bytes, ``corrupt`` for content that cannot be read, and the reasons of the formats.
+    `Unusable`: ``format`` for an unknown suffix or another format's content, ``empty`` for 0 bytes,
+    ``corrupt`` for content that cannot be read, and the reasons of the formats.
     """
     form = format_of(path)
     if form is None:

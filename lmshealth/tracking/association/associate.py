@@ -36,13 +36,7 @@ _MOST_PENDING = 64
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Estimates:
-    """The modal estimates of one log.
-
-    Raises
-    ------
-    ValueError
-        If shapes of arrays do not match.
-    """
+    """The modal estimates of one log; `ValueError` if shapes of arrays do not match."""
 
     names: tuple[str, ...]  # from the identification, empty where it assigned none
     sources: tuple[str, ...]  # two estimates of one source are never of one mode
