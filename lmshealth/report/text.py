@@ -9,7 +9,6 @@ import numpy as np
 
 from lmshealth._arrays import FloatArray
 from lmshealth.report import constants
-from lmshealth.stage.degradation_laws import AnyLaw
 
 _KM = 1000.0
 GAP = "\u202f"  # narrow no-break space between a number and its unit, and between thousands
@@ -36,6 +35,8 @@ def covariate(column: str) -> tuple[str, str]:
 
 def law(kind: str) -> str:
     """Return the description of a degradation law."""
+    from lmshealth.stage.degradation_laws import AnyLaw  # late: --help needs no scipy
+
     labels = {law.__struct_config__.tag: law.label for law in get_args(AnyLaw)}
     return str(labels.get(kind, kind))
 
