@@ -147,6 +147,7 @@ class CsvLayout(Struct, frozen=True, forbid_unknown_fields=True):
 
     skip_rows: Annotated[int, Meta(ge=0)] = 0
     delimiter: Annotated[str, Meta(min_length=1, max_length=1)] = ","
+    decimal: Literal[".", ","] = "."
     header: bool | list[str] = True
 
 
@@ -237,3 +238,5 @@ def _check(columns: ColumnMap) -> None:
     delimiter = columns.csv.delimiter
     if not delimiter.isascii() or delimiter in '\r\n"#':
         raise ValueError(f"[csv] delimiter is {delimiter!r}, needed one ASCII separator")
+    if delimiter == columns.csv.decimal:
+        raise ValueError(f"[csv] delimiter and decimal are both {delimiter!r}; set the delimiter")

@@ -126,7 +126,7 @@ def parse_text(stream: Any, stored: int, columns: ColumnMap) -> Content:
     if not places:
         return Content({}, metadata, tuple(names), hint=_hint(text, columns))
     text.n_fields = len(names)
-    return Content(_numbers(text, places, layout.delimiter), metadata, tuple(names))
+    return Content(_numbers(text, places, layout), metadata, tuple(names))
 
 
 def _line(text: Text) -> str:
@@ -185,9 +185,10 @@ def _hint(text: Text, columns: ColumnMap) -> str:
         return ""
     text.seek(0)
     head = b"".join(text.line() for _ in range(_HEAD)).removeprefix(_BOM).decode(errors="replace")
+    lines = head.splitlines()
     # Leading "# key: value" lines before the header are not skipped, other lines are.
     n_skip = 0
-    for n_before, line in enumerate(head.splitlines()):
+    for n_before, line in enumerate(lines):
         fitting = [d for d in (layout.delimiter, *_DELIMITERS) if _names(line, d, columns)]
         if fitting:
             wrong = [] if fitting[0] == layout.delimiter else [f'delimiter = "{fitting[0]}"']
@@ -197,6 +198,10 @@ def _hint(text: Text, columns: ColumnMap) -> str:
             return f"line {n_before + 1} names them: set {keys} under [csv] of the column map"
         if line.strip() and not line.startswith("#"):
             n_skip = n_before + 1
+    rows = [s for s in lines[layout.skip_rows :] if s.strip() and not s.startswith("#")]
+    if rows and any(_is_row(rows[0], delimiter) for delimiter in (layout.delimiter, *_DELIMITERS)):
+        keys = 'set header = false under [csv] and name the columns "0", "1", … under [columns]'
+        return f"the first line holds only numbers: if no line names the columns, {keys}"
     fits = "do skip_rows and delimiter under [csv] of the column map fit the file?"
     return fits if columns.columns else ""
 
@@ -209,7 +214,15 @@ def _names(line: str, delimiter: str, columns: ColumnMap) -> bool:
     return any(columns.target(field) is not None for field in fields)
 
 
-def _numbers(text: Text, places: dict[str, int], delimiter: str) -> dict[str, Samples]:
+def _is_row(line: str, delimiter: str) -> bool:
+    """Return whether all fields of a line are numbers."""
+    try:
+        return bool([float(field.replace(",", ".")) for field in line.split(delimiter)])
+    except ValueError:
+        return False
+
+
+def _numbers(text: Text, places: dict[str, int], layout: CsvLayout) -> dict[str, Samples]:
     """Read the wanted columns, ``(n_rows,)`` each, NaN where a field is empty."""
     import pandas as pd
 
@@ -221,7 +234,8 @@ def _numbers(text: Text, places: dict[str, int], delimiter: str) -> dict[str, Sa
     read = partial(
         pd.read_csv,
         text,
-        sep=delimiter,
+        sep=layout.delimiter,
+        decimal=layout.decimal,
         header=None,
         names=list(range(text.n_fields + n_spare)),
         index_col=False,
@@ -280,7 +294,9 @@ def _first_text(values: list[object], n_before: int) -> str:
         try:
             float(value)  # type: ignore[arg-type]
         except (TypeError, ValueError):
-            return f"{str(value)[:40]!r} in row {n_before + i + 1}"
+            found = f"{str(value)[:40]!r} in row {n_before + i + 1}"
+            hint = ' (for decimal commas set decimal = "," under [csv] of the column map)'
+            return found + (hint if _is_row(str(value), ";") else "")
     return "text"
 
 

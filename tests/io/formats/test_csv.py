@@ -50,6 +50,15 @@ def test_layout():
     assert parse_with(b"1,2\n3,4\n", numbered).columns["1"].tolist() == [2.0, 4.0]
 
 
+def test_decimal_commas_are_read_where_the_map_says_so():
+    """A decimal comma needs the key; without it the field is quoted."""
+    text = "delta_e_um;b\n1,5;x\n-2,25e1;y\n"
+    raw = parse(text, delimiter=";", decimal=",")
+    assert raw.columns["delta_e_um"].tolist() == [1.5, -22.5]
+    with pytest.raises(Unusable, match=r"'1,5' in row 1.*set decimal = \",\" under \[csv\]"):
+        parse(text, delimiter=";")
+
+
 @pytest.mark.parametrize(
     ("text", "reason", "word"),
     [
@@ -219,6 +228,16 @@ def test_names_that_no_line_has_are_asked_for(tmp_path):
         with pytest.raises(BadLog, match="needs AI 5") as refused:
             read_log(tmp_path / "log.csv", columns=columns)
         assert ("do skip_rows and delimiter" in refused.value.detail) is asked
+
+
+@pytest.mark.parametrize("text", ["0,1\n1,2\n", "Rate\n0;1\n", "0,5;1\n"])
+def test_a_file_without_header_line_is_named(tmp_path, text):
+    """A first line of numbers only: how to name the columns; with that the file is read."""
+    (tmp_path / "log.csv").write_text(text)
+    columns = ColumnMap(csv=CsvLayout(skip_rows=text.startswith("Rate")))
+    with pytest.raises(BadLog, match="set header = false under") as refused:
+        read_log(tmp_path / "log.csv", columns=columns)
+    assert refused.value.reason == "columns"
 
 
 def test_the_beginning_of_a_contract_file_after_a_preamble_is_named(tmp_path):
