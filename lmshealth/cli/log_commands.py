@@ -63,12 +63,11 @@ _PLOT = click.option(
 def modes(ctx: click.Context, /, **given: Any) -> None:
     """Identify the modes of single logs: natural frequency and damping ratio."""
     from lmshealth.modal.free_decay.identification import identify_decays
-    from lmshealth.modal.identification import identify
+    from lmshealth.modal.identification import AmbientReading, read_ambient
     from lmshealth.report.tables import modes_rows
     from lmshealth.signal.following_error import loop_error
     from lmshealth.tracking.history import LogEstimates
 
-    method = identify_decays if given["part"] == "settling" else identify
     stage, band, channels = given["stage"], options.checked_band(given["band"]), given["channels"]
     names = [name.strip() for name in channels.split(",")] if channels else None
     if given["save"]:
@@ -76,13 +75,16 @@ def modes(ctx: click.Context, /, **given: Any) -> None:
     _check_plot(given["plot"], given["logs"])
 
     def estimate(log: Log) -> LogEstimates:
-        found = method(log, stage, channels=names, band=band)
+        settling = given["part"] == "settling"
+        read: Any = identify_decays if settling else read_ambient
+        reading = read(log, stage, channels=names, band=band)
+        found = reading if settling else reading.modes
         if given["plot"]:
-            from lmshealth.report.log_figures import spectra_figure, write_figure
+            from lmshealth.report.log_figures import modes_figure, settling_spectra, write_figure
 
-            settling = given["part"] == "settling"
-            more: Any = {"channels": names, "band": band, "settling": settling}
-            write_figure(given["plot"], spectra_figure(log, found, stage, **more))
+            if settling:
+                reading = AmbientReading(found, settling_spectra(log, names))
+            write_figure(given["plot"], modes_figure(log, reading, stage, band=band))
         return LogEstimates(log.name, log.digest, log.metadata, found, loop_error(log))
 
     found, lost = _each(ctx, estimate)

@@ -24,6 +24,8 @@ class Refusal:
     channel: str = ""
     mode: str = ""
     source: str = ""
+    # Of a refused mode in Hz.
+    frequency: float | None = field(default=None, compare=False, kw_only=True)
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,7 +8,7 @@ where the start values come from, how modes are named and what happens to modes 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -19,6 +19,7 @@ from lmshealth.modal.ambient.candidates import add_excess, clusters, find_peaks
 from lmshealth.modal.ambient.cluster_fit import bin_cluster, fit_cluster, locate
 from lmshealth.modal.ambient.cluster_modes import (
     ClusterFit,
+    FittedSpectrum,
     drop_duplicates,
     merge_close_modes,
     refuse_close_modes,
@@ -38,6 +39,17 @@ _MOST_ROUNDS = 3
 _CEILING = 4.0
 # A cluster is fitted below this share of the sample rate.
 _TOP = 0.49
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class AmbientReading:
+    """Modes of a log, and what they were identified from."""
+
+    modes: Modes
+    spectra: LogSpectra  # without the sinusoids that were subtracted
+    fitted: tuple[FittedSpectrum, ...] = ()  # of each cluster, ascending in frequency
+    # Everything that was rejected; without a description modes.refused does not list it.
+    rejected: tuple[Refusal, ...] = ()
 
 
 def identify(
@@ -93,6 +105,17 @@ def identify(
     ...     print(f"{f:.1f} ± {f_std:.1f} Hz, {zeta:.1%} ± {zeta_std:.1%}")
     126.4 ± 0.1 Hz, 1.5% ± 0.1%
     """
+    return read_ambient(log, stage, channels=channels, band=band).modes
+
+
+def read_ambient(
+    log: Log,
+    stage: Stage | None = None,
+    *,
+    channels: Sequence[str] | None = None,
+    band: tuple[float, float] | None = None,
+) -> AmbientReading:
+    """Identify modes as `identify` does; return them with the spectra and their fit."""
     used = choose_channels(log, channels)
     targets = () if stage is None else choose_targets(stage, band)
     stretches, spectra = _transform(log, used, targets, band)
@@ -106,7 +129,8 @@ def identify(
     else:
         fits = [_fit_described(spectra, cluster, targets, top) for cluster in groups]
     refused = [refusal for fit in fits for refusal in fit.refusals(log.name)]
-    found = [fit.modes for fit in fits if fit.modes is not None]
+    rejected, found = refused, [fit.modes for fit in fits if fit.modes is not None]
+    fitted = tuple(one.fitted for one in found)
     masked = [line for one in found for line in one.lines]
     seen = [*tested, *spectra.removed_lines, *masked]
     lines = name_lines(seen, [s.velocity for s in stretches], stage, 1.5 / spectra.duration)
@@ -115,7 +139,8 @@ def identify(
         anything = any(one.names for one in found)
         refused = [] if anything else [_nothing_found(log, lines, refused)]
     modes = merge([one.modes for one in found], lines, (*log.refused, *refused), spectra.channels)
-    return numbered(modes) if stage is None else modes
+    modes = numbered(modes) if stage is None else modes
+    return AmbientReading(modes, spectra, fitted, tuple(rejected))
 
 
 def _transform(

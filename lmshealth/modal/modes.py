@@ -27,6 +27,7 @@ class Rejection(NamedTuple):
 
     reason: str
     detail: str
+    frequency: float | None = None  # in Hz, at which it was found or sought
 
 
 @dataclass(frozen=True, slots=True, eq=False)

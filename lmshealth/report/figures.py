@@ -112,6 +112,7 @@ def print_figure(
         warnings.filterwarnings("ignore", message="Glyph .* missing")
         figure = Figure(figsize=size, dpi=_DPI, layout="constrained", facecolor=paper)
         draw(figure)
+        _fix_layout(figure)
         # Directly, because `savefig` draws everything twice.
         canvas: Any
         if kind == "svg":
@@ -121,6 +122,18 @@ def print_figure(
             canvas = FigureCanvasAgg(figure)
             canvas.print_png(target, metadata={"Software": None})
     return target.getvalue()
+
+
+def _fix_layout(figure: Figure) -> None:
+    """Lay out, and round all positions: the solver rounds differently each time."""
+    engine: Any = figure.get_layout_engine()
+    engine.execute(figure)
+    figure.set_layout_engine("none")
+    for part in figure.subfigs:
+        part.bbox_relative.set_points(part.bbox_relative.get_points().round(6))
+    for ax in figure.axes:
+        x, y, width, height = (round(edge, 6) for edge in ax.get_position().bounds)
+        ax.set_position((x, y, width, height))
 
 
 # Hints are written as addresses of links: the only text per point that matplotlib supports.

@@ -4,26 +4,30 @@ from __future__ import annotations
 
 import textwrap
 from collections.abc import Callable, Sequence
+from dataclasses import replace
+from functools import partial
 from itertools import cycle
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from scipy.optimize import isotonic_regression
+from scipy.stats import gamma
 
 from lmshealth._arrays import FloatArray
 from lmshealth._files import write_bytes, write_text
 from lmshealth.errors import BadLog
-from lmshealth.io.log import Channel, Log, Refusal
+from lmshealth.io.log import Log, Refusal
 from lmshealth.modal.frf.identification import FrfReading
+from lmshealth.modal.identification import AmbientReading
 from lmshealth.modal.modes import Modes
+from lmshealth.modal.spectra_summary import WIDE, SpectraSummary, summarise
 from lmshealth.modal.targets import choose_channels
 from lmshealth.report import figures
 from lmshealth.report.rendering import render
 from lmshealth.report.text import spell
-from lmshealth.signal.segments import find_segments, select_segments
-from lmshealth.signal.spectra import periodogram
-from lmshealth.signal.waterfall import bin_density
+from lmshealth.signal.segments import select_segments
+from lmshealth.signal.spectra import LogSpectra, ResonanceRange, cross_spectra
 from lmshealth.stage.description import Stage
 
 if TYPE_CHECKING:
@@ -33,13 +37,9 @@ if TYPE_CHECKING:
 _WIDTH, _NOTE_COLUMNS = 8.0, 112
 # Heights of a panel, of legend and labels, of upright labels and of a line of notes, in inches.
 _PANEL, _FRAME, _LETTERS, _NOTE = 1.15, 1.75, 1.1, 0.16
-# Bins of a spectrum: at most so many, of at least so many ordinates, which average their scatter,
-# but not wider than this share of the half-power bandwidth of a mode.
-_BINS, _ORDINATES, _SHARE = 480, 4.0, 0.35
+_BINS = 480  # of a spectrum, at most
 # Distance of labels over the width of the axes: side by side, and upright from this many on.
 _APART, _APART_UPRIGHT, _UPRIGHT = 0.2, 0.03, 6
-# Ratio of the ends of a band from which on its axis is logarithmic.
-_WIDE = 6.0
 _MARKERS = "v^sDPX*<>"
 
 
@@ -52,39 +52,92 @@ class LogFigure(NamedTuple):
     modes: Modes
 
 
-def spectra_figure(
+def modes_figure(
     log: Log,
-    modes: Modes,
+    reading: AmbientReading,
     stage: Stage | None = None,
     *,
-    channels: Sequence[str] | None = None,
     band: tuple[float, float] | None = None,
-    settling: bool = False,
 ) -> LogFigure:
-    """Return a figure of the power spectral density of each channel, with the modes found in it.
-
-    Arguments are those of `identify`; with ``settling`` spectra are of the decays after moves.
-    """
-    used = choose_channels(log, channels)
+    """Return a figure of the spectra of a log with its modes; ``band`` is that of `identify`."""
+    modes = replace(reading.modes, refused=_join(reading.modes.refused, reading.rejected))
     low, high = band or _band(log, modes, stage)
     high = min(high, 0.49 * log.sample_rate)
-    edges = _edges(low, high, modes, sum(b - a for a, b in log.pieces) / log.sample_rate)
-    densities = [_density(log, channel, edges, settling) for channel in used]
-    middle = (edges[1:] + edges[:-1]) / 2
+    summary = summarise(reading.spectra, reading.fitted, modes, (low, high), _BINS)
+    size = _size(len(summary.channels) + bool(len(summary.singular)), modes)
+    draw = partial(plot_spectra, summary=summary, modes=modes, stage=stage)
+    return LogFigure(f"Modes of {log.name}", size, draw, modes)
 
-    def draw(figure: Figure) -> None:
-        panels = list(figure.subplots(len(used), sharex=True, squeeze=False)[:, 0])
-        for ax, channel, density in zip(panels, used, densities, strict=True):
-            ax.plot(middle, density, color=figures.INK, lw=0.9)
-            ax.set_yscale("log")
-            name = figures.plain_label(channel.name)
-            name += "\n(2nd derivative)" if channel.kind == "displacement" else ""
-            ax.text(1.01, 0.5, name, transform=ax.transAxes, va="center", size=8.5)
-            _mark_lines(ax, modes, channel.name, middle, density)
-        figure.supylabel("acceleration PSD in (m/s²)²/Hz", fontsize=9)
-        _annotate(figure, panels, (low, high), modes, stage)
 
-    return LogFigure(f"Modes of {log.name}", _size(len(used), modes), draw, modes)
+def plot_spectra(
+    figure: Figure, summary: SpectraSummary, modes: Modes, stage: Stage | None
+) -> Figure:
+    """Plot the spectrum of each channel with its fit, lines, modes and what was refused."""
+    middle = (summary.edges[1:] + summary.edges[:-1]) / 2
+    n = len(summary.channels) + bool(len(summary.singular))
+    panels = list(figure.subplots(n, sharex=True, squeeze=False)[:, 0])
+    level, fitted, singular = (
+        10 ** (np.asarray(part, dtype=float) / 10)
+        for part in (summary.level, summary.fitted, summary.singular)
+    )
+    count = summary.count.astype(float)
+    range_ = gamma.ppf([[0.025], [0.975]], count) / count
+    for ax, name, derived, density, fit in zip(
+        panels, summary.channels, summary.derived, level, fitted, strict=False
+    ):
+        ax.plot(middle, density, color=figures.INK, lw=0.7, label="measured")
+        ax.plot(middle, fit, color=figures.GREEN, lw=1.4, label="fit")
+        if np.isfinite(fit).any():
+            style: Any = {"color": figures.GREEN, "alpha": 0.2, "lw": 0}
+            ax.fill_between(
+                middle, *(fit * range_), **style, label="95 % range of the data, by the fit"
+            )
+        label = figures.plain_label(name) + ("\n(2nd derivative)" if derived else "")
+        ax.text(1.01, 0.5, label, transform=ax.transAxes, va="center", size=8.5)
+        _mark_lines(ax, modes, name, middle, density)
+    for k, values in enumerate(singular):
+        style = {"lw": 0.9 if k == 0 else 0.6, "color": figures.MUTED if k else figures.INK}
+        panels[-1].plot(middle, values, **style)
+    if singular.size:
+        label = "singular values\nof all channels"
+        panels[-1].text(1.01, 0.5, label, transform=panels[-1].transAxes, va="center", size=8.5)
+    for ax in panels:
+        ax.set_yscale("log")
+        ax.margins(y=0.08)  # room for markers
+    figure.supylabel("acceleration PSD in (m/s²)²/Hz", fontsize=9)
+    _annotate(figure, panels, (summary.low, summary.high), modes, stage)
+    return figure
+
+
+def settling_spectra(log: Log, channels: Sequence[str] | None) -> LogSpectra:
+    """Return the spectra of the free decays after moves, as `identify_decays` uses them.
+
+    Raises
+    ------
+    BadLog
+        If there is none.
+    """
+    used = choose_channels(log, channels)
+    segments = select_segments(log, "settling")
+    if not segments:
+        raise BadLog(log.name, "too-short", "no free decay after a move to plot")
+    everywhere = ResonanceRange(0.0, np.inf, 0.0)  # nothing is subtracted
+    top = 0.49 * log.sample_rate
+    return LogSpectra(
+        tuple(channel.name for channel in used),
+        tuple("delta_e" if c.kind == "displacement" else "acc" for c in used),
+        cross_spectra(used, segments, log.sample_rate, top, resonances=[everywhere]),
+    )
+
+
+def _join(listed: Sequence[Refusal], rejected: Sequence[Refusal]) -> tuple[Refusal, ...]:
+    """Append resonances that are not listed, ascending, named by their frequencies."""
+    found = [
+        (one.frequency, replace(one, mode=f"{one.frequency:.4g} Hz"))
+        for one in rejected
+        if one not in listed and one.frequency is not None and one.reason != "not-excited"
+    ]
+    return (*listed, *(one for _, one in sorted(found, key=lambda pair: pair[0])))
 
 
 def response_figure(
@@ -150,35 +203,14 @@ def _size(n_panels: int, modes: Modes) -> tuple[float, float]:
 
 
 def _band(log: Log, modes: Modes, stage: Stage | None) -> tuple[float, float]:
-    """Return the band of the searches, or of the modes found, with a margin."""
+    """Return the band of the searches, or of the resonances found, with a margin."""
     places = [(f, 0.3) for f in modes.frequency.tolist()]
+    places += [(one.frequency, 0.3) for one in modes.refused if one.frequency]
     if stage is not None:
         places += [(mode.frequency_hz, mode.search) for mode in stage.modes]
     if not places:
         return 20 * log.sample_rate / max(b - a for a, b in log.pieces), 0.45 * log.sample_rate
     return min(f * (1 - share) for f, share in places), max(f * (1 + share) for f, share in places)
-
-
-def _edges(low: float, high: float, modes: Modes, duration: float) -> FloatArray:
-    """Return bins that show each mode and average the scatter of the periodogram."""
-    if high > _WIDE * low > 0:
-        return np.geomspace(low, high, _BINS + 1)
-    widths = 2 * modes.damping_ratio * modes.frequency
-    width = min(_ORDINATES / duration, _SHARE * float(np.min(widths, initial=np.inf)))
-    return np.linspace(low, high, 1 + int(np.clip((high - low) / width, 8, _BINS)))
-
-
-def _density(log: Log, channel: Channel, edges: FloatArray, settling: bool) -> FloatArray:
-    """Average the spectrum of a channel over its segments and in bins, NaN where it is zero."""
-    shortest = 10 / edges[-1]
-    segments = select_segments(log, "settling") if settling else find_segments(log, shortest)
-    if not segments:
-        raise BadLog(log.name, "too-short", f"no segment of {shortest:.3g} s to plot")
-    weights = [segment.stop - segment.start for segment in segments]
-    top = float(edges[-1])
-    spectra = [periodogram(channel, s, log.sample_rate, top) for s in segments]
-    mean = np.average([bin_density(s, edges) for s in spectra], axis=0, weights=weights)
-    return np.where(mean > 0, mean, np.nan)
 
 
 def _mark_lines(
@@ -225,7 +257,7 @@ def _annotate(
             labels.append((at, f"{spell(refusal.mode)}\n{refusal.reason}", figures.RED))
     panels[-1].set_xlabel("frequency in Hz")
     panels[-1].set_xlim(*band)
-    if band[1] > _WIDE * band[0] > 0:
+    if band[1] > WIDE * band[0] > 0:
         from matplotlib.ticker import LogLocator, NullLocator, StrMethodFormatter
 
         panels[-1].set_xscale("log")
@@ -271,6 +303,8 @@ def _write_labels(ax: Axes, labels: list[tuple[float, str, str]]) -> None:
 
 def _place(refusal: Refusal, stage: Stage | None) -> float | None:
     """Return the frequency in Hz at which a refused candidate was sought; None if unknown."""
+    if refusal.frequency is not None:
+        return refusal.frequency
     if refusal.mode.endswith(" Hz"):
         return float(refusal.mode.removesuffix(" Hz"))
     named = {mode.name: mode.frequency_hz for mode in stage.modes} if stage else {}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -13,8 +14,11 @@ from matplotlib.figure import Figure
 from matplotlib.text import Text
 
 from lmshealth.io.log import Log, Refusal
+from lmshealth.modal.identification import AmbientReading
 from lmshealth.modal.modes import Modes, estimates_only, merge, numbered
-from lmshealth.report.log_figures import LogFigure, spectra_figure, write_figure
+from lmshealth.report.log_figures import LogFigure, modes_figure, write_figure
+from lmshealth.signal.segments import find_segments
+from lmshealth.signal.spectra import LogSpectra, cross_spectra
 from lmshealth.signal.spectral_lines import Line
 from tests.signals import Mode, accelerations, make_log, make_stage, sine, white
 
@@ -40,6 +44,14 @@ def some_modes(ln_f_std: float, *frequencies: float) -> Modes:
     return numbered(merge([found], [Line(50.0, 10.0, "m/s²", "mains", "acc_n")], [refused]))
 
 
+def read(log: Log, modes: Modes) -> AmbientReading:
+    """Give the spectra of a whole log."""
+    segments = find_segments(log, 1.0)
+    spectra = cross_spectra(log.channels, segments, RATE, 0.49 * RATE)
+    names = tuple(channel.name for channel in log.channels)
+    return AmbientReading(modes, LogSpectra(names, ("acc",) * len(names), spectra))
+
+
 def draw(figure: LogFigure) -> Figure:
     """Draw with matplotlib, and lay out."""
     whole = Figure(figsize=figure.size, layout="constrained")
@@ -51,8 +63,8 @@ def draw(figure: LogFigure) -> Figure:
 
 def test_spectra_modes_lines_and_refusals_stand_at_their_places(log: Log) -> None:
     """The level of white noise, the interval of a mode, a line in its channel, a candidate."""
-    whole = draw(spectra_figure(log, some_modes(0.01, 62.0), band=(40.0, 90.0)))
-    second, first = whole.axes  # by name
+    whole = draw(modes_figure(log, read(log, some_modes(0.01, 62.0)), band=(40.0, 90.0)))
+    first, second, _ = whole.axes  # then the singular values
     curves: dict[str, Any] = {line.get_label(): line for line in first.lines}
     x, y = np.asarray(first.lines[0].get_data(), dtype=float)
     away = np.abs(x - 50) > 2
@@ -66,7 +78,7 @@ def test_spectra_modes_lines_and_refusals_stand_at_their_places(log: Log) -> Non
     assert (box.get_x(), box.get_x() + box.get_width()) == pytest.approx(
         62.0 * np.exp([-0.0196, 0.0196])
     )
-    assert [text.get_text() for text in second.texts][1:] == [
+    assert [text.get_text() for text in first.texts][1:] == [
         "mode 1\n62.00 ± 0.62 Hz", "80.5 Hz\ntoo-uncertain"
     ]  # fmt: skip
 
@@ -74,7 +86,8 @@ def test_spectra_modes_lines_and_refusals_stand_at_their_places(log: Log) -> Non
 @pytest.mark.parametrize("frequencies", [(60.0, 60.2, 60.4), tuple(60 + 0.1 * np.arange(12))])
 def test_names_of_close_modes_do_not_overlap(log: Log, frequencies: tuple[float, ...]) -> None:
     """Labels above the axes are moved apart, upright when there are many."""
-    whole = draw(spectra_figure(log, some_modes(1e-4, *frequencies), band=(40.0, 90.0)))
+    reading = read(log, some_modes(1e-4, *frequencies))
+    whole = draw(modes_figure(log, reading, band=(40.0, 90.0)))
     # The extent of an annotation includes its arrow.
     texts = [Text.get_window_extent(text) for text in whole.axes[0].texts[1:]]
     spans = sorted((box.x0, box.x1) for box in texts)
@@ -87,7 +100,7 @@ def test_a_described_mode_that_is_refused_is_drawn_where_it_is_described(log: Lo
     """The whole search is shown."""
     stage = make_stage([("roll", 80.0, 0.02)])
     refusal = Refusal("log", "not-excited", "none", mode=stage.modes[0].name)
-    whole = draw(spectra_figure(log, merge([], [], [refusal]), stage))
+    whole = draw(modes_figure(log, read(log, merge([], [], [refusal])), stage))
     (line,) = (one for one in whole.axes[0].lines if "described" in str(one.get_label()))
     assert np.asarray(line.get_xdata()) == pytest.approx(80.0)
     reach = stage.modes[0].search
@@ -96,8 +109,19 @@ def test_a_described_mode_that_is_refused_is_drawn_where_it_is_described(log: Lo
 
 def test_figures_are_reproducible_and_keep_dollar_signs(log: Log, tmp_path: Path) -> None:
     """A dollar sign starts no formula; the bytes of a figure are the same each time."""
-    figure = spectra_figure(log, some_modes(0.01, 62.0), band=(40.0, 90.0))
+    figure = modes_figure(log, read(log, some_modes(0.01, 62.0)), band=(40.0, 90.0))
     for suffix in ("svg", "png", "html"):
         for name in "ab":
             write_figure(tmp_path / f"{name}.{suffix}", figure)
         assert (tmp_path / f"a.{suffix}").read_bytes() == (tmp_path / f"b.{suffix}").read_bytes()
+
+
+def test_resonances_that_were_rejected_are_drawn_where_they_were_found(log: Log) -> None:
+    """Without a description the list of refusals lacks them; those not excited are not drawn."""
+    rejected = (
+        Refusal("log", "poor-fit", "scatters", mode="mode_7", frequency=70.25),
+        Refusal("log", "not-excited", "nothing", mode="mode_8", frequency=75.0),
+    )
+    reading = replace(read(log, numbered(merge([], [], []))), rejected=rejected)
+    whole = draw(modes_figure(log, reading, band=(40.0, 90.0)))
+    assert [t.get_text() for t in whole.axes[0].texts][1:] == ["70.25 Hz\npoor-fit"]

@@ -16,7 +16,12 @@ from scipy.stats import gamma
 
 from lmshealth._arrays import BoolArray, ComplexArray, FloatArray
 from lmshealth.modal import constants
-from lmshealth.modal.ambient.cluster_modes import ClusterFit, ClusterModes, LineEstimate
+from lmshealth.modal.ambient.cluster_modes import (
+    ClusterFit,
+    ClusterModes,
+    FittedSpectrum,
+    LineEstimate,
+)
 from lmshealth.modal.ambient.expected_periodogram import MeanOrdinates, average_ordinates
 from lmshealth.modal.ambient.whittle import Likelihood, lay_out, marginalise
 from lmshealth.modal.modes import Modes, Rejection, paired
@@ -225,7 +230,7 @@ def fit_cluster(
     n, needed = sum(int(mask.sum()) for mask in data.masks), 10 + 6 * len(present)
     if n < needed:
         detail = f"{n} Fourier frequencies in the band hold no line, needed {needed}: record longer"
-        short = dict.fromkeys((t.name for t in present), Rejection("too-short", detail))
+        short = {t.name: Rejection("too-short", detail, t.frequency) for t in present}
         return ClusterFit(None, _not_excited(absent, gains) | short)
     data = mask_prominent_lines(data)
     for _ in range(_MOST_LINE_ROUNDS):
@@ -303,6 +308,7 @@ def _not_excited(targets: Sequence[Target], gains: dict[str, float]) -> dict[str
             "not-excited",
             f"no resonance near {target.frequency:.4g} Hz in any channel: it would improve the log "
             f"likelihood by {max(gains[target.name], 0):.1f}; excite it more or record longer",
+            target.frequency,
         )
         for target in targets
     }
@@ -497,7 +503,9 @@ def _conclude(
     estimate, cov, decrement = marginalise(likelihood, p)
     if not decrement < constants.WORST_DECREMENT:
         detail = f"the fit did not converge (Newton decrement {decrement:.2g}); record longer"
-        return ClusterFit(None, dict.fromkeys(names, Rejection("not-identified", detail)))
+        return ClusterFit(
+            None, {t.name: Rejection("not-identified", detail, t.frequency) for t in targets}
+        )
     n, (f, zeta) = len(targets), np.exp(estimate).reshape(2, -1)
     ratio = likelihood.signal_to_noise(p)
     residual = _residual(data, expected)
@@ -520,14 +528,20 @@ def _conclude(
         refused=(),
     )
     judged = [_incredible(modes, i, one, residual.duration) for i, one in enumerate(targets)]
-    rejected = {name: why for name, why in zip(names, judged, strict=True) if why is not None}
+    rejected = {
+        name: why._replace(frequency=at)
+        for name, why, at in zip(names, judged, f.tolist(), strict=True)
+        if why is not None
+    }
     narrow = [why is not None and why.reason == "line-not-mode" for why in judged]
     ordinates = masked_ordinates(data)
     for k in np.searchsorted(residual.frequency, f[narrow]).tolist():
         ordinates.append((max(0, k - _LINE_BINS), k + _LINE_BINS + 1))
     clarity = np.array([gains[name] for name in names])
     lines = tuple(read_line(data, first, last) for first, last in ordinates)
-    found = ClusterModes(modes, data.unit, clarity, lines, residual)
+    longest = data.longest
+    fitted = FittedSpectrum(channels, data.unit, data.spectra.spectra[longest], expected[longest])
+    found = ClusterModes(modes, data.unit, clarity, lines, residual, fitted)
     return ClusterFit(found.keep(name for name in names if name not in rejected), rejected)
 
 

@@ -9,11 +9,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from lmshealth._arrays import FloatArray
+from lmshealth._arrays import ComplexArray, FloatArray
 from lmshealth.io.log import Refusal
 from lmshealth.modal import constants
 from lmshealth.modal.modes import Modes, Rejection
-from lmshealth.signal.spectra import Spectrum
+from lmshealth.signal.spectra import CrossSpectrum, Spectrum
 
 
 class LineEstimate(NamedTuple):
@@ -22,6 +22,16 @@ class LineEstimate(NamedTuple):
     channel: str
     frequency: float
     amplitude: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FittedSpectrum:
+    """Cross spectrum of the longest observation that a cluster was fitted to."""
+
+    channels: tuple[str, ...]
+    unit: FloatArray  # of the channels in (m/s²)/Hz^½, (n_channels,)
+    spectrum: CrossSpectrum  # in these units
+    expected: ComplexArray  # of its matrix, by the fit; infinite at lines
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -34,6 +44,7 @@ class ClusterModes:
     lines: tuple[LineEstimate, ...]  # excluded from the fit
     # ordinates of the longest observation over their expectation, mean over channels
     residual: Spectrum
+    fitted: FittedSpectrum
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -65,8 +76,8 @@ class ClusterFit:
         """Return the rejections as refusals of a log, except of names that were assigned."""
         assigned = () if self.modes is None else self.modes.names
         return [
-            Refusal(log=log, mode=name, reason=reason, detail=detail)
-            for name, (reason, detail) in self.rejected.items()
+            Refusal(log, why.reason, why.detail, mode=name, frequency=why.frequency)
+            for name, why in self.rejected.items()
             if name not in assigned
         ]
 
@@ -89,7 +100,9 @@ def refuse_close_modes(fit: ClusterFit) -> ClusterFit:
             f"{100 * mean.damping_ratio[0]:.2g} %: record longer, or in a channel that they move "
             "differently"
         )
-        rejected = rejected | dict.fromkeys(names, Rejection("too-close", detail))
+        rejected = rejected | dict.fromkeys(
+            names, Rejection("too-close", detail, float(mean.frequency[0]))
+        )
         modes = modes.keep(name for name in modes.names if name not in names)
     return ClusterFit(modes, rejected)
 

@@ -119,7 +119,7 @@ def identify_decays(
     named, ambiguous = _name(targets, found)
     names = {name for modes in named for name in modes.names}
     refused = [
-        Refusal(log.name, *(ambiguous.get(t.name) or _why_missing(t, found)), mode=t.name)
+        Refusal(log.name, *(ambiguous.get(t.name) or _why_missing(t, found))[:2], mode=t.name)
         for t in targets
         if t.name not in names
     ]
@@ -404,7 +404,7 @@ def _number(log: Log, bands: list[_BandModes]) -> Modes:
         rejected = [pole for band in bands for pole in band.rejected]
         strongest = max(rejected, key=lambda pole: pole.snr.max(), default=None)
         nothing = ("not-excited", "nothing decays in the band: stop harder, or change the band")
-        raise BadLog(log.name, *((strongest and strongest.rejection) or nothing))
+        raise BadLog(log.name, *((strongest and strongest.rejection) or nothing)[:2])
     return modes
 
 

@@ -234,14 +234,14 @@ def _modes(log: Log, frf: Frf, output: Channel, fit: ResponseFit) -> Modes:
     if fit.ordinates.periodic and fit.missed > constants.FRF_MISSED:
         nothing = _why_missed(frf, fit)
         why = dict.fromkeys(range(m), nothing)
-    elif len(why) == m and {reason for reason, _ in why.values()} <= _NO_RESONANCE:
+    elif len(why) == m and {one.reason for one in why.values()} <= _NO_RESONANCE:
         nothing = _why_none(frf, fit)
     refused = [
-        Refusal(log.name, reason, detail, output.name, f"{np.exp(fit.estimate[i]):.5g} Hz", "frf")
-        for i, (reason, detail) in why.items()
+        Refusal(log.name, *one[:2], output.name, f"{np.exp(fit.estimate[i]):.5g} Hz", "frf")
+        for i, one in why.items()
     ]
     if nothing is not None:
-        refused.append(Refusal(log.name, *nothing, output.name, source="frf"))
+        refused.append(Refusal(log.name, *nothing[:2], output.name, source="frf"))
     found = estimates_only(fit.estimate, fit.cov, fit.snr, "frf", [output.name] * m)
     kept = found.select([i for i in range(m) if i not in why])
     return numbered(merge([kept], _lines(log, output, fit), (*log.refused, *refused)))
