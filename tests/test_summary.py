@@ -85,11 +85,11 @@ def test_what_failed_is_told(copied: Path) -> None:
     """What a record says not to be so stands on the page, with its reason."""
     path = copied / "frf_modes" / "result.json"
     record: dict[str, Any] = json.loads(path.read_text())
-    assert "Not so: *coverage*" not in summary.page()
+    assert "Check not met: *coverage*" not in summary.page()
     record["passed"]["coverage"] = False
     record["not_met"]["coverage"] = "the noise was another one"
     path.write_text(json.dumps(record))
-    assert "Not so: *coverage*: the noise was another one." in summary.page()
+    assert "Check not met: *coverage*: the noise was another one." in summary.page()
 
 
 def test_claims_are_judged() -> None:

@@ -355,14 +355,14 @@ def claims(answer: Row) -> Iterator[Claim]:
         wrong = [line for found in row["wrong"].values() for line in found]
         yield Claim(
             f"what hostile names and metadata do ({kind})",
-            f"{len(wrong)} of {len(row['wrong'])} things that must not be",
+            f"{len(wrong)} of {len(row['wrong'])} forbidden effects",
             f"{row['machines']} machines",
             controls_seen(answer["controls"]),
             not wrong,
         )
     if peaks := [row["peak_mb"] for row in answer["bombs"]]:
         yield Claim(
-            "memory that a file which swells takes, with all libraries",
+            "memory for a file that decodes to many times its size, with all libraries",
             f"{max(peaks)} MB at most",
             f"{len(peaks)} kinds",
             "",

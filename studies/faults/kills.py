@@ -171,7 +171,7 @@ def claims(answer: Row) -> Iterator[Claim]:
     for kind, row in answer["kills"].items():
         wrong = len(row["differences"]) + len(row["other_ends"])
         yield Claim(
-            f"what is not as uninterrupted after kills at random moments ({kind})",
+            f"differences from an uninterrupted run after kills at random moments ({kind})",
             f"{wrong} in {row['n']} kills, {row['batches']} batches",
             f"slowest end {row['slowest_end_s']:.0f} s",
             controls_seen(answer["control"]),

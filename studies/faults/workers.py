@@ -119,7 +119,7 @@ def claims(answer: Row) -> Iterator[Claim]:
     row, passed = answer["workers killed"], answer["passed"]
     wrong = len(row["differences"]) + len(row["other_ends"])
     yield Claim(
-        "what is not as uninterrupted after workers were killed",
+        "differences from an uninterrupted run after workers were killed",
         f"{wrong} in {row['n']} kills, {row['batches']} batches",
         "",
         controls_seen(answer["control"]),
@@ -130,10 +130,10 @@ def claims(answer: Row) -> Iterator[Claim]:
             passed[f"{what}, scheduler lost"] for what in ("as uninterrupted", "told in one line")
         )
         yield Claim(
-            "what is not so after the scheduler was lost",
+            "the same after the scheduler was lost",
             str(len(lost["differences"])),
             "",
-            "told in one line" if fine else "not told in one line",
+            "reported in one line" if fine else "not reported in one line",
             fine,
         )
 

@@ -14,8 +14,8 @@ NAMES = {
     "learned": "learned from its fleet",
     "learned, laws alone": "learned, laws alone",
     "known": "the fleet is known",
-    "only the worn teach": "only the worn teach",
-    "another fleet teaches": "another fleet teaches",
+    "only the worn teach": "prior from worn machines only",
+    "another fleet teaches": "prior from another fleet",
 }
 COLOURS = {"description": BLACK, "learned": BLUE, "learned, laws alone": BLUE, "known": GREY}
 
@@ -82,7 +82,7 @@ def draw_figure(figure: Figure, result: Row) -> None:
     draw_coverage(axes[1], result["ways"])
     draw_priors(axes[2], result["priors"])
     title = f"{result['young']} young machines of {result['fleets']} fleets"
-    figure.suptitle(f"{title}, {result['teachers']} teachers each", fontsize=10)
+    figure.suptitle(f"{title}, {result['teachers']} machines for each prior", fontsize=10)
 
 
 if __name__ == "__main__":

@@ -419,7 +419,7 @@ def claims(answer: Row) -> Iterator[Claim]:
         "coverage with a motor that distorts",
         percents(bent),
         "",
-        f"95 % at least asked; {lost} of {answer['n_seeds']} records show another number of modes",
+        f"95 % required; {lost} of {answer['n_seeds']} records show another number of modes",
         lost == 0,
     )
     sides = answer["two_inertias"]

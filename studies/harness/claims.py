@@ -88,7 +88,7 @@ def share(what: str, row: Row, beside: str = "", *, met: bool = True) -> Claim:
 
 def controls_seen(found: Mapping[str, bool]) -> str:
     """Format how many negative controls were detected."""
-    return f"{sum(map(bool, found.values()))} of {len(found)} controls are seen"
+    return f"{sum(map(bool, found.values()))} of {len(found)} controls are detected"
 
 
 def covered(what: str, rows: Iterable[Row], beside: str = "", *, met: bool | None = None) -> Claim:

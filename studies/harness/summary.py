@@ -109,7 +109,7 @@ def section(record: Record) -> Iterator[str]:
     for name, fine in record.content.get("passed", {}).items():
         if not fine:
             why = f": {reasons[name]}" if isinstance(reasons, dict) and name in reasons else ""
-            yield from ("", f"Not so: *{name}*{why}.")
+            yield from ("", f"Check not met: *{name}*{why}.")
 
 
 def question(record: Record) -> str:

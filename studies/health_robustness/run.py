@@ -423,7 +423,7 @@ def claims(answer: Row) -> Iterator[Claim]:
         ]  # fmt: skip
         control = arm != "coherent"
         yield covered(
-            f"the map is 5 % wrong, its error believed: {arm}" + (" (control)" if control else ""),
+            f"the map is 5 % wrong, error model: {arm}" + (" (control)" if control else ""),
             own,
             "" if control else "90 % required",
             met=all(row["holds"] for row in own) != control,

@@ -149,7 +149,7 @@ def claims(answer: Row) -> Iterator[Claim]:
         "lmshealth --help, over the import of numpy, scipy and pandas",
         f"{number(start['times_bare']['--help'])} times",
         f"median of {start['turns']} turns",
-        "less than once asked",
+        "less than once required",
         passed["so does help"],
     )
     yield Claim(

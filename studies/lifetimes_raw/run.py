@@ -13,9 +13,9 @@ Method
     none.
 Answer
     Yes. With the map's error intervals of 50 and 90 % cover 62 to 69 and 94 to 100 %. Of 36
-    machines that reach no limit within the horizon 31 have the answer that no end of life is
-    visible, the others a probability near it (95 % in the mean). No machine was refused, and no
-    false step was detected.
+    machines that reach no limit within the horizon 31 have a service later than it; the mean
+    probability of no limit within it is 95 %. No machine was refused, and no false step was
+    detected.
 Run time
     90 minutes on one processor for simulation and identification, ten for the posteriors.
 """
@@ -67,7 +67,7 @@ class PriorPlan(Plan):
 STEP = "prognose"
 
 SEED = 20261122
-BELIEVED, STATED = "map believed", "map error of 5 %"
+BELIEVED, STATED = "map believed", "map error of 5 %"  # the first: map taken as exact
 HALVED = "draws pulled to half their distance"
 N_LIVES, QUICK_LIVES, QUICK_LOGS, QUICK_SECONDS = 100, 1, 4, 8.0
 KM_PER_DAY = 12.0
@@ -185,15 +185,16 @@ def claims(answer: Row) -> Iterator[Claim]:
     """Claim the remaining life from raw samples on, and of machines that keep their health."""
     for kind, rows in answer["ranks"].items():
         if kind != STATED:
-            yield from ranked(f"from raw logs, {kind}", rows.values(), control=kind == HALVED)
+            what = "map taken as exact" if kind == BELIEVED else kind
+            yield from ranked(f"from raw logs, {what}", rows.values(), control=kind == HALVED)
     kept, lost = answer["no_limit_within_horizon"], answer["limit_within_horizon"]
     yield counted(
-        "lives that reach no limit within the horizon are told that no end is visible",
+        "lives that reach no limit within the horizon: service later than it",
         kept["no_end_visible"],
         kept["n"],
     )
     yield counted(
-        "lives that do reach one are told the same",
+        "the same of lives that do reach one",
         lost["no_end_visible"],
         lost["n"],
         met=lost["no_end_visible"] == 0,

@@ -170,7 +170,7 @@ def claims(answer: Row) -> Iterator[Claim]:
                 f"lines of {row['ratio_db']} dB found in white noise of 3 s",
                 round(row["share_found"] * row["n"]),
                 row["n"],
-                f"{percents([row['best_any_frequency']])} by who knows the density",
+                f"{percents([row['best_any_frequency']])} by a detector with the density given",
             )
     moved = answer["modes"]["strengths"]
     hits = [round(row["share_in_place"] * row["n"]) for row in moved]
@@ -181,10 +181,11 @@ def claims(answer: Row) -> Iterator[Claim]:
     )
     worst = min(moved, key=lambda row: row["share_in_place"])
     yield counted(
-        f"the same at {worst['times_peak']:g} times the peak, where it is worst",
+        f"the same at {worst['times_peak']:g} times the peak, the worst place",
         round(worst["share_in_place"] * worst["n"]),
         worst["n"],
-        "95 % asked; with lines left in " + percents([worst["share_in_place_with_lines_left_in"]]),
+        "95 % required; with lines left in "
+        + percents([worst["share_in_place_with_lines_left_in"]]),
         met=worst["share_in_place"] >= 0.95,
     )
 

@@ -1,4 +1,4 @@
-"""Does what is known of real measurements lie where identified modes and their intervals say?
+"""Do identified modes and their intervals agree with what is known of real measurements?
 
 Method
     A timber building under ambient excitation (90 min, 6 accelerometers, 100 Hz) is cut into
@@ -137,7 +137,7 @@ def claims(answer: Row) -> Iterator[Claim]:
     off = [abs(row["median_frequency_hz"] / row["published_hz"] - 1) for row in modes]
     n = building["n_windows"]
     yield Claim(
-        f"a timber building: logs of five minutes in which each of {len(off)} modes is told",
+        f"a timber building: logs of five minutes in which each of {len(off)} modes is identified",
         f"{min(row['n_windows'] for row in modes)} of {n}",
         met=all(row["n_windows"] == n for row in modes),
     )

@@ -1,4 +1,4 @@
-"""Is the position of a roller under a real beam where the posterior says it is?
+"""Does the posterior contain the position of a roller under a real beam?
 
 Method
     The movable-roller testbed DROPBEAR (data set 8): a roller makes a cantilever stiffer in five

@@ -193,7 +193,7 @@ def claims(answer: Row) -> Iterator[Claim]:
     rows, left, passed = answer["stiffness"], answer["remaining"], answer["passed"]
     lines = [line for step in answer["steps"] for line in step["commands"]]
     yield Claim(
-        "commands of the tutorial that do what it says",
+        "commands of the tutorial with the documented output",
         f"{len(lines)} of {len(lines)}" if passed["what is shown comes out"] else "not all",
         met=passed["what is shown comes out"],
     )

@@ -1,4 +1,4 @@
-"""What is gained where one guide serves an X and a Y configuration, and what X alone cannot tell?
+"""What is gained where one guide serves an X and a Y stage, and what does X alone not identify?
 
 Method
     Preload, mount of X and mount of Y are drawn from the priors of the descriptions. Drifts are

@@ -224,7 +224,11 @@ def claims(answer: Row) -> Iterator[Claim]:
     modal = [x for row in rows if row["table"] == "Table 5" for x in row["ratio"]]
     off = [abs(x - 1) for x in modal if x is not None]
     yield Claim(
-        "Table 5, all cells, off at most", percents([max(off)]), "", "3 % asked", max(off) <= 0.03
+        "Table 5, all cells, off at most",
+        percents([max(off)]),
+        "",
+        "3 % required",
+        max(off) <= 0.03,
     )
     for key, what in COUNTS.items():
         yield Claim(
@@ -239,7 +243,7 @@ def claims(answer: Row) -> Iterator[Claim]:
     for axis, row in answer["growing_with_velocity"].items():
         found, named = row["named_and_simulated"].split(" of ")
         yield Claim(
-            f"frequencies said to grow with velocity that do ({axis.upper()})",
+            f"frequencies reported to grow with velocity that do ({axis.upper()})",
             row["named_and_simulated"],
             met=found == named,
         )

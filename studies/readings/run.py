@@ -98,7 +98,7 @@ def claims(answer: Row) -> Iterator[Claim]:
     for what, ending, control in (
         ("95 % intervals of slopes of growth cover", "coverage of the 95 % interval",
          "coverage with σ halved"),
-        ("what does not depend on velocity is said to grow", "said to grow",
+        ("constant amplitudes reported to grow with velocity", "said to grow",
          "said to grow with σ halved"),
     ):  # fmt: skip
         own, others = (

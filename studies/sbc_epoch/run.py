@@ -158,7 +158,7 @@ def claims(answer: Row) -> Iterator[Claim]:
     """Claim uniform ranks of the truth, and controls that are detected."""
     for kind, rows in answer["ranks"].items():
         if kind == DRIFTS:
-            yield from ranked(f"{kind}, which is not seen", rows.values())
+            yield from ranked(f"{kind}, which has no effect", rows.values())
         else:
             yield from ranked(kind, rows.values(), control=kind in (HALVED, EXACT))
 

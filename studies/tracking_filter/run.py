@@ -111,7 +111,7 @@ def claims(answer: Row) -> Iterator[Claim]:
     stated, halved = known["as reported"], known["halved"]
     band = stated["drift"]
     yield Claim(
-        "mean squared errors of ln f, ln ζ, drift and innovations over what they are said to be",
+        "mean squared errors of ln f, ln ζ, drift and innovations over the stated variances",
         span(row["mean"] for row in stated.values()),
         f"band of drifts {number(band['low'])} to {number(band['high'])} (99.9 %), "
         f"{known['lives']:,} lives",

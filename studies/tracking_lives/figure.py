@@ -74,7 +74,7 @@ def draw_delays(ax: Axes, delays: Row) -> None:
         ax.plot(own["q50"], y, "o", ms=6, color=colour)
         ax.text(own["q95"] + 0.8, y, km, va="center", fontsize=7)
     name_lines(ax, [name for name, _ in _WHO.values()])
-    ax.set(xlim=(0, 60), xlabel="logs of 20 s until it is told: median, 5 to 95 %")
+    ax.set(xlim=(0, 60), xlabel="logs of 20 s until the alarm: median, 5 to 95 %")
     ax.set_title("Delay of a loss of 5 % preload over 60 logs")
 
 
@@ -89,7 +89,7 @@ def draw_events(ax: Axes, rows: list[Row]) -> None:
         ax.text(0.61, y, when, va="center", fontsize=7)
     name_lines(ax, [label(row) for row in rows])
     ax.set(xlim=(0.6, 1.01), title="Events")
-    ax.set_xlabel("share of undeclared events told for what they are, 99.9 % interval")
+    ax.set_xlabel("share of undeclared events detected with the right kind, 99.9 % interval")
 
 
 def draw_figure(figure: Figure, result: Row) -> None:

@@ -246,21 +246,21 @@ def claims(answer: Row) -> Iterator[Claim]:
     power = answer["power"]
     alarms, delay = power["alarms"], power["delays"]["tracker"]
     yield counted(
-        "5 % of preload lost over 60 logs is told",
+        "5 % of preload lost over 60 logs raises an alarm",
         alarms["hits"],
         alarms["n"],
         "95 % required",
         met=alarms["share"] >= 0.95,
     )
     yield Claim(
-        "logs until it is told, over those of the best that must learn as much",
+        "logs until the alarm, over those of the optimum that estimates as much",
         number(power["over_best_that_learns"]),
         f"{number(delay['mean'])} logs in the mean, 90 % of lives {number(delay['q5'])} to "
         f"{number(delay['q95'])}",
-        f"{number(power['over_best_that_knows'])} times those of who knows all",
+        f"{number(power['over_best_that_knows'])} times those of the optimum with all known",
     )
     yield _counted(
-        "lives alarm of which temperature, payload or a retuning is hidden (control)",
+        "lives alarm with undeclared temperature, payload or retuning (control)",
         [row["alarms"] for row in answer["controls"]],
     )
 
@@ -288,7 +288,7 @@ def _lives(answer: Row) -> Iterator[Claim]:
     yield covered(
         "intervals of 90 % hold the drift of healthy lives",
         [row["coverage"]["90"] for row in healthy],
-        "wider than asked" if any(not r["coverage"]["90"]["holds"] for r in healthy) else "",
+        "wider than required" if any(not r["coverage"]["90"]["holds"] for r in healthy) else "",
         met=passed["intervals of healthy lives cover at least"],
     )
     for what, own, beside, asked in (
@@ -299,7 +299,7 @@ def _lives(answer: Row) -> Iterator[Claim]:
     for name in EVENTS:
         own = [row["events"]["found_right"] for row in rows if row["name"] == name]
         each = ", ".join(f"{row['hits']} of {row['n']}" for row in own) if len(own) > 1 else ""
-        yield _counted(f"told for what it is: {name}", own, each)
+        yield _counted(f"detected with the right kind: {name}", own, each)
 
 
 if __name__ == "__main__":
