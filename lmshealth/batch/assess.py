@@ -113,6 +113,7 @@ def assess(
         notes=(*notes, *found.notes),
         seed=seed,
         waterfall=Waterfall.stack([(reading.levels, reading.modes.lines) for reading in used]),
+        latest=used[-1] if used else None,
         evidence=found.evidence,
     )
 

@@ -19,9 +19,11 @@ from lmshealth.io.log import Metadata, Refusal
 from lmshealth.io.manifest import find_logs, name_of, read_manifest
 from lmshealth.io.reading import content_digest, read_log, require_identity
 from lmshealth.io.refusal import visible
-from lmshealth.modal.identification import identify
+from lmshealth.modal.identification import read_ambient
+from lmshealth.modal.spectra_summary import summarise
+from lmshealth.signal.constants import N_BINS
 from lmshealth.signal.following_error import loop_error
-from lmshealth.signal.waterfall import relative_spectrum
+from lmshealth.signal.waterfall import relative_spectrum, shown_band
 from lmshealth.stage.description import Stage
 from lmshealth.tracking.history import LogEstimates
 
@@ -246,9 +248,17 @@ def identify_log(task: _Task, stages: tuple[Stage, ...], max_memory: float) -> I
             by = _none_of(stages)
             raise BadLog(task.name, "no-stage", _unmatched(log.metadata, stages))
         by = described.digest
-        modes, spectrum = identify(log, described), relative_spectrum(log, described)
+        reading = read_ambient(log, described)
+        modes, band = reading.modes, shown_band(described)
+        spectra = summarise(reading.spectra, reading.fitted, modes, band, N_BINS)
         estimates = LogEstimates(
-            log.name, log.digest, log.metadata, modes, loop_error(log), spectrum
+            log.name,
+            log.digest,
+            log.metadata,
+            modes,
+            loop_error(log),
+            relative_spectrum(log, described),
+            spectra,
         )
         return Identified(estimates, by, stage, asked)
     except BadLog as error:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,8 +21,8 @@ _ORDINATES, _SHARE = 4.0, 0.35
 _LEAST_BINS = 8
 # Ratio of the ends of a band from which on bins are of equal width in ln f.
 WIDE = 6.0
-# Singular values shown, and ordinates per channel that their matrices average at least.
-_MOST_SINGULAR, _PER_CHANNEL = 4, 2
+# Ordinates per channel that the matrices of singular values average at least.
+_PER_CHANNEL = 2
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -62,10 +62,13 @@ def summarise(
     modes: Modes,
     band: tuple[float, float],
     most_bins: int,
+    *,
+    n_singular: int = 0,
 ) -> SpectraSummary:
     """Average the spectra of a log, and their expectation, in bins of a band in Hz.
 
-    Sinusoids that were subtracted from the samples are added again, each in its bin.
+    Sinusoids that were subtracted from the samples are added again, each in its bin. Of several
+    channels the first ``n_singular`` singular values are returned.
     """
     low, high = band
     high = min(high, max(float(s.frequency[-1]) for s in spectra.spectra))
@@ -89,10 +92,9 @@ def summarise(
         rows = [spectra.channels.index(name) for name in fit.channels]
         own = _decibel(_expected(fit, edges))
         expected[rows] = np.where(np.isnan(own), expected[rows], own)
-    return SpectraSummary(
-        empty.channels, empty.derived, low, high, level, expected,
-        _singular_values(matrix, float(np.median(count))), count.clip(1, 6e4).astype(np.float16),
-    )  # fmt: skip
+    singular = _singular_values(matrix, float(np.median(count)), n_singular)
+    shown = count.clip(1, 6e4).astype(np.float16)
+    return replace(empty, level=level, fitted=expected, singular=singular, count=shown)
 
 
 def _binned(spectrum: CrossSpectrum, edges: FloatArray) -> ComplexArray:
@@ -129,16 +131,16 @@ def _expected(fit: FittedSpectrum, edges: FloatArray) -> FloatArray:
     return np.array(rows)
 
 
-def _singular_values(matrix: ComplexArray, count: float) -> NDArray[np.float16]:
+def _singular_values(matrix: ComplexArray, count: float, most: int) -> NDArray[np.float16]:
     """Return levels of the singular values of means over bins of ``count`` ordinates."""
     n = matrix.shape[1]
-    if n == 1:
+    if n == 1 or not most:
         return np.empty((0, len(matrix)), dtype=np.float16)
     size = max(1, int(np.ceil(_PER_CHANNEL * n / count)))
     mean = uniform_filter1d(matrix.real, size, axis=0) + 1j * uniform_filter1d(
         matrix.imag, size, axis=0
     )
-    return _decibel(np.linalg.eigvalsh(mean)[:, ::-1][:, :_MOST_SINGULAR].T)
+    return _decibel(np.linalg.eigvalsh(mean)[:, ::-1][:, :most].T)
 
 
 def _decibel(density: FloatArray) -> NDArray[np.float16]:

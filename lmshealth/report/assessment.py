@@ -19,7 +19,7 @@ from lmshealth.report import constants
 from lmshealth.report.text import quantiles, spell
 from lmshealth.signal.waterfall import Waterfall
 from lmshealth.stage.description import ParameterSpec, Stage
-from lmshealth.tracking.history import History
+from lmshealth.tracking.history import History, LogEstimates
 from lmshealth.tracking.track import Track
 
 State = Literal["good", "bad", "open"]
@@ -41,6 +41,7 @@ class Assessment:
     seed: int  # seed of all random streams
     # Spectra of the logs of the history; None when no log covers the band of the modes.
     waterfall: Waterfall | None = None
+    latest: LogEstimates | None = None  # of the last log
     # Evidence for the fleet prior; None without a posterior of the life.
     evidence: MachineEvidence | None = None
     # Fleet prior of the prognosis; None when it rests on the prior of the description.

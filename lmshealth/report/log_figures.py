@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 _WIDTH, _NOTE_COLUMNS = 8.0, 112
 # Heights of a panel, of legend and labels, of upright labels and of a line of notes, in inches.
 _PANEL, _FRAME, _LETTERS, _NOTE = 1.15, 1.75, 1.1, 0.16
-_BINS = 480  # of a spectrum, at most
+_BINS, _SINGULAR = 480, 4  # of a spectrum, and singular values, at most
 # Distance of labels over the width of the axes: side by side, and upright from this many on.
 _APART, _APART_UPRIGHT, _UPRIGHT = 0.2, 0.03, 6
 _MARKERS = "v^sDPX*<>"
@@ -63,10 +63,16 @@ def modes_figure(
     modes = replace(reading.modes, refused=_join(reading.modes.refused, reading.rejected))
     low, high = band or _band(log, modes, stage)
     high = min(high, 0.49 * log.sample_rate)
-    summary = summarise(reading.spectra, reading.fitted, modes, (low, high), _BINS)
-    size = _size(len(summary.channels) + bool(len(summary.singular)), modes)
+    summary = summarise(
+        reading.spectra, reading.fitted, modes, (low, high), _BINS, n_singular=_SINGULAR
+    )
     draw = partial(plot_spectra, summary=summary, modes=modes, stage=stage)
-    return LogFigure(f"Modes of {log.name}", size, draw, modes)
+    return LogFigure(f"Modes of {log.name}", spectra_size(summary, modes), draw, modes)
+
+
+def spectra_size(summary: SpectraSummary, modes: Modes) -> tuple[float, float]:
+    """Return the size of `plot_spectra` in inches."""
+    return _size(len(summary.channels) + bool(len(summary.singular)), modes)
 
 
 def plot_spectra(

@@ -25,6 +25,7 @@ from lmshealth.prognosis.results import Prognosis
 from lmshealth.report import constants, figures
 from lmshealth.report.assessment import Assessment, Summary, limit_of, summarise
 from lmshealth.report.changes import Reported, changes, reported
+from lmshealth.report.log_figures import plot_spectra, spectra_size
 from lmshealth.report.rendering import render
 from lmshealth.report.svg import share_letters
 from lmshealth.report.tables import track_rows
@@ -76,11 +77,19 @@ def make_page(
     }
     draw = _track_pictures(assessment, content["influences"])
     draw |= _health_pictures(assessment, service)
-    pictures = {}
-    for k, (key, plot) in enumerate(draw.items()):
-        text = figures.svg(plot, salt=f"p{k}", size=_SIZES.get(key[0], figures.SIZE))
-        # An HTML parser needs no namespaces; without them the page names no address at all.
-        pictures[key] = re.sub(r'\sxmlns(:xlink)?="[^"]*"', "", text)
+    pictures = {
+        key: figures.svg(plot, salt=f"p{k}", size=_SIZES.get(key[0], figures.SIZE))
+        for k, (key, plot) in enumerate(draw.items())
+    }
+    latest = assessment.latest
+    if latest is not None and latest.spectra is not None:
+        shown = latest.spectra, latest.modes
+        plot = partial(plot_spectra, summary=shown[0], modes=shown[1], stage=assessment.stage)
+        pictures["latest", "all"] = figures.inline(plot, salt="last", size=spectra_size(*shown))
+    # An HTML parser needs no namespaces; without them the page names no address at all.
+    pictures = {
+        key: re.sub(r'\sxmlns(:xlink)?="[^"]*"', "", text) for key, text in pictures.items()
+    }
     content["letters"], content["picture"] = share_letters(pictures)
     return Page(file, render("stage.html.j2", generated, **content), summary)
 

@@ -15,6 +15,7 @@ from lmshealth._arrays import BoolArray, FloatArray, ReadOnly, expect_shape, fre
 from lmshealth.errors import NotEnoughData
 from lmshealth.io.log import Metadata, Refusal
 from lmshealth.modal.modes import Modes
+from lmshealth.modal.spectra_summary import SpectraSummary
 from lmshealth.signal.waterfall import RelativeSpectrum
 from lmshealth.stage.description import Stage
 from lmshealth.tracking import constants
@@ -168,6 +169,8 @@ class LogEstimates:
         RMS of the following error from 1 to 40 Hz in m; None where unknown.
     levels : RelativeSpectrum or None
         Spectrum about the tracked modes, for plots; None where the log has none.
+    spectra : SpectraSummary or None
+        Spectrum of each channel with the fit of the modes, for plots; None if it was not kept.
 
     Examples
     --------
@@ -193,6 +196,7 @@ class LogEstimates:
     modes: Modes
     loop_error: float | None = None
     levels: RelativeSpectrum | None = None
+    spectra: SpectraSummary | None = None
 
 
 def sort_by_time(readings: Sequence[LogEstimates]) -> tuple[LogEstimates, ...]:

@@ -19,7 +19,9 @@ def test_levels_fit_and_singular_values_are_those_of_the_process() -> None:
     one, two = accelerations(rng, [MODE], N, RATE, NOISE)
     log = make_log({"acc_a": one + sine(N, RATE, 75.0, 3.0), "acc_b": two}, RATE)
     reading = read_ambient(log, make_stage([("roll", 62.0, 0.02)]))
-    summary = summarise(reading.spectra, reading.fitted, reading.modes, (50.0, 80.0), 100)
+    summary = summarise(
+        reading.spectra, reading.fitted, reading.modes, (50.0, 80.0), 100, n_singular=2
+    )
     middle = (summary.edges[1:] + summary.edges[:-1]) / 2
     true = 10 * np.log10(density([MODE], middle, NOISE))
     line = np.abs(middle - 75.0) < 0.5
@@ -44,7 +46,7 @@ def test_a_channel_without_power_has_no_level() -> None:
     log = make_log({"acc_a": white(rng, 1.0, 8000, RATE)}, RATE)
     reading = read_ambient(log, band=(50.0, 80.0))
     spectra = reading.spectra
-    summary = summarise(spectra, (), reading.modes, (50.0, 80.0), 100)
+    summary = summarise(spectra, (), reading.modes, (50.0, 80.0), 100, n_singular=2)
     assert summary.singular.shape == (0, summary.count.size)
     assert np.isfinite(summary.level).all()
     assert np.isnan(summary.fitted).all()

@@ -15,6 +15,8 @@ from msgspec import structs
 
 from lmshealth._arrays import FloatArray
 from lmshealth.io.log import Refusal
+from lmshealth.modal.identification import read_ambient
+from lmshealth.modal.spectra_summary import summarise
 from lmshealth.prognosis.fleet_prior import FleetPrior, LawPrior
 from lmshealth.prognosis.life_likelihood import expected_scatter, scatter_prior
 from lmshealth.prognosis.results import Prognosis
@@ -27,7 +29,7 @@ from lmshealth.report.text import GAP
 from lmshealth.stage.description import Decision, ScatterPrior, load_stage
 from lmshealth.stage.priors import Lognormal, Normal
 from lmshealth.tracking.covariate_effects import find_covariate_effects
-from lmshealth.tracking.history import Series
+from lmshealth.tracking.history import LogEstimates, Series
 from tests.assessments import (
     Maker,
     Page,
@@ -40,6 +42,7 @@ from tests.assessments import (
     write_report,
     write_stage,
 )
+from tests.signals import Mode, accelerations, make_log
 
 __all__ = ["make"]
 
@@ -541,3 +544,21 @@ def test_browser_shows_every_picture_and_prints(
         paper = page.pdf()
         assert paper.startswith(b"%PDF") and len(paper) > 100_000
         assert seen == []
+
+
+def test_the_spectrum_of_the_last_log_is_explained_and_names_what_is_missing(
+    make: Maker, tmp_path: Path
+) -> None:
+    """The figure of the fit, its caption, and the reason of a refused mode."""
+    stage = load_stage("lms-y")
+    rng = np.random.default_rng(2)
+    modes = [Mode(126.4, 0.015), Mode(136.4, 0.015)]
+    log = make_log({"acc_pitch": accelerations(rng, modes, 20_000, 1000.0, 1.0)[0]}, 1000.0)
+    reading = read_ambient(log, stage)
+    spectra = summarise(reading.spectra, reading.fitted, reading.modes, (110.0, 180.0), 100)
+    latest = LogEstimates("log-9.h5", log.digest, log.metadata, reading.modes, spectra=spectra)
+    page = one(tmp_path, replace(make(), latest=latest))
+    text = words(page)
+    caption = text[text.index("Spectrum of the last log") :]
+    assert "log-9.h5" in caption and "natural frequency of the machine" in caption
+    assert "Dashed: not used in this log. Yaw, not-excited: no resonance near 15" in caption
