@@ -139,8 +139,6 @@ class FilterModel:
         history, r = space.history, len(space.history.series)
         self.values = np.hstack([history.ln_frequency, history.ln_damping])
         self.there = np.isfinite(self.values)
-        self.complete: BoolArray = np.asarray(self.there.all(axis=1))
-        self.all_rows = np.arange(2 * r)
         self.sources = tuple(dict.fromkeys(one.source for one in history.series))
         self.scale_of = np.array([self.sources.index(one.source) for one in history.series] * 2)
         self.grid = hyperparameter_grid(len(self.sources))
@@ -215,20 +213,18 @@ def update(
 
     Rows that are `outlying`, ``(2 n_series,)``, have the variance of the prior, and no innovation.
     """
-    complete = model.complete[k]
-    rows: np.ndarray = model.all_rows if complete else np.flatnonzero(model.there[k])
+    rows: np.ndarray = np.flatnonzero(model.there[k])
     space = model.space
     matrix, value = space.matrix(k)[rows], model.values[k, rows]
     if value.size == 0:
         return bank, Innovation(np.array([], dtype=int), np.array([]), 0.0)
     scales = bank.hyperparameters.scales[:, model.scale_of[rows]]
-    noise = space.history.cov[k] if complete else space.history.cov[k][np.ix_(rows, rows)]
+    noise = space.history.cov[k][np.ix_(rows, rows)]
     log_weight = bank.log_weight
     n, size = bank.mean.shape
     # One product of all states with the matrix instead of one each.
     crossed = (bank.cov.reshape(-1, size) @ matrix.T).reshape(n, size, -1)
     total = matrix @ crossed + noise * scales[:, :, None] * scales[:, None, :]
-    i = model.all_rows[: value.size]
     _diagonal(total, slice(0, value.size))[:] += model.extra[k, rows]
     if outlying is not None:
         own = np.flatnonzero(outlying[rows])
@@ -241,7 +237,7 @@ def update(
     white = (half @ off[:, :, None])[:, :, 0]
     gain = half @ np.swapaxes(crossed, 1, 2)
     nis = np.square(white).sum(axis=1)
-    log_det = np.log(root[:, i, i]).sum(axis=1)
+    log_det = np.log(np.einsum("nii->ni", root)).sum(axis=1)
     reduction = np.swapaxes(gain, 1, 2) @ gain
     updated = FilterBank(
         bank.hyperparameters,

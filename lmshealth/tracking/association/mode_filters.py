@@ -48,9 +48,6 @@ def _log_densities(x: FloatArray, var: FloatArray, std: float) -> tuple[FloatArr
 
 
 def _is_stray(x: FloatArray, var: FloatArray, std: float) -> BoolArray:
-    # Within two standard deviations the regular density is always the larger.
-    if (x * x <= 4 * var).all():
-        return np.zeros(x.shape, dtype=bool)
     regular, stray = _log_densities(x, var, std)
     return np.asarray(stray > regular)
 
