@@ -229,7 +229,8 @@ def _none_of(stages: Sequence[Stage]) -> str:
 
 
 def _crashed(task: _Task, why: str) -> Identified:
-    refusal = Refusal(task.name, "corrupt", f"{why}: the file may be damaged or too large")
+    needed = "no other log is affected; run again with fewer --workers"
+    refusal = Refusal(task.name, "crashed", f"{why} (crash or out of memory); {needed}")
     return Identified((refusal,), lasting=False)
 
 

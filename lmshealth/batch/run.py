@@ -35,7 +35,8 @@ class Settings:
     store : str or None
         SQLAlchemy URL; None for a SQLite file in the folder of the output.
     workers : int
-        Processes of this machine; results do not depend on it.
+        Processes of this machine; results do not depend on it. The command line takes one per
+        processor by default.
     scheduler : str or None
         Address of a Dask scheduler, whose workers replace the processes.
     epochs : int

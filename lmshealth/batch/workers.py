@@ -1,7 +1,8 @@
 """Workers: this process, processes of this machine (loky), or a Dask cluster.
 
-Only the task of a worker that dies is lost: see `Pool.map_unordered`. This module imports
-little, because the processes import it before the batch begins; the rest follows with the tasks.
+Tasks of a worker that dies are run again; only one that ends its worker each time is lost. This
+module imports little, because the processes import it before the batch begins; the rest follows
+with the tasks.
 """
 
 from __future__ import annotations
@@ -154,7 +155,8 @@ class _ProcessPool(Pool):
             except BrokenExecutor:
                 self.kill()
                 self.start()
-        return on_crash(item, "it ended the process that worked on it")
+        ended = f"the process that worked on it alone ended {constants.ATTEMPTS_ALONE} times"
+        return on_crash(item, ended)
 
 
 def _completed(
@@ -273,7 +275,7 @@ class _Cluster(Pool):
                 try:
                     result = future.result()
                 except self.crashes:
-                    result = on_crash(item, "it ended every worker that took it")
+                    result = on_crash(item, "every worker that took it ended")
                 yield item, result
         finally:
             self.client.cancel(list(running))

@@ -106,7 +106,9 @@ SEED = click.option(
     "--seed", type=click.IntRange(0), default=0, help="Seed of all random numbers: results repeat."
 )
 WORKERS = click.option(
-    "--workers", type=click.IntRange(1), help="Number of processes; default one per processor."
+    "--workers",
+    type=click.IntRange(1),
+    help="Number of processes; default one per processor (in Python: 1).",
 )
 PDF = click.option("--pdf", is_flag=True, help="Also write the page of each stage as PDF.")
 

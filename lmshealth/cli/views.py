@@ -40,6 +40,13 @@ _HINDRANCES = {
     "baseline": ("baseline too short", "more or longer baseline logs are needed."),
     "parameters": ("hidden", "other parameters change the modes alike; track further modes."),
 }
+_FLAGS = {
+    "resolution-limited": "segments too short for the damping.",
+    "at-bound": "at the end of the search; check the description.",
+    "loose-fit": "the residual scatters more than noise, and the standard deviations may be too "
+    "small: spectral lines, further modes or unsteady operation; it is about the fit, not bolts.",
+    "cluster": "one estimate for two modes that the data do not separate.",
+}
 _VERDICTS = {
     "told": "identifiable",
     "longer-logs": "longer logs",
@@ -72,6 +79,9 @@ def print_modes(rows: Sequence[Row], refused: Sequence[Row]) -> None:
         )
     if rows:
         print_table("Modes (± one standard deviation)", cells, 3)
+        present = {flag for row in rows for flag in row["flags"].split()}
+        for flag in sorted(present):
+            print_text(f"{flag}: {_FLAGS[flag]}")
     else:
         print_text("No modes found.")
     print_refused(refused)

@@ -48,7 +48,7 @@ def dawdle(data: bytes) -> int:
 
 def lost(number: int, why: str) -> int:
     """Stand for what was lost."""
-    assert why
+    assert "ended" in why
     return -number
 
 

@@ -235,7 +235,7 @@ def test_harmonics_are_listed_with_their_channel(capsys: pytest.CaptureFixture[s
 
 
 def test_logs_are_named_without_their_folder(capsys: pytest.CaptureFixture[str]) -> None:
-    """A long path does not tear names; two logs of one name keep their folders."""
+    """Names are without folders unless two logs share one; flags are explained."""
     row: dict[str, object] = {
         "log": "a/very/long/path/of/folders/log-0001.h5", "mode": "mode_1", "channel": "acc_pitch",
         "frequency_hz": 136.6, "frequency_std_hz": 0.2, "damping_ratio": 0.015,
@@ -244,6 +244,9 @@ def test_logs_are_named_without_their_folder(capsys: pytest.CaptureFixture[str])
     print_modes([row], [])
     line = next(line for line in capsys.readouterr().out.splitlines() if "mode_1" in line)
     assert line.split()[:3] == ["log-0001.h5", "mode_1", "acc_pitch"]
+    print_modes([row | {"flags": "cluster loose-fit"}], [])
+    out = capsys.readouterr().out
+    assert "cluster: one estimate for two modes" in out and "loose-fit: the residual" in out
     print_modes([row | {"log": "x/log.h5"}, row | {"log": "y/log.h5"}], [])
     out = capsys.readouterr().out
     assert "x/log.h5" in out and "y/log.h5" in out

@@ -626,7 +626,7 @@ def _incredible(modes: Modes, i: int, target: Target, duration: float) -> Reject
         return Rejection(
             "poor-fit",
             f"the residual near {f:.5g} Hz scatters {modes.dispersion[i]:.1f} times as much as "
-            "noise: lines, unsteady operation or an impact; choose a steadier part of the log",
+            "noise: lines, unsteady operation or an impact; export a steadier part of the log",
         )
     described = target.nominal or target.frequency
     if abs(np.log(f / described)) > np.log1p(target.search) or not low < zeta < high:
