@@ -105,7 +105,7 @@ def test_a_mode_that_is_not_there_is_refused_and_the_other_kept() -> None:
     )
     assert result is not None
     assert list(result.names) == ["roll"]
-    reason, detail = rejected["pitch"]
+    reason, detail, *_ = rejected["pitch"]
     assert reason == "not-excited"
     assert "125 Hz in any channel" in detail
 
@@ -116,7 +116,7 @@ def test_noise_alone_has_no_fit() -> None:
     noise = np.array([white(rng, 1.0, 60_000, RATE) for _ in range(3)])
     result, rejected = fit(noise, [ROLL, PITCH])
     assert result is None
-    assert {name: reason for name, (reason, _) in rejected.items()} == {
+    assert {name: why.reason for name, why in rejected.items()} == {
         "roll": "not-excited",
         "pitch": "not-excited",
     }
@@ -183,7 +183,7 @@ def test_too_few_ordinates_are_named_with_their_number() -> None:
     (_, binned), (spectra, _) = spectra_of(both()), spectra_of(both(n=250))
     result, rejected = fit_spectra(spectra, binned, (ROLL,))
     assert result is None
-    reason, detail = rejected["roll"]
+    reason, detail, *_ = rejected["roll"]
     assert reason == "too-short"
     assert "needed 16" in detail
 

@@ -60,7 +60,7 @@ def test_modes_are_close_within_a_bandwidth_unless_their_shapes_differ(
     assert (set(rejected) == {"roll", "pitch"}) is close
     assert (len(kept.names) == 0) is close
     if close:
-        reason, detail = rejected["roll"]
+        reason, detail, *_ = rejected["roll"]
         assert reason == "too-close"
         assert f"{np.exp(fit.modes.estimate[0]):.5g}" in detail
 
@@ -223,7 +223,7 @@ def test_a_mode_under_a_line_that_is_too_unsteady_to_be_told_is_refused() -> Non
         np.abs((result.modes.estimate - TRUTH[[1, 3]]) / np.sqrt(np.diag(result.modes.cov))).max()
         < 4
     )
-    reason, detail = rejected["roll"]
+    reason, detail, *_ = rejected["roll"]
     assert reason == "poor-fit"
     assert "times as much as noise" in detail
     # At a third of that amplitude the mode is published with a flag.
