@@ -44,9 +44,10 @@ LINE_FALSE_ALARM = 1e-3
 # Gain in log likelihood of the binned spectra: below the first a mode is absent; above the second
 # it is present; between them the Bayesian information criterion decides, with this margin.
 ABSENT, PRESENT, EVIDENCE_MARGIN = 3.0, 60.0, 10.0
-# Contrast in standard deviations by which a peak stands out without a description, and by which
-# the residual of a fit shows a further mode.
-PEAK_THRESHOLD, EXCESS_THRESHOLD = 6.0, 5.0
+# Search without a description: share of the orders of a subspace model in which a candidate occurs;
+# gain in log likelihood by which it enters the joint model, and by which the residual of that model
+# shows a further mode (evidence decides afterwards); most modes that are published from one fit.
+STABLE, LEAST_START, LEAST_EXCESS, MOST_FOUND = 0.4, 15.0, 40.0, 5
 # Dispersion (variance of the residual over that of noise): flagged as loose-fit, refused as
 # poor-fit; and the ordinates needed to measure it.
 LOOSE_FIT, POOR_FIT, LEAST_ORDINATES = 1.5, 3.0, 30
@@ -56,6 +57,9 @@ RESOLVED = 4.0
 AT_BOUND = 0.9
 # Largest Newton decrement of a fit that has converged.
 WORST_DECREMENT = 0.1
+# A resonance is a harmonic that wanders where the kurtosis of its envelope (2 for noise, 1 for a
+# sine) is below the second value and by so many standard deviations below that of noise.
+WANDERING_SIGMAS, WANDERING_KURTOSIS = 3.5, 1.7
 # Damping ratio above which a resonance without a description is attributed to the noise.
 MOST_DAMPING = 0.1
 # Least distance of two modes in half-power bandwidths, where channels see them alike (modal
@@ -66,6 +70,9 @@ APART_ALIKE, APART, ALIKE = 1.0, 0.2, 0.8
 # not constrain: ln f, ln ζ, forces of modes, shapes, and level, slope and bend of ln noise floors.
 PRIOR_LN_F, PRIOR_LN_ZETA, PRIOR_FORCE, PRIOR_SHAPE = 0.2, 2.0, 30.0, 30.0
 PRIOR_FLOOR = (5.0, 2.0, 1.0)
+# Standard deviation of the static response of a mode over its receptance: 0 where the force acts on
+# the moving body, -1 where the base moves and the acceleration is absolute (without a description).
+PRIOR_STATIC = 1.0
 # Of the share of a floor that is coherent with the modes and with other floors (in units of the
 # floor), and of its bend: marginalised over these widths, of which the fit uses the last.
 WIDTHS_SHARED, WIDTHS_COMMON, WIDTHS_BEND = (0.03, 0.1, 1.0), (0.03, 0.3, 3.0), (0.03, 0.1, 1.0)

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
+from lmshealth._arrays import ComplexArray
 from lmshealth.errors import BadLog, BadStage
 from lmshealth.io.log import Channel, Log
+from lmshealth.modal import constants
+from lmshealth.stage.constants import BAND
 from lmshealth.stage.description import Stage
 
 
@@ -21,6 +24,8 @@ class Target:
     damping_ratio: float  # start value
     search: float  # half width of the search, as a fraction of the frequency
     nominal: float | None = None  # described frequency in Hz, once the start value is another
+    # Root of the PSD of the modal force in each channel of the log, with the signs of the shape.
+    amplitude: ComplexArray | None = field(default=None, compare=False)
 
     def band(self, widths: float) -> tuple[float, float]:
         """Return the band in Hz within so many damping ratios of the frequency."""
@@ -67,3 +72,22 @@ def choose_targets(stage: Stage, band: tuple[float, float] | None = None) -> tup
     if not targets:
         raise BadStage(f"{stage.name}: no [[mode]] lies between {low:g} and {high:g} Hz")
     return targets
+
+
+def clusters(targets: Sequence[Target]) -> list[tuple[Target, ...]]:
+    """Group neighbours to fit jointly: their bands overlap, their bandwidths are similar."""
+    groups: list[list[Target]] = []
+    for target in targets:
+        last = groups[-1] if groups else []
+        if last and len(last) < constants.MOST_TOGETHER and _interact(last[-1], target):
+            last.append(target)
+        else:
+            groups.append([target])
+    return [tuple(group) for group in groups]
+
+
+def _interact(lower: Target, upper: Target) -> bool:
+    # A narrow peak near a broad resonance would need the finest resolution over the whole band.
+    ratio = (upper.frequency * upper.damping_ratio) / (lower.frequency * lower.damping_ratio)
+    similar = 1 / constants.SIMILAR_BANDWIDTH < ratio < constants.SIMILAR_BANDWIDTH
+    return upper.band(BAND)[0] < lower.band(BAND)[1] and similar

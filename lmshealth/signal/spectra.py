@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -15,7 +15,7 @@ from lmshealth.io.buffers import MINUTE
 from lmshealth.io.log import Channel
 from lmshealth.signal import constants
 from lmshealth.signal.segments import Segment
-from lmshealth.signal.tone_removal import remove_sinusoids
+from lmshealth.signal.tone_removal import Sinusoid, remove_sinusoids
 
 # Shortest period over the lag of the second difference of a displacement.
 _LAG_PERIODS = 8.0
@@ -97,6 +97,7 @@ class CrossSpectrum:
     # Index of the channel, frequency in Hz and amplitude in m/s² of each removed sinusoid.
     lines: tuple[tuple[int, float, float], ...] = ()
     count: int = 1
+    foreign: ComplexArray | None = None  # expectation of what no mode causes, as the matrix
 
     def __post_init__(self) -> None:
         if self.matrix.shape[:1] != self.frequency.shape:
@@ -118,11 +119,16 @@ class CrossSpectrum:
             matrix=self.matrix[cut],
             free=self.free[cut],
             lines=tuple(line for line in self.lines if low <= line[1] < high),
+            foreign=None if self.foreign is None else self.foreign[cut],
         )
 
     def without(self, lines: Sequence[float]) -> CrossSpectrum:
         """Mask the ordinates of lines at these frequencies in Hz."""
         return replace(self, free=self.free & self.channel(0).clear_of(lines))
+
+    def with_foreign(self, added: ComplexArray) -> CrossSpectrum:
+        """Add an expectation that is of the shape of ``matrix``."""
+        return replace(self, foreign=added if self.foreign is None else self.foreign + added)
 
     def channel(self, index: int) -> Spectrum:
         """Return the spectrum of one channel."""
@@ -155,6 +161,21 @@ class LogSpectra:
     def removed_lines(self) -> list[tuple[str, float, float]]:
         """Channel, frequency in Hz and amplitude in m/s² of lines subtracted from the samples."""
         return [(self.channels[c], f, a) for s in self.spectra for c, f, a in s.lines]
+
+    def with_foreign(self, expected: Callable[[FloatArray], ComplexArray]) -> LogSpectra:
+        """Add an expectation that is a function of the frequency in Hz."""
+        spectra = tuple(s.with_foreign(expected(s.frequency)) for s in self.spectra)
+        return replace(self, spectra=spectra)
+
+    def without_band(self, low: float, high: float) -> LogSpectra:
+        """Exclude the ordinates from low to high Hz."""
+        return replace(
+            self,
+            spectra=tuple(
+                replace(s, free=s.free & ((s.frequency < low) | (s.frequency > high)))
+                for s in self.spectra
+            ),
+        )
 
     def without(self, frequencies: Sequence[float]) -> LogSpectra:
         """Exclude the ordinates that lines at these frequencies in Hz may reach."""
@@ -223,6 +244,47 @@ def _cross_spectrum(
     ceiling: float,
     resonances: Sequence[ResonanceRange],
 ) -> CrossSpectrum:
+    segment_transforms = transform_segment(
+        channels, segment, sample_rate, top, ceiling=ceiling, resonances=resonances
+    )
+    transforms = segment_transforms.transforms
+    step = sample_rate / round(segment_transforms.duration * sample_rate)
+    lines = tuple(
+        # Σ I = A² T / 2 over the ordinates of a sine.
+        (one.channel, (one.ordinate + 1) * step, float(np.sqrt(2 * one.power * step)))
+        for one in segment_transforms.sinusoids
+    )
+    matrix = transforms[:, :, None] * transforms[:, None].conj()
+    return CrossSpectrum(
+        segment_transforms.frequency,
+        matrix,
+        segment_transforms.duration,
+        segment.velocity,
+        segment_transforms.free,
+        lines,
+    )
+
+
+class SegmentTransforms(NamedTuple):
+    """Transforms of all channels over one segment, without the strong sinusoids."""
+
+    frequency: FloatArray  # in Hz, (n_ordinates,)
+    transforms: ComplexArray  # squared magnitudes are periodograms, (n_ordinates, n_channels)
+    duration: float  # in s
+    free: BoolArray  # ordinates without a sinusoid
+    sinusoids: tuple[Sinusoid, ...]
+
+
+def transform_segment(
+    channels: Sequence[Channel],
+    segment: Segment,
+    sample_rate: float,
+    top: float,
+    *,
+    ceiling: float = np.inf,
+    resonances: Sequence[ResonanceRange] = ANY_RESONANCE,
+) -> SegmentTransforms:
+    """Transform one segment of all channels; arguments as in `cross_spectra`."""
     parts = [as_acceleration(channel, segment, sample_rate, top) for channel in channels]
     # A second difference has no values at the ends; the other channels are cut there, too.
     short = max(lag for _, lag in parts)
@@ -237,16 +299,10 @@ def _cross_spectrum(
     for c, (x, lag) in enumerate(parts):
         x = x[short - lag : n + short - lag]
         transforms[:, c] = _transform(x, lag, frequency, sample_rate)
-    protected = np.any([r.unresolved(frequency, n / sample_rate) for r in resonances], axis=0)
-    transforms, free, sinusoids = remove_sinusoids(transforms, n / sample_rate, protected)
-    step = sample_rate / n
-    lines = tuple(
-        # Σ I = A² T / 2 over the ordinates of a sine.
-        (one.channel, (one.ordinate + 1) * step, float(np.sqrt(2 * one.power * step)))
-        for one in sinusoids
-    )
-    matrix = transforms[:, :, None] * transforms[:, None].conj()
-    return CrossSpectrum(frequency, matrix, n / sample_rate, segment.velocity, free, lines)
+    duration = n / sample_rate
+    protected = np.any([r.unresolved(frequency, duration) for r in resonances], axis=0)
+    rest, free, sinusoids = remove_sinusoids(transforms, duration, protected)
+    return SegmentTransforms(frequency, rest, duration, free, sinusoids)
 
 
 def _frequencies(n: int, sample_rate: float, ceiling: float) -> FloatArray:

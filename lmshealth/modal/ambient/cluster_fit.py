@@ -63,6 +63,7 @@ class ClusterData:
     unit: FloatArray  # root of the noise in (m/s²)/Hz^½, (n_channels,)
     binned: BinnedSpectra  # in the same units
     masks: tuple[BoolArray, ...]  # ordinates of each spectrum without lines
+    index: tuple[int, ...]  # the channels among those of the log
 
     @property
     def longest(self) -> int:
@@ -247,6 +248,92 @@ def fit_cluster(
     return ClusterFit(fit.modes, rejected | fit.rejected)
 
 
+def fit_found(
+    spectra: LogSpectra,
+    binned: BinnedSpectra,
+    targets: tuple[Target, ...],
+    band: tuple[float, float],
+) -> ClusterFit:
+    """Fit modes that a search found in a band in Hz, and drop those without evidence."""
+    data = prepare(spectra, binned, targets, band)
+    n, needed = sum(int(mask.sum()) for mask in data.masks), 10 + 6 * len(targets)
+    if n < needed:
+        detail = f"{n} Fourier frequencies in the band hold no line, needed {needed}: record longer"
+        short = {t.name: Rejection("too-short", detail, t.frequency) for t in targets}
+        return ClusterFit(None, short)
+    data = mask_prominent_lines(data)
+    for _ in range(_MOST_LINE_ROUNDS):
+        optimum, gains = _prune(data, targets)
+        targets = optimum.targets
+        optimum = _refined(data, optimum)
+        expected = _expected(data, optimum)
+        before, data = data, mask_residual_lines(data, expected)
+        if data is before:
+            break
+    return _conclude(data, optimum, expected, gains)
+
+
+def _prune(data: ClusterData, targets: tuple[Target, ...]) -> tuple[_Optimum, dict[str, float]]:
+    """Fit all modes, and drop those without evidence, the least likely first.
+
+    Returns the loss of log likelihood without each, the others fixed, too.
+    """
+    pairs = zip(data.spectra.spectra, data.masks, strict=True)
+    n_ordinates = sum(spectrum.count * int(mask.sum()) for spectrum, mask in pairs)
+
+    def solve(some: tuple[Target, ...]) -> _Optimum:
+        # A pole that is narrow by error would need the finest bins.
+        widths = [2 * t.frequency * t.damping_ratio for t in some]
+        bandwidth = max(min(widths), float(np.median(widths)) / constants.SIMILAR_BANDWIDTH)
+        blocks = make_blocks(data, bandwidth, [target.frequency for target in some])
+        return _solve(data, blocks, some)
+
+    optimum = solve(targets)
+    while True:
+        fixed = removal_losses(optimum)
+        gains = {t.name: loss for t, loss in zip(optimum.targets, fixed, strict=True)}
+        if len(fixed) == 1:
+            return optimum, gains
+        lost = _escaped(optimum)
+        doubtful = lost or [i for i, loss in enumerate(fixed) if loss < _DOUBTFUL]
+        worst, least = None, constants.EVIDENCE_MARGIN
+        for i in doubtful:
+            less = solve(optimum.targets[:i] + optimum.targets[i + 1 :])
+            extra = optimum.p.size - less.p.size
+            evidence = 2 * (less.misfit - optimum.misfit) - extra * np.log(n_ordinates)
+            if lost or evidence < least:
+                worst, least = less, evidence
+        if worst is None:
+            return optimum, gains
+        optimum = worst
+
+
+_DOUBTFUL = 200.0
+
+
+def _escaped(optimum: _Optimum) -> list[int]:
+    """Return the mode that left its start furthest, if one did by more than three bandwidths."""
+    m = len(optimum.targets)
+    f, zeta = np.exp(optimum.p[:m]), np.exp(optimum.p[m : 2 * m])
+    start = np.array([[t.frequency, t.damping_ratio] for t in optimum.targets]).T
+    left = np.abs(np.log(f / start[0])) / np.maximum(2 * start[1], 2e-3)
+    left[zeta > constants.MOST_DAMPING] = np.inf
+    return [int(left.argmax())] if left.max() > 3 else []
+
+
+def removal_losses(optimum: _Optimum) -> list[float]:
+    """Loss of log likelihood without each mode, all others fixed."""
+    lay = optimum.likelihood.layout
+    losses = []
+    for i in range(lay.n_modes):
+        p = optimum.p.copy()
+        for a, (row, column) in enumerate(lay.force):
+            if i in (row, column):
+                p[lay.forces.start + a] = 0.0
+        losses.append(optimum.likelihood.data_value(p) - optimum.misfit)
+    return losses
+
+
 def screen(
     binned: BinnedSpectra, targets: tuple[Target, ...]
 ) -> tuple[tuple[Target, ...], dict[str, float]]:
@@ -291,15 +378,20 @@ def prepare(
     noise = np.maximum(strength[index, -1], 1e-2 * level.min(axis=1))
     unit = np.sqrt(noise)
     rows, columns = np.ix_(index, index)
+    whiten = np.outer(unit, unit)
     scaled = tuple(
-        replace(s, matrix=s.matrix[:, rows, columns] / np.outer(unit, unit))
+        replace(
+            s,
+            matrix=s.matrix[:, rows, columns] / whiten,
+            foreign=None if s.foreign is None else s.foreign[:, rows, columns] / whiten,
+        )
         for s in (spectrum.band(*band) for spectrum in spectra.spectra)
         if s.frequency.size
     )
     channels = tuple(spectra.channels[c] for c in index)
     chosen = LogSpectra(channels, tuple(spectra.sources[c] for c in index), scaled)
     whitened = replace(binned, level=level / noise[:, None])
-    return ClusterData(chosen, unit, whitened, tuple(s.free for s in scaled))
+    return ClusterData(chosen, unit, whitened, tuple(s.free for s in scaled), tuple(index))
 
 
 def _not_excited(targets: Sequence[Target], gains: dict[str, float]) -> dict[str, Rejection]:
@@ -428,7 +520,9 @@ def _refined(data: ClusterData, optimum: _Optimum) -> _Optimum:
 
 
 def _solve(
-    data: ClusterData, blocks: tuple[MeanOrdinates, ...], targets: tuple[Target, ...]
+    data: ClusterData,
+    blocks: tuple[MeanOrdinates, ...],
+    targets: tuple[Target, ...],
 ) -> _Optimum:
     """Find the posterior mode of a set of modes."""
     n_channels = data.unit.size
@@ -438,19 +532,28 @@ def _solve(
     strength, _ = fit_strengths(data.binned, targets)
     amplitude = np.sqrt(np.maximum(strength[:, : len(targets)], least))
     reference = amplitude.argmax(axis=0).tolist()
-    scale = amplitude.max(axis=0)
-    layout = lay_out(reference, n_channels)
     near = [target.band(_SIGN_BAND) for target in targets]
+    sign = np.ones_like(amplitude)
+    for i, target in enumerate(targets):
+        if target.amplitude is not None:
+            own = target.amplitude[list(data.index)] / data.unit
+            own = own * np.exp(-1j * np.angle(own[np.abs(own).argmax()]))
+            amplitude[:, i] = np.maximum(np.abs(own), np.sqrt(least[:, i]))
+            sign[:, i] = np.where(own.real < 0, -1.0, 1.0)
+            reference[i] = int(amplitude[:, i].argmax())
+        else:
+            for c in range(n_channels):
+                sign[c, i] = relative_sign(blocks, near[i], c, reference[i])
+    scale = amplitude.max(axis=0)
+    has_static = all(target.amplitude is not None for target in targets)
+    layout = lay_out(reference, n_channels, has_static=has_static)
     start = np.concatenate(
         [
             np.log([target.frequency for target in targets]),
             np.log(zeta),
             np.zeros(layout.n_poles - 2 * len(targets)),
             [float(i == j) for i, j in layout.force],
-            [
-                relative_sign(blocks, near[i], c, reference[i]) * amplitude[c, i] / scale[i]
-                for c, i in layout.shape
-            ],
+            [sign[c, i] * amplitude[c, i] / scale[i] for c, i in layout.shape],
         ]
     )
     low = min(float(block.frequency[0]) for block in blocks)
@@ -612,6 +715,8 @@ def _incredible(modes: Modes, i: int, target: Target, duration: float) -> Reject
     f, zeta = float(modes.frequency[i]), float(modes.damping_ratio[i])
     std_f, std_zeta = np.sqrt(np.diag(modes.cov))[paired([i], len(modes.names))].tolist()
     low, high = _damping_bounds(target)
+    if target.amplitude is not None:
+        low, high = 0.0, constants.MOST_DAMPING
     if 2 * zeta * f * duration < 1:
         return Rejection(
             "line-not-mode",

@@ -89,6 +89,7 @@ class MeanOrdinates:
     matrix: ComplexArray  # F F*, F the transform of all channels, (n, n_channels, n_channels)
     count: FloatArray  # ordinates of single segments in each mean, (n,)
     kernel: Kernel | None  # None where density and expected periodogram are equal
+    foreign: ComplexArray | None = None  # expectation of what no mode causes, as the matrix
 
     @property
     def grid(self) -> FloatArray:
@@ -121,12 +122,13 @@ def average_ordinates(
         total += (spectrum.count * mask)[:, None, None] * spectrum.matrix
     kept: BoolArray = count > 0
     frequency, count, total = first.frequency[kept], count[kept], total[kept]
+    foreign = None if first.foreign is None else first.foreign[kept]
     resolution = bandwidth * first.duration
     n_segments = sum(spectrum.count for spectrum in spectra)
     if resolution < _RESOLVED * n_segments:
         finer = np.clip(np.ceil(_SAMPLES_PER_BANDWIDTH / resolution), _LEAST_FINER, _MOST_FINER)
         kernel = make_kernel(first, kept, int(finer), _MARGIN)
-        return MeanOrdinates(frequency, total / count[:, None, None], count, kernel)
+        return MeanOrdinates(frequency, total / count[:, None, None], count, kernel, foreign)
     if near is not None:
         # The mean over the r-th part of the half-power bandwidth B is below the peak by the share
         # 1/(3r²), and the damping too large by as much. Its standard deviation is (π B T)^-½; a
@@ -136,9 +138,12 @@ def average_ordinates(
         starts = _bins(first.frequency, near, bandwidth, fine)[kept]
         starts = np.flatnonzero(np.diff(starts, prepend=-1))
         weight = np.add.reduceat(count, starts)
+        if foreign is not None:
+            foreign = np.add.reduceat(count[:, None, None] * foreign, starts, axis=0)
+            foreign = foreign / weight[:, None, None]
         frequency = np.add.reduceat(count * frequency, starts) / weight
         total, count = np.add.reduceat(total, starts, axis=0), weight
-    return MeanOrdinates(frequency, total / count[:, None, None], count, None)
+    return MeanOrdinates(frequency, total / count[:, None, None], count, None, foreign)
 
 
 def _bins(

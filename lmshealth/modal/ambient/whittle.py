@@ -39,6 +39,12 @@ class Layout:
     n_channels: int
     force: tuple[tuple[int, int], ...]  # row and column of each unknown of L
     shape: tuple[tuple[int, int], ...]  # channel and mode of each unknown of the shapes
+    has_static: bool = False  # third unknown of each mode: its static response
+
+    @property
+    def _of_modes(self) -> tuple[int, ...]:
+        """Derivatives of h by the unknowns of a mode."""
+        return (1, 2, 3) if self.has_static else (1, 2)
 
     @property
     def n_components(self) -> int:
@@ -48,12 +54,12 @@ class Layout:
     @property
     def n_poles(self) -> int:
         """Number of the unknowns of h, which come first: two per mode, three per floor."""
-        return 2 * self.n_modes + 3 * self.n_channels
+        return len(self._of_modes) * self.n_modes + 3 * self.n_channels
 
     @property
     def pole(self) -> list[tuple[int, int]]:
         """Component of each unknown of h, and the index of its derivative of h."""
-        modes = [(i, q) for q in (1, 2) for i in range(self.n_modes)]
+        modes = [(i, q) for q in self._of_modes for i in range(self.n_modes)]
         floors = [(i, q) for i in range(self.n_modes, self.n_components) for q in (1, 2, 3)]
         return modes + floors
 
@@ -77,7 +83,7 @@ class Layout:
     @property
     def bends(self) -> list[int]:
         """Unknowns b of the floors."""
-        return list(range(2 * self.n_modes + 2, self.n_poles, 3))
+        return list(range(self.n_poles - 3 * self.n_channels + 2, self.n_poles, 3))
 
     @property
     def shapes(self) -> slice:
@@ -90,14 +96,14 @@ class Layout:
         return self.n_poles + len(self.force) + len(self.shape)
 
 
-def lay_out(reference: Sequence[int], n_channels: int) -> Layout:
+def lay_out(reference: Sequence[int], n_channels: int, *, has_static: bool = False) -> Layout:
     """Return the places of the unknowns; ``reference`` is the channel in which a shape is one."""
     m = len(reference)
     # A single channel only shows which forces neighbours share.
     modes = [(i, j) for i in range(m) for j in range(i + 1) if n_channels > 1 or i - j < 2]
     floors = [(m + c, j) for c in range(n_channels) for j in range(m + c)]
     shape = [(c, i) for i in range(m) for c in range(n_channels) if c != reference[i]]
-    return Layout(m, n_channels, (*modes, *floors), tuple(shape))
+    return Layout(m, n_channels, (*modes, *floors), tuple(shape), has_static)
 
 
 # Index of the second derivatives of h by the indices of the first ones.
@@ -170,6 +176,7 @@ class Likelihood:
         return np.concatenate(
             [
                 np.repeat([constants.PRIOR_LN_F, constants.PRIOR_LN_ZETA], lay.n_modes),
+                np.full(lay.has_static * lay.n_modes, constants.PRIOR_STATIC),
                 np.tile(constants.PRIOR_FLOOR, lay.n_channels),
                 forces,
                 np.full(len(lay.shape), constants.PRIOR_SHAPE),
@@ -280,7 +287,9 @@ class _Point:
             self._root[i, j] = self._scale[i] * value
         self._phi = np.concatenate([likelihood.shapes(p), np.eye(lay.n_channels)], axis=1)
         self._poles = p[:m, None], p[m : 2 * m, None]
-        self._tilts = p[2 * m : lay.n_poles].reshape(-1, 3)
+        first = lay.n_poles - 3 * lay.n_channels
+        self._tilts = p[first : lay.n_poles].reshape(-1, 3)
+        self._static = p[2 * m : 3 * m, None] if lay.has_static else None
         self._u = np.log(block.grid / likelihood.centre) / likelihood.spread
 
     @cached_property
@@ -288,6 +297,8 @@ class _Point:
         """Responses h of all components, shape ``(components, grid)``."""
         ln_f, ln_zeta = self._poles
         modes = response(np.exp(ln_f), np.exp(ln_zeta), self._block.grid)
+        if self._static is not None:
+            modes = modes + self._static
         return np.concatenate([modes, floor_response(self._tilts, self._u)])
 
     @cached_property
@@ -295,6 +306,9 @@ class _Point:
         """The same with its derivatives, shape ``(10, components, grid)``."""
         ln_f, ln_zeta = self._poles
         modes = receptance(np.exp(ln_f), np.exp(ln_zeta), self._block.grid)
+        if self._static is not None:
+            modes[0] += self._static
+            modes[3] = 1.0
         return np.concatenate([modes, floors(self._tilts, self._u)], axis=1)
 
     @cached_property
@@ -323,7 +337,8 @@ class _Point:
     @cached_property
     def expected(self) -> ComplexArray:
         """E, shape ``(n, channels, channels)``."""
-        return np.moveaxis(_congruent(self._phi.T, self._modal), -1, 0).copy()
+        expected = np.moveaxis(_congruent(self._phi.T, self._modal), -1, 0).copy()
+        return expected if self._block.foreign is None else expected + self._block.foreign
 
     def misfit(self) -> float:
         """Σ n (ln det E + tr E⁻¹ W)."""

@@ -1,0 +1,399 @@
+"""Search of a band for modes on all channels at once, without a description.
+
+Candidates are the stable poles of a subspace model. Those that the cross spectra need start a joint
+model of the band, which is refined, pruned by evidence and extended where its residual shows
+further modes. Modes of constant amplitude are harmonics that wander: they are left out, and the
+search is repeated.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+from scipy.special import comb
+
+from lmshealth._arrays import ComplexArray, FloatArray
+from lmshealth.modal import constants
+from lmshealth.modal.ambient.joint_model import LEAST_FLOOR, BandData, JointModel
+from lmshealth.modal.ambient.subspace import Candidate, find_candidates
+from lmshealth.modal.ambient.wandering import Harmonic, Recording, find_harmonic
+from lmshealth.modal.targets import Target
+from lmshealth.signal.constants import LINE_WIDTH
+from lmshealth.signal.spectra import LogSpectra
+from lmshealth.stage.constants import BAND
+
+# Width of the bins at a resonance in damping ratios, of which the least counts, and the widest as a
+# fraction of the frequency.
+_BIN, _NARROWEST, _WIDEST_BIN = 0.4, 2e-3, 0.006
+_MOST_HARMONICS = 6
+# A pole at a line that is narrower than so many of its widths is what masking left of it.
+_FOOT = 5.0
+# A mode is tried without if its loss, the others fixed, is below the first, or another one is
+# within so many half-power bandwidths.
+_DOUBTFUL, _NEAR, _MOST_TRIED = 150.0, 3.0, 6
+_ROUNDS = 4
+# Half widths of the windows in which the residual is averaged, as fractions of the frequency.
+_WINDOWS = (0.003, 0.006, 0.012, 0.024)
+# Modes closer than this, in half-power bandwidths, are neighbours; of these, those that overlap.
+_NEIGHBOUR, _OVERLAP = 12.0, 4.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Found:
+    """Modes of a band in Hz, ascending, and harmonics that wander."""
+
+    modes: tuple[Target, ...]
+    harmonics: tuple[Harmonic, ...]
+    spectra: LogSpectra  # without the directions of the harmonics
+    model: JointModel
+    band: tuple[float, float]
+
+    def within(self, frequency: float) -> bool:
+        """Return whether a frequency in Hz lies in the band."""
+        return self.band[0] <= frequency <= self.band[1]
+
+    def around(self, near: tuple[Target, ...], low: float, high: float) -> LogSpectra:
+        """Return the spectra from low to high Hz, with the other modes as foreign."""
+        spectra = tuple(s.band(low, high) for s in self.spectra.spectra)
+        cut = replace(self.spectra, spectra=spectra)
+        others = ~np.isin(self.model.f, [target.frequency for target in near])
+        if not others.any():
+            return cut
+        return cut.with_foreign(lambda frequency: self.model.modal(others, frequency))
+
+
+def search(
+    spectra: LogSpectra,
+    recording: Recording,
+    low: float,
+    high: float,
+    lines: Sequence[float] = (),
+) -> Found:
+    """Search a band; frequencies are in Hz.
+
+    ``recording`` is the longest segment, to recognise harmonics; ``lines`` are masked.
+    """
+    harmonics: list[Harmonic] = []
+    while True:
+        candidates = [
+            c
+            for c in find_candidates(spectra, low, high)
+            if 2 * c.damping_ratio * c.frequency * spectra.duration > 1.0
+        ]
+        model = _select(spectra, candidates, low, high)
+        harmonic = find_harmonic(model, recording, harmonics)
+        if harmonic is None or len(harmonics) == _MOST_HARMONICS:
+            break
+        harmonics.append(harmonic)
+        if len(spectra.channels) == 1:
+            spectra = spectra.without_band(harmonic.low, harmonic.high)
+        else:
+            spectra = spectra.with_foreign(harmonic.expected)
+    # What is as narrow as a line, or is the foot of one, stays in the model, as foreign to modes.
+    width = 2 * model.zeta
+    wide = (width > LINE_WIDTH) & (width * model.f * spectra.duration > 1)
+    for line in lines:
+        foot = np.abs(model.f / line - 1) < LINE_WIDTH + model.zeta
+        wide &= ~(foot & (width < _FOOT * LINE_WIDTH))
+    modes = tuple(
+        Target(
+            f"mode_{number}",
+            float(model.f[i]),
+            float(model.zeta[i]),
+            max(0.02, 4 * float(model.zeta[i])),
+            amplitude=(model.phi[:, i] * model.data.scale).astype(np.complex128),
+        )
+        for number, i in enumerate((i for i in np.argsort(model.f) if wide[i]), start=1)
+    )
+    return Found(modes, tuple(harmonics), spectra, model, (low, high))
+
+
+def _select(
+    spectra: LogSpectra, candidates: list[Candidate], low: float, high: float
+) -> JointModel:
+    """Select the modes that the cross spectra need, by stepwise maximum likelihood."""
+    data = _bin(spectra, candidates, low, high)
+    start = _StartModel(data, candidates)
+    start.update(10)
+    rest = list(range(len(candidates)))
+    while rest:
+        gains, strength = start.gains(rest)
+        best = int(gains.argmax())
+        if gains[best] < constants.LEAST_START:
+            break
+        start.add(rest.pop(best), float(strength[best]))
+        start.update(8)
+    model = start.joint()
+    model.refine(6)
+    for _ in range(_ROUNDS):
+        model = _prune(model)
+        more = _grow(model)
+        if more is None:
+            break
+        model = more
+    return model
+
+
+def _evidence(more: JointModel, less: JointModel) -> float:
+    """Return twice the log evidence (BIC) for the modes that one has and the other has not."""
+    cost = (more.size - less.size) * np.log(more.data.count.sum())
+    return float(2 * (less.misfit - more.misfit) - cost)
+
+
+def _prune(model: JointModel) -> JointModel:
+    """Drop modes without evidence, the least likely first."""
+    while model.f.size:
+        worst, least = None, constants.EVIDENCE_MARGIN
+        for i in _doubtful(model):
+            less = model.without(i)
+            less.refine(2, less.nearest(model.f[i]))
+            less.refine(2)
+            evidence = _evidence(model, less)
+            if evidence < least:
+                worst, least = less, evidence
+        if worst is None:
+            break
+        model = worst
+        model.refine(2)
+    return model
+
+
+def _doubtful(model: JointModel) -> list[int]:
+    """Return modes whose absence the others may explain."""
+    losses = np.array([model.without(i).misfit - model.misfit for i in range(model.f.size)])
+    width = model.f * model.zeta
+    apart = np.abs(model.f[:, None] - model.f) / (width[:, None] + width)
+    np.fill_diagonal(apart, np.inf)
+    near = apart.min(axis=1) < _NEAR
+    return [int(i) for i in losses.argsort() if losses[i] < _DOUBTFUL or near[i]][:_MOST_TRIED]
+
+
+def _grow(model: JointModel) -> JointModel | None:
+    """Add the mode that the residual shows most clearly; None where there is no evidence."""
+    for excess in _excesses(model)[:2]:
+        if excess.gain < constants.LEAST_EXCESS:
+            break
+        more = model.with_mode(excess.frequency, excess.damping_ratio, excess.amplitude)
+        more.refine(3, more.nearest(excess.frequency))
+        enough = _evidence(more, model) >= constants.EVIDENCE_MARGIN
+        if enough and more.zeta[-1] < constants.MOST_DAMPING:
+            return more
+    return None
+
+
+class _Excess(NamedTuple):
+    gain: float  # of log likelihood
+    frequency: float
+    damping_ratio: float
+    amplitude: FloatArray  # root of the PSD of the modal force in each channel
+
+
+def _excesses(model: JointModel) -> list[_Excess]:
+    """Return, for each window, where an eigenvalue of the whitened residual is largest.
+
+    Of the mean of n ordinates the eigenvalue λ gains n (λ - 1 - ln λ) in log likelihood.
+    """
+    data = model.data
+    root = np.linalg.cholesky(model.expected())
+    inverse = np.linalg.inv(root)
+    white = inverse @ data.matrix @ np.swapaxes(inverse.conj(), 1, 2)
+    summed = np.cumsum(white * data.count[:, None, None], axis=0)
+    total = np.concatenate([np.zeros_like(white[:1]), summed])
+    count = np.concatenate([[0.0], np.cumsum(data.count)])
+    found = []
+    for half in _WINDOWS:
+        first = np.searchsorted(data.frequency, data.frequency * (1 - half))
+        last = np.searchsorted(data.frequency, data.frequency * (1 + half), side="right")
+        weight = count[last] - count[first]
+        value, vector = np.linalg.eigh((total[last] - total[first]) / weight[:, None, None])
+        largest = value[:, -1].clip(1.0)
+        gain = weight * (largest - 1 - np.log(largest))
+        k = int(gain.argmax())
+        phi = root[k] @ vector[k, :, -1]
+        phi = np.real(phi * np.exp(-0.5j * np.angle(np.sum(phi * phi))))
+        strength = 2 * half * np.sqrt(largest[k] - 1)
+        found.append(_Excess(float(gain[k]), float(data.frequency[k]), half, strength * phi))
+    return sorted(found, key=lambda excess: -excess.gain)
+
+
+def split_groups(targets: tuple[Target, ...]) -> list[tuple[Target, ...]]:
+    """Group neighbours whose bands overlap; groups of too many are split at the widest gap."""
+    groups: list[tuple[Target, ...]] = []
+    for target in targets:
+        if groups and target.band(BAND)[0] < groups[-1][-1].band(BAND)[1]:
+            groups[-1] = (*groups[-1], target)
+        else:
+            groups.append((target,))
+    done = []
+    while groups:
+        group = groups.pop(0)
+        if len(group) <= constants.MOST_FOUND:
+            done.append(group)
+        else:
+            groups[:0] = halves(group)
+    return done
+
+
+def halves(group: tuple[Target, ...]) -> list[tuple[Target, ...]]:
+    """Split a group at its widest gap."""
+    k = 1 + int(np.argmax([_gap(a, b) for a, b in pairwise(group)]))
+    return [group[:k], group[k:]]
+
+
+def _gap(a: Target, b: Target) -> float:
+    """Distance of two modes in half the sum of their half-power bandwidths."""
+    widths = a.frequency * a.damping_ratio + b.frequency * b.damping_ratio
+    return (b.frequency - a.frequency) / widths
+
+
+def neighbourhood(group: tuple[Target, ...], targets: tuple[Target, ...]) -> tuple[Target, ...]:
+    """Add the neighbours of a group, and those that these overlap with."""
+    first, last = targets.index(group[0]), targets.index(group[-1]) + 1
+    limit = _NEIGHBOUR
+    while first and _gap(targets[first - 1], targets[first]) < limit:
+        first, limit = first - 1, _OVERLAP
+    limit = _NEIGHBOUR
+    while last < len(targets) and _gap(targets[last - 1], targets[last]) < limit:
+        last, limit = last + 1, _OVERLAP
+    return targets[first:last]
+
+
+class _StartModel:
+    """Candidates with fixed poles and shapes, driven by forces of covariance S, and floors.
+
+    Expectation maximisation of S, a multiplicative update of the floors; candidates are added one
+    by one by their gain with all else fixed.
+    """
+
+    def __init__(self, data: BandData, candidates: list[Candidate]) -> None:
+        self._data = data
+        self._floor = np.full((data.scale.size, len(data.basis)), 0.5)
+        self._f = np.array([c.frequency for c in candidates])
+        self._zeta = np.array([c.damping_ratio for c in candidates])
+        phi = np.array([c.shape for c in candidates]).reshape(-1, data.scale.size) / data.scale
+        self._phi = phi / np.linalg.norm(phi, axis=1, keepdims=True)
+        beta = self._f[:, None] / data.frequency
+        h = 1 / (1 - beta**2 - 2j * self._zeta[:, None] * beta)
+        self._peak = np.abs(h).max(axis=1, initial=1e-300)
+        h = h / self._peak[:, None]
+        self._b = np.einsum("ic,ik->kci", self._phi, h)
+        self._s = np.zeros((0, 0), dtype=complex)
+        self._chosen: list[int] = []
+
+    def _inverse(self) -> ComplexArray:
+        b = self._b[:, :, self._chosen]
+        e = b @ self._s @ np.swapaxes(b.conj(), 1, 2)
+        k = np.arange(e.shape[1])
+        e[:, k, k] += (self._floor @ self._data.basis).T
+        if self._data.foreign is not None:
+            e = e + self._data.foreign
+        return np.linalg.inv(e)
+
+    def update(self, times: int) -> None:
+        """Improve forces and floors."""
+        count, basis = self._data.count, self._data.basis
+        for _ in range(times):
+            g = self._inverse()
+            gwg = g @ self._data.matrix @ g
+            if self._chosen:
+                b = self._b[:, :, self._chosen]
+                adjoint = np.swapaxes(b.conj(), 1, 2)
+                lack = np.einsum("k,kij->ij", count, adjoint @ (gwg - g) @ b)
+                information = np.einsum("k,kii->i", count, adjoint @ g @ b).real
+                self._s = self._s + _force_step(self._s, lack, information)
+            up = (count * np.einsum("kaa->ak", gwg).real) @ basis.T
+            down = (count * np.einsum("kaa->ak", g).real) @ basis.T
+            self._floor = np.maximum(self._floor * np.sqrt(up / down) ** 1.5, LEAST_FLOOR)
+
+    def gains(self, index: list[int]) -> tuple[FloatArray, FloatArray]:
+        """Return the gain in log likelihood by each candidate, and its strength."""
+        count, b = self._data.count, self._b[:, :, index]
+        gb = self._inverse() @ b
+        r = np.einsum("kac,kac->ck", b.conj(), gb).real
+        q = np.einsum("kac,kab,kbc->ck", gb.conj(), self._data.matrix, gb, optimize=True).real
+        x = 10.0 ** np.arange(-2, 5, 0.25)[:, None, None] / r.max(axis=1)[:, None]
+        gain = (count * (x * q / (1 + x * r) - np.log1p(x * r))).sum(axis=-1)
+        best, k = gain.argmax(axis=0), np.arange(len(index))
+        return gain[best, k], x[best, k, 0]
+
+    def add(self, i: int, strength: float) -> None:
+        """Add a candidate."""
+        m = len(self._chosen)
+        s = np.zeros((m + 1, m + 1), dtype=complex)
+        s[:m, :m], s[m, m] = self._s, strength
+        self._s = s
+        self._chosen.append(i)
+
+    def joint(self) -> JointModel:
+        """Return the chosen candidates as a joint model, with real shapes."""
+        phi = self._phi[self._chosen]
+        turn = np.exp(-0.5j * np.angle(np.sum(phi * phi, axis=1)))
+        root = np.sqrt(np.diagonal(self._s).real)
+        r = np.real(self._s * np.outer(turn.conj(), turn)) / np.outer(root, root)
+        r = 0.95 * r + 0.05 * np.eye(len(r))  # not singular
+        real = np.real(phi * turn[:, None]) * (root / self._peak[self._chosen])[:, None]
+        f, zeta = self._f[self._chosen], self._zeta[self._chosen]
+        return JointModel(self._data, self._floor, f, zeta, real.T, r)
+
+
+def _force_step(s: ComplexArray, lack: ComplexArray, information: FloatArray) -> ComplexArray:
+    """Return a step of the forces by expectation maximisation.
+
+    The information takes the place of the number of ordinates; the step is shortened until S stays
+    positive.
+    """
+    n = (np.diagonal(s).real * information).clip(1e-12)
+    step = s @ lack @ s / np.sqrt(n[:, None] * n)
+    least = 1e-3 * np.linalg.eigvalsh(s).min().clip(0)
+    for scale in (1.0, 0.5, 0.25, 0.1):
+        new = s + scale * step
+        if np.linalg.eigvalsh((new + new.conj().T) / 2).min() > least:
+            return np.asarray(scale * (step + step.conj().T) / 2)
+    return np.zeros_like(s)
+
+
+def _bin(spectra: LogSpectra, candidates: list[Candidate], low: float, high: float) -> BandData:
+    """Average the cross spectra of a band in bins that are fine at the candidates."""
+    fine = np.geomspace(low, high, 20_000)
+    density = np.full(fine.size, 1 / _WIDEST_BIN)
+    for c in candidates:
+        off = np.log(fine / c.frequency)
+        width = _BIN * np.hypot(max(c.damping_ratio, _NARROWEST), off)
+        density = np.maximum(density, 1 / width)
+    place = np.concatenate([[0.0], np.cumsum(density[1:] * np.diff(np.log(fine)))])
+    edges = np.interp(np.arange(0, place[-1] + 1), place, fine)
+    edges[-1] = high
+    n, n_bins = len(spectra.channels), edges.size - 1
+    total = np.zeros((n_bins, n, n), dtype=complex)
+    foreign = np.zeros_like(total)
+    count, mean = np.zeros(n_bins), np.zeros(n_bins)
+    for s in spectra.spectra:
+        number = np.searchsorted(edges, s.frequency) - 1
+        within = s.free & (number >= 0) & (number < n_bins)
+        at = number[within]
+        np.add.at(total, at, s.count * s.matrix[within])
+        if s.foreign is not None:
+            np.add.at(foreign, at, s.count * s.foreign[within])
+        count += np.bincount(at, minlength=n_bins) * s.count
+        mean += np.bincount(at, weights=s.frequency[within], minlength=n_bins) * s.count
+    kept = count > 0
+    weight = count[kept][:, None, None]
+    matrix = np.asarray(total[kept] / weight)
+    scale = np.sqrt(np.median(np.diagonal(matrix, axis1=1, axis2=2).real, axis=0).clip(1e-300))
+    whole = np.outer(scale, scale)
+    frequency = mean[kept] / count[kept]
+    u = np.log(frequency / frequency[0]) / np.log(frequency[-1] / frequency[0])
+    degree = 2 + round(2 * np.log(high / low))
+    basis = [comb(degree, k) * u**k * (1 - u) ** (degree - k) for k in range(degree + 1)]
+    return BandData(
+        frequency,
+        count[kept],
+        np.asarray(matrix / whole, dtype=np.complex128),
+        np.asarray(foreign[kept] / weight / whole, dtype=np.complex128) if foreign.any() else None,
+        scale,
+        np.stack(basis) + 1e-3,
+    )

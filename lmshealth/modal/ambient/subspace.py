@@ -1,0 +1,202 @@
+"""Candidate modes of all channels at once, by covariance-driven subspace identification."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.cluster.hierarchy import fcluster, linkage
+from scipy.signal import czt
+from scipy.signal.windows import tukey
+from scipy.spatial.distance import squareform
+
+from lmshealth._arrays import ComplexArray, FloatArray
+from lmshealth.modal import constants
+from lmshealth.signal.spectra import CrossSpectrum, LogSpectra
+
+# Orders of the subspace model, and most block rows of its Hankel matrix.
+_ORDERS, _MOST_ROWS = range(2, 31), 60
+# The band is widened by this share to either side, and tapered there.
+_MARGIN = 0.1
+# Distance at which poles are of different clusters: in half-power bandwidths, half the logarithm of
+# the dampings' ratio, and the shapes' lack of correlation together.
+_APART = 0.8
+_LEAST_DAMPING = 2e-4
+# Poles of shapes this alike within so many half-power bandwidths are one that noise split.
+_SPLIT_ALIKE, _SPLIT = 0.7, 1.2
+# Ordinates to either side whose mean replaces a masked one.
+_NEAR_LINE = 4
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Candidate:
+    """A pole that many orders of the model have."""
+
+    frequency: float  # in Hz
+    damping_ratio: float
+    shape: ComplexArray  # relative accelerations, (n_channels,)
+    stability: float  # share of the orders
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Poles:
+    """Poles of all orders."""
+
+    order: FloatArray
+    frequency: FloatArray
+    damping_ratio: FloatArray
+    shape: ComplexArray  # of unit norm in whitened channels, (n_poles, n_channels)
+
+
+def find_candidates(spectra: LogSpectra, low: float, high: float) -> list[Candidate]:
+    """Return the stable poles of a band in Hz, ascending in frequency.
+
+    Correlations at the rate of the band come from the cross spectra, so that lines are masked and
+    other bands cost nothing; they are complex. Channels are scaled by their smooth level, as a
+    strong floor would hide modes that other channels show.
+    """
+    margin = _MARGIN * (high - low)
+    bottom = max(low - margin, min(float(s.frequency[0]) for s in spectra.spectra))
+    top = min(high + margin, min(float(s.frequency[-1]) for s in spectra.spectra))
+    poles = _solve(_correlate(spectra, bottom, top), bottom, top - bottom)
+    longest = max(spectra.spectra, key=lambda s: s.observed).band(bottom, top)
+    level = _level(longest.matrix)
+
+    def physical(one: Candidate) -> ComplexArray:
+        place = min(int(np.searchsorted(longest.frequency, one.frequency)), len(level) - 1)
+        return np.asarray(one.shape * level[place])
+
+    stable = [one for one in _merge(_cluster(poles)) if low <= one.frequency <= high]
+    return [replace(one, shape=physical(one)) for one in stable]
+
+
+def _correlate(spectra: LogSpectra, low: float, high: float) -> ComplexArray:
+    """Return the correlations of the channels at the rate of a band, (n_lags, n, n)."""
+    n, width = len(spectra.channels), high - low
+    rows = int(min(_MOST_ROWS, width * spectra.duration / 10))
+    lags = np.arange(2 * rows + 2)
+    total = np.zeros((lags.size, n, n), dtype=complex)
+    for spectrum in spectra.spectra:
+        cut = spectrum.band(low, high)
+        if cut.frequency.size < _NEAR_LINE:
+            continue
+        tapered = _whitened(cut) * tukey(cut.frequency.size, 2 * _MARGIN)[:, None, None]
+        turn = np.exp(2j * np.pi / (cut.duration * width))
+        first = np.exp(2j * np.pi * (cut.frequency[0] - low) / width * lags)
+        total += spectrum.count * czt(tapered, lags.size, turn, axis=0) * first[:, None, None]
+    return total
+
+
+def _whitened(spectrum: CrossSpectrum) -> ComplexArray:
+    """Scale channels by a smooth level, and replace masked ordinates by their surroundings."""
+    matrix = _project(spectrum)
+    masked, free = np.flatnonzero(~spectrum.free), np.flatnonzero(spectrum.free)
+    if masked.size and free.size > 2 * _NEAR_LINE:
+        place = np.searchsorted(free, masked)
+        reach = range(-_NEAR_LINE, _NEAR_LINE)
+        near = np.stack([free[np.clip(place + k, 0, free.size - 1)] for k in reach])
+        matrix[masked] = matrix[near].mean(axis=0)
+    level = _level(matrix)
+    return np.asarray(matrix / level[:, :, None] / level[:, None, :])
+
+
+def _project(spectrum: CrossSpectrum) -> ComplexArray:
+    """Return the matrices without the directions of what no mode causes."""
+    matrix = spectrum.matrix.copy()
+    if spectrum.foreign is None:
+        return matrix
+    within = np.flatnonzero(np.trace(spectrum.foreign, axis1=1, axis2=2).real)
+    level = np.diagonal(matrix[within], axis1=1, axis2=2).real.mean(axis=0)
+    root = np.sqrt(level.clip(1e-300))
+    whole = np.outer(root, root)
+    directions, place = np.unique(spectrum.foreign[within], axis=0, return_inverse=True)
+    for k, foreign in enumerate(directions):
+        value, vector = np.linalg.eigh(foreign / whole)
+        kept = vector[:, value < 1e-6 * value[-1]]
+        project = kept @ kept.conj().T
+        at = within[place.ravel() == k]
+        matrix[at] = project @ (matrix[at] / whole) @ project * whole
+    return matrix
+
+
+def _level(matrix: ComplexArray) -> FloatArray:
+    """Smooth root of the density of each channel, shape ``(n_ordinates, n_channels)``."""
+    power = np.diagonal(matrix, axis1=1, axis2=2).real.clip(1e-300)
+    u = np.linspace(-1, 1, len(power))
+    fit = np.polynomial.polynomial.polyfit(u, np.log(power), 2)
+    return np.asarray(np.exp(np.polynomial.polynomial.polyval(u, fit) / 2).T)
+
+
+def _solve(lags: ComplexArray, low: float, rate: float) -> _Poles:
+    """Realise models of all orders from one decomposition of the Hankel matrix."""
+    n, rows = lags.shape[1], len(lags) // 2 - 1
+    blocks = np.stack([lags[1 + i : 2 + i + rows] for i in range(rows)])  # (rows, rows + 1, n, n)
+    hankel = blocks.transpose(0, 2, 1, 3).reshape(rows * n, (rows + 1) * n)
+    u, s, vh = np.linalg.svd(hankel[:, :-n], full_matrices=False)
+    most = min(_ORDERS.stop - 1, int((s > 1e-12 * s[0]).sum()))
+    if most < _ORDERS.start:  # silent channels
+        return _Poles(np.empty(0), np.empty(0), np.empty(0), np.empty((0, n), dtype=complex))
+    u, s, vh = u[:, :most], s[:most], vh[:most]
+    transition = (u.conj().T @ hankel[:, n:] @ vh.conj().T) / np.sqrt(s[:, None] * s)
+    output = u[:n] * np.sqrt(s)
+    orders, poles, shapes = [], [], []
+    for order in range(_ORDERS.start, most + 1):
+        value, vector = np.linalg.eig(transition[:order, :order])
+        exponent = np.log(value) * rate
+        turned = exponent.imag % (2 * np.pi * rate)
+        orders.append(np.full(order, float(order)))
+        poles.append(exponent.real + 1j * (2 * np.pi * low + turned))
+        shapes.append((output[:, :order] @ vector).T)
+    pole, shape = np.concatenate(poles), np.concatenate(shapes)
+    zeta = -pole.real / np.abs(pole)
+    kept = (zeta > _LEAST_DAMPING) & (zeta < constants.MOST_DAMPING)
+    shape = shape / np.linalg.norm(shape, axis=1, keepdims=True)
+    frequency = np.abs(pole) / (2 * np.pi)
+    return _Poles(np.concatenate(orders)[kept], frequency[kept], zeta[kept], shape[kept])
+
+
+def _cluster(poles: _Poles) -> list[Candidate]:
+    """Cluster the poles of all orders; keep clusters that many orders have."""
+    f, zeta, shape = poles.frequency, poles.damping_ratio, poles.shape
+    if f.size < 2:
+        return []
+    distance = np.abs(np.log(f[:, None] / f)) / (zeta[:, None] + zeta)
+    distance += 1 - np.abs(shape @ shape.conj().T) ** 2
+    distance += np.abs(np.log(zeta[:, None] / zeta)) / 2
+    np.fill_diagonal(distance, 0)
+    label = fcluster(linkage(squareform(distance, checks=False), "average"), _APART, "distance")
+    n_orders = np.unique(poles.order).size
+    found = []
+    for number in np.unique(label):
+        members = np.flatnonzero(label == number)
+        stability = np.unique(poles.order[members]).size / n_orders
+        if stability < constants.STABLE:
+            continue
+        centre = members[distance[np.ix_(members, members)].sum(axis=1).argmin()]
+        pole = float(np.median(f[members])), float(np.median(zeta[members]))
+        found.append(Candidate(*pole, shape[centre], stability))
+    return found
+
+
+def _merge(candidates: list[Candidate]) -> list[Candidate]:
+    """Merge poles that noise split, the most stable first; ascending in frequency."""
+    rest = sorted(candidates, key=lambda c: -c.stability)
+    merged = []
+    while rest:
+        first = rest[0]
+        group = [c for c in rest if c is first or _is_split(c, first)]
+        rest = [c for c in rest if not any(c is member for member in group)]
+        weight = np.array([c.stability for c in group]) ** 4
+        weight /= weight.sum()
+        f = np.array([c.frequency for c in group])
+        zeta = np.array([c.damping_ratio for c in group])
+        mean = float(weight @ f)
+        damping = float(np.sqrt(weight @ (zeta**2 + (f / mean - 1) ** 2)))
+        merged.append(replace(first, frequency=mean, damping_ratio=damping))
+    return sorted(merged, key=lambda c: c.frequency)
+
+
+def _is_split(one: Candidate, other: Candidate) -> bool:
+    width = one.frequency * one.damping_ratio + other.frequency * other.damping_ratio
+    alike = abs(one.shape.conj() @ other.shape) ** 2 > _SPLIT_ALIKE
+    return bool(alike and abs(one.frequency - other.frequency) < _SPLIT * width)

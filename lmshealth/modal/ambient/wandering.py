@@ -1,0 +1,182 @@
+"""Harmonics whose frequency wanders: recognised by their constant amplitude.
+
+A mode under random forces has a Gaussian response: of its complex envelope z the ratio
+E|z|⁴ / (E|z|²)² is 2. The harmonic of a shaft whose speed wanders has nearly constant amplitude:
+the ratio is 1, and 2 - s² where a share s of the power is its. Its spectrum alone may look like a
+mode's.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from lmshealth._arrays import ComplexArray, FloatArray
+from lmshealth.modal import constants
+from lmshealth.modal.ambient.joint_model import JointModel
+from lmshealth.signal.spectra import SegmentTransforms, Spectrum
+
+# Half widths of the filter, and the widest search for its edges, as fractions of the frequency.
+_WIDTHS = (0.015, 0.03)
+_WIDEST = 0.1
+_DRAWS = 200
+# Poles this close with shapes this alike may belong to one harmonic.
+_CLOSE, _ALIKE = 0.03, 0.5
+# Power over that of everything else from which on the signal stands out.
+_STANDS_OUT = 2.0
+_LEAST_ORDINATES = 8
+# Its tails reach beyond where it stands out, by this share of that band to either side.
+_WIDER = 0.3
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Harmonic:
+    """A harmonic that wanders, with the covariance by which its direction is left out."""
+
+    frequency: float  # mean in Hz
+    low: float  # of its band, in Hz
+    high: float
+    amplitude: float  # root mean square times √2 in the channel that shows it best, m/s²
+    channel: int
+    covariance: ComplexArray  # (n_channels, n_channels)
+
+    def expected(self, frequency: FloatArray) -> ComplexArray:
+        """Return the covariance in its band and zero elsewhere, frequency first."""
+        within = (frequency >= self.low) & (frequency <= self.high)
+        return np.asarray(within[:, None, None] * self.covariance)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Recording:
+    """Transforms of the longest segment: one-sided, (n_ordinates, n_channels); duration in s."""
+
+    frequency: FloatArray
+    transforms: ComplexArray
+    duration: float
+
+    @classmethod
+    def of(cls, segment: SegmentTransforms, lines: Sequence[float]) -> Recording:
+        """Remove the ordinates of lines."""
+        as_spectrum = Spectrum(
+            segment.frequency, np.empty_like(segment.frequency), segment.duration, np.nan
+        )
+        clear = segment.free & as_spectrum.clear_of(lines)
+        return cls(segment.frequency, segment.transforms * clear[:, None], segment.duration)
+
+
+def find_harmonic(
+    model: JointModel, recording: Recording, known: Sequence[Harmonic] = ()
+) -> Harmonic | None:
+    """Return the clearest harmonic that wanders among the modes; None if there is none.
+
+    In the bands of known ones less evidence is needed: their direction may vary.
+    """
+    found = [one for i in range(model.f.size) if (one := _test(model, i, recording)) is not None]
+    for sigmas, harmonic in sorted(found, key=lambda one: one[0]):
+        near = any(harmonic.low < h.high and h.low < harmonic.high for h in known)
+        needed = constants.WANDERING_SIGMAS / (2 if near else 1)
+        if sigmas < -needed:
+            return harmonic
+    return None
+
+
+def _test(model: JointModel, i: int, recording: Recording) -> tuple[float, Harmonic] | None:
+    """Return by how many standard deviations the amplitude is too constant for noise."""
+    f0 = model.f[i]
+    shape = model.phi / np.linalg.norm(model.phi, axis=0)
+    own = (np.abs(model.f / f0 - 1) < _CLOSE) & ((shape.T @ shape[:, i]) ** 2 > _ALIKE)
+    rest = model.subset(~own)
+    expected = rest.expected()
+    near = np.abs(model.data.frequency / f0 - 1) < max(0.01, model.zeta[i])
+    phi = _direction(model, expected, near, shape[:, i])
+    inverse = np.linalg.inv(expected)
+    gain = inverse @ phi
+    power = np.real(gain @ phi.conj())
+    weight = gain / power[:, None]  # passes the direction unchanged, with the least of the rest
+    first, last = np.searchsorted(recording.frequency, [f0 * (1 - _WIDEST), f0 * (1 + _WIDEST)])
+    frequency = recording.frequency[first:last]
+    if frequency.size < _LEAST_ORDINATES:
+        return None
+    weights = np.stack(
+        [
+            np.interp(frequency, model.data.frequency, w.real)
+            + 1j * np.interp(frequency, model.data.frequency, w.imag)
+            for w in weight.T
+        ],
+        axis=1,
+    )
+    z = np.sum(weights.conj() * recording.transforms[first:last] / model.data.scale, axis=1)
+    noise = np.interp(frequency, model.data.frequency, 1 / power)
+    width = max(5, int(0.5 * model.zeta[i] * f0 * recording.duration) | 1)
+    level = np.convolve(np.abs(z) ** 2, np.ones(width) / width, "same")
+    within = _around(level > _STANDS_OUT * noise, int(np.argmin(np.abs(frequency - f0))))
+    windows = [within]
+    for half in _WIDTHS:
+        windows.append(slice(*np.searchsorted(frequency, [f0 * (1 - half), f0 * (1 + half)])))
+    sigmas = [_constancy(z[w], level[w]) for w in windows]
+    wide = frequency[within]
+    if wide.size < 2:
+        return None
+    mean_square = float(np.sum(np.abs(z[within]) ** 2) / recording.duration)
+    channel = int(np.argmax(np.abs(phi) * model.data.scale))
+    amplitude = np.sqrt(2 * mean_square) * abs(phi[channel]) * model.data.scale[channel]
+    strength = 1e2 * float(level[within].max())
+    physical = phi * model.data.scale
+    more = _WIDER * float(wide[-1] - wide[0])
+    harmonic = Harmonic(
+        float(np.average(wide, weights=np.abs(z[within]) ** 2)),
+        float(wide[0]) - more,
+        float(wide[-1]) + more,
+        float(amplitude),
+        channel,
+        strength * np.outer(physical, physical.conj()),
+    )
+    return min(sigmas), harmonic
+
+
+def _direction(
+    model: JointModel, expected: ComplexArray, near: np.ndarray, start: FloatArray
+) -> ComplexArray:
+    """Return the direction that exceeds the rest most, of unit norm."""
+    if not near.any():
+        return start.astype(complex)
+    root = np.linalg.cholesky(expected[near])
+    inverse = np.linalg.inv(root)
+    white = inverse @ model.data.matrix[near] @ np.swapaxes(inverse.conj(), 1, 2)
+    strongest = int(np.argmax(np.trace(white, axis1=1, axis2=2).real * model.data.count[near]))
+    root = root[strongest]
+    inverse = np.linalg.inv(root)
+    total = np.tensordot(model.data.count[near], model.data.matrix[near], axes=1)
+    vector = np.linalg.eigh(inverse @ total @ inverse.conj().T)[1][:, -1]
+    phi = root @ vector
+    return np.asarray(phi / np.linalg.norm(phi))
+
+
+def _around(stands_out: np.ndarray, k: int) -> slice:
+    """Return the run of true values that holds an index."""
+    off = np.flatnonzero(~stands_out)
+    place = int(np.searchsorted(off, k))
+    low = int(off[place - 1]) + 1 if place else 0
+    high = int(off[place]) if place < off.size else stands_out.size
+    return slice(low, max(low + 1, high))
+
+
+def _constancy(z: ComplexArray, level: FloatArray) -> float:
+    """Return the logarithm of the envelope's kurtosis, in standard deviations of Gaussian noise."""
+    n = z.size
+    if n < _LEAST_ORDINATES:
+        return 0.0
+    kurtosis = np.log(_kurtosis(np.fft.ifft(z, 2 * n)[None])[0])
+    if kurtosis > np.log(constants.WANDERING_KURTOSIS):
+        return 0.0
+    rng = np.random.default_rng(n)
+    draws = rng.standard_normal((_DRAWS, 2 * n)).view(complex) * np.sqrt(level / 2)
+    noise = np.log(_kurtosis(np.fft.ifft(draws, 2 * n, axis=1)))
+    return float((kurtosis - noise.mean()) / noise.std())
+
+
+def _kurtosis(z: ComplexArray) -> FloatArray:
+    square = np.abs(z) ** 2
+    return np.asarray((square**2).mean(axis=1) / square.mean(axis=1) ** 2)
