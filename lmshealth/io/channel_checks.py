@@ -13,10 +13,10 @@ from lmshealth.io.refusal import Unusable
 from lmshealth.io.time_axis import IntArray, too_many
 
 
-def missing_stretches(values: Samples) -> tuple[IntArray, str]:
+def missing_ranges(values: Samples) -> tuple[IntArray, str]:
     """Find the missing samples (NaN, infinite or absurd) of a channel, ``(n_samples,)`` in SI.
 
-    Return half-open ranges in which every sample is missing, ascending, ``(n_stretches, 2)``, and
+    Return half-open ranges in which every sample is missing, ascending, ``(n_ranges, 2)``, and
     their counts as a text, empty if nothing is missing. `Unusable` (``missing-samples``) where they
     are so many that they would cut the other channels to pieces.
     """
@@ -27,17 +27,17 @@ def missing_stretches(values: Samples) -> tuple[IntArray, str]:
             edges = np.diff(missing.view(np.int8), prepend=0, append=0)
             found.append(np.flatnonzero(edges) + at)
     bounds = np.concatenate(found)
-    # A stretch that ends at the edge of a block continues in the next.
+    # A range that ends at the edge of a block continues in the next.
     twice = np.flatnonzero(np.diff(bounds) == 0)
     bounds = np.delete(bounds, np.concatenate([twice, twice + 1]))
-    stretches: IntArray = bounds.reshape(-1, 2)
-    if not stretches.size:
-        return stretches, ""
-    n_missing, n_stretches = int(np.sum(stretches[:, 1] - stretches[:, 0])), len(stretches)
-    note = f"{n_missing} of {values.size} samples are missing (NaN) in {n_stretches} stretches"
-    if n_missing > constants.LARGEST_MISSING * values.size or too_many(n_stretches, values.size):
+    ranges: IntArray = bounds.reshape(-1, 2)
+    if not ranges.size:
+        return ranges, ""
+    n_missing, n_ranges = int(np.sum(ranges[:, 1] - ranges[:, 0])), len(ranges)
+    note = f"{n_missing} of {values.size} samples are missing (NaN) in {n_ranges} ranges"
+    if n_missing > constants.LARGEST_MISSING * values.size or too_many(n_ranges, values.size):
         raise Unusable("missing-samples", note)
-    return stretches, note
+    return ranges, note
 
 
 def check_signal(values: Samples) -> None:

@@ -16,7 +16,7 @@ ChannelKind = Literal["displacement", "acceleration", "current"]
 
 @dataclass(frozen=True, slots=True)
 class Refusal:
-    """A log, channel, stretch or mode that was not analysed: one row of ``refused.csv``."""
+    """A log, channel, part or mode that was not analysed: one row of ``refused.csv``."""
 
     log: str
     reason: str
@@ -50,7 +50,7 @@ class Channel:
     name: str  # column name without its unit (``delta_e``, ``acc_feed``, ``current``)
     kind: ChannelKind  # physical quantity, in m, m/s² or A
     # Samples in SI units, shape ``(n_samples,)``; NaN where a sample is missing. Those of a long
-    # record are on disk: read a stretch of them by ``values[start:stop]``.
+    # record are on disk: read a part of them by ``values[start:stop]``.
     values: Samples
 
     def __post_init__(self) -> None:
@@ -70,7 +70,7 @@ class Log:
     channels: tuple[Channel, ...]  # usable signals, all of the same length
     reference_velocity: Samples | None  # set point in m/s, ``(n_samples,)``; NaN where missing
     pieces: tuple[tuple[int, int], ...]  # half-open sample ranges without gaps
-    refused: tuple[Refusal, ...]  # channels that were left out, and stretches of others
+    refused: tuple[Refusal, ...]  # channels that were left out, and parts of others
 
     def __post_init__(self) -> None:
         if self.sample_rate <= 0 or not np.isfinite(self.sample_rate):

@@ -15,7 +15,7 @@ import numpy as np
 from lmshealth.errors import BadLog
 from lmshealth.io import constants
 from lmshealth.io.buffers import Samples, Stored, in_unit
-from lmshealth.io.channel_checks import check_signal, missing_stretches
+from lmshealth.io.channel_checks import check_signal, missing_ranges
 from lmshealth.io.column_map import ColumnMap, Role, Signal
 from lmshealth.io.formats.content import Content
 from lmshealth.io.formats.registry import load
@@ -57,7 +57,7 @@ def read_log(
     Returns
     -------
     Log
-        In SI units. Its ``refused`` lists the channels that cannot be used, and the stretches that
+        In SI units. Its ``refused`` lists the channels that cannot be used, and the ranges that
         were left out (reason ``gaps``).
 
     Raises
@@ -210,7 +210,7 @@ def _series(content: Content, columns: ColumnMap) -> list[_Series]:
 def _missing(item: _Series, name: str, refused: list[Refusal]) -> IntArray | None:
     """Find the missing samples of a channel; None if it cannot be used, which is refused."""
     try:
-        gone, note = missing_stretches(item.values)
+        gone, note = missing_ranges(item.values)
         if item.signal.role in _MEASURED:
             check_signal(item.values)
     except Unusable as error:

@@ -51,11 +51,11 @@ class Magnitude:
     channel: str
     band: FrequencyBand
     # magnitude, frequency, resolution: amplitude in m/s² and frequency in Hz of the strongest
-    # harmonic of the longest stretch, and the spacing of its harmonics in Hz.
+    # harmonic of the longest segment, and the spacing of its harmonics in Hz.
     magnitude: float
     frequency: float
     resolution: float
-    # rms, dof: of all stretches, in m/s², and the degrees of freedom of the mean square: two
+    # rms, dof: of all segments, in m/s², and the degrees of freedom of the mean square: two
     # per harmonic.
     rms: float
     dof: int
@@ -167,14 +167,14 @@ def _usable(log: Log, bands: Iterable[FrequencyBand], longest: int) -> list[Freq
     needed, seconds = constants.LEAST_ORDINATES / narrowest, longest / log.sample_rate
     if seconds < needed:
         needs = f"a band of {narrowest:.3g} Hz needs {needed:.3g} s"
-        raise BadLog(log.name, "too-short", f"the longest stretch has {seconds:.3g} s; {needs}")
+        raise BadLog(log.name, "too-short", f"the longest segment has {seconds:.3g} s; {needs}")
     return usable
 
 
 def _read(
     channel: Channel, sample_rate: float, segments: Sequence[Segment], bands: list[FrequencyBand]
 ) -> list[tuple[float, float, float, float, int]]:
-    """Return the last five fields of `Magnitude` in all bands, the longest stretch first."""
+    """Return the last five fields of `Magnitude` in all bands, the longest segment first."""
     ordered = sorted(segments, key=lambda s: s.start - s.stop)
     strongest: list[tuple[float, float, float]] = []
     total, seconds = np.zeros((2, len(bands)))
@@ -190,7 +190,7 @@ def _read(
                 peak = float(harmonics.amplitude[at]), float(harmonics.frequency[at])
                 strongest.append((*peak, 1 / harmonics.duration))
         for i, own in enumerate(inside):
-            # Stretches too short for the band are omitted.
+            # Segments too short for the band are omitted.
             if own.stop - own.start >= constants.LEAST_ORDINATES - 1:
                 total[i] += harmonics.duration * float(harmonics.power[own].sum())
                 seconds[i] += harmonics.duration

@@ -9,10 +9,10 @@ VELOCITY_TOLERANCE = 1e-3
 SETTLING_TIME = 0.5
 # Relative difference up to which two set velocities are one: encoders measure them to a percent.
 SAME_VELOCITY = 0.01
-# Stretches shorter than this share of the longest do not define the velocity of a log: the top of
+# Segments shorter than this share of the longest do not define the velocity of a log: the top of
 # a triangular move has constant velocity for an instant.
-LEAST_STRETCH = 0.05
-# A stretch of more than a minute is cut into parts of at least this many shortest segments.
+LEAST_LENGTH = 0.05
+# A segment of more than a minute is cut into parts of at least this many shortest segments.
 PARTS_LENGTH = 10
 
 # --- Lines --------------------------------------------------------------------------------------
@@ -51,7 +51,7 @@ ENCODER_FLOOR = 30e-9
 # Band in Hz of the error left by the control loop: a servo acts below its crossover, and the modes
 # of guide and mount lie above.
 LOOP_BAND = (1.0, 40.0)
-# Periods of its lower end that a stretch must hold: detrending removes slower content.
+# Periods of its lower end that a segment must hold: detrending removes slower content.
 LOOP_PERIODS = 2.0
 
 # --- Acceleration levels ------------------------------------------------------------------------
@@ -67,6 +67,6 @@ SIGNIFICANCE = 0.05
 LEAST_ORDINATES = 3
 
 # --- Waterfall ----------------------------------------------------------------------------------
-# Bins of the band, and periods of its lowest frequency that a stretch must hold.
+# Bins of the band, and periods of its lowest frequency that a segment must hold.
 N_BINS = 160
 LEAST_PERIODS = 20

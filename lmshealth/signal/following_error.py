@@ -36,7 +36,7 @@ class FollowingError(ReadOnly):
     highest: float
     std: float
     mean: float
-    harmonics: Harmonics  # of the longest gap-free stretch, at most of a minute at 20 kHz
+    harmonics: Harmonics  # of the longest gap-free segment, at most of a minute at 20 kHz
     kept: Indices  # indices of the strongest harmonics, strongest first, shape ``(n_kept,)``
     floor: float  # amplitude in m above which a harmonic is no noise
 
@@ -65,7 +65,7 @@ def read_error(
     """Analyse the following error of a log, one reading per displacement channel [Piscalov2021].
 
     The `count` strongest harmonics are kept; those up to the floor in m are noise. `part` is a
-    motion phase, see `select_segments`. `BadLog`: ``too-short`` where the longest stretch has fewer
+    motion phase, see `select_segments`. `BadLog`: ``too-short`` where the longest segment has fewer
     than ``count`` harmonics, or as `select_channels` and `select_segments` do.
     """
     channels = select_channels(log, "displacement")
@@ -73,7 +73,7 @@ def read_error(
     longest = max(segments, key=lambda segment: segment.stop - segment.start)
     n, needed = longest.stop - longest.start, 2 * count + 1
     if n < needed:
-        found = f"the longest stretch has {n / log.sample_rate:.3g} s"
+        found = f"the longest segment has {n / log.sample_rate:.3g} s"
         needs = f"{count} harmonics need {needed / log.sample_rate:.3g} s"
         raise BadLog(log.name, "too-short", f"{found}; {needs}: record longer or lower --count")
     velocity = nominal_velocity(log)
@@ -91,9 +91,9 @@ def read_error(
 def loop_error(log: Log) -> float | None:
     """Measure the RMS following error in m from 1 to 40 Hz, which depends on the servo tuning.
 
-    Stretches of constant velocity of two seconds or more are detrended and weighted by duration,
+    Segments of constant velocity of two seconds or more are detrended and weighted by duration,
     channels equally. Disturbances depend on velocity: only logs of one velocity are comparable.
-    None without a displacement channel, such a stretch, or a sample rate above 80 Hz.
+    None without a displacement channel, such a segment, or a sample rate above 80 Hz.
     """
     low, high = constants.LOOP_BAND
     channels = [channel for channel in log.channels if channel.kind == "displacement"]
@@ -109,7 +109,7 @@ def loop_error(log: Log) -> float | None:
 
 
 def _mean_square(values: FloatArray, sample_rate: float) -> float:
-    """Return the mean square of a stretch in the band of the loop."""
+    """Return the mean square of a segment in the band of the loop."""
     # The window prevents leakage of drift below the band and of lines above it.
     frequency, density = signal.periodogram(
         values, sample_rate, window="hann", detrend=signal.detrend, scaling="density"

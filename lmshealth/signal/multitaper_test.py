@@ -77,16 +77,16 @@ def _octaves(low: float, high: float) -> list[tuple[float, float]]:
 
 @dataclass(frozen=True, slots=True)
 class _Octave:
-    """Stretches and frequencies by which an octave is tested.
+    """Blocks and frequencies by which an octave is tested.
 
-    `n` are the samples of a stretch, 0 where the segments are too short; `stretches` the first
+    `n` are the samples of a block, 0 where the segments are too short; `blocks` the first
     samples of those of each segment; `start` and `stop` a half-open range of indices of the padded
-    transform of a stretch.
+    transform of a block.
     """
 
     sample_rate: float
     n: int
-    stretches: list[range]
+    blocks: list[range]
     start: int
     stop: int
 
@@ -96,8 +96,8 @@ class _Octave:
         return self.n / (_PER_ORDINATE * (self.n + 1))
 
     def each(self, read: Callable[[int], FloatArray]) -> Iterator[FloatArray]:
-        """Yield the stretches without their means."""
-        for number, starts in enumerate(self.stretches):
+        """Yield the blocks without their means."""
+        for number, starts in enumerate(self.blocks):
             values = read(number) if starts else np.empty(0)
             for a in starts:
                 part = values[a : a + self.n]
@@ -105,21 +105,21 @@ class _Octave:
 
 
 def _plan(lengths: Sequence[int], sample_rate: float, low: float, high: float) -> _Octave:
-    """Cut segments into stretches of one length, in which a line keeps its phase."""
+    """Cut segments into blocks of one length, in which a line keeps its phase."""
     top = _EDGE * 2.0 ** np.ceil(np.log2(high / _EDGE))
     coherent = (1 / constants.LINE_WIDTH) * sample_rate
     apart = [length // max(1, round(length * top / coherent)) for length in lengths]
     room = min(own for own, size in zip(apart, lengths, strict=True) if 2 * size >= max(lengths))
     # A few samples are omitted for a fast transform.
     n = fft.prev_fast_len(room + 1, real=True) - 1 if room > 4 * _TAPERS else 0
-    stretches = [
+    blocks = [
         range(0, length - n + 1, own) if n and 2 * length >= max(lengths) else range(0)
         for length, own in zip(lengths, apart, strict=True)
     ]
     size = _PER_ORDINATE * (n + 1)
     start, stop = (int(np.ceil(edge * size / sample_rate)) for edge in (low, high))
     start, stop = max(start, _REACH), min(stop, size // 2 + 1 - _REACH)
-    return _Octave(sample_rate, n, stretches, start, stop)
+    return _Octave(sample_rate, n, blocks, start, stop)
 
 
 def _search(
@@ -135,7 +135,7 @@ def _search(
             here = slice(first - octave.start, stop - octave.start)
             evidence[here] += _white(ratio)
             power[here] += squared
-    threshold = float(gamma.isf(p_value, sum(map(len, octave.stretches))))
+    threshold = float(gamma.isf(p_value, sum(map(len, octave.blocks))))
     passed = np.flatnonzero(evidence > threshold)
     centres: list[int] = []
     for index in passed[np.argsort(-power[passed])].tolist():
@@ -154,10 +154,10 @@ def _search(
     return [(ordinate * octave.sample_rate / octave.n, amplitude) for ordinate, amplitude in found]
 
 
-def _windows(stretches: Iterator[FloatArray], starts: list[int]) -> list[ComplexArray]:
-    """Return the series of windows, ``(n_stretches, _WINDOW)``, from their first ordinates on."""
+def _windows(blocks: Iterator[FloatArray], starts: list[int]) -> list[ComplexArray]:
+    """Return the series of windows, ``(n_blocks, _WINDOW)``, from their first ordinates on."""
     cut: list[list[ComplexArray]] = [[] for _ in starts]
-    for part in stretches if starts else ():
+    for part in blocks if starts else ():
         transform = fft.fft(part, norm="forward")
         for own, start in zip(cut, starts, strict=True):
             # The transform is periodic.
@@ -255,8 +255,8 @@ def _clean(window: ComplexArray, first: int, threshold: float) -> list[tuple[flo
 class _LineFit:
     """Fit of a sine to a window.
 
-    The window demodulated by the sine, shape ``(n_stretches, _WINDOW)``; the conjugate of the sine
-    ``(_WINDOW,)``; its complex amplitude, and its power over the rest, ``(n_stretches,)``.
+    The window demodulated by the sine, shape ``(n_blocks, _WINDOW)``; the conjugate of the sine
+    ``(_WINDOW,)``; its complex amplitude, and its power over the rest, ``(n_blocks,)``.
     """
 
     base: ComplexArray
@@ -277,7 +277,7 @@ class _LineFit:
 
     @property
     def amplitude(self) -> float:
-        """RMS amplitude over the stretches, corrected for noise."""
+        """RMS amplitude over the blocks, corrected for noise."""
         squared = np.abs(self.mean) ** 2 * (1 - 1 / (_TAPERS - 1) / self.ratio.clip(1e-300))
         return float(2 * np.sqrt(np.mean(squared).clip(0)))
 

@@ -1,4 +1,4 @@
-"""Segments of a log: gap-free stretches of one motion phase (README.md, "Segments")."""
+"""Segments of a log: gap-free parts of one motion phase (README.md, "Segments")."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _KINDS: tuple[Kind, ...] = ("ramp", "constant", "settling", "idle")
 
 @dataclass(frozen=True, slots=True)
 class Segment:
-    """A gap-free stretch of a log: a half-open range of samples.
+    """A gap-free part of a log: a half-open range of samples.
 
     `velocity` is the mean set velocity in m/s; `kind` is ``constant`` velocity, ``ramp`` between
     two velocities, ``settling`` after a move, or ``idle`` otherwise at rest. Where the log has no
@@ -79,12 +79,12 @@ def find_phases(log: Log) -> tuple[Segment, ...]:
 
 
 def find_segments(log: Log, shortest: float) -> tuple[Segment, ...]:
-    """Cut a log into gap-free stretches in which it is stationary.
+    """Cut a log into gap-free segments in which it is stationary.
 
-    These are the stretches of constant velocity of at least ``shortest`` s; without a set point,
-    and in a log at rest (ambient vibration), the gap-free pieces. A stretch of more than a minute
+    These are the segments of constant velocity of at least ``shortest`` s; without a set point,
+    and in a log at rest (ambient vibration), the gap-free pieces. A segment of more than a minute
     at 20 kHz is cut into parts of one length, each at least ten times ``shortest``. The result is
-    in order of time, and empty if no stretch is long enough.
+    in order of time, and empty if no segment is long enough.
     """
     return stationary(find_phases(log), round(shortest * log.sample_rate))
 
@@ -152,12 +152,12 @@ def select_channels(log: Log, kind: Literal["displacement", "acceleration"]) -> 
 
 
 def select_segments(log: Log, part: Part) -> tuple[Segment, ...]:
-    """Select the gap-free stretches of one motion phase.
+    """Select the gap-free segments of one motion phase.
 
     ``record`` is all of the log, acceleration and braking included; without a set point only it can
     be selected, also as ``constant``. The result is at least one segment, in order of time, each of
     at most a minute at 20 kHz. `BadLog`: ``no-set-point`` where the set point is needed and
-    missing, ``no-such-part`` where the log has no such stretch.
+    missing, ``no-such-part`` where the log has no such segment.
     """
     if part == "record" or (log.reference_velocity is None and part == "constant"):
         pieces = [Segment(start, stop, float("nan")) for start, stop in log.pieces]
@@ -186,7 +186,7 @@ def nominal_velocity(log: Log) -> float:
     if not steady:
         return float("nan")
     length = np.array([s.stop - s.start for s in steady])
-    speed = np.abs([s.velocity for s in steady])[length >= constants.LEAST_STRETCH * length.max()]
+    speed = np.abs([s.velocity for s in steady])[length >= constants.LEAST_LENGTH * length.max()]
     if speed.max() > (1 + constants.SAME_VELOCITY) * speed.min():
         return float("nan")
     return float(np.median(speed))

@@ -21,7 +21,7 @@ from lmshealth.signal.tone_removal import Sinusoid, remove_sinusoids
 _LAG_PERIODS = 8.0
 # Segments of more samples than this lose a few at their end for a fast transform.
 _LONG = 1 << 14
-# Only segments of at least this many samples are averaged: the parts of a long stretch.
+# Only segments of at least this many samples are averaged: the parts of a long segment.
 _LEAST_PART = MINUTE // 2
 
 
@@ -213,7 +213,7 @@ def cross_spectra(
     ceiling: float = np.inf,
     resonances: Sequence[ResonanceRange] = ANY_RESONANCE,
 ) -> tuple[CrossSpectrum, ...]:
-    """Transform all channels segment by segment, and average the parts of long stretches.
+    """Transform all channels segment by segment, and average the parts of long segments.
 
     Parts of one length and set velocity have the same expectation: their mean is a sufficient
     statistic. Short moves stay separate, so that a line is masked in each at its own frequency.

@@ -88,17 +88,17 @@ def relative_spectrum(
 ) -> RelativeSpectrum | None:
     """Compute the spectrum of a log relative to its median in the band of the tracked modes.
 
-    Periodograms of parts of the constant-velocity stretches are averaged within bins. Each channel,
+    Periodograms of parts of the constant-velocity segments are averaged within bins. Each channel,
     also a displacement as acceleration, is divided by its median over the band, and the mean of all
     channels is returned: logs of different velocity, load or sensors then differ in their
-    resonances only. None without a channel, a stretch of twenty periods, or a sufficient sample
+    resonances only. None without a channel, a segment of twenty periods, or a sufficient sample
     rate.
     """
     low, high = shown_band(stage)
     edges = np.geomspace(low, high, n_bins + 1)
     channels = [c for c in log.channels if c.kind in ("displacement", "acceleration")]
-    stretches = find_segments(log, constants.LEAST_PERIODS / low)
-    segments = _cut(stretches, log.sample_rate / np.diff(edges)[0])
+    stationary = find_segments(log, constants.LEAST_PERIODS / low)
+    segments = _cut(stationary, log.sample_rate / np.diff(edges)[0])
     below = edges[1:] < log.sample_rate / 2
     if not channels or not segments or not below.any():
         return None
@@ -127,7 +127,7 @@ def _cut(segments: Sequence[Segment], size: float) -> list[Segment]:
 def _density(
     channel: Channel, segments: Sequence[Segment], sample_rate: float, edges: FloatArray
 ) -> FloatArray:
-    """Average the power spectral density of a channel over stretches and within bins."""
+    """Average the power spectral density of a channel over segments and within bins."""
     top = float(edges[-1])
     spectra = [periodogram(channel, s, sample_rate, top, ceiling=1.1 * top) for s in segments]
     duration = np.array([spectrum.duration for spectrum in spectra])

@@ -50,7 +50,7 @@ def suspect(sums: FloatArray, first: int, leaps: list[int]) -> int | None:
     """Return the log since which the following error, or else innovations, differ suspiciously.
 
     `sums` are the running sums before the first log and after every log so far, `first` is the
-    first log of the segment, and `leaps` are those of `unexplained_leaps`, which locate a retuning
+    first log of the regime, and `leaps` are those of `unexplained_leaps`, which locate a retuning
     better than innovations do.
     """
     k = len(sums) - 2

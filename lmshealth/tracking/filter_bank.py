@@ -261,7 +261,7 @@ def advance(model: FilterModel, bank: FilterBank, first: int, last: int) -> Filt
 
 
 def restart(model: FilterModel, bank: FilterBank) -> FilterBank:
-    """Start a segment: keep state and noise scales, and give process noise its prior again."""
+    """Start a regime: keep state and noise scales, and give process noise its prior again."""
     grid, own = model.grid, bank.hyperparameters
     scales, place = np.unique(own.scales, axis=0, return_inverse=True)
     weight = np.bincount(place.ravel(), weights=bank.weight)

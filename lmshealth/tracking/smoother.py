@@ -45,7 +45,7 @@ def smooth(history: History, followed: Track, stage: Stage | None = None) -> Smo
     The steps of its track are in the model; the stage is that of `track`.
     """
     space = StateSpace(history, stage, followed.steps)
-    # Where a segment begins, rates have their prior variance again.
+    # Where a regime begins, rates have their prior variance again.
     begun = {step.first for step in followed.steps if step.kind == "reset" or not step.declared}
     model = FilterModel(space, begun - {0})
     bank = advance(model, initial(model), 0, len(history.logs) - 1)

@@ -245,15 +245,15 @@ def track(history: History, stage: Stage | None = None) -> Track:
 class _Driver:
     """Filters a history log by log and filters again from a checkpoint where a step is detected.
 
-    A segment begins at a reset and at a detected step: the state continues, the process noise has
-    its prior again, and changes before the segment are not weighed again.
+    A regime begins at a reset and at a detected step: the state continues, the process noise has
+    its prior again, and changes before the regime are not weighed again.
     """
 
     def __init__(self, model: FilterModel) -> None:
         self.model, self.history = model, model.space.history
         self.resets = {step.first for step in self.history.steps if step.kind == "reset"}
         self.bank = initial(model)
-        # Banks after each of the last logs of the segment, and the first log of its windows.
+        # Banks after each of the last logs of the regime, and the first log of its windows.
         self.checkpoints: dict[int, FilterBank] = {}
         self.first = 1
         n, n_rows = model.values.shape
@@ -279,15 +279,15 @@ class _Driver:
         """Filter all logs."""
         for k in range(len(self.history.logs)):
             if k in self.resets and k:
-                self._begin_segment(self.bank, k)
+                self._begin_regime(self.bank, k)
                 self.alarmed = False
             self._filter(k, reject_outliers=k not in self.resets)
             self._detect(k)
             self._publish(k)
         return self._track()
 
-    def _begin_segment(self, bank: FilterBank, first: int) -> None:
-        """Continue from a bank; evidence before the segment is not comparable."""
+    def _begin_regime(self, bank: FilterBank, first: int) -> None:
+        """Continue from a bank; evidence before the regime is not comparable."""
         self.bank, self.first, self.checkpoints = restart(self.model, bank), first, {}
 
     def _filter(self, k: int, *, reject_outliers: bool) -> None:
@@ -355,7 +355,7 @@ class _Driver:
             self.leaps = unexplained_leaps(self.history.loop_error, steps)
             before = before.padded(self.model.space.size)
         self._extend_widening(k, self._dof())
-        self._begin_segment(before, j + 1)
+        self._begin_regime(before, j + 1)
         for again in range(j, k + 1):
             self._filter(again, reject_outliers=False)
         if change.damage:

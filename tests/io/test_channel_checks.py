@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from lmshealth.io.buffers import BLOCK
-from lmshealth.io.channel_checks import check_signal, missing_stretches
+from lmshealth.io.channel_checks import check_signal, missing_ranges
 from lmshealth.io.refusal import Unusable
 
 N = 40_000
@@ -56,27 +56,27 @@ def test_flat():
         check_signal(np.full(100, 3.0))
 
 
-def test_missing_stretches():
+def test_missing_ranges():
     """NaN, infinite and absurd samples are counted; too many of them end the channel."""
     values = np.ones(1000)
     values[[3, 4, 50, 70]] = np.nan, np.inf, 1e300, -np.inf
-    stretches, note = missing_stretches(values)
-    assert stretches.tolist() == [[3, 5], [50, 51], [70, 71]]
-    assert "4 of 1000" in note and "3 stretches" in note
-    assert missing_stretches(np.ones(5))[1] == ""
+    ranges, note = missing_ranges(values)
+    assert ranges.tolist() == [[3, 5], [50, 51], [70, 71]]
+    assert "4 of 1000" in note and "3 ranges" in note
+    assert missing_ranges(np.ones(5))[1] == ""
     values[:101] = np.nan
     for bad in (values, np.where(np.arange(1000) % 20 == 0, np.nan, 1.0)):
         with pytest.raises(Unusable, match="missing"):
-            missing_stretches(bad)
+            missing_ranges(bad)
 
 
 def test_a_stretch_across_blocks_is_one():
-    """Samples missing at the end of a block and at the beginning of the next are one stretch."""
+    """Samples missing at the end of a block and at the beginning of the next are one range."""
     values = np.ones(3 * BLOCK)
     values[BLOCK - 2 : BLOCK + 3] = values[-1] = values[0] = np.nan
-    stretches, note = missing_stretches(values)
-    assert stretches.tolist() == [[0, 1], [BLOCK - 2, BLOCK + 3], [3 * BLOCK - 1, 3 * BLOCK]]
-    assert "7 of" in note and "3 stretches" in note
+    ranges, note = missing_ranges(values)
+    assert ranges.tolist() == [[0, 1], [BLOCK - 2, BLOCK + 3], [3 * BLOCK - 1, 3 * BLOCK]]
+    assert "7 of" in note and "3 ranges" in note
 
 
 def test_long_signals_are_judged_as_a_whole():

@@ -118,7 +118,7 @@ STEPS = {
 @pytest.mark.parametrize("steps", STEPS)
 @pytest.mark.parametrize("speed", [0.005, 0.1, 0.4])
 def test_steps_do_not_break_a_stroke(steps, speed):
-    """Both constant stretches are found whole but for 40 ms, at their speed."""
+    """Both constant segments are found whole but for 40 ms, at their speed."""
     _, position = stroke(speed)
     rounded = np.asarray(STEPS[steps](position), dtype=np.float64)
     velocity = set_velocity(rounded, ((0, rounded.size),), RATE)
@@ -129,7 +129,7 @@ def test_steps_do_not_break_a_stroke(steps, speed):
 
 
 def test_neighbouring_differences_would_break_it():
-    """The negative control: in steps of 1 um the plain difference leaves no stretch whole."""
+    """The negative control: in steps of 1 um the plain difference leaves no segment whole."""
     _, position = stroke(0.1)
     plain = np.gradient(np.round(position, 6), 1 / RATE)
     log = make_log({"acc_a": np.zeros(position.size)}, RATE, velocity=plain)

@@ -578,7 +578,7 @@ def test_mains_that_wander_are_no_mode_and_leave_the_others_alone() -> None:
     assert "mains" in {line.kind for line in dirty.lines}
 
 
-def test_stretches_of_an_instant_are_passed_over() -> None:
+def test_segments_of_an_instant_are_passed_over() -> None:
     """The top of a triangular move, too short for the band to be seen in it, does no harm."""
     rate, mode = 20_000.0, Mode(60.0, 0.02)
     down, up = np.linspace(0.1, -0.1, 4000), np.linspace(-0.1, 0.1, 4000)

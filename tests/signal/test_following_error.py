@@ -71,7 +71,7 @@ def test_nothing_above_the_floor_has_no_bandwidth() -> None:
 
 
 def test_gaps_leave_the_longest_piece_to_the_harmonics() -> None:
-    """Statistics are those of all samples that are there, harmonics of the longest stretch."""
+    """Statistics are those of all samples that are there, harmonics of the longest segment."""
     x = known(12_000)
     x[8000:8100] = np.nan
     log = replace(make_log({"delta_e": x}, RATE), pieces=((0, 8000), (8100, 12_000)))
@@ -125,7 +125,7 @@ def test_the_loop_error_is_the_rms_of_what_lies_in_its_band() -> None:
     assert alone < 0.01 * expected
 
 
-def test_stretches_count_by_their_durations_and_moves_do_not() -> None:
+def test_segments_count_by_their_durations_and_moves_do_not() -> None:
     """Of 4 s at 1 µm and 8 s at 3 µm the mean square is (1 + 2 · 9)/3; ramps are left out."""
     n = round(4 * RATE)
     ramp = np.linspace(0.1, 0.2, N // 4)

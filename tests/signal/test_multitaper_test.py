@@ -81,7 +81,7 @@ def test_a_resonance_wider_than_all_is_white() -> None:
 @pytest.mark.slow
 def test_narrow_resonances_in_a_long_record_are_no_lines(monkeypatch: pytest.MonkeyPatch) -> None:
     """Of 20 records of 30 s with four resonances of 0.2 % none alarms; taken for noise, most do."""
-    # At the bottom of octaves they are narrowest: two ordinates of a stretch.
+    # At the bottom of octaves they are narrowest: two ordinates of a block.
     modes = [Mode(f, 0.002) for f in (47.1, 93.3, 185.2, 365.4)]
     rng = np.random.default_rng(3)
     records = [accelerations(rng, modes, 30_000, RATE, 0.1)[0] for _ in range(20)]
@@ -133,7 +133,7 @@ def test_segments_show_together_what_none_shows_alone() -> None:
 
 
 def test_segments_much_shorter_than_the_longest_are_left_out() -> None:
-    """Half as long is read and a little less is not; the stretches have the length of the half."""
+    """Half as long is read and a little less is not; the blocks have the length of the half."""
     noise = white(np.random.default_rng(7), 1e-2, 4000, RATE)
     read: list[int] = []
 

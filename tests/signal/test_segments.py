@@ -1,4 +1,4 @@
-"""Segments: motion phases by the set point, selection of stretches, speed of a log."""
+"""Segments: motion phases by the set point, selection by phase, speed of a log."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ def test_a_part_that_is_not_there_is_an_error_with_those_that_are() -> None:
 
 
 def test_gaps_split_every_part() -> None:
-    """No stretch of any kind reaches across a gap."""
+    """No segment of any kind reaches across a gap."""
     log = replace(log_of(strokes(0.1)), pieces=((0, 1000), (1010, 3300)))
     assert [(s.start, s.stop) for s in select_segments(log, "record")] == [(0, 1000), (1010, 3300)]
     first, second = select_segments(log, "constant")
@@ -97,7 +97,7 @@ def test_a_log_of_several_velocities_has_none() -> None:
 
 
 def moves(rate: float = 20_000.0) -> tuple[np.ndarray, list[tuple[int, int, float]]]:
-    """Velocity set point of a move there and back with rests, and its constant stretches."""
+    """Velocity set point of a move there and back with rests, and its constant segments."""
     ramp = np.arange(0, 0.08, 1 / rate) * 5.0  # 5 m/s² up to 0.4 m/s
     top, rest = np.full(13_000, 0.4), np.zeros(4000)
     there = np.concatenate([ramp, top, ramp[::-1]])
@@ -108,7 +108,7 @@ def moves(rate: float = 20_000.0) -> tuple[np.ndarray, list[tuple[int, int, floa
 
 
 def test_moves_are_cut_to_their_constant_velocity() -> None:
-    """Ramps and rests are left out, at most 2 ms of a stretch are lost, the velocity is exact."""
+    """Ramps and rests are left out, at most 2 ms of a segment are lost, the velocity is exact."""
     velocity, truth = moves()
     log = make_log({"acc_a": np.zeros(velocity.size)}, 20_000.0, velocity=velocity)
     segments = find_segments(log, 0.1)
@@ -153,7 +153,7 @@ def test_rest_beside_moves_is_not_stationary() -> None:
 
 
 def test_short_segments_are_left_out() -> None:
-    """A stretch below the shortest useful one is no segment."""
+    """A segment below the shortest useful one is no segment."""
     velocity, _ = moves()
     log = make_log({"acc_a": np.zeros(velocity.size)}, 20_000.0, velocity=velocity)
     assert find_segments(log, 0.66) == ()
@@ -212,7 +212,7 @@ def test_phases_do_not_depend_on_blocks(monkeypatch: pytest.MonkeyPatch) -> None
         np.testing.assert_allclose([p.velocity for p in parts], [p.velocity for p in whole])
 
 
-def test_long_stretches_are_cut_into_equal_parts(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_long_segments_are_cut_into_equal_parts(monkeypatch: pytest.MonkeyPatch) -> None:
     """What is longer than the longest is cut; parts have one length and follow each other."""
     monkeypatch.setattr(segments, "MINUTE", 1000)
     log = make_log({"acc_a": np.zeros(3701)}, RATE, pieces=((0, 900), (1000, 3701)))

@@ -1,4 +1,4 @@
-"""Spectra: what a periodogram reads, and which stretches of a log are averaged."""
+"""Spectra: what a periodogram reads, and which segments of a log are averaged."""
 
 from __future__ import annotations
 
@@ -248,7 +248,7 @@ def test_a_delayed_channel_lags_by_its_phase() -> None:
 
 
 def test_long_parts_of_one_velocity_are_averaged_and_short_ones_are_not() -> None:
-    """Long stretches to and fro make one mean; another velocity and short moves stay apart."""
+    """Long segments to and fro make one mean; another velocity and short moves stay apart."""
     n = 600_000
     values = {"acc_a": np.random.default_rng(17).normal(size=4 * n)}
     parts = [Segment(k * n, (k + 1) * n, v) for k, v in enumerate((0.2, -0.2, 0.4, 0.2))]
@@ -319,7 +319,7 @@ def averaged(values: np.ndarray | Stored, segments: list[Segment]) -> tuple[Spec
 
 @pytest.fixture
 def short_minute(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Take 1000 samples for a part of a long stretch."""
+    """Take 1000 samples for a part of a long segment."""
     monkeypatch.setattr(spectra, "_LEAST_PART", 1000)
 
 

@@ -97,7 +97,7 @@ def test_following_error_counts_as_acceleration() -> None:
 
 
 def test_what_cannot_be_read_is_missing() -> None:
-    """No fitting channel, no stretch, no signal or too low a rate give None; half a band NaN."""
+    """No fitting channel, no segment, no signal or too low a rate give None; half a band NaN."""
     noise = white(np.random.default_rng(5), NOISE, N, RATE)
     assert relative_spectrum(make_log({"current": noise}, RATE), STAGE) is None
     assert relative_spectrum(make_log({"acc_a": noise}, RATE, pieces=[(0, 50)]), STAGE) is None

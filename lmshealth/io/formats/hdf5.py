@@ -130,7 +130,7 @@ def _dataset(file: Any, name: str) -> Any:
 
 
 def _read(dataset: Any, spool: Spool) -> None:
-    """Read a column, beyond a minute in stretches of whole chunks: each is unpacked only once."""
+    """Read a column, beyond a minute in parts of whole chunks: each is unpacked only once."""
     chunk = 1 if dataset.chunks is None else dataset.chunks[0]
     step = max(1, dataset.size) if dataset.size <= MINUTE else -(-BLOCK // chunk) * chunk
     for start in range(0, dataset.size, step):

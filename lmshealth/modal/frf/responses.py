@@ -1,4 +1,4 @@
-"""Frequency response of an output to an input, over periods or over stretches of a record.
+"""Frequency response of an output to an input, over periods or over blocks of a record.
 
 Noise of the lines comes from the sensors and from forces that excite the same modes.
 """
@@ -47,8 +47,8 @@ def smooth_noise(power: FloatArray, response: FloatArray, width: int) -> FloatAr
 
 # Complex degrees of freedom that a variance needs; few periods are supplemented by neighbours.
 _FREEDOM = 16
-# Stretches of a record, half overlapping, that a coherence is averaged over.
-_STRETCHES = 8
+# Blocks of a record, half overlapping, that a coherence is averaged over.
+_BLOCKS = 8
 _ROUNDING = 1e-9  # share of the largest amplitude
 
 
@@ -57,13 +57,13 @@ class Frf:
     """Frequency response function with its coherence.
 
     With a periodic excitation ``response`` is the mean output over the mean input, unbiased by
-    noise of either. Otherwise it is H1 from spectra of half overlapping stretches.
+    noise of either. Otherwise it is H1 from spectra of half overlapping blocks.
 
     Noise of the input reduces H1 by its share of the input's power, most at resonances of a driven
     structure; noise of the output raises H2, most at antiresonances; Hv lies between them and is
     unbiased where both have the same share of noise (channels are weighted by their mean power). In
     a closed loop, where the input contains fed back noise of the output, all three are biased
-    towards the inverse of the feedback. Stretches too short for a resonance flatten it.
+    towards the inverse of the feedback. Blocks too short for a resonance flatten it.
 
     Arrays have shape ``(n_lines,)``.
     """
@@ -73,12 +73,12 @@ class Frf:
     frequency: FloatArray  # in Hz; with a periodic excitation only excited harmonics
     response: ComplexArray  # SI unit of the output per that of the input
     std: FloatArray  # of the response by noise, sqrt(E|ΔH|²)
-    h1: ComplexArray  # from the spectra of all periods or stretches
+    h1: ComplexArray  # from the spectra of all periods or blocks
     h2: ComplexArray
     hv: ComplexArray
-    coherence: FloatArray  # over periods or stretches, 0 to 1
+    coherence: FloatArray  # over periods or blocks, 0 to 1
     period: float  # of the excitation in s; NaN where it is not periodic
-    n_averages: float  # periods, or equivalent number of independent stretches
+    n_averages: float  # periods, or equivalent number of independent blocks
     # Amplitude of the output beyond noise at harmonics without input over that at excited ones:
     # nonlinear. NaN where the excitation is not periodic or excites all harmonics.
     stray: float = float("nan")
@@ -203,7 +203,7 @@ def _is_transient(answer: ComplexArray) -> bool:
 
 
 def from_record(pair: Pair, band: tuple[float, float]) -> tuple[Frf, Ordinates]:
-    """Average half overlapping stretches for the response; transform the record for its modes.
+    """Average half overlapping blocks for the response; transform the record for its modes.
 
     Raises
     ------
@@ -220,7 +220,7 @@ def from_record(pair: Pair, band: tuple[float, float]) -> tuple[Frf, Ordinates]:
         / (size / 2 * pair.gain(lines))
         for x in pair.signals
     )
-    length = size // _STRETCHES
+    length = size // _BLOCKS
     # Of two half overlapping Hann windows the spectra correlate by 1/6.
     n = (2 * size / length - 1) / (1 + 2 / 6**2)
     (frequency, auto_in), (_, cross), (_, auto_out) = (

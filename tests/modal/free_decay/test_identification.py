@@ -80,7 +80,7 @@ def test_decays_are_those_after_the_moves_of_the_set_point() -> None:
 
 
 def test_given_segments_are_the_decays() -> None:
-    """Only the stretches that are named are looked at."""
+    """Only the segments that are named are looked at."""
     rng = np.random.default_rng(5)
     parts = [stop(rng, [Ring(f, 0.01)], 400, RATE, 0.02)[0] for f in (50.0, 60.0, 50.0)]
     log = make_log({"acc_0": np.concatenate(parts)}, RATE)

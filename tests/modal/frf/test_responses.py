@@ -1,4 +1,4 @@
-"""Frequency responses over periods and stretches, and the noise of their lines."""
+"""Frequency responses over periods and blocks, and the noise of their lines."""
 
 from __future__ import annotations
 
@@ -158,7 +158,7 @@ def test_a_record_has_the_coherence_of_its_noise() -> None:
     truth = machine.response(frf.frequency)
     noise = np.var(answer) / 2
     expected = np.abs(truth) ** 2 / (np.abs(truth) ** 2 + noise)
-    # A mean over n stretches makes it larger by (1 - γ²)²/n.
+    # A mean over n blocks makes it larger by (1 - γ²)²/n.
     bias = np.mean((1 - expected) ** 2) / frf.n_averages
     assert frf.coherence.mean() == pytest.approx(expected.mean() + bias, abs=0.02)
     error = np.abs(frf.h1 - truth) ** 2 / frf.std**2
