@@ -8,7 +8,7 @@ logs, and an estimate gets a mode only if that mode has nearly all of the poster
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from itertools import pairwise
 from typing import Literal
@@ -29,6 +29,9 @@ from lmshealth.tracking.association.mode_filters import (
 from lmshealth.tracking.association.track_initiation import Candidates, follow, prune
 
 Reason = Literal["ambiguous", "jump", "unconfirmed"]
+
+# Filters that catch up with repeated logs need no more than these: older ones have no influence.
+_MOST_PENDING = 64
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -115,8 +118,14 @@ class State:
     order: IntArray  # modes that the identification names, ascending in first frequency
     names: tuple[str, ...] = ()  # of the modes, in the order in which they were found
     first: tuple[float, ...] = ()  # their first ln f
-    # Last place of each named mode and source.
-    places: dict[tuple[str, str], Place] = field(default_factory=dict)
+    # Last place of each named mode and source, before the last log.
+    places: dict[tuple[str, str], Place] | None = None
+    last: Log | None = None
+    labels: tuple[Label, ...] = ()  # of the last log
+    # Whether one hypothesis is left without candidates, and all names of the last log are right.
+    repeatable: bool = False
+    # Logs that repeat the one before and that the filters have not processed yet.
+    pending: tuple[Log, ...] = ()
     clock: float | None = None  # to which the filters are predicted
 
     @classmethod
@@ -171,11 +180,20 @@ def associate(
 def associate_log(state: State, log: Log) -> tuple[State, tuple[Label, ...]]:
     """Associate the estimates of one log: the next state, and a label per estimate.
 
-    All filters are predicted to the log and the sources are associated one after the other: by the
+    A log that repeats the one before has its labels; the filters catch up with it later. Otherwise
+    all filters are predicted to the log and the sources are associated one after the other: by the
     gates where only one assignment is possible, else by hypotheses.
     """
-    if not log.opened and _is_common_jump(state.places, log, state.prior_std):
+    if _repeats(state, log):
+        pending = (*state.pending, log)[-_MOST_PENDING:]
+        return replace(state, last=log, pending=pending), state.labels
+    places = dict(state.places or {}) | ({} if state.last is None else _places(state.last))
+    if not log.opened and _is_common_jump(places, log, state.prior_std):
         log = replace(log, opened=True)
+    for late in state.pending:
+        state = _predict(state, late)
+        for rows, meant in _groups(state.names, late.names, late.sources):
+            state = _update(state, meant, late.measurements.pick(rows), _row(late))
     state = _predict(state, log)
     found: list[Label] = [Label(None)] * len(log.names)
     confirmed: set[int] = set()
@@ -187,9 +205,7 @@ def associate_log(state: State, log: Log) -> tuple[State, tuple[Label, ...]]:
         scan = Scan(log.epoch, rows, meant, own, _row(log))
         unique = None if log.opened else _unique_assignment(state, scan)
         if unique is not None:
-            at, modes = (np.zeros_like(unique), unique), unique.tolist()
-            filters = update(state.hypotheses.filters, at, own, scan.row)
-            state = replace(state, hypotheses=replace(state.hypotheses, filters=filters))
+            state, modes = _update(state, unique, own, scan.row), unique.tolist()
             labels = [Label(state.names[mode]) for mode in modes]
         else:
             state, modes, labels = _resolve(state, scan, log, confirmed)
@@ -197,8 +213,46 @@ def associate_log(state: State, log: Log) -> tuple[State, tuple[Label, ...]]:
         for row, label in zip(rows, labels, strict=True):
             found[row] = label
     candidates = prune(state.candidates, log.epoch, confirmed, detected)
-    state = replace(state, candidates=candidates, places=state.places | _places(log))
-    return state, tuple(found)
+    state = replace(state, candidates=candidates, places=places, last=log, labels=tuple(found))
+    filters = state.hypotheses.filters
+    certain = len(filters.mean) == 1 and not len(candidates)
+    right = all(label.mode == name for label, name in zip(found, log.names, strict=True))
+    # Names by order and by mode must be the same.
+    rising = np.diff(filters.predicted(_row(log))[0][0, state.order]) > 0
+    return replace(state, repeatable=bool(certain and right and rising.all())), state.labels
+
+
+def _repeats(state: State, log: Log) -> bool:
+    """Return whether a log repeats the one before: names, places, dampings and shapes.
+
+    The labels are then the names, without any filter: a test holds them equal to those of the full
+    step on random lives.
+    """
+    last = state.last
+    if last is None or not state.repeatable or log.opened or not log.names:
+        return False
+    if log.names != last.names or log.sources != last.sources:
+        return False
+    new, old = log.measurements, last.measurements
+    step, std = np.abs(new.ln_f - old.ln_f), np.sqrt(new.var_f + old.var_f)
+    moved = float(np.abs(log.offsets - last.offsets) @ state.prior_std)
+    reach = constants.REPEAT_LN_F + moved + constants.REPEAT_GATE * std
+    # Where a damping is unknown its variance is infinite.
+    far = constants.REPEAT_GATE * np.sqrt(new.var_zeta + old.var_zeta)
+    if ((step / reach) ** 2 + ((new.ln_zeta - old.ln_zeta) / far) ** 2 > 1).any():
+        return False
+    covariates = constants.JUMP_COVARIATE_GATE * moved
+    jumped = step > constants.JUMP_LN_F + covariates + constants.JUMP_GATE * std
+    if np.count_nonzero(jumped) > 1:
+        return False
+    if new.shapes.shape[1] > 1:
+        product = new.shapes * old.shapes
+        mac = np.where(np.isnan(product), 0.0, product).sum(axis=1) ** 2
+        if (mac < constants.LEAST_MAC).any():
+            return False
+    names, gap = np.array(log.names), np.abs(new.ln_f[:, None] - new.ln_f)
+    near = gap < constants.REPEAT_SEPARATION + reach.max()
+    return not (near & (names[:, None] != names)).any()
 
 
 @lru_cache(maxsize=256)
@@ -259,7 +313,13 @@ def _predict(state: State, log: Log) -> State:
     if len(candidates):
         filters = predict(candidates.filters, step, log.life, opened=log.opened)
         candidates = replace(candidates, filters=filters)
-    return replace(state, hypotheses=hypotheses, candidates=candidates, clock=log.clock)
+    return replace(state, hypotheses=hypotheses, candidates=candidates, clock=log.clock, pending=())
+
+
+def _update(state: State, modes: IntArray, new: Measurements, row: FloatArray) -> State:
+    """Update the filters of a single hypothesis with estimates of known modes."""
+    filters = update(state.hypotheses.filters, (np.zeros_like(modes), modes), new, row)
+    return replace(state, hypotheses=replace(state.hypotheses, filters=filters))
 
 
 def _unique_assignment(state: State, scan: Scan) -> IntArray | None:
