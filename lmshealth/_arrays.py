@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import fields
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,6 +28,18 @@ class ReadOnly:
 
     def __post_init__(self) -> None:
         freeze(self)
+
+
+class Rows:
+    """Base of dataclasses whose fields share their first axis: they are indexed as arrays are."""
+
+    __slots__ = ()
+
+    def __getitem__(self, chosen: Any) -> Self:
+        """Return some of the rows, by index or mask."""
+        own: Any = self
+        some: Self = type(own)(*(getattr(own, item.name)[chosen] for item in fields(own)))
+        return some
 
 
 def expect_shape(name: str, array: np.ndarray[Any, Any], shape: tuple[int, ...]) -> None:

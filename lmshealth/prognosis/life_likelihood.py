@@ -7,13 +7,13 @@ logs), and `LifeLikelihood` (the data whitened at every point of a grid of nuisa
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from itertools import product
 
 import numpy as np
 from scipy.linalg import qr, solve_triangular
 
-from lmshealth._arrays import BoolArray, FloatArray, ReadOnly
+from lmshealth._arrays import BoolArray, FloatArray, ReadOnly, Rows
 from lmshealth.errors import NotEnoughData
 from lmshealth.health.epoch_posterior import one_at_a_time
 from lmshealth.prognosis import constants
@@ -127,7 +127,7 @@ class NodeBasis(ReadOnly):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Grid:
+class Grid(Rows):
     """Data whitened at the points of a grid of walk, noise scale and deviation.
 
     `design` is R of each mode, shape ``(n_points, n_modes, n_nodes, n_rows)``; `target` is
@@ -160,10 +160,6 @@ class Grid:
             rest = np.sum(u**2) - np.sum(target**2)
             points.append((walk, scale, deviation, design, target, rest, log_weight))
         return cls(*(np.array(column) for column in zip(*points, strict=True)))
-
-    def chosen(self, which: BoolArray) -> Grid:
-        """Return some of the points."""
-        return Grid(*(getattr(self, field.name)[which] for field in fields(self)))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -215,7 +211,7 @@ class LifeLikelihood:
         n_moments, n_parameters)``, and between the parameters ``(…, n_parameters, n_parameters)``.
         """
         data, deviation = self.data, float(grid.deviation[k])
-        point = grid.chosen(np.arange(grid.walk.size) == k)
+        point = grid[np.arange(grid.walk.size) == k]
         factor = self.covariance.factor(float(grid.walk[k]), float(grid.noise_scale[k]), deviation)
         unit = deviation**2 / data.horizon
         shared = unit * np.maximum(np.minimum.outer(moments, data.clock[data.log_of]), 0.0)

@@ -75,7 +75,7 @@ class LifeDensity:
         order = np.argsort(weight)
         kept = np.ones(weight.size, dtype=bool)
         kept[order[np.cumsum(weight[order]) < _NEGLIGIBLE]] = False
-        return replace(self, grid=self.grid.chosen(kept))
+        return replace(self, grid=self.grid[kept])
 
     def settings(self, y: FloatArray) -> FloatArray:
         """Return the means of walk, noise scale, deviation, and χ² at the mean of coordinates."""

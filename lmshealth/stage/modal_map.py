@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import pandas as pd
-from numpy.polynomial.chebyshev import chebder
+from numpy.polynomial.chebyshev import chebder, chebvander
 
 from lmshealth._arrays import BoolArray, FloatArray
 from lmshealth.errors import BadStage, OutsideMap
@@ -136,32 +136,19 @@ def _evaluate(coefficients: FloatArray, unit: FloatArray) -> FloatArray:
     """Sum a tensor Chebyshev series at points ``(n_points, n_parameters)`` from -1 to 1."""
     shape = coefficients.shape
     # One matrix product contracts the last parameter axis for all points and modes.
-    basis = _polynomials(unit[:, -1], shape[-2])
+    basis = chebvander(unit[:, -1], shape[-2] - 1)
     last = np.moveaxis(coefficients, -2, 0).reshape(shape[-2], -1)
     value = (basis @ last).reshape(-1, *shape[:-2], shape[-1])
     for axis in reversed(range(unit.shape[1] - 1)):
-        basis = _polynomials(unit[:, axis], shape[axis])
+        basis = chebvander(unit[:, axis], shape[axis] - 1)
         value = np.einsum("n...km,nk->n...m", value, basis)
     return np.asarray(value)
-
-
-def _polynomials(unit: FloatArray, n: int) -> FloatArray:
-    """Evaluate Chebyshev polynomials 0 … n-1 at points from -1 to 1, shape ``(n_points, n)``."""
-    # Faster than numpy's chebvander for the few points of a step of an ensemble.
-    value = np.ones((n, unit.size))
-    if n > 1:
-        value[1] = unit
-    twice = 2 * unit
-    for k in range(2, n):
-        np.multiply(twice, value[k - 1], out=value[k])
-        value[k] -= value[k - 2]
-    return value.T
 
 
 def _basis(unit: FloatArray, degrees: list[int]) -> FloatArray:
     basis = np.ones((unit.shape[0], 1))
     for axis, degree in enumerate(degrees):
-        vander = _polynomials(unit[:, axis], degree + 1)
+        vander = chebvander(unit[:, axis], degree)
         basis = (basis[:, :, None] * vander[:, None, :]).reshape(unit.shape[0], -1)
     return basis
 

@@ -150,8 +150,8 @@ def _gains(
     gains["drift", "", j] = -np.inf
     if before.hyperparameters.healthy.any():
         # A healthy machine begins to change.
-        begun = restart(model, before.only(before.hyperparameters.healthy))
-        begun = begun.only(~begun.hyperparameters.healthy)
+        begun = restart(model, before[before.hyperparameters.healthy])
+        begun = begun[~begun.hyperparameters.healthy]
         changed = advance(model, begun, j, now).log_evidence - begun.log_evidence
         unchanged = checkpoints[now].log_evidence - before.log_evidence
         gains["drift", "", j] = changed - unchanged + place

@@ -9,13 +9,13 @@ from __future__ import annotations
 
 from collections.abc import Collection
 from copy import copy
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from itertools import product
 from math import prod
 
 import numpy as np
 
-from lmshealth._arrays import BoolArray, FloatArray
+from lmshealth._arrays import BoolArray, FloatArray, Rows
 from lmshealth.tracking import constants
 from lmshealth.tracking.history import Step
 from lmshealth.tracking.state_space import StateSpace
@@ -25,7 +25,7 @@ _NEGLIGIBLE = float(np.log(1e-5))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Hyperparameters:
+class Hyperparameters(Rows):
     """Process noise and noise scales, one set per filter: standard deviations of ln f and lives."""
 
     level_walk: FloatArray  # of the random walk of ln f over a life, ``(n,)``
@@ -38,10 +38,6 @@ class Hyperparameters:
     def healthy(self) -> BoolArray:
         """Whether each set has no rate, shape ``(n,)``."""
         return np.asarray(self.rate_std == 0)
-
-    def only(self, keep: np.ndarray) -> Hyperparameters:
-        """Return some of the sets, by index or mask."""
-        return Hyperparameters(*(getattr(self, one.name)[keep] for one in fields(self)))
 
 
 def hyperparameter_grid(n_sources: int) -> Hyperparameters:
@@ -63,19 +59,13 @@ def hyperparameter_grid(n_sources: int) -> Hyperparameters:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class FilterBank:
+class FilterBank(Rows):
     """Filters of all hyperparameters that are left, at one log."""
 
     hyperparameters: Hyperparameters
     log_weight: FloatArray  # log of prior times evidence so far, ``(n,)``
     mean: FloatArray  # states, ``(n, size)``
     cov: FloatArray  # their covariances, ``(n, size, size)``
-
-    def only(self, keep: np.ndarray) -> FilterBank:
-        """Return some of the filters, by index or mask."""
-        return FilterBank(
-            self.hyperparameters.only(keep), self.log_weight[keep], self.mean[keep], self.cov[keep]
-        )
 
     def padded(self, size: int) -> FilterBank:
         """Return a bank with a longer state, whose new entries are exactly 0."""
@@ -109,7 +99,7 @@ class FilterBank:
         best = np.full(2, -np.inf)
         np.maximum.at(best, group, self.log_weight)
         keep = self.log_weight > best[group] + _NEGLIGIBLE
-        return self if keep.all() else self.only(keep)
+        return self if keep.all() else self[keep]
 
     def collapse(self, size: int | None = None) -> tuple[FloatArray, FloatArray]:
         """Return mean and covariance of the mixture, of the first `size` entries of the state."""
@@ -266,7 +256,7 @@ def restart(model: FilterModel, bank: FilterBank) -> FilterBank:
     scales, place = np.unique(own.scales, axis=0, return_inverse=True)
     weight = np.bincount(place.ravel(), weights=bank.weight)
     match = (grid.scales[:, None, :] == scales[None]).all(axis=2)
-    grid, match = grid.only(match.any(axis=1)), match[match.any(axis=1)]
+    grid, match = grid[match.any(axis=1)], match[match.any(axis=1)]
     share = np.log(np.maximum(match @ weight, 1e-12))
     _, place = np.unique(grid.scales, axis=0, return_inverse=True)
     place = place.ravel()
@@ -275,7 +265,7 @@ def restart(model: FilterModel, bank: FilterBank) -> FilterBank:
     mean, cov = np.empty((n, bank.mean.shape[1])), np.empty((n, *bank.cov.shape[1:]))
     for group in (True, False):
         members = own.healthy == group
-        state = (bank.only(members) if members.any() else bank).collapse()
+        state = (bank[members] if members.any() else bank).collapse()
         mean[grid.healthy == group], cov[grid.healthy == group] = state
     # A healthy machine has no rate, whatever its rate was before.
     rates = np.arange(model.space.rate.start, model.space.rate.stop)

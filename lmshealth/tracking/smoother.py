@@ -50,9 +50,9 @@ def smooth(history: History, followed: Track, stage: Stage | None = None) -> Smo
     model = FilterModel(space, begun - {0})
     bank = advance(model, initial(model), 0, len(history.logs) - 1)
     order = np.argsort(bank.weight)
-    bank = bank.only(order[np.cumsum(bank.weight[order]) > _SHARE])
+    bank = bank[order[np.cumsum(bank.weight[order]) > _SHARE]]
     weight = bank.weight
-    runs = [smooth_one(model, bank.hyperparameters.only(np.array([g]))) for g in range(weight.size)]
+    runs = [smooth_one(model, bank.hyperparameters[[g]]) for g in range(weight.size)]
     mean = np.einsum("g,gki->ki", weight, [run[0] for run in runs])
     cov = np.einsum("g,gkij->kij", weight, [run[1] for run in runs])
     for share, (own, _) in zip(weight, runs, strict=True):
@@ -116,7 +116,7 @@ def _transition(model: FilterModel, own: Hyperparameters, k: int) -> tuple[Float
     """Return transition matrix and process noise into log k: `predict` of exactly known states."""
     size = model.space.size
     unit = FilterBank(
-        own.only(np.zeros(size + 1, dtype=int)),
+        own[np.zeros(size + 1, dtype=int)],
         np.zeros(size + 1),
         np.vstack([np.eye(size), np.zeros(size)]),
         np.zeros((size + 1, size, size)),

@@ -99,7 +99,7 @@ def two_ways(history: History, stage: Stage, walkers: int, looped: int) -> Walke
     grid, n_kept = density.grid, density.grid.walk.size
     # A filter with health as given knows of no deviation from it.
     value = np.where(grid.deviation == 0, grid.log_weight - 0.5 * grid.rest, -np.inf)
-    density = replace(density, grid=grid.chosen(np.arange(n_kept) == np.argmax(value)))
+    density = replace(density, grid=grid[np.arange(n_kept) == np.argmax(value)])
     walk, scale = float(density.grid.walk[0]), float(density.grid.noise_scale[0])
     prior = scenario.log_prior(y)
     assert stage.description.map is not None

@@ -73,7 +73,7 @@ def draw(rng: np.random.Generator, sources: tuple[str, ...] = ("acc",)) -> Life:
     tenth of the estimates and of the temperatures are missing.
     """
     grid = hyperparameter_grid(len(sources))
-    chosen = grid.only(rng.choice(grid.rate_std.size, size=1, p=np.exp(grid.log_prior)))
+    chosen = grid[rng.choice(grid.rate_std.size, size=1, p=np.exp(grid.log_prior))]
     n, m, r = int(rng.integers(20, 41)), len(MODES), len(MODES) * len(sources)
     travel = np.cumsum(np.r_[1e5, HORIZON * rng.uniform(0.002, 0.05, n - 1)])
     level, damping = _walk(rng, chosen, np.diff(travel) / HORIZON)

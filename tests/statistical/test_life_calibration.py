@@ -148,7 +148,7 @@ def test_health_off_its_law_is_calibrated(
         history, _, left = draw_history(rng, 0.2)
         density = density_of(history, stage)
         found.append(level_of_health(density, rng, left))
-        lawful = replace(density, grid=density.grid.chosen(density.grid.deviation == 0))
+        lawful = replace(density, grid=density.grid[density.grid.deviation == 0])
         wrong.append(level_of_health(lawful, rng, left))
     claims.claim("health now, off its law", uniform(found))
     claims.control("health now, off its law", uniform(wrong))

@@ -280,7 +280,7 @@ def test_a_segment_keeps_the_state_and_restarts_the_process_noise(stage: Stage) 
         assert share == pytest.approx(before, abs=1e-9)
     for still in (True, False):
         group = healthy == still
-        mean, cov = old.only(old.hyperparameters.healthy == still).collapse()
+        mean, cov = old[old.hyperparameters.healthy == still].collapse()
         rest = np.setdiff1d(np.arange(space.size), np.arange(space.rate.start, space.rate.stop))
         np.testing.assert_allclose(new.mean[group][:, rest], np.tile(mean[rest], (group.sum(), 1)))
         for own in new.cov[group]:

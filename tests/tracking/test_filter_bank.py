@@ -167,7 +167,7 @@ def test_evidence_of_a_drift_is_that_of_one_group_over_the_other(stage: Stage) -
     ]
     at, _ = run(history, stage)[-1]
     assert at.log_bayes_factor() == pytest.approx(groups[0] - groups[1], abs=1e-8)
-    assert at.only(grid.healthy).log_bayes_factor() == 0.0
+    assert at[grid.healthy].log_bayes_factor() == 0.0
 
 
 def test_pruning_changes_next_to_nothing(stage: Stage) -> None:
@@ -182,7 +182,7 @@ def test_pruning_changes_next_to_nothing(stage: Stage) -> None:
     for k in range(60):
         banks = [update(model, predict(model, at, k), k)[0] for at in banks]
         banks[1] = banks[1].pruned()
-        banks[2] = banks[2].only(banks[2].log_weight == banks[2].log_weight.max())
+        banks[2] = banks[2][banks[2].log_weight == banks[2].log_weight.max()]
         (mean, cov), (pruned, own), (poor, _) = (at.collapse() for at in banks)
         std = np.sqrt(np.maximum(np.diag(cov), 1e-12))
         moved[k] = np.abs((pruned - mean) / std).max()

@@ -201,7 +201,7 @@ def associate_log(state: State, log: Log) -> tuple[State, tuple[Label, ...]]:
     for source in range(len(set(log.sources))):
         # Modes that one source starts are known to the next.
         rows, meant = _groups(state.names, log.names, log.sources)[source]
-        own = log.measurements if rows.size == len(log.names) else log.measurements.pick(rows)
+        own = log.measurements[rows]
         scan = Scan(log.epoch, rows, meant, own, _row(log))
         unique = None if log.opened else _unique_assignment(state, scan)
         if unique is not None:
@@ -432,7 +432,7 @@ def _confirm(state: State, j: int, row: FloatArray) -> tuple[State, int]:
         ln_f = float(new.predicted(row)[0][0, 0])
         name = _unique_name(state.names, float(np.exp(ln_f)))
         return _add_mode(state, filters.join(new), name, ln_f), len(state.names)
-    filters = filters.take(np.arange(len(filters.mean)))
+    filters = filters[np.arange(len(filters.mean))]
     for part in ("mean", "cov", "ln_zeta", "var_zeta"):
         getattr(filters, part)[:, mode] = getattr(new, part)[0, 0]
     return replace(state, hypotheses=replace(state.hypotheses, filters=filters)), mode

@@ -39,7 +39,7 @@ class Scan:
     def pick(self, chosen: IntArray) -> Scan:
         """Return some of the estimates."""
         rows, names = self.rows[chosen], self.names[chosen]
-        return replace(self, rows=rows, names=names, measurements=self.measurements.pick(chosen))
+        return replace(self, rows=rows, names=names, measurements=self.measurements[chosen])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -212,10 +212,10 @@ def extend(now: Hypotheses, scan: Scan, order: IntArray, *, opened: bool) -> Hyp
                 log_weights[i] += np.log(constants.REORDERING_PROBABILITY)
     total = logsumexp(log_weights, axis=1)
     kept = np.flatnonzero(total > total.max() + constants.PRUNING_LOG_ODDS)
-    chosen, filters = labels[kept], now.filters.take(parents[kept])
+    chosen, filters = labels[kept], now.filters[parents[kept]]
     each, detected = np.nonzero(chosen >= 0)
     at_modes = (each, chosen[each, detected])
-    filters = update(filters, at_modes, scan.measurements.pick(detected), scan.row)
+    filters = update(filters, at_modes, scan.measurements[detected], scan.row)
     return Hypotheses(filters, normalised(log_weights[kept]), chosen)
 
 
@@ -248,7 +248,7 @@ def _with_veering(now: Hypotheses, scan: Scan) -> Hypotheses:
         near = abs(at[t] - at[u]) <= constants.VEERING_LN_F
         if not near or not (now.filters.n_shapes[:, [t, u]] > 0).all():
             continue
-        other = now.filters.take(np.arange(len(now.filters.mean)))
+        other = now.filters[np.arange(len(now.filters.mean))]
         levels = other.mean[:, [t, u], 0]
         other.mean[:, [u, t], 0] = levels
         # The rates come from the approach to the other's level: an error of half the step.
@@ -273,7 +273,7 @@ def reduce_hypotheses(extended: Hypotheses) -> Hypotheses:
     total = logsumexp(extended.log_weights, axis=1)
     order = np.argsort(-total)
     order = order[total[order] > total[order[0]] + constants.PRUNING_LOG_ODDS]
-    filters, weights = extended.filters.take(order), extended.log_weights[order]
+    filters, weights = extended.filters[order], extended.log_weights[order]
     left = np.ones(order.size, dtype=bool)
     leaders: list[int] = []
     for i in range(order.size):
@@ -288,7 +288,7 @@ def reduce_hypotheses(extended: Hypotheses) -> Hypotheses:
         leaders.append(i)
     heaviest = sorted(leaders, key=lambda i: -float(logsumexp(weights[i])))
     rows = np.array(heaviest[: constants.MOST_HYPOTHESES])
-    return Hypotheses(filters.take(rows), normalised(weights[rows]), extended.labels[order[rows]])
+    return Hypotheses(filters[rows], normalised(weights[rows]), extended.labels[order[rows]])
 
 
 def _distance(filters: ModeFilters, i: int, group: IntArray) -> FloatArray:

@@ -14,7 +14,7 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
-from lmshealth._arrays import BoolArray, FloatArray
+from lmshealth._arrays import BoolArray, FloatArray, Rows
 from lmshealth.tracking import constants
 
 IntArray = NDArray[np.intp]
@@ -24,7 +24,7 @@ _FLAT_VARIANCE = 1e100
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Measurements:
+class Measurements(Rows):
     """Estimates of one log."""
 
     ln_f: FloatArray  # of Hz, ``(n,)``
@@ -32,10 +32,6 @@ class Measurements:
     ln_zeta: FloatArray  # ``(n,)``; 0 with infinite variance where unknown
     var_zeta: FloatArray
     shapes: FloatArray  # of unit length, ``(n, n_channels)``; NaN where a channel is absent
-
-    def pick(self, rows: IntArray) -> Measurements:
-        """Return some of them, in any order and any number of times."""
-        return Measurements(*(getattr(self, item.name)[rows] for item in fields(self)))
 
 
 def _log_densities(x: FloatArray, var: FloatArray, std: float) -> tuple[FloatArray, FloatArray]:
@@ -53,7 +49,7 @@ def _is_stray(x: FloatArray, var: FloatArray, std: float) -> BoolArray:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class ModeFilters:
+class ModeFilters(Rows):
     """Filters of m modes under h hypotheses."""
 
     mean: FloatArray  # states, ``(h, m, d)``
@@ -75,17 +71,13 @@ class ModeFilters:
         """Number of modes."""
         return int(self.mean.shape[1])
 
-    def take(self, hypotheses: IntArray) -> Self:
-        """Return copies of some hypotheses, in any order and any number of times."""
-        return type(self)(*(getattr(self, item.name)[hypotheses] for item in fields(self)))
-
     def keep(self, modes: IntArray) -> Self:
         """Return copies of some modes, in any order."""
         return type(self)(*(getattr(self, item.name)[:, modes] for item in fields(self)))
 
     def join(self, other: ModeFilters) -> Self:
         """Append the modes of other filters that have one hypothesis."""
-        return self.append(other.take(np.zeros(len(self.mean), dtype=int)), axis=1)
+        return self.append(other[np.zeros(len(self.mean), dtype=int)], axis=1)
 
     def append(self, other: ModeFilters, *, axis: int) -> Self:
         """Append the hypotheses (axis 0) or the modes (axis 1) of other filters."""

@@ -63,7 +63,7 @@ def follow(
     lone = np.array([i for i, j in enumerate(mine) if j is None], dtype=int)
     filters = candidates.filters
     if lone.size:
-        filters = filters.start(scan.measurements.pick(lone), scan.row, prior_std, life)
+        filters = filters.start(scan.measurements[lone], scan.row, prior_std, life)
     grown = Candidates(
         filters,
         np.append(candidates.modes, scan.names[lone]),
@@ -93,7 +93,7 @@ def _assign(candidates: Candidates, scan: Scan) -> tuple[Candidates, list[int | 
     log_odds = candidates.log_odds.copy()
     log_odds[own] += gains[rows, own]
     at = (np.zeros_like(own), own)
-    filters = update(candidates.filters, at, scan.measurements.pick(rows), scan.row)
+    filters = update(candidates.filters, at, scan.measurements[rows], scan.row)
     return replace(candidates, filters=filters, log_odds=log_odds), mine
 
 

@@ -37,7 +37,7 @@ def measured(ln_f: list[float]) -> Measurements:
 def hypotheses(levels: list[list[float]], weights: list[float]) -> Hypotheses:
     """Make hypotheses of two modes that differ in levels."""
     filters = ModeFilters.empty(0, 0).start(measured([4.6, 4.8]), ROW, np.zeros(0), 50.0)
-    filters = filters.take(np.zeros(len(levels), dtype=int))
+    filters = filters[np.zeros(len(levels), dtype=int)]
     filters.mean[:, :, 0] = levels
     log_weights = np.log(np.array(weights))[:, None] + np.log([0.5, 0.5])
     return Hypotheses(filters, log_weights, np.zeros((len(levels), 1), dtype=int))
