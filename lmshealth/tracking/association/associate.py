@@ -193,7 +193,7 @@ def associate_log(state: State, log: Log) -> tuple[State, tuple[Label, ...]]:
     for late in state.pending:
         state = _predict(state, late)
         for rows, meant in _groups(state.names, late.names, late.sources):
-            state = _update(state, meant, late.measurements.pick(rows), _row(late))
+            state = _update(state, meant, late.measurements[rows], _row(late))
     state = _predict(state, log)
     found: list[Label] = [Label(None)] * len(log.names)
     confirmed: set[int] = set()
@@ -201,7 +201,7 @@ def associate_log(state: State, log: Log) -> tuple[State, tuple[Label, ...]]:
     for source in range(len(set(log.sources))):
         # Modes that one source starts are known to the next.
         rows, meant = _groups(state.names, log.names, log.sources)[source]
-        own = log.measurements[rows]
+        own = log.measurements if rows.size == len(log.names) else log.measurements[rows]
         scan = Scan(log.epoch, rows, meant, own, _row(log))
         unique = None if log.opened else _unique_assignment(state, scan)
         if unique is not None:
