@@ -21,7 +21,7 @@ from lmshealth.io.reading import content_digest, read_log, require_identity
 from lmshealth.io.refusal import visible
 from lmshealth.modal.identification import read_ambient
 from lmshealth.modal.spectra_summary import summarise
-from lmshealth.signal.constants import N_BINS
+from lmshealth.signal.constants import WATERFALL_BINS
 from lmshealth.signal.following_error import loop_error
 from lmshealth.signal.waterfall import relative_spectrum, shown_band
 from lmshealth.stage.description import Stage
@@ -251,7 +251,7 @@ def identify_log(task: _Task, stages: tuple[Stage, ...], max_memory: float) -> I
         by = described.digest
         reading = read_ambient(log, described)
         modes, band = reading.modes, shown_band(described)
-        spectra = summarise(reading.spectra, reading.fitted, modes, band, N_BINS)
+        spectra = summarise(reading.spectra, reading.fitted, modes, band, WATERFALL_BINS)
         estimates = LogEstimates(
             log.name,
             log.digest,

@@ -39,7 +39,7 @@ class MachineDrifts:
         """Return χ² of the drifts and the log determinant of their covariance, ``(n_points,)``."""
         own = x[:, self.columns]
         n, n_parameters = own.shape
-        drift = self.stage.drift(one_at_a_time(self.stage, own), self.modes)
+        drift = self.stage.drift(with_single_changes(self.stage, own), self.modes)
         drift = drift.reshape(n_parameters + 1, n, -1)
         model_std = self.stage.description.map.model_std if self.stage.description.map else 0.0
         error = model_std**2 * np.sum(drift[1:] ** 2, axis=0)
@@ -93,7 +93,7 @@ class EpochPosterior:
         return EpochPosterior(self.prior.widened(constants.PRIOR_FACTOR), self.machines)
 
 
-def one_at_a_time(stage: Stage, x: FloatArray) -> FloatArray:
+def with_single_changes(stage: Stage, x: FloatArray) -> FloatArray:
     """Stack points with copies in which all parameters but one are at baseline.
 
     Ln parameters ``(n_points, n_parameters)`` become ``((1 + n_parameters) n_points,

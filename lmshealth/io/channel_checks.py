@@ -22,7 +22,7 @@ def missing_ranges(values: Samples) -> tuple[IntArray, str]:
     """
     found = [np.empty(0, dtype=np.int64)]
     for at, block in blocks(values):
-        missing = ~(np.abs(block) < constants.ABSURD)
+        missing = ~(np.abs(block) < constants.LARGEST_MAGNITUDE)
         if missing.any():
             edges = np.diff(missing.view(np.int8), prepend=0, append=0)
             found.append(np.flatnonzero(edges) + at)
@@ -57,7 +57,7 @@ def check_signal(values: Samples) -> None:
 def _measured(values: Samples) -> Iterator[FloatArray]:
     """Yield the samples block by block, without the missing ones."""
     for _, block in blocks(values):
-        there = np.abs(block) < constants.ABSURD
+        there = np.abs(block) < constants.LARGEST_MAGNITUDE
         if there.all():
             yield block
         elif there.any():
@@ -83,8 +83,8 @@ def _stuck(values: Samples, low: float, high: float, sign: float) -> int:
     if n_at < max(constants.FEWEST_STUCK, constants.CLIPPED_SHARE / 2 * values.size):
         return 0
     step = high - below
-    if n_adjacent < constants.ADJACENT * n_at or high - low < constants.FEWEST_LEVELS * step:
+    if n_adjacent < constants.ADJACENT_SHARE * n_at or high - low < constants.FEWEST_LEVELS * step:
         return 0
     floor = high - (constants.LEVELS_BELOW + 0.5) * step
     n_below = sum(int(np.count_nonzero(sign * b > floor)) for b in _measured(values)) - n_at
-    return n_at if n_at > constants.PILE_UP * n_below else 0
+    return n_at if n_at > constants.CLIPPING_RATIO * n_below else 0

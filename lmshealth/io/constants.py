@@ -20,21 +20,21 @@ SMALL_ENOUGH = 256 << 20
 
 LARGEST_MISSING = 0.10
 """Largest share of missing samples of a channel: the others would be cut at each of its gaps."""
-ABSURD = 1e12
+LARGEST_MAGNITUDE = 1e12
 """Magnitude in SI units from which a sample counts as missing: no acceleration, position or current
 reaches it, and its square is still finite."""
 CLIPPED_SHARE = 1e-3
 """Share of samples at both ends of the range from which a channel is clipped."""
-PILE_UP = 2.0
+CLIPPING_RATIO = 2.0
 """Clipping needs this ratio of samples at an end to those in the `LEVELS_BELOW` levels next to it.
 A sine in steps of an encoder reaches 1 / 1.24."""
 LEVELS_BELOW = 4
-"""Levels of quantisation that `PILE_UP` compares with."""
+"""Levels of quantisation that `CLIPPING_RATIO` compares with."""
 FEWEST_LEVELS = 16
 """Range in levels below which a signal is too coarse to judge clipping."""
 FEWEST_STUCK = 5
 """Fewest samples at an end that may be clipping."""
-ADJACENT = 0.1
+ADJACENT_SHARE = 0.1
 """Least share of samples at an end whose successor is there too."""
 
 # Time
@@ -46,7 +46,7 @@ GAP = 1.5
 JITTER = 0.25
 """Largest relative deviation of an interval. Time stamps are rounded (to 1e-6 s in many exports, to
 2e-6 s by float32 after 20 s); no sampling clock deviates so far."""
-BROKEN = 0.01
+INTERRUPTED_SHARE = 0.01
 """Interruptions per sample above which a record is refused instead of cut, beyond
 `ALWAYS_ALLOWED`."""
 ALWAYS_ALLOWED = 10

@@ -190,7 +190,7 @@ def _series(content: Content, columns: ColumnMap) -> list[_Series]:
             signal = columns.signal(target)
         except Unusable as error:
             raise Unusable(error.reason, f"{error.detail}; {there}") from error
-        limit = np.inf if signal.role == "time" else constants.ABSURD
+        limit = np.inf if signal.role == "time" else constants.LARGEST_MAGNITUDE
         scaled = values.scaled if isinstance(values, Stored) else partial(in_unit, values)
         series.append(_Series(signal, scaled(signal.factor, limit)))
     if twice := repeated(item.signal.name for item in series):

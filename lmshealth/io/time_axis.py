@@ -35,7 +35,7 @@ class TimeAxis(NamedTuple):
 
 def too_many(n_interruptions: int, n_samples: int) -> bool:
     """Return whether a record is interrupted too often to be cut into pieces."""
-    return n_interruptions > max(constants.ALWAYS_ALLOWED, constants.BROKEN * n_samples)
+    return n_interruptions > max(constants.ALWAYS_ALLOWED, constants.INTERRUPTED_SHARE * n_samples)
 
 
 def time_axis(time: Samples | None, rate: float | None) -> TimeAxis:
@@ -112,7 +112,7 @@ def _check_order(time: Samples) -> None:
         steps = np.diff(stamps)
         if first is None and not (steps > 0).all():
             first = at + int(np.argmin(steps > 0)) + 1
-        unknown += int(np.count_nonzero(~(np.abs(stamps[at > 0 :]) < constants.ABSURD)))
+        unknown += int(np.count_nonzero(~(np.abs(stamps[at > 0 :]) < constants.LARGEST_MAGNITUDE)))
         backwards += int(np.count_nonzero(steps < 0))
         repeated += int(np.count_nonzero(steps == 0))
     if unknown:

@@ -9,7 +9,7 @@ from lmshealth.errors import BadLog
 from lmshealth.io.log import Log, Refusal
 from lmshealth.modal.identification import identify
 from lmshealth.signal.acceleration_levels import Magnitude, choose_bands, read_magnitudes
-from lmshealth.signal.constants import GRID_BAND
+from lmshealth.signal.constants import LEVEL_BAND_RANGE
 from lmshealth.signal.segments import Part
 from lmshealth.signal.spectral_lines import Line, find_lines_by_velocity
 from lmshealth.stage.description import Stage
@@ -47,8 +47,8 @@ def survey(
     bands = choose_bands(stage, identified, band)
     magnitudes = read_magnitudes(log, bands, part=part)
     widest = band or (
-        min([GRID_BAND[0], *(b.low for b in bands)]),
-        max([GRID_BAND[1], *(b.high for b in bands)]),
+        min([LEVEL_BAND_RANGE[0], *(b.low for b in bands)]),
+        max([LEVEL_BAND_RANGE[1], *(b.high for b in bands)]),
     )
     return Survey(
         log.name,

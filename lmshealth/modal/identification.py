@@ -37,7 +37,7 @@ from lmshealth.signal.spectra import (
     transform_segment,
 )
 from lmshealth.signal.spectral_lines import Line, find_lines, name_lines
-from lmshealth.stage.constants import BAND, LEAST_RESOLUTION
+from lmshealth.stage.constants import BAND_HALF_WIDTH, LEAST_RESOLUTION
 from lmshealth.stage.description import Stage
 
 # Without a description spectra reach up to this multiple of the band: further than flanks do.
@@ -170,7 +170,7 @@ def _transform(
     resonances: Sequence[ResonanceRange] = ANY_RESONANCE
     highest, rate = 0.0, log.sample_rate
     if targets:
-        highest = max(target.band(BAND)[1] for target in targets)
+        highest = max(target.band(BAND_HALF_WIDTH)[1] for target in targets)
         reach = ceiling = (1 + max(target.search for target in targets)) * highest
         shortest = LEAST_RESOLUTION / min(2 * t.damping_ratio * t.frequency for t in targets)
         # The damping may be half of the described one.

@@ -11,7 +11,7 @@ from lmshealth._arrays import ComplexArray
 from lmshealth.errors import BadLog, BadStage
 from lmshealth.io.log import Channel, Log
 from lmshealth.modal import constants
-from lmshealth.stage.constants import BAND
+from lmshealth.stage.constants import BAND_HALF_WIDTH
 from lmshealth.stage.description import Stage
 
 
@@ -90,4 +90,4 @@ def _interact(lower: Target, upper: Target) -> bool:
     # A narrow peak near a broad resonance would need the finest resolution over the whole band.
     ratio = (upper.frequency * upper.damping_ratio) / (lower.frequency * lower.damping_ratio)
     similar = 1 / constants.SIMILAR_BANDWIDTH < ratio < constants.SIMILAR_BANDWIDTH
-    return upper.band(BAND)[0] < lower.band(BAND)[1] and similar
+    return upper.band(BAND_HALF_WIDTH)[0] < lower.band(BAND_HALF_WIDTH)[1] and similar

@@ -18,16 +18,16 @@ widths of health change by less than a quarter of a 90 % interval when 240 logs 
 # Priors of nuisance parameters; studies/sbc_life has the ranks of the truth under them.
 INTERCEPT_STD = 0.1
 """Standard deviation of ln f of a mode at the baseline: so wide that only the data decide."""
-JUMP = Normal(0.0, 0.3)
+STEP_PRIOR = Normal(0.0, 0.3)
 """Ln factor on a health parameter at a step: one standard deviation is a loss of a quarter."""
-WALKS = (1e-5, 5e-4, 1.5e-3, 5e-3, 1.5e-2)
+WALK_STDS = (1e-5, 5e-4, 1.5e-3, 5e-3, 1.5e-2)
 """Standard deviations over the history of the random walk of ln f, equally probable: from none to
 several times the 0.4 % that frequencies of a real building move by (studies/modes_real)."""
 NOISE_SCALES = (1.0, 1.5, 2.25)
 """Factors on the reported standard deviations of ln f; 1 is probable, as 95 % intervals of the
 identification cover 95 % (studies/identification)."""
 NOISE_SCALE_PRIOR = (0.9, 0.07, 0.03)
-DEVIATIONS = (0.0, 0.04, 0.15)
+DEVIATION_STDS = (0.0, 0.04, 0.15)
 """Standard deviations at the horizon of ln health about its law: exact laws, and deviations of a
 tenth and of a third of the loss at a limit of 0.6."""
 DEVIATION_PRIOR = (0.6, 0.3, 0.1)

@@ -15,7 +15,7 @@ from scipy.linalg import qr, solve_triangular
 
 from lmshealth._arrays import BoolArray, FloatArray, ReadOnly, Rows
 from lmshealth.errors import NotEnoughData
-from lmshealth.health.epoch_posterior import one_at_a_time
+from lmshealth.health.epoch_posterior import with_single_changes
 from lmshealth.prognosis import constants
 from lmshealth.prognosis.life_data import LifeData
 from lmshealth.prognosis.scenarios import Scenario
@@ -148,9 +148,9 @@ class Grid(Rows):
         """Whiten data at all points of the grid."""
         points, prior = [], scatter_prior(data.stage)
         for (walk, p), (scale, q), (deviation, r) in product(
-            zip(constants.WALKS, prior.walk, strict=True),
+            zip(constants.WALK_STDS, prior.walk, strict=True),
             zip(constants.NOISE_SCALES, prior.noise_scale, strict=True),
-            zip(constants.DEVIATIONS, prior.deviation, strict=True),
+            zip(constants.DEVIATION_STDS, prior.deviation, strict=True),
         ):
             factor = covariance.factor(walk, scale, deviation)
             u, basis_q, basis_r = _reduced(data, basis, factor)
@@ -270,7 +270,7 @@ def _drifts(data: LifeData, x: FloatArray) -> FloatArray:
     Shape ``(n_modes, 1 + n_parameters, n, n_moments)``.
     """
     n, n_moments, n_parameters = x.shape
-    flat = one_at_a_time(data.stage, x.reshape(-1, n_parameters))
+    flat = with_single_changes(data.stage, x.reshape(-1, n_parameters))
     drift = data.stage.drift(flat, data.modes).reshape(-1, n, n_moments, len(data.modes))
     return np.moveaxis(drift, 3, 0)
 
@@ -291,14 +291,14 @@ def scatter_prior(stage: Stage) -> ScatterPrior:
     """Return the prior of walk, noise scale and deviation: the fleet's, or the default."""
     if stage.scatter is not None:
         return stage.scatter
-    walks = (1.0,) * len(constants.WALKS)
+    walks = (1.0,) * len(constants.WALK_STDS)
     return ScatterPrior(walks, constants.NOISE_SCALE_PRIOR, constants.DEVIATION_PRIOR)
 
 
 def expected_scatter(scatter: ScatterPrior) -> tuple[float, float, float]:
     """Return the prior means of walk, noise scale and deviation."""
     return (
-        float(np.average(constants.WALKS, weights=scatter.walk)),
+        float(np.average(constants.WALK_STDS, weights=scatter.walk)),
         float(np.average(constants.NOISE_SCALES, weights=scatter.noise_scale)),
-        float(np.average(constants.DEVIATIONS, weights=scatter.deviation)),
+        float(np.average(constants.DEVIATION_STDS, weights=scatter.deviation)),
     )

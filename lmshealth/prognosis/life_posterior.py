@@ -130,7 +130,8 @@ class ScenarioPosterior:
     # One minus the squared ratio of posterior to prior width of the 90 % interval of each
     # natural parameter, at least 0, shape ``(n_dim,)``.
     interval_shrinkage: FloatArray
-    n_mixture: int  # draws of each ensemble that represent this scenario in the mixture of all
+    # Draws of each ensemble that represent this scenario in the mixture of all.
+    n_mixture_draws: int
 
     def __post_init__(self) -> None:
         n = self.scenario.n_dim
@@ -158,8 +159,8 @@ class ScenarioPosterior:
 
     @property
     def mixture_draws(self) -> FloatArray:
-        """Coordinates in the mixture of all scenarios, ``(n_ensembles n_mixture, n_dim)``."""
-        return np.concatenate(thin(self.coordinates, self.n_mixture))
+        """Coordinates in the mixture of all scenarios, ``(n_ensembles n_mixture_draws, n_dim)``."""
+        return np.concatenate(thin(self.coordinates, self.n_mixture_draws))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -187,7 +188,7 @@ class LifePosterior:
         shape, p = self.health.shape, len(self.parameters)
         for name in ("health", "off", "rate"):
             expect_shape(name, getattr(self, name), (*shape[:2], p))
-        if sum(one.n_mixture for one in self.scenarios) != shape[1]:
+        if sum(one.n_mixture_draws for one in self.scenarios) != shape[1]:
             raise ValueError("the draws of the scenarios do not add up to those of health")
         freeze(self)
 
@@ -195,7 +196,7 @@ class LifePosterior:
         """Yield each scenario with `off` and `rate` of its draws, ``(n, n_parameters)``."""
         first = 0
         for one in self.scenarios:
-            part = slice(first, first + one.n_mixture)
+            part = slice(first, first + one.n_mixture_draws)
             first = part.stop
             off, rate = (x[:, part].reshape(-1, x.shape[-1]) for x in (self.off, self.rate))
             yield one, off, rate
@@ -332,12 +333,12 @@ def fit_life(
         y = one.mixture_draws
         own_off, own_rate = one.density.deviations(y, now, rng)
         by_law = one.scenario.health(one.scenario.natural(y), now)
-        shape = (_N_ENSEMBLES, one.n_mixture, own_off.shape[-1])
+        shape = (_N_ENSEMBLES, one.n_mixture_draws, own_off.shape[-1])
         parts = (by_law * np.exp(own_off), own_off, own_rate)
         draws.append([part.reshape(shape) for part in parts])
         settings.append(one.density.settings(y[:: max(1, y.shape[0] // _N_SETTINGS)]))
     health, off, rate = (np.concatenate(part, axis=1) for part in zip(*draws, strict=True))
-    share = np.array([one.n_mixture for one in scenarios]) / n_kept
+    share = np.array([one.n_mixture_draws for one in scenarios]) / n_kept
     walk, noise_scale, deviation, chi_square = (float(v) for v in share @ np.array(settings))
     return LifePosterior(
         stage=history.stage,
@@ -429,7 +430,7 @@ def _sampled_scenarios(
             ess_tail=draws.ess_tail,
             r_hat=draws.r_hat,
             interval_shrinkage=_interval_shrinkage(density.scenario, coordinates),
-            n_mixture=int(share),
+            n_mixture_draws=int(share),
         )
         sampled.append(one)
     return tuple(sampled)

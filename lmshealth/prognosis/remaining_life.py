@@ -146,7 +146,7 @@ def remaining_travel(
             of_health = (path, theta[j], off[:, j], rate[:, j], rng)
             columns.append(first_passage(*of_health, now=now, limit=limit, horizon=horizon))
         found = np.column_stack([*columns, np.min(columns, axis=0)])
-        parts.append(found.reshape(life.rate.shape[0], one.n_mixture, -1))
+        parts.append(found.reshape(life.rate.shape[0], one.n_mixture_draws, -1))
     joined = np.concatenate(parts, axis=1)
     return joined.reshape(-1, joined.shape[-1])
 

@@ -51,11 +51,11 @@ class DegradationPath:
         """Return the log prior density of coordinates, shape ``(n,)``."""
         own, jumps = self._split(y)
         total = self.law.log_prior(own, now - self.begin)
-        return np.asarray(total + constants.JUMP.log_density(jumps).sum(axis=1))
+        return np.asarray(total + constants.STEP_PRIOR.log_density(jumps).sum(axis=1))
 
     def draw(self, rng: np.random.Generator, n: int, now: float) -> FloatArray:
         """Draw coordinates from the prior, shape ``(n, k)``."""
-        jumps = constants.JUMP.quantile(rng.uniform(1e-9, 1 - 1e-9, (n, len(self.steps))))
+        jumps = constants.STEP_PRIOR.quantile(rng.uniform(1e-9, 1 - 1e-9, (n, len(self.steps))))
         return np.hstack([self.law.draw(rng, n, now - self.begin), jumps])
 
     def health(self, theta: FloatArray, travel: FloatArray) -> FloatArray:

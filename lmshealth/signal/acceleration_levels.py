@@ -99,8 +99,8 @@ def choose_bands(
     ascending in frequency, then health band, then watched bands.
     """
     if stage is None:
-        step = constants.GRID
-        low, high = span or constants.GRID_BAND
+        step = constants.LEVEL_BAND_SPACING
+        low, high = span or constants.LEVEL_BAND_RANGE
         grid = step * np.arange(max(1, np.ceil(low / step)), np.floor(high / step) + 1)
         return tuple(
             FrequencyBand(f"{f:g} Hz", "grid", f - step / 2, f + step / 2) for f in grid.tolist()
@@ -128,8 +128,8 @@ def _mode_bands(
     ends = pairwise([-np.inf, *middles, np.inf])
     bands = []
     for (f, damping, name), (least, most) in zip(places, ends, strict=False):
-        below = max(f * (1 - constants.BAND_WIDTHS * damping), least)
-        above = min(f * (1 + constants.BAND_WIDTHS * damping), most)
+        below = max(f * (1 - constants.MODE_BAND_HALF_WIDTH * damping), least)
+        above = min(f * (1 + constants.MODE_BAND_HALF_WIDTH * damping), most)
         source = "identified" if name in found else "stage"
         bands.append(FrequencyBand(name, "mode", below, above, source))
     return bands

@@ -20,7 +20,7 @@ PARTS_LENGTH = 10
 # 10 mHz).
 LINE_WIDTH = 1e-3
 # Probability that noise and resonances alone show a line somewhere in the band of one channel.
-FALSE_ALARM = 0.01
+LINE_TEST_FALSE_ALARM = 0.01
 # Damping ratio of the narrowest resonance that the multitaper test takes for noise.
 LEAST_DAMPING = 0.002
 # False-alarm probability of the test that noise rises towards a line, which decides whether the
@@ -34,10 +34,10 @@ OTHER_VELOCITY = 1.02
 
 # --- Removal of strong sinusoids ----------------------------------------------------------------
 # Ratio of an ordinate to the median of its surroundings from which it may be a sinusoid.
-TOWERING = 60.0
+SINUSOID_CONTRAST = 60.0
 # Largest ratio, after the fit of a sinusoid, of its surroundings to those further away: around a
 # resonance it stays larger.
-LEFT_OVER = 4.0
+SINUSOID_RESIDUAL = 4.0
 # Damping ratio of the narrowest resonance where no description states any, and the width in
 # ordinates from which a resonance is distinct from a sinusoid.
 LEAST_EXPECTED_DAMPING = 0.005
@@ -57,10 +57,10 @@ LOOP_PERIODS = 2.0
 # --- Acceleration levels ------------------------------------------------------------------------
 # Spacing and range in Hz of the bands without a description: rows of Tables 6 and 7 of
 # [Piscalov2021].
-GRID = 10.0
-GRID_BAND = (10.0, 400.0)
+LEVEL_BAND_SPACING = 10.0
+LEVEL_BAND_RANGE = (10.0, 400.0)
 # Half-width of the band of a mode in damping ratios.
-BAND_WIDTHS = 2.5
+MODE_BAND_HALF_WIDTH = 2.5
 # One-sided significance of growth with velocity: one in twenty bands without growth shows it.
 SIGNIFICANCE = 0.05
 # Least number of harmonics in a band.
@@ -68,5 +68,5 @@ LEAST_ORDINATES = 3
 
 # --- Waterfall ----------------------------------------------------------------------------------
 # Bins of the band, and periods of its lowest frequency that a segment must hold.
-N_BINS = 160
-LEAST_PERIODS = 20
+WATERFALL_BINS = 160
+WATERFALL_PERIODS = 20

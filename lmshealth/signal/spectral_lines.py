@@ -34,7 +34,7 @@ def find_lines(
     segments: Sequence[Segment],
     sample_rate: float,
     band: tuple[float, float],
-    false_alarm: float = constants.FALSE_ALARM,
+    false_alarm: float = constants.LINE_TEST_FALSE_ALARM,
 ) -> FloatArray:
     """Find the narrow lines that segments, at least one, have in common; see `detect_sinusoids`.
 
@@ -87,7 +87,7 @@ def find_lines_by_velocity(
     channels: Sequence[Channel],
     stage: Stage | None,
     band: tuple[float, float],
-    false_alarm: float = constants.FALSE_ALARM,
+    false_alarm: float = constants.LINE_TEST_FALSE_ALARM,
 ) -> tuple[Line, ...]:
     """Find the lines at every velocity of a log, and name those that are proportional to it.
 

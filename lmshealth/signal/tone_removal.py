@@ -120,7 +120,7 @@ def _filled(rest: ComplexArray, free: BoolArray) -> FloatArray:
 def _towering(power: FloatArray) -> list[int]:
     """List the ordinates far above their surroundings, of neighbours the highest."""
     contrast = _contrast(power).max(axis=1)
-    suspects = np.flatnonzero(contrast > constants.TOWERING)
+    suspects = np.flatnonzero(contrast > constants.SINUSOID_CONTRAST)
     peaks: list[int] = []
     for at in suspects[np.argsort(-power[suspects].max(axis=1), kind="stable")].tolist():
         if all(abs(at - peak) > _FOOT for peak in peaks):
@@ -149,7 +149,7 @@ def _contrast(power: FloatArray) -> FloatArray:
     place = np.arange(n)
     below, above = np.maximum(place - centre, 0), np.minimum(place + centre, n - 1)
     contrast = power / np.minimum(least[below], least[above]).clip(1e-300)
-    at, channel = np.nonzero(contrast > constants.TOWERING)
+    at, channel = np.nonzero(contrast > constants.SINUSOID_CONTRAST)
     around = np.abs(at[:, None] + np.array([k for b in _SURROUNDINGS for k in (-b, b)]))
     around = np.where(around < n, around, 2 * (n - 1) - around)
     level = np.median(power[around, channel[:, None]], axis=1)
@@ -185,7 +185,7 @@ def _fit(
     level = left(fits[-1], widest, widest + _NEAR)
     far = left(fits[-1], widest + _NEAR, widest + _FAR)
     channel = int(np.argmax(np.sum(np.abs(sizes[-1]) ** 2, axis=0) / level))
-    if not level[channel] <= constants.LEFT_OVER * far[channel]:
+    if not level[channel] <= constants.SINUSOID_RESIDUAL * far[channel]:
         return None
     for size, fit in zip(sizes, fits, strict=True):
         foot = _foot(len(size))

@@ -84,7 +84,7 @@ def shown_band(stage: Stage) -> tuple[float, float]:
 
 
 def relative_spectrum(
-    log: Log, stage: Stage, *, n_bins: int = constants.N_BINS
+    log: Log, stage: Stage, *, n_bins: int = constants.WATERFALL_BINS
 ) -> RelativeSpectrum | None:
     """Compute the spectrum of a log relative to its median in the band of the tracked modes.
 
@@ -97,7 +97,7 @@ def relative_spectrum(
     low, high = shown_band(stage)
     edges = np.geomspace(low, high, n_bins + 1)
     channels = [c for c in log.channels if c.kind in ("displacement", "acceleration")]
-    stationary = find_segments(log, constants.LEAST_PERIODS / low)
+    stationary = find_segments(log, constants.WATERFALL_PERIODS / low)
     segments = _cut(stationary, log.sample_rate / np.diff(edges)[0])
     below = edges[1:] < log.sample_rate / 2
     if not channels or not segments or not below.any():

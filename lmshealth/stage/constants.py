@@ -23,7 +23,7 @@ RESERVED_WORDS = ("healthy", "both", "step", "not-enough-data")
 # --- Identification, as the Cramér-Rao bound assumes it -----------------------------------------
 # Half-width of the band that a mode is fitted in, in damping ratios times its frequency. Beyond it
 # a resonance adds little information, and the noise need not be as simple as the model.
-BAND = 8.0
+BAND_HALF_WIDTH = 8.0
 # Least duration of a segment times the half-power bandwidth of a mode identified in it.
 LEAST_RESOLUTION = 2.0
 

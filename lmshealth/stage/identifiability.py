@@ -113,5 +113,5 @@ def identifiability_of(stage: Stage) -> Identifiability:
 def _bound(mode: ModeSpec, duration: float) -> float:
     """Bound the variance of ln f in the band that identification uses."""
     f, zeta = mode.frequency_hz, mode.damping_ratio
-    band = (f * (1 - constants.BAND * zeta), f * (1 + constants.BAND * zeta))
+    band = (f * (1 - constants.BAND_HALF_WIDTH * zeta), f * (1 + constants.BAND_HALF_WIDTH * zeta))
     return float(ambient_bound(f, zeta, mode.snr, duration, band=band)[0, 0])

@@ -74,7 +74,7 @@ CHANGING_RATES = ((0.03, 0.01), (0.03, 0.1), (0.3, 0.1), (0.3, 1.0), (1.0, 3.0))
 HEALTHY_PROBABILITY = 0.1
 # Factors on the reported standard deviations of one source, with prior probabilities. Sources past
 # the third share the factor of the third, to bound the size of the grid.
-NOISE_SCALES = ((0.5, 0.02), (0.7, 0.05), (1.0, 0.8), (1.5, 0.08), (2.25, 0.03), (4.0, 0.02))
+SOURCE_NOISE_SCALES = ((0.5, 0.02), (0.7, 0.05), (1.0, 0.8), (1.5, 0.08), (2.25, 0.03), (4.0, 0.02))
 MOST_SCALED_SOURCES = 3
 
 # --- Association: gates --------------------------------------------------------------------------

@@ -50,7 +50,7 @@ def hyperparameter_grid(n_sources: int) -> Hyperparameters:
     changing = [(walk, rate, drive, share) for walk in walks for rate, drive in rates]
     rows = []
     for (walk, rate, drive, weight), choice in product(
-        healthy + changing, product(constants.NOISE_SCALES, repeat=scaled)
+        healthy + changing, product(constants.SOURCE_NOISE_SCALES, repeat=scaled)
     ):
         scales = [scale for scale, _ in choice] + [choice[-1][0]] * (n_sources - scaled)
         rows.append((walk, rate, drive, weight * prod(chance for _, chance in choice), *scales))

@@ -130,7 +130,7 @@ def _part(rng: np.random.Generator, fleet: Stage, clock: Array) -> tuple[Part, A
     if isinstance(law, HertzWear):
         first, second = rng.uniform(size=(2, 1))
         theta = np.r_[1000 * law.life_km.quantile(first), law.exponent.quantile(second)]
-    deviation = rng.choice(constants.DEVIATIONS, p=_shares(fleet, "deviation"))
+    deviation = rng.choice(constants.DEVIATION_STDS, p=_shares(fleet, "deviation"))
     rate = float(deviation**2 / (1000 * fleet.description.usage.horizon_km))
     steps = np.sqrt(rate * np.diff(clock, prepend=0.0)) * rng.standard_normal(clock.size)
     part = Part(law, theta, 0.0, np.inf, 1.0, np.cumsum(steps), rate)
@@ -147,7 +147,7 @@ def _modes(
     # The mount keeps its stiffness: the error of the map is that of the preload alone.
     error = fleet.description.map.model_std * rng.standard_normal(len(names))
     level = (1 + error) * fleet.drift(path, names)
-    walk = rng.choice(constants.WALKS, p=_shares(fleet, "walk"))
+    walk = rng.choice(constants.WALK_STDS, p=_shares(fleet, "walk"))
     steps = walk * np.sqrt(np.diff(clock, prepend=0.0) / clock[-1])
     level = level + np.cumsum(steps[:, None] * rng.standard_normal(level.shape), axis=0)
     known = np.log([mode.frequency_hz for mode in fleet.modes if mode.name in names])

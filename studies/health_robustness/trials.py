@@ -322,6 +322,6 @@ def claimed(left: Array, stage: Stage) -> Array:
 def _noise_as_stated() -> patch.multiple:
     """Leave of the grid of scatter the point at which estimates are all that errs."""
     return patch.multiple(
-        constants, WALKS=constants.WALKS[:1], NOISE_SCALES=(1.0,), NOISE_SCALE_PRIOR=(1.0,),
-        DEVIATIONS=(0.0,), DEVIATION_PRIOR=(1.0,),
+        constants, WALK_STDS=constants.WALK_STDS[:1], NOISE_SCALES=(1.0,), NOISE_SCALE_PRIOR=(1.0,),
+        DEVIATION_STDS=(0.0,), DEVIATION_PRIOR=(1.0,),
     )  # fmt: skip

@@ -183,7 +183,7 @@ def moves(values: Array, at: float, std: float, velocity: Array | None = None) -
     moved = (estimate(values, velocity)[0] - at) / std
     # Strong lines are removed from the transforms, and weak ones masked.
     with (
-        patch.object(signal_constants, "TOWERING", np.inf),
+        patch.object(signal_constants, "SINUSOID_CONTRAST", np.inf),
         patch.object(modal_constants, "LINE_FALSE_ALARM", 0.0),
     ):
         bare = (estimate(values, velocity)[0] - at) / std

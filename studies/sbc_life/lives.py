@@ -116,7 +116,7 @@ def _parts(
     assert machine.modal_map is not None
     step = np.inf if first is None else float(clock[first - 1 : first + 1].mean())
     while True:
-        deviation = rng.choice(constants.DEVIATIONS, p=constants.DEVIATION_PRIOR)
+        deviation = rng.choice(constants.DEVIATION_STDS, p=constants.DEVIATION_PRIOR)
         rate = deviation**2 / (1000 * machine.description.usage.horizon_km)
         parts = tuple(_part(rng, one, clock, step, rate) for one in machine.parameters)
         with np.errstate(divide="ignore"):
@@ -137,7 +137,7 @@ def _part(
         theta=_of_law(rng, law),
         begin=step if anew else 0.0,
         step=step,
-        jump=float(np.exp(constants.JUMP.std * rng.standard_normal())),
+        jump=float(np.exp(constants.STEP_PRIOR.std * rng.standard_normal())),
         off=np.cumsum(steps),
         rate=float(rate),
     )
@@ -172,7 +172,7 @@ def _modes(
         alone[:, j] = x[:, j]
         error = machine.description.map.model_std * rng.standard_normal(len(names))
         level = level + error * machine.drift(alone, names)
-    walk = rng.choice(constants.WALKS) * np.sqrt(np.diff(clock, prepend=0.0) / clock[-1])
+    walk = rng.choice(constants.WALK_STDS) * np.sqrt(np.diff(clock, prepend=0.0) / clock[-1])
     level = level + np.cumsum(walk[:, None] * rng.standard_normal(level.shape), axis=0)
     known = np.log([mode.frequency_hz for mode in machine.modes if mode.name in names])
     return np.asarray(level + known + constants.INTERCEPT_STD * rng.standard_normal(len(names)))

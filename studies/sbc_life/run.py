@@ -135,7 +135,7 @@ def quantities(found: LifePosterior, now: float, rng: np.random.Generator) -> Ar
     left[left > horizon] = np.inf
     n = found.rate.shape[0]
     paths = [
-        np.tile([bool(path.law.names) for path in way.scenario.paths], (n, way.n_mixture, 1))
+        np.tile([bool(path.law.names) for path in way.scenario.paths], (n, way.n_mixture_draws, 1))
         for way in found.scenarios
     ]
     loses = np.concatenate(paths, axis=1)

@@ -145,7 +145,7 @@ def halved(sizes: Sizes, n: int) -> Row:
         if kind in DAMAGED:
             pairs = pairs_of(sizes, i, n)
             small = [(life, replace(one, cov=one.cov / 2)) for life, one in pairs]
-            with patch.object(constants, "NOISE_SCALES", ((1.0, 1.0),)):
+            with patch.object(constants, "SOURCE_NOISE_SCALES", ((1.0, 1.0),)):
                 found += follow(small)
     return coverage(found)
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from lmshealth._arrays import FloatArray
-from lmshealth.health.epoch_posterior import EpochPosterior, one_at_a_time
+from lmshealth.health.epoch_posterior import EpochPosterior, with_single_changes
 from lmshealth.stage.description import Stage
 from tests.lives import AXES, make_stage, true_drift
 from tests.oracles import epoch_log_posterior
@@ -70,4 +70,4 @@ def test_one_at_a_time_moves_one_parameter(stage: Stage) -> None:
     """The stack is the points, then each parameter alone with the other at baseline."""
     x = np.array([[-0.1, -0.2], [-0.3, -0.4]])
     known = [[-0.1, -0.2], [-0.3, -0.4], [-0.1, 0], [-0.3, 0], [0, -0.2], [0, -0.4]]
-    np.testing.assert_array_equal(one_at_a_time(stage, x), known)
+    np.testing.assert_array_equal(with_single_changes(stage, x), known)

@@ -322,10 +322,10 @@ def test_priors_have_two_digits(stage: Stage) -> None:
 def small_grid() -> Iterator[None]:
     """Average over one walk and no deviation: evidence is computed alike for any."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(constants, "WALKS", (1e-5,))
+        patch.setattr(constants, "WALK_STDS", (1e-5,))
         patch.setattr(constants, "NOISE_SCALES", (1.0,))
         patch.setattr(constants, "NOISE_SCALE_PRIOR", (1.0,))
-        patch.setattr(constants, "DEVIATIONS", (0.0,))
+        patch.setattr(constants, "DEVIATION_STDS", (0.0,))
         patch.setattr(constants, "DEVIATION_PRIOR", (1.0,))
         yield
 

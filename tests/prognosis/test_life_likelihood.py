@@ -93,10 +93,10 @@ def book(history: History, density: LifeDensity, y: FloatArray, model_std: float
         intercept_std=constants.INTERCEPT_STD,
     )
     scales = zip(constants.NOISE_SCALES, constants.NOISE_SCALE_PRIOR, strict=True)
-    deviations = zip(constants.DEVIATIONS, constants.DEVIATION_PRIOR, strict=True)
+    deviations = zip(constants.DEVIATION_STDS, constants.DEVIATION_PRIOR, strict=True)
     grid = [
         LifeSetting(walk, scale, deviation, p * q)
-        for walk, (scale, p), (deviation, q) in product(constants.WALKS, scales, deviations)
+        for walk, (scale, p), (deviation, q) in product(constants.WALK_STDS, scales, deviations)
     ]
     found = life_log_likelihood(history, true_drift(NAMES, x)[:, :2], alone, belief, grid)
     return found + density.likelihood.data.y.size / 2 * np.log(2 * np.pi)
@@ -105,10 +105,10 @@ def book(history: History, density: LifeDensity, y: FloatArray, model_std: float
 @pytest.fixture
 def short_grid(monkeypatch: pytest.MonkeyPatch) -> None:
     """Average over two values each, so that a plainly written oracle takes no long time."""
-    monkeypatch.setattr(constants, "WALKS", (5e-4, 5e-3))
+    monkeypatch.setattr(constants, "WALK_STDS", (5e-4, 5e-3))
     monkeypatch.setattr(constants, "NOISE_SCALES", (1.0, 1.5))
     monkeypatch.setattr(constants, "NOISE_SCALE_PRIOR", (0.9, 0.1))
-    monkeypatch.setattr(constants, "DEVIATIONS", (0.0, 0.15))
+    monkeypatch.setattr(constants, "DEVIATION_STDS", (0.0, 0.15))
     monkeypatch.setattr(constants, "DEVIATION_PRIOR", (0.6, 0.4))
 
 
@@ -156,7 +156,7 @@ def test_what_is_wrong_is_noticed(stage: Stage, what: str, monkeypatch: pytest.M
     y = coordinates(density)
     found = density.log_probability(y) - density.scenario.log_prior(y)
     if what == "deviation":
-        monkeypatch.setattr(constants, "DEVIATIONS", (0.0, 0.151))
+        monkeypatch.setattr(constants, "DEVIATION_STDS", (0.0, 0.151))
     model_std = 0.0501 if what == "map error" else 0.05
     known = np.array([book(history, density, point, model_std) for point in y])
     assert np.abs(found - known).max() > 1e-5
@@ -395,9 +395,9 @@ def test_settings_lie_inside_their_grids(poor_map: Stage) -> None:
     """Averages of walk, noise scale and deviation lie inside their grids; χ² is no less than 0."""
     density = density_of(rough_history(np.random.default_rng(11)), poor_map)
     walk, scale, deviation, chi_square = density.settings(coordinates(density, 30))
-    assert constants.WALKS[0] <= walk <= constants.WALKS[-1]
+    assert constants.WALK_STDS[0] <= walk <= constants.WALK_STDS[-1]
     assert 1 <= scale <= constants.NOISE_SCALES[-1]
-    assert constants.DEVIATIONS[0] <= deviation <= constants.DEVIATIONS[-1]
+    assert constants.DEVIATION_STDS[0] <= deviation <= constants.DEVIATION_STDS[-1]
     assert chi_square > 0
 
 
@@ -429,10 +429,10 @@ def test_chi_square_of_a_life_as_stated_is_near_its_degrees_of_freedom(tmp_path:
 @pytest.fixture
 def with_deviation(monkeypatch: pytest.MonkeyPatch) -> LifeSetting:
     """One point of the grid, at which health is far off its laws."""
-    monkeypatch.setattr(constants, "WALKS", (1.5e-3,))
+    monkeypatch.setattr(constants, "WALK_STDS", (1.5e-3,))
     monkeypatch.setattr(constants, "NOISE_SCALES", (1.0,))
     monkeypatch.setattr(constants, "NOISE_SCALE_PRIOR", (1.0,))
-    monkeypatch.setattr(constants, "DEVIATIONS", (0.4,))
+    monkeypatch.setattr(constants, "DEVIATION_STDS", (0.4,))
     monkeypatch.setattr(constants, "DEVIATION_PRIOR", (1.0,))
     return LifeSetting(1.5e-3, 1.0, 0.4)
 
@@ -518,7 +518,7 @@ def test_points_of_the_grid_are_drawn_by_their_weight(
     poor_map: Stage, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Draws without a deviation are as many as their weight, and are exactly on the law."""
-    monkeypatch.setattr(constants, "WALKS", (1.5e-3,))
+    monkeypatch.setattr(constants, "WALK_STDS", (1.5e-3,))
     density = density_of(rough_history(np.random.default_rng(15)), poor_map)
     y = coordinates(density, 1)
     n = 4000

@@ -46,10 +46,10 @@ MOUNT_OR_NOT = MOUNT[: MOUNT.index("[parameter.law]")] + (
 def small_grid() -> Iterator[None]:
     """Average over two walks, two deviations and one noise scale: checks hold for any of them."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(constants, "WALKS", (1e-5, 1.5e-3))
+        patch.setattr(constants, "WALK_STDS", (1e-5, 1.5e-3))
         patch.setattr(constants, "NOISE_SCALES", (1.0,))
         patch.setattr(constants, "NOISE_SCALE_PRIOR", (1.0,))
-        patch.setattr(constants, "DEVIATIONS", (0.0, 0.01))
+        patch.setattr(constants, "DEVIATION_STDS", (0.0, 0.01))
         patch.setattr(constants, "DEVIATION_PRIOR", (0.5, 0.5))
         yield
 
@@ -115,7 +115,7 @@ def forked(unchained: LifePosterior) -> LifePosterior:
             ess_tail=800.0 - 100 * k - steps,
             r_hat=1.001 + 0.004 * k + 1e-4 * steps,
             interval_shrinkage=0.9 - 0.4 * k - 0.01 * steps,
-            n_mixture=int(100 * probability),
+            n_mixture_draws=int(100 * probability),
         )
         for k, probability in enumerate((0.75, 0.25))
     )
@@ -222,7 +222,7 @@ def test_a_life_has_its_diagnostics(found: LifePosterior) -> None:
     assert found.modes == ("roll", "pitch")
     assert found.seed == (3, 4)
     assert way.probability == 1
-    assert way.n_mixture == found.health.shape[1] == 2500
+    assert way.n_mixture_draws == found.health.shape[1] == 2500
     assert found.worst_r_hat < 1.01
     assert found.ess > 1000
     assert way.interval_shrinkage[0] > 0.9
@@ -311,7 +311,7 @@ def test_the_law_of_the_data_is_the_most_probable(faded: LifePosterior, wavering
         assert min(probability) >= 0.01
         for name in NAMES:
             assert sum(fit.laws(name).values()) == pytest.approx(1, abs=1e-12)
-        share = [way.n_mixture / fit.health.shape[1] for way in fit.scenarios]
+        share = [way.n_mixture_draws / fit.health.shape[1] for way in fit.scenarios]
         np.testing.assert_allclose(share, probability, atol=1 / 2500)
 
 
@@ -321,8 +321,8 @@ def test_draws_of_several_scenarios_follow_each_other(faded: LifePosterior) -> N
     assert len(faded.scenarios) > 1
     first = 0
     for way, off, _ in faded.by_scenario():
-        part = faded.health[:, first : first + way.n_mixture].reshape(-1, 2)
-        first += way.n_mixture
+        part = faded.health[:, first : first + way.n_mixture_draws].reshape(-1, 2)
+        first += way.n_mixture_draws
         theta = way.scenario.natural(way.mixture_draws)
         by_law = way.scenario.health(theta, TRAVEL[-1:])[:, 0]
         np.testing.assert_allclose(by_law * np.exp(off), part, rtol=1e-12)

@@ -49,11 +49,11 @@ LIMITED_FOOT = FOOT + "limit = { below = 0.8 }\n"
 def small_grid() -> Iterator[None]:
     """Average over two walks, in short chains, about exact laws: checks hold for any of them."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(constants, "WALKS", (1e-5, 1.5e-3))
+        patch.setattr(constants, "WALK_STDS", (1e-5, 1.5e-3))
         patch.setattr(sampling, "_FIRST_STEPS", 300)
         patch.setattr(constants, "NOISE_SCALES", (1.0,))
         patch.setattr(constants, "NOISE_SCALE_PRIOR", (1.0,))
-        patch.setattr(constants, "DEVIATIONS", (0.0,))
+        patch.setattr(constants, "DEVIATION_STDS", (0.0,))
         patch.setattr(constants, "DEVIATION_PRIOR", (1.0,))
         yield
 
@@ -337,7 +337,7 @@ def test_deviation_makes_life_less_certain(
     stage: Stage, fading: Prognosis, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A deviation widens what is left, and what is past is so of the health that is now."""
-    monkeypatch.setattr(constants, "DEVIATIONS", (0.15,))
+    monkeypatch.setattr(constants, "DEVIATION_STDS", (0.15,))
     for rate, past_share in ((1.5e-4, 0.0), (0.4 / 1400, 0.5)):
         found = prognose(fading_life(rate), stage, 3)
         assert found.deviation == pytest.approx(0.15)

@@ -183,7 +183,7 @@ def test_the_prior_of_a_line_with_a_jump_integrates_to_one(begin: float) -> None
     assert np.exp(scenario.log_prior(y)).sum() * cell == pytest.approx(1, abs=1e-9)
     # Negative control: a density of the rate itself, without the Jacobian, does not.
     bare = LINEAR.rate_per_km.log_density(scenario.natural(y)[:, 0] * 1000)
-    bare = np.exp(bare + constants.JUMP.log_density(y[:, 1])).sum() * cell
+    bare = np.exp(bare + constants.STEP_PRIOR.log_density(y[:, 1])).sum() * cell
     assert abs(bare - 1) > 0.1
 
 
@@ -216,7 +216,7 @@ def test_draws_follow_the_prior() -> None:
     assert y.shape == (5000, 5)
     assert np.isfinite(scenario.log_prior(y)).all()
     theta = scenario.natural(y)
-    books = [stats.norm(0.0, 2e-7), *[stats.lognorm(constants.JUMP.std)] * 4]
+    books = [stats.norm(0.0, 2e-7), *[stats.lognorm(constants.STEP_PRIOR.std)] * 4]
     for column, book in zip(theta.T, books, strict=True):
         assert stats.kstest(column, book.cdf).pvalue > 1e-4
     correlation = np.corrcoef(y.T)[np.triu_indices(5, 1)]

@@ -66,8 +66,8 @@ def draw_history(rng: np.random.Generator, model_std: float) -> tuple[History, f
     temperature = 21 + 4 * rng.standard_normal(N_LOGS)
     drift += np.outer(temperature - 21, rng.normal(0, 1e-3, 2))
     steps = np.sqrt(np.diff(clock) / now)[:, None] * rng.standard_normal((N_LOGS - 1, 2))
-    drift[1:] += rng.choice(constants.WALKS) * np.cumsum(steps, axis=0)
-    deviation = rng.choice(constants.DEVIATIONS, p=constants.DEVIATION_PRIOR)
+    drift[1:] += rng.choice(constants.WALK_STDS) * np.cumsum(steps, axis=0)
+    deviation = rng.choice(constants.DEVIATION_STDS, p=constants.DEVIATION_PRIOR)
     steps = np.sqrt(np.diff(clock) / HORIZON) * rng.standard_normal(N_LOGS - 1)
     off = deviation * np.r_[0, np.cumsum(steps)]
     drift += np.outer(off, SENSITIVITY["guide_preload"][:2])
@@ -139,8 +139,8 @@ def test_health_off_its_law_is_calibrated(
 
     Control: taken never to leave its law, it is not.
     """
-    monkeypatch.setattr(constants, "WALKS", (1e-5, 5e-4, 1.5e-3))
-    monkeypatch.setattr(constants, "DEVIATIONS", (0.0, 0.4))
+    monkeypatch.setattr(constants, "WALK_STDS", (1e-5, 5e-4, 1.5e-3))
+    monkeypatch.setattr(constants, "DEVIATION_STDS", (0.0, 0.4))
     monkeypatch.setattr(constants, "DEVIATION_PRIOR", (0.1, 0.9))
     stage = make_stage(tmp_path, (FADING,), model_std=0.2, tail=TEMPERATURE)
     found, wrong = [], []

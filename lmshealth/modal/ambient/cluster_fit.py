@@ -29,7 +29,7 @@ from lmshealth.modal.naming import shift_cost
 from lmshealth.modal.targets import Target
 from lmshealth.signal.constants import LINE_WIDTH
 from lmshealth.signal.spectra import CrossSpectrum, LogSpectra, Spectrum, median_ordinate
-from lmshealth.stage.constants import BAND
+from lmshealth.stage.constants import BAND_HALF_WIDTH
 
 # Steps of the common shift and of the shift of each mode.
 _COMMON_STEPS, _OWN_STEPS = 41, 15
@@ -94,8 +94,8 @@ def bin_cluster(
     ``searched`` widens the band by the search of each mode.
     """
     searches = [searched * target.search for target in cluster]
-    low = min(t.band(BAND)[0] * (1 - s) for t, s in zip(cluster, searches, strict=True))
-    high = max(t.band(BAND)[1] * (1 + s) for t, s in zip(cluster, searches, strict=True))
+    low = min(t.band(BAND_HALF_WIDTH)[0] * (1 - s) for t, s in zip(cluster, searches, strict=True))
+    high = max(t.band(BAND_HALF_WIDTH)[1] * (1 + s) for t, s in zip(cluster, searches, strict=True))
     high = min(high, top)
     width = 0.5 * min(t.damping_ratio * t.frequency for t in cluster)
     near = tuple(t for t in targets if t not in cluster and low / 1.3 < t.frequency < 1.3 * high)
@@ -225,8 +225,8 @@ def fit_cluster(
     absent = [target for target in targets if target.name not in names]
     if not present:
         return ClusterFit(None, _not_excited(absent, gains))
-    low = min(target.band(BAND)[0] for target in present)
-    high = max(target.band(BAND)[1] for target in present)
+    low = min(target.band(BAND_HALF_WIDTH)[0] for target in present)
+    high = max(target.band(BAND_HALF_WIDTH)[1] for target in present)
     data = prepare(spectra, binned, present, (low, high))
     n, needed = sum(int(mask.sum()) for mask in data.masks), 10 + 6 * len(present)
     if n < needed:

@@ -24,7 +24,7 @@ from lmshealth.modal.ambient.wandering import Harmonic, Recording, find_harmonic
 from lmshealth.modal.targets import Target
 from lmshealth.signal.constants import LINE_WIDTH
 from lmshealth.signal.spectra import LogSpectra
-from lmshealth.stage.constants import BAND
+from lmshealth.stage.constants import BAND_HALF_WIDTH
 
 # Width of the bins at a resonance in damping ratios, of which the least counts, and the widest as a
 # fraction of the frequency.
@@ -224,7 +224,7 @@ def split_groups(targets: tuple[Target, ...]) -> list[tuple[Target, ...]]:
     """Group neighbours whose bands overlap; groups of too many are split at the widest gap."""
     groups: list[tuple[Target, ...]] = []
     for target in targets:
-        if groups and target.band(BAND)[0] < groups[-1][-1].band(BAND)[1]:
+        if groups and target.band(BAND_HALF_WIDTH)[0] < groups[-1][-1].band(BAND_HALF_WIDTH)[1]:
             groups[-1] = (*groups[-1], target)
         else:
             groups.append((target,))
