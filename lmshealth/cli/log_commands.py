@@ -14,6 +14,7 @@ from lmshealth.io.log import Log, Refusal
 
 if TYPE_CHECKING:
     from lmshealth.io.manifest import Manifest
+    from lmshealth.modal.identification import AmbientReading
     from lmshealth.report.tables import Row
     from lmshealth.tracking.history import LogEstimates
 
@@ -58,13 +59,17 @@ _PLOT = click.option(
     help="Write a stage description with the modes found in one log, ready to edit.",
 )
 @_PLOT
+@click.option("--shapes", is_flag=True, help="Print mode shapes, their complexity and their MAC.")
 @_FORMAT
 @click.pass_context
 def modes(ctx: click.Context, /, **given: Any) -> None:
-    """Identify the modes of single logs: natural frequency and damping ratio."""
-    from lmshealth.modal.free_decay.identification import identify_decays
-    from lmshealth.modal.identification import AmbientReading, read_ambient
-    from lmshealth.report.tables import modes_rows
+    """Identify the modes of single logs: natural frequency and damping ratio.
+
+    json also lists complex mode shapes, their phase collinearity (MPC), the modal assurance
+    criterion (MAC) of each pair of modes, and spectral lines.
+    """
+    from lmshealth.modal.mode_shapes import mode_shapes
+    from lmshealth.report.tables import modes_rows, shapes_rows
     from lmshealth.signal.following_error import loop_error
     from lmshealth.tracking.history import LogEstimates
 
@@ -74,27 +79,29 @@ def modes(ctx: click.Context, /, **given: Any) -> None:
         _check_save(given["save"], stage, given["logs"])
     _check_plot(given["plot"], given["logs"])
 
-    def estimate(log: Log) -> LogEstimates:
-        settling = given["part"] == "settling"
-        read: Any = identify_decays if settling else read_ambient
-        reading = read(log, stage, channels=names, band=band)
-        found = reading if settling else reading.modes
-        if given["plot"]:
-            from lmshealth.report.log_figures import modes_figure, settling_spectra, write_figure
+    content: dict[str, list[Row]] = {"modes": [], "lines": [], "shapes": [], "mac": []}
 
-            if settling:
-                reading = AmbientReading(found, settling_spectra(log, names))
+    def estimate(log: Log) -> LogEstimates:
+        reading = _read_modes(log, given, names)
+        shapes, mac = shapes_rows(log.name, mode_shapes(reading.modes, reading.fitted))
+        content["shapes"] += shapes
+        content["mac"] += mac
+        if given["plot"]:
+            from lmshealth.report.log_figures import modes_figure, write_figure
+
             write_figure(given["plot"], modes_figure(log, reading, stage, band=band))
-        return LogEstimates(log.name, log.digest, log.metadata, found, loop_error(log))
+        return LogEstimates(log.name, log.digest, log.metadata, reading.modes, loop_error(log))
 
     found, lost = _each(ctx, estimate)
     rows = [row for one in found for row in modes_rows(one)]
     refused = [refusal for one in found for refusal in one.modes.refused]
-    content = {"modes": rows, "lines": _line_rows((r.log, r.modes.lines) for r in found)}
+    content["modes"], content["lines"] = rows, _line_rows((r.log, r.modes.lines) for r in found)
 
     def show(rejected: list[Row]) -> None:
         if found:
             views.print_modes(rows, rejected)
+            if given["shapes"]:
+                views.print_shapes(content["shapes"], content["mac"])
             if rows and stage is None and band is None:
                 terminal.print_text(_NO_BAND)
 
@@ -102,6 +109,19 @@ def modes(ctx: click.Context, /, **given: Any) -> None:
     if given["save"] and found:
         _save(given["save"], found[0])
     _exit(ctx, found, lost)
+
+
+def _read_modes(log: Log, given: dict[str, Any], names: list[str] | None) -> AmbientReading:
+    """Identify the modes of a log by the chosen part of it."""
+    from lmshealth.modal.free_decay.identification import identify_decays
+    from lmshealth.modal.identification import AmbientReading, read_ambient
+    from lmshealth.report.log_figures import settling_spectra
+
+    chosen: Any = {"channels": names, "band": given["band"] or None}
+    if given["part"] == "constant":
+        return read_ambient(log, given["stage"], **chosen)
+    found = identify_decays(log, given["stage"], **chosen)
+    return AmbientReading(found, settling_spectra(log, names))
 
 
 def _check_save(path: Path, stage: object, logs: Sequence[Path]) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from datetime import date
 from itertools import combinations
 from typing import TYPE_CHECKING
@@ -35,6 +35,7 @@ if TYPE_CHECKING:  # so that --help does not import pandas and scipy
     from lmshealth.tracking.track import Track
 
 _KM = 1000.0
+_MATRIX = 6  # columns of a matrix that fit on a terminal
 _HINDRANCES = {
     "too-short": ("log too short", "its modes cannot be identified."),
     "baseline": ("baseline too short", "more or longer baseline logs are needed."),
@@ -85,6 +86,48 @@ def print_modes(rows: Sequence[Row], refused: Sequence[Row]) -> None:
     else:
         print_text("No modes found.")
     print_refused(refused)
+
+
+def print_shapes(rows: Sequence[Row], pairs: Sequence[Row]) -> None:
+    """Print complex mode shapes, their collinearity and the MAC of the modes of each log."""
+    if not rows:
+        print_text("No mode shapes: they need the fit of segments of constant velocity.")
+    logs = short_names([row["log"] for row in rows])
+    cells = [
+        {
+            "log": logs[row["log"]],
+            "mode": row["mode"],
+            "channel": key.removeprefix("amplitude_"),
+            "amplitude": f"{amplitude:.3f}",
+            "phase °": f"{round(row[key.replace('amplitude', 'phase_deg', 1)])}",
+        }
+        for row in rows
+        for key, amplitude in row.items()
+        if key.startswith("amplitude_") and amplitude is not None
+    ]
+    if cells:
+        print_table("Mode shapes (accelerations relative to the largest)", cells, 3)
+    of_pair = {(pair["log"], pair["mode_a"], pair["mode_b"]): pair["mac"] for pair in pairs}
+    for log in logs:
+        own = [row for row in rows if row["log"] == log]
+        for first in range(0, len(own), _MATRIX):
+            some = [row["mode"] for row in own[first : first + _MATRIX]]
+            cells = []
+            for row in own:
+                cell = {"log": logs[log], "mode": row["mode"], "MPC": _criterion(row["mpc"])}
+                for name in some:
+                    mac = of_pair.get((log, *sorted((row["mode"], name), key=_order(own))), 1.0)
+                    cell[name] = _criterion(mac)
+                cells.append(cell)
+            print_table("Phase collinearity (MPC) and modal assurance criterion (MAC)", cells, 2)
+
+
+def _order(rows: Sequence[Row]) -> Callable[[str], int]:
+    return [row["mode"] for row in rows].index
+
+
+def _criterion(value: float | None) -> str:
+    return "" if value is None else f"{value:.2f}"
 
 
 def print_frf(

@@ -5,13 +5,13 @@ from __future__ import annotations
 import textwrap
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from functools import partial
 from itertools import cycle
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from scipy.optimize import isotonic_regression
+from scipy.sparse.csgraph import minimum_spanning_tree
 from scipy.stats import gamma
 
 from lmshealth._arrays import FloatArray
@@ -20,6 +20,7 @@ from lmshealth.errors import BadLog
 from lmshealth.io.log import Log, Refusal
 from lmshealth.modal.frf.identification import FrfReading
 from lmshealth.modal.identification import AmbientReading
+from lmshealth.modal.mode_shapes import ModeShapes, mode_shapes
 from lmshealth.modal.modes import Modes
 from lmshealth.modal.spectra_summary import WIDE, SpectraSummary, summarise
 from lmshealth.modal.targets import choose_channels
@@ -28,7 +29,7 @@ from lmshealth.report.rendering import render
 from lmshealth.report.text import spell
 from lmshealth.signal.segments import select_segments
 from lmshealth.signal.spectra import LogSpectra, ResonanceRange, cross_spectra
-from lmshealth.stage.description import Stage
+from lmshealth.stage.description import ChannelSpec, Stage
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -38,6 +39,10 @@ _WIDTH, _NOTE_COLUMNS = 8.0, 112
 # Heights of a panel, of legend and labels, of upright labels and of a line of notes, in inches.
 _PANEL, _FRAME, _LETTERS, _NOTE = 1.15, 1.75, 1.1, 0.16
 _BINS, _SINGULAR = 480, 4  # of a spectrum, and singular values, at most
+# Drawings of shapes in a row, their height in inches, the largest motion over the extent of the
+# sensors, and the projection of x, y and z.
+_DRAWN_BESIDE, _DRAWING, _MOVED = 4, 1.8, 0.25
+_ISOMETRIC = np.array([[0.866, -0.5], [0.866, 0.5], [0.0, 1.0]])
 # Distance of labels over the width of the axes: side by side, and upright from this many on.
 _APART, _APART_UPRIGHT, _UPRIGHT = 0.2, 0.03, 6
 _MARKERS = "v^sDPX*<>"
@@ -66,8 +71,68 @@ def modes_figure(
     summary = summarise(
         reading.spectra, reading.fitted, modes, (low, high), _BINS, n_singular=_SINGULAR
     )
-    draw = partial(plot_spectra, summary=summary, modes=modes, stage=stage)
-    return LogFigure(f"Modes of {log.name}", spectra_size(summary, modes), draw, modes)
+    shapes = mode_shapes(modes, reading.fitted)
+    sensors = {one.name: one for one in stage.description.channel} if stage else {}
+    places = [sensors[name] for name in shapes.channels if name in sensors]
+    width, height = spectra_size(summary, modes)
+    n_rows = -(-len(modes.names) // _DRAWN_BESIDE) if places else 0
+
+    def draw(figure: Figure) -> None:
+        if not n_rows:
+            plot_spectra(figure, summary, modes, stage)
+            return
+        parts: Any = figure.subfigures(2, height_ratios=[height, n_rows * _DRAWING])
+        plot_spectra(parts[0], summary, modes, stage)
+        axes = parts[1].subplots(n_rows, _DRAWN_BESIDE, squeeze=False).ravel()
+        for ax in axes[len(modes.names) :]:
+            ax.set_axis_off()
+        for i, ax in enumerate(axes[: len(modes.names)]):
+            plot_shape(ax, shapes, i, places)
+
+    size = width, height + n_rows * _DRAWING
+    return LogFigure(f"Modes of {log.name}", size, draw, modes)
+
+
+def plot_shape(ax: Axes, shapes: ModeShapes, i: int, places: Sequence[ChannelSpec]) -> Axes:
+    """Draw the shape of a mode in one extreme, in isometric projection, from sensors at places."""
+    at: dict[tuple[float, float, float], FloatArray] = {}
+    for one in places:
+        part = shapes.shapes[i, shapes.channels.index(one.name)].real
+        direction = np.array(one.direction) / np.linalg.norm(one.direction)
+        moved = at.setdefault(one.position_m, np.zeros(3))
+        at[one.position_m] = moved + (direction * part if np.isfinite(part) else 0.0)
+    rest, moved = np.array([*at]), np.array([*at.values()])
+    extent = float(np.ptp(rest, axis=0).max()) or 1.0
+    largest = float(np.linalg.norm(moved, axis=1).max()) or 1.0
+    moved = rest + _MOVED * extent / largest * moved
+    start, end = rest @ _ISOMETRIC, moved @ _ISOMETRIC
+    ground = np.c_[rest[:, :2], np.full(len(rest), rest[:, 2].min())] @ _ISOMETRIC
+    for foot, point in zip(ground, start, strict=True):
+        ax.plot(*np.c_[foot, point], color=figures.GRID, lw=0.8)
+    # Neighbours are joined: the shortest tree.
+    apart = np.linalg.norm(rest[:, None] - rest, axis=2)
+    for a, b in zip(*minimum_spanning_tree(apart).nonzero(), strict=True):
+        ax.plot(*start[[a, b]].T, color=figures.MUTED, lw=0.8, ls=":")
+        ax.plot(*end[[a, b]].T, color=figures.BLUE, lw=1)
+    ax.plot(*start.T, "o", mfc="none", mec=figures.MUTED, ms=5)
+    style: Any = {"arrowstyle": "-|>", "color": figures.BLUE, "shrinkA": 0, "shrinkB": 0}
+    for point, tip in zip(start, end, strict=True):
+        ax.annotate("", tip, point, arrowprops=style)
+    # Axes of the positions, in the lower left corner.
+    corner = np.vstack([ground, start, end]).min(axis=0) - 0.25 * extent
+    for axis, name in zip(0.2 * extent * _ISOMETRIC, "xyz", strict=True):
+        ax.plot(*np.c_[corner, corner + axis], color=figures.MUTED, lw=0.8)
+        u, v = corner + 1.3 * axis
+        ax.text(u, v, name, color=figures.MUTED, size=7, ha="center", va="center")
+    ax.update_datalim(end)
+    ax.margins(0.12)
+    ax.set_aspect("equal", anchor="N")
+    ax.set_axis_off()
+    title = spell(shapes.names[i])
+    if np.isfinite(shapes.complexity[i]):
+        title += f", MPC {shapes.complexity[i]:.2f}"
+    ax.set_title(figures.plain_label(title), size=8.5)
+    return ax
 
 
 def spectra_size(summary: SpectraSummary, modes: Modes) -> tuple[float, float]:

@@ -16,6 +16,7 @@ from lmshealth.health.results import Health
 from lmshealth.io.log import Refusal
 from lmshealth.io.metadata import COVARIATES
 from lmshealth.modal.frf.identification import FrfReading
+from lmshealth.modal.mode_shapes import ModeShapes
 from lmshealth.prognosis.maintenance_decision import ProbabilityBounds, Service
 from lmshealth.report.assessment import Assessment, Life, summarise_life
 from lmshealth.report.constants import RUL_LEVELS
@@ -75,6 +76,7 @@ LOG_COLUMNS = {
     "harmonics": "log channel frequency_hz amplitude_um phase_rad above_floor",
     "growth": "stage channel band n_logs n_velocities slope slope_std p_value grows",
     "lines": "frequency_hz amplitude unit kind channel",
+    "mac": "log mode_a mode_b mac",
 }
 
 Row = dict[str, Any]
@@ -144,6 +146,31 @@ def modes_rows(reading: LogEstimates) -> list[Row]:
         channels = zip(modes.shape_channels, shape, strict=True)
         row |= {f"shape_{channel}": part for channel, part in channels}
     return rows
+
+
+def shapes_rows(log: str, shapes: ModeShapes) -> tuple[list[Row], list[Row]]:
+    """Return complex shapes, one row per mode, and the MAC of each pair of modes.
+
+    Amplitudes and phases in degrees are relative to the largest component; None where the channel
+    does not show the mode.
+    """
+    rows = []
+    if not shapes.channels:
+        return [], []
+    amplitude, phase = np.abs(shapes.shapes), np.angle(shapes.shapes, deg=True)
+    for i, complexity in enumerate(shapes.complexity):
+        row: Row = {"log": log, "mode": shapes.names[i], "mpc": _or_none(complexity)}
+        for part, values in (("amplitude", amplitude[i]), ("phase_deg", phase[i])):
+            pairs = zip(shapes.channels, values, strict=True)
+            row |= {f"{part}_{channel}": _or_none(value) for channel, value in pairs}
+        rows.append(row)
+    pairs_ = combinations(range(len(shapes.names)), 2)
+    mac = [(log, shapes.names[i], shapes.names[j], _or_none(shapes.mac[i, j])) for i, j in pairs_]
+    return rows, _rows("mac", mac)
+
+
+def _or_none(value: float) -> float | None:
+    return float(value) if np.isfinite(value) else None
 
 
 def _modes_cov_rows(reading: LogEstimates) -> list[Row]:

@@ -108,6 +108,14 @@ class Order(_Part, frozen=True):
     wavelength_mm: Positive
 
 
+class ChannelSpec(_Part, frozen=True):
+    """Place of a sensor in m and the direction that it measures, for drawings of mode shapes."""
+
+    name: Name
+    position_m: tuple[float, float, float]
+    direction: tuple[float, float, float]  # of any length
+
+
 class Covariate(_Part, frozen=True):
     """A measured quantity that shifts ln f without wear.
 
@@ -164,6 +172,7 @@ class Description(_Part, frozen=True):
     parameter: tuple[ParameterSpec, ...] = ()
     map: MapSpec | None = None
     order: tuple[Order, ...] = ()
+    channel: tuple[ChannelSpec, ...] = ()
     covariate: tuple[Covariate, ...] = ()
     loop: tuple[dict[str, object], ...] = ()
     baseline: Baseline = Baseline()
@@ -324,6 +333,16 @@ def _refuse(path: Path, content: bytes, faults: Iterable[tuple[Keys, str]]) -> N
 
 def _faults(description: Description) -> Iterator[tuple[Keys, str]]:
     """Find contradictions between the parts of a description; yield key and message."""
+    for k, one in enumerate(description.channel):
+        if not any(one.direction):
+            yield ("channel", k, "direction"), f"the direction of {one.name} has no length"
+    yield from _common_faults(description)
+    for k, parameter in enumerate(description.parameter):
+        yield from _parameter_faults(k, parameter)
+
+
+def _common_faults(description: Description) -> Iterator[tuple[Keys, str]]:
+    """Find faults of bands, names, map and decision."""
     bands: list[tuple[Keys, tuple[float, float]]] = [
         (("watch", k), (band.low_hz, band.high_hz)) for k, band in enumerate(description.watch)
     ]
@@ -332,7 +351,7 @@ def _faults(description: Description) -> Iterator[tuple[Keys, str]]:
     for keys, (low, high) in bands:
         if not low < high:
             yield keys, f"reaches from {low:g} to {high:g} Hz: needed low < high"
-    for kind in ("mode", "parameter", "covariate"):
+    for kind in ("mode", "parameter", "covariate", "channel"):
         names = [part.name for part in getattr(description, kind)]
         for k, name in enumerate(names):
             if name in names[:k]:
@@ -343,8 +362,6 @@ def _faults(description: Description) -> Iterator[tuple[Keys, str]]:
     if risk is not None and ratio is not None:
         fault = f"cost_ratio = {ratio:g} and max_risk = {risk:g} each choose a service date"
         yield ("decision", "cost_ratio"), f"{fault}: state one of them"
-    for k, parameter in enumerate(description.parameter):
-        yield from _parameter_faults(k, parameter)
 
 
 def _parameter_faults(k: int, parameter: ParameterSpec) -> Iterator[tuple[Keys, str]]:

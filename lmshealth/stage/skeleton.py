@@ -38,6 +38,12 @@ snr = {snr:.3g}
 search = {search:.2g}
 """
 _TAIL = """
+# Places of the sensors, for drawings of the mode shapes by `lmshealth modes --plot`.
+# [[channel]]
+# name = "acc_pitch"
+# position_m = [0.10, 0.00, 0.25]
+# direction = [0, 0, 1]
+
 # Lines that move with the velocity: frequency = velocity / wavelength.
 # [[order]]
 # name = "ball pass"

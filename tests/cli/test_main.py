@@ -162,10 +162,22 @@ def test_modes_as_json_have_the_keys_of_the_contract(folder: Path, stage: Path) 
     result = call("modes", log, "--stage", stage, "--format", "json")
     assert result.exit_code == 0
     content = strict(result.stdout)
-    assert set(content) == {"modes", "lines", "refused"}
+    assert set(content) == {"modes", "lines", "shapes", "mac", "refused"}
+    assert [shape["mode"] for shape in content["shapes"]] == ["roll", "pitch"]
+    assert {pair["mode_b"] for pair in content["mac"]} == {"pitch"}
     assert [mode["mode"] for mode in content["modes"]] == ["roll", "pitch"]
     assert all(set(mode) >= MODE_KEYS for mode in content["modes"])
     assert content["modes"][0]["frequency_hz"] == pytest.approx(62.0, rel=0.01)
+
+
+def test_mode_shapes_are_printed_where_they_are_asked_for(folder: Path, stage: Path) -> None:
+    """Amplitude and phase per channel, collinearity and MAC follow the modes."""
+    log = folder / "good" / "log-00.h5"
+    plain = call("modes", log, "--stage", stage)
+    result = call("modes", log, "--stage", stage, "--shapes")
+    assert result.stdout.startswith(plain.stdout.rstrip())
+    assert "Mode shapes (accelerations relative to the largest)" in result.stdout
+    assert "modal assurance criterion (MAC)" in result.stdout
 
 
 def test_modes_of_a_bare_log_have_nulls_and_need_no_metadata(folder: Path) -> None:

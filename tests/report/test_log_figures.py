@@ -11,15 +11,17 @@ import numpy as np
 import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from matplotlib.text import Text
+from matplotlib.text import Annotation, Text
 
 from lmshealth.io.log import Log, Refusal
 from lmshealth.modal.identification import AmbientReading
+from lmshealth.modal.mode_shapes import ModeShapes
 from lmshealth.modal.modes import Modes, estimates_only, merge, numbered
-from lmshealth.report.log_figures import LogFigure, modes_figure, write_figure
+from lmshealth.report.log_figures import LogFigure, modes_figure, plot_shape, write_figure
 from lmshealth.signal.segments import find_segments
 from lmshealth.signal.spectra import LogSpectra, cross_spectra
 from lmshealth.signal.spectral_lines import Line
+from lmshealth.stage.description import ChannelSpec
 from tests.signals import Mode, accelerations, make_log, make_stage, sine, white
 
 RATE, N = 500.0, 16000
@@ -125,3 +127,21 @@ def test_resonances_that_were_rejected_are_drawn_where_they_were_found(log: Log)
     reading = replace(read(log, numbered(merge([], [], []))), rejected=rejected)
     whole = draw(modes_figure(log, reading, band=(40.0, 90.0)))
     assert [t.get_text() for t in whole.axes[0].texts][1:] == ["70.25 Hz\npoor-fit"]
+
+
+def test_shapes_are_drawn_where_the_description_places_the_sensors() -> None:
+    """Two sensors at one place and one above; the largest motion is a quarter of their extent."""
+    shape = np.array([[1.0, -0.5, 0.25]], dtype=complex)
+    shapes = ModeShapes(("roll",), ("a", "b", "c"), shape)
+    places = [
+        ChannelSpec("a", (0.0, 0.0, 0.0), (2.0, 0.0, 0.0)),
+        ChannelSpec("b", (0.0, 0.0, 0.0), (0.0, 1.0, 0.0)),
+        ChannelSpec("c", (0.0, 0.0, 4.0), (0.0, 0.0, -1.0)),
+    ]
+    ax = plot_shape(Figure().add_subplot(), shapes, 0, places)
+    tips = [text.xy for text in ax.texts if isinstance(text, Annotation)]
+    motions = np.array([[1.0, -0.5, 0.0], [0.0, 0.0, -0.25]]) / np.hypot(1.0, 0.5)
+    rest = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 4.0]])
+    isometric = np.array([[0.866, -0.5], [0.866, 0.5], [0.0, 1.0]])
+    assert np.array(tips) == pytest.approx((rest + motions) @ isometric)
+    assert ax.get_title() == "roll, MPC 1.00"

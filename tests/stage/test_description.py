@@ -65,6 +65,11 @@ def load(folder: Path, text: str) -> Stage:
             r"line 7: mode\[1\]\.name: \[\[mode\]\] names must be unique.*roll",
         ),
         (
+            "[map]",
+            '[[channel]]\nname = "a"\nposition_m = [0, 0, 1]\ndirection = [0, 0, 0]\n[map]',
+            r"line 29: channel\[0\]\.direction: the direction of a has no length",
+        ),
+        (
             'name = "mount_stiffness"',
             'name = "guide_preload"',
             r"line 17: parameter\[1\]\.name: \[\[parameter\]\].*unique",
