@@ -133,7 +133,7 @@ def _search(
             stop = min(first + _BLOCK, octave.stop)
             ratio, squared = _line_test(transform, octave.n, first, stop)
             here = slice(first - octave.start, stop - octave.start)
-            evidence[here] += _white(ratio)
+            evidence[here] += _noise_evidence(ratio)
             power[here] += squared
     threshold = float(gamma.isf(p_value, sum(map(len, octave.blocks))))
     passed = np.flatnonzero(evidence > threshold)
@@ -146,7 +146,7 @@ def _search(
     found: list[tuple[float, float]] = []
     starts = [centre - _WINDOW // 2 for centre in centres]
     for first, window in zip(starts, _windows(octave.each(read), starts), strict=True):
-        for ordinate, amplitude in _clean(window, first, threshold):
+        for ordinate, amplitude in _window_lines(window, first, threshold):
             # Windows overlap.
             new = all(abs(ordinate - other) > _TAPERS / 2 for other, _ in found)
             if new and low <= ordinate < high:
@@ -195,12 +195,12 @@ def _rest(total: FloatArray, explained: FloatArray) -> FloatArray:
     return np.asarray((total - explained).clip(1e-12 * explained + 1e-300))
 
 
-def _white(ratio: FloatArray) -> FloatArray:
+def _noise_evidence(ratio: FloatArray) -> FloatArray:
     """Return -ln p of the ratio F / (K - 1) in white noise."""
     return (_TAPERS - 1) * np.log1p(ratio)
 
 
-def _narrow(ratio: FloatArray, width: float) -> FloatArray:
+def _resonance_evidence(ratio: FloatArray, width: float) -> FloatArray:
     """Return -ln p of the ratio at the peak of a resonance, its width in ordinates (README.md).
 
     Off the peak, in wider resonances and in more noise p is smaller.
@@ -223,7 +223,7 @@ def _tapers() -> FloatArray:
     return np.asarray(norm * np.sin(np.pi * np.outer(k, j) / (_WINDOW + 1)))
 
 
-def _clean(window: ComplexArray, first: int, threshold: float) -> list[tuple[float, float]]:
+def _window_lines(window: ComplexArray, first: int, threshold: float) -> list[tuple[float, float]]:
     """Return ordinate and amplitude of the lines of a window, removed strongest first."""
     size = _PER_ORDINATE * (_WINDOW + 1)
     start, stop = size // 2 - _PER_ORDINATE * _VICINITY, size // 2 + _PER_ORDINATE * _VICINITY
@@ -234,7 +234,7 @@ def _clean(window: ComplexArray, first: int, threshold: float) -> list[tuple[flo
     for _ in range(_MOST_LINES):
         ratio, squared = _line_test(fft.fft(window, size), _WINDOW, start, stop)
         power = squared.sum(axis=0)
-        passed = np.flatnonzero(free & (known | (_white(ratio).sum(axis=0) > threshold)))
+        passed = np.flatnonzero(free & (known | (_noise_evidence(ratio).sum(axis=0) > threshold)))
         if passed.size == 0:
             break
         # The foot of a strong line is coherent as well.
@@ -285,7 +285,7 @@ class _LineFit:
         """Return whether neither noise nor the narrowest resonance explains the sine."""
         # Below one period a resonance cannot be distinguished from a line.
         width = 2 * constants.LEAST_DAMPING * max(periods, 1.0)
-        evidence = _narrow(self.ratio, width).sum()
+        evidence = _resonance_evidence(self.ratio, width).sum()
         return bool(evidence > threshold) or not self._noise_rises(periods)
 
     def _noise_rises(self, periods: float) -> bool:

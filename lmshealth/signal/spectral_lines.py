@@ -65,9 +65,9 @@ def name_lines(
     velocities of the log are in m/s, the resolution of the spectrum in Hz. The result is ascending
     in frequency, each line once per channel.
     """
-    bases = _bases(stage, velocities)
+    fundamentals = _fundamentals(stage, velocities)
     named = [
-        Line(frequency, amplitude, "m/s²", _kind(frequency, bases, resolution), channel)
+        Line(frequency, amplitude, "m/s²", _kind(frequency, fundamentals, resolution), channel)
         for channel, frequency, amplitude in seen
     ]
     return _without_duplicates(named, resolution)
@@ -104,10 +104,10 @@ def find_lines_by_velocity(
         detections = []
         for group in groups:
             velocity, resolution = abs(group[0].velocity), 0.5 * _ordinate(log, group)
-            bases, share = _bases(stage, [velocity]), false_alarm / len(groups)
+            fundamentals, share = _fundamentals(stage, [velocity]), false_alarm / len(groups)
             found = find_lines(channel, group, log.sample_rate, band, share)
             for frequency, amplitude in found.tolist():
-                kind = _kind(frequency, bases, resolution)
+                kind = _kind(frequency, fundamentals, resolution)
                 line = Line(frequency, amplitude, "m/s²", kind, channel.name)
                 detections.append(_Detection(line, velocity, resolution))
         known = [s.line for s in detections if s.line.kind != "unknown"]
@@ -134,7 +134,7 @@ def _ordinate(log: Log, segments: Sequence[Segment]) -> float:
     return log.sample_rate / max((s.stop - s.start for s in segments), default=1)
 
 
-def _bases(stage: Stage | None, velocities: Iterable[float]) -> list[tuple[float, str]]:
+def _fundamentals(stage: Stage | None, velocities: Iterable[float]) -> list[tuple[float, str]]:
     orders = () if stage is None else stage.description.order
     return [(mains, "mains") for mains in constants.MAINS] + [
         (abs(velocity) / (order.wavelength_mm * 1e-3), order.name)
@@ -143,11 +143,11 @@ def _bases(stage: Stage | None, velocities: Iterable[float]) -> list[tuple[float
     ]
 
 
-def _kind(frequency: float, bases: list[tuple[float, str]], resolution: float) -> str:
+def _kind(frequency: float, fundamentals: list[tuple[float, str]], resolution: float) -> str:
     """Name a line by the base with the lowest matching harmonic; mains before orders."""
     kind, lowest = "unknown", constants.MOST_HARMONICS + 1
     resolution = max(resolution, constants.LINE_WIDTH * frequency)
-    for base, name in bases:
+    for base, name in fundamentals:
         # The harmonics of a base below three resolutions would match any line.
         n = round(frequency / base) if base > 3 * resolution else 0
         if 1 <= n < lowest and abs(frequency - n * base) < resolution:
@@ -166,8 +166,8 @@ def _orders(unknown: Sequence[_Detection]) -> list[Line]:
                 continue
             expected = one.line.frequency * other.velocity / one.velocity
             # The resolution of the first scales with the ratio of velocities.
-            blur = other.resolution + one.resolution * other.velocity / one.velocity
-            if abs(other.line.frequency - expected) < blur:
+            tolerance = other.resolution + one.resolution * other.velocity / one.velocity
+            if abs(other.line.frequency - expected) < tolerance:
                 kind = f"order of {1e3 * one.velocity / one.line.frequency:.3g} mm"
         named.append(replace(one.line, kind=kind))
     return named

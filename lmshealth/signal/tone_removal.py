@@ -14,14 +14,14 @@ from lmshealth.signal import constants
 # Distances in ordinates of the surroundings whose median a peak is compared with.
 _SURROUNDINGS = (3, 4, 5, 6, 7, 8)
 # Numbers of Legendre polynomials of the varying amplitude. The fewest are used whose residual
-# around the sinusoid is at most _AS_LITTLE times that of the most. Amplitude and phase of a line
+# around the sinusoid is at most _FIT_RATIO times that of the most. Amplitude and phase of a line
 # vary over seconds, those of a mode faster: _TERMS_PER_SECOND describe the line only.
-_TERMS, _AS_LITTLE, _TERMS_PER_SECOND = (4, 8, 12, 16, 24), 1.5, 0.6
+_TERMS, _FIT_RATIO, _TERMS_PER_SECOND = (4, 8, 12, 16, 24), 1.5, 0.6
 # Half-width of the fit, and distances of the near and far surroundings, in ordinates.
 _REACH, _NEAR, _FAR = 400, 10, 40
 _MOST_SINUSOIDS, _MOST_ROUNDS = 30, 4
 # Sinusoids fitted together, strongest first; peaks this close to a stronger one belong to it.
-_TOGETHER, _FOOT = 6, 4
+_TOGETHER, _PEAK_WIDTH = 6, 4
 # Skirt of a sinusoid relative to the level below which it is not subtracted.
 _SKIRT = 0.05
 
@@ -66,7 +66,7 @@ def remove_sinusoids(
     choice = tuple(k for k in _TERMS if k <= max(_TERMS[0], _TERMS_PER_SECOND * duration))
     removed: list[Sinusoid] = []
     for _ in range(_MOST_ROUNDS):
-        peaks = [k for k in _towering(_filled(rest, free)) if free[k] and not protected[k]]
+        peaks = [k for k in _peaks(_filled(rest, free)) if free[k] and not protected[k]]
         found = _remove(rest, free, peaks, choice)
         removed += found
         if not found:
@@ -83,7 +83,7 @@ def _remove(
         near = slice(max(0, at - _REACH), min(at + _REACH + 1, len(rest)))
         # Others within reach are fitted, too.
         others = [k for k in peaks if k != at and near.start <= k < near.stop and free[k]]
-        places = np.array([_place(rest, k) for k in (at, *others[: _TOGETHER - 1])])
+        places = np.array([_peak_ordinate(rest, k) for k in (at, *others[: _TOGETHER - 1])])
         found = _fit(rest[near], places - near.start, choice)
         if found is None:
             continue
@@ -91,7 +91,7 @@ def _remove(
         terms = len(size)
         fitted = _basis(near, places[0], terms) @ size
         # Of sinusoids too close to each other, as of a comb, one may exceed the sum of all.
-        if _energy(rest[near] - fitted, level) > _energy(rest[near], level):
+        if _residual_power(rest[near] - fitted, level) > _residual_power(rest[near], level):
             continue
         power = np.sum(np.abs(fitted) ** 2, axis=0)
         channel = int(np.argmax(power / level))
@@ -102,8 +102,8 @@ def _remove(
         reach = max(_REACH, int(np.sqrt(np.max(power / level) / _SKIRT) / np.pi))
         reached = slice(max(0, at - reach), min(at + reach + 1, len(rest)))
         rest[reached] -= _basis(reached, places[0], terms) @ size
-        foot = _foot(terms)
-        free[max(0, at - foot) : at + foot + 1] = False
+        width = _half_width(terms)
+        free[max(0, at - width) : at + width + 1] = False
     return removed
 
 
@@ -117,18 +117,18 @@ def _filled(rest: ComplexArray, free: BoolArray) -> FloatArray:
     return power
 
 
-def _towering(power: FloatArray) -> list[int]:
+def _peaks(power: FloatArray) -> list[int]:
     """List the ordinates far above their surroundings, of neighbours the highest."""
     contrast = _contrast(power).max(axis=1)
     suspects = np.flatnonzero(contrast > constants.SINUSOID_CONTRAST)
     peaks: list[int] = []
     for at in suspects[np.argsort(-power[suspects].max(axis=1), kind="stable")].tolist():
-        if all(abs(at - peak) > _FOOT for peak in peaks):
+        if all(abs(at - peak) > _PEAK_WIDTH for peak in peaks):
             peaks.append(at)
     return peaks[:_MOST_SINUSOIDS]
 
 
-def _place(rest: ComplexArray, at: int) -> float:
+def _peak_ordinate(rest: ComplexArray, at: int) -> float:
     """Interpolate the ordinate of a sinusoid from three transforms.
 
     At δ above its highest ordinate they are proportional to 1/δ, 1/(1 - δ) and -1/(1 + δ).
@@ -166,7 +166,7 @@ def _fit(
     ``(n_channels,)``; None where no polynomial explains it.
     """
     apart = np.abs(np.arange(len(rest)) - places[:, None])
-    widest = _foot(choice[-1])
+    widest = _half_width(choice[-1])
     # Around the other sinusoids the noise is fitted, too.
     alone = (apart[1:] > widest).all(axis=0)
 
@@ -188,17 +188,17 @@ def _fit(
     if not level[channel] <= constants.SINUSOID_RESIDUAL * far[channel]:
         return None
     for size, fit in zip(sizes, fits, strict=True):
-        foot = _foot(len(size))
-        if (left(fit, foot, foot + _NEAR) <= _AS_LITTLE * level).all():
+        width = _half_width(len(size))
+        if (left(fit, width, width + _NEAR) <= _FIT_RATIO * level).all():
             return size, level
     return sizes[-1], level
 
 
-def _energy(rest: ComplexArray, level: FloatArray) -> float:
+def _residual_power(rest: ComplexArray, level: FloatArray) -> float:
     return float(np.sum(np.abs(rest) ** 2 / level))
 
 
-def _foot(terms: int) -> int:
+def _half_width(terms: int) -> int:
     return terms // 2 + 1
 
 

@@ -46,15 +46,15 @@ def add_to_sums(sums: FloatArray, rows: np.ndarray, innovation: FloatArray) -> F
     return np.asarray(sums + np.array([innovation @ own, own.sum(axis=0)]))
 
 
-def suspect(sums: FloatArray, first: int, leaps: list[int]) -> int | None:
+def suspect(sums: FloatArray, first: int, loop_changes: list[int]) -> int | None:
     """Return the log since which the following error, or else innovations, differ suspiciously.
 
     `sums` are the running sums before the first log and after every log so far, `first` is the
-    first log of the regime, and `leaps` are those of `unexplained_leaps`, which locate a retuning
-    better than innovations do.
+    first log of the regime, and `loop_changes` those of `unexplained_loop_changes`, which
+    locate a retuning better than innovations do.
     """
     k = len(sums) - 2
-    recent = [j for j in leaps if first <= j < k]
+    recent = [j for j in loop_changes if first <= j < k]
     if recent and k - recent[-1] <= constants.LOOP_LOGS:
         return recent[-1]
     start = k + 1 - _WINDOWS
@@ -158,7 +158,7 @@ def _gains(
     return gains
 
 
-def unexplained_leaps(loop_error: FloatArray, steps: tuple[Step, ...]) -> list[int]:
+def unexplained_loop_changes(loop_error: FloatArray, steps: tuple[Step, ...]) -> list[int]:
     """List logs since which two following errors in a row differ from the dozen before.
 
     Logs about a step that is in the model are left out.
@@ -176,8 +176,8 @@ def unexplained_leaps(loop_error: FloatArray, steps: tuple[Step, ...]) -> list[i
     enough = (there.sum(axis=1) >= constants.LOOP_FEWEST) & (std > 0)
     reach = std * stats.t.isf(constants.LOOP_P_VALUE / 2, n - 1)
     off = np.stack([values[:-1], values[1:]]) - mean
-    leaps = (np.abs(off) > reach).all(axis=0) & (off[0] * off[1] > 0) & enough
-    return [j for j in np.flatnonzero(leaps).tolist() if not _is_explained(steps, j)]
+    loop_changes = (np.abs(off) > reach).all(axis=0) & (off[0] * off[1] > 0) & enough
+    return [j for j in np.flatnonzero(loop_changes).tolist() if not _is_explained(steps, j)]
 
 
 def _is_explained(steps: tuple[Step, ...], j: int) -> bool:

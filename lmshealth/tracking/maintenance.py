@@ -32,7 +32,7 @@ class Action:
 
 
 @dataclass(frozen=True, slots=True)
-class Unread:
+class UnreadableRow:
     """A refused row or table of ``maintenance.csv``."""
 
     refusal: Refusal  # under the name of the table
@@ -44,7 +44,7 @@ class Maintenance:
     """Actions, and rows that cannot be read."""
 
     actions: tuple[Action, ...] = ()  # in the order of time
-    unread: tuple[Unread, ...] = ()  # possible further actions
+    unread: tuple[UnreadableRow, ...] = ()  # possible further actions
 
     def of(self, machine: str) -> Maintenance:
         """Return the part that concerns one machine; rows without a machine concern all."""
@@ -62,7 +62,9 @@ def read_maintenance(folder: Path) -> Maintenance:
     """Read every ``maintenance.csv`` below a folder, or raise `BadTable` if it is none."""
     found = find_sheets(folder, _FILE)
     work = _read((path, name_of(path, folder)) for path in found.logs)
-    return replace(work, unread=(*(Unread(one, None) for one in found.refused), *work.unread))
+    return replace(
+        work, unread=(*(UnreadableRow(one, None) for one in found.refused), *work.unread)
+    )
 
 
 def read_actions(path: Path) -> tuple[Action, ...]:
@@ -76,7 +78,7 @@ def read_actions(path: Path) -> tuple[Action, ...]:
 def _read(tables: Iterable[tuple[Path, str]]) -> Maintenance:
     """Read tables, each with the name that its refusals have."""
     actions: list[Action] = []
-    unread: list[Unread] = []
+    unread: list[UnreadableRow] = []
     for path, name in tables:
         try:
             for row in read_sheet(path, _NEEDED):
@@ -84,9 +86,9 @@ def _read(tables: Iterable[tuple[Path, str]]) -> Maintenance:
                     actions.append(_action(row))
                 except Unusable as error:
                     refusal = Refusal(name, "bad-row", f"{row.where}: {error.detail}")
-                    unread.append(Unread(refusal, _machine(row)))
+                    unread.append(UnreadableRow(refusal, _machine(row)))
         except Unusable as error:
-            unread.append(Unread(Refusal(name, error.reason, error.detail), None))
+            unread.append(UnreadableRow(Refusal(name, error.reason, error.detail), None))
     return Maintenance(tuple(sorted(actions, key=lambda a: a.recorded_at)), tuple(unread))
 
 

@@ -25,7 +25,7 @@ from lmshealth.tracking.change_detection import (
     add_to_sums,
     suspect,
     threshold,
-    unexplained_leaps,
+    unexplained_loop_changes,
     weigh_changes,
 )
 from lmshealth.tracking.filter_bank import (
@@ -239,10 +239,10 @@ def track(history: History, stage: Stage | None = None) -> Track:
             "a mode without a name is known once three logs show it"
         )
     model = FilterModel(StateSpace(history, stage, history.steps))
-    return _Driver(model).run()
+    return _Tracker(model).run()
 
 
-class _Driver:
+class _Tracker:
     """Filters a history log by log and filters again from a checkpoint where a step is detected.
 
     A regime begins at a reset and at a detected step: the state continues, the process noise has
@@ -266,7 +266,7 @@ class _Driver:
         self.mean, self.cov = np.empty((n, size)), np.empty((n, size, size))
         self.noise_scale = np.empty((n, len(model.sources)))
         self.widening = np.empty(0)
-        self.leaps = unexplained_leaps(self.history.loop_error, model.space.steps)
+        self.loop_changes = unexplained_loop_changes(self.history.loop_error, model.space.steps)
         # Detected changes by the number of their step, with the log that detected them.
         self.changes: dict[int, tuple[Change, int]] = {}
         self.alarms: list[Event] = []
@@ -313,7 +313,7 @@ class _Driver:
 
     def _detect(self, k: int) -> None:
         """Weigh a suspected change, and raise the alarm of a drift."""
-        suspected = suspect(self.sums[: k + 2], self.first, self.leaps)
+        suspected = suspect(self.sums[: k + 2], self.first, self.loop_changes)
         if self.open is not None and suspected is not None:
             # A significant change keeps its place until it is settled.
             suspected = self.open.first
@@ -352,7 +352,7 @@ class _Driver:
             self.model = self.model.with_step(step)
             steps = self.model.space.steps
             self.changes[len(steps) - 1] = (change, k)
-            self.leaps = unexplained_leaps(self.history.loop_error, steps)
+            self.loop_changes = unexplained_loop_changes(self.history.loop_error, steps)
             before = before.padded(self.model.space.size)
         self._extend_widening(k, self._dof())
         self._begin_regime(before, j + 1)

@@ -63,18 +63,22 @@ def test_all_tapers_are_in_one_transform() -> None:
 def test_the_tail_in_a_resonance_is_that_of_a_simulated_one(width: float) -> None:
     """At three limits the share of 20,000 draws is as computed within 4σ, and not as in noise."""
     limits = np.array([0.5, 1.5, 4.0])
-    p = np.exp(-linetest._narrow(limits, width))
+    p = np.exp(-linetest._resonance_evidence(limits, width))
     share = shares(np.random.default_rng(2), width, limits)
     std = np.sqrt(p * (1 - p) / 20_000)
     assert np.all(np.abs(share - p) < 4 * std + 0.02 * p)
-    assert share[0] - np.exp(-linetest._white(limits))[0] > 4 * std[0]
+    assert share[0] - np.exp(-linetest._noise_evidence(limits))[0] > 4 * std[0]
 
 
 def test_a_resonance_wider_than_all_is_white() -> None:
     """The computed tail goes over into that of Fisher's F, and falls as the width grows."""
     limits = np.array([0.5, 3.0, 20.0])
-    np.testing.assert_allclose(linetest._narrow(limits, 1e5), linetest._white(limits), rtol=1e-9)
-    evidence = np.array([linetest._narrow(limits, w) for w in (0.1, 0.5, 2.0, 8.0, 30.0)])
+    np.testing.assert_allclose(
+        linetest._resonance_evidence(limits, 1e5), linetest._noise_evidence(limits), rtol=1e-9
+    )
+    evidence = np.array(
+        [linetest._resonance_evidence(limits, w) for w in (0.1, 0.5, 2.0, 8.0, 30.0)]
+    )
     assert np.all(np.diff(evidence, axis=0) > 0)
 
 

@@ -19,7 +19,7 @@ from lmshealth.tracking.change_detection import (
     loop_evidence,
     suspect,
     threshold,
-    unexplained_leaps,
+    unexplained_loop_changes,
 )
 from lmshealth.tracking.filter_bank import FilterModel, restart
 from lmshealth.tracking.history import History, Step
@@ -201,11 +201,11 @@ def test_leaps_of_the_loop_are_suspected() -> None:
     lone = error.copy()
     lone[15] *= 1.5
     error[20:] *= 1.5
-    leaps, sums = unexplained_leaps(error, ()), np.zeros((31, 2, 4))
+    leaps, sums = unexplained_loop_changes(error, ()), np.zeros((31, 2, 4))
     assert suspect(sums[:22], 1, leaps) is None
     assert suspect(sums[:23], 1, leaps) == 20
-    assert 15 not in unexplained_leaps(lone, ())
-    assert 20 not in unexplained_leaps(error, (since("servo", 20, 30),))
+    assert 15 not in unexplained_loop_changes(lone, ())
+    assert 20 not in unexplained_loop_changes(error, (since("servo", 20, 30),))
 
 
 def test_windows_do_not_reach_before_the_segment() -> None:
