@@ -33,7 +33,7 @@ COMMON_SHIFT, OWN_SHIFT = 1 / 2, 1 / 6
 
 # Least duration of a segment in periods of the top of the band, without a description; with one,
 # `stage.constants.LEAST_RESOLUTION` holds.
-LEAST_PERIODS = 10.0
+SEGMENT_PERIODS = 10.0
 # Least number of Fourier frequencies in the band, without a description.
 LEAST_FREQUENCIES = 50
 # Largest factor between the bandwidths of modes that are fitted together: a narrow peak on a broad
@@ -65,7 +65,7 @@ MOST_DAMPING = 0.1
 # Least distance of two modes in half-power bandwidths, where channels see them alike (modal
 # assurance criterion above the third) and otherwise: strength and damping of closer modes cannot be
 # estimated separately, and their likelihood is not normal.
-APART_ALIKE, APART, ALIKE = 1.0, 0.2, 0.8
+SEPARATION_ALIKE, SEPARATION, ALIKE_MAC = 1.0, 0.2, 0.8
 # Standard deviations of the priors. Weak ones about the start, which bound directions that data do
 # not constrain: ln f, ln ζ, forces of modes, shapes, and level, slope and bend of ln noise floors.
 PRIOR_LN_F, PRIOR_LN_ZETA, PRIOR_FORCE, PRIOR_SHAPE = 0.2, 2.0, 30.0, 30.0
@@ -110,7 +110,7 @@ DISTORTED, LESS_DISTORTED = 6.6, 1 / 3
 FRF_MISSED = 1 / 3
 # Harmonics below this share of the strongest amplitude of the input have none; an output above the
 # second share there shows that a response is missed because it is nonlinear.
-SILENT, STRAY = 0.01, 0.05
+NO_INPUT, STRAY = 0.01, 0.05
 # Lines of a periodic excitation within this many half-power bandwidths that a mode needs: with two
 # complex values the four real unknowns of a mode are solved for, with a third they are checked.
 LINES_OF_MODE, BANDWIDTHS_OF_LINES = 3, 3

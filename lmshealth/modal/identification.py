@@ -181,7 +181,7 @@ def _transform(
     else:
         reach = band[1] if band else np.inf
         ceiling = _CEILING * reach
-        shortest = constants.LEAST_PERIODS / min(reach, constants.USABLE * rate)
+        shortest = constants.SEGMENT_PERIODS / min(reach, constants.USABLE * rate)
     phases = find_phases(log)
     segments = stationary(phases, round(shortest * rate))
     if highest > rate / 2:

@@ -1,4 +1,4 @@
-"""Fleets drawn from the model by which priors are learned, and lives of their machines."""
+"""Fleets drawn from the model by which priors are estimated, and lives of their machines."""
 
 from __future__ import annotations
 

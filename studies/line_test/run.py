@@ -4,7 +4,7 @@ Method
     Noise without lines counts the alarms: white and coloured noise and resonances of 0.2 % damping
     and more, 3 s and 30 s; then single resonances of 0.2 %, from a quarter of an ordinate to four
     ordinates wide, for the limit. A rate is exceeded if its whole 99 % Clopper-Pearson interval is
-    above the declared one. Detection is compared with the best detector that knows the noise and
+    above the declared one. Detection is compared with the best detector for given noise and
     with the Cramér-Rao bounds: alone, near a strong line, in short strokes. A mode at 105 Hz is
     identified with and without a line; its move is expressed in σ of its frequency. Controls that
     must fail: a threshold that does not divide the declared rate among the frequencies; the highest

@@ -4,7 +4,7 @@ Not made is what changes nothing that a module computes: in type annotations, de
 docstrings and ``__all__``; in errors, assertions, warnings, logging, and strings that are text
 (they have a space, are formatted, or have triple quotes); in aliases of types and ``cast``; in
 ``strict`` of ``zip``, which asks for what holds. Nor is a change that leaves the syntax tree as it
-was. Whether another mutant computes the same cannot be told by rule: it is made.
+was. Whether another mutant computes the same is not decided by a rule: it is made.
 """
 
 from __future__ import annotations

@@ -20,7 +20,7 @@ Answer
     Yes, but for one figure that the ASCII file itself cannot give (``not_met``).  A sine half way
     between two harmonics reads 36 % low, and a fifth of its power stands outside of the nearest
     two.  White noise of an encoder leaks into the low end of a displacement's spectrum.  That a
-    frequency grows beyond chance says little: nine in ten printed and simulated rows do.
+    frequency grows beyond chance is no evidence: nine in ten printed and simulated rows do.
 Run time
     A minute and a half on one processor.
 Data

@@ -10,16 +10,16 @@ Method
     as states of the same laws, in steps of 10 km; it leaves out runs that do not end, so that it
     is given with all runs too, and all ways answer for six healthy lives. Bound: Fisher's
     information of the laws' parameters (see `lives.bound`), once with the map known to be right,
-    as it is here, and once to 5 %, as all estimators believe. Prognostic horizon: the life left
+    as it is here, and once to 5 %, as all estimators assume. Prognostic horizon: the life left
     when half of the draws lie within a tenth of the whole life, and stay there. A cut at a share of
-    the true life is known to nobody and biases a perfect posterior too: calibration is judged on
+    the true life is not observable and biases a perfect posterior too: calibration is judged on
     other lives, in sbc_life. Control: draws with a tenth of the spread must not cover.
 Answer
     See the claims. The prognostic horizon is 51 % of life in the median, that of the line 32 %
     where it is ever good (39 of 48). Of services at a risk of 5 % none comes too late, of the
     line's four to seven of 48. No better than others at 30 % of life, where a twentieth of the
     draws never end; intervals near the end are too wide (1.7 times the life left at 90 %), because
-    the map is right and believed to 5 % only.
+    the map is exact and assumed right to 5 % only.
 Run time
     Half an hour on one processor. progpy comes with the extra ``peers``; without it its rows are
     missing.

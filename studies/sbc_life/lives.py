@@ -1,4 +1,4 @@
-"""Whole lives drawn from the estimator's own model, with all that it does not know of them."""
+"""Whole lives drawn from the estimator's own model, with all that is unknown to it."""
 
 from __future__ import annotations
 

@@ -4,8 +4,8 @@ Method
     Lives are drawn from the tracker's own model: 20 to 40 logs of two modes, correlated errors of
     varying size, a tenth of the estimates and temperatures missing, the setting by the tracker's
     prior. Squared errors at one log of each life, and all innovations, are summed under the true
-    setting and compared with their 99.9 % band of χ². The tracker does not know the setting: the
-    quantiles of its average over settings, and its published mean and standard deviation, are
+    setting and compared with their 99.9 % band of χ². The setting is not an input of the tracker:
+    the quantiles of its average over settings, and its published mean and standard deviation, are
     judged by the coverage of 50 and 90 % intervals (99.9 % Clopper-Pearson), one mode at one log of
     each life. Lives that two sources see with errors correlated by 0.9 are tracked by both and by
     one alone. Controls that must fail: half the reported covariance; intervals of half the width;

@@ -8,9 +8,9 @@ Method
     commissioning. Judged is one interval a life, of one mode after one log (99.9 %
     Clopper-Pearson); where the true drift is zero, a filter that allows for healthy machines covers
     more than it states: of healthy lives only too low a coverage is a failure. A loss of 5 % of
-    preload is spread evenly over 60 logs; its optimum knows onset, direction and course, and either
-    knows or has to estimate the initial modes and the effect of temperature. Controls that must
-    fail: covariances halved while the filter may not estimate their size; the retuning neither
+    preload is spread evenly over 60 logs; its optimum is given onset, direction and course, and is
+    either given or has to estimate the initial modes and the effect of temperature. Controls that
+    must fail: covariances halved while the filter may not estimate their size; the retuning neither
     declared nor visible; temperature unknown; payload unknown. With ``--raw`` lives are simulated
     at 20 kHz and identified log by log, and judged alike in raw.json.
 Answer

@@ -122,8 +122,8 @@ def _closest(found: ClusterModes) -> tuple[int, int] | None:
     shapes = shapes / np.linalg.norm(shapes, axis=1, keepdims=True)
     for i, j in combinations(range(f.size), 2):
         apart = abs(f[i] - f[j]) / (zeta[i] * f[i] + zeta[j] * f[j])
-        alike = float(shapes[i] @ shapes[j]) ** 2 > constants.ALIKE
-        if apart < (constants.APART_ALIKE if alike else constants.APART):
+        alike = float(shapes[i] @ shapes[j]) ** 2 > constants.ALIKE_MAC
+        if apart < (constants.SEPARATION_ALIKE if alike else constants.SEPARATION):
             return i, j
     return None
 

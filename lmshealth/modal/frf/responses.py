@@ -157,7 +157,7 @@ def _stray(spectra: ComplexArray) -> float:
     """Compare the output at harmonics with and without input, ``(2, n_periods, n_harmonics)``."""
     power = np.abs(spectra.mean(axis=1)[:, 1:]) ** 2
     noise = np.var(spectra[1, :, 1:], axis=0, ddof=1) / spectra.shape[1]
-    silent = power[0] < constants.SILENT**2 * power[0].max()
+    silent = power[0] < constants.NO_INPUT**2 * power[0].max()
     loud = power[0] >= constants.EXCITED**2 * power[0].max()
     if not silent.any():
         return float("nan")
