@@ -56,13 +56,13 @@ class MachineEvidence:
     """Evidence of one machine for the prior of the others.
 
     `laws` by health parameter and kind of law; `scatter` by field of `ScatterPrior`, of each value;
-    `informed` is the share of the prior variance of a law's pace that the logs removed, the least
-    of all probable laws of identifiable parameters with a limit.
+    `pace_informed` is the share of the prior variance of a law's pace that the logs removed, the
+    least of all probable laws of identifiable parameters with a limit.
     """
 
     laws: dict[str, dict[str, LawEvidence]]
     scatter: dict[str, tuple[LawEvidence, ...]]
-    informed: float
+    pace_informed: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,7 +110,7 @@ def machine_evidence(stage: Stage, life: LifePosterior) -> MachineEvidence:
     """
     limited = {j for j, _ in identifiable_limits(stage, life.modes)}
     laws: dict[str, dict[str, LawEvidence]] = {}
-    informed = 1.0
+    pace_informed = 1.0
     for j, parameter in enumerate(stage.parameters):
         total = sum(law.weight for law in parameter.laws)
         laws[parameter.name] = {}
@@ -122,9 +122,9 @@ def machine_evidence(stage: Stage, life: LifePosterior) -> MachineEvidence:
             if _pace_field(law) and after:
                 pace = pace_likelihood(z, weight / after)
                 if j in limited and after >= constants.MIN_LAW_PROBABILITY:
-                    informed = min(informed, 1 - float(np.cov(z, aweights=weight)))
+                    pace_informed = min(pace_informed, 1 - float(np.cov(z, aweights=weight)))
             laws[parameter.name][law.kind] = LawEvidence(law.weight / total, after, pace)
-    return MachineEvidence(laws, _scatter_evidence(stage, life), informed)
+    return MachineEvidence(laws, _scatter_evidence(stage, life), pace_informed)
 
 
 def pace_likelihood(z: FloatArray, weight: FloatArray) -> FloatArray:
@@ -145,7 +145,7 @@ def needs_fleet_prior(evidence: MachineEvidence) -> bool:
 
     So do those of a machine without wear, until a law by which it would wear is improbable.
     """
-    return evidence.informed < INFORMED
+    return evidence.pace_informed < INFORMED
 
 
 def fleet_priors(stage: Stage, evidence: Mapping[str, MachineEvidence]) -> dict[str, FleetPrior]:

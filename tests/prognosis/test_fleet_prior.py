@@ -77,7 +77,7 @@ def scattering(walk: tuple[float, ...] = WALKS) -> dict[str, tuple[LawEvidence, 
 
 
 def measured(
-    z: float, error: float, wears: float = 0.5, *, informed: float = 0.9
+    z: float, error: float, wears: float = 0.5, *, pace_informed: float = 0.9
 ) -> MachineEvidence:
     """Make the evidence of a machine with a measured pace, if it wears."""
     pace = pace_likelihood(gaussian(z, error), np.full(N, 1 / N))
@@ -88,7 +88,7 @@ def measured(
         },
         "mount_stiffness": {"none": LawEvidence(1.0, 1.0, FLAT)},
     }
-    return MachineEvidence(laws, scattering(), informed)
+    return MachineEvidence(laws, scattering(), pace_informed)
 
 
 def silent() -> MachineEvidence:
@@ -208,8 +208,8 @@ def test_scatter_of_a_fleet_is_estimated(stage: Stage) -> None:
 def test_a_machine_does_not_change_its_own_prior(stage: Stage) -> None:
     """The evidence of a machine changes the priors of others, and not its own."""
     others = {str(k): measured(0.2 * k, 0.2, 0.9) for k in range(6)}
-    slow = others | {"a": measured(2.0, 0.5, 0.9, informed=0.1), "b": silent()}
-    fast = others | {"a": measured(-2.0, 0.5, 0.1, informed=0.1), "b": silent()}
+    slow = others | {"a": measured(2.0, 0.5, 0.9, pace_informed=0.1), "b": silent()}
+    fast = others | {"a": measured(-2.0, 0.5, 0.1, pace_informed=0.1), "b": silent()}
     of_slow, of_fast = fleet_priors(stage, slow), fleet_priors(stage, fast)
     assert of_slow["a"] == of_fast["a"]
     assert of_slow["a"].n_machines == 7
@@ -350,9 +350,9 @@ def test_a_machine_needs_the_fleet_prior_until_its_life_is_informed(
     old = machine_evidence(stage, fitted(lived(np.linspace(0.0, 2e6, 12), 4000.0), stage))
     new = machine_evidence(stage, fitted(lived(np.linspace(0.0, 4e4, 6), 4000.0), stage))
     assert not needs_fleet_prior(old)
-    assert old.informed > 0.95
+    assert old.pace_informed > 0.95
     assert needs_fleet_prior(new)
-    assert new.informed < 0.3
+    assert new.pace_informed < 0.3
     assert len(pack(old)) < 30_000
 
 
@@ -377,7 +377,7 @@ def test_a_law_that_is_ruled_out_changes_its_share_alone(small_grid: None, stage
     assert preload.posterior < 0.05
     ruled_out = replace(preload, posterior=0.0, pace=np.zeros_like(preload.pace))
     laws = {"hertz-wear": ruled_out, "none": LawEvidence(0.5, 1.0, FLAT)}
-    sound = replace(still, laws=still.laws | {"guide_preload": laws}, informed=0.0)
+    sound = replace(still, laws=still.laws | {"guide_preload": laws}, pace_informed=0.0)
     share, prior = wear_of(fleet_priors(stage, {str(k): sound for k in range(5)})["0"])
     assert share < 0.2
     assert prior == Lognormal(8000, 1.0)
