@@ -22,7 +22,9 @@ if TYPE_CHECKING:
 Start = Callable[[np.random.Generator], FloatArray]
 """Draw the start of an ensemble inside the support: ``(n_walkers, n_dim)``."""
 
-_FIRST_STEPS, _MIN_WALKERS, _START_ATTEMPTS = 250, 32, 100
+_FIRST_STEPS, _START_ATTEMPTS = 250, 100
+# Vectorised, many walkers cost little more than few.
+_MIN_WALKERS, _WALKERS_PER_DIMENSION = 32, 16
 # Draws of the prior, and of the importance sampler, that starts are chosen from.
 _N_PRIOR, _N_START = 1000, 1000
 
@@ -146,17 +148,12 @@ def _diagnose(what: str, chains: FloatArray, **options: Any) -> FloatArray:
     return np.array([float(diagnostic(column, **options)) for column in columns])
 
 
-def _n_walkers(n_dim: int) -> int:
-    """Return the number of walkers; vectorised, many cost little more than few."""
-    return max(_MIN_WALKERS, 16 * n_dim)
-
-
 def start_near(centre: FloatArray, cov: FloatArray, log_probability: LogProbability) -> Start:
     """Start from a normal distribution of twice the standard deviations, inside the support."""
     factor = 2 * np.linalg.cholesky(cov)
 
     def start(rng: np.random.Generator) -> FloatArray:
-        n = _n_walkers(centre.size)
+        n = max(_MIN_WALKERS, _WALKERS_PER_DIMENSION * centre.size)
         found = np.empty((0, centre.size))
         for _ in range(_START_ATTEMPTS):
             points = centre + rng.standard_normal((n, centre.size)) @ factor.T
@@ -173,7 +170,7 @@ def start_among(points: FloatArray, weight: FloatArray) -> Start:
     """Start from distinct draws ``(n, n_dim)`` of the posterior by weight ``(n,)``, tempered."""
 
     def start(rng: np.random.Generator) -> FloatArray:
-        n = _n_walkers(points.shape[1])
+        n = max(_MIN_WALKERS, _WALKERS_PER_DIMENSION * points.shape[1])
         if points.shape[0] < n:
             found = (
                 f"{points.shape[0]} draws lie inside the modal map, {n} are needed to start from"

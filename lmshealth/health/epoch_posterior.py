@@ -88,10 +88,6 @@ class EpochPosterior:
         margin = constants.EDGE_SHARE * (self.prior.high - self.prior.low)
         return np.asarray((low < self.prior.low + margin) | (high > self.prior.high - margin))
 
-    def widened(self) -> EpochPosterior:
-        """Return the posterior under priors twice as wide."""
-        return EpochPosterior(self.prior.widened(constants.PRIOR_FACTOR), self.machines)
-
 
 def with_single_changes(stage: Stage, x: FloatArray) -> FloatArray:
     """Stack points with copies in which all parameters but one are at baseline.

@@ -292,7 +292,8 @@ def _wider_quantiles(
 
     NaN for a parameter whose prior the map hardly lets widen.
     """
-    x, prior, wider = drawn.flat, posterior.prior, posterior.widened()
+    x, prior = drawn.flat, posterior.prior
+    wider = replace(posterior, prior=prior.widened(constants.PRIOR_FACTOR))
     log_weight = wider.prior.log_density(x) - prior.log_density(x)
     weight = np.exp(log_weight - log_weight.max())
     if weight.sum() ** 2 / np.sum(weight**2) < _MIN_SHARE * weight.size:

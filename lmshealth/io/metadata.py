@@ -39,13 +39,15 @@ def parse_metadata(text: Mapping[str, str]) -> tuple[Metadata, float | None]:
     travel = _number(given, "travel_km", scale=1e3)
     if travel is not None and travel < 0:
         raise _bad(given, "travel_km", "an odometer of 0 or more")
+    if (flag := given.get("baseline", "").lower()) and flag not in _BOOLEANS:
+        raise _bad(given, "baseline", "true or false")
     metadata = Metadata(
         stage=parse_name(given, "stage"),
         recorded_at=parse_moment(given),
         travel=travel,
         covariates={key: value for key in COVARIATES if (value := _number(given, key)) is not None},
         servo_id=parse_name(given, "servo_id"),
-        baseline=_boolean(given),
+        baseline=_BOOLEANS.get(flag),
         description=parse_name(given, "description"),
         velocity=_number(given, "velocity_mm_s", scale=1e-3),
     )
@@ -99,12 +101,6 @@ def _number(given: Mapping[str, str], key: str, *, scale: float = 1.0) -> float 
     if not math.isfinite(value):
         raise _bad(given, key, "a finite number")
     return value
-
-
-def _boolean(given: Mapping[str, str]) -> bool | None:
-    if "baseline" in given and given["baseline"].lower() not in _BOOLEANS:
-        raise _bad(given, "baseline", "true or false")
-    return _BOOLEANS.get(given.get("baseline", "").lower())
 
 
 def as_text(value: object) -> str:

@@ -165,7 +165,7 @@ def first_passage(
     """Draw the travel from now to the first passage of a limit.
 
     Without deviation the passage is that of the law, in closed form. With deviation, ln health is
-    drawn at grid points with Brownian bridges between them; README.md has the equations. The result
+    drawn at grid points with Brownian bridges between them [Borodin2002]; see README.md. The result
     in m, shape ``(n,)``, is negative, by the law, if the limit has been passed, and infinite if it
     is never reached or, with deviation, not before the horizon.
 
@@ -177,10 +177,6 @@ def first_passage(
         Deviation of ln health from its law now, and its variance per m, shape ``(n,)``.
     now, limit, horizon : float
         Travel in m since the baseline, limit as a fraction of it, and m from now to the horizon.
-
-    References
-    ----------
-    [Borodin2002]
     """
     left = path.passage(theta, limit * np.exp(-off)) - now
     # A law that gains may have been below the limit before, and is above it now.

@@ -36,7 +36,7 @@ def detect_sinusoids(
     band: tuple[float, float],
     false_alarm: float,
 ) -> FloatArray:
-    """Detect the sinusoids that several segments have in common; README.md has test and limits.
+    """Detect the sinusoids that several segments have in common [Thomson1982], [Riedel1995].
 
     Parameters
     ----------
@@ -54,10 +54,6 @@ def detect_sinusoids(
     -------
     ndarray
         Frequency in Hz and amplitude of each, ascending, shape ``(n_lines, 2)``.
-
-    References
-    ----------
-    Thomson1982, Riedel1995
     """
     low, high = band
     cuts = _octaves(max(low, high / 2**_MOST_OCTAVES), high)

@@ -23,7 +23,8 @@ def ambient_bound(
     """Bound the covariance of [ln f, ln ζ], ``(2, 2)``, by ambient accelerations in white noise.
 
     Of the channels' covariance S D φφᵀ + S_e I one eigenvalue is S D + S_e and all others are S_e:
-    further channels inform about the noise, and about the mode only by the sum of their SNR.
+    further channels inform about the noise, and about the mode only by the sum of their SNR. See
+    [Au2014].
 
     Parameters
     ----------
@@ -34,10 +35,6 @@ def ambient_bound(
         Of the record in s. For n records of one length divide the result by n.
     band, n_channels : (float, float), int
         Band in Hz in which the noise is white with an unknown level, and channels with that noise.
-
-    References
-    ----------
-    Au2014
     """
     f = fourier_frequencies(duration, band)
     beta2 = (frequency / f) ** 2

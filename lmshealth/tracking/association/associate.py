@@ -146,6 +146,8 @@ def associate(
 ) -> Association:
     """Assign the estimates of all logs to modes; the labels of a log use it and earlier logs.
 
+    `BadTable` if an estimate is not finite or has no positive variance.
+
     Parameters
     ----------
     epochs : sequence of Estimates
@@ -157,11 +159,6 @@ def associate(
         standard deviations of d ln f per unit of each, ``(n_covariates,)``.
     jumps : collection of int
         Epochs at which frequencies may step, as after declared maintenance.
-
-    Raises
-    ------
-    BadTable
-        If an estimate is not finite or has no positive variance.
     """
     state = State.start(prior_std, epochs[0].shapes.shape[1])
     declared, places = frozenset(jumps), clock.tolist()
