@@ -102,16 +102,20 @@ def _mode_records(stage_name: str, condition: Condition) -> list[dict[str, Any]]
 @click.option(
     "--temperature", default=NOMINAL.temperature_c, show_default=True, help="Temperature, °C."
 )
+@click.option(
+    "--position", default=0.0, show_default=True, help="On the travel, mm from its middle."
+)
 @_shown_as
-def modes(stage: str, preload: float, mount: float, temperature: float, file_format: str) -> None:
-    """Print the closed-loop modes of STAGE (lms-x or lms-y).
+def modes(stage: str, preload: float, mount: float, file_format: str, **state: float) -> None:
+    """Print the closed-loop modes of STAGE (lms-x, lms-y, lms-x-full or lms-y-full).
 
     Participation is the displacement that a signal reads in the mode, as a part of the mode's
     largest; then the share of the strain energy in the isolators, the mount and the guide. JSON
     has that of every joint, the motion of every body and, for roll, pitch and yaw, the modal
     signal-to-noise ratio at 10 mm/s.
     """
-    records = _mode_records(stage, Condition(preload, mount, temperature))
+    condition = Condition(preload, mount, state["temperature"], position_mm=state["position"])
+    records = _mode_records(stage, condition)
     if file_format == "json":
         click.echo(json.dumps({"modes": records}, indent=2))
         return

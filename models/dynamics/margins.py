@@ -18,8 +18,14 @@ from scipy.optimize import brentq, minimize_scalar
 
 from models.dynamics.equations import CONTROLLER, OPEN_LOOP, PLANT, READINGS, Ratio, factors, ratio
 from models.dynamics.plant import sensor_rows, structure_state
-from models.dynamics.servo import python_control
-from models.dynamics.stages import NOMINAL, Condition, build_structure, stage_named
+from models.dynamics.servo import MEASURED, controller, current_loop, python_control
+from models.dynamics.stages import (
+    NOMINAL,
+    Condition,
+    build_structure,
+    stage_named,
+    tuning_named,
+)
 from models.dynamics.structure import named_modes
 
 Array = NDArray[np.float64]
@@ -30,6 +36,7 @@ ComplexArray = NDArray[np.complex128]
 GAIN_MARGIN_DB = 6.0
 PHASE_MARGIN_DEG = 30.0
 TABLE_1 = {"lms-x": (12.5, 14.5, 40.5), "lms-y": (10.5, 13.5, 30.3)}
+TABLE_1 |= {f"{name}-full": row for name, row in TABLE_1.items()}
 
 GAIN_CROSSOVER = "gain crossover"
 UPPER_CROSSOVER = "upper phase crossover"
@@ -176,6 +183,17 @@ def flexible_loop(stage: str, reading: str, condition: Condition = NOMINAL) -> A
     )
 
 
+def drive_loop(stage: str, structure: str, condition: Condition = NOMINAL) -> Any:
+    """Return the open loop of a full stage with the tuning of its drive, rigid or flexible."""
+    control = python_control()
+    tuning = tuning_named(stage, condition.servo_id)
+    mass = stage_named(stage).moving_mass.value
+    rigid = control.ss([[0.0, 1.0], [0.0, 0.0]], [[0.0], [1 / mass]], [[1.0, 0.0]], [[0.0]])
+    path = structure_path(stage, condition) if structure == "flexible" else rigid
+    force = control.ss([], [], [], [[tuning.force_constant]])
+    return control.series(controller(tuning), current_loop(tuning), force, path)
+
+
 def sensitivity(loop: Any) -> Any:
     """Return 1/(1+L), reference to error."""
     return python_control().feedback(1, loop)
@@ -299,12 +317,21 @@ def margin_record(case: Case) -> dict[str, Any]:
 def cases(stage: str, condition: Condition = NOMINAL) -> list[Case]:
     """Return the loops of a stage: three readings and the printed product, rigid and flexible.
 
+    A full stage has the loop of its drive alone: the equations say nothing of its lag.
+
     Raises
     ------
     UnknownStage
         If there is no stage of that name.
     """
     name = stage_named(stage).name
+    if name in MEASURED:
+        modes = named_modes(build_structure(stage_named(name), condition))
+        resonances = dict(zip(modes.names, (modes.omega / (2 * np.pi)).tolist(), strict=True))
+        return [
+            Case("measured", kind, "drive", margins(drive_loop(name, kind, condition)), near)
+            for kind, near in (("rigid", {}), ("flexible", resonances))
+        ]
     product = f"({PLANT[name]}) × ({CONTROLLER[name]})"
     written = ratio(OPEN_LOOP[name], "printed").state_space()
     modes = named_modes(build_structure(stage_named(name), condition))

@@ -45,7 +45,8 @@ def body_motions(
     what moves out of phase with it, by damping or by the servo, is left out.
     """
     structure = build_structure(stage, condition)
-    motion = _in_place(stage, structure, mode.shape).real.reshape(-1, len(DIRECTIONS))
+    rigid = slice(len(DIRECTIONS) * len(structure.bodies))
+    motion = _in_place(stage, structure, mode.shape)[rigid].real.reshape(-1, len(DIRECTIONS))
     return {
         body.name: dict(zip(DIRECTIONS, map(float, row), strict=True))
         for body, row in zip(structure.bodies, motion, strict=True)
@@ -57,8 +58,9 @@ def strain_energy(
 ) -> dict[str, list[float]]:
     """Return each joint's share of a mode's strain energy, by group in the order of `corners`.
 
-    The shares of all joints add up to 1: the servo's stiffness is no joint.  Half a group's sum is
-    d ln f / d ln k of its stiffness, as far as the servo does not matter.
+    Elastic modes of bodies are the group ``elastic``, where there are any.  All shares add up to 1:
+    the servo's stiffness is no joint.  Half a group's sum is d ln f / d ln k of its stiffness, as
+    far as the servo does not matter.
     """
     structure = build_structure(stage, condition)
     energy: dict[str, list[float]] = {}
@@ -66,5 +68,9 @@ def strain_energy(
         stretch = stretch_rows(structure.bodies, joint) @ mode.shape
         stored = float(np.array(joint.stiffness) @ np.abs(stretch) ** 2)
         energy.setdefault(joint.group, []).append(stored)
+    if structure.elastic:
+        moved = np.abs(mode.shape[-len(structure.elastic) :])
+        omega = np.array([part.omega for part in structure.elastic])
+        energy["elastic"] = ((omega * moved) ** 2).tolist()
     total = sum(map(sum, energy.values()))
     return {group: [part / total for part in parts] for group, parts in energy.items()}

@@ -11,13 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
+from models.dynamics.quantities import Point
 from models.dynamics.servo import Tuning, servo_matrices
 from models.dynamics.stages import (
     HOUSING,
     NOMINAL,
     PLATFORM,
     Condition,
-    Point,
     Stage,
     build_structure,
     corners,
@@ -50,6 +50,8 @@ _LARGEST_STEP = 0.3
 _TRUSTED_ASSURANCE = 0.9
 _LOST_ASSURANCE = 0.5
 _HALVINGS = 8
+# Travel that changes a stage about as much as a factor e in stiffness.
+_MM_PER_UNIT = 150.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,6 +103,7 @@ def sensor_rows(stage: Stage, structure: Structure) -> dict[str, Array]:
         return displacement_rows(bodies, body, point.value)
 
     encoder = moved(PLATFORM, stage.encoder_point) - moved(HOUSING, stage.encoder_point)
+    encoder[0, 6 * len(bodies) :] += [mode.encoder for mode in structure.elastic]
     return {
         "delta_e": encoder[0],
         "acc_feed": moved(PLATFORM, stage.acc_feed_point)[0],
@@ -268,11 +271,15 @@ def _on_the_way(condition: Condition, part: float) -> Condition:
         temperature_c=NOMINAL.temperature_c * (1 - part) + condition.temperature_c * part,
         added_payload=condition.added_payload * part,
         guide_damping=condition.guide_damping**part,
+        position_mm=condition.position_mm * part,
     )
 
 
 def _distance(stage: Stage, condition: Condition) -> float:
-    """Return how far a condition is from the nominal, in the logarithm of stiffness or mass."""
+    """Return how far a condition is from the nominal, in the logarithm of stiffness or mass.
+
+    A flexible stage also along its travel.
+    """
     warmer = condition.temperature_c - NOMINAL.temperature_c
     moving = build_structure(stage, condition).bodies[PLATFORM].mass
     return max(
@@ -281,6 +288,7 @@ def _distance(stage: Stage, condition: Condition) -> float:
         abs(warmer) * stage.temperature_softening.value,
         abs(math.log(moving / stage.moving_mass.value)),
         abs(math.log(condition.guide_damping)),
+        abs(condition.position_mm) / _MM_PER_UNIT if stage.flexible else 0.0,
     )
 
 

@@ -3,34 +3,25 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
 
-from models.dynamics.servo import TUNINGS, Tuning
+from models.dynamics.elastic import (
+    Attachment,
+    ElasticMode,
+    FreeBeam,
+    Overhang,
+    Part,
+    attached_mode,
+    beam_modes,
+    overhang_mode,
+)
+from models.dynamics.quantities import Number, Point, refuse_unstated
+from models.dynamics.servo import MEASURED, TUNINGS, Tuning
 from models.dynamics.structure import GROUND, Body, Joint, Structure, assemble
 from models.errors import BadParameter, UnknownServo, UnknownStage
-
-SOURCES = ("paper", "catalogue", "calibrated", "our choice")
-
-
-@dataclass(frozen=True, slots=True)
-class Number:
-    """A value (SI) with its unit and where it comes from."""
-
-    value: float
-    unit: str
-    source: str
-
-
-@dataclass(frozen=True, slots=True)
-class Point:
-    """A point or three lengths (m) with where they come from."""
-
-    value: tuple[float, float, float]
-    unit: str
-    source: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,6 +40,8 @@ class Condition:
         Loss of the guide's joints as a fraction of commissioning: the state of the grease.
     servo_id
         Which tuning of the position loop, see `tuning_named`.
+    position_mm
+        Where the platform stands on its travel, from the middle; rigid stages are alike everywhere.
     """
 
     guide_preload: float = 1.0
@@ -57,6 +50,7 @@ class Condition:
     added_payload: float = 0.0
     guide_damping: float = 1.0
     servo_id: str = "commissioning"
+    position_mm: float = 0.0
 
     def __post_init__(self) -> None:
         """Reject conditions in which the laws of contact and mass mean nothing."""
@@ -68,9 +62,36 @@ class Condition:
             raise BadParameter("temperature_c", self.temperature_c, "within -40..120 °C")
         if not math.isfinite(self.added_payload):
             raise BadParameter("added_payload", self.added_payload, "a finite mass, kg")
+        if not abs(self.position_mm) <= 150.0:
+            raise BadParameter("position_mm", self.position_mm, "within ±150 mm of the middle")
 
 
 NOMINAL = Condition()
+GRANITE, HOUSING, PLATFORM = range(3)
+
+
+@dataclass(frozen=True, slots=True)
+class Flexible:
+    """What a stage is beyond rigid bodies that are the same everywhere on their travel.
+
+    Parameters
+    ----------
+    parts
+        Elastic parts of the bodies.
+    block_load_slope
+        Relative change of the load of the front blocks per m of travel, 1/m; opposite at the rear:
+        the moment of the cable chain and of the housing's overhang.
+    bench_offset
+        How far the stage stands beside the middle of the granite, lateral, m.
+    """
+
+    parts: tuple[Part, ...]
+    block_load_slope: Number
+    bench_offset: Number
+
+    def __post_init__(self) -> None:
+        """Reject a number without a source."""
+        refuse_unstated(self)
 
 
 @dataclass(frozen=True, slots=True)
@@ -132,18 +153,11 @@ class Stage:
     acc_feed_point: Point
     acc_pitch_point: Point
     acc_range: Number
+    flexible: Flexible | None = None
 
     def __post_init__(self) -> None:
         """Reject a number without a source, and a mass or stiffness that is not positive."""
-        for field in fields(self):
-            entry = getattr(self, field.name)
-            if isinstance(entry, Number | Point) and entry.source not in SOURCES:
-                raise BadParameter(f"source of {field.name}", entry.source, ", ".join(SOURCES))
-            if isinstance(entry, Number | Point) and not np.all(np.isfinite(entry.value)):
-                raise BadParameter(field.name, f"{entry.value} {entry.unit}", "finite numbers")
-            physical = isinstance(entry, Number) and entry.unit in ("kg", "N/m")
-            if physical and not 0.0 < entry.value < math.inf:
-                raise BadParameter(field.name, f"{entry.value} {entry.unit}", "a positive number")
+        refuse_unstated(self)
 
 
 _LMS_X = Stage(
@@ -216,18 +230,138 @@ _LMS_Y = replace(
 STAGES = {stage.name: stage for stage in (_LMS_X, _LMS_Y)}
 
 
+def _attached(
+    name: str, point: tuple[float, float, float], mass: float, stiffness: float, damping: float
+) -> Attachment:
+    """Return a mass on the platform that moves along the feed on a calibrated spring."""
+    at, kilograms = Point(point, "m", "our choice"), Number(mass, "kg", "our choice")
+    spring = Number(stiffness, "N/m", "calibrated")
+    loss, slope = Number(damping, "1", "our choice"), Number(0.0, "1/m", "our choice")
+    return Attachment(name, PLATFORM, 0, at, kilograms, spring, slope, loss)
+
+
+def _bending(name: str, body: int, length: float, stiffness: float) -> FreeBeam:
+    """Return the first vertical bending of a body, from its dimensions alone."""
+    sizes = Number(length, "m", "our choice"), Number(stiffness, "N m²", "our choice")
+    return FreeBeam(name, body, "vertical", 1, *sizes, Number(0.005, "1", "our choice"))
+
+
+def _load(name: str, bends: int, parity: int, mass: float, stiffness: float) -> Overhang:
+    """Return the load as a bar that overhangs on both sides, across its length alike or not.
+
+    In X it lies across the feed, in Y along it, as the calibrated spreads of the load say.
+    """
+    root, reach = Point((0.0, 0.0, 0.14), "m", "our choice"), Number(0.3, "m", "our choice")
+    kilograms, spring = Number(mass, "kg", "our choice"), Number(stiffness, "N m²", "calibrated")
+    loss = Number(0.012, "1", "our choice")
+    along = 1 if bends == 0 else 0
+    return Overhang(name, PLATFORM, along, bends, parity, root, reach, kilograms, spring, loss)
+
+
+# Housing: aluminium, 0.60 m long, base plate 20 mm and two walls 12 x 60 mm, 70 GPa.  Granite: a
+# block 0.30 m high and 1.0 m wide, 55 GPa, as long as its spread along the feed says.
+# Masses of the attached parts: our choice; resonances of Table 2 that X and Y have alike (255 and
+# 271 Hz, 317 and 341 Hz, 742 and 794 Hz, 923 and 927 Hz) are those of parts that they share.
+_HOUSING = _bending("housing_bending", HOUSING, 0.60, 1.5e5)
+
+
+def _cable(mass: float, stiffness: float) -> Attachment:
+    """Return the loop of cables of the platform: the further it is pulled, the softer."""
+    slope = Number(2.0, "1/m", "our choice")
+    return replace(
+        _attached("cable_feed", (0.0, 0.09, 0.03), mass, stiffness, 0.03), loosening=slope
+    )
+
+
+def _encoder_head(mass: float, stiffness: float) -> Attachment:
+    """Return the head of the encoder on its bracket."""
+    head = _attached("encoder_feed", (0.0, 0.055, -0.010), mass, stiffness, 0.015)
+    return replace(head, encoder=True)
+
+
+_FULL_X = replace(
+    _LMS_X,
+    name="lms-x-full",
+    load_offset_feed=Number(0.025, "m", "our choice"),
+    load_offset_lateral=Number(0.020, "m", "our choice"),
+    guide_loss_time=Number(2.4e-5, "s", "our choice"),
+    isolator_horizontal_loss_time=Number(2.0e-3, "s", "our choice"),
+    housing_box=Point((0.60, 0.165, 0.06), "m", "our choice"),
+    block_stiffness=Number(4.434358e07, "N/m", "calibrated"),
+    isolator_feed=Number(2058052, "N/m", "calibrated"),
+    isolator_vertical=Number(1.788488e07, "N/m", "calibrated"),
+    housing_mass=Number(16.75808, "kg", "calibrated"),
+    load_height=Number(0.1169406, "m", "calibrated"),
+    load_spread_feed=Number(0.03025437, "m", "calibrated"),
+    load_spread_lateral=Number(0.1895174, "m", "calibrated"),
+    load_spread_vertical=Number(0.1037917, "m", "calibrated"),
+    granite_spread_feed=Number(0.4227731, "m", "calibrated"),
+    flexible=Flexible(
+        parts=(
+            _HOUSING,
+            _bending("granite_bending", GRANITE, 1.466, 1.24e8),
+            _cable(0.6, 260947.8),
+            _attached("cover_feed", (-0.08, 0.0, 0.04), 0.2, 525791.6, 0.015),
+            _attached("bracket_feed", (0.0, 0.10, 0.02), 0.4, 1476161, 0.012),
+            _load("load_feed", 0, 1, 8.0, 108338.2),
+            _attached("adapter_feed", (0.0, 0.0, -0.020), 1.0, 1.822732e07, 0.015),
+            _encoder_head(0.1, 3305313),
+        ),
+        block_load_slope=Number(1.0, "1/m", "our choice"),
+        bench_offset=Number(0.0, "m", "our choice"),
+    ),
+)
+_FULL_Y = replace(
+    _LMS_Y,
+    name="lms-y-full",
+    load_offset_feed=Number(0.030, "m", "our choice"),
+    load_offset_lateral=Number(0.020, "m", "our choice"),
+    guide_loss_time=Number(2.4e-5, "s", "our choice"),
+    mount_loss_time=Number(1.2e-5, "s", "our choice"),
+    isolator_horizontal_loss_time=Number(0.5e-3, "s", "our choice"),
+    housing_box=Point((0.60, 0.165, 0.06), "m", "our choice"),
+    mount_half_spacing=Point((0.104, 0.050, -0.060), "m", "our choice"),
+    block_stiffness=Number(4.434358e07, "N/m", "calibrated"),
+    isolator_feed=Number(2058052, "N/m", "calibrated"),
+    isolator_vertical=Number(1.788488e07, "N/m", "calibrated"),
+    housing_mass=Number(16.75808, "kg", "calibrated"),
+    mount_stiffness=Number(1.501022e08, "N/m", "calibrated"),
+    load_height=Number(0.1054973, "m", "calibrated"),
+    load_spread_feed=Number(0.1830049, "m", "calibrated"),
+    load_spread_lateral=Number(0.02971101, "m", "calibrated"),
+    load_spread_vertical=Number(0.05940542, "m", "calibrated"),
+    granite_spread_feed=Number(0.5217993, "m", "calibrated"),
+    flexible=Flexible(
+        parts=(
+            _HOUSING,
+            _bending("granite_bending", GRANITE, 1.810, 1.24e8),
+            _cable(0.6, 86056.53),
+            _load("load_pitch", 2, -1, 3.0, 4865.366),
+            _attached("cover_feed", (-0.08, 0.0, 0.04), 0.2, 574310.3, 0.015),
+            _attached("bracket_feed", (0.0, 0.10, 0.02), 0.4, 1790889, 0.012),
+            _attached("adapter_feed", (0.0, 0.0, -0.020), 1.0, 2.33185e07, 0.015),
+            _encoder_head(0.1, 3368238),
+        ),
+        block_load_slope=Number(1.0, "1/m", "our choice"),
+        bench_offset=Number(0.32, "m", "our choice"),
+    ),
+)
+FULL_STAGES = {stage.name: stage for stage in (_FULL_X, _FULL_Y)}
+
+
 def stage_named(name: str) -> Stage:
-    """Return a stage by its name.
+    """Return a stage by its name, rigid or full.
 
     Raises
     ------
     UnknownStage
-        If the name is neither ``lms-x`` nor ``lms-y``.
+        If there is no stage of that name.
     """
+    stages = STAGES | FULL_STAGES
     try:
-        return STAGES[name]
+        return stages[name]
     except KeyError:
-        raise UnknownStage(name, STAGES) from None
+        raise UnknownStage(name, stages) from None
 
 
 # A later retuning to a wider bandwidth, as a user would do it: more gain, with the notch lower in
@@ -250,7 +384,11 @@ _RETUNED = {
         ),
     ),
 }
-SERVOS = {"commissioning": TUNINGS, "retuned": _RETUNED}
+_RETUNED |= {
+    name: replace(tuning, name="retuned", drive_gain=1.3 * tuning.drive_gain)
+    for name, tuning in MEASURED.items()
+}
+SERVOS = {"commissioning": TUNINGS | MEASURED, "retuned": _RETUNED}
 
 
 def tuning_named(stage: str, servo_id: str) -> Tuning:
@@ -307,7 +445,10 @@ def _with_block(body: Body, mass: float, height: float, radii: tuple[float, floa
 
 
 def _bodies(stage: Stage, condition: Condition) -> list[Body]:
-    """Return granite, housing and platform with its load."""
+    """Return granite, housing and platform with its load.
+
+    The origin is in the middle of the blocks: as the platform moves forward, all else moves back.
+    """
     centre = (
         stage.load_offset_feed.value,
         stage.load_offset_lateral.value,
@@ -321,24 +462,47 @@ def _bodies(stage: Stage, condition: Condition) -> list[Body]:
             stage.payload_height.value,
             _box_radii(stage.payload_box.value),
         )
-    return [
-        Body(
-            "granite",
-            stage.granite_mass.value,
-            (0.0, 0.0, stage.granite_height.value),
-            _radii(stage, "granite"),
-        ),
-        Body(
-            "housing",
-            stage.housing_mass.value,
-            (0.0, 0.0, stage.housing_height.value),
-            _box_radii(stage.housing_box.value),
-        ),
+    back, aside = _granite_middle(stage, condition)
+    granite = (back, aside, stage.granite_height.value)
+    housing = (back, 0.0, stage.housing_height.value)
+    box = _box_radii(stage.housing_box.value)
+    bodies = [
+        Body("granite", stage.granite_mass.value, granite, _radii(stage, "granite")),
+        Body("housing", stage.housing_mass.value, housing, box),
         platform,
     ]
+    if stage.flexible:
+        bodies = [
+            replace(body, elastic=_elastic(stage, stage.flexible.parts, condition, i, body))
+            for i, body in enumerate(bodies)
+        ]
+    return bodies
 
 
-GRANITE, HOUSING, PLATFORM = range(3)
+def _granite_middle(stage: Stage, condition: Condition) -> tuple[float, float]:
+    """Return feed and lateral coordinate of the granite's middle, m: rigid stages stand on it."""
+    if stage.flexible is None:
+        return 0.0, 0.0
+    return 0.0 - 1e-3 * condition.position_mm, 0.0 - stage.flexible.bench_offset.value
+
+
+def _elastic(
+    stage: Stage, parts: tuple[Part, ...], condition: Condition, index: int, body: Body
+) -> tuple[ElasticMode, ...]:
+    """Return the elastic modes of a body; joints soften with temperature, bodies hardly."""
+    modes: list[ElasticMode] = []
+    for part in parts:
+        if part.body != index:
+            continue
+        if isinstance(part, FreeBeam):
+            modes += beam_modes(part, body.mass, body.radii[0])
+        elif isinstance(part, Overhang):
+            carried = 1 + condition.added_payload / stage.payload.value
+            modes.append(overhang_mode(part, np.array(body.centre), carried))
+        else:
+            travel = 1e-3 * condition.position_mm
+            modes.append(attached_mode(part, np.array(body.centre), travel))
+    return tuple(modes)
 
 
 def corners(spacing: Point) -> list[tuple[float, float, float]]:
@@ -382,16 +546,22 @@ def build_structure(stage: Stage, condition: Condition = NOMINAL) -> Structure:
         stage.isolator_vertical.value * soft,
     )
     guide = (0.0, block * stage.block_lateral_ratio.value, block)
+    back, aside = _granite_middle(stage, condition)
     joints = [
-        Joint("isolator", GROUND, GRANITE, p, isolator, (flat, flat, upright))
-        for p in corners(stage.isolator_half_spacing)
+        Joint(
+            "isolator", GROUND, GRANITE, (x + back, y + aside, z), isolator, (flat, flat, upright)
+        )
+        for x, y, z in corners(stage.isolator_half_spacing)
     ]
     joints += [
-        Joint("mount", GRANITE, HOUSING, p, (mount,) * 3, (outer,) * 3)
-        for p in corners(stage.mount_half_spacing)
+        Joint("mount", GRANITE, HOUSING, (x + back, y, z), (mount,) * 3, (outer,) * 3)
+        for x, y, z in corners(stage.mount_half_spacing)
     ]
-    joints += [
-        Joint("guide", HOUSING, PLATFORM, p, guide, (inner,) * 3)
-        for p in corners(stage.block_half_spacing)
-    ]
+    for p in corners(stage.block_half_spacing):
+        springs = guide
+        if stage.flexible:
+            load = 1 - math.copysign(stage.flexible.block_load_slope.value, p[0]) * back
+            share = load**stage.preload_exponent.value
+            springs = (0.0, guide[1] * share, guide[2] * share)
+        joints.append(Joint("guide", HOUSING, PLATFORM, p, springs, (inner,) * 3))
     return assemble(_bodies(stage, condition), joints)

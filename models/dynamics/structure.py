@@ -1,7 +1,7 @@
 """Rigid bodies joined by springs at points: mass, damping and stiffness matrices, named modes.
 
 Coordinates are the six motions (x, y, z, roll, pitch, yaw) of each body's centre of gravity,
-relative to the ground, bodies in the order of the argument.
+relative to the ground, bodies in the order of the argument; then the elastic modes of each body.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from scipy.linalg import eigh
 from scipy.optimize import linear_sum_assignment
 
+from models.dynamics.elastic import ElasticMode
 from models.errors import BadParameter
 
 Array = NDArray[np.float64]
@@ -26,12 +27,16 @@ _FREE_BELOW_RAD_S = 2 * np.pi * 0.5
 
 @dataclass(frozen=True, slots=True)
 class Body:
-    """A rigid body: mass (kg), centre of gravity (m), radii of gyration about x, y, z (m)."""
+    """A body: mass (kg), centre of gravity (m), radii of gyration about x, y, z (m), elastic modes.
+
+    Without elastic modes it is rigid.
+    """
 
     name: str
     mass: float
     centre: tuple[float, float, float]
     radii: tuple[float, float, float]
+    elastic: tuple[ElasticMode, ...] = ()
 
     def __post_init__(self) -> None:
         """Reject a body without inertia, or with moments that no distribution of mass has."""
@@ -72,7 +77,7 @@ class Joint:
 
 @dataclass(frozen=True, slots=True)
 class Structure:
-    """Assembled bodies and joints; the matrices have shape (6 bodies, 6 bodies), SI."""
+    """Assembled bodies and joints; the matrices have shape (dof, dof), SI."""
 
     bodies: tuple[Body, ...]
     joints: tuple[Joint, ...]
@@ -83,7 +88,12 @@ class Structure:
     @property
     def size(self) -> int:
         """Count of degrees of freedom."""
-        return 6 * len(self.bodies)
+        return len(self.mass)
+
+    @property
+    def elastic(self) -> tuple[ElasticMode, ...]:
+        """The elastic modes in the order of their coordinates, the last of the structure."""
+        return tuple(mode for body in self.bodies for mode in body.elastic)
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,11 +114,20 @@ def point_motion(point: Sequence[float], centre: Sequence[float]) -> Array:
     )
 
 
+def degrees_of_freedom(bodies: Sequence[Body]) -> int:
+    """Return the count of coordinates of bodies: six each, and one per elastic mode."""
+    return 6 * len(bodies) + sum(len(body.elastic) for body in bodies)
+
+
 def displacement_rows(bodies: Sequence[Body], body: int, point: Sequence[float]) -> Array:
     """Return (3, dof) rows that read the displacement of a point of a body (ground: zeros)."""
-    rows = np.zeros((3, 6 * len(bodies)))
+    rows = np.zeros((3, degrees_of_freedom(bodies)))
     if body != GROUND:
         rows[:, 6 * body : 6 * body + 6] = point_motion(point, bodies[body].centre)
+        arm = np.subtract(point, bodies[body].centre)
+        first = degrees_of_freedom(bodies[:body]) + 6 * len(bodies[body:])
+        for i, mode in enumerate(bodies[body].elastic):
+            rows[:, first + i] = mode.shape(arm)
     return rows
 
 
@@ -120,12 +139,31 @@ def stretch_rows(bodies: Sequence[Body], joint: Joint) -> Array:
 
 
 def assemble(bodies: Sequence[Body], joints: Sequence[Joint]) -> Structure:
-    """Assemble mass, damping and stiffness matrices of joined bodies."""
-    size = 6 * len(bodies)
+    """Assemble mass, damping and stiffness matrices of joined bodies.
+
+    Raises
+    ------
+    BadParameter
+        If the elastic modes of a body move more mass than it has.
+    """
+    size = degrees_of_freedom(bodies)
     mass, damping, stiffness = (np.zeros((size, size)) for _ in range(3))
+    elastic = 6 * len(bodies)
     for i, body in enumerate(bodies):
         inertia = [body.mass] * 3 + [body.mass * r**2 for r in body.radii]
-        mass[6 * i : 6 * i + 6, 6 * i : 6 * i + 6] = np.diag(inertia)
+        rigid = slice(6 * i, 6 * i + 6)
+        mass[rigid, rigid] = np.diag(inertia)
+        for mode in body.elastic:
+            mass[rigid, elastic] = mass[elastic, rigid] = mode.momentum
+            mass[elastic, elastic] = 1.0
+            damping[elastic, elastic] = 2 * mode.damping_ratio * mode.omega
+            stiffness[elastic, elastic] = mode.omega**2
+            elastic += 1
+        moved = sum(np.outer(mode.momentum, mode.momentum) for mode in body.elastic)
+        rest = float(np.linalg.eigvalsh(np.diag(inertia) - moved)[0])
+        if not rest > 0:
+            needed = "elastic modes that move less than its mass and inertia"
+            raise BadParameter(f"body {body.name}", f"{rest:.3g} without them", needed)
     for joint in joints:
         rows = stretch_rows(bodies, joint)
         k = np.array(joint.stiffness)
@@ -138,7 +176,8 @@ def assemble(bodies: Sequence[Body], joints: Sequence[Joint]) -> Structure:
 
 def rigid_translation(structure: Structure) -> Array:
     """Return the (dof, 3) motion of all bodies together along x, y and z."""
-    return np.tile(np.vstack([np.eye(3), np.zeros((3, 3))]), (len(structure.bodies), 1))
+    rigid = np.tile(np.vstack([np.eye(3), np.zeros((3, 3))]), (len(structure.bodies), 1))
+    return np.vstack([rigid, np.zeros((structure.size - len(rigid), 3))])
 
 
 def _group_energy(structure: Structure, group: str, shapes: Array) -> Array:
@@ -149,6 +188,7 @@ def _group_energy(structure: Structure, group: str, shapes: Array) -> Array:
     """
     joints = [j for j in structure.joints if j.group == group]
     centre = np.mean([j.point for j in joints], axis=0)
+    rigid = 6 * len(structure.bodies)
     motion = np.zeros((6, structure.size))
     for body, sign in ((joints[0].upper, 1.0), (joints[0].lower, -1.0)):
         if body == GROUND:
@@ -156,6 +196,10 @@ def _group_energy(structure: Structure, group: str, shapes: Array) -> Array:
         block = np.eye(6)
         block[:3] = point_motion(tuple(centre), structure.bodies[body].centre)
         motion[:, 6 * body : 6 * body + 6] += sign * block
+    # Of an elastic mode the motion that fits the stretch of all joints best.
+    points = np.vstack([point_motion(j.point, tuple(centre)) for j in joints])
+    stretch = np.vstack([stretch_rows(structure.bodies, j)[:, rigid:] for j in joints])
+    motion[:, rigid:] = np.linalg.pinv(points) @ stretch
     stiffness = np.zeros(6)
     for joint in joints:
         rows = point_motion(joint.point, tuple(centre))
@@ -190,7 +234,8 @@ def named_modes(structure: Structure) -> NamedShapes:
 
     Isolator modes are ``granite_<direction>``.  Guide and mount act in series, hence share a
     direction's energy: of its two modes the lower is the platform's on the guide
-    (``<direction>``), the upper the housing's on the mount (``housing_<direction>``).
+    (``<direction>``), the upper the housing's on the mount (``housing_<direction>``).  An elastic
+    mode of a body is named by itself.
     """
     omega, shapes = undamped_modes(structure)
     granite = energy_shares(structure, "isolator", shapes, omega)
@@ -199,6 +244,8 @@ def named_modes(structure: Structure) -> NamedShapes:
     slots = [(f"granite_{d}", granite[i]) for i, d in enumerate(DIRECTIONS)]
     for i, direction in enumerate(DIRECTIONS):
         slots += [(direction, guide[i] + mount[i])] * (1 if direction == "feed" else 2)
+    for i, mode in enumerate(structure.elastic, 6 * len(structure.bodies)):
+        slots.append((mode.name, (mode.omega * shapes[i] / omega) ** 2))
     score = np.array([share for _, share in slots])
     if score.shape[0] != omega.size:
         raise BadParameter("structure", f"{omega.size} modes", f"{score.shape[0]} elastic modes")

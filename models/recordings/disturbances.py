@@ -75,6 +75,8 @@ class Line:
 FRICTION = {
     "lms-x": Noise(density=0.0105, power=0.35, corner_hz=10.0),
     "lms-y": Noise(density=0.0034, power=0.4, corner_hz=10.0),
+    "lms-x-full": Noise(density=0.0105, power=0.35, corner_hz=10.0),
+    "lms-y-full": Noise(density=0.0034, power=0.4, corner_hz=10.0),
 }
 # Force across the feed, lateral and vertical, one sequence per block and direction: from 1 to
 # 20 mm/s Table 7 hardly grows, from there to 400 mm/s a hundredfold.
@@ -94,6 +96,7 @@ _MAINS = {
     "lms-x": {50.0: 15.0e-3, 100.0: 2.3e-3, 150.0: 10.0e-3, 200.0: 3.2e-3, 250.0: 1.9e-3},
     "lms-y": {50.0: 23.0e-3, 100.0: 3.9e-3, 150.0: 7.0e-3, 250.0: 1.0e-3, 350.0: 5.0e-3},
 }
+_MAINS |= {f"{name}-full": lines for name, lines in _MAINS.items()}
 # The cable of the accelerometer along the feed picks up less: our choice.
 _MAINS_SHARE = {"acc_feed": 0.7, "acc_pitch": 1.0}
 

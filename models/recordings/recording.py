@@ -196,7 +196,9 @@ def record(
     velocity: float = DEFAULT_VELOCITY,
     rng: np.random.Generator,
 ) -> Recording:
-    """Record a move at constant velocity through the middle of the travel.
+    """Record a move at constant velocity through the condition's position on the travel.
+
+    The stage is linear about that position: its modes stay what they are there.
 
     Parameters
     ----------
@@ -209,7 +211,8 @@ def record(
     signals = simulate_signals(stage, condition, seconds=seconds, velocity=velocity, rng=rng)
     samples = signals.shape[1]
     time = (np.arange(samples) - (samples - 1) / 2) / SAMPLE_RATE_HZ
-    return to_recording(stage, condition, signals, velocity * time, np.full(samples, velocity))
+    position = 1e-3 * condition.position_mm + velocity * time
+    return to_recording(stage, condition, signals, position, np.full(samples, velocity))
 
 
 def payload_kg(stage: Stage, condition: Condition) -> float:
@@ -226,7 +229,7 @@ def to_recording(
         "sample_rate_hz": SAMPLE_RATE_HZ,
         "temperature_c": round(condition.temperature_c, 2),
         "payload_kg": payload_kg(stage, condition),
-        "position_mm": 0.0,
+        "position_mm": condition.position_mm,
     }
     stored = {n: v.astype(np.float32) for n, v in zip(COLUMNS, columns, strict=True)}
     return Recording(stored, metadata)

@@ -25,7 +25,8 @@ from models.dynamics.plant import (
     closed_loop_modes,
     structure_state,
 )
-from models.dynamics.stages import NOMINAL, Condition, Number, Stage, build_structure, tuning_named
+from models.dynamics.quantities import Number
+from models.dynamics.stages import NOMINAL, Condition, Stage, build_structure, tuning_named
 from models.errors import BadParameter
 from models.recordings.recording import (
     DEFAULT_VELOCITY,

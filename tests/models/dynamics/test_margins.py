@@ -1,6 +1,8 @@
 """Tests of the margins."""
 
 import json
+from dataclasses import replace
+from unittest.mock import patch
 
 import control
 import numpy as np
@@ -18,6 +20,7 @@ from models.dynamics.margins import (
     Case,
     cases,
     complementary_sensitivity,
+    drive_loop,
     flexible_loop,
     margin_record,
     margins,
@@ -26,8 +29,8 @@ from models.dynamics.margins import (
     structure_path,
 )
 from models.dynamics.plant import closed_loop
-from models.dynamics.servo import controller, current_loop
-from models.dynamics.stages import NOMINAL, STAGES, Condition, stage_named, tuning_named
+from models.dynamics.servo import MEASURED, controller, current_loop
+from models.dynamics.stages import NOMINAL, SERVOS, STAGES, Condition, stage_named, tuning_named
 from models.errors import BadParameter, UnknownStage, UnstableLoop
 
 NAMES = sorted(STAGES)
@@ -337,3 +340,20 @@ def test_command_help_has_an_example():
     """The command's help ends with an example."""
     output = CliRunner().invoke(cli, ["margins", "--help"]).output
     assert "Example: python -m models margins" in output
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", sorted(MEASURED))
+def test_margins_of_the_full_stages_are_those_measured(name):
+    """Bandwidth and margins are within 10 % of Table 1; control: not without lag."""
+
+    def off(**change):
+        tunings = {**SERVOS["commissioning"], name: replace(MEASURED[name], **change)}
+        with patch.dict(SERVOS, commissioning=tunings):
+            found = margins(drive_loop(name, "flexible"))
+        first = of_kind(found, GAIN_CROSSOVER)[0]
+        limits = first.frequency_hz, found.deciding(UPPER_CROSSOVER).margin, first.margin
+        return np.abs(np.array(limits) / TABLE_1[name] - 1)
+
+    assert off().max() < 0.1
+    assert off(delay=1e-4)[1:].min() > 0.15

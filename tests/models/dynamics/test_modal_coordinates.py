@@ -28,7 +28,8 @@ from models.dynamics.plant import (
     closed_loop,
     closed_loop_modes,
 )
-from models.dynamics.stages import HOUSING, PLATFORM, STAGES, Number, build_structure, corners
+from models.dynamics.quantities import Number
+from models.dynamics.stages import HOUSING, PLATFORM, STAGES, build_structure, corners
 from models.dynamics.structure import displacement_rows
 
 RATE = 20000.0

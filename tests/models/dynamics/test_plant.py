@@ -13,13 +13,13 @@ from models.dynamics.plant import (
     closed_loop_modes,
     sensor_rows,
 )
+from models.dynamics.quantities import Number
 from models.dynamics.servo import TUNINGS, controller, current_loop, servo_matrices
 from models.dynamics.stages import (
     HOUSING,
     PLATFORM,
     STAGES,
     Condition,
-    Number,
     build_structure,
     tuning_named,
 )

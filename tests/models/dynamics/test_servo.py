@@ -7,7 +7,14 @@ import numpy as np
 import pytest
 
 from models.dynamics.equations import CONTROLLER, ratio
-from models.dynamics.servo import TUNINGS, controller, current_loop, python_control, servo_matrices
+from models.dynamics.servo import (
+    TUNINGS,
+    controller,
+    current_loop,
+    delay_sections,
+    python_control,
+    servo_matrices,
+)
 from models.errors import BadParameter, MissingLibrary
 
 
@@ -71,3 +78,13 @@ def test_a_missing_library_is_named_with_its_extra(monkeypatch):
     monkeypatch.setitem(sys.modules, "control", None)
     with pytest.raises(MissingLibrary, match=r"control: pip install 'lmshealth\[models\]'"):
         python_control()
+
+
+def test_delay_delays():
+    """The delay lets every frequency pass, and lags by its time up to 0.6 cycles within 1°."""
+    first, second = delay_sections(3e-3)
+    hertz = np.array([5.0, 50.0, 200.0])
+    response = first(2j * np.pi * hertz) * second(2j * np.pi * hertz)
+    np.testing.assert_allclose(np.abs(response), 1.0, rtol=1e-9)
+    lag = np.angle(response * np.exp(2j * np.pi * hertz * 3e-3), deg=True)
+    assert np.abs(lag).max() < 1.0

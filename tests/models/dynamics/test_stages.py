@@ -5,13 +5,12 @@ from dataclasses import fields, replace
 import numpy as np
 import pytest
 
+from models.dynamics.quantities import SOURCES, Number, Point
 from models.dynamics.stages import (
+    FULL_STAGES,
     PLATFORM,
-    SOURCES,
     STAGES,
     Condition,
-    Number,
-    Point,
     build_structure,
     stage_named,
     tuning_named,
@@ -21,11 +20,16 @@ from models.errors import BadParameter, UnknownServo, UnknownStage
 
 
 def test_every_number_has_unit_and_source():
-    """No number of a stage is without unit or source."""
-    for stage in STAGES.values():
-        for field in fields(stage):
-            entry = getattr(stage, field.name)
-            if not isinstance(entry, str):
+    """No number of a stage or of an elastic part is without unit or source."""
+    owners = [*STAGES.values(), *FULL_STAGES.values()]
+    for stage in FULL_STAGES.values():
+        owners += [stage.flexible, *stage.flexible.parts]
+    plain = {"name", "identity_suffix", "flexible", "parts"}
+    plain |= {"body", "kind", "modes", "along", "bends", "parity", "moves", "encoder"}
+    for owner in owners:
+        for field in fields(owner):
+            if field.name not in plain:
+                entry = getattr(owner, field.name)
                 assert isinstance(entry, Number | Point)
                 assert entry.unit
                 assert entry.source in SOURCES
@@ -40,7 +44,7 @@ def test_both_stages_share_one_guide():
 
 def test_unknown_stage_lists_the_known():
     """An unknown stage raises with the list of those that exist."""
-    with pytest.raises(UnknownStage, match="lms-x, lms-y") as caught:
+    with pytest.raises(UnknownStage, match="lms-x, lms-y, lms-x-full, lms-y-full") as caught:
         stage_named("lms-z")
     assert caught.value.got == "lms-z"
 
@@ -56,6 +60,12 @@ def test_unknown_source_is_refused():
     """A number of unstated origin raises."""
     with pytest.raises(BadParameter, match="moving_mass"):
         replace(STAGES["lms-x"], moving_mass=Number(23.5, "kg", "somewhere"))
+
+
+def test_position_beyond_the_travel_is_refused():
+    """A position that the platform cannot reach raises."""
+    with pytest.raises(BadParameter, match=r"position_mm is 151.*within ±150 mm"):
+        Condition(position_mm=151.0)
 
 
 @pytest.mark.parametrize("field", ["moving_mass", "granite_mass", "block_stiffness", "payload"])

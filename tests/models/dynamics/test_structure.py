@@ -5,7 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from models.dynamics.stages import PLATFORM, STAGES, Condition, Number, build_structure, stage_named
+from models.dynamics.quantities import Number
+from models.dynamics.stages import PLATFORM, STAGES, Condition, build_structure, stage_named
 from models.dynamics.structure import (
     GROUND,
     Body,

@@ -8,7 +8,8 @@ import pytest
 from scipy.signal import lfilter, periodogram
 
 from models.dynamics.plant import OUTPUTS
-from models.dynamics.stages import NOMINAL, STAGES, Number
+from models.dynamics.quantities import Number
+from models.dynamics.stages import NOMINAL, STAGES
 from models.errors import BadParameter
 from models.recordings.recording import (
     COLUMNS,

@@ -12,8 +12,9 @@ from scipy.signal import hilbert
 from models.__main__ import cli
 from models.dynamics.modal_coordinates import diagonalise, frequency_response
 from models.dynamics.plant import GUIDE_MODES, INPUTS, OUTPUTS, closed_loop, structure_state
+from models.dynamics.quantities import Number
 from models.dynamics.servo import TUNINGS
-from models.dynamics.stages import STAGES, Number, build_structure
+from models.dynamics.stages import STAGES, build_structure
 from models.errors import BadParameter
 from models.recordings.formats import WRITERS
 from models.recordings.recording import COLUMNS, SAMPLE_RATE_HZ, record
