@@ -40,11 +40,11 @@ STEP = "identify"
 NOT_MET = {
     "building: intervals of each third hold the whole": (
         "some frequencies of a third are little more than two standard deviations off: windows "
-        "scatter by more than is said as well"
+        "scatter by more than stated as well"
     ),
     "building: frequencies do not depend on the described damping": (
         "the band of the fit follows from it, the noise of a real building is not as simple as the "
-        "likelihood says, and the likelihood of close modes has several maxima"
+        "likelihood assumes, and the likelihood of close modes has several maxima"
     ),
     "shear frame: documented frequencies inside": (
         "what they are after an integration by the trapezoidal rule in steps of 1/12 s, up to 3 % "
